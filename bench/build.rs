@@ -1,5 +1,5 @@
-//! Adds the paths of the MuJoCo and RealSense libraries for this crate's tests. Binaries of other packages do this in
-//! their own build scripts.
+//! Adds the paths of the MuJoCo and RealSense libraries for this crate's tests. Binaries of other
+//! packages do this in their own build scripts.
 
 fn main() {
     println!("cargo::rerun-if-env-changed=MUJOCO_DYNAMIC_LINK_DIR");

@@ -1,18 +1,21 @@
 //! Settings of the C library's allocator.
 //!
-//! glibc serves large blocks from separate memory mappings, which return to the system when the blocks are freed.
-//! However, each such free raises the size above which glibc maps blocks, up to 32 MiB. Images are then allocated on
-//! the heaps, together with small blocks. In a long run, the heaps fragment and grow although memory use is constant,
-//! because small blocks remain between freed keyframes. A fixed threshold keeps images out of the heaps.
+//! glibc serves large blocks from separate memory mappings, which return to the system when the
+//! blocks are freed. However, each such free raises the size above which glibc maps blocks, up to
+//! 32 MiB. Images are then allocated on the heaps, together with small blocks. In a long run, the
+//! heaps fragment and grow although memory use is constant, because small blocks remain between
+//! freed keyframes. A fixed threshold keeps images out of the heaps.
 //!
-//! The cost: the kernel clears a mapped block page by page when it is first written. Pictures for viewers are such
-//! blocks. On a GPU that draws a picture in a millisecond, clearing takes most of the time (H200, 1024x1024 with depth,
-//! 8 clients: 105 ms from request to picture instead of 45). The setting is therefore used only with software adapters,
-//! where drawing takes far longer and host memory holds images twice.
+//! The cost: the kernel clears a mapped block page by page when it is first written. Pictures for
+//! viewers are such blocks. On a GPU that draws a picture in a millisecond, clearing takes most of
+//! the time (H200, 1024x1024 with depth, 8 clients: 105 ms from request to picture instead of 45).
+//! The setting is therefore used only with software adapters, where drawing takes far longer and
+//! host memory holds images twice.
 
 /// Blocks of at least this size get a separate mapping. An image of 640x480 takes 1.2 MB.
 const MMAP_THRESHOLD_BYTES: i32 = 1 << 20;
-/// Free memory at the end of a heap returns to the system above this size: twice [`MMAP_THRESHOLD_BYTES`], as in glibc.
+/// Free memory at the end of a heap returns to the system above this size: twice
+/// [`MMAP_THRESHOLD_BYTES`], as in glibc.
 const TRIM_THRESHOLD_BYTES: i32 = 2 * MMAP_THRESHOLD_BYTES;
 
 /// Keeps large blocks out of the heaps, unless the environment sets the allocator's thresholds.
@@ -23,8 +26,8 @@ pub(crate) fn keep_images_out_of_heaps() {
         return;
     }
     #[expect(unsafe_code, reason = "the allocator has no other interface")]
-    // SAFETY: `mallopt` takes the allocator's lock, and both values are within the documented range. The call affects
-    // future allocations only.
+    // SAFETY: `mallopt` takes the allocator's lock, and both values are within the documented
+    // range. The call affects future allocations only.
     let results = unsafe {
         [
             libc::mallopt(libc::M_MMAP_THRESHOLD, MMAP_THRESHOLD_BYTES),
@@ -61,10 +64,14 @@ mod tests {
         // Without the setting, freeing this block would put the images below into a heap.
         drop(vec![1u8; 24 << 20]);
         let before = mapped_bytes();
-        // These blocks are zeroed and never written, so they take address space but no memory. Together they are far
-        // larger than any memory that parallel tests may free.
+        // These blocks are zeroed and never written, so they take address space but no memory.
+        // Together they are far larger than any memory that parallel tests may free.
         let images: Vec<Vec<u8>> = (0..N_BLOCKS).map(|_| vec![0; BLOCK_BYTES]).collect();
         let grown = mapped_bytes().saturating_sub(before);
-        assert!(grown >= N_BLOCKS / 2 * BLOCK_BYTES, "{grown} bytes of {} are mapped", images.len() * BLOCK_BYTES);
+        assert!(
+            grown >= N_BLOCKS / 2 * BLOCK_BYTES,
+            "{grown} bytes of {} are mapped",
+            images.len() * BLOCK_BYTES
+        );
     }
 }

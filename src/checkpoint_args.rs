@@ -13,13 +13,17 @@ pub(crate) struct CheckpointArgs {
 
 impl From<CheckpointOptions> for CheckpointArgs {
     fn from(options: CheckpointOptions) -> Self {
-        Self { checkpoint_secs: options.period }
+        Self {
+            checkpoint_secs: options.period,
+        }
     }
 }
 
 impl CheckpointArgs {
     /// The flag as an option.
     pub(crate) fn options(self) -> CheckpointOptions {
-        CheckpointOptions { period: self.checkpoint_secs }
+        CheckpointOptions {
+            period: self.checkpoint_secs,
+        }
     }
 }

@@ -1,7 +1,9 @@
-//! The subcommands and their `--help` summaries. The flags of each subcommand are at the top of its own file.
+//! The subcommands and their `--help` summaries. The flags of each subcommand are at the top of its
+//! own file.
 
 use crate::commands::{
-    bench, calibrate, devices, doctor, eval, export, fk, metrics, move_arm, record, render, run, sim, train, view,
+    bench, calibrate, devices, doctor, eval, export, fk, metrics, move_arm, record, render, run,
+    sim, train, view,
 };
 use crate::exit::Exit;
 use clap::{ArgAction, Parser, Subcommand};
@@ -63,7 +65,8 @@ pub(crate) enum Command {
 }
 
 impl Command {
-    /// Whether other users of this computer must not read its results, because they show where the robot was.
+    /// Whether other users of this computer must not read its results, because they show where the
+    /// robot was.
     pub(crate) fn is_private(&self) -> bool {
         let permissions = match self {
             Self::Run(args) => args.permissions,

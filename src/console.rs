@@ -37,13 +37,22 @@ pub(crate) struct Console {
 }
 
 impl Console {
-    /// A console for a session with these limits. Several sessions at once have no progress bar, because their bars
-    /// would overwrite each other.
+    /// A console for a session with these limits. Several sessions at once have no progress bar,
+    /// because their bars would overwrite each other.
     pub(crate) fn new(output: OutputMode, limits: Limits, n_sessions: usize) -> Self {
         let length = limits.steps.or(limits.seconds.map(whole_secs));
-        let template = if length.is_some() { "{bar:30} {elapsed} {msg}" } else { "{spinner} {elapsed} {msg}" };
+        let template = if length.is_some() {
+            "{bar:30} {elapsed} {msg}"
+        } else {
+            "{spinner} {elapsed} {msg}"
+        };
         let is_hidden = n_sessions > 1 || matches!(output, OutputMode::Json | OutputMode::Nothing);
-        Self { output, limits, is_hidden, bar: print::bar(length, template, is_hidden) }
+        Self {
+            output,
+            limits,
+            is_hidden,
+            bar: print::bar(length, template, is_hidden),
+        }
     }
 }
 
@@ -53,10 +62,17 @@ impl Observer for Console {
             (SessionEvent::Progress(session), _) => {
                 let progress = &session.progress;
                 let has_steps = self.limits.steps.is_some();
-                self.bar.set_position(if has_steps { progress.step } else { whole_secs(session.seconds) });
-                let psnr = session.psnr.map_or(String::new(), |psnr| format!(", {psnr:.2} dB"));
+                self.bar.set_position(if has_steps {
+                    progress.step
+                } else {
+                    whole_secs(session.seconds)
+                });
+                let psnr = session
+                    .psnr
+                    .map_or(String::new(), |psnr| format!(", {psnr:.2} dB"));
                 let primitives = counted(progress.primitives, session.primitive);
-                self.bar.set_message(format!("step {}, {primitives}{psnr}", progress.step));
+                self.bar
+                    .set_message(format!("step {}, {primitives}{psnr}", progress.step));
             }
             (SessionEvent::TrainingEnded, _) => self.bar.finish_and_clear(),
             (SessionEvent::Scoring { n_scored, n_all }, _) => {
@@ -70,14 +86,16 @@ impl Observer for Console {
                 }
             }
             (SessionEvent::Evaluated(evaluation), OutputMode::Json) => print_json(evaluation),
-            (SessionEvent::Evaluated(evaluation), OutputMode::Lines) => print::report(format_args!(
-                "{:7.2} s  step {:6}  {:>15}  {:7.2} ms/step  {}",
-                evaluation.seconds,
-                evaluation.step,
-                counted(evaluation.primitives, evaluation.primitive),
-                evaluation.step_millis.unwrap_or_default(),
-                evaluation.scores
-            )),
+            (SessionEvent::Evaluated(evaluation), OutputMode::Lines) => {
+                print::report(format_args!(
+                    "{:7.2} s  step {:6}  {:>15}  {:7.2} ms/step  {}",
+                    evaluation.seconds,
+                    evaluation.step,
+                    counted(evaluation.primitives, evaluation.primitive),
+                    evaluation.step_millis.unwrap_or_default(),
+                    evaluation.scores
+                ))
+            }
             (SessionEvent::Finished(finished), OutputMode::Json) => {
                 finished.profile.iter().for_each(print_json);
                 print_json(finished.done);
@@ -95,10 +113,17 @@ impl Observer for Console {
                     done.bytes as f64 / 1e6,
                     done.scores
                 ));
-                let with_page = if finished.has_page { ", with pictures and scores in report.html" } else { "" };
+                let with_page = if finished.has_page {
+                    ", with pictures and scores in report.html"
+                } else {
+                    ""
+                };
                 print::report(format_args!("saved in {}{with_page}", done.out.display()));
             }
-            (SessionEvent::Evaluated(_) | SessionEvent::Finished(_), OutputMode::Bar | OutputMode::Nothing) => {}
+            (
+                SessionEvent::Evaluated(_) | SessionEvent::Finished(_),
+                OutputMode::Bar | OutputMode::Nothing,
+            ) => {}
         }
     }
 }
@@ -119,7 +144,11 @@ pub(crate) fn print_next_commands(models: &[FinishedModel]) {
 }
 
 /// Whole seconds for the progress bar.
-#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "float casts saturate")]
+#[expect(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "float casts saturate"
+)]
 fn whole_secs(secs: f64) -> u64 {
     secs as u64
 }
@@ -134,13 +163,19 @@ pub(crate) struct ReadBar {
 impl ReadBar {
     /// A bar that appears with the first progress, unless it is hidden.
     pub(crate) fn new(is_hidden: bool) -> Self {
-        Self { is_hidden, bar: Mutex::default() }
+        Self {
+            is_hidden,
+            bar: Mutex::default(),
+        }
     }
 
     /// Shows the progress.
     pub(crate) fn show(&self, progress: ReadProgress) {
         let mut current = self.bar.lock();
-        if current.as_ref().is_none_or(|(noun, _)| *noun != progress.noun) {
+        if current
+            .as_ref()
+            .is_none_or(|(noun, _)| *noun != progress.noun)
+        {
             clear(&mut current);
             let template = match progress.noun {
                 "images" => "{bar:30} {pos} of {len} images",

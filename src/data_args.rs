@@ -7,8 +7,8 @@ use std::path::PathBuf;
 /// Which images are used, and for what.
 #[derive(Clone, Debug, clap::Args)]
 pub(crate) struct DataArgs {
-    /// Use every N-th image for testing, or the images listed in a file, one per line; with 1, eval scores all
-    /// [default: 8]
+    /// Use every N-th image for testing, or the images listed in a file, one per line; with 1, eval
+    /// scores all [default: 8]
     #[arg(long, value_name = "N|FILE")]
     holdout: Option<String>,
     /// Use exactly the keyframes listed by an earlier run (keyframes.txt)
@@ -17,8 +17,8 @@ pub(crate) struct DataArgs {
     /// Read a recording with this rig file instead of the one stored in it
     #[arg(long, value_name = "FILE")]
     rig: Option<PathBuf>,
-    /// Scale the images (not their depth) to this fraction of their width and height, 0.05 to 1 [default: the rig
-    /// file's, else 1]
+    /// Scale the images (not their depth) to this fraction of their width and height, 0.05 to 1
+    /// [default: the rig file's, else 1]
     #[arg(long, value_name = "FRACTION", value_parser = downscale::parse_scale)]
     scale: Option<f64>,
 }
@@ -26,7 +26,17 @@ pub(crate) struct DataArgs {
 impl DataArgs {
     /// The flags as options.
     pub(crate) fn options(&self) -> DataOptions {
-        let Self { holdout, keyframes, rig, scale } = self.clone();
-        DataOptions { holdout, keyframes, rig, scale }
+        let Self {
+            holdout,
+            keyframes,
+            rig,
+            scale,
+        } = self.clone();
+        DataOptions {
+            holdout,
+            keyframes,
+            rig,
+            scale,
+        }
     }
 }

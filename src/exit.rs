@@ -25,7 +25,11 @@ pub(crate) enum Exit {
 impl Exit {
     /// Turns success into a loss if some of the output could not be printed.
     pub(crate) fn or_output_loss(self) -> Self {
-        if self == Self::Done && print::has_lost_output() { Self::Loss } else { self }
+        if self == Self::Done && print::has_lost_output() {
+            Self::Loss
+        } else {
+            self
+        }
     }
 }
 
@@ -72,7 +76,10 @@ fn class_of(error: &(dyn std::error::Error + 'static)) -> Option<ErrorClass> {
     let of_capture = || Some(error.downcast_ref::<capture::Error>()?.class());
     let of_keyframe = || Some(error.downcast_ref::<keyframe::Error>()?.class());
     let of_calibration = || Some(error.downcast_ref::<calibration::Error>()?.class());
-    of_session().or_else(of_capture).or_else(of_keyframe).or_else(of_calibration)
+    of_session()
+        .or_else(of_capture)
+        .or_else(of_keyframe)
+        .or_else(of_calibration)
 }
 
 /// Whether a command was rejected because of bad arguments or insufficient data.
@@ -85,13 +92,20 @@ pub(crate) fn from_losses(data_losses: &[String]) -> Exit {
     for loss in data_losses {
         log::warn!("data loss: {loss}");
     }
-    if data_losses.is_empty() { Exit::Done } else { Exit::Loss }
+    if data_losses.is_empty() {
+        Exit::Done
+    } else {
+        Exit::Loss
+    }
 }
 
-/// Whether the reader of stdout closed the pipe, as `head` does. This ends a command whose result is its output.
+/// Whether the reader of stdout closed the pipe, as `head` does. This ends a command whose result
+/// is its output.
 pub(crate) fn is_broken_pipe(error: &anyhow::Error) -> bool {
     let is_pipe = |io: &std::io::Error| io.kind() == ErrorKind::BrokenPipe;
-    error.downcast_ref::<crate::print::StdoutError>().is_some_and(|error| is_pipe(&error.0))
+    error
+        .downcast_ref::<crate::print::StdoutError>()
+        .is_some_and(|error| is_pipe(&error.0))
 }
 
 #[cfg(test)]
@@ -104,8 +118,15 @@ mod tests {
         let error = anyhow::Error::new(BadArgument("unknown key".into())).context("rig file");
         assert_eq!(of(&error), Exit::BadArguments);
         assert_eq!(of(&anyhow::anyhow!("disk full")), Exit::Failed);
-        let budget = trainer::Error::BudgetTooSmall { model: "neural field", max_bytes: 1, min_bytes: 2 };
-        assert_eq!(of(&anyhow::Error::new(budget).context("run")), Exit::BadArguments);
+        let budget = trainer::Error::BudgetTooSmall {
+            model: "neural field",
+            max_bytes: 1,
+            min_bytes: 2,
+        };
+        assert_eq!(
+            of(&anyhow::Error::new(budget).context("run")),
+            Exit::BadArguments
+        );
     }
 
     #[test]
@@ -118,8 +139,12 @@ mod tests {
     fn only_closed_stdout_is_not_an_error() {
         let closed = || std::io::Error::from(ErrorKind::BrokenPipe);
         assert!(is_broken_pipe(&crate::print::StdoutError(closed()).into()));
-        assert!(!is_broken_pipe(&crate::print::StdoutError(ErrorKind::StorageFull.into()).into()));
-        let camera = Err::<(), _>(closed()).context("camera").expect_err("closed");
+        assert!(!is_broken_pipe(
+            &crate::print::StdoutError(ErrorKind::StorageFull.into()).into()
+        ));
+        let camera = Err::<(), _>(closed())
+            .context("camera")
+            .expect_err("closed");
         assert!(!is_broken_pipe(&camera));
     }
 }

@@ -8,16 +8,26 @@ use syn::buffer::{Cursor, TokenBuffer};
 use syn::visit::Visit;
 use syn::{Attribute, Item, LitStr, Macro, Meta};
 
-/// Source files whose messages several commands print, or folders of such files, with these commands. All of them must
-/// accept the flags. Other messages must name a command that does.
+/// Source files whose messages several commands print, or folders of such files, with these
+/// commands. All of them must accept the flags. Other messages must name a command that does.
 const PRINTED_BY: [(&str, &[&str]); 24] = [
     ("bench/src", &["bench"]),
     ("calibration/src/hand_eye", &["calibrate hand-eye"]),
     ("keyframe/src/error.rs", &["train", "eval", "bench"]),
-    ("session/src/calibration_report", &["calibrate intrinsics", "calibrate hand-eye", "calibrate scene"]),
+    (
+        "session/src/calibration_report",
+        &[
+            "calibrate intrinsics",
+            "calibrate hand-eye",
+            "calibrate scene",
+        ],
+    ),
     ("session/src/camera_path.rs", &["render"]),
     ("session/src/checkpoints.rs", &["run", "train"]),
-    ("session/src/corrected_rig.rs", &["calibrate intrinsics", "calibrate hand-eye"]),
+    (
+        "session/src/corrected_rig.rs",
+        &["calibrate intrinsics", "calibrate hand-eye"],
+    ),
     ("session/src/data.rs", &["train", "eval", "bench"]),
     ("session/src/depth_from.rs", &["train"]),
     ("session/src/replay.rs", &["train"]),
@@ -25,13 +35,29 @@ const PRINTED_BY: [(&str, &[&str]); 24] = [
     ("session/src/scene_calibration.rs", &["calibrate scene"]),
     ("session/src/session/persistence.rs", &["run", "train"]),
     ("session/src/training.rs", &["train", "bench"]),
-    ("session/src/training_options.rs", &["run", "train", "bench"]),
+    (
+        "session/src/training_options.rs",
+        &["run", "train", "bench"],
+    ),
     ("src/commands/bench", &["bench"]),
     ("src/commands/calibrate", &["calibrate"]),
-    ("src/page_args.rs", &["run", "view", "calibrate intrinsics", "calibrate hand-eye"]),
-    ("targets/src/error.rs", &["calibrate intrinsics", "calibrate hand-eye", "calibrate target"]),
+    (
+        "src/page_args.rs",
+        &["run", "view", "calibrate intrinsics", "calibrate hand-eye"],
+    ),
+    (
+        "targets/src/error.rs",
+        &[
+            "calibrate intrinsics",
+            "calibrate hand-eye",
+            "calibrate target",
+        ],
+    ),
     ("trainer/src/splat/trainer", &["run", "train", "bench"]),
-    ("viz/src/error.rs", &["run", "view", "calibrate intrinsics", "calibrate hand-eye"]),
+    (
+        "viz/src/error.rs",
+        &["run", "view", "calibrate intrinsics", "calibrate hand-eye"],
+    ),
     // These build command lines for other commands.
     ("session/src/next_commands.rs", &["eval", "export"]),
     ("src/commands/bench/live.rs", &["run"]),
@@ -50,35 +76,55 @@ const NOT_PRINTED: [(&str, &str); 2] = [
 fn flags_of(path: &str) -> BTreeSet<String> {
     let cli = Cli::command();
     let command = path.split(' ').fold(&cli, |command, name| {
-        command.find_subcommand(name).unwrap_or_else(|| panic!("there is no command {path:?}"))
+        command
+            .find_subcommand(name)
+            .unwrap_or_else(|| panic!("there is no command {path:?}"))
     });
     let mut flags = BTreeSet::new();
     let mut waiting = vec![command];
     while let Some(command) = waiting.pop() {
-        flags.extend(command.get_arguments().filter_map(|argument| argument.get_long()).map(str::to_owned));
+        flags.extend(
+            command
+                .get_arguments()
+                .filter_map(|argument| argument.get_long())
+                .map(str::to_owned),
+        );
         waiting.extend(command.get_subcommands());
     }
     flags
 }
 
 fn is_in(file: &str, place: &str) -> bool {
-    file.strip_prefix(place).is_some_and(|rest| rest.is_empty() || rest.starts_with('/'))
+    file.strip_prefix(place)
+        .is_some_and(|rest| rest.is_empty() || rest.starts_with('/'))
 }
 
-/// The sets of flags of which each must contain the flags in a file: one for each command that prints its messages.
+/// The sets of flags of which each must contain the flags in a file: one for each command that
+/// prints its messages.
 fn accepted_in(file: &str) -> Vec<BTreeSet<String>> {
     // The longest place is the most specific one.
     let places = PRINTED_BY.iter().filter(|(place, _)| is_in(file, place));
     if let Some((_, commands)) = places.max_by_key(|(place, _)| place.len()) {
         return match is_in(file, "session/src/next_commands.rs") {
-            true => vec![commands.iter().flat_map(|command| flags_of(command)).collect()],
+            true => vec![
+                commands
+                    .iter()
+                    .flat_map(|command| flags_of(command))
+                    .collect(),
+            ],
             false => commands.iter().map(|command| flags_of(command)).collect(),
         };
     }
-    let own = file.strip_prefix("src/commands/").and_then(|rest| rest.split(['/', '.']).next());
+    let own = file
+        .strip_prefix("src/commands/")
+        .and_then(|rest| rest.split(['/', '.']).next());
     let is_command = |name: &&str| Cli::command().find_subcommand(name).is_some();
     let renamed = own.map(|name| if name == "move_arm" { "move" } else { name });
-    vec![renamed.filter(is_command).map_or_else(BTreeSet::new, flags_of)]
+    vec![
+        renamed
+            .filter(is_command)
+            .map_or_else(BTreeSet::new, flags_of),
+    ]
 }
 
 /// A flag in a text, and the text before it.
@@ -94,7 +140,8 @@ fn flags_in(text: &str) -> Vec<NamedFlag<'_>> {
         let (before, rest) = (&text[..at], &text[at + dashes.len()..]);
         let is_part = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '-';
         let name = &rest[..rest.find(|c: char| !is_part(c)).unwrap_or(rest.len())];
-        let begins = !before.ends_with(|c: char| c.is_alphanumeric() || matches!(c, '-' | '"' | '_'));
+        let begins =
+            !before.ends_with(|c: char| c.is_alphanumeric() || matches!(c, '-' | '"' | '_'));
         // Variables of style sheets.
         let is_variable = before.ends_with("var(");
         let is_flag = begins && !is_variable && name.starts_with(|c: char| c.is_ascii_lowercase());
@@ -103,7 +150,8 @@ fn flags_in(text: &str) -> Vec<NamedFlag<'_>> {
     named.collect()
 }
 
-/// Whether a text names a command that accepts a flag: as `` `train` ``, `fieldrig train`, or directly before the flag.
+/// Whether a text names a command that accepts a flag: as `` `train` ``, `fieldrig train`, or
+/// directly before the flag.
 fn names_a_command_with(text: &str, flag: NamedFlag<'_>) -> bool {
     let is_named = |name: &str| {
         text.contains(&format!("fieldrig {name}"))
@@ -125,7 +173,11 @@ impl Texts {
     fn add_all(&mut self, mut tokens: Cursor<'_>) {
         loop {
             if let Some((literal, rest)) = tokens.literal() {
-                self.0.extend(syn::parse_str::<LitStr>(&literal.to_string()).ok().map(|text| text.value()));
+                self.0.extend(
+                    syn::parse_str::<LitStr>(&literal.to_string())
+                        .ok()
+                        .map(|text| text.value()),
+                );
                 tokens = rest;
             } else if let Some((punct, rest)) = tokens.punct() {
                 // An attribute, usually documentation, follows a number sign.
@@ -146,9 +198,14 @@ impl Texts {
 /// Whether an attribute such as `#[cfg(test)]` restricts an item to tests.
 fn is_for_tests(attributes: &[Attribute]) -> bool {
     attributes.iter().any(|attribute| {
-        let Meta::List(list) = &attribute.meta else { return false };
+        let Meta::List(list) = &attribute.meta else {
+            return false;
+        };
         let condition = list.tokens.to_string();
-        list.path.is_ident("cfg") && condition.split(|c: char| !c.is_alphanumeric()).any(|word| word == "test")
+        list.path.is_ident("cfg")
+            && condition
+                .split(|c: char| !c.is_alphanumeric())
+                .any(|word| word == "test")
     })
 }
 
@@ -179,15 +236,29 @@ impl<'ast> Visit<'ast> for Texts {
 
 /// Source files of all crates, except tests.
 fn source_files(root: &Path) -> Vec<PathBuf> {
-    let is_test = |path: &Path| path.to_string_lossy().ends_with("tests.rs") || path.ends_with("testing.rs");
-    let crates = std::fs::read_dir(root).expect("the workspace").flatten().map(|entry| entry.path().join("src"));
-    let mut folders: Vec<PathBuf> = crates.chain([root.join("src")]).filter(|folder| folder.is_dir()).collect();
+    let is_test =
+        |path: &Path| path.to_string_lossy().ends_with("tests.rs") || path.ends_with("testing.rs");
+    let crates = std::fs::read_dir(root)
+        .expect("the workspace")
+        .flatten()
+        .map(|entry| entry.path().join("src"));
+    let mut folders: Vec<PathBuf> = crates
+        .chain([root.join("src")])
+        .filter(|folder| folder.is_dir())
+        .collect();
     let mut files = Vec::new();
     while let Some(folder) = folders.pop() {
-        for path in std::fs::read_dir(folder).expect("a folder of sources").flatten().map(|entry| entry.path()) {
+        for path in std::fs::read_dir(folder)
+            .expect("a folder of sources")
+            .flatten()
+            .map(|entry| entry.path())
+        {
             match path.is_dir() {
                 true => folders.push(path),
-                false if path.extension().is_some_and(|extension| extension == "rs") && !is_test(&path) => {
+                false
+                    if path.extension().is_some_and(|extension| extension == "rs")
+                        && !is_test(&path) =>
+                {
                     files.push(path);
                 }
                 false => {}
@@ -203,11 +274,21 @@ fn messages_name_only_flags_of_their_command() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));
     let (mut n_flags, mut wrong) = (0, Vec::new());
     for path in source_files(root) {
-        let file = path.strip_prefix(root).expect("in the workspace").to_string_lossy().into_owned();
+        let file = path
+            .strip_prefix(root)
+            .expect("in the workspace")
+            .to_string_lossy()
+            .into_owned();
         let source = std::fs::read_to_string(&path).expect("a source file");
         let mut texts = Texts::default();
-        texts.visit_file(&syn::parse_file(&source).unwrap_or_else(|error| panic!("{file}: {error}")));
-        let texts: Vec<&String> = texts.0.iter().filter(|text| !flags_in(text).is_empty()).collect();
+        texts.visit_file(
+            &syn::parse_file(&source).unwrap_or_else(|error| panic!("{file}: {error}")),
+        );
+        let texts: Vec<&String> = texts
+            .0
+            .iter()
+            .filter(|text| !flags_in(text).is_empty())
+            .collect();
         if texts.is_empty() {
             continue;
         }
@@ -224,15 +305,30 @@ fn messages_name_only_flags_of_their_command() {
             }
         }
     }
-    assert_eq!(wrong, Vec::<String>::new(), "name the command that has the flag, or correct PRINTED_BY");
+    assert_eq!(
+        wrong,
+        Vec::<String>::new(),
+        "name the command that has the flag, or correct PRINTED_BY"
+    );
     assert!(n_flags > 100, "{n_flags} flags were found");
 }
 
 #[test]
 fn flags_are_found_in_texts() {
-    let names = |text| flags_in(text).iter().map(|flag| flag.name).collect::<Vec<_>>();
-    assert_eq!(names("--out {}: give --max-splats, or (--scale)"), ["out", "max-splats", "scale"]);
-    assert_eq!(names("a -- b, --{name}, x--y, var(--text), style=\"--part:1\", ---"), Vec::<&str>::new());
+    let names = |text| {
+        flags_in(text)
+            .iter()
+            .map(|flag| flag.name)
+            .collect::<Vec<_>>()
+    };
+    assert_eq!(
+        names("--out {}: give --max-splats, or (--scale)"),
+        ["out", "max-splats", "scale"]
+    );
+    assert_eq!(
+        names("a -- b, --{name}, x--y, var(--text), style=\"--part:1\", ---"),
+        Vec::<&str>::new()
+    );
     let is_accepted = |text: &str| names_a_command_with(text, flags_in(text)[0]);
     assert!(is_accepted("`fieldrig run --sim` replaces devices"));
     assert!(is_accepted("--max-bytes of `train`") && is_accepted("train --resume continues"));
@@ -243,5 +339,8 @@ fn flags_are_found_in_texts() {
     texts.visit_file(&syn::parse_str(source).expect("Rust"));
     assert_eq!(texts.0, ["a {}", "b", "c"]);
     assert_eq!(accepted_in("src/commands/move_arm.rs"), [flags_of("move")]);
-    assert_eq!(accepted_in("capture/src/open/mod.rs"), [BTreeSet::<String>::new()]);
+    assert_eq!(
+        accepted_in("capture/src/open/mod.rs"),
+        [BTreeSet::<String>::new()]
+    );
 }

@@ -50,11 +50,17 @@ fn start_threads() -> anyhow::Result<()> {
     })
 }
 
-/// Suppresses an irrelevant error on machines without a desktop: software Vulkan connects to Wayland, and libwayland
-/// prints an error if `XDG_RUNTIME_DIR` is not set, unless `WAYLAND_DISPLAY` is an absolute path.
-#[expect(unsafe_code, reason = "libwayland can only be configured through the environment")]
+/// Suppresses an irrelevant error on machines without a desktop: software Vulkan connects to
+/// Wayland, and libwayland prints an error if `XDG_RUNTIME_DIR` is not set, unless
+/// `WAYLAND_DISPLAY` is an absolute path.
+#[expect(
+    unsafe_code,
+    reason = "libwayland can only be configured through the environment"
+)]
 fn keep_wayland_quiet() {
-    if std::env::var_os("XDG_RUNTIME_DIR").is_none() && std::env::var_os("WAYLAND_DISPLAY").is_none() {
+    if std::env::var_os("XDG_RUNTIME_DIR").is_none()
+        && std::env::var_os("WAYLAND_DISPLAY").is_none()
+    {
         // SAFETY: this runs before anything else, so no other thread can read the environment.
         unsafe { std::env::set_var("WAYLAND_DISPLAY", "/nowhere") };
     }

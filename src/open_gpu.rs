@@ -5,15 +5,19 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Once};
 use trainer::gpu::{Gpu, GpuOptions};
 
-/// Opens the GPU. `FIELDRIG_GPU` selects one of several; `FIELDRIG_GPU_FEATURES=none` disables all optional features,
-/// and `no-matrices` only cooperative matrices.
+/// Opens the GPU. `FIELDRIG_GPU` selects one of several; `FIELDRIG_GPU_FEATURES=none` disables all
+/// optional features, and `no-matrices` only cooperative matrices.
 pub(crate) fn open_gpu() -> session::Result<Arc<Gpu>> {
     let features = std::env::var_os("FIELDRIG_GPU_FEATURES");
     let [optional_features, matrices] =
         ["none", "no-matrices"].map(|word| features.as_ref().is_none_or(|value| value != word));
     let adapter = match std::env::var("FIELDRIG_GPU") {
         Ok(text) => {
-            let invalid = |_| session::Error::BadInput(format!("FIELDRIG_GPU: {text:?} is not the number of a GPU"));
+            let invalid = |_| {
+                session::Error::BadInput(format!(
+                    "FIELDRIG_GPU: {text:?} is not the number of a GPU"
+                ))
+            };
             Some(text.parse().map_err(invalid)?)
         }
         Err(_) => None,
@@ -21,26 +25,40 @@ pub(crate) fn open_gpu() -> session::Result<Arc<Gpu>> {
     hide_caught_panics();
     check_open_for_tests()?;
     // For tests: loses the GPU once, when a model reaches this step.
-    if let Some(step) = std::env::var("FIELDRIG_TEST_LOSE_GPU_AT_STEP").ok().and_then(|text| text.parse().ok()) {
+    if let Some(step) = std::env::var("FIELDRIG_TEST_LOSE_GPU_AT_STEP")
+        .ok()
+        .and_then(|text| text.parse().ok())
+    {
         session::lose_gpu_at_step(step);
     }
     // For tests: limits GPU memory.
-    let memory_limit_bytes = std::env::var("FIELDRIG_TEST_GPU_BYTES").ok().and_then(|text| text.parse().ok());
-    let gpu =
-        Gpu::open(&GpuOptions { optional_features, matrices, memory_limit_bytes, adapter, ..GpuOptions::default() })?;
+    let memory_limit_bytes = std::env::var("FIELDRIG_TEST_GPU_BYTES")
+        .ok()
+        .and_then(|text| text.parse().ok());
+    let gpu = Gpu::open(&GpuOptions {
+        optional_features,
+        matrices,
+        memory_limit_bytes,
+        adapter,
+        ..GpuOptions::default()
+    })?;
     if gpu.is_software() {
         allocator::keep_images_out_of_heaps();
     }
     Ok(gpu)
 }
 
-/// Hides the message of a panic that is caught: wgpu panics if it detects a lost device while waiting.
+/// Hides the message of a panic that is caught: wgpu panics if it detects a lost device while
+/// waiting.
 fn hide_caught_panics() {
     static IS_SET: Once = Once::new();
     IS_SET.call_once(|| {
         let before = std::panic::take_hook();
         std::panic::set_hook(Box::new(move |info| {
-            if !info.payload_as_str().is_some_and(|message| message.starts_with("Error in Device::poll")) {
+            if !info
+                .payload_as_str()
+                .is_some_and(|message| message.starts_with("Error in Device::poll"))
+            {
                 before(info);
             }
         }));

@@ -11,20 +11,22 @@ use viz::{Certificate, Hub, Server, ServerConfig, Sharing, Tokens};
 /// Where the page is served, and to whom.
 #[derive(Clone, Debug, clap::Args)]
 pub(crate) struct PageArgs {
-    /// Address of the page: numeric IP address and port [default: 127.0.0.1:7007, with --share 0.0.0.0:7007; `view`
-    /// and `calibrate` take a free port if that one is in use]
+    /// Address of the page: numeric IP address and port [default: 127.0.0.1:7007, with --share
+    /// 0.0.0.0:7007; `view` and `calibrate` take a free port if that one is in use]
     #[arg(long, value_name = "ADDRESS", value_parser = address)]
     listen: Option<SocketAddr>,
     /// Serve the page to other machines over TLS; the printed addresses contain the required token
     #[arg(long)]
     share: bool,
-    /// TLS certificate for --share, with its chain (PEM) [default: self-signed, kept for later runs]
+    /// TLS certificate for --share, with its chain (PEM) [default: self-signed, kept for later
+    /// runs]
     #[arg(long, value_name = "FILE", requires = "share")]
     certificate: Option<PathBuf>,
     /// Private key of --certificate (PEM) [default: it is in the same file]
     #[arg(long, value_name = "FILE", requires = "certificate")]
     certificate_key: Option<PathBuf>,
-    /// Also serve images, joint states, frames, keyframes and metrics to Foxglove at this loopback address
+    /// Also serve images, joint states, frames, keyframes and metrics to Foxglove at this loopback
+    /// address
     #[arg(long, value_name = "ADDRESS", num_args = 0..=1, require_equals = true,
         default_missing_value = "127.0.0.1:8765", value_parser = address)]
     foxglove: Option<SocketAddr>,
@@ -32,7 +34,8 @@ pub(crate) struct PageArgs {
 
 /// Parses the address of the page.
 fn address(text: &str) -> Result<SocketAddr, String> {
-    text.parse().map_err(|_| "expected an address and a port, such as 127.0.0.1:7007".to_owned())
+    text.parse()
+        .map_err(|_| "expected an address and a port, such as 127.0.0.1:7007".to_owned())
 }
 
 impl PageArgs {
@@ -41,7 +44,8 @@ impl PageArgs {
         self.listen.is_some() || self.share || self.foxglove.is_some()
     }
 
-    /// Rejects an address that other machines can reach, unless the page is shared, and flags that this build lacks.
+    /// Rejects an address that other machines can reach, unless the page is shared, and flags that
+    /// this build lacks.
     pub(crate) fn check(&self) -> Result<(), BadArgument> {
         match self.listen {
             Some(address) if !address.ip().is_loopback() && !self.share => {
@@ -97,7 +101,10 @@ impl PageArgs {
             server,
             shared,
             #[cfg(feature = "foxglove")]
-            foxglove: self.foxglove.map(|address| viz::FoxgloveServer::start(address, hub.clone())).transpose()?,
+            foxglove: self
+                .foxglove
+                .map(|address| viz::FoxgloveServer::start(address, hub.clone()))
+                .transpose()?,
         })
     }
 
@@ -108,7 +115,14 @@ impl PageArgs {
         };
         let tokens = Tokens::random().context("cannot create a token")?;
         let (fingerprint, is_self_signed) = (certificate.fingerprint(), self.certificate.is_none());
-        let server = Server::start_shared(config, Sharing { certificate, tokens: tokens.clone() }, hub.clone())?;
+        let server = Server::start_shared(
+            config,
+            Sharing {
+                certificate,
+                tokens: tokens.clone(),
+            },
+            hub.clone(),
+        )?;
         let shared = Shared::new(server.address(), &tokens, fingerprint, is_self_signed);
         Ok((server, shared))
     }
@@ -116,9 +130,17 @@ impl PageArgs {
 
 /// The user's folder for data of this program.
 fn data_folder() -> Result<PathBuf, BadArgument> {
-    let given = std::env::var_os("XDG_DATA_HOME").map(PathBuf::from).filter(|folder| folder.is_absolute());
+    let given = std::env::var_os("XDG_DATA_HOME")
+        .map(PathBuf::from)
+        .filter(|folder| folder.is_absolute());
     let in_home = || Some(std::env::home_dir()?.join(".local/share"));
-    given.or_else(in_home).map(|folder| folder.join("fieldrig")).ok_or_else(|| {
-        BadArgument("there is no home folder for the TLS certificate: set HOME, or use --certificate".to_owned())
-    })
+    given
+        .or_else(in_home)
+        .map(|folder| folder.join("fieldrig"))
+        .ok_or_else(|| {
+            BadArgument(
+                "there is no home folder for the TLS certificate: set HOME, or use --certificate"
+                    .to_owned(),
+            )
+        })
 }

@@ -1,12 +1,14 @@
 //! Terminal output: results on stdout, log and progress on stderr.
 //!
-//! A command whose result is its output (`devices`, `metrics`) prints with [`line()`] and [`json`], which fail if
-//! stdout fails. A command whose result is a file (`train`, `run`, `record`) prints with [`report`] and
-//! [`report_json`], which never fail: a closed terminal or a full disk loses lines, not the model. A thread per stream
-//! writes the lines, so that a terminal or a program that accepts no output blocks neither this program nor the other
-//! stream. [`has_lost_output`] returns whether any lines of stdout were lost.
+//! A command whose result is its output (`devices`, `metrics`) prints with [`line()`] and [`json`],
+//! which fail if stdout fails. A command whose result is a file (`train`, `run`, `record`) prints
+//! with [`report`] and [`report_json`], which never fail: a closed terminal or a full disk loses
+//! lines, not the model. A thread per stream writes the lines, so that a terminal or a program that
+//! accepts no output blocks neither this program nor the other stream. [`has_lost_output`] returns
+//! whether any lines of stdout were lost.
 //!
-//! Text may come from files and other programs, so control characters, which a terminal may interpret, are escaped in it.
+//! Text may come from files and other programs, so control characters, which a terminal may
+//! interpret, are escaped in it.
 
 use anyhow::Context;
 use console::Term;
@@ -31,8 +33,8 @@ static BARS: LazyLock<MultiProgress> = LazyLock::new(|| MultiProgress::with_draw
 /// Whether any line of [`report`] could not be written.
 static LOST_OUTPUT: AtomicBool = AtomicBool::new(false);
 
-/// Maximum number of output chunks that wait to be written. With a queue, a terminal that accepts no output, for
-/// example after a broken connection, does not block the program.
+/// Maximum number of output chunks that wait to be written. With a queue, a terminal that accepts
+/// no output, for example after a broken connection, does not block the program.
 const MAX_WAITING: usize = 4096;
 /// At exit, the program waits at most this long for its output to be written.
 const MAX_FLUSH: Duration = Duration::from_secs(5);
@@ -62,7 +64,8 @@ static STDERR: LazyLock<SyncSender<OutputChunk>> = LazyLock::new(|| {
     writer(|bytes| drop(std::io::stderr().write_all(bytes)))
 });
 
-/// Starts the thread that calls `write` for each chunk. If it cannot be started, the output is lost.
+/// Starts the thread that calls `write` for each chunk. If it cannot be started, the output is
+/// lost.
 fn writer(write: fn(&[u8])) -> SyncSender<OutputChunk> {
     let (sender, chunks) = sync_channel(MAX_WAITING);
     let write_all = move || {
@@ -73,21 +76,32 @@ fn writer(write: fn(&[u8])) -> SyncSender<OutputChunk> {
             }
         }
     };
-    if std::thread::Builder::new().name("output".to_owned()).spawn(write_all).is_err() {
+    if std::thread::Builder::new()
+        .name("output".to_owned())
+        .spawn(write_all)
+        .is_err()
+    {
         LOST_OUTPUT.store(true, Ordering::Relaxed);
     }
     sender
 }
 
-/// Queues text for a stream; returns false if the queue is full. The progress bars are hidden meanwhile.
+/// Queues text for a stream; returns false if the queue is full. The progress bars are hidden
+/// meanwhile.
 fn send(stream: &SyncSender<OutputChunk>, text: String) -> bool {
-    BARS.suspend(|| stream.try_send(OutputChunk::Bytes(text.into_bytes())).is_ok())
+    BARS.suspend(|| {
+        stream
+            .try_send(OutputChunk::Bytes(text.into_bytes()))
+            .is_ok()
+    })
 }
 
-/// Escapes control characters other than line breaks and tabs, and characters that change the direction of text.
+/// Escapes control characters other than line breaks and tabs, and characters that change the
+/// direction of text.
 fn printable(text: &str) -> Cow<'_, str> {
     let is_hidden = |c: char| {
-        (c.is_control() && !matches!(c, '\n' | '\t')) || matches!(c, '\u{202A}'..='\u{202E}' | '\u{2066}'..='\u{2069}')
+        (c.is_control() && !matches!(c, '\n' | '\t'))
+            || matches!(c, '\u{202A}'..='\u{202E}' | '\u{2066}'..='\u{2069}')
     };
     if !text.contains(is_hidden) {
         return text.into();
@@ -113,12 +127,16 @@ pub(crate) fn flush() {
     flush_for(MAX_FLUSH);
 }
 
-/// Waits until stdout is written, at most [`MAX_FLUSH`], and until stderr is written, at most `max_stderr` from the call.
+/// Waits until stdout is written, at most [`MAX_FLUSH`], and until stderr is written, at most
+/// `max_stderr` from the call.
 fn flush_for(max_stderr: Duration) {
     let began = Instant::now();
     let [out, err] = [&STDOUT, &STDERR].map(|stream| {
         let (done, is_done) = sync_channel(1);
-        stream.try_send(OutputChunk::Flush(done)).ok().map(|()| is_done)
+        stream
+            .try_send(OutputChunk::Flush(done))
+            .ok()
+            .map(|()| is_done)
     });
     if out.is_none_or(|is_done| is_done.recv_timeout(MAX_FLUSH).is_err()) {
         LOST_OUTPUT.store(true, Ordering::Relaxed);
@@ -132,16 +150,20 @@ fn flush_for(max_stderr: Duration) {
 fn target() -> ProgressDrawTarget {
     let term = Term::stderr();
     if term.is_term() {
-        ProgressDrawTarget::term_like(Box::new(BarTerm { term, buffered: Mutex::default() }))
+        ProgressDrawTarget::term_like(Box::new(BarTerm {
+            term,
+            buffered: Mutex::default(),
+        }))
     } else {
         ProgressDrawTarget::hidden()
     }
 }
 
-/// A terminal that may disappear or stop accepting output at any time: output goes through the writer thread.
+/// A terminal that may disappear or stop accepting output at any time: output goes through the
+/// writer thread.
 ///
-/// indicatif's own target blocks on the terminal, and panics if drawing fails (`MultiProgress::suspend`), as it does
-/// with EIO after a terminal is closed.
+/// indicatif's own target blocks on the terminal, and panics if drawing fails
+/// (`MultiProgress::suspend`), as it does with EIO after a terminal is closed.
 #[derive(Debug)]
 struct BarTerm {
     term: Term,
@@ -156,7 +178,11 @@ impl BarTerm {
     }
 
     fn move_cursor(&self, n: usize, direction: char) -> std::io::Result<()> {
-        if n > 0 { self.draw(&format!("\x1b[{n}{direction}")) } else { Ok(()) }
+        if n > 0 {
+            self.draw(&format!("\x1b[{n}{direction}"))
+        } else {
+            Ok(())
+        }
     }
 }
 
@@ -212,12 +238,14 @@ pub(crate) fn line(text: impl Display) -> Result<(), StdoutError> {
     let text = text.to_string();
     BARS.suspend(|| {
         let mut stdout = std::io::stdout().lock();
-        writeln!(stdout, "{}", printable(&text)).and_then(|()| stdout.flush()).map_err(StdoutError)
+        writeln!(stdout, "{}", printable(&text))
+            .and_then(|()| stdout.flush())
+            .map_err(StdoutError)
     })
 }
 
-/// Prints one line about a result in a file. If stdout fails or accepts no output, the line is lost, which is logged
-/// once.
+/// Prints one line about a result in a file. If stdout fails or accepts no output, the line is
+/// lost, which is logged once.
 pub(crate) fn report(text: impl Display) {
     report_styled(printable(&text.to_string()));
 }
@@ -234,10 +262,14 @@ pub(crate) fn notice(text: impl Display) {
     send(&STDERR, format!("{text}\n"));
 }
 
-/// Prints the error that ends the program to stderr. Like the log, it goes through the writer thread, so a terminal
-/// that accepts no output does not prevent the program from exiting with the right code.
+/// Prints the error that ends the program to stderr. Like the log, it goes through the writer
+/// thread, so a terminal that accepts no output does not prevent the program from exiting with the
+/// right code.
 pub(crate) fn error(error: &anyhow::Error) {
-    send(&STDERR, format!("error: {}\n", printable(&format!("{error:#}"))));
+    send(
+        &STDERR,
+        format!("error: {}\n", printable(&format!("{error:#}"))),
+    );
 }
 
 /// Whether any line of [`report`] was lost.
@@ -264,12 +296,15 @@ fn json_text(value: &impl Serialize) -> anyhow::Result<String> {
     serde_json::to_string(value).context("cannot write the result as JSON")
 }
 
-/// Returns a progress bar on stderr; it is not drawn if `hidden` is set or stderr is not a terminal.
+/// Returns a progress bar on stderr; it is not drawn if `hidden` is set or stderr is not a
+/// terminal.
 ///
 /// `template` is an indicatif template.
 pub(crate) fn bar(length: Option<u64>, template: &'static str, hidden: bool) -> ProgressBar {
     let bar = length.map_or_else(ProgressBar::new_spinner, ProgressBar::new);
-    bar.set_style(ProgressStyle::with_template(template).expect("templates are constants of this program"));
+    bar.set_style(
+        ProgressStyle::with_template(template).expect("templates are constants of this program"),
+    );
     if hidden {
         bar.set_draw_target(ProgressDrawTarget::hidden());
         return bar;
@@ -278,12 +313,25 @@ pub(crate) fn bar(length: Option<u64>, template: &'static str, hidden: bool) -> 
 }
 
 /// The crates that log progress.
-const WORKSPACE_CRATES: [&str; 9] =
-    ["fieldrig", "bench", "calibration", "capture", "drivers", "session", "sim", "trainer", "viz"];
+const WORKSPACE_CRATES: [&str; 9] = [
+    "fieldrig",
+    "bench",
+    "calibration",
+    "capture",
+    "drivers",
+    "session",
+    "sim",
+    "trainer",
+    "viz",
+];
 
 /// Sends log records to stderr. `RUST_LOG` takes precedence; `verbose` counts the `-v` flags.
 pub(crate) fn start_log(verbose: u8) {
-    let of_workspace = |level| WORKSPACE_CRATES.map(|name| format!(",{name}={level}")).concat();
+    let of_workspace = |level| {
+        WORKSPACE_CRATES
+            .map(|name| format!(",{name}={level}"))
+            .concat()
+    };
     let filter = match verbose {
         0 => format!("warn{}", of_workspace("info")),
         1 => format!("info{}", of_workspace("debug")),
@@ -295,12 +343,16 @@ pub(crate) fn start_log(verbose: u8) {
         .init();
 }
 
-/// Writes to stderr above the progress bars. Records that cannot be written are dropped without an error.
+/// Writes to stderr above the progress bars. Records that cannot be written are dropped without an
+/// error.
 struct LogTarget;
 
 impl Write for LogTarget {
     fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
-        send(&STDERR, printable(&String::from_utf8_lossy(bytes)).into_owned());
+        send(
+            &STDERR,
+            printable(&String::from_utf8_lossy(bytes)).into_owned(),
+        );
         Ok(bytes.len())
     }
 
@@ -318,7 +370,13 @@ mod tests {
         for plain in ["a\tb\nc", "Größe 5 µm → 3 Ω", ""] {
             assert!(matches!(printable(plain), Cow::Borrowed(_)), "{plain}");
         }
-        assert_eq!(printable("\x1b]0;title\x07\x1b[2J"), "\\u{1b}]0;title\\u{7}\\u{1b}[2J");
-        assert_eq!(printable("\u{9b}31m\u{7f}\r\u{202e}x"), "\\u{9b}31m\\u{7f}\\u{d}\\u{202e}x");
+        assert_eq!(
+            printable("\x1b]0;title\x07\x1b[2J"),
+            "\\u{1b}]0;title\\u{7}\\u{1b}[2J"
+        );
+        assert_eq!(
+            printable("\u{9b}31m\u{7f}\r\u{202e}x"),
+            "\\u{9b}31m\\u{7f}\\u{d}\\u{202e}x"
+        );
     }
 }

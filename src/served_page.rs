@@ -29,13 +29,24 @@ pub(crate) struct Shared {
 
 impl Shared {
     /// The URLs of a page that is served at this address.
-    pub(crate) fn new(address: SocketAddr, tokens: &Tokens, fingerprint: String, is_self_signed: bool) -> Self {
+    pub(crate) fn new(
+        address: SocketAddr,
+        tokens: &Tokens,
+        fingerprint: String,
+        is_self_signed: bool,
+    ) -> Self {
         let mut addresses = reachable_addresses(address.ip());
         let url_address = SocketAddr::new(addresses.remove(0), address.port());
         // The token is in the fragment, which browsers send neither to servers nor to other sites.
-        let [operator_url, viewer_url] =
-            [&tokens.operator, &tokens.viewer].map(|token| format!("https://{url_address}/#token={}", token.text()));
-        Self { operator_url, viewer_url, other_addresses: addresses, fingerprint, is_self_signed }
+        let [operator_url, viewer_url] = [&tokens.operator, &tokens.viewer]
+            .map(|token| format!("https://{url_address}/#token={}", token.text()));
+        Self {
+            operator_url,
+            viewer_url,
+            other_addresses: addresses,
+            fingerprint,
+            is_self_signed,
+        }
     }
 }
 
@@ -47,7 +58,9 @@ impl ServedPage {
 
     /// The address to open in a browser, as operator.
     pub(crate) fn url(&self) -> String {
-        self.shared.as_ref().map_or_else(|| self.server.url(), |shared| shared.operator_url.clone())
+        self.shared
+            .as_ref()
+            .map_or_else(|| self.server.url(), |shared| shared.operator_url.clone())
     }
 
     /// The address to open in Foxglove.
@@ -60,7 +73,11 @@ impl ServedPage {
 
     /// Prints the addresses of the page; if `is_json`, as an event that also has these fields.
     pub(crate) fn print(&self, is_json: bool, fields: Value) -> anyhow::Result<()> {
-        if is_json { self.print_event(fields) } else { self.print_lines() }
+        if is_json {
+            self.print_event(fields)
+        } else {
+            self.print_lines()
+        }
     }
 
     fn print_event(&self, fields: Value) -> anyhow::Result<()> {
@@ -86,19 +103,38 @@ impl ServedPage {
         Ok(())
     }
 
-    /// The addresses of the page, and what else clients need to know. They contain the tokens, so they must not be logged.
+    /// The addresses of the page, and what else clients need to know. They contain the tokens, so
+    /// they must not be logged.
     pub(crate) fn lines(&self) -> Vec<String> {
         let mut lines = vec![format!("open {} in a browser", self.url())];
-        lines.extend(self.foxglove_url().map(|url| format!("open the connection {url} in Foxglove")));
-        let Some(shared) = &self.shared else { return lines };
+        lines.extend(
+            self.foxglove_url()
+                .map(|url| format!("open the connection {url} in Foxglove")),
+        );
+        let Some(shared) = &self.shared else {
+            return lines;
+        };
         lines.push(format!("view-only address: {}", shared.viewer_url));
         if !shared.other_addresses.is_empty() {
-            let others: Vec<String> = shared.other_addresses.iter().map(ToString::to_string).collect();
-            lines.push(format!("other addresses of this computer: {}", others.join(", ")));
+            let others: Vec<String> = shared
+                .other_addresses
+                .iter()
+                .map(ToString::to_string)
+                .collect();
+            lines.push(format!(
+                "other addresses of this computer: {}",
+                others.join(", ")
+            ));
         }
-        let remark =
-            if shared.is_self_signed { " (self-signed: the browser warns once; compare this value first)" } else { "" };
-        lines.push(format!("certificate SHA-256: {}{remark}", shared.fingerprint));
+        let remark = if shared.is_self_signed {
+            " (self-signed: the browser warns once; compare this value first)"
+        } else {
+            ""
+        };
+        lines.push(format!(
+            "certificate SHA-256: {}{remark}",
+            shared.fingerprint
+        ));
         lines
     }
 }
@@ -121,7 +157,11 @@ fn reachable_addresses(listen: IpAddr) -> Vec<IpAddr> {
     let default = default_route_address();
     addresses.sort_by_key(|address| (Some(*address) != default, address.is_ipv6()));
     if addresses.is_empty() {
-        addresses.push(if listen.is_ipv4() { Ipv4Addr::LOCALHOST.into() } else { Ipv6Addr::LOCALHOST.into() });
+        addresses.push(if listen.is_ipv4() {
+            Ipv4Addr::LOCALHOST.into()
+        } else {
+            Ipv6Addr::LOCALHOST.into()
+        });
     }
     addresses
 }
@@ -138,5 +178,9 @@ fn default_route_address() -> Option<IpAddr> {
 fn qr_code(text: &str) -> anyhow::Result<String> {
     let code = QrCode::new(text).context("cannot create a QR code")?;
     let lines = code.render::<Dense1x2>().build();
-    Ok(lines.lines().map(|line| format!("\x1b[30;107m{line}\x1b[0m")).collect::<Vec<_>>().join("\n"))
+    Ok(lines
+        .lines()
+        .map(|line| format!("\x1b[30;107m{line}\x1b[0m"))
+        .collect::<Vec<_>>()
+        .join("\n"))
 }

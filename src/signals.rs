@@ -1,9 +1,10 @@
 //! Signals that end a command: it stops, saves, and exits.
 //!
-//! SIGINT (Ctrl-C), SIGTERM and SIGHUP (the terminal was closed) request an orderly stop. A second Ctrl-C ends the
-//! process at once, and so does SIGQUIT; arms with CAN motors get their fail-safe command before that. SIGHUP never ends the process at once, because closing a
-//! terminal sends it more than once: from the kernel to the foreground group, and from the shell to its jobs. If SIGHUP
-//! is ignored, as under `nohup`, it stays ignored.
+//! SIGINT (Ctrl-C), SIGTERM and SIGHUP (the terminal was closed) request an orderly stop. A second
+//! Ctrl-C ends the process at once, and so does SIGQUIT; arms with CAN motors get their fail-safe
+//! command before that. SIGHUP never ends the process at once, because closing a terminal sends it
+//! more than once: from the kernel to the foreground group, and from the shell to its jobs. If
+//! SIGHUP is ignored, as under `nohup`, it stays ignored.
 
 use anyhow::Context;
 use capture::Stop;
@@ -19,10 +20,12 @@ use std::time::{Duration, Instant};
 
 /// Shells report this plus the signal number as the exit code of a process that a signal ended.
 const SIGNAL_EXIT_BASE: i32 = 128;
-/// A second Ctrl-C within this time counts as the same one: some programs signal both a process and its group.
+/// A second Ctrl-C within this time counts as the same one: some programs signal both a process and
+/// its group.
 const MIN_BETWEEN: Duration = Duration::from_millis(500);
 
-/// Handles SIGINT, SIGTERM and SIGHUP of a command that saves its results; at most once per process.
+/// Handles SIGINT, SIGTERM and SIGHUP of a command that saves its results; at most once per
+/// process.
 pub(crate) fn stop_on_signals() -> anyhow::Result<Stop> {
     stop_on_signals_logging("stopping and saving; Ctrl-C again exits at once")
 }
@@ -30,7 +33,8 @@ pub(crate) fn stop_on_signals() -> anyhow::Result<Stop> {
 /// As [`stop_on_signals`], for a command that saves nothing.
 pub(crate) fn stop_on_signals_logging(message: &'static str) -> anyhow::Result<Stop> {
     let (stop, [signaled, interrupted]) = Stop::with_signal_flags(message);
-    let mut signals = Signals::new(termination_signals().chain([SIGQUIT])).context("cannot install signal handlers")?;
+    let mut signals = Signals::new(termination_signals().chain([SIGQUIT]))
+        .context("cannot install signal handlers")?;
     let mut interrupted_at = Instant::now();
     let take_signals = move || {
         for signal in signals.forever() {
@@ -49,24 +53,31 @@ pub(crate) fn stop_on_signals_logging(message: &'static str) -> anyhow::Result<S
             signaled.store(true, Ordering::Relaxed);
         }
     };
-    std::thread::Builder::new().name("signals".into()).spawn(take_signals).context("cannot start a thread")?;
+    std::thread::Builder::new()
+        .name("signals".into())
+        .spawn(take_signals)
+        .context("cannot start a thread")?;
     Ok(stop)
 }
 
-/// Requests a stop when stdout or stderr is closed, for example because a terminal closed without sending SIGHUP, or the
-/// reader of a pipe ended. Nobody then supervises the motion. At most once per process.
+/// Requests a stop when stdout or stderr is closed, for example because a terminal closed without
+/// sending SIGHUP, or the reader of a pipe ended. Nobody then supervises the motion. At most once
+/// per process.
 pub(crate) fn stop_when_output_closes(stop: &Stop) -> anyhow::Result<()> {
     let stop = stop.clone();
     let watch = move || {
         let (stdout, stderr) = (std::io::stdout(), std::io::stderr());
         // Errors and hang-ups are reported without being requested.
-        let mut outputs =
-            [stdout.as_fd(), stderr.as_fd()].map(|output| PollFd::from_borrowed_fd(output, PollFlags::empty()));
+        let mut outputs = [stdout.as_fd(), stderr.as_fd()]
+            .map(|output| PollFd::from_borrowed_fd(output, PollFlags::empty()));
         while poll(&mut outputs, None) == Err(Errno::INTR) {}
         log::warn!("the output was closed: stopping");
         stop.request();
     };
-    std::thread::Builder::new().name("output".into()).spawn(watch).context("cannot start a thread")?;
+    std::thread::Builder::new()
+        .name("output".into())
+        .spawn(watch)
+        .context("cannot start a thread")?;
     Ok(())
 }
 
@@ -74,25 +85,33 @@ pub(crate) fn stop_when_output_closes(stop: &Stop) -> anyhow::Result<()> {
 ///
 /// For commands that have nothing to save when they are cancelled; others use [`stop_on_signals`].
 pub(crate) fn remove_partial_files_on_signals() -> anyhow::Result<()> {
-    let mut signals = Signals::new(termination_signals()).context("cannot install signal handlers")?;
+    let mut signals =
+        Signals::new(termination_signals()).context("cannot install signal handlers")?;
     let remove_all = move || {
         if let Some(signal) = signals.forever().next() {
             let _no_new_files = partial::remove_all();
             std::process::exit(SIGNAL_EXIT_BASE + signal);
         }
     };
-    std::thread::Builder::new().name("signals".into()).spawn(remove_all).context("cannot start a thread")?;
+    std::thread::Builder::new()
+        .name("signals".into())
+        .spawn(remove_all)
+        .context("cannot start a thread")?;
     Ok(())
 }
 
 /// The signals that request a stop; without SIGHUP if it is ignored.
 fn termination_signals() -> impl Iterator<Item = i32> {
-    [SIGINT, SIGTERM].into_iter().chain((!is_ignored(SIGHUP)).then_some(SIGHUP))
+    [SIGINT, SIGTERM]
+        .into_iter()
+        .chain((!is_ignored(SIGHUP)).then_some(SIGHUP))
 }
 
 /// Whether this process was started with the signal ignored, which Linux reports in `/proc`.
 fn is_ignored(signal: i32) -> bool {
-    let Ok(status) = std::fs::read_to_string("/proc/self/status") else { return false };
+    let Ok(status) = std::fs::read_to_string("/proc/self/status") else {
+        return false;
+    };
     is_in_ignore_mask(&status, signal)
 }
 
@@ -109,7 +128,9 @@ mod tests {
 
     #[test]
     fn ignored_signals_are_parsed_from_the_mask() {
-        let status = |mask: &str| format!("Name:\tfieldrig\nSigBlk:\t0000000000000001\nSigIgn:\t{mask}\nSigCgt:\tff\n");
+        let status = |mask: &str| {
+            format!("Name:\tfieldrig\nSigBlk:\t0000000000000001\nSigIgn:\t{mask}\nSigCgt:\tff\n")
+        };
         assert!(is_in_ignore_mask(&status("0000000000001001"), SIGHUP));
         assert!(!is_in_ignore_mask(&status("0000000000001000"), SIGHUP));
         assert!(is_in_ignore_mask(&status("0000000000001000"), 13));

@@ -11,7 +11,9 @@ use trainer::splat::CountPolicy;
 
 /// Help of `--method`.
 static METHOD_HELP: LazyLock<String> = LazyLock::new(|| {
-    let described = ModelKind::ALL.iter().map(|kind| format!("{} ({})", kind.name(), kind.entry().description));
+    let described = ModelKind::ALL
+        .iter()
+        .map(|kind| format!("{} ({})", kind.name(), kind.entry().description));
     format!(
         "Scene model: {}, or several separated by commas. `train` and `run` train several at once, `bench curve` one \
          after the other [default: train.method of the rig file, else {}]",
@@ -25,28 +27,30 @@ static METHOD_HELP: LazyLock<String> = LazyLock::new(|| {
 pub(crate) struct TrainingArgs {
     #[arg(long, value_name = "METHOD", value_parser = methods, help = METHOD_HELP.as_str())]
     pub(crate) method: Option<Methods>,
-    /// Random seed, 0 to 2^63 - 1. With the same number of steps, the same seed gives the same result
-    /// [default: the rig file's, else 1]
+    /// Random seed, 0 to 2^63 - 1. With the same number of steps, the same seed gives the same
+    /// result [default: the rig file's, else 1]
     #[arg(long, value_name = "N", value_parser = value_parser!(u64).range(SEED_RANGE))]
     pub(crate) seed: Option<u64>,
-    /// Maximum GPU memory of each model in bytes, at least 1000000 and enough for the smallest model of the method
-    /// [default: the rig file's, else no limit]
+    /// Maximum GPU memory of each model in bytes, at least 1000000 and enough for the smallest
+    /// model of the method [default: the rig file's, else no limit]
     #[arg(long, value_name = "BYTES", value_parser = max_bytes)]
     pub(crate) max_bytes: Option<u64>,
     /// Maximum number of splats, 1 to 100000000 [default: the rig file's, else 400000]
     #[arg(long, value_name = "N", value_parser = value_parser!(u64).range(MAX_SPLATS_RANGE))]
     pub(crate) max_splats: Option<u64>,
-    /// Calibration parameters to estimate: auto (those that improve validation images), none, or a list of base,
-    /// extrinsics, time-offset, joints, depth-pose, lens, depth-scale, readout, image-poses and image-gains, separated
-    /// by commas. Images with depth are registered while training runs; without depth, extrinsics, time-offset and
-    /// (if listed) lens are estimated from matched features, and all parameters are optimized with the scene. base estimates the pose of a mobile base at every station [default: base; on a GPU: auto, but without
-    /// trials in live runs]
+    /// Calibration parameters to estimate: auto (those that improve validation images), none, or a
+    /// list of base, extrinsics, time-offset, joints, depth-pose, lens, depth-scale, readout,
+    /// image-poses and image-gains, separated by commas. Images with depth are registered while
+    /// training runs; without depth, extrinsics, time-offset and (if listed) lens are estimated
+    /// from matched features, and all parameters are optimized with the scene. base estimates the
+    /// pose of a mobile base at every station [default: base; on a GPU: auto, but without trials in
+    /// live runs]
     #[arg(long, value_name = "PARAMS", value_delimiter = ',', hide_possible_values = true, value_parser = refine())]
     pub(crate) refine: Vec<Refine>,
-    /// How the number of splats is chosen: to-cap (grow to --max-splats), tested (grow to --max-splats, or to fewer
-    /// splats if there are fewer than 40 images; then halve as long as that costs less than 0.1 dB on validation
-    /// images) or tested-growth (double as long as that gains more than 0.1 dB, then halve) [default: to-cap; for data
-    /// on disk with a GPU: tested]
+    /// How the number of splats is chosen: to-cap (grow to --max-splats), tested (grow to
+    /// --max-splats, or to fewer splats if there are fewer than 40 images; then halve as long as
+    /// that costs less than 0.1 dB on validation images) or tested-growth (double as long as that
+    /// gains more than 0.1 dB, then halve) [default: to-cap; for data on disk with a GPU: tested]
     #[arg(long, value_name = "HOW", hide_possible_values = true)]
     pub(crate) count: Option<CountArg>,
 }
@@ -72,15 +76,26 @@ fn methods(text: &str) -> Result<Methods, String> {
 
 /// Parses a value of `--max-bytes`.
 fn max_bytes(text: &str) -> Result<u64, String> {
-    let found = text.parse().ok().filter(|bytes| MAX_BYTES_RANGE.contains(bytes));
+    let found = text
+        .parse()
+        .ok()
+        .filter(|bytes| MAX_BYTES_RANGE.contains(bytes));
     found.ok_or_else(|| {
-        format!("must be a number of bytes from {}, such as 4000000000 for 4 GB", MAX_BYTES_RANGE.start())
+        format!(
+            "must be a number of bytes from {}, such as 4000000000 for 4 GB",
+            MAX_BYTES_RANGE.start()
+        )
     })
 }
 
 /// Parses a value of `--refine`.
 fn refine() -> impl TypedValueParser<Value = Refine> {
-    let find = |name: String| Refine::ALL.into_iter().find(|(known, _)| *known == name).map(|(_, refine)| refine);
+    let find = |name: String| {
+        Refine::ALL
+            .into_iter()
+            .find(|(known, _)| *known == name)
+            .map(|(_, refine)| refine)
+    };
     PossibleValuesParser::new(Refine::ALL.map(|(name, _)| name))
         .try_map(move |name| find(name).ok_or("unknown parameter"))
 }
@@ -121,10 +136,20 @@ mod tests {
 
     #[test]
     fn methods_are_distinct() {
-        assert_eq!(methods("tsdf,splat").map(|Methods(kinds)| kinds), Ok(vec![kind("tsdf"), kind("splat")]));
-        for (text, message) in [("mesh", "\"mesh\""), ("splat,splat", "listed twice"), ("splat,", "\"\""), ("", "\"\"")]
-        {
-            assert!(methods(text).is_err_and(|error| error.contains(message)), "{text}");
+        assert_eq!(
+            methods("tsdf,splat").map(|Methods(kinds)| kinds),
+            Ok(vec![kind("tsdf"), kind("splat")])
+        );
+        for (text, message) in [
+            ("mesh", "\"mesh\""),
+            ("splat,splat", "listed twice"),
+            ("splat,", "\"\""),
+            ("", "\"\""),
+        ] {
+            assert!(
+                methods(text).is_err_and(|error| error.contains(message)),
+                "{text}"
+            );
         }
     }
 }

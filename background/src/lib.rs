@@ -1,5 +1,5 @@
-//! Background tasks. If a limit on threads or memory prevents a new thread during a run, the calling thread does the work, so
-//! that keyframes and models are still saved.
+//! Background tasks. If a limit on threads or memory prevents a new thread during a run, the
+//! calling thread does the work, so that keyframes and models are still saved.
 //!
 //! ```
 //! let task = background::Task::start("sum", || (1..=100).sum::<u32>());
@@ -22,7 +22,8 @@ enum State<T> {
 }
 
 impl<T: Send + 'static> Task<T> {
-    /// Starts `work` on a thread with this name. If none can be started, does the work before it returns, and warns once.
+    /// Starts `work` on a thread with this name. If none can be started, does the work before it
+    /// returns, and warns once.
     pub fn start(name: &str, work: impl FnOnce() -> T + Send + 'static) -> Self {
         Self::start_on(Builder::new().name(name.to_owned()), work)
     }
@@ -30,7 +31,8 @@ impl<T: Send + 'static> Task<T> {
     fn start_on(builder: Builder, work: impl FnOnce() -> T + Send + 'static) -> Self {
         // A failed start drops its closure, so the work is kept here.
         let kept = Arc::new(Mutex::new(Some(work)));
-        let take = |kept: &Mutex<Option<_>>| kept.lock().unwrap_or_else(PoisonError::into_inner).take();
+        let take =
+            |kept: &Mutex<Option<_>>| kept.lock().unwrap_or_else(PoisonError::into_inner).take();
         let for_thread = Arc::clone(&kept);
         let started = builder.spawn(move || take(&for_thread).expect("the work is taken once")());
         Self(match started {
@@ -59,7 +61,8 @@ impl<T: Send + 'static> Task<T> {
     }
 }
 
-/// Starts the global thread pool, one thread per processor, so that a limit on threads is found before data are captured.
+/// Starts the global thread pool, one thread per processor, so that a limit on threads is found
+/// before data are captured.
 ///
 /// # Errors
 ///
@@ -68,11 +71,14 @@ pub fn start_threads() -> Result<(), Box<dyn std::error::Error + Send + Sync>> {
     Ok(rayon::ThreadPoolBuilder::new().build_global()?)
 }
 
-/// Runs `work` in a separate thread pool, on three quarters of the processors. In the global pool, training, which
-/// downscales images on all processors, would wait for it.
+/// Runs `work` in a separate thread pool, on three quarters of the processors. In the global pool,
+/// training, which downscales images on all processors, would wait for it.
 pub fn run_in_background_pool<T: Send>(work: impl FnOnce() -> T + Send) -> T {
     let n_processors = std::thread::available_parallelism().map_or(1, usize::from);
-    match rayon::ThreadPoolBuilder::new().num_threads((3 * n_processors).div_ceil(4)).build() {
+    match rayon::ThreadPoolBuilder::new()
+        .num_threads((3 * n_processors).div_ceil(4))
+        .build()
+    {
         Ok(pool) => pool.install(work),
         Err(error) => {
             warn_once(&error);

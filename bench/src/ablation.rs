@@ -19,19 +19,52 @@ const DEFAULT_SECONDS: f64 = 16.0;
 const TABLE_SECS: [f64; 2] = [1.0, 4.0];
 
 /// The unchanged method, to which all variants are compared.
-const BASELINE: Variant<SplatOptions> = Variant { name: "baseline", change: |_| () };
+const BASELINE: Variant<SplatOptions> = Variant {
+    name: "baseline",
+    change: |_| (),
+};
 
 const VARIANTS: &[Variant<SplatOptions>] = &[
-    Variant { name: "no seeds from depth", change: |model| model.specific.seeds_per_image = Some(0.0) },
-    Variant { name: "no depth loss", change: |model| model.specific.depth_per_m = 0.0 },
-    Variant { name: "no structure loss", change: |model| model.specific.dssim_frac = 0.0 },
-    Variant { name: "full resolution from the start", change: |model| model.specific.coarse_steps = Some([0; 2]) },
-    Variant { name: "black background", change: |model| model.specific.random_background = 0.0 },
-    Variant { name: "no opacity and size regularization", change: |model| model.specific.cost_images = 0.0 },
-    Variant { name: "no growth", change: |model| model.specific.growth_frac = 0.0 },
-    Variant { name: "no position noise", change: |model| model.specific.noise = 0.0 },
-    Variant { name: "constant color per splat", change: |model| model.specific.sh_degree = 0 },
-    Variant { name: "grown to the cap", change: |model| model.specific.count = CountPolicy::ToCap },
+    Variant {
+        name: "no seeds from depth",
+        change: |model| model.specific.seeds_per_image = Some(0.0),
+    },
+    Variant {
+        name: "no depth loss",
+        change: |model| model.specific.depth_per_m = 0.0,
+    },
+    Variant {
+        name: "no structure loss",
+        change: |model| model.specific.dssim_frac = 0.0,
+    },
+    Variant {
+        name: "full resolution from the start",
+        change: |model| model.specific.coarse_steps = Some([0; 2]),
+    },
+    Variant {
+        name: "black background",
+        change: |model| model.specific.random_background = 0.0,
+    },
+    Variant {
+        name: "no opacity and size regularization",
+        change: |model| model.specific.cost_images = 0.0,
+    },
+    Variant {
+        name: "no growth",
+        change: |model| model.specific.growth_frac = 0.0,
+    },
+    Variant {
+        name: "no position noise",
+        change: |model| model.specific.noise = 0.0,
+    },
+    Variant {
+        name: "constant color per splat",
+        change: |model| model.specific.sh_degree = 0,
+    },
+    Variant {
+        name: "grown to the cap",
+        change: |model| model.specific.count = CountPolicy::ToCap,
+    },
     Variant::CAMERAS_AS_GIVEN,
 ];
 
@@ -82,14 +115,22 @@ pub fn run(options: &AblationOptions, host: &Host<'_>) -> Result<BenchResult> {
     let is_selected = |change: &&Variant<SplatOptions>| {
         options.only.is_empty() || options.only.iter().any(|word| change.name.contains(word))
     };
-    let changes: Vec<&Variant<SplatOptions>> =
-        VARIANTS.iter().filter(|change| is_change(change, &base_options)).filter(is_selected).collect();
+    let changes: Vec<&Variant<SplatOptions>> = VARIANTS
+        .iter()
+        .filter(|change| is_change(change, &base_options))
+        .filter(is_selected)
+        .collect();
     if changes.is_empty() {
         let names: Vec<&str> = VARIANTS.iter().map(|change| change.name).collect();
-        return Err(Error::BadInput(format!("--only: no variant matches; variants: {}", names.join(", "))));
+        return Err(Error::BadInput(format!(
+            "--only: no variant matches; variants: {}",
+            names.join(", ")
+        )));
     }
     if options.runs.training.count.is_some() {
-        return Err(Error::BadInput("--count: this bench sets it; remove the flag".into()));
+        return Err(Error::BadInput(
+            "--count: this bench sets it; remove the flag".into(),
+        ));
     }
     runs.expect((changes.len() as u64 + 1) * options.seeds);
     let mut baseline: Vec<Run> = Vec::new();
@@ -127,9 +168,14 @@ fn is_change(change: &Variant<SplatOptions>, options: &ModelOptions<SplatOptions
 
 impl VariantResult {
     fn of(name: &'static str, baseline: &[Run], runs: Vec<Run>) -> Option<Self> {
-        let median_of = |of: &dyn Fn(&Run) -> Option<f64>| median(&runs.iter().filter_map(of).collect::<Vec<_>>());
-        let gain: Vec<f64> =
-            baseline.iter().zip(&runs).map(|(baseline, changed)| baseline.psnr() - changed.psnr()).collect();
+        let median_of = |of: &dyn Fn(&Run) -> Option<f64>| {
+            median(&runs.iter().filter_map(of).collect::<Vec<_>>())
+        };
+        let gain: Vec<f64> = baseline
+            .iter()
+            .zip(&runs)
+            .map(|(baseline, changed)| baseline.psnr() - changed.psnr())
+            .collect();
         Some(Self {
             name,
             psnr: median_of(&|run| Some(run.psnr()))?,
@@ -149,14 +195,22 @@ impl VariantResult {
         };
         let at = |secs: f64| {
             let of_run = |run: &Run| {
-                run.curve().into_iter().find(|(time, _)| (time / secs - 1.0).abs() < 0.1).map(|(_, psnr)| psnr)
+                run.curve()
+                    .into_iter()
+                    .find(|(time, _)| (time / secs - 1.0).abs() < 0.1)
+                    .map(|(_, psnr)| psnr)
             };
-            number(median(&self.runs.iter().filter_map(of_run).collect::<Vec<_>>()), 2)
+            number(
+                median(&self.runs.iter().filter_map(of_run).collect::<Vec<_>>()),
+                2,
+            )
         };
         let gain = if self.name == BASELINE.name {
             "-".to_owned()
         } else {
-            let spread = self.gain_std_db.map_or_else(String::new, |std| format!(" (std {std:.2})"));
+            let spread = self
+                .gain_std_db
+                .map_or_else(String::new, |std| format!(" (std {std:.2})"));
             format!("{:+.2}{spread}", self.gain_db)
         };
         let mut row = vec![self.name.to_owned()];
@@ -183,7 +237,17 @@ fn findings(
     let length = session::limits(options.seconds, options.steps, DEFAULT_SECONDS)?.describe();
     let mut head = vec!["variant".to_owned()];
     head.extend(TABLE_SECS.map(|secs| format!("at {secs} s, dB")));
-    head.extend(["at the end, dB", "gain, dB", "SSIM", "LPIPS", "depth RMSE, mm", "splats"].map(str::to_owned));
+    head.extend(
+        [
+            "at the end, dB",
+            "gain, dB",
+            "SSIM",
+            "LPIPS",
+            "depth RMSE, mm",
+            "splats",
+        ]
+        .map(str::to_owned),
+    );
     let findings = Findings {
         name: "ablation",
         title: format!("Contribution of each part: {}", data.name),
@@ -193,7 +257,11 @@ fn findings(
  Gain: PSNR of the baseline minus PSNR of the variant, for the same seed.",
                 options.seeds
             ),
-            format!("{}; fieldrig {}.", runs.adapter(), env!("CARGO_PKG_VERSION")),
+            format!(
+                "{}; fieldrig {}.",
+                runs.adapter(),
+                env!("CARGO_PKG_VERSION")
+            ),
         ],
         charts: Vec::new(),
         tables: vec![Table {
@@ -220,18 +288,40 @@ mod tests {
 
     #[test]
     fn gains_are_computed_per_seed() {
-        let baseline = [run("a", &[(1.0, 24.0), (4.0, 26.0)], 900), run("b", &[(1.0, 23.0), (4.0, 27.0)], 900)];
-        let changed = vec![run("a", &[(1.0, 20.0), (4.0, 25.0)], 800), run("b", &[(1.0, 21.0), (4.0, 25.0)], 1000)];
+        let baseline = [
+            run("a", &[(1.0, 24.0), (4.0, 26.0)], 900),
+            run("b", &[(1.0, 23.0), (4.0, 27.0)], 900),
+        ];
+        let changed = vec![
+            run("a", &[(1.0, 20.0), (4.0, 25.0)], 800),
+            run("b", &[(1.0, 21.0), (4.0, 25.0)], 1000),
+        ];
         let changed = VariantResult::of("less", &baseline, changed).expect("two runs");
-        assert_eq!((changed.psnr, changed.gain_db, changed.primitives), (25.0, 1.5, 900.0));
-        assert_eq!(changed.row()[..5], ["less", "20.50", "25.00", "25.00", "+1.50 (std 0.71)"]);
+        assert_eq!(
+            (changed.psnr, changed.gain_db, changed.primitives),
+            (25.0, 1.5, 900.0)
+        );
+        assert_eq!(
+            changed.row()[..5],
+            ["less", "20.50", "25.00", "25.00", "+1.50 (std 0.71)"]
+        );
     }
 
     #[test]
     fn variants_without_effect_are_skipped() {
-        let options = SplatOptions { depth_per_m: 0.0, ..SplatOptions::default() }.into();
-        let tried: Vec<&str> =
-            VARIANTS.iter().filter(|change| is_change(change, &options)).map(|change| change.name).collect();
-        assert!(!tried.contains(&"no depth loss") && tried.contains(&"no growth"), "{tried:?}");
+        let options = SplatOptions {
+            depth_per_m: 0.0,
+            ..SplatOptions::default()
+        }
+        .into();
+        let tried: Vec<&str> = VARIANTS
+            .iter()
+            .filter(|change| is_change(change, &options))
+            .map(|change| change.name)
+            .collect();
+        assert!(
+            !tried.contains(&"no depth loss") && tried.contains(&"no growth"),
+            "{tried:?}"
+        );
     }
 }

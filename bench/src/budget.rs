@@ -65,7 +65,9 @@ struct Gain {
 pub fn run(options: &BudgetOptions, host: &Host<'_>) -> Result<BenchResult> {
     let limits = session::limits(options.seconds, options.steps, DEFAULT_SECONDS)?;
     if options.runs.training.max_splats.is_some() || options.runs.training.count.is_some() {
-        return Err(Error::BadInput("--max-splats, --count: this bench sets them; choose limits with --splats".into()));
+        return Err(Error::BadInput(
+            "--max-splats, --count: this bench sets them; choose limits with --splats".into(),
+        ));
     }
     let mut caps: Vec<Option<u32>> = options.splats.iter().copied().map(Some).collect();
     caps.sort_unstable();
@@ -85,7 +87,11 @@ pub fn run(options: &BudgetOptions, host: &Host<'_>) -> Result<BenchResult> {
         for seed in first_seed..first_seed.saturating_add(options.seeds) {
             let capped_options = base_options.clone().with(|model| {
                 model.common.seed = seed;
-                model.specific.count = if cap.is_some() { CountPolicy::ToCap } else { CountPolicy::Tested };
+                model.specific.count = if cap.is_some() {
+                    CountPolicy::ToCap
+                } else {
+                    CountPolicy::Tested
+                };
                 model.specific.max_splats = cap.unwrap_or(model.specific.max_splats);
             });
             finished.push(runs.run(Job {
@@ -109,26 +115,44 @@ impl Capped {
     fn of(cap: Option<u32>, runs: Vec<Run>) -> Option<Self> {
         let sizes: Vec<f64> = runs.iter().map(|run| run.end.primitives as f64).collect();
         let ends: Vec<f64> = runs.iter().map(Run::psnr).collect();
-        Some(Self { cap, primitives: median(&sizes)?, psnr: median(&ends)?, psnr_extent: extent(&ends)?, runs })
+        Some(Self {
+            cap,
+            primitives: median(&sizes)?,
+            psnr: median(&ends)?,
+            psnr_extent: extent(&ends)?,
+            runs,
+        })
     }
 
     fn point(&self) -> Point {
         let [low, high] = self.psnr_extent;
-        Point { x: self.primitives.max(1.0), y: self.psnr, low, high }
+        Point {
+            x: self.primitives.max(1.0),
+            y: self.psnr,
+            low,
+            high,
+        }
     }
 
     fn cap_label(&self) -> String {
-        self.cap.map_or_else(|| "none".to_owned(), |cap| cap.to_string())
+        self.cap
+            .map_or_else(|| "none".to_owned(), |cap| cap.to_string())
     }
 }
 
-/// Gains per doubling between neighboring limits, if the number of splats grew from one to the next.
+/// Gains per doubling between neighboring limits, if the number of splats grew from one to the
+/// next.
 fn gains(by_cap: &[&Capped]) -> Vec<Gain> {
     let pairs = by_cap.windows(2);
     let gain = |pair: &[&Capped]| {
         let [fewer, more] = [pair[0], pair[1]].map(|capped| (capped.primitives, capped.psnr));
         let db_per_doubling = db_per_doubling(fewer, more)?;
-        Some(Gain { to_cap: pair[1].cap, from_primitives: fewer.0, to_primitives: more.0, db_per_doubling })
+        Some(Gain {
+            to_cap: pair[1].cap,
+            from_primitives: fewer.0,
+            to_primitives: more.0,
+            db_per_doubling,
+        })
     };
     pairs.filter_map(gain).collect()
 }
@@ -140,22 +164,39 @@ fn findings(
     data: &NamedData,
     capped: &[Capped],
 ) -> Result<(Findings, PathBuf)> {
-    let by_cap: Vec<&Capped> = capped.iter().filter(|capped| capped.cap.is_some()).collect();
+    let by_cap: Vec<&Capped> = capped
+        .iter()
+        .filter(|capped| capped.cap.is_some())
+        .collect();
     let chosen = capped.iter().find(|capped| capped.cap.is_none());
     let gains = gains(&by_cap);
     let length = session::limits(options.seconds, options.steps, DEFAULT_SECONDS)?.describe();
     let spread = if options.seeds > 1 {
-        format!("median of {} seeds; band: minimum to maximum", options.seeds)
+        format!(
+            "median of {} seeds; band: minimum to maximum",
+            options.seeds
+        )
     } else {
         "one run per cap".to_owned()
     };
     let subtitle = format!("{}, splat, {length}; {spread}", data.name);
-    let x = |label: &str| Axis { label: label.to_owned(), scale: Scale::Log, ticks: Vec::new() };
-    let line = |label: &str, points: Vec<Point>| Line { label: label.to_owned(), points, is_peer: false };
+    let x = |label: &str| Axis {
+        label: label.to_owned(),
+        scale: Scale::Log,
+        ticks: Vec::new(),
+    };
+    let line = |label: &str, points: Vec<Point>| Line {
+        label: label.to_owned(),
+        points,
+        is_peer: false,
+    };
     let own_curve_point = chosen.map(Capped::point);
     let own_marker = chosen.map(|chosen| Marker {
         x: chosen.primitives.max(1.0),
-        label: format!("chosen by the trainer: {} splats, {:.2} dB", chosen.primitives, chosen.psnr),
+        label: format!(
+            "chosen by the trainer: {} splats, {:.2} dB",
+            chosen.primitives, chosen.psnr
+        ),
         line_ix: 1,
     });
     let mut points: Vec<Point> = by_cap.iter().map(|capped| capped.point()).collect();
@@ -164,34 +205,63 @@ fn findings(
         title: "PSNR of test images over the number of splats".into(),
         subtitle: subtitle.clone(),
         x: x("splats at the end (log)"),
-        y: Axis { label: "test PSNR, dB".into(), scale: Scale::Linear, ticks: Vec::new() },
-        lines: vec![line("with a cap", points), line("no cap", own_curve_point.into_iter().collect())],
+        y: Axis {
+            label: "test PSNR, dB".into(),
+            scale: Scale::Linear,
+            ticks: Vec::new(),
+        },
+        lines: vec![
+            line("with a cap", points),
+            line("no cap", own_curve_point.into_iter().collect()),
+        ],
         thresholds: Vec::new(),
         markers: own_marker.into_iter().collect(),
     };
     let gain_point = |gain: &Gain| {
         let x = (gain.from_primitives * gain.to_primitives).sqrt();
-        Point { x, y: gain.db_per_doubling, low: gain.db_per_doubling, high: gain.db_per_doubling }
+        Point {
+            x,
+            y: gain.db_per_doubling,
+            low: gain.db_per_doubling,
+            high: gain.db_per_doubling,
+        }
     };
     let gain_chart = Chart {
         title: "Gain from doubling the splats".into(),
         subtitle: format!("{subtitle}; each point is between two neighboring caps"),
         x: x("splats (log)"),
-        y: Axis { label: "gain, dB per doubling".into(), scale: Scale::Linear, ticks: Vec::new() },
-        lines: vec![line("gain per doubling", gains.iter().map(gain_point).collect())],
-        thresholds: vec![(MIN_GAIN_DB, format!("{MIN_GAIN_DB} dB: minimum worthwhile gain"))],
+        y: Axis {
+            label: "gain, dB per doubling".into(),
+            scale: Scale::Linear,
+            ticks: Vec::new(),
+        },
+        lines: vec![line(
+            "gain per doubling",
+            gains.iter().map(gain_point).collect(),
+        )],
+        thresholds: vec![(
+            MIN_GAIN_DB,
+            format!("{MIN_GAIN_DB} dB: minimum worthwhile gain"),
+        )],
         markers: Vec::new(),
     };
     let row = |capped: &Capped| {
-        let gain = gains.iter().find(|gain| capped.cap.is_some() && gain.to_cap == capped.cap);
+        let gain = gains
+            .iter()
+            .find(|gain| capped.cap.is_some() && gain.to_cap == capped.cap);
         vec![
             capped.cap_label(),
             format!("{:.0}", capped.primitives),
             format!("{:.2}", capped.psnr),
-            gain.map_or_else(|| "-".to_owned(), |gain| format!("{:+.2}", gain.db_per_doubling)),
+            gain.map_or_else(
+                || "-".to_owned(),
+                |gain| format!("{:+.2}", gain.db_per_doubling),
+            ),
         ]
     };
-    let head = ["cap", "splats", "PSNR, dB", "gain per doubling, dB"].map(str::to_owned).to_vec();
+    let head = ["cap", "splats", "PSNR, dB", "gain per doubling, dB"]
+        .map(str::to_owned)
+        .to_vec();
     let findings = Findings {
         name: "budget",
         title: format!("Accuracy over size: {}", data.name),
@@ -202,11 +272,21 @@ fn findings(
  this costs less than {MIN_GAIN_DB} dB on validation images.",
                 data.splats()?.specific.max_splats
             ),
-            format!("Doubling the splats is not worthwhile if it gains less than {MIN_GAIN_DB} dB."),
-            format!("{}; fieldrig {}.", runs.adapter(), env!("CARGO_PKG_VERSION")),
+            format!(
+                "Doubling the splats is not worthwhile if it gains less than {MIN_GAIN_DB} dB."
+            ),
+            format!(
+                "{}; fieldrig {}.",
+                runs.adapter(),
+                env!("CARGO_PKG_VERSION")
+            ),
         ],
         charts: vec![("", accuracy), ("-gain", gain_chart)],
-        tables: vec![Table { title: format!("After {length}"), head, rows: capped.iter().map(row).collect() }],
+        tables: vec![Table {
+            title: format!("After {length}"),
+            head,
+            rows: capped.iter().map(row).collect(),
+        }],
         numbers: serde_json::json!({
             "bench": "budget",
             "data": data.path,
@@ -231,7 +311,11 @@ mod tests {
         let capped = |cap: u32, n_splats: u64, psnr: f64| {
             Capped::of(Some(cap), vec![run("a", &[(1.0, psnr)], n_splats)]).expect("a run")
         };
-        let all = [capped(1000, 1000, 20.0), capped(4000, 4000, 23.0), capped(8000, 4100, 23.1)];
+        let all = [
+            capped(1000, 1000, 20.0),
+            capped(4000, 4000, 23.0),
+            capped(8000, 4100, 23.1),
+        ];
         let gains = gains(&all.iter().collect::<Vec<_>>());
         assert_eq!((gains.len(), gains[0].to_cap), (1, Some(4000)), "{gains:?}");
         assert!((gains[0].db_per_doubling - 1.5).abs() < 1e-12);

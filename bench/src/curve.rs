@@ -104,9 +104,18 @@ pub fn run(options: &CurveOptions, host: &Host<'_>) -> Result<BenchResult> {
     if options.seconds == 0.0 {
         return Err(Error::BadInput("--seconds: must be above 0".into()));
     }
-    let peers = options.peers.iter().map(|path| Peer::load(path)).collect::<Result<Vec<_>>>()?;
+    let peers = options
+        .peers
+        .iter()
+        .map(|path| Peer::load(path))
+        .collect::<Result<Vec<_>>>()?;
     let mut runs = Runs::open(&options.runs, host)?;
-    let mut bench = Bench { options, peers, results: Vec::new(), notes: Vec::new() };
+    let mut bench = Bench {
+        options,
+        peers,
+        results: Vec::new(),
+        notes: Vec::new(),
+    };
     let (mut data_losses, mut names) = (Vec::new(), HashSet::new());
     let mut page = None;
     for (path, n_left) in options.data.iter().zip((1..=options.data.len()).rev()) {
@@ -116,25 +125,37 @@ pub fn run(options: &CurveOptions, host: &Host<'_>) -> Result<BenchResult> {
         runs.expect((n_left * model_specs.len()) as u64 * options.seeds);
         for model_spec in model_specs {
             let mut finished = Vec::new();
-            bench.results.push(CurveResult::of_runs(&data, model_spec.kind, Vec::new()));
+            bench
+                .results
+                .push(CurveResult::of_runs(&data, model_spec.kind, Vec::new()));
             let first_seed = model_spec.options.common.seed;
             for seed in first_seed..first_seed.saturating_add(options.seeds) {
-                finished.push(runs.run(Job {
-                    name: format!("curve {} {} seed {seed}", data.name, model_spec.kind.name()),
-                    data: &data,
-                    model_spec: ModelSpec {
-                        kind: model_spec.kind,
-                        options: model_spec.options.clone().with(|model| model.common.seed = seed),
-                    },
-                    limits,
-                    disturbed: None,
-                    variant: None,
-                    keyframes: &|| data.data.keyframes.clone(),
-                    is_thorough: true,
-                })?);
-                // Findings are written after every run, so that an interrupted bench leaves results.
+                finished.push(
+                    runs.run(Job {
+                        name: format!("curve {} {} seed {seed}", data.name, model_spec.kind.name()),
+                        data: &data,
+                        model_spec: ModelSpec {
+                            kind: model_spec.kind,
+                            options: model_spec
+                                .options
+                                .clone()
+                                .with(|model| model.common.seed = seed),
+                        },
+                        limits,
+                        disturbed: None,
+                        variant: None,
+                        keyframes: &|| data.data.keyframes.clone(),
+                        is_thorough: true,
+                    })?,
+                );
+                // Findings are written after every run, so that an interrupted bench leaves
+                // results.
                 bench.results.pop();
-                bench.results.push(CurveResult::of_runs(&data, model_spec.kind, finished.clone()));
+                bench.results.push(CurveResult::of_runs(
+                    &data,
+                    model_spec.kind,
+                    finished.clone(),
+                ));
                 page = Some(bench.findings(&runs)?);
             }
         }
@@ -167,8 +188,16 @@ impl CurveResult {
         let ends = FinalValues {
             psnr: last.map(|row| row.psnr).into_iter().collect(),
             seconds: last.map(|row| row.seconds).into_iter().collect(),
-            primitives: last.and_then(|row| row.n).map(|n| n as f64).into_iter().collect(),
-            bytes: last.and_then(|row| row.bytes).map(|bytes| bytes as f64).into_iter().collect(),
+            primitives: last
+                .and_then(|row| row.n)
+                .map(|n| n as f64)
+                .into_iter()
+                .collect(),
+            bytes: last
+                .and_then(|row| row.bytes)
+                .map(|bytes| bytes as f64)
+                .into_iter()
+                .collect(),
         };
         Self {
             label: peer.label.clone(),
@@ -187,28 +216,49 @@ impl CurveResult {
             low: evaluation.min_psnr,
             high: evaluation.max_psnr,
         };
-        Line { label: self.label.clone(), points: self.points.iter().map(point).collect(), is_peer: self.is_peer }
+        Line {
+            label: self.label.clone(),
+            points: self.points.iter().map(point).collect(),
+            is_peer: self.is_peer,
+        }
     }
 
     /// The final PSNR over the size of the model; without a point if either is unknown.
     fn size_line(&self) -> Line {
         let Summary { psnr, bytes, .. } = self.summary;
-        let megabytes = bytes.map(|bytes| bytes / 1e6).filter(|megabytes| *megabytes > 0.0);
-        let point = megabytes.zip(psnr).map(|(x, y)| Point { x, y, low: y, high: y });
-        Line { label: self.label.clone(), points: point.into_iter().collect(), is_peer: self.is_peer }
+        let megabytes = bytes
+            .map(|bytes| bytes / 1e6)
+            .filter(|megabytes| *megabytes > 0.0);
+        let point = megabytes.zip(psnr).map(|(x, y)| Point {
+            x,
+            y,
+            low: y,
+            high: y,
+        });
+        Line {
+            label: self.label.clone(),
+            points: point.into_iter().collect(),
+            is_peer: self.is_peer,
+        }
     }
 }
 
-/// Median and range at each scheduled evaluation that at least half of the runs reached, ordered by time.
+/// Median and range at each scheduled evaluation that at least half of the runs reached, ordered by
+/// time.
 fn median_curve(curves: &[Vec<(f64, f64)>]) -> Vec<CurvePoint> {
-    // Keyed by the bits of the scheduled time, which sort like the time. The flag marks a final evaluation between two
-    // scheduled times, which gets a separate group.
+    // Keyed by the bits of the scheduled time, which sort like the time. The flag marks a final
+    // evaluation between two scheduled times, which gets a separate group.
     let mut groups: BTreeMap<(u64, bool), Vec<(f64, f64)>> = BTreeMap::new();
     for curve in curves {
         let mut taken = HashSet::new();
         for &(seconds, psnr) in curve {
-            let scheduled_bits = evaluation_schedule::latest(seconds).unwrap_or(0.0).to_bits();
-            groups.entry((scheduled_bits, !taken.insert(scheduled_bits))).or_default().push((seconds, psnr));
+            let scheduled_bits = evaluation_schedule::latest(seconds)
+                .unwrap_or(0.0)
+                .to_bits();
+            groups
+                .entry((scheduled_bits, !taken.insert(scheduled_bits)))
+                .or_default()
+                .push((seconds, psnr));
         }
     }
     let mut evaluations: Vec<CurvePoint> = groups
@@ -218,7 +268,13 @@ fn median_curve(curves: &[Vec<(f64, f64)>]) -> Vec<CurvePoint> {
             let (seconds, psnr): (Vec<f64>, Vec<f64>) = group.into_iter().unzip();
             let [min_psnr, max_psnr] = extent(&psnr)?;
             let n_runs = psnr.len();
-            Some(CurvePoint { seconds: median(&seconds)?, psnr: median(&psnr)?, min_psnr, max_psnr, n_runs })
+            Some(CurvePoint {
+                seconds: median(&seconds)?,
+                psnr: median(&psnr)?,
+                min_psnr,
+                max_psnr,
+                n_runs,
+            })
         })
         .collect();
     evaluations.sort_by(|a, b| a.seconds.total_cmp(&b.seconds));
@@ -228,8 +284,15 @@ fn median_curve(curves: &[Vec<(f64, f64)>]) -> Vec<CurvePoint> {
 impl Summary {
     fn of(curves: &[Vec<(f64, f64)>], ends: &FinalValues) -> Self {
         let reached = |target_db: f64| {
-            let seconds: Vec<f64> = curves.iter().filter_map(|curve| secs_to(curve, target_db)).collect();
-            TimeToQuality { psnr: target_db, seconds: median(&seconds), n_runs: seconds.len() }
+            let seconds: Vec<f64> = curves
+                .iter()
+                .filter_map(|curve| secs_to(curve, target_db))
+                .collect();
+            TimeToQuality {
+                psnr: target_db,
+                seconds: median(&seconds),
+                n_runs: seconds.len(),
+            }
         };
         let mean_size = ends.primitives.iter().sum::<f64>() / ends.primitives.len().max(1) as f64;
         Self {
@@ -249,10 +312,18 @@ impl Summary {
         let number = |value: Option<f64>, digits: usize| {
             value.map_or_else(|| "-".to_owned(), |value| format!("{value:.digits$}"))
         };
-        let mut row = vec![label.to_owned(), self.n_runs.to_string(), number(self.psnr, 2), number(self.psnr_std, 3)];
+        let mut row = vec![
+            label.to_owned(),
+            self.n_runs.to_string(),
+            number(self.psnr, 2),
+            number(self.psnr_std, 3),
+        ];
         row.extend([number(self.seconds, 2), number(self.primitives, 0)]);
         let spread = self.primitives_extent.filter(|_| self.n_runs > 1);
-        row.push(spread.map_or_else(|| "-".to_owned(), |[low, high]| format!("{low:.0} to {high:.0}")));
+        row.push(spread.map_or_else(
+            || "-".to_owned(),
+            |[low, high]| format!("{low:.0} to {high:.0}"),
+        ));
         row.push(number(self.primitives_spread.map(|share| 100.0 * share), 2));
         row.push(number(self.bytes.map(|bytes| bytes / 1e6), 2));
         row.extend(self.seconds_to.iter().map(|reached| match reached.seconds {
@@ -274,8 +345,8 @@ struct Bench<'a> {
 }
 
 impl Bench<'_> {
-    /// The methods that support these data. If there are none, all methods are returned, so that training reports the
-    /// problem.
+    /// The methods that support these data. If there are none, all methods are returned, so that
+    /// training reports the problem.
     fn applicable<'a>(&mut self, data: &'a NamedData) -> Vec<&'a ModelSpec> {
         let (applicable, without_depth): (Vec<_>, Vec<_>) = data
             .model_specs
@@ -285,8 +356,11 @@ impl Bench<'_> {
             return without_depth;
         }
         for model_spec in without_depth {
-            let note =
-                format!("{} has no depth, which {} needs: this line is omitted", data.name, model_spec.kind.name());
+            let note = format!(
+                "{} has no depth, which {} needs: this line is omitted",
+                data.name,
+                model_spec.kind.name()
+            );
             log::warn!("{note}");
             self.notes.push(note + ".");
         }
@@ -297,14 +371,21 @@ impl Bench<'_> {
     fn findings(&self, runs: &Runs<'_>) -> Result<(Findings, PathBuf)> {
         let peers: Vec<CurveResult> = self.peers.iter().map(CurveResult::of_peer).collect();
         let all = || self.results.iter().chain(&peers);
-        let last_secs = all().flat_map(|results| &results.points).map(|point| point.seconds).fold(1.0, f64::max);
+        let last_secs = all()
+            .flat_map(|results| &results.points)
+            .map(|point| point.seconds)
+            .fold(1.0, f64::max);
         let (n_seeds, seconds) = (self.options.seeds, compact_number(self.options.seconds));
         let subtitle = if n_seeds > 1 {
             format!("median of {n_seeds} seeds; band: minimum to maximum; dashed: peers")
         } else {
             "one run per line; dashed: peers".to_owned()
         };
-        let psnr = || Axis { label: "test PSNR, dB".into(), scale: Scale::Linear, ticks: Vec::new() };
+        let psnr = || Axis {
+            label: "test PSNR, dB".into(),
+            scale: Scale::Linear,
+            ticks: Vec::new(),
+        };
         let over_time = Chart {
             title: "PSNR of test images over time".into(),
             subtitle,
@@ -321,18 +402,37 @@ impl Bench<'_> {
         let over_size = Chart {
             title: "PSNR of test images over the size of the model".into(),
             subtitle: format!("after {seconds} s; median of the runs"),
-            x: Axis { label: "GPU memory of the model, MB (log)".into(), scale: Scale::Log, ticks: Vec::new() },
+            x: Axis {
+                label: "GPU memory of the model, MB (log)".into(),
+                scale: Scale::Log,
+                ticks: Vec::new(),
+            },
             y: psnr(),
             lines: all().map(CurveResult::size_line).collect(),
             thresholds: Vec::new(),
             markers: Vec::new(),
         };
-        let head = ["data, method", "runs", "PSNR, dB", "std, dB", "seconds", "primitives", "range", "spread, %", "MB"];
-        let head = head.map(str::to_owned).into_iter().chain(TARGET_DB.map(|target_db| format!("to {target_db} dB")));
+        let head = [
+            "data, method",
+            "runs",
+            "PSNR, dB",
+            "std, dB",
+            "seconds",
+            "primitives",
+            "range",
+            "spread, %",
+            "MB",
+        ];
+        let head = head
+            .map(str::to_owned)
+            .into_iter()
+            .chain(TARGET_DB.map(|target_db| format!("to {target_db} dB")));
         let table = Table {
             title: format!("After {seconds} s (peers: after their last row)"),
             head: head.collect(),
-            rows: all().map(|results| results.summary.row(&results.label)).collect(),
+            rows: all()
+                .map(|results| results.summary.row(&results.label))
+                .collect(),
         };
         let mut sentences = vec![
             format!(
@@ -347,7 +447,11 @@ impl Bench<'_> {
                 .into(),
         ];
         sentences.extend(self.notes.iter().cloned());
-        sentences.push(format!("{}; fieldrig {}.", runs.adapter(), env!("CARGO_PKG_VERSION")));
+        sentences.push(format!(
+            "{}; fieldrig {}.",
+            runs.adapter(),
+            env!("CARGO_PKG_VERSION")
+        ));
         let findings = Findings {
             name: "curve",
             title: "Accuracy over time".into(),
@@ -380,21 +484,42 @@ mod tests {
             vec![(0.55, 15.0), (1.02, 25.0), (2.5, 23.0)],
         ];
         let evaluations = median_curve(&curves);
-        let points: Vec<(f64, f64, usize)> =
-            evaluations.iter().map(|point| (point.seconds, point.psnr, point.n_runs)).collect();
-        assert_eq!(points, [(0.28, 11.0, 2), (1.02, 21.0, 3), (2.5, 23.0, 3)], "a single run at 0.5 s gives no point");
-        assert_eq!((evaluations[1].min_psnr, evaluations[1].max_psnr), (20.0, 25.0));
+        let points: Vec<(f64, f64, usize)> = evaluations
+            .iter()
+            .map(|point| (point.seconds, point.psnr, point.n_runs))
+            .collect();
+        assert_eq!(
+            points,
+            [(0.28, 11.0, 2), (1.02, 21.0, 3), (2.5, 23.0, 3)],
+            "a single run at 0.5 s gives no point"
+        );
+        assert_eq!(
+            (evaluations[1].min_psnr, evaluations[1].max_psnr),
+            (20.0, 25.0)
+        );
     }
 
     #[test]
     fn end_between_evaluations_is_a_separate_point() {
-        let evaluations = median_curve(&[vec![(1.0, 20.0), (1.9, 21.0)], vec![(1.0, 22.0), (1.9, 23.0)]]);
-        assert_eq!(evaluations.iter().map(|point| point.psnr).collect::<Vec<_>>(), [21.0, 22.0]);
+        let evaluations = median_curve(&[
+            vec![(1.0, 20.0), (1.9, 21.0)],
+            vec![(1.0, 22.0), (1.9, 23.0)],
+        ]);
+        assert_eq!(
+            evaluations
+                .iter()
+                .map(|point| point.psnr)
+                .collect::<Vec<_>>(),
+            [21.0, 22.0]
+        );
     }
 
     #[test]
     fn summary_counts_runs_that_reached_a_quality() {
-        let curves = [vec![(1.0, 20.0), (4.0, 30.0)], vec![(1.0, 20.0), (4.0, 26.0)]];
+        let curves = [
+            vec![(1.0, 20.0), (4.0, 30.0)],
+            vec![(1.0, 20.0), (4.0, 26.0)],
+        ];
         let ends = FinalValues {
             psnr: vec![30.0, 26.0],
             primitives: vec![1000.0, 3000.0],
@@ -402,11 +527,22 @@ mod tests {
             ..FinalValues::default()
         };
         let summary = Summary::of(&curves, &ends);
-        assert_eq!((summary.psnr, summary.primitives), (Some(28.0), Some(2000.0)));
-        let [to_25, to_28, _] = &summary.seconds_to[..] else { panic!("three qualities") };
+        assert_eq!(
+            (summary.psnr, summary.primitives),
+            (Some(28.0), Some(2000.0))
+        );
+        let [to_25, to_28, _] = &summary.seconds_to[..] else {
+            panic!("three qualities")
+        };
         assert_eq!((to_25.n_runs, to_28.n_runs), (2, 1));
-        assert_eq!(to_25.seconds.map(|seconds| (seconds * 100.0).round()), Some(259.0));
+        assert_eq!(
+            to_25.seconds.map(|seconds| (seconds * 100.0).round()),
+            Some(259.0)
+        );
         let row = summary.row("fox");
-        assert!(row[10].ends_with("(1 of 2)") && row[6] == "1000 to 3000" && row[8] == "6.00", "{row:?}");
+        assert!(
+            row[10].ends_with("(1 of 2)") && row[6] == "1000 to 3000" && row[8] == "6.00",
+            "{row:?}"
+        );
     }
 }

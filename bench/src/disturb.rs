@@ -1,11 +1,12 @@
 //! Disturbs keyframes, for example with pose noise or a clock offset of a given size.
 //!
-//! A clock offset and an exposure step affect all images including test images, as they would on a robot. Pose noise
-//! does not affect test images: they keep their true poses, so that the scores measure the model.
+//! A clock offset and an exposure step affect all images including test images, as they would on a
+//! robot. Pose noise does not affect test images: they keep their true poses, so that the scores
+//! measure the model.
 //!
-//! A disturbance is a pure function of its size, a seed and the keyframes. Its effect on a keyframe does not depend on
-//! the order of the keyframes. With one seed, all sizes use the same random directions, so that random variation
-//! between sizes does not add noise to a curve.
+//! A disturbance is a pure function of its size, a seed and the keyframes. Its effect on a keyframe
+//! does not depend on the order of the keyframes. With one seed, all sizes use the same random
+//! directions, so that random variation between sizes does not add noise to a curve.
 
 use crate::statistics::Interpolation;
 use keyframe::{Keyframe, Split};
@@ -33,7 +34,12 @@ const DEGREES_PER_MM: f64 = 0.1;
 
 impl Disturbance {
     /// All disturbances.
-    pub const ALL: [Self; 4] = [Self::PoseNoise, Self::ClockOffset, Self::Exposure, Self::Keyframes];
+    pub const ALL: [Self; 4] = [
+        Self::PoseNoise,
+        Self::ClockOffset,
+        Self::Exposure,
+        Self::Keyframes,
+    ];
 
     /// Name in files and on the command line.
     #[must_use]
@@ -49,7 +55,9 @@ impl Disturbance {
     /// Axis label for the size, with its unit.
     pub(crate) fn axis(self) -> &'static str {
         match self {
-            Self::PoseNoise => "pose noise, mm (standard deviation along each axis; 0.1 degrees of rotation per mm)",
+            Self::PoseNoise => {
+                "pose noise, mm (standard deviation along each axis; 0.1 degrees of rotation per mm)"
+            }
             Self::ClockOffset => "clock offset of the poses, ms",
             Self::Exposure => "exposure step in the middle of the capture, EV",
             Self::Keyframes => "training keyframes",
@@ -66,7 +74,8 @@ impl Disturbance {
         }
     }
 
-    /// Default sizes, in ascending order. For keyframes, the smallest number is the largest disturbance.
+    /// Default sizes, in ascending order. For keyframes, the smallest number is the largest
+    /// disturbance.
     pub(crate) fn default_levels(self) -> &'static [f64] {
         match self {
             Self::PoseNoise => &[0.0, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0],
@@ -87,7 +96,8 @@ impl Disturbance {
     /// Applies the disturbance to keyframes.
     ///
     /// * `level`: size in [`Self::unit`].
-    /// * `nanos_per_sec`: length of a second in units of the stamps; 1e9 unless stamps only count images.
+    /// * `nanos_per_sec`: length of a second in units of the stamps; 1e9 unless stamps only count
+    ///   images.
     pub(crate) fn apply(
         self,
         keyframes: &[Arc<Keyframe>],
@@ -129,10 +139,13 @@ fn pose_noise(keyframes: &[Arc<Keyframe>], sigma_mm: f64, seed: u64) -> Vec<Arc<
         if keyframe.split == Split::Test {
             return;
         }
-        let [x, y, z, rotation_x, rotation_y, rotation_z] = six_normals(seed, &keyframe.camera, keyframe.stamp);
+        let [x, y, z, rotation_x, rotation_y, rotation_z] =
+            six_normals(seed, &keyframe.camera, keyframe.stamp);
         let camera_from_disturbed = Transform::from_parts(
             (Vector3::new(x, y, z) * sigma_m).into(),
-            UnitQuaternion::from_scaled_axis(Vector3::new(rotation_x, rotation_y, rotation_z) * sigma_rad),
+            UnitQuaternion::from_scaled_axis(
+                Vector3::new(rotation_x, rotation_y, rotation_z) * sigma_rad,
+            ),
         );
         move_to(keyframe, keyframe.world_from_camera * camera_from_disturbed);
     })
@@ -173,7 +186,10 @@ fn clock_offset(keyframes: &[Arc<Keyframe>], offset_nanos: f64) -> Vec<Arc<Keyfr
     let mut trajectories: BTreeMap<Arc<str>, Trajectory> = BTreeMap::new();
     for keyframe in keyframes {
         let state = (keyframe.stamp, keyframe.world_from_camera, keyframe.twist);
-        trajectories.entry(keyframe.camera.clone()).or_default().push(state);
+        trajectories
+            .entry(keyframe.camera.clone())
+            .or_default()
+            .push(state);
     }
     for trajectory in trajectories.values_mut() {
         trajectory.sort_by_key(|(stamp, ..)| *stamp);
@@ -188,7 +204,8 @@ fn clock_offset(keyframes: &[Arc<Keyframe>], offset_nanos: f64) -> Vec<Arc<Keyfr
     })
 }
 
-/// Pose and velocity at a time, interpolated between the neighboring states or extrapolated beyond the ends.
+/// Pose and velocity at a time, interpolated between the neighboring states or extrapolated beyond
+/// the ends.
 fn at(trajectory: &Trajectory, nanos: f64) -> Option<(Transform, Option<Twist>)> {
     let next = trajectory.partition_point(|(stamp, ..)| (stamp.0 as f64) < nanos);
     let next = next.clamp(1, trajectory.len().checked_sub(1).filter(|last| *last > 0)?);
@@ -201,15 +218,29 @@ fn at(trajectory: &Trajectory, nanos: f64) -> Option<(Transform, Option<Twist>)>
     Some((transform::interpolate(a, b, frac), twist))
 }
 
-/// Darkens the first half of the capture and brightens the second, by half of `step_ev` each to preserve the mean.
+/// Darkens the first half of the capture and brightens the second, by half of `step_ev` each to
+/// preserve the mean.
 fn exposure_step(keyframes: &[Arc<Keyframe>], step_ev: f64) -> Vec<Arc<Keyframe>> {
-    let mut stamps: Vec<Stamp> =
-        keyframes.iter().filter(|keyframe| keyframe.split != Split::Test).map(|keyframe| keyframe.stamp).collect();
+    let mut stamps: Vec<Stamp> = keyframes
+        .iter()
+        .filter(|keyframe| keyframe.split != Split::Test)
+        .map(|keyframe| keyframe.stamp)
+        .collect();
     stamps.sort();
-    let Some(middle) = stamps.get(stamps.len() / 2).copied() else { return keyframes.to_vec() };
-    let [darker, brighter] = [-0.5, 0.5].map(|fraction| exposure_table(2.0_f64.powf(fraction * step_ev)));
+    let Some(middle) = stamps.get(stamps.len() / 2).copied() else {
+        return keyframes.to_vec();
+    };
+    let [darker, brighter] =
+        [-0.5, 0.5].map(|fraction| exposure_table(2.0_f64.powf(fraction * step_ev)));
     map(keyframes, |keyframe| {
-        expose(keyframe, if keyframe.stamp < middle { &darker } else { &brighter });
+        expose(
+            keyframe,
+            if keyframe.stamp < middle {
+                &darker
+            } else {
+                &brighter
+            },
+        );
     })
 }
 
@@ -217,19 +248,35 @@ fn exposure_step(keyframes: &[Arc<Keyframe>], step_ev: f64) -> Vec<Arc<Keyframe>
 pub(crate) fn expose(keyframe: &mut Keyframe, table: &[u8; 256]) {
     let pixels = keyframe.rgba_srgb.chunks_exact(4);
     keyframe.rgba_srgb = pixels
-        .flat_map(|rgba| [table[rgba[0] as usize], table[rgba[1] as usize], table[rgba[2] as usize], rgba[3]])
+        .flat_map(|rgba| {
+            [
+                table[rgba[0] as usize],
+                table[rgba[1] as usize],
+                table[rgba[2] as usize],
+                rgba[3],
+            ]
+        })
         .collect();
 }
 
-/// Maps each sRGB byte to its value after multiplying the light by `gain`: linear light, clipped, rounded to 8 bits.
+/// Maps each sRGB byte to its value after multiplying the light by `gain`: linear light, clipped,
+/// rounded to 8 bits.
 ///
 /// Source: IEC 61966-2-1 for both transfer functions.
 pub(crate) fn exposure_table(gain: f64) -> [u8; 256] {
     std::array::from_fn(|byte| {
         let srgb = byte as f64 / 255.0;
-        let linear = if srgb <= 0.04045 { srgb / 12.92 } else { ((srgb + 0.055) / 1.055).powf(2.4) };
+        let linear = if srgb <= 0.04045 {
+            srgb / 12.92
+        } else {
+            ((srgb + 0.055) / 1.055).powf(2.4)
+        };
         let linear = (gain * linear).clamp(0.0, 1.0);
-        let srgb = if linear <= 0.0031308 { 12.92 * linear } else { 1.055 * linear.powf(1.0 / 2.4) - 0.055 };
+        let srgb = if linear <= 0.0031308 {
+            12.92 * linear
+        } else {
+            1.055 * linear.powf(1.0 / 2.4) - 0.055
+        };
         #[expect(clippy::cast_possible_truncation, reason = "clamped to 0 to 1 above")]
         let byte = (255.0 * srgb).round() as u8;
         byte
@@ -238,7 +285,10 @@ pub(crate) fn exposure_table(gain: f64) -> [u8; 256] {
 
 /// Keeps `n` evenly spaced training keyframes and all test keyframes.
 fn subsample(keyframes: &[Arc<Keyframe>], n: f64) -> Vec<Arc<Keyframe>> {
-    let n_all = keyframes.iter().filter(|keyframe| keyframe.split != Split::Test).count() as f64;
+    let n_all = keyframes
+        .iter()
+        .filter(|keyframe| keyframe.split != Split::Test)
+        .count() as f64;
     let fraction = (n / n_all).min(1.0);
     let mut n_visited = 0.0;
     let mut is_kept = |keyframe: &&Arc<Keyframe>| {
@@ -250,7 +300,11 @@ fn subsample(keyframes: &[Arc<Keyframe>], n: f64) -> Vec<Arc<Keyframe>> {
         n_visited += 1.0;
         (n_visited * fraction + 0.5).floor() > before
     };
-    keyframes.iter().filter(|keyframe| is_kept(keyframe)).cloned().collect()
+    keyframes
+        .iter()
+        .filter(|keyframe| is_kept(keyframe))
+        .cloned()
+        .collect()
 }
 
 #[cfg(test)]
@@ -259,8 +313,8 @@ pub(crate) mod tests {
 
     const TOLERANCE: f64 = 1e-9; // Rounding errors of products of poses with elements near 1.
 
-    /// A camera that moves along a line and rotates: 0.1 m and 0.02 rad per keyframe, 10 keyframes per second, gray
-    /// images.
+    /// A camera that moves along a line and rotates: 0.1 m and 0.02 rad per keyframe, 10 keyframes
+    /// per second, gray images.
     pub(crate) fn capture(n: i64) -> Vec<Arc<Keyframe>> {
         let keyframe = |ix: i64| {
             let along = ix as f64;
@@ -297,7 +351,9 @@ pub(crate) mod tests {
     }
 
     fn trained(keyframes: &[Arc<Keyframe>]) -> impl Iterator<Item = &Arc<Keyframe>> {
-        keyframes.iter().filter(|keyframe| keyframe.split != Split::Test)
+        keyframes
+            .iter()
+            .filter(|keyframe| keyframe.split != Split::Test)
     }
 
     #[test]
@@ -306,17 +362,26 @@ pub(crate) mod tests {
         for disturbance in Disturbance::ALL {
             let changed = disturbance.apply(&capture, 3.0, 1, 1e9);
             let tests = |keyframes: &[Arc<Keyframe>]| -> Vec<Arc<Keyframe>> {
-                keyframes.iter().filter(|keyframe| keyframe.split == Split::Test).cloned().collect()
+                keyframes
+                    .iter()
+                    .filter(|keyframe| keyframe.split == Split::Test)
+                    .cloned()
+                    .collect()
             };
-            let is_unchanged = matches!(disturbance, Disturbance::PoseNoise | Disturbance::Keyframes);
+            let is_unchanged =
+                matches!(disturbance, Disturbance::PoseNoise | Disturbance::Keyframes);
             for (before, after) in tests(&capture).iter().zip(tests(&changed)) {
-                let is_same =
-                    before.world_from_camera == after.world_from_camera && before.rgba_srgb == after.rgba_srgb;
+                let is_same = before.world_from_camera == after.world_from_camera
+                    && before.rgba_srgb == after.rgba_srgb;
                 assert_eq!(is_same, is_unchanged, "{disturbance:?} and a test keyframe");
             }
             assert_eq!(tests(&changed).len(), 5, "{disturbance:?}");
         }
-        for disturbance in [Disturbance::PoseNoise, Disturbance::ClockOffset, Disturbance::Exposure] {
+        for disturbance in [
+            Disturbance::PoseNoise,
+            Disturbance::ClockOffset,
+            Disturbance::Exposure,
+        ] {
             for (before, after) in capture.iter().zip(disturbance.apply(&capture, 0.0, 1, 1e9)) {
                 let difference = before.world_from_camera.inverse() * after.world_from_camera;
                 assert!(
@@ -339,9 +404,10 @@ pub(crate) mod tests {
             let difference = before.world_from_camera.inverse() * after.world_from_camera;
             translations.extend(difference.translation.vector.iter().copied());
             rotations.extend(difference.rotation.scaled_axis().iter().copied());
-            let [depth_before, depth_after] =
-                [before, after].map(|keyframe| keyframe.depth.as_ref().expect("depth").world_from_camera);
-            let camera_from_depth = |camera: &Transform, depth: &Transform| camera.inverse() * depth;
+            let [depth_before, depth_after] = [before, after]
+                .map(|keyframe| keyframe.depth.as_ref().expect("depth").world_from_camera);
+            let camera_from_depth =
+                |camera: &Transform, depth: &Transform| camera.inverse() * depth;
             let moved = camera_from_depth(&before.world_from_camera, &depth_before).inverse()
                 * camera_from_depth(&after.world_from_camera, &depth_after);
             assert!(
@@ -354,7 +420,10 @@ pub(crate) mod tests {
             let mean = values.iter().sum::<f64>() / n;
             let std = (values.iter().map(|value| value * value).sum::<f64>() / n).sqrt();
             assert!(mean.abs() < 4.0 * sigma / n.sqrt(), "mean {mean}");
-            assert!((std / sigma - 1.0).abs() < REL_TOLERANCE, "standard deviation {std}, not {sigma}");
+            assert!(
+                (std / sigma - 1.0).abs() < REL_TOLERANCE,
+                "standard deviation {std}, not {sigma}"
+            );
         }
     }
 
@@ -363,49 +432,76 @@ pub(crate) mod tests {
         let capture = capture(10);
         let translation_of = |sigma_mm: f64, seed: u64| {
             let noisy = pose_noise(&capture, sigma_mm, seed);
-            (capture[1].world_from_camera.inverse() * noisy[1].world_from_camera).translation.vector
+            (capture[1].world_from_camera.inverse() * noisy[1].world_from_camera)
+                .translation
+                .vector
         };
         assert_eq!(translation_of(5.0, 1), translation_of(5.0, 1));
         assert!((translation_of(10.0, 1) - 2.0 * translation_of(5.0, 1)).norm() < TOLERANCE);
         assert!((translation_of(5.0, 2) - translation_of(5.0, 1)).norm() > 1e-4);
         let alone = pose_noise(&capture[1..2], 5.0, 1);
-        assert_eq!(alone[0].world_from_camera, pose_noise(&capture, 5.0, 1)[1].world_from_camera);
+        assert_eq!(
+            alone[0].world_from_camera,
+            pose_noise(&capture, 5.0, 1)[1].world_from_camera
+        );
     }
 
     #[test]
     fn clock_offset_uses_poses_of_a_later_time() {
         let capture = capture(20);
-        // 50 ms is half the time to the next keyframe. With 250 ms, the last keyframes are extrapolated.
+        // 50 ms is half the time to the next keyframe. With 250 ms, the last keyframes are
+        // extrapolated.
         for (millis, n_keyframes) in [(50.0, 0.5), (200.0, 2.0), (250.0, 2.5), (-50.0, -0.5)] {
             let moved = Disturbance::ClockOffset.apply(&capture, millis, 1, 1e9);
             for (before, after) in trained(&capture).zip(trained(&moved)) {
                 let expected_x = before.world_from_camera.translation.x + 0.1 * n_keyframes;
-                let expected_angle_rad = before.world_from_camera.rotation.angle() + 0.02 * n_keyframes;
-                assert!((after.world_from_camera.translation.x - expected_x).abs() < TOLERANCE, "{millis} ms");
+                let expected_angle_rad =
+                    before.world_from_camera.rotation.angle() + 0.02 * n_keyframes;
                 assert!(
-                    (after.world_from_camera.rotation.angle() - expected_angle_rad).abs() < TOLERANCE,
+                    (after.world_from_camera.translation.x - expected_x).abs() < TOLERANCE,
+                    "{millis} ms"
+                );
+                assert!(
+                    (after.world_from_camera.rotation.angle() - expected_angle_rad).abs()
+                        < TOLERANCE,
                     "{millis} ms"
                 );
             }
         }
-        // If stamps count images, the image rate defines a second: at 1 image per second, 100 ms is 0.1 images.
+        // If stamps count images, the image rate defines a second: at 1 image per second, 100 ms is
+        // 0.1 images.
         let counted = Disturbance::ClockOffset.apply(&capture, 100.0, 1, 1e8);
         assert!((counted[1].world_from_camera.translation.x - 0.11).abs() < TOLERANCE);
         let alone = clock_offset(&capture[1..2], 1e8);
-        assert_eq!(alone[0].world_from_camera, capture[1].world_from_camera, "a single keyframe defines no motion");
+        assert_eq!(
+            alone[0].world_from_camera, capture[1].world_from_camera,
+            "a single keyframe defines no motion"
+        );
     }
 
     #[test]
     fn exposure_is_multiplied_in_linear_light() {
-        assert!(exposure_table(1.0).iter().enumerate().all(|(byte, after)| byte == *after as usize));
+        assert!(
+            exposure_table(1.0)
+                .iter()
+                .enumerate()
+                .all(|(byte, after)| byte == *after as usize)
+        );
         let doubled = exposure_table(2.0);
         // 128 is 0.2159 in linear light; twice that is 175.6. 188 is just above 0.5.
-        assert_eq!((doubled[0], doubled[128], doubled[188], doubled[255]), (0, 176, 255, 255));
+        assert_eq!(
+            (doubled[0], doubled[128], doubled[188], doubled[255]),
+            (0, 176, 255, 255)
+        );
         let capture = capture(20);
         let stepped = exposure_step(&capture, 2.0);
         assert_eq!(stepped[1].rgba_srgb[1], exposure_table(0.5)[128]);
         assert_eq!(stepped[19].rgba_srgb[1], 176);
-        assert_eq!(&stepped[19].rgba_srgb[3..5], &[255, exposure_table(2.0)[10]], "alpha is unchanged");
+        assert_eq!(
+            &stepped[19].rgba_srgb[3..5],
+            &[255, exposure_table(2.0)[10]],
+            "alpha is unchanged"
+        );
         assert_eq!(stepped[19].rgba_srgb[7], 0, "alpha is unchanged");
     }
 
@@ -414,10 +510,15 @@ pub(crate) mod tests {
         let capture = capture(80);
         for n in [1, 3, 10, 69, 70] {
             let kept = subsample(&capture, f64::from(n));
-            let ixs: Vec<i64> = trained(&kept).map(|keyframe| keyframe.stamp.0 / 100_000_000).collect();
+            let ixs: Vec<i64> = trained(&kept)
+                .map(|keyframe| keyframe.stamp.0 / 100_000_000)
+                .collect();
             assert_eq!(ixs.len(), n as usize);
             let (first, last) = (ixs[0], ixs[ixs.len() - 1]);
-            assert!(first <= 80 / i64::from(n) && last >= 79 - 80 / i64::from(n), "{ixs:?}");
+            assert!(
+                first <= 80 / i64::from(n) && last >= 79 - 80 / i64::from(n),
+                "{ixs:?}"
+            );
         }
         assert_eq!(trained(&subsample(&capture, 300.0)).count(), 70);
     }

@@ -19,8 +19,8 @@ const DEFAULT_REPEATS_ON_CPU: u32 = 3;
 pub struct FieldOptions {
     /// Rays per step.
     pub n_rays: u32,
-    /// Samples per step, one row for each value; the defaults if empty. Each value is rounded down to a multiple of the
-    /// rays, but at least one sample per ray.
+    /// Samples per step, one row for each value; the defaults if empty. Each value is rounded down
+    /// to a multiple of the rays, but at least one sample per ray.
     pub n_samples: Vec<u32>,
     /// Number of timed steps, of which the median is reported. If `None`: 100, or 3 on the CPU.
     pub n_repeats: Option<u32>,
@@ -61,9 +61,21 @@ pub fn measure<E: From<Error>>(
     mut on_row: impl FnMut(&FieldRow) -> Result<(), E>,
 ) -> Result<(), E> {
     let is_software = open_gpu()?.is_software();
-    let default_samples: &[u32] = if is_software { &DEFAULT_SAMPLES_ON_CPU } else { &DEFAULT_SAMPLES };
-    let n_samples = if options.n_samples.is_empty() { default_samples } else { &options.n_samples };
-    let n_repeats = options.n_repeats.unwrap_or(if is_software { DEFAULT_REPEATS_ON_CPU } else { DEFAULT_REPEATS });
+    let default_samples: &[u32] = if is_software {
+        &DEFAULT_SAMPLES_ON_CPU
+    } else {
+        &DEFAULT_SAMPLES
+    };
+    let n_samples = if options.n_samples.is_empty() {
+        default_samples
+    } else {
+        &options.n_samples
+    };
+    let n_repeats = options.n_repeats.unwrap_or(if is_software {
+        DEFAULT_REPEATS_ON_CPU
+    } else {
+        DEFAULT_REPEATS
+    });
     for (row_ix, n_samples) in n_samples.iter().enumerate() {
         // Each row uses a new device, so that the peak memory of earlier rows is not included.
         let gpu = open_gpu()?;

@@ -37,9 +37,16 @@ pub struct BenchResult {
 
 impl BenchResult {
     /// The result of a bench that trains, with the findings after its last run.
-    pub(crate) fn of(latest: Option<(Findings, PathBuf)>, data_losses: Vec<String>) -> Result<Self> {
+    pub(crate) fn of(
+        latest: Option<(Findings, PathBuf)>,
+        data_losses: Vec<String>,
+    ) -> Result<Self> {
         let (findings, page) = latest.ok_or_else(|| failed!("there is nothing to train"))?;
-        Ok(Self { findings, page, data_losses })
+        Ok(Self {
+            findings,
+            page,
+            data_losses,
+        })
     }
 }
 
@@ -59,7 +66,9 @@ impl Findings {
             write_file(&path_with(&format!("{part}.svg")), svg.as_bytes())?;
             write_file(&path_with(&format!("{part}.png")), &raster::png(&drawing)?)?;
             let title = escaped(&chart.title);
-            page.push_str(&format!("<figure role=\"img\" aria-label=\"{title}\">\n{svg}</figure>\n"));
+            page.push_str(&format!(
+                "<figure role=\"img\" aria-label=\"{title}\">\n{svg}</figure>\n"
+            ));
         }
         for table in &self.tables {
             page.push_str(&table.html());
@@ -102,7 +111,11 @@ mod tests {
 
     fn table() -> Table {
         let words = |words: [&str; 2]| words.map(str::to_owned).to_vec();
-        Table { title: "Sizes".into(), head: words(["data", "dB"]), rows: vec![words(["a<b", "1.25"])] }
+        Table {
+            title: "Sizes".into(),
+            head: words(["data", "dB"]),
+            rows: vec![words(["a<b", "1.25"])],
+        }
     }
 
     #[test]
@@ -116,9 +129,14 @@ mod tests {
             tables: vec![table()],
             numbers: serde_json::json!({ "lines": [] }),
         };
-        let page = findings.write(folder.path()).expect("the folder is writable");
+        let page = findings
+            .write(folder.path())
+            .expect("the folder is writable");
         let text = std::fs::read_to_string(page).expect("a page");
-        assert!(text.contains("<p>One &amp; all.</p>") && text.contains("<h2>Sizes</h2>"), "{text}");
+        assert!(
+            text.contains("<p>One &amp; all.</p>") && text.contains("<h2>Sizes</h2>"),
+            "{text}"
+        );
         assert!(folder.path().join("curve.json").is_file());
     }
 }

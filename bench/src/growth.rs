@@ -12,7 +12,8 @@ use session::Context;
 const SETTLE_SECS: f64 = 60.0;
 /// Minimum time over which a rate is measured.
 const MIN_SPAN_SECS: f64 = 60.0;
-/// Maximum number of samples for a rate. More samples are reduced to medians of at most this many groups.
+/// Maximum number of samples for a rate. More samples are reduced to medians of at most this many
+/// groups.
 const MAX_GROUPS: usize = 400;
 const SECS_PER_HOUR: f64 = 3600.0;
 
@@ -57,7 +58,8 @@ pub enum Excluded {
 }
 
 impl Excluded {
-    /// Resident memory without the excluded part and without the picture timings that the viewers of a benchmark store.
+    /// Resident memory without the excluded part and without the picture timings that the viewers
+    /// of a benchmark store.
     pub(crate) fn bytes(self, sample: &Sample) -> f64 {
         let excluded_bytes = match self {
             Self::Nothing => 0,
@@ -90,10 +92,16 @@ impl Growth {
     /// Returns `None` if less than a minute of samples can be used.
     #[must_use]
     pub fn of(samples: &[Sample], excluded: Excluded) -> Option<Self> {
-        let full_at = samples.iter().find(|sample| sample.evicted > 0).map(|sample| sample.seconds + SETTLE_SECS);
+        let full_at = samples
+            .iter()
+            .find(|sample| sample.evicted > 0)
+            .map(|sample| sample.seconds + SETTLE_SECS);
         let last = samples.last()?;
         let from_seconds = full_at.unwrap_or(0.5 * last.seconds);
-        let counted: Vec<&Sample> = samples.iter().filter(|sample| sample.seconds >= from_seconds).collect();
+        let counted: Vec<&Sample> = samples
+            .iter()
+            .filter(|sample| sample.seconds >= from_seconds)
+            .collect();
         if last.seconds - counted.first()?.seconds < MIN_SPAN_SECS {
             return None;
         }
@@ -102,9 +110,16 @@ impl Growth {
             let bytes: Vec<f64> = group.iter().map(|sample| excluded.bytes(sample)).collect();
             median(&seconds).zip(median(&bytes))
         };
-        let groups: Vec<(f64, f64)> = counted.chunks(counted.len().div_ceil(MAX_GROUPS)).filter_map(of_group).collect();
-        let resident: Vec<f64> = counted.iter().map(|sample| sample.resident_bytes as f64).collect();
-        let (resident_bytes, bytes_per_hour) = (median(&resident)?, theil_sen(&groups)? * SECS_PER_HOUR);
+        let groups: Vec<(f64, f64)> = counted
+            .chunks(counted.len().div_ceil(MAX_GROUPS))
+            .filter_map(of_group)
+            .collect();
+        let resident: Vec<f64> = counted
+            .iter()
+            .map(|sample| sample.resident_bytes as f64)
+            .collect();
+        let (resident_bytes, bytes_per_hour) =
+            (median(&resident)?, theil_sen(&groups)? * SECS_PER_HOUR);
         Some(Self {
             store_was_full: full_at.is_some(),
             from_seconds: counted.first()?.seconds,
@@ -123,15 +138,23 @@ impl Growth {
 /// If the system does not report the resident memory, which only Linux does.
 pub fn resident_bytes() -> Result<(u64, u64)> {
     const STATUS: &str = "/proc/self/status";
-    let status = std::fs::read_to_string(STATUS)
-        .with_context(|| format!("cannot read {STATUS}: resident memory is measured on Linux only"))?;
+    let status = std::fs::read_to_string(STATUS).with_context(|| {
+        format!("cannot read {STATUS}: resident memory is measured on Linux only")
+    })?;
     let now = kilobytes(&status, "VmRSS:").ok_or_else(|| failed!("{STATUS} has no line VmRSS"))?;
     let peak = kilobytes(&status, "VmHWM:").ok_or_else(|| failed!("{STATUS} has no line VmHWM"))?;
     Ok((now << 10, peak << 10))
 }
 
 fn kilobytes(status: &str, name: &str) -> Option<u64> {
-    status.lines().find_map(|line| line.strip_prefix(name))?.trim().strip_suffix("kB")?.trim().parse().ok()
+    status
+        .lines()
+        .find_map(|line| line.strip_prefix(name))?
+        .trim()
+        .strip_suffix("kB")?
+        .trim()
+        .parse()
+        .ok()
 }
 
 #[cfg(test)]
@@ -142,9 +165,18 @@ mod tests {
     fn samples(n: u32, bytes: impl Fn(f64) -> f64) -> Vec<Sample> {
         let sample = |ix: u32| {
             let seconds = f64::from(ix);
-            #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "small numbers")]
+            #[expect(
+                clippy::cast_possible_truncation,
+                clippy::cast_sign_loss,
+                reason = "small numbers"
+            )]
             let resident_bytes = bytes(seconds) as u64;
-            Sample { seconds, resident_bytes, evicted: u64::from(ix >= 100), ..Sample::default() }
+            Sample {
+                seconds,
+                resident_bytes,
+                evicted: u64::from(ix >= 100),
+                ..Sample::default()
+            }
         };
         (0..n).map(sample).collect()
     }
@@ -152,11 +184,22 @@ mod tests {
     #[test]
     fn growth_starts_at_full_store_and_ignores_jumps() {
         let growing = |seconds: f64| {
-            let jump = if (1000.0..1010.0).contains(&seconds) { 5e8 } else { 0.0 };
-            if seconds < 150.0 { 1e7 * seconds } else { 2e9 + 1e8 * seconds / 3600.0 + jump }
+            let jump = if (1000.0..1010.0).contains(&seconds) {
+                5e8
+            } else {
+                0.0
+            };
+            if seconds < 150.0 {
+                1e7 * seconds
+            } else {
+                2e9 + 1e8 * seconds / 3600.0 + jump
+            }
         };
         let growth = Growth::of(&samples(3600, growing), Excluded::Model).expect("an hour");
-        assert!(growth.store_was_full && growth.from_seconds == 160.0 && growth.to_seconds == 3599.0, "{growth:?}");
+        assert!(
+            growth.store_was_full && growth.from_seconds == 160.0 && growth.to_seconds == 3599.0,
+            "{growth:?}"
+        );
         assert!((growth.bytes_per_hour - 1e8).abs() < 1e6, "{growth:?}");
         assert!((growth.percent_per_hour - 4.9).abs() < 0.1, "{growth:?}");
     }
@@ -167,7 +210,11 @@ mod tests {
         for sample in &mut with_model {
             sample.model_bytes = sample.resident_bytes - 1_000_000_000;
         }
-        let rate = |samples: &[Sample], excluded| Growth::of(samples, excluded).expect("long enough").bytes_per_hour;
+        let rate = |samples: &[Sample], excluded| {
+            Growth::of(samples, excluded)
+                .expect("long enough")
+                .bytes_per_hour
+        };
         assert!(rate(&with_model, Excluded::Model).abs() < 1.0);
         assert!((rate(&with_model, Excluded::Nothing) - 3.6e9).abs() < 1e6);
         for sample in &mut with_model {
@@ -182,7 +229,10 @@ mod tests {
         let mut never_full = samples(400, |_| 1e9);
         never_full.iter_mut().for_each(|sample| sample.evicted = 0);
         let growth = Growth::of(&never_full, Excluded::Model).expect("long enough");
-        assert!(!growth.store_was_full && growth.from_seconds == 200.0, "{growth:?}");
+        assert!(
+            !growth.store_was_full && growth.from_seconds == 200.0,
+            "{growth:?}"
+        );
         assert_eq!(
             Growth::of(&samples(200, |_| 1e9), Excluded::Model),
             None,
@@ -197,8 +247,15 @@ mod tests {
         // Far more than concurrent tests free at the same time.
         let held = vec![1u8; 512 << 20];
         let (now, peak) = resident_bytes().expect("Linux");
-        assert!(now >= before + (384 << 20) && peak >= now, "{before} {now} {peak} {}", held.len());
-        assert_eq!(kilobytes("VmHWM:\t  2048 kB\nVmRSS:\t  1024 kB\n", "VmRSS:"), Some(1024));
+        assert!(
+            now >= before + (384 << 20) && peak >= now,
+            "{before} {now} {peak} {}",
+            held.len()
+        );
+        assert_eq!(
+            kilobytes("VmHWM:\t  2048 kB\nVmRSS:\t  1024 kB\n", "VmRSS:"),
+            Some(1024)
+        );
         assert_eq!(kilobytes("VmRSS: some", "VmRSS:"), None);
     }
 }

@@ -24,12 +24,25 @@ const DEFAULTS: Defaults = Defaults {
     n_splats: &[100_000, 300_000, 1_000_000, 3_000_000],
     n_repeats: 30,
 };
-/// Defaults on the CPU, which is about a thousand times slower than a GPU and supports only smaller buffers.
-const DEFAULTS_ON_CPU: Defaults = Defaults { sizes_px: &[[320, 240]], n_splats: &[10_000, 30_000], n_repeats: 3 };
+/// Defaults on the CPU, which is about a thousand times slower than a GPU and supports only smaller
+/// buffers.
+const DEFAULTS_ON_CPU: Defaults = Defaults {
+    sizes_px: &[[320, 240]],
+    n_splats: &[10_000, 30_000],
+    n_repeats: 3,
+};
 /// Defaults of [`KernelsOptions::scan`].
-const SCAN_DEFAULTS: Defaults = Defaults { sizes_px: &[[640, 480]], n_splats: &[400_000], n_repeats: 30 };
+const SCAN_DEFAULTS: Defaults = Defaults {
+    sizes_px: &[[640, 480]],
+    n_splats: &[400_000],
+    n_repeats: 30,
+};
 /// Defaults on the CPU, with as many splats per pixel as on a GPU.
-const SCAN_DEFAULTS_ON_CPU: Defaults = Defaults { sizes_px: &[[160, 120]], n_splats: &[25_000], n_repeats: 3 };
+const SCAN_DEFAULTS_ON_CPU: Defaults = Defaults {
+    sizes_px: &[[160, 120]],
+    n_splats: &[25_000],
+    n_repeats: 3,
+};
 
 /// Options of [`measure`].
 #[derive(Clone, Debug)]
@@ -40,12 +53,13 @@ pub struct KernelsOptions {
     pub sizes_px: Vec<[u32; 2]>,
     /// Numbers of splats of the synthetic cloud; the defaults if empty.
     pub n_splats: Vec<u32>,
-    /// Number of timed images and steps, of which the median is reported. If `None`: 30, or 3 on the CPU.
+    /// Number of timed images and steps, of which the median is reported. If `None`: 30, or 3 on
+    /// the CPU.
     pub n_repeats: Option<u32>,
     /// Whether the camera is inside the cloud, so that only some of the splats are visible.
     pub inside: bool,
-    /// Whether to measure a step like those of a scan with depth: its splats are distributed unevenly, and the loss
-    /// includes D-SSIM and depth. Without `cloud` and `inside`.
+    /// Whether to measure a step like those of a scan with depth: its splats are distributed
+    /// unevenly, and the loss includes D-SSIM and depth. Without `cloud` and `inside`.
     pub scan: bool,
     /// Whether to report the GPU time of each pass.
     pub profile: bool,
@@ -89,14 +103,31 @@ pub fn measure<E: From<Error>>(
         (true, false) => SCAN_DEFAULTS,
         (true, true) => SCAN_DEFAULTS_ON_CPU,
     };
-    let sizes_px = if options.sizes_px.is_empty() { defaults.sizes_px } else { &options.sizes_px };
-    let splat_counts = if options.n_splats.is_empty() { defaults.n_splats } else { &options.n_splats };
+    let sizes_px = if options.sizes_px.is_empty() {
+        defaults.sizes_px
+    } else {
+        &options.sizes_px
+    };
+    let splat_counts = if options.n_splats.is_empty() {
+        defaults.n_splats
+    } else {
+        &options.n_splats
+    };
     let counts = given.as_ref().map_or_else(
-        || splat_counts.iter().map(|n_splats| *n_splats as usize).collect(),
+        || {
+            splat_counts
+                .iter()
+                .map(|n_splats| *n_splats as usize)
+                .collect()
+        },
         |cloud| vec![cloud.n_splats()],
     );
     let n_repeats = options.n_repeats.unwrap_or(defaults.n_repeats) as usize;
-    let eye = if options.inside { Eye::Inside } else { Eye::Outside };
+    let eye = if options.inside {
+        Eye::Inside
+    } else {
+        Eye::Outside
+    };
     let (losses, generate): (_, fn(usize, u64) -> SplatArrays) = match options.scan {
         true => (Losses::Training, scan_cloud),
         false => (Losses::L1, synthetic_cloud),
@@ -122,13 +153,22 @@ pub fn measure<E: From<Error>>(
                 n_timed: n_repeats,
                 n_consecutive: 3 * n_repeats,
             };
-            let setup = KernelSetup { size_px: *size_px, eye, losses };
+            let setup = KernelSetup {
+                size_px: *size_px,
+                eye,
+                losses,
+            };
             let figures = time_kernels(&gpu, cloud, setup, repeats).with_context(|| {
                 let [width, height] = size_px;
                 format!("{width}x{height} pixels and {n_splats} splats: try fewer --splats or a smaller --size")
             })?;
             let passes = profile(&figures.passes, options.profile);
-            on_row(&KernelsRow { size_px: *size_px, n_splats: *n_splats, figures, passes })?;
+            on_row(&KernelsRow {
+                size_px: *size_px,
+                n_splats: *n_splats,
+                figures,
+                passes,
+            })?;
         }
     }
     Ok(())
@@ -136,5 +176,9 @@ pub fn measure<E: From<Error>>(
 
 /// Names and milliseconds of the passes, if requested.
 pub(crate) fn profile(passes: &[PassTiming], is_requested: bool) -> Vec<(&'static str, f64)> {
-    if is_requested { passes.iter().map(|pass| (pass.name, pass.millis)).collect() } else { Vec::new() }
+    if is_requested {
+        passes.iter().map(|pass| (pass.name, pass.millis)).collect()
+    } else {
+        Vec::new()
+    }
 }

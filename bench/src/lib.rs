@@ -1,9 +1,11 @@
-//! The experiments of `fieldrig bench`: they train many models, or measure a part of the program, and draw charts.
+//! The experiments of `fieldrig bench`: they train many models, or measure a part of the program,
+//! and draw charts.
 //!
-//! [`curve`], [`budget`], [`ablation`] and [`stability`] train models. They save each finished run to a file, so that a
-//! bench restarted in the same folder does not repeat it. [`kernels`] and [`field`] measure training speed, [`stamps`]
-//! the errors of image stamps, [`calibration`] the accuracy of calibration, [`live`] a live run with viewers, and [`memory`] the memory of a long run. The results
-//! are [`Findings`]: JSON with every number, charts, and a page.
+//! [`curve`], [`budget`], [`ablation`] and [`stability`] train models. They save each finished run
+//! to a file, so that a bench restarted in the same folder does not repeat it. [`kernels`] and
+//! [`field`] measure training speed, [`stamps`] the errors of image stamps, [`calibration`] the
+//! accuracy of calibration, [`live`] a live run with viewers, and [`memory`] the memory of a long
+//! run. The results are [`Findings`]: JSON with every number, charts, and a page.
 //!
 //! The caller opens the GPU, requests stops and receives reports ([`Host`], [`BenchObserver`]).
 //!
@@ -54,7 +56,9 @@ pub use findings::{BenchResult, Findings};
 pub use growth::{Excluded, Growth, Sample, resident_bytes};
 pub use live_disturbance::LiveDisturbance;
 pub use over_time::{Bucket, OverTime, Timeline, Trend};
-pub use runs::{BenchObserver, Disturbed, Host, Run, RunReport, RunScores, RunSettings, RunsOptions};
+pub use runs::{
+    BenchObserver, Disturbed, Host, Run, RunReport, RunScores, RunSettings, RunsOptions,
+};
 // Errors of benches come from sessions and files, so benches use the error type of `session`.
 pub use session::{Error, Result};
 pub use viewer::{ReceivedPicture, Viewer, ViewerOptions};

@@ -1,7 +1,8 @@
-//! Measures a live run: latency of pictures and keyframes, training speed, and accuracy over time, with correct and
-//! wrong calibration.
+//! Measures a live run: latency of pictures and keyframes, training speed, and accuracy over time,
+//! with correct and wrong calibration.
 //!
-//! All times are on the clock of this process, from mid-exposure of an image to the arrival of a picture at its viewer.
+//! All times are on the clock of this process, from mid-exposure of an image to the arrival of a
+//! picture at its viewer.
 
 use crate::findings::Findings;
 use crate::live_disturbance::LiveDisturbance;
@@ -42,7 +43,11 @@ impl HandEyeError {
         let rotation = UnitQuaternion::from_axis_angle(&direction(), self.degrees.to_radians());
         let translation = direction().into_inner() * self.millimeters * 1e-3;
         let error = Transform::from_parts(translation.into(), rotation);
-        for camera in rig.cameras.iter_mut().filter(|camera| camera.parent == Parent::Flange) {
+        for camera in rig
+            .cameras
+            .iter_mut()
+            .filter(|camera| camera.parent == Parent::Flange)
+        {
             camera.parent_from_camera *= error;
         }
     }
@@ -50,7 +55,11 @@ impl HandEyeError {
 
 impl fmt::Display for HandEyeError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "hand-eye off by {} degrees, {} mm (seed {})", self.degrees, self.millimeters, self.seed)
+        write!(
+            f,
+            "hand-eye off by {} degrees, {} mm (seed {})",
+            self.degrees, self.millimeters, self.seed
+        )
     }
 }
 
@@ -68,8 +77,10 @@ pub struct Conditions {
 impl fmt::Display for Conditions {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(&counted(self.n_viewers, "viewer"))?;
-        self.hand_eye_error.map_or(Ok(()), |error| write!(f, ", {error}"))?;
-        self.disturbance.map_or(Ok(()), |disturbance| write!(f, ", {disturbance}"))
+        self.hand_eye_error
+            .map_or(Ok(()), |error| write!(f, ", {error}"))?;
+        self.disturbance
+            .map_or(Ok(()), |disturbance| write!(f, ", {disturbance}"))
     }
 }
 
@@ -122,7 +133,10 @@ impl InputCounts {
             images: counts.images,
             dropped_images: counts.device_skipped,
             range_scans: counts.range_scans,
-            stations: input_result.stations.as_ref().map_or(0, |stations| stations.reports().len()),
+            stations: input_result
+                .stations
+                .as_ref()
+                .map_or(0, |stations| stations.reports().len()),
         }
     }
 }
@@ -130,7 +144,12 @@ impl InputCounts {
 impl LiveRun {
     /// Collects the measurements of a run that is over, except for the counts of its input.
     #[must_use]
-    pub fn of(conditions: Conditions, live: &Live, viewers: &[Viewer], timeline: &Timeline) -> Self {
+    pub fn of(
+        conditions: Conditions,
+        live: &Live,
+        viewers: &[Viewer],
+        timeline: &Timeline,
+    ) -> Self {
         let session = &live.sessions()[0];
         let (progress, seconds) = (session.progress(), session.secs());
         let pictures: Vec<Vec<ReceivedPicture>> = viewers.iter().map(Viewer::pictures).collect();
@@ -150,7 +169,9 @@ impl LiveRun {
             psnr_per_camera: session
                 .evaluations()
                 .last()
-                .map_or(BTreeMap::new(), |evaluation| evaluation.scores.psnr_per_camera.clone()),
+                .map_or(BTreeMap::new(), |evaluation| {
+                    evaluation.scores.psnr_per_camera.clone()
+                }),
             over_time: timeline.over_time(&pictures),
             input: InputCounts::default(),
         }
@@ -159,25 +180,41 @@ impl LiveRun {
     /// A duration by name.
     #[must_use]
     pub fn latency(&self, name: &str) -> Option<Latency> {
-        self.latencies.iter().find(|(known, _)| *known == name).map(|(_, latency)| *latency)
+        self.latencies
+            .iter()
+            .find(|(known, _)| *known == name)
+            .map(|(_, latency)| *latency)
     }
 }
 
-/// Latencies of all pictures, and of all keyframes until the first viewer receives them in a picture. With several
-/// cameras, also the latencies of each camera up to the model.
-fn latencies(pictures: &[Vec<ReceivedPicture>], keyframes: &[KeyframeTimes]) -> Vec<(String, Latency)> {
-    let of_pictures =
-        |name, millis: fn(&ReceivedPicture) -> f64| (name, Latency::of(pictures.iter().flatten().map(millis)));
+/// Latencies of all pictures, and of all keyframes until the first viewer receives them in a
+/// picture. With several cameras, also the latencies of each camera up to the model.
+fn latencies(
+    pictures: &[Vec<ReceivedPicture>],
+    keyframes: &[KeyframeTimes],
+) -> Vec<(String, Latency)> {
+    let of_pictures = |name, millis: fn(&ReceivedPicture) -> f64| {
+        (name, Latency::of(pictures.iter().flatten().map(millis)))
+    };
     let cameras: BTreeSet<&str> = keyframes.iter().map(|keyframe| &*keyframe.camera).collect();
     let of_camera = |camera: &&str| {
-        let keyframes = keyframes.iter().filter(|keyframe| *keyframe.camera == **camera);
-        let pushed = Latency::of(keyframes.filter_map(|keyframe| keyframe.millis_until(keyframe.pushed)));
+        let keyframes = keyframes
+            .iter()
+            .filter(|keyframe| *keyframe.camera == **camera);
+        let pushed =
+            Latency::of(keyframes.filter_map(|keyframe| keyframe.millis_until(keyframe.pushed)));
         Some((format!("shutter to model, camera {camera}"), pushed?))
     };
-    let to_picture = pictures.first().and_then(|pictures| Latency::of(shutter_to_picture(pictures, keyframes)));
+    let to_picture = pictures
+        .first()
+        .and_then(|pictures| Latency::of(shutter_to_picture(pictures, keyframes)));
     let named = [
-        of_pictures("request to complete picture", |picture| millis(picture.complete - picture.requested)),
-        of_pictures("request to first stage", |picture| millis(picture.first_stage - picture.requested)),
+        of_pictures("request to complete picture", |picture| {
+            millis(picture.complete - picture.requested)
+        }),
+        of_pictures("request to first stage", |picture| {
+            millis(picture.first_stage - picture.requested)
+        }),
         of_pictures("picture: waiting", |picture| picture.waited_millis),
         of_pictures("picture: rendering", |picture| picture.render_millis),
         of_pictures("picture: encoding", |picture| picture.encode_millis),
@@ -186,17 +223,26 @@ fn latencies(pictures: &[Vec<ReceivedPicture>], keyframes: &[KeyframeTimes]) -> 
             (millis(picture.complete - picture.requested) - on_server).max(0.0)
         }),
     ];
-    let named = named.into_iter().filter_map(|(name, latency)| Some((name.to_owned(), latency?)));
+    let named = named
+        .into_iter()
+        .filter_map(|(name, latency)| Some((name.to_owned(), latency?)));
     let mut since_shutter = session::latencies(keyframes);
-    let shown_at = since_shutter.iter().position(|(name, _)| name == SHOWN).unwrap_or(since_shutter.len());
+    let shown_at = since_shutter
+        .iter()
+        .position(|(name, _)| name == SHOWN)
+        .unwrap_or(since_shutter.len());
     if let Some(to_picture) = to_picture {
         since_shutter.insert(shown_at, ("shutter to picture".to_owned(), to_picture));
     }
-    let of_cameras = cameras.iter().filter_map(of_camera).filter(|_| cameras.len() > 1);
+    let of_cameras = cameras
+        .iter()
+        .filter_map(of_camera)
+        .filter(|_| cameras.len() > 1);
     named.chain(since_shutter).chain(of_cameras).collect()
 }
 
-/// For each keyframe, the time from mid-exposure to the arrival of the first picture that contains it, milliseconds.
+/// For each keyframe, the time from mid-exposure to the arrival of the first picture that contains
+/// it, milliseconds.
 fn shutter_to_picture<'a>(
     pictures: &'a [ReceivedPicture],
     keyframes: &'a [KeyframeTimes],
@@ -220,7 +266,12 @@ fn millis(duration: Duration) -> f64 {
 pub fn findings(input: &str, runs: &[LiveRun]) -> Findings {
     let mut rows: Vec<Vec<String>> = Vec::new();
     let mut add = |name: &str, value: &dyn Fn(&LiveRun) -> String| {
-        rows.push([name.to_owned()].into_iter().chain(runs.iter().map(value)).collect());
+        rows.push(
+            [name.to_owned()]
+                .into_iter()
+                .chain(runs.iter().map(value))
+                .collect(),
+        );
     };
     let mut names: Vec<&str> = Vec::new();
     for (name, _) in runs.iter().flat_map(|run| &run.latencies) {
@@ -230,15 +281,21 @@ pub fn findings(input: &str, runs: &[LiveRun]) -> Findings {
     }
     for name in names {
         add(&format!("{name}, ms"), &|run| {
-            run.latency(name).map_or(String::new(), |latency| format!("{:.1} / {:.1}", latency.p50, latency.p99))
+            run.latency(name).map_or(String::new(), |latency| {
+                format!("{:.1} / {:.1}", latency.p50, latency.p99)
+            })
         });
     }
-    add("training steps per second", &|run| format!("{:.1}", run.steps_per_sec));
+    add("training steps per second", &|run| {
+        format!("{:.1}", run.steps_per_sec)
+    });
     add("primitives", &|run| run.primitives.to_string());
     add("keyframes", &|run| run.keyframes.to_string());
     let is_any = |count: fn(&InputCounts) -> bool| runs.iter().any(|run| count(&run.input));
     if is_any(|input| input.dropped_images > 0) {
-        add("images dropped", &|run| run.input.dropped_images.to_string());
+        add("images dropped", &|run| {
+            run.input.dropped_images.to_string()
+        });
     }
     if is_any(|input| input.range_scans > 0) {
         add("range scans", &|run| run.input.range_scans.to_string());
@@ -246,29 +303,57 @@ pub fn findings(input: &str, runs: &[LiveRun]) -> Findings {
     if is_any(|input| input.stations > 0) {
         add("stations registered", &|run| run.input.stations.to_string());
     }
-    let marks = runs.iter().map(|run| &run.psnr).max_by_key(|psnr| psnr.len());
+    let marks = runs
+        .iter()
+        .map(|run| &run.psnr)
+        .max_by_key(|psnr| psnr.len());
     for (ix, (seconds, _)) in marks.into_iter().flatten().enumerate() {
         add(&format!("test PSNR at {seconds:.1} s, dB"), &|run| {
-            run.psnr.get(ix).map_or(String::new(), |(_, psnr)| format!("{psnr:.2}"))
+            run.psnr
+                .get(ix)
+                .map_or(String::new(), |(_, psnr)| format!("{psnr:.2}"))
         });
     }
-    let cameras: BTreeSet<&String> = runs.iter().flat_map(|run| run.psnr_per_camera.keys()).collect();
+    let cameras: BTreeSet<&String> = runs
+        .iter()
+        .flat_map(|run| run.psnr_per_camera.keys())
+        .collect();
     for camera in cameras {
         add(&format!("last test PSNR, camera {camera}, dB"), &|run| {
-            run.psnr_per_camera.get(camera).map_or(String::new(), |psnr| format!("{psnr:.2}"))
+            run.psnr_per_camera
+                .get(camera)
+                .map_or(String::new(), |psnr| format!("{psnr:.2}"))
         });
     }
-    let head: Vec<String> =
-        ["quantity".to_owned()].into_iter().chain(runs.iter().map(|run| run.conditions.to_string())).collect();
-    let mut tables =
-        vec![Table { title: "Live run (durations: median / 99th percentile)".to_owned(), head: head.clone(), rows }];
+    let head: Vec<String> = ["quantity".to_owned()]
+        .into_iter()
+        .chain(runs.iter().map(|run| run.conditions.to_string()))
+        .collect();
+    let mut tables = vec![Table {
+        title: "Live run (durations: median / 99th percentile)".to_owned(),
+        head: head.clone(),
+        rows,
+    }];
     let rows = OverTime::rows(&runs.iter().map(|run| &run.over_time).collect::<Vec<_>>());
     if !rows.is_empty() {
-        tables.push(Table { title: "Second half of the run: median and change per hour".to_owned(), head, rows });
+        tables.push(Table {
+            title: "Second half of the run: median and change per hour".to_owned(),
+            head,
+            rows,
+        });
     }
     let line = |run: &LiveRun| Line {
         label: run.conditions.to_string(),
-        points: run.psnr.iter().map(|&(x, y)| Point { x, y, low: y, high: y }).collect(),
+        points: run
+            .psnr
+            .iter()
+            .map(|&(x, y)| Point {
+                x,
+                y,
+                low: y,
+                high: y,
+            })
+            .collect(),
         is_peer: false,
     };
     let mut charts = vec![(
@@ -276,22 +361,41 @@ pub fn findings(input: &str, runs: &[LiveRun]) -> Findings {
         Chart {
             title: "Accuracy of a live run".to_owned(),
             subtitle: input.to_owned(),
-            x: Axis { label: "seconds of training".to_owned(), scale: Scale::Log, ticks: Vec::new() },
-            y: Axis { label: "test PSNR, dB".to_owned(), scale: Scale::Linear, ticks: Vec::new() },
-            lines: runs.iter().map(line).filter(|line| !line.points.is_empty()).collect(),
+            x: Axis {
+                label: "seconds of training".to_owned(),
+                scale: Scale::Log,
+                ticks: Vec::new(),
+            },
+            y: Axis {
+                label: "test PSNR, dB".to_owned(),
+                scale: Scale::Linear,
+                ticks: Vec::new(),
+            },
+            lines: runs
+                .iter()
+                .map(line)
+                .filter(|line| !line.points.is_empty())
+                .collect(),
             thresholds: Vec::new(),
             markers: Vec::new(),
         },
     )];
     // The first run with viewers; without viewers, there is no latency.
-    let charted = runs.iter().rev().max_by_key(|run| run.over_time.trends.len());
+    let charted = runs
+        .iter()
+        .rev()
+        .max_by_key(|run| run.over_time.trends.len());
     if let Some(run) = charted.filter(|run| !run.over_time.trends.is_empty()) {
         charts.push((
             "-over-time",
             Chart {
                 title: "Live run over time".to_owned(),
                 subtitle: format!("{}: {input}", run.conditions),
-                x: Axis { label: "minutes of training".to_owned(), scale: Scale::Linear, ticks: Vec::new() },
+                x: Axis {
+                    label: "minutes of training".to_owned(),
+                    scale: Scale::Linear,
+                    ticks: Vec::new(),
+                },
                 y: Axis {
                     label: "% of the median in the second half".to_owned(),
                     scale: Scale::Linear,
@@ -333,7 +437,11 @@ mod tests {
         KeyframeTimes {
             camera: "wrist".into(),
             stamp: Stamp(0),
-            input: InputTimes { captured: Some(captured), arrived: at(captured, 5), queued: at(captured, 8) },
+            input: InputTimes {
+                captured: Some(captured),
+                arrived: at(captured, 5),
+                queued: at(captured, 8),
+            },
             pushed: at(captured, 12),
             pushed_at_steps: vec![0],
             trained: Some(at(captured, 20)),
@@ -342,7 +450,12 @@ mod tests {
         }
     }
 
-    fn picture(began: Instant, requested_millis: u64, complete_millis: u64, n_keyframes: u64) -> ReceivedPicture {
+    fn picture(
+        began: Instant,
+        requested_millis: u64,
+        complete_millis: u64,
+        n_keyframes: u64,
+    ) -> ReceivedPicture {
         ReceivedPicture {
             requested: at(began, requested_millis),
             first_stage: at(began, requested_millis + 1),
@@ -357,17 +470,48 @@ mod tests {
     #[test]
     fn latency_ends_at_the_first_picture_with_the_keyframe() {
         let began = Instant::now();
-        let keyframes = [keyframe(began, 0), keyframe(began, 10), keyframe(began, 100), keyframe(began, 200)];
-        let pictures = [picture(began, 0, 20, 0), picture(began, 20, 50, 2), picture(began, 50, 130, 3)];
+        let keyframes = [
+            keyframe(began, 0),
+            keyframe(began, 10),
+            keyframe(began, 100),
+            keyframe(began, 200),
+        ];
+        let pictures = [
+            picture(began, 0, 20, 0),
+            picture(began, 20, 50, 2),
+            picture(began, 50, 130, 3),
+        ];
         let seen: Vec<f64> = shutter_to_picture(&pictures, &keyframes).collect();
-        assert_eq!(seen.iter().map(|millis| millis.round()).collect::<Vec<_>>(), [50.0, 40.0, 30.0]);
+        assert_eq!(
+            seen.iter().map(|millis| millis.round()).collect::<Vec<_>>(),
+            [50.0, 40.0, 30.0]
+        );
         let latencies = latencies(&[pictures.to_vec()], &keyframes);
-        let p50 = |name: &str| latencies.iter().find(|(known, _)| *known == name).expect("measured").1.p50.round();
+        let p50 = |name: &str| {
+            latencies
+                .iter()
+                .find(|(known, _)| *known == name)
+                .expect("measured")
+                .1
+                .p50
+                .round()
+        };
         assert_eq!(p50("request to complete picture"), 30.0);
         assert_eq!(p50("picture: transfer"), 24.0);
-        assert_eq!(["shutter to arrival", "shutter to model", "shutter to first step"].map(p50), [5.0, 12.0, 20.0]);
+        assert_eq!(
+            [
+                "shutter to arrival",
+                "shutter to model",
+                "shutter to first step"
+            ]
+            .map(p50),
+            [5.0, 12.0, 20.0]
+        );
         let names: Vec<&str> = latencies.iter().map(|(name, _)| &**name).collect();
-        assert_eq!(names[names.len() - 3..], ["shutter to sent", "shutter to picture", "shutter to shown"]);
+        assert_eq!(
+            names[names.len() - 3..],
+            ["shutter to sent", "shutter to picture", "shutter to shown"]
+        );
         assert_eq!(["shutter to sent", SHOWN].map(p50), [24.0, 33.0]);
     }
 
@@ -376,12 +520,23 @@ mod tests {
         let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../rigs/static-arm.toml");
         let rig = Rig::load(&path, &[]).expect("a bundled rig file");
         let mut wrong = rig.clone();
-        HandEyeError { degrees: 1.0, millimeters: 5.0, seed: 3 }.apply(&mut wrong);
-        let error = rig.cameras[0].parent_from_camera.inverse() * wrong.cameras[0].parent_from_camera;
+        HandEyeError {
+            degrees: 1.0,
+            millimeters: 5.0,
+            seed: 3,
+        }
+        .apply(&mut wrong);
+        let error =
+            rig.cameras[0].parent_from_camera.inverse() * wrong.cameras[0].parent_from_camera;
         assert!((error.rotation.angle().to_degrees() - 1.0).abs() < 1e-9);
         assert!((error.translation.vector.norm() - 5e-3).abs() < 1e-12);
         let mut other = rig.clone();
-        HandEyeError { degrees: 1.0, millimeters: 5.0, seed: 4 }.apply(&mut other);
+        HandEyeError {
+            degrees: 1.0,
+            millimeters: 5.0,
+            seed: 4,
+        }
+        .apply(&mut other);
         assert_ne!(other, wrong);
     }
 }

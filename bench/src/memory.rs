@@ -16,7 +16,11 @@ use trainer::gpu::Gpu;
 /// Maximum number of points of a line in the chart.
 const MAX_POINTS: usize = 60;
 /// Labels of GPU buffers that hold images of keyframes.
-const IMAGE_BUFFERS: [&str; 3] = ["splat.target_image", "splat.target_depth", "splat.validation"];
+const IMAGE_BUFFERS: [&str; 3] = [
+    "splat.target_image",
+    "splat.target_depth",
+    "splat.validation",
+];
 /// Number of GPU buffers in the table, the largest first.
 const MAX_GPU_BUFFERS: usize = 12;
 const BYTES_PER_MB: f64 = 1e6;
@@ -59,17 +63,30 @@ impl MemoryRun {
         let samples = &self.samples;
         let growths: Vec<(&str, Growth)> = match self.is_software {
             true => {
-                vec![("without the model", Excluded::Model), ("without model and training buffers", Excluded::Training)]
+                vec![
+                    ("without the model", Excluded::Model),
+                    ("without model and training buffers", Excluded::Training),
+                ]
             }
             false => vec![("of the host", Excluded::Nothing)],
         }
         .into_iter()
         .filter_map(|(name, excluded)| Some((name, Growth::of(samples, excluded)?)))
         .collect();
-        let rate = growths.first().map_or("too short to measure a growth rate".to_owned(), |(name, growth)| {
-            let since = if growth.store_was_full { "with a full keyframe store" } else { "in the second half" };
-            format!("memory growth {name} {since}: {:+.2} % per hour", growth.percent_per_hour)
-        });
+        let rate = growths.first().map_or(
+            "too short to measure a growth rate".to_owned(),
+            |(name, growth)| {
+                let since = if growth.store_was_full {
+                    "with a full keyframe store"
+                } else {
+                    "in the second half"
+                };
+                format!(
+                    "memory growth {name} {since}: {:+.2} % per hour",
+                    growth.percent_per_hour
+                )
+            },
+        );
         let conditions = format!("{}, {}", self.input, counted(self.n_viewers, "viewer"));
         let lines: Vec<Line> = COMPONENTS
             .iter()
@@ -92,20 +109,32 @@ impl MemoryRun {
                 }
             }
             add("peak of resident memory", mb(resident_bytes()?.1 as f64));
-            add("keyframes", format!("{}, {} evicted", last.keyframes, last.evicted));
+            add(
+                "keyframes",
+                format!("{}, {} evicted", last.keyframes, last.evicted),
+            );
             add("steps", last.step.to_string());
             add("pictures for viewers", last.pictures.to_string());
         }
         for (name, growth) in &growths {
             let (from, to) = (growth.from_seconds, growth.to_seconds);
-            let of = format!("{} per hour, {:+.2} %", mb(growth.bytes_per_hour), growth.percent_per_hour);
+            let of = format!(
+                "{} per hour, {:+.2} %",
+                mb(growth.bytes_per_hour),
+                growth.percent_per_hour
+            );
             add(&format!("growth {name}, {from:.0} s to {to:.0} s"), of);
         }
-        let mut gpu_buffers: Vec<(&Arc<str>, u64)> =
-            self.gpu_buffers.iter().map(|(label, bytes)| (label, *bytes)).collect();
+        let mut gpu_buffers: Vec<(&Arc<str>, u64)> = self
+            .gpu_buffers
+            .iter()
+            .map(|(label, bytes)| (label, *bytes))
+            .collect();
         gpu_buffers.sort_by_key(|(_, bytes)| std::cmp::Reverse(*bytes));
-        let gpu_rows =
-            gpu_buffers.iter().take(MAX_GPU_BUFFERS).map(|(label, bytes)| vec![label.to_string(), mb(*bytes as f64)]);
+        let gpu_rows = gpu_buffers
+            .iter()
+            .take(MAX_GPU_BUFFERS)
+            .map(|(label, bytes)| vec![label.to_string(), mb(*bytes as f64)]);
         Ok(Findings {
             name: "memory",
             title: "Memory of a long run".to_owned(),
@@ -149,7 +178,11 @@ impl MemoryRun {
 }
 
 /// Memory of a run in progress, and its GPU buffers, bytes by label.
-pub(crate) fn sample(live: &Live, gpu: &Gpu, viewers: &[Viewer]) -> Result<(Sample, BTreeMap<Arc<str>, u64>)> {
+pub(crate) fn sample(
+    live: &Live,
+    gpu: &Gpu,
+    viewers: &[Viewer],
+) -> Result<(Sample, BTreeMap<Arc<str>, u64>)> {
     let gpu_buffers = gpu.live_bytes_by_label();
     let sessions = live.sessions();
     let sample = Sample {
@@ -157,13 +190,28 @@ pub(crate) fn sample(live: &Live, gpu: &Gpu, viewers: &[Viewer]) -> Result<(Samp
         resident_bytes: resident_bytes()?.0,
         gpu_bytes: gpu.live_bytes(),
         gpu_reserved_bytes: gpu.reserved_bytes(),
-        model_bytes: sessions.iter().map(|session| session.progress().bytes).sum(),
-        gpu_image_bytes: IMAGE_BUFFERS.iter().filter_map(|label| gpu_buffers.get(*label)).sum(),
-        keyframe_bytes: live.keyframes().iter().map(|keyframe| keyframe.bytes()).sum(),
+        model_bytes: sessions
+            .iter()
+            .map(|session| session.progress().bytes)
+            .sum(),
+        gpu_image_bytes: IMAGE_BUFFERS
+            .iter()
+            .filter_map(|label| gpu_buffers.get(*label))
+            .sum(),
+        keyframe_bytes: live
+            .keyframes()
+            .iter()
+            .map(|keyframe| keyframe.bytes())
+            .sum(),
         keyframes: live.keyframes().len(),
         evicted: live.n_evicted(),
-        step: sessions.first().map_or(0, |session| session.progress().step),
-        viewers: viewers.iter().filter(|viewer| viewer.is_connected()).count(),
+        step: sessions
+            .first()
+            .map_or(0, |session| session.progress().step),
+        viewers: viewers
+            .iter()
+            .filter(|viewer| viewer.is_connected())
+            .count(),
         pictures: viewers.iter().map(Viewer::n_pictures).sum(),
     };
     Ok((sample, gpu_buffers))
@@ -176,22 +224,48 @@ struct MemoryComponent {
 }
 
 const COMPONENTS: [MemoryComponent; 6] = [
-    MemoryComponent { label: "resident", bytes: |sample| Some(sample.resident_bytes) },
-    MemoryComponent { label: "GPU buffers", bytes: |sample| Some(sample.gpu_bytes) },
-    MemoryComponent { label: "keyframes on the host", bytes: |sample| Some(sample.keyframe_bytes) },
-    MemoryComponent { label: "model", bytes: |sample| Some(sample.model_bytes) },
-    MemoryComponent { label: "images on the GPU", bytes: |sample| Some(sample.gpu_image_bytes) },
-    MemoryComponent { label: "reserved for GPU buffers", bytes: |sample| sample.gpu_reserved_bytes },
+    MemoryComponent {
+        label: "resident",
+        bytes: |sample| Some(sample.resident_bytes),
+    },
+    MemoryComponent {
+        label: "GPU buffers",
+        bytes: |sample| Some(sample.gpu_bytes),
+    },
+    MemoryComponent {
+        label: "keyframes on the host",
+        bytes: |sample| Some(sample.keyframe_bytes),
+    },
+    MemoryComponent {
+        label: "model",
+        bytes: |sample| Some(sample.model_bytes),
+    },
+    MemoryComponent {
+        label: "images on the GPU",
+        bytes: |sample| Some(sample.gpu_image_bytes),
+    },
+    MemoryComponent {
+        label: "reserved for GPU buffers",
+        bytes: |sample| sample.gpu_reserved_bytes,
+    },
 ];
 
 /// The line of one component: median and range of each group of samples.
 fn line(component: &MemoryComponent, samples: &[Sample]) -> Line {
     let of_group = |group: &[Sample]| {
-        let mut mb: Vec<f64> =
-            group.iter().filter_map(component.bytes).map(|bytes| bytes as f64 / BYTES_PER_MB).collect();
+        let mut mb: Vec<f64> = group
+            .iter()
+            .filter_map(component.bytes)
+            .map(|bytes| bytes as f64 / BYTES_PER_MB)
+            .collect();
         let [low, high] = extent(&mb)?;
         let x = group[group.len() / 2].seconds / SECS_PER_MINUTE;
-        Some(Point { x, y: quantile(&mut mb, 0.5, Rank::Upper)?, low, high })
+        Some(Point {
+            x,
+            y: quantile(&mut mb, 0.5, Rank::Upper)?,
+            low,
+            high,
+        })
     };
     let n_each = samples.len().div_ceil(MAX_POINTS).max(1);
     Line {
@@ -218,24 +292,59 @@ mod tests {
         };
         let samples: Vec<Sample> = (0..600).map(sample).collect();
         let gpu_buffers = BTreeMap::from([("small".into(), 1), ("large".into(), 2)]);
-        let mut measured = MemoryRun { is_software: true, samples, gpu_buffers, ..MemoryRun::default() };
-        let of_host =
-            MemoryRun { is_software: false, ..MemoryRun { samples: measured.samples.clone(), ..MemoryRun::default() } };
+        let mut measured = MemoryRun {
+            is_software: true,
+            samples,
+            gpu_buffers,
+            ..MemoryRun::default()
+        };
+        let of_host = MemoryRun {
+            is_software: false,
+            ..MemoryRun {
+                samples: measured.samples.clone(),
+                ..MemoryRun::default()
+            }
+        };
         let of_host = of_host.findings().expect("numbers");
         assert!(
             of_host.sentences[0].contains("+3.59") && of_host.sentences[0].contains("host"),
             "{}",
             of_host.sentences[0]
         );
-        measured.samples.iter_mut().for_each(|sample| sample.model_bytes = sample.resident_bytes - 900_000_000);
+        measured
+            .samples
+            .iter_mut()
+            .for_each(|sample| sample.model_bytes = sample.resident_bytes - 900_000_000);
         let findings = measured.findings().expect("numbers");
-        assert!(findings.sentences[0].contains("without the model with a full"), "{}", findings.sentences[0]);
-        assert!(findings.sentences[0].contains("+0.00 % per hour"), "{}", findings.sentences[0]);
+        assert!(
+            findings.sentences[0].contains("without the model with a full"),
+            "{}",
+            findings.sentences[0]
+        );
+        assert!(
+            findings.sentences[0].contains("+0.00 % per hour"),
+            "{}",
+            findings.sentences[0]
+        );
         assert_eq!(findings.tables[1].rows[0][0], "large");
         let chart = &findings.charts[0].1;
-        assert_eq!(chart.lines.len(), 5, "no line for the unknown reserved memory");
-        assert!(chart.lines.iter().all(|line| line.points.len() <= MAX_POINTS), "{}", chart.lines[0].points.len());
+        assert_eq!(
+            chart.lines.len(),
+            5,
+            "no line for the unknown reserved memory"
+        );
+        assert!(
+            chart
+                .lines
+                .iter()
+                .all(|line| line.points.len() <= MAX_POINTS),
+            "{}",
+            chart.lines[0].points.len()
+        );
         assert_eq!(chart.markers[0].label, "store full: 100 keyframes");
-        assert_eq!(findings.numbers["samples"].as_array().map(Vec::len), Some(600));
+        assert_eq!(
+            findings.numbers["samples"].as_array().map(Vec::len),
+            Some(600)
+        );
     }
 }

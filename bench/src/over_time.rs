@@ -1,4 +1,5 @@
-//! Latency, accuracy, training speed and memory of a live run over time, and how they change per hour.
+//! Latency, accuracy, training speed and memory of a live run over time, and how they change per
+//! hour.
 
 use crate::growth::Excluded;
 use crate::memory;
@@ -41,12 +42,27 @@ impl Timeline {
     pub fn sample(&mut self, live: &Live, gpu: &Gpu, viewers: &[Viewer]) {
         let (at, session) = (Instant::now(), &live.sessions()[0]);
         let (seconds, step, psnr) = (session.secs(), session.progress().step, session.psnr());
-        let is_due = self.moments.last().is_none_or(|last| at - last.at >= SAMPLE_PERIOD);
+        let is_due = self
+            .moments
+            .last()
+            .is_none_or(|last| at - last.at >= SAMPLE_PERIOD);
         if is_due && seconds > 0.0 {
             // On a software adapter, the model and its working memory are in host memory, too.
-            let excluded = if gpu.is_software() { Excluded::Training } else { Excluded::Nothing };
-            let host_bytes = memory::sample(live, gpu, viewers).ok().map(|(sample, _)| excluded.bytes(&sample));
-            self.moments.push(Moment { at, seconds, step, psnr, host_bytes });
+            let excluded = if gpu.is_software() {
+                Excluded::Training
+            } else {
+                Excluded::Nothing
+            };
+            let host_bytes = memory::sample(live, gpu, viewers)
+                .ok()
+                .map(|(sample, _)| excluded.bytes(&sample));
+            self.moments.push(Moment {
+                at,
+                seconds,
+                step,
+                psnr,
+                host_bytes,
+            });
         }
     }
 
@@ -57,7 +73,12 @@ impl Timeline {
         let mut received: Vec<(Instant, f64)> = pictures
             .iter()
             .flatten()
-            .map(|picture| (picture.complete, (picture.complete - picture.requested).as_secs_f64() * 1e3))
+            .map(|picture| {
+                (
+                    picture.complete,
+                    (picture.complete - picture.requested).as_secs_f64() * 1e3,
+                )
+            })
             .collect();
         received.sort_by_key(|(complete, _)| *complete);
         let last_ix = self.moments.len().saturating_sub(1);
@@ -65,10 +86,15 @@ impl Timeline {
         let bucket = |from_ix: usize| {
             let moments = &self.moments[from_ix..=last_ix.min(from_ix + n_each)];
             let (from, to) = (moments[0], moments[moments.len() - 1]);
-            let [first, end] = [from, to].map(|moment| received.partition_point(|(complete, _)| *complete < moment.at));
-            let millis: Vec<f64> = received[first..end].iter().map(|(_, millis)| *millis).collect();
-            let median_of =
-                |value: fn(&Moment) -> Option<f64>| median(&moments.iter().filter_map(value).collect::<Vec<f64>>());
+            let [first, end] = [from, to]
+                .map(|moment| received.partition_point(|(complete, _)| *complete < moment.at));
+            let millis: Vec<f64> = received[first..end]
+                .iter()
+                .map(|(_, millis)| *millis)
+                .collect();
+            let median_of = |value: fn(&Moment) -> Option<f64>| {
+                median(&moments.iter().filter_map(value).collect::<Vec<f64>>())
+            };
             let elapsed_secs = (to.at - from.at).as_secs_f64();
             Bucket {
                 seconds: 0.5 * (from.seconds + to.seconds),
@@ -104,8 +130,8 @@ pub struct Bucket {
     pub psnr: Option<f64>,
     /// Training steps per second.
     pub steps_per_sec: f64,
-    /// Resident memory without the picture timings that the viewers of a benchmark store and, on a software adapter,
-    /// without the buffers of training; `None` if the system does not report it.
+    /// Resident memory without the picture timings that the viewers of a benchmark store and, on a
+    /// software adapter, without the buffers of training; `None` if the system does not report it.
     pub host_mb: Option<f64>,
 }
 
@@ -125,7 +151,11 @@ impl Trend {
     fn of(points: &[(f64, f64)]) -> Option<Self> {
         let median = median(&points.iter().map(|(_, value)| *value).collect::<Vec<_>>())?;
         let per_hour = theil_sen(points)? * SECS_PER_HOUR;
-        Some(Self { median, per_hour, percent_per_hour: 100.0 * per_hour / median })
+        Some(Self {
+            median,
+            per_hour,
+            percent_per_hour: 100.0 * per_hour / median,
+        })
     }
 }
 
@@ -145,32 +175,64 @@ struct Quantity {
 }
 
 const QUANTITIES: [Quantity; 4] = [
-    Quantity { name: "request to complete picture, ms", n_decimals: 1, value: |bucket| bucket.picture_millis },
-    Quantity { name: "test PSNR, dB", n_decimals: 2, value: |bucket| bucket.psnr },
-    Quantity { name: "training steps per second", n_decimals: 1, value: |bucket| Some(bucket.steps_per_sec) },
-    Quantity { name: "host memory, MB", n_decimals: 1, value: |bucket| bucket.host_mb },
+    Quantity {
+        name: "request to complete picture, ms",
+        n_decimals: 1,
+        value: |bucket| bucket.picture_millis,
+    },
+    Quantity {
+        name: "test PSNR, dB",
+        n_decimals: 2,
+        value: |bucket| bucket.psnr,
+    },
+    Quantity {
+        name: "training steps per second",
+        n_decimals: 1,
+        value: |bucket| Some(bucket.steps_per_sec),
+    },
+    Quantity {
+        name: "host memory, MB",
+        n_decimals: 1,
+        value: |bucket| bucket.host_mb,
+    },
 ];
 
 impl Quantity {
     /// Seconds and values.
     fn points(&self, buckets: &[Bucket]) -> Vec<(f64, f64)> {
-        buckets.iter().filter_map(|bucket| Some((bucket.seconds, (self.value)(bucket)?))).collect()
+        buckets
+            .iter()
+            .filter_map(|bucket| Some((bucket.seconds, (self.value)(bucket)?)))
+            .collect()
     }
 }
 
 impl OverTime {
-    /// Rows of a table: a quantity, and its median and change in each of the runs. Empty if all runs are short.
+    /// Rows of a table: a quantity, and its median and change in each of the runs. Empty if all
+    /// runs are short.
     pub(crate) fn rows(runs: &[&Self]) -> Vec<Vec<String>> {
-        let cell = |run: &Self, Quantity { name, n_decimals, .. }: &Quantity| {
+        let cell = |run: &Self,
+                    Quantity {
+                        name, n_decimals, ..
+                    }: &Quantity| {
             let (_, trend) = run.trends.iter().find(|(known, _)| known == name)?;
-            let Trend { median, per_hour, percent_per_hour } = trend;
-            Some(format!("{median:.n_decimals$}, {per_hour:+.n_decimals$} per hour ({percent_per_hour:+.1} %)"))
+            let Trend {
+                median,
+                per_hour,
+                percent_per_hour,
+            } = trend;
+            Some(format!(
+                "{median:.n_decimals$}, {per_hour:+.n_decimals$} per hour ({percent_per_hour:+.1} %)"
+            ))
         };
         let row = |quantity: &Quantity| {
             let cells: Vec<Option<String>> = runs.iter().map(|run| cell(run, quantity)).collect();
             cells.iter().any(Option::is_some).then(|| {
                 let cells = cells.into_iter().map(Option::unwrap_or_default);
-                [quantity.name.to_owned()].into_iter().chain(cells).collect()
+                [quantity.name.to_owned()]
+                    .into_iter()
+                    .chain(cells)
+                    .collect()
             })
         };
         QUANTITIES.iter().filter_map(row).collect()
@@ -182,11 +244,27 @@ impl OverTime {
             let quantity = QUANTITIES.iter().find(|quantity| quantity.name == *name)?;
             let point = |(seconds, value): (f64, f64)| {
                 let y = 100.0 * value / trend.median;
-                Point { x: seconds / 60.0, y, low: y, high: y }
+                Point {
+                    x: seconds / 60.0,
+                    y,
+                    low: y,
+                    high: y,
+                }
             };
-            let label = name.split_once(',').map_or(*name, |(label, _)| label).to_owned();
-            let points = quantity.points(&self.buckets).into_iter().map(point).collect();
-            Some(Line { label, points, is_peer: false })
+            let label = name
+                .split_once(',')
+                .map_or(*name, |(label, _)| label)
+                .to_owned();
+            let points = quantity
+                .points(&self.buckets)
+                .into_iter()
+                .map(point)
+                .collect();
+            Some(Line {
+                label,
+                points,
+                is_peer: false,
+            })
         };
         self.trends.iter().filter_map(line).collect()
     }
@@ -196,8 +274,8 @@ impl OverTime {
 mod tests {
     use super::*;
 
-    /// A run of `n` seconds whose memory grows by 36 MB per hour, with ten pictures per second of 20 ms at the start and
-    /// 10 ms more per hour.
+    /// A run of `n` seconds whose memory grows by 36 MB per hour, with ten pictures per second of
+    /// 20 ms at the start and 10 ms more per hour.
     fn over_time(n: u32) -> OverTime {
         let began = Instant::now();
         let moment = |ix: u32| Moment {
@@ -223,21 +301,51 @@ mod tests {
         };
         // The first picture is requested before the first sample.
         let pictures: Vec<ReceivedPicture> = (1..10 * n).map(picture).collect();
-        Timeline { moments: (0..=n).map(moment).collect() }.over_time(&[pictures])
+        Timeline {
+            moments: (0..=n).map(moment).collect(),
+        }
+        .over_time(&[pictures])
     }
 
     #[test]
     fn trends_are_those_of_the_second_half() {
         let run = over_time(540);
         assert_eq!(run.buckets.len(), MAX_BUCKETS);
-        let trend = |name: &str| run.trends.iter().find(|(known, _)| known.starts_with(name)).expect("measured").1;
-        assert!((trend("request").per_hour - 10.0).abs() < 0.1, "{:?}", trend("request"));
-        assert!((trend("request").median - 21.1).abs() < 0.1, "{:?}", trend("request"));
-        assert_eq!((trend("test PSNR").median, trend("test PSNR").per_hour), (30.0, 0.0));
-        assert!((trend("training").median - 50.0).abs() < 1e-9 && trend("training").per_hour.abs() < 1e-6);
-        assert!((trend("host memory").per_hour - 36.0).abs() < 0.1, "{:?}", trend("host memory"));
+        let trend = |name: &str| {
+            run.trends
+                .iter()
+                .find(|(known, _)| known.starts_with(name))
+                .expect("measured")
+                .1
+        };
+        assert!(
+            (trend("request").per_hour - 10.0).abs() < 0.1,
+            "{:?}",
+            trend("request")
+        );
+        assert!(
+            (trend("request").median - 21.1).abs() < 0.1,
+            "{:?}",
+            trend("request")
+        );
+        assert_eq!(
+            (trend("test PSNR").median, trend("test PSNR").per_hour),
+            (30.0, 0.0)
+        );
+        assert!(
+            (trend("training").median - 50.0).abs() < 1e-9
+                && trend("training").per_hour.abs() < 1e-6
+        );
+        assert!(
+            (trend("host memory").per_hour - 36.0).abs() < 0.1,
+            "{:?}",
+            trend("host memory")
+        );
         let rows = OverTime::rows(&[&run, &over_time(20)]);
-        assert_eq!(rows[1], ["test PSNR, dB", "30.00, +0.00 per hour (+0.0 %)", ""]);
+        assert_eq!(
+            rows[1],
+            ["test PSNR, dB", "30.00, +0.00 per hour (+0.0 %)", ""]
+        );
         assert_eq!((rows.len(), run.lines().len()), (4, 4));
         assert_eq!(run.lines()[3].label, "host memory");
         assert!(run.buckets[0].psnr.is_none() && run.buckets[1].psnr.is_some());
@@ -248,7 +356,11 @@ mod tests {
         for n_secs in [0, 1, 90] {
             let run = over_time(n_secs);
             assert_eq!(run.buckets.is_empty(), n_secs == 0);
-            assert!(run.trends.is_empty() && run.lines().is_empty() && OverTime::rows(&[&run]).is_empty());
+            assert!(
+                run.trends.is_empty()
+                    && run.lines().is_empty()
+                    && OverTime::rows(&[&run]).is_empty()
+            );
         }
         assert_eq!(over_time(120).trends.len(), 4);
     }

@@ -1,5 +1,5 @@
-//! The runs of a bench. Each run is trained once and saved to a file, so that a bench restarted in the same folder does
-//! not repeat it.
+//! The runs of a bench. Each run is trained once and saved to a file, so that a bench restarted in
+//! the same folder does not repeat it.
 
 use crate::{Error, Result};
 use capture::Stop;
@@ -10,8 +10,8 @@ use session::Context;
 use session::methods::MAX_SPLATS;
 use session::run_folder::{self, CreatedFolders};
 use session::{
-    Data, DataOptions, Evaluation, Evaluator, Evaluators, Limits, Observer, OpenGpu, Purpose, ReadProgress,
-    TrainingOptions, TrainingOutcome, TrainingPlan, ignore_progress,
+    Data, DataOptions, Evaluation, Evaluator, Evaluators, Limits, Observer, OpenGpu, Purpose,
+    ReadProgress, TrainingOptions, TrainingOutcome, TrainingPlan, ignore_progress,
 };
 use std::collections::HashSet;
 use std::path::{Path, PathBuf};
@@ -47,7 +47,8 @@ pub struct Host<'a> {
 
 /// Receives the reports of a bench that trains, for example to print them.
 pub trait BenchObserver {
-    /// Returns a callback for the progress of reading one data set. The callback is dropped after the last image.
+    /// Returns a callback for the progress of reading one data set. The callback is dropped after
+    /// the last image.
     fn reading(&self) -> Box<dyn Fn(ReadProgress) + Sync>;
     /// Returns the observer of the training session of one run with these limits.
     fn training(&self, limits: Limits) -> Box<dyn Observer>;
@@ -183,9 +184,14 @@ impl Run {
     pub fn curve(&self) -> Vec<(f64, f64)> {
         /// Minimum ratio of the end to the last evaluation for the end to be a separate point.
         const MIN_SECONDS_RATIO: f64 = 1.02;
-        let is_new = self.evaluations.last().is_none_or(|last| self.end.seconds > MIN_SECONDS_RATIO * last.seconds);
+        let is_new = self
+            .evaluations
+            .last()
+            .is_none_or(|last| self.end.seconds > MIN_SECONDS_RATIO * last.seconds);
         let points = self.evaluations.iter().chain(is_new.then_some(&self.end));
-        points.filter_map(|point| Some((point.seconds, point.psnr?))).collect()
+        points
+            .filter_map(|point| Some((point.seconds, point.psnr?)))
+            .collect()
     }
 }
 
@@ -210,7 +216,8 @@ pub(crate) struct Job<'a> {
     pub(crate) variant: Option<String>,
     /// Returns the keyframes. Called only if the run is not saved yet.
     pub(crate) keyframes: &'a dyn Fn() -> Vec<Arc<Keyframe>>,
-    /// Whether scheduled evaluations compute all scores instead of PSNR only. The final evaluation computes all scores.
+    /// Whether scheduled evaluations compute all scores instead of PSNR only. The final evaluation
+    /// computes all scores.
     pub(crate) is_thorough: bool,
 }
 
@@ -255,13 +262,19 @@ impl NamedData {
         let wrong_method = || {
             let (data, methods) = (&self.name, self.methods());
             let needed = SplatOptions::METHOD;
-            Error::BadInput(format!("{data}: this bench needs the method {needed}, but the method is {methods}"))
+            Error::BadInput(format!(
+                "{data}: this bench needs the method {needed}, but the method is {methods}"
+            ))
         };
         options.ok_or_else(wrong_method)
     }
 
     fn methods(&self) -> String {
-        let kinds: Vec<ModelKind> = self.model_specs.iter().map(|model_spec| model_spec.kind).collect();
+        let kinds: Vec<ModelKind> = self
+            .model_specs
+            .iter()
+            .map(|model_spec| model_spec.kind)
+            .collect();
         session::methods::describe(&kinds)
     }
 }
@@ -282,9 +295,18 @@ impl<'a> Runs<'a> {
         let mut created = CreatedFolders::default();
         let out = created.make(options.out.as_deref())?;
         let runs = out.join(RUNS);
-        std::fs::create_dir_all(&runs).with_context(|| format!("cannot create the folder {}", runs.display()))?;
+        std::fs::create_dir_all(&runs)
+            .with_context(|| format!("cannot create the folder {}", runs.display()))?;
         log::info!("{}", gpu.describe());
-        Ok(Self { options, host, out, created, gpu, n_all: 0, n_done: 0 })
+        Ok(Self {
+            options,
+            host,
+            out,
+            created,
+            gpu,
+            n_all: 0,
+            n_done: 0,
+        })
     }
 
     /// The folder of the bench.
@@ -304,25 +326,45 @@ impl<'a> Runs<'a> {
 
     /// Loads data and chooses a name that is not in `used_names`.
     pub(crate) fn load(&self, path: &Path, used_names: &mut HashSet<String>) -> Result<NamedData> {
-        let RunsOptions { training, images, .. } = self.options;
+        let RunsOptions {
+            training, images, ..
+        } = self.options;
         session::check_before_data(training, path, images)?;
         let on_progress = self.host.observer.reading();
-        let data = Data::load(path, images, Purpose::Training, &training.overrides(), &on_progress)?;
+        let data = Data::load(
+            path,
+            images,
+            Purpose::Training,
+            &training.overrides(),
+            &on_progress,
+        )?;
         drop(on_progress);
         if data.of_split(Split::Test).is_empty() {
             let reason = "there are no test images, so nothing can be scored; see --holdout";
-            return Err(Error::InsufficientData(format!("{}: {reason}", path.display())));
+            return Err(Error::InsufficientData(format!(
+                "{}: {reason}",
+                path.display()
+            )));
         }
         let model_specs = session::model_specs(training, &data, None, self.gpu.is_software())?;
         let (name, initial_points) = (unique_name(path, used_names), data.initial_points());
-        Ok(NamedData { name, path: path.to_owned(), data, initial_points, model_specs })
+        Ok(NamedData {
+            name,
+            path: path.to_owned(),
+            data,
+            initial_points,
+            model_specs,
+        })
     }
 
     /// Returns the run of a job from its file. If there is none, trains the run and saves it.
     pub(crate) fn run(&mut self, job: Job<'_>) -> Result<Run> {
         self.n_done += 1;
         let settings = self.settings(&job);
-        let path = self.out.join(RUNS).join(format!("{}.json", file_name(&job.name)));
+        let path = self
+            .out
+            .join(RUNS)
+            .join(format!("{}.json", file_name(&job.name)));
         if path.exists() {
             let cached = read(&path)?;
             if let Some(difference) = difference(&cached.settings, &settings)? {
@@ -336,7 +378,9 @@ impl<'a> Runs<'a> {
             return Ok(cached);
         }
         log::info!("run {} of {}: {}", self.n_done, self.n_all, job.name);
-        let outcome = self.train(&job).with_context(|| format!("run {}", job.name))?;
+        let outcome = self
+            .train(&job)
+            .with_context(|| format!("run {}", job.name))?;
         let run = Run {
             name: job.name,
             settings,
@@ -359,7 +403,11 @@ impl<'a> Runs<'a> {
 
     fn train(&self, job: &Job<'_>) -> Result<TrainingOutcome> {
         let thorough = Evaluator::thorough(None)?;
-        let during_training = if job.is_thorough { thorough.clone() } else { Evaluator::psnr_only() };
+        let during_training = if job.is_thorough {
+            thorough.clone()
+        } else {
+            Evaluator::psnr_only()
+        };
         let mut model_spec = job.model_spec.clone();
         if let Some(steps) = job.limits.steps {
             model_spec.options.common.n_planned_steps = steps;
@@ -367,7 +415,11 @@ impl<'a> Runs<'a> {
         let plan = TrainingPlan {
             model_spec,
             // The points are not disturbed, and would reveal the true scene.
-            initial_points: job.data.initial_points.clone().filter(|_| job.disturbed.is_none()),
+            initial_points: job
+                .data
+                .initial_points
+                .clone()
+                .filter(|_| job.disturbed.is_none()),
             evaluators: Evaluators {
                 during_training,
                 max_images_during_training: usize::MAX,
@@ -400,7 +452,12 @@ impl<'a> Runs<'a> {
             data: job.data.path.clone(),
             method: job.model_spec.kind.name().to_owned(),
             seed: job.model_spec.options.common.seed,
-            max_splats: job.model_spec.options.specific.get(MAX_SPLATS).and_then(serde_json::Value::as_u64),
+            max_splats: job
+                .model_spec
+                .options
+                .specific
+                .get(MAX_SPLATS)
+                .and_then(serde_json::Value::as_u64),
             max_bytes: job.model_spec.options.common.max_bytes,
             seconds: job.limits.seconds,
             steps: job.limits.steps,
@@ -417,7 +474,13 @@ impl<'a> Runs<'a> {
     }
 
     fn report(&self, run: &Run, is_cached: bool) {
-        let report = RunReport { event: "run", is_cached, run, n_done: self.n_done, n_all: self.n_all };
+        let report = RunReport {
+            event: "run",
+            is_cached,
+            run,
+            n_done: self.n_done,
+            n_all: self.n_all,
+        };
         self.host.observer.on_run(&report);
     }
 }
@@ -436,16 +499,24 @@ fn from_evaluation(evaluation: &Evaluation) -> RunScores {
 }
 
 fn read(path: &Path) -> Result<Run> {
-    let message = || format!("{} is not a finished run; remove it to repeat the run", path.display());
+    let message = || {
+        format!(
+            "{} is not a finished run; remove it to repeat the run",
+            path.display()
+        )
+    };
     let text = files::read_text(path).with_context(message)?;
     serde_json::from_str(&text).with_context(message)
 }
 
 /// Description of the first setting that differs.
 fn difference(cached: &RunSettings, requested: &RunSettings) -> Result<Option<String>> {
-    let fields = |settings: &RunSettings| serde_json::to_value(settings).context("settings are plain data");
+    let fields =
+        |settings: &RunSettings| serde_json::to_value(settings).context("settings are plain data");
     let (cached, requested) = (fields(cached)?, fields(requested)?);
-    let requested = requested.as_object().ok_or_else(|| failed!("settings are an object"))?;
+    let requested = requested
+        .as_object()
+        .ok_or_else(|| failed!("settings are an object"))?;
     Ok(requested
         .iter()
         .find(|(key, value)| cached[key.as_str()] != **value)
@@ -455,8 +526,15 @@ fn difference(cached: &RunSettings, requested: &RunSettings) -> Result<Option<St
 /// Derives a name for data from its path, with a number if the name is already used.
 fn unique_name(path: &Path, used_names: &mut HashSet<String>) -> String {
     let canonical = path.canonicalize().unwrap_or_else(|_| path.to_owned());
-    let stem = if canonical.is_dir() { canonical.file_name() } else { canonical.file_stem() };
-    let stem = stem.map_or_else(|| "data".to_owned(), |stem| stem.to_string_lossy().into_owned());
+    let stem = if canonical.is_dir() {
+        canonical.file_name()
+    } else {
+        canonical.file_stem()
+    };
+    let stem = stem.map_or_else(
+        || "data".to_owned(),
+        |stem| stem.to_string_lossy().into_owned(),
+    );
     let mut name = stem.clone();
     let mut n = 2;
     while !used_names.insert(name.clone()) {
@@ -468,7 +546,15 @@ fn unique_name(path: &Path, used_names: &mut HashSet<String>) -> String {
 
 /// Turns a name into a file name of letters, digits, dots and dashes.
 fn file_name(name: &str) -> String {
-    name.chars().map(|letter| if letter.is_alphanumeric() || letter == '.' { letter } else { '-' }).collect()
+    name.chars()
+        .map(|letter| {
+            if letter.is_alphanumeric() || letter == '.' {
+                letter
+            } else {
+                '-'
+            }
+        })
+        .collect()
 }
 
 #[cfg(test)]
@@ -506,7 +592,12 @@ pub(crate) mod tests {
             version: "0".into(),
         };
         let evaluations = curve.iter().map(scores_at).collect();
-        Run { name: name.into(), settings, evaluations, end: scores_at(curve.last().expect("a point")) }
+        Run {
+            name: name.into(),
+            settings,
+            evaluations,
+            end: scores_at(curve.last().expect("a point")),
+        }
     }
 
     #[test]
@@ -517,23 +608,39 @@ pub(crate) mod tests {
         run_folder::write_json(&path, &written).expect("written");
         assert_eq!(read(&path).expect("read"), written);
         std::fs::write(&path, "{").expect("written");
-        assert!(read(&path).expect_err("truncated").to_string().contains("run.json"));
+        assert!(
+            read(&path)
+                .expect_err("truncated")
+                .to_string()
+                .contains("run.json")
+        );
     }
 
     #[test]
     fn settings_difference_names_the_setting() {
         let cached = run("a", &[(1.0, 20.0)], 1).settings;
         assert_eq!(difference(&cached, &cached).expect("plain"), None);
-        let requested = RunSettings { max_splats: Some(2000), ..cached.clone() };
-        let message = difference(&cached, &requested).expect("plain").expect("one differs");
+        let requested = RunSettings {
+            max_splats: Some(2000),
+            ..cached.clone()
+        };
+        let message = difference(&cached, &requested)
+            .expect("plain")
+            .expect("one differs");
         assert_eq!(message, "max_splats (1000 saved, 2000 now)");
     }
 
     #[test]
     fn names_are_unique_and_valid_file_names() {
         let mut used_names = HashSet::new();
-        assert_eq!(unique_name(Path::new("absent/fox.mcap"), &mut used_names), "fox");
-        assert_eq!(unique_name(Path::new("other/fox.mcap"), &mut used_names), "fox-2");
+        assert_eq!(
+            unique_name(Path::new("absent/fox.mcap"), &mut used_names),
+            "fox"
+        );
+        assert_eq!(
+            unique_name(Path::new("other/fox.mcap"), &mut used_names),
+            "fox-2"
+        );
         assert_eq!(file_name("a b/c 0.5 mm"), "a-b-c-0.5-mm");
     }
 
@@ -541,7 +648,11 @@ pub(crate) mod tests {
     fn final_evaluation_is_not_counted_twice() {
         let mut run = run("a", &[(1.0, 20.0), (4.0, 24.0)], 1);
         assert_eq!(run.curve(), [(1.0, 20.0), (4.0, 24.0)]);
-        run.end = RunScores { seconds: 6.0, psnr: Some(25.0), ..run.end };
+        run.end = RunScores {
+            seconds: 6.0,
+            psnr: Some(25.0),
+            ..run.end
+        };
         assert_eq!(run.curve(), [(1.0, 20.0), (4.0, 24.0), (6.0, 25.0)]);
     }
 }

@@ -26,7 +26,13 @@ const NANOS_PER_SEC: f64 = 1e9;
 const NANOS_PER_COUNT: f64 = 1e6;
 
 /// All variants are trained on the same disturbed data; each gives one line per chart.
-const VARIANTS: &[Variant] = &[Variant { name: "with --refine", change: |_| () }, Variant::CAMERAS_AS_GIVEN];
+const VARIANTS: &[Variant] = &[
+    Variant {
+        name: "with --refine",
+        change: |_| (),
+    },
+    Variant::CAMERAS_AS_GIVEN,
+];
 
 /// Options of [`run`].
 #[derive(Clone, Debug)]
@@ -88,7 +94,8 @@ struct Level {
     runs: Vec<Run>,
 }
 
-/// Size at which the PSNR has fallen by `drop_db` from the undisturbed PSNR; `None` if it does not fall that far.
+/// Size at which the PSNR has fallen by `drop_db` from the undisturbed PSNR; `None` if it does not
+/// fall that far.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 struct Break {
     drop_db: f64,
@@ -119,11 +126,16 @@ pub fn run(options: &StabilityOptions, host: &Host<'_>) -> Result<BenchResult> {
             disturbance: plan.disturbance,
         });
         for &variant in &variants {
-            let mut curve = Curve { name: variant.name, points: Vec::new(), breaks: Vec::new() };
+            let mut curve = Curve {
+                name: variant.name,
+                points: Vec::new(),
+                breaks: Vec::new(),
+            };
             for level in &plan.levels {
                 let finished = measure(options, &mut runs, &data, limits, plan, variant, *level)?;
                 curve.add(plan.disturbance, *level, finished);
-                // Findings are written after every size, so that an interrupted bench leaves results.
+                // Findings are written after every size, so that an interrupted bench leaves
+                // results.
                 let variants = &mut results.last_mut().expect("pushed above").variants;
                 variants.retain(|curve| curve.name != variant.name);
                 variants.push(curve.clone());
@@ -134,17 +146,23 @@ pub fn run(options: &StabilityOptions, host: &Host<'_>) -> Result<BenchResult> {
     BenchResult::of(page, data.data.data_losses)
 }
 
-/// The variants that differ for these options. If no camera parameters are refined, there is only one.
+/// The variants that differ for these options. If no camera parameters are refined, there is only
+/// one.
 fn distinguished(options: &ModelOptions) -> Vec<&'static Variant> {
     let mut distinguished: Vec<&Variant> = Vec::new();
     for variant in VARIANTS {
         let changed = variant.options(options);
-        if distinguished.iter().all(|other| other.options(options) != changed) {
+        if distinguished
+            .iter()
+            .all(|other| other.options(options) != changed)
+        {
             distinguished.push(variant);
         }
     }
     if distinguished.len() < VARIANTS.len() {
-        log::warn!("no camera parameters are refined, so only one variant is measured; see --refine");
+        log::warn!(
+            "no camera parameters are refined, so only one variant is measured; see --refine"
+        );
     }
     distinguished
 }
@@ -174,14 +192,23 @@ fn measure(
         rate_hz: plan.rate_hz,
     });
     let mut finished = Vec::new();
-    let ModelSpec { kind, options: base_options } = data.single_model_spec()?;
+    let ModelSpec {
+        kind,
+        options: base_options,
+    } = data.single_model_spec()?;
     let first_seed = base_options.common.seed;
     for seed in first_seed..first_seed.saturating_add(options.seeds) {
         let seeded = base_options.clone().with(|model| model.common.seed = seed);
         finished.push(runs.run(Job {
-            name: format!("stability {} {} {size} seed {seed}", data.name, variant.name),
+            name: format!(
+                "stability {} {} {size} seed {seed}",
+                data.name, variant.name
+            ),
             data,
-            model_spec: ModelSpec { kind: *kind, options: variant.options(&seeded) },
+            model_spec: ModelSpec {
+                kind: *kind,
+                options: variant.options(&seeded),
+            },
             limits,
             disturbed: disturbed.clone(),
             variant: Some(variant.name.to_owned()),
@@ -199,17 +226,30 @@ fn disturb(
     seed: u64,
     is_undisturbed: bool,
 ) -> Vec<Arc<Keyframe>> {
-    if is_undisturbed { keyframes.to_vec() } else { plan.disturbance.apply(keyframes, level, seed, plan.nanos_per_sec) }
+    if is_undisturbed {
+        keyframes.to_vec()
+    } else {
+        plan.disturbance
+            .apply(keyframes, level, seed, plan.nanos_per_sec)
+    }
 }
 
 /// Number of training images before any disturbance.
 fn n_train(data: &NamedData) -> usize {
-    data.data.keyframes.iter().filter(|keyframe| keyframe.split != Split::Test).count()
+    data.data
+        .keyframes
+        .iter()
+        .filter(|keyframe| keyframe.split != Split::Test)
+        .count()
 }
 
 /// Whether this size leaves the data unchanged.
 fn is_undisturbed(disturbance: Disturbance, level: f64, n_train: usize) -> bool {
-    if disturbance == Disturbance::Keyframes { level >= n_train as f64 } else { level == 0.0 }
+    if disturbance == Disturbance::Keyframes {
+        level >= n_train as f64
+    } else {
+        level == 0.0
+    }
 }
 
 impl StabilityOptions {
@@ -220,17 +260,33 @@ impl StabilityOptions {
                 "--levels: needs a single disturbance in --disturb, because units differ".into(),
             ));
         }
-        let min_level = if *selected == [Disturbance::Keyframes] { 1.0 } else { 0.0 };
-        if let Some(level) = self.levels.iter().find(|level| !level.is_finite() || **level < min_level) {
-            return Err(Error::BadInput(format!("--levels {level}: must be a number of at least {min_level}")));
+        let min_level = if *selected == [Disturbance::Keyframes] {
+            1.0
+        } else {
+            0.0
+        };
+        if let Some(level) = self
+            .levels
+            .iter()
+            .find(|level| !level.is_finite() || **level < min_level)
+        {
+            return Err(Error::BadInput(format!(
+                "--levels {level}: must be a number of at least {min_level}"
+            )));
         }
-        if self.rate_hz.is_some_and(|rate| !rate.is_finite() || rate <= 0.0) {
-            return Err(Error::BadInput("--rate-hz: must be a number above 0".into()));
+        if self
+            .rate_hz
+            .is_some_and(|rate| !rate.is_finite() || rate <= 0.0)
+        {
+            return Err(Error::BadInput(
+                "--rate-hz: must be a number above 0".into(),
+            ));
         }
         Ok(())
     }
 
-    /// Plans the measurements. If images have no times, a clock offset is an error, or is skipped for `all`.
+    /// Plans the measurements. If images have no times, a clock offset is an error, or is skipped
+    /// for `all`.
     fn plans(&self, data: &NamedData) -> Result<Vec<DisturbancePlan>> {
         let mut selected = self.disturbances.clone();
         let (nanos_per_sec, rate_hz) = match (data.data.has_times, self.rate_hz) {
@@ -251,7 +307,11 @@ impl StabilityOptions {
         };
         ensure!(!selected.is_empty(), "no disturbance is left to measure");
         let plan = |disturbance: Disturbance| {
-            let requested = if self.levels.is_empty() { disturbance.default_levels() } else { &self.levels };
+            let requested = if self.levels.is_empty() {
+                disturbance.default_levels()
+            } else {
+                &self.levels
+            };
             let rate_hz = rate_hz.filter(|_| disturbance == Disturbance::ClockOffset);
             DisturbancePlan {
                 disturbance,
@@ -285,18 +345,41 @@ fn levels(disturbance: Disturbance, requested: &[f64], n_train: usize) -> Vec<f6
 impl Curve {
     fn add(&mut self, disturbance: Disturbance, level: f64, runs: Vec<Run>) {
         let ends: Vec<f64> = runs.iter().map(Run::psnr).collect();
-        let Some((psnr, psnr_extent)) = median(&ends).zip(extent(&ends)) else { return };
-        self.points.push(Level { level, psnr, psnr_extent, runs });
-        let curve: Vec<(f64, f64)> = self.points.iter().map(|point| (point.level, point.psnr)).collect();
-        let break_at = |drop_db| Break { drop_db, level: break_point(&curve, drop_db, disturbance.interpolation()) };
+        let Some((psnr, psnr_extent)) = median(&ends).zip(extent(&ends)) else {
+            return;
+        };
+        self.points.push(Level {
+            level,
+            psnr,
+            psnr_extent,
+            runs,
+        });
+        let curve: Vec<(f64, f64)> = self
+            .points
+            .iter()
+            .map(|point| (point.level, point.psnr))
+            .collect();
+        let break_at = |drop_db| Break {
+            drop_db,
+            level: break_point(&curve, drop_db, disturbance.interpolation()),
+        };
         self.breaks = BREAKS_DB.map(break_at).into();
     }
 
     fn line(&self, label: &str) -> Line {
-        let point = |at: &Level| Point { x: at.level, y: at.psnr, low: at.psnr_extent[0], high: at.psnr_extent[1] };
+        let point = |at: &Level| Point {
+            x: at.level,
+            y: at.psnr,
+            low: at.psnr_extent[0],
+            high: at.psnr_extent[1],
+        };
         let mut points: Vec<Point> = self.points.iter().map(point).collect();
         points.sort_by(|a, b| a.x.total_cmp(&b.x));
-        Line { label: label.to_owned(), points, is_peer: false }
+        Line {
+            label: label.to_owned(),
+            points,
+            is_peer: false,
+        }
     }
 }
 
@@ -304,8 +387,12 @@ impl DisturbanceResult {
     /// `of_one` is the label of the line if there is only one variant.
     fn chart(&self, subtitle: &str, of_one: &str) -> Chart {
         let levels = || {
-            let mut levels: Vec<f64> =
-                self.variants.iter().flat_map(|curve| &curve.points).map(|point| point.level).collect();
+            let mut levels: Vec<f64> = self
+                .variants
+                .iter()
+                .flat_map(|curve| &curve.points)
+                .map(|point| point.level)
+                .collect();
             levels.sort_by(f64::total_cmp);
             levels.dedup();
             levels
@@ -316,28 +403,64 @@ impl DisturbanceResult {
         };
         let marker = |line_ix: usize, at: &Break| {
             let level = at.level?;
-            let label = format!("-{} dB at {} {}", at.drop_db, significant_digits(level), self.unit);
-            let label =
-                if self.variants.len() > 1 { format!("{}: {label}", self.variants[line_ix].name) } else { label };
-            Some(Marker { x: level, label, line_ix })
+            let label = format!(
+                "-{} dB at {} {}",
+                at.drop_db,
+                significant_digits(level),
+                self.unit
+            );
+            let label = if self.variants.len() > 1 {
+                format!("{}: {label}", self.variants[line_ix].name)
+            } else {
+                label
+            };
+            Some(Marker {
+                x: level,
+                label,
+                line_ix,
+            })
         };
         let curves = self.variants.iter().enumerate();
-        let label = |curve: &Curve| if self.variants.len() > 1 { curve.name } else { of_one };
+        let label = |curve: &Curve| {
+            if self.variants.len() > 1 {
+                curve.name
+            } else {
+                of_one
+            }
+        };
         Chart {
             title: format!("PSNR of test images with {}", describe(self.disturbance)),
             subtitle: subtitle.to_owned(),
-            x: Axis { label: self.disturbance.axis().to_owned(), scale, ticks },
-            y: Axis { label: "test PSNR, dB".into(), scale: Scale::Linear, ticks: Vec::new() },
-            lines: self.variants.iter().map(|curve| curve.line(label(curve))).collect(),
+            x: Axis {
+                label: self.disturbance.axis().to_owned(),
+                scale,
+                ticks,
+            },
+            y: Axis {
+                label: "test PSNR, dB".into(),
+                scale: Scale::Linear,
+                ticks: Vec::new(),
+            },
+            lines: self
+                .variants
+                .iter()
+                .map(|curve| curve.line(label(curve)))
+                .collect(),
             thresholds: Vec::new(),
-            markers: curves.flat_map(|(ix, curve)| curve.breaks.iter().filter_map(move |at| marker(ix, at))).collect(),
+            markers: curves
+                .flat_map(|(ix, curve)| curve.breaks.iter().filter_map(move |at| marker(ix, at)))
+                .collect(),
         }
     }
 
     fn rows(&self) -> impl Iterator<Item = Vec<String>> {
         self.variants.iter().map(|curve| {
             let undisturbed = curve.points.first().map_or(0.0, |point| point.psnr);
-            let mut row = vec![self.name.to_owned(), curve.name.to_owned(), format!("{undisturbed:.2}")];
+            let mut row = vec![
+                self.name.to_owned(),
+                curve.name.to_owned(),
+                format!("{undisturbed:.2}"),
+            ];
             row.extend(curve.breaks.iter().map(|at| match at.level {
                 Some(level) => format!("{} {}", significant_digits(level), self.unit),
                 None => "not reached".to_owned(),
@@ -374,7 +497,10 @@ fn findings(
 ) -> Result<(Findings, PathBuf)> {
     let length = session::limits(options.seconds, options.steps, DEFAULT_SECONDS)?.describe();
     let spread = if options.seeds > 1 {
-        format!("median of {} seeds; band: minimum to maximum", options.seeds)
+        format!(
+            "median of {} seeds; band: minimum to maximum",
+            options.seeds
+        )
     } else {
         "one run per size".to_owned()
     };
@@ -386,8 +512,18 @@ fn findings(
         Disturbance::Exposure => "-exposure",
         Disturbance::Keyframes => "-keyframes",
     };
-    let charts = results.iter().map(|result| (part(result.disturbance), result.chart(&subtitle, &label)));
-    let head = ["disturbance", "variant", "undisturbed, dB", "-1 dB at", "-3 dB at"].map(str::to_owned).to_vec();
+    let charts = results
+        .iter()
+        .map(|result| (part(result.disturbance), result.chart(&subtitle, &label)));
+    let head = [
+        "disturbance",
+        "variant",
+        "undisturbed, dB",
+        "-1 dB at",
+        "-3 dB at",
+    ]
+    .map(str::to_owned)
+    .to_vec();
     let level_rows = results.iter().flat_map(|result| {
         result.variants.iter().flat_map(|curve| {
             curve.points.iter().map(|point| {
@@ -400,7 +536,9 @@ fn findings(
             })
         })
     });
-    let level_head = ["disturbance, variant", "size", "PSNR, dB", "change, dB"].map(str::to_owned).to_vec();
+    let level_head = ["disturbance, variant", "size", "PSNR, dB", "change, dB"]
+        .map(str::to_owned)
+        .to_vec();
     let findings = Findings {
         name: "stability",
         title: format!("Stability: {}", data.name),
@@ -436,24 +574,59 @@ mod tests {
 
     #[test]
     fn levels_start_undisturbed_and_clip_to_available_keyframes() {
-        assert_eq!(levels(Disturbance::PoseNoise, &[5.0, 2.0, 2.0], 40), [0.0, 2.0, 5.0]);
         assert_eq!(
-            levels(Disturbance::Keyframes, Disturbance::Keyframes.default_levels(), 44),
+            levels(Disturbance::PoseNoise, &[5.0, 2.0, 2.0], 40),
+            [0.0, 2.0, 5.0]
+        );
+        assert_eq!(
+            levels(
+                Disturbance::Keyframes,
+                Disturbance::Keyframes.default_levels(),
+                44
+            ),
             [44.0, 20.0, 10.0, 5.0, 3.0]
         );
-        assert!(is_undisturbed(Disturbance::Keyframes, 44.0, 44) && !is_undisturbed(Disturbance::Keyframes, 20.0, 44));
-        assert!(is_undisturbed(Disturbance::Exposure, 0.0, 44) && !is_undisturbed(Disturbance::Exposure, 0.1, 44));
+        assert!(
+            is_undisturbed(Disturbance::Keyframes, 44.0, 44)
+                && !is_undisturbed(Disturbance::Keyframes, 20.0, 44)
+        );
+        assert!(
+            is_undisturbed(Disturbance::Exposure, 0.0, 44)
+                && !is_undisturbed(Disturbance::Exposure, 0.1, 44)
+        );
     }
 
     #[test]
     fn break_points_are_computed_from_points() {
-        let mut curve = Curve { name: "plain", points: Vec::new(), breaks: Vec::new() };
+        let mut curve = Curve {
+            name: "plain",
+            points: Vec::new(),
+            breaks: Vec::new(),
+        };
         for (level, psnr) in [(100.0, 30.0), (25.0, 28.0), (5.0, 20.0)] {
-            curve.add(Disturbance::Keyframes, level, vec![run("a", &[(1.0, psnr)], 10)]);
+            curve.add(
+                Disturbance::Keyframes,
+                level,
+                vec![run("a", &[(1.0, psnr)], 10)],
+            );
         }
-        let [first, second] = &curve.breaks[..] else { panic!("two breaks") };
-        assert!(first.level.is_some_and(|level| (level - 50.0).abs() < 1e-9), "{first:?}");
-        assert!(second.level.is_some_and(|level| (5.0..25.0).contains(&level)), "{second:?}");
-        assert_eq!(curve.line("plain").points[0].x, 5.0, "lines run from left to right");
+        let [first, second] = &curve.breaks[..] else {
+            panic!("two breaks")
+        };
+        assert!(
+            first.level.is_some_and(|level| (level - 50.0).abs() < 1e-9),
+            "{first:?}"
+        );
+        assert!(
+            second
+                .level
+                .is_some_and(|level| (5.0..25.0).contains(&level)),
+            "{second:?}"
+        );
+        assert_eq!(
+            curve.line("plain").points[0].x,
+            5.0,
+            "lines run from left to right"
+        );
     }
 }

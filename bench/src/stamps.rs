@@ -1,4 +1,5 @@
-//! Measures stamp errors of images from a simulated camera that has its own clock and a connection with jitter.
+//! Measures stamp errors of images from a simulated camera that has its own clock and a connection
+//! with jitter.
 
 use crate::findings::{BenchResult, Findings};
 use crate::{Error, Result};
@@ -14,7 +15,8 @@ use std::time::Duration;
 
 /// Width of a histogram bin, milliseconds.
 const BIN_MILLIS: f64 = 0.1;
-/// Range of the histogram to either side, milliseconds. Larger errors are counted in the outermost bins.
+/// Range of the histogram to either side, milliseconds. Larger errors are counted in the outermost
+/// bins.
 const HISTOGRAM_RANGE_MILLIS: f64 = 8.0;
 /// Joint states per second.
 const JOINT_RATE_HZ: u32 = 1000;
@@ -72,13 +74,19 @@ pub struct StampErrors {
 /// If an option is out of range or the folder cannot be written.
 pub fn run(options: &StampsOptions) -> Result<BenchResult> {
     let results = measure(options)?;
-    std::fs::create_dir_all(&options.out).with_context(|| format!("cannot create {}", options.out.display()))?;
+    std::fs::create_dir_all(&options.out)
+        .with_context(|| format!("cannot create {}", options.out.display()))?;
     let findings = findings(options, &results)?;
     let page = findings.write(&options.out)?;
-    Ok(BenchResult { findings, page, data_losses: Vec::new() })
+    Ok(BenchResult {
+        findings,
+        page,
+        data_losses: Vec::new(),
+    })
 }
 
-/// Measures the stamp errors at each rate, first with a calibrated fixed latency, then without calibration.
+/// Measures the stamp errors at each rate, first with a calibrated fixed latency, then without
+/// calibration.
 ///
 /// # Errors
 ///
@@ -87,10 +95,16 @@ pub fn measure(options: &StampsOptions) -> Result<Vec<StampErrors>> {
     check(options)?;
     let mut results = Vec::new();
     for rate_hz in &options.rates_hz {
-        let errors: Vec<f64> = (1..=options.seeds).flat_map(|seed| errors_millis(options, *rate_hz, seed)).collect();
+        let errors: Vec<f64> = (1..=options.seeds)
+            .flat_map(|seed| errors_millis(options, *rate_hz, seed))
+            .collect();
         for is_calibrated in [true, false] {
             // The rig file's offset is subtracted from every stamp.
-            let fixed_latency = if is_calibrated { options.fixed_millis } else { 0.0 };
+            let fixed_latency = if is_calibrated {
+                options.fixed_millis
+            } else {
+                0.0
+            };
             let errors: Vec<f64> = errors.iter().map(|error| error - fixed_latency).collect();
             results.push(StampErrors::of(*rate_hz, is_calibrated, &errors));
         }
@@ -100,36 +114,68 @@ pub fn measure(options: &StampsOptions) -> Result<Vec<StampErrors>> {
 
 fn check(options: &StampsOptions) -> Result<()> {
     let numbers = [
-        ("--rates", options.rates_hz.iter().copied().fold(f64::INFINITY, f64::min), 1.0..=10_000.0),
-        ("--rates", options.rates_hz.iter().copied().fold(0.0, f64::max), 1.0..=10_000.0),
+        (
+            "--rates",
+            options
+                .rates_hz
+                .iter()
+                .copied()
+                .fold(f64::INFINITY, f64::min),
+            1.0..=10_000.0,
+        ),
+        (
+            "--rates",
+            options.rates_hz.iter().copied().fold(0.0, f64::max),
+            1.0..=10_000.0,
+        ),
         ("--fixed-millis", options.fixed_millis, 0.0..=1000.0),
         ("--jitter-millis", options.jitter_millis, 0.0..=1000.0),
         ("--drift-ppm", options.drift_ppm, -200.0..=200.0),
         ("--seconds", options.seconds, 1.0..=3600.0),
-        ("--settle-seconds", options.settle_seconds, 0.0..=options.seconds - 0.5),
+        (
+            "--settle-seconds",
+            options.settle_seconds,
+            0.0..=options.seconds - 0.5,
+        ),
     ];
-    match numbers.into_iter().find(|(_, number, allowed)| !allowed.contains(number)) {
-        Some((flag, number, allowed)) => {
-            Err(Error::BadInput(format!("{flag}: {number} is outside {} to {}", allowed.start(), allowed.end())))
-        }
+    match numbers
+        .into_iter()
+        .find(|(_, number, allowed)| !allowed.contains(number))
+    {
+        Some((flag, number, allowed)) => Err(Error::BadInput(format!(
+            "{flag}: {number} is outside {} to {}",
+            allowed.start(),
+            allowed.end()
+        ))),
         None => Ok(()),
     }
 }
 
-/// The stamp error of each image after the settling time: time of the joint state at its stamp, minus time of its
-/// shutter. Includes the fixed latency.
-#[expect(clippy::cast_possible_truncation, reason = "times of an hour at most, in nanoseconds")]
+/// The stamp error of each image after the settling time: time of the joint state at its stamp,
+/// minus time of its shutter. Includes the fixed latency.
+#[expect(
+    clippy::cast_possible_truncation,
+    reason = "times of an hour at most, in nanoseconds"
+)]
 fn errors_millis(options: &StampsOptions, rate_hz: f64, seed: u64) -> Vec<f64> {
     let mut random = Random::new(seed);
     let mut clock = ClockMap::new();
     let n_readings =
-        (options.seconds + options.fixed_millis * 1e-3 + options.jitter_millis * 1e-3 + 1.0) * f64::from(JOINT_RATE_HZ);
+        (options.seconds + options.fixed_millis * 1e-3 + options.jitter_millis * 1e-3 + 1.0)
+            * f64::from(JOINT_RATE_HZ);
     let mut joints = JointHistory::new(Duration::from_millis(100), n_readings.ceil() as usize + 1);
     for ix in 0..n_readings.ceil() as i64 {
         let stamp = Stamp(ix * 1_000_000_000 / i64::from(JOINT_RATE_HZ));
         let position = vec![SPEED_RAD_S * stamp.secs_since(Stamp(0))];
-        let state = JointState { stamp, position, velocity: vec![SPEED_RAD_S], effort: Vec::new() };
-        joints.push(state).expect("the states are ordered and finite");
+        let state = JointState {
+            stamp,
+            position,
+            velocity: vec![SPEED_RAD_S],
+            effort: Vec::new(),
+        };
+        joints
+            .push(state)
+            .expect("the states are ordered and finite");
     }
     let mut errors = Vec::new();
     for ix in 0..(options.seconds * rate_hz) as i64 {
@@ -149,13 +195,19 @@ fn errors_millis(options: &StampsOptions, rate_hz: f64, seed: u64) -> Vec<f64> {
 }
 
 impl StampErrors {
-    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the bins")]
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "clamped to the bins"
+    )]
     fn of(rate_hz: f64, is_calibrated: bool, errors: &[f64]) -> Self {
         let n_bars = (2.0 * HISTOGRAM_RANGE_MILLIS / BIN_MILLIS).round() as usize;
         let mut bars = vec![0.0; n_bars];
         let n = errors.len();
         for error in errors {
-            let bar = ((error + HISTOGRAM_RANGE_MILLIS) / BIN_MILLIS).floor().max(0.0) as usize;
+            let bar = ((error + HISTOGRAM_RANGE_MILLIS) / BIN_MILLIS)
+                .floor()
+                .max(0.0) as usize;
             bars[bar.min(n_bars - 1)] += 1.0 / n as f64;
         }
         let median_millis = median(errors).unwrap_or(f64::NAN);
@@ -164,7 +216,11 @@ impl StampErrors {
             rate_hz,
             is_calibrated,
             images: n,
-            within_1_ms_frac: sizes.iter().filter(|size| **size <= MAX_ERROR_MILLIS).count() as f64 / n as f64,
+            within_1_ms_frac: sizes
+                .iter()
+                .filter(|size| **size <= MAX_ERROR_MILLIS)
+                .count() as f64
+                / n as f64,
             median_millis,
             p99_abs_millis: quantile(&mut sizes, 0.99, Rank::Lower).unwrap_or(f64::NAN),
             max_abs_millis: quantile(&mut sizes, 1.0, Rank::Lower).unwrap_or(f64::NAN),
@@ -173,7 +229,11 @@ impl StampErrors {
     }
 
     fn label(&self) -> String {
-        let suffix = if self.is_calibrated { "" } else { ", fixed latency unknown" };
+        let suffix = if self.is_calibrated {
+            ""
+        } else {
+            ", fixed latency unknown"
+        };
         format!("{} Hz{suffix}", self.rate_hz)
     }
 }
@@ -181,17 +241,39 @@ impl StampErrors {
 fn findings(options: &StampsOptions, results: &[StampErrors]) -> Result<Findings> {
     let point = |(ix, fraction): (usize, &f64)| {
         let y = 100.0 * fraction;
-        Point { x: (ix as f64 + 0.5) * BIN_MILLIS - HISTOGRAM_RANGE_MILLIS, y, low: y, high: y }
+        Point {
+            x: (ix as f64 + 0.5) * BIN_MILLIS - HISTOGRAM_RANGE_MILLIS,
+            y,
+            low: y,
+            high: y,
+        }
     };
     let line = |results: &StampErrors| {
         // Draws one empty bin on either side of the nonempty ones.
-        let first = results.bars.iter().position(|fraction| *fraction > 0.0).unwrap_or(0).saturating_sub(1);
-        let n_empty_after =
-            results.bars.iter().rev().position(|fraction| *fraction > 0.0).unwrap_or(0).saturating_sub(1);
+        let first = results
+            .bars
+            .iter()
+            .position(|fraction| *fraction > 0.0)
+            .unwrap_or(0)
+            .saturating_sub(1);
+        let n_empty_after = results
+            .bars
+            .iter()
+            .rev()
+            .position(|fraction| *fraction > 0.0)
+            .unwrap_or(0)
+            .saturating_sub(1);
         let n_drawn = results.bars.len() - n_empty_after - first;
         Line {
             label: results.label(),
-            points: results.bars.iter().enumerate().skip(first).take(n_drawn).map(point).collect(),
+            points: results
+                .bars
+                .iter()
+                .enumerate()
+                .skip(first)
+                .take(n_drawn)
+                .map(point)
+                .collect(),
             is_peer: !results.is_calibrated,
         }
     };
@@ -214,7 +296,14 @@ fn findings(options: &StampsOptions, results: &[StampErrors]) -> Result<Findings
             format!("{:.3}", results.max_abs_millis),
         ]
     };
-    let head = ["camera", "images", "within 1 ms, %", "median, ms", "99th percentile, ms", "maximum, ms"];
+    let head = [
+        "camera",
+        "images",
+        "within 1 ms, %",
+        "median, ms",
+        "99th percentile, ms",
+        "maximum, ms",
+    ];
     Ok(Findings {
         name: "stamps",
         title: "Errors of image stamps".to_owned(),
@@ -265,21 +354,53 @@ mod tests {
     #[test]
     fn calibrated_stamps_are_within_one_millisecond() {
         let errors = measure(&options()).expect("in range");
-        let [fixed_latency, unknown] = &errors[..] else { panic!("one rate") };
+        let [fixed_latency, unknown] = &errors[..] else {
+            panic!("one rate")
+        };
         assert_eq!(fixed_latency.within_1_ms_frac, 1.0, "{fixed_latency:?}");
         assert!((fixed_latency.bars.iter().sum::<f64>() - 1.0).abs() < 1e-9);
-        assert!((unknown.median_millis - 5.0).abs() < 0.5 && unknown.within_1_ms_frac == 0.0, "{unknown:?}");
+        assert!(
+            (unknown.median_millis - 5.0).abs() < 0.5 && unknown.within_1_ms_frac == 0.0,
+            "{unknown:?}"
+        );
     }
 
     #[test]
     fn out_of_range_options_are_rejected() {
         for (flag, options) in [
-            ("--seconds", StampsOptions { seconds: 0.0, ..options() }),
-            ("--rates", StampsOptions { rates_hz: vec![0.0, 30.0], ..options() }),
-            ("--drift-ppm", StampsOptions { drift_ppm: -900.0, ..options() }),
-            ("--settle-seconds", StampsOptions { settle_seconds: 500.0, ..options() }),
+            (
+                "--seconds",
+                StampsOptions {
+                    seconds: 0.0,
+                    ..options()
+                },
+            ),
+            (
+                "--rates",
+                StampsOptions {
+                    rates_hz: vec![0.0, 30.0],
+                    ..options()
+                },
+            ),
+            (
+                "--drift-ppm",
+                StampsOptions {
+                    drift_ppm: -900.0,
+                    ..options()
+                },
+            ),
+            (
+                "--settle-seconds",
+                StampsOptions {
+                    settle_seconds: 500.0,
+                    ..options()
+                },
+            ),
         ] {
-            assert!(check(&options).is_err_and(|error| error.to_string().contains(flag)), "{flag}");
+            assert!(
+                check(&options).is_err_and(|error| error.to_string().contains(flag)),
+                "{flag}"
+            );
         }
     }
 }

@@ -5,7 +5,9 @@ use kinematics::quantile::median;
 /// Smallest and largest value.
 pub(crate) fn extent(values: &[f64]) -> Option<[f64; 2]> {
     let first = *values.first()?;
-    Some(values.iter().fold([first; 2], |[low, high], value| [low.min(*value), high.max(*value)]))
+    Some(values.iter().fold([first; 2], |[low, high], value| {
+        [low.min(*value), high.max(*value)]
+    }))
 }
 
 /// Sample standard deviation (divided by n - 1); `None` for fewer than two values.
@@ -15,28 +17,43 @@ pub(crate) fn sample_std(values: &[f64]) -> Option<f64> {
     }
     let n = values.len() as f64;
     let mean = values.iter().sum::<f64>() / n;
-    Some((values.iter().map(|value| (value - mean).powi(2)).sum::<f64>() / (n - 1.0)).sqrt())
+    Some(
+        (values
+            .iter()
+            .map(|value| (value - mean).powi(2))
+            .sum::<f64>()
+            / (n - 1.0))
+            .sqrt(),
+    )
 }
 
-/// Time at which a curve of `(seconds, dB)` first reaches `target_db`, interpolated over the logarithm of time.
+/// Time at which a curve of `(seconds, dB)` first reaches `target_db`, interpolated over the
+/// logarithm of time.
 ///
 /// For a curve that starts above the target, this is the time of its first point.
 pub(crate) fn secs_to(curve: &[(f64, f64)], target_db: f64) -> Option<f64> {
     let at = curve.iter().position(|(_, psnr)| *psnr >= target_db)?;
     let (secs, psnr) = curve[at];
-    let Some((previous_secs, earlier_psnr)) = at.checked_sub(1).map(|before| curve[before]) else { return Some(secs) };
+    let Some((previous_secs, earlier_psnr)) = at.checked_sub(1).map(|before| curve[before]) else {
+        return Some(secs);
+    };
     let frac = (target_db - earlier_psnr) / (psnr - earlier_psnr);
     Some(previous_secs * (secs / previous_secs).powf(frac))
 }
 
-/// Slope of a line through `(x, y)` by the Theil-Sen estimator: the median of the slopes between all pairs of points,
-/// which is robust to outliers. `None` with fewer than two values of x.
+/// Slope of a line through `(x, y)` by the Theil-Sen estimator: the median of the slopes between
+/// all pairs of points, which is robust to outliers. `None` with fewer than two values of x.
 ///
 /// Source: Theil 1950, Sen 1968.
 pub(crate) fn theil_sen(points: &[(f64, f64)]) -> Option<f64> {
-    let pairs = points.iter().enumerate().flat_map(|(ix, from)| points[ix + 1..].iter().map(move |to| (from, to)));
-    let rates: Vec<f64> =
-        pairs.filter(|(from, to)| to.0 != from.0).map(|(from, to)| (to.1 - from.1) / (to.0 - from.0)).collect();
+    let pairs = points
+        .iter()
+        .enumerate()
+        .flat_map(|(ix, from)| points[ix + 1..].iter().map(move |to| (from, to)));
+    let rates: Vec<f64> = pairs
+        .filter(|(from, to)| to.0 != from.0)
+        .map(|(from, to)| (to.1 - from.1) / (to.0 - from.0))
+        .collect();
     median(&rates)
 }
 
@@ -49,9 +66,13 @@ pub(crate) enum Interpolation {
     Log,
 }
 
-/// The level at which a curve of `(level, dB)` has first fallen by `drop_db` from its first point; `None` if it never
-/// does.
-pub(crate) fn break_point(curve: &[(f64, f64)], drop_db: f64, interpolation: Interpolation) -> Option<f64> {
+/// The level at which a curve of `(level, dB)` has first fallen by `drop_db` from its first point;
+/// `None` if it never does.
+pub(crate) fn break_point(
+    curve: &[(f64, f64)],
+    drop_db: f64,
+    interpolation: Interpolation,
+) -> Option<f64> {
     let floor = curve.first()?.1 - drop_db;
     let at = curve.iter().position(|(_, psnr)| *psnr <= floor)?;
     let ((before, psnr_before), (level, psnr)) = (curve[at.checked_sub(1)?], curve[at]);
@@ -65,8 +86,8 @@ pub(crate) fn break_point(curve: &[(f64, f64)], drop_db: f64, interpolation: Int
 /// Minimum growth of a count; for less growth, the gain per doubling would be mostly noise.
 const MIN_GROWTH: f64 = 1.05;
 
-/// Gain per doubling of the count between two points `(count, dB)`; `None` if the count grew by less than
-/// [`MIN_GROWTH`].
+/// Gain per doubling of the count between two points `(count, dB)`; `None` if the count grew by
+/// less than [`MIN_GROWTH`].
 pub(crate) fn db_per_doubling(fewer: (f64, f64), more: (f64, f64)) -> Option<f64> {
     let growth = more.0 / fewer.0;
     (growth >= MIN_GROWTH).then(|| (more.1 - fewer.1) / growth.log2())
@@ -94,7 +115,10 @@ mod tests {
     #[test]
     fn sample_std_uses_n_minus_one() {
         assert_eq!(sample_std(&[1.0]), None);
-        assert_close(sample_std(&[2.0, 4.0, 4.0, 4.0, 5.0, 5.0, 7.0, 9.0]), (32.0_f64 / 7.0).sqrt());
+        assert_close(
+            sample_std(&[2.0, 4.0, 4.0, 4.0, 5.0, 5.0, 7.0, 9.0]),
+            (32.0_f64 / 7.0).sqrt(),
+        );
     }
 
     #[test]
@@ -102,7 +126,11 @@ mod tests {
         let curve = [(1.0, 20.0), (4.0, 24.0), (16.0, 23.0), (64.0, 30.0)];
         assert_close(secs_to(&curve, 22.0), 2.0);
         assert_close(secs_to(&curve, 24.0), 4.0);
-        assert_eq!(secs_to(&curve, 19.0), Some(1.0), "the time of the first point");
+        assert_eq!(
+            secs_to(&curve, 19.0),
+            Some(1.0),
+            "the time of the first point"
+        );
         assert_eq!(secs_to(&curve, 31.0), None);
     }
 
@@ -111,7 +139,11 @@ mod tests {
         let curve = [(0.0, 30.0), (2.0, 29.6), (4.0, 28.6), (8.0, 24.6)];
         assert_close(break_point(&curve, 1.0, Interpolation::Linear), 3.2);
         assert_close(break_point(&curve, 3.0, Interpolation::Linear), 5.6);
-        assert_eq!(break_point(&curve, 6.0, Interpolation::Linear), None, "it never falls that far");
+        assert_eq!(
+            break_point(&curve, 6.0, Interpolation::Linear),
+            None,
+            "it never falls that far"
+        );
         assert_eq!(break_point(&[], 1.0, Interpolation::Linear), None);
         let fewer = [(100.0, 30.0), (25.0, 28.0)];
         assert_close(break_point(&fewer, 1.0, Interpolation::Log), 50.0);
@@ -127,7 +159,9 @@ mod tests {
 
     #[test]
     fn theil_sen_is_robust_to_outliers() {
-        let mut points: Vec<(f64, f64)> = (0..50).map(|x| (f64::from(x), 3.0 - 0.25 * f64::from(x))).collect();
+        let mut points: Vec<(f64, f64)> = (0..50)
+            .map(|x| (f64::from(x), 3.0 - 0.25 * f64::from(x)))
+            .collect();
         points[20].1 = 1e6;
         points[21].1 = -1e6;
         assert!((theil_sen(&points).expect("many points") + 0.25).abs() < 1e-9);

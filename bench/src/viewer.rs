@@ -1,7 +1,8 @@
 //! A viewer for benches: a WebSocket client that requests images back to back and discards them.
 //!
-//! It uses the capabilities that the web page uses for pictures. It runs in the measured process. To affect the
-//! measurement little, it decodes only the first picture with a new keyframe, and reports that it has shown it.
+//! It uses the capabilities that the web page uses for pictures. It runs in the measured process.
+//! To affect the measurement little, it decodes only the first picture with a new keyframe, and
+//! reports that it has shown it.
 
 use crate::Result;
 use keyframe::{ensure, failed};
@@ -41,7 +42,8 @@ const PONG: u8 = 10;
 pub struct ViewerOptions {
     /// Width and height, pixels.
     pub size_px: [u32; 2],
-    /// All directions around a point in the scene (equirectangular) instead of a pinhole view from outside.
+    /// All directions around a point in the scene (equirectangular) instead of a pinhole view from
+    /// outside.
     pub is_panorama: bool,
     /// Minimum time between two requests; zero: each request follows the previous picture at once.
     pub period: Duration,
@@ -49,7 +51,11 @@ pub struct ViewerOptions {
 
 impl Default for ViewerOptions {
     fn default() -> Self {
-        Self { size_px: [960, 720], is_panorama: false, period: Duration::ZERO }
+        Self {
+            size_px: [960, 720],
+            is_panorama: false,
+            period: Duration::ZERO,
+        }
     }
 }
 
@@ -62,7 +68,8 @@ pub struct ReceivedPicture {
     pub first_stage: Instant,
     /// Time at which the last stage was received.
     pub complete: Instant,
-    /// Time from the arrival of the request at the server to the start of rendering the last stage, milliseconds.
+    /// Time from the arrival of the request at the server to the start of rendering the last stage,
+    /// milliseconds.
     pub waited_millis: f64,
     /// Time for rendering the last stage, milliseconds.
     pub render_millis: f64,
@@ -87,10 +94,16 @@ impl Viewer {
     ///
     /// If the server does not accept the connection.
     pub fn connect(address: SocketAddr, options: ViewerOptions) -> Result<Self> {
-        let stream = TcpStream::connect(address).with_context(|| format!("cannot connect to {address}"))?;
-        stream.set_read_timeout(Some(MAX_SILENCE)).context("cannot set a timeout")?;
-        // As in browsers: otherwise, a request after a report would wait up to 40 ms for an acknowledgment.
-        stream.set_nodelay(true).context("cannot set an option of a connection")?;
+        let stream =
+            TcpStream::connect(address).with_context(|| format!("cannot connect to {address}"))?;
+        stream
+            .set_read_timeout(Some(MAX_SILENCE))
+            .context("cannot set a timeout")?;
+        // As in browsers: otherwise, a request after a report would wait up to 40 ms for an
+        // acknowledgment.
+        stream
+            .set_nodelay(true)
+            .context("cannot set an option of a connection")?;
         let pictures = Arc::default();
         let mut client = Client {
             reader: BufReader::new(stream.try_clone().context("cannot share a connection")?),
@@ -108,8 +121,14 @@ impl Viewer {
             n_keyframes: 0,
         };
         client.handshake(address)?;
-        let thread = std::thread::Builder::new().name("viewer".into()).spawn(move || client.run());
-        Ok(Self { stream, pictures, thread: Some(thread.context("cannot start a thread")?) })
+        let thread = std::thread::Builder::new()
+            .name("viewer".into())
+            .spawn(move || client.run());
+        Ok(Self {
+            stream,
+            pictures,
+            thread: Some(thread.context("cannot start a thread")?),
+        })
     }
 
     /// Number of complete pictures received so far.
@@ -127,7 +146,9 @@ impl Viewer {
     /// Whether the viewer is still connected.
     #[must_use]
     pub fn is_connected(&self) -> bool {
-        self.thread.as_ref().is_some_and(|thread| !thread.is_finished())
+        self.thread
+            .as_ref()
+            .is_some_and(|thread| !thread.is_finished())
     }
 }
 
@@ -172,10 +193,17 @@ impl Client {
         )?;
         let mut line = String::new();
         self.reader.read_line(&mut line)?;
-        ensure!(line.starts_with("HTTP/1.1 101"), "the server responded {:?}, expected a WebSocket", line.trim_end());
+        ensure!(
+            line.starts_with("HTTP/1.1 101"),
+            "the server responded {:?}, expected a WebSocket",
+            line.trim_end()
+        );
         while line.trim_end() != "" {
             line.clear();
-            ensure!(self.reader.read_line(&mut line)? > 0, "the server closed the connection");
+            ensure!(
+                self.reader.read_line(&mut line)? > 0,
+                "the server closed the connection"
+            );
         }
         Ok(())
     }
@@ -195,7 +223,9 @@ impl Client {
                 BINARY => self.handle_binary(n_bytes)?,
                 PING => {
                     let mut contents = Vec::new();
-                    (&mut self.reader).take(n_bytes.min(125)).read_to_end(&mut contents)?;
+                    (&mut self.reader)
+                        .take(n_bytes.min(125))
+                        .read_to_end(&mut contents)?;
                     self.send(PONG, &contents)?;
                 }
                 CLOSE => return Ok(()),
@@ -205,17 +235,31 @@ impl Client {
     }
 
     fn handle_text(&mut self, n_bytes: u64) -> Result<()> {
-        ensure!(n_bytes <= MAX_TEXT_BYTES, "a text message of {n_bytes} bytes, expected at most {MAX_TEXT_BYTES}");
+        ensure!(
+            n_bytes <= MAX_TEXT_BYTES,
+            "a text message of {n_bytes} bytes, expected at most {MAX_TEXT_BYTES}"
+        );
         let message: Value = serde_json::from_reader((&mut self.reader).take(n_bytes))?;
-        if let Some(clock) = message["clock_millis"].as_f64().and_then(|n| Duration::try_from_secs_f64(n * 1e-3).ok()) {
+        if let Some(clock) = message["clock_millis"]
+            .as_f64()
+            .and_then(|n| Duration::try_from_secs_f64(n * 1e-3).ok())
+        {
             let started = Instant::now().checked_sub(clock);
             self.server_started = self.server_started.into_iter().chain(started).min();
         }
         match message["type"].as_str() {
             Some("scene") => {
-                let number = |value: &Value| value.as_f64().ok_or_else(|| failed!("a scene message lacks a number"));
+                let number = |value: &Value| {
+                    value
+                        .as_f64()
+                        .ok_or_else(|| failed!("a scene message lacks a number"))
+                };
                 let center = &message["center_m"];
-                self.center_m = Point3::new(number(&center[0])?, number(&center[1])?, number(&center[2])?);
+                self.center_m = Point3::new(
+                    number(&center[0])?,
+                    number(&center[1])?,
+                    number(&center[2])?,
+                );
                 self.radius_m = number(&message["radius_m"])?;
             }
             // At first, the server cannot draw a picture yet.
@@ -239,7 +283,10 @@ impl Client {
         );
         let mut message = Vec::new();
         let n_read = (&mut self.reader).take(n_bytes).read_to_end(&mut message)?;
-        ensure!(n_read as u64 == n_bytes, "the server closed the connection within a message");
+        ensure!(
+            n_read as u64 == n_bytes,
+            "the server closed the connection within a message"
+        );
         let (header, payload) = split(&message)?;
         if header["type"] != "part" {
             return self.handle_picture(&header, payload);
@@ -287,12 +334,20 @@ impl Client {
 
     /// Decodes a picture and reports that it is shown.
     fn show(&mut self, header: &Value, payload: &[u8]) -> Result<()> {
-        let number = |name: &str| header["color"][name].as_u64().and_then(|n| usize::try_from(n).ok());
-        let jpeg = number("offset").zip(number("bytes")).and_then(|(offset, n)| payload.get(offset..)?.get(..n));
+        let number = |name: &str| {
+            header["color"][name]
+                .as_u64()
+                .and_then(|n| usize::try_from(n).ok())
+        };
+        let jpeg = number("offset")
+            .zip(number("bytes"))
+            .and_then(|(offset, n)| payload.get(offset..)?.get(..n));
         let jpeg = jpeg.ok_or_else(|| failed!("a picture without color: {header}"))?;
         image::load_from_memory_with_format(jpeg, image::ImageFormat::Jpeg)
             .map_err(|error| failed!("cannot decode a picture: {error}"))?;
-        let Some(started) = self.server_started else { return Ok(()) };
+        let Some(started) = self.server_started else {
+            return Ok(());
+        };
         let shown_millis = started.elapsed().as_secs_f64() * 1e3;
         let shown = json!({ "type": "shown", "id": header["id"], "shown_millis": shown_millis });
         self.send(TEXT, shown.to_string().as_bytes())
@@ -305,7 +360,8 @@ impl Client {
         let distance_m = if is_panorama { 0.2 } else { 1.5 } * self.radius_m;
         let offset = Vector3::new(angle.cos(), angle.sin(), 0.7) * distance_m;
         // The y axis of `face_towards` points up, but that of a camera points down.
-        let world_from_camera = Transform::face_towards(&(self.center_m + offset), &self.center_m, &-Vector3::z());
+        let world_from_camera =
+            Transform::face_towards(&(self.center_m + offset), &self.center_m, &-Vector3::z());
         let request = json!({
             "type": "render",
             "id": self.n_requested,
@@ -328,7 +384,10 @@ impl Client {
         let mut head = [0; 2];
         self.reader.read_exact(&mut head)?;
         let is_final = head[0] & 0x80 != 0;
-        ensure!(is_final, "the server sent a fragmented message, expected one frame per message");
+        ensure!(
+            is_final,
+            "the server sent a fragmented message, expected one frame per message"
+        );
         let n_bytes = match head[1] {
             126 => {
                 let mut bytes = [0; 2];
@@ -341,26 +400,43 @@ impl Client {
                 u64::from_be_bytes(bytes)
             }
             short @ 0..126 => u64::from(short),
-            masked => return Err(failed!("the server sent a masked frame (length byte {masked})")),
+            masked => {
+                return Err(failed!(
+                    "the server sent a masked frame (length byte {masked})"
+                ));
+            }
         };
         Ok((head[0] & 0x0f, n_bytes))
     }
 
     fn skip(&mut self, n_bytes: u64) -> Result<()> {
         let n_skipped = std::io::copy(&mut (&mut self.reader).take(n_bytes), &mut std::io::sink())?;
-        ensure!(n_skipped == n_bytes, "the server closed the connection within a message");
+        ensure!(
+            n_skipped == n_bytes,
+            "the server closed the connection within a message"
+        );
         Ok(())
     }
 
-    /// Sends a frame. The protocol requires a mask; it is zero, because there is no proxy to protect on loopback.
+    /// Sends a frame. The protocol requires a mask; it is zero, because there is no proxy to
+    /// protect on loopback.
     fn send(&mut self, opcode: u8, contents: &[u8]) -> Result<()> {
         let mut frame = vec![0x80 | opcode];
         match u8::try_from(contents.len()) {
             Ok(n @ 0..126) => frame.push(0x80 | n),
             _ => {
                 frame.push(0x80 | 126);
-                let too_long = |_| failed!("a message of {} bytes, expected at most 65535", contents.len());
-                frame.extend(u16::try_from(contents.len()).map_err(too_long)?.to_be_bytes());
+                let too_long = |_| {
+                    failed!(
+                        "a message of {} bytes, expected at most 65535",
+                        contents.len()
+                    )
+                };
+                frame.extend(
+                    u16::try_from(contents.len())
+                        .map_err(too_long)?
+                        .to_be_bytes(),
+                );
             }
         }
         frame.extend([0; 4]);
@@ -371,11 +447,11 @@ impl Client {
 
 /// Header and payload of a binary message.
 fn split(message: &[u8]) -> Result<(Value, &[u8])> {
-    let header = message
-        .split_first_chunk()
-        .and_then(|(length, rest)| rest.split_at_checked(usize::try_from(u32::from_le_bytes(*length)).ok()?));
-    let (header, payload) =
-        header.ok_or_else(|| failed!("a binary message of {} bytes without header", message.len()))?;
+    let header = message.split_first_chunk().and_then(|(length, rest)| {
+        rest.split_at_checked(usize::try_from(u32::from_le_bytes(*length)).ok()?)
+    });
+    let (header, payload) = header
+        .ok_or_else(|| failed!("a binary message of {} bytes without header", message.len()))?;
     Ok((serde_json::from_slice(header)?, payload))
 }
 
@@ -394,7 +470,11 @@ mod tests {
         let started = Instant::now();
         let mut n_drawn = 0;
         while viewer.n_pictures() < 3 {
-            assert!(viewer.is_connected() && started.elapsed() < Duration::from_secs(60), "{}", viewer.n_pictures());
+            assert!(
+                viewer.is_connected() && started.elapsed() < Duration::from_secs(60),
+                "{}",
+                viewer.n_pictures()
+            );
             let Some(pending) = hub.next_request() else {
                 std::thread::sleep(Duration::from_millis(1));
                 continue;
@@ -406,9 +486,19 @@ mod tests {
                 let size_px = pending.request.size_px;
                 let n = (size_px[0] * size_px[1]) as usize;
                 let now = Instant::now();
-                let newest = NewestKeyframe { captured_at: now, added_at: now };
-                let pending = pending.of_keyframes(TrainedKeyframes { n: n_drawn, newest: Some(newest) });
-                pending.deliver(Picture { size_px, rgba_srgb: vec![128; 4 * n], depth_m: vec![1.0; n] });
+                let newest = NewestKeyframe {
+                    captured_at: now,
+                    added_at: now,
+                };
+                let pending = pending.of_keyframes(TrainedKeyframes {
+                    n: n_drawn,
+                    newest: Some(newest),
+                });
+                pending.deliver(Picture {
+                    size_px,
+                    rgba_srgb: vec![128; 4 * n],
+                    depth_m: vec![1.0; n],
+                });
             }
             n_drawn += 1;
         }
@@ -418,14 +508,31 @@ mod tests {
             shown.append(&mut hub.take_shown_pictures());
             std::thread::sleep(Duration::from_millis(1));
         }
-        assert!(shown[1..].iter().all(|picture| !picture.new_keyframes.is_empty()), "{shown:?}");
-        // The viewer's estimate of the server's clock is wrong by less than a round trip, which is long on a busy computer.
+        assert!(
+            shown[1..]
+                .iter()
+                .all(|picture| !picture.new_keyframes.is_empty()),
+            "{shown:?}"
+        );
+        // The viewer's estimate of the server's clock is wrong by less than a round trip, which is
+        // long on a busy computer.
         let elapsed_secs = started.elapsed().as_secs_f64();
-        let decoding_secs: Vec<f64> =
-            shown.iter().map(|picture| secs_between(picture.sent_at, picture.shown_at)).collect();
-        assert!(decoding_secs.iter().all(|secs| secs.abs() < elapsed_secs), "{decoding_secs:?} of {elapsed_secs} s");
-        assert!(decoding_secs.iter().any(|secs| *secs != 0.0), "{decoding_secs:?}");
-        assert!(n_drawn >= 4, "one failed request and three images, with one stage each if the server renders fast");
+        let decoding_secs: Vec<f64> = shown
+            .iter()
+            .map(|picture| secs_between(picture.sent_at, picture.shown_at))
+            .collect();
+        assert!(
+            decoding_secs.iter().all(|secs| secs.abs() < elapsed_secs),
+            "{decoding_secs:?} of {elapsed_secs} s"
+        );
+        assert!(
+            decoding_secs.iter().any(|secs| *secs != 0.0),
+            "{decoding_secs:?}"
+        );
+        assert!(
+            n_drawn >= 4,
+            "one failed request and three images, with one stage each if the server renders fast"
+        );
         drop(viewer);
         while hub.n_clients() > 0 {
             assert!(started.elapsed() < Duration::from_secs(60));
@@ -451,9 +558,13 @@ mod tests {
                 assert!(n_read > 0);
                 request.extend(&part[..n_read]);
             }
-            stream.write_all(b"HTTP/1.1 404 Not Found\r\n\r\n").expect("sent");
+            stream
+                .write_all(b"HTTP/1.1 404 Not Found\r\n\r\n")
+                .expect("sent");
         });
-        let error_message = Viewer::connect(address, ViewerOptions::default()).expect_err("no WebSocket").to_string();
+        let error_message = Viewer::connect(address, ViewerOptions::default())
+            .expect_err("no WebSocket")
+            .to_string();
         assert!(error_message.contains("404"), "{error_message}");
         other.join().expect("no panic");
     }

@@ -1,5 +1,5 @@
-//! Runs alignment in parallel with training. Alignment starts with the first training step, on its own thread; its
-//! result is applied at a fixed step.
+//! Runs alignment in parallel with training. Alignment starts with the first training step, on its
+//! own thread; its result is applied at a fixed step.
 
 use crate::registration::{Alignment, CameraMovement, MovementDetector, align};
 use crate::{CalibratedCamera, CameraCorrection, CameraRefinement, Error};
@@ -8,14 +8,18 @@ use keyframe::Keyframe;
 use kinematics::Stamp;
 use std::sync::Arc;
 
-/// Step at which training waits for the result and applies it. It is smaller on software adapters, where a step takes
-/// as long as alignment.
+/// Step at which training waits for the result and applies it. It is smaller on software adapters,
+/// where a step takes as long as alignment.
 const ALIGNMENT_STEP: u64 = 400;
 const SOFTWARE_ALIGNMENT_STEP: u64 = 50;
 
 /// Step at which the result is applied.
 pub fn alignment_step(is_software: bool, n_planned_steps: u64) -> u64 {
-    let default_step = if is_software { SOFTWARE_ALIGNMENT_STEP } else { ALIGNMENT_STEP };
+    let default_step = if is_software {
+        SOFTWARE_ALIGNMENT_STEP
+    } else {
+        ALIGNMENT_STEP
+    };
     default_step.min(n_planned_steps / 4).max(1)
 }
 
@@ -41,12 +45,22 @@ impl AlignmentTask {
     /// Requests alignment unless `choice` selects no parameter.
     pub fn new(choice: &CameraRefinement) -> Self {
         let is_requested = !choice.always().is_empty() || !choice.candidates().is_empty();
-        Self { state: if is_requested { TaskState::Requested } else { TaskState::Done }, result: None }
+        Self {
+            state: if is_requested {
+                TaskState::Requested
+            } else {
+                TaskState::Done
+            },
+            result: None,
+        }
     }
 
     /// Alignment that ended with this result.
     pub fn done(result: Option<Alignment>) -> Self {
-        Self { state: TaskState::Done, result }
+        Self {
+            state: TaskState::Done,
+            result,
+        }
     }
 
     /// The latest result; `None` before the first end, or if alignment was not possible.
@@ -86,16 +100,24 @@ impl AlignmentTask {
         self.state = TaskState::Running(Task::start("alignment", work));
     }
 
-    /// Waits for the result. Returns whether these keyframes must be corrected differently than before. If alignment
-    /// was not possible, the latest result stays.
+    /// Waits for the result. Returns whether these keyframes must be corrected differently than
+    /// before. If alignment was not possible, the latest result stays.
     pub fn finish(&mut self, keyframes: &[Arc<Keyframe>]) -> Result<bool, Error> {
-        let TaskState::Running(thread) = std::mem::replace(&mut self.state, TaskState::Done) else { return Ok(false) };
+        let TaskState::Running(thread) = std::mem::replace(&mut self.state, TaskState::Done) else {
+            return Ok(false);
+        };
         let result = thread.join().map_err(|_| Error::AlignmentPanicked)?;
         for line in result.iter().flat_map(Alignment::lines) {
             log::info!("{line}");
         }
-        let Some(mut result) = result else { return Ok(false) };
-        if self.result.as_ref().is_some_and(|latest| is_as_good(latest, &result, keyframes)) {
+        let Some(mut result) = result else {
+            return Ok(false);
+        };
+        if self
+            .result
+            .as_ref()
+            .is_some_and(|latest| is_as_good(latest, &result, keyframes))
+        {
             return Ok(false);
         }
         if let Some(latest) = &self.result {
@@ -103,7 +125,9 @@ impl AlignmentTask {
         }
         let is_changed = match &self.result {
             None => result.has_corrections(),
-            Some(latest) => keyframes.iter().any(|keyframe| latest.differs(&result, keyframe)),
+            Some(latest) => keyframes
+                .iter()
+                .any(|keyframe| latest.differs(&result, keyframe)),
         };
         if is_changed || self.result.is_none() {
             self.result = Some(result);
@@ -113,18 +137,29 @@ impl AlignmentTask {
 
     /// Adds a movement of a camera to the result; see [`Alignment::add_movement`].
     pub fn add_movement(&mut self, movement: CameraMovement, first: Stamp) {
-        self.result.get_or_insert_default().add_movement(movement, first);
+        self.result
+            .get_or_insert_default()
+            .add_movement(movement, first);
     }
 
     /// The keyframe with the corrections of alignment, if there are any.
     pub fn corrected(&self, keyframe: &Arc<Keyframe>) -> Arc<Keyframe> {
-        self.result.as_ref().map_or_else(|| keyframe.clone(), |result| result.corrected(keyframe))
+        self.result
+            .as_ref()
+            .map_or_else(|| keyframe.clone(), |result| result.corrected(keyframe))
     }
 
-    /// The camera of a keyframe with the corrections of alignment, followed by the corrections that were learned with
-    /// the splats.
-    pub fn calibrated_camera(&self, keyframe: &Keyframe, learned: Option<&CameraCorrection>) -> CalibratedCamera {
-        self.result.as_ref().unwrap_or(&Alignment::default()).camera(keyframe, learned)
+    /// The camera of a keyframe with the corrections of alignment, followed by the corrections that
+    /// were learned with the splats.
+    pub fn calibrated_camera(
+        &self,
+        keyframe: &Keyframe,
+        learned: Option<&CameraCorrection>,
+    ) -> CalibratedCamera {
+        self.result
+            .as_ref()
+            .unwrap_or(&Alignment::default())
+            .camera(keyframe, learned)
     }
 }
 
@@ -132,8 +167,9 @@ impl AlignmentTask {
 const COLOR_ACCURACY_RAD: f64 = 1.75e-3;
 const COLOR_ACCURACY_M: f64 = 3e-3;
 
-/// Whether the latest corrections are as good as newer ones. Without depth, they are if both agree within their accuracy,
-/// or if the newer estimate was rejected; cameras would move back and forth otherwise.
+/// Whether the latest corrections are as good as newer ones. Without depth, they are if both agree
+/// within their accuracy, or if the newer estimate was rejected; cameras would move back and forth
+/// otherwise.
 fn is_as_good(latest: &Alignment, newer: &Alignment, keyframes: &[Arc<Keyframe>]) -> bool {
     if !latest.has_corrections() || keyframes.iter().any(|keyframe| keyframe.depth.is_some()) {
         return false;
@@ -143,17 +179,19 @@ fn is_as_good(latest: &Alignment, newer: &Alignment, keyframes: &[Arc<Keyframe>]
         let motion = latest.world_from_camera.inverse() * newer.world_from_camera;
         let has_same_lens = (0..2).all(|axis| {
             let focal = (latest.focal_px[axis] / newer.focal_px[axis]).ln().abs();
-            let principal = (latest.principal_px[axis] - newer.principal_px[axis]).abs() / newer.focal_px[axis];
+            let principal =
+                (latest.principal_px[axis] - newer.principal_px[axis]).abs() / newer.focal_px[axis];
             focal.max(principal) < COLOR_ACCURACY_RAD
         });
-        let is_same_pose =
-            motion.rotation.angle() < COLOR_ACCURACY_RAD && motion.translation.vector.norm() < COLOR_ACCURACY_M;
+        let is_same_pose = motion.rotation.angle() < COLOR_ACCURACY_RAD
+            && motion.translation.vector.norm() < COLOR_ACCURACY_M;
         is_same_pose && has_same_lens
     };
     !newer.has_corrections() || keyframes.iter().all(agrees)
 }
 
-/// Detects camera movements in the background. Its keyframes already have the corrections of alignment.
+/// Detects camera movements in the background. Its keyframes already have the corrections of
+/// alignment.
 #[derive(Debug)]
 pub struct MovementTask {
     worker: Worker,
@@ -174,7 +212,10 @@ enum Worker {
 impl MovementTask {
     /// Creates a task that compares later keyframes with `references`.
     pub fn new(references: Vec<Arc<Keyframe>>) -> Self {
-        Self { worker: Worker::New(references), pending: Vec::new() }
+        Self {
+            worker: Worker::New(references),
+            pending: Vec::new(),
+        }
     }
 
     /// Adds a keyframe to test.
@@ -196,7 +237,9 @@ impl MovementTask {
         let keyframes = std::mem::take(&mut self.pending);
         let test = move || {
             let mut detector = detector();
-            let movement = keyframes.iter().find_map(|keyframe| detector.push(keyframe));
+            let movement = keyframes
+                .iter()
+                .find_map(|keyframe| detector.push(keyframe));
             (detector, movement)
         };
         self.worker = Worker::Running(Task::start("movement", || run_in_background_pool(test)));
@@ -210,7 +253,8 @@ impl MovementTask {
             }
             match std::mem::replace(&mut self.worker, Worker::Done) {
                 Worker::Running(thread) if wait || thread.is_finished() => {
-                    let (detector, movement) = thread.join().map_err(|_| Error::AlignmentPanicked)?;
+                    let (detector, movement) =
+                        thread.join().map_err(|_| Error::AlignmentPanicked)?;
                     if movement.is_some() {
                         return Ok(movement);
                     }

@@ -9,8 +9,8 @@ use std::collections::BTreeMap;
 #[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct CameraCorrection {
-    /// Rotation vector in the camera's own axes, radians. The rotation, then the translation, are applied after
-    /// `camera_from_world`.
+    /// Rotation vector in the camera's own axes, radians. The rotation, then the translation, are
+    /// applied after `camera_from_world`.
     pub rotation_rad: [f64; 3],
     /// Translation in the camera's axes, meters.
     pub translation_m: [f64; 3],
@@ -20,10 +20,11 @@ pub struct CameraCorrection {
     pub log_focal: [f64; 2],
     /// Offset of the principal point, in focal lengths.
     pub principal_offset_focals: [f64; 2],
-    /// Offsets added to the readings of the joints that carry the camera, radians or meters; may be empty.
+    /// Offsets added to the readings of the joints that carry the camera, radians or meters; may be
+    /// empty.
     pub joint_offsets: Vec<f64>,
-    /// Rotation vector in the camera's own axes, radians. The rotation, then the translation, are applied after
-    /// `color_from_depth`.
+    /// Rotation vector in the camera's own axes, radians. The rotation, then the translation, are
+    /// applied after `color_from_depth`.
     pub depth_rotation_rad: [f64; 3],
     /// Translation in the camera's axes, meters.
     pub depth_translation_m: [f64; 3],
@@ -31,15 +32,17 @@ pub struct CameraCorrection {
     pub log_depth_scale: f64,
     /// Offset added to the readout time, seconds.
     pub readout_secs: f64,
-    /// Pose correction of each training image, by stamp in nanoseconds: rotation vector (radians) and translation
-    /// (meters). Interpolated linearly between images.
+    /// Pose correction of each training image, by stamp in nanoseconds: rotation vector (radians)
+    /// and translation (meters). Interpolated linearly between images.
     pub drift: BTreeMap<i64, [f64; 6]>,
-    /// Share of the interpolated drift that is applied to images without an entry in `drift`, 0 to 1.
+    /// Share of the interpolated drift that is applied to images without an entry in `drift`, 0 to
+    /// 1.
     pub drift_weight: f64,
-    /// Logarithms of the gains of red, green and blue of each training image, by stamp in nanoseconds.
+    /// Logarithms of the gains of red, green and blue of each training image, by stamp in
+    /// nanoseconds.
     pub log_gains: BTreeMap<i64, [f64; 3]>,
-    /// Appearance embedding of each training image in a neural field, by stamp in nanoseconds. The values have no
-    /// meaning outside this field.
+    /// Appearance embedding of each training image in a neural field, by stamp in nanoseconds. The
+    /// values have no meaning outside this field.
     pub appearance_embeddings: BTreeMap<i64, [f64; EMBEDDING_DIM]>,
 }
 
@@ -80,7 +83,8 @@ pub struct CalibratedCamera {
     pub shutter: Option<Shutter>,
     /// Pose of the depth frame in the camera frame, if there is depth.
     pub color_from_depth: Option<Transform>,
-    /// Factors on red, green and blue that match a render to the exposure and white balance of the image.
+    /// Factors on red, green and blue that match a render to the exposure and white balance of the
+    /// image.
     pub gains: [f64; 3],
 }
 
@@ -88,10 +92,12 @@ pub struct CalibratedCamera {
 const NOTICEABLE_FOCAL: f64 = 1e-3;
 
 impl CalibratedCamera {
-    /// Whether another calibration of the same image has a noticeably different pose or focal length.
+    /// Whether another calibration of the same image has a noticeably different pose or focal
+    /// length.
     pub fn differs_noticeably(&self, other: &Self) -> bool {
         let motion = self.world_from_camera.inverse() * other.world_from_camera;
-        let focal_change = (0..2).map(|axis| (other.focal_px[axis] / self.focal_px[axis] - 1.0).abs());
+        let focal_change =
+            (0..2).map(|axis| (other.focal_px[axis] / self.focal_px[axis] - 1.0).abs());
         transform::is_noticeable(&motion) || focal_change.fold(0.0, f64::max) > NOTICEABLE_FOCAL
     }
 
@@ -101,7 +107,10 @@ impl CalibratedCamera {
             world_from_camera: keyframe.world_from_camera,
             focal_px: keyframe.focal_px,
             principal_px: keyframe.principal_px,
-            shutter: keyframe.twist.map(|twist| Shutter { twist, readout_secs: keyframe.readout_secs }),
+            shutter: keyframe.twist.map(|twist| Shutter {
+                twist,
+                readout_secs: keyframe.readout_secs,
+            }),
             color_from_depth: keyframe
                 .depth
                 .as_ref()
@@ -115,7 +124,12 @@ impl CameraCorrection {
     /// The correction without the parts that apply to single images.
     #[must_use]
     pub fn of_all_images(self) -> Self {
-        Self { drift: BTreeMap::new(), log_gains: BTreeMap::new(), appearance_embeddings: BTreeMap::new(), ..self }
+        Self {
+            drift: BTreeMap::new(),
+            log_gains: BTreeMap::new(),
+            appearance_embeddings: BTreeMap::new(),
+            ..self
+        }
     }
 
     /// The corrected camera of a keyframe; [`CalibratedCamera::of`] is the uncorrected one.
@@ -130,9 +144,13 @@ impl CameraCorrection {
         let joints = transform::exp(&by_joints, -1.0);
         let extrinsics = rigid_transform(self.rotation_rad.into(), self.translation_m.into());
         let [rotation_x, rotation_y, rotation_z, x, y, z] = self.drift_at(keyframe.stamp);
-        let drift = rigid_transform(Vector3::new(rotation_x, rotation_y, rotation_z), Vector3::new(x, y, z));
+        let drift = rigid_transform(
+            Vector3::new(rotation_x, rotation_y, rotation_z),
+            Vector3::new(x, y, z),
+        );
         let world_from_camera =
-            (extrinsics * drift * joints * time_offset * lens.world_from_camera.inverse()).inverse();
+            (extrinsics * drift * joints * time_offset * lens.world_from_camera.inverse())
+                .inverse();
         let raw_from_corrected = lens.world_from_camera.inverse() * world_from_camera;
         let shutter = |shutter: Shutter| Shutter {
             twist: shutter.twist.of_attached(&raw_from_corrected),
@@ -145,44 +163,75 @@ impl CameraCorrection {
             principal_px: std::array::from_fn(|axis| {
                 lens.principal_px[axis] + self.principal_offset_focals[axis] * lens.focal_px[axis]
             }),
-            color_from_depth: keyframe.depth.as_ref().map(|depth| self.color_from_depth(keyframe, depth)),
-            gains: interpolate(&self.log_gains, keyframe.stamp).unwrap_or_default().map(f64::exp),
+            color_from_depth: keyframe
+                .depth
+                .as_ref()
+                .map(|depth| self.color_from_depth(keyframe, depth)),
+            gains: interpolate(&self.log_gains, keyframe.stamp)
+                .unwrap_or_default()
+                .map(f64::exp),
         }
     }
 
-    /// Drift of an image: its own entry if there is one, otherwise the interpolation between its neighbors in time,
-    /// multiplied by `drift_weight`.
+    /// Drift of an image: its own entry if there is one, otherwise the interpolation between its
+    /// neighbors in time, multiplied by `drift_weight`.
     pub fn drift_at(&self, stamp: Stamp) -> [f64; 6] {
-        let share = if self.drift.contains_key(&stamp.0) { 1.0 } else { self.drift_weight };
-        interpolate(&self.drift, stamp).unwrap_or_default().map(|part| share * part)
+        let share = if self.drift.contains_key(&stamp.0) {
+            1.0
+        } else {
+            self.drift_weight
+        };
+        interpolate(&self.drift, stamp)
+            .unwrap_or_default()
+            .map(|part| share * part)
     }
 
     /// Motion of the camera from the uncorrected pose to the pose at the exposure of the image.
     pub fn time_corrected_from_input(&self, keyframe: &Keyframe) -> Transform {
         keyframe.twist.map_or(Transform::identity(), |twist| {
-            rigid_transform(-self.time_offset_secs * twist.angular_rad_s, -self.time_offset_secs * twist.linear_m_s)
+            rigid_transform(
+                -self.time_offset_secs * twist.angular_rad_s,
+                -self.time_offset_secs * twist.linear_m_s,
+            )
         })
     }
 
     /// Corrected pose of a keyframe's depth frame in its color frame.
     pub fn color_from_depth(&self, keyframe: &Keyframe, depth: &DepthMap) -> Transform {
-        let rigid_transform = rigid_transform(self.depth_rotation_rad.into(), self.depth_translation_m.into());
+        let rigid_transform = rigid_transform(
+            self.depth_rotation_rad.into(),
+            self.depth_translation_m.into(),
+        );
         rigid_transform * keyframe.world_from_camera.inverse() * depth.world_from_camera
     }
 
     /// The keyframe with corrected pose, intrinsics, depth and readout time.
     pub fn corrected(&self, keyframe: &Keyframe) -> Keyframe {
-        let CalibratedCamera { world_from_camera, focal_px, principal_px, .. } = self.apply(keyframe);
+        let CalibratedCamera {
+            world_from_camera,
+            focal_px,
+            principal_px,
+            ..
+        } = self.apply(keyframe);
         let depth = keyframe.depth.as_ref().map(|depth| {
             let has_same_lens = shares_lens(keyframe, depth);
             let focal = |axis: usize| depth.focal_px[axis] * self.log_focal[axis].exp();
-            let principal =
-                |axis: usize| depth.principal_px[axis] + self.principal_offset_focals[axis] * depth.focal_px[axis];
+            let principal = |axis: usize| {
+                depth.principal_px[axis] + self.principal_offset_focals[axis] * depth.focal_px[axis]
+            };
             let factor = f32_of(self.log_depth_scale.exp());
             DepthMap {
                 size_px: depth.size_px,
-                focal_px: if has_same_lens { [0, 1].map(focal) } else { depth.focal_px },
-                principal_px: if has_same_lens { [0, 1].map(principal) } else { depth.principal_px },
+                focal_px: if has_same_lens {
+                    [0, 1].map(focal)
+                } else {
+                    depth.focal_px
+                },
+                principal_px: if has_same_lens {
+                    [0, 1].map(principal)
+                } else {
+                    depth.principal_px
+                },
                 depth_m: match factor {
                     1.0 => depth.depth_m.clone(),
                     factor => depth.depth_m.iter().map(|z| z * factor).collect(),
@@ -196,22 +245,34 @@ impl CameraCorrection {
             principal_px,
             depth,
             world_from_camera,
-            twist: keyframe.twist.map(|twist| twist.of_attached(&raw_from_corrected)),
+            twist: keyframe
+                .twist
+                .map(|twist| twist.of_attached(&raw_from_corrected)),
             readout_secs: (keyframe.readout_secs + self.readout_secs).max(0.0),
-            joint_twists: keyframe.joint_twists.iter().map(|twist| twist.of_attached(&raw_from_corrected)).collect(),
+            joint_twists: keyframe
+                .joint_twists
+                .iter()
+                .map(|twist| twist.of_attached(&raw_from_corrected))
+                .collect(),
             ..keyframe.clone()
         }
     }
 }
 
-/// Linear interpolation at a stamp between the entries before and after it; `None` if there are no entries.
-pub fn interpolate<const N: usize>(known: &BTreeMap<i64, [f64; N]>, stamp: Stamp) -> Option<[f64; N]> {
+/// Linear interpolation at a stamp between the entries before and after it; `None` if there are no
+/// entries.
+pub fn interpolate<const N: usize>(
+    known: &BTreeMap<i64, [f64; N]>,
+    stamp: Stamp,
+) -> Option<[f64; N]> {
     let before = known.range(..=stamp.0).next_back();
     let after = known.range(stamp.0..).next();
     match (before, after) {
         (Some((begin, from)), Some((end, to))) if end > begin => {
             let share = (stamp.0 - begin) as f64 / (end - begin) as f64;
-            Some(std::array::from_fn(|ix| from[ix] + share * (to[ix] - from[ix])))
+            Some(std::array::from_fn(|ix| {
+                from[ix] + share * (to[ix] - from[ix])
+            }))
         }
         (Some((_, value)), _) | (None, Some((_, value))) => Some(*value),
         (None, None) => None,
@@ -220,26 +281,32 @@ pub fn interpolate<const N: usize>(known: &BTreeMap<i64, [f64; N]>, stamp: Stamp
 
 /// Share of the drift between images that also applies to other images, 0 to 1.
 ///
-/// Leaves out each image in turn, predicts its drift from its neighbors in time, and returns 1 minus the ratio of the
-/// squared prediction errors to the squared drifts.
+/// Leaves out each image in turn, predicts its drift from its neighbors in time, and returns 1
+/// minus the ratio of the squared prediction errors to the squared drifts.
 ///
-/// Returns 0 if the errors of images are independent, if predicting is worse than assuming no drift, or if there are
-/// too few images.
+/// Returns 0 if the errors of images are independent, if predicting is worse than assuming no
+/// drift, or if there are too few images.
 ///
 /// * `scene_size_m`: lever arm that converts rotations to lengths.
 pub fn drift_weight(drift: &BTreeMap<i64, [f64; 6]>, scene_size_m: f64) -> f64 {
     /// Smaller weights are set to zero, because they may be due to chance.
     const MIN_WEIGHT: f64 = 0.2;
-    let known: Vec<(f64, &[f64; 6])> = drift.iter().map(|(stamp, parts)| (*stamp as f64, parts)).collect();
+    let known: Vec<(f64, &[f64; 6])> = drift
+        .iter()
+        .map(|(stamp, parts)| (*stamp as f64, parts))
+        .collect();
     let squares = |parts: [f64; 6]| {
-        let [rotation, translation] = [&parts[..3], &parts[3..]].map(|parts| parts.iter().map(|x| x * x).sum::<f64>());
+        let [rotation, translation] =
+            [&parts[..3], &parts[3..]].map(|parts| parts.iter().map(|x| x * x).sum::<f64>());
         rotation * scene_size_m * scene_size_m + translation
     };
     let (mut residual, mut all) = (0.0, 0.0);
     for neighbors in known.windows(3) {
         let [(begin, from), (stamp, own), (end, to)] = [neighbors[0], neighbors[1], neighbors[2]];
         let frac = (stamp - begin) / (end - begin);
-        residual += squares(std::array::from_fn(|ix| own[ix] - from[ix] - frac * (to[ix] - from[ix])));
+        residual += squares(std::array::from_fn(|ix| {
+            own[ix] - from[ix] - frac * (to[ix] - from[ix])
+        }));
         all += squares(*own);
     }
     let share = if all > 0.0 { 1.0 - residual / all } else { 0.0 };
@@ -248,11 +315,14 @@ pub fn drift_weight(drift: &BTreeMap<i64, [f64; 6]>, scene_size_m: f64) -> f64 {
 
 /// The rigid motion that rotates by a rotation vector, then translates.
 pub fn rigid_transform(rotation_rad: Vector3<f64>, translation_m: Vector3<f64>) -> Transform {
-    Transform::from_parts(Translation3::from(translation_m), UnitQuaternion::from_scaled_axis(rotation_rad))
+    Transform::from_parts(
+        Translation3::from(translation_m),
+        UnitQuaternion::from_scaled_axis(rotation_rad),
+    )
 }
 
-/// Whether the depth image has the same lens as the color image, for example because it was registered to the color
-/// image. If so, lens corrections apply to both.
+/// Whether the depth image has the same lens as the color image, for example because it was
+/// registered to the color image. If so, lens corrections apply to both.
 pub fn shares_lens(keyframe: &Keyframe, depth: &DepthMap) -> bool {
     const TOLERANCE_FRAC: f64 = 1e-4; // Sizes are rounded to pixels.
     [0, 1].into_iter().all(|axis| {

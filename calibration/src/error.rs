@@ -64,13 +64,17 @@ pub enum Error {
         image: String,
     },
     /// The points of the target are in the wrong unit.
-    #[error("the target is {size_m} m wide, expected 0.002 to 10 m; its dimensions must be in meters")]
+    #[error(
+        "the target is {size_m} m wide, expected 0.002 to 10 m; its dimensions must be in meters"
+    )]
     TargetSize {
         /// Longer side of the target, meters.
         size_m: String,
     },
     /// The points of the target are not in one plane.
-    #[error("the target is not flat: its points differ by {depth_mm} mm in z; calibration needs a flat target")]
+    #[error(
+        "the target is not flat: its points differ by {depth_mm} mm in z; calibration needs a flat target"
+    )]
     TargetNotFlat {
         /// Range of the z coordinates, millimeters.
         depth_mm: String,
@@ -130,7 +134,8 @@ pub enum Error {
         /// What is wrong, with the value found and the value expected.
         why: String,
     },
-    /// The measurements do not determine the result, or a mistake in them explains why they disagree.
+    /// The measurements do not determine the result, or a mistake in them explains why they
+    /// disagree.
     #[error("calibration refused: {0}")]
     Refused(Box<Refusal>),
 }

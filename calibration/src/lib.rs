@@ -1,15 +1,16 @@
 //! Calibration parameters of cameras and their estimation from keyframes.
 //!
-//! A [`CameraCorrection`] holds the estimated errors of one camera: extrinsics (hand-eye), time offset, intrinsics,
-//! joint offsets, and the pose, scale and timing of its depth camera. A [`ParamSet`] selects which of them are
-//! estimated. [`align`] estimates them by registering keyframes with depth, keeps those that improve validation images
-//! ([`Trial`]), and reports their uncertainty. Without depth, it estimates extrinsics from matched features.
-//! [`AlignmentTask`] runs [`align`] in parallel with training. [`register_station`] estimates the pose of a mobile base
-//! at one station. [`hand_eye`] calibrates a camera with a target, and [`time_offset`] finds the offset between the
-//! clocks of two pose streams.
+//! A [`CameraCorrection`] holds the estimated errors of one camera: extrinsics (hand-eye), time
+//! offset, intrinsics, joint offsets, and the pose, scale and timing of its depth camera. A
+//! [`ParamSet`] selects which of them are estimated. [`align`] estimates them by registering
+//! keyframes with depth, keeps those that improve validation images ([`Trial`]), and reports their
+//! uncertainty. Without depth, it estimates extrinsics from matched features. [`AlignmentTask`]
+//! runs [`align`] in parallel with training. [`register_station`] estimates the pose of a mobile
+//! base at one station. [`hand_eye`] calibrates a camera with a target, and [`time_offset`] finds
+//! the offset between the clocks of two pose streams.
 //!
-//! [`calibrate_intrinsics`] estimates focal length, principal point and lens of one camera from images of a flat
-//! calibration target.
+//! [`calibrate_intrinsics`] estimates focal length, principal point and lens of one camera from
+//! images of a flat calibration target.
 //!
 //! ```
 //! use calibration::CameraCorrection;
@@ -44,18 +45,21 @@ mod trial;
 pub use background::{AlignmentTask, MovementTask, alignment_step};
 pub use board::{BoardPoint, BoardView};
 pub use correction::{
-    CalibratedCamera, CameraCorrection, EMBEDDING_DIM, drift_weight, interpolate, rigid_transform, shares_lens,
+    CalibratedCamera, CameraCorrection, EMBEDDING_DIM, drift_weight, interpolate, rigid_transform,
+    shares_lens,
 };
 pub use error::Error;
 pub use intrinsics::{
-    BoardPose, EstimatedParam, ImageFit, ImageGrid, ImageRegion, IntrinsicsAdvice, IntrinsicsCalibration,
-    IntrinsicsGuidance, IntrinsicsInput, LensModel, LensTrial, NextView, PointFit, RECOMMENDED_IMAGES, Rejected,
-    RejectionReason, Side, board_pose, calibrate_intrinsics,
+    BoardPose, EstimatedParam, ImageFit, ImageGrid, ImageRegion, IntrinsicsAdvice,
+    IntrinsicsCalibration, IntrinsicsGuidance, IntrinsicsInput, LensModel, LensTrial, NextView,
+    PointFit, RECOMMENDED_IMAGES, Rejected, RejectionReason, Side, board_pose,
+    calibrate_intrinsics,
 };
 pub use params::ParamSet;
 pub use registration::{
-    Alignment, CameraMovement, Estimate, ExtrinsicsCovariance, MOVEMENT_WINDOW, MovementDetector, PoseEstimate,
-    PoseSigmas, ScalarEstimate, StationCorrection, Unobservable, align, candidates, register_station,
+    Alignment, CameraMovement, Estimate, ExtrinsicsCovariance, MOVEMENT_WINDOW, MovementDetector,
+    PoseEstimate, PoseSigmas, ScalarEstimate, StationCorrection, Unobservable, align, candidates,
+    register_station,
 };
 pub use tag_check::{ContradictionCause, TagCheck, TagContradiction, TagObservation};
 pub use trial::{CameraRefinement, Candidate, MIN_VALIDATION_IMAGES, Trial, TrialReport};

@@ -15,8 +15,8 @@ bitflags::bitflags! {
     /// ```
     #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
     pub struct ParamSet: u16 {
-        /// Extrinsics of each camera: rotation and translation relative to its parent (hand-eye if the parent is the
-        /// flange).
+        /// Extrinsics of each camera: rotation and translation relative to its parent (hand-eye if
+        /// the parent is the flange).
         const EXTRINSICS = 1;
         /// Time by which the poses of each camera lag behind its images.
         const TIME_OFFSET = 1 << 1;
@@ -26,8 +26,8 @@ bitflags::bitflags! {
         const IMAGE_POSES = 1 << 3;
         /// Gains of red, green and blue of each image.
         const IMAGE_GAINS = 1 << 4;
-        /// Offset added to the readings of each joint that carries a camera. This parameter and the following ones are
-        /// estimated only by alignment.
+        /// Offset added to the readings of each joint that carries a camera. This parameter and the
+        /// following ones are estimated only by alignment.
         const JOINTS = 1 << 5;
         /// Pose of the depth frame in the camera frame.
         const DEPTH_POSE = 1 << 6;
@@ -51,17 +51,28 @@ impl std::fmt::Display for ParamSet {
             (ParamSet::DEPTH_SCALE, "depth scales"),
             (ParamSet::READOUT, "readout times"),
         ];
-        let names: Vec<&str> = NAMES.iter().filter(|(param, _)| self.contains(*param)).map(|(_, name)| *name).collect();
-        f.write_str(&if names.is_empty() { "nothing".to_owned() } else { names.join(", ") })
+        let names: Vec<&str> = NAMES
+            .iter()
+            .filter(|(param, _)| self.contains(*param))
+            .map(|(_, name)| *name)
+            .collect();
+        f.write_str(&if names.is_empty() {
+            "nothing".to_owned()
+        } else {
+            names.join(", ")
+        })
     }
 }
 
-/// Serializes the set as a map from the names of all parameters, in lower case, to booleans: whether the set contains
-/// them.
+/// Serializes the set as a map from the names of all parameters, in lower case, to booleans:
+/// whether the set contains them.
 impl Serialize for ParamSet {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         let all = Self::all();
-        serializer.collect_map(all.iter_names().map(|(name, param)| (name.to_lowercase(), self.contains(param))))
+        serializer.collect_map(
+            all.iter_names()
+                .map(|(name, param)| (name.to_lowercase(), self.contains(param))),
+        )
     }
 }
 
@@ -69,7 +80,9 @@ impl<'de> Deserialize<'de> for ParamSet {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
         let params = BTreeMap::<String, bool>::deserialize(deserializer)?;
         let contained = params.into_iter().filter(|(_, is_contained)| *is_contained);
-        Ok(contained.filter_map(|(name, _)| Self::from_name(&name.to_uppercase())).collect())
+        Ok(contained
+            .filter_map(|(name, _)| Self::from_name(&name.to_uppercase()))
+            .collect())
     }
 }
 
@@ -86,6 +99,9 @@ mod tests {
             r#"{"extrinsics":false,"time_offset":true,"lens":false,"image_poses":false,"image_gains":true,"joints":false,"depth_pose":false,"depth_scale":false,"readout":false}"#
         );
         assert_eq!(serde_json::from_str::<ParamSet>(&json).unwrap(), set);
-        assert_eq!(serde_json::from_str::<ParamSet>(r#"{"lens":true}"#).unwrap(), ParamSet::LENS);
+        assert_eq!(
+            serde_json::from_str::<ParamSet>(r#"{"lens":true}"#).unwrap(),
+            ParamSet::LENS
+        );
     }
 }

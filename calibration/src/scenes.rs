@@ -1,4 +1,5 @@
-//! A room of textured planes, observed by a camera on an arm with four joints: keyframes with known calibration errors.
+//! A room of textured planes, observed by a camera on an arm with four joints: keyframes with known
+//! calibration errors.
 
 use crate::{CameraCorrection, rigid_transform};
 use keyframe::{DepthMap, Keyframe, Split};
@@ -21,12 +22,18 @@ pub type Joints = [f64; 4];
 /// Azimuth, elevation, roll (radians) and reach (meters).
 fn base_from_flange([azimuth, elevation, roll, reach]: Joints) -> Transform {
     let rotation = |axis: Vector3<f64>, angle: f64| {
-        Isometry3::from_parts(Translation3::identity(), UnitQuaternion::from_scaled_axis(axis * angle))
+        Isometry3::from_parts(
+            Translation3::identity(),
+            UnitQuaternion::from_scaled_axis(axis * angle),
+        )
     };
     let translation = |x: f64, y: f64, z: f64| Isometry3::translation(x, y, z);
     // At zero, the flange looks along x, with its x axis to the right: -y of the base.
-    let look_at =
-        UnitQuaternion::from_matrix(&nalgebra::Matrix3::from_columns(&[-Vector3::y(), -Vector3::z(), Vector3::x()]));
+    let look_at = UnitQuaternion::from_matrix(&nalgebra::Matrix3::from_columns(&[
+        -Vector3::y(),
+        -Vector3::z(),
+        Vector3::x(),
+    ]));
     rotation(Vector3::z(), azimuth)
         * translation(0.1, 0.0, 0.5)
         * rotation(Vector3::y(), elevation)
@@ -36,7 +43,10 @@ fn base_from_flange([azimuth, elevation, roll, reach]: Joints) -> Transform {
 }
 
 fn flange_from_camera() -> Transform {
-    Transform::new(Vector3::new(0.03, -0.02, 0.05), Vector3::new(0.05, -0.1, 0.3))
+    Transform::new(
+        Vector3::new(0.03, -0.02, 0.05),
+        Vector3::new(0.05, -0.1, 0.3),
+    )
 }
 
 /// Pose of the camera in the base frame at joint positions.
@@ -46,17 +56,28 @@ pub fn camera_at(joints: Joints) -> Transform {
 
 /// Joint positions of a scan at a time in seconds, in which all joints move or only the azimuth.
 pub fn joints_at(secs: f64, azimuth_only: bool) -> Joints {
-    let wave = |size: f64, hz: f64, phase: f64| size * (2.0 * std::f64::consts::PI * hz * secs + phase).sin();
+    let wave = |size: f64, hz: f64, phase: f64| {
+        size * (2.0 * std::f64::consts::PI * hz * secs + phase).sin()
+    };
     match azimuth_only {
         true => [wave(0.5, 0.11, 0.2), 0.15, 0.2, 0.1],
-        false => [wave(0.4, 0.11, 0.2), 0.15 + wave(0.25, 0.23, 1.0), wave(0.5, 0.17, 2.0), 0.1 + wave(0.1, 0.31, 0.5)],
+        false => [
+            wave(0.4, 0.11, 0.2),
+            0.15 + wave(0.25, 0.23, 1.0),
+            wave(0.5, 0.17, 2.0),
+            0.1 + wave(0.1, 0.31, 0.5),
+        ],
     }
 }
 
 /// Twist of the camera when the joints move along a direction.
 fn twist_along(joints: Joints, direction: Joints) -> Twist {
     const STEP: f64 = 1e-5;
-    let at = |sign: f64| camera_at(std::array::from_fn(|ix| joints[ix] + sign * STEP * direction[ix]));
+    let at = |sign: f64| {
+        camera_at(std::array::from_fn(|ix| {
+            joints[ix] + sign * STEP * direction[ix]
+        }))
+    };
     transform::log(&(at(-1.0).inverse() * at(1.0)), 2.0 * STEP)
 }
 
@@ -73,11 +94,17 @@ fn cast(from: Point3<f64>, ray: Vector3<f64>) -> (f64, f64) {
     let distance = |(normal, offset): &(Vector3<f64>, f64)| {
         let along = normal.dot(&ray);
         let distance = (offset - normal.dot(&from.coords)) / along;
-        if along > 0.0 && distance > 0.0 { distance } else { f64::INFINITY }
+        if along > 0.0 && distance > 0.0 {
+            distance
+        } else {
+            f64::INFINITY
+        }
     };
     let nearest = planes.iter().map(distance).fold(f64::INFINITY, f64::min);
     let p = from + ray * nearest;
-    let wave = |size: f64, x: f64, y: f64, z: f64, phase: f64| size * (x * p.x + y * p.y + z * p.z + phase).sin();
+    let wave = |size: f64, x: f64, y: f64, z: f64, phase: f64| {
+        size * (x * p.x + y * p.y + z * p.z + phase).sin()
+    };
     let brightness = 128.0
         + wave(30.0, 21.0, 13.0, -17.0, 0.3)
         + wave(25.0, -11.0, 29.0, 9.0, 1.3)
@@ -96,7 +123,8 @@ pub struct Miscalibration {
     pub time_offset_secs: f64,
     /// Error of the joint readings.
     pub joints: Joints,
-    /// Error of the depth pose: the input pose of the depth frame is the true pose times this transform.
+    /// Error of the depth pose: the input pose of the depth frame is the true pose times this
+    /// transform.
     pub depth_pose: Transform,
     /// Relative error of the focal lengths.
     pub focal_frac: f64,
@@ -139,7 +167,11 @@ fn noise(key: u64) -> f64 {
 }
 
 /// Keyframes of a scan of the room.
-#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "bytes and stamps of a test")]
+#[expect(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "bytes and stamps of a test"
+)]
 pub fn capture(miscalibration: &Miscalibration) -> Vec<Arc<Keyframe>> {
     let image = |ix: usize| {
         let secs = 0.3 * ix as f64 + 0.05 * (ix as f64 * 1.7).sin();
@@ -147,8 +179,11 @@ pub fn capture(miscalibration: &Miscalibration) -> Vec<Arc<Keyframe>> {
         let [width, height] = SIZE_PX.map(|side| side as usize);
         let cast_pixel = |pose: &Transform, x: usize, y: usize| {
             let at = [x as f64 + 0.5, y as f64 + 0.5];
-            let ray =
-                Vector3::new((at[0] - PRINCIPAL_PX[0]) / FOCAL_PX[0], (at[1] - PRINCIPAL_PX[1]) / FOCAL_PX[1], 1.0);
+            let ray = Vector3::new(
+                (at[0] - PRINCIPAL_PX[0]) / FOCAL_PX[0],
+                (at[1] - PRINCIPAL_PX[1]) / FOCAL_PX[1],
+                1.0,
+            );
             cast(Point3::from(pose.translation.vector), pose.rotation * ray)
         };
         let key = |pixel: usize, stream: u64| {
@@ -157,12 +192,18 @@ pub fn capture(miscalibration: &Miscalibration) -> Vec<Arc<Keyframe>> {
         let mut rgba = Vec::new();
         for y in 0..height {
             let share = (y as f64 + 0.5) / height as f64 - 0.5;
-            let pose =
-                camera_at(joints(secs + if miscalibration.has_rolling_shutter { share * READOUT_SECS } else { 0.0 }));
+            let pose = camera_at(joints(
+                secs + if miscalibration.has_rolling_shutter {
+                    share * READOUT_SECS
+                } else {
+                    0.0
+                },
+            ));
             for x in 0..width {
                 let (_, value) = cast_pixel(&pose, x, y);
-                let value =
-                    (value + miscalibration.noise * noise(key(y * width + x, 0))).round().clamp(0.0, 255.0) as u8;
+                let value = (value + miscalibration.noise * noise(key(y * width + x, 0)))
+                    .round()
+                    .clamp(0.0, 255.0) as u8;
                 rgba.extend([value, value, value, 255]);
             }
         }
@@ -171,8 +212,8 @@ pub fn capture(miscalibration: &Miscalibration) -> Vec<Arc<Keyframe>> {
         let depth_m: Vec<f32> = (0..width * height)
             .map(|pixel| {
                 let z = cast_pixel(&depth_pose, pixel % width, pixel / width).0;
-                ((z + 0.0007 * miscalibration.noise * z * z * noise(key(pixel, 1))) * (1.0 - miscalibration.depth_frac))
-                    as f32
+                ((z + 0.0007 * miscalibration.noise * z * z * noise(key(pixel, 1)))
+                    * (1.0 - miscalibration.depth_frac)) as f32
             })
             .collect();
         let reported_joints = {
@@ -188,7 +229,8 @@ pub fn capture(miscalibration: &Miscalibration) -> Vec<Arc<Keyframe>> {
             );
             std::array::from_fn(|joint| (after[joint] - before[joint]) / 2e-4)
         };
-        let unit = |joint: usize| std::array::from_fn(|other| if joint == other { 1.0 } else { 0.0 });
+        let unit =
+            |joint: usize| std::array::from_fn(|other| if joint == other { 1.0 } else { 0.0 });
         Arc::new(Keyframe {
             camera: "wrist".into(),
             stamp: Stamp((secs * 1e9) as i64),
@@ -210,7 +252,9 @@ pub fn capture(miscalibration: &Miscalibration) -> Vec<Arc<Keyframe>> {
             } else {
                 0.0
             },
-            joint_twists: (0..4).map(|joint| attached(twist_along(reported_joints, unit(joint)))).collect(),
+            joint_twists: (0..4)
+                .map(|joint| attached(twist_along(reported_joints, unit(joint))))
+                .collect(),
             base: None,
             split: Split::of(ix),
             truth: None,
@@ -221,12 +265,21 @@ pub fn capture(miscalibration: &Miscalibration) -> Vec<Arc<Keyframe>> {
 
 /// An extrinsics error of about 1 degree and 5 mm.
 pub fn wrong_extrinsics() -> Transform {
-    Transform::new(Vector3::new(0.003, -0.0035, 0.002), Vector3::new(0.01, 0.012, -0.008))
+    Transform::new(
+        Vector3::new(0.003, -0.0035, 0.002),
+        Vector3::new(0.01, 0.012, -0.008),
+    )
 }
 
 /// Rotation and translation that remain of an extrinsics error, degrees and millimeters.
 pub fn remaining(correction: &CameraCorrection, miscalibration: &Transform) -> (f64, f64) {
-    let estimated = rigid_transform(correction.rotation_rad.into(), correction.translation_m.into());
+    let estimated = rigid_transform(
+        correction.rotation_rad.into(),
+        correction.translation_m.into(),
+    );
     let remaining = miscalibration * estimated.inverse();
-    (remaining.rotation.angle().to_degrees(), 1e3 * remaining.translation.vector.norm())
+    (
+        remaining.rotation.angle().to_degrees(),
+        1e3 * remaining.translation.vector.norm(),
+    )
 }

@@ -1,8 +1,9 @@
 //! Whether tags at known poses contradict the calibrated pose of a camera while a robot works.
 //!
-//! Each image with a tag gives the pose of the camera relative to the world. If the camera has moved relative to its mount,
-//! this pose differs from the calibrated one by the same motion in the frame of the camera, wherever the robot is. If the
-//! tag has moved, it differs by the same motion in the world.
+//! Each image with a tag gives the pose of the camera relative to the world. If the camera has
+//! moved relative to its mount, this pose differs from the calibrated one by the same motion in the
+//! frame of the camera, wherever the robot is. If the tag has moved, it differs by the same motion
+//! in the world.
 
 use crate::least_squares::sigma_of;
 use kinematics::{Stamp, Transform, Twist, transform};
@@ -18,7 +19,8 @@ const MIN_TRANSLATION_M: f64 = 0.005;
 const MIN_ROTATION_RAD: f64 = 0.0087;
 /// A difference is significant from this multiple of its standard deviation.
 const MIN_SIGMAS: f64 = 5.0;
-/// Images of a camera that moves less than this show the same errors and count once, unless this time has passed.
+/// Images of a camera that moves less than this show the same errors and count once, unless this
+/// time has passed.
 const MIN_STEP_M: f64 = 0.02;
 const MIN_STEP_RAD: f64 = 0.05;
 const MIN_STEP_SECS: f64 = 2.0;
@@ -59,7 +61,8 @@ pub struct TagContradiction {
     pub tags: Vec<u32>,
     /// Number of images at different poses.
     pub n_images: usize,
-    /// Angle between the calibrated and the observed camera pose and its standard deviation, radians.
+    /// Angle between the calibrated and the observed camera pose and its standard deviation,
+    /// radians.
     pub rotation_rad: [f64; 2],
     /// Distance between them and its standard deviation, meters.
     pub translation_m: [f64; 2],
@@ -81,12 +84,21 @@ pub enum ContradictionCause {
 impl TagCheck {
     /// A check of a camera.
     pub fn new(camera: &str) -> Self {
-        Self { camera: camera.to_owned(), observations: VecDeque::new(), is_reported: false }
+        Self {
+            camera: camera.to_owned(),
+            observations: VecDeque::new(),
+            is_reported: false,
+        }
     }
 
     /// Adds an image. Returns a contradiction once, when it becomes significant.
     pub fn push(&mut self, observation: TagObservation) -> Option<TagContradiction> {
-        if self.is_reported || self.observations.back().is_some_and(|last| is_same_view(last, &observation)) {
+        if self.is_reported
+            || self
+                .observations
+                .back()
+                .is_some_and(|last| is_same_view(last, &observation))
+        {
             return None;
         }
         self.observations.push_back(observation);
@@ -103,8 +115,10 @@ impl TagCheck {
         if n < MIN_IMAGES {
             return None;
         }
-        let in_camera = |observation: &TagObservation| observation.calibrated.inverse() * observation.seen;
-        let in_world = |observation: &TagObservation| observation.seen * observation.calibrated.inverse();
+        let in_camera =
+            |observation: &TagObservation| observation.calibrated.inverse() * observation.seen;
+        let in_world =
+            |observation: &TagObservation| observation.seen * observation.calibrated.inverse();
         let mean_in_camera = mean(self.observations.iter().map(in_camera))?;
         let mean_in_world = mean(self.observations.iter().map(in_world))?;
         let residual = |predicted: &dyn Fn(&TagObservation) -> Transform| -> Vec<Vector6<f64>> {
@@ -115,7 +129,8 @@ impl TagCheck {
         };
         let of_camera = residual(&|observation| observation.calibrated * mean_in_camera);
         let of_world = residual(&|observation| mean_in_world * observation.calibrated);
-        let [squares_of_camera, squares_of_world] = [&of_camera, &of_world].map(|residuals| squares(residuals));
+        let [squares_of_camera, squares_of_world] =
+            [&of_camera, &of_world].map(|residuals| squares(residuals));
         let cause = if squares_of_camera * CLEARER.powi(2) < squares_of_world {
             ContradictionCause::Camera
         } else if squares_of_world * CLEARER.powi(2) < squares_of_camera {
@@ -123,13 +138,26 @@ impl TagCheck {
         } else {
             ContradictionCause::Unknown
         };
-        // The scatter about the better explanation, and the stated noise, which is larger if the robot stands still.
-        let residuals = if squares_of_camera <= squares_of_world { &of_camera } else { &of_world };
-        let stated =
-            self.observations.iter().map(|observation| observation.covariance).sum::<Matrix6<f64>>() / n as f64;
-        let scatter =
-            residuals.iter().map(|residual| residual * residual.transpose()).sum::<Matrix6<f64>>() / (n - 1) as f64;
-        // A tag that has moved shows in other camera axes at each pose: those of the latest image are used.
+        // The scatter about the better explanation, and the stated noise, which is larger if the
+        // robot stands still.
+        let residuals = if squares_of_camera <= squares_of_world {
+            &of_camera
+        } else {
+            &of_world
+        };
+        let stated = self
+            .observations
+            .iter()
+            .map(|observation| observation.covariance)
+            .sum::<Matrix6<f64>>()
+            / n as f64;
+        let scatter = residuals
+            .iter()
+            .map(|residual| residual * residual.transpose())
+            .sum::<Matrix6<f64>>()
+            / (n - 1) as f64;
+        // A tag that has moved shows in other camera axes at each pose: those of the latest image
+        // are used.
         let latest = self.observations.back()?.calibrated;
         let difference = match squares_of_camera <= squares_of_world {
             true => twist(&mean_in_camera),
@@ -139,13 +167,21 @@ impl TagCheck {
         let with_sigma = |first: usize| {
             let part = difference.fixed_rows::<3>(first).into_owned();
             let direction = part.try_normalize(0.0)?;
-            let variance = (direction.transpose() * mean_covariance.fixed_view::<3, 3>(first, first) * direction)[0];
+            let variance = (direction.transpose()
+                * mean_covariance.fixed_view::<3, 3>(first, first)
+                * direction)[0];
             Some([part.norm(), sigma_of(variance)])
         };
         let (translation_m, rotation_rad) = (with_sigma(0)?, with_sigma(3)?);
-        let is_significant = |[value, sigma]: [f64; 2], min: f64| value > min && value > MIN_SIGMAS * sigma;
-        let is_off = is_significant(translation_m, MIN_TRANSLATION_M) || is_significant(rotation_rad, MIN_ROTATION_RAD);
-        let tags: BTreeSet<u32> = self.observations.iter().flat_map(|observation| observation.tags.clone()).collect();
+        let is_significant =
+            |[value, sigma]: [f64; 2], min: f64| value > min && value > MIN_SIGMAS * sigma;
+        let is_off = is_significant(translation_m, MIN_TRANSLATION_M)
+            || is_significant(rotation_rad, MIN_ROTATION_RAD);
+        let tags: BTreeSet<u32> = self
+            .observations
+            .iter()
+            .flat_map(|observation| observation.tags.clone())
+            .collect();
         is_off.then(|| TagContradiction {
             camera: self.camera.clone(),
             tags: tags.into_iter().collect(),
@@ -168,34 +204,66 @@ fn is_same_view(a: &TagObservation, b: &TagObservation) -> bool {
 fn mean(transforms: impl Iterator<Item = Transform>) -> Option<Transform> {
     let transforms: Vec<Transform> = transforms.collect();
     let first = transforms.first()?;
-    let sum: Vector6<f64> = transforms.iter().map(|other| twist(&(first.inverse() * other))).sum();
+    let sum: Vector6<f64> = transforms
+        .iter()
+        .map(|other| twist(&(first.inverse() * other)))
+        .sum();
     let mean = sum / transforms.len() as f64;
-    let (linear, angular) = (mean.fixed_rows::<3>(0).into_owned(), mean.fixed_rows::<3>(3).into_owned());
-    Some(first * transform::exp(&Twist { linear_m_s: linear, angular_rad_s: angular }, 1.0))
+    let (linear, angular) = (
+        mean.fixed_rows::<3>(0).into_owned(),
+        mean.fixed_rows::<3>(3).into_owned(),
+    );
+    Some(
+        first
+            * transform::exp(
+                &Twist {
+                    linear_m_s: linear,
+                    angular_rad_s: angular,
+                },
+                1.0,
+            ),
+    )
 }
 
 fn twist(motion: &Transform) -> Vector6<f64> {
-    let Twist { linear_m_s: linear, angular_rad_s: angular } = transform::log(motion, 1.0);
-    Vector6::new(linear.x, linear.y, linear.z, angular.x, angular.y, angular.z)
+    let Twist {
+        linear_m_s: linear,
+        angular_rad_s: angular,
+    } = transform::log(motion, 1.0);
+    Vector6::new(
+        linear.x, linear.y, linear.z, angular.x, angular.y, angular.z,
+    )
 }
 
 fn squares(residuals: &[Vector6<f64>]) -> f64 {
     let square = |residual: &Vector6<f64>| {
-        residual.fixed_rows::<3>(0).norm_squared() + (ARM_M * residual.fixed_rows::<3>(3)).norm_squared()
+        residual.fixed_rows::<3>(0).norm_squared()
+            + (ARM_M * residual.fixed_rows::<3>(3)).norm_squared()
     };
     residuals.iter().map(square).sum()
 }
 
 impl std::fmt::Display for TagContradiction {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let Self { camera, tags, n_images, .. } = self;
+        let Self {
+            camera,
+            tags,
+            n_images,
+            ..
+        } = self;
         let names: Vec<String> = tags.iter().map(u32::to_string).collect();
         let names: Vec<&str> = names.iter().map(String::as_str).collect();
-        let tags = format!("{} {}", if names.len() == 1 { "tag" } else { "tags" }, keyframe::listed(&names, "and"));
+        let tags = format!(
+            "{} {}",
+            if names.len() == 1 { "tag" } else { "tags" },
+            keyframe::listed(&names, "and")
+        );
         let [angle, angle_sigma] = self.rotation_rad.map(f64::to_degrees);
         let [mm, mm_sigma] = self.translation_m.map(|m| 1e3 * m);
-        let off = format!("by {angle:.1} +- {angle_sigma:.1} degrees and {mm:.0} +- {mm_sigma:.0} mm");
-        let calibrate = "stop and check its mount, then calibrate it again with `fieldrig calibrate`";
+        let off =
+            format!("by {angle:.1} +- {angle_sigma:.1} degrees and {mm:.0} +- {mm_sigma:.0} mm");
+        let calibrate =
+            "stop and check its mount, then calibrate it again with `fieldrig calibrate`";
         match self.cause {
             ContradictionCause::Camera => write!(
                 f,
@@ -222,19 +290,28 @@ mod tests {
     const SIGMA_M: f64 = 0.0005;
     const SIGMA_RAD: f64 = 0.002;
 
-    /// Runs a check with poses around a tag. `seen` gives the true camera pose for a calibrated one.
-    fn run(n: usize, moves: bool, seen: impl Fn(&Transform) -> Transform) -> Option<(usize, TagContradiction)> {
+    /// Runs a check with poses around a tag. `seen` gives the true camera pose for a calibrated
+    /// one.
+    fn run(
+        n: usize,
+        moves: bool,
+        seen: impl Fn(&Transform) -> Transform,
+    ) -> Option<(usize, TagContradiction)> {
         let mut random = Random::new(7);
         let mut check = TagCheck::new("wrist");
         for ix in 0..n {
             let spread = if moves { 1.0 } else { 0.0 };
-            let mut vector = |scale: f64| Vector3::new(random.normal(), random.normal(), random.normal()) * scale;
+            let mut vector = |scale: f64| {
+                Vector3::new(random.normal(), random.normal(), random.normal()) * scale
+            };
             let calibrated = Transform::new(
                 Vector3::new(0.5, 0.0, 0.4) + vector(0.1 * spread),
                 Vector3::new(3.0, 0.0, 0.0) + vector(0.3 * spread),
             );
             let noise = Transform::new(vector(SIGMA_M), vector(SIGMA_RAD));
-            let variances = Vector6::new(SIGMA_M, SIGMA_M, SIGMA_M, SIGMA_RAD, SIGMA_RAD, SIGMA_RAD).map(|s| s * s);
+            let variances =
+                Vector6::new(SIGMA_M, SIGMA_M, SIGMA_M, SIGMA_RAD, SIGMA_RAD, SIGMA_RAD)
+                    .map(|s| s * s);
             let observation = TagObservation {
                 stamp: Stamp(0).plus_secs(3.0 * ix as f64),
                 calibrated,
@@ -254,7 +331,11 @@ mod tests {
         assert_eq!(run(500, true, |calibrated| *calibrated), None);
         assert_eq!(run(500, false, |calibrated| *calibrated), None);
         // Small errors are usual.
-        assert_eq!(run(500, true, |calibrated| calibrated * Transform::translation(0.003, 0.0, 0.0)), None);
+        assert_eq!(
+            run(500, true, |calibrated| calibrated
+                * Transform::translation(0.003, 0.0, 0.0)),
+            None
+        );
     }
 
     #[test]
@@ -262,15 +343,25 @@ mod tests {
         let moved = Transform::new(Vector3::new(0.01, 0.0, 0.005), Vector3::new(0.0, 0.03, 0.0));
         let (n, found) = run(100, true, |calibrated| calibrated * moved).expect("a contradiction");
         assert!(n <= MIN_IMAGES + 2, "{n}");
-        assert_eq!((found.cause, found.tags.as_slice()), (ContradictionCause::Camera, &[7][..]));
-        assert!((found.rotation_rad[0] - 0.03).abs() < 0.003 && found.rotation_rad[1] < 0.002, "{found:?}");
+        assert_eq!(
+            (found.cause, found.tags.as_slice()),
+            (ContradictionCause::Camera, &[7][..])
+        );
+        assert!(
+            (found.rotation_rad[0] - 0.03).abs() < 0.003 && found.rotation_rad[1] < 0.002,
+            "{found:?}"
+        );
         assert!((found.translation_m[0] - 0.0112).abs() < 0.002, "{found:?}");
         let text = found.to_string();
         assert!(
-            text.starts_with("camera \"wrist\" is off by 1.7 +- 0.") && text.contains("according to tag 7"),
+            text.starts_with("camera \"wrist\" is off by 1.7 +- 0.")
+                && text.contains("according to tag 7"),
             "{text}"
         );
-        assert!(text.contains("it has moved relative to its mount"), "{text}");
+        assert!(
+            text.contains("it has moved relative to its mount"),
+            "{text}"
+        );
     }
 
     #[test]
@@ -278,13 +369,17 @@ mod tests {
         let moved = Transform::new(Vector3::new(0.03, 0.01, 0.0), Vector3::new(0.0, 0.0, 0.1));
         let (_, found) = run(100, true, |calibrated| moved * calibrated).expect("a contradiction");
         assert_eq!(found.cause, ContradictionCause::Tag, "{found}");
-        assert!(found.to_string().contains("measure world_from_tag again"), "{found}");
+        assert!(
+            found.to_string().contains("measure world_from_tag again"),
+            "{found}"
+        );
         // A robot that stands still sees no difference.
         let (_, found) = run(100, false, |calibrated| moved * calibrated).expect("a contradiction");
         assert_eq!(found.cause, ContradictionCause::Unknown, "{found}");
     }
 
-    /// In camera axes, the motion of the tag has another direction at each pose, so that its mean is far too small.
+    /// In camera axes, the motion of the tag has another direction at each pose, so that its mean
+    /// is far too small.
     #[test]
     fn moved_tag_is_measured_in_the_world_while_the_wrist_rotates() {
         for moved in [
@@ -295,7 +390,10 @@ mod tests {
             let angles = [-90.0_f64, 90.0].into_iter().cycle().map(f64::to_radians);
             let found = angles.take(40).enumerate().find_map(|(ix, angle)| {
                 // Around the viewing direction, straight above the origin of the world.
-                let down = Transform::new(Vector3::new(0.0, 0.0, 0.4), Vector3::x() * std::f64::consts::PI);
+                let down = Transform::new(
+                    Vector3::new(0.0, 0.0, 0.4),
+                    Vector3::x() * std::f64::consts::PI,
+                );
                 let calibrated = down * Transform::new(Vector3::zeros(), Vector3::z() * angle);
                 check.push(TagObservation {
                     stamp: Stamp(0).plus_secs(3.0 * ix as f64),
@@ -307,8 +405,12 @@ mod tests {
             });
             let found = found.expect("the tag has moved by 40 mm");
             assert_eq!(found.cause, ContradictionCause::Tag, "{found}");
-            assert!((found.rotation_rad[0] - moved.rotation.angle()).abs() < 1e-3, "{found:?}");
-            // The rotation about the origin of the world also shifts the camera, but not from above it.
+            assert!(
+                (found.rotation_rad[0] - moved.rotation.angle()).abs() < 1e-3,
+                "{found:?}"
+            );
+            // The rotation about the origin of the world also shifts the camera, but not from above
+            // it.
             assert!((found.translation_m[0] - 0.04).abs() < 1e-3, "{found:?}");
         }
     }
@@ -325,7 +427,11 @@ mod tests {
                 covariance: Matrix6::identity() * 1e-8,
                 tags: vec![1],
             };
-            assert_eq!(check.push(observation), None, "one second with the same view");
+            assert_eq!(
+                check.push(observation),
+                None,
+                "one second with the same view"
+            );
         }
     }
 }

@@ -1,4 +1,5 @@
-//! Results of A/B trials: the gain of a change of a model on validation images, and whether it is significant.
+//! Results of A/B trials: the gain of a change of a model on validation images, and whether it is
+//! significant.
 
 use crate::ParamSet;
 use serde::{Deserialize, Serialize};
@@ -22,8 +23,8 @@ pub enum CameraRefinement {
     Try(Vec<ParamSet>),
     /// Optimizes the first set from the first step on, and tries each of the others.
     AlwaysAndTry(ParamSet, Vec<ParamSet>),
-    /// Optimizes the first set from the first step on, and also the second as soon as arriving keyframes show that it is
-    /// needed.
+    /// Optimizes the first set from the first step on, and also the second as soon as arriving
+    /// keyframes show that it is needed.
     AlwaysAndWatch(ParamSet, ParamSet),
 }
 
@@ -37,7 +38,9 @@ impl CameraRefinement {
     /// The parameters that are optimized without a trial.
     pub fn always(&self) -> ParamSet {
         match self {
-            Self::Always(params) | Self::AlwaysAndTry(params, _) | Self::AlwaysAndWatch(params, _) => *params,
+            Self::Always(params)
+            | Self::AlwaysAndTry(params, _)
+            | Self::AlwaysAndWatch(params, _) => *params,
             Self::Try(_) => ParamSet::empty(),
         }
     }
@@ -126,8 +129,12 @@ impl MeanGain {
     pub(crate) fn of(gains: &[f64]) -> Self {
         let n = gains.len().max(1) as f64;
         let mean = gains.iter().sum::<f64>() / n;
-        let variance = gains.iter().map(|gain| (gain - mean).powi(2)).sum::<f64>() / f64::max(n - 1.0, 1.0);
-        Self { mean, standard_error: (variance / n).sqrt() }
+        let variance =
+            gains.iter().map(|gain| (gain - mean).powi(2)).sum::<f64>() / f64::max(n - 1.0, 1.0);
+        Self {
+            mean,
+            standard_error: (variance / n).sqrt(),
+        }
     }
 }
 
@@ -160,22 +167,39 @@ pub struct Trial {
 impl Trial {
     /// Evaluates paired scores, dB.
     pub fn of(candidate: Candidate, baseline_db: &[f64], variant_db: &[f64]) -> Self {
-        let gains_db = baseline_db.iter().zip(variant_db).map(|(baseline, variant)| variant - baseline);
+        let gains_db = baseline_db
+            .iter()
+            .zip(variant_db)
+            .map(|(baseline, variant)| variant - baseline);
         Self::of_gains(candidate, &gains_db.collect::<Vec<f64>>())
     }
 
     /// Evaluates the gains of single images, dB.
     pub fn of_gains(candidate: Candidate, gains_db: &[f64]) -> Self {
-        let MeanGain { mean: gain_db, standard_error: standard_error_db } = MeanGain::of(gains_db);
+        let MeanGain {
+            mean: gain_db,
+            standard_error: standard_error_db,
+        } = MeanGain::of(gains_db);
         let (n_images, min_db) = (gains_db.len(), candidate.min_gain_db());
         // In case of doubt, neither additions nor reductions are accepted.
         let is_significant = match candidate {
-            Candidate::Halved { .. } | Candidate::ShDegree { .. } => -gain_db + 0.5 * standard_error_db <= min_db,
+            Candidate::Halved { .. } | Candidate::ShDegree { .. } => {
+                -gain_db + 0.5 * standard_error_db <= min_db
+            }
             Candidate::Doubled { .. } => gain_db - standard_error_db > min_db,
-            Candidate::Cameras(_) => gain_db > f64::max(min_db, MIN_STANDARD_ERRORS * standard_error_db),
+            Candidate::Cameras(_) => {
+                gain_db > f64::max(min_db, MIN_STANDARD_ERRORS * standard_error_db)
+            }
         };
         let kept = n_images > 1 && is_significant;
-        Self { candidate, gain_db, standard_error_db, n_images, kept, gain_by_camera_db: BTreeMap::new() }
+        Self {
+            candidate,
+            gain_db,
+            standard_error_db,
+            n_images,
+            kept,
+            gain_by_camera_db: BTreeMap::new(),
+        }
     }
 
     /// Adds the mean gain of each camera from the gains of single images, dB.
@@ -183,29 +207,47 @@ impl Trial {
     pub fn with_cameras<'a>(self, gains_db: impl Iterator<Item = (&'a str, f64)>) -> Self {
         let mut by_camera: BTreeMap<String, Vec<f64>> = BTreeMap::new();
         for (camera, gain_db) in gains_db {
-            by_camera.entry(camera.to_owned()).or_default().push(gain_db);
+            by_camera
+                .entry(camera.to_owned())
+                .or_default()
+                .push(gain_db);
         }
-        let means = by_camera.into_iter().map(|(camera, gains_db)| (camera, MeanGain::of(&gains_db).mean));
-        Self { gain_by_camera_db: means.collect(), ..self }
+        let means = by_camera
+            .into_iter()
+            .map(|(camera, gains_db)| (camera, MeanGain::of(&gains_db).mean));
+        Self {
+            gain_by_camera_db: means.collect(),
+            ..self
+        }
     }
 
     /// Rejects the change if there are fewer than [`MIN_VALIDATION_IMAGES`].
     #[must_use]
     pub fn with_enough_images(self) -> Self {
-        Self { kept: self.kept && self.n_images >= MIN_VALIDATION_IMAGES, ..self }
+        Self {
+            kept: self.kept && self.n_images >= MIN_VALIDATION_IMAGES,
+            ..self
+        }
     }
 
-    /// Report on the tested part of the model: the addition, or the part that the reduction would remove.
+    /// Report on the tested part of the model: the addition, or the part that the reduction would
+    /// remove.
     pub fn report(&self) -> TrialReport {
         let (candidate, is_reduction) = match self.candidate {
             Candidate::Cameras(params) => (params.to_string(), false),
             Candidate::Doubled { from, to } => (format!("{to} instead of {from} splats"), false),
             Candidate::Halved { from, to } => (format!("{from} instead of {to} splats"), true),
-            Candidate::ShDegree { from, to } => (format!("colors of degree {from} instead of {to}"), true),
+            Candidate::ShDegree { from, to } => {
+                (format!("colors of degree {from} instead of {to}"), true)
+            }
         };
         TrialReport {
             candidate,
-            gain_db: if is_reduction { -self.gain_db } else { self.gain_db },
+            gain_db: if is_reduction {
+                -self.gain_db
+            } else {
+                self.gain_db
+            },
             standard_error_db: self.standard_error_db,
             n_images: self.n_images,
             kept: self.kept != is_reduction,
@@ -226,7 +268,13 @@ impl Trial {
 
 impl std::fmt::Display for Trial {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let Self { candidate, gain_db, standard_error_db, n_images, .. } = self;
+        let Self {
+            candidate,
+            gain_db,
+            standard_error_db,
+            n_images,
+            ..
+        } = self;
         write!(
             f,
             "{candidate}: {gain_db:+.2} dB on {n_images} validation images (standard error {standard_error_db:.2})"
@@ -237,7 +285,8 @@ impl std::fmt::Display for Trial {
 /// Result of a trial on validation images, for reports.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct TrialReport {
-    /// Description of the tested part of the model: the addition, or the part that the reduction would remove.
+    /// Description of the tested part of the model: the addition, or the part that the reduction
+    /// would remove.
     pub candidate: String,
     /// Mean PSNR with that part minus mean PSNR without it, dB.
     pub gain_db: f64,

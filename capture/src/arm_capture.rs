@@ -15,15 +15,16 @@ use std::time::{Duration, Instant};
 
 /// Largest change of a joint in one step, radians or meters.
 const MAX_STEP: f64 = 0.25;
-/// Time before an image during which the arm must stand still: longer than stamps are wrong and mounts vibrate.
+/// Time before an image during which the arm must stand still: longer than stamps are wrong and
+/// mounts vibrate.
 const SETTLE_SECS: f64 = 0.3;
-/// Largest drift of a joint during that time, radians or meters: the difference between the means of both halves, which
-/// averages the noise of encoders.
+/// Largest drift of a joint during that time, radians or meters: the difference between the means
+/// of both halves, which averages the noise of encoders.
 const MAX_DRIFT: f64 = 3e-4;
 /// Maximum time until the arm stands still and an image arrives.
 const MAX_WAIT_SECS: f64 = 15.0;
-/// Largest distance of a joint from its target after a motion, and largest correction of its sag, radians or meters. Arms
-/// without gravity compensation sag.
+/// Largest distance of a joint from its target after a motion, and largest correction of its sag,
+/// radians or meters. Arms without gravity compensation sag.
 const MAX_ERROR: f64 = 0.1;
 /// The measured flange may be this much farther from its start than allowed for targets, meters.
 const DISTANCE_TOLERANCE_M: f64 = 0.03;
@@ -85,11 +86,21 @@ impl ArmCapture {
         let order = chain.order_in(&rig.arm.joints)?;
         let arm = SupervisedArm::new(arm, &rig);
         let (accepted, limit, recent, first) = (None, None, VecDeque::new(), None);
-        Ok(Self { rig, chain, order, arm, accepted, limit, camera, recent, first })
+        Ok(Self {
+            rig,
+            chain,
+            order,
+            arm,
+            accepted,
+            limit,
+            camera,
+            recent,
+            first,
+        })
     }
 
-    /// Limits the distance of the flange from where it is now. A motion that exceeds it, for example because the arm sags,
-    /// is reversed.
+    /// Limits the distance of the flange from where it is now. A motion that exceeds it, for
+    /// example because the arm sags, is reversed.
     ///
     /// # Errors
     /// If the arm has stopped or reports nothing.
@@ -123,23 +134,34 @@ impl ArmCapture {
         Ok(self.in_chain_order(&state.position))
     }
 
-    /// Moves to joint values in the order of the chain, in steps. Returns false if a stop was requested; the arm then stands
-    /// still.
+    /// Moves to joint values in the order of the chain, in steps. Returns false if a stop was
+    /// requested; the arm then stands still.
     ///
     /// # Errors
-    /// If the arm stops because of a fault, does not reach a step, or leaves the limit of the distance. In the last two
-    /// cases, it has returned to the previous step, or holds where it is.
+    /// If the arm stops because of a fault, does not reach a step, or leaves the limit of the
+    /// distance. In the last two cases, it has returned to the previous step, or holds where it is.
     pub fn move_to(&mut self, joints: &[f64], stop: &Stop) -> crate::Result<bool> {
         let from = self.joints()?;
-        let largest = from.iter().zip(joints).map(|(from, to)| (to - from).abs()).fold(0.0, f64::max);
-        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "joints move by a few radians")]
+        let largest = from
+            .iter()
+            .zip(joints)
+            .map(|(from, to)| (to - from).abs())
+            .fold(0.0, f64::max);
+        #[expect(
+            clippy::cast_possible_truncation,
+            clippy::cast_sign_loss,
+            reason = "joints move by a few radians"
+        )]
         let n_steps = (largest / MAX_STEP).ceil().clamp(1.0, 1000.0) as u32;
         for step in 1..=n_steps {
             if stop.requested() {
                 return Ok(false);
             }
             let share = f64::from(step) / f64::from(n_steps);
-            let waypoint = from.iter().zip(joints).map(|(from, to)| from + share * (to - from));
+            let waypoint = from
+                .iter()
+                .zip(joints)
+                .map(|(from, to)| from + share * (to - from));
             if !self.step_to(&waypoint.collect::<Vec<_>>(), stop)? {
                 return Ok(false);
             }
@@ -151,26 +173,40 @@ impl ArmCapture {
         let free = self.read()?.position;
         // A command to stay here: the previous target, unless someone has moved the arm since then.
         let accepted = self.accepted.get_or_insert_with(|| free.clone());
-        let sag = accepted.iter().zip(&free).map(|(target, actual)| (target - actual).clamp(-MAX_ERROR, MAX_ERROR));
+        let sag = accepted
+            .iter()
+            .zip(&free)
+            .map(|(target, actual)| (target - actual).clamp(-MAX_ERROR, MAX_ERROR));
         let sag: Vec<f64> = sag.collect();
-        let stay: Vec<f64> = free.iter().zip(&sag).map(|(actual, sag)| actual + sag).collect();
+        let stay: Vec<f64> = free
+            .iter()
+            .zip(&sag)
+            .map(|(actual, sag)| actual + sag)
+            .collect();
         // Joints that do not move the camera keep their target.
         let (mut target, mut expected) = (stay.clone(), free.clone());
         for (value, ix) in joints.iter().zip(&self.order) {
             target[*ix] = value + sag[*ix];
             expected[*ix] = *value;
         }
-        let Some(state) = self.go(&target, stop)? else { return Ok(false) };
+        let Some(state) = self.go(&target, stop)? else {
+            return Ok(false);
+        };
         if let Some(problem) = self.problem(&state, &expected)? {
-            let end = self.retreat(&stay, &free, stop).with_context(|| problem.clone())?;
+            let end = self
+                .retreat(&stay, &free, stop)
+                .with_context(|| problem.clone())?;
             bail!("{problem}; {end}");
         }
         Ok(true)
     }
 
-    /// Moves to positions of all joints. Returns the state at the end, or `None` if a stop was requested.
+    /// Moves to positions of all joints. Returns the state at the end, or `None` if a stop was
+    /// requested.
     fn go(&mut self, position: &[f64], stop: &Stop) -> crate::Result<Option<JointState>> {
-        let accepted = self.arm.command(&JointTarget { position: position.to_vec() })?;
+        let accepted = self.arm.command(&JointTarget {
+            position: position.to_vec(),
+        })?;
         self.accepted = Some(accepted.position);
         let recent = &mut self.recent;
         let end = self.arm.follow(stop, |state| remember(recent, state))?;
@@ -193,7 +229,9 @@ impl ArmCapture {
                 expected[ix]
             )));
         }
-        let Some((start, max_m)) = &self.limit else { return Ok(None) };
+        let Some((start, max_m)) = &self.limit else {
+            return Ok(None);
+        };
         let flange = self.chain.forward(&self.in_chain_order(&state.position))?;
         let distance_m = (flange.translation.vector - start.translation.vector).norm();
         Ok((distance_m > max_m + DISTANCE_TOLERANCE_M).then(|| {
@@ -205,11 +243,17 @@ impl ArmCapture {
         }))
     }
 
-    /// Ends the push against an obstacle: returns to the previous step, which was free, or holds the arm where it is.
+    /// Ends the push against an obstacle: returns to the previous step, which was free, or holds
+    /// the arm where it is.
     ///
     /// * `stay`: the command of the previous step.
     /// * `expected`: where it brings the arm.
-    fn retreat(&mut self, stay: &[f64], expected: &[f64], stop: &Stop) -> crate::Result<&'static str> {
+    fn retreat(
+        &mut self,
+        stay: &[f64],
+        expected: &[f64],
+        stop: &Stop,
+    ) -> crate::Result<&'static str> {
         if let Some(state) = self.go(stay, stop)?
             && largest_error(&state.position, expected).is_none_or(|(_, error)| error <= MAX_ERROR)
         {
@@ -220,15 +264,18 @@ impl ArmCapture {
         Ok("the arm did not return to the previous step, and holds where it is")
     }
 
-    /// Waits until the arm stands still, and returns the next image exposed from then on, with the mean of the joints.
-    /// `None` if a stop was requested.
+    /// Waits until the arm stands still, and returns the next image exposed from then on, with the
+    /// mean of the joints. `None` if a stop was requested.
     ///
     /// # Errors
     /// If a device fails, the arm does not come to rest, or no image can be decoded.
     pub fn image(&mut self, stop: &Stop) -> crate::Result<Option<CalibrationImage>> {
         self.read_queued()?;
         let began = self.read()?.stamp;
-        let wait = Wait { began, since: Instant::now() };
+        let wait = Wait {
+            began,
+            since: Instant::now(),
+        };
         self.first.get_or_insert(began);
         let mut seen = Seen::Nothing;
         loop {
@@ -255,7 +302,9 @@ impl ArmCapture {
             }
             // Queued images may be from before the motion.
             if settling < began {
-                seen = Seen::Old { secs: began.secs_since(start) };
+                seen = Seen::Old {
+                    secs: began.secs_since(start),
+                };
                 continue;
             }
             while self.recent.back().is_none_or(|newest| newest.stamp < end) {
@@ -263,7 +312,13 @@ impl ArmCapture {
                     return Ok(None);
                 }
                 let now = self.read()?.stamp;
-                self.check_wait(&wait, now, &Seen::Early { secs: end.secs_since(now) })?;
+                self.check_wait(
+                    &wait,
+                    now,
+                    &Seen::Early {
+                        secs: end.secs_since(now),
+                    },
+                )?;
             }
             let joints = match self.joints_at_rest(settling, end) {
                 Ok(joints) => joints,
@@ -278,16 +333,22 @@ impl ArmCapture {
             };
             let pose = self.chain.forward(&joints)?;
             return Ok(Some(CalibrationImage {
-                secs: self.first.map_or(0.0, |first| image.stamp.secs_since(first)),
+                secs: self
+                    .first
+                    .map_or(0.0, |first| image.stamp.secs_since(first)),
                 size_px: image.size_px,
                 gray,
-                arm: Some(ArmDuringImage { base_from_flange: pose, base_from_flange_at_rows: [pose; 2], joints }),
+                arm: Some(ArmDuringImage {
+                    base_from_flange: pose,
+                    base_from_flange_at_rows: [pose; 2],
+                    joints,
+                }),
             }));
         }
     }
 
-    /// Reads the joint states that have arrived, so that a slow caller does not fall behind. Simulated devices advance only
-    /// when they are read.
+    /// Reads the joint states that have arrived, so that a slow caller does not fall behind.
+    /// Simulated devices advance only when they are read.
     fn read_queued(&mut self) -> crate::Result<()> {
         if self.camera.waits_for_caller() {
             return Ok(());
@@ -308,13 +369,21 @@ impl ArmCapture {
         let clocks = "check that the stamps of the camera and of the arm are on the same clock";
         let reason = match seen {
             Seen::Nothing => "no image arrived; check that the camera delivers images".to_owned(),
-            Seen::Undecodable => "the images cannot be decoded; choose another pixel format".to_owned(),
-            Seen::Old { secs } => {
-                format!("the last image was exposed {secs:.1} s before the arm came to rest; {clocks}")
+            Seen::Undecodable => {
+                "the images cannot be decoded; choose another pixel format".to_owned()
             }
-            Seen::Early { secs } => format!("the last image is {secs:.1} s ahead of the joint states; {clocks}"),
+            Seen::Old { secs } => {
+                format!(
+                    "the last image was exposed {secs:.1} s before the arm came to rest; {clocks}"
+                )
+            }
+            Seen::Early { secs } => {
+                format!("the last image is {secs:.1} s ahead of the joint states; {clocks}")
+            }
             Seen::FewStates => {
-                format!("there are too few joint states during the images; check the rate of the arm, and {clocks}")
+                format!(
+                    "there are too few joint states during the images; check the rate of the arm, and {clocks}"
+                )
             }
             Seen::Drift { joint_ix, drift } => format!(
                 "joint {:?} drifts by {drift:.5} rad within {SETTLE_SECS} s (at most {MAX_DRIFT}); let the arm hold still, or raise the stiffness",
@@ -334,13 +403,18 @@ impl ArmCapture {
         [mid.plus_secs(-half_secs), mid.plus_secs(half_secs)]
     }
 
-    /// Mean of the joints over a time span, in the order of the chain. An error if the states do not cover it, or if a joint
-    /// moves.
+    /// Mean of the joints over a time span, in the order of the chain. An error if the states do
+    /// not cover it, or if a joint moves.
     fn joints_at_rest(&self, start: Stamp, end: Stamp) -> Result<Vec<f64>, Seen> {
         const MIN_STATES: usize = 4;
         let [oldest, newest] = [self.recent.front(), self.recent.back()];
-        let covers = oldest.is_some_and(|state| state.stamp <= start) && newest.is_some_and(|state| state.stamp >= end);
-        let span: Vec<&JointState> = self.recent.iter().filter(|state| (start..=end).contains(&state.stamp)).collect();
+        let covers = oldest.is_some_and(|state| state.stamp <= start)
+            && newest.is_some_and(|state| state.stamp >= end);
+        let span: Vec<&JointState> = self
+            .recent
+            .iter()
+            .filter(|state| (start..=end).contains(&state.stamp))
+            .collect();
         if !covers || span.len() < MIN_STATES {
             return Err(Seen::FewStates);
         }
@@ -372,14 +446,19 @@ impl ArmCapture {
 
 /// The joint with the largest distance from its target, and this distance.
 fn largest_error(actual: &[f64], target: &[f64]) -> Option<(usize, f64)> {
-    let errors = actual.iter().zip(target).map(|(actual, target)| (actual - target).abs());
+    let errors = actual
+        .iter()
+        .zip(target)
+        .map(|(actual, target)| (actual - target).abs());
     errors.enumerate().max_by(|a, b| a.1.total_cmp(&b.1))
 }
 
 /// Mean joint positions.
 fn mean(states: &[&JointState]) -> Vec<f64> {
     let n_joints = states.first().map_or(0, |state| state.position.len());
-    let of = |ix: usize| states.iter().map(|state| state.position[ix]).sum::<f64>() / states.len() as f64;
+    let of = |ix: usize| {
+        states.iter().map(|state| state.position[ix]).sum::<f64>() / states.len() as f64
+    };
     (0..n_joints).map(of).collect()
 }
 

@@ -1,7 +1,8 @@
-//! Images of one camera for calibration with a target: from devices or a recording, with the pose of the flange.
+//! Images of one camera for calibration with a target: from devices or a recording, with the pose
+//! of the flange.
 //!
-//! Images are kept while the robot is slow and at poses that differ from those of the images before. If the robot has no
-//! arm, images are kept at a fixed interval.
+//! Images are kept while the robot is slow and at poses that differ from those of the images
+//! before. If the robot has no arm, images are kept at a fixed interval.
 
 #[cfg(test)]
 mod tests;
@@ -76,8 +77,8 @@ pub struct CalibrationImages {
 
 /// Reads the images of a camera until `on_sample` breaks or the samples end.
 ///
-/// * `max_shift_px`: maximum predicted image motion over readout, exposure and stamp uncertainty, for a scene at
-///   `join.default_depth_m`. Images with more motion are not kept.
+/// * `max_shift_px`: maximum predicted image motion over readout, exposure and stamp uncertainty,
+///   for a scene at `join.default_depth_m`. Images with more motion are not kept.
 /// * `on_sample`: is called with each sample before it is used, and with the images kept so far.
 ///
 /// # Errors
@@ -89,7 +90,12 @@ pub fn calibration_images(
     max_shift_px: f64,
     mut on_sample: impl FnMut(&Sample, &[CalibrationImage]) -> ControlFlow<()>,
 ) -> crate::Result<CalibrationImages> {
-    let Opened { rig, mut source, damage, .. } = opened;
+    let Opened {
+        rig,
+        mut source,
+        damage,
+        ..
+    } = opened;
     let mut reader = Reader::new(&rig, camera, max_shift_px)?;
     while let Some(sample) = source.next_sample()? {
         if on_sample(&sample, &reader.found.images).is_break() {
@@ -98,7 +104,10 @@ pub fn calibration_images(
         reader.push(sample);
     }
     reader.found.n_unusable += reader.waiting.len();
-    Ok(CalibrationImages { damage: damage.get().cloned(), ..reader.found })
+    Ok(CalibrationImages {
+        damage: damage.get().cloned(),
+        ..reader.found
+    })
 }
 
 /// Gray values of an image, row by row. `None` if it does not decode.
@@ -141,7 +150,9 @@ impl<'a> Reader<'a> {
                 "base.driver: the base moves, but calibration with a target needs a fixed base; while the base stands still, use a copy of the rig file with base.driver = \"fixed\""
             );
         }
-        let arm = (rig.arm.driver != ArmDriver::None).then(|| Arm::new(rig)).transpose()?;
+        let arm = (rig.arm.driver != ArmDriver::None)
+            .then(|| Arm::new(rig))
+            .transpose()?;
         Ok(Self {
             rig,
             camera,
@@ -188,10 +199,13 @@ impl<'a> Reader<'a> {
     }
 
     fn arm_during(&self, image: &Image) -> Result<Option<ArmDuringImage>, HistoryError> {
-        let Some(arm) = &self.arm else { return Ok(None) };
+        let Some(arm) = &self.arm else {
+            return Ok(None);
+        };
         let mid = self.camera.mid_exposure(image.stamp);
         let half_secs = 0.5 * self.readout_secs();
-        let [first, middle, last] = [-half_secs, 0.0, half_secs].map(|secs| arm.joints.at(mid.plus_secs(secs)));
+        let [first, middle, last] =
+            [-half_secs, 0.0, half_secs].map(|secs| arm.joints.at(mid.plus_secs(secs)));
         let (first, middle, last) = (first?, middle?, last?);
         // Readings have as many joints as the chain.
         let forward = |joints: &JointState| arm.chain.forward(&joints.position).unwrap_or_default();
@@ -203,11 +217,16 @@ impl<'a> Reader<'a> {
     }
 
     fn decide(&mut self, image: &Image, arm: Option<ArmDuringImage>) {
-        let secs = self.first.map_or(0.0, |first| image.stamp.secs_since(first));
+        let secs = self
+            .first
+            .map_or(0.0, |first| image.stamp.secs_since(first));
         if self.found.images.len() >= MAX_IMAGES || !self.is_different(secs, arm.as_ref()) {
             return;
         }
-        if arm.as_ref().is_some_and(|arm| self.shift_px(image, arm) > self.max_shift_px) {
+        if arm
+            .as_ref()
+            .is_some_and(|arm| self.shift_px(image, arm) > self.max_shift_px)
+        {
             self.found.n_fast += 1;
             return;
         }
@@ -215,39 +234,68 @@ impl<'a> Reader<'a> {
             self.found.n_unusable += 1;
             return;
         };
-        self.found.images.push(CalibrationImage { secs, size_px: image.size_px, gray, arm });
+        self.found.images.push(CalibrationImage {
+            secs,
+            size_px: image.size_px,
+            gray,
+            arm,
+        });
     }
 
-    /// Whether the pose differs from those of all images kept; without an arm, whether the last one is old enough.
+    /// Whether the pose differs from those of all images kept; without an arm, whether the last one
+    /// is old enough.
     fn is_different(&self, secs: f64, arm: Option<&ArmDuringImage>) -> bool {
         let join = &self.rig.join;
         let Some(arm) = arm else {
-            return self.found.images.last().is_none_or(|last| secs - last.secs >= INTERVAL_SECS);
+            return self
+                .found
+                .images
+                .last()
+                .is_none_or(|last| secs - last.secs >= INTERVAL_SECS);
         };
         let is_near = |other: &ArmDuringImage| {
             let motion = other.base_from_flange.inverse() * arm.base_from_flange;
-            motion.translation.vector.norm() < join.min_translation_m && motion.rotation.angle() < join.min_rotation_rad
+            motion.translation.vector.norm() < join.min_translation_m
+                && motion.rotation.angle() < join.min_rotation_rad
         };
-        !self.found.images.iter().filter_map(|image| image.arm.as_ref()).any(is_near)
+        !self
+            .found
+            .images
+            .iter()
+            .filter_map(|image| image.arm.as_ref())
+            .any(is_near)
     }
 
     /// Maximum predicted image motion over readout, exposure and stamp uncertainty, pixels.
     fn shift_px(&self, image: &Image, arm: &ArmDuringImage) -> f64 {
         let [first, last] = &arm.base_from_flange_at_rows;
         let readout_secs = self.readout_secs();
-        let exposure_secs = image.exposure_secs.or(self.camera.exposure_micros.map(|micros| 1e-6 * micros));
+        let exposure_secs = image
+            .exposure_secs
+            .or(self.camera.exposure_micros.map(|micros| 1e-6 * micros));
         let (motion, secs) = match (&self.arm, readout_secs > 0.0) {
             // Without a readout time, the motion since a short time before.
             (Some(history), false) => {
-                let earlier = self.camera.mid_exposure(image.stamp).plus_secs(-STAMP_SIGMA_SECS);
-                let joints = history.joints.at(earlier).map(|joints| joints.position).unwrap_or_default();
-                let before = history.chain.forward(&joints).unwrap_or(arm.base_from_flange);
+                let earlier = self
+                    .camera
+                    .mid_exposure(image.stamp)
+                    .plus_secs(-STAMP_SIGMA_SECS);
+                let joints = history
+                    .joints
+                    .at(earlier)
+                    .map(|joints| joints.position)
+                    .unwrap_or_default();
+                let before = history
+                    .chain
+                    .forward(&joints)
+                    .unwrap_or(arm.base_from_flange);
                 (before.inverse() * arm.base_from_flange, STAMP_SIGMA_SECS)
             }
             _ => (first.inverse() * last, readout_secs),
         };
         let focal_px = self.camera.intrinsics.focal_px[0];
-        let angle = motion.rotation.angle() + motion.translation.vector.norm() / self.rig.join.default_depth_m;
+        let angle = motion.rotation.angle()
+            + motion.translation.vector.norm() / self.rig.join.default_depth_m;
         focal_px * angle / secs * (readout_secs + exposure_secs.unwrap_or(0.0) + STAMP_SIGMA_SECS)
     }
 }
@@ -257,19 +305,33 @@ impl Arm {
         let chain = chain_of(rig)?;
         let order = chain.order_in(&rig.arm.joints)?;
         let max_gap = Duration::from_secs_f64(rig.join.max_gap_millis * 1e-3);
-        Ok(Self { chain, order, joints: JointHistory::new(max_gap, MAX_READINGS) })
+        Ok(Self {
+            chain,
+            order,
+            joints: JointHistory::new(max_gap, MAX_READINGS),
+        })
     }
 
-    /// Adds a reading in the order of the device. Invalid readings are ignored: images at their stamps are not used.
+    /// Adds a reading in the order of the device. Invalid readings are ignored: images at their
+    /// stamps are not used.
     fn push(&mut self, state: &JointState, offsets: &[f64]) {
         let position = self.order.iter().map(|ix| {
             let offset = offsets.get(*ix).copied().unwrap_or(0.0);
             state.position.get(*ix).map(|reading| reading + offset)
         });
-        let velocity = self.order.iter().map(|ix| state.velocity.get(*ix).copied()).collect::<Option<Vec<f64>>>();
+        let velocity = self
+            .order
+            .iter()
+            .map(|ix| state.velocity.get(*ix).copied())
+            .collect::<Option<Vec<f64>>>();
         if let Some(position) = position.collect::<Option<Vec<f64>>>() {
             let velocity = velocity.unwrap_or_default();
-            let _ = self.joints.push(JointState { stamp: state.stamp, position, velocity, effort: Vec::new() });
+            let _ = self.joints.push(JointState {
+                stamp: state.stamp,
+                position,
+                velocity,
+                effort: Vec::new(),
+            });
         }
     }
 }

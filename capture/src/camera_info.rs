@@ -1,7 +1,8 @@
-//! Lens parameters of ROS: messages `sensor_msgs/CameraInfo`, and the files that `camera_calibration` writes.
+//! Lens parameters of ROS: messages `sensor_msgs/CameraInfo`, and the files that
+//! `camera_calibration` writes.
 //!
-//! The keys are listed in docs/reference/camera-info.md. Source: the definition of `sensor_msgs/CameraInfo`, and of its
-//! distortion models in `image_geometry`.
+//! The keys are listed in docs/reference/camera-info.md. Source: the definition of
+//! `sensor_msgs/CameraInfo`, and of its distortion models in `image_geometry`.
 
 use kinematics::Lens;
 use serde_json::{Map, Value, json};
@@ -14,7 +15,8 @@ pub struct CameraInfo {
     pub size_px: Option<[u32; 2]>,
     /// Focal lengths along x and y, pixels.
     pub focal_px: [f64; 2],
-    /// Principal point, pixels. Half a pixel is added to that of ROS, which counts from the center of the first pixel.
+    /// Principal point, pixels. Half a pixel is added to that of ROS, which counts from the center
+    /// of the first pixel.
     pub principal_px: [f64; 2],
     /// Distortion.
     pub lens: Lens,
@@ -22,7 +24,8 @@ pub struct CameraInfo {
     pub notes: Vec<String>,
 }
 
-/// Names of a key in files, in messages of ROS 1 and in messages of ROS 2. At most one of them may be used.
+/// Names of a key in files, in messages of ROS 1 and in messages of ROS 2. At most one of them may
+/// be used.
 type Names = &'static [&'static str];
 
 const WIDTH: Names = &["image_width", "width"];
@@ -44,22 +47,29 @@ impl CameraInfo {
     /// Reads a file in YAML or JSON.
     ///
     /// # Errors
-    /// If the text is neither, a value is malformed, or the lens or the image region has no equivalent. The message names
-    /// the line or the key.
+    /// If the text is neither, a value is malformed, or the lens or the image region has no
+    /// equivalent. The message names the line or the key.
     pub fn parse(text: &str) -> Result<Self, String> {
         Self::of(&parse_value(text)?)
     }
 
     fn of(value: &Value) -> Result<Self, String> {
-        let object = value.as_object().ok_or("expected keys such as camera_matrix, found a single value or a list")?;
-        let (matrix_key, matrix) = find(object, CAMERA_MATRIX)?.ok_or("camera_matrix is missing")?;
+        let object = value
+            .as_object()
+            .ok_or("expected keys such as camera_matrix, found a single value or a list")?;
+        let (matrix_key, matrix) =
+            find(object, CAMERA_MATRIX)?.ok_or("camera_matrix is missing")?;
         let camera_matrix: [f64; 9] = matrix_of(matrix_key, matrix)?;
         let [fx, skew, cx, zero, fy, cy, ..] = camera_matrix;
         if camera_matrix == [0.0; 9] {
-            return Err(format!("{matrix_key} contains only zeros: the camera is not calibrated"));
+            return Err(format!(
+                "{matrix_key} contains only zeros: the camera is not calibrated"
+            ));
         }
         if skew != 0.0 || zero != 0.0 || camera_matrix[6..] != [0.0, 0.0, 1.0] {
-            return Err(format!("{matrix_key} must be fx, 0, cx, 0, fy, cy, 0, 0, 1"));
+            return Err(format!(
+                "{matrix_key} must be fx, 0, cx, 0, fy, cy, 0, 0, 1"
+            ));
         }
         let size_px = size_px(object)?;
         check_region(object, size_px)?;
@@ -90,13 +100,14 @@ impl CameraInfo {
     }
 }
 
-/// Replaces a ROS `CameraInfo` object, of a message or file, by one with the keys of samples files; leaves an object without
-/// a camera matrix unchanged. Returns notes for the user.
+/// Replaces a ROS `CameraInfo` object, of a message or file, by one with the keys of samples files;
+/// leaves an object without a camera matrix unchanged. Returns notes for the user.
 ///
 /// # Errors
 /// As for [`CameraInfo::parse`].
 pub fn convert(intrinsics: &mut Value) -> Result<Vec<String>, String> {
-    let has_matrix = |object: &Map<String, Value>| CAMERA_MATRIX.iter().any(|name| object.contains_key(*name));
+    let has_matrix =
+        |object: &Map<String, Value>| CAMERA_MATRIX.iter().any(|name| object.contains_key(*name));
     if !intrinsics.as_object().is_some_and(has_matrix) {
         return Ok(Vec::new());
     }
@@ -105,7 +116,8 @@ pub fn convert(intrinsics: &mut Value) -> Result<Vec<String>, String> {
     Ok(info.notes)
 }
 
-/// Parses YAML or JSON. The line of dashes that `rostopic echo` and `ros2 topic echo` print after a message may follow.
+/// Parses YAML or JSON. The line of dashes that `rostopic echo` and `ros2 topic echo` print after a
+/// message may follow.
 ///
 /// # Errors
 /// If the text is neither; the message gives line and column.
@@ -126,16 +138,33 @@ pub fn parse_value(text: &str) -> Result<Value, String> {
 
 /// Whether a text is a list of keys in YAML.
 pub fn is_yaml(text: &str) -> bool {
-    let mut lines = text.lines().filter(|line| !line.is_empty() && !line.starts_with(['#', '%']) && *line != "---");
-    let is_key = |word: &str| !word.is_empty() && word.chars().all(|c| c.is_ascii_alphanumeric() || "_-".contains(c));
-    lines.next().and_then(|line| line.split_once(':')).is_some_and(|(key, _)| is_key(key.trim_start_matches("- ")))
+    let mut lines = text
+        .lines()
+        .filter(|line| !line.is_empty() && !line.starts_with(['#', '%']) && *line != "---");
+    let is_key = |word: &str| {
+        !word.is_empty()
+            && word
+                .chars()
+                .all(|c| c.is_ascii_alphanumeric() || "_-".contains(c))
+    };
+    lines
+        .next()
+        .and_then(|line| line.split_once(':'))
+        .is_some_and(|(key, _)| is_key(key.trim_start_matches("- ")))
 }
 
 /// The key that is used and its value; `None` if there is none. `null` counts as missing.
-fn find(object: &Map<String, Value>, names: Names) -> Result<Option<(&'static str, &Value)>, String> {
-    let mut found = names.iter().filter_map(|name| Some((*name, object.get(*name).filter(|value| !value.is_null())?)));
+fn find(
+    object: &Map<String, Value>,
+    names: Names,
+) -> Result<Option<(&'static str, &Value)>, String> {
+    let mut found = names
+        .iter()
+        .filter_map(|name| Some((*name, object.get(*name).filter(|value| !value.is_null())?)));
     match (found.next(), found.next()) {
-        (Some((name, _)), Some((other, _))) => Err(format!("{name} and {other} mean the same: keep one of them")),
+        (Some((name, _)), Some((other, _))) => Err(format!(
+            "{name} and {other} mean the same: keep one of them"
+        )),
         (first, _) => Ok(first),
     }
 }
@@ -144,22 +173,37 @@ fn find(object: &Map<String, Value>, names: Names) -> Result<Option<(&'static st
 fn numbers(key: &str, value: &Value) -> Result<Vec<f64>, String> {
     let list = match value.as_object() {
         Some(object) => {
-            if let Some(unknown) = object.keys().find(|name| !["rows", "cols", "data"].contains(&name.as_str())) {
-                return Err(format!("{key} has an unknown key {unknown:?}, expected rows, cols and data"));
+            if let Some(unknown) = object
+                .keys()
+                .find(|name| !["rows", "cols", "data"].contains(&name.as_str()))
+            {
+                return Err(format!(
+                    "{key} has an unknown key {unknown:?}, expected rows, cols and data"
+                ));
             }
-            object.get("data").ok_or_else(|| format!("{key}: data is missing"))?
+            object
+                .get("data")
+                .ok_or_else(|| format!("{key}: data is missing"))?
         }
         None => value,
     };
-    let numbers: Option<Vec<f64>> = list.as_array().and_then(|list| list.iter().map(Value::as_f64).collect());
+    let numbers: Option<Vec<f64>> = list
+        .as_array()
+        .and_then(|list| list.iter().map(Value::as_f64).collect());
     let numbers = numbers.ok_or_else(|| format!("{key} must be a list of numbers"))?;
     let side = |name: &str| {
-        value.get(name).map(|side| side.as_u64().ok_or_else(|| format!("{key}: {name} is {side}, expected a number")))
+        value.get(name).map(|side| {
+            side.as_u64()
+                .ok_or_else(|| format!("{key}: {name} is {side}, expected a number"))
+        })
     };
     if let (Some(rows), Some(cols)) = (side("rows").transpose()?, side("cols").transpose()?)
         && rows.checked_mul(cols) != Some(numbers.len() as u64)
     {
-        return Err(format!("{key} has {rows} rows and {cols} columns, but {} numbers", numbers.len()));
+        return Err(format!(
+            "{key} has {rows} rows and {cols} columns, but {} numbers",
+            numbers.len()
+        ));
     }
     Ok(numbers)
 }
@@ -167,14 +211,22 @@ fn numbers(key: &str, value: &Value) -> Result<Vec<f64>, String> {
 fn matrix_of<const N: usize>(key: &str, value: &Value) -> Result<[f64; N], String> {
     let numbers = numbers(key, value)?;
     let n = numbers.len();
-    numbers.try_into().map_err(|_| format!("{key} has {n} numbers, expected {N}"))
+    numbers
+        .try_into()
+        .map_err(|_| format!("{key} has {n} numbers, expected {N}"))
 }
 
 fn size_px(object: &Map<String, Value>) -> Result<Option<[u32; 2]>, String> {
     let side = |names: Names| {
-        let Some((key, value)) = find(object, names)? else { return Ok(None) };
-        let px = value.as_u64().and_then(|px| u32::try_from(px).ok()).filter(|px| *px > 0);
-        px.map(Some).ok_or_else(|| format!("{key} is {value}, expected a number of pixels"))
+        let Some((key, value)) = find(object, names)? else {
+            return Ok(None);
+        };
+        let px = value
+            .as_u64()
+            .and_then(|px| u32::try_from(px).ok())
+            .filter(|px| *px > 0);
+        px.map(Some)
+            .ok_or_else(|| format!("{key} is {value}, expected a number of pixels"))
     };
     match (side(WIDTH)?, side(HEIGHT)?) {
         (Some(width), Some(height)) => Ok(Some([width, height])),
@@ -186,20 +238,29 @@ fn size_px(object: &Map<String, Value>) -> Result<Option<[u32; 2]>, String> {
 
 /// Rejects images that are smaller than those of the camera matrix.
 fn check_region(object: &Map<String, Value>, size_px: Option<[u32; 2]>) -> Result<(), String> {
-    const REMEDY: &str = "the camera matrix is that of whole images; calibrate with images as they are recorded";
+    const REMEDY: &str =
+        "the camera matrix is that of whole images; calibrate with images as they are recorded";
     for names in BINNING {
         // 0 and 1 both mean that pixels are not combined.
-        if let Some((key, value)) = find(object, names)?.filter(|(_, value)| ![0, 1].map(Value::from).contains(value)) {
+        if let Some((key, value)) =
+            find(object, names)?.filter(|(_, value)| ![0, 1].map(Value::from).contains(value))
+        {
             return Err(format!("{key} is {value}: {REMEDY}"));
         }
     }
-    let Some((key, roi)) = find(object, ROI)? else { return Ok(()) };
+    let Some((key, roi)) = find(object, ROI)? else {
+        return Ok(());
+    };
     if !roi.is_object() {
-        return Err(format!("{key} must have the keys x_offset, y_offset, width and height"));
+        return Err(format!(
+            "{key} must have the keys x_offset, y_offset, width and height"
+        ));
     }
     let number = |name: &str| roi.get(name).unwrap_or(&Value::Null).clone();
     let is_zero = |name: &str| number(name).is_null() || number(name) == 0;
-    let is_whole = |name: &str, ix: usize| is_zero(name) || size_px.is_some_and(|size_px| number(name) == size_px[ix]);
+    let is_whole = |name: &str, ix: usize| {
+        is_zero(name) || size_px.is_some_and(|size_px| number(name) == size_px[ix])
+    };
     if is_zero("x_offset") && is_zero("y_offset") && is_whole("width", 0) && is_whole("height", 1) {
         return Ok(());
     }
@@ -215,16 +276,24 @@ fn lens(object: &Map<String, Value>) -> Result<Lens, String> {
         coefficients.pop();
     }
     let model = match find(object, DISTORTION_MODEL)? {
-        Some((key, model)) => model.as_str().ok_or_else(|| format!("{key} is {model}, expected a name"))?,
+        Some((key, model)) => model
+            .as_str()
+            .ok_or_else(|| format!("{key} is {model}, expected a name"))?,
         None => "",
     };
     // Drivers of cameras without distortion often leave the model empty.
     let model = if model.is_empty() { "plumb_bob" } else { model };
     let n = coefficients.len();
-    let too_many = |max: usize| Err(format!("{n} distortion coefficients that are not 0; {model} has at most {max}"));
+    let too_many = |max: usize| {
+        Err(format!(
+            "{n} distortion coefficients that are not 0; {model} has at most {max}"
+        ))
+    };
     match model {
         "plumb_bob" | "rational_polynomial" if n == 0 => Ok(Lens::Pinhole),
-        "plumb_bob" | "rational_polynomial" if n <= 5 => Ok(Lens::BrownConrady(padded(&coefficients))),
+        "plumb_bob" | "rational_polynomial" if n <= 5 => {
+            Ok(Lens::BrownConrady(padded(&coefficients)))
+        }
         "plumb_bob" => too_many(5),
         "rational_polynomial" if n <= 8 => Ok(Lens::RationalBrownConrady(padded(&coefficients))),
         "rational_polynomial" => too_many(8),
@@ -252,9 +321,13 @@ fn notes(object: &Map<String, Value>, camera_matrix: &[f64; 9]) -> Result<Vec<St
     }
     if let Some((key, value)) = find(object, PROJECTION)? {
         let projection: [f64; 12] = matrix_of(key, value)?;
-        let [a, b, c, d] = [0, 1, 2, 3].map(|column| [0, 1, 2].map(|row| projection[4 * row + column]));
-        let of_raw_images = [0, 1, 2].map(|column| [0, 1, 2].map(|row| camera_matrix[3 * row + column]));
-        rectified.extend(([a, b, c] != of_raw_images && projection != [0.0; 12] || d != [0.0; 3]).then_some(key));
+        let [a, b, c, d] =
+            [0, 1, 2, 3].map(|column| [0, 1, 2].map(|row| projection[4 * row + column]));
+        let of_raw_images =
+            [0, 1, 2].map(|column| [0, 1, 2].map(|row| camera_matrix[3 * row + column]));
+        rectified.extend(
+            ([a, b, c] != of_raw_images && projection != [0.0; 12] || d != [0.0; 3]).then_some(key),
+        );
     }
     let mut notes = Vec::new();
     if !rectified.is_empty() {
@@ -263,11 +336,29 @@ fn notes(object: &Map<String, Value>, camera_matrix: &[f64; 9]) -> Result<Vec<St
             rectified.join(", ")
         ));
     }
-    let known = [WIDTH, HEIGHT, CAMERA_MATRIX, DISTORTION_MODEL, DISTORTION, RECTIFICATION, PROJECTION, ROI, UNUSED];
-    let is_known = |key: &str| known.iter().chain(&BINNING).any(|names| names.contains(&key));
+    let known = [
+        WIDTH,
+        HEIGHT,
+        CAMERA_MATRIX,
+        DISTORTION_MODEL,
+        DISTORTION,
+        RECTIFICATION,
+        PROJECTION,
+        ROI,
+        UNUSED,
+    ];
+    let is_known = |key: &str| {
+        known
+            .iter()
+            .chain(&BINNING)
+            .any(|names| names.contains(&key))
+    };
     let unknown: Vec<&String> = object.keys().filter(|key| !is_known(key)).collect();
     if !unknown.is_empty() {
-        notes.push(format!("unknown keys are not used: {}", kinematics::shortened(&unknown, MAX_NAMED, ", ")));
+        notes.push(format!(
+            "unknown keys are not used: {}",
+            kinematics::shortened(&unknown, MAX_NAMED, ", ")
+        ));
     }
     Ok(notes)
 }
@@ -319,15 +410,24 @@ projection_matrix:
     #[test]
     fn files_in_yaml_and_json_are_read() {
         assert_eq!(CameraInfo::parse(FILE), Ok(info_of_file()));
-        assert_eq!(CameraInfo::parse(&FILE.replace('\n', "\r\n")), Ok(info_of_file()));
+        assert_eq!(
+            CameraInfo::parse(&FILE.replace('\n', "\r\n")),
+            Ok(info_of_file())
+        );
         let json = parse_value(FILE).unwrap().to_string();
         assert_eq!(CameraInfo::parse(&json), Ok(info_of_file()));
         let printed = "header: {seq: 1, frame_id: ''}\nheight: 48\nwidth: 64\ndistortion_model: \"plumb_bob\"\n\
             D: [0.5, 0.0, 0.0, 0.0, 0.0]\nK: [60.0, 0.0, 31.5, 0.0, 60.0, 23.5, 0.0, 0.0, 1.0]\nbinning_x: 0\n\
             binning_y: 1\nroi: \n  x_offset: 0\n  y_offset: 0\n  height: 0\n  width: 64\n  do_rectify: False\n---\n";
         let message = CameraInfo::parse(printed).unwrap();
-        assert_eq!((message.size_px, message.principal_px), (Some([64, 48]), [32.0, 24.0]));
-        assert_eq!((message.lens, message.notes.len()), (Lens::BrownConrady([0.5, 0.0, 0.0, 0.0, 0.0]), 0));
+        assert_eq!(
+            (message.size_px, message.principal_px),
+            (Some([64, 48]), [32.0, 24.0])
+        );
+        assert_eq!(
+            (message.lens, message.notes.len()),
+            (Lens::BrownConrady([0.5, 0.0, 0.0, 0.0, 0.0]), 0)
+        );
     }
 
     #[test]
@@ -345,22 +445,45 @@ projection_matrix:
     fn distortion_models_map_to_lenses() {
         let lens = |model: &str, d: &[f64]| {
             let k = [60.0, 0.0, 31.5, 0.0, 60.0, 23.5, 0.0, 0.0, 1.0];
-            CameraInfo::of(&json!({"k": k, "distortion_model": model, "d": d})).map(|info| info.lens)
+            CameraInfo::of(&json!({"k": k, "distortion_model": model, "d": d}))
+                .map(|info| info.lens)
         };
         let eight = [0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8];
         assert_eq!(lens("plumb_bob", &[0.0; 8]), Ok(Lens::Pinhole));
         assert_eq!(lens("", &[]), Ok(Lens::Pinhole));
-        assert_eq!(lens("plumb_bob", &eight[..4]), Ok(Lens::BrownConrady([0.1, 0.2, 0.3, 0.4, 0.0])));
-        assert_eq!(lens("rational_polynomial", &eight), Ok(Lens::RationalBrownConrady(eight)));
+        assert_eq!(
+            lens("plumb_bob", &eight[..4]),
+            Ok(Lens::BrownConrady([0.1, 0.2, 0.3, 0.4, 0.0]))
+        );
+        assert_eq!(
+            lens("rational_polynomial", &eight),
+            Ok(Lens::RationalBrownConrady(eight))
+        );
         let with_thin_prism = [&eight[..], &[0.0; 6]].concat();
-        assert_eq!(lens("rational_polynomial", &with_thin_prism), Ok(Lens::RationalBrownConrady(eight)));
+        assert_eq!(
+            lens("rational_polynomial", &with_thin_prism),
+            Ok(Lens::RationalBrownConrady(eight))
+        );
         for model in ["equidistant", "fisheye"] {
-            assert_eq!(lens(model, &eight[..4]), Ok(Lens::KannalaBrandt([0.1, 0.2, 0.3, 0.4])));
-            assert_eq!(lens(model, &[0.0; 4]), Ok(Lens::KannalaBrandt([0.0; 4])), "not a pinhole");
-            assert!(lens(model, &eight).is_err_and(|why| why.contains("8 distortion coefficients")));
+            assert_eq!(
+                lens(model, &eight[..4]),
+                Ok(Lens::KannalaBrandt([0.1, 0.2, 0.3, 0.4]))
+            );
+            assert_eq!(
+                lens(model, &[0.0; 4]),
+                Ok(Lens::KannalaBrandt([0.0; 4])),
+                "not a pinhole"
+            );
+            assert!(
+                lens(model, &eight).is_err_and(|why| why.contains("8 distortion coefficients"))
+            );
         }
-        assert!(lens("plumb_bob", &eight).is_err_and(|why| why.contains("8 distortion coefficients")));
-        assert!(lens("rational_polynomial", &[0.1; 12]).is_err_and(|why| why.contains("at most 8")));
+        assert!(
+            lens("plumb_bob", &eight).is_err_and(|why| why.contains("8 distortion coefficients"))
+        );
+        assert!(
+            lens("rational_polynomial", &[0.1; 12]).is_err_and(|why| why.contains("at most 8"))
+        );
         assert!(lens("omni", &[]).is_err_and(|why| why.contains("omni")));
     }
 
@@ -371,47 +494,113 @@ projection_matrix:
             CameraInfo::parse(&FILE.replacen(was, is, 1)).expect_err(is)
         };
         for (was, is, expected) in [
-            ("610.5, 0. ", "610.5, 0.1", "camera_matrix must be fx, 0, cx"),
-            ("  cols: 3\n", "  cols: 2\n", "camera_matrix has 3 rows and 2 columns, but 9 numbers"),
-            ("  rows: 3\n", "  dt: d\n", "camera_matrix has an unknown key \"dt\""),
-            ("  data: [610.5", "  dada: [610.5", "camera_matrix has an unknown key \"dada\""),
-            ("data: [0.1", "data: [one", "distortion_coefficients must be a list of numbers"),
+            (
+                "610.5, 0. ",
+                "610.5, 0.1",
+                "camera_matrix must be fx, 0, cx",
+            ),
+            (
+                "  cols: 3\n",
+                "  cols: 2\n",
+                "camera_matrix has 3 rows and 2 columns, but 9 numbers",
+            ),
+            (
+                "  rows: 3\n",
+                "  dt: d\n",
+                "camera_matrix has an unknown key \"dt\"",
+            ),
+            (
+                "  data: [610.5",
+                "  dada: [610.5",
+                "camera_matrix has an unknown key \"dada\"",
+            ),
+            (
+                "data: [0.1",
+                "data: [one",
+                "distortion_coefficients must be a list of numbers",
+            ),
             ("data: [0.1", "data: [.nan", "line 14"),
-            ("image_width: 640", "image_width: 640.5", "image_width is 640.5, expected a number of pixels"),
+            (
+                "image_width: 640",
+                "image_width: 640.5",
+                "image_width is 640.5, expected a number of pixels",
+            ),
             ("image_width: 640", "", "the width of the images is missing"),
-            ("image_width: 640", "image_width: 640\nwidth: 640", "image_width and width mean the same"),
-            ("image_width: 640", "image_width: 640\nimage_width: 641", "line 2"),
-            ("camera_matrix:", "camera_matrices:", "camera_matrix is missing"),
-            ("plumb_bob", "[plumb_bob]", "distortion_model is [\"plumb_bob\"], expected a name"),
+            (
+                "image_width: 640",
+                "image_width: 640\nwidth: 640",
+                "image_width and width mean the same",
+            ),
+            (
+                "image_width: 640",
+                "image_width: 640\nimage_width: 641",
+                "line 2",
+            ),
+            (
+                "camera_matrix:",
+                "camera_matrices:",
+                "camera_matrix is missing",
+            ),
+            (
+                "plumb_bob",
+                "[plumb_bob]",
+                "distortion_model is [\"plumb_bob\"], expected a name",
+            ),
             ("  cols: 5\n", "  cols: 5\n bad\n", "line 1"),
         ] {
             let reason = reason_after(was, is);
-            assert!(reason.contains(expected) && !reason.contains('\n'), "{was} -> {is}: {reason}");
+            assert!(
+                reason.contains(expected) && !reason.contains('\n'),
+                "{was} -> {is}: {reason}"
+            );
         }
-        assert!(CameraInfo::parse("%YAML:1.0\n---\nK: 1").is_err_and(|why| why.contains("YAML of OpenCV")));
-        assert!(CameraInfo::parse("").is_err() && CameraInfo::parse("- 1").is_err() && CameraInfo::parse("[").is_err());
+        assert!(
+            CameraInfo::parse("%YAML:1.0\n---\nK: 1")
+                .is_err_and(|why| why.contains("YAML of OpenCV"))
+        );
+        assert!(
+            CameraInfo::parse("").is_err()
+                && CameraInfo::parse("- 1").is_err()
+                && CameraInfo::parse("[").is_err()
+        );
         let zeros = json!({"k": vec![0; 9]});
         assert!(CameraInfo::of(&zeros).is_err_and(|why| why.contains("k contains only zeros")));
         // Each alias would double the size.
-        let aliases: String = (1..40).map(|ix| format!("a{ix}: &a{ix} [*a{}, *a{}]\n", ix - 1, ix - 1)).collect();
+        let aliases: String = (1..40)
+            .map(|ix| format!("a{ix}: &a{ix} [*a{}, *a{}]\n", ix - 1, ix - 1))
+            .collect();
         assert!(CameraInfo::parse(&format!("a0: &a0 [1]\n{aliases}")).is_err());
-        assert!(CameraInfo::parse(&"[".repeat(100_000)).is_err(), "deep nesting");
+        assert!(
+            CameraInfo::parse(&"[".repeat(100_000)).is_err(),
+            "deep nesting"
+        );
     }
 
     /// Feeds each name of the table in docs/reference/camera-info.md alone.
     #[test]
     fn keys_are_used_refused_or_named_as_documented() {
         let page = include_str!("../../docs/reference/camera-info.md");
-        let (documented, _) = page.split_once("\n## ").expect("the table comes before the first section");
+        let (documented, _) = page
+            .split_once("\n## ")
+            .expect("the table comes before the first section");
         let rows: Vec<[&str; 3]> = documented
             .lines()
             .filter(|line| line.starts_with("| `"))
-            .filter_map(|line| line.trim_matches(['|', ' ']).split(" | ").collect::<Vec<_>>().try_into().ok())
+            .filter_map(|line| {
+                line.trim_matches(['|', ' '])
+                    .split(" | ")
+                    .collect::<Vec<_>>()
+                    .try_into()
+                    .ok()
+            })
             .collect();
         assert!(rows.len() > 10, "{rows:?}");
         let base = json!({"k": [60, 0, 31.5, 0, 60, 23.5, 0, 0, 1], "width": 64, "height": 48, "d": [0.1, 0.2]});
         let mut tested = Vec::new();
-        for (names, use_of_key) in rows.iter().map(|[names, _, use_of_key]| (*names, *use_of_key)) {
+        for (names, use_of_key) in rows
+            .iter()
+            .map(|[names, _, use_of_key]| (*names, *use_of_key))
+        {
             for name in names.split(", ").map(|name| name.trim_matches('`')) {
                 let value = match name {
                     "image_width" | "width" => json!(65),
@@ -420,9 +609,13 @@ projection_matrix:
                     "distortion_model" => json!("equidistant"),
                     "distortion_coefficients" | "D" | "d" => json!([0.3]),
                     "rectification_matrix" | "R" | "r" => json!([0, 1, 0, -1, 0, 0, 0, 0, 1]),
-                    "projection_matrix" | "P" | "p" => json!([60, 0, 31.5, -7, 0, 60, 23.5, 0, 0, 0, 1, 0]),
+                    "projection_matrix" | "P" | "p" => {
+                        json!([60, 0, 31.5, -7, 0, 60, 23.5, 0, 0, 0, 1, 0])
+                    }
                     "binning_x" | "binning_y" => json!(2),
-                    "roi" => json!({"x_offset": 8, "y_offset": 0, "width": 32, "height": 48, "do_rectify": false}),
+                    "roi" => {
+                        json!({"x_offset": 8, "y_offset": 0, "width": 32, "height": 48, "do_rectify": false})
+                    }
                     "camera_name" => json!("left"),
                     "header" => json!({"frame_id": "left"}),
                     _ => json!(7),
@@ -432,35 +625,68 @@ projection_matrix:
                 let object = changed.as_object_mut().unwrap();
                 // Names with the same meaning must not be used together.
                 let groups = [WIDTH, HEIGHT, CAMERA_MATRIX, DISTORTION];
-                groups.iter().filter(|names| names.contains(&name)).flat_map(|names| names.iter()).for_each(|name| {
-                    object.remove(*name);
-                });
+                groups
+                    .iter()
+                    .filter(|names| names.contains(&name))
+                    .flat_map(|names| names.iter())
+                    .for_each(|name| {
+                        object.remove(*name);
+                    });
                 object.insert(name.to_owned(), value);
                 let (before, after) = (CameraInfo::of(&base).unwrap(), CameraInfo::of(&changed));
                 let context = format!("{name}: {use_of_key}: {after:?}");
-                let without_notes = |info: &CameraInfo| CameraInfo { notes: Vec::new(), ..info.clone() };
+                let without_notes = |info: &CameraInfo| CameraInfo {
+                    notes: Vec::new(),
+                    ..info.clone()
+                };
                 match use_of_key {
-                    "yes" => assert!(after.is_ok_and(|after| after != before && after.notes.is_empty()), "{context}"),
+                    "yes" => assert!(
+                        after.is_ok_and(|after| after != before && after.notes.is_empty()),
+                        "{context}"
+                    ),
                     "no" => assert_eq!(after, Ok(before), "{context}"),
                     "refused" => assert!(after.unwrap_err().starts_with(name), "{context}"),
                     "note" => {
                         let after = after.unwrap();
                         assert_eq!(without_notes(&after), before, "{context}");
-                        assert!(after.notes.len() == 1 && after.notes[0].ends_with(&format!(": {name}")), "{context}");
+                        assert!(
+                            after.notes.len() == 1
+                                && after.notes[0].ends_with(&format!(": {name}")),
+                            "{context}"
+                        );
                     }
                     other => panic!("unknown use {other:?}"),
                 }
             }
         }
-        let all = [WIDTH, HEIGHT, CAMERA_MATRIX, DISTORTION_MODEL, DISTORTION, RECTIFICATION, PROJECTION, ROI, UNUSED];
-        let untested: Vec<_> =
-            all.iter().chain(&BINNING).flat_map(|names| names.iter()).filter(|name| !tested.contains(name)).collect();
+        let all = [
+            WIDTH,
+            HEIGHT,
+            CAMERA_MATRIX,
+            DISTORTION_MODEL,
+            DISTORTION,
+            RECTIFICATION,
+            PROJECTION,
+            ROI,
+            UNUSED,
+        ];
+        let untested: Vec<_> = all
+            .iter()
+            .chain(&BINNING)
+            .flat_map(|names| names.iter())
+            .filter(|name| !tested.contains(name))
+            .collect();
         assert!(untested.is_empty(), "not documented: {untested:?}");
     }
 
     #[test]
     fn yaml_is_recognized() {
-        for yaml in ["samples:\n- a: 1", "# comment\n---\nimage_width: 640", "%YAML:1.0\nK: [1]", "- a: 1"] {
+        for yaml in [
+            "samples:\n- a: 1",
+            "# comment\n---\nimage_width: 640",
+            "%YAML:1.0\nK: [1]",
+            "- a: 1",
+        ] {
             assert!(is_yaml(yaml), "{yaml}");
         }
         for other in ["{\"a\": 1}", "", "[1]", "hello", "\"a\": 1"] {

@@ -12,8 +12,8 @@ use std::sync::{Arc, OnceLock};
 
 /// Name of the only camera of a dataset.
 const CAMERA: &str = "camera";
-/// Maximum number of pixels of the photos that are decoded at the same time, unless a single photo has more: 134 million.
-/// Each takes 4 to 12 bytes until the photo is scaled.
+/// Maximum number of pixels of the photos that are decoded at the same time, unless a single photo
+/// has more: 134 million. Each takes 4 to 12 bytes until the photo is scaled.
 const MAX_PX_AT_ONCE: u64 = 1 << 27;
 
 /// The photos of a dataset as keyframes: undistorted and scaled, with the poses of the dataset.
@@ -31,14 +31,15 @@ pub struct LoadedDataset {
 
 /// Decodes all photos in parallel, few at a time if they are large.
 ///
-/// `holdout` assigns the splits; without it, the lists of the dataset do, or [`Holdout::default`] if it has none. `scale_frac` scales the undistorted photos (not their depth) by averaging areas; 1
-/// keeps their size. `on_progress` receives the number of finished photos, from any thread. A photo that does not decode
-/// is skipped and reported in `data_losses`.
+/// `holdout` assigns the splits; without it, the lists of the dataset do, or [`Holdout::default`]
+/// if it has none. `scale_frac` scales the undistorted photos (not their depth) by averaging areas;
+/// 1 keeps their size. `on_progress` receives the number of finished photos, from any thread. A
+/// photo that does not decode is skipped and reported in `data_losses`.
 ///
 /// # Errors
 ///
-/// If no photo decodes, the scaled photos would be too small or do not fit into memory, or `holdout` does not match the
-/// names.
+/// If no photo decodes, the scaled photos would be too small or do not fit into memory, or
+/// `holdout` does not match the names.
 pub fn load(
     dataset: &Dataset,
     holdout: Option<&Holdout>,
@@ -48,7 +49,8 @@ pub fn load(
     load_few_at_once(dataset, holdout, scale_frac, MAX_PX_AT_ONCE, on_progress)
 }
 
-/// Loads as [`load`] does, and decodes photos with at most this many pixels in total at the same time.
+/// Loads as [`load`] does, and decodes photos with at most this many pixels in total at the same
+/// time.
 fn load_few_at_once(
     dataset: &Dataset,
     holdout: Option<&Holdout>,
@@ -62,13 +64,25 @@ fn load_few_at_once(
     if let Some(available_bytes) = memory::available_bytes() {
         check_memory(dataset, scale_frac, available_bytes)?;
     }
-    let names: Vec<&str> = dataset.images.iter().map(|image| image.name.as_str()).collect();
-    let listed = || dataset.images.iter().map(|image| image.listed.map(split_of)).collect::<Option<Vec<Split>>>();
+    let names: Vec<&str> = dataset
+        .images
+        .iter()
+        .map(|image| image.name.as_str())
+        .collect();
+    let listed = || {
+        dataset
+            .images
+            .iter()
+            .map(|image| image.listed.map(split_of))
+            .collect::<Option<Vec<Split>>>()
+    };
     let splits = match holdout.map_or_else(listed, |_| None) {
         Some(listed) => listed,
         None => {
             let holdout = holdout.cloned().unwrap_or_default();
-            holdout.splits(&names).with_context(|| dataset.path.display().to_string())?
+            holdout
+                .splits(&names)
+                .with_context(|| dataset.path.display().to_string())?
         }
     };
     let n_done = AtomicUsize::new(0);
@@ -79,7 +93,11 @@ fn load_few_at_once(
         (
             image.name.clone(),
             keyframe.map(|converted| Converted {
-                keyframe: Keyframe { camera: camera.clone(), split, ..converted.keyframe },
+                keyframe: Keyframe {
+                    camera: camera.clone(),
+                    split,
+                    ..converted.keyframe
+                },
                 ..converted
             }),
         )
@@ -90,7 +108,11 @@ fn load_few_at_once(
     let mut start = 0;
     for run in dataset.images.chunk_by(|a, b| a.intrinsics == b.intrinsics) {
         let lens = LensMaps::of(&run[0].intrinsics);
-        let n_at_once = n_at_once(run[0].intrinsics.size_px, max_px_at_once, rayon::current_num_threads());
+        let n_at_once = n_at_once(
+            run[0].intrinsics.size_px,
+            max_px_at_once,
+            rayon::current_num_threads(),
+        );
         let n_at_once = n_at_once.unwrap_or(run.len());
         let run_splits = &splits[start..start + run.len()];
         for (images, image_splits) in run.chunks(n_at_once).zip(run_splits.chunks(n_at_once)) {
@@ -101,11 +123,21 @@ fn load_few_at_once(
     }
 
     let (notes, data_losses) = (dataset.notes.clone(), dataset.data_losses.clone());
-    let mut loaded = LoadedDataset { keyframes: Vec::new(), names: Vec::new(), notes, data_losses };
-    let (mut image_errors, mut depth_errors, mut mask_warnings) = (Vec::new(), Vec::new(), Vec::new());
+    let mut loaded = LoadedDataset {
+        keyframes: Vec::new(),
+        names: Vec::new(),
+        notes,
+        data_losses,
+    };
+    let (mut image_errors, mut depth_errors, mut mask_warnings) =
+        (Vec::new(), Vec::new(), Vec::new());
     for (name, result) in results {
         match result {
-            Ok(Converted { keyframe, depth_error, mask_warning }) => {
+            Ok(Converted {
+                keyframe,
+                depth_error,
+                mask_warning,
+            }) => {
                 loaded.keyframes.push(Arc::new(keyframe));
                 loaded.names.push(name);
                 depth_errors.extend(depth_error);
@@ -116,7 +148,10 @@ fn load_few_at_once(
     }
     if !mask_warnings.is_empty() {
         let n_masks = counted(mask_warnings.len() as u64, "mask");
-        loaded.notes.push(format!("{n_masks} may exclude the wrong pixels: {}", first_of(&mask_warnings)));
+        loaded.notes.push(format!(
+            "{n_masks} may exclude the wrong pixels: {}",
+            first_of(&mask_warnings)
+        ));
     }
     ensure!(
         !loaded.keyframes.is_empty(),
@@ -127,14 +162,17 @@ fn load_few_at_once(
     for (what, errors) in [("image", image_errors), ("depth image", depth_errors)] {
         if !errors.is_empty() {
             let n_unusable = counted(errors.len() as u64, what);
-            loaded.data_losses.push(format!("{n_unusable} cannot be used: {}", first_of(&errors)));
+            loaded.data_losses.push(format!(
+                "{n_unusable} cannot be used: {}",
+                first_of(&errors)
+            ));
         }
     }
     Ok(loaded)
 }
 
-/// Number of photos of this size, at least 1, that are decoded at the same time, so that together they have at most
-/// `max_px` pixels; `None` if each thread may decode one.
+/// Number of photos of this size, at least 1, that are decoded at the same time, so that together
+/// they have at most `max_px` pixels; `None` if each thread may decode one.
 fn n_at_once(size_px: [u32; 2], max_px: u64, n_threads: usize) -> Option<usize> {
     let n_px: u64 = size_px.map(u64::from).iter().product();
     let n_photos = usize::try_from(max_px / n_px.max(1)).unwrap_or(usize::MAX);
@@ -148,7 +186,15 @@ fn check_memory(dataset: &Dataset, scale_frac: f64, available_bytes: u64) -> cra
     let n_bytes: u64 = dataset
         .images
         .iter()
-        .map(|image| 4 * image.intrinsics.scaled(scale_frac).size_px.map(u64::from).iter().product::<u64>())
+        .map(|image| {
+            4 * image
+                .intrinsics
+                .scaled(scale_frac)
+                .size_px
+                .map(u64::from)
+                .iter()
+                .product::<u64>()
+        })
         .sum();
     if n_bytes <= available_bytes {
         return Ok(());
@@ -156,7 +202,9 @@ fn check_memory(dataset: &Dataset, scale_frac: f64, available_bytes: u64) -> cra
     let fitting = scale_frac * (available_bytes as f64 / n_bytes as f64).sqrt();
     let remedy = match (100.0 * fitting).floor() / 100.0 {
         scale if scale >= downscale::MIN_SCALE => {
-            format!("scale them to {scale} or less (--scale of `fieldrig train`, `eval` and `bench`)")
+            format!(
+                "scale them to {scale} or less (--scale of `fieldrig train`, `eval` and `bench`)"
+            )
         }
         _ => "use fewer photos".to_owned(),
     };
@@ -186,32 +234,52 @@ fn first_of(errors: &[String]) -> String {
 /// Undistortion maps of one lens; empty for a lens without distortion.
 struct LensMaps {
     color: Option<Undistortion>,
-    /// Map for depth images whose size differs from that of the photos; computed for the first such image.
+    /// Map for depth images whose size differs from that of the photos; computed for the first such
+    /// image.
     depth: OnceLock<Undistortion>,
 }
 
 impl LensMaps {
     fn of(intrinsics: &Intrinsics) -> Self {
         let color = (!intrinsics.is_pinhole()).then(|| Undistortion::new(intrinsics));
-        Self { color, depth: OnceLock::new() }
+        Self {
+            color,
+            depth: OnceLock::new(),
+        }
     }
 
-    /// Undistorts and scales a photo. If it becomes smaller, the undistorted photo is never in memory.
-    fn scaled_color(&self, rgba: Vec<u8>, from_px: [u32; 2], to_px: [u32; 2]) -> Result<Vec<u8>, kinematics::Error> {
+    /// Undistorts and scales a photo. If it becomes smaller, the undistorted photo is never in
+    /// memory.
+    fn scaled_color(
+        &self,
+        rgba: Vec<u8>,
+        from_px: [u32; 2],
+        to_px: [u32; 2],
+    ) -> Result<Vec<u8>, kinematics::Error> {
         match &self.color {
             None => Ok(downscale::rgba(rgba, from_px, to_px)),
-            Some(map) if from_px == to_px => Ok(downscale::rgba(map.apply_rgba(&rgba)?, from_px, to_px)),
-            Some(map) => Ok(downscale::rgba_of_rows(from_px, to_px, map.rgba_rows(&rgba)?)),
+            Some(map) if from_px == to_px => {
+                Ok(downscale::rgba(map.apply_rgba(&rgba)?, from_px, to_px))
+            }
+            Some(map) => Ok(downscale::rgba_of_rows(
+                from_px,
+                to_px,
+                map.rgba_rows(&rgba)?,
+            )),
         }
     }
 
     fn undistorted_depth(&self, depth: &DepthImage) -> Result<Vec<f32>, kinematics::Error> {
-        let Some(color) = &self.color else { return Ok(depth.depth_m.clone()) };
+        let Some(color) = &self.color else {
+            return Ok(depth.depth_m.clone());
+        };
         let size_px = depth.intrinsics.size_px;
         if color.size_px() == size_px {
             return color.apply_depth(&depth.depth_m);
         }
-        let cached = self.depth.get_or_init(|| Undistortion::new(&depth.intrinsics));
+        let cached = self
+            .depth
+            .get_or_init(|| Undistortion::new(&depth.intrinsics));
         match cached.size_px() == size_px {
             true => cached.apply_depth(&depth.depth_m),
             false => Undistortion::new(&depth.intrinsics).apply_depth(&depth.depth_m),
@@ -230,18 +298,24 @@ struct Converted {
 fn keyframe(lens: &LensMaps, image: &DatasetImage, scale_frac: f64) -> crate::Result<Converted> {
     let loaded = image.load()?;
     let in_image = || image.name.clone();
-    let depth = loaded.depth.as_ref().zip(image.depth.as_ref()).map(|(depth, file)| {
-        Ok::<_, crate::Error>(DepthMap {
-            size_px: depth.intrinsics.size_px,
-            focal_px: depth.intrinsics.focal_px,
-            principal_px: depth.intrinsics.principal_px,
-            depth_m: lens.undistorted_depth(depth).with_context(in_image)?.into(),
-            world_from_camera: file.world_from_camera,
-        })
-    });
+    let depth = loaded
+        .depth
+        .as_ref()
+        .zip(image.depth.as_ref())
+        .map(|(depth, file)| {
+            Ok::<_, crate::Error>(DepthMap {
+                size_px: depth.intrinsics.size_px,
+                focal_px: depth.intrinsics.focal_px,
+                principal_px: depth.intrinsics.principal_px,
+                depth_m: lens.undistorted_depth(depth).with_context(in_image)?.into(),
+                world_from_camera: file.world_from_camera,
+            })
+        });
     let depth = depth.transpose()?;
     let scaled = image.intrinsics.scaled(scale_frac);
-    let rgba = lens.scaled_color(loaded.rgba_srgb, image.intrinsics.size_px, scaled.size_px).with_context(in_image)?;
+    let rgba = lens
+        .scaled_color(loaded.rgba_srgb, image.intrinsics.size_px, scaled.size_px)
+        .with_context(in_image)?;
     let keyframe = Keyframe {
         camera: CAMERA.into(),
         stamp: image.stamp,
@@ -258,7 +332,11 @@ fn keyframe(lens: &LensMaps, image: &DatasetImage, scale_frac: f64) -> crate::Re
         split: Split::Train,
         truth: None,
     };
-    Ok(Converted { keyframe, depth_error: loaded.depth_error, mask_warning: loaded.mask_warning })
+    Ok(Converted {
+        keyframe,
+        depth_error: loaded.depth_error,
+        mask_warning: loaded.mask_warning,
+    })
 }
 
 #[cfg(test)]

@@ -16,12 +16,21 @@ const SCALE_RANGE: std::ops::RangeInclusive<f64> = MIN_SCALE..=1.0;
 ///
 /// If the text is not a number from 0.05 to 1; the message gives the range.
 pub fn parse_scale(text: &str) -> Result<f64, String> {
-    let share = text.parse::<f64>().ok().filter(|share| SCALE_RANGE.contains(share));
-    share.ok_or_else(|| format!("must be a number from {} to {}", SCALE_RANGE.start(), SCALE_RANGE.end()))
+    let share = text
+        .parse::<f64>()
+        .ok()
+        .filter(|share| SCALE_RANGE.contains(share));
+    share.ok_or_else(|| {
+        format!(
+            "must be a number from {} to {}",
+            SCALE_RANGE.start(),
+            SCALE_RANGE.end()
+        )
+    })
 }
 
-/// Intrinsics of images scaled to the fraction `share` of their width and height; returns an error if they become too
-/// small.
+/// Intrinsics of images scaled to the fraction `share` of their width and height; returns an error
+/// if they become too small.
 pub(crate) fn intrinsics(full: &Intrinsics, share: f64) -> Result<Intrinsics, Error> {
     let scaled = full.scaled(share);
     if scaled.size_px != full.size_px && scaled.size_px.iter().any(|side| *side < MIN_SIDE_PX) {
@@ -34,23 +43,31 @@ pub(crate) fn intrinsics(full: &Intrinsics, share: f64) -> Result<Intrinsics, Er
     Ok(scaled)
 }
 
-/// Scales an image `[height, width, 4]` with alpha from `from_px` (width and height) to the smaller size `to_px`.
+/// Scales an image `[height, width, 4]` with alpha from `from_px` (width and height) to the smaller
+/// size `to_px`.
 ///
-/// If the sizes are equal, the color is unchanged. A new pixel is masked (alpha 0) if it covers any masked pixel, so
-/// that no masked content leaks into the result.
+/// If the sizes are equal, the color is unchanged. A new pixel is masked (alpha 0) if it covers any
+/// masked pixel, so that no masked content leaks into the result.
 #[must_use]
 pub fn rgba(rgba: Vec<u8>, from_px: [u32; 2], to_px: [u32; 2]) -> Vec<u8> {
     if from_px == to_px {
         return with_binary_alpha(rgba);
     }
     let row_bytes = 4 * from_px[0] as usize;
-    rgba_of_rows(from_px, to_px, |row, to| to.copy_from_slice(&rgba[row * row_bytes..(row + 1) * row_bytes]))
+    rgba_of_rows(from_px, to_px, |row, to| {
+        to.copy_from_slice(&rgba[row * row_bytes..(row + 1) * row_bytes])
+    })
 }
 
 /// Scales an image as [`rgba`] does, but to a smaller size, and without holding it in memory.
 ///
-/// * `write_row`: writes the row of the image with the given index to `[width, 4]`. It is called once per row, in order.
-pub(crate) fn rgba_of_rows(from_px: [u32; 2], to_px: [u32; 2], write_row: impl FnMut(usize, &mut [u8])) -> Vec<u8> {
+/// * `write_row`: writes the row of the image with the given index to `[width, 4]`. It is called
+///   once per row, in order.
+pub(crate) fn rgba_of_rows(
+    from_px: [u32; 2],
+    to_px: [u32; 2],
+    write_row: impl FnMut(usize, &mut [u8]),
+) -> Vec<u8> {
     with_binary_alpha(area_mean(from_px, to_px, write_row))
 }
 
@@ -62,10 +79,18 @@ fn with_binary_alpha(mut rgba: Vec<u8>) -> Vec<u8> {
     rgba
 }
 
-/// Shrinks `[height, width, 4]`. Each new pixel is the mean over the area it covers, including fractions of pixels.
-fn area_mean(from_px: [u32; 2], to_px: [u32; 2], mut write_row: impl FnMut(usize, &mut [u8])) -> Vec<u8> {
+/// Shrinks `[height, width, 4]`. Each new pixel is the mean over the area it covers, including
+/// fractions of pixels.
+fn area_mean(
+    from_px: [u32; 2],
+    to_px: [u32; 2],
+    mut write_row: impl FnMut(usize, &mut [u8]),
+) -> Vec<u8> {
     let [from_width, to_width] = [from_px[0] as usize, to_px[0] as usize];
-    let (columns, rows) = (coverage(from_px[0], to_px[0]), coverage(from_px[1], to_px[1]));
+    let (columns, rows) = (
+        coverage(from_px[0], to_px[0]),
+        coverage(from_px[1], to_px[1]),
+    );
     let mut out = Vec::with_capacity(4 * to_width * rows.len());
     let mut sums = vec![[0.0_f32; 4]; from_width];
     let (mut row, mut row_y) = (vec![0; 4 * from_width], None);
@@ -82,8 +107,17 @@ fn area_mean(from_px: [u32; 2], to_px: [u32; 2], mut write_row: impl FnMut(usize
             }
         }
         for covered_columns in &columns {
-            let mean = |channel: usize| covered_columns.iter().map(|&(x, share)| share * sums[x][channel]).sum::<f32>();
-            #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a mean of bytes is a byte")]
+            let mean = |channel: usize| {
+                covered_columns
+                    .iter()
+                    .map(|&(x, share)| share * sums[x][channel])
+                    .sum::<f32>()
+            };
+            #[expect(
+                clippy::cast_possible_truncation,
+                clippy::cast_sign_loss,
+                reason = "a mean of bytes is a byte"
+            )]
             out.extend((0..4).map(|channel| mean(channel).round() as u8));
         }
     }
@@ -91,12 +125,21 @@ fn area_mean(from_px: [u32; 2], to_px: [u32; 2], mut write_row: impl FnMut(usize
 }
 
 /// For each new pixel of a line, the old pixels it covers and their weights, which add up to 1.
-#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "positions lie inside the line")]
+#[expect(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "positions lie inside the line"
+)]
 fn coverage(from: u32, to: u32) -> Vec<Vec<(usize, f32)>> {
     let ratio = f64::from(from) / f64::from(to);
     let covered = |ix: u32| {
-        let (start, end) = (f64::from(ix) * ratio, (f64::from(ix + 1) * ratio).min(f64::from(from)));
-        let overlap = |source_ix: usize| ((source_ix as f64 + 1.0).min(end) - (source_ix as f64).max(start)) / ratio;
+        let (start, end) = (
+            f64::from(ix) * ratio,
+            (f64::from(ix + 1) * ratio).min(f64::from(from)),
+        );
+        let overlap = |source_ix: usize| {
+            ((source_ix as f64 + 1.0).min(end) - (source_ix as f64).max(start)) / ratio
+        };
         let source_pixels = start as usize..(end.ceil() as usize).min(from as usize);
         source_pixels
             .map(|source_ix| (source_ix, overlap(source_ix) as f32))
@@ -121,7 +164,9 @@ mod tests {
     #[test]
     fn rows_are_read_once_and_in_order() {
         const SIZE_PX: [u32; 2] = [5, 7];
-        let image: Vec<u8> = (0..4 * 5 * 7).map(|ix| if ix % 4 == 3 && ix != 43 { 255 } else { ix }).collect();
+        let image: Vec<u8> = (0..4 * 5 * 7)
+            .map(|ix| if ix % 4 == 3 && ix != 43 { 255 } else { ix })
+            .collect();
         for to_px in [[2, 3], [4, 6], [1, 1], [5, 2]] {
             let mut read = Vec::new();
             let scaled = rgba_of_rows(SIZE_PX, to_px, |row, to| {
@@ -131,7 +176,10 @@ mod tests {
             assert_eq!(read, (0..7).collect::<Vec<_>>());
             assert_eq!(scaled, rgba(image.clone(), SIZE_PX, to_px));
             assert_eq!(scaled.len(), 4 * (to_px[0] * to_px[1]) as usize);
-            assert!(scaled.chunks(4).any(|pixel| pixel[3] == 0), "one pixel is masked");
+            assert!(
+                scaled.chunks(4).any(|pixel| pixel[3] == 0),
+                "one pixel is masked"
+            );
         }
         // The mean of columns 0 to 4 and rows 0 to 6.
         assert_eq!(rgba(image, SIZE_PX, [1, 1])[..3], [68, 69, 70]);
@@ -141,7 +189,10 @@ mod tests {
     fn scale_and_image_size_are_bounded() {
         assert_eq!(parse_scale("0.05"), Ok(0.05));
         for invalid in ["0", "0.049", "1.01", "nan", "-1", "half"] {
-            assert!(parse_scale(invalid).is_err_and(|message| message.contains("0.05 to 1")), "{invalid}");
+            assert!(
+                parse_scale(invalid).is_err_and(|message| message.contains("0.05 to 1")),
+                "{invalid}"
+            );
         }
         let full = Intrinsics {
             size_px: [160, 120],
@@ -151,10 +202,19 @@ mod tests {
             rectified: true,
         };
         let half = intrinsics(&full, 0.5).expect("large enough");
-        assert_eq!((half.size_px, half.focal_px, half.principal_px), ([80, 60], [50.0; 2], [40.0, 30.5]));
+        assert_eq!(
+            (half.size_px, half.focal_px, half.principal_px),
+            ([80, 60], [50.0; 2], [40.0, 30.5])
+        );
         let message = intrinsics(&full, 0.1).expect_err("12 rows").to_string();
-        assert!(message.contains("160x120") && message.contains("16x12"), "{message}");
-        let small = Intrinsics { size_px: [8, 6], ..full };
+        assert!(
+            message.contains("160x120") && message.contains("16x12"),
+            "{message}"
+        );
+        let small = Intrinsics {
+            size_px: [8, 6],
+            ..full
+        };
         assert_eq!(intrinsics(&small, 1.0).expect("unchanged"), small);
     }
 }

@@ -10,8 +10,8 @@ pub type Result<T, E = Error> = std::result::Result<T, E>;
 
 /// An error of opening or reading a rig, or of joining its samples.
 ///
-/// [`Error::class`] distinguishes invalid input, insufficient data and failures. The message of the error is its
-/// outermost context; `{:#}` gives the message with all causes.
+/// [`Error::class`] distinguishes invalid input, insufficient data and failures. The message of the
+/// error is its outermost context; `{:#}` gives the message with all causes.
 #[derive(Debug)]
 #[non_exhaustive]
 pub enum Error {
@@ -51,9 +51,11 @@ impl Error {
             Self::InsufficientData(_) => ErrorClass::InsufficientData,
             Self::Keyframe(error) => error.class(),
             Self::Context { source, .. } => source.class(),
-            Self::Failed(_) | Self::Driver(_) | Self::Kinematics(_) | Self::Io(_) | Self::Other(_) => {
-                ErrorClass::Failed
-            }
+            Self::Failed(_)
+            | Self::Driver(_)
+            | Self::Kinematics(_)
+            | Self::Io(_)
+            | Self::Other(_) => ErrorClass::Failed,
         }
     }
 
@@ -67,14 +69,18 @@ impl Error {
 impl Display for Error {
     fn fmt(&self, f: &mut Formatter<'_>) -> std::fmt::Result {
         match self {
-            Self::BadInput(text) | Self::InsufficientData(text) | Self::Failed(text) => f.write_str(text),
+            Self::BadInput(text) | Self::InsufficientData(text) | Self::Failed(text) => {
+                f.write_str(text)
+            }
             Self::Config(error) => write_chain(f, error),
             Self::Keyframe(error) => write_chain(f, error),
             Self::Driver(error) => write_chain(f, error),
             Self::Kinematics(error) => write_chain(f, error),
             Self::Io(error) => write_chain(f, error),
             Self::Other(error) => write_chain(f, error.as_ref()),
-            Self::Context { context, source } if f.alternate() => write!(f, "{context}: {source:#}"),
+            Self::Context { context, source } if f.alternate() => {
+                write!(f, "{context}: {source:#}")
+            }
             Self::Context { context, .. } => f.write_str(context),
         }
     }
@@ -108,10 +114,14 @@ mod tests {
 
     #[test]
     fn context_keeps_the_class_and_the_causes() {
-        let error = Err::<(), _>(Error::BadInput("scale is 2".into())).context("rig.toml").expect_err("an error");
+        let error = Err::<(), _>(Error::BadInput("scale is 2".into()))
+            .context("rig.toml")
+            .expect_err("an error");
         assert_eq!(error.class(), ErrorClass::BadInput);
         assert_eq!(format!("{error:#}"), "rig.toml: scale is 2");
-        let missing = std::fs::read("no/such/file").with_context(|| "the list").expect_err("no file");
+        let missing = std::fs::read("no/such/file")
+            .with_context(|| "the list")
+            .expect_err("no file");
         assert_eq!(missing.class(), ErrorClass::Failed);
         assert!(format!("{missing:#}").starts_with("the list: "));
     }

@@ -1,5 +1,5 @@
-//! The input side of a run: a thread reads the source, records and joins the samples, and corrects base poses at
-//! stations. Keyframes are delivered through a bounded queue.
+//! The input side of a run: a thread reads the source, records and joins the samples, and corrects
+//! base poses at stations. Keyframes are delivered through a bounded queue.
 
 use crate::error::{Context, Error};
 use crate::join::{Change, Join, JoinEvent, PosedImage};
@@ -19,11 +19,12 @@ use std::sync::{Arc, OnceLock};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-/// Maximum number of keyframes that wait for the trainer. If the queue is full, the input thread waits, and live
-/// devices drop and count images.
+/// Maximum number of keyframes that wait for the trainer. If the queue is full, the input thread
+/// waits, and live devices drop and count images.
 const MAX_WAITING: usize = 8;
 
-/// Number of images whose arrival is remembered until they become keyframes: more than a station holds back.
+/// Number of images whose arrival is remembered until they become keyframes: more than a station
+/// holds back.
 const MAX_ARRIVALS: usize = 512;
 
 /// When a keyframe passed the stages of the input.
@@ -46,7 +47,8 @@ pub struct FeedItem {
     pub times: Option<InputTimes>,
 }
 
-/// Receives the camera images and the motion of the robot from a running input, for example to show them.
+/// Receives the camera images and the motion of the robot from a running input, for example to show
+/// them.
 pub trait InputObserver: Send {
     /// Whether images are needed. If not, they are not decoded.
     fn needs_images(&self) -> bool;
@@ -78,7 +80,8 @@ pub struct ObservedRangeScan {
 pub struct ObservedRobot {
     /// Time of the reading.
     pub stamp: Stamp,
-    /// The same time on this process's clock; the time of arrival if the stamp comes from another clock.
+    /// The same time on this process's clock; the time of arrival if the stamp comes from another
+    /// clock.
     pub captured_at: Instant,
     /// Pose of the base, with the correction of its station.
     pub world_from_base: Transform,
@@ -93,7 +96,8 @@ pub struct ObservedImage {
     pub camera: Arc<str>,
     /// Mid-exposure.
     pub stamp: Stamp,
-    /// Mid-exposure on this process's clock; the time of arrival if the stamp comes from another clock.
+    /// Mid-exposure on this process's clock; the time of arrival if the stamp comes from another
+    /// clock.
     pub captured_at: Instant,
     /// Width and height, pixels.
     pub size_px: [u32; 2],
@@ -163,18 +167,37 @@ pub struct Feed {
 }
 
 impl Feed {
-    /// Starts reading `input`. The feed ends when the input ends, when `stop` is requested, or when the source fails.
+    /// Starts reading `input`. The feed ends when the input ends, when `stop` is requested, or when
+    /// the source fails.
     ///
     /// # Errors
     ///
     /// If no thread can be started.
-    pub fn start(input: Input, observer: Box<dyn InputObserver>, stop: Stop) -> crate::Result<Self> {
+    pub fn start(
+        input: Input,
+        observer: Box<dyn InputObserver>,
+        stop: Stop,
+    ) -> crate::Result<Self> {
         let (sender, changes) = sync_channel(MAX_WAITING);
         let shared = Arc::new(Shared::default());
-        let pump = Pump { input, observer, stop, sender, shared: shared.clone(), arrivals: VecDeque::new() };
-        let thread =
-            std::thread::Builder::new().name("input".into()).spawn(|| pump.run()).context("cannot start a thread")?;
-        Ok(Self { changes, shared, thread, ended: false })
+        let pump = Pump {
+            input,
+            observer,
+            stop,
+            sender,
+            shared: shared.clone(),
+            arrivals: VecDeque::new(),
+        };
+        let thread = std::thread::Builder::new()
+            .name("input".into())
+            .spawn(|| pump.run())
+            .context("cannot start a thread")?;
+        Ok(Self {
+            changes,
+            shared,
+            thread,
+            ended: false,
+        })
     }
 
     /// Time at which the first image arrived; `None` if none has arrived.
@@ -189,7 +212,8 @@ impl Feed {
         self.shared.rejected.lock().clone()
     }
 
-    /// Waits at most `timeout` for the next change. Returns `None` if none arrived or the input has ended.
+    /// Waits at most `timeout` for the next change. Returns `None` if none arrived or the input has
+    /// ended.
     pub fn next(&mut self, timeout: Duration) -> Option<FeedItem> {
         match self.changes.recv_timeout(timeout) {
             Ok(item) => Some(item),
@@ -221,7 +245,9 @@ impl Feed {
     pub fn finish(self) -> crate::Result<InputResult> {
         // Wakes an input thread that is waiting to send.
         drop(self.changes);
-        self.thread.join().map_err(|_| Error::Failed("the input thread panicked: this is a bug".into()))
+        self.thread
+            .join()
+            .map_err(|_| Error::Failed("the input thread panicked: this is a bug".into()))
     }
 }
 
@@ -268,15 +294,21 @@ impl Pump {
             if let Sample::Image(image) = &sample {
                 self.shared.first_image.get_or_init(Instant::now);
                 if !image.is_depth() {
-                    self.arrivals.push_back((image.camera.clone(), image.stamp, Instant::now()));
-                    self.arrivals.drain(..self.arrivals.len().saturating_sub(MAX_ARRIVALS));
+                    self.arrivals
+                        .push_back((image.camera.clone(), image.stamp, Instant::now()));
+                    self.arrivals
+                        .drain(..self.arrivals.len().saturating_sub(MAX_ARRIVALS));
                 }
             }
             self.publish_robot(&sample);
             let newest = sample.stamp();
             let events = self.input.join.push(sample);
             let newest = self.input.join.shifted(newest);
-            if self.forward(events).and_then(|()| self.advance_to(newest)).is_err() {
+            if self
+                .forward(events)
+                .and_then(|()| self.advance_to(newest))
+                .is_err()
+            {
                 break;
             }
         }
@@ -288,7 +320,12 @@ impl Pump {
         {
             recording_error = Some(error.into());
         }
-        InputResult { join: self.input.join, stations: self.input.stations, input_error, recording_error }
+        InputResult {
+            join: self.input.join,
+            stations: self.input.stations,
+            input_error,
+            recording_error,
+        }
     }
 
     /// Handles a restart of the source: finishes pending images and stations.
@@ -303,11 +340,18 @@ impl Pump {
         for event in events {
             match event {
                 JoinEvent::Accepted(keyframe) => self.apply(Change::Accepted(keyframe))?,
-                JoinEvent::Evicted { camera, stamp } => self.apply(Change::Evicted { camera, stamp })?,
+                JoinEvent::Evicted { camera, stamp } => {
+                    self.apply(Change::Evicted { camera, stamp })?
+                }
                 JoinEvent::PosedImage(posed_image) => self.publish_image(&posed_image),
                 JoinEvent::RangeScan(scan) => self.publish_range_scan(scan),
                 JoinEvent::Rejected { why, .. } => {
-                    *self.shared.rejected.lock().entry(why.name().to_owned()).or_default() += 1;
+                    *self
+                        .shared
+                        .rejected
+                        .lock()
+                        .entry(why.name().to_owned())
+                        .or_default() += 1;
                 }
             }
         }
@@ -323,7 +367,11 @@ impl Pump {
     }
 
     fn advance_to(&mut self, newest: Stamp) -> Result<(), TrainerGone> {
-        let forwarded = self.input.stations.as_mut().map(|stations| stations.advance_to(newest));
+        let forwarded = self
+            .input
+            .stations
+            .as_mut()
+            .map(|stations| stations.advance_to(newest));
         self.send(forwarded.unwrap_or_default())
     }
 
@@ -336,19 +384,30 @@ impl Pump {
     fn send(&self, changes: Vec<Change>) -> Result<(), TrainerGone> {
         changes.into_iter().try_for_each(|change| {
             let times = self.times(&change);
-            self.sender.send(FeedItem { change, times }).map_err(|_| TrainerGone)
+            self.sender
+                .send(FeedItem { change, times })
+                .map_err(|_| TrainerGone)
         })
     }
 
-    /// Times of an accepted keyframe. Its stamp differs from its image's by the offsets in the rig file, so its image is
-    /// the one closest in time.
+    /// Times of an accepted keyframe. Its stamp differs from its image's by the offsets in the rig
+    /// file, so its image is the one closest in time.
     fn times(&self, change: &Change) -> Option<InputTimes> {
-        let Change::Accepted(keyframe) = change else { return None };
-        let images = self.arrivals.iter().filter(|(camera, ..)| *camera == keyframe.camera);
+        let Change::Accepted(keyframe) = change else {
+            return None;
+        };
+        let images = self
+            .arrivals
+            .iter()
+            .filter(|(camera, ..)| *camera == keyframe.camera);
         let distance = |stamp: Stamp| self.input.join.shifted(stamp).0.abs_diff(keyframe.stamp.0);
         let &(_, stamp, arrived) = images.min_by_key(|(_, stamp, _)| distance(*stamp))?;
         let captured = self.input.stamp_clock.instant_of(stamp);
-        Some(InputTimes { captured, arrived, queued: Instant::now() })
+        Some(InputTimes {
+            captured,
+            arrived,
+            queued: Instant::now(),
+        })
     }
 
     /// Passes a camera image to the observer.
@@ -373,15 +432,24 @@ impl Pump {
             }
             PixelFormat::DepthU16 { .. } => return,
         };
-        let Some(&(focal_px, principal_px)) = self.input.camera_intrinsics.get(&image.camera) else { return };
-        let pose = |stations: &Stations| stations.corrected_pose(&image.camera, &posed_image.world_from_camera);
+        let Some(&(focal_px, principal_px)) = self.input.camera_intrinsics.get(&image.camera)
+        else {
+            return;
+        };
+        let pose = |stations: &Stations| {
+            stations.corrected_pose(&image.camera, &posed_image.world_from_camera)
+        };
         self.observer.observe(ObservedImage {
             camera: image.camera.clone(),
             stamp: image.stamp,
             captured_at: self.captured_at(image.stamp),
             size_px: image.size_px,
             pixels,
-            world_from_camera: self.input.stations.as_ref().map_or(posed_image.world_from_camera, pose),
+            world_from_camera: self
+                .input
+                .stations
+                .as_ref()
+                .map_or(posed_image.world_from_camera, pose),
             focal_px,
             principal_px,
         });
@@ -389,15 +457,21 @@ impl Pump {
 
     /// Passes a reading of the robot to the observer.
     fn publish_robot(&mut self, sample: &Sample) {
-        let Some(reading) = self.input.robot_motion.push(sample).filter(|_| self.observer.needs_robot()) else {
+        let Some(reading) = self
+            .input
+            .robot_motion
+            .push(sample)
+            .filter(|_| self.observer.needs_robot())
+        else {
             return;
         };
         let stations = self.input.stations.as_ref();
         self.observer.observe_robot(ObservedRobot {
             stamp: reading.stamp,
             captured_at: self.captured_at(reading.stamp),
-            world_from_base: stations
-                .map_or(reading.world_from_base, |stations| stations.map_from_odom() * reading.world_from_base),
+            world_from_base: stations.map_or(reading.world_from_base, |stations| {
+                stations.map_from_odom() * reading.world_from_base
+            }),
             positions: reading.positions,
         });
     }
@@ -406,11 +480,18 @@ impl Pump {
     fn publish_range_scan(&self, scan: Arc<RangePoints>) {
         let stations = self.input.stations.as_ref();
         let map_from_odom = stations.map_or_else(Transform::identity, Stations::map_from_odom);
-        self.observer.observe_range_scan(ObservedRangeScan { scan, map_from_odom });
+        self.observer.observe_range_scan(ObservedRangeScan {
+            scan,
+            map_from_odom,
+        });
     }
 
-    /// Time at which a sample was captured, or now if its stamp is on another clock (recordings, simulations).
+    /// Time at which a sample was captured, or now if its stamp is on another clock (recordings,
+    /// simulations).
     fn captured_at(&self, stamp: Stamp) -> Instant {
-        self.input.stamp_clock.instant_of(stamp).unwrap_or_else(Instant::now)
+        self.input
+            .stamp_clock
+            .instant_of(stamp)
+            .unwrap_or_else(Instant::now)
     }
 }

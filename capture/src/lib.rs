@@ -1,10 +1,12 @@
-//! From a rig file to keyframes: opens the devices, joins images with poses, and corrects base poses.
+//! From a rig file to keyframes: opens the devices, joins images with poses, and corrects base
+//! poses.
 //!
-//! A [`Rig`] is a checked rig file. [`open::rig`] opens its devices, real or simulated, and [`open::recording`] a
-//! recording, as one source of samples. A [`Join`] turns the samples into keyframes: it pairs each image with the pose
-//! of its camera at mid-exposure, rejects images that are blurred, badly exposed or too close to others, and bounds the
-//! memory. [`Stations`] corrects the drift of a moving base. [`Feed`] does all of this on a separate thread.
-//! [`dataset`] loads datasets with known poses instead. [`doctor`] checks whether this computer and its devices are
+//! A [`Rig`] is a checked rig file. [`open::rig`] opens its devices, real or simulated, and
+//! [`open::recording`] a recording, as one source of samples. A [`Join`] turns the samples into
+//! keyframes: it pairs each image with the pose of its camera at mid-exposure, rejects images that
+//! are blurred, badly exposed or too close to others, and bounds the memory. [`Stations`] corrects
+//! the drift of a moving base. [`Feed`] does all of this on a separate thread. [`dataset`] loads
+//! datasets with known poses instead. [`doctor`] checks whether this computer and its devices are
 //! ready.
 //!
 //! ```
@@ -49,12 +51,14 @@ mod stop;
 mod supervised_arm;
 
 pub use arm_capture::ArmCapture;
-pub use calibration_images::{ArmDuringImage, CalibrationImage, CalibrationImages, calibration_images};
+pub use calibration_images::{
+    ArmDuringImage, CalibrationImage, CalibrationImages, calibration_images,
+};
 pub use config::{ConfigError, Override, Rig};
 pub use error::{Error, Result};
 pub use feed::{
-    Feed, FeedItem, Input, InputObserver, InputResult, InputTimes, ObservedImage, ObservedPixels, ObservedRangeScan,
-    ObservedRobot,
+    Feed, FeedItem, Input, InputObserver, InputResult, InputTimes, ObservedImage, ObservedPixels,
+    ObservedRangeScan, ObservedRobot,
 };
 pub use join::{Change, Counts, Join, JoinEvent, PosedImage, Rejection, SampleUse};
 pub use nearest_name::nearest_name;

@@ -1,6 +1,7 @@
 //! Memory of this computer.
 
-/// Memory that programs can still use, including free swap space, bytes; `None` if the system does not report it.
+/// Memory that programs can still use, including free swap space, bytes; `None` if the system does
+/// not report it.
 pub(crate) fn available_bytes() -> Option<u64> {
     available_in(&std::fs::read_to_string("/proc/meminfo").ok()?)
 }
@@ -20,7 +21,8 @@ mod tests {
 
     #[test]
     fn swap_counts_as_available() {
-        let meminfo = "MemTotal:  8000 kB\nMemAvailable:  3000 kB\nSwapTotal:  70 kB\nSwapFree:  7 kB\n";
+        let meminfo =
+            "MemTotal:  8000 kB\nMemAvailable:  3000 kB\nSwapTotal:  70 kB\nSwapFree:  7 kB\n";
         assert_eq!(available_in(meminfo), Some(3007 * 1024));
         assert_eq!(available_in("MemAvailable:  3000 kB\n"), Some(3000 * 1024));
         assert_eq!(available_in("MemTotal:  8000000 kB\n"), None);

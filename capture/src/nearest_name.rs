@@ -4,9 +4,14 @@
 const MIN_SIMILARITY: f64 = 0.75;
 
 /// The known name that is most similar to an unknown one; `None` if none is similar.
-pub fn nearest_name<'a>(unknown: &str, known: impl IntoIterator<Item = &'a str>) -> Option<&'a str> {
+pub fn nearest_name<'a>(
+    unknown: &str,
+    known: impl IntoIterator<Item = &'a str>,
+) -> Option<&'a str> {
     let similarity = |name: &str| strsim::jaro_winkler(unknown, name);
-    let nearest = known.into_iter().max_by(|a, b| similarity(a).total_cmp(&similarity(b)));
+    let nearest = known
+        .into_iter()
+        .max_by(|a, b| similarity(a).total_cmp(&similarity(b)));
     nearest.filter(|name| similarity(name) > MIN_SIMILARITY)
 }
 

@@ -4,7 +4,8 @@ use crate::config::{BaseDriver, Rig};
 use drivers::Sample;
 use kinematics::{Stamp, Transform};
 
-/// Follows the readings of the robot. Unlike the join, it returns every reading at once, without interpolation.
+/// Follows the readings of the robot. Unlike the join, it returns every reading at once, without
+/// interpolation.
 #[derive(Clone, Debug)]
 pub struct RobotMotion {
     /// Number of joints in a reading, and the offset of each.
@@ -20,11 +21,13 @@ pub struct RobotMotion {
 /// Joint positions and base pose at one time.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RobotReading {
-    /// Time of the reading: the older one of joint positions and base pose, so that neither is older than its stamp.
+    /// Time of the reading: the older one of joint positions and base pose, so that neither is
+    /// older than its stamp.
     pub stamp: Stamp,
     /// Pose of the base, without the correction of its station.
     pub world_from_base: Transform,
-    /// Positions of [`Arm::joints`](crate::config::Arm::joints) with their offsets, radians or meters.
+    /// Positions of [`Arm::joints`](crate::config::Arm::joints) with their offsets, radians or
+    /// meters.
     pub positions: Vec<f64>,
 }
 
@@ -42,19 +45,36 @@ impl RobotMotion {
         }
     }
 
-    /// Takes a sample; returns a reading if the sample moves the robot and the pose of its base is known.
+    /// Takes a sample; returns a reading if the sample moves the robot and the pose of its base is
+    /// known.
     pub fn push(&mut self, sample: &Sample) -> Option<RobotReading> {
         match sample {
             Sample::Joints(state) => {
-                let is_valid = state.position.len() == self.n_joints && state.position.iter().all(|q| q.is_finite());
+                let is_valid = state.position.len() == self.n_joints
+                    && state.position.iter().all(|q| q.is_finite());
                 let offset = |ix: usize| self.joint_offsets.get(ix).copied().unwrap_or_default();
-                let positions = state.position.iter().enumerate().map(|(ix, position)| position + offset(ix)).collect();
+                let positions = state
+                    .position
+                    .iter()
+                    .enumerate()
+                    .map(|(ix, position)| position + offset(ix))
+                    .collect();
                 let world_from_base = self.world_from_base.filter(|_| is_valid)?;
-                let stamp = self.base_stamp.map_or(state.stamp, |base_stamp| base_stamp.min(state.stamp));
-                Some(RobotReading { stamp, world_from_base, positions })
+                let stamp = self
+                    .base_stamp
+                    .map_or(state.stamp, |base_stamp| base_stamp.min(state.stamp));
+                Some(RobotReading {
+                    stamp,
+                    world_from_base,
+                    positions,
+                })
             }
-            Sample::Base(pose) if self.has_moving_base && kinematics::transform::is_finite(&pose.world_from_base) => {
-                (self.world_from_base, self.base_stamp) = (Some(pose.world_from_base), Some(pose.stamp));
+            Sample::Base(pose)
+                if self.has_moving_base
+                    && kinematics::transform::is_finite(&pose.world_from_base) =>
+            {
+                (self.world_from_base, self.base_stamp) =
+                    (Some(pose.world_from_base), Some(pose.stamp));
                 // Readings of the joints come more often than base poses.
                 (self.n_joints == 0).then(|| RobotReading {
                     stamp: pose.stamp,
@@ -78,11 +98,19 @@ mod tests {
     }
 
     fn joints_at(stamp: i64, position: Vec<f64>) -> Sample {
-        Sample::Joints(JointState { stamp: Stamp(stamp), position, velocity: Vec::new(), effort: Vec::new() })
+        Sample::Joints(JointState {
+            stamp: Stamp(stamp),
+            position,
+            velocity: Vec::new(),
+            effort: Vec::new(),
+        })
     }
 
     fn base(x: f64) -> Sample {
-        Sample::Base(BasePose { stamp: Stamp(9), world_from_base: Transform::translation(x, 0.0, 0.0) })
+        Sample::Base(BasePose {
+            stamp: Stamp(9),
+            world_from_base: Transform::translation(x, 0.0, 0.0),
+        })
     }
 
     fn motion(n_joints: usize, world_from_base: Option<Transform>) -> RobotMotion {
@@ -98,25 +126,53 @@ mod tests {
     #[test]
     fn readings_have_offsets_and_the_latest_base_pose() {
         let mut moving = motion(2, None);
-        assert_eq!(moving.push(&joints(vec![1.0, 2.0])), None, "the base is nowhere yet");
+        assert_eq!(
+            moving.push(&joints(vec![1.0, 2.0])),
+            None,
+            "the base is nowhere yet"
+        );
         assert_eq!(moving.push(&base(3.0)), None, "the joints follow");
         let reading = moving.push(&joints(vec![1.0, 2.0])).expect("a reading");
-        assert_eq!((reading.stamp, reading.world_from_base.translation.x), (Stamp(7), 3.0));
+        assert_eq!(
+            (reading.stamp, reading.world_from_base.translation.x),
+            (Stamp(7), 3.0)
+        );
         assert_eq!(reading.positions, [1.1, 2.1]);
         let mut fixed = motion(2, Some(Transform::identity()));
         assert_eq!(fixed.push(&base(3.0)), None, "a fixed base does not move");
-        assert_eq!(fixed.push(&joints(vec![0.0, 0.0])).expect("a reading").world_from_base, Transform::identity());
+        assert_eq!(
+            fixed
+                .push(&joints(vec![0.0, 0.0]))
+                .expect("a reading")
+                .world_from_base,
+            Transform::identity()
+        );
     }
 
     #[test]
     fn the_older_of_joints_and_base_counts() {
         let mut moving = motion(1, None);
         assert_eq!(moving.push(&base(0.0)), None, "the joints follow");
-        assert_eq!(moving.push(&joints_at(8, vec![0.0])).expect("a reading").stamp, Stamp(8), "the base is newer");
-        let frozen = moving.push(&joints_at(5_000, vec![0.0])).expect("a reading");
+        assert_eq!(
+            moving
+                .push(&joints_at(8, vec![0.0]))
+                .expect("a reading")
+                .stamp,
+            Stamp(8),
+            "the base is newer"
+        );
+        let frozen = moving
+            .push(&joints_at(5_000, vec![0.0]))
+            .expect("a reading");
         assert_eq!(frozen.stamp, Stamp(9), "the base has not reported since");
         let mut fixed = motion(1, Some(Transform::identity()));
-        assert_eq!(fixed.push(&joints_at(5_000, vec![0.0])).expect("a reading").stamp, Stamp(5_000));
+        assert_eq!(
+            fixed
+                .push(&joints_at(5_000, vec![0.0]))
+                .expect("a reading")
+                .stamp,
+            Stamp(5_000)
+        );
     }
 
     #[test]
@@ -129,6 +185,14 @@ mod tests {
     #[test]
     fn a_base_without_joints_is_a_robot_too() {
         let mut moving = motion(0, None);
-        assert_eq!(moving.push(&base(2.0)).expect("a reading").world_from_base.translation.x, 2.0);
+        assert_eq!(
+            moving
+                .push(&base(2.0))
+                .expect("a reading")
+                .world_from_base
+                .translation
+                .x,
+            2.0
+        );
     }
 }

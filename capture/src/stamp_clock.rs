@@ -10,7 +10,8 @@ const MAX_LIVE_AGE_SECS: f64 = 60.0;
 /// Relates stamps to the clock of this process.
 #[derive(Clone, Debug)]
 pub enum StampClock {
-    /// Devices are read in real time, and their stamps are on this computer's clock. Older ones are from another clock.
+    /// Devices are read in real time, and their stamps are on this computer's clock. Older ones are
+    /// from another clock.
     Computer,
     /// All devices are simulated, and their stamps are on the simulation's clock.
     Simulation,
@@ -28,7 +29,9 @@ impl StampClock {
             Self::Computer => {
                 let age_secs = clock::now().secs_since(stamp);
                 let is_plausible = (0.0..MAX_LIVE_AGE_SECS).contains(&age_secs);
-                is_plausible.then(|| Instant::now().checked_sub(Duration::from_secs_f64(age_secs))).flatten()
+                is_plausible
+                    .then(|| Instant::now().checked_sub(Duration::from_secs_f64(age_secs)))
+                    .flatten()
             }
             Self::Playback(playback) => playback.instant_of(stamp),
             Self::Simulation | Self::Unrelated => None,
@@ -44,8 +47,13 @@ mod tests {
     fn only_recent_stamps_of_this_computer_have_a_time() {
         let recent = clock::now();
         let long_ago = Stamp(recent.0 - 61_000_000_000);
-        let age = StampClock::Computer.instant_of(recent).map(|at| at.elapsed());
-        assert!(age.is_some_and(|age| age < Duration::from_secs(10)), "{age:?}");
+        let age = StampClock::Computer
+            .instant_of(recent)
+            .map(|at| at.elapsed());
+        assert!(
+            age.is_some_and(|age| age < Duration::from_secs(10)),
+            "{age:?}"
+        );
         assert_eq!(StampClock::Computer.instant_of(long_ago), None);
         // Soon after the computer has started, a simulation's stamps look like recent ones.
         assert_eq!(StampClock::Simulation.instant_of(recent), None);

@@ -1,10 +1,12 @@
-//! Corrects the pose of a moving base at each station by registering its images there with those of earlier stations.
+//! Corrects the pose of a moving base at each station by registering its images there with those of
+//! earlier stations.
 //!
-//! Keyframes pass through this module on their way from the join to the trainer. Keyframes of the first station pass
-//! unchanged. After that, keyframes taken while the base moves and the first keyframes of the next station are queued
-//! until the station can be registered with earlier ones ([`calibration::register_station`]). Then they and all later
-//! keyframes pass with the correction. The result depends only on the keyframes and their order, so that a run, its
-//! recording and the replay of that recording agree; only the time at which keyframes pass depends on a clock.
+//! Keyframes pass through this module on their way from the join to the trainer. Keyframes of the
+//! first station pass unchanged. After that, keyframes taken while the base moves and the first
+//! keyframes of the next station are queued until the station can be registered with earlier ones
+//! ([`calibration::register_station`]). Then they and all later keyframes pass with the correction.
+//! The result depends only on the keyframes and their order, so that a run, its recording and the
+//! replay of that recording agree; only the time at which keyframes pass depends on a clock.
 
 use crate::config::{BaseDriver, Parent, Rig};
 use crate::join::Change;
@@ -17,22 +19,23 @@ use std::collections::{BTreeSet, VecDeque};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-/// Number of keyframes with depth, excluding test keyframes, with which a station is registered. A scan of a few
-/// seconds gives so many.
+/// Number of keyframes with depth, excluding test keyframes, with which a station is registered. A
+/// scan of a few seconds gives so many.
 const MIN_KEYFRAMES: usize = 14;
 /// Maximum time to wait for that many keyframes, seconds.
 const MAX_SCAN_SECS: f64 = 10.0;
-/// Maximum time to wait for a station while the base moves, seconds. Afterwards, or with [`MAX_HELD`] queued keyframes,
-/// the queued keyframes get the correction of the previous station.
+/// Maximum time to wait for a station while the base moves, seconds. Afterwards, or with
+/// [`MAX_HELD`] queued keyframes, the queued keyframes get the correction of the previous station.
 const MAX_TRAVEL_SECS: f64 = 30.0;
 const MAX_HELD: usize = 128;
-/// Maximum number of reference keyframes from earlier stations. When it is reached, every other one is removed.
+/// Maximum number of reference keyframes from earlier stations. When it is reached, every other one
+/// is removed.
 const MAX_REFERENCE_KEYFRAMES: usize = 160;
 
 /// Corrects keyframes for errors of the reported base poses, at each station.
 ///
-/// A station is an interval in which the base is stationary. Its keyframes are registered with those of earlier
-/// stations; keyframes taken on the way get a share of the correction.
+/// A station is an interval in which the base is stationary. Its keyframes are registered with
+/// those of earlier stations; keyframes taken on the way get a share of the correction.
 pub struct Stations {
     /// Cameras on the base or the arm.
     carried: BTreeSet<Arc<str>>,
@@ -68,7 +71,8 @@ pub struct StationReport {
     station: usize,
     /// Number of keyframes used for registration.
     n_keyframes: usize,
-    /// The correction since the previous station; null if the images do not overlap with those of earlier stations.
+    /// The correction since the previous station; null if the images do not overlap with those of
+    /// earlier stations.
     correction: Option<StationCorrection>,
     /// Error of the base pose before and after the correction; in simulation only.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -83,12 +87,15 @@ struct PoseDistance {
 }
 
 impl Stations {
-    /// Corrections for the base of a rig; `None` unless it moves and [`Base::realign`](crate::config::Base::realign) is
-    /// set.
+    /// Corrections for the base of a rig; `None` unless it moves and
+    /// [`Base::realign`](crate::config::Base::realign) is set.
     #[must_use]
     pub fn new(rig: &Rig) -> Option<Self> {
         let carried = || {
-            let on_base = rig.cameras.iter().filter(|camera| camera.parent != Parent::World);
+            let on_base = rig
+                .cameras
+                .iter()
+                .filter(|camera| camera.parent != Parent::World);
             on_base.map(|camera| Arc::clone(&camera.name)).collect()
         };
         (rig.base.driver != BaseDriver::Fixed && rig.base.realign).then(|| Self {
@@ -111,11 +118,20 @@ impl Stations {
     pub fn resume_from(mut self, keyframes: &[Arc<Keyframe>]) -> Self {
         /// Station index of the earlier run, different from all stations of this run.
         const PREVIOUS_RUN: usize = usize::MAX;
-        if let Some(base_state) = keyframes.iter().rev().find_map(|keyframe| keyframe.base.as_ref()) {
-            (self.station, self.world_from_base, self.map_from_odom) =
-                (Some(PREVIOUS_RUN), base_state.world_from_base, base_state.map_from_odom);
+        if let Some(base_state) = keyframes
+            .iter()
+            .rev()
+            .find_map(|keyframe| keyframe.base.as_ref())
+        {
+            (self.station, self.world_from_base, self.map_from_odom) = (
+                Some(PREVIOUS_RUN),
+                base_state.world_from_base,
+                base_state.map_from_odom,
+            );
         }
-        keyframes.iter().for_each(|keyframe| self.add_reference(keyframe));
+        keyframes
+            .iter()
+            .for_each(|keyframe| self.add_reference(keyframe));
         self
     }
 
@@ -127,8 +143,9 @@ impl Stations {
         released
     }
 
-    /// Updates the time, because the wait for a station is limited. `newest`: the newest stamp of all samples, on the
-    /// clock of the keyframes. Returns the changes that can be passed on, in order.
+    /// Updates the time, because the wait for a station is limited. `newest`: the newest stamp of
+    /// all samples, on the clock of the keyframes. Returns the changes that can be passed on, in
+    /// order.
     pub(crate) fn advance_to(&mut self, newest: Stamp) -> Vec<Change> {
         let mut released = Vec::new();
         self.process_queue(false, &mut released);
@@ -151,7 +168,8 @@ impl Stations {
         released
     }
 
-    /// Restarts at an uncorrected first station, because the source has restarted. Returns the queued changes in order.
+    /// Restarts at an uncorrected first station, because the source has restarted. Returns the
+    /// queued changes in order.
     pub(crate) fn restart(&mut self) -> Vec<Change> {
         let released = self.finish();
         self.station = None;
@@ -174,9 +192,14 @@ impl Stations {
         released.into_iter().filter_map(keyframe).collect()
     }
 
-    /// Applies the current correction to the pose of a camera that was computed from the reported base pose.
+    /// Applies the current correction to the pose of a camera that was computed from the reported
+    /// base pose.
     pub(crate) fn corrected_pose(&self, camera: &str, world_from_camera: &Transform) -> Transform {
-        if self.carried.contains(camera) { self.map_from_odom * world_from_camera } else { *world_from_camera }
+        if self.carried.contains(camera) {
+            self.map_from_odom * world_from_camera
+        } else {
+            *world_from_camera
+        }
     }
 
     /// The current correction of reported base poses.
@@ -199,25 +222,35 @@ impl Stations {
     /// Processes queued changes. `wait_for_search`: whether to wait for a registration in progress.
     fn process_queue(&mut self, wait_for_search: bool, released: &mut Vec<Change>) {
         loop {
-            if let Some(search) = self.search.take_if(|search| wait_for_search || search.is_finished()) {
+            if let Some(search) = self
+                .search
+                .take_if(|search| wait_for_search || search.is_finished())
+            {
                 // If registration fails, only the correction of this station is lost.
                 let search_result = search.join().unwrap_or_else(|_| {
                     log::error!("registering a station panicked: this is a bug");
-                    SearchResult { correction: None, took: Duration::ZERO }
+                    SearchResult {
+                        correction: None,
+                        took: Duration::ZERO,
+                    }
                 });
                 self.apply_result(search_result, released);
             }
             if self.search.is_some() {
                 return;
             }
-            let Some(change) = self.queue.pop_front() else { return };
+            let Some(change) = self.queue.pop_front() else {
+                return;
+            };
             self.take(change, released);
         }
     }
 
     fn take(&mut self, change: Change, released: &mut Vec<Change>) {
         let ends_group = match &change {
-            Change::Accepted(keyframe) => self.is_overdue(keyframe.stamp) || self.leaves_station(keyframe),
+            Change::Accepted(keyframe) => {
+                self.is_overdue(keyframe.stamp) || self.leaves_station(keyframe)
+            }
             Change::Evicted { .. } => false,
         };
         if ends_group {
@@ -226,10 +259,14 @@ impl Stations {
             return;
         }
         match change {
-            Change::Accepted(keyframe) if self.held.is_empty() && self.is_at_current_station(&keyframe) => {
+            Change::Accepted(keyframe)
+                if self.held.is_empty() && self.is_at_current_station(&keyframe) =>
+            {
                 released.push(Change::Accepted(self.placed(keyframe)));
             }
-            change if self.held.is_empty() && matches!(change, Change::Evicted { .. }) => released.push(change),
+            change if self.held.is_empty() && matches!(change, Change::Evicted { .. }) => {
+                released.push(change)
+            }
             change => {
                 self.held.push(change);
                 if self.group().filter(|keyframe| is_usable(keyframe)).count() >= MIN_KEYFRAMES
@@ -258,7 +295,10 @@ impl Stations {
     /// Whether the queued keyframes have waited too long at the time `now`.
     fn is_overdue(&self, now: Stamp) -> bool {
         let waited_secs = |first: Option<&Keyframe>| first.map(|first| now.secs_since(first.stamp));
-        match (waited_secs(self.group().next()), waited_secs(self.held_keyframes().next())) {
+        match (
+            waited_secs(self.group().next()),
+            waited_secs(self.held_keyframes().next()),
+        ) {
             (Some(scan_secs), _) => scan_secs > MAX_SCAN_SECS,
             (None, Some(travel_secs)) => travel_secs > MAX_TRAVEL_SECS,
             (None, None) => false,
@@ -274,14 +314,19 @@ impl Stations {
 
     /// The queued keyframes of the next station.
     fn group(&self) -> impl Iterator<Item = &Keyframe> {
-        self.held_keyframes().filter(|keyframe| station_of(keyframe).is_some())
+        self.held_keyframes()
+            .filter(|keyframe| station_of(keyframe).is_some())
     }
 
-    /// Starts to register the next station. If no queued keyframe is at a station, passes them with the current
-    /// correction.
+    /// Starts to register the next station. If no queued keyframe is at a station, passes them with
+    /// the current correction.
     fn start_search(&mut self, released: &mut Vec<Change>) {
         let guess = self.map_from_odom;
-        let Some(base_state) = self.group().next().and_then(|keyframe| keyframe.base.clone()) else {
+        let Some(base_state) = self
+            .group()
+            .next()
+            .and_then(|keyframe| keyframe.base.clone())
+        else {
             for change in std::mem::take(&mut self.held) {
                 released.push(corrected(change, |_| guess));
             }
@@ -292,33 +337,55 @@ impl Stations {
             .filter(|keyframe| is_usable(keyframe))
             .map(|keyframe| Arc::new(keyframe.with_base_correction(&guess)))
             .collect();
-        let (reference_keyframes, world_from_base) =
-            (self.reference_keyframes.clone(), guess * base_state.world_from_base);
+        let (reference_keyframes, world_from_base) = (
+            self.reference_keyframes.clone(),
+            guess * base_state.world_from_base,
+        );
         self.search = Some(Task::start("station", move || {
             let started = Instant::now();
-            let correction = run_in_background_pool(|| register_station(&reference_keyframes, &new, &world_from_base));
-            SearchResult { correction, took: started.elapsed() }
+            let correction = run_in_background_pool(|| {
+                register_station(&reference_keyframes, &new, &world_from_base)
+            });
+            SearchResult {
+                correction,
+                took: started.elapsed(),
+            }
         }));
     }
 
     /// Passes the queued keyframes on with the correction that registration estimated.
-    fn apply_result(&mut self, SearchResult { correction, took }: SearchResult, released: &mut Vec<Change>) {
+    fn apply_result(
+        &mut self,
+        SearchResult { correction, took }: SearchResult,
+        released: &mut Vec<Change>,
+    ) {
         self.spent += took;
-        let base_state = self.group().next().and_then(|keyframe| keyframe.base.clone());
+        let base_state = self
+            .group()
+            .next()
+            .and_then(|keyframe| keyframe.base.clone());
         let base_state = base_state.expect("the keyframes of the registered station are queued");
         let (left, before) = (self.world_from_base, self.map_from_odom);
-        // Correction at a reported base pose that lies at this fraction of the path between the two stations.
+        // Correction at a reported base pose that lies at this fraction of the path between the two
+        // stations.
         let correction_at = |reported: &Transform, fraction: f64| {
             let guess = before * reported;
-            correction.as_ref().map_or(before, |correction| correction.map_from_odom(&guess, fraction) * before)
+            correction.as_ref().map_or(before, |correction| {
+                correction.map_from_odom(&guess, fraction) * before
+            })
         };
         let now = correction_at(&base_state.world_from_base, 1.0);
         let correction_of = |at: &BaseState| match at.station {
             Some(_) => now,
             None => {
-                let (from, to) =
-                    (distance(&left, &at.world_from_base), distance(&at.world_from_base, &base_state.world_from_base));
-                correction_at(&at.world_from_base, if from > 0.0 { from / (from + to) } else { 0.0 })
+                let (from, to) = (
+                    distance(&left, &at.world_from_base),
+                    distance(&at.world_from_base, &base_state.world_from_base),
+                );
+                correction_at(
+                    &at.world_from_base,
+                    if from > 0.0 { from / (from + to) } else { 0.0 },
+                )
             }
         };
         let report = StationReport::new(
@@ -329,8 +396,10 @@ impl Stations {
         );
         log::info!("{report}");
         self.reported.push(report);
-        let held: Vec<Change> =
-            std::mem::take(&mut self.held).into_iter().map(|held| corrected(held, correction_of)).collect();
+        let held: Vec<Change> = std::mem::take(&mut self.held)
+            .into_iter()
+            .map(|held| corrected(held, correction_of))
+            .collect();
         (self.station, self.world_from_base, self.map_from_odom) =
             (base_state.station, base_state.world_from_base, now);
         for change in &held {
@@ -343,7 +412,9 @@ impl Stations {
 
     /// Corrects a keyframe of the current station.
     fn placed(&mut self, keyframe: Arc<Keyframe>) -> Arc<Keyframe> {
-        let Some(base_state) = &keyframe.base else { return keyframe };
+        let Some(base_state) = &keyframe.base else {
+            return keyframe;
+        };
         if base_state.station.is_some() {
             (self.station, self.world_from_base) = (base_state.station, base_state.world_from_base);
         }
@@ -359,9 +430,11 @@ impl Stations {
         self.reference_keyframes.push(Arc::clone(keyframe));
         if self.reference_keyframes.len() > MAX_REFERENCE_KEYFRAMES {
             // Sorted by split first, so that thinning keeps keyframes of both splits.
-            self.reference_keyframes.sort_by_key(|keyframe| (keyframe.split == Split::Validation, keyframe.stamp));
+            self.reference_keyframes
+                .sort_by_key(|keyframe| (keyframe.split == Split::Validation, keyframe.stamp));
             let mut ixs = 0..;
-            self.reference_keyframes.retain(|_| ixs.next().is_some_and(|ix| ix % 2 == 0));
+            self.reference_keyframes
+                .retain(|_| ixs.next().is_some_and(|ix| ix % 2 == 0));
         }
     }
 }
@@ -377,7 +450,8 @@ fn is_usable(keyframe: &Keyframe) -> bool {
 
 /// Distance between two poses of a base; one radian counts as one meter.
 fn distance(one: &Transform, other: &Transform) -> f64 {
-    (one.translation.vector - other.translation.vector).norm() + one.rotation.angle_to(&other.rotation)
+    (one.translation.vector - other.translation.vector).norm()
+        + one.rotation.angle_to(&other.rotation)
 }
 
 fn carried(keyframe: &Arc<Keyframe>, map_from_odom: &Transform) -> Arc<Keyframe> {
@@ -428,20 +502,36 @@ impl std::fmt::Display for StationReport {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         write!(f, "base at station {}: ", self.station)?;
         match &self.correction {
-            None => f.write_str("its images do not overlap with earlier ones; the previous correction is kept")?,
+            None => f.write_str(
+                "its images do not overlap with earlier ones; the previous correction is kept",
+            )?,
             Some(correction) if correction.kept => write!(f, "{correction}")?,
-            Some(correction) => {
-                write!(f, "the previous correction is kept, as this one is uncertain or not significant: {correction}")?
-            }
+            Some(correction) => write!(
+                f,
+                "the previous correction is kept, as this one is uncertain or not significant: {correction}"
+            )?,
         }
-        for unobservable in self.correction.iter().flat_map(|correction| &correction.unobservable) {
+        for unobservable in self
+            .correction
+            .iter()
+            .flat_map(|correction| &correction.unobservable)
+        {
             write!(f, "; not observable: {unobservable}")?;
         }
         if let Some([before, after]) = self.base_error {
             let format_error = |base_error: PoseDistance| {
-                format!("{:.1} mm and {:.2} degrees", 1e3 * base_error.m, base_error.rad.to_degrees())
+                format!(
+                    "{:.1} mm and {:.2} degrees",
+                    1e3 * base_error.m,
+                    base_error.rad.to_degrees()
+                )
             };
-            write!(f, "; error {} before, {} after", format_error(before), format_error(after))?;
+            write!(
+                f,
+                "; error {} before, {} after",
+                format_error(before),
+                format_error(after)
+            )?;
         }
         Ok(())
     }
@@ -459,18 +549,31 @@ mod tests {
         let origin = pose.translation.vector;
         for pixel in 0..SIZE_PX[0] * SIZE_PX[1] {
             let [x, y] = [pixel % SIZE_PX[0], pixel / SIZE_PX[0]].map(|px| f64::from(px) + 0.5);
-            let direction = pose.rotation * Vector3::new((x - 80.0) / FOCAL_PX, (y - 60.0) / FOCAL_PX, 1.0);
-            let walls =
-                [(Vector3::x(), 2.0), (Vector3::y(), 1.1), (-Vector3::y(), 1.2), (Vector3::new(0.3, 0.2, -1.0), 0.9)];
+            let direction =
+                pose.rotation * Vector3::new((x - 80.0) / FOCAL_PX, (y - 60.0) / FOCAL_PX, 1.0);
+            let walls = [
+                (Vector3::x(), 2.0),
+                (Vector3::y(), 1.1),
+                (-Vector3::y(), 1.2),
+                (Vector3::new(0.3, 0.2, -1.0), 0.9),
+            ];
             let depth_along = |(normal, offset): &(Vector3<f64>, f64)| {
                 let z = (offset - normal.dot(&origin)) / normal.dot(&direction);
                 if z > 0.0 { z } else { f64::INFINITY }
             };
             let z = walls.iter().map(depth_along).fold(f64::INFINITY, f64::min);
             let at = origin + direction * z;
-            let wave = |size: f64, x: f64, y: f64, z: f64| size * (x * at.x + y * at.y + z * at.z).sin();
-            let level = 128.0 + wave(30.0, 9.0, 13.0, -8.0) + wave(30.0, -6.0, 7.0, 15.0) + wave(25.0, 4.0, -5.0, 3.0);
-            #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a gray level in a test")]
+            let wave =
+                |size: f64, x: f64, y: f64, z: f64| size * (x * at.x + y * at.y + z * at.z).sin();
+            let level = 128.0
+                + wave(30.0, 9.0, 13.0, -8.0)
+                + wave(30.0, -6.0, 7.0, 15.0)
+                + wave(25.0, 4.0, -5.0, 3.0);
+            #[expect(
+                clippy::cast_possible_truncation,
+                clippy::cast_sign_loss,
+                reason = "a gray level in a test"
+            )]
             let level = level.round() as u8;
             rgba.extend([level, level, level, 255]);
             #[expect(clippy::cast_possible_truncation, reason = "meters in a test")]
@@ -484,20 +587,26 @@ mod tests {
 
     /// True base pose: at one station, on the way, at another station.
     fn true_base(fraction: f64) -> Transform {
-        Transform::new(Vector3::new(0.5 * fraction, 0.1 * fraction, 0.0), Vector3::new(0.0, 0.0, 0.15 * fraction))
+        Transform::new(
+            Vector3::new(0.5 * fraction, 0.1 * fraction, 0.0),
+            Vector3::new(0.0, 0.0, 0.15 * fraction),
+        )
     }
 
     /// Error of the reported base pose, which grows on the way.
     fn reported_base(fraction: f64) -> Transform {
         let truth = true_base(fraction);
-        let rotation = nalgebra::UnitQuaternion::from_scaled_axis(Vector3::new(0.003, -0.004, 0.014) * fraction);
+        let rotation = nalgebra::UnitQuaternion::from_scaled_axis(
+            Vector3::new(0.003, -0.004, 0.014) * fraction,
+        );
         Transform::from_parts(
             (truth.translation.vector + Vector3::new(0.012, -0.015, 0.005) * fraction).into(),
             rotation * truth.rotation,
         )
     }
 
-    /// The `ix`-th keyframe at 2 Hz: ten seconds at a station, three on the way, ten at the next station.
+    /// The `ix`-th keyframe at 2 Hz: ten seconds at a station, three on the way, ten at the next
+    /// station.
     fn keyframe(ix: usize) -> Arc<Keyframe> {
         let (station, fraction) = match ix {
             0..24 => (Some(0), 0.0),
@@ -506,7 +615,12 @@ mod tests {
         };
         let wave = |hz: f64, phase: f64| (hz * ix as f64 + phase).sin();
         let base_from_camera = Transform::from_parts(
-            Vector3::new(0.15 * wave(0.9, 0.0), 0.2 * wave(0.7, 1.0), 0.3 + 0.1 * wave(0.5, 2.0)).into(),
+            Vector3::new(
+                0.15 * wave(0.9, 0.0),
+                0.2 * wave(0.7, 1.0),
+                0.3 + 0.1 * wave(0.5, 2.0),
+            )
+            .into(),
             nalgebra::UnitQuaternion::from_scaled_axis(Vector3::z() * (0.4 * wave(0.8, 0.5)))
                 * nalgebra::UnitQuaternion::from_matrix(&nalgebra::Matrix3::from_columns(&[
                     -Vector3::y(),
@@ -560,12 +674,18 @@ mod tests {
         let base_state = keyframe.base.as_ref().unwrap();
         let base = base_state.map_from_odom * base_state.world_from_base;
         let left = base_state.truth.unwrap().inverse() * base;
-        (1e3 * left.translation.vector.norm(), left.rotation.angle().to_degrees())
+        (
+            1e3 * left.translation.vector.norm(),
+            left.rotation.angle().to_degrees(),
+        )
     }
 
     fn bits(keyframes: &[Arc<Keyframe>]) -> Vec<String> {
         let shown = |keyframe: &Arc<Keyframe>| {
-            format!("{:?} {:?} {:?}", keyframe.stamp, keyframe.world_from_camera, keyframe.base)
+            format!(
+                "{:?} {:?} {:?}",
+                keyframe.stamp, keyframe.world_from_camera, keyframe.base
+            )
         };
         keyframes.iter().map(shown).collect()
     }
@@ -575,24 +695,47 @@ mod tests {
         let given = all();
         let mut stations = stations();
         let released = stations.corrected(given.clone());
-        let stamps = |keyframes: &[Arc<Keyframe>]| keyframes.iter().map(|keyframe| keyframe.stamp).collect::<Vec<_>>();
+        let stamps = |keyframes: &[Arc<Keyframe>]| {
+            keyframes
+                .iter()
+                .map(|keyframe| keyframe.stamp)
+                .collect::<Vec<_>>()
+        };
         assert_eq!(stamps(&given), stamps(&released));
         assert!(
-            given[..24].iter().zip(&released).all(|(given, released)| Arc::ptr_eq(given, released)),
+            given[..24]
+                .iter()
+                .zip(&released)
+                .all(|(given, released)| Arc::ptr_eq(given, released)),
             "keyframes of the first station are unchanged"
         );
         for (given, released) in given.iter().zip(&released).skip(24) {
             let ((before_mm, _), (mm, degrees)) = (base_error(given), base_error(released));
-            assert!(mm < 0.5 && degrees < 0.05, "{:?}: {before_mm} mm, now {mm} mm, {degrees}", released.stamp);
+            assert!(
+                mm < 0.5 && degrees < 0.05,
+                "{:?}: {before_mm} mm, now {mm} mm, {degrees}",
+                released.stamp
+            );
             // Depth is corrected too.
-            let [was, is] = [given, released]
-                .map(|of| of.world_from_camera.inverse() * of.depth.as_ref().unwrap().world_from_camera);
+            let [was, is] = [given, released].map(|of| {
+                of.world_from_camera.inverse() * of.depth.as_ref().unwrap().world_from_camera
+            });
             assert!((was.to_homogeneous() - is.to_homogeneous()).abs().max() < 1e-9);
         }
-        let [report] = stations.reports() else { panic!("{:?}", stations.reports()) };
+        let [report] = stations.reports() else {
+            panic!("{:?}", stations.reports())
+        };
         let [before, after] = report.base_error.unwrap();
-        assert!(report.station == 1 && before.m > 0.019 && after.m < 5e-4 && after.rad < 1e-3, "{report}");
-        assert!(report.to_string().starts_with("base at station 1: moved by"), "{report}");
+        assert!(
+            report.station == 1 && before.m > 0.019 && after.m < 5e-4 && after.rad < 1e-3,
+            "{report}"
+        );
+        assert!(
+            report
+                .to_string()
+                .starts_with("base at station 1: moved by"),
+            "{report}"
+        );
         let camera = Transform::translation(0.1, 0.2, 0.3);
         assert_ne!(stations.corrected_pose("wrist", &camera), camera);
         assert_eq!(stations.corrected_pose("of the room", &camera), camera);
@@ -605,8 +748,16 @@ mod tests {
         assert!(base_error(&all()[53]).0 > 15.0 && base_error(&first_round[53]).0 < 0.5);
         assert!(stations.restart().is_empty(), "nothing is queued");
         let second_round = stations.corrected(all());
-        assert_eq!(bits(&second_round[..24]), bits(&all()[..24]), "the first station is uncorrected");
-        assert!(base_error(&second_round[53]).0 < 0.5, "{:?}", base_error(&second_round[53]));
+        assert_eq!(
+            bits(&second_round[..24]),
+            bits(&all()[..24]),
+            "the first station is uncorrected"
+        );
+        assert!(
+            base_error(&second_round[53]).0 < 0.5,
+            "{:?}",
+            base_error(&second_round[53])
+        );
     }
 
     #[test]
@@ -624,7 +775,13 @@ mod tests {
             released.extend(stations.finish());
             let released: Vec<_> = released
                 .into_iter()
-                .filter_map(|change| if let Change::Accepted(keyframe) = change { Some(keyframe) } else { None })
+                .filter_map(|change| {
+                    if let Change::Accepted(keyframe) = change {
+                        Some(keyframe)
+                    } else {
+                        None
+                    }
+                })
                 .collect();
             assert_eq!(bits(&at_once), bits(&released));
         }
@@ -635,15 +792,29 @@ mod tests {
         let mut stations = stations();
         let count = |released: &[Change]| released.len();
         for keyframe in all().into_iter().take(24) {
-            assert_eq!(count(&stations.push(Change::Accepted(keyframe))), 1, "the first station is not queued");
+            assert_eq!(
+                count(&stations.push(Change::Accepted(keyframe))),
+                1,
+                "the first station is not queued"
+            );
         }
-        let evicted = || Change::Evicted { camera: "wrist".into(), stamp: Stamp(0) };
+        let evicted = || Change::Evicted {
+            camera: "wrist".into(),
+            stamp: Stamp(0),
+        };
         assert_eq!(count(&stations.push(evicted())), 1);
-        assert!(stations.push(Change::Accepted(keyframe(25))).is_empty(), "on the way");
+        assert!(
+            stations.push(Change::Accepted(keyframe(25))).is_empty(),
+            "on the way"
+        );
         assert!(stations.push(evicted()).is_empty());
         assert!(stations.advance_to(Stamp::from_secs(30.0)).is_empty());
         let released = stations.advance_to(Stamp::from_secs(12.5 + MAX_TRAVEL_SECS + 1.0));
-        assert!(matches!(&released[..], [Change::Accepted(_), Change::Evicted { .. }]), "{}", released.len());
+        assert!(
+            matches!(&released[..], [Change::Accepted(_), Change::Evicted { .. }]),
+            "{}",
+            released.len()
+        );
         // A scan with too few keyframes is registered once it has lasted long enough.
         for ix in 40..44 {
             assert!(stations.push(Change::Accepted(keyframe(ix))).is_empty());
@@ -655,7 +826,9 @@ mod tests {
             released = stations.advance_to(late);
         }
         assert_eq!((released.len(), stations.reports().len()), (4, 1));
-        let Change::Accepted(keyframe) = &released[0] else { panic!("a keyframe") };
+        let Change::Accepted(keyframe) = &released[0] else {
+            panic!("a keyframe")
+        };
         assert!(
             stations.reports()[0]
                 .correction
@@ -666,16 +839,21 @@ mod tests {
 
     #[test]
     fn station_without_overlap_is_kept_and_reported() {
-        let away = |keyframe: Arc<Keyframe>| match keyframe.base.as_ref().and_then(|base| base.station) {
-            Some(1) => Arc::new(keyframe.with_base_correction(&Transform::translation(90.0, 0.0, 0.0))),
-            _ => keyframe,
-        };
+        let away =
+            |keyframe: Arc<Keyframe>| match keyframe.base.as_ref().and_then(|base| base.station) {
+                Some(1) => {
+                    Arc::new(keyframe.with_base_correction(&Transform::translation(90.0, 0.0, 0.0)))
+                }
+                _ => keyframe,
+            };
         let given: Vec<_> = all().into_iter().map(away).collect();
         let mut stations = stations();
         let released = stations.corrected(given.clone());
         assert_eq!(bits(&given), bits(&released));
         assert!(
-            stations.reports()[0].to_string().contains("do not overlap with earlier ones"),
+            stations.reports()[0]
+                .to_string()
+                .contains("do not overlap with earlier ones"),
             "{}",
             stations.reports()[0]
         );
@@ -684,8 +862,14 @@ mod tests {
     #[test]
     fn only_moving_bases_are_realigned_on_request() {
         let rig = |name: &str, realign: bool| {
-            let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../rigs").join(name);
-            Rig::load(&path, &[crate::config::Override::new("base.realign", realign)]).unwrap()
+            let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR"))
+                .join("../rigs")
+                .join(name);
+            Rig::load(
+                &path,
+                &[crate::config::Override::new("base.realign", realign)],
+            )
+            .unwrap()
         };
         assert!(Stations::new(&rig("mobile-arm.toml", false)).is_none());
         assert!(Stations::new(&rig("static-arm.toml", true)).is_none());

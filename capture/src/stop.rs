@@ -19,21 +19,31 @@ pub struct Stop {
 }
 
 impl Stop {
-    /// Creates a stop and two flags for signal handlers. Setting the first requests the stop; the next query then logs the
-    /// message. The second records a Ctrl-C, so that the next one ends the process at once.
+    /// Creates a stop and two flags for signal handlers. Setting the first requests the stop; the
+    /// next query then logs the message. The second records a Ctrl-C, so that the next one ends the
+    /// process at once.
     #[must_use]
     pub fn with_signal_flags(message: &'static str) -> (Self, [Arc<AtomicBool>; 2]) {
-        let stop = Self { message, ..Self::default() };
+        let stop = Self {
+            message,
+            ..Self::default()
+        };
         let flags = [stop.signaled.clone(), stop.interrupted.clone()];
         (stop, flags)
     }
 
-    /// Withdraws all requests, so that the next signal requests a stop again, with another message, and the next Ctrl-C
-    /// does not end the process at once.
+    /// Withdraws all requests, so that the next signal requests a stop again, with another message,
+    /// and the next Ctrl-C does not end the process at once.
     pub fn rearm(&mut self, message: &'static str) {
         self.message = message;
-        // A signal that arrives in between still requests a stop, because its handler sets `interrupted` first.
-        for flag in [&self.signaled, &self.requested, &self.logged, &self.interrupted] {
+        // A signal that arrives in between still requests a stop, because its handler sets
+        // `interrupted` first.
+        for flag in [
+            &self.signaled,
+            &self.requested,
+            &self.logged,
+            &self.interrupted,
+        ] {
             flag.store(false, Ordering::Relaxed);
         }
     }
@@ -73,7 +83,10 @@ mod tests {
         assert!(stop.requested() && stop.signaled());
         stop.rearm("ending");
         assert!(!stop.requested() && !stop.signaled());
-        assert!(!interrupted.load(Ordering::Relaxed), "the next Ctrl-C would end the process at once");
+        assert!(
+            !interrupted.load(Ordering::Relaxed),
+            "the next Ctrl-C would end the process at once"
+        );
         signaled.store(true, Ordering::Relaxed);
         assert!(stop.requested() && stop.signaled());
     }

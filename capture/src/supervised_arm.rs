@@ -14,7 +14,8 @@ const POLL: Duration = Duration::from_millis(50);
 /// A movable arm that reports nothing for this long counts as lost.
 const MAX_SILENCE: Duration = Duration::from_secs(2);
 
-/// A movable arm and its joint offsets. All positions include `arm.joint_offsets`, as everywhere else.
+/// A movable arm and its joint offsets. All positions include `arm.joint_offsets`, as everywhere
+/// else.
 pub struct SupervisedArm {
     arm: Box<dyn MovableArm>,
     offsets: Vec<f64>,
@@ -37,7 +38,8 @@ impl SupervisedArm {
         Self { arm, offsets }
     }
 
-    /// Enables a stopped arm again. Call this only at the request of a person who has checked the arm.
+    /// Enables a stopped arm again. Call this only at the request of a person who has checked the
+    /// arm.
     ///
     /// # Errors
     /// If the arm does not recover.
@@ -55,7 +57,12 @@ impl SupervisedArm {
             match self.read_within(POLL)? {
                 Some(state) => return Ok(state),
                 None if clock::now() < deadline => {}
-                None => return Err(Error::NoJoints { waited: MAX_SILENCE }.into()),
+                None => {
+                    return Err(Error::NoJoints {
+                        waited: MAX_SILENCE,
+                    }
+                    .into());
+                }
             }
         }
     }
@@ -64,11 +71,17 @@ impl SupervisedArm {
     fn read_within(&mut self, timeout: Duration) -> crate::Result<Option<JointState>> {
         let state = self.arm.read(timeout);
         if let Motion::Stopped { reason } = self.arm.motion() {
-            bail!("the arm stopped: {reason}. Inspect it, then recover it with `fieldrig move --recover`");
+            bail!(
+                "the arm stopped: {reason}. Inspect it, then recover it with `fieldrig move --recover`"
+            );
         }
         match state {
             Ok(mut state) => {
-                state.position.iter_mut().zip(&self.offsets).for_each(|(position, offset)| *position += offset);
+                state
+                    .position
+                    .iter_mut()
+                    .zip(&self.offsets)
+                    .for_each(|(position, offset)| *position += offset);
                 Ok(Some(state))
             }
             Err(Error::NoJoints { .. }) => Ok(None),
@@ -108,36 +121,53 @@ impl SupervisedArm {
         Ok(with_offsets(&accepted, 1.0))
     }
 
-    /// Waits until the arm has arrived. If a stop is requested or the arm cannot be read, brings it to rest instead.
+    /// Waits until the arm has arrived. If a stop is requested or the arm cannot be read, brings it
+    /// to rest instead.
     ///
     /// * `on_state`: is called with each joint state.
     ///
     /// # Errors
     /// If the arm has stopped because of a fault, reports nothing, or cannot be stopped.
-    pub fn follow(&mut self, stop: &Stop, on_state: impl FnMut(&JointState)) -> crate::Result<MotionEnd> {
+    pub fn follow(
+        &mut self,
+        stop: &Stop,
+        on_state: impl FnMut(&JointState),
+    ) -> crate::Result<MotionEnd> {
         let end = self.follow_while_read(stop, on_state);
         if end.is_err()
             && !matches!(self.arm.motion(), Motion::Stopped { .. })
             && let Err(error) = self.arm.stop()
         {
-            log::error!("cannot stop the arm, which may still move: {error}; press the emergency stop");
+            log::error!(
+                "cannot stop the arm, which may still move: {error}; press the emergency stop"
+            );
         }
         end
     }
 
-    fn follow_while_read(&mut self, stop: &Stop, mut on_state: impl FnMut(&JointState)) -> crate::Result<MotionEnd> {
+    fn follow_while_read(
+        &mut self,
+        stop: &Stop,
+        mut on_state: impl FnMut(&JointState),
+    ) -> crate::Result<MotionEnd> {
         loop {
             let state = self.read()?;
             on_state(&state);
             if self.arm.motion() == Motion::Holding {
-                return Ok(MotionEnd { state, has_arrived: true });
+                return Ok(MotionEnd {
+                    state,
+                    has_arrived: true,
+                });
             }
             if stop.requested() {
                 self.arm.stop().context("cannot stop the arm")?;
                 while self.arm.motion() == Motion::Moving {
                     on_state(&self.read()?);
                 }
-                return Ok(MotionEnd { state: self.read()?, has_arrived: false });
+                return Ok(MotionEnd {
+                    state: self.read()?,
+                    has_arrived: false,
+                });
             }
         }
     }
@@ -146,7 +176,11 @@ impl SupervisedArm {
     ///
     /// # Errors
     /// As [`SupervisedArm::read`].
-    pub fn hold(&mut self, stop: &Stop, mut on_state: impl FnMut(&JointState)) -> crate::Result<()> {
+    pub fn hold(
+        &mut self,
+        stop: &Stop,
+        mut on_state: impl FnMut(&JointState),
+    ) -> crate::Result<()> {
         while !stop.requested() {
             on_state(&self.read()?);
         }

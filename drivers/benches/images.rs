@@ -25,31 +25,51 @@ fn jpeg_1080p() -> Image {
     let pixel = |x: u32, y: u32| {
         let noise = (x.wrapping_mul(2_654_435_761) ^ y.wrapping_mul(40_503)).to_le_bytes()[1] % 12;
         let gradient = ((x / 60 + y / 40) * 11 + x / 16).to_le_bytes()[0] / 2;
-        [gradient + noise, gradient / 2 + 40 + noise, 200 - gradient + noise]
+        [
+            gradient + noise,
+            gradient / 2 + 40 + noise,
+            200 - gradient + noise,
+        ]
     };
-    let rgb: Vec<u8> = (0..size_px[1]).flat_map(|y| (0..size_px[0]).flat_map(move |x| pixel(x, y))).collect();
+    let rgb: Vec<u8> = (0..size_px[1])
+        .flat_map(|y| (0..size_px[0]).flat_map(move |x| pixel(x, y)))
+        .collect();
     let mut file = Vec::new();
     let encoder = image::codecs::jpeg::JpegEncoder::new_with_quality(&mut file, 85);
-    image::ImageEncoder::write_image(encoder, &rgb, size_px[0], size_px[1], image::ExtendedColorType::Rgb8)
-        .expect("an image");
+    image::ImageEncoder::write_image(
+        encoder,
+        &rgb,
+        size_px[0],
+        size_px[1],
+        image::ExtendedColorType::Rgb8,
+    )
+    .expect("an image");
     image(PixelFormat::Jpeg, size_px, file)
 }
 
 fn yuv_1080p(layout: YuvLayout) -> Image {
-    let colors = YuvColors { matrix: YuvMatrix::Bt601, range: YuvRange::Limited };
+    let colors = YuvColors {
+        matrix: YuvMatrix::Bt601,
+        range: YuvRange::Limited,
+    };
     let n_bytes = match layout {
         YuvLayout::Yuyv | YuvLayout::Uyvy => 2 * 1920 * 1080,
         YuvLayout::Nv12 => 1920 * 1080 * 3 / 2,
     };
-    let data = (0..n_bytes).map(|ix: usize| (ix * 37).to_le_bytes()[0]).collect();
+    let data = (0..n_bytes)
+        .map(|ix: usize| (ix * 37).to_le_bytes()[0])
+        .collect();
     image(PixelFormat::Yuv { layout, colors }, [1920, 1080], data)
 }
 
 fn decoding(criterion: &mut Criterion) {
     let jpeg = jpeg_1080p();
-    criterion.bench_function(&format!("decode JPEG 1920x1080, {} kB", jpeg.data.len() / 1000), |bench| {
-        bench.iter(|| black_box(&jpeg).decode_rgb().expect("an image"));
-    });
+    criterion.bench_function(
+        &format!("decode JPEG 1920x1080, {} kB", jpeg.data.len() / 1000),
+        |bench| {
+            bench.iter(|| black_box(&jpeg).decode_rgb().expect("an image"));
+        },
+    );
     for layout in [YuvLayout::Yuyv, YuvLayout::Uyvy, YuvLayout::Nv12] {
         let yuv = yuv_1080p(layout);
         criterion.bench_function(&format!("decode {layout:?} 1920x1080"), |bench| {
@@ -67,8 +87,18 @@ fn depth_640x480() -> Image {
         _ => 900 + 400 * column / width + 300 * row / height,
     };
     let pixels = (0..height).flat_map(|row| (0..width).map(move |column| count(column, row)));
-    let bytes = pixels.flat_map(|count| u16::try_from(count).expect("below two meters").to_le_bytes());
-    image(PixelFormat::DepthU16 { meters_per_count: 1e-3 }, [width, height], bytes.collect())
+    let bytes = pixels.flat_map(|count| {
+        u16::try_from(count)
+            .expect("below two meters")
+            .to_le_bytes()
+    });
+    image(
+        PixelFormat::DepthU16 {
+            meters_per_count: 1e-3,
+        },
+        [width, height],
+        bytes.collect(),
+    )
 }
 
 fn camera([width, height]: [u32; 2], focal_px: f64, lens: Lens) -> Intrinsics {
@@ -95,11 +125,18 @@ fn alignment(criterion: &mut Criterion) {
         ("distorted", d455, [640, 480], 610.0),
         ("distorted", d455, [1280, 720], 910.0),
     ] {
-        let alignment = DepthAlignment::new(&depth_camera, &camera(color_px, focal_px, lens), &color_from_depth);
+        let alignment = DepthAlignment::new(
+            &depth_camera,
+            &camera(color_px, focal_px, lens),
+            &color_from_depth,
+        );
         let [width, height] = color_px;
-        criterion.bench_function(&format!("align depth 640x480 to {name} {width}x{height}"), |bench| {
-            bench.iter(|| alignment.align(black_box(&depth)).expect("depth"));
-        });
+        criterion.bench_function(
+            &format!("align depth 640x480 to {name} {width}x{height}"),
+            |bench| {
+                bench.iter(|| alignment.align(black_box(&depth)).expect("depth"));
+            },
+        );
     }
 }
 

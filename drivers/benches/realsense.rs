@@ -1,5 +1,5 @@
-//! Aligns the depth of a RealSense camera to its color with our code and with librealsense2. Run it on one core
-//! (`taskset -c 0`), because the library uses several.
+//! Aligns the depth of a RealSense camera to its color with our code and with librealsense2. Run it
+//! on one core (`taskset -c 0`), because the library uses several.
 
 #[path = "../../tests/hil/realsense_scene.rs"]
 mod realsense_scene;
@@ -20,18 +20,29 @@ fn alignment(criterion: &mut Criterion) {
         let camera = d435i(color_px, Lens::Pinhole);
         let depth = depth_of(&camera);
         let [width, height] = color_px;
-        let alignment = DepthAlignment::new(&depth.intrinsics, &camera.intrinsics, &depth.camera_from_depth);
+        let alignment = DepthAlignment::new(
+            &depth.intrinsics,
+            &camera.intrinsics,
+            &depth.camera_from_depth,
+        );
         let image = depth_image(&camera, 0);
-        criterion.bench_function(&format!("align depth 640x480 to {width}x{height}"), |bench| {
-            bench.iter(|| alignment.align(black_box(&image)).expect("depth"));
-        });
+        criterion.bench_function(
+            &format!("align depth 640x480 to {width}x{height}"),
+            |bench| {
+                bench.iter(|| alignment.align(black_box(&image)).expect("depth"));
+            },
+        );
         record(&path, &camera, N_IMAGES);
-        criterion.bench_function(&format!("align depth 640x480 to {width}x{height}, librealsense2"), |bench| {
-            bench.iter_custom(|n| {
-                let aligned = aligned_by_library(&path, usize::try_from(n).expect("few images"));
-                aligned.into_iter().map(|(.., elapsed)| elapsed).sum()
-            });
-        });
+        criterion.bench_function(
+            &format!("align depth 640x480 to {width}x{height}, librealsense2"),
+            |bench| {
+                bench.iter_custom(|n| {
+                    let aligned =
+                        aligned_by_library(&path, usize::try_from(n).expect("few images"));
+                    aligned.into_iter().map(|(.., elapsed)| elapsed).sum()
+                });
+            },
+        );
     }
 }
 

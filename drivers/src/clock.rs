@@ -3,13 +3,15 @@
 use kinematics::Stamp;
 use std::time::Duration;
 
-/// Current time of the kernel's `CLOCK_MONOTONIC`. All programs on this computer and V4L2 images use this clock.
+/// Current time of the kernel's `CLOCK_MONOTONIC`. All programs on this computer and V4L2 images
+/// use this clock.
 #[cfg(unix)]
 pub fn now() -> Stamp {
     read(rustix::time::ClockId::Monotonic)
 }
 
-/// Current time of a clock that keeps counting while the computer is suspended. Use it only to detect a suspend.
+/// Current time of a clock that keeps counting while the computer is suspended. Use it only to
+/// detect a suspend.
 #[cfg(target_os = "linux")]
 pub(crate) fn now_including_suspend() -> Stamp {
     read(rustix::time::ClockId::Boottime)
@@ -19,7 +21,11 @@ pub(crate) fn now_including_suspend() -> Stamp {
 fn read(clock: rustix::time::ClockId) -> Stamp {
     const NANOS_PER_SEC: i64 = 1_000_000_000;
     let now = rustix::time::clock_gettime(clock);
-    Stamp(now.tv_sec.saturating_mul(NANOS_PER_SEC).saturating_add(now.tv_nsec))
+    Stamp(
+        now.tv_sec
+            .saturating_mul(NANOS_PER_SEC)
+            .saturating_add(now.tv_nsec),
+    )
 }
 
 /// CPU time that this process has used so far, or `None` on platforms where it is not implemented.

@@ -18,7 +18,11 @@ impl std::fmt::Display for RecordedSpan {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self.n_samples {
             0 => f.write_str("no samples were saved"),
-            n_samples => write!(f, "the first {:.1} s ({n_samples} samples) are saved", self.seconds),
+            n_samples => write!(
+                f,
+                "the first {:.1} s ({n_samples} samples) are saved",
+                self.seconds
+            ),
         }
     }
 }
@@ -44,7 +48,8 @@ pub enum Error {
         /// Description of the problem.
         problem: Box<crate::v4l2::Problem>,
     },
-    /// A RealSense camera or one of its files cannot be opened, or the camera did not reconnect in time.
+    /// A RealSense camera or one of its files cannot be opened, or the camera did not reconnect in
+    /// time.
     #[error("camera {camera:?}: {problem}")]
     Realsense {
         /// Name in the rig file.
@@ -220,7 +225,9 @@ pub enum Error {
         expected_bytes: usize,
     },
     /// A device uses a color encoding that is not supported.
-    #[error("V4L2 colorspace {colorspace} with Y'CbCr encoding {ycbcr_enc}: only BT.601 and BT.709 are supported")]
+    #[error(
+        "V4L2 colorspace {colorspace} with Y'CbCr encoding {ycbcr_enc}: only BT.601 and BT.709 are supported"
+    )]
     YuvColors {
         /// `enum v4l2_colorspace`.
         colorspace: u32,
@@ -244,7 +251,9 @@ pub enum Error {
         path: PathBuf,
     },
     /// The recording contains no samples of a rig.
-    #[error("the recording {path:?} contains no images or joint states recorded by this program{reason}")]
+    #[error(
+        "the recording {path:?} contains no images or joint states recorded by this program{reason}"
+    )]
     EmptyRecording {
         /// The file.
         path: PathBuf,
@@ -296,7 +305,9 @@ pub enum Error {
         source: crate::wire::Malformed,
     },
     /// A folder is not a dataset.
-    #[error("{path:?} is not a dataset: expected transforms.json (nerfstudio) or rgb.txt (TUM RGB-D) in it")]
+    #[error(
+        "{path:?} is not a dataset: expected transforms.json (nerfstudio) or rgb.txt (TUM RGB-D) in it"
+    )]
     NotADataset {
         /// The folder.
         path: PathBuf,
@@ -310,7 +321,9 @@ pub enum Error {
         reason: String,
     },
     /// No frame of a dataset can be used.
-    #[error("{path:?} contains no usable image: {n_missing} are missing, {n_unusable} cannot be used{first_reason}")]
+    #[error(
+        "{path:?} contains no usable image: {n_missing} are missing, {n_unusable} cannot be used{first_reason}"
+    )]
     EmptyDataset {
         /// The folder.
         path: PathBuf,

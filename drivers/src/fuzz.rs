@@ -1,10 +1,11 @@
-//! Fuzz targets: each function here feeds arbitrary bytes to a reader and panics if the result is inconsistent.
+//! Fuzz targets: each function here feeds arbitrary bytes to a reader and panics if the result is
+//! inconsistent.
 //!
-//! Long fuzzing runs use the targets in the folder `fuzz`. The tests here replay its seeds, both unchanged and
-//! corrupted at random. A seed is exactly the input of its function.
+//! Long fuzzing runs use the targets in the folder `fuzz`. The tests here replay its seeds, both
+//! unchanged and corrupted at random. A seed is exactly the input of its function.
 //!
-//! The target of a device family is in the folder of that family. `input` reads values from the bytes, and `scratch`
-//! provides folders for targets that read files.
+//! The target of a device family is in the folder of that family. `input` reads values from the
+//! bytes, and `scratch` provides folders for targets that read files.
 
 mod dataset;
 pub(crate) mod input;

@@ -2,10 +2,11 @@
 
 use kinematics::Stamp;
 
-/// If an image is late by more than this many periods, images were dropped before it. Smaller delays are jitter.
+/// If an image is late by more than this many periods, images were dropped before it. Smaller
+/// delays are jitter.
 const LATE_PERIODS: f64 = 0.75;
-/// Fraction of the delay by which the next due time is corrected, because the actual frame rate differs from the
-/// nominal rate.
+/// Fraction of the delay by which the next due time is corrected, because the actual frame rate
+/// differs from the nominal rate.
 const DRIFT_GAIN: f64 = 0.05;
 
 /// Estimates when the images of a camera are due. Images may be late, but never early.
@@ -17,7 +18,10 @@ pub(crate) struct GapEstimator {
 
 impl GapEstimator {
     pub(crate) fn new(rate_hz: f64) -> Self {
-        Self { period_secs: 1.0 / rate_hz, due: None }
+        Self {
+            period_secs: 1.0 / rate_hz,
+            due: None,
+        }
     }
 
     /// Estimated number of images that were dropped before an image with this stamp.
@@ -30,9 +34,17 @@ impl GapEstimator {
         let lost_periods = (late_periods - LATE_PERIODS).ceil().max(0.0);
         let delayed_secs = (late_periods - lost_periods) * self.period_secs;
         // An image before its due time means that earlier images were delayed.
-        let correction_secs = if delayed_secs < 0.0 { delayed_secs } else { DRIFT_GAIN * delayed_secs };
+        let correction_secs = if delayed_secs < 0.0 {
+            delayed_secs
+        } else {
+            DRIFT_GAIN * delayed_secs
+        };
         self.due = Some(due.plus_secs((1.0 + lost_periods) * self.period_secs + correction_secs));
-        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "not negative; the cast saturates")]
+        #[expect(
+            clippy::cast_possible_truncation,
+            clippy::cast_sign_loss,
+            reason = "not negative; the cast saturates"
+        )]
         let n_lost = lost_periods as u64;
         n_lost
     }
@@ -45,7 +57,10 @@ mod tests {
     /// Estimated number of dropped images for the given stamps in milliseconds.
     fn n_lost(rate_hz: f64, millis: impl IntoIterator<Item = f64>) -> u64 {
         let mut gap_estimator = GapEstimator::new(rate_hz);
-        millis.into_iter().map(|millis| gap_estimator.n_lost_before(Stamp::from_secs(millis * 1e-3))).sum()
+        millis
+            .into_iter()
+            .map(|millis| gap_estimator.n_lost_before(Stamp::from_secs(millis * 1e-3)))
+            .sum()
     }
 
     #[test]
@@ -56,13 +71,20 @@ mod tests {
         assert_eq!(n_lost(25.0, [0.0, 65.0, 105.0, 122.0, 160.0]), 0);
         let jitter = |ix: u32| f64::from(ix) * 40.0 + f64::from(ix * ix % 27);
         assert_eq!(n_lost(25.0, (0..1000).map(jitter)), 0);
-        assert_eq!(n_lost(25.0, (0..1000).filter(|ix| ix % 7 != 3).map(jitter)), 143);
+        assert_eq!(
+            n_lost(25.0, (0..1000).filter(|ix| ix % 7 != 3).map(jitter)),
+            143
+        );
     }
 
     #[test]
     fn rate_mismatch_is_not_counted_as_loss() {
         for rate_hz in [29.9, 29.97, 30.1] {
-            assert_eq!(n_lost(30.0, (0..10_000).map(|ix| f64::from(ix) * 1e3 / rate_hz)), 0, "{rate_hz}");
+            assert_eq!(
+                n_lost(30.0, (0..10_000).map(|ix| f64::from(ix) * 1e3 / rate_hz)),
+                0,
+                "{rate_hz}"
+            );
         }
     }
 }

@@ -65,17 +65,19 @@ pub trait Camera: Send {
     fn name(&self) -> &str;
     /// Lens parameters of the color image.
     fn intrinsics(&self) -> &Intrinsics;
-    /// Waits for the next image that was not returned yet, in stamp order. The format distinguishes color and depth.
+    /// Waits for the next image that was not returned yet, in stamp order. The format distinguishes
+    /// color and depth.
     ///
-    /// If the caller is too slow, the oldest images are dropped and counted in [`Image::n_skipped`].
+    /// If the caller is too slow, the oldest images are dropped and counted in
+    /// [`Image::n_skipped`].
     ///
     /// # Errors
-    /// [`Error::NoImage`] after `timeout`; [`Error::Reconnecting`], for a limited time, while the driver tries to
-    /// reconnect to the camera. Cameras played back from a file return [`Error::NotDue`] if the next image is due
-    /// later, and [`Error::Ended`] at the end.
+    /// [`Error::NoImage`] after `timeout`; [`Error::Reconnecting`], for a limited time, while the
+    /// driver tries to reconnect to the camera. Cameras played back from a file return
+    /// [`Error::NotDue`] if the next image is due later, and [`Error::Ended`] at the end.
     fn next_image(&mut self, timeout: Duration) -> Result<Image, Error>;
-    /// Whether the camera waits for a slow caller instead of dropping images. True, for example, for a file that is
-    /// read as fast as possible.
+    /// Whether the camera waits for a slow caller instead of dropping images. True, for example,
+    /// for a file that is read as fast as possible.
     fn waits_for_caller(&self) -> bool {
         false
     }
@@ -99,23 +101,25 @@ pub trait Base: Send {
 pub trait RangeScanner: Send {
     /// Name in the rig file; also the name of its frame.
     fn name(&self) -> &str;
-    /// Waits for the next scan that was not returned yet, in stamp order. If the caller is too slow, the oldest scans
-    /// are dropped.
+    /// Waits for the next scan that was not returned yet, in stamp order. If the caller is too
+    /// slow, the oldest scans are dropped.
     fn next_scan(&mut self, timeout: Duration) -> Result<RangeScan, Error>;
 }
 
-/// A source of all samples of a rig in one deterministic order: a recording, a lockstep simulation or live devices.
+/// A source of all samples of a rig in one deterministic order: a recording, a lockstep simulation
+/// or live devices.
 pub trait Source: Send {
     /// Returns the next sample, in stamp order as far as the devices allow, or `None` at the end.
     fn next_sample(&mut self) -> Result<Option<Sample>, Error>;
 
-    /// Number of joint states, base poses and range scans dropped so far because the caller was too slow.
+    /// Number of joint states, base poses and range scans dropped so far because the caller was too
+    /// slow.
     fn n_other_samples_dropped(&self) -> u64 {
         0
     }
 
-    /// Number of restarts of the source up to the latest sample. The robot's pose jumps at a restart, so samples before
-    /// and after it must not be interpolated.
+    /// Number of restarts of the source up to the latest sample. The robot's pose jumps at a
+    /// restart, so samples before and after it must not be interpolated.
     fn n_restarts(&self) -> u64 {
         0
     }

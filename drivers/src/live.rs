@@ -1,4 +1,5 @@
-//! Combines live devices into one source of samples. Each device has a thread and a bounded queue to the caller.
+//! Combines live devices into one source of samples. Each device has a thread and a bounded queue
+//! to the caller.
 
 use crate::{Arm, Base, Camera, Error, Image, RangeScanner, Sample, Source};
 use parking_lot::{Condvar, Mutex};
@@ -15,7 +16,8 @@ const MAX_JOINTS: usize = 1000;
 const MAX_SCANS: usize = 20;
 /// A device that delivers no samples for this long causes an error.
 const MAX_SILENCE: Duration = Duration::from_secs(5);
-/// Duration of one wait on a device. It bounds the time until its thread notices that it has to stop.
+/// Duration of one wait on a device. It bounds the time until its thread notices that it has to
+/// stop.
 const POLL: Duration = Duration::from_millis(100);
 
 /// The devices of a rig.
@@ -33,13 +35,13 @@ pub struct Devices {
 
 /// A source that reads all devices of a rig, each in its own thread.
 ///
-/// If the caller is too slow, the oldest samples of a device are dropped. Dropped images are counted in
-/// [`Image::n_skipped`] of the next image of the same kind, all other samples in [`Source::n_other_samples_dropped`].
-/// Cameras that wait for their caller are blocked instead.
+/// If the caller is too slow, the oldest samples of a device are dropped. Dropped images are
+/// counted in [`Image::n_skipped`] of the next image of the same kind, all other samples in
+/// [`Source::n_other_samples_dropped`]. Cameras that wait for their caller are blocked instead.
 ///
-/// The first error of a device ends the source; [`Source::next_sample`] returns it once. If cameras are played back
-/// from files, the end of the last file also ends the source, after all samples read until then have been returned.
-/// Dropping the source stops the threads.
+/// The first error of a device ends the source; [`Source::next_sample`] returns it once. If cameras
+/// are played back from files, the end of the last file also ends the source, after all samples
+/// read until then have been returned. Dropping the source stops the threads.
 #[derive(Debug)]
 pub struct Live {
     shared: Arc<Shared>,
@@ -73,8 +75,16 @@ struct State {
 impl Live {
     /// Starts reading.
     pub fn new(devices: Devices) -> Result<Self, Error> {
-        let Devices { cameras, arm, base, scanners } = devices;
-        let n_devices = cameras.len() + usize::from(arm.is_some()) + usize::from(base.is_some()) + scanners.len();
+        let Devices {
+            cameras,
+            arm,
+            base,
+            scanners,
+        } = devices;
+        let n_devices = cameras.len()
+            + usize::from(arm.is_some())
+            + usize::from(base.is_some())
+            + scanners.len();
         let state = State {
             queues: vec![VecDeque::new(); n_devices],
             dropped: vec![[0; 2]; n_devices],
@@ -83,50 +93,77 @@ impl Live {
             ..State::default()
         };
         let mut live = Self {
-            shared: Arc::new(Shared { state: Mutex::new(state), arrived: Condvar::new(), taken: Condvar::new() }),
+            shared: Arc::new(Shared {
+                state: Mutex::new(state),
+                arrived: Condvar::new(),
+                taken: Condvar::new(),
+            }),
             threads: Vec::new(),
         };
         for mut camera in cameras {
             let name = camera.name().to_owned();
-            let timeout_error = move |waited| Error::NoImage { camera: name.clone(), waited };
-            let policy = QueuePolicy { capacity: MAX_IMAGES, blocks_device: camera.waits_for_caller() };
-            live.read(format!("camera {:?}", camera.name()), policy, timeout_error, move || {
-                match camera.next_image(POLL) {
+            let timeout_error = move |waited| Error::NoImage {
+                camera: name.clone(),
+                waited,
+            };
+            let policy = QueuePolicy {
+                capacity: MAX_IMAGES,
+                blocks_device: camera.waits_for_caller(),
+            };
+            live.read(
+                format!("camera {:?}", camera.name()),
+                policy,
+                timeout_error,
+                move || match camera.next_image(POLL) {
                     Err(Error::Ended { .. }) => Ok(ReadOutcome::End),
                     Err(Error::NoImage { .. }) => Ok(ReadOutcome::NoSample),
-                    Err(Error::Reconnecting { .. } | Error::NotDue { .. }) => Ok(ReadOutcome::Pending),
+                    Err(Error::Reconnecting { .. } | Error::NotDue { .. }) => {
+                        Ok(ReadOutcome::Pending)
+                    }
                     image => image.map(Sample::Image).map(ReadOutcome::Sample),
-                }
-            })?;
+                },
+            )?;
         }
         if let Some(mut arm) = arm {
             let timeout_error = |waited| Error::NoJoints { waited };
-            live.read("arm".to_owned(), QueuePolicy::drop_oldest(MAX_JOINTS), timeout_error, move || {
-                match arm.read(POLL) {
+            live.read(
+                "arm".to_owned(),
+                QueuePolicy::drop_oldest(MAX_JOINTS),
+                timeout_error,
+                move || match arm.read(POLL) {
                     Err(Error::NoJoints { .. }) => Ok(ReadOutcome::NoSample),
                     state => state.map(Sample::Joints).map(ReadOutcome::Sample),
-                }
-            })?;
+                },
+            )?;
         }
         if let Some(mut base) = base {
             let timeout_error = |waited| Error::NoBasePose { waited };
-            live.read("base".to_owned(), QueuePolicy::drop_oldest(MAX_JOINTS), timeout_error, move || {
-                match base.next_pose(POLL) {
+            live.read(
+                "base".to_owned(),
+                QueuePolicy::drop_oldest(MAX_JOINTS),
+                timeout_error,
+                move || match base.next_pose(POLL) {
                     Err(Error::NoBasePose { .. }) => Ok(ReadOutcome::NoSample),
                     pose => pose.map(Sample::Base).map(ReadOutcome::Sample),
-                }
-            })?;
+                },
+            )?;
         }
         for mut scanner in scanners {
             let name = scanner.name().to_owned();
-            let timeout_error = move |waited| Error::NoScan { scanner: name.clone(), waited };
+            let timeout_error = move |waited| Error::NoScan {
+                scanner: name.clone(),
+                waited,
+            };
             let device = format!("range scanner {:?}", scanner.name());
-            live.read(device, QueuePolicy::drop_oldest(MAX_SCANS), timeout_error, move || {
-                match scanner.next_scan(POLL) {
+            live.read(
+                device,
+                QueuePolicy::drop_oldest(MAX_SCANS),
+                timeout_error,
+                move || match scanner.next_scan(POLL) {
                     Err(Error::NoScan { .. }) => Ok(ReadOutcome::NoSample),
                     scan => scan.map(Sample::Range).map(ReadOutcome::Sample),
-                }
-            })?;
+                },
+            )?;
         }
         Ok(live)
     }
@@ -140,17 +177,26 @@ impl Live {
         read: impl FnMut() -> Result<ReadOutcome, Error> + Send + 'static,
     ) -> Result<(), Error> {
         let device_ix = self.threads.len();
-        self.spawn(device, move |shared| read_until_stopped(shared, device_ix, policy, read, timeout_error))
+        self.spawn(device, move |shared| {
+            read_until_stopped(shared, device_ix, policy, read, timeout_error)
+        })
     }
 
-    fn spawn(&mut self, device: String, read: impl FnOnce(&Shared) + Send + 'static) -> Result<(), Error> {
+    fn spawn(
+        &mut self,
+        device: String,
+        read: impl FnOnce(&Shared) + Send + 'static,
+    ) -> Result<(), Error> {
         let shared = Arc::clone(&self.shared);
-        let thread = std::thread::Builder::new().name(device.clone()).spawn(move || {
-            read(&shared);
-            shared.state.lock().n_running -= 1;
-            shared.arrived.notify_all();
-        });
-        self.threads.push(thread.map_err(|source| Error::Thread { device, source })?);
+        let thread = std::thread::Builder::new()
+            .name(device.clone())
+            .spawn(move || {
+                read(&shared);
+                shared.state.lock().n_running -= 1;
+                shared.arrived.notify_all();
+            });
+        self.threads
+            .push(thread.map_err(|source| Error::Thread { device, source })?);
         Ok(())
     }
 }
@@ -165,7 +211,10 @@ struct QueuePolicy {
 
 impl QueuePolicy {
     fn drop_oldest(capacity: usize) -> Self {
-        Self { capacity, blocks_device: false }
+        Self {
+            capacity,
+            blocks_device: false,
+        }
     }
 }
 
@@ -174,7 +223,8 @@ enum ReadOutcome {
     Sample(Sample),
     /// The device is connected but sent nothing.
     NoSample,
-    /// The driver is trying to reconnect for a limited time, or the next image of a file is not due yet.
+    /// The driver is trying to reconnect for a limited time, or the next image of a file is not due
+    /// yet.
     Pending,
     /// The file has ended.
     End,
@@ -198,7 +248,10 @@ fn read_until_stopped(
         let error = match sample {
             Ok(ReadOutcome::Sample(sample)) => {
                 waited = Duration::ZERO;
-                while policy.blocks_device && state.queues[device_ix].len() >= policy.capacity && !state.stop {
+                while policy.blocks_device
+                    && state.queues[device_ix].len() >= policy.capacity
+                    && !state.stop
+                {
                     shared.taken.wait(&mut state);
                 }
                 state.put(device_ix, policy.capacity, sample);
@@ -230,11 +283,14 @@ fn read_until_stopped(
 }
 
 impl State {
-    /// Queues a sample. If the queue is full, the oldest sample of this device is dropped and counted.
+    /// Queues a sample. If the queue is full, the oldest sample of this device is dropped and
+    /// counted.
     fn put(&mut self, device_ix: usize, capacity: usize, mut sample: Sample) {
         if self.queues[device_ix].len() >= capacity {
             match self.queues[device_ix].pop_front() {
-                Some(Sample::Image(dropped_image)) => self.report_dropped(device_ix, &dropped_image, &mut sample),
+                Some(Sample::Image(dropped_image)) => {
+                    self.report_dropped(device_ix, &dropped_image, &mut sample)
+                }
                 Some(_) => self.n_other_samples_dropped += 1,
                 None => {}
             }
@@ -242,13 +298,16 @@ impl State {
         self.queues[device_ix].push_back(sample);
     }
 
-    /// Adds a dropped image and the images dropped before it to the count of the next image of its kind.
+    /// Adds a dropped image and the images dropped before it to the count of the next image of its
+    /// kind.
     fn report_dropped(&mut self, device_ix: usize, dropped_image: &Image, newest: &mut Sample) {
         let same_kind = |sample: &&mut Sample| matches!(sample, Sample::Image(image) if image.is_depth() == dropped_image.is_depth());
         let pending = &mut self.dropped[device_ix][usize::from(dropped_image.is_depth())];
         *pending += dropped_image.n_skipped + 1;
-        if let Some(Sample::Image(next)) =
-            self.queues[device_ix].iter_mut().chain(std::iter::once(newest)).find(same_kind)
+        if let Some(Sample::Image(next)) = self.queues[device_ix]
+            .iter_mut()
+            .chain(std::iter::once(newest))
+            .find(same_kind)
         {
             next.n_skipped += std::mem::take(pending);
         }
@@ -256,7 +315,11 @@ impl State {
 
     /// Removes the oldest queued sample of all devices.
     fn take(&mut self) -> Option<Sample> {
-        let heads = self.queues.iter().enumerate().filter_map(|(ix, queue)| Some((queue.front()?.stamp(), ix)));
+        let heads = self
+            .queues
+            .iter()
+            .enumerate()
+            .filter_map(|(ix, queue)| Some((queue.front()?.stamp(), ix)));
         let (_, device_ix) = heads.min()?;
         self.queues[device_ix].pop_front()
     }
@@ -318,7 +381,9 @@ mod tests {
         }
         fn next_image(&mut self, _timeout: Duration) -> Result<Image, Error> {
             if self.next == self.n_images {
-                return Err(Error::Simulation { reason: "cable pulled".into() });
+                return Err(Error::Simulation {
+                    reason: "cable pulled".into(),
+                });
             }
             self.next += 1;
             Ok(image(self.next, self.next % 2 == 0))
@@ -326,7 +391,13 @@ mod tests {
     }
 
     fn image(stamp: i64, depth: bool) -> Image {
-        let format = if depth { PixelFormat::DepthU16 { meters_per_count: 1e-3 } } else { PixelFormat::Gray8 };
+        let format = if depth {
+            PixelFormat::DepthU16 {
+                meters_per_count: 1e-3,
+            }
+        } else {
+            PixelFormat::Gray8
+        };
         Image {
             camera: "fast".into(),
             stamp: Stamp(stamp),
@@ -347,7 +418,11 @@ mod tests {
     };
 
     fn fast_camera(n_images: i64) -> Box<dyn Camera> {
-        Box::new(FastCamera { intrinsics: LENS, n_images, next: 0 })
+        Box::new(FastCamera {
+            intrinsics: LENS,
+            n_images,
+            next: 0,
+        })
     }
 
     struct SlowArm {
@@ -364,30 +439,50 @@ mod tests {
                 return Err(Error::NoJoints { waited: timeout });
             }
             self.next += 1;
-            Ok(JointState { stamp: Stamp(self.next), position: vec![], velocity: vec![], effort: vec![] })
+            Ok(JointState {
+                stamp: Stamp(self.next),
+                position: vec![],
+                velocity: vec![],
+                effort: vec![],
+            })
         }
     }
 
     #[test]
     fn slow_caller_gets_newest_images_and_drop_counts() {
-        let mut live =
-            Live::new(Devices { cameras: vec![fast_camera(101)], ..Devices::default() }).expect("threads start");
+        let mut live = Live::new(Devices {
+            cameras: vec![fast_camera(101)],
+            ..Devices::default()
+        })
+        .expect("threads start");
         while live.shared.state.lock().n_running > 0 {
             std::thread::yield_now();
         }
         // Errors come first: samples that a failed device sent earlier are not worth waiting for.
-        assert!(live.next_sample().expect_err("the cable").to_string().contains("cable pulled"));
+        assert!(
+            live.next_sample()
+                .expect_err("the cable")
+                .to_string()
+                .contains("cable pulled")
+        );
         let mut stamps = Vec::new();
         let mut n_skipped = [0; 2];
-        while let Some(Sample::Image(image)) = live.next_sample().expect("the error is returned only once") {
+        while let Some(Sample::Image(image)) =
+            live.next_sample().expect("the error is returned only once")
+        {
             stamps.push(image.stamp.0);
             n_skipped[usize::from(image.is_depth())] += image.n_skipped;
         }
         assert_eq!(stamps, (94..=101).collect::<Vec<_>>());
-        assert_eq!(n_skipped, [47, 46], "51 color images with 4 delivered, 50 depth images with 4 delivered");
+        assert_eq!(
+            n_skipped,
+            [47, 46],
+            "51 color images with 4 delivered, 50 depth images with 4 delivered"
+        );
     }
 
-    /// A camera that reports reconnecting for longer than the silence limit. It returns without waiting.
+    /// A camera that reports reconnecting for longer than the silence limit. It returns without
+    /// waiting.
     struct ReconnectingCamera {
         camera: FastCamera,
         n_tries: u32,
@@ -403,7 +498,10 @@ mod tests {
         fn next_image(&mut self, timeout: Duration) -> Result<Image, Error> {
             self.n_tries += 1;
             if self.n_tries <= 100 {
-                return Err(Error::Reconnecting { camera: "fast".into(), waited: timeout * self.n_tries });
+                return Err(Error::Reconnecting {
+                    camera: "fast".into(),
+                    waited: timeout * self.n_tries,
+                });
             }
             self.camera.next_image(timeout)
         }
@@ -411,15 +509,36 @@ mod tests {
 
     #[test]
     fn reconnecting_camera_does_not_time_out() {
-        let camera = ReconnectingCamera { camera: FastCamera { intrinsics: LENS, n_images: 1, next: 0 }, n_tries: 0 };
-        let devices = Devices { cameras: vec![Box::new(camera)], ..Devices::default() };
+        let camera = ReconnectingCamera {
+            camera: FastCamera {
+                intrinsics: LENS,
+                n_images: 1,
+                next: 0,
+            },
+            n_tries: 0,
+        };
+        let devices = Devices {
+            cameras: vec![Box::new(camera)],
+            ..Devices::default()
+        };
         let mut live = Live::new(devices).expect("threads start");
         while live.shared.state.lock().n_running > 0 {
             std::thread::yield_now();
         }
         // After ten seconds of reconnecting, the image arrives. The error follows it.
-        assert!(live.next_sample().expect_err("the cable").to_string().contains("cable pulled"));
-        assert_eq!(live.next_sample().expect("the error is returned only once").expect("an image").stamp(), Stamp(1));
+        assert!(
+            live.next_sample()
+                .expect_err("the cable")
+                .to_string()
+                .contains("cable pulled")
+        );
+        assert_eq!(
+            live.next_sample()
+                .expect("the error is returned only once")
+                .expect("an image")
+                .stamp(),
+            Stamp(1)
+        );
     }
 
     /// A camera that is played back from a file as fast as possible.
@@ -434,7 +553,9 @@ mod tests {
         }
         fn next_image(&mut self, timeout: Duration) -> Result<Image, Error> {
             if self.0.next == self.0.n_images {
-                return Err(Error::Ended { camera: "recorded".into() });
+                return Err(Error::Ended {
+                    camera: "recorded".into(),
+                });
             }
             self.0.next_image(timeout)
         }
@@ -446,10 +567,18 @@ mod tests {
     #[test]
     fn file_camera_blocks_for_slow_caller_and_ends_source() {
         let n_images = 5 * i64::try_from(MAX_IMAGES).expect("a small number");
-        let camera = FileCamera(FastCamera { intrinsics: LENS, n_images, next: 0 });
+        let camera = FileCamera(FastCamera {
+            intrinsics: LENS,
+            n_images,
+            next: 0,
+        });
         // The arm never ends.
         let arm: Box<dyn Arm> = Box::new(SlowArm { next: 0 });
-        let devices = Devices { cameras: vec![Box::new(camera)], arm: Some(arm), ..Devices::default() };
+        let devices = Devices {
+            cameras: vec![Box::new(camera)],
+            arm: Some(arm),
+            ..Devices::default()
+        };
         let mut live = Live::new(devices).expect("threads start");
         let mut stamps = Vec::new();
         while let Some(sample) = live.next_sample().expect("the end is not an error") {
@@ -463,10 +592,19 @@ mod tests {
 
     #[test]
     fn joints_arrive_in_stamp_order_and_drop_stops_threads() {
-        let mut live = Live::new(Devices { arm: Some(Box::new(SlowArm { next: 0 })), ..Devices::default() })
-            .expect("threads start");
-        let stamps: Vec<_> =
-            (0..3).map(|_| live.next_sample().expect("alive").expect("three joint states").stamp()).collect();
+        let mut live = Live::new(Devices {
+            arm: Some(Box::new(SlowArm { next: 0 })),
+            ..Devices::default()
+        })
+        .expect("threads start");
+        let stamps: Vec<_> = (0..3)
+            .map(|_| {
+                live.next_sample()
+                    .expect("alive")
+                    .expect("three joint states")
+                    .stamp()
+            })
+            .collect();
         assert_eq!(stamps, [Stamp(1), Stamp(2), Stamp(3)]);
         let shared = Arc::clone(&live.shared);
         drop(live);
@@ -475,14 +613,20 @@ mod tests {
 
     #[test]
     fn samples_of_multiple_devices_are_merged_by_stamp() {
-        let mut state = State { queues: vec![VecDeque::new(); 2], dropped: vec![[0; 2]; 2], ..State::default() };
+        let mut state = State {
+            queues: vec![VecDeque::new(); 2],
+            dropped: vec![[0; 2]; 2],
+            ..State::default()
+        };
         for stamp in [2, 5] {
             state.put(0, 8, Sample::Image(image(stamp, false)));
         }
         for stamp in [1, 3, 4] {
             state.put(1, 8, Sample::Image(image(stamp, true)));
         }
-        let order: Vec<_> = std::iter::from_fn(|| state.take()).map(|sample| sample.stamp().0).collect();
+        let order: Vec<_> = std::iter::from_fn(|| state.take())
+            .map(|sample| sample.stamp().0)
+            .collect();
         assert_eq!(order, [1, 2, 3, 4, 5]);
     }
 }

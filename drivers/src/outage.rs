@@ -1,4 +1,5 @@
-//! Outage of a camera: its start, the number of reconnection attempts, and the time of the next one.
+//! Outage of a camera: its start, the number of reconnection attempts, and the time of the next
+//! one.
 
 use kinematics::Stamp;
 use std::time::{Duration, Instant};
@@ -15,16 +16,24 @@ impl Outage {
     /// Returns the current outage of a camera, or starts a new one.
     pub(crate) fn of(outage: &mut Option<Self>) -> Self {
         let now = Instant::now();
-        let outage = outage.get_or_insert(Self { since: now, n_tries: 0, last_try: now });
+        let outage = outage.get_or_insert(Self {
+            since: now,
+            n_tries: 0,
+            last_try: now,
+        });
         outage.last_try = now;
         *outage
     }
 
-    /// Waits until the next attempt is due, one pause after the last attempt, and counts the attempt. If it is due
-    /// after the deadline, waits until the deadline and returns false.
+    /// Waits until the next attempt is due, one pause after the last attempt, and counts the
+    /// attempt. If it is due after the deadline, waits until the deadline and returns false.
     pub(crate) fn wait_for_retry(&mut self, pause: Duration, deadline: Instant) -> bool {
         let next_try = self.last_try + pause;
-        std::thread::sleep(next_try.min(deadline).saturating_duration_since(Instant::now()));
+        std::thread::sleep(
+            next_try
+                .min(deadline)
+                .saturating_duration_since(Instant::now()),
+        );
         if next_try > deadline {
             return false;
         }
@@ -37,7 +46,11 @@ impl Outage {
 /// Number of images between two stamps at the given rate.
 pub(crate) fn n_between(last: Stamp, next: Stamp, rate_hz: f64) -> u64 {
     let periods = next.0.saturating_sub(last.0) as f64 * 1e-9 * rate_hz;
-    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "the cast saturates as intended")]
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "the cast saturates as intended"
+    )]
     let n_images = (periods.round() - 1.0).max(0.0) as u64;
     n_images
 }
@@ -59,13 +72,23 @@ mod tests {
     fn retry_waits_for_pause_but_not_past_deadline() {
         let mut lost = None;
         let mut outage = Outage::of(&mut lost);
-        assert!(outage.wait_for_retry(Duration::ZERO, Instant::now()), "the first attempt may be due immediately");
+        assert!(
+            outage.wait_for_retry(Duration::ZERO, Instant::now()),
+            "the first attempt may be due immediately"
+        );
         let began = Instant::now();
         assert!(!outage.wait_for_retry(Duration::from_secs(60), began + Duration::from_millis(10)));
-        assert!(began.elapsed() >= Duration::from_millis(10) && began.elapsed() < Duration::from_secs(30));
+        assert!(
+            began.elapsed() >= Duration::from_millis(10)
+                && began.elapsed() < Duration::from_secs(30)
+        );
         assert!(outage.wait_for_retry(Duration::from_millis(20), began + Duration::from_secs(60)));
         assert!(began.elapsed() >= Duration::from_millis(15));
         assert_eq!(outage.n_tries, 2);
-        assert_eq!(Outage::of(&mut lost).since, outage.since, "the same outage continues");
+        assert_eq!(
+            Outage::of(&mut lost).since,
+            outage.since,
+            "the same outage continues"
+        );
     }
 }

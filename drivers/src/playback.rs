@@ -6,14 +6,16 @@ use std::collections::BTreeMap;
 use std::sync::{Arc, OnceLock};
 use std::time::{Duration, Instant};
 
-/// Images later than this are dropped. [`Live`](crate::Live) holds as many images of a camera at 30 Hz.
+/// Images later than this are dropped. [`Live`](crate::Live) holds as many images of a camera at 30
+/// Hz.
 const MAX_DELAY: Duration = Duration::from_millis(270);
 
 /// A source whose samples are returned when they are due, by their stamps and their order.
 ///
-/// A sample is due as long after the first one as its stamp is, but not before the samples in front of it: an image that
-/// was recorded after the joint states of the following 30 ms is returned 30 ms after its stamp, which keeps the latency
-/// of its camera. If the caller is too slow, images are dropped and counted, as with devices.
+/// A sample is due as long after the first one as its stamp is, but not before the samples in front
+/// of it: an image that was recorded after the joint states of the following 30 ms is returned 30
+/// ms after its stamp, which keeps the latency of its camera. If the caller is too slow, images are
+/// dropped and counted, as with devices.
 pub struct Playback {
     source: Box<dyn Source>,
     clock: PlaybackClock,
@@ -31,14 +33,18 @@ pub struct PlaybackClock {
 }
 
 impl PlaybackClock {
-    /// When a measurement with this stamp takes place in the playback; `None` before the first sample, and for earlier
-    /// stamps that this process's clock cannot represent.
+    /// When a measurement with this stamp takes place in the playback; `None` before the first
+    /// sample, and for earlier stamps that this process's clock cannot represent.
     #[must_use]
     pub fn instant_of(&self, stamp: Stamp) -> Option<Instant> {
         let (first, began) = self.start.get()?;
         let after_secs = stamp.secs_since(*first);
         let distance = Duration::try_from_secs_f64(after_secs.abs()).ok()?;
-        if after_secs >= 0.0 { began.checked_add(distance) } else { began.checked_sub(distance) }
+        if after_secs >= 0.0 {
+            began.checked_add(distance)
+        } else {
+            began.checked_sub(distance)
+        }
     }
 }
 
@@ -46,7 +52,12 @@ impl Playback {
     /// Plays a source from its first sample, which is returned at once.
     #[must_use]
     pub fn new(source: Box<dyn Source>) -> Self {
-        Self { source, clock: PlaybackClock::default(), last_due: None, n_dropped: BTreeMap::new() }
+        Self {
+            source,
+            clock: PlaybackClock::default(),
+            last_due: None,
+            n_dropped: BTreeMap::new(),
+        }
     }
 
     /// The clock of this playback; it starts with the first sample.
@@ -58,7 +69,11 @@ impl Playback {
     /// When a sample is due.
     fn due(&mut self, stamp: Stamp) -> Instant {
         self.clock.start.get_or_init(|| (stamp, Instant::now()));
-        let due = self.clock.instant_of(stamp).max(self.last_due).unwrap_or_else(Instant::now);
+        let due = self
+            .clock
+            .instant_of(stamp)
+            .max(self.last_due)
+            .unwrap_or_else(Instant::now);
         self.last_due = Some(due);
         due
     }
@@ -67,8 +82,13 @@ impl Playback {
 impl Source for Playback {
     fn next_sample(&mut self) -> Result<Option<Sample>, Error> {
         loop {
-            let Some(mut sample) = self.source.next_sample()? else { return Ok(None) };
-            let delay = match self.due(sample.stamp()).checked_duration_since(Instant::now()) {
+            let Some(mut sample) = self.source.next_sample()? else {
+                return Ok(None);
+            };
+            let delay = match self
+                .due(sample.stamp())
+                .checked_duration_since(Instant::now())
+            {
                 Some(remaining) => {
                     std::thread::sleep(remaining);
                     Duration::ZERO
@@ -116,18 +136,35 @@ mod tests {
 
     #[test]
     fn samples_are_returned_when_due_and_keep_their_latency() {
-        let mut playback = playback(vec![joints(millis(0)), joints(millis(60)), image(millis(20)), joints(millis(80))]);
+        let mut playback = playback(vec![
+            joints(millis(0)),
+            joints(millis(60)),
+            image(millis(20)),
+            joints(millis(80)),
+        ]);
         assert_eq!(playback.clock().instant_of(millis(0)), None);
         let mut returned = Vec::new();
         while let Some(sample) = playback.next_sample().expect("no error") {
             returned.push((sample.stamp(), Instant::now()));
         }
-        let began = playback.clock().instant_of(millis(0)).expect("it has begun");
+        let began = playback
+            .clock()
+            .instant_of(millis(0))
+            .expect("it has begun");
         for ((stamp, at), due_millis) in returned.iter().zip([0, 60, 60, 80]) {
-            assert!(*at >= began + Duration::from_millis(due_millis), "{stamp:?}");
+            assert!(
+                *at >= began + Duration::from_millis(due_millis),
+                "{stamp:?}"
+            );
         }
-        assert_eq!(returned.iter().map(|(stamp, _)| *stamp).collect::<Vec<_>>(), [0, 60, 20, 80].map(millis));
-        assert_eq!(playback.clock().instant_of(millis(20)), Some(began + Duration::from_millis(20)));
+        assert_eq!(
+            returned.iter().map(|(stamp, _)| *stamp).collect::<Vec<_>>(),
+            [0, 60, 20, 80].map(millis)
+        );
+        assert_eq!(
+            playback.clock().instant_of(millis(20)),
+            Some(began + Duration::from_millis(20))
+        );
     }
 
     #[test]
@@ -139,11 +176,22 @@ mod tests {
             image(millis(20)),
             image(millis(1_000)),
         ]);
-        assert_eq!(playback.next_sample().expect("no error").map(|sample| sample.stamp()), Some(millis(0)));
+        assert_eq!(
+            playback
+                .next_sample()
+                .expect("no error")
+                .map(|sample| sample.stamp()),
+            Some(millis(0))
+        );
         std::thread::sleep(Duration::from_millis(20) + 2 * MAX_DELAY);
-        assert!(matches!(playback.next_sample(), Ok(Some(Sample::Joints(_)))), "joint states are kept");
+        assert!(
+            matches!(playback.next_sample(), Ok(Some(Sample::Joints(_)))),
+            "joint states are kept"
+        );
         match playback.next_sample() {
-            Ok(Some(Sample::Image(image))) => assert_eq!((image.stamp, image.n_skipped), (millis(1_000), 2)),
+            Ok(Some(Sample::Image(image))) => {
+                assert_eq!((image.stamp, image.n_skipped), (millis(1_000), 2))
+            }
             other => panic!("{other:?}"),
         }
         assert!(matches!(playback.next_sample(), Ok(None)));

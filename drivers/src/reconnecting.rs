@@ -1,7 +1,8 @@
 //! Reopens a camera after it was disconnected. All camera drivers use this code.
 //!
-//! A driver implements [`ReopenableCamera`], which opens the camera, reads images and describes problems. [`Reconnecting`]
-//! decides when to retry and when to give up, and counts the images that were lost in the meantime.
+//! A driver implements [`ReopenableCamera`], which opens the camera, reads images and describes
+//! problems. [`Reconnecting`] decides when to retry and when to give up, and counts the images that
+//! were lost in the meantime.
 
 use crate::outage::{Outage, n_between};
 use crate::{Error, Image};
@@ -11,31 +12,33 @@ use std::time::{Duration, Instant};
 
 /// A camera that can be opened repeatedly.
 ///
-/// Images that the camera queued before it was opened must not be returned. Stamps of cameras without a clock are taken
-/// when the last byte of an image has arrived.
+/// Images that the camera queued before it was opened must not be returned. Stamps of cameras
+/// without a clock are taken when the last byte of an image has arrived.
 pub(crate) trait ReopenableCamera: Debug {
     /// The open camera. Dropping it closes the camera.
     type Stream: Debug;
     /// A problem of this kind of camera.
     type Problem: Display;
 
-    /// Opens the camera. Must return within about 100 ms, because the caller cannot stop in the meantime: a camera that
-    /// takes longer is opened by a thread of its own, and [`Self::describe`] returns `None` until it is open.
+    /// Opens the camera. Must return within about 100 ms, because the caller cannot stop in the
+    /// meantime: a camera that takes longer is opened by a thread of its own, and
+    /// [`Self::describe`] returns `None` until it is open.
     fn open(&mut self) -> Result<Self::Stream, Failure<Self::Problem>>;
 
-    /// Description of device, mode and settings for the log; `None` as long as the camera is still being opened.
+    /// Description of device, mode and settings for the log; `None` as long as the camera is still
+    /// being opened.
     fn describe(&self, stream: &Self::Stream) -> Option<String>;
 
-    /// Waits for the next image. Returns `None` if no image arrived; the caller may call again if the deadline has not
-    /// passed.
+    /// Waits for the next image. Returns `None` if no image arrived; the caller may call again if
+    /// the deadline has not passed.
     fn next_image(
         &mut self,
         stream: &mut Self::Stream,
         deadline: Instant,
     ) -> Result<Option<Image>, Failure<Self::Problem>>;
 
-    /// Called before each attempt to reopen the camera. `n_tries` counts the attempts from 1. Returns true if it reset
-    /// the camera, which ends the attempt.
+    /// Called before each attempt to reopen the camera. `n_tries` counts the attempts from 1.
+    /// Returns true if it reset the camera, which ends the attempt.
     fn reset(&mut self, _n_tries: u32) -> bool {
         false
     }
@@ -49,8 +52,8 @@ pub(crate) trait ReopenableCamera: Debug {
 pub(crate) enum Failure<P> {
     /// The camera is disconnected, or has a problem that may disappear if it is reopened.
     Lost(P),
-    /// An error that another attempt cannot remove, because the camera answered and refuses the rig file's settings. It
-    /// is returned without another attempt.
+    /// An error that another attempt cannot remove, because the camera answered and refuses the rig
+    /// file's settings. It is returned without another attempt.
     #[cfg_attr(
         not(any(target_os = "linux", feature = "realsense", test)),
         expect(dead_code, reason = "the nokhwa driver has no such errors")
@@ -109,8 +112,8 @@ pub(crate) struct Reconnecting<C: ReopenableCamera> {
     stream: Option<C::Stream>,
     /// Whether the camera has finished opening.
     is_streaming: bool,
-    /// The outage, from its start until the next image. A camera that can be opened but sends nothing still counts as
-    /// disconnected.
+    /// The outage, from its start until the next image. A camera that can be opened but sends
+    /// nothing still counts as disconnected.
     outage: Option<Outage>,
     /// Stamp of the last color image and of the last depth image, kept across reconnections.
     last: [Option<Stamp>; 2],
@@ -162,7 +165,10 @@ impl<C: ReopenableCamera> Reconnecting<C> {
             if self.stream.is_some() && Instant::now() >= deadline {
                 return Err(match self.outage {
                     Some(outage) if !self.is_streaming => self.reconnecting(outage),
-                    _ => Error::NoImage { camera: self.policy.camera.clone(), waited: timeout },
+                    _ => Error::NoImage {
+                        camera: self.policy.camera.clone(),
+                        waited: timeout,
+                    },
                 });
             }
         }
@@ -170,7 +176,9 @@ impl<C: ReopenableCamera> Reconnecting<C> {
 
     /// Waits once for an image of a connected camera.
     fn poll_image(&mut self, deadline: Instant) -> Result<Option<Image>, Error> {
-        let Some(stream) = &mut self.stream else { return Ok(None) };
+        let Some(stream) = &mut self.stream else {
+            return Ok(None);
+        };
         let image = self.device.next_image(stream, deadline);
         self.report_reconnection();
         match image {
@@ -180,14 +188,17 @@ impl<C: ReopenableCamera> Reconnecting<C> {
         }
     }
 
-    /// Counts an image. If it is the first of its kind since the camera was reopened, also counts the images missed
-    /// before it.
+    /// Counts an image. If it is the first of its kind since the camera was reopened, also counts
+    /// the images missed before it.
     fn count(&mut self, mut image: Image) -> Image {
         let kind = usize::from(image.is_depth());
         let last = self.last[kind].replace(image.stamp);
         let is_first_since_open = !std::mem::replace(&mut self.has_image[kind], true);
         if let (true, Some(last)) = (is_first_since_open, last) {
-            image.n_skipped = image.n_skipped.max(n_between(last, image.stamp, self.policy.rate_hz));
+            image.n_skipped =
+                image
+                    .n_skipped
+                    .max(n_between(last, image.stamp, self.policy.rate_hz));
         }
         self.outage = None;
         self.counts.n_images += 1;
@@ -195,20 +206,29 @@ impl<C: ReopenableCamera> Reconnecting<C> {
         image
     }
 
-    /// Closes the camera, because an open device node would keep its number when the camera returns.
+    /// Closes the camera, because an open device node would keep its number when the camera
+    /// returns.
     fn disconnect(&mut self, problem: C::Problem) -> Result<(), Error> {
         let outage = Outage::of(&mut self.outage);
         self.stream = None;
         if outage.n_tries > 0 {
             return self.fail_if_overdue(outage, problem);
         }
-        let ReconnectPolicy { camera, reconnect_for, .. } = &self.policy;
+        let ReconnectPolicy {
+            camera,
+            reconnect_for,
+            ..
+        } = &self.policy;
         log::warn!("camera {camera:?}: {problem}; trying to reconnect for {reconnect_for:?}");
         Ok(())
     }
 
     /// Fails if the camera has been disconnected for longer than the rig file allows.
-    fn fail_if_overdue(&self, Outage { since, n_tries, .. }: Outage, problem: C::Problem) -> Result<(), Error> {
+    fn fail_if_overdue(
+        &self,
+        Outage { since, n_tries, .. }: Outage,
+        problem: C::Problem,
+    ) -> Result<(), Error> {
         let waited = since.elapsed();
         if waited < self.policy.reconnect_for {
             log::debug!("camera {:?}: {problem}", self.policy.camera);
@@ -219,8 +239,14 @@ impl<C: ReopenableCamera> Reconnecting<C> {
 
     /// Tries once to reopen a disconnected camera, after the pause since the last attempt.
     fn reconnect(&mut self, deadline: Instant) -> Result<(), Error> {
-        let Some(outage) = &mut self.outage else { unreachable!("a camera without a stream is in an outage") };
-        let pause = if outage.n_tries == 0 { self.policy.first_pause } else { self.policy.retry_pause };
+        let Some(outage) = &mut self.outage else {
+            unreachable!("a camera without a stream is in an outage")
+        };
+        let pause = if outage.n_tries == 0 {
+            self.policy.first_pause
+        } else {
+            self.policy.retry_pause
+        };
         let is_due = outage.wait_for_retry(pause, deadline);
         let outage = *outage;
         if !is_due {
@@ -231,7 +257,8 @@ impl<C: ReopenableCamera> Reconnecting<C> {
         }
         match self.device.open() {
             Ok(stream) => {
-                (self.stream, self.is_streaming, self.has_image) = (Some(stream), false, [false; 2]);
+                (self.stream, self.is_streaming, self.has_image) =
+                    (Some(stream), false, [false; 2]);
                 self.report_reconnection();
                 Ok(())
             }
@@ -242,19 +269,27 @@ impl<C: ReopenableCamera> Reconnecting<C> {
 
     /// Counts and logs a reconnection once the camera has finished opening.
     fn report_reconnection(&mut self) {
-        let (Some(stream), Some(Outage { since, n_tries, .. }), false) = (&self.stream, self.outage, self.is_streaming)
+        let (Some(stream), Some(Outage { since, n_tries, .. }), false) =
+            (&self.stream, self.outage, self.is_streaming)
         else {
             return;
         };
-        let Some(description) = self.device.describe(stream) else { return };
+        let Some(description) = self.device.describe(stream) else {
+            return;
+        };
         let (camera, waited) = (&self.policy.camera, since.elapsed());
-        log::info!("camera {camera:?}: reconnected after {waited:?} ({n_tries} attempts): {description}");
+        log::info!(
+            "camera {camera:?}: reconnected after {waited:?} ({n_tries} attempts): {description}"
+        );
         self.is_streaming = true;
         self.counts.n_reconnections += 1;
     }
 
     fn reconnecting(&self, outage: Outage) -> Error {
-        Error::Reconnecting { camera: self.policy.camera.clone(), waited: outage.since.elapsed() }
+        Error::Reconnecting {
+            camera: self.policy.camera.clone(),
+            waited: outage.since.elapsed(),
+        }
     }
 }
 

@@ -3,14 +3,14 @@
 use crate::{Error, Sample, Source};
 use kinematics::Stamp;
 
-/// Time between the last sample of a round and the first of the next one. It is longer than the time within which range
-/// scans are used for the depth of an image.
+/// Time between the last sample of a round and the first of the next one. It is longer than the
+/// time within which range scans are used for the depth of an image.
 const PAUSE_NANOS: i64 = 1_100_000_000;
 
 /// A source that starts again from its beginning whenever it ends.
 ///
-/// Stamps continue to increase: those of each round are shifted by the length of the rounds before it. The robot jumps
-/// back at the beginning of a round, see [`Source::n_restarts`].
+/// Stamps continue to increase: those of each round are shifted by the length of the rounds before
+/// it. The robot jumps back at the beginning of a round, see [`Source::n_restarts`].
 pub struct Repeating<Reopen> {
     source: Box<dyn Source>,
     reopen: Reopen,
@@ -18,7 +18,8 @@ pub struct Repeating<Reopen> {
     offset_nanos: i64,
     /// The earliest and latest stamp of this round, without the offset.
     span: Option<[Stamp; 2]>,
-    /// Whether this round has an image. A recording without images is not repeated, because a run would never begin.
+    /// Whether this round has an image. A recording without images is not repeated, because a run
+    /// would never begin.
     has_image: bool,
     n_restarts: u64,
 }
@@ -26,7 +27,14 @@ pub struct Repeating<Reopen> {
 impl<Reopen: FnMut() -> Result<Box<dyn Source>, Error> + Send> Repeating<Reopen> {
     /// Repeats `source`. `reopen` reopens it at its first sample.
     pub fn new(source: Box<dyn Source>, reopen: Reopen) -> Self {
-        Self { source, reopen, offset_nanos: 0, span: None, has_image: false, n_restarts: 0 }
+        Self {
+            source,
+            reopen,
+            offset_nanos: 0,
+            span: None,
+            has_image: false,
+            n_restarts: 0,
+        }
     }
 }
 
@@ -42,7 +50,9 @@ impl<Reopen: FnMut() -> Result<Box<dyn Source>, Error> + Send> Source for Repeat
                 sample.shift(self.offset_nanos);
                 return Ok(Some(sample));
             }
-            let Some([earliest, latest]) = self.span.take().filter(|_| self.has_image) else { return Ok(None) };
+            let Some([earliest, latest]) = self.span.take().filter(|_| self.has_image) else {
+                return Ok(None);
+            };
             self.has_image = false;
             self.source = (self.reopen)()?;
             let round_nanos = latest.nanos_since(earliest).saturating_add(PAUSE_NANOS);
@@ -68,7 +78,9 @@ mod tests {
     use kinematics::Transform;
 
     fn repeating(samples: Vec<Sample>) -> impl Source {
-        let open = move || -> Result<Box<dyn Source>, Error> { Ok(Box::new(Scripted::new(samples.clone()))) };
+        let open = move || -> Result<Box<dyn Source>, Error> {
+            Ok(Box::new(Scripted::new(samples.clone())))
+        };
         Repeating::new(open().expect("scripted"), open)
     }
 
@@ -81,7 +93,11 @@ mod tests {
             world_from_camera: Transform::identity(),
             psnr_ceiling: None,
         };
-        let scan = RangeScan { scanner: "lidar".into(), stamp: Stamp(90), points: [].into() };
+        let scan = RangeScan {
+            scanner: "lidar".into(),
+            stamp: Stamp(90),
+            points: [].into(),
+        };
         // The image arrives after a joint state with a later stamp.
         let round = vec![
             joints(Stamp(50)),
@@ -94,13 +110,23 @@ mod tests {
         let mut stamps = Vec::new();
         for n_restarts in 0..3 {
             for _ in 0..5 {
-                stamps.push(source.next_sample().expect("no error").expect("repeated").stamp().0);
+                stamps.push(
+                    source
+                        .next_sample()
+                        .expect("no error")
+                        .expect("repeated")
+                        .stamp()
+                        .0,
+                );
                 assert_eq!(source.n_restarts(), n_restarts);
             }
         }
         let round = |offset: i64| [50, 40, 40, 90, 100].map(|nanos| nanos + offset);
         let length = 60 + PAUSE_NANOS;
-        assert_eq!(stamps, [round(0), round(length), round(2 * length)].concat());
+        assert_eq!(
+            stamps,
+            [round(0), round(length), round(2 * length)].concat()
+        );
     }
 
     #[test]
@@ -109,8 +135,15 @@ mod tests {
         let mut without_images = repeating(vec![joints(Stamp(0))]);
         assert!(matches!(without_images.next_sample(), Ok(Some(_))));
         assert!(matches!(without_images.next_sample(), Ok(None)));
-        let reopen = || Err(Error::Ended { camera: "wrist".to_owned() });
-        let mut failing = Repeating::new(Box::new(Scripted::new(vec![Sample::Image(image(Stamp(0)))])), reopen);
+        let reopen = || {
+            Err(Error::Ended {
+                camera: "wrist".to_owned(),
+            })
+        };
+        let mut failing = Repeating::new(
+            Box::new(Scripted::new(vec![Sample::Image(image(Stamp(0)))])),
+            reopen,
+        );
         assert!(matches!(failing.next_sample(), Ok(Some(_))));
         assert!(failing.next_sample().is_err());
     }

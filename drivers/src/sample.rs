@@ -26,7 +26,8 @@ pub enum PixelFormat {
     Png,
     /// Depth along the camera's z axis as little-endian 16-bit counts; 0 if unknown.
     DepthU16 {
-        /// Meters per count. By default 0.001 for a RealSense D4xx, 0.0001 for a D405 and 0.00025 for an L515.
+        /// Meters per count. By default 0.001 for a RealSense D4xx, 0.0001 for a D405 and 0.00025
+        /// for an L515.
         meters_per_count: f64,
     },
 }
@@ -42,7 +43,8 @@ pub struct Image {
     pub size_px: [u32; 2],
     /// Format of `data`.
     pub format: PixelFormat,
-    /// Pixels in row-major order from the top left, without padding between rows (see [`Image::pack_rows`]).
+    /// Pixels in row-major order from the top left, without padding between rows (see
+    /// [`Image::pack_rows`]).
     pub data: Arc<[u8]>,
     /// Exposure time in seconds, if the device reports it.
     pub exposure_secs: Option<f64>,
@@ -62,21 +64,24 @@ pub struct BasePose {
 /// Ground truth of a simulated image: the image without noise, blur and shear, and the camera pose.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TruthImage {
-    /// The noise-free image, [`PixelFormat::Rgb8`] or `Png`, with the camera and stamp of the noisy one.
+    /// The noise-free image, [`PixelFormat::Rgb8`] or `Png`, with the camera and stamp of the noisy
+    /// one.
     pub image: Image,
-    /// Noise-free depth along z, meters, `[height, width]`; 0 where there is no surface. Empty if not requested.
+    /// Noise-free depth along z, meters, `[height, width]`; 0 where there is no surface. Empty if
+    /// not requested.
     pub depth_m: Arc<[f32]>,
     /// True pose of the camera at mid-exposure of the middle row.
     pub world_from_camera: Transform,
-    /// PSNR in dB of the delivered image relative to the same image (including shear and blur) before noise was added;
-    /// `None` without noise.
+    /// PSNR in dB of the delivered image relative to the same image (including shear and blur)
+    /// before noise was added; `None` without noise.
     pub psnr_ceiling: Option<f64>,
 }
 
 /// One return of a range scanner.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RangePoint {
-    /// Position of the surface in the sensor frame (x forward, z up) at the time of this point, meters.
+    /// Position of the surface in the sensor frame (x forward, z up) at the time of this point,
+    /// meters.
     pub position_m: [f32; 3],
     /// Ring of the scanner that measured the point, counted from the lowest.
     pub ring: u16,
@@ -91,8 +96,8 @@ pub struct RangeScan {
     pub scanner: Arc<str>,
     /// Start of the revolution.
     pub stamp: Stamp,
-    /// Points in the order of measurement. Each point is expressed in the sensor frame at its own time, since the
-    /// scanner may move during a scan.
+    /// Points in the order of measurement. Each point is expressed in the sensor frame at its own
+    /// time, since the scanner may move during a scan.
     pub points: Arc<[RangePoint]>,
 }
 

@@ -21,10 +21,23 @@ impl Source for Scripted {
 /// An image of one pixel.
 pub(crate) fn image(stamp: Stamp) -> Image {
     let (camera, format, data) = ("wrist".into(), PixelFormat::Rgb8, [0; 3].into());
-    Image { camera, stamp, size_px: [1, 1], format, data, exposure_secs: None, n_skipped: 0 }
+    Image {
+        camera,
+        stamp,
+        size_px: [1, 1],
+        format,
+        data,
+        exposure_secs: None,
+        n_skipped: 0,
+    }
 }
 
 /// A state of one joint.
 pub(crate) fn joints(stamp: Stamp) -> Sample {
-    Sample::Joints(JointState { stamp, position: vec![0.0], velocity: Vec::new(), effort: Vec::new() })
+    Sample::Joints(JointState {
+        stamp,
+        position: vec![0.0],
+        velocity: Vec::new(),
+        effort: Vec::new(),
+    })
 }

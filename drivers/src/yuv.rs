@@ -1,8 +1,8 @@
 //! Converts YUV images (luma and chroma) from cameras to red, green and blue.
 //!
-//! Source: ITU-R BT.601-7 and BT.709-6 (matrices, limited range), Linux `videodev2.h` (defaults, layouts). The transfer
-//! function is assumed to be that of sRGB: the transfer function that cameras announce is rarely correct, and the
-//! difference is only a tone curve.
+//! Source: ITU-R BT.601-7 and BT.709-6 (matrices, limited range), Linux `videodev2.h` (defaults,
+//! layouts). The transfer function is assumed to be that of sRGB: the transfer function that
+//! cameras announce is rarely correct, and the difference is only a tone curve.
 
 use crate::Error;
 
@@ -13,7 +13,8 @@ pub enum YuvLayout {
     Yuyv,
     /// `U Y0 V Y1` for every two pixels of a row.
     Uyvy,
-    /// First all Y, in rows padded to an even width; then, for every two rows, one row with `U V` for every two pixels.
+    /// First all Y, in rows padded to an even width; then, for every two rows, one row with `U V`
+    /// for every two pixels.
     Nv12,
 }
 
@@ -44,8 +45,8 @@ pub struct YuvColors {
     pub range: YuvRange,
 }
 
-/// Color encoding reported by a V4L2 device (`struct v4l2_pix_format`), with the constants of `videodev2.h`; 0 means
-/// default.
+/// Color encoding reported by a V4L2 device (`struct v4l2_pix_format`), with the constants of
+/// `videodev2.h`; 0 means default.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct V4l2Colors {
     /// `enum v4l2_colorspace`.
@@ -54,8 +55,8 @@ pub struct V4l2Colors {
     pub ycbcr_enc: u32,
     /// `enum v4l2_quantization`.
     pub quantization: u32,
-    /// Whether the device receives a high-definition television signal (it has DV timings), as HDMI grabbers do and
-    /// cameras do not.
+    /// Whether the device receives a high-definition television signal (it has DV timings), as HDMI
+    /// grabbers do and cameras do not.
     pub is_hdtv: bool,
 }
 
@@ -80,7 +81,12 @@ impl YuvColors {
             (1 | 3 | 5, _) => YuvMatrix::Bt601,
             (2 | 4, _) | (0, REC709 | DCI_P3) => YuvMatrix::Bt709,
             (0, 1 | 4..=9 | 11) => YuvMatrix::Bt601,
-            _ => return Err(Error::YuvColors { colorspace, ycbcr_enc: reported.ycbcr_enc }),
+            _ => {
+                return Err(Error::YuvColors {
+                    colorspace,
+                    ycbcr_enc: reported.ycbcr_enc,
+                });
+            }
         };
         let range = match (reported.quantization, colorspace) {
             (1, _) | (0, JPEG) => YuvRange::Full,
@@ -97,7 +103,8 @@ impl YuvColors {
         }
     }
 
-    /// Luma count of black, and coefficients of the counts: `[y, v in red, u in green, v in green, u in blue]`.
+    /// Luma count of black, and coefficients of the counts: `[y, v in red, u in green, v in green,
+    /// u in blue]`.
     fn coefficients(self) -> (f64, [f64; 5]) {
         let [red, blue] = self.luma_weights();
         let green = 1.0 - red - blue;
@@ -107,7 +114,16 @@ impl YuvColors {
         };
         let v_in_red = 2.0 * (1.0 - red) * chroma;
         let u_in_blue = 2.0 * (1.0 - blue) * chroma;
-        (black, [luma, v_in_red, -u_in_blue * blue / green, -v_in_red * red / green, u_in_blue])
+        (
+            black,
+            [
+                luma,
+                v_in_red,
+                -u_in_blue * blue / green,
+                -v_in_red * red / green,
+                u_in_blue,
+            ],
+        )
     }
 }
 
@@ -129,8 +145,8 @@ impl YuvLayout {
     }
 }
 
-/// Converts an image without padding to red, green and blue, `[height, width, 3]`. The length of `data` must match the
-/// layout.
+/// Converts an image without padding to red, green and blue, `[height, width, 3]`. The length of
+/// `data` must match the layout.
 pub(crate) fn rgb(layout: YuvLayout, colors: YuvColors, size_px: [u32; 2], data: &[u8]) -> Vec<u8> {
     let [width, height] = size_px.map(|side| side as usize);
     let mut rgb = vec![0; width * height * 3];
@@ -140,21 +156,45 @@ pub(crate) fn rgb(layout: YuvLayout, colors: YuvColors, size_px: [u32; 2], data:
     let fixed = Fixed::new(colors);
     let row_bytes = layout.row_bytes(width);
     let (rows, chroma) = data.split_at(row_bytes * height);
-    for (row_ix, (out, row)) in rgb.chunks_exact_mut(width * 3).zip(rows.chunks_exact(row_bytes)).enumerate() {
+    for (row_ix, (out, row)) in rgb
+        .chunks_exact_mut(width * 3)
+        .zip(rows.chunks_exact(row_bytes))
+        .enumerate()
+    {
         match layout {
-            YuvLayout::Yuyv => fixed.row(out, row.as_chunks::<4>().0.iter().map(|&[y0, u, y1, v]| [y0, y1, u, v])),
-            YuvLayout::Uyvy => fixed.row(out, row.as_chunks::<4>().0.iter().map(|&[u, y0, v, y1]| [y0, y1, u, v])),
+            YuvLayout::Yuyv => fixed.row(
+                out,
+                row.as_chunks::<4>()
+                    .0
+                    .iter()
+                    .map(|&[y0, u, y1, v]| [y0, y1, u, v]),
+            ),
+            YuvLayout::Uyvy => fixed.row(
+                out,
+                row.as_chunks::<4>()
+                    .0
+                    .iter()
+                    .map(|&[u, y0, v, y1]| [y0, y1, u, v]),
+            ),
             YuvLayout::Nv12 => {
-                let chroma_row = chroma[row_ix / 2 * row_bytes..][..row_bytes].as_chunks::<2>().0;
+                let chroma_row = chroma[row_ix / 2 * row_bytes..][..row_bytes]
+                    .as_chunks::<2>()
+                    .0;
                 let lumas = row.as_chunks::<2>().0.iter();
-                fixed.row(out, lumas.zip(chroma_row).map(|(&[y0, y1], &[u, v])| [y0, y1, u, v]));
+                fixed.row(
+                    out,
+                    lumas
+                        .zip(chroma_row)
+                        .map(|(&[y0, y1], &[u, v])| [y0, y1, u, v]),
+                );
             }
         }
     }
     rgb
 }
 
-/// Coefficients of [`YuvColors`] times `1 << SHIFT`. Products and sums fit in 32 bits, with errors below 0.04 counts.
+/// Coefficients of [`YuvColors`] times `1 << SHIFT`. Products and sums fit in 32 bits, with errors
+/// below 0.04 counts.
 #[derive(Clone, Copy)]
 struct Fixed {
     black: i32,
@@ -170,15 +210,25 @@ const SHIFT: u32 = 13;
 impl Fixed {
     fn new(colors: YuvColors) -> Self {
         let (black, coefficients) = colors.coefficients();
-        #[expect(clippy::cast_possible_truncation, reason = "coefficients are below 3, black is 0 or 16")]
+        #[expect(
+            clippy::cast_possible_truncation,
+            reason = "coefficients are below 3, black is 0 or 16"
+        )]
         let to_integer = |number: f64| number.round() as i32;
         let [luma, v_in_red, u_in_green, v_in_green, u_in_blue] =
             coefficients.map(|coefficient| to_integer(coefficient * f64::from(1 << SHIFT)));
-        Self { black: to_integer(black), luma, v_in_red, u_in_green, v_in_green, u_in_blue }
+        Self {
+            black: to_integer(black),
+            luma,
+            v_in_red,
+            u_in_green,
+            v_in_green,
+            u_in_blue,
+        }
     }
 
-    /// Converts one row from its pairs `[y0, y1, u, v]`. For an odd width, only the first pixel of the last pair is
-    /// used.
+    /// Converts one row from its pairs `[y0, y1, u, v]`. For an odd width, only the first pixel of
+    /// the last pair is used.
     #[inline(always)]
     fn row(self, out: &mut [u8], mut pairs: impl Iterator<Item = [u8; 4]>) {
         let (complete, rest) = out.as_chunks_mut::<6>();
@@ -198,7 +248,15 @@ impl Fixed {
         let green = u * self.u_in_green + v * self.v_in_green + HALF;
         let blue = u * self.u_in_blue + HALF;
         let [y0, y1] = [y0, y1].map(|y| (i32::from(y) - self.black) * self.luma);
-        [y0 + red, y0 + green, y0 + blue, y1 + red, y1 + green, y1 + blue].map(to_byte)
+        [
+            y0 + red,
+            y0 + green,
+            y0 + blue,
+            y1 + red,
+            y1 + green,
+            y1 + blue,
+        ]
+        .map(to_byte)
     }
 }
 
@@ -214,12 +272,17 @@ mod tests {
     const LAYOUTS: [YuvLayout; 3] = [YuvLayout::Yuyv, YuvLayout::Uyvy, YuvLayout::Nv12];
 
     fn all_colors() -> impl Iterator<Item = YuvColors> {
-        [YuvMatrix::Bt601, YuvMatrix::Bt709].into_iter().flat_map(|matrix| {
-            [YuvRange::Limited, YuvRange::Full].into_iter().map(move |range| YuvColors { matrix, range })
-        })
+        [YuvMatrix::Bt601, YuvMatrix::Bt709]
+            .into_iter()
+            .flat_map(|matrix| {
+                [YuvRange::Limited, YuvRange::Full]
+                    .into_iter()
+                    .map(move |range| YuvColors { matrix, range })
+            })
     }
 
-    /// CPU twin in f64 that follows the definition in the standards: chroma is `blue - luma` and `red - luma`, scaled.
+    /// CPU twin in f64 that follows the definition in the standards: chroma is `blue - luma` and
+    /// `red - luma`, scaled.
     fn twin(colors: YuvColors, y: u8, u: u8, v: u8) -> [f64; 3] {
         let [red_weight, blue_weight] = colors.luma_weights();
         let [y, u, v] = [y, u, v].map(f64::from);
@@ -229,7 +292,8 @@ mod tests {
         };
         let red = luma + 2.0 * (1.0 - red_weight) * cr;
         let blue = luma + 2.0 * (1.0 - blue_weight) * cb;
-        let green = (luma - red_weight * red - blue_weight * blue) / (1.0 - red_weight - blue_weight);
+        let green =
+            (luma - red_weight * red - blue_weight * blue) / (1.0 - red_weight - blue_weight);
         [red, green, blue].map(|color| (color * 255.0).clamp(0.0, 255.0))
     }
 
@@ -242,9 +306,11 @@ mod tests {
                 for u in (0..=255).step_by(5) {
                     for v in (0..=255).step_by(3) {
                         let got = fixed.pair([y, 255 - y, u, v]);
-                        for (got, expected) in
-                            got.iter().zip(twin(colors, y, u, v).into_iter().chain(twin(colors, 255 - y, u, v)))
-                        {
+                        for (got, expected) in got.iter().zip(
+                            twin(colors, y, u, v)
+                                .into_iter()
+                                .chain(twin(colors, 255 - y, u, v)),
+                        ) {
                             assert!(
                                 (f64::from(*got) - expected).abs() <= MAX_ERROR,
                                 "{colors:?} {y} {u} {v}: {got}, expected {expected}"
@@ -258,46 +324,77 @@ mod tests {
 
     #[test]
     fn published_colors_convert_correctly() {
-        let limited = YuvColors { matrix: YuvMatrix::Bt601, range: YuvRange::Limited };
+        let limited = YuvColors {
+            matrix: YuvMatrix::Bt601,
+            range: YuvRange::Limited,
+        };
         let of = |colors: YuvColors, y, u, v| rgb(YuvLayout::Yuyv, colors, [1, 1], &[y, u, 0, v]);
         assert_eq!(of(limited, 16, 128, 128), [0, 0, 0]);
         assert_eq!(of(limited, 235, 128, 128), [255, 255, 255]);
         assert_eq!(of(limited, 81, 90, 240), [254, 0, 0]); // Red bar of BT.601. Counts are rounded, so red is not 255.
         assert_eq!(of(limited, 41, 240, 110), [0, 0, 255]);
-        let high = YuvColors { matrix: YuvMatrix::Bt709, range: YuvRange::Limited };
+        let high = YuvColors {
+            matrix: YuvMatrix::Bt709,
+            range: YuvRange::Limited,
+        };
         assert_eq!(of(high, 63, 102, 240), [255, 1, 0]); // Bars of BT.709.
-        let full = YuvColors { matrix: YuvMatrix::Bt601, range: YuvRange::Full };
+        let full = YuvColors {
+            matrix: YuvMatrix::Bt601,
+            range: YuvRange::Full,
+        };
         assert_eq!(of(full, 76, 85, 255), [254, 0, 0]); // JFIF's red.
     }
 
     #[test]
     fn all_layouts_convert_identically_at_odd_sizes() {
-        let colors = YuvColors { matrix: YuvMatrix::Bt601, range: YuvRange::Full };
+        let colors = YuvColors {
+            matrix: YuvMatrix::Bt601,
+            range: YuvRange::Full,
+        };
         let luma = |x: usize, y: usize| (20 + 31 * x + 47 * y).to_le_bytes()[0];
-        let chroma = |x: usize, y: usize, plus: usize| (90 + plus + 13 * (x / 2) + 7 * (y / 2)).to_le_bytes()[0];
+        let chroma = |x: usize, y: usize, plus: usize| {
+            (90 + plus + 13 * (x / 2) + 7 * (y / 2)).to_le_bytes()[0]
+        };
         for size_px in [[1, 1], [2, 2], [5, 3], [4, 3], [7, 2]] {
             let [width, height] = size_px.map(|side| side as usize);
             let pairs = width.div_ceil(2);
             let packed = |order: fn(u8, u8, u8, u8) -> [u8; 4]| -> Vec<u8> {
-                let pair = |x: usize, y: usize| order(luma(x, y), luma(x + 1, y), chroma(x, y, 0), chroma(x, y, 40));
-                (0..height).flat_map(|y| (0..pairs).flat_map(move |pair_ix| pair(2 * pair_ix, y))).collect()
+                let pair = |x: usize, y: usize| {
+                    order(
+                        luma(x, y),
+                        luma(x + 1, y),
+                        chroma(x, y, 0),
+                        chroma(x, y, 40),
+                    )
+                };
+                (0..height)
+                    .flat_map(|y| (0..pairs).flat_map(move |pair_ix| pair(2 * pair_ix, y)))
+                    .collect()
             };
             let lumas = (0..height).flat_map(|y| (0..2 * pairs).map(move |x| luma(x, y)));
-            let chroma_row = (0..height.div_ceil(2))
-                .flat_map(|row| (0..pairs).flat_map(move |pair| [0, 40].map(|plus| chroma(2 * pair, 2 * row, plus))));
+            let chroma_row = (0..height.div_ceil(2)).flat_map(|row| {
+                (0..pairs).flat_map(move |pair| [0, 40].map(|plus| chroma(2 * pair, 2 * row, plus)))
+            });
             let images = [
                 packed(|y0, y1, u, v| [y0, u, y1, v]),
                 packed(|y0, y1, u, v| [u, y0, v, y1]),
                 lumas.chain(chroma_row).collect(),
             ];
             for (layout, data) in LAYOUTS.into_iter().zip(images) {
-                assert_eq!(data.len(), layout.row_bytes(width) * layout.n_rows(height), "{layout:?}");
+                assert_eq!(
+                    data.len(),
+                    layout.row_bytes(width) * layout.n_rows(height),
+                    "{layout:?}"
+                );
                 let got = rgb(layout, colors, size_px, &data);
                 for (ix, got) in got.chunks_exact(3).enumerate() {
                     let (x, y) = (ix % width, ix / width);
                     let expected = twin(colors, luma(x, y), chroma(x, y, 0), chroma(x, y, 40));
                     for (got, expected) in got.iter().zip(expected) {
-                        assert!((f64::from(*got) - expected).abs() <= 1.0, "{layout:?} {width}x{height} at {x}, {y}");
+                        assert!(
+                            (f64::from(*got) - expected).abs() <= 1.0,
+                            "{layout:?} {width}x{height} at {x}, {y}"
+                        );
                     }
                 }
                 assert_eq!(got.len(), width * height * 3);
@@ -308,8 +405,15 @@ mod tests {
     #[test]
     fn unset_colors_use_v4l2_defaults() {
         let resolved = |colorspace, ycbcr_enc, quantization, is_hdtv| {
-            let reported = V4l2Colors { colorspace, ycbcr_enc, quantization, is_hdtv };
-            YuvColors::from_v4l2(reported).map(|colors| (colors.matrix, colors.range)).ok()
+            let reported = V4l2Colors {
+                colorspace,
+                ycbcr_enc,
+                quantization,
+                is_hdtv,
+            };
+            YuvColors::from_v4l2(reported)
+                .map(|colors| (colors.matrix, colors.range))
+                .ok()
         };
         use YuvMatrix::{Bt601, Bt709};
         use YuvRange::{Full, Limited};

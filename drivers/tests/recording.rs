@@ -1,10 +1,12 @@
-//! Tests of writing and reading recordings: samples and their order are preserved, and damaged files are read as far as
-//! possible.
+//! Tests of writing and reading recordings: samples and their order are preserved, and damaged
+//! files are read as far as possible.
 
 mod recompress;
 
 use drivers::recording::{RIG_FILE, Recorder, Recording, RecordingMetadata};
-use drivers::{BasePose, Error, Image, PixelFormat, RangePoint, RangeScan, Sample, Source, TruthImage};
+use drivers::{
+    BasePose, Error, Image, PixelFormat, RangePoint, RangeScan, Sample, Source, TruthImage,
+};
 use kinematics::random::Random;
 use kinematics::{Intrinsics, JointState, Lens, Stamp, Transform};
 use mcap::Compression;
@@ -14,7 +16,8 @@ use std::path::Path;
 
 const RIG: &str = "[arm]\ndriver = \"sim\"\n";
 
-/// Two seconds of a rig: joints at 100 Hz, color and depth at 10 Hz with ground truth, some base poses.
+/// Two seconds of a rig: joints at 100 Hz, color and depth at 10 Hz with ground truth, some base
+/// poses.
 fn samples() -> Vec<Sample> {
     let mut samples = Vec::new();
     for tick in 0..200_i32 {
@@ -22,7 +25,9 @@ fn samples() -> Vec<Sample> {
         let angle = f64::from(tick) * 0.013;
         samples.push(Sample::Joints(JointState {
             stamp,
-            position: (1..8).map(|joint| (angle * f64::from(joint)).sin()).collect(),
+            position: (1..8)
+                .map(|joint| (angle * f64::from(joint)).sin())
+                .collect(),
             velocity: vec![angle.cos(); 7],
             effort: vec![],
         }));
@@ -36,22 +41,55 @@ fn samples() -> Vec<Sample> {
                 camera: "wrist".into(),
                 stamp,
                 size_px: [16, 12],
-                format: if tick % 20 == 5 { PixelFormat::Rgb8 } else { PixelFormat::Png },
+                format: if tick % 20 == 5 {
+                    PixelFormat::Rgb8
+                } else {
+                    PixelFormat::Png
+                },
                 data: noise(tick, 16 * 12 * 3).into(),
                 exposure_secs: (tick % 30 == 5).then_some(1e-3),
                 n_skipped: u64::from(tick == 55),
             };
-            let format = PixelFormat::DepthU16 { meters_per_count: 1e-4 };
-            let depth =
-                Image { stamp: Stamp(stamp.0 + 777), format, data: noise(tick, 16 * 12 * 2).into(), ..color.clone() };
-            let depth_m =
-                if tick < 100 { (0..16 * 12_u16).map(|count| f32::from(count) * 0.37).collect() } else { vec![] };
-            let image = Image { exposure_secs: None, ..color.clone() };
+            let format = PixelFormat::DepthU16 {
+                meters_per_count: 1e-4,
+            };
+            let depth = Image {
+                stamp: Stamp(stamp.0 + 777),
+                format,
+                data: noise(tick, 16 * 12 * 2).into(),
+                ..color.clone()
+            };
+            let depth_m = if tick < 100 {
+                (0..16 * 12_u16)
+                    .map(|count| f32::from(count) * 0.37)
+                    .collect()
+            } else {
+                vec![]
+            };
+            let image = Image {
+                exposure_secs: None,
+                ..color.clone()
+            };
             let psnr_ceiling = (tick < 50).then_some(42.0 + angle);
-            let truth = TruthImage { image, depth_m: depth_m.into(), world_from_camera, psnr_ceiling };
-            samples.extend([Sample::Image(color), Sample::Truth(truth), Sample::Image(depth)]);
-            samples.push(Sample::Base(BasePose { stamp, world_from_base: world_from_camera.inverse() }));
-            samples.push(Sample::BaseTruth(BasePose { stamp, world_from_base: world_from_camera }));
+            let truth = TruthImage {
+                image,
+                depth_m: depth_m.into(),
+                world_from_camera,
+                psnr_ceiling,
+            };
+            samples.extend([
+                Sample::Image(color),
+                Sample::Truth(truth),
+                Sample::Image(depth),
+            ]);
+            samples.push(Sample::Base(BasePose {
+                stamp,
+                world_from_base: world_from_camera.inverse(),
+            }));
+            samples.push(Sample::BaseTruth(BasePose {
+                stamp,
+                world_from_base: world_from_camera,
+            }));
             let point = |ring: u16| RangePoint {
                 position_m: [0.1, -f32::from(ring), 3.7],
                 ring,
@@ -113,7 +151,10 @@ fn replay_equals_recorded_samples_in_order() {
     }
     assert_eq!(recording.damage(), None);
     assert_eq!(recording.attachment(RIG_FILE), Some(RIG.as_bytes()));
-    assert_eq!(recording.joint_names(), Some(&["a".to_owned(), "b".to_owned()][..]));
+    assert_eq!(
+        recording.joint_names(),
+        Some(&["a".to_owned(), "b".to_owned()][..])
+    );
     let second_path = folder.path().join("again.mcap");
     record(&second_path, &read);
     assert!(
@@ -134,18 +175,37 @@ fn truncated_recording_yields_samples_before_the_cut() {
     for eighths in 1..8 {
         std::fs::write(&cut_path, &whole[..whole.len() * eighths / 8]).expect("a shorter file");
         let (read, recording) = replay(&cut_path);
-        assert!(read.len() >= n_before && read.len() < sent.len(), "{} of {} samples", read.len(), sent.len());
-        assert!(read[..] == sent[..read.len()], "the remaining samples are unchanged");
+        assert!(
+            read.len() >= n_before && read.len() < sent.len(),
+            "{} of {} samples",
+            read.len(),
+            sent.len()
+        );
+        assert!(
+            read[..] == sent[..read.len()],
+            "the remaining samples are unchanged"
+        );
         let damage = recording.damage().expect("the truncation is reported");
-        assert!(damage.contains("truncated") && damage.contains(&read.len().to_string()), "{damage}");
+        assert!(
+            damage.contains("truncated") && damage.contains(&read.len().to_string()),
+            "{damage}"
+        );
         n_before = read.len();
     }
-    assert!(n_before > sent.len() / 2, "a cut near the end loses few samples: {n_before} of {}", sent.len());
+    assert!(
+        n_before > sent.len() / 2,
+        "a cut near the end loses few samples: {n_before} of {}",
+        sent.len()
+    );
 }
 
 /// Compressions that other programs use, with the sizes of their chunks.
-const COMPRESSIONS: [(Compression, u64); 4] =
-    [(Compression::Zstd, 2000), (Compression::Zstd, 4 << 20), (Compression::Lz4, 2000), (Compression::Lz4, 4 << 20)];
+const COMPRESSIONS: [(Compression, u64); 4] = [
+    (Compression::Zstd, 2000),
+    (Compression::Zstd, 4 << 20),
+    (Compression::Lz4, 2000),
+    (Compression::Lz4, 4 << 20),
+];
 
 #[test]
 fn recordings_compressed_by_other_programs_are_read() {
@@ -158,10 +218,17 @@ fn recordings_compressed_by_other_programs_are_read() {
         let compressed = recompress(&uncompressed, compression, chunk_bytes);
         std::fs::write(&path, &compressed).expect("the file");
         let (read, recording) = replay(&path);
-        assert!(read == sent, "{compression:?}, chunks of {chunk_bytes} bytes: {} samples", read.len());
+        assert!(
+            read == sent,
+            "{compression:?}, chunks of {chunk_bytes} bytes: {} samples",
+            read.len()
+        );
         assert_eq!(recording.damage(), None);
         assert_eq!(recording.attachment(RIG_FILE), Some(RIG.as_bytes()));
-        assert_eq!(recording.joint_names(), Some(&["a".to_owned(), "b".to_owned()][..]));
+        assert_eq!(
+            recording.joint_names(),
+            Some(&["a".to_owned(), "b".to_owned()][..])
+        );
     }
 }
 
@@ -176,7 +243,11 @@ fn truncated_compressed_recording_yields_samples_of_complete_chunks() {
         let compressed = recompress(&uncompressed, compression, 20_000);
         std::fs::write(&path, &compressed[..compressed.len() / 2]).expect("a shorter file");
         let (read, recording) = replay(&path);
-        assert!(read.len() > sent.len() / 8 && read[..] == sent[..read.len()], "{} samples", read.len());
+        assert!(
+            read.len() > sent.len() / 8 && read[..] == sent[..read.len()],
+            "{} samples",
+            read.len()
+        );
         let damage = recording.damage().expect("the truncation is reported");
         assert!(damage.contains("is truncated after"), "{damage}");
     }
@@ -200,7 +271,10 @@ fn flipped_bit_is_detected() {
             Err(e) => break Some(e.to_string()),
         }
     };
-    assert!(n_samples > 10 && damage_or_error.is_some(), "{n_samples} samples, {damage_or_error:?}");
+    assert!(
+        n_samples > 10 && damage_or_error.is_some(),
+        "{n_samples} samples, {damage_or_error:?}"
+    );
 }
 
 #[test]
@@ -216,14 +290,18 @@ fn an_unfinished_recording_is_readable() {
     let (read, recording) = replay(&path);
     assert!(read[..] == sent[..read.len()]);
     let last = read.last().expect("some").stamp();
-    assert!(sent[sent.len() - 1].stamp().0 - last.0 < 1_100_000_000, "at most about a second is lost");
+    assert!(
+        sent[sent.len() - 1].stamp().0 - last.0 < 1_100_000_000,
+        "at most about a second is lost"
+    );
     assert!(recording.damage().is_some());
 }
 
 #[test]
 fn non_recordings_are_rejected() {
     let folder = tempfile::tempdir().expect("a folder");
-    let missing = Recording::open(&folder.path().join("missing.mcap")).expect_err("the file does not exist");
+    let missing =
+        Recording::open(&folder.path().join("missing.mcap")).expect_err("the file does not exist");
     assert!(matches!(missing, Error::Open { .. }) && missing.to_string().contains("missing.mcap"));
     for content in [&b""[..], b"short", b"a longer text that is not a recording"] {
         let path = folder.path().join("text.mcap");
@@ -235,7 +313,10 @@ fn non_recordings_are_rejected() {
     record(&empty, &samples());
     let bytes = std::fs::read(&empty).expect("the file");
     std::fs::write(&empty, &bytes[..100]).expect("a shorter file");
-    assert!(matches!(Recording::open(&empty), Err(Error::EmptyRecording { .. })));
+    assert!(matches!(
+        Recording::open(&empty),
+        Err(Error::EmptyRecording { .. })
+    ));
 }
 
 #[test]
@@ -244,7 +325,11 @@ fn existing_file_is_rejected_and_unchanged() {
     let path = folder.path().join("run.mcap");
     record(&path, &samples());
     let before = std::fs::read(&path).expect("the file");
-    let error = Recorder::create(&path, &RecordingMetadata::default()).expect_err("the file exists");
-    assert!(matches!(error, Error::Exists { .. }) && error.to_string().contains("run.mcap"), "{error}");
+    let error =
+        Recorder::create(&path, &RecordingMetadata::default()).expect_err("the file exists");
+    assert!(
+        matches!(error, Error::Exists { .. }) && error.to_string().contains("run.mcap"),
+        "{error}"
+    );
     assert!(std::fs::read(&path).expect("the file") == before);
 }

@@ -1,15 +1,17 @@
-//! What the reader of one input may use: the limits of all formats, and the checks before anything is allocated.
+//! What the reader of one input may use: the limits of all formats, and the checks before anything
+//! is allocated.
 
 use std::fmt;
 
 /// Memory for decoded data that any input may use, bytes.
 const FREE_BYTES: u64 = 64 << 20;
 
-/// Limits for one input. All are checked against numbers that the input declares, before memory is allocated for them.
+/// Limits for one input. All are checked against numbers that the input declares, before memory is
+/// allocated for them.
 ///
-/// Nesting has no limit of its own here: the parsers of JSON and TOML stop at 128 levels or fewer, and robot descriptions
-/// are parsed without recursion, with the limits of `kinematics::urdf`. Time has none either, because all readers are
-/// linear in the size of their input.
+/// Nesting has no limit of its own here: the parsers of JSON and TOML stop at 128 levels or fewer,
+/// and robot descriptions are parsed without recursion, with the limits of `kinematics::urdf`. Time
+/// has none either, because all readers are linear in the size of their input.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Budget {
     /// Size of the input, bytes.
@@ -22,25 +24,63 @@ pub struct Budget {
 
 impl Budget {
     /// Texts: rig files, lists, reports, samples.
-    pub const TEXT: Self = Self { max_bytes: 64 << 20, max_elements: u64::MAX, max_expansion: u64::MAX };
+    pub const TEXT: Self = Self {
+        max_bytes: 64 << 20,
+        max_elements: u64::MAX,
+        max_expansion: u64::MAX,
+    };
     /// Tables with free names in a rig file: cameras, scanners, motors or tags.
-    pub const RIG_TABLES: Self = Self { max_elements: 1000, ..Self::TEXT };
+    pub const RIG_TABLES: Self = Self {
+        max_elements: 1000,
+        ..Self::TEXT
+    };
     /// Meshes of a robot, which are passed on as they are.
-    pub const MESH: Self = Self { max_bytes: 64 << 20, max_elements: u64::MAX, max_expansion: 1 };
+    pub const MESH: Self = Self {
+        max_bytes: 64 << 20,
+        max_elements: u64::MAX,
+        max_expansion: 1,
+    };
     /// All meshes of a robot together.
-    pub const MESHES: Self = Self { max_bytes: 256 << 20, ..Self::MESH };
+    pub const MESHES: Self = Self {
+        max_bytes: 256 << 20,
+        ..Self::MESH
+    };
     /// Color images; elements are pixels. A small file of a uniform image can contain very many.
-    pub const COLOR_IMAGE: Self = Self { max_bytes: 1 << 30, max_elements: 1 << 27, max_expansion: u64::MAX };
+    pub const COLOR_IMAGE: Self = Self {
+        max_bytes: 1 << 30,
+        max_elements: 1 << 27,
+        max_expansion: u64::MAX,
+    };
     /// Depth images; elements are pixels.
-    pub const DEPTH_IMAGE: Self = Self { max_elements: 1 << 25, ..Self::COLOR_IMAGE };
-    /// Records of recordings; the largest contains one image. Compressed records expand to at most this size, too.
-    pub const RECORD: Self = Self { max_bytes: 512 << 20, max_elements: u64::MAX, max_expansion: u64::MAX };
+    pub const DEPTH_IMAGE: Self = Self {
+        max_elements: 1 << 25,
+        ..Self::COLOR_IMAGE
+    };
+    /// Records of recordings; the largest contains one image. Compressed records expand to at most
+    /// this size, too.
+    pub const RECORD: Self = Self {
+        max_bytes: 512 << 20,
+        max_elements: u64::MAX,
+        max_expansion: u64::MAX,
+    };
     /// Files of splats. Compressed ones expand by a factor of 2 to 4.
-    pub const SPLATS: Self = Self { max_bytes: u64::MAX, max_elements: 100_000_000, max_expansion: 50 };
+    pub const SPLATS: Self = Self {
+        max_bytes: u64::MAX,
+        max_elements: 100_000_000,
+        max_expansion: 50,
+    };
     /// Point clouds from which training starts.
-    pub const POINTS: Self = Self { max_bytes: 1 << 30, ..Self::SPLATS };
-    /// Files whose decoded data is not larger than the file: checkpoints, weights. Their size is limited by the disk only.
-    pub const PLAIN: Self = Self { max_bytes: u64::MAX, max_elements: u64::MAX, max_expansion: 1 };
+    pub const POINTS: Self = Self {
+        max_bytes: 1 << 30,
+        ..Self::SPLATS
+    };
+    /// Files whose decoded data is not larger than the file: checkpoints, weights. Their size is
+    /// limited by the disk only.
+    pub const PLAIN: Self = Self {
+        max_bytes: u64::MAX,
+        max_elements: u64::MAX,
+        max_expansion: 1,
+    };
 
     /// Checks the size of an input.
     ///
@@ -48,7 +88,10 @@ impl Budget {
     /// If the input is larger.
     pub fn check_bytes(&self, n_bytes: u64) -> Result<(), OverBudget> {
         if n_bytes > self.max_bytes {
-            return Err(OverBudget::Bytes { n_bytes, max_bytes: self.max_bytes });
+            return Err(OverBudget::Bytes {
+                n_bytes,
+                max_bytes: self.max_bytes,
+            });
         }
         Ok(())
     }
@@ -59,7 +102,10 @@ impl Budget {
     /// If there are more.
     pub fn check_elements(&self, n: u64) -> Result<(), OverBudget> {
         if n > self.max_elements {
-            return Err(OverBudget::Elements { n, max: self.max_elements });
+            return Err(OverBudget::Elements {
+                n,
+                max: self.max_elements,
+            });
         }
         Ok(())
     }
@@ -68,9 +114,16 @@ impl Budget {
     ///
     /// # Errors
     /// If an input of this size cannot contain as much.
-    pub fn check_decoded(&self, n_decoded_bytes: u64, n_input_bytes: u64) -> Result<(), OverBudget> {
+    pub fn check_decoded(
+        &self,
+        n_decoded_bytes: u64,
+        n_input_bytes: u64,
+    ) -> Result<(), OverBudget> {
         if n_decoded_bytes > FREE_BYTES.max(self.max_expansion.saturating_mul(n_input_bytes)) {
-            return Err(OverBudget::Decoded { n_decoded_bytes, n_input_bytes });
+            return Err(OverBudget::Decoded {
+                n_decoded_bytes,
+                n_input_bytes,
+            });
         }
         Ok(())
     }
@@ -78,7 +131,10 @@ impl Budget {
     /// What is left of the size after a part of the input.
     #[must_use]
     pub fn after(&self, n_bytes: u64) -> Self {
-        Self { max_bytes: self.max_bytes.saturating_sub(n_bytes), ..*self }
+        Self {
+            max_bytes: self.max_bytes.saturating_sub(n_bytes),
+            ..*self
+        }
     }
 }
 
@@ -111,10 +167,18 @@ pub enum OverBudget {
 impl fmt::Display for OverBudget {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Self::Bytes { n_bytes, max_bytes } => write!(f, "it has {n_bytes} bytes, at most {max_bytes} are read"),
+            Self::Bytes { n_bytes, max_bytes } => {
+                write!(f, "it has {n_bytes} bytes, at most {max_bytes} are read")
+            }
             Self::Elements { n, max } => write!(f, "it declares {n}, expected at most {max}"),
-            Self::Decoded { n_decoded_bytes, n_input_bytes } => {
-                write!(f, "it declares {n_decoded_bytes} bytes, which {n_input_bytes} bytes cannot contain")
+            Self::Decoded {
+                n_decoded_bytes,
+                n_input_bytes,
+            } => {
+                write!(
+                    f,
+                    "it declares {n_decoded_bytes} bytes, which {n_input_bytes} bytes cannot contain"
+                )
             }
         }
     }
@@ -126,7 +190,9 @@ impl From<OverBudget> for std::io::Error {
     fn from(error: OverBudget) -> Self {
         let kind = match error {
             OverBudget::Bytes { .. } => std::io::ErrorKind::FileTooLarge,
-            OverBudget::Elements { .. } | OverBudget::Decoded { .. } => std::io::ErrorKind::InvalidData,
+            OverBudget::Elements { .. } | OverBudget::Decoded { .. } => {
+                std::io::ErrorKind::InvalidData
+            }
         };
         Self::new(kind, error.to_string())
     }
@@ -138,24 +204,57 @@ mod tests {
 
     #[test]
     fn limits_are_inclusive_and_small_inputs_have_free_memory() {
-        let budget = Budget { max_bytes: 10, max_elements: 3, max_expansion: 2 };
+        let budget = Budget {
+            max_bytes: 10,
+            max_elements: 3,
+            max_expansion: 2,
+        };
         assert_eq!(budget.check_bytes(10), Ok(()));
-        assert_eq!(budget.check_bytes(11), Err(OverBudget::Bytes { n_bytes: 11, max_bytes: 10 }));
-        assert_eq!(budget.after(4).check_bytes(7), Err(OverBudget::Bytes { n_bytes: 7, max_bytes: 6 }));
+        assert_eq!(
+            budget.check_bytes(11),
+            Err(OverBudget::Bytes {
+                n_bytes: 11,
+                max_bytes: 10
+            })
+        );
+        assert_eq!(
+            budget.after(4).check_bytes(7),
+            Err(OverBudget::Bytes {
+                n_bytes: 7,
+                max_bytes: 6
+            })
+        );
         assert_eq!(budget.after(11).max_bytes, 0);
         assert_eq!(budget.check_elements(3), Ok(()));
-        assert_eq!(budget.check_elements(4), Err(OverBudget::Elements { n: 4, max: 3 }));
+        assert_eq!(
+            budget.check_elements(4),
+            Err(OverBudget::Elements { n: 4, max: 3 })
+        );
         assert_eq!(budget.check_decoded(FREE_BYTES, 1), Ok(()));
         assert!(budget.check_decoded(FREE_BYTES + 1, 1).is_err());
         assert_eq!(budget.check_decoded(2 * FREE_BYTES, FREE_BYTES), Ok(()));
-        assert!(budget.check_decoded(2 * FREE_BYTES + 1, FREE_BYTES).is_err());
-        assert_eq!(Budget::TEXT.check_decoded(u64::MAX, 2), Ok(()), "no overflow");
+        assert!(
+            budget
+                .check_decoded(2 * FREE_BYTES + 1, FREE_BYTES)
+                .is_err()
+        );
+        assert_eq!(
+            Budget::TEXT.check_decoded(u64::MAX, 2),
+            Ok(()),
+            "no overflow"
+        );
     }
 
     #[test]
     fn errors_name_value_and_limit() {
         let too_large = Budget::TEXT.check_bytes(65 << 20).expect_err("too large");
-        assert_eq!(too_large.to_string(), "it has 68157440 bytes, at most 67108864 are read");
-        assert_eq!(std::io::Error::from(too_large).kind(), std::io::ErrorKind::FileTooLarge);
+        assert_eq!(
+            too_large.to_string(),
+            "it has 68157440 bytes, at most 67108864 are read"
+        );
+        assert_eq!(
+            std::io::Error::from(too_large).kind(),
+            std::io::ErrorKind::FileTooLarge
+        );
     }
 }

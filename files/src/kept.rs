@@ -30,7 +30,10 @@ impl Kept {
     /// # Errors
     /// If it cannot be opened.
     pub fn open(path: &Path) -> std::io::Result<Self> {
-        Ok(Self { path: path.to_owned(), file: File::open(path)? })
+        Ok(Self {
+            path: path.to_owned(),
+            file: File::open(path)?,
+        })
     }
 
     /// The path at which it was opened.
@@ -41,12 +44,15 @@ impl Kept {
     /// Where it is now.
     pub fn place(&self) -> Place {
         let is_this = |metadata: Metadata| {
-            self.file.metadata().is_ok_and(|own| (own.dev(), own.ino()) == (metadata.dev(), metadata.ino()))
+            self.file
+                .metadata()
+                .is_ok_and(|own| (own.dev(), own.ino()) == (metadata.dev(), metadata.ino()))
         };
         if self.path.metadata().is_ok_and(is_this) {
             return Place::Here;
         }
-        // Only Linux reports the path of an open file. For a removed file, this path ends with " (deleted)" and does not exist.
+        // Only Linux reports the path of an open file. For a removed file, this path ends with "
+        // (deleted)" and does not exist.
         let now = std::fs::read_link(self.in_proc());
         let moved = now.ok().filter(|now| now.metadata().is_ok_and(is_this));
         moved.map_or(Place::Removed, Place::MovedTo)
@@ -62,7 +68,9 @@ impl Kept {
             Err(error) if error.kind() == ErrorKind::NotFound => self.file.try_clone()?,
             opened => opened?,
         };
-        crate::create(&self.path, |file| std::io::copy(&mut contents, file).map(drop))
+        crate::create(&self.path, |file| {
+            std::io::copy(&mut contents, file).map(drop)
+        })
     }
 
     fn in_proc(&self) -> PathBuf {
@@ -90,7 +98,10 @@ mod tests {
         assert!(kept.restore().is_err(), "the other file stays");
         fs::remove_file(&path).expect("it exists");
         kept.restore().expect("space");
-        assert_eq!(fs::read_to_string(&path).expect("it is there"), "written later");
+        assert_eq!(
+            fs::read_to_string(&path).expect("it is there"),
+            "written later"
+        );
     }
 
     #[test]
@@ -100,7 +111,10 @@ mod tests {
         fs::create_dir(&old).expect("space");
         let kept = Kept::open(&old).expect("it exists");
         fs::rename(&old, &new).expect("it exists");
-        assert_eq!(kept.place(), Place::MovedTo(new.canonicalize().expect("it exists")));
+        assert_eq!(
+            kept.place(),
+            Place::MovedTo(new.canonicalize().expect("it exists"))
+        );
         fs::remove_dir(&new).expect("it is empty");
         assert_eq!(kept.place(), Place::Removed);
     }

@@ -1,7 +1,7 @@
 //! Names and removes output files and folders that were not written completely.
 //!
-//! After an error or a signal, the writing functions of this crate remove what they have not finished. What a killed program
-//! leaves behind is removed when the same file is written again.
+//! After an error or a signal, the writing functions of this crate remove what they have not
+//! finished. What a killed program leaves behind is removed when the same file is written again.
 
 use parking_lot::{Mutex, MutexGuard};
 use std::collections::BTreeSet;
@@ -13,19 +13,23 @@ use std::path::{Path, PathBuf};
 /// The files and folders that this process is writing.
 static IN_PROGRESS: Mutex<BTreeSet<PathBuf>> = Mutex::new(BTreeSet::new());
 
-/// Start and end of temporary names. No other program uses them, so what has such a name and is not locked is a leftover of
-/// this program and can be removed. A name like `scene.ply.part` could be that of an unfinished download.
+/// Start and end of temporary names. No other program uses them, so what has such a name and is not
+/// locked is a leftover of this program and can be removed. A name like `scene.ply.part` could be
+/// that of an unfinished download.
 const PREFIX: &[u8] = b".";
 const SUFFIX: &[u8] = b".fieldrig.part";
 /// Maximum length of a file name on Linux and macOS.
 const MAX_NAME_BYTES: usize = 255;
 
-/// Temporary path of a file or folder that is being written: `.NAME.fieldrig.part` in the same folder.
+/// Temporary path of a file or folder that is being written: `.NAME.fieldrig.part` in the same
+/// folder.
 ///
-/// It depends only on the path, so that programs that write the same file at the same time notice each other.
+/// It depends only on the path, so that programs that write the same file at the same time notice
+/// each other.
 pub fn path_of(path: &Path) -> PathBuf {
     let name = path.file_name().unwrap_or_default().as_bytes();
-    // Very long names are cut. Two that begin with the same letters exclude each other, as if they were the same.
+    // Very long names are cut. Two that begin with the same letters exclude each other, as if they
+    // were the same.
     let name = &name[..name.len().min(MAX_NAME_BYTES - PREFIX.len() - SUFFIX.len())];
     path.with_file_name(OsStr::from_bytes(&[PREFIX, name, SUFFIX].concat()))
 }
@@ -68,25 +72,41 @@ pub struct NoNewFiles {
 pub fn remove_all() -> NoNewFiles {
     let in_progress = IN_PROGRESS.lock();
     in_progress.iter().for_each(|path| remove(path));
-    NoNewFiles { _in_progress: in_progress }
+    NoNewFiles {
+        _in_progress: in_progress,
+    }
 }
 
-/// Removes the temporary file or folder that a killed program left at a path of [`path_of`], if there is one. A folder is
-/// removed only if it contains nothing but entries with these names, complete or not.
+/// Removes the temporary file or folder that a killed program left at a path of [`path_of`], if
+/// there is one. A folder is removed only if it contains nothing but entries with these names,
+/// complete or not.
 ///
 /// # Errors
 /// If the folder has other entries, or cannot be removed.
 pub fn remove_leftover(unfinished: &Path, names: &[&OsStr]) -> std::io::Result<()> {
-    let cannot_remove =
-        |error: Error| Error::new(error.kind(), format!("cannot remove {}: {error}", unfinished.display()));
+    let cannot_remove = |error: Error| {
+        Error::new(
+            error.kind(),
+            format!("cannot remove {}: {error}", unfinished.display()),
+        )
+    };
     if is_folder(unfinished) {
         let own_paths: Vec<PathBuf> = names.iter().map(|name| unfinished.join(name)).collect();
-        let is_own = |entry: &Path| own_paths.iter().any(|own| entry == own || entry == path_of(own));
-        let mut entries = std::fs::read_dir(unfinished).map_err(cannot_remove)?.flatten();
+        let is_own = |entry: &Path| {
+            own_paths
+                .iter()
+                .any(|own| entry == own || entry == path_of(own))
+        };
+        let mut entries = std::fs::read_dir(unfinished)
+            .map_err(cannot_remove)?
+            .flatten();
         if entries.any(|entry| !is_own(&entry.path())) {
             return Err(Error::new(
                 ErrorKind::AlreadyExists,
-                format!("{} is a folder with other files; remove it, or choose another name", unfinished.display()),
+                format!(
+                    "{} is a folder with other files; remove it, or choose another name",
+                    unfinished.display()
+                ),
             ));
         }
     }
@@ -96,12 +116,19 @@ pub fn remove_leftover(unfinished: &Path, names: &[&OsStr]) -> std::io::Result<(
 /// Removes a file, a link or a folder, if it is there; warns if this fails.
 fn remove(path: &Path) {
     if let Err(error) = remove_any(path) {
-        log::warn!("cannot remove the incomplete output {}: {error}", path.display());
+        log::warn!(
+            "cannot remove the incomplete output {}: {error}",
+            path.display()
+        );
     }
 }
 
 fn remove_any(path: &Path) -> std::io::Result<()> {
-    let removed = if is_folder(path) { std::fs::remove_dir_all(path) } else { std::fs::remove_file(path) };
+    let removed = if is_folder(path) {
+        std::fs::remove_dir_all(path)
+    } else {
+        std::fs::remove_file(path)
+    };
     match removed {
         Err(error) if error.kind() == ErrorKind::NotFound => Ok(()),
         removed => removed,
@@ -110,7 +137,8 @@ fn remove_any(path: &Path) -> std::io::Result<()> {
 
 /// Whether a path is a folder, and not a link to one.
 fn is_folder(path: &Path) -> bool {
-    path.symlink_metadata().is_ok_and(|metadata| metadata.is_dir())
+    path.symlink_metadata()
+        .is_ok_and(|metadata| metadata.is_dir())
 }
 
 #[cfg(test)]
@@ -148,6 +176,9 @@ mod tests {
         let [dropped, mut kept] = registered;
         kept.disarm();
         drop((dropped, kept));
-        assert_eq!(["dropped", "kept"].map(|name| at(name).exists()), [false, true]);
+        assert_eq!(
+            ["dropped", "kept"].map(|name| at(name).exists()),
+            [false, true]
+        );
     }
 }

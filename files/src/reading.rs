@@ -11,10 +11,14 @@ use std::path::Path;
 /// # Errors
 /// If the file cannot be opened, or is a folder, a pipe, a socket or a device.
 pub fn open(path: &Path) -> std::io::Result<File> {
-    // Opening a pipe waits for its writer, and opening a device may start it, so the type is checked before, too.
+    // Opening a pipe waits for its writer, and opening a device may start it, so the type is
+    // checked before, too.
     check_type(&std::fs::metadata(path)?.file_type())?;
     let flags = rustix::fs::OFlags::NONBLOCK.bits().cast_signed();
-    let file = OpenOptions::new().read(true).custom_flags(flags).open(path)?;
+    let file = OpenOptions::new()
+        .read(true)
+        .custom_flags(flags)
+        .open(path)?;
     check_type(&file.metadata()?.file_type())?;
     Ok(file)
 }
@@ -33,7 +37,10 @@ fn check_type(kind: &std::fs::FileType) -> std::io::Result<()> {
     } else {
         "a device"
     };
-    Err(Error::new(ErrorKind::InvalidInput, format!("it is {what}; expected a file")))
+    Err(Error::new(
+        ErrorKind::InvalidInput,
+        format!("it is {what}; expected a file"),
+    ))
 }
 
 /// Reads a regular file within a budget.
@@ -47,7 +54,8 @@ pub fn read(path: &Path, budget: Budget) -> std::io::Result<Vec<u8>> {
     let mut bytes = Vec::new();
     bytes.try_reserve_exact(usize::try_from(n_bytes).unwrap_or(usize::MAX))?;
     // The file may grow, and files in /proc have no size.
-    file.take(budget.max_bytes.saturating_add(1)).read_to_end(&mut bytes)?;
+    file.take(budget.max_bytes.saturating_add(1))
+        .read_to_end(&mut bytes)?;
     budget.check_bytes(bytes.len() as u64)?;
     Ok(bytes)
 }
@@ -58,9 +66,15 @@ pub fn read(path: &Path, budget: Budget) -> std::io::Result<Vec<u8>> {
 /// As [`read`], and if the file is not UTF-8.
 pub fn read_text(path: &Path) -> std::io::Result<String> {
     let bytes = read(path, Budget::TEXT)?;
-    let is_utf_16 = [[0xFF, 0xFE], [0xFE, 0xFF]].iter().any(|mark| bytes.starts_with(mark));
+    let is_utf_16 = [[0xFF, 0xFE], [0xFE, 0xFF]]
+        .iter()
+        .any(|mark| bytes.starts_with(mark));
     let mut text = String::from_utf8(bytes).map_err(|_| {
-        let found = if is_utf_16 { "it is UTF-16 text; save it as UTF-8" } else { "it is not UTF-8 text" };
+        let found = if is_utf_16 {
+            "it is UTF-16 text; save it as UTF-8"
+        } else {
+            "it is not UTF-8 text"
+        };
         Error::new(ErrorKind::InvalidData, found)
     })?;
     if text.starts_with('\u{FEFF}') {
@@ -79,27 +93,62 @@ mod tests {
     fn only_regular_files_up_to_the_limit_are_read() {
         let folder = tempfile::tempdir().expect("a folder");
         let at = |name: &str| folder.path().join(name);
-        let of_bytes = |max_bytes| Budget { max_bytes, ..Budget::TEXT };
+        let of_bytes = |max_bytes| Budget {
+            max_bytes,
+            ..Budget::TEXT
+        };
         std::fs::write(at("text"), "twelve bytes").expect("written");
         symlink(at("text"), at("link")).expect("a link");
-        assert_eq!(read(&at("link"), of_bytes(12)).expect("a link to a file"), b"twelve bytes");
+        assert_eq!(
+            read(&at("link"), of_bytes(12)).expect("a link to a file"),
+            b"twelve bytes"
+        );
         assert_eq!(read_text(&at("text")).expect("text"), "twelve bytes");
-        assert_eq!(read(&at("text"), of_bytes(11)).expect_err("too large").kind(), ErrorKind::FileTooLarge);
+        assert_eq!(
+            read(&at("text"), of_bytes(11))
+                .expect_err("too large")
+                .kind(),
+            ErrorKind::FileTooLarge
+        );
         std::fs::write(at("latin"), [b'a', 0xE4]).expect("written");
-        assert_eq!(read_text(&at("latin")).expect_err("not UTF-8").to_string(), "it is not UTF-8 text");
+        assert_eq!(
+            read_text(&at("latin")).expect_err("not UTF-8").to_string(),
+            "it is not UTF-8 text"
+        );
         std::fs::write(at("marked"), "\u{FEFF}text").expect("written");
         assert_eq!(read_text(&at("marked")).expect("text"), "text");
         std::fs::write(at("wide"), [0xFF, 0xFE, b'a', 0]).expect("written");
-        assert_eq!(read_text(&at("wide")).expect_err("UTF-16").to_string(), "it is UTF-16 text; save it as UTF-8");
-        assert_eq!(read(&at("absent"), of_bytes(1)).expect_err("absent").kind(), ErrorKind::NotFound);
-        assert_eq!(read(folder.path(), of_bytes(1)).expect_err("a folder").to_string(), "it is a folder");
-        let made = Command::new("mkfifo").arg(at("pipe")).status().expect("mkfifo is part of every system");
+        assert_eq!(
+            read_text(&at("wide")).expect_err("UTF-16").to_string(),
+            "it is UTF-16 text; save it as UTF-8"
+        );
+        assert_eq!(
+            read(&at("absent"), of_bytes(1)).expect_err("absent").kind(),
+            ErrorKind::NotFound
+        );
+        assert_eq!(
+            read(folder.path(), of_bytes(1))
+                .expect_err("a folder")
+                .to_string(),
+            "it is a folder"
+        );
+        let made = Command::new("mkfifo")
+            .arg(at("pipe"))
+            .status()
+            .expect("mkfifo is part of every system");
         assert!(made.success());
         symlink("/dev/zero", at("zero")).expect("a link");
         for (name, what) in [("pipe", "it is a pipe"), ("zero", "it is a device")] {
-            let error = read(&at(name), Budget::PLAIN).expect_err("not a file").to_string();
+            let error = read(&at(name), Budget::PLAIN)
+                .expect_err("not a file")
+                .to_string();
             assert!(error.starts_with(what), "{error}");
         }
-        assert!(read(Path::new("/proc/self/status"), Budget::TEXT).expect("a file without a size").len() > 100);
+        assert!(
+            read(Path::new("/proc/self/status"), Budget::TEXT)
+                .expect("a file without a size")
+                .len()
+                > 100
+        );
     }
 }

@@ -11,8 +11,13 @@ use std::path::{Path, PathBuf};
 ///
 /// # Errors
 /// If the file cannot be written, or another program is writing it; the previous file is kept.
-pub fn replace(path: &Path, contents: impl FnOnce(&mut File) -> std::io::Result<()>) -> std::io::Result<()> {
-    write_and_publish(path, contents, |unfinished| std::fs::rename(unfinished, path))
+pub fn replace(
+    path: &Path,
+    contents: impl FnOnce(&mut File) -> std::io::Result<()>,
+) -> std::io::Result<()> {
+    write_and_publish(path, contents, |unfinished| {
+        std::fs::rename(unfinished, path)
+    })
 }
 
 /// As [`replace`], with contents that are in memory.
@@ -23,7 +28,8 @@ pub fn write(path: &Path, contents: impl AsRef<[u8]>) -> std::io::Result<()> {
     replace(path, |file| file.write_all(contents.as_ref()))
 }
 
-/// Starts a file that grows while it is written, such as a log. A file or link with this name is removed first.
+/// Starts a file that grows while it is written, such as a log. A file or link with this name is
+/// removed first.
 ///
 /// # Errors
 /// If the file cannot be created.
@@ -37,8 +43,12 @@ pub fn begin(path: &Path) -> std::io::Result<File> {
 /// Writes a new file.
 ///
 /// # Errors
-/// If the file cannot be written, a file or symbolic link with this name exists, or another program is writing it.
-pub fn create(path: &Path, contents: impl FnOnce(&mut File) -> std::io::Result<()>) -> std::io::Result<()> {
+/// If the file cannot be written, a file or symbolic link with this name exists, or another program
+/// is writing it.
+pub fn create(
+    path: &Path,
+    contents: impl FnOnce(&mut File) -> std::io::Result<()>,
+) -> std::io::Result<()> {
     if path.symlink_metadata().is_ok() {
         return Err(exists());
     }
@@ -49,7 +59,10 @@ pub fn create(path: &Path, contents: impl FnOnce(&mut File) -> std::io::Result<(
 ///
 /// # Errors
 /// The errors of `write`, and those of [`create`].
-pub fn create_from<T, E: From<Error>>(path: &Path, write: impl FnOnce(&Path) -> Result<T, E>) -> Result<T, E> {
+pub fn create_from<T, E: From<Error>>(
+    path: &Path,
+    write: impl FnOnce(&Path) -> Result<T, E>,
+) -> Result<T, E> {
     if path.symlink_metadata().is_ok() {
         return Err(exists().into());
     }
@@ -61,9 +74,10 @@ pub fn create_from<T, E: From<Error>>(path: &Path, write: impl FnOnce(&Path) -> 
     Ok(written)
 }
 
-/// Calls `write` with a path in a temporary folder, where it writes a folder, and moves this folder to `path`. If `path` is
-/// a folder already, those of its `entries` that were written are moved into it, in this order: a killed program may leave
-/// the first ones, so the last one should be the one that readers look for.
+/// Calls `write` with a path in a temporary folder, where it writes a folder, and moves this folder
+/// to `path`. If `path` is a folder already, those of its `entries` that were written are moved
+/// into it, in this order: a killed program may leave the first ones, so the last one should be the
+/// one that readers look for.
 ///
 /// # Errors
 /// The errors of `write`, and those of [`create`]. What has been moved is removed again.
@@ -125,18 +139,30 @@ fn publish(from: &Path, to: &Path) -> std::io::Result<()> {
 
 /// A rename is durable only after the folder is synced.
 fn sync_parent(path: &Path) -> std::io::Result<()> {
-    let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let folder = path
+        .parent()
+        .filter(|folder| !folder.as_os_str().is_empty())
+        .unwrap_or(Path::new("."));
     match File::open(folder)?.sync_all() {
         // Some network file systems cannot sync folders.
-        Err(error) if matches!(error.kind(), ErrorKind::InvalidInput | ErrorKind::Unsupported) => Ok(()),
+        Err(error)
+            if matches!(
+                error.kind(),
+                ErrorKind::InvalidInput | ErrorKind::Unsupported
+            ) =>
+        {
+            Ok(())
+        }
         synced => synced,
     }
 }
 
-/// A file or folder with a temporary name, locked by this process; removed on drop if it is still there.
+/// A file or folder with a temporary name, locked by this process; removed on drop if it is still
+/// there.
 struct Unfinished {
     path: PathBuf,
-    /// Declared before `file`: fields drop in order, so the path is removed while it is still locked.
+    /// Declared before `file`: fields drop in order, so the path is removed while it is still
+    /// locked.
     registered: Registered,
     /// The file, or the folder opened for the lock.
     file: File,
@@ -157,9 +183,13 @@ impl Unfinished {
         })
     }
 
-    /// Makes and locks the temporary file. One that is left over from a program that was killed is removed first.
-    /// Until it is locked, another program may mistake it for a leftover and remove it; then `make` returns `None`.
-    fn new(path: &Path, make: impl Fn(&Path) -> std::io::Result<Option<File>>) -> std::io::Result<Self> {
+    /// Makes and locks the temporary file. One that is left over from a program that was killed is
+    /// removed first. Until it is locked, another program may mistake it for a leftover and remove
+    /// it; then `make` returns `None`.
+    fn new(
+        path: &Path,
+        make: impl Fn(&Path) -> std::io::Result<Option<File>>,
+    ) -> std::io::Result<Self> {
         const MAX_ATTEMPTS: usize = 100;
         let busy = || Error::new(ErrorKind::ResourceBusy, "another program is writing it");
         let unfinished = partial::path_of(path);
@@ -170,20 +200,27 @@ impl Unfinished {
                 Ok(Some(file)) => {
                     if try_lock(&file)? && is_at(&file, &unfinished) {
                         let registered = Registered::new(&unfinished);
-                        return Ok(Self { path: unfinished, registered, file });
+                        return Ok(Self {
+                            path: unfinished,
+                            registered,
+                            file,
+                        });
                     }
                 }
                 Err(error) if error.kind() == ErrorKind::AlreadyExists => {
-                    let flags = OFlags::RDONLY | OFlags::NOFOLLOW | OFlags::NONBLOCK | OFlags::CLOEXEC;
+                    let flags =
+                        OFlags::RDONLY | OFlags::NOFOLLOW | OFlags::NONBLOCK | OFlags::CLOEXEC;
                     match rustix::fs::open(&unfinished, flags, Mode::empty()).map(File::from) {
                         Ok(leftover) if !try_lock(&leftover)? => return Err(busy()),
-                        // Holding the lock keeps other programs from removing a new file at this path in the meantime.
+                        // Holding the lock keeps other programs from removing a new file at this
+                        // path in the meantime.
                         Ok(leftover) if is_at(&leftover, &unfinished) => {
                             partial::remove_leftover(&unfinished, &[name])?;
                         }
                         // Its program has just published or removed it.
                         Ok(_) | Err(rustix::io::Errno::NOENT) => {}
-                        // A symbolic link and a socket cannot be opened, and no program is writing them.
+                        // A symbolic link and a socket cannot be opened, and no program is writing
+                        // them.
                         Err(_) => partial::remove_leftover(&unfinished, &[name])?,
                     }
                 }
@@ -194,7 +231,8 @@ impl Unfinished {
     }
 }
 
-/// Takes the lock of an open file; returns whether it was free. On a file system without locks, always returns true.
+/// Takes the lock of an open file; returns whether it was free. On a file system without locks,
+/// always returns true.
 fn try_lock(file: &File) -> std::io::Result<bool> {
     match flock(file, FlockOperation::NonBlockingLockExclusive) {
         Ok(()) | Err(rustix::io::Errno::NOTSUP | rustix::io::Errno::NOLCK) => Ok(true),
@@ -205,18 +243,24 @@ fn try_lock(file: &File) -> std::io::Result<bool> {
 
 fn is_at(file: &File, path: &Path) -> bool {
     let id = |metadata: std::fs::Metadata| (metadata.dev(), metadata.ino());
-    file.metadata().is_ok_and(|open| path.symlink_metadata().is_ok_and(|named| id(open) == id(named)))
+    file.metadata().is_ok_and(|open| {
+        path.symlink_metadata()
+            .is_ok_and(|named| id(open) == id(named))
+    })
 }
 
-/// Takes the lock of a file, which is created if necessary and keeps its contents. Returns `None` if another program
-/// holds it. The lock is released when the file is closed.
+/// Takes the lock of a file, which is created if necessary and keeps its contents. Returns `None`
+/// if another program holds it. The lock is released when the file is closed.
 ///
 /// # Errors
 /// If the file cannot be created, or is a symbolic link.
 pub fn lock(path: &Path) -> std::io::Result<Option<File>> {
-    let flags = OFlags::RDWR | OFlags::CREATE | OFlags::NOFOLLOW | OFlags::NONBLOCK | OFlags::CLOEXEC;
+    let flags =
+        OFlags::RDWR | OFlags::CREATE | OFlags::NOFOLLOW | OFlags::NONBLOCK | OFlags::CLOEXEC;
     let file = match rustix::fs::open(path, flags, Mode::from_raw_mode(0o666)) {
-        Err(rustix::io::Errno::LOOP) => return Err(Error::new(ErrorKind::InvalidInput, "it is a symbolic link")),
+        Err(rustix::io::Errno::LOOP) => {
+            return Err(Error::new(ErrorKind::InvalidInput, "it is a symbolic link"));
+        }
         opened => File::from(opened?),
     };
     Ok(try_lock(&file)?.then_some(file))
@@ -251,8 +295,15 @@ mod tests {
 
     fn names(folder: &Path) -> Vec<String> {
         let entries = std::fs::read_dir(folder).expect("a folder");
-        let mut names: Vec<_> =
-            entries.map(|entry| entry.expect("an entry").file_name().to_string_lossy().into_owned()).collect();
+        let mut names: Vec<_> = entries
+            .map(|entry| {
+                entry
+                    .expect("an entry")
+                    .file_name()
+                    .to_string_lossy()
+                    .into_owned()
+            })
+            .collect();
         names.sort();
         names
     }
@@ -266,8 +317,14 @@ mod tests {
             file.write_all(b"sec")?;
             Err(ErrorKind::StorageFull.into())
         });
-        assert_eq!(failed.expect_err("the disk is full").kind(), ErrorKind::StorageFull);
-        assert_eq!(create(&path, text("second")).expect_err("it exists").kind(), ErrorKind::AlreadyExists);
+        assert_eq!(
+            failed.expect_err("the disk is full").kind(),
+            ErrorKind::StorageFull
+        );
+        assert_eq!(
+            create(&path, text("second")).expect_err("it exists").kind(),
+            ErrorKind::AlreadyExists
+        );
         assert_eq!(std::fs::read(&path).expect("kept"), b"first");
         assert_eq!(names(folder.path()), ["scene.ply"]);
     }
@@ -287,15 +344,22 @@ mod tests {
             symlink(at(target), at(name)).expect("a link");
         }
         replace(&at("a"), text("new")).expect("the links are replaced");
-        create_from(&at("b"), |inside| std::fs::write(inside, "new")).expect("the link is replaced");
+        create_from(&at("b"), |inside| std::fs::write(inside, "new"))
+            .expect("the link is replaced");
         symlink(at("precious"), at("log")).expect("a link");
-        begin(&at("log")).expect("the link is replaced").write_all(b"new").expect("written");
+        begin(&at("log"))
+            .expect("the link is replaced")
+            .write_all(b"new")
+            .expect("written");
         assert_eq!(
             ["a", "b", "precious"].map(|name| std::fs::read_to_string(at(name)).expect("text")),
             ["new", "new", "precious"]
         );
         assert!(!at("a").is_symlink() && names(&at("elsewhere")).is_empty());
-        assert_eq!(lock(&at(".lock")).expect_err("a link").to_string(), "it is a symbolic link");
+        assert_eq!(
+            lock(&at(".lock")).expect_err("a link").to_string(),
+            "it is a symbolic link"
+        );
         symlink(at("elsewhere"), at("keyframes")).expect("a link");
         assert!(
             check_no_link(&at("keyframes"))
@@ -316,7 +380,12 @@ mod tests {
             // As another program would; locks of one process conflict in the same way.
             let refused = replace(&path, text("other")).expect_err("it is being written");
             assert_eq!(refused.to_string(), "another program is writing it");
-            assert_eq!(create(&path, text("other")).expect_err("it is being written").kind(), ErrorKind::ResourceBusy);
+            assert_eq!(
+                create(&path, text("other"))
+                    .expect_err("it is being written")
+                    .kind(),
+                ErrorKind::ResourceBusy
+            );
             file.write_all(b"first")
         })
         .expect("the first writer wins");
@@ -327,7 +396,10 @@ mod tests {
             std::fs::write(&other, "early")?; // By a program without locks.
             Ok(7)
         });
-        assert_eq!(created.expect_err("it exists").kind(), ErrorKind::AlreadyExists);
+        assert_eq!(
+            created.expect_err("it exists").kind(),
+            ErrorKind::AlreadyExists
+        );
         assert_eq!(std::fs::read(&other).expect("a file"), b"early");
         assert_eq!(names(folder.path()), ["b.ply", "scene.ply"]);
     }
@@ -340,7 +412,10 @@ mod tests {
         let created = folder.path().join("scene.spz");
         let until_written = |write: &dyn Fn() -> std::io::Result<()>| {
             while let Err(error) = write() {
-                let is_refused = matches!(error.kind(), ErrorKind::ResourceBusy | ErrorKind::AlreadyExists);
+                let is_refused = matches!(
+                    error.kind(),
+                    ErrorKind::ResourceBusy | ErrorKind::AlreadyExists
+                );
                 assert!(is_refused, "{error}");
             }
         };
@@ -363,8 +438,13 @@ mod tests {
         let part = partial::path_of(&path);
         std::fs::create_dir(&part).expect("a folder");
         std::fs::write(part.join("notes.txt"), "of the user").expect("written");
-        let refused = replace(&path, text("new")).expect_err("the folder may not be removed").to_string();
-        assert!(refused.contains(".a.ply.fieldrig.part is a folder with other files"), "{refused}");
+        let refused = replace(&path, text("new"))
+            .expect_err("the folder may not be removed")
+            .to_string();
+        assert!(
+            refused.contains(".a.ply.fieldrig.part is a folder with other files"),
+            "{refused}"
+        );
         std::fs::rename(part.join("notes.txt"), part.join("a.ply")).expect("renamed");
         replace(&path, text("new")).expect("the folder is a leftover");
         assert_eq!(names(folder.path()), ["a.ply"]);
@@ -381,7 +461,10 @@ mod tests {
         create_from(&at("b"), |inside| std::fs::write(inside, "new")).expect("written");
         create(&at("c"), text("new")).expect("written");
         create_folder(&at("d"), &[], |inside| std::fs::create_dir(inside)).expect("created");
-        assert_eq!(names(folder.path()), [".c.part", "a", "a.part", "b", "b.part", "c", "d"]);
+        assert_eq!(
+            names(folder.path()),
+            [".c.part", "a", "a.part", "b", "b.part", "c", "d"]
+        );
         for name in ["a.part", ".c.part"] {
             assert_eq!(std::fs::read_to_string(at(name)).expect("text"), "download");
         }
@@ -413,15 +496,24 @@ mod tests {
         .expect("the leftover is replaced");
         assert_eq!(
             (names(&scan), names(folder.path())),
-            (vec!["images".to_owned(), "list".to_owned()], vec!["scan".to_owned()])
+            (
+                vec!["images".to_owned(), "list".to_owned()],
+                vec!["scan".to_owned()]
+            )
         );
         std::fs::remove_dir_all(&scan).expect("it exists");
         let failed = create_folder(&scan, &ENTRIES, |inside| {
             dataset(inside)?;
             Err::<(), Error>(ErrorKind::StorageFull.into())
         });
-        assert_eq!(failed.expect_err("the disk is full").kind(), ErrorKind::StorageFull);
-        assert!(names(folder.path()).is_empty(), "an incomplete folder is removed");
+        assert_eq!(
+            failed.expect_err("the disk is full").kind(),
+            ErrorKind::StorageFull
+        );
+        assert!(
+            names(folder.path()).is_empty(),
+            "an incomplete folder is removed"
+        );
         symlink(folder.path().join("absent"), &scan).expect("a link");
         let refused = create_folder(&scan, &ENTRIES, dataset).expect_err("a link");
         assert_eq!(refused.kind(), ErrorKind::AlreadyExists);
@@ -446,8 +538,15 @@ mod tests {
         std::fs::remove_dir_all(at("images")).expect("it exists");
         let refused = create_folder(folder.path(), &ENTRIES, dataset).expect_err("the list exists");
         assert_eq!(refused.kind(), ErrorKind::AlreadyExists);
-        assert_eq!(names(folder.path()), ["contents", "list"], "images are removed again");
-        assert_eq!(std::fs::read_to_string(at("contents")).expect("text"), "of the user");
+        assert_eq!(
+            names(folder.path()),
+            ["contents", "list"],
+            "images are removed again"
+        );
+        assert_eq!(
+            std::fs::read_to_string(at("contents")).expect("text"),
+            "of the user"
+        );
     }
 
     #[test]

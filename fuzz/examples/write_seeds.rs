@@ -1,5 +1,5 @@
-//! Writes the generated seeds to the folder `seeds`. Run it after a format change. Seeds found by fuzzing and
-//! recordings compressed by other programs are kept, because they have other names.
+//! Writes the generated seeds to the folder `seeds`. Run it after a format change. Seeds found by
+//! fuzzing and recordings compressed by other programs are kept, because they have other names.
 //!
 //! ```text
 //! RUSTFLAGS="--cfg fuzzing" cargo run --manifest-path fuzz/Cargo.toml --example write_seeds

@@ -1,8 +1,9 @@
-//! Fuzz target for model files: splats in `.ply`, `.spz` and `.splat`, and training checkpoints. The crate `trainer` is
-//! not linked, to keep the build fast.
+//! Fuzz target for model files: splats in `.ply`, `.spz` and `.splat`, and training checkpoints.
+//! The crate `trainer` is not linked, to keep the build fast.
 //!
-//! The first byte selects the format of the other bytes: a complete `.ply`, the uncompressed contents of a `.spz`, a
-//! complete `.spz`, a checkpoint without its checksum, or a complete `.splat`.
+//! The first byte selects the format of the other bytes: a complete `.ply`, the uncompressed
+//! contents of a `.spz`, a complete `.spz`, a checkpoint without its checksum, or a complete
+//! `.splat`.
 #![no_main]
 #![allow(dead_code, reason = "only reading is tested here")]
 

@@ -1,5 +1,5 @@
-//! Fuzz target for rig files, with a fixed robot description. The effective rig file (with all defaults) of an accepted
-//! rig file must be accepted, too.
+//! Fuzz target for rig files, with a fixed robot description. The effective rig file (with all
+//! defaults) of an accepted rig file must be accepted, too.
 #![no_main]
 
 use capture::Rig;

@@ -30,8 +30,9 @@ macro_rules! impl_from {
     )* };
 }
 
-/// Defines the trait `Context`, which adds the failed operation to an error. The error type of the calling crate needs
-/// the variants `Context { context: String, source: Box<Self> }` and `Failed(String)`.
+/// Defines the trait `Context`, which adds the failed operation to an error. The error type of the
+/// calling crate needs the variants `Context { context: String, source: Box<Self> }` and
+/// `Failed(String)`.
 #[macro_export]
 macro_rules! define_context {
     ($error:ident) => {
@@ -41,8 +42,12 @@ macro_rules! define_context {
             ///
             /// # Errors
             ///
-            /// The error with its context; a missing value is a failure with the context as its message.
-            fn with_context<C: Into<String>>(self, context: impl FnOnce() -> C) -> std::result::Result<T, $error>;
+            /// The error with its context; a missing value is a failure with the context as its
+            /// message.
+            fn with_context<C: Into<String>>(
+                self,
+                context: impl FnOnce() -> C,
+            ) -> std::result::Result<T, $error>;
 
             /// Adds a context.
             ///
@@ -55,13 +60,22 @@ macro_rules! define_context {
         }
 
         impl<T, E: Into<$error>> Context<T> for std::result::Result<T, E> {
-            fn with_context<C: Into<String>>(self, context: impl FnOnce() -> C) -> std::result::Result<T, $error> {
-                self.map_err(|error| $error::Context { context: context().into(), source: Box::new(error.into()) })
+            fn with_context<C: Into<String>>(
+                self,
+                context: impl FnOnce() -> C,
+            ) -> std::result::Result<T, $error> {
+                self.map_err(|error| $error::Context {
+                    context: context().into(),
+                    source: Box::new(error.into()),
+                })
             }
         }
 
         impl<T> Context<T> for Option<T> {
-            fn with_context<C: Into<String>>(self, context: impl FnOnce() -> C) -> std::result::Result<T, $error> {
+            fn with_context<C: Into<String>>(
+                self,
+                context: impl FnOnce() -> C,
+            ) -> std::result::Result<T, $error> {
                 self.ok_or_else(|| $error::Failed(context().into()))
             }
         }
@@ -70,7 +84,10 @@ macro_rules! define_context {
 
 /// Creates the error `Failed` of the calling crate, with a formatted message.
 #[macro_export]
-#[expect(clippy::crate_in_macro_def, reason = "the error type is that of the calling crate")]
+#[expect(
+    clippy::crate_in_macro_def,
+    reason = "the error type is that of the calling crate"
+)]
 macro_rules! failed {
     ($($message:tt)*) => { crate::Error::Failed(format!($($message)*)) };
 }

@@ -14,7 +14,9 @@ pub fn counted(n: u64, noun: &str) -> String {
 #[must_use]
 pub fn listed(words: &[&str], conjunction: &str) -> String {
     match words.split_last() {
-        Some((last, others)) if !others.is_empty() => format!("{} {conjunction} {last}", others.join(", ")),
+        Some((last, others)) if !others.is_empty() => {
+            format!("{} {conjunction} {last}", others.join(", "))
+        }
         _ => words.concat(),
     }
 }

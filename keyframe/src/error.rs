@@ -48,7 +48,9 @@ pub enum Error {
         reason: String,
     },
     /// A list of keyframes has no keyframe in common with the data.
-    #[error("the keyframe list matches nothing in the data: it lists {listed}, the data has {found}")]
+    #[error(
+        "the keyframe list matches nothing in the data: it lists {listed}, the data has {found}"
+    )]
     NoListedKeyframe {
         /// Camera and stamp of a listed keyframe.
         listed: String,
@@ -72,9 +74,10 @@ impl Error {
         match self {
             Self::Holdout { .. } => ErrorClass::BadInput,
             Self::NoListedKeyframe { .. } => ErrorClass::InsufficientData,
-            Self::ImageBytes { .. } | Self::DepthPixels { .. } | Self::Read { .. } | Self::List { .. } => {
-                ErrorClass::Failed
-            }
+            Self::ImageBytes { .. }
+            | Self::DepthPixels { .. }
+            | Self::Read { .. }
+            | Self::List { .. } => ErrorClass::Failed,
         }
     }
 }

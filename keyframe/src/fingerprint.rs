@@ -3,19 +3,33 @@
 use crate::{DepthMap, Keyframe};
 use kinematics::{Transform, Twist, transform};
 
-/// Fingerprint of pixels, depth, intrinsics, pose, velocity and joint twists, without the split and ground truth.
+/// Fingerprint of pixels, depth, intrinsics, pose, velocity and joint twists, without the split and
+/// ground truth.
 #[must_use]
 pub fn fingerprint(keyframe: &Keyframe) -> u64 {
     let mut hash = Hash::default();
     hash.sizes(keyframe.size_px, keyframe.focal_px, keyframe.principal_px);
     hash.pose(&keyframe.world_from_camera);
     hash.number(keyframe.readout_secs);
-    keyframe.twist.iter().chain(keyframe.joint_twists.iter()).for_each(|twist| hash.twist(twist));
+    keyframe
+        .twist
+        .iter()
+        .chain(keyframe.joint_twists.iter())
+        .for_each(|twist| hash.twist(twist));
     hash.bytes(&keyframe.rgba_srgb);
-    if let Some(DepthMap { size_px, focal_px, principal_px, depth_m, world_from_camera }) = &keyframe.depth {
+    if let Some(DepthMap {
+        size_px,
+        focal_px,
+        principal_px,
+        depth_m,
+        world_from_camera,
+    }) = &keyframe.depth
+    {
         hash.sizes(*size_px, *focal_px, *principal_px);
         hash.pose(world_from_camera);
-        depth_m.iter().for_each(|depth_m| hash.word(depth_m.to_bits().into()));
+        depth_m
+            .iter()
+            .for_each(|depth_m| hash.word(depth_m.to_bits().into()));
     }
     hash.0
 }
@@ -37,7 +51,9 @@ impl Hash {
 
     fn bytes(&mut self, bytes: &[u8]) {
         let (words, rest) = bytes.as_chunks::<8>();
-        words.iter().for_each(|word| self.word(u64::from_le_bytes(*word)));
+        words
+            .iter()
+            .for_each(|word| self.word(u64::from_le_bytes(*word)));
         rest.iter().for_each(|byte| self.word((*byte).into()));
         self.word(bytes.len() as u64);
     }
@@ -48,15 +64,24 @@ impl Hash {
 
     fn sizes(&mut self, size_px: [u32; 2], focal_px: [f64; 2], principal_px: [f64; 2]) {
         size_px.into_iter().for_each(|size| self.word(size.into()));
-        focal_px.into_iter().chain(principal_px).for_each(|number| self.number(number));
+        focal_px
+            .into_iter()
+            .chain(principal_px)
+            .for_each(|number| self.number(number));
     }
 
     fn twist(&mut self, twist: &Twist) {
-        twist.linear_m_s.iter().chain(twist.angular_rad_s.iter()).for_each(|number| self.number(*number));
+        twist
+            .linear_m_s
+            .iter()
+            .chain(twist.angular_rad_s.iter())
+            .for_each(|number| self.number(*number));
     }
 
     fn pose(&mut self, pose: &Transform) {
-        transform::to_xyz_xyzw(pose).into_iter().for_each(|number| self.number(number));
+        transform::to_xyz_xyzw(pose)
+            .into_iter()
+            .for_each(|number| self.number(number));
     }
 }
 
@@ -95,7 +120,13 @@ mod tests {
     #[test]
     fn fingerprint_covers_everything_a_model_uses() {
         let same = of(&keyframe());
-        assert_eq!(of(&Keyframe { split: Split::Test, ..keyframe() }), same);
+        assert_eq!(
+            of(&Keyframe {
+                split: Split::Test,
+                ..keyframe()
+            }),
+            same
+        );
         let changes: [fn(&mut Keyframe); 10] = [
             |keyframe| keyframe.rgba_srgb = (1..13).collect(),
             |keyframe| keyframe.rgba_srgb = (0..11).chain([12]).collect(),

@@ -25,9 +25,13 @@ impl Holdout {
     ///
     /// # Errors
     ///
-    /// If the argument is neither a number of at least 1 nor a readable file with at least one name.
+    /// If the argument is neither a number of at least 1 nor a readable file with at least one
+    /// name.
     pub fn from_argument(argument: &str) -> Result<Self, Error> {
-        let invalid = |reason: &str| Error::Holdout { request: argument.to_owned(), reason: reason.to_owned() };
+        let invalid = |reason: &str| Error::Holdout {
+            request: argument.to_owned(),
+            reason: reason.to_owned(),
+        };
         if let Ok(every) = argument.parse::<i64>() {
             return usize::try_from(every)
                 .ok()
@@ -35,16 +39,28 @@ impl Holdout {
                 .map(Self::Every)
                 .ok_or_else(|| invalid("must be at least 1, or a file that lists photos"));
         }
-        let text = files::read_text(Path::new(argument))
-            .map_err(|error| invalid(&format!("neither a whole number nor a readable file ({error})")))?;
-        let names: Vec<_> = text.lines().map(str::trim).filter(|name| !name.is_empty()).map(str::to_owned).collect();
-        if names.is_empty() { Err(invalid("the file lists no photo")) } else { Ok(Self::Named(names)) }
+        let text = files::read_text(Path::new(argument)).map_err(|error| {
+            invalid(&format!(
+                "neither a whole number nor a readable file ({error})"
+            ))
+        })?;
+        let names: Vec<_> = text
+            .lines()
+            .map(str::trim)
+            .filter(|name| !name.is_empty())
+            .map(str::to_owned)
+            .collect();
+        if names.is_empty() {
+            Err(invalid("the file lists no photo"))
+        } else {
+            Ok(Self::Named(names))
+        }
     }
 
     /// The split of each photo, in the order of `names`.
     ///
-    /// Validation photos lie halfway between test photos; with named test photos, they are every 8th of the others,
-    /// from the 5th. Names match with or without folder and extension.
+    /// Validation photos lie halfway between test photos; with named test photos, they are every
+    /// 8th of the others, from the 5th. Names match with or without folder and extension.
     ///
     /// # Errors
     ///
@@ -67,7 +83,10 @@ fn every_nth(ix: usize, every: usize) -> Split {
 
 fn splits_by_name(test_names: &[String], names: &[&str]) -> Result<Vec<Split>, Error> {
     // Whether each name has matched a photo.
-    let mut requested: HashMap<&str, bool> = test_names.iter().map(|name| (name.as_str(), false)).collect();
+    let mut requested: HashMap<&str, bool> = test_names
+        .iter()
+        .map(|name| (name.as_str(), false))
+        .collect();
     let mut n_remaining = 0;
     let mut splits = Vec::with_capacity(names.len());
     for name in names {
@@ -85,12 +104,16 @@ fn splits_by_name(test_names: &[String], names: &[&str]) -> Result<Vec<Split>, E
         });
     }
     match test_names.iter().find(|name| !requested[name.as_str()]) {
-        Some(name) => Err(Error::Holdout { request: format!("{name:?}"), reason: "no photo has this name".into() }),
+        Some(name) => Err(Error::Holdout {
+            request: format!("{name:?}"),
+            reason: "no photo has this name".into(),
+        }),
         None => Ok(splits),
     }
 }
 
-/// The names by which a photo may be requested: its path in the folder, its file name, and its file name without extension.
+/// The names by which a photo may be requested: its path in the folder, its file name, and its file
+/// name without extension.
 fn forms(name: &str) -> impl Iterator<Item = &str> {
     let path = Path::new(name);
     let parts = [path.file_name(), path.file_stem()];
@@ -107,32 +130,71 @@ mod tests {
         let names = vec!["photo"; 20];
         let expected: Vec<_> = (0..20).map(Split::of).collect();
         assert_eq!(Holdout::default().splits(&names).unwrap(), expected);
-        assert_eq!(Holdout::Every(2).splits(&names[..4]).unwrap(), [Test, Train, Test, Train]);
-        assert_eq!(Holdout::Every(4).splits(&names[..5]).unwrap(), [Test, Train, Validation, Train, Test]);
+        assert_eq!(
+            Holdout::Every(2).splits(&names[..4]).unwrap(),
+            [Test, Train, Test, Train]
+        );
+        assert_eq!(
+            Holdout::Every(4).splits(&names[..5]).unwrap(),
+            [Test, Train, Validation, Train, Test]
+        );
     }
 
     #[test]
     fn photos_match_with_or_without_folder_and_extension() {
-        let names = ["images/a.jpg", "images/b.jpg", "images/c.jpg", "images/d.jpg"];
-        let splits_by_name =
-            |test: &[&str]| Holdout::Named(test.iter().map(|name| (*name).to_owned()).collect()).splits(&names);
-        assert_eq!(splits_by_name(&["images/a.jpg", "b.jpg", "c"]).unwrap(), [Test, Test, Test, Train]);
-        assert!(splits_by_name(&["e"]).unwrap_err().to_string().contains("\"e\": no photo has this name"));
-        assert_eq!(splits_by_name(&["a", "b", "c", "d"]).unwrap(), [Test; 4], "all photos may be scored");
+        let names = [
+            "images/a.jpg",
+            "images/b.jpg",
+            "images/c.jpg",
+            "images/d.jpg",
+        ];
+        let splits_by_name = |test: &[&str]| {
+            Holdout::Named(test.iter().map(|name| (*name).to_owned()).collect()).splits(&names)
+        };
+        assert_eq!(
+            splits_by_name(&["images/a.jpg", "b.jpg", "c"]).unwrap(),
+            [Test, Test, Test, Train]
+        );
+        assert!(
+            splits_by_name(&["e"])
+                .unwrap_err()
+                .to_string()
+                .contains("\"e\": no photo has this name")
+        );
+        assert_eq!(
+            splits_by_name(&["a", "b", "c", "d"]).unwrap(),
+            [Test; 4],
+            "all photos may be scored"
+        );
     }
 
     #[test]
     fn argument_is_a_number_or_a_file() {
         assert_eq!(Holdout::from_argument("10").unwrap(), Holdout::Every(10));
-        assert_eq!(Holdout::from_argument("1").unwrap().splits(&["a", "b"]).unwrap(), [Test, Test]);
+        assert_eq!(
+            Holdout::from_argument("1")
+                .unwrap()
+                .splits(&["a", "b"])
+                .unwrap(),
+            [Test, Test]
+        );
         for invalid in ["0", "-3"] {
-            assert!(Holdout::from_argument(invalid).unwrap_err().to_string().contains("at least 1"), "{invalid}");
+            assert!(
+                Holdout::from_argument(invalid)
+                    .unwrap_err()
+                    .to_string()
+                    .contains("at least 1"),
+                "{invalid}"
+            );
         }
         assert!(Holdout::from_argument("no/such/file").is_err());
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("test.txt");
         std::fs::write(&file, "a.jpg\n\n b.jpg \n").unwrap();
         let names = vec!["a.jpg".to_owned(), "b.jpg".to_owned()];
-        assert_eq!(Holdout::from_argument(file.to_str().unwrap()).unwrap(), Holdout::Named(names));
+        assert_eq!(
+            Holdout::from_argument(file.to_str().unwrap()).unwrap(),
+            Holdout::Named(names)
+        );
     }
 }

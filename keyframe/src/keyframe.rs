@@ -17,8 +17,8 @@ pub enum Split {
 }
 
 impl Split {
-    /// The split of the keyframe at index `ix` of a camera: every 8th keyframe, starting at index 0, is for testing,
-    /// and every 8th, starting at index 4, for validation.
+    /// The split of the keyframe at index `ix` of a camera: every 8th keyframe, starting at index
+    /// 0, is for testing, and every 8th, starting at index 4, for validation.
     pub fn of(ix: usize) -> Self {
         match ix % 8 {
             0 => Self::Test,
@@ -41,8 +41,8 @@ pub struct Keyframe {
     pub focal_px: [f64; 2],
     /// Principal point of the undistorted image, pixels.
     pub principal_px: [f64; 2],
-    /// `[height, width, 4]`, sRGB. Alpha is 255 for valid pixels, and 0 for pixels that are masked or left empty by
-    /// undistortion.
+    /// `[height, width, 4]`, sRGB. Alpha is 255 for valid pixels, and 0 for pixels that are masked
+    /// or left empty by undistortion.
     pub rgba_srgb: Arc<[u8]>,
     /// Depth, if the camera provides it.
     pub depth: Option<DepthMap>,
@@ -52,8 +52,8 @@ pub struct Keyframe {
     pub twist: Option<Twist>,
     /// Time from the first row's exposure to the last row's, seconds; 0 for a global shutter.
     pub readout_secs: f64,
-    /// For each joint that carries the camera, the twist of the camera, in its own axes, when only that joint moves at
-    /// unit speed. Empty if unknown.
+    /// For each joint that carries the camera, the twist of the camera, in its own axes, when only
+    /// that joint moves at unit speed. Empty if unknown.
     pub joint_twists: Arc<[Twist]>,
     /// State of the base that carries the camera; `None` if the base is fixed.
     pub base: Option<BaseState>,
@@ -64,8 +64,8 @@ pub struct Keyframe {
 }
 
 impl Keyframe {
-    /// Whether most of the image has no depth: the keyframe has no depth, or its depth comes from a range scanner,
-    /// which covers only a band.
+    /// Whether most of the image has no depth: the keyframe has no depth, or its depth comes from a
+    /// range scanner, which covers only a band.
     pub fn lacks_dense_depth(&self) -> bool {
         self.depth.as_ref().is_none_or(|depth| {
             let n_known = depth.depth_m.iter().filter(|z| **z > 0.0).count();
@@ -75,7 +75,10 @@ impl Keyframe {
 
     /// Host memory of the arrays, bytes.
     pub fn bytes(&self) -> u64 {
-        let depth = self.depth.as_ref().map_or(0, |depth| size_of_val(&*depth.depth_m));
+        let depth = self
+            .depth
+            .as_ref()
+            .map_or(0, |depth| size_of_val(&*depth.depth_m));
         let truth = self.truth.as_ref().map_or(0, |truth| truth.rgba_srgb.len());
         (self.rgba_srgb.len() + depth + truth) as u64
     }
@@ -85,26 +88,42 @@ impl Keyframe {
         let [width, height] = self.size_px;
         let (got, expected) = (self.rgba_srgb.len(), 4 * width as usize * height as usize);
         if got != expected {
-            return Err(Error::ImageBytes { width, height, got, expected });
+            return Err(Error::ImageBytes {
+                width,
+                height,
+                got,
+                expected,
+            });
         }
-        let Some(depth) = &self.depth else { return Ok(()) };
+        let Some(depth) = &self.depth else {
+            return Ok(());
+        };
         let [width, height] = depth.size_px;
         let (got, expected) = (depth.depth_m.len(), width as usize * height as usize);
         if got != expected {
-            return Err(Error::DepthPixels { width, height, got, expected });
+            return Err(Error::DepthPixels {
+                width,
+                height,
+                got,
+                expected,
+            });
         }
         Ok(())
     }
 
-    /// Returns the keyframe with a corrected base pose: all its poses are multiplied by `map_from_odom` from the left.
+    /// Returns the keyframe with a corrected base pose: all its poses are multiplied by
+    /// `map_from_odom` from the left.
     pub fn with_base_correction(&self, map_from_odom: &Transform) -> Self {
         Self {
             world_from_camera: map_from_odom * self.world_from_camera,
-            depth: self
-                .depth
-                .clone()
-                .map(|depth| DepthMap { world_from_camera: map_from_odom * depth.world_from_camera, ..depth }),
-            base: self.base.clone().map(|base| BaseState { map_from_odom: map_from_odom * base.map_from_odom, ..base }),
+            depth: self.depth.clone().map(|depth| DepthMap {
+                world_from_camera: map_from_odom * depth.world_from_camera,
+                ..depth
+            }),
+            base: self.base.clone().map(|base| BaseState {
+                map_from_odom: map_from_odom * base.map_from_odom,
+                ..base
+            }),
             ..self.clone()
         }
     }
@@ -112,15 +131,21 @@ impl Keyframe {
     /// Whether all camera parameters are finite; depth readings are not checked.
     pub fn is_finite(&self) -> bool {
         let is_valid_lens = |focal_px: [f64; 2], principal_px: [f64; 2]| {
-            focal_px.iter().all(|focal| focal.is_finite() && *focal > 0.0) && principal_px.iter().all(|x| x.is_finite())
+            focal_px
+                .iter()
+                .all(|focal| focal.is_finite() && *focal > 0.0)
+                && principal_px.iter().all(|x| x.is_finite())
         };
         let twists = self.twist.iter().chain(self.joint_twists.iter());
         transform::is_finite(&self.world_from_camera)
             && is_valid_lens(self.focal_px, self.principal_px)
             && self.readout_secs.is_finite()
-            && twists.flat_map(|twist| twist.linear_m_s.iter().chain(twist.angular_rad_s.iter())).all(|x| x.is_finite())
+            && twists
+                .flat_map(|twist| twist.linear_m_s.iter().chain(twist.angular_rad_s.iter()))
+                .all(|x| x.is_finite())
             && self.depth.as_ref().is_none_or(|depth| {
-                transform::is_finite(&depth.world_from_camera) && is_valid_lens(depth.focal_px, depth.principal_px)
+                transform::is_finite(&depth.world_from_camera)
+                    && is_valid_lens(depth.focal_px, depth.principal_px)
             })
     }
 }
@@ -154,7 +179,8 @@ pub struct DepthMap {
 }
 
 impl DepthMap {
-    /// Point at depth `z_m` on the ray through the center of a pixel, in the depth camera's axes, meters.
+    /// Point at depth `z_m` on the ray through the center of a pixel, in the depth camera's axes,
+    /// meters.
     ///
     /// ```
     /// use keyframe::DepthMap;
@@ -171,18 +197,24 @@ impl DepthMap {
     /// assert_eq!(depth.point(3, 0, 1.5).as_slice(), [1.125, -0.375, 1.5]);
     /// ```
     pub fn point(&self, x: u32, y: u32, z_m: f64) -> Vector3<f64> {
-        let ray = |pixel: u32, axis: usize| (f64::from(pixel) + 0.5 - self.principal_px[axis]) / self.focal_px[axis];
+        let ray = |pixel: u32, axis: usize| {
+            (f64::from(pixel) + 0.5 - self.principal_px[axis]) / self.focal_px[axis]
+        };
         Vector3::new(ray(x, 0), ray(y, 1), 1.0) * z_m
     }
 
-    /// Returns a smaller depth map that contains the center pixel of every square of `stride` by `stride` pixels
-    /// (`stride` is odd), with the same readings along the same rays. Incomplete squares at the right and lower edges
-    /// are dropped.
+    /// Returns a smaller depth map that contains the center pixel of every square of `stride` by
+    /// `stride` pixels (`stride` is odd), with the same readings along the same rays. Incomplete
+    /// squares at the right and lower edges are dropped.
     #[must_use]
     pub fn subsampled(&self, stride: u32) -> Self {
         let [width, height] = self.size_px.map(|size| size / stride);
-        let at = |x: u32, y: u32| ((y * stride + stride / 2) * self.size_px[0] + x * stride + stride / 2) as usize;
-        let depth_m = (0..height).flat_map(|y| (0..width).map(move |x| (x, y))).map(|(x, y)| self.depth_m[at(x, y)]);
+        let at = |x: u32, y: u32| {
+            ((y * stride + stride / 2) * self.size_px[0] + x * stride + stride / 2) as usize
+        };
+        let depth_m = (0..height)
+            .flat_map(|y| (0..width).map(move |x| (x, y)))
+            .map(|(x, y)| self.depth_m[at(x, y)]);
         let scaled = |value_px: [f64; 2]| value_px.map(|px| px / f64::from(stride));
         Self {
             size_px: [width, height],
@@ -201,8 +233,8 @@ pub struct Truth {
     pub rgba_srgb: Arc<[u8]>,
     /// True pose at the keyframe's stamp.
     pub world_from_camera: Transform,
-    /// PSNR of the keyframe's image against its noise-free version, dB; a perfect model reaches this score. `None`
-    /// without noise.
+    /// PSNR of the keyframe's image against its noise-free version, dB; a perfect model reaches
+    /// this score. `None` without noise.
     pub psnr_ceiling: Option<f64>,
 }
 
@@ -225,8 +257,13 @@ mod tests {
         assert_eq!((subsampled.size_px, subsampled.depth_m.len()), ([2, 2], 4));
         for (x, y) in [(0, 0), (1, 0), (0, 1), (1, 1)] {
             let z_m = subsampled.depth_m[(y * 2 + x) as usize];
-            assert_eq!(z_m, full.depth_m[((3 * y + 1) * 8 + 3 * x + 1) as usize], "{x} {y}");
-            let difference = subsampled.point(x, y, z_m.into()) - full.point(3 * x + 1, 3 * y + 1, z_m.into());
+            assert_eq!(
+                z_m,
+                full.depth_m[((3 * y + 1) * 8 + 3 * x + 1) as usize],
+                "{x} {y}"
+            );
+            let difference =
+                subsampled.point(x, y, z_m.into()) - full.point(3 * x + 1, 3 * y + 1, z_m.into());
             assert!(difference.norm() < 1e-12, "{x} {y}: {difference}");
         }
         assert_eq!(full.subsampled(1).depth_m, full.depth_m);

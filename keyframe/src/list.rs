@@ -7,7 +7,11 @@ use std::fmt::Write as _;
 use std::path::Path;
 use std::sync::Arc;
 
-const SPLITS: [(Split, &str); 3] = [(Split::Train, "train"), (Split::Validation, "validation"), (Split::Test, "test")];
+const SPLITS: [(Split, &str); 3] = [
+    (Split::Train, "train"),
+    (Split::Validation, "validation"),
+    (Split::Test, "test"),
+];
 
 /// The selected keyframes and their splits.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -24,8 +28,14 @@ impl KeyframeList {
     /// If the file cannot be read, lists no keyframe, or has an invalid line.
     pub fn load(path: &Path) -> Result<Self, Error> {
         let read = files::read_text(path);
-        let text = read.map_err(|error| Error::Read { path: path.to_owned(), reason: error.to_string() })?;
-        Self::parse(&text).map_err(|reason| Error::List { path: path.to_owned(), reason })
+        let text = read.map_err(|error| Error::Read {
+            path: path.to_owned(),
+            reason: error.to_string(),
+        })?;
+        Self::parse(&text).map_err(|reason| Error::List {
+            path: path.to_owned(),
+            reason,
+        })
     }
 
     /// Number of listed keyframes.
@@ -40,8 +50,8 @@ impl KeyframeList {
         self.0.is_empty()
     }
 
-    /// Checks the list against the cameras and stamps of the data. Returns a message if some listed keyframes are
-    /// missing.
+    /// Checks the list against the cameras and stamps of the data. Returns a message if some listed
+    /// keyframes are missing.
     ///
     /// `example_image`: an image of the data, listed or not, for the error message.
     ///
@@ -54,8 +64,13 @@ impl KeyframeList {
         example_image: Option<(&str, Stamp)>,
     ) -> Result<Option<String>, Error> {
         let found: BTreeSet<(&str, i64)> = found.map(|(camera, stamp)| (camera, stamp.0)).collect();
-        let mut missing = self.0.keys().filter(|(camera, stamp)| !found.contains(&(camera.as_str(), *stamp)));
-        let Some((camera, stamp)) = missing.next() else { return Ok(None) };
+        let mut missing = self
+            .0
+            .keys()
+            .filter(|(camera, stamp)| !found.contains(&(camera.as_str(), *stamp)));
+        let Some((camera, stamp)) = missing.next() else {
+            return Ok(None);
+        };
         let n_missing = 1 + missing.count();
         if n_missing < self.len() {
             return Ok(Some(format!(
@@ -63,20 +78,29 @@ impl KeyframeList {
                 self.len()
             )));
         }
-        let found = example_image.map_or("no image".to_owned(), |(camera, stamp)| format!("{camera} {}", stamp.0));
-        Err(Error::NoListedKeyframe { listed: format!("{camera} {stamp}"), found })
+        let found = example_image.map_or("no image".to_owned(), |(camera, stamp)| {
+            format!("{camera} {}", stamp.0)
+        });
+        Err(Error::NoListedKeyframe {
+            listed: format!("{camera} {stamp}"),
+            found,
+        })
     }
 
     /// The split of a listed keyframe.
     #[must_use]
     pub fn split_of(&self, camera: &str, stamp: Stamp) -> Option<Split> {
-        self.0.get(&(camera.to_owned(), stamp.0)).map(|split| SPLITS[*split].0)
+        self.0
+            .get(&(camera.to_owned(), stamp.0))
+            .map(|split| SPLITS[*split].0)
     }
 
     fn parse(text: &str) -> Result<Self, String> {
         let mut list = BTreeMap::new();
-        for (line_ix, line) in
-            text.lines().enumerate().filter(|(_, line)| !line.trim().is_empty() && !line.starts_with('#'))
+        for (line_ix, line) in text
+            .lines()
+            .enumerate()
+            .filter(|(_, line)| !line.trim().is_empty() && !line.starts_with('#'))
         {
             let words: Vec<&str> = line.split_whitespace().collect();
             let parsed = match words[..] {
@@ -106,21 +130,37 @@ impl KeyframeList {
 
 impl FromIterator<(String, Stamp, Split)> for KeyframeList {
     fn from_iter<T: IntoIterator<Item = (String, Stamp, Split)>>(keyframes: T) -> Self {
-        let index_of = |split| SPLITS.iter().position(|(known, _)| *known == split).unwrap_or_default();
-        Self(keyframes.into_iter().map(|(camera, stamp, split)| ((camera, stamp.0), index_of(split))).collect())
+        let index_of = |split| {
+            SPLITS
+                .iter()
+                .position(|(known, _)| *known == split)
+                .unwrap_or_default()
+        };
+        Self(
+            keyframes
+                .into_iter()
+                .map(|(camera, stamp, split)| ((camera, stamp.0), index_of(split)))
+                .collect(),
+        )
     }
 }
 
 /// The name of a split in files.
 #[must_use]
 pub fn split_name(split: Split) -> &'static str {
-    SPLITS.iter().find(|(known, _)| *known == split).map_or("train", |(_, name)| name)
+    SPLITS
+        .iter()
+        .find(|(known, _)| *known == split)
+        .map_or("train", |(_, name)| name)
 }
 
 /// The split with this name in files.
 #[must_use]
 pub fn split_from_name(name: &str) -> Option<Split> {
-    SPLITS.iter().find(|(_, known)| *known == name).map(|(split, _)| *split)
+    SPLITS
+        .iter()
+        .find(|(_, known)| *known == name)
+        .map(|(split, _)| *split)
 }
 
 /// The text of a `keyframes.txt`.
@@ -129,7 +169,8 @@ pub fn list_text<'a>(keyframes: impl Iterator<Item = &'a Arc<Keyframe>>) -> Stri
     let mut text = String::from("# camera stamp_nanos split\n");
     for keyframe in keyframes {
         let split = split_name(keyframe.split);
-        writeln!(text, "{} {} {split}", keyframe.camera, keyframe.stamp.0).expect("writing to a String cannot fail");
+        writeln!(text, "{} {} {split}", keyframe.camera, keyframe.stamp.0)
+            .expect("writing to a String cannot fail");
     }
     text
 }
@@ -147,15 +188,23 @@ mod tests {
         };
         assert_eq!(check(&[("wrist", 17), ("wrist", 18)]).expect("all"), None);
         let partial = check(&[("wrist", 18)]).expect("one").expect("a loss");
-        assert!(partial.starts_with("1 of 2 listed") && partial.ends_with("wrist 17"), "{partial}");
+        assert!(
+            partial.starts_with("1 of 2 listed") && partial.ends_with("wrist 17"),
+            "{partial}"
+        );
         let disjoint = check(&[("wrist", 16)]).expect_err("nothing").to_string();
-        assert!(disjoint.contains("wrist 17") && disjoint.contains("the data has front 5"), "{disjoint}");
+        assert!(
+            disjoint.contains("wrist 17") && disjoint.contains("the data has front 5"),
+            "{disjoint}"
+        );
     }
 
     #[test]
     fn list_is_parsed_and_errors_give_the_line() {
-        let list = KeyframeList::parse("# camera stamp split\nwrist 17 test\n\nwrist -3 train\nside 17 validation\n")
-            .expect("a list");
+        let list = KeyframeList::parse(
+            "# camera stamp split\nwrist 17 test\n\nwrist -3 train\nside 17 validation\n",
+        )
+        .expect("a list");
         assert_eq!(list.len(), 3);
         assert_eq!(list.split_of("wrist", Stamp(17)), Some(Split::Test));
         assert_eq!(list.split_of("wrist", Stamp(-3)), Some(Split::Train));

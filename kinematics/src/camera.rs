@@ -1,4 +1,5 @@
-//! Camera models. Pixel `(0, 0)` covers `[0,1) x [0,1)`; camera axes are x right, y down, z forward.
+//! Camera models. Pixel `(0, 0)` covers `[0,1) x [0,1)`; camera axes are x right, y down, z
+//! forward.
 
 use crate::Error;
 use crate::lens;
@@ -39,13 +40,15 @@ pub struct Intrinsics {
 pub enum Lens {
     /// No distortion.
     Pinhole,
-    /// Radial (k1, k2, k3) and tangential (p1, p2) coefficients in the order of OpenCV: k1, k2, p1, p2, k3.
+    /// Radial (k1, k2, k3) and tangential (p1, p2) coefficients in the order of OpenCV: k1, k2, p1,
+    /// p2, k3.
     BrownConrady([f64; 5]),
-    /// Fisheye: coefficients k1, k2, k3, k4 of the equidistant polynomial (Kannala and Brandt 2006, as in OpenCV's
-    /// fisheye model).
+    /// Fisheye: coefficients k1, k2, k3, k4 of the equidistant polynomial (Kannala and Brandt 2006,
+    /// as in OpenCV's fisheye model).
     KannalaBrandt([f64; 4]),
-    /// Brown-Conrady with a rational radial part, in the order of OpenCV's rational model: k1, k2, p1, p2, k3, k4, k5,
-    /// k6. The radial factor is `(1 + k1 r2 + k2 r4 + k3 r6) / (1 + k4 r2 + k5 r4 + k6 r6)`.
+    /// Brown-Conrady with a rational radial part, in the order of OpenCV's rational model: k1, k2,
+    /// p1, p2, k3, k4, k5, k6. The radial factor is `(1 + k1 r2 + k2 r4 + k3 r6) / (1 + k4 r2 + k5
+    /// r4 + k6 r6)`.
     RationalBrownConrady([f64; 8]),
 }
 
@@ -60,7 +63,8 @@ impl Lens {
         }
     }
 
-    /// The distorted position of a point of the plane `z = 1`. `None` outside the range of the lens.
+    /// The distorted position of a point of the plane `z = 1`. `None` outside the range of the
+    /// lens.
     pub(crate) fn distort(&self, plane: Vector2<f64>) -> Option<lens::Distorted> {
         match self {
             Self::Pinhole => Some(lens::Distorted::none(plane)),
@@ -83,8 +87,9 @@ impl Lens {
 impl Intrinsics {
     /// Projects a point in camera coordinates to a pixel, which may lie outside the image.
     ///
-    /// Returns `None` if the lens cannot image the point: it lies behind or next to the camera (`z <= 0`), it lies
-    /// beyond the radius up to which the distortion polynomial is monotonic, or it is not finite.
+    /// Returns `None` if the lens cannot image the point: it lies behind or next to the camera (`z
+    /// <= 0`), it lies beyond the radius up to which the distortion polynomial is monotonic, or it
+    /// is not finite.
     pub fn project(&self, point_in_camera: &Vector3<f64>) -> Option<[f64; 2]> {
         if point_in_camera.z.is_nan() || point_in_camera.z <= 0.0 {
             return None;
@@ -93,9 +98,12 @@ impl Intrinsics {
         self.pixel_at(self.lens_in_use().distort(plane)?.value)
     }
 
-    /// Like [`Intrinsics::project`], and also returns the derivative of the pixel with respect to the point, pixels
-    /// per meter.
-    pub fn project_with_jacobian(&self, point_in_camera: &Vector3<f64>) -> Option<([f64; 2], Matrix2x3<f64>)> {
+    /// Like [`Intrinsics::project`], and also returns the derivative of the pixel with respect to
+    /// the point, pixels per meter.
+    pub fn project_with_jacobian(
+        &self,
+        point_in_camera: &Vector3<f64>,
+    ) -> Option<([f64; 2], Matrix2x3<f64>)> {
         let &[x, y, z] = point_in_camera.as_ref();
         if z.is_nan() || z <= 0.0 {
             return None;
@@ -109,10 +117,11 @@ impl Intrinsics {
         Some((self.pixel_at(distorted.value)?, pixel_by_point))
     }
 
-    /// Back-projects a pixel to the point on its ray with `z = 1`. The inverse of [`Intrinsics::project`], accurate to
-    /// 1e-12.
+    /// Back-projects a pixel to the point on its ray with `z = 1`. The inverse of
+    /// [`Intrinsics::project`], accurate to 1e-12.
     ///
-    /// Returns `None` if the pixel is not finite or if no direction in front of the camera projects to it.
+    /// Returns `None` if the pixel is not finite or if no direction in front of the camera projects
+    /// to it.
     pub fn unproject(&self, pixel: [f64; 2]) -> Option<Vector3<f64>> {
         let distorted = Vector2::new(
             (pixel[0] - self.principal_px[0]) / self.focal_px[0],
@@ -125,12 +134,19 @@ impl Intrinsics {
         Some(Vector3::new(plane.x, plane.y, 1.0))
     }
 
-    /// Returns the intrinsics for the image scaled by `frac`. Its size is rounded to whole pixels, at least one.
+    /// Returns the intrinsics for the image scaled by `frac`. Its size is rounded to whole pixels,
+    /// at least one.
     ///
-    /// Focal length and principal point follow the rounded size, so image corners map to image corners.
-    #[expect(clippy::cast_possible_truncation, reason = "the cast saturates, as intended")]
+    /// Focal length and principal point follow the rounded size, so image corners map to image
+    /// corners.
+    #[expect(
+        clippy::cast_possible_truncation,
+        reason = "the cast saturates, as intended"
+    )]
     pub fn scaled(&self, frac: f64) -> Self {
-        let size_px = self.size_px.map(|size| ((f64::from(size) * frac).round() as u32).max(1));
+        let size_px = self
+            .size_px
+            .map(|size| ((f64::from(size) * frac).round() as u32).max(1));
         self.resized(size_px)
     }
 
@@ -140,19 +156,26 @@ impl Intrinsics {
         Self {
             size_px,
             focal_px: [self.focal_px[0] * ratio(0), self.focal_px[1] * ratio(1)],
-            principal_px: [self.principal_px[0] * ratio(0), self.principal_px[1] * ratio(1)],
+            principal_px: [
+                self.principal_px[0] * ratio(0),
+                self.principal_px[1] * ratio(1),
+            ],
             ..*self
         }
     }
 
-    /// Pinhole camera with the same size, focal length and principal point: the camera of the images that
-    /// [`crate::Undistortion`] returns.
+    /// Pinhole camera with the same size, focal length and principal point: the camera of the
+    /// images that [`crate::Undistortion`] returns.
     pub fn undistorted(&self) -> Self {
-        Self { lens: Lens::Pinhole, rectified: true, ..*self }
+        Self {
+            lens: Lens::Pinhole,
+            rectified: true,
+            ..*self
+        }
     }
 
-    /// Whether the pinhole model describes the image: the image is rectified, the lens is a pinhole, or all
-    /// coefficients of a Brown-Conrady lens are zero.
+    /// Whether the pinhole model describes the image: the image is rectified, the lens is a
+    /// pinhole, or all coefficients of a Brown-Conrady lens are zero.
     pub fn is_pinhole(&self) -> bool {
         match self.lens_in_use() {
             Lens::Pinhole => true,
@@ -171,26 +194,58 @@ impl Intrinsics {
     pub fn validate(&self) -> Result<(), Error> {
         let check = |what, value: f64, fine: bool, allowed| match fine {
             true => Ok(()),
-            false => Err(Error::Intrinsics { what, value, allowed }),
+            false => Err(Error::Intrinsics {
+                what,
+                value,
+                allowed,
+            }),
         };
-        const NAMES: [[&str; 3]; 2] =
-            [["width", "focal length x", "principal point x"], ["height", "focal length y", "principal point y"]];
+        const NAMES: [[&str; 3]; 2] = [
+            ["width", "focal length x", "principal point x"],
+            ["height", "focal length y", "principal point y"],
+        ];
         for (axis, [size_name, focal_name, principal_name]) in NAMES.into_iter().enumerate() {
-            let (size, focal, principal) = (self.size_px[axis], self.focal_px[axis], self.principal_px[axis]);
+            let (size, focal, principal) = (
+                self.size_px[axis],
+                self.focal_px[axis],
+                self.principal_px[axis],
+            );
             check(size_name, f64::from(size), size > 0, "at least 1 px")?;
-            check(focal_name, focal, focal.is_finite() && focal > 0.0, "a positive number of pixels")?;
-            check(principal_name, principal, principal.is_finite(), "a finite number of pixels")?;
+            check(
+                focal_name,
+                focal,
+                focal.is_finite() && focal > 0.0,
+                "a positive number of pixels",
+            )?;
+            check(
+                principal_name,
+                principal,
+                principal.is_finite(),
+                "a finite number of pixels",
+            )?;
         }
-        let is_finite = |&k: &f64| check("a distortion coefficient", k, k.is_finite(), "a finite number");
+        let is_finite = |&k: &f64| {
+            check(
+                "a distortion coefficient",
+                k,
+                k.is_finite(),
+                "a finite number",
+            )
+        };
         self.lens.coefficients().iter().try_for_each(is_finite)
     }
 
     pub(crate) fn lens_in_use(&self) -> Lens {
-        if self.rectified { Lens::Pinhole } else { self.lens }
+        if self.rectified {
+            Lens::Pinhole
+        } else {
+            self.lens
+        }
     }
 
     pub(crate) fn pixel_at(&self, distorted: Vector2<f64>) -> Option<[f64; 2]> {
-        let pixel = [0, 1].map(|axis| self.focal_px[axis] * distorted[axis] + self.principal_px[axis]);
+        let pixel =
+            [0, 1].map(|axis| self.focal_px[axis] * distorted[axis] + self.principal_px[axis]);
         (pixel[0].is_finite() && pixel[1].is_finite()).then_some(pixel)
     }
 }
@@ -224,7 +279,9 @@ mod tests {
     }
 
     fn pixels() -> impl Iterator<Item = [f64; 2]> {
-        (0..=16).flat_map(|row| (0..=16).map(move |column| [f64::from(column) * 40.0, f64::from(row) * 30.0]))
+        (0..=16).flat_map(|row| {
+            (0..=16).map(move |column| [f64::from(column) * 40.0, f64::from(row) * 30.0])
+        })
     }
 
     #[test]
@@ -232,7 +289,9 @@ mod tests {
         for lens in lenses() {
             let camera = camera(lens);
             for pixel in pixels() {
-                let ray = camera.unproject(pixel).unwrap_or_else(|| panic!("{lens:?} shows nothing at {pixel:?}"));
+                let ray = camera
+                    .unproject(pixel)
+                    .unwrap_or_else(|| panic!("{lens:?} shows nothing at {pixel:?}"));
                 assert_eq!(ray.z, 1.0);
                 for depth_m in [0.01, 1.0, 30.0] {
                     let back = camera.project(&(ray * depth_m)).unwrap();
@@ -261,11 +320,18 @@ mod tests {
     fn equidistant_fisheye_is_linear_in_angle() {
         let camera = camera(Lens::KannalaBrandt([0.0; 4]));
         let angle = 0.9_f64;
-        let [u, v] = camera.project(&Vector3::new(3.0 * angle.sin(), 0.0, 3.0 * angle.cos())).unwrap();
+        let [u, v] = camera
+            .project(&Vector3::new(3.0 * angle.sin(), 0.0, 3.0 * angle.cos()))
+            .unwrap();
         assert!((u - (600.0 * angle + 321.5)).abs() < 1e-10);
         assert!((v - 238.25).abs() < 1e-10);
-        let distorted_camera = Intrinsics { lens: Lens::KannalaBrandt([0.1, 0.0, 0.0, 0.01]), ..camera };
-        let [_, v] = distorted_camera.project(&Vector3::new(0.0, angle.sin(), angle.cos())).unwrap();
+        let distorted_camera = Intrinsics {
+            lens: Lens::KannalaBrandt([0.1, 0.0, 0.0, 0.01]),
+            ..camera
+        };
+        let [_, v] = distorted_camera
+            .project(&Vector3::new(0.0, angle.sin(), angle.cos()))
+            .unwrap();
         let by_hand = angle * (1.0 + 0.1 * 0.81 + 0.01 * 0.43046721);
         assert!((v - (580.0 * by_hand + 238.25)).abs() < 1e-10);
     }
@@ -273,12 +339,17 @@ mod tests {
     #[test]
     fn derivatives_match_central_differences() {
         const NUDGE_M: f64 = 1e-6;
-        // Derivatives are hundreds of pixels per meter, with relative errors of 1e-12 (truncation) and 1e-13 / 1e-6
-        // (rounding).
+        // Derivatives are hundreds of pixels per meter, with relative errors of 1e-12 (truncation)
+        // and 1e-13 / 1e-6 (rounding).
         const CLOSE: f64 = 1e-6;
         for lens in lenses() {
             let camera = camera(lens);
-            for point in [[0.3, -0.2, 1.5], [0.0, 0.0, 0.7], [-0.4, 0.35, 1.1], [1e-9, 0.0, 1.0]] {
+            for point in [
+                [0.3, -0.2, 1.5],
+                [0.0, 0.0, 0.7],
+                [-0.4, 0.35, 1.1],
+                [1e-9, 0.0, 1.0],
+            ] {
                 let point = Vector3::from(point);
                 let (pixel, jacobian) = camera.project_with_jacobian(&point).unwrap();
                 assert_eq!(Some(pixel), camera.project(&point));
@@ -290,7 +361,10 @@ mod tests {
                     for row in 0..2 {
                         let numeric = (ahead[row] - behind[row]) / (2.0 * NUDGE_M);
                         let off = (jacobian[(row, axis)] - numeric).abs();
-                        assert!(off < CLOSE, "{lens:?} {point:?} row {row} axis {axis} off by {off}");
+                        assert!(
+                            off < CLOSE,
+                            "{lens:?} {point:?} row {row} axis {axis} off by {off}"
+                        );
                     }
                 }
             }
@@ -301,9 +375,23 @@ mod tests {
     fn invisible_points_project_to_none() {
         for lens in lenses() {
             let camera = camera(lens);
-            for point in [[0.0, 0.0, 0.0], [0.1, 0.0, -1.0], [1.0, 1.0, f64::NAN], [f64::NAN, 0.0, 1.0]] {
-                assert_eq!(camera.project(&Vector3::from(point)), None, "{lens:?} {point:?}");
-                assert!(camera.project_with_jacobian(&Vector3::from(point)).is_none(), "{lens:?} {point:?}");
+            for point in [
+                [0.0, 0.0, 0.0],
+                [0.1, 0.0, -1.0],
+                [1.0, 1.0, f64::NAN],
+                [f64::NAN, 0.0, 1.0],
+            ] {
+                assert_eq!(
+                    camera.project(&Vector3::from(point)),
+                    None,
+                    "{lens:?} {point:?}"
+                );
+                assert!(
+                    camera
+                        .project_with_jacobian(&Vector3::from(point))
+                        .is_none(),
+                    "{lens:?} {point:?}"
+                );
             }
             assert_eq!(camera.unproject([f64::NAN, 0.0]), None);
             assert_eq!(camera.unproject([f64::INFINITY, 0.0]), None);
@@ -319,8 +407,9 @@ mod tests {
         assert!(at(turning_radius * 0.999).is_some());
         assert_eq!(at(turning_radius * 1.001), None);
         assert_eq!(at(1.8), None); // Evaluated without the limit, the formula gives 0.03 of the focal length.
-        let unproject_at =
-            |radius: f64| camera.unproject([321.5 + 600.0 * radius * 0.6, 238.25 + 580.0 * radius * 0.8]);
+        let unproject_at = |radius: f64| {
+            camera.unproject([321.5 + 600.0 * radius * 0.6, 238.25 + 580.0 * radius * 0.8])
+        };
         assert!(unproject_at(turning_radius * 2.0 / 3.0 * 0.999).is_some());
         assert_eq!(unproject_at(turning_radius * 2.0 / 3.0 * 1.001), None);
     }
@@ -337,10 +426,16 @@ mod tests {
         let point = Vector3::new(0.4, -0.3, 1.2);
         let pinhole = camera(Lens::Pinhole);
         for lens in lenses().into_iter().skip(1) {
-            let rectified = Intrinsics { rectified: true, ..camera(lens) };
+            let rectified = Intrinsics {
+                rectified: true,
+                ..camera(lens)
+            };
             assert_ne!(camera(lens).project(&point), pinhole.project(&point));
             assert_eq!(rectified.project(&point), pinhole.project(&point));
-            assert_eq!(camera(lens).undistorted().project(&point), pinhole.project(&point));
+            assert_eq!(
+                camera(lens).undistorted().project(&point),
+                pinhole.project(&point)
+            );
             assert!(rectified.is_pinhole() && !camera(lens).is_pinhole());
         }
     }
@@ -354,7 +449,10 @@ mod tests {
         let point = Vector3::new(0.2, 0.1, 1.0);
         let [u, v] = camera(lenses()[1]).project(&point).unwrap();
         let [small_u, small_v] = odd.project(&point).unwrap();
-        assert!((small_u / 213.0 - u / 640.0).abs() < 1e-12 && (small_v / 160.0 - v / 480.0).abs() < 1e-12);
+        assert!(
+            (small_u / 213.0 - u / 640.0).abs() < 1e-12
+                && (small_v / 160.0 - v / 480.0).abs() < 1e-12
+        );
         assert_eq!(camera(Lens::Pinhole).scaled(0.0).size_px, [1, 1]);
     }
 
@@ -363,16 +461,40 @@ mod tests {
         let good = camera(lenses()[1]);
         good.validate().unwrap();
         for bad in [
-            Intrinsics { size_px: [0, 480], ..good.clone() },
-            Intrinsics { focal_px: [600.0, -1.0], ..good.clone() },
-            Intrinsics { focal_px: [f64::NAN, 1.0], ..good.clone() },
-            Intrinsics { principal_px: [0.0, f64::INFINITY], ..good.clone() },
-            Intrinsics { lens: Lens::KannalaBrandt([0.0, f64::NAN, 0.0, 0.0]), ..good },
+            Intrinsics {
+                size_px: [0, 480],
+                ..good.clone()
+            },
+            Intrinsics {
+                focal_px: [600.0, -1.0],
+                ..good.clone()
+            },
+            Intrinsics {
+                focal_px: [f64::NAN, 1.0],
+                ..good.clone()
+            },
+            Intrinsics {
+                principal_px: [0.0, f64::INFINITY],
+                ..good.clone()
+            },
+            Intrinsics {
+                lens: Lens::KannalaBrandt([0.0, f64::NAN, 0.0, 0.0]),
+                ..good
+            },
         ] {
             assert!(bad.validate().is_err(), "{bad:?}");
         }
         let message = camera(Lens::Pinhole);
-        let message = Intrinsics { size_px: [640, 0], ..message }.validate().unwrap_err().to_string();
-        assert_eq!(message, "camera intrinsics: height is 0, must be at least 1 px");
+        let message = Intrinsics {
+            size_px: [640, 0],
+            ..message
+        }
+        .validate()
+        .unwrap_err()
+        .to_string();
+        assert_eq!(
+            message,
+            "camera intrinsics: height is 0, must be at least 1 px"
+        );
     }
 }

@@ -7,8 +7,9 @@ use std::collections::HashMap;
 
 /// The joints between two links of a robot, ready to compute poses.
 ///
-/// Configurations are slices in the order of [`Chain::joint_names`]: radians for revolute joints, meters for
-/// prismatic ones. Mimic joints are not part of a configuration; they are computed from the joints they follow.
+/// Configurations are slices in the order of [`Chain::joint_names`]: radians for revolute joints,
+/// meters for prismatic ones. Mimic joints are not part of a configuration; they are computed from
+/// the joints they follow.
 #[derive(Clone, Debug)]
 pub struct Chain {
     base_link: String,
@@ -22,8 +23,8 @@ pub struct Chain {
 
 /// A constant transform, followed by the motion of one joint along or about the z axis.
 ///
-/// Fixed joints are merged into the constant, and frames are rotated so that every joint moves along or about z. Both
-/// happen once, when the chain is built.
+/// Fixed joints are merged into the constant, and frames are rotated so that every joint moves
+/// along or about z. Both happen once, when the chain is built.
 #[derive(Clone, Debug)]
 struct Segment {
     before: RigidMotion,
@@ -67,12 +68,17 @@ impl Chain {
                 JointKind::Revolute => false,
                 JointKind::Prismatic => true,
                 JointKind::Unsupported(kind) => {
-                    return Err(Error::JointType { joint: joint.name.clone(), kind });
+                    return Err(Error::JointType {
+                        joint: joint.name.clone(),
+                        kind,
+                    });
                 }
             };
             let joint_from_aligned = rotation_from_z_to(&joint.axis);
             let rule = follow_mimics(robot, joint, &mut rules)?;
-            let joint_ix = *indices.entry(&rule.source.name).or_insert_with(|| chain.add(rule.source));
+            let joint_ix = *indices
+                .entry(&rule.source.name)
+                .or_insert_with(|| chain.add(rule.source));
             chain.segments.push(Segment {
                 before: RigidMotion::new(&(constant * joint_from_aligned)),
                 is_prismatic,
@@ -80,7 +86,8 @@ impl Chain {
                 multiplier: rule.multiplier,
                 offset: rule.offset,
             });
-            constant = Transform::from_parts(Translation3::identity(), joint_from_aligned.inverse());
+            constant =
+                Transform::from_parts(Translation3::identity(), joint_from_aligned.inverse());
         }
         chain.last_from_tip = RigidMotion::new(&constant);
         Ok(chain)
@@ -96,8 +103,9 @@ impl Chain {
         &self.tip_link
     }
 
-    /// Names of the independent moving joints, from base to tip. A joint that a mimic joint follows is listed at the
-    /// first position where it affects the chain, even if it is not on the path from base to tip.
+    /// Names of the independent moving joints, from base to tip. A joint that a mimic joint follows
+    /// is listed at the first position where it affects the chain, even if it is not on the path
+    /// from base to tip.
     pub fn joint_names(&self) -> &[String] {
         &self.joint_names
     }
@@ -112,14 +120,18 @@ impl Chain {
         &self.limits
     }
 
-    /// Index in `names` of each joint of the chain, for devices and files with a different joint order.
+    /// Index in `names` of each joint of the chain, for devices and files with a different joint
+    /// order.
     pub fn order_in(&self, names: &[String]) -> Result<Vec<usize>, Error> {
         let find = |joint: &String| {
-            names.iter().position(|name| name == joint).ok_or_else(|| Error::MissingJoint {
-                joint: joint.clone(),
-                tip: self.tip_link.clone(),
-                given: names.to_vec(),
-            })
+            names
+                .iter()
+                .position(|name| name == joint)
+                .ok_or_else(|| Error::MissingJoint {
+                    joint: joint.clone(),
+                    tip: self.tip_link.clone(),
+                    given: names.to_vec(),
+                })
         };
         self.joint_names.iter().map(find).collect()
     }
@@ -131,8 +143,8 @@ impl Chain {
         Ok(base_from_tip)
     }
 
-    /// Like [`Chain::forward`], but writes the pose into `base_from_tip`, which is unchanged on error. Neither function
-    /// allocates memory.
+    /// Like [`Chain::forward`], but writes the pose into `base_from_tip`, which is unchanged on
+    /// error. Neither function allocates memory.
     pub fn forward_into(&self, q: &[f64], base_from_tip: &mut Transform) -> Result<(), Error> {
         self.check(q)?;
         let mut pose = RigidMotion::IDENTITY;
@@ -145,8 +157,9 @@ impl Chain {
         Ok(())
     }
 
-    /// Geometric Jacobian at `q`. Multiplied by the joint velocities, it gives the velocity of the tip's origin (rows
-    /// 0 to 2) and the angular velocity of the tip (rows 3 to 5), both in the base frame.
+    /// Geometric Jacobian at `q`. Multiplied by the joint velocities, it gives the velocity of the
+    /// tip's origin (rows 0 to 2) and the angular velocity of the tip (rows 3 to 5), both in the
+    /// base frame.
     pub fn jacobian(&self, q: &[f64]) -> Result<Matrix6xX<f64>, Error> {
         let tip_in_base = self.forward(q)?.translation.vector;
         let mut jacobian = Matrix6xX::zeros(self.n_joints());
@@ -156,7 +169,10 @@ impl Chain {
             let axis_in_base = rotate(&pose.rotation, &Vector3::z());
             let (linear, angular) = match segment.is_prismatic {
                 true => (axis_in_base, Vector3::zeros()),
-                false => (axis_in_base.cross(&(tip_in_base - pose.translation)), axis_in_base),
+                false => (
+                    axis_in_base.cross(&(tip_in_base - pose.translation)),
+                    axis_in_base,
+                ),
             };
             let mut column = jacobian.column_mut(segment.joint_ix);
             let mut add = |row: usize, part: Vector3<f64>| {
@@ -171,8 +187,8 @@ impl Chain {
         Ok(jacobian)
     }
 
-    /// Velocity of the tip relative to the base, in the tip frame, when the joints are at `q` and move with the
-    /// velocities `qd` (rad/s or m/s).
+    /// Velocity of the tip relative to the base, in the tip frame, when the joints are at `q` and
+    /// move with the velocities `qd` (rad/s or m/s).
     pub fn tip_twist(&self, q: &[f64], qd: &[f64]) -> Result<Twist, Error> {
         self.check(qd)?;
         let mut tip = Twist::zero();
@@ -183,8 +199,8 @@ impl Chain {
         Ok(tip)
     }
 
-    /// For each joint, the velocity of the tip relative to the base, in the tip frame, when only that joint moves from
-    /// `q` at unit speed (1 rad/s or 1 m/s).
+    /// For each joint, the velocity of the tip relative to the base, in the tip frame, when only
+    /// that joint moves from `q` at unit speed (1 rad/s or 1 m/s).
     pub fn tip_twists_by_joint(&self, q: &[f64]) -> Result<Vec<Twist>, Error> {
         let tip_from_base = self.forward(q)?.rotation.inverse();
         let in_tip = |linear: Vector3<f64>, angular: Vector3<f64>| Twist {
@@ -193,7 +209,14 @@ impl Chain {
         };
         let jacobian = self.jacobian(q)?;
         let columns = jacobian.column_iter();
-        Ok(columns.map(|column| in_tip(column.fixed_rows::<3>(0).into(), column.fixed_rows::<3>(3).into())).collect())
+        Ok(columns
+            .map(|column| {
+                in_tip(
+                    column.fixed_rows::<3>(0).into(),
+                    column.fixed_rows::<3>(3).into(),
+                )
+            })
+            .collect())
     }
 
     fn check(&self, values: &[f64]) -> Result<(), Error> {
@@ -206,7 +229,10 @@ impl Chain {
         }
         match values.iter().position(|value| !value.is_finite()) {
             None => Ok(()),
-            Some(at) => Err(Error::JointNotFinite { joint: self.joint_names[at].clone(), value: values[at] }),
+            Some(at) => Err(Error::JointNotFinite {
+                joint: self.joint_names[at].clone(),
+                value: values[at],
+            }),
         }
     }
 
@@ -217,8 +243,8 @@ impl Chain {
     }
 }
 
-/// How a joint follows an independent joint: `multiplier * source + offset`. A joint without `<mimic>` is its own
-/// source.
+/// How a joint follows an independent joint: `multiplier * source + offset`. A joint without
+/// `<mimic>` is its own source.
 #[derive(Clone, Copy)]
 struct MimicRule<'a> {
     source: &'a Joint,
@@ -229,7 +255,11 @@ struct MimicRule<'a> {
 /// The known rules, by joint: chains of mimic joints are followed once.
 type MimicRules<'a> = HashMap<&'a str, MimicRule<'a>>;
 
-fn follow_mimics<'a>(robot: &'a Robot, joint: &'a Joint, rules: &mut MimicRules<'a>) -> Result<MimicRule<'a>, Error> {
+fn follow_mimics<'a>(
+    robot: &'a Robot,
+    joint: &'a Joint,
+    rules: &mut MimicRules<'a>,
+) -> Result<MimicRule<'a>, Error> {
     let mut followers = Vec::new();
     let mut current = joint;
     let mut rule = loop {
@@ -237,10 +267,20 @@ fn follow_mimics<'a>(robot: &'a Robot, joint: &'a Joint, rules: &mut MimicRules<
             break *known;
         }
         let Some(mimic) = &current.mimic else {
-            break MimicRule { source: current, multiplier: 1.0, offset: 0.0 };
+            break MimicRule {
+                source: current,
+                multiplier: 1.0,
+                offset: 0.0,
+            };
         };
-        let rejected = |why| Error::Mimic { joint: joint.name.clone(), source_joint: mimic.source.clone(), why };
-        let source = robot.joint(&mimic.source).ok_or_else(|| rejected("is not in the URDF"))?;
+        let rejected = |why| Error::Mimic {
+            joint: joint.name.clone(),
+            source_joint: mimic.source.clone(),
+            why,
+        };
+        let source = robot
+            .joint(&mimic.source)
+            .ok_or_else(|| rejected("is not in the URDF"))?;
         if let Some(problem) = &source.problem {
             return Err(problem.clone());
         }
@@ -254,7 +294,11 @@ fn follow_mimics<'a>(robot: &'a Robot, joint: &'a Joint, rules: &mut MimicRules<
         current = source;
     };
     while let Some((follower, mimic)) = followers.pop() {
-        let MimicRule { source, multiplier, offset } = rule;
+        let MimicRule {
+            source,
+            multiplier,
+            offset,
+        } = rule;
         rule = MimicRule {
             source,
             multiplier: mimic.multiplier * multiplier,
@@ -266,7 +310,8 @@ fn follow_mimics<'a>(robot: &'a Robot, joint: &'a Joint, rules: &mut MimicRules<
 }
 
 fn rotation_from_z_to(axis: &Unit<Vector3<f64>>) -> UnitQuaternion<f64> {
-    // Opposite directions leave the rotation axis undetermined: a half turn about any axis perpendicular to z works.
+    // Opposite directions leave the rotation axis undetermined: a half turn about any axis
+    // perpendicular to z works.
     UnitQuaternion::rotation_between_axis(&Vector3::z_axis(), axis)
         .unwrap_or_else(|| UnitQuaternion::from_quaternion(Quaternion::new(0.0, 1.0, 0.0, 0.0)))
 }
@@ -283,12 +328,18 @@ impl RigidMotion {
     };
 
     fn new(transform: &Transform) -> Self {
-        Self { rotation: transform.rotation.into_inner(), translation: transform.translation.vector }
+        Self {
+            rotation: transform.rotation.into_inner(),
+            translation: transform.translation.vector,
+        }
     }
 
     fn transform(&self) -> Transform {
         // The product of a few unit quaternions deviates from unit length only by rounding.
-        Transform::from_parts(self.translation.into(), UnitQuaternion::new_unchecked(self.rotation))
+        Transform::from_parts(
+            self.translation.into(),
+            UnitQuaternion::new_unchecked(self.rotation),
+        )
     }
 
     fn compose(&mut self, next: &Self) {
@@ -302,11 +353,16 @@ impl RigidMotion {
             self.translation += rotate(&self.rotation, &Vector3::new(0.0, 0.0, value));
             return;
         }
-        // Multiplies by the quaternion (cos, 0, 0, sin) of half the angle without the terms that are zero.
+        // Multiplies by the quaternion (cos, 0, 0, sin) of half the angle without the terms that
+        // are zero.
         let (sin, cos) = (0.5 * value).sin_cos();
         let r = &self.rotation;
-        self.rotation =
-            Quaternion::new(r.w * cos - r.k * sin, r.i * cos + r.j * sin, r.j * cos - r.i * sin, r.k * cos + r.w * sin);
+        self.rotation = Quaternion::new(
+            r.w * cos - r.k * sin,
+            r.i * cos + r.j * sin,
+            r.j * cos - r.i * sin,
+            r.k * cos + r.w * sin,
+        );
     }
 }
 
@@ -349,15 +405,17 @@ mod tests {
 
     fn configurations(n_joints: usize) -> Vec<Vec<f64>> {
         let value = |at: usize, joint: usize| ((at * 7 + joint * 13 + 3) as f64 * 1.7).sin() * 2.5;
-        (0..50).map(|at| (0..n_joints).map(|joint| value(at, joint)).collect()).collect()
+        (0..50)
+            .map(|at| (0..n_joints).map(|joint| value(at, joint)).collect())
+            .collect()
     }
 
     fn distance(a: &Matrix4<f64>, b: &Matrix4<f64>) -> f64 {
         (a - b).abs().max()
     }
 
-    /// Every joint type, non-standard axes, and mimic joints with offsets, one of which follows a joint outside the
-    /// path.
+    /// Every joint type, non-standard axes, and mimic joints with offsets, one of which follows a
+    /// joint outside the path.
     const ODD: &str = r#"<robot name="odd">
         <link name="a"/><link name="b"/><link name="c"/><link name="d"/><link name="e"/><link name="f"/><link name="g"/>
         <link name="off"/><link name="soft"/>
@@ -377,7 +435,9 @@ mod tests {
     </robot>"#;
 
     fn odd_by_hand(q: &[f64]) -> Matrix4<f64> {
-        let rotate_by = |axis: Vector3<f64>, angle: f64| Matrix4::from_axis_angle(&Unit::new_normalize(axis), angle);
+        let rotate_by = |axis: Vector3<f64>, angle: f64| {
+            Matrix4::from_axis_angle(&Unit::new_normalize(axis), angle)
+        };
         let translate_by = |vector: Vector3<f64>| Matrix4::new_translation(&vector);
         let rpy = |r: f64, p: f64, y: f64| {
             rotate_by(Vector3::z(), y) * rotate_by(Vector3::y(), p) * rotate_by(Vector3::x(), r)
@@ -399,9 +459,17 @@ mod tests {
     fn panda_matches_published_dh_table() {
         let chain = Chain::from_urdf(PANDA, "link0", "link8").unwrap();
         for q in configurations(7) {
-            assert!(distance(&chain.forward(&q).unwrap().to_homogeneous(), &panda_by_dh(&q)) < CLOSE);
+            assert!(
+                distance(
+                    &chain.forward(&q).unwrap().to_homogeneous(),
+                    &panda_by_dh(&q)
+                ) < CLOSE
+            );
         }
-        let off = distance(&chain.forward(&[0.001; 7]).unwrap().to_homogeneous(), &panda_by_dh(&[0.0; 7]));
+        let off = distance(
+            &chain.forward(&[0.001; 7]).unwrap().to_homogeneous(),
+            &panda_by_dh(&[0.0; 7]),
+        );
         assert!(off > 1e-4, "the comparison must distinguish poses");
     }
 
@@ -410,9 +478,17 @@ mod tests {
         let chain = Chain::from_urdf(ODD, "a", "g").unwrap();
         assert_eq!(chain.joint_names(), ["down", "slide", "far"]);
         assert_eq!(chain.n_joints(), 3);
-        assert_eq!((chain.limits()[1].lower, chain.limits()[0].upper), (-1.0, f64::INFINITY));
+        assert_eq!(
+            (chain.limits()[1].lower, chain.limits()[0].upper),
+            (-1.0, f64::INFINITY)
+        );
         for q in configurations(3) {
-            assert!(distance(&chain.forward(&q).unwrap().to_homogeneous(), &odd_by_hand(&q)) < CLOSE);
+            assert!(
+                distance(
+                    &chain.forward(&q).unwrap().to_homogeneous(),
+                    &odd_by_hand(&q)
+                ) < CLOSE
+            );
         }
     }
 
@@ -421,14 +497,24 @@ mod tests {
         let chain = Chain::from_urdf(PANDA, "link7", "tcp").unwrap();
         assert_eq!(chain.n_joints(), 0);
         assert!((chain.forward(&[]).unwrap().translation.z - 0.2104).abs() < CLOSE);
-        assert_eq!(Chain::from_urdf(PANDA, "tcp", "tcp").unwrap().forward(&[]).unwrap(), Transform::identity());
+        assert_eq!(
+            Chain::from_urdf(PANDA, "tcp", "tcp")
+                .unwrap()
+                .forward(&[])
+                .unwrap(),
+            Transform::identity()
+        );
     }
 
     #[test]
     fn jacobian_matches_central_differences() {
         const NUDGE: f64 = 1e-6;
         const ABS: f64 = 1e-8; // Truncation NUDGE², rounding 1e-16 / NUDGE, each times sizes near 10.
-        for (urdf, base, tip) in [(PANDA, "link0", "tcp"), (PANDA, "link0", "finger_right"), (ODD, "a", "g")] {
+        for (urdf, base, tip) in [
+            (PANDA, "link0", "tcp"),
+            (PANDA, "link0", "finger_right"),
+            (ODD, "a", "g"),
+        ] {
             let chain = Chain::from_urdf(urdf, base, tip).unwrap();
             for q in configurations(chain.n_joints()) {
                 let jacobian = chain.jacobian(&q).unwrap();
@@ -440,17 +526,31 @@ mod tests {
                         chain.forward(&q).unwrap()
                     };
                     let (ahead, behind) = (nudged(NUDGE), nudged(-NUDGE));
-                    let linear = (ahead.translation.vector - behind.translation.vector) / (2.0 * NUDGE);
-                    let angular = (ahead.rotation * behind.rotation.inverse()).scaled_axis() / (2.0 * NUDGE);
-                    assert!((jacobian.fixed_view::<3, 1>(0, joint) - linear).norm() < ABS, "{tip} joint {joint}");
-                    assert!((jacobian.fixed_view::<3, 1>(3, joint) - angular).norm() < ABS, "{tip} joint {joint}");
+                    let linear =
+                        (ahead.translation.vector - behind.translation.vector) / (2.0 * NUDGE);
+                    let angular =
+                        (ahead.rotation * behind.rotation.inverse()).scaled_axis() / (2.0 * NUDGE);
+                    assert!(
+                        (jacobian.fixed_view::<3, 1>(0, joint) - linear).norm() < ABS,
+                        "{tip} joint {joint}"
+                    );
+                    assert!(
+                        (jacobian.fixed_view::<3, 1>(3, joint) - angular).norm() < ABS,
+                        "{tip} joint {joint}"
+                    );
                     // Compares the same motion as a twist in the tip frame.
                     let mut qd = vec![0.0; chain.n_joints()];
                     qd[joint] = 1.0;
                     let twist = chain.tip_twist(&q, &qd).unwrap();
                     let moved = crate::transform::log(&(pose.inverse() * ahead), NUDGE);
-                    assert!((twist.linear_m_s - moved.linear_m_s).norm() < 1e-4, "{tip} joint {joint}");
-                    assert!((twist.angular_rad_s - moved.angular_rad_s).norm() < 1e-4, "{tip} joint {joint}");
+                    assert!(
+                        (twist.linear_m_s - moved.linear_m_s).norm() < 1e-4,
+                        "{tip} joint {joint}"
+                    );
+                    assert!(
+                        (twist.angular_rad_s - moved.angular_rad_s).norm() < 1e-4,
+                        "{tip} joint {joint}"
+                    );
                 }
             }
         }
@@ -471,9 +571,18 @@ mod tests {
     fn invalid_configurations_are_rejected() {
         let chain = Chain::from_urdf(PANDA, "link0", "link3").unwrap();
         let error_of = |q: &[f64]| chain.forward(q).unwrap_err().to_string();
-        assert_eq!(error_of(&[0.0, 1.0]), "2 joint values given, the chain has 3: joint1, joint2, joint3");
-        assert_eq!(error_of(&[0.0, f64::NAN, 0.0]), r#"joint "joint2": NaN is not a finite number"#);
-        assert!(chain.jacobian(&[0.0; 4]).is_err() && chain.tip_twist(&[0.0; 3], &[f64::INFINITY; 3]).is_err());
+        assert_eq!(
+            error_of(&[0.0, 1.0]),
+            "2 joint values given, the chain has 3: joint1, joint2, joint3"
+        );
+        assert_eq!(
+            error_of(&[0.0, f64::NAN, 0.0]),
+            r#"joint "joint2": NaN is not a finite number"#
+        );
+        assert!(
+            chain.jacobian(&[0.0; 4]).is_err()
+                && chain.tip_twist(&[0.0; 3], &[f64::INFINITY; 3]).is_err()
+        );
         let names = ["joint3", "x", "joint1", "joint2"].map(String::from);
         assert_eq!(chain.order_in(&names), Ok(vec![2, 3, 0]));
         assert_eq!(
@@ -484,12 +593,15 @@ mod tests {
 
     #[test]
     fn unsupported_joints_are_rejected() {
-        let error_of = |urdf: &str, base: &str, tip: &str| Chain::from_urdf(urdf, base, tip).unwrap_err().to_string();
+        let error_of = |urdf: &str, base: &str, tip: &str| {
+            Chain::from_urdf(urdf, base, tip).unwrap_err().to_string()
+        };
         assert_eq!(
             error_of(ODD, "a", "soft"),
             r#"joint "float" has the type floating; only fixed, revolute, continuous and prismatic joints are supported"#
         );
-        let mimic = |from: &str, to: &str| error_of(&PANDA.replace(from, to), "link0", "finger_right");
+        let mimic =
+            |from: &str, to: &str| error_of(&PANDA.replace(from, to), "link0", "finger_right");
         let source = r#"mimic joint="finger_joint_left""#;
         assert_eq!(
             mimic(source, r#"mimic joint="thumb""#),

@@ -5,14 +5,15 @@ use std::collections::VecDeque;
 
 /// Maps stamps of one device's clock to the host's monotonic clock.
 ///
-/// Every message arrives at `device * (1 + drift) + offset + latency`, where the latency has a fixed minimum and is
-/// often much larger. All arrivals therefore lie above a line. The map is the highest such line: the edge of the lower
-/// convex hull across the mean device time (Moon, Skelly and Towsley 1999, section 4). Late arrivals do not move the
-/// line. The minimum latency cannot be observed and remains in the result; calibration estimates it.
+/// Every message arrives at `device * (1 + drift) + offset + latency`, where the latency has a
+/// fixed minimum and is often much larger. All arrivals therefore lie above a line. The map is the
+/// highest such line: the edge of the lower convex hull across the mean device time (Moon, Skelly
+/// and Towsley 1999, section 4). Late arrivals do not move the line. The minimum latency cannot be
+/// observed and remains in the result; calibration estimates it.
 #[derive(Clone, Debug)]
 pub struct ClockMap {
-    /// Device stamp and arrival of the first message since the start or the last restart. Device times are relative to
-    /// it.
+    /// Device stamp and arrival of the first message since the start or the last restart. Device
+    /// times are relative to it.
     origin: Option<Origin>,
     /// For each bucket of device time, the message with the smallest delay.
     buckets: VecDeque<Bucket>,
@@ -46,20 +47,22 @@ struct Line {
 
 /// Each bucket keeps one arrival.
 const BUCKET_NANOS: i64 = 250_000_000;
-/// Arrivals older than this are discarded, so that the map follows a drift that changes with temperature.
+/// Arrivals older than this are discarded, so that the map follows a drift that changes with
+/// temperature.
 const WINDOW_SECS: f64 = 120.0;
 /// Maximum drift. It exceeds the drift of any common crystal; steeper slopes are caused by latency.
 const MAX_DRIFT: f64 = 200e-6;
-/// Observed time span from which on the estimated drift is applied in full. It is applied in proportion to shorter
-/// spans, because latency looks like drift over short spans.
+/// Observed time span from which on the estimated drift is applied in full. It is applied in
+/// proportion to shorter spans, because latency looks like drift over short spans.
 const FULL_DRIFT_SECS: f64 = 80.0;
-/// If a device stamp is earlier than the newest one by more than this, the clock has restarted. Smaller steps back come
-/// from reordered messages.
+/// If a device stamp is earlier than the newest one by more than this, the clock has restarted.
+/// Smaller steps back come from reordered messages.
 const MAX_DISORDER_NANOS: i64 = 500_000_000;
-/// If a message arrives earlier than the line by more than this, in seconds, the device clock has jumped ahead.
+/// If a message arrives earlier than the line by more than this, in seconds, the device clock has
+/// jumped ahead.
 const MAX_EARLY_SECS: f64 = 0.25;
-/// If all arrivals within [`MAX_LATE_NANOS`] are late by more than this, in seconds, the device clock has jumped back a
-/// little or was paused.
+/// If all arrivals within [`MAX_LATE_NANOS`] are late by more than this, in seconds, the device
+/// clock has jumped back a little or was paused.
 const MAX_LATE_SECS: f64 = 1.0;
 /// How long arrivals must be late before the clock counts as restarted.
 const MAX_LATE_NANOS: i64 = 3_000_000_000;
@@ -96,9 +99,13 @@ impl ClockMap {
         self.newest_nanos = self.newest_nanos.max(device_nanos);
         let since_nanos = device_nanos.saturating_sub(origin.device_nanos);
         let device_secs = since_nanos as f64 / NANOS_PER_SEC;
-        let delay_secs = arrival.nanos_since(origin.arrival).saturating_sub(since_nanos) as f64 / NANOS_PER_SEC;
+        let delay_secs = arrival
+            .nanos_since(origin.arrival)
+            .saturating_sub(since_nanos) as f64
+            / NANOS_PER_SEC;
         let lateness_secs = delay_secs - self.line.at(device_secs);
-        // The first arrival may have had any latency, so early arrivals are checked only after a line has formed.
+        // The first arrival may have had any latency, so early arrivals are checked only after a
+        // line has formed.
         let has_line = self.buckets.len() > 4;
         if has_line && lateness_secs < -MAX_EARLY_SECS {
             return self.restart(device_nanos, arrival);
@@ -106,32 +113,45 @@ impl ClockMap {
         if self.late_for_too_long(lateness_secs, arrival) {
             return self.restart(device_nanos, arrival);
         }
-        if self.insert(Bucket { index: since_nanos.div_euclid(BUCKET_NANOS), device_secs, delay_secs }) {
+        if self.insert(Bucket {
+            index: since_nanos.div_euclid(BUCKET_NANOS),
+            device_secs,
+            delay_secs,
+        }) {
             self.line = self.fit();
         }
     }
 
     /// Converts a device stamp to host time. Returns `None` before the first message.
     ///
-    /// The result includes the minimum latency of the connection. Stamps may map to slightly earlier times once a
-    /// faster message has arrived, so two stamps close together can change order while there are few observations.
-    #[expect(clippy::cast_possible_truncation, reason = "a float to integer cast saturates")]
+    /// The result includes the minimum latency of the connection. Stamps may map to slightly
+    /// earlier times once a faster message has arrived, so two stamps close together can change
+    /// order while there are few observations.
+    #[expect(
+        clippy::cast_possible_truncation,
+        reason = "a float to integer cast saturates"
+    )]
     pub fn map(&self, device_nanos: i64) -> Option<Stamp> {
         let origin = self.origin?;
         let since_nanos = device_nanos.saturating_sub(origin.device_nanos);
         let delay_nanos = self.line.at(since_nanos as f64 / NANOS_PER_SEC) * NANOS_PER_SEC;
-        let mapped = origin.arrival.0.saturating_add(since_nanos).saturating_add(delay_nanos.round() as i64);
+        let mapped = origin
+            .arrival
+            .0
+            .saturating_add(since_nanos)
+            .saturating_add(delay_nanos.round() as i64);
         Some(Stamp(mapped))
     }
 
     /// Adds one message and returns its host time, which is never later than its arrival.
     pub fn stamp(&mut self, device_nanos: i64, arrival: Stamp) -> Stamp {
         self.observe(device_nanos, arrival);
-        self.map(device_nanos).map_or(arrival, |mapped| mapped.min(arrival))
+        self.map(device_nanos)
+            .map_or(arrival, |mapped| mapped.min(arrival))
     }
 
-    /// Relative rate difference: positive if the host clock runs faster than the device clock (1e-6 is one part per
-    /// million).
+    /// Relative rate difference: positive if the host clock runs faster than the device clock (1e-6
+    /// is one part per million).
     pub fn drift(&self) -> f64 {
         self.line.drift
     }
@@ -142,12 +162,19 @@ impl ClockMap {
     }
 
     fn start(&mut self, device_nanos: i64, arrival: Stamp) {
-        self.origin = Some(Origin { device_nanos, arrival });
+        self.origin = Some(Origin {
+            device_nanos,
+            arrival,
+        });
         self.newest_nanos = device_nanos;
         self.late_since_nanos = None;
         self.line = Line::default();
         self.buckets.clear();
-        self.buckets.push_back(Bucket { index: 0, device_secs: 0.0, delay_secs: 0.0 });
+        self.buckets.push_back(Bucket {
+            index: 0,
+            device_secs: 0.0,
+            delay_secs: 0.0,
+        });
     }
 
     fn restart(&mut self, device_nanos: i64, arrival: Stamp) {
@@ -160,19 +187,30 @@ impl ClockMap {
             self.late_since_nanos = None;
             return false;
         }
-        arrival.0.saturating_sub(*self.late_since_nanos.get_or_insert(arrival.0)) > MAX_LATE_NANOS
+        arrival
+            .0
+            .saturating_sub(*self.late_since_nanos.get_or_insert(arrival.0))
+            > MAX_LATE_NANOS
     }
 
     /// Merges an arrival into its bucket. Returns whether anything changed.
     fn insert(&mut self, new: Bucket) -> bool {
-        let at = self.buckets.partition_point(|bucket| bucket.index < new.index);
+        let at = self
+            .buckets
+            .partition_point(|bucket| bucket.index < new.index);
         match self.buckets.get_mut(at) {
             None => self.buckets.push_back(new),
-            Some(known) if known.index == new.index && new.delay_secs < known.delay_secs => *known = new,
+            Some(known) if known.index == new.index && new.delay_secs < known.delay_secs => {
+                *known = new
+            }
             Some(_) => return false,
         }
         let oldest_secs = new.device_secs - WINDOW_SECS;
-        while self.buckets.front().is_some_and(|bucket| bucket.device_secs < oldest_secs) {
+        while self
+            .buckets
+            .front()
+            .is_some_and(|bucket| bucket.device_secs < oldest_secs)
+        {
             self.buckets.pop_front();
         }
         true
@@ -185,13 +223,24 @@ impl ClockMap {
         };
         let max_drift = MAX_DRIFT * (span_secs / FULL_DRIFT_SECS).min(1.0);
         let drift = self.hull_slope().clamp(-max_drift, max_drift);
-        let offset_secs = self.buckets.iter().map(|bucket| bucket.delay_secs - drift * bucket.device_secs);
-        Line { offset_secs: offset_secs.fold(f64::INFINITY, f64::min), drift }
+        let offset_secs = self
+            .buckets
+            .iter()
+            .map(|bucket| bucket.delay_secs - drift * bucket.device_secs);
+        Line {
+            offset_secs: offset_secs.fold(f64::INFINITY, f64::min),
+            drift,
+        }
     }
 
     /// Slope of the edge of the lower convex hull at the mean device time.
     fn hull_slope(&self) -> f64 {
-        let mean_secs = self.buckets.iter().map(|bucket| bucket.device_secs).sum::<f64>() / self.buckets.len() as f64;
+        let mean_secs = self
+            .buckets
+            .iter()
+            .map(|bucket| bucket.device_secs)
+            .sum::<f64>()
+            / self.buckets.len() as f64;
         let mut hull: Vec<&Bucket> = Vec::with_capacity(self.buckets.len());
         for bucket in &self.buckets {
             while let [.., a, b] = hull[..]
@@ -201,7 +250,9 @@ impl ClockMap {
             }
             hull.push(bucket);
         }
-        let edge = hull.windows(2).find(|edge| edge[1].device_secs >= mean_secs);
+        let edge = hull
+            .windows(2)
+            .find(|edge| edge[1].device_secs >= mean_secs);
         edge.map_or(0.0, |edge| slope(edge[0], edge[1]))
     }
 }
@@ -216,7 +267,8 @@ fn slope(a: &Bucket, b: &Bucket) -> f64 {
     (b.delay_secs - a.delay_secs) / (b.device_secs - a.device_secs)
 }
 
-/// Unwraps a device's 32-bit microsecond counter, which overflows every 71.6 minutes, to nanoseconds.
+/// Unwraps a device's 32-bit microsecond counter, which overflows every 71.6 minutes, to
+/// nanoseconds.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct WrappingMicros {
     last: Option<(u32, i64)>,
@@ -228,7 +280,8 @@ impl WrappingMicros {
         Self::default()
     }
 
-    /// Returns the count as monotonic nanoseconds, assuming that it lies within 35 minutes of the previous count.
+    /// Returns the count as monotonic nanoseconds, assuming that it lies within 35 minutes of the
+    /// previous count.
     pub fn nanos(&mut self, micros: u32) -> i64 {
         const NANOS_PER_MICRO: i64 = 1000;
         let total = match self.last {
@@ -242,7 +295,10 @@ impl WrappingMicros {
 
 #[cfg(test)]
 mod tests {
-    #![expect(clippy::cast_possible_truncation, reason = "test numbers lie well inside the integers' ranges")]
+    #![expect(
+        clippy::cast_possible_truncation,
+        reason = "test numbers lie well inside the integers' ranges"
+    )]
 
     use super::*;
     use crate::random::Random;
@@ -251,7 +307,8 @@ mod tests {
     const JITTER_NANOS: f64 = 75e6;
     const DRIFT: f64 = 50e-6;
 
-    /// A device that sends at a fixed rate over a connection with jitter. Drift and latencies derive from one seed.
+    /// A device that sends at a fixed rate over a connection with jitter. Drift and latencies
+    /// derive from one seed.
     struct Device {
         rate_hz: f64,
         random: Random,
@@ -260,7 +317,11 @@ mod tests {
 
     impl Device {
         fn new(rate_hz: f64, seed: u64) -> Self {
-            Self { rate_hz, random: Random::new(seed), clock_starts: 9_876_543_210 }
+            Self {
+                rate_hz,
+                random: Random::new(seed),
+                clock_starts: 9_876_543_210,
+            }
         }
 
         /// True time, device time and arrival of the message at `ix`, in nanoseconds.
@@ -272,7 +333,8 @@ mod tests {
         }
     }
 
-    /// Largest error from `settled_secs` to the end, in nanoseconds, after subtracting the fixed latency.
+    /// Largest error from `settled_secs` to the end, in nanoseconds, after subtracting the fixed
+    /// latency.
     fn worst_error(clock: &mut ClockMap, device: &mut Device, secs: f64, settled_secs: f64) -> i64 {
         let n_messages = (secs * device.rate_hz) as u32;
         let mut worst = 0;
@@ -289,9 +351,9 @@ mod tests {
 
     #[test]
     fn jitter_and_drift_are_filtered_to_a_millisecond() {
-        // Rate, run length, settling time, maximum error after settling, and number of runs whose error may be up to
-        // twice the maximum. At a low rate, messages with a low latency are rare: the fastest of n messages in a window
-        // has about 75 ms / n of jitter.
+        // Rate, run length, settling time, maximum error after settling, and number of runs whose
+        // error may be up to twice the maximum. At a low rate, messages with a low latency are
+        // rare: the fastest of n messages in a window has about 75 ms / n of jitter.
         const RUNS: [(f64, f64, f64, i64, usize); 4] = [
             (1000.0, 30.0, 2.0, 300_000, 0),
             (200.0, 60.0, 6.0, 700_000, 0),
@@ -301,15 +363,30 @@ mod tests {
         for (rate_hz, secs, settled_secs, close_nanos, max_n_exceeding) in RUNS {
             let worst_of_run = |seed| {
                 let mut clock = ClockMap::new();
-                let worst = worst_error(&mut clock, &mut Device::new(rate_hz, seed), secs, settled_secs);
-                assert!((clock.drift() - DRIFT).abs() < 20e-6, "{rate_hz} Hz, seed {seed}: drift {}", clock.drift());
+                let worst = worst_error(
+                    &mut clock,
+                    &mut Device::new(rate_hz, seed),
+                    secs,
+                    settled_secs,
+                );
+                assert!(
+                    (clock.drift() - DRIFT).abs() < 20e-6,
+                    "{rate_hz} Hz, seed {seed}: drift {}",
+                    clock.drift()
+                );
                 assert_eq!(clock.n_restarts(), 0);
                 worst
             };
             let worst: Vec<i64> = (1..=20).map(worst_of_run).collect();
-            assert!(worst.iter().all(|nanos| *nanos < 2 * close_nanos), "{rate_hz} Hz: {worst:?} ns off");
+            assert!(
+                worst.iter().all(|nanos| *nanos < 2 * close_nanos),
+                "{rate_hz} Hz: {worst:?} ns off"
+            );
             let n_exceeding = worst.iter().filter(|nanos| **nanos >= close_nanos).count();
-            assert!(n_exceeding <= max_n_exceeding, "{rate_hz} Hz: {worst:?} ns off");
+            assert!(
+                n_exceeding <= max_n_exceeding,
+                "{rate_hz} Hz: {worst:?} ns off"
+            );
         }
     }
 
@@ -353,13 +430,16 @@ mod tests {
     fn small_clock_step_is_detected() {
         let mut clock = ClockMap::new();
         let send = |clock: &mut ClockMap, ms: i64, behind_ms: i64| {
-            clock.stamp((ms - behind_ms) * 1_000_000, Stamp(ms * 1_000_000)).0 - ms * 1_000_000
+            clock
+                .stamp((ms - behind_ms) * 1_000_000, Stamp(ms * 1_000_000))
+                .0
+                - ms * 1_000_000
         };
         for ix in 0..500 {
             assert_eq!(send(&mut clock, ix * 10, 0), 0);
         }
-        // The device and its clock were paused for three seconds: every later stamp is 3 s behind, and no stamp
-        // decreases.
+        // The device and its clock were paused for three seconds: every later stamp is 3 s behind,
+        // and no stamp decreases.
         for ix in 800..1200 {
             send(&mut clock, ix * 10, 3000);
         }
@@ -373,7 +453,11 @@ mod tests {
         for ix in 0..1000_i64 {
             let device = ix * 10_000_000;
             // Everything sent in the third second arrives at the end of that second.
-            let sent = if (200..300).contains(&ix) { 3_000_000_000 } else { device };
+            let sent = if (200..300).contains(&ix) {
+                3_000_000_000
+            } else {
+                device
+            };
             clock.observe(device, Stamp(sent + 77));
         }
         assert_eq!(clock.n_restarts(), 0);
@@ -402,6 +486,9 @@ mod tests {
             micros = micros.wrapping_add(1_000_000_000);
             wrapping.nanos(micros);
         }
-        assert_eq!(wrapping.nanos(micros), (4_294_967_296 + 10_000_000_000) * 1000);
+        assert_eq!(
+            wrapping.nanos(micros),
+            (4_294_967_296 + 10_000_000_000) * 1000
+        );
     }
 }

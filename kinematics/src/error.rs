@@ -72,7 +72,9 @@ pub enum Error {
         why: String,
     },
     /// The file parses but contains no robot.
-    #[error("urdf: robot {robot:?} has no <link> (an export that failed or was never expanded from xacro?)")]
+    #[error(
+        "urdf: robot {robot:?} has no <link> (an export that failed or was never expanded from xacro?)"
+    )]
     NoLinks {
         /// Name of the robot; may be empty.
         robot: String,
@@ -138,15 +140,17 @@ pub enum Error {
         ancestors: Vec<String>,
     },
     /// A joint on the path has a type with more than one degree of freedom.
-    #[error("joint {joint:?} has the type {kind}; only fixed, revolute, continuous and prismatic joints are supported")]
+    #[error(
+        "joint {joint:?} has the type {kind}; only fixed, revolute, continuous and prismatic joints are supported"
+    )]
     JointType {
         /// The joint.
         joint: String,
         /// Its type.
         kind: &'static str,
     },
-    /// A mimic joint follows a joint that does not exist or is not revolute, continuous or prismatic, or mimic joints
-    /// form a loop.
+    /// A mimic joint follows a joint that does not exist or is not revolute, continuous or
+    /// prismatic, or mimic joints form a loop.
     #[error("joint {joint:?} mimics {source_joint:?}, which {why}")]
     Mimic {
         /// The mimic joint.

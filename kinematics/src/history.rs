@@ -45,7 +45,8 @@ pub enum HistoryError {
     /// A pushed reading was dropped because it contained NaN or infinity.
     #[error("reading contains a non-finite value, dropped")]
     NotFinite,
-    /// A pushed reading was dropped because it had a different number of joints than earlier readings.
+    /// A pushed reading was dropped because it had a different number of joints than earlier
+    /// readings.
     #[error("reading has {got} joints, earlier readings had {expected}; dropped")]
     JointCount {
         /// Number of joints in the reading.
@@ -56,7 +57,10 @@ pub enum HistoryError {
 }
 
 fn behind(newest: Stamp, requested: Stamp) -> String {
-    format!(" (the newest is {:.1} ms older)", requested.secs_since(newest) * 1e3)
+    format!(
+        " (the newest is {:.1} ms older)",
+        requested.secs_since(newest) * 1e3
+    )
 }
 
 /// Stamped readings in order. If the capacity is exceeded, the oldest reading is dropped.
@@ -68,8 +72,9 @@ struct Readings<T> {
     n_rejected: u64,
 }
 
-/// Two neighboring readings and the position of the stamp between them, 0 to 1. At 0 or 1 the stamp coincides with a
-/// reading; if that reading has no neighbor within `max_gap`, both entries are that reading.
+/// Two neighboring readings and the position of the stamp between them, 0 to 1. At 0 or 1 the stamp
+/// coincides with a reading; if that reading has no neighbor within `max_gap`, both entries are
+/// that reading.
 struct Bracket<'a, T> {
     before: (Stamp, &'a T),
     after: (Stamp, &'a T),
@@ -78,14 +83,22 @@ struct Bracket<'a, T> {
 
 impl<T> Readings<T> {
     fn new(max_gap: Duration, capacity: usize) -> Self {
-        Self { max_gap, capacity: capacity.max(2), buffer: VecDeque::new(), n_rejected: 0 }
+        Self {
+            max_gap,
+            capacity: capacity.max(2),
+            buffer: VecDeque::new(),
+            n_rejected: 0,
+        }
     }
 
     fn push(&mut self, stamp: Stamp, reading: T) -> Result<(), HistoryError> {
         if let Some(&(newest, _)) = self.buffer.back()
             && stamp <= newest
         {
-            return self.reject(HistoryError::OutOfOrder { newest, pushed: stamp });
+            return self.reject(HistoryError::OutOfOrder {
+                newest,
+                pushed: stamp,
+            });
         }
         if self.buffer.len() == self.capacity {
             self.buffer.pop_front();
@@ -100,33 +113,67 @@ impl<T> Readings<T> {
     }
 
     fn around(&self, requested: Stamp) -> Result<Bracket<'_, T>, HistoryError> {
-        let (Some((oldest, _)), Some((newest, _))) = (self.buffer.front(), self.buffer.back()) else {
-            return Err(HistoryError::NotYet { newest: None, requested });
+        let (Some((oldest, _)), Some((newest, _))) = (self.buffer.front(), self.buffer.back())
+        else {
+            return Err(HistoryError::NotYet {
+                newest: None,
+                requested,
+            });
         };
         if requested > *newest {
-            return Err(HistoryError::NotYet { newest: Some(*newest), requested });
+            return Err(HistoryError::NotYet {
+                newest: Some(*newest),
+                requested,
+            });
         }
         if requested < *oldest {
-            return Err(HistoryError::TooOld { oldest: *oldest, requested });
+            return Err(HistoryError::TooOld {
+                oldest: *oldest,
+                requested,
+            });
         }
         let after_ix = self.buffer.partition_point(|(stamp, _)| *stamp < requested);
-        let reading = |ix: usize| self.buffer.get(ix).map(|(stamp, reading)| (*stamp, reading));
+        let reading = |ix: usize| {
+            self.buffer
+                .get(ix)
+                .map(|(stamp, reading)| (*stamp, reading))
+        };
         let near = |a: Stamp, b: Stamp| b.duration_since(a) <= self.max_gap;
         let after = reading(after_ix).expect("the newest reading is not before the stamp");
         let before = after_ix.checked_sub(1).and_then(reading);
         if after.0 == requested {
             return Ok(match (before, reading(after_ix + 1)) {
-                (Some(before), _) if near(before.0, requested) => Bracket { before, after, frac: 1.0 },
-                (_, Some(next)) if near(requested, next.0) => Bracket { before: after, after: next, frac: 0.0 },
-                _ => Bracket { before: after, after, frac: 0.0 },
+                (Some(before), _) if near(before.0, requested) => Bracket {
+                    before,
+                    after,
+                    frac: 1.0,
+                },
+                (_, Some(next)) if near(requested, next.0) => Bracket {
+                    before: after,
+                    after: next,
+                    frac: 0.0,
+                },
+                _ => Bracket {
+                    before: after,
+                    after,
+                    frac: 0.0,
+                },
             });
         }
         let before = before.expect("the oldest reading is not after the stamp");
         if !near(before.0, after.0) {
-            return Err(HistoryError::Gap { before: before.0, after: after.0, max_gap: self.max_gap });
+            return Err(HistoryError::Gap {
+                before: before.0,
+                after: after.0,
+                max_gap: self.max_gap,
+            });
         }
         let frac = requested.secs_since(before.0) / after.0.secs_since(before.0);
-        Ok(Bracket { before, after, frac })
+        Ok(Bracket {
+            before,
+            after,
+            frac,
+        })
     }
 
     fn newest(&self) -> Option<Stamp> {
@@ -160,16 +207,24 @@ pub struct JointHistory {
 }
 
 impl JointHistory {
-    /// Creates a history that keeps the newest `capacity` readings (at least 2) and interpolates between neighbors at
-    /// most `max_gap` apart.
+    /// Creates a history that keeps the newest `capacity` readings (at least 2) and interpolates
+    /// between neighbors at most `max_gap` apart.
     pub fn new(max_gap: Duration, capacity: usize) -> Self {
-        Self { readings: Readings::new(max_gap, capacity) }
+        Self {
+            readings: Readings::new(max_gap, capacity),
+        }
     }
 
-    /// Adds a reading. A reading that is invalid or not later than all stored readings is dropped and counted, and an
-    /// error is returned.
+    /// Adds a reading. A reading that is invalid or not later than all stored readings is dropped
+    /// and counted, and an error is returned.
     pub fn push(&mut self, state: JointState) -> Result<(), HistoryError> {
-        let numbers = || state.position.iter().chain(&state.velocity).chain(&state.effort);
+        let numbers = || {
+            state
+                .position
+                .iter()
+                .chain(&state.velocity)
+                .chain(&state.effort)
+        };
         if !numbers().all(|number| number.is_finite()) {
             return self.readings.reject(HistoryError::NotFinite);
         }
@@ -177,26 +232,38 @@ impl JointHistory {
             && last.position.len() != state.position.len()
         {
             let expected = last.position.len();
-            return self.readings.reject(HistoryError::JointCount { got: state.position.len(), expected });
+            return self.readings.reject(HistoryError::JointCount {
+                got: state.position.len(),
+                expected,
+            });
         }
         self.readings.push(state.stamp, state)
     }
 
     /// The joints at a stamp.
     ///
-    /// Positions follow the cubic through both neighbors' positions and velocities, or a line if the device does not
-    /// report velocities. Velocities are the derivative of that curve; efforts are interpolated linearly. At the stamp
-    /// of a reading, that reading is returned; if it has no velocities, they are the slope of the line to a neighbor.
+    /// Positions follow the cubic through both neighbors' positions and velocities, or a line if
+    /// the device does not report velocities. Velocities are the derivative of that curve; efforts
+    /// are interpolated linearly. At the stamp of a reading, that reading is returned; if it has no
+    /// velocities, they are the slope of the line to a neighbor.
     pub fn at(&self, stamp: Stamp) -> Result<JointState, HistoryError> {
-        let Bracket { before: (before, a), after: (after, b), frac } = self.readings.around(stamp)?;
+        let Bracket {
+            before: (before, a),
+            after: (after, b),
+            frac,
+        } = self.readings.around(stamp)?;
         let span_secs = after.secs_since(before);
         let n_joints = a.position.len();
         let has_velocities = |state: &JointState| state.velocity.len() == n_joints;
         if frac == 0.0 || frac == 1.0 {
             let mut at_reading = if frac == 0.0 { a.clone() } else { b.clone() };
             if !has_velocities(&at_reading) && before < after {
-                at_reading.velocity =
-                    a.position.iter().zip(&b.position).map(|(from, to)| (to - from) / span_secs).collect();
+                at_reading.velocity = a
+                    .position
+                    .iter()
+                    .zip(&b.position)
+                    .map(|(from, to)| (to - from) / span_secs)
+                    .collect();
             }
             return Ok(at_reading);
         }
@@ -204,13 +271,28 @@ impl JointHistory {
         let curve = |joint: usize| {
             let (from, to) = (a.position[joint], b.position[joint]);
             match is_cubic {
-                true => hermite([from, to], [a.velocity[joint], b.velocity[joint]], span_secs, frac),
+                true => hermite(
+                    [from, to],
+                    [a.velocity[joint], b.velocity[joint]],
+                    span_secs,
+                    frac,
+                ),
                 false => (from + (to - from) * frac, (to - from) / span_secs),
             }
         };
         let (position, velocity) = (0..n_joints).map(curve).unzip();
-        let effort = a.effort.iter().zip(&b.effort).map(|(from, to)| from + (to - from) * frac).collect();
-        Ok(JointState { stamp, position, velocity, effort })
+        let effort = a
+            .effort
+            .iter()
+            .zip(&b.effort)
+            .map(|(from, to)| from + (to - from) * frac)
+            .collect();
+        Ok(JointState {
+            stamp,
+            position,
+            velocity,
+            effort,
+        })
     }
 
     /// Stamp of the newest reading.
@@ -234,7 +316,8 @@ impl JointHistory {
     }
 }
 
-/// Position and velocity at `frac` (0 to 1) on the cubic with the given end positions and end velocities.
+/// Position and velocity at `frac` (0 to 1) on the cubic with the given end positions and end
+/// velocities.
 fn hermite([p0, p1]: [f64; 2], [v0, v1]: [f64; 2], span_secs: f64, frac: f64) -> (f64, f64) {
     let (m0, m1, rise) = (v0 * span_secs, v1 * span_secs, p1 - p0);
     let (second, third) = (3.0 * rise - 2.0 * m0 - m1, m0 + m1 - 2.0 * rise);
@@ -250,16 +333,20 @@ pub struct PoseHistory {
 }
 
 impl PoseHistory {
-    /// Creates a history that keeps the newest `capacity` poses (at least 2) and interpolates between neighbors at
-    /// most `max_gap` apart.
+    /// Creates a history that keeps the newest `capacity` poses (at least 2) and interpolates
+    /// between neighbors at most `max_gap` apart.
     pub fn new(max_gap: Duration, capacity: usize) -> Self {
-        Self { readings: Readings::new(max_gap, capacity) }
+        Self {
+            readings: Readings::new(max_gap, capacity),
+        }
     }
 
-    /// Adds a pose. A pose that is not finite or not later than all stored poses is dropped and counted, and an error
-    /// is returned.
+    /// Adds a pose. A pose that is not finite or not later than all stored poses is dropped and
+    /// counted, and an error is returned.
     pub fn push(&mut self, stamp: Stamp, pose: Transform) -> Result<(), HistoryError> {
-        let finite = transform::to_rows(&pose).iter().all(|number| number.is_finite());
+        let finite = transform::to_rows(&pose)
+            .iter()
+            .all(|number| number.is_finite());
         if !finite {
             return self.readings.reject(HistoryError::NotFinite);
         }
@@ -268,7 +355,11 @@ impl PoseHistory {
 
     /// The pose at a stamp, by [`transform::interpolate`].
     pub fn at(&self, stamp: Stamp) -> Result<Transform, HistoryError> {
-        let Bracket { before: (_, a), after: (_, b), frac } = self.readings.around(stamp)?;
+        let Bracket {
+            before: (_, a),
+            after: (_, b),
+            frac,
+        } = self.readings.around(stamp)?;
         Ok(match frac {
             0.0 => *a,
             1.0 => *b,
@@ -276,10 +367,15 @@ impl PoseHistory {
         })
     }
 
-    /// The pose and velocity at a stamp. The velocity is assumed constant between neighboring poses, and is expressed
-    /// in the body frame at the stamp. It is zero if the pose has no neighbor within the allowed gap.
+    /// The pose and velocity at a stamp. The velocity is assumed constant between neighboring
+    /// poses, and is expressed in the body frame at the stamp. It is zero if the pose has no
+    /// neighbor within the allowed gap.
     pub fn with_twist_at(&self, stamp: Stamp) -> Result<(Transform, Twist), HistoryError> {
-        let Bracket { before: (before, a), after: (after, b), .. } = self.readings.around(stamp)?;
+        let Bracket {
+            before: (before, a),
+            after: (after, b),
+            ..
+        } = self.readings.around(stamp)?;
         let pose = self.at(stamp)?;
         let span_secs = after.secs_since(before);
         if span_secs <= 0.0 {
@@ -287,7 +383,13 @@ impl PoseHistory {
         }
         let velocity_m_s = (b.translation.vector - a.translation.vector) / span_secs;
         let angular_rad_s = (a.rotation.inverse() * b.rotation).scaled_axis() / span_secs;
-        Ok((pose, Twist { linear_m_s: pose.rotation.inverse() * velocity_m_s, angular_rad_s }))
+        Ok((
+            pose,
+            Twist {
+                linear_m_s: pose.rotation.inverse() * velocity_m_s,
+                angular_rad_s,
+            },
+        ))
     }
 
     /// Stamp of the newest pose.
@@ -322,21 +424,29 @@ mod tests {
         JointState {
             stamp: Stamp::from_secs(secs),
             position: vec![position, -2.0 * position],
-            velocity: velocity.map(|velocity| vec![velocity, -2.0 * velocity]).unwrap_or_default(),
+            velocity: velocity
+                .map(|velocity| vec![velocity, -2.0 * velocity])
+                .unwrap_or_default(),
             effort: vec![10.0 * position; 2],
         }
     }
 
     fn history(states: impl IntoIterator<Item = JointState>) -> JointHistory {
         let mut history = JointHistory::new(MAX_GAP, 100);
-        states.into_iter().for_each(|state| history.push(state).unwrap());
+        states
+            .into_iter()
+            .for_each(|state| history.push(state).unwrap());
         history
     }
 
     #[test]
     fn cubic_motion_with_velocities_is_exact() {
-        let motion =
-            |secs: f64| (1.0 + secs - 3.0 * secs * secs + 20.0 * secs.powi(3), 1.0 - 6.0 * secs + 60.0 * secs * secs);
+        let motion = |secs: f64| {
+            (
+                1.0 + secs - 3.0 * secs * secs + 20.0 * secs.powi(3),
+                1.0 - 6.0 * secs + 60.0 * secs * secs,
+            )
+        };
         let readings = (0..10).map(|ix| f64::from(ix) * 0.02).map(|secs| {
             let (position, velocity) = motion(secs);
             state(secs, position, Some(velocity))
@@ -347,7 +457,10 @@ mod tests {
             let at = history.at(Stamp::from_secs(secs)).unwrap();
             assert_eq!(at.stamp, Stamp::from_secs(secs));
             for (got, expected_position) in at.position.iter().zip([position, -2.0 * position]) {
-                assert!((got - expected_position).abs() < 1e-12, "{secs}: {got} {expected_position}");
+                assert!(
+                    (got - expected_position).abs() < 1e-12,
+                    "{secs}: {got} {expected_position}"
+                );
             }
             assert!((at.velocity[1] + 2.0 * velocity).abs() < 1e-11, "{secs}"); // Rounding over the 20 ms between readings.
         }
@@ -363,23 +476,41 @@ mod tests {
         for (secs, position) in [(1.0, 0.5), (1.02, 0.7)] {
             let at_reading = history.at(Stamp::from_secs(secs)).unwrap();
             assert!((at_reading.velocity[0] - 10.0).abs() < 1e-9);
-            assert_eq!(JointState { velocity: vec![], ..at_reading }, state(secs, position, None));
+            assert_eq!(
+                JointState {
+                    velocity: vec![],
+                    ..at_reading
+                },
+                state(secs, position, None)
+            );
         }
         let alone = self::history([state(1.0, 0.5, None)]);
-        assert_eq!(alone.at(Stamp::from_secs(1.0)).unwrap(), state(1.0, 0.5, None));
+        assert_eq!(
+            alone.at(Stamp::from_secs(1.0)).unwrap(),
+            state(1.0, 0.5, None)
+        );
     }
 
     #[test]
     fn no_extrapolation_and_specific_errors() {
         let empty = JointHistory::new(MAX_GAP, 3);
-        assert!(matches!(empty.at(Stamp(0)), Err(HistoryError::NotYet { newest: None, .. })));
+        assert!(matches!(
+            empty.at(Stamp(0)),
+            Err(HistoryError::NotYet { newest: None, .. })
+        ));
         let mut history = JointHistory::new(MAX_GAP, 3);
         for secs in [1.0, 1.01, 1.02, 1.05] {
             history.push(state(secs, secs, None)).unwrap();
         }
         let ask = |secs: f64| history.at(Stamp::from_secs(secs));
         assert_eq!(history.oldest(), Some(Stamp::from_secs(1.01)));
-        assert!(matches!(ask(1.05001), Err(HistoryError::NotYet { newest: Some(_), .. })));
+        assert!(matches!(
+            ask(1.05001),
+            Err(HistoryError::NotYet {
+                newest: Some(_),
+                ..
+            })
+        ));
         assert!(matches!(ask(1.00999), Err(HistoryError::TooOld { .. })));
         assert!(matches!(ask(1.03), Err(HistoryError::Gap { .. })));
         assert_eq!(
@@ -397,10 +528,25 @@ mod tests {
         let mut history = history([state(1.0, 0.5, None), state(1.01, 0.6, None)]);
         let late = history.push(state(1.005, 9.0, None));
         assert!(matches!(late, Err(HistoryError::OutOfOrder { .. })));
-        assert!(matches!(history.push(state(1.01, 9.0, None)), Err(HistoryError::OutOfOrder { .. })));
-        assert_eq!(history.push(state(1.02, f64::NAN, None)), Err(HistoryError::NotFinite));
-        let short = JointState { position: vec![0.0], ..state(1.02, 0.0, None) };
-        assert_eq!(history.push(short), Err(HistoryError::JointCount { got: 1, expected: 2 }));
+        assert!(matches!(
+            history.push(state(1.01, 9.0, None)),
+            Err(HistoryError::OutOfOrder { .. })
+        ));
+        assert_eq!(
+            history.push(state(1.02, f64::NAN, None)),
+            Err(HistoryError::NotFinite)
+        );
+        let short = JointState {
+            position: vec![0.0],
+            ..state(1.02, 0.0, None)
+        };
+        assert_eq!(
+            history.push(short),
+            Err(HistoryError::JointCount {
+                got: 1,
+                expected: 2
+            })
+        );
         assert_eq!(history.n_rejected(), 4);
         assert_eq!(history.newest(), Some(Stamp::from_secs(1.01)));
         assert!((history.at(Stamp::from_secs(1.005)).unwrap().position[0] - 0.55).abs() < 1e-12);
@@ -416,13 +562,30 @@ mod tests {
         history.push(Stamp::from_secs(1.02), pose(1.0)).unwrap();
         history.push(Stamp::from_secs(1.1), pose(2.0)).unwrap();
         let at = history.at(Stamp::from_secs(1.005)).unwrap();
-        assert!((at.to_homogeneous() - pose(0.25).to_homogeneous()).abs().max() < 1e-12);
+        assert!(
+            (at.to_homogeneous() - pose(0.25).to_homogeneous())
+                .abs()
+                .max()
+                < 1e-12
+        );
         assert_eq!(history.at(Stamp::from_secs(1.1)).unwrap(), pose(2.0));
-        assert!(matches!(history.at(Stamp::from_secs(1.05)), Err(HistoryError::Gap { .. })));
-        assert!(matches!(history.at(Stamp::from_secs(1.2)), Err(HistoryError::NotYet { .. })));
-        assert!(matches!(history.at(Stamp::from_secs(0.9)), Err(HistoryError::TooOld { .. })));
+        assert!(matches!(
+            history.at(Stamp::from_secs(1.05)),
+            Err(HistoryError::Gap { .. })
+        ));
+        assert!(matches!(
+            history.at(Stamp::from_secs(1.2)),
+            Err(HistoryError::NotYet { .. })
+        ));
+        assert!(matches!(
+            history.at(Stamp::from_secs(0.9)),
+            Err(HistoryError::TooOld { .. })
+        ));
         let broken = pose(f64::NAN);
-        assert_eq!(history.push(Stamp::from_secs(2.0), broken), Err(HistoryError::NotFinite));
+        assert_eq!(
+            history.push(Stamp::from_secs(2.0), broken),
+            Err(HistoryError::NotFinite)
+        );
         assert!(history.push(Stamp::from_secs(1.05), pose(0.0)).is_err());
         assert_eq!(history.n_rejected(), 2);
     }

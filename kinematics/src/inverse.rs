@@ -13,15 +13,17 @@ const MIN_DAMPING: f64 = 1e-9;
 const MAX_STEP: f64 = 0.3;
 
 impl Chain {
-    /// Joint values near `start` for which the tip has the pose `base_from_tip`. `None` if none are found within the
-    /// bounds. With more than six joints, the solution is the closest one that the steps reach.
+    /// Joint values near `start` for which the tip has the pose `base_from_tip`. `None` if none are
+    /// found within the bounds. With more than six joints, the solution is the closest one that the
+    /// steps reach.
     ///
     /// * `bounds`: lower and upper bound of each joint.
     ///
-    /// Levenberg-Marquardt steps whose damping is the squared error of the pose; joints that would leave their bounds
-    /// stay there for the rest of the step.
+    /// Levenberg-Marquardt steps whose damping is the squared error of the pose; joints that would
+    /// leave their bounds stay there for the rest of the step.
     ///
-    /// Source: Sugihara 2011, "Solvability-unconcerned inverse kinematics by the Levenberg-Marquardt method", section III.
+    /// Source: Sugihara 2011, "Solvability-unconcerned inverse kinematics by the
+    /// Levenberg-Marquardt method", section III.
     ///
     /// # Errors
     /// If `start` or `bounds` do not have one finite value per joint (bounds may be infinite).
@@ -40,7 +42,11 @@ impl Chain {
         }
         // Bounds that are in the wrong order contain no value.
         let clamped = |value: f64, [lower, upper]: [f64; 2]| value.max(lower).min(upper);
-        let mut q: Vec<f64> = start.iter().zip(bounds).map(|(value, bound)| clamped(*value, *bound)).collect();
+        let mut q: Vec<f64> = start
+            .iter()
+            .zip(bounds)
+            .map(|(value, bound)| clamped(*value, *bound))
+            .collect();
         let mut error = pose_error(base_from_tip, &self.forward(start)?);
         if q != start {
             error = pose_error(base_from_tip, &self.forward(&q)?);
@@ -66,25 +72,47 @@ impl Chain {
     }
 
     /// One damped step within the bounds.
-    fn step(&self, q: &[f64], error: &Vector6<f64>, damping: f64, bounds: &[[f64; 2]]) -> Result<Vec<f64>, Error> {
+    fn step(
+        &self,
+        q: &[f64],
+        error: &Vector6<f64>,
+        damping: f64,
+        bounds: &[[f64; 2]],
+    ) -> Result<Vec<f64>, Error> {
         let mut jacobian = self.jacobian(q)?;
         loop {
             let change = damped_change(&jacobian, error, damping);
-            let longest = change.iter().fold(0.0f64, |longest, value| longest.max(value.abs()));
-            let scale = if longest > MAX_STEP { MAX_STEP / longest } else { 1.0 };
-            let moved: Vec<f64> = q.iter().zip(&change).map(|(value, change)| value + scale * change).collect();
+            let longest = change
+                .iter()
+                .fold(0.0f64, |longest, value| longest.max(value.abs()));
+            let scale = if longest > MAX_STEP {
+                MAX_STEP / longest
+            } else {
+                1.0
+            };
+            let moved: Vec<f64> = q
+                .iter()
+                .zip(&change)
+                .map(|(value, change)| value + scale * change)
+                .collect();
             // Joints that are at a bound and would leave it are removed, and the others take over.
             let is_stuck = |ix: usize| {
                 let [lower, upper] = bounds[ix];
                 (q[ix] <= lower && moved[ix] < lower) || (q[ix] >= upper && moved[ix] > upper)
             };
-            let stuck: Vec<usize> =
-                (0..q.len()).filter(|ix| is_stuck(*ix) && jacobian.column(*ix).norm() > 0.0).collect();
+            let stuck: Vec<usize> = (0..q.len())
+                .filter(|ix| is_stuck(*ix) && jacobian.column(*ix).norm() > 0.0)
+                .collect();
             if stuck.is_empty() {
-                let clamped = moved.iter().zip(bounds).map(|(value, [lower, upper])| value.max(*lower).min(*upper));
+                let clamped = moved
+                    .iter()
+                    .zip(bounds)
+                    .map(|(value, [lower, upper])| value.max(*lower).min(*upper));
                 return Ok(clamped.collect());
             }
-            stuck.into_iter().for_each(|ix| jacobian.column_mut(ix).fill(0.0));
+            stuck
+                .into_iter()
+                .for_each(|ix| jacobian.column_mut(ix).fill(0.0));
         }
     }
 }
@@ -92,7 +120,10 @@ impl Chain {
 fn damped_change(jacobian: &Matrix6xX<f64>, error: &Vector6<f64>, damping: f64) -> Vec<f64> {
     let square: Matrix6<f64> = jacobian * jacobian.transpose() + Matrix6::identity() * damping;
     match square.cholesky() {
-        Some(factor) => (jacobian.transpose() * factor.solve(error)).iter().copied().collect(),
+        Some(factor) => (jacobian.transpose() * factor.solve(error))
+            .iter()
+            .copied()
+            .collect(),
         None => vec![0.0; jacobian.ncols()],
     }
 }
@@ -101,7 +132,14 @@ fn damped_change(jacobian: &Matrix6xX<f64>, error: &Vector6<f64>, damping: f64) 
 fn pose_error(target: &Transform, actual: &Transform) -> Vector6<f64> {
     let translation = target.translation.vector - actual.translation.vector;
     let rotation = (target.rotation * actual.rotation.inverse()).scaled_axis();
-    Vector6::new(translation.x, translation.y, translation.z, rotation.x, rotation.y, rotation.z)
+    Vector6::new(
+        translation.x,
+        translation.y,
+        translation.z,
+        rotation.x,
+        rotation.y,
+        rotation.z,
+    )
 }
 
 #[cfg(test)]
@@ -114,7 +152,11 @@ mod tests {
 
     fn panda() -> (Chain, Vec<[f64; 2]>) {
         let chain = Chain::from_urdf(PANDA, "link0", "link8").unwrap();
-        let bounds = chain.limits().iter().map(|limit| [limit.lower, limit.upper]).collect();
+        let bounds = chain
+            .limits()
+            .iter()
+            .map(|limit| [limit.lower, limit.upper])
+            .collect();
         (chain, bounds)
     }
 
@@ -131,10 +173,20 @@ mod tests {
             let translation = Vector3::new(value(0), value(1), value(2)) * 0.12;
             let rotation = Vector3::new(value(3), value(4), value(5)) * 0.45;
             let target = start * Transform::new(translation, rotation);
-            let found = chain.inverse(&target, &REST, &bounds).unwrap().expect("the pose is reachable");
+            let found = chain
+                .inverse(&target, &REST, &bounds)
+                .unwrap()
+                .expect("the pose is reachable");
             assert!(distance(&chain, &found, &target) < 1e-6);
-            let is_inside = found.iter().zip(&bounds).all(|(q, [lower, upper])| (*lower..=*upper).contains(q));
-            let largest = found.iter().zip(&REST).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+            let is_inside = found
+                .iter()
+                .zip(&bounds)
+                .all(|(q, [lower, upper])| (*lower..=*upper).contains(q));
+            let largest = found
+                .iter()
+                .zip(&REST)
+                .map(|(a, b)| (a - b).abs())
+                .fold(0.0, f64::max);
             assert!(is_inside && largest < 2.0, "{found:?}");
         }
     }
@@ -142,16 +194,30 @@ mod tests {
     #[test]
     fn joints_at_their_bounds_stay_there_and_others_take_over() {
         let (chain, mut bounds) = panda();
-        let target = chain.forward(&REST).unwrap() * Transform::new(Vector3::new(0.02, 0.0, 0.0), Vector3::z() * 0.1);
-        let free = chain.inverse(&target, &REST, &bounds).unwrap().expect("reachable");
-        assert!((free[0] - REST[0]).abs() > 1e-3, "the joint moves if it may");
+        let target = chain.forward(&REST).unwrap()
+            * Transform::new(Vector3::new(0.02, 0.0, 0.0), Vector3::z() * 0.1);
+        let free = chain
+            .inverse(&target, &REST, &bounds)
+            .unwrap()
+            .expect("reachable");
+        assert!(
+            (free[0] - REST[0]).abs() > 1e-3,
+            "the joint moves if it may"
+        );
         bounds[0] = [REST[0], REST[0]];
-        let held = chain.inverse(&target, &REST, &bounds).unwrap().expect("six joints are left");
+        let held = chain
+            .inverse(&target, &REST, &bounds)
+            .unwrap()
+            .expect("six joints are left");
         assert_eq!(held[0], REST[0]);
         assert!(distance(&chain, &held, &target) < 1e-6);
         bounds[2] = bounds[0];
         bounds[4] = bounds[0];
-        assert_eq!(chain.inverse(&target, &REST, &bounds).unwrap(), None, "four joints are not enough");
+        assert_eq!(
+            chain.inverse(&target, &REST, &bounds).unwrap(),
+            None,
+            "four joints are not enough"
+        );
     }
 
     #[test]
@@ -164,7 +230,13 @@ mod tests {
         }
         let distant = Transform::translation(3.0, 0.0, 0.0);
         assert_eq!(chain.inverse(&distant, &REST, &bounds).unwrap(), None);
-        assert_eq!(chain.inverse(&reachable, &stretched, &bounds).unwrap().as_deref(), Some(&stretched[..]));
+        assert_eq!(
+            chain
+                .inverse(&reachable, &stretched, &bounds)
+                .unwrap()
+                .as_deref(),
+            Some(&stretched[..])
+        );
     }
 
     #[test]
@@ -173,7 +245,13 @@ mod tests {
         let pose = Transform::identity();
         assert!(chain.inverse(&pose, &REST[..3], &bounds).is_err());
         assert!(chain.inverse(&pose, &[f64::NAN; 7], &bounds).is_err());
-        let error = chain.inverse(&pose, &REST, &bounds[..3]).unwrap_err().to_string();
-        assert!(error.starts_with("3 joint values given, the chain has 7"), "{error}");
+        let error = chain
+            .inverse(&pose, &REST, &bounds[..3])
+            .unwrap_err()
+            .to_string();
+        assert!(
+            error.starts_with("3 joint values given, the chain has 7"),
+            "{error}"
+        );
     }
 }

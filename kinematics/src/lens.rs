@@ -11,11 +11,15 @@ pub(crate) struct Distorted {
 
 impl Distorted {
     pub(crate) fn none(plane: Vector2<f64>) -> Self {
-        Self { value: plane, jacobian: Matrix2::identity() }
+        Self {
+            value: plane,
+            jacobian: Matrix2::identity(),
+        }
     }
 }
 
-/// Radial part of Brown-Conrady distortion: the factor `numerator(r2) / denominator(r2)` of the radius `r`.
+/// Radial part of Brown-Conrady distortion: the factor `numerator(r2) / denominator(r2)` of the
+/// radius `r`.
 trait Radial {
     /// The factor and its derivative with respect to `r2`.
     fn factor(&self, r2: f64) -> (f64, f64);
@@ -29,7 +33,10 @@ struct PolynomialRadial([f64; 3]);
 impl Radial for PolynomialRadial {
     fn factor(&self, r2: f64) -> (f64, f64) {
         let [k1, k2, k3] = self.0;
-        (1.0 + r2 * (k1 + r2 * (k2 + r2 * k3)), k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3))
+        (
+            1.0 + r2 * (k1 + r2 * (k2 + r2 * k3)),
+            k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3),
+        )
     }
 
     fn is_rising_to(&self, r2: f64) -> bool {
@@ -46,13 +53,17 @@ struct RationalRadial {
 
 impl Radial for RationalRadial {
     fn factor(&self, r2: f64) -> (f64, f64) {
-        let (numerator, denominator) = (evaluate(&self.numerator, r2), evaluate(&self.denominator, r2));
+        let (numerator, denominator) = (
+            evaluate(&self.numerator, r2),
+            evaluate(&self.denominator, r2),
+        );
         let by_r2 = evaluate(&derivative(&self.numerator), r2) * denominator
             - numerator * evaluate(&derivative(&self.denominator), r2);
         (numerator / denominator, by_r2 / (denominator * denominator))
     }
 
-    /// With numerator N and denominator D, the derivative of `r N / D` is `(N D + 2 r2 (N' D - N D')) / D²`.
+    /// With numerator N and denominator D, the derivative of `r N / D` is `(N D + 2 r2 (N' D - N
+    /// D')) / D²`.
     fn is_rising_to(&self, r2: f64) -> bool {
         let mut rise = [0.0; 7];
         for (i, n) in self.numerator.iter().enumerate() {
@@ -68,19 +79,26 @@ fn derivative(&[_, a, b, c]: &[f64; 4]) -> [f64; 3] {
     [a, 2.0 * b, 3.0 * c]
 }
 
-/// Applies Brown-Conrady distortion (Brown 1966, Conrady 1919) in OpenCV's form. `None` beyond the radius up to which
-/// the radial part is monotonic.
+/// Applies Brown-Conrady distortion (Brown 1966, Conrady 1919) in OpenCV's form. `None` beyond the
+/// radius up to which the radial part is monotonic.
 pub(crate) fn brown_conrady(k: &[f64; 5], plane: Vector2<f64>) -> Option<Distorted> {
     distort(&PolynomialRadial([k[0], k[1], k[4]]), [k[2], k[3]], plane)
 }
 
 /// The point that [`brown_conrady`] maps to `distorted`.
-pub(crate) fn undistort_brown_conrady(k: &[f64; 5], distorted: Vector2<f64>) -> Option<Vector2<f64>> {
-    undistort(&PolynomialRadial([k[0], k[1], k[4]]), [k[2], k[3]], distorted)
+pub(crate) fn undistort_brown_conrady(
+    k: &[f64; 5],
+    distorted: Vector2<f64>,
+) -> Option<Vector2<f64>> {
+    undistort(
+        &PolynomialRadial([k[0], k[1], k[4]]),
+        [k[2], k[3]],
+        distorted,
+    )
 }
 
-/// Applies Brown-Conrady distortion with a rational radial part, OpenCV's rational model (Claus and Fitzgibbon 2005).
-/// `None` beyond the radius up to which the radial part is monotonic.
+/// Applies Brown-Conrady distortion with a rational radial part, OpenCV's rational model (Claus and
+/// Fitzgibbon 2005). `None` beyond the radius up to which the radial part is monotonic.
 pub(crate) fn rational(k: &[f64; 8], plane: Vector2<f64>) -> Option<Distorted> {
     distort(&rational_radial(k), [k[2], k[3]], plane)
 }
@@ -91,12 +109,16 @@ pub(crate) fn undistort_rational(k: &[f64; 8], distorted: Vector2<f64>) -> Optio
 }
 
 fn rational_radial(&[k1, k2, _, _, k3, k4, k5, k6]: &[f64; 8]) -> RationalRadial {
-    RationalRadial { numerator: [1.0, k1, k2, k3], denominator: [1.0, k4, k5, k6] }
+    RationalRadial {
+        numerator: [1.0, k1, k2, k3],
+        denominator: [1.0, k4, k5, k6],
+    }
 }
 
 fn distort(radial: &impl Radial, tangential: [f64; 2], plane: Vector2<f64>) -> Option<Distorted> {
     let distorted = distort_unchecked(radial, tangential, plane);
-    let monotonic = radial.is_rising_to(plane.norm_squared()) && distorted.jacobian.determinant() > 0.0;
+    let monotonic =
+        radial.is_rising_to(plane.norm_squared()) && distorted.jacobian.determinant() > 0.0;
     monotonic.then_some(distorted)
 }
 
@@ -118,14 +140,18 @@ fn distort_unchecked(radial: &impl Radial, [p1, p2]: [f64; 2], plane: Vector2<f6
     Distorted { value, jacobian }
 }
 
-fn undistort(radial: &impl Radial, tangential: [f64; 2], distorted: Vector2<f64>) -> Option<Vector2<f64>> {
+fn undistort(
+    radial: &impl Radial,
+    tangential: [f64; 2],
+    distorted: Vector2<f64>,
+) -> Option<Vector2<f64>> {
     const MAX_STEPS: usize = 50;
     let length = distorted.norm();
     if length == 0.0 && tangential == [0.0; 2] {
         return Some(distorted);
     }
-    // Without the tangential part, solving for the radius suffices. With it, that solution is the initial value of
-    // Newton's method in the plane.
+    // Without the tangential part, solving for the radius suffices. With it, that solution is the
+    // initial value of Newton's method in the plane.
     let distorted_radius = |radius: f64| {
         let r2 = radius * radius;
         let (factor, factor_by_r2) = radial.factor(r2);
@@ -155,7 +181,13 @@ fn undistort(radial: &impl Radial, tangential: [f64; 2], distorted: Vector2<f64>
 /// Derivatives of [`brown_conrady`] with respect to its coefficients.
 pub(crate) fn brown_conrady_by_coefficients(plane: Vector2<f64>) -> [Vector2<f64>; 5] {
     let (r2, [by_p1, by_p2]) = (plane.norm_squared(), tangential_by_coefficients(plane));
-    [plane * r2, plane * (r2 * r2), by_p1, by_p2, plane * (r2 * r2 * r2)]
+    [
+        plane * r2,
+        plane * (r2 * r2),
+        by_p1,
+        by_p2,
+        plane * (r2 * r2 * r2),
+    ]
 }
 
 /// Derivatives of [`rational`] with respect to its coefficients.
@@ -164,17 +196,23 @@ pub(crate) fn rational_by_coefficients(k: &[f64; 8], plane: Vector2<f64>) -> [Ve
     let radial = rational_radial(k);
     let by_numerator = plane / evaluate(&radial.denominator, r2);
     let by_denominator = by_numerator * -radial.factor(r2).0;
-    let [first, second] = [by_numerator, by_denominator].map(|by| [by * r2, by * (r2 * r2), by * (r2 * r2 * r2)]);
-    [first[0], first[1], by_p1, by_p2, first[2], second[0], second[1], second[2]]
+    let [first, second] =
+        [by_numerator, by_denominator].map(|by| [by * r2, by * (r2 * r2), by * (r2 * r2 * r2)]);
+    [
+        first[0], first[1], by_p1, by_p2, first[2], second[0], second[1], second[2],
+    ]
 }
 
 fn tangential_by_coefficients(plane: Vector2<f64>) -> [Vector2<f64>; 2] {
     let (xy, r2) = (2.0 * plane.x * plane.y, plane.norm_squared());
-    [Vector2::new(xy, r2 + 2.0 * plane.y * plane.y), Vector2::new(r2 + 2.0 * plane.x * plane.x, xy)]
+    [
+        Vector2::new(xy, r2 + 2.0 * plane.y * plane.y),
+        Vector2::new(r2 + 2.0 * plane.x * plane.x, xy),
+    ]
 }
 
-/// Applies Kannala-Brandt distortion (Kannala and Brandt 2006, equation 6, radial terms only), as in OpenCV's fisheye
-/// model.
+/// Applies Kannala-Brandt distortion (Kannala and Brandt 2006, equation 6, radial terms only), as
+/// in OpenCV's fisheye model.
 pub(crate) fn kannala_brandt(k: &[f64; 4], plane: Vector2<f64>) -> Option<Distorted> {
     let radius = plane.norm();
     let angle = radius.atan();
@@ -185,25 +223,39 @@ pub(crate) fn kannala_brandt(k: &[f64; 4], plane: Vector2<f64>) -> Option<Distor
     let series = 1.0 + angle2 * (k[0] + angle2 * (k[1] + angle2 * (k[2] + angle2 * k[3])));
     let length = angle * series;
     let length_by_radius = evaluate(&angle_derivative(k), angle2) / (1.0 + radius * radius);
-    // Computes length / radius, and its derivative divided by radius. Near the axis both quotients lose all digits, but
-    // the map is the identity up to third order.
+    // Computes length / radius, and its derivative divided by radius. Near the axis both quotients
+    // lose all digits, but the map is the identity up to third order.
     const NEAR_AXIS: f64 = 1e-6;
     let (share, share_by_radius2) = if radius < NEAR_AXIS {
-        (1.0 + (k[0] - 1.0 / 3.0) * radius * radius, 2.0 * (k[0] - 1.0 / 3.0))
+        (
+            1.0 + (k[0] - 1.0 / 3.0) * radius * radius,
+            2.0 * (k[0] - 1.0 / 3.0),
+        )
     } else {
-        (length / radius, (length_by_radius - length / radius) / (radius * radius))
+        (
+            length / radius,
+            (length_by_radius - length / radius) / (radius * radius),
+        )
     };
     let jacobian = Matrix2::identity() * share + plane * plane.transpose() * share_by_radius2;
-    Some(Distorted { value: plane * share, jacobian })
+    Some(Distorted {
+        value: plane * share,
+        jacobian,
+    })
 }
 
-/// Derivative of `angle (1 + k1 angle2 + ...)` with respect to the angle, as a polynomial in angle2.
+/// Derivative of `angle (1 + k1 angle2 + ...)` with respect to the angle, as a polynomial in
+/// angle2.
 fn angle_derivative(&[k1, k2, k3, k4]: &[f64; 4]) -> [f64; 5] {
     [1.0, 3.0 * k1, 5.0 * k2, 7.0 * k3, 9.0 * k4]
 }
 
-/// The point that [`kannala_brandt`] maps to `distorted`. `None` at 90 degrees from the axis or more.
-pub(crate) fn undistort_kannala_brandt(k: &[f64; 4], distorted: Vector2<f64>) -> Option<Vector2<f64>> {
+/// The point that [`kannala_brandt`] maps to `distorted`. `None` at 90 degrees from the axis or
+/// more.
+pub(crate) fn undistort_kannala_brandt(
+    k: &[f64; 4],
+    distorted: Vector2<f64>,
+) -> Option<Vector2<f64>> {
     let length = distorted.norm();
     if length == 0.0 {
         return Some(distorted);
@@ -212,10 +264,18 @@ pub(crate) fn undistort_kannala_brandt(k: &[f64; 4], distorted: Vector2<f64>) ->
     let derivative = angle_derivative(k);
     let distorted_angle = |angle: f64| {
         let angle2 = angle * angle;
-        (angle * evaluate(&series, angle2), evaluate(&derivative, angle2))
+        (
+            angle * evaluate(&series, angle2),
+            evaluate(&derivative, angle2),
+        )
     };
     let is_rising_to = |angle: f64| positive_on(&derivative, angle * angle);
-    let angle = solve_rising(distorted_angle, is_rising_to, length, std::f64::consts::FRAC_PI_2)?;
+    let angle = solve_rising(
+        distorted_angle,
+        is_rising_to,
+        length,
+        std::f64::consts::FRAC_PI_2,
+    )?;
     (angle < std::f64::consts::FRAC_PI_2).then(|| distorted * (angle.tan() / length))
 }
 
@@ -224,9 +284,18 @@ pub(crate) fn kannala_brandt_by_coefficients(plane: Vector2<f64>) -> [Vector2<f6
     let radius = plane.norm();
     let angle = radius.atan();
     // The quotient tends to 1 on the axis.
-    let direction = if radius > 0.0 { plane * (angle / radius) } else { plane };
+    let direction = if radius > 0.0 {
+        plane * (angle / radius)
+    } else {
+        plane
+    };
     let angle2 = angle * angle;
-    [direction * angle2, direction * angle2.powi(2), direction * angle2.powi(3), direction * angle2.powi(4)]
+    [
+        direction * angle2,
+        direction * angle2.powi(2),
+        direction * angle2.powi(3),
+        direction * angle2.powi(4),
+    ]
 }
 
 #[cfg(test)]
@@ -235,22 +304,37 @@ mod tests {
 
     #[test]
     fn undistortion_inverts_strong_lenses() {
-        for k in [[-0.3, 0.1, 0.0, 0.0, 0.0], [-0.4, 0.0, 0.003, -0.002, 0.0], [0.5, -0.9, 0.0, 0.0, 0.3], [0.9; 5]] {
+        for k in [
+            [-0.3, 0.1, 0.0, 0.0, 0.0],
+            [-0.4, 0.0, 0.003, -0.002, 0.0],
+            [0.5, -0.9, 0.0, 0.0, 0.3],
+            [0.9; 5],
+        ] {
             let mut n_checked = 0;
             for step in 0..400 {
                 let radius = f64::from(step) * 0.005;
                 let plane = Vector2::new(radius * 0.6, radius * -0.8);
-                let Some(distorted) = brown_conrady(&k, plane) else { continue };
-                // Very close to the limit the inverse is not accurate to 1e-12 because its derivative grows without
-                // bound.
+                let Some(distorted) = brown_conrady(&k, plane) else {
+                    continue;
+                };
+                // Very close to the limit the inverse is not accurate to 1e-12 because its
+                // derivative grows without bound.
                 if distorted.jacobian.determinant() < 1e-3 {
                     continue;
                 }
                 n_checked += 1;
-                let back = undistort_brown_conrady(&k, distorted.value).unwrap_or_else(|| panic!("{k:?} at {radius}"));
-                assert!((back - plane).norm() < 1e-11, "{k:?} at {radius}: off by {:e}", (back - plane).norm());
+                let back = undistort_brown_conrady(&k, distorted.value)
+                    .unwrap_or_else(|| panic!("{k:?} at {radius}"));
+                assert!(
+                    (back - plane).norm() < 1e-11,
+                    "{k:?} at {radius}: off by {:e}",
+                    (back - plane).norm()
+                );
             }
-            assert!(n_checked > 100, "{k:?}: only {n_checked} points inside the limit");
+            assert!(
+                n_checked > 100,
+                "{k:?}: only {n_checked} points inside the limit"
+            );
         }
     }
 
@@ -266,16 +350,26 @@ mod tests {
             for step in 0..600 {
                 let radius = f64::from(step) * 0.005;
                 let plane = Vector2::new(radius * 0.6, radius * -0.8);
-                let Some(distorted) = rational(&k, plane) else { continue };
+                let Some(distorted) = rational(&k, plane) else {
+                    continue;
+                };
                 assert!(k[5] != -0.25 || radius < 2.0, "beyond the pole");
                 if distorted.jacobian.determinant() < 1e-3 || distorted.value.norm() > 10.0 {
                     continue;
                 }
                 n_checked += 1;
-                let back = undistort_rational(&k, distorted.value).unwrap_or_else(|| panic!("{k:?} at {radius}"));
-                assert!((back - plane).norm() < 1e-11, "{k:?} at {radius}: off by {:e}", (back - plane).norm());
+                let back = undistort_rational(&k, distorted.value)
+                    .unwrap_or_else(|| panic!("{k:?} at {radius}"));
+                assert!(
+                    (back - plane).norm() < 1e-11,
+                    "{k:?} at {radius}: off by {:e}",
+                    (back - plane).norm()
+                );
             }
-            assert!(n_checked > 200, "{k:?}: only {n_checked} points inside the limit");
+            assert!(
+                n_checked > 200,
+                "{k:?}: only {n_checked} points inside the limit"
+            );
         }
     }
 
@@ -283,9 +377,11 @@ mod tests {
     fn rational_lens_without_denominator_is_brown_conrady() {
         let k = [-0.28, 0.07, 0.001, -0.0005, 0.02];
         let plane = Vector2::new(0.3, -0.4);
-        let [expected, actual] =
-            [brown_conrady(&k, plane), rational(&[k[0], k[1], k[2], k[3], k[4], 0.0, 0.0, 0.0], plane)]
-                .map(Option::unwrap);
+        let [expected, actual] = [
+            brown_conrady(&k, plane),
+            rational(&[k[0], k[1], k[2], k[3], k[4], 0.0, 0.0, 0.0], plane),
+        ]
+        .map(Option::unwrap);
         assert!((expected.value - actual.value).norm() < 1e-15);
         assert!((expected.jacobian - actual.jacobian).norm() < 1e-14);
     }

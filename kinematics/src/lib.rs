@@ -1,4 +1,5 @@
-//! Transforms, time, camera models and kinematic chains: pure math in f64, no I/O, no clock, no GPU.
+//! Transforms, time, camera models and kinematic chains: pure math in f64, no I/O, no clock, no
+//! GPU.
 //!
 //! ```
 //! use kinematics::{Chain, Intrinsics, Lens};

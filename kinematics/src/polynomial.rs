@@ -1,9 +1,11 @@
 //! Polynomials that must be positive on an interval, and inverses of rising functions.
 
-/// A root search stops when the step is below this fraction of the value, just above rounding errors.
+/// A root search stops when the step is below this fraction of the value, just above rounding
+/// errors.
 pub(crate) const CONVERGED: f64 = 1e-15;
 
-/// The smallest `x` from 0 to `limit` at which a function that is 0 at 0 reaches `target`, if it rises from 0 up to it.
+/// The smallest `x` from 0 to `limit` at which a function that is 0 at 0 reaches `target`, if it
+/// rises from 0 up to it.
 ///
 /// Uses Newton's method inside a bracket that shrinks with every step.
 ///
@@ -17,8 +19,8 @@ pub(crate) fn solve_rising(
 ) -> Option<f64> {
     const MAX_STEPS: usize = 200; // Bisection alone needs about 60 steps.
     let value = |x: f64| function(x).0 - target;
-    // Find a bracket: x from `low`, where the value is below the target, to `high`, where it is above or the
-    // derivative has changed sign.
+    // Find a bracket: x from `low`, where the value is below the target, to `high`, where it is
+    // above or the derivative has changed sign.
     let (mut low, mut high) = (0.0, target.min(limit));
     while is_rising_to(high) && value(high) < 0.0 {
         if high >= limit || high > f64::MAX.sqrt() * 0.25 {
@@ -39,7 +41,11 @@ pub(crate) fn solve_rising(
         }
         // Beyond the maximum, Newton's method could converge to another root.
         let newton = x - (reached - target) / derivative;
-        let next = if rising && newton > low && newton < high { newton } else { 0.5 * (low + high) };
+        let next = if rising && newton > low && newton < high {
+            newton
+        } else {
+            0.5 * (low + high)
+        };
         let step = (next - x).abs();
         x = next;
         if step <= CONVERGED * x || high - low <= CONVERGED * high {
@@ -52,13 +58,16 @@ pub(crate) fn solve_rising(
 
 /// Value of the polynomial with these coefficients, the constant one first.
 pub(crate) fn evaluate<const N: usize>(p: &[f64; N], s: f64) -> f64 {
-    p.iter().rev().fold(0.0, |sum, coefficient| sum * s + coefficient)
+    p.iter()
+        .rev()
+        .fold(0.0, |sum, coefficient| sum * s + coefficient)
 }
 
 /// Whether a polynomial with `p[0] > 0` is positive from 0 to `end`.
 ///
-/// The Bernstein coefficients on the interval bound the polynomial from below. If they are not conclusive, the interval
-/// is halved (Lane and Riesenfeld 1981). For a point well inside the range of the lens, the first test is conclusive.
+/// The Bernstein coefficients on the interval bound the polynomial from below. If they are not
+/// conclusive, the interval is halved (Lane and Riesenfeld 1981). For a point well inside the range
+/// of the lens, the first test is conclusive.
 pub(crate) fn positive_on<const N: usize>(p: &[f64; N], end: f64) -> bool {
     const MAX_HALVINGS: u32 = 30;
     let mut power = *p;
@@ -71,12 +80,17 @@ pub(crate) fn positive_on<const N: usize>(p: &[f64; N], end: f64) -> bool {
         scale *= end;
     }
     let weights = const { bernstein_weights::<N>() };
-    let bernstein = weights.map(|row| row.iter().zip(&power).map(|(weight, term)| weight * term).sum());
+    let bernstein = weights.map(|row| {
+        row.iter()
+            .zip(&power)
+            .map(|(weight, term)| weight * term)
+            .sum()
+    });
     all_positive(&bernstein, MAX_HALVINGS)
 }
 
-/// Matrix from power to Bernstein coefficients of a polynomial with `N` coefficients: `choose(j, i) / choose(N - 1, i)`
-/// in row `j` and column `i`.
+/// Matrix from power to Bernstein coefficients of a polynomial with `N` coefficients: `choose(j, i)
+/// / choose(N - 1, i)` in row `j` and column `i`.
 const fn bernstein_weights<const N: usize>() -> [[f64; N]; N] {
     let mut weights = [[0.0; N]; N];
     let mut row = 0;
@@ -97,8 +111,8 @@ fn all_positive<const N: usize>(bernstein: &[f64; N], halvings_left: u32) -> boo
     if bernstein.iter().all(|&coefficient| coefficient > 0.0) {
         return true;
     }
-    // The first and last coefficients are values of the polynomial itself. The comparison is written so that NaN is
-    // not positive.
+    // The first and last coefficients are values of the polynomial itself. The comparison is
+    // written so that NaN is not positive.
     if !(bernstein[0] > 0.0 && bernstein[N - 1] > 0.0) || halvings_left == 0 {
         return false;
     }

@@ -4,7 +4,8 @@ use crate::camera::{Intrinsics, Lens};
 use crate::lens;
 use nalgebra::{Matrix2x3, SMatrix, Vector2, Vector3};
 
-/// Maximum number of parameters of a camera: two focal lengths, the principal point, and eight coefficients.
+/// Maximum number of parameters of a camera: two focal lengths, the principal point, and eight
+/// coefficients.
 pub const MAX_INTRINSICS_PARAMS: usize = 12;
 
 /// A projected point and the derivatives of its pixel.
@@ -14,17 +15,22 @@ pub struct Projection {
     pub pixel: [f64; 2],
     /// Derivative with respect to the point in the camera frame, pixels per meter.
     pub by_point: Matrix2x3<f64>,
-    /// Derivative with respect to the intrinsics, in the order of [`Intrinsics::params`]. Columns beyond the number of
-    /// parameters are zero.
+    /// Derivative with respect to the intrinsics, in the order of [`Intrinsics::params`]. Columns
+    /// beyond the number of parameters are zero.
     pub by_intrinsics: SMatrix<f64, 2, MAX_INTRINSICS_PARAMS>,
 }
 
 impl Intrinsics {
-    /// The parameters as a vector: focal length x and y, principal point x and y, then the coefficients of the lens,
-    /// which are left out if the image is rectified.
+    /// The parameters as a vector: focal length x and y, principal point x and y, then the
+    /// coefficients of the lens, which are left out if the image is rectified.
     pub fn params(&self) -> Vec<f64> {
         let lens = self.lens_in_use();
-        self.focal_px.iter().chain(&self.principal_px).chain(lens.coefficients()).copied().collect()
+        self.focal_px
+            .iter()
+            .chain(&self.principal_px)
+            .chain(lens.coefficients())
+            .copied()
+            .collect()
     }
 
     /// These intrinsics with other parameters, in the order of [`Intrinsics::params`].
@@ -43,11 +49,16 @@ impl Intrinsics {
             Lens::KannalaBrandt(k) => k.copy_from_slice(coefficients),
             Lens::RationalBrownConrady(k) => k.copy_from_slice(coefficients),
         }
-        Self { focal_px: [plane[0], plane[1]], principal_px: [plane[2], plane[3]], lens, ..*self }
+        Self {
+            focal_px: [plane[0], plane[1]],
+            principal_px: [plane[2], plane[3]],
+            lens,
+            ..*self
+        }
     }
 
-    /// Like [`Intrinsics::project_with_jacobian`], and also returns the derivative of the pixel with respect to the
-    /// intrinsics.
+    /// Like [`Intrinsics::project_with_jacobian`], and also returns the derivative of the pixel
+    /// with respect to the intrinsics.
     pub fn project_with_derivatives(&self, point_in_camera: &Vector3<f64>) -> Option<Projection> {
         let &[x, y, z] = point_in_camera.as_ref();
         if z.is_nan() || z <= 0.0 {
@@ -68,8 +79,12 @@ impl Intrinsics {
         match &lens {
             Lens::Pinhole => (),
             Lens::BrownConrady(_) => set_coefficients(&lens::brown_conrady_by_coefficients(plane)),
-            Lens::KannalaBrandt(_) => set_coefficients(&lens::kannala_brandt_by_coefficients(plane)),
-            Lens::RationalBrownConrady(k) => set_coefficients(&lens::rational_by_coefficients(k, plane)),
+            Lens::KannalaBrandt(_) => {
+                set_coefficients(&lens::kannala_brandt_by_coefficients(plane))
+            }
+            Lens::RationalBrownConrady(k) => {
+                set_coefficients(&lens::rational_by_coefficients(k, plane))
+            }
         }
         for axis in 0..2 {
             by_point.row_mut(axis).scale_mut(self.focal_px[axis]);
@@ -77,7 +92,11 @@ impl Intrinsics {
             by_intrinsics[(axis, axis)] = distorted.value[axis];
             by_intrinsics[(axis, 2 + axis)] = 1.0;
         }
-        Some(Projection { pixel, by_point, by_intrinsics })
+        Some(Projection {
+            pixel,
+            by_point,
+            by_intrinsics,
+        })
     }
 }
 
@@ -105,12 +124,18 @@ mod tests {
     #[test]
     fn derivatives_with_respect_to_intrinsics_match_central_differences() {
         const NUDGE: f64 = 1e-6;
-        // The projection is linear in all parameters but the denominator, so only rounding errors of 1e-13 / 1e-6 and,
-        // for the denominator, truncation errors of 1e-12 times the focal length remain.
+        // The projection is linear in all parameters but the denominator, so only rounding errors
+        // of 1e-13 / 1e-6 and, for the denominator, truncation errors of 1e-12 times the focal
+        // length remain.
         const CLOSE: f64 = 1e-6;
         for camera in cameras() {
             let params = camera.params();
-            for point in [[0.3, -0.2, 1.5], [0.0, 0.0, 0.7], [-0.4, 0.35, 1.1], [1e-9, 0.0, 1.0]] {
+            for point in [
+                [0.3, -0.2, 1.5],
+                [0.0, 0.0, 0.7],
+                [-0.4, 0.35, 1.1],
+                [1e-9, 0.0, 1.0],
+            ] {
                 let point = Vector3::from(point);
                 let projection = camera.project_with_derivatives(&point).unwrap();
                 let (pixel, by_point) = camera.project_with_jacobian(&point).unwrap();
@@ -118,12 +143,20 @@ mod tests {
                 for (ix, column) in projection.by_intrinsics.column_iter().enumerate() {
                     let at = |nudge: f64| {
                         let mut params = params.clone();
-                        params.iter_mut().skip(ix).take(1).for_each(|value| *value += nudge);
+                        params
+                            .iter_mut()
+                            .skip(ix)
+                            .take(1)
+                            .for_each(|value| *value += nudge);
                         Vector2::from(camera.with_params(&params).project(&point).unwrap())
                     };
                     let numeric = (at(NUDGE) - at(-NUDGE)) / (2.0 * NUDGE);
                     let off = (column - numeric).norm();
-                    assert!(off < CLOSE, "{:?} {point:?} parameter {ix} is off by {off}", camera.lens);
+                    assert!(
+                        off < CLOSE,
+                        "{:?} {point:?} parameter {ix} is off by {off}",
+                        camera.lens
+                    );
                 }
             }
         }
@@ -138,7 +171,15 @@ mod tests {
             let rectified = camera.undistorted();
             assert_eq!(rectified.params().len(), 4);
             let point = Vector3::new(0.1, 0.2, 1.0);
-            assert_eq!(rectified.project_with_derivatives(&point).unwrap().by_intrinsics.column(4).norm(), 0.0);
+            assert_eq!(
+                rectified
+                    .project_with_derivatives(&point)
+                    .unwrap()
+                    .by_intrinsics
+                    .column(4)
+                    .norm(),
+                0.0
+            );
         }
     }
 }

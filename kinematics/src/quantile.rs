@@ -2,10 +2,12 @@
 //!
 //! Except for [`median`], every result is one of the given values; [`Rank`] selects which one.
 
-/// Selects the value that is returned if the quantile falls between two of `n` sorted values. Indices start at 0.
+/// Selects the value that is returned if the quantile falls between two of `n` sorted values.
+/// Indices start at 0.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Rank {
-    /// The smallest value that at least the fraction `frac` of the values do not exceed: index `ceil(frac n) - 1`.
+    /// The smallest value that at least the fraction `frac` of the values do not exceed: index
+    /// `ceil(frac n) - 1`.
     ///
     /// This is the inverse of the empirical distribution function: type 1 of Hyndman and Fan 1996.
     Lower,
@@ -15,7 +17,8 @@ pub enum Rank {
     Upper,
 }
 
-/// The median. For an even number of values, it is the mean of the two middle values. `None` without values.
+/// The median. For an even number of values, it is the mean of the two middle values. `None`
+/// without values.
 pub fn median(values: &[f64]) -> Option<f64> {
     let mut sorted = values.to_vec();
     sorted.sort_unstable_by(f64::total_cmp);
@@ -45,19 +48,29 @@ pub fn quantile(values: &mut [f64], frac: f64, rank: Rank) -> Option<f64> {
         Rank::Nearest => (frac * (n - 1.0)).round(),
         Rank::Upper => (frac * n).floor(),
     };
-    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "limited to the indices")]
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "limited to the indices"
+    )]
     let ix = (ix.max(0.0) as usize).min(last_ix);
     Some(*values.select_nth_unstable_by(ix, f64::total_cmp).1)
 }
 
-/// The range without the lowest and the highest `floor(outside_frac n)` values, for fractions below one half. `None`
-/// without values. Reorders the values.
+/// The range without the lowest and the highest `floor(outside_frac n)` values, for fractions below
+/// one half. `None` without values. Reorders the values.
 pub fn trimmed_range(values: &mut [f64], outside_frac: f64) -> Option<[f64; 2]> {
     let last_ix = values.len().checked_sub(1)?;
-    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a fraction of a length")]
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "a fraction of a length"
+    )]
     let n_outside = ((outside_frac * values.len() as f64) as usize).min(last_ix / 2);
     let low = *values.select_nth_unstable_by(n_outside, f64::total_cmp).1;
-    let high = *values.select_nth_unstable_by(last_ix - n_outside, f64::total_cmp).1;
+    let high = *values
+        .select_nth_unstable_by(last_ix - n_outside, f64::total_cmp)
+        .1;
     Some([low, high])
 }
 
@@ -96,7 +109,11 @@ mod tests {
                 }
             }
             let n_outside = n / 50;
-            assert_eq!(trimmed_range(&mut values, 0.02), Some([sorted[n_outside], sorted[n - 1 - n_outside]]), "{n}");
+            assert_eq!(
+                trimmed_range(&mut values, 0.02),
+                Some([sorted[n_outside], sorted[n - 1 - n_outside]]),
+                "{n}"
+            );
         }
         for rank in [Rank::Lower, Rank::Nearest, Rank::Upper] {
             assert_eq!(quantile(&mut [], 0.5, rank), None);

@@ -1,8 +1,8 @@
 //! Reproducible pseudorandom numbers: `SplitMix64`.
 //!
-//! The same seed gives the same numbers on every machine. Source: Steele, Lea and Flood 2014, "Fast splittable
-//! pseudorandom number generators", with the output function "variant 13" of Stafford; Box and Muller 1958 for normal
-//! numbers.
+//! The same seed gives the same numbers on every machine. Source: Steele, Lea and Flood 2014, "Fast
+//! splittable pseudorandom number generators", with the output function "variant 13" of Stafford;
+//! Box and Muller 1958 for normal numbers.
 
 use std::f64::consts::TAU;
 
@@ -18,9 +18,13 @@ pub struct Random {
 }
 
 impl Random {
-    /// Starts the sequence of a seed. All seeds are suitable, and neighboring seeds give unrelated sequences.
+    /// Starts the sequence of a seed. All seeds are suitable, and neighboring seeds give unrelated
+    /// sequences.
     pub fn new(seed: u64) -> Self {
-        Self { state: seed, spare_normal: None }
+        Self {
+            state: seed,
+            spare_normal: None,
+        }
     }
 
     /// The next 64 random bits.
@@ -116,7 +120,10 @@ mod tests {
         ];
         let mut random = Random::new(1_234_567);
         for (n, expected) in (0..).zip(EXPECTED) {
-            assert_eq!((random.bits(), nth_bits(1_234_567, n)), (expected, expected));
+            assert_eq!(
+                (random.bits(), nth_bits(1_234_567, n)),
+                (expected, expected)
+            );
         }
         assert_eq!(hash(1_234_567), EXPECTED[0]);
         assert_eq!(hash(0), 0xe220_a839_7b1d_cdaf);
@@ -130,7 +137,10 @@ mod tests {
         assert_eq!(random.bits_32(), 2_285_812_965);
         assert_eq!(random.byte(), 63);
         assert_eq!(random.below(1000), 821);
-        assert_eq!([unit_from_bits(0), unit_from_bits(u64::MAX)], [0.0, 1.0 - f64::EPSILON / 2.0]);
+        assert_eq!(
+            [unit_from_bits(0), unit_from_bits(u64::MAX)],
+            [0.0, 1.0 - f64::EPSILON / 2.0]
+        );
     }
 
     #[test]
@@ -139,9 +149,17 @@ mod tests {
         let n = 100_000;
         let numbers: Vec<f64> = (0..n).map(|_| random.normal()).collect();
         let mean = numbers.iter().sum::<f64>() / f64::from(n);
-        let variance = numbers.iter().map(|number| (number - mean).powi(2)).sum::<f64>() / f64::from(n);
-        let within_one = numbers.iter().filter(|number| number.abs() < 1.0).count() as f64 / f64::from(n);
-        assert!(mean.abs() < 0.015 && (variance - 1.0).abs() < 0.02, "mean {mean}, variance {variance}");
+        let variance = numbers
+            .iter()
+            .map(|number| (number - mean).powi(2))
+            .sum::<f64>()
+            / f64::from(n);
+        let within_one =
+            numbers.iter().filter(|number| number.abs() < 1.0).count() as f64 / f64::from(n);
+        assert!(
+            mean.abs() < 0.015 && (variance - 1.0).abs() < 0.02,
+            "mean {mean}, variance {variance}"
+        );
         assert!((within_one - 0.6827).abs() < 0.007, "{within_one}");
     }
 
@@ -155,6 +173,9 @@ mod tests {
             *counts.entry(items).or_default() += 1;
         }
         assert_eq!(counts.len(), 6);
-        assert!(counts.values().all(|n| (850..1150).contains(n)), "{counts:?}");
+        assert!(
+            counts.values().all(|n| (850..1150).contains(n)),
+            "{counts:?}"
+        );
     }
 }

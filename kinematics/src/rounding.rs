@@ -1,5 +1,8 @@
 //! The only place where f64 is converted to f32, for images and the GPU.
-#![expect(clippy::cast_possible_truncation, reason = "rounding to f32 is the purpose of this file")]
+#![expect(
+    clippy::cast_possible_truncation,
+    reason = "rounding to f32 is the purpose of this file"
+)]
 
 /// Rounds to the nearest f32.
 pub fn f32_of(value: f64) -> f32 {

@@ -74,15 +74,32 @@ pub(crate) fn read_all(robot: Element<'_>, notes: &mut Notes) -> HashMap<String,
             continue;
         }
         let of_link = format!("link {name:?}");
-        link.note_unknown(&["name", "type"], &["visual", "collision", "inertial"], notes);
+        link.note_unknown(
+            &["name", "type"],
+            &["visual", "collision", "inertial"],
+            notes,
+        );
         check_inertials(link, &of_link, notes);
         for collision in link.all("collision") {
-            if let Some(shape) = noted(shape(collision, notes), &format!("a collision shape of {of_link}"), notes) {
-                by_link.entry(name.to_owned()).or_default().collisions.push(shape);
+            if let Some(shape) = noted(
+                shape(collision, notes),
+                &format!("a collision shape of {of_link}"),
+                notes,
+            ) {
+                by_link
+                    .entry(name.to_owned())
+                    .or_default()
+                    .collisions
+                    .push(shape);
             }
         }
         for visual in link.all("visual") {
-            let material = noted(visual.only("material"), &format!("a material of {of_link}"), notes).flatten();
+            let material = noted(
+                visual.only("material"),
+                &format!("a material of {of_link}"),
+                notes,
+            )
+            .flatten();
             if let Some(material) = material {
                 read_material(material, &of_link, &mut materials, notes);
             }
@@ -90,11 +107,22 @@ pub(crate) fn read_all(robot: Element<'_>, notes: &mut Notes) -> HashMap<String,
         }
     }
     for (link, visual, material) in visuals {
-        if let Some(mut shape) = noted(shape(visual, notes), &format!("a visual shape of link {link:?}"), notes) {
+        if let Some(mut shape) = noted(
+            shape(visual, notes),
+            &format!("a visual shape of link {link:?}"),
+            notes,
+        ) {
             shape.color_srgba = material.and_then(|material| {
-                own_color(material).ok().flatten().or_else(|| materials.get(material.attribute("name")?).copied())
+                own_color(material)
+                    .ok()
+                    .flatten()
+                    .or_else(|| materials.get(material.attribute("name")?).copied())
             });
-            by_link.entry(link.to_owned()).or_default().visuals.push(shape);
+            by_link
+                .entry(link.to_owned())
+                .or_default()
+                .visuals
+                .push(shape);
         }
     }
     by_link
@@ -104,11 +132,17 @@ type Materials<'a> = HashMap<&'a str, [f64; 4]>;
 
 /// The value, or `None` and a note.
 fn noted<T>(read: Result<T, Problem>, what: &str, notes: &mut Notes) -> Option<T> {
-    read.map_err(|Problem { line, why }| notes.add(line, &format!("{what} is not used: {why}"))).ok()
+    read.map_err(|Problem { line, why }| notes.add(line, &format!("{what} is not used: {why}")))
+        .ok()
 }
 
 /// Remembers a material with a name and a color.
-fn read_material<'a>(material: Element<'a>, owner: &str, materials: &mut Materials<'a>, notes: &mut Notes) {
+fn read_material<'a>(
+    material: Element<'a>,
+    owner: &str,
+    materials: &mut Materials<'a>,
+    notes: &mut Notes,
+) {
     material.note_unknown(&["name"], &["color", "texture"], notes);
     let color = noted(own_color(material), &format!("a color of {owner}"), notes).flatten();
     if let (Some(name), Some(color)) = (material.attribute("name"), color) {
@@ -116,17 +150,23 @@ fn read_material<'a>(material: Element<'a>, owner: &str, materials: &mut Materia
     }
     if let Some(texture) = material.all("texture").next() {
         let file = texture.attribute("filename").unwrap_or_default();
-        notes.add(texture.line(), &format!("a texture of {owner} is not drawn: {file:?}"));
+        notes.add(
+            texture.line(),
+            &format!("a texture of {owner} is not drawn: {file:?}"),
+        );
     }
 }
 
 fn own_color(material: Element<'_>) -> Result<Option<[f64; 4]>, Problem> {
-    let Some(color) = material.only("color")? else { return Ok(None) };
+    let Some(color) = material.only("color")? else {
+        return Ok(None);
+    };
     let rgba = color.numbers::<4>("rgba")?;
     match rgba {
-        Some(rgba) if !rgba.iter().all(|channel| (0.0..=1.0).contains(channel)) => {
-            Err(color.problem(format!("rgba is {rgba:?}, expected four numbers from 0 to 1")))
-        }
+        Some(rgba) if !rgba.iter().all(|channel| (0.0..=1.0).contains(channel)) => Err(color
+            .problem(format!(
+                "rgba is {rgba:?}, expected four numbers from 0 to 1"
+            ))),
         rgba => Ok(rgba),
     }
 }
@@ -135,7 +175,11 @@ fn own_color(material: Element<'_>) -> Result<Option<[f64; 4]>, Problem> {
 fn check_inertials(link: Element<'_>, of_link: &str, notes: &mut Notes) {
     for inertial in link.all("inertial") {
         let check = || -> Result<(), Problem> {
-            let child = |tag| inertial.only(tag)?.ok_or_else(|| inertial.problem(format!("it has no <{tag}>")));
+            let child = |tag| {
+                inertial
+                    .only(tag)?
+                    .ok_or_else(|| inertial.problem(format!("it has no <{tag}>")))
+            };
             child("mass")?.number("value")?;
             let inertia = child("inertia")?;
             for moment in ["ixx", "ixy", "ixz", "iyy", "iyz", "izz"] {
@@ -144,20 +188,32 @@ fn check_inertials(link: Element<'_>, of_link: &str, notes: &mut Notes) {
             Ok(())
         };
         if let Err(Problem { line, why }) = check() {
-            notes.add(line, &format!("the inertia of {of_link} is invalid (it is not used): {why}"));
+            notes.add(
+                line,
+                &format!("the inertia of {of_link} is invalid (it is not used): {why}"),
+            );
         }
     }
 }
 
 fn shape(element: Element<'_>, notes: &mut Notes) -> Result<Shape, Problem> {
-    element.note_unknown(&["name", "group"], &["origin", "geometry", "material", "verbose"], notes);
-    let geometry = element.only("geometry")?.ok_or_else(|| element.problem("it has no <geometry>"))?;
+    element.note_unknown(
+        &["name", "group"],
+        &["origin", "geometry", "material", "verbose"],
+        notes,
+    );
+    let geometry = element
+        .only("geometry")?
+        .ok_or_else(|| element.problem("it has no <geometry>"))?;
     if let Ok(Some(origin)) = element.only("origin") {
         origin.note_unknown(&ORIGIN_ATTRIBUTES, &[], notes);
     }
     let forms: Vec<Element<'_>> = geometry.children().collect();
     let [form] = forms[..] else {
-        return Err(geometry.problem(format!("<geometry> has {} children, expected one", forms.len())));
+        return Err(geometry.problem(format!(
+            "<geometry> has {} children, expected one",
+            forms.len()
+        )));
     };
     let attributes: &[&str] = match form.tag() {
         "box" => &["size"],
@@ -165,13 +221,17 @@ fn shape(element: Element<'_>, notes: &mut Notes) -> Result<Shape, Problem> {
         "sphere" => &["radius"],
         "mesh" => &["filename", "scale"],
         other => {
-            return Err(
-                form.problem(format!("unknown geometry <{other}>, expected box, cylinder, capsule, sphere or mesh"))
-            );
+            return Err(form.problem(format!(
+                "unknown geometry <{other}>, expected box, cylinder, capsule, sphere or mesh"
+            )));
         }
     };
     form.note_unknown(attributes, &[], notes);
-    Ok(Shape { link_from_shape: origin(element)?, geometry: read_geometry(form)?, color_srgba: None })
+    Ok(Shape {
+        link_from_shape: origin(element)?,
+        geometry: read_geometry(form)?,
+        color_srgba: None,
+    })
 }
 
 fn read_geometry(form: Element<'_>) -> Result<Geometry, Problem> {
@@ -187,17 +247,36 @@ fn read_geometry(form: Element<'_>) -> Result<Geometry, Problem> {
         "box" => {
             form.required("size")?;
             let [x, y, z] = form.numbers("size")?.unwrap_or_default();
-            Geometry::Box { size_m: [positive("size", x)?, positive("size", y)?, positive("size", z)?] }
+            Geometry::Box {
+                size_m: [
+                    positive("size", x)?,
+                    positive("size", y)?,
+                    positive("size", z)?,
+                ],
+            }
         }
-        "cylinder" => Geometry::Cylinder { radius_m: length("radius")?, length_m: length("length")? },
-        "capsule" => Geometry::Capsule { radius_m: length("radius")?, length_m: length("length")? },
-        "sphere" => Geometry::Sphere { radius_m: length("radius")? },
+        "cylinder" => Geometry::Cylinder {
+            radius_m: length("radius")?,
+            length_m: length("length")?,
+        },
+        "capsule" => Geometry::Capsule {
+            radius_m: length("radius")?,
+            length_m: length("length")?,
+        },
+        "sphere" => Geometry::Sphere {
+            radius_m: length("radius")?,
+        },
         _ => {
             let scale = form.numbers("scale")?.unwrap_or([1.0; 3]);
             if scale.contains(&0.0) {
-                return Err(form.problem(format!("its scale is {scale:?}, expected numbers other than 0")));
+                return Err(form.problem(format!(
+                    "its scale is {scale:?}, expected numbers other than 0"
+                )));
             }
-            Geometry::Mesh { file: form.required("filename")?.to_owned(), scale }
+            Geometry::Mesh {
+                file: form.required("filename")?.to_owned(),
+                scale,
+            }
         }
     })
 }
@@ -228,34 +307,85 @@ mod tests {
                <collision><geometry><capsule radius="0.1" length="0.3"/></geometry></collision>"#,
         );
         let visuals = robot.visuals("a");
-        assert_eq!(visuals[0].geometry, Geometry::Box { size_m: [1.0, 2.0, 3.0] });
-        assert_eq!(visuals[0].color_srgba, Some([0.5, 0.5, 0.6, 1.0]), "a material of the robot");
+        assert_eq!(
+            visuals[0].geometry,
+            Geometry::Box {
+                size_m: [1.0, 2.0, 3.0]
+            }
+        );
+        assert_eq!(
+            visuals[0].color_srgba,
+            Some([0.5, 0.5, 0.6, 1.0]),
+            "a material of the robot"
+        );
         let corner = visuals[0].link_from_shape * Point3::new(1.0, 0.0, 0.0);
-        assert!((corner - Point3::new(1.0, 1.0, 0.0)).norm() < 1e-12, "{corner}");
-        assert_eq!(visuals[1].geometry, Geometry::Cylinder { radius_m: 0.1, length_m: 0.4 });
+        assert!(
+            (corner - Point3::new(1.0, 1.0, 0.0)).norm() < 1e-12,
+            "{corner}"
+        );
+        assert_eq!(
+            visuals[1].geometry,
+            Geometry::Cylinder {
+                radius_m: 0.1,
+                length_m: 0.4
+            }
+        );
         assert_eq!(visuals[1].color_srgba, Some([1.0, 0.0, 0.0, 0.5]));
-        assert_eq!((&visuals[2].geometry, visuals[2].color_srgba), (&Geometry::Sphere { radius_m: 0.2 }, None));
-        assert_eq!(visuals[3].geometry, Geometry::Mesh { file: "package://r/a.stl".into(), scale: [0.001; 3] });
-        assert_eq!(robot.collisions("a")[0].geometry, Geometry::Capsule { radius_m: 0.1, length_m: 0.3 });
+        assert_eq!(
+            (&visuals[2].geometry, visuals[2].color_srgba),
+            (&Geometry::Sphere { radius_m: 0.2 }, None)
+        );
+        assert_eq!(
+            visuals[3].geometry,
+            Geometry::Mesh {
+                file: "package://r/a.stl".into(),
+                scale: [0.001; 3]
+            }
+        );
+        assert_eq!(
+            robot.collisions("a")[0].geometry,
+            Geometry::Capsule {
+                radius_m: 0.1,
+                length_m: 0.3
+            }
+        );
         assert!(robot.notes().is_empty() && robot.visuals("b").is_empty());
     }
 
     #[test]
     fn invalid_shapes_are_ignored_with_a_reason() {
         for (shape, named) in [
-            (r#"<geometry><sphere radius="-1"/></geometry>"#, "radius is -1"),
+            (
+                r#"<geometry><sphere radius="-1"/></geometry>"#,
+                "radius is -1",
+            ),
             (r#"<geometry><box size="1 0 1"/></geometry>"#, "size is 0"),
-            (r#"<origin xyz="nan 0 0"/><geometry><sphere radius="1"/></geometry>"#, "origin"),
-            (r#"<geometry><mesh filename="a.stl" scale="1 inf 1"/></geometry>"#, "scale"),
-            (r#"<geometry><mesh/></geometry>"#, r#"<mesh> has no attribute "filename""#),
-            (r#"<geometry><cone radius="1"/></geometry>"#, "unknown geometry <cone>"),
+            (
+                r#"<origin xyz="nan 0 0"/><geometry><sphere radius="1"/></geometry>"#,
+                "origin",
+            ),
+            (
+                r#"<geometry><mesh filename="a.stl" scale="1 inf 1"/></geometry>"#,
+                "scale",
+            ),
+            (
+                r#"<geometry><mesh/></geometry>"#,
+                r#"<mesh> has no attribute "filename""#,
+            ),
+            (
+                r#"<geometry><cone radius="1"/></geometry>"#,
+                "unknown geometry <cone>",
+            ),
             (r#"<geometry/>"#, "<geometry> has 0 children"),
             (r#"<origin xyz="0 0 0"/>"#, "it has no <geometry>"),
         ] {
             let robot = robot(&format!("<visual>{shape}</visual>"));
             assert!(robot.visuals("a").is_empty());
             let reasons = robot.notes();
-            assert!(reasons.len() == 1 && reasons[0].contains(named) && reasons[0].contains("\"a\""), "{reasons:?}");
+            assert!(
+                reasons.len() == 1 && reasons[0].contains(named) && reasons[0].contains("\"a\""),
+                "{reasons:?}"
+            );
         }
     }
 
@@ -266,8 +396,13 @@ mod tests {
             let material = format!(r#"<material name="x"><color rgba="{color}"/></material>"#);
             let robot = robot(&format!("<visual>{sphere}{material}</visual>"));
             assert_eq!(robot.visuals("a")[0].color_srgba, None);
-            let [note] = robot.notes() else { panic!("{:?}", robot.notes()) };
-            assert!(note.starts_with("line 2: a color of link \"a\" is not used: rgba"), "{note}");
+            let [note] = robot.notes() else {
+                panic!("{:?}", robot.notes())
+            };
+            assert!(
+                note.starts_with("line 2: a color of link \"a\" is not used: rgba"),
+                "{note}"
+            );
         }
     }
 
@@ -278,6 +413,9 @@ mod tests {
             r#"<visual>{sphere}<material name="red"/></visual></link>
                <link name="b"><visual>{sphere}<material name="red"><color rgba="1 0 0 1"/></material></visual>"#
         ));
-        assert_eq!(robot.visuals("a")[0].color_srgba, Some([1.0, 0.0, 0.0, 1.0]));
+        assert_eq!(
+            robot.visuals("a")[0].color_srgba,
+            Some([1.0, 0.0, 0.0, 1.0])
+        );
     }
 }

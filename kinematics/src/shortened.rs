@@ -1,4 +1,5 @@
-//! Lists in messages, shortened. They are here because this is the lowest crate whose users name links, markers and files.
+//! Lists in messages, shortened. They are here because this is the lowest crate whose users name
+//! links, markers and files.
 
 use std::fmt::Display;
 
@@ -18,7 +19,10 @@ pub fn shortened<T: Display>(items: &[T], max: usize, separator: &str) -> String
     match items.len().saturating_sub(max) {
         0 => shown,
         // There is no comma before "and".
-        n_more => format!("{shown}{} and {n_more} more", separator.trim_end_matches([',', ' '])),
+        n_more => format!(
+            "{shown}{} and {n_more} more",
+            separator.trim_end_matches([',', ' '])
+        ),
     }
 }
 
@@ -31,7 +35,10 @@ mod tests {
         let ids: Vec<u32> = (0..9).collect();
         assert_eq!(shortened(&ids[..0], 8, ", "), "");
         assert_eq!(shortened(&ids[..8], 8, ", "), "0, 1, 2, 3, 4, 5, 6, 7");
-        assert_eq!(shortened(&ids, 8, ", "), "0, 1, 2, 3, 4, 5, 6, 7 and 1 more");
+        assert_eq!(
+            shortened(&ids, 8, ", "),
+            "0, 1, 2, 3, 4, 5, 6, 7 and 1 more"
+        );
         assert_eq!(shortened(&ids, 2, "; "), "0; 1; and 7 more");
     }
 }

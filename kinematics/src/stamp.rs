@@ -3,7 +3,8 @@
 use std::ops::{Add, AddAssign, Sub};
 use std::time::Duration;
 
-/// A time in nanoseconds on one monotonic clock. Images are stamped at mid-exposure, if the device reports it.
+/// A time in nanoseconds on one monotonic clock. Images are stamped at mid-exposure, if the device
+/// reports it.
 ///
 /// ```
 /// use kinematics::Stamp;
@@ -18,10 +19,15 @@ pub struct Stamp(pub i64);
 const NANOS_PER_SEC: f64 = 1e9;
 
 impl Stamp {
-    /// The stamp closest to `secs` after the clock's zero. Saturates at the ends of the range; NaN becomes zero.
+    /// The stamp closest to `secs` after the clock's zero. Saturates at the ends of the range; NaN
+    /// becomes zero.
     ///
-    /// Exact to a nanosecond up to 104 days from zero; beyond that, an f64 of seconds has a coarser resolution.
-    #[expect(clippy::cast_possible_truncation, reason = "a float to integer cast saturates, as documented")]
+    /// Exact to a nanosecond up to 104 days from zero; beyond that, an f64 of seconds has a coarser
+    /// resolution.
+    #[expect(
+        clippy::cast_possible_truncation,
+        reason = "a float to integer cast saturates, as documented"
+    )]
     pub fn from_secs(secs: f64) -> Self {
         Self((secs * NANOS_PER_SEC).round() as i64)
     }

@@ -8,7 +8,8 @@ pub type Transform = Isometry3<f64>;
 
 /// Velocity of a frame relative to the world, expressed in that frame.
 ///
-/// In this frame, a point at rest in the world moves by `-(linear_m_s + angular_rad_s x point_in_frame)` per second.
+/// In this frame, a point at rest in the world moves by `-(linear_m_s + angular_rad_s x
+/// point_in_frame)` per second.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Twist {
     /// Velocity of the frame's origin, meters per second.
@@ -17,30 +18,32 @@ pub struct Twist {
     pub angular_rad_s: Vector3<f64>,
 }
 
-/// Largest element of `|RᵀR - 1|` that is accepted as a rounding error in a file. Quaternions with three decimals stay
-/// below it; a scale error of 0.1 % exceeds it.
+/// Largest element of `|RᵀR - 1|` that is accepted as a rounding error in a file. Quaternions with
+/// three decimals stay below it; a scale error of 0.1 % exceeds it.
 pub const RIGID_TOLERANCE: f64 = 1e-3;
-/// As [`RIGID_TOLERANCE`], for matrices with three decimals, which deviate by up to `2 * sqrt(3) * 0.0005`.
+/// As [`RIGID_TOLERANCE`], for matrices with three decimals, which deviate by up to `2 * sqrt(3) *
+/// 0.0005`.
 pub const ROUNDED_TOLERANCE: f64 = 2e-3;
 
-/// Below this angle, in radians, [`exp`] and [`log`] use series instead of quotients. At this angle, series and
-/// quotients agree to 1e-16.
+/// Below this angle, in radians, [`exp`] and [`log`] use series instead of quotients. At this
+/// angle, series and quotients agree to 1e-16.
 const SMALL_ANGLE_RAD: f64 = 1e-4;
 
 /// Parses a row-major 4x4 matrix.
 ///
-/// The rotation part is replaced by the nearest rotation in the least-squares sense, which removes rounding errors.
+/// The rotation part is replaced by the nearest rotation in the least-squares sense, which removes
+/// rounding errors.
 ///
 /// # Errors
 ///
-/// Rejects non-finite elements, a last row other than `0 0 0 1`, and a rotation part that is mirrored or deviates by
-/// more than [`RIGID_TOLERANCE`].
+/// Rejects non-finite elements, a last row other than `0 0 0 1`, and a rotation part that is
+/// mirrored or deviates by more than [`RIGID_TOLERANCE`].
 pub fn from_rows(rows: &[f64; 16]) -> Result<Transform, Error> {
     from_rows_within(rows, RIGID_TOLERANCE)
 }
 
-/// Like [`from_rows`], for numbers that may be rounded to three decimals. Also returns whether they deviate by more than
-/// [`from_rows`] accepts. The rotation is then wrong by up to 0.1 degrees.
+/// Like [`from_rows`], for numbers that may be rounded to three decimals. Also returns whether they
+/// deviate by more than [`from_rows`] accepts. The rotation is then wrong by up to 0.1 degrees.
 ///
 /// # Errors
 ///
@@ -54,28 +57,48 @@ pub fn from_rounded_rows(rows: &[f64; 16]) -> Result<(Transform, bool), Error> {
 
 fn from_rows_within(rows: &[f64; 16], tolerance: f64) -> Result<Transform, Error> {
     if let Some(at) = rows.iter().position(|value| !value.is_finite()) {
-        return Err(Error::TransformNotFinite { row: at / 4, column: at % 4, value: rows[at] });
+        return Err(Error::TransformNotFinite {
+            row: at / 4,
+            column: at % 4,
+            value: rows[at],
+        });
     }
     let last = [rows[12], rows[13], rows[14], rows[15]];
-    if last.iter().zip([0.0, 0.0, 0.0, 1.0]).any(|(got, expected)| (got - expected).abs() > RIGID_TOLERANCE) {
+    if last
+        .iter()
+        .zip([0.0, 0.0, 0.0, 1.0])
+        .any(|(got, expected)| (got - expected).abs() > RIGID_TOLERANCE)
+    {
         return Err(Error::LastRow { row: last });
     }
     let given = Matrix3::from_fn(|row, column| rows[4 * row + column]);
-    let off = (given.transpose() * given - Matrix3::identity()).abs().max();
+    let off = (given.transpose() * given - Matrix3::identity())
+        .abs()
+        .max();
     let determinant = given.determinant();
     if off > tolerance || determinant < 0.0 {
-        return Err(Error::NotRigid { off, allowed: tolerance, determinant });
+        return Err(Error::NotRigid {
+            off,
+            allowed: tolerance,
+            determinant,
+        });
     }
     let translation = Translation3::new(rows[3], rows[7], rows[11]);
-    Ok(Transform::from_parts(translation, UnitQuaternion::from_rotation_matrix(&nearest_rotation(given))))
+    Ok(Transform::from_parts(
+        translation,
+        UnitQuaternion::from_rotation_matrix(&nearest_rotation(given)),
+    ))
 }
 
-/// The orthogonal polar factor, by Newton's iteration (Higham 1986), which converges quadratically for matrices that
-/// are close to a rotation.
+/// The orthogonal polar factor, by Newton's iteration (Higham 1986), which converges quadratically
+/// for matrices that are close to a rotation.
 fn nearest_rotation(mut matrix: Matrix3<f64>) -> Rotation3<f64> {
     const STEPS: usize = 4; // Errors go from 1e-3 to 1e-6 and 1e-12, then below rounding; one extra step is cheap.
     for _ in 0..STEPS {
-        let inverse_transpose = matrix.try_inverse().expect("a matrix near a rotation has an inverse").transpose();
+        let inverse_transpose = matrix
+            .try_inverse()
+            .expect("a matrix near a rotation has an inverse")
+            .transpose();
         matrix = (matrix + inverse_transpose) * 0.5;
     }
     Rotation3::from_matrix_unchecked(matrix)
@@ -87,7 +110,8 @@ pub fn to_rows(transform: &Transform) -> [f64; 16] {
     std::array::from_fn(|at| matrix[(at / 4, at % 4)])
 }
 
-/// The seven numbers of a pose in files: the position x, y, z in meters, then the quaternion x, y, z, w.
+/// The seven numbers of a pose in files: the position x, y, z in meters, then the quaternion x, y,
+/// z, w.
 pub fn to_xyz_xyzw(transform: &Transform) -> [f64; 7] {
     let [x, y, z] = transform.translation.vector.into();
     let [i, j, k, w] = transform.rotation.coords.into();
@@ -96,9 +120,13 @@ pub fn to_xyz_xyzw(transform: &Transform) -> [f64; 7] {
 
 /// The bit-exact inverse of [`to_xyz_xyzw`].
 ///
-/// The quaternion must have unit length: it is not normalized again, because that would change its last bits.
+/// The quaternion must have unit length: it is not normalized again, because that would change its
+/// last bits.
 pub fn from_xyz_xyzw([x, y, z, i, j, k, w]: [f64; 7]) -> Transform {
-    Transform::from_parts(Translation3::new(x, y, z), UnitQuaternion::new_unchecked(Quaternion::new(w, i, j, k)))
+    Transform::from_parts(
+        Translation3::new(x, y, z),
+        UnitQuaternion::new_unchecked(Quaternion::new(w, i, j, k)),
+    )
 }
 
 /// Smaller motions of a camera are noticeable neither in a picture nor in a map of the scene.
@@ -114,20 +142,25 @@ pub fn is_noticeable(motion: &Transform) -> bool {
 
 /// Whether all elements of a pose are finite.
 pub fn is_finite(transform: &Transform) -> bool {
-    to_xyz_xyzw(transform).iter().all(|number| number.is_finite())
+    to_xyz_xyzw(transform)
+        .iter()
+        .all(|number| number.is_finite())
 }
 
-/// Interpolates from `a` (`frac` 0) to `b` (`frac` 1): the translation linearly, the rotation at a constant rate
-/// along the shorter arc.
+/// Interpolates from `a` (`frac` 0) to `b` (`frac` 1): the translation linearly, the rotation at a
+/// constant rate along the shorter arc.
 pub fn interpolate(a: &Transform, b: &Transform, frac: f64) -> Transform {
     let translation = a.translation.vector.lerp(&b.translation.vector, frac);
     // The scaled axis of a unit quaternion has an angle of at most pi, so this is the shorter arc.
     let rotation_vector = (a.rotation.inverse() * b.rotation).scaled_axis();
-    Transform::from_parts(translation.into(), a.rotation * UnitQuaternion::from_scaled_axis(rotation_vector * frac))
+    Transform::from_parts(
+        translation.into(),
+        a.rotation * UnitQuaternion::from_scaled_axis(rotation_vector * frac),
+    )
 }
 
-/// Motion of a frame that moves with a constant `twist` for `secs` seconds: the new `world_from_frame` is the old one
-/// times this motion.
+/// Motion of a frame that moves with a constant `twist` for `secs` seconds: the new
+/// `world_from_frame` is the old one times this motion.
 ///
 /// Source: Murray, Li and Sastry 1994, section 2.3.2 (exponential of se(3)).
 ///
@@ -146,18 +179,25 @@ pub fn exp(twist: &Twist, secs: f64) -> Transform {
     let angle = rotation_vector.norm();
     // (1 - cos a) / a² and (a - sin a) / a³.
     let (first, second) = if angle < SMALL_ANGLE_RAD {
-        (0.5 - angle * angle / 24.0, 1.0 / 6.0 - angle * angle / 120.0)
+        (
+            0.5 - angle * angle / 24.0,
+            1.0 / 6.0 - angle * angle / 120.0,
+        )
     } else {
         let half = (0.5 * angle).sin() / angle;
         (2.0 * half * half, (angle - angle.sin()) / angle.powi(3))
     };
     let first_cross = rotation_vector.cross(&translation_part);
-    let translation = translation_part + first_cross * first + rotation_vector.cross(&first_cross) * second;
-    Transform::from_parts(translation.into(), UnitQuaternion::from_scaled_axis(rotation_vector))
+    let translation =
+        translation_part + first_cross * first + rotation_vector.cross(&first_cross) * second;
+    Transform::from_parts(
+        translation.into(),
+        UnitQuaternion::from_scaled_axis(rotation_vector),
+    )
 }
 
-/// The constant twist that produces `transform` in `secs` seconds. The inverse of [`exp`] for rotations below 180
-/// degrees.
+/// The constant twist that produces `transform` in `secs` seconds. The inverse of [`exp`] for
+/// rotations below 180 degrees.
 pub fn log(transform: &Transform, secs: f64) -> Twist {
     let rotation_vector = transform.rotation.scaled_axis();
     let angle = rotation_vector.norm();
@@ -169,21 +209,35 @@ pub fn log(transform: &Transform, secs: f64) -> Twist {
     };
     let translation = transform.translation.vector;
     let first_cross = rotation_vector.cross(&translation);
-    let translation_part = translation - first_cross * 0.5 + rotation_vector.cross(&first_cross) * second;
-    Twist { linear_m_s: translation_part / secs, angular_rad_s: rotation_vector / secs }
+    let translation_part =
+        translation - first_cross * 0.5 + rotation_vector.cross(&first_cross) * second;
+    Twist {
+        linear_m_s: translation_part / secs,
+        angular_rad_s: rotation_vector / secs,
+    }
 }
 
 impl Twist {
     /// The twist of a frame at rest.
     pub fn zero() -> Self {
-        Self { linear_m_s: Vector3::zeros(), angular_rad_s: Vector3::zeros() }
+        Self {
+            linear_m_s: Vector3::zeros(),
+            angular_rad_s: Vector3::zeros(),
+        }
     }
 
-    /// Twist of another frame that is rigidly attached to this one, expressed in the other frame (adjoint transform).
+    /// Twist of another frame that is rigidly attached to this one, expressed in the other frame
+    /// (adjoint transform).
     pub fn of_attached(&self, this_from_other: &Transform) -> Self {
         let other_from_this = this_from_other.rotation.inverse();
-        let linear_m_s = self.linear_m_s + self.angular_rad_s.cross(&this_from_other.translation.vector);
-        Self { linear_m_s: other_from_this * linear_m_s, angular_rad_s: other_from_this * self.angular_rad_s }
+        let linear_m_s = self.linear_m_s
+            + self
+                .angular_rad_s
+                .cross(&this_from_other.translation.vector);
+        Self {
+            linear_m_s: other_from_this * linear_m_s,
+            angular_rad_s: other_from_this * self.angular_rad_s,
+        }
     }
 
     /// Velocity, in this frame, of a point at rest in the world, meters per second.
@@ -224,9 +278,17 @@ mod tests {
         let a = Transform::from_parts(Translation3::new(0.1 + 0.2, -0.0, 5e-324), rotation);
         let numbers = to_xyz_xyzw(&a);
         let expected = [0.1 + 0.2, -0.0, 5e-324, -0.5, 0.5, 0.5 + 1e-9, 0.5];
-        assert_eq!(numbers.map(f64::to_bits), expected.map(f64::to_bits), "x y z, then the quaternion with w last");
+        assert_eq!(
+            numbers.map(f64::to_bits),
+            expected.map(f64::to_bits),
+            "x y z, then the quaternion with w last"
+        );
         let back = from_xyz_xyzw(numbers);
-        assert_eq!(to_xyz_xyzw(&back).map(f64::to_bits), expected.map(f64::to_bits), "not normalized");
+        assert_eq!(
+            to_xyz_xyzw(&back).map(f64::to_bits),
+            expected.map(f64::to_bits),
+            "not normalized"
+        );
         assert!(is_finite(&back));
         for ix in 0..7 {
             let mut broken = numbers;
@@ -240,7 +302,12 @@ mod tests {
         let rows = to_rows(&pose(0.7, [0.3, -1.2, 2.0])).map(|value| (value * 1e4).round() / 1e4);
         let read = from_rows(&rows).unwrap();
         let matrix = read.rotation.to_rotation_matrix().into_inner();
-        assert!((matrix.transpose() * matrix - Matrix3::identity()).abs().max() < 1e-15);
+        assert!(
+            (matrix.transpose() * matrix - Matrix3::identity())
+                .abs()
+                .max()
+                < 1e-15
+        );
         assert!(distance(&read, &pose(0.7, [0.3, -1.2, 2.0])) < 1e-4);
     }
 
@@ -252,13 +319,29 @@ mod tests {
             changed[at] = value;
             from_rows(&changed)
         };
-        assert!(matches!(with(6, f64::NAN), Err(Error::TransformNotFinite { row: 1, column: 2, .. })));
-        assert!(matches!(with(3, f64::INFINITY), Err(Error::TransformNotFinite { row: 0, column: 3, .. })));
+        assert!(matches!(
+            with(6, f64::NAN),
+            Err(Error::TransformNotFinite {
+                row: 1,
+                column: 2,
+                ..
+            })
+        ));
+        assert!(matches!(
+            with(3, f64::INFINITY),
+            Err(Error::TransformNotFinite {
+                row: 0,
+                column: 3,
+                ..
+            })
+        ));
         assert!(matches!(with(12, 0.1), Err(Error::LastRow { .. })));
         assert!(matches!(with(15, 0.0), Err(Error::LastRow { .. })));
         let scaled = |factor: f64| {
             let mut scaled = rows;
-            (0..11).filter(|at| at % 4 < 3).for_each(|at| scaled[at] *= factor);
+            (0..11)
+                .filter(|at| at % 4 < 3)
+                .for_each(|at| scaled[at] *= factor);
             scaled
         };
         let mut mirrored = rows;
@@ -270,7 +353,10 @@ mod tests {
         ];
         for (rows, advice) in refused {
             let error = from_rows(&rows).unwrap_err();
-            assert!(matches!(error, Error::NotRigid { .. }) && error.to_string().ends_with(advice), "{error}");
+            assert!(
+                matches!(error, Error::NotRigid { .. }) && error.to_string().ends_with(advice),
+                "{error}"
+            );
         }
         assert!(matches!(from_rows(&[0.0; 16]), Err(Error::LastRow { .. })));
     }
@@ -285,7 +371,10 @@ mod tests {
         // From 170 to 190 degrees it is 20 degrees, and q and -q are the same rotation.
         let c = pose(0.0, [0.0, 0.0, 170.0 / 180.0 * PI]);
         let d = pose(0.0, [0.0, 0.0, 190.0 / 180.0 * PI]);
-        let flipped = Transform::from_parts(d.translation, UnitQuaternion::new_unchecked(-d.rotation.into_inner()));
+        let flipped = Transform::from_parts(
+            d.translation,
+            UnitQuaternion::new_unchecked(-d.rotation.into_inner()),
+        );
         for end in [d, flipped] {
             assert!(distance(&interpolate(&c, &end, 0.5), &pose(0.0, [0.0, 0.0, PI])) < CLOSE);
         }
@@ -294,15 +383,26 @@ mod tests {
     #[test]
     fn exp_matches_rotation_about_point_and_log_inverts_it() {
         // A quarter circle of radius 2 about the point (0, 2, 0).
-        let quarter = Twist { linear_m_s: Vector3::new(PI, 0.0, 0.0), angular_rad_s: Vector3::new(0.0, 0.0, 0.5 * PI) };
+        let quarter = Twist {
+            linear_m_s: Vector3::new(PI, 0.0, 0.0),
+            angular_rad_s: Vector3::new(0.0, 0.0, 0.5 * PI),
+        };
         let moved = exp(&quarter, 1.0);
         assert!((moved.translation.vector - Vector3::new(2.0, 2.0, 0.0)).norm() < CLOSE);
         for scale in [0.0, 1e-9, 0.99e-4, 1.01e-4, 1e-2, 1.0, 2.4] {
-            let twist =
-                Twist { linear_m_s: Vector3::new(0.3, -0.2, 0.5), angular_rad_s: Vector3::new(0.6, -0.7, 0.5) * scale };
+            let twist = Twist {
+                linear_m_s: Vector3::new(0.3, -0.2, 0.5),
+                angular_rad_s: Vector3::new(0.6, -0.7, 0.5) * scale,
+            };
             let back = log(&exp(&twist, 0.5), 0.5);
-            assert!((back.linear_m_s - twist.linear_m_s).norm() < CLOSE, "{scale}");
-            assert!((back.angular_rad_s - twist.angular_rad_s).norm() < CLOSE, "{scale}");
+            assert!(
+                (back.linear_m_s - twist.linear_m_s).norm() < CLOSE,
+                "{scale}"
+            );
+            assert!(
+                (back.angular_rad_s - twist.angular_rad_s).norm() < CLOSE,
+                "{scale}"
+            );
             let halves = exp(&twist, 0.25) * exp(&twist, 0.25);
             assert!(distance(&halves, &exp(&twist, 0.5)) < CLOSE, "{scale}");
         }
@@ -310,7 +410,10 @@ mod tests {
 
     #[test]
     fn attached_frame_has_same_motion() {
-        let twist = Twist { linear_m_s: Vector3::new(0.3, -0.2, 0.5), angular_rad_s: Vector3::new(1.0, 0.4, -0.3) };
+        let twist = Twist {
+            linear_m_s: Vector3::new(0.3, -0.2, 0.5),
+            angular_rad_s: Vector3::new(1.0, 0.4, -0.3),
+        };
         let this_from_other = pose(0.2, [0.5, 0.1, -0.9]);
         let moved = this_from_other.inverse() * exp(&twist, 0.7) * this_from_other;
         assert!(distance(&exp(&twist.of_attached(&this_from_other), 0.7), &moved) < CLOSE);
@@ -319,9 +422,14 @@ mod tests {
     #[test]
     fn resting_point_moves_against_the_frame() {
         const STEP_SECS: f64 = 1e-6;
-        let twist = Twist { linear_m_s: Vector3::new(0.3, -0.2, 0.5), angular_rad_s: Vector3::new(1.0, 0.4, -0.3) };
+        let twist = Twist {
+            linear_m_s: Vector3::new(0.3, -0.2, 0.5),
+            angular_rad_s: Vector3::new(1.0, 0.4, -0.3),
+        };
         let point_in_frame = Vector3::new(0.1, 0.5, 0.9);
-        let at = |secs: f64| (exp(&twist, secs).inverse() * nalgebra::Point3::from(point_in_frame)).coords;
+        let at = |secs: f64| {
+            (exp(&twist, secs).inverse() * nalgebra::Point3::from(point_in_frame)).coords
+        };
         let numeric = (at(STEP_SECS) - at(-STEP_SECS)) / (2.0 * STEP_SECS);
         assert!((numeric - twist.apparent_velocity(&point_in_frame)).norm() < 1e-9);
     }

@@ -2,17 +2,20 @@
 
 use crate::{Error, Intrinsics};
 
-/// For every pixel of the pinhole image, its position in the distorted image. Computed once per camera.
+/// For every pixel of the pinhole image, its position in the distorted image. Computed once per
+/// camera.
 ///
-/// Input and output have the size of the camera. Pixel centers are at `(0.5, 0.5)`. OpenCV places them at integers, so
-/// its principal point differs by half a pixel, but the resulting images are the same.
+/// Input and output have the size of the camera. Pixel centers are at `(0.5, 0.5)`. OpenCV places
+/// them at integers, so its principal point differs by half a pixel, but the resulting images are
+/// the same.
 #[derive(Clone, Debug)]
 pub struct Undistortion {
     size_px: [u32; 2],
     taps: Vec<Tap>,
 }
 
-/// Source of one output pixel: the upper left of four neighbors, and the weights of the right and the lower neighbors.
+/// Source of one output pixel: the upper left of four neighbors, and the weights of the right and
+/// the lower neighbors.
 #[derive(Clone, Copy, Debug)]
 struct Tap {
     upper_left: u32,
@@ -22,10 +25,15 @@ struct Tap {
 
 impl Tap {
     /// The tap of a pixel whose source lies outside the image.
-    const OUTSIDE: Self = Self { upper_left: u32::MAX, right: 0, lower: 0 };
+    const OUTSIDE: Self = Self {
+        upper_left: u32::MAX,
+        right: 0,
+        lower: 0,
+    };
 }
 
-/// The value 1 in the fixed-point format of [`Tap`]. Two 11-bit weights and 8 bits of color fit 32 bits.
+/// The value 1 in the fixed-point format of [`Tap`]. Two 11-bit weights and 8 bits of color fit 32
+/// bits.
 const ONE: u32 = 1 << SHARE_BITS;
 const SHARE_BITS: u32 = 11;
 
@@ -36,12 +44,19 @@ impl Undistortion {
         let [width, height] = intrinsics.size_px;
         let tap = |column: u32, row: u32| {
             let ray = pinhole.unproject([f64::from(column) + 0.5, f64::from(row) + 0.5])?;
-            let source = intrinsics.project(&ray).filter(|source| intrinsics.contains(*source))?;
+            let source = intrinsics
+                .project(&ray)
+                .filter(|source| intrinsics.contains(*source))?;
             Some(tap_at(source, [width, height]))
         };
         let rows = (0..height).flat_map(|row| (0..width).map(move |column| (column, row)));
-        let taps = rows.map(|(column, row)| tap(column, row).unwrap_or(Tap::OUTSIDE)).collect();
-        Self { size_px: [width, height], taps }
+        let taps = rows
+            .map(|(column, row)| tap(column, row).unwrap_or(Tap::OUTSIDE))
+            .collect();
+        Self {
+            size_px: [width, height],
+            taps,
+        }
     }
 
     /// Width and height of input and output, in pixels.
@@ -51,18 +66,21 @@ impl Undistortion {
 
     /// Number of output pixels that the distorted image does not cover.
     pub fn n_outside(&self) -> usize {
-        self.taps.iter().filter(|tap| tap.upper_left == u32::MAX).count()
+        self.taps
+            .iter()
+            .filter(|tap| tap.upper_left == u32::MAX)
+            .count()
     }
 
-    /// Undistorts `[height, width, 3]` to `[height, width, 4]` with bilinear sampling. Alpha is 255, or 0 if the
-    /// source lies outside the image.
+    /// Undistorts `[height, width, 3]` to `[height, width, 4]` with bilinear sampling. Alpha is
+    /// 255, or 0 if the source lies outside the image.
     pub fn apply_rgb(&self, rgb: &[u8]) -> Result<Vec<u8>, Error> {
         self.check_len(rgb.len(), 3)?;
         Ok(self.resample::<3>(rgb))
     }
 
-    /// Undistorts `[height, width, 4]` with bilinear sampling of all four channels. Pixels whose source lies outside
-    /// the image are zero.
+    /// Undistorts `[height, width, 4]` with bilinear sampling of all four channels. Pixels whose
+    /// source lies outside the image are zero.
     ///
     /// Alpha is straight: masks stored in it are interpolated like colors.
     pub fn apply_rgba(&self, rgba: &[u8]) -> Result<Vec<u8>, Error> {
@@ -70,21 +88,26 @@ impl Undistortion {
         Ok(self.resample::<4>(rgba))
     }
 
-    /// Undistorts the rows of `[height, width, 4]` as [`Self::apply_rgba`] does, but one at a time, so that the undistorted
-    /// image need not be in memory.
+    /// Undistorts the rows of `[height, width, 4]` as [`Self::apply_rgba`] does, but one at a time,
+    /// so that the undistorted image need not be in memory.
     ///
     /// The returned function writes the row with the given index to `[width, 4]`.
     pub fn rgba_rows(&self, rgba: &[u8]) -> Result<impl Fn(usize, &mut [u8]), Error> {
         self.check_len(rgba.len(), 4)?;
         let width = self.size_px[0] as usize;
         Ok(move |row: usize, undistorted: &mut [u8]| {
-            self.resample_to::<4>(rgba, &self.taps[row * width..(row + 1) * width], undistorted);
+            self.resample_to::<4>(
+                rgba,
+                &self.taps[row * width..(row + 1) * width],
+                undistorted,
+            );
         })
     }
 
-    /// Undistorts `[height, width]` depth along the camera's z axis. Lens distortion moves depth values but does not
-    /// change them. Each output pixel takes the nearest source pixel, because averaging across an edge gives a depth at
-    /// which there is no surface. Pixels whose source lies outside the image are 0.
+    /// Undistorts `[height, width]` depth along the camera's z axis. Lens distortion moves depth
+    /// values but does not change them. Each output pixel takes the nearest source pixel, because
+    /// averaging across an edge gives a depth at which there is no surface. Pixels whose source
+    /// lies outside the image are 0.
     pub fn apply_depth(&self, depth_m: &[f32]) -> Result<Vec<f32>, Error> {
         self.check_len(depth_m.len(), 1)?;
         let [step_right, step_down] = self.steps();
@@ -92,8 +115,16 @@ impl Undistortion {
             if tap.upper_left == u32::MAX {
                 return 0.0;
             }
-            let right = if u32::from(tap.right) * 2 >= ONE { step_right } else { 0 };
-            let down = if u32::from(tap.lower) * 2 >= ONE { step_down } else { 0 };
+            let right = if u32::from(tap.right) * 2 >= ONE {
+                step_right
+            } else {
+                0
+            };
+            let down = if u32::from(tap.lower) * 2 >= ONE {
+                step_down
+            } else {
+                0
+            };
             depth_m[tap.upper_left as usize + right + down]
         };
         Ok(self.taps.iter().map(nearest).collect())
@@ -117,8 +148,13 @@ impl Undistortion {
             let (left, upper) = (ONE - right, ONE - lower);
             let at = tap.upper_left as usize * CHANNELS;
             let pair = |start: usize| {
-                let (a, b) = (&source[start..start + CHANNELS], &source[start + step_right..][..CHANNELS]);
-                std::array::from_fn::<u32, CHANNELS, _>(|c| u32::from(a[c]) * left + u32::from(b[c]) * right)
+                let (a, b) = (
+                    &source[start..start + CHANNELS],
+                    &source[start + step_right..][..CHANNELS],
+                );
+                std::array::from_fn::<u32, CHANNELS, _>(|c| {
+                    u32::from(a[c]) * left + u32::from(b[c]) * right
+                })
             };
             let (above, below) = (pair(at), pair(at + step_down));
             out[3] = 255;
@@ -129,16 +165,29 @@ impl Undistortion {
         }
     }
 
-    /// Index offsets of the right and the lower neighbor in the source; 0 in an image of one column or row.
+    /// Index offsets of the right and the lower neighbor in the source; 0 in an image of one column
+    /// or row.
     fn steps(&self) -> [usize; 2] {
         let [width, height] = self.size_px;
-        [usize::from(width > 1), if height > 1 { width as usize } else { 0 }]
+        [
+            usize::from(width > 1),
+            if height > 1 { width as usize } else { 0 },
+        ]
     }
 
     fn check_len(&self, got: usize, channels: usize) -> Result<(), Error> {
         let expected = self.taps.len() * channels;
         let [width, height] = self.size_px;
-        if got == expected { Ok(()) } else { Err(Error::ImageSize { got, expected, width, height }) }
+        if got == expected {
+            Ok(())
+        } else {
+            Err(Error::ImageSize {
+                got,
+                expected,
+                width,
+                height,
+            })
+        }
     }
 }
 
@@ -147,8 +196,8 @@ fn round_share(sum: u32) -> u8 {
     ((sum + (1 << (2 * SHARE_BITS - 1))) >> (2 * SHARE_BITS)) as u8
 }
 
-/// The tap for a source position inside the image. Positions within half a pixel of the border take the color of the
-/// border.
+/// The tap for a source position inside the image. Positions within half a pixel of the border take
+/// the color of the border.
 #[expect(
     clippy::cast_possible_truncation,
     clippy::cast_sign_loss,
@@ -158,17 +207,28 @@ fn tap_at(source: [f64; 2], size_px: [u32; 2]) -> Tap {
     let along = |axis: usize| {
         let last = f64::from(size_px[axis] - 1);
         let position = (source[axis] - 0.5).clamp(0.0, last);
-        // The last pixel is read as the right neighbor of the one before it, so that no read goes past the end.
+        // The last pixel is read as the right neighbor of the one before it, so that no read goes
+        // past the end.
         let start = position.floor().min((last - 1.0).max(0.0));
-        (start as u32, ((position - start) * f64::from(ONE)).round() as u16)
+        (
+            start as u32,
+            ((position - start) * f64::from(ONE)).round() as u16,
+        )
     };
     let ((column, right), (row, lower)) = (along(0), along(1));
-    Tap { upper_left: row * size_px[0] + column, right, lower }
+    Tap {
+        upper_left: row * size_px[0] + column,
+        right,
+        lower,
+    }
 }
 
 #[cfg(test)]
 mod tests {
-    #![expect(clippy::cast_possible_truncation, reason = "test numbers lie well inside the integers' ranges")]
+    #![expect(
+        clippy::cast_possible_truncation,
+        reason = "test numbers lie well inside the integers' ranges"
+    )]
 
     use super::*;
     use crate::Lens;
@@ -195,34 +255,64 @@ mod tests {
     #[test]
     fn pinhole_image_is_unchanged() {
         let rgb = noise(40 * 30 * 3);
-        for intrinsics in [camera([40, 30], Lens::Pinhole), Intrinsics { rectified: true, ..camera([40, 30], CUSHION) }]
-        {
+        for intrinsics in [
+            camera([40, 30], Lens::Pinhole),
+            Intrinsics {
+                rectified: true,
+                ..camera([40, 30], CUSHION)
+            },
+        ] {
             let out = Undistortion::new(&intrinsics).apply_rgb(&rgb).unwrap();
-            assert!(out.chunks(4).zip(rgb.chunks(3)).all(|(out, rgb)| out[..3] == *rgb && out[3] == 255));
+            assert!(
+                out.chunks(4)
+                    .zip(rgb.chunks(3))
+                    .all(|(out, rgb)| out[..3] == *rgb && out[3] == 255)
+            );
         }
-        let distorted = Undistortion::new(&camera([40, 30], BARREL)).apply_rgb(&rgb).unwrap();
-        assert!(distorted.chunks(4).zip(rgb.chunks(3)).any(|(out, rgb)| out[..3] != *rgb));
+        let distorted = Undistortion::new(&camera([40, 30], BARREL))
+            .apply_rgb(&rgb)
+            .unwrap();
+        assert!(
+            distorted
+                .chunks(4)
+                .zip(rgb.chunks(3))
+                .any(|(out, rgb)| out[..3] != *rgb)
+        );
     }
 
     #[test]
     fn straight_lines_become_straight() {
         // A ramp over x / z in the distorted image must become a ramp over columns.
-        for lens in [BARREL, CUSHION, Lens::KannalaBrandt([0.02, -0.01, 0.0, 0.0])] {
+        for lens in [
+            BARREL,
+            CUSHION,
+            Lens::KannalaBrandt([0.02, -0.01, 0.0, 0.0]),
+        ] {
             let intrinsics = camera([160, 120], lens);
             let ramp = |x_on_plane: f64| 128.0 + 150.0 * x_on_plane;
             let mut rgb = Vec::new();
-            for (row, column) in (0..120).flat_map(|row| (0..160).map(move |column| (row, column))) {
-                let ray = intrinsics.unproject([f64::from(column) + 0.5, f64::from(row) + 0.5]).unwrap();
+            for (row, column) in (0..120).flat_map(|row| (0..160).map(move |column| (row, column)))
+            {
+                let ray = intrinsics
+                    .unproject([f64::from(column) + 0.5, f64::from(row) + 0.5])
+                    .unwrap();
                 rgb.extend([ramp(ray.x).round().clamp(0.0, 255.0) as u8; 3]);
             }
             let map = Undistortion::new(&intrinsics);
             let out = map.apply_rgb(&rgb).unwrap();
             let mut n_compared = 0;
-            for (at, pixel) in out.chunks(4).enumerate().filter(|(_, pixel)| pixel[3] == 255) {
-                let ray = intrinsics.undistorted().unproject([(at % 160) as f64 + 0.5, 0.0]).unwrap();
+            for (at, pixel) in out
+                .chunks(4)
+                .enumerate()
+                .filter(|(_, pixel)| pixel[3] == 255)
+            {
+                let ray = intrinsics
+                    .undistorted()
+                    .unproject([(at % 160) as f64 + 0.5, 0.0])
+                    .unwrap();
                 let off = (f64::from(pixel[0]) - ramp(ray.x)).abs();
-                // Bytes are rounded twice. The outermost half pixel of the source repeats the border, which adds up
-                // to half a step.
+                // Bytes are rounded twice. The outermost half pixel of the source repeats the
+                // border, which adds up to half a step.
                 assert!(off < 1.8, "{lens:?} at {at}: off by {off}");
                 n_compared += 1;
             }
@@ -238,7 +328,10 @@ mod tests {
         let rgba = noise(33 * 21 * 4);
         let out = Undistortion::new(&intrinsics).apply_rgba(&rgba).unwrap();
         let value = |column: f64, row: f64, channel: usize| {
-            let (column, row) = (column.clamp(0.0, 32.0) as usize, row.clamp(0.0, 20.0) as usize);
+            let (column, row) = (
+                column.clamp(0.0, 32.0) as usize,
+                row.clamp(0.0, 20.0) as usize,
+            );
             f64::from(rgba[(row * 33 + column) * 4 + channel])
         };
         for at in 0..33 * 21 {
@@ -250,7 +343,8 @@ mod tests {
                     let (x, y) = (source[0] - 0.5, source[1] - 0.5);
                     let (right, lower) = (x - x.floor(), y - y.floor());
                     let mix = |row: f64| {
-                        (1.0 - right) * value(x.floor(), row, channel) + right * value(x.floor() + 1.0, row, channel)
+                        (1.0 - right) * value(x.floor(), row, channel)
+                            + right * value(x.floor() + 1.0, row, channel)
                     };
                     (1.0 - lower) * mix(y.floor()) + lower * mix(y.floor() + 1.0)
                 } else {
@@ -283,20 +377,34 @@ mod tests {
         assert!(map.n_outside() > 0);
         let out = map.apply_rgb(&vec![200; 64 * 48 * 3]).unwrap();
         for pixel in out.chunks(4) {
-            assert!(pixel == [200, 200, 200, 255] || pixel == [0, 0, 0, 0], "{pixel:?}");
+            assert!(
+                pixel == [200, 200, 200, 255] || pixel == [0, 0, 0, 0],
+                "{pixel:?}"
+            );
         }
-        assert_eq!(out.chunks(4).filter(|pixel| pixel[3] == 0).count(), map.n_outside());
+        assert_eq!(
+            out.chunks(4).filter(|pixel| pixel[3] == 0).count(),
+            map.n_outside()
+        );
         let depth = map.apply_depth(&[1.5; 64 * 48]).unwrap();
-        assert_eq!(depth.iter().filter(|depth| **depth == 0.0).count(), map.n_outside());
+        assert_eq!(
+            depth.iter().filter(|depth| **depth == 0.0).count(),
+            map.n_outside()
+        );
     }
 
     #[test]
     fn depth_uses_nearest_source_pixel() {
         let intrinsics = camera([33, 21], BARREL);
         let depth_m: Vec<f32> = (0..33 * 21).map(|at| at as f32).collect();
-        let out = Undistortion::new(&intrinsics).apply_depth(&depth_m).unwrap();
+        let out = Undistortion::new(&intrinsics)
+            .apply_depth(&depth_m)
+            .unwrap();
         for (at, depth) in out.iter().enumerate() {
-            let ray = intrinsics.undistorted().unproject([(at % 33) as f64 + 0.5, (at / 33) as f64 + 0.5]).unwrap();
+            let ray = intrinsics
+                .undistorted()
+                .unproject([(at % 33) as f64 + 0.5, (at / 33) as f64 + 0.5])
+                .unwrap();
             let [u, v] = intrinsics.project(&ray).unwrap();
             assert_eq!(*depth as usize, v as usize * 33 + u as usize, "{at}");
         }
@@ -309,9 +417,20 @@ mod tests {
             let map = Undistortion::new(&camera(size_px, Lens::Pinhole));
             let rgb = noise(n_pixels * 3);
             let out = map.apply_rgb(&rgb).unwrap();
-            assert!(out.chunks(4).zip(rgb.chunks(3)).all(|(out, rgb)| out[..3] == *rgb), "{size_px:?}");
-            assert_eq!(map.apply_depth(&vec![2.0; n_pixels]).unwrap(), vec![2.0; n_pixels]);
-            assert!(matches!(map.apply_rgb(&rgb[1..]), Err(Error::ImageSize { .. })));
+            assert!(
+                out.chunks(4)
+                    .zip(rgb.chunks(3))
+                    .all(|(out, rgb)| out[..3] == *rgb),
+                "{size_px:?}"
+            );
+            assert_eq!(
+                map.apply_depth(&vec![2.0; n_pixels]).unwrap(),
+                vec![2.0; n_pixels]
+            );
+            assert!(matches!(
+                map.apply_rgb(&rgb[1..]),
+                Err(Error::ImageSize { .. })
+            ));
         }
     }
 }

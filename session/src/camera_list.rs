@@ -1,5 +1,5 @@
-//! The camera poses of a run, stored in `cameras.json` next to the model. Viewers draw these cameras and derive the
-//! initial view from them.
+//! The camera poses of a run, stored in `cameras.json` next to the model. Viewers draw these
+//! cameras and derive the initial view from them.
 
 use crate::error::Context;
 use crate::{camera_path, run_folder};
@@ -62,8 +62,14 @@ pub(crate) fn of_model(method: &mut dyn Method, keyframes: &[Arc<Keyframe>]) -> 
 
 /// Writes the list, one camera per line.
 pub fn write(folder: &Path, cameras: &[PosedCamera]) -> crate::Result<()> {
-    let lines: Vec<String> = cameras.iter().map(serde_json::to_string).collect::<Result<_, _>>()?;
-    run_folder::write_atomic(&folder.join(FILE), &format!("{{\"cameras\": [\n{}\n]}}\n", lines.join(",\n")))
+    let lines: Vec<String> = cameras
+        .iter()
+        .map(serde_json::to_string)
+        .collect::<Result<_, _>>()?;
+    run_folder::write_atomic(
+        &folder.join(FILE),
+        &format!("{{\"cameras\": [\n{}\n]}}\n", lines.join(",\n")),
+    )
 }
 
 /// Reads the list; `None` if the folder has none.
@@ -74,12 +80,14 @@ pub fn read(folder: &Path) -> crate::Result<Option<Vec<KeyframePose>>> {
         Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(None),
         Err(error) => return Err(error).with_context(|| format!("cannot read {}", path.display())),
     };
-    let File { cameras } = serde_json::from_str(&text).with_context(|| format!("{} is damaged", path.display()))?;
+    let File { cameras } =
+        serde_json::from_str(&text).with_context(|| format!("{} is damaged", path.display()))?;
     let posed = cameras.into_iter().map(|camera| {
-        let world_from_camera = camera_path::rigid(&camera.world_from_camera).with_context(|| {
-            let (name, stamp) = (&camera.camera, camera.stamp_nanos);
-            format!("{}: the pose of {name} {stamp}", path.display())
-        })?;
+        let world_from_camera =
+            camera_path::rigid(&camera.world_from_camera).with_context(|| {
+                let (name, stamp) = (&camera.camera, camera.stamp_nanos);
+                format!("{}: the pose of {name} {stamp}", path.display())
+            })?;
         Ok(KeyframePose {
             camera: camera.camera.into(),
             stamp: Stamp(camera.stamp_nanos),
@@ -122,12 +130,27 @@ mod tests {
         assert!(read(folder.path()).expect("no file is no error").is_none());
         write(folder.path(), &[camera(), camera()]).expect("disk space");
         let cameras = read(folder.path()).expect("a list").expect("a file");
-        assert_eq!((cameras.len(), cameras[0].camera.as_ref(), cameras[1].size_px), (2, "wrist", [64, 48]));
-        for (number, expected) in row_major(&cameras[1].world_from_camera).iter().zip(camera().world_from_camera) {
+        assert_eq!(
+            (
+                cameras.len(),
+                cameras[0].camera.as_ref(),
+                cameras[1].size_px
+            ),
+            (2, "wrist", [64, 48])
+        );
+        for (number, expected) in row_major(&cameras[1].world_from_camera)
+            .iter()
+            .zip(camera().world_from_camera)
+        {
             assert!((number - expected).abs() < 1e-12);
         }
         write(folder.path(), &[]).expect("disk space");
-        assert_eq!(read(folder.path()).expect("a list").map(|cameras| cameras.len()), Some(0));
+        assert_eq!(
+            read(folder.path())
+                .expect("a list")
+                .map(|cameras| cameras.len()),
+            Some(0)
+        );
     }
 
     #[test]
@@ -137,7 +160,10 @@ mod tests {
         skewed.world_from_camera[0] = 3.0;
         write(folder.path(), &[skewed]).expect("disk space");
         let message = format!("{:#}", read(folder.path()).expect_err("not rigid"));
-        assert!(message.contains(FILE) && message.contains("wrist -7"), "{message}");
+        assert!(
+            message.contains(FILE) && message.contains("wrist -7"),
+            "{message}"
+        );
         std::fs::write(folder.path().join(FILE), "{").expect("disk space");
         assert!(format!("{:#}", read(folder.path()).expect_err("truncated")).contains("damaged"));
     }

@@ -49,7 +49,8 @@ const UNUSED: [&str; 9] = [
     "render_time",
 ];
 
-/// The file format of nerfstudio. Sizes are whole numbers, but the viewer writes them with decimals.
+/// The file format of nerfstudio. Sizes are whole numbers, but the viewer writes them with
+/// decimals.
 #[derive(Debug, Deserialize)]
 struct PathFile {
     render_height: Option<f64>,
@@ -75,16 +76,28 @@ struct PathFileCamera {
 impl PathFile {
     fn size_px(&self) -> crate::Result<Option<[u32; 2]>> {
         let side = |name: &str, side_px: Option<f64>| {
-            let Some(side_px) = side_px else { return Ok(None) };
+            let Some(side_px) = side_px else {
+                return Ok(None);
+            };
             ensure!(
                 side_px.fract() == 0.0 && (1.0..=MAX_SIDE_PX).contains(&side_px),
                 "{name} is {side_px}, must be a whole number from 1 to {MAX_SIDE_PX}"
             );
-            #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "checked above")]
+            #[expect(
+                clippy::cast_possible_truncation,
+                clippy::cast_sign_loss,
+                reason = "checked above"
+            )]
             Ok::<_, crate::Error>(Some(side_px as u32))
         };
-        let (width, height) = (side("render_width", self.render_width)?, side("render_height", self.render_height)?);
-        ensure!(width.is_some() == height.is_some(), "render_width and render_height must be given together");
+        let (width, height) = (
+            side("render_width", self.render_width)?,
+            side("render_height", self.render_height)?,
+        );
+        ensure!(
+            width.is_some() == height.is_some(),
+            "render_width and render_height must be given together"
+        );
         Ok(width.zip(height).map(|(width, height)| [width, height]))
     }
 
@@ -92,31 +105,50 @@ impl PathFile {
         const MAX_NAMED: usize = 5;
         let of_cameras = self.camera_path.iter().flat_map(|camera| &camera.other);
         let is_unknown = |key: &str, value: &Value| !UNUSED.contains(&key) && !value.is_null();
-        let all = self.other.iter().chain(of_cameras).filter(|(key, value)| is_unknown(key, value));
+        let all = self
+            .other
+            .iter()
+            .chain(of_cameras)
+            .filter(|(key, value)| is_unknown(key, value));
         let unknown: BTreeSet<&str> = all.map(|(key, _)| key.as_str()).collect();
         if unknown.is_empty() {
             return Vec::new();
         }
         let quoted: Vec<String> = unknown.iter().map(|key| format!("{key:?}")).collect();
         let named = shortened(&quoted, MAX_NAMED, ", ");
-        let advice = if unknown.contains("crop") { "; for \"crop\", use --crop" } else { "" };
+        let advice = if unknown.contains("crop") {
+            "; for \"crop\", use --crop"
+        } else {
+            ""
+        };
         vec![format!("unknown keys are not used: {named}{advice}")]
     }
 }
 
 impl CameraPath {
-    /// Reads a nerfstudio camera path and converts its cameras to the axes of [`kinematics::camera`].
+    /// Reads a nerfstudio camera path and converts its cameras to the axes of
+    /// [`kinematics::camera`].
     pub fn load(path: &Path) -> crate::Result<Self> {
-        let text = files::read_text(path).with_context(|| format!("cannot read {}", path.display()))?;
+        let text =
+            files::read_text(path).with_context(|| format!("cannot read {}", path.display()))?;
         Self::parse(&text).with_context(|| format!("the nerfstudio camera path {}", path.display()))
     }
 
-    /// A path with one viewpoint, from the 16 numbers of `world_from_camera`, row major, with the axes of
-    /// [`kinematics::camera`].
+    /// A path with one viewpoint, from the 16 numbers of `world_from_camera`, row major, with the
+    /// axes of [`kinematics::camera`].
     pub fn of_pose(numbers: &[f64]) -> Result<Self, Error> {
-        let world_from_camera = rigid(numbers).map_err(|error| Error::BadInput(format!("--pose: {error}")))?;
-        let cameras = vec![PathCamera { world_from_camera, fov_y_rad: None }];
-        Ok(Self { cameras, size_px: None, is_panoramic: false, notes: Vec::new() })
+        let world_from_camera =
+            rigid(numbers).map_err(|error| Error::BadInput(format!("--pose: {error}")))?;
+        let cameras = vec![PathCamera {
+            world_from_camera,
+            fov_y_rad: None,
+        }];
+        Ok(Self {
+            cameras,
+            size_px: None,
+            is_panoramic: false,
+            notes: Vec::new(),
+        })
     }
 
     fn parse(text: &str) -> crate::Result<Self> {
@@ -128,7 +160,8 @@ impl CameraPath {
             "camera_type is {camera_type:?}, but only {PERSPECTIVE:?} and {EQUIRECTANGULAR:?} are supported"
         );
         let camera = |(ix, camera): (usize, &PathFileCamera)| {
-            let world_from_opengl = rigid(&camera.camera_to_world).with_context(|| format!("camera {ix}"))?;
+            let world_from_opengl =
+                rigid(&camera.camera_to_world).with_context(|| format!("camera {ix}"))?;
             let opengl_from_camera = drivers::dataset::nerfstudio::opengl_from_camera();
             Ok::<_, crate::Error>(PathCamera {
                 world_from_camera: world_from_opengl * opengl_from_camera,
@@ -136,7 +169,12 @@ impl CameraPath {
             })
         };
         Ok(Self {
-            cameras: file.camera_path.iter().enumerate().map(camera).collect::<Result<_, _>>()?,
+            cameras: file
+                .camera_path
+                .iter()
+                .enumerate()
+                .map(camera)
+                .collect::<Result<_, _>>()?,
             size_px: file.size_px()?,
             is_panoramic: camera_type == EQUIRECTANGULAR,
             notes: file.notes(),
@@ -146,9 +184,12 @@ impl CameraPath {
 
 /// Converts a row-major 4x4 matrix, whose numbers may be rounded, to a rigid transform.
 pub fn rigid(numbers: &[f64]) -> crate::Result<Transform> {
-    let rows: &[f64; 16] =
-        numbers.try_into().ok().with_context(|| format!("a pose has 16 numbers, got {}", numbers.len()))?;
-    let (pose, _) = transform::from_rounded_rows(rows).map_err(|error| Error::BadInput(error.to_string()))?;
+    let rows: &[f64; 16] = numbers
+        .try_into()
+        .ok()
+        .with_context(|| format!("a pose has 16 numbers, got {}", numbers.len()))?;
+    let (pose, _) =
+        transform::from_rounded_rows(rows).map_err(|error| Error::BadInput(error.to_string()))?;
     Ok(pose)
 }
 
@@ -157,7 +198,9 @@ mod tests {
     use super::*;
     use nalgebra::Point3;
 
-    const IDENTITY: [f64; 16] = [1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0];
+    const IDENTITY: [f64; 16] = [
+        1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0,
+    ];
 
     #[test]
     fn nerfstudio_camera_axes_are_converted() {
@@ -170,28 +213,39 @@ mod tests {
         let camera = path.cameras[0];
         assert_eq!(camera.fov_y_rad, Some(std::f64::consts::FRAC_PI_2));
         let ahead_in_world = camera.world_from_camera * Point3::new(0.0, 0.0, 1.0);
-        assert!((ahead_in_world - Point3::new(1.0, 2.0, 2.0)).norm() < 1e-12, "{ahead_in_world}");
+        assert!(
+            (ahead_in_world - Point3::new(1.0, 2.0, 2.0)).norm() < 1e-12,
+            "{ahead_in_world}"
+        );
         let below_in_world = camera.world_from_camera * Point3::new(0.0, 1.0, 0.0);
-        assert!((below_in_world - Point3::new(1.0, 1.0, 3.0)).norm() < 1e-12, "{below_in_world}");
+        assert!(
+            (below_in_world - Point3::new(1.0, 1.0, 3.0)).norm() < 1e-12,
+            "{below_in_world}"
+        );
     }
 
     #[test]
     fn only_perspective_cameras_are_supported() {
         let of_type = |camera_type: &str| {
-            let text =
-                serde_json::json!({ "camera_type": camera_type, "camera_path": [{ "camera_to_world": IDENTITY }] });
+            let text = serde_json::json!({ "camera_type": camera_type, "camera_path": [{ "camera_to_world": IDENTITY }] });
             CameraPath::parse(&text.to_string())
         };
         assert!(!of_type("perspective").expect("a perspective").is_panoramic);
         assert!(of_type("equirectangular").expect("a panorama").is_panoramic);
-        assert!(of_type("fisheye").expect_err("a fisheye").to_string().contains("fisheye"));
+        assert!(
+            of_type("fisheye")
+                .expect_err("a fisheye")
+                .to_string()
+                .contains("fisheye")
+        );
     }
 
     /// The keys in docs/reference/cli.md.
     #[test]
     fn keys_are_used_or_named() {
         let camera = serde_json::json!({ "camera_to_world": IDENTITY });
-        let plain = serde_json::json!({ "render_width": 8, "render_height": 6, "camera_path": [camera] });
+        let plain =
+            serde_json::json!({ "render_width": 8, "render_height": 6, "camera_path": [camera] });
         let parse = |file: &Value| CameraPath::parse(&file.to_string());
         let mut viewer = plain.clone();
         (viewer["render_width"], viewer["render_height"]) = (8.0.into(), 6.0.into());
@@ -201,9 +255,15 @@ mod tests {
         for key in &UNUSED[6..] {
             viewer["camera_path"][0][*key] = 1.into();
         }
-        assert_eq!(parse(&viewer).expect("as the viewer writes it"), parse(&plain).expect("a path"));
+        assert_eq!(
+            parse(&viewer).expect("as the viewer writes it"),
+            parse(&plain).expect("a path")
+        );
         for (key, note) in [
-            ("crop", "unknown keys are not used: \"crop\"; for \"crop\", use --crop"),
+            (
+                "crop",
+                "unknown keys are not used: \"crop\"; for \"crop\", use --crop",
+            ),
             ("smooth", "unknown keys are not used: \"smooth\""),
         ] {
             let mut changed = plain.clone();
@@ -221,9 +281,14 @@ mod tests {
         assert_eq!(parse(&many).expect("a path").notes, [note]);
         let mut wide = plain.clone();
         wide["default_fov"] = 90.into();
-        assert_eq!(parse(&wide).expect("a path").cameras[0].fov_y_rad, Some(std::f64::consts::FRAC_PI_2));
+        assert_eq!(
+            parse(&wide).expect("a path").cameras[0].fov_y_rad,
+            Some(std::f64::consts::FRAC_PI_2)
+        );
         for size in ["0", "7.5", "-8", "1e9", "null"] {
-            let text = plain.to_string().replace("\"render_width\":8", &format!("\"render_width\":{size}"));
+            let text = plain
+                .to_string()
+                .replace("\"render_width\":8", &format!("\"render_width\":{size}"));
             match CameraPath::parse(&text) {
                 Err(error) => assert!(error.to_string().contains("render_width "), "{error}"),
                 Ok(path) => panic!("{size}: {:?}", path.size_px),
@@ -240,9 +305,12 @@ mod tests {
         mirrored[0] = -1.0;
         let mut unknown = IDENTITY;
         unknown[3] = f64::NAN;
-        for (numbers, word) in
-            [(&IDENTITY[..15], "16 numbers"), (&stretched, "not rigid"), (&mirrored, "not rigid"), (&unknown, "finite")]
-        {
+        for (numbers, word) in [
+            (&IDENTITY[..15], "16 numbers"),
+            (&stretched, "not rigid"),
+            (&mirrored, "not rigid"),
+            (&unknown, "finite"),
+        ] {
             let error = CameraPath::of_pose(numbers).expect_err(word).to_string();
             assert!(error.contains(word), "{error}");
         }

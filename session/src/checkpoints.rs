@@ -30,13 +30,22 @@ pub struct CheckpointOptions {
 impl CheckpointOptions {
     /// The flag as it is stored in a checkpoint, if it was given.
     pub fn flag(self) -> Option<(String, String)> {
-        Some((CHECKPOINT_SECS.to_owned(), self.period?.as_secs_f64().to_string()))
+        Some((
+            CHECKPOINT_SECS.to_owned(),
+            self.period?.as_secs_f64().to_string(),
+        ))
     }
 
     /// These options, with the period of the earlier run if the flag was not given.
     pub fn or_previous(self, flags: &BTreeMap<String, String>) -> Self {
-        let previous = || flags.get(CHECKPOINT_SECS).and_then(|text| parse_period(text).ok());
-        Self { period: self.period.or_else(previous) }
+        let previous = || {
+            flags
+                .get(CHECKPOINT_SECS)
+                .and_then(|text| parse_period(text).ok())
+        };
+        Self {
+            period: self.period.or_else(previous),
+        }
     }
 }
 
@@ -46,17 +55,21 @@ impl CheckpointOptions {
 ///
 /// If the text is not such a number.
 pub fn parse_period(text: &str) -> Result<Duration, String> {
-    let secs = text.parse().ok().and_then(|secs| Duration::try_from_secs_f64(secs).ok());
+    let secs = text
+        .parse()
+        .ok()
+        .and_then(|secs| Duration::try_from_secs_f64(secs).ok());
     secs.ok_or_else(|| "expected a number of at least 0".to_owned())
 }
 
-/// Reads the checkpoint in a run folder. If the folder also contains the complete model, the edits are those saved with
-/// it, which operators may have changed after the end of the run.
+/// Reads the checkpoint in a run folder. If the folder also contains the complete model, the edits
+/// are those saved with it, which operators may have changed after the end of the run.
 pub fn read(folder: &Path) -> crate::Result<Checkpoint> {
     expect_one_model(folder)?;
     let mut checkpoint = Checkpoint::read(&folder.join(CHECKPOINT))
         .with_context(|| format!("no checkpoint to resume from in {}", folder.display()))?;
-    let last_file = ModelKind::from_name(&checkpoint.method).and_then(|kind| kind.entry().files.last());
+    let last_file =
+        ModelKind::from_name(&checkpoint.method).and_then(|kind| kind.entry().files.last());
     if last_file.is_some_and(|file| folder.join(file).is_file()) {
         checkpoint.edits = Edits::read(folder)?;
     }
@@ -64,7 +77,11 @@ pub fn read(folder: &Path) -> crate::Result<Checkpoint> {
 }
 
 /// Rejects a limit in seconds that earlier training has already reached.
-pub fn check_limit_not_passed(seconds: Option<f64>, checkpoint: &Checkpoint, subject: &str) -> Result<(), Error> {
+pub fn check_limit_not_passed(
+    seconds: Option<f64>,
+    checkpoint: &Checkpoint,
+    subject: &str,
+) -> Result<(), Error> {
     match seconds.filter(|seconds| *seconds <= checkpoint.seconds) {
         Some(seconds) => Err(Error::BadInput(format!(
             "--seconds {seconds}: {subject} has already been trained for {:.1} s, which counts; give a larger limit",
@@ -123,7 +140,10 @@ pub struct Snapshot<'a> {
 impl Checkpoints {
     /// Returns `None` if checkpoints are disabled. The first checkpoint is due after one period.
     pub fn new(folder: &Path, options: CheckpointOptions) -> Option<Self> {
-        let (period, path) = (options.period.unwrap_or(DEFAULT_PERIOD), folder.join(CHECKPOINT));
+        let (period, path) = (
+            options.period.unwrap_or(DEFAULT_PERIOD),
+            folder.join(CHECKPOINT),
+        );
         (!period.is_zero()).then(|| Self {
             path,
             run_flags: RunFlags::default(),
@@ -142,11 +162,15 @@ impl Checkpoints {
         Self { run_flags, ..self }
     }
 
-    /// Also stores the keyframes, for a live run whose images exist nowhere else. The first checkpoint is due as soon
-    /// as the first keyframes are written, because resuming needs both.
+    /// Also stores the keyframes, for a live run whose images exist nowhere else. The first
+    /// checkpoint is due as soon as the first keyframes are written, because resuming needs both.
     pub fn with_keyframes(self, run: &Path) -> Self {
         let due_after = self.period.min(KEYFRAME_PERIOD);
-        Self { stored_keyframes: Some(StoredKeyframes::of_run(run)), due_after, ..self }
+        Self {
+            stored_keyframes: Some(StoredKeyframes::of_run(run)),
+            due_after,
+            ..self
+        }
     }
 
     /// Whether keyframes are also stored.
@@ -154,10 +178,14 @@ impl Checkpoints {
         self.stored_keyframes.is_some()
     }
 
-    /// Starts a checkpoint if one is due and the previous one is complete. Returns whether a checkpoint was started.
-    /// Write errors are logged and do not stop training.
+    /// Starts a checkpoint if one is due and the previous one is complete. Returns whether a
+    /// checkpoint was started. Write errors are logged and do not stop training.
     pub fn write_when_due(&mut self, now: Snapshot<'_>) -> Result<bool, trainer::Error> {
-        if self.writer.as_ref().is_some_and(|writer| !writer.thread.is_finished()) {
+        if self
+            .writer
+            .as_ref()
+            .is_some_and(|writer| !writer.thread.is_finished())
+        {
             return Ok(false);
         }
         let is_resumable = self.stored_keyframes.is_none() || !now.keyframes.is_empty();
@@ -165,12 +193,18 @@ impl Checkpoints {
             self.begin(now)?;
             return Ok(true);
         }
-        if let Some(stored) = self.stored_keyframes.clone().filter(|_| self.last_keyframes.elapsed() >= KEYFRAME_PERIOD)
+        if let Some(stored) = self
+            .stored_keyframes
+            .clone()
+            .filter(|_| self.last_keyframes.elapsed() >= KEYFRAME_PERIOD)
         {
             self.wait_and_warn();
             let keyframes = now.keyframes.to_vec();
             let thread = Task::start("keyframes", move || stored.add(&keyframes));
-            self.writer = Some(WriterThread { thread, is_checkpoint: false });
+            self.writer = Some(WriterThread {
+                thread,
+                is_checkpoint: false,
+            });
             self.last_keyframes = Instant::now();
         }
         Ok(false)
@@ -193,7 +227,10 @@ impl Checkpoints {
         self.wait_and_warn();
         let started = Instant::now();
         let pending = now.method.checkpoint()?;
-        log::debug!("taking a checkpoint paused training for {:?}", started.elapsed());
+        log::debug!(
+            "taking a checkpoint paused training for {:?}",
+            started.elapsed()
+        );
         Ok(CheckpointWrite {
             pending,
             seconds: now.seconds,
@@ -201,33 +238,47 @@ impl Checkpoints {
             edits: now.edits.clone(),
             run_flags: self.run_flags.clone(),
             path: self.path.clone(),
-            keyframes: self.stored_keyframes.clone().map(|stored| (stored, now.keyframes.to_vec())),
+            keyframes: self
+                .stored_keyframes
+                .clone()
+                .map(|stored| (stored, now.keyframes.to_vec())),
         })
     }
 
     /// Writes a copy on a separate thread.
     pub fn write(&mut self, job: CheckpointWrite) {
         let thread = Task::start("checkpoint", move || job.write());
-        self.writer = Some(WriterThread { thread, is_checkpoint: true });
+        self.writer = Some(WriterThread {
+            thread,
+            is_checkpoint: true,
+        });
         (self.last, self.last_keyframes) = (Instant::now(), Instant::now());
         self.due_after = self.period;
     }
 
     fn wait_and_warn(&mut self) {
-        let is_checkpoint = self.writer.as_ref().is_some_and(|writer| writer.is_checkpoint);
+        let is_checkpoint = self
+            .writer
+            .as_ref()
+            .is_some_and(|writer| writer.is_checkpoint);
         match self.wait() {
             Ok(()) => {}
             Err(error) if is_checkpoint => {
-                let previous = if self.path.exists() { "; the previous one is kept" } else { "" };
+                let previous = if self.path.exists() {
+                    "; the previous one is kept"
+                } else {
+                    ""
+                };
                 log::warn!("cannot write a checkpoint{previous}: {error:#}");
             }
-            // The next checkpoint tries to store the same keyframes, and a failure is then logged as a warning.
+            // The next checkpoint tries to store the same keyframes, and a failure is then logged
+            // as a warning.
             Err(error) => log::debug!("cannot store keyframes: {error:#}"),
         }
     }
 
-    /// Path of the newest checkpoint of this run. Waits for the checkpoint in progress; if it fails, the previous
-    /// checkpoint is the newest.
+    /// Path of the newest checkpoint of this run. Waits for the checkpoint in progress; if it
+    /// fails, the previous checkpoint is the newest.
     pub fn newest(&mut self) -> Option<&Path> {
         if let Err(error) = self.wait() {
             log::warn!("the checkpoint in progress failed: {error:#}");
@@ -237,7 +288,13 @@ impl Checkpoints {
 
     /// Waits until the checkpoint in progress is on disk.
     pub fn wait(&mut self) -> crate::Result<()> {
-        let Some(WriterThread { thread, is_checkpoint }) = self.writer.take() else { return Ok(()) };
+        let Some(WriterThread {
+            thread,
+            is_checkpoint,
+        }) = self.writer.take()
+        else {
+            return Ok(());
+        };
         match thread.join() {
             Ok(written) => {
                 written?;
@@ -261,7 +318,8 @@ pub struct CheckpointWrite {
 }
 
 impl CheckpointWrite {
-    /// Writes new keyframes, then the checkpoint, then removes keyframes that only the previous checkpoint needed.
+    /// Writes new keyframes, then the checkpoint, then removes keyframes that only the previous
+    /// checkpoint needed.
     fn write(self) -> crate::Result<()> {
         let started = Instant::now();
         let RunFlags { depth_from, flags } = self.run_flags;
@@ -269,7 +327,15 @@ impl CheckpointWrite {
             stored.add(keyframes)?;
         }
         let (seconds, is_finished, edits) = (self.seconds, self.is_finished, self.edits);
-        Checkpoint { seconds, is_finished, edits, depth_from, flags, ..self.pending.finish()? }.write(&self.path)?;
+        Checkpoint {
+            seconds,
+            is_finished,
+            edits,
+            depth_from,
+            flags,
+            ..self.pending.finish()?
+        }
+        .write(&self.path)?;
         if let Some((stored, keyframes)) = &self.keyframes {
             stored.keep_only(keyframes)?;
         }
@@ -295,8 +361,9 @@ mod tests {
 
     #[test]
     fn resumed_run_keeps_the_checkpoint_period() {
-        let [none, one, two] =
-            [None, Some(1.0), Some(2.5)].map(|secs| CheckpointOptions { period: secs.map(Duration::from_secs_f64) });
+        let [none, one, two] = [None, Some(1.0), Some(2.5)].map(|secs| CheckpointOptions {
+            period: secs.map(Duration::from_secs_f64),
+        });
         let flags = |options: CheckpointOptions| options.flag().into_iter().collect();
         assert_eq!(none.or_previous(&flags(two)).period, two.period);
         assert_eq!(one.or_previous(&flags(two)).period, one.period);
@@ -309,7 +376,11 @@ mod tests {
         let folder = folder.path();
         let kind = ModelKind::from_name("tsdf").expect("a method");
         let edits_of = |n: usize| {
-            let aabb = Aabb { world_from_box: kinematics::Transform::identity(), min_m: [0.0; 3], max_m: [1.0; 3] };
+            let aabb = Aabb {
+                world_from_box: kinematics::Transform::identity(),
+                min_m: [0.0; 3],
+                max_m: [1.0; 3],
+            };
             let mut edits = Edits::default();
             (0..n).for_each(|_| edits.push(Edit::Box(aabb)).expect("few edits"));
             edits
@@ -341,6 +412,10 @@ mod tests {
     fn missing_checkpoint_error_names_the_folder() {
         let folder = tempfile::tempdir().expect("a folder");
         let message = format!("{:#}", read(folder.path()).expect_err("none"));
-        assert!(message.contains(folder.path().to_str().expect("plain")) && message.contains(CHECKPOINT), "{message}");
+        assert!(
+            message.contains(folder.path().to_str().expect("plain"))
+                && message.contains(CHECKPOINT),
+            "{message}"
+        );
     }
 }

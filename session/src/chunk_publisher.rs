@@ -7,7 +7,8 @@ use std::time::{Duration, Instant};
 use trainer::{Edits, Error, Method, ModelChunks, ModelKind};
 use viz::Hub;
 
-/// Minimum time between two versions of a model, because each one is read from the GPU and encoded as a whole.
+/// Minimum time between two versions of a model, because each one is read from the GPU and encoded
+/// as a whole.
 const MIN_PERIOD: Duration = Duration::from_millis(500);
 /// Pause after a failure.
 const RETRY_PERIOD: Duration = Duration::from_secs(10);
@@ -40,13 +41,23 @@ struct Published {
 impl ChunkPublisher {
     /// A publisher for the clients of a hub.
     pub(crate) fn new(hub: Hub) -> Self {
-        Self { hub, task: None, models: BTreeMap::new(), failed: BTreeSet::new() }
+        Self {
+            hub,
+            task: None,
+            models: BTreeMap::new(),
+            failed: BTreeSet::new(),
+        }
     }
 
-    /// Publishes chunks that are encoded, and starts to encode the model if a client draws it and it has changed.
-    /// Returns the time spent, during which the model could not train. A failure does not affect the run: a lost device is
-    /// detected by training, too.
-    pub(crate) fn publish(&mut self, kind: ModelKind, method: &mut dyn Method, edits: &Arc<Edits>) -> Duration {
+    /// Publishes chunks that are encoded, and starts to encode the model if a client draws it and
+    /// it has changed. Returns the time spent, during which the model could not train. A failure
+    /// does not affect the run: a lost device is detected by training, too.
+    pub(crate) fn publish(
+        &mut self,
+        kind: ModelKind,
+        method: &mut dyn Method,
+        edits: &Arc<Edits>,
+    ) -> Duration {
         let began = Instant::now();
         self.finish();
         let name = kind.name();
@@ -68,11 +79,22 @@ impl ChunkPublisher {
             return began.elapsed();
         }
         let next_at = began + period.max(MIN_PERIOD);
-        self.models.insert(name, Published { step, edits: Arc::clone(edits), next_at });
+        self.models.insert(
+            name,
+            Published {
+                step,
+                edits: Arc::clone(edits),
+                next_at,
+            },
+        );
         match method.queue_chunks(only_changed, edits) {
             Ok(None) => {}
             Ok(Some(pending)) => {
-                self.task = Some(Encoding { name, began, thread: Task::start("chunks", || pending.finish()) });
+                self.task = Some(Encoding {
+                    name,
+                    began,
+                    thread: Task::start("chunks", || pending.finish()),
+                });
             }
             Err(error) => self.fail(name, &error.to_string()),
         }
@@ -81,7 +103,12 @@ impl ChunkPublisher {
 
     /// Publishes the chunks that are encoded.
     fn finish(&mut self) {
-        let Some(Encoding { name, began, thread }) = self.task.take_if(|task| task.thread.is_finished()) else {
+        let Some(Encoding {
+            name,
+            began,
+            thread,
+        }) = self.task.take_if(|task| task.thread.is_finished())
+        else {
             return;
         };
         let pause = Duration::from_secs_f64(began.elapsed().as_secs_f64() / MAX_ENCODE_FRAC);

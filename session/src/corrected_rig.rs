@@ -16,8 +16,9 @@ use std::path::{Path, PathBuf};
 const ALIGNED: &str = "registration of keyframes";
 const LEARNED: &str = "optimization with the scene";
 
-/// The rig with the corrections of alignment, followed by those optimized with the scene; of these, extrinsics are left
-/// out if alignment has estimated them. Corrections of single images have no key in a rig file and are left out, too.
+/// The rig with the corrections of alignment, followed by those optimized with the scene; of these,
+/// extrinsics are left out if alignment has estimated them. Corrections of single images have no
+/// key in a rig file and are left out, too.
 pub fn corrected(
     rig: &Rig,
     alignment: Option<&Alignment>,
@@ -40,7 +41,8 @@ pub fn corrected(
                 _ => false,
             };
             if alignment.estimates.iter().any(is_of_camera) {
-                // Registration is more accurate: extrinsics that are optimized with an unfinished scene adapt to it.
+                // Registration is more accurate: extrinsics that are optimized with an unfinished
+                // scene adapt to it.
                 (correction.rotation_rad, correction.translation_m) = ([0.0; 3], [0.0; 3]);
             } else if correction.rotation_rad != [0.0; 3] {
                 log::info!(
@@ -53,8 +55,11 @@ pub fn corrected(
             correct(camera, &correction, &[], LEARNED);
         }
     }
-    let joint_offsets =
-        alignment.corrections.values().map(|correction| &correction.joint_offsets).max_by_key(|offsets| offsets.len());
+    let joint_offsets = alignment
+        .corrections
+        .values()
+        .map(|correction| &correction.joint_offsets)
+        .max_by_key(|offsets| offsets.len());
     if let Some(by_chain) = joint_offsets.filter(|offsets| !offsets.is_empty()) {
         let chain = Chain::from_urdf(&rig.arm.urdf_text, &rig.arm.base_link, &rig.arm.flange_link)?;
         rig.arm.joint_offsets.resize(rig.arm.joints.len(), 0.0);
@@ -70,10 +75,16 @@ pub fn corrected(
 /// # Errors
 /// [`Error::BadInput`] with the names of all cameras if there is none of this name.
 pub fn camera<'a>(rig: &'a Rig, name: &str) -> Result<&'a Camera, Error> {
-    rig.cameras.iter().find(|camera| *camera.name == *name).ok_or_else(|| {
-        let names: Vec<&str> = rig.cameras.iter().map(|camera| &*camera.name).collect();
-        Error::BadInput(format!("--camera {name}: the rig file has no such camera; it has {}", listed(&names, "and")))
-    })
+    rig.cameras
+        .iter()
+        .find(|camera| *camera.name == *name)
+        .ok_or_else(|| {
+            let names: Vec<&str> = rig.cameras.iter().map(|camera| &*camera.name).collect();
+            Error::BadInput(format!(
+                "--camera {name}: the rig file has no such camera; it has {}",
+                listed(&names, "and")
+            ))
+        })
 }
 
 /// The rig with other intrinsics of a camera. Depth images with the same lens get them, too.
@@ -90,11 +101,16 @@ pub fn with_intrinsics(
 ) -> Result<Rig, Error> {
     expect_size(camera(rig, name)?, intrinsics.size_px)?;
     let mut rig = rig.clone();
-    for camera in rig.cameras.iter_mut().filter(|camera| *camera.name == *name) {
+    for camera in rig
+        .cameras
+        .iter_mut()
+        .filter(|camera| *camera.name == *name)
+    {
         let before = std::mem::replace(&mut camera.intrinsics, intrinsics.clone());
         camera.realsense.unknown.intrinsics = false;
         // Symmetric, so the order of rows and columns does not matter.
-        camera.intrinsics_covariance = covariance.map_or_else(Vec::new, |covariance| covariance.as_slice().to_vec());
+        camera.intrinsics_covariance =
+            covariance.map_or_else(Vec::new, |covariance| covariance.as_slice().to_vec());
         if let Some(depth) = &mut camera.depth
             && depth.intrinsics == before.resized(depth.intrinsics.size_px)
         {
@@ -104,11 +120,18 @@ pub fn with_intrinsics(
     Ok(rig)
 }
 
-/// The rig with another pose of a camera. A pose in a fixed base is converted for a camera that is attached to the world.
+/// The rig with another pose of a camera. A pose in a fixed base is converted for a camera that is
+/// attached to the world.
 ///
 /// # Errors
-/// [`Error::BadInput`] if there is no such camera, or if it is attached to another frame than `parent`.
-pub fn with_extrinsics(rig: &Rig, name: &str, parent: Parent, pose: &Transform) -> Result<Rig, Error> {
+/// [`Error::BadInput`] if there is no such camera, or if it is attached to another frame than
+/// `parent`.
+pub fn with_extrinsics(
+    rig: &Rig,
+    name: &str,
+    parent: Parent,
+    pose: &Transform,
+) -> Result<Rig, Error> {
     let given = camera(rig, name)?.parent;
     let is_converted = (parent, given) == (Parent::Base, Parent::World) && !rig.has_moving_base();
     if given != parent && !is_converted {
@@ -124,8 +147,8 @@ pub fn with_extrinsics(rig: &Rig, name: &str, parent: Parent, pose: &Transform) 
     Ok(rig)
 }
 
-/// `parent_from_camera` for a pose of a camera on the flange or in a fixed base: the latter is converted if the parent is
-/// the world.
+/// `parent_from_camera` for a pose of a camera on the flange or in a fixed base: the latter is
+/// converted if the parent is the world.
 pub fn parent_from_camera(base: &Base, parent: Parent, pose: &Transform) -> Transform {
     match parent {
         Parent::World => base.world_from_base * pose,
@@ -158,9 +181,15 @@ fn name_of(parent: Parent) -> &'static str {
 
 /// Checks that a rig file can be written to this path.
 pub fn check_target_file(rig: &Rig, file: &Path) -> Result<(), Error> {
-    let folder = file.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let folder = file
+        .parent()
+        .filter(|folder| !folder.as_os_str().is_empty())
+        .unwrap_or(Path::new("."));
     if !folder.is_dir() || file.is_dir() {
-        return Err(Error::BadInput(format!("--write-rig {}: must be a file in an existing folder", file.display())));
+        return Err(Error::BadInput(format!(
+            "--write-rig {}: must be a file in an existing folder",
+            file.display()
+        )));
     }
     match other_robot(rig, file) {
         Some(urdf) => Err(Error::BadInput(format!(
@@ -179,13 +208,15 @@ fn other_robot(rig: &Rig, file: &Path) -> Option<PathBuf> {
     (existing != rig.arm.urdf_text).then_some(urdf)
 }
 
-/// Writes a rig file atomically, and the robot's URDF next to it. A file that it replaces is kept with the extension
-/// `.old`, or `.old2` and so on if that exists. Does not overwrite the URDF of another robot. Of two programs that write the
-/// same file at the same time, the second gets an error.
+/// Writes a rig file atomically, and the robot's URDF next to it. A file that it replaces is kept
+/// with the extension `.old`, or `.old2` and so on if that exists. Does not overwrite the URDF of
+/// another robot. Of two programs that write the same file at the same time, the second gets an
+/// error.
 pub fn write(rig: &Rig, file: &Path) -> crate::Result<()> {
     check_target_file(rig, file)?;
     let linked = std::fs::read_link(file);
-    // The previous file is copied while no other program can write it, so that the copy has the latest contents.
+    // The previous file is copied while no other program can write it, so that the copy has the
+    // latest contents.
     let written = files::replace(file, |unfinished| {
         write_urdf(rig, file)?;
         back_up(file)?;
@@ -193,7 +224,11 @@ pub fn write(rig: &Rig, file: &Path) -> crate::Result<()> {
     });
     written.with_context(|| format!("cannot write {}", file.display()))?;
     if let Ok(target) = linked {
-        log::warn!("{} was a symbolic link: it is a file now, and {} is unchanged", file.display(), target.display());
+        log::warn!(
+            "{} was a symbolic link: it is a file now, and {} is unchanged",
+            file.display(),
+            target.display()
+        );
     }
     Ok(())
 }
@@ -213,7 +248,10 @@ fn write_urdf(rig: &Rig, file: &Path) -> std::io::Result<()> {
         },
         _ => error.to_string(),
     };
-    Err(std::io::Error::new(error.kind(), format!("{}: {problem}", urdf.display())))
+    Err(std::io::Error::new(
+        error.kind(),
+        format!("{}: {problem}", urdf.display()),
+    ))
 }
 
 /// Copies a file, if it exists, to an unused name.
@@ -223,8 +261,12 @@ fn back_up(file: &Path) -> std::io::Result<()> {
     }
     let backup = unused_backup(file);
     let copy = |backup: &mut File| std::io::copy(&mut files::open(file)?, backup).map(drop);
-    files::create(&backup, copy)
-        .map_err(|error| std::io::Error::new(error.kind(), format!("cannot keep it as {}: {error}", backup.display())))
+    files::create(&backup, copy).map_err(|error| {
+        std::io::Error::new(
+            error.kind(),
+            format!("cannot keep it as {}: {error}", backup.display()),
+        )
+    })
 }
 
 /// Path of a backup that does not exist yet.
@@ -237,12 +279,19 @@ fn unused_backup(file: &Path) -> PathBuf {
     let numbered = (2..).map(|number: u32| with(format!(".old{number}")));
     let mut names = std::iter::once(with(".old".to_owned())).chain(numbered);
     // A broken symbolic link takes a name, too.
-    names.find(|path| path.symlink_metadata().is_err()).expect("an unused number")
+    names
+        .find(|path| path.symlink_metadata().is_err())
+        .expect("an unused number")
 }
 
-/// Applies a correction. `estimates` contain the standard deviation of the time offset, if it is known; `source` names
-/// the method of estimation.
-fn correct(camera: &mut Camera, correction: &CameraCorrection, estimates: &[Estimate], source: &str) {
+/// Applies a correction. `estimates` contain the standard deviation of the time offset, if it is
+/// known; `source` names the method of estimation.
+fn correct(
+    camera: &mut Camera,
+    correction: &CameraCorrection,
+    estimates: &[Estimate],
+    source: &str,
+) {
     let moved = |rotation_rad: [f64; 3], translation_m: [f64; 3]| {
         Transform::from_parts(
             Translation3::from(Vector3::from(translation_m)),
@@ -252,11 +301,16 @@ fn correct(camera: &mut Camera, correction: &CameraCorrection, estimates: &[Esti
     camera.parent_from_camera *= moved(correction.rotation_rad, correction.translation_m).inverse();
     if correction.time_offset_secs != 0.0 {
         let sigma = estimates.iter().find_map(|estimate| match estimate {
-            Estimate::TimeOffset(time_offset) if *time_offset.camera == *camera.name => Some(time_offset.sigma),
+            Estimate::TimeOffset(time_offset) if *time_offset.camera == *camera.name => {
+                Some(time_offset.sigma)
+            }
             _ => None,
         });
         camera.stamp_to_mid_exposure = Some(TimeOffset {
-            value_millis: camera.stamp_to_mid_exposure.as_ref().map_or(0.0, |known| known.value_millis)
+            value_millis: camera
+                .stamp_to_mid_exposure
+                .as_ref()
+                .map_or(0.0, |known| known.value_millis)
                 + 1e3 * correction.time_offset_secs,
             sigma_millis: 1e3 * sigma.unwrap_or(0.0),
             source: source.to_owned(),
@@ -268,7 +322,8 @@ fn correct(camera: &mut Camera, correction: &CameraCorrection, estimates: &[Esti
     }
     let correct_lens = |intrinsics: &mut Intrinsics| {
         for axis in 0..2 {
-            intrinsics.principal_px[axis] += correction.principal_offset_focals[axis] * intrinsics.focal_px[axis];
+            intrinsics.principal_px[axis] +=
+                correction.principal_offset_focals[axis] * intrinsics.focal_px[axis];
             intrinsics.focal_px[axis] *= correction.log_focal[axis].exp();
         }
     };
@@ -278,8 +333,10 @@ fn correct(camera: &mut Camera, correction: &CameraCorrection, estimates: &[Esti
         if shares_lens {
             correct_lens(&mut depth.intrinsics);
         }
-        depth.camera_from_depth =
-            moved(correction.depth_rotation_rad, correction.depth_translation_m) * depth.camera_from_depth;
+        depth.camera_from_depth = moved(
+            correction.depth_rotation_rad,
+            correction.depth_translation_m,
+        ) * depth.camera_from_depth;
         depth.factor *= correction.log_depth_scale.exp();
     }
     correct_lens(&mut camera.intrinsics);
@@ -328,24 +385,44 @@ mod tests {
         let calibrated_rig = corrected(&rig, Some(&alignment), &BTreeMap::new()).unwrap();
         let (before, after) = (&rig.cameras[0], &calibrated_rig.cameras[0]);
         // The correction is applied after camera_from_parent.
-        let moved = Transform::new(Vector3::from(correction.translation_m), Vector3::from(correction.rotation_rad));
+        let moved = Transform::new(
+            Vector3::from(correction.translation_m),
+            Vector3::from(correction.rotation_rad),
+        );
         let expected = moved * before.parent_from_camera.inverse();
-        let max_error = (after.parent_from_camera.inverse().to_homogeneous() - expected.to_homogeneous()).abs().max();
+        let max_error = (after.parent_from_camera.inverse().to_homogeneous()
+            - expected.to_homogeneous())
+        .abs()
+        .max();
         assert!(max_error < TOLERANCE, "{max_error}");
         let time_offset = after.stamp_to_mid_exposure.as_ref().unwrap();
         assert!(
-            (time_offset.value_millis - 4.0).abs() < TOLERANCE && (time_offset.sigma_millis - 0.1).abs() < TOLERANCE
+            (time_offset.value_millis - 4.0).abs() < TOLERANCE
+                && (time_offset.sigma_millis - 0.1).abs() < TOLERANCE
         );
         assert_eq!(time_offset.source, ALIGNED);
         assert!((after.readout_micros.unwrap() - 12_000.0).abs() < 1e-6);
-        assert!((after.intrinsics.focal_px[0] / before.intrinsics.focal_px[0] - 0.01f64.exp()).abs() < TOLERANCE);
+        assert!(
+            (after.intrinsics.focal_px[0] / before.intrinsics.focal_px[0] - 0.01f64.exp()).abs()
+                < TOLERANCE
+        );
         let [fx, fy] = before.intrinsics.focal_px;
-        let moved = [0, 1].map(|axis| after.intrinsics.principal_px[axis] - before.intrinsics.principal_px[axis]);
-        assert!((moved[0] - 0.001 * fx).abs() < 1e-9 && (moved[1] + 0.002 * fy).abs() < 1e-9, "{moved:?}");
+        let moved = [0, 1]
+            .map(|axis| after.intrinsics.principal_px[axis] - before.intrinsics.principal_px[axis]);
+        assert!(
+            (moved[0] - 0.001 * fx).abs() < 1e-9 && (moved[1] + 0.002 * fy).abs() < 1e-9,
+            "{moved:?}"
+        );
         let depth = after.depth.as_ref().unwrap();
-        assert_eq!(depth.intrinsics.focal_px, after.intrinsics.focal_px, "depth uses the same lens");
+        assert_eq!(
+            depth.intrinsics.focal_px, after.intrinsics.focal_px,
+            "depth uses the same lens"
+        );
         assert!((depth.factor - 0.01f64.exp()).abs() < TOLERANCE);
-        assert!((depth.camera_from_depth.translation.vector - Vector3::new(0.0, 0.0, 0.005)).norm() < TOLERANCE);
+        assert!(
+            (depth.camera_from_depth.translation.vector - Vector3::new(0.0, 0.0, 0.005)).norm()
+                < TOLERANCE
+        );
         let expected: Vec<f64> = (0..7).rev().map(|joint| 0.001 * f64::from(joint)).collect();
         assert_eq!(calibrated_rig.arm.joint_offsets, expected);
         // The written file can be read back, and the URDF of another robot is not overwritten.
@@ -354,14 +431,28 @@ mod tests {
         write(&calibrated_rig, &file).unwrap();
         assert_eq!(Rig::load(&file, &[]).unwrap(), calibrated_rig);
         assert!(
-            Rig::load(&file, &[]).unwrap().has_same_calibration(&calibrated_rig)
+            Rig::load(&file, &[])
+                .unwrap()
+                .has_same_calibration(&calibrated_rig)
                 && !rig.has_same_calibration(&calibrated_rig)
         );
-        std::fs::write(folder.path().join(drivers::recording::URDF_FILE), "<robot/>").unwrap();
-        assert!(write(&calibrated_rig, &file).unwrap_err().to_string().contains("another robot"));
+        std::fs::write(
+            folder.path().join(drivers::recording::URDF_FILE),
+            "<robot/>",
+        )
+        .unwrap();
+        assert!(
+            write(&calibrated_rig, &file)
+                .unwrap_err()
+                .to_string()
+                .contains("another robot")
+        );
         assert!(check_target_file(&calibrated_rig, &folder.path().join("none/rig.toml")).is_err());
         assert!(
-            check_target_file(&calibrated_rig, &file).unwrap_err().to_string().contains("another robot"),
+            check_target_file(&calibrated_rig, &file)
+                .unwrap_err()
+                .to_string()
+                .contains("another robot"),
             "the check before training rejects it, too"
         );
     }
@@ -382,7 +473,10 @@ mod tests {
                     Ok(()) => texts.push(rig.to_toml()),
                     Err(error) => {
                         let message = format!("{error:#}");
-                        assert!(message.ends_with("rig.toml: another program is writing it"), "{message}");
+                        assert!(
+                            message.ends_with("rig.toml: another program is writing it"),
+                            "{message}"
+                        );
                     }
                 }
             }
@@ -390,17 +484,37 @@ mod tests {
         };
         let mut written = std::thread::scope(|scope| {
             let write_often = &write_often;
-            let writers: Vec<_> = (0..N_WRITERS).map(|writer| scope.spawn(move || write_often(writer))).collect();
-            writers.into_iter().flat_map(|writer| writer.join().unwrap()).collect::<Vec<String>>()
+            let writers: Vec<_> = (0..N_WRITERS)
+                .map(|writer| scope.spawn(move || write_often(writer)))
+                .collect();
+            writers
+                .into_iter()
+                .flat_map(|writer| writer.join().unwrap())
+                .collect::<Vec<String>>()
         });
-        let is_rig =
-            |path: &PathBuf| path.file_name().is_some_and(|name| name.to_string_lossy().starts_with("rig.toml"));
-        let paths = std::fs::read_dir(folder.path()).unwrap().map(|entry| entry.unwrap().path()).filter(is_rig);
-        let mut found: Vec<String> = paths.map(|path| std::fs::read_to_string(path).unwrap()).collect();
+        let is_rig = |path: &PathBuf| {
+            path.file_name()
+                .is_some_and(|name| name.to_string_lossy().starts_with("rig.toml"))
+        };
+        let paths = std::fs::read_dir(folder.path())
+            .unwrap()
+            .map(|entry| entry.unwrap().path())
+            .filter(is_rig);
+        let mut found: Vec<String> = paths
+            .map(|path| std::fs::read_to_string(path).unwrap())
+            .collect();
         written.sort();
         found.sort();
-        assert!(!written.is_empty() && found == written, "{} files of {} writes", found.len(), written.len());
-        assert!(std::fs::read_dir(folder.path()).unwrap().count() == found.len() + 1, "these and the URDF");
+        assert!(
+            !written.is_empty() && found == written,
+            "{} files of {} writes",
+            found.len(),
+            written.len()
+        );
+        assert!(
+            std::fs::read_dir(folder.path()).unwrap().count() == found.len() + 1,
+            "these and the URDF"
+        );
     }
 
     #[test]
@@ -412,7 +526,10 @@ mod tests {
         write_urdf(&rig, &file).expect("it is that of the same robot");
         std::fs::write(&urdf, "<robot/>").unwrap();
         let error = write_urdf(&rig, &file).unwrap_err().to_string();
-        assert!(error.ends_with("robot.urdf: it is that of another robot"), "{error}");
+        assert!(
+            error.ends_with("robot.urdf: it is that of another robot"),
+            "{error}"
+        );
         assert_eq!(std::fs::read_to_string(&urdf).unwrap(), "<robot/>");
         std::fs::remove_file(&urdf).unwrap();
         std::os::unix::fs::symlink(folder.path().join("absent"), &urdf).unwrap();
@@ -424,15 +541,28 @@ mod tests {
     fn intrinsics_and_extrinsics_are_replaced() {
         let rig = bundled_rig();
         let before = &rig.cameras[0];
-        let other = Intrinsics { focal_px: [700.0, 701.0], ..before.intrinsics.clone() };
+        let other = Intrinsics {
+            focal_px: [700.0, 701.0],
+            ..before.intrinsics.clone()
+        };
         let covariance = DMatrix::from_diagonal_element(4, 4, 0.25);
         let replaced = with_intrinsics(&rig, "wrist", &other, Some(&covariance)).unwrap();
         assert_eq!(replaced.cameras[0].intrinsics, other);
-        assert_eq!(replaced.cameras[0].intrinsics_covariance, covariance.as_slice());
+        assert_eq!(
+            replaced.cameras[0].intrinsics_covariance,
+            covariance.as_slice()
+        );
         let again = with_intrinsics(&replaced, "wrist", &before.intrinsics, None).unwrap();
-        assert!(again.cameras[0].intrinsics_covariance.is_empty(), "it was that of other intrinsics");
+        assert!(
+            again.cameras[0].intrinsics_covariance.is_empty(),
+            "it was that of other intrinsics"
+        );
         let depth = replaced.cameras[0].depth.as_ref().unwrap();
-        assert_eq!(depth.intrinsics, other.resized(depth.intrinsics.size_px), "depth uses the same lens");
+        assert_eq!(
+            depth.intrinsics,
+            other.resized(depth.intrinsics.size_px),
+            "depth uses the same lens"
+        );
         let pose = Transform::translation(0.1, 0.2, 0.3);
         let moved = with_extrinsics(&rig, "wrist", Parent::Flange, &pose).unwrap();
         assert_eq!(moved.cameras[0].parent_from_camera, pose);
@@ -440,11 +570,20 @@ mod tests {
 
         let message = |result: Result<Rig, Error>| result.unwrap_err().to_string();
         let unknown = message(with_intrinsics(&rig, "wirst", &other, None));
-        assert!(unknown.contains("wirst") && unknown.contains("wrist"), "{unknown}");
-        let small = Intrinsics { size_px: [320, 240], ..other };
+        assert!(
+            unknown.contains("wirst") && unknown.contains("wrist"),
+            "{unknown}"
+        );
+        let small = Intrinsics {
+            size_px: [320, 240],
+            ..other
+        };
         assert!(message(with_intrinsics(&rig, "wrist", &small, None)).contains("320x240"));
         let base = message(with_extrinsics(&rig, "wrist", Parent::Base, &pose));
-        assert!(base.contains("is flange") && base.contains("the base"), "{base}");
+        assert!(
+            base.contains("is flange") && base.contains("the base"),
+            "{base}"
+        );
     }
 
     #[test]
@@ -454,10 +593,17 @@ mod tests {
         rig.base.world_from_base = Transform::new(Vector3::new(1.0, 2.0, 0.5), Vector3::z() * 0.5);
         let base_from_camera = Transform::new(Vector3::new(0.4, -0.1, 0.3), Vector3::x() * 1.5);
         let moved = with_extrinsics(&rig, "wrist", Parent::Base, &base_from_camera).unwrap();
-        let difference = moved.cameras[0].parent_from_camera.inverse() * rig.base.world_from_base * base_from_camera;
+        let difference = moved.cameras[0].parent_from_camera.inverse()
+            * rig.base.world_from_base
+            * base_from_camera;
         assert!(difference.translation.vector.norm() < 1e-12 && difference.rotation.angle() < 1e-7);
         rig.base.driver = capture::config::BaseDriver::Udp;
-        let error = with_extrinsics(&rig, "wrist", Parent::Base, &base_from_camera).unwrap_err().to_string();
-        assert!(error.contains("is world"), "a moving base has no fixed pose in the world: {error}");
+        let error = with_extrinsics(&rig, "wrist", Parent::Base, &base_from_camera)
+            .unwrap_err()
+            .to_string();
+        assert!(
+            error.contains("is world"),
+            "a moving base has no fixed pose in the world: {error}"
+        );
     }
 }

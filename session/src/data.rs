@@ -24,62 +24,101 @@ use trainer::{InitialPoints, ModelKind};
 /// Which images are read, and how they are scaled and split.
 #[derive(Clone, Debug, Default)]
 pub struct DataOptions {
-    /// Test images: a number n for every n-th image, or a file that lists them. Every 8th image if `None`.
+    /// Test images: a number n for every n-th image, or a file that lists them. Every 8th image if
+    /// `None`.
     pub holdout: Option<String>,
     /// List of the keyframes to use.
     pub keyframes: Option<PathBuf>,
     /// Rig file that replaces the rig file stored in a recording.
     pub rig: Option<PathBuf>,
-    /// Fraction of the width and height to which color images are scaled. Depth images are not scaled.
+    /// Fraction of the width and height to which color images are scaled. Depth images are not
+    /// scaled.
     pub scale: Option<f64>,
 }
 
 impl DataOptions {
     /// The test images selected by `--holdout`, if it is given.
     pub fn holdout(&self) -> Result<Option<Holdout>, Error> {
-        Ok(self.holdout.as_deref().map(Holdout::from_argument).transpose()?)
+        Ok(self
+            .holdout
+            .as_deref()
+            .map(Holdout::from_argument)
+            .transpose()?)
     }
 
     /// Names and values of the given flags that affect keyframes. Paths of files are absolute.
     pub fn flags(&self) -> BTreeMap<String, String> {
-        let canonical = |file: &Path| file.canonicalize().unwrap_or_else(|_| file.to_owned()).display().to_string();
-        let holdout = |text: &String| if is_number(text) { text.clone() } else { canonical(Path::new(text)) };
+        let canonical = |file: &Path| {
+            file.canonicalize()
+                .unwrap_or_else(|_| file.to_owned())
+                .display()
+                .to_string()
+        };
+        let holdout = |text: &String| {
+            if is_number(text) {
+                text.clone()
+            } else {
+                canonical(Path::new(text))
+            }
+        };
         let given = [
             ("holdout", self.holdout.as_ref().map(holdout)),
             ("keyframes", self.keyframes.as_deref().map(canonical)),
             ("rig", self.rig.as_deref().map(canonical)),
             ("scale", self.scale.map(|scale| scale.to_string())),
         ];
-        given.into_iter().filter_map(|(name, value)| Some((name.to_owned(), value?))).collect()
+        given
+            .into_iter()
+            .filter_map(|(name, value)| Some((name.to_owned(), value?)))
+            .collect()
     }
 
     /// The flags that affect the pixels of listed keyframes, as command-line arguments.
     pub fn flags_of_images(&self) -> Vec<String> {
-        let rig = self.rig.as_ref().map(|file| ["--rig".to_owned(), file.display().to_string()]);
-        let scale = self.scale.map(|scale| ["--scale".to_owned(), scale.to_string()]);
+        let rig = self
+            .rig
+            .as_ref()
+            .map(|file| ["--rig".to_owned(), file.display().to_string()]);
+        let scale = self
+            .scale
+            .map(|scale| ["--scale".to_owned(), scale.to_string()]);
         rig.into_iter().chain(scale).flatten().collect()
     }
 
-    /// Fills in missing flags from those of an earlier run, `before`. A number must be the same as before. A path may
-    /// differ, because the file may have moved; its contents are compared later.
+    /// Fills in missing flags from those of an earlier run, `before`. A number must be the same as
+    /// before. A path may differ, because the file may have moved; its contents are compared later.
     ///
     /// `subject`: name of the earlier result in messages.
-    pub fn completed_with(&self, subject: &str, before: &BTreeMap<String, String>) -> Result<Self, Error> {
+    pub fn completed_with(
+        &self,
+        subject: &str,
+        before: &BTreeMap<String, String>,
+    ) -> Result<Self, Error> {
         let now = self.flags();
         for (name, value) in before {
             let is_other = |now: &String| now != value && is_number(now) && is_number(value);
             if let Some(now) = now.get(name).filter(|now| is_other(now)) {
-                return Err(Error::BadInput(format!("--{name} {now}: {subject} was trained with --{name} {value}")));
+                return Err(Error::BadInput(format!(
+                    "--{name} {now}: {subject} was trained with --{name} {value}"
+                )));
             }
         }
         let unset_flag = |name: &str| before.get(name).filter(|_| !now.contains_key(name));
-        // `--holdout` and `--keyframes` both select images, so giving either one discards both earlier values.
-        let image_flag = |name: &str| unset_flag(name).filter(|_| self.holdout.is_none() && self.keyframes.is_none());
+        // `--holdout` and `--keyframes` both select images, so giving either one discards both
+        // earlier values.
+        let image_flag = |name: &str| {
+            unset_flag(name).filter(|_| self.holdout.is_none() && self.keyframes.is_none())
+        };
         let scale = unset_flag("scale").map(|scale| scale.parse());
-        let scale = scale.transpose().map_err(|_| Error::BadInput(format!("{subject}: the scale is not a number")))?;
+        let scale = scale
+            .transpose()
+            .map_err(|_| Error::BadInput(format!("{subject}: the scale is not a number")))?;
         let restored = Self {
             holdout: self.holdout.clone().or(image_flag("holdout").cloned()),
-            keyframes: self.keyframes.clone().or(image_flag("keyframes").map(PathBuf::from)),
+            keyframes: self
+                .keyframes
+                .clone()
+                .or(image_flag("keyframes").map(PathBuf::from)),
             rig: self.rig.clone().or(unset_flag("rig").map(PathBuf::from)),
             scale: self.scale.or(scale),
         };
@@ -90,7 +129,10 @@ impl DataOptions {
             .map(|(name, value)| format!("--{name} {value}"))
             .collect();
         if !restored_flags.is_empty() {
-            log::info!("using the flags that {subject} was trained with: {}", restored_flags.join(" "));
+            log::info!(
+                "using the flags that {subject} was trained with: {}",
+                restored_flags.join(" ")
+            );
         }
         Ok(restored)
     }
@@ -118,7 +160,8 @@ pub struct Data {
     pub stations: Vec<StationReport>,
     /// Depth that was rendered from a model for images without depth.
     pub rendered_depth: Option<RenderedDepth>,
-    /// Time spent on station registration and depth rendering, which precede training but count as training time.
+    /// Time spent on station registration and depth rendering, which precede training but count as
+    /// training time.
     pub preparation_time: Duration,
 }
 
@@ -151,18 +194,29 @@ impl Data {
         overrides: &[Override],
         progress: OnReadProgress<'_>,
     ) -> crate::Result<Self> {
-        let list = args.keyframes.as_deref().map(KeyframeList::load).transpose()?;
+        let list = args
+            .keyframes
+            .as_deref()
+            .map(KeyframeList::load)
+            .transpose()?;
         let holdout = args.holdout()?;
         Self::load_selected(
             path,
-            DataSelection { list, holdout, scale: args.scale, rig: args.rig.clone(), use_reported_poses: false },
+            DataSelection {
+                list,
+                holdout,
+                scale: args.scale,
+                rig: args.rig.clone(),
+                use_reported_poses: false,
+            },
             purpose,
             overrides,
             progress,
         )
     }
 
-    /// Reads the keyframes of a list. Images are scaled by `scale`, and base poses are used as reported.
+    /// Reads the keyframes of a list. Images are scaled by `scale`, and base poses are used as
+    /// reported.
     pub fn of_list(
         path: &Path,
         list: KeyframeList,
@@ -171,8 +225,13 @@ impl Data {
         overrides: &[Override],
         progress: OnReadProgress<'_>,
     ) -> crate::Result<Self> {
-        let selection =
-            DataSelection { list: Some(list), holdout: None, scale: Some(scale), rig, use_reported_poses: true };
+        let selection = DataSelection {
+            list: Some(list),
+            holdout: None,
+            scale: Some(scale),
+            rig,
+            use_reported_poses: true,
+        };
         Self::load_selected(path, selection, Purpose::Training, overrides, progress)
     }
 
@@ -183,16 +242,28 @@ impl Data {
         overrides: &[Override],
         progress: OnReadProgress<'_>,
     ) -> crate::Result<Self> {
-        let DataSelection { list, holdout, scale, rig, use_reported_poses } = selection;
+        let DataSelection {
+            list,
+            holdout,
+            scale,
+            rig,
+            use_reported_poses,
+        } = selection;
         expect(path)?;
         let is_recording = is_recording(path);
         let mut data = if is_recording {
             let scale = scale.map(|scale| Override::new("train.scale", scale));
             let overrides: Vec<Override> = overrides.iter().cloned().chain(scale).collect();
-            let rig = rig.as_deref().map(|file| Rig::load(file, &overrides)).transpose()?;
+            let rig = rig
+                .as_deref()
+                .map(|file| Rig::load(file, &overrides))
+                .transpose()?;
             Self::from_recording(path, rig, list, overrides, progress)?
         } else if let Some(rig) = rig {
-            return Err(Error::BadInput(format!("--rig {}: only recordings take a rig file", rig.display())));
+            return Err(Error::BadInput(format!(
+                "--rig {}: only recordings take a rig file",
+                rig.display()
+            )));
         } else {
             Self::from_folder(path, holdout.as_ref(), scale.unwrap_or(1.0), list, progress)?
         };
@@ -208,9 +279,17 @@ impl Data {
         };
         if data.of_split(required_split).is_empty() {
             let n_images = counted(data.keyframes.len() as u64, "image");
-            return Err(Error::InsufficientData(format!("{}: {message} among {n_images}", path.display())));
+            return Err(Error::InsufficientData(format!(
+                "{}: {message} among {n_images}",
+                path.display()
+            )));
         }
-        let is_masked = |keyframe: &&Arc<Keyframe>| keyframe.rgba_srgb.chunks_exact(4).all(|pixel| pixel[3] == 0);
+        let is_masked = |keyframe: &&Arc<Keyframe>| {
+            keyframe
+                .rgba_srgb
+                .chunks_exact(4)
+                .all(|pixel| pixel[3] == 0)
+        };
         let n_masked = data.keyframes.iter().filter(is_masked).count();
         if n_masked == data.keyframes.len() {
             return Err(Error::InsufficientData(format!(
@@ -221,42 +300,72 @@ impl Data {
         }
         if n_masked > 0 {
             let n_images = counted(n_masked as u64, "image");
-            log::warn!("{}: no pixel of {n_images} can be used, because all are masked", path.display());
+            log::warn!(
+                "{}: no pixel of {n_images} can be used, because all are masked",
+                path.display()
+            );
         }
         Ok(data)
     }
 
     /// The rig of a recording, before flags override its keys.
     pub fn rig_as_given(path: &Path, args: &DataOptions) -> crate::Result<Rig> {
-        let rig = args.rig.as_deref().map(|file| Rig::load(file, &[])).transpose()?;
+        let rig = args
+            .rig
+            .as_deref()
+            .map(|file| Rig::load(file, &[]))
+            .transpose()?;
         Ok(open::recording(path, rig, &[])?.rig)
     }
 
-    /// The methods to train if no flag names any: those in the rig file of a recording, or else the default method.
+    /// The methods to train if no flag names any: those in the rig file of a recording, or else the
+    /// default method.
     pub fn default_methods(path: &Path, args: &DataOptions) -> crate::Result<Vec<ModelKind>> {
         expect(path)?;
-        if is_recording(path) { methods_of(&Self::rig_as_given(path, args)?) } else { Ok(vec![ModelKind::default()]) }
+        if is_recording(path) {
+            methods_of(&Self::rig_as_given(path, args)?)
+        } else {
+            Ok(vec![ModelKind::default()])
+        }
     }
 
     /// Keyframes of one split.
     pub fn of_split(&self, split: Split) -> Vec<Arc<Keyframe>> {
-        self.keyframes.iter().filter(|keyframe| keyframe.split == split).cloned().collect()
+        self.keyframes
+            .iter()
+            .filter(|keyframe| keyframe.split == split)
+            .cloned()
+            .collect()
     }
 
     /// Names of the images by camera and stamp.
     pub fn image_names(&self) -> BTreeMap<(String, i64), String> {
         let key = |keyframe: &Arc<Keyframe>| (keyframe.camera.to_string(), keyframe.stamp.0);
-        self.keyframes.iter().map(key).zip(self.names.iter().cloned()).collect()
+        self.keyframes
+            .iter()
+            .map(key)
+            .zip(self.names.iter().cloned())
+            .collect()
     }
 
     /// Properties of the data that limit which parameters can be estimated.
     pub fn available(&self) -> AvailableData {
-        let n_cameras = self.keyframes.iter().map(|keyframe| &keyframe.camera).collect::<HashSet<_>>().len();
+        let n_cameras = self
+            .keyframes
+            .iter()
+            .map(|keyframe| &keyframe.camera)
+            .collect::<HashSet<_>>()
+            .len();
         AvailableData {
             joints: self.rig.is_some(),
             drifts: self.rig.as_ref().is_none_or(Rig::has_moving_base),
-            // Depth rendered from reported camera poses contains no information about the true poses.
-            depth: self.has_depth() && self.rendered_depth.as_ref().is_none_or(|rendered| rendered.n_images == 0),
+            // Depth rendered from reported camera poses contains no information about the true
+            // poses.
+            depth: self.has_depth()
+                && self
+                    .rendered_depth
+                    .as_ref()
+                    .is_none_or(|rendered| rendered.n_images == 0),
             color_only: !self.has_depth(),
             many_images_per_camera: self.keyframes.len() >= MIN_IMAGES_PER_CAMERA * n_cameras,
         }
@@ -264,11 +373,13 @@ impl Data {
 
     /// Whether any keyframe has depth.
     pub fn has_depth(&self) -> bool {
-        self.keyframes.iter().any(|keyframe| keyframe.depth.is_some())
+        self.keyframes
+            .iter()
+            .any(|keyframe| keyframe.depth.is_some())
     }
 
-    /// Reads the points from which models without depth start. `None` if the data names none, if they cannot be read, or if
-    /// a training or validation image has depth; the reason is logged.
+    /// Reads the points from which models without depth start. `None` if the data names none, if
+    /// they cannot be read, or if a training or validation image has depth; the reason is logged.
     pub fn initial_points(&self) -> Option<Arc<InitialPoints>> {
         let path = self.points_path.as_deref()?;
         let shown = path.display();
@@ -316,7 +427,13 @@ impl Data {
     ) -> crate::Result<Self> {
         let folder = drivers::dataset::read(path)?;
         let n_all = Some(folder.images.len());
-        let on_image = |n_done| progress(ReadProgress { noun: "images", n_done, n_all });
+        let on_image = |n_done| {
+            progress(ReadProgress {
+                noun: "images",
+                n_done,
+                n_all,
+            })
+        };
         let loaded = dataset::load(&folder, holdout, scale, &on_image)?;
         for note in &loaded.notes {
             log::warn!("{note}");
@@ -345,10 +462,16 @@ impl Data {
         overrides: Vec<Override>,
         progress: OnReadProgress<'_>,
     ) -> crate::Result<Self> {
-        Self::from_source(open::recording(path, rig, &overrides)?, list, |_| false, progress)
+        Self::from_source(
+            open::recording(path, rig, &overrides)?,
+            list,
+            |_| false,
+            progress,
+        )
     }
 
-    /// Joins the images of a rig's devices with poses until `is_end` returns true for a sample, or the devices end.
+    /// Joins the images of a rig's devices with poses until `is_end` returns true for a sample, or
+    /// the devices end.
     pub fn from_devices(
         opened: Opened,
         is_end: impl FnMut(&Sample) -> bool,
@@ -365,7 +488,12 @@ impl Data {
         mut is_end: impl FnMut(&Sample) -> bool,
         progress: OnReadProgress<'_>,
     ) -> crate::Result<Self> {
-        let Opened { rig, mut source, damage, .. } = opened;
+        let Opened {
+            rig,
+            mut source,
+            damage,
+            ..
+        } = opened;
         let mut join = Join::new(&rig)?;
         if let Some(list) = list {
             join = join.taking_only(list);
@@ -376,12 +504,20 @@ impl Data {
                 match event {
                     JoinEvent::Accepted(keyframe) => keyframes.push(keyframe),
                     JoinEvent::Evicted { camera, stamp } => {
-                        keyframes.retain(|keyframe| keyframe.camera != camera || keyframe.stamp != stamp);
+                        keyframes.retain(|keyframe| {
+                            keyframe.camera != camera || keyframe.stamp != stamp
+                        });
                     }
-                    JoinEvent::PosedImage(_) | JoinEvent::RangeScan(_) | JoinEvent::Rejected { .. } => {}
+                    JoinEvent::PosedImage(_)
+                    | JoinEvent::RangeScan(_)
+                    | JoinEvent::Rejected { .. } => {}
                 }
             }
-            progress(ReadProgress { noun: "keyframes", n_done: keyframes.len(), n_all: None });
+            progress(ReadProgress {
+                noun: "keyframes",
+                n_done: keyframes.len(),
+                n_all: None,
+            });
         };
         while let Some(sample) = source.next_sample()? {
             if is_end(&sample) {
@@ -410,7 +546,9 @@ impl Data {
 
     /// Corrects the base poses at stations, as a live run does.
     fn realign(&mut self) {
-        let Some(mut stations) = self.rig.as_ref().and_then(Stations::new) else { return };
+        let Some(mut stations) = self.rig.as_ref().and_then(Stations::new) else {
+            return;
+        };
         self.keyframes = stations.corrected(std::mem::take(&mut self.keyframes));
         (self.stations, self.preparation_time) = (stations.reports().to_vec(), stations.spent());
     }
@@ -419,7 +557,10 @@ impl Data {
     fn assign_splits(&mut self, holdout: &Holdout) -> crate::Result<()> {
         let mut by_camera: BTreeMap<Arc<str>, Vec<usize>> = BTreeMap::new();
         for (ix, keyframe) in self.keyframes.iter().enumerate() {
-            by_camera.entry(keyframe.camera.clone()).or_default().push(ix);
+            by_camera
+                .entry(keyframe.camera.clone())
+                .or_default()
+                .push(ix);
         }
         for ixs in by_camera.values() {
             let names: Vec<&str> = ixs.iter().map(|ix| self.names[*ix].as_str()).collect();
@@ -432,9 +573,16 @@ impl Data {
 
     /// Keeps only the listed keyframes, with the splits in the list.
     fn take_only(&mut self, list: &KeyframeList) -> Result<(), Error> {
-        let images = || self.keyframes.iter().map(|keyframe| (&*keyframe.camera, keyframe.stamp));
-        self.data_losses.extend(list.check_found(images(), images().next())?);
-        let all = std::mem::take(&mut self.keyframes).into_iter().zip(std::mem::take(&mut self.names));
+        let images = || {
+            self.keyframes
+                .iter()
+                .map(|keyframe| (&*keyframe.camera, keyframe.stamp))
+        };
+        self.data_losses
+            .extend(list.check_found(images(), images().next())?);
+        let all = std::mem::take(&mut self.keyframes)
+            .into_iter()
+            .zip(std::mem::take(&mut self.names));
         for (mut keyframe, name) in all {
             if let Some(split) = list.split_of(&keyframe.camera, keyframe.stamp) {
                 Arc::make_mut(&mut keyframe).split = split;
@@ -476,18 +624,54 @@ mod tests {
 
     #[test]
     fn missing_flags_are_restored() {
-        let none = DataOptions { holdout: None, keyframes: None, rig: None, scale: None };
-        let first = DataOptions { holdout: Some("5".into()), scale: Some(0.25), ..none.clone() };
+        let none = DataOptions {
+            holdout: None,
+            keyframes: None,
+            rig: None,
+            scale: None,
+        };
+        let first = DataOptions {
+            holdout: Some("5".into()),
+            scale: Some(0.25),
+            ..none.clone()
+        };
         let again = |args: &DataOptions| args.completed_with("the checkpoint", &first.flags());
-        assert_eq!(again(&none).expect("no flag is given").flags(), first.flags());
-        let listed = DataOptions { keyframes: Some("other.txt".into()), ..none.clone() };
-        let names: Vec<String> = again(&listed).expect("lists are compared later").flags().into_keys().collect();
+        assert_eq!(
+            again(&none).expect("no flag is given").flags(),
+            first.flags()
+        );
+        let listed = DataOptions {
+            keyframes: Some("other.txt".into()),
+            ..none.clone()
+        };
+        let names: Vec<String> = again(&listed)
+            .expect("lists are compared later")
+            .flags()
+            .into_keys()
+            .collect();
         assert_eq!(names, ["keyframes", "scale"]);
-        let same = DataOptions { scale: Some(0.25), ..none.clone() };
+        let same = DataOptions {
+            scale: Some(0.25),
+            ..none.clone()
+        };
         assert_eq!(again(&same).expect("the same").flags(), first.flags());
-        let other = again(&DataOptions { scale: Some(0.5), ..none.clone() }).expect_err("another").to_string();
-        assert_eq!(other, "--scale 0.5: the checkpoint was trained with --scale 0.25");
-        assert!(again(&DataOptions { holdout: Some("2".into()), ..none }).is_err());
+        let other = again(&DataOptions {
+            scale: Some(0.5),
+            ..none.clone()
+        })
+        .expect_err("another")
+        .to_string();
+        assert_eq!(
+            other,
+            "--scale 0.5: the checkpoint was trained with --scale 0.25"
+        );
+        assert!(
+            again(&DataOptions {
+                holdout: Some("2".into()),
+                ..none
+            })
+            .is_err()
+        );
     }
 
     #[test]
@@ -495,7 +679,9 @@ mod tests {
         let folder = tempfile::tempdir().expect("a folder");
         let at = |name: &str| folder.path().join(name);
         let frame = |name: &str| {
-            image::RgbImage::from_pixel(64, 48, image::Rgb([10, 20, 30])).save(at(name)).expect("saved");
+            image::RgbImage::from_pixel(64, 48, image::Rgb([10, 20, 30]))
+                .save(at(name))
+                .expect("saved");
             let rows = [[1, 0, 0, 5], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]];
             json!({ "file_path": name, "transform_matrix": rows })
         };
@@ -503,33 +689,53 @@ mod tests {
         let mut document = json!({ "fl_x": 60.0, "frames": frames, "ply_file_path": "points.ply" });
         let load = |document: &Value| {
             std::fs::write(at("transforms.json"), document.to_string()).expect("written");
-            let data = Data::load(folder.path(), &DataOptions::default(), Purpose::Training, &[], &ignore_progress);
+            let data = Data::load(
+                folder.path(),
+                &DataOptions::default(),
+                Purpose::Training,
+                &[],
+                &ignore_progress,
+            );
             data.expect("points do not affect the images")
         };
         let coordinates = "property float x\nproperty float y\nproperty float z\n";
         let channels = "property uchar red\nproperty uchar green\nproperty uchar blue\n";
-        let header = format!("ply\nformat ascii 1.0\nelement vertex 2\n{coordinates}{channels}end_header\n");
-        let write = |rows: &str| std::fs::write(at("points.ply"), format!("{header}{rows}")).expect("written");
+        let header =
+            format!("ply\nformat ascii 1.0\nelement vertex 2\n{coordinates}{channels}end_header\n");
+        let write = |rows: &str| {
+            std::fs::write(at("points.ply"), format!("{header}{rows}")).expect("written")
+        };
 
         write("5.5 1 -3 255 0 0\nnan 0 0 1 2 3\n");
         let data = load(&document);
         let points = data.initial_points().expect("one point is usable");
         assert_eq!(points.points_in_world_m, [[5.5, 1.0, -3.0]]);
         assert_eq!(points.colors_srgb, [[255, 0, 0]]);
-        // The point is in the frame of the poses: to the right of the camera, above its axis, and in front of it.
+        // The point is in the frame of the poses: to the right of the camera, above its axis, and
+        // in front of it.
         let in_camera = data.keyframes[0].world_from_camera.inverse() * Point3::new(5.5, 1.0, -3.0);
-        assert!((in_camera - Point3::new(0.5, -1.0, 3.0)).norm() < 1e-9, "{in_camera}");
+        assert!(
+            (in_camera - Point3::new(0.5, -1.0, 3.0)).norm() < 1e-9,
+            "{in_camera}"
+        );
         let first = points_sha256(&points);
         write("5.5 1 -3 255 0 1\nnan 0 0 1 2 3\n");
         let second = points_sha256(&load(&document).initial_points().expect("another color"));
         assert!(first.len() == 64 && first != second, "{first} {second}");
 
-        let depth = image::ImageBuffer::<image::Luma<u16>, _>::from_pixel(64, 48, image::Luma([1000]));
+        let depth =
+            image::ImageBuffer::<image::Luma<u16>, _>::from_pixel(64, 48, image::Luma([1000]));
         depth.save(at("depth.png")).expect("saved");
         document["frames"][0]["depth_file_path"] = "depth.png".into();
-        assert!(load(&document).initial_points().is_some(), "test images do not matter");
+        assert!(
+            load(&document).initial_points().is_some(),
+            "test images do not matter"
+        );
         document["frames"][1]["depth_file_path"] = "depth.png".into();
-        assert!(load(&document).initial_points().is_none(), "depth has priority");
+        assert!(
+            load(&document).initial_points().is_none(),
+            "depth has priority"
+        );
         document["frames"][1]["depth_file_path"] = Value::Null;
         write("5.5 1 -3 255 0 1\n");
         assert!(load(&document).initial_points().is_none(), "truncated");

@@ -12,16 +12,20 @@ use std::sync::Arc;
 
 /// Depth unit: millimeters, which readers assume if the file does not specify a unit.
 const METERS_PER_COUNT: f64 = 0.001;
-/// Maximum difference between the intrinsics of depth and color, in pixels of the depth image. If they differ more,
-/// depth is not exported.
+/// Maximum difference between the intrinsics of depth and color, in pixels of the depth image. If
+/// they differ more, depth is not exported.
 const MAX_LENS_DIFFERENCE_PX: f64 = 0.5;
 /// List of the test images, one per line, in the format of `--holdout`.
 const TEST_LIST: &str = "test.txt";
 /// The split lists of nerfstudio.
-const LISTS: [(&str, Split); 3] =
-    [("train_filenames", Split::Train), ("val_filenames", Split::Validation), ("test_filenames", Split::Test)];
+const LISTS: [(&str, Split); 3] = [
+    ("train_filenames", Split::Train),
+    ("val_filenames", Split::Validation),
+    ("test_filenames", Split::Test),
+];
 
-/// The entries of a dataset folder. The last one identifies a dataset, so a folder that has it is complete.
+/// The entries of a dataset folder. The last one identifies a dataset, so a folder that has it is
+/// complete.
 const ENTRIES: [&str; 5] = [IMAGES, MASKS, DEPTH, TEST_LIST, nerfstudio::FILE_NAME];
 const IMAGES: &str = "images";
 const MASKS: &str = "masks";
@@ -34,18 +38,26 @@ pub struct Written {
     pub n_images: usize,
     /// Number of depth images.
     pub n_depth: usize,
-    /// Number of depth images that were left out, because their intrinsics differ from those of the color image. The
-    /// format cannot express this.
+    /// Number of depth images that were left out, because their intrinsics differ from those of the
+    /// color image. The format cannot express this.
     pub n_depth_skipped: usize,
 }
 
-/// Writes a dataset to a folder that does not contain one yet. The folder is written under a temporary name, so it is
-/// complete or absent even if the program is killed. Into a folder that exists already, `transforms.json` is moved last.
+/// Writes a dataset to a folder that does not contain one yet. The folder is written under a
+/// temporary name, so it is complete or absent even if the program is killed. Into a folder that
+/// exists already, `transforms.json` is moved last.
 ///
-/// Depth is rounded to millimeters and limited to 65 m. Velocities, readout times and ground truth of simulators are
-/// not exported.
-pub fn write_nerfstudio(out: &Path, keyframes: impl Iterator<Item = Arc<Keyframe>>) -> crate::Result<Written> {
-    if let Some(existing) = ENTRIES.iter().map(|entry| out.join(entry)).find(|entry| entry.exists()) {
+/// Depth is rounded to millimeters and limited to 65 m. Velocities, readout times and ground truth
+/// of simulators are not exported.
+pub fn write_nerfstudio(
+    out: &Path,
+    keyframes: impl Iterator<Item = Arc<Keyframe>>,
+) -> crate::Result<Written> {
+    if let Some(existing) = ENTRIES
+        .iter()
+        .map(|entry| out.join(entry))
+        .find(|entry| entry.exists())
+    {
         bail!("{} already exists: give another folder", existing.display());
     }
     for entry in ENTRIES {
@@ -54,12 +66,19 @@ pub fn write_nerfstudio(out: &Path, keyframes: impl Iterator<Item = Arc<Keyframe
     let mut keyframes = keyframes.peekable();
     ensure!(keyframes.peek().is_some(), "no keyframe to export");
     let in_out = || format!("cannot write {}", out.display());
-    out.parent().map_or(Ok(()), std::fs::create_dir_all).with_context(in_out)?;
-    files::create_folder(out, &ENTRIES, |folder| write_dataset(folder, keyframes)).with_context(in_out)
+    out.parent()
+        .map_or(Ok(()), std::fs::create_dir_all)
+        .with_context(in_out)?;
+    files::create_folder(out, &ENTRIES, |folder| write_dataset(folder, keyframes))
+        .with_context(in_out)
 }
 
-/// Writes the files of a dataset. Errors name them relative to the folder, which has a temporary name.
-fn write_dataset(folder: &Path, keyframes: impl Iterator<Item = Arc<Keyframe>>) -> crate::Result<Written> {
+/// Writes the files of a dataset. Errors name them relative to the folder, which has a temporary
+/// name.
+fn write_dataset(
+    folder: &Path,
+    keyframes: impl Iterator<Item = Arc<Keyframe>>,
+) -> crate::Result<Written> {
     let mut written = Written::default();
     let (mut cameras, mut frames, mut splits) = (Vec::new(), Vec::new(), Vec::new());
     for keyframe in keyframes {
@@ -68,28 +87,47 @@ fn write_dataset(folder: &Path, keyframes: impl Iterator<Item = Arc<Keyframe>>) 
         splits.push(keyframe.split);
     }
     let names = |wanted_split: Split| {
-        let of_split = frames.iter().zip(&splits).filter(move |(_, split)| **split == wanted_split);
-        of_split.filter_map(|(frame, _)| frame["file_path"].as_str().map(str::to_owned)).collect::<Vec<_>>()
+        let of_split = frames
+            .iter()
+            .zip(&splits)
+            .filter(move |(_, split)| **split == wanted_split);
+        of_split
+            .filter_map(|(frame, _)| frame["file_path"].as_str().map(str::to_owned))
+            .collect::<Vec<_>>()
     };
     write_text(folder, TEST_LIST, &(names(Split::Test).join("\n") + "\n"))?;
     let mut document = Map::new();
     document.insert("camera_model".to_owned(), json!("PINHOLE"));
-    document.insert("depth_unit_scale_factor".to_owned(), json!(METERS_PER_COUNT));
+    document.insert(
+        "depth_unit_scale_factor".to_owned(),
+        json!(METERS_PER_COUNT),
+    );
     document.extend(LISTS.map(|(key, split)| (key.to_owned(), json!(names(split)))));
-    // A single camera is written once at the top level, which every reader supports; several cameras are written per
-    // frame.
+    // A single camera is written once at the top level, which every reader supports; several
+    // cameras are written per frame.
     if cameras.iter().all(|camera| *camera == cameras[0]) {
         document.append(&mut cameras[0]);
     } else {
-        frames.iter_mut().zip(&mut cameras).for_each(|(frame, camera)| frame.append(camera));
+        frames
+            .iter_mut()
+            .zip(&mut cameras)
+            .for_each(|(frame, camera)| frame.append(camera));
     }
     document.insert("frames".to_owned(), json!(frames));
-    write_text(folder, nerfstudio::FILE_NAME, &serde_json::to_string_pretty(&document)?)?;
+    write_text(
+        folder,
+        nerfstudio::FILE_NAME,
+        &serde_json::to_string_pretty(&document)?,
+    )?;
     Ok(written)
 }
 
 /// Writes the images of one keyframe and returns its entry.
-fn write_frame(folder: &Path, keyframe: &Keyframe, written: &mut Written) -> crate::Result<Map<String, Value>> {
+fn write_frame(
+    folder: &Path,
+    keyframe: &Keyframe,
+    written: &mut Written,
+) -> crate::Result<Map<String, Value>> {
     let name = format!("{}_{:020}.png", keyframe.camera, keyframe.stamp.0);
     let [image, mask, depth_image] = [IMAGES, MASKS, DEPTH].map(|entry| format!("{entry}/{name}"));
     let mut frame = Map::new();
@@ -98,20 +136,44 @@ fn write_frame(folder: &Path, keyframe: &Keyframe, written: &mut Written) -> cra
     insert("transform_matrix", opengl_rows(&keyframe.world_from_camera));
 
     let pixels = keyframe.rgba_srgb.as_chunks::<4>().0;
-    let rgb: Vec<u8> = pixels.iter().flat_map(|&[red, green, blue, _]| [red, green, blue]).collect();
-    write_png(folder, &image, keyframe.size_px, &rgb, ExtendedColorType::Rgb8)?;
+    let rgb: Vec<u8> = pixels
+        .iter()
+        .flat_map(|&[red, green, blue, _]| [red, green, blue])
+        .collect();
+    write_png(
+        folder,
+        &image,
+        keyframe.size_px,
+        &rgb,
+        ExtendedColorType::Rgb8,
+    )?;
     written.n_images += 1;
     if pixels.iter().any(|pixel| pixel[3] == 0) {
         let alpha: Vec<u8> = pixels.iter().map(|pixel| pixel[3]).collect();
-        write_png(folder, &mask, keyframe.size_px, &alpha, ExtendedColorType::L8)?;
+        write_png(
+            folder,
+            &mask,
+            keyframe.size_px,
+            &alpha,
+            ExtendedColorType::L8,
+        )?;
         insert("mask_path", json!(mask));
     }
     match &keyframe.depth {
         Some(depth) if has_lens_of(depth, keyframe) => {
-            write_png(folder, &depth_image, depth.size_px, &depth_counts(depth), ExtendedColorType::L16)?;
+            write_png(
+                folder,
+                &depth_image,
+                depth.size_px,
+                &depth_counts(depth),
+                ExtendedColorType::L16,
+            )?;
             insert("depth_file_path", json!(depth_image));
             if depth.world_from_camera != keyframe.world_from_camera {
-                insert("depth_transform_matrix", opengl_rows(&depth.world_from_camera));
+                insert(
+                    "depth_transform_matrix",
+                    opengl_rows(&depth.world_from_camera),
+                );
             }
             written.n_depth += 1;
         }
@@ -124,8 +186,8 @@ fn write_frame(folder: &Path, keyframe: &Keyframe, written: &mut Written) -> cra
 /// Size and intrinsics of a keyframe under nerfstudio's keys.
 fn camera_keys(keyframe: &Keyframe) -> Map<String, Value> {
     let [[fl_x, fl_y], [cx, cy]] = [keyframe.focal_px, keyframe.principal_px];
-    let keys =
-        [("fl_x", fl_x), ("fl_y", fl_y), ("cx", cx), ("cy", cy)].map(|(key, value)| (key.to_owned(), json!(value)));
+    let keys = [("fl_x", fl_x), ("fl_y", fl_y), ("cx", cx), ("cy", cy)]
+        .map(|(key, value)| (key.to_owned(), json!(value)));
     let [width, height] = keyframe.size_px;
     let size = [("w", width), ("h", height)].map(|(key, value)| (key.to_owned(), json!(value)));
     keys.into_iter().chain(size).collect()
@@ -144,18 +206,31 @@ fn has_lens_of(depth: &DepthMap, keyframe: &Keyframe) -> bool {
         let ratio = f64::from(depth.size_px[axis]) / f64::from(keyframe.size_px[axis]);
         let focal_difference = depth.focal_px[axis] - ratio * keyframe.focal_px[axis];
         let principal_difference = depth.principal_px[axis] - ratio * keyframe.principal_px[axis];
-        focal_difference.abs() < MAX_LENS_DIFFERENCE_PX && principal_difference.abs() < MAX_LENS_DIFFERENCE_PX
+        focal_difference.abs() < MAX_LENS_DIFFERENCE_PX
+            && principal_difference.abs() < MAX_LENS_DIFFERENCE_PX
     })
 }
 
 /// Depth in millimeters, in native byte order as the encoder expects; 0 where unknown or too far.
-#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "the range is checked first")]
+#[expect(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "the range is checked first"
+)]
 fn depth_counts(depth: &DepthMap) -> Vec<u8> {
     let count = |depth_m: &f32| {
         let count = (f64::from(*depth_m) / METERS_PER_COUNT).round();
-        if (0.0..=f64::from(u16::MAX)).contains(&count) { count as u16 } else { 0 }
+        if (0.0..=f64::from(u16::MAX)).contains(&count) {
+            count as u16
+        } else {
+            0
+        }
     };
-    depth.depth_m.iter().flat_map(|depth_m| count(depth_m).to_ne_bytes()).collect()
+    depth
+        .depth_m
+        .iter()
+        .flat_map(|depth_m| count(depth_m).to_ne_bytes())
+        .collect()
 }
 
 /// Writes pixels in the given format to a file with a relative path.
@@ -189,13 +264,16 @@ mod tests {
     /// A keyframe of 32 x 24 pixels with depth.
     fn keyframe(ix: usize) -> Keyframe {
         let rotation = UnitQuaternion::from_euler_angles(0.1 * ix as f64, 0.2, -1.0);
-        let world_from_camera = Transform::from_parts(Vector3::new(ix as f64, 2.0, 3.0).into(), rotation);
+        let world_from_camera =
+            Transform::from_parts(Vector3::new(ix as f64, 2.0, 3.0).into(), rotation);
         let pixels = (0..24).flat_map(|y: u8| (0..32).flat_map(move |x: u8| [3 * x, y, 9, 255]));
         let depth = DepthMap {
             size_px: [16, 12],
             focal_px: [15.0, 15.5],
             principal_px: [8.0, 6.5],
-            depth_m: (0..16 * 12).map(|pixel_ix| pixel_ix as f32 * 0.011).collect(),
+            depth_m: (0..16 * 12)
+                .map(|pixel_ix| pixel_ix as f32 * 0.011)
+                .collect(),
             world_from_camera,
         };
         Keyframe {
@@ -220,7 +298,9 @@ mod tests {
         let dataset = drivers::dataset::read(out).unwrap();
         assert!(dataset.notes.is_empty(), "{:?}", dataset.notes);
         let holdout = Holdout::from_argument(out.join(TEST_LIST).to_str().unwrap()).unwrap();
-        dataset::load(&dataset, Some(&holdout), 1.0, &|_| ()).unwrap().keyframes
+        dataset::load(&dataset, Some(&holdout), 1.0, &|_| ())
+            .unwrap()
+            .keyframes
     }
 
     #[test]
@@ -234,7 +314,14 @@ mod tests {
         let moved_pose = Transform::translation(0.001, 0.0, 0.0) * keyframes[5].world_from_camera;
         keyframes[5].depth.as_mut().unwrap().world_from_camera = moved_pose;
         let written = write_nerfstudio(&out, keyframes.iter().cloned().map(Arc::new)).unwrap();
-        assert_eq!(written, Written { n_images: 10, n_depth: 10, n_depth_skipped: 0 });
+        assert_eq!(
+            written,
+            Written {
+                n_images: 10,
+                n_depth: 10,
+                n_depth_skipped: 0
+            }
+        );
         for (got, expected) in read_back(&out).iter().zip(&keyframes) {
             assert_eq!(
                 (got.size_px, got.focal_px, got.principal_px),
@@ -242,11 +329,30 @@ mod tests {
             );
             assert!(got.rgba_srgb == expected.rgba_srgb, "colors differ");
             assert_eq!(got.split == Split::Test, expected.split == Split::Test);
-            assert!((got.world_from_camera.inverse() * expected.world_from_camera).to_homogeneous().is_identity(1e-12));
-            let (got, expected) = (got.depth.as_ref().unwrap(), expected.depth.as_ref().unwrap());
-            assert_eq!((got.size_px, got.focal_px), (expected.size_px, expected.focal_px));
-            assert!(got.depth_m.iter().zip(expected.depth_m.iter()).all(|(a, b)| (a - b).abs() < 1e-6));
-            assert!((got.world_from_camera.inverse() * expected.world_from_camera).to_homogeneous().is_identity(1e-12));
+            assert!(
+                (got.world_from_camera.inverse() * expected.world_from_camera)
+                    .to_homogeneous()
+                    .is_identity(1e-12)
+            );
+            let (got, expected) = (
+                got.depth.as_ref().unwrap(),
+                expected.depth.as_ref().unwrap(),
+            );
+            assert_eq!(
+                (got.size_px, got.focal_px),
+                (expected.size_px, expected.focal_px)
+            );
+            assert!(
+                got.depth_m
+                    .iter()
+                    .zip(expected.depth_m.iter())
+                    .all(|(a, b)| (a - b).abs() < 1e-6)
+            );
+            assert!(
+                (got.world_from_camera.inverse() * expected.world_from_camera)
+                    .to_homogeneous()
+                    .is_identity(1e-12)
+            );
         }
     }
 
@@ -257,8 +363,16 @@ mod tests {
         second.camera = "overview".into();
         second.size_px = [24, 32];
         second.depth.as_mut().unwrap().focal_px = [40.0, 40.0];
-        let written = write_nerfstudio(folder.path(), [first, second].map(Arc::new).into_iter()).unwrap();
-        assert_eq!(written, Written { n_images: 2, n_depth: 1, n_depth_skipped: 1 });
+        let written =
+            write_nerfstudio(folder.path(), [first, second].map(Arc::new).into_iter()).unwrap();
+        assert_eq!(
+            written,
+            Written {
+                n_images: 2,
+                n_depth: 1,
+                n_depth_skipped: 1
+            }
+        );
         let sizes: Vec<_> = drivers::dataset::read(folder.path())
             .unwrap()
             .images
@@ -277,23 +391,42 @@ mod tests {
         std::fs::create_dir_all(&leftover).unwrap();
         std::fs::write(leftover.join("old.png"), b"half of").unwrap();
         let until_complete = |ix| {
-            assert!(!out.exists(), "the export can be killed before keyframe {ix}");
+            assert!(
+                !out.exists(),
+                "the export can be killed before keyframe {ix}"
+            );
             Arc::new(keyframe(ix))
         };
         write_nerfstudio(&out, (0..3).map(until_complete)).unwrap();
         assert_eq!(std::fs::read_dir(out.join(IMAGES)).unwrap().count(), 3);
-        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1, "no temporary folder remains");
-        let error = write_nerfstudio(&out.join("transforms.json/new"), (0..3).map(|ix| Arc::new(keyframe(ix))));
+        assert_eq!(
+            std::fs::read_dir(folder.path()).unwrap().count(),
+            1,
+            "no temporary folder remains"
+        );
+        let error = write_nerfstudio(
+            &out.join("transforms.json/new"),
+            (0..3).map(|ix| Arc::new(keyframe(ix))),
+        );
         let error = format!("{:#}", error.unwrap_err());
-        assert!(error.starts_with("cannot write ") && error.contains("transforms.json/new: "), "{error}");
+        assert!(
+            error.starts_with("cannot write ") && error.contains("transforms.json/new: "),
+            "{error}"
+        );
     }
 
     #[test]
     fn empty_exports_and_existing_datasets_are_rejected() {
         let folder = tempfile::tempdir().unwrap();
-        assert!(write_nerfstudio(folder.path(), std::iter::empty()).unwrap_err().to_string().contains("no keyframe"));
+        assert!(
+            write_nerfstudio(folder.path(), std::iter::empty())
+                .unwrap_err()
+                .to_string()
+                .contains("no keyframe")
+        );
         write_nerfstudio(folder.path(), std::iter::once(Arc::new(keyframe(0)))).unwrap();
-        let again = write_nerfstudio(folder.path(), std::iter::once(Arc::new(keyframe(0)))).unwrap_err();
+        let again =
+            write_nerfstudio(folder.path(), std::iter::once(Arc::new(keyframe(0)))).unwrap_err();
         assert!(again.to_string().contains("already exists"), "{again}");
     }
 }

@@ -1,8 +1,8 @@
-//! The log of timing-dependent decisions: at which step each keyframe was added or removed, when the result of an
-//! alignment was applied, and when training ended.
+//! The log of timing-dependent decisions: at which step each keyframe was added or removed, when
+//! the result of an alignment was applied, and when training ended.
 //!
-//! One JSON object per line, see `docs/reference/files.md`. The log contains steps but no times, so that replaying it
-//! with the same data gives the same model.
+//! One JSON object per line, see `docs/reference/files.md`. The log contains steps but no times, so
+//! that replaying it with the same data gives the same model.
 
 use crate::Error;
 use crate::error::Context;
@@ -36,11 +36,13 @@ pub struct Settings {
     pub adapter: String,
     /// Fraction of the width and height to which images were scaled.
     pub scale: f64,
-    /// SHA-256 of the model from which missing depth was rendered; `None` if depth was not rendered.
+    /// SHA-256 of the model from which missing depth was rendered; `None` if depth was not
+    /// rendered.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub depth_from: Option<String>,
-    /// SHA-256 of the points of the dataset from which training starts, see [`points_sha256`](crate::points_sha256); `None`
-    /// if there are none, or if they are not used because of depth.
+    /// SHA-256 of the points of the dataset from which training starts, see
+    /// [`points_sha256`](crate::points_sha256); `None` if there are none, or if they are not used
+    /// because of depth.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub points: Option<String>,
     /// Step of the checkpoint that training continued from; `None` for a new run.
@@ -72,7 +74,10 @@ pub struct RunDescription<'a> {
 impl Settings {
     /// The settings of a run.
     pub fn new(description: RunDescription<'_>) -> Self {
-        let name = |path: &Path| path.file_name().map(|name| name.to_string_lossy().into_owned());
+        let name = |path: &Path| {
+            path.file_name()
+                .map(|name| name.to_string_lossy().into_owned())
+        };
         Self {
             version: VERSION,
             method: description.method.to_owned(),
@@ -88,9 +93,13 @@ impl Settings {
 }
 
 impl Settings {
-    /// The same settings for a run that continues from the checkpoint of step `from_step`, or restarts if `None`.
+    /// The same settings for a run that continues from the checkpoint of step `from_step`, or
+    /// restarts if `None`.
     pub fn continued_from(&self, from_step: Option<u64>) -> Self {
-        Self { from_step, ..self.clone() }
+        Self {
+            from_step,
+            ..self.clone()
+        }
     }
 }
 
@@ -113,9 +122,11 @@ pub enum Decision {
     Push(Pushed),
     /// A keyframe was removed.
     Remove(Removed),
-    /// A picture was drawn before the next keyframe was added. This created splats from the keyframes so far.
+    /// A picture was drawn before the next keyframe was added. This created splats from the
+    /// keyframes so far.
     Seed(True),
-    /// Training on the keyframes so far was started, but no update was made before the next keyframe was added.
+    /// Training on the keyframes so far was started, but no update was made before the next
+    /// keyframe was added.
     Begin(True),
     /// The result of an alignment in the background was applied.
     Align(True),
@@ -137,8 +148,9 @@ pub struct Pushed {
     pub stamp_nanos: i64,
     split: String,
     fingerprint: String,
-    /// Correction of the base pose (`map_from_odom`), if the keyframe's station was re-registered: a translation in
-    /// meters, then a quaternion with its real part last. The keyframe's poses were multiplied by it from the left.
+    /// Correction of the base pose (`map_from_odom`), if the keyframe's station was re-registered:
+    /// a translation in meters, then a quaternion with its real part last. The keyframe's poses
+    /// were multiplied by it from the left.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     map_from_odom: Option<[f64; 7]>,
 }
@@ -177,11 +189,14 @@ impl Pushed {
             stamp_nanos: keyframe.stamp.0,
             split: split_name(keyframe.split).to_owned(),
             fingerprint: fingerprint_of(keyframe),
-            map_from_odom: map_from_odom.filter(is_motion).map(|motion| to_xyz_xyzw(&motion)),
+            map_from_odom: map_from_odom
+                .filter(is_motion)
+                .map(|motion| to_xyz_xyzw(&motion)),
         }
     }
 
-    /// The keyframe as it was added: `reported` with the logged correction of its base pose applied.
+    /// The keyframe as it was added: `reported` with the logged correction of its base pose
+    /// applied.
     pub fn corrected(&self, reported: &Arc<Keyframe>) -> Arc<Keyframe> {
         match self.map_from_odom {
             Some(numbers) => Arc::new(reported.with_base_correction(&from_xyz_xyzw(numbers))),
@@ -189,7 +204,8 @@ impl Pushed {
         }
     }
 
-    /// The split of the keyframe. Always `Some` for a log that was read, because the parser checks it.
+    /// The split of the keyframe. Always `Some` for a log that was read, because the parser checks
+    /// it.
     pub fn split(&self) -> Option<Split> {
         split_from_name(&self.split)
     }
@@ -216,7 +232,8 @@ enum Activity {
     Training,
 }
 
-/// Writes the log on a separate thread, so that a slow disk or a large image does not delay training.
+/// Writes the log on a separate thread, so that a slow disk or a large image does not delay
+/// training.
 pub struct DecisionLog {
     sender: SyncSender<Line>,
     thread: JoinHandle<std::io::Result<()>>,
@@ -235,23 +252,35 @@ enum Line {
 }
 
 impl DecisionLog {
-    /// Creates the log in a run folder. A run that continues from a checkpoint writes a separate file and keeps the
-    /// earlier log.
+    /// Creates the log in a run folder. A run that continues from a checkpoint writes a separate
+    /// file and keeps the earlier log.
     pub fn create(folder: &Path, settings: Settings) -> crate::Result<Self> {
         let name = match settings.from_step {
             None => FILE.to_owned(),
             Some(step) => FILE.replace('.', &format!("-from-{step}.")),
         };
         let path = folder.join(name);
-        let mut file = files::begin(&path).with_context(|| format!("cannot write {}", path.display()))?;
+        let mut file =
+            files::begin(&path).with_context(|| format!("cannot write {}", path.display()))?;
         let (sender, lines) = sync_channel(MAX_WAITING);
-        let thread = std::thread::Builder::new().name("decisions".into()).spawn(move || {
-            // Written line by line, so that all decisions so far are on disk if the process is killed.
-            lines.into_iter().try_for_each(|line: Line| file.write_all(line.text()?.as_bytes()))
-        });
+        let thread = std::thread::Builder::new()
+            .name("decisions".into())
+            .spawn(move || {
+                // Written line by line, so that all decisions so far are on disk if the process is
+                // killed.
+                lines
+                    .into_iter()
+                    .try_for_each(|line: Line| file.write_all(line.text()?.as_bytes()))
+            });
         let thread = thread.context("cannot start a thread")?;
         let kept = files::Kept::open(&path).ok();
-        let mut log = Self { sender, thread, kept, last_step: None, activity: Activity::Nothing };
+        let mut log = Self {
+            sender,
+            thread,
+            kept,
+            last_step: None,
+            activity: Activity::Nothing,
+        };
         log.write(Line::Settings(Box::new(settings)));
         Ok(log)
     }
@@ -270,26 +299,41 @@ impl DecisionLog {
     /// Logs that a keyframe was removed after this many steps.
     pub fn removed(&mut self, step: u64, camera: &str, stamp: Stamp) {
         self.log_activity(step);
-        let removed_keyframe = Removed { camera: camera.to_owned(), stamp_nanos: stamp.0 };
-        self.write(Line::Entry(Entry { step, decision: Decision::Remove(removed_keyframe) }));
+        let removed_keyframe = Removed {
+            camera: camera.to_owned(),
+            stamp_nanos: stamp.0,
+        };
+        self.write(Line::Entry(Entry {
+            step,
+            decision: Decision::Remove(removed_keyframe),
+        }));
     }
 
     /// Logs that the result of an alignment was applied after this many steps.
     pub fn aligned(&mut self, step: u64) {
         self.log_activity(step);
-        self.write(Line::Entry(Entry { step, decision: Decision::Align(True) }));
+        self.write(Line::Entry(Entry {
+            step,
+            decision: Decision::Align(True),
+        }));
     }
 
     /// Logs that a search for the model size was ended after this many steps.
     pub fn size_search_ended(&mut self, step: u64) {
         self.log_activity(step);
-        self.write(Line::Entry(Entry { step, decision: Decision::EndSizeSearch(True) }));
+        self.write(Line::Entry(Entry {
+            step,
+            decision: Decision::EndSizeSearch(True),
+        }));
     }
 
     /// Logs that growth was paused or continued after this many steps.
     pub fn growth_paused(&mut self, step: u64, is_paused: bool) {
         self.log_activity(step);
-        self.write(Line::Entry(Entry { step, decision: Decision::PauseGrowth(is_paused) }));
+        self.write(Line::Entry(Entry {
+            step,
+            decision: Decision::PauseGrowth(is_paused),
+        }));
     }
 
     /// Records that a picture was drawn.
@@ -304,10 +348,14 @@ impl DecisionLog {
         self.activity = Activity::Training;
     }
 
-    /// Logs that a checkpoint was taken after this many steps. It is not a decision, so it does not affect which activity
-    /// is logged: a replay takes other checkpoints, and its log must have the same decisions.
+    /// Logs that a checkpoint was taken after this many steps. It is not a decision, so it does not
+    /// affect which activity is logged: a replay takes other checkpoints, and its log must have the
+    /// same decisions.
     pub fn checkpoint(&mut self, step: u64) {
-        self.write(Line::Entry(Entry { step, decision: Decision::Checkpoint(True) }));
+        self.write(Line::Entry(Entry {
+            step,
+            decision: Decision::Checkpoint(True),
+        }));
     }
 
     /// Ends the log.
@@ -317,18 +365,26 @@ impl DecisionLog {
     /// If the log could not be written completely.
     pub fn end(mut self, step: u64) -> crate::Result<()> {
         self.log_activity(step);
-        self.write(Line::Entry(Entry { step, decision: Decision::End(True) }));
+        self.write(Line::Entry(Entry {
+            step,
+            decision: Decision::End(True),
+        }));
         drop(self.sender);
-        let written = self.thread.join().map_err(|_| Error::Failed("the log thread panicked: this is a bug".into()))?;
+        let written = self
+            .thread
+            .join()
+            .map_err(|_| Error::Failed("the log thread panicked: this is a bug".into()))?;
         written.context("the decision log is incomplete")?;
         match self.kept.filter(|kept| kept.place() != files::Place::Here) {
-            Some(kept) => kept.restore().with_context(|| format!("cannot write {} again", kept.path().display())),
+            Some(kept) => kept
+                .restore()
+                .with_context(|| format!("cannot write {} again", kept.path().display())),
             None => Ok(()),
         }
     }
 
-    /// Closes the log without an end, as if the run had been killed. All decisions so far are written when this
-    /// returns.
+    /// Closes the log without an end, as if the run had been killed. All decisions so far are
+    /// written when this returns.
     pub fn close_unfinished(self) {
         drop(self.sender);
         let _ = self.thread.join(); // After a write error, the log is valid up to an earlier step.
@@ -359,12 +415,14 @@ impl Line {
     fn text(self) -> std::io::Result<String> {
         let mut text = match self {
             Self::Settings(settings) => serde_json::to_string(&settings),
-            Self::Push(step, keyframe) => {
-                serde_json::to_string(&Entry { step, decision: Decision::Push(Pushed::of(&keyframe)) })
-            }
-            Self::Restored(step, keyframe) => {
-                serde_json::to_string(&Entry { step, decision: Decision::Restored(Pushed::of(&keyframe)) })
-            }
+            Self::Push(step, keyframe) => serde_json::to_string(&Entry {
+                step,
+                decision: Decision::Push(Pushed::of(&keyframe)),
+            }),
+            Self::Restored(step, keyframe) => serde_json::to_string(&Entry {
+                step,
+                decision: Decision::Restored(Pushed::of(&keyframe)),
+            }),
             Self::Entry(entry) => serde_json::to_string(&entry),
         }?;
         text.push('\n');
@@ -381,21 +439,26 @@ pub struct Decisions {
 
 impl Decisions {
     pub fn load(path: &Path) -> crate::Result<Self> {
-        let text = files::read_text(path).with_context(|| format!("cannot read the decision log {path:?}"))?;
+        let text = files::read_text(path)
+            .with_context(|| format!("cannot read the decision log {path:?}"))?;
         Self::parse(&text).with_context(|| format!("the decision log {path:?}"))
     }
 
     /// Whether the log contains the end of training. The log of a killed run does not.
     pub fn is_complete(&self) -> bool {
-        self.entries.last().is_some_and(|entry| entry.decision == Decision::End(True))
+        self.entries
+            .last()
+            .is_some_and(|entry| entry.decision == Decision::End(True))
     }
 
     /// The keyframes in the log, in order.
     pub fn pushed(&self) -> impl Iterator<Item = &Pushed> {
-        self.entries.iter().filter_map(|entry| match &entry.decision {
-            Decision::Restored(pushed) | Decision::Push(pushed) => Some(pushed),
-            _ => None,
-        })
+        self.entries
+            .iter()
+            .filter_map(|entry| match &entry.decision {
+                Decision::Restored(pushed) | Decision::Push(pushed) => Some(pushed),
+                _ => None,
+            })
     }
 
     fn parse(text: &str) -> crate::Result<Self> {
@@ -406,27 +469,39 @@ impl Decisions {
             serde_json::from_str(first).map_err(|e| invalid(format!("line 1: {e}")))?;
         match description["version"].as_u64() {
             Some(VERSION) => {}
-            Some(other) => return Err(invalid(format!("unsupported version {other}, expected {VERSION}"))),
+            Some(other) => {
+                return Err(invalid(format!(
+                    "unsupported version {other}, expected {VERSION}"
+                )));
+            }
             None => return Err(invalid("line 1 has no version".to_owned())),
         }
-        let settings = serde_json::from_value(description).map_err(|e| invalid(format!("line 1: {e}")))?;
+        let settings =
+            serde_json::from_value(description).map_err(|e| invalid(format!("line 1: {e}")))?;
         let mut entries: Vec<Entry> = Vec::new();
         for (line, number) in lines {
             if !line.ends_with('\n') {
                 break; // The run was killed while it wrote this line.
             }
-            let entry: Entry = serde_json::from_str(line).map_err(|e| invalid(format!("line {number}: {e}")))?;
+            let entry: Entry =
+                serde_json::from_str(line).map_err(|e| invalid(format!("line {number}: {e}")))?;
             let before = entries.last();
             if before.is_some_and(|before| before.decision == Decision::End(True)) {
                 return Err(invalid(format!("line {number} comes after the end")));
             }
             if before.is_some_and(|before| before.step > entry.step) {
-                return Err(invalid(format!("line {number}: step {} comes after a later step", entry.step)));
+                return Err(invalid(format!(
+                    "line {number}: step {} comes after a later step",
+                    entry.step
+                )));
             }
             if let Decision::Restored(pushed) | Decision::Push(pushed) = &entry.decision
                 && pushed.split().is_none()
             {
-                return Err(invalid(format!("line {number}: {:?} is not train, validation or test", pushed.split)));
+                return Err(invalid(format!(
+                    "line {number}: {:?} is not train, validation or test",
+                    pushed.split
+                )));
             }
             entries.push(entry);
         }
@@ -508,7 +583,11 @@ mod tests {
             .map(|(line, entry)| {
                 assert_eq!(serde_json::to_string(entry).expect("JSON"), line);
                 let value: serde_json::Value = serde_json::from_str(line).expect("JSON");
-                let mut keys = value.as_object().expect("an object").keys().filter(|key| *key != "step");
+                let mut keys = value
+                    .as_object()
+                    .expect("an object")
+                    .keys()
+                    .filter(|key| *key != "step");
                 (entry.step, keys.next().expect("a decision").clone())
             })
             .collect();
@@ -522,16 +601,36 @@ mod tests {
             (40, "checkpoint"),
             (60, "end"),
         ];
-        assert_eq!(expected_error, expected.map(|(step, what)| (step, what.to_owned())));
+        assert_eq!(
+            expected_error,
+            expected.map(|(step, what)| (step, what.to_owned()))
+        );
         assert!(read.is_complete());
-        let pushed: Vec<_> = read.pushed().map(|pushed| (pushed.stamp_nanos, pushed.split())).collect();
-        assert_eq!(pushed, [(17, Some(Split::Test)), (18, Some(Split::Train)), (19, Some(Split::Validation))]);
+        let pushed: Vec<_> = read
+            .pushed()
+            .map(|pushed| (pushed.stamp_nanos, pushed.split()))
+            .collect();
+        assert_eq!(
+            pushed,
+            [
+                (17, Some(Split::Test)),
+                (18, Some(Split::Train)),
+                (19, Some(Split::Validation))
+            ]
+        );
         let first = read.pushed().next().expect("one");
-        assert!(first.matches(&keyframe(17, Split::Train)), "the split is not part of the image");
+        assert!(
+            first.matches(&keyframe(17, Split::Train)),
+            "the split is not part of the image"
+        );
         let mut other = keyframe(17, Split::Test).as_ref().clone();
         other.rgba_srgb = vec![1, 2, 4, 255].into();
         assert!(!first.matches(&other));
-        assert!(text.contains("\"data\":\"scan.mcap\"") && !text.contains("somewhere") && !text.contains("secs\":"));
+        assert!(
+            text.contains("\"data\":\"scan.mcap\"")
+                && !text.contains("somewhere")
+                && !text.contains("secs\":")
+        );
     }
 
     #[test]
@@ -548,7 +647,10 @@ mod tests {
             log.pushed(50, &keyframe(18, Split::Train));
             log.end(60).expect("disk space");
             let text = std::fs::read_to_string(folder.path().join(FILE)).expect("the log");
-            text.lines().filter(|line| !line.contains("\"checkpoint\"")).map(str::to_owned).collect()
+            text.lines()
+                .filter(|line| !line.contains("\"checkpoint\""))
+                .map(str::to_owned)
+                .collect()
         };
         assert_eq!(decisions(true), decisions(false));
     }
@@ -561,8 +663,14 @@ mod tests {
         log.restored(130, &keyframe(18, Split::Train));
         log.end(260).expect("disk space");
         let read = Decisions::load(&folder.path().join("decisions-from-130.jsonl")).expect("a log");
-        assert_eq!((read.settings.from_step, read.pushed().count()), (Some(130), 1));
-        assert_eq!(std::fs::read_to_string(folder.path().join(FILE)).expect("the log"), before);
+        assert_eq!(
+            (read.settings.from_step, read.pushed().count()),
+            (Some(130), 1)
+        );
+        assert_eq!(
+            std::fs::read_to_string(folder.path().join(FILE)).expect("the log"),
+            before
+        );
     }
 
     #[test]
@@ -574,10 +682,21 @@ mod tests {
         let ended = text.trim_end().rfind('\n').expect("lines") + 1;
         for n_bytes in [ended, ended + 5, text.len() - 1] {
             let read = parse_prefix(n_bytes);
-            assert!(!read.is_complete() && read.entries.len() == lines - 2, "{n_bytes}: {:?}", read.entries);
+            assert!(
+                !read.is_complete() && read.entries.len() == lines - 2,
+                "{n_bytes}: {:?}",
+                read.entries
+            );
         }
-        assert!(parse_prefix(text.find('\n').expect("a line") + 1).entries.is_empty());
-        assert!(Decisions::parse(&text[..9]).is_err(), "a log without settings is invalid");
+        assert!(
+            parse_prefix(text.find('\n').expect("a line") + 1)
+                .entries
+                .is_empty()
+        );
+        assert!(
+            Decisions::parse(&text[..9]).is_err(),
+            "a log without settings is invalid"
+        );
     }
 
     #[test]
@@ -590,12 +709,27 @@ mod tests {
             ("\"scale\"", "\"skale\"", "line 1: "),
             ("\"begin\":true", "\"begin\":false", "line 5: must be true"),
             ("\"seed\":true", "\"sing\":true", "line 3: "),
-            ("\"validation\"", "\"selected\"", "line 6: \"selected\" is not train"),
-            ("{\"step\":40,\"remove\"", "{\"step\":70,\"remove\"", "line 8: step 40 comes after a later step"),
-            ("{\"step\":40,\"checkpoint\":true}", "{\"step\":40,\"end\":true}", "line 9 comes after the end"),
+            (
+                "\"validation\"",
+                "\"selected\"",
+                "line 6: \"selected\" is not train",
+            ),
+            (
+                "{\"step\":40,\"remove\"",
+                "{\"step\":70,\"remove\"",
+                "line 8: step 40 comes after a later step",
+            ),
+            (
+                "{\"step\":40,\"checkpoint\":true}",
+                "{\"step\":40,\"end\":true}",
+                "line 9 comes after the end",
+            ),
         ] {
             assert!(text.contains(was), "{was}");
-            let error = format!("{:#}", Decisions::parse(&text.replace(was, is)).expect_err(is));
+            let error = format!(
+                "{:#}",
+                Decisions::parse(&text.replace(was, is)).expect_err(is)
+            );
             assert!(error.contains(expected_error), "{error}");
         }
     }

@@ -25,8 +25,8 @@ pub struct DepthSource {
 pub struct RenderedDepth {
     model: PathBuf,
     model_sha256: String,
-    /// Number of images for which depth was rendered. Only images that lack depth in more than half of their pixels are
-    /// eligible.
+    /// Number of images for which depth was rendered. Only images that lack depth in more than half
+    /// of their pixels are eligible.
     pub n_images: usize,
     /// Fraction of the missing depth pixels of eligible images that were filled.
     rendered_frac: f64,
@@ -38,17 +38,20 @@ impl DepthSource {
         let invalid = |error: crate::Error| Error::BadInput(format!("--depth-from: {error:#}"));
         run_folder::expect_model(model).map_err(invalid)?;
         let sha256 = if model.is_file() {
-            let bytes =
-                files::read(model, files::Budget::PLAIN).with_context(|| format!("cannot read {}", model.display()))?;
+            let bytes = files::read(model, files::Budget::PLAIN)
+                .with_context(|| format!("cannot read {}", model.display()))?;
             run_folder::hex(&Sha256::digest(bytes))
         } else {
             run_folder::checkpoint_sha256(model)?
         };
-        Ok(Self { model: model.to_owned(), sha256 })
+        Ok(Self {
+            model: model.to_owned(),
+            sha256,
+        })
     }
 
-    /// Renders depth for training and validation keyframes that have no depth or only sparse depth. Measured depth is
-    /// kept.
+    /// Renders depth for training and validation keyframes that have no depth or only sparse depth.
+    /// Measured depth is kept.
     pub fn draw(
         &self,
         gpu: Arc<Gpu>,
@@ -56,11 +59,15 @@ impl DepthSource {
         progress: OnReadProgress<'_>,
     ) -> crate::Result<RenderedDepth> {
         let model_name = self.model.display();
-        let mut model = methods::load(gpu, &self.model).with_context(|| format!("--depth-from {model_name}"))?.method;
+        let mut model = methods::load(gpu, &self.model)
+            .with_context(|| format!("--depth-from {model_name}"))?
+            .method;
         let n_all = Some(keyframes.len());
         let mut totals = Filled::default();
         let mut n_images = 0;
-        let lacking = |keyframe: &&mut Arc<Keyframe>| keyframe.split != Split::Test && keyframe.lacks_dense_depth();
+        let lacking = |keyframe: &&mut Arc<Keyframe>| {
+            keyframe.split != Split::Test && keyframe.lacks_dense_depth()
+        };
         for (ix, keyframe) in keyframes.iter_mut().filter(lacking).enumerate() {
             let filled = fill(model.as_mut(), keyframe)?;
             n_images += usize::from(filled.n_rendered > 0);
@@ -68,11 +75,17 @@ impl DepthSource {
                 n_missing: totals.n_missing + filled.n_missing,
                 n_rendered: totals.n_rendered + filled.n_rendered,
             };
-            progress(ReadProgress { noun: "depth images", n_done: ix + 1, n_all });
+            progress(ReadProgress {
+                noun: "depth images",
+                n_done: ix + 1,
+                n_all,
+            });
         }
         if totals.n_missing > 0 && totals.n_rendered == 0 {
             let message = "the model is not visible in any image that lacks depth";
-            return Err(Error::InsufficientData(format!("--depth-from {model_name}: {message}; {CHECK_SAME_SCENE}")));
+            return Err(Error::InsufficientData(format!(
+                "--depth-from {model_name}: {message}; {CHECK_SAME_SCENE}"
+            )));
         }
         let rendered_frac = totals.n_rendered as f64 / totals.n_missing.max(1) as f64;
         let images = counted(n_images as u64, "image");
@@ -87,7 +100,12 @@ impl DepthSource {
             (_, frac) if frac < MIN_COVERED_FRAC => log::warn!("{message}; {CHECK_SAME_SCENE}"),
             _ => log::info!("{message}"),
         }
-        Ok(RenderedDepth { model: self.model.clone(), model_sha256: self.sha256.clone(), n_images, rendered_frac })
+        Ok(RenderedDepth {
+            model: self.model.clone(),
+            model_sha256: self.sha256.clone(),
+            n_images,
+            rendered_frac,
+        })
     }
 }
 
@@ -97,7 +115,9 @@ impl DepthSource {
 pub fn check_same(subject: &str, before: Option<&str>, now: Option<&str>) -> Result<(), Error> {
     match (before, now) {
         (before, now) if before == now => Ok(()),
-        (None, _) => Err(Error::BadInput(format!("{subject} was made without --depth-from: remove the flag"))),
+        (None, _) => Err(Error::BadInput(format!(
+            "{subject} was made without --depth-from: remove the flag"
+        ))),
         (Some(before), None) => Err(Error::BadInput(format!(
             "{subject} used depth rendered from the model with the SHA-256 {before}: give that model with --depth-from"
         ))),
@@ -115,8 +135,8 @@ struct Filled {
     n_rendered: u64,
 }
 
-/// Renders the missing depth of one keyframe at the resolution of its depth image, or of its color image if it has no
-/// depth.
+/// Renders the missing depth of one keyframe at the resolution of its depth image, or of its color
+/// image if it has no depth.
 fn fill(model: &mut dyn Method, keyframe: &mut Arc<Keyframe>) -> crate::Result<Filled> {
     let mut request_keyframe = keyframe.as_ref().clone();
     let depth = request_keyframe.depth.get_or_insert_with(|| DepthMap {
@@ -132,17 +152,24 @@ fn fill(model: &mut dyn Method, keyframe: &mut Arc<Keyframe>) -> crate::Result<F
     };
     let (depth_m, filled) = merge_depth(&measured.depth_m, &rendered);
     if filled.n_rendered > 0 {
-        request_keyframe.depth = Some(DepthMap { depth_m: depth_m.into(), ..measured });
+        request_keyframe.depth = Some(DepthMap {
+            depth_m: depth_m.into(),
+            ..measured
+        });
         *keyframe = Arc::new(request_keyframe);
     }
     Ok(filled)
 }
 
-/// Measured depth in meters. Missing pixels are filled with rendered depth, or 0 if that is missing, too.
+/// Measured depth in meters. Missing pixels are filled with rendered depth, or 0 if that is
+/// missing, too.
 fn merge_depth(own_m: &[f32], rendered: &Picture) -> (Vec<f32>, Filled) {
     let is_known = |z: f32| z > 0.0 && z.is_finite();
     let mut filled = Filled::default();
-    let pixels = own_m.iter().zip(&rendered.depth_m).zip(rendered.rgba_srgb.as_chunks::<4>().0);
+    let pixels = own_m
+        .iter()
+        .zip(&rendered.depth_m)
+        .zip(rendered.rgba_srgb.as_chunks::<4>().0);
     let depth_m = pixels.map(|((measured, rendered), [.., alpha])| {
         if is_known(*measured) {
             return *measured;
@@ -167,17 +194,39 @@ mod tests {
         let depth_m = vec![3.0, 3.0, 4.0, 5.0, f32::NAN, 0.0];
         let alphas = [255, 255, MIN_ALPHA, MIN_ALPHA - 1, 255, 255];
         let rgba_srgb = alphas.iter().flat_map(|alpha| [9, 9, 9, *alpha]).collect();
-        let (depth_m, filled) = merge_depth(&own_m, &Picture { size_px: [6, 1], rgba_srgb, depth_m });
+        let (depth_m, filled) = merge_depth(
+            &own_m,
+            &Picture {
+                size_px: [6, 1],
+                rgba_srgb,
+                depth_m,
+            },
+        );
         assert_eq!(depth_m, [2.0, 3.0, 4.0, 0.0, 0.0, 0.0]);
-        assert_eq!(filled, Filled { n_missing: 5, n_rendered: 2 });
+        assert_eq!(
+            filled,
+            Filled {
+                n_missing: 5,
+                n_rendered: 2
+            }
+        );
     }
 
     #[test]
     fn different_depth_model_is_rejected() {
-        let message = |before, now| check_same("the log", before, now).map_err(|error| error.to_string());
-        assert_eq!((message(None, None), message(Some("5ad1"), Some("5ad1"))), (Ok(()), Ok(())));
-        assert!(message(None, Some("5ad1")).is_err_and(|message| message.contains("remove the flag")));
-        assert!(message(Some("5ad1"), None).is_err_and(|message| message.contains("5ad1: give that model with")));
+        let message =
+            |before, now| check_same("the log", before, now).map_err(|error| error.to_string());
+        assert_eq!(
+            (message(None, None), message(Some("5ad1"), Some("5ad1"))),
+            (Ok(()), Ok(()))
+        );
+        assert!(
+            message(None, Some("5ad1")).is_err_and(|message| message.contains("remove the flag"))
+        );
+        assert!(
+            message(Some("5ad1"), None)
+                .is_err_and(|message| message.contains("5ad1: give that model with"))
+        );
         let other = message(Some("5ad1"), Some("c0de"));
         assert!(other.is_err_and(|message| message.contains("5ad1") && message.contains("c0de")));
     }

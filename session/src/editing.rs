@@ -6,8 +6,8 @@ use trainer::edits::{Edit, Edits, Floaters, PendingFloaters};
 use trainer::{Error, Method};
 use viz::{EditAction, EditRequest};
 
-/// Changes the edits of models. Searches for floaters on another thread, one model at a time, so that training and
-/// pictures continue.
+/// Changes the edits of models. Searches for floaters on another thread, one model at a time, so
+/// that training and pictures continue.
 #[derive(Default)]
 pub(crate) struct Editor {
     search: Option<Search>,
@@ -20,8 +20,8 @@ struct Search {
 }
 
 impl Editor {
-    /// Changes the edits of a model. Returns a note on what was done, `None` if a search was started, or the reason why
-    /// the edit is not possible.
+    /// Changes the edits of a model. Returns a note on what was done, `None` if a search was
+    /// started, or the reason why the edit is not possible.
     ///
     /// * `action`: the action of `request`, in the world of the model.
     pub(crate) fn apply(
@@ -32,12 +32,16 @@ impl Editor {
         method: &mut dyn Method,
     ) -> Result<Option<String>, String> {
         let applied = match action {
-            EditAction::Erase(aabb) => {
-                Arc::make_mut(edits).push(Edit::Box(*aabb)).map(|()| Some("erased a box".to_owned()))
-            }
-            EditAction::Undo => Arc::make_mut(edits).undo().map(|()| Some("undid the last edit".to_owned())),
+            EditAction::Erase(aabb) => Arc::make_mut(edits)
+                .push(Edit::Box(*aabb))
+                .map(|()| Some("erased a box".to_owned())),
+            EditAction::Undo => Arc::make_mut(edits)
+                .undo()
+                .map(|()| Some("undid the last edit".to_owned())),
             EditAction::RemoveFloaters if self.search.is_some() => {
-                return Err("a search for floaters is already running; wait for its result".to_owned());
+                return Err(
+                    "a search for floaters is already running; wait for its result".to_owned(),
+                );
             }
             EditAction::RemoveFloaters => method.find_floaters(edits).map(|pending| {
                 self.start(request.clone(), pending);
@@ -48,18 +52,28 @@ impl Editor {
     }
 
     fn start(&mut self, request: EditRequest, pending: PendingFloaters) {
-        self.search = Some(Search { request, thread: Task::start("floaters", || pending.finish()) });
+        self.search = Some(Search {
+            request,
+            thread: Task::start("floaters", || pending.finish()),
+        });
     }
 
     /// A note on the search that is running.
     pub(crate) fn note(&self) -> Option<String> {
-        self.search.as_ref().map(|_| "looking for floaters …".to_owned())
+        self.search
+            .as_ref()
+            .map(|_| "looking for floaters …".to_owned())
     }
 
-    /// Takes the result of the search if it is ready, or waits for it if `wait`: the request and the floaters, or the
-    /// reason why there are none.
-    pub(crate) fn take_found(&mut self, wait: bool) -> Option<(EditRequest, Result<Floaters, String>)> {
-        let Search { request, thread } = self.search.take_if(|search| wait || search.thread.is_finished())?;
+    /// Takes the result of the search if it is ready, or waits for it if `wait`: the request and
+    /// the floaters, or the reason why there are none.
+    pub(crate) fn take_found(
+        &mut self,
+        wait: bool,
+    ) -> Option<(EditRequest, Result<Floaters, String>)> {
+        let Search { request, thread } = self
+            .search
+            .take_if(|search| wait || search.thread.is_finished())?;
         let found = match thread.join() {
             Ok(found) => found.map_err(|error| error.to_string()),
             Err(_) => Err("the search for floaters panicked".to_owned()),
@@ -71,10 +85,19 @@ impl Editor {
 /// Erases floaters. Returns a note on what was done, or the reason why it is not possible.
 pub(crate) fn erase_floaters(
     edits: &mut Arc<Edits>,
-    Floaters { cells, n_erased, item }: Floaters,
+    Floaters {
+        cells,
+        n_erased,
+        item,
+    }: Floaters,
 ) -> Result<String, String> {
-    Arc::make_mut(edits).push(Edit::Cells(cells)).map_err(|error| error.to_string())?;
-    Ok(format!("removed floaters: {}", keyframe::counted(n_erased, item)))
+    Arc::make_mut(edits)
+        .push(Edit::Cells(cells))
+        .map_err(|error| error.to_string())?;
+    Ok(format!(
+        "removed floaters: {}",
+        keyframe::counted(n_erased, item)
+    ))
 }
 
 #[cfg(test)]
@@ -88,8 +111,9 @@ mod tests {
         let mut editor = Editor::default();
         let mut edits = Arc::default();
         let request = EditRequest::of_nobody(EditAction::RemoveFloaters);
-        let mut apply =
-            |editor: &mut Editor, action: &EditAction| editor.apply(&request, action, &mut edits, &mut FailedModel);
+        let mut apply = |editor: &mut Editor, action: &EditAction| {
+            editor.apply(&request, action, &mut edits, &mut FailedModel)
+        };
         let (end, ended) = mpsc::sync_channel(1);
         editor.start(
             request.clone(),
@@ -100,13 +124,26 @@ mod tests {
         );
         assert!(editor.take_found(false).is_none() && editor.note().is_some());
         let second = apply(&mut editor, &EditAction::RemoveFloaters);
-        assert_eq!(second, Err("a search for floaters is already running; wait for its result".to_owned()));
-        assert_eq!(apply(&mut editor, &EditAction::Undo), Err("there is nothing to undo".to_owned()));
+        assert_eq!(
+            second,
+            Err("a search for floaters is already running; wait for its result".to_owned())
+        );
+        assert_eq!(
+            apply(&mut editor, &EditAction::Undo),
+            Err("there is nothing to undo".to_owned())
+        );
         end.send(()).expect("the search waits");
         let (of, found) = editor.take_found(true).expect("a result");
-        assert_eq!((of, found), (request.clone(), Err(Error::NoFloaters.to_string())));
+        assert_eq!(
+            (of, found),
+            (request.clone(), Err(Error::NoFloaters.to_string()))
+        );
         assert!(editor.take_found(true).is_none() && editor.note().is_none());
         let third = apply(&mut editor, &EditAction::RemoveFloaters);
-        assert_eq!(third, Err(Error::CannotFindFloaters.to_string()), "the model is asked again");
+        assert_eq!(
+            third,
+            Err(Error::CannotFindFloaters.to_string()),
+            "the model is asked again"
+        );
     }
 }

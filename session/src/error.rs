@@ -9,8 +9,8 @@ pub type Result<T, E = Error> = std::result::Result<T, E>;
 
 /// Reason why a session cannot train, evaluate, save or resume.
 ///
-/// [`Error::class`] distinguishes invalid input, insufficient data and failures. `{}` prints the outermost context;
-/// `{:#}` also prints all causes.
+/// [`Error::class`] distinguishes invalid input, insufficient data and failures. `{}` prints the
+/// outermost context; `{:#}` also prints all causes.
 #[derive(Debug)]
 #[non_exhaustive]
 pub enum Error {
@@ -34,7 +34,8 @@ pub enum Error {
     Io(std::io::Error),
     /// An error of another library.
     Other(Box<dyn StdError + Send + Sync>),
-    /// The GPU failed and the run could not continue on another device. The message describes how to continue.
+    /// The GPU failed and the run could not continue on another device. The message describes how
+    /// to continue.
     GpuUnrecoverable(String),
     /// The operation that failed, with the cause.
     Context {
@@ -50,7 +51,9 @@ impl Error {
     #[must_use]
     pub fn class(&self) -> ErrorClass {
         match self {
-            Self::BadInput(_) | Self::Trainer(trainer::Error::BudgetTooSmall { .. }) => ErrorClass::BadInput,
+            Self::BadInput(_) | Self::Trainer(trainer::Error::BudgetTooSmall { .. }) => {
+                ErrorClass::BadInput
+            }
             Self::InsufficientData(_) => ErrorClass::InsufficientData,
             Self::Capture(error) => error.class(),
             Self::Keyframe(error) => error.class(),
@@ -92,7 +95,9 @@ impl Error {
         while let Some(error) = cause {
             let is_io = match error.downcast_ref() {
                 Some(Self::Io(_)) => true,
-                Some(Self::Trainer(error)) => error.source().is_some_and(|source| source.is::<std::io::Error>()),
+                Some(Self::Trainer(error)) => error
+                    .source()
+                    .is_some_and(|source| source.is::<std::io::Error>()),
                 _ => error.is::<std::io::Error>(),
             };
             if is_io {
@@ -106,7 +111,10 @@ impl Error {
     /// Adds the operation that failed.
     #[must_use]
     pub fn with_context(self, context: impl Into<String>) -> Self {
-        Self::Context { context: context.into(), source: Box::new(self) }
+        Self::Context {
+            context: context.into(),
+            source: Box::new(self),
+        }
     }
 }
 
@@ -114,9 +122,10 @@ impl Error {
 impl Display for Error {
     fn fmt(&self, f: &mut Formatter<'_>) -> std::fmt::Result {
         match self {
-            Self::BadInput(text) | Self::InsufficientData(text) | Self::Failed(text) | Self::GpuUnrecoverable(text) => {
-                f.write_str(text)
-            }
+            Self::BadInput(text)
+            | Self::InsufficientData(text)
+            | Self::Failed(text)
+            | Self::GpuUnrecoverable(text) => f.write_str(text),
             Self::Capture(error) => write_chain(f, error),
             Self::Trainer(error) => write_chain(f, error),
             Self::Keyframe(error) => write_chain(f, error),
@@ -124,7 +133,9 @@ impl Display for Error {
             Self::Kinematics(error) => write_chain(f, error),
             Self::Io(error) => write_chain(f, error),
             Self::Other(error) => write_chain(f, error.as_ref()),
-            Self::Context { context, source } if f.alternate() => write!(f, "{context}: {source:#}"),
+            Self::Context { context, source } if f.alternate() => {
+                write!(f, "{context}: {source:#}")
+            }
             Self::Context { context, .. } => f.write_str(context),
         }
     }
@@ -133,7 +144,10 @@ impl Display for Error {
 impl StdError for Error {
     fn source(&self) -> Option<&(dyn StdError + 'static)> {
         match self {
-            Self::BadInput(_) | Self::InsufficientData(_) | Self::Failed(_) | Self::GpuUnrecoverable(_) => None,
+            Self::BadInput(_)
+            | Self::InsufficientData(_)
+            | Self::Failed(_)
+            | Self::GpuUnrecoverable(_) => None,
             Self::Capture(error) => error.source(),
             Self::Trainer(error) => error.source(),
             Self::Keyframe(error) => error.source(),
@@ -157,10 +171,14 @@ mod tests {
 
     #[test]
     fn context_keeps_the_class_and_the_causes() {
-        let error = Err::<(), _>(Error::BadInput("scale is 2".into())).context("rig.toml").expect_err("an error");
+        let error = Err::<(), _>(Error::BadInput("scale is 2".into()))
+            .context("rig.toml")
+            .expect_err("an error");
         assert_eq!(error.class(), ErrorClass::BadInput);
         assert_eq!(format!("{error:#}"), "rig.toml: scale is 2");
-        let missing = std::fs::read("no/such/file").with_context(|| "the list").expect_err("no file");
+        let missing = std::fs::read("no/such/file")
+            .with_context(|| "the list")
+            .expect_err("no file");
         assert_eq!(missing.class(), ErrorClass::Failed);
         assert!(format!("{missing:#}").starts_with("the list: "));
     }

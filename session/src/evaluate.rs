@@ -1,4 +1,5 @@
-//! Evaluates a model: renders it at the pose and size of each test keyframe, and scores the renders.
+//! Evaluates a model: renders it at the pose and size of each test keyframe, and scores the
+//! renders.
 //!
 //! `train`, `run` and `eval` all use this code, so they report the same scores for the same model.
 
@@ -31,12 +32,16 @@ pub const MIN_ALPHA: u8 = 128;
 /// Minimum covered fraction. With less, model and images probably show different scenes.
 pub const MIN_COVERED_FRAC: f64 = 0.05;
 /// Hint to print if the covered fraction is below [`MIN_COVERED_FRAC`].
-pub const CHECK_SAME_SCENE: &str = "check that model and camera poses belong to the same scene and world frame";
+pub const CHECK_SAME_SCENE: &str =
+    "check that model and camera poses belong to the same scene and world frame";
 
-/// Loads LPIPS if the flag or `FIELDRIG_LPIPS_WEIGHTS` gives weights. A program built without LPIPS logs a warning.
+/// Loads LPIPS if the flag or `FIELDRIG_LPIPS_WEIGHTS` gives weights. A program built without LPIPS
+/// logs a warning.
 pub fn load_lpips(flag: Option<&Path>) -> Result<Option<Lpips>, trainer::Error> {
     let named = std::env::var_os(LPIPS_WEIGHTS).map(PathBuf::from);
-    let Some(weights) = flag.or(named.as_deref()) else { return Ok(None) };
+    let Some(weights) = flag.or(named.as_deref()) else {
+        return Ok(None);
+    };
     match Lpips::load(weights) {
         Err(error @ trainer::Error::LpipsNotBuilt) => {
             log::warn!("no LPIPS: {error}");
@@ -70,7 +75,8 @@ pub struct ImageScores {
     pub lpips: Option<f64>,
     /// Root mean square error along z over pixels with rendered and measured depth, meters.
     pub depth_rmse_m: Option<f64>,
-    /// Accuracy: mean distance of the rendered surface from the measured surface along the measured normal, meters.
+    /// Accuracy: mean distance of the rendered surface from the measured surface along the measured
+    /// normal, meters.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub surface_error_m: Option<f64>,
     /// Completeness: fraction of the measured surface that is rendered within 5 mm.
@@ -116,24 +122,38 @@ pub struct Scores {
 }
 
 impl Evaluator {
-    /// Computes PSNR, SSIM, depth scores and, if the flag or `FIELDRIG_LPIPS_WEIGHTS` gives weights, LPIPS.
+    /// Computes PSNR, SSIM, depth scores and, if the flag or `FIELDRIG_LPIPS_WEIGHTS` gives
+    /// weights, LPIPS.
     pub fn thorough(lpips_weights: Option<&Path>) -> crate::Result<Self> {
-        Ok(Self { is_full: true, lpips: load_lpips(lpips_weights)?.map(Arc::new) })
+        Ok(Self {
+            is_full: true,
+            lpips: load_lpips(lpips_weights)?.map(Arc::new),
+        })
     }
 
     /// Returns this evaluator without LPIPS, which takes seconds per image.
     #[must_use]
     pub fn without_lpips(&self) -> Self {
-        Self { lpips: None, ..self.clone() }
+        Self {
+            lpips: None,
+            ..self.clone()
+        }
     }
 
     /// Computes PSNR only, with one render per image.
     pub fn psnr_only() -> Self {
-        Self { is_full: false, lpips: None }
+        Self {
+            is_full: false,
+            lpips: None,
+        }
     }
 
     /// Scores one test keyframe.
-    pub fn score(&self, method: &mut dyn Method, keyframe: &Keyframe) -> crate::Result<ImageScores> {
+    pub fn score(
+        &self,
+        method: &mut dyn Method,
+        keyframe: &Keyframe,
+    ) -> crate::Result<ImageScores> {
         if !self.is_full
             && self.lpips.is_none()
             && let Some(psnr) = psnr_on_gpu(method, keyframe)?
@@ -156,14 +176,20 @@ impl Evaluator {
     }
 
     /// Scores one test keyframe. Errors name the keyframe.
-    pub fn score_named(&self, method: &mut dyn Method, keyframe: &Keyframe) -> crate::Result<ImageScores> {
-        self.score(method, keyframe).with_context(|| name_of(keyframe))
+    pub fn score_named(
+        &self,
+        method: &mut dyn Method,
+        keyframe: &Keyframe,
+    ) -> crate::Result<ImageScores> {
+        self.score(method, keyframe)
+            .with_context(|| name_of(keyframe))
     }
 
-    /// Scores test keyframes: while some are scored on the CPU, the next ones are rendered. The result has the order of
-    /// `tests`.
+    /// Scores test keyframes: while some are scored on the CPU, the next ones are rendered. The
+    /// result has the order of `tests`.
     ///
-    /// * `meanwhile`: called often, with the number of scored keyframes, also while no render is due.
+    /// * `meanwhile`: called often, with the number of scored keyframes, also while no render is
+    ///   due.
     pub fn score_all<'a>(
         &self,
         method: &mut dyn Method,
@@ -177,9 +203,15 @@ impl Evaluator {
             let mut n_drawn = 0;
             let mut tests = tests.fuse();
             loop {
-                let next = if n_drawn - scored.len() < max_waiting { tests.next() } else { None };
+                let next = if n_drawn - scored.len() < max_waiting {
+                    tests.next()
+                } else {
+                    None
+                };
                 if let Some(keyframe) = next {
-                    let drawn = self.draw(method, keyframe).with_context(|| name_of(keyframe))?;
+                    let drawn = self
+                        .draw(method, keyframe)
+                        .with_context(|| name_of(keyframe))?;
                     let (ix, sender) = (n_drawn, sender.clone());
                     scope.spawn(move |_| {
                         let scores = catch_unwind(AssertUnwindSafe(|| drawn.scores(self)));
@@ -190,7 +222,11 @@ impl Evaluator {
                 } else if scored.len() == n_drawn {
                     return Ok(());
                 }
-                let wait = if next.is_some() { Duration::ZERO } else { MEANWHILE_PERIOD };
+                let wait = if next.is_some() {
+                    Duration::ZERO
+                } else {
+                    MEANWHILE_PERIOD
+                };
                 if let Ok((ix, keyframe, scores)) = receiver.recv_timeout(wait) {
                     let scores = scores.unwrap_or_else(|panic| resume_unwind(panic));
                     scored.push((ix, scores.with_context(|| name_of(keyframe))?));
@@ -204,17 +240,32 @@ impl Evaluator {
     }
 
     /// Renders the pictures from which the scores of a keyframe are computed.
-    fn draw<'a>(&self, method: &mut dyn Method, keyframe: &'a Keyframe) -> crate::Result<Drawn<'a>> {
+    fn draw<'a>(
+        &self,
+        method: &mut dyn Method,
+        keyframe: &'a Keyframe,
+    ) -> crate::Result<Drawn<'a>> {
         let (depth, at_truth) = match self.is_full {
-            true => (draw_depth(method, keyframe)?, draw_at_truth(method, keyframe)?),
+            true => (
+                draw_depth(method, keyframe)?,
+                draw_at_truth(method, keyframe)?,
+            ),
             false => (None, None),
         };
-        Ok(Drawn { keyframe, picture: draw(method, keyframe, false)?, depth, at_truth })
+        Ok(Drawn {
+            keyframe,
+            picture: draw(method, keyframe, false)?,
+            depth,
+            at_truth,
+        })
     }
 }
 
 fn name_of(keyframe: &Keyframe) -> String {
-    format!("test image of {:?} at {} ns", keyframe.camera, keyframe.stamp.0)
+    format!(
+        "test image of {:?} at {} ns",
+        keyframe.camera, keyframe.stamp.0
+    )
 }
 
 /// The renders from which the scores of a test keyframe are computed.
@@ -230,21 +281,39 @@ struct Drawn<'a> {
 impl Drawn<'_> {
     /// Computes the scores, without the GPU.
     fn scores(&self, evaluator: &Evaluator) -> crate::Result<ImageScores> {
-        let Self { keyframe, picture, depth, at_truth } = self;
+        let Self {
+            keyframe,
+            picture,
+            depth,
+            at_truth,
+        } = self;
         let pair = PixelPair::new(keyframe.size_px, &picture.rgba_srgb, &keyframe.rgba_srgb)?;
-        let rmse_m = depth.as_ref().map(|(drawn, depth)| depth_rmse_m(&drawn.depth_m, &depth.depth_m));
-        let surface = depth.as_ref().map(|(drawn, depth)| surface_error(&drawn.depth_m, depth)).transpose()?.flatten();
-        let truth = keyframe.truth.as_ref();
-        let psnr_truth = at_truth
+        let rmse_m = depth
             .as_ref()
-            .zip(truth)
-            .map(|(drawn, truth)| psnr(&PixelPair::new(keyframe.size_px, &drawn.rgba_srgb, &truth.rgba_srgb)?));
+            .map(|(drawn, depth)| depth_rmse_m(&drawn.depth_m, &depth.depth_m));
+        let surface = depth
+            .as_ref()
+            .map(|(drawn, depth)| surface_error(&drawn.depth_m, depth))
+            .transpose()?
+            .flatten();
+        let truth = keyframe.truth.as_ref();
+        let psnr_truth = at_truth.as_ref().zip(truth).map(|(drawn, truth)| {
+            psnr(&PixelPair::new(
+                keyframe.size_px,
+                &drawn.rgba_srgb,
+                &truth.rgba_srgb,
+            )?)
+        });
         Ok(ImageScores {
             camera: keyframe.camera.to_string(),
             stamp_nanos: keyframe.stamp.0,
             psnr: psnr(&pair)?,
             ssim: evaluator.is_full.then(|| ssim(&pair)).transpose()?,
-            lpips: evaluator.lpips.as_ref().map(|lpips| lpips.distance(&pair)).transpose()?,
+            lpips: evaluator
+                .lpips
+                .as_ref()
+                .map(|lpips| lpips.distance(&pair))
+                .transpose()?,
             depth_rmse_m: rmse_m.transpose()?.flatten(),
             surface_error_m: surface.and_then(|surface| surface.mean_m),
             surface_within_5_mm: surface.map(|surface| surface.near_frac),
@@ -260,7 +329,10 @@ impl Scores {
     pub fn mean(images: &[ImageScores]) -> Self {
         let mut psnr_per_camera = BTreeMap::new();
         for image in images {
-            psnr_per_camera.entry(image.camera.clone()).or_insert_with(Vec::new).push(image.psnr);
+            psnr_per_camera
+                .entry(image.camera.clone())
+                .or_insert_with(Vec::new)
+                .push(image.psnr);
         }
         if psnr_per_camera.len() < 2 {
             psnr_per_camera.clear();
@@ -284,33 +356,58 @@ impl Scores {
 
 impl Display for Scores {
     fn fmt(&self, f: &mut Formatter<'_>) -> std::fmt::Result {
-        let decibels = |what: &str, value: Option<f64>| value.map(|value| format!("{what} {value:.2} dB"));
+        let decibels =
+            |what: &str, value: Option<f64>| value.map(|value| format!("{what} {value:.2} dB"));
         let mut words: Vec<String> = decibels("PSNR", self.psnr).into_iter().collect();
-        words.extend(self.psnr_per_camera.iter().filter_map(|(camera, psnr)| decibels(camera, Some(*psnr))));
+        words.extend(
+            self.psnr_per_camera
+                .iter()
+                .filter_map(|(camera, psnr)| decibels(camera, Some(*psnr))),
+        );
         words.extend(decibels("against truth", self.psnr_truth));
         words.extend(decibels("ceiling", self.psnr_ceiling));
         words.extend(self.ssim.map(|ssim| format!("SSIM {ssim:.4}")));
         words.extend(self.lpips.map(|lpips| format!("LPIPS {lpips:.4}")));
-        words.extend(self.depth_rmse_m.map(|depth| format!("depth {:.1} mm", depth * 1e3)));
-        words.extend(self.surface_error_m.map(|error| format!("surface {:.1} mm", error * 1e3)));
-        words.extend(self.surface_within_5_mm.map(|share| format!("{:.1} % within 5 mm", share * 1e2)));
-        if words.is_empty() { f.write_str("no test image yet") } else { f.write_str(&words.join(", ")) }
+        words.extend(
+            self.depth_rmse_m
+                .map(|depth| format!("depth {:.1} mm", depth * 1e3)),
+        );
+        words.extend(
+            self.surface_error_m
+                .map(|error| format!("surface {:.1} mm", error * 1e3)),
+        );
+        words.extend(
+            self.surface_within_5_mm
+                .map(|share| format!("{:.1} % within 5 mm", share * 1e2)),
+        );
+        if words.is_empty() {
+            f.write_str("no test image yet")
+        } else {
+            f.write_str(&words.join(", "))
+        }
     }
 }
 
 /// Fraction of a picture's pixels that the model covers.
 pub fn covered_frac(picture: &Picture) -> f64 {
     let pixels = picture.rgba_srgb.as_chunks::<4>().0;
-    let n_covered = pixels.iter().filter(|[.., alpha]| *alpha >= MIN_ALPHA).count();
+    let n_covered = pixels
+        .iter()
+        .filter(|[.., alpha]| *alpha >= MIN_ALPHA)
+        .count();
     n_covered as f64 / pixels.len().max(1) as f64
 }
 
-/// Logs a warning if a model covers almost nothing of several pictures, given the covered fraction of each.
+/// Logs a warning if a model covers almost nothing of several pictures, given the covered fraction
+/// of each.
 pub fn warn_if_hardly_covered(covered_fracs: &[f64]) {
     let covered_frac = covered_fracs.iter().sum::<f64>() / covered_fracs.len().max(1) as f64;
     if covered_frac < MIN_COVERED_FRAC {
         let views = counted(covered_fracs.len() as u64, "view");
-        log::warn!("the model covers {:.1} % of {views}; {CHECK_SAME_SCENE}", 100.0 * covered_frac);
+        log::warn!(
+            "the model covers {:.1} % of {views}; {CHECK_SAME_SCENE}",
+            100.0 * covered_frac
+        );
     }
 }
 
@@ -324,12 +421,20 @@ fn mean(values: impl Iterator<Item = Option<f64>>) -> Option<f64> {
     (n > 0.0).then(|| sum / n)
 }
 
-/// Renders a model at the pose of a keyframe, with the model's background and the keyframe's rolling shutter and color
-/// gains.
-pub fn draw(method: &mut dyn Method, keyframe: &Keyframe, depth: bool) -> Result<Picture, trainer::Error> {
+/// Renders a model at the pose of a keyframe, with the model's background and the keyframe's
+/// rolling shutter and color gains.
+pub fn draw(
+    method: &mut dyn Method,
+    keyframe: &Keyframe,
+    depth: bool,
+) -> Result<Picture, trainer::Error> {
     let lens = method.calibrated_camera(keyframe)?;
     let background_srgb = method.background_srgb();
-    let mut picture = method.render(&RenderRequest { depth, background_srgb, ..request(keyframe, &lens) })?;
+    let mut picture = method.render(&RenderRequest {
+        depth,
+        background_srgb,
+        ..request(keyframe, &lens)
+    })?;
     if lens.gains != [1.0; 3] {
         let by_byte = lens.gains.map(gain_table);
         for [red, green, blue, _] in picture.rgba_srgb.as_chunks_mut::<4>().0 {
@@ -341,30 +446,44 @@ pub fn draw(method: &mut dyn Method, keyframe: &Keyframe, depth: bool) -> Result
     Ok(picture)
 }
 
-/// Computes the PSNR of [`draw`]'s picture on the GPU, bit-identical to the PSNR of the picture on the host. `None` if
-/// the method does not support this, or if gains are applied after rendering.
-fn psnr_on_gpu(method: &mut dyn Method, keyframe: &Keyframe) -> Result<Option<f64>, trainer::Error> {
+/// Computes the PSNR of [`draw`]'s picture on the GPU, bit-identical to the PSNR of the picture on
+/// the host. `None` if the method does not support this, or if gains are applied after rendering.
+fn psnr_on_gpu(
+    method: &mut dyn Method,
+    keyframe: &Keyframe,
+) -> Result<Option<f64>, trainer::Error> {
     let lens = method.calibrated_camera(keyframe)?;
     if lens.gains != [1.0; 3] {
         return Ok(None);
     }
     let background_srgb = method.background_srgb();
-    method.psnr(&RenderRequest { background_srgb, ..request(keyframe, &lens) }, keyframe)
+    method.psnr(
+        &RenderRequest {
+            background_srgb,
+            ..request(keyframe, &lens)
+        },
+        keyframe,
+    )
 }
 
-/// Renders a model at the pose of a keyframe's depth image. Size and intrinsics come from `depth`, which may be a
-/// subsampled depth map. `None` for a keyframe without depth.
+/// Renders a model at the pose of a keyframe's depth image. Size and intrinsics come from `depth`,
+/// which may be a subsampled depth map. `None` for a keyframe without depth.
 pub fn render_depth(
     method: &mut dyn Method,
     keyframe: &Keyframe,
     depth: &DepthMap,
 ) -> Result<Option<Picture>, trainer::Error> {
     let lens = method.calibrated_camera(keyframe)?;
-    let Some(color_from_depth) = lens.color_from_depth else { return Ok(None) };
+    let Some(color_from_depth) = lens.color_from_depth else {
+        return Ok(None);
+    };
     let drawn = method.render(&RenderRequest {
         world_from_camera: lens.world_from_camera * color_from_depth,
         size_px: depth.size_px,
-        projection: Projection::Pinhole { focal_px: depth.focal_px, principal_px: depth.principal_px },
+        projection: Projection::Pinhole {
+            focal_px: depth.focal_px,
+            principal_px: depth.principal_px,
+        },
         shutter: None,
         depth: true,
         ..request(keyframe, &lens)
@@ -373,7 +492,11 @@ pub fn render_depth(
 }
 
 /// Lookup table for multiplying a color value by `gain`.
-#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to a byte")]
+#[expect(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "clamped to a byte"
+)]
 fn gain_table(gain: f64) -> [u8; 256] {
     std::array::from_fn(|value| (gain * value as f64).round().clamp(0.0, 255.0) as u8)
 }
@@ -382,7 +505,10 @@ fn request(keyframe: &Keyframe, lens: &CalibratedCamera) -> RenderRequest {
     RenderRequest {
         world_from_camera: lens.world_from_camera,
         size_px: keyframe.size_px,
-        projection: Projection::Pinhole { focal_px: lens.focal_px, principal_px: lens.principal_px },
+        projection: Projection::Pinhole {
+            focal_px: lens.focal_px,
+            principal_px: lens.principal_px,
+        },
         shutter: lens.shutter,
         near_m: NEAR_M,
         far_m: FAR_M,
@@ -399,18 +525,34 @@ fn draw_depth<'a>(
     method: &mut dyn Method,
     keyframe: &'a Keyframe,
 ) -> crate::Result<Option<(Picture, Cow<'a, DepthMap>)>> {
-    let Some(full) = &keyframe.depth else { return Ok(None) };
+    let Some(full) = &keyframe.depth else {
+        return Ok(None);
+    };
     let stride = method.depth_stride();
-    let depth = if stride > 1 { Cow::Owned(full.subsampled(stride)) } else { Cow::Borrowed(full) };
+    let depth = if stride > 1 {
+        Cow::Owned(full.subsampled(stride))
+    } else {
+        Cow::Borrowed(full)
+    };
     Ok(render_depth(method, keyframe, &depth)?.map(|drawn| (drawn, depth)))
 }
 
-/// Renders at the true pose, for the comparison with the noise-free image, which has no rolling shutter.
+/// Renders at the true pose, for the comparison with the noise-free image, which has no rolling
+/// shutter.
 fn draw_at_truth(method: &mut dyn Method, keyframe: &Keyframe) -> crate::Result<Option<Picture>> {
-    let Some(truth) = &keyframe.truth else { return Ok(None) };
-    let lens = CalibratedCamera { world_from_camera: truth.world_from_camera, ..method.calibrated_camera(keyframe)? };
+    let Some(truth) = &keyframe.truth else {
+        return Ok(None);
+    };
+    let lens = CalibratedCamera {
+        world_from_camera: truth.world_from_camera,
+        ..method.calibrated_camera(keyframe)?
+    };
     let background_srgb = method.background_srgb();
-    Ok(Some(method.render(&RenderRequest { shutter: None, background_srgb, ..request(keyframe, &lens) })?))
+    Ok(Some(method.render(&RenderRequest {
+        shutter: None,
+        background_srgb,
+        ..request(keyframe, &lens)
+    })?))
 }
 
 #[cfg(test)]
@@ -435,23 +577,45 @@ mod tests {
 
     #[test]
     fn pixels_count_as_covered_from_half_alpha() {
-        let rgba_srgb = [0, MIN_ALPHA - 1, MIN_ALPHA, 255].into_iter().flat_map(|alpha| [9, 9, 9, alpha]).collect();
-        assert_eq!(covered_frac(&Picture { size_px: [2, 2], rgba_srgb, depth_m: vec![0.0; 4] }), 0.5);
+        let rgba_srgb = [0, MIN_ALPHA - 1, MIN_ALPHA, 255]
+            .into_iter()
+            .flat_map(|alpha| [9, 9, 9, alpha])
+            .collect();
+        assert_eq!(
+            covered_frac(&Picture {
+                size_px: [2, 2],
+                rgba_srgb,
+                depth_m: vec![0.0; 4]
+            }),
+            0.5
+        );
     }
 
     #[test]
     fn means_skip_unknown_scores() {
         let scores = Scores::mean(&[image("wrist", 20.0, Some(0.5)), image("wrist", 30.0, None)]);
-        assert_eq!((scores.psnr, scores.lpips, scores.ssim), (Some(25.0), Some(0.5), None));
-        assert!(scores.psnr_per_camera.is_empty(), "a single camera is not reported separately");
+        assert_eq!(
+            (scores.psnr, scores.lpips, scores.ssim),
+            (Some(25.0), Some(0.5), None)
+        );
+        assert!(
+            scores.psnr_per_camera.is_empty(),
+            "a single camera is not reported separately"
+        );
         assert_eq!(Scores::mean(&[]), Scores::default());
     }
 
     #[test]
     fn psnr_is_reported_per_camera() {
-        let scores =
-            Scores::mean(&[image("wrist", 20.0, None), image("front", 30.0, None), image("wrist", 22.0, None)]);
+        let scores = Scores::mean(&[
+            image("wrist", 20.0, None),
+            image("front", 30.0, None),
+            image("wrist", 22.0, None),
+        ]);
         assert_eq!(scores.psnr, Some(24.0));
-        assert_eq!(scores.psnr_per_camera, BTreeMap::from([("front".into(), 30.0), ("wrist".into(), 21.0)]));
+        assert_eq!(
+            scores.psnr_per_camera,
+            BTreeMap::from([("front".into(), 30.0), ("wrist".into(), 21.0)])
+        );
     }
 }

@@ -14,7 +14,9 @@ pub fn lose_gpu_at_step(step: u64) {
 /// Makes the device fail if [`lose_gpu_at_step`] requested it and the step is reached.
 pub(crate) fn lose_when_due(gpu: &Gpu, step: u64) {
     static IS_LOST: AtomicBool = AtomicBool::new(false);
-    if AT_STEP.get().is_some_and(|at_step| step >= *at_step) && !IS_LOST.swap(true, Ordering::Relaxed) {
+    if AT_STEP.get().is_some_and(|at_step| step >= *at_step)
+        && !IS_LOST.swap(true, Ordering::Relaxed)
+    {
         gpu.lose();
     }
 }

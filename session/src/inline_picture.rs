@@ -10,15 +10,27 @@ pub(crate) fn fit_size(size_px: [u32; 2], max_side_px: u32) -> [u32; 2] {
     if max_side <= max_side_px {
         return size_px;
     }
-    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "smaller than the size, above 0")]
-    size_px.map(|side| ((f64::from(side) * f64::from(max_side_px) / f64::from(max_side)).round() as u32).max(1))
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "smaller than the size, above 0"
+    )]
+    size_px.map(|side| {
+        ((f64::from(side) * f64::from(max_side_px) / f64::from(max_side)).round() as u32).max(1)
+    })
 }
 
 /// A JPEG as a data URI for `<img>`.
-pub(crate) fn data_uri(rgb: &[u8], [width, height]: [u32; 2], quality: u8) -> crate::Result<String> {
+pub(crate) fn data_uri(
+    rgb: &[u8],
+    [width, height]: [u32; 2],
+    quality: u8,
+) -> crate::Result<String> {
     let mut bytes = Vec::new();
     let mut encoder = JpegEncoder::new_with_quality(&mut bytes, quality);
-    encoder.encode(rgb, width, height, ExtendedColorType::Rgb8).context("cannot encode a picture as JPEG")?;
+    encoder
+        .encode(rgb, width, height, ExtendedColorType::Rgb8)
+        .context("cannot encode a picture as JPEG")?;
     let mut uri = String::from("data:image/jpeg;base64,");
     write_base64(&bytes, &mut uri);
     Ok(uri)
@@ -27,10 +39,17 @@ pub(crate) fn data_uri(rgb: &[u8], [width, height]: [u32; 2], quality: u8) -> cr
 fn write_base64(bytes: &[u8], to: &mut String) {
     const SYMBOLS: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
     for group in bytes.chunks(3) {
-        let bits = group.iter().fold(0_u32, |bits, byte| bits << 8 | u32::from(*byte)) << (8 * (3 - group.len()));
+        let bits = group
+            .iter()
+            .fold(0_u32, |bits, byte| bits << 8 | u32::from(*byte))
+            << (8 * (3 - group.len()));
         for source_ix in 0..4 {
             let symbol = SYMBOLS[(bits >> (18 - 6 * source_ix) & 63) as usize];
-            to.push(if source_ix <= group.len() { char::from(symbol) } else { '=' });
+            to.push(if source_ix <= group.len() {
+                char::from(symbol)
+            } else {
+                '='
+            });
         }
     }
 }
@@ -41,9 +60,14 @@ mod tests {
 
     #[test]
     fn base64_matches_rfc_4648() {
-        for (bytes, expected) in
-            [("", ""), ("f", "Zg=="), ("fo", "Zm8="), ("foo", "Zm9v"), ("foob", "Zm9vYg=="), ("foobar", "Zm9vYmFy")]
-        {
+        for (bytes, expected) in [
+            ("", ""),
+            ("f", "Zg=="),
+            ("fo", "Zm8="),
+            ("foo", "Zm9v"),
+            ("foob", "Zm9vYg=="),
+            ("foobar", "Zm9vYmFy"),
+        ] {
             let mut text = String::new();
             write_base64(bytes.as_bytes(), &mut text);
             assert_eq!(text, expected);

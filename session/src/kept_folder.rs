@@ -24,17 +24,30 @@ pub struct KeptFolder {
 }
 
 impl KeptFolder {
-    /// Watches the folder of a model, and with `in_subfolder` also its parent, the folder of the run.
+    /// Watches the folder of a model, and with `in_subfolder` also its parent, the folder of the
+    /// run.
     pub fn of_run(folder: &Path, in_subfolder: bool) -> Vec<Self> {
-        folder.ancestors().take(if in_subfolder { 2 } else { 1 }).map(Self::new).collect()
+        folder
+            .ancestors()
+            .take(if in_subfolder { 2 } else { 1 })
+            .map(Self::new)
+            .collect()
     }
 
     /// Watches a locked folder, after the first files were written into it.
     fn new(folder: &Path) -> Self {
-        let read = |name| Some((name, files::read(&folder.join(name), files::Budget::TEXT).ok()?));
+        let read = |name| {
+            Some((
+                name,
+                files::read(&folder.join(name), files::Budget::TEXT).ok()?,
+            ))
+        };
         Self {
             kept: Kept::open(folder).ok(),
-            first_files: [RIG_FILE, URDF_FILE, KEYFRAME_LIST].into_iter().filter_map(read).collect(),
+            first_files: [RIG_FILE, URDF_FILE, KEYFRAME_LIST]
+                .into_iter()
+                .filter_map(read)
+                .collect(),
             next_check: Instant::now() + PERIOD,
         }
     }
@@ -59,11 +72,15 @@ impl KeptFolder {
         let shown = path.display();
         self.kept = match self.make_again(&path) {
             Ok(kept) => {
-                log::warn!("the run folder {shown} {what}: the run continues in a new folder {shown}");
+                log::warn!(
+                    "the run folder {shown} {what}: the run continues in a new folder {shown}"
+                );
                 Some(kept)
             }
             Err(error) => {
-                log::warn!("the run folder {shown} {what}, and no new one can be created: {error:#}");
+                log::warn!(
+                    "the run folder {shown} {what}, and no new one can be created: {error:#}"
+                );
                 None
             }
         };
@@ -102,8 +119,14 @@ mod tests {
                 _ => fs::rename(&run, parent.path().join("renamed")).expect("it is there"),
             }
             kept.check();
-            assert_eq!(fs::read_to_string(run.join(RIG_FILE)).expect("written again"), "a rig");
-            assert_eq!(fs::read_to_string(run.join(URDF_FILE)).expect("written again"), "<robot/>");
+            assert_eq!(
+                fs::read_to_string(run.join(RIG_FILE)).expect("written again"),
+                "a rig"
+            );
+            assert_eq!(
+                fs::read_to_string(run.join(URDF_FILE)).expect("written again"),
+                "<robot/>"
+            );
             assert!(run.join(".lock").exists() && !run.join("report.json").exists());
         }
         fs::remove_dir_all(&run).expect("it is there");

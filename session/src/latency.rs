@@ -19,6 +19,10 @@ impl Latency {
     pub fn of(millis: impl IntoIterator<Item = f64>) -> Option<Self> {
         let mut millis: Vec<f64> = millis.into_iter().collect();
         let p50 = quantile(&mut millis, 0.5, Rank::Lower)?;
-        Some(Self { p50, p99: quantile(&mut millis, 0.99, Rank::Lower)?, n: millis.len() })
+        Some(Self {
+            p50,
+            p99: quantile(&mut millis, 0.99, Rank::Lower)?,
+            n: millis.len(),
+        })
     }
 }

@@ -1,4 +1,5 @@
-//! Times at which each keyframe of a live run passed the stages from the camera to the screens of viewers.
+//! Times at which each keyframe of a live run passed the stages from the camera to the screens of
+//! viewers.
 
 use crate::latency::Latency;
 use capture::InputTimes;
@@ -20,10 +21,12 @@ pub struct KeyframeTimes {
     pub pushed: Instant,
     /// Number of steps of each model at `pushed`, including queued steps.
     pub pushed_at_steps: Vec<u64>,
-    /// Time at which the first steps of the first model after `pushed` were complete; `None` until then.
+    /// Time at which the first steps of the first model after `pushed` were complete; `None` until
+    /// then.
     pub trained: Option<Instant>,
-    /// Time at which the server began to send the first picture that contains it, to the first client that reported this
-    /// picture as shown. Clients that have connected later are not considered.
+    /// Time at which the server began to send the first picture that contains it, to the first
+    /// client that reported this picture as shown. Clients that have connected later are not
+    /// considered.
     pub sent: Option<Instant>,
     /// Time at which this client showed this picture, as reported by the client.
     pub shown: Option<Instant>,
@@ -63,9 +66,14 @@ impl Ledger {
     pub fn trained_keyframes(&self, session_ix: usize, step: u64) -> TrainedKeyframes {
         let n = self.n_in_model(session_ix, step);
         let newest = n.checked_sub(1).map(|ix| &self.keyframes[ix]);
-        let newest =
-            newest.map(|keyframe| NewestKeyframe { captured_at: keyframe.captured_at(), added_at: keyframe.pushed });
-        TrainedKeyframes { n: n as u64, newest }
+        let newest = newest.map(|keyframe| NewestKeyframe {
+            captured_at: keyframe.captured_at(),
+            added_at: keyframe.pushed,
+        });
+        TrainedKeyframes {
+            n: n as u64,
+            newest,
+        }
     }
 
     /// Durations from mid-exposure by stage, in order.
@@ -74,9 +82,11 @@ impl Ledger {
         latencies(&self.keyframes)
     }
 
-    /// Number of keyframes, from the first, that were available in at least one of the first `step` steps of a model.
+    /// Number of keyframes, from the first, that were available in at least one of the first `step`
+    /// steps of a model.
     fn n_in_model(&self, session_ix: usize, step: u64) -> usize {
-        self.keyframes.partition_point(|keyframe| keyframe.pushed_at_steps[session_ix] < step)
+        self.keyframes
+            .partition_point(|keyframe| keyframe.pushed_at_steps[session_ix] < step)
     }
 
     /// Adds a keyframe that was just pushed.
@@ -88,30 +98,47 @@ impl Ledger {
     pub(crate) fn completed(&mut self, step: u64) {
         let n_trained = self.n_in_model(0, step).max(self.n_trained);
         let now = Instant::now();
-        self.keyframes[self.n_trained..n_trained].iter_mut().for_each(|keyframe| keyframe.trained = Some(now));
+        self.keyframes[self.n_trained..n_trained]
+            .iter_mut()
+            .for_each(|keyframe| keyframe.trained = Some(now));
         self.n_trained = n_trained;
     }
 
     /// Records that a client has shown a picture of the first model.
     pub(crate) fn shown(&mut self, picture: &ShownPicture) {
-        let [begin, end] = [picture.new_keyframes.start, picture.new_keyframes.end]
-            .map(|n| usize::try_from(n).unwrap_or(usize::MAX).min(self.keyframes.len()));
-        for keyframe in self.keyframes.iter_mut().take(end).skip(begin).filter(|keyframe| keyframe.shown.is_none()) {
+        let [begin, end] = [picture.new_keyframes.start, picture.new_keyframes.end].map(|n| {
+            usize::try_from(n)
+                .unwrap_or(usize::MAX)
+                .min(self.keyframes.len())
+        });
+        for keyframe in self
+            .keyframes
+            .iter_mut()
+            .take(end)
+            .skip(begin)
+            .filter(|keyframe| keyframe.shown.is_none())
+        {
             (keyframe.sent, keyframe.shown) = (Some(picture.sent_at), Some(picture.shown_at));
         }
     }
 }
 
-/// Durations from mid-exposure to each stage, over these keyframes. Without stamps on the clock of this process, from
-/// the arrival of the image.
+/// Durations from mid-exposure to each stage, over these keyframes. Without stamps on the clock of
+/// this process, from the arrival of the image.
 pub fn latencies(keyframes: &[KeyframeTimes]) -> Vec<(String, Latency)> {
     let until = |name: &str, at: fn(&KeyframeTimes) -> Option<Instant>| {
-        let millis = keyframes.iter().filter_map(|keyframe| keyframe.millis_until(at(keyframe)?));
+        let millis = keyframes
+            .iter()
+            .filter_map(|keyframe| keyframe.millis_until(at(keyframe)?));
         Some((name.to_owned(), Latency::of(millis)?))
     };
     let stages = [
-        until("shutter to arrival", |keyframe| keyframe.input.captured.and(Some(keyframe.input.arrived))),
-        until("shutter to keyframe", |keyframe| Some(keyframe.input.queued)),
+        until("shutter to arrival", |keyframe| {
+            keyframe.input.captured.and(Some(keyframe.input.arrived))
+        }),
+        until("shutter to keyframe", |keyframe| {
+            Some(keyframe.input.queued)
+        }),
         until("shutter to model", |keyframe| Some(keyframe.pushed)),
         until("shutter to first step", |keyframe| keyframe.trained),
         until("shutter to sent", |keyframe| keyframe.sent),
@@ -130,7 +157,11 @@ mod tests {
         KeyframeTimes {
             camera: "wrist".into(),
             stamp: Stamp(0),
-            input: InputTimes { captured: Some(now), arrived: now, queued: now },
+            input: InputTimes {
+                captured: Some(now),
+                arrived: now,
+                queued: now,
+            },
             pushed: now,
             pushed_at_steps: vec![pushed_at_step, 0],
             trained: None,
@@ -142,8 +173,13 @@ mod tests {
     #[test]
     fn keyframes_are_trained_by_the_first_step_after_their_push() {
         let mut ledger = Ledger::default();
-        let trained =
-            |ledger: &Ledger| ledger.keyframes().iter().map(|keyframe| keyframe.trained.is_some()).collect::<Vec<_>>();
+        let trained = |ledger: &Ledger| {
+            ledger
+                .keyframes()
+                .iter()
+                .map(|keyframe| keyframe.trained.is_some())
+                .collect::<Vec<_>>()
+        };
         ledger.push(keyframe(0));
         ledger.completed(0);
         assert_eq!(trained(&ledger), [false]);
@@ -151,7 +187,10 @@ mod tests {
         ledger.push(keyframe(5));
         ledger.completed(5);
         assert_eq!(trained(&ledger), [true, false]);
-        assert_eq!([0, 1, 5, 6].map(|step| ledger.n_in_model(0, step)), [0, 1, 1, 2]);
+        assert_eq!(
+            [0, 1, 5, 6].map(|step| ledger.n_in_model(0, step)),
+            [0, 1, 1, 2]
+        );
         let first = ledger.keyframes()[0].trained;
         ledger.completed(6);
         assert_eq!(trained(&ledger), [true, true]);
@@ -162,23 +201,50 @@ mod tests {
     fn first_shown_picture_with_a_keyframe_counts() {
         let mut ledger = Ledger::default();
         (0..4).for_each(|n| ledger.push(keyframe(5 * n)));
-        let newest = |trained: TrainedKeyframes| (trained.n, trained.newest.map(|keyframe| keyframe.added_at));
+        let newest = |trained: TrainedKeyframes| {
+            (trained.n, trained.newest.map(|keyframe| keyframe.added_at))
+        };
         let pushed = |ix: usize| Some(ledger.keyframes()[ix].pushed);
         assert_eq!(newest(ledger.trained_keyframes(0, 0)), (0, None));
         assert_eq!(newest(ledger.trained_keyframes(0, 6)), (2, pushed(1)));
-        assert_eq!(newest(ledger.trained_keyframes(1, 6)), (4, pushed(3)), "the second model");
+        assert_eq!(
+            newest(ledger.trained_keyframes(1, 6)),
+            (4, pushed(3)),
+            "the second model"
+        );
         let captured = ledger.keyframes()[0].captured_at();
         let at = |millis| captured + Duration::from_millis(millis);
         let reversed = std::ops::Range { start: 2, end: 1 }; // A picture that was drawn before the previous one.
-        for (new_keyframes, sent, shown) in
-            [(0..0, 10, 15), (1..2, 30, 45), (1..3, 40, 60), (3..99, 50, 70), (reversed, 1, 1)]
-        {
+        for (new_keyframes, sent, shown) in [
+            (0..0, 10, 15),
+            (1..2, 30, 45),
+            (1..3, 40, 60),
+            (3..99, 50, 70),
+            (reversed, 1, 1),
+        ] {
             let (sent_at, shown_at) = (at(sent), at(shown));
-            ledger.shown(&ShownPicture { method: None, new_keyframes, sent_at, shown_at });
+            ledger.shown(&ShownPicture {
+                method: None,
+                new_keyframes,
+                sent_at,
+                shown_at,
+            });
         }
-        let times: Vec<_> = ledger.keyframes().iter().map(|keyframe| keyframe.sent.zip(keyframe.shown)).collect();
-        let expected = [None, Some((at(30), at(45))), Some((at(40), at(60))), Some((at(50), at(70)))];
-        assert_eq!(times, expected, "the first was already known when the client connected");
+        let times: Vec<_> = ledger
+            .keyframes()
+            .iter()
+            .map(|keyframe| keyframe.sent.zip(keyframe.shown))
+            .collect();
+        let expected = [
+            None,
+            Some((at(30), at(45))),
+            Some((at(40), at(60))),
+            Some((at(50), at(70))),
+        ];
+        assert_eq!(
+            times, expected,
+            "the first was already known when the client connected"
+        );
     }
 
     #[test]
@@ -186,17 +252,40 @@ mod tests {
         let timed = |captured: Option<u64>| {
             let began = Instant::now();
             let at = |millis| began + Duration::from_millis(millis);
-            let input = InputTimes { captured: captured.map(at), arrived: at(10), queued: at(14) };
-            KeyframeTimes { input, pushed: at(20), shown: Some(at(50)), ..keyframe(0) }
+            let input = InputTimes {
+                captured: captured.map(at),
+                arrived: at(10),
+                queued: at(14),
+            };
+            KeyframeTimes {
+                input,
+                pushed: at(20),
+                shown: Some(at(50)),
+                ..keyframe(0)
+            }
         };
         let rounded = |keyframes: &[KeyframeTimes]| -> Vec<(String, f64)> {
-            latencies(keyframes).into_iter().map(|(name, latency)| (name, latency.p50.round())).collect()
+            latencies(keyframes)
+                .into_iter()
+                .map(|(name, latency)| (name, latency.p50.round()))
+                .collect()
         };
         let named = |pairs: &[(&str, f64)]| -> Vec<(String, f64)> {
-            pairs.iter().map(|(name, millis)| (format!("shutter to {name}"), *millis)).collect()
+            pairs
+                .iter()
+                .map(|(name, millis)| (format!("shutter to {name}"), *millis))
+                .collect()
         };
-        let on_clock = [("arrival", 10.0), ("keyframe", 14.0), ("model", 20.0), ("shown", 50.0)];
+        let on_clock = [
+            ("arrival", 10.0),
+            ("keyframe", 14.0),
+            ("model", 20.0),
+            ("shown", 50.0),
+        ];
         assert_eq!(rounded(&[timed(Some(0))]), named(&on_clock));
-        assert_eq!(rounded(&[timed(None)]), named(&[("keyframe", 4.0), ("model", 10.0), ("shown", 40.0)]));
+        assert_eq!(
+            rounded(&[timed(None)]),
+            named(&[("keyframe", 4.0), ("model", 10.0), ("shown", 40.0)])
+        );
     }
 }

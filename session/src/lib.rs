@@ -1,9 +1,11 @@
-//! Training sessions: train models on keyframes, evaluate them on a schedule, and recover from failures.
+//! Training sessions: train models on keyframes, evaluate them on a schedule, and recover from
+//! failures.
 //!
-//! A [`Session`] is one model in training with its clock, evaluations, checkpoints and reports. [`Data`] reads
-//! keyframes from disk; [`train`] and [`drive`] train on them. [`Live`] is the loop of a live run: it takes keyframes
-//! from a [`capture::Feed`] and draws pictures for viewers. [`finish`] saves and scores the models. Timing-dependent
-//! decisions are logged ([`DecisionLog`]) and can be replayed ([`Replay`]). An [`Observer`] receives all reports.
+//! A [`Session`] is one model in training with its clock, evaluations, checkpoints and reports.
+//! [`Data`] reads keyframes from disk; [`train`] and [`drive`] train on them. [`Live`] is the loop
+//! of a live run: it takes keyframes from a [`capture::Feed`] and draws pictures for viewers.
+//! [`finish`] saves and scores the models. Timing-dependent decisions are logged ([`DecisionLog`])
+//! and can be replayed ([`Replay`]). An [`Observer`] receives all reports.
 //!
 //! ```
 //! use keyframe::{Keyframe, Split};
@@ -78,13 +80,17 @@ pub use latency::Latency;
 pub use ledger::{KeyframeTimes, Ledger, latencies};
 pub use live::{KeyframeChange, Live, LiveOptions, Pace};
 pub use methods::methods_of;
-pub use observer::{DoneEvent, Evaluation, FinishedReport, Observer, ProfileEvent, SessionEvent, SessionProgress};
+pub use observer::{
+    DoneEvent, Evaluation, FinishedReport, Observer, ProfileEvent, SessionEvent, SessionProgress,
+};
 pub use read_progress::{OnReadProgress, ReadProgress, ignore_progress};
 pub use recoveries::OpenGpu;
 pub use recovery::Recovery;
 pub use replay::Replay;
 pub use scene_calibration::{RelativePose, SCENE_PARAMS, SceneCalibration, calibrate_scene};
-pub use session::{EndingSession, Evaluators, FinishedModel, Limits, Session, TrainingOutcome, finish};
+pub use session::{
+    EndingSession, Evaluators, FinishedModel, Limits, Session, TrainingOutcome, finish,
+};
 pub use stored_keyframes::StoredKeyframes;
 pub use table::Table;
 pub use training::{TrainingPlan, check_before_data, drive, limits, model_specs, train};

@@ -23,7 +23,10 @@ pub const SH_DEGREE: &str = "sh_degree";
 
 /// Lists kinds in prose: `splat`, `tsdf and splat`, `tsdf, nerf and splat`.
 pub fn describe(kinds: &[ModelKind]) -> String {
-    listed(&kinds.iter().map(|kind| kind.name()).collect::<Vec<_>>(), "and")
+    listed(
+        &kinds.iter().map(|kind| kind.name()).collect::<Vec<_>>(),
+        "and",
+    )
 }
 
 /// The kind of the model at a path; `None` if there is no model.
@@ -36,7 +39,8 @@ pub fn kind_of(path: &Path) -> crate::Result<Option<ModelKind>> {
     Ok(ModelKind::of_saved(path)?)
 }
 
-/// Loads a saved model of any kind from its folder, or splats from a file. An empty model causes a warning.
+/// Loads a saved model of any kind from its folder, or splats from a file. An empty model causes a
+/// warning.
 pub fn load(gpu: Arc<Gpu>, model: &Path) -> crate::Result<LoadedModel> {
     expect_model(model)?;
     let loaded = trainer::load(gpu, model)?;
@@ -57,7 +61,10 @@ pub fn note_if_empty(path: &Path, model: &LoadedModel) -> Option<String> {
 
 fn empty_note(path: &Path, kind: ModelKind) -> String {
     let primitives = kind.entry().primitives_label.to_lowercase();
-    format!("{} contains no {primitives}: its pictures show only the background", path.display())
+    format!(
+        "{} contains no {primitives}: its pictures show only the background",
+        path.display()
+    )
 }
 
 /// The methods listed in a rig file.
@@ -66,7 +73,10 @@ fn empty_note(path: &Path, kind: ModelKind) -> String {
 ///
 /// If a method is unknown.
 pub fn methods_of(rig: &Rig) -> crate::Result<Vec<ModelKind>> {
-    let known: Vec<_> = ModelKind::ALL.iter().map(|kind| (kind.name(), *kind)).collect();
+    let known: Vec<_> = ModelKind::ALL
+        .iter()
+        .map(|kind| (kind.name(), *kind))
+        .collect();
     Ok(rig.train.methods.resolve(&known)?)
 }
 
@@ -80,19 +90,36 @@ pub fn options(train: &Train, steps: Option<u64>) -> (CommonOptions, Settings) {
         ..defaults
     };
     let max_splats = train.max_splats.map(|n| (MAX_SPLATS, n.into()));
-    (common, max_splats.into_iter().chain([(SH_DEGREE, train.sh_degree.into())]).collect())
+    (
+        common,
+        max_splats
+            .into_iter()
+            .chain([(SH_DEGREE, train.sh_degree.into())])
+            .collect(),
+    )
 }
 
 /// One model spec per kind. Each gets the common options and those `settings` that its method has.
-pub fn specs(kinds: &[ModelKind], common: &CommonOptions, settings: &Settings) -> Result<Vec<ModelSpec>, Error> {
+pub fn specs(
+    kinds: &[ModelKind],
+    common: &CommonOptions,
+    settings: &Settings,
+) -> Result<Vec<ModelSpec>, Error> {
     let spec = |kind: &ModelKind| ModelSpec::new(*kind, common.clone(), settings);
-    kinds.iter().map(spec).collect::<Result<_, _>>().map_err(|error| Error::BadInput(error.to_string()))
+    kinds
+        .iter()
+        .map(spec)
+        .collect::<Result<_, _>>()
+        .map_err(|error| Error::BadInput(error.to_string()))
 }
 
 /// Why there is no model of the requested method among these.
 pub(crate) fn unknown(kinds: impl Iterator<Item = ModelKind>, requested: Option<&str>) -> String {
     let names = kinds.map(ModelKind::name).collect::<Vec<_>>().join(" or ");
-    format!("no model with the method {:?}; use {names}", requested.unwrap_or_default())
+    format!(
+        "no model with the method {:?}; use {names}",
+        requested.unwrap_or_default()
+    )
 }
 
 #[cfg(test)]
@@ -102,15 +129,25 @@ mod tests {
     #[test]
     fn every_setting_belongs_to_a_method() {
         for name in [MAX_SPLATS, COUNT, SH_DEGREE] {
-            assert!(ModelKind::ALL.iter().any(|kind| kind.has_option(name)), "{name}");
+            assert!(
+                ModelKind::ALL.iter().any(|kind| kind.has_option(name)),
+                "{name}"
+            );
         }
-        assert!(!ModelKind::ALL.iter().any(|kind| kind.has_option("max-splats")));
+        assert!(
+            !ModelKind::ALL
+                .iter()
+                .any(|kind| kind.has_option("max-splats"))
+        );
     }
 
     #[test]
     fn note_names_the_empty_model() {
         let note = empty_note(Path::new("splats.ply"), ModelKind::default());
-        assert_eq!(note, "splats.ply contains no splats: its pictures show only the background");
+        assert_eq!(
+            note,
+            "splats.ply contains no splats: its pictures show only the background"
+        );
     }
 
     #[test]

@@ -1,4 +1,5 @@
-//! Suggested commands to run after training. They work as printed in the folder where training was started.
+//! Suggested commands to run after training. They work as printed in the folder where training was
+//! started.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -20,7 +21,9 @@ impl DataSource {
     /// The file name of an image, or its camera and stamp if no file name is known.
     pub fn image_name(&self, camera: &str, stamp_nanos: i64) -> String {
         let known = self.image_names.get(&(camera.to_owned(), stamp_nanos));
-        known.cloned().unwrap_or_else(|| format!("{camera}/{stamp_nanos}"))
+        known
+            .cloned()
+            .unwrap_or_else(|| format!("{camera}/{stamp_nanos}"))
     }
 }
 
@@ -48,11 +51,21 @@ pub struct NextCommand {
 
 /// The commands for models that were trained together.
 pub fn for_models(models: &[SavedModel<'_>]) -> Vec<NextCommand> {
-    let program = std::env::args_os().next().map_or("fieldrig".into(), |word| word.to_string_lossy().into_owned());
+    let program = std::env::args_os()
+        .next()
+        .map_or("fieldrig".into(), |word| {
+            word.to_string_lossy().into_owned()
+        });
     let mut commands = Vec::new();
     let mut add = |purpose: &str, words: &[&str]| {
-        let words: Vec<String> = std::iter::once(&*program).chain(words.iter().copied()).map(quoted).collect();
-        commands.push(NextCommand { purpose: purpose.to_owned(), command: words.join(" ") });
+        let words: Vec<String> = std::iter::once(&*program)
+            .chain(words.iter().copied())
+            .map(quoted)
+            .collect();
+        commands.push(NextCommand {
+            purpose: purpose.to_owned(),
+            command: words.join(" "),
+        });
     };
     if let Some(folder) = common_folder(models) {
         add("view the model", &["view", &argument(folder)]);
@@ -67,9 +80,15 @@ pub fn for_models(models: &[SavedModel<'_>]) -> Vec<NextCommand> {
             words.extend(model.data.flags.iter().map(String::as_str));
             add("score the model again", &words);
         }
-        if let Some(Export { format, contents, .. }) = model.kind.entry().exports.first() {
+        if let Some(Export {
+            format, contents, ..
+        }) = model.kind.entry().exports.first()
+        {
             let out = argument(&unused_file(&model_name(model.folder), format));
-            add(&format!("export the {contents}"), &["export", &folder, "--to", format, "--out", &out]);
+            add(
+                &format!("export the {contents}"),
+                &["export", &folder, "--to", format, "--out", &out],
+            );
         }
     }
     commands
@@ -77,13 +96,22 @@ pub fn for_models(models: &[SavedModel<'_>]) -> Vec<NextCommand> {
 
 /// The command line of this process.
 pub fn this_command() -> String {
-    std::env::args_os().map(|word| quoted(&word.to_string_lossy())).collect::<Vec<_>>().join(" ")
+    std::env::args_os()
+        .map(|word| quoted(&word.to_string_lossy()))
+        .collect::<Vec<_>>()
+        .join(" ")
 }
 
 /// Purposes and commands in two columns.
 pub fn lines(commands: &[NextCommand]) -> Vec<String> {
-    let width = commands.iter().map(|next| next.purpose.len()).max().unwrap_or_default() + 1;
-    let line = |next: &NextCommand| format!("{:width$}  {}", format!("{}:", next.purpose), next.command);
+    let width = commands
+        .iter()
+        .map(|next| next.purpose.len())
+        .max()
+        .unwrap_or_default()
+        + 1;
+    let line =
+        |next: &NextCommand| format!("{:width$}  {}", format!("{}:", next.purpose), next.command);
     commands.iter().map(line).collect()
 }
 
@@ -96,22 +124,39 @@ fn common_folder<'a>(models: &[SavedModel<'a>]) -> Option<&'a Path> {
     }
 }
 
-/// Base name for exported files: the name of the model's folder. In a run of several methods, that is the method name.
+/// Base name for exported files: the name of the model's folder. In a run of several methods, that
+/// is the method name.
 fn model_name(folder: &Path) -> String {
-    folder.file_name().map_or_else(|| "model".to_owned(), |name| name.to_string_lossy().into_owned())
+    folder.file_name().map_or_else(
+        || "model".to_owned(),
+        |name| name.to_string_lossy().into_owned(),
+    )
 }
 
 /// An unused file name in the current folder; `export` does not overwrite files.
 fn unused_file(name: &str, extension: &str) -> PathBuf {
-    let numbered =
-        |n: u32| PathBuf::from(if n == 1 { format!("{name}.{extension}") } else { format!("{name}-{n}.{extension}") });
-    (1..100).map(numbered).find(|file| !file.exists()).unwrap_or_else(|| numbered(100))
+    let numbered = |n: u32| {
+        PathBuf::from(if n == 1 {
+            format!("{name}.{extension}")
+        } else {
+            format!("{name}-{n}.{extension}")
+        })
+    };
+    (1..100)
+        .map(numbered)
+        .find(|file| !file.exists())
+        .unwrap_or_else(|| numbered(100))
 }
 
-/// A path as a positional argument. A path that starts with a hyphen would be parsed as a flag, so `./` is prepended.
+/// A path as a positional argument. A path that starts with a hyphen would be parsed as a flag, so
+/// `./` is prepended.
 fn argument(path: &Path) -> String {
     let text = path.to_string_lossy();
-    if text.starts_with('-') { format!("./{text}") } else { text.into_owned() }
+    if text.starts_with('-') {
+        format!("./{text}")
+    } else {
+        text.into_owned()
+    }
 }
 
 /// A word, quoted for a shell.
@@ -129,9 +174,22 @@ mod tests {
 
     #[test]
     fn quoted_words_round_trip_through_the_shell() {
-        for word in ["plain/path-1.spz", "two words", "it's", "$HOME `x` \"y\" \\ *", "", "naïve", "a\nb"] {
-            let output = std::process::Command::new("sh").args(["-c", &format!("printf %s {}", quoted(word))]).output();
-            assert_eq!(String::from_utf8_lossy(&output.expect("sh starts").stdout), word);
+        for word in [
+            "plain/path-1.spz",
+            "two words",
+            "it's",
+            "$HOME `x` \"y\" \\ *",
+            "",
+            "naïve",
+            "a\nb",
+        ] {
+            let output = std::process::Command::new("sh")
+                .args(["-c", &format!("printf %s {}", quoted(word))])
+                .output();
+            assert_eq!(
+                String::from_utf8_lossy(&output.expect("sh starts").stdout),
+                word
+            );
         }
         assert_eq!(quoted("runs/20261123-170000"), "runs/20261123-170000");
     }
@@ -144,10 +202,19 @@ mod tests {
             ..DataSource::default()
         };
         let kind = |name| ModelKind::from_name(name).expect("registered");
-        let model = |name, folder| SavedModel { kind: kind(name), folder: Path::new(folder), data: &data, n_tests: 3 };
+        let model = |name, folder| SavedModel {
+            kind: kind(name),
+            folder: Path::new(folder),
+            data: &data,
+            n_tests: 3,
+        };
         let commands = |models: &[SavedModel<'_>]| -> Vec<String> {
             let program = quoted(&std::env::args().next().expect("a program"));
-            let strip = |next: NextCommand| next.command.trim_start_matches(&format!("{program} ")).to_owned();
+            let strip = |next: NextCommand| {
+                next.command
+                    .trim_start_matches(&format!("{program} "))
+                    .to_owned()
+            };
             for_models(models).into_iter().map(strip).collect()
         };
         assert_eq!(
@@ -168,7 +235,10 @@ mod tests {
             ]
         );
         let live = DataSource::default();
-        let unscored = SavedModel { data: &live, ..model("nerf", "-out") };
+        let unscored = SavedModel {
+            data: &live,
+            ..model("nerf", "-out")
+        };
         assert_eq!(commands(&[unscored]), ["view ./-out"]);
         assert_eq!(commands(&[]), Vec::<String>::new());
     }
@@ -176,7 +246,8 @@ mod tests {
     #[test]
     fn unnamed_images_use_camera_and_stamp() {
         let mut data = DataSource::default();
-        data.image_names.insert(("camera".into(), 8), "images/0008.jpg".into());
+        data.image_names
+            .insert(("camera".into(), 8), "images/0008.jpg".into());
         assert_eq!(data.image_name("camera", 8), "images/0008.jpg");
         assert_eq!(data.image_name("camera", 9), "camera/9");
     }

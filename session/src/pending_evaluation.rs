@@ -19,8 +19,9 @@ pub(crate) struct PendingEvaluation {
 }
 
 impl PendingEvaluation {
-    /// An evaluation due at `seconds` that scores at most `max_images` of the test keyframes, and fewer if `max_spent` is
-    /// reached first: on a CPU, rendering a neural field takes seconds per image.
+    /// An evaluation due at `seconds` that scores at most `max_images` of the test keyframes, and
+    /// fewer if `max_spent` is reached first: on a CPU, rendering a neural field takes seconds per
+    /// image.
     pub(crate) fn new<'a>(
         seconds: f64,
         tests: impl ExactSizeIterator<Item = &'a Arc<Keyframe>>,
@@ -28,15 +29,29 @@ impl PendingEvaluation {
         max_spent: Duration,
     ) -> Self {
         let stride = tests.len().div_ceil(max_images).max(1);
-        let mut selected: Vec<(usize, &Arc<Keyframe>)> = tests.step_by(stride).enumerate().collect();
+        let mut selected: Vec<(usize, &Arc<Keyframe>)> =
+            tests.step_by(stride).enumerate().collect();
         selected.sort_by_key(|(ix, _)| ix.reverse_bits());
-        let remaining = selected.into_iter().map(|(_, keyframe)| keyframe.clone()).collect();
-        Self { seconds, remaining, images: Vec::new(), spent: Duration::ZERO, max_spent }
+        let remaining = selected
+            .into_iter()
+            .map(|(_, keyframe)| keyframe.clone())
+            .collect();
+        Self {
+            seconds,
+            remaining,
+            images: Vec::new(),
+            spent: Duration::ZERO,
+            max_spent,
+        }
     }
 
     /// The next test keyframe to score; `None` if all are scored or the time limit is reached.
     pub(crate) fn take_next(&mut self) -> Option<Arc<Keyframe>> {
-        if self.is_complete() { None } else { self.remaining.pop_front() }
+        if self.is_complete() {
+            None
+        } else {
+            self.remaining.pop_front()
+        }
     }
 
     /// Adds the scores of the last keyframe and the time that scoring took.

@@ -1,4 +1,5 @@
-//! Recovers from a GPU failure during a run: reopens the device and continues every model from its newest checkpoint.
+//! Recovers from a GPU failure during a run: reopens the device and continues every model from its
+//! newest checkpoint.
 
 use crate::Error;
 use crate::error::Context;
@@ -9,14 +10,20 @@ use trainer::gpu::Gpu;
 
 /// Maximum number of attempts to reopen the GPU.
 const MAX_RECOVERIES: u32 = 3;
-/// The attempt count is reset after this time without a failure, because a run of several days may fail occasionally.
+/// The attempt count is reset after this time without a failure, because a run of several days may
+/// fail occasionally.
 const RESET_COUNT_AFTER: Duration = Duration::from_secs(600);
 /// Pause between attempts, because a driver reset takes time.
 const RETRY_DELAY: Duration = Duration::from_secs(1);
 
-/// Describes how to continue these sessions if they fail now, as a sentence without a period. Empty without recovery.
+/// Describes how to continue these sessions if they fail now, as a sentence without a period. Empty
+/// without recovery.
 pub fn describe_recoverable(sessions: &mut [Session]) -> String {
-    sessions.iter_mut().filter_map(Session::describe_recoverable).collect::<Vec<_>>().join("; ")
+    sessions
+        .iter_mut()
+        .filter_map(Session::describe_recoverable)
+        .collect::<Vec<_>>()
+        .join("; ")
 }
 
 /// Opens the GPU, also after a failure.
@@ -34,17 +41,24 @@ impl Recoveries {
     /// A counter without attempts.
     #[must_use]
     pub fn new(open_gpu: OpenGpu) -> Self {
-        Self { open_gpu, n: 0, last: None }
+        Self {
+            open_gpu,
+            n: 0,
+            last: None,
+        }
     }
 
-    /// Continues all sessions on a reopened device if the GPU caused `error`. Returns an error if the cause was another
-    /// one, or if all attempts fail.
+    /// Continues all sessions on a reopened device if the GPU caused `error`. Returns an error if
+    /// the cause was another one, or if all attempts fail.
     pub fn recover(&mut self, sessions: &mut [Session], error: crate::Error) -> crate::Result<()> {
         if !error.is_gpu_error() || !sessions.iter().all(Session::can_restart) {
             return Err(error);
         }
         let began = Instant::now();
-        if self.last.is_some_and(|last| last.elapsed() > RESET_COUNT_AFTER) {
+        if self
+            .last
+            .is_some_and(|last| last.elapsed() > RESET_COUNT_AFTER)
+        {
             self.n = 0;
         }
         let mut error = error;
@@ -53,11 +67,17 @@ impl Recoveries {
                 std::thread::sleep(RETRY_DELAY);
             }
             self.n += 1;
-            log::warn!("{error:#}: reopening the GPU, attempt {} of {MAX_RECOVERIES}", self.n);
+            log::warn!(
+                "{error:#}: reopening the GPU, attempt {} of {MAX_RECOVERIES}",
+                self.n
+            );
             match restart_all(sessions, self.open_gpu) {
                 Ok(()) => {
                     // All sessions share one clock, so the time is excluded only once.
-                    sessions.iter().take(1).for_each(|session| session.exclude(began.elapsed()));
+                    sessions
+                        .iter()
+                        .take(1)
+                        .for_each(|session| session.exclude(began.elapsed()));
                     self.last = Some(Instant::now());
                     return Ok(());
                 }
@@ -74,7 +94,9 @@ impl Recoveries {
 fn restart_all(sessions: &mut [Session], open_gpu: OpenGpu) -> crate::Result<()> {
     sessions.iter_mut().for_each(Session::drop_model); // Frees memory for the new models.
     let gpu = open_gpu().context("cannot reopen the GPU")?;
-    sessions.iter_mut().try_for_each(|session| session.restart_on(&gpu))
+    sessions
+        .iter_mut()
+        .try_for_each(|session| session.restart_on(&gpu))
 }
 
 #[cfg(test)]
@@ -94,10 +116,14 @@ mod tests {
     fn only_gpu_errors_reopen_the_gpu() {
         let mut recoveries = Recoveries::new(open_and_count);
         let bug = trainer::Error::Internal("a buffer is missing".to_owned());
-        let error = recoveries.recover(&mut [], bug.into()).expect_err("the bug is reported");
+        let error = recoveries
+            .recover(&mut [], bug.into())
+            .expect_err("the bug is reported");
         assert!(error.to_string().contains("a buffer is missing"), "{error}");
         assert_eq!((N_OPENED.load(Ordering::Relaxed), recoveries.n), (0, 0));
-        recoveries.recover(&mut [], trainer::Error::DeviceLost.into()).expect("the GPU is reopened");
+        recoveries
+            .recover(&mut [], trainer::Error::DeviceLost.into())
+            .expect("the GPU is reopened");
         assert_eq!((N_OPENED.load(Ordering::Relaxed), recoveries.n), (1, 1));
     }
 }

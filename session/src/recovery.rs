@@ -26,13 +26,23 @@ pub struct Recovery {
 impl Recovery {
     /// Describes how to continue if the model cannot be saved, as a sentence without a period.
     pub fn describe_recoverable(&self, has_checkpoint: bool) -> String {
-        let Self { folder, resume_command, .. } = self;
+        let Self {
+            folder,
+            resume_command,
+            ..
+        } = self;
         match (has_checkpoint, &self.resumed) {
             (true, _) => {
-                format!("the newest checkpoint is {}: `{resume_command}` continues from it", in_folder(folder))
+                format!(
+                    "the newest checkpoint is {}: `{resume_command}` continues from it",
+                    in_folder(folder)
+                )
             }
             (false, Some(resumed)) => {
-                format!("no newer checkpoint was written: resume again from the one in {}", resumed.display())
+                format!(
+                    "no newer checkpoint was written: resume again from the one in {}",
+                    resumed.display()
+                )
             }
             (false, None) => "no checkpoint was written yet: start the run again".to_owned(),
         }
@@ -46,7 +56,9 @@ fn in_folder(folder: &Path) -> String {
 /// Adds a description of how to continue to a GPU error.
 pub fn with_recoverable(error: crate::Error, recoverable: &str) -> crate::Error {
     if error.is_gpu_error() && !recoverable.is_empty() {
-        error.with_context(format!("the GPU failed at the end of the run; {recoverable}"))
+        error.with_context(format!(
+            "the GPU failed at the end of the run; {recoverable}"
+        ))
     } else {
         error
     }

@@ -1,13 +1,13 @@
 //! Limits the share of time that is spent on drawing pictures during training.
 //!
-//! Each second of training adds credit for pictures: a second on a software adapter, 0.66 seconds on a GPU. Pictures
-//! are drawn immediately while credit is left. Training therefore keeps at least 1/2 or 3/5 of the time, unless a single
-//! picture takes longer than the maximum debt.
+//! Each second of training adds credit for pictures: a second on a software adapter, 0.66 seconds
+//! on a GPU. Pictures are drawn immediately while credit is left. Training therefore keeps at least
+//! 1/2 or 3/5 of the time, unless a single picture takes longer than the maximum debt.
 
 use std::time::Duration;
 
-/// Maximum credit, seconds, which is the maximum length of a burst of pictures. After a longer slice of training, the
-/// maximum is the length of that slice.
+/// Maximum credit, seconds, which is the maximum length of a burst of pictures. After a longer
+/// slice of training, the maximum is the length of that slice.
 const MAX_CREDIT_SECS: f64 = 0.1;
 /// Maximum debt, seconds. After a picture that takes longer, training makes up for this time only.
 const MAX_DEBT_SECS: f64 = 1.0;
@@ -28,7 +28,14 @@ pub(crate) struct RenderBudget {
 impl RenderBudget {
     /// Full credit.
     pub(crate) fn new(is_software: bool) -> Self {
-        Self { balance_secs: MAX_CREDIT_SECS, rate: if is_software { CREDIT_ON_SOFTWARE } else { CREDIT_ON_GPU } }
+        Self {
+            balance_secs: MAX_CREDIT_SECS,
+            rate: if is_software {
+                CREDIT_ON_SOFTWARE
+            } else {
+                CREDIT_ON_GPU
+            },
+        }
     }
 
     /// Restores the full credit.
@@ -61,7 +68,11 @@ mod tests {
 
     /// Fraction of the time that pictures get if they are requested back to back.
     fn render_frac(is_software: bool, picture: Duration, step: Duration) -> f64 {
-        let (mut budget, mut rendered, mut trained) = (RenderBudget::new(is_software), Duration::ZERO, Duration::ZERO);
+        let (mut budget, mut rendered, mut trained) = (
+            RenderBudget::new(is_software),
+            Duration::ZERO,
+            Duration::ZERO,
+        );
         for _ in 0..10_000 {
             while budget.may_render() {
                 budget.add_render(picture);
@@ -78,7 +89,10 @@ mod tests {
         for (is_software, share) in [(true, 1.0 / 2.0), (false, 2.0 / 5.0)] {
             for millis in [1, 3, 40, 400] {
                 let frac = render_frac(is_software, Duration::from_millis(millis), STEP);
-                assert!((frac - share).abs() < 0.01, "{millis} ms per picture: {frac}");
+                assert!(
+                    (frac - share).abs() < 0.01,
+                    "{millis} ms per picture: {frac}"
+                );
             }
         }
         // On a CPU a picture may take so long that its debt is capped.

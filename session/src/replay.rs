@@ -29,26 +29,62 @@ impl Replay {
     pub fn load(path: &Path) -> crate::Result<Self> {
         let decisions = Decisions::load(path)?;
         let kind = ModelKind::from_name(&decisions.settings.method).ok_or_else(|| {
-            Error::BadInput(format!("{}: unknown method {:?}", path.display(), decisions.settings.method))
+            Error::BadInput(format!(
+                "{}: unknown method {:?}",
+                path.display(),
+                decisions.settings.method
+            ))
         })?;
-        let model_spec = ModelSpec { kind, options: decisions.settings.options.clone() };
-        model_spec.check().map_err(|error| Error::BadInput(format!("{}: line 1: {error}", path.display())))?;
-        let replay = Self { path: path.to_owned(), decisions, model_spec };
+        let model_spec = ModelSpec {
+            kind,
+            options: decisions.settings.options.clone(),
+        };
+        model_spec
+            .check()
+            .map_err(|error| Error::BadInput(format!("{}: line 1: {error}", path.display())))?;
+        let replay = Self {
+            path: path.to_owned(),
+            decisions,
+            model_spec,
+        };
         if replay.decisions.pushed().next().is_none() {
-            return Err(Error::InsufficientData(format!("{} contains no keyframe to replay", replay.name())));
+            return Err(Error::InsufficientData(format!(
+                "{} contains no keyframe to replay",
+                replay.name()
+            )));
         }
         Ok(replay)
     }
 
-    /// Loads exactly the keyframes that the log lists. [`Self::check_data`] checks that their contents are the same.
-    pub fn load_data(&self, path: &Path, rig: Option<PathBuf>, progress: OnReadProgress<'_>) -> crate::Result<Data> {
+    /// Loads exactly the keyframes that the log lists. [`Self::check_data`] checks that their
+    /// contents are the same.
+    pub fn load_data(
+        &self,
+        path: &Path,
+        rig: Option<PathBuf>,
+        progress: OnReadProgress<'_>,
+    ) -> crate::Result<Data> {
         let pushed = || self.decisions.pushed();
         let list: KeyframeList = pushed()
-            .filter_map(|pushed| Some((pushed.camera.clone(), Stamp(pushed.stamp_nanos), pushed.split()?)))
+            .filter_map(|pushed| {
+                Some((
+                    pushed.camera.clone(),
+                    Stamp(pushed.stamp_nanos),
+                    pushed.split()?,
+                ))
+            })
             .collect();
-        let mut data = Data::of_list(path, list, rig, self.decisions.settings.scale, &self.overrides(), progress)?;
-        let as_pushed: HashMap<(&str, i64), &Pushed> =
-            pushed().map(|pushed| ((&*pushed.camera, pushed.stamp_nanos), pushed)).collect();
+        let mut data = Data::of_list(
+            path,
+            list,
+            rig,
+            self.decisions.settings.scale,
+            &self.overrides(),
+            progress,
+        )?;
+        let as_pushed: HashMap<(&str, i64), &Pushed> = pushed()
+            .map(|pushed| ((&*pushed.camera, pushed.stamp_nanos), pushed))
+            .collect();
         for keyframe in &mut data.keyframes {
             if let Some(pushed) = as_pushed.get(&(&*keyframe.camera, keyframe.stamp.0)) {
                 *keyframe = pushed.corrected(keyframe);
@@ -57,7 +93,9 @@ impl Replay {
         if !self.decisions.is_complete() {
             let last = self.decisions.entries.last().map_or(0, |entry| entry.step);
             let name = self.name();
-            data.data_losses.push(format!("{name} is truncated: replaying up to its last step, {last}"));
+            data.data_losses.push(format!(
+                "{name} is truncated: replaying up to its last step, {last}"
+            ));
         }
         Ok(data)
     }
@@ -83,12 +121,18 @@ impl Replay {
         Ok(())
     }
 
-    /// Checks that depth was rendered from the same model as in the logged run, identified by its SHA-256.
+    /// Checks that depth was rendered from the same model as in the logged run, identified by its
+    /// SHA-256.
     pub fn check_depth_from(&self, sha256: Option<&str>) -> Result<(), Error> {
-        depth_from::check_same(&self.name(), self.decisions.settings.depth_from.as_deref(), sha256)
+        depth_from::check_same(
+            &self.name(),
+            self.decisions.settings.depth_from.as_deref(),
+            sha256,
+        )
     }
 
-    /// Checks that training starts from the same points as the logged run, identified by their SHA-256.
+    /// Checks that training starts from the same points as the logged run, identified by their
+    /// SHA-256.
     pub fn check_points(&self, sha256: Option<&str>) -> Result<(), Error> {
         let name = self.name();
         match (self.decisions.settings.points.as_deref(), sha256) {
@@ -98,24 +142,29 @@ impl Replay {
             ))),
             (Some(log), here) => Err(Error::InsufficientData(format!(
                 "{name} starts from points with the SHA-256 {log}, but the data {}: restore the file of ply_file_path",
-                here.map_or_else(|| "has no points".to_owned(), |here| format!("has points with {here}"))
+                here.map_or_else(
+                    || "has no points".to_owned(),
+                    |here| format!("has points with {here}")
+                )
             ))),
         }
     }
 
-    /// Checks that training starts at the same step as the log. `from_step`: step of the checkpoint that training
-    /// continues from.
+    /// Checks that training starts at the same step as the log. `from_step`: step of the checkpoint
+    /// that training continues from.
     pub fn check_start(&self, from_step: Option<u64>) -> Result<(), Error> {
         let name = self.name();
         match (self.decisions.settings.from_step, from_step) {
             (log, here) if log == here => Ok(()),
-            (None, _) => Err(Error::BadInput(format!("{name} starts at the first step: remove --resume"))),
+            (None, _) => Err(Error::BadInput(format!(
+                "{name} starts at the first step: remove --resume"
+            ))),
             (Some(log), None) => Err(Error::BadInput(format!(
                 "{name} continues from step {log}: give the folder of that checkpoint with --resume"
             ))),
-            (Some(log), Some(here)) => {
-                Err(Error::BadInput(format!("{name} continues from step {log}, but the checkpoint is at step {here}")))
-            }
+            (Some(log), Some(here)) => Err(Error::BadInput(format!(
+                "{name} continues from step {log}, but the checkpoint is at step {here}"
+            ))),
         }
     }
 
@@ -128,12 +177,20 @@ impl Replay {
     pub fn check_adapter(&self, adapter: &str) {
         let logged_adapter = &self.decisions.settings.adapter;
         if logged_adapter != adapter {
-            log::warn!("{} was written on {logged_adapter:?}: this adapter rounds differently", self.name());
+            log::warn!(
+                "{} was written on {logged_adapter:?}: this adapter rounds differently",
+                self.name()
+            );
         }
     }
 
     /// Replays the decisions, each at its step.
-    pub fn drive(&self, session: &mut Session, keyframes: &[Arc<Keyframe>], stop: &Stop) -> crate::Result<()> {
+    pub fn drive(
+        &self,
+        session: &mut Session,
+        keyframes: &[Arc<Keyframe>],
+        stop: &Stop,
+    ) -> crate::Result<()> {
         let by_key = by_name(keyframes);
         session.start_clock(Instant::now());
         for entry in &self.decisions.entries {
@@ -159,7 +216,9 @@ impl Replay {
                         session.push(keyframe)?;
                     }
                 }
-                Decision::Remove(removed) => session.remove(&removed.camera, Stamp(removed.stamp_nanos))?,
+                Decision::Remove(removed) => {
+                    session.remove(&removed.camera, Stamp(removed.stamp_nanos))?
+                }
                 Decision::Seed(_) => session.seed()?,
                 Decision::Align(_) => drop(session.poll_alignment(true)?),
                 Decision::EndSizeSearch(_) => session.end_size_search()?,
@@ -171,17 +230,24 @@ impl Replay {
         Ok(())
     }
 
-    /// The logged settings as keys of a rig file, so that the resolved rig file lists the settings of the replay.
+    /// The logged settings as keys of a rig file, so that the resolved rig file lists the settings
+    /// of the replay.
     fn overrides(&self) -> Vec<Override> {
         let ModelSpec { kind, options } = &self.model_spec;
-        let specific = |key, name: &str| Some(Override::new(key, options.specific.get(name)?.as_i64()?));
+        let specific =
+            |key, name: &str| Some(Override::new(key, options.specific.get(name)?.as_i64()?));
         let mut overrides = vec![
             Override::new("train.method", kind.name()),
             Override::new("train.seed", options.common.seed.cast_signed()),
         ];
         overrides.extend(specific("train.max_splats", MAX_SPLATS));
         overrides.extend(specific("train.sh_degree", SH_DEGREE));
-        overrides.extend(options.common.max_bytes.map(|bytes| Override::new("train.max_bytes", bytes.cast_signed())));
+        overrides.extend(
+            options
+                .common
+                .max_bytes
+                .map(|bytes| Override::new("train.max_bytes", bytes.cast_signed())),
+        );
         overrides
     }
 
@@ -191,5 +257,8 @@ impl Replay {
 }
 
 fn by_name(keyframes: &[Arc<Keyframe>]) -> HashMap<(&str, i64), &Arc<Keyframe>> {
-    keyframes.iter().map(|keyframe| ((&*keyframe.camera, keyframe.stamp.0), keyframe)).collect()
+    keyframes
+        .iter()
+        .map(|keyframe| ((&*keyframe.camera, keyframe.stamp.0), keyframe))
+        .collect()
 }

@@ -8,8 +8,8 @@ use kinematics::urdf::Robot;
 use std::path::{Path, PathBuf};
 use viz::{MeshFormat, RobotDescription, RobotMesh};
 
-/// The robot of a rig; `None` if the rig has neither an arm nor a moving base. Shapes that cannot be drawn cause only a
-/// warning.
+/// The robot of a rig; `None` if the rig has neither an arm nor a moving base. Shapes that cannot
+/// be drawn cause only a warning.
 ///
 /// # Errors
 ///
@@ -22,7 +22,12 @@ pub fn description(rig: &Rig, rig_file: &Path) -> crate::Result<Option<RobotDesc
     let folder = Rig::urdf_folder(rig_file).unwrap_or_default();
     let meshes = meshes(&robot, &folder);
     let (base_link, joint_names) = (rig.arm.base_link.clone(), rig.arm.joints.clone());
-    Ok(Some(RobotDescription { robot, base_link, joint_names, meshes }))
+    Ok(Some(RobotDescription {
+        robot,
+        base_link,
+        joint_names,
+        meshes,
+    }))
 }
 
 /// Reads the mesh files of all visual shapes.
@@ -43,7 +48,9 @@ fn meshes(robot: &Robot, urdf_folder: &Path) -> Vec<RobotMesh> {
                 budget = budget.after(mesh.bytes.len() as u64);
                 meshes.push(mesh);
             }
-            Err(why) => log::warn!("the robot is drawn incompletely: cannot draw the mesh {file:?}: {why}"),
+            Err(why) => {
+                log::warn!("the robot is drawn incompletely: cannot draw the mesh {file:?}: {why}")
+            }
         }
     }
     meshes
@@ -51,31 +58,54 @@ fn meshes(robot: &Robot, urdf_folder: &Path) -> Vec<RobotMesh> {
 
 /// Reads a mesh file. The error is the reason, in one sentence.
 fn read(file: &str, urdf_folder: &Path, left: Budget) -> Result<RobotMesh, String> {
-    let format = MeshFormat::of_file(file).ok_or("its type is not supported, convert it to .stl, .dae or .obj")?;
+    let format = MeshFormat::of_file(file)
+        .ok_or("its type is not supported, convert it to .stl, .dae or .obj")?;
     let candidates = candidates(file, urdf_folder);
     let Some(path) = candidates.iter().find(|path| path.is_file()) else {
-        let tried: Vec<_> = candidates.iter().map(|path| path.display().to_string()).collect();
+        let tried: Vec<_> = candidates
+            .iter()
+            .map(|path| path.display().to_string())
+            .collect();
         return Err(format!("no such file; tried {}", tried.join(", ")));
     };
     let shown = path.display();
     let max_bytes = Budget::MESH.max_bytes.min(left.max_bytes);
-    let bytes = files::read(path, Budget { max_bytes, ..Budget::MESH }).map_err(|error| match error.kind() {
+    let bytes = files::read(
+        path,
+        Budget {
+            max_bytes,
+            ..Budget::MESH
+        },
+    )
+    .map_err(|error| match error.kind() {
         std::io::ErrorKind::FileTooLarge => format!("{shown}: {error}; reduce its triangles"),
         _ => format!("cannot read {shown}: {error}"),
     })?;
-    Ok(RobotMesh { file: file.to_owned(), format, bytes: bytes.into() })
+    Ok(RobotMesh {
+        file: file.to_owned(),
+        format,
+        bytes: bytes.into(),
+    })
 }
 
-/// Paths where a mesh file may be. A package is a folder of that name above the URDF, or beside a folder above it.
+/// Paths where a mesh file may be. A package is a folder of that name above the URDF, or beside a
+/// folder above it.
 fn candidates(file: &str, urdf_folder: &Path) -> Vec<PathBuf> {
-    let package_path = file.strip_prefix("package://").or_else(|| file.strip_prefix("model://"));
+    let package_path = file
+        .strip_prefix("package://")
+        .or_else(|| file.strip_prefix("model://"));
     let Some((package, rest)) = package_path.and_then(|path| path.split_once('/')) else {
         return vec![urdf_folder.join(file.strip_prefix("file://").unwrap_or(file))];
     };
-    let above = urdf_folder.ancestors().filter(|folder| !folder.as_os_str().is_empty());
+    let above = urdf_folder
+        .ancestors()
+        .filter(|folder| !folder.as_os_str().is_empty());
     let in_folder = |folder: &Path| {
         let is_package = folder.file_name().is_some_and(|name| name == package);
-        [is_package.then(|| folder.join(rest)), Some(folder.join(package).join(rest))]
+        [
+            is_package.then(|| folder.join(rest)),
+            Some(folder.join(package).join(rest)),
+        ]
     };
     above.flat_map(in_folder).flatten().collect()
 }
@@ -88,9 +118,14 @@ mod tests {
     use viz::MeshFormat;
 
     fn robot(files: &[&str]) -> Robot {
-        let mesh = |file: &&str| format!(r#"<visual><geometry><mesh filename="{file}"/></geometry></visual>"#);
+        let mesh = |file: &&str| {
+            format!(r#"<visual><geometry><mesh filename="{file}"/></geometry></visual>"#)
+        };
         let shapes: String = files.iter().map(mesh).collect();
-        Robot::parse(&format!(r#"<robot name="r"><link name="a">{shapes}</link></robot>"#)).expect("a robot")
+        Robot::parse(&format!(
+            r#"<robot name="r"><link name="a">{shapes}</link></robot>"#
+        ))
+        .expect("a robot")
     }
 
     fn write(path: &Path, contents: &str) {
@@ -114,9 +149,15 @@ mod tests {
             "package://arm_description/meshes/a.txt",
         ];
         let found = meshes(&robot(&files), &root.join("arm_description/urdf"));
-        let found: Vec<_> = found.iter().map(|mesh| (&*mesh.file, mesh.format, mesh.bytes[0])).collect();
-        let expected =
-            [(files[0], MeshFormat::Stl, b'a'), (files[1], MeshFormat::Obj, b'b'), (files[2], MeshFormat::Dae, b'c')];
+        let found: Vec<_> = found
+            .iter()
+            .map(|mesh| (&*mesh.file, mesh.format, mesh.bytes[0]))
+            .collect();
+        let expected = [
+            (files[0], MeshFormat::Stl, b'a'),
+            (files[1], MeshFormat::Obj, b'b'),
+            (files[2], MeshFormat::Dae, b'c'),
+        ];
         assert_eq!(found, expected);
     }
 }

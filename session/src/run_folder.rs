@@ -29,9 +29,14 @@ const SECS_PER_DAY: u64 = 86_400;
 
 /// Returns an error if a folder contains any model, so that results are never mixed or overwritten.
 pub fn check_no_model(folder: &Path) -> Result<(), Error> {
-    let subfolders = [PathBuf::new()].into_iter().chain(ModelKind::ALL.iter().map(|kind| PathBuf::from(kind.name())));
-    let mut files =
-        subfolders.flat_map(|path| ModelKind::model_files().map(|name| path.join(name)).collect::<Vec<_>>());
+    let subfolders = [PathBuf::new()]
+        .into_iter()
+        .chain(ModelKind::ALL.iter().map(|kind| PathBuf::from(kind.name())));
+    let mut files = subfolders.flat_map(|path| {
+        ModelKind::model_files()
+            .map(|name| path.join(name))
+            .collect::<Vec<_>>()
+    });
     match files.find(|file| folder.join(file).exists()) {
         Some(file) => Err(Error::BadInput(format!(
             "--out {}: the folder already contains a model ({}); give another folder",
@@ -42,10 +47,15 @@ pub fn check_no_model(folder: &Path) -> Result<(), Error> {
     }
 }
 
-/// Returns an error if a folder contains any interrupted run, because a new run would replace its checkpoint.
+/// Returns an error if a folder contains any interrupted run, because a new run would replace its
+/// checkpoint.
 pub fn check_no_unfinished_run(out: &Path) -> Result<(), Error> {
-    let folders = std::iter::once(out.to_owned()).chain(ModelKind::ALL.iter().map(|kind| out.join(kind.name())));
-    match folders.into_iter().find(|folder| folder.join(CHECKPOINT).exists()) {
+    let folders = std::iter::once(out.to_owned())
+        .chain(ModelKind::ALL.iter().map(|kind| out.join(kind.name())));
+    match folders
+        .into_iter()
+        .find(|folder| folder.join(CHECKPOINT).exists())
+    {
         Some(folder) => Err(Error::BadInput(format!(
             "--out {}: {} contains an interrupted run: continue it with --resume, or give another folder",
             out.display(),
@@ -67,7 +77,8 @@ pub fn check_not_data_folder(out: &Path, data: &Path) -> Result<(), Error> {
     }
 }
 
-/// Returns an error if a folder contains models only in subfolders for several methods. The error lists the subfolders.
+/// Returns an error if a folder contains models only in subfolders for several methods. The error
+/// lists the subfolders.
 pub fn expect_one_model(folder: &Path) -> Result<(), Error> {
     let holds_one = |folder: &Path| holds_model(folder) || folder.join(CHECKPOINT).exists();
     let inside: Vec<String> = ModelKind::ALL
@@ -86,7 +97,8 @@ pub fn expect_one_model(folder: &Path) -> Result<(), Error> {
     )))
 }
 
-/// Returns an error unless the path is a model: an existing folder with exactly one model, or a file of splats.
+/// Returns an error unless the path is a model: an existing folder with exactly one model, or a
+/// file of splats.
 pub fn expect_model(model: &Path) -> crate::Result<()> {
     let shown = model.display();
     ensure!(model.exists(), "{shown} does not exist");
@@ -96,19 +108,34 @@ pub fn expect_model(model: &Path) -> crate::Result<()> {
             return Ok(());
         }
         let has_checkpoint = model.join(CHECKPOINT).exists();
-        let hint = if has_checkpoint { " but has a checkpoint: train --resume continues from it" } else { "" };
+        let hint = if has_checkpoint {
+            " but has a checkpoint: train --resume continues from it"
+        } else {
+            ""
+        };
         bail!("{shown} contains no model{hint}");
     }
     // One file of a model with several files may have the extension of a single-file model.
     let is_part = |kind: &ModelKind| {
-        let is_complete = |file: &str| kind.entry().single_file.is_some() && kind.entry().files.last() == Some(&file);
-        kind.entry().files.iter().any(|file| model.ends_with(file) && !is_complete(file))
+        let is_complete = |file: &str| {
+            kind.entry().single_file.is_some() && kind.entry().files.last() == Some(&file)
+        };
+        kind.entry()
+            .files
+            .iter()
+            .any(|file| model.ends_with(file) && !is_complete(file))
     };
     if ModelKind::ALL.iter().any(is_part) || ModelKind::of_single_file(model).is_none() {
-        let single_files = ModelKind::ALL.iter().filter_map(|kind| kind.entry().single_file);
-        let described: Vec<String> =
-            single_files.map(|file| format!("{} (.{})", file.description, file.extensions.join(", ."))).collect();
-        let described = listed(&described.iter().map(String::as_str).collect::<Vec<_>>(), "or");
+        let single_files = ModelKind::ALL
+            .iter()
+            .filter_map(|kind| kind.entry().single_file);
+        let described: Vec<String> = single_files
+            .map(|file| format!("{} (.{})", file.description, file.extensions.join(", .")))
+            .collect();
+        let described = listed(
+            &described.iter().map(String::as_str).collect::<Vec<_>>(),
+            "or",
+        );
         let message = format!("{shown} is not {described}; for a saved model, give its folder");
         return Err(Error::BadInput(message));
     }
@@ -120,10 +147,13 @@ fn holds_model(folder: &Path) -> bool {
     ModelKind::model_files().any(|name| folder.join(name).exists())
 }
 
-/// The models at a path: the path itself or, for a run of several methods, the subfolders that contain a model. If
-/// there is no model, returns the error of [`expect_model`].
+/// The models at a path: the path itself or, for a run of several methods, the subfolders that
+/// contain a model. If there is no model, returns the error of [`expect_model`].
 pub fn models_at(path: &Path) -> crate::Result<Vec<PathBuf>> {
-    let inside = ModelKind::ALL.iter().map(|kind| path.join(kind.name())).filter(|folder| holds_model(folder));
+    let inside = ModelKind::ALL
+        .iter()
+        .map(|kind| path.join(kind.name()))
+        .filter(|folder| holds_model(folder));
     let inside: Vec<PathBuf> = inside.collect();
     if path.is_dir() && !holds_model(path) && !inside.is_empty() {
         return Ok(inside);
@@ -142,8 +172,9 @@ pub struct CreatedFolders {
 }
 
 impl CreatedFolders {
-    /// Creates the folder of each model of a run: the requested folder for a single model, else a subfolder per method.
-    /// Writes the resolved rig file, if any, into each folder; in a subfolder, it lists only the method of that model.
+    /// Creates the folder of each model of a run: the requested folder for a single model, else a
+    /// subfolder per method. Writes the resolved rig file, if any, into each folder; in a
+    /// subfolder, it lists only the method of that model.
     pub fn make_each(
         &mut self,
         requested: Option<&Path>,
@@ -151,14 +182,16 @@ impl CreatedFolders {
         rig: Option<&Rig>,
     ) -> crate::Result<Vec<PathBuf>> {
         let write = |rig: &Rig, folder: &Path| {
-            rig.write_resolved(folder).with_context(|| format!("cannot write into {}", folder.display()))
+            rig.write_resolved(folder)
+                .with_context(|| format!("cannot write into {}", folder.display()))
         };
         let out = self.make(requested)?;
         let folders: Vec<PathBuf> = match kinds {
             [_] => vec![out.clone()],
-            several => {
-                several.iter().map(|kind| self.make(Some(&out.join(kind.name())))).collect::<crate::Result<_>>()?
-            }
+            several => several
+                .iter()
+                .map(|kind| self.make(Some(&out.join(kind.name()))))
+                .collect::<crate::Result<_>>()?,
         };
         if let Some(rig) = rig {
             write(rig, &out)?;
@@ -169,10 +202,17 @@ impl CreatedFolders {
         Ok(folders)
     }
 
-    /// Creates the requested folder, or `runs/<UTC time>`. A folder that already contains a model is an error.
+    /// Creates the requested folder, or `runs/<UTC time>`. A folder that already contains a model
+    /// is an error.
     pub fn make(&mut self, requested: Option<&Path>) -> crate::Result<PathBuf> {
         let is_missing = |folder: &&Path| !folder.as_os_str().is_empty() && !folder.exists();
-        let missing = |folder: &Path| folder.ancestors().take_while(is_missing).map(Path::to_owned).collect::<Vec<_>>();
+        let missing = |folder: &Path| {
+            folder
+                .ancestors()
+                .take_while(is_missing)
+                .map(Path::to_owned)
+                .collect::<Vec<_>>()
+        };
         let runs = missing(Path::new(RUNS));
         let missing_parents = requested.map_or(Vec::new(), missing);
         let created = make(requested)?;
@@ -190,14 +230,18 @@ impl CreatedFolders {
         Ok(created)
     }
 
-    /// Removes the created folders with their contents, unless they contain a model, a checkpoint or a recording.
+    /// Removes the created folders with their contents, unless they contain a model, a checkpoint
+    /// or a recording.
     pub fn remove_created(self) {
         let holds_recording = |folder: &PathBuf| {
             let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
-            entries.map(|entry| entry.path()).any(|path| is_recording(&path))
+            entries
+                .map(|entry| entry.path())
+                .any(|path| is_recording(&path))
         };
-        let must_keep =
-            |folder: &PathBuf| holds_recording(folder) || holds_model(folder) || folder.join(CHECKPOINT).exists();
+        let must_keep = |folder: &PathBuf| {
+            holds_recording(folder) || holds_model(folder) || folder.join(CHECKPOINT).exists()
+        };
         if self.leaves.iter().any(must_keep) {
             return;
         }
@@ -209,8 +253,8 @@ impl CreatedFolders {
         }
     }
 
-    /// Removes the created folders if the command was rejected because of bad input or insufficient data, or failed before
-    /// it had anything to keep.
+    /// Removes the created folders if the command was rejected because of bad input or insufficient
+    /// data, or failed before it had anything to keep.
     pub fn keep_unless(self, is_rejected: bool) {
         if is_rejected {
             self.remove_created();
@@ -221,26 +265,37 @@ impl CreatedFolders {
 fn make(requested: Option<&Path>) -> crate::Result<PathBuf> {
     if let Some(folder) = requested {
         if folder.to_str().is_none() {
-            return Err(Error::BadInput(format!("--out {}: the name must be valid UTF-8", folder.display())));
+            return Err(Error::BadInput(format!(
+                "--out {}: the name must be valid UTF-8",
+                folder.display()
+            )));
         }
         check_no_model(folder)?;
-        std::fs::create_dir_all(folder).with_context(|| format!("cannot create the folder {}", folder.display()))?;
+        std::fs::create_dir_all(folder)
+            .with_context(|| format!("cannot create the folder {}", folder.display()))?;
         lock(folder)?;
         return Ok(folder.to_owned());
     }
     make_in(Path::new(RUNS), "")
 }
 
-/// Creates a folder in the system's temporary folder, for a model that cannot be saved in its run folder.
+/// Creates a folder in the system's temporary folder, for a model that cannot be saved in its run
+/// folder.
 pub fn make_fallback_folder() -> crate::Result<PathBuf> {
     make_in(&std::env::temp_dir(), "fieldrig-")
 }
 
 /// Creates a new folder named after the current time.
 fn make_in(parent: &Path, prefix: &str) -> crate::Result<PathBuf> {
-    #[expect(clippy::disallowed_methods, reason = "only a readable name; no time is measured")]
-    let since_epoch = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
-    std::fs::create_dir_all(parent).with_context(|| format!("cannot create the folder {}", parent.display()))?;
+    #[expect(
+        clippy::disallowed_methods,
+        reason = "only a readable name; no time is measured"
+    )]
+    let since_epoch = SystemTime::now()
+        .duration_since(UNIX_EPOCH)
+        .unwrap_or_default();
+    std::fs::create_dir_all(parent)
+        .with_context(|| format!("cannot create the folder {}", parent.display()))?;
     let name = format!("{prefix}{}", name_from_time(since_epoch));
     for attempt in 1..100 {
         let folder = match attempt {
@@ -253,17 +308,26 @@ fn make_in(parent: &Path, prefix: &str) -> crate::Result<PathBuf> {
                 return Ok(folder);
             }
             Err(error) if error.kind() == std::io::ErrorKind::AlreadyExists => {}
-            Err(error) => return Err(error).with_context(|| format!("cannot create the folder {}", folder.display())),
+            Err(error) => {
+                return Err(error)
+                    .with_context(|| format!("cannot create the folder {}", folder.display()));
+            }
         }
     }
-    bail!("{} and 98 numbered variants already exist: give a folder with --out", parent.join(name).display())
+    bail!(
+        "{} and 98 numbered variants already exist: give a folder with --out",
+        parent.join(name).display()
+    )
 }
 
-/// Locks a folder against other runs for the lifetime of this process. A folder whose subfolders are links is rejected: it
-/// may come from somebody else, and files written through its links would replace other files.
+/// Locks a folder against other runs for the lifetime of this process. A folder whose subfolders
+/// are links is rejected: it may come from somebody else, and files written through its links would
+/// replace other files.
 pub(crate) fn lock(folder: &Path) -> crate::Result<()> {
     let of_methods = ModelKind::ALL.iter().map(|kind| kind.name());
-    let subfolders = std::iter::once(KEYFRAMES).chain(of_methods).map(|name| folder.join(name));
+    let subfolders = std::iter::once(KEYFRAMES)
+        .chain(of_methods)
+        .map(|name| folder.join(name));
     for subfolder in subfolders.chain([partial_model(folder)]) {
         files::check_no_link(&subfolder).map_err(|link| Error::BadInput(link.to_string()))?;
     }
@@ -271,7 +335,10 @@ pub(crate) fn lock(folder: &Path) -> crate::Result<()> {
     match files::lock(&path).with_context(|| format!("cannot write {}", path.display()))? {
         Some(file) => std::mem::forget(file), // The system releases the lock when the process ends.
         None => {
-            let message = format!("--out {}: another run uses this folder; give another one", folder.display());
+            let message = format!(
+                "--out {}: another run uses this folder; give another one",
+                folder.display()
+            );
             return Err(Error::BadInput(message));
         }
     }
@@ -283,17 +350,22 @@ fn partial_model(folder: &Path) -> PathBuf {
     files::partial::path_of(&folder.join(MODEL))
 }
 
-/// Saves a model and its edits in a temporary subfolder and moves its files into place once it is complete.
+/// Saves a model and its edits in a temporary subfolder and moves its files into place once it is
+/// complete.
 pub fn save_model(method: &mut dyn Method, edits: &Edits, folder: &Path) -> crate::Result<()> {
     let partial_folder = partial_model(folder);
-    // Left over if an earlier run was killed while saving. No other run saves now, because this one has locked the folder.
+    // Left over if an earlier run was killed while saving. No other run saves now, because this one
+    // has locked the folder.
     let model_files: Vec<&OsStr> = ModelKind::model_files().map(OsStr::new).collect();
     files::partial::remove_leftover(&partial_folder, &model_files)?;
     let save_edited = |method: &mut dyn Method| match edits.is_empty() {
         true => Ok(()),
         false => method.write_for_others(&partial_folder, edits),
     };
-    if let Err(error) = method.save(&partial_folder).and_then(|()| save_edited(method)) {
+    if let Err(error) = method
+        .save(&partial_folder)
+        .and_then(|()| save_edited(method))
+    {
         let _ = std::fs::remove_dir_all(&partial_folder); // Frees the disk space of the incomplete model.
         return Err(error.into());
     }
@@ -305,12 +377,14 @@ pub fn save_model(method: &mut dyn Method, edits: &Edits, folder: &Path) -> crat
             .with_context(|| format!("cannot write {}", path.display()))?;
     }
     // Fails if the folder is not empty, so that files missing from `model_files` are not lost.
-    std::fs::remove_dir(&partial_folder).with_context(|| format!("cannot remove {}", partial_folder.display()))
+    std::fs::remove_dir(&partial_folder)
+        .with_context(|| format!("cannot remove {}", partial_folder.display()))
 }
 
 /// Writes a report as indented JSON.
 pub fn write_json(path: &Path, report: &impl Serialize) -> crate::Result<()> {
-    let mut text = serde_json::to_string_pretty(report).context("cannot write the report as JSON")?;
+    let mut text =
+        serde_json::to_string_pretty(report).context("cannot write the report as JSON")?;
     text.push('\n');
     write_atomic(path, &text)
 }
@@ -334,8 +408,8 @@ pub fn checkpoint_sha256(folder: &Path) -> crate::Result<String> {
         if !path.exists() {
             continue;
         }
-        let bytes =
-            files::read(&path, files::Budget::PLAIN).with_context(|| format!("cannot read {}", path.display()))?;
+        let bytes = files::read(&path, files::Budget::PLAIN)
+            .with_context(|| format!("cannot read {}", path.display()))?;
         hash.update(format!("{name} {}\n", bytes.len()));
         hash.update(&bytes);
         n_files += 1;
@@ -354,27 +428,54 @@ fn name_from_time(since_epoch: Duration) -> String {
     let secs = since_epoch.as_secs();
     let (year, month, day) = date_from_days(secs / SECS_PER_DAY);
     let secs_of_day = secs % SECS_PER_DAY;
-    format!("{year:04}{month:02}{day:02}-{:02}{:02}{:02}", secs_of_day / 3600, secs_of_day / 60 % 60, secs_of_day % 60)
+    format!(
+        "{year:04}{month:02}{day:02}-{:02}{:02}{:02}",
+        secs_of_day / 3600,
+        secs_of_day / 60 % 60,
+        secs_of_day % 60
+    )
 }
 
 /// Date and time of day in UTC, for readers.
 pub(crate) fn utc_now() -> String {
     #[expect(clippy::disallowed_methods, reason = "only shown; no time is measured")]
-    let secs = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_secs();
+    let secs = SystemTime::now()
+        .duration_since(UNIX_EPOCH)
+        .unwrap_or_default()
+        .as_secs();
     let (year, month, day) = date_from_days(secs / SECS_PER_DAY);
     let minutes = secs % SECS_PER_DAY / 60;
-    format!("{year:04}-{month:02}-{day:02} {:02}:{:02} UTC", minutes / 60, minutes % 60)
+    format!(
+        "{year:04}-{month:02}-{day:02} {:02}:{:02} UTC",
+        minutes / 60,
+        minutes % 60
+    )
 }
 
 /// Converts days since 1 January 1970 to year, month and day.
 fn date_from_days(mut days: u64) -> (u64, usize, u64) {
-    let is_leap = |year: u64| year.is_multiple_of(4) && (!year.is_multiple_of(100) || year.is_multiple_of(400));
+    let is_leap = |year: u64| {
+        year.is_multiple_of(4) && (!year.is_multiple_of(100) || year.is_multiple_of(400))
+    };
     let mut year = 1970;
     while days >= 365 + u64::from(is_leap(year)) {
         days -= 365 + u64::from(is_leap(year));
         year += 1;
     }
-    let lengths = [31, 28 + u64::from(is_leap(year)), 31, 30, 31, 30, 31, 31, 30, 31, 30, 31];
+    let lengths = [
+        31,
+        28 + u64::from(is_leap(year)),
+        31,
+        30,
+        31,
+        30,
+        31,
+        31,
+        30,
+        31,
+        30,
+        31,
+    ];
     let mut month_ix = 0;
     while days >= lengths[month_ix] {
         days -= lengths[month_ix];
@@ -385,7 +486,8 @@ fn date_from_days(mut days: u64) -> (u64, usize, u64) {
 
 /// Whether a path has the file extension of recordings.
 pub fn is_recording(path: &Path) -> bool {
-    path.extension().is_some_and(|extension| extension == RECORDING_EXTENSION)
+    path.extension()
+        .is_some_and(|extension| extension == RECORDING_EXTENSION)
 }
 
 #[cfg(test)]
@@ -399,19 +501,32 @@ mod tests {
     #[test]
     fn folders_are_named_by_utc() {
         assert_eq!(name_from_time(Duration::ZERO), "19700101-000000");
-        assert_eq!(name_from_time(Duration::from_secs(951_782_400)), "20000229-000000");
-        assert_eq!(name_from_time(Duration::from_secs(1_795_253_400)), "20261121-093000");
-        assert_eq!(name_from_time(Duration::from_secs(4_102_444_799)), "20991231-235959");
+        assert_eq!(
+            name_from_time(Duration::from_secs(951_782_400)),
+            "20000229-000000"
+        );
+        assert_eq!(
+            name_from_time(Duration::from_secs(1_795_253_400)),
+            "20261121-093000"
+        );
+        assert_eq!(
+            name_from_time(Duration::from_secs(4_102_444_799)),
+            "20991231-235959"
+        );
     }
 
     #[test]
     fn folder_with_a_model_is_rejected() {
         let folder = tempfile::tempdir().expect("folder");
-        assert_eq!(make(Some(folder.path())).expect("an empty folder"), folder.path());
+        assert_eq!(
+            make(Some(folder.path())).expect("an empty folder"),
+            folder.path()
+        );
         std::fs::write(folder.path().join("model.json"), b"{}").expect("file");
         let message = make(Some(folder.path())).expect_err("a model").to_string();
         assert!(
-            message.contains(folder.path().to_str().expect("plain")) && message.contains("model.json"),
+            message.contains(folder.path().to_str().expect("plain"))
+                && message.contains("model.json"),
             "{message}"
         );
     }
@@ -420,22 +535,40 @@ mod tests {
     fn models_of_several_methods_are_found_in_subfolders() {
         let folder = tempfile::tempdir().expect("folder");
         let requested = folder.path().join("out");
-        let created =
-            CreatedFolders::default().make_each(Some(&requested), &tsdf_and_splat(), None).expect("it is free");
+        let created = CreatedFolders::default()
+            .make_each(Some(&requested), &tsdf_and_splat(), None)
+            .expect("it is free");
         assert_eq!(created, [requested.join("tsdf"), requested.join("splat")]);
         expect_one_model(&requested).expect("there is none yet");
         std::fs::write(created[0].join(CHECKPOINT), b"{}").expect("file");
-        assert!(models_at(&requested).is_err(), "a checkpoint is not a model");
+        assert!(
+            models_at(&requested).is_err(),
+            "a checkpoint is not a model"
+        );
         std::fs::write(created[1].join("splats.ply"), b"{}").expect("file");
-        assert_eq!(models_at(&requested).expect("one of them"), [requested.join("splat")]);
+        assert_eq!(
+            models_at(&requested).expect("one of them"),
+            [requested.join("splat")]
+        );
         std::fs::write(created[0].join("model.json"), b"{}").expect("file");
-        assert_eq!(models_at(&requested).expect("both"), [requested.join("splat"), requested.join("tsdf")]);
-        assert_eq!(models_at(&created[0]).expect("itself"), [requested.join("tsdf")]);
+        assert_eq!(
+            models_at(&requested).expect("both"),
+            [requested.join("splat"), requested.join("tsdf")]
+        );
+        assert_eq!(
+            models_at(&created[0]).expect("itself"),
+            [requested.join("tsdf")]
+        );
         std::fs::remove_file(created[0].join("model.json")).expect("file");
         let message = expect_one_model(&requested).expect_err("two").to_string();
-        assert!(message.contains("out/splat or ") && message.ends_with("out/tsdf"), "{message}");
+        assert!(
+            message.contains("out/splat or ") && message.ends_with("out/tsdf"),
+            "{message}"
+        );
         expect_one_model(&created[1]).expect("one");
-        let message = check_no_model(&requested).expect_err("one inside").to_string();
+        let message = check_no_model(&requested)
+            .expect_err("one inside")
+            .to_string();
         assert!(message.contains("splat/splats.ply"), "{message}");
     }
 
@@ -447,26 +580,38 @@ mod tests {
         std::fs::create_dir(&run).expect("disk space");
         check_no_unfinished_run(out.path()).expect("no checkpoint");
         std::fs::write(run.join(CHECKPOINT), b"x").expect("disk space");
-        assert!(
-            check_no_unfinished_run(out.path())
-                .is_err_and(|error| error.to_string().contains("splat contains an interrupted run"))
-        );
+        assert!(check_no_unfinished_run(out.path()).is_err_and(|error| {
+            error
+                .to_string()
+                .contains("splat contains an interrupted run")
+        }));
         assert!(check_no_unfinished_run(&run).is_err());
     }
 
     #[test]
     fn rejected_run_removes_only_its_own_folders() {
         let folder = tempfile::tempdir().expect("folder");
-        let (own_folder, foreign_folder) = (folder.path().join("a/b"), folder.path().join("theirs"));
+        let (own_folder, foreign_folder) =
+            (folder.path().join("a/b"), folder.path().join("theirs"));
         std::fs::create_dir(&foreign_folder).expect("disk space");
         for (requested, is_left) in [(&own_folder, false), (&foreign_folder, true)] {
             let mut created = CreatedFolders::default();
-            created.make_each(Some(requested), &tsdf_and_splat(), None).expect("it is free");
+            created
+                .make_each(Some(requested), &tsdf_and_splat(), None)
+                .expect("it is free");
             created.keep_unless(true);
-            assert_eq!((requested.exists(), requested.join("tsdf").exists()), (is_left, false), "{requested:?}");
+            assert_eq!(
+                (requested.exists(), requested.join("tsdf").exists()),
+                (is_left, false),
+                "{requested:?}"
+            );
         }
         assert!(!folder.path().join("a").exists());
-        for (is_rejected, file) in [(true, CHECKPOINT), (true, "scan.mcap"), (false, "keyframes.txt")] {
+        for (is_rejected, file) in [
+            (true, CHECKPOINT),
+            (true, "scan.mcap"),
+            (false, "keyframes.txt"),
+        ] {
             let mut created = CreatedFolders::default();
             let out = folder.path().join(file);
             created.make(Some(&out)).expect("it is free");
@@ -499,14 +644,22 @@ mod tests {
     fn folder_is_locked_by_one_run() {
         let folder = tempfile::tempdir().expect("folder");
         make(Some(folder.path())).expect("the first");
-        let message = make(Some(folder.path())).expect_err("the second").to_string();
-        assert!(message.contains("another run uses this folder"), "{message}");
+        let message = make(Some(folder.path()))
+            .expect_err("the second")
+            .to_string();
+        assert!(
+            message.contains("another run uses this folder"),
+            "{message}"
+        );
     }
 
     #[test]
     fn checksum_covers_model_files_only() {
         let folder = tempfile::tempdir().expect("folder");
-        assert!(checkpoint_sha256(folder.path()).is_err(), "no model, no checksum");
+        assert!(
+            checkpoint_sha256(folder.path()).is_err(),
+            "no model, no checksum"
+        );
         std::fs::write(folder.path().join("splats.ply"), b"abc").expect("file");
         let first = checkpoint_sha256(folder.path()).expect("a model");
         std::fs::write(folder.path().join("report.json"), b"other").expect("file");

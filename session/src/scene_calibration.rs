@@ -15,7 +15,8 @@ use std::sync::Arc;
 pub struct SceneCalibration {
     /// Estimates with their standard deviations, and the trials that accepted or rejected them.
     pub alignment: Alignment,
-    /// The rig with the accepted corrections; `None` without a rig. Cameras in `refused` keep their extrinsics.
+    /// The rig with the accepted corrections; `None` without a rig. Cameras in `refused` keep their
+    /// extrinsics.
     pub rig: Option<Rig>,
     /// Cameras whose extrinsics the motion does not determine, with the reason.
     pub refused: BTreeMap<String, String>,
@@ -24,32 +25,46 @@ pub struct SceneCalibration {
 impl SceneCalibration {
     /// Whether there is no camera whose extrinsics are determined.
     pub fn is_refused(&self, data: &Data) -> bool {
-        data.keyframes.iter().all(|keyframe| self.refused.contains_key(&*keyframe.camera))
+        data.keyframes
+            .iter()
+            .all(|keyframe| self.refused.contains_key(&*keyframe.camera))
     }
 
-    /// Standard deviations of the pose of a camera in its parent frame, along and about the axes of the camera. `None` if
-    /// its extrinsics were not estimated.
+    /// Standard deviations of the pose of a camera in its parent frame, along and about the axes of
+    /// the camera. `None` if its extrinsics were not estimated.
     pub fn sigmas(&self, camera: &str) -> Option<PoseSigmas> {
         self.covariance(&[camera])?.of_camera(camera)
     }
 
-    /// Pose of a camera in the frame of the first camera with the same parent, by name. `None` for that camera, and without
-    /// a rig.
+    /// Pose of a camera in the frame of the first camera with the same parent, by name. `None` for
+    /// that camera, and without a rig.
     pub fn relative(&self, camera: &str) -> Option<RelativePose> {
         let cameras = &self.rig.as_ref()?.cameras;
         let camera = cameras.iter().find(|other| *other.name == *camera)?;
         let same_parent = cameras.iter().filter(|other| other.parent == camera.parent);
-        let first = same_parent.min_by_key(|other| &other.name).filter(|first| first.name != camera.name)?;
+        let first = same_parent
+            .min_by_key(|other| &other.name)
+            .filter(|first| first.name != camera.name)?;
         let first_from_camera = first.parent_from_camera.inverse() * camera.parent_from_camera;
         let covariance = self.covariance(&[&first.name, &camera.name]);
-        let sigmas = covariance.and_then(|known| known.between(&first.name, &camera.name, &first_from_camera));
-        Some(RelativePose { first: first.name.to_string(), first_from_camera, sigmas })
+        let sigmas = covariance
+            .and_then(|known| known.between(&first.name, &camera.name, &first_from_camera));
+        Some(RelativePose {
+            first: first.name.to_string(),
+            first_from_camera,
+            sigmas,
+        })
     }
 
     /// The covariance, unless one of the cameras was refused.
     fn covariance(&self, cameras: &[&str]) -> Option<&ExtrinsicsCovariance> {
-        let is_refused = cameras.iter().any(|camera| self.refused.contains_key(*camera));
-        self.alignment.extrinsics_covariance.as_ref().filter(|_| !is_refused)
+        let is_refused = cameras
+            .iter()
+            .any(|camera| self.refused.contains_key(*camera));
+        self.alignment
+            .extrinsics_covariance
+            .as_ref()
+            .filter(|_| !is_refused)
     }
 }
 
@@ -76,26 +91,38 @@ pub const SCENE_PARAMS: [Refine; 8] = [
     Refine::Readout,
 ];
 
-/// Estimates calibration parameters from keyframes: those of `params`, or with [`Refine::Auto`] all that improve the
-/// prediction of validation images. Test images are used for the estimation, too.
+/// Estimates calibration parameters from keyframes: those of `params`, or with [`Refine::Auto`] all
+/// that improve the prediction of validation images. Test images are used for the estimation, too.
 ///
 /// * `rig`: the rig to correct, without settings that only apply to these data.
 ///
 /// # Errors
 ///
 /// If a parameter cannot be estimated from these data, or if too few images overlap.
-pub fn calibrate_scene(data: &Data, params: &[Refine], rig: Option<&Rig>) -> Result<SceneCalibration, Error> {
-    let options = TrainingOptions { refine: params.to_vec(), ..TrainingOptions::default() };
+pub fn calibrate_scene(
+    data: &Data,
+    params: &[Refine],
+    rig: Option<&Rig>,
+) -> Result<SceneCalibration, Error> {
+    let options = TrainingOptions {
+        refine: params.to_vec(),
+        ..TrainingOptions::default()
+    };
     let choice = match options.refining(data.available(), Refine::Auto) {
         Ok(settings) => without_image_poses(settings.align),
-        Err(Error::BadInput(reason)) => return Err(Error::BadInput(reason.replace("--refine", "--params"))),
+        Err(Error::BadInput(reason)) => {
+            return Err(Error::BadInput(reason.replace("--refine", "--params")));
+        }
         Err(error) => return Err(error),
     };
     let keyframes: Vec<_> = data.keyframes.iter().map(for_calibration).collect();
     let Some(alignment) = calibration::align(&keyframes, &choice) else {
         let n_images = counted(data.keyframes.len() as u64, "image");
-        let needed =
-            if data.has_depth() { "" } else { " or have texture; without depth, each camera needs at least 10 images" };
+        let needed = if data.has_depth() {
+            ""
+        } else {
+            " or have texture; without depth, each camera needs at least 10 images"
+        };
         return Err(Error::InsufficientData(format!(
             "the cameras cannot be calibrated from {n_images}: too few of them show the same surfaces{needed}. Move the camera around the scene, and turn it about all of its axes"
         )));
@@ -103,16 +130,28 @@ pub fn calibrate_scene(data: &Data, params: &[Refine], rig: Option<&Rig>) -> Res
     let mut refused: BTreeMap<String, Vec<String>> = BTreeMap::new();
     for direction in &alignment.unobservable {
         for camera in &direction.moves_cameras {
-            refused.entry(camera.clone()).or_default().push(direction.to_string());
+            refused
+                .entry(camera.clone())
+                .or_default()
+                .push(direction.to_string());
         }
     }
     let reason = |(camera, directions): (String, Vec<String>)| {
-        let text = refusal(&directions, rig.and_then(|rig| rig.cameras.iter().find(|other| *other.name == *camera)));
+        let text = refusal(
+            &directions,
+            rig.and_then(|rig| rig.cameras.iter().find(|other| *other.name == *camera)),
+        );
         (camera, text)
     };
     let refused: BTreeMap<String, String> = refused.into_iter().map(reason).collect();
-    let rig = rig.map(|given| corrected(given, &alignment, &refused)).transpose()?;
-    Ok(SceneCalibration { alignment, rig, refused })
+    let rig = rig
+        .map(|given| corrected(given, &alignment, &refused))
+        .transpose()?;
+    Ok(SceneCalibration {
+        alignment,
+        rig,
+        refused,
+    })
 }
 
 /// A rig file has no keys for the poses of images.
@@ -120,12 +159,18 @@ fn without_image_poses(choice: CameraRefinement) -> CameraRefinement {
     let without = |set: ParamSet| set - ParamSet::IMAGE_POSES;
     match choice {
         CameraRefinement::Always(set) => CameraRefinement::Always(without(set)),
-        CameraRefinement::Try(sets) => {
-            CameraRefinement::Try(sets.into_iter().map(without).filter(|set| !set.is_empty()).collect())
-        }
+        CameraRefinement::Try(sets) => CameraRefinement::Try(
+            sets.into_iter()
+                .map(without)
+                .filter(|set| !set.is_empty())
+                .collect(),
+        ),
         CameraRefinement::AlwaysAndTry(set, sets) => CameraRefinement::AlwaysAndTry(
             without(set),
-            sets.into_iter().map(without).filter(|set| !set.is_empty()).collect(),
+            sets.into_iter()
+                .map(without)
+                .filter(|set| !set.is_empty())
+                .collect(),
         ),
         CameraRefinement::AlwaysAndWatch(set, watched) => {
             CameraRefinement::AlwaysAndWatch(without(set), without(watched))
@@ -136,21 +181,37 @@ fn without_image_poses(choice: CameraRefinement) -> CameraRefinement {
 /// The keyframe; test keyframes become training keyframes.
 fn for_calibration(keyframe: &Arc<Keyframe>) -> Arc<Keyframe> {
     match keyframe.split {
-        Split::Test => Arc::new(Keyframe { split: Split::Train, ..(**keyframe).clone() }),
+        Split::Test => Arc::new(Keyframe {
+            split: Split::Train,
+            ..(**keyframe).clone()
+        }),
         Split::Train | Split::Validation => keyframe.clone(),
     }
 }
 
 fn refusal(directions: &[String], camera: Option<&capture::config::Camera>) -> String {
     let advice = match camera.map(|camera| camera.parent) {
-        None | Some(Parent::Flange) => "turn the camera about at least two axes, by 20 degrees or more",
-        Some(Parent::Base) => "a base that turns only about one axis cannot determine it; use a target",
-        Some(Parent::World) => "the camera does not move, so it must see surfaces that moving cameras see, too",
+        None | Some(Parent::Flange) => {
+            "turn the camera about at least two axes, by 20 degrees or more"
+        }
+        Some(Parent::Base) => {
+            "a base that turns only about one axis cannot determine it; use a target"
+        }
+        Some(Parent::World) => {
+            "the camera does not move, so it must see surfaces that moving cameras see, too"
+        }
     };
-    format!("the motion does not determine: {}; {advice}", directions.join("; "))
+    format!(
+        "the motion does not determine: {}; {advice}",
+        directions.join("; ")
+    )
 }
 
-fn corrected(given: &Rig, alignment: &Alignment, refused: &BTreeMap<String, String>) -> Result<Rig, Error> {
+fn corrected(
+    given: &Rig,
+    alignment: &Alignment,
+    refused: &BTreeMap<String, String>,
+) -> Result<Rig, Error> {
     let mut rig = corrected_rig::corrected(given, Some(alignment), &BTreeMap::new())?;
     for (camera, before) in rig.cameras.iter_mut().zip(&given.cameras) {
         if refused.contains_key(&*camera.name) {

@@ -1,4 +1,5 @@
-//! The initial view of a scene, centered on the point that the cameras look at or, without cameras, on the model.
+//! The initial view of a scene, centered on the point that the cameras look at or, without cameras,
+//! on the model.
 
 use keyframe::Keyframe;
 use kinematics::Transform;
@@ -9,25 +10,35 @@ use viz::SceneHint;
 
 /// Assumed distance of the scene from each camera if the optical axes do not determine it, meters.
 const PRIOR_DISTANCE_M: f64 = 0.5;
-/// Weight of the assumed distance relative to one optical axis. It matters only in directions that the axes do not
-/// constrain.
+/// Weight of the assumed distance relative to one optical axis. It matters only in directions that
+/// the axes do not constrain.
 const PRIOR_WEIGHT: f64 = 0.01;
 
-/// Distance of an outside view, in radii of the model. Most of the model fits into a field of view of 50 degrees.
+/// Distance of an outside view, in radii of the model. Most of the model fits into a field of view
+/// of 50 degrees.
 const DISTANCE_RADII: f64 = 2.0;
 /// Direction from the model to an outside view: from the front right, 30 degrees above the horizon.
 const VIEW_DIRECTION: [f64; 3] = [0.5, -0.707, 0.5];
 
-/// The view of the first camera, centered on the point nearest to all optical axes; `None` without keyframes.
+/// The view of the first camera, centered on the point nearest to all optical axes; `None` without
+/// keyframes.
 pub fn from_keyframes(keyframes: &[Arc<Keyframe>]) -> Option<SceneHint> {
-    from_cameras(keyframes.iter().map(|keyframe| keyframe.world_from_camera).collect())
+    from_cameras(
+        keyframes
+            .iter()
+            .map(|keyframe| keyframe.world_from_camera)
+            .collect(),
+    )
 }
 
-/// The view of the first camera, centered on the point nearest to all optical axes; `None` without cameras.
+/// The view of the first camera, centered on the point nearest to all optical axes; `None` without
+/// cameras.
 pub fn from_cameras(world_from_cameras: Vec<Transform>) -> Option<SceneHint> {
     let world_from_camera = *world_from_cameras.first()?;
     let center = nearest_to_axes(&world_from_cameras)?;
-    let distances_m = world_from_cameras.iter().map(|pose| (center.coords - pose.translation.vector).norm());
+    let distances_m = world_from_cameras
+        .iter()
+        .map(|pose| (center.coords - pose.translation.vector).norm());
     Some(SceneHint {
         center_m: center.coords.into(),
         radius_m: distances_m.sum::<f64>() / world_from_cameras.len() as f64,
@@ -42,7 +53,8 @@ pub fn from_bounds(bounds: &Bounds) -> SceneHint {
     let right = forward.cross(&Vector3::z()).normalize();
     let axes = Matrix3::from_columns(&[right, forward.cross(&right), forward]);
     let rotation = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(axes));
-    let position_m = Vector3::from(bounds.center_m) + DISTANCE_RADII * bounds.radius_m * view_direction;
+    let position_m =
+        Vector3::from(bounds.center_m) + DISTANCE_RADII * bounds.radius_m * view_direction;
     SceneHint {
         center_m: bounds.center_m,
         radius_m: bounds.radius_m,
@@ -50,7 +62,8 @@ pub fn from_bounds(bounds: &Bounds) -> SceneHint {
     }
 }
 
-/// The point with the least squared distances to all optical axes, with a weak prior on the distance from each camera.
+/// The point with the least squared distances to all optical axes, with a weak prior on the
+/// distance from each camera.
 fn nearest_to_axes(world_from_cameras: &[Transform]) -> Option<Point3<f64>> {
     let mut normal = Matrix3::zeros();
     let mut right = Vector3::zeros();
@@ -71,7 +84,8 @@ mod tests {
 
     fn camera_at(position: [f64; 3], target: Point3<f64>) -> Transform {
         let position = Point3::from(position);
-        let rotation = UnitQuaternion::rotation_between(&Vector3::z(), &(target - position)).expect("not opposite");
+        let rotation = UnitQuaternion::rotation_between(&Vector3::z(), &(target - position))
+            .expect("not opposite");
         Transform::from_parts(Translation3::from(position.coords), rotation)
     }
 
@@ -80,8 +94,14 @@ mod tests {
         /// The prior shifts the result by about its weight times its error, which is 0.5 m here.
         const TOLERANCE_M: f64 = 0.01;
         let target = Point3::new(0.5, 0.1, 0.05);
-        let positions = [[1.5, 0.1, 0.05], [0.5, 1.1, 0.1], [0.4, 0.1, 1.05], [0.5, -0.9, 0.3]];
-        let center = nearest_to_axes(&positions.map(|position| camera_at(position, target))).expect("cameras");
+        let positions = [
+            [1.5, 0.1, 0.05],
+            [0.5, 1.1, 0.1],
+            [0.4, 0.1, 1.05],
+            [0.5, -0.9, 0.3],
+        ];
+        let center = nearest_to_axes(&positions.map(|position| camera_at(position, target)))
+            .expect("cameras");
         assert!((center - target).norm() < TOLERANCE_M, "{center}");
     }
 
@@ -90,20 +110,32 @@ mod tests {
         const TOLERANCE_M: f64 = 1e-9;
         let pose = camera_at([1.0, 2.0, 3.0], Point3::new(1.0, 3.0, 3.0));
         let center = nearest_to_axes(&[pose]).expect("a camera");
-        assert!((center - Point3::new(1.0, 2.5, 3.0)).norm() < TOLERANCE_M, "{center}");
+        assert!(
+            (center - Point3::new(1.0, 2.5, 3.0)).norm() < TOLERANCE_M,
+            "{center}"
+        );
         assert!(from_keyframes(&[]).is_none());
     }
 
     #[test]
     fn outside_view_looks_at_center_and_is_upright() {
         const TOLERANCE_M: f64 = 1e-9;
-        let bounds = Bounds { center_m: [1.0, 2.0, 3.0], radius_m: 0.5 };
+        let bounds = Bounds {
+            center_m: [1.0, 2.0, 3.0],
+            radius_m: 0.5,
+        };
         let pose = from_bounds(&bounds).world_from_camera;
         let center_in_camera = pose.inverse() * Point3::from(bounds.center_m);
-        assert!((center_in_camera - Point3::new(0.0, 0.0, 1.0)).norm() < TOLERANCE_M, "{center_in_camera}");
+        assert!(
+            (center_in_camera - Point3::new(0.0, 0.0, 1.0)).norm() < TOLERANCE_M,
+            "{center_in_camera}"
+        );
         let right = pose.rotation * Vector3::x();
         let down = pose.rotation * Vector3::y();
-        assert!(right.z.abs() < TOLERANCE_M && down.z < -0.5, "{right} {down}");
+        assert!(
+            right.z.abs() < TOLERANCE_M && down.z < -0.5,
+            "{right} {down}"
+        );
         assert!(pose.translation.vector.z > bounds.center_m[2]);
     }
 }

@@ -37,15 +37,16 @@ use std::time::{Duration, Instant};
 use trainer::edits::Floaters;
 use trainer::gpu::Gpu;
 use trainer::{
-    Edits, FailedModel, InitialPoints, Method, ModelKind, Packing, Picture, Progress, QueuedPicture, RenderRequest,
-    Rendered,
+    Edits, FailedModel, InitialPoints, Method, ModelKind, Packing, Picture, Progress,
+    QueuedPicture, RenderRequest, Rendered,
 };
 use training_time::TrainingTime;
 use viz::EditRequest;
 
 /// Approximate duration of a slice. The device is idle for a moment at the end of each slice.
 const TIME_SLICE: Duration = Duration::from_millis(40);
-/// Step time at which a live run pauses the growth of its model. Pictures take about as long as steps.
+/// Step time at which a live run pauses the growth of its model. Pictures take about as long as
+/// steps.
 const MAX_LIVE_STEP_MILLIS: f64 = 300.0;
 
 /// A model in training.
@@ -92,20 +93,30 @@ impl Session {
         }
     }
 
-    /// Starts at these points if no keyframe has depth. Logs a warning if the method does not use points.
+    /// Starts at these points if no keyframe has depth. Logs a warning if the method does not use
+    /// points.
     pub fn with_initial_points(mut self, points: Option<Arc<InitialPoints>>) -> Self {
         self.initial_points = points;
         if !self.set_initial_points() {
             let method = self.kind().name();
-            log::warn!("the method {method} does not start from points: those of the dataset are not used");
+            log::warn!(
+                "the method {method} does not start from points: those of the dataset are not used"
+            );
         }
         self
     }
 
-    /// Passes the initial points to the model. Returns false if there are some, but the model does not use them.
+    /// Passes the initial points to the model. Returns false if there are some, but the model does
+    /// not use them.
     fn set_initial_points(&mut self) -> bool {
-        let Self { method, initial_points, .. } = self;
-        initial_points.as_ref().is_none_or(|points| method.set_initial_points(points))
+        let Self {
+            method,
+            initial_points,
+            ..
+        } = self;
+        initial_points
+            .as_ref()
+            .is_none_or(|points| method.set_initial_points(points))
     }
 
     /// Enables checkpoints.
@@ -116,12 +127,15 @@ impl Session {
 
     /// Aborts an evaluation, without reporting it, when `stop` is requested.
     pub fn with_stop(self, stop: &Stop) -> Self {
-        Self { stop: stop.clone(), ..self }
+        Self {
+            stop: stop.clone(),
+            ..self
+        }
     }
 
-    /// Leaves scoring to [`Self::score_next`], so that the caller can draw pictures in between. The caller must neither
-    /// train nor push keyframes while [`Self::is_scoring`], so that all images of an evaluation are scored on the same
-    /// model state.
+    /// Leaves scoring to [`Self::score_next`], so that the caller can draw pictures in between. The
+    /// caller must neither train nor push keyframes while [`Self::is_scoring`], so that all images
+    /// of an evaluation are scored on the same model state.
     pub fn with_stepwise_scoring(mut self) -> Self {
         self.scoreboard.set_stepwise();
         self
@@ -135,7 +149,10 @@ impl Session {
 
     /// Continues with the edits of an earlier run.
     pub fn with_edits(self, edits: Edits) -> Self {
-        Self { edits: Arc::new(edits), ..self }
+        Self {
+            edits: Arc::new(edits),
+            ..self
+        }
     }
 
     /// Enables the log of timing-dependent decisions.
@@ -214,7 +231,8 @@ impl Session {
         self.persistence.log_push(self.method.as_mut(), keyframe)
     }
 
-    /// Adds a keyframe without pushing it to the model, such as one that a resumed model was already trained on.
+    /// Adds a keyframe without pushing it to the model, such as one that a resumed model was
+    /// already trained on.
     pub fn hold(&mut self, keyframe: &Arc<Keyframe>) {
         self.scoreboard.hold(keyframe);
         self.keyframes.push(keyframe.clone());
@@ -223,11 +241,15 @@ impl Session {
     /// Removes a keyframe.
     pub fn remove(&mut self, camera: &str, stamp: Stamp) -> crate::Result<()> {
         let is_other = |held: &Arc<Keyframe>| held.camera.as_ref() != camera || held.stamp != stamp;
-        self.keyframes.iter().filter(|held| !is_other(held)).for_each(|keyframe| self.persistence.evict(keyframe));
+        self.keyframes
+            .iter()
+            .filter(|held| !is_other(held))
+            .for_each(|keyframe| self.persistence.evict(keyframe));
         self.keyframes.retain(is_other);
         self.scoreboard.remove(camera, stamp);
         self.method.remove(camera, stamp)?;
-        self.persistence.log_removal(self.method.as_mut(), camera, stamp)
+        self.persistence
+            .log_removal(self.method.as_mut(), camera, stamp)
     }
 
     /// Creates splats for the keyframes so far.
@@ -251,7 +273,10 @@ impl Session {
         self.persistence.log_render();
         match packing {
             Some(packing) => self.method.queue_packed(request, packing),
-            None => self.method.render(request).map(|picture| QueuedPicture::ready(picture.into())),
+            None => self
+                .method
+                .render(request)
+                .map(|picture| QueuedPicture::ready(picture.into())),
         }
     }
 
@@ -280,8 +305,17 @@ impl Session {
     }
 
     /// Changes the edits; see [`Editor::apply`].
-    pub(crate) fn edit(&mut self, editor: &mut Editor, request: &EditRequest) -> Result<Option<String>, String> {
-        editor.apply(request, request.action(), &mut self.edits, self.method.as_mut())
+    pub(crate) fn edit(
+        &mut self,
+        editor: &mut Editor,
+        request: &EditRequest,
+    ) -> Result<Option<String>, String> {
+        editor.apply(
+            request,
+            request.action(),
+            &mut self.edits,
+            self.method.as_mut(),
+        )
     }
 
     /// Erases floaters; see [`editing::erase_floaters`].
@@ -332,11 +366,20 @@ impl Session {
         Ok(n)
     }
 
-    /// Ends a search for the model size if too little time is left for it and for the training after it.
+    /// Ends a search for the model size if too little time is left for it and for the training
+    /// after it.
     fn end_size_search_when_late(&mut self) -> crate::Result<()> {
         let n_needed = self.method.n_steps_for_size_search();
-        let is_late = n_needed > 0 && self.time.n_steps_in_time().is_some_and(|n_left| n_left < n_needed as f64);
-        if is_late { self.end_size_search() } else { Ok(()) }
+        let is_late = n_needed > 0
+            && self
+                .time
+                .n_steps_in_time()
+                .is_some_and(|n_left| n_left < n_needed as f64);
+        if is_late {
+            self.end_size_search()
+        } else {
+            Ok(())
+        }
     }
 
     /// Ends a search for the model size, if there is one.
@@ -347,8 +390,8 @@ impl Session {
         Ok(())
     }
 
-    /// Pauses the growth of the model while its steps take too long for a live run. A larger model would be trained and
-    /// drawn even more slowly, so that an operator would see less.
+    /// Pauses the growth of the model while its steps take too long for a live run. A larger model
+    /// would be trained and drawn even more slowly, so that an operator would see less.
     pub(crate) fn pause_growth_when_slow(&mut self) -> crate::Result<()> {
         match self.progress().step_millis {
             millis if millis > MAX_LIVE_STEP_MILLIS => self.pause_growth(true),
@@ -360,18 +403,23 @@ impl Session {
     /// Pauses or continues the growth of the model.
     pub(crate) fn pause_growth(&mut self, is_paused: bool) -> crate::Result<()> {
         if self.method.pause_growth(is_paused)? {
-            let Progress { primitives, step_millis, .. } = self.progress();
+            let Progress {
+                primitives,
+                step_millis,
+                ..
+            } = self.progress();
             let change = if is_paused { "is paused" } else { "continues" };
             log::info!(
                 "growth {change} at {primitives} splats: a step takes {step_millis:.0} ms, limit {MAX_LIVE_STEP_MILLIS} ms"
             );
-            self.persistence.log_growth_pause(self.method.as_mut(), is_paused)?;
+            self.persistence
+                .log_growth_pause(self.method.as_mut(), is_paused)?;
         }
         Ok(())
     }
 
-    /// Applies the result of an alignment in the background if it is ready, or waits for it if `wait`. Returns whether
-    /// a result was applied.
+    /// Applies the result of an alignment in the background if it is ready, or waits for it if
+    /// `wait`. Returns whether a result was applied.
     pub fn poll_alignment(&mut self, wait: bool) -> crate::Result<bool> {
         let is_applied = self.method.poll_alignment(wait)?;
         if is_applied {
@@ -381,27 +429,34 @@ impl Session {
         Ok(is_applied)
     }
 
-    /// Camera of a keyframe with the corrections of alignment and those that [`Self::refresh_corrections`] has read.
+    /// Camera of a keyframe with the corrections of alignment and those that
+    /// [`Self::refresh_corrections`] has read.
     pub fn camera_of(&self, keyframe: &Keyframe) -> CalibratedCamera {
         let learned = self.learned.get(&*keyframe.camera);
-        self.method.alignment().unwrap_or(&Alignment::default()).camera(keyframe, learned)
+        self.method
+            .alignment()
+            .unwrap_or(&Alignment::default())
+            .camera(keyframe, learned)
     }
 
-    /// Reads the corrections that are optimized with the scene, for [`Self::camera_of`]. Waits for queued work.
+    /// Reads the corrections that are optimized with the scene, for [`Self::camera_of`]. Waits for
+    /// queued work.
     pub fn refresh_corrections(&mut self) -> crate::Result<()> {
         self.learned = self.method.camera_corrections()?;
         Ok(())
     }
 
-    /// Corrections of cameras that were optimized with the scene; they follow those of [`Self::alignment`].
+    /// Corrections of cameras that were optimized with the scene; they follow those of
+    /// [`Self::alignment`].
     pub fn camera_corrections(&mut self) -> crate::Result<BTreeMap<String, CameraCorrection>> {
         Ok(self.method.camera_corrections()?)
     }
 
-    /// Trains for one time slice on a shared device, at most `max_steps` steps. Queued work is complete when this
-    /// returns.
+    /// Trains for one time slice on a shared device, at most `max_steps` steps. Queued work is
+    /// complete when this returns.
     ///
-    /// `is_render_pending` returns whether a picture is requested, which ends the slice; called after each submit.
+    /// `is_render_pending` returns whether a picture is requested, which ends the slice; called
+    /// after each submit.
     pub fn run_time_slice(
         &mut self,
         max_steps: impl Fn(&Self) -> u64,
@@ -418,8 +473,13 @@ impl Session {
             }
         }
         self.method.n_total_steps()?;
-        // A session that cannot train is charged a full slice, so that it is not selected every time.
-        self.time.add_device_time(if n_steps == 0 { TIME_SLICE } else { started.elapsed() });
+        // A session that cannot train is charged a full slice, so that it is not selected every
+        // time.
+        self.time.add_device_time(if n_steps == 0 {
+            TIME_SLICE
+        } else {
+            started.elapsed()
+        });
         if self.has_finished_steps() {
             self.mark_finished();
         }
@@ -431,7 +491,8 @@ impl Session {
         self.time.device_time()
     }
 
-    /// Raises the device time to at least `device_time`, so that an idle session does not catch up later.
+    /// Raises the device time to at least `device_time`, so that an idle session does not catch up
+    /// later.
     pub fn raise_device_time(&mut self, device_time: Duration) {
         self.time.raise_device_time(device_time);
     }
@@ -463,7 +524,8 @@ impl Session {
         }
     }
 
-    /// Describes how to continue if the run fails now, as a sentence without a period; `None` without recovery.
+    /// Describes how to continue if the run fails now, as a sentence without a period; `None`
+    /// without recovery.
     pub fn describe_recoverable(&mut self) -> Option<String> {
         self.persistence.describe_recoverable()
     }
@@ -489,7 +551,8 @@ impl Session {
         self.gpu = gpu.clone();
         self.set_initial_points();
         self.time.unmark_finished();
-        // Drops an evaluation in progress: all of its images must be scored on the same model state, which is lost.
+        // Drops an evaluation in progress: all of its images must be scored on the same model
+        // state, which is lost.
         self.scoreboard.take_pending();
         Ok(())
     }
@@ -504,10 +567,17 @@ impl Session {
         self.persistence.check_folders_when_due();
         let seconds = self.secs();
         let (method, keyframes, edits) = (self.method.as_mut(), &self.keyframes[..], &*self.edits);
-        self.persistence.write_checkpoint_when_due(Snapshot { method, keyframes, edits, seconds, is_finished: false })
+        self.persistence.write_checkpoint_when_due(Snapshot {
+            method,
+            keyframes,
+            edits,
+            seconds,
+            is_finished: false,
+        })
     }
 
-    /// Writes a checkpoint if one is due, and evaluates if an evaluation is due. A finished session does neither.
+    /// Writes a checkpoint if one is due, and evaluates if an evaluation is due. A finished session
+    /// does neither.
     pub fn evaluate_when_due(&mut self) -> crate::Result<()> {
         if self.time.is_finished() {
             return Ok(());
@@ -521,7 +591,8 @@ impl Session {
                 self.score_next()?;
             }
         }
-        self.reporter.report_progress(self.secs(), self.progress(), self.psnr());
+        self.reporter
+            .report_progress(self.secs(), self.progress(), self.psnr());
         Ok(())
     }
 
@@ -530,22 +601,27 @@ impl Session {
         self.scoreboard.is_scoring()
     }
 
-    /// Scores one more test image of the evaluation in progress, and reports the evaluation after its last image.
+    /// Scores one more test image of the evaluation in progress, and reports the evaluation after
+    /// its last image.
     pub fn score_next(&mut self) -> crate::Result<()> {
-        let Some(mut evaluation) = self.scoreboard.take_pending() else { return Ok(()) };
+        let Some(mut evaluation) = self.scoreboard.take_pending() else {
+            return Ok(());
+        };
         if self.stop.requested() {
             return Ok(());
         }
         if let Some(keyframe) = evaluation.take_next() {
             let before = Instant::now();
-            let scores = self.without_clock(|scoreboard, method| scoreboard.score(method, &keyframe))?;
+            let scores =
+                self.without_clock(|scoreboard, method| scoreboard.score(method, &keyframe))?;
             evaluation.add(scores, before.elapsed());
         }
         if evaluation.is_complete() {
             self.scoreboard.add_spent(evaluation.spent());
             let (seconds, images) = (evaluation.seconds, evaluation.into_images());
             self.scoreboard.record(&images, self.secs());
-            self.reporter.report_evaluation(seconds, &images, self.progress());
+            self.reporter
+                .report_evaluation(seconds, &images, self.progress());
         } else {
             self.scoreboard.continue_with(evaluation);
         }
@@ -571,10 +647,12 @@ impl Session {
         self.method.set_watched(watched);
     }
 
-    /// Scores the test keyframe with the oldest score, for the PSNR curve between scheduled evaluations. Counts as
-    /// training time.
+    /// Scores the test keyframe with the oldest score, for the PSNR curve between scheduled
+    /// evaluations. Counts as training time.
     pub fn refresh_psnr(&mut self) -> crate::Result<()> {
-        let Some(oldest) = self.scoreboard.next_to_refresh() else { return Ok(()) };
+        let Some(oldest) = self.scoreboard.next_to_refresh() else {
+            return Ok(());
+        };
         self.persistence.log_render();
         let scores = Evaluator::psnr_only().score(self.method.as_mut(), &oldest)?;
         self.scoreboard.record(&[scores], self.secs());

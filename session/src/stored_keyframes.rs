@@ -1,7 +1,7 @@
 //! Stores the keyframes of a live run on disk, next to its checkpoint, for `run --resume`.
 //!
-//! Each keyframe is a separate file in the layout of a checkpoint (`docs/reference/files.md`), with its color and depth
-//! as PNG. Ground truth from a simulator is left out.
+//! Each keyframe is a separate file in the layout of a checkpoint (`docs/reference/files.md`), with
+//! its color and depth as PNG. Ground truth from a simulator is left out.
 
 use crate::error::Context;
 use crate::run_folder::KEYFRAMES;
@@ -67,12 +67,15 @@ struct BaseDescription {
 impl StoredKeyframes {
     /// The stored keyframes of the run in this folder. Does not access the disk.
     pub fn of_run(run: &Path) -> Self {
-        Self { folder: run.join(KEYFRAMES) }
+        Self {
+            folder: run.join(KEYFRAMES),
+        }
     }
 
     /// Writes the keyframes that are not stored yet.
     pub fn add(&self, keyframes: &[Arc<Keyframe>]) -> crate::Result<()> {
-        std::fs::create_dir_all(&self.folder).with_context(|| format!("cannot create {}", self.folder.display()))?;
+        std::fs::create_dir_all(&self.folder)
+            .with_context(|| format!("cannot create {}", self.folder.display()))?;
         let existing = self.names()?;
         for keyframe in keyframes {
             let name = name_of(keyframe);
@@ -88,12 +91,14 @@ impl StoredKeyframes {
         let stored: BTreeSet<String> = keyframes.iter().map(|keyframe| name_of(keyframe)).collect();
         for name in self.names()?.difference(&stored) {
             let path = self.folder.join(name);
-            std::fs::remove_file(&path).with_context(|| format!("cannot remove {}", path.display()))?;
+            std::fs::remove_file(&path)
+                .with_context(|| format!("cannot remove {}", path.display()))?;
         }
         Ok(())
     }
 
-    /// Reads all keyframes, ordered by stamp. Those that cannot be read are left out, each with a warning.
+    /// Reads all keyframes, ordered by stamp. Those that cannot be read are left out, each with a
+    /// warning.
     ///
     /// # Errors
     ///
@@ -123,12 +128,19 @@ impl StoredKeyframes {
 
     fn names(&self) -> crate::Result<BTreeSet<String>> {
         let list = || {
-            let names = std::fs::read_dir(&self.folder)?.map(|entry| entry.map(|entry| entry.file_name()));
+            let names =
+                std::fs::read_dir(&self.folder)?.map(|entry| entry.map(|entry| entry.file_name()));
             names.collect::<std::io::Result<Vec<_>>>()
         };
         let names = list().with_context(|| format!("cannot list {}", self.folder.display()))?;
         let names = names.into_iter().filter_map(|name| name.into_string().ok());
-        Ok(names.filter(|name| Path::new(name).extension().is_some_and(|extension| extension == EXTENSION)).collect())
+        Ok(names
+            .filter(|name| {
+                Path::new(name)
+                    .extension()
+                    .is_some_and(|extension| extension == EXTENSION)
+            })
+            .collect())
     }
 }
 
@@ -160,10 +172,20 @@ fn to_checkpoint(keyframe: &Keyframe) -> crate::Result<Checkpoint> {
             map_from_odom: to_xyz_xyzw(&base.map_from_odom),
         }),
     };
-    let mut arrays = vec![Array { name: COLOR.to_owned(), bytes: png(keyframe.size_px, &keyframe.rgba_srgb)? }];
+    let mut arrays = vec![Array {
+        name: COLOR.to_owned(),
+        bytes: png(keyframe.size_px, &keyframe.rgba_srgb)?,
+    }];
     if let Some(depth) = &keyframe.depth {
-        let bytes: Vec<u8> = depth.depth_m.iter().flat_map(|depth_m| depth_m.to_le_bytes()).collect();
-        arrays.push(Array { name: DEPTH.to_owned(), bytes: png(depth.size_px, &bytes)? });
+        let bytes: Vec<u8> = depth
+            .depth_m
+            .iter()
+            .flat_map(|depth_m| depth_m.to_le_bytes())
+            .collect();
+        arrays.push(Array {
+            name: DEPTH.to_owned(),
+            bytes: png(depth.size_px, &bytes)?,
+        });
     }
     Ok(Checkpoint {
         method: METHOD.to_owned(),
@@ -178,18 +200,31 @@ fn to_checkpoint(keyframe: &Keyframe) -> crate::Result<Checkpoint> {
 }
 
 fn keyframe_of(checkpoint: &Checkpoint) -> crate::Result<Keyframe> {
-    ensure!(checkpoint.method == METHOD, "it contains a {}, expected a {METHOD}", checkpoint.method);
+    ensure!(
+        checkpoint.method == METHOD,
+        "it contains a {}, expected a {METHOD}",
+        checkpoint.method
+    );
     let metadata: Description = serde_json::from_value(checkpoint.state.clone())?;
     let pixels = |name: &str, size_px: [u32; 2]| {
         let array = checkpoint.arrays.iter().find(|array| array.name == name);
-        let png = &array.with_context(|| format!("array {name:?} is missing"))?.bytes;
+        let png = &array
+            .with_context(|| format!("array {name:?} is missing"))?
+            .bytes;
         let image = image::load_from_memory_with_format(png, image::ImageFormat::Png)?;
-        ensure!([image.width(), image.height()] == size_px, "array {name:?} has the wrong size, expected {size_px:?}");
+        ensure!(
+            [image.width(), image.height()] == size_px,
+            "array {name:?} has the wrong size, expected {size_px:?}"
+        );
         Ok(image.into_rgba8().into_raw())
     };
     let depth = metadata.depth.map(|depth| {
         let bytes = pixels(DEPTH, depth.size_px)?;
-        let depth_m = bytes.as_chunks::<4>().0.iter().map(|bytes| f32::from_le_bytes(*bytes));
+        let depth_m = bytes
+            .as_chunks::<4>()
+            .0
+            .iter()
+            .map(|bytes| f32::from_le_bytes(*bytes));
         Ok::<_, crate::Error>(DepthMap {
             size_px: depth.size_px,
             focal_px: depth.focal_px,
@@ -216,13 +251,14 @@ fn keyframe_of(checkpoint: &Checkpoint) -> crate::Result<Keyframe> {
             map_from_odom: from_xyz_xyzw(base.map_from_odom),
             truth: None,
         }),
-        split: split_from_name(&metadata.split).with_context(|| format!("unknown split {:?}", metadata.split))?,
+        split: split_from_name(&metadata.split)
+            .with_context(|| format!("unknown split {:?}", metadata.split))?,
         truth: None,
     })
 }
 
-/// Losslessly encodes four bytes per pixel. For depth, these are the bytes of an f32, which compress well because
-/// neighboring pixels are similar.
+/// Losslessly encodes four bytes per pixel. For depth, these are the bytes of an f32, which
+/// compress well because neighboring pixels are similar.
 fn png([width, height]: [u32; 2], bytes: &[u8]) -> crate::Result<Vec<u8>> {
     let mut png = Vec::new();
     let encoder = PngEncoder::new_with_quality(&mut png, CompressionType::Fast, FilterType::Sub);
@@ -236,7 +272,10 @@ fn twist_numbers(twist: &Twist) -> [f64; 6] {
 }
 
 fn twist([x, y, z, a, b, c]: [f64; 6]) -> Twist {
-    Twist { linear_m_s: Vector3::new(x, y, z), angular_rad_s: Vector3::new(a, b, c) }
+    Twist {
+        linear_m_s: Vector3::new(x, y, z),
+        angular_rad_s: Vector3::new(a, b, c),
+    }
 }
 
 #[cfg(test)]
@@ -246,7 +285,10 @@ mod tests {
     use kinematics::Transform;
 
     fn keyframe(stamp_nanos: i64, depth: bool) -> Arc<Keyframe> {
-        let pose = Transform::new(Vector3::new(0.1, 1.0 / 3.0, -2.0), Vector3::new(0.3, -0.2, 0.1));
+        let pose = Transform::new(
+            Vector3::new(0.1, 1.0 / 3.0, -2.0),
+            Vector3::new(0.3, -0.2, 0.1),
+        );
         Arc::new(Keyframe {
             camera: "wrist".into(),
             stamp: Stamp(stamp_nanos),
@@ -280,14 +322,21 @@ mod tests {
     fn keyframes_round_trip_bit_for_bit_in_order() {
         let run = tempfile::tempdir().expect("a folder");
         let stored = StoredKeyframes::of_run(run.path());
-        let all = [keyframe(9_000_000_000, true), keyframe(20, false), keyframe(10_000_000_000, true)];
+        let all = [
+            keyframe(9_000_000_000, true),
+            keyframe(20, false),
+            keyframe(10_000_000_000, true),
+        ];
         stored.add(&all[..2]).expect("disk space");
         stored.add(&all).expect("disk space");
         let read = stored.read().expect("complete files");
         let in_order = [&all[1], &all[0], &all[2]];
         assert_eq!(read.len(), 3);
         for (read, expected) in read.iter().zip(in_order) {
-            assert_eq!((read.stamp, &read.camera, read.split), (expected.stamp, &expected.camera, expected.split));
+            assert_eq!(
+                (read.stamp, &read.camera, read.split),
+                (expected.stamp, &expected.camera, expected.split)
+            );
             assert_eq!(keyframe::fingerprint(read), keyframe::fingerprint(expected));
             assert_eq!(read.base, expected.base);
         }
@@ -301,16 +350,35 @@ mod tests {
         let stored = StoredKeyframes::of_run(run.path());
         assert!(stored.read().is_err(), "no folder yet");
         stored.add(&[keyframe(1, true)]).expect("disk space");
-        let path = run.path().join(KEYFRAMES).join("wrist_00000000000000000001.keyframe");
+        let path = run
+            .path()
+            .join(KEYFRAMES)
+            .join("wrist_00000000000000000001.keyframe");
         let mut bytes = std::fs::read(&path).expect("a file");
         let middle = bytes.len() / 2;
         bytes[middle] ^= 1;
         std::fs::write(&path, bytes).expect("disk space");
         let message = format!("{:#}", stored.read().expect_err("damaged"));
-        assert!(message.contains("wrist_00000000000000000001.keyframe") && message.contains("damaged"), "{message}");
-        stored.add(&[keyframe(2, true), keyframe(3, false)]).expect("disk space");
-        std::fs::write(run.path().join(KEYFRAMES).join("wrist_00000000000000000003.keyframe"), "").expect("disk space");
-        let stamps: Vec<i64> = stored.read().expect("one is readable").iter().map(|read| read.stamp.0).collect();
+        assert!(
+            message.contains("wrist_00000000000000000001.keyframe") && message.contains("damaged"),
+            "{message}"
+        );
+        stored
+            .add(&[keyframe(2, true), keyframe(3, false)])
+            .expect("disk space");
+        std::fs::write(
+            run.path()
+                .join(KEYFRAMES)
+                .join("wrist_00000000000000000003.keyframe"),
+            "",
+        )
+        .expect("disk space");
+        let stamps: Vec<i64> = stored
+            .read()
+            .expect("one is readable")
+            .iter()
+            .map(|read| read.stamp.0)
+            .collect();
         assert_eq!(stamps, [2], "the others are left out");
     }
 }

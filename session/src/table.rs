@@ -16,7 +16,10 @@ impl Table {
     /// The table with its title as HTML.
     pub fn html(&self) -> String {
         let row = |cells: &[String], tag: &str| {
-            let cells: String = cells.iter().map(|cell| format!("<{tag}>{}</{tag}>", escaped(cell))).collect();
+            let cells: String = cells
+                .iter()
+                .map(|cell| format!("<{tag}>{}</{tag}>", escaped(cell)))
+                .collect();
             format!("<tr>{cells}</tr>\n")
         };
         let rows: String = self.rows.iter().map(|cells| row(cells, "td")).collect();
@@ -30,7 +33,9 @@ impl Table {
     pub fn text(&self) -> String {
         let all = || std::iter::once(&self.head).chain(&self.rows);
         let width = |column: usize| {
-            let widths = all().filter_map(|row| row.get(column)).map(|cell| cell.chars().count());
+            let widths = all()
+                .filter_map(|row| row.get(column))
+                .map(|cell| cell.chars().count());
             widths.max().unwrap_or(0)
         };
         let mut text = format!("\n{}\n", self.title);
@@ -51,12 +56,20 @@ mod tests {
 
     fn table() -> Table {
         let words = |words: [&str; 2]| words.map(str::to_owned).to_vec();
-        Table { title: "Sizes".into(), head: words(["data", "dB"]), rows: vec![words(["a<b", "1.25"])] }
+        Table {
+            title: "Sizes".into(),
+            head: words(["data", "dB"]),
+            rows: vec![words(["a<b", "1.25"])],
+        }
     }
 
     #[test]
     fn tables_are_escaped_and_aligned() {
         assert_eq!(table().text(), "\nSizes\n  data    dB\n  a<b   1.25");
-        assert!(table().html().contains("<tr><td>a&lt;b</td><td>1.25</td></tr>"));
+        assert!(
+            table()
+                .html()
+                .contains("<tr><td>a&lt;b</td><td>1.25</td></tr>")
+        );
     }
 }

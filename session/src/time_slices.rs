@@ -1,22 +1,25 @@
 //! Time slices for several models on one device.
 //!
-//! The next slice goes to the model with the least device time so far. Slices do not affect results, which depend only
-//! on the steps and keyframes of a model.
+//! The next slice goes to the model with the least device time so far. Slices do not affect
+//! results, which depend only on the steps and keyframes of a model.
 
 use crate::session::Session;
 use std::time::Duration;
 
-/// Trains the session with the least device time among those that can train, then runs all evaluations that are due.
+/// Trains the session with the least device time among those that can train, then runs all
+/// evaluations that are due.
 ///
-/// `max_steps` returns the maximum number of steps of a session, given its index. `is_render_pending` returns whether a
-/// picture is requested; the slice then ends after the current submit.
+/// `max_steps` returns the maximum number of steps of a session, given its index.
+/// `is_render_pending` returns whether a picture is requested; the slice then ends after the
+/// current submit.
 pub(crate) fn train_next(
     sessions: &mut [Session],
     max_steps: impl Fn(usize, &Session) -> u64,
     is_render_pending: impl Fn() -> bool,
 ) -> crate::Result<()> {
-    let can_train =
-        |ix: usize, session: &Session| !session.is_over() && !session.is_idle() && max_steps(ix, session) > 0;
+    let can_train = |ix: usize, session: &Session| {
+        !session.is_over() && !session.is_idle() && max_steps(ix, session) > 0
+    };
     let device_time: Vec<Option<Duration>> = sessions
         .iter()
         .enumerate()
@@ -27,15 +30,17 @@ pub(crate) fn train_next(
             sessions[ix].train_steps(max_steps(ix, &sessions[ix]))?;
         } else {
             // A session that was idle for a while does not catch up.
-            sessions.iter_mut().for_each(|session| session.raise_device_time(min_time));
+            sessions
+                .iter_mut()
+                .for_each(|session| session.raise_device_time(min_time));
             sessions[ix].run_time_slice(|session| max_steps(ix, session), is_render_pending)?;
         }
     }
     sessions.iter_mut().try_for_each(Session::evaluate_when_due)
 }
 
-/// Index and device time of the session with the least device time (the first one if several have the same); `None` if
-/// no session can train.
+/// Index and device time of the session with the least device time (the first one if several have
+/// the same); `None` if no session can train.
 fn next(device_time: &[Option<Duration>]) -> Option<(usize, Duration)> {
     device_time
         .iter()
@@ -56,9 +61,18 @@ mod tests {
             let (ix, _) = next(&device_time.map(Some)).expect("all can train");
             device_time[ix] += Duration::from_millis(MILLIS[ix]);
         }
-        let (max_time, min_time) = (device_time.iter().max().expect("three"), device_time.iter().min().expect("three"));
-        assert!(*max_time - *min_time <= Duration::from_millis(90), "{device_time:?}");
-        assert_eq!(next(&[None, Some(device_time[1]), None]), Some((1, device_time[1])));
+        let (max_time, min_time) = (
+            device_time.iter().max().expect("three"),
+            device_time.iter().min().expect("three"),
+        );
+        assert!(
+            *max_time - *min_time <= Duration::from_millis(90),
+            "{device_time:?}"
+        );
+        assert_eq!(
+            next(&[None, Some(device_time[1]), None]),
+            Some((1, device_time[1]))
+        );
         assert_eq!(next(&[None, None]), None);
     }
 }

@@ -45,13 +45,28 @@ pub fn train(
     let kind = plan.model_spec.kind;
     let mut method = plan.model_spec.start(gpu.clone())?;
     method.prepare()?;
-    let session = Session::new(gpu, (kind, method), plan.evaluators, plan.limits, plan.observer);
-    let mut session = session.with_stop(stop).with_initial_points(plan.initial_points);
-    drive(std::slice::from_mut(&mut session), keyframes, preparation_time, stop, open_gpu)?;
+    let session = Session::new(
+        gpu,
+        (kind, method),
+        plan.evaluators,
+        plan.limits,
+        plan.observer,
+    );
+    let mut session = session
+        .with_stop(stop)
+        .with_initial_points(plan.initial_points);
+    drive(
+        std::slice::from_mut(&mut session),
+        keyframes,
+        preparation_time,
+        stop,
+        open_gpu,
+    )?;
     Ok(session)
 }
 
-/// Starts the clock, pushes the keyframes to all models, and trains each until a limit or until `stop` is requested.
+/// Starts the clock, pushes the keyframes to all models, and trains each until a limit or until
+/// `stop` is requested.
 ///
 /// `preparation_time`: time already spent on preparing the keyframes; it counts as training time.
 pub fn drive(
@@ -69,8 +84,11 @@ pub fn drive(
             session.push(keyframe)?;
         }
         if session.is_idle() && session.progress().step == 0 {
-            let others: Vec<&str> =
-                ModelKind::ALL.iter().filter(|kind| !kind.entry().needs_depth).map(|kind| kind.name()).collect();
+            let others: Vec<&str> = ModelKind::ALL
+                .iter()
+                .filter(|kind| !kind.entry().needs_depth)
+                .map(|kind| kind.name())
+                .collect();
             return Err(Error::InsufficientData(format!(
                 "the method {} needs depth, but no training image has depth: \
                  use `fieldrig train --depth-from` to render depth from another model of the scene, or use the method {}",
@@ -86,7 +104,10 @@ pub fn drive(
             if let Err(error) = time_slices::train_next(sessions, |_, _| u64::MAX, || false) {
                 recoveries.recover(sessions, error)?;
             }
-            sessions.iter_mut().filter(|session| session.is_idle()).for_each(Session::mark_finished);
+            sessions
+                .iter_mut()
+                .filter(|session| session.is_idle())
+                .for_each(Session::mark_finished);
         }
         match sessions.iter().try_for_each(Session::wait) {
             Ok(()) => return Ok(()),
@@ -95,8 +116,8 @@ pub fn drive(
     }
 }
 
-/// The methods and their options. For a recording, they come from its rig file with flags applied; for a folder, from
-/// flags only.
+/// The methods and their options. For a recording, they come from its rig file with flags applied;
+/// for a folder, from flags only.
 pub fn model_specs(
     options: &TrainingOptions,
     data: &Data,
@@ -104,20 +125,39 @@ pub fn model_specs(
     software: bool,
 ) -> Result<Vec<ModelSpec>, Error> {
     let rig_methods = data.rig.as_ref().map(methods_of).transpose()?;
-    let kinds = rig_methods.or(options.methods.clone()).unwrap_or_else(|| vec![ModelKind::default()]);
+    let kinds = rig_methods
+        .or(options.methods.clone())
+        .unwrap_or_else(|| vec![ModelKind::default()]);
     options.check_for(&kinds)?;
     let available = data.available();
     // On a CPU, no trials by default: each takes hundreds of additional steps, which take minutes.
-    let RefineSettings { align, with_scene: cameras } =
-        options.refining(available, if software { Refine::None } else { Refine::Auto })?;
+    let RefineSettings {
+        align,
+        with_scene: cameras,
+    } = options.refining(
+        available,
+        if software { Refine::None } else { Refine::Auto },
+    )?;
     options.check_learned(&kinds, available)?;
-    let count = options.count.unwrap_or(if software { CountPolicy::ToCap } else { CountPolicy::Tested });
+    let count = options.count.unwrap_or(if software {
+        CountPolicy::ToCap
+    } else {
+        CountPolicy::Tested
+    });
     let (common, mut settings) = match &data.rig {
         Some(rig) => methods::options(&rig.train, steps),
         None => options_without_rig(options, steps),
     };
     settings.push((COUNT, serde_json::json!(count)));
-    methods::specs(&kinds, &CommonOptions { cameras, align, ..common }, &settings)
+    methods::specs(
+        &kinds,
+        &CommonOptions {
+            cameras,
+            align,
+            ..common
+        },
+        &settings,
+    )
 }
 
 /// Options from flags alone.
@@ -129,20 +169,41 @@ fn options_without_rig(options: &TrainingOptions, steps: Option<u64>) -> (Common
         n_planned_steps: steps.unwrap_or(defaults.n_planned_steps),
         ..defaults
     };
-    (common, options.max_splats.map(|n| (MAX_SPLATS, n.into())).into_iter().collect())
+    (
+        common,
+        options
+            .max_splats
+            .map(|n| (MAX_SPLATS, n.into()))
+            .into_iter()
+            .collect(),
+    )
 }
 
-/// Checks the flags that do not depend on the contents of the data, so that errors appear before all data are read.
-pub fn check_before_data(options: &TrainingOptions, path: &Path, images: &DataOptions) -> crate::Result<()> {
+/// Checks the flags that do not depend on the contents of the data, so that errors appear before
+/// all data are read.
+pub fn check_before_data(
+    options: &TrainingOptions,
+    path: &Path,
+    images: &DataOptions,
+) -> crate::Result<()> {
     let defaults = || Data::default_methods(path, images);
     let kinds = options.methods.clone().map_or_else(defaults, Ok)?;
     options.check_before_data(&kinds, run_folder::is_recording(path))
 }
 
 /// The limits given by `--seconds` and `--steps`, or `default_secs` if neither is given.
-pub fn limits(seconds: Option<f64>, steps: Option<u64>, default_secs: f64) -> Result<Limits, Error> {
+pub fn limits(
+    seconds: Option<f64>,
+    steps: Option<u64>,
+    default_secs: f64,
+) -> Result<Limits, Error> {
     if seconds.is_some_and(|seconds| seconds.is_nan() || seconds < 0.0) {
-        return Err(Error::BadInput("--seconds: must be a number of at least 0".into()));
+        return Err(Error::BadInput(
+            "--seconds: must be a number of at least 0".into(),
+        ));
     }
-    Ok(Limits { seconds: seconds.or(steps.is_none().then_some(default_secs)), steps })
+    Ok(Limits {
+        seconds: seconds.or(steps.is_none().then_some(default_secs)),
+        steps,
+    })
 }

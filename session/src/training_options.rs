@@ -1,4 +1,5 @@
-//! Options shared by all commands that train. They override the keys of the same name in a rig file.
+//! Options shared by all commands that train. They override the keys of the same name in a rig
+//! file.
 
 use crate::Error;
 use crate::methods::{COUNT, MAX_SPLATS, describe};
@@ -35,7 +36,8 @@ pub enum Refine {
     Auto,
     /// No parameters.
     None,
-    /// Pose of a mobile base at each station (`base.realign` in the rig file); not a camera parameter.
+    /// Pose of a mobile base at each station (`base.realign` in the rig file); not a camera
+    /// parameter.
     Base,
     /// Pose of each camera relative to its parent.
     Extrinsics,
@@ -77,7 +79,10 @@ impl Refine {
     /// The name on the command line.
     #[must_use]
     pub fn name(self) -> &'static str {
-        Self::ALL.iter().find(|(_, refine)| *refine == self).map_or("", |(name, _)| name)
+        Self::ALL
+            .iter()
+            .find(|(_, refine)| *refine == self)
+            .map_or("", |(name, _)| name)
     }
 }
 
@@ -93,16 +98,18 @@ pub struct RefineSettings {
 /// Properties of the data that limit which calibration parameters can be estimated.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct AvailableData {
-    /// Whether poses come from the joints of a recording, so that their errors are systematic and shared by all images.
+    /// Whether poses come from the joints of a recording, so that their errors are systematic and
+    /// shared by all images.
     pub joints: bool,
-    /// Whether poses come from a SLAM system or a base that uses one, so that they drift from image to image.
+    /// Whether poses come from a SLAM system or a base that uses one, so that they drift from image
+    /// to image.
     pub drifts: bool,
     /// Whether keyframes have depth.
     pub depth: bool,
     /// Whether no keyframe has any depth, including depth from range scanners and rendered depth.
     pub color_only: bool,
-    /// Whether cameras have at least 10 images on average. With fewer, the extrinsics of a camera are
-    /// hardly different from the poses of its images.
+    /// Whether cameras have at least 10 images on average. With fewer, the extrinsics of a camera
+    /// are hardly different from the poses of its images.
     pub many_images_per_camera: bool,
 }
 
@@ -117,11 +124,20 @@ impl TrainingOptions {
 
     /// Rejects flags for options that none of the methods has.
     pub fn check_for(&self, kinds: &[ModelKind]) -> Result<(), Error> {
-        let flags = [(self.max_splats.is_some(), "--max-splats", MAX_SPLATS), (self.count.is_some(), "--count", COUNT)];
+        let flags = [
+            (self.max_splats.is_some(), "--max-splats", MAX_SPLATS),
+            (self.count.is_some(), "--count", COUNT),
+        ];
         let is_unused = |option: &str| !kinds.iter().any(|kind| kind.has_option(option));
-        match flags.into_iter().find(|(is_given, _, option)| *is_given && is_unused(option)) {
+        match flags
+            .into_iter()
+            .find(|(is_given, _, option)| *is_given && is_unused(option))
+        {
             Some((_, flag, option)) => {
-                let having = ModelKind::ALL.iter().filter(|kind| kind.has_option(option)).map(|kind| kind.name());
+                let having = ModelKind::ALL
+                    .iter()
+                    .filter(|kind| kind.has_option(option))
+                    .map(|kind| kind.name());
                 Err(Error::BadInput(format!(
                     "{flag}: needs the method {}, but the method is {}",
                     listed(&having.collect::<Vec<_>>(), "or"),
@@ -134,28 +150,57 @@ impl TrainingOptions {
 
     /// Rejects flags that are invalid for any data, before the data is read.
     pub fn check_before_data(&self, kinds: &[ModelKind], joints: bool) -> Result<(), Error> {
-        let all_available =
-            AvailableData { joints, drifts: true, depth: true, color_only: false, many_images_per_camera: true };
+        let all_available = AvailableData {
+            joints,
+            drifts: true,
+            depth: true,
+            color_only: false,
+            many_images_per_camera: true,
+        };
         self.check_for(kinds)?;
         self.refining(all_available, Refine::None)?;
         self.check_learned(kinds, all_available)
     }
 
-    /// Rejects requested parameters that no scene model can estimate. The error lists the supported parameters.
-    pub fn check_learned(&self, kinds: &[ModelKind], available: AvailableData) -> Result<(), Error> {
+    /// Rejects requested parameters that no scene model can estimate. The error lists the supported
+    /// parameters.
+    pub fn check_learned(
+        &self,
+        kinds: &[ModelKind],
+        available: AvailableData,
+    ) -> Result<(), Error> {
         let can_align = |param: &Refine| match available.depth {
             true => *param != Refine::ImageGains,
-            false => available.color_only && matches!(param, Refine::Extrinsics | Refine::TimeOffset | Refine::Lens),
+            false => {
+                available.color_only
+                    && matches!(
+                        param,
+                        Refine::Extrinsics | Refine::TimeOffset | Refine::Lens
+                    )
+            }
         };
         let can_learn = |param: &Refine| {
             let set = param_set(std::slice::from_ref(param));
-            !set.is_empty() && kinds.iter().any(|kind| kind.entry().learnable.contains(set))
+            !set.is_empty()
+                && kinds
+                    .iter()
+                    .any(|kind| kind.entry().learnable.contains(set))
         };
         let is_other = |param: &Refine| matches!(param, Refine::Auto | Refine::None | Refine::Base);
         let is_known = |param: &Refine| is_other(param) || can_align(param) || can_learn(param);
-        let Some(unknown) = self.refine.iter().find(|param| !is_known(param)) else { return Ok(()) };
-        let known: Vec<&str> = Refine::ALL.iter().filter(|(_, param)| is_known(param)).map(|(name, _)| *name).collect();
-        let without = if available.depth { "" } else { " without measured depth" };
+        let Some(unknown) = self.refine.iter().find(|param| !is_known(param)) else {
+            return Ok(());
+        };
+        let known: Vec<&str> = Refine::ALL
+            .iter()
+            .filter(|(_, param)| is_known(param))
+            .map(|(name, _)| *name)
+            .collect();
+        let without = if available.depth {
+            ""
+        } else {
+            " without measured depth"
+        };
         Err(Error::BadInput(format!(
             "--refine {}: the method {} cannot estimate this{without}; it supports {}",
             unknown.name(),
@@ -165,27 +210,54 @@ impl TrainingOptions {
     }
 
     /// Which calibration parameters to estimate; `default_value` applies if the flag is not given.
-    pub fn refining(&self, available: AvailableData, default_value: Refine) -> Result<RefineSettings, Error> {
-        let requested = if self.refine.is_empty() { std::slice::from_ref(&default_value) } else { &self.refine };
+    pub fn refining(
+        &self,
+        available: AvailableData,
+        default_value: Refine,
+    ) -> Result<RefineSettings, Error> {
+        let requested = if self.refine.is_empty() {
+            std::slice::from_ref(&default_value)
+        } else {
+            &self.refine
+        };
         let has = |param| requested.contains(&param);
         if (has(Refine::Auto) || has(Refine::None)) && requested.len() > 1 {
-            return Err(Error::BadInput("--refine: auto and none cannot be combined with other values".into()));
+            return Err(Error::BadInput(
+                "--refine: auto and none cannot be combined with other values".into(),
+            ));
         }
         if has(Refine::Auto) {
             return Ok(available.auto_settings());
         }
-        let needs_depth = [Refine::Joints, Refine::DepthPose, Refine::DepthScale, Refine::Readout];
-        if let (Some(param), false) = (needs_depth.into_iter().find(|param| has(*param)), available.depth) {
+        let needs_depth = [
+            Refine::Joints,
+            Refine::DepthPose,
+            Refine::DepthScale,
+            Refine::Readout,
+        ];
+        if let (Some(param), false) = (
+            needs_depth.into_iter().find(|param| has(*param)),
+            available.depth,
+        ) {
             let message = "needs depth images measured by a camera";
-            return Err(Error::BadInput(format!("--refine {}: {message}", param.name())));
+            return Err(Error::BadInput(format!(
+                "--refine {}: {message}",
+                param.name()
+            )));
         }
         if has(Refine::Joints) && !available.joints {
-            return Err(Error::BadInput("--refine joints: needs a recording of an arm".into()));
+            return Err(Error::BadInput(
+                "--refine joints: needs a recording of an arm".into(),
+            ));
         }
         let set = param_set(requested);
         if !available.depth {
             let from_features = ParamSet::EXTRINSICS | ParamSet::TIME_OFFSET | ParamSet::LENS;
-            let aligned = if available.color_only { set & from_features } else { ParamSet::empty() };
+            let aligned = if available.color_only {
+                set & from_features
+            } else {
+                ParamSet::empty()
+            };
             return Ok(RefineSettings {
                 align: CameraRefinement::Always(aligned),
                 with_scene: CameraRefinement::Always(set),
@@ -193,19 +265,30 @@ impl TrainingOptions {
         }
         Ok(RefineSettings {
             align: CameraRefinement::Always(set - ParamSet::IMAGE_GAINS),
-            with_scene: CameraRefinement::Always(set & (ParamSet::IMAGE_POSES | ParamSet::IMAGE_GAINS)),
+            with_scene: CameraRefinement::Always(
+                set & (ParamSet::IMAGE_POSES | ParamSet::IMAGE_GAINS),
+            ),
         })
     }
 
-    /// Which calibration parameters a live run estimates. Without the flag, these are all that registration or features can
-    /// estimate, and image gains once the exposure changes; or none on a software adapter, where training is already slow.
-    pub fn refining_live(&self, available: AvailableData, software: bool) -> Result<RefineSettings, Error> {
+    /// Which calibration parameters a live run estimates. Without the flag, these are all that
+    /// registration or features can estimate, and image gains once the exposure changes; or none on
+    /// a software adapter, where training is already slow.
+    pub fn refining_live(
+        &self,
+        available: AvailableData,
+        software: bool,
+    ) -> Result<RefineSettings, Error> {
         if !self.refine.is_empty() || software {
             return self.refining(available, Refine::None);
         }
         let settings = available.auto_settings();
-        let with_scene = CameraRefinement::AlwaysAndWatch(settings.with_scene.always(), ParamSet::IMAGE_GAINS);
-        Ok(RefineSettings { with_scene, ..settings })
+        let with_scene =
+            CameraRefinement::AlwaysAndWatch(settings.with_scene.always(), ParamSet::IMAGE_GAINS);
+        Ok(RefineSettings {
+            with_scene,
+            ..settings
+        })
     }
 
     /// The rig file keys that the flags override.
@@ -227,9 +310,14 @@ impl TrainingOptions {
         overrides
     }
 
-    /// Whether the pose of a mobile base is re-estimated at each station; `None` if `--refine` is not given.
+    /// Whether the pose of a mobile base is re-estimated at each station; `None` if `--refine` is
+    /// not given.
     pub fn realign(&self) -> Option<bool> {
-        let is_on = || self.refine.iter().any(|param| matches!(param, Refine::Auto | Refine::Base));
+        let is_on = || {
+            self.refine
+                .iter()
+                .any(|param| matches!(param, Refine::Auto | Refine::Base))
+        };
         (!self.refine.is_empty()).then(is_on)
     }
 }
@@ -238,7 +326,11 @@ impl TrainingOptions {
 fn method_names(kinds: &[ModelKind]) -> toml::Value {
     match kinds {
         [one] => one.name().into(),
-        several => several.iter().map(|kind| kind.name()).collect::<Vec<_>>().into(),
+        several => several
+            .iter()
+            .map(|kind| kind.name())
+            .collect::<Vec<_>>()
+            .into(),
     }
 }
 
@@ -256,28 +348,40 @@ fn param_set(requested: &[Refine]) -> ParamSet {
         (Refine::DepthScale, ParamSet::DEPTH_SCALE),
         (Refine::Readout, ParamSet::READOUT),
     ];
-    params.into_iter().filter(|(param, _)| has(*param)).map(|(_, param)| param).collect()
+    params
+        .into_iter()
+        .filter(|(param, _)| has(*param))
+        .map(|(_, param)| param)
+        .collect()
 }
 
 impl AvailableData {
-    /// Candidates for trials, the most promising first. They are estimated by registration if there is depth, otherwise
-    /// jointly with the scene.
+    /// Candidates for trials, the most promising first. They are estimated by registration if there
+    /// is depth, otherwise jointly with the scene.
     ///
-    /// Without depth, extrinsics are estimated from features and then optimized with the scene from the first step on:
-    /// their error is shared by all images, so it is observable if the poses are right, and a trial of a few hundred steps
-    /// is too short to correct it.
+    /// Without depth, extrinsics are estimated from features and then optimized with the scene from
+    /// the first step on: their error is shared by all images, so it is observable if the poses are
+    /// right, and a trial of a few hundred steps is too short to correct it.
     fn auto_settings(self) -> RefineSettings {
         let gains = ParamSet::IMAGE_GAINS;
         let poses = ParamSet::IMAGE_POSES;
         let with_scene = match self {
             Self { drifts: true, .. } => vec![gains, poses],
             Self { depth: true, .. } => vec![gains],
-            Self { depth: false, many_images_per_camera: true, .. } => vec![gains, ParamSet::TIME_OFFSET],
+            Self {
+                depth: false,
+                many_images_per_camera: true,
+                ..
+            } => vec![gains, ParamSet::TIME_OFFSET],
             Self { depth: false, .. } => vec![gains, ParamSet::EXTRINSICS | ParamSet::TIME_OFFSET],
         };
         let aligned = match self {
             Self { depth: true, .. } => candidates(),
-            Self { color_only: true, many_images_per_camera: true, .. } => {
+            Self {
+                color_only: true,
+                many_images_per_camera: true,
+                ..
+            } => {
                 vec![ParamSet::EXTRINSICS, ParamSet::TIME_OFFSET]
             }
             _ => Vec::new(),
@@ -301,12 +405,23 @@ mod tests {
     }
 
     fn available(joints: bool, depth: bool) -> AvailableData {
-        AvailableData { joints, drifts: !joints, depth, color_only: !depth, many_images_per_camera: true }
+        AvailableData {
+            joints,
+            drifts: !joints,
+            depth,
+            color_only: !depth,
+            many_images_per_camera: true,
+        }
     }
 
     fn refining(requested: &[Refine], joints: bool, depth: bool) -> Result<RefineSettings, String> {
-        let options = TrainingOptions { refine: requested.to_vec(), ..TrainingOptions::default() };
-        options.refining(available(joints, depth), Refine::None).map_err(|error| error.to_string())
+        let options = TrainingOptions {
+            refine: requested.to_vec(),
+            ..TrainingOptions::default()
+        };
+        options
+            .refining(available(joints, depth), Refine::None)
+            .map_err(|error| error.to_string())
     }
 
     #[test]
@@ -314,7 +429,10 @@ mod tests {
         let extrinsics = ParamSet::EXTRINSICS;
         let by_depth = refining(&[Refine::Extrinsics, Refine::ImageGains], true, true).unwrap();
         assert_eq!(by_depth.align, CameraRefinement::Always(extrinsics));
-        assert_eq!(by_depth.with_scene, CameraRefinement::Always(ParamSet::IMAGE_GAINS));
+        assert_eq!(
+            by_depth.with_scene,
+            CameraRefinement::Always(ParamSet::IMAGE_GAINS)
+        );
         let without = refining(&[Refine::Extrinsics], true, false).unwrap();
         assert_eq!(
             without,
@@ -325,10 +443,14 @@ mod tests {
         );
 
         let candidates = |choice: CameraRefinement| choice.candidates().len();
-        for (joints, depth, aligned, learned) in
-            [(true, true, 8, 1), (true, false, 2, 2), (false, true, 8, 2), (false, false, 2, 2)]
-        {
-            let RefineSettings { align, with_scene } = refining(&[Refine::Auto], joints, depth).unwrap();
+        for (joints, depth, aligned, learned) in [
+            (true, true, 8, 1),
+            (true, false, 2, 2),
+            (false, true, 8, 2),
+            (false, false, 2, 2),
+        ] {
+            let RefineSettings { align, with_scene } =
+                refining(&[Refine::Auto], joints, depth).unwrap();
             assert_eq!(
                 (candidates(align), candidates(with_scene)),
                 (aligned, learned),
@@ -341,25 +463,52 @@ mod tests {
             (true, true, true, ParamSet::empty()),
             (false, false, false, ParamSet::empty()),
         ] {
-            let available = AvailableData { many_images_per_camera, ..available(joints, depth) };
+            let available = AvailableData {
+                many_images_per_camera,
+                ..available(joints, depth)
+            };
             let options = TrainingOptions::default();
-            assert_eq!(options.refining(available, Refine::Auto).unwrap().with_scene.always(), always);
+            assert_eq!(
+                options
+                    .refining(available, Refine::Auto)
+                    .unwrap()
+                    .with_scene
+                    .always(),
+                always
+            );
             let live = options.refining_live(available, false).unwrap().with_scene;
-            assert_eq!(live, CameraRefinement::AlwaysAndWatch(always, ParamSet::IMAGE_GAINS));
+            assert_eq!(
+                live,
+                CameraRefinement::AlwaysAndWatch(always, ParamSet::IMAGE_GAINS)
+            );
         }
         assert_eq!(refining(&[], true, true), Ok(RefineSettings::default()));
     }
 
     #[test]
     fn unsupported_flags_are_rejected_for_each_method() {
-        let options =
-            TrainingOptions { max_splats: Some(5), refine: vec![Refine::ImageGains], ..TrainingOptions::default() };
+        let options = TrainingOptions {
+            max_splats: Some(5),
+            refine: vec![Refine::ImageGains],
+            ..TrainingOptions::default()
+        };
         let available = available(true, true);
         let both = [kind("tsdf"), kind("splat")];
-        assert!(options.check_for(&both).is_ok() && options.check_learned(&both, available).is_ok());
-        let message = options.check_for(&[kind("tsdf"), kind("nerf")]).unwrap_err().to_string();
-        assert!(message.contains("--max-splats") && message.contains("tsdf and nerf"), "{message}");
-        let message = options.check_learned(&[kind("tsdf")], available).unwrap_err().to_string();
+        assert!(
+            options.check_for(&both).is_ok() && options.check_learned(&both, available).is_ok()
+        );
+        let message = options
+            .check_for(&[kind("tsdf"), kind("nerf")])
+            .unwrap_err()
+            .to_string();
+        assert!(
+            message.contains("--max-splats") && message.contains("tsdf and nerf"),
+            "{message}"
+        );
+        let message = options
+            .check_learned(&[kind("tsdf")], available)
+            .unwrap_err()
+            .to_string();
         assert!(
             message.starts_with(
                 "--refine image-gains: the method tsdf cannot estimate this; it supports auto, none, base, extrinsics,"
@@ -368,24 +517,44 @@ mod tests {
         );
         assert!(message.ends_with("readout, image-poses"), "{message}");
         assert!(options.check_learned(&[kind("nerf")], available).is_ok());
-        let options = TrainingOptions { refine: vec![Refine::Extrinsics], ..TrainingOptions::default() };
+        let options = TrainingOptions {
+            refine: vec![Refine::Extrinsics],
+            ..TrainingOptions::default()
+        };
         assert!(options.check_before_data(&[kind("nerf")], false).is_ok());
         let message = options
-            .check_learned(&[kind("nerf")], AvailableData { depth: false, ..available })
+            .check_learned(
+                &[kind("nerf")],
+                AvailableData {
+                    depth: false,
+                    ..available
+                },
+            )
             .unwrap_err()
             .to_string();
-        assert!(message.ends_with("supports auto, none, base, image-poses, image-gains"), "{message}");
-        let options = TrainingOptions { refine: vec![Refine::Joints], ..TrainingOptions::default() };
+        assert!(
+            message.ends_with("supports auto, none, base, image-poses, image-gains"),
+            "{message}"
+        );
+        let options = TrainingOptions {
+            refine: vec![Refine::Joints],
+            ..TrainingOptions::default()
+        };
         assert!(options.check_before_data(&[kind("splat")], true).is_ok());
         assert!(options.check_before_data(&[kind("splat")], false).is_err());
     }
 
     #[test]
     fn unsupported_refine_params_are_rejected() {
-        let message = |requested: &[Refine], joints, depth| refining(requested, joints, depth).unwrap_err();
-        assert!(message(&[Refine::DepthPose], true, false).contains("depth-pose: needs depth images"));
+        let message =
+            |requested: &[Refine], joints, depth| refining(requested, joints, depth).unwrap_err();
+        assert!(
+            message(&[Refine::DepthPose], true, false).contains("depth-pose: needs depth images")
+        );
         assert!(message(&[Refine::Readout], false, false).contains("readout: needs"));
         assert!(message(&[Refine::Joints], false, true).contains("needs a recording of an arm"));
-        assert!(message(&[Refine::Auto, Refine::Extrinsics], true, true).contains("cannot be combined"));
+        assert!(
+            message(&[Refine::Auto, Refine::Extrinsics], true, true).contains("cannot be combined")
+        );
     }
 }

@@ -10,7 +10,9 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 use trainer::{Aabb, Edits, Method, ModelKind, RenderRequest, Rendered};
-use viz::{Control, EditAction, EditRequest, Hub, KeyframePose, ModelStatus, PendingRender, Status};
+use viz::{
+    Control, EditAction, EditRequest, Hub, KeyframePose, ModelStatus, PendingRender, Status,
+};
 
 /// Maximum response time to Ctrl-C while no client requests a picture.
 const POLL_PERIOD: Duration = Duration::from_millis(100);
@@ -47,12 +49,19 @@ pub struct ModelViewer {
 }
 
 impl ModelViewer {
-    /// A viewer of models whose z axis points up. The keyframes of the hub are the views of the model's training images.
+    /// A viewer of models whose z axis points up. The keyframes of the hub are the views of the
+    /// model's training images.
     pub fn new(models: Vec<ServedModel>, hub: Hub) -> Self {
-        let posed =
-            |pose: KeyframePose| PosedKeyframe { pose, keyframe: None, color_from_depth: Transform::identity() };
+        let posed = |pose: KeyframePose| PosedKeyframe {
+            pose,
+            keyframe: None,
+            color_from_depth: Transform::identity(),
+        };
         Self {
-            saved: models.iter().map(|model| Arc::clone(&model.edits)).collect(),
+            saved: models
+                .iter()
+                .map(|model| Arc::clone(&model.edits))
+                .collect(),
             models,
             chunk_publisher: ChunkPublisher::new(hub.clone()),
             cameras: hub.keyframe_poses().into_iter().map(posed).collect(),
@@ -68,7 +77,10 @@ impl ModelViewer {
     /// Rotates the models so that they are upright in the page's world, which is z up.
     pub fn with_model_from_page(self, model_from_page: Transform) -> Self {
         self.hub.set_world_from_model(model_from_page.inverse());
-        Self { model_from_page, ..self }
+        Self {
+            model_from_page,
+            ..self
+        }
     }
 
     /// Draws requested pictures until a signal requests a stop.
@@ -89,7 +101,10 @@ impl ModelViewer {
     }
 
     fn has_unsaved_edits(&self) -> bool {
-        self.models.iter().zip(&self.saved).any(|(model, saved)| model.path.is_dir() && model.edits != *saved)
+        self.models
+            .iter()
+            .zip(&self.saved)
+            .any(|(model, saved)| model.path.is_dir() && model.edits != *saved)
     }
 
     fn publish_observations(&mut self) {
@@ -100,12 +115,23 @@ impl ModelViewer {
         let model_from_page = &self.model_from_page;
         let render = |request: &RenderRequest| method.render(&in_model(request, model_from_page));
         // The step has no effect, because the model does not change.
-        let model = ModelState { step: 1, edits, captured_at: &|_| None };
-        self.observation_publisher.publish(&self.cameras, &model, render);
+        let model = ModelState {
+            step: 1,
+            edits,
+            captured_at: &|_| None,
+        };
+        self.observation_publisher
+            .publish(&self.cameras, &model, render);
     }
 
     fn publish_chunks(&mut self) {
-        for ServedModel { kind, method, edits, .. } in &mut self.models {
+        for ServedModel {
+            kind,
+            method,
+            edits,
+            ..
+        } in &mut self.models
+        {
             self.chunk_publisher.publish(*kind, method.as_mut(), edits);
         }
     }
@@ -125,7 +151,9 @@ impl ModelViewer {
         }
         if self.hub.take_controls().contains(&Control::Save) {
             let saved = self.models.iter_mut().zip(&mut self.saved);
-            let notes: Vec<String> = saved.map(|(model, saved)| model.save_edits(saved)).collect();
+            let notes: Vec<String> = saved
+                .map(|(model, saved)| model.save_edits(saved))
+                .collect();
             self.note = Some(notes.join("; "));
             self.publish_notes();
         }
@@ -138,7 +166,8 @@ impl ModelViewer {
             EditAction::Erase(aabb) => EditAction::Erase(box_in_model(aabb, &self.model_from_page)),
             action => action,
         };
-        self.editor.apply(request, &action, &mut model.edits, model.method.as_mut())
+        self.editor
+            .apply(request, &action, &mut model.edits, model.method.as_mut())
     }
 
     /// Publishes the result of an edit, or sends the reason why it was not possible.
@@ -148,7 +177,11 @@ impl ModelViewer {
             Ok(Some(note)) => {
                 self.publish_edits();
                 let is_unsaved = self.has_unsaved_edits();
-                self.note = Some(if is_unsaved { format!("{note}; not saved yet") } else { note });
+                self.note = Some(if is_unsaved {
+                    format!("{note}; not saved yet")
+                } else {
+                    note
+                });
             }
             Err(reason) => self.hub.reject_edit(request, &reason),
         }
@@ -157,18 +190,30 @@ impl ModelViewer {
 
     /// Publishes the numbers of edits.
     fn publish_edits(&self) {
-        self.hub.change_status(|Status { model, others, edit_revision, .. }| {
-            for ModelStatus { method, edits, .. } in std::iter::once(model).chain(others) {
-                let model = self.models.iter().find(|model| model.kind.name() == method);
-                *edits = model.map_or(0, |model| model.edits.len());
-            }
-            *edit_revision += 1;
-        });
+        self.hub.change_status(
+            |Status {
+                 model,
+                 others,
+                 edit_revision,
+                 ..
+             }| {
+                for ModelStatus { method, edits, .. } in std::iter::once(model).chain(others) {
+                    let model = self.models.iter().find(|model| model.kind.name() == method);
+                    *edits = model.map_or(0, |model| model.edits.len());
+                }
+                *edit_revision += 1;
+            },
+        );
     }
 
     /// Publishes the notes on edits in place of the previous ones.
     fn publish_notes(&mut self) {
-        let current: Vec<String> = self.note.iter().cloned().chain(self.editor.note()).collect();
+        let current: Vec<String> = self
+            .note
+            .iter()
+            .cloned()
+            .chain(self.editor.note())
+            .collect();
         let previous = std::mem::replace(&mut self.published_notes, current.clone());
         self.hub.change_status(|Status { notes, .. }| {
             notes.retain(|shown| !previous.contains(shown));
@@ -192,8 +237,16 @@ pub(crate) fn answer(pending: PendingRender, method: &mut dyn Method, edits: &Ar
     answer_with(pending, request, method, edits);
 }
 
-fn answer_with(pending: PendingRender, request: RenderRequest, method: &mut dyn Method, edits: &Arc<Edits>) {
-    let request = RenderRequest { edits: Arc::clone(edits), ..request };
+fn answer_with(
+    pending: PendingRender,
+    request: RenderRequest,
+    method: &mut dyn Method,
+    edits: &Arc<Edits>,
+) {
+    let request = RenderRequest {
+        edits: Arc::clone(edits),
+        ..request
+    };
     let rendered = match pending.packing() {
         Some(packing) => method.render_packed(&request, packing),
         None => method.render(&request).map(Rendered::Picture),
@@ -205,13 +258,17 @@ fn answer_with(pending: PendingRender, request: RenderRequest, method: &mut dyn 
 }
 
 impl ServedModel {
-    /// Writes the edits into the folder of the model, and updates `saved`. Returns a note on the result.
+    /// Writes the edits into the folder of the model, and updates `saved`. Returns a note on the
+    /// result.
     fn save_edits(&mut self, saved: &mut Arc<Edits>) -> String {
         let path = self.path.display();
         if !self.path.is_dir() {
             return format!("edits cannot be saved: {path} is not a model folder");
         }
-        let written = self.edits.write(&self.path).and_then(|()| self.method.write_for_others(&self.path, &self.edits));
+        let written = self
+            .edits
+            .write(&self.path)
+            .and_then(|()| self.method.write_for_others(&self.path, &self.edits));
         match written {
             Ok(()) => {
                 *saved = Arc::clone(&self.edits);
@@ -226,20 +283,36 @@ impl ServedModel {
 }
 
 /// The model of this method; the first one if no method is given.
-fn model_mut<'a>(models: &'a mut [ServedModel], method: Option<&str>) -> Result<&'a mut ServedModel, String> {
-    match models.iter().position(|model| method.is_none_or(|name| model.kind.name() == name)) {
+fn model_mut<'a>(
+    models: &'a mut [ServedModel],
+    method: Option<&str>,
+) -> Result<&'a mut ServedModel, String> {
+    match models
+        .iter()
+        .position(|model| method.is_none_or(|name| model.kind.name() == name))
+    {
         Some(ix) => Ok(&mut models[ix]),
-        None => Err(methods::unknown(models.iter().map(|model| model.kind), method)),
+        None => Err(methods::unknown(
+            models.iter().map(|model| model.kind),
+            method,
+        )),
     }
 }
 
 /// Transforms a box from the page's world frame to the model's world frame.
 fn box_in_model(aabb: Aabb, model_from_page: &Transform) -> Aabb {
-    Aabb { world_from_box: model_from_page * aabb.world_from_box, ..aabb }
+    Aabb {
+        world_from_box: model_from_page * aabb.world_from_box,
+        ..aabb
+    }
 }
 
 /// Transforms a request from the page's world frame to the model's world frame.
 fn in_model(request: &RenderRequest, model_from_page: &Transform) -> RenderRequest {
     let crop = request.crop.map(|crop| box_in_model(crop, model_from_page));
-    RenderRequest { world_from_camera: model_from_page * request.world_from_camera, crop, ..request.clone() }
+    RenderRequest {
+        world_from_camera: model_from_page * request.world_from_camera,
+        crop,
+        ..request.clone()
+    }
 }

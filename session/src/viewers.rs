@@ -41,6 +41,9 @@ impl InputObserver for Viewers {
     }
 
     fn observe_range_scan(&self, observed: ObservedRangeScan) {
-        self.0.set_range_scan(RangeScan { scan: observed.scan, map_from_odom: observed.map_from_odom });
+        self.0.set_range_scan(RangeScan {
+            scan: observed.scan,
+            map_from_odom: observed.map_from_odom,
+        });
     }
 }

@@ -1,6 +1,7 @@
 //! Runs the default rig and writes its images into a folder, for inspection and timing.
 //!
-//! `cargo run --release -p sim --example look -- FOLDER N_IMAGES [EVERY] [720p|two|notruth|global|ideal|mobile-base|mobile-arm]`
+//! `cargo run --release -p sim --example look -- FOLDER N_IMAGES [EVERY]
+//! [720p|two|notruth|global|ideal|mobile-base|mobile-arm]`
 
 use drivers::{PixelFormat, Sample, Source};
 use nalgebra::{Isometry3, Point3, Vector3};
@@ -13,7 +14,10 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let n_images: u64 = args.get(1).map_or(Ok(20), |text| text.parse())?;
     let every: u64 = args.get(2).map_or(Ok(1), |text| text.parse())?;
     std::fs::create_dir_all(&folder)?;
-    let mut config = Config { n_images: Some(n_images), ..Config::default() };
+    let mut config = Config {
+        n_images: Some(n_images),
+        ..Config::default()
+    };
     match args.get(3).map_or("", String::as_str) {
         "720p" => {
             let camera = &mut config.cameras[0];
@@ -25,10 +29,14 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
             let mut fixed = CameraConfig::wrist("fixed");
             fixed.intrinsics = fixed.intrinsics.resized([1280, 720]);
             fixed.intrinsics.focal_px = [1480.0, 1478.0];
-            fixed.intrinsics.lens = kinematics::Lens::BrownConrady([0.06, -0.12, 0.0005, -0.0003, 0.0]);
+            fixed.intrinsics.lens =
+                kinematics::Lens::BrownConrady([0.06, -0.12, 0.0005, -0.0003, 0.0]);
             fixed.parent = Parent::World;
-            fixed.parent_from_camera =
-                Isometry3::face_towards(&Point3::new(1.04, 0.0, 0.75), &Point3::new(0.74, 0.0, 0.15), &-Vector3::z());
+            fixed.parent_from_camera = Isometry3::face_towards(
+                &Point3::new(1.04, 0.0, 0.75),
+                &Point3::new(0.74, 0.0, 0.15),
+                &-Vector3::z(),
+            );
             fixed.depth = None;
             fixed.rate_hz = 5.0;
             config.cameras.push(fixed);
@@ -64,23 +72,45 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
                     let file = folder.join(format!("{}_{kind}_{n_taken:04}.png", image.camera));
                     let [width, height] = image.size_px;
                     if is_color {
-                        image::save_buffer(file, &image.data, width, height, image::ExtendedColorType::Rgb8)?;
+                        image::save_buffer(
+                            file,
+                            &image.data,
+                            width,
+                            height,
+                            image::ExtendedColorType::Rgb8,
+                        )?;
                     } else {
                         let near: Vec<u8> = image
                             .data
                             .chunks_exact(2)
-                            .map(|count| u8::try_from(u16::from_le_bytes([count[0], count[1]]) / 40).unwrap_or(255))
+                            .map(|count| {
+                                u8::try_from(u16::from_le_bytes([count[0], count[1]]) / 40)
+                                    .unwrap_or(255)
+                            })
                             .collect();
-                        image::save_buffer(file, &near, width, height, image::ExtendedColorType::L8)?;
+                        image::save_buffer(
+                            file,
+                            &near,
+                            width,
+                            height,
+                            image::ExtendedColorType::L8,
+                        )?;
                     }
                 }
             }
             Sample::Truth(truth) => {
                 ceiling += truth.psnr_ceiling.unwrap_or(0.0);
                 if n_taken % every == 0 {
-                    let file = folder.join(format!("{}_truth_{n_taken:04}.png", truth.image.camera));
+                    let file =
+                        folder.join(format!("{}_truth_{n_taken:04}.png", truth.image.camera));
                     let [width, height] = truth.image.size_px;
-                    image::save_buffer(file, &truth.image.data, width, height, image::ExtendedColorType::Rgb8)?;
+                    image::save_buffer(
+                        file,
+                        &truth.image.data,
+                        width,
+                        height,
+                        image::ExtendedColorType::Rgb8,
+                    )?;
                 }
             }
             Sample::Range(scan) => n_points += scan.points.len(),
@@ -107,11 +137,16 @@ fn mobile_base(config: &mut Config) {
         camera.intrinsics.focal_px = [640.0, 640.0];
         camera.parent = Parent::Base;
         let eye = Point3::new(x, 0.0, 0.06);
-        camera.parent_from_camera =
-            Isometry3::face_towards(&eye, &(eye + Vector3::new(ahead, 0.0, 0.05)), &-Vector3::z());
+        camera.parent_from_camera = Isometry3::face_towards(
+            &eye,
+            &(eye + Vector3::new(ahead, 0.0, 0.05)),
+            &-Vector3::z(),
+        );
         camera.depth = None;
         camera.rate_hz = 1.0;
         config.cameras.push(camera);
     }
-    config.scanners.push(sim::ScannerConfig::sixteen_rings("lidar"));
+    config
+        .scanners
+        .push(sim::ScannerConfig::sixteen_rings("lidar"));
 }

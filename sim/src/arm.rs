@@ -12,7 +12,8 @@ use std::sync::Arc;
 /// Period of the dynamics steps and of the joint readings, nanoseconds.
 pub(crate) const STEP_NANOS: i64 = 1_000_000;
 const STEP_SECS: f64 = 1e-3;
-/// Stiffness, newton meters per radian, and damping, newton meter seconds per radian, of each joint's controller.
+/// Stiffness, newton meters per radian, and damping, newton meter seconds per radian, of each
+/// joint's controller.
 const STIFFNESS: [f64; N_JOINTS] = [2000.0, 2000.0, 1600.0, 1600.0, 600.0, 600.0, 300.0];
 const DAMPING: [f64; N_JOINTS] = [120.0, 120.0, 90.0, 90.0, 35.0, 35.0, 18.0];
 
@@ -79,16 +80,31 @@ pub(crate) struct Arm {
 }
 
 impl Arm {
-    /// Places the arm at rest at the start of the scan. Readings are kept for `history_duration_nanos`.
-    pub(crate) fn new(model: Arc<MjModel>, follower: Follower, history_duration_nanos: i64) -> Result<Self, Error> {
+    /// Places the arm at rest at the start of the scan. Readings are kept for
+    /// `history_duration_nanos`.
+    pub(crate) fn new(
+        model: Arc<MjModel>,
+        follower: Follower,
+        history_duration_nanos: i64,
+    ) -> Result<Self, Error> {
         let mut data = MjData::new(model);
         if data.qpos().len() != N_JOINTS {
-            return Err(Error::NJoints { got: data.qpos().len(), expected: N_JOINTS });
+            return Err(Error::NJoints {
+                got: data.qpos().len(),
+                expected: N_JOINTS,
+            });
         }
-        data.qpos_mut().copy_from_slice(follower.position_rad().as_slice());
+        data.qpos_mut()
+            .copy_from_slice(follower.position_rad().as_slice());
         data.forward();
         let reference = Reference::Scan(Box::new(follower));
-        Ok(Self { data, reference, n_steps: 0, readings: VecDeque::new(), history_duration_nanos })
+        Ok(Self {
+            data,
+            reference,
+            n_steps: 0,
+            readings: VecDeque::new(),
+            history_duration_nanos,
+        })
     }
 
     /// Position of the joints.
@@ -96,9 +112,14 @@ impl Arm {
         Joints::from_column_slice(self.data.qpos())
     }
 
-    /// Follows commands from now on, starting at rest at the current position. `joint_ixs` and `joint_offsets` are those
-    /// of the joint readings.
-    pub(crate) fn follow_commands(&mut self, commands: Commands, joint_ixs: &[usize], joint_offsets: &[f64]) {
+    /// Follows commands from now on, starting at rest at the current position. `joint_ixs` and
+    /// `joint_offsets` are those of the joint readings.
+    pub(crate) fn follow_commands(
+        &mut self,
+        commands: Commands,
+        joint_ixs: &[usize],
+        joint_offsets: &[f64],
+    ) {
         self.reference = Reference::Commands(JointCommands {
             commands,
             joint_ixs: joint_ixs.to_vec(),
@@ -113,16 +134,29 @@ impl Arm {
         let position_rad = self.position_rad();
         let velocity_rad_s = Joints::from_column_slice(self.data.qvel());
         let torque_nm = self.control(&position_rad, &velocity_rad_s);
-        let reading = JointReading { nanos: self.n_steps * STEP_NANOS, position_rad, velocity_rad_s, torque_nm };
-        self.data.qfrc_applied_mut().copy_from_slice(torque_nm.as_slice());
+        let reading = JointReading {
+            nanos: self.n_steps * STEP_NANOS,
+            position_rad,
+            velocity_rad_s,
+            torque_nm,
+        };
+        self.data
+            .qfrc_applied_mut()
+            .copy_from_slice(torque_nm.as_slice());
         self.data.step();
         self.n_steps += 1;
         match &mut self.reference {
-            Reference::Scan(follower) => follower.advance(self.n_steps as f64 * STEP_SECS, STEP_SECS),
+            Reference::Scan(follower) => {
+                follower.advance(self.n_steps as f64 * STEP_SECS, STEP_SECS)
+            }
             Reference::Commands(commands) => commands.advance(),
         }
         self.readings.push_back(reading);
-        while self.readings.front().is_some_and(|first| first.nanos + self.history_duration_nanos < reading.nanos) {
+        while self
+            .readings
+            .front()
+            .is_some_and(|first| first.nanos + self.history_duration_nanos < reading.nanos)
+        {
             self.readings.pop_front();
         }
         reading
@@ -142,8 +176,8 @@ impl Arm {
         })
     }
 
-    /// Joint positions at a time, by cubic interpolation of the two neighboring readings; `None` if no readings cover
-    /// it.
+    /// Joint positions at a time, by cubic interpolation of the two neighboring readings; `None` if
+    /// no readings cover it.
     pub(crate) fn position_at(&self, nanos: i64) -> Option<Joints> {
         let first = self.readings.front()?;
         let ix = usize::try_from((nanos - first.nanos).checked_div(STEP_NANOS)?).ok()?;

@@ -1,4 +1,5 @@
-//! Motion of the robot's base: fixed, walking around a pedestal, or walking from one station to the next.
+//! Motion of the robot's base: fixed, walking around a pedestal, or walking from one station to the
+//! next.
 
 use crate::config::Scene;
 use crate::random::RandomStream;
@@ -11,7 +12,8 @@ use std::f64::consts::TAU;
 pub(crate) enum BaseMotion {
     /// The base is at the world's origin.
     Fixed,
-    /// A quadruped walks sideways around the origin, facing mostly inward. The value scales its speed.
+    /// A quadruped walks sideways around the origin, facing mostly inward. The value scales its
+    /// speed.
     Lap(f64),
     /// The base stands at a far station, then walks to a near one. The value scales its speed.
     Stations(f64),
@@ -27,7 +29,8 @@ const PITCH_RAD: f64 = 0.006;
 /// Height of the body's center above the floor, meters.
 pub(crate) const BODY_Z_M: f64 = 0.52;
 
-/// Time at which the base leaves the first station, and duration of the walk to the second, seconds at speed 1.
+/// Time at which the base leaves the first station, and duration of the walk to the second, seconds
+/// at speed 1.
 const DEPARTURE_SECS: f64 = 14.0;
 const WALK_DURATION_SECS: f64 = 5.0;
 /// The stations: x, y in meters and heading in radians.
@@ -60,7 +63,8 @@ impl BaseMotion {
         }
     }
 
-    /// Completed fraction of the walk (one lap, or from the first station to the last); above 1 in later laps.
+    /// Completed fraction of the walk (one lap, or from the first station to the last); above 1 in
+    /// later laps.
     pub(crate) fn walked_frac(&self, secs: f64) -> f64 {
         match self {
             Self::Fixed => 0.0,
@@ -76,8 +80,9 @@ impl BaseMotion {
             Self::Lap(speed) => lap_pose(lap_secs(secs, *speed), secs * speed),
             Self::Stations(_) => {
                 let share = self.walked_frac(secs);
-                let [x, y, yaw] =
-                    std::array::from_fn(|ix| FAR_STATION[ix] + (NEAR_STATION[ix] - FAR_STATION[ix]) * share);
+                let [x, y, yaw] = std::array::from_fn(|ix| {
+                    FAR_STATION[ix] + (NEAR_STATION[ix] - FAR_STATION[ix]) * share
+                });
                 // The gait fades out before the base stops.
                 let gait_amplitude = (4.0 * share * (1.0 - share)).clamp(0.0, 1.0);
                 gait(secs, gait_amplitude, [x, y, yaw])
@@ -85,16 +90,20 @@ impl BaseMotion {
         }
     }
 
-    /// Times at which the base leaves its first station and reaches its last, seconds; zero if it has no stations.
+    /// Times at which the base leaves its first station and reaches its last, seconds; zero if it
+    /// has no stations.
     pub(crate) fn walk_secs(&self) -> [f64; 2] {
         match self {
-            Self::Stations(speed) => [DEPARTURE_SECS / speed, (DEPARTURE_SECS + WALK_DURATION_SECS) / speed],
+            Self::Stations(speed) => [
+                DEPARTURE_SECS / speed,
+                (DEPARTURE_SECS + WALK_DURATION_SECS) / speed,
+            ],
             Self::Fixed | Self::Lap(_) => [0.0; 2],
         }
     }
 
-    /// Index of the current station and seconds since arrival (at speed 1), or `None` while the base moves. The arm
-    /// scans only at stations.
+    /// Index of the current station and seconds since arrival (at speed 1), or `None` while the
+    /// base moves. The arm scans only at stations.
     pub(crate) fn station_at(&self, secs: f64) -> Option<(usize, f64)> {
         match self {
             Self::Fixed => Some((0, secs)),
@@ -104,14 +113,16 @@ impl BaseMotion {
                 if at < DEPARTURE_SECS {
                     Some((0, at))
                 } else {
-                    (at > DEPARTURE_SECS + WALK_DURATION_SECS).then_some((1, at - DEPARTURE_SECS - WALK_DURATION_SECS))
+                    (at > DEPARTURE_SECS + WALK_DURATION_SECS)
+                        .then_some((1, at - DEPARTURE_SECS - WALK_DURATION_SECS))
                 }
             }
         }
     }
 }
 
-/// Progress along the laps, in seconds at nominal speed. The walk starts at rest; then its speed varies by a third.
+/// Progress along the laps, in seconds at nominal speed. The walk starts at rest; then its speed
+/// varies by a third.
 fn lap_secs(secs: f64, speed: f64) -> f64 {
     const START_SECS: f64 = 1.5;
     const OSCILLATION: (f64, f64) = (0.35, 7.3);
@@ -127,8 +138,11 @@ fn lap_pose(at: f64, gait_secs: f64) -> Transform {
     let radius_m = oscillate([2.25, 0.38, 23.0, 0.1], at);
     // The heading varies between facing the pedestal and facing past it.
     let heading_offset_rad = oscillate([0.25, 0.55, 15.7, 0.0], at);
-    let position =
-        [radius_m * around.cos(), radius_m * around.sin(), around + std::f64::consts::PI + heading_offset_rad];
+    let position = [
+        radius_m * around.cos(),
+        radius_m * around.sin(),
+        around + std::f64::consts::PI + heading_offset_rad,
+    ];
     gait(gait_secs, smooth(at / 2.0), position)
 }
 
@@ -137,9 +151,18 @@ fn gait(secs: f64, gait_amplitude: f64, [x, y, yaw]: [f64; 3]) -> Transform {
     let step = secs * GAIT_HZ * TAU;
     let bounce_m = BOUNCE_M * gait_amplitude * (2.0 * step).sin();
     let rotation_vector = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), yaw)
-        * UnitQuaternion::from_axis_angle(&Vector3::y_axis(), PITCH_RAD * gait_amplitude * (2.0 * step + 0.7).sin())
-        * UnitQuaternion::from_axis_angle(&Vector3::x_axis(), ROLL_RAD * gait_amplitude * step.sin());
-    Transform::from_parts(Translation3::new(x, y, BODY_Z_M + bounce_m), rotation_vector)
+        * UnitQuaternion::from_axis_angle(
+            &Vector3::y_axis(),
+            PITCH_RAD * gait_amplitude * (2.0 * step + 0.7).sin(),
+        )
+        * UnitQuaternion::from_axis_angle(
+            &Vector3::x_axis(),
+            ROLL_RAD * gait_amplitude * step.sin(),
+        );
+    Transform::from_parts(
+        Translation3::new(x, y, BODY_Z_M + bounce_m),
+        rotation_vector,
+    )
 }
 
 /// Drift like that of a SLAM system: a random walk that advances only while the base walks.
@@ -153,7 +176,8 @@ pub(crate) struct Drift {
 
 /// Steps of the random walk over the whole walk.
 const N_STEPS: f64 = 64.0;
-/// Errors of height, roll and pitch relative to the other axes: gravity and the floor constrain them.
+/// Errors of height, roll and pitch relative to the other axes: gravity and the floor constrain
+/// them.
 const CONSTRAINED_AXIS_FRAC: f64 = 0.3;
 /// Identifies the random number stream.
 const DRIFT: u64 = 0xd41f;
@@ -162,13 +186,20 @@ impl Drift {
     /// `size_m` and `size_rad` are the root mean square errors at the end of the whole walk.
     pub(crate) fn new(seed: u64, size_m: f64, size_rad: f64) -> Self {
         let step_sigmas = |size: f64, weights: [f64; 3]| {
-            let norm = weights.iter().map(|weight| weight * weight).sum::<f64>().sqrt();
+            let norm = weights
+                .iter()
+                .map(|weight| weight * weight)
+                .sum::<f64>()
+                .sqrt();
             weights.map(|weight| size * weight / norm / N_STEPS.sqrt())
         };
         Self {
             random: RandomStream::new(seed, &[DRIFT]),
             step_m: step_sigmas(size_m, [1.0, 1.0, CONSTRAINED_AXIS_FRAC]),
-            step_rad: step_sigmas(size_rad, [CONSTRAINED_AXIS_FRAC, CONSTRAINED_AXIS_FRAC, 1.0]),
+            step_rad: step_sigmas(
+                size_rad,
+                [CONSTRAINED_AXIS_FRAC, CONSTRAINED_AXIS_FRAC, 1.0],
+            ),
         }
     }
 
@@ -177,16 +208,21 @@ impl Drift {
         let steps = walked_frac * N_STEPS;
         let (mut translation_error, mut rotation_vector) = (Vector3::zeros(), Vector3::zeros());
         let mut step = 0_u64;
-        // Summing all steps each time needs no state, and even a long run has only a few hundred steps.
+        // Summing all steps each time needs no state, and even a long run has only a few hundred
+        // steps.
         while (step as f64) < steps {
             let share = smooth(steps - step as f64);
-            let [a, b] = [2 * step, 2 * step + 1].map(|counter| self.random.normals(counter).map(f64::from));
+            let [a, b] =
+                [2 * step, 2 * step + 1].map(|counter| self.random.normals(counter).map(f64::from));
             translation_error += Vector3::from_fn(|axis, _| self.step_m[axis] * a[axis]) * share;
             rotation_vector += Vector3::from_fn(|axis, _| self.step_rad[axis] * b[axis]) * share;
             step += 1;
         }
         let rotation = UnitQuaternion::from_scaled_axis(rotation_vector) * world_from_base.rotation;
-        Transform::from_parts((world_from_base.translation.vector + translation_error).into(), rotation)
+        Transform::from_parts(
+            (world_from_base.translation.vector + translation_error).into(),
+            rotation,
+        )
     }
 }
 
@@ -204,30 +240,48 @@ mod tests {
                 let drift = Drift::new(seed, 0.02, 0.0175);
                 let truth = BaseMotion::Lap(1.0).world_from_base(17.0);
                 let reported = drift.reported(&truth, walked_frac);
-                squares_m += (reported.translation.vector - truth.translation.vector).norm_squared();
+                squares_m +=
+                    (reported.translation.vector - truth.translation.vector).norm_squared();
                 squares_rad += reported.rotation.angle_to(&truth.rotation).powi(2);
                 assert_eq!(drift.reported(&truth, 0.0), truth);
             }
-            let [rms_m, rms_rad] = [squares_m, squares_rad].map(|squares| (squares / N_SEEDS as f64).sqrt());
-            assert!((rms_m / (0.02 * growth) - 1.0).abs() < TOLERANCE, "{rms_m} m after {walked_frac}");
-            assert!((rms_rad / (0.0175 * growth) - 1.0).abs() < TOLERANCE, "{rms_rad} rad after {walked_frac}");
+            let [rms_m, rms_rad] =
+                [squares_m, squares_rad].map(|squares| (squares / N_SEEDS as f64).sqrt());
+            assert!(
+                (rms_m / (0.02 * growth) - 1.0).abs() < TOLERANCE,
+                "{rms_m} m after {walked_frac}"
+            );
+            assert!(
+                (rms_rad / (0.0175 * growth) - 1.0).abs() < TOLERANCE,
+                "{rms_rad} rad after {walked_frac}"
+            );
         }
     }
 
     #[test]
     fn base_walks_smoothly_and_rests_at_stations() {
         const STEP_SECS: f64 = 1e-3;
-        for (motion, fastest_m_s) in [(BaseMotion::Lap(1.0), 0.9), (BaseMotion::Stations(1.0), 0.6)] {
+        for (motion, fastest_m_s) in [
+            (BaseMotion::Lap(1.0), 0.9),
+            (BaseMotion::Stations(1.0), 0.6),
+        ] {
             let mut before = motion.world_from_base(0.0);
             let mut speed_before = 0.0;
             for step in 1..60_000 {
                 let secs = f64::from(step) * STEP_SECS;
                 let pose = motion.world_from_base(secs);
-                let speed = (pose.translation.vector - before.translation.vector).norm() / STEP_SECS;
+                let speed =
+                    (pose.translation.vector - before.translation.vector).norm() / STEP_SECS;
                 assert!(speed < fastest_m_s, "{motion:?}: {speed} m/s at {secs} s");
-                assert!((speed - speed_before).abs() / STEP_SECS < 4.0, "{motion:?}: a jerk at {secs} s");
+                assert!(
+                    (speed - speed_before).abs() / STEP_SECS < 4.0,
+                    "{motion:?}: a jerk at {secs} s"
+                );
                 if motion.station_at(secs).is_some() {
-                    assert!(speed < 1e-9, "{motion:?} moves at {secs} s while at a station");
+                    assert!(
+                        speed < 1e-9,
+                        "{motion:?} moves at {secs} s while at a station"
+                    );
                 }
                 (before, speed_before) = (pose, speed);
             }

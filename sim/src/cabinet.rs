@@ -1,7 +1,8 @@
-//! The cabinet of the mobile-arm scene: a yellow switchboard of 1 x 1 m with a bar across it, and a box with a screen
-//! and a switch inside.
+//! The cabinet of the mobile-arm scene: a yellow switchboard of 1 x 1 m with a bar across it, and a
+//! box with a screen and a switch inside.
 //!
-//! The world's origin lies on the floor below the initial base position; the cabinet opens toward it.
+//! The world's origin lies on the floor below the initial base position; the cabinet opens toward
+//! it.
 
 use crate::furniture::{Furniture, upright};
 use crate::lab_texture;
@@ -38,8 +39,11 @@ fn furniture() -> Furniture {
     furniture.add_boxes(&upright([1.9, -1.5, 0.0], 35.0), 3);
     furniture.add_boxes(&upright([2.05, 1.05, 0.0], 12.0), 2);
     furniture.bench(&upright([0.4, -2.0, 0.0], 90.0));
-    for (y, z, half, ix) in [(-1.15, 1.5, [0.38, 0.5], 7), (1.05, 1.75, [0.4, 0.45], 2), (-1.95, 1.6, [0.3, 0.45], 14)]
-    {
+    for (y, z, half, ix) in [
+        (-1.15, 1.5, [0.38, 0.5], 7),
+        (1.05, 1.75, [0.4, 0.45], 2),
+        (-1.95, 1.6, [0.3, 0.45], 14),
+    ] {
         furniture.poster(&upright([ROOM_X_M[1], y, z], 180.0), half, ix);
     }
     for (x, z, half, ix) in [(0.6, 1.7, [0.5, 0.5], 5), (-1.2, 1.6, [0.4, 0.5], 8)] {
@@ -57,18 +61,44 @@ fn equip(furniture: &mut Furniture) {
     furniture.add_item(&box_pose, BOX_HALF_M, 12, 12);
     let mut screen = Mesh::default();
     let at = Point3::new(x - 0.002, y, z);
-    screen.rectangle(at, Vector3::y() * -0.125, Vector3::z() * 0.09, lab_texture::picture(9));
+    screen.rectangle(
+        at,
+        Vector3::y() * -0.125,
+        Vector3::z() * 0.09,
+        lab_texture::picture(9),
+    );
     furniture.things.append(screen, Vector3::zeros());
     let back = FRONT_X_M + DEPTH_M - 2.0 * SHEET_M;
     for breaker in 0..14 {
         let y = -0.40 + 0.058 * f64::from(breaker);
         let picture = [13, 14, 15, 10, 7][breaker as usize % 5];
-        furniture.add_item(&upright([back - 0.05, y, 1.29], 180.0), [0.045, 0.025, 0.055], picture, 12);
+        furniture.add_item(
+            &upright([back - 0.05, y, 1.29], 180.0),
+            [0.045, 0.025, 0.055],
+            picture,
+            12,
+        );
     }
-    furniture.frame(&upright([back - 0.012, 0.0, 1.29], 0.0), [0.010, 0.46, 0.018]);
-    furniture.frame(&upright([back - 0.035, 0.0, 1.16], 0.0), [0.033, 0.46, 0.02]);
-    furniture.add_item(&upright([back - 0.06, 0.28, 0.62], 180.0), [0.055, 0.13, 0.10], 8, 12);
-    furniture.add_item(&upright([back - 0.05, -0.12, 0.60], 180.0), [0.045, 0.16, 0.08], 11, 12);
+    furniture.frame(
+        &upright([back - 0.012, 0.0, 1.29], 0.0),
+        [0.010, 0.46, 0.018],
+    );
+    furniture.frame(
+        &upright([back - 0.035, 0.0, 1.16], 0.0),
+        [0.033, 0.46, 0.02],
+    );
+    furniture.add_item(
+        &upright([back - 0.06, 0.28, 0.62], 180.0),
+        [0.055, 0.13, 0.10],
+        8,
+        12,
+    );
+    furniture.add_item(
+        &upright([back - 0.05, -0.12, 0.60], 180.0),
+        [0.045, 0.16, 0.08],
+        11,
+        12,
+    );
     let [x, y, z] = SWITCH_M;
     furniture.add_item(&upright([x, y, z], 180.0), [0.03, 0.08, 0.10], 10, 10);
 }
@@ -77,34 +107,59 @@ fn equip(furniture: &mut Furniture) {
 fn shell() -> (Mesh, Mesh) {
     let (mut yellow, mut plate) = (Mesh::default(), Mesh::default());
     let middle_x = FRONT_X_M + 0.5 * DEPTH_M;
-    let mut put = |pose: Transform, half: [f64; 3]| yellow.append_at(Mesh::cuboid(half, &[WHOLE; 6]), &pose);
+    let mut put =
+        |pose: Transform, half: [f64; 3]| yellow.append_at(Mesh::cuboid(half, &[WHOLE; 6]), &pose);
     for side in [-1.0, 1.0] {
         let half = [0.5 * DEPTH_M, SHEET_M, HALF_M];
-        put(upright([middle_x, side * (HALF_M - SHEET_M), CENTER_Z_M], 0.0), half);
+        put(
+            upright([middle_x, side * (HALF_M - SHEET_M), CENTER_Z_M], 0.0),
+            half,
+        );
         let half = [0.5 * DEPTH_M, HALF_M, SHEET_M];
-        put(upright([middle_x, 0.0, CENTER_Z_M + side * (HALF_M - SHEET_M)], 0.0), half);
+        put(
+            upright([middle_x, 0.0, CENTER_Z_M + side * (HALF_M - SHEET_M)], 0.0),
+            half,
+        );
     }
     // The door hangs open on the left as viewed from the base.
     let hinge = upright([FRONT_X_M, HALF_M, CENTER_Z_M], 24.0);
-    put(hinge * upright([-0.02, HALF_M, 0.0], 0.0), [SHEET_M, HALF_M, HALF_M]);
+    put(
+        hinge * upright([-0.02, HALF_M, 0.0], 0.0),
+        [SHEET_M, HALF_M, HALF_M],
+    );
     // Feet.
     for y in [-0.42, 0.42] {
         let half = 0.5 * (CENTER_Z_M - HALF_M);
         put(upright([middle_x, y, half], 0.0), [0.14, 0.04, half]);
     }
     let back = upright([FRONT_X_M + DEPTH_M - SHEET_M, 0.0, CENTER_Z_M], 180.0);
-    plate.append_at(Mesh::cuboid([SHEET_M, HALF_M - 2.0 * SHEET_M, HALF_M - 2.0 * SHEET_M], &[WHOLE; 6]), &back);
+    plate.append_at(
+        Mesh::cuboid(
+            [SHEET_M, HALF_M - 2.0 * SHEET_M, HALF_M - 2.0 * SHEET_M],
+            &[WHOLE; 6],
+        ),
+        &back,
+    );
     (yellow, plate)
 }
 
 /// A round bar between two points.
 fn bar(from: [f64; 3], to: [f64; 3], radius_m: f64) -> Mesh {
     let (from, to) = (Vector3::from(from), Vector3::from(to));
-    let rotation = UnitQuaternion::rotation_between(&Vector3::z(), &(to - from)).unwrap_or_default();
+    let rotation =
+        UnitQuaternion::rotation_between(&Vector3::z(), &(to - from)).unwrap_or_default();
     let length_m = (to - from).norm();
-    let profile = [[0.0005, 0.0], [radius_m, 0.0], [radius_m, length_m], [0.0005, length_m]];
+    let profile = [
+        [0.0005, 0.0],
+        [radius_m, 0.0],
+        [radius_m, length_m],
+        [0.0005, length_m],
+    ];
     let mut mesh = Mesh::default();
-    mesh.append_at(Mesh::lathe(&profile, 20, WHOLE, false), &Transform::from_parts(Translation3::from(from), rotation));
+    mesh.append_at(
+        Mesh::lathe(&profile, 20, WHOLE, false),
+        &Transform::from_parts(Translation3::from(from), rotation),
+    );
     mesh
 }
 
@@ -112,7 +167,10 @@ fn bars() -> Mesh {
     let (x, z) = (FRONT_X_M - 0.035, 0.66);
     let mut mesh = bar([x, -0.49, z], [x, 0.49, z], 0.016);
     for y in [-0.47, 0.47] {
-        mesh.append(bar([x, y, z], [FRONT_X_M + 0.01, y, z], 0.012), Vector3::zeros());
+        mesh.append(
+            bar([x, y, z], [FRONT_X_M + 0.01, y, z], 0.012),
+            Vector3::zeros(),
+        );
     }
     mesh
 }
@@ -121,17 +179,30 @@ fn bars() -> Mesh {
 fn lever_and_cables() -> (Mesh, Mesh) {
     let [x, y, z] = SWITCH_M;
     let mut lever = bar([x - 0.03, y, z - 0.02], [x - 0.095, y, z + 0.045], 0.013);
-    lever.append(bar([x - 0.028, y, z - 0.055], [x - 0.036, y, z - 0.055], 0.018), Vector3::zeros());
+    lever.append(
+        bar([x - 0.028, y, z - 0.055], [x - 0.036, y, z - 0.055], 0.018),
+        Vector3::zeros(),
+    );
     let mut cables = Mesh::default();
-    for (ix, (from_y, to_y)) in [(-0.30, -0.22), (-0.18, 0.05), (0.0, 0.10), (0.14, 0.33)].into_iter().enumerate() {
+    for (ix, (from_y, to_y)) in [(-0.30, -0.22), (-0.18, 0.05), (0.0, 0.10), (0.14, 0.33)]
+        .into_iter()
+        .enumerate()
+    {
         let depth = 2.325 - 0.02 * ix as f64;
         let point_at = |step: i32| {
             let share = f64::from(step) / 8.0;
             let sag = 0.05 * (share * std::f64::consts::PI).sin();
-            [depth - 0.5 * sag, from_y + (to_y - from_y) * share + sag, 1.17 - share * 0.36 - sag]
+            [
+                depth - 0.5 * sag,
+                from_y + (to_y - from_y) * share + sag,
+                1.17 - share * 0.36 - sag,
+            ]
         };
         for step in 0..8 {
-            cables.append(bar(point_at(step), point_at(step + 1), 0.0075), Vector3::zeros());
+            cables.append(
+                bar(point_at(step), point_at(step + 1), 0.0075),
+                Vector3::zeros(),
+            );
         }
     }
     (lever, cables)
@@ -145,8 +216,18 @@ fn flat(center: [f64; 3], right: Vector3<f64>, up: Vector3<f64>, texture: [f64; 
 
 /// All objects except the robot.
 pub(crate) fn objects() -> Vec<Object> {
-    let object = |name, material, mesh| Object { name, material, mesh, world_from_mesh: Transform::identity() };
-    let Furniture { things, posters, frames, .. } = furniture();
+    let object = |name, material, mesh| Object {
+        name,
+        material,
+        mesh,
+        world_from_mesh: Transform::identity(),
+    };
+    let Furniture {
+        things,
+        posters,
+        frames,
+        ..
+    } = furniture();
     let (yellow, plate) = shell();
     let (lever, cables) = lever_and_cables();
     let [near, far] = ROOM_X_M;
@@ -155,15 +236,30 @@ pub(crate) fn objects() -> Vec<Object> {
     for side in [-1.0, 1.0] {
         let right = Vector3::x() * (half_x * side);
         let texture = [0.0, 0.0, 2.0 * half_x / ROOM_HEIGHT_M, 1.0];
-        let wall = flat([middle_x, side * ROOM_HALF_Y_M, half_z], right, Vector3::z() * half_z, texture);
+        let wall = flat(
+            [middle_x, side * ROOM_HALF_Y_M, half_z],
+            right,
+            Vector3::z() * half_z,
+            texture,
+        );
         sides.append(wall, Vector3::zeros());
     }
     let (right, up) = (Vector3::y() * -ROOM_HALF_Y_M, Vector3::z() * half_z);
     let back = flat([far, 0.0, half_z], right, up, [0.0, 0.0, 2.0, 1.2]);
     let behind = flat([near, 0.0, half_z], -right, up, [0.0, 0.0, 1.8, 1.0]);
     sides.append(behind, Vector3::zeros());
-    let floor = flat([middle_x, 0.0, 0.0], Vector3::x() * half_x, Vector3::y() * ROOM_HALF_Y_M, WHOLE);
-    let ceiling = flat([middle_x, 0.0, ROOM_HEIGHT_M], Vector3::x() * half_x, Vector3::y() * -ROOM_HALF_Y_M, WHOLE);
+    let floor = flat(
+        [middle_x, 0.0, 0.0],
+        Vector3::x() * half_x,
+        Vector3::y() * ROOM_HALF_Y_M,
+        WHOLE,
+    );
+    let ceiling = flat(
+        [middle_x, 0.0, ROOM_HEIGHT_M],
+        Vector3::x() * half_x,
+        Vector3::y() * -ROOM_HALF_Y_M,
+        WHOLE,
+    );
     vec![
         object("things", "items", things),
         object("posters", "posters", posters),
@@ -195,7 +291,11 @@ pub(crate) fn textures() -> Vec<(&'static str, Texture)> {
     let [near, far] = ROOM_X_M;
     let mut tiles = lab_texture::floor_tiles([far - near, 2.0 * ROOM_HALF_Y_M], 1.1);
     tiles.shade(WHOLE, 100, |u, v, name| {
-        let point = Point3::new(near + (far - near) * u, (1.0 - 2.0 * v) * ROOM_HALF_Y_M, 0.0);
+        let point = Point3::new(
+            near + (far - near) * u,
+            (1.0 - 2.0 * v) * ROOM_HALF_Y_M,
+            0.0,
+        );
         occluders.light_frac(&point, &Vector3::z(), name)
     });
     let mut plate = lab_texture::mounting_plate();

@@ -20,14 +20,20 @@ pub(crate) struct CabinetTour {
 /// Seconds at the second station before the camera enters, and duration of one trip in and out.
 const OUTSIDE_SECS: f64 = 9.0;
 const IN_AND_OUT_SECS: f64 = 22.0;
-/// The lamps change while the camera moves between these depths behind the opening, meters; negative is outside.
+/// The lamps change while the camera moves between these depths behind the opening, meters;
+/// negative is outside.
 const LIGHT_TRANSITION_M: [f64; 2] = [-0.20, 0.02];
 
 impl CabinetTour {
     pub(crate) fn new(motion: BaseMotion, speed: f64) -> Self {
         let walk_interval_secs = motion.walk_secs();
         let world_from_station = walk_interval_secs.map(|secs| motion.world_from_base(secs));
-        Self { motion, world_from_station, walk_secs: walk_interval_secs, speed }
+        Self {
+            motion,
+            world_from_station,
+            walk_secs: walk_interval_secs,
+            speed,
+        }
     }
 
     /// Target pose of the camera in the arm's base frame.
@@ -36,8 +42,8 @@ impl CabinetTour {
         match self.motion.station_at(secs) {
             Some((station, at)) => self.at_station(station, at),
             None => {
-                // While the base walks, the camera moves from its last pose at the first station to its first pose at
-                // the second.
+                // While the base walks, the camera moves from its last pose at the first station to
+                // its first pose at the second.
                 let share = smooth((secs - departure_secs) / (arrival_secs - departure_secs));
                 transform::interpolate(
                     &self.at_station(0, departure_secs * self.speed),
@@ -50,8 +56,8 @@ impl CabinetTour {
 
     fn at_station(&self, station: usize, at: f64) -> Transform {
         let (eye, look_at, roll_rad) = if station == 0 { far(at) } else { near(at) };
-        let orientation =
-            looking_along(&(look_at - eye).normalize()) * UnitQuaternion::from_axis_angle(&Vector3::z_axis(), roll_rad);
+        let orientation = looking_along(&(look_at - eye).normalize())
+            * UnitQuaternion::from_axis_angle(&Vector3::z_axis(), roll_rad);
         let world_from_camera = Transform::from_parts(Translation3::from(eye), orientation);
         (self.world_from_station[station] * base_from_arm()).inverse() * world_from_camera
     }
@@ -72,7 +78,8 @@ fn far(at: f64) -> (Vector3<f64>, Vector3<f64>, f64) {
     (eye, look_at, oscillate([0.0, 0.15, 8.3, 0.6], at))
 }
 
-/// Eye, look-at point and roll at the second station: before the opening, then repeatedly in and out.
+/// Eye, look-at point and roll at the second station: before the opening, then repeatedly in and
+/// out.
 fn near(at: f64) -> (Vector3<f64>, Vector3<f64>, f64) {
     let cycle = ((at - OUTSIDE_SECS).max(0.0) / IN_AND_OUT_SECS * std::f64::consts::TAU).cos();
     let inside = 0.5 - 0.5 * cycle;
@@ -96,7 +103,11 @@ fn near(at: f64) -> (Vector3<f64>, Vector3<f64>, f64) {
             oscillate([0.0, 0.26, 7.1, 0.4], at),
             CENTER_Z_M + oscillate([0.0, 0.24, 5.7, 0.1], at),
         ),
-        Vector3::new(x + 0.05, y + oscillate([-0.10, 0.20, 6.7, 0.0], at), z + oscillate([0.0, 0.12, 7.9, 0.2], at)),
+        Vector3::new(
+            x + 0.05,
+            y + oscillate([-0.10, 0.20, 6.7, 0.0], at),
+            z + oscillate([0.0, 0.12, 7.9, 0.2], at),
+        ),
     );
     (eye, look_at, oscillate([0.0, 0.15, 8.3, 0.1], at))
 }
@@ -124,15 +135,19 @@ mod tests {
         let motion = BaseMotion::of(Scene::MobileArm, 1.0);
         let tour = CabinetTour::new(motion, 1.0);
         let flange_from_camera = CameraConfig::mobile_wrist("wrist").parent_from_camera;
-        let mut follower =
-            Follower::new(Tour::Cabinet(tour), flange_from_camera).expect("the arm can reach the first pose");
-        let (mut secs, mut off_tour_secs, mut worst, mut max_depth_m) = (0.0, 0.0, [0.0_f64; 3], f64::MIN);
+        let mut follower = Follower::new(Tour::Cabinet(tour), flange_from_camera)
+            .expect("the arm can reach the first pose");
+        let (mut secs, mut off_tour_secs, mut worst, mut max_depth_m) =
+            (0.0, 0.0, [0.0_f64; 3], f64::MIN);
         while secs < 60.0 {
             secs += STEP_SECS;
             follower.advance(secs, STEP_SECS);
             let actual = panda::base_from_flange(follower.position_rad()) * flange_from_camera;
             let pose_error = tour.arm_from_camera(secs).inverse() * actual;
-            let off = [pose_error.translation.vector.norm(), pose_error.rotation.angle()];
+            let off = [
+                pose_error.translation.vector.norm(),
+                pose_error.rotation.angle(),
+            ];
             if off[0] > MAX_POSITION_ERROR_M || off[1] > MAX_ROTATION_ERROR_RAD {
                 off_tour_secs += STEP_SECS;
             }
@@ -142,7 +157,10 @@ mod tests {
             let world_from_camera = motion.world_from_base(secs) * base_from_arm() * actual;
             max_depth_m = max_depth_m.max(world_from_camera.translation.vector.x - FRONT_X_M);
         }
-        assert!(off_tour_secs < 3.0, "{off_tour_secs} s of 60 s off the tour, worst (m, rad, s) {worst:?}");
+        assert!(
+            off_tour_secs < 3.0,
+            "{off_tour_secs} s of 60 s off the tour, worst (m, rad, s) {worst:?}"
+        );
         assert!(max_depth_m > -0.06, "{max_depth_m} m");
     }
 }

@@ -1,7 +1,9 @@
-//! An arm that follows commands instead of a tour: a rig that advances only when its devices are read.
+//! An arm that follows commands instead of a tour: a rig that advances only when its devices are
+//! read.
 //!
-//! Cameras and the arm share one simulation. Reading the arm advances it by a millisecond; waiting for an image advances it
-//! until the image arrives. Timeouts count simulated time, so that results do not depend on the speed of the computer.
+//! Cameras and the arm share one simulation. Reading the arm advances it by a millisecond; waiting
+//! for an image advances it until the image arrives. Timeouts count simulated time, so that results
+//! do not depend on the speed of the computer.
 
 use crate::Error;
 use crate::arm::STEP_NANOS;
@@ -32,25 +34,48 @@ pub struct CommandedRig {
 }
 
 impl CommandedRig {
-    pub(crate) fn new(mut engine: Engine, info: RigInfo, limits: &[MotionLimits]) -> Result<Self, Error> {
-        let commands =
-            Commands::new(limits, &engine.reported_joints()?, Duration::from_nanos(STEP_NANOS.unsigned_abs()))?;
+    pub(crate) fn new(
+        mut engine: Engine,
+        info: RigInfo,
+        limits: &[MotionLimits],
+    ) -> Result<Self, Error> {
+        let commands = Commands::new(
+            limits,
+            &engine.reported_joints()?,
+            Duration::from_nanos(STEP_NANOS.unsigned_abs()),
+        )?;
         engine.follow_commands(commands.clone())?;
         let simulation = Simulation {
             engine,
-            camera_names: info.cameras.iter().map(|camera| camera.name.clone()).collect(),
+            camera_names: info
+                .cameras
+                .iter()
+                .map(|camera| camera.name.clone())
+                .collect(),
             images: vec![VecDeque::new(); info.cameras.len()],
             readings: VecDeque::new(),
             nanos: 0,
         };
         let simulation = Arc::new(Mutex::new(simulation));
-        let arm = CommandedArm { simulation: Arc::clone(&simulation), commands, joint_names: info.joint_names.clone() };
+        let arm = CommandedArm {
+            simulation: Arc::clone(&simulation),
+            commands,
+            joint_names: info.joint_names.clone(),
+        };
         let cameras = info.cameras.iter().enumerate().map(|(camera_ix, camera)| {
             let (name, intrinsics) = (camera.name.clone(), camera.intrinsics.clone());
-            Box::new(SharedCamera { simulation: Arc::clone(&simulation), camera_ix, name, intrinsics })
-                as Box<dyn Camera>
+            Box::new(SharedCamera {
+                simulation: Arc::clone(&simulation),
+                camera_ix,
+                name,
+                intrinsics,
+            }) as Box<dyn Camera>
         });
-        Ok(Self { arm: Box::new(arm), cameras: cameras.collect(), info })
+        Ok(Self {
+            arm: Box::new(arm),
+            cameras: cameras.collect(),
+            info,
+        })
     }
 }
 
@@ -71,7 +96,9 @@ impl Simulation {
         timeout: Duration,
         mut take: impl FnMut(&mut Self) -> Option<T>,
     ) -> Result<Option<T>, drivers::Error> {
-        let until = self.nanos.saturating_add(i64::try_from(timeout.as_nanos()).unwrap_or(i64::MAX));
+        let until = self
+            .nanos
+            .saturating_add(i64::try_from(timeout.as_nanos()).unwrap_or(i64::MAX));
         loop {
             if let Some(taken) = take(self) {
                 return Ok(Some(taken));
@@ -79,7 +106,9 @@ impl Simulation {
             if self.nanos >= until {
                 return Ok(None);
             }
-            let failed = |error: Error| drivers::Error::Simulation { reason: error.to_string() };
+            let failed = |error: Error| drivers::Error::Simulation {
+                reason: error.to_string(),
+            };
             let Some((nanos, sample)) = self.engine.next().map_err(failed)? else {
                 let reason = "the simulation reached its end".to_owned();
                 return Err(drivers::Error::Simulation { reason });
@@ -87,7 +116,11 @@ impl Simulation {
             self.nanos = self.nanos.max(nanos);
             match sample {
                 Sample::Image(image) => {
-                    if let Some(ix) = self.camera_names.iter().position(|name| **name == *image.camera) {
+                    if let Some(ix) = self
+                        .camera_names
+                        .iter()
+                        .position(|name| **name == *image.camera)
+                    {
                         push_bounded(&mut self.images[ix], MAX_IMAGES, image);
                     }
                 }
@@ -117,14 +150,19 @@ impl Arm for CommandedArm {
     }
 
     fn read(&mut self, timeout: Duration) -> Result<JointState, drivers::Error> {
-        let reading = self.simulation.lock().wait(timeout, |simulation| simulation.readings.pop_front())?;
+        let reading = self
+            .simulation
+            .lock()
+            .wait(timeout, |simulation| simulation.readings.pop_front())?;
         reading.ok_or(drivers::Error::NoJoints { waited: timeout })
     }
 }
 
 impl MovableArm for CommandedArm {
     fn command(&mut self, target: &JointTarget) -> Result<JointTarget, drivers::Error> {
-        self.commands.set_target(target).map_err(|reason| drivers::Error::Simulation { reason })
+        self.commands
+            .set_target(target)
+            .map_err(|reason| drivers::Error::Simulation { reason })
     }
 
     fn motion(&self) -> Motion {
@@ -137,7 +175,9 @@ impl MovableArm for CommandedArm {
     }
 
     fn recover(&mut self) -> Result<(), drivers::Error> {
-        self.commands.recover().map_err(|reason| drivers::Error::Simulation { reason })
+        self.commands
+            .recover()
+            .map_err(|reason| drivers::Error::Simulation { reason })
     }
 }
 
@@ -158,8 +198,13 @@ impl Camera for SharedCamera {
     }
 
     fn next_image(&mut self, timeout: Duration) -> Result<Image, drivers::Error> {
-        let image = self.simulation.lock().wait(timeout, |simulation| simulation.images[self.camera_ix].pop_front())?;
-        image.ok_or_else(|| drivers::Error::NoImage { camera: self.name.clone(), waited: timeout })
+        let image = self.simulation.lock().wait(timeout, |simulation| {
+            simulation.images[self.camera_ix].pop_front()
+        })?;
+        image.ok_or_else(|| drivers::Error::NoImage {
+            camera: self.name.clone(),
+            waited: timeout,
+        })
     }
 
     fn waits_for_caller(&self) -> bool {
@@ -185,8 +230,18 @@ mod tests {
     }
 
     fn rig(reading_order: &[usize], joint_offsets: Vec<f64>) -> CommandedRig {
-        let camera = CameraConfig { rate_hz: 2.0, depth: None, ..CameraConfig::wrist("wrist") };
-        let camera = CameraConfig { sensor: SensorConfig { latency_millis: 5.0, ..camera.sensor }, ..camera };
+        let camera = CameraConfig {
+            rate_hz: 2.0,
+            depth: None,
+            ..CameraConfig::wrist("wrist")
+        };
+        let camera = CameraConfig {
+            sensor: SensorConfig {
+                latency_millis: 5.0,
+                ..camera.sensor
+            },
+            ..camera
+        };
         let names = Config::default().joint_names;
         let config = Config {
             ideal: true,
@@ -195,39 +250,63 @@ mod tests {
             joint_offsets,
             ..Config::default()
         };
-        crate::open(&config).expect("a scene").into_commanded(&limits(reading_order)).expect("the arm is in its range")
+        crate::open(&config)
+            .expect("a scene")
+            .into_commanded(&limits(reading_order))
+            .expect("the arm is in its range")
     }
 
     #[test]
     fn arm_reaches_targets_within_its_speed_and_images_show_the_motion() {
         let offsets = vec![0.02, 0.0, -0.01, 0.0, 0.0, 0.03, 0.0];
-        let CommandedRig { mut arm, mut cameras, .. } = rig(&[6, 0, 1, 2, 3, 4, 5], offsets);
+        let CommandedRig {
+            mut arm,
+            mut cameras,
+            ..
+        } = rig(&[6, 0, 1, 2, 3, 4, 5], offsets);
         let start = arm.read(Duration::from_secs(1)).expect("a reading");
         assert_eq!(arm.joint_names()[0], "panda_joint7");
-        let before = cameras[0].next_image(Duration::from_secs(1)).expect("an image");
+        let before = cameras[0]
+            .next_image(Duration::from_secs(1))
+            .expect("an image");
         let mut target = start.position.clone();
         target[0] += 0.3;
         target[3] -= 0.1;
-        let accepted = arm.command(&JointTarget { position: target.clone() }).expect("a valid target");
+        let accepted = arm
+            .command(&JointTarget {
+                position: target.clone(),
+            })
+            .expect("a valid target");
         assert_eq!(accepted.position, target);
         assert_eq!(arm.motion(), Motion::Moving);
         let mut fastest = 0.0f64;
         let mut last = start;
         while arm.motion() == Motion::Moving {
             last = arm.read(Duration::from_secs(1)).expect("a reading");
-            fastest = last.velocity.iter().fold(fastest, |fastest, speed| fastest.max(speed.abs()));
+            fastest = last
+                .velocity
+                .iter()
+                .fold(fastest, |fastest, speed| fastest.max(speed.abs()));
             assert!(last.stamp.0 < 5_000_000_000, "it does not arrive");
         }
-        assert!(fastest > 0.2 && fastest < 1.1 * SPEED_RAD_S, "{fastest} rad/s");
+        assert!(
+            fastest > 0.2 && fastest < 1.1 * SPEED_RAD_S,
+            "{fastest} rad/s"
+        );
         for _ in 0..500 {
             last = arm.read(Duration::from_secs(1)).expect("a reading");
         }
         for (ix, (target, actual)) in target.iter().zip(&last.position).enumerate() {
-            assert!((target - actual).abs() < 1e-3, "joint {ix}: {actual}, commanded {target}");
+            assert!(
+                (target - actual).abs() < 1e-3,
+                "joint {ix}: {actual}, commanded {target}"
+            );
         }
         let mut after = before.clone();
         while after.stamp < last.stamp {
-            after = cameras[0].next_image(Duration::from_secs(1)).expect("an image");
+            after = cameras[0]
+                .next_image(Duration::from_secs(1))
+                .expect("an image");
         }
         assert!(before.data != after.data && after.stamp > before.stamp);
     }
@@ -238,7 +317,10 @@ mod tests {
         let start = arm.read(Duration::from_secs(1)).expect("a reading");
         let mut target = start.position.clone();
         target[1] += 0.5;
-        arm.command(&JointTarget { position: target.clone() }).expect("a valid target");
+        arm.command(&JointTarget {
+            position: target.clone(),
+        })
+        .expect("a valid target");
         for _ in 0..700 {
             arm.read(Duration::from_secs(1)).expect("a reading");
         }
@@ -247,8 +329,16 @@ mod tests {
             arm.read(Duration::from_secs(1)).expect("a reading");
         }
         let rest = arm.read(Duration::from_secs(1)).expect("a reading");
-        assert!(rest.position[1] > start.position[1] + 0.01 && rest.position[1] < target[1] - 0.05, "{rest:?}");
-        assert!(arm.command(&JointTarget { position: vec![f64::NAN; 7] }).is_err());
+        assert!(
+            rest.position[1] > start.position[1] + 0.01 && rest.position[1] < target[1] - 0.05,
+            "{rest:?}"
+        );
+        assert!(
+            arm.command(&JointTarget {
+                position: vec![f64::NAN; 7]
+            })
+            .is_err()
+        );
         assert_eq!(arm.motion(), Motion::Holding);
     }
 }

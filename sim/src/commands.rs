@@ -1,4 +1,5 @@
-//! Commanded joint motion, shared by the controller of the arm and its client. Positions are those that the arm reports.
+//! Commanded joint motion, shared by the controller of the arm and its client. Positions are those
+//! that the arm reports.
 
 use crate::Error;
 use drivers::motion::{JointTarget, Motion, MotionLimits, Setpoint, TrajectoryGenerator};
@@ -19,11 +20,19 @@ struct CommandedMotion {
 
 impl Commands {
     /// An arm at rest at `position`, with one setpoint per `period`.
-    pub(crate) fn new(limits: &[MotionLimits], position: &[f64], period: Duration) -> Result<Self, Error> {
+    pub(crate) fn new(
+        limits: &[MotionLimits],
+        position: &[f64],
+        period: Duration,
+    ) -> Result<Self, Error> {
         let failed = |reason: String| Error::Motion { reason };
         let mut generator = TrajectoryGenerator::new(limits, position, period).map_err(failed)?;
         let last = generator.step().map_err(failed)?;
-        Ok(Self(Arc::new(Mutex::new(CommandedMotion { generator, stopped: None, last }))))
+        Ok(Self(Arc::new(Mutex::new(CommandedMotion {
+            generator,
+            stopped: None,
+            last,
+        }))))
     }
 
     /// The setpoint of the next period. Without a trajectory, the arm stays where it is.
@@ -45,7 +54,9 @@ impl Commands {
     pub(crate) fn set_target(&self, target: &JointTarget) -> Result<JointTarget, String> {
         let mut motion = self.0.lock();
         match &motion.stopped {
-            Some(reason) => Err(format!("the arm accepts no target before it is recovered: {reason}")),
+            Some(reason) => Err(format!(
+                "the arm accepts no target before it is recovered: {reason}"
+            )),
             None => motion.generator.set_target(target),
         }
     }
@@ -53,7 +64,9 @@ impl Commands {
     pub(crate) fn motion(&self) -> Motion {
         let motion = self.0.lock();
         match &motion.stopped {
-            Some(reason) => Motion::Stopped { reason: reason.clone() },
+            Some(reason) => Motion::Stopped {
+                reason: reason.clone(),
+            },
             None if motion.generator.is_at_rest() => Motion::Holding,
             None => Motion::Moving,
         }

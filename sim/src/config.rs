@@ -12,17 +12,18 @@ pub struct Config {
     pub scene: Scene,
     /// Seed of all random numbers. In lockstep, the same seed gives identical bits.
     pub seed: u64,
-    /// Disables all sensor imperfections: noise, blur, rolling-shutter shear, holes, latency, dropped images. Lens
-    /// and range limits stay.
+    /// Disables all sensor imperfections: noise, blur, rolling-shutter shear, holes, latency,
+    /// dropped images. Lens and range limits stay.
     pub ideal: bool,
     /// Whether each color image is followed by its [`drivers::TruthImage`].
     pub truth: bool,
     /// Whether the ground truth of cameras with depth includes noise-free depth.
     pub truth_depth: bool,
-    /// Factor on the speed of the scanning motion, 0.01 to 2; at 1 the camera moves at 0.1 to 0.25 m/s.
+    /// Factor on the speed of the scanning motion, 0.01 to 2; at 1 the camera moves at 0.1 to 0.25
+    /// m/s.
     pub speed: f64,
-    /// Whether the camera only rotates about the vertical axis. Such a scan does not determine the whole hand-eye
-    /// transform.
+    /// Whether the camera only rotates about the vertical axis. Such a scan does not determine the
+    /// whole hand-eye transform.
     pub azimuth_only: bool,
     /// The rig stops after this simulated time, seconds.
     pub duration_secs: Option<f64>,
@@ -32,8 +33,8 @@ pub struct Config {
     pub joint_names: Vec<String>,
     /// Joint names in the order of the joint readings.
     pub reading_order: Vec<String>,
-    /// Offsets that must be added to the joint readings to get the true positions, in the order of the readings,
-    /// radians; empty if the readings are right.
+    /// Offsets that must be added to the joint readings to get the true positions, in the order of
+    /// the readings, radians; empty if the readings are right.
     pub joint_offsets: Vec<f64>,
     /// The cameras; names are unique.
     pub cameras: Vec<CameraConfig>,
@@ -41,7 +42,8 @@ pub struct Config {
     pub scanners: Vec<ScannerConfig>,
     /// Reporting of a moving base.
     pub base: BaseConfig,
-    /// Brightness of all lamps while the arm's camera is inside the cabinet, relative to outside; 1 has no effect.
+    /// Brightness of all lamps while the arm's camera is inside the cabinet, relative to outside; 1
+    /// has no effect.
     pub light_inside_frac: f64,
     /// Printed calibration targets in the scene; names are unique.
     pub targets: Vec<TargetConfig>,
@@ -72,14 +74,19 @@ pub enum TargetParent {
 impl Config {
     /// Whether the arm carries a target, so that images of all cameras depend on its joints.
     pub(crate) fn has_carried_target(&self) -> bool {
-        self.targets.iter().any(|target| target.parent == TargetParent::Flange)
+        self.targets
+            .iter()
+            .any(|target| target.parent == TargetParent::Flange)
     }
 }
 
 impl TargetConfig {
     /// The parsed specification.
     pub(crate) fn target(&self) -> Result<TargetSpec, Error> {
-        self.spec.parse().map_err(|source| Error::Target { target: self.name.clone(), source })
+        self.spec.parse().map_err(|source| Error::Target {
+            target: self.name.clone(),
+            source,
+        })
     }
 }
 
@@ -88,8 +95,8 @@ impl TargetConfig {
 pub struct BaseConfig {
     /// Poses per second.
     pub rate_hz: f64,
-    /// Root mean square error of the reported position at the end of the walk (one lap, or the last station), meters.
-    /// The error grows with the square root of the distance.
+    /// Root mean square error of the reported position at the end of the walk (one lap, or the last
+    /// station), meters. The error grows with the square root of the distance.
     pub drift_m: f64,
     /// Root mean square error of the reported orientation at the end of the walk, radians.
     pub drift_rad: f64,
@@ -97,7 +104,11 @@ pub struct BaseConfig {
 
 impl Default for BaseConfig {
     fn default() -> Self {
-        Self { rate_hz: 100.0, drift_m: 0.02, drift_rad: 0.0175 }
+        Self {
+            rate_hz: 100.0,
+            drift_m: 0.02,
+            drift_rad: 0.0175,
+        }
     }
 }
 
@@ -151,7 +162,8 @@ pub enum Scene {
     StaticArm,
     /// A quadruped walks around a wooden pedestal with a glass bowl in a laboratory of 15 x 10 m.
     MobileBase,
-    /// A Panda on a quadruped in front of a switchboard cabinet: first 2 m away, then close to and inside it.
+    /// A Panda on a quadruped in front of a switchboard cabinet: first 2 m away, then close to and
+    /// inside it.
     MobileArm,
 }
 
@@ -230,7 +242,8 @@ pub struct StampConfig {
 pub struct SensorConfig {
     /// Standard deviation of the noise at mid gray (128), on a scale of 0 to 255.
     pub noise_sigma: f64,
-    /// Fraction of the noise variance at mid gray that is shot noise (grows with brightness); the rest is read noise.
+    /// Fraction of the noise variance at mid gray that is shot noise (grows with brightness); the
+    /// rest is read noise.
     pub shot_frac: f64,
     /// Exposure time, microseconds. Causes blur only if `blur_samples` is above 1.
     pub exposure_micros: f64,
@@ -261,7 +274,8 @@ impl Default for SensorConfig {
     }
 }
 
-/// Imperfections and limits of depth images, which have the stamp of the color image and a global shutter.
+/// Imperfections and limits of depth images, which have the stamp of the color image and a global
+/// shutter.
 #[derive(Clone, Debug, PartialEq)]
 pub struct DepthConfig {
     /// Factor that must be applied to the readings to get the true depth.
@@ -304,7 +318,8 @@ impl Default for DepthConfig {
 }
 
 impl CameraConfig {
-    /// A wrist RGB-D camera like a `RealSense` D435i: 640x480 at 15 Hz, tilted, on a bracket next to the flange.
+    /// A wrist RGB-D camera like a `RealSense` D435i: 640x480 at 15 Hz, tilted, on a bracket next
+    /// to the flange.
     pub fn wrist(name: &str) -> Self {
         Self {
             name: name.to_owned(),
@@ -324,8 +339,8 @@ impl CameraConfig {
         }
     }
 
-    /// A wrist RGB-D camera like a `RealSense` L515, for upright objects in front of the arm: 1280x720 color at 4 Hz,
-    /// 640x480 depth with its own lens and pose, tilted by 80 degrees.
+    /// A wrist RGB-D camera like a `RealSense` L515, for upright objects in front of the arm:
+    /// 1280x720 color at 4 Hz, 640x480 depth with its own lens and pose, tilted by 80 degrees.
     pub fn mobile_wrist(name: &str) -> Self {
         let pinhole = |size_px, focal_px, principal_px| Intrinsics {
             size_px,
@@ -354,7 +369,8 @@ impl CameraConfig {
     }
 }
 
-/// The bracket of the wrist camera, as `flange_from_camera`: next to the flange, tilted to look past it.
+/// The bracket of the wrist camera, as `flange_from_camera`: next to the flange, tilted to look
+/// past it.
 ///
 /// With the tilt, the arm can view the scene from low elevations without reaching its joint limits.
 fn wrist_extrinsics(tilt_degrees: f64) -> Transform {
@@ -391,8 +407,14 @@ impl Config {
     /// Index of the joint, counted from the base, for each value of a reading.
     pub(crate) fn joint_ixs(&self) -> Result<Vec<usize>, Error> {
         let find = |name: &String| {
-            let unknown = || Error::UnknownJoint { joint: name.clone(), known: self.joint_names.clone() };
-            self.joint_names.iter().position(|known| known == name).ok_or_else(unknown)
+            let unknown = || Error::UnknownJoint {
+                joint: name.clone(),
+                known: self.joint_names.clone(),
+            };
+            self.joint_names
+                .iter()
+                .position(|known| known == name)
+                .ok_or_else(unknown)
         };
         self.reading_order.iter().map(find).collect()
     }
@@ -405,30 +427,50 @@ impl Config {
         }
         let expected = if self.scene.has_arm() { N_JOINTS } else { 0 };
         if self.joint_names.len() != expected {
-            return Err(Error::NJoints { got: self.joint_names.len(), expected });
+            return Err(Error::NJoints {
+                got: self.joint_names.len(),
+                expected,
+            });
         }
         self.joint_ixs()?;
         if !self.joint_offsets.is_empty() && self.joint_offsets.len() != expected {
-            return Err(Error::NJoints { got: self.joint_offsets.len(), expected });
+            return Err(Error::NJoints {
+                got: self.joint_offsets.len(),
+                expected,
+            });
         }
-        self.joint_offsets.iter().try_for_each(|offset| check("arm", "joint_offsets", *offset, -1.0, 1.0))?;
+        self.joint_offsets
+            .iter()
+            .try_for_each(|offset| check("arm", "joint_offsets", *offset, -1.0, 1.0))?;
         check("sim", "light_inside_frac", self.light_inside_frac, 0.0, 4.0)?;
         self.base.check()?;
         if self.cameras.is_empty() {
             return Err(Error::NoCamera);
         }
         for (ix, camera) in self.cameras.iter().enumerate() {
-            if self.cameras[..ix].iter().any(|other| other.name == camera.name) {
-                return Err(Error::DuplicateName { camera: camera.name.clone() });
+            if self.cameras[..ix]
+                .iter()
+                .any(|other| other.name == camera.name)
+            {
+                return Err(Error::DuplicateName {
+                    camera: camera.name.clone(),
+                });
             }
             camera.check()?;
             if camera.parent == Parent::Flange && !self.scene.has_arm() {
-                return Err(Error::NoFlange { camera: camera.name.clone() });
+                return Err(Error::NoFlange {
+                    camera: camera.name.clone(),
+                });
             }
         }
         for (ix, scanner) in self.scanners.iter().enumerate() {
-            if self.scanners[..ix].iter().any(|other| other.name == scanner.name) {
-                return Err(Error::DuplicateName { camera: scanner.name.clone() });
+            if self.scanners[..ix]
+                .iter()
+                .any(|other| other.name == scanner.name)
+            {
+                return Err(Error::DuplicateName {
+                    camera: scanner.name.clone(),
+                });
             }
             scanner.check()?;
         }
@@ -436,7 +478,9 @@ impl Config {
             target.target()?;
             check_pose(&target.name, "parent_from_board", &target.parent_from_board)?;
             if target.parent == TargetParent::Flange && !self.scene.has_arm() {
-                return Err(Error::TargetWithoutFlange { target: target.name.clone() });
+                return Err(Error::TargetWithoutFlange {
+                    target: target.name.clone(),
+                });
             }
         }
         Ok(())
@@ -458,7 +502,13 @@ impl ScannerConfig {
         check(of, "n_rings", self.n_rings.into(), 1.0, 256.0)?;
         check(of, "n_columns", self.n_columns.into(), 4.0, 4096.0)?;
         check(of, "lowest elevation", self.elevation_rad[0], -1.57, 1.57)?;
-        check(of, "highest elevation", self.elevation_rad[1], self.elevation_rad[0], 1.57)?;
+        check(
+            of,
+            "highest elevation",
+            self.elevation_rad[1],
+            self.elevation_rad[0],
+            1.57,
+        )?;
         check(of, "min_m", self.min_m, 0.0, 100.0)?;
         check(of, "max_m", self.max_m, self.min_m, 1000.0)?;
         check(of, "noise_sigma_m", self.noise_sigma_m, 0.0, 1.0)?;
@@ -475,34 +525,93 @@ impl CameraConfig {
         check_lens(&self.name, &self.intrinsics)?;
         check(&self.name, "rate_hz", self.rate_hz, 0.01, 200.0)?;
         check_pose(&self.name, "parent_from_camera", &self.parent_from_camera)?;
-        check(&self.name, "stamp_to_mid_exposure", self.stamps.to_mid_exposure_secs, -1.0, 1.0)?;
-        check(&self.name, "clock_drift", self.stamps.drift_frac, -0.01, 0.01)?;
+        check(
+            &self.name,
+            "stamp_to_mid_exposure",
+            self.stamps.to_mid_exposure_secs,
+            -1.0,
+            1.0,
+        )?;
+        check(
+            &self.name,
+            "clock_drift",
+            self.stamps.drift_frac,
+            -0.01,
+            0.01,
+        )?;
         let sensor = &self.sensor;
         check(&self.name, "noise_sigma", sensor.noise_sigma, 0.0, 100.0)?;
         check(&self.name, "shot_frac", sensor.shot_frac, 0.0, 1.0)?;
-        check(&self.name, "exposure_micros", sensor.exposure_micros, 0.0, 1e6 / self.rate_hz)?;
-        check(&self.name, "blur_samples", f64::from(sensor.blur_samples), 1.0, 64.0)?;
-        check(&self.name, "readout_micros", sensor.readout_micros, 0.0, 1e6 / self.rate_hz)?;
-        check(&self.name, "latency_millis", sensor.latency_millis, 0.0, 10_000.0)?;
+        check(
+            &self.name,
+            "exposure_micros",
+            sensor.exposure_micros,
+            0.0,
+            1e6 / self.rate_hz,
+        )?;
+        check(
+            &self.name,
+            "blur_samples",
+            f64::from(sensor.blur_samples),
+            1.0,
+            64.0,
+        )?;
+        check(
+            &self.name,
+            "readout_micros",
+            sensor.readout_micros,
+            0.0,
+            1e6 / self.rate_hz,
+        )?;
+        check(
+            &self.name,
+            "latency_millis",
+            sensor.latency_millis,
+            0.0,
+            10_000.0,
+        )?;
         check(&self.name, "dropped_frac", sensor.dropped_frac, 0.0, 0.9)?;
-        check(&self.name, "supersample", f64::from(sensor.supersample), 1.0, 4.0)?;
+        check(
+            &self.name,
+            "supersample",
+            f64::from(sensor.supersample),
+            1.0,
+            4.0,
+        )?;
         if let Some(depth) = &self.depth {
             if let Some(sensor) = &depth.sensor {
                 check_lens(&self.name, &sensor.intrinsics)?;
             }
             check(&self.name, "depth factor", depth.factor, 0.5, 2.0)?;
-            check(&self.name, "depth noise_sigma_m", depth.noise_sigma_m, 0.0, 1.0)?;
+            check(
+                &self.name,
+                "depth noise_sigma_m",
+                depth.noise_sigma_m,
+                0.0,
+                1.0,
+            )?;
             check(&self.name, "hole_frac", depth.hole_frac, 0.0, 0.9)?;
             check(&self.name, "depth min_m", depth.min_m, 0.0, 10.0)?;
             check(&self.name, "depth max_m", depth.max_m, depth.min_m, 100.0)?;
-            check(&self.name, "meters_per_count", depth.meters_per_count, 1e-6, 0.1)?;
+            check(
+                &self.name,
+                "meters_per_count",
+                depth.meters_per_count,
+                1e-6,
+                0.1,
+            )?;
         }
         Ok(())
     }
 }
 
 fn check_lens(of: &str, lens: &Intrinsics) -> Result<(), Error> {
-    let Intrinsics { size_px, focal_px, principal_px, .. } = lens;
+    let Intrinsics {
+        size_px,
+        focal_px,
+        principal_px,
+        ..
+    } = lens;
     for axis in 0..2 {
         let size = f64::from(size_px[axis]);
         check(of, "size_px", size, 16.0, 4096.0)?;
@@ -513,7 +622,9 @@ fn check_lens(of: &str, lens: &Intrinsics) -> Result<(), Error> {
 }
 
 fn check_pose(of: &str, key: &'static str, pose: &Transform) -> Result<(), Error> {
-    transform::to_xyz_xyzw(pose).into_iter().try_for_each(|number| check(of, key, number, -100.0, 100.0))
+    transform::to_xyz_xyzw(pose)
+        .into_iter()
+        .try_for_each(|number| check(of, key, number, -100.0, 100.0))
 }
 
 /// Rejects numbers outside `lower..=upper`, and NaN.
@@ -521,7 +632,13 @@ fn check(of: &str, key: &'static str, got: f64, lower: f64, upper: f64) -> Resul
     if got >= lower && got <= upper {
         return Ok(());
     }
-    Err(Error::OutOfRange { of: of.to_owned(), key, got, lower, upper })
+    Err(Error::OutOfRange {
+        of: of.to_owned(),
+        key,
+        got,
+        lower,
+        upper,
+    })
 }
 
 #[cfg(test)]
@@ -534,15 +651,26 @@ mod tests {
         assert!(config.check().is_ok());
         config.cameras[0].sensor.readout_micros = f64::NAN;
         let message = config.check().expect_err("NaN").to_string();
-        assert!(message.contains("readout_micros") && message.contains("wrist"), "{message}");
+        assert!(
+            message.contains("readout_micros") && message.contains("wrist"),
+            "{message}"
+        );
         config = Config::default();
         config.cameras.push(CameraConfig::wrist("wrist"));
         assert!(matches!(config.check(), Err(Error::DuplicateName { .. })));
         config = Config::default();
         let (name, spec) = ("wall".to_owned(), "chessboard:9x6:25".to_owned());
         let parent_from_board = Transform::identity();
-        config.targets.push(TargetConfig { name, spec, parent: TargetParent::World, parent_from_board });
+        config.targets.push(TargetConfig {
+            name,
+            spec,
+            parent: TargetParent::World,
+            parent_from_board,
+        });
         let message = config.check().expect_err("no unit").to_string();
-        assert!(message.contains("wall") && message.contains("no unit"), "{message}");
+        assert!(
+            message.contains("wall") && message.contains("no unit"),
+            "{message}"
+        );
     }
 }

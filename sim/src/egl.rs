@@ -21,18 +21,26 @@ pub(crate) struct HeadlessContext {
 }
 
 impl HeadlessContext {
-    /// Opens the first platform that works: a hardware device, Mesa's surfaceless platform, a software device.
+    /// Opens the first platform that works: a hardware device, Mesa's surfaceless platform, a
+    /// software device.
     ///
-    /// On machines with a GPU, Mesa's surfaceless platform may render in software, so hardware devices come first.
+    /// On machines with a GPU, Mesa's surfaceless platform may render in software, so hardware
+    /// devices come first.
     pub(crate) fn open() -> Result<Self, Error> {
         // SAFETY: loading libEGL runs its initializers, and the system's library is trusted.
-        let egl = unsafe { Egl::load_required() }.map_err(|error| Error::NoEgl { reason: error.to_string() })?;
+        let egl = unsafe { Egl::load_required() }.map_err(|error| Error::NoEgl {
+            reason: error.to_string(),
+        })?;
         let devices = devices(&egl);
         let hardware = devices.iter().filter(|device| !device.is_software);
         let software = devices.iter().filter(|device| device.is_software);
         let candidates = hardware
             .map(|device| ("hardware device", PLATFORM_DEVICE, device.handle))
-            .chain([("surfaceless", PLATFORM_SURFACELESS_MESA, egl::DEFAULT_DISPLAY)])
+            .chain([(
+                "surfaceless",
+                PLATFORM_SURFACELESS_MESA,
+                egl::DEFAULT_DISPLAY,
+            )])
             .chain(software.map(|device| ("software device", PLATFORM_DEVICE, device.handle)));
         let mut refused = Vec::new();
         for (what, platform, native) in candidates {
@@ -40,12 +48,19 @@ impl HeadlessContext {
                 Ok((display, context)) => {
                     let renderer = renderer_name(&egl);
                     log::info!("rendering with {renderer} ({what})");
-                    return Ok(Self { egl, display, context, renderer });
+                    return Ok(Self {
+                        egl,
+                        display,
+                        context,
+                        renderer,
+                    });
                 }
                 Err(error) => refused.push(format!("{what}: {error}")),
             }
         }
-        Err(Error::NoContext { reason: refused.join("; ") })
+        Err(Error::NoContext {
+            reason: refused.join("; "),
+        })
     }
 
     /// The renderer's name as reported by OpenGL.
@@ -68,11 +83,13 @@ struct Device {
 }
 
 fn devices(egl: &Egl) -> Vec<Device> {
-    type QueryDevices = extern "system" fn(egl::Int, *mut *mut c_void, *mut egl::Int) -> egl::Boolean;
+    type QueryDevices =
+        extern "system" fn(egl::Int, *mut *mut c_void, *mut egl::Int) -> egl::Boolean;
     type QueryDeviceString = extern "system" fn(*mut c_void, egl::Int) -> *const c_char;
-    let (Some(query), Some(query_string)) =
-        (egl.get_proc_address("eglQueryDevicesEXT"), egl.get_proc_address("eglQueryDeviceStringEXT"))
-    else {
+    let (Some(query), Some(query_string)) = (
+        egl.get_proc_address("eglQueryDevicesEXT"),
+        egl.get_proc_address("eglQueryDeviceStringEXT"),
+    ) else {
         return Vec::new();
     };
     // SAFETY: the signatures are those of EGL_EXT_device_enumeration and EGL_EXT_device_query.
@@ -106,7 +123,8 @@ fn make_current(
     platform: egl::Enum,
     native: egl::NativeDisplayType,
 ) -> Result<(egl::Display, egl::Context), egl::Error> {
-    // SAFETY: the native display is null for the surfaceless platform, and a device listed by EGL otherwise.
+    // SAFETY: the native display is null for the surfaceless platform, and a device listed by EGL
+    // otherwise.
     let display = unsafe { egl.get_platform_display(platform, native, &[egl::ATTRIB_NONE]) }?;
     egl.initialize(display)?;
     let attributes = [
@@ -117,9 +135,14 @@ fn make_current(
         (egl::BLUE_SIZE, 8),
         (egl::DEPTH_SIZE, 24),
     ];
-    let attributes: Vec<egl::Int> =
-        attributes.iter().flat_map(|(key, value)| [*key, *value]).chain([egl::NONE]).collect();
-    let config = egl.choose_first_config(display, &attributes)?.ok_or(egl::Error::BadConfig)?;
+    let attributes: Vec<egl::Int> = attributes
+        .iter()
+        .flat_map(|(key, value)| [*key, *value])
+        .chain([egl::NONE])
+        .collect();
+    let config = egl
+        .choose_first_config(display, &attributes)?
+        .ok_or(egl::Error::BadConfig)?;
     egl.bind_api(egl::OPENGL_API)?;
     let context = egl.create_context(display, config, None, &[egl::NONE])?;
     if let Err(error) = egl.make_current(display, None, None, Some(context)) {
@@ -142,5 +165,7 @@ fn renderer_name(egl: &Egl) -> String {
         return "an unnamed renderer".to_owned();
     }
     // SAFETY: a context is current, so OpenGL returns a static string that ends in a zero byte.
-    unsafe { CStr::from_ptr(name) }.to_string_lossy().into_owned()
+    unsafe { CStr::from_ptr(name) }
+        .to_string_lossy()
+        .into_owned()
 }

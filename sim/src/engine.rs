@@ -40,9 +40,11 @@ pub(crate) struct Engine {
     start: Stamp,
     /// Whether the robot moves ahead of its samples while images are rendered.
     looks_ahead: bool,
-    /// Maximum number of images being rendered; the engine waits for the oldest before it submits more.
+    /// Maximum number of images being rendered; the engine waits for the oldest before it submits
+    /// more.
     max_pending: usize,
-    /// Images that would arrive before this simulated time are skipped. Set by the real-time loop when it is late.
+    /// Images that would arrive before this simulated time are skipped. Set by the real-time loop
+    /// when it is late.
     skip_before_nanos: i64,
     slots: VecDeque<Slot>,
     n_pending: usize,
@@ -81,7 +83,8 @@ struct Exposure {
     arrival_nanos: i64,
     n_skipped: u64,
     world_from_camera: Transform,
-    /// Camera poses at the exposure instants of the rows, relative to `world_from_camera`; empty if all are the same.
+    /// Camera poses at the exposure instants of the rows, relative to `world_from_camera`; empty if
+    /// all are the same.
     row_motions: Vec<RowMotion>,
     picture: Pending,
     depth_picture: Option<Pending>,
@@ -98,7 +101,10 @@ const DROP_STREAM: u64 = 3;
 /// Random number stream of one scan.
 const SCANS: u64 = 4;
 
-#[expect(clippy::cast_possible_truncation, reason = "times of a run in nanoseconds fit an i64")]
+#[expect(
+    clippy::cast_possible_truncation,
+    reason = "times of a run in nanoseconds fit an i64"
+)]
 fn nanos_from_secs(secs: f64) -> i64 {
     (secs * 1e9).round() as i64
 }
@@ -114,9 +120,14 @@ impl Camera {
             ..config.sensor
         };
         let sensor = if ideal { flawless } else { config.sensor };
-        let is_sharp = config.parent == Parent::World || (sensor.readout_micros <= 0.0 && sensor.blur_samples <= 1);
-        let depth_sensor = config.depth.as_ref().and_then(|depth| depth.sensor.as_ref());
-        let depth_optics = depth_sensor.map(|sensor| Optics::with_lens(config, &sensor.intrinsics, 1, true));
+        let is_sharp = config.parent == Parent::World
+            || (sensor.readout_micros <= 0.0 && sensor.blur_samples <= 1);
+        let depth_sensor = config
+            .depth
+            .as_ref()
+            .and_then(|depth| depth.sensor.as_ref());
+        let depth_optics =
+            depth_sensor.map(|sensor| Optics::with_lens(config, &sensor.intrinsics, 1, true));
         Ok(Self {
             depth_optics: depth_optics.transpose()?,
             name: config.name.as_str().into(),
@@ -137,7 +148,10 @@ impl Camera {
 
     /// The stamp that the camera reports for a mid-exposure at `nanos`.
     fn reported_nanos(&self, nanos: i64) -> i64 {
-        let StampConfig { to_mid_exposure_secs, drift_frac } = self.config.stamps;
+        let StampConfig {
+            to_mid_exposure_secs,
+            drift_frac,
+        } = self.config.stamps;
         nanos + nanos_from_secs(drift_frac * nanos as f64 * 1e-9 - to_mid_exposure_secs)
     }
 
@@ -146,16 +160,19 @@ impl Camera {
         nanos_from_secs(0.5e-6 * (self.sensor.readout_micros + self.sensor.exposure_micros))
     }
 
-    /// Time from the stamp to the arrival. It is long enough for the joint readings to cover the last row.
+    /// Time from the stamp to the arrival. It is long enough for the joint readings to cover the
+    /// last row.
     fn delivery_delay_nanos(&self) -> i64 {
         self.half_span_nanos() + STEP_NANOS + nanos_from_secs(1e-3 * self.sensor.latency_millis)
     }
 
-    /// Exposure instants relative to the stamp: all instants of the first row, then of the second, and so on. Empty if
-    /// the camera is stationary or exposes all rows at the stamp.
+    /// Exposure instants relative to the stamp: all instants of the first row, then of the second,
+    /// and so on. Empty if the camera is stationary or exposes all rows at the stamp.
     fn row_offsets_nanos(&self) -> Vec<i64> {
         let sensor = &self.sensor;
-        if self.config.parent == Parent::World || (sensor.readout_micros <= 0.0 && sensor.blur_samples <= 1) {
+        if self.config.parent == Parent::World
+            || (sensor.readout_micros <= 0.0 && sensor.blur_samples <= 1)
+        {
             return Vec::new();
         }
         let [_, height] = self.config.intrinsics.size_px;
@@ -164,7 +181,9 @@ impl Camera {
             let by_row = ((f64::from(row) + 0.5) / f64::from(height) - 0.5) * sensor.readout_micros;
             for sample in 0..sensor.blur_samples {
                 let share = (f64::from(sample) + 0.5) / f64::from(sensor.blur_samples) - 0.5;
-                offsets.push(nanos_from_secs(1e-6 * (by_row + share * sensor.exposure_micros)));
+                offsets.push(nanos_from_secs(
+                    1e-6 * (by_row + share * sensor.exposure_micros),
+                ));
             }
         }
         offsets
@@ -179,9 +198,17 @@ impl Camera {
     }
 
     /// View of the depth sensor, if it is separate from the color sensor.
-    fn depth_view(&self, world_from_camera: &Transform, robot: Option<RobotPose>) -> Option<render::View> {
+    fn depth_view(
+        &self,
+        world_from_camera: &Transform,
+        robot: Option<RobotPose>,
+    ) -> Option<render::View> {
         let sensor = self.config.depth.as_ref()?.sensor.as_ref()?;
-        Some(self.depth_optics.as_ref()?.view(world_from_camera * sensor.camera_from_depth, robot, 1.0))
+        Some(self.depth_optics.as_ref()?.view(
+            world_from_camera * sensor.camera_from_depth,
+            robot,
+            1.0,
+        ))
     }
 
     fn random(&self, seed: u64, image_ix: u64, stream: u64) -> RandomStream {
@@ -193,7 +220,9 @@ impl Camera {
 pub(crate) fn history_nanos(config: &Config) -> i64 {
     let longest = |camera: &CameraConfig| {
         let sensor = &camera.sensor;
-        nanos_from_secs(1e-6 * (sensor.readout_micros + sensor.exposure_micros) + 1e-3 * sensor.latency_millis)
+        nanos_from_secs(
+            1e-6 * (sensor.readout_micros + sensor.exposure_micros) + 1e-3 * sensor.latency_millis,
+        )
     };
     config.cameras.iter().map(longest).max().unwrap_or(0) + 10 * STEP_NANOS
 }
@@ -203,15 +232,24 @@ pub(crate) struct Cameras(Vec<Camera>);
 
 impl Cameras {
     pub(crate) fn new(config: &Config) -> Result<Self, Error> {
-        let cameras = config.cameras.iter().enumerate().map(|(ix, camera)| Camera::new(camera, ix, config.ideal));
+        let cameras = config
+            .cameras
+            .iter()
+            .enumerate()
+            .map(|(ix, camera)| Camera::new(camera, ix, config.ideal));
         Ok(Self(cameras.collect::<Result<_, _>>()?))
     }
 
     /// Size that fits the rendered images of all cameras.
     pub(crate) fn largest_view_px(&self) -> [u32; 2] {
-        let all = self.0.iter().flat_map(|camera| std::iter::once(&camera.optics).chain(&camera.depth_optics));
+        let all = self
+            .0
+            .iter()
+            .flat_map(|camera| std::iter::once(&camera.optics).chain(&camera.depth_optics));
         let sizes = all.map(Optics::view_size_px);
-        sizes.fold([1, 1], |largest, size| [largest[0].max(size[0]), largest[1].max(size[1])])
+        sizes.fold([1, 1], |largest, size| {
+            [largest[0].max(size[0]), largest[1].max(size[1])]
+        })
     }
 }
 
@@ -223,7 +261,11 @@ impl Engine {
         renderer: Renderer,
         model: Arc<MjModel>,
     ) -> Result<Self, Error> {
-        let [drift_m, drift_rad] = if config.ideal { [0.0; 2] } else { [config.base.drift_m, config.base.drift_rad] };
+        let [drift_m, drift_rad] = if config.ideal {
+            [0.0; 2]
+        } else {
+            [config.base.drift_m, config.base.drift_rad]
+        };
         Ok(Self {
             joint_ixs: config.joint_ixs()?,
             drift: Drift::new(config.seed, drift_m, drift_rad),
@@ -254,7 +296,12 @@ impl Engine {
     pub(crate) fn reported_joints(&mut self) -> Result<Vec<f64>, Error> {
         let position_rad = self.robot.arm_mut().ok_or(Error::NoArm)?.position_rad();
         let zero = Joints::zeros();
-        let reading = JointReading { nanos: 0, position_rad, velocity_rad_s: zero, torque_nm: zero };
+        let reading = JointReading {
+            nanos: 0,
+            position_rad,
+            velocity_rad_s: zero,
+            torque_nm: zero,
+        };
         Ok(self.joint_state(&reading).position)
     }
 
@@ -267,10 +314,20 @@ impl Engine {
     }
 
     /// Moves the arm by emulated motors instead of the scan. `start`: stamp of simulated time zero.
-    pub(crate) fn follow_motors(&mut self, motors: MotorHistory, start: Stamp) -> Result<(), Error> {
+    pub(crate) fn follow_motors(
+        &mut self,
+        motors: MotorHistory,
+        start: Stamp,
+    ) -> Result<(), Error> {
         self.robot.arm_mut().ok_or(Error::NoArm)?;
-        let (joint_ixs, joint_offsets) = (self.joint_ixs.clone(), self.config.joint_offsets.clone());
-        self.robot.follow_motors(MotorizedArm { motors, start, joint_ixs, joint_offsets });
+        let (joint_ixs, joint_offsets) =
+            (self.joint_ixs.clone(), self.config.joint_offsets.clone());
+        self.robot.follow_motors(MotorizedArm {
+            motors,
+            start,
+            joint_ixs,
+            joint_offsets,
+        });
         self.looks_ahead = false;
         Ok(())
     }
@@ -291,7 +348,8 @@ impl Engine {
             if let Some(delivery) = self.ready.pop_front() {
                 return Ok(Some(delivery));
             }
-            // Commands apply to the samples that follow them, so the robot must not be ahead of its samples.
+            // Commands apply to the samples that follow them, so the robot must not be ahead of its
+            // samples.
             let is_due = |engine: &Self| match engine.looks_ahead {
                 true => engine.n_pending < engine.max_pending,
                 false => engine.slots.is_empty(),
@@ -302,10 +360,15 @@ impl Engine {
             match self.slots.pop_front() {
                 None => return Ok(None),
                 Some(Slot::Joints(reading)) => {
-                    return Ok(Some((reading.nanos, Sample::Joints(self.joint_state(&reading)))));
+                    return Ok(Some((
+                        reading.nanos,
+                        Sample::Joints(self.joint_state(&reading)),
+                    )));
                 }
                 Some(Slot::Base(nanos)) => self.emit_base_pose(nanos),
-                Some(Slot::Scan(scanner_ix, scan_ix, nanos)) => self.scan(scanner_ix, scan_ix, nanos)?,
+                Some(Slot::Scan(scanner_ix, scan_ix, nanos)) => {
+                    self.scan(scanner_ix, scan_ix, nanos)?
+                }
                 Some(Slot::Image(exposure)) => {
                     self.n_pending -= 1;
                     self.finish_image(exposure)?;
@@ -317,7 +380,11 @@ impl Engine {
     /// Moves the robot by one step and starts rendering the images that arrive by then.
     fn step(&mut self) -> Result<(), Error> {
         let (nanos, reading) = self.robot.step()?;
-        if self.config.duration_secs.is_some_and(|secs| nanos > nanos_from_secs(secs)) {
+        if self
+            .config
+            .duration_secs
+            .is_some_and(|secs| nanos > nanos_from_secs(secs))
+        {
             self.has_ended = true;
             return Ok(());
         }
@@ -325,7 +392,9 @@ impl Engine {
         self.queue_base_and_scans(nanos);
         for camera_ix in 0..self.cameras.len() {
             while !self.has_ended
-                && self.cameras[camera_ix].stamp_nanos() + self.cameras[camera_ix].delivery_delay_nanos() <= nanos
+                && self.cameras[camera_ix].stamp_nanos()
+                    + self.cameras[camera_ix].delivery_delay_nanos()
+                    <= nanos
             {
                 self.expose(camera_ix)?;
             }
@@ -336,14 +405,21 @@ impl Engine {
     /// Queues the poses of a moving base and the scanner revolutions that end by now.
     fn queue_base_and_scans(&mut self, nanos: i64) {
         let due = |n_done: u64, rate_hz: f64| nanos_from_secs(n_done as f64 / rate_hz);
-        while self.config.scene.has_moving_base() && due(self.n_base_poses, self.config.base.rate_hz) <= nanos {
-            self.slots.push_back(Slot::Base(due(self.n_base_poses, self.config.base.rate_hz)));
+        while self.config.scene.has_moving_base()
+            && due(self.n_base_poses, self.config.base.rate_hz) <= nanos
+        {
+            self.slots
+                .push_back(Slot::Base(due(self.n_base_poses, self.config.base.rate_hz)));
             self.n_base_poses += 1;
         }
         for (scanner_ix, scanner) in self.config.scanners.iter().enumerate() {
             let n_scans = &mut self.n_scans[scanner_ix];
             while FIRST_NANOS + due(*n_scans + 1, scanner.rate_hz) <= nanos {
-                self.slots.push_back(Slot::Scan(scanner_ix, *n_scans, FIRST_NANOS + due(*n_scans, scanner.rate_hz)));
+                self.slots.push_back(Slot::Scan(
+                    scanner_ix,
+                    *n_scans,
+                    FIRST_NANOS + due(*n_scans, scanner.rate_hz),
+                ));
                 *n_scans += 1;
             }
         }
@@ -353,25 +429,49 @@ impl Engine {
     fn emit_base_pose(&mut self, nanos: i64) {
         let (stamp, secs) = (Stamp(self.start.0 + nanos), nanos as f64 * 1e-9);
         let truth = self.robot.motion().world_from_base(secs);
-        let reported = self.drift.reported(&truth, self.robot.motion().walked_frac(secs));
-        self.ready.push_back((nanos, Sample::Base(BasePose { stamp, world_from_base: reported })));
+        let reported = self
+            .drift
+            .reported(&truth, self.robot.motion().walked_frac(secs));
+        self.ready.push_back((
+            nanos,
+            Sample::Base(BasePose {
+                stamp,
+                world_from_base: reported,
+            }),
+        ));
         if self.config.truth {
-            self.ready.push_back((nanos, Sample::BaseTruth(BasePose { stamp, world_from_base: truth })));
+            self.ready.push_back((
+                nanos,
+                Sample::BaseTruth(BasePose {
+                    stamp,
+                    world_from_base: truth,
+                }),
+            ));
         }
     }
 
     fn scan(&mut self, scanner_ix: usize, scan_ix: u64, nanos: i64) -> Result<(), Error> {
         let scanner = &self.config.scanners[scanner_ix];
         let arrival_nanos = nanos + nanos_from_secs(1.0 / scanner.rate_hz);
-        let Some(rays) = self.rays.as_mut().filter(|_| arrival_nanos >= self.skip_before_nanos) else {
+        let Some(rays) = self
+            .rays
+            .as_mut()
+            .filter(|_| arrival_nanos >= self.skip_before_nanos)
+        else {
             return Ok(());
         };
         let motion = self.robot.motion();
         let random = RandomStream::new(self.config.seed, &[scanner_ix as u64, scan_ix, SCANS]);
-        let world_from_base = |offset_nanos: i64| motion.world_from_base((nanos + offset_nanos) as f64 * 1e-9);
-        let points = lidar::scan_revolution(rays, scanner, self.config.ideal, random, world_from_base)?;
+        let world_from_base =
+            |offset_nanos: i64| motion.world_from_base((nanos + offset_nanos) as f64 * 1e-9);
+        let points =
+            lidar::scan_revolution(rays, scanner, self.config.ideal, random, world_from_base)?;
         let stamp = Stamp(self.start.0 + nanos);
-        let scan = RangeScan { scanner: scanner.name.as_str().into(), stamp, points: points.into() };
+        let scan = RangeScan {
+            scanner: scanner.name.as_str().into(),
+            stamp,
+            points: points.into(),
+        };
         self.ready.push_back((arrival_nanos, Sample::Range(scan)));
         Ok(())
     }
@@ -382,7 +482,9 @@ impl Engine {
         let (image_ix, stamp_nanos) = (camera.n_exposed, camera.stamp_nanos());
         let arrival_nanos = stamp_nanos + camera.delivery_delay_nanos();
         camera.n_exposed += 1;
-        let drop_sample = camera.random(self.config.seed, image_ix, DROP_STREAM).unit(0);
+        let drop_sample = camera
+            .random(self.config.seed, image_ix, DROP_STREAM)
+            .unit(0);
         if drop_sample < camera.sensor.dropped_frac || arrival_nanos < self.skip_before_nanos {
             camera.n_skipped += 1;
             return Ok(());
@@ -396,7 +498,8 @@ impl Engine {
             let world_from_row = camera.world_from_camera(&robot_at(stamp_nanos + offset)?);
             row_motions.push(RowMotion::new(&(camera_from_world * world_from_row)));
         }
-        // Images of cameras on the robot omit the robot and its shadow, but not a target that it carries.
+        // Images of cameras on the robot omit the robot and its shadow, but not a target that it
+        // carries.
         let is_robot_visible = camera.config.parent == Parent::World;
         let robot = (is_robot_visible || self.config.has_carried_target()).then_some(robot);
         let light_frac = match self.config.scene {
@@ -405,11 +508,19 @@ impl Engine {
             }
             _ => 1.0,
         };
-        let view = render::View { is_robot_visible, ..camera.optics.view(world_from_camera, robot, light_frac) };
-        let depth_view = camera.depth_view(&world_from_camera, robot.filter(|_| self.config.has_carried_target()));
+        let view = render::View {
+            is_robot_visible,
+            ..camera.optics.view(world_from_camera, robot, light_frac)
+        };
+        let depth_view = camera.depth_view(
+            &world_from_camera,
+            robot.filter(|_| self.config.has_carried_target()),
+        );
         let n_skipped = std::mem::take(&mut camera.n_skipped);
         let picture = self.renderer.submit(view)?;
-        let depth_picture = depth_view.map(|view| self.renderer.submit(view)).transpose()?;
+        let depth_picture = depth_view
+            .map(|view| self.renderer.submit(view))
+            .transpose()?;
         self.slots.push_back(Slot::Image(Exposure {
             camera_ix,
             image_ix,
@@ -424,7 +535,10 @@ impl Engine {
         self.n_pending += 1;
         if camera_ix == 0 {
             self.n_images += 1;
-            self.has_ended = self.config.n_images.is_some_and(|n_images| self.n_images >= n_images);
+            self.has_ended = self
+                .config
+                .n_images
+                .is_some_and(|n_images| self.n_images >= n_images);
         }
         Ok(())
     }
@@ -435,65 +549,111 @@ impl Engine {
         let picture = exposure.picture.wait()?;
         let (seed, image_ix) = (self.config.seed, exposure.image_ix);
         let stamp = Stamp(self.start.0 + camera.reported_nanos(exposure.stamp_nanos));
-        let depth_lens = camera.config.depth.as_ref().and_then(|depth| Some(&depth.sensor.as_ref()?.intrinsics));
+        let depth_lens = camera
+            .config
+            .depth
+            .as_ref()
+            .and_then(|depth| Some(&depth.sensor.as_ref()?.intrinsics));
         let color_px = camera.config.intrinsics.size_px;
         let depth_px = depth_lens.map_or(color_px, |lens| lens.size_px);
         let image = |format: PixelFormat, data: Vec<u8>| Image {
             camera: Arc::clone(&camera.name),
             stamp,
-            size_px: if matches!(format, PixelFormat::DepthU16 { .. }) { depth_px } else { color_px },
+            size_px: if matches!(format, PixelFormat::DepthU16 { .. }) {
+                depth_px
+            } else {
+                color_px
+            },
             format,
             data: data.into(),
             exposure_secs: Some(1e-6 * camera.sensor.exposure_micros),
             n_skipped: exposure.n_skipped,
         };
         let is_moving = !exposure.row_motions.is_empty();
-        let motion_free =
-            if self.config.truth || !is_moving { camera.optics.motion_free(&picture) } else { Vec::new() };
-        let motion_blurred =
-            if is_moving { camera.optics.motion_blurred(&picture, &exposure.row_motions) } else { Vec::new() };
-        let sensed = if is_moving { &motion_blurred } else { &motion_free };
+        let motion_free = if self.config.truth || !is_moving {
+            camera.optics.motion_free(&picture)
+        } else {
+            Vec::new()
+        };
+        let motion_blurred = if is_moving {
+            camera
+                .optics
+                .motion_blurred(&picture, &exposure.row_motions)
+        } else {
+            Vec::new()
+        };
+        let sensed = if is_moving {
+            &motion_blurred
+        } else {
+            &motion_free
+        };
         let is_noisy = camera.sensor.noise_sigma > 0.0;
         let data = if is_noisy {
-            noise::add_color_noise(sensed, &camera.sensor, camera.random(seed, image_ix, COLOR_NOISE))
+            noise::add_color_noise(
+                sensed,
+                &camera.sensor,
+                camera.random(seed, image_ix, COLOR_NOISE),
+            )
         } else {
             noise::to_bytes(sensed)
         };
         let psnr_ceiling = (is_noisy && self.config.truth).then(|| noise::psnr(&data, sensed));
-        self.ready.push_back((exposure.arrival_nanos, Sample::Image(image(PixelFormat::Rgb8, data))));
+        self.ready.push_back((
+            exposure.arrival_nanos,
+            Sample::Image(image(PixelFormat::Rgb8, data)),
+        ));
         let sensor_depth_m = match (&camera.depth_optics, exposure.depth_picture) {
             (Some(optics), Some(picture)) => Some(optics.depth_m(&picture.wait()?)),
             _ => None,
         };
         let needs_depth = (camera.config.depth.is_some() && sensor_depth_m.is_none())
             || (self.config.truth && self.config.truth_depth);
-        let depth_m = if needs_depth { camera.optics.depth_m(&picture) } else { Vec::new() };
+        let depth_m = if needs_depth {
+            camera.optics.depth_m(&picture)
+        } else {
+            Vec::new()
+        };
         if let Some(depth) = &camera.config.depth {
             let width = depth_px[0] as usize;
             let random = camera.random(seed, image_ix, DEPTH_NOISE);
             let sensed_m = sensor_depth_m.as_ref().unwrap_or(&depth_m);
             let counts = noise::depth_counts(sensed_m, width, depth, random, self.config.ideal);
-            let data = counts.iter().flat_map(|count| count.to_le_bytes()).collect();
-            let format = PixelFormat::DepthU16 { meters_per_count: depth.meters_per_count };
-            self.ready.push_back((exposure.arrival_nanos, Sample::Image(image(format, data))));
+            let data = counts
+                .iter()
+                .flat_map(|count| count.to_le_bytes())
+                .collect();
+            let format = PixelFormat::DepthU16 {
+                meters_per_count: depth.meters_per_count,
+            };
+            self.ready
+                .push_back((exposure.arrival_nanos, Sample::Image(image(format, data))));
         }
         if self.config.truth {
-            let depth_m = if self.config.truth_depth { depth_m } else { Vec::new() };
+            let depth_m = if self.config.truth_depth {
+                depth_m
+            } else {
+                Vec::new()
+            };
             let truth = TruthImage {
                 image: image(PixelFormat::Rgb8, noise::to_bytes(&motion_free)),
                 depth_m: depth_m.into(),
                 world_from_camera: exposure.world_from_camera,
                 psnr_ceiling,
             };
-            self.ready.push_back((exposure.arrival_nanos, Sample::Truth(truth)));
+            self.ready
+                .push_back((exposure.arrival_nanos, Sample::Truth(truth)));
         }
         Ok(())
     }
 
     fn joint_state(&self, reading: &JointReading) -> JointState {
-        let ordered = |joints: &Joints| -> Vec<f64> { self.joint_ixs.iter().map(|ix| joints[*ix]).collect() };
+        let ordered =
+            |joints: &Joints| -> Vec<f64> { self.joint_ixs.iter().map(|ix| joints[*ix]).collect() };
         let mut position = ordered(&reading.position_rad);
-        position.iter_mut().zip(&self.config.joint_offsets).for_each(|(position, offset)| *position -= offset);
+        position
+            .iter_mut()
+            .zip(&self.config.joint_offsets)
+            .for_each(|(position, offset)| *position -= offset);
         JointState {
             stamp: Stamp(self.start.0 + reading.nanos),
             position,

@@ -62,7 +62,9 @@ pub enum Error {
         camera: String,
     },
     /// A target is attached to the flange of a robot without an arm.
-    #[error("{target} is on the flange, but the robot of this scene has no arm: give world_from_board")]
+    #[error(
+        "{target} is on the flange, but the robot of this scene has no arm: give world_from_board"
+    )]
     TargetWithoutFlange {
         /// Name of the target in the rig file.
         target: String,

@@ -1,4 +1,5 @@
-//! The scanning motion in joint space: joint positions over time that move the camera along its tour.
+//! The scanning motion in joint space: joint positions over time that move the camera along its
+//! tour.
 
 use crate::Error;
 use crate::cabinet_tour::CabinetTour;
@@ -38,7 +39,8 @@ pub(crate) struct Follower {
 }
 
 /// Preferred posture: far from the joint limits, elbow up.
-const REST_POSTURE_RAD: [f64; N_JOINTS] = [0.0, -0.3, 0.0, -2.2, 0.0, 2.2, std::f64::consts::FRAC_PI_4];
+const REST_POSTURE_RAD: [f64; N_JOINTS] =
+    [0.0, -0.3, 0.0, -2.2, 0.0, 2.2, std::f64::consts::FRAC_PI_4];
 /// Margin to the joint limits, radians.
 const LIMIT_MARGIN_RAD: f64 = 0.05;
 /// Fraction of the maximum joint speeds that the scan uses.
@@ -48,8 +50,8 @@ const DAMPING: f64 = 0.03;
 /// Rate at which pose errors and posture errors decay, per second.
 const POSE_GAIN_HZ: f64 = 8.0;
 const REST_POSTURE_GAIN_HZ: f64 = 0.6;
-/// The joint velocity follows the desired velocity as a critically damped spring of this frequency, radians per
-/// second, which keeps the motion smooth.
+/// The joint velocity follows the desired velocity as a critically damped spring of this frequency,
+/// radians per second, which keeps the motion smooth.
 const SMOOTHING_RAD_S: f64 = 40.0;
 /// A joint may approach its limit by this fraction of the remaining distance per second.
 const LIMIT_APPROACH_HZ: f64 = 3.0;
@@ -80,8 +82,8 @@ impl Follower {
         Ok(follower)
     }
 
-    /// Follows half a minute of the scan without dynamics, and warns if the camera leaves the tour. With some camera
-    /// extrinsics, this happens because the arm reaches its joint limits.
+    /// Follows half a minute of the scan without dynamics, and warns if the camera leaves the tour.
+    /// With some camera extrinsics, this happens because the arm reaches its joint limits.
     fn warn_if_tour_is_unreachable(mut self) {
         const CHECKED_SECS: f64 = 30.0;
         const STEP_SECS: f64 = 0.005;
@@ -90,7 +92,8 @@ impl Follower {
         while secs < CHECKED_SECS {
             secs += STEP_SECS;
             self.advance(secs, STEP_SECS);
-            let base_from_camera = panda::base_from_flange(&self.position_rad) * self.flange_from_camera;
+            let base_from_camera =
+                panda::base_from_flange(&self.position_rad) * self.flange_from_camera;
             let error = pose_error(&self.scan.arm_from_camera(secs), &base_from_camera);
             worst_rad = worst_rad.max(error.fixed_rows::<3>(3).norm());
         }
@@ -118,34 +121,49 @@ impl Follower {
         let desired_velocity = self.desired_velocity(&target_pose, &target_twist);
         for ix in 0..N_JOINTS {
             let allowed = self.allowed_speed_rad_s(ix);
-            let velocity_error = desired_velocity[ix].clamp(allowed[0], allowed[1]) - self.velocity_rad_s[ix];
+            let velocity_error =
+                desired_velocity[ix].clamp(allowed[0], allowed[1]) - self.velocity_rad_s[ix];
             let acceleration = self.acceleration_rad_s2[ix];
             let jerk = (velocity_error * SMOOTHING_RAD_S - 2.0 * acceleration) * SMOOTHING_RAD_S;
-            let (max_jerk, max_acceleration) = (panda::MAX_JERK_RAD_S3[ix], panda::MAX_ACCELERATION_RAD_S2[ix]);
-            let acceleration =
-                acceleration + jerk.clamp(-DYNAMICS_LIMIT_FRAC * max_jerk, DYNAMICS_LIMIT_FRAC * max_jerk) * step_secs;
-            self.acceleration_rad_s2[ix] =
-                acceleration.clamp(-DYNAMICS_LIMIT_FRAC * max_acceleration, DYNAMICS_LIMIT_FRAC * max_acceleration);
+            let (max_jerk, max_acceleration) = (
+                panda::MAX_JERK_RAD_S3[ix],
+                panda::MAX_ACCELERATION_RAD_S2[ix],
+            );
+            let acceleration = acceleration
+                + jerk.clamp(
+                    -DYNAMICS_LIMIT_FRAC * max_jerk,
+                    DYNAMICS_LIMIT_FRAC * max_jerk,
+                ) * step_secs;
+            self.acceleration_rad_s2[ix] = acceleration.clamp(
+                -DYNAMICS_LIMIT_FRAC * max_acceleration,
+                DYNAMICS_LIMIT_FRAC * max_acceleration,
+            );
         }
         self.velocity_rad_s += self.acceleration_rad_s2 * step_secs;
         self.position_rad = clamp_to_limits(self.position_rad + self.velocity_rad_s * step_secs);
     }
 
-    /// Minimum and maximum velocity of a joint. Close to a position limit, the velocity toward it is reduced.
+    /// Minimum and maximum velocity of a joint. Close to a position limit, the velocity toward it
+    /// is reduced.
     fn allowed_speed_rad_s(&self, ix: usize) -> [f64; 2] {
-        let (position, fastest) = (self.position_rad[ix], SPEED_LIMIT_FRAC * panda::MAX_SPEED_RAD_S[ix]);
+        let (position, fastest) = (
+            self.position_rad[ix],
+            SPEED_LIMIT_FRAC * panda::MAX_SPEED_RAD_S[ix],
+        );
         let to_lower = position - panda::LOWER_RAD[ix] - LIMIT_MARGIN_RAD;
         let to_upper = panda::UPPER_RAD[ix] - LIMIT_MARGIN_RAD - position;
         let towards = |distance: f64| (LIMIT_APPROACH_HZ * distance).clamp(0.0, fastest);
         [-towards(to_lower), towards(to_upper)]
     }
 
-    /// Joint velocity that moves the camera toward the target pose. Null-space motion moves the joints toward the
-    /// preferred posture.
+    /// Joint velocity that moves the camera toward the target pose. Null-space motion moves the
+    /// joints toward the preferred posture.
     fn desired_velocity(&self, target_pose: &Transform, target_twist: &Vector6<f64>) -> Joints {
-        let (base_from_camera, jacobian) = panda::jacobian(&self.position_rad, &self.flange_from_camera);
+        let (base_from_camera, jacobian) =
+            panda::jacobian(&self.position_rad, &self.flange_from_camera);
         let twist = target_twist + pose_error(target_pose, &base_from_camera) * POSE_GAIN_HZ;
-        let rest_posture_velocity = (Joints::from(REST_POSTURE_RAD) - self.position_rad) * REST_POSTURE_GAIN_HZ;
+        let rest_posture_velocity =
+            (Joints::from(REST_POSTURE_RAD) - self.position_rad) * REST_POSTURE_GAIN_HZ;
         let inverse = damped_inverse(&jacobian);
         rest_posture_velocity + inverse * (twist - jacobian * rest_posture_velocity)
     }
@@ -153,7 +171,9 @@ impl Follower {
 
 fn damped_inverse(jacobian: &Jacobian) -> SMatrix<f64, N_JOINTS, 6> {
     let square = jacobian * jacobian.transpose() + Matrix6::identity() * DAMPING.powi(2);
-    let inverse = square.try_inverse().expect("a damped square is positive definite");
+    let inverse = square
+        .try_inverse()
+        .expect("a damped square is positive definite");
     jacobian.transpose() * inverse
 }
 
@@ -173,7 +193,10 @@ fn pose_error(target_pose: &Transform, actual: &Transform) -> Vector6<f64> {
 
 fn clamp_to_limits(position_rad: Joints) -> Joints {
     let clamp = |ix: usize| {
-        position_rad[ix].clamp(panda::LOWER_RAD[ix] + LIMIT_MARGIN_RAD, panda::UPPER_RAD[ix] - LIMIT_MARGIN_RAD)
+        position_rad[ix].clamp(
+            panda::LOWER_RAD[ix] + LIMIT_MARGIN_RAD,
+            panda::UPPER_RAD[ix] - LIMIT_MARGIN_RAD,
+        )
     };
     Joints::from_fn(|ix, _| clamp(ix))
 }

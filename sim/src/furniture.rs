@@ -52,23 +52,43 @@ impl Furniture {
     fn draw_picture(&mut self, among: &[usize]) -> usize {
         self.n_drawn += 1;
         let n = among.len() as u64;
-        among[usize::try_from(self.random.bits(self.n_drawn) % n).expect("below the number of pictures")]
+        among[usize::try_from(self.random.bits(self.n_drawn) % n)
+            .expect("below the number of pictures")]
     }
 
     /// A box with one texture on its front (+x), back and sides, and another on its top.
-    pub(crate) fn add_item(&mut self, world_from_box: &Transform, half_m: [f64; 3], front: usize, top: usize) {
+    pub(crate) fn add_item(
+        &mut self,
+        world_from_box: &Transform,
+        half_m: [f64; 3],
+        front: usize,
+        top: usize,
+    ) {
         let (around, above) = (picture(front), picture(top));
-        self.add_textured_box(world_from_box, half_m, &[around, around, around, around, above, above]);
+        self.add_textured_box(
+            world_from_box,
+            half_m,
+            &[around, around, around, around, above, above],
+        );
     }
 
-    fn add_textured_box(&mut self, world_from_box: &Transform, half_m: [f64; 3], sides: &[TextureRect; 6]) {
-        self.things.append_at(Mesh::cuboid(half_m, sides), world_from_box);
+    fn add_textured_box(
+        &mut self,
+        world_from_box: &Transform,
+        half_m: [f64; 3],
+        sides: &[TextureRect; 6],
+    ) {
+        self.things
+            .append_at(Mesh::cuboid(half_m, sides), world_from_box);
         self.solids.push((*world_from_box, half_m));
     }
 
     /// A plain box.
     pub(crate) fn frame(&mut self, world_from_box: &Transform, half_m: [f64; 3]) {
-        self.frames.append_at(Mesh::cuboid(half_m, &[crate::mesh::WHOLE; 6]), world_from_box);
+        self.frames.append_at(
+            Mesh::cuboid(half_m, &[crate::mesh::WHOLE; 6]),
+            world_from_box,
+        );
         self.solids.push((*world_from_box, half_m));
     }
 
@@ -77,7 +97,12 @@ impl Furniture {
         const LIFT_M: f64 = 0.012;
         let mut mesh = Mesh::default();
         let center = Point3::new(LIFT_M, 0.0, 0.0);
-        mesh.rectangle(center, Vector3::y() * half_m[0], Vector3::z() * half_m[1], picture(ix));
+        mesh.rectangle(
+            center,
+            Vector3::y() * half_m[0],
+            Vector3::z() * half_m[1],
+            picture(ix),
+        );
         self.posters.append_at(mesh, world_from_wall);
     }
 
@@ -85,22 +110,38 @@ impl Furniture {
     pub(crate) fn bench(&mut self, world_from_bench: &Transform) {
         let [half_length, half_depth, top_m] = BENCH_M;
         let at = |x: f64, y: f64, z: f64| world_from_bench * Translation3::new(x, y, z);
-        self.add_item(&at(0.0, 0.0, top_m), [half_depth, half_length, 0.025], 12, 2);
+        self.add_item(
+            &at(0.0, 0.0, top_m),
+            [half_depth, half_length, 0.025],
+            12,
+            2,
+        );
         for (x, y) in [(-1.0, -1.0), (-1.0, 1.0), (1.0, -1.0), (1.0, 1.0)] {
-            let leg = at(x * (half_depth - 0.05), y * (half_length - 0.05), 0.5 * top_m);
+            let leg = at(
+                x * (half_depth - 0.05),
+                y * (half_length - 0.05),
+                0.5 * top_m,
+            );
             self.frame(&leg, [0.025, 0.025, 0.5 * top_m - 0.025]);
         }
         let drawer_y = self.draw_uniform(-0.5, 0.5);
         self.add_item(&at(-0.05, drawer_y, 0.36), [0.26, 0.22, 0.36], 11, 12);
         let mut y = -half_length + 0.05;
         loop {
-            let half = [self.draw_uniform(0.06, 0.2), self.draw_uniform(0.08, 0.2), self.draw_uniform(0.07, 0.24)];
+            let half = [
+                self.draw_uniform(0.06, 0.2),
+                self.draw_uniform(0.08, 0.2),
+                self.draw_uniform(0.07, 0.24),
+            ];
             y += half[1];
             if y + half[1] > half_length {
                 break;
             }
             let front = self.draw_picture(&[0, 1, 7, 8, 9, 9, 11, 13, 14, 15]);
-            let (x, yaw) = (self.draw_uniform(-0.15, 0.12), self.draw_uniform(-14.0, 14.0));
+            let (x, yaw) = (
+                self.draw_uniform(-0.15, 0.12),
+                self.draw_uniform(-14.0, 14.0),
+            );
             let pose = at(x, y, top_m + 0.025 + half[2]) * upright([0.0; 3], yaw);
             self.add_item(&pose, half, front, 12);
             y += half[1] + self.draw_uniform(0.03, 0.16);
@@ -112,9 +153,17 @@ impl Furniture {
         let [half_length, half_depth, height_m] = SHELF_M;
         let at = |x: f64, y: f64, z: f64| world_from_shelf * Translation3::new(x, y, z);
         for side in [-1.0, 1.0] {
-            self.add_item(&at(0.0, side * half_length, 0.5 * height_m), [half_depth, 0.015, 0.5 * height_m], 3, 3);
+            self.add_item(
+                &at(0.0, side * half_length, 0.5 * height_m),
+                [half_depth, 0.015, 0.5 * height_m],
+                3,
+                3,
+            );
         }
-        self.frame(&at(-half_depth, 0.0, 0.5 * height_m), [0.006, half_length, 0.5 * height_m]);
+        self.frame(
+            &at(-half_depth, 0.0, 0.5 * height_m),
+            [0.006, half_length, 0.5 * height_m],
+        );
         for board in 0..5 {
             let z = 0.08 + 0.42 * f64::from(board);
             self.add_item(&at(0.0, 0.0, z), [half_depth, half_length, 0.013], 2, 2);
@@ -123,8 +172,11 @@ impl Furniture {
             }
             let mut y = -half_length + 0.03;
             loop {
-                let half =
-                    [self.draw_uniform(0.10, 0.19), self.draw_uniform(0.08, 0.26), self.draw_uniform(0.09, 0.185)];
+                let half = [
+                    self.draw_uniform(0.10, 0.19),
+                    self.draw_uniform(0.08, 0.26),
+                    self.draw_uniform(0.09, 0.185),
+                ];
                 y += half[1];
                 if y + half[1] > half_length - 0.02 {
                     break;
@@ -141,9 +193,16 @@ impl Furniture {
     pub(crate) fn add_boxes(&mut self, world_from_boxes: &Transform, n_boxes: usize) {
         let mut z = 0.0;
         for _ in 0..n_boxes {
-            let half = [self.draw_uniform(0.2, 0.32), self.draw_uniform(0.22, 0.36), self.draw_uniform(0.14, 0.26)];
-            let (x, y, yaw) =
-                (self.draw_uniform(-0.06, 0.06), self.draw_uniform(-0.06, 0.06), self.draw_uniform(-20.0, 20.0));
+            let half = [
+                self.draw_uniform(0.2, 0.32),
+                self.draw_uniform(0.22, 0.36),
+                self.draw_uniform(0.14, 0.26),
+            ];
+            let (x, y, yaw) = (
+                self.draw_uniform(-0.06, 0.06),
+                self.draw_uniform(-0.06, 0.06),
+                self.draw_uniform(-20.0, 20.0),
+            );
             let front = self.draw_picture(&[0, 1, 2, 3, 10, 11]);
             let pose = world_from_boxes * upright([x, y, z + half[2]], yaw);
             self.add_item(&pose, half, front, front);
@@ -151,7 +210,8 @@ impl Furniture {
         }
     }
 
-    /// Adds all larger boxes as occluders. Shadows of small items on shelves would not be visible on the floor.
+    /// Adds all larger boxes as occluders. Shadows of small items on shelves would not be visible
+    /// on the floor.
     pub(crate) fn add_occluders(&self, occluders: &mut Occluders) {
         const MIN_HALF_M: f64 = 0.22;
         let large = |half_m: &[f64; 3]| half_m.iter().any(|half_m| *half_m >= MIN_HALF_M);

@@ -1,5 +1,5 @@
-//! The laboratory of the mobile base: 15 x 10 m with benches, shelves, crates and posters. A pedestal with a glass
-//! bowl stands in the middle; the world's origin is on the floor there.
+//! The laboratory of the mobile base: 15 x 10 m with benches, shelves, crates and posters. A
+//! pedestal with a glass bowl stands in the middle; the world's origin is on the floor there.
 
 use crate::furniture::{Furniture, upright};
 use crate::lab_texture;
@@ -27,8 +27,14 @@ const BENCHES: [[f64; 3]; 7] = [
     [0.4, 4.55, -90.0],
     [5.2, 4.55, -90.0],
 ];
-const SHELVES: [[f64; 3]; 6] =
-    [[-7.2, -2.6, 0.0], [-7.2, 0.2, 0.0], [-7.2, 2.9, 0.0], [7.2, 1.6, 180.0], [7.2, -1.9, 180.0], [2.8, 4.7, -90.0]];
+const SHELVES: [[f64; 3]; 6] = [
+    [-7.2, -2.6, 0.0],
+    [-7.2, 0.2, 0.0],
+    [-7.2, 2.9, 0.0],
+    [7.2, 1.6, 180.0],
+    [7.2, -1.9, 180.0],
+    [2.8, 4.7, -90.0],
+];
 const BOX_STACKS: [([f64; 3], usize); 8] = [
     ([4.2, 2.3, 20.0], 3),
     ([4.9, 1.5, -30.0], 2),
@@ -39,7 +45,8 @@ const BOX_STACKS: [([f64; 3], usize); 8] = [
     ([-1.6, 3.7, 5.0], 2),
     ([6.6, 4.2, 30.0], 4),
 ];
-/// Posters: wall (east, west, north, south), position along it, height, half width, half height, picture.
+/// Posters: wall (east, west, north, south), position along it, height, half width, half height,
+/// picture.
 const POSTERS: [(usize, [f64; 4], usize); 17] = [
     (0, [-3.6, 1.6, 0.5, 0.7], 0),
     (0, [0.0, 1.7, 0.55, 0.4], 7),
@@ -95,15 +102,31 @@ fn world_from_pedestal() -> Transform {
 
 /// All objects except the robot.
 pub(crate) fn objects() -> Vec<Object> {
-    let object = |name, material, mesh| Object { name, material, mesh, world_from_mesh: Transform::identity() };
-    let Furniture { things, posters, frames, .. } = furniture();
+    let object = |name, material, mesh| Object {
+        name,
+        material,
+        mesh,
+        world_from_mesh: Transform::identity(),
+    };
+    let Furniture {
+        things,
+        posters,
+        frames,
+        ..
+    } = furniture();
     let sides: [_; 6] = std::array::from_fn(texture::side_rectangle);
     let mut pedestal = Mesh::default();
-    pedestal.append_at(Mesh::cuboid(PEDESTAL_HALF_M, &sides), &world_from_pedestal());
+    pedestal.append_at(
+        Mesh::cuboid(PEDESTAL_HALF_M, &sides),
+        &world_from_pedestal(),
+    );
     let mut plinth = Mesh::default();
     let [half_x, half_y, half_z] = PEDESTAL_HALF_M;
     let plinth_pose = world_from_pedestal() * upright([0.0, 0.0, 0.06 - half_z], 0.0);
-    plinth.append_at(Mesh::cuboid([half_x + 0.05, half_y + 0.05, 0.06], &sides), &plinth_pose);
+    plinth.append_at(
+        Mesh::cuboid([half_x + 0.05, half_y + 0.05, 0.06], &sides),
+        &plinth_pose,
+    );
     let mut objects = vec![
         object("things", "items", things),
         object("posters", "posters", posters),
@@ -127,11 +150,27 @@ pub(crate) fn objects() -> Vec<Object> {
 const TOP_M: f64 = 2.0 * PEDESTAL_HALF_M[2];
 
 fn bowl() -> Mesh {
-    let outer = [[0.06, 0.0], [0.07, 0.012], [0.12, 0.05], [0.165, 0.11], [0.18, 0.17], [0.172, 0.172]];
-    let inner = [[0.172, 0.172], [0.155, 0.112], [0.11, 0.06], [0.05, 0.028], [0.001, 0.022]];
+    let outer = [
+        [0.06, 0.0],
+        [0.07, 0.012],
+        [0.12, 0.05],
+        [0.165, 0.11],
+        [0.18, 0.17],
+        [0.172, 0.172],
+    ];
+    let inner = [
+        [0.172, 0.172],
+        [0.155, 0.112],
+        [0.11, 0.06],
+        [0.05, 0.028],
+        [0.001, 0.022],
+    ];
     let mut mesh = Mesh::default();
     for part in [&outer[..], &inner[..]] {
-        mesh.append(Mesh::lathe(part, 48, WHOLE, true), Vector3::new(0.0, 0.0, TOP_M));
+        mesh.append(
+            Mesh::lathe(part, 48, WHOLE, true),
+            Vector3::new(0.0, 0.0, TOP_M),
+        );
     }
     mesh
 }
@@ -141,13 +180,21 @@ fn fruit() -> [Mesh; 3] {
     let ball = |spheres: &[[f64; 4]]| {
         let mut mesh = Mesh::default();
         for [x, y, z, radius] in spheres {
-            let axes = [Vector3::x() * *radius, Vector3::y() * *radius, Vector3::z() * (0.93 * radius)];
+            let axes = [
+                Vector3::x() * *radius,
+                Vector3::y() * *radius,
+                Vector3::z() * (0.93 * radius),
+            ];
             mesh.add_ellipsoid(Point3::new(*x, *y, TOP_M + z), axes, 12, |_, _| 0.5, 0.5);
         }
         mesh
     };
     [
-        ball(&[[0.055, 0.01, 0.075, 0.042], [-0.045, 0.045, 0.075, 0.04], [0.0, 0.0, 0.14, 0.041]]),
+        ball(&[
+            [0.055, 0.01, 0.075, 0.042],
+            [-0.045, 0.045, 0.075, 0.04],
+            [0.0, 0.0, 0.14, 0.041],
+        ]),
         ball(&[[-0.02, -0.06, 0.08, 0.044], [0.07, 0.065, 0.115, 0.04]]),
         ball(&[[-0.085, -0.02, 0.105, 0.033], [0.06, -0.065, 0.12, 0.032]]),
     ]
@@ -158,9 +205,17 @@ fn walls() -> Mesh {
     for wall in 0..4 {
         let half_width = ROOM_HALF_M[usize::from(wall < 2)];
         let mut flat = Mesh::default();
-        let (right, up) = (Vector3::y() * half_width, Vector3::z() * (0.5 * ROOM_HEIGHT_M));
+        let (right, up) = (
+            Vector3::y() * half_width,
+            Vector3::z() * (0.5 * ROOM_HEIGHT_M),
+        );
         let texture = [0.0, 0.0, 2.0 * half_width / ROOM_HEIGHT_M, 1.0];
-        flat.rectangle(Point3::new(0.0, 0.0, 0.5 * ROOM_HEIGHT_M), right, up, texture);
+        flat.rectangle(
+            Point3::new(0.0, 0.0, 0.5 * ROOM_HEIGHT_M),
+            right,
+            up,
+            texture,
+        );
         mesh.append_at(flat, &world_from_wall(wall));
     }
     mesh
@@ -168,17 +223,30 @@ fn walls() -> Mesh {
 
 fn floor() -> Mesh {
     let mut mesh = Mesh::default();
-    mesh.rectangle(Point3::origin(), Vector3::x() * ROOM_HALF_M[0], Vector3::y() * ROOM_HALF_M[1], WHOLE);
+    mesh.rectangle(
+        Point3::origin(),
+        Vector3::x() * ROOM_HALF_M[0],
+        Vector3::y() * ROOM_HALF_M[1],
+        WHOLE,
+    );
     mesh
 }
 
 fn ceiling() -> Mesh {
     let mut mesh = Mesh::default();
     let center = Point3::new(0.0, 0.0, ROOM_HEIGHT_M);
-    mesh.rectangle(center, Vector3::x() * ROOM_HALF_M[0], Vector3::y() * -ROOM_HALF_M[1], WHOLE);
+    mesh.rectangle(
+        center,
+        Vector3::x() * ROOM_HALF_M[0],
+        Vector3::y() * -ROOM_HALF_M[1],
+        WHOLE,
+    );
     // Beams, so that the ceiling is not a single color.
     for x in [-5.0, -2.5, 0.0, 2.5, 5.0] {
-        mesh.append(Mesh::cuboid([0.08, ROOM_HALF_M[1], 0.1], &[WHOLE; 6]), Vector3::new(x, 0.0, ROOM_HEIGHT_M - 0.1));
+        mesh.append(
+            Mesh::cuboid([0.08, ROOM_HALF_M[1], 0.1], &[WHOLE; 6]),
+            Vector3::new(x, 0.0, ROOM_HEIGHT_M - 0.1),
+        );
     }
     mesh
 }
@@ -187,7 +255,10 @@ fn tubes() -> Mesh {
     let mut mesh = Mesh::default();
     for x in [-6.2, -3.7, -1.2, 1.2, 3.7, 6.2] {
         for y in [-2.4, 2.4] {
-            mesh.append(Mesh::cuboid([0.1, 0.7, 0.03], &[WHOLE; 6]), Vector3::new(x, y, ROOM_HEIGHT_M - 0.25));
+            mesh.append(
+                Mesh::cuboid([0.1, 0.7, 0.03], &[WHOLE; 6]),
+                Vector3::new(x, y, ROOM_HEIGHT_M - 0.25),
+            );
         }
     }
     mesh
@@ -203,11 +274,20 @@ pub(crate) fn textures() -> Vec<(&'static str, Texture)> {
     let size_m = ROOM_HALF_M.map(|half| 2.0 * half);
     let mut tiles = lab_texture::floor_tiles(size_m, 3.2);
     tiles.shade(WHOLE, 150, |u, v, name| {
-        let point = Point3::new((2.0 * u - 1.0) * ROOM_HALF_M[0], (1.0 - 2.0 * v) * ROOM_HALF_M[1], 0.0);
+        let point = Point3::new(
+            (2.0 * u - 1.0) * ROOM_HALF_M[0],
+            (1.0 - 2.0 * v) * ROOM_HALF_M[1],
+            0.0,
+        );
         occluders.light_frac(&point, &Vector3::z(), name)
     });
     let mut wood = texture::wood();
-    shade_box(&mut wood, &occluders, PEDESTAL_HALF_M, &world_from_pedestal());
+    shade_box(
+        &mut wood,
+        &occluders,
+        PEDESTAL_HALF_M,
+        &world_from_pedestal(),
+    );
     vec![
         ("items", lab_texture::items()),
         ("posters", lab_texture::posters()),

@@ -1,8 +1,9 @@
 //! Simulated rigs in MuJoCo, behind the traits of `drivers`.
 //!
-//! [`open`] builds a rig. [`Rig::into_lockstep`] runs it as fast as the caller takes samples; the same seed gives
-//! bit-identical samples. [`Rig::into_live`] runs it in real time as devices. [`Rig::into_commanded`] gives an arm that
-//! moves by commands, [`Rig::into_motorized`] cameras on an arm that emulated motors move.
+//! [`open`] builds a rig. [`Rig::into_lockstep`] runs it as fast as the caller takes samples; the
+//! same seed gives bit-identical samples. [`Rig::into_live`] runs it in real time as devices.
+//! [`Rig::into_commanded`] gives an arm that moves by commands, [`Rig::into_motorized`] cameras on
+//! an arm that emulated motors move.
 //!
 //! ```no_run
 //! use sim::Config;
@@ -57,14 +58,15 @@ pub mod wire;
 pub mod layout {
     pub use crate::lab::{PEDESTAL_HALF_M, ROOM_HALF_M, ROOM_HEIGHT_M};
     pub use crate::objects::{
-        BLOCK_HALF_M, CUBE_HALF_M, TABLE_Z_M, TARGET_XY_M, world_from_block, world_from_cube, world_from_tag,
+        BLOCK_HALF_M, CUBE_HALF_M, TABLE_Z_M, TARGET_XY_M, world_from_block, world_from_cube,
+        world_from_tag,
     };
 }
 
 pub use commanded::CommandedRig;
 pub use config::{
-    BaseConfig, CameraConfig, Config, DepthConfig, DepthSensor, Parent, ScannerConfig, Scene, SensorConfig,
-    StampConfig, TargetConfig, TargetParent,
+    BaseConfig, CameraConfig, Config, DepthConfig, DepthSensor, Parent, ScannerConfig, Scene,
+    SensorConfig, StampConfig, TargetConfig, TargetParent,
 };
 pub use error::Error;
 pub use live::{LiveRig, LiveTruth};

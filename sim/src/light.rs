@@ -1,7 +1,8 @@
 //! Scene lighting: computes how much light reaches each point and bakes it into the textures.
 //!
-//! Nothing in front of a wrist camera moves, so shadows can be computed once instead of for every image. This halves
-//! the rendering time and allows soft shadows from an extended lamp and ambient occlusion in corners.
+//! Nothing in front of a wrist camera moves, so shadows can be computed once instead of for every
+//! image. This halves the rendering time and allows soft shadows from an extended lamp and ambient
+//! occlusion in corners.
 
 use crate::random::RandomStream;
 use kinematics::Transform;
@@ -17,11 +18,23 @@ pub(crate) struct Lamp {
 }
 
 /// The lamp that casts shadows.
-const KEY: Lamp = Lamp { direction: [0.42, 0.30, -0.86], diffuse: [0.86, 0.84, 0.78], specular: 0.3 };
+const KEY: Lamp = Lamp {
+    direction: [0.42, 0.30, -0.86],
+    diffuse: [0.86, 0.84, 0.78],
+    specular: 0.3,
+};
 /// Fill lamps, which cast no shadows.
 const FILLS: [Lamp; 2] = [
-    Lamp { direction: [0.55, -0.6, -0.45], diffuse: [0.20, 0.21, 0.24], specular: 0.0 },
-    Lamp { direction: [-0.4, 0.1, -0.5], diffuse: [0.10, 0.10, 0.10], specular: 0.0 },
+    Lamp {
+        direction: [0.55, -0.6, -0.45],
+        diffuse: [0.20, 0.21, 0.24],
+        specular: 0.0,
+    },
+    Lamp {
+        direction: [-0.4, 0.1, -0.5],
+        diffuse: [0.10, 0.10, 0.10],
+        specular: 0.0,
+    },
 ];
 /// Ambient light, sRGB 0 to 1.
 const AMBIENT: [f64; 3] = [0.37, 0.37, 0.39];
@@ -42,7 +55,8 @@ impl Lamp {
     }
 }
 
-/// MJCF of the lamps (elements of the world body) and of the ambient light (a visual setting), both scaled by `gain`.
+/// MJCF of the lamps (elements of the world body) and of the ambient light (a visual setting), both
+/// scaled by `gain`.
 pub(crate) fn mjcf(gain: f64) -> (String, String) {
     let list = |numbers: [f64; 3]| numbers.map(|number| (gain * number).to_string()).join(" ");
     let mut lamps = String::new();
@@ -55,7 +69,10 @@ pub(crate) fn mjcf(gain: f64) -> (String, String) {
             list([lamp.specular; 3])
         );
     }
-    let ambient = format!("<headlight ambient=\"{}\" diffuse=\"0 0 0\" specular=\"0 0 0\"/>", list(AMBIENT));
+    let ambient = format!(
+        "<headlight ambient=\"{}\" diffuse=\"0 0 0\" specular=\"0 0 0\"/>",
+        list(AMBIENT)
+    );
     (lamps, ambient)
 }
 
@@ -77,13 +94,20 @@ struct Ellipsoid {
 }
 
 impl Occluders {
-    /// Creates an empty set. Objects farther away than `ambient_reach_m` do not block ambient light.
+    /// Creates an empty set. Objects farther away than `ambient_reach_m` do not block ambient
+    /// light.
     pub(crate) fn new(ambient_reach_m: f64) -> Self {
-        Self { boxes: Vec::new(), ellipsoids: Vec::new(), bounds: (Point3::origin(), 0.0), ambient_reach_m }
+        Self {
+            boxes: Vec::new(),
+            ellipsoids: Vec::new(),
+            bounds: (Point3::origin(), 0.0),
+            ambient_reach_m,
+        }
     }
 
     pub(crate) fn add_box(&mut self, world_from_box: Transform, half_m: [f64; 3]) {
-        self.boxes.push((world_from_box.inverse(), Vector3::from(half_m)));
+        self.boxes
+            .push((world_from_box.inverse(), Vector3::from(half_m)));
     }
 
     /// Adds ellipsoids, given by center and half axes, that lie inside a bounding sphere.
@@ -92,26 +116,47 @@ impl Occluders {
         ellipsoids: impl Iterator<Item = (Point3<f64>, [Vector3<f64>; 3])>,
         bounds: (Point3<f64>, f64),
     ) {
-        self.ellipsoids.extend(ellipsoids.map(|(center, half_axes)| {
-            let rows = half_axes.map(|axis| (axis / axis.norm_squared()).transpose());
-            Ellipsoid { center, sphere_from_offset: Matrix3::from_rows(&rows) }
-        }));
+        self.ellipsoids
+            .extend(ellipsoids.map(|(center, half_axes)| {
+                let rows = half_axes.map(|axis| (axis / axis.norm_squared()).transpose());
+                Ellipsoid {
+                    center,
+                    sphere_from_offset: Matrix3::from_rows(&rows),
+                }
+            }));
         self.bounds = bounds;
     }
 
-    fn is_occluded(&self, from: &Point3<f64>, direction: &Vector3<f64>, max_distance_m: f64) -> bool {
+    fn is_occluded(
+        &self,
+        from: &Point3<f64>,
+        direction: &Vector3<f64>,
+        max_distance_m: f64,
+    ) -> bool {
         let hits_box = |(box_from_world, half_m): &(Transform, Vector3<f64>)| {
-            hits_box(&(box_from_world * from).coords, &(box_from_world * direction), half_m, max_distance_m)
+            hits_box(
+                &(box_from_world * from).coords,
+                &(box_from_world * direction),
+                half_m,
+                max_distance_m,
+            )
         };
         if self.boxes.iter().any(hits_box) {
             return true;
         }
         let (center, radius_m) = self.bounds;
-        hits_sphere(&((from - center) / radius_m), &(direction / radius_m), max_distance_m)
-            && self.ellipsoids.iter().any(|ellipsoid| {
-                let offset = ellipsoid.sphere_from_offset * (from - ellipsoid.center);
-                hits_sphere(&offset, &(ellipsoid.sphere_from_offset * direction), max_distance_m)
-            })
+        hits_sphere(
+            &((from - center) / radius_m),
+            &(direction / radius_m),
+            max_distance_m,
+        ) && self.ellipsoids.iter().any(|ellipsoid| {
+            let offset = ellipsoid.sphere_from_offset * (from - ellipsoid.center);
+            hits_sphere(
+                &offset,
+                &(ellipsoid.sphere_from_offset * direction),
+                max_distance_m,
+            )
+        })
     }
 
     /// Fraction of the unoccluded light that reaches a surface, 0 to 1.
@@ -122,8 +167,16 @@ impl Occluders {
         let random = RandomStream::new(0x11_6874, &[name]);
         let from = point + normal * LIFT_M;
         let key = KEY.brightness(normal);
-        let others = AMBIENT[1] + FILLS.iter().map(|lamp| lamp.brightness(normal)).sum::<f64>();
-        let key_frac = if key > 0.0 { self.key_frac(&from, random) } else { 0.0 };
+        let others = AMBIENT[1]
+            + FILLS
+                .iter()
+                .map(|lamp| lamp.brightness(normal))
+                .sum::<f64>();
+        let key_frac = if key > 0.0 {
+            self.key_frac(&from, random)
+        } else {
+            0.0
+        };
         let other_frac = self.ambient_frac(&from, normal, random);
         (key * key_frac + others * other_frac) / (key + others)
     }
@@ -135,7 +188,8 @@ impl Occluders {
         let n_free = (0..N_KEY_RAYS).filter(|ray| {
             // Spread evenly over the lamp's disc, with a random rotation (Vogel 1979).
             let radius = KEY_SIZE * ((*ray as f64 + 0.5) / N_KEY_RAYS as f64).sqrt();
-            let (sin, cos) = (*ray as f64 * 2.399_963 + random.between(0, 0.0, std::f64::consts::TAU)).sin_cos();
+            let (sin, cos) =
+                (*ray as f64 * 2.399_963 + random.between(0, 0.0, std::f64::consts::TAU)).sin_cos();
             let direction = (to_lamp + side * (radius * cos) + across * (radius * sin)).normalize();
             !self.is_occluded(from, &direction, 10.0)
         });
@@ -143,14 +197,20 @@ impl Occluders {
     }
 
     fn ambient_frac(&self, from: &Point3<f64>, normal: &Vector3<f64>, random: RandomStream) -> f64 {
-        let side =
-            if normal.x.abs() < 0.7 { normal.cross(&Vector3::x()) } else { normal.cross(&Vector3::y()) }.normalize();
+        let side = if normal.x.abs() < 0.7 {
+            normal.cross(&Vector3::x())
+        } else {
+            normal.cross(&Vector3::y())
+        }
+        .normalize();
         let across = normal.cross(&side);
         let n_free = (0..N_AMBIENT_RAYS).filter(|ray| {
             // Cosine-weighted directions around the normal.
             let square = (*ray as f64 + random.unit(2 + ray)) / N_AMBIENT_RAYS as f64;
-            let (sin, cos) = (*ray as f64 * 2.399_963 + random.between(1, 0.0, std::f64::consts::TAU)).sin_cos();
-            let direction = normal * (1.0 - square).sqrt() + (side * cos + across * sin) * square.sqrt();
+            let (sin, cos) =
+                (*ray as f64 * 2.399_963 + random.between(1, 0.0, std::f64::consts::TAU)).sin_cos();
+            let direction =
+                normal * (1.0 - square).sqrt() + (side * cos + across * sin) * square.sqrt();
             !self.is_occluded(from, &direction, self.ambient_reach_m)
         });
         n_free.count() as f64 / N_AMBIENT_RAYS as f64
@@ -159,7 +219,11 @@ impl Occluders {
 
 /// Whether a ray hits the unit sphere before `reach`, or starts inside the sphere.
 fn hits_sphere(from: &Vector3<f64>, direction: &Vector3<f64>, reach: f64) -> bool {
-    let (a, b, c) = (direction.norm_squared(), from.dot(direction), from.norm_squared() - 1.0);
+    let (a, b, c) = (
+        direction.norm_squared(),
+        from.dot(direction),
+        from.norm_squared() - 1.0,
+    );
     let inside = b * b - a * c;
     if inside < 0.0 {
         return false;
@@ -170,11 +234,19 @@ fn hits_sphere(from: &Vector3<f64>, direction: &Vector3<f64>, reach: f64) -> boo
 }
 
 /// Whether a ray hits a box between its start and `reach`.
-fn hits_box(from: &Vector3<f64>, direction: &Vector3<f64>, half_m: &Vector3<f64>, reach: f64) -> bool {
+fn hits_box(
+    from: &Vector3<f64>,
+    direction: &Vector3<f64>,
+    half_m: &Vector3<f64>,
+    reach: f64,
+) -> bool {
     let (mut enter, mut leave) = (0.0_f64, reach);
     for axis in 0..3 {
         let inverse = 1.0 / direction[axis];
-        let (a, b) = ((-half_m[axis] - from[axis]) * inverse, (half_m[axis] - from[axis]) * inverse);
+        let (a, b) = (
+            (-half_m[axis] - from[axis]) * inverse,
+            (half_m[axis] - from[axis]) * inverse,
+        );
         enter = enter.max(a.min(b));
         leave = leave.min(a.max(b));
     }
@@ -192,7 +264,11 @@ mod tests {
         let up = Vector3::z();
         let share = |x: f64, y: f64| occluders.light_frac(&Point3::new(x, y, 0.0), &up, 1);
         assert!(share(0.5, 0.5) > 0.99, "far away: {}", share(0.5, 0.5));
-        assert!(share(0.055, 0.0) < 0.5, "in the shadow: {}", share(0.055, 0.0));
+        assert!(
+            share(0.055, 0.0) < 0.5,
+            "in the shadow: {}",
+            share(0.055, 0.0)
+        );
         let before = share(-0.055, 0.0);
         assert!(before > 0.6 && before < 0.95, "in the lit corner: {before}");
     }
@@ -201,8 +277,13 @@ mod tests {
     fn rays_hit_ellipsoids() {
         let mut occluders = Occluders::new(0.25);
         let axes = [Vector3::x() * 0.2, Vector3::y() * 0.1, Vector3::z() * 0.1];
-        occluders.add_ellipsoids([(Point3::new(1.0, 0.0, 0.0), axes)].into_iter(), (Point3::new(1.0, 0.0, 0.0), 0.2));
-        let hits = |y: f64, reach: f64| occluders.is_occluded(&Point3::new(0.0, y, 0.0), &Vector3::x(), reach);
+        occluders.add_ellipsoids(
+            [(Point3::new(1.0, 0.0, 0.0), axes)].into_iter(),
+            (Point3::new(1.0, 0.0, 0.0), 0.2),
+        );
+        let hits = |y: f64, reach: f64| {
+            occluders.is_occluded(&Point3::new(0.0, y, 0.0), &Vector3::x(), reach)
+        };
         assert!(hits(0.09, 2.0) && !hits(0.11, 2.0) && !hits(0.0, 0.79) && hits(0.0, 0.81));
         assert!(!occluders.is_occluded(&Point3::origin(), &-Vector3::x(), 2.0));
     }

@@ -3,7 +3,9 @@
 use crate::Error;
 use crate::engine::{Delivery, Engine};
 use crate::rig_info::RigInfo;
-use drivers::{Arm, Base, BasePose, Camera, Devices, Image, PixelFormat, RangeScan, RangeScanner, Sample};
+use drivers::{
+    Arm, Base, BasePose, Camera, Devices, Image, PixelFormat, RangeScan, RangeScanner, Sample,
+};
 use kinematics::{Intrinsics, JointState, Stamp};
 use parking_lot::{Condvar, Mutex};
 use std::collections::VecDeque;
@@ -26,7 +28,8 @@ const MAX_LATE: Duration = Duration::from_millis(50);
 pub struct LiveRig {
     /// Cameras in the order of the configuration, the arm, the base if it moves, and the scanners.
     pub devices: Devices,
-    /// Ground truth of color images and base poses. If its queue is full, the oldest entry is dropped.
+    /// Ground truth of color images and base poses. If its queue is full, the oldest entry is
+    /// dropped.
     pub truth: LiveTruth,
     /// True parameters of the rig.
     pub info: RigInfo,
@@ -41,7 +44,10 @@ impl LiveTruth {
     /// Returns the oldest queued ground truth without waiting; base poses come before images.
     pub fn take(&self) -> Option<Sample> {
         let mut state = self.simulation.shared.state.lock();
-        state.truth_poses.pop_front().or_else(|| state.truth_images.pop_front())
+        state
+            .truth_poses
+            .pop_front()
+            .or_else(|| state.truth_images.pop_front())
     }
 }
 
@@ -86,7 +92,11 @@ struct QueueState {
 
 impl LiveRig {
     pub(crate) fn start(engine: Engine, info: RigInfo, start: Stamp) -> Result<Self, Error> {
-        let names: Vec<Arc<str>> = info.cameras.iter().map(|camera| camera.name.as_str().into()).collect();
+        let names: Vec<Arc<str>> = info
+            .cameras
+            .iter()
+            .map(|camera| camera.name.as_str().into())
+            .collect();
         let shared = Arc::new(SharedQueues::default());
         {
             let mut state = shared.state.lock();
@@ -94,27 +104,62 @@ impl LiveRig {
             state.n_dropped = vec![[0; 2]; names.len()];
             state.scans = vec![VecDeque::new(); info.scanner_names.len()];
         }
-        let thread = std::thread::Builder::new().name("sim-live".to_owned()).spawn({
-            let shared = Arc::clone(&shared);
-            let scanner_names = info.scanner_names.clone();
-            move || run_simulation(engine, &shared, &DeviceNames { cameras: names, scanners: scanner_names }, start)
+        let thread = std::thread::Builder::new()
+            .name("sim-live".to_owned())
+            .spawn({
+                let shared = Arc::clone(&shared);
+                let scanner_names = info.scanner_names.clone();
+                move || {
+                    run_simulation(
+                        engine,
+                        &shared,
+                        &DeviceNames {
+                            cameras: names,
+                            scanners: scanner_names,
+                        },
+                        start,
+                    )
+                }
+            });
+        let simulation = Arc::new(SimulationThread {
+            shared,
+            thread: Some(thread.map_err(Error::Thread)?),
         });
-        let simulation = Arc::new(SimulationThread { shared, thread: Some(thread.map_err(Error::Thread)?) });
         let cameras = info.cameras.iter().enumerate().map(|(camera_ix, camera)| {
             let (name, intrinsics) = (camera.name.clone(), camera.intrinsics.clone());
-            Box::new(LiveCamera { simulation: Arc::clone(&simulation), camera_ix, name, intrinsics }) as Box<dyn Camera>
+            Box::new(LiveCamera {
+                simulation: Arc::clone(&simulation),
+                camera_ix,
+                name,
+                intrinsics,
+            }) as Box<dyn Camera>
         });
-        let arm = LiveArm { simulation: Arc::clone(&simulation), joint_names: info.joint_names.clone() };
-        let base = LiveBase { simulation: Arc::clone(&simulation) };
-        let scanners = info.scanner_names.iter().enumerate().map(|(scanner_ix, name)| {
-            let (simulation, name) = (Arc::clone(&simulation), name.clone());
-            Box::new(LiveScanner { simulation, scanner_ix, name }) as Box<dyn RangeScanner>
-        });
+        let arm = LiveArm {
+            simulation: Arc::clone(&simulation),
+            joint_names: info.joint_names.clone(),
+        };
+        let base = LiveBase {
+            simulation: Arc::clone(&simulation),
+        };
+        let scanners = info
+            .scanner_names
+            .iter()
+            .enumerate()
+            .map(|(scanner_ix, name)| {
+                let (simulation, name) = (Arc::clone(&simulation), name.clone());
+                Box::new(LiveScanner {
+                    simulation,
+                    scanner_ix,
+                    name,
+                }) as Box<dyn RangeScanner>
+            });
         Ok(Self {
             devices: Devices {
                 cameras: cameras.collect(),
                 arm: (!info.joint_names.is_empty()).then(|| Box::new(arm) as Box<dyn Arm>),
-                base: info.has_moving_base.then(|| Box::new(base) as Box<dyn Base>),
+                base: info
+                    .has_moving_base
+                    .then(|| Box::new(base) as Box<dyn Base>),
                 scanners: scanners.collect(),
             },
             truth: LiveTruth { simulation },
@@ -166,20 +211,27 @@ impl SharedQueues {
         let mut state = self.state.lock();
         match sample {
             Sample::Image(image) => {
-                if let Some(camera_ix) = names.cameras.iter().position(|name| *name == image.camera) {
+                if let Some(camera_ix) = names.cameras.iter().position(|name| *name == image.camera)
+                {
                     state.put_image(camera_ix, image);
                 }
             }
             Sample::Joints(reading) => push_bounded(&mut state.readings, MAX_READINGS, reading),
             Sample::Base(pose) => push_bounded(&mut state.poses, MAX_READINGS, pose),
             Sample::Range(scan) => {
-                if let Some(scanner_ix) = names.scanners.iter().position(|name| **name == *scan.scanner) {
+                if let Some(scanner_ix) = names
+                    .scanners
+                    .iter()
+                    .position(|name| **name == *scan.scanner)
+                {
                     push_bounded(&mut state.scans[scanner_ix], MAX_SCANS, scan);
                 }
             }
-            image @ Sample::Truth(_) => {
-                push_bounded(&mut state.truth_images, MAX_TRUTH_IMAGES * names.cameras.len(), image)
-            }
+            image @ Sample::Truth(_) => push_bounded(
+                &mut state.truth_images,
+                MAX_TRUTH_IMAGES * names.cameras.len(),
+                image,
+            ),
             pose @ Sample::BaseTruth(_) => push_bounded(&mut state.truth_poses, MAX_READINGS, pose),
         }
         let is_running = !state.stop;
@@ -188,7 +240,8 @@ impl SharedQueues {
         is_running
     }
 
-    /// Waits until `take` returns a value. Returns an error if nothing came in time or the rig has ended.
+    /// Waits until `take` returns a value. Returns an error if nothing came in time or the rig has
+    /// ended.
     fn wait<T>(
         &self,
         timeout: Duration,
@@ -202,7 +255,9 @@ impl SharedQueues {
                 return Ok(sample);
             }
             if let Some(reason) = &state.end {
-                return Err(drivers::Error::Simulation { reason: reason.clone() });
+                return Err(drivers::Error::Simulation {
+                    reason: reason.clone(),
+                });
             }
             let left = until.saturating_duration_since(Instant::now());
             if left.is_zero() {
@@ -214,8 +269,8 @@ impl SharedQueues {
 }
 
 impl QueueState {
-    /// Queues an image. If the queue is full, the camera's oldest image is dropped, and the next image of its kind
-    /// reports it.
+    /// Queues an image. If the queue is full, the camera's oldest image is dropped, and the next
+    /// image of its kind reports it.
     fn put_image(&mut self, camera_ix: usize, mut image: Image) {
         let queue = &mut self.images[camera_ix];
         let n_dropped = &mut self.n_dropped[camera_ix];
@@ -224,9 +279,14 @@ impl QueueState {
         if queue.len() <= MAX_IMAGES {
             return;
         }
-        let Some(oldest) = queue.pop_front() else { return };
+        let Some(oldest) = queue.pop_front() else {
+            return;
+        };
         let n_newly_dropped = oldest.n_skipped + 1;
-        match queue.iter_mut().find(|image| stream_ix(image) == stream_ix(&oldest)) {
+        match queue
+            .iter_mut()
+            .find(|image| stream_ix(image) == stream_ix(&oldest))
+        {
             Some(next) => next.n_skipped += n_newly_dropped,
             None => n_dropped[stream_ix(&oldest)] += n_newly_dropped,
         }
@@ -257,8 +317,15 @@ impl Camera for LiveCamera {
     }
 
     fn next_image(&mut self, timeout: Duration) -> Result<Image, drivers::Error> {
-        let timeout_error = || drivers::Error::NoImage { camera: self.name.clone(), waited: timeout };
-        self.simulation.shared.wait(timeout, |state| state.images[self.camera_ix].pop_front(), timeout_error)
+        let timeout_error = || drivers::Error::NoImage {
+            camera: self.name.clone(),
+            waited: timeout,
+        };
+        self.simulation.shared.wait(
+            timeout,
+            |state| state.images[self.camera_ix].pop_front(),
+            timeout_error,
+        )
     }
 }
 
@@ -274,7 +341,9 @@ impl Arm for LiveArm {
 
     fn read(&mut self, timeout: Duration) -> Result<JointState, drivers::Error> {
         let timeout_error = || drivers::Error::NoJoints { waited: timeout };
-        self.simulation.shared.wait(timeout, |state| state.readings.pop_front(), timeout_error)
+        self.simulation
+            .shared
+            .wait(timeout, |state| state.readings.pop_front(), timeout_error)
     }
 }
 
@@ -285,7 +354,9 @@ struct LiveBase {
 impl Base for LiveBase {
     fn next_pose(&mut self, timeout: Duration) -> Result<BasePose, drivers::Error> {
         let timeout_error = || drivers::Error::NoBasePose { waited: timeout };
-        self.simulation.shared.wait(timeout, |state| state.poses.pop_front(), timeout_error)
+        self.simulation
+            .shared
+            .wait(timeout, |state| state.poses.pop_front(), timeout_error)
     }
 }
 
@@ -301,7 +372,14 @@ impl RangeScanner for LiveScanner {
     }
 
     fn next_scan(&mut self, timeout: Duration) -> Result<RangeScan, drivers::Error> {
-        let timeout_error = || drivers::Error::NoScan { scanner: self.name.clone(), waited: timeout };
-        self.simulation.shared.wait(timeout, |state| state.scans[self.scanner_ix].pop_front(), timeout_error)
+        let timeout_error = || drivers::Error::NoScan {
+            scanner: self.name.clone(),
+            waited: timeout,
+        };
+        self.simulation.shared.wait(
+            timeout,
+            |state| state.scans[self.scanner_ix].pop_front(),
+            timeout_error,
+        )
     }
 }

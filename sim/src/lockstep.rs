@@ -4,7 +4,8 @@ use crate::engine::Engine;
 use crate::rig_info::RigInfo;
 use drivers::{Sample, Source};
 
-/// Samples of a rig in delivery order. On one machine, the same configuration gives bit-identical samples.
+/// Samples of a rig in delivery order. On one machine, the same configuration gives bit-identical
+/// samples.
 pub struct Lockstep {
     engine: Engine,
     info: RigInfo,
@@ -23,7 +24,12 @@ impl Lockstep {
 
 impl Source for Lockstep {
     fn next_sample(&mut self) -> Result<Option<Sample>, drivers::Error> {
-        let delivery = self.engine.next().map_err(|error| drivers::Error::Simulation { reason: error.to_string() })?;
+        let delivery = self
+            .engine
+            .next()
+            .map_err(|error| drivers::Error::Simulation {
+                reason: error.to_string(),
+            })?;
         Ok(delivery.map(|(_, sample)| sample))
     }
 }

@@ -28,12 +28,22 @@ pub(crate) const WHOLE: TextureRect = [0.0, 0.0, 1.0, 1.0];
 
 impl Mesh {
     /// Adds a vertex and returns its index.
-    #[expect(clippy::cast_possible_truncation, reason = "the format holds f32 and i32")]
+    #[expect(
+        clippy::cast_possible_truncation,
+        reason = "the format holds f32 and i32"
+    )]
     pub(crate) fn push(&mut self, corner: Corner) -> i32 {
-        let Corner { point_m, normal, texcoord } = corner;
-        self.points_m.push([point_m.x as f32, point_m.y as f32, point_m.z as f32]);
-        self.normals.push([normal.x as f32, normal.y as f32, normal.z as f32]);
-        self.texcoords.push([texcoord[0] as f32, texcoord[1] as f32]);
+        let Corner {
+            point_m,
+            normal,
+            texcoord,
+        } = corner;
+        self.points_m
+            .push([point_m.x as f32, point_m.y as f32, point_m.z as f32]);
+        self.normals
+            .push([normal.x as f32, normal.y as f32, normal.z as f32]);
+        self.texcoords
+            .push([texcoord[0] as f32, texcoord[1] as f32]);
         self.points_m.len() as i32 - 1
     }
 
@@ -53,7 +63,11 @@ impl Mesh {
         let normal = half_right.cross(&half_up).normalize();
         let [left, top, right, bottom] = texture;
         let mut corner = |across: f64, up: f64, texcoord| {
-            self.push(Corner { point_m: center + half_right * across + half_up * up, normal, texcoord })
+            self.push(Corner {
+                point_m: center + half_right * across + half_up * up,
+                normal,
+                texcoord,
+            })
         };
         let [a, b, c, d] = [
             corner(-1.0, -1.0, [left, bottom]),
@@ -69,14 +83,25 @@ impl Mesh {
     pub(crate) fn cuboid(half_m: [f64; 3], textures: &[TextureRect; 6]) -> Self {
         let mut mesh = Self::default();
         for ((outward, right, up), texture) in BOX_FACES.iter().zip(textures) {
-            let scale = |axis: &[f64; 3]| Vector3::new(axis[0] * half_m[0], axis[1] * half_m[1], axis[2] * half_m[2]);
-            mesh.rectangle(Point3::from(scale(outward)), scale(right), scale(up), *texture);
+            let scale = |axis: &[f64; 3]| {
+                Vector3::new(
+                    axis[0] * half_m[0],
+                    axis[1] * half_m[1],
+                    axis[2] * half_m[2],
+                )
+            };
+            mesh.rectangle(
+                Point3::from(scale(outward)),
+                scale(right),
+                scale(up),
+                *texture,
+            );
         }
         mesh
     }
 
-    /// Adds an ellipsoid given by three perpendicular half axes. `texture_x` maps a point and its normal to the
-    /// horizontal texture coordinate; `texture_y` is constant.
+    /// Adds an ellipsoid given by three perpendicular half axes. `texture_x` maps a point and its
+    /// normal to the horizontal texture coordinate; `texture_y` is constant.
     pub(crate) fn add_ellipsoid(
         &mut self,
         center: Point3<f64>,
@@ -93,28 +118,47 @@ impl Mesh {
                 let around = f64::from(sector) / f64::from(n_sectors);
                 let direction = sphere_direction(down, around);
                 let normal = ellipsoid_normal(&half_axes, &direction);
-                let point_m =
-                    center + half_axes[0] * direction.x + half_axes[1] * direction.y + half_axes[2] * direction.z;
+                let point_m = center
+                    + half_axes[0] * direction.x
+                    + half_axes[1] * direction.y
+                    + half_axes[2] * direction.z;
                 let texcoord = [texture_x(&point_m, &normal), texture_y];
-                self.push(Corner { point_m, normal, texcoord });
+                self.push(Corner {
+                    point_m,
+                    normal,
+                    texcoord,
+                });
             }
         }
         let row = i32::try_from(n_sectors + 1).expect("meshes stay small");
         for ring in 0..i32::try_from(n_rings).expect("meshes stay small") {
             for sector in 0..row - 1 {
-                let [a, b] = [first + ring * row + sector, first + (ring + 1) * row + sector];
+                let [a, b] = [
+                    first + ring * row + sector,
+                    first + (ring + 1) * row + sector,
+                ];
                 self.triangle([a, b, b + 1]);
                 self.triangle([a, b + 1, a + 1]);
             }
         }
     }
 
-    /// Point and outward normal on a box's side at a position in its texture, 0 to 1 from the top left.
-    pub(crate) fn on_cuboid(half_m: [f64; 3], side: usize, u: f64, v: f64) -> (Point3<f64>, Vector3<f64>) {
+    /// Point and outward normal on a box's side at a position in its texture, 0 to 1 from the top
+    /// left.
+    pub(crate) fn on_cuboid(
+        half_m: [f64; 3],
+        side: usize,
+        u: f64,
+        v: f64,
+    ) -> (Point3<f64>, Vector3<f64>) {
         let (outward, right, up) = BOX_FACES[side];
-        let unit =
-            Vector3::from(outward) + Vector3::from(right) * (2.0 * u - 1.0) + Vector3::from(up) * (1.0 - 2.0 * v);
-        (Point3::from(unit.component_mul(&Vector3::from(half_m))), Vector3::from(outward))
+        let unit = Vector3::from(outward)
+            + Vector3::from(right) * (2.0 * u - 1.0)
+            + Vector3::from(up) * (1.0 - 2.0 * v);
+        (
+            Point3::from(unit.component_mul(&Vector3::from(half_m))),
+            Vector3::from(outward),
+        )
     }
 
     /// Translates every point.
@@ -132,24 +176,36 @@ impl Mesh {
         self.points_m.extend(other.points_m);
         self.normals.extend(other.normals);
         self.texcoords.extend(other.texcoords);
-        self.faces.extend(other.faces.iter().map(|face| face.map(|corner| corner + first)));
+        self.faces.extend(
+            other
+                .faces
+                .iter()
+                .map(|face| face.map(|corner| corner + first)),
+        );
     }
 
     /// Adds another mesh, transformed.
     pub(crate) fn append_at(&mut self, mut other: Self, self_from_other: &Transform) {
         for (point, normal) in other.points_m.iter_mut().zip(&mut other.normals) {
-            *point = (self_from_other.cast::<f32>() * Point3::from(*point)).coords.into();
+            *point = (self_from_other.cast::<f32>() * Point3::from(*point))
+                .coords
+                .into();
             *normal = (self_from_other.cast::<f32>() * Vector3::from(*normal)).into();
         }
         self.append(other, Vector3::zeros());
     }
 
-    /// A surface of revolution about z. The profile is a list of `(radius, z)` in meters; the outside is on the right
-    /// of an upward profile.
+    /// A surface of revolution about z. The profile is a list of `(radius, z)` in meters; the
+    /// outside is on the right of an upward profile.
     ///
-    /// The texture wraps around the axis once; its top is at the first point. With `is_smooth`, normals are averaged
-    /// where pieces of the profile meet.
-    pub(crate) fn lathe(profile_m: &[[f64; 2]], n_sectors: u32, texture: TextureRect, is_smooth: bool) -> Self {
+    /// The texture wraps around the axis once; its top is at the first point. With `is_smooth`,
+    /// normals are averaged where pieces of the profile meet.
+    pub(crate) fn lathe(
+        profile_m: &[[f64; 2]],
+        n_sectors: u32,
+        texture: TextureRect,
+        is_smooth: bool,
+    ) -> Self {
         let mut mesh = Self::default();
         let [left, top, right, bottom] = texture;
         let n_pieces = profile_m.len() - 1;
@@ -159,8 +215,14 @@ impl Mesh {
             Vector3::new(b[1] - a[1], 0.0, a[0] - b[0]).normalize()
         };
         let bend = |piece: usize, end: usize| {
-            let other = (piece + end).checked_sub(1).filter(|other| *other < n_pieces && is_smooth);
-            let neighbor = if end == 0 { other } else { Some(piece + 1).filter(|next| *next < n_pieces && is_smooth) };
+            let other = (piece + end)
+                .checked_sub(1)
+                .filter(|other| *other < n_pieces && is_smooth);
+            let neighbor = if end == 0 {
+                other
+            } else {
+                Some(piece + 1).filter(|next| *next < n_pieces && is_smooth)
+            };
             (slope(piece) + neighbor.map_or_else(Vector3::zeros, slope)).normalize()
         };
         for piece in 0..n_pieces {
@@ -188,7 +250,8 @@ impl Mesh {
         mesh
     }
 
-    /// The bytes of MuJoCo's `.msh` format: four counts, then points, normals, texture coordinates and faces.
+    /// The bytes of MuJoCo's `.msh` format: four counts, then points, normals, texture coordinates
+    /// and faces.
     pub(crate) fn to_msh(&self) -> Vec<u8> {
         let n_points = i32::try_from(self.points_m.len()).expect("meshes stay small");
         let n_faces = i32::try_from(self.faces.len()).expect("meshes stay small");
@@ -196,8 +259,12 @@ impl Mesh {
         for count in [n_points, n_points, n_points, n_faces] {
             bytes.extend(count.to_le_bytes());
         }
-        for number in
-            self.points_m.iter().flatten().chain(self.normals.iter().flatten()).chain(self.texcoords.iter().flatten())
+        for number in self
+            .points_m
+            .iter()
+            .flatten()
+            .chain(self.normals.iter().flatten())
+            .chain(self.texcoords.iter().flatten())
         {
             bytes.extend(number.to_le_bytes());
         }
@@ -208,7 +275,8 @@ impl Mesh {
     }
 }
 
-/// Outward, right and up directions of a box's faces in the order +x, -x, +y, -y, +z, -z; sides are upright.
+/// Outward, right and up directions of a box's faces in the order +x, -x, +y, -y, +z, -z; sides are
+/// upright.
 pub(crate) const BOX_FACES: [([f64; 3], [f64; 3], [f64; 3]); 6] = [
     ([1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]),
     ([-1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]),
@@ -225,9 +293,12 @@ pub(crate) fn sphere_direction(down: f64, around: f64) -> Vector3<f64> {
     Vector3::new(sin_down * cos_around, sin_down * sin_around, cos_down)
 }
 
-/// Outward normal of an ellipsoid at the point that corresponds to `direction` on the unit sphere; the half axes are
-/// perpendicular.
-pub(crate) fn ellipsoid_normal(half_axes: &[Vector3<f64>; 3], direction: &Vector3<f64>) -> Vector3<f64> {
+/// Outward normal of an ellipsoid at the point that corresponds to `direction` on the unit sphere;
+/// the half axes are perpendicular.
+pub(crate) fn ellipsoid_normal(
+    half_axes: &[Vector3<f64>; 3],
+    direction: &Vector3<f64>,
+) -> Vector3<f64> {
     let sum = half_axes[0] * (direction.x / half_axes[0].norm_squared())
         + half_axes[1] * (direction.y / half_axes[1].norm_squared())
         + half_axes[2] * (direction.z / half_axes[2].norm_squared());

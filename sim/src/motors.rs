@@ -26,7 +26,10 @@ struct SharedStates {
 impl Default for MotorHistory {
     fn default() -> Self {
         let history = Mutex::new(JointHistory::new(MAX_GAP, MAX_STATES));
-        Self(Arc::new(SharedStates { history, arrived: Condvar::new() }))
+        Self(Arc::new(SharedStates {
+            history,
+            arrived: Condvar::new(),
+        }))
     }
 }
 
@@ -68,10 +71,19 @@ impl MotorizedArm {
 
     /// Joint positions at a simulated time; `None` if the motors do not cover it.
     pub(crate) fn position_at(&self, nanos: i64) -> Option<Joints> {
-        let state = self.motors.0.history.lock().at(Stamp(self.start.0 + nanos)).ok()?;
+        let state = self
+            .motors
+            .0
+            .history
+            .lock()
+            .at(Stamp(self.start.0 + nanos))
+            .ok()?;
         let mut position_rad = Joints::zeros();
-        for (value_ix, (joint_ix, position)) in self.joint_ixs.iter().zip(&state.position).enumerate() {
-            position_rad[*joint_ix] = position + self.joint_offsets.get(value_ix).copied().unwrap_or(0.0);
+        for (value_ix, (joint_ix, position)) in
+            self.joint_ixs.iter().zip(&state.position).enumerate()
+        {
+            position_rad[*joint_ix] =
+                position + self.joint_offsets.get(value_ix).copied().unwrap_or(0.0);
         }
         Some(position_rad)
     }

@@ -1,10 +1,14 @@
 //! Noise of color and depth images, and the holes of depth images.
-#![expect(clippy::cast_possible_truncation, reason = "values are clamped before they become integers")]
+#![expect(
+    clippy::cast_possible_truncation,
+    reason = "values are clamped before they become integers"
+)]
 
 use crate::config::{DepthConfig, SensorConfig};
 use crate::random::RandomStream;
 use rayon::prelude::{
-    IndexedParallelIterator, IntoParallelRefMutIterator, ParallelIterator, ParallelSlice, ParallelSliceMut,
+    IndexedParallelIterator, IntoParallelRefMutIterator, ParallelIterator, ParallelSlice,
+    ParallelSliceMut,
 };
 
 /// Rounds colors to bytes.
@@ -17,38 +21,57 @@ fn to_byte(value: f32) -> u8 {
 }
 
 /// Adds shot and read noise to `[height, width, 3]` colors of 0 to 255.
-pub(crate) fn add_color_noise(colors: &[f32], sensor: &SensorConfig, random: RandomStream) -> Vec<u8> {
+pub(crate) fn add_color_noise(
+    colors: &[f32],
+    sensor: &SensorConfig,
+    random: RandomStream,
+) -> Vec<u8> {
     const PIXELS_A_CHUNK: usize = 640;
     let sigma: [f32; 256] = std::array::from_fn(|level| noise_sigma(sensor, level as f64) as f32);
     let mut bytes = vec![0; colors.len()];
-    bytes.par_chunks_mut(3 * PIXELS_A_CHUNK).zip(colors.par_chunks(3 * PIXELS_A_CHUNK)).enumerate().for_each(
-        |(chunk, (bytes, colors))| {
-            for (ix, (bytes, colors)) in bytes.chunks_exact_mut(3).zip(colors.chunks_exact(3)).enumerate() {
+    bytes
+        .par_chunks_mut(3 * PIXELS_A_CHUNK)
+        .zip(colors.par_chunks(3 * PIXELS_A_CHUNK))
+        .enumerate()
+        .for_each(|(chunk, (bytes, colors))| {
+            for (ix, (bytes, colors)) in bytes
+                .chunks_exact_mut(3)
+                .zip(colors.chunks_exact(3))
+                .enumerate()
+            {
                 let normals = random.normals((chunk * PIXELS_A_CHUNK + ix) as u64);
                 for channel in 0..3 {
                     let level = usize::from(to_byte(colors[channel]));
                     bytes[channel] = to_byte(colors[channel] + sigma[level] * normals[channel]);
                 }
             }
-        },
-    );
+        });
     bytes
 }
 
 /// Standard deviation of the noise at a level of 0 to 255.
 pub(crate) fn noise_sigma(sensor: &SensorConfig, level: f64) -> f64 {
     const MID_GRAY: f64 = 128.0;
-    sensor.noise_sigma * (1.0 - sensor.shot_frac + sensor.shot_frac * level / MID_GRAY).max(0.0).sqrt()
+    sensor.noise_sigma
+        * (1.0 - sensor.shot_frac + sensor.shot_frac * level / MID_GRAY)
+            .max(0.0)
+            .sqrt()
 }
 
 /// PSNR in dB of bytes against colors rounded to bytes; infinite if they are equal.
 pub(crate) fn psnr(bytes: &[u8], colors: &[f32]) -> f64 {
     const SAMPLES_A_CHUNK: usize = 4096;
     // Chunks, so that the innermost loop runs over slices.
-    let squares = bytes.par_chunks(SAMPLES_A_CHUNK).zip(colors.par_chunks(SAMPLES_A_CHUNK)).map(|(bytes, colors)| {
-        let squares = bytes.iter().zip(colors).map(|(byte, color)| u32::from(byte.abs_diff(to_byte(*color))).pow(2));
-        u64::from(squares.sum::<u32>())
-    });
+    let squares = bytes
+        .par_chunks(SAMPLES_A_CHUNK)
+        .zip(colors.par_chunks(SAMPLES_A_CHUNK))
+        .map(|(bytes, colors)| {
+            let squares = bytes
+                .iter()
+                .zip(colors)
+                .map(|(byte, color)| u32::from(byte.abs_diff(to_byte(*color))).pow(2));
+            u64::from(squares.sum::<u32>())
+        });
     let mean_square = squares.sum::<u64>() as f64 / bytes.len() as f64;
     10.0 * (255.0 * 255.0 / mean_square).log10()
 }
@@ -61,11 +84,23 @@ pub(crate) fn depth_counts(
     random: RandomStream,
     ideal: bool,
 ) -> Vec<u16> {
-    let in_range = |meters: f32| f64::from(meters) >= depth.min_m && f64::from(meters) <= depth.max_m;
-    let to_count =
-        |meters: f64| ((meters / (depth.factor * depth.meters_per_count)).clamp(0.0, f64::from(u16::MAX)) + 0.5) as u16;
+    let in_range =
+        |meters: f32| f64::from(meters) >= depth.min_m && f64::from(meters) <= depth.max_m;
+    let to_count = |meters: f64| {
+        ((meters / (depth.factor * depth.meters_per_count)).clamp(0.0, f64::from(u16::MAX)) + 0.5)
+            as u16
+    };
     if ideal {
-        return depth_m.iter().map(|&meters| if in_range(meters) { to_count(meters.into()) } else { 0 }).collect();
+        return depth_m
+            .iter()
+            .map(|&meters| {
+                if in_range(meters) {
+                    to_count(meters.into())
+                } else {
+                    0
+                }
+            })
+            .collect();
     }
     let holes = Holes::new(depth_m, width, depth.hole_frac, random);
     let mut counts = vec![0; depth_m.len()];
@@ -80,7 +115,8 @@ pub(crate) fn depth_counts(
     counts
 }
 
-/// Pixels at which a stereo camera finds no match: next to depth edges first, then in small clusters.
+/// Pixels at which a stereo camera finds no match: next to depth edges first, then in small
+/// clusters.
 struct Holes {
     is_edge: Vec<bool>,
     width: usize,
@@ -107,8 +143,15 @@ impl Holes {
         let n_holes_target = hole_frac * depth_m.len() as f64;
         let edge_share = (0.7 * n_holes_target / n_edge.max(1.0)).min(MAX_EDGE_SHARE);
         let n_rest = depth_m.len() as f64 - n_edge;
-        let cluster_share = ((n_holes_target - edge_share * n_edge) / n_rest.max(1.0)).clamp(0.0, 1.0);
-        Self { is_edge, width, random, edge_share, cluster_share }
+        let cluster_share =
+            ((n_holes_target - edge_share * n_edge) / n_rest.max(1.0)).clamp(0.0, 1.0);
+        Self {
+            is_edge,
+            width,
+            random,
+            edge_share,
+            cluster_share,
+        }
     }
 
     fn contains(&self, ix: usize) -> bool {
@@ -121,8 +164,8 @@ impl Holes {
     }
 }
 
-/// Marks the pixels of a row within two pixels of a depth jump. There, the surface is visible to only one of the two
-/// imagers.
+/// Marks the pixels of a row within two pixels of a depth jump. There, the surface is visible to
+/// only one of the two imagers.
 fn mark_edges(is_edge: &mut [bool], depth_m: &[f32]) {
     const EDGE_RADIUS_PX: usize = 2;
     const JUMP_FRAC: f32 = 0.03;
@@ -144,10 +187,17 @@ mod tests {
             let bytes = add_color_noise(&colors, &sensor, RandomStream::new(1, &[2]));
             let n = bytes.len() as f64;
             let mean = bytes.iter().map(|byte| f64::from(*byte)).sum::<f64>() / n;
-            let variance = bytes.iter().map(|byte| (f64::from(*byte) - mean).powi(2)).sum::<f64>() / n;
+            let variance = bytes
+                .iter()
+                .map(|byte| (f64::from(*byte) - mean).powi(2))
+                .sum::<f64>()
+                / n;
             // Rounding to bytes adds a variance of 1/12.
             let expected = noise_sigma(&sensor, level).powi(2) + 1.0 / 12.0;
-            assert!((variance / expected - 1.0).abs() < 0.03, "{level}: {variance} against {expected}");
+            assert!(
+                (variance / expected - 1.0).abs() < 0.03,
+                "{level}: {variance} against {expected}"
+            );
             assert!((mean - level).abs() < 0.05);
         }
         assert!((noise_sigma(&sensor, 128.0) - 2.0).abs() < 1e-12);
@@ -158,13 +208,23 @@ mod tests {
         let depth = DepthConfig::default();
         let plane = vec![1.0_f32; 640 * 480];
         let counts = depth_counts(&plane, 640, &depth, RandomStream::new(1, &[3]), false);
-        let meters: Vec<f64> =
-            counts.iter().filter(|count| **count > 0).map(|count| f64::from(*count) * 1e-4).collect();
+        let meters: Vec<f64> = counts
+            .iter()
+            .filter(|count| **count > 0)
+            .map(|count| f64::from(*count) * 1e-4)
+            .collect();
         let holes = 1.0 - meters.len() as f64 / plane.len() as f64;
-        let sigma = (meters.iter().map(|z| (z - 1.0).powi(2)).sum::<f64>() / meters.len() as f64).sqrt();
+        let sigma =
+            (meters.iter().map(|z| (z - 1.0).powi(2)).sum::<f64>() / meters.len() as f64).sqrt();
         assert!((holes - 0.02).abs() < 0.003, "{holes}");
         assert!((sigma - 0.0015).abs() < 0.00005, "{sigma}");
-        let near = depth_counts(&[0.05, 7.0, 0.5], 3, &depth, RandomStream::new(1, &[3]), true);
+        let near = depth_counts(
+            &[0.05, 7.0, 0.5],
+            3,
+            &depth,
+            RandomStream::new(1, &[3]),
+            true,
+        );
         assert_eq!(near, [0, 0, 5000]);
     }
 }

@@ -27,7 +27,11 @@ const CORNER_XY_M: [f64; 2] = [TARGET_XY_M[0] + 0.42, 0.0];
 
 fn on_table(x_m: f64, y_m: f64, above_m: f64, yaw_degrees: f64) -> Transform {
     Transform::from_parts(
-        Translation3::new(TARGET_XY_M[0] + x_m, TARGET_XY_M[1] + y_m, TABLE_Z_M + above_m),
+        Translation3::new(
+            TARGET_XY_M[0] + x_m,
+            TARGET_XY_M[1] + y_m,
+            TABLE_Z_M + above_m,
+        ),
         UnitQuaternion::from_axis_angle(&Vector3::z_axis(), yaw_degrees.to_radians()),
     )
 }
@@ -37,13 +41,16 @@ pub fn world_from_cube() -> Transform {
     on_table(-0.035, 0.062, CUBE_HALF_M, 28.0)
 }
 
-/// Pose of a tag on the cube by its id, 0 to 5: x points right on the printed tag, y down, z into the cube.
+/// Pose of a tag on the cube by its id, 0 to 5: x points right on the printed tag, y down, z into
+/// the cube.
 pub fn world_from_tag(id: usize) -> Transform {
     let (outward, right, up) = BOX_FACES[id];
     let [outward, right, up] = [outward, right, up].map(Vector3::from);
     let axes = Rotation3::from_matrix_unchecked(Matrix3::from_columns(&[right, -up, -outward]));
-    let cube_from_tag =
-        Transform::from_parts(Translation3::from(outward * CUBE_HALF_M), UnitQuaternion::from_rotation_matrix(&axes));
+    let cube_from_tag = Transform::from_parts(
+        Translation3::from(outward * CUBE_HALF_M),
+        UnitQuaternion::from_rotation_matrix(&axes),
+    );
     world_from_cube() * cube_from_tag
 }
 
@@ -60,12 +67,19 @@ fn table_center() -> Point3<f64> {
     Point3::new(TABLE_FRONT_X_M + TABLE_HALF_XY_M[0], 0.0, TABLE_Z_M)
 }
 
-/// Pose of the wall on the +y side (1) or -y side (-1): x points into the room, z up. From the corner behind the table,
-/// both walls run toward the robot at 45 degrees.
+/// Pose of the wall on the +y side (1) or -y side (-1): x points into the room, z up. From the
+/// corner behind the table, both walls run toward the robot at 45 degrees.
 fn world_from_wall(side: f64) -> Transform {
     let half = WALL_HALF_M[0] * std::f64::consts::FRAC_1_SQRT_2;
-    let center = Translation3::new(CORNER_XY_M[0] - half, CORNER_XY_M[1] + side * half, TABLE_Z_M + WALL_HALF_M[1]);
-    Transform::from_parts(center, UnitQuaternion::from_axis_angle(&Vector3::z_axis(), -side * 135f64.to_radians()))
+    let center = Translation3::new(
+        CORNER_XY_M[0] - half,
+        CORNER_XY_M[1] + side * half,
+        TABLE_Z_M + WALL_HALF_M[1],
+    );
+    Transform::from_parts(
+        center,
+        UnitQuaternion::from_axis_angle(&Vector3::z_axis(), -side * 135f64.to_radians()),
+    )
 }
 
 /// A mesh with the name of its texture or plain material.
@@ -78,16 +92,35 @@ pub(crate) struct Object {
 
 /// All objects except the arm.
 pub(crate) fn objects() -> Vec<Object> {
-    let object = |name, material, mesh, world_from_mesh| Object { name, material, mesh, world_from_mesh };
+    let object = |name, material, mesh, world_from_mesh| Object {
+        name,
+        material,
+        mesh,
+        world_from_mesh,
+    };
     let occluders = occluders();
     let toy_light = |point: &Point3<f64>, normal: &Vector3<f64>, name: u64| {
-        occluders.light_frac(&(world_from_toy() * point), &(world_from_toy() * normal), name)
+        occluders.light_frac(
+            &(world_from_toy() * point),
+            &(world_from_toy() * normal),
+            name,
+        )
     };
     let sides: [_; 6] = std::array::from_fn(texture::side_rectangle);
     let here = Transform::identity();
     vec![
-        object("cube", "tags", Mesh::cuboid([CUBE_HALF_M; 3], &sides), world_from_cube()),
-        object("block", "wood", Mesh::cuboid(BLOCK_HALF_M, &sides), world_from_block()),
+        object(
+            "cube",
+            "tags",
+            Mesh::cuboid([CUBE_HALF_M; 3], &sides),
+            world_from_cube(),
+        ),
+        object(
+            "block",
+            "wood",
+            Mesh::cuboid(BLOCK_HALF_M, &sides),
+            world_from_block(),
+        ),
         object("toy_body", "fur", toy::body(&toy_light), world_from_toy()),
         object("toy_fur", "fur", toy::fur(&toy_light), world_from_toy()),
         object("table_top", "metal", table_top(), here),
@@ -105,13 +138,25 @@ pub(crate) fn textures() -> Vec<(&'static str, Texture)> {
     for (wall, side) in [(&mut brick, 1.0), (&mut plaster, -1.0)] {
         let world_from_wall = world_from_wall(side);
         wall.shade(WHOLE, 160, |u, v, name| {
-            let point = Point3::new(0.0, (2.0 * u - 1.0) * WALL_HALF_M[0], (1.0 - 2.0 * v) * WALL_HALF_M[1]);
-            occluders.light_frac(&(world_from_wall * point), &(world_from_wall * Vector3::x()), name)
+            let point = Point3::new(
+                0.0,
+                (2.0 * u - 1.0) * WALL_HALF_M[0],
+                (1.0 - 2.0 * v) * WALL_HALF_M[1],
+            );
+            occluders.light_frac(
+                &(world_from_wall * point),
+                &(world_from_wall * Vector3::x()),
+                name,
+            )
         });
     }
     let mut metal = texture::metal_table([2.0 * TABLE_HALF_XY_M[1], 2.0 * TABLE_HALF_XY_M[0]]);
     metal.shade(WHOLE, 400, |u, v, name| {
-        let right_up = Vector3::new((1.0 - 2.0 * v) * TABLE_HALF_XY_M[0], (1.0 - 2.0 * u) * TABLE_HALF_XY_M[1], 0.0);
+        let right_up = Vector3::new(
+            (1.0 - 2.0 * v) * TABLE_HALF_XY_M[0],
+            (1.0 - 2.0 * u) * TABLE_HALF_XY_M[1],
+            0.0,
+        );
         occluders.light_frac(&(table_center() + right_up), &Vector3::z(), name)
     });
     let [mut wood, mut tags] = [texture::wood(), texture::tags()];
@@ -128,7 +173,12 @@ pub(crate) fn textures() -> Vec<(&'static str, Texture)> {
     ]
 }
 
-pub(crate) fn shade_box(texture: &mut Texture, occluders: &Occluders, half_m: [f64; 3], world_from_box: &Transform) {
+pub(crate) fn shade_box(
+    texture: &mut Texture,
+    occluders: &Occluders,
+    half_m: [f64; 3],
+    world_from_box: &Transform,
+) {
     for side in 0..6 {
         texture.shade(texture::side_rectangle(side), 40, |u, v, name| {
             let (point, normal) = Mesh::on_cuboid(half_m, side, u, v);
@@ -146,22 +196,38 @@ fn occluders() -> Occluders {
     occluders.add_box(world_from_block(), BLOCK_HALF_M);
     let table = table_center() - Vector3::new(0.0, 0.0, TABLE_HALF_THICKNESS_M);
     let [half_x, half_y] = TABLE_HALF_XY_M;
-    occluders.add_box(Translation3::from(table.coords).into(), [half_x, half_y, TABLE_HALF_THICKNESS_M]);
+    occluders.add_box(
+        Translation3::from(table.coords).into(),
+        [half_x, half_y, TABLE_HALF_THICKNESS_M],
+    );
     for side in [1.0, -1.0] {
-        let world_from_box = world_from_wall(side) * Translation3::new(-WALL_HALF_THICKNESS_M, 0.0, 0.0);
-        occluders.add_box(world_from_box, [WALL_HALF_THICKNESS_M, WALL_HALF_M[0], WALL_HALF_M[1]]);
+        let world_from_box =
+            world_from_wall(side) * Translation3::new(-WALL_HALF_THICKNESS_M, 0.0, 0.0);
+        occluders.add_box(
+            world_from_box,
+            [WALL_HALF_THICKNESS_M, WALL_HALF_M[0], WALL_HALF_M[1]],
+        );
     }
     let world_from_toy = world_from_toy();
     let (center, radius_m) = toy::bounds();
-    let ellipsoids = toy::ellipsoids()
-        .map(|(center, half_axes)| (world_from_toy * center, half_axes.map(|axis| world_from_toy * axis)));
+    let ellipsoids = toy::ellipsoids().map(|(center, half_axes)| {
+        (
+            world_from_toy * center,
+            half_axes.map(|axis| world_from_toy * axis),
+        )
+    });
     occluders.add_ellipsoids(ellipsoids, (world_from_toy * center, radius_m));
     occluders
 }
 
 fn table_top() -> Mesh {
     let mut mesh = Mesh::default();
-    mesh.rectangle(table_center(), Vector3::y() * -TABLE_HALF_XY_M[1], Vector3::x() * TABLE_HALF_XY_M[0], WHOLE);
+    mesh.rectangle(
+        table_center(),
+        Vector3::y() * -TABLE_HALF_XY_M[1],
+        Vector3::x() * TABLE_HALF_XY_M[0],
+        WHOLE,
+    );
     mesh
 }
 
@@ -175,17 +241,35 @@ fn wall() -> Mesh {
 
 fn floor() -> Mesh {
     let mut mesh = Mesh::default();
-    mesh.rectangle(Point3::new(0.5, 0.0, -0.75), Vector3::x() * 3.0, Vector3::y() * 3.0, [0.0, 0.0, 4.0, 4.0]);
+    mesh.rectangle(
+        Point3::new(0.5, 0.0, -0.75),
+        Vector3::x() * 3.0,
+        Vector3::y() * 3.0,
+        [0.0, 0.0, 4.0, 4.0],
+    );
     mesh
 }
 
 /// The robot's pedestal, and the table's edge and legs.
 fn frame() -> Mesh {
     let mut mesh = Mesh::default();
-    mesh.append(Mesh::cuboid([0.15, 0.15, 0.36], &[WHOLE; 6]), Vector3::new(-0.02, 0.0, -0.365));
-    let slab = Mesh::cuboid([TABLE_HALF_XY_M[0], TABLE_HALF_XY_M[1], TABLE_HALF_THICKNESS_M], &[WHOLE; 6]);
+    mesh.append(
+        Mesh::cuboid([0.15, 0.15, 0.36], &[WHOLE; 6]),
+        Vector3::new(-0.02, 0.0, -0.365),
+    );
+    let slab = Mesh::cuboid(
+        [
+            TABLE_HALF_XY_M[0],
+            TABLE_HALF_XY_M[1],
+            TABLE_HALF_THICKNESS_M,
+        ],
+        &[WHOLE; 6],
+    );
     // Slightly below the top, to avoid z-fighting.
-    mesh.append(slab, table_center().coords - Vector3::new(0.0, 0.0, TABLE_HALF_THICKNESS_M + 1e-4));
+    mesh.append(
+        slab,
+        table_center().coords - Vector3::new(0.0, 0.0, TABLE_HALF_THICKNESS_M + 1e-4),
+    );
     for (x, y) in [(-1.0, -1.0), (-1.0, 1.0), (1.0, -1.0), (1.0, 1.0)] {
         let corner = table_center() + Vector3::new(x * 0.36, y * 0.42, -0.45);
         mesh.append(Mesh::cuboid([0.02, 0.02, 0.41], &[WHOLE; 6]), corner.coords);

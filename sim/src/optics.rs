@@ -1,5 +1,8 @@
 //! Converts rendered pinhole images to sensor images: lens, rolling shutter, motion blur.
-#![expect(clippy::cast_possible_truncation, reason = "pixel positions are clamped to the picture before the cast")]
+#![expect(
+    clippy::cast_possible_truncation,
+    reason = "pixel positions are clamped to the picture before the cast"
+)]
 
 use crate::Error;
 use crate::config::CameraConfig;
@@ -35,7 +38,11 @@ pub(crate) struct RowMotion {
 impl RowMotion {
     pub(crate) fn new(drawn_from_camera: &Transform) -> Self {
         Self {
-            rotation_matrix: drawn_from_camera.rotation.to_rotation_matrix().matrix().cast(),
+            rotation_matrix: drawn_from_camera
+                .rotation
+                .to_rotation_matrix()
+                .matrix()
+                .cast(),
             translation_m: drawn_from_camera.translation.vector.cast(),
         }
     }
@@ -48,7 +55,12 @@ const SAME_DEPTH_FRAC: f32 = 0.005;
 
 impl Optics {
     pub(crate) fn new(camera: &CameraConfig, is_motion_free: bool) -> Result<Self, Error> {
-        Self::with_lens(camera, &camera.intrinsics, camera.sensor.supersample, is_motion_free)
+        Self::with_lens(
+            camera,
+            &camera.intrinsics,
+            camera.sensor.supersample,
+            is_motion_free,
+        )
     }
 
     /// Optics of another sensor in the same camera.
@@ -64,16 +76,21 @@ impl Optics {
         for row in 0..height {
             for column in 0..width {
                 let pixel = [f64::from(column) + 0.5, f64::from(row) + 0.5];
-                let point =
-                    intrinsics.unproject(pixel).ok_or_else(|| Error::Lens { camera: camera.name.clone(), pixel })?;
+                let point = intrinsics.unproject(pixel).ok_or_else(|| Error::Lens {
+                    camera: camera.name.clone(),
+                    pixel,
+                })?;
                 rays.push([point.x as f32, point.y as f32]);
             }
         }
-        // Rolling shutter and blur show content from outside the image: a few pixels at the speeds of the arm.
+        // Rolling shutter and blur show content from outside the image: a few pixels at the speeds
+        // of the arm.
         let margin_px = if is_motion_free { 0 } else { 4 + height / 60 };
         let mut optics = Self {
             view_size_px: [0; 2],
-            view_focal_px: intrinsics.focal_px.map(|focal| focal * f64::from(supersample)),
+            view_focal_px: intrinsics
+                .focal_px
+                .map(|focal| focal * f64::from(supersample)),
             view_principal_px: [0.0; 2],
             drawn_pinhole_px: [[0.0; 2]; 2],
             intrinsics,
@@ -89,8 +106,8 @@ impl Optics {
             let extent = ((last - first) * optics.view_focal_px[axis] + 2.0 * margin - 1e-2).ceil();
             optics.view_size_px[axis] = extent.clamp(1.0, f64::from(MAX_VIEW_PX)) as u32;
         }
-        optics.drawn_pinhole_px =
-            [optics.view_focal_px, optics.view_principal_px].map(|pair| pair.map(|value| value as f32));
+        optics.drawn_pinhole_px = [optics.view_focal_px, optics.view_principal_px]
+            .map(|pair| pair.map(|value| value as f32));
         Ok(optics)
     }
 
@@ -98,11 +115,19 @@ impl Optics {
     fn bounds(&self, axis: usize) -> (f64, f64) {
         let half_pixel = 0.5 / self.intrinsics.focal_px[axis];
         if self.intrinsics.is_pinhole() {
-            let [principal, focal] = [self.intrinsics.principal_px[axis], self.intrinsics.focal_px[axis]];
-            return (-principal / focal, (f64::from(self.intrinsics.size_px[axis]) - principal) / focal);
+            let [principal, focal] = [
+                self.intrinsics.principal_px[axis],
+                self.intrinsics.focal_px[axis],
+            ];
+            return (
+                -principal / focal,
+                (f64::from(self.intrinsics.size_px[axis]) - principal) / focal,
+            );
         }
         let values = self.rays.iter().map(|ray| f64::from(ray[axis]));
-        let (first, last) = values.fold((f64::MAX, f64::MIN), |(first, last), x| (first.min(x), last.max(x)));
+        let (first, last) = values.fold((f64::MAX, f64::MIN), |(first, last), x| {
+            (first.min(x), last.max(x))
+        });
         (first - half_pixel, last + half_pixel)
     }
 
@@ -112,7 +137,12 @@ impl Optics {
     }
 
     /// The view to render for a pose. The robot is not drawn.
-    pub(crate) fn view(&self, world_from_camera: Transform, robot: Option<RobotPose>, light_frac: f64) -> View {
+    pub(crate) fn view(
+        &self,
+        world_from_camera: Transform,
+        robot: Option<RobotPose>,
+        light_frac: f64,
+    ) -> View {
         View {
             size_px: self.view_size_px,
             focal_px: self.view_focal_px,
@@ -158,15 +188,17 @@ impl Optics {
 
     /// Color of each pixel, averaged over the instants at which its row is exposed.
     ///
-    /// `row_motions` holds all motions of the first row, then of the second, and so on. Each pixel's ray is traced into
-    /// the rendered image with the rendered depth, so surfaces have the correct positions. The exception is a strip
-    /// next to each depth edge, as wide as the parallax during the readout, which repeats the adjacent content.
+    /// `row_motions` holds all motions of the first row, then of the second, and so on. Each
+    /// pixel's ray is traced into the rendered image with the rendered depth, so surfaces have the
+    /// correct positions. The exception is a strip next to each depth edge, as wide as the parallax
+    /// during the readout, which repeats the adjacent content.
     pub(crate) fn motion_blurred(&self, picture: &Picture, row_motions: &[RowMotion]) -> Vec<f32> {
         let n_samples = row_motions.len() / self.intrinsics.size_px[1] as usize;
         let share = 1.0 / n_samples as f32;
         self.expose(|row, colors| {
             for row_motion in &row_motions[row * n_samples..(row + 1) * n_samples] {
-                // The search starts at the offset of the previous pixel, because neighboring offsets are almost equal.
+                // The search starts at the offset of the previous pixel, because neighboring
+                // offsets are almost equal.
                 let mut offset_px = [0.0; 2];
                 for (color, ray) in colors.iter_mut().zip(self.row_of_rays(row)) {
                     let static_px = self.drawn_from_ray(ray);
@@ -190,11 +222,14 @@ impl Optics {
     pub(crate) fn depth_m(&self, picture: &Picture) -> Vec<f32> {
         let [width, height] = self.intrinsics.size_px.map(|side| side as usize);
         let mut depth_m = vec![0.0; width * height];
-        depth_m.par_chunks_mut(width).enumerate().for_each(|(row, line)| {
-            for (depth, ray) in line.iter_mut().zip(self.row_of_rays(row)) {
-                *depth = self.depth_at(picture, self.drawn_from_ray(ray));
-            }
-        });
+        depth_m
+            .par_chunks_mut(width)
+            .enumerate()
+            .for_each(|(row, line)| {
+                for (depth, ray) in line.iter_mut().zip(self.row_of_rays(row)) {
+                    *depth = self.depth_at(picture, self.drawn_from_ray(ray));
+                }
+            });
         depth_m
     }
 
@@ -206,7 +241,10 @@ impl Optics {
     fn expose(&self, paint: impl Fn(usize, &mut [[f32; 3]]) + Sync) -> Vec<f32> {
         let [width, height] = self.intrinsics.size_px.map(|side| side as usize);
         let mut colors = vec![[0.0; 3]; width * height];
-        colors.par_chunks_mut(width).enumerate().for_each(|(row, line)| paint(row, line));
+        colors
+            .par_chunks_mut(width)
+            .enumerate()
+            .for_each(|(row, line)| paint(row, line));
         colors.into_flattened()
     }
 
@@ -216,14 +254,22 @@ impl Optics {
         [ray[0] * focal_x + center_x, ray[1] * focal_y + center_y]
     }
 
-    /// Intersects a ray of the moved camera with the rendered surface, starting from an initial guess.
-    fn trace_pixel(&self, picture: &Picture, row_motion: &RowMotion, ray: &[f32; 2], guess: [f32; 2]) -> [f32; 2] {
+    /// Intersects a ray of the moved camera with the rendered surface, starting from an initial
+    /// guess.
+    fn trace_pixel(
+        &self,
+        picture: &Picture,
+        row_motion: &RowMotion,
+        ray: &[f32; 2],
+        guess: [f32; 2],
+    ) -> [f32; 2] {
         let direction = row_motion.rotation_matrix * Vector3::new(ray[0], ray[1], 1.0);
         let mut depth = nearest_depth(picture, guess);
         let mut drawn = guess;
         for _ in 0..MAX_CORRECTIONS {
             let along = (depth - row_motion.translation_m.z) / direction.z;
-            let at = |axis: usize| (direction[axis] * along + row_motion.translation_m[axis]) / depth;
+            let at =
+                |axis: usize| (direction[axis] * along + row_motion.translation_m[axis]) / depth;
             drawn = self.drawn_from_ray(&[at(0), at(1)]);
             let found = nearest_depth(picture, drawn);
             let is_same = (found - depth).abs() < SAME_DEPTH_FRAC * depth;
@@ -266,8 +312,9 @@ impl Optics {
         sum.map(|channel| channel / area)
     }
 
-    /// Depth at a position in the rendered image: the mean of the four surrounding pixels if they lie on one surface,
-    /// else the smallest of the four depths. With odd supersampling, it is the depth of the pixel at this position.
+    /// Depth at a position in the rendered image: the mean of the four surrounding pixels if they
+    /// lie on one surface, else the smallest of the four depths. With odd supersampling, it is the
+    /// depth of the pixel at this position.
     fn depth_at(&self, picture: &Picture, at: [f32; 2]) -> f32 {
         /// Neighbors whose depths differ by more than this fraction belong to different surfaces.
         const SAME_SURFACE_FRAC: f32 = 0.01;
@@ -275,10 +322,15 @@ impl Optics {
             return nearest_depth(picture, at);
         }
         let around = [[-0.5, -0.5], [0.5, -0.5], [-0.5, 0.5], [0.5, 0.5]];
-        let depths = around.map(|[dx, dy]: [f32; 2]| nearest_depth(picture, [at[0] + dx, at[1] + dy]));
+        let depths =
+            around.map(|[dx, dy]: [f32; 2]| nearest_depth(picture, [at[0] + dx, at[1] + dy]));
         let nearest = depths.into_iter().fold(f32::MAX, f32::min);
         let furthest = depths.into_iter().fold(0.0, f32::max);
-        if furthest - nearest < SAME_SURFACE_FRAC * nearest { depths.iter().sum::<f32>() / 4.0 } else { nearest }
+        if furthest - nearest < SAME_SURFACE_FRAC * nearest {
+            depths.iter().sum::<f32>() / 4.0
+        } else {
+            nearest
+        }
     }
 }
 
@@ -291,8 +343,16 @@ fn between_pixels(picture: &Picture, at: [f32; 2]) -> [f32; 3] {
     let (fx, fy) = (x - column as f32, y - row as f32);
     let stride = 3 * width as usize;
     let start = row * stride + 3 * column;
-    let (above, below) = (&picture.rgb[start..start + 6], &picture.rgb[start + stride..start + stride + 6]);
-    let weights = [(1.0 - fx) * (1.0 - fy), fx * (1.0 - fy), (1.0 - fx) * fy, fx * fy];
+    let (above, below) = (
+        &picture.rgb[start..start + 6],
+        &picture.rgb[start + stride..start + stride + 6],
+    );
+    let weights = [
+        (1.0 - fx) * (1.0 - fy),
+        fx * (1.0 - fy),
+        (1.0 - fx) * fy,
+        fx * fy,
+    ];
     std::array::from_fn(|channel| {
         weights[0] * f32::from(above[channel])
             + weights[1] * f32::from(above[channel + 3])

@@ -27,27 +27,51 @@ pub(crate) struct Printed {
 /// Draws a target.
 pub(crate) fn print(config: &TargetConfig) -> Result<Printed, Error> {
     let target = config.target()?;
-    let failed = |source| Error::DrawTarget { target: config.name.clone(), source };
+    let failed = |source| Error::DrawTarget {
+        target: config.name.clone(),
+        source,
+    };
     // First rasterize at 1 px per mm to get the size.
     let coarse = target.raster(1000.0).map_err(failed)?;
     let longest_px = coarse.size_px.into_iter().max().unwrap_or(1);
-    let picture = target.raster(1000.0 * f64::from(SIDE_PX - 1) / f64::from(longest_px)).map_err(failed)?;
-    let png = png(&picture).map_err(|source| Error::Texture { name: config.name.clone(), source })?;
+    let picture = target
+        .raster(1000.0 * f64::from(SIDE_PX - 1) / f64::from(longest_px))
+        .map_err(failed)?;
+    let png = png(&picture).map_err(|source| Error::Texture {
+        name: config.name.clone(),
+        source,
+    })?;
 
     let side_m = |px: u32| f64::from(px) / picture.px_per_m;
     let half_m = picture.size_px.map(|px| 0.5 * side_m(px));
-    let center = Point3::new(picture.origin_m[0] + half_m[0], picture.origin_m[1] + half_m[1], 0.0);
+    let center = Point3::new(
+        picture.origin_m[0] + half_m[0],
+        picture.origin_m[1] + half_m[1],
+        0.0,
+    );
     let [right, bottom] = picture.size_px.map(|px| f64::from(px) / f64::from(SIDE_PX));
     let mut mesh = Mesh::default();
-    mesh.rectangle(center, Vector3::x() * half_m[0], Vector3::y() * -half_m[1], [0.0, 0.0, right, bottom]);
+    mesh.rectangle(
+        center,
+        Vector3::x() * half_m[0],
+        Vector3::y() * -half_m[1],
+        [0.0, 0.0, right, bottom],
+    );
     let mut plate = Mesh::default();
     let behind = center.coords + Vector3::z() * (GAP_M + 0.5 * PLATE_M);
-    plate.append(Mesh::cuboid([half_m[0], half_m[1], 0.5 * PLATE_M], &[WHOLE; 6]), behind);
+    plate.append(
+        Mesh::cuboid([half_m[0], half_m[1], 0.5 * PLATE_M], &[WHOLE; 6]),
+        behind,
+    );
     Ok(Printed { png, mesh, plate })
 }
 
 /// The picture at the top left of a square texture; the rest is paper.
-#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "between ink and paper")]
+#[expect(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "between ink and paper"
+)]
 fn png(picture: &Raster) -> Result<Vec<u8>, image::ImageError> {
     let shade = |white: u8| (INK + (PAPER - INK) * f64::from(white) / 255.0).round() as u8;
     let side = SIDE_PX as usize;
@@ -86,8 +110,16 @@ mod tests {
         let [x, y] = layout::TARGET_XY_M;
         let at = Vector3::new(x, y, layout::TABLE_Z_M + 0.06) - forward * 0.11 - rotation * center;
         let world_from_board = Transform::from_parts(at.into(), rotation.into());
-        let sensor = SensorConfig { supersample: 2, ..SensorConfig::default() };
-        let camera = CameraConfig { sensor, rate_hz: 1.0, depth: None, ..CameraConfig::wrist("wrist") };
+        let sensor = SensorConfig {
+            supersample: 2,
+            ..SensorConfig::default()
+        };
+        let camera = CameraConfig {
+            sensor,
+            rate_hz: 1.0,
+            depth: None,
+            ..CameraConfig::wrist("wrist")
+        };
         let config = Config {
             ideal: true,
             n_images: Some(6),
@@ -105,12 +137,29 @@ mod tests {
         let mut samples = rig.into_lockstep();
         let mut errors = Vec::new();
         while let Some(sample) = samples.next_sample().expect("the rig works") {
-            let Sample::Truth(TruthImage { image, world_from_camera, .. }) = sample else { continue };
+            let Sample::Truth(TruthImage {
+                image,
+                world_from_camera,
+                ..
+            }) = sample
+            else {
+                continue;
+            };
             let gray: Vec<u8> = image.data.chunks_exact(3).map(|rgb| rgb[1]).collect();
-            assert!(gray.iter().filter(|value| **value == u8::MAX).count() < gray.len() / 50, "overexposed");
-            let Ok(found) = target.detect(GrayImage { size_px: image.size_px, pixels: &gray }) else { continue };
+            assert!(
+                gray.iter().filter(|value| **value == u8::MAX).count() < gray.len() / 50,
+                "overexposed"
+            );
+            let Ok(found) = target.detect(GrayImage {
+                size_px: image.size_px,
+                pixels: &gray,
+            }) else {
+                continue;
+            };
             for corner in found.corners {
-                let point = world_from_camera.inverse() * world_from_board * Point3::from(corner.point_in_board);
+                let point = world_from_camera.inverse()
+                    * world_from_board
+                    * Point3::from(corner.point_in_board);
                 let pixel = intrinsics.project(&point.coords).expect("a pixel");
                 errors.push([corner.pixel[0] - pixel[0], corner.pixel[1] - pixel[1]]);
             }
@@ -133,9 +182,15 @@ mod tests {
             let n = errors.len() as f64;
             let mean = [0, 1].map(|axis| errors.iter().map(|error| error[axis]).sum::<f64>() / n);
             let rms = (errors.iter().map(|[x, y]| x * x + y * y).sum::<f64>() / n).sqrt();
-            assert!(errors.len() >= min_corners, "{spec}: only {n} corners detected");
+            assert!(
+                errors.len() >= min_corners,
+                "{spec}: only {n} corners detected"
+            );
             let is_unbiased = mean.iter().all(|mean| mean.abs() < MAX_BIAS_PX);
-            assert!(is_unbiased && rms < MAX_RMS_PX, "{spec}: bias {mean:?} px, RMS {rms} px");
+            assert!(
+                is_unbiased && rms < MAX_RMS_PX,
+                "{spec}: bias {mean:?} px, RMS {rms} px"
+            );
         }
     }
 }

@@ -1,4 +1,5 @@
-//! Random numbers that depend only on a key and a counter, so that any image can be reproduced independently.
+//! Random numbers that depend only on a key and a counter, so that any image can be reproduced
+//! independently.
 
 use kinematics::random::{hash, nth_bits, unit_from_bits};
 use std::sync::LazyLock;
@@ -12,7 +13,11 @@ pub(crate) struct RandomStream {
 impl RandomStream {
     /// The stream of a seed and the numbers that identify its use, such as camera and image.
     pub(crate) fn new(seed: u64, names: &[u64]) -> Self {
-        Self { key: names.iter().fold(hash(seed), |key, name| hash(key ^ hash(*name))) }
+        Self {
+            key: names
+                .iter()
+                .fold(hash(seed), |key, name| hash(key ^ hash(*name))),
+        }
     }
 
     /// 64 random bits at a counter.
@@ -40,7 +45,9 @@ impl RandomStream {
 
 /// Quantiles of the standard normal distribution at `(i + 1/2) / 4096`, scaled to variance 1.
 static QUANTILES: LazyLock<[f32; 4096]> = LazyLock::new(|| {
-    let quantiles: Vec<f64> = (0..4096).map(|ix| normal_quantile((f64::from(ix) + 0.5) / 4096.0)).collect();
+    let quantiles: Vec<f64> = (0..4096)
+        .map(|ix| normal_quantile((f64::from(ix) + 0.5) / 4096.0))
+        .collect();
     let scale = (quantiles.iter().map(|q| q * q).sum::<f64>() / 4096.0).sqrt();
     #[expect(clippy::cast_possible_truncation, reason = "a table in f32")]
     std::array::from_fn(|ix| (quantiles[ix] / scale) as f32)
@@ -81,11 +88,17 @@ mod tests {
     #[test]
     fn normals_are_standard_and_depend_on_key() {
         let random = RandomStream::new(7, &[1, 2]);
-        let numbers: Vec<f64> = (0..50_000).flat_map(|ix| random.normals(ix)).map(f64::from).collect();
+        let numbers: Vec<f64> = (0..50_000)
+            .flat_map(|ix| random.normals(ix))
+            .map(f64::from)
+            .collect();
         let n = numbers.len() as f64;
         let mean = numbers.iter().sum::<f64>() / n;
         let variance = numbers.iter().map(|x| (x - mean).powi(2)).sum::<f64>() / n;
-        assert!(mean.abs() < 0.01 && (variance - 1.0).abs() < 0.02, "mean {mean}, variance {variance}");
+        assert!(
+            mean.abs() < 0.01 && (variance - 1.0).abs() < 0.02,
+            "mean {mean}, variance {variance}"
+        );
         assert_ne!(RandomStream::new(7, &[1, 3]).bits(0), random.bits(0));
         assert_ne!(RandomStream::new(8, &[1, 2]).bits(0), random.bits(0));
     }

@@ -1,5 +1,8 @@
 //! Renders the scene on a separate thread with one OpenGL context for all cameras.
-#![expect(unsafe_code, reason = "the scene's cameras are set through MuJoCo's C structs")]
+#![expect(
+    unsafe_code,
+    reason = "the scene's cameras are set through MuJoCo's C structs"
+)]
 #![expect(clippy::cast_possible_truncation, reason = "OpenGL works in f32")]
 
 use crate::Error;
@@ -9,7 +12,8 @@ use crate::scene::ARM_GROUP;
 use crossbeam_channel::{Receiver, Sender, bounded};
 use kinematics::Transform;
 use mujoco_rs::prelude::{
-    MjData, MjModel, MjrContext, MjrRectangle, MjtObj, MjtRndFlag, MjvCamera, MjvOption, MjvPerturb, MjvScene,
+    MjData, MjModel, MjrContext, MjrRectangle, MjtObj, MjtRndFlag, MjvCamera, MjvOption,
+    MjvPerturb, MjvScene,
 };
 use mujoco_rs::wrappers::traits::ModelType;
 use nalgebra::Vector3;
@@ -80,7 +84,9 @@ impl Pending {
 }
 
 fn render_thread_stopped() -> Error {
-    Error::Stopped { reason: "it sent no image".to_owned() }
+    Error::Stopped {
+        reason: "it sent no image".to_owned(),
+    }
 }
 
 impl Renderer {
@@ -98,7 +104,11 @@ impl Renderer {
             })
             .map_err(Error::Thread)?;
         let name = started.recv().map_err(|_| render_thread_stopped())??;
-        Ok(Self { job_sender: Some(job_sender), thread: Some(thread), name })
+        Ok(Self {
+            job_sender: Some(job_sender),
+            thread: Some(thread),
+            name,
+        })
     }
 
     /// The renderer's name as reported by OpenGL.
@@ -110,7 +120,9 @@ impl Renderer {
     pub(crate) fn submit(&self, view: View) -> Result<Pending, Error> {
         let (reply, picture) = bounded(1);
         let job_sender = self.job_sender.as_ref().ok_or_else(render_thread_stopped)?;
-        job_sender.send(Job { view, reply }).map_err(|_| render_thread_stopped())?;
+        job_sender
+            .send(Job { view, reply })
+            .map_err(|_| render_thread_stopped())?;
         Ok(Pending(picture))
     }
 }
@@ -125,7 +137,8 @@ impl Drop for Renderer {
     }
 }
 
-/// Renders until the last sender is dropped. The context outlives everything that MuJoCo created in it.
+/// Renders until the last sender is dropped. The context outlives everything that MuJoCo created in
+/// it.
 fn draw_all(
     current: &HeadlessContext,
     model: &Arc<MjModel>,
@@ -134,8 +147,8 @@ fn draw_all(
     queue: &Receiver<Job>,
 ) {
     let mut canvas = Canvas::new(current, model, near_far_m);
-    // OpenGL drivers compile their shaders for the first image, which takes seconds on a busy processor. Without this
-    // warm-up, cameras would send nothing for that time.
+    // OpenGL drivers compile their shaders for the first image, which takes seconds on a busy
+    // processor. Without this warm-up, cameras would send nothing for that time.
     canvas.draw(&View::warm_up());
     // A closed channel means that the rig was dropped; `queue` is then closed as well.
     let _ = ready.send(Ok(current.renderer().to_owned()));
@@ -155,8 +168,13 @@ pub(crate) struct Canvas {
 
 impl Canvas {
     /// The context must outlive the canvas.
-    pub(crate) fn new(_current: &HeadlessContext, model: &Arc<MjModel>, near_far_m: [f64; 2]) -> Self {
-        // SAFETY: an OpenGL context is current on this thread until after the canvas is dropped; only this model is drawn.
+    pub(crate) fn new(
+        _current: &HeadlessContext,
+        model: &Arc<MjModel>,
+        near_far_m: [f64; 2],
+    ) -> Self {
+        // SAFETY: an OpenGL context is current on this thread until after the canvas is dropped;
+        // only this model is drawn.
         let mut context = unsafe { MjrContext::new(model) };
         context.offscreen();
         Self {
@@ -173,7 +191,8 @@ impl Canvas {
         self.draw_with(view, &options)
     }
 
-    /// The pixels at which MuJoCo's segmentation shows the robot; with nothing else in the scene if `is_alone`.
+    /// The pixels at which MuJoCo's segmentation shows the robot; with nothing else in the scene if
+    /// `is_alone`.
     pub(crate) fn robot_mask(&mut self, view: &View, is_alone: bool) -> Vec<bool> {
         let mut options = MjvOption::default();
         if is_alone {
@@ -184,12 +203,25 @@ impl Canvas {
         let picture = self.draw_with(view, &options);
         self.set_segmentation(false);
         let groups = self.data.model().geom_group();
-        let is_arm = |object: i32| usize::try_from(object).is_ok_and(|ix| groups[ix] == ARM_GROUP as i32);
-        let geoms = self.scene.geoms().iter().filter(|geom| geom.objtype == MjtObj::mjOBJ_GEOM as i32);
-        let arm: BTreeSet<i32> = geoms.filter(|geom| is_arm(geom.objid)).map(|geom| geom.segid).collect();
+        let is_arm =
+            |object: i32| usize::try_from(object).is_ok_and(|ix| groups[ix] == ARM_GROUP as i32);
+        let geoms = self
+            .scene
+            .geoms()
+            .iter()
+            .filter(|geom| geom.objtype == MjtObj::mjOBJ_GEOM as i32);
+        let arm: BTreeSet<i32> = geoms
+            .filter(|geom| is_arm(geom.objid))
+            .map(|geom| geom.segid)
+            .collect();
         // MuJoCo adds 1 to the number of each geometry; 0 is the background.
-        let number = |rgb: &[u8]| i32::from(rgb[0]) + (i32::from(rgb[1]) << 8) + (i32::from(rgb[2]) << 16);
-        picture.rgb.chunks_exact(3).map(|rgb| arm.contains(&(number(rgb) - 1))).collect()
+        let number =
+            |rgb: &[u8]| i32::from(rgb[0]) + (i32::from(rgb[1]) << 8) + (i32::from(rgb[2]) << 16);
+        picture
+            .rgb
+            .chunks_exact(3)
+            .map(|rgb| arm.contains(&(number(rgb) - 1)))
+            .collect()
     }
 
     fn set_segmentation(&mut self, is_on: bool) {
@@ -208,11 +240,21 @@ impl Canvas {
             set_base_pose(&mut self.data, &robot.world_from_base);
         }
         self.data.forward_kinematics();
-        self.scene.update(&mut self.data, options, &MjvPerturb::default(), &mut MjvCamera::default());
+        self.scene.update(
+            &mut self.data,
+            options,
+            &MjvPerturb::default(),
+            &mut MjvCamera::default(),
+        );
         self.set_view(view);
         self.scale_lights(view.light_frac as f32);
         let [width, height] = view.size_px;
-        let viewport = MjrRectangle::new(0, 0, i32::try_from(width).unwrap_or(0), i32::try_from(height).unwrap_or(0));
+        let viewport = MjrRectangle::new(
+            0,
+            0,
+            i32::try_from(width).unwrap_or(0),
+            i32::try_from(height).unwrap_or(0),
+        );
         self.scene.render(&viewport, &self.context);
         self.read(view.size_px, &viewport)
     }
@@ -224,7 +266,10 @@ impl Canvas {
         let in_f32 = |vector: Vector3<f64>| [vector.x as f32, vector.y as f32, vector.z as f32];
         let [width, height] = view.size_px.map(f64::from);
         let at_near = |pixels: f64, axis: usize| pixels * near / view.focal_px[axis];
-        let [left, right] = [at_near(-view.principal_px[0], 0), at_near(width - view.principal_px[0], 0)];
+        let [left, right] = [
+            at_near(-view.principal_px[0], 0),
+            at_near(width - view.principal_px[0], 0),
+        ];
         // SAFETY: only cameras and flags are written, and they contain only numbers.
         let scene = unsafe { self.scene.ffi_mut() };
         for camera in &mut scene.camera {
@@ -247,7 +292,12 @@ impl Canvas {
         let scene = unsafe { self.scene.ffi_mut() };
         let n_lamps = usize::try_from(scene.nlight).unwrap_or(0);
         for lamp in scene.lights.iter_mut().take(n_lamps) {
-            for channel in lamp.ambient.iter_mut().chain(&mut lamp.diffuse).chain(&mut lamp.specular) {
+            for channel in lamp
+                .ambient
+                .iter_mut()
+                .chain(&mut lamp.diffuse)
+                .chain(&mut lamp.specular)
+            {
                 *channel *= light_frac;
             }
         }
@@ -258,7 +308,11 @@ impl Canvas {
         let mut from_bottom = vec![0; 3 * width * height];
         let mut depth_from_bottom = vec![0.0; width * height];
         self.context
-            .read_pixels(Some(&mut from_bottom), Some(&mut depth_from_bottom), viewport)
+            .read_pixels(
+                Some(&mut from_bottom),
+                Some(&mut depth_from_bottom),
+                viewport,
+            )
             .expect("the buffers match the viewport's size");
         let mut rgb = Vec::with_capacity(from_bottom.len());
         let mut depth_m = Vec::with_capacity(depth_from_bottom.len());
@@ -270,7 +324,11 @@ impl Canvas {
                     .map(|depth| meters_from_depth(*depth, self.near_far_m)),
             );
         }
-        Picture { size_px, rgb, depth_m }
+        Picture {
+            size_px,
+            rgb,
+            depth_m,
+        }
     }
 }
 

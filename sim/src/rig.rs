@@ -20,7 +20,8 @@ use drivers::motion::MotionLimits;
 use kinematics::{Stamp, Transform};
 use std::sync::Arc;
 
-/// The simulated arm as a URDF: same kinematics and limits, base `panda_link0`, flange `panda_link8`.
+/// The simulated arm as a URDF: same kinematics and limits, base `panda_link0`, flange
+/// `panda_link8`.
 pub const PANDA_URDF: &str = include_str!("../../rigs/robots/panda.urdf");
 
 /// The mobile arm as a URDF: root `base`, arm as above.
@@ -58,17 +59,33 @@ pub fn open(config: &Config) -> Result<Rig, Error> {
     let arm = match tour {
         Some(tour) => {
             let follower = Follower::new(tour, scanning_camera(config))?;
-            Some(Arm::new(Arc::clone(&model), follower, history_nanos(config))?)
+            Some(Arm::new(
+                Arc::clone(&model),
+                follower,
+                history_nanos(config),
+            )?)
         }
         None => None,
     };
-    let base_from_arm = if config.scene.has_moving_base() { base_from_arm() } else { Transform::identity() };
+    let base_from_arm = if config.scene.has_moving_base() {
+        base_from_arm()
+    } else {
+        Transform::identity()
+    };
     let robot = Robot::new(arm, motion, base_from_arm);
     let engine = Engine::new(config.clone(), robot, cameras, renderer, model)?;
     let info = RigInfo {
-        cameras: config.cameras.iter().map(|camera| camera_info(camera, config.ideal)).collect(),
+        cameras: config
+            .cameras
+            .iter()
+            .map(|camera| camera_info(camera, config.ideal))
+            .collect(),
         joint_names: config.reading_order.clone(),
-        scanner_names: config.scanners.iter().map(|scanner| scanner.name.clone()).collect(),
+        scanner_names: config
+            .scanners
+            .iter()
+            .map(|scanner| scanner.name.clone())
+            .collect(),
         has_moving_base: config.scene.has_moving_base(),
         urdf: urdf_of(config.scene),
         world_from_base: motion.world_from_base(0.0),
@@ -77,11 +94,17 @@ pub fn open(config: &Config) -> Result<Rig, Error> {
     Ok(Rig { engine, info })
 }
 
-/// `flange_from_camera` of the camera that follows the tour: the first one on the flange, or a default if there is
-/// none.
+/// `flange_from_camera` of the camera that follows the tour: the first one on the flange, or a
+/// default if there is none.
 fn scanning_camera(config: &Config) -> Transform {
-    let on_flange = config.cameras.iter().find(|camera| camera.parent == Parent::Flange);
-    on_flange.map_or_else(|| CameraConfig::wrist("wrist").parent_from_camera, |camera| camera.parent_from_camera)
+    let on_flange = config
+        .cameras
+        .iter()
+        .find(|camera| camera.parent == Parent::Flange);
+    on_flange.map_or_else(
+        || CameraConfig::wrist("wrist").parent_from_camera,
+        |camera| camera.parent_from_camera,
+    )
 }
 
 fn camera_info(camera: &CameraConfig, ideal: bool) -> CameraInfo {
@@ -91,7 +114,11 @@ fn camera_info(camera: &CameraConfig, ideal: bool) -> CameraInfo {
         parent: camera.parent,
         parent_from_camera: camera.parent_from_camera,
         rate_hz: camera.rate_hz,
-        readout_micros: if ideal { 0.0 } else { camera.sensor.readout_micros },
+        readout_micros: if ideal {
+            0.0
+        } else {
+            camera.sensor.readout_micros
+        },
         has_depth: camera.depth.is_some(),
     }
 }
@@ -107,8 +134,8 @@ impl Rig {
         Lockstep::new(self.engine, self.info)
     }
 
-    /// Runs as fast as its devices are read, with an arm that moves by commands within the given limits, which are in the
-    /// order of the joint readings. Simulated time zero has the stamp 0.
+    /// Runs as fast as its devices are read, with an arm that moves by commands within the given
+    /// limits, which are in the order of the joint readings. Simulated time zero has the stamp 0.
     pub fn into_commanded(self, limits: &[MotionLimits]) -> Result<CommandedRig, Error> {
         CommandedRig::new(self.engine, self.info, limits)
     }
@@ -118,11 +145,17 @@ impl Rig {
         self.engine.reported_joints()
     }
 
-    /// The cameras, in real time, on an arm that emulated motors move. Simulated time zero is now, which is `start` on the
-    /// clock of the motors.
-    pub fn into_motorized(mut self, motors: MotorHistory, start: Stamp) -> Result<Vec<Box<dyn Camera>>, Error> {
+    /// The cameras, in real time, on an arm that emulated motors move. Simulated time zero is now,
+    /// which is `start` on the clock of the motors.
+    pub fn into_motorized(
+        mut self,
+        motors: MotorHistory,
+        start: Stamp,
+    ) -> Result<Vec<Box<dyn Camera>>, Error> {
         self.engine.follow_motors(motors, start)?;
-        Ok(LiveRig::start(self.engine, self.info, start)?.devices.cameras)
+        Ok(LiveRig::start(self.engine, self.info, start)?
+            .devices
+            .cameras)
     }
 
     /// Runs in real time. Simulated time zero is now, which is `start` on the caller's clock.

@@ -19,7 +19,10 @@ pub(crate) struct RobotPose {
 impl RobotPose {
     /// Pose of the flange, or of the arm's mounting point if there is no arm.
     pub(crate) fn world_from_flange(&self) -> Transform {
-        let arm_from_flange = self.joints_rad.as_ref().map_or_else(Transform::identity, panda::base_from_flange);
+        let arm_from_flange = self
+            .joints_rad
+            .as_ref()
+            .map_or_else(Transform::identity, panda::base_from_flange);
         self.world_from_base * self.base_from_arm * arm_from_flange
     }
 }
@@ -43,7 +46,12 @@ pub(crate) struct Robot {
 impl Robot {
     pub(crate) fn new(arm: Option<Arm>, motion: BaseMotion, base_from_arm: Transform) -> Self {
         let arm = arm.map(|arm| ArmMotion::Simulated(Box::new(arm)));
-        Self { arm, motion, base_from_arm, n_steps: 0 }
+        Self {
+            arm,
+            motion,
+            base_from_arm,
+            n_steps: 0,
+        }
     }
 
     pub(crate) fn motion(&self) -> &BaseMotion {
@@ -63,14 +71,17 @@ impl Robot {
         self.arm = Some(ArmMotion::Motorized(arm));
     }
 
-    /// Advances by one step. Returns the time before the step, nanoseconds, and the joint reading at that time. Emulated
-    /// motors report their joints themselves; the step then waits for them, and fails if they have stopped.
+    /// Advances by one step. Returns the time before the step, nanoseconds, and the joint reading
+    /// at that time. Emulated motors report their joints themselves; the step then waits for them,
+    /// and fails if they have stopped.
     pub(crate) fn step(&mut self) -> Result<(i64, Option<JointReading>), Error> {
         let nanos = self.n_steps * STEP_NANOS;
         self.n_steps += 1;
         let reading = match &mut self.arm {
             Some(ArmMotion::Simulated(arm)) => Some(arm.step()),
-            Some(ArmMotion::Motorized(arm)) if !arm.wait_until(nanos) => return Err(Error::MotorsStopped),
+            Some(ArmMotion::Motorized(arm)) if !arm.wait_until(nanos) => {
+                return Err(Error::MotorsStopped);
+            }
             Some(ArmMotion::Motorized(_)) | None => None,
         };
         Ok((nanos, reading))
@@ -84,6 +95,10 @@ impl Robot {
             None => None,
         };
         let world_from_base = self.motion.world_from_base(nanos as f64 * 1e-9);
-        Some(RobotPose { world_from_base, base_from_arm: self.base_from_arm, joints_rad })
+        Some(RobotPose {
+            world_from_base,
+            base_from_arm: self.base_from_arm,
+            joints_rad,
+        })
     }
 }

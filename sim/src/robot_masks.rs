@@ -22,7 +22,8 @@ pub struct PinholeView {
     pub world_from_camera: Transform,
 }
 
-/// Draws a scene with a robot without cameras on its flange. It draws on the thread that has opened it.
+/// Draws a scene with a robot without cameras on its flange. It draws on the thread that has opened
+/// it.
 pub struct RobotMasks {
     // Dropped before the context.
     canvas: Canvas,
@@ -36,14 +37,22 @@ impl RobotMasks {
     ///
     /// If OpenGL cannot be used, or the scene is invalid.
     pub fn open(scene: Scene, largest_px: [u32; 2]) -> Result<Self, Error> {
-        let config = Config { scene, cameras: Vec::new(), ..Config::default() };
+        let config = Config {
+            scene,
+            cameras: Vec::new(),
+            ..Config::default()
+        };
         let model = Arc::new(scene::build(&config, largest_px)?);
         let context = HeadlessContext::open()?;
         let canvas = Canvas::new(&context, &model, scene::near_far_m(scene));
-        Ok(Self { canvas, _context: context })
+        Ok(Self {
+            canvas,
+            _context: context,
+        })
     }
 
-    /// The pixels at which MuJoCo's segmentation shows the robot, row by row; with nothing else in the scene if `is_alone`.
+    /// The pixels at which MuJoCo's segmentation shows the robot, row by row; with nothing else in
+    /// the scene if `is_alone`.
     ///
     /// * `joints_rad`: positions of the arm's joints from base to flange.
     ///
@@ -58,7 +67,10 @@ impl RobotMasks {
         is_alone: bool,
     ) -> Result<Vec<bool>, Error> {
         if joints_rad.len() != N_JOINTS {
-            return Err(Error::NJoints { got: joints_rad.len(), expected: N_JOINTS });
+            return Err(Error::NJoints {
+                got: joints_rad.len(),
+                expected: N_JOINTS,
+            });
         }
         let robot = RobotPose {
             world_from_base: *world_from_base,
@@ -68,7 +80,8 @@ impl RobotMasks {
         Ok(self.canvas.robot_mask(&drawn(view, Some(robot)), is_alone))
     }
 
-    /// Depth of the scene without the robot, row by row, meters along z; the far plane where there is nothing.
+    /// Depth of the scene without the robot, row by row, meters along z; the far plane where there
+    /// is nothing.
     pub fn depth_without_robot_m(&mut self, view: &PinholeView) -> Vec<f32> {
         self.canvas.draw(&drawn(view, None)).depth_m
     }
@@ -94,7 +107,8 @@ mod tests {
     /// Seen from behind a wall of the scene.
     fn view() -> PinholeView {
         let eye = Point3::new(0.75, -1.2, 0.9);
-        let rotation = UnitQuaternion::face_towards(&(Point3::new(0.15, 0.0, 0.35) - eye), &-Vector3::z());
+        let rotation =
+            UnitQuaternion::face_towards(&(Point3::new(0.15, 0.0, 0.35) - eye), &-Vector3::z());
         PinholeView {
             size_px: [160, 120],
             focal_px: [150.0; 2],
@@ -108,10 +122,20 @@ mod tests {
         let mut masks = RobotMasks::open(Scene::StaticArm, [160, 120]).expect("the scene is valid");
         let (view, base) = (view(), Transform::identity());
         let joints = [0.3, -0.5, 0.2, -2.1, 0.4, 1.7, 0.6];
-        let mut mask = |is_alone| masks.mask(&view, &base, &joints, is_alone).expect("seven joints");
+        let mut mask = |is_alone| {
+            masks
+                .mask(&view, &base, &joints, is_alone)
+                .expect("seven joints")
+        };
         let [alone, visible] = [true, false].map(&mut mask);
         let count = |mask: &[bool]| mask.iter().filter(|is_robot| **is_robot).count();
-        assert!(alone.iter().zip(&visible).all(|(alone, visible)| *alone || !visible), "the robot alone covers more");
+        assert!(
+            alone
+                .iter()
+                .zip(&visible)
+                .all(|(alone, visible)| *alone || !visible),
+            "the robot alone covers more"
+        );
         assert!(
             count(&alone) > 500 && (100..count(&alone)).contains(&count(&visible)),
             "{} {}",
@@ -119,14 +143,24 @@ mod tests {
             count(&visible)
         );
         // The flange is inside the body.
-        let flange = crate::panda::base_from_flange(&Joints::from(joints)) * Point3::new(0.0, 0.0, -0.03);
+        let flange =
+            crate::panda::base_from_flange(&Joints::from(joints)) * Point3::new(0.0, 0.0, -0.03);
         let in_camera = view.world_from_camera.inverse_transform_point(&flange);
-        let at = |axis: usize| view.focal_px[axis] * in_camera[axis] / in_camera.z + view.principal_px[axis];
-        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a pixel of the view")]
+        let at = |axis: usize| {
+            view.focal_px[axis] * in_camera[axis] / in_camera.z + view.principal_px[axis]
+        };
+        #[expect(
+            clippy::cast_possible_truncation,
+            clippy::cast_sign_loss,
+            reason = "a pixel of the view"
+        )]
         let ix = at(1) as usize * 160 + at(0) as usize;
         assert!(alone[ix], "{:?}", [at(0), at(1)]);
         let depth_m = masks.depth_without_robot_m(&view);
-        assert!(depth_m.iter().all(|depth| (0.02..12.1).contains(depth)) && depth_m.iter().any(|depth| *depth < 2.0));
+        assert!(
+            depth_m.iter().all(|depth| (0.02..12.1).contains(depth))
+                && depth_m.iter().any(|depth| *depth < 2.0)
+        );
         assert!(masks.mask(&view, &base, &joints[..6], true).is_err());
     }
 }

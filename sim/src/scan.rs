@@ -7,9 +7,10 @@ use std::f64::consts::TAU;
 
 /// The tour around the target area.
 ///
-/// Azimuth, elevation, distance, roll and look-at point oscillate with periods that have no common multiple, so the
-/// first seconds cover the whole range coarsely and later ones fill the gaps. Every quantity moves both ways at
-/// continuously changing speed, so a time offset and a hand-eye error have different effects.
+/// Azimuth, elevation, distance, roll and look-at point oscillate with periods that have no common
+/// multiple, so the first seconds cover the whole range coarsely and later ones fill the gaps.
+/// Every quantity moves both ways at continuously changing speed, so a time offset and a hand-eye
+/// error have different effects.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Scan {
     speed: f64,
@@ -40,14 +41,21 @@ const START_SECS: f64 = 0.5;
 const SPEED_OSCILLATION: (f64, f64) = (0.35, 4.9);
 
 impl Scan {
-    /// With `is_azimuth_only`, all quantities except the azimuth stay at their means: the camera rotates about one
-    /// axis.
+    /// With `is_azimuth_only`, all quantities except the azimuth stay at their means: the camera
+    /// rotates about one axis.
     pub(crate) fn new(speed: f64, is_azimuth_only: bool) -> Self {
-        Self { speed, is_azimuth_only }
+        Self {
+            speed,
+            is_azimuth_only,
+        }
     }
 
     fn oscillation(&self, oscillation: &Oscillation, at: f64) -> f64 {
-        if self.is_azimuth_only { oscillation.0 } else { oscillation.at(at) }
+        if self.is_azimuth_only {
+            oscillation.0
+        } else {
+            oscillation.at(at)
+        }
     }
 
     /// Progress along the tour, in seconds at constant speed; starts at rest.
@@ -55,7 +63,8 @@ impl Scan {
         let (share, period_secs) = SPEED_OSCILLATION;
         // The integral of a smooth ramp from 0 to 1.
         let ramp = (secs / START_SECS).clamp(0.0, 1.0);
-        let started = START_SECS * (ramp.powi(3) - 0.5 * ramp.powi(4)) + (secs - START_SECS).max(0.0);
+        let started =
+            START_SECS * (ramp.powi(3) - 0.5 * ramp.powi(4)) + (secs - START_SECS).max(0.0);
         let uniform_secs = started * self.speed;
         uniform_secs + share * period_secs / TAU * (1.0 - (uniform_secs * TAU / period_secs).cos())
     }
@@ -67,13 +76,25 @@ impl Scan {
         let elevation = self.oscillation(&ELEVATION_DEGREES, at).to_radians();
         let [look_at_x_m, look_at_y_m] =
             [&LOOK_AT_X_M, &LOOK_AT_Y_M].map(|oscillation| self.oscillation(oscillation, at));
-        let target =
-            Vector3::new(TARGET_XY_M[0] + look_at_x_m, TARGET_XY_M[1] + look_at_y_m, TABLE_Z_M + LOOK_AT_HEIGHT_M);
-        let back = Vector3::new(-elevation.cos() * azimuth.cos(), -elevation.cos() * azimuth.sin(), elevation.sin());
+        let target = Vector3::new(
+            TARGET_XY_M[0] + look_at_x_m,
+            TARGET_XY_M[1] + look_at_y_m,
+            TABLE_Z_M + LOOK_AT_HEIGHT_M,
+        );
+        let back = Vector3::new(
+            -elevation.cos() * azimuth.cos(),
+            -elevation.cos() * azimuth.sin(),
+            elevation.sin(),
+        );
         let upright = looking_along(&-back);
-        let roll =
-            UnitQuaternion::from_axis_angle(&Vector3::z_axis(), self.oscillation(&ROLL_DEGREES, at).to_radians());
-        Transform::from_parts(Translation3::from(target + back * self.oscillation(&DISTANCE_M, at)), upright * roll)
+        let roll = UnitQuaternion::from_axis_angle(
+            &Vector3::z_axis(),
+            self.oscillation(&ROLL_DEGREES, at).to_radians(),
+        );
+        Transform::from_parts(
+            Translation3::from(target + back * self.oscillation(&DISTANCE_M, at)),
+            upright * roll,
+        )
     }
 }
 

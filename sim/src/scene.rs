@@ -51,18 +51,32 @@ pub(crate) fn build(config: &Config, largest_px: [u32; 2]) -> Result<MjModel, Er
              <material name=\"{name}\" texture=\"{name}\" specular=\"{specular}\" shininess=\"0.4\"/>"
         );
     }
-    for Object { name, material, mesh, world_from_mesh } in &scene_assets.objects {
+    for Object {
+        name,
+        material,
+        mesh,
+        world_from_mesh,
+    } in &scene_assets.objects
+    {
         add_file(&mut files, &format!("{name}.msh"), &mesh.to_msh())?;
-        let _ = writeln!(assets, "<mesh name=\"{name}\" file=\"{name}.msh\" inertia=\"shell\"/>");
+        let _ = writeln!(
+            assets,
+            "<mesh name=\"{name}\" file=\"{name}.msh\" inertia=\"shell\"/>"
+        );
         let pose = panda::pose_attributes(world_from_mesh);
         let group = if *material == "glass" { GLASS_GROUP } else { 0 };
-        let _ =
-            writeln!(bodies, "<geom type=\"mesh\" mesh=\"{name}\" material=\"{material}\" group=\"{group}\" {pose}/>");
+        let _ = writeln!(
+            bodies,
+            "<geom type=\"mesh\" mesh=\"{name}\" material=\"{material}\" group=\"{group}\" {pose}/>"
+        );
     }
     let mut on_flange = String::new();
     for (ix, target) in config.targets.iter().enumerate() {
         let printed_target::Printed { png, mesh, plate } = printed_target::print(target)?;
-        let (name, pose) = (format!("target{ix}"), panda::pose_attributes(&target.parent_from_board));
+        let (name, pose) = (
+            format!("target{ix}"),
+            panda::pose_attributes(&target.parent_from_board),
+        );
         add_file(&mut files, &format!("{name}.png"), &png)?;
         add_file(&mut files, &format!("{name}.msh"), &mesh.to_msh())?;
         add_file(&mut files, &format!("{name}_plate.msh"), &plate.to_msh())?;
@@ -106,12 +120,18 @@ pub(crate) fn build(config: &Config, largest_px: [u32; 2]) -> Result<MjModel, Er
         config.scene.name()
     );
     add_file(&mut files, "scene.xml", xml.as_bytes())?;
-    MjModel::from_xml_vfs("scene.xml", &files).map_err(|error| Error::Scene { reason: error.to_string() })
+    MjModel::from_xml_vfs("scene.xml", &files).map_err(|error| Error::Scene {
+        reason: error.to_string(),
+    })
 }
 
 /// MJCF body of the robot: an arm alone, or a base with or without an arm.
 fn robot(config: &Config, on_flange: &str) -> String {
-    let arm = if config.scene.has_arm() { panda::mjcf(&(brackets(config) + on_flange)) } else { String::new() };
+    let arm = if config.scene.has_arm() {
+        panda::mjcf(&(brackets(config) + on_flange))
+    } else {
+        String::new()
+    };
     if !config.scene.has_moving_base() {
         return arm;
     }
@@ -142,8 +162,8 @@ fn extra_materials(scene: Scene) -> &'static str {
     }
 }
 
-/// Assets of a scene. They are created once per process, because this takes a second and does not depend on the
-/// configuration.
+/// Assets of a scene. They are created once per process, because this takes a second and does not
+/// depend on the configuration.
 struct SceneAssets {
     textures_png: Vec<(&'static str, Vec<u8>)>,
     objects: Vec<Object>,
@@ -157,15 +177,27 @@ impl SceneAssets {
             return Ok(Arc::clone(scene_assets));
         }
         let encode = |(name, texture): (&'static str, Texture)| {
-            texture.to_png().map(|png| (name, png)).map_err(|source| Error::Texture { name: name.to_owned(), source })
+            texture
+                .to_png()
+                .map(|png| (name, png))
+                .map_err(|source| Error::Texture {
+                    name: name.to_owned(),
+                    source,
+                })
         };
         let (textures, objects) = match scene {
             Scene::StaticArm => (objects::textures(), objects::objects()),
             Scene::MobileBase => (lab::textures(), lab::objects()),
             Scene::MobileArm => (cabinet::textures(), cabinet::objects()),
         };
-        let textures_png = textures.into_par_iter().map(encode).collect::<Result<_, _>>()?;
-        let scene_assets = Arc::new(Self { textures_png, objects });
+        let textures_png = textures
+            .into_par_iter()
+            .map(encode)
+            .collect::<Result<_, _>>()?;
+        let scene_assets = Arc::new(Self {
+            textures_png,
+            objects,
+        });
         all.insert(scene.name(), Arc::clone(&scene_assets));
         Ok(scene_assets)
     }
@@ -177,15 +209,27 @@ const MATERIALS: &str = "<material name=\"arm_white\" rgba=\"0.93 0.93 0.92 1\" 
      <material name=\"frame\" rgba=\"0.20 0.21 0.23 1\" specular=\"0.1\"/>\n";
 
 fn add_file(files: &mut MjVfs, name: &str, bytes: &[u8]) -> Result<(), Error> {
-    files.add_from_buffer(name, bytes).map_err(|error| Error::Scene { reason: format!("{name}: {error}") })
+    files
+        .add_from_buffer(name, bytes)
+        .map_err(|error| Error::Scene {
+            reason: format!("{name}: {error}"),
+        })
 }
 
 /// Camera bodies on the flange, just behind the optical centers.
 fn brackets(config: &Config) -> String {
     let mut xml = String::new();
-    for camera in config.cameras.iter().filter(|camera| camera.parent == Parent::Flange) {
-        let pose = panda::pose_attributes(&(camera.parent_from_camera * Translation3::new(0.0, 0.0, -0.016)));
-        let [x, y, z] = (camera.parent_from_camera * Point3::new(0.0, 0.0, -0.02)).coords.into();
+    for camera in config
+        .cameras
+        .iter()
+        .filter(|camera| camera.parent == Parent::Flange)
+    {
+        let pose = panda::pose_attributes(
+            &(camera.parent_from_camera * Translation3::new(0.0, 0.0, -0.016)),
+        );
+        let [x, y, z] = (camera.parent_from_camera * Point3::new(0.0, 0.0, -0.02))
+            .coords
+            .into();
         let _ = writeln!(
             xml,
             "<geom type=\"box\" {pose} size=\"0.045 0.0125 0.0125\" material=\"arm_gray\"/>\n\
@@ -206,10 +250,17 @@ mod tests {
     fn flange_matches_kinematics_and_urdf() {
         const TOLERANCE: f64 = 1e-9;
         let model = build(&Config::default(), [64, 64]).expect("the scene is valid");
-        let flange_ix = model.name_to_id(MjtObjBase::mjOBJ_BODY, "panda_link8").expect("the flange is a body");
-        let chain = kinematics::Chain::from_urdf(crate::PANDA_URDF, "panda_link0", "panda_link8").expect("valid");
+        let flange_ix = model
+            .name_to_id(MjtObjBase::mjOBJ_BODY, "panda_link8")
+            .expect("the flange is a body");
+        let chain = kinematics::Chain::from_urdf(crate::PANDA_URDF, "panda_link0", "panda_link8")
+            .expect("valid");
         let mut data = MjData::new(&model);
-        for position_rad in [[0.0; 7], [0.4, -0.9, 1.3, -2.2, -0.7, 1.8, 0.6], [-2.1, 1.1, 0.3, -0.4, 2.2, 3.1, -1.9]] {
+        for position_rad in [
+            [0.0; 7],
+            [0.4, -0.9, 1.3, -2.2, -0.7, 1.8, 0.6],
+            [-2.1, 1.1, 0.3, -0.4, 2.2, 3.1, -1.9],
+        ] {
             data.qpos_mut().copy_from_slice(&position_rad);
             data.forward_kinematics();
             let [w, x, y, z] = data.xquat()[flange_ix];
@@ -217,7 +268,10 @@ mod tests {
             let ours = panda::base_from_flange(&Joints::from(position_rad));
             let urdf = chain.forward(&position_rad).expect("seven joints");
             for pose in [ours, urdf] {
-                assert!((pose.translation.vector - Vector3::from(data.xpos()[flange_ix])).norm() < TOLERANCE);
+                assert!(
+                    (pose.translation.vector - Vector3::from(data.xpos()[flange_ix])).norm()
+                        < TOLERANCE
+                );
                 assert!(pose.rotation.angle_to(&rotation) < 10.0 * TOLERANCE);
             }
         }
@@ -226,19 +280,40 @@ mod tests {
     #[test]
     fn moving_base_and_arm_match_urdfs() {
         const TOLERANCE: f64 = 1e-9;
-        let names = |scene: Scene| if scene.has_arm() { Config::default().joint_names } else { Vec::new() };
+        let names = |scene: Scene| {
+            if scene.has_arm() {
+                Config::default().joint_names
+            } else {
+                Vec::new()
+            }
+        };
         for scene in [Scene::MobileBase, Scene::MobileArm] {
-            let mut config =
-                Config { scene, joint_names: names(scene), reading_order: names(scene), ..Config::default() };
+            let mut config = Config {
+                scene,
+                joint_names: names(scene),
+                reading_order: names(scene),
+                ..Config::default()
+            };
             if !scene.has_arm() {
                 config.cameras[0].parent = Parent::Base;
             }
             let model = build(&config, [64, 64]).expect("the scene is valid");
-            let tip = if scene.has_arm() { "panda_link8" } else { "top_plate" };
-            let chain = kinematics::Chain::from_urdf(crate::rig::urdf_of(scene), "base", tip).expect("valid");
-            let tip_ix = model.name_to_id(MjtObjBase::mjOBJ_BODY, tip).expect("a body");
+            let tip = if scene.has_arm() {
+                "panda_link8"
+            } else {
+                "top_plate"
+            };
+            let chain = kinematics::Chain::from_urdf(crate::rig::urdf_of(scene), "base", tip)
+                .expect("valid");
+            let tip_ix = model
+                .name_to_id(MjtObjBase::mjOBJ_BODY, tip)
+                .expect("a body");
             let mut data = MjData::new(&model);
-            let position_rad: &[f64] = if scene.has_arm() { &[0.4, -0.9, 1.3, -2.2, -0.7, 1.8, 0.6] } else { &[] };
+            let position_rad: &[f64] = if scene.has_arm() {
+                &[0.4, -0.9, 1.3, -2.2, -0.7, 1.8, 0.6]
+            } else {
+                &[]
+            };
             let world_from_base = crate::base::BaseMotion::of(scene, 1.0).world_from_base(16.3);
             data.qpos_mut().copy_from_slice(position_rad);
             crate::render::set_base_pose(&mut data, &world_from_base);
@@ -246,7 +321,10 @@ mod tests {
             let expected = world_from_base * chain.forward(position_rad).expect("as many joints");
             let [w, x, y, z] = data.xquat()[tip_ix];
             let rotation = UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z));
-            assert!((expected.translation.vector - Vector3::from(data.xpos()[tip_ix])).norm() < TOLERANCE);
+            assert!(
+                (expected.translation.vector - Vector3::from(data.xpos()[tip_ix])).norm()
+                    < TOLERANCE
+            );
             assert!(expected.rotation.angle_to(&rotation) < 10.0 * TOLERANCE);
         }
     }

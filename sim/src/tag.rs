@@ -3,17 +3,28 @@
 /// Codes of the first tags of the family; the index is the tag's id.
 ///
 /// Source: Olson 2011; table `codedata` of AprilRobotics/apriltag, `tag36h11.c`.
-pub(crate) const CODES: [u64; 6] =
-    [0xd_7e00_984b, 0xd_da66_4ca7, 0xd_c4a1_c821, 0xe_17b4_70e9, 0xe_f91d_01b1, 0xf_429c_dd73];
+pub(crate) const CODES: [u64; 6] = [
+    0xd_7e00_984b,
+    0xd_da66_4ca7,
+    0xd_c4a1_c821,
+    0xe_17b4_70e9,
+    0xe_f91d_01b1,
+    0xf_429c_dd73,
+];
 
 /// Cells along a side, including the black border and the white margin around it.
 pub const N_CELLS: usize = 10;
 
-/// Column and row of each bit, most significant first, counted in the 8x8 cells inside the margin (same source).
-const BIT_X: [usize; 36] =
-    [1, 2, 3, 4, 5, 2, 3, 4, 3, 6, 6, 6, 6, 6, 5, 5, 5, 4, 6, 5, 4, 3, 2, 5, 4, 3, 4, 1, 1, 1, 1, 1, 2, 2, 2, 3];
-const BIT_Y: [usize; 36] =
-    [1, 1, 1, 1, 1, 2, 2, 2, 3, 1, 2, 3, 4, 5, 2, 3, 4, 3, 6, 6, 6, 6, 6, 5, 5, 5, 4, 6, 5, 4, 3, 2, 5, 4, 3, 4];
+/// Column and row of each bit, most significant first, counted in the 8x8 cells inside the margin
+/// (same source).
+const BIT_X: [usize; 36] = [
+    1, 2, 3, 4, 5, 2, 3, 4, 3, 6, 6, 6, 6, 6, 5, 5, 5, 4, 6, 5, 4, 3, 2, 5, 4, 3, 4, 1, 1, 1, 1, 1,
+    2, 2, 2, 3,
+];
+const BIT_Y: [usize; 36] = [
+    1, 1, 1, 1, 1, 2, 2, 2, 3, 1, 2, 3, 4, 5, 2, 3, 4, 3, 6, 6, 6, 6, 6, 5, 5, 5, 4, 6, 5, 4, 3, 2,
+    5, 4, 3, 4,
+];
 
 /// Cells of the tag with an id below 6, `[row][column]` from the top left; true is white.
 ///
@@ -42,7 +53,10 @@ mod tests {
         for id in 0..CODES.len() {
             let cells = cells(id);
             assert!(cells[0].iter().all(|white| *white) && cells[9].iter().all(|white| *white));
-            assert!(cells[1][1..9].iter().all(|white| !white) && cells[8][1..9].iter().all(|white| !white));
+            assert!(
+                cells[1][1..9].iter().all(|white| !white)
+                    && cells[8][1..9].iter().all(|white| !white)
+            );
         }
         for (id, code) in CODES.iter().enumerate() {
             for other in &CODES[..id] {

@@ -19,13 +19,31 @@ struct Part {
     hair_m: f64,
 }
 
-const fn part(center_m: [f64; 3], half_m: [f64; 3], pitch_rad: f64, roll_rad: f64, band: FurBand) -> Part {
-    Part { center_m, half_m, pitch_rad, roll_rad, band, n_hairs: 0, hair_m: 0.0 }
+const fn part(
+    center_m: [f64; 3],
+    half_m: [f64; 3],
+    pitch_rad: f64,
+    roll_rad: f64,
+    band: FurBand,
+) -> Part {
+    Part {
+        center_m,
+        half_m,
+        pitch_rad,
+        roll_rad,
+        band,
+        n_hairs: 0,
+        hair_m: 0.0,
+    }
 }
 
 impl Part {
     const fn with_hair(self, n_hairs: u64, hair_m: f64) -> Self {
-        Self { n_hairs, hair_m, ..self }
+        Self {
+            n_hairs,
+            hair_m,
+            ..self
+        }
     }
 
     fn half_axes(&self) -> [Vector3<f64>; 3] {
@@ -49,32 +67,176 @@ const DENSITY: u64 = 3;
 /// The toy stands on z = 0, looks along x, and is 0.15 m high.
 const PARTS: [Part; 22] = [
     // Trunk, chest and belly.
-    part([0.0, 0.0, 0.062], [0.048, 0.027, 0.027], 0.0, 0.0, FurBand::Coat).with_hair(900, 0.010),
-    part([0.034, 0.0, 0.068], [0.024, 0.024, 0.027], -0.3, 0.0, FurBand::Coat).with_hair(300, 0.010),
-    part([0.0, 0.0, 0.052], [0.038, 0.021, 0.020], 0.0, 0.0, FurBand::Light).with_hair(160, 0.009),
+    part(
+        [0.0, 0.0, 0.062],
+        [0.048, 0.027, 0.027],
+        0.0,
+        0.0,
+        FurBand::Coat,
+    )
+    .with_hair(900, 0.010),
+    part(
+        [0.034, 0.0, 0.068],
+        [0.024, 0.024, 0.027],
+        -0.3,
+        0.0,
+        FurBand::Coat,
+    )
+    .with_hair(300, 0.010),
+    part(
+        [0.0, 0.0, 0.052],
+        [0.038, 0.021, 0.020],
+        0.0,
+        0.0,
+        FurBand::Light,
+    )
+    .with_hair(160, 0.009),
     // Neck, head, muzzle.
-    part([0.052, 0.0, 0.092], [0.028, 0.016, 0.019], -0.95, 0.0, FurBand::Coat).with_hair(350, 0.008),
-    part([0.070, 0.0, 0.113], [0.026, 0.018, 0.020], 0.35, 0.0, FurBand::Coat).with_hair(400, 0.006),
-    part([0.090, 0.0, 0.104], [0.016, 0.014, 0.014], 0.35, 0.0, FurBand::Light).with_hair(160, 0.003),
+    part(
+        [0.052, 0.0, 0.092],
+        [0.028, 0.016, 0.019],
+        -0.95,
+        0.0,
+        FurBand::Coat,
+    )
+    .with_hair(350, 0.008),
+    part(
+        [0.070, 0.0, 0.113],
+        [0.026, 0.018, 0.020],
+        0.35,
+        0.0,
+        FurBand::Coat,
+    )
+    .with_hair(400, 0.006),
+    part(
+        [0.090, 0.0, 0.104],
+        [0.016, 0.014, 0.014],
+        0.35,
+        0.0,
+        FurBand::Light,
+    )
+    .with_hair(160, 0.003),
     // Nostrils and eyes.
-    part([0.1045, 0.006, 0.103], [0.002, 0.002, 0.0028], 0.35, 0.0, FurBand::Dark),
-    part([0.1045, -0.006, 0.103], [0.002, 0.002, 0.0028], 0.35, 0.0, FurBand::Dark),
-    part([0.079, 0.0165, 0.119], [0.0042, 0.0030, 0.0048], 0.3, 0.0, FurBand::Dark),
-    part([0.079, -0.0165, 0.119], [0.0042, 0.0030, 0.0048], 0.3, 0.0, FurBand::Dark),
+    part(
+        [0.1045, 0.006, 0.103],
+        [0.002, 0.002, 0.0028],
+        0.35,
+        0.0,
+        FurBand::Dark,
+    ),
+    part(
+        [0.1045, -0.006, 0.103],
+        [0.002, 0.002, 0.0028],
+        0.35,
+        0.0,
+        FurBand::Dark,
+    ),
+    part(
+        [0.079, 0.0165, 0.119],
+        [0.0042, 0.0030, 0.0048],
+        0.3,
+        0.0,
+        FurBand::Dark,
+    ),
+    part(
+        [0.079, -0.0165, 0.119],
+        [0.0042, 0.0030, 0.0048],
+        0.3,
+        0.0,
+        FurBand::Dark,
+    ),
     // Ears and their insides.
-    part([0.060, 0.014, 0.143], [0.006, 0.009, 0.024], -0.25, -0.30, FurBand::Coat).with_hair(180, 0.005),
-    part([0.060, -0.014, 0.143], [0.006, 0.009, 0.024], -0.25, 0.30, FurBand::Coat).with_hair(180, 0.005),
-    part([0.0635, 0.014, 0.143], [0.005, 0.0062, 0.019], -0.25, -0.30, FurBand::Pink),
-    part([0.0635, -0.014, 0.143], [0.005, 0.0062, 0.019], -0.25, 0.30, FurBand::Pink),
+    part(
+        [0.060, 0.014, 0.143],
+        [0.006, 0.009, 0.024],
+        -0.25,
+        -0.30,
+        FurBand::Coat,
+    )
+    .with_hair(180, 0.005),
+    part(
+        [0.060, -0.014, 0.143],
+        [0.006, 0.009, 0.024],
+        -0.25,
+        0.30,
+        FurBand::Coat,
+    )
+    .with_hair(180, 0.005),
+    part(
+        [0.0635, 0.014, 0.143],
+        [0.005, 0.0062, 0.019],
+        -0.25,
+        -0.30,
+        FurBand::Pink,
+    ),
+    part(
+        [0.0635, -0.014, 0.143],
+        [0.005, 0.0062, 0.019],
+        -0.25,
+        0.30,
+        FurBand::Pink,
+    ),
     // Legs, then hooves.
-    part([0.034, 0.016, 0.028], [0.011, 0.010, 0.026], 0.0, 0.0, FurBand::Coat).with_hair(130, 0.006),
-    part([0.034, -0.016, 0.028], [0.011, 0.010, 0.026], 0.0, 0.0, FurBand::Coat).with_hair(130, 0.006),
-    part([-0.034, 0.016, 0.028], [0.012, 0.011, 0.026], 0.1, 0.0, FurBand::Coat).with_hair(130, 0.006),
-    part([-0.034, -0.016, 0.028], [0.012, 0.011, 0.026], 0.1, 0.0, FurBand::Coat).with_hair(130, 0.006),
-    part([0.035, 0.016, 0.006], [0.012, 0.011, 0.006], 0.0, 0.0, FurBand::Dark),
-    part([0.035, -0.016, 0.006], [0.012, 0.011, 0.006], 0.0, 0.0, FurBand::Dark),
-    part([-0.037, 0.016, 0.006], [0.012, 0.011, 0.006], 0.0, 0.0, FurBand::Dark),
-    part([-0.037, -0.016, 0.006], [0.012, 0.011, 0.006], 0.0, 0.0, FurBand::Dark),
+    part(
+        [0.034, 0.016, 0.028],
+        [0.011, 0.010, 0.026],
+        0.0,
+        0.0,
+        FurBand::Coat,
+    )
+    .with_hair(130, 0.006),
+    part(
+        [0.034, -0.016, 0.028],
+        [0.011, 0.010, 0.026],
+        0.0,
+        0.0,
+        FurBand::Coat,
+    )
+    .with_hair(130, 0.006),
+    part(
+        [-0.034, 0.016, 0.028],
+        [0.012, 0.011, 0.026],
+        0.1,
+        0.0,
+        FurBand::Coat,
+    )
+    .with_hair(130, 0.006),
+    part(
+        [-0.034, -0.016, 0.028],
+        [0.012, 0.011, 0.026],
+        0.1,
+        0.0,
+        FurBand::Coat,
+    )
+    .with_hair(130, 0.006),
+    part(
+        [0.035, 0.016, 0.006],
+        [0.012, 0.011, 0.006],
+        0.0,
+        0.0,
+        FurBand::Dark,
+    ),
+    part(
+        [0.035, -0.016, 0.006],
+        [0.012, 0.011, 0.006],
+        0.0,
+        0.0,
+        FurBand::Dark,
+    ),
+    part(
+        [-0.037, 0.016, 0.006],
+        [0.012, 0.011, 0.006],
+        0.0,
+        0.0,
+        FurBand::Dark,
+    ),
+    part(
+        [-0.037, -0.016, 0.006],
+        [0.012, 0.011, 0.006],
+        0.0,
+        0.0,
+        FurBand::Dark,
+    ),
 ];
 
 /// Fraction of light at a point of the toy, given the normal there and the sample's index.
@@ -95,11 +257,18 @@ pub(crate) fn body(light: Light<'_>) -> Mesh {
     let mut mesh = Mesh::default();
     for part in &PARTS {
         let [tip, root] = part.band.rows();
-        // Under hair, the skin has a color close to the roots; bare skin has the middle color of the band.
-        let texture_y = if part.n_hairs > 0 { 0.3 * tip + 0.7 * root } else { 0.5 * (tip + root) };
+        // Under hair, the skin has a color close to the roots; bare skin has the middle color of
+        // the band.
+        let texture_y = if part.n_hairs > 0 {
+            0.3 * tip + 0.7 * root
+        } else {
+            0.5 * (tip + root)
+        };
         let texture_x = |point: &Point3<f64>, normal: &Vector3<f64>| {
-            // Brightness varies at the scale of tufts, so that skin between hairs does not look bare.
-            let tuft = RandomStream::new(0x70f7, &[point.x.to_bits(), point.z.to_bits()]).between(0, 0.45, 0.9);
+            // Brightness varies at the scale of tufts, so that skin between hairs does not look
+            // bare.
+            let tuft = RandomStream::new(0x70f7, &[point.x.to_bits(), point.z.to_bits()])
+                .between(0, 0.45, 0.9);
             texture_x(tuft * light(point, normal, 0))
         };
         mesh.add_ellipsoid(part.center(), part.half_axes(), 10, texture_x, texture_y);
@@ -121,14 +290,22 @@ pub(crate) fn fur(light: Light<'_>) -> Mesh {
         for hair in 0..DENSITY * part.n_hairs / 2 {
             let down = (1.0 - 2.0 * random.unit(8 * hair)).acos() / std::f64::consts::PI;
             let direction = sphere_direction(down, random.unit(8 * hair + 1));
-            let root =
-                part.center() + half_axes[0] * direction.x + half_axes[1] * direction.y + half_axes[2] * direction.z;
+            let root = part.center()
+                + half_axes[0] * direction.x
+                + half_axes[1] * direction.y
+                + half_axes[2] * direction.z;
             if is_inside_another(&root, ix) {
                 continue;
             }
             let normal = ellipsoid_normal(&half_axes, &direction);
             let length_m = part.hair_m * random.between(8 * hair + 2, 0.8, 1.5);
-            let hair_at = Hair { root, normal, length_m, width_m: 0.0011, band: part.band };
+            let hair_at = Hair {
+                root,
+                normal,
+                length_m,
+                width_m: 0.0011,
+                band: part.band,
+            };
             grow_hair(&mut mesh, light, random, 8 * hair + 3, &hair_at);
         }
     }
@@ -140,7 +317,11 @@ pub(crate) fn fur(light: Light<'_>) -> Mesh {
 fn is_inside_another(point: &Point3<f64>, own_ix: usize) -> bool {
     PARTS.iter().enumerate().any(|(ix, part)| {
         let offset = point - part.center();
-        let share: f64 = part.half_axes().iter().map(|axis| (axis.dot(&offset) / axis.norm_squared()).powi(2)).sum();
+        let share: f64 = part
+            .half_axes()
+            .iter()
+            .map(|axis| (axis.dot(&offset) / axis.norm_squared()).powi(2))
+            .sum();
         ix != own_ix && share < 0.9
     })
 }
@@ -167,7 +348,11 @@ fn grow_hair(mesh: &mut Mesh, light: Light<'_>, random: RandomStream, counter: u
     let tip = middle + end * (0.45 * hair.length_m);
     let side = start.cross(&Vector3::new(0.3, 0.2, 0.9)).normalize();
     let across = start.cross(&side);
-    let share = light(&(hair.root + hair.normal * (0.6 * hair.length_m)), &hair.normal, counter);
+    let share = light(
+        &(hair.root + hair.normal * (0.6 * hair.length_m)),
+        &hair.normal,
+        counter,
+    );
     let tone = texture_x(share * random.between(counter + 3, 0.45, 1.0));
     let [band_tip, band_root] = hair.band.rows();
     let corners = [0.0, 1.0, 2.0].map(|third: f64| {
@@ -188,7 +373,11 @@ fn grow_hair(mesh: &mut Mesh, light: Light<'_>, random: RandomStream, counter: u
     };
     let below = ring(hair.root, 0.5 * hair.width_m, 0.0);
     let above = ring(middle, 0.36 * hair.width_m, 0.6);
-    let top = mesh.push(Corner { point_m: tip, normal: shade(&end), texcoord: [tone, row(1.0)] });
+    let top = mesh.push(Corner {
+        point_m: tip,
+        normal: shade(&end),
+        texcoord: [tone, row(1.0)],
+    });
     for ix in 0..3 {
         let next = (ix + 1) % 3;
         mesh.triangle([below[ix], below[next], above[next]]);
@@ -218,7 +407,13 @@ fn add_mane(mesh: &mut Mesh, light: Light<'_>) {
             light,
             random,
             9 * hair + 3,
-            &Hair { root, normal, length_m, width_m: 0.0013, band: FurBand::Dark },
+            &Hair {
+                root,
+                normal,
+                length_m,
+                width_m: 0.0013,
+                band: FurBand::Dark,
+            },
         );
     }
 }
@@ -227,8 +422,11 @@ fn add_tail(mesh: &mut Mesh, light: Light<'_>) {
     let random = RandomStream::new(0xf0_44, &[101]);
     for hair in 0..160 {
         let along = random.unit(9 * hair);
-        let root =
-            Point3::new(-0.046 - 0.020 * along, random.between(9 * hair + 1, -0.003, 0.003), 0.075 - 0.030 * along);
+        let root = Point3::new(
+            -0.046 - 0.020 * along,
+            random.between(9 * hair + 1, -0.003, 0.003),
+            0.075 - 0.030 * along,
+        );
         let normal = Vector3::new(-0.5, 0.0, -0.8).normalize();
         let length_m = 0.012 + 0.016 * along;
         grow_hair(
@@ -236,7 +434,13 @@ fn add_tail(mesh: &mut Mesh, light: Light<'_>) {
             light,
             random,
             9 * hair + 3,
-            &Hair { root, normal, length_m, width_m: 0.0013, band: FurBand::Dark },
+            &Hair {
+                root,
+                normal,
+                length_m,
+                width_m: 0.0013,
+                band: FurBand::Dark,
+            },
         );
     }
 }

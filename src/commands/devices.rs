@@ -1,4 +1,5 @@
-//! `fieldrig devices`: lists connected devices, as reported by the kernel, with the values to use in a rig file.
+//! `fieldrig devices`: lists connected devices, as reported by the kernel, with the values to use
+//! in a rig file.
 
 use crate::exit::Exit;
 use crate::open_gpu::open_gpu;
@@ -48,7 +49,10 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
             print::json(device)?;
         } else {
             let label = if device.usable { "yes" } else { "no " };
-            print::line(format_args!("{label}  {:10} {:14} {}", device.kind, device.address, device.name))?;
+            print::line(format_args!(
+                "{label}  {:10} {:14} {}",
+                device.kind, device.address, device.name
+            ))?;
             print::line(format_args!("     {}", device.note))?;
         }
     }
@@ -62,11 +66,21 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
 
 fn gpu() -> DeviceInfo {
     let (name, usable, note) = match open_gpu() {
-        Ok(gpu) if gpu.is_software() => (gpu.describe(), true, "software adapter: works, but slowly".to_owned()),
+        Ok(gpu) if gpu.is_software() => (
+            gpu.describe(),
+            true,
+            "software adapter: works, but slowly".to_owned(),
+        ),
         Ok(gpu) => (gpu.describe(), true, "trains and renders".to_owned()),
         Err(error) => ("none".to_owned(), false, error.to_string()),
     };
-    DeviceInfo { kind: "gpu", address: "default".into(), name, usable, note }
+    DeviceInfo {
+        kind: "gpu",
+        address: "default".into(),
+        name,
+        usable,
+        note,
+    }
 }
 
 fn simulation() -> DeviceInfo {
@@ -76,21 +90,36 @@ fn simulation() -> DeviceInfo {
     } else {
         "built without simulation; run `make deps`, then `cargo build --release --features sim`"
     };
-    DeviceInfo { kind: "simulation", address: "run --sim".into(), name: "MuJoCo".into(), usable, note: note.into() }
+    DeviceInfo {
+        kind: "simulation",
+        address: "run --sim".into(),
+        name: "MuJoCo".into(),
+        usable,
+        note: note.into(),
+    }
 }
 
 /// V4L2 capture devices with their image modes.
 #[cfg(target_os = "linux")]
 fn video_devices(cameras: Vec<Result<v4l2::FoundCamera, v4l2::Problem>>) -> Vec<DeviceInfo> {
     let describe = |camera: v4l2::FoundCamera| {
-        let usb = camera.usb_mbits.map_or(String::new(), |mbits| format!(", USB at {mbits} Mbit/s"));
-        let serial = camera.serial.as_ref().map_or(String::new(), |serial| format!(", serial {serial}"));
+        let usb = camera
+            .usb_mbits
+            .map_or(String::new(), |mbits| format!(", USB at {mbits} Mbit/s"));
+        let serial = camera
+            .serial
+            .as_ref()
+            .map_or(String::new(), |serial| format!(", serial {serial}"));
         let offers = v4l2::summary(&camera.modes);
         DeviceInfo {
             kind: "camera",
             address: camera.address(),
             usable: !camera.modes.is_empty(),
-            note: format!("driver v4l2, {}, at {}{serial}{usb}: {offers}", camera.node.display(), camera.bus),
+            note: format!(
+                "driver v4l2, {}, at {}{serial}{usb}: {offers}",
+                camera.node.display(),
+                camera.bus
+            ),
             name: camera.name,
         }
     };
@@ -101,23 +130,40 @@ fn video_devices(cameras: Vec<Result<v4l2::FoundCamera, v4l2::Problem>>) -> Vec<
         usable: false,
         note: problem.to_string(),
     };
-    cameras.into_iter().map(|camera| camera.map_or_else(unavailable, describe)).collect()
+    cameras
+        .into_iter()
+        .map(|camera| camera.map_or_else(unavailable, describe))
+        .collect()
 }
 
 /// RealSense cameras found by librealsense.
 #[cfg(feature = "realsense")]
 fn realsense_cameras(_sys: &Path) -> Vec<DeviceInfo> {
-    let found = |address, name, usable, note| DeviceInfo { kind: "camera", address, name, usable, note };
+    let found = |address, name, usable, note| DeviceInfo {
+        kind: "camera",
+        address,
+        name,
+        usable,
+        note,
+    };
     match drivers::realsense::cameras() {
         Ok(cameras) => cameras
             .into_iter()
             .map(|camera| {
-                let usb = camera.usb.as_ref().map_or(String::new(), |usb| format!(", USB {usb}"));
+                let usb = camera
+                    .usb
+                    .as_ref()
+                    .map_or(String::new(), |usb| format!(", USB {usb}"));
                 let note = format!("driver realsense, firmware {}{usb}", camera.firmware);
                 found(camera.serial, camera.name, true, note)
             })
             .collect(),
-        Err(problem) => vec![found("unknown".into(), "RealSense".into(), false, problem.to_string())],
+        Err(problem) => vec![found(
+            "unknown".into(),
+            "RealSense".into(),
+            false,
+            problem.to_string(),
+        )],
     }
 }
 
@@ -148,9 +194,16 @@ fn can_interfaces(sys: &Path) -> Vec<DeviceInfo> {
         .map(|interface| {
             let state = attribute(&sys.join("class/net").join(&interface).join("operstate"))
                 .unwrap_or_else(|| "unknown".into());
-            let note = format!("driver can, [arm.bus.{interface}]; `fieldrig doctor` checks its settings");
+            let note =
+                format!("driver can, [arm.bus.{interface}]; `fieldrig doctor` checks its settings");
             let usable = cfg!(target_os = "linux");
-            DeviceInfo { kind: "can", address: interface, name: format!("CAN interface, {state}"), usable, note }
+            DeviceInfo {
+                kind: "can",
+                address: interface,
+                name: format!("CAN interface, {state}"),
+                usable,
+                note,
+            }
         })
         .collect()
 }
@@ -189,12 +242,19 @@ mod tests {
         write(sys.path(), "class/net/can0/operstate", "up\n");
         write(sys.path(), "class/net/eth0/type", "1\n");
         write(sys.path(), "bus/usb/devices/2-1/idVendor", "8086\n");
-        write(sys.path(), "bus/usb/devices/2-1/product", "Intel(R) RealSense(TM) Depth Camera 435i\n");
+        write(
+            sys.path(),
+            "bus/usb/devices/2-1/product",
+            "Intel(R) RealSense(TM) Depth Camera 435i\n",
+        );
         write(sys.path(), "bus/usb/devices/2-2/idVendor", "8086\n");
         write(sys.path(), "bus/usb/devices/2-2/product", "Bluetooth\n");
         let can = can_interfaces(sys.path());
         assert_eq!(can.len(), 1);
-        assert_eq!((can[0].address.as_str(), can[0].name.as_str()), ("can0", "CAN interface, up"));
+        assert_eq!(
+            (can[0].address.as_str(), can[0].name.as_str()),
+            ("can0", "CAN interface, up")
+        );
         let realsense = realsense_on_usb(sys.path());
         assert_eq!(realsense.len(), 1);
         assert_eq!(realsense[0].address, "usb 2-1");
@@ -212,12 +272,26 @@ mod tests {
             modes: Vec::new(),
         };
         let source = std::io::ErrorKind::PermissionDenied.into();
-        let unavailable = v4l2::Problem::Open { path: "/dev/video4".into(), source };
+        let unavailable = v4l2::Problem::Open {
+            path: "/dev/video4".into(),
+            source,
+        };
         let found = video_devices(vec![Ok(camera), Err(unavailable)]);
         assert_eq!(found[0].address, "/dev/v4l/by-id/usb-A1B2-index0");
-        assert!(found[0].note.contains("/dev/video2, at usb-0000:00:14.0-2, serial A1B2, USB at 480 Mbit/s"));
-        assert!(!found[0].usable && !found[1].usable, "one has no modes, the other cannot be opened");
-        assert!(found[1].note.contains("usermod -aG video"), "{}", found[1].note);
+        assert!(
+            found[0]
+                .note
+                .contains("/dev/video2, at usb-0000:00:14.0-2, serial A1B2, USB at 480 Mbit/s")
+        );
+        assert!(
+            !found[0].usable && !found[1].usable,
+            "one has no modes, the other cannot be opened"
+        );
+        assert!(
+            found[1].note.contains("usermod -aG video"),
+            "{}",
+            found[1].note
+        );
     }
 
     #[test]

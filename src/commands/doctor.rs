@@ -1,4 +1,5 @@
-//! `fieldrig doctor`: checks this computer and the devices of a rig, and prints a fix for each problem.
+//! `fieldrig doctor`: checks this computer and the devices of a rig, and prints a fix for each
+//! problem.
 
 mod gpu;
 mod page_address;
@@ -18,7 +19,8 @@ const DEFAULT_ADDRESS: &str = "127.0.0.1:7007";
 pub(crate) struct Args {
     /// Rig file; its devices are checked, too
     rig: Option<PathBuf>,
-    /// After the checks, read all devices for S seconds and print rates, latencies and losses; nothing is moved
+    /// After the checks, read all devices for S seconds and print rates, latencies and losses;
+    /// nothing is moved
     #[arg(long, value_name = "S", requires = "rig", value_parser = number_in_range(1.0..=3600.0))]
     listen: Option<f64>,
     /// Print JSON, one object per line
@@ -28,7 +30,11 @@ pub(crate) struct Args {
 
 /// Runs all checks; the exit code is 1 if one fails.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
-    let rig = args.rig.as_ref().map(|path| Rig::load(path, &[])).transpose()?;
+    let rig = args
+        .rig
+        .as_ref()
+        .map(|path| Rig::load(path, &[]))
+        .transpose()?;
     let mut findings = gpu::gpu();
     findings.push(simulation());
     findings.push(page_address::page_address(DEFAULT_ADDRESS));
@@ -46,7 +52,9 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         print_findings(&result.findings, args.json)?;
         findings.extend(result.findings);
     }
-    let failed = findings.iter().any(|finding| finding.verdict == Verdict::Fail);
+    let failed = findings
+        .iter()
+        .any(|finding| finding.verdict == Verdict::Fail);
     Ok(if failed { Exit::Failed } else { Exit::Done })
 }
 
@@ -61,7 +69,10 @@ fn print_findings(findings: &[Finding], as_json: bool) -> anyhow::Result<()> {
             Verdict::Warn => "warn",
             Verdict::Fail => "fail",
         };
-        print::line(format_args!("{label}  {:12} {}", finding.check, finding.message))?;
+        print::line(format_args!(
+            "{label}  {:12} {}",
+            finding.check, finding.message
+        ))?;
         if let Some(remedy) = &finding.remedy {
             print::line(format_args!("      {:12} -> {remedy}", ""))?;
         }
@@ -74,6 +85,10 @@ fn simulation() -> Finding {
         Finding::ok("simulation", "MuJoCo is built in")
     } else {
         let remedy = "make deps && cargo build --release --features sim";
-        Finding::warn("simulation", "built without MuJoCo: `fieldrig run --sim` is not available", remedy)
+        Finding::warn(
+            "simulation",
+            "built without MuJoCo: `fieldrig run --sim` is not available",
+            remedy,
+        )
     }
 }

@@ -22,7 +22,8 @@ pub(crate) struct Args {
     data: PathBuf,
     #[command(flatten)]
     images: DataArgs,
-    /// `SqueezeNet` weights for LPIPS (safetensors) [default: `FIELDRIG_LPIPS_WEIGHTS`, else no LPIPS]
+    /// `SqueezeNet` weights for LPIPS (safetensors) [default: `FIELDRIG_LPIPS_WEIGHTS`, else no
+    /// LPIPS]
     #[arg(long, value_name = "FILE")]
     lpips_weights: Option<PathBuf>,
     /// Print one JSON object
@@ -56,43 +57,85 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let mut model = loaded.method;
     let overrides = training_overrides(&args.model);
     let bar = ReadBar::new(args.json);
-    let data = Data::load(&args.data, &args.images.options(), Purpose::Scoring, &overrides, &|read| bar.show(read))?;
+    let data = Data::load(
+        &args.data,
+        &args.images.options(),
+        Purpose::Scoring,
+        &overrides,
+        &|read| bar.show(read),
+    )?;
     let tests = data.of_split(Split::Test);
     let n_trained_on = n_trained_on(args, &tests, data.rig.is_some());
     if n_trained_on > 0 {
-        log::warn!("the model was trained on {n_trained_on} of the {} images that are scored", tests.len());
+        log::warn!(
+            "the model was trained on {n_trained_on} of the {} images that are scored",
+            tests.len()
+        );
     }
-    if data.rig.as_ref().is_some_and(|rig| differs_from_training_rig(rig, &args.model)) {
+    if data
+        .rig
+        .as_ref()
+        .is_some_and(|rig| differs_from_training_rig(rig, &args.model))
+    {
         log::warn!(
             "the model was trained with another rig file, and its camera corrections apply to that file; see --rig"
         );
     }
-    let scored = print::bar(Some(tests.len() as u64), "{bar:30} {elapsed} scored {pos} of {len} images", args.json);
-    let images =
-        evaluator.score_all(model.as_mut(), tests.iter(), |_, n_scored| scored.set_position(n_scored as u64))?;
+    let scored = print::bar(
+        Some(tests.len() as u64),
+        "{bar:30} {elapsed} scored {pos} of {len} images",
+        args.json,
+    );
+    let images = evaluator.score_all(model.as_mut(), tests.iter(), |_, n_scored| {
+        scored.set_position(n_scored as u64)
+    })?;
     scored.finish_and_clear();
     if !is_empty {
-        warn_if_hardly_covered(&images.iter().filter_map(|image| image.covered_frac).collect::<Vec<_>>());
+        warn_if_hardly_covered(
+            &images
+                .iter()
+                .filter_map(|image| image.covered_frac)
+                .collect::<Vec<_>>(),
+        );
     }
     let scores = Scores::mean(&images);
     let is_test = |keyframe: &Keyframe| keyframe.split == Split::Test;
-    let names = data.keyframes.iter().zip(data.names).filter(|(keyframe, _)| is_test(keyframe)).map(|(_, name)| name);
-    let per_image: Vec<NamedScores> = names.zip(images).map(|(name, scores)| NamedScores { name, scores }).collect();
+    let names = data
+        .keyframes
+        .iter()
+        .zip(data.names)
+        .filter(|(keyframe, _)| is_test(keyframe))
+        .map(|(_, name)| name);
+    let per_image: Vec<NamedScores> = names
+        .zip(images)
+        .map(|(name, scores)| NamedScores { name, scores })
+        .collect();
     if args.json {
         print::json(&EvalResult { scores, per_image })?;
     } else {
         for image in &per_image {
-            print::line(format_args!("{:30} {}", image.name, Scores::mean(std::slice::from_ref(&image.scores))))?;
+            print::line(format_args!(
+                "{:30} {}",
+                image.name,
+                Scores::mean(std::slice::from_ref(&image.scores))
+            ))?;
         }
-        print::line(format_args!("{:30} {scores}", format!("mean of {}", per_image.len())))?;
+        print::line(format_args!(
+            "{:30} {scores}",
+            format!("mean of {}", per_image.len())
+        ))?;
     }
     Ok(exit::from_losses(&data.data_losses))
 }
 
-/// Takes `base.realign` from the rig file of the model, because the base poses must be treated as in training.
+/// Takes `base.realign` from the rig file of the model, because the base poses must be treated as
+/// in training.
 fn training_overrides(model: &Path) -> Vec<Override> {
     let training_rig = Rig::load(&model.join(drivers::recording::RIG_FILE), &[]);
-    training_rig.iter().map(|rig| Override::new("base.realign", rig.base.realign)).collect()
+    training_rig
+        .iter()
+        .map(|rig| Override::new("base.realign", rig.base.realign))
+        .collect()
 }
 
 /// Whether the calibration of a rig differs from the one in the model's folder.
@@ -101,16 +144,21 @@ fn differs_from_training_rig(rig: &Rig, model: &Path) -> bool {
     training_rig.is_ok_and(|training_rig| !rig.has_same_calibration(&training_rig))
 }
 
-/// Number of test images that the model was trained on, according to the list in its folder; 0 without a list.
+/// Number of test images that the model was trained on, according to the list in its folder; 0
+/// without a list.
 ///
-/// Image names are not unique across dataset folders, so the list is used only if the model was trained on the same
-/// folder.
+/// Image names are not unique across dataset folders, so the list is used only if the model was
+/// trained on the same folder.
 fn n_trained_on(args: &Args, tests: &[Arc<Keyframe>], is_recording: bool) -> usize {
-    let Ok(list) = KeyframeList::load(&args.model.join("keyframes.txt")) else { return 0 };
+    let Ok(list) = KeyframeList::load(&args.model.join("keyframes.txt")) else {
+        return 0;
+    };
     if !is_recording && trained_folder(&args.model) != args.data.canonicalize().ok() {
         return 0;
     }
-    let is_trained = |keyframe: &&Arc<Keyframe>| list.split_of(&keyframe.camera, keyframe.stamp) == Some(Split::Train);
+    let is_trained = |keyframe: &&Arc<Keyframe>| {
+        list.split_of(&keyframe.camera, keyframe.stamp) == Some(Split::Train)
+    };
     tests.iter().filter(is_trained).count()
 }
 

@@ -30,7 +30,8 @@ pub(crate) struct Args {
     /// Simplify the mesh of a distance field to one vertex per cell of this width, meters
     #[arg(long, value_name = "M", value_parser = parse_cell_width)]
     cell_m: Option<f64>,
-    /// Export exactly the keyframes that this `keyframes.txt` lists [default: the keyframes that a run would accept]
+    /// Export exactly the keyframes that this `keyframes.txt` lists [default: the keyframes that a
+    /// run would accept]
     #[arg(long, value_name = "FILE")]
     keyframes: Option<PathBuf>,
     /// Use this rig file instead of the recording's
@@ -47,7 +48,10 @@ const NERFSTUDIO: &str = "nerfstudio";
 fn formats() -> Vec<PossibleValue> {
     let mut contents: BTreeMap<&str, Vec<&str>> = BTreeMap::new();
     for export in exports() {
-        contents.entry(export.format).or_default().push(export.contents);
+        contents
+            .entry(export.format)
+            .or_default()
+            .push(export.contents);
     }
     let format = |(format, contents): (_, Vec<&str>)| {
         let contents = listed(&contents, "or");
@@ -56,7 +60,11 @@ fn formats() -> Vec<PossibleValue> {
     let nerfstudio = PossibleValue::new(NERFSTUDIO).help(
         "From a recording: a folder with PNG photos, 16-bit depth, and transforms.json with poses and split lists",
     );
-    contents.into_iter().map(format).chain([nerfstudio]).collect()
+    contents
+        .into_iter()
+        .map(format)
+        .chain([nerfstudio])
+        .collect()
 }
 
 /// The output formats of all methods.
@@ -65,7 +73,10 @@ fn exports() -> impl Iterator<Item = &'static Export> {
 }
 
 fn parse_cell_width(text: &str) -> Result<f64, String> {
-    let width_m = text.parse().ok().filter(|width_m: &f64| *width_m > 0.0 && width_m.is_finite());
+    let width_m = text
+        .parse()
+        .ok()
+        .filter(|width_m: &f64| *width_m > 0.0 && width_m.is_finite());
     width_m.ok_or_else(|| "expected a number above 0".to_owned())
 }
 
@@ -87,13 +98,20 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     signals::remove_partial_files_on_signals()?;
     match (contents, &*args.to) {
         (Contents::Recording, NERFSTUDIO) => export_recording(args),
-        (Contents::Recording, _) => {
-            Err(unsupported("this is a recording; splats and meshes are exported from a model", args))
-        }
-        (Contents::Model(_), NERFSTUDIO) => {
-            Err(unsupported("this is a model; nerfstudio is exported from a recording", args))
-        }
-        (Contents::Model(kind), format) => match kind.entry().exports.iter().find(|export| export.format == format) {
+        (Contents::Recording, _) => Err(unsupported(
+            "this is a recording; splats and meshes are exported from a model",
+            args,
+        )),
+        (Contents::Model(_), NERFSTUDIO) => Err(unsupported(
+            "this is a model; nerfstudio is exported from a recording",
+            args,
+        )),
+        (Contents::Model(kind), format) => match kind
+            .entry()
+            .exports
+            .iter()
+            .find(|export| export.format == format)
+        {
             Some(export) => export_model(export, args),
             None => Err(unsupported(&describe_exports(kind, format), args)),
         },
@@ -102,22 +120,36 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
 
 /// Why a model cannot be exported to a format.
 fn describe_exports(kind: ModelKind, format: &str) -> String {
-    let formats: Vec<&str> = kind.entry().exports.iter().map(|export| export.format).collect();
+    let formats: Vec<&str> = kind
+        .entry()
+        .exports
+        .iter()
+        .map(|export| export.format)
+        .collect();
     let model = kind.entry().model;
     if formats.is_empty() {
         return format!("{model} cannot be exported");
     }
-    format!("{model} cannot be exported as {format}, only as {}", listed(&formats, "or"))
+    format!(
+        "{model} cannot be exported as {format}, only as {}",
+        listed(&formats, "or")
+    )
 }
 
 fn contents(path: &Path) -> anyhow::Result<Contents> {
-    ensure!(path.exists(), BadArgument(format!("{} does not exist", path.display())));
+    ensure!(
+        path.exists(),
+        BadArgument(format!("{} does not exist", path.display()))
+    );
     if let Some(kind) = methods::kind_of(path)? {
         run_folder::expect_model(path)?;
         return Ok(Contents::Model(kind));
     }
     let sentence = "not a model folder, a splat file or a recording";
-    ensure!(path.is_file(), BadArgument(format!("{}: {sentence}", path.display())));
+    ensure!(
+        path.is_file(),
+        BadArgument(format!("{}: {sentence}", path.display()))
+    );
     Ok(Contents::Recording)
 }
 
@@ -128,11 +160,19 @@ fn check_file(args: &Args) -> Result<(), BadArgument> {
         return Ok(());
     }
     let out = args.out.display();
-    if !args.out.extension().is_some_and(|actual| actual.eq_ignore_ascii_case(extension)) {
-        return Err(BadArgument(format!("--out {out}: the file name must end in .{extension}")));
+    if !args
+        .out
+        .extension()
+        .is_some_and(|actual| actual.eq_ignore_ascii_case(extension))
+    {
+        return Err(BadArgument(format!(
+            "--out {out}: the file name must end in .{extension}"
+        )));
     }
     if args.out.exists() {
-        return Err(BadArgument(format!("--out {out}: the file exists; choose another name")));
+        return Err(BadArgument(format!(
+            "--out {out}: the file exists; choose another name"
+        )));
     }
     Ok(())
 }
@@ -144,7 +184,11 @@ fn unsupported(sentence: &str, args: &Args) -> anyhow::Error {
 /// Exports a model.
 fn export_model(export: &Export, args: &Args) -> anyhow::Result<Exit> {
     let export = |out: &Path| -> anyhow::Result<Exported> {
-        let request = ExportRequest { model: &args.from, out, cell_m: args.cell_m };
+        let request = ExportRequest {
+            model: &args.from,
+            out,
+            cell_m: args.cell_m,
+        };
         let exported = match export.write {
             ExportWriter::Cpu(write) => write(&request),
             ExportWriter::Gpu(write) => write(open_gpu()?, &request),
@@ -157,16 +201,27 @@ fn export_model(export: &Export, args: &Args) -> anyhow::Result<Exit> {
         })
     };
     let exported = files::create_from(&args.out, export);
-    let Exported { n_items, item, detail } =
-        exported.with_context(|| format!("cannot write {}", args.out.display()))?;
+    let Exported {
+        n_items,
+        item,
+        detail,
+    } = exported.with_context(|| format!("cannot write {}", args.out.display()))?;
     let separator = if detail.is_empty() { "" } else { " " };
-    print::report(format!("{}{separator}{detail} -> {}", counted(n_items, item), args.out.display()));
+    print::report(format!(
+        "{}{separator}{detail} -> {}",
+        counted(n_items, item),
+        args.out.display()
+    ));
     Ok(Exit::Done)
 }
 
 fn export_recording(args: &Args) -> anyhow::Result<Exit> {
     let overrides = [Override::new("train.scale", 1.0)];
-    let rig = args.rig.as_deref().map(|file| Rig::load(file, &overrides)).transpose()?;
+    let rig = args
+        .rig
+        .as_deref()
+        .map(|file| Rig::load(file, &overrides))
+        .transpose()?;
     let mut opened = open::recording(&args.from, rig, &overrides)?;
     let mut join = Join::new(&opened.rig)?;
     if let Some(list) = &args.keyframes {
@@ -195,10 +250,20 @@ fn export_recording(args: &Args) -> anyhow::Result<Exit> {
 }
 
 fn sentence(written: Written) -> String {
-    let Written { n_images, n_depth, n_depth_skipped } = written;
+    let Written {
+        n_images,
+        n_depth,
+        n_depth_skipped,
+    } = written;
     let skipped = match n_depth_skipped as u64 {
         0 => String::new(),
-        n => format!(", {} skipped: their lens differs from the lens of the photo", counted(n, "depth image")),
+        n => format!(
+            ", {} skipped: their lens differs from the lens of the photo",
+            counted(n, "depth image")
+        ),
     };
-    format!("{}, {n_depth} of them with depth{skipped}", counted(n_images as u64, "photo"))
+    format!(
+        "{}, {n_depth} of them with depth{skipped}",
+        counted(n_images as u64, "photo")
+    )
 }

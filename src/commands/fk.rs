@@ -20,8 +20,9 @@ pub(crate) struct Args {
     base: Option<String>,
     /// Joint values as JSON, `{"joint_names": ["j1", ...], "configurations": [[0.1, ...], ...]}`
     ///
-    /// Radians for revolute joints, meters for prismatic ones. The names may be in any order. Joints that do not move
-    /// the tip and joints that mimic others may be included; they have no effect.
+    /// Radians for revolute joints, meters for prismatic ones. The names may be in any order.
+    /// Joints that do not move the tip and joints that mimic others may be included; they have no
+    /// effect.
     #[arg(long, value_name = "FILE.json")]
     joints: PathBuf,
 }
@@ -50,8 +51,12 @@ pub(crate) fn run(args: Args) -> anyhow::Result<()> {
         log::warn!("{}: {note}", args.urdf.display());
     }
     let joints = read(&args.joints)?;
-    let poses = poses(&robot, &chain, &joints).with_context(|| args.joints.display().to_string())?;
-    print::json(&Poses { tip: &args.tip, poses })
+    let poses =
+        poses(&robot, &chain, &joints).with_context(|| args.joints.display().to_string())?;
+    print::json(&Poses {
+        tip: &args.tip,
+        poses,
+    })
 }
 
 fn read(path: &Path) -> anyhow::Result<String> {
@@ -77,10 +82,17 @@ fn poses(robot: &Robot, chain: &Chain, joints: &str) -> anyhow::Result<Vec<[f64;
             values.len()
         );
         let q: Vec<f64> = order.iter().map(|&column| values[column]).collect();
-        let base_from_tip = chain.forward(&q).with_context(|| format!("configuration {at} (from 0)"))?;
+        let base_from_tip = chain
+            .forward(&q)
+            .with_context(|| format!("configuration {at} (from 0)"))?;
         Ok(transform::to_rows(&base_from_tip))
     };
-    let poses = joints.configurations.iter().enumerate().map(pose).collect::<anyhow::Result<_>>()?;
+    let poses = joints
+        .configurations
+        .iter()
+        .enumerate()
+        .map(pose)
+        .collect::<anyhow::Result<_>>()?;
     warn_outside_limits(robot, &joints);
     Ok(poses)
 }
@@ -89,7 +101,9 @@ fn poses(robot: &Robot, chain: &Chain, joints: &str) -> anyhow::Result<Vec<[f64;
 fn warn_outside_limits(robot: &Robot, joints: &JointsFile) {
     for (at, values) in joints.configurations.iter().enumerate() {
         for (name, value) in joints.joint_names.iter().zip(values) {
-            let Some(limits) = robot.joint(name).map(|joint| joint.limits) else { continue };
+            let Some(limits) = robot.joint(name).map(|joint| joint.limits) else {
+                continue;
+            };
             if !(limits.lower..=limits.upper).contains(value) {
                 let (lower, upper) = (limits.lower, limits.upper);
                 log::warn!(
@@ -103,11 +117,19 @@ fn warn_outside_limits(robot: &Robot, joints: &JointsFile) {
 
 fn check_names(robot: &Robot, names: &[String]) -> anyhow::Result<()> {
     for (at, name) in names.iter().enumerate() {
-        ensure!(!names[..at].contains(name), "joint {name:?} is listed twice in joint_names");
+        ensure!(
+            !names[..at].contains(name),
+            "joint {name:?} is listed twice in joint_names"
+        );
         if robot.joint(name).is_none() {
-            let moving = robot.joints().iter().filter(|joint| joint.kind != JointKind::Fixed);
+            let moving = robot
+                .joints()
+                .iter()
+                .filter(|joint| joint.kind != JointKind::Fixed);
             let nearest = capture::nearest_name(name, moving.map(|joint| joint.name.as_str()));
-            let hint = nearest.map(|joint| format!("; did you mean {joint:?}?")).unwrap_or_default();
+            let hint = nearest
+                .map(|joint| format!("; did you mean {joint:?}?"))
+                .unwrap_or_default();
             bail!("joint {name:?} is not in the URDF{hint}");
         }
     }

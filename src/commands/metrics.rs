@@ -22,7 +22,8 @@ pub(crate) struct Args {
     /// Print one JSON object; null means unavailable or, for PSNR, infinite
     #[arg(long)]
     json: bool,
-    /// `SqueezeNet` weights for LPIPS (safetensors) [default: `FIELDRIG_LPIPS_WEIGHTS`, else no LPIPS]
+    /// `SqueezeNet` weights for LPIPS (safetensors) [default: `FIELDRIG_LPIPS_WEIGHTS`, else no
+    /// LPIPS]
     #[arg(long, value_name = "FILE")]
     lpips_weights: Option<PathBuf>,
     /// Meters per count, if both images are 16-bit depth
@@ -31,7 +32,10 @@ pub(crate) struct Args {
 }
 
 fn positive(text: &str) -> Result<f64, String> {
-    let number = text.parse::<f64>().ok().filter(|number| number.is_finite() && *number > 0.0);
+    let number = text
+        .parse::<f64>()
+        .ok()
+        .filter(|number| number.is_finite() && *number > 0.0);
     number.ok_or_else(|| "must be a number above 0".to_owned())
 }
 
@@ -47,7 +51,8 @@ struct Scores {
 /// Prints PSNR, SSIM and LPIPS of two images, or the error of two depth images.
 pub(crate) fn run(args: Args) -> anyhow::Result<()> {
     let (rendered, truth) = (open(&args.rendered)?, open(&args.truth)?);
-    let [size_px, truth_px] = [&rendered, &truth].map(|picture| [picture.width(), picture.height()]);
+    let [size_px, truth_px] =
+        [&rendered, &truth].map(|picture| [picture.width(), picture.height()]);
     if size_px != truth_px {
         bail!(
             "{} is {}x{} pixels, {} is {}x{}: the images must have the same size",
@@ -65,27 +70,54 @@ pub(crate) fn run(args: Args) -> anyhow::Result<()> {
         }
         (rendered, truth) => {
             let (rendered, truth) = (rendered.into_rgba8(), truth.into_rgba8());
-            color_scores(&PixelPair::new(size_px, &rendered, &truth)?, args.lpips_weights.as_deref())?
+            color_scores(
+                &PixelPair::new(size_px, &rendered, &truth)?,
+                args.lpips_weights.as_deref(),
+            )?
         }
     };
-    if args.json { print::json(&scores) } else { Ok(print::line(scores.to_text())?) }
+    if args.json {
+        print::json(&scores)
+    } else {
+        Ok(print::line(scores.to_text())?)
+    }
 }
 
 fn open(path: &Path) -> anyhow::Result<DynamicImage> {
-    let read = || anyhow::Ok(ImageReader::new(BufReader::new(files::open(path)?)).with_guessed_format()?.decode()?);
+    let read = || {
+        anyhow::Ok(
+            ImageReader::new(BufReader::new(files::open(path)?))
+                .with_guessed_format()?
+                .decode()?,
+        )
+    };
     read().with_context(|| format!("cannot read the image {}", path.display()))
 }
 
 fn color_scores(pair: &PixelPair<'_>, lpips_weights: Option<&Path>) -> anyhow::Result<Scores> {
-    let lpips = load_lpips(lpips_weights)?.map(|lpips| lpips.distance(pair)).transpose()?;
-    Ok(Scores { psnr: Some(psnr(pair)?), ssim: Some(ssim(pair)?), lpips, depth_rmse_m: None })
+    let lpips = load_lpips(lpips_weights)?
+        .map(|lpips| lpips.distance(pair))
+        .transpose()?;
+    Ok(Scores {
+        psnr: Some(psnr(pair)?),
+        ssim: Some(ssim(pair)?),
+        lpips,
+        depth_rmse_m: None,
+    })
 }
 
 fn depth_scores(counts: [&Vec<u16>; 2], meters_per_count: f64) -> anyhow::Result<Scores> {
-    #[expect(clippy::cast_possible_truncation, reason = "16-bit counts keep more digits in f32 than sensors have")]
+    #[expect(
+        clippy::cast_possible_truncation,
+        reason = "16-bit counts keep more digits in f32 than sensors have"
+    )]
     let meters_from_count = |count: &u16| (f64::from(*count) * meters_per_count) as f32;
-    let [rendered_m, truth_m] = counts.map(|counts| counts.iter().map(meters_from_count).collect::<Vec<_>>());
-    Ok(Scores { depth_rmse_m: depth_rmse_m(&rendered_m, &truth_m)?, ..Scores::default() })
+    let [rendered_m, truth_m] =
+        counts.map(|counts| counts.iter().map(meters_from_count).collect::<Vec<_>>());
+    Ok(Scores {
+        depth_rmse_m: depth_rmse_m(&rendered_m, &truth_m)?,
+        ..Scores::default()
+    })
 }
 
 impl Scores {
@@ -94,9 +126,14 @@ impl Scores {
             self.psnr.map(|psnr| format!("PSNR {psnr:.3} dB")),
             self.ssim.map(|ssim| format!("SSIM {ssim:.5}")),
             self.lpips.map(|lpips| format!("LPIPS {lpips:.5}")),
-            self.depth_rmse_m.map(|rmse_m| format!("depth error {:.2} mm", 1e3 * rmse_m)),
+            self.depth_rmse_m
+                .map(|rmse_m| format!("depth error {:.2} mm", 1e3 * rmse_m)),
         ];
         let known: Vec<_> = parts.into_iter().flatten().collect();
-        if known.is_empty() { "no pixel has depth in both images".to_owned() } else { known.join("  ") }
+        if known.is_empty() {
+            "no pixel has depth in both images".to_owned()
+        } else {
+            known.join("  ")
+        }
     }
 }

@@ -16,8 +16,7 @@ use std::path::PathBuf;
 const TOLERANCE_RAD: f64 = 1e-4;
 
 /// What to do while an arm is held that its motors would release.
-pub(super) const HOLDING: &str =
-    "holding the arm; support it before you press Ctrl-C, because the motors then no longer hold it";
+pub(super) const HOLDING: &str = "holding the arm; support it before you press Ctrl-C, because the motors then no longer hold it";
 
 /// Flags of `move`.
 #[derive(Debug, clap::Args)]
@@ -26,9 +25,16 @@ pub(crate) struct Args {
     /// Rig file with the arm (TOML); its table [arm.motion] defines how the arm may be moved
     rig_file: PathBuf,
     /// Target positions of all joints in the order of arm.joints, rad or m: 0,-0.5,0,-2.0,0,1.8,0.7
-    #[arg(long, value_name = "Q,Q,...", value_delimiter = ',', allow_hyphen_values = true, conflicts_with = "by")]
+    #[arg(
+        long,
+        value_name = "Q,Q,...",
+        value_delimiter = ',',
+        allow_hyphen_values = true,
+        conflicts_with = "by"
+    )]
     to: Option<Vec<f64>>,
-    /// Move this joint by this much from its current position, rad or m; can be repeated for other joints
+    /// Move this joint by this much from its current position, rad or m; can be repeated for other
+    /// joints
     #[arg(long, value_name = "JOINT=DELTA", value_parser = delta)]
     by: Vec<(String, f64)>,
     /// Recover an arm that has stopped, before any motion; inspect the arm first
@@ -37,7 +43,8 @@ pub(crate) struct Args {
     /// Confirm the motion: nobody is within reach of the arm, and a hand is on the emergency stop
     #[arg(long, required = true)]
     enable_motion: bool,
-    /// Exit as soon as the arm has arrived, even if its motors then release it or only damp its motion
+    /// Exit as soon as the arm has arrived, even if its motors then release it or only damp its
+    /// motion
     #[arg(long)]
     exit_on_arrival: bool,
     /// Print JSON, one object per line
@@ -46,7 +53,9 @@ pub(crate) struct Args {
 }
 
 fn delta(text: &str) -> Result<(String, f64), String> {
-    let parsed = text.split_once('=').and_then(|(joint, delta)| Some((joint.to_owned(), delta.parse().ok()?)));
+    let parsed = text
+        .split_once('=')
+        .and_then(|(joint, delta)| Some((joint.to_owned(), delta.parse().ok()?)));
     parsed
         .filter(|(_, delta): &(String, f64)| delta.is_finite())
         .ok_or_else(|| "expected JOINT=DELTA, such as joint1=0.1".to_owned())
@@ -67,7 +76,9 @@ struct ArrivedEvent<'a> {
 
 /// Moves the arm, then holds it if its motors would release it on exit.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
-    let stop = signals::stop_on_signals_logging("bringing the arm to rest; Ctrl-C again applies on_loss at once")?;
+    let stop = signals::stop_on_signals_logging(
+        "bringing the arm to rest; Ctrl-C again applies on_loss at once",
+    )?;
     signals::stop_when_output_closes(&stop)?;
     let rig = Rig::load(&args.rig_file, &[])?;
     let motion = motion_of(&rig)?;
@@ -83,24 +94,34 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         let requested = target(args, &rig.arm.joints, &initial);
         check_range(&rig, &requested, &initial)?;
         let target = arm.command(&requested)?;
-        for (joint, (requested, accepted)) in rig.arm.joints.iter().zip(requested.position.iter().zip(&target.position))
+        for (joint, (requested, accepted)) in rig
+            .arm
+            .joints
+            .iter()
+            .zip(requested.position.iter().zip(&target.position))
         {
             if (requested - accepted).abs() > TOLERANCE_RAD {
-                log::warn!("joint {joint:?} moves to {accepted:.4}, the limit of its range, instead of {requested:.4}");
+                log::warn!(
+                    "joint {joint:?} moves to {accepted:.4}, the limit of its range, instead of {requested:.4}"
+                );
             }
         }
         let began = clock::now();
         let last = follow(&mut arm, &target, &stop, &bar).inspect_err(|error| {
             if args.json {
                 // Output errors are ignored: the arm's error is returned.
-                let _ = print::report_json(&serde_json::json!({ "event": "stopped", "reason": format!("{error:#}") }));
+                let _ = print::report_json(
+                    &serde_json::json!({ "event": "stopped", "reason": format!("{error:#}") }),
+                );
             }
         })?;
         report_arrival(args, &rig.arm.joints, &target, &last, began)?;
     }
     if motion.on_loss != OnLoss::Hold && !args.exit_on_arrival {
         log::info!("{HOLDING}");
-        arm.hold(&stop, |state| bar.set_message(format!("held at {}", format_positions(&state.position))))?;
+        arm.hold(&stop, |state| {
+            bar.set_message(format!("held at {}", format_positions(&state.position)))
+        })?;
     }
     bar.finish_and_clear();
     Ok(Exit::Done)
@@ -120,25 +141,42 @@ fn check(args: &Args, rig: &Rig) -> Result<(), BadArgument> {
     let joints = &rig.arm.joints;
     if let Some(to) = args.to.as_ref().filter(|to| to.len() != joints.len()) {
         let (n, names) = (to.len(), joints.join(", "));
-        return Err(BadArgument(format!("--to has {n} positions, the arm has {} joints: {names}", joints.len())));
+        return Err(BadArgument(format!(
+            "--to has {n} positions, the arm has {} joints: {names}",
+            joints.len()
+        )));
     }
-    if let Some(joint) = joints.iter().find(|joint| args.by.iter().filter(|(by, _)| by == *joint).count() > 1) {
+    if let Some(joint) = joints
+        .iter()
+        .find(|joint| args.by.iter().filter(|(by, _)| by == *joint).count() > 1)
+    {
         return Err(BadArgument(format!("--by: joint {joint:?} is given twice")));
     }
     if let Some((joint, _)) = args.by.iter().find(|(joint, _)| !joints.contains(joint)) {
-        let available = if joints.is_empty() { "none".to_owned() } else { joints.join(", ") };
-        return Err(BadArgument(format!("--by: unknown joint {joint:?}; joints of the arm: {available}")));
+        let available = if joints.is_empty() {
+            "none".to_owned()
+        } else {
+            joints.join(", ")
+        };
+        return Err(BadArgument(format!(
+            "--by: unknown joint {joint:?}; joints of the arm: {available}"
+        )));
     }
     Ok(())
 }
 
-/// Rejects a target outside the joint ranges of the URDF, so that a typing error does not move an arm to its limits. A
-/// joint that is already outside its range may stay there.
+/// Rejects a target outside the joint ranges of the URDF, so that a typing error does not move an
+/// arm to its limits. A joint that is already outside its range may stay there.
 fn check_range(rig: &Rig, requested: &JointTarget, now: &JointState) -> anyhow::Result<()> {
     let chain = open::chain_of(rig)?;
     for (ix, joint) in rig.arm.joints.iter().enumerate() {
-        let Some(joint_ix) = chain.joint_names().iter().position(|known| known == joint) else { continue };
-        let (lower, upper) = (chain.limits()[joint_ix].lower, chain.limits()[joint_ix].upper);
+        let Some(joint_ix) = chain.joint_names().iter().position(|known| known == joint) else {
+            continue;
+        };
+        let (lower, upper) = (
+            chain.limits()[joint_ix].lower,
+            chain.limits()[joint_ix].upper,
+        );
         let (requested, now) = (requested.position[ix], now.position[ix]);
         if (requested - now).abs() > TOLERANCE_RAD
             && !(lower - TOLERANCE_RAD..=upper + TOLERANCE_RAD).contains(&requested)
@@ -155,7 +193,10 @@ fn check_range(rig: &Rig, requested: &JointTarget, now: &JointState) -> anyhow::
 fn target(args: &Args, joints: &[String], now: &JointState) -> JointTarget {
     let mut position = args.to.clone().unwrap_or_else(|| now.position.clone());
     for (joint, delta) in &args.by {
-        let moved = joints.iter().zip(&mut position).find(|(name, _)| *name == joint);
+        let moved = joints
+            .iter()
+            .zip(&mut position)
+            .find(|(name, _)| *name == joint);
         if let Some((_, position)) = moved {
             *position += delta;
         }
@@ -170,11 +211,22 @@ fn report_arrival(
     last: &JointState,
     began: Stamp,
 ) -> anyhow::Result<()> {
-    let errors = target.position.iter().zip(&last.position).map(|(target, actual)| (target - actual).abs());
+    let errors = target
+        .position
+        .iter()
+        .zip(&last.position)
+        .map(|(target, actual)| (target - actual).abs());
     let (error, seconds) = (errors.fold(0.0, f64::max), clock::now().secs_since(began));
     if args.json {
         let (target, position) = (&target.position[..], &last.position[..]);
-        return print::report_json(&ArrivedEvent { event: "done", joints, target, position, error, seconds });
+        return print::report_json(&ArrivedEvent {
+            event: "done",
+            joints,
+            target,
+            position,
+            error,
+            seconds,
+        });
     }
     print::report(format_args!(
         "arrived after {seconds:.1} s at {}, maximum error {error:.5}",
@@ -184,17 +236,32 @@ fn report_arrival(
 }
 
 /// Waits until the arm arrives. Ctrl-C stops the arm and returns an error.
-fn follow(arm: &mut SupervisedArm, target: &JointTarget, stop: &Stop, bar: &ProgressBar) -> anyhow::Result<JointState> {
+fn follow(
+    arm: &mut SupervisedArm,
+    target: &JointTarget,
+    stop: &Stop,
+    bar: &ProgressBar,
+) -> anyhow::Result<JointState> {
     let target = format_positions(&target.position);
     let end = arm.follow(stop, |state| {
-        bar.set_message(format!("at {} of {target}", format_positions(&state.position)));
+        bar.set_message(format!(
+            "at {} of {target}",
+            format_positions(&state.position)
+        ));
     })?;
     if !end.has_arrived {
-        bail!("stopped before the target, at {}", format_positions(&end.state.position));
+        bail!(
+            "stopped before the target, at {}",
+            format_positions(&end.state.position)
+        );
     }
     Ok(end.state)
 }
 
 fn format_positions(position: &[f64]) -> String {
-    position.iter().map(|position| format!("{position:.4}")).collect::<Vec<_>>().join(", ")
+    position
+        .iter()
+        .map(|position| format!("{position:.4}"))
+        .collect::<Vec<_>>()
+        .join(", ")
 }

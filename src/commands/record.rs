@@ -27,8 +27,8 @@ pub(crate) struct Args {
     /// Simulate as fast as possible, without loss [default: real time]
     #[arg(long, requires = "sim")]
     lockstep: bool,
-    /// Stop after S seconds of device time [default: until Ctrl-C or until the devices end; required with --lockstep,
-    /// unless the rig file ends the simulation]
+    /// Stop after S seconds of device time [default: until Ctrl-C or until the devices end;
+    /// required with --lockstep, unless the rig file ends the simulation]
     #[arg(long, value_name = "S", value_parser = number_in_range(0.1..=1e7))]
     seconds: Option<f64>,
     #[command(flatten)]
@@ -46,7 +46,8 @@ struct Recorded {
     /// Color images.
     images: u64,
     depth_images: u64,
-    /// Color images dropped by the devices, or because the disk was too slow. `dropped` has the counts per camera.
+    /// Color images dropped by the devices, or because the disk was too slow. `dropped` has the
+    /// counts per camera.
     images_dropped_by_devices: u64,
     dropped: BTreeMap<String, DroppedImages>,
     joint_states: u64,
@@ -95,7 +96,11 @@ impl Recorded {
 
     /// Recounts from the file after a write error. The counts of dropped images are kept.
     fn recount_from_file(self) -> Self {
-        let mut found = Self { event: self.event, out: self.out, ..Self::default() };
+        let mut found = Self {
+            event: self.event,
+            out: self.out,
+            ..Self::default()
+        };
         let mut first: Option<Stamp> = None;
         if let Ok(mut recording) = Recording::open(&found.out) {
             while let Ok(Some(sample)) = recording.next_sample() {
@@ -104,12 +109,25 @@ impl Recorded {
                 found.count(&sample);
             }
         }
-        Self { dropped: self.dropped, images_dropped_by_devices: self.images_dropped_by_devices, ..found }
+        Self {
+            dropped: self.dropped,
+            images_dropped_by_devices: self.images_dropped_by_devices,
+            ..found
+        }
     }
 
     fn summary(&self) -> String {
-        let Self { images, depth_images, joint_states, base_poses, range_scans, .. } = self;
-        let mut message = format!("{images} color images, {depth_images} depth images, {joint_states} joint states");
+        let Self {
+            images,
+            depth_images,
+            joint_states,
+            base_poses,
+            range_scans,
+            ..
+        } = self;
+        let mut message = format!(
+            "{images} color images, {depth_images} depth images, {joint_states} joint states"
+        );
         for (n, what) in [(base_poses, "base poses"), (range_scans, "range scans")] {
             if *n > 0 {
                 message.push_str(&format!(", {n} {what}"));
@@ -120,16 +138,25 @@ impl Recorded {
 
     /// Devices of the rig without recorded data.
     fn missing_devices(&self, rig: &Rig) -> Vec<String> {
-        let arm = (rig.arm.driver != ArmDriver::None && self.joint_states == 0).then_some("joint state of the arm");
-        let base = (rig.base.driver != BaseDriver::Fixed && self.base_poses == 0).then_some("pose of the base");
+        let arm = (rig.arm.driver != ArmDriver::None && self.joint_states == 0)
+            .then_some("joint state of the arm");
+        let base = (rig.base.driver != BaseDriver::Fixed && self.base_poses == 0)
+            .then_some("pose of the base");
         let images = (self.images == 0).then_some("image");
-        [arm, base, images].into_iter().flatten().map(|what| format!("no {what} was recorded")).collect()
+        [arm, base, images]
+            .into_iter()
+            .flatten()
+            .map(|what| format!("no {what} was recorded"))
+            .collect()
     }
 
     /// Dropped images, one message per camera.
     fn data_losses(&self) -> Vec<String> {
         let sentence = |(camera, dropped): (&String, &DroppedImages)| {
-            format!("camera {camera:?} dropped {} color and {} depth images", dropped.images, dropped.depth_images)
+            format!(
+                "camera {camera:?} dropped {} color and {} depth images",
+                dropped.images, dropped.depth_images
+            )
         };
         self.dropped.iter().map(sentence).collect()
     }
@@ -137,11 +164,13 @@ impl Recorded {
 
 /// Rejects a lockstep simulation without an end, because it would fill the disk.
 fn check_end(args: &Args, rig: &Rig) -> Result<(), BadArgument> {
-    let is_endless = args.seconds.is_none() && rig.sim.duration_secs.is_none() && rig.sim.n_images.is_none();
+    let is_endless =
+        args.seconds.is_none() && rig.sim.duration_secs.is_none() && rig.sim.n_images.is_none();
     let is_simulated = args.sim || rig.arm.driver == ArmDriver::Sim;
     if is_simulated && rig.sim.lockstep && is_endless {
         return Err(BadArgument(
-            "a lockstep simulation without an end would fill the disk: limit it with --seconds".into(),
+            "a lockstep simulation without an end would fill the disk: limit it with --seconds"
+                .into(),
         ));
     }
     Ok(())
@@ -150,15 +179,35 @@ fn check_end(args: &Args, rig: &Rig) -> Result<(), BadArgument> {
 /// Records until the time limit, the end of the devices, or Ctrl-C.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let stop = signals::stop_on_signals()?;
-    let overrides = if args.lockstep { vec![Override::new("sim.lockstep", true)] } else { Vec::new() };
+    let overrides = if args.lockstep {
+        vec![Override::new("sim.lockstep", true)]
+    } else {
+        Vec::new()
+    };
     let rig = Rig::load(&args.rig_file, &overrides)?;
     check_end(args, &rig)?;
     if args.out.exists() {
-        return Err(drivers::Error::Exists { path: args.out.clone() }.into()); // Checked before the devices are opened.
+        return Err(drivers::Error::Exists {
+            path: args.out.clone(),
+        }
+        .into()); // Checked before the devices are opened.
     }
-    let Opened { rig, mut source, .. } = open::rig(rig, if args.sim { Devices::Sim } else { Devices::Real })?;
+    let Opened {
+        rig, mut source, ..
+    } = open::rig(
+        rig,
+        if args.sim {
+            Devices::Sim
+        } else {
+            Devices::Real
+        },
+    )?;
     let mut recorder = open::recorder(&args.out, &rig)?;
-    let mut recorded = Recorded { event: "done", out: args.out.clone(), ..Recorded::default() };
+    let mut recorded = Recorded {
+        event: "done",
+        out: args.out.clone(),
+        ..Recorded::default()
+    };
     let bar = print::bar(None, "{spinner} {elapsed} {msg}", args.json);
     let mut first: Option<Stamp> = None;
     let mut input_error = None;
@@ -174,7 +223,10 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         };
         let since_first = sample.stamp().0 - first.get_or_insert(sample.stamp()).0;
         recorded.seconds = recorded.seconds.max(since_first as f64 * 1e-9);
-        if args.seconds.is_some_and(|seconds| recorded.seconds > seconds) {
+        if args
+            .seconds
+            .is_some_and(|seconds| recorded.seconds > seconds)
+        {
             break;
         }
         if let Err(error) = recorder.write(&sample) {
@@ -197,18 +249,28 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         None => None,
     };
     if let Some(error) = input_error {
-        let finished = format!("a device failed; {} contains the data up to that point", args.out.display());
+        let finished = format!(
+            "a device failed; {} contains the data up to that point",
+            args.out.display()
+        );
         return Err(anyhow::Error::new(error).context(finished));
     }
     if n_written == Some(0) {
-        return Err(
-            InsufficientData(format!("no device sent any data, so {} was not written", args.out.display())).into()
-        );
+        return Err(InsufficientData(format!(
+            "no device sent any data, so {} was not written",
+            args.out.display()
+        ))
+        .into());
     }
     if args.json {
         print::report_json(&recorded)?;
     } else {
-        print::report(format_args!("{:.1} s, {} in {}", recorded.seconds, recorded.summary(), args.out.display()));
+        print::report(format_args!(
+            "{:.1} s, {} in {}",
+            recorded.seconds,
+            recorded.summary(),
+            args.out.display()
+        ));
     }
     data_losses.extend(recorded.data_losses());
     data_losses.extend(recorded.missing_devices(&rig));

@@ -29,7 +29,8 @@ pub(crate) struct Args {
     /// Camera path in nerfstudio's format (JSON)
     #[arg(long, value_name = "FILE", group = "where")]
     camera_path: Option<PathBuf>,
-    /// `world_from_camera`: 16 numbers, row major, separated by spaces or commas; camera: x right, y down, z forward
+    /// `world_from_camera`: 16 numbers, row major, separated by spaces or commas; camera: x right,
+    /// y down, z forward
     #[arg(long, value_name = "NUMBERS", group = "where", allow_hyphen_values = true, value_parser = numbers::<16>)]
     pose: Option<Numbers<16>>,
     /// Size of the images [default: the camera path's, else 1280x720]
@@ -41,8 +42,8 @@ pub(crate) struct Args {
     /// Render a 360-degree equirectangular image instead of a pinhole view
     #[arg(long, conflicts_with = "fov")]
     equirect: bool,
-    /// Render only the part of the scene in this box: x y z of the lower corner, then of the upper corner, world frame,
-    /// meters
+    /// Render only the part of the scene in this box: x y z of the lower corner, then of the upper
+    /// corner, world frame, meters
     #[arg(long, value_name = "NUMBERS", allow_hyphen_values = true, value_parser = corners)]
     crop: Option<Numbers<6>>,
     /// Also write depth as .npy: meters along the camera's z axis (distance with --equirect)
@@ -62,10 +63,16 @@ struct Numbers<const N: usize>([f64; N]);
 
 fn numbers<const N: usize>(text: &str) -> Result<Numbers<N>, String> {
     let words = text.split([' ', ',']).filter(|word| !word.is_empty());
-    let values: Vec<f64> =
-        words.map(|word| word.parse().map_err(|_| format!("{word:?} is not a number"))).collect::<Result<_, _>>()?;
+    let values: Vec<f64> = words
+        .map(|word| {
+            word.parse()
+                .map_err(|_| format!("{word:?} is not a number"))
+        })
+        .collect::<Result<_, _>>()?;
     let n = values.len();
-    <[f64; N]>::try_from(values).map(Numbers).map_err(|_| format!("got {n} numbers, expected {N}"))
+    <[f64; N]>::try_from(values)
+        .map(Numbers)
+        .map_err(|_| format!("got {n} numbers, expected {N}"))
 }
 
 /// Two opposite corners of a box, the lower one first.
@@ -74,17 +81,23 @@ fn corners(text: &str) -> Result<Numbers<6>, String> {
     let Numbers([x, y, z, to_x, to_y, to_z]) = corners;
     for (axis, from, to) in [("x", x, to_x), ("y", y, to_y), ("z", z, to_z)] {
         if !(from.is_finite() && to.is_finite() && from < to) {
-            return Err(format!("{axis} ranges from {from} to {to}; both must be finite and increasing"));
+            return Err(format!(
+                "{axis} ranges from {from} to {to}; both must be finite and increasing"
+            ));
         }
     }
     Ok(corners)
 }
 
 fn size(text: &str) -> Result<[u32; 2], String> {
-    let sides = text.split_once('x').and_then(|(width, height)| Some([width.parse().ok()?, height.parse().ok()?]));
+    let sides = text
+        .split_once('x')
+        .and_then(|(width, height)| Some([width.parse().ok()?, height.parse().ok()?]));
     sides
         .filter(|sides: &[u32; 2]| sides.iter().all(|side| (1..=MAX_SIDE_PX).contains(side)))
-        .ok_or_else(|| format!("expected WIDTHxHEIGHT, such as 1280x720, each side at most {MAX_SIDE_PX}"))
+        .ok_or_else(|| {
+            format!("expected WIDTHxHEIGHT, such as 1280x720, each side at most {MAX_SIDE_PX}")
+        })
 }
 
 /// A rendered image.
@@ -103,33 +116,59 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let path = match (&args.camera_path, &args.pose) {
         (Some(file), _) => CameraPath::load(file)?,
         (None, Some(pose)) => CameraPath::of_pose(&pose.0)?,
-        (None, None) => return Err(BadArgument("either --camera-path or --pose is needed".into()).into()),
+        (None, None) => {
+            return Err(BadArgument("either --camera-path or --pose is needed".into()).into());
+        }
     };
     for note in &path.notes {
         log::warn!("--camera-path: {note}");
     }
     if path.is_panoramic && !args.equirect {
-        return Err(BadArgument("--camera-path: the path was made for panoramas; add --equirect".into()).into());
+        return Err(BadArgument(
+            "--camera-path: the path was made for panoramas; add --equirect".into(),
+        )
+        .into());
     }
     let size_px = args.size.or(path.size_px).unwrap_or(DEFAULT_SIZE_PX);
-    let requests = path.cameras.iter().map(|camera| args.request(camera, size_px)).collect::<Result<Vec<_>, _>>()?;
+    let requests = path
+        .cameras
+        .iter()
+        .map(|camera| args.request(camera, size_px))
+        .collect::<Result<Vec<_>, _>>()?;
     expect_model(&args.model)?;
     check_no_overwrite(&args.out, requests.len())?;
     signals::remove_partial_files_on_signals()?;
     let loaded = methods::load(open_gpu()?, &args.model)?;
     let is_empty = methods::note_if_empty(&args.model, &loaded).is_some();
-    let LoadedModel { method: mut model, edits, .. } = loaded;
+    let LoadedModel {
+        method: mut model,
+        edits,
+        ..
+    } = loaded;
     let edits = Arc::new(edits);
-    std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create the folder {}", args.out.display()))?;
-    let bar = print::bar(Some(requests.len() as u64), "{bar:30} {pos} of {len}", args.json);
+    std::fs::create_dir_all(&args.out)
+        .with_context(|| format!("cannot create the folder {}", args.out.display()))?;
+    let bar = print::bar(
+        Some(requests.len() as u64),
+        "{bar:30} {pos} of {len}",
+        args.json,
+    );
     let mut covered_fracs = Vec::new();
     for (ix, request) in requests.iter().enumerate() {
         let since = Instant::now();
-        let picture = model.render(&RenderRequest { edits: Arc::clone(&edits), ..request.clone() })?;
+        let picture = model.render(&RenderRequest {
+            edits: Arc::clone(&edits),
+            ..request.clone()
+        })?;
         let draw_millis = since.elapsed().as_secs_f64() * 1e3;
         covered_fracs.push(covered_frac(&picture));
         let (picture, depth) = write(&args.out, ix, &picture, args.depth)?;
-        let rendered = RenderedPicture { picture, depth, size_px, draw_millis };
+        let rendered = RenderedPicture {
+            picture,
+            depth,
+            size_px,
+            draw_millis,
+        };
         bar.inc(1);
         if args.json {
             print::report_json(&rendered)?;
@@ -147,9 +186,17 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
 }
 
 impl Args {
-    fn request(&self, camera: &PathCamera, size_px: [u32; 2]) -> Result<RenderRequest, BadArgument> {
+    fn request(
+        &self,
+        camera: &PathCamera,
+        size_px: [u32; 2],
+    ) -> Result<RenderRequest, BadArgument> {
         const DEFAULT_FOV_DEGREES: f64 = 60.0;
-        let fov_y_rad = self.fov.map(f64::to_radians).or(camera.fov_y_rad).unwrap_or(DEFAULT_FOV_DEGREES.to_radians());
+        let fov_y_rad = self
+            .fov
+            .map(f64::to_radians)
+            .or(camera.fov_y_rad)
+            .unwrap_or(DEFAULT_FOV_DEGREES.to_radians());
         if !(fov_y_rad > 0.0 && fov_y_rad < std::f64::consts::PI) {
             return Err(BadArgument(format!(
                 "field of view {} degrees: must be above 0 and below 180",
@@ -158,11 +205,18 @@ impl Args {
         }
         let [width, height] = size_px.map(f64::from);
         let focal_px = 0.5 * height / (0.5 * fov_y_rad).tan();
-        let pinhole = Projection::Pinhole { focal_px: [focal_px; 2], principal_px: [0.5 * width, 0.5 * height] };
+        let pinhole = Projection::Pinhole {
+            focal_px: [focal_px; 2],
+            principal_px: [0.5 * width, 0.5 * height],
+        };
         Ok(RenderRequest {
             world_from_camera: camera.world_from_camera,
             size_px,
-            projection: if self.equirect { Projection::Equirectangular } else { pinhole },
+            projection: if self.equirect {
+                Projection::Equirectangular
+            } else {
+                pinhole
+            },
             shutter: None,
             near_m: 0.01,
             far_m: 1000.0,
@@ -181,25 +235,46 @@ impl Args {
 
 /// File names of an image and its depth.
 fn files(folder: &Path, ix: usize) -> [PathBuf; 2] {
-    [folder.join(format!("{ix:05}.png")), folder.join(format!("{ix:05}_depth.npy"))]
+    [
+        folder.join(format!("{ix:05}.png")),
+        folder.join(format!("{ix:05}_depth.npy")),
+    ]
 }
 
 /// Rejects a folder that already holds any of the `n` images or their depth.
 fn check_no_overwrite(folder: &Path, n: usize) -> Result<(), BadArgument> {
-    match (0..n).flat_map(|ix| files(folder, ix)).find(|file| file.exists()) {
-        Some(file) => Err(BadArgument(format!("--out: {} exists; choose another folder", file.display()))),
+    match (0..n)
+        .flat_map(|ix| files(folder, ix))
+        .find(|file| file.exists())
+    {
+        Some(file) => Err(BadArgument(format!(
+            "--out: {} exists; choose another folder",
+            file.display()
+        ))),
         None => Ok(()),
     }
 }
 
 /// Writes an image and optionally its depth; returns their files.
-fn write(folder: &Path, ix: usize, picture: &Picture, with_depth: bool) -> anyhow::Result<(PathBuf, Option<PathBuf>)> {
+fn write(
+    folder: &Path,
+    ix: usize,
+    picture: &Picture,
+    with_depth: bool,
+) -> anyhow::Result<(PathBuf, Option<PathBuf>)> {
     let [width, height] = picture.size_px;
     let [file, depth] = files(folder, ix);
     let write_png = |inside: &Path| -> anyhow::Result<()> {
-        Ok(image::save_buffer(inside, &picture.rgba_srgb, width, height, image::ExtendedColorType::Rgba8)?)
+        Ok(image::save_buffer(
+            inside,
+            &picture.rgba_srgb,
+            width,
+            height,
+            image::ExtendedColorType::Rgba8,
+        )?)
     };
-    files::create_from(&file, write_png).with_context(|| format!("cannot write {}", file.display()))?;
+    files::create_from(&file, write_png)
+        .with_context(|| format!("cannot write {}", file.display()))?;
     let depth = with_depth.then_some(depth);
     if let Some(depth) = &depth {
         files::create(depth, |file| write_npy(file, picture))
@@ -213,7 +288,11 @@ fn write_npy(file: &mut std::fs::File, picture: &Picture) -> std::io::Result<()>
     use npyz::WriterBuilder;
     let [width, height] = picture.size_px.map(u64::from);
     let to = std::io::BufWriter::new(file);
-    let mut writer = npyz::WriteOptions::new().default_dtype().shape(&[height, width]).writer(to).begin_nd()?;
+    let mut writer = npyz::WriteOptions::new()
+        .default_dtype()
+        .shape(&[height, width])
+        .writer(to)
+        .begin_nd()?;
     writer.extend(picture.depth_m.iter())?;
     writer.finish()
 }
@@ -228,11 +307,20 @@ mod tests {
         for invalid in ["640", "640x", "0x480", "99999x1", "640x480x3"] {
             assert!(size(invalid).is_err(), "{invalid}");
         }
-        assert_eq!(numbers::<3>("1, -2 3.5").map(|Numbers(values)| values), Ok([1.0, -2.0, 3.5]));
+        assert_eq!(
+            numbers::<3>("1, -2 3.5").map(|Numbers(values)| values),
+            Ok([1.0, -2.0, 3.5])
+        );
         assert!(numbers::<3>("1 2").is_err_and(|error| error.contains("got 2")));
         assert!(numbers::<1>("one").is_err());
         assert!(corners("0 0 0 1 1 1").is_ok());
-        for invalid in ["0 0 1 1 1 0", "0 0 0 1 1 nan", "0 0 0 1 0 1", "-inf 0 0 1 1 1", "0 0 0"] {
+        for invalid in [
+            "0 0 1 1 1 0",
+            "0 0 0 1 1 nan",
+            "0 0 0 1 0 1",
+            "-inf 0 0 1 1 1",
+            "0 0 0",
+        ] {
             assert!(corners(invalid).is_err(), "{invalid}");
         }
     }
@@ -240,8 +328,11 @@ mod tests {
     #[test]
     fn depth_files_hold_the_rendered_depth() {
         let folder = tempfile::tempdir().expect("folder");
-        let picture =
-            Picture { size_px: [2, 3], rgba_srgb: vec![255; 24], depth_m: vec![0.0, 1.0, 2.0, 3.0, 4.0, 5.5] };
+        let picture = Picture {
+            size_px: [2, 3],
+            rgba_srgb: vec![255; 24],
+            depth_m: vec![0.0, 1.0, 2.0, 3.0, 4.0, 5.5],
+        };
         let (file, depth) = write(folder.path(), 7, &picture, true).expect("written");
         let bytes = std::fs::read(depth.expect("requested")).expect("a file");
         let read = npyz::NpyFile::new(&bytes[..]).expect("npy");
@@ -249,7 +340,9 @@ mod tests {
         assert_eq!(read.into_vec::<f32>().expect("floats"), picture.depth_m);
         assert!(file.ends_with("00007.png"));
         check_no_overwrite(folder.path(), 7).expect("the eighth image is not requested");
-        let message = check_no_overwrite(folder.path(), 8).expect_err("the file exists").0;
+        let message = check_no_overwrite(folder.path(), 8)
+            .expect_err("the file exists")
+            .0;
         assert!(message.contains("00007.png exists"), "{message}");
     }
 }

@@ -15,8 +15,8 @@ use capture::config::{ArmDriver, Override, Rig};
 use capture::doctor;
 use capture::open::{self, Devices, Opened};
 use capture::{
-    Counts, Feed, Input, InputResult, Join, Notes, Rejection, RobotMotion, SampleUse, StampClock, StationReport,
-    Stations, Stop,
+    Counts, Feed, Input, InputResult, Join, Notes, Rejection, RobotMotion, SampleUse, StampClock,
+    StationReport, Stations, Stop,
 };
 use drivers::Source;
 use keyframe::{Keyframe, Split, counted};
@@ -26,10 +26,10 @@ use session::methods::{self, COUNT};
 use session::next_commands::{DataSource, quoted};
 use session::run_folder::{self, CreatedFolders};
 use session::{
-    AvailableData, Checkpoints, Clock, DecisionLog, EndingSession, Evaluator, Evaluators, FinishedModel, KeptFolder,
-    Latency, Limits, Live, LiveOptions, ModelViewer, Pace, REALIGN, Recovery, RefineSettings, RunDescription, RunFlags,
-    ServedModel, Session, Settings, StoredKeyframes, Viewers, checkpoints, corrected_rig, methods_of, recovery,
-    robot_meshes,
+    AvailableData, Checkpoints, Clock, DecisionLog, EndingSession, Evaluator, Evaluators,
+    FinishedModel, KeptFolder, Latency, Limits, Live, LiveOptions, ModelViewer, Pace, REALIGN,
+    Recovery, RefineSettings, RunDescription, RunFlags, ServedModel, Session, Settings,
+    StoredKeyframes, Viewers, checkpoints, corrected_rig, methods_of, recovery, robot_meshes,
 };
 use std::collections::BTreeMap;
 use std::io::IsTerminal;
@@ -50,33 +50,35 @@ pub(crate) struct Args {
     /// Simulate all devices of the rig file
     #[arg(long, conflicts_with = "from")]
     sim: bool,
-    /// Make the simulation wait for the trainer, so that with --steps the result depends only on the seed [default:
-    /// real time]
+    /// Make the simulation wait for the trainer, so that with --steps the result depends only on
+    /// the seed [default: real time]
     #[arg(long, requires = "sim", conflicts_with = "from")]
     lockstep: bool,
     /// Replay a recording instead of live devices
     #[arg(long, value_name = "RECORDING")]
     from: Option<PathBuf>,
-    /// Play the recording at the speed of its devices instead of waiting for the trainer. Keyframes are taken as they
-    /// arrive, and images that come too fast are dropped
+    /// Play the recording at the speed of its devices instead of waiting for the trainer. Keyframes
+    /// are taken as they arrive, and images that come too fast are dropped
     #[arg(long, requires = "from", conflicts_with = "steps_per_keyframe")]
     real_time: bool,
-    /// Play the recording again whenever it ends, until the limit of --seconds or --steps is reached
+    /// Play the recording again whenever it ends, until the limit of --seconds or --steps is
+    /// reached
     #[arg(long, requires = "real_time", conflicts_with = "record")]
     repeat: bool,
-    /// Also write everything that the devices send to an MCAP file. Images that devices drop then count as a loss (exit
-    /// code 3)
+    /// Also write everything that the devices send to an MCAP file. Images that devices drop then
+    /// count as a loss (exit code 3)
     #[arg(long, value_name = "FILE")]
     record: Option<PathBuf>,
-    /// Continue a run that crashed or was stopped, from the checkpoint and keyframes in its folder and with its flags.
-    /// New keyframes are added; --record and --listen are not restored
+    /// Continue a run that crashed or was stopped, from the checkpoint and keyframes in its folder
+    /// and with its flags. New keyframes are added; --record and --listen are not restored
     #[arg(long, value_name = "FOLDER", conflicts_with_all = ["from", "method", "seed", "max_bytes", "max_splats", "refine", "count"])]
     resume: Option<PathBuf>,
-    /// Stop S seconds after the first image; time before --resume counts [default: run until Ctrl-C]
+    /// Stop S seconds after the first image; time before --resume counts [default: run until
+    /// Ctrl-C]
     #[arg(long, value_name = "S", allow_negative_numbers = true, value_parser = number_in_range(0.0..=1e9))]
     seconds: Option<f64>,
-    /// Stop after N optimizer steps, or when the devices have ended and all data is fused; steps before --resume count.
-    /// With --lockstep, the result then depends only on the seed
+    /// Stop after N optimizer steps, or when the devices have ended and all data is fused; steps
+    /// before --resume count. With --lockstep, the result then depends only on the seed
     #[arg(long, value_name = "N")]
     steps: Option<u64>,
     /// Optimizer steps between two keyframes; needs --lockstep or --from [default: 10]
@@ -86,15 +88,16 @@ pub(crate) struct Args {
     training: TrainingArgs,
     #[command(flatten)]
     page: PageArgs,
-    /// Folder for the results and the effective rig file; several methods get a subfolder each. A folder that contains
-    /// a model is refused [default: a new folder in runs]
+    /// Folder for the results and the effective rig file; several methods get a subfolder each. A
+    /// folder that contains a model is refused [default: a new folder in runs]
     #[arg(long, value_name = "FOLDER")]
     out: Option<PathBuf>,
     #[command(flatten)]
     pub(crate) permissions: PermissionArgs,
     #[command(flatten)]
     checkpoints: CheckpointArgs,
-    /// At a limit, keep serving the page until Ctrl-C, or exit [default: stay on a terminal without --json, else exit]
+    /// At a limit, keep serving the page until Ctrl-C, or exit [default: stay on a terminal without
+    /// --json, else exit]
     #[arg(long, value_name = "WHAT")]
     when_done: Option<WhenDone>,
     /// Print JSON, one object per line
@@ -140,7 +143,8 @@ struct RunDetails {
     evicted: u64,
     rejected: BTreeMap<&'static str, u64>,
     device_skipped: u64,
-    /// Number of range scans, which are stored in addition to the keyframes, and number of their points.
+    /// Number of range scans, which are stored in addition to the keyframes, and number of their
+    /// points.
     range_scans: usize,
     range_points: usize,
     data_losses: Vec<String>,
@@ -154,17 +158,26 @@ struct RunDetails {
     max_position_error_m: Option<f64>,
 }
 
-/// Runs until a limit, the end of the devices, or Ctrl-C; saves the model, its keyframes and the effective rig file.
+/// Runs until a limit, the end of the devices, or Ctrl-C; saves the model, its keyframes and the
+/// effective rig file.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let (mut created, mut has_keyframes) = (CreatedFolders::default(), false);
     let result = drive(args, &mut created, &mut has_keyframes);
     // The folder of a run that failed before its first keyframe contains nothing of use.
-    created.keep_unless(result.as_ref().is_err_and(|error| !has_keyframes || exit::is_rejection(error)));
+    created.keep_unless(
+        result
+            .as_ref()
+            .is_err_and(|error| !has_keyframes || exit::is_rejection(error)),
+    );
     result
 }
 
 /// Runs and saves. Sets `has_keyframes` as soon as the run is over.
-fn drive(args: &Args, created: &mut CreatedFolders, has_keyframes: &mut bool) -> anyhow::Result<Exit> {
+fn drive(
+    args: &Args,
+    created: &mut CreatedFolders,
+    has_keyframes: &mut bool,
+) -> anyhow::Result<Exit> {
     let previous = args.resume.as_deref().map(PreviousRun::read).transpose()?;
     if let Some(previous) = &previous
         && args.is_finished(previous)
@@ -175,7 +188,9 @@ fn drive(args: &Args, created: &mut CreatedFolders, has_keyframes: &mut bool) ->
         let subject = format!("the checkpoint in {}", previous.folder.display());
         checkpoints::check_limit_not_passed(args.seconds, &previous.checkpoint, &subject)?;
     }
-    let args = &previous.as_ref().map_or_else(|| args.clone(), |previous| args.with_flags_of(previous));
+    let args = &previous
+        .as_ref()
+        .map_or_else(|| args.clone(), |previous| args.with_flags_of(previous));
     let mut running = start(args, previous.as_ref(), created)?;
     let result = loop {
         match running.run_time_slice() {
@@ -188,7 +203,15 @@ fn drive(args: &Args, created: &mut CreatedFolders, has_keyframes: &mut bool) ->
             Err(error) => break Err(error),
         }
     };
-    let Running { live, rig, folders, damage, stop, page, .. } = running;
+    let Running {
+        live,
+        rig,
+        folders,
+        damage,
+        stop,
+        page,
+        ..
+    } = running;
     *has_keyframes = !live.keyframes().is_empty();
     let hub = live.hub();
     if let Err(error) = result {
@@ -208,9 +231,22 @@ fn drive(args: &Args, created: &mut CreatedFolders, has_keyframes: &mut bool) ->
     stop.request();
     let (exit, models) = save(live, args, &rig, folders, &damage)?;
     if args.keeps_serving() && !models.is_empty() && !stop.signaled() {
-        print::report(format_args!("serving the page at {} until Ctrl-C", page.url()));
-        let shown =
-            |FinishedModel { kind, method, edits, folder, .. }| ServedModel { kind, method, edits, path: folder };
+        print::report(format_args!(
+            "serving the page at {} until Ctrl-C",
+            page.url()
+        ));
+        let shown = |FinishedModel {
+                         kind,
+                         method,
+                         edits,
+                         folder,
+                         ..
+                     }| ServedModel {
+            kind,
+            method,
+            edits,
+            path: folder,
+        };
         ModelViewer::new(models.into_iter().map(shown).collect(), hub).serve(&stop);
     }
     Ok(exit)
@@ -252,8 +288,8 @@ pub(super) struct Running {
 }
 
 impl Running {
-    /// Takes keyframes, trains for one slice, renders and publishes the status; returns `false` when the run is over or
-    /// interrupted.
+    /// Takes keyframes, trains for one slice, renders and publishes the status; returns `false`
+    /// when the run is over or interrupted.
     pub(super) fn run_time_slice(&mut self) -> session::Result<bool> {
         if self.stop.requested() || self.live.is_over() {
             return Ok(false);
@@ -267,7 +303,9 @@ impl Running {
         let is_interrupted = self.stop.signaled();
         self.stop.request();
         let keyframes = self.live.keyframes();
-        let has_model = keyframes.iter().any(|keyframe| keyframe.split == Split::Train);
+        let has_model = keyframes
+            .iter()
+            .any(|keyframe| keyframe.split == Split::Train);
         let n_keyframes = keyframes.len();
         let (mut sessions, input_result) = self.live.finish();
         // The caller may remove the folders, so checkpoints in progress must finish first.
@@ -277,7 +315,12 @@ impl Running {
         let mut data_losses = counts.data_losses(SampleUse::ProcessedOnly);
         data_losses.extend(self.damage.get().cloned());
         let no_model_reason = (!has_model).then(|| no_model_reason(n_keyframes, counts, &self.rig));
-        Ok(DiscardedRun { input_result, data_losses, no_model_reason, is_interrupted })
+        Ok(DiscardedRun {
+            input_result,
+            data_losses,
+            no_model_reason,
+            is_interrupted,
+        })
     }
 }
 
@@ -322,10 +365,16 @@ pub(super) fn start(
     training.check_learned(&kinds, available)?;
     training.refining_live(available, true)?; // Invalid flags are rejected before the GPU is opened.
     let (common, mut settings) = methods::options(&rig.train, args.steps);
-    settings.push((COUNT, serde_json::json!(training.count.unwrap_or(CountPolicy::ToCap))));
+    settings.push((
+        COUNT,
+        serde_json::json!(training.count.unwrap_or(CountPolicy::ToCap)),
+    ));
     let pace = args.pace(&rig)?;
     let gpu = open_gpu()?;
-    let RefineSettings { align, with_scene: cameras } = training.refining_live(available, gpu.is_software())?;
+    let RefineSettings {
+        align,
+        with_scene: cameras,
+    } = training.refining_live(available, gpu.is_software())?;
     let common = CommonOptions {
         cameras,
         align,
@@ -338,10 +387,18 @@ pub(super) fn start(
         None => {
             let start = |model_spec: ModelSpec| {
                 let method = model_spec.start(gpu.clone())?;
-                Ok(Resumed { model_spec, method, untrained: Vec::new(), edits: Edits::default() })
+                Ok(Resumed {
+                    model_spec,
+                    method,
+                    untrained: Vec::new(),
+                    edits: Edits::default(),
+                })
             };
             let model_specs = methods::specs(&kinds, &common, &settings)?;
-            model_specs.into_iter().map(start).collect::<session::Result<_>>()?
+            model_specs
+                .into_iter()
+                .map(start)
+                .collect::<session::Result<_>>()?
         }
     };
     let hub = Hub::new();
@@ -350,9 +407,16 @@ pub(super) fn start(
         log::warn!("{finding}");
     }
     // Compile kernels before the first image, so that keyframes do not wait.
-    models.iter_mut().try_for_each(|model| model.method.prepare())?;
+    models
+        .iter_mut()
+        .try_for_each(|model| model.method.prepare())?;
     let device_notes = Notes::default();
-    let Opened { rig, source, damage, stamp_clock } = args.open(rig)?.with_tag_check(&device_notes)?;
+    let Opened {
+        rig,
+        source,
+        damage,
+        stamp_clock,
+    } = args.open(rig)?.with_tag_check(&device_notes)?;
     page.print(args.json, serde_json::json!({}))?;
     let folders = created.make_each(args.out(), &kinds, Some(&rig))?;
     let held = previous.map_or(&[][..], |previous| &previous.keyframes);
@@ -371,13 +435,26 @@ pub(super) fn start(
         max_frac_during_training: Some(MAX_EVALUATION_FRAC),
         at_end: Evaluator::thorough(None)?,
     };
-    let limits = Limits { seconds: args.seconds, steps: args.steps };
+    let limits = Limits {
+        seconds: args.seconds,
+        steps: args.steps,
+    };
     let clock = Clock::default();
     let mut sessions = Vec::new();
-    for (Resumed { model_spec: ModelSpec { kind, options }, mut method, untrained, edits }, folder) in
-        models.into_iter().zip(&folders)
+    for (
+        Resumed {
+            model_spec: ModelSpec { kind, options },
+            mut method,
+            untrained,
+            edits,
+        },
+        folder,
+    ) in models.into_iter().zip(&folders)
     {
-        let from_step = previous.is_some().then(|| method.n_total_steps()).transpose()?;
+        let from_step = previous
+            .is_some()
+            .then(|| method.n_total_steps())
+            .transpose()?;
         let description = RunDescription {
             method: kind.name(),
             data: args.record.as_deref().or(args.from.as_deref()),
@@ -390,7 +467,8 @@ pub(super) fn start(
         };
         let settings = Settings::new(description);
         let mut decisions = DecisionLog::create(folder, settings.clone())?;
-        let is_new = |keyframe: &Arc<Keyframe>| untrained.iter().any(|other| Arc::ptr_eq(other, keyframe));
+        let is_new =
+            |keyframe: &Arc<Keyframe>| untrained.iter().any(|other| Arc::ptr_eq(other, keyframe));
         for keyframe in held.iter().filter(|keyframe| !is_new(keyframe)) {
             decisions.restored(from_step.unwrap_or_default(), keyframe);
         }
@@ -404,44 +482,77 @@ pub(super) fn start(
         };
         let console = Console::new(OutputMode::of_command(args.json), limits, kinds.len());
         let checkpoints = Checkpoints::new(folder, args.checkpoints.options());
-        let run_flags = RunFlags { depth_from: None, flags: args.flags(limits) };
-        let session = Session::new(gpu.clone(), (kind, method), evaluators.clone(), limits, Box::new(console))
-            .with_stop(&stop)
-            .with_edits(edits)
-            .with_stepwise_scoring()
-            .with_checkpoints(checkpoints.map(|to| to.with_flags(run_flags).with_keyframes(folder)))
-            .with_decisions(decisions)
-            .with_data(args.data_source(folder))
-            .with_folders(KeptFolder::of_run(folder, kinds.len() > 1))
-            .with_recovery(recovery);
+        let run_flags = RunFlags {
+            depth_from: None,
+            flags: args.flags(limits),
+        };
+        let session = Session::new(
+            gpu.clone(),
+            (kind, method),
+            evaluators.clone(),
+            limits,
+            Box::new(console),
+        )
+        .with_stop(&stop)
+        .with_edits(edits)
+        .with_stepwise_scoring()
+        .with_checkpoints(checkpoints.map(|to| to.with_flags(run_flags).with_keyframes(folder)))
+        .with_decisions(decisions)
+        .with_data(args.data_source(folder))
+        .with_folders(KeptFolder::of_run(folder, kinds.len() > 1))
+        .with_recovery(recovery);
         let mut session = match previous {
             Some(previous) => session.with_elapsed_secs(previous.checkpoint.seconds),
             None if kinds.len() == 1 => session,
             None => session.with_shared_clock(clock.clone()),
         };
         for keyframe in held {
-            if is_new(keyframe) { session.push(keyframe)? } else { session.hold(keyframe) }
+            if is_new(keyframe) {
+                session.push(keyframe)?
+            } else {
+                session.hold(keyframe)
+            }
         }
         for (camera, stamp) in &evicted {
             session.remove(camera, *stamp)?;
         }
         sessions.push(session);
     }
-    let start_keyframes = rig.join.start_keyframes_or_default(pace == Pace::RealTime, depth);
-    let options = LiveOptions { pace, start_keyframes, notes, device_notes, open_gpu };
+    let start_keyframes = rig
+        .join
+        .start_keyframes_or_default(pace == Pace::RealTime, depth);
+    let options = LiveOptions {
+        pace,
+        start_keyframes,
+        notes,
+        device_notes,
+        open_gpu,
+    };
 
-    let held = sessions.first().map_or(Vec::new(), |session| session.keyframes().to_vec());
+    let held = sessions
+        .first()
+        .map_or(Vec::new(), |session| session.keyframes().to_vec());
     let live = Live::new(sessions, feed, hub, options).resume_from(held);
-    Ok(Running { live, gpu, page, stop, rig, folders, damage })
+    Ok(Running {
+        live,
+        gpu,
+        page,
+        stop,
+        rig,
+        folders,
+        damage,
+    })
 }
 
-/// Closes the recording and writes the keyframe lists after a GPU failure. Returns the error with a note of what was
-/// saved.
+/// Closes the recording and writes the keyframe lists after a GPU failure. Returns the error with a
+/// note of what was saved.
 fn keep_input(mut live: Live, folders: &[PathBuf], error: session::Error) -> session::Error {
     let recoverable = live.describe_recoverable();
     let (sessions, input_result) = live.finish();
     for (session, folder) in sessions.iter().zip(folders) {
-        if let Err(error) = run_folder::write_keyframe_list(&folder.join("keyframes.txt"), session.keyframes()) {
+        if let Err(error) =
+            run_folder::write_keyframe_list(&folder.join("keyframes.txt"), session.keyframes())
+        {
             log::error!("{error:#}");
         }
     }
@@ -455,7 +566,11 @@ fn keep_input(mut live: Live, folders: &[PathBuf], error: session::Error) -> ses
         Err(error) => log::error!("{error:#}"),
     }
     let is_already_reported = recoverable.is_empty() || error.is_gpu_unrecoverable();
-    if is_already_reported { error } else { error.with_context(format!("the run stopped early; {recoverable}")) }
+    if is_already_reported {
+        error
+    } else {
+        error.with_context(format!("the run stopped early; {recoverable}"))
+    }
 }
 
 /// Saves the models, then reports errors of the input.
@@ -468,7 +583,11 @@ fn save(
 ) -> anyhow::Result<(Exit, Vec<FinishedModel>)> {
     let hub = live.hub();
     let n_keyframes = live.keyframes().len();
-    let n_train = live.keyframes().iter().filter(|keyframe| keyframe.split == Split::Train).count();
+    let n_train = live
+        .keyframes()
+        .iter()
+        .filter(|keyframe| keyframe.split == Split::Train)
+        .count();
     let position_error_m = max_position_error_m(live.keyframes());
     let recoverable = live.describe_recoverable();
     let mut latencies = live.ledger().latencies();
@@ -479,14 +598,22 @@ fn save(
         Err(error) => {
             // Save the models even if the input has failed.
             let details = || serde_json::json!({ "data_losses": [error.to_string()] });
-            let ending = |(session, out): (Session, PathBuf)| EndingSession { details: details(), session, out };
+            let ending = |(session, out): (Session, PathBuf)| EndingSession {
+                details: details(),
+                session,
+                out,
+            };
             if n_train > 0 {
-                session::finish(sessions.into_iter().zip(folders).map(ending).collect(), Some(&hub))?;
+                session::finish(
+                    sessions.into_iter().zip(folders).map(ending).collect(),
+                    Some(&hub),
+                )?;
             }
             return Err(error.into());
         }
     };
-    // Errors are returned only at the end: the models may still be saved even if the disk is too full for the lists.
+    // Errors are returned only at the end: the models may still be saved even if the disk is too
+    // full for the lists.
     let list = |(session, folder): (&Session, &PathBuf)| {
         run_folder::write_keyframe_list(&folder.join("keyframes.txt"), session.keyframes())
     };
@@ -501,31 +628,53 @@ fn save(
     // Commands that score the model later need a complete recording at this path.
     let is_moved = args.record.as_ref().is_some_and(|file| !file.exists());
     let is_recorded = input_result.recording_error.is_none() && !is_moved;
-    data_losses.extend(input_result.recording_error.map(|error| format!("the recording is incomplete: {error:#}")));
+    data_losses.extend(
+        input_result
+            .recording_error
+            .map(|error| format!("the recording is incomplete: {error:#}")),
+    );
     data_losses.extend(damage.get().cloned());
     let corrected = corrected_rigs(rig, &mut sessions, &folders);
-    let stations = input_result.stations.as_ref().map_or(Vec::new(), |stations| stations.reports().to_vec());
+    let stations = input_result
+        .stations
+        .as_ref()
+        .map_or(Vec::new(), |stations| stations.reports().to_vec());
     let mut ending = |(session, out): (Session, PathBuf)| EndingSession {
         details: RunDetails {
             method: session.kind().name(),
             seed: rig.train.seed,
             keyframes: session.keyframes().len(),
             evicted: counts.evicted,
-            rejected: counts.rejected.iter().map(|(why, n)| (why.name(), *n)).collect(),
+            rejected: counts
+                .rejected
+                .iter()
+                .map(|(why, n)| (why.name(), *n))
+                .collect(),
             device_skipped: counts.device_skipped,
             range_scans: input_result.join.range_scans().count(),
-            range_points: input_result.join.range_scans().map(|scan| scan.points_in_world_m.len()).sum(),
+            range_points: input_result
+                .join
+                .range_scans()
+                .map(|scan| scan.points_in_world_m.len())
+                .sum(),
             data_losses: data_losses.clone(),
             stations: stations.clone(),
             latencies: std::mem::take(&mut latencies),
             max_position_error_m: position_error_m,
         },
-        session: if is_recorded { session } else { session.with_data(DataSource::default()) },
+        session: if is_recorded {
+            session
+        } else {
+            session.with_data(DataSource::default())
+        },
         out,
     };
     let mut models = Vec::new();
     if n_train > 0 {
-        let finished = session::finish(sessions.into_iter().zip(folders).map(&mut ending).collect(), Some(&hub));
+        let finished = session::finish(
+            sessions.into_iter().zip(folders).map(&mut ending).collect(),
+            Some(&hub),
+        );
         models = finished.map_err(|error| recovery::with_recoverable(error, &recoverable))?;
         if !args.json {
             print_next_commands(&models);
@@ -535,7 +684,10 @@ fn save(
     listed?;
     for (rig, file) in corrected? {
         corrected_rig::write(&rig, &file)?;
-        log::info!("rig file with the estimated corrections written to {}", file.display());
+        log::info!(
+            "rig file with the estimated corrections written to {}",
+            file.display()
+        );
     }
     if let Some(error) = input_result.input_error {
         return Err(anyhow::Error::new(error).context("a device failed"));
@@ -547,7 +699,11 @@ fn save(
 }
 
 /// The corrected rig files, with their paths, of the models whose cameras were corrected.
-fn corrected_rigs(rig: &Rig, sessions: &mut [Session], folders: &[PathBuf]) -> session::Result<Vec<(Rig, PathBuf)>> {
+fn corrected_rigs(
+    rig: &Rig,
+    sessions: &mut [Session],
+    folders: &[PathBuf],
+) -> session::Result<Vec<(Rig, PathBuf)>> {
     let mut rigs = Vec::new();
     for (session, folder) in sessions.iter_mut().zip(folders) {
         let learned = session.camera_corrections()?;
@@ -586,12 +742,17 @@ impl PreviousRun {
             checkpoint.seconds,
             counted(keyframes.len() as u64, "keyframe")
         );
-        Ok(Self { folder: folder.to_owned(), checkpoint, keyframes })
+        Ok(Self {
+            folder: folder.to_owned(),
+            checkpoint,
+            keyframes,
+        })
     }
 
     /// Restores its model, without the keyframes that cannot be read.
     fn resume(&self, gpu: &Arc<Gpu>) -> anyhow::Result<Resumed> {
-        let (resumed, missing) = trainer::resume_without_missing(gpu.clone(), &self.checkpoint, &self.keyframes)?;
+        let (resumed, missing) =
+            trainer::resume_without_missing(gpu.clone(), &self.checkpoint, &self.keyframes)?;
         if let Some((camera, stamp)) = missing.first() {
             log::warn!(
                 "{} of the earlier run {} missing, the first of camera {camera:?} at {} ns: training continues without them, \
@@ -606,9 +767,13 @@ impl PreviousRun {
 
     /// Rig file settings that flags of that run have changed.
     fn overrides(&self) -> Vec<Override> {
-        let realign = self.checkpoint.flags.get(REALIGN).map(|is_on| Override::new(REALIGN, is_on == "true"));
-        let method =
-            ModelKind::from_name(&self.checkpoint.method).map(|kind| Override::new("train.method", kind.name()));
+        let realign = self
+            .checkpoint
+            .flags
+            .get(REALIGN)
+            .map(|is_on| Override::new(REALIGN, is_on == "true"));
+        let method = ModelKind::from_name(&self.checkpoint.method)
+            .map(|kind| Override::new("train.method", kind.name()));
         realign.into_iter().chain(method).collect()
     }
 }
@@ -625,7 +790,8 @@ impl Args {
     /// Whether to keep serving the page after the run.
     fn keeps_serving(&self) -> bool {
         let is_watched = !self.json && std::io::stdout().is_terminal();
-        self.when_done.map_or(is_watched, |when_done| when_done == WhenDone::Stay)
+        self.when_done
+            .map_or(is_watched, |when_done| when_done == WhenDone::Stay)
     }
 
     /// The flags to store in the checkpoint, by name.
@@ -634,13 +800,27 @@ impl Args {
         let given = [
             (SECONDS, limits.seconds.map(|seconds| seconds.to_string())),
             (STEPS, limits.steps.map(|steps| steps.to_string())),
-            (STEPS_PER_KEYFRAME, self.steps_per_keyframe.map(|n| n.to_string())),
+            (
+                STEPS_PER_KEYFRAME,
+                self.steps_per_keyframe.map(|n| n.to_string()),
+            ),
             (SIM, is_on(self.sim)),
             (LOCKSTEP, is_on(self.lockstep)),
-            (RECORD, self.record.as_ref().map(|file| file.display().to_string())),
-            (REALIGN, self.training.options().realign().map(|is_on| is_on.to_string())),
+            (
+                RECORD,
+                self.record.as_ref().map(|file| file.display().to_string()),
+            ),
+            (
+                REALIGN,
+                self.training
+                    .options()
+                    .realign()
+                    .map(|is_on| is_on.to_string()),
+            ),
         ];
-        let flags = given.into_iter().filter_map(|(name, value)| Some((name.to_owned(), value?)));
+        let flags = given
+            .into_iter()
+            .filter_map(|(name, value)| Some((name.to_owned(), value?)));
         flags.chain(self.checkpoints.options().flag()).collect()
     }
 
@@ -657,15 +837,22 @@ impl Args {
         Self {
             seconds: self.seconds.or_else(|| limit(SECONDS)?.parse().ok()),
             steps: self.steps.or_else(|| limit(STEPS)?.parse().ok()),
-            steps_per_keyframe: self.steps_per_keyframe.or_else(|| flag(STEPS_PER_KEYFRAME)?.parse().ok()),
+            steps_per_keyframe: self
+                .steps_per_keyframe
+                .or_else(|| flag(STEPS_PER_KEYFRAME)?.parse().ok()),
             sim: self.sim || flag(SIM).is_some(),
             lockstep: self.lockstep || flag(LOCKSTEP).is_some(),
-            checkpoints: self.checkpoints.options().or_previous(&previous.checkpoint.flags).into(),
+            checkpoints: self
+                .checkpoints
+                .options()
+                .or_previous(&previous.checkpoint.flags)
+                .into(),
             ..self.clone()
         }
     }
 
-    /// Whether the previous run reached its limit and saved its model, and no flag raises the limit.
+    /// Whether the previous run reached its limit and saved its model, and no flag raises the
+    /// limit.
     fn is_finished(&self, previous: &PreviousRun) -> bool {
         let asks_for_more = self.seconds.is_some() || self.steps.is_some();
         let has_model = || run_folder::check_no_model(&previous.folder).is_err();
@@ -675,7 +862,9 @@ impl Args {
     fn report_finished(&self, previous: &PreviousRun) -> anyhow::Result<Exit> {
         let (folder, seconds) = (&previous.folder, previous.checkpoint.seconds);
         if self.json {
-            print::report_json(&serde_json::json!({ "event": "finished", "seconds": seconds, "out": folder }))?;
+            print::report_json(
+                &serde_json::json!({ "event": "finished", "seconds": seconds, "out": folder }),
+            )?;
         } else {
             print::report(format_args!(
                 "nothing left to do: the run in {} is finished ({seconds:.1} s) and its model is saved there; \
@@ -688,7 +877,11 @@ impl Args {
 
     /// The given folder; an unfinished run continues in its previous folder.
     fn out(&self) -> Option<&Path> {
-        let unfinished = || self.resume.as_deref().filter(|folder| run_folder::check_no_model(folder).is_ok());
+        let unfinished = || {
+            self.resume
+                .as_deref()
+                .filter(|folder| run_folder::check_no_model(folder).is_ok())
+        };
         self.out.as_deref().or_else(unfinished)
     }
 
@@ -701,24 +894,51 @@ impl Args {
     /// The data and flags with which `eval` scores the model in `folder` on the images of this run.
     fn data_source(&self, folder: &Path) -> DataSource {
         // A recording that was started with --resume lacks the earlier images.
-        let path = self.record.as_ref().or(self.from.as_ref()).filter(|_| self.resume.is_none()).cloned();
-        let rig = folder.join(drivers::recording::RIG_FILE).display().to_string();
-        DataSource { path, flags: vec!["--rig".to_owned(), rig], ..DataSource::default() }
+        let path = self
+            .record
+            .as_ref()
+            .or(self.from.as_ref())
+            .filter(|_| self.resume.is_none())
+            .cloned();
+        let rig = folder
+            .join(drivers::recording::RIG_FILE)
+            .display()
+            .to_string();
+        DataSource {
+            path,
+            flags: vec!["--rig".to_owned(), rig],
+            ..DataSource::default()
+        }
     }
 
     fn open(&self, rig: Rig) -> anyhow::Result<Opened> {
         match &self.from {
             Some(recording) => {
                 let opened = open::recording(recording, Some(rig), &[])?;
-                let opened = if self.repeat { opened.repeated(recording) } else { opened };
-                Ok(if self.real_time { opened.in_real_time() } else { opened })
+                let opened = if self.repeat {
+                    opened.repeated(recording)
+                } else {
+                    opened
+                };
+                Ok(if self.real_time {
+                    opened.in_real_time()
+                } else {
+                    opened
+                })
             }
-            None => Ok(open::rig(rig, if self.sim { Devices::Sim } else { Devices::Real })?),
+            None => Ok(open::rig(
+                rig,
+                if self.sim {
+                    Devices::Sim
+                } else {
+                    Devices::Real
+                },
+            )?),
         }
     }
 
-    /// Opens the input and restores the keyframes of the previous run. Also returns keyframes that exceed the memory
-    /// limit.
+    /// Opens the input and restores the keyframes of the previous run. Also returns keyframes that
+    /// exceed the memory limit.
     fn input(
         &self,
         rig: &Rig,
@@ -730,13 +950,22 @@ impl Args {
             source,
             join,
             stations: Stations::new(rig).map(|stations| stations.resume_from(previous)),
-            recorder: self.record.as_deref().map(|file| open::recorder(file, rig)).transpose()?,
+            recorder: self
+                .record
+                .as_deref()
+                .map(|file| open::recorder(file, rig))
+                .transpose()?,
             robot_motion: RobotMotion::new(rig),
             stamp_clock,
             camera_intrinsics: rig
                 .cameras
                 .iter()
-                .map(|camera| (camera.name.clone(), (camera.intrinsics.focal_px, camera.intrinsics.principal_px)))
+                .map(|camera| {
+                    (
+                        camera.name.clone(),
+                        (camera.intrinsics.focal_px, camera.intrinsics.principal_px),
+                    )
+                })
                 .collect(),
         };
         Ok((input, evicted))
@@ -750,7 +979,9 @@ impl Args {
             None => is_simulated && rig.sim.lockstep,
         };
         if is_lockstep {
-            let steps_per_keyframe = self.steps_per_keyframe.unwrap_or(DEFAULT_STEPS_PER_KEYFRAME);
+            let steps_per_keyframe = self
+                .steps_per_keyframe
+                .unwrap_or(DEFAULT_STEPS_PER_KEYFRAME);
             return Ok(Pace::Lockstep { steps_per_keyframe });
         }
         match self.steps_per_keyframe {
@@ -765,26 +996,48 @@ impl Args {
 
 /// A sentence that explains why a run ended without a model.
 fn no_model_reason(n_keyframes: usize, counts: &Counts, rig: &Rig) -> String {
-    let quoted = |names: Vec<&str>| names.iter().map(|name| format!("{name:?}")).collect::<Vec<_>>().join(", ");
+    let quoted = |names: Vec<&str>| {
+        names
+            .iter()
+            .map(|name| format!("{name:?}"))
+            .collect::<Vec<_>>()
+            .join(", ")
+    };
     let expected = quoted(rig.cameras.iter().map(|camera| &*camera.name).collect());
     let unknown = quoted(counts.unknown_cameras.iter().map(|name| &**name).collect());
-    let n_unknown = counts.rejected.get(&Rejection::UnknownCamera).copied().unwrap_or_default();
+    let n_unknown = counts
+        .rejected
+        .get(&Rejection::UnknownCamera)
+        .copied()
+        .unwrap_or_default();
     match (n_keyframes, counts.accepted) {
         (1, _) => format!("nothing to train on: the only keyframe is a test image ({counts})"),
-        (2.., _) => format!("nothing to train on: all {n_keyframes} keyframes are test images ({counts})"),
+        (2.., _) => {
+            format!("nothing to train on: all {n_keyframes} keyframes are test images ({counts})")
+        }
         (0, 1..) => format!("the run ended before the trainer received a keyframe ({counts})"),
-        (0, 0) if counts.images == 0 => format!("no image was received; the rig file has the cameras {expected}"),
+        (0, 0) if counts.images == 0 => {
+            format!("no image was received; the rig file has the cameras {expected}")
+        }
         (0, 0) if n_unknown == counts.images => {
-            format!("no image is from a camera in the rig file ({expected}): all {n_unknown} are from {unknown}")
+            format!(
+                "no image is from a camera in the rig file ({expected}): all {n_unknown} are from {unknown}"
+            )
         }
         (0, 0) => format!("no image became a keyframe: {counts}"),
     }
 }
 
-/// Largest position error of the keyframes; `None` if no true poses are known (only simulators report them).
+/// Largest position error of the keyframes; `None` if no true poses are known (only simulators
+/// report them).
 fn max_position_error_m(keyframes: &[Arc<Keyframe>]) -> Option<f64> {
     let error_m = |keyframe: &Arc<Keyframe>| {
-        let truth = keyframe.truth.as_ref()?.world_from_camera.translation.vector;
+        let truth = keyframe
+            .truth
+            .as_ref()?
+            .world_from_camera
+            .translation
+            .vector;
         Some((keyframe.world_from_camera.translation.vector - truth).norm())
     };
     keyframes.iter().filter_map(error_m).reduce(f64::max)
@@ -792,7 +1045,11 @@ fn max_position_error_m(keyframes: &[Arc<Keyframe>]) -> Option<f64> {
 
 /// Notes that the page shows to its viewers.
 pub(super) fn notes(gpu: &Gpu) -> Vec<String> {
-    if gpu.is_software() { vec!["no GPU: kernels run on the CPU, which is slow".to_owned()] } else { Vec::new() }
+    if gpu.is_software() {
+        vec!["no GPU: kernels run on the CPU, which is slow".to_owned()]
+    } else {
+        Vec::new()
+    }
 }
 
 #[cfg(test)]
@@ -811,11 +1068,27 @@ mod tests {
             ..Counts::default()
         };
         for (n_keyframes, counts, expected) in [
-            (1, counts(1, 1, &[]), "the only keyframe is a test image (1 keyframe of 1 image)"),
-            (0, counts(1, 1, &[]), "ended before the trainer received a keyframe"),
+            (
+                1,
+                counts(1, 1, &[]),
+                "the only keyframe is a test image (1 keyframe of 1 image)",
+            ),
+            (
+                0,
+                counts(1, 1, &[]),
+                "ended before the trainer received a keyframe",
+            ),
             (0, counts(0, 0, &[]), "no image was received"),
-            (0, counts(7, 0, &[(Rejection::UnknownCamera, 7)]), "(\"wrist\"): all 7 are from \"front\""),
-            (0, counts(7, 0, &[(Rejection::NoPose, 7)]), "0 keyframes of 7 images; 7 no joint states or base pose"),
+            (
+                0,
+                counts(7, 0, &[(Rejection::UnknownCamera, 7)]),
+                "(\"wrist\"): all 7 are from \"front\"",
+            ),
+            (
+                0,
+                counts(7, 0, &[(Rejection::NoPose, 7)]),
+                "0 keyframes of 7 images; 7 no joint states or base pose",
+            ),
         ] {
             let message = no_model_reason(n_keyframes, &counts, &rig);
             assert!(message.contains(expected), "{message}");

@@ -1,4 +1,5 @@
-//! `fieldrig sim`: emulates a rig's devices on the wire, for the drivers of `fieldrig run` or of other programs.
+//! `fieldrig sim`: emulates a rig's devices on the wire, for the drivers of `fieldrig run` or of
+//! other programs.
 
 use super::number_in_range;
 use crate::exit::Exit;
@@ -9,15 +10,16 @@ use std::path::PathBuf;
 pub(crate) struct Args {
     /// Rig file to emulate (TOML), or a scene: static-arm or mobile-arm
     ///
-    /// Each device is emulated as its driver in the rig file expects: `franka` as a controller at arm.address, `can` as
-    /// motors on the buses of [arm.bus], `udp` as datagrams, `realsense` as a .bag file. Scenes include a rig file.
+    /// Each device is emulated as its driver in the rig file expects: `franka` as a controller at
+    /// arm.address, `can` as motors on the buses of [arm.bus], `udp` as datagrams, `realsense` as a
+    /// .bag file. Scenes include a rig file.
     rig_or_scene: String,
-    /// Folder for the rig file to run against the emulated devices, the robot description and the camera recordings
-    /// [default: sim-NAME]
+    /// Folder for the rig file to run against the emulated devices, the robot description and the
+    /// camera recordings [default: sim-NAME]
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
-    /// Length of the playback in seconds; after it, devices stand still until Ctrl-C. A 640x480 RGB-D camera at 15 Hz
-    /// writes 60 MB per second into the folder
+    /// Length of the playback in seconds; after it, devices stand still until Ctrl-C. A 640x480
+    /// RGB-D camera at 15 Hz writes 60 MB per second into the folder
     #[arg(long, value_name = "S", default_value_t = 60.0, value_parser = number_in_range(0.1..=86_400.0))]
     seconds: f64,
     /// Play back this recording of the same rig instead of a simulation
@@ -29,8 +31,8 @@ pub(crate) struct Args {
     /// Version of FCI that the emulated Franka controller uses: 5 (Panda) or 10 (FR3)
     #[arg(long, value_name = "VERSION", default_value = "10", value_parser = ["5", "10"])]
     fci: String,
-    /// Time for which the emulated Franka controller waits for each command during a motion, milliseconds. A real one
-    /// does not wait; with 15, a busy computer rarely causes a reflex
+    /// Time for which the emulated Franka controller waits for each command during a motion,
+    /// milliseconds. A real one does not wait; with 15, a busy computer rarely causes a reflex
     #[arg(long, value_name = "MS", default_value_t = 0.0, value_parser = number_in_range(0.0..=1000.0))]
     answer_wait: f64,
     /// Print JSON, one object per line

@@ -16,9 +16,9 @@ use session::depth_from::{self, DepthSource, RenderedDepth};
 use session::next_commands::{DataSource, quoted};
 use session::run_folder::{self, CreatedFolders};
 use session::{
-    Checkpoints, Clock, Data, DecisionLog, EndingSession, Evaluator, Evaluators, KeptFolder, Limits, Purpose, REALIGN,
-    Recovery, Replay, RunDescription, RunFlags, Session, Settings, checkpoints, corrected_rig, points_sha256,
-    recoveries, recovery,
+    Checkpoints, Clock, Data, DecisionLog, EndingSession, Evaluator, Evaluators, KeptFolder,
+    Limits, Purpose, REALIGN, Recovery, Replay, RunDescription, RunFlags, Session, Settings,
+    checkpoints, corrected_rig, points_sha256, recoveries, recovery,
 };
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -47,20 +47,21 @@ pub(crate) struct Args {
     data: PathBuf,
     #[command(flatten)]
     training: TrainingArgs,
-    /// Continue from the checkpoint in this folder, on the same data and with its flags; no other flag is needed. A
-    /// larger --steps or --seconds continues a finished run; model settings cannot be changed
+    /// Continue from the checkpoint in this folder, on the same data and with its flags; no other
+    /// flag is needed. A larger --steps or --seconds continues a finished run; model settings
+    /// cannot be changed
     #[arg(long, value_name = "FOLDER", conflicts_with_all = ["method", "seed", "max_bytes", "max_splats", "refine", "count", "plan_steps"])]
     resume: Option<PathBuf>,
-    /// Repeat the timing-dependent decisions in this decisions.jsonl of an earlier run. With the same data, this gives
-    /// the same model
+    /// Repeat the timing-dependent decisions in this decisions.jsonl of an earlier run. With the
+    /// same data, this gives the same model
     #[arg(long, value_name = "FILE", conflicts_with_all = ["method", "seed", "max_bytes", "max_splats", "refine", "count", "plan_steps", "seconds", "steps", "holdout", "keyframes", "scale"])]
     replay_decisions: Option<PathBuf>,
-    /// Stop after S seconds of training; loading and scoring do not count, time before --resume does
-    /// [default: 120, unless --steps is given]
+    /// Stop after S seconds of training; loading and scoring do not count, time before --resume
+    /// does [default: 120, unless --steps is given]
     #[arg(long, value_name = "S", allow_negative_numbers = true)]
     seconds: Option<f64>,
-    /// Stop after N optimizer steps; steps before --resume count. Without --seconds, no decision depends on timing, and
-    /// the result depends only on the seed
+    /// Stop after N optimizer steps; steps before --resume count. Without --seconds, no decision
+    /// depends on timing, and the result depends only on the seed
     #[arg(long, value_name = "N")]
     steps: Option<u64>,
     /// Steps over which the learning rate decays and the model grows [default: --steps, else 7000]
@@ -68,20 +69,23 @@ pub(crate) struct Args {
     plan_steps: Option<u64>,
     #[command(flatten)]
     images: DataArgs,
-    /// Render depth from this model (a folder or a splat file) for images that have depth on less than half of their
-    /// pixels. All methods treat rendered depth as measured. The model must be of the same scene, in the same world
-    /// frame. --refine then estimates parameters jointly with the scene
+    /// Render depth from this model (a folder or a splat file) for images that have depth on less
+    /// than half of their pixels. All methods treat rendered depth as measured. The model must be
+    /// of the same scene, in the same world frame. --refine then estimates parameters jointly with
+    /// the scene
     #[arg(long, value_name = "MODEL")]
     depth_from: Option<PathBuf>,
-    /// `SqueezeNet` weights for LPIPS (safetensors) [default: `FIELDRIG_LPIPS_WEIGHTS`, else no LPIPS]
+    /// `SqueezeNet` weights for LPIPS (safetensors) [default: `FIELDRIG_LPIPS_WEIGHTS`, else no
+    /// LPIPS]
     #[arg(long, value_name = "FILE")]
     lpips_weights: Option<PathBuf>,
-    /// Folder for the results; several methods get a subfolder each. A folder that contains a model is refused
-    /// [default: the folder of --resume if it contains no model, else a new folder in runs]
+    /// Folder for the results; several methods get a subfolder each. A folder that contains a model
+    /// is refused [default: the folder of --resume if it contains no model, else a new folder in
+    /// runs]
     #[arg(long, value_name = "FOLDER")]
     out: Option<PathBuf>,
-    /// Write the recording's rig file here with the estimated calibration, and the robot description (robot.urdf) next
-    /// to it
+    /// Write the recording's rig file here with the estimated calibration, and the robot
+    /// description (robot.urdf) next to it
     #[arg(long, value_name = "FILE")]
     write_rig: Option<PathBuf>,
     #[command(flatten)]
@@ -124,7 +128,11 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
 
 fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
     let started = Instant::now();
-    let replay = args.replay_decisions.as_deref().map(Replay::load).transpose()?;
+    let replay = args
+        .replay_decisions
+        .as_deref()
+        .map(Replay::load)
+        .transpose()?;
     session::limits(args.seconds, args.steps, DEFAULT_SECONDS)?; // Checked before anything is read.
     if let Some(out) = &args.out {
         run_folder::check_no_model(out)?;
@@ -135,7 +143,10 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
     }
     let stop = signals::stop_on_signals()?;
     let checkpoint = args.resume.as_deref().map(checkpoints::read).transpose()?;
-    let subject = args.resume.as_deref().map(|folder| format!("the checkpoint in {}", folder.display()));
+    let subject = args
+        .resume
+        .as_deref()
+        .map(|folder| format!("the checkpoint in {}", folder.display()));
     if let (Some(checkpoint), Some(subject)) = (&checkpoint, &subject) {
         if args.is_finished(checkpoint) {
             if let Some(model) = &args.depth_from {
@@ -147,15 +158,23 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
         checkpoints::check_limit_not_passed(args.seconds, checkpoint, subject)?;
     }
     let given_steps = args.steps;
-    let args = &checkpoint.as_ref().map_or_else(|| args.clone(), |checkpoint| args.with_flags_of(checkpoint));
+    let args = &checkpoint
+        .as_ref()
+        .map_or_else(|| args.clone(), |checkpoint| args.with_flags_of(checkpoint));
     let limits = match (&replay, &checkpoint) {
         (Some(_), _) => Limits::default(),
         (None, checkpoint) => {
-            let previous_secs = checkpoint.as_ref().map_or(0.0, |checkpoint| checkpoint.seconds);
+            let previous_secs = checkpoint
+                .as_ref()
+                .map_or(0.0, |checkpoint| checkpoint.seconds);
             session::limits(args.seconds, args.steps, previous_secs + DEFAULT_SECONDS)?
         }
     };
-    let depth_from = args.depth_from.as_deref().map(DepthSource::find).transpose()?;
+    let depth_from = args
+        .depth_from
+        .as_deref()
+        .map(DepthSource::find)
+        .transpose()?;
     let depth_model_sha256 = depth_from.as_ref().map(|source| source.sha256.as_str());
     if let Some(replay) = &replay {
         replay.check_depth_from(depth_model_sha256)?;
@@ -166,7 +185,11 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
         images.scale = Some(replay.decisions.settings.scale);
     }
     if let (Some(checkpoint), Some(subject)) = (&checkpoint, &subject) {
-        depth_from::check_same(subject, checkpoint.depth_from.as_deref(), depth_model_sha256)?;
+        depth_from::check_same(
+            subject,
+            checkpoint.depth_from.as_deref(),
+            depth_model_sha256,
+        )?;
         if replay.is_none() {
             images = images.completed_with(subject, &checkpoint.flags)?;
         }
@@ -184,13 +207,24 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
     };
     let bar = ReadBar::new(args.json);
     let mut data = match &replay {
-        Some(replay) => replay.load_data(&args.data, args.images.options().rig, &|read| bar.show(read))?,
-        None => Data::load(&args.data, &images, Purpose::Training, &overrides, &|read| bar.show(read))?,
+        Some(replay) => replay.load_data(&args.data, args.images.options().rig, &|read| {
+            bar.show(read)
+        })?,
+        None => Data::load(
+            &args.data,
+            &images,
+            Purpose::Training,
+            &overrides,
+            &|read| bar.show(read),
+        )?,
     };
     if let Some(file) = &args.write_rig {
         let Some(rig) = &data.rig else {
             let data = args.data.display();
-            return Err(BadArgument(format!("--write-rig: {data} contains no rig file; use a recording")).into());
+            return Err(BadArgument(format!(
+                "--write-rig: {data} contains no rig file; use a recording"
+            ))
+            .into());
         };
         corrected_rig::check_target_file(rig, file)?; // Checked before training.
     }
@@ -205,34 +239,56 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
         replay.check_points(initial_points_sha256.as_deref())?;
     }
     let mut models = args.models(&gpu, &data, replay.as_ref(), checkpoint.as_ref())?;
-    let from_step = checkpoint.is_some().then(|| models[0].method.n_total_steps()).transpose()?;
+    let from_step = checkpoint
+        .is_some()
+        .then(|| models[0].method.n_total_steps())
+        .transpose()?;
     // Like the limit, `step` excludes steps of rejected trials and steps before a restart.
     let step = models[0].method.progress().step;
     if let (Some(steps), Some(subject)) = (given_steps, &subject)
         && steps < step
     {
-        return Err(BadArgument(format!("--steps {steps}: {subject} is at step {step}; use at least that many")).into());
+        return Err(BadArgument(format!(
+            "--steps {steps}: {subject} is at step {step}; use at least that many"
+        ))
+        .into());
     }
     if let Some(replay) = &replay {
         replay.check_start(from_step)?;
         replay.check_adapter(&gpu.describe());
     }
-    models.iter_mut().try_for_each(|model| model.method.prepare())?;
+    models
+        .iter_mut()
+        .try_for_each(|model| model.method.prepare())?;
     let kinds: Vec<ModelKind> = models.iter().map(|model| model.model_spec.kind).collect();
     let folders = created.make_each(args.out(), &kinds, data.rig.as_ref())?;
     let mut flags = images.flags();
     flags.extend(realign.map(|is_on| (REALIGN.to_owned(), is_on.to_string())));
     flags.extend(args.flags(limits));
-    let source =
-        DataSource { path: Some(args.data.clone()), flags: images.flags_of_images(), image_names: data.image_names() };
-    let run_flags = RunFlags { depth_from: depth_model_sha256.map(str::to_owned), flags };
+    let source = DataSource {
+        path: Some(args.data.clone()),
+        flags: images.flags_of_images(),
+        image_names: data.image_names(),
+    };
+    let run_flags = RunFlags {
+        depth_from: depth_model_sha256.map(str::to_owned),
+        flags,
+    };
 
     let untrained = models[0].untrained.clone(); // A resumed run has one model; several new models start with the same images.
-    let is_untrained = |keyframe: &Arc<Keyframe>| untrained.iter().any(|other| Arc::ptr_eq(other, keyframe));
+    let is_untrained =
+        |keyframe: &Arc<Keyframe>| untrained.iter().any(|other| Arc::ptr_eq(other, keyframe));
     let clock = Clock::default();
     let (mut sessions, mut seeds) = (Vec::new(), Vec::new());
-    for (Resumed { model_spec: ModelSpec { kind, options }, method, edits, .. }, folder) in
-        models.into_iter().zip(&folders)
+    for (
+        Resumed {
+            model_spec: ModelSpec { kind, options },
+            method,
+            edits,
+            ..
+        },
+        folder,
+    ) in models.into_iter().zip(&folders)
     {
         run_folder::write_keyframe_list(&folder.join("keyframes.txt"), &data.keyframes)?;
         seeds.push(options.common.seed);
@@ -240,37 +296,64 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
             method: kind.name(),
             data: Some(&args.data),
             adapter: gpu.describe(),
-            scale: data.rig.as_ref().map(|rig| rig.train.scale).or(images.scale).unwrap_or(1.0),
+            scale: data
+                .rig
+                .as_ref()
+                .map(|rig| rig.train.scale)
+                .or(images.scale)
+                .unwrap_or(1.0),
             depth_from: run_flags.depth_from.clone(),
             points: initial_points_sha256.clone(),
             from_step,
             options,
         };
         let recovery = Recovery {
-            model_spec: ModelSpec { kind, options: description.options.clone() },
+            model_spec: ModelSpec {
+                kind,
+                options: description.options.clone(),
+            },
             folder: folder.clone(),
             resumed: args.resume.clone(),
-            known: data.keyframes.iter().filter(|keyframe| !is_untrained(keyframe)).cloned().collect(),
+            known: data
+                .keyframes
+                .iter()
+                .filter(|keyframe| !is_untrained(keyframe))
+                .cloned()
+                .collect(),
             settings: Settings::new(description),
             resume_command: args.resume_command(folder),
         };
         let mut decisions = DecisionLog::create(folder, recovery.settings.clone())?;
-        for keyframe in data.keyframes.iter().filter(|keyframe| !is_untrained(keyframe)) {
+        for keyframe in data
+            .keyframes
+            .iter()
+            .filter(|keyframe| !is_untrained(keyframe))
+        {
             decisions.restored(from_step.unwrap_or_default(), keyframe);
         }
         let console = Console::new(OutputMode::of_command(args.json), limits, kinds.len());
         let checkpoints = Checkpoints::new(folder, args.checkpoints.options());
-        let session = Session::new(gpu.clone(), (kind, method), evaluators.clone(), limits, Box::new(console))
-            .with_stop(&stop)
-            .with_initial_points(initial_points.clone())
-            .with_edits(edits)
-            .with_checkpoints(checkpoints.map(|to| to.with_flags(run_flags.clone())))
-            .with_profile(args.profile)
-            .with_decisions(decisions)
-            .with_folders(KeptFolder::of_run(folder, kinds.len() > 1))
-            .with_data(source.clone());
+        let session = Session::new(
+            gpu.clone(),
+            (kind, method),
+            evaluators.clone(),
+            limits,
+            Box::new(console),
+        )
+        .with_stop(&stop)
+        .with_initial_points(initial_points.clone())
+        .with_edits(edits)
+        .with_checkpoints(checkpoints.map(|to| to.with_flags(run_flags.clone())))
+        .with_profile(args.profile)
+        .with_decisions(decisions)
+        .with_folders(KeptFolder::of_run(folder, kinds.len() > 1))
+        .with_data(source.clone());
         // A replay is not restarted after a GPU failure, because its log refers to step numbers.
-        let session = if replay.is_none() { session.with_recovery(recovery) } else { session };
+        let session = if replay.is_none() {
+            session.with_recovery(recovery)
+        } else {
+            session
+        };
         sessions.push(match (&kinds[..], &checkpoint) {
             ([_], Some(checkpoint)) => session.with_elapsed_secs(checkpoint.seconds),
             ([_], None) => session,
@@ -278,15 +361,23 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
         });
     }
     // Time for aligning base stations and rendering depth counts only in the first run.
-    let preparation_time = if checkpoint.is_some() { Duration::ZERO } else { data.preparation_time };
+    let preparation_time = if checkpoint.is_some() {
+        Duration::ZERO
+    } else {
+        data.preparation_time
+    };
     match &replay {
         Some(replay) => replay.drive(&mut sessions[0], &untrained, &stop)?,
         None => session::drive(&mut sessions, &untrained, preparation_time, &stop, open_gpu)?,
     }
 
-    let corrected =
-        args.write_rig.as_ref().map(|_| with_corrections(&Data::rig_as_given(&args.data, &images)?, &mut sessions));
-    let startup_secs = sessions[0].clock_started().map_or(0.0, |at| (at - started).as_secs_f64());
+    let corrected = args
+        .write_rig
+        .as_ref()
+        .map(|_| with_corrections(&Data::rig_as_given(&args.data, &images)?, &mut sessions));
+    let startup_secs = sessions[0]
+        .clock_started()
+        .map_or(0.0, |at| (at - started).as_secs_f64());
     let ending = |((session, out), seed): ((Session, PathBuf), u64)| EndingSession {
         details: TrainDetails {
             method: session.kind().name(),
@@ -304,7 +395,15 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
         out,
     };
     let recoverable = recoveries::describe_recoverable(&mut sessions);
-    let finished = session::finish(sessions.into_iter().zip(folders).zip(seeds).map(ending).collect(), None);
+    let finished = session::finish(
+        sessions
+            .into_iter()
+            .zip(folders)
+            .zip(seeds)
+            .map(ending)
+            .collect(),
+        None,
+    );
     let finished = finished.map_err(|error| recovery::with_recoverable(error, &recoverable))?;
     if !args.json {
         print_next_commands(&finished);
@@ -316,7 +415,8 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
     Ok(exit::from_losses(&data.data_losses))
 }
 
-/// The rig with the corrections of the first session that has any. Logs the reason if nothing changes.
+/// The rig with the corrections of the first session that has any. Logs the reason if nothing
+/// changes.
 fn with_corrections(rig: &Rig, sessions: &mut [Session]) -> anyhow::Result<Rig> {
     for session in &mut *sessions {
         let learned = session.camera_corrections()?;
@@ -345,27 +445,48 @@ impl Args {
         checkpoint: Option<&Checkpoint>,
     ) -> anyhow::Result<Vec<Resumed>> {
         if let Some(checkpoint) = checkpoint {
-            return Ok(vec![self.resumed(trainer::resume(gpu.clone(), checkpoint, &data.keyframes)?)]);
+            return Ok(vec![self.resumed(trainer::resume(
+                gpu.clone(),
+                checkpoint,
+                &data.keyframes,
+            )?)]);
         }
         let model_specs = match replay {
             Some(replay) => vec![replay.model_spec()],
-            None => {
-                session::model_specs(&self.training.options(), data, self.plan_steps.or(self.steps), gpu.is_software())?
-            }
+            None => session::model_specs(
+                &self.training.options(),
+                data,
+                self.plan_steps.or(self.steps),
+                gpu.is_software(),
+            )?,
         };
         let start = |model_spec: ModelSpec| {
             let method = model_spec.start(gpu.clone())?;
-            Ok(Resumed { model_spec, method, untrained: data.keyframes.clone(), edits: Edits::default() })
+            Ok(Resumed {
+                model_spec,
+                method,
+                untrained: data.keyframes.clone(),
+                edits: Edits::default(),
+            })
         };
         model_specs.into_iter().map(start).collect()
     }
 
     /// The flags to store in the checkpoint, besides those of the images, by name.
     fn flags(&self, limits: Limits) -> BTreeMap<String, String> {
-        let canonical = |file: &PathBuf| file.canonicalize().unwrap_or_else(|_| file.clone()).display().to_string();
+        let canonical = |file: &PathBuf| {
+            file.canonicalize()
+                .unwrap_or_else(|_| file.clone())
+                .display()
+                .to_string()
+        };
         // The file does not exist yet, so it cannot be canonicalized.
-        let to_write =
-            |file: &PathBuf| std::path::absolute(file).unwrap_or_else(|_| file.clone()).display().to_string();
+        let to_write = |file: &PathBuf| {
+            std::path::absolute(file)
+                .unwrap_or_else(|_| file.clone())
+                .display()
+                .to_string()
+        };
         let given = [
             (SECONDS, limits.seconds.map(|seconds| seconds.to_string())),
             (STEPS, limits.steps.map(|steps| steps.to_string())),
@@ -374,17 +495,21 @@ impl Args {
             (WRITE_RIG, self.write_rig.as_ref().map(to_write)),
             (PROFILE, self.profile.then(|| true.to_string())),
         ];
-        let flags = given.into_iter().filter_map(|(name, value)| Some((name.to_owned(), value?)));
+        let flags = given
+            .into_iter()
+            .filter_map(|(name, value)| Some((name.to_owned(), value?)));
         flags.chain(self.checkpoints.options().flag()).collect()
     }
 
-    /// Returns these flags; missing ones are taken from the previous run. The path of an output is not, because the
-    /// checkpoint may come from somebody else.
+    /// Returns these flags; missing ones are taken from the previous run. The path of an output is
+    /// not, because the checkpoint may come from somebody else.
     fn with_flags_of(&self, checkpoint: &Checkpoint) -> Self {
         let flag = |name: &str| checkpoint.flags.get(name);
         let path = |name: &str| flag(name).map(PathBuf::from);
         if let (None, Some(file)) = (&self.write_rig, flag(WRITE_RIG)) {
-            log::warn!("no rig file is written: the previous run wrote {file:?}; to write it again, add --write-rig");
+            log::warn!(
+                "no rig file is written: the previous run wrote {file:?}; to write it again, add --write-rig"
+            );
         }
         let has_limit = self.seconds.is_some() || self.steps.is_some();
         let limit = |name: &str| flag(name).filter(|_| !has_limit);
@@ -394,7 +519,11 @@ impl Args {
             depth_from: self.depth_from.clone().or_else(|| path(DEPTH_FROM)),
             lpips_weights: self.lpips_weights.clone().or_else(|| path(LPIPS_WEIGHTS)),
             profile: self.profile || flag(PROFILE).is_some(),
-            checkpoints: self.checkpoints.options().or_previous(&checkpoint.flags).into(),
+            checkpoints: self
+                .checkpoints
+                .options()
+                .or_previous(&checkpoint.flags)
+                .into(),
             ..self.clone()
         }
     }
@@ -405,23 +534,39 @@ impl Args {
         format!("fieldrig train {data} --resume {folder}")
     }
 
-    /// Whether the previous run reached its limit and saved its model, and no flag raises the limit.
+    /// Whether the previous run reached its limit and saved its model, and no flag raises the
+    /// limit.
     fn is_finished(&self, checkpoint: &Checkpoint) -> bool {
         let asks_for_more = self.seconds.is_some()
             || self.steps.is_some()
             || self.replay_decisions.is_some()
             || !self.images.options().flags().is_empty();
-        let has_model = || self.resume.as_deref().is_some_and(|folder| run_folder::check_no_model(folder).is_err());
+        let has_model = || {
+            self.resume
+                .as_deref()
+                .is_some_and(|folder| run_folder::check_no_model(folder).is_err())
+        };
         checkpoint.is_finished && !asks_for_more && has_model()
     }
 
     fn report_finished(&self, checkpoint: &Checkpoint) -> anyhow::Result<Exit> {
         let folder = self.resume.as_deref().unwrap_or(Path::new(""));
-        let limit = |name| checkpoint.flags.get(name).map(|value| format!("--{name} {value}"));
-        let limits = [limit(STEPS), limit(SECONDS)].into_iter().flatten().collect::<Vec<_>>().join(" ");
+        let limit = |name| {
+            checkpoint
+                .flags
+                .get(name)
+                .map(|value| format!("--{name} {value}"))
+        };
+        let limits = [limit(STEPS), limit(SECONDS)]
+            .into_iter()
+            .flatten()
+            .collect::<Vec<_>>()
+            .join(" ");
         if self.json {
             let seconds = checkpoint.seconds;
-            print::report_json(&serde_json::json!({ "event": "finished", "seconds": seconds, "out": folder }))?;
+            print::report_json(
+                &serde_json::json!({ "event": "finished", "seconds": seconds, "out": folder }),
+            )?;
         } else {
             print::report(format_args!(
                 "nothing left to do: the run in {} is finished ({limits}, {:.1} s) and its model is saved there; \
@@ -435,20 +580,36 @@ impl Args {
 
     /// The given folder; an unfinished run continues in its previous folder.
     fn out(&self) -> Option<&Path> {
-        let unfinished = || self.resume.as_deref().filter(|folder| run_folder::check_no_model(folder).is_ok());
+        let unfinished = || {
+            self.resume
+                .as_deref()
+                .filter(|folder| run_folder::check_no_model(folder).is_ok())
+        };
         self.out.as_deref().or_else(unfinished)
     }
 
     /// Logs in which ways the resumed run differs from an uninterrupted one.
     fn resumed(&self, resumed: Resumed) -> Resumed {
-        let (planned, step) = (resumed.model_spec.options.common.n_planned_steps, resumed.method.progress().step);
+        let (planned, step) = (
+            resumed.model_spec.options.common.n_planned_steps,
+            resumed.method.progress().step,
+        );
         log::info!("continuing from step {step} of {planned} planned steps");
         if self.steps.is_some_and(|steps| steps > planned) {
-            log::warn!("the learning rate was planned to decay over {planned} steps: later steps change little");
+            log::warn!(
+                "the learning rate was planned to decay over {planned} steps: later steps change little"
+            );
         }
-        let n_new = resumed.untrained.iter().filter(|keyframe| keyframe.split != Split::Test).count();
+        let n_new = resumed
+            .untrained
+            .iter()
+            .filter(|keyframe| keyframe.split != Split::Test)
+            .count();
         if n_new > 0 {
-            log::warn!("{} that are not in the checkpoint", counted(n_new as u64, "new image"));
+            log::warn!(
+                "{} that are not in the checkpoint",
+                counted(n_new as u64, "new image")
+            );
         }
         resumed
     }

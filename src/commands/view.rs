@@ -16,11 +16,13 @@ use viz::{Hub, KeyframePose, ModelStatus, SceneHint, Status};
 /// Flags of `view`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// Folder of a saved model or of a run with several methods, or a splat file (.ply, .spz, .splat)
+    /// Folder of a saved model or of a run with several methods, or a splat file (.ply, .spz,
+    /// .splat)
     model: PathBuf,
     #[command(flatten)]
     page: PageArgs,
-    /// Axis of the model that points up: x, y, z, -x, -y or -z; files from other programs are often -y up
+    /// Axis of the model that points up: x, y, z, -x, -y or -z; files from other programs are often
+    /// -y up
     #[arg(long, value_name = "AXIS", default_value = "z", allow_hyphen_values = true, value_parser = up_axis)]
     up: Up,
     /// Print JSON, one object per line
@@ -33,7 +35,9 @@ pub(crate) struct Args {
 struct Up(Vector3<f64>);
 
 fn up_axis(text: &str) -> Result<Up, String> {
-    let (sign, axis) = text.strip_prefix('-').map_or((1.0, text), |axis| (-1.0, axis));
+    let (sign, axis) = text
+        .strip_prefix('-')
+        .map_or((1.0, text), |axis| (-1.0, axis));
     let axis = match axis {
         "x" => Vector3::x(),
         "y" => Vector3::y(),
@@ -48,7 +52,8 @@ impl Up {
     fn model_from_page(self) -> Transform {
         let rotation = UnitQuaternion::rotation_between(&Vector3::z(), &self.0);
         // If the two are opposite, rotate by 180 degrees about a horizontal axis.
-        let rotation = rotation.unwrap_or_else(|| UnitQuaternion::new(std::f64::consts::PI * Vector3::x()));
+        let rotation =
+            rotation.unwrap_or_else(|| UnitQuaternion::new(std::f64::consts::PI * Vector3::x()));
         Transform::from_parts(Translation3::identity(), rotation)
     }
 }
@@ -68,10 +73,20 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let cameras = cameras(&paths);
     let models = paths.iter().map(|path| methods::load(gpu.clone(), path));
     let mut models = models.collect::<session::Result<Vec<LoadedModel>>>()?;
-    let bounds = if cameras.is_empty() { bounds(&mut models)? } else { None };
-    let empty_notes = paths.iter().zip(&models).filter_map(|(path, model)| methods::note_if_empty(path, model));
+    let bounds = if cameras.is_empty() {
+        bounds(&mut models)?
+    } else {
+        None
+    };
+    let empty_notes = paths
+        .iter()
+        .zip(&models)
+        .filter_map(|(path, model)| methods::note_if_empty(path, model));
     let notes = notes(&gpu).into_iter().chain(empty_notes).collect();
-    let mut statuses = paths.iter().zip(&models).map(|(path, model)| model_status(path, model));
+    let mut statuses = paths
+        .iter()
+        .zip(&models)
+        .map(|(path, model)| model_status(path, model));
     let report = report(&paths[0]);
     let status = Status {
         state: "viewing".to_owned(),
@@ -91,9 +106,23 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
 
     let methods: Vec<&str> = models.iter().map(|model| model.kind.name()).collect();
     page.print(args.json, json!({ "methods": methods }))?;
-    let served = |(LoadedModel { kind, method, edits }, path)| ServedModel { kind, method, edits: edits.into(), path };
+    let served = |(
+        LoadedModel {
+            kind,
+            method,
+            edits,
+        },
+        path,
+    )| ServedModel {
+        kind,
+        method,
+        edits: edits.into(),
+        path,
+    };
     let models = models.into_iter().zip(paths).map(served).collect();
-    ModelViewer::new(models, hub).with_model_from_page(model_from_page).serve(&stop);
+    ModelViewer::new(models, hub)
+        .with_model_from_page(model_from_page)
+        .serve(&stop);
     Ok(Exit::Done)
 }
 
@@ -101,7 +130,10 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
 fn check_is_model(model: &Path) -> Result<(), BadArgument> {
     let shown = model.display();
     let is_url = |scheme: &str| model.to_str().is_some_and(|text| text.starts_with(scheme));
-    if ["http://", "https://", "ws://", "wss://"].into_iter().any(is_url) {
+    if ["http://", "https://", "ws://", "wss://"]
+        .into_iter()
+        .any(is_url)
+    {
         return Err(BadArgument(format!(
             "{shown} is the address of a page: open it in a browser; view shows saved models and splat files"
         )));
@@ -120,7 +152,8 @@ fn check_is_model(model: &Path) -> Result<(), BadArgument> {
     Ok(())
 }
 
-/// The cameras of the first model whose folder lists them. An unreadable list only causes a warning.
+/// The cameras of the first model whose folder lists them. An unreadable list only causes a
+/// warning.
 fn cameras(models: &[PathBuf]) -> Vec<KeyframePose> {
     let read = |folder: &PathBuf| {
         camera_list::read(folder).unwrap_or_else(|error| {
@@ -129,13 +162,18 @@ fn cameras(models: &[PathBuf]) -> Vec<KeyframePose> {
         })
     };
     let folders = models.iter().filter(|model| model.is_dir());
-    folders.filter_map(read).find(|cameras| !cameras.is_empty()).unwrap_or_default()
+    folders
+        .filter_map(read)
+        .find(|cameras| !cameras.is_empty())
+        .unwrap_or_default()
 }
 
 fn in_page(cameras: Vec<KeyframePose>, model_from_page: &Transform) -> Vec<KeyframePose> {
     let page_from_model = model_from_page.inverse();
-    let in_page =
-        |camera: KeyframePose| KeyframePose { world_from_camera: page_from_model * camera.world_from_camera, ..camera };
+    let in_page = |camera: KeyframePose| KeyframePose {
+        world_from_camera: page_from_model * camera.world_from_camera,
+        ..camera
+    };
     cameras.into_iter().map(in_page).collect()
 }
 
@@ -149,13 +187,24 @@ fn bounds(models: &mut [LoadedModel]) -> anyhow::Result<Option<Bounds>> {
     Ok(None)
 }
 
-/// The initial view: from the first camera or, without cameras, from outside the model; `None` for an empty model.
-fn first_view(cameras: &[KeyframePose], bounds: Option<Bounds>, model_from_page: &Transform) -> Option<SceneHint> {
-    let poses = cameras.iter().map(|camera| camera.world_from_camera).collect();
+/// The initial view: from the first camera or, without cameras, from outside the model; `None` for
+/// an empty model.
+fn first_view(
+    cameras: &[KeyframePose],
+    bounds: Option<Bounds>,
+    model_from_page: &Transform,
+) -> Option<SceneHint> {
+    let poses = cameras
+        .iter()
+        .map(|camera| camera.world_from_camera)
+        .collect();
     scene_hint::from_cameras(poses).or_else(|| {
         let Bounds { center_m, radius_m } = bounds?;
         let center = model_from_page.inverse() * nalgebra::Point3::from(center_m);
-        Some(scene_hint::from_bounds(&Bounds { center_m: center.coords.into(), radius_m }))
+        Some(scene_hint::from_bounds(&Bounds {
+            center_m: center.coords.into(),
+            radius_m,
+        }))
     })
 }
 
@@ -167,13 +216,21 @@ fn report(model: &Path) -> Value {
 
 /// Size and scores of a model at the end of its training.
 fn model_status(path: &Path, model: &LoadedModel) -> ModelStatus {
-    ModelStatus { edits: model.edits.len(), ..trained_status(path, model.kind, &model.method.progress()) }
+    ModelStatus {
+        edits: model.edits.len(),
+        ..trained_status(path, model.kind, &model.method.progress())
+    }
 }
 
 fn trained_status(model: &Path, kind: ModelKind, progress: &Progress) -> ModelStatus {
     let report = report(model);
     let (done, evaluations) = (&report["done"], report["evaluations"].as_array());
-    let point = |evaluation: &Value| Some((evaluation["seconds"].as_f64()?, evaluation["psnr"].as_f64()?));
+    let point = |evaluation: &Value| {
+        Some((
+            evaluation["seconds"].as_f64()?,
+            evaluation["psnr"].as_f64()?,
+        ))
+    };
     ModelStatus {
         method: kind.name().to_owned(),
         step: done["steps"].as_u64().unwrap_or(progress.step),
@@ -184,7 +241,12 @@ fn trained_status(model: &Path, kind: ModelKind, progress: &Progress) -> ModelSt
         has_chunks: kind.entry().has_chunks,
         edits: 0,
         psnr: done["psnr"].as_f64(),
-        psnr_history: evaluations.into_iter().flatten().chain([done]).filter_map(point).collect(),
+        psnr_history: evaluations
+            .into_iter()
+            .flatten()
+            .chain([done])
+            .filter_map(point)
+            .collect(),
     }
 }
 
@@ -206,7 +268,10 @@ mod tests {
             let Up(axis) = up_axis(text).expect("an axis");
             assert_eq!(axis, Vector3::from(up), "{text}");
             let in_page = Up(axis).model_from_page().inverse() * Point3::from(up);
-            assert!((in_page - Point3::new(0.0, 0.0, 1.0)).norm() < TOLERANCE, "{text}: {in_page}");
+            assert!(
+                (in_page - Point3::new(0.0, 0.0, 1.0)).norm() < TOLERANCE,
+                "{text}: {in_page}"
+            );
         }
         for invalid in ["", "up", "--z", "Z", "xy"] {
             assert!(up_axis(invalid).is_err(), "{invalid}");
@@ -216,14 +281,22 @@ mod tests {
     #[test]
     fn model_status_uses_the_report_scores() {
         let folder = tempfile::tempdir().expect("a folder");
-        let progress = Progress { primitives: 5, bytes: 80, ..Progress::default() };
+        let progress = Progress {
+            primitives: 5,
+            bytes: 80,
+            ..Progress::default()
+        };
         let status = trained_status(folder.path(), ModelKind::default(), &progress);
-        assert_eq!((status.psnr, status.step, status.primitives, status.bytes), (None, 0, 5, 80));
+        assert_eq!(
+            (status.psnr, status.step, status.primitives, status.bytes),
+            (None, 0, 5, 80)
+        );
         let text = json!({
             "done": { "psnr": 23.5, "steps": 700, "seconds": 8.0 },
             "evaluations": [{ "seconds": 0.5, "psnr": 20.0 }, { "seconds": 1.0, "psnr": null }, { "seconds": 2.0, "psnr": 22.0 }],
         });
-        std::fs::write(folder.path().join("report.json"), text.to_string()).expect("the file is writable");
+        std::fs::write(folder.path().join("report.json"), text.to_string())
+            .expect("the file is writable");
         let status = trained_status(folder.path(), ModelKind::default(), &progress);
         assert_eq!((status.psnr, status.step), (Some(23.5), 700));
         assert_eq!(status.psnr_history, [(0.5, 20.0), (2.0, 22.0), (8.0, 23.5)]);

@@ -21,13 +21,19 @@ impl Printed<'_> {
     /// Aligns all corners. Corners where this fails stay as they are.
     pub(crate) fn align(&self, plane: &Plane, lattice: &mut Lattice) {
         let aligned = self.aligned(plane, lattice);
-        lattice.corners.iter_mut().for_each(|(cell, pixel)| *pixel = aligned[cell].unwrap_or(*pixel));
+        lattice
+            .corners
+            .iter_mut()
+            .for_each(|(cell, pixel)| *pixel = aligned[cell].unwrap_or(*pixel));
     }
 
     /// Aligns all corners. Corners where this fails are removed.
     pub(crate) fn align_strictly(&self, plane: &Plane, lattice: &mut Lattice) {
         let aligned = self.aligned(plane, lattice);
-        lattice.corners = aligned.into_iter().filter_map(|(cell, pixel)| Some((cell, pixel?))).collect();
+        lattice.corners = aligned
+            .into_iter()
+            .filter_map(|(cell, pixel)| Some((cell, pixel?)))
+            .collect();
     }
 
     /// Positions of all corners after alignment. `None` where this fails.
@@ -42,7 +48,11 @@ impl Printed<'_> {
                 reach_px: None,
             };
             let pixel_by_point = lattice.pixel_by_point(cell, pixel, self.square_m);
-            (cell, pixel_by_point.and_then(|map| template::find(plane, &self.surface, &neighborhood(map))))
+            (
+                cell,
+                pixel_by_point
+                    .and_then(|map| template::find(plane, &self.surface, &neighborhood(map))),
+            )
         };
         lattice.corners.iter().map(aligned).collect()
     }

@@ -1,8 +1,8 @@
 //! Board geometry: frame, positions of corners, symmetry.
 //!
 //! # Board frame
-//! The frame is that of OpenCV: as seen by a viewer of the printed target, x points right, y down and z into the
-//! board, away from the viewer. All corners have z = 0.
+//! The frame is that of OpenCV: as seen by a viewer of the printed target, x points right, y down
+//! and z into the board, away from the viewer. All corners have z = 0.
 //!
 //! | target | origin | corner ids |
 //! |---|---|---|
@@ -40,50 +40,87 @@ impl TargetSpec {
         let at = |columns: u32| [f64::from(id % columns), f64::from(id / columns)];
         let [x, y] = match self.pattern {
             Pattern::Chessboard { inner, square_m } => at(inner[0]).map(|count| count * square_m),
-            Pattern::Puzzleboard { squares, square_m, .. } => at(squares[0] - 1).map(|count| count * square_m),
-            Pattern::Charuco { squares, square_m, .. } => at(squares[0] - 1).map(|count| (count + 1.0) * square_m),
-            Pattern::Aprilgrid { tags, tag_m, spacing_frac } => {
+            Pattern::Puzzleboard {
+                squares, square_m, ..
+            } => at(squares[0] - 1).map(|count| count * square_m),
+            Pattern::Charuco {
+                squares, square_m, ..
+            } => at(squares[0] - 1).map(|count| (count + 1.0) * square_m),
+            Pattern::Aprilgrid {
+                tags,
+                tag_m,
+                spacing_frac,
+            } => {
                 let [left, top] = tag_origin(tags, tag_m, spacing_frac, id / 4);
                 let [x, y] = CORNERS_FROM_LOWER_LEFT[(id % 4) as usize];
                 [left + x * tag_m, top + y * tag_m]
             }
-            Pattern::Tag { side_m, .. } => CORNERS_FROM_LOWER_LEFT[id as usize].map(|frac| (frac - 0.5) * side_m),
+            Pattern::Tag { side_m, .. } => {
+                CORNERS_FROM_LOWER_LEFT[id as usize].map(|frac| (frac - 0.5) * side_m)
+            }
         };
         Some(Vector3::new(x, y, 0.0))
     }
 
-    /// Corners of the pattern's bounding rectangle in the board frame: smallest x and y, largest x and y, meters.
+    /// Corners of the pattern's bounding rectangle in the board frame: smallest x and y, largest x
+    /// and y, meters.
     pub fn bounds_m(&self) -> [[f64; 2]; 2] {
         let of_squares = |squares: [u32; 2], square_m: f64, first: f64| {
-            [[first; 2], squares.map(|count| f64::from(count) * square_m + first)]
+            [
+                [first; 2],
+                squares.map(|count| f64::from(count) * square_m + first),
+            ]
         };
         match self.pattern {
-            Pattern::Chessboard { inner, square_m } => of_squares(inner.map(|count| count + 1), square_m, -square_m),
-            Pattern::Charuco { squares, square_m, .. } => of_squares(squares, square_m, 0.0),
-            Pattern::Puzzleboard { squares, square_m, .. } => of_squares(squares, square_m, -square_m),
-            Pattern::Aprilgrid { tags, tag_m, spacing_frac } => {
+            Pattern::Chessboard { inner, square_m } => {
+                of_squares(inner.map(|count| count + 1), square_m, -square_m)
+            }
+            Pattern::Charuco {
+                squares, square_m, ..
+            } => of_squares(squares, square_m, 0.0),
+            Pattern::Puzzleboard {
+                squares, square_m, ..
+            } => of_squares(squares, square_m, -square_m),
+            Pattern::Aprilgrid {
+                tags,
+                tag_m,
+                spacing_frac,
+            } => {
                 let gap = tag_m * spacing_frac;
-                [[-gap; 2], tags.map(|count| f64::from(count) * (tag_m + gap))]
+                [
+                    [-gap; 2],
+                    tags.map(|count| f64::from(count) * (tag_m + gap)),
+                ]
             }
             Pattern::Tag { side_m, .. } => [[-side_m / 2.0; 2], [side_m / 2.0; 2]],
         }
     }
 
-    /// Rotations of the board that give the same picture: `board_from_rotated_board`, starting with the identity.
+    /// Rotations of the board that give the same picture: `board_from_rotated_board`, starting with
+    /// the identity.
     ///
-    /// A pose of such a board is ambiguous: `camera_from_board * rotation` fits the image equally well for every
-    /// rotation of this list. A chessboard whose numbers of inner corners are both even or both odd looks the same
-    /// rotated by 180 degrees; if they are also equal and even, by 90 degrees. All other targets are unambiguous.
+    /// A pose of such a board is ambiguous: `camera_from_board * rotation` fits the image equally
+    /// well for every rotation of this list. A chessboard whose numbers of inner corners are both
+    /// even or both odd looks the same rotated by 180 degrees; if they are also equal and even, by
+    /// 90 degrees. All other targets are unambiguous.
     pub fn symmetry(&self) -> Vec<Transform> {
-        let Pattern::Chessboard { inner: [columns, rows], square_m } = self.pattern else {
+        let Pattern::Chessboard {
+            inner: [columns, rows],
+            square_m,
+        } = self.pattern
+        else {
             return vec![Transform::identity()];
         };
-        let quarters: &[f64] = match ((columns + rows) % 2 == 0, columns == rows && columns % 2 == 0) {
+        let quarters: &[f64] = match (
+            (columns + rows) % 2 == 0,
+            columns == rows && columns % 2 == 0,
+        ) {
             (_, true) => &[0.0, 1.0, 2.0, 3.0],
             (true, _) => &[0.0, 2.0],
             _ => &[0.0],
         };
-        let center = Vector3::new(f64::from(columns - 1), f64::from(rows - 1), 0.0) * (square_m / 2.0);
+        let center =
+            Vector3::new(f64::from(columns - 1), f64::from(rows - 1), 0.0) * (square_m / 2.0);
         let about_center = |quarter: &f64| {
             let rotation = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), quarter * PI / 2.0);
             Transform::from_parts(Translation3::from(center - rotation * center), rotation)
@@ -92,9 +129,10 @@ impl TargetSpec {
     }
 }
 
-/// Lower left, lower right, upper right and upper left corner of a square of side 1 whose top left corner is the
-/// origin.
-pub(crate) const CORNERS_FROM_LOWER_LEFT: [[f64; 2]; 4] = [[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]];
+/// Lower left, lower right, upper right and upper left corner of a square of side 1 whose top left
+/// corner is the origin.
+pub(crate) const CORNERS_FROM_LOWER_LEFT: [[f64; 2]; 4] =
+    [[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]];
 
 /// Top left corner of a tag of an AprilGrid.
 pub(crate) fn tag_origin(tags: [u32; 2], tag_m: f64, spacing_frac: f64, tag: u32) -> [f64; 2] {
@@ -112,21 +150,35 @@ mod tests {
     }
 
     fn corner(text: &str, id: u32) -> [f64; 3] {
-        spec(text).corner(id).unwrap().map(|value| (value * 1e9).round() / 1e9).into()
+        spec(text)
+            .corner(id)
+            .unwrap()
+            .map(|value| (value * 1e9).round() / 1e9)
+            .into()
     }
 
     #[test]
     fn corners_follow_opencv_and_kalibr() {
         assert_eq!(corner("chessboard:9x6:25mm", 0), [0.0, 0.0, 0.0]);
         assert_eq!(corner("chessboard:9x6:25mm", 10), [0.025, 0.025, 0.0]);
-        assert_eq!(corner("charuco:5x7:34mm:28mm:6X6_250", 0), [0.034, 0.034, 0.0]);
-        assert_eq!(corner("charuco:5x7:34mm:28mm:6X6_250", 23), [0.136, 0.204, 0.0]);
+        assert_eq!(
+            corner("charuco:5x7:34mm:28mm:6X6_250", 0),
+            [0.034, 0.034, 0.0]
+        );
+        assert_eq!(
+            corner("charuco:5x7:34mm:28mm:6X6_250", 23),
+            [0.136, 0.204, 0.0]
+        );
         // Tag 0 is at the lower left, tag 30 at the upper left.
         assert_eq!(corner("aprilgrid:6x6:88mm:0.3", 0), [0.0, 0.66, 0.0]);
         assert_eq!(corner("aprilgrid:6x6:88mm:0.3", 123), [0.0, 0.0, 0.0]);
         assert_eq!(corner("aprilgrid:6x6:88mm:0.3", 5), [0.2024, 0.66, 0.0]);
         assert_eq!(corner("tag:36h11:3:100mm", 0), [-0.05, 0.05, 0.0]);
-        for text in ["chessboard:9x6:25mm", "tag:36h11:3:100mm", "aprilgrid:2x3:88mm:0.3"] {
+        for text in [
+            "chessboard:9x6:25mm",
+            "tag:36h11:3:100mm",
+            "aprilgrid:2x3:88mm:0.3",
+        ] {
             assert_eq!(spec(text).corner(spec(text).n_corners()), None);
         }
     }
@@ -143,12 +195,21 @@ mod tests {
         ] {
             let target = spec(text);
             let rotations = target.symmetry();
-            assert_eq!((rotations.len(), rotations[0]), (n_rotations, Transform::identity()), "{text}");
-            let corners: Vec<_> = (0..target.n_corners()).filter_map(|id| target.corner(id)).collect();
+            assert_eq!(
+                (rotations.len(), rotations[0]),
+                (n_rotations, Transform::identity()),
+                "{text}"
+            );
+            let corners: Vec<_> = (0..target.n_corners())
+                .filter_map(|id| target.corner(id))
+                .collect();
             for rotation in rotations {
                 for corner in &corners {
                     let rotated = rotation.rotation * corner + rotation.translation.vector;
-                    assert!(corners.iter().any(|other| (other - rotated).norm() < 1e-12), "{text} {rotated}");
+                    assert!(
+                        corners.iter().any(|other| (other - rotated).norm() < 1e-12),
+                        "{text} {rotated}"
+                    );
                 }
             }
         }

@@ -5,8 +5,8 @@ use std::sync::LazyLock;
 
 /// Markers with their ids.
 ///
-/// The codes come from the crate `calib-targets-aruco`; they equal those of OpenCV, `DICT_4X4_50` to
-/// `DICT_7X7_1000` and `DICT_APRILTAG_36h11`.
+/// The codes come from the crate `calib-targets-aruco`; they equal those of OpenCV, `DICT_4X4_50`
+/// to `DICT_7X7_1000` and `DICT_APRILTAG_36h11`.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Dictionary {
     name: &'static str,
@@ -28,21 +28,25 @@ impl PartialEq for Dictionary {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Match {
     pub(crate) id: u32,
-    /// Number of quarter turns, clockwise as seen in the image, from the upright marker to the cells as given.
+    /// Number of quarter turns, clockwise as seen in the image, from the upright marker to the
+    /// cells as given.
     pub(crate) quarter_turns: usize,
     pub(crate) n_wrong: u32,
 }
 
-/// Names in OpenCV's order, without its prefix `DICT_`. Smaller dictionaries are the beginnings of larger ones.
+/// Names in OpenCV's order, without its prefix `DICT_`. Smaller dictionaries are the beginnings of
+/// larger ones.
 const ARUCO: [&str; 16] = [
-    "4X4_50", "4X4_100", "4X4_250", "4X4_1000", "5X5_50", "5X5_100", "5X5_250", "5X5_1000", "6X6_50", "6X6_100",
-    "6X6_250", "6X6_1000", "7X7_50", "7X7_100", "7X7_250", "7X7_1000",
+    "4X4_50", "4X4_100", "4X4_250", "4X4_1000", "5X5_50", "5X5_100", "5X5_250", "5X5_1000",
+    "6X6_50", "6X6_100", "6X6_250", "6X6_1000", "7X7_50", "7X7_100", "7X7_250", "7X7_1000",
 ];
-/// Largest number of wrong cells that are corrected in 4X4 markers, whose codes are similar, and in larger ones.
+/// Largest number of wrong cells that are corrected in 4X4 markers, whose codes are similar, and in
+/// larger ones.
 const CORRECTED: [u32; 2] = [0, 2];
 
 impl Dictionary {
-    /// Returns the dictionary with a name such as `6X6_250`, in any case, with or without OpenCV's prefix `DICT_`.
+    /// Returns the dictionary with a name such as `6X6_250`, in any case, with or without OpenCV's
+    /// prefix `DICT_`.
     pub(crate) fn aruco(name: &str) -> Option<Self> {
         let upper = name.trim().to_ascii_uppercase();
         let short = upper.strip_prefix("DICT_").unwrap_or(&upper);
@@ -59,13 +63,21 @@ impl Dictionary {
 
     /// All dictionaries, smaller ones before larger ones that contain them.
     pub(crate) fn all() -> impl Iterator<Item = Self> {
-        ARUCO.into_iter().filter_map(Self::aruco).chain([Self::tag36h11()])
+        ARUCO
+            .into_iter()
+            .filter_map(Self::aruco)
+            .chain([Self::tag36h11()])
     }
 
     fn builtin(name: &'static str, builtin: &str) -> Option<Self> {
         let dictionary = builtin_dictionary(builtin)?;
         let n_bits = dictionary.marker_size();
-        Some(Self { name, n_bits, codes: dictionary.codes(), n_corrected: CORRECTED[usize::from(n_bits > 4)] })
+        Some(Self {
+            name,
+            n_bits,
+            codes: dictionary.codes(),
+            n_corrected: CORRECTED[usize::from(n_bits > 4)],
+        })
     }
 
     /// Name without OpenCV's prefix.
@@ -87,8 +99,8 @@ impl Dictionary {
         code >> (row * self.n_bits + column) & 1 == 1
     }
 
-    /// Finds the marker most similar to the cells (row by row, true is black). Returns `None` if more cells are
-    /// wrong than can be corrected.
+    /// Finds the marker most similar to the cells (row by row, true is black). Returns `None` if
+    /// more cells are wrong than can be corrected.
     pub(crate) fn decode(&self, cells: &[bool]) -> Option<Match> {
         self.decode_with(cells, self.n_corrected)
     }
@@ -103,7 +115,8 @@ impl Dictionary {
         if cells.len() != n * n {
             return None;
         }
-        // Cell of the upright marker, for each number of quarter turns that the marker appears rotated by.
+        // Cell of the upright marker, for each number of quarter turns that the marker appears
+        // rotated by.
         let cell = |turns: usize, row: usize, column: usize| match turns {
             0 => cells[row * n + column],
             1 => cells[column * n + (n - 1 - row)],
@@ -112,11 +125,17 @@ impl Dictionary {
         };
         let mut best: Option<Match> = None;
         for quarter_turns in 0..4 {
-            let seen = (0..n * n).fold(0_u64, |code, at| code | u64::from(cell(quarter_turns, at / n, at % n)) << at);
+            let seen = (0..n * n).fold(0_u64, |code, at| {
+                code | u64::from(cell(quarter_turns, at / n, at % n)) << at
+            });
             for (id, code) in (0..).zip(self.codes) {
                 let n_wrong = (seen ^ code).count_ones();
                 if n_wrong <= n_corrected && best.is_none_or(|best| n_wrong < best.n_wrong) {
-                    best = Some(Match { id, quarter_turns, n_wrong });
+                    best = Some(Match {
+                        id,
+                        quarter_turns,
+                        n_wrong,
+                    });
                 }
             }
         }
@@ -130,19 +149,33 @@ mod tests {
 
     fn rows(dictionary: &Dictionary, id: u32) -> Vec<String> {
         let n = dictionary.n_bits();
-        let cell = |row, column| if dictionary.is_black(id, row, column) { '#' } else { '.' };
-        (0..n).map(|row| (0..n).map(|column| cell(row, column)).collect()).collect()
+        let cell = |row, column| {
+            if dictionary.is_black(id, row, column) {
+                '#'
+            } else {
+                '.'
+            }
+        };
+        (0..n)
+            .map(|row| (0..n).map(|column| cell(row, column)).collect())
+            .collect()
     }
 
     #[test]
     fn codes_match_opencv() {
         // From `cv2.aruco.generateImageMarker`, OpenCV 5.0, without the border.
-        assert_eq!(rows(&Dictionary::aruco("4X4_50").unwrap(), 1), ["####", "....", ".##.", ".#.#"]);
+        assert_eq!(
+            rows(&Dictionary::aruco("4X4_50").unwrap(), 1),
+            ["####", "....", ".##.", ".#.#"]
+        );
         assert_eq!(
             rows(&Dictionary::aruco("6X6_250").unwrap(), 0),
             ["###...", ".###..", "..#...", "#..###", "##.#.#", ".##..#"]
         );
-        assert_eq!(rows(&Dictionary::tag36h11(), 0), ["##.###", "#..#.#", "###.#.", "###..#", ".#...#", ".#.#.."]);
+        assert_eq!(
+            rows(&Dictionary::tag36h11(), 0),
+            ["##.###", "#..#.#", "###.#.", "###..#", ".#...#", ".#.#.."]
+        );
     }
 
     #[test]
@@ -159,10 +192,26 @@ mod tests {
         let dictionary = Dictionary::aruco("6X6_250").unwrap();
         let n = dictionary.n_bits();
         // The marker, rotated clockwise by one quarter: its left column is the top row.
-        let mut cells: Vec<bool> = (0..n * n).map(|at| dictionary.is_black(42, n - 1 - at % n, at / n)).collect();
-        assert_eq!(dictionary.decode(&cells), Some(Match { id: 42, quarter_turns: 1, n_wrong: 0 }));
+        let mut cells: Vec<bool> = (0..n * n)
+            .map(|at| dictionary.is_black(42, n - 1 - at % n, at / n))
+            .collect();
+        assert_eq!(
+            dictionary.decode(&cells),
+            Some(Match {
+                id: 42,
+                quarter_turns: 1,
+                n_wrong: 0
+            })
+        );
         cells[7] = !cells[7];
-        assert_eq!(dictionary.decode(&cells), Some(Match { id: 42, quarter_turns: 1, n_wrong: 1 }));
+        assert_eq!(
+            dictionary.decode(&cells),
+            Some(Match {
+                id: 42,
+                quarter_turns: 1,
+                n_wrong: 1
+            })
+        );
         assert_eq!(dictionary.decode_exactly(&cells), None);
         assert_eq!(dictionary.decode(&cells[1..]), None);
         assert_eq!(dictionary.decode(&vec![true; n * n]), None);

@@ -32,7 +32,9 @@ pub enum SpecError {
         form: &'static str,
     },
     /// The counts are not two whole numbers.
-    #[error("target {spec:?}: {value:?} is not a count of columns and rows, expected two whole numbers such as 9x6")]
+    #[error(
+        "target {spec:?}: {value:?} is not a count of columns and rows, expected two whole numbers such as 9x6"
+    )]
     Counts {
         /// The specification.
         spec: String,
@@ -54,7 +56,9 @@ pub enum SpecError {
         max: u32,
     },
     /// A length has no unit or an unknown one.
-    #[error("target {spec:?}: {what} {value:?} has no unit, expected a number with mm, cm or m, such as 25mm")]
+    #[error(
+        "target {spec:?}: {what} {value:?} has no unit, expected a number with mm, cm or m, such as 25mm"
+    )]
     Unit {
         /// The specification.
         spec: String,
@@ -74,7 +78,9 @@ pub enum SpecError {
         value: String,
     },
     /// A length is outside the range of printed targets, usually because of a wrong unit.
-    #[error("target {spec:?}: {what} is {found_m} m, expected {min_m} to {max_m} m; check the unit (mm, cm or m)")]
+    #[error(
+        "target {spec:?}: {what} is {found_m} m, expected {min_m} to {max_m} m; check the unit (mm, cm or m)"
+    )]
     Length {
         /// The specification.
         spec: String,
@@ -113,7 +119,9 @@ pub enum SpecError {
         expected: String,
     },
     /// The target has more markers than the dictionary.
-    #[error("target {spec:?} has {needed} markers, but {dictionary} has only {available}; use {suggestion}")]
+    #[error(
+        "target {spec:?} has {needed} markers, but {dictionary} has only {available}; use {suggestion}"
+    )]
     DictionaryTooSmall {
         /// The specification.
         spec: String,
@@ -127,7 +135,9 @@ pub enum SpecError {
         suggestion: String,
     },
     /// The spacing of an AprilGrid is not a plausible fraction.
-    #[error("target {spec:?}: spacing is {found}, expected a fraction of the tag's side from 0.1 to 1, such as 0.3")]
+    #[error(
+        "target {spec:?}: spacing is {found}, expected a fraction of the tag's side from 0.1 to 1, such as 0.3"
+    )]
     Spacing {
         /// The specification.
         spec: String,
@@ -161,7 +171,9 @@ pub enum NotDetected {
         target: &'static str,
     },
     /// A board of another size is in the image.
-    #[error("found a board with {found} inner corners, expected {expected}; check the counts of the target")]
+    #[error(
+        "found a board with {found} inner corners, expected {expected}; check the counts of the target"
+    )]
     OtherSize {
         /// Columns and rows found.
         found: Counts,
@@ -169,7 +181,9 @@ pub enum NotDetected {
         expected: Counts,
     },
     /// The markers are those of a board with other counts.
-    #[error("the markers form a board of {found} {what} (or more rows), not {expected}; correct --target")]
+    #[error(
+        "the markers form a board of {found} {what} (or more rows), not {expected}; correct --target"
+    )]
     OtherCounts {
         /// Columns of the board in the image, and the fewest rows that contain all its marker ids.
         found: Counts,
@@ -179,7 +193,9 @@ pub enum NotDetected {
         what: &'static str,
     },
     /// A part of the board is in the image and cannot be identified.
-    #[error("only {found} of the {expected} inner corners found; move the camera until the whole board is in view")]
+    #[error(
+        "only {found} of the {expected} inner corners found; move the camera until the whole board is in view"
+    )]
     Partial {
         /// Columns and rows found.
         found: Counts,
@@ -187,7 +203,9 @@ pub enum NotDetected {
         expected: Counts,
     },
     /// The markers belong to another dictionary.
-    #[error("found {n} markers of {found}, expected {expected}; specify {found} as the dictionary of the target")]
+    #[error(
+        "found {n} markers of {found}, expected {expected}; specify {found} as the dictionary of the target"
+    )]
     OtherDictionary {
         /// Dictionary of the markers in the image.
         found: String,
@@ -235,7 +253,9 @@ pub enum NotDetected {
         n: usize,
     },
     /// Not enough corners to estimate a pose.
-    #[error("only {found} corners found, expected at least {min}; move closer or show more of the target")]
+    #[error(
+        "only {found} corners found, expected at least {min}; move closer or show more of the target"
+    )]
     TooFewCorners {
         /// Corners found.
         found: usize,
@@ -289,7 +309,9 @@ impl fmt::Display for Ids {
 #[non_exhaustive]
 pub enum PrintError {
     /// The target does not fit the paper.
-    #[error("the target needs {need_mm:.0?} mm with margins, but {paper} has {paper_mm:.0?} mm; use {suggestion}")]
+    #[error(
+        "the target needs {need_mm:.0?} mm with margins, but {paper} has {paper_mm:.0?} mm; use {suggestion}"
+    )]
     TooLarge {
         /// Width and height needed, millimeters.
         need_mm: [f64; 2],

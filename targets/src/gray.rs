@@ -31,10 +31,19 @@ impl Plane {
         let [width, height] = image.size_px;
         let n_pixels = u64::from(width) * u64::from(height);
         if width.min(height) < MIN_SIDE_PX || image.pixels.len() as u64 != n_pixels {
-            return Err(NotDetected::Image { n_bytes: image.pixels.len(), width, height, min: MIN_SIDE_PX });
+            return Err(NotDetected::Image {
+                n_bytes: image.pixels.len(),
+                width,
+                height,
+                min: MIN_SIDE_PX,
+            });
         }
         let values = image.pixels.iter().map(|&value| f32::from(value)).collect();
-        Ok(Self { width: width as usize, height: height as usize, values })
+        Ok(Self {
+            width: width as usize,
+            height: height as usize,
+            values,
+        })
     }
 
     pub(crate) fn size(&self) -> [usize; 2] {
@@ -51,35 +60,53 @@ impl Plane {
 
     /// Whether a position is at least `margin` pixels inside the image.
     pub(crate) fn contains(&self, [x, y]: [f64; 2], margin: f64) -> bool {
-        x >= margin && y >= margin && x <= self.width as f64 - margin && y <= self.height as f64 - margin
+        x >= margin
+            && y >= margin
+            && x <= self.width as f64 - margin
+            && y <= self.height as f64 - margin
     }
 
-    /// Interpolates bilinearly between pixel centers; positions outside the image take the nearest value.
-    #[expect(clippy::cast_possible_truncation, reason = "clamped to the image; the fraction needs no precision")]
+    /// Interpolates bilinearly between pixel centers; positions outside the image take the nearest
+    /// value.
+    #[expect(
+        clippy::cast_possible_truncation,
+        reason = "clamped to the image; the fraction needs no precision"
+    )]
     pub(crate) fn sample(&self, [x, y]: [f64; 2]) -> f32 {
         let clamp = |value: f64, size: usize| (value - 0.5).clamp(0.0, (size - 1) as f64);
         let (x, y) = (clamp(x, self.width), clamp(y, self.height));
-        let (left, top) = ((x as usize).min(self.width - 2), (y as usize).min(self.height - 2));
+        let (left, top) = (
+            (x as usize).min(self.width - 2),
+            (y as usize).min(self.height - 2),
+        );
         let (right_frac, lower_frac) = ((x - left as f64) as f32, (y - top as f64) as f32);
         let at = top * self.width + left;
-        let [upper, lower] =
-            [at, at + self.width].map(|at| self.values[at] + (self.values[at + 1] - self.values[at]) * right_frac);
+        let [upper, lower] = [at, at + self.width]
+            .map(|at| self.values[at] + (self.values[at + 1] - self.values[at]) * right_frac);
         upper + (lower - upper) * lower_frac
     }
 
     /// Smooths with the binomial kernel (1 4 6 4 1) / 16 along both axes, a Gaussian of 1 px.
     pub(crate) fn smoothed(&self) -> Self {
         let mut across = self.values.clone();
-        for (out, row) in across.chunks_exact_mut(self.width).zip(self.values.chunks_exact(self.width)) {
+        for (out, row) in across
+            .chunks_exact_mut(self.width)
+            .zip(self.values.chunks_exact(self.width))
+        {
             for (at, window) in row.windows(5).enumerate() {
                 out[at + 2] = binomial([window[0], window[1], window[2], window[3], window[4]]);
             }
         }
         let mut values = across.clone();
         for y in 2..self.height - 2 {
-            let row = |offset: usize| &across[(y + offset - 2) * self.width..(y + offset - 1) * self.width];
+            let row = |offset: usize| {
+                &across[(y + offset - 2) * self.width..(y + offset - 1) * self.width]
+            };
             let rows = [row(0), row(1), row(2), row(3), row(4)];
-            for (x, out) in values[y * self.width..(y + 1) * self.width].iter_mut().enumerate() {
+            for (x, out) in values[y * self.width..(y + 1) * self.width]
+                .iter_mut()
+                .enumerate()
+            {
                 *out = binomial(rows.map(|row| row[x]));
             }
         }
@@ -93,9 +120,15 @@ impl Plane {
         for y in 0..height {
             let (upper, lower) = (self.row(2 * y), self.row(2 * y + 1));
             let pairs = upper.chunks_exact(2).zip(lower.chunks_exact(2));
-            values.extend(pairs.map(|(upper, lower)| (upper[0] + upper[1] + lower[0] + lower[1]) * 0.25));
+            values.extend(
+                pairs.map(|(upper, lower)| (upper[0] + upper[1] + lower[0] + lower[1]) * 0.25),
+            );
         }
-        Self { width, height, values }
+        Self {
+            width,
+            height,
+            values,
+        }
     }
 
     /// Whether the image can be halved and still be searched.
@@ -115,8 +148,14 @@ mod tests {
 
     #[test]
     fn pixel_centers_are_at_one_half() {
-        let pixels: Vec<u8> = (0..32 * 32).map(|at| u8::try_from(at % 32 * 8).unwrap()).collect();
-        let plane = Plane::new(GrayImage { size_px: [32, 32], pixels: &pixels }).unwrap();
+        let pixels: Vec<u8> = (0..32 * 32)
+            .map(|at| u8::try_from(at % 32 * 8).unwrap())
+            .collect();
+        let plane = Plane::new(GrayImage {
+            size_px: [32, 32],
+            pixels: &pixels,
+        })
+        .unwrap();
         assert_eq!(plane.sample([3.5, 7.5]), 24.0);
         assert_eq!(plane.sample([4.0, 7.0]), 28.0);
         assert_eq!(plane.sample([-5.0, 99.0]), 0.0);
@@ -126,9 +165,21 @@ mod tests {
 
     #[test]
     fn wrong_sizes_are_rejected() {
-        for (size_px, n) in [([32, 32], 1023), ([0, 0], 0), ([23, 40], 920), ([u32::MAX, u32::MAX], 7)] {
+        for (size_px, n) in [
+            ([32, 32], 1023),
+            ([0, 0], 0),
+            ([23, 40], 920),
+            ([u32::MAX, u32::MAX], 7),
+        ] {
             let pixels = vec![0; n];
-            assert!(Plane::new(GrayImage { size_px, pixels: &pixels }).is_err(), "{size_px:?}");
+            assert!(
+                Plane::new(GrayImage {
+                    size_px,
+                    pixels: &pixels
+                })
+                .is_err(),
+                "{size_px:?}"
+            );
         }
     }
 }

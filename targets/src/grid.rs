@@ -1,9 +1,10 @@
 //! Links saddles along the edges between them into lattices.
 //!
-//! Every saddle looks for the nearest saddle along each of its four edges; links that both ends agree on are kept if
-//! the image is black on one side and white on the other all along. The links are then walked, which gives every
-//! saddle a column and a row. All decisions are local, so the lens may bend the board. Similar to Geiger et al. 2012,
-//! "Automatic camera and range sensor calibration using a single shot", section III.
+//! Every saddle looks for the nearest saddle along each of its four edges; links that both ends
+//! agree on are kept if the image is black on one side and white on the other all along. The links
+//! are then walked, which gives every saddle a column and a row. All decisions are local, so the
+//! lens may bend the board. Similar to Geiger et al. 2012, "Automatic camera and range sensor
+//! calibration using a single shot", section III.
 
 use crate::gray::Plane;
 use crate::lattice::{Cell, Lattice, STEPS, distance};
@@ -35,7 +36,8 @@ pub(crate) fn link(plane: &Plane, saddles: &[Saddle], min: usize) -> Vec<Lattice
     grids
 }
 
-/// Neighbor of a saddle along one of its edges, and the index of the edge of the neighbor that leads back.
+/// Neighbor of a saddle along one of its edges, and the index of the edge of the neighbor that
+/// leads back.
 type Link = Option<(usize, usize)>;
 
 fn links(plane: &Plane, saddles: &[Saddle]) -> Vec<[Link; 4]> {
@@ -43,12 +45,16 @@ fn links(plane: &Plane, saddles: &[Saddle]) -> Vec<[Link; 4]> {
     let nearest: Vec<[Link; 4]> = (0..saddles.len())
         .map(|from| std::array::from_fn(|edge| nearest_along(saddles, &buckets, from, edge)))
         .collect();
-    let is_mutual = |from: usize, edge: usize, (to, back): (usize, usize)| nearest[to][back] == Some((from, edge));
+    let is_mutual = |from: usize, edge: usize, (to, back): (usize, usize)| {
+        nearest[to][back] == Some((from, edge))
+    };
     let mut links = vec![[None; 4]; saddles.len()];
     for (from, edges) in links.iter_mut().enumerate() {
         for (edge, link) in edges.iter_mut().enumerate() {
-            *link = nearest[from][edge]
-                .filter(|&link| is_mutual(from, edge, link) && is_edge(plane, &saddles[from], edge, &saddles[link.0]));
+            *link = nearest[from][edge].filter(|&link| {
+                is_mutual(from, edge, link)
+                    && is_edge(plane, &saddles[from], edge, &saddles[link.0])
+            });
         }
     }
     // The check of the image is not symmetric in rounding, so links are compared once more.
@@ -66,15 +72,26 @@ fn links(plane: &Plane, saddles: &[Saddle]) -> Vec<[Link; 4]> {
 fn nearest_along(saddles: &[Saddle], buckets: &Buckets, from: usize, edge: usize) -> Link {
     let origin = &saddles[from];
     let is_candidate = |to: usize| {
-        let (dx, dy) = (saddles[to].pixel[0] - origin.pixel[0], saddles[to].pixel[1] - origin.pixel[1]);
+        let (dx, dy) = (
+            saddles[to].pixel[0] - origin.pixel[0],
+            saddles[to].pixel[1] - origin.pixel[1],
+        );
         let toward_rad = dy.atan2(dx);
         if to == from || angle_between(toward_rad, origin.edges_rad[edge]).abs() > MAX_ANGLE_RAD {
             return None;
         }
-        let back_rad =
-            |back: usize| angle_between(toward_rad + std::f64::consts::PI, saddles[to].edges_rad[back]).abs();
-        // An edge with black after it, in ascending angles, is seen from its other end with black before it.
-        let back = [1 - edge % 2, 3 - edge % 2].into_iter().min_by(|&a, &b| back_rad(a).total_cmp(&back_rad(b)))?;
+        let back_rad = |back: usize| {
+            angle_between(
+                toward_rad + std::f64::consts::PI,
+                saddles[to].edges_rad[back],
+            )
+            .abs()
+        };
+        // An edge with black after it, in ascending angles, is seen from its other end with black
+        // before it.
+        let back = [1 - edge % 2, 3 - edge % 2]
+            .into_iter()
+            .min_by(|&a, &b| back_rad(a).total_cmp(&back_rad(b)))?;
         (back_rad(back) <= MAX_ANGLE_RAD).then_some(back)
     };
     buckets.nearest(saddles, origin.pixel, is_candidate)
@@ -92,16 +109,31 @@ fn is_edge(plane: &Plane, from: &Saddle, edge: usize, to: &Saddle) -> bool {
     let contrast = from.contrast.min(to.contrast) * MIN_CONTRAST_FRAC;
     ALONG.into_iter().all(|along| {
         let center = [from.pixel[0] + along * dx, from.pixel[1] + along * dy];
-        let side = |sign: f64| [center[0] - sign * across_px * dy, center[1] + sign * across_px * dx];
+        let side = |sign: f64| {
+            [
+                center[0] - sign * across_px * dy,
+                center[1] + sign * across_px * dx,
+            ]
+        };
         plane.sample(side(-black_sign)) - plane.sample(side(black_sign)) > contrast
     })
 }
 
-/// Removes links that are much longer than the other links of a saddle: they skip a missing corner or leave the board.
+/// Removes links that are much longer than the other links of a saddle: they skip a missing corner
+/// or leave the board.
 fn drop_odd_lengths(saddles: &[Saddle], links: &mut [[Link; 4]]) {
-    let length = |from: usize, link: Link| link.map(|(to, _)| distance(saddles[from].pixel, saddles[to].pixel));
-    let shortest = |from: usize| links[from].iter().filter_map(|&link| length(from, link)).min_by(f64::total_cmp);
-    let shortest: Vec<f64> = (0..saddles.len()).map(|from| shortest(from).unwrap_or(f64::INFINITY)).collect();
+    let length = |from: usize, link: Link| {
+        link.map(|(to, _)| distance(saddles[from].pixel, saddles[to].pixel))
+    };
+    let shortest = |from: usize| {
+        links[from]
+            .iter()
+            .filter_map(|&link| length(from, link))
+            .min_by(f64::total_cmp)
+    };
+    let shortest: Vec<f64> = (0..saddles.len())
+        .map(|from| shortest(from).unwrap_or(f64::INFINITY))
+        .collect();
     for (from, edges) in links.iter_mut().enumerate() {
         for link in edges {
             let is_odd = |(to, _): (usize, usize)| {
@@ -113,8 +145,8 @@ fn drop_odd_lengths(saddles: &[Saddle], links: &mut [[Link; 4]]) {
     }
 }
 
-/// Assigns columns and rows, starting at a saddle, which is at (0, 0). Its edge 0 leads to column 1, so the sector
-/// between its edges 2 and 3 is at the upper left, and black.
+/// Assigns columns and rows, starting at a saddle, which is at (0, 0). Its edge 0 leads to column
+/// 1, so the sector between its edges 2 and 3 is at the upper left, and black.
 fn walk(saddles: &[Saddle], links: &[[Link; 4]], seed: usize, is_used: &mut [bool]) -> Lattice {
     let mut lattice = Lattice::default();
     // Saddle, its cell, and the direction (index in STEPS) of its edge 0.
@@ -158,7 +190,11 @@ impl Buckets {
             let [column, row] = bucket(saddle.pixel);
             buckets[row * counts[0] + column].push(ix);
         }
-        Self { side_px: SIDE_PX, counts, buckets }
+        Self {
+            side_px: SIDE_PX,
+            counts,
+            buckets,
+        }
     }
 
     /// The nearest saddle for which `accept` returns a value, with this value.
@@ -177,8 +213,9 @@ impl Buckets {
             if best.as_ref().is_some_and(|best| best.0 < searched_px) {
                 break;
             }
-            let range =
-                |axis: usize| center[axis].saturating_sub(ring)..=(center[axis] + ring).min(self.counts[axis] - 1);
+            let range = |axis: usize| {
+                center[axis].saturating_sub(ring)..=(center[axis] + ring).min(self.counts[axis] - 1)
+            };
             for row in range(1) {
                 for column in range(0) {
                     if row.abs_diff(center[1]).max(column.abs_diff(center[0])) != ring {
@@ -200,7 +237,11 @@ impl Buckets {
     }
 }
 
-#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "positions are within the image")]
+#[expect(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "positions are within the image"
+)]
 fn index(value: f64, side_px: f64) -> usize {
     (value.max(0.0) / side_px) as usize
 }

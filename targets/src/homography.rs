@@ -9,13 +9,17 @@ pub(crate) struct Homography(Matrix3<f64>);
 impl Homography {
     /// The map that takes four points to four others. `None` if three of either lie on a line.
     ///
-    /// Source: Hartley and Zisserman 2004, section 4.1, with the last element fixed to 1: the image of the first
-    /// plane's origin must be finite, so points of the first plane should be near its origin.
+    /// Source: Hartley and Zisserman 2004, section 4.1, with the last element fixed to 1: the image
+    /// of the first plane's origin must be finite, so points of the first plane should be near its
+    /// origin.
     pub(crate) fn from_corners(from: &[[f64; 2]; 4], to: &[[f64; 2]; 4]) -> Option<Self> {
         let mut matrix = SMatrix::<f64, 8, 8>::zeros();
         let mut right = SVector::<f64, 8>::zeros();
         for (at, ([x, y], [u, v])) in from.iter().zip(to).enumerate() {
-            let rows = [[*x, *y, 1.0, 0.0, 0.0, 0.0, -u * x, -u * y], [0.0, 0.0, 0.0, *x, *y, 1.0, -v * x, -v * y]];
+            let rows = [
+                [*x, *y, 1.0, 0.0, 0.0, 0.0, -u * x, -u * y],
+                [0.0, 0.0, 0.0, *x, *y, 1.0, -v * x, -v * y],
+            ];
             for (offset, row) in rows.into_iter().enumerate() {
                 matrix.row_mut(2 * at + offset).copy_from_slice(&row);
             }
@@ -26,7 +30,9 @@ impl Homography {
             return None;
         }
         let element = |at: usize| if at < 8 { solution[at] } else { 1.0 };
-        Some(Self(Matrix3::from_fn(|row, column| element(3 * row + column))))
+        Some(Self(Matrix3::from_fn(|row, column| {
+            element(3 * row + column)
+        })))
     }
 
     /// The image of a point; not finite for points at infinity.
@@ -61,12 +67,15 @@ mod tests {
         const NUDGE: f64 = 1e-6;
         let jacobian = homography.jacobian([0.3, 0.8]);
         for (axis, nudge) in [[NUDGE, 0.0], [0.0, NUDGE]].into_iter().enumerate() {
-            let [ahead, behind] =
-                [1.0, -1.0].map(|sign| homography.map([0.3 + sign * nudge[0], 0.8 + sign * nudge[1]]));
+            let [ahead, behind] = [1.0, -1.0]
+                .map(|sign| homography.map([0.3 + sign * nudge[0], 0.8 + sign * nudge[1]]));
             for row in 0..2 {
                 let numeric = (ahead[row] - behind[row]) / (2.0 * NUDGE);
                 // Derivatives are near 100; differences lose ten digits.
-                assert!((jacobian[(row, axis)] - numeric).abs() < 1e-6, "{row} {axis}");
+                assert!(
+                    (jacobian[(row, axis)] - numeric).abs() < 1e-6,
+                    "{row} {axis}"
+                );
             }
         }
         let line = [[0.0, 0.0], [1.0, 1.0], [2.0, 2.0], [0.0, 1.0]];

@@ -20,54 +20,72 @@ pub(crate) struct Lattice {
 const MAX_DEVIATION: f64 = 0.22;
 /// Radius of the ring that verifies a corner, relative to the distance between neighbors.
 const RING_FRAC: f64 = 0.27;
-/// Half the refinement window, relative to the distance between neighbors, and its limits in pixels.
+/// Half the refinement window, relative to the distance between neighbors, and its limits in
+/// pixels.
 const WINDOW_FRAC: f64 = 0.38;
 const WINDOW_PX: [f64; 2] = [2.0, 9.0];
 
 /// How corners are refined and verified.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Refinement {
-    /// Part of the distance between corners around each corner that shows nothing but the four edges, 0 to 0.5.
+    /// Part of the distance between corners around each corner that shows nothing but the four
+    /// edges, 0 to 0.5.
     pub(crate) clear_frac: f64,
 }
 
 impl Lattice {
     fn at(&self, cell: Cell, step: Cell, n: i32) -> Option<[f64; 2]> {
-        self.corners.get(&[cell[0] + n * step[0], cell[1] + n * step[1]]).copied()
+        self.corners
+            .get(&[cell[0] + n * step[0], cell[1] + n * step[1]])
+            .copied()
     }
 
     /// Distance to the nearest neighbor, pixels.
     pub(crate) fn spacing_px(&self, cell: Cell) -> Option<f64> {
         let here = self.corners.get(&cell)?;
         let neighbors = STEPS.iter().filter_map(|&step| self.at(cell, step, 1));
-        neighbors.map(|near| distance(*here, near)).min_by(f64::total_cmp)
+        neighbors
+            .map(|near| distance(*here, near))
+            .min_by(f64::total_cmp)
     }
 
-    /// Predicts a corner from its neighbors, without using the corner itself. Also returns the distance between
-    /// neighbors there.
+    /// Predicts a corner from its neighbors, without using the corner itself. Also returns the
+    /// distance between neighbors there.
     ///
-    /// The mean of all predictions of the most accurate kind is used: between two neighbors; extrapolation of a
-    /// parabola; completion of a square; linear extrapolation.
+    /// The mean of all predictions of the most accurate kind is used: between two neighbors;
+    /// extrapolation of a parabola; completion of a square; linear extrapolation.
     pub(crate) fn predict(&self, cell: Cell) -> Option<Prediction> {
         let between = |step: Cell| {
             let (a, b) = (self.at(cell, step, 1)?, self.at(cell, step, -1)?);
-            Some(Prediction { pixel: combine(&[(0.5, a), (0.5, b)]), spacing_px: distance(a, b) / 2.0 })
+            Some(Prediction {
+                pixel: combine(&[(0.5, a), (0.5, b)]),
+                spacing_px: distance(a, b) / 2.0,
+            })
         };
         let square = |at: usize| {
             let (step, turned) = (STEPS[at], STEPS[(at + 1) % 4]);
             let (a, b) = (self.at(cell, step, 1)?, self.at(cell, turned, 1)?);
             let diagonal = self.at([cell[0] + step[0], cell[1] + step[1]], turned, 1)?;
             let spacing_px = distance(a, diagonal).min(distance(b, diagonal));
-            Some(Prediction { pixel: combine(&[(1.0, a), (1.0, b), (-1.0, diagonal)]), spacing_px })
+            Some(Prediction {
+                pixel: combine(&[(1.0, a), (1.0, b), (-1.0, diagonal)]),
+                spacing_px,
+            })
         };
         let parabola = |at: usize| {
             let [a, b, c] = [1, 2, 3].map(|n| self.at(cell, STEPS[at], n));
             let (a, b, c) = (a?, b?, c?);
-            Some(Prediction { pixel: combine(&[(3.0, a), (-3.0, b), (1.0, c)]), spacing_px: distance(a, b) })
+            Some(Prediction {
+                pixel: combine(&[(3.0, a), (-3.0, b), (1.0, c)]),
+                spacing_px: distance(a, b),
+            })
         };
         let line = |at: usize| {
             let (a, b) = (self.at(cell, STEPS[at], 1)?, self.at(cell, STEPS[at], 2)?);
-            Some(Prediction { pixel: combine(&[(2.0, a), (-1.0, b)]), spacing_px: distance(a, b) })
+            Some(Prediction {
+                pixel: combine(&[(2.0, a), (-1.0, b)]),
+                spacing_px: distance(a, b),
+            })
         };
         mean(STEPS[..2].iter().filter_map(|&step| between(step)))
             .or_else(|| mean((0..4).filter_map(parabola)))
@@ -75,9 +93,14 @@ impl Lattice {
             .or_else(|| mean((0..4).filter_map(line)))
     }
 
-    /// Derivative of the pixel with respect to the point on the board (pixels per meter) at a cell whose corner is at
-    /// `pixel`, from the cell's neighbors. `None` if it has none along an axis.
-    pub(crate) fn pixel_by_point(&self, cell: Cell, pixel: [f64; 2], square_m: f64) -> Option<Matrix2<f64>> {
+    /// Derivative of the pixel with respect to the point on the board (pixels per meter) at a cell
+    /// whose corner is at `pixel`, from the cell's neighbors. `None` if it has none along an axis.
+    pub(crate) fn pixel_by_point(
+        &self,
+        cell: Cell,
+        pixel: [f64; 2],
+        square_m: f64,
+    ) -> Option<Matrix2<f64>> {
         // Of second order if possible: of a parabola through three corners.
         let one_sided = |step: Cell, sign: i32| {
             let (near, far) = (self.at(cell, step, sign)?, self.at(cell, step, 2 * sign));
@@ -95,8 +118,8 @@ impl Lattice {
         Some(Matrix2::new(x[0], y[0], x[1], y[1]) / square_m)
     }
 
-    /// Second derivatives of the pixel with respect to x and x, x and y, y and y, pixels per square meter, from the
-    /// neighbors of a cell; zero where there are too few.
+    /// Second derivatives of the pixel with respect to x and x, x and y, y and y, pixels per square
+    /// meter, from the neighbors of a cell; zero where there are too few.
     pub(crate) fn bend(&self, cell: Cell, pixel: [f64; 2], square_m: f64) -> [[f64; 2]; 3] {
         let straight = |step: Cell| {
             let (before, after) = (self.at(cell, step, -1)?, self.at(cell, step, 1)?);
@@ -104,17 +127,31 @@ impl Lattice {
         };
         let diagonal = |x: i32, y: i32| {
             let (a, b) = (self.at(cell, [x, 0], 1)?, self.at(cell, [0, y], 1)?);
-            let twist = combine(&[(1.0, self.at(cell, [x, y], 1)?), (1.0, pixel), (-1.0, a), (-1.0, b)]);
+            let twist = combine(&[
+                (1.0, self.at(cell, [x, y], 1)?),
+                (1.0, pixel),
+                (-1.0, a),
+                (-1.0, b),
+            ]);
             Some(twist.map(|value| value * f64::from(x * y)))
         };
-        let twists: Vec<[f64; 2]> =
-            [[1, 1], [1, -1], [-1, 1], [-1, -1]].into_iter().filter_map(|[x, y]| diagonal(x, y)).collect();
-        let mean = [0, 1].map(|axis| twists.iter().map(|twist| twist[axis]).sum::<f64>() / twists.len().max(1) as f64);
-        [straight(STEPS[0]).unwrap_or_default(), mean, straight(STEPS[1]).unwrap_or_default()]
-            .map(|second| second.map(|value| value / (square_m * square_m)))
+        let twists: Vec<[f64; 2]> = [[1, 1], [1, -1], [-1, 1], [-1, -1]]
+            .into_iter()
+            .filter_map(|[x, y]| diagonal(x, y))
+            .collect();
+        let mean = [0, 1].map(|axis| {
+            twists.iter().map(|twist| twist[axis]).sum::<f64>() / twists.len().max(1) as f64
+        });
+        [
+            straight(STEPS[0]).unwrap_or_default(),
+            mean,
+            straight(STEPS[1]).unwrap_or_default(),
+        ]
+        .map(|second| second.map(|value| value / (square_m * square_m)))
     }
 
-    /// Adds corners that are missing inside `range` (inclusive) where a saddle lies close to its prediction, repeatedly.
+    /// Adds corners that are missing inside `range` (inclusive) where a saddle lies close to its
+    /// prediction, repeatedly.
     pub(crate) fn complete(&mut self, plane: &Plane, range: [Cell; 2], refinement: Refinement) {
         let max_passes = range[1][0] - range[0][0] + range[1][1] - range[0][1] + 2;
         for _ in 0..max_passes {
@@ -125,7 +162,9 @@ impl Lattice {
                     if self.corners.contains_key(&cell) {
                         continue;
                     }
-                    let corner = self.predict(cell).and_then(|prediction| prediction.find(plane, refinement));
+                    let corner = self
+                        .predict(cell)
+                        .and_then(|prediction| prediction.find(plane, refinement));
                     added.extend(corner.map(|pixel| (cell, pixel)));
                 }
             }
@@ -139,7 +178,9 @@ impl Lattice {
     /// Refines all corners and removes those that are no saddles.
     pub(crate) fn refine(&mut self, plane: &Plane, refinement: Refinement) {
         let refined = self.corners.iter().filter_map(|(&cell, &pixel)| {
-            let spacing_px = self.spacing_px(cell).or_else(|| Some(self.predict(cell)?.spacing_px))?;
+            let spacing_px = self
+                .spacing_px(cell)
+                .or_else(|| Some(self.predict(cell)?.spacing_px))?;
             Some((cell, refinement.refine(plane, pixel, spacing_px)?))
         });
         self.corners = refined.collect();
@@ -150,9 +191,16 @@ impl Lattice {
         loop {
             let deviation = |(&cell, &pixel): (&Cell, &[f64; 2])| {
                 let prediction = self.predict(cell)?;
-                Some((cell, distance(pixel, prediction.pixel) / prediction.spacing_px))
+                Some((
+                    cell,
+                    distance(pixel, prediction.pixel) / prediction.spacing_px,
+                ))
             };
-            let worst = self.corners.iter().filter_map(deviation).max_by(|a, b| a.1.total_cmp(&b.1));
+            let worst = self
+                .corners
+                .iter()
+                .filter_map(deviation)
+                .max_by(|a, b| a.1.total_cmp(&b.1));
             match worst {
                 Some((cell, deviation)) if deviation > MAX_DEVIATION => self.corners.remove(&cell),
                 _ => return,
@@ -165,7 +213,10 @@ impl Lattice {
         let mut cells = self.corners.keys();
         let first = *cells.next()?;
         let grown = |[low, high]: [Cell; 2], cell: &Cell| {
-            [[low[0].min(cell[0]), low[1].min(cell[1])], [high[0].max(cell[0]), high[1].max(cell[1])]]
+            [
+                [low[0].min(cell[0]), low[1].min(cell[1])],
+                [high[0].max(cell[0]), high[1].max(cell[1])],
+            ]
         };
         Some(cells.fold([first, first], grown))
     }
@@ -197,7 +248,8 @@ impl Refinement {
 
     /// Refines a corner and checks that it still is a saddle.
     fn refine(self, plane: &Plane, start: [f64; 2], spacing_px: f64) -> Option<[f64; 2]> {
-        let half_window_px = (spacing_px * WINDOW_FRAC.min(self.clear_frac)).clamp(WINDOW_PX[0], WINDOW_PX[1]);
+        let half_window_px =
+            (spacing_px * WINDOW_FRAC.min(self.clear_frac)).clamp(WINDOW_PX[0], WINDOW_PX[1]);
         let pixel = saddle::refine(plane, start, half_window_px)?;
         saddle::ring(plane, pixel, self.ring_px(spacing_px)).map(|_| pixel)
     }
@@ -207,7 +259,12 @@ impl Refinement {
 pub(crate) const STEPS: [Cell; 4] = [[1, 0], [0, 1], [-1, 0], [0, -1]];
 
 fn combine(parts: &[(f64, [f64; 2])]) -> [f64; 2] {
-    [0, 1].map(|axis| parts.iter().map(|(weight, pixel)| weight * pixel[axis]).sum())
+    [0, 1].map(|axis| {
+        parts
+            .iter()
+            .map(|(weight, pixel)| weight * pixel[axis])
+            .sum()
+    })
 }
 
 fn mean(predictions: impl Iterator<Item = Prediction>) -> Option<Prediction> {
@@ -217,7 +274,10 @@ fn mean(predictions: impl Iterator<Item = Prediction>) -> Option<Prediction> {
         spacing_px += prediction.spacing_px;
         n += 1.0;
     }
-    (n > 0.0).then(|| Prediction { pixel: sum.map(|sum| sum / n), spacing_px: spacing_px / n })
+    (n > 0.0).then(|| Prediction {
+        pixel: sum.map(|sum| sum / n),
+        spacing_px: spacing_px / n,
+    })
 }
 
 pub(crate) fn distance(a: [f64; 2], b: [f64; 2]) -> f64 {

@@ -10,7 +10,8 @@ use crate::spec::Pattern;
 /// One arrangement of the markers of a board.
 #[derive(Clone, Debug)]
 pub(crate) struct Layout {
-    /// Corners of every marker in the board frame, meters, by id; in the order of [`Marker::corners_px`].
+    /// Corners of every marker in the board frame, meters, by id; in the order of
+    /// [`Marker::corners_px`].
     pub(crate) corners_m: Vec<Quad>,
     /// Whether this is the arrangement of ChArUco boards before OpenCV 4.6.
     pub(crate) is_legacy: bool,
@@ -22,11 +23,24 @@ const MAX_DEVIATION: f64 = 0.35;
 /// The arrangements in which a board may be printed, the standard one first.
 pub(crate) fn layouts(pattern: &Pattern) -> Vec<Layout> {
     match *pattern {
-        Pattern::Charuco { squares, square_m, marker_m, .. } => {
+        Pattern::Charuco {
+            squares,
+            square_m,
+            marker_m,
+            ..
+        } => {
             let layout = |is_legacy| charuco(squares, square_m, marker_m, is_legacy);
-            if squares[1].is_multiple_of(2) { vec![layout(false), layout(true)] } else { vec![layout(false)] }
+            if squares[1].is_multiple_of(2) {
+                vec![layout(false), layout(true)]
+            } else {
+                vec![layout(false)]
+            }
         }
-        Pattern::Aprilgrid { tags, tag_m, spacing_frac } => {
+        Pattern::Aprilgrid {
+            tags,
+            tag_m,
+            spacing_frac,
+        } => {
             // Programs disagree on the rotation of the tags; their places are the same.
             let tag = |quarter_turns: usize, tag: u32| {
                 let [x, y] = tag_origin(tags, tag_m, spacing_frac, tag);
@@ -34,17 +48,21 @@ pub(crate) fn layouts(pattern: &Pattern) -> Vec<Layout> {
                 std::array::from_fn(|at| square[(at + quarter_turns) % 4])
             };
             let layout = |quarter_turns| Layout {
-                corners_m: (0..tags[0] * tags[1]).map(|id| tag(quarter_turns, id)).collect(),
+                corners_m: (0..tags[0] * tags[1])
+                    .map(|id| tag(quarter_turns, id))
+                    .collect(),
                 is_legacy: false,
             };
             (0..4).map(layout).collect()
         }
-        Pattern::Chessboard { .. } | Pattern::Puzzleboard { .. } | Pattern::Tag { .. } => Vec::new(),
+        Pattern::Chessboard { .. } | Pattern::Puzzleboard { .. } | Pattern::Tag { .. } => {
+            Vec::new()
+        }
     }
 }
 
-/// Whether a square of a ChArUco board is black. In the legacy pattern with an even number of rows, the colors are
-/// swapped.
+/// Whether a square of a ChArUco board is black. In the legacy pattern with an even number of rows,
+/// the colors are swapped.
 pub(crate) fn is_black_square(column: u32, row: u32, n_rows: u32, is_legacy: bool) -> bool {
     let is_swapped = is_legacy && n_rows.is_multiple_of(2);
     (column + row).is_multiple_of(2) != is_swapped
@@ -58,7 +76,10 @@ fn charuco(squares: [u32; 2], square_m: f64, marker_m: f64, is_legacy: bool) -> 
         let [x, y] = cell.map(|count| f64::from(count) * square_m + margin_m);
         UNIT_SQUARE.map(|[column, row]| [x + column * marker_m, y + row * marker_m])
     };
-    Layout { corners_m: white.map(marker).collect(), is_legacy }
+    Layout {
+        corners_m: white.map(marker).collect(),
+        is_legacy,
+    }
 }
 
 /// Markers that agree with a layout.
@@ -70,21 +91,35 @@ pub(crate) struct Fit {
     pub(crate) n_confirmed: usize,
 }
 
-/// Chooses the layout in which most markers predict the places of their neighbors. `None` if there is no marker.
+/// Chooses the layout in which most markers predict the places of their neighbors. `None` if there
+/// is no marker.
 ///
 /// A marker without neighbors cannot be confirmed, but is kept, unless most others contradict it.
 pub(crate) fn fit(layouts: Vec<Layout>, markers: &[Marker]) -> Option<Fit> {
     let fits = layouts.into_iter().map(|layout| {
         let (markers, n_confirmed) = confirmed(&layout, markers);
-        Fit { layout, markers, n_confirmed }
+        Fit {
+            layout,
+            markers,
+            n_confirmed,
+        }
     });
     // Of equals, the first is kept.
-    let better = |best: Fit, next: Fit| if next.n_confirmed > best.n_confirmed { next } else { best };
+    let better = |best: Fit, next: Fit| {
+        if next.n_confirmed > best.n_confirmed {
+            next
+        } else {
+            best
+        }
+    };
     fits.reduce(better).filter(|fit| !fit.markers.is_empty())
 }
 
 fn confirmed(layout: &Layout, markers: &[Marker]) -> (Vec<Marker>, usize) {
-    let known: Vec<&Marker> = markers.iter().filter(|marker| (marker.id as usize) < layout.corners_m.len()).collect();
+    let known: Vec<&Marker> = markers
+        .iter()
+        .filter(|marker| (marker.id as usize) < layout.corners_m.len())
+        .collect();
     let center_m = |marker: &Marker| center(&layout.corners_m[marker.id as usize]);
     let mut votes: Vec<(i32, &Marker)> = Vec::new();
     for marker in &known {
@@ -97,13 +132,22 @@ fn confirmed(layout: &Layout, markers: &[Marker]) -> (Vec<Marker>, usize) {
         others.sort_by(|a, b| a.0.total_cmp(&b.0));
         const N_NEIGHBORS: usize = 4;
         let nearest = others.first().map_or(0.0, |other| other.0);
-        let close = others.iter().take(N_NEIGHBORS).filter(|other| other.0 <= 1.5 * nearest);
+        let close = others
+            .iter()
+            .take(N_NEIGHBORS)
+            .filter(|other| other.0 <= 1.5 * nearest);
         let vote = |other: &Marker| if agrees(layout, marker, other) { 1 } else { -1 };
         votes.push((close.map(|(_, other)| vote(other)).sum(), *marker));
     }
     let n_confirmed = votes.iter().filter(|(votes, _)| *votes > 0).count();
-    let is_kept = |(votes, _): &&(i32, &Marker)| *votes > 0 || (*votes == 0 && n_confirmed == 0 && known.len() == 1);
-    let mut kept: Vec<Marker> = votes.iter().filter(is_kept).map(|(_, marker)| **marker).collect();
+    let is_kept = |(votes, _): &&(i32, &Marker)| {
+        *votes > 0 || (*votes == 0 && n_confirmed == 0 && known.len() == 1)
+    };
+    let mut kept: Vec<Marker> = votes
+        .iter()
+        .filter(is_kept)
+        .map(|(_, marker)| **marker)
+        .collect();
     // An id at several places is not trusted anywhere.
     let ids: Vec<u32> = kept.iter().map(|marker| marker.id).collect();
     kept.retain(|marker| ids.iter().filter(|id| **id == marker.id).count() == 1);
@@ -116,13 +160,17 @@ fn agrees(layout: &Layout, a: &Marker, b: &Marker) -> bool {
         let corners_m = &layout.corners_m[from.id as usize];
         let origin = center(corners_m);
         let centered = |corners_m: &Quad| corners_m.map(|[x, y]| [x - origin[0], y - origin[1]]);
-        let Some(pixel_from_board) = Homography::from_corners(&centered(corners_m), &from.corners_px) else {
+        let Some(pixel_from_board) =
+            Homography::from_corners(&centered(corners_m), &from.corners_px)
+        else {
             return false;
         };
         let to_m = centered(&layout.corners_m[to.id as usize]);
         let side_px = distance(to.corners_px[0], to.corners_px[2]) / 2_f64.sqrt();
         // Farther markers are predicted less accurately, in particular through a fisheye lens.
-        let steps = (center(&to_m)[0].hypot(center(&to_m)[1]) / distance(corners_m[0], corners_m[1])).max(1.0);
+        let steps = (center(&to_m)[0].hypot(center(&to_m)[1])
+            / distance(corners_m[0], corners_m[1]))
+        .max(1.0);
         let off = |at: usize| distance(pixel_from_board.map(to_m[at]), to.corners_px[at]);
         (0..4).all(|at| off(at) <= MAX_DEVIATION * steps * side_px)
     };

@@ -1,8 +1,9 @@
 //! Calibration targets: their geometry, detection in gray images, printing to scale.
 //!
-//! A [`TargetSpec`] is parsed from text such as `chessboard:9x6:25mm`, `charuco:5x7:34mm:28mm:6X6_250`,
-//! `aprilgrid:6x6:88mm:0.3`, `puzzleboard:12x9:20mm` or `tag:36h11:5:100mm`. It returns the positions of all
-//! corners in the [board frame](board), detects them in images, and draws the target.
+//! A [`TargetSpec`] is parsed from text such as `chessboard:9x6:25mm`,
+//! `charuco:5x7:34mm:28mm:6X6_250`, `aprilgrid:6x6:88mm:0.3`, `puzzleboard:12x9:20mm` or
+//! `tag:36h11:5:100mm`. It returns the positions of all corners in the [board frame](board),
+//! detects them in images, and draws the target.
 //!
 //! ```
 //! use targets::{GrayImage, Paper, TargetSpec};
@@ -25,14 +26,15 @@
 //! ```
 //!
 //! # Detection
-//! - Chessboards and PuzzleBoards: saddle points of the image (`saddle`) are linked along the edges between them
-//!   (`grid`).
-//! - ChArUco boards, AprilGrids and tags: dark quadrilaterals (`quad`) are decoded (`marker`), and arrangements that
-//!   contradict the target are rejected (`layout`).
+//! - Chessboards and PuzzleBoards: saddle points of the image (`saddle`) are linked along the edges
+//!   between them (`grid`).
+//! - ChArUco boards, AprilGrids and tags: dark quadrilaterals (`quad`) are decoded (`marker`), and
+//!   arrangements that contradict the target are rejected (`layout`).
 //! - In the end, every corner is aligned with the printed pattern around it (`template`).
 //!
-//! Only neighboring corners are compared, so the lens may distort the board, and parts of it may be hidden. Markers are
-//! decoded through a homography, so strong fisheye distortion reduces the number of detected markers.
+//! Only neighboring corners are compared, so the lens may distort the board, and parts of it may be
+//! hidden. Markers are decoded through a homography, so strong fisheye distortion reduces the
+//! number of detected markers.
 
 mod alignment;
 pub mod board;

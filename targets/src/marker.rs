@@ -23,22 +23,39 @@ pub(crate) struct Marker {
     n_wrong: u32,
 }
 
-/// Decodes the markers among quadrilaterals, in ascending order of ids. Markers found several times are merged; if an
-/// id is at several places, all are returned.
+/// Decodes the markers among quadrilaterals, in ascending order of ids. Markers found several times
+/// are merged; if an id is at several places, all are returned.
 ///
 /// `borders`: widths of the black border in cells that occur.
-pub(crate) fn decode(plane: &Plane, quads: &[Quad], dictionary: &Dictionary, borders: &[usize]) -> Vec<Marker> {
+pub(crate) fn decode(
+    plane: &Plane,
+    quads: &[Quad],
+    dictionary: &Dictionary,
+    borders: &[usize],
+) -> Vec<Marker> {
     let mut markers: Vec<Marker> = Vec::new();
     for quad in quads {
         let decoded = borders.iter().find_map(|&border| {
             let cells = read_cells(plane, quad, dictionary.n_bits(), border)?;
             dictionary.decode(&cells)
         });
-        let Some(Match { id, quarter_turns, n_wrong }) = decoded else { continue };
+        let Some(Match {
+            id,
+            quarter_turns,
+            n_wrong,
+        }) = decoded
+        else {
+            continue;
+        };
         let corners_px = std::array::from_fn(|at| quad[(at + quarter_turns) % 4]);
-        let marker = Marker { id, corners_px, n_wrong };
+        let marker = Marker {
+            id,
+            corners_px,
+            n_wrong,
+        };
         let is_same = |other: &&mut Marker| {
-            other.id == id && distance(other.corners_px[0], corners_px[0]) < shortest_side(quad) / 2.0
+            other.id == id
+                && distance(other.corners_px[0], corners_px[0]) < shortest_side(quad) / 2.0
         };
         match markers.iter_mut().find(is_same) {
             // Outlines of larger windows are more accurate, and come later.
@@ -47,7 +64,10 @@ pub(crate) fn decode(plane: &Plane, quads: &[Quad], dictionary: &Dictionary, bor
             None => markers.push(marker),
         }
     }
-    markers.sort_by(|a, b| a.id.cmp(&b.id).then(a.corners_px[0][0].total_cmp(&b.corners_px[0][0])));
+    markers.sort_by(|a, b| {
+        a.id.cmp(&b.id)
+            .then(a.corners_px[0][0].total_cmp(&b.corners_px[0][0]))
+    });
     markers
 }
 
@@ -61,24 +81,33 @@ pub(crate) struct Exact {
 }
 
 /// Reads the markers of a dictionary, or those that are its markers mirrored.
-pub(crate) fn read_exactly(plane: &Plane, quads: &[Quad], dictionary: &Dictionary, is_mirrored: bool) -> Exact {
+pub(crate) fn read_exactly(
+    plane: &Plane,
+    quads: &[Quad],
+    dictionary: &Dictionary,
+    is_mirrored: bool,
+) -> Exact {
     let n = dictionary.n_bits();
     let mut exact = Exact::default();
     for quad in quads {
-        let Some(mut cells) = read_cells(plane, quad, n, 1) else { continue };
+        let Some(mut cells) = read_cells(plane, quad, n, 1) else {
+            continue;
+        };
         exact.n_by_chance += 4.0 * f64::from(dictionary.n_markers()) * 0.5_f64.powf((n * n) as f64);
         if is_mirrored {
             cells.chunks_exact_mut(n).for_each(<[bool]>::reverse);
         }
-        exact.ids.extend(dictionary.decode_exactly(&cells).map(|found| found.id));
+        exact
+            .ids
+            .extend(dictionary.decode_exactly(&cells).map(|found| found.id));
     }
     exact.ids.sort_unstable();
     exact.ids.dedup();
     exact
 }
 
-/// Reads the cells inside the border, row by row; true is black. `None` if the border is not black or the contrast is
-/// low.
+/// Reads the cells inside the border, row by row; true is black. `None` if the border is not black
+/// or the contrast is low.
 fn read_cells(plane: &Plane, quad: &Quad, n_bits: usize, border: usize) -> Option<Vec<bool>> {
     let n = n_bits + 2 * border;
     if shortest_side(quad) < 1.5 * n as f64 {
@@ -89,23 +118,36 @@ fn read_cells(plane: &Plane, quad: &Quad, n_bits: usize, border: usize) -> Optio
     for at in 0..n * n {
         const OFFSETS: [[f64; 2]; 5] = [[0.5, 0.5], [0.3, 0.3], [0.7, 0.3], [0.3, 0.7], [0.7, 0.7]];
         let sample = |[x, y]: [f64; 2]| {
-            let point = [((at % n) as f64 + x) / n as f64, ((at / n) as f64 + y) / n as f64];
+            let point = [
+                ((at % n) as f64 + x) / n as f64,
+                ((at / n) as f64 + y) / n as f64,
+            ];
             plane.sample(pixel_from_unit.map(point))
         };
         values.push(OFFSETS.map(sample).iter().sum::<f32>() / OFFSETS.len() as f32);
     }
     let threshold = threshold(&values)?;
     let is_black: Vec<bool> = values.iter().map(|&value| value < threshold).collect();
-    let is_inside = |at: usize| (border..n - border).contains(&(at % n)) && (border..n - border).contains(&(at / n));
+    let is_inside = |at: usize| {
+        (border..n - border).contains(&(at % n)) && (border..n - border).contains(&(at / n))
+    };
     let n_border = n * n - n_bits * n_bits;
-    let n_wrong = (0..n * n).filter(|&at| !is_inside(at) && !is_black[at]).count();
+    let n_wrong = (0..n * n)
+        .filter(|&at| !is_inside(at) && !is_black[at])
+        .count();
     if n_wrong as f64 > MAX_BORDER_ERRORS * n_border as f64 {
         return None;
     }
-    Some((0..n * n).filter(|&at| is_inside(at)).map(|at| is_black[at]).collect())
+    Some(
+        (0..n * n)
+            .filter(|&at| is_inside(at))
+            .map(|at| is_black[at])
+            .collect(),
+    )
 }
 
-/// The gray value that separates black from white cells best (Otsu 1979). `None` if the contrast is low.
+/// The gray value that separates black from white cells best (Otsu 1979). `None` if the contrast is
+/// low.
 fn threshold(values: &[f32]) -> Option<f32> {
     let mut sorted = values.to_vec();
     sorted.sort_by(f32::total_cmp);

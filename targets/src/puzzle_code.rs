@@ -1,13 +1,15 @@
 //! Code of PuzzleBoards: which edges between squares carry a black or a white dot.
 //!
-//! Source: Stelldinger, Schönherr and Biermann 2024, "PuzzleBoard: A new camera calibration pattern with position
-//! encoding". The maps are those of the authors, from the crate `calib-targets-puzzleboard`.
+//! Source: Stelldinger, Schönherr and Biermann 2024, "PuzzleBoard: A new camera calibration pattern
+//! with position encoding". The maps are those of the authors, from the crate
+//! `calib-targets-puzzleboard`.
 
 use calib_targets_puzzleboard::code_maps::{horizontal_edge_bit, vertical_edge_bit};
 
 /// The master pattern has this many columns and rows and repeats after them.
 pub(crate) const PERIOD: u32 = 501;
-/// The code of one kind of edges repeats after 3 squares along one axis and after this many along the other.
+/// The code of one kind of edges repeats after 3 squares along one axis and after this many along
+/// the other.
 const LONG: u32 = 167;
 const SHORT: u32 = 3;
 /// Diameter of the dots relative to the square.
@@ -26,12 +28,20 @@ pub(crate) struct Edge {
 impl Edge {
     /// Whether the dot on this edge of the master pattern is white.
     pub(crate) fn is_white(self) -> bool {
-        let bit = if self.is_vertical { vertical_edge_bit } else { horizontal_edge_bit };
+        let bit = if self.is_vertical {
+            vertical_edge_bit
+        } else {
+            horizontal_edge_bit
+        };
         bit(self.row, self.column) == 1
     }
 
     fn shifted(self, columns: u32, rows: u32) -> Self {
-        Self { column: self.column + columns.cast_signed(), row: self.row + rows.cast_signed(), ..self }
+        Self {
+            column: self.column + columns.cast_signed(),
+            row: self.row + rows.cast_signed(),
+            ..self
+        }
     }
 }
 
@@ -43,18 +53,30 @@ pub(crate) struct Position {
     pub(crate) n_right: usize,
 }
 
-/// Finds the offset at which most observed dots (edge, whether the dot is white) agree with the master pattern, among
-/// those that are possible. `None` if none is.
+/// Finds the offset at which most observed dots (edge, whether the dot is white) agree with the
+/// master pattern, among those that are possible. `None` if none is.
 ///
-/// The horizontal and the vertical edges each depend on the offset modulo 3 along one axis and modulo 167 along the
-/// other, so their agreement is counted separately and summed for every offset.
-pub(crate) fn locate(dots: &[(Edge, bool)], is_possible: impl Fn([u32; 2]) -> bool) -> Option<Position> {
+/// The horizontal and the vertical edges each depend on the offset modulo 3 along one axis and
+/// modulo 167 along the other, so their agreement is counted separately and summed for every
+/// offset.
+pub(crate) fn locate(
+    dots: &[(Edge, bool)],
+    is_possible: impl Fn([u32; 2]) -> bool,
+) -> Option<Position> {
     let agreement = |is_vertical: bool, columns: u32, rows: u32| -> Vec<usize> {
         let agrees = |offset: [u32; 2]| {
-            let of_kind = dots.iter().filter(|(edge, _)| edge.is_vertical == is_vertical);
-            of_kind.filter(|(edge, is_white)| edge.shifted(offset[0], offset[1]).is_white() == *is_white).count()
+            let of_kind = dots
+                .iter()
+                .filter(|(edge, _)| edge.is_vertical == is_vertical);
+            of_kind
+                .filter(|(edge, is_white)| {
+                    edge.shifted(offset[0], offset[1]).is_white() == *is_white
+                })
+                .count()
         };
-        (0..columns * rows).map(|at| agrees([at % columns, at / columns])).collect()
+        (0..columns * rows)
+            .map(|at| agrees([at % columns, at / columns]))
+            .collect()
     };
     let vertical = agreement(true, LONG, SHORT);
     let horizontal = agreement(false, SHORT, LONG);
@@ -65,7 +87,12 @@ pub(crate) fn locate(dots: &[(Edge, bool)], is_possible: impl Fn([u32; 2]) -> bo
     };
     let offsets = (0..PERIOD).flat_map(|row| (0..PERIOD).map(move |column| [column, row]));
     let possible = offsets.filter(|&offset| is_possible(offset));
-    possible.map(|offset| Position { offset, n_right: n_right(offset) }).max_by_key(|position| position.n_right)
+    possible
+        .map(|offset| Position {
+            offset,
+            n_right: n_right(offset),
+        })
+        .max_by_key(|position| position.n_right)
 }
 
 #[cfg(test)]
@@ -75,14 +102,30 @@ mod tests {
     #[test]
     fn a_part_is_located_despite_wrong_dots() {
         let edges = (0..6).flat_map(|row| (0..7).map(move |column| [column, row]));
-        let both = edges.flat_map(|[column, row]| [true, false].map(|is_vertical| Edge { column, row, is_vertical }));
-        let mut dots: Vec<(Edge, bool)> = both.map(|edge| (edge, edge.shifted(333, 77).is_white())).collect();
+        let both = edges.flat_map(|[column, row]| {
+            [true, false].map(|is_vertical| Edge {
+                column,
+                row,
+                is_vertical,
+            })
+        });
+        let mut dots: Vec<(Edge, bool)> = both
+            .map(|edge| (edge, edge.shifted(333, 77).is_white()))
+            .collect();
         for wrong in [3, 20, 41, 60] {
             dots[wrong].1 = !dots[wrong].1;
         }
-        let expected = Position { offset: [333, 77], n_right: dots.len() - 4 };
+        let expected = Position {
+            offset: [333, 77],
+            n_right: dots.len() - 4,
+        };
         assert_eq!(locate(&dots, |_| true), Some(expected));
         assert_eq!(locate(&dots, |_| false), None);
-        assert!(locate(&dots, |offset| offset != expected.offset).unwrap().n_right < expected.n_right);
+        assert!(
+            locate(&dots, |offset| offset != expected.offset)
+                .unwrap()
+                .n_right
+                < expected.n_right
+        );
     }
 }

@@ -1,4 +1,5 @@
-//! Finds dark convex quadrilaterals: outlines of dark regions after adaptive thresholding, approximated by polygons.
+//! Finds dark convex quadrilaterals: outlines of dark regions after adaptive thresholding,
+//! approximated by polygons.
 
 use crate::gray::Plane;
 use crate::lattice::distance;
@@ -9,14 +10,16 @@ const WINDOWS_PX: [usize; 3] = [9, 23, 61];
 const DARKER_BY: f32 = 5.0;
 /// Shortest side of a quadrilateral, pixels.
 const MIN_SIDE_PX: f64 = 6.0;
-/// Largest distance of an outline from its polygon, relative to the square root of the enclosed area.
+/// Largest distance of an outline from its polygon, relative to the square root of the enclosed
+/// area.
 const TOLERANCE: f64 = 0.1;
 const MIN_TOLERANCE_PX: f64 = 1.2;
 
 /// Corners in the order clockwise as seen in the image, pixels.
 pub(crate) type Quad = [[f64; 2]; 4];
 
-/// Finds dark quadrilaterals. The same one may be found several times, with slightly different corners.
+/// Finds dark quadrilaterals. The same one may be found several times, with slightly different
+/// corners.
 ///
 /// `do_touch`: whether corners of quadrilaterals touch other dark regions, as on AprilGrids.
 pub(crate) fn find(plane: &Plane, do_touch: bool) -> Vec<Quad> {
@@ -24,7 +27,8 @@ pub(crate) fn find(plane: &Plane, do_touch: bool) -> Vec<Quad> {
     let mut quads = Vec::new();
     for window_px in WINDOWS_PX {
         let mut is_dark = threshold(plane, &sums, window_px);
-        let mut add = |outline: &[[i32; 2]]| quads.extend(quad(outline).map(|quad| refine(plane, quad)));
+        let mut add =
+            |outline: &[[i32; 2]]| quads.extend(quad(outline).map(|quad| refine(plane, quad)));
         outlines(&is_dark, plane.size(), &mut add);
         if do_touch {
             erode(&mut is_dark, plane.size());
@@ -61,12 +65,15 @@ fn threshold(plane: &Plane, sums: &Sums, window_px: usize) -> Vec<bool> {
     let half = window_px / 2;
     let mut is_dark = Vec::with_capacity(width * height);
     for y in 0..height {
-        let (top, bottom) = (y.saturating_sub(half) * sums.stride, (y + half + 1).min(height) * sums.stride);
+        let (top, bottom) = (
+            y.saturating_sub(half) * sums.stride,
+            (y + half + 1).min(height) * sums.stride,
+        );
         let n_rows = (bottom - top) / sums.stride;
         for (x, &value) in plane.row(y).iter().enumerate() {
             let (left, right) = (x.saturating_sub(half), (x + half + 1).min(width));
-            let sum =
-                sums.sums[bottom + right] - sums.sums[bottom + left] - sums.sums[top + right] + sums.sums[top + left];
+            let sum = sums.sums[bottom + right] - sums.sums[bottom + left] - sums.sums[top + right]
+                + sums.sums[top + left];
             let n = (n_rows * (right - left)) as f64;
             is_dark.push(f64::from(value + DARKER_BY) * n < sum);
         }
@@ -80,20 +87,29 @@ fn erode(is_dark: &mut [bool], [width, height]: [usize; 2]) {
     for y in 1..height - 1 {
         for x in 1..width - 1 {
             let at = y * width + x;
-            is_dark[at] = before[at] && before[at - 1] && before[at + 1] && before[at - width] && before[at + width];
+            is_dark[at] = before[at]
+                && before[at - 1]
+                && before[at + 1]
+                && before[at - width]
+                && before[at + width];
         }
     }
 }
 
-/// Walks around every dark region (of pixels with common sides), on the borders between pixels, dark on the right.
+/// Walks around every dark region (of pixels with common sides), on the borders between pixels,
+/// dark on the right.
 ///
 /// Points are pixel corners, so the outline lies between dark and bright pixels. Holes are skipped.
 fn outlines(is_dark: &[bool], [width, height]: [usize; 2], mut visit: impl FnMut(&[[i32; 2]])) {
     let dark = |x: i32, y: i32| {
-        let (Ok(x), Ok(y)) = (usize::try_from(x), usize::try_from(y)) else { return false };
+        let (Ok(x), Ok(y)) = (usize::try_from(x), usize::try_from(y)) else {
+            return false;
+        };
         x < width && y < height && is_dark[y * width + x]
     };
-    let (Ok(n_columns), Ok(n_rows)) = (i32::try_from(width), i32::try_from(height)) else { return };
+    let (Ok(n_columns), Ok(n_rows)) = (i32::try_from(width), i32::try_from(height)) else {
+        return;
+    };
     let mut is_visited = vec![false; width * height]; // Upper borders of dark pixels.
     let mut outline = Vec::new();
     for y in 0..n_rows {
@@ -108,11 +124,13 @@ fn outlines(is_dark: &[bool], [width, height]: [usize; 2], mut visit: impl FnMut
             loop {
                 outline.push(point);
                 if step == 0 {
-                    is_visited[point[1].cast_unsigned() as usize * width + point[0].cast_unsigned() as usize] = true;
+                    is_visited[point[1].cast_unsigned() as usize * width
+                        + point[0].cast_unsigned() as usize] = true;
                 }
                 let [dx, dy] = crate::lattice::STEPS[step];
                 let next = [point[0] + dx, point[1] + dy];
-                twice_area += i64::from(point[0]) * i64::from(next[1]) - i64::from(next[0]) * i64::from(point[1]);
+                twice_area += i64::from(point[0]) * i64::from(next[1])
+                    - i64::from(next[0]) * i64::from(point[1]);
                 point = next;
                 // The two pixels ahead, left and right of the walking direction.
                 let (left, right) = match step {
@@ -121,7 +139,8 @@ fn outlines(is_dark: &[bool], [width, height]: [usize; 2], mut visit: impl FnMut
                     2 => ([-1, 0], [-1, -1]),
                     _ => ([-1, -1], [0, -1]),
                 };
-                let is_dark_at = |offset: [i32; 2]| dark(point[0] + offset[0], point[1] + offset[1]);
+                let is_dark_at =
+                    |offset: [i32; 2]| dark(point[0] + offset[0], point[1] + offset[1]);
                 step = match (is_dark_at(left), is_dark_at(right)) {
                     (_, false) => (step + 1) % 4,
                     (true, true) => (step + 3) % 4,
@@ -149,8 +168,9 @@ fn quad(outline: &[[i32; 2]]) -> Option<Quad> {
     }
     let n = points.len();
     let center = [0, 1].map(|axis| points.iter().map(|point| point[axis]).sum::<f64>() / n as f64);
-    let farthest =
-        |from: [f64; 2]| (0..n).max_by(|&a, &b| distance(points[a], from).total_cmp(&distance(points[b], from)));
+    let farthest = |from: [f64; 2]| {
+        (0..n).max_by(|&a, &b| distance(points[a], from).total_cmp(&distance(points[b], from)))
+    };
     let first = farthest(center)?;
     let second = farthest(points[first])?;
     let (low, high) = (first.min(second), first.max(second));
@@ -164,7 +184,8 @@ fn quad(outline: &[[i32; 2]]) -> Option<Quad> {
     (is_similar && is_convex(&quad) && shortest_side(&quad) >= MIN_SIDE_PX).then_some(quad)
 }
 
-/// Appends the corners between two points of an outline (Ramer 1972, Douglas and Peucker 1973). Stops at five corners.
+/// Appends the corners between two points of an outline (Ramer 1972, Douglas and Peucker 1973).
+/// Stops at five corners.
 fn split(points: &[[f64; 2]], from: usize, to: usize, tolerance_px: f64, corners: &mut Vec<usize>) {
     let n = points.len();
     let (a, b) = (points[from % n], points[to % n]);
@@ -173,7 +194,9 @@ fn split(points: &[[f64; 2]], from: usize, to: usize, tolerance_px: f64, corners
         let point = points[at % n];
         ((b[0] - a[0]) * (point[1] - a[1]) - (b[1] - a[1]) * (point[0] - a[0])).abs() / length
     };
-    let Some(at) = (from + 1..to).max_by(|&a, &b| away(a).total_cmp(&away(b))) else { return };
+    let Some(at) = (from + 1..to).max_by(|&a, &b| away(a).total_cmp(&away(b))) else {
+        return;
+    };
     if away(at) <= tolerance_px || corners.len() > 4 {
         return;
     }
@@ -185,7 +208,12 @@ fn split(points: &[[f64; 2]], from: usize, to: usize, tolerance_px: f64, corners
 /// Enclosed area; positive for clockwise outlines.
 fn area(points: &[[f64; 2]]) -> f64 {
     let next = points.iter().cycle().skip(1);
-    points.iter().zip(next).map(|(a, b)| a[0] * b[1] - b[0] * a[1]).sum::<f64>() / 2.0
+    points
+        .iter()
+        .zip(next)
+        .map(|(a, b)| a[0] * b[1] - b[0] * a[1])
+        .sum::<f64>()
+        / 2.0
 }
 
 fn is_convex(quad: &Quad) -> bool {
@@ -196,7 +224,9 @@ fn is_convex(quad: &Quad) -> bool {
 }
 
 pub(crate) fn shortest_side(quad: &Quad) -> f64 {
-    (0..4).map(|at| distance(quad[at], quad[(at + 1) % 4])).fold(f64::INFINITY, f64::min)
+    (0..4)
+        .map(|at| distance(quad[at], quad[(at + 1) % 4]))
+        .fold(f64::INFINITY, f64::min)
 }
 
 /// Moves the sides to the strongest change from dark to bright near them and intersects them.
@@ -204,13 +234,20 @@ pub(crate) fn shortest_side(quad: &Quad) -> f64 {
 /// Returns the quadrilateral unchanged if a side cannot be located or a corner moves far.
 fn refine(plane: &Plane, quad: Quad) -> Quad {
     let max_move_px = (0.15 * shortest_side(&quad)).max(2.0);
-    let sides: [Option<Line>; 4] = std::array::from_fn(|at| fit_side(plane, quad[at], quad[(at + 1) % 4]));
+    let sides: [Option<Line>; 4] =
+        std::array::from_fn(|at| fit_side(plane, quad[at], quad[(at + 1) % 4]));
     let corner = |at: usize| Line::intersection(&sides[(at + 3) % 4]?, &sides[at]?);
     let refined: [Option<[f64; 2]>; 4] = std::array::from_fn(corner);
-    let [Some(a), Some(b), Some(c), Some(d)] = refined else { return quad };
+    let [Some(a), Some(b), Some(c), Some(d)] = refined else {
+        return quad;
+    };
     let refined = [a, b, c, d];
     let is_near = (0..4).all(|at| distance(refined[at], quad[at]) <= max_move_px);
-    if is_near && is_convex(&refined) { refined } else { quad }
+    if is_near && is_convex(&refined) {
+        refined
+    } else {
+        quad
+    }
 }
 
 /// Points with `normal · point = offset`.
@@ -236,14 +273,20 @@ fn fit_side(plane: &Plane, from: [f64; 2], to: [f64; 2]) -> Option<Line> {
     let length = distance(from, to);
     let along = [(to[0] - from[0]) / length, (to[1] - from[1]) / length];
     let outward = [along[1], -along[0]];
-    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a small positive number")]
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "a small positive number"
+    )]
     let n = (length as usize).clamp(4, 40);
     let mut points: Vec<[f64; 2]> = Vec::with_capacity(n);
     for at in 0..n {
         // The ends are rounded by blur.
         let frac = 0.12 + 0.76 * (at as f64 + 0.5) / n as f64;
         let center = [0, 1].map(|axis| from[axis] + frac * (to[axis] - from[axis]));
-        let sample = |away: f64| f64::from(plane.sample([0, 1].map(|axis| center[axis] + away * outward[axis])));
+        let sample = |away: f64| {
+            f64::from(plane.sample([0, 1].map(|axis| center[axis] + away * outward[axis])))
+        };
         let (mut weight_sum, mut sum) = (0.0, 0.0);
         let mut away = -REACH_PX;
         while away <= REACH_PX {
@@ -261,7 +304,9 @@ fn fit_side(plane: &Plane, from: [f64; 2], to: [f64; 2]) -> Option<Line> {
         return None;
     }
     let line = fit_line(&points)?;
-    let off = |point: &[f64; 2]| (line.normal[0] * point[0] + line.normal[1] * point[1] - line.offset).abs();
+    let off = |point: &[f64; 2]| {
+        (line.normal[0] * point[0] + line.normal[1] * point[1] - line.offset).abs()
+    };
     let mut offs: Vec<f64> = points.iter().map(off).collect();
     offs.sort_by(f64::total_cmp);
     let allowed = (2.5 * offs[offs.len() / 2]).max(0.1);
@@ -276,10 +321,17 @@ fn fit_line(points: &[[f64; 2]]) -> Option<Line> {
     }
     let n = points.len() as f64;
     let mean = [0, 1].map(|axis| points.iter().map(|point| point[axis]).sum::<f64>() / n);
-    let moment =
-        |a: usize, b: usize| points.iter().map(|point| (point[a] - mean[a]) * (point[b] - mean[b])).sum::<f64>();
+    let moment = |a: usize, b: usize| {
+        points
+            .iter()
+            .map(|point| (point[a] - mean[a]) * (point[b] - mean[b]))
+            .sum::<f64>()
+    };
     let (xx, xy, yy) = (moment(0, 0), moment(0, 1), moment(1, 1));
     let direction_rad = (2.0 * xy).atan2(xx - yy) / 2.0;
     let normal = [-direction_rad.sin(), direction_rad.cos()];
-    Some(Line { normal, offset: normal[0] * mean[0] + normal[1] * mean[1] })
+    Some(Line {
+        normal,
+        offset: normal[0] * mean[0] + normal[1] * mean[1],
+    })
 }

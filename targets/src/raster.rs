@@ -25,38 +25,70 @@ impl TargetSpec {
     fn margin_m(&self) -> f64 {
         let [low, high] = self.bounds_m();
         // A single tag has no squares around its corners; they are detected by the margin.
-        let frac = if matches!(self.pattern, Pattern::Tag { .. }) { 0.2 } else { 0.05 };
+        let frac = if matches!(self.pattern, Pattern::Tag { .. }) {
+            0.2
+        } else {
+            0.05
+        };
         frac * (high[0] - low[0]).min(high[1] - low[1])
     }
 
-    /// Draws the target with a white margin. Pixels on edges are gray according to the part that is white.
+    /// Draws the target with a white margin. Pixels on edges are gray according to the part that is
+    /// white.
     ///
     /// # Errors
     /// If the resolution is not a positive number or the picture would be larger than 16384 pixels.
     pub fn raster(&self, px_per_m: f64) -> Result<Raster, PrintError> {
         let [low, high] = self.bounds_m();
         let margin_m = self.margin_m();
-        let side_px = [0, 1].map(|axis| ((high[axis] - low[axis] + 2.0 * margin_m) * px_per_m).ceil());
-        let is_valid = px_per_m > 0.0 && side_px.iter().all(|&side| side >= 1.0 && side <= f64::from(MAX_SIDE_PX));
+        let side_px =
+            [0, 1].map(|axis| ((high[axis] - low[axis] + 2.0 * margin_m) * px_per_m).ceil());
+        let is_valid = px_per_m > 0.0
+            && side_px
+                .iter()
+                .all(|&side| side >= 1.0 && side <= f64::from(MAX_SIDE_PX));
         if !is_valid {
-            return Err(PrintError::Resolution { px_per_m, size_px: side_px, max: MAX_SIDE_PX });
+            return Err(PrintError::Resolution {
+                px_per_m,
+                size_px: side_px,
+                max: MAX_SIDE_PX,
+            });
         }
-        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "checked to be small and positive")]
+        #[expect(
+            clippy::cast_possible_truncation,
+            clippy::cast_sign_loss,
+            reason = "checked to be small and positive"
+        )]
         let size_px = side_px.map(|side| side as u32);
         let origin_m = low.map(|value| value - margin_m);
         let surface = self.surface();
-        let pixels = (0..size_px[1]).flat_map(|row| (0..size_px[0]).map(move |column| [column, row]));
-        let pixels = pixels.map(|cell| white_part(&surface, cell, origin_m, px_per_m)).collect();
-        Ok(Raster { size_px, pixels, origin_m, px_per_m })
+        let pixels =
+            (0..size_px[1]).flat_map(|row| (0..size_px[0]).map(move |column| [column, row]));
+        let pixels = pixels
+            .map(|cell| white_part(&surface, cell, origin_m, px_per_m))
+            .collect();
+        Ok(Raster {
+            size_px,
+            pixels,
+            origin_m,
+            px_per_m,
+        })
     }
 }
 
 /// The part of a pixel that is white, 0 to 255.
-#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "between 0 and 255")]
+#[expect(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "between 0 and 255"
+)]
 fn white_part(surface: &Surface<'_>, cell: [u32; 2], origin_m: [f64; 2], px_per_m: f64) -> u8 {
     let [column, row] = cell.map(f64::from);
     let is_white = |x: f64, y: f64| {
-        let point = [origin_m[0] + (column + x) / px_per_m, origin_m[1] + (row + y) / px_per_m];
+        let point = [
+            origin_m[0] + (column + x) / px_per_m,
+            origin_m[1] + (row + y) / px_per_m,
+        ];
         f64::from(u8::from(!surface.is_black(point)))
     };
     (255.0 * pixel_mean(is_white)).round() as u8

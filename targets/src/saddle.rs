@@ -1,16 +1,18 @@
-//! Saddle points of gray images: places where two black and two white sectors meet, such as chessboard corners.
+//! Saddle points of gray images: places where two black and two white sectors meet, such as
+//! chessboard corners.
 //!
-//! Candidates are maxima of minus the determinant of the Hessian; a ring of samples around each shows whether it has
-//! two black and two white sectors, and the directions of the four edges between them. Positions are then refined to
-//! the point that all gradients around it are perpendicular to (Förstner and Gülch 1987).
+//! Candidates are maxima of minus the determinant of the Hessian; a ring of samples around each
+//! shows whether it has two black and two white sectors, and the directions of the four edges
+//! between them. Positions are then refined to the point that all gradients around it are
+//! perpendicular to (Förstner and Gülch 1987).
 
 use crate::gray::Plane;
 use std::f64::consts::{PI, TAU};
 
 /// Smallest difference in gray value between black and white sectors.
 const MIN_CONTRAST: f32 = 12.0;
-/// Largest deviation of opposite edges from a straight line, radians. Perspective keeps lines straight; the rest is
-/// for blur, noise and fisheye lenses.
+/// Largest deviation of opposite edges from a straight line, radians. Perspective keeps lines
+/// straight; the rest is for blur, noise and fisheye lenses.
 const MAX_BEND_RAD: f64 = 0.55;
 /// Smallest angle of a sector, radians.
 const MIN_SECTOR_RAD: f64 = 0.35;
@@ -22,8 +24,8 @@ const N_RING: usize = 32;
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Saddle {
     pub(crate) pixel: [f64; 2],
-    /// Directions of the edges as angles from x towards y, in ascending order. The sectors from edge 0 to 1 and from
-    /// 2 to 3 are black.
+    /// Directions of the edges as angles from x towards y, in ascending order. The sectors from
+    /// edge 0 to 1 and from 2 to 3 are black.
     pub(crate) edges_rad: [f64; 4],
     /// Difference in gray value between the sectors.
     pub(crate) contrast: f32,
@@ -50,7 +52,8 @@ pub(crate) fn find(plane: &Plane) -> Vec<Saddle> {
     saddles
 }
 
-/// Smallest determinant, gray values squared per pixel to the fourth: a chessboard corner of minimum contrast, blurred.
+/// Smallest determinant, gray values squared per pixel to the fourth: a chessboard corner of
+/// minimum contrast, blurred.
 const MIN_RESPONSE: f32 = 0.2;
 
 /// Minus the determinant of the Hessian at every pixel.
@@ -74,11 +77,14 @@ fn is_maximum(response: &[f32], width: usize, x: usize, y: usize) -> bool {
     let value = response[y * width + x];
     (y - 2..=y + 2).all(|near_y| {
         let row = &response[near_y * width + x - 2..=near_y * width + x + 2];
-        row.iter().zip(x - 2..).all(|(&near, near_x)| near < value || (near == value && (near_y, near_x) >= (y, x)))
+        row.iter()
+            .zip(x - 2..)
+            .all(|(&near, near_x)| near < value || (near == value && (near_y, near_x) >= (y, x)))
     })
 }
 
-/// The point near a pixel's center where the gradient vanishes, from the second-order expansion there.
+/// The point near a pixel's center where the gradient vanishes, from the second-order expansion
+/// there.
 fn stationary_point(plane: &Plane, x: usize, y: usize) -> [f64; 2] {
     let at = |dx: usize, dy: usize| f64::from(plane.at(x + dx - 1, y + dy - 1));
     let gradient = [(at(2, 1) - at(0, 1)) / 2.0, (at(1, 2) - at(1, 0)) / 2.0];
@@ -88,11 +94,18 @@ fn stationary_point(plane: &Plane, x: usize, y: usize) -> [f64; 2] {
     let determinant = xx * yy - xy * xy;
     let dx = (xy * gradient[1] - yy * gradient[0]) / determinant;
     let dy = (xy * gradient[0] - xx * gradient[1]) / determinant;
-    let limited = |delta: f64| if delta.is_finite() { delta.clamp(-1.0, 1.0) } else { 0.0 };
+    let limited = |delta: f64| {
+        if delta.is_finite() {
+            delta.clamp(-1.0, 1.0)
+        } else {
+            0.0
+        }
+    };
     [x as f64 + 0.5 + limited(dx), y as f64 + 0.5 + limited(dy)]
 }
 
-/// Samples a ring around a point and returns the saddle if two black and two white sectors alternate.
+/// Samples a ring around a point and returns the saddle if two black and two white sectors
+/// alternate.
 pub(crate) fn ring(plane: &Plane, center: [f64; 2], radius_px: f64) -> Option<Saddle> {
     if !plane.contains(center, radius_px + 1.0) {
         return None;
@@ -106,7 +119,10 @@ pub(crate) fn ring(plane: &Plane, center: [f64; 2], radius_px: f64) -> Option<Sa
     let mut sorted = samples;
     sorted.sort_by(f32::total_cmp);
     let quarter_mean = |quarter: &[f32]| quarter.iter().sum::<f32>() / quarter.len() as f32;
-    let (black, white) = (quarter_mean(&sorted[..N_RING / 4]), quarter_mean(&sorted[N_RING * 3 / 4..]));
+    let (black, white) = (
+        quarter_mean(&sorted[..N_RING / 4]),
+        quarter_mean(&sorted[N_RING * 3 / 4..]),
+    );
     let (contrast, threshold) = (white - black, (white + black) / 2.0);
     if contrast < MIN_CONTRAST {
         return None;
@@ -114,10 +130,16 @@ pub(crate) fn ring(plane: &Plane, center: [f64; 2], radius_px: f64) -> Option<Sa
     let mut edges = [(0.0, false); 4];
     let mut n_edges = 0;
     for at in 0..N_RING {
-        let (here, next) = (samples[at] - threshold, samples[(at + 1) % N_RING] - threshold);
+        let (here, next) = (
+            samples[at] - threshold,
+            samples[(at + 1) % N_RING] - threshold,
+        );
         if (here < 0.0) != (next < 0.0) {
             let edge = edges.get_mut(n_edges)?; // A fifth edge: not a saddle.
-            *edge = (angle(at) + TAU / N_RING as f64 * f64::from(here / (here - next)), next < 0.0);
+            *edge = (
+                angle(at) + TAU / N_RING as f64 * f64::from(here / (here - next)),
+                next < 0.0,
+            );
             n_edges += 1;
         }
     }
@@ -131,10 +153,21 @@ pub(crate) fn ring(plane: &Plane, center: [f64; 2], radius_px: f64) -> Option<Sa
         edges[(first + at) % 4].0 + turns
     });
     let bend = |at: usize| (edges_rad[at + 2] - edges_rad[at] - PI).abs();
-    let sector =
-        |at: usize| if at == 3 { edges_rad[0] + TAU - edges_rad[3] } else { edges_rad[at + 1] - edges_rad[at] };
-    let is_saddle = bend(0) < MAX_BEND_RAD && bend(1) < MAX_BEND_RAD && (0..4).all(|at| sector(at) > MIN_SECTOR_RAD);
-    is_saddle.then_some(Saddle { pixel: center, edges_rad, contrast })
+    let sector = |at: usize| {
+        if at == 3 {
+            edges_rad[0] + TAU - edges_rad[3]
+        } else {
+            edges_rad[at + 1] - edges_rad[at]
+        }
+    };
+    let is_saddle = bend(0) < MAX_BEND_RAD
+        && bend(1) < MAX_BEND_RAD
+        && (0..4).all(|at| sector(at) > MIN_SECTOR_RAD);
+    is_saddle.then_some(Saddle {
+        pixel: center,
+        edges_rad,
+        contrast,
+    })
 }
 
 /// Difference between two angles, radians, -pi to pi.
@@ -142,12 +175,17 @@ pub(crate) fn angle_between(a_rad: f64, b_rad: f64) -> f64 {
     (a_rad - b_rad + PI).rem_euclid(TAU) - PI
 }
 
-/// Refines the position of a saddle in a window that must not reach beyond the edges which meet there.
+/// Refines the position of a saddle in a window that must not reach beyond the edges which meet
+/// there.
 ///
-/// Returns the point `q` that minimizes the weighted sum of `(gradient · (pixel - q))^2` (Förstner and Gülch 1987),
-/// with Gaussian weights centered at `q`: every pixel on a straight edge through `q` has a gradient perpendicular to
-/// it. `None` if the point moves out of the window or the window shows only one edge.
-#[expect(clippy::cast_possible_truncation, reason = "pixel indices are bounded by the image")]
+/// Returns the point `q` that minimizes the weighted sum of `(gradient · (pixel - q))^2` (Förstner
+/// and Gülch 1987), with Gaussian weights centered at `q`: every pixel on a straight edge through
+/// `q` has a gradient perpendicular to it. `None` if the point moves out of the window or the
+/// window shows only one edge.
+#[expect(
+    clippy::cast_possible_truncation,
+    reason = "pixel indices are bounded by the image"
+)]
 pub(crate) fn refine(plane: &Plane, start: [f64; 2], half_window_px: f64) -> Option<[f64; 2]> {
     const MAX_STEPS: usize = 12;
     const CONVERGED_PX: f64 = 2e-4;
@@ -174,13 +212,17 @@ pub(crate) fn refine(plane: &Plane, start: [f64; 2], half_window_px: f64) -> Opt
             }
         }
         let determinant = xx * yy - xy * xy;
-        // The smaller eigenvalue is determinant / trace at least; near zero, only one direction is known.
+        // The smaller eigenvalue is determinant / trace at least; near zero, only one direction is
+        // known.
         const MIN_RATIO: f64 = 0.02;
         let is_corner = determinant > MIN_RATIO * (xx + yy) * (xx + yy);
         if !is_corner {
             return None;
         }
-        let step = [(yy * bx - xy * by) / determinant, (xx * by - xy * bx) / determinant];
+        let step = [
+            (yy * bx - xy * by) / determinant,
+            (xx * by - xy * bx) / determinant,
+        ];
         center = [center[0] + step[0], center[1] + step[1]];
         let moved = (center[0] - start[0]).hypot(center[1] - start[1]);
         let is_near = moved <= half_window_px;
@@ -194,9 +236,18 @@ pub(crate) fn refine(plane: &Plane, start: [f64; 2], half_window_px: f64) -> Opt
     Some(center)
 }
 
-/// Finds a saddle near a predicted position: the largest response within `reach_px`, verified by a ring.
-#[expect(clippy::cast_possible_truncation, reason = "pixel indices are bounded by the image")]
-pub(crate) fn find_near(plane: &Plane, predicted: [f64; 2], reach_px: f64, radius_px: f64) -> Option<Saddle> {
+/// Finds a saddle near a predicted position: the largest response within `reach_px`, verified by a
+/// ring.
+#[expect(
+    clippy::cast_possible_truncation,
+    reason = "pixel indices are bounded by the image"
+)]
+pub(crate) fn find_near(
+    plane: &Plane,
+    predicted: [f64; 2],
+    reach_px: f64,
+    radius_px: f64,
+) -> Option<Saddle> {
     if !plane.contains(predicted, reach_px + 3.0) {
         return None;
     }

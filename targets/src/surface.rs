@@ -1,4 +1,5 @@
-//! What is printed where: the color of every point of a target, and the black shapes it consists of.
+//! What is printed where: the color of every point of a target, and the black shapes it consists
+//! of.
 
 use crate::dictionary::Dictionary;
 use crate::layout::is_black_square;
@@ -16,7 +17,11 @@ pub(crate) enum Shape {
     /// Black rectangle: smallest x and y, largest x and y.
     Rectangle([[f64; 2]; 2]),
     /// Disk: center, radius.
-    Disk { center: [f64; 2], radius: f64, is_black: bool },
+    Disk {
+        center: [f64; 2],
+        radius: f64,
+        is_black: bool,
+    },
 }
 
 /// A printed target.
@@ -29,7 +34,10 @@ pub(crate) struct Surface<'a> {
 
 impl TargetSpec {
     pub(crate) fn surface(&self) -> Surface<'_> {
-        Surface { pattern: &self.pattern, is_legacy: false }
+        Surface {
+            pattern: &self.pattern,
+            is_legacy: false,
+        }
     }
 }
 
@@ -38,26 +46,53 @@ impl Surface<'_> {
     pub(crate) fn is_black(&self, [x, y]: [f64; 2]) -> bool {
         match self.pattern {
             Pattern::Chessboard { inner, square_m } => {
-                let square = square([x / square_m + 1.0, y / square_m + 1.0], inner.map(|count| count + 1));
+                let square = square(
+                    [x / square_m + 1.0, y / square_m + 1.0],
+                    inner.map(|count| count + 1),
+                );
                 square.is_some_and(|[column, row]| is_black_square(column, row, 1, false))
             }
-            Pattern::Charuco { squares, square_m, marker_m, dictionary } => {
+            Pattern::Charuco {
+                squares,
+                square_m,
+                marker_m,
+                dictionary,
+            } => {
                 let position = [x / square_m, y / square_m];
-                let Some([column, row]) = square(position, *squares) else { return false };
+                let Some([column, row]) = square(position, *squares) else {
+                    return false;
+                };
                 if is_black_square(column, row, squares[1], self.is_legacy) {
                     return true;
                 }
                 let marker_frac = marker_m / square_m;
-                let in_marker = [position[0] - f64::from(column), position[1] - f64::from(row)]
-                    .map(|frac| (frac - 0.5) / marker_frac + 0.5);
-                is_black_cell(dictionary, self.charuco_id(*squares, column, row), BORDER, in_marker)
+                let in_marker = [
+                    position[0] - f64::from(column),
+                    position[1] - f64::from(row),
+                ]
+                .map(|frac| (frac - 0.5) / marker_frac + 0.5);
+                is_black_cell(
+                    dictionary,
+                    self.charuco_id(*squares, column, row),
+                    BORDER,
+                    in_marker,
+                )
             }
-            Pattern::Aprilgrid { tags, tag_m, spacing_frac } => {
+            Pattern::Aprilgrid {
+                tags,
+                tag_m,
+                spacing_frac,
+            } => {
                 let pitch = 1.0 + spacing_frac;
                 let position = [x, y].map(|value| (value / tag_m + spacing_frac) / pitch);
                 // One more column and row: the last consists of small squares only.
-                let Some([column, row]) = square(position, tags.map(|count| count + 1)) else { return false };
-                let in_pitch = [(position[0] - f64::from(column)) * pitch, (position[1] - f64::from(row)) * pitch];
+                let Some([column, row]) = square(position, tags.map(|count| count + 1)) else {
+                    return false;
+                };
+                let in_pitch = [
+                    (position[0] - f64::from(column)) * pitch,
+                    (position[1] - f64::from(row)) * pitch,
+                ];
                 match in_pitch.map(|value| value < *spacing_frac) {
                     [true, true] => true,
                     [false, false] if column < tags[0] && row < tags[1] => {
@@ -68,15 +103,26 @@ impl Surface<'_> {
                     _ => false,
                 }
             }
-            Pattern::Puzzleboard { squares, square_m, origin } => {
+            Pattern::Puzzleboard {
+                squares,
+                square_m,
+                origin,
+            } => {
                 let position = [x / square_m + 1.0, y / square_m + 1.0];
-                let Some(cell) = square(position, *squares) else { return false };
+                let Some(cell) = square(position, *squares) else {
+                    return false;
+                };
                 let dot = dot_near(position, cell, *squares, *origin);
-                dot.unwrap_or_else(|| is_black_square(cell[0] + origin[0], cell[1] + origin[1], 1, false))
+                dot.unwrap_or_else(|| {
+                    is_black_square(cell[0] + origin[0], cell[1] + origin[1], 1, false)
+                })
             }
-            Pattern::Tag { id, side_m } => {
-                is_black_cell(&Dictionary::tag36h11(), *id, BORDER, [x / side_m + 0.5, y / side_m + 0.5])
-            }
+            Pattern::Tag { id, side_m } => is_black_cell(
+                &Dictionary::tag36h11(),
+                *id,
+                BORDER,
+                [x / side_m + 0.5, y / side_m + 0.5],
+            ),
         }
     }
 
@@ -91,51 +137,91 @@ impl Surface<'_> {
     /// All shapes, in the order of painting.
     pub(crate) fn shapes(&self) -> Vec<Shape> {
         let mut shapes = Vec::new();
-        let cells =
-            |counts: [u32; 2]| (0..counts[1]).flat_map(move |row| (0..counts[0]).map(move |column| [column, row]));
-        let mut squares_of = |counts: [u32; 2], first_m: f64, square_m: f64, is_black: &dyn Fn([u32; 2]) -> bool| {
-            for cell in cells(counts).filter(|&cell| is_black(cell)) {
-                let corner = cell.map(|count| first_m + f64::from(count) * square_m);
-                shapes.push(Shape::Rectangle([corner, corner.map(|value| value + square_m)]));
-            }
+        let cells = |counts: [u32; 2]| {
+            (0..counts[1]).flat_map(move |row| (0..counts[0]).map(move |column| [column, row]))
         };
+        let mut squares_of =
+            |counts: [u32; 2], first_m: f64, square_m: f64, is_black: &dyn Fn([u32; 2]) -> bool| {
+                for cell in cells(counts).filter(|&cell| is_black(cell)) {
+                    let corner = cell.map(|count| first_m + f64::from(count) * square_m);
+                    shapes.push(Shape::Rectangle([
+                        corner,
+                        corner.map(|value| value + square_m),
+                    ]));
+                }
+            };
         match *self.pattern {
             Pattern::Chessboard { inner, square_m } => {
                 let is_black = |[column, row]: [u32; 2]| is_black_square(column, row, 1, false);
                 squares_of(inner.map(|count| count + 1), -square_m, square_m, &is_black);
             }
-            Pattern::Charuco { squares, square_m, marker_m, dictionary } => {
-                let is_black = |[column, row]: [u32; 2]| is_black_square(column, row, squares[1], self.is_legacy);
+            Pattern::Charuco {
+                squares,
+                square_m,
+                marker_m,
+                dictionary,
+            } => {
+                let is_black = |[column, row]: [u32; 2]| {
+                    is_black_square(column, row, squares[1], self.is_legacy)
+                };
                 squares_of(squares, 0.0, square_m, &is_black);
                 for cell in cells(squares).filter(|&cell| !is_black(cell)) {
-                    let corner = cell.map(|count| f64::from(count) * square_m + (square_m - marker_m) / 2.0);
+                    let corner =
+                        cell.map(|count| f64::from(count) * square_m + (square_m - marker_m) / 2.0);
                     let id = self.charuco_id(squares, cell[0], cell[1]);
                     marker(&dictionary, id, BORDER, corner, marker_m, &mut shapes);
                 }
             }
-            Pattern::Aprilgrid { tags, tag_m, spacing_frac } => {
+            Pattern::Aprilgrid {
+                tags,
+                tag_m,
+                spacing_frac,
+            } => {
                 let (gap_m, pitch_m) = (tag_m * spacing_frac, tag_m * (1.0 + spacing_frac));
                 for cell in cells(tags.map(|count| count + 1)) {
                     let corner = cell.map(|count| f64::from(count) * pitch_m - gap_m);
-                    shapes.push(Shape::Rectangle([corner, corner.map(|value| value + gap_m)]));
+                    shapes.push(Shape::Rectangle([
+                        corner,
+                        corner.map(|value| value + gap_m),
+                    ]));
                 }
                 for [column, row] in cells(tags) {
                     let id = (tags[1] - 1 - row) * tags[0] + column;
                     let corner = [column, row].map(|count| f64::from(count) * pitch_m);
-                    marker(&Dictionary::tag36h11(), id, GRID_TAG_BORDER, corner, tag_m, &mut shapes);
+                    marker(
+                        &Dictionary::tag36h11(),
+                        id,
+                        GRID_TAG_BORDER,
+                        corner,
+                        tag_m,
+                        &mut shapes,
+                    );
                 }
             }
-            Pattern::Puzzleboard { squares, square_m, origin } => {
-                let is_black = |[column, row]: [u32; 2]| is_black_square(column + origin[0], row + origin[1], 1, false);
+            Pattern::Puzzleboard {
+                squares,
+                square_m,
+                origin,
+            } => {
+                let is_black = |[column, row]: [u32; 2]| {
+                    is_black_square(column + origin[0], row + origin[1], 1, false)
+                };
                 squares_of(squares, -square_m, square_m, &is_black);
                 for [column, row] in cells(squares) {
                     for is_vertical in [true, false] {
-                        let is_last = if is_vertical { column + 1 == squares[0] } else { row + 1 == squares[1] };
+                        let is_last = if is_vertical {
+                            column + 1 == squares[0]
+                        } else {
+                            row + 1 == squares[1]
+                        };
                         if is_last {
                             continue;
                         }
                         let middle = if is_vertical { [1.0, 0.5] } else { [0.5, 1.0] };
-                        let center = [f64::from(column) + middle[0] - 1.0, f64::from(row) + middle[1] - 1.0];
+                        let center = [
+                            f64::from(column) + middle[0] - 1.0,
+                            f64::from(row) + middle[1] - 1.0,
+                        ];
                         shapes.push(Shape::Disk {
                             center: center.map(|value| value * square_m),
                             radius: square_m * DOT_FRAC / 2.0,
@@ -145,7 +231,14 @@ impl Surface<'_> {
                 }
             }
             Pattern::Tag { id, side_m } => {
-                marker(&Dictionary::tag36h11(), id, BORDER, [-side_m / 2.0; 2], side_m, &mut shapes);
+                marker(
+                    &Dictionary::tag36h11(),
+                    id,
+                    BORDER,
+                    [-side_m / 2.0; 2],
+                    side_m,
+                    &mut shapes,
+                );
             }
         }
         shapes
@@ -157,23 +250,42 @@ pub(crate) fn pixel_mean(color: impl Fn(f64, f64) -> f64) -> f64 {
     /// Samples per pixel, a Fibonacci number, and the ratio of the previous one to it.
     const N_SAMPLES: usize = 89;
     const GOLDEN_FRAC: f64 = 55.0 / 89.0;
-    const BORDER: [[f64; 2]; 8] =
-        [[0.0, 0.0], [0.5, 0.0], [1.0, 0.0], [0.0, 0.5], [1.0, 0.5], [0.0, 1.0], [0.5, 1.0], [1.0, 1.0]];
+    const BORDER: [[f64; 2]; 8] = [
+        [0.0, 0.0],
+        [0.5, 0.0],
+        [1.0, 0.0],
+        [0.0, 0.5],
+        [1.0, 0.5],
+        [0.0, 1.0],
+        [0.5, 1.0],
+        [1.0, 1.0],
+    ];
     // Most pixels have one color.
     let first = color(0.5, 0.5);
     if BORDER.into_iter().all(|[x, y]| color(x, y) == first) {
         return first;
     }
-    // A lattice in which no two samples share a row or a column, so that edges along them are smooth, too.
+    // A lattice in which no two samples share a row or a column, so that edges along them are
+    // smooth, too.
     let half = 0.5 / N_SAMPLES as f64;
-    let sample = |n: f64| color(n / N_SAMPLES as f64 + half, (n * GOLDEN_FRAC).fract() + half);
+    let sample = |n: f64| {
+        color(
+            n / N_SAMPLES as f64 + half,
+            (n * GOLDEN_FRAC).fract() + half,
+        )
+    };
     (0..N_SAMPLES).map(|n| sample(n as f64)).sum::<f64>() / N_SAMPLES as f64
 }
 
 /// The square that contains a position in units of squares. `None` outside of all squares.
-#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "checked to be within the counts")]
+#[expect(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "checked to be within the counts"
+)]
 fn square(position: [f64; 2], counts: [u32; 2]) -> Option<[u32; 2]> {
-    let is_inside = (0..2).all(|axis| position[axis] >= 0.0 && position[axis] < f64::from(counts[axis]));
+    let is_inside =
+        (0..2).all(|axis| position[axis] >= 0.0 && position[axis] < f64::from(counts[axis]));
     is_inside.then(|| position.map(|value| value as u32))
 }
 
@@ -181,21 +293,41 @@ fn square(position: [f64; 2], counts: [u32; 2]) -> Option<[u32; 2]> {
 fn is_black_cell(dictionary: &Dictionary, id: u32, border: usize, point: [f64; 2]) -> bool {
     let n_bits = dictionary.n_bits();
     let n = n_bits + 2 * border;
-    let Ok(count) = u32::try_from(n) else { return false };
-    let Some(cell) = square(point.map(|value| value * n as f64), [count; 2]) else { return false };
+    let Ok(count) = u32::try_from(n) else {
+        return false;
+    };
+    let Some(cell) = square(point.map(|value| value * n as f64), [count; 2]) else {
+        return false;
+    };
     let [column, row] = cell.map(|value| value as usize);
     let is_inside = |at: usize| (border..border + n_bits).contains(&at);
     !(is_inside(column) && is_inside(row)) || dictionary.is_black(id, row - border, column - border)
 }
 
-/// Appends a marker: one rectangle per run of black cells in a row, and one for each part of the border.
-fn marker(dictionary: &Dictionary, id: u32, border: usize, corner: [f64; 2], side_m: f64, shapes: &mut Vec<Shape>) {
+/// Appends a marker: one rectangle per run of black cells in a row, and one for each part of the
+/// border.
+fn marker(
+    dictionary: &Dictionary,
+    id: u32,
+    border: usize,
+    corner: [f64; 2],
+    side_m: f64,
+    shapes: &mut Vec<Shape>,
+) {
     let n_bits = dictionary.n_bits();
     let n = n_bits + 2 * border;
     let cell_m = side_m / n as f64;
     let mut rectangle = |columns: [usize; 2], rows: [usize; 2]| {
-        let at = |column: usize, row: usize| [corner[0] + column as f64 * cell_m, corner[1] + row as f64 * cell_m];
-        shapes.push(Shape::Rectangle([at(columns[0], rows[0]), at(columns[1], rows[1])]));
+        let at = |column: usize, row: usize| {
+            [
+                corner[0] + column as f64 * cell_m,
+                corner[1] + row as f64 * cell_m,
+            ]
+        };
+        shapes.push(Shape::Rectangle([
+            at(columns[0], rows[0]),
+            at(columns[1], rows[1]),
+        ]));
     };
     rectangle([0, n], [0, border]);
     rectangle([0, n], [n - border, n]);
@@ -204,9 +336,14 @@ fn marker(dictionary: &Dictionary, id: u32, border: usize, corner: [f64; 2], sid
     for row in 0..n_bits {
         let mut column = 0;
         while column < n_bits {
-            let end = (column..n_bits).find(|&at| !dictionary.is_black(id, row, at)).unwrap_or(n_bits);
+            let end = (column..n_bits)
+                .find(|&at| !dictionary.is_black(id, row, at))
+                .unwrap_or(n_bits);
             if end > column {
-                rectangle([column + border, end + border], [row + border, row + border + 1]);
+                rectangle(
+                    [column + border, end + border],
+                    [row + border, row + border + 1],
+                );
             }
             column = end + 1;
         }
@@ -215,16 +352,29 @@ fn marker(dictionary: &Dictionary, id: u32, border: usize, corner: [f64; 2], sid
 
 fn edge([column, row]: [u32; 2], is_vertical: bool, origin: [u32; 2]) -> Edge {
     let [column, row] = [column + origin[0], row + origin[1]].map(u32::cast_signed);
-    Edge { column, row, is_vertical }
+    Edge {
+        column,
+        row,
+        is_vertical,
+    }
 }
 
 /// The color of the dot that covers a position in a square of a puzzleboard: whether it is black.
-fn dot_near(position: [f64; 2], cell: [u32; 2], squares: [u32; 2], origin: [u32; 2]) -> Option<bool> {
+fn dot_near(
+    position: [f64; 2],
+    cell: [u32; 2],
+    squares: [u32; 2],
+    origin: [u32; 2],
+) -> Option<bool> {
     let [column, row] = cell;
-    let in_square = [position[0] - f64::from(column), position[1] - f64::from(row)];
+    let in_square = [
+        position[0] - f64::from(column),
+        position[1] - f64::from(row),
+    ];
     let reach = DOT_FRAC / 2.0;
     let covers = |x: f64, y: f64| (in_square[0] - x).hypot(in_square[1] - y) <= reach;
-    let color = |cell: [u32; 2], is_vertical: bool| Some(!edge(cell, is_vertical, origin).is_white());
+    let color =
+        |cell: [u32; 2], is_vertical: bool| Some(!edge(cell, is_vertical, origin).is_white());
     if column > 0 && covers(0.0, 0.5) {
         color([column - 1, row], true)
     } else if column + 1 < squares[0] && covers(1.0, 0.5) {
@@ -246,12 +396,14 @@ mod tests {
 
     fn is_black_in(shapes: &[Shape], point: [f64; 2]) -> bool {
         let covers = |shape: &Shape| match *shape {
-            Shape::Rectangle([low, high]) => {
-                (0..2).all(|axis| point[axis] >= low[axis] && point[axis] < high[axis]).then_some(true)
-            }
-            Shape::Disk { center, radius, is_black } => {
-                ((point[0] - center[0]).hypot(point[1] - center[1]) <= radius).then_some(is_black)
-            }
+            Shape::Rectangle([low, high]) => (0..2)
+                .all(|axis| point[axis] >= low[axis] && point[axis] < high[axis])
+                .then_some(true),
+            Shape::Disk {
+                center,
+                radius,
+                is_black,
+            } => ((point[0] - center[0]).hypot(point[1] - center[1]) <= radius).then_some(is_black),
         };
         shapes.iter().rev().find_map(covers).unwrap_or(false)
     }
@@ -269,13 +421,21 @@ mod tests {
         ] {
             let target: TargetSpec = text.parse().unwrap();
             for is_legacy in [false, true] {
-                let surface = Surface { pattern: &target.pattern, is_legacy };
+                let surface = Surface {
+                    pattern: &target.pattern,
+                    is_legacy,
+                };
                 let shapes = surface.shapes();
                 let [low, high] = target.bounds_m();
                 let mut n_black = 0;
                 for _ in 0..5000 {
-                    let point = [0, 1].map(|axis| random.uniform(low[axis] - 0.01, high[axis] + 0.01));
-                    assert_eq!(surface.is_black(point), is_black_in(&shapes, point), "{text} at {point:?}");
+                    let point =
+                        [0, 1].map(|axis| random.uniform(low[axis] - 0.01, high[axis] + 0.01));
+                    assert_eq!(
+                        surface.is_black(point),
+                        is_black_in(&shapes, point),
+                        "{text} at {point:?}"
+                    );
                     n_black += i32::from(surface.is_black(point));
                 }
                 assert!((1000..4000).contains(&n_black), "{text}: {n_black}");
@@ -285,17 +445,27 @@ mod tests {
 
     #[test]
     fn markers_are_where_the_layouts_say() {
-        for text in ["charuco:5x7:34mm:28mm:6X6_250", "charuco:5x8:34mm:28mm:6X6_250", "aprilgrid:3x4:88mm:0.3"] {
+        for text in [
+            "charuco:5x7:34mm:28mm:6X6_250",
+            "charuco:5x8:34mm:28mm:6X6_250",
+            "aprilgrid:3x4:88mm:0.3",
+        ] {
             let target: TargetSpec = text.parse().unwrap();
             for layout in layouts(&target.pattern)
                 .into_iter()
                 .take(2)
                 .filter(|layout| text.contains("charuco") || !layout.is_legacy)
             {
-                let surface = Surface { pattern: &target.pattern, is_legacy: layout.is_legacy };
+                let surface = Surface {
+                    pattern: &target.pattern,
+                    is_legacy: layout.is_legacy,
+                };
                 for [first, _, third, _] in &layout.corners_m {
                     // Just inside the marker is black, just outside white or another black square.
-                    let inside = [0.99 * first[0] + 0.01 * third[0], 0.99 * first[1] + 0.01 * third[1]];
+                    let inside = [
+                        0.99 * first[0] + 0.01 * third[0],
+                        0.99 * first[1] + 0.01 * third[1],
+                    ];
                     assert!(surface.is_black(inside), "{text} {inside:?}");
                 }
             }

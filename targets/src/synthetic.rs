@@ -33,38 +33,51 @@ const PAPER: f64 = 205.0;
 const BACKGROUND: f64 = 105.0;
 /// Renders a target. Returns one byte per pixel, row by row.
 ///
-/// Every pixel is the mean of a grid of samples. Between the corners of a pixel, board positions are interpolated,
-/// which is accurate to 1e-3 px for lenses in use. The light falls off across the image.
+/// Every pixel is the mean of a grid of samples. Between the corners of a pixel, board positions
+/// are interpolated, which is accurate to 1e-3 px for lenses in use. The light falls off across the
+/// image.
 pub fn render(target: &TargetSpec, view: &View) -> Vec<u8> {
     let [width, height] = view.intrinsics.size_px.map(|side| side as usize);
-    let surface = Surface { pattern: &target.pattern, is_legacy: view.is_legacy };
+    let surface = Surface {
+        pattern: &target.pattern,
+        is_legacy: view.is_legacy,
+    };
     let points: Vec<Option<[f64; 2]>> = (0..(width + 1) * (height + 1))
         .map(|at| point_on_board(view, [(at % (width + 1)) as f64, (at / (width + 1)) as f64]))
         .collect();
     let [low, high] = target.bounds_m();
     let margin_m = MARGIN_FRAC * (high[0] - low[0]).max(high[1] - low[1]);
     let color = |point: [f64; 2]| {
-        let is_on_paper =
-            (0..2).all(|axis| point[axis] >= low[axis] - margin_m && point[axis] <= high[axis] + margin_m);
+        let is_on_paper = (0..2).all(|axis| {
+            point[axis] >= low[axis] - margin_m && point[axis] <= high[axis] + margin_m
+        });
         match (is_on_paper, surface.is_black(point)) {
             (false, _) => BACKGROUND,
             (true, true) => INK,
             (true, false) => PAPER,
         }
     };
-    let pixel =
-        |at: usize| {
-            let corner = (at / width) * (width + 1) + at % width;
-            let corners = [corner, corner + 1, corner + width + 1, corner + width + 2].map(|at| points[at]);
-            let [Some(a), Some(b), Some(c), Some(d)] = corners else { return BACKGROUND };
-            pixel_mean(|x, y| {
-                color([0, 1].map(|axis| {
-                    (a[axis] * (1.0 - x) + b[axis] * x) * (1.0 - y) + (c[axis] * (1.0 - x) + d[axis] * x) * y
-                }))
-            })
+    let pixel = |at: usize| {
+        let corner = (at / width) * (width + 1) + at % width;
+        let corners =
+            [corner, corner + 1, corner + width + 1, corner + width + 2].map(|at| points[at]);
+        let [Some(a), Some(b), Some(c), Some(d)] = corners else {
+            return BACKGROUND;
         };
+        pixel_mean(|x, y| {
+            color([0, 1].map(|axis| {
+                (a[axis] * (1.0 - x) + b[axis] * x) * (1.0 - y)
+                    + (c[axis] * (1.0 - x) + d[axis] * x) * y
+            }))
+        })
+    };
     let sharp: Vec<f64> = (0..width * height).map(pixel).collect();
-    let blurred = blur(&blur(&sharp, [width, height], 1, view.blur_px), [width, height], width, view.blur_px);
+    let blurred = blur(
+        &blur(&sharp, [width, height], 1, view.blur_px),
+        [width, height],
+        width,
+        view.blur_px,
+    );
     let mut random = Random::new(view.seed);
     let lit = |(at, value): (usize, f64)| {
         let fall_off = 1.0 - 0.25 * (at % width) as f64 / width as f64;
@@ -90,7 +103,8 @@ fn point_on_board(view: &View, pixel: [f64; 2]) -> Option<[f64; 2]> {
     let origin: Vector3<f64> = board_from_camera.translation.vector;
     let ray = board_from_camera.rotation * ray_in_camera;
     let distance = -origin.z / ray.z;
-    (distance > 0.0 && distance.is_finite()).then(|| [origin.x + distance * ray.x, origin.y + distance * ray.y])
+    (distance > 0.0 && distance.is_finite())
+        .then(|| [origin.x + distance * ray.x, origin.y + distance * ray.y])
 }
 
 /// Blurs along one axis. `stride`: distance of neighbors in the array.
@@ -98,22 +112,38 @@ fn blur(values: &[f64], [width, height]: [usize; 2], stride: usize, sigma_px: f6
     if sigma_px <= 0.0 {
         return values.to_vec();
     }
-    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a few pixels")]
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "a few pixels"
+    )]
     let reach = (3.0 * sigma_px).ceil() as usize;
-    let weight = |offset: usize| (-0.5 * (offset as f64 - reach as f64).powi(2) / (sigma_px * sigma_px)).exp();
+    let weight = |offset: usize| {
+        (-0.5 * (offset as f64 - reach as f64).powi(2) / (sigma_px * sigma_px)).exp()
+    };
     let weights: Vec<f64> = (0..=2 * reach).map(weight).collect();
     let sum: f64 = weights.iter().sum();
     let (n, position) = if stride == 1 { (width, 0) } else { (height, 1) };
     let blurred = |at: usize| {
         let here = [at % width, at / width][position];
-        let neighbor =
-            |offset: usize| values[at - here * stride + (here + offset).saturating_sub(reach).min(n - 1) * stride];
-        weights.iter().enumerate().map(|(offset, weight)| weight * neighbor(offset)).sum::<f64>() / sum
+        let neighbor = |offset: usize| {
+            values[at - here * stride + (here + offset).saturating_sub(reach).min(n - 1) * stride]
+        };
+        weights
+            .iter()
+            .enumerate()
+            .map(|(offset, weight)| weight * neighbor(offset))
+            .sum::<f64>()
+            / sum
     };
     (0..values.len()).map(blurred).collect()
 }
 
-#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "rounded and clamped")]
+#[expect(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "rounded and clamped"
+)]
 fn quantized(value: f64) -> u8 {
     value.round().clamp(0.0, 255.0) as u8
 }

@@ -1,9 +1,10 @@
 //! Refines corners by comparing the image with the printed pattern around them.
 //!
-//! Where other edges are close to a corner, such as those of a marker with a narrow margin, the pattern around the
-//! corner is known but is no plain saddle. The pattern is rendered with the local scale, rotation and shear, and
-//! shifted until it matches the image best (Lucas and Kanade 1981, inverse compositional as in Baker and Matthews 2004,
-//! with gain and offset of the gray values).
+//! Where other edges are close to a corner, such as those of a marker with a narrow margin, the
+//! pattern around the corner is known but is no plain saddle. The pattern is rendered with the
+//! local scale, rotation and shear, and shifted until it matches the image best (Lucas and Kanade
+//! 1981, inverse compositional as in Baker and Matthews 2004, with gain and offset of the gray
+//! values).
 
 use crate::gray::Plane;
 use crate::surface::Surface;
@@ -23,9 +24,11 @@ pub(crate) struct Neighborhood {
     pub(crate) pixel: [f64; 2],
     /// Derivative of the pixel with respect to the point, pixels per meter.
     pub(crate) pixel_by_point: Matrix2<f64>,
-    /// Second derivatives of the pixel with respect to x and x, x and y, y and y, pixels per square meter.
+    /// Second derivatives of the pixel with respect to x and x, x and y, y and y, pixels per square
+    /// meter.
     pub(crate) bend: [[f64; 2]; 3],
-    /// Size of the part of the board whose image is about as large as the compared window should be.
+    /// Size of the part of the board whose image is about as large as the compared window should
+    /// be.
     pub(crate) side_m: f64,
     /// Largest distance from the predicted position. `None`: a part of the window.
     pub(crate) reach_px: Option<f64>,
@@ -37,24 +40,43 @@ const HALF_WINDOW_PX: [f64; 2] = [3.0, 9.0];
 /// Largest distance from a prediction, relative to the image of `side_m`, and its limits in pixels.
 const REACH_FRAC: f64 = 0.12;
 const REACH_PX: [f64; 2] = [1.5, 8.0];
-/// Numbers of times the pattern is blurred by the kernel (1 2 1) / 4, from images in focus to images out of focus.
+/// Numbers of times the pattern is blurred by the kernel (1 2 1) / 4, from images in focus to
+/// images out of focus.
 const BLURS: [usize; 3] = [1, 4, 10];
 /// Above this correlation, no other blur is tried.
 const GOOD_CORRELATION: f64 = 0.94;
 
 /// Finds the corner. `None` if the image does not show the pattern there.
-pub(crate) fn find(plane: &Plane, surface: &Surface<'_>, neighborhood: &Neighborhood) -> Option<[f64; 2]> {
-    let Neighborhood { pixel, pixel_by_point, side_m, .. } = *neighborhood;
-    let side_px = pixel_by_point.column(0).norm().min(pixel_by_point.column(1).norm()) * side_m;
+pub(crate) fn find(
+    plane: &Plane,
+    surface: &Surface<'_>,
+    neighborhood: &Neighborhood,
+) -> Option<[f64; 2]> {
+    let Neighborhood {
+        pixel,
+        pixel_by_point,
+        side_m,
+        ..
+    } = *neighborhood;
+    let side_px = pixel_by_point
+        .column(0)
+        .norm()
+        .min(pixel_by_point.column(1).norm())
+        * side_m;
     #[expect(clippy::cast_possible_truncation, reason = "a few pixels")]
-    let half_px = (WINDOW_FRAC * side_px).clamp(HALF_WINDOW_PX[0], HALF_WINDOW_PX[1]).round() as i32;
-    let reach_px = neighborhood.reach_px.unwrap_or((REACH_FRAC * side_px).clamp(REACH_PX[0], REACH_PX[1]));
+    let half_px = (WINDOW_FRAC * side_px)
+        .clamp(HALF_WINDOW_PX[0], HALF_WINDOW_PX[1])
+        .round() as i32;
+    let reach_px = neighborhood
+        .reach_px
+        .unwrap_or((REACH_FRAC * side_px).clamp(REACH_PX[0], REACH_PX[1]));
     if !side_px.is_finite() || !plane.contains(pixel, f64::from(half_px) + reach_px + 1.0) {
         return None;
     }
     let mut best: Option<(f64, [f64; 2])> = None;
     for n_blurs in BLURS {
-        let found = Template::new(surface, neighborhood, half_px, n_blurs)?.find(plane, pixel, reach_px);
+        let found =
+            Template::new(surface, neighborhood, half_px, n_blurs)?.find(plane, pixel, reach_px);
         // The correlation rises up to the blur of the image and falls beyond it.
         let is_worse = |best: (f64, [f64; 2])| found.is_none_or(|found| found.0 <= best.0);
         if best.is_some_and(is_worse) {
@@ -65,7 +87,8 @@ pub(crate) fn find(plane: &Plane, surface: &Surface<'_>, neighborhood: &Neighbor
             break;
         }
     }
-    best.filter(|(correlation, _)| *correlation >= MIN_CORRELATION).map(|(_, pixel)| pixel)
+    best.filter(|(correlation, _)| *correlation >= MIN_CORRELATION)
+        .map(|(_, pixel)| pixel)
 }
 
 /// The rendered pattern with its derivatives.
@@ -80,7 +103,12 @@ struct Template {
 }
 
 impl Template {
-    fn new(surface: &Surface<'_>, neighborhood: &Neighborhood, half_px: i32, n_blurs: usize) -> Option<Self> {
+    fn new(
+        surface: &Surface<'_>,
+        neighborhood: &Neighborhood,
+        half_px: i32,
+        n_blurs: usize,
+    ) -> Option<Self> {
         let point_by_pixel = neighborhood.pixel_by_point.try_inverse()?;
         // More pixels on each side for blur and derivatives.
         let padding = i32::try_from(n_blurs).ok()? + 1;
@@ -88,16 +116,25 @@ impl Template {
         let value = |at: i32| {
             const OFFSETS: [f64; 4] = [-0.375, -0.125, 0.125, 0.375];
             let offset = [f64::from(at % side - padded), f64::from(at / side - padded)];
-            let samples = OFFSETS.iter().flat_map(|dy| OFFSETS.map(|dx| [offset[0] + dx, offset[1] + dy]));
+            let samples = OFFSETS
+                .iter()
+                .flat_map(|dy| OFFSETS.map(|dx| [offset[0] + dx, offset[1] + dy]));
             let is_white = |[x, y]: [f64; 2]| {
                 let first = point_by_pixel * Vector2::new(x, y);
-                let [xx, xy, yy] = [first.x * first.x / 2.0, first.x * first.y, first.y * first.y / 2.0];
+                let [xx, xy, yy] = [
+                    first.x * first.x / 2.0,
+                    first.x * first.y,
+                    first.y * first.y / 2.0,
+                ];
                 let bent = [0, 1].map(|axis| {
                     let bend = neighborhood.bend.map(|derivative| derivative[axis]);
                     xx * bend[0] + xy * bend[1] + yy * bend[2]
                 });
                 let away = point_by_pixel * Vector2::new(x - bent[0], y - bent[1]);
-                !surface.is_black([neighborhood.point_m[0] + away.x, neighborhood.point_m[1] + away.y])
+                !surface.is_black([
+                    neighborhood.point_m[0] + away.x,
+                    neighborhood.point_m[1] + away.y,
+                ])
             };
             samples.filter(|&sample| is_white(sample)).count() as f64 / 16.0
         };
@@ -109,12 +146,17 @@ impl Template {
             let before = blurred.clone();
             for y in pass..side - pass {
                 for x in pass..side - pass {
-                    let row = |y: i32| at(&before, x - 1, y) + 2.0 * at(&before, x, y) + at(&before, x + 1, y);
-                    blurred[(y * side + x).cast_unsigned() as usize] = (row(y - 1) + 2.0 * row(y) + row(y + 1)) / 16.0;
+                    let row = |y: i32| {
+                        at(&before, x - 1, y) + 2.0 * at(&before, x, y) + at(&before, x + 1, y)
+                    };
+                    blurred[(y * side + x).cast_unsigned() as usize] =
+                        (row(y - 1) + 2.0 * row(y) + row(y + 1)) / 16.0;
                 }
             }
         }
-        let inner = || (padding..side - padding).flat_map(|y| (padding..side - padding).map(move |x| (x, y)));
+        let inner = || {
+            (padding..side - padding).flat_map(|y| (padding..side - padding).map(move |x| (x, y)))
+        };
         let values: Vec<f64> = inner().map(|(x, y)| at(&blurred, x, y)).collect();
         let mean = values.iter().sum::<f64>() / values.len() as f64;
         let values: Vec<f64> = values.into_iter().map(|value| value - mean).collect();
@@ -131,16 +173,27 @@ impl Template {
                 Vector4::new(dx, dy, value, 1.0)
             })
             .collect();
-        let hessian = steepest.iter().map(|row| row * row.transpose()).sum::<Matrix4<f64>>();
-        Some(Self { half_px, values, norm, steepest, inverse: hessian.try_inverse()? })
+        let hessian = steepest
+            .iter()
+            .map(|row| row * row.transpose())
+            .sum::<Matrix4<f64>>();
+        Some(Self {
+            half_px,
+            values,
+            norm,
+            steepest,
+            inverse: hessian.try_inverse()?,
+        })
     }
 
     /// Finds the shift of the pattern, and the correlation there.
     fn find(&self, plane: &Plane, pixel: [f64; 2], reach_px: f64) -> Option<(f64, [f64; 2])> {
-        // The best whole-pixel shift first: the alignment converges from about half an edge's width.
+        // The best whole-pixel shift first: the alignment converges from about half an edge's
+        // width.
         #[expect(clippy::cast_possible_truncation, reason = "a few pixels")]
         let steps = reach_px.floor() as i32;
-        let shifts = (-steps..=steps).flat_map(|y| (-steps..=steps).map(move |x| [f64::from(x), f64::from(y)]));
+        let shifts = (-steps..=steps)
+            .flat_map(|y| (-steps..=steps).map(move |x| [f64::from(x), f64::from(y)]));
         let centers = shifts.map(|[x, y]| [pixel[0] + x, pixel[1] + y]);
         let scored = centers.map(|center| (self.correlation(plane, center), center));
         let (_, start) = scored.max_by(|a, b| a.0.total_cmp(&b.0))?;
@@ -151,7 +204,9 @@ impl Template {
 
     fn samples(&self, plane: &Plane, center: [f64; 2]) -> impl Iterator<Item = f64> {
         let range = -self.half_px..=self.half_px;
-        let offsets = range.clone().flat_map(move |y| range.clone().map(move |x| [f64::from(x), f64::from(y)]));
+        let offsets = range
+            .clone()
+            .flat_map(move |y| range.clone().map(move |x| [f64::from(x), f64::from(y)]));
         offsets.map(move |[x, y]| f64::from(plane.sample([center[0] + x, center[1] + y])))
     }
 
@@ -165,7 +220,11 @@ impl Template {
         }
         let n = self.values.len() as f64;
         let deviation = (squares - sum * sum / n).max(0.0).sqrt();
-        if deviation < MIN_DEVIATION * n.sqrt() { 0.0 } else { products / (deviation * self.norm) }
+        if deviation < MIN_DEVIATION * n.sqrt() {
+            0.0
+        } else {
+            products / (deviation * self.norm)
+        }
     }
 
     /// Shifts the pattern to the position of least squares.
@@ -174,10 +233,14 @@ impl Template {
         const CONVERGED_PX: f64 = 1e-3;
         let mut center = start;
         for _ in 0..MAX_STEPS {
-            let right =
-                self.samples(plane, center).zip(&self.steepest).map(|(sample, row)| row * sample).sum::<Vector4<f64>>();
+            let right = self
+                .samples(plane, center)
+                .zip(&self.steepest)
+                .map(|(sample, row)| row * sample)
+                .sum::<Vector4<f64>>();
             let solution = self.inverse * right;
-            // The image is gain * pattern(shifted) + offset; its derivative with respect to the shift is gain * gradient.
+            // The image is gain * pattern(shifted) + offset; its derivative with respect to the
+            // shift is gain * gradient.
             let gain = solution[2];
             if gain <= 0.0 {
                 return None;

@@ -1,6 +1,7 @@
-//! An arm with emulated CAN motors is moved to poses and photographed at rest, inside the virtual kernel: the path of
-//! `fieldrig calibrate hand-eye --move` below the detection of the target. Drivers, bus and camera device are those of a
-//! real rig; the motors are emulated, and the images are the test pattern of vivid.
+//! An arm with emulated CAN motors is moved to poses and photographed at rest, inside the virtual
+//! kernel: the path of `fieldrig calibrate hand-eye --move` below the detection of the target.
+//! Drivers, bus and camera device are those of a real rig; the motors are emulated, and the images
+//! are the test pattern of vivid.
 
 use crate::can::Wire;
 use crate::can_motion::Motors;
@@ -26,27 +27,55 @@ fn can_arm_visits_poses_holds_and_stops() {
         Override::new("arm.motor.joint2.stiffness_nm_rad", 30.0),
         Override::new("arm.motor.joint2.damping_nm_s_rad", 1.5),
     ];
-    let rig = Rig::load(Path::new("/rigs/vivid-can.toml"), &overrides).expect("the rig file of the tests");
+    let rig = Rig::load(Path::new("/rigs/vivid-can.toml"), &overrides)
+        .expect("the rig file of the tests");
     let motors = Motors::new(wire.config(false), rig.arm.motors.clone(), false);
     let opened = open::movable(&rig, Devices::Real, "wrist").expect("camera and motors answer");
     let mut capture = ArmCapture::new(opened).expect("the robot description matches");
-    capture.limit_distance(0.3).expect("the arm reports its joints");
+    capture
+        .limit_distance(0.3)
+        .expect("the arm reports its joints");
     for goal in [[0.0, 0.0], [0.4, -0.2], [-0.3, 0.3]] {
-        assert!(capture.move_to(&goal, &Stop::default()).expect("the arm arrives"));
-        let image = capture.image(&Stop::default()).expect("vivid streams").expect("no stop was requested");
+        assert!(
+            capture
+                .move_to(&goal, &Stop::default())
+                .expect("the arm arrives")
+        );
+        let image = capture
+            .image(&Stop::default())
+            .expect("vivid streams")
+            .expect("no stop was requested");
         let joints = image.arm.expect("the arm is known").joints;
-        assert!(max_difference(&joints, &goal) < CLOSE_RAD, "{joints:?}, commanded {goal:?}");
-        assert!(max_difference(&motors.positions(), &goal) < CLOSE_RAD, "the shafts are elsewhere");
+        assert!(
+            max_difference(&joints, &goal) < CLOSE_RAD,
+            "{joints:?}, commanded {goal:?}"
+        );
+        assert!(
+            max_difference(&motors.positions(), &goal) < CLOSE_RAD,
+            "the shafts are elsewhere"
+        );
         assert_eq!(image.gray.len(), 640 * 360);
     }
     // Before the arm has been at rest for long enough, so that no image ends the wait.
-    assert!(capture.move_to(&[-0.2, 0.2], &Stop::default()).expect("the arm arrives"));
-    assert!(capture.image(&requested_after(Duration::from_millis(100))).expect("the arm is well").is_none());
+    assert!(
+        capture
+            .move_to(&[-0.2, 0.2], &Stop::default())
+            .expect("the arm arrives")
+    );
+    assert!(
+        capture
+            .image(&requested_after(Duration::from_millis(100)))
+            .expect("the arm is well")
+            .is_none()
+    );
     let held = motors.positions();
     for _ in 0..100 {
         capture.joints().expect("the arm holds");
     }
-    assert!(max_difference(&motors.positions(), &held) < 1e-3 && max_difference(&held, &[-0.2, 0.2]) < CLOSE_RAD);
+    assert!(
+        max_difference(&motors.positions(), &held) < 1e-3
+            && max_difference(&held, &[-0.2, 0.2]) < CLOSE_RAD
+    );
     // During a motion.
     let is_complete = capture.move_to(&[0.6, 0.2], &requested_after(Duration::from_millis(400)));
     assert!(!is_complete.expect("the arm stops"));
@@ -54,17 +83,27 @@ fn can_arm_visits_poses_holds_and_stops() {
     for _ in 0..100 {
         capture.joints().expect("the arm holds");
     }
-    assert!(max_difference(&motors.positions(), &rest) < 2e-3 && rest[0] < 0.5, "{rest:?}");
+    assert!(
+        max_difference(&motors.positions(), &rest) < 2e-3 && rest[0] < 0.5,
+        "{rest:?}"
+    );
     assert_eq!(motors.states(), [State::Enabled; 2]);
-    println!("can: visited three poses, stopped while waiting at {held:.4?} and while moving at {rest:.4?}");
+    println!(
+        "can: visited three poses, stopped while waiting at {held:.4?} and while moving at {rest:.4?}"
+    );
     drop(capture);
     motors.wait_until("the motors are released", |observed| {
-        observed.iter().all(|observed| observed.state != State::Enabled)
+        observed
+            .iter()
+            .all(|observed| observed.state != State::Enabled)
     });
 }
 
 fn max_difference(a: &[f64], b: &[f64]) -> f64 {
-    a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)
+    a.iter()
+        .zip(b)
+        .map(|(a, b)| (a - b).abs())
+        .fold(0.0, f64::max)
 }
 
 fn requested_after(delay: Duration) -> Stop {

@@ -1,12 +1,14 @@
-//! Tests of the Franka driver and of the emulated controller against independent implementations of the protocol:
-//! libfranka as a client (`pylibfranka`) and `franka-sim` as a controller. Both are installed once from the Python
-//! Package Index into a virtual environment.
+//! Tests of the Franka driver and of the emulated controller against independent implementations of
+//! the protocol: libfranka as a client (`pylibfranka`) and `franka-sim` as a controller. Both are
+//! installed once from the Python Package Index into a virtual environment.
 
 #![cfg(target_os = "linux")]
 
 use drivers::Arm;
 use drivers::franka::emulated::{EmulatedRobot, JointSimulator, Joints, Limits, RobotConfig};
-use drivers::franka::{ArmConfig, ContactConfig, FciVersion, FrankaArm, MotionStatistics, MovableFrankaArm, N_JOINTS};
+use drivers::franka::{
+    ArmConfig, ContactConfig, FciVersion, FrankaArm, MotionStatistics, MovableFrankaArm, N_JOINTS,
+};
 use drivers::motion::{JointTarget, Motion, MotionConfig, MotionLimits, MovableArm, OnLoss};
 use kinematics::{Chain, Transform};
 use parking_lot::Mutex;
@@ -42,23 +44,37 @@ fn libfranka_moves_emulated_robot_and_recovers_from_reflex() {
         flange_from_tool: Transform::identity(),
         limits: Limits::fr3(),
     };
-    let emulated = EmulatedRobot::start_waiting(config, ANSWER_WAIT, ideal_joints(REST_RAD)).unwrap();
+    let emulated =
+        EmulatedRobot::start_waiting(config, ANSWER_WAIT, ideal_joints(REST_RAD)).unwrap();
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/hil/libfranka_client.py");
-    let output = Command::new(python).arg(script).arg(ip.to_string()).output().unwrap();
-    let [reported, errors] = [output.stdout, output.stderr].map(|bytes| String::from_utf8_lossy(&bytes).into_owned());
+    let output = Command::new(python)
+        .arg(script)
+        .arg(ip.to_string())
+        .output()
+        .unwrap();
+    let [reported, errors] =
+        [output.stdout, output.stderr].map(|bytes| String::from_utf8_lossy(&bytes).into_owned());
     assert!(output.status.success(), "{reported}{errors}");
     report(&format!("libfranka against the emulated robot: {reported}"));
     let reported: serde_json::Value = serde_json::from_str(&reported).unwrap();
     let number = |key: &str| reported[key].as_f64().unwrap();
-    assert!(number("cycles") > 0.99 * 2000.0 && number("answered") > 0.999, "{reported}");
+    assert!(
+        number("cycles") > 0.99 * 2000.0 && number("answered") > 0.999,
+        "{reported}"
+    );
     for (ix, by) in reported["moved_rad"].as_array().unwrap().iter().enumerate() {
         let expected = if ix == 3 { 0.2 } else { 0.0 };
         assert!((by.as_f64().unwrap() - expected).abs() < 1e-6, "{reported}");
     }
     let stopped = reported["stopped"].as_str().unwrap();
-    assert!(stopped.contains("reflex") && stopped.contains("discontinuity"), "{reported}");
     assert!(
-        reported["reflex"] == true && reported["recovered"] == true && number("cycles_again") > 0.99 * 2000.0,
+        stopped.contains("reflex") && stopped.contains("discontinuity"),
+        "{reported}"
+    );
+    assert!(
+        reported["reflex"] == true
+            && reported["recovered"] == true
+            && number("cycles_again") > 0.99 * 2000.0,
         "{reported}"
     );
     drop(emulated);
@@ -74,7 +90,14 @@ fn ten_thousand_states_are_received_from_franka_sim() {
     for _ in 0..10_000 {
         let state = arm.read(TEST_TIMEOUT).unwrap();
         assert!(last.is_none_or(|last| state.stamp > last));
-        assert_eq!((state.position.len(), state.velocity.len(), state.effort.len()), (N_JOINTS, N_JOINTS, N_JOINTS));
+        assert_eq!(
+            (
+                state.position.len(),
+                state.velocity.len(),
+                state.effort.len()
+            ),
+            (N_JOINTS, N_JOINTS, N_JOINTS)
+        );
         last = Some(state.stamp);
     }
     let statistics = arm.statistics();
@@ -82,7 +105,10 @@ fn ten_thousand_states_are_received_from_franka_sim() {
     assert!(statistics.success_frac() > 0.99, "{statistics}");
     // FCI accepts one client at a time.
     let second_client_error = FrankaArm::open(&server.config()).unwrap_err().to_string();
-    assert!(second_client_error.contains("one client") && second_client_error.contains("udp"), "{second_client_error}");
+    assert!(
+        second_client_error.contains("one client") && second_client_error.contains("udp"),
+        "{second_client_error}"
+    );
 }
 
 #[test]
@@ -101,10 +127,14 @@ fn ten_thousand_motion_cycles_with_both_controllers() {
         flange_from_tool: Transform::identity(),
         limits: Limits::fr3(),
     };
-    let emulated = EmulatedRobot::start(config, ideal_joints([0.1, -0.5, 0.2, -2.0, 0.3, 1.8, 0.7])).unwrap();
+    let emulated =
+        EmulatedRobot::start(config, ideal_joints([0.1, -0.5, 0.2, -2.0, 0.3, 1.8, 0.7])).unwrap();
     let chain = chain("panda_link8");
-    let config =
-        ArmConfig { address: emulated.address().to_string(), joint_names: chain.joint_names().to_vec(), chain };
+    let config = ArmConfig {
+        address: emulated.address().to_string(),
+        joint_names: chain.joint_names().to_vec(),
+        chain,
+    };
     follow_for_ten_thousand_cycles("the emulated robot", || {
         MovableFrankaArm::open(&config, &motion(), &ContactConfig::default()).unwrap()
     });
@@ -113,31 +143,44 @@ fn ten_thousand_motion_cycles_with_both_controllers() {
 /// Motion configuration of these tests.
 fn motion() -> MotionConfig {
     MotionConfig {
-        limits: chain("panda_link8").limits().iter().map(|joint| MotionLimits::new(joint, 0.5, 0.5, 0.1)).collect(),
+        limits: chain("panda_link8")
+            .limits()
+            .iter()
+            .map(|joint| MotionLimits::new(joint, 0.5, 0.5, 0.1))
+            .collect(),
         on_loss: OnLoss::Hold,
         timeout: Duration::from_millis(100),
         accept_no_watchdog: false,
     }
 }
 
-/// Moves back and forth for 10 000 cycles. Checks on both sides that more than 99 % of the states are answered in time,
-/// not counting the time for which a processor was stalled.
+/// Moves back and forth for 10 000 cycles. Checks on both sides that more than 99 % of the states
+/// are answered in time, not counting the time for which a processor was stalled.
 ///
-/// On a busy machine, up to three attempts are made. A reflex caused by a violated limit fails immediately.
+/// On a busy machine, up to three attempts are made. A reflex caused by a violated limit fails
+/// immediately.
 fn follow_for_ten_thousand_cycles(name: &str, open: impl Fn() -> MovableFrankaArm) {
     const MAX_ATTEMPTS: usize = 3;
     const BY_RAD: f64 = 0.3;
     const NEAR_RAD: f64 = 5e-3; // The joints of franka-sim have inertia.
     for attempt in 1..=MAX_ATTEMPTS {
         let mut arm = open();
-        let rest = arm.read(TEST_TIMEOUT).expect("the arm reports its joints").position;
+        let rest = arm
+            .read(TEST_TIMEOUT)
+            .expect("the arm reports its joints")
+            .position;
         let (stalls, began) = (Stalls::start(), Instant::now());
         let mut directions = [-1.0, 0.0, 1.0, 0.0].into_iter().cycle();
         while arm.motion_statistics().n_answered < 10_000 {
             let by_rad = BY_RAD * directions.next().expect("the iterator is infinite");
-            let target = JointTarget { position: rest.iter().map(|rest| rest + by_rad).collect() };
+            let target = JointTarget {
+                position: rest.iter().map(|rest| rest + by_rad).collect(),
+            };
             let recover = |arm: &mut MovableFrankaArm, reason: &str| {
-                assert!(reason.contains("communication_constraints_violation"), "{name}: {reason}");
+                assert!(
+                    reason.contains("communication_constraints_violation"),
+                    "{name}: {reason}"
+                );
                 arm.recover().expect("the arm recovers");
             };
             match arm.command(&target) {
@@ -150,7 +193,11 @@ fn follow_for_ten_thousand_cycles(name: &str, open: impl Fn() -> MovableFrankaAr
             }
             let until = Instant::now() + TEST_TIMEOUT;
             while arm.motion() == Motion::Moving {
-                assert!(Instant::now() < until, "the arm does not come to rest: {}", arm.motion_statistics());
+                assert!(
+                    Instant::now() < until,
+                    "the arm does not come to rest: {}",
+                    arm.motion_statistics()
+                );
                 std::thread::sleep(Duration::from_millis(5));
             }
             if let Motion::Stopped { reason } = arm.motion() {
@@ -167,7 +214,10 @@ fn follow_for_ten_thousand_cycles(name: &str, open: impl Fn() -> MovableFrankaAr
         }
         let statistics = arm.motion_statistics();
         let stalled_frac = stalls.stop().frac(began, Instant::now());
-        let outcome = format!("{name}: {statistics}; stalled for {:.1} % of the time", 100.0 * stalled_frac);
+        let outcome = format!(
+            "{name}: {statistics}; stalled for {:.1} % of the time",
+            100.0 * stalled_frac
+        );
         report(&format!("our driver moves {outcome}\n"));
         if is_in_time(&statistics, stalled_frac) {
             return;
@@ -176,7 +226,8 @@ fn follow_for_ten_thousand_cycles(name: &str, open: impl Fn() -> MovableFrankaAr
     }
 }
 
-/// Whether more than 99 % of the states were answered in time according to both sides, not counting a fraction of them.
+/// Whether more than 99 % of the states were answered in time according to both sides, not counting
+/// a fraction of them.
 fn is_in_time(statistics: &MotionStatistics, stalled_frac: f64) -> bool {
     let [reported, _] = statistics.robot_success_frac().expect("the arm has moved");
     statistics.n_motions > 0 && statistics.success_frac().min(reported) > 0.99 - stalled_frac
@@ -185,7 +236,10 @@ fn is_in_time(statistics: &MotionStatistics, stalled_frac: f64) -> bool {
 /// Joint positions after the arm has come to rest. Skips older states in the queue.
 fn settled_position(arm: &mut MovableFrankaArm) -> Vec<f64> {
     std::thread::sleep(Duration::from_millis(100));
-    let mut position = arm.read(TEST_TIMEOUT).expect("the arm reports its joints").position;
+    let mut position = arm
+        .read(TEST_TIMEOUT)
+        .expect("the arm reports its joints")
+        .position;
     while let Ok(state) = arm.read(Duration::ZERO) {
         position = state.position;
     }
@@ -200,34 +254,57 @@ struct FrankaSim {
 
 impl FrankaSim {
     fn start(python: &Path) -> Self {
-        let port =
-            TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).expect("a free port").local_addr().expect("a free port").port();
+        let port = TcpListener::bind((Ipv4Addr::LOCALHOST, 0))
+            .expect("a free port")
+            .local_addr()
+            .expect("a free port")
+            .port();
         let log = fs::File::create(folder().join("franka-sim.log")).expect("creating the log file");
-        // The model of franka-sim is a separate download, so this uses our model of primitive shapes.
-        let (root, model) = (Path::new(env!("CARGO_MANIFEST_DIR")).join(".."), folder().join("panda.xml"));
+        // The model of franka-sim is a separate download, so this uses our model of primitive
+        // shapes.
+        let (root, model) = (
+            Path::new(env!("CARGO_MANIFEST_DIR")).join(".."),
+            folder().join("panda.xml"),
+        );
         let model_output = Command::new(python)
             .arg(root.join("tests/hil/franka_sim_model.py"))
             .args([&root.join("rigs/robots/panda.urdf"), &model])
             .output()
             .expect("Python starts");
-        assert!(model_output.status.success(), "{}", String::from_utf8_lossy(&model_output.stderr));
+        assert!(
+            model_output.status.success(),
+            "{}",
+            String::from_utf8_lossy(&model_output.stderr)
+        );
         let child = Command::new(python)
             .args(["-m", "franka_sim.run_server", "--no-gripper"])
-            .args(["--enforce-comm-constraints", "--enforce-motion-limits", "--port", &port.to_string()])
+            .args([
+                "--enforce-comm-constraints",
+                "--enforce-motion-limits",
+                "--port",
+                &port.to_string(),
+            ])
             .env("FR3_MJCF", &model)
             .stdin(Stdio::null())
             .stdout(Stdio::null())
             .stderr(log)
             .spawn()
             .expect("Python starts");
-        Self { address: SocketAddr::from((Ipv4Addr::LOCALHOST, port)).to_string(), _process: KillOnDrop(child) }
+        Self {
+            address: SocketAddr::from((Ipv4Addr::LOCALHOST, port)).to_string(),
+            _process: KillOnDrop(child),
+        }
     }
 
-    /// Configuration for franka-sim, which reports the pose of its seventh link as the flange pose. The real flange is
-    /// 107 mm further along the axis.
+    /// Configuration for franka-sim, which reports the pose of its seventh link as the flange pose.
+    /// The real flange is 107 mm further along the axis.
     fn config(&self) -> ArmConfig {
         let chain = chain("panda_link7");
-        ArmConfig { address: self.address.clone(), joint_names: chain.joint_names().to_vec(), chain }
+        ArmConfig {
+            address: self.address.clone(),
+            joint_names: chain.joint_names().to_vec(),
+            chain,
+        }
     }
 
     /// Opens the arm once the server is ready.
@@ -247,8 +324,16 @@ impl FrankaSim {
 fn ideal_joints(rest_rad: [f64; N_JOINTS]) -> JointSimulator {
     let mut is_first = true;
     Box::new(move |_, command| {
-        let position_rad = if std::mem::take(&mut is_first) { rest_rad } else { command.position_rad };
-        Joints { position_rad, velocity_rad_s: command.velocity_rad_s, ..Joints::default() }
+        let position_rad = if std::mem::take(&mut is_first) {
+            rest_rad
+        } else {
+            command.position_rad
+        };
+        Joints {
+            position_rad,
+            velocity_rad_s: command.velocity_rad_s,
+            ..Joints::default()
+        }
     })
 }
 
@@ -269,7 +354,9 @@ impl Drop for KillOnDrop {
 
 /// Writes to stderr directly, because the test harness hides the output of passing tests.
 fn report(text: &str) {
-    std::io::stderr().write_all(text.as_bytes()).expect("stderr is open");
+    std::io::stderr()
+        .write_all(text.as_bytes())
+        .expect("stderr is open");
 }
 
 /// Python of the virtual environment. Returns `None` and prints the reason if it cannot be created.
@@ -293,21 +380,29 @@ fn make_environment() -> Result<(), String> {
     }
     let run = |program: &Path, arguments: &[&str]| {
         let output = Command::new(program).args(arguments).output();
-        let output = output.map_err(|error| format!("cannot start {}: {error}", program.display()))?;
+        let output =
+            output.map_err(|error| format!("cannot start {}: {error}", program.display()))?;
         let errors = String::from_utf8_lossy(&output.stderr).into_owned();
         let last = errors.lines().last().unwrap_or_default().to_owned();
-        if output.status.success() { Ok(()) } else { Err(last) }
+        if output.status.success() {
+            Ok(())
+        } else {
+            Err(last)
+        }
     };
     let is_python_3_11 = "import sys; sys.exit(sys.version_info[:2] != (3, 11))";
-    run(Path::new("python3"), &["-c", is_python_3_11])
-        .map_err(|_| "the Python packages of the Franka tests require Python 3.11 (Debian 12)".to_owned())?;
+    run(Path::new("python3"), &["-c", is_python_3_11]).map_err(|_| {
+        "the Python packages of the Franka tests require Python 3.11 (Debian 12)".to_owned()
+    })?;
     // Leftovers of an interrupted run.
     let _ = fs::remove_dir_all(&folder);
-    let [at, requirements] = [&folder, &folder.join("requirements.txt")].map(|path| path.display().to_string());
+    let [at, requirements] =
+        [&folder, &folder.join("requirements.txt")].map(|path| path.display().to_string());
     run(Path::new("python3"), &["-m", "venv", &at])
         .map_err(|error| format!("cannot create a virtual environment: {error}"))?;
-    let requirements_text: String =
-        pins().map(|[sha256, _, wheel]| format!("{wheel} --hash=sha256:{sha256}\n")).collect();
+    let requirements_text: String = pins()
+        .map(|[sha256, _, wheel]| format!("{wheel} --hash=sha256:{sha256}\n"))
+        .collect();
     fs::write(&requirements, requirements_text).map_err(|error| error.to_string())?;
     let pip = [
         "-m",
@@ -320,15 +415,18 @@ fn make_environment() -> Result<(), String> {
         "-r",
         &requirements,
     ];
-    run(&folder.join("bin/python"), &pip)
-        .map_err(|error| format!("cannot install the Python packages of the Franka tests: {error}"))?;
+    run(&folder.join("bin/python"), &pip).map_err(|error| {
+        format!("cannot install the Python packages of the Franka tests: {error}")
+    })?;
     fs::write(complete_marker, "").map_err(|error| error.to_string())
 }
 
 /// Folder of the virtual environment in the target folder. Its name depends on the pinned wheels.
 fn folder() -> PathBuf {
     let shas: String = pins().map(|[sha256, ..]| &sha256[..4]).collect();
-    Path::new(env!("CARGO_TARGET_TMPDIR")).join("../hil").join(format!("franka-{shas}"))
+    Path::new(env!("CARGO_TARGET_TMPDIR"))
+        .join("../hil")
+        .join(format!("franka-{shas}"))
 }
 
 /// The pinned wheels: sha256, file, requirement.
@@ -337,6 +435,9 @@ fn pins() -> impl Iterator<Item = [&'static str; 3]> {
         let columns: Vec<&str> = line.split_whitespace().collect();
         <[&str; 3]>::try_from(columns).ok()
     };
-    let lines = PINS.lines().filter(|line| !line.starts_with('#')).filter_map(columns);
+    let lines = PINS
+        .lines()
+        .filter(|line| !line.starts_with('#'))
+        .filter_map(columns);
     lines.filter(|[_, _, requirement]| requirement.contains("=="))
 }

@@ -1,14 +1,17 @@
-//! Guards of a moving arm, inside the virtual kernel: an obstacle, a second program, a panic of the arm's thread, a
-//! second Ctrl-C, and a closed terminal. The tests of the obstacle, the panic, Ctrl-C and the closed output repeat the
-//! fault `FIELDRIG_TRIALS` times, 3 by default, at different times of the motion.
+//! Guards of a moving arm, inside the virtual kernel: an obstacle, a second program, a panic of the
+//! arm's thread, a second Ctrl-C, and a closed terminal. The tests of the obstacle, the panic,
+//! Ctrl-C and the closed output repeat the fault `FIELDRIG_TRIALS` times, 3 by default, at
+//! different times of the motion.
 
 use crate::can::{Wire, all_families, damiao};
-use crate::can_motion::{MotorObservation, Motors, motors_with_watchdog, movable, wait_until_stopped};
+use crate::can_motion::{
+    MotorObservation, Motors, motors_with_watchdog, movable, wait_until_stopped,
+};
 use capture::config::Rig;
 use drivers::can::emulated::{EmulatedProtocol, State};
 use drivers::can::{
-    MotionProtocol, MotorConfig, MotorFamily, MotorProtocol, MotorQuery, MotorReading, MotorSettings, MovableCanArm,
-    Reports, Traffic, Watchdog, WatchdogPlan,
+    MotionProtocol, MotorConfig, MotorFamily, MotorProtocol, MotorQuery, MotorReading,
+    MotorSettings, MovableCanArm, Reports, Traffic, Watchdog, WatchdogPlan,
 };
 use drivers::motion::{JointTarget, MovableArm, OnLoss};
 use drivers::wire::can::Frame;
@@ -25,11 +28,16 @@ use std::time::Duration;
 const MAX_REACTION: Duration = Duration::from_millis(40);
 
 fn n_trials() -> u64 {
-    std::env::var("FIELDRIG_TRIALS").ok().and_then(|n| n.parse().ok()).unwrap_or(3)
+    std::env::var("FIELDRIG_TRIALS")
+        .ok()
+        .and_then(|n| n.parse().ok())
+        .unwrap_or(3)
 }
 
 fn is_moving(observed: &[MotorObservation]) -> bool {
-    observed.iter().all(|observed| observed.state == State::Enabled && observed.velocity_rad_s.abs() > 0.1)
+    observed
+        .iter()
+        .all(|observed| observed.state == State::Enabled && observed.velocity_rad_s.abs() > 0.1)
 }
 
 /// Waits for a time that differs between trials.
@@ -42,27 +50,42 @@ fn wait_for_trial(trial: u64) {
 fn obstacle_stops_the_arm() {
     let wire = Wire::new("vcan14", false);
     let mut configs = motors_with_watchdog();
-    configs.iter_mut().for_each(|config| config.following.max_error_rad = 0.1);
+    configs
+        .iter_mut()
+        .for_each(|config| config.following.max_error_rad = 0.1);
     let motors = Motors::new(wire.config(false), configs.clone(), false);
     let config = movable(wire.config(false), &configs, OnLoss::Release);
     let mut arm = MovableCanArm::open(&config).expect("the motors are enabled");
     for trial in 0..n_trials() {
-        let side = if motors.positions()[0] > 0.0 { -1.5 } else { 1.5 };
-        arm.command(&JointTarget { position: vec![side; configs.len()] }).expect("within the limits");
+        let side = if motors.positions()[0] > 0.0 {
+            -1.5
+        } else {
+            1.5
+        };
+        arm.command(&JointTarget {
+            position: vec![side; configs.len()],
+        })
+        .expect("within the limits");
         motors.wait_until("the arm moves", is_moving);
         wait_for_trial(trial);
         motors.is_blocked.store(true, Ordering::Relaxed);
         let reason = wait_until_stopped(&arm);
         assert!(
-            reason.contains("from its commanded position") && reason.contains("max_following_error_rad is 0.1"),
+            reason.contains("from its commanded position")
+                && reason.contains("max_following_error_rad is 0.1"),
             "{reason}"
         );
-        motors
-            .wait_until("no motor pushes", |observed| observed.iter().all(|observed| observed.state != State::Enabled));
+        motors.wait_until("no motor pushes", |observed| {
+            observed
+                .iter()
+                .all(|observed| observed.state != State::Enabled)
+        });
         motors.is_blocked.store(false, Ordering::Relaxed);
         // Released motors coast to rest.
         motors.wait_until("the motors are at rest", |observed| {
-            observed.iter().all(|observed| observed.velocity_rad_s.abs() < 0.01)
+            observed
+                .iter()
+                .all(|observed| observed.velocity_rad_s.abs() < 0.01)
         });
         arm.recover().expect("the motors answer");
     }
@@ -76,13 +99,19 @@ fn obstacle_stops_the_arm() {
         config
     };
     let configs = [limited(&damiao(1))];
-    let mut arm =
-        MovableCanArm::open(&movable(wire.config(false), &configs, OnLoss::Release)).expect("the motor is enabled");
-    arm.command(&JointTarget { position: vec![1.0] }).expect("within the limits");
+    let mut arm = MovableCanArm::open(&movable(wire.config(false), &configs, OnLoss::Release))
+        .expect("the motor is enabled");
+    arm.command(&JointTarget {
+        position: vec![1.0],
+    })
+    .expect("within the limits");
     std::thread::sleep(Duration::from_millis(600));
     motors.is_blocked.store(true, Ordering::Relaxed);
     let reason = wait_until_stopped(&arm);
-    assert!(reason.contains("its effort is") && reason.contains("max_effort_nm is 1.5"), "{reason}");
+    assert!(
+        reason.contains("its effort is") && reason.contains("max_effort_nm is 1.5"),
+        "{reason}"
+    );
     println!("guards: {reason}");
 }
 
@@ -92,16 +121,34 @@ fn second_program_cannot_move_the_arm() {
     let wire = Wire::new("vcan14", false);
     let rig = rig_without_watchdogs();
     let (motors, mut moving) = moving_arm(&wire, &rig);
-    let second = Command::new("/bin/fieldrig").arg("move").arg(&rig).args(["--recover", "--enable-motion"]).output();
+    let second = Command::new("/bin/fieldrig")
+        .arg("move")
+        .arg(&rig)
+        .args(["--recover", "--enable-motion"])
+        .output();
     let second = second.expect("fieldrig is installed");
     let printed = String::from_utf8_lossy(&second.stderr);
-    let expected = format!("another program (process {}) moves the arm on vcan14", moving.id());
-    assert!(second.status.code() == Some(1) && printed.contains(&expected), "{printed}");
-    assert_eq!(motors.states(), [State::Enabled; 2], "the arm is not disturbed");
+    let expected = format!(
+        "another program (process {}) moves the arm on vcan14",
+        moving.id()
+    );
+    assert!(
+        second.status.code() == Some(1) && printed.contains(&expected),
+        "{printed}"
+    );
+    assert_eq!(
+        motors.states(),
+        [State::Enabled; 2],
+        "the arm is not disturbed"
+    );
     moving.kill().expect("our own child");
     moving.wait().expect("our own child");
     // The kernel has released the lock. An arm that is only read needs none.
-    let config = movable(wire.config(false), &Rig::load(&rig, &[]).expect("a rig file").arm.motors, OnLoss::Damp);
+    let config = movable(
+        wire.config(false),
+        &Rig::load(&rig, &[]).expect("a rig file").arm.motors,
+        OnLoss::Damp,
+    );
     drop(MovableCanArm::open(&config).expect("the bus is free"));
 }
 
@@ -114,10 +161,23 @@ fn panic_of_the_arm_thread_applies_the_fail_safe() {
     for trial in 0..n_trials() {
         let motors = Motors::new(wire.config(false), vec![ak.clone()], false);
         let fails = Arc::new(AtomicBool::new(false));
-        let protocol = Arc::new(Failing { protocol: Arc::clone(&ak.protocol), fails: Arc::clone(&fails) });
-        let config = movable(wire.config(false), &[MotorConfig { protocol, ..ak.clone() }], OnLoss::Damp);
+        let protocol = Arc::new(Failing {
+            protocol: Arc::clone(&ak.protocol),
+            fails: Arc::clone(&fails),
+        });
+        let config = movable(
+            wire.config(false),
+            &[MotorConfig {
+                protocol,
+                ..ak.clone()
+            }],
+            OnLoss::Damp,
+        );
         let mut arm = MovableCanArm::open(&config).expect("the motor answers");
-        arm.command(&JointTarget { position: vec![1.5] }).expect("within the limits");
+        arm.command(&JointTarget {
+            position: vec![1.5],
+        })
+        .expect("within the limits");
         motors.wait_until("the arm moves", is_moving);
         wait_for_trial(trial);
         fails.store(true, Ordering::Relaxed);
@@ -125,7 +185,12 @@ fn panic_of_the_arm_thread_applies_the_fail_safe() {
         motors.wait_until("the motor gets its fail-safe command", is_damped);
         assert!(clock::now().duration_since(failed_at) < MAX_REACTION);
         assert!(wait_until_stopped(&arm).contains("the thread of the arm failed"));
-        assert!(arm.command(&JointTarget { position: vec![0.0] }).is_err());
+        assert!(
+            arm.command(&JointTarget {
+                position: vec![0.0]
+            })
+            .is_err()
+        );
     }
 }
 
@@ -137,12 +202,16 @@ fn second_ctrl_c_applies_the_fail_safe() {
     for trial in 0..n_trials() {
         let (motors, mut moving) = moving_arm(&wire, &rig);
         wait_for_trial(trial);
-        // The first one brings the arm to rest, which takes seconds at the acceleration of this rig.
+        // The first one brings the arm to rest, which takes seconds at the acceleration of this
+        // rig.
         interrupt(&moving);
         std::thread::sleep(Duration::from_millis(100));
         interrupt(&moving); // The same key press, sent twice.
         std::thread::sleep(Duration::from_millis(500));
-        assert!(motors.observed()[0].velocity_rad_s.abs() > 0.02 && !is_damped(&motors.observed()), "it still brakes");
+        assert!(
+            motors.observed()[0].velocity_rad_s.abs() > 0.02 && !is_damped(&motors.observed()),
+            "it still brakes"
+        );
         interrupt(&moving);
         let interrupted_at = clock::now();
         motors.wait_until("the motors get their fail-safe command", is_damped);
@@ -170,15 +239,18 @@ fn closed_output_stops_the_motion() {
             end.position_rad < 2.0 && end.velocity_rad_s.abs() < 0.05,
             "expected a stop before the target: {end:?}"
         );
-        assert!(is_damped(&motors.observed()), "the arm came to rest, then on_loss was applied");
+        assert!(
+            is_damped(&motors.observed()),
+            "the arm came to rest, then on_loss was applied"
+        );
     }
 }
 
 /// Whether all motors execute a command without stiffness, as after the fail-safe command `damp`.
 fn is_damped(observed: &[MotorObservation]) -> bool {
-    observed
-        .iter()
-        .all(|observed| observed.state == State::Enabled && observed.gains[0] == 0.0 && observed.gains[1] > 0.0)
+    observed.iter().all(|observed| {
+        observed.state == State::Enabled && observed.gains[0] == 0.0 && observed.gains[1] > 0.0
+    })
 }
 
 /// A rig file with two motors without a watchdog. The arm takes seconds to come to rest.
@@ -203,9 +275,14 @@ fn rig_without_watchdogs() -> PathBuf {
     path.to_owned()
 }
 
-/// Starts the motors of a rig and a motion of the first joint that takes several seconds, and waits until it moves.
+/// Starts the motors of a rig and a motion of the first joint that takes several seconds, and waits
+/// until it moves.
 fn moving_arm(wire: &Wire, rig: &Path) -> (Motors, Child) {
-    let motors = Motors::new(wire.config(false), Rig::load(rig, &[]).expect("a rig file").arm.motors, false);
+    let motors = Motors::new(
+        wire.config(false),
+        Rig::load(rig, &[]).expect("a rig file").arm.motors,
+        false,
+    );
     let moving = Command::new("/bin/fieldrig")
         .arg("move")
         .arg(rig)
@@ -214,7 +291,9 @@ fn moving_arm(wire: &Wire, rig: &Path) -> (Motors, Child) {
         .stderr(Stdio::piped())
         .spawn()
         .expect("fieldrig is installed");
-    motors.wait_until("the arm moves", |observed| observed[0].velocity_rad_s.abs() > 0.1);
+    motors.wait_until("the arm moves", |observed| {
+        observed[0].velocity_rad_s.abs() > 0.1
+    });
     (motors, moving)
 }
 
@@ -231,7 +310,10 @@ struct Failing {
 
 impl MotorProtocol for Failing {
     fn read(&self, frame: &Frame, limits: &Limits) -> Option<MotorReading> {
-        assert!(!self.fails.swap(false, Ordering::Relaxed), "requested by the test");
+        assert!(
+            !self.fails.swap(false, Ordering::Relaxed),
+            "requested by the test"
+        );
         self.protocol.read(frame, limits)
     }
 

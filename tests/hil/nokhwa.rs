@@ -30,10 +30,13 @@ fn config() -> Config {
     }
 }
 
-/// Opens a camera after setting a format that nokhwa supports. nokhwa cannot open a camera that is set to another
-/// format, as it may be after the V4L2 tests.
+/// Opens a camera after setting a format that nokhwa supports. nokhwa cannot open a camera that is
+/// set to another format, as it may be after the V4L2 tests.
 fn open(config: Config) -> NokhwaCamera {
-    let known_format = v4l2::Config { format: Some(V4l2Format::Yuyv), ..cameras::config(WEBCAM, [640, 360], RATE_HZ) };
+    let known_format = v4l2::Config {
+        format: Some(V4l2Format::Yuyv),
+        ..cameras::config(WEBCAM, [640, 360], RATE_HZ)
+    };
     drop(V4l2Camera::open(known_format).expect("vivid opens"));
     NokhwaCamera::open(config).expect("vivid opens")
 }
@@ -45,7 +48,10 @@ fn time_to_recover(camera: &mut NokhwaCamera) -> (Image, Duration) {
         match camera.next_image(Duration::from_millis(100)) {
             Ok(image) => return (image, start_time.elapsed()),
             Err(Error::NoImage { .. } | Error::Reconnecting { .. }) => {
-                assert!(start_time.elapsed() < Duration::from_secs(10), "no more images")
+                assert!(
+                    start_time.elapsed() < Duration::from_secs(10),
+                    "no more images"
+                )
             }
             Err(other) => panic!("{other}"),
         }
@@ -55,8 +61,14 @@ fn time_to_recover(camera: &mut NokhwaCamera) -> (Image, Duration) {
 /// Waits until the camera reports that it is reconnecting.
 fn time_to_disconnect(camera: &mut NokhwaCamera) -> Duration {
     let start_time = Instant::now();
-    while !matches!(camera.next_image(Duration::from_millis(50)), Err(Error::Reconnecting { .. })) {
-        assert!(start_time.elapsed() < Duration::from_secs(10), "the driver did not detect the outage");
+    while !matches!(
+        camera.next_image(Duration::from_millis(50)),
+        Err(Error::Reconnecting { .. })
+    ) {
+        assert!(
+            start_time.elapsed() < Duration::from_secs(10),
+            "the driver did not detect the outage"
+        );
     }
     start_time.elapsed()
 }
@@ -66,19 +78,27 @@ fn time_to_disconnect(camera: &mut NokhwaCamera) -> Duration {
 fn nokhwa_streams_ten_seconds() {
     for format in [None, Some(V4l2Format::Nv12)] {
         let mut camera = open(Config { format, ..config() });
-        let first = camera.next_image(Duration::from_secs(2)).expect("vivid streams");
+        let first = camera
+            .next_image(Duration::from_secs(2))
+            .expect("vivid streams");
         assert_eq!(first.decode_rgb().expect("raw pixels").len(), 640 * 360 * 3);
         assert!(matches!(first.format, PixelFormat::Yuv { .. }));
         let start_time = Instant::now();
         let mut last = first.stamp;
         while start_time.elapsed() < Duration::from_secs(if format.is_none() { 10 } else { 2 }) {
-            let image = camera.next_image(Duration::from_secs(2)).expect("vivid streams");
+            let image = camera
+                .next_image(Duration::from_secs(2))
+                .expect("vivid streams");
             assert!(image.stamp > last, "stamps decrease");
             last = image.stamp;
         }
         let by_time = last.secs_since(first.stamp) * RATE_HZ;
         let counts = camera.counts();
-        println!("nokhwa, {:?}: {counts:?} in {:.2?}, {by_time:.1} by time", first.format, start_time.elapsed());
+        println!(
+            "nokhwa, {:?}: {counts:?} in {:.2?}, {by_time:.1} by time",
+            first.format,
+            start_time.elapsed()
+        );
         assert_eq!((counts.n_reconnections, camera.n_abandoned()), (0, 0));
         let n_counted = (counts.n_images - 1 + counts.n_skipped) as f64;
         assert!(
@@ -92,7 +112,9 @@ fn nokhwa_streams_ten_seconds() {
 #[ignore = "runs in the virtual kernel"]
 fn hanging_nokhwa_call_is_abandoned() {
     let mut camera = open(config());
-    camera.next_image(Duration::from_secs(2)).expect("vivid streams");
+    camera
+        .next_image(Duration::from_secs(2))
+        .expect("vivid streams");
     // vivid stops sending images, and the call of nokhwa never returns.
     v4l2::set_control(&node(WEBCAM), DROP_PERCENT, 100).expect("vivid injects faults");
     let detected_after = time_to_disconnect(&mut camera);
@@ -102,7 +124,10 @@ fn hanging_nokhwa_call_is_abandoned() {
     write_driver_action("unbind");
     let unplugged_at = Instant::now();
     while unplugged_at.elapsed() < Duration::from_secs(1) {
-        assert!(matches!(camera.next_image(Duration::from_millis(50)), Err(Error::Reconnecting { .. })));
+        assert!(matches!(
+            camera.next_image(Duration::from_millis(50)),
+            Err(Error::Reconnecting { .. })
+        ));
     }
     write_driver_action("bind");
     let (image, elapsed) = time_to_recover(&mut camera);
@@ -114,7 +139,9 @@ fn hanging_nokhwa_call_is_abandoned() {
     );
     assert_eq!(camera.counts().n_reconnections, 1);
     for _ in 0..25 {
-        camera.next_image(Duration::from_secs(2)).expect("streaming continues");
+        camera
+            .next_image(Duration::from_secs(2))
+            .expect("streaming continues");
     }
 }
 
@@ -122,7 +149,9 @@ fn hanging_nokhwa_call_is_abandoned() {
 #[ignore = "runs in the virtual kernel"]
 fn nokhwa_camera_survives_unplugging() {
     let mut camera = open(config());
-    camera.next_image(Duration::from_secs(2)).expect("vivid streams");
+    camera
+        .next_image(Duration::from_secs(2))
+        .expect("vivid streams");
     write_driver_action("unbind");
     let unplugged_at = Instant::now();
     let detected_after = time_to_disconnect(&mut camera);
@@ -139,21 +168,47 @@ fn nokhwa_camera_survives_unplugging() {
     );
     // At least one second without a camera, plus the times to bind it and to open it again.
     let lost_range = 20.0..=unplugged_at.elapsed().as_secs_f64() * RATE_HZ + 10.0;
-    assert!(lost_range.contains(&(image.n_skipped as f64)), "{} images lost, expected {lost_range:?}", image.n_skipped);
+    assert!(
+        lost_range.contains(&(image.n_skipped as f64)),
+        "{} images lost, expected {lost_range:?}",
+        image.n_skipped
+    );
 }
 
 #[test]
 #[ignore = "runs in the virtual kernel"]
 fn unsupported_nokhwa_settings_are_errors() {
-    let open_error = |config| NokhwaCamera::open(config).expect_err("the settings are unsupported").to_string();
-    let absent = open_error(Config { device: "no such camera".into(), ..config() });
+    let open_error = |config| {
+        NokhwaCamera::open(config)
+            .expect_err("the settings are unsupported")
+            .to_string()
+    };
+    let absent = open_error(Config {
+        device: "no such camera".into(),
+        ..config()
+    });
     println!("{absent}");
-    assert!(absent.contains("\"no such camera\"") && absent.contains("vivid-000"), "{absent}");
+    assert!(
+        absent.contains("\"no such camera\"") && absent.contains("vivid-000"),
+        "{absent}"
+    );
     let mut large = config();
     large.intrinsics.size_px = [800, 600];
     let large = open_error(large);
     println!("{large}");
     assert!(large.contains("cannot start 800x600 at 25 Hz"), "{large}");
-    assert!(open_error(Config { rate_hz: 29.97, ..config() }).contains("expected an integer"));
-    assert!(open_error(Config { format: Some(V4l2Format::Grey), ..config() }).contains("grey"));
+    assert!(
+        open_error(Config {
+            rate_hz: 29.97,
+            ..config()
+        })
+        .contains("expected an integer")
+    );
+    assert!(
+        open_error(Config {
+            format: Some(V4l2Format::Grey),
+            ..config()
+        })
+        .contains("grey")
+    );
 }

@@ -1,9 +1,10 @@
-//! Host side: boots a machine in QEMU with two Kvaser PCI cards on one CAN bus, and injects faults into their chips.
+//! Host side: boots a machine in QEMU with two Kvaser PCI cards on one CAN bus, and injects faults
+//! into their chips.
 //!
-//! QEMU's chip (SJA1000, `hw/net/can/can_sja1000.c`) produces no errors: it never sets the status bits for errors and
-//! bus-off or their interrupts, and its error counters always read 0. Therefore, these bits are set from outside in the
-//! memory of QEMU, as by a debugger. Everything else runs in the kernel's driver for real chips and the layers above
-//! it.
+//! QEMU's chip (SJA1000, `hw/net/can/can_sja1000.c`) produces no errors: it never sets the status
+//! bits for errors and bus-off or their interrupts, and its error counters always read 0.
+//! Therefore, these bits are set from outside in the memory of QEMU, as by a debugger. Everything
+//! else runs in the kernel's driver for real chips and the layers above it.
 
 use super::{run, write_script};
 use std::fs;
@@ -30,16 +31,17 @@ echo "hil: exit $?"
 $bb reboot -f
 "#;
 
-/// Stands in for `sudo`, which the printed commands use; all processes here run as root. The explicit path bypasses the
-/// commands of busybox.
+/// Stands in for `sudo`, which the printed commands use; all processes here run as root. The
+/// explicit path bypasses the commands of busybox.
 const SUDO: &str = "#!/bin/busybox sh\nexec /bin/\"$@\"\n";
 
-/// Request for fault injection from a test inside: interface, status bits and interrupt bits, both hexadecimal.
+/// Request for fault injection from a test inside: interface, status bits and interrupt bits, both
+/// hexadecimal.
 pub(crate) const INJECT: &str = "hil: inject ";
 /// Answer to a successful request.
 pub(crate) const INJECTED: &str = "injected";
-/// With these values in the last half of its acceptance registers, a chip accepts all frames. The first half is then
-/// available for the interface name.
+/// With these values in the last half of its acceptance registers, a chip accepts all frames. The
+/// first half is then available for the interface name.
 pub(crate) const ACCEPT_ALL: [u8; 4] = [0xFF; 4];
 /// Bits of the status register for errors and bus-off.
 const STATUS_ERRORS: u8 = 0xC0;
@@ -49,16 +51,36 @@ pub(crate) fn install_root(root: &Path) {
     write_script(&root.join("bin/sudo"), SUDO);
 }
 
-/// Boots the machine, waits until it ends, and returns the console output. `kernel` is the folder of
-/// `debian-kernel.sh`.
+/// Boots the machine, waits until it ends, and returns the console output. `kernel` is the folder
+/// of `debian-kernel.sh`.
 pub(crate) fn boot(kernel: &Path, root: &Path) -> String {
     let mut command = Command::new(PROGRAM);
     command
-        .args(["-machine", "pc", "-accel", "tcg", "-cpu", "max", "-smp", "1", "-m", "768"])
-        .args(["-nodefaults", "-no-user-config", "-display", "none", "-no-reboot", "-serial", "stdio"])
-        .args(["-object", "can-bus,id=bus", "-device", "kvaser_pci,canbus=bus", "-device", "kvaser_pci,canbus=bus"])
+        .args([
+            "-machine", "pc", "-accel", "tcg", "-cpu", "max", "-smp", "1", "-m", "768",
+        ])
+        .args([
+            "-nodefaults",
+            "-no-user-config",
+            "-display",
+            "none",
+            "-no-reboot",
+            "-serial",
+            "stdio",
+        ])
+        .args([
+            "-object",
+            "can-bus,id=bus",
+            "-device",
+            "kvaser_pci,canbus=bus",
+            "-device",
+            "kvaser_pci,canbus=bus",
+        ])
         .arg("-fsdev")
-        .arg(format!("local,id=root,path={},security_model=none,readonly=on", root.display()))
+        .arg(format!(
+            "local,id=root,path={},security_model=none,readonly=on",
+            root.display()
+        ))
         .args(["-device", "virtio-9p-pci,fsdev=root,mount_tag=root"])
         .arg("-kernel")
         .arg(kernel.join("vmlinuz"))
@@ -80,29 +102,52 @@ pub(crate) fn boot(kernel: &Path, root: &Path) -> String {
 
 /// Sets the error bits in the status of a chip and adds pending interrupts.
 ///
-/// The chip is located by its acceptance registers, which contain the interface name. In QEMU's memory, the bytes
-/// before them are mode, status, interrupts, enabled interrupts, number of waiting messages, their position, and clock
-/// divider.
+/// The chip is located by its acceptance registers, which contain the interface name. In QEMU's
+/// memory, the bytes before them are mode, status, interrupts, enabled interrupts, number of
+/// waiting messages, their position, and clock divider.
 fn inject_fault(machine: u32, request: &str) -> std::io::Result<()> {
     let words: Vec<&str> = request.split(' ').collect();
-    let &[interface, status, interrupts] = words.as_slice() else { panic!("expected three words, got {request}") };
-    let [status, interrupts] = [status, interrupts].map(|hex| u8::from_str_radix(hex, 16).expect("hexadecimal"));
+    let &[interface, status, interrupts] = words.as_slice() else {
+        panic!("expected three words, got {request}")
+    };
+    let [status, interrupts] =
+        [status, interrupts].map(|hex| u8::from_str_radix(hex, 16).expect("hexadecimal"));
     let maps = fs::read_to_string(format!("/proc/{machine}/maps"))?;
-    let heap = maps.lines().find(|line| line.ends_with("[heap]")).expect("QEMU has a heap");
-    let (from, to) = heap.split_once(' ').and_then(|(range, _)| range.split_once('-')).expect("FROM-TO");
+    let heap = maps
+        .lines()
+        .find(|line| line.ends_with("[heap]"))
+        .expect("QEMU has a heap");
+    let (from, to) = heap
+        .split_once(' ')
+        .and_then(|(range, _)| range.split_once('-'))
+        .expect("FROM-TO");
     let [from, to] = [from, to].map(|hex| u64::from_str_radix(hex, 16).expect("hexadecimal"));
-    let memory = fs::OpenOptions::new().read(true).write(true).open(format!("/proc/{machine}/mem"))?;
+    let memory = fs::OpenOptions::new()
+        .read(true)
+        .write(true)
+        .open(format!("/proc/{machine}/mem"))?;
     let mut bytes = vec![0; usize::try_from(to - from).expect("64 bits")];
     memory.read_exact_at(&mut bytes, from)?;
     let acceptance = [interface.as_bytes(), &ACCEPT_ALL].concat();
-    // In the mode that the driver uses, the highest bit of the clock divider is set. It is not set in other copies of
-    // these bytes in memory.
+    // In the mode that the driver uses, the highest bit of the clock divider is set. It is not set
+    // in other copies of these bytes in memory.
     let is_chip = |at: &usize| bytes[*at..].starts_with(&acceptance) && bytes[*at - 1] & 0x80 != 0;
-    let found: Vec<usize> = (7..bytes.len() - acceptance.len()).filter(is_chip).collect();
+    let found: Vec<usize> = (7..bytes.len() - acceptance.len())
+        .filter(is_chip)
+        .collect();
     let &[at] = found.as_slice() else {
-        return Err(std::io::Error::other(format!("{interface} is {} times in QEMU's memory", found.len())));
+        return Err(std::io::Error::other(format!(
+            "{interface} is {} times in QEMU's memory",
+            found.len()
+        )));
     };
     let (status_at, interrupts_at) = (at - 6, at - 5);
-    memory.write_all_at(&[bytes[status_at] & !STATUS_ERRORS | status], from + status_at as u64)?;
-    memory.write_all_at(&[bytes[interrupts_at] | interrupts], from + interrupts_at as u64)
+    memory.write_all_at(
+        &[bytes[status_at] & !STATUS_ERRORS | status],
+        from + status_at as u64,
+    )?;
+    memory.write_all_at(
+        &[bytes[interrupts_at] | interrupts],
+        from + interrupts_at as u64,
+    )
 }

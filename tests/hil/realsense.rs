@@ -1,5 +1,6 @@
-//! Tests of RealSense cameras without hardware. Files that the library records from a software device are played back
-//! through the production driver, and our depth alignment is compared with the library's.
+//! Tests of RealSense cameras without hardware. Files that the library records from a software
+//! device are played back through the production driver, and our depth alignment is compared with
+//! the library's.
 
 mod realsense_scene;
 
@@ -9,8 +10,8 @@ use drivers::realsense::{Config, Filter, Pace, RealsenseCamera, Settings, Stream
 use drivers::{Camera, Devices, Error, Image, Live, Sample, Source};
 use kinematics::{Intrinsics, Lens, Stamp};
 use realsense_scene::{
-    BEGIN_NANOS, DEPTH_LATER_NANOS, PERIOD_NANOS, RATE_HZ, aligned_by_library, d435i, depth_image, depth_of, image,
-    record, scene_m,
+    BEGIN_NANOS, DEPTH_LATER_NANOS, PERIOD_NANOS, RATE_HZ, aligned_by_library, d435i, depth_image,
+    depth_of, image, record, scene_m,
 };
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
@@ -56,13 +57,21 @@ fn assert_same_lens(got: &Intrinsics, expected: &Intrinsics) {
     let close = |got: f64, expected: f64| (got - expected).abs() <= REL * expected.abs().max(1.0);
     assert_eq!(got.size_px, expected.size_px);
     for axis in 0..2 {
-        assert!(close(got.focal_px[axis], expected.focal_px[axis]), "{got:?}, expected {expected:?}");
-        assert!(close(got.principal_px[axis], expected.principal_px[axis]), "{got:?}, expected {expected:?}");
+        assert!(
+            close(got.focal_px[axis], expected.focal_px[axis]),
+            "{got:?}, expected {expected:?}"
+        );
+        assert!(
+            close(got.principal_px[axis], expected.principal_px[axis]),
+            "{got:?}, expected {expected:?}"
+        );
     }
     match (got.lens, expected.lens) {
         (Lens::BrownConrady(got), Lens::BrownConrady(expected)) => {
             assert!(
-                got.iter().zip(expected).all(|(got, expected)| close(*got, expected)),
+                got.iter()
+                    .zip(expected)
+                    .all(|(got, expected)| close(*got, expected)),
                 "{got:?}, expected {expected:?}"
             );
         }
@@ -80,7 +89,10 @@ fn emulated_camera_round_trips_through_driver() {
             meters_per_count: 0.000_25,
             ..depth_of(&d435i([640, 480], Lens::Pinhole)).clone()
         }),
-        ..d435i([1280, 720], Lens::BrownConrady([0.155, -0.456, -0.0007, 0.0003, 0.41]))
+        ..d435i(
+            [1280, 720],
+            Lens::BrownConrady([0.155, -0.456, -0.0007, 0.0003, 0.41]),
+        )
     };
     for (camera, n_images) in [(d435i([640, 480], d455), N_IMAGES), (l515, 4)] {
         let path = folder.path().join("camera.bag");
@@ -92,7 +104,10 @@ fn emulated_camera_round_trips_through_driver() {
         assert_same_lens(&calibration.intrinsics, &camera.intrinsics);
         assert_same_lens(&reported_depth.intrinsics, &depth.intrinsics);
         let error = reported_depth.camera_from_depth.inverse() * depth.camera_from_depth;
-        assert!(error.translation.vector.norm() < 1e-8 && error.rotation.angle() < 1e-6, "{error}");
+        assert!(
+            error.translation.vector.norm() < 1e-8 && error.rotation.angle() < 1e-6,
+            "{error}"
+        );
         assert_eq!(reported_depth.meters_per_count, depth.meters_per_count);
         // Every image is delivered once, with unchanged bytes and stamp.
         let (depths, colors): (Vec<_>, Vec<_>) = images.into_iter().partition(Image::is_depth);
@@ -105,23 +120,46 @@ fn emulated_camera_round_trips_through_driver() {
             );
             for (got, number) in got.iter().zip(0..) {
                 let expected: Image = expected(&camera, number);
-                assert_eq!((got.stamp, got.size_px, got.format), (expected.stamp, expected.size_px, expected.format));
-                assert!(got.data == expected.data, "the bytes of image {number} differ");
-                let (got_secs, expected_secs) = (got.exposure_secs.unwrap(), expected.exposure_secs.unwrap());
-                assert!((got_secs - expected_secs).abs() < 1e-9, "{got_secs}, expected {expected_secs}");
+                assert_eq!(
+                    (got.stamp, got.size_px, got.format),
+                    (expected.stamp, expected.size_px, expected.format)
+                );
+                assert!(
+                    got.data == expected.data,
+                    "the bytes of image {number} differ"
+                );
+                let (got_secs, expected_secs) =
+                    (got.exposure_secs.unwrap(), expected.exposure_secs.unwrap());
+                assert!(
+                    (got_secs - expected_secs).abs() < 1e-9,
+                    "{got_secs}, expected {expected_secs}"
+                );
                 assert_eq!(got.n_skipped, 0);
             }
         }
         // Depth in meters is accurate to one count.
         let meters = depths[0].decode_depth_m().unwrap();
-        for (ix, meters) in meters.iter().enumerate().filter(|(ix, meters)| *ix > 1 && **meters > 0.0) {
+        for (ix, meters) in meters
+            .iter()
+            .enumerate()
+            .filter(|(ix, meters)| *ix > 1 && **meters > 0.0)
+        {
             let (column, row) = (ix % 640, ix / 640);
-            let ray = depth.intrinsics.unproject([column as f64 + 0.5, row as f64 + 0.5]).unwrap();
+            let ray = depth
+                .intrinsics
+                .unproject([column as f64 + 0.5, row as f64 + 0.5])
+                .unwrap();
             let error_m = (f64::from(*meters) - scene_m(&ray)).abs();
-            assert!(error_m <= depth.meters_per_count * 0.501, "column {column} row {row}: {error_m} m");
+            assert!(
+                error_m <= depth.meters_per_count * 0.501,
+                "column {column} row {row}: {error_m} m"
+            );
         }
         assert!(meters.iter().filter(|meters| **meters > 0.0).count() > 300_000);
-        assert_eq!(driver.counts().n_images, 2 * u64::try_from(n_images).unwrap());
+        assert_eq!(
+            driver.counts().n_images,
+            2 * u64::try_from(n_images).unwrap()
+        );
     }
 }
 
@@ -133,14 +171,32 @@ fn file_plays_in_real_time_and_fast_file_loses_nothing() {
     record(&path, &camera, N_IMAGES);
     let start_time = Instant::now();
     let (_, images) = play(config(path.clone(), &camera, Pace::RealTime));
-    let duration = Duration::from_nanos(((N_IMAGES - 1) * PERIOD_NANOS + DEPTH_LATER_NANOS).unsigned_abs());
-    assert!(start_time.elapsed() >= duration, "{:?}", start_time.elapsed());
+    let duration =
+        Duration::from_nanos(((N_IMAGES - 1) * PERIOD_NANOS + DEPTH_LATER_NANOS).unsigned_abs());
+    assert!(
+        start_time.elapsed() >= duration,
+        "{:?}",
+        start_time.elapsed()
+    );
     let first = images[0].stamp.0;
-    let since: Vec<i64> = images.iter().filter(|image| !image.is_depth()).map(|image| image.stamp.0 - first).collect();
-    assert_eq!(since, (0..N_IMAGES).map(|number| number * PERIOD_NANOS).collect::<Vec<_>>());
+    let since: Vec<i64> = images
+        .iter()
+        .filter(|image| !image.is_depth())
+        .map(|image| image.stamp.0 - first)
+        .collect();
+    assert_eq!(
+        since,
+        (0..N_IMAGES)
+            .map(|number| number * PERIOD_NANOS)
+            .collect::<Vec<_>>()
+    );
     // The file has more images than the queue of a live rig can hold.
     let open = RealsenseCamera::open(config(path, &camera, Pace::Fast)).unwrap();
-    let mut live = Live::new(Devices { cameras: vec![Box::new(open)], ..Devices::default() }).unwrap();
+    let mut live = Live::new(Devices {
+        cameras: vec![Box::new(open)],
+        ..Devices::default()
+    })
+    .unwrap();
     let mut n_images = 0;
     while let Some(Sample::Image(image)) = live.next_sample().unwrap() {
         assert_eq!(image.n_skipped, 0);
@@ -163,13 +219,27 @@ fn file_on_the_clock_starts_at_its_stamps() {
     }
     writer.finish().unwrap();
     // The file contains only color.
-    let clock_config = Config { depth_size_px: None, ..config(path, &camera, Pace::Clock) };
-    let open = RealsenseCamera::open(Config { clock_offset_nanos: starts_at.0 - BEGIN_NANOS, ..clock_config }).unwrap();
-    let mut live = Live::new(Devices { cameras: vec![Box::new(open)], ..Devices::default() }).unwrap();
+    let clock_config = Config {
+        depth_size_px: None,
+        ..config(path, &camera, Pace::Clock)
+    };
+    let open = RealsenseCamera::open(Config {
+        clock_offset_nanos: starts_at.0 - BEGIN_NANOS,
+        ..clock_config
+    })
+    .unwrap();
+    let mut live = Live::new(Devices {
+        cameras: vec![Box::new(open)],
+        ..Devices::default()
+    })
+    .unwrap();
     for number in 0..3 {
         let sample = live.next_sample().unwrap().unwrap();
         assert_eq!(sample.stamp(), Stamp(starts_at.0 + number * PERIOD_NANOS));
-        assert!(drivers::clock::now() >= sample.stamp(), "the image was delivered too early");
+        assert!(
+            drivers::clock::now() >= sample.stamp(),
+            "the image was delivered too early"
+        );
     }
     assert_eq!(live.next_sample().unwrap(), None);
 }
@@ -177,15 +247,30 @@ fn file_on_the_clock_starts_at_its_stamps() {
 #[test]
 fn file_opened_late_starts_at_current_time_without_loss() {
     let folder = tempfile::tempdir().unwrap();
-    let (path, camera) = (folder.path().join("camera.bag"), d435i([640, 480], Lens::Pinhole));
+    let (path, camera) = (
+        folder.path().join("camera.bag"),
+        d435i([640, 480], Lens::Pinhole),
+    );
     let n_before = 30;
     let mut writer = BagWriter::create(&path, &camera).unwrap();
     (0..3 * n_before).for_each(|number| writer.write(&image(&camera, number)).unwrap());
     writer.finish().unwrap();
-    let starts_at = drivers::clock::now() - Duration::from_nanos((n_before * PERIOD_NANOS).unsigned_abs());
-    let clock_config = Config { depth_size_px: None, ..config(path, &camera, Pace::Clock) };
-    let open = RealsenseCamera::open(Config { clock_offset_nanos: starts_at.0 - BEGIN_NANOS, ..clock_config }).unwrap();
-    let mut live = Live::new(Devices { cameras: vec![Box::new(open)], ..Devices::default() }).unwrap();
+    let starts_at =
+        drivers::clock::now() - Duration::from_nanos((n_before * PERIOD_NANOS).unsigned_abs());
+    let clock_config = Config {
+        depth_size_px: None,
+        ..config(path, &camera, Pace::Clock)
+    };
+    let open = RealsenseCamera::open(Config {
+        clock_offset_nanos: starts_at.0 - BEGIN_NANOS,
+        ..clock_config
+    })
+    .unwrap();
+    let mut live = Live::new(Devices {
+        cameras: vec![Box::new(open)],
+        ..Devices::default()
+    })
+    .unwrap();
     let mut images = Vec::new();
     while let Some(Sample::Image(image)) = live.next_sample().unwrap() {
         images.push(image);
@@ -193,7 +278,10 @@ fn file_opened_late_starts_at_current_time_without_loss() {
     let first = (images[0].stamp.0 - starts_at.0) / PERIOD_NANOS;
     assert!((n_before..2 * n_before).contains(&first), "{first}");
     for (ix, image) in (first..).zip(&images) {
-        assert_eq!((image.stamp.0, image.n_skipped), (starts_at.0 + ix * PERIOD_NANOS, 0));
+        assert_eq!(
+            (image.stamp.0, image.n_skipped),
+            (starts_at.0 + ix * PERIOD_NANOS, 0)
+        );
     }
     assert_eq!(first + i64::try_from(images.len()).unwrap(), 3 * n_before);
 }
@@ -201,15 +289,23 @@ fn file_opened_late_starts_at_current_time_without_loss() {
 #[test]
 fn file_not_read_to_its_end_is_closed() {
     let folder = tempfile::tempdir().expect("a folder");
-    let (path, camera) = (folder.path().join("long.bag"), d435i([640, 480], Lens::Pinhole));
+    let (path, camera) = (
+        folder.path().join("long.bag"),
+        d435i([640, 480], Lens::Pinhole),
+    );
     // More images than all queues together can hold.
     record(&path, &camera, 10 * N_IMAGES);
-    let mut open = RealsenseCamera::open(config(path, &camera, Pace::Fast)).expect("opening the file");
+    let mut open =
+        RealsenseCamera::open(config(path, &camera, Pace::Fast)).expect("opening the file");
     open.next_image(TEST_TIMEOUT).expect("the first image");
     std::thread::sleep(Duration::from_millis(500));
     let start_time = Instant::now();
     drop(open);
-    assert!(start_time.elapsed() < TEST_TIMEOUT, "{:?}", start_time.elapsed());
+    assert!(
+        start_time.elapsed() < TEST_TIMEOUT,
+        "{:?}",
+        start_time.elapsed()
+    );
 }
 
 #[test]
@@ -220,32 +316,69 @@ fn missing_streams_are_errors_and_filters_fill_holes() {
     record(&path, &camera, 2);
     let open_error = |config: Config| RealsenseCamera::open(config).unwrap_err().to_string();
     let plain_config = config(path.clone(), &camera, Pace::Fast);
-    let message = open_error(Config { size_px: [848, 480], ..plain_config.clone() });
-    assert!(message.contains("color 848x480") && message.contains("rgb 640x480 at 30 Hz"), "{message}");
-    let message = open_error(Config { stream: Stream::Infrared, ..plain_config.clone() });
+    let message = open_error(Config {
+        size_px: [848, 480],
+        ..plain_config.clone()
+    });
+    assert!(
+        message.contains("color 848x480") && message.contains("rgb 640x480 at 30 Hz"),
+        "{message}"
+    );
+    let message = open_error(Config {
+        stream: Stream::Infrared,
+        ..plain_config.clone()
+    });
     assert!(message.contains("no infrared"), "{message}");
-    let message = open_error(Config { file: Some(folder.path().join("absent.bag")), ..plain_config.clone() });
-    assert!(message.contains("absent.bag") && message.contains("No such file"), "{message}");
+    let message = open_error(Config {
+        file: Some(folder.path().join("absent.bag")),
+        ..plain_config.clone()
+    });
+    assert!(
+        message.contains("absent.bag") && message.contains("No such file"),
+        "{message}"
+    );
     let truncated = folder.path().join("cut.bag");
     std::fs::write(&truncated, &std::fs::read(&path).unwrap()[..5000]).unwrap();
-    let message = open_error(Config { file: Some(truncated), ..plain_config.clone() });
+    let message = open_error(Config {
+        file: Some(truncated),
+        ..plain_config.clone()
+    });
     assert!(message.contains("cut.bag"), "{message}");
     let n_holes = |images: &[Image]| {
         let depth = images.iter().find(|image| image.is_depth()).unwrap();
-        depth.data.as_chunks::<2>().0.iter().filter(|count| **count == [0; 2]).count()
+        depth
+            .data
+            .as_chunks::<2>()
+            .0
+            .iter()
+            .filter(|count| **count == [0; 2])
+            .count()
     };
     let (_, images) = play(plain_config.clone());
     assert!(n_holes(&images) > 1000);
     let filters = vec![Filter::Spatial, Filter::Temporal, Filter::HoleFilling];
-    let (_, filtered) = play(Config { filters, ..plain_config });
+    let (_, filtered) = play(Config {
+        filters,
+        ..plain_config
+    });
     assert_eq!(filtered.len(), images.len());
-    assert!(n_holes(&filtered) * 10 < n_holes(&images), "{} holes left", n_holes(&filtered));
+    assert!(
+        n_holes(&filtered) * 10 < n_holes(&images),
+        "{} holes left",
+        n_holes(&filtered)
+    );
     let stamps = |images: &[Image]| images.iter().map(|image| image.stamp).collect::<Vec<_>>();
     assert_eq!(stamps(&filtered), stamps(&images));
 }
 
 fn counts(image: &Image) -> Vec<u16> {
-    image.data.as_chunks::<2>().0.iter().map(|bytes| u16::from_le_bytes(*bytes)).collect()
+    image
+        .data
+        .as_chunks::<2>()
+        .0
+        .iter()
+        .map(|bytes| u16::from_le_bytes(*bytes))
+        .collect()
 }
 
 fn equal_frac(a: &[u16], b: &[u16]) -> f64 {
@@ -253,16 +386,21 @@ fn equal_frac(a: &[u16], b: &[u16]) -> f64 {
     a.iter().zip(b).filter(|(a, b)| a == b).count() as f64 / a.len() as f64
 }
 
-/// The library's fast path adds half a pixel to the corners of a depth pixel and then rounds, where it should truncate.
-/// This shifts the result by half a pixel to the right and down (`src/proc/sse/sse-align.cpp`; the scalar path is
-/// correct). With a principal point shifted by half a pixel, our result is the same.
+/// The library's fast path adds half a pixel to the corners of a depth pixel and then rounds, where
+/// it should truncate. This shifts the result by half a pixel to the right and down
+/// (`src/proc/sse/sse-align.cpp`; the scalar path is correct). With a principal point shifted by
+/// half a pixel, our result is the same.
 fn with_library_rounding(color: &Intrinsics) -> Intrinsics {
-    Intrinsics { principal_px: color.principal_px.map(|center| center + 0.5), ..color.clone() }
+    Intrinsics {
+        principal_px: color.principal_px.map(|center| center + 0.5),
+        ..color.clone()
+    }
 }
 
 #[test]
 fn alignment_matches_library_except_half_pixel() {
-    // Both computations use single precision, so a corner occasionally falls on the other side of a pixel edge.
+    // Both computations use single precision, so a corner occasionally falls on the other side of a
+    // pixel edge.
     const EQUAL_FRAC: f64 = 0.999;
     let folder = tempfile::tempdir().unwrap();
     for color_px in [[640, 480], [1280, 720]] {
@@ -271,11 +409,18 @@ fn alignment_matches_library_except_half_pixel() {
         record(&path, &camera, 4);
         let depth = depth_of(&camera);
         let align = |color: &Intrinsics, image: &Image| {
-            counts(&DepthAlignment::new(&depth.intrinsics, color, &depth.camera_from_depth).align(image).unwrap())
+            counts(
+                &DepthAlignment::new(&depth.intrinsics, color, &depth.camera_from_depth)
+                    .align(image)
+                    .unwrap(),
+            )
         };
         for (number, library, _) in aligned_by_library(&path, 3) {
             let image = depth_image(&camera, number);
-            let equal_with_rounding = equal_frac(&align(&with_library_rounding(&camera.intrinsics), &image), &library);
+            let equal_with_rounding = equal_frac(
+                &align(&with_library_rounding(&camera.intrinsics), &image),
+                &library,
+            );
             let equal_without_rounding = equal_frac(&align(&camera.intrinsics, &image), &library);
             eprintln!(
                 "{color_px:?}: equal {equal_with_rounding:.5}; without the half-pixel shift {equal_without_rounding:.5}"
@@ -284,7 +429,10 @@ fn alignment_matches_library_except_half_pixel() {
                 equal_with_rounding >= EQUAL_FRAC && equal_without_rounding < equal_with_rounding,
                 "{color_px:?}: {equal_with_rounding}, {equal_without_rounding}"
             );
-            assert!(library.iter().filter(|count| **count > 0).count() > library.len() / 2, "the scene is not visible");
+            assert!(
+                library.iter().filter(|count| **count > 0).count() > library.len() / 2,
+                "the scene is not visible"
+            );
         }
     }
 }

@@ -1,5 +1,5 @@
-//! An emulated RealSense camera in front of a simple scene, and the depth alignment of librealsense2; for tests and a
-//! benchmark.
+//! An emulated RealSense camera in front of a simple scene, and the depth alignment of
+//! librealsense2; for tests and a benchmark.
 
 use drivers::realsense::emulated::{BagWriter, EmulatedCamera, EmulatedDepth};
 use drivers::{Image, PixelFormat};
@@ -33,7 +33,10 @@ pub(crate) fn d435i(color_px: [u32; 2], lens: Lens) -> EmulatedCamera {
         intrinsics: Intrinsics {
             size_px: color_px,
             focal_px: [focal_px, focal_px + 0.75],
-            principal_px: [f64::from(color_px[0]) * 0.5 + 3.25, f64::from(color_px[1]) * 0.5 - 2.125],
+            principal_px: [
+                f64::from(color_px[0]) * 0.5 + 3.25,
+                f64::from(color_px[1]) * 0.5 - 2.125,
+            ],
             lens,
             rectified: false,
         },
@@ -59,18 +62,33 @@ pub(crate) fn depth_of(camera: &EmulatedCamera) -> &EmulatedDepth {
     camera.depth.as_ref().expect("the camera has depth")
 }
 
-/// Depth in meters along a ray of the plane `z` = 1: a slanted wall, a floor, and a box with a slanted front.
+/// Depth in meters along a ray of the plane `z` = 1: a slanted wall, a floor, and a box with a
+/// slanted front.
 pub(crate) fn scene_m(ray: &Vector3<f64>) -> f64 {
     // normal * point = offset
-    let planes = [(Vector3::new(0.25, 0.05, 1.0), 1.6), (Vector3::new(0.0, 1.0, 0.1), 0.7)];
+    let planes = [
+        (Vector3::new(0.25, 0.05, 1.0), 1.6),
+        (Vector3::new(0.0, 1.0, 0.1), 0.7),
+    ];
     let distance_along_ray = |(normal, offset): &(Vector3<f64>, f64)| {
         let along = normal.dot(ray);
-        if along > 0.0 { offset / along } else { f64::INFINITY }
+        if along > 0.0 {
+            offset / along
+        } else {
+            f64::INFINITY
+        }
     };
-    let background = planes.iter().map(distance_along_ray).fold(f64::INFINITY, f64::min);
+    let background = planes
+        .iter()
+        .map(distance_along_ray)
+        .fold(f64::INFINITY, f64::min);
     let front = distance_along_ray(&(Vector3::new(-0.3, 0.2, 1.0), 0.65));
     let hit = ray * front;
-    if hit.x.abs() < 0.12 && (hit.y - 0.03).abs() < 0.1 { front.min(background) } else { background }
+    if hit.x.abs() < 0.12 && (hit.y - 0.03).abs() < 0.1 {
+        front.min(background)
+    } else {
+        background
+    }
 }
 
 /// Depth counts of the scene, with some holes.
@@ -81,7 +99,10 @@ fn counts_of(depth: &EmulatedDepth) -> Vec<u16> {
         if (column * 7 + row * 13) % 97 == 0 {
             return 0;
         }
-        let ray = depth.intrinsics.unproject([f64::from(column) + 0.5, f64::from(row) + 0.5]).expect("a pinhole");
+        let ray = depth
+            .intrinsics
+            .unproject([f64::from(column) + 0.5, f64::from(row) + 0.5])
+            .expect("a pinhole");
         #[expect(
             clippy::cast_possible_truncation,
             clippy::cast_sign_loss,
@@ -95,7 +116,8 @@ fn counts_of(depth: &EmulatedDepth) -> Vec<u16> {
 
 pub(crate) fn image(camera: &EmulatedCamera, number: i64) -> Image {
     let [width, height] = camera.intrinsics.size_px;
-    let bytes = (0..width * height * 3).map(|ix| (i64::from(ix) * 31 + number * 7).to_le_bytes()[0]);
+    let bytes =
+        (0..width * height * 3).map(|ix| (i64::from(ix) * 31 + number * 7).to_le_bytes()[0]);
     Image {
         camera: "wrist".into(),
         stamp: Stamp(BEGIN_NANOS + number * PERIOD_NANOS),
@@ -115,8 +137,13 @@ pub(crate) fn depth_image(camera: &EmulatedCamera, number: i64) -> Image {
     Image {
         stamp: Stamp(BEGIN_NANOS + number * PERIOD_NANOS + DEPTH_LATER_NANOS),
         size_px: depth.intrinsics.size_px,
-        format: PixelFormat::DepthU16 { meters_per_count: depth.meters_per_count },
-        data: counts.iter().flat_map(|count| count.to_le_bytes()).collect(),
+        format: PixelFormat::DepthU16 {
+            meters_per_count: depth.meters_per_count,
+        },
+        data: counts
+            .iter()
+            .flat_map(|count| count.to_le_bytes())
+            .collect(),
         exposure_secs: Some(0.007_123),
         ..image(camera, number)
     }
@@ -126,17 +153,23 @@ pub(crate) fn depth_image(camera: &EmulatedCamera, number: i64) -> Image {
 pub(crate) fn record(path: &Path, camera: &EmulatedCamera, n_images: i64) {
     let mut writer = BagWriter::create(path, camera).expect("a file to write");
     for number in 0..n_images {
-        writer.write(&image(camera, number)).expect("writing an image");
-        writer.write(&depth_image(camera, number)).expect("writing an image");
+        writer
+            .write(&image(camera, number))
+            .expect("writing an image");
+        writer
+            .write(&depth_image(camera, number))
+            .expect("writing an image");
     }
     writer.finish().expect("completing the file");
 }
 
-/// Aligns the depth of a file to color with the library. Returns the index of each image, the counts, and the time it
-/// took.
+/// Aligns the depth of a file to color with the library. Returns the index of each image, the
+/// counts, and the time it took.
 pub(crate) fn aligned_by_library(path: &Path, n_images: usize) -> Vec<(i64, Vec<u16>, Duration)> {
     let mut config = PipelineConfig::new();
-    config.enable_device_from_file(path, true).expect("the file is valid");
+    config
+        .enable_device_from_file(path, true)
+        .expect("the file is valid");
     let mut pipeline = InactivePipeline::try_from(&Context::new().expect("the library starts"))
         .expect("a pipeline")
         .start(Some(config))
@@ -150,7 +183,9 @@ pub(crate) fn aligned_by_library(path: &Path, n_images: usize) -> Vec<(i64, Vec<
         }
         let start_time = Instant::now();
         align.queue(frames).expect("depth and color");
-        let frames = align.wait(IMAGE_TIMEOUT).expect("the library aligns the images");
+        let frames = align
+            .wait(IMAGE_TIMEOUT)
+            .expect("the library aligns the images");
         let elapsed = start_time.elapsed();
         for depth in frames.frames_of_type::<DepthFrame>() {
             let count = |pixel: PixelKind<'_>| match pixel {

@@ -1,5 +1,5 @@
-//! Checks the dependencies between the crates of the workspace, as reported by `cargo metadata`, against
-//! ARCHITECTURE.md.
+//! Checks the dependencies between the crates of the workspace, as reported by `cargo metadata`,
+//! against ARCHITECTURE.md.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::process::Command;
@@ -16,14 +16,55 @@ const ALLOWED: [(&str, &[&str]); 16] = [
     ("targets", &["kinematics"]),
     ("test-features", &[]),
     ("test-support", &[]),
-    ("capture", &["background", "calibration", "drivers", "files", "keyframe", "kinematics", "sim"]),
-    ("trainer", &["background", "calibration", "files", "keyframe", "kinematics"]),
+    (
+        "capture",
+        &[
+            "background",
+            "calibration",
+            "drivers",
+            "files",
+            "keyframe",
+            "kinematics",
+            "sim",
+        ],
+    ),
+    (
+        "trainer",
+        &[
+            "background",
+            "calibration",
+            "files",
+            "keyframe",
+            "kinematics",
+        ],
+    ),
     ("viz", &["files", "keyframe", "kinematics", "trainer"]),
     (
         "session",
-        &["background", "calibration", "capture", "drivers", "files", "keyframe", "kinematics", "trainer", "viz"],
+        &[
+            "background",
+            "calibration",
+            "capture",
+            "drivers",
+            "files",
+            "keyframe",
+            "kinematics",
+            "trainer",
+            "viz",
+        ],
     ),
-    ("bench", &["calibration", "capture", "files", "keyframe", "kinematics", "session", "trainer"]),
+    (
+        "bench",
+        &[
+            "calibration",
+            "capture",
+            "files",
+            "keyframe",
+            "kinematics",
+            "session",
+            "trainer",
+        ],
+    ),
     (
         "fieldrig",
         &[
@@ -52,21 +93,40 @@ type Dependencies = BTreeMap<String, BTreeSet<String>>;
 
 fn dependencies() -> Dependencies {
     let output = Command::new(env!("CARGO"))
-        .args(["metadata", "--format-version", "1", "--no-deps", "--offline"])
+        .args([
+            "metadata",
+            "--format-version",
+            "1",
+            "--no-deps",
+            "--offline",
+        ])
         .current_dir(env!("CARGO_MANIFEST_DIR"))
         .output()
         .expect("cargo runs");
-    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
-    let metadata: serde_json::Value = serde_json::from_slice(&output.stdout).expect("cargo prints JSON");
+    assert!(
+        output.status.success(),
+        "{}",
+        String::from_utf8_lossy(&output.stderr)
+    );
+    let metadata: serde_json::Value =
+        serde_json::from_slice(&output.stdout).expect("cargo prints JSON");
     let text = |value: &serde_json::Value| value.as_str().expect("a string").to_owned();
     metadata["packages"]
         .as_array()
         .expect("packages")
         .iter()
         .map(|package| {
-            let direct = package["dependencies"].as_array().expect("dependencies").iter();
+            let direct = package["dependencies"]
+                .as_array()
+                .expect("dependencies")
+                .iter();
             let shipped = direct.filter(|dependency| dependency["kind"] != "dev");
-            (text(&package["name"]), shipped.map(|dependency| text(&dependency["name"])).collect())
+            (
+                text(&package["name"]),
+                shipped
+                    .map(|dependency| text(&dependency["name"]))
+                    .collect(),
+            )
         })
         .collect()
 }
@@ -81,11 +141,15 @@ fn violations(dependencies: &Dependencies) -> Vec<String> {
             continue;
         };
         for dependency in direct {
-            if workspace_crates.contains(dependency.as_str()) && !allowed.contains(&dependency.as_str()) {
+            if workspace_crates.contains(dependency.as_str())
+                && !allowed.contains(&dependency.as_str())
+            {
                 violations_found.push(format!("{package} -> {dependency}"));
             }
             if package != "fieldrig" && BINARY_ONLY.contains(&dependency.as_str()) {
-                violations_found.push(format!("{package} -> {dependency}, which only fieldrig may use"));
+                violations_found.push(format!(
+                    "{package} -> {dependency}, which only fieldrig may use"
+                ));
             }
         }
     }
@@ -95,32 +159,53 @@ fn violations(dependencies: &Dependencies) -> Vec<String> {
 #[test]
 fn dependencies_follow_architecture() {
     let dependencies = dependencies();
-    assert_eq!(dependencies.len(), ALLOWED.len(), "crates: {:?}", dependencies.keys());
+    assert_eq!(
+        dependencies.len(),
+        ALLOWED.len(),
+        "crates: {:?}",
+        dependencies.keys()
+    );
     assert_eq!(violations(&dependencies), Vec::<String>::new());
 }
 
 #[test]
 fn forbidden_dependency_is_detected() {
     let mut dependencies = dependencies();
-    dependencies.get_mut("trainer").expect("trainer").extend(["drivers".to_owned(), "anyhow".to_owned()]);
+    dependencies
+        .get_mut("trainer")
+        .expect("trainer")
+        .extend(["drivers".to_owned(), "anyhow".to_owned()]);
     dependencies.insert("shortcut".to_owned(), BTreeSet::new());
-    let expected =
-        ["shortcut has no rule in this test", "trainer -> anyhow, which only fieldrig may use", "trainer -> drivers"];
+    let expected = [
+        "shortcut has no rule in this test",
+        "trainer -> anyhow, which only fieldrig may use",
+        "trainer -> drivers",
+    ];
     assert_eq!(violations(&dependencies), expected);
 }
 
-/// Dependencies are compiled without checks of overflow and without debug assertions, the crates of this workspace with them.
+/// Dependencies are compiled without checks of overflow and without debug assertions, the crates of
+/// this workspace with them.
 #[test]
 fn every_crate_is_checked_in_development() {
     const CHECKS: [&str; 2] = ["debug-assertions", "overflow-checks"];
-    let manifest = std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/Cargo.toml")).expect("a manifest");
+    let manifest = std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/Cargo.toml"))
+        .expect("a manifest");
     let manifest: toml::Table = manifest.parse().expect("TOML");
     let profile = manifest["profile"]["dev"].as_table().expect("a table");
     let packages = profile["package"].as_table().expect("a table");
     for check in CHECKS {
-        assert!(packages["*"].get(check).is_some() && !profile.contains_key(check), "{check}");
+        assert!(
+            packages["*"].get(check).is_some() && !profile.contains_key(check),
+            "{check}"
+        );
         for (name, _) in ALLOWED {
-            assert!(packages.get(name).is_none_or(|package| package.get(check).is_none()), "{check} of {name}");
+            assert!(
+                packages
+                    .get(name)
+                    .is_none_or(|package| package.get(check).is_none()),
+                "{check} of {name}"
+            );
         }
     }
 }

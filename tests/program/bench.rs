@@ -1,5 +1,5 @@
-//! Tests `fieldrig bench curve`, `budget`, `ablation` and `stability` as users run them, on a scene of a few tiny
-//! photos.
+//! Tests `fieldrig bench curve`, `budget`, `ablation` and `stability` as users run them, on a scene
+//! of a few tiny photos.
 
 use image::RgbImage;
 use serde_json::{Value, json};
@@ -16,15 +16,27 @@ fn scene(folder: &Path) {
     for ix in 0..N_PHOTOS {
         let x_m = 0.05 * f64::from(ix);
         let color = |u: u32, v: u32| {
-            let (x, y) = (x_m + (f64::from(u) - 15.5) / focal_px, (f64::from(v) - 11.5) / focal_px);
+            let (x, y) = (
+                x_m + (f64::from(u) - 15.5) / focal_px,
+                (f64::from(v) - 11.5) / focal_px,
+            );
             #[expect(clippy::cast_possible_truncation, reason = "27 to 227")]
-            let wave = |phase: f64| (127.0 + 100.0 * (8.0 * x + phase).sin() * (7.0 * y + phase).cos()) as u8;
+            let wave = |phase: f64| {
+                (127.0 + 100.0 * (8.0 * x + phase).sin() * (7.0 * y + phase).cos()) as u8
+            };
             image::Rgb([wave(0.0), wave(1.0), wave(2.0)])
         };
         let name = format!("{ix:02}.png");
-        RgbImage::from_fn(SIZE_PX[0], SIZE_PX[1], color).save(folder.join(&name)).expect("the disk has space");
+        RgbImage::from_fn(SIZE_PX[0], SIZE_PX[1], color)
+            .save(folder.join(&name))
+            .expect("the disk has space");
         // An OpenGL camera that looks along -z, as in nerfstudio.
-        let rows = [[1.0, 0.0, 0.0, x_m], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 1.0], [0.0, 0.0, 0.0, 1.0]];
+        let rows = [
+            [1.0, 0.0, 0.0, x_m],
+            [0.0, 1.0, 0.0, 0.0],
+            [0.0, 0.0, 1.0, 1.0],
+            [0.0, 0.0, 0.0, 1.0],
+        ];
         frames.push(json!({ "file_path": name, "transform_matrix": rows }));
     }
     let [w, h] = SIZE_PX;
@@ -34,16 +46,27 @@ fn scene(folder: &Path) {
 
 fn bench(folder: &Path, args: &[&str]) -> Output {
     let mut command = Command::new(env!("CARGO_BIN_EXE_fieldrig"));
-    command.current_dir(folder).env_remove("FIELDRIG_LPIPS_WEIGHTS").arg("bench").args(args);
+    command
+        .current_dir(folder)
+        .env_remove("FIELDRIG_LPIPS_WEIGHTS")
+        .arg("bench")
+        .args(args);
     command.output().expect("fieldrig starts")
 }
 
 /// The JSON lines of a successful bench.
 fn events(folder: &Path, args: &[&str]) -> Vec<Value> {
     let output = bench(folder, args);
-    assert!(output.status.success(), "{args:?}: {}", String::from_utf8_lossy(&output.stderr));
+    assert!(
+        output.status.success(),
+        "{args:?}: {}",
+        String::from_utf8_lossy(&output.stderr)
+    );
     let stdout = String::from_utf8(output.stdout).expect("stdout is UTF-8");
-    stdout.lines().map(|line| serde_json::from_str(line).expect("one JSON object per line")).collect()
+    stdout
+        .lines()
+        .map(|line| serde_json::from_str(line).expect("one JSON object per line"))
+        .collect()
 }
 
 /// Asserts that a bench fails with one error message that contains all `words`.
@@ -51,29 +74,59 @@ fn assert_fails_with(folder: &Path, args: &[&str], code: i32, words: &[&str]) {
     let output = bench(folder, args);
     let printed = String::from_utf8_lossy(&output.stderr);
     assert_eq!(output.status.code(), Some(code), "{args:?}: {printed}");
-    assert!(words.iter().all(|word| printed.contains(word)), "{args:?}: {printed}");
-    assert_eq!(printed.lines().filter(|line| line.starts_with("error: ")).count(), 1, "{printed}");
+    assert!(
+        words.iter().all(|word| printed.contains(word)),
+        "{args:?}: {printed}"
+    );
+    assert_eq!(
+        printed
+            .lines()
+            .filter(|line| line.starts_with("error: "))
+            .count(),
+        1,
+        "{printed}"
+    );
 }
 
 fn assert_chart(folder: &Path, name: &str) {
     let svg = std::fs::read_to_string(folder.join(format!("{name}.svg"))).expect("a drawing");
-    assert!(svg.contains("test PSNR, dB") || svg.contains("gain, dB"), "{svg}");
+    assert!(
+        svg.contains("test PSNR, dB") || svg.contains("gain, dB"),
+        "{svg}"
+    );
     assert!(!svg.contains("NaN") && !svg.contains("inf"), "{svg}");
-    let picture = image::open(folder.join(format!("{name}.png"))).expect("a picture").into_rgb8();
+    let picture = image::open(folder.join(format!("{name}.png")))
+        .expect("a picture")
+        .into_rgb8();
     let n_inked = picture.pixels().filter(|pixel| pixel.0 != [255; 3]).count();
-    assert!(picture.width() > 1000 && n_inked > 10_000, "{name}: {n_inked} pixels drawn");
+    assert!(
+        picture.width() > 1000 && n_inked > 10_000,
+        "{name}: {n_inked} pixels drawn"
+    );
 }
 
 #[test]
 fn kernel_bench_reports_every_variant() {
     let folder = tempfile::tempdir().expect("a folder");
-    let args = ["kernels", "--size", "64x48", "--splats", "2000", "--repeats", "1", "--inside", "--json"];
+    let args = [
+        "kernels",
+        "--size",
+        "64x48",
+        "--splats",
+        "2000",
+        "--repeats",
+        "1",
+        "--inside",
+        "--json",
+    ];
     let row = &events(folder.path(), &args)[0];
     for column in ["render_millis", "step_millis", "step_visible_millis"] {
         assert!(row[column].as_f64() > Some(0.0), "{column}: {row}");
     }
     assert!(
-        row["n_splats_in_view"].as_u64().is_some_and(|n| (50..1500).contains(&n)),
+        row["n_splats_in_view"]
+            .as_u64()
+            .is_some_and(|n| (50..1500).contains(&n)),
         "only some of the splats are visible: {row}"
     );
     let plain = Command::new(env!("CARGO_BIN_EXE_fieldrig"))
@@ -85,15 +138,30 @@ fn kernel_bench_reports_every_variant() {
     assert!(row["step_visible_millis"].as_f64() > Some(0.0), "{row}");
 }
 
-/// Checks the counts that `--scan` imitates (docs/benchmarks/README.md), with as many splats per pixel as a scan.
+/// Checks the counts that `--scan` imitates (docs/benchmarks/README.md), with as many splats per
+/// pixel as a scan.
 #[test]
 fn kernel_bench_of_a_scan_has_uneven_lists() {
     let folder = tempfile::tempdir().expect("a folder");
     let row = &events(
         folder.path(),
-        &["kernels", "--scan", "--size", "160x120", "--splats", "25000", "--repeats", "1", "--json"],
+        &[
+            "kernels",
+            "--scan",
+            "--size",
+            "160x120",
+            "--splats",
+            "25000",
+            "--repeats",
+            "1",
+            "--json",
+        ],
     )[0];
-    let count = |name: &str| row[name].as_f64().unwrap_or_else(|| panic!("no {name} in {row}"));
+    let count = |name: &str| {
+        row[name]
+            .as_f64()
+            .unwrap_or_else(|| panic!("no {name} in {row}"))
+    };
     let mean = count("n_intersections") / count("n_tiles");
     assert!((400.0..900.0).contains(&mean), "{row}");
     let visible_frac = count("n_visible") / count("n_intersections");
@@ -107,42 +175,95 @@ fn curve_bench_draws_peers_and_resumes() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
     scene(folder);
-    let peer =
-        json!({ "rows": [{ "seconds": 0.25, "psnr": 12.0, "n": 50 }, { "seconds": 1.0, "psnr": 26.0, "n": 90 }] });
+    let peer = json!({ "rows": [{ "seconds": 0.25, "psnr": 12.0, "n": 50 }, { "seconds": 1.0, "psnr": 26.0, "n": 90 }] });
     std::fs::write(folder.join("other.json"), peer.to_string()).expect("the disk has space");
-    let args =
-        ["curve", ".", "--seconds", "0.6", "--seeds", "2", "--max-splats", "500", "--peer", "other.json", "--out", "c"];
+    let args = [
+        "curve",
+        ".",
+        "--seconds",
+        "0.6",
+        "--seeds",
+        "2",
+        "--max-splats",
+        "500",
+        "--peer",
+        "other.json",
+        "--out",
+        "c",
+    ];
     let printed = events(folder, &[&args[..], &["--json"]].concat());
-    assert_eq!(printed.iter().filter(|event| event["event"] == "run").count(), 2);
-    let lines = printed[2]["findings"]["lines"].as_array().expect("lines").clone();
+    assert_eq!(
+        printed
+            .iter()
+            .filter(|event| event["event"] == "run")
+            .count(),
+        2
+    );
+    let lines = printed[2]["findings"]["lines"]
+        .as_array()
+        .expect("lines")
+        .clone();
     assert_eq!((lines.len(), &lines[1]["label"]), (2, &json!("other")));
-    assert!(lines[0]["points"].as_array().is_some_and(|points| !points.is_empty()), "{}", lines[0]);
+    assert!(
+        lines[0]["points"]
+            .as_array()
+            .is_some_and(|points| !points.is_empty()),
+        "{}",
+        lines[0]
+    );
     assert_eq!(lines[0]["summary"]["n_runs"], 2);
     let reached = &lines[1]["summary"]["seconds_to"][0];
-    assert!(reached["seconds"].as_f64().is_some_and(|secs| (0.8..1.0).contains(&secs)), "{reached}");
+    assert!(
+        reached["seconds"]
+            .as_f64()
+            .is_some_and(|secs| (0.8..1.0).contains(&secs)),
+        "{reached}"
+    );
     assert_chart(&folder.join("c"), "curve");
     let page = std::fs::read_to_string(folder.join("c/curve.html")).expect("a page");
     assert!(page.contains("<svg ") && page.contains("to 28 dB"));
 
     // Only the removed run is repeated, not the finished one.
     let runs = std::fs::read_dir(folder.join("c/bench-runs")).expect("runs");
-    let first = runs.map(|run| run.expect("a run").path()).min().expect("a run");
+    let first = runs
+        .map(|run| run.expect("a run").path())
+        .min()
+        .expect("a run");
     std::fs::remove_file(first).expect("removed");
     let again = events(folder, &[&args[..], &["--json"]].concat());
-    assert_eq!([&again[0]["cached"], &again[1]["cached"]], [&json!(false), &json!(true)]);
+    assert_eq!(
+        [&again[0]["cached"], &again[1]["cached"]],
+        [&json!(false), &json!(true)]
+    );
     assert_eq!(again[1]["end"], printed[1]["end"]);
-    let changed = ["curve", ".", "--seconds", "0.6", "--seeds", "2", "--max-splats", "400", "--out", "c"];
+    let changed = [
+        "curve",
+        ".",
+        "--seconds",
+        "0.6",
+        "--seeds",
+        "2",
+        "--max-splats",
+        "400",
+        "--out",
+        "c",
+    ];
     assert_fails_with(folder, &changed, 2, &["max_splats", "--out c"]);
 }
 
 /// Adds depth images of 1 m everywhere, the distance of the wall of [`scene`].
 fn add_depth(folder: &Path) {
     let file = folder.join("transforms.json");
-    let mut scene: Value = serde_json::from_slice(&std::fs::read(&file).expect("a scene")).expect("JSON");
+    let mut scene: Value =
+        serde_json::from_slice(&std::fs::read(&file).expect("a scene")).expect("JSON");
     let [width, height] = SIZE_PX;
     for frame in scene["frames"].as_array_mut().expect("frames") {
         let name = format!("depth_{}", frame["file_path"].as_str().expect("a name"));
-        let depth = image::ImageBuffer::<image::Luma<u16>, _>::from_pixel(width, height, image::Luma([1000]));
+        let depth = image::ImageBuffer::<image::Luma<u16>, _>::from_pixel(
+            width,
+            height,
+            image::Luma([1000]),
+        );
         depth.save(folder.join(&name)).expect("the disk has space");
         frame["depth_file_path"] = json!(name);
     }
@@ -158,42 +279,141 @@ fn curve_bench_skips_methods_without_sufficient_data() {
         scene(&folder.join(data));
     }
     add_depth(&folder.join("deep"));
-    let one = ["curve", "deep", "flat", "--seconds", "0.4", "--seeds", "1", "--max-splats", "300", "--out", "c"];
-    let printed = events(folder, &[&one[..], &["--method", "splat", "--json"]].concat());
-    assert_eq!(printed.iter().filter(|event| event["event"] == "run").count(), 2);
+    let one = [
+        "curve",
+        "deep",
+        "flat",
+        "--seconds",
+        "0.4",
+        "--seeds",
+        "1",
+        "--max-splats",
+        "300",
+        "--out",
+        "c",
+    ];
+    let printed = events(
+        folder,
+        &[&one[..], &["--method", "splat", "--json"]].concat(),
+    );
+    assert_eq!(
+        printed
+            .iter()
+            .filter(|event| event["event"] == "run")
+            .count(),
+        2
+    );
     // Adding methods in the same folder does not repeat finished runs.
-    let printed = events(folder, &[&one[..], &["--method", "splat,tsdf,nerf", "--json"]].concat());
-    let cached: Vec<bool> = printed.iter().filter_map(|event| event["cached"].as_bool()).collect();
+    let printed = events(
+        folder,
+        &[&one[..], &["--method", "splat,tsdf,nerf", "--json"]].concat(),
+    );
+    let cached: Vec<bool> = printed
+        .iter()
+        .filter_map(|event| event["cached"].as_bool())
+        .collect();
     assert_eq!(cached, [true, false, false, true, false]);
     let findings = &printed.last().expect("events")["findings"];
     let lines = findings["lines"].as_array().expect("lines");
-    let labels: Vec<&str> = lines.iter().filter_map(|line| line["label"].as_str()).collect();
-    assert_eq!(labels, ["deep, splat", "deep, tsdf", "deep, nerf", "flat, splat", "flat, nerf"]);
-    assert!(findings["notes"][0].as_str().is_some_and(|note| note.contains("flat has no depth")), "{findings}");
+    let labels: Vec<&str> = lines
+        .iter()
+        .filter_map(|line| line["label"].as_str())
+        .collect();
+    assert_eq!(
+        labels,
+        [
+            "deep, splat",
+            "deep, tsdf",
+            "deep, nerf",
+            "flat, splat",
+            "flat, nerf"
+        ]
+    );
+    assert!(
+        findings["notes"][0]
+            .as_str()
+            .is_some_and(|note| note.contains("flat has no depth")),
+        "{findings}"
+    );
     for line in lines {
-        assert_eq!(Some(line["method"].as_str()), line["label"].as_str().map(|label| label.split(", ").nth(1)));
-        assert!(line["points"].as_array().is_some_and(|points| !points.is_empty()), "{line}");
+        assert_eq!(
+            Some(line["method"].as_str()),
+            line["label"].as_str().map(|label| label.split(", ").nth(1))
+        );
+        assert!(
+            line["points"]
+                .as_array()
+                .is_some_and(|points| !points.is_empty()),
+            "{line}"
+        );
         for known in ["psnr", "seconds", "primitives", "bytes"] {
-            assert!(line["summary"][known].as_f64() > Some(0.0), "{known}: {line}");
+            assert!(
+                line["summary"][known].as_f64() > Some(0.0),
+                "{known}: {line}"
+            );
         }
     }
     assert_chart(&folder.join("c"), "curve");
     assert_chart(&folder.join("c"), "curve-size");
     let page = std::fs::read_to_string(folder.join("c/curve.html")).expect("a page");
-    assert!(page.contains("deep, nerf") && page.contains("flat has no depth"), "{page}");
+    assert!(
+        page.contains("deep, nerf") && page.contains("flat has no depth"),
+        "{page}"
+    );
 
     // Training of a distance field ends once every image is fused, before the time limit.
     let printed = events(
         folder,
-        &["curve", "deep", "--method", "tsdf", "--seconds", "60", "--seeds", "1", "--out", "e", "--json"],
+        &[
+            "curve",
+            "deep",
+            "--method",
+            "tsdf",
+            "--seconds",
+            "60",
+            "--seeds",
+            "1",
+            "--out",
+            "e",
+            "--json",
+        ],
     );
     let tsdf = &printed.last().expect("events")["findings"]["lines"][0]["runs"][0];
     assert_eq!(tsdf["end"]["step"], tsdf["settings"]["n_train"], "{tsdf}");
-    assert!(tsdf["end"]["seconds"].as_f64().is_some_and(|secs| secs < 60.0), "{tsdf}");
+    assert!(
+        tsdf["end"]["seconds"]
+            .as_f64()
+            .is_some_and(|secs| secs < 60.0),
+        "{tsdf}"
+    );
 
-    assert_fails_with(folder, &["curve", "flat", "--method", "tsdf", "--seconds", "1", "--out", "d"], 4, &["depth"]);
-    assert_fails_with(folder, &["budget", "flat", "--method", "splat,nerf"], 2, &["splat and nerf"]);
-    assert_fails_with(folder, &["stability", "flat", "--method", "splat,nerf"], 2, &["a single method"]);
+    assert_fails_with(
+        folder,
+        &[
+            "curve",
+            "flat",
+            "--method",
+            "tsdf",
+            "--seconds",
+            "1",
+            "--out",
+            "d",
+        ],
+        4,
+        &["depth"],
+    );
+    assert_fails_with(
+        folder,
+        &["budget", "flat", "--method", "splat,nerf"],
+        2,
+        &["splat and nerf"],
+    );
+    assert_fails_with(
+        folder,
+        &["stability", "flat", "--method", "splat,nerf"],
+        2,
+        &["a single method"],
+    );
 }
 
 #[test]
@@ -201,9 +421,19 @@ fn budget_bench_reports_the_automatic_count() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
     scene(folder);
-    let printed = events(folder, &["budget", ".", "--steps", "20", "--splats", "200,50", "--out", "b", "--json"]);
+    let printed = events(
+        folder,
+        &[
+            "budget", ".", "--steps", "20", "--splats", "200,50", "--out", "b", "--json",
+        ],
+    );
     let findings = &printed.last().expect("events")["findings"];
-    assert!(findings["automatic"]["psnr"].as_f64().is_some_and(f64::is_finite), "{findings}");
+    assert!(
+        findings["automatic"]["psnr"]
+            .as_f64()
+            .is_some_and(f64::is_finite),
+        "{findings}"
+    );
     let caps: Vec<u64> = findings["caps"]
         .as_array()
         .expect("caps")
@@ -212,11 +442,19 @@ fn budget_bench_reports_the_automatic_count() {
         .collect();
     assert_eq!(caps, [50, 200]);
     for capped in findings["caps"].as_array().expect("caps") {
-        assert!(capped["primitives"].as_f64() <= capped["cap"].as_f64(), "{capped}");
+        assert!(
+            capped["primitives"].as_f64() <= capped["cap"].as_f64(),
+            "{capped}"
+        );
     }
     assert_chart(&folder.join("b"), "budget");
     assert_chart(&folder.join("b"), "budget-gain");
-    assert_fails_with(folder, &["budget", ".", "--max-splats", "9"], 2, &["--max-splats", "--splats"]);
+    assert_fails_with(
+        folder,
+        &["budget", ".", "--max-splats", "9"],
+        2,
+        &["--max-splats", "--splats"],
+    );
 }
 
 #[test]
@@ -224,12 +462,32 @@ fn ablation_bench_reports_gains() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
     scene(folder);
-    let args = ["ablation", ".", "--steps", "30", "--seeds", "1", "--only", "structure,black", "--out", "a"];
+    let args = [
+        "ablation",
+        ".",
+        "--steps",
+        "30",
+        "--seeds",
+        "1",
+        "--only",
+        "structure,black",
+        "--out",
+        "a",
+    ];
     let printed = events(folder, &[&args[..], &["--json"]].concat());
-    let changes = printed.last().expect("events")["findings"]["changes"].as_array().expect("changes").clone();
-    let names: Vec<&str> = changes.iter().filter_map(|change| change["name"].as_str()).collect();
+    let changes = printed.last().expect("events")["findings"]["changes"]
+        .as_array()
+        .expect("changes")
+        .clone();
+    let names: Vec<&str> = changes
+        .iter()
+        .filter_map(|change| change["name"].as_str())
+        .collect();
     assert_eq!(names, ["baseline", "no structure loss", "black background"]);
-    let psnrs: Vec<f64> = changes.iter().filter_map(|change| change["psnr"].as_f64()).collect();
+    let psnrs: Vec<f64> = changes
+        .iter()
+        .filter_map(|change| change["psnr"].as_f64())
+        .collect();
     assert!(
         psnrs.len() == 3 && psnrs[1] != psnrs[0] && psnrs[2] != psnrs[0],
         "the changes reach the trainer: {psnrs:?}"
@@ -237,7 +495,12 @@ fn ablation_bench_reports_gains() {
     assert_eq!(changes[1]["gain_db"].as_f64(), Some(psnrs[0] - psnrs[1]));
     let page = std::fs::read_to_string(folder.join("a/ablation.html")).expect("a page");
     assert!(page.contains("black background"), "{page}");
-    assert_fails_with(folder, &["ablation", ".", "--only", "nothing", "--out", "b"], 2, &["--only", "no growth"]);
+    assert_fails_with(
+        folder,
+        &["ablation", ".", "--only", "nothing", "--out", "b"],
+        2,
+        &["--only", "no growth"],
+    );
 }
 
 #[test]
@@ -246,7 +509,15 @@ fn stability_bench_is_repeatable_and_needs_times() {
     let folder = folder.path();
     scene(folder);
     let small = ["--steps", "20", "--max-splats", "300", "--json"];
-    let poses = ["stability", ".", "--disturb", "pose-noise", "--levels", "0,50", "--out"];
+    let poses = [
+        "stability",
+        ".",
+        "--disturb",
+        "pose-noise",
+        "--levels",
+        "0,50",
+        "--out",
+    ];
     let measured = |out: &str| {
         let printed = events(folder, &[&poses[..], &[out], &small].concat());
         printed.last().expect("events")["findings"]["disturbances"].clone()
@@ -254,21 +525,60 @@ fn stability_bench_is_repeatable_and_needs_times() {
     let (first, second) = (measured("s"), measured("again"));
     let psnrs = |of: &Value| -> Vec<f64> {
         let points = of[0]["variants"][0]["points"].as_array().expect("points");
-        points.iter().map(|point| point["psnr"].as_f64().expect("a score")).collect()
+        points
+            .iter()
+            .map(|point| point["psnr"].as_f64().expect("a score"))
+            .collect()
     };
     assert_eq!(psnrs(&first).len(), 2);
-    assert_eq!(psnrs(&first), psnrs(&second), "the same seed gives the same result");
-    assert_ne!(psnrs(&first)[0], psnrs(&first)[1], "the noise affects training");
+    assert_eq!(
+        psnrs(&first),
+        psnrs(&second),
+        "the same seed gives the same result"
+    );
+    assert_ne!(
+        psnrs(&first)[0],
+        psnrs(&first)[1],
+        "the noise affects training"
+    );
     assert_chart(&folder.join("s"), "stability-pose-noise");
 
-    let clock = ["stability", ".", "--disturb", "clock-offset", "--levels", "100", "--out", "t"];
+    let clock = [
+        "stability",
+        ".",
+        "--disturb",
+        "clock-offset",
+        "--levels",
+        "100",
+        "--out",
+        "t",
+    ];
     assert_fails_with(folder, &clock, 2, &["clock-offset", "--rate-hz"]);
     let n_runs = |refine: &str, out: &str| {
-        let clock = [&clock[..7], &[out, "--rate-hz", "10", "--refine", refine], &small].concat();
-        events(folder, &clock).iter().filter(|event| event["event"] == "run").count()
+        let clock = [
+            &clock[..7],
+            &[out, "--rate-hz", "10", "--refine", refine],
+            &small,
+        ]
+        .concat();
+        events(folder, &clock)
+            .iter()
+            .filter(|event| event["event"] == "run")
+            .count()
     };
     assert_eq!(n_runs("none", "t"), 2, "undisturbed, and 100 ms");
-    assert_eq!(n_runs("image-gains", "u"), 4, "each with and without the estimated camera parameters");
-    let few = ["stability", ".", "--disturb", "keyframes,exposure", "--levels", "1"];
+    assert_eq!(
+        n_runs("image-gains", "u"),
+        4,
+        "each with and without the estimated camera parameters"
+    );
+    let few = [
+        "stability",
+        ".",
+        "--disturb",
+        "keyframes,exposure",
+        "--levels",
+        "1",
+    ];
     assert_fails_with(folder, &few, 2, &["--levels", "a single disturbance"]);
 }

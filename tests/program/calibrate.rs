@@ -27,7 +27,10 @@ fn camera() -> Intrinsics {
 }
 
 fn flange_from_camera() -> Transform {
-    Transform::new(Vector3::new(0.04, -0.02, 0.06), Vector3::new(0.1, -0.05, 1.4))
+    Transform::new(
+        Vector3::new(0.04, -0.02, 0.06),
+        Vector3::new(0.1, -0.05, 1.4),
+    )
 }
 
 /// Poses of the camera relative to the board: around it, tilted, at different distances.
@@ -36,9 +39,17 @@ fn board_poses() -> Vec<Transform> {
     (0..12)
         .map(|ix| {
             let angle = f64::from(ix) * 0.53;
-            let tilt = Vector3::new(0.45 * angle.sin(), 0.45 * (1.7 * angle).cos(), 0.4 * (0.9 * angle).sin());
+            let tilt = Vector3::new(
+                0.45 * angle.sin(),
+                0.45 * (1.7 * angle).cos(),
+                0.4 * (0.9 * angle).sin(),
+            );
             let rotation = UnitQuaternion::from_scaled_axis(tilt);
-            let position = Vector3::new(0.03 * angle.cos(), 0.02 * angle.sin(), 0.34 + 0.02 * f64::from(ix % 4));
+            let position = Vector3::new(
+                0.03 * angle.cos(),
+                0.02 * angle.sin(),
+                0.34 + 0.02 * f64::from(ix % 4),
+            );
             Transform::from_parts((position - rotation * center).into(), rotation)
         })
         .collect()
@@ -84,7 +95,9 @@ fn robot_poses() -> Vec<Transform> {
     let base_from_board = Transform::new(Vector3::new(0.5, 0.1, 0.02), Vector3::new(3.0, 0.1, 0.0));
     board_poses()
         .iter()
-        .map(|camera_from_board| base_from_board * camera_from_board.inverse() * flange_from_camera().inverse())
+        .map(|camera_from_board| {
+            base_from_board * camera_from_board.inverse() * flange_from_camera().inverse()
+        })
         .collect()
 }
 
@@ -96,18 +109,42 @@ fn lens_and_hand_eye_are_found_from_images() {
     write_images(&images);
     std::fs::write(images.join("broken.jpg"), b"not a picture").expect("a file");
 
-    let output = fieldrig(folder.path(), &["calibrate", "intrinsics", "images", "--target", TARGET, "--json"]);
+    let output = fieldrig(
+        folder.path(),
+        &[
+            "calibrate",
+            "intrinsics",
+            "images",
+            "--target",
+            TARGET,
+            "--json",
+        ],
+    );
     assert_eq!(output.status.code(), Some(DONE), "{}", stderr(&output));
     let lens = json_of(&output);
-    assert_eq!((lens["model"].as_str(), lens["size_px"] == json!(SIZE_PX)), (Some("brown_conrady"), true), "{lens}");
+    assert_eq!(
+        (lens["model"].as_str(), lens["size_px"] == json!(SIZE_PX)),
+        (Some("brown_conrady"), true),
+        "{lens}"
+    );
     let truth = camera();
     for (axis, name) in ["fx", "fy"].into_iter().enumerate() {
-        let error = (lens["focal_px"][axis].as_f64().expect("a number") - truth.focal_px[axis]).abs();
+        let error =
+            (lens["focal_px"][axis].as_f64().expect("a number") - truth.focal_px[axis]).abs();
         let sigma = lens["sigma"][name].as_f64().expect("a number");
-        assert!(error < 4.0 * sigma && sigma < 2.0, "{name}: {error} px, {sigma} px");
+        assert!(
+            error < 4.0 * sigma && sigma < 2.0,
+            "{name}: {error} px, {sigma} px"
+        );
     }
-    assert!(lens["rms_px"].as_f64().is_some_and(|rms| rms < 0.1), "{lens}");
-    assert_eq!(lens["rejected"][0]["image"], "broken.jpg", "an unreadable image is named");
+    assert!(
+        lens["rms_px"].as_f64().is_some_and(|rms| rms < 0.1),
+        "{lens}"
+    );
+    assert_eq!(
+        lens["rejected"][0]["image"], "broken.jpg",
+        "an unreadable image is named"
+    );
 
     // Samples in another order than that of the file names.
     let robot_poses = robot_poses();
@@ -115,28 +152,72 @@ fn lens_and_hand_eye_are_found_from_images() {
     let samples: Vec<Value> = (0..robot_poses.len()).rev().map(sample).collect();
     let file = json!({"intrinsics": lens, "target": TARGET, "samples": samples});
     std::fs::write(folder.path().join("samples.json"), file.to_string()).expect("a file");
-    let output = fieldrig(folder.path(), &["calibrate", "hand-eye", "samples.json", "--json"]);
+    let output = fieldrig(
+        folder.path(),
+        &["calibrate", "hand-eye", "samples.json", "--json"],
+    );
     assert_eq!(output.status.code(), Some(DONE), "{}", stderr(&output));
     let result = json_of(&output);
     let error = flange_from_camera().inverse() * transform_of(&result["flange_from_camera"]);
-    let (mm, degrees) = (1e3 * error.translation.vector.norm(), error.rotation.angle().to_degrees());
-    assert!(mm < 1.0 && degrees < 0.1, "{mm} mm, {degrees} degrees: {result}");
-    assert!(result["refused"].is_null() && result["sigma_mm"].as_array().is_some_and(|sigma| sigma.len() == 3));
+    let (mm, degrees) = (
+        1e3 * error.translation.vector.norm(),
+        error.rotation.angle().to_degrees(),
+    );
+    assert!(
+        mm < 1.0 && degrees < 0.1,
+        "{mm} mm, {degrees} degrees: {result}"
+    );
+    assert!(
+        result["refused"].is_null()
+            && result["sigma_mm"]
+                .as_array()
+                .is_some_and(|sigma| sigma.len() == 3)
+    );
 
     // Reports are complete, and names from files are escaped.
     std::fs::rename(images.join("3.png"), images.join("<i>3.png")).expect("a file");
-    let args = ["calibrate", "intrinsics", "images", "--target", TARGET, "--report", "lens.html"];
+    let args = [
+        "calibrate",
+        "intrinsics",
+        "images",
+        "--target",
+        TARGET,
+        "--report",
+        "lens.html",
+    ];
     assert_eq!(fieldrig(folder.path(), &args).status.code(), Some(DONE));
     let page = report(folder.path(), "lens.html");
-    for words in ["Accepted", "focal length x", "Projection uncertainty", "magnified", "&lt;i&gt;3.png", "broken.jpg"] {
+    for words in [
+        "Accepted",
+        "focal length x",
+        "Projection uncertainty",
+        "magnified",
+        "&lt;i&gt;3.png",
+        "broken.jpg",
+    ] {
         assert!(page.contains(words), "{words} is missing");
     }
-    assert_eq!(page.matches("data:image/jpeg;base64,").count(), 2, "the worst and the median image");
+    assert_eq!(
+        page.matches("data:image/jpeg;base64,").count(),
+        2,
+        "the worst and the median image"
+    );
     std::fs::rename(images.join("<i>3.png"), images.join("3.png")).expect("a file");
-    let args = ["calibrate", "hand-eye", "samples.json", "--report", "hand-eye.html"];
+    let args = [
+        "calibrate",
+        "hand-eye",
+        "samples.json",
+        "--report",
+        "hand-eye.html",
+    ];
     assert_eq!(fieldrig(folder.path(), &args).status.code(), Some(DONE));
     let page = report(folder.path(), "hand-eye.html");
-    for words in ["Accepted", "position of the camera in the flange", "Rotations of the flange", "images/11.png"] {
+    for words in [
+        "Accepted",
+        "position of the camera in the flange",
+        "Rotations of the flange",
+        "images/11.png",
+    ] {
         assert!(page.contains(words), "{words} is missing");
     }
 
@@ -149,16 +230,36 @@ fn lens_and_hand_eye_are_found_from_images() {
     assert!(stderr(&output).contains("960x720"), "{}", stderr(&output));
 
     // Another target is named.
-    let output =
-        fieldrig(folder.path(), &["calibrate", "intrinsics", "images", "--target", "charuco:5x7:34mm:26mm:4X4_50"]);
+    let output = fieldrig(
+        folder.path(),
+        &[
+            "calibrate",
+            "intrinsics",
+            "images",
+            "--target",
+            "charuco:5x7:34mm:26mm:4X4_50",
+        ],
+    );
     assert_eq!(output.status.code(), Some(INSUFFICIENT_DATA));
     assert!(stderr(&output).contains("5X5"), "{}", stderr(&output));
 
     // Markers of another size are measured.
-    let output =
-        fieldrig(folder.path(), &["calibrate", "intrinsics", "images", "--target", "charuco:5x7:34mm:20mm:5X5_100"]);
+    let output = fieldrig(
+        folder.path(),
+        &[
+            "calibrate",
+            "intrinsics",
+            "images",
+            "--target",
+            "charuco:5x7:34mm:20mm:5X5_100",
+        ],
+    );
     assert_eq!(output.status.code(), Some(INSUFFICIENT_DATA));
-    assert!(stderr(&output).contains("the markers are about 0.7"), "{}", stderr(&output));
+    assert!(
+        stderr(&output).contains("the markers are about 0.7"),
+        "{}",
+        stderr(&output)
+    );
 }
 
 /// A report. It must not load anything.
@@ -169,9 +270,13 @@ fn report(folder: &Path, name: &str) -> String {
         assert!(!page.contains(source), "{name} contains {source}");
     }
     // Encoded pictures may contain any letters.
-    let without_picture = |part: &str| part.split_once('"').map_or(String::new(), |(_, rest)| rest.to_owned());
+    let without_picture = |part: &str| {
+        part.split_once('"')
+            .map_or(String::new(), |(_, rest)| rest.to_owned())
+    };
     let mut parts = page.split("base64,");
-    let text = parts.next().unwrap_or_default().to_owned() + &parts.map(without_picture).collect::<String>();
+    let text = parts.next().unwrap_or_default().to_owned()
+        + &parts.map(without_picture).collect::<String>();
     assert!(!text.contains("NaN") && !text.contains("<i>"), "{name}");
     page
 }
@@ -199,78 +304,175 @@ fn results_are_written_into_a_rig_file() {
         text.parse::<toml::Table>().expect("a rig file")["camera"]["wrist"].clone()
     };
 
-    let (code, error) =
-        run(&[&lens[..], &["--rig", "rig.toml", "--camera", "wrist", "--write-rig", "new.toml"]].concat());
+    let (code, error) = run(&[
+        &lens[..],
+        &[
+            "--rig",
+            "rig.toml",
+            "--camera",
+            "wrist",
+            "--write-rig",
+            "new.toml",
+        ],
+    ]
+    .concat());
     assert_eq!(code, Some(DONE), "{error}");
-    let focal_px = written("new.toml")["intrinsics"]["focal_px"][0].as_float().expect("a number");
+    let focal_px = written("new.toml")["intrinsics"]["focal_px"][0]
+        .as_float()
+        .expect("a number");
     assert!((focal_px - camera().focal_px[0]).abs() < 2.0, "{focal_px}");
 
     let poses = robot_poses().into_iter().zip(board_poses());
     let pair = |(robot, board): (Transform, Transform)| json!({"base_from_flange": rows(&robot), "camera_from_board": rows(&board)});
     let samples: Vec<Value> = poses.map(pair).collect();
-    std::fs::write(folder.path().join("samples.json"), json!({"samples": samples}).to_string()).expect("a file");
-    let hand_eye = ["hand-eye", "samples.json", "--rig", "new.toml", "--camera", "wrist", "--write-rig", "new.toml"];
+    std::fs::write(
+        folder.path().join("samples.json"),
+        json!({"samples": samples}).to_string(),
+    )
+    .expect("a file");
+    let hand_eye = [
+        "hand-eye",
+        "samples.json",
+        "--rig",
+        "new.toml",
+        "--camera",
+        "wrist",
+        "--write-rig",
+        "new.toml",
+    ];
     let (code, error) = run(&hand_eye);
     assert_eq!(code, Some(DONE), "{error}");
     let camera = written("new.toml");
-    let x_m = camera["parent_from_camera"]["xyz_m"][0].as_float().expect("a number");
-    assert!((x_m - flange_from_camera().translation.x).abs() < 1e-6, "{x_m}");
-    assert_eq!(camera["intrinsics"]["focal_px"][0].as_float(), Some(focal_px), "the intrinsics are kept");
+    let x_m = camera["parent_from_camera"]["xyz_m"][0]
+        .as_float()
+        .expect("a number");
+    assert!(
+        (x_m - flange_from_camera().translation.x).abs() < 1e-6,
+        "{x_m}"
+    );
+    assert_eq!(
+        camera["intrinsics"]["focal_px"][0].as_float(),
+        Some(focal_px),
+        "the intrinsics are kept"
+    );
     assert!(folder.path().join("new.toml.old").exists());
 
     // Two programs write the same file at once: no result disappears.
-    let both = ["--rig", "new.toml", "--camera", "wrist", "--write-rig", "both.toml"];
+    let both = [
+        "--rig",
+        "new.toml",
+        "--camera",
+        "wrist",
+        "--write-rig",
+        "both.toml",
+    ];
     let start = || {
         let mut command = Command::new(env!("CARGO_BIN_EXE_fieldrig"));
-        command.args(["calibrate", "hand-eye", "samples.json"]).args(both).current_dir(folder.path());
-        command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().expect("it starts")
+        command
+            .args(["calibrate", "hand-eye", "samples.json"])
+            .args(both)
+            .current_dir(folder.path());
+        command
+            .stdout(Stdio::piped())
+            .stderr(Stdio::piped())
+            .spawn()
+            .expect("it starts")
     };
     let outputs = [start(), start()].map(|child| child.wait_with_output().expect("it ends"));
-    let (done, refused): (Vec<_>, Vec<_>) = outputs.iter().partition(|output| output.status.success());
+    let (done, refused): (Vec<_>, Vec<_>) =
+        outputs.iter().partition(|output| output.status.success());
     for output in refused {
-        assert!(stderr(output).contains("both.toml: another program is writing it"), "{}", stderr(output));
+        assert!(
+            stderr(output).contains("both.toml: another program is writing it"),
+            "{}",
+            stderr(output)
+        );
     }
     let entries = std::fs::read_dir(folder.path()).expect("a folder");
-    let names = entries.map(|entry| entry.expect("an entry").file_name().to_string_lossy().into_owned());
+    let names = entries.map(|entry| {
+        entry
+            .expect("an entry")
+            .file_name()
+            .to_string_lossy()
+            .into_owned()
+    });
     let names: Vec<String> = names.filter(|name| name.contains("both.toml")).collect();
-    assert!(!done.is_empty() && names.len() == done.len(), "{} wrote {names:?}", done.len());
+    assert!(
+        !done.is_empty() && names.len() == done.len(),
+        "{} wrote {names:?}",
+        done.len()
+    );
 
     // Nothing is written if something is wrong.
     let rejected = |args: &[&str], expected: i32, words: &str| {
         let (code, error) = run(args);
-        assert!(code == Some(expected) && error.contains(words), "{code:?} {error}");
+        assert!(
+            code == Some(expected) && error.contains(words),
+            "{code:?} {error}"
+        );
         assert!(!folder.path().join("not.toml").exists());
     };
     let target = ["--write-rig", "not.toml"];
     rejected(
-        &[&lens[..], &["--rig", "rig.toml", "--camera", "wirst"], &target].concat(),
+        &[
+            &lens[..],
+            &["--rig", "rig.toml", "--camera", "wirst"],
+            &target,
+        ]
+        .concat(),
         BAD_ARGUMENTS,
         "it has wrist",
     );
     rejected(
-        &[&lens[..], &["--rig", "other-size.toml", "--camera", "wrist"], &target].concat(),
+        &[
+            &lens[..],
+            &["--rig", "other-size.toml", "--camera", "wrist"],
+            &target,
+        ]
+        .concat(),
         BAD_ARGUMENTS,
         "640x480",
     );
     rejected(&[&lens[..], &target].concat(), BAD_ARGUMENTS, "--rig");
-    std::fs::write(folder.path().join("few.json"), json!({"samples": samples[..2]}).to_string()).expect("a file");
-    let few = ["hand-eye", "few.json", "--rig", "rig.toml", "--camera", "wrist"];
-    rejected(&[&few[..], &target].concat(), INSUFFICIENT_DATA, "at least 3");
+    std::fs::write(
+        folder.path().join("few.json"),
+        json!({"samples": samples[..2]}).to_string(),
+    )
+    .expect("a file");
+    let few = [
+        "hand-eye", "few.json", "--rig", "rig.toml", "--camera", "wrist",
+    ];
+    rejected(
+        &[&few[..], &target].concat(),
+        INSUFFICIENT_DATA,
+        "at least 3",
+    );
     let to_hand = json!({"samples": samples, "setup": "eye-to-hand"});
     std::fs::write(folder.path().join("to-hand.json"), to_hand.to_string()).expect("a file");
-    let to_hand = ["hand-eye", "to-hand.json", "--rig", "rig.toml", "--camera", "wrist"];
-    rejected(&[&to_hand[..], &target].concat(), BAD_ARGUMENTS, "parent in the rig file is flange");
+    let to_hand = [
+        "hand-eye",
+        "to-hand.json",
+        "--rig",
+        "rig.toml",
+        "--camera",
+        "wrist",
+    ];
+    rejected(
+        &[&to_hand[..], &target].concat(),
+        BAD_ARGUMENTS,
+        "parent in the rig file is flange",
+    );
 }
 
 #[test]
 fn bad_input_is_named_and_has_its_own_exit_code() {
     let folder = tempfile::tempdir().expect("a folder");
-    let write = |name: &str, text: &str| std::fs::write(folder.path().join(name), text).expect("a file");
+    let write =
+        |name: &str, text: &str| std::fs::write(folder.path().join(name), text).expect("a file");
     std::fs::create_dir(folder.path().join("empty")).expect("a folder");
     std::fs::create_dir(folder.path().join("unreadable")).expect("a folder");
     write("unreadable/a.png", "not an image");
-    let sample =
-        json!({"base_from_flange": rows(&Transform::identity()), "camera_from_board": rows(&Transform::identity())});
+    let sample = json!({"base_from_flange": rows(&Transform::identity()), "camera_from_board": rows(&Transform::identity())});
     let changed = |name: &str, key: &str, value: Value| {
         let mut bad = sample.clone();
         bad[key] = value;
@@ -291,19 +493,40 @@ fn bad_input_is_named_and_has_its_own_exit_code() {
         (images("unreadable"), "none of 1 images can be read; a.png"),
         (hand_eye("absent.json"), "absent.json"),
         (hand_eye("syntax.json"), "syntax.json"),
-        (hand_eye("matrix.json"), "matrix.json: samples[1].base_from_flange: must be a matrix"),
-        (hand_eye("missing.json"), "samples[1].base_from_flange: missing"),
-        (hand_eye("key.json"), "samples[1]: unknown key \"base_to_flange\"; did you mean \"base_from_flange\"?"),
+        (
+            hand_eye("matrix.json"),
+            "matrix.json: samples[1].base_from_flange: must be a matrix",
+        ),
+        (
+            hand_eye("missing.json"),
+            "samples[1].base_from_flange: missing",
+        ),
+        (
+            hand_eye("key.json"),
+            "samples[1]: unknown key \"base_to_flange\"; did you mean \"base_from_flange\"?",
+        ),
         (hand_eye("both.json"), "samples[1].image: "),
-        (hand_eye("empty.json"), "empty.json: samples: the list is empty"),
+        (
+            hand_eye("empty.json"),
+            "empty.json: samples: the list is empty",
+        ),
         (vec!["time-offset", "absent.csv", "table.csv"], "absent.csv"),
-        (vec!["time-offset", "table.csv", "table.csv"], "line 1: 3 numbers, expected 8"),
+        (
+            vec!["time-offset", "table.csv", "table.csv"],
+            "line 1: 3 numbers, expected 8",
+        ),
         (vec!["scene", "absent"], "absent does not exist"),
-        (vec!["hand-eye", "key.json", "--report", "page.pdf"], "extension .html"),
+        (
+            vec!["hand-eye", "key.json", "--report", "page.pdf"],
+            "extension .html",
+        ),
     ] {
         let output = fieldrig(folder.path(), &[vec!["calibrate"], args.clone()].concat());
         let error = stderr(&output);
-        assert!(output.status.code() == Some(BAD_ARGUMENTS) && error.contains(words), "{args:?}: {error}");
+        assert!(
+            output.status.code() == Some(BAD_ARGUMENTS) && error.contains(words),
+            "{args:?}: {error}"
+        );
     }
 }
 
@@ -313,20 +536,42 @@ fn weak_excitation_and_mistakes_are_refused() {
     let run = |samples: Vec<Value>| {
         let file = json!({"samples": samples});
         std::fs::write(folder.path().join("samples.json"), file.to_string()).expect("a file");
-        let args = ["calibrate", "hand-eye", "samples.json", "--json", "--report", "page.html"];
+        let args = [
+            "calibrate",
+            "hand-eye",
+            "samples.json",
+            "--json",
+            "--report",
+            "page.html",
+        ];
         let output = fieldrig(folder.path(), &args);
         (output.status.code(), json_of(&output))
     };
     let both = || robot_poses().into_iter().zip(board_poses());
     let pair = |(robot, board): (Transform, Transform)| json!({"base_from_flange": rows(&robot), "camera_from_board": rows(&board)});
     let (code, result) = run(both().map(pair).collect());
-    assert_eq!((code, result["refused"].is_null()), (Some(DONE), true), "{result}");
+    assert_eq!(
+        (code, result["refused"].is_null()),
+        (Some(DONE), true),
+        "{result}"
+    );
 
-    let inverted = both().map(|(robot, board)| (robot.inverse(), board.inverse())).map(pair).collect();
+    let inverted = both()
+        .map(|(robot, board)| (robot.inverse(), board.inverse()))
+        .map(pair)
+        .collect();
     let (code, result) = run(inverted);
     assert_eq!(code, Some(INSUFFICIENT_DATA), "{result}");
-    assert!(result["refused"].as_str().is_some_and(|reason| reason.contains("behind the camera")), "{result}");
-    assert!(result["flange_from_camera"].is_null() && result.get("flange_from_camera").is_some(), "{result}");
+    assert!(
+        result["refused"]
+            .as_str()
+            .is_some_and(|reason| reason.contains("behind the camera")),
+        "{result}"
+    );
+    assert!(
+        result["flange_from_camera"].is_null() && result.get("flange_from_camera").is_some(),
+        "{result}"
+    );
 
     let millimeters = both().map(|(mut robot, board)| {
         robot.translation.vector *= 1e3;
@@ -334,29 +579,54 @@ fn weak_excitation_and_mistakes_are_refused() {
     });
     let (code, result) = run(millimeters.collect());
     assert_eq!(code, Some(INSUFFICIENT_DATA), "{result}");
-    assert!(result["refused"].as_str().is_some_and(|reason| reason.contains("millimeters")), "{result}");
+    assert!(
+        result["refused"]
+            .as_str()
+            .is_some_and(|reason| reason.contains("millimeters")),
+        "{result}"
+    );
 
     // All rotations about the flange's z axis.
     let first = robot_poses()[0];
     let base_from_board = first * flange_from_camera() * board_poses()[0];
     let about_z = (0..8).map(|ix| {
-        let turn = Transform::new(Vector3::new(0.01 * f64::from(ix), 0.0, 0.0), Vector3::z() * 0.15 * f64::from(ix));
+        let turn = Transform::new(
+            Vector3::new(0.01 * f64::from(ix), 0.0, 0.0),
+            Vector3::z() * 0.15 * f64::from(ix),
+        );
         let robot = first * turn;
-        pair((robot, (robot * flange_from_camera()).inverse() * base_from_board))
+        pair((
+            robot,
+            (robot * flange_from_camera()).inverse() * base_from_board,
+        ))
     });
     let (code, result) = run(about_z.collect());
     assert_eq!(code, Some(INSUFFICIENT_DATA), "{result}");
-    assert!(result["refused"].as_str().is_some_and(|reason| reason.contains("z axis")), "{result}");
+    assert!(
+        result["refused"]
+            .as_str()
+            .is_some_and(|reason| reason.contains("z axis")),
+        "{result}"
+    );
     let page = report(folder.path(), "page.html");
     for words in ["Refused", "hardly any rotation", "Rotations of the flange"] {
         assert!(page.contains(words), "{words} is missing");
     }
 
     // Each image is paired with the robot pose of the sample before it.
-    let shifted = robot_poses().into_iter().zip(board_poses().into_iter().skip(1)).map(pair).collect();
+    let shifted = robot_poses()
+        .into_iter()
+        .zip(board_poses().into_iter().skip(1))
+        .map(pair)
+        .collect();
     let (code, result) = run(shifted);
     assert_eq!(code, Some(INSUFFICIENT_DATA), "{result}");
-    assert!(result["refused"].as_str().is_some_and(|reason| reason.contains("off by one")), "{result}");
+    assert!(
+        result["refused"]
+            .as_str()
+            .is_some_and(|reason| reason.contains("off by one")),
+        "{result}"
+    );
 }
 
 #[test]
@@ -365,33 +635,80 @@ fn time_offset_of_two_streams_is_found() {
     let write = |name: &str, rate_hz: f64, clock_secs: f64, moves: bool| {
         let line = |ix: u32| {
             let secs = f64::from(ix) / rate_hz;
-            let angle = if moves { 0.5 * (1.3 * secs).sin() + 0.3 * (2.9 * secs).cos() } else { 0.0 };
-            let rotation =
-                UnitQuaternion::from_scaled_axis(Vector3::new(angle, 0.4 * (0.7 * secs).sin() * angle, 0.2 * angle));
+            let angle = if moves {
+                0.5 * (1.3 * secs).sin() + 0.3 * (2.9 * secs).cos()
+            } else {
+                0.0
+            };
+            let rotation = UnitQuaternion::from_scaled_axis(Vector3::new(
+                angle,
+                0.4 * (0.7 * secs).sin() * angle,
+                0.2 * angle,
+            ));
             let [x, y, z, w]: [f64; 4] = rotation.coords.into();
-            format!("{},0.1,0.2,{},{x},{y},{z},{w}\n", secs + clock_secs, 0.1 * angle)
+            format!(
+                "{},0.1,0.2,{},{x},{y},{z},{w}\n",
+                secs + clock_secs,
+                0.1 * angle
+            )
         };
         let n = 20.0 * rate_hz;
-        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a number of rows")]
+        #[expect(
+            clippy::cast_possible_truncation,
+            clippy::cast_sign_loss,
+            reason = "a number of rows"
+        )]
         let rows: String = (0..n as u32).map(line).collect();
-        std::fs::write(folder.path().join(name), format!("t,x,y,z,qx,qy,qz,qw\n{rows}")).expect("a file");
+        std::fs::write(
+            folder.path().join(name),
+            format!("t,x,y,z,qx,qy,qz,qw\n{rows}"),
+        )
+        .expect("a file");
     };
     write("a.csv", 100.0, 50.0, true);
     write("b.csv", 30.0, 7.25, true);
     write("still.csv", 30.0, 7.25, false);
-    let output = fieldrig(folder.path(), &["calibrate", "time-offset", "a.csv", "b.csv", "--json"]);
+    let output = fieldrig(
+        folder.path(),
+        &["calibrate", "time-offset", "a.csv", "b.csv", "--json"],
+    );
     assert_eq!(output.status.code(), Some(DONE), "{}", stderr(&output));
     let offset_secs = json_of(&output)["offset_secs"].as_f64().expect("a number");
     assert!((offset_secs - 42.75).abs() < 1e-3, "{offset_secs}");
-    let args = ["calibrate", "time-offset", "a.csv", "b.csv", "--report", "found.html"];
+    let args = [
+        "calibrate",
+        "time-offset",
+        "a.csv",
+        "b.csv",
+        "--report",
+        "found.html",
+    ];
     assert_eq!(fieldrig(folder.path(), &args).status.code(), Some(DONE));
     let page = report(folder.path(), "found.html");
-    for words in ["Accepted", "Highest correlation", "After: both streams on the clock of A", "RMS "] {
+    for words in [
+        "Accepted",
+        "Highest correlation",
+        "After: both streams on the clock of A",
+        "RMS ",
+    ] {
         assert!(page.contains(words), "{words} is missing");
     }
-    let args = ["calibrate", "time-offset", "a.csv", "still.csv", "--json", "--report", "refused.html"];
+    let args = [
+        "calibrate",
+        "time-offset",
+        "a.csv",
+        "still.csv",
+        "--json",
+        "--report",
+        "refused.html",
+    ];
     let output = fieldrig(folder.path(), &args);
-    assert_eq!(output.status.code(), Some(INSUFFICIENT_DATA), "{}", stderr(&output));
+    assert_eq!(
+        output.status.code(),
+        Some(INSUFFICIENT_DATA),
+        "{}",
+        stderr(&output)
+    );
     assert!(json_of(&output)["refused"].is_string());
     assert!(report(folder.path(), "refused.html").contains("body B hardly rotates"));
     // Stamps in milliseconds.
@@ -401,9 +718,21 @@ fn time_offset_of_two_streams_is_found() {
         format!("{},{rest}\n", 1e3 * secs.parse::<f64>().expect("a number"))
     });
     std::fs::write(folder.path().join("millis.csv"), millis.collect::<String>()).expect("a file");
-    let output = fieldrig(folder.path(), &["calibrate", "time-offset", "a.csv", "millis.csv"]);
-    assert_eq!(output.status.code(), Some(INSUFFICIENT_DATA), "{}", stderr(&output));
-    assert!(stderr(&output).contains("stream B are probably in milliseconds"), "{}", stderr(&output));
+    let output = fieldrig(
+        folder.path(),
+        &["calibrate", "time-offset", "a.csv", "millis.csv"],
+    );
+    assert_eq!(
+        output.status.code(),
+        Some(INSUFFICIENT_DATA),
+        "{}",
+        stderr(&output)
+    );
+    assert!(
+        stderr(&output).contains("stream B are probably in milliseconds"),
+        "{}",
+        stderr(&output)
+    );
 }
 
 #[test]
@@ -413,10 +742,27 @@ fn targets_are_printed_once() {
     assert_eq!(fieldrig(folder.path(), &args).status.code(), Some(DONE));
     let pdf = std::fs::read(folder.path().join("board.pdf")).expect("a file");
     assert!(pdf.starts_with(b"%PDF"));
-    assert_eq!(fieldrig(folder.path(), &args).status.code(), Some(BAD_ARGUMENTS), "the file exists");
-    let output =
-        fieldrig(folder.path(), &["calibrate", "target", "--target", "chessboard:9x6:25", "--out", "other.pdf"]);
-    assert!(output.status.code() == Some(BAD_ARGUMENTS) && stderr(&output).contains("no unit"), "{}", stderr(&output));
+    assert_eq!(
+        fieldrig(folder.path(), &args).status.code(),
+        Some(BAD_ARGUMENTS),
+        "the file exists"
+    );
+    let output = fieldrig(
+        folder.path(),
+        &[
+            "calibrate",
+            "target",
+            "--target",
+            "chessboard:9x6:25",
+            "--out",
+            "other.pdf",
+        ],
+    );
+    assert!(
+        output.status.code() == Some(BAD_ARGUMENTS) && stderr(&output).contains("no unit"),
+        "{}",
+        stderr(&output)
+    );
 }
 
 #[cfg(feature = "sim")]
@@ -433,8 +779,17 @@ fn rig_is_calibrated_from_a_simulated_scan() {
     let urdf = rigs.join("robots/panda.urdf").display().to_string();
     let rig = small.replace("robots/panda.urdf", &urdf);
     std::fs::write(folder.path().join("rig.toml"), rig).expect("a file");
-    let args =
-        ["calibrate", "scene", "rig.toml", "--sim", "--seconds", "15", "--json", "--write-rig", "calibrated.toml"];
+    let args = [
+        "calibrate",
+        "scene",
+        "rig.toml",
+        "--sim",
+        "--seconds",
+        "15",
+        "--json",
+        "--write-rig",
+        "calibrated.toml",
+    ];
     let output = fieldrig(folder.path(), &args);
     assert_eq!(output.status.code(), Some(DONE), "{}", stderr(&output));
     let result = json_of(&output);
@@ -449,13 +804,22 @@ fn rig_is_calibrated_from_a_simulated_scan() {
         )),
     );
     let error = truth.inverse() * transform_of(&camera["parent_from_camera"]);
-    let (mm, degrees) = (1e3 * error.translation.vector.norm(), error.rotation.angle().to_degrees());
+    let (mm, degrees) = (
+        1e3 * error.translation.vector.norm(),
+        error.rotation.angle().to_degrees(),
+    );
     assert!(mm < 0.5 && degrees < 0.05, "{mm} mm, {degrees} degrees");
-    let offset_millis = camera["stamp_to_mid_exposure_millis"].as_f64().expect("a number");
+    let offset_millis = camera["stamp_to_mid_exposure_millis"]
+        .as_f64()
+        .expect("a number");
     assert!((offset_millis - 8.0).abs() < 0.5, "{offset_millis} ms");
     // The written file is calibrated, and has the same truth and the same drivers.
-    let written = std::fs::read_to_string(folder.path().join("calibrated.toml")).expect("a rig file");
-    assert!(written.contains("[camera.wrist.sim.truth") && !written.contains("lockstep = true"), "{written}");
+    let written =
+        std::fs::read_to_string(folder.path().join("calibrated.toml")).expect("a rig file");
+    assert!(
+        written.contains("[camera.wrist.sim.truth") && !written.contains("lockstep = true"),
+        "{written}"
+    );
 }
 
 /// The disk is full, here a limit of the file size.
@@ -467,12 +831,23 @@ fn result_is_printed_if_the_report_cannot_be_written() {
     let sample = |(robot, board): (Transform, Transform)| json!({"base_from_flange": rows(&robot), "camera_from_board": rows(&board)});
     let samples: Vec<Value> = pairs.map(sample).collect();
     for (name, samples) in [("good.json", &samples[..]), ("few.json", &samples[..2])] {
-        std::fs::write(folder.path().join(name), json!({"samples": samples}).to_string()).expect("a file");
+        std::fs::write(
+            folder.path().join(name),
+            json!({"samples": samples}).to_string(),
+        )
+        .expect("a file");
     }
     let run = |input: &str| {
         let limited = "trap '' XFSZ; ulimit -f 1; exec \"$0\" \"$@\"";
         std::process::Command::new("sh")
-            .args(["-c", limited, env!("CARGO_BIN_EXE_fieldrig"), "calibrate", "hand-eye", input])
+            .args([
+                "-c",
+                limited,
+                env!("CARGO_BIN_EXE_fieldrig"),
+                "calibrate",
+                "hand-eye",
+                input,
+            ])
             .args(["--json", "--report", "page.html"])
             .current_dir(folder.path())
             .output()
@@ -481,14 +856,30 @@ fn result_is_printed_if_the_report_cannot_be_written() {
     let output = run("good.json");
     let problem = stderr(&output);
     assert_eq!(output.status.code(), Some(1), "{problem}");
-    assert!(json_of(&output)["flange_from_camera"].is_array(), "{problem}");
-    assert_eq!(problem.lines().filter(|line| line.contains("page.html")).count(), 1, "{problem}");
+    assert!(
+        json_of(&output)["flange_from_camera"].is_array(),
+        "{problem}"
+    );
+    assert_eq!(
+        problem
+            .lines()
+            .filter(|line| line.contains("page.html"))
+            .count(),
+        1,
+        "{problem}"
+    );
     // A refusal keeps its reason and its exit code.
     let output = run("few.json");
     let problem = stderr(&output);
     assert_eq!(output.status.code(), Some(INSUFFICIENT_DATA), "{problem}");
-    assert!(json_of(&output)["refused"].is_string() && problem.contains("page.html"), "{problem}");
-    let left: Vec<_> =
-        std::fs::read_dir(folder.path()).expect("a folder").flatten().map(|file| file.file_name()).collect();
+    assert!(
+        json_of(&output)["refused"].is_string() && problem.contains("page.html"),
+        "{problem}"
+    );
+    let left: Vec<_> = std::fs::read_dir(folder.path())
+        .expect("a folder")
+        .flatten()
+        .map(|file| file.file_name())
+        .collect();
     assert_eq!(left.len(), 2, "no part of a report is left: {left:?}");
 }

@@ -20,11 +20,17 @@ struct Received {
 
 /// Receives guidance and images until the server says goodbye.
 fn receive(url: &str) -> Received {
-    let address = url.strip_prefix("http://").expect("a URL").trim_end_matches('/');
+    let address = url
+        .strip_prefix("http://")
+        .expect("a URL")
+        .trim_end_matches('/');
     let stream = std::net::TcpStream::connect(address).expect("the server listens");
-    let (mut socket, _) = tungstenite::client(format!("ws://{address}/ws"), stream).expect("a WebSocket");
+    let (mut socket, _) =
+        tungstenite::client(format!("ws://{address}/ws"), stream).expect("a WebSocket");
     let hello = json!({"type": "hello", "protocols": [3, 4], "capabilities": []});
-    socket.send(Message::text(hello.to_string())).expect("the server reads");
+    socket
+        .send(Message::text(hello.to_string()))
+        .expect("the server reads");
     let mut received = Received::default();
     loop {
         match socket.read().expect("a goodbye comes before the end") {
@@ -33,18 +39,28 @@ fn receive(url: &str) -> Received {
                 match message["type"].as_str().expect("a type") {
                     "status" => {
                         let guidance = &message["guidance"];
-                        received.texts.push(guidance["text"].as_str().expect("guidance").to_owned());
-                        received.is_finished = guidance["is_finished"].as_bool().expect("a boolean");
+                        received
+                            .texts
+                            .push(guidance["text"].as_str().expect("guidance").to_owned());
+                        received.is_finished =
+                            guidance["is_finished"].as_bool().expect("a boolean");
                     }
                     "goodbye" => return received,
                     _ => (),
                 }
             }
             Message::Binary(bytes) => {
-                let n_header = u32::from_le_bytes(bytes[..4].try_into().expect("four bytes")) as usize;
+                let n_header =
+                    u32::from_le_bytes(bytes[..4].try_into().expect("four bytes")) as usize;
                 let header: Value = serde_json::from_slice(&bytes[4..4 + n_header]).expect("JSON");
-                assert_eq!((&header["type"], &header["camera"]), (&json!("live_image"), &json!("wrist")));
-                assert!(bytes[4 + n_header..].starts_with(&[0xFF, 0xD8]), "a JPEG file");
+                assert_eq!(
+                    (&header["type"], &header["camera"]),
+                    (&json!("live_image"), &json!("wrist"))
+                );
+                assert!(
+                    bytes[4 + n_header..].starts_with(&[0xFF, 0xD8]),
+                    "a JPEG file"
+                );
                 received.images_px.push(header["size_px"].clone());
             }
             _ => (),
@@ -52,13 +68,21 @@ fn receive(url: &str) -> Received {
     }
 }
 
-/// Runs `calibrate` with these arguments, and returns what a client of its page received and what was logged.
+/// Runs `calibrate` with these arguments, and returns what a client of its page received and what
+/// was logged.
 fn calibrate(args: &[&str]) -> (Received, String) {
     let rig = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs/calibration-board.toml");
     let mut child = Command::new(env!("CARGO_BIN_EXE_fieldrig"))
         .args(["calibrate", args[0]])
         .arg(rig)
-        .args(["--sim", "--listen", "127.0.0.1:0", "--target", TARGET, "--json"])
+        .args([
+            "--sim",
+            "--listen",
+            "127.0.0.1:0",
+            "--target",
+            TARGET,
+            "--json",
+        ])
         .args(&args[1..])
         .stdout(Stdio::null())
         .stderr(Stdio::piped())
@@ -67,8 +91,14 @@ fn calibrate(args: &[&str]) -> (Received, String) {
     let mut stderr = BufReader::new(child.stderr.take().expect("piped"));
     let mut log = String::new();
     let url = loop {
-        assert!(stderr.read_line(&mut log).expect("text") > 0, "it ended early: {log}");
-        if let Some(url) = log.split_whitespace().find(|word| word.starts_with("http://")) {
+        assert!(
+            stderr.read_line(&mut log).expect("text") > 0,
+            "it ended early: {log}"
+        );
+        if let Some(url) = log
+            .split_whitespace()
+            .find(|word| word.starts_with("http://"))
+        {
             break url.to_owned();
         }
     };
@@ -76,25 +106,56 @@ fn calibrate(args: &[&str]) -> (Received, String) {
     stderr.read_to_string(&mut log).expect("text");
     let status = child.wait().expect("our own child");
     assert!(status.success(), "{log}");
-    (client.join().unwrap_or_else(|_| panic!("the client failed: {log}")), log)
+    (
+        client
+            .join()
+            .unwrap_or_else(|_| panic!("the client failed: {log}")),
+        log,
+    )
 }
 
 #[test]
 fn images_and_instructions_of_a_scan_reach_a_client() {
     let (received, log) = calibrate(&["intrinsics", "--seconds", "12"]);
     let has = |words: &str| received.texts.iter().any(|text| text.contains(words));
-    assert!(has("% of the image; next: ") && has("images of the target cover"), "{:?}", received.texts);
-    assert!(received.is_finished && has("the result is in the terminal"), "{:?}", received.texts);
+    assert!(
+        has("% of the image; next: ") && has("images of the target cover"),
+        "{:?}",
+        received.texts
+    );
+    assert!(
+        received.is_finished && has("the result is in the terminal"),
+        "{:?}",
+        received.texts
+    );
     assert!(!received.images_px.is_empty(), "{log}");
     // The same text as in the terminal.
-    let shown = received.texts.iter().find(|text| text.contains("next: ")).expect("checked above");
+    let shown = received
+        .texts
+        .iter()
+        .find(|text| text.contains("next: "))
+        .expect("checked above");
     assert!(log.contains(shown.as_str()), "{shown} is not in {log}");
 }
 
 #[test]
 fn poses_of_a_moving_arm_reach_a_client() {
-    let (received, _) = calibrate(&["hand-eye", "--move", "--max-poses", "10", "--with-intrinsics"]);
-    let n_motions = received.texts.iter().filter(|text| text.starts_with("moving to pose ")).count();
-    assert!(n_motions > 0 && received.is_finished, "{:?}", received.texts);
+    let (received, _) = calibrate(&[
+        "hand-eye",
+        "--move",
+        "--max-poses",
+        "10",
+        "--with-intrinsics",
+    ]);
+    let n_motions = received
+        .texts
+        .iter()
+        .filter(|text| text.starts_with("moving to pose "))
+        .count();
+    assert!(
+        n_motions > 0 && received.is_finished,
+        "{:?}",
+        received.texts
+    );
     assert!(!received.images_px.is_empty());
 }

@@ -5,7 +5,11 @@ use std::path::Path;
 use std::process::{Command, Output};
 
 pub(crate) fn fieldrig(folder: &Path, args: &[&str]) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_fieldrig")).args(args).current_dir(folder).output().expect("fieldrig starts")
+    Command::new(env!("CARGO_BIN_EXE_fieldrig"))
+        .args(args)
+        .current_dir(folder)
+        .output()
+        .expect("fieldrig starts")
 }
 
 pub(crate) fn json_of(output: &Output) -> Value {

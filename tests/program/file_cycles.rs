@@ -1,8 +1,9 @@
 //! Checks that the source files of each crate do not import each other in cycles.
 //!
-//! The graph is read from the source: `use` items and paths such as `crate::join::Join`, followed through re-exports to
-//! the file that defines the name. A module may import from its parents, and a parent may re-export its children, so
-//! imports of a module's own submodules do not count. Test code does not count either.
+//! The graph is read from the source: `use` items and paths such as `crate::join::Join`, followed
+//! through re-exports to the file that defines the name. A module may import from its parents, and
+//! a parent may re-export its children, so imports of a module's own submodules do not count. Test
+//! code does not count either.
 #![expect(clippy::unwrap_used, reason = "a test that cannot continue may panic")]
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -44,9 +45,15 @@ struct File {
 
 fn is_for_tests(attributes: &[Attribute]) -> bool {
     attributes.iter().any(|attribute| {
-        let syn::Meta::List(list) = &attribute.meta else { return false };
+        let syn::Meta::List(list) = &attribute.meta else {
+            return false;
+        };
         list.path.is_ident("cfg")
-            && list.tokens.to_string().split(|c: char| !c.is_alphanumeric()).any(|word| word == "test")
+            && list
+                .tokens
+                .to_string()
+                .split(|c: char| !c.is_alphanumeric())
+                .any(|word| word == "test")
     })
 }
 
@@ -100,7 +107,12 @@ impl<'ast> Visit<'ast> for File {
 
     fn visit_path(&mut self, path: &'ast syn::Path) {
         if path.segments.len() > 1 {
-            self.paths.push(path.segments.iter().map(|segment| segment.ident.to_string()).collect());
+            self.paths.push(
+                path.segments
+                    .iter()
+                    .map(|segment| segment.ident.to_string())
+                    .collect(),
+            );
         }
         syn::visit::visit_path(self, path);
     }
@@ -108,17 +120,26 @@ impl<'ast> Visit<'ast> for File {
 
 /// The visible names and full paths of a `use` tree.
 fn flatten(tree: &UseTree, prefix: &mut Module, found: &mut Vec<(String, Module)>) {
-    let full = |prefix: &Module, last: String| prefix.iter().cloned().chain([last]).collect::<Module>();
+    let full =
+        |prefix: &Module, last: String| prefix.iter().cloned().chain([last]).collect::<Module>();
     match tree {
         UseTree::Path(path) => {
             prefix.push(path.ident.to_string());
             flatten(&path.tree, prefix, found);
             prefix.pop();
         }
-        UseTree::Name(name) => found.push((name.ident.to_string(), full(prefix, name.ident.to_string()))),
-        UseTree::Rename(name) => found.push((name.rename.to_string(), full(prefix, name.ident.to_string()))),
+        UseTree::Name(name) => {
+            found.push((name.ident.to_string(), full(prefix, name.ident.to_string())))
+        }
+        UseTree::Rename(name) => found.push((
+            name.rename.to_string(),
+            full(prefix, name.ident.to_string()),
+        )),
         UseTree::Glob(_) => found.push(("*".to_owned(), prefix.clone())),
-        UseTree::Group(group) => group.items.iter().for_each(|tree| flatten(tree, prefix, found)),
+        UseTree::Group(group) => group
+            .items
+            .iter()
+            .for_each(|tree| flatten(tree, prefix, found)),
     }
 }
 
@@ -139,7 +160,10 @@ fn files_in(root: &Path) -> BTreeMap<Module, File> {
                 folders.push(path);
             } else if path.extension().is_some_and(|extension| extension == "rs") {
                 let relative = path.strip_prefix(root).unwrap().with_extension("");
-                let mut module: Module = relative.iter().map(|part| part.to_str().unwrap().to_owned()).collect();
+                let mut module: Module = relative
+                    .iter()
+                    .map(|part| part.to_str().unwrap().to_owned())
+                    .collect();
                 module.pop_if(|last| matches!(last.as_str(), "mod" | "lib" | "main"));
                 files.insert(module, parse(&std::fs::read_to_string(&path).unwrap()));
             }
@@ -148,8 +172,13 @@ fn files_in(root: &Path) -> BTreeMap<Module, File> {
     files
 }
 
-/// Converts a path that is used in `module` to a path from the crate root; `None` if it leads to another crate.
-fn absolute(module: &Module, path: &[String], is_module: impl Fn(&Module) -> bool) -> Option<Module> {
+/// Converts a path that is used in `module` to a path from the crate root; `None` if it leads to
+/// another crate.
+fn absolute(
+    module: &Module,
+    path: &[String],
+    is_module: impl Fn(&Module) -> bool,
+) -> Option<Module> {
     let mut base = module.clone();
     let mut rest = path;
     match path.first()?.as_str() {
@@ -175,9 +204,17 @@ fn absolute(module: &Module, path: &[String], is_module: impl Fn(&Module) -> boo
 
 /// The file that defines the item at a path; follows re-exports.
 fn defining_file(files: &BTreeMap<Module, File>, path: &Module, depth: u32) -> Module {
-    let length = (0..=path.len()).rev().find(|length| files.contains_key(&path[..*length])).unwrap_or(0);
+    let length = (0..=path.len())
+        .rev()
+        .find(|length| files.contains_key(&path[..*length]))
+        .unwrap_or(0);
     let (module, rest) = (path[..length].to_vec(), &path[length..]);
-    let Some(target) = rest.first().and_then(|name| files.get(&module)?.exports.get(name)) else { return module };
+    let Some(target) = rest
+        .first()
+        .and_then(|name| files.get(&module)?.exports.get(name))
+    else {
+        return module;
+    };
     match absolute(&module, target, |module| files.contains_key(module)) {
         Some(target) if depth < 8 && target != *path => defining_file(files, &target, depth + 1),
         _ => module,
@@ -188,7 +225,9 @@ fn graph(files: &BTreeMap<Module, File>) -> Graph {
     let tests: Vec<Module> = files
         .iter()
         .flat_map(|(module, file)| {
-            file.test_modules.iter().map(|name| module.iter().chain([name]).cloned().collect::<Module>())
+            file.test_modules
+                .iter()
+                .map(|name| module.iter().chain([name]).cloned().collect::<Module>())
         })
         .collect();
     let is_test = |module: &Module| tests.iter().any(|test| module.starts_with(test));
@@ -218,11 +257,20 @@ fn cycles(graph: &Graph) -> Vec<String> {
         }
         reached
     };
-    let reachable: BTreeMap<&Module, BTreeSet<Module>> =
-        graph.keys().map(|module| (module, reachable(module))).collect();
-    let on_cycle =
-        |a: &Module, b: &Module| reachable[a].contains(b) && reachable.get(b).is_some_and(|from_b| from_b.contains(a));
-    let name = |module: &Module| if module.is_empty() { "crate root".to_owned() } else { module.join("::") };
+    let reachable: BTreeMap<&Module, BTreeSet<Module>> = graph
+        .keys()
+        .map(|module| (module, reachable(module)))
+        .collect();
+    let on_cycle = |a: &Module, b: &Module| {
+        reachable[a].contains(b) && reachable.get(b).is_some_and(|from_b| from_b.contains(a))
+    };
+    let name = |module: &Module| {
+        if module.is_empty() {
+            "crate root".to_owned()
+        } else {
+            module.join("::")
+        }
+    };
     graph
         .iter()
         .flat_map(|(module, targets)| targets.iter().map(move |target| (module, target)))
@@ -238,8 +286,15 @@ fn files_do_not_import_each_other_in_cycles() {
     for root in ROOTS {
         let files = files_in(&workspace.join(root));
         let graph = graph(&files);
-        assert!(graph.len() == 1 || graph.values().any(|targets| !targets.is_empty()), "{root}: no imports were found");
-        found.extend(cycles(&graph).into_iter().map(|edge| format!("{root}: {edge}")));
+        assert!(
+            graph.len() == 1 || graph.values().any(|targets| !targets.is_empty()),
+            "{root}: no imports were found"
+        );
+        found.extend(
+            cycles(&graph)
+                .into_iter()
+                .map(|edge| format!("{root}: {edge}")),
+        );
     }
     assert_eq!(found, Vec::<String>::new());
 }
@@ -247,8 +302,16 @@ fn files_do_not_import_each_other_in_cycles() {
 #[test]
 fn cycles_are_found_through_re_exports_and_paths() {
     let files = |sources: &[(&str, &str)]| -> BTreeMap<Module, File> {
-        let module = |name: &str| name.split("::").filter(|part| !part.is_empty()).map(str::to_owned).collect();
-        sources.iter().map(|(name, text)| (module(name), parse(text))).collect()
+        let module = |name: &str| {
+            name.split("::")
+                .filter(|part| !part.is_empty())
+                .map(str::to_owned)
+                .collect()
+        };
+        sources
+            .iter()
+            .map(|(name, text)| (module(name), parse(text)))
+            .collect()
     };
     let sources = [
         ("", "mod a; mod b; #[cfg(test)] mod t; pub use b::inner::B;"),
@@ -257,8 +320,18 @@ fn cycles_are_found_through_re_exports_and_paths() {
         ("b::inner", "pub struct B; fn f() { crate::a::g(); }"),
         ("t", "use crate::a::A;"),
     ];
-    assert_eq!(cycles(&graph(&files(&sources))), ["a -> b::inner", "b::inner -> a"]);
-    let acyclic =
-        [sources[0], sources[1], sources[2], ("b::inner", "pub struct B; #[cfg(test)] mod x { use crate::a::A; }")];
+    assert_eq!(
+        cycles(&graph(&files(&sources))),
+        ["a -> b::inner", "b::inner -> a"]
+    );
+    let acyclic = [
+        sources[0],
+        sources[1],
+        sources[2],
+        (
+            "b::inner",
+            "pub struct B; #[cfg(test)] mod x { use crate::a::A; }",
+        ),
+    ];
     assert_eq!(cycles(&graph(&files(&acyclic))), Vec::<String>::new());
 }

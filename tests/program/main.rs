@@ -1,4 +1,5 @@
-//! Tests of the whole program `fieldrig` in one program, so that they are linked once and fill all processors.
+//! Tests of the whole program `fieldrig` in one program, so that they are linked once and fill all
+//! processors.
 
 mod arrows;
 mod bench;

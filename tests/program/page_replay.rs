@@ -1,7 +1,8 @@
-//! Records what a run sends to the page, and replays it to a page at the original and at double speed.
+//! Records what a run sends to the page, and replays it to a page at the original and at double
+//! speed.
 //!
-//! WebGL calls draw nothing, because drawing on the CPU would dominate the tasks of the page. Skipped, with a message,
-//! if Chromium or the bundle (`make web`) is missing.
+//! WebGL calls draw nothing, because drawing on the CPU would dominate the tasks of the page.
+//! Skipped, with a message, if Chromium or the bundle (`make web`) is missing.
 #![cfg(feature = "sim")]
 
 use crate::page_server::PageServer;
@@ -20,9 +21,11 @@ use test_support::browser::{Browser, NO_DRAWING, Task, browser_for_page, wait_fo
 const WINDOW_PX: [u32; 2] = [1280, 720];
 /// How long the run is recorded after its first picture.
 const RECORDED: Duration = Duration::from_secs(15);
-/// Length of the run if it is not interrupted: longer than Chromium takes to start on a busy computer, and the recording.
+/// Length of the run if it is not interrupted: longer than Chromium takes to start on a busy
+/// computer, and the recording.
 const MAX_SECONDS: &str = "90";
-/// Limit of the 99th percentile of the CPU time of tasks. CPU time does not depend on the tests that run beside this one.
+/// Limit of the 99th percentile of the CPU time of tasks. CPU time does not depend on the tests
+/// that run beside this one.
 const MAX_P99_MILLIS: f64 = 4.0;
 /// Additional time for decoding an image on a slow computer.
 const SLOW_DECODING_MILLIS: u32 = 400;
@@ -54,7 +57,17 @@ fn open(program: &Path, profile: &Path, url: &str, delay_millis: u32) -> Browser
 fn record(program: &Path, profile: &Path) -> (Session, Value) {
     let folder = tempfile::tempdir().expect("a folder");
     small_rig::write(folder.path(), small_rig::Pace::RealTime);
-    let args = ["run", "rig.toml", "--sim", "--seconds", MAX_SECONDS, "--max-splats", "3000", "--out", "out"];
+    let args = [
+        "run",
+        "rig.toml",
+        "--sim",
+        "--seconds",
+        MAX_SECONDS,
+        "--max-splats",
+        "3000",
+        "--out",
+        "out",
+    ];
     let mut run = Command::new(env!("CARGO_BIN_EXE_fieldrig"))
         .args(args)
         .args(["--listen", "127.0.0.1:0", "--json"])
@@ -63,12 +76,19 @@ fn record(program: &Path, profile: &Path) -> (Session, Value) {
         .stderr(Stdio::null())
         .spawn()
         .expect("it is built");
-    let mut lines = BufReader::new(run.stdout.take().expect("piped")).lines().map_while(Result::ok);
+    let mut lines = BufReader::new(run.stdout.take().expect("piped"))
+        .lines()
+        .map_while(Result::ok);
     let serving: Value = serde_json::from_str(&lines.next().expect("an event")).expect("JSON");
-    let address = serving["url"].as_str().and_then(|url| url.strip_prefix("http://")).expect("a URL");
+    let address = serving["url"]
+        .as_str()
+        .and_then(|url| url.strip_prefix("http://"))
+        .expect("a URL");
     let proxy = RecordingProxy::start(address.trim_end_matches('/').parse().expect("an address"));
     let mut browser = open(program, profile, &proxy.url(), 0);
-    wait_for(&mut browser, "a picture", |browser| browser.text("picture-text").contains(" ms"));
+    wait_for(&mut browser, "a picture", |browser| {
+        browser.text("picture-text").contains(" ms")
+    });
     browser.evaluate(
         "(() => { const refresh = document.getElementById('refresh'); refresh.value = 'continuous';
          refresh.dispatchEvent(new Event('change')); })()",
@@ -76,14 +96,19 @@ fn record(program: &Path, profile: &Path) -> (Session, Value) {
     browser.click("toggle-keyframes");
     browser.click("toggle-points");
     std::thread::sleep(RECORDED);
-    let interrupt = Command::new("kill").args(["-INT", &run.id().to_string()]).status();
+    let interrupt = Command::new("kill")
+        .args(["-INT", &run.id().to_string()])
+        .status();
     assert!(interrupt.expect("kill runs").success());
     lines.for_each(drop);
     let status = run.wait().expect("our own child");
     assert!([Some(0), Some(3)].contains(&status.code()), "{status}"); // 3: a busy computer drops images.
     drop(browser);
     let report = std::fs::read_to_string(folder.path().join("out/report.json")).expect("a report");
-    (proxy.session(), serde_json::from_str(&report).expect("JSON"))
+    (
+        proxy.session(),
+        serde_json::from_str(&report).expect("JSON"),
+    )
 }
 
 /// A page that receives a session.
@@ -99,7 +124,11 @@ impl Replay {
         let (session, is_over_here) = (session.clone(), Arc::clone(&is_over));
         let server = PageServer::start(move |socket| session.play(socket, speed, &is_over_here));
         let profile = profile(&format!("{speed}-{delay_millis}"));
-        Self { browser: open(program, &profile, &server.url(), delay_millis), profile, is_over }
+        Self {
+            browser: open(program, &profile, &server.url(), delay_millis),
+            profile,
+            is_over,
+        }
     }
 
     fn end(self) {
@@ -110,26 +139,35 @@ impl Replay {
 }
 
 fn profile(name: &str) -> PathBuf {
-    Path::new(env!("CARGO_TARGET_TMPDIR")).join(format!("chromium-replay-{name}-{}", std::process::id()))
+    Path::new(env!("CARGO_TARGET_TMPDIR"))
+        .join(format!("chromium-replay-{name}-{}", std::process::id()))
 }
 
 #[test]
 fn a_recorded_session_keeps_the_main_thread_free_and_outdated_images_are_dropped() {
-    let Some(program) = browser_for_page() else { return };
+    let Some(program) = browser_for_page() else {
+        return;
+    };
     let recording = profile("recording");
     let (session, report) = record(&program, &recording);
     std::fs::remove_dir_all(&recording).expect("the browser has left its profile");
     let [pictures, images] = ["picture", "live_image"].map(|kind| session.binaries(kind));
     check_report(&report);
     check_times(&pictures);
-    let n_states = session.texts().filter(|message| message["type"] == "robot_state").count();
+    let n_states = session
+        .texts()
+        .filter(|message| message["type"] == "robot_state")
+        .count();
     eprintln!(
         "{:?}: {} pictures, {} images, {n_states} robot states",
         session.duration(),
         pictures.len(),
         images.len()
     );
-    assert!(pictures.len() > 20 && images.len() > 30 && n_states > 200, "too little was recorded");
+    assert!(
+        pictures.len() > 20 && images.len() > 30 && n_states > 200,
+        "too little was recorded"
+    );
     for speed in [1.0, 2.0] {
         check_tasks(&program, &session, speed);
     }
@@ -140,25 +178,44 @@ fn a_recorded_session_keeps_the_main_thread_free_and_outdated_images_are_dropped
 fn check_report(report: &Value) {
     let latency = |name: &str| {
         let latencies = report["latencies"].as_array().expect("a list");
-        let found = latencies.iter().find(|pair| pair[0] == name).map(|pair| pair[1].clone());
+        let found = latencies
+            .iter()
+            .find(|pair| pair[0] == name)
+            .map(|pair| pair[1].clone());
         found.unwrap_or_else(|| panic!("{name} is missing: {latencies:?}"))
     };
-    let [model, sent, shown] = ["model", "sent", "shown"].map(|stage| latency(&format!("shutter to {stage}")));
+    let [model, sent, shown] =
+        ["model", "sent", "shown"].map(|stage| latency(&format!("shutter to {stage}")));
     eprintln!("shutter to model {model}, sent {sent}, shown {shown}");
-    assert!(model["p50"].as_f64().is_some_and(|millis| millis > 0.0), "{model}");
+    assert!(
+        model["p50"].as_f64().is_some_and(|millis| millis > 0.0),
+        "{model}"
+    );
     // The same keyframes. More of them were added to the model than shown.
     assert_eq!(sent["n"], shown["n"]);
-    assert!(sent["p50"].as_f64() < shown["p50"].as_f64() && sent["p99"].as_f64() < shown["p99"].as_f64(), "{report}");
+    assert!(
+        sent["p50"].as_f64() < shown["p50"].as_f64()
+            && sent["p99"].as_f64() < shown["p99"].as_f64(),
+        "{report}"
+    );
     assert!(shown["n"].as_u64().is_some_and(|n| n >= 3), "{shown}");
 }
 
-/// Each picture is sent after its newest keyframe was added to the model, which is after the shutter.
+/// Each picture is sent after its newest keyframe was added to the model, which is after the
+/// shutter.
 fn check_times(pictures: &[(Value, Vec<u8>)]) {
     let mut newest_keyframes = BTreeSet::new();
     for (header, _) in pictures {
         let newest = &header["newest_keyframe"];
-        let times = [&newest["captured_millis"], &newest["added_millis"], &header["sent_millis"]].map(Value::as_f64);
-        let [Some(captured), Some(added), Some(sent)] = times else { continue };
+        let times = [
+            &newest["captured_millis"],
+            &newest["added_millis"],
+            &header["sent_millis"],
+        ]
+        .map(Value::as_f64);
+        let [Some(captured), Some(added), Some(sent)] = times else {
+            continue;
+        };
         assert!(captured < added && added < sent, "{header}");
         newest_keyframes.insert(header["keyframes"].as_u64());
     }
@@ -168,7 +225,9 @@ fn check_times(pictures: &[(Value, Vec<u8>)]) {
 /// Tasks of the main thread are short while a session is replayed.
 fn check_tasks(program: &Path, session: &Session, speed: f64) {
     let mut replay = Replay::start(program, session, speed, 0);
-    wait_for(&mut replay.browser, "a picture", |browser| browser.text("picture-text").contains(" ms"));
+    wait_for(&mut replay.browser, "a picture", |browser| {
+        browser.text("picture-text").contains(" ms")
+    });
     let traced = session.duration().mul_f64(0.7 / speed);
     let tasks = replay.browser.trace_tasks(traced);
     let percentile = |millis: fn(&Task) -> f64, share: usize| {
@@ -186,31 +245,58 @@ fn check_tasks(program: &Path, session: &Session, speed: f64) {
         percentile(|task| task.millis, 990)
     );
     assert!(tasks.len() > 500, "only {} tasks", tasks.len());
-    assert!(percentile(cpu, 990) < MAX_P99_MILLIS, "the 99th percentile is {:.1} ms", percentile(cpu, 990));
+    assert!(
+        percentile(cpu, 990) < MAX_P99_MILLIS,
+        "the 99th percentile is {:.1} ms",
+        percentile(cpu, 990)
+    );
     replay.end();
 }
 
-/// If images arrive faster than they can be decoded, at most one picture and one camera image is decoded at a time, the
-/// newest one is next, and all others are dropped.
-fn check_dropping(program: &Path, session: &Session, [pictures, images]: [Vec<(Value, Vec<u8>)>; 2]) {
+/// If images arrive faster than they can be decoded, at most one picture and one camera image is
+/// decoded at a time, the newest one is next, and all others are dropped.
+fn check_dropping(
+    program: &Path,
+    session: &Session,
+    [pictures, images]: [Vec<(Value, Vec<u8>)>; 2],
+) {
     let mut replay = Replay::start(program, session, 2.0, SLOW_DECODING_MILLIS);
     std::thread::sleep(session.duration().mul_f64(0.5) + Duration::from_secs(2));
     let browser = &mut replay.browser;
-    wait_for(browser, "the last image", |browser| browser.evaluate("window.decoders.nActive") == 0);
+    wait_for(browser, "the last image", |browser| {
+        browser.evaluate("window.decoders.nActive") == 0
+    });
     let decoders = browser.evaluate("window.decoders");
     let n_received = pictures.len() + images.len();
-    let n_decoded = decoders["n"].as_u64().and_then(|n| usize::try_from(n).ok()).expect("a count");
+    let n_decoded = decoders["n"]
+        .as_u64()
+        .and_then(|n| usize::try_from(n).ok())
+        .expect("a count");
     eprintln!("{n_decoded} of {n_received} pictures and images were decoded: {decoders}");
-    assert_eq!(decoders["maxActive"], 2, "one picture and one image of the only camera");
-    assert!(10 < n_decoded && n_decoded < n_received * 3 / 4, "{n_decoded} of {n_received} were decoded");
+    assert_eq!(
+        decoders["maxActive"], 2,
+        "one picture and one image of the only camera"
+    );
+    assert!(
+        10 < n_decoded && n_decoded < n_received * 3 / 4,
+        "{n_decoded} of {n_received} were decoded"
+    );
     let sizes = decoders["sizes"].as_array().expect("a list");
     for received in [&pictures, &images] {
         let size = |(header, payload): &(Value, Vec<u8>)| {
-            json!(header["color"]["bytes"].as_u64().unwrap_or(payload.len() as u64))
+            json!(
+                header["color"]["bytes"]
+                    .as_u64()
+                    .unwrap_or(payload.len() as u64)
+            )
         };
         let received: Vec<Value> = received.iter().map(size).collect();
         let last_decoded = sizes.iter().rev().find(|size| received.contains(size));
-        assert_eq!(last_decoded, received.last(), "the newest is decoded last: {sizes:?}");
+        assert_eq!(
+            last_decoded,
+            received.last(),
+            "the newest is decoded last: {sizes:?}"
+        );
     }
     replay.end();
 }

@@ -38,7 +38,8 @@ impl PageServer {
     }
 }
 
-/// The head of a request, which remains to be read. `None` if the browser closes the connection before it sends one.
+/// The head of a request, which remains to be read. `None` if the browser closes the connection
+/// before it sends one.
 fn head_of(stream: &TcpStream) -> Option<String> {
     let mut bytes = [0; 8192];
     loop {
@@ -67,8 +68,9 @@ fn send_file(mut stream: TcpStream, head: &str) {
         Err(_) => ("404 Not Found", Vec::new()),
     };
     let n_bytes = body.len();
-    let answer =
-        format!("HTTP/1.1 {status}\r\nContent-Type: {kind}\r\nContent-Length: {n_bytes}\r\nConnection: close\r\n\r\n");
+    let answer = format!(
+        "HTTP/1.1 {status}\r\nContent-Type: {kind}\r\nContent-Length: {n_bytes}\r\nConnection: close\r\n\r\n"
+    );
     // Fails if the browser no longer wants the file.
     let _ = stream.write_all(&[answer.into_bytes(), body].concat());
 }

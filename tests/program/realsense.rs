@@ -1,5 +1,5 @@
-//! A rig whose camera is a file recorded by librealsense2: the binary reads lens and depth pose from this file and
-//! records its images.
+//! A rig whose camera is a file recorded by librealsense2: the binary reads lens and depth pose
+//! from this file and records its images.
 
 use drivers::realsense::emulated::{BagWriter, EmulatedCamera, EmulatedDepth};
 use drivers::recording::{RIG_FILE, Recording};
@@ -61,8 +61,16 @@ fn write_bag(path: &Path) {
             n_skipped: 0,
         };
         writer.write(&color).expect("the disk has space");
-        let format = PixelFormat::DepthU16 { meters_per_count: 0.001 };
-        writer.write(&Image { format, data: [232, 3].repeat(320 * 240).into(), ..color }).expect("the disk has space");
+        let format = PixelFormat::DepthU16 {
+            meters_per_count: 0.001,
+        };
+        writer
+            .write(&Image {
+                format,
+                data: [232, 3].repeat(320 * 240).into(),
+                ..color
+            })
+            .expect("the disk has space");
     }
     writer.finish().expect("the disk has space");
 }
@@ -76,8 +84,17 @@ fn recording_stores_calibration_read_from_the_bag() {
     let record = || {
         let _ = std::fs::remove_file(&out);
         let program = env!("CARGO_BIN_EXE_fieldrig");
-        let output = Command::new(program).arg("record").arg(&rig).arg("--out").arg(&out).output().unwrap();
-        (output.status.code(), String::from_utf8_lossy(&output.stderr).into_owned())
+        let output = Command::new(program)
+            .arg("record")
+            .arg(&rig)
+            .arg("--out")
+            .arg(&out)
+            .output()
+            .unwrap();
+        (
+            output.status.code(),
+            String::from_utf8_lossy(&output.stderr).into_owned(),
+        )
     };
     // The bag plays in real time, so a stalled machine loses images.
     let (mut code, mut printed) = record();
@@ -91,13 +108,29 @@ fn recording_stores_calibration_read_from_the_bag() {
     let resolved = String::from_utf8(recording.attachment(RIG_FILE).unwrap().to_vec()).unwrap();
     // 15 mm in single precision.
     let depth_translations = ["0.01499999", "0.015"];
-    assert!(depth_translations.iter().any(|translation| resolved.contains(translation)), "{resolved}");
-    assert!(resolved.contains("303.25") && resolved.contains("192.5"), "{resolved}");
+    assert!(
+        depth_translations
+            .iter()
+            .any(|translation| resolved.contains(translation)),
+        "{resolved}"
+    );
+    assert!(
+        resolved.contains("303.25") && resolved.contains("192.5"),
+        "{resolved}"
+    );
     let mut n_images = [0; 2];
     while let Some(sample) = recording.next_sample().unwrap() {
-        let Sample::Image(image) = sample else { panic!("cameras deliver images") };
+        let Sample::Image(image) = sample else {
+            panic!("cameras deliver images")
+        };
         match image.is_depth() {
-            true => assert!(image.decode_depth_m().unwrap().iter().all(|meters| (meters - 1.0).abs() < 1e-6)),
+            true => assert!(
+                image
+                    .decode_depth_m()
+                    .unwrap()
+                    .iter()
+                    .all(|meters| (meters - 1.0).abs() < 1e-6)
+            ),
             false => assert!(image.data.iter().all(|byte| *byte == image.data[0])),
         }
         n_images[usize::from(image.is_depth())] += 1;

@@ -1,7 +1,9 @@
-//! The robot that the page draws from the messages of a simulated run, compared with MuJoCo's segmentation.
+//! The robot that the page draws from the messages of a simulated run, compared with MuJoCo's
+//! segmentation.
 //!
-//! The page gets the robot and its states as the run has sent them. The pictures have the exact depth of the scene, so
-//! that only the robot is tested. Skipped, with a message, if Chromium or the bundle (`make web`) is missing.
+//! The page gets the robot and its states as the run has sent them. The pictures have the exact
+//! depth of the scene, so that only the robot is tested. Skipped, with a message, if Chromium or
+//! the bundle (`make web`) is missing.
 #![cfg(feature = "sim")]
 
 use crate::page_server::PageServer;
@@ -54,54 +56,98 @@ fn robot_of_run() -> Robot {
     let folder = tempfile::tempdir().expect("a folder");
     small_rig::write(folder.path(), small_rig::Pace::RealTime);
     let run = Command::new(env!("CARGO_BIN_EXE_fieldrig"))
-        .args(["run", "rig.toml", "--sim", "--max-splats", "1000", "--out", "out", "--listen", "127.0.0.1:0", "--json"])
+        .args([
+            "run",
+            "rig.toml",
+            "--sim",
+            "--max-splats",
+            "1000",
+            "--out",
+            "out",
+            "--listen",
+            "127.0.0.1:0",
+            "--json",
+        ])
         .current_dir(folder.path())
         .stdout(Stdio::piped())
         .stderr(Stdio::null())
         .spawn()
         .expect("it is built");
     let mut run = Running(run);
-    let mut lines = BufReader::new(run.0.stdout.take().expect("piped")).lines().map_while(Result::ok);
+    let mut lines = BufReader::new(run.0.stdout.take().expect("piped"))
+        .lines()
+        .map_while(Result::ok);
     let serving: Value = serde_json::from_str(&lines.next().expect("an event")).expect("JSON");
-    let address = serving["url"].as_str().and_then(|url| url.strip_prefix("http://")).expect("a URL");
+    let address = serving["url"]
+        .as_str()
+        .and_then(|url| url.strip_prefix("http://"))
+        .expect("a URL");
     let address = address.trim_end_matches('/');
     let stream = TcpStream::connect(address).expect("the server listens");
     stream.set_read_timeout(Some(TIMEOUT)).expect("a timeout");
-    let (mut socket, _) = tungstenite::client(format!("ws://{address}/ws"), stream).expect("a WebSocket");
+    let (mut socket, _) =
+        tungstenite::client(format!("ws://{address}/ws"), stream).expect("a WebSocket");
     for message in [
         json!({"type": "hello", "protocols": [3, 4], "capabilities": ["subscribe", "robot"]}),
         json!({"type": "subscribe", "topic": "robot_state", "rate_hz": 20}),
     ] {
-        socket.send(Message::text(message.to_string())).expect("the server reads");
+        socket
+            .send(Message::text(message.to_string()))
+            .expect("the server reads");
     }
     let (mut description, mut states) = (None, Vec::<Value>::new());
     let began = Instant::now();
     while states.len() < 2 {
-        assert!(began.elapsed() < TIMEOUT, "the robot has not moved within {TIMEOUT:?}");
-        let Message::Text(text) = socket.read().expect("the server sends") else { continue };
+        assert!(
+            began.elapsed() < TIMEOUT,
+            "the robot has not moved within {TIMEOUT:?}"
+        );
+        let Message::Text(text) = socket.read().expect("the server sends") else {
+            continue;
+        };
         let message: Value = serde_json::from_str(&text).expect("JSON");
         match message["type"].as_str() {
             Some("robot") => description = Some(message),
-            Some("robot_state") if states.first().is_none_or(|first| motion_rad(first, &message) > MIN_MOTION_RAD) => {
+            Some("robot_state")
+                if states
+                    .first()
+                    .is_none_or(|first| motion_rad(first, &message) > MIN_MOTION_RAD) =>
+            {
                 states.push(message);
             }
             _ => {}
         }
     }
-    Robot { description: description.expect("a robot comes before its states"), states }
+    Robot {
+        description: description.expect("a robot comes before its states"),
+        states,
+    }
 }
 
 fn positions(state: &Value) -> Vec<f64> {
-    state["positions"].as_array().expect("a list").iter().map(|value| value.as_f64().expect("a number")).collect()
+    state["positions"]
+        .as_array()
+        .expect("a list")
+        .iter()
+        .map(|value| value.as_f64().expect("a number"))
+        .collect()
 }
 
 /// Largest difference of a joint position, radians.
 fn motion_rad(a: &Value, b: &Value) -> f64 {
-    positions(a).iter().zip(positions(b)).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)
+    positions(a)
+        .iter()
+        .zip(positions(b))
+        .map(|(a, b)| (a - b).abs())
+        .fold(0.0, f64::max)
 }
 
 fn pose(row_major: &Value) -> Transform {
-    let numbers = row_major.as_array().expect("16 numbers").iter().map(|value| value.as_f64().expect("a number"));
+    let numbers = row_major
+        .as_array()
+        .expect("16 numbers")
+        .iter()
+        .map(|value| value.as_f64().expect("a number"));
     nalgebra::try_convert(Matrix4::from_row_iterator(numbers)).expect("a rigid transform")
 }
 
@@ -112,14 +158,20 @@ fn row_major(pose: &Transform) -> Value {
 /// A view of the robot from behind a wall, which hides a part of it.
 fn first_view() -> Transform {
     let eye = Point3::new(0.75, -1.2, 0.9);
-    let rotation = UnitQuaternion::face_towards(&(Point3::new(0.15, 0.0, 0.35) - eye), &-Vector3::z());
+    let rotation =
+        UnitQuaternion::face_towards(&(Point3::new(0.15, 0.0, 0.35) - eye), &-Vector3::z());
     Transform::from_parts(eye.into(), rotation)
 }
 
 /// The view of a `render` message.
 fn view_of(request: &Value) -> PinholeView {
     let pair = |value: &Value| [0, 1].map(|ix| value[ix].as_f64().expect("two numbers"));
-    let size_px = [0, 1].map(|ix| request["size_px"][ix].as_u64().and_then(|n| u32::try_from(n).ok()).expect("a size"));
+    let size_px = [0, 1].map(|ix| {
+        request["size_px"][ix]
+            .as_u64()
+            .and_then(|n| u32::try_from(n).ok())
+            .expect("a size")
+    });
     PinholeView {
         size_px,
         focal_px: pair(&request["projection"]["focal_px"]),
@@ -139,7 +191,9 @@ fn start_renderer() -> SyncSender<DepthJob> {
         let mut scene = RobotMasks::open(Scene::StaticArm, WINDOW_PX).expect("the scene is valid");
         ready.send(()).expect("the test waits");
         for (view, reply) in queue {
-            reply.send(scene.depth_without_robot_m(&view)).expect("the requester waits");
+            reply
+                .send(scene.depth_without_robot_m(&view))
+                .expect("the requester waits");
         }
     });
     started.recv().expect("a renderer");
@@ -157,7 +211,10 @@ struct Stage {
 impl Stage {
     /// Serves one page: sends the robot and its current state, and answers requests of pictures.
     fn talk(&self, mut socket: WebSocket<TcpStream>) {
-        socket.get_ref().set_read_timeout(Some(Duration::from_millis(20))).expect("a timeout");
+        socket
+            .get_ref()
+            .set_read_timeout(Some(Duration::from_millis(20)))
+            .expect("a timeout");
         let began = Instant::now();
         let clock_millis = || began.elapsed().as_secs_f64() * 1e3;
         let hello = json!({
@@ -167,8 +224,9 @@ impl Stage {
         let view = json!({
             "type": "scene", "center_m": [0.15, 0.0, 0.35], "radius_m": 1.0, "world_from_camera": row_major(&first_view()),
         });
-        let mut outbox: Vec<Message> =
-            [&hello, &view, &self.robot].map(|message| Message::text(message.to_string())).into();
+        let mut outbox: Vec<Message> = [&hello, &view, &self.robot]
+            .map(|message| Message::text(message.to_string()))
+            .into();
         loop {
             let mut state = self.state.lock().expect("no panic").clone();
             state["captured_millis"] = json!(clock_millis());
@@ -199,7 +257,11 @@ impl Stage {
 
     fn depth_m(&self, view: PinholeView) -> Vec<f32> {
         let (reply, depth_m) = sync_channel(1);
-        self.renderer.lock().expect("no panic").send((view, reply)).expect("it renders");
+        self.renderer
+            .lock()
+            .expect("no panic")
+            .send((view, reply))
+            .expect("it renders");
         depth_m.recv().expect("it renders")
     }
 
@@ -213,9 +275,14 @@ fn picture(request: &Value, depth_m: &[f32]) -> Message {
     let size_px = view_of(request).size_px;
     let mut jpeg = std::io::Cursor::new(Vec::new());
     let image = image::RgbImage::from_pixel(size_px[0], size_px[1], image::Rgb(BACKGROUND));
-    image.write_to(&mut jpeg, image::ImageFormat::Jpeg).expect("encoded");
+    image
+        .write_to(&mut jpeg, image::ImageFormat::Jpeg)
+        .expect("encoded");
     let jpeg = jpeg.into_inner();
-    let depth: Vec<u8> = depth_m.iter().flat_map(|depth| depth.to_le_bytes()).collect();
+    let depth: Vec<u8> = depth_m
+        .iter()
+        .flat_map(|depth| depth.to_le_bytes())
+        .collect();
     let header = json!({
         "type": "picture", "id": request["id"], "stage": 0, "n_stages": 1, "scale": 1.0, "last": true,
         "size_px": size_px, "full_size_px": size_px, "world_from_camera": request["world_from_camera"],
@@ -232,20 +299,38 @@ fn picture(request: &Value, depth_m: &[f32]) -> Message {
 /// Where the robot is drawn: the pixels that change when it is hidden.
 fn drawn_silhouette(browser: &mut Browser, name: &str) -> Vec<bool> {
     let with_robot = canvas_shot(browser);
-    with_robot.save(Path::new(env!("CARGO_TARGET_TMPDIR")).join(name)).expect("written");
+    with_robot
+        .save(Path::new(env!("CARGO_TARGET_TMPDIR")).join(name))
+        .expect("written");
     browser.click("toggle-robot");
     let without_robot = canvas_shot(browser);
     browser.click("toggle-robot");
-    let differs =
-        |(a, b): (&image::Rgb<u8>, &image::Rgb<u8>)| a.0.iter().zip(b.0).any(|(a, b)| a.abs_diff(b) > MIN_CONTRAST);
-    with_robot.pixels().zip(without_robot.pixels()).map(differs).collect()
+    let differs = |(a, b): (&image::Rgb<u8>, &image::Rgb<u8>)| {
+        a.0.iter()
+            .zip(b.0)
+            .any(|(a, b)| a.abs_diff(b) > MIN_CONTRAST)
+    };
+    with_robot
+        .pixels()
+        .zip(without_robot.pixels())
+        .map(differs)
+        .collect()
 }
 
 #[test]
 fn silhouette_of_a_simulated_robot_matches_the_simulator() {
-    let Some(program) = browser_for_page() else { return };
-    let Robot { description, states } = robot_of_run();
-    assert_eq!(description["joint_names"][6], "panda_joint7", "all joints in order: {}", description["joint_names"]);
+    let Some(program) = browser_for_page() else {
+        return;
+    };
+    let Robot {
+        description,
+        states,
+    } = robot_of_run();
+    assert_eq!(
+        description["joint_names"][6], "panda_joint7",
+        "all joints in order: {}",
+        description["joint_names"]
+    );
     let stage = Arc::new(Stage {
         renderer: Mutex::new(start_renderer()),
         robot: description,
@@ -254,10 +339,12 @@ fn silhouette_of_a_simulated_robot_matches_the_simulator() {
     });
     let talking = Arc::clone(&stage);
     let server = PageServer::start(move |socket| talking.talk(socket));
-    let profile: PathBuf =
-        Path::new(env!("CARGO_TARGET_TMPDIR")).join(format!("chromium-silhouette-{}", std::process::id()));
+    let profile: PathBuf = Path::new(env!("CARGO_TARGET_TMPDIR"))
+        .join(format!("chromium-silhouette-{}", std::process::id()));
     let mut browser = Browser::open(&program, &profile, &server.url(), WINDOW_PX);
-    wait_for(&mut browser, "a full picture", |browser| browser.text("picture-text").contains("100 %"));
+    wait_for(&mut browser, "a full picture", |browser| {
+        browser.text("picture-text").contains("100 %")
+    });
     browser.click("toggle-grid");
     let view = stage.view();
     let mut masks = RobotMasks::open(Scene::StaticArm, view.size_px).expect("the scene is valid");
@@ -266,13 +353,19 @@ fn silhouette_of_a_simulated_robot_matches_the_simulator() {
         *stage.state.lock().expect("no panic") = state.clone();
         for is_alone in [false, true] {
             let base = pose(&state["world_from_base"]);
-            let mask = masks.mask(&view, &base, &positions(state), is_alone).expect("seven joints");
+            let mask = masks
+                .mask(&view, &base, &positions(state), is_alone)
+                .expect("seven joints");
             let name = format!("simulated-robot-{n}-{is_alone}.png");
-            wait_for(&mut browser, &format!("the silhouette in {name}"), |browser| {
-                let overlap = iou(view.size_px, &drawn_silhouette(browser, &name), &mask);
-                eprintln!("{name}: IoU {overlap:.4}");
-                overlap >= MIN_IOU
-            });
+            wait_for(
+                &mut browser,
+                &format!("the silhouette in {name}"),
+                |browser| {
+                    let overlap = iou(view.size_px, &drawn_silhouette(browser, &name), &mask);
+                    eprintln!("{name}: IoU {overlap:.4}");
+                    overlap >= MIN_IOU
+                },
+            );
             exact.push(mask);
             browser.click("toggle-occlude");
         }
@@ -280,7 +373,10 @@ fn silhouette_of_a_simulated_robot_matches_the_simulator() {
     // The cases differ, so that a wrong case would have been detected.
     for (a, b) in [(0, 1), (0, 2), (1, 3), (2, 3)] {
         let similarity = iou(view.size_px, &exact[a], &exact[b]);
-        assert!(similarity < MIN_IOU - 0.02, "cases {a} and {b} are too similar: {similarity}");
+        assert!(
+            similarity < MIN_IOU - 0.02,
+            "cases {a} and {b} are too similar: {similarity}"
+        );
     }
     drop(browser);
     std::fs::remove_dir_all(&profile).expect("the browser has left its profile");

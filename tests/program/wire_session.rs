@@ -30,7 +30,9 @@ impl RecordingProxy {
         let recorded = Arc::clone(&connections);
         std::thread::spawn(move || {
             for client in listener.incoming().map_while(Result::ok) {
-                let Ok(server) = TcpStream::connect(server) else { continue };
+                let Ok(server) = TcpStream::connect(server) else {
+                    continue;
+                };
                 let [client_too, server_too] =
                     [&client, &server].map(|stream| stream.try_clone().expect("a descriptor"));
                 std::thread::spawn(move || forward(client, server_too, |_| ()));
@@ -42,12 +44,16 @@ impl RecordingProxy {
                 let recorded = Arc::clone(&recorded);
                 std::thread::spawn(move || {
                     forward(server, client_too, |bytes| {
-                        recorded.lock().expect("no panic")[ix].push((Instant::now(), bytes.to_vec()));
+                        recorded.lock().expect("no panic")[ix]
+                            .push((Instant::now(), bytes.to_vec()));
                     });
                 });
             }
         });
-        Self { address, connections }
+        Self {
+            address,
+            connections,
+        }
     }
 
     /// URL of the page through the proxy.
@@ -58,8 +64,11 @@ impl RecordingProxy {
     /// The messages of the only WebSocket.
     pub(crate) fn session(&self) -> Session {
         let connections = self.connections.lock().expect("no panic");
-        let is_websocket =
-            |chunks: &&Vec<Chunk>| chunks.first().is_some_and(|(_, bytes)| bytes.starts_with(b"HTTP/1.1 101"));
+        let is_websocket = |chunks: &&Vec<Chunk>| {
+            chunks
+                .first()
+                .is_some_and(|(_, bytes)| bytes.starts_with(b"HTTP/1.1 101"))
+        };
         let mut sockets = connections.iter().filter(is_websocket);
         let session = Session::parse(sockets.next().expect("a WebSocket"));
         assert!(sockets.next().is_none(), "the page connected again");
@@ -91,7 +100,11 @@ pub(crate) struct Session {
 impl Session {
     /// The server sends each message as one frame, without mask.
     fn parse(chunks: &[Chunk]) -> Self {
-        let bytes: Vec<u8> = chunks.iter().flat_map(|(_, bytes)| bytes).copied().collect();
+        let bytes: Vec<u8> = chunks
+            .iter()
+            .flat_map(|(_, bytes)| bytes)
+            .copied()
+            .collect();
         // The time at which the byte with this index was received.
         let time_of = |ix: usize| {
             let mut end = 0;
@@ -101,25 +114,35 @@ impl Session {
             };
             chunks.iter().find(is_inside).expect("a received byte").0
         };
-        let head = bytes.windows(4).position(|window| window == b"\r\n\r\n").expect("the end of the handshake");
+        let head = bytes
+            .windows(4)
+            .position(|window| window == b"\r\n\r\n")
+            .expect("the end of the handshake");
         let (mut at, mut timed) = (head + 4, Vec::new());
         while let Some((opcode, payload)) = frame(&bytes[at..]) {
             let end = payload.as_ptr_range().end as usize - bytes.as_ptr() as usize;
             match opcode {
-                TEXT => {
-                    timed.push((time_of(end - 1), Message::text(String::from_utf8(payload.to_vec()).expect("UTF-8"))))
-                }
+                TEXT => timed.push((
+                    time_of(end - 1),
+                    Message::text(String::from_utf8(payload.to_vec()).expect("UTF-8")),
+                )),
                 BINARY => timed.push((time_of(end - 1), Message::binary(payload.to_vec()))),
                 _ => {}
             }
             at = end;
         }
         let began = timed.first().expect("a hello").0;
-        let messages: Arc<[_]> = timed.into_iter().map(|(time, message)| (time - began, message)).collect();
+        let messages: Arc<[_]> = timed
+            .into_iter()
+            .map(|(time, message)| (time - began, message))
+            .collect();
         let hello = texts(&messages).next().expect("a hello");
         assert_eq!(hello["type"], "hello");
         let clock_millis = hello["clock_millis"].as_f64().expect("a time");
-        Self { messages, clock_millis }
+        Self {
+            messages,
+            clock_millis,
+        }
     }
 
     pub(crate) fn duration(&self) -> Duration {
@@ -135,7 +158,9 @@ impl Session {
     pub(crate) fn binaries(&self, kind: &str) -> Vec<(Value, Vec<u8>)> {
         let (mut joined, mut found) = (Vec::new(), Vec::new());
         for (_, message) in self.messages.iter() {
-            let Message::Binary(bytes) = message else { continue };
+            let Message::Binary(bytes) = message else {
+                continue;
+            };
             let (mut header, mut payload) = unframed(bytes);
             if header["type"] == "part" {
                 joined.extend(payload);
@@ -151,14 +176,22 @@ impl Session {
         found
     }
 
-    /// Plays the session to a page at a multiple of its speed, then keeps the connection open until `is_over`. Answers
-    /// pings on the clock of the session.
+    /// Plays the session to a page at a multiple of its speed, then keeps the connection open until
+    /// `is_over`. Answers pings on the clock of the session.
     pub(crate) fn play(&self, mut socket: WebSocket<TcpStream>, speed: f64, is_over: &AtomicBool) {
-        socket.get_ref().set_read_timeout(Some(Duration::from_millis(1))).expect("a timeout");
+        socket
+            .get_ref()
+            .set_read_timeout(Some(Duration::from_millis(1)))
+            .expect("a timeout");
         let began = Instant::now();
         let elapsed = || began.elapsed().mul_f64(speed);
-        let is_played = |message: &Message| !matches!(message, Message::Text(text) if is_own_answer(text));
-        let mut rest = self.messages.iter().filter(|(_, message)| is_played(message)).peekable();
+        let is_played =
+            |message: &Message| !matches!(message, Message::Text(text) if is_own_answer(text));
+        let mut rest = self
+            .messages
+            .iter()
+            .filter(|(_, message)| is_played(message))
+            .peekable();
         while !is_over.load(Ordering::Relaxed) {
             while let Some((_, message)) = rest.next_if(|(at, _)| *at <= elapsed()) {
                 if socket.send(message.clone()).is_err() {
@@ -186,7 +219,9 @@ impl Session {
 /// Whether a recorded message is replaced when a session is played, or would end the connection.
 fn is_own_answer(text: &str) -> bool {
     let message: Value = serde_json::from_str(text).expect("JSON");
-    ["pong", "goodbye"].iter().any(|kind| message["type"] == *kind)
+    ["pong", "goodbye"]
+        .iter()
+        .any(|kind| message["type"] == *kind)
 }
 
 fn answer_to(text: &str, clock_millis: f64) -> Option<Message> {
@@ -206,8 +241,14 @@ fn texts(messages: &[(Duration, Message)]) -> impl Iterator<Item = Value> {
 fn frame(bytes: &[u8]) -> Option<(u8, &[u8])> {
     let opcode = bytes.first()? & 0x0f;
     let (begin, n) = match bytes.get(1)? {
-        126 => (4, usize::from(u16::from_be_bytes(bytes.get(2..4)?.try_into().ok()?))),
-        127 => (10, usize::try_from(u64::from_be_bytes(bytes.get(2..10)?.try_into().ok()?)).ok()?),
+        126 => (
+            4,
+            usize::from(u16::from_be_bytes(bytes.get(2..4)?.try_into().ok()?)),
+        ),
+        127 => (
+            10,
+            usize::try_from(u64::from_be_bytes(bytes.get(2..10)?.try_into().ok()?)).ok()?,
+        ),
         n => (2, usize::from(*n)),
     };
     Some((opcode, bytes.get(begin..begin + n)?))
@@ -217,5 +258,8 @@ fn frame(bytes: &[u8]) -> Option<(u8, &[u8])> {
 fn unframed(bytes: &[u8]) -> (Value, Vec<u8>) {
     let (length, rest) = bytes.split_first_chunk().expect("a length");
     let (header, payload) = rest.split_at(u32::from_le_bytes(*length) as usize);
-    (serde_json::from_slice(header).expect("a JSON header"), payload.to_vec())
+    (
+        serde_json::from_slice(header).expect("a JSON header"),
+        payload.to_vec(),
+    )
 }

@@ -1,8 +1,7 @@
-//! Benchmarks of the signed distance field: fusing a keyframe of 640x480 with color, rendering, and meshing, with voxels
-//! of 1 cm.
-//! Times for fusing, rendering, and meshing the changes of one keyframe are GPU times if the adapter has timestamps.
-//! The times of all passes of one keyframe are printed first.
-//! passes of one keyframe are printed before.
+//! Benchmarks of the signed distance field: fusing a keyframe of 640x480 with color, rendering, and
+//! meshing, with voxels of 1 cm. Times for fusing, rendering, and meshing the changes of one
+//! keyframe are GPU times if the adapter has timestamps. The times of all passes of one keyframe
+//! are printed first. passes of one keyframe are printed before.
 
 use criterion::{Criterion, criterion_group, criterion_main};
 use keyframe::Keyframe;
@@ -21,14 +20,27 @@ const N_KEYFRAMES: usize = 12;
 /// A ball on a floor in front of a wall. The camera moves around it.
 fn keyframes() -> Vec<Arc<Keyframe>> {
     let shapes = [
-        TestShape::Sphere { center_m: Point3::new(0.0, 0.0, 0.3), radius_m: 0.3 },
-        TestShape::Plane { normal: Vector3::z(), offset_m: 0.0 },
-        TestShape::Plane { normal: Vector3::new(0.0, -1.0, 0.0), offset_m: -1.5 },
+        TestShape::Sphere {
+            center_m: Point3::new(0.0, 0.0, 0.3),
+            radius_m: 0.3,
+        },
+        TestShape::Plane {
+            normal: Vector3::z(),
+            offset_m: 0.0,
+        },
+        TestShape::Plane {
+            normal: Vector3::new(0.0, -1.0, 0.0),
+            offset_m: -1.5,
+        },
     ];
     let keyframe_at = |ix: usize| {
         let turn_rad = 0.02 * ix as f64 - 1.57;
         let eye = Point3::new(1.6 * turn_rad.cos(), 1.6 * turn_rad.sin(), 0.9);
-        Arc::new(large_keyframe(ix as i64, &shapes, look_at(eye, Point3::new(0.0, 0.3, 0.3))))
+        Arc::new(large_keyframe(
+            ix as i64,
+            &shapes,
+            look_at(eye, Point3::new(0.0, 0.3, 0.3)),
+        ))
     };
     (0..N_KEYFRAMES).map(keyframe_at).collect()
 }
@@ -44,9 +56,17 @@ impl Fusion {
     fn new() -> Self {
         let gpu = Gpu::open(&GpuOptions::default()).expect("an adapter");
         eprintln!("{}", gpu.describe());
-        let options = TsdfOptions { voxel_m: Some(0.01), noise_per_m2: Some(1.5e-3), ..TsdfOptions::default() };
+        let options = TsdfOptions {
+            voxel_m: Some(0.01),
+            noise_per_m2: Some(1.5e-3),
+            ..TsdfOptions::default()
+        };
         let model = TsdfModel::new(gpu, options.into()).expect("the options are valid");
-        let mut fusion = Self { model, keyframes: keyframes(), n_pushed: 0 };
+        let mut fusion = Self {
+            model,
+            keyframes: keyframes(),
+            n_pushed: 0,
+        };
         for _ in 0..N_KEYFRAMES {
             fusion.push();
             fusion.fuse_all();
@@ -57,7 +77,12 @@ impl Fusion {
     fn push(&mut self) {
         let keyframe = &self.keyframes[self.n_pushed % N_KEYFRAMES];
         let stamp = Stamp(self.n_pushed as i64);
-        self.model.push(Arc::new(Keyframe { stamp, ..keyframe.as_ref().clone() })).expect("a valid keyframe");
+        self.model
+            .push(Arc::new(Keyframe {
+                stamp,
+                ..keyframe.as_ref().clone()
+            }))
+            .expect("a valid keyframe");
         self.n_pushed += 1;
     }
 
@@ -77,7 +102,9 @@ impl Fusion {
 fn gpu_time(passes: &[PassTiming], begin: Instant) -> Duration {
     match passes {
         [] => begin.elapsed(),
-        passes => Duration::from_secs_f64(passes.iter().map(|pass| pass.millis).sum::<f64>() * 1e-3),
+        passes => {
+            Duration::from_secs_f64(passes.iter().map(|pass| pass.millis).sum::<f64>() * 1e-3)
+        }
     }
 }
 
@@ -85,7 +112,10 @@ fn request() -> RenderRequest {
     RenderRequest {
         world_from_camera: look_at(Point3::new(0.1, -1.6, 0.9), Point3::new(0.0, 0.3, 0.3)),
         size_px: [640, 480],
-        projection: Projection::Pinhole { focal_px: [525.0; 2], principal_px: [320.0, 240.0] },
+        projection: Projection::Pinhole {
+            focal_px: [525.0; 2],
+            principal_px: [320.0, 240.0],
+        },
         shutter: None,
         near_m: 0.01,
         far_m: 100.0,
@@ -115,8 +145,14 @@ fn tsdf(criterion: &mut Criterion) {
         bench.iter_custom(|n| {
             let timed = (0..n).map(|_| {
                 let begin = Instant::now();
-                let millis = fusion.model.profile_picture(&request()).expect("the GPU works");
-                millis.map_or_else(|| begin.elapsed(), |millis| Duration::from_secs_f64(millis * 1e-3))
+                let millis = fusion
+                    .model
+                    .profile_picture(&request())
+                    .expect("the GPU works");
+                millis.map_or_else(
+                    || begin.elapsed(),
+                    |millis| Duration::from_secs_f64(millis * 1e-3),
+                )
             });
             timed.sum()
         });

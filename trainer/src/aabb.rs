@@ -18,7 +18,9 @@ impl Aabb {
     /// Whether the box contains a point in world.
     #[must_use]
     pub fn contains(&self, point_m: [f64; 3]) -> bool {
-        let in_box = self.world_from_box.inverse_transform_point(&Point3::from(point_m));
+        let in_box = self
+            .world_from_box
+            .inverse_transform_point(&Point3::from(point_m));
         (0..3).all(|axis| (self.min_m[axis]..=self.max_m[axis]).contains(&in_box[axis]))
     }
 }

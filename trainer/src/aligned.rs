@@ -1,10 +1,11 @@
 //! A scene model whose cameras are aligned while it trains.
 //!
-//! Alignment runs in parallel with training, once or repeatedly as keyframes arrive. Its result is applied a fixed number
-//! of steps after it began, so that a seed gives one result; in real time, it is applied when the caller asks for it
-//! ([`Method::poll_alignment`]), so that training never waits. Alignment from features, without depth, takes only
-//! seconds, so it precedes the first step if it runs once. A result that changes the corrections replaces the
-//! keyframes; the model moves along with them or restarts, see [`Recalibrate`].
+//! Alignment runs in parallel with training, once or repeatedly as keyframes arrive. Its result is
+//! applied a fixed number of steps after it began, so that a seed gives one result; in real time,
+//! it is applied when the caller asks for it ([`Method::poll_alignment`]), so that training never
+//! waits. Alignment from features, without depth, takes only seconds, so it precedes the first step
+//! if it runs once. A result that changes the corrections replaces the keyframes; the model moves
+//! along with them or restarts, see [`Recalibrate`].
 
 use crate::checkpoint::{Checkpoint, PendingCheckpoint};
 use crate::edits::{Edits, PendingFloaters};
@@ -13,11 +14,13 @@ use crate::initial_points::InitialPoints;
 use crate::model_chunks::PendingChunks;
 use crate::model_metadata::{METADATA_FILE, read_metadata};
 use crate::model_options::{AlignTiming, CommonOptions};
-use crate::{Bounds, Error, Method, Packing, Picture, Progress, QueuedPicture, RenderRequest, Rendered};
+use crate::{
+    Bounds, Error, Method, Packing, Picture, Progress, QueuedPicture, RenderRequest, Rendered,
+};
 use calibration::TrialReport;
 use calibration::{
-    Alignment, AlignmentTask, CalibratedCamera, CameraCorrection, CameraRefinement, MOVEMENT_WINDOW, MovementTask,
-    alignment_step,
+    Alignment, AlignmentTask, CalibratedCamera, CameraCorrection, CameraRefinement,
+    MOVEMENT_WINDOW, MovementTask, alignment_step,
 };
 use keyframe::{Keyframe, Split};
 use kinematics::Stamp;
@@ -26,12 +29,14 @@ use std::collections::{BTreeMap, HashMap};
 use std::path::Path;
 use std::sync::Arc;
 
-/// Key of the alignment state in a checkpoint. [`METADATA_KEY`] is the key of the alignment in `model.json`.
+/// Key of the alignment state in a checkpoint. [`METADATA_KEY`] is the key of the alignment in
+/// `model.json`.
 const STATE_KEY: &str = "aligned";
 const METADATA_KEY: &str = "alignment";
 
-/// Number of keyframes at which a live run is aligned for the first time: about four of them are validation images. It
-/// is aligned again each time the number has grown by the next constant, a factor.
+/// Number of keyframes at which a live run is aligned for the first time: about four of them are
+/// validation images. It is aligned again each time the number has grown by the next constant, a
+/// factor.
 const FIRST_LIVE_ALIGNMENT: usize = 25;
 const LIVE_ALIGNMENT_GROWTH: f64 = std::f64::consts::SQRT_2;
 
@@ -46,7 +51,10 @@ pub struct CorrectedKeyframe {
 
 /// Replaces a keyframe with its version after the corrections.
 pub(crate) fn replacement(keyframes: &[CorrectedKeyframe]) -> impl Fn(&mut Arc<Keyframe>) {
-    let after: HashMap<_, _> = keyframes.iter().map(|keyframe| (id_of(&keyframe.before), &keyframe.after)).collect();
+    let after: HashMap<_, _> = keyframes
+        .iter()
+        .map(|keyframe| (id_of(&keyframe.before), &keyframe.after))
+        .collect();
     move |keyframe| {
         if let Some(after) = after.get(&id_of(keyframe)).copied() {
             *keyframe = Arc::clone(after);
@@ -56,12 +64,16 @@ pub(crate) fn replacement(keyframes: &[CorrectedKeyframe]) -> impl Fn(&mut Arc<K
 
 /// A model whose cameras can be corrected during training.
 pub trait Recalibrate: Method {
-    /// Replaces all keyframes pushed so far. The model moves along with its keyframes, or forgets all training if it
-    /// cannot be moved.
+    /// Replaces all keyframes pushed so far. The model moves along with its keyframes, or forgets
+    /// all training if it cannot be moved.
     ///
     /// * `keyframes`: in the order of their arrival, without test keyframes.
     /// * `alignment`: the source of the new corrections.
-    fn recalibrate(&mut self, keyframes: &[CorrectedKeyframe], alignment: &Alignment) -> Result<(), Error>;
+    fn recalibrate(
+        &mut self,
+        keyframes: &[CorrectedKeyframe],
+        alignment: &Alignment,
+    ) -> Result<(), Error>;
 }
 
 /// A resumed model, and the keyframes that it was not trained on.
@@ -122,8 +134,14 @@ fn id_of(keyframe: &Keyframe) -> (&str, i64) {
 }
 
 impl<M: Recalibrate + 'static> Aligned<M> {
-    /// A model whose keyframes are aligned as specified by `choice`; the result is applied early in `n_planned_steps`.
-    pub fn new(model: M, choice: CameraRefinement, is_software: bool, n_planned_steps: u64) -> Self {
+    /// A model whose keyframes are aligned as specified by `choice`; the result is applied early in
+    /// `n_planned_steps`.
+    pub fn new(
+        model: M,
+        choice: CameraRefinement,
+        is_software: bool,
+        n_planned_steps: u64,
+    ) -> Self {
         Self {
             model,
             alignment_task: AlignmentTask::new(&choice),
@@ -146,12 +164,21 @@ impl<M: Recalibrate + 'static> Aligned<M> {
         if common.align == CameraRefinement::default() {
             return Box::new(model);
         }
-        let begins_at = if common.align_timing == AlignTiming::Once { 0 } else { FIRST_LIVE_ALIGNMENT };
+        let begins_at = if common.align_timing == AlignTiming::Once {
+            0
+        } else {
+            FIRST_LIVE_ALIGNMENT
+        };
         Box::new(Self {
             timing: common.align_timing,
             begins_at,
             detects_movements: common.detects_movements && common.align_timing != AlignTiming::Once,
-            ..Self::new(model, common.align.clone(), gpu.is_software(), common.n_planned_steps)
+            ..Self::new(
+                model,
+                common.align.clone(),
+                gpu.is_software(),
+                common.n_planned_steps,
+            )
         })
     }
 
@@ -173,14 +200,17 @@ impl<M: Recalibrate + 'static> Aligned<M> {
             );
         }
         let alignment_task = AlignmentTask::done(metadata.alignment);
-        Ok(Self { alignment_task, ..Self::new(model, CameraRefinement::default(), false, 0) })
+        Ok(Self {
+            alignment_task,
+            ..Self::new(model, CameraRefinement::default(), false, 0)
+        })
     }
 
-    /// Resumes from a checkpoint. `resume` receives the corrected keyframes, and returns the model and the keyframes
-    /// that it was not trained on.
+    /// Resumes from a checkpoint. `resume` receives the corrected keyframes, and returns the model
+    /// and the keyframes that it was not trained on.
     ///
-    /// * `placeholders`: keyframes without pixels, with corrected poses, in place of missing keyframes. The caller must
-    ///   remove them from the resumed model.
+    /// * `placeholders`: keyframes without pixels, with corrected poses, in place of missing
+    ///   keyframes. The caller must remove them from the resumed model.
     pub fn resume(
         checkpoint: &Checkpoint,
         keyframes: &[Arc<Keyframe>],
@@ -188,11 +218,17 @@ impl<M: Recalibrate + 'static> Aligned<M> {
         resume: impl FnOnce(&Checkpoint, &[Arc<Keyframe>]) -> Result<(M, Vec<Arc<Keyframe>>), Error>,
     ) -> Result<ResumedModel, Error> {
         let mut own_checkpoint = checkpoint.clone();
-        let Some(state) = own_checkpoint.state.as_object_mut().and_then(|state| state.remove(STATE_KEY)) else {
+        let Some(state) = own_checkpoint
+            .state
+            .as_object_mut()
+            .and_then(|state| state.remove(STATE_KEY))
+        else {
             let (model, untrained) = resume(checkpoint, &[keyframes, placeholders].concat())?;
             return Ok((Box::new(model), untrained));
         };
-        let invalid_state = |error: serde_json::Error| Error::CheckpointState { reason: error.to_string() };
+        let invalid_state = |error: serde_json::Error| Error::CheckpointState {
+            reason: error.to_string(),
+        };
         let AlignedState {
             choice,
             is_aligned,
@@ -212,20 +248,30 @@ impl<M: Recalibrate + 'static> Aligned<M> {
         if !is_aligned {
             alignment_task.request_again();
         }
-        let corrected = keyframes.iter().map(|keyframe| alignment_task.corrected(keyframe));
+        let corrected = keyframes
+            .iter()
+            .map(|keyframe| alignment_task.corrected(keyframe));
         let corrected: Vec<_> = corrected.chain(placeholders.iter().cloned()).collect();
         let (model, untrained) = resume(&own_checkpoint, &corrected)?;
-        let originals: BTreeMap<_, _> = keyframes.iter().map(|keyframe| (id_of(keyframe), keyframe)).collect();
+        let originals: BTreeMap<_, _> = keyframes
+            .iter()
+            .map(|keyframe| (id_of(keyframe), keyframe))
+            .collect();
         let original = |id: (&str, i64)| originals.get(&id).map(|keyframe| Arc::clone(keyframe));
-        // After recovery, evicted keyframes have no pixels. They are removed from the model, like missing ones.
+        // After recovery, evicted keyframes have no pixels. They are removed from the model, like
+        // missing ones.
         let with_pixels = |(camera, nanos): &(String, i64)| {
-            original((camera, *nanos)).filter(|keyframe: &Arc<Keyframe>| !keyframe.rgba_srgb.is_empty())
+            original((camera, *nanos))
+                .filter(|keyframe: &Arc<Keyframe>| !keyframe.rgba_srgb.is_empty())
         };
         let n_with_pixels = |n: usize| ids.iter().take(n).filter_map(with_pixels).count();
         let [n_begun, n_references] = [n_begun, n_references].map(|n| n.map(n_with_pixels));
         let original_keyframes: Vec<_> = ids.iter().filter_map(with_pixels).collect();
         // Uncorrected, because `push` corrects them.
-        let untrained = untrained.iter().filter_map(|keyframe| original(id_of(keyframe))).collect();
+        let untrained = untrained
+            .iter()
+            .filter_map(|keyframe| original(id_of(keyframe)))
+            .collect();
         let mut aligned = Self {
             model,
             choice,
@@ -255,11 +301,16 @@ impl<M: Recalibrate + 'static> Aligned<M> {
             return;
         }
         let n_begun = *self.n_begun.get_or_insert(n_keyframes);
-        let from = if self.timing == AlignTiming::Once { 0 } else { self.model.progress().step };
+        let from = if self.timing == AlignTiming::Once {
+            0
+        } else {
+            self.model.progress().step
+        };
         if self.timing != AlignTiming::RealTime {
             self.due_step.get_or_insert(from + self.alignment_steps);
         }
-        self.alignment_task.begin(&self.original_keyframes[..n_begun], &self.choice);
+        self.alignment_task
+            .begin(&self.original_keyframes[..n_begun], &self.choice);
     }
 
     /// Applies the result of alignment at a fixed step, or when the model is idle.
@@ -292,7 +343,8 @@ impl<M: Recalibrate + 'static> Aligned<M> {
                 (None, Some(n_begun)) => self.detect_movements(n_begun),
                 (Some((_, n_references)), _) if is_changed => {
                     // The latest keyframes are tested again with the new corrections.
-                    let n_older = first_recent(&self.original_keyframes, MOVEMENT_WINDOW).max(*n_references);
+                    let n_older =
+                        first_recent(&self.original_keyframes, MOVEMENT_WINDOW).max(*n_references);
                     self.detect_movements(n_older);
                 }
                 _ => {}
@@ -306,7 +358,9 @@ impl<M: Recalibrate + 'static> Aligned<M> {
 
     /// Replaces the keyframes with their newly corrected versions.
     fn recalibrate(&mut self, previous: &AlignmentTask) -> Result<(), Error> {
-        let Some(alignment) = self.alignment_task.result() else { return Ok(()) };
+        let Some(alignment) = self.alignment_task.result() else {
+            return Ok(());
+        };
         let keyframes: Vec<_> = self
             .original_keyframes
             .iter()
@@ -325,24 +379,36 @@ impl<M: Recalibrate + 'static> Aligned<M> {
         Ok(())
     }
 
-    /// Detects movements from now on: the first `n_references` keyframes are references, later ones are tested.
+    /// Detects movements from now on: the first `n_references` keyframes are references, later ones
+    /// are tested.
     fn detect_movements(&mut self, n_references: usize) {
         let corrected = |keyframe: &Arc<Keyframe>| self.alignment_task.corrected(keyframe);
         let (references, later) = self.original_keyframes.split_at(n_references);
         let mut task = MovementTask::new(references.iter().map(corrected).collect());
-        later.iter().map(corrected).for_each(|keyframe| task.push(keyframe));
+        later
+            .iter()
+            .map(corrected)
+            .for_each(|keyframe| task.push(keyframe));
         self.movements = Some((task, n_references));
     }
 
-    /// Applies a movement if one was found. With `wait`, tests all keyframes first. Returns whether a movement was
-    /// applied. During an alignment, no keyframes are tested.
+    /// Applies a movement if one was found. With `wait`, tests all keyframes first. Returns whether
+    /// a movement was applied. During an alignment, no keyframes are tested.
     fn poll_movement(&mut self, wait: bool) -> Result<bool, Error> {
-        let (Some((task, _)), None) = (&mut self.movements, self.n_begun) else { return Ok(false) };
-        let Some(movement) = task.poll(wait)? else { return Ok(false) };
+        let (Some((task, _)), None) = (&mut self.movements, self.n_begun) else {
+            return Ok(false);
+        };
+        let Some(movement) = task.poll(wait)? else {
+            return Ok(false);
+        };
         let first = self.first_stamp.unwrap_or(Stamp(movement.since_nanos));
         let previous = AlignmentTask::done(self.alignment_task.result().cloned());
         self.alignment_task.add_movement(movement, first);
-        if let Some(movement) = self.alignment_task.result().and_then(|alignment| alignment.movements.last()) {
+        if let Some(movement) = self
+            .alignment_task
+            .result()
+            .and_then(|alignment| alignment.movements.last())
+        {
             log::warn!("{movement}");
         }
         self.recalibrate(&previous)?;
@@ -366,7 +432,10 @@ impl<M: Recalibrate + 'static> Aligned<M> {
         self.timing == AlignTiming::Once
             && self.model.progress().step == 0
             && self.alignment_task.is_requested()
-            && self.original_keyframes.iter().all(|keyframe| keyframe.depth.is_none())
+            && self
+                .original_keyframes
+                .iter()
+                .all(|keyframe| keyframe.depth.is_none())
     }
 
     /// Steps until the result of alignment is due.
@@ -381,9 +450,14 @@ impl<M: Recalibrate + 'static> Aligned<M> {
 
 impl<M: Recalibrate + 'static> Method for Aligned<M> {
     fn push(&mut self, keyframe: Arc<Keyframe>) -> Result<(), Error> {
-        let is_used = !self.alignment_task.is_done() && keyframe.split != Split::Test && keyframe.is_finite();
+        let is_used =
+            !self.alignment_task.is_done() && keyframe.split != Split::Test && keyframe.is_finite();
         // Validation keyframes are pushed again after resuming.
-        let is_new = is_used && !self.original_keyframes.iter().any(|known| id_of(known) == id_of(&keyframe));
+        let is_new = is_used
+            && !self
+                .original_keyframes
+                .iter()
+                .any(|known| id_of(known) == id_of(&keyframe));
         if is_new && self.timing == AlignTiming::Lockstep {
             self.poll_movement(true)?;
         }
@@ -400,9 +474,15 @@ impl<M: Recalibrate + 'static> Method for Aligned<M> {
     }
 
     fn remove(&mut self, camera: &str, stamp: Stamp) -> Result<(), Error> {
-        if let Some(ix) = self.original_keyframes.iter().position(|keyframe| id_of(keyframe) == (camera, stamp.0)) {
+        if let Some(ix) = self
+            .original_keyframes
+            .iter()
+            .position(|keyframe| id_of(keyframe) == (camera, stamp.0))
+        {
             self.original_keyframes.remove(ix);
-            self.n_begun = self.n_begun.map(|n_begun| n_begun - usize::from(ix < n_begun));
+            self.n_begun = self
+                .n_begun
+                .map(|n_begun| n_begun - usize::from(ix < n_begun));
             if let Some((_, n_references)) = &mut self.movements {
                 *n_references -= usize::from(ix < *n_references);
             }
@@ -465,15 +545,27 @@ impl<M: Recalibrate + 'static> Method for Aligned<M> {
         self.model.render(request)
     }
 
-    fn render_packed(&mut self, request: &RenderRequest, packing: Packing) -> Result<Rendered, Error> {
+    fn render_packed(
+        &mut self,
+        request: &RenderRequest,
+        packing: Packing,
+    ) -> Result<Rendered, Error> {
         self.model.render_packed(request, packing)
     }
 
-    fn queue_packed(&mut self, request: &RenderRequest, packing: Packing) -> Result<QueuedPicture, Error> {
+    fn queue_packed(
+        &mut self,
+        request: &RenderRequest,
+        packing: Packing,
+    ) -> Result<QueuedPicture, Error> {
         self.model.queue_packed(request, packing)
     }
 
-    fn queue_chunks(&mut self, only_changed: bool, edits: &Arc<Edits>) -> Result<Option<PendingChunks>, Error> {
+    fn queue_chunks(
+        &mut self,
+        only_changed: bool,
+        edits: &Arc<Edits>,
+    ) -> Result<Option<PendingChunks>, Error> {
         self.model.queue_chunks(only_changed, edits)
     }
 
@@ -511,7 +603,9 @@ impl<M: Recalibrate + 'static> Method for Aligned<M> {
 
     fn calibrated_camera(&mut self, keyframe: &Keyframe) -> Result<CalibratedCamera, Error> {
         let learned = self.model.camera_corrections()?;
-        Ok(self.alignment_task.calibrated_camera(keyframe, learned.get(&*keyframe.camera)))
+        Ok(self
+            .alignment_task
+            .calibrated_camera(keyframe, learned.get(&*keyframe.camera)))
     }
 
     fn profile_step(&mut self) -> Result<Vec<PassTiming>, Error> {
@@ -544,17 +638,29 @@ impl<M: Recalibrate + 'static> Method for Aligned<M> {
 
     fn save(&mut self, folder: &Path) -> Result<(), Error> {
         self.model.save(folder)?;
-        let Some(alignment) = self.alignment_task.result() else { return Ok(()) };
+        let Some(alignment) = self.alignment_task.result() else {
+            return Ok(());
+        };
         let path = folder.join(METADATA_FILE);
-        let invalid_file =
-            |error: serde_json::Error| Error::SplatFile { path: path.clone(), reason: error.to_string() };
-        let bytes =
-            files::read(&path, files::Budget::TEXT).map_err(|source| Error::Read { path: path.clone(), source })?;
+        let invalid_file = |error: serde_json::Error| Error::SplatFile {
+            path: path.clone(),
+            reason: error.to_string(),
+        };
+        let bytes = files::read(&path, files::Budget::TEXT).map_err(|source| Error::Read {
+            path: path.clone(),
+            source,
+        })?;
         let mut metadata: serde_json::Map<String, serde_json::Value> =
             serde_json::from_slice(&bytes).map_err(invalid_file)?;
-        metadata.insert(METADATA_KEY.to_owned(), serde_json::to_value(alignment).map_err(invalid_file)?);
+        metadata.insert(
+            METADATA_KEY.to_owned(),
+            serde_json::to_value(alignment).map_err(invalid_file)?,
+        );
         let text = format!("{:#}\n", serde_json::Value::Object(metadata));
-        files::write(&path, text).map_err(|source| Error::Write { path: path.clone(), source })
+        files::write(&path, text).map_err(|source| Error::Write {
+            path: path.clone(),
+            source,
+        })
     }
 
     fn checkpoint(&mut self) -> Result<PendingCheckpoint, Error> {
@@ -569,7 +675,10 @@ impl<M: Recalibrate + 'static> Method for Aligned<M> {
             n_steps_before_restart: self.n_steps_before_restart,
             detects_movements: self.detects_movements,
             first_nanos: self.first_stamp.map(|stamp| stamp.0),
-            n_references: self.movements.as_ref().map(|(_, n_references)| *n_references),
+            n_references: self
+                .movements
+                .as_ref()
+                .map(|(_, n_references)| *n_references),
             keyframes: self
                 .original_keyframes
                 .iter()
@@ -577,7 +686,9 @@ impl<M: Recalibrate + 'static> Method for Aligned<M> {
                 .collect(),
             n_begun: self.n_begun,
         };
-        let invalid_state = |error: serde_json::Error| Error::CheckpointState { reason: error.to_string() };
+        let invalid_state = |error: serde_json::Error| Error::CheckpointState {
+            reason: error.to_string(),
+        };
         let state = serde_json::to_value(state).map_err(invalid_state)?;
         let pending = self.model.checkpoint()?;
         Ok(PendingCheckpoint::new(move || {
@@ -605,7 +716,11 @@ fn first_recent(keyframes: &[Arc<Keyframe>], n: usize) -> usize {
 }
 
 /// Number of keyframes at which the next alignment of a live run begins after one with `n`.
-#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a number of keyframes")]
+#[expect(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "a number of keyframes"
+)]
 fn next_live_alignment(n: usize) -> usize {
     (n as f64 * LIVE_ALIGNMENT_GROWTH).ceil() as usize
 }
@@ -633,16 +748,28 @@ mod tests {
     }
 
     fn nerf(gpu: &Arc<Gpu>) -> NerfModel {
-        let nerf_budget =
-            NerfBudget { n_rays: 64, n_samples: 1 << 10, n_cells: 32, max_log2_entries: 10, ..NerfBudget::SMALL };
+        let nerf_budget = NerfBudget {
+            n_rays: 64,
+            n_samples: 1 << 10,
+            n_cells: 32,
+            max_log2_entries: 10,
+            ..NerfBudget::SMALL
+        };
         let options = ModelOptions {
-            common: CommonOptions { n_planned_steps: 4 * ALIGNMENT_STEP, ..CommonOptions::default() },
-            specific: NerfOptions { nerf_budget: Some(nerf_budget), ..NerfOptions::default() },
+            common: CommonOptions {
+                n_planned_steps: 4 * ALIGNMENT_STEP,
+                ..CommonOptions::default()
+            },
+            specific: NerfOptions {
+                nerf_budget: Some(nerf_budget),
+                ..NerfOptions::default()
+            },
         };
         NerfModel::new(gpu.clone(), options).unwrap()
     }
 
-    type Resume<M> = fn(Arc<Gpu>, &Checkpoint, &[Arc<Keyframe>]) -> Result<(M, Vec<Arc<Keyframe>>), Error>;
+    type Resume<M> =
+        fn(Arc<Gpu>, &Checkpoint, &[Arc<Keyframe>]) -> Result<(M, Vec<Arc<Keyframe>>), Error>;
 
     fn train(model: &mut dyn Method, n_steps: u64) {
         for _ in 0..n_steps {
@@ -655,8 +782,20 @@ mod tests {
         /// Steps after the first one that follows the correction.
         const RESTARTED: u64 = 1;
         let gpu = test_gpu();
-        check_correction(&gpu, tsdf(&gpu), RESTARTED, TsdfModel::resume, TsdfModel::load);
-        check_correction(&gpu, nerf(&gpu), ALIGNMENT_STEP + 1, NerfModel::resume, NerfModel::load);
+        check_correction(
+            &gpu,
+            tsdf(&gpu),
+            RESTARTED,
+            TsdfModel::resume,
+            TsdfModel::load,
+        );
+        check_correction(
+            &gpu,
+            nerf(&gpu),
+            ALIGNMENT_STEP + 1,
+            NerfModel::resume,
+            NerfModel::load,
+        );
         check_correction(
             &gpu,
             MeanColor::new(ModelOptions::default()),
@@ -673,26 +812,46 @@ mod tests {
         resume: Resume<M>,
         load: fn(Arc<Gpu>, &Path) -> Result<M, Error>,
     ) {
-        let miscalibration = Miscalibration { extrinsics: wrong_extrinsics(), ..Miscalibration::none() };
+        let miscalibration = Miscalibration {
+            extrinsics: wrong_extrinsics(),
+            ..Miscalibration::none()
+        };
         let keyframes = capture(&miscalibration);
-        let test = keyframes.iter().find(|keyframe| keyframe.split == Split::Test).unwrap();
-        let mut uninterrupted =
-            Aligned::new(model, CameraRefinement::Always(ParamSet::EXTRINSICS), true, 4 * ALIGNMENT_STEP);
-        keyframes.iter().for_each(|keyframe| uninterrupted.push(keyframe.clone()).unwrap());
+        let test = keyframes
+            .iter()
+            .find(|keyframe| keyframe.split == Split::Test)
+            .unwrap();
+        let mut uninterrupted = Aligned::new(
+            model,
+            CameraRefinement::Always(ParamSet::EXTRINSICS),
+            true,
+            4 * ALIGNMENT_STEP,
+        );
+        keyframes
+            .iter()
+            .for_each(|keyframe| uninterrupted.push(keyframe.clone()).unwrap());
         train(&mut uninterrupted, ALIGNMENT_STEP - 2);
         let early = uninterrupted.checkpoint().unwrap().finish().unwrap();
         train(&mut uninterrupted, 2);
-        assert!(uninterrupted.alignment().is_none() && uninterrupted.progress().step == ALIGNMENT_STEP);
+        assert!(
+            uninterrupted.alignment().is_none() && uninterrupted.progress().step == ALIGNMENT_STEP
+        );
         let due = uninterrupted.checkpoint().unwrap().finish().unwrap();
         train(&mut uninterrupted, 1);
         assert_eq!(
-            (uninterrupted.progress().step, uninterrupted.n_total_steps().unwrap()),
+            (
+                uninterrupted.progress().step,
+                uninterrupted.n_total_steps().unwrap()
+            ),
             (n_steps_after_correction, ALIGNMENT_STEP + 1)
         );
         let correction = uninterrupted.alignment().unwrap().corrections["wrist"].clone();
         let (degrees, mm) = remaining(&correction, &miscalibration.extrinsics);
         assert!(degrees < 0.05 && mm < 0.5, "{degrees} degrees, {mm} mm");
-        assert_eq!(uninterrupted.calibrated_camera(test).unwrap(), correction.apply(test));
+        assert_eq!(
+            uninterrupted.calibrated_camera(test).unwrap(),
+            correction.apply(test)
+        );
         train(&mut uninterrupted, 2);
 
         let resumed = |checkpoint: &Checkpoint| {
@@ -703,20 +862,30 @@ mod tests {
         };
         let (mut interrupted, untrained) = resumed(&early);
         let is_original = |keyframe: &Arc<Keyframe>| {
-            keyframes.iter().any(|original_keyframes| Arc::ptr_eq(original_keyframes, keyframe))
+            keyframes
+                .iter()
+                .any(|original_keyframes| Arc::ptr_eq(original_keyframes, keyframe))
         };
         assert!(!untrained.is_empty() && untrained.iter().all(is_original));
-        untrained.into_iter().for_each(|keyframe| interrupted.push(keyframe).unwrap());
+        untrained
+            .into_iter()
+            .for_each(|keyframe| interrupted.push(keyframe).unwrap());
         train(&mut *interrupted, 3);
-        let (mut interrupted, untrained) = resumed(&interrupted.checkpoint().unwrap().finish().unwrap());
-        untrained.into_iter().for_each(|keyframe| interrupted.push(keyframe).unwrap());
+        let (mut interrupted, untrained) =
+            resumed(&interrupted.checkpoint().unwrap().finish().unwrap());
+        untrained
+            .into_iter()
+            .for_each(|keyframe| interrupted.push(keyframe).unwrap());
         train(&mut *interrupted, 2);
-        let [uninterrupted_end, interrupted_end] = [&mut uninterrupted as &mut dyn Method, &mut *interrupted]
-            .map(|model| model.checkpoint().unwrap().finish().unwrap());
+        let [uninterrupted_end, interrupted_end] =
+            [&mut uninterrupted as &mut dyn Method, &mut *interrupted]
+                .map(|model| model.checkpoint().unwrap().finish().unwrap());
         assert_eq!(uninterrupted_end, interrupted_end);
 
         let (mut interrupted, untrained) = resumed(&due);
-        untrained.into_iter().for_each(|keyframe| interrupted.push(keyframe).unwrap());
+        untrained
+            .into_iter()
+            .for_each(|keyframe| interrupted.push(keyframe).unwrap());
         train(&mut *interrupted, 3);
         assert_eq!(
             interrupted.checkpoint().unwrap().finish().unwrap(),
@@ -726,8 +895,12 @@ mod tests {
 
         let folder = tempfile::tempdir().unwrap();
         uninterrupted.save(folder.path()).unwrap();
-        let loaded = || Aligned::load(load(gpu.clone(), folder.path()).unwrap(), folder.path()).unwrap();
-        assert_eq!(loaded().calibrated_camera(test).unwrap(), correction.apply(test));
+        let loaded =
+            || Aligned::load(load(gpu.clone(), folder.path()).unwrap(), folder.path()).unwrap();
+        assert_eq!(
+            loaded().calibrated_camera(test).unwrap(),
+            correction.apply(test)
+        );
         std::fs::remove_file(folder.path().join(METADATA_FILE)).unwrap();
         assert_eq!(
             loaded().calibrated_camera(test).unwrap(),
@@ -738,7 +911,10 @@ mod tests {
 
     #[test]
     fn more_keyframes_change_the_corrections() {
-        let miscalibration = Miscalibration { extrinsics: wrong_extrinsics(), ..Miscalibration::none() };
+        let miscalibration = Miscalibration {
+            extrinsics: wrong_extrinsics(),
+            ..Miscalibration::none()
+        };
         let mut keyframes = capture(&miscalibration);
         keyframes.retain(|keyframe| keyframe.split != Split::Test);
         let n_first = 2 * keyframes.len() / 3;
@@ -747,44 +923,78 @@ mod tests {
             let mut model = Aligned {
                 timing,
                 begins_at: n_first,
-                ..Aligned::new(MeanColor::new(ModelOptions::default()), choice, true, 4 * ALIGNMENT_STEP)
+                ..Aligned::new(
+                    MeanColor::new(ModelOptions::default()),
+                    choice,
+                    true,
+                    4 * ALIGNMENT_STEP,
+                )
             };
-            let correction = |model: &dyn Method| model.alignment().unwrap().corrections["wrist"].clone();
-            let remaining_after = |model: &dyn Method| remaining(&correction(model), &miscalibration.extrinsics);
+            let correction =
+                |model: &dyn Method| model.alignment().unwrap().corrections["wrist"].clone();
+            let remaining_after =
+                |model: &dyn Method| remaining(&correction(model), &miscalibration.extrinsics);
             let is_real_time = timing == AlignTiming::RealTime;
-            keyframes[..n_first - 1].iter().for_each(|keyframe| model.push(keyframe.clone()).unwrap());
+            keyframes[..n_first - 1]
+                .iter()
+                .for_each(|keyframe| model.push(keyframe.clone()).unwrap());
             train(&mut model, ALIGNMENT_STEP + 3);
-            assert!(model.alignment().is_none() && !model.poll_alignment(true).unwrap(), "there are too few keyframes");
+            assert!(
+                model.alignment().is_none() && !model.poll_alignment(true).unwrap(),
+                "there are too few keyframes"
+            );
             model.push(keyframes[n_first - 1].clone()).unwrap();
             train(&mut model, ALIGNMENT_STEP + 2);
-            assert_eq!(model.alignment().is_none(), is_real_time, "in real time, results are applied on request");
+            assert_eq!(
+                model.alignment().is_none(),
+                is_real_time,
+                "in real time, results are applied on request"
+            );
             assert_eq!(model.poll_alignment(true).unwrap(), is_real_time);
-            assert!(model.progress().step < ALIGNMENT_STEP, "the model must have restarted");
+            assert!(
+                model.progress().step < ALIGNMENT_STEP,
+                "the model must have restarted"
+            );
             let (degrees, mm) = remaining_after(&model);
             assert!(degrees < 0.1 && mm < 1.0, "{degrees} degrees, {mm} mm");
             let step = model.progress().step;
-            keyframes[n_first..].iter().for_each(|keyframe| model.push(keyframe.clone()).unwrap());
+            keyframes[n_first..]
+                .iter()
+                .for_each(|keyframe| model.push(keyframe.clone()).unwrap());
             let before = correction(&model);
             train(&mut model, ALIGNMENT_STEP + 2);
             assert_eq!(model.poll_alignment(true).unwrap(), is_real_time);
             let has_restarted = model.progress().step < step + ALIGNMENT_STEP + 2;
-            assert_eq!(has_restarted, correction(&model) != before, "it restarts only for other corrections");
+            assert_eq!(
+                has_restarted,
+                correction(&model) != before,
+                "it restarts only for other corrections"
+            );
             let (degrees, mm) = remaining_after(&model);
             assert!(degrees < 0.05 && mm < 0.5, "{degrees} degrees, {mm} mm");
             train(&mut model, 3 * ALIGNMENT_STEP);
-            assert!(model.progress().step > 2 * ALIGNMENT_STEP, "no further alignment");
+            assert!(
+                model.progress().step > 2 * ALIGNMENT_STEP,
+                "no further alignment"
+            );
             assert!(!model.poll_alignment(true).unwrap());
         }
     }
 
-    /// A model without steps before its first alignment with `n` keyframes, which detects movements.
+    /// A model without steps before its first alignment with `n` keyframes, which detects
+    /// movements.
     fn detecting(timing: AlignTiming, n: usize) -> Aligned<MeanColor> {
         let choice = CameraRefinement::Always(ParamSet::EXTRINSICS);
         Aligned {
             timing,
             begins_at: n,
             detects_movements: true,
-            ..Aligned::new(MeanColor::new(ModelOptions::default()), choice, true, 4 * ALIGNMENT_STEP)
+            ..Aligned::new(
+                MeanColor::new(ModelOptions::default()),
+                choice,
+                true,
+                4 * ALIGNMENT_STEP,
+            )
         }
     }
 
@@ -792,14 +1002,21 @@ mod tests {
     fn movement_of_a_camera_corrects_the_images_since_then() {
         const N_FIRST: usize = 17;
         const MOVED_AT: usize = 22;
-        let motion = Transform::new(Vector3::new(-0.004, 0.003, 0.004), Vector3::new(0.02, -0.025, 0.018));
+        let motion = Transform::new(
+            Vector3::new(-0.004, 0.003, 0.004),
+            Vector3::new(0.02, -0.025, 0.018),
+        );
         let error = wrong_extrinsics();
         let scan = |extrinsics: Transform| {
-            let mut keyframes = capture(&Miscalibration { extrinsics, ..Miscalibration::none() });
+            let mut keyframes = capture(&Miscalibration {
+                extrinsics,
+                ..Miscalibration::none()
+            });
             keyframes.retain(|keyframe| keyframe.split != Split::Test);
             keyframes
         };
-        let [before, after, right] = [error, motion.inverse() * error, Transform::identity()].map(scan);
+        let [before, after, right] =
+            [error, motion.inverse() * error, Transform::identity()].map(scan);
         let keyframes = [&before[..MOVED_AT], &after[MOVED_AT..]].concat();
         let train_on = |model: &mut dyn Method, keyframes: &[Arc<Keyframe>]| {
             for keyframe in keyframes {
@@ -810,7 +1027,9 @@ mod tests {
         };
         let start = |timing: AlignTiming| {
             let mut model = detecting(timing, N_FIRST);
-            keyframes[..N_FIRST].iter().for_each(|keyframe| model.push(keyframe.clone()).unwrap());
+            keyframes[..N_FIRST]
+                .iter()
+                .for_each(|keyframe| model.push(keyframe.clone()).unwrap());
             train(&mut model, ALIGNMENT_STEP + 2);
             model.poll_alignment(true).unwrap();
             assert!(model.alignment().unwrap().has_corrections());
@@ -823,14 +1042,23 @@ mod tests {
             model.poll_alignment(true).unwrap();
             let movements = &model.alignment().unwrap().movements;
             assert_eq!(movements.len(), 1, "{movements:?}");
-            assert_eq!((&*movements[0].camera, movements[0].since_nanos), ("wrist", keyframes[MOVED_AT].stamp.0));
+            assert_eq!(
+                (&*movements[0].camera, movements[0].since_nanos),
+                ("wrist", keyframes[MOVED_AT].stamp.0)
+            );
             let text = movements[0].to_string();
             assert!(text.contains("moved by 2.1 degrees and 6 mm"), "{text}");
             for (ix, (keyframe, right)) in keyframes.iter().zip(&right).enumerate() {
                 let camera = model.calibrated_camera(keyframe).unwrap();
                 let left = right.world_from_camera.inverse() * camera.world_from_camera;
-                let (degrees, mm) = (left.rotation.angle().to_degrees(), 1e3 * left.translation.vector.norm());
-                assert!(degrees < 0.06 && mm < 0.8, "image {ix}: {degrees} degrees, {mm} mm");
+                let (degrees, mm) = (
+                    left.rotation.angle().to_degrees(),
+                    1e3 * left.translation.vector.norm(),
+                );
+                assert!(
+                    degrees < 0.06 && mm < 0.8,
+                    "image {ix}: {degrees} degrees, {mm} mm"
+                );
             }
         }
 
@@ -839,9 +1067,13 @@ mod tests {
         let n_before = MOVED_AT + 2;
         train_on(&mut uninterrupted, &keyframes[N_FIRST..n_before]);
         let checkpoint = uninterrupted.checkpoint().unwrap().finish().unwrap();
-        let resume = |own: &Checkpoint, keyframes: &[Arc<Keyframe>]| MeanColor::resume(own, keyframes);
-        let (mut resumed, untrained) = Aligned::resume(&checkpoint, &keyframes[..n_before], &[], resume).unwrap();
-        untrained.into_iter().for_each(|keyframe| resumed.push(keyframe).unwrap());
+        let resume =
+            |own: &Checkpoint, keyframes: &[Arc<Keyframe>]| MeanColor::resume(own, keyframes);
+        let (mut resumed, untrained) =
+            Aligned::resume(&checkpoint, &keyframes[..n_before], &[], resume).unwrap();
+        untrained
+            .into_iter()
+            .for_each(|keyframe| resumed.push(keyframe).unwrap());
         let ends = [&mut uninterrupted as &mut dyn Method, &mut *resumed].map(|model| {
             train_on(model, &keyframes[n_before..]);
             model.checkpoint().unwrap().finish().unwrap()
@@ -853,32 +1085,53 @@ mod tests {
         let evicted = [2, N_FIRST + 2];
         let mut restored = keyframes[..n_before].to_vec();
         for ix in evicted {
-            restored[ix] = Arc::new(Keyframe { rgba_srgb: [].into(), ..restored[ix].as_ref().clone() });
+            restored[ix] = Arc::new(Keyframe {
+                rgba_srgb: [].into(),
+                ..restored[ix].as_ref().clone()
+            });
         }
         let (mut recovered, _) = Aligned::resume(&checkpoint, &restored, &[], resume).unwrap();
-        evicted.iter().for_each(|ix| recovered.remove("wrist", keyframes[*ix].stamp).unwrap());
+        evicted
+            .iter()
+            .for_each(|ix| recovered.remove("wrist", keyframes[*ix].stamp).unwrap());
         train_on(&mut *recovered, &keyframes[n_before..]);
         assert_eq!(recovered.alignment().unwrap().movements.len(), 1);
     }
 
     #[test]
     fn cameras_without_depth_are_corrected_before_the_first_step() {
-        let miscalibration = Miscalibration { extrinsics: wrong_extrinsics(), ..Miscalibration::none() };
-        let without_depth = |keyframe: &Arc<Keyframe>| Arc::new(Keyframe { depth: None, ..(**keyframe).clone() });
+        let miscalibration = Miscalibration {
+            extrinsics: wrong_extrinsics(),
+            ..Miscalibration::none()
+        };
+        let without_depth = |keyframe: &Arc<Keyframe>| {
+            Arc::new(Keyframe {
+                depth: None,
+                ..(**keyframe).clone()
+            })
+        };
         let keyframes: Vec<_> = capture(&miscalibration).iter().map(without_depth).collect();
         let choice = CameraRefinement::Try(vec![ParamSet::EXTRINSICS]);
         let gpu = test_gpu();
         let splats = SplatTrainer::new(gpu, ModelOptions::default()).unwrap();
         let mut model = Aligned::new(splats, choice, true, 4 * ALIGNMENT_STEP);
-        keyframes.iter().for_each(|keyframe| model.push(keyframe.clone()).unwrap());
+        keyframes
+            .iter()
+            .for_each(|keyframe| model.push(keyframe.clone()).unwrap());
         assert!(model.alignment().is_none());
         train(&mut model, 1);
         let correction = model.alignment().unwrap().corrections["wrist"].clone();
         let (degrees, mm) = remaining(&correction, &miscalibration.extrinsics);
         assert!(degrees < 0.15 && mm < 4.0, "{degrees} degrees, {mm} mm");
         assert_eq!(model.progress().step, 1, "no step was discarded");
-        let test = keyframes.iter().find(|keyframe| keyframe.split == Split::Test).unwrap();
-        assert_eq!(model.calibrated_camera(test).unwrap(), correction.apply(test));
+        let test = keyframes
+            .iter()
+            .find(|keyframe| keyframe.split == Split::Test)
+            .unwrap();
+        assert_eq!(
+            model.calibrated_camera(test).unwrap(),
+            correction.apply(test)
+        );
     }
 
     #[test]
@@ -890,7 +1143,12 @@ mod tests {
     }
 
     fn check_training_continues<M: Recalibrate + 'static>(model: M) {
-        let mut model = Aligned::new(model, CameraRefinement::Always(ParamSet::EXTRINSICS), true, 4 * ALIGNMENT_STEP);
+        let mut model = Aligned::new(
+            model,
+            CameraRefinement::Always(ParamSet::EXTRINSICS),
+            true,
+            4 * ALIGNMENT_STEP,
+        );
         assert!(model.is_idle());
         for keyframe in scenes::ring(&[scenes::floor()], nalgebra::Point3::origin(), 2) {
             model.push(keyframe).unwrap();
@@ -898,7 +1156,11 @@ mod tests {
         while !model.is_idle() && model.progress().step < ALIGNMENT_STEP + 2 {
             model.step(1).unwrap();
         }
-        assert!(model.alignment().is_none_or(|alignment| !alignment.has_corrections()));
+        assert!(
+            model
+                .alignment()
+                .is_none_or(|alignment| !alignment.has_corrections())
+        );
         assert!(model.progress().step > 0);
     }
 }

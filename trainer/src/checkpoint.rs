@@ -90,36 +90,51 @@ impl Checkpoint {
         }
     }
 
-    /// Writes the file under a temporary name, syncs it and renames it. The final name therefore always refers to a
-    /// complete file: the previous one or the new one.
+    /// Writes the file under a temporary name, syncs it and renames it. The final name therefore
+    /// always refers to a complete file: the previous one or the new one.
     pub fn write(&self, path: &Path) -> Result<(), Error> {
-        files::replace(path, |file| self.write_to(file))
-            .map_err(|source| Error::Write { path: path.to_owned(), source })
+        files::replace(path, |file| self.write_to(file)).map_err(|source| Error::Write {
+            path: path.to_owned(),
+            source,
+        })
     }
 
     /// Reads a file and verifies its checksum.
     pub fn read(path: &Path) -> Result<Self, Error> {
-        let bytes =
-            files::read(path, files::Budget::PLAIN).map_err(|source| Error::Read { path: path.to_owned(), source })?;
-        Self::from_bytes(&bytes).map_err(|reason| Error::Checkpoint { path: path.to_owned(), reason })
+        let bytes = files::read(path, files::Budget::PLAIN).map_err(|source| Error::Read {
+            path: path.to_owned(),
+            source,
+        })?;
+        Self::from_bytes(&bytes).map_err(|reason| Error::Checkpoint {
+            path: path.to_owned(),
+            reason,
+        })
     }
 
     /// Returns the array with this name, which must have `n_bytes` bytes.
     pub(crate) fn array(&self, name: &str, n_bytes: u64) -> Result<&[u8], Error> {
         let array = self.arrays.iter().find(|array| array.name == name);
-        let bytes = array
-            .map(|array| array.bytes.as_slice())
-            .ok_or_else(|| Error::CheckpointState { reason: format!("array {name:?} is missing") })?;
+        let bytes =
+            array
+                .map(|array| array.bytes.as_slice())
+                .ok_or_else(|| Error::CheckpointState {
+                    reason: format!("array {name:?} is missing"),
+                })?;
         if bytes.len() as u64 != n_bytes {
-            let reason = format!("array {name:?} has {} bytes, expected {n_bytes}", bytes.len());
+            let reason = format!(
+                "array {name:?} has {} bytes, expected {n_bytes}",
+                bytes.len()
+            );
             return Err(Error::CheckpointState { reason });
         }
         Ok(bytes)
     }
 
     fn write_to(&self, file: &mut impl Write) -> std::io::Result<()> {
-        let lengths =
-            self.arrays.iter().map(|array| ArrayHeader { name: array.name.clone(), bytes: array.bytes.len() as u64 });
+        let lengths = self.arrays.iter().map(|array| ArrayHeader {
+            name: array.name.clone(),
+            bytes: array.bytes.len() as u64,
+        });
         let header = serde_json::to_vec(&Header {
             method: self.method.clone(),
             seconds: self.seconds,
@@ -133,7 +148,9 @@ impl Checkpoint {
         let n_bytes = u32::try_from(header.len()).map_err(std::io::Error::other)?;
         let preamble = [&MAGIC[..], &VERSION.to_le_bytes(), &n_bytes.to_le_bytes()].concat();
         let mut checksum = Sha256::new();
-        let chunks = [&preamble, &header].into_iter().chain(self.arrays.iter().map(|array| &array.bytes));
+        let chunks = [&preamble, &header]
+            .into_iter()
+            .chain(self.arrays.iter().map(|array| &array.bytes));
         for chunk in chunks {
             checksum.update(chunk);
             file.write_all(chunk)?;
@@ -146,11 +163,25 @@ impl Checkpoint {
         if preamble[..8] != MAGIC {
             return Err("not a checkpoint file".to_owned());
         }
-        let word = |at: usize| u32::from_le_bytes([preamble[at], preamble[at + 1], preamble[at + 2], preamble[at + 3]]);
+        let word = |at: usize| {
+            u32::from_le_bytes([
+                preamble[at],
+                preamble[at + 1],
+                preamble[at + 2],
+                preamble[at + 3],
+            ])
+        };
         if word(8) != VERSION {
-            return Err(format!("format version {}, this program reads version {VERSION}", word(8)));
+            return Err(format!(
+                "format version {}, this program reads version {VERSION}",
+                word(8)
+            ));
         }
-        let whole = bytes.len().checked_sub(CHECKSUM_BYTES).filter(|n| *n >= PREAMBLE_BYTES).ok_or("truncated")?;
+        let whole = bytes
+            .len()
+            .checked_sub(CHECKSUM_BYTES)
+            .filter(|n| *n >= PREAMBLE_BYTES)
+            .ok_or("truncated")?;
         let (body, checksum) = bytes.split_at(whole);
         let checksum_matches = Sha256::digest(body)[..] == *checksum;
         let rest = &body[PREAMBLE_BYTES..];
@@ -161,22 +192,49 @@ impl Checkpoint {
             Err(error) if checksum_matches => return Err(format!("invalid header: {error}")),
             Err(_) => return Err("damaged: the checksum does not match".to_owned()),
         };
-        let expected = header.arrays.iter().try_fold(0_u64, |total, array| total.checked_add(array.bytes));
+        let expected = header
+            .arrays
+            .iter()
+            .try_fold(0_u64, |total, array| total.checked_add(array.bytes));
         match expected.unwrap_or(u64::MAX) {
             expected if expected > rest.len() as u64 => return Err("truncated".to_owned()),
-            expected if expected < rest.len() as u64 => return Err("unexpected bytes after the end".to_owned()),
+            expected if expected < rest.len() as u64 => {
+                return Err("unexpected bytes after the end".to_owned());
+            }
             _ if !checksum_matches => return Err("damaged: the checksum does not match".to_owned()),
             _ => {}
         }
         let mut arrays = Vec::new();
         for ArrayHeader { name, bytes } in header.arrays {
-            let n_bytes = usize::try_from(bytes).expect("not longer than the file, which is in memory");
+            let n_bytes =
+                usize::try_from(bytes).expect("not longer than the file, which is in memory");
             let (array, after) = rest.split_at(n_bytes);
-            arrays.push(Array { name, bytes: array.to_vec() });
+            arrays.push(Array {
+                name,
+                bytes: array.to_vec(),
+            });
             rest = after;
         }
-        let Header { method, seconds, depth_from, flags, is_finished, edits, state, .. } = header;
-        Ok(Self { method, seconds, depth_from, flags, is_finished, edits, state, arrays })
+        let Header {
+            method,
+            seconds,
+            depth_from,
+            flags,
+            is_finished,
+            edits,
+            state,
+            ..
+        } = header;
+        Ok(Self {
+            method,
+            seconds,
+            depth_from,
+            flags,
+            is_finished,
+            edits,
+            state,
+            arrays,
+        })
     }
 }
 
@@ -189,12 +247,22 @@ mod tests {
     fn edits() -> Edits {
         let mut edits = Edits::default();
         let world_from_box = kinematics::Transform::translation(0.1, -2.0, 0.3);
-        edits.push(Edit::Box(Aabb { world_from_box, min_m: [-0.1; 3], max_m: [0.7; 3] })).unwrap();
+        edits
+            .push(Edit::Box(Aabb {
+                world_from_box,
+                min_m: [-0.1; 3],
+                max_m: [0.7; 3],
+            }))
+            .unwrap();
         edits
     }
 
     fn checkpoint() -> Checkpoint {
-        let arrays = [("means", vec![1, 2, 3]), ("nothing", vec![]), ("more", vec![9; 100])];
+        let arrays = [
+            ("means", vec![1, 2, 3]),
+            ("nothing", vec![]),
+            ("more", vec![9; 100]),
+        ];
         Checkpoint {
             method: "splat".into(),
             seconds: 0.1 + 0.2,
@@ -203,7 +271,12 @@ mod tests {
             is_finished: true,
             edits: edits(),
             state: serde_json::json!({ "step": u64::MAX, "size_m": 1.0 / 3.0 }),
-            arrays: arrays.map(|(name, bytes)| Array { name: name.into(), bytes }).into(),
+            arrays: arrays
+                .map(|(name, bytes)| Array {
+                    name: name.into(),
+                    bytes,
+                })
+                .into(),
         }
     }
 
@@ -219,12 +292,22 @@ mod tests {
         let path = folder.path().join("training.ckpt");
         std::fs::write(files::partial::path_of(&path), b"of a run that was killed").unwrap();
         for seconds in [0.0, 1.5] {
-            let written = Checkpoint { seconds, ..checkpoint() };
+            let written = Checkpoint {
+                seconds,
+                ..checkpoint()
+            };
             written.write(&path).unwrap();
             assert_eq!(Checkpoint::read(&path).unwrap(), written);
         }
-        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1, "no partial file remains");
-        assert!(matches!(checkpoint().write(&folder.path().join("none/x")), Err(Error::Write { .. })));
+        assert_eq!(
+            std::fs::read_dir(folder.path()).unwrap().count(),
+            1,
+            "no partial file remains"
+        );
+        assert!(matches!(
+            checkpoint().write(&folder.path().join("none/x")),
+            Err(Error::Write { .. })
+        ));
     }
 
     #[test]
@@ -242,19 +325,34 @@ mod tests {
         let whole = bytes_of(&checkpoint());
         let error_of = |bytes: &[u8]| Checkpoint::from_bytes(bytes).unwrap_err();
         for length in 0..whole.len() {
-            assert_eq!(error_of(&whole[..length]), "truncated", "{length} of {} bytes", whole.len());
+            assert_eq!(
+                error_of(&whole[..length]),
+                "truncated",
+                "{length} of {} bytes",
+                whole.len()
+            );
         }
         assert_eq!(error_of(b"ply\nformat binary"), "not a checkpoint file");
-        assert_eq!(error_of(&[&whole[..], &[0; 5]].concat()), "unexpected bytes after the end");
+        assert_eq!(
+            error_of(&[&whole[..], &[0; 5]].concat()),
+            "unexpected bytes after the end"
+        );
         let error_with_byte = |at: usize, to: u8| {
             let mut bytes = whole.clone();
             bytes[at] = to;
             error_of(&bytes)
         };
-        assert_eq!(error_with_byte(8, 1), "format version 1, this program reads version 6");
+        assert_eq!(
+            error_with_byte(8, 1),
+            "format version 1, this program reads version 6"
+        );
         assert_eq!(error_with_byte(15, 255), "truncated");
         for at in [20, whole.len() - 40, whole.len() - 1] {
-            assert_eq!(error_with_byte(at, 0xff), "damaged: the checksum does not match", "byte {at}");
+            assert_eq!(
+                error_with_byte(at, 0xff),
+                "damaged: the checksum does not match",
+                "byte {at}"
+            );
         }
         let mut other = whole[..16].to_vec();
         other[12..16].copy_from_slice(&2_u32.to_le_bytes());

@@ -15,7 +15,9 @@ pub enum Error {
     #[error(transparent)]
     Keyframe(#[from] keyframe::Error),
     /// No GPU adapter, real or software, was found.
-    #[error("no GPU adapter found: install a Vulkan driver (software: the package mesa-vulkan-drivers)")]
+    #[error(
+        "no GPU adapter found: install a Vulkan driver (software: the package mesa-vulkan-drivers)"
+    )]
     NoAdapter,
     /// The requested adapter does not exist.
     #[error("no GPU with index {ix}: found {n_adapters} adapters, numbered from 0")]
@@ -36,7 +38,8 @@ pub enum Error {
     /// The GPU stopped answering.
     #[error("the GPU stopped answering: its driver reset or lost the device")]
     DeviceLost,
-    /// The GPU has no memory left for a buffer, or for commands; for commands, `label` is empty and `bytes` is 0.
+    /// The GPU has no memory left for a buffer, or for commands; for commands, `label` is empty and
+    /// `bytes` is 0.
     #[error(
         "the GPU ran out of memory{}; close other programs that use it, use smaller images, or train a smaller model (--max-splats or --max-bytes of `fieldrig train` and `run`)",
         buffer_suffix(label, *bytes)
@@ -50,8 +53,8 @@ pub enum Error {
     /// The driver failed to execute a valid command.
     #[error("the GPU's driver failed: {0}")]
     DriverFailed(String),
-    /// A bug in this program: its state contradicts itself, or it gave the GPU an invalid command. Another device would
-    /// not help, so this is not a [GPU error](Self::is_gpu_error).
+    /// A bug in this program: its state contradicts itself, or it gave the GPU an invalid command.
+    /// Another device would not help, so this is not a [GPU error](Self::is_gpu_error).
     #[error("internal error: {0}; this is a bug in fieldrig, please report it")]
     Internal(String),
     /// A buffer exceeds the adapter's limit.
@@ -67,7 +70,9 @@ pub enum Error {
         limit_bytes: u64,
     },
     /// A kernel needs more workgroup memory than the adapter has.
-    #[error("kernel {kernel}: {bytes} bytes of workgroup memory are more than this GPU has ({limit_bytes} bytes)")]
+    #[error(
+        "kernel {kernel}: {bytes} bytes of workgroup memory are more than this GPU has ({limit_bytes} bytes)"
+    )]
     WorkgroupTooLarge {
         /// Name of the kernel.
         kernel: &'static str,
@@ -250,7 +255,10 @@ pub enum Error {
         cell_m: f64,
     },
     /// A model has the maximum number of edits.
-    #[error("a model has at most {} edits; undo one first", crate::edits::MAX_EDITS)]
+    #[error(
+        "a model has at most {} edits; undo one first",
+        crate::edits::MAX_EDITS
+    )]
     TooManyEdits,
     /// An edit has values that kernels cannot compute with.
     #[error("invalid edit: {reason}")]
@@ -280,7 +288,10 @@ impl Error {
 
     /// Whether the GPU caused the error. If so, the same work may succeed on another device.
     pub fn is_gpu_error(&self) -> bool {
-        matches!(self, Self::DeviceLost | Self::OutOfMemory { .. } | Self::DriverFailed(_))
+        matches!(
+            self,
+            Self::DeviceLost | Self::OutOfMemory { .. } | Self::DriverFailed(_)
+        )
     }
 
     /// Whether a buffer of the requested size could not be allocated.
@@ -290,5 +301,9 @@ impl Error {
 }
 
 fn buffer_suffix(label: &str, bytes: u64) -> String {
-    if bytes == 0 { String::new() } else { format!(": buffer {label} needs {bytes} bytes") }
+    if bytes == 0 {
+        String::new()
+    } else {
+        format!(": buffer {label} needs {bytes} bytes")
+    }
 }

@@ -83,15 +83,18 @@ impl KeyframeSignature {
         } else {
             return None;
         };
-        Some(format!("image {} of camera {:?} {problem}", self.stamp_nanos, self.camera))
+        Some(format!(
+            "image {} of camera {:?} {problem}",
+            self.stamp_nanos, self.camera
+        ))
     }
 }
 
 /// The matched keyframes in the expected order, and all other keyframes.
 pub(crate) type MatchedAndOthers = (Vec<Arc<Keyframe>>, Vec<Arc<Keyframe>>);
 
-/// Finds the expected keyframes. Fails if one differs, or if some are missing; the error then contains placeholders for the
-/// missing ones.
+/// Finds the expected keyframes. Fails if one differs, or if some are missing; the error then
+/// contains placeholders for the missing ones.
 pub(crate) fn match_keyframes(
     expected: &[KeyframeSignature],
     keyframes: &[Arc<Keyframe>],
@@ -101,7 +104,8 @@ pub(crate) fn match_keyframes(
         .filter(|keyframe| keyframe.split != Split::Test)
         .map(|keyframe| ((&*keyframe.camera, keyframe.stamp.0), keyframe))
         .collect();
-    let (mut found, mut missing): (Vec<Arc<Keyframe>>, Vec<Arc<Keyframe>>) = (Vec::new(), Vec::new());
+    let (mut found, mut missing): (Vec<Arc<Keyframe>>, Vec<Arc<Keyframe>>) =
+        (Vec::new(), Vec::new());
     for expected in expected {
         let Some(keyframe) = by_name.get(&(expected.camera.as_str(), expected.stamp_nanos)) else {
             missing.push(Arc::new(expected.placeholder()));
@@ -113,9 +117,16 @@ pub(crate) fn match_keyframes(
         found.push(Arc::clone(keyframe));
     }
     if !missing.is_empty() {
-        return Err(Error::MissingKeyframes { placeholders: missing });
+        return Err(Error::MissingKeyframes {
+            placeholders: missing,
+        });
     }
-    let is_matched = |keyframe: &Arc<Keyframe>| found.iter().any(|matched| Arc::ptr_eq(matched, keyframe));
-    let others = keyframes.iter().filter(|keyframe| !is_matched(keyframe)).cloned().collect();
+    let is_matched =
+        |keyframe: &Arc<Keyframe>| found.iter().any(|matched| Arc::ptr_eq(matched, keyframe));
+    let others = keyframes
+        .iter()
+        .filter(|keyframe| !is_matched(keyframe))
+        .cloned()
+        .collect();
     Ok((found, others))
 }

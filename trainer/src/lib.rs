@@ -57,9 +57,13 @@ pub use error::Error;
 pub use failed_model::FailedModel;
 pub use initial_points::InitialPoints;
 pub use method::{Method, Progress};
-pub use model_chunks::{ChunkData, ChunkLayout, MAX_MESH_COUNT, ModelChunk, ModelChunks, PendingChunks};
+pub use model_chunks::{
+    ChunkData, ChunkLayout, MAX_MESH_COUNT, ModelChunk, ModelChunks, PendingChunks,
+};
 pub use model_options::{AlignTiming, CommonOptions, MethodOptions, ModelOptions};
-pub use model_spec::{KeyframeId, LoadedModel, ModelSpec, Resumed, load, resume, resume_without_missing};
+pub use model_spec::{
+    KeyframeId, LoadedModel, ModelSpec, Resumed, load, resume, resume_without_missing,
+};
 pub use packing::{JPEG_QUALITY, PackedDepth, PackedPicture, Packing, QueuedPicture, Rendered};
 pub use pending::Pending;
 pub use registry::ModelKind;

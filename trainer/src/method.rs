@@ -27,71 +27,98 @@ pub struct Progress {
     pub step_millis: f64,
 }
 
-/// Maximum GPU time of a training submit. Short enough that checkpoints, keyframes and Ctrl-C are handled soon.
+/// Maximum GPU time of a training submit. Short enough that checkpoints, keyframes and Ctrl-C are
+/// handled soon.
 const SUBMIT_MILLIS: f64 = 20.0;
-/// Maximum while pictures are requested: each picture waits for the running submit and the queued submit.
+/// Maximum while pictures are requested: each picture waits for the running submit and the queued
+/// submit.
 const SUBMIT_MILLIS_WATCHED: f64 = 2.0;
 
 /// Maximum GPU time of a training submit, milliseconds.
 pub(crate) fn submit_millis(watched: bool) -> f64 {
-    if watched { SUBMIT_MILLIS_WATCHED } else { SUBMIT_MILLIS }
+    if watched {
+        SUBMIT_MILLIS_WATCHED
+    } else {
+        SUBMIT_MILLIS
+    }
 }
 
 /// A scene model that trains on keyframes.
 ///
 /// Several models can share one device; each is owned by one thread.
 pub trait Method {
-    /// Adds a keyframe. Test keyframes are used for evaluation only. The method checks the parts of the keyframe that
-    /// it uses ([`Keyframe::check`]).
+    /// Adds a keyframe. Test keyframes are used for evaluation only. The method checks the parts of
+    /// the keyframe that it uses ([`Keyframe::check`]).
     fn push(&mut self, keyframe: Arc<Keyframe>) -> Result<(), Error>;
-    /// Removes the keyframe with this camera and stamp, if there is one. The scene learned from it stays, but
-    /// resuming from a later checkpoint must not require the keyframe.
+    /// Removes the keyframe with this camera and stamp, if there is one. The scene learned from it
+    /// stays, but resuming from a later checkpoint must not require the keyframe.
     fn remove(&mut self, camera: &str, stamp: Stamp) -> Result<(), Error>;
-    /// Sets points on the surfaces of the scene, from which the model starts if no keyframe has depth. Call before the
-    /// first step, and again after resuming, because checkpoints do not contain the points. Returns false if the method
-    /// does not use them.
+    /// Sets points on the surfaces of the scene, from which the model starts if no keyframe has
+    /// depth. Call before the first step, and again after resuming, because checkpoints do not
+    /// contain the points. Returns false if the method does not use them.
     fn set_initial_points(&mut self, _points: &Arc<InitialPoints>) -> bool {
         false
     }
-    /// Queues up to `n` optimizer updates, but at most 20 ms of GPU work (4 ms while watched, [`Method::set_watched`]).
-    /// Returns the number of queued updates. At most one submit runs and one is queued.
+    /// Queues up to `n` optimizer updates, but at most 20 ms of GPU work (4 ms while watched,
+    /// [`Method::set_watched`]). Returns the number of queued updates. At most one submit runs and
+    /// one is queued.
     ///
-    /// If a buffer is too small, a queued update is discarded and repeated later. If all `n` updates were queued, the
-    /// call waits for them, so that [`Method::progress`] is exact. Call in a loop until the desired step is reached.
+    /// If a buffer is too small, a queued update is discarded and repeated later. If all `n`
+    /// updates were queued, the call waits for them, so that [`Method::progress`] is exact. Call in
+    /// a loop until the desired step is reached.
     fn step(&mut self, n: u64) -> Result<u64, Error>;
     /// Whether further steps have no effect until a keyframe arrives.
     fn is_idle(&self) -> bool;
-    /// Waits for queued updates and returns the total number of updates, including those of rejected trials. Unlike
-    /// [`Progress::step`], it never decreases.
+    /// Waits for queued updates and returns the total number of updates, including those of
+    /// rejected trials. Unlike [`Progress::step`], it never decreases.
     fn n_total_steps(&mut self) -> Result<u64, Error>;
-    /// Initializes the model from the keyframes added so far, so that it can be rendered without training.
+    /// Initializes the model from the keyframes added so far, so that it can be rendered without
+    /// training.
     fn seed(&mut self) -> Result<(), Error>;
-    /// Waits until all training kernels are compiled. Without this call, the first [`Method::step`] waits.
+    /// Waits until all training kernels are compiled. Without this call, the first [`Method::step`]
+    /// waits.
     fn prepare(&mut self) -> Result<(), Error>;
-    /// Sets whether pictures are requested during training. If so, submits are shorter; the trained parameters are
-    /// bit-identical either way.
+    /// Sets whether pictures are requested during training. If so, submits are shorter; the trained
+    /// parameters are bit-identical either way.
     fn set_watched(&mut self, watched: bool);
     /// Renders a picture. If the model is empty, first initializes it as [`Method::seed`] does.
     fn render(&mut self, request: &RenderRequest) -> Result<Picture, Error>;
-    /// Renders a picture as [`Method::render`] does and packs it on the GPU, if the model and the adapter support it.
-    fn render_packed(&mut self, request: &RenderRequest, _packing: Packing) -> Result<Rendered, Error> {
+    /// Renders a picture as [`Method::render`] does and packs it on the GPU, if the model and the
+    /// adapter support it.
+    fn render_packed(
+        &mut self,
+        request: &RenderRequest,
+        _packing: Packing,
+    ) -> Result<Rendered, Error> {
         self.render(request).map(Rendered::Picture)
     }
     /// Starts [`Method::render_packed`] without waiting for the GPU, if the model supports this.
-    fn queue_packed(&mut self, request: &RenderRequest, packing: Packing) -> Result<QueuedPicture, Error> {
-        self.render_packed(request, packing).map(QueuedPicture::ready)
+    fn queue_packed(
+        &mut self,
+        request: &RenderRequest,
+        packing: Packing,
+    ) -> Result<QueuedPicture, Error> {
+        self.render_packed(request, packing)
+            .map(QueuedPicture::ready)
     }
-    /// Starts to encode the model for clients that draw it themselves. With `only_changed`, only the chunks that have
-    /// changed since the last call are encoded. Erased space is left out. Later training does not affect the result.
-    /// Waiting for the GPU and encoding take place in [`PendingChunks::finish`].
+    /// Starts to encode the model for clients that draw it themselves. With `only_changed`, only
+    /// the chunks that have changed since the last call are encoded. Erased space is left out.
+    /// Later training does not affect the result. Waiting for the GPU and encoding take place in
+    /// [`PendingChunks::finish`].
     ///
-    /// `None` if the model is empty or if [`MethodEntry::has_chunks`](crate::method_entry::MethodEntry) is false.
-    fn queue_chunks(&mut self, _only_changed: bool, _edits: &Arc<Edits>) -> Result<Option<PendingChunks>, Error> {
+    /// `None` if the model is empty or if
+    /// [`MethodEntry::has_chunks`](crate::method_entry::MethodEntry) is false.
+    fn queue_chunks(
+        &mut self,
+        _only_changed: bool,
+        _edits: &Arc<Edits>,
+    ) -> Result<Option<PendingChunks>, Error> {
         Ok(None)
     }
-    /// Starts to search for small parts that are not connected to the large parts of the model. Space that is already
-    /// erased is ignored. Later training does not affect the result. The search, which may take seconds, takes place in
-    /// [`PendingFloaters::finish`]; it fails if there are no floaters.
+    /// Starts to search for small parts that are not connected to the large parts of the model.
+    /// Space that is already erased is ignored. Later training does not affect the result. The
+    /// search, which may take seconds, takes place in [`PendingFloaters::finish`]; it fails if
+    /// there are no floaters.
     ///
     /// # Errors
     ///
@@ -99,52 +126,63 @@ pub trait Method {
     fn find_floaters(&mut self, _edits: &Arc<Edits>) -> Result<PendingFloaters, Error> {
         Err(Error::CannotFindFloaters)
     }
-    /// PSNR of the requested picture against a keyframe's image of the same size, dB, computed on the GPU.
-    /// Bit-identical to [`crate::eval::psnr`] of the 8-bit picture. `None` if the model does not support this, or not
-    /// yet.
-    fn psnr(&mut self, _request: &RenderRequest, _keyframe: &Keyframe) -> Result<Option<f64>, Error> {
+    /// PSNR of the requested picture against a keyframe's image of the same size, dB, computed on
+    /// the GPU. Bit-identical to [`crate::eval::psnr`] of the 8-bit picture. `None` if the model
+    /// does not support this, or not yet.
+    fn psnr(
+        &mut self,
+        _request: &RenderRequest,
+        _keyframe: &Keyframe,
+    ) -> Result<Option<f64>, Error> {
         Ok(None)
     }
     /// Background for comparisons with images, sRGB 0 to 1: the expected color of unobserved areas.
     fn background_srgb(&self) -> [f32; 3] {
         [0.0; 3]
     }
-    /// Pixel stride along both axes for depth images that are compared with measured ones. Odd; above 1 if rays are
-    /// expensive.
+    /// Pixel stride along both axes for depth images that are compared with measured ones. Odd;
+    /// above 1 if rays are expensive.
     fn depth_stride(&self) -> u32 {
         1
     }
-    /// A sphere that contains most of the model; `None` if the model is empty or does not support this.
+    /// A sphere that contains most of the model; `None` if the model is empty or does not support
+    /// this.
     fn bounds(&mut self) -> Result<Option<Bounds>, Error> {
         Ok(None)
     }
-    /// Corrections of cameras that were optimized with the scene, by name. They follow those of [`Method::alignment`].
-    /// Waits for queued work.
+    /// Corrections of cameras that were optimized with the scene, by name. They follow those of
+    /// [`Method::alignment`]. Waits for queued work.
     fn camera_corrections(&mut self) -> Result<BTreeMap<String, CameraCorrection>, Error> {
         Ok(BTreeMap::new())
     }
-    /// The camera of a keyframe with the model's per-camera corrections, but without its per-image corrections.
+    /// The camera of a keyframe with the model's per-camera corrections, but without its per-image
+    /// corrections.
     fn calibrated_camera(&mut self, keyframe: &Keyframe) -> Result<CalibratedCamera, Error>;
-    /// Takes one step with timestamps around every pass; returns an empty list if the adapter does not support them.
+    /// Takes one step with timestamps around every pass; returns an empty list if the adapter does
+    /// not support them.
     fn profile_step(&mut self) -> Result<Vec<PassTiming>, Error>;
-    /// Result of keyframe alignment; `None` until it is done, or if it was not requested or not possible.
+    /// Result of keyframe alignment; `None` until it is done, or if it was not requested or not
+    /// possible.
     fn alignment(&self) -> Option<&Alignment>;
-    /// In a live run, applies the result of an alignment in the background if it is ready, or waits for it if `wait`.
-    /// Returns whether a result was applied, which depends on timing unless `wait` is set.
+    /// In a live run, applies the result of an alignment in the background if it is ready, or waits
+    /// for it if `wait`. Returns whether a result was applied, which depends on timing unless
+    /// `wait` is set.
     fn poll_alignment(&mut self, _wait: bool) -> Result<bool, Error> {
         Ok(false)
     }
-    /// Number of steps that must remain for a search for the model size that is pending or running: the rest of the
-    /// search, and as many steps after it as the whole search takes. 0 if there is no search.
+    /// Number of steps that must remain for a search for the model size that is pending or running:
+    /// the rest of the search, and as many steps after it as the whole search takes. 0 if there is
+    /// no search.
     fn n_steps_for_size_search(&self) -> u64 {
         0
     }
-    /// Ends a search for the model size that is pending or running, with its result so far. Returns whether there was
-    /// one.
+    /// Ends a search for the model size that is pending or running, with its result so far. Returns
+    /// whether there was one.
     fn end_size_search(&mut self) -> Result<bool, Error> {
         Ok(false)
     }
-    /// Pauses or continues the growth of the model. Returns false if this changes nothing, or is not possible now.
+    /// Pauses or continues the growth of the model. Returns false if this changes nothing, or is
+    /// not possible now.
     fn pause_growth(&mut self, _is_paused: bool) -> Result<bool, Error> {
         Ok(false)
     }
@@ -152,13 +190,15 @@ pub trait Method {
     fn progress(&self) -> Progress;
     /// Reports of the trials, in the order in which they ran.
     fn report(&self) -> Vec<TrialReport>;
-    /// Writes the model into an existing folder. The files do not depend on the number of planned steps.
+    /// Writes the model into an existing folder. The files do not depend on the number of planned
+    /// steps.
     fn save(&mut self, folder: &Path) -> Result<(), Error>;
-    /// Writes the files of a saved model that are only for other programs, without erased space. All other files contain
-    /// the complete model.
+    /// Writes the files of a saved model that are only for other programs, without erased space.
+    /// All other files contain the complete model.
     fn write_for_others(&mut self, _folder: &Path, _edits: &Edits) -> Result<(), Error> {
         Ok(())
     }
-    /// Takes a checkpoint of everything needed to continue training; later training does not change it.
+    /// Takes a checkpoint of everything needed to continue training; later training does not change
+    /// it.
     fn checkpoint(&mut self) -> Result<PendingCheckpoint, Error>;
 }

@@ -1,4 +1,5 @@
-//! Registry entry of a method: its names, files and options, and functions that create, resume and load its models.
+//! Registry entry of a method: its names, files and options, and functions that create, resume and
+//! load its models.
 
 use crate::checkpoint::Checkpoint;
 use crate::gpu::Gpu;
@@ -12,9 +13,10 @@ use std::sync::Arc;
 
 /// Creates an untrained model.
 pub type StartModel = fn(Arc<Gpu>, &ModelOptions) -> Result<Box<dyn Method>, Error>;
-/// Restores a model from a checkpoint. The keyframes must include those that the model was trained on, except those that
-/// placeholders stand for (see [`Aligned::resume`](crate::Aligned::resume)).
-pub type ResumeModel = fn(Arc<Gpu>, &Checkpoint, &[Arc<Keyframe>], &[Arc<Keyframe>]) -> Result<ResumedModel, Error>;
+/// Restores a model from a checkpoint. The keyframes must include those that the model was trained
+/// on, except those that placeholders stand for (see [`Aligned::resume`](crate::Aligned::resume)).
+pub type ResumeModel =
+    fn(Arc<Gpu>, &Checkpoint, &[Arc<Keyframe>], &[Arc<Keyframe>]) -> Result<ResumedModel, Error>;
 /// Loads a saved model from a folder or a single file.
 pub type LoadModel = fn(Arc<Gpu>, &Path) -> Result<Box<dyn Method>, Error>;
 
@@ -30,14 +32,15 @@ pub struct MethodEntry {
     pub primitive: &'static str,
     /// Label of the primitive count: plural and capitalized.
     pub primitives_label: &'static str,
-    /// Files of a saved model besides `model.json`, in the order in which they are moved into place. A folder that
-    /// contains the last file contains the complete model.
+    /// Files of a saved model besides `model.json`, in the order in which they are moved into
+    /// place. A folder that contains the last file contains the complete model.
     pub files: &'static [&'static str],
     /// Files that each hold a complete model; `None` if a model is always a folder.
     pub single_file: Option<SingleFile>,
     /// Whether the method trains only on keyframes with depth.
     pub needs_depth: bool,
-    /// Whether models can be sent to clients that draw them themselves, see [`Method::queue_chunks`].
+    /// Whether models can be sent to clients that draw them themselves, see
+    /// [`Method::queue_chunks`].
     pub has_chunks: bool,
     /// Camera parameters that can be optimized with the scene.
     pub learnable: ParamSet,
@@ -49,8 +52,9 @@ pub struct MethodEntry {
     pub check_options: fn(&ModelOptions) -> Result<(), Error>,
     /// Creates an untrained model.
     pub start: StartModel,
-    /// Restores a model from a checkpoint, whose `state.options` are [`ModelOptions`]. The keyframes must include all
-    /// training keyframes that were not removed. A keyframe may lack pixels if the caller removes it right afterwards.
+    /// Restores a model from a checkpoint, whose `state.options` are [`ModelOptions`]. The
+    /// keyframes must include all training keyframes that were not removed. A keyframe may lack
+    /// pixels if the caller removes it right afterwards.
     pub resume: ResumeModel,
     /// Loads a saved model from its folder, or from a single file.
     pub load: LoadModel,

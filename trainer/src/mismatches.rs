@@ -12,14 +12,24 @@ pub(crate) struct Mismatches {
 }
 
 impl Mismatches {
-    /// Records a mismatch unless `|got - expected| <= abs + rel * max(|got|, |expected|)`; a NaN never passes.
-    pub(crate) fn check(&mut self, name: impl Display, got: f64, expected: f64, abs: f64, rel: f64) {
+    /// Records a mismatch unless `|got - expected| <= abs + rel * max(|got|, |expected|)`; a NaN
+    /// never passes.
+    pub(crate) fn check(
+        &mut self,
+        name: impl Display,
+        got: f64,
+        expected: f64,
+        abs: f64,
+        rel: f64,
+    ) {
         let ratio = (got - expected).abs() / (abs + rel * got.abs().max(expected.abs()));
         self.n_checked += 1;
         self.max_ratio = self.max_ratio.max(ratio);
         let passes = ratio <= 1.0; // False for NaN.
         if !passes {
-            self.mismatches.push(format!("{name}: got {got:.9e}, expected {expected:.9e} ({ratio:.1} x tolerance)"));
+            self.mismatches.push(format!(
+                "{name}: got {got:.9e}, expected {expected:.9e} ({ratio:.1} x tolerance)"
+            ));
         }
     }
 
@@ -32,7 +42,11 @@ impl Mismatches {
     #[track_caller]
     pub(crate) fn assert_none(&self) {
         assert!(self.n_checked > 0, "nothing was compared");
-        let Self { n_checked, mismatches, max_ratio } = self;
+        let Self {
+            n_checked,
+            mismatches,
+            max_ratio,
+        } = self;
         assert!(
             mismatches.is_empty(),
             "{} of {n_checked} values differ, worst {max_ratio:.1} x tolerance:\n{}",
@@ -56,7 +70,11 @@ mod tests {
         mismatches.check("not a number", f64::NAN, 1.0, 1.0, 1.0);
         mismatches.check("endless", f64::INFINITY, 1.0, 1.0, 0.0);
         assert_eq!(mismatches.n_mismatches(), 5);
-        assert!(mismatches.mismatches[0].starts_with("wrong: got"), "{}", mismatches.mismatches[0]);
+        assert!(
+            mismatches.mismatches[0].starts_with("wrong: got"),
+            "{}",
+            mismatches.mismatches[0]
+        );
     }
 
     #[test]

@@ -6,7 +6,8 @@ use serde::Serialize;
 /// The chunks of a model at one moment.
 #[derive(Debug, Default)]
 pub struct ModelChunks {
-    /// Whether `chunks` are all chunks of the model. Otherwise, they are those that have changed since the last call.
+    /// Whether `chunks` are all chunks of the model. Otherwise, they are those that have changed
+    /// since the last call.
     pub is_complete: bool,
     /// The chunks.
     pub chunks: Vec<ModelChunk>,
@@ -17,7 +18,8 @@ pub struct ModelChunks {
 /// A spatial part of a model.
 #[derive(Debug)]
 pub struct ModelChunk {
-    /// Identifies the chunk within its model; less than 2^53, so that JavaScript represents it exactly.
+    /// Identifies the chunk within its model; less than 2^53, so that JavaScript represents it
+    /// exactly.
     pub id: u64,
     /// How much the chunk has changed since the last call, in a unit of the method.
     pub change: f64,

@@ -16,13 +16,14 @@ pub trait MethodOptions: Serialize + DeserializeOwned + Default {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum AlignTiming {
-    /// Once, with the keyframes that are known at the first step. The result is applied a fixed number of steps later, or
-    /// before the first step if no keyframe has depth.
+    /// Once, with the keyframes that are known at the first step. The result is applied a fixed
+    /// number of steps later, or before the first step if no keyframe has depth.
     Once,
     /// Repeatedly as keyframes arrive. Results are applied a fixed number of steps later.
     Lockstep,
     /// Repeatedly as keyframes arrive. Results are applied by
-    /// [`Method::poll_alignment`](crate::Method::poll_alignment), so that training never waits for them.
+    /// [`Method::poll_alignment`](crate::Method::poll_alignment), so that training never waits for
+    /// them.
     RealTime,
 }
 
@@ -38,18 +39,19 @@ pub struct CommonOptions {
     pub n_planned_steps: u64,
     /// Camera parameters that are optimized with the scene.
     pub cameras: CameraRefinement,
-    /// Camera parameters that alignment estimates by registering keyframes that have depth, or from features of keyframes
-    /// without depth.
+    /// Camera parameters that alignment estimates by registering keyframes that have depth, or from
+    /// features of keyframes without depth.
     pub align: CameraRefinement,
     /// When they are estimated.
     pub align_timing: AlignTiming,
-    /// Whether movements of cameras relative to their mounts are detected, if cameras are aligned repeatedly. The poses
-    /// must not drift.
+    /// Whether movements of cameras relative to their mounts are detected, if cameras are aligned
+    /// repeatedly. The poses must not drift.
     #[serde(default)]
     pub detects_movements: bool,
 }
 
-/// Options of a model. `S` is the type of the method-specific options; the default, JSON, holds those of any method.
+/// Options of a model. `S` is the type of the method-specific options; the default, JSON, holds
+/// those of any method.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ModelOptions<S = Value> {
@@ -85,7 +87,10 @@ impl<S> ModelOptions<S> {
 impl<S> From<S> for ModelOptions<S> {
     /// Combines method-specific options with the default common options.
     fn from(specific: S) -> Self {
-        Self { common: CommonOptions::default(), specific }
+        Self {
+            common: CommonOptions::default(),
+            specific,
+        }
     }
 }
 
@@ -96,16 +101,24 @@ impl ModelOptions {
     ///
     /// Fails if an option of the method is missing, unknown or has an invalid value.
     pub fn typed<S: MethodOptions>(&self) -> Result<ModelOptions<S>, Error> {
-        let specific = S::deserialize(&self.specific)
-            .map_err(|error| Error::InvalidOptions { method: S::METHOD, reason: error.to_string() })?;
-        Ok(ModelOptions { common: self.common.clone(), specific })
+        let specific = S::deserialize(&self.specific).map_err(|error| Error::InvalidOptions {
+            method: S::METHOD,
+            reason: error.to_string(),
+        })?;
+        Ok(ModelOptions {
+            common: self.common.clone(),
+            specific,
+        })
     }
 }
 
 impl<S: MethodOptions> ModelOptions<S> {
     /// Converts the method-specific options to JSON.
     pub fn to_json(&self) -> ModelOptions {
-        ModelOptions { common: self.common.clone(), specific: json(&self.specific) }
+        ModelOptions {
+            common: self.common.clone(),
+            specific: json(&self.specific),
+        }
     }
 }
 
@@ -139,10 +152,19 @@ mod tests {
         let mut options = ModelOptions::<MeanColorOptions>::default().to_json();
         options.specific["rate"] = "fast".into();
         let message = options.typed::<MeanColorOptions>().unwrap_err().to_string();
-        assert!(message.contains("mean-color") && message.contains("fast"), "{message}");
+        assert!(
+            message.contains("mean-color") && message.contains("fast"),
+            "{message}"
+        );
         options.specific = serde_json::json!({ "rate": 0.5, "seed": 1 });
-        assert!(options.typed::<MeanColorOptions>().is_err(), "common options must be rejected");
+        assert!(
+            options.typed::<MeanColorOptions>().is_err(),
+            "common options must be rejected"
+        );
         options.specific = serde_json::json!({});
-        assert!(options.typed::<MeanColorOptions>().is_err(), "missing options must be rejected");
+        assert!(
+            options.typed::<MeanColorOptions>().is_err(),
+            "missing options must be rejected"
+        );
     }
 }

@@ -47,20 +47,28 @@ pub struct LoadedModel {
 }
 
 impl ModelSpec {
-    /// The default options of the method, overridden by `settings`: names and values of options. Settings that the
-    /// method does not have are ignored, so that several methods can share one list of settings.
+    /// The default options of the method, overridden by `settings`: names and values of options.
+    /// Settings that the method does not have are ignored, so that several methods can share one
+    /// list of settings.
     ///
     /// # Errors
     ///
     /// Fails if a value is invalid.
-    pub fn new(kind: ModelKind, common: CommonOptions, settings: &[(&str, Value)]) -> Result<Self, Error> {
+    pub fn new(
+        kind: ModelKind,
+        common: CommonOptions,
+        settings: &[(&str, Value)],
+    ) -> Result<Self, Error> {
         let mut specific = (kind.entry().default_options)();
         for (name, value) in settings {
             if let Some(option) = specific.get_mut(name) {
                 *option = value.clone();
             }
         }
-        let model_spec = Self { kind, options: ModelOptions { common, specific } };
+        let model_spec = Self {
+            kind,
+            options: ModelOptions { common, specific },
+        };
         model_spec.check()?;
         Ok(model_spec)
     }
@@ -71,7 +79,10 @@ impl ModelSpec {
     ///
     /// Fails if the method is not registered.
     pub fn of<S: MethodOptions>(options: &ModelOptions<S>) -> Result<Self, Error> {
-        Ok(Self { kind: registered(S::METHOD)?, options: options.to_json() })
+        Ok(Self {
+            kind: registered(S::METHOD)?,
+            options: options.to_json(),
+        })
     }
 
     /// The options as the method-specific type `S`; `None` if the model uses another method.
@@ -80,7 +91,9 @@ impl ModelSpec {
     ///
     /// Fails if the options are invalid.
     pub fn options_of<S: MethodOptions>(&self) -> Result<Option<ModelOptions<S>>, Error> {
-        (self.kind.name() == S::METHOD).then(|| self.options.typed()).transpose()
+        (self.kind.name() == S::METHOD)
+            .then(|| self.options.typed())
+            .transpose()
     }
 
     /// Fails if the options do not belong to the method or are invalid.
@@ -98,17 +111,23 @@ impl ModelSpec {
     }
 }
 
-/// Restores a model from a checkpoint. `keyframes` must include those that the model was trained on.
+/// Restores a model from a checkpoint. `keyframes` must include those that the model was trained
+/// on.
 ///
 /// # Errors
 ///
-/// Fails if the checkpoint is invalid, if keyframes are missing or differ, or on an error of the GPU.
-pub fn resume(gpu: Arc<Gpu>, checkpoint: &Checkpoint, keyframes: &[Arc<Keyframe>]) -> Result<Resumed, Error> {
+/// Fails if the checkpoint is invalid, if keyframes are missing or differ, or on an error of the
+/// GPU.
+pub fn resume(
+    gpu: Arc<Gpu>,
+    checkpoint: &Checkpoint,
+    keyframes: &[Arc<Keyframe>],
+) -> Result<Resumed, Error> {
     resume_with(gpu, checkpoint, keyframes, &[])
 }
 
-/// Like [`resume`], but keyframes may be missing. They are removed from the training set; their effect on the
-/// parameters remains. Also returns the cameras and stamps of the missing keyframes.
+/// Like [`resume`], but keyframes may be missing. They are removed from the training set; their
+/// effect on the parameters remains. Also returns the cameras and stamps of the missing keyframes.
 ///
 /// # Errors
 ///
@@ -127,7 +146,13 @@ pub fn resume_without_missing(
     for missing in &placeholders {
         resumed.method.remove(&missing.camera, missing.stamp)?;
     }
-    Ok((resumed, placeholders.iter().map(|missing| (Arc::clone(&missing.camera), missing.stamp)).collect()))
+    Ok((
+        resumed,
+        placeholders
+            .iter()
+            .map(|missing| (Arc::clone(&missing.camera), missing.stamp))
+            .collect(),
+    ))
 }
 
 fn resume_with(
@@ -138,10 +163,16 @@ fn resume_with(
 ) -> Result<Resumed, Error> {
     let kind = registered(&checkpoint.method)?;
     let options = checkpoint.state.get("options").unwrap_or(&Value::Null);
-    let options = ModelOptions::deserialize(options)
-        .map_err(|error| Error::CheckpointState { reason: format!("options: {error}") })?;
+    let options = ModelOptions::deserialize(options).map_err(|error| Error::CheckpointState {
+        reason: format!("options: {error}"),
+    })?;
     let (method, untrained) = (kind.entry().resume)(gpu, checkpoint, keyframes, placeholders)?;
-    Ok(Resumed { model_spec: ModelSpec { kind, options }, method, untrained, edits: checkpoint.edits.clone() })
+    Ok(Resumed {
+        model_spec: ModelSpec { kind, options },
+        method,
+        untrained,
+        edits: checkpoint.edits.clone(),
+    })
 }
 
 /// Loads a saved model from its folder, or from a single file.
@@ -150,10 +181,18 @@ fn resume_with(
 ///
 /// Fails if the method of the model is unknown, if a file is invalid, or on an error of the GPU.
 pub fn load(gpu: Arc<Gpu>, model: &Path) -> Result<LoadedModel, Error> {
-    let kind = ModelKind::of_saved(model)?.ok_or_else(|| Error::UnknownModel { path: model.to_owned() })?;
-    Ok(LoadedModel { kind, edits: Edits::read(model)?, method: (kind.entry().load)(gpu, model)? })
+    let kind = ModelKind::of_saved(model)?.ok_or_else(|| Error::UnknownModel {
+        path: model.to_owned(),
+    })?;
+    Ok(LoadedModel {
+        kind,
+        edits: Edits::read(model)?,
+        method: (kind.entry().load)(gpu, model)?,
+    })
 }
 
 fn registered(name: &str) -> Result<ModelKind, Error> {
-    ModelKind::from_name(name).ok_or_else(|| Error::UnknownMethod { name: name.to_owned() })
+    ModelKind::from_name(name).ok_or_else(|| Error::UnknownMethod {
+        name: name.to_owned(),
+    })
 }

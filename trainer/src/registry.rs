@@ -40,8 +40,9 @@ impl ModelKind {
         (self.0.default_options)().get(name).is_some()
     }
 
-    /// The method of a saved model. `None` if it cannot be determined. For a folder, it is read from `model.json`, or
-    /// else derived from the files in the folder; for a single file, it is derived from the extension.
+    /// The method of a saved model. `None` if it cannot be determined. For a folder, it is read
+    /// from `model.json`, or else derived from the files in the folder; for a single file, it is
+    /// derived from the extension.
     ///
     /// # Errors
     ///
@@ -54,34 +55,49 @@ impl ModelKind {
         if model.is_file() {
             return Ok(Self::of_single_file(model));
         }
-        let is_complete = |kind: &Self| kind.0.files.last().is_some_and(|file| model.join(file).is_file());
+        let is_complete = |kind: &Self| {
+            kind.0
+                .files
+                .last()
+                .is_some_and(|file| model.join(file).is_file())
+        };
         let by_files = || Self::ALL.iter().copied().find(is_complete);
         let path = model.join(METADATA_FILE);
         let bytes = match files::read(&path, files::Budget::TEXT) {
             Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(by_files()),
-            read => read.map_err(|source| Error::Read { path: path.clone(), source })?,
+            read => read.map_err(|source| Error::Read {
+                path: path.clone(),
+                source,
+            })?,
         };
-        let metadata: Metadata =
-            serde_json::from_slice(&bytes).map_err(|source| Error::ModelMetadata { path, source })?;
-        Ok(metadata.method.as_deref().and_then(Self::from_name).or_else(by_files))
+        let metadata: Metadata = serde_json::from_slice(&bytes)
+            .map_err(|source| Error::ModelMetadata { path, source })?;
+        Ok(metadata
+            .method
+            .as_deref()
+            .and_then(Self::from_name)
+            .or_else(by_files))
     }
 
-    /// The method whose models are single files with the extension of this file, including extensions that are not
-    /// supported.
+    /// The method whose models are single files with the extension of this file, including
+    /// extensions that are not supported.
     pub fn of_single_file(file: &Path) -> Option<Self> {
         let extension = file.extension()?.to_str()?.to_ascii_lowercase();
         let has_extension = |kind: &Self| {
             let single_file = kind.0.single_file;
-            let extensions =
-                single_file.into_iter().flat_map(|single| [single.extensions, single.unsupported_extensions]);
+            let extensions = single_file
+                .into_iter()
+                .flat_map(|single| [single.extensions, single.unsupported_extensions]);
             extensions.flatten().any(|known| *known == extension)
         };
         Self::ALL.iter().copied().find(has_extension)
     }
 
-    /// Names of the model files of all methods, in the order in which the files are moved into place and hashed.
+    /// Names of the model files of all methods, in the order in which the files are moved into
+    /// place and hashed.
     pub fn model_files() -> impl Iterator<Item = &'static str> {
-        std::iter::once(METADATA_FILE).chain(Self::ALL.iter().flat_map(|kind| kind.0.files).copied())
+        std::iter::once(METADATA_FILE)
+            .chain(Self::ALL.iter().flat_map(|kind| kind.0.files).copied())
     }
 }
 

@@ -17,8 +17,8 @@ pub enum Projection {
         /// Principal point, pixels.
         principal_px: [f64; 2],
     },
-    /// All directions: longitude along x from -180 to 180 degrees, latitude along y from up to down, forward in the
-    /// center.
+    /// All directions: longitude along x from -180 to 180 degrees, latitude along y from up to
+    /// down, forward in the center.
     Equirectangular,
 }
 
@@ -43,9 +43,11 @@ pub struct RenderRequest {
     pub edits: Arc<Edits>,
     /// Background color, sRGB 0 to 1.
     pub background_srgb: [f32; 3],
-    /// Camera and stamp of the image whose lighting and exposure to use, if the model has them; `None`: the mean image.
+    /// Camera and stamp of the image whose lighting and exposure to use, if the model has them;
+    /// `None`: the mean image.
     pub appearance_of: Option<(Arc<str>, Stamp)>,
-    /// Whether depth is requested. Without depth, [`Picture::depth_m`] is empty and the GPU readback is half as large.
+    /// Whether depth is requested. Without depth, [`Picture::depth_m`] is empty and the GPU
+    /// readback is half as large.
     pub depth: bool,
 }
 
@@ -56,8 +58,8 @@ pub struct Picture {
     pub size_px: [u32; 2],
     /// `[height, width, 4]`, sRGB over the background; alpha is coverage.
     pub rgba_srgb: Vec<u8>,
-    /// `[height, width]`, meters along z (distance for equirectangular); 0 for pixels without a surface. Empty without
-    /// [`RenderRequest::depth`].
+    /// `[height, width]`, meters along z (distance for equirectangular); 0 for pixels without a
+    /// surface. Empty without [`RenderRequest::depth`].
     pub depth_m: Vec<f32>,
 }
 
@@ -69,20 +71,38 @@ impl Picture {
         depths: Option<&'a Buffer>,
     ) -> Vec<(&'a Buffer, usize)> {
         let n_bytes = 4 * size_px[0] as usize * size_px[1] as usize;
-        std::iter::once(pixels).chain(depths).map(|buffer| (buffer, n_bytes)).collect()
+        std::iter::once(pixels)
+            .chain(depths)
+            .map(|buffer| (buffer, n_bytes))
+            .collect()
     }
 
     /// Assembles the picture from the data read back from [`Self::buffers`].
     pub(crate) fn from_parts(size_px: [u32; 2], parts: &[&[u8]]) -> Self {
-        let depth_m = parts.get(1).map_or(Vec::new(), |bytes| bytemuck::pod_collect_to_vec(bytes));
-        Self { size_px, rgba_srgb: parts[0].to_vec(), depth_m }
+        let depth_m = parts
+            .get(1)
+            .map_or(Vec::new(), |bytes| bytemuck::pod_collect_to_vec(bytes));
+        Self {
+            size_px,
+            rgba_srgb: parts[0].to_vec(),
+            depth_m,
+        }
     }
 
     /// A picture that shows only the background.
     pub(crate) fn empty(size_px: [u32; 2], background_srgb: [f32; 3], depth: bool) -> Self {
         let n = size_px[0] as usize * size_px[1] as usize;
-        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to 0 to 255")]
-        let [red, green, blue] = background_srgb.map(|part| (part.clamp(0.0, 1.0) * 255.0 + 0.5).floor() as u8);
-        Self { size_px, rgba_srgb: [red, green, blue, 0].repeat(n), depth_m: vec![0.0; if depth { n } else { 0 }] }
+        #[expect(
+            clippy::cast_possible_truncation,
+            clippy::cast_sign_loss,
+            reason = "clamped to 0 to 255"
+        )]
+        let [red, green, blue] =
+            background_srgb.map(|part| (part.clamp(0.0, 1.0) * 255.0 + 0.5).floor() as u8);
+        Self {
+            size_px,
+            rgba_srgb: [red, green, blue, 0].repeat(n),
+            depth_m: vec![0.0; if depth { n } else { 0 }],
+        }
     }
 }

@@ -1,6 +1,8 @@
-//! Color of a splat as a function of the viewing direction: real spherical harmonics up to degree 3.
+//! Color of a splat as a function of the viewing direction: real spherical harmonics up to degree
+//! 3.
 //!
-//! Source: Kerbl et al. 2023 for constants, order and signs; the polynomials agree with Sloan 2013 on the unit sphere.
+//! Source: Kerbl et al. 2023 for constants, order and signs; the polynomials agree with Sloan 2013
+//! on the unit sphere.
 
 use nalgebra::Vector3;
 
@@ -26,29 +28,42 @@ const C3: [f64; 7] = [
     -0.590_043_589_926_643_5,
 ];
 
-/// Color in the direction `offset`, the vector from the camera to the splat in the world frame; clamped below at 0.
+/// Color in the direction `offset`, the vector from the camera to the splat in the world frame;
+/// clamped below at 0.
 ///
 /// `sh` holds 1, 4, 9 or 16 coefficients.
 pub fn color(sh: &[[f64; 3]], offset: &Vector3<f64>) -> [f64; 3] {
     unclamped_color(sh, offset).map(|channel| channel.max(0.0))
 }
 
-/// Gradient with respect to `sh` and `offset`, from the gradient with respect to the color; zero for clamped
-/// channels.
-pub fn color_backward(sh: &[[f64; 3]], offset: &Vector3<f64>, v_color: &[f64; 3]) -> (Vec<[f64; 3]>, Vector3<f64>) {
+/// Gradient with respect to `sh` and `offset`, from the gradient with respect to the color; zero
+/// for clamped channels.
+pub fn color_backward(
+    sh: &[[f64; 3]],
+    offset: &Vector3<f64>,
+    v_color: &[f64; 3],
+) -> (Vec<[f64; 3]>, Vector3<f64>) {
     let direction = offset.normalize();
     let (basis, by_direction) = (basis(&direction), basis_gradient(&direction));
     let unclamped = unclamped_color(sh, offset);
-    let v_color: [f64; 3] =
-        std::array::from_fn(|channel| if unclamped[channel] > 0.0 { v_color[channel] } else { 0.0 });
+    let v_color: [f64; 3] = std::array::from_fn(|channel| {
+        if unclamped[channel] > 0.0 {
+            v_color[channel]
+        } else {
+            0.0
+        }
+    });
     let mut v_direction = Vector3::zeros();
     let mut v_sh = Vec::with_capacity(sh.len());
     for (coeff_ix, coeff) in sh.iter().enumerate() {
         v_sh.push(v_color.map(|v| v * basis[coeff_ix]));
-        let v_basis: f64 = (0..3).map(|channel| v_color[channel] * coeff[channel]).sum();
+        let v_basis: f64 = (0..3)
+            .map(|channel| v_color[channel] * coeff[channel])
+            .sum();
         v_direction += by_direction[coeff_ix] * v_basis;
     }
-    // The color does not depend on the length of the offset, so the component along the direction is removed.
+    // The color does not depend on the length of the offset, so the component along the direction
+    // is removed.
     let v_offset = (v_direction - direction * direction.dot(&v_direction)) / offset.norm();
     (v_sh, v_offset)
 }
@@ -103,7 +118,13 @@ fn basis_gradient(direction: &Vector3<f64>) -> [Vector3<f64>; MAX_N_COEFFS] {
 
 fn unclamped_color(sh: &[[f64; 3]], offset: &Vector3<f64>) -> [f64; 3] {
     let basis = basis(&offset.normalize());
-    std::array::from_fn(|channel| 0.5 + sh.iter().zip(basis).map(|(coeff, value)| coeff[channel] * value).sum::<f64>())
+    std::array::from_fn(|channel| {
+        0.5 + sh
+            .iter()
+            .zip(basis)
+            .map(|(coeff, value)| coeff[channel] * value)
+            .sum::<f64>()
+    })
 }
 
 #[cfg(test)]
@@ -114,7 +135,8 @@ mod tests {
     #[test]
     fn basis_is_orthonormal_on_the_sphere() {
         const N_AZIMUTHS: u32 = 16; // Makes the sum over azimuths exact for products of degree 6.
-        // Gauss-Legendre with 4 points is exact to degree 7 in z (Abramowitz and Stegun 1964, table 25.4).
+        // Gauss-Legendre with 4 points is exact to degree 7 in z (Abramowitz and Stegun 1964, table
+        // 25.4).
         const HEIGHTS: [(f64, f64); 4] = [
             (-0.861_136_311_594_052_6, 0.347_854_845_137_453_9),
             (-0.339_981_043_584_856_3, 0.652_145_154_862_546_1),
@@ -126,17 +148,29 @@ mod tests {
             let azimuth_rad = std::f64::consts::TAU * f64::from(azimuth_ix) / f64::from(N_AZIMUTHS);
             for (z, weight) in HEIGHTS {
                 let radius = (1.0 - z * z).sqrt();
-                let values = basis(&Vector3::new(radius * azimuth_rad.cos(), radius * azimuth_rad.sin(), z));
+                let values = basis(&Vector3::new(
+                    radius * azimuth_rad.cos(),
+                    radius * azimuth_rad.sin(),
+                    z,
+                ));
                 let area = weight * std::f64::consts::TAU / f64::from(N_AZIMUTHS);
                 for (row, a) in products.iter_mut().zip(values) {
-                    row.iter_mut().zip(values).for_each(|(product, b)| *product += area * a * b);
+                    row.iter_mut()
+                        .zip(values)
+                        .for_each(|(product, b)| *product += area * a * b);
                 }
             }
         }
         let mut mismatches = Mismatches::default();
         for (i, row) in products.iter().enumerate() {
             for (j, &product) in row.iter().enumerate() {
-                mismatches.check(format!("<{i}, {j}>"), product, if i == j { 1.0 } else { 0.0 }, 1e-12, 0.0);
+                mismatches.check(
+                    format!("<{i}, {j}>"),
+                    product,
+                    if i == j { 1.0 } else { 0.0 },
+                    1e-12,
+                    0.0,
+                );
             }
         }
         mismatches.assert_none();
@@ -144,8 +178,8 @@ mod tests {
 
     #[test]
     fn basis_has_the_signs_of_published_splat_files() {
-        // In this direction (x > sqrt(3) y > 0, z large), every polynomial without its constant is positive, so the
-        // constants determine the signs.
+        // In this direction (x > sqrt(3) y > 0, z large), every polynomial without its constant is
+        // positive, so the constants determine the signs.
         let signs = basis(&Vector3::new(0.36, 0.2, 0.9).normalize()).map(f64::signum);
         let published = [1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1].map(f64::from);
         assert_eq!(signs, published);

@@ -28,17 +28,34 @@ struct InFlight {
 
 impl Submits {
     pub(crate) fn new() -> Self {
-        Self { in_flight: None, idle_since: Instant::now(), step_millis: 0.0, is_watched: false }
+        Self {
+            in_flight: None,
+            idle_since: Instant::now(),
+            step_millis: 0.0,
+            is_watched: false,
+        }
     }
 
-    /// Registers a submit that returns counters at its end. Recording of the submit began at `since`.
+    /// Registers a submit that returns counters at its end. Recording of the submit began at
+    /// `since`.
     pub(crate) fn begin(&mut self, counters: PendingRead, n_steps: u64, since: Instant) {
-        self.in_flight = Some(InFlight { counters, n_steps, since });
+        self.in_flight = Some(InFlight {
+            counters,
+            n_steps,
+            since,
+        });
     }
 
     /// Waits for the submit in flight and returns its counters, if there is one.
     pub(crate) fn finish(&mut self, gpu: &Gpu) -> Result<Option<Vec<u32>>, Error> {
-        let Some(InFlight { counters, n_steps, since }) = self.in_flight.take() else { return Ok(None) };
+        let Some(InFlight {
+            counters,
+            n_steps,
+            since,
+        }) = self.in_flight.take()
+        else {
+            return Ok(None);
+        };
         let counters = counters.finish(gpu)?;
         let completed = Instant::now();
         let began = since.max(self.idle_since); // The previous submit may have been running at `since`.
@@ -53,12 +70,19 @@ impl Submits {
 
     /// Number of steps in the submit in flight.
     pub(crate) fn n_steps_in_flight(&self) -> u64 {
-        self.in_flight.as_ref().map_or(0, |in_flight| in_flight.n_steps)
+        self.in_flight
+            .as_ref()
+            .map_or(0, |in_flight| in_flight.n_steps)
     }
 
-    /// Number of steps that fit into the time limit of a submit; `None` until a submit has been timed.
+    /// Number of steps that fit into the time limit of a submit; `None` until a submit has been
+    /// timed.
     pub(crate) fn n_steps_in_limit(&self) -> Option<u64> {
-        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "rounded down on purpose")]
+        #[expect(
+            clippy::cast_possible_truncation,
+            clippy::cast_sign_loss,
+            reason = "rounded down on purpose"
+        )]
         let n_steps = |step_millis: f64| (submit_millis(self.is_watched) / step_millis) as u64;
         (self.step_millis > 0.0).then(|| n_steps(self.step_millis))
     }

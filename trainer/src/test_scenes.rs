@@ -8,14 +8,21 @@ use kinematics::Transform;
 use std::sync::Arc;
 
 pub(crate) fn options() -> ModelOptions<TsdfOptions> {
-    ModelOptions::from(TsdfOptions { voxel_m: Some(0.02), noise_per_m2: Some(1e-4), ..TsdfOptions::default() })
+    ModelOptions::from(TsdfOptions {
+        voxel_m: Some(0.02),
+        noise_per_m2: Some(1e-4),
+        ..TsdfOptions::default()
+    })
 }
 
 pub(crate) fn request(world_from_camera: Transform) -> RenderRequest {
     RenderRequest {
         world_from_camera,
         size_px: SIZE_PX,
-        projection: Projection::Pinhole { focal_px: FOCAL_PX, principal_px: PRINCIPAL_PX },
+        projection: Projection::Pinhole {
+            focal_px: FOCAL_PX,
+            principal_px: PRINCIPAL_PX,
+        },
         shutter: None,
         near_m: 0.01,
         far_m: 100.0,

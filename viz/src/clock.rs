@@ -11,7 +11,9 @@ pub(crate) struct ServerClock {
 impl ServerClock {
     /// A clock that starts at 0 now.
     pub(crate) fn start() -> Self {
-        Self { started: Instant::now() }
+        Self {
+            started: Instant::now(),
+        }
     }
 
     /// The current time.
@@ -28,6 +30,7 @@ impl ServerClock {
 
     /// The instant of a time; `None` if it is before the server started, or not representable.
     pub(crate) fn instant(self, millis: f64) -> Option<Instant> {
-        self.started.checked_add(Duration::try_from_secs_f64(millis * 1e-3).ok()?)
+        self.started
+            .checked_add(Duration::try_from_secs_f64(millis * 1e-3).ok()?)
     }
 }

@@ -18,8 +18,15 @@ pub enum EditAction {
 impl std::fmt::Display for EditAction {
     fn fmt(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self {
-            Self::Erase(Aabb { min_m: [x, y, z], max_m: [to_x, to_y, to_z], .. }) => {
-                write!(formatter, "erase the box from ({x:.3}, {y:.3}, {z:.3}) to ({to_x:.3}, {to_y:.3}, {to_z:.3}) m")
+            Self::Erase(Aabb {
+                min_m: [x, y, z],
+                max_m: [to_x, to_y, to_z],
+                ..
+            }) => {
+                write!(
+                    formatter,
+                    "erase the box from ({x:.3}, {y:.3}, {z:.3}) to ({to_x:.3}, {to_y:.3}, {to_z:.3}) m"
+                )
             }
             Self::RemoveFloaters => formatter.write_str("remove floaters"),
             Self::Undo => formatter.write_str("undo"),
@@ -42,17 +49,29 @@ impl EditRequest {
     /// Validates a client's message.
     pub(crate) fn check(client: u64, message: &EditMessage) -> Result<Self, InvalidRequest> {
         let action = match (message.action, &message.erased_box) {
-            (EditKind::Erase, Some(erased_box)) => EditAction::Erase(checked_box(erased_box, "box")?),
+            (EditKind::Erase, Some(erased_box)) => {
+                EditAction::Erase(checked_box(erased_box, "box")?)
+            }
             (EditKind::RemoveFloaters, None) => EditAction::RemoveFloaters,
             (EditKind::Undo, None) => EditAction::Undo,
             _ => return Err(InvalidRequest::EditBox),
         };
-        Ok(Self { client, id: message.id, method: message.method.clone(), action })
+        Ok(Self {
+            client,
+            id: message.id,
+            method: message.method.clone(),
+            action,
+        })
     }
 
     /// A request for the first model, with no client that waits for it.
     pub fn of_nobody(action: EditAction) -> Self {
-        Self { client: 0, id: None, method: None, action }
+        Self {
+            client: 0,
+            id: None,
+            method: None,
+            action,
+        }
     }
 
     /// The model to edit; the first if `None`. The name comes from the client and may not exist.

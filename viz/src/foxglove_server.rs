@@ -7,10 +7,12 @@ use crate::topics::robot::{RobotDescription, RobotState};
 use crate::topics::updates::{KeyframePose, LiveImage, Status};
 use crate::{Error, Hub};
 use ::foxglove::messages::{
-    CameraCalibration, CompressedImage, FrameTransform, FrameTransforms, JointState, JointStates, Pose, PosesInFrame,
-    Quaternion, Timestamp, Vector3,
+    CameraCalibration, CompressedImage, FrameTransform, FrameTransforms, JointState, JointStates,
+    Pose, PosesInFrame, Quaternion, Timestamp, Vector3,
 };
-use ::foxglove::{Channel, ChannelBuilder, Context, PartialMetadata, RawChannel, Schema, WebSocketServer};
+use ::foxglove::{
+    Channel, ChannelBuilder, Context, PartialMetadata, RawChannel, Schema, WebSocketServer,
+};
 use kinematics::urdf::{Joint, JointKind};
 use kinematics::{Stamp, Transform};
 use nalgebra::{Translation3, UnitQuaternion};
@@ -25,7 +27,8 @@ use tokio::sync::watch;
 
 /// Period of checking whether a client is connected.
 const CLIENT_CHECK_PERIOD: Duration = Duration::from_millis(200);
-/// Keyframes and metrics are repeated with this period, because Foxglove sends only what comes after a subscription.
+/// Keyframes and metrics are repeated with this period, because Foxglove sends only what comes
+/// after a subscription.
 const REPEAT_PERIOD: Duration = Duration::from_secs(1);
 /// Messages that may wait for a client; older ones are dropped.
 const MAX_WAITING: usize = 64;
@@ -89,10 +92,24 @@ impl FoxgloveServer {
             .map_err(|source| Error::Thread { source })?;
         let port = match started.recv() {
             Ok(Ok(port)) => port,
-            Ok(Err(error)) => return Err(Error::Foxglove { address, reason: error.to_string() }),
-            Err(_) => return Err(Error::Foxglove { address, reason: "its thread panicked".to_owned() }),
+            Ok(Err(error)) => {
+                return Err(Error::Foxglove {
+                    address,
+                    reason: error.to_string(),
+                });
+            }
+            Err(_) => {
+                return Err(Error::Foxglove {
+                    address,
+                    reason: "its thread panicked".to_owned(),
+                });
+            }
         };
-        Ok(Self { address: SocketAddr::new(address.ip(), port), stop, thread: Some(thread) })
+        Ok(Self {
+            address: SocketAddr::new(address.ip(), port),
+            stop,
+            thread: Some(thread),
+        })
     }
 
     /// The URL to open in Foxglove.
@@ -109,7 +126,11 @@ impl FoxgloveServer {
 impl Drop for FoxgloveServer {
     fn drop(&mut self) {
         self.stop.send_replace(true);
-        if self.thread.take().is_some_and(|thread| thread.join().is_err()) {
+        if self
+            .thread
+            .take()
+            .is_some_and(|thread| thread.join().is_err())
+        {
             log::error!("the Foxglove server on {} panicked", self.address);
         }
     }
@@ -138,7 +159,11 @@ impl Topics {
         let builder = |topic: &str| ChannelBuilder::new(topic).context(context);
         let metrics = builder("/metrics")
             .message_encoding("json")
-            .schema(Schema::new("fieldrig.Metrics", "jsonschema", METRICS_SCHEMA.as_bytes()))
+            .schema(Schema::new(
+                "fieldrig.Metrics",
+                "jsonschema",
+                METRICS_SCHEMA.as_bytes(),
+            ))
             .build_raw()
             .expect("it has a message encoding");
         Self {
@@ -161,8 +186,13 @@ struct CameraTopics {
 
 impl CameraTopics {
     fn new(context: &Arc<Context>, camera: &str) -> Self {
-        let topic = |name: &str| ChannelBuilder::new(format!("/cameras/{camera}/{name}")).context(context);
-        Self { image: topic("image").build(), calibration: topic("calibration").build(), published: None }
+        let topic =
+            |name: &str| ChannelBuilder::new(format!("/cameras/{camera}/{name}")).context(context);
+        Self {
+            image: topic("image").build(),
+            calibration: topic("calibration").build(),
+            published: None,
+        }
     }
 }
 
@@ -172,7 +202,8 @@ async fn publish_images(topics: &Topics) {
     let mut live_images = topics.hub.latest::<LiveImages>().subscribe();
     live_images.mark_changed();
     while live_images.changed().await.is_ok() {
-        let images: Vec<Arc<LiveImage>> = live_images.borrow_and_update().values().cloned().collect();
+        let images: Vec<Arc<LiveImage>> =
+            live_images.borrow_and_update().values().cloned().collect();
         for image in images {
             let camera = cameras
                 .entry(Arc::clone(&image.camera))
@@ -180,16 +211,30 @@ async fn publish_images(topics: &Topics) {
             if camera.published.replace(image.stamp) == Some(image.stamp) {
                 continue;
             }
-            camera.calibration.log_with_time(&calibration(&image), nanos(image.stamp));
+            camera
+                .calibration
+                .log_with_time(&calibration(&image), nanos(image.stamp));
             if let Some(world_from_camera) = &image.world_from_camera {
-                let transform = frame_transform(image.stamp, WORLD, &camera_frame(&image.camera), world_from_camera);
-                topics.transforms.log_with_time(&FrameTransforms { transforms: vec![transform] }, nanos(image.stamp));
+                let transform = frame_transform(
+                    image.stamp,
+                    WORLD,
+                    &camera_frame(&image.camera),
+                    world_from_camera,
+                );
+                topics.transforms.log_with_time(
+                    &FrameTransforms {
+                        transforms: vec![transform],
+                    },
+                    nanos(image.stamp),
+                );
             }
             if !camera.image.has_sinks() {
                 continue;
             }
             let source = Arc::clone(&image);
-            let encoded = tokio::task::spawn_blocking(move || live_jpeg(&source, source.size_px).map(Cow::into_owned));
+            let encoded = tokio::task::spawn_blocking(move || {
+                live_jpeg(&source, source.size_px).map(Cow::into_owned)
+            });
             match encoded.await {
                 Ok(Ok(jpeg)) => camera.image.log_with_time(
                     &CompressedImage {
@@ -212,19 +257,34 @@ async fn publish_robot(topics: &Topics) {
     let mut states = topics.hub.latest::<Option<Arc<RobotState>>>().subscribe();
     states.mark_changed();
     while states.changed().await.is_ok() {
-        let (state, description) =
-            (states.borrow_and_update().clone(), topics.hub.latest::<Option<Arc<RobotDescription>>>().borrow().clone());
-        let (Some(state), Some(description)) = (state, description) else { continue };
+        let (state, description) = (
+            states.borrow_and_update().clone(),
+            topics
+                .hub
+                .latest::<Option<Arc<RobotDescription>>>()
+                .borrow()
+                .clone(),
+        );
+        let (Some(state), Some(description)) = (state, description) else {
+            continue;
+        };
         let joints = description.joint_names.iter().zip(&state.positions);
         let joint = |(name, position): (&String, &f64)| JointState {
             name: name.clone(),
             position: Some(*position),
             ..JointState::default()
         };
-        let joint_states = JointStates { timestamp: Some(timestamp(state.stamp)), joints: joints.map(joint).collect() };
-        topics.joint_states.log_with_time(&joint_states, nanos(state.stamp));
+        let joint_states = JointStates {
+            timestamp: Some(timestamp(state.stamp)),
+            joints: joints.map(joint).collect(),
+        };
+        topics
+            .joint_states
+            .log_with_time(&joint_states, nanos(state.stamp));
         let transforms = link_transforms(&description, &state);
-        topics.transforms.log_with_time(&FrameTransforms { transforms }, nanos(state.stamp));
+        topics
+            .transforms
+            .log_with_time(&FrameTransforms { transforms }, nanos(state.stamp));
     }
 }
 
@@ -242,12 +302,20 @@ async fn publish_lists(topics: &Topics) {
         };
         if has_keyframes {
             let keyframes = keyframes.borrow_and_update().clone();
-            let newest = keyframes.iter().map(|keyframe| keyframe.stamp).max().unwrap_or_default();
-            topics.keyframes.log_with_time(&poses_in_frame(&keyframes, newest), nanos(newest));
+            let newest = keyframes
+                .iter()
+                .map(|keyframe| keyframe.stamp)
+                .max()
+                .unwrap_or_default();
+            topics
+                .keyframes
+                .log_with_time(&poses_in_frame(&keyframes, newest), nanos(newest));
         }
         if has_status && let Some(status) = status.borrow_and_update().clone() {
             let time = PartialMetadata::with_log_time(nanos(newest_stamp(&topics.hub)));
-            topics.metrics.log_with_meta(metrics(&status).as_bytes(), time);
+            topics
+                .metrics
+                .log_with_meta(metrics(&status).as_bytes(), time);
         }
     }
 }
@@ -256,7 +324,11 @@ async fn publish_lists(topics: &Topics) {
 fn newest_stamp(hub: &Hub) -> Stamp {
     let images = hub.latest::<LiveImages>();
     let of_images = images.borrow().values().map(|image| image.stamp).max();
-    let of_robot = hub.latest::<Option<Arc<RobotState>>>().borrow().as_ref().map(|state| state.stamp);
+    let of_robot = hub
+        .latest::<Option<Arc<RobotState>>>()
+        .borrow()
+        .as_ref()
+        .map(|state| state.stamp);
     of_images.max(of_robot).unwrap_or_default()
 }
 
@@ -273,7 +345,10 @@ fn metrics(status: &Status) -> String {
 fn poses_in_frame(keyframes: &[KeyframePose], newest: Stamp) -> PosesInFrame {
     let pose = |keyframe: &KeyframePose| {
         let (position, orientation) = parts(&keyframe.world_from_camera);
-        Pose { position: Some(position), orientation: Some(orientation) }
+        Pose {
+            position: Some(position),
+            orientation: Some(orientation),
+        }
     };
     PosesInFrame {
         timestamp: Some(timestamp(newest)),
@@ -293,7 +368,20 @@ fn calibration(image: &LiveImage) -> CameraCalibration {
         // Pixel centers are at integers in Foxglove.
         k: vec![fx, 0.0, cx - 0.5, 0.0, fy, cy - 0.5, 0.0, 0.0, 1.0],
         r: vec![1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
-        p: vec![fx, 0.0, cx - 0.5, 0.0, 0.0, fy, cy - 0.5, 0.0, 0.0, 0.0, 1.0, 0.0],
+        p: vec![
+            fx,
+            0.0,
+            cx - 0.5,
+            0.0,
+            0.0,
+            fy,
+            cy - 0.5,
+            0.0,
+            0.0,
+            0.0,
+            1.0,
+            0.0,
+        ],
         ..CameraCalibration::default()
     }
 }
@@ -307,10 +395,15 @@ fn link_transforms(description: &RobotDescription, state: &RobotState) -> Vec<Fr
         .iter()
         .map(|joint| frame_transform(state.stamp, &joint.parent, &joint.child, &in_parent(joint)))
         .collect();
-    let path = robot.root().and_then(|root| Ok((root, robot.path(root, &description.base_link)?)));
+    let path = robot
+        .root()
+        .and_then(|root| Ok((root, robot.path(root, &description.base_link)?)));
     match path {
         Ok((root, joints)) => {
-            let root_from_base = joints.into_iter().map(in_parent).fold(Transform::identity(), |a, b| a * b);
+            let root_from_base = joints
+                .into_iter()
+                .map(in_parent)
+                .fold(Transform::identity(), |a, b| a * b);
             let world_from_root = state.world_from_base * root_from_base.inverse();
             transforms.push(frame_transform(state.stamp, WORLD, root, &world_from_root));
         }
@@ -319,9 +412,16 @@ fn link_transforms(description: &RobotDescription, state: &RobotState) -> Vec<Fr
     transforms
 }
 
-fn parent_from_child(joint: &Joint, description: &RobotDescription, positions: &[f64]) -> Transform {
+fn parent_from_child(
+    joint: &Joint,
+    description: &RobotDescription,
+    positions: &[f64],
+) -> Transform {
     let measured = |name: &str| {
-        let ix = description.joint_names.iter().position(|other| other == name)?;
+        let ix = description
+            .joint_names
+            .iter()
+            .position(|other| other == name)?;
         positions.get(ix).copied()
     };
     let position = match &joint.mimic {
@@ -339,7 +439,12 @@ fn parent_from_child(joint: &Joint, description: &RobotDescription, positions: &
     joint.parent_from_joint * motion
 }
 
-fn frame_transform(stamp: Stamp, parent: &str, child: &str, parent_from_child: &Transform) -> FrameTransform {
+fn frame_transform(
+    stamp: Stamp,
+    parent: &str,
+    child: &str,
+    parent_from_child: &Transform,
+) -> FrameTransform {
     let (translation, rotation) = parts(parent_from_child);
     FrameTransform {
         timestamp: Some(timestamp(stamp)),
@@ -352,8 +457,20 @@ fn frame_transform(stamp: Stamp, parent: &str, child: &str, parent_from_child: &
 
 fn parts(transform: &Transform) -> (Vector3, Quaternion) {
     let (translation, rotation) = (transform.translation.vector, transform.rotation.coords);
-    let position = Vector3 { x: translation.x, y: translation.y, z: translation.z };
-    (position, Quaternion { x: rotation.x, y: rotation.y, z: rotation.z, w: rotation.w })
+    let position = Vector3 {
+        x: translation.x,
+        y: translation.y,
+        z: translation.z,
+    };
+    (
+        position,
+        Quaternion {
+            x: rotation.x,
+            y: rotation.y,
+            z: rotation.z,
+            w: rotation.w,
+        },
+    )
 }
 
 fn camera_frame(camera: &str) -> String {

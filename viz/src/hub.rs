@@ -1,4 +1,5 @@
-//! Shared state of the training thread and the server. The training thread never waits for a client.
+//! Shared state of the training thread and the server. The training thread never waits for a
+//! client.
 
 use crate::edit::EditRequest;
 use crate::pictures::picture::packing;
@@ -20,7 +21,8 @@ use std::time::{Duration, Instant};
 use tokio::sync::{Notify, watch};
 use trainer::{Packing, Projection, RenderRequest, Rendered};
 
-/// Handle shared by the training thread and a [`Server`](crate::Server). Clones refer to the same hub.
+/// Handle shared by the training thread and a [`Server`](crate::Server). Clones refer to the same
+/// hub.
 #[derive(Clone, Debug, Default)]
 pub struct Hub {
     shared: Arc<Shared>,
@@ -29,8 +31,8 @@ pub struct Hub {
 /// The latest data of the topics, by type.
 type LatestData = BTreeMap<TypeId, Box<dyn Any + Send>>;
 
-/// A client gets keyframes and images this long after it has joined, or after its hello. Earlier, it is not known which
-/// of them it wants, and at which size.
+/// A client gets keyframes and images this long after it has joined, or after its hello. Earlier,
+/// it is not known which of them it wants, and at which size.
 const HELLO_GRACE: Duration = Duration::from_millis(500);
 /// Maximum number of edits that wait to be applied.
 pub(crate) const MAX_WAITING_EDITS: usize = 64;
@@ -52,7 +54,13 @@ pub(crate) struct Demand {
 impl Demand {
     /// The demand of a client that has sent nothing.
     pub(crate) fn new(joined: Instant) -> Self {
-        Self { joined, has_hello: false, subscriptions: Arc::default(), has_keyframe_changes: false, viewpoint: None }
+        Self {
+            joined,
+            has_hello: false,
+            subscriptions: Arc::default(),
+            has_keyframe_changes: false,
+            viewpoint: None,
+        }
     }
 
     /// The time from which the client gets keyframes and images, if it is later.
@@ -85,11 +93,17 @@ impl Hub {
         Self::default()
     }
 
-    /// The latest data of this type. Each topic has types of its own, and sets and reads them in its module.
+    /// The latest data of this type. Each topic has types of its own, and sets and reads them in
+    /// its module.
     pub(crate) fn latest<T: Default + Send + Sync + 'static>(&self) -> watch::Sender<T> {
         let mut latest = self.shared.latest.lock();
-        let sender = latest.entry(TypeId::of::<T>()).or_insert_with(|| Box::new(watch::Sender::<T>::default()));
-        sender.downcast_ref::<watch::Sender<T>>().expect("the key is its type").clone()
+        let sender = latest
+            .entry(TypeId::of::<T>())
+            .or_insert_with(|| Box::new(watch::Sender::<T>::default()));
+        sender
+            .downcast_ref::<watch::Sender<T>>()
+            .expect("the key is its type")
+            .clone()
     }
 
     /// Whether a client receives a topic.
@@ -99,7 +113,11 @@ impl Hub {
 
     /// Whether the subscriptions of any client fulfill a condition.
     pub(crate) fn has_subscription(&self, condition: impl Fn(&Subscriptions) -> bool) -> bool {
-        self.shared.demands.lock().values().any(|demand| condition(&demand.subscriptions))
+        self.shared
+            .demands
+            .lock()
+            .values()
+            .any(|demand| condition(&demand.subscriptions))
     }
 
     /// The minimum period over the subscriptions of all clients; `None` if no client has one.
@@ -107,13 +125,20 @@ impl Hub {
         &self,
         period: impl Fn(&Subscriptions) -> Option<Duration>,
     ) -> Option<Duration> {
-        self.shared.demands.lock().values().filter_map(|demand| period(&demand.subscriptions)).min()
+        self.shared
+            .demands
+            .lock()
+            .values()
+            .filter_map(|demand| period(&demand.subscriptions))
+            .min()
     }
 
     /// Sets whether somebody besides the clients needs images and robot states.
     #[cfg(feature = "foxglove")]
     pub(crate) fn set_observed(&self, is_observed: bool) {
-        self.shared.is_observed.store(is_observed, Ordering::Relaxed);
+        self.shared
+            .is_observed
+            .store(is_observed, Ordering::Relaxed);
     }
 
     pub(crate) fn is_observed(&self) -> bool {
@@ -132,8 +157,8 @@ impl Hub {
         controls.push(action);
     }
 
-    /// The pictures of models in training that clients have shown since the last call. If it is not called for long, the
-    /// oldest are missing.
+    /// The pictures of models in training that clients have shown since the last call. If it is not
+    /// called for long, the oldest are missing.
     pub fn take_shown_pictures(&self) -> Vec<ShownPicture> {
         self.shared.shown_pictures.lock().take()
     }
@@ -147,7 +172,10 @@ impl Hub {
 
     /// Records that a client has shown a picture; does nothing if the picture is unknown.
     pub(crate) fn picture_shown(&self, client: u64, id: u64, view: &str, shown_at: Instant) {
-        let picture = self.queue().unreported(client).and_then(|unreported| unreported.shown(id, view, shown_at));
+        let picture = self
+            .queue()
+            .unreported(client)
+            .and_then(|unreported| unreported.shown(id, view, shown_at));
         if let Some(picture) = picture {
             self.shared.shown_pictures.lock().push(picture);
         }
@@ -160,7 +188,10 @@ impl Hub {
 
     /// Sends the client a one-sentence reason why an edit could not be made.
     pub fn reject_edit(&self, request: &EditRequest, reason: &str) {
-        let rejected = Outgoing::Rejected { id: request.id, reason: reason.to_owned() };
+        let rejected = Outgoing::Rejected {
+            id: request.id,
+            reason: reason.to_owned(),
+        };
         self.queue().push_outgoing(request.client, rejected);
     }
 
@@ -181,7 +212,8 @@ impl Hub {
 
     /// The next picture to render, if a client is waiting for one.
     ///
-    /// Each call returns one stage of one view. Clients are served in turn, and so are the views of a client.
+    /// Each call returns one stage of one view. Clients are served in turn, and so are the views of
+    /// a client.
     pub fn next_request(&self) -> Option<PendingRender> {
         let job = self.queue().take()?;
         Some(PendingRender {
@@ -199,7 +231,9 @@ impl Hub {
     /// For callers that have nothing to train.
     pub fn wait_for_request(&self, timeout: Duration) -> bool {
         let mut queue = self.queue();
-        self.shared.work_arrived.wait_while_for(&mut queue, |queue| !queue.has_work(), timeout);
+        self.shared
+            .work_arrived
+            .wait_while_for(&mut queue, |queue| !queue.has_work(), timeout);
         queue.has_work()
     }
 
@@ -242,15 +276,15 @@ impl Hub {
         self.shared.work_arrived.notify_all();
     }
 
-    /// Locks the queue. It holds plain values that are valid after every statement, so it stays usable after a panic
-    /// elsewhere.
+    /// Locks the queue. It holds plain values that are valid after every statement, so it stays
+    /// usable after a panic elsewhere.
     fn queue(&self) -> MutexGuard<'_, Queue> {
         self.shared.queue.lock()
     }
 }
 
-/// A picture for which a client is waiting. If it is dropped without an answer, the client receives nothing for this
-/// stage.
+/// A picture for which a client is waiting. If it is dropped without an answer, the client receives
+/// nothing for this stage.
 #[derive(Debug)]
 pub struct PendingRender {
     /// What to render, at the size of this stage.
@@ -275,9 +309,13 @@ impl PendingRender {
         self
     }
 
-    /// How this stage is packed on the GPU; `None` if the client requested a format that the GPU does not support.
+    /// How this stage is packed on the GPU; `None` if the client requested a format that the GPU
+    /// does not support.
     pub fn packing(&self) -> Option<Packing> {
-        packing(&self.job.view_request, self.job.stage + 1 == self.job.view_request.stages.len())
+        packing(
+            &self.job.view_request,
+            self.job.stage + 1 == self.job.view_request.stages.len(),
+        )
     }
 
     /// Sets when rendering began, if other pictures of a batch were rendered first.
@@ -292,9 +330,16 @@ impl PendingRender {
         let rendered = picture.into();
         let header = self.header(rendered.size_px());
         if header.last {
-            self.hub.queue().record_render_time(&self.job, header.render_millis);
+            self.hub
+                .queue()
+                .record_render_time(&self.job, header.render_millis);
         }
-        let drawn = DrawnPicture { job: self.job.clone(), header, trained_on: self.trained_on, rendered };
+        let drawn = DrawnPicture {
+            job: self.job.clone(),
+            header,
+            trained_on: self.trained_on,
+            rendered,
+        };
         self.enqueue_answer(Outgoing::Picture(Box::new(drawn)));
     }
 
@@ -302,7 +347,11 @@ impl PendingRender {
     pub fn fail(mut self, reason: &str) {
         let view_request = &self.job.view_request;
         let (id, view) = (view_request.id, Arc::clone(&view_request.view));
-        self.enqueue_answer(Outgoing::Failed { id, view, reason: reason.to_owned() });
+        self.enqueue_answer(Outgoing::Failed {
+            id,
+            view,
+            reason: reason.to_owned(),
+        });
     }
 
     fn enqueue_answer(&mut self, outgoing: Outgoing) {
@@ -347,7 +396,10 @@ impl Drop for PendingRender {
 
 fn projection_message(projection: &Projection) -> ProjectionMessage {
     match *projection {
-        Projection::Pinhole { focal_px, principal_px } => ProjectionMessage::Pinhole {
+        Projection::Pinhole {
+            focal_px,
+            principal_px,
+        } => ProjectionMessage::Pinhole {
             focal_px: Some(focal_px),
             principal_px: Some(principal_px),
             vertical_fov_rad: None,

@@ -1,7 +1,7 @@
 //! The web viewer: a render server and its web page.
 //!
-//! The training thread publishes to a [`Hub`], which never blocks it. A [`Server`] sends the hub's data to browsers
-//! over one port. `docs/reference/protocol.md` describes the messages.
+//! The training thread publishes to a [`Hub`], which never blocks it. A [`Server`] sends the hub's
+//! data to browsers over one port. `docs/reference/protocol.md` describes the messages.
 //!
 //! ```
 //! use viz::{Hub, Status};
@@ -37,7 +37,9 @@ pub use session::protocol::{BASE_PROTOCOL_VERSION, Control, PROTOCOL_VERSION};
 pub use topics::observation_map::{ObservationMap, ObservedCell};
 pub use topics::range_scan::RangeScan;
 pub use topics::robot::{MeshFormat, RobotDescription, RobotMesh, RobotState};
-pub use topics::updates::{Guidance, KeyframePose, LiveImage, LivePixels, ModelStatus, RunResult, SceneHint, Status};
+pub use topics::updates::{
+    Guidance, KeyframePose, LiveImage, LivePixels, ModelStatus, RunResult, SceneHint, Status,
+};
 
 /// Handles the messages of a client, one per line, and panics if a result is inconsistent.
 #[cfg(fuzzing)]

@@ -2,7 +2,8 @@
 
 use super::scene::{input, with_board_poses};
 use calibration::hand_eye::{
-    BoardObservation, ClosedForm, HandEyeCalibration, HandEyeOptions, HandEyeSample, calibrate_hand_eye,
+    BoardObservation, ClosedForm, HandEyeCalibration, HandEyeOptions, HandEyeSample,
+    calibrate_hand_eye,
 };
 use kinematics::Transform;
 use nalgebra::Vector6;
@@ -44,13 +45,17 @@ impl Method {
 
     /// Calibrates from corners.
     pub(super) fn calibrate(self, samples: &[HandEyeSample], truth: &Transform) -> Outcome {
-        let options =
-            HandEyeOptions { estimate_intrinsics: self == Self::BundleAdjustmentWithLens, ..HandEyeOptions::default() };
+        let options = HandEyeOptions {
+            estimate_intrinsics: self == Self::BundleAdjustmentWithLens,
+            ..HandEyeOptions::default()
+        };
         let found = match self {
             Self::ClosedForm(solver) => {
                 let pairs: Vec<_> = with_board_poses(samples).iter().filter_map(pair).collect();
                 let found = solver.flange_from_camera(&pairs);
-                return found.map_or(Outcome::Refused, |found| Outcome::Solved(Errors::of(&found, truth, None)));
+                return found.map_or(Outcome::Refused, |found| {
+                    Outcome::Solved(Errors::of(&found, truth, None))
+                });
             }
             Self::Refined => calibrate_hand_eye(&input(with_board_poses(samples), options)),
             Self::BundleAdjustment | Self::BundleAdjustmentWithLens => {
@@ -79,7 +84,10 @@ pub(super) fn squared_error(found: &HandEyeCalibration, truth: &Transform) -> f6
     let error = found.parent_from_camera.inverse() * truth;
     let (t, r) = (error.translation.vector, error.rotation.scaled_axis());
     let error = Vector6::new(t.x, t.y, t.z, r.x, r.y, r.z);
-    found.covariance.cholesky().map_or(f64::INFINITY, |factor| error.dot(&factor.solve(&error)))
+    found
+        .covariance
+        .cholesky()
+        .map_or(f64::INFINITY, |factor| error.dot(&factor.solve(&error)))
 }
 
 /// Result of one calibration.
@@ -101,7 +109,11 @@ pub(super) struct Errors {
 impl Errors {
     pub(super) fn of(found: &Transform, truth: &Transform, squared: Option<f64>) -> Self {
         let error = truth.inverse() * found;
-        Self { mm: 1e3 * error.translation.vector.norm(), deg: error.rotation.angle().to_degrees(), squared }
+        Self {
+            mm: 1e3 * error.translation.vector.norm(),
+            deg: error.rotation.angle().to_degrees(),
+            squared,
+        }
     }
 
     /// Whether the result failed: error above 5 mm or 0.5 degrees, or not finite.

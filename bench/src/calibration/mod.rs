@@ -1,7 +1,8 @@
-//! Accuracy, reported uncertainty, speed and limits of calibration, on simulated measurements with a known truth.
+//! Accuracy, reported uncertainty, speed and limits of calibration, on simulated measurements with
+//! a known truth.
 //!
-//! Corners of a chessboard are computed with normal errors, without rendering. Calibration without a target
-//! ([`CalibrationOptions::rig`]) needs the simulator.
+//! Corners of a chessboard are computed with normal errors, without rendering. Calibration without
+//! a target ([`CalibrationOptions::rig`]) needs the simulator.
 
 mod arm_configurations;
 mod coverage;
@@ -99,19 +100,27 @@ impl CalibrationOptions {
 ///
 /// If the rig cannot be simulated, or the folder cannot be written.
 pub fn run(options: &CalibrationOptions) -> Result<BenchResult> {
-    std::fs::create_dir_all(&options.out).with_context(|| format!("cannot create {}", options.out.display()))?;
+    std::fs::create_dir_all(&options.out)
+        .with_context(|| format!("cannot create {}", options.out.display()))?;
     // Speed before the other measurements, which use all processors.
     let mut results = Results {
         speed: options.measured(Part::Speed, || speed::measure(options.seeds)),
         coverage: options.measured(Part::Coverage, || coverage::measure(options.coverage)),
         stability: options.measured(Part::Stability, || stability::measure(options.seeds)),
-        arm_configurations: options.measured(Part::ArmConfigurations, || arm_configurations::measure(options.seeds)),
+        arm_configurations: options.measured(Part::ArmConfigurations, || {
+            arm_configurations::measure(options.seeds)
+        }),
         rigs: Vec::new(),
     };
-    let rig = options.rig.as_ref().filter(|_| options.parts.contains(&Part::Rigs));
+    let rig = options
+        .rig
+        .as_ref()
+        .filter(|_| options.parts.contains(&Part::Rigs));
     for seed in options.first_rig..options.first_rig + options.rigs {
         let Some(rig) = rig else { break };
-        results.rigs.push(rigs::measure(rig, seed, options.scan_secs)?);
+        results
+            .rigs
+            .push(rigs::measure(rig, seed, options.scan_secs)?);
         log::info!("rig {seed}: {:?}", results.rigs.last());
         // An interrupted bench leaves results.
         write(options, &results)?;
@@ -125,5 +134,9 @@ fn write(options: &CalibrationOptions, results: &Results) -> Result<BenchResult>
     let tables = options.out.join("calibration.md");
     std::fs::write(&tables, pages::markdown(&findings.tables))
         .with_context(|| format!("cannot write {}", tables.display()))?;
-    Ok(BenchResult { findings, page, data_losses: Vec::new() })
+    Ok(BenchResult {
+        findings,
+        page,
+        data_losses: Vec::new(),
+    })
 }

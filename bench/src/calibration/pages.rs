@@ -20,13 +20,22 @@ pub(super) fn findings(options: &CalibrationOptions, results: &Results) -> Findi
         tables.push(coverage_table(&results.coverage));
     }
     if !results.speed.is_empty() {
-        charts.push(("-time", speed_chart(&results.speed, "time, ms", |speed| speed.millis)));
-        charts.push(("-error", speed_chart(&results.speed, "position error, mm", |speed| speed.mm)));
+        charts.push((
+            "-time",
+            speed_chart(&results.speed, "time, ms", |speed| speed.millis),
+        ));
+        charts.push((
+            "-error",
+            speed_chart(&results.speed, "position error, mm", |speed| speed.mm),
+        ));
         tables.push(speed_table(&results.speed));
     }
     if !results.stability.is_empty() {
         charts.extend(stability_charts(&results.stability));
-        tables.extend([limits_table(&results.stability), totals_table(&results.stability)]);
+        tables.extend([
+            limits_table(&results.stability),
+            totals_table(&results.stability),
+        ]);
     }
     if !results.arm_configurations.is_empty() {
         tables.push(arm_configurations_table(results));
@@ -57,35 +66,65 @@ pub(super) fn markdown(tables: &[Table]) -> String {
     let row = |cells: &[String]| format!("| {} |\n", cells.join(" | "));
     let table = |table: &Table| {
         let rows: String = table.rows.iter().map(|cells| row(cells)).collect();
-        format!("## {}\n\n{}{}\n{rows}\n", table.title, row(&table.head), "|---".repeat(table.head.len()) + "|")
+        format!(
+            "## {}\n\n{}{}\n{rows}\n",
+            table.title,
+            row(&table.head),
+            "|---".repeat(table.head.len()) + "|"
+        )
     };
     tables.iter().map(table).collect()
 }
 
 fn axis(label: &str, scale: Scale, ticks: Vec<f64>) -> Axis {
-    Axis { label: label.to_owned(), scale, ticks }
+    Axis {
+        label: label.to_owned(),
+        scale,
+        ticks,
+    }
 }
 
 fn point(x: f64, y: f64) -> Point {
-    Point { x, y, low: y, high: y }
+    Point {
+        x,
+        y,
+        low: y,
+        high: y,
+    }
 }
 
 fn coverage_chart(results: &[Coverage]) -> Chart {
     const LEVELS: [f64; 10] = [10.0, 20.0, 30.0, 40.0, 50.0, 60.0, 70.0, 80.0, 90.0, 95.0];
     let line = |coverage: &Coverage| {
         let observed = |level: f64| {
-            let n = coverage.levels.iter().filter(|own| **own <= 0.01 * level).count();
+            let n = coverage
+                .levels
+                .iter()
+                .filter(|own| **own <= 0.01 * level)
+                .count();
             100.0 * n as f64 / coverage.levels.len().max(1) as f64
         };
         let points = LEVELS.map(|level| point(level, observed(level))).to_vec();
-        Line { label: coverage.name.to_owned(), points, is_peer: false }
+        Line {
+            label: coverage.name.to_owned(),
+            points,
+            is_peer: false,
+        }
     };
-    let ideal = Line { label: "ideal".into(), points: LEVELS.map(|level| point(level, level)).into(), is_peer: true };
+    let ideal = Line {
+        label: "ideal".into(),
+        points: LEVELS.map(|level| point(level, level)).into(),
+        is_peer: true,
+    };
     Chart {
         title: "Coverage of the reported uncertainty".into(),
         subtitle: "fraction of results whose confidence ellipsoid contains the truth".into(),
         x: axis("confidence level, %", Scale::Linear, LEVELS.into()),
-        y: axis("results that contain the truth, %", Scale::Linear, Vec::new()),
+        y: axis(
+            "results that contain the truth, %",
+            Scale::Linear,
+            Vec::new(),
+        ),
         lines: results.iter().map(line).chain([ideal]).collect(),
         thresholds: Vec::new(),
         markers: Vec::new(),
@@ -108,7 +147,13 @@ fn coverage_table(results: &[Coverage]) -> Table {
     };
     Table {
         title: "Coverage of the 95 % ellipsoid".into(),
-        head: words(["calibration", "covered", "median error", "95th percentile", "refused"]),
+        head: words([
+            "calibration",
+            "covered",
+            "median error",
+            "95th percentile",
+            "refused",
+        ]),
         rows: results.iter().map(row).collect(),
     }
 }
@@ -121,9 +166,17 @@ fn speed_chart(results: &[Speed], label: &str, value: fn(&Speed) -> f64) -> Char
     let mut ticks: Vec<f64> = results.iter().map(|speed| speed.n_poses as f64).collect();
     ticks.dedup();
     let line = |method: Method| {
-        let own = results.iter().filter(|speed| speed.method == method.name() && value(speed).is_finite());
-        let points = own.map(|speed| point(speed.n_poses as f64, value(speed))).collect();
-        Line { label: method.name().to_owned(), points, is_peer: matches!(method, Method::ClosedForm(_)) }
+        let own = results
+            .iter()
+            .filter(|speed| speed.method == method.name() && value(speed).is_finite());
+        let points = own
+            .map(|speed| point(speed.n_poses as f64, value(speed)))
+            .collect();
+        Line {
+            label: method.name().to_owned(),
+            points,
+            is_peer: matches!(method, Method::ClosedForm(_)),
+        }
     };
     Chart {
         title: format!("Hand-eye calibration: {label}"),
@@ -188,7 +241,9 @@ fn sweeps() -> [Sweep; 4] {
             label: "outlier corners, %",
             value: |cell| f64::from(cell.condition.outlier_percent),
             is_in: |cell| {
-                has_base_spread(cell) && has_base_poses(cell) && cell.condition.outlier_type == OutlierType::Corners
+                has_base_spread(cell)
+                    && has_base_poses(cell)
+                    && cell.condition.outlier_type == OutlierType::Corners
             },
         },
         Sweep {
@@ -236,7 +291,9 @@ fn limits_table(cells: &[Cell]) -> Table {
     let mut rows = Vec::new();
     for sweep in sweeps() {
         for method in methods() {
-            let own = cells.iter().filter(|cell| (sweep.is_in)(cell) && cell.method == method.name());
+            let own = cells
+                .iter()
+                .filter(|cell| (sweep.is_in)(cell) && cell.method == method.name());
             let level = |cell: &Cell| {
                 let rest = match (cell.n_refused, cell.n_failed) {
                     (0, 0) => "ok".to_owned(),
@@ -247,7 +304,10 @@ fn limits_table(cells: &[Cell]) -> Table {
                 format!("{}: {rest}", (sweep.value)(cell))
             };
             let levels: Vec<String> = own.map(level).collect();
-            rows.push(vec![format!("{}, {}", sweep.label, method.name()), levels.join("; ")]);
+            rows.push(vec![
+                format!("{}, {}", sweep.label, method.name()),
+                levels.join("; "),
+            ]);
         }
     }
     let n_runs = cells.first().map_or(0, |cell| cell.n_runs);
@@ -261,13 +321,24 @@ fn limits_table(cells: &[Cell]) -> Table {
 fn totals_table(cells: &[Cell]) -> Table {
     let row = |method: Method| {
         let sum = |value: fn(&Cell) -> usize| -> usize {
-            cells.iter().filter(|cell| cell.method == method.name()).map(value).sum()
+            cells
+                .iter()
+                .filter(|cell| cell.method == method.name())
+                .map(value)
+                .sum()
         };
         let n_runs = sum(|cell| cell.n_runs);
-        let [refused, failed, outside_region] =
-            [sum(|cell| cell.n_refused), sum(|cell| cell.n_failed), sum(|cell| cell.n_failed_outside_region)];
+        let [refused, failed, outside_region] = [
+            sum(|cell| cell.n_refused),
+            sum(|cell| cell.n_failed),
+            sum(|cell| cell.n_failed_outside_region),
+        ];
         let has_uncertainty = !matches!(method, Method::ClosedForm(_));
-        let outside_region = if has_uncertainty { outside_region.to_string() } else { "not reported".into() };
+        let outside_region = if has_uncertainty {
+            outside_region.to_string()
+        } else {
+            "not reported".into()
+        };
         vec![
             method.name().to_owned(),
             n_runs.to_string(),
@@ -292,14 +363,21 @@ fn totals_table(cells: &[Cell]) -> Table {
 }
 
 fn arm_configurations_table(results: &Results) -> Table {
-    let percent = |frac: Option<f64>| frac.map_or("-".to_owned(), |frac| format!("{:.0} %", 100.0 * frac));
-    let number = |value: Option<f64>, digits: usize| value.map_or("-".to_owned(), |value| format!("{value:.digits$}"));
+    let percent =
+        |frac: Option<f64>| frac.map_or("-".to_owned(), |frac| format!("{:.0} %", 100.0 * frac));
+    let number = |value: Option<f64>, digits: usize| {
+        value.map_or("-".to_owned(), |value| format!("{value:.digits$}"))
+    };
     let row = |configuration: &super::ArmConfiguration| {
         vec![
             format!(
                 "{} degrees, {}",
                 configuration.angle_deg,
-                if configuration.estimates_joints { "offsets estimated" } else { "offsets ignored" }
+                if configuration.estimates_joints {
+                    "offsets estimated"
+                } else {
+                    "offsets ignored"
+                }
             ),
             number(configuration.mm, 2),
             number(configuration.deg, 3),
@@ -310,7 +388,8 @@ fn arm_configurations_table(results: &Results) -> Table {
         ]
     };
     Table {
-        title: "Distance of joint 6 from the wrist singularity, with joint offsets of 4 mrad".into(),
+        title: "Distance of joint 6 from the wrist singularity, with joint offsets of 4 mrad"
+            .into(),
         head: words([
             "arm configuration",
             "mm",
@@ -327,13 +406,24 @@ fn arm_configurations_table(results: &Results) -> Table {
 fn rigs_chart(results: &Results) -> Chart {
     const GOAL_MM: f64 = 0.2;
     let line = |label: &str, value: &dyn Fn(&super::RigResult) -> Option<f64>| {
-        let points = results.rigs.iter().filter_map(|rig| Some(point(rig.seed as f64, value(rig)?)));
-        Line { label: label.to_owned(), points: points.collect(), is_peer: label != "error" }
+        let points = results
+            .rigs
+            .iter()
+            .filter_map(|rig| Some(point(rig.seed as f64, value(rig)?)));
+        Line {
+            label: label.to_owned(),
+            points: points.collect(),
+            is_peer: label != "error",
+        }
     };
     Chart {
         title: "Calibration without a target: position error".into(),
         subtitle: "hand-eye wrong by 3 degrees and 20 mm in random directions".into(),
-        x: axis("rig", Scale::Levels(results.rigs.iter().map(|rig| rig.seed as f64).collect()), Vec::new()),
+        x: axis(
+            "rig",
+            Scale::Levels(results.rigs.iter().map(|rig| rig.seed as f64).collect()),
+            Vec::new(),
+        ),
         y: axis("mm", Scale::Log, Vec::new()),
         lines: vec![
             line("error", &|rig| rig.errors.map(|errors| errors.mm)),
@@ -345,7 +435,9 @@ fn rigs_chart(results: &Results) -> Chart {
 }
 
 fn rigs_table(results: &Results) -> Table {
-    let number = |value: Option<f64>, digits: usize| value.map_or("-".to_owned(), |value| format!("{value:.digits$}"));
+    let number = |value: Option<f64>, digits: usize| {
+        value.map_or("-".to_owned(), |value| format!("{value:.digits$}"))
+    };
     let row = |rig: &super::RigResult| {
         vec![
             rig.seed.to_string(),
@@ -360,7 +452,16 @@ fn rigs_table(results: &Results) -> Table {
     };
     Table {
         title: "Calibration without a target".into(),
-        head: words(["rig", "images", "mm", "sigma, mm", "degrees", "sigma, degrees", "s", "goal reached"]),
+        head: words([
+            "rig",
+            "images",
+            "mm",
+            "sigma, mm",
+            "degrees",
+            "sigma, degrees",
+            "s",
+            "goal reached",
+        ]),
         rows: results.rigs.iter().map(row).collect(),
     }
 }
@@ -371,7 +472,14 @@ mod tests {
 
     #[test]
     fn tables_are_markdown() {
-        let table = Table { title: "Sizes".into(), head: words(["a", "b"]), rows: vec![words(["1", "2"])] };
-        assert_eq!(markdown(&[table]), "## Sizes\n\n| a | b |\n|---|---|\n| 1 | 2 |\n\n");
+        let table = Table {
+            title: "Sizes".into(),
+            head: words(["a", "b"]),
+            rows: vec![words(["1", "2"])],
+        };
+        assert_eq!(
+            markdown(&[table]),
+            "## Sizes\n\n| a | b |\n|---|---|\n| 1 | 2 |\n\n"
+        );
     }
 }

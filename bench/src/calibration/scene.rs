@@ -31,7 +31,13 @@ pub(super) struct Noise {
 }
 
 pub(super) fn intrinsics(lens: Lens) -> Intrinsics {
-    Intrinsics { size_px: [1280, 720], focal_px: [900.0, 905.0], principal_px: [643.0, 358.0], lens, rectified: false }
+    Intrinsics {
+        size_px: [1280, 720],
+        focal_px: [900.0, 905.0],
+        principal_px: [643.0, 358.0],
+        lens,
+        rectified: false,
+    }
 }
 
 /// The lens of hand-eye scenes.
@@ -40,7 +46,8 @@ pub(super) fn brown_conrady() -> Lens {
 }
 
 fn corners() -> impl Iterator<Item = Vector3<f64>> {
-    let at = |row: u32, column: u32| Vector3::new(f64::from(column), f64::from(row), 0.0) * SQUARE_M;
+    let at =
+        |row: u32, column: u32| Vector3::new(f64::from(column), f64::from(row), 0.0) * SQUARE_M;
     (0..ROWS).flat_map(move |row| (0..COLUMNS).map(move |column| at(row, column)))
 }
 
@@ -49,7 +56,11 @@ fn normal_vector(random: &mut Random, scale: f64) -> Vector3<f64> {
 }
 
 /// A pose from which the whole board is visible: rotated about a random axis by a normal angle.
-pub(super) fn camera_from_board(intrinsics: &Intrinsics, spread_rad: f64, random: &mut Random) -> Transform {
+pub(super) fn camera_from_board(
+    intrinsics: &Intrinsics,
+    spread_rad: f64,
+    random: &mut Random,
+) -> Transform {
     const MAX_TILT_RAD: f64 = 1.0;
     let center = Vector3::new(f64::from(COLUMNS - 1), f64::from(ROWS - 1), 0.0) * (0.5 * SQUARE_M);
     let mut pose = Transform::identity();
@@ -68,27 +79,50 @@ pub(super) fn camera_from_board(intrinsics: &Intrinsics, spread_rad: f64, random
 }
 
 /// The corners inside the image, with normal errors.
-pub(super) fn view(intrinsics: &Intrinsics, pose: &Transform, noise_px: f64, random: &mut Random) -> BoardView {
+pub(super) fn view(
+    intrinsics: &Intrinsics,
+    pose: &Transform,
+    noise_px: f64,
+    random: &mut Random,
+) -> BoardView {
     let point = |point_in_board: Vector3<f64>| {
         let pixel = intrinsics.project(&(pose * Point3::from(point_in_board)).coords)?;
-        let pixel = if noise_px > 0.0 { pixel.map(|value| value + noise_px * random.normal()) } else { pixel };
-        intrinsics.contains(pixel).then_some(BoardPoint { point_in_board, pixel })
+        let pixel = if noise_px > 0.0 {
+            pixel.map(|value| value + noise_px * random.normal())
+        } else {
+            pixel
+        };
+        intrinsics.contains(pixel).then_some(BoardPoint {
+            point_in_board,
+            pixel,
+        })
     };
-    BoardView { name: String::new(), points: corners().filter_map(point).collect() }
+    BoardView {
+        name: String::new(),
+        points: corners().filter_map(point).collect(),
+    }
 }
 
 impl Scene {
     /// `spread_rad`: standard deviation of the rotation of the flange about each axis.
     pub(super) fn new(n_poses: usize, spread_rad: f64, seed: u64) -> Self {
         let mut random = Random::new(seed);
-        let flange_from_camera = Transform::new(Vector3::new(0.05, -0.03, 0.08), Vector3::new(0.1, -0.2, 1.6));
-        let base_from_board = Transform::new(Vector3::new(0.6, 0.1, 0.02), Vector3::new(3.0, 0.1, -0.2));
+        let flange_from_camera = Transform::new(
+            Vector3::new(0.05, -0.03, 0.08),
+            Vector3::new(0.1, -0.2, 1.6),
+        );
+        let base_from_board =
+            Transform::new(Vector3::new(0.6, 0.1, 0.02), Vector3::new(3.0, 0.1, -0.2));
         let lens = intrinsics(brown_conrady());
         let base_from_flange = (0..n_poses).map(|_| {
             let pose = camera_from_board(&lens, spread_rad, &mut random);
             base_from_board * pose.inverse() * flange_from_camera.inverse()
         });
-        Self { flange_from_camera, base_from_board, base_from_flange: base_from_flange.collect() }
+        Self {
+            flange_from_camera,
+            base_from_board,
+            base_from_flange: base_from_flange.collect(),
+        }
     }
 
     /// Measured robot poses and corners.
@@ -96,30 +130,55 @@ impl Scene {
         let mut random = Random::new(seed ^ 0x5eed_0000);
         let lens = intrinsics(brown_conrady());
         let mut sample = |(ix, pose): (usize, &Transform)| {
-            let error =
-                Transform::new(normal_vector(&mut random, noise.robot_m), normal_vector(&mut random, noise.robot_rad));
-            let camera_from_board = (pose * self.flange_from_camera).inverse() * self.base_from_board;
-            let board = BoardObservation::View(view(&lens, &camera_from_board, noise.corner_px, &mut random));
-            HandEyeSample { name: format!("{ix}"), base_from_flange: pose * error, board, joints: None }
+            let error = Transform::new(
+                normal_vector(&mut random, noise.robot_m),
+                normal_vector(&mut random, noise.robot_rad),
+            );
+            let camera_from_board =
+                (pose * self.flange_from_camera).inverse() * self.base_from_board;
+            let board = BoardObservation::View(view(
+                &lens,
+                &camera_from_board,
+                noise.corner_px,
+                &mut random,
+            ));
+            HandEyeSample {
+                name: format!("{ix}"),
+                base_from_flange: pose * error,
+                board,
+                joints: None,
+            }
         };
-        self.base_from_flange.iter().enumerate().map(&mut sample).collect()
+        self.base_from_flange
+            .iter()
+            .enumerate()
+            .map(&mut sample)
+            .collect()
     }
 }
 
-/// The samples with the poses of the board instead of its corners. Samples without a pose are left out.
+/// The samples with the poses of the board instead of its corners. Samples without a pose are left
+/// out.
 pub(super) fn with_board_poses(samples: &[HandEyeSample]) -> Vec<HandEyeSample> {
     let lens = intrinsics(brown_conrady());
     let pose = |sample: &HandEyeSample| {
-        let BoardObservation::View(view) = &sample.board else { return Some(sample.clone()) };
+        let BoardObservation::View(view) = &sample.board else {
+            return Some(sample.clone());
+        };
         let board = BoardObservation::Pose(board_pose(&lens, &view.points)?.camera_from_board);
-        Some(HandEyeSample { board, ..sample.clone() })
+        Some(HandEyeSample {
+            board,
+            ..sample.clone()
+        })
     };
     samples.iter().filter_map(pose).collect()
 }
 
 /// Input for these samples.
 pub(super) fn input(samples: Vec<HandEyeSample>, options: HandEyeOptions) -> HandEyeInput<'static> {
-    let has_corners = samples.iter().any(|sample| matches!(sample.board, BoardObservation::View(_)));
+    let has_corners = samples
+        .iter()
+        .any(|sample| matches!(sample.board, BoardObservation::View(_)));
     HandEyeInput {
         setup: Setup::EyeInHand,
         samples,

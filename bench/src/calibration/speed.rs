@@ -8,7 +8,11 @@ use std::time::Instant;
 
 const N_POSES: [usize; 5] = [10, 20, 50, 100, 200];
 const SPREAD_RAD: f64 = 0.4;
-const NOISE: Noise = Noise { corner_px: 0.1, robot_rad: 1e-4, robot_m: 1e-4 };
+const NOISE: Noise = Noise {
+    corner_px: 0.1,
+    robot_rad: 1e-4,
+    robot_m: 1e-4,
+};
 
 /// Medians over the seeds for one method and number of poses.
 #[derive(Clone, Debug, Serialize)]
@@ -25,7 +29,9 @@ pub(super) struct Speed {
 pub(super) fn measure(n_seeds: u64) -> Vec<Speed> {
     let mut results = Vec::new();
     for n_poses in N_POSES {
-        let scenes: Vec<Scene> = (0..n_seeds).map(|seed| Scene::new(n_poses, SPREAD_RAD, 3000 + seed)).collect();
+        let scenes: Vec<Scene> = (0..n_seeds)
+            .map(|seed| Scene::new(n_poses, SPREAD_RAD, 3000 + seed))
+            .collect();
         for method in Method::ALL {
             let (mut millis, mut mm, mut deg) = (Vec::new(), Vec::new(), Vec::new());
             for (seed, scene) in (0..).zip(&scenes) {
@@ -38,8 +44,15 @@ pub(super) fn measure(n_seeds: u64) -> Vec<Speed> {
                     deg.push(errors.deg);
                 }
             }
-            let [millis, mm, deg] = [millis, mm, deg].map(|values| median(&values).unwrap_or(f64::NAN));
-            results.push(Speed { method: method.name(), n_poses, millis, mm, deg });
+            let [millis, mm, deg] =
+                [millis, mm, deg].map(|values| median(&values).unwrap_or(f64::NAN));
+            results.push(Speed {
+                method: method.name(),
+                n_poses,
+                millis,
+                mm,
+                deg,
+            });
         }
     }
     results

@@ -12,7 +12,11 @@ use serde::Serialize;
 const SPREADS_DEG: [f64; 6] = [2.0, 5.0, 10.0, 20.0, 40.0, 90.0];
 const POSES: [usize; 6] = [3, 5, 8, 12, 20, 40];
 const OUTLIER_PERCENT: [u32; 5] = [0, 10, 20, 30, 40];
-const NOISE: Noise = Noise { corner_px: 0.2, robot_rad: 3e-4, robot_m: 3e-4 };
+const NOISE: Noise = Noise {
+    corner_px: 0.2,
+    robot_rad: 3e-4,
+    robot_m: 3e-4,
+};
 
 /// Measurements that become outliers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
@@ -50,7 +54,9 @@ pub(super) struct Cell {
 
 /// The compared methods. The lens is known.
 pub(super) fn methods() -> impl Iterator<Item = Method> {
-    Method::ALL.into_iter().filter(|method| *method != Method::BundleAdjustmentWithLens)
+    Method::ALL
+        .into_iter()
+        .filter(|method| *method != Method::BundleAdjustmentWithLens)
 }
 
 /// Measures every combination with `n_seeds` scenes.
@@ -62,29 +68,46 @@ pub(super) fn measure(n_seeds: u64) -> Vec<Cell> {
                 for outlier_percent in OUTLIER_PERCENT {
                     // Without outliers, the outlier type has no effect.
                     if outlier_percent > 0 || outlier_type == OutlierType::Corners {
-                        conditions.push(Condition { spread_deg, n_poses, outlier_type, outlier_percent });
+                        conditions.push(Condition {
+                            spread_deg,
+                            n_poses,
+                            outlier_type,
+                            outlier_percent,
+                        });
                     }
                 }
             }
         }
     }
-    conditions.par_iter().flat_map_iter(|condition| cells(*condition, n_seeds)).collect()
+    conditions
+        .par_iter()
+        .flat_map_iter(|condition| cells(*condition, n_seeds))
+        .collect()
 }
 
 fn cells(condition: Condition, n_seeds: u64) -> Vec<Cell> {
     let runs: Vec<(Scene, Vec<HandEyeSample>)> = (0..n_seeds)
         .into_par_iter()
         .map(|seed| {
-            let scene = Scene::new(condition.n_poses, condition.spread_deg.to_radians(), 5000 + seed);
+            let scene = Scene::new(
+                condition.n_poses,
+                condition.spread_deg.to_radians(),
+                5000 + seed,
+            );
             let mut samples = scene.samples(NOISE, seed);
             condition.add_outliers(&mut samples, seed);
             (scene, samples)
         })
         .collect();
     let cell = |method: Method| {
-        let calibrate =
-            |(scene, samples): &(Scene, Vec<HandEyeSample>)| method.calibrate(samples, &scene.flange_from_camera);
-        Cell::of(condition, method, &runs.iter().map(calibrate).collect::<Vec<_>>())
+        let calibrate = |(scene, samples): &(Scene, Vec<HandEyeSample>)| {
+            method.calibrate(samples, &scene.flange_from_camera)
+        };
+        Cell::of(
+            condition,
+            method,
+            &runs.iter().map(calibrate).collect::<Vec<_>>(),
+        )
     };
     methods().map(cell).collect()
 }
@@ -97,7 +120,9 @@ impl Condition {
         match self.outlier_type {
             OutlierType::Corners => {
                 for sample in samples {
-                    let BoardObservation::View(view) = &mut sample.board else { continue };
+                    let BoardObservation::View(view) = &mut sample.board else {
+                        continue;
+                    };
                     let n = n_outliers(view.points.len());
                     random.shuffle(&mut view.points);
                     for point in &mut view.points[..n] {
@@ -123,7 +148,9 @@ impl Cell {
         const MAX_SQUARED: f64 = 27.86;
         let solved: Vec<_> = outcomes.iter().filter_map(Outcome::errors).collect();
         let failed = solved.iter().filter(|errors| errors.has_failed());
-        let column = |value: fn(&super::method::Errors) -> f64| median(&solved.iter().map(value).collect::<Vec<_>>());
+        let column = |value: fn(&super::method::Errors) -> f64| {
+            median(&solved.iter().map(value).collect::<Vec<_>>())
+        };
         Self {
             condition,
             method: method.name(),

@@ -1,5 +1,5 @@
-//! Where an arm moves to calibrate its camera: first small rotations about the target, then poses by information gain,
-//! until the result is accurate.
+//! Where an arm moves to calibrate its camera: first small rotations about the target, then poses
+//! by information gain, until the result is accurate.
 
 use super::next_poses::{NextPoseOptions, suggest_next_poses};
 use super::planar_pose;
@@ -15,7 +15,8 @@ use std::collections::VecDeque;
 pub struct ArmPlanOptions {
     /// Maximum number of poses at which the target is seen.
     pub max_poses: usize,
-    /// Standard deviation of the position along each axis at which the result is accurate, millimeters.
+    /// Standard deviation of the position along each axis at which the result is accurate,
+    /// millimeters.
     pub goal_mm: f64,
     /// The same of the rotation, degrees.
     pub goal_deg: f64,
@@ -23,12 +24,12 @@ pub struct ArmPlanOptions {
 
 /// Minimum number of poses: standard deviations from fewer are not reliable.
 pub const MIN_POSES: usize = 10;
-/// Number of poses in a row without the target after which the plan ends. Larger than the six rotations about the target,
-/// all of which fail if the given camera pose is wrong.
+/// Number of poses in a row without the target after which the plan ends. Larger than the six
+/// rotations about the target, all of which fail if the given camera pose is wrong.
 const MAX_UNSEEN: usize = 8;
 
-/// Standard deviation of the position up to which an estimate selects poses, as long as small rotations remain,
-/// millimeters.
+/// Standard deviation of the position up to which an estimate selects poses, as long as small
+/// rotations remain, millimeters.
 const MAX_EARLY_SIGMA_MM: f64 = 20.0;
 
 /// What an arm does next.
@@ -59,10 +60,17 @@ pub struct FirstView<'a> {
 }
 
 impl FirstView<'_> {
-    /// Distance of a point of the board from the camera, meters. `None` if the view does not determine it.
+    /// Distance of a point of the board from the camera, meters. `None` if the view does not
+    /// determine it.
     pub fn distance_m(&self, point_in_board: &Vector3<f64>) -> Option<f64> {
-        let pose = planar_pose::board_poses(self.view, self.intrinsics).into_iter().next()?;
-        Some((pose.camera_from_board * Point3::from(*point_in_board)).coords.norm())
+        let pose = planar_pose::board_poses(self.view, self.intrinsics)
+            .into_iter()
+            .next()?;
+        Some(
+            (pose.camera_from_board * Point3::from(*point_in_board))
+                .coords
+                .norm(),
+        )
     }
 }
 
@@ -81,8 +89,8 @@ pub struct ArmPlan<'a> {
 impl<'a> ArmPlan<'a> {
     /// Plans motions around the configuration at which the target is seen.
     ///
-    /// * `poses`: the board's size and the visibility limits for [`suggest_next_poses`]; `n_poses`, `reach` and `seed` are
-    ///   ignored.
+    /// * `poses`: the board's size and the visibility limits for [`suggest_next_poses`]; `n_poses`,
+    ///   `reach` and `seed` are ignored.
     pub fn new(
         reach: &Reach<'a>,
         poses: &NextPoseOptions<'a>,
@@ -91,7 +99,10 @@ impl<'a> ArmPlan<'a> {
     ) -> Self {
         Self {
             reach: *reach,
-            poses: NextPoseOptions { n_poses: 1, ..*poses },
+            poses: NextPoseOptions {
+                n_poses: 1,
+                ..*poses
+            },
             options: *options,
             first: first_poses(reach, first, &poses.center_in_board),
             n_unseen: 0,
@@ -99,9 +110,15 @@ impl<'a> ArmPlan<'a> {
         }
     }
 
-    /// Options of the calibrations during the plan: they may be uncertain, and joint offsets need more poses.
+    /// Options of the calibrations during the plan: they may be uncertain, and joint offsets need
+    /// more poses.
     pub fn estimate_options(options: &HandEyeOptions) -> HandEyeOptions {
-        HandEyeOptions { estimate_joint_offsets: false, max_sigma_m: 0.1, max_sigma_rad: 0.1, ..*options }
+        HandEyeOptions {
+            estimate_joint_offsets: false,
+            max_sigma_m: 0.1,
+            max_sigma_rad: 0.1,
+            ..*options
+        }
     }
 
     /// Records that the target was not seen at the last pose.
@@ -129,7 +146,10 @@ impl<'a> ArmPlan<'a> {
         if let Ok(calibration) = estimate {
             let sigma_mm = calibration.sigma_mm.into_iter().fold(0.0, f64::max);
             let sigma_deg = calibration.sigma_deg.into_iter().fold(0.0, f64::max);
-            if n >= MIN_POSES && sigma_mm <= self.options.goal_mm && sigma_deg <= self.options.goal_deg {
+            if n >= MIN_POSES
+                && sigma_mm <= self.options.goal_mm
+                && sigma_deg <= self.options.goal_deg
+            {
                 return ArmStep::Finished(format!(
                     "the standard deviations are at most {sigma_mm:.2} mm and {sigma_deg:.3} degrees"
                 ));
@@ -139,10 +159,18 @@ impl<'a> ArmPlan<'a> {
             return ArmStep::Finished(format!("the target was seen at {n} poses, the maximum"));
         }
         if self.n_unseen >= MAX_UNSEEN {
-            return ArmStep::Finished(format!("the target was not seen at the last {MAX_UNSEEN} poses"));
+            return ArmStep::Finished(format!(
+                "the target was not seen at the last {MAX_UNSEEN} poses"
+            ));
         }
-        // A few small rotations first: with fewer samples, or a large uncertainty, an estimate may be far off.
-        let is_uncertain = |found: &HandEyeCalibration| found.sigma_mm.iter().any(|sigma| *sigma > MAX_EARLY_SIGMA_MM);
+        // A few small rotations first: with fewer samples, or a large uncertainty, an estimate may
+        // be far off.
+        let is_uncertain = |found: &HandEyeCalibration| {
+            found
+                .sigma_mm
+                .iter()
+                .any(|sigma| *sigma > MAX_EARLY_SIGMA_MM)
+        };
         if n < 5 || estimate.as_ref().map_or(true, |found| is_uncertain(found)) {
             while let Some((pose, purpose)) = self.first.pop_front() {
                 if let Some(joints) = self.reach.joints_for(&pose, current) {
@@ -152,11 +180,20 @@ impl<'a> ArmPlan<'a> {
         }
         let calibration = match estimate {
             Ok(calibration) => calibration,
-            Err(error) => return ArmStep::Finished(format!("small rotations of the flange give no estimate: {error}")),
+            Err(error) => {
+                return ArmStep::Finished(format!(
+                    "small rotations of the flange give no estimate: {error}"
+                ));
+            }
         };
-        // Another seed each time, so that a pose at which the target was not seen is not suggested again.
+        // Another seed each time, so that a pose at which the target was not seen is not suggested
+        // again.
         self.n_refined += 1;
-        let options = NextPoseOptions { reach: Some((self.reach, current)), seed: self.n_refined as u64, ..self.poses };
+        let options = NextPoseOptions {
+            reach: Some((self.reach, current)),
+            seed: self.n_refined as u64,
+            ..self.poses
+        };
         match suggest_next_poses(input, calibration, &options).pop() {
             Some(next) => match next.joints {
                 Some(joints) => ArmStep::Move { joints, purpose: next.relation },
@@ -169,8 +206,9 @@ impl<'a> ArmPlan<'a> {
     }
 }
 
-/// Rotations about the center of the target according to the approximate pose of the camera, which keep the target in
-/// view. If that pose is far off, the target leaves the view; therefore, small rotations about the flange follow.
+/// Rotations about the center of the target according to the approximate pose of the camera, which
+/// keep the target in view. If that pose is far off, the target leaves the view; therefore, small
+/// rotations about the flange follow.
 fn first_poses(
     reach: &Reach<'_>,
     first: &FirstView<'_>,
@@ -179,11 +217,26 @@ fn first_poses(
     /// Rotation about the target, and about the flange, degrees.
     const ABOUT_TARGET_DEG: f64 = 15.0;
     const ABOUT_FLANGE_DEG: [f64; 2] = [6.0, 10.0];
-    const DIRECTIONS: [(f64, usize); 6] = [(1.0, 0), (1.0, 1), (1.0, 2), (-1.0, 0), (-1.0, 1), (-1.0, 2)];
-    let Ok(start) = reach.chain.forward(reach.start) else { return VecDeque::new() };
-    let unit = |(sign, axis): (f64, usize)| Vector3::from_fn(|row, _| if row == axis { sign } else { 0.0 });
+    const DIRECTIONS: [(f64, usize); 6] = [
+        (1.0, 0),
+        (1.0, 1),
+        (1.0, 2),
+        (-1.0, 0),
+        (-1.0, 1),
+        (-1.0, 2),
+    ];
+    let Ok(start) = reach.chain.forward(reach.start) else {
+        return VecDeque::new();
+    };
+    let unit = |(sign, axis): (f64, usize)| {
+        Vector3::from_fn(|row, _| if row == axis { sign } else { 0.0 })
+    };
     let name = |verb: &str, (sign, axis): (f64, usize), degrees: f64, body: &str| {
-        format!("{verb} by {:.0} degrees about the {body}'s {} axis", sign * degrees, ["x", "y", "z"][axis])
+        format!(
+            "{verb} by {:.0} degrees about the {body}'s {} axis",
+            sign * degrees,
+            ["x", "y", "z"][axis]
+        )
     };
     let mut poses = VecDeque::new();
     if let Some(board) = planar_pose::board_poses(first.view, first.intrinsics).first() {
@@ -191,18 +244,25 @@ fn first_poses(
             Setup::EyeInHand => start * first.parent_from_camera,
             Setup::EyeToHand => *first.parent_from_camera,
         };
-        let center = (base_from_camera * board.camera_from_board * Point3::from(*center_in_board)).coords;
+        let center =
+            (base_from_camera * board.camera_from_board * Point3::from(*center_in_board)).coords;
         poses.extend(DIRECTIONS.map(|direction| {
             let axis = base_from_camera.rotation * unit(direction);
             let rotation = UnitQuaternion::from_scaled_axis(axis * ABOUT_TARGET_DEG.to_radians());
             let about_center = Transform::from_parts((center - rotation * center).into(), rotation);
-            (about_center * start, name("orbit the target", direction, ABOUT_TARGET_DEG, "camera"))
+            (
+                about_center * start,
+                name("orbit the target", direction, ABOUT_TARGET_DEG, "camera"),
+            )
         }));
     }
     for degrees in ABOUT_FLANGE_DEG {
         poses.extend(DIRECTIONS.map(|direction| {
             let rotation = Transform::new(Vector3::zeros(), unit(direction) * degrees.to_radians());
-            (start * rotation, name("rotate the flange", direction, degrees, "flange"))
+            (
+                start * rotation,
+                name("rotate the flange", direction, degrees, "flange"),
+            )
         }));
     }
     poses
@@ -219,7 +279,8 @@ mod tests {
     const PANDA: &str = include_str!("../../../rigs/robots/panda.urdf");
     const START: [f64; 7] = [0.0, -0.3, 0.0, -2.2, 0.0, 2.2, 0.8];
 
-    /// Runs a plan with simulated corners. Returns the samples, the end, and whether each configuration was allowed.
+    /// Runs a plan with simulated corners. Returns the samples, the end, and whether each
+    /// configuration was allowed.
     fn run(
         setup: Setup,
         options: &ArmPlanOptions,
@@ -233,11 +294,20 @@ mod tests {
         let (x, y) = (scene.parent_from_camera, scene.parent_from_board);
         let camera_from_board = scene.camera_from_board(&scene.base_from_flange[0]);
         let camera_from_board_at = |base_from_flange: &Transform| match setup {
-            Setup::EyeInHand => x.inverse() * base_from_flange.inverse() * (start * x * camera_from_board),
-            Setup::EyeToHand => camera_from_board * y.inverse() * start.inverse() * base_from_flange * y,
+            Setup::EyeInHand => {
+                x.inverse() * base_from_flange.inverse() * (start * x * camera_from_board)
+            }
+            Setup::EyeToHand => {
+                camera_from_board * y.inverse() * start.inverse() * base_from_flange * y
+            }
         };
         let intrinsics = scene::intrinsics();
-        let reach = Reach { chain: &chain, start: &START, max_joint_change: 0.8, max_distance_m: 0.3 };
+        let reach = Reach {
+            chain: &chain,
+            start: &START,
+            max_joint_change: 0.8,
+            max_distance_m: 0.3,
+        };
         let half = |n: u32| 0.5 * f64::from(n - 1) * SQUARE_M;
         let poses = NextPoseOptions {
             n_poses: 1,
@@ -255,31 +325,47 @@ mod tests {
             let base_from_flange = chain.forward(&joints).expect("a configuration");
             let view = scene::view(&camera_from_board_at(&base_from_flange), 0.1, &mut random);
             let is_inside = |point: &crate::BoardPoint| {
-                (0..2).all(|axis| (0.0..f64::from(intrinsics.size_px[axis])).contains(&point.pixel[axis]))
+                (0..2).all(|axis| {
+                    (0.0..f64::from(intrinsics.size_px[axis])).contains(&point.pixel[axis])
+                })
             };
             let is_seen = view.points.iter().all(is_inside) && !is_hidden(step_ix);
             let plan = plan.get_or_insert_with(|| {
                 let parent_from_camera = &(x * given);
-                let first = FirstView { setup, view: &view, intrinsics: &intrinsics, parent_from_camera };
+                let first = FirstView {
+                    setup,
+                    view: &view,
+                    intrinsics: &intrinsics,
+                    parent_from_camera,
+                };
                 ArmPlan::new(&reach, &poses, options, &first)
             });
             let board = BoardObservation::View(view);
             if is_seen {
                 let name = step_ix.to_string();
-                samples.push(HandEyeSample { name, base_from_flange, board, joints: Some(joints.clone()) });
+                samples.push(HandEyeSample {
+                    name,
+                    base_from_flange,
+                    board,
+                    joints: Some(joints.clone()),
+                });
                 plan.seen();
             } else {
                 plan.unseen();
             }
             let wide = ArmPlan::estimate_options(&HandEyeOptions::default());
             let mut input = scene.input(samples.clone());
-            (input.intrinsics, input.chain, input.options) = (Some(intrinsics.clone()), Some(&chain), wide);
+            (input.intrinsics, input.chain, input.options) =
+                (Some(intrinsics.clone()), Some(&chain), wide);
             let estimate = calibrate_hand_eye(&input);
             match plan.next(&input, estimate.as_ref(), &joints) {
                 ArmStep::Move { joints: next, .. } => {
                     let limits = chain.limits().iter().zip(&next).zip(&START);
                     for ((limit, joint), start) in limits {
-                        assert!((limit.lower..=limit.upper).contains(joint) && (joint - start).abs() <= 0.8);
+                        assert!(
+                            (limit.lower..=limit.upper).contains(joint)
+                                && (joint - start).abs() <= 0.8
+                        );
                     }
                     joints = next;
                 }
@@ -291,9 +377,16 @@ mod tests {
 
     #[test]
     fn plan_reaches_the_goal_from_a_single_view() {
-        let options = ArmPlanOptions { max_poses: 30, goal_mm: 0.3, goal_deg: 0.05 };
+        let options = ArmPlanOptions {
+            max_poses: 30,
+            goal_mm: 0.3,
+            goal_deg: 0.05,
+        };
         // A given pose that is wrong by 4 degrees and 30 mm, and one that is useless.
-        let wrong = Transform::new(Vector3::new(0.02, -0.02, 0.01), Vector3::new(0.04, 0.05, -0.03));
+        let wrong = Transform::new(
+            Vector3::new(0.02, -0.02, 0.01),
+            Vector3::new(0.04, 0.05, -0.03),
+        );
         let useless = Transform::new(Vector3::new(0.1, 0.0, -0.1), Vector3::new(1.0, 1.5, 0.5));
         for (setup, given) in [
             (Setup::EyeInHand, wrong),
@@ -302,21 +395,40 @@ mod tests {
             (Setup::EyeToHand, useless),
         ] {
             let (samples, why) = run(setup, &options, &given, |_| false);
-            assert!(why.starts_with("the standard deviations are at most"), "{setup:?}: {why}");
-            assert!((MIN_POSES..30).contains(&samples.len()), "{setup:?}: {} poses", samples.len());
+            assert!(
+                why.starts_with("the standard deviations are at most"),
+                "{setup:?}: {why}"
+            );
+            assert!(
+                (MIN_POSES..30).contains(&samples.len()),
+                "{setup:?}: {} poses",
+                samples.len()
+            );
         }
     }
 
     #[test]
     fn plan_ends_at_the_maximum_and_without_the_target() {
-        let strict = ArmPlanOptions { max_poses: 8, goal_mm: 1e-6, goal_deg: 1e-6 };
-        let run = |is_hidden: &dyn Fn(usize) -> bool| run(Setup::EyeInHand, &strict, &Transform::identity(), is_hidden);
+        let strict = ArmPlanOptions {
+            max_poses: 8,
+            goal_mm: 1e-6,
+            goal_deg: 1e-6,
+        };
+        let run = |is_hidden: &dyn Fn(usize) -> bool| {
+            run(Setup::EyeInHand, &strict, &Transform::identity(), is_hidden)
+        };
         let (samples, why) = run(&|_| false);
-        assert_eq!((samples.len(), why.as_str()), (8, "the target was seen at 8 poses, the maximum"));
+        assert_eq!(
+            (samples.len(), why.as_str()),
+            (8, "the target was seen at 8 poses, the maximum")
+        );
         // Single poses without the target are skipped.
         let (samples, why) = run(&|step_ix| step_ix % 3 == 1);
         assert_eq!(samples.len(), 8, "{why}");
         let (samples, why) = run(&|step_ix| step_ix > 0);
-        assert!(samples.len() == 1 && why == "the target was not seen at the last 8 poses", "{why}");
+        assert!(
+            samples.len() == 1 && why == "the target was not seen at the last 8 poses",
+            "{why}"
+        );
     }
 }

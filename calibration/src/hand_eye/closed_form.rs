@@ -1,10 +1,12 @@
 //! Closed-form solutions of `a x = x b`: Park and Martin 1994, Daniilidis 1999, Tsai and Lenz 1989.
 //!
-//! `a` is the motion of the flange between two samples, `b` the motion of the camera, and `x` is `flange_from_camera`.
+//! `a` is the motion of the flange between two samples, `b` the motion of the camera, and `x` is
+//! `flange_from_camera`.
 
 use kinematics::Transform;
 use nalgebra::{
-    DMatrix, DVector, Matrix3, Quaternion, Rotation3, SMatrix, SymmetricEigen, Translation3, UnitQuaternion, Vector3,
+    DMatrix, DVector, Matrix3, Quaternion, Rotation3, SMatrix, SymmetricEigen, Translation3,
+    UnitQuaternion, Vector3,
 };
 
 /// Motions with a smaller rotation, in radians, have no usable rotation axis.
@@ -16,7 +18,8 @@ const MAX_MOTIONS: usize = 2000;
 /// A closed-form solver.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ClosedForm {
-    /// Rotation from rotation vectors, then translation (Park and Martin 1994, sections III and IV).
+    /// Rotation from rotation vectors, then translation (Park and Martin 1994, sections III and
+    /// IV).
     ParkMartin,
     /// Rotation and translation from dual quaternions (Daniilidis 1999, section 4).
     Daniilidis,
@@ -28,8 +31,9 @@ impl ClosedForm {
     /// All solvers.
     pub const ALL: [Self; 3] = [Self::ParkMartin, Self::Daniilidis, Self::TsaiLenz];
 
-    /// Pose of the camera on the flange from pairs `(base_from_flange, camera_from_board)`. All pairs have the same
-    /// weight, so a wrong one spoils the result. `None` if the rotation axes of the motions are parallel.
+    /// Pose of the camera on the flange from pairs `(base_from_flange, camera_from_board)`. All
+    /// pairs have the same weight, so a wrong one spoils the result. `None` if the rotation axes of
+    /// the motions are parallel.
     pub fn flange_from_camera(self, pairs: &[(Transform, Transform)]) -> Option<Transform> {
         self.solve(&motions(pairs))
     }
@@ -54,26 +58,33 @@ pub(super) struct Motion {
 
 /// Motions between all pairs of samples, or between evenly distributed pairs if there are many.
 ///
-/// * `pairs`: `a` and `camera_from_board` of each sample, where `a x camera_from_board` is constant.
+/// * `pairs`: `a` and `camera_from_board` of each sample, where `a x camera_from_board` is
+///   constant.
 pub(super) fn motions(pairs: &[(Transform, Transform)]) -> Vec<Motion> {
     let n = pairs.len();
     let stride = (n * n.saturating_sub(1) / 2).div_ceil(MAX_MOTIONS).max(1);
     let all = (0..n).flat_map(|i| (i + 1..n).map(move |j| (i, j)));
     all.step_by(stride)
-        .map(|(i, j)| Motion { a: pairs[j].0.inverse() * pairs[i].0, b: pairs[j].1 * pairs[i].1.inverse() })
+        .map(|(i, j)| Motion {
+            a: pairs[j].0.inverse() * pairs[i].0,
+            b: pairs[j].1 * pairs[i].1.inverse(),
+        })
         .collect()
 }
 
-/// Rotation with the least squared distance between the rotation vectors of `a` and the rotated ones of `b`.
+/// Rotation with the least squared distance between the rotation vectors of `a` and the rotated
+/// ones of `b`.
 fn park_martin_rotation(motions: &[Motion]) -> Option<UnitQuaternion<f64>> {
     let mut correlation = Matrix3::zeros();
     for motion in motions {
-        correlation += motion.a.rotation.scaled_axis() * motion.b.rotation.scaled_axis().transpose();
+        correlation +=
+            motion.a.rotation.scaled_axis() * motion.b.rotation.scaled_axis().transpose();
     }
     nearest_rotation(&correlation)
 }
 
-/// The rotation `r` that maximizes the trace of `r' correlation` (Kabsch 1976). `None` if it is not unique.
+/// The rotation `r` that maximizes the trace of `r' correlation` (Kabsch 1976). `None` if it is not
+/// unique.
 pub(crate) fn nearest_rotation(correlation: &Matrix3<f64>) -> Option<UnitQuaternion<f64>> {
     const MIN_RATIO: f64 = 1e-9; // Of the second to the first singular value; parallel axes have 0.
     if !correlation.iter().all(|value| value.is_finite()) {
@@ -85,7 +96,9 @@ pub(crate) fn nearest_rotation(correlation: &Matrix3<f64>) -> Option<UnitQuatern
     }
     let (u, v_t) = (svd.u?, svd.v_t?);
     let mirror = Matrix3::from_diagonal(&Vector3::new(1.0, 1.0, (u * v_t).determinant().signum()));
-    Some(UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(u * mirror * v_t)))
+    Some(UnitQuaternion::from_rotation_matrix(
+        &Rotation3::from_matrix_unchecked(u * mirror * v_t),
+    ))
 }
 
 fn tsai_lenz_rotation(motions: &[Motion]) -> Option<UnitQuaternion<f64>> {
@@ -100,7 +113,10 @@ fn tsai_lenz_rotation(motions: &[Motion]) -> Option<UnitQuaternion<f64>> {
     let tangent = solve(&normal, &right)?;
     // The vector is the axis times the tangent of half the angle.
     let half_cosine = 1.0 / (1.0 + tangent.norm_squared()).sqrt();
-    Some(UnitQuaternion::from_quaternion(Quaternion::from_parts(half_cosine, tangent * half_cosine)))
+    Some(UnitQuaternion::from_quaternion(Quaternion::from_parts(
+        half_cosine,
+        tangent * half_cosine,
+    )))
 }
 
 /// Rotation axis times twice the sine of half the angle.
@@ -129,14 +145,22 @@ fn with_translation(motions: &[Motion], rotation: UnitQuaternion<f64>) -> Option
     for motion in motions {
         let factor = motion.a.rotation.to_rotation_matrix().into_inner() - Matrix3::identity();
         normal += factor.transpose() * factor;
-        right += factor.transpose() * (rotation * motion.b.translation.vector - motion.a.translation.vector);
+        right += factor.transpose()
+            * (rotation * motion.b.translation.vector - motion.a.translation.vector);
     }
-    Some(Transform::from_parts(Translation3::from(solve(&normal, &right)?), rotation))
+    Some(Transform::from_parts(
+        Translation3::from(solve(&normal, &right)?),
+        rotation,
+    ))
 }
 
-/// Scale of the translations of `b` relative to those of `a`, estimated together with the translation, and its standard
-/// deviation. 1 if both have the same unit; 1000 if only those of `a` are in millimeters.
-pub(super) fn relative_scale(motions: &[Motion], rotation: UnitQuaternion<f64>) -> Option<(f64, f64)> {
+/// Scale of the translations of `b` relative to those of `a`, estimated together with the
+/// translation, and its standard deviation. 1 if both have the same unit; 1000 if only those of `a`
+/// are in millimeters.
+pub(super) fn relative_scale(
+    motions: &[Motion],
+    rotation: UnitQuaternion<f64>,
+) -> Option<(f64, f64)> {
     let rows = 3 * motions.len();
     (rows > 4).then_some(())?;
     let mut matrix = DMatrix::zeros(rows, 4);
@@ -144,16 +168,24 @@ pub(super) fn relative_scale(motions: &[Motion], rotation: UnitQuaternion<f64>) 
     for (ix, motion) in motions.iter().enumerate() {
         let factor = motion.a.rotation.to_rotation_matrix().into_inner() - Matrix3::identity();
         matrix.fixed_view_mut::<3, 3>(3 * ix, 0).copy_from(&factor);
-        matrix.fixed_view_mut::<3, 1>(3 * ix, 3).copy_from(&-(rotation * motion.b.translation.vector));
-        right.fixed_rows_mut::<3>(3 * ix).copy_from(&-motion.a.translation.vector);
+        matrix
+            .fixed_view_mut::<3, 1>(3 * ix, 3)
+            .copy_from(&-(rotation * motion.b.translation.vector));
+        right
+            .fixed_rows_mut::<3>(3 * ix)
+            .copy_from(&-motion.a.translation.vector);
     }
     let inverse = (matrix.transpose() * &matrix).try_inverse()?;
     let solution = &inverse * matrix.transpose() * &right;
     let variance = (&matrix * &solution - right).norm_squared() / (rows - 4) as f64;
-    // The motions between all pairs of n samples contain n - 1 independent ones; with n (n - 1) / 2 pairs, n is:
+    // The motions between all pairs of n samples contain n - 1 independent ones; with n (n - 1) / 2
+    // pairs, n is:
     let n_samples = 0.5 + (0.25 + 2.0 * motions.len() as f64).sqrt();
     let repetition = motions.len() as f64 / (n_samples - 1.0);
-    Some((solution[3], (variance * inverse[(3, 3)] * repetition).max(0.0).sqrt()))
+    Some((
+        solution[3],
+        (variance * inverse[(3, 3)] * repetition).max(0.0).sqrt(),
+    ))
 }
 
 fn daniilidis(motions: &[Motion]) -> Option<Transform> {
@@ -166,11 +198,18 @@ fn daniilidis(motions: &[Motion]) -> Option<Transform> {
         let mut rows = SMatrix::<f64, 6, 8>::zeros();
         for (row, column, difference, sum) in [
             (0, 0, a.imag() - b.imag(), a.imag() + b.imag()),
-            (3, 0, a_dual.imag() - b_dual.imag(), a_dual.imag() + b_dual.imag()),
+            (
+                3,
+                0,
+                a_dual.imag() - b_dual.imag(),
+                a_dual.imag() + b_dual.imag(),
+            ),
             (3, 4, a.imag() - b.imag(), a.imag() + b.imag()),
         ] {
-            rows.fixed_view_mut::<3, 1>(row, column).copy_from(&difference);
-            rows.fixed_view_mut::<3, 3>(row, column + 1).copy_from(&sum.cross_matrix());
+            rows.fixed_view_mut::<3, 1>(row, column)
+                .copy_from(&difference);
+            rows.fixed_view_mut::<3, 3>(row, column + 1)
+                .copy_from(&sum.cross_matrix());
         }
         normal += rows.transpose() * rows;
     }
@@ -182,8 +221,14 @@ fn daniilidis(motions: &[Motion]) -> Option<Transform> {
     (eigen.eigenvalues[order[2]] > MIN_RATIO * eigen.eigenvalues[order[7]]).then_some(())?;
     let null = [order[0], order[1]].map(|ix| {
         let vector = eigen.eigenvectors.column(ix).into_owned();
-        let part =
-            |first: usize| Quaternion::new(vector[first], vector[first + 1], vector[first + 2], vector[first + 3]);
+        let part = |first: usize| {
+            Quaternion::new(
+                vector[first],
+                vector[first + 1],
+                vector[first + 2],
+                vector[first + 3],
+            )
+        };
         (part(0), part(4))
     });
     let dot = |p: &Quaternion<f64>, q: &Quaternion<f64>| p.coords.dot(&q.coords);
@@ -194,24 +239,34 @@ fn daniilidis(motions: &[Motion]) -> Option<Transform> {
         vec![(1.0, 0.0), (last, -middle)]
     } else {
         let root = (middle * middle - 4.0 * first * last).max(0.0).sqrt();
-        [root, -root].map(|root| ((-middle + root) / (2.0 * first), 1.0)).to_vec()
+        [root, -root]
+            .map(|root| ((-middle + root) / (2.0 * first), 1.0))
+            .to_vec()
     };
     let squared_norm = |&(s, t): &(f64, f64)| {
         (s * s * dot(u1, u1) + 2.0 * s * t * dot(u1, u2) + t * t * dot(u2, u2)) / (s * s + t * t)
     };
-    let (s, t) = candidates.into_iter().max_by(|p, q| squared_norm(p).total_cmp(&squared_norm(q)))?;
+    let (s, t) = candidates
+        .into_iter()
+        .max_by(|p, q| squared_norm(p).total_cmp(&squared_norm(q)))?;
     let (real, dual) = (*u1 * s + *u2 * t, *v1 * s + *v2 * t);
     let norm = real.norm();
     (norm > 0.0).then_some(())?;
     let (real, dual) = (real / norm, dual / norm);
     let translation = (dual * real.conjugate()).imag() * 2.0;
-    Some(Transform::from_parts(translation.into(), UnitQuaternion::from_quaternion(real)))
+    Some(Transform::from_parts(
+        translation.into(),
+        UnitQuaternion::from_quaternion(real),
+    ))
 }
 
 /// Real and dual part (Daniilidis 1999, section 3.2).
 fn dual_quaternion(motion: &Transform) -> (Quaternion<f64>, Quaternion<f64>) {
     let real = positive(motion.rotation);
-    (real, Quaternion::from_imag(motion.translation.vector) * real * 0.5)
+    (
+        real,
+        Quaternion::from_imag(motion.translation.vector) * real * 0.5,
+    )
 }
 
 #[cfg(test)]
@@ -245,7 +300,11 @@ mod tests {
             let (x, pairs) = scene(n);
             for solver in ClosedForm::ALL {
                 let found = solver.solve(&motions(&pairs)).unwrap();
-                assert!(distance(&found, &x) < CLOSE, "{solver:?}: off by {:e}", distance(&found, &x));
+                assert!(
+                    distance(&found, &x) < CLOSE,
+                    "{solver:?}: off by {:e}",
+                    distance(&found, &x)
+                );
                 assert!(distance(&found, &pairs[0].0) > CLOSE);
             }
         }
@@ -256,7 +315,10 @@ mod tests {
         let (x, _) = scene(3);
         let pairs: Vec<_> = (0..6)
             .map(|ix| {
-                let a = Transform::new(Vector3::new(0.1 * f64::from(ix), 0.3, 0.0), Vector3::z() * f64::from(ix) * 0.3);
+                let a = Transform::new(
+                    Vector3::new(0.1 * f64::from(ix), 0.3, 0.0),
+                    Vector3::z() * f64::from(ix) * 0.3,
+                );
                 (a, x.inverse() * a.inverse())
             })
             .collect();
@@ -274,6 +336,9 @@ mod tests {
             pair.0.translation.vector *= 1000.0;
         }
         let (scale, sigma) = relative_scale(&motions(&pairs), x.rotation).unwrap();
-        assert!((scale - 1000.0).abs() < 1e-6 && sigma < 1e-6, "{scale} +- {sigma}");
+        assert!(
+            (scale - 1000.0).abs() < 1e-6 && sigma < 1e-6,
+            "{scale} +- {sigma}"
+        );
     }
 }

@@ -1,8 +1,8 @@
-//! Minimization of the reprojection error over hand-eye, board pose, robot pose errors and, when asked, intrinsics and
-//! joint offsets.
+//! Minimization of the reprojection error over hand-eye, board pose, robot pose errors and, when
+//! asked, intrinsics and joint offsets.
 //!
-//! Each stop of the robot has a small unknown error with an estimated variance. These local parameters are eliminated by the
-//! Schur complement of the solver.
+//! Each stop of the robot has a small unknown error with an estimated variance. These local
+//! parameters are eliminated by the Schur complement of the solver.
 
 use super::geometry::{N_PARAMS, Solution};
 use super::{HandEyeNoise, Setup};
@@ -54,7 +54,9 @@ impl CornerProblem<'_> {
     /// If a corner cannot be projected, or if there are too few corners.
     pub(super) fn minimize(&self, initial: CornerState) -> Result<Fit<CornerState>, Error> {
         let options = least_squares::Options {
-            loss: Loss::Huber { threshold: LOSS_THRESHOLD },
+            loss: Loss::Huber {
+                threshold: LOSS_THRESHOLD,
+            },
             max_steps: 40,
             ..least_squares::Options::default()
         };
@@ -62,16 +64,27 @@ impl CornerProblem<'_> {
     }
 
     fn n_joints(&self) -> usize {
-        self.chain.map_or(0, |chain| chain.n_joints().saturating_sub(2))
+        self.chain
+            .map_or(0, |chain| chain.n_joints().saturating_sub(2))
     }
 
-    /// Pose of the flange of a view with corrected joints, and the velocity of the flange for each inner joint.
-    fn corrected_pose(&self, view: &View, offsets: &[f64]) -> Option<(Transform, Vec<kinematics::Twist>)> {
-        let Some(chain) = self.chain else { return Some((view.base_from_flange, Vec::new())) };
+    /// Pose of the flange of a view with corrected joints, and the velocity of the flange for each
+    /// inner joint.
+    fn corrected_pose(
+        &self,
+        view: &View,
+        offsets: &[f64],
+    ) -> Option<(Transform, Vec<kinematics::Twist>)> {
+        let Some(chain) = self.chain else {
+            return Some((view.base_from_flange, Vec::new()));
+        };
         let corrected = corrected_joints(&view.joints, offsets);
         let tip_from_flange = chain.forward(&view.joints).ok()?.inverse() * view.base_from_flange;
         let twists = chain.tip_twists_by_joint(&corrected).ok()?;
-        let inner = twists[1..twists.len() - 1].iter().map(|twist| twist.of_attached(&tip_from_flange)).collect();
+        let inner = twists[1..twists.len() - 1]
+            .iter()
+            .map(|twist| twist.of_attached(&tip_from_flange))
+            .collect();
         Some((chain.forward(&corrected).ok()? * tip_from_flange, inner))
     }
 
@@ -91,7 +104,9 @@ impl CornerProblem<'_> {
         let mut rows = [vec![0.0; n_shared + 6], vec![0.0; n_shared + 6]];
         for point in &view.points {
             let at = chain.at(&point.point_in_board);
-            let projection = state.intrinsics.project_with_derivatives(&at.point_in_camera)?;
+            let projection = state
+                .intrinsics
+                .project_with_derivatives(&at.point_in_camera)?;
             let by_point: Matrix2x3<f64> = projection.by_point / corner_px;
             let by_solution = by_point * at.by_solution;
             let by_flange = by_point * at.by_flange;
@@ -111,7 +126,8 @@ impl CornerProblem<'_> {
                     row[n_shared + ix] = by_error[(axis, ix)];
                 }
             }
-            let residual = [0, 1].map(|axis| (projection.pixel[axis] - point.pixel[axis]) / corner_px);
+            let residual =
+                [0, 1].map(|axis| (projection.pixel[axis] - point.pixel[axis]) / corner_px);
             sums.add(residual, [rows[0].as_slice(), rows[1].as_slice()]);
         }
         Some(())
@@ -158,17 +174,29 @@ impl least_squares::Problem for CornerProblem<'_> {
         Some(())
     }
 
-    fn moved(&self, state: &CornerState, shared: &DVector<f64>, local: &[DVector<f64>]) -> CornerState {
+    fn moved(
+        &self,
+        state: &CornerState,
+        shared: &DVector<f64>,
+        local: &[DVector<f64>],
+    ) -> CornerState {
         let n_intrinsics = self.n_intrinsics;
         let steps = shared.as_slice();
         let intrinsics = if n_intrinsics > 0 {
             let params = state.intrinsics.params();
-            let moved: Vec<f64> = params.iter().zip(&steps[N_PARAMS..]).map(|(param, step)| param + step).collect();
+            let moved: Vec<f64> = params
+                .iter()
+                .zip(&steps[N_PARAMS..])
+                .map(|(param, step)| param + step)
+                .collect();
             state.intrinsics.with_params(&moved)
         } else {
             state.intrinsics.clone()
         };
-        let offsets = state.joint_offsets.iter().zip(&steps[N_PARAMS + n_intrinsics..]);
+        let offsets = state
+            .joint_offsets
+            .iter()
+            .zip(&steps[N_PARAMS + n_intrinsics..]);
         CornerState {
             solution: state.solution.moved(steps),
             intrinsics,
@@ -184,7 +212,14 @@ impl least_squares::Problem for CornerProblem<'_> {
 }
 
 fn stacked(rotation: &Vector3<f64>, translation: &Vector3<f64>) -> Vector6<f64> {
-    Vector6::new(rotation.x, rotation.y, rotation.z, translation.x, translation.y, translation.z)
+    Vector6::new(
+        rotation.x,
+        rotation.y,
+        rotation.z,
+        translation.x,
+        translation.y,
+        translation.z,
+    )
 }
 
 /// Maps points of the board to the camera for one view.
@@ -209,7 +244,12 @@ struct PointAt {
 }
 
 impl PointChain {
-    fn new(setup: Setup, solution: &Solution, base_from_flange: &Transform, error: &Vector6<f64>) -> Self {
+    fn new(
+        setup: Setup,
+        solution: &Solution,
+        base_from_flange: &Transform,
+        error: &Vector6<f64>,
+    ) -> Self {
         let error_rad: Vector3<f64> = error.fixed_rows::<3>(0).into_owned();
         Self {
             setup,
@@ -223,8 +263,10 @@ impl PointChain {
     }
 
     fn at(&self, point_in_board: &Vector3<f64>) -> PointAt {
-        let map = |transform: &Transform, point: &Vector3<f64>| (transform * Point3::from(*point)).coords;
-        let matrix = |rotation: nalgebra::UnitQuaternion<f64>| rotation.to_rotation_matrix().into_inner();
+        let map =
+            |transform: &Transform, point: &Vector3<f64>| (transform * Point3::from(*point)).coords;
+        let matrix =
+            |rotation: nalgebra::UnitQuaternion<f64>| rotation.to_rotation_matrix().into_inner();
         let point_in_y = map(&self.y, point_in_board);
         // The flange frame without and with the pose error, and the map of the last to the camera.
         let error_rotation = matrix(self.error_motion.rotation);
@@ -240,7 +282,12 @@ impl PointChain {
                 let right = Matrix3::identity() - cross * 0.5;
                 let by_error = joined(rotation * point.cross_matrix() * right, -corrected);
                 let camera_from_y = corrected * matrix(self.base_from_flange.rotation).transpose();
-                (map(&self.camera_from_x, &point), camera_from_y, by_flange, by_error)
+                (
+                    map(&self.camera_from_x, &point),
+                    camera_from_y,
+                    by_flange,
+                    by_error,
+                )
             }
             Setup::EyeToHand => {
                 let rotated = self.error_motion.rotation * point_in_y;
@@ -250,7 +297,12 @@ impl PointChain {
                 let by_flange = joined(-rotation * point.cross_matrix(), rotation);
                 let left = Matrix3::identity() + cross * 0.5;
                 let by_error = joined(-rotation * rotated.cross_matrix() * left, rotation);
-                (map(&camera_from_flange, &point), rotation * error_rotation, by_flange, by_error)
+                (
+                    map(&camera_from_flange, &point),
+                    rotation * error_rotation,
+                    by_flange,
+                    by_error,
+                )
             }
         };
         let mut by_solution = SMatrix::<f64, 3, 12>::zeros();
@@ -261,9 +313,16 @@ impl PointChain {
             (6, -camera_from_board * point_in_board.cross_matrix()),
             (9, camera_from_board),
         ] {
-            by_solution.fixed_view_mut::<3, 3>(0, column).copy_from(&block);
+            by_solution
+                .fixed_view_mut::<3, 3>(0, column)
+                .copy_from(&block);
         }
-        PointAt { point_in_camera, by_solution, by_flange, by_error }
+        PointAt {
+            point_in_camera,
+            by_solution,
+            by_flange,
+            by_error,
+        }
     }
 }
 
@@ -286,7 +345,8 @@ mod tests {
             x: Transform::new(Vector3::new(0.05, -0.02, 0.1), Vector3::new(0.3, -1.0, 2.0)),
             y: Transform::new(Vector3::new(0.6, 0.2, 0.1), Vector3::new(2.0, 0.5, -0.3)),
         };
-        let base_from_flange = Transform::new(Vector3::new(0.4, -0.1, 0.5), Vector3::new(1.0, 2.0, -0.5));
+        let base_from_flange =
+            Transform::new(Vector3::new(0.4, -0.1, 0.5), Vector3::new(1.0, 2.0, -0.5));
         let error = Vector6::new(1e-3, -2e-3, 1e-3, 0.002, 0.001, -0.003);
         let point = Vector3::new(0.1, 0.07, 0.0);
         for setup in [Setup::EyeInHand, Setup::EyeToHand] {
@@ -303,18 +363,32 @@ mod tests {
                     step[ix] = nudge;
                     chain(&solution.moved(&step), &base_from_flange, &error)
                 };
-                assert!((numeric(&moved) - at.by_solution.column(ix)).norm() < CLOSE, "{setup:?}, parameter {ix}");
+                assert!(
+                    (numeric(&moved) - at.by_solution.column(ix)).norm() < CLOSE,
+                    "{setup:?}, parameter {ix}"
+                );
             }
             for ix in 0..6 {
-                let step = |nudge: f64| Vector6::from_fn(|row, _| if row == ix { nudge } else { 0.0 });
-                let moved = |nudge: f64| chain(&solution, &base_from_flange, &(error + step(nudge)));
-                assert!((numeric(&moved) - at.by_error.column(ix)).norm() < CLOSE, "{setup:?}, error {ix}");
+                let step =
+                    |nudge: f64| Vector6::from_fn(|row, _| if row == ix { nudge } else { 0.0 });
+                let moved =
+                    |nudge: f64| chain(&solution, &base_from_flange, &(error + step(nudge)));
+                assert!(
+                    (numeric(&moved) - at.by_error.column(ix)).norm() < CLOSE,
+                    "{setup:?}, error {ix}"
+                );
                 let moved = |nudge: f64| {
                     let step = step(nudge);
-                    let motion = Transform::new(step.fixed_rows::<3>(3).into(), step.fixed_rows::<3>(0).into());
+                    let motion = Transform::new(
+                        step.fixed_rows::<3>(3).into(),
+                        step.fixed_rows::<3>(0).into(),
+                    );
                     chain(&solution, &(base_from_flange * motion), &error)
                 };
-                assert!((numeric(&moved) - at.by_flange.column(ix)).norm() < CLOSE, "{setup:?}, flange {ix}");
+                assert!(
+                    (numeric(&moved) - at.by_flange.column(ix)).norm() < CLOSE,
+                    "{setup:?}, flange {ix}"
+                );
             }
         }
     }

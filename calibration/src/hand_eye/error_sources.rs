@@ -11,8 +11,13 @@ const MAX_RESIDUAL_PX: f64 = 0.7;
 
 /// A sentence on the likely cause if the errors are larger than those of usual arms and cameras.
 ///
-/// If each image on its own fits the board, lens and board are right, and the robot poses are not those of the images.
-pub(super) fn warning(noise: &HandEyeNoise, scatter: Scatter, rms_px: Option<f64>) -> Option<String> {
+/// If each image on its own fits the board, lens and board are right, and the robot poses are not
+/// those of the images.
+pub(super) fn warning(
+    noise: &HandEyeNoise,
+    scatter: Scatter,
+    rms_px: Option<f64>,
+) -> Option<String> {
     let has_large_error = rms_px.is_some_and(|rms_px| rms_px > MAX_RMS_PX)
         || scatter.mm > MAX_SCATTER.mm
         || scatter.deg > MAX_SCATTER.deg;
@@ -40,18 +45,26 @@ mod tests {
 
     #[test]
     fn cause_of_large_errors_is_named() {
-        let noise =
-            |residual_px| HandEyeNoise { corner_px: residual_px, residual_px, rotation_rad: 1e-3, translation_m: 1e-3 };
+        let noise = |residual_px| HandEyeNoise {
+            corner_px: residual_px,
+            residual_px,
+            rotation_rad: 1e-3,
+            translation_m: 1e-3,
+        };
         let (small, large) = (Scatter { mm: 1.0, deg: 0.1 }, Scatter { mm: 4.0, deg: 0.8 });
         assert_eq!(warning(&noise(Some(0.2)), small, Some(1.0)), None);
         let robot = warning(&noise(Some(0.2)), large, Some(9.0)).unwrap();
         assert!(
-            robot.contains("9.0 px, 4.0 mm and 0.80 degrees") && robot.contains("robot poses do not match"),
+            robot.contains("9.0 px, 4.0 mm and 0.80 degrees")
+                && robot.contains("robot poses do not match"),
             "{robot}"
         );
         let lens = warning(&noise(Some(2.0)), small, Some(9.0)).unwrap();
         assert!(lens.contains("the lens or the target is wrong"), "{lens}");
         let poses = warning(&noise(None), large, None).unwrap();
-        assert!(poses.contains("(4.0 mm") && poses.contains("time offset"), "{poses}");
+        assert!(
+            poses.contains("(4.0 mm") && poses.contains("time offset"),
+            "{poses}"
+        );
     }
 }

@@ -1,7 +1,8 @@
 //! Whether the rotations of the robot determine all parameters.
 //!
-//! A rotation about one axis leaves the position along it and the rotation around it undetermined (Tsai and Lenz 1989,
-//! section III). Errors of the robot poses are amplified by the reciprocal of the rotation about the second axis.
+//! A rotation about one axis leaves the position along it and the rotation around it undetermined
+//! (Tsai and Lenz 1989, section III). Errors of the robot poses are amplified by the reciprocal of
+//! the rotation about the second axis.
 
 use super::geometry::Solution;
 use super::refusal::Refusal;
@@ -9,8 +10,9 @@ use crate::least_squares::sigma_of;
 use kinematics::Transform;
 use nalgebra::{DMatrix, Matrix3, SymmetricEigen, Vector3};
 
-/// Pose errors may be amplified by at most this factor: the reciprocal of the rotation about the second axis, in
-/// radians. Robots whose poses are accurate to 0.1 to 1 mm then give a hand-eye transform that is accurate to 2 to 20 mm.
+/// Pose errors may be amplified by at most this factor: the reciprocal of the rotation about the
+/// second axis, in radians. Robots whose poses are accurate to 0.1 to 1 mm then give a hand-eye
+/// transform that is accurate to 2 to 20 mm.
 const MAX_AMPLIFICATION: f64 = 20.0;
 
 /// Recommended rotation about each axis, degrees.
@@ -39,7 +41,9 @@ pub(crate) fn check_rotations(base_from_flange: &[Transform], body: &str) -> Res
                 first.to_degrees(),
                 min_rad.to_degrees()
             ),
-            format!("rotate the {body} by at least {RECOMMENDED_DEG:.0} degrees around two different axes"),
+            format!(
+                "rotate the {body} by at least {RECOMMENDED_DEG:.0} degrees around two different axes"
+            ),
         ));
     }
     let axis = axes.column(0).into_owned();
@@ -74,19 +78,34 @@ impl RotationExcitation {
     pub fn of(base_from_flange: &[Transform]) -> Option<Self> {
         let (rms_rad, axes) = rotation_spread(base_from_flange)?;
         let axes = [0, 1, 2].map(|ix| axis_name(&axes.column(ix).into_owned(), "flange"));
-        Some(Self { rms_rad, axes, min_rad: 1.0 / MAX_AMPLIFICATION })
+        Some(Self {
+            rms_rad,
+            axes,
+            min_rad: 1.0 / MAX_AMPLIFICATION,
+        })
     }
 }
 
-/// RMS rotations about three orthogonal axes of the body, radians, the largest first, and the axes as columns.
+/// RMS rotations about three orthogonal axes of the body, radians, the largest first, and the axes
+/// as columns.
 pub(super) fn rotation_spread(poses: &[Transform]) -> Option<([f64; 3], Matrix3<f64>)> {
-    let sum: Matrix3<f64> = poses.iter().map(|pose| pose.rotation.to_rotation_matrix().into_inner()).sum();
-    let mean = super::closed_form::nearest_rotation(&sum).or_else(|| poses.first().map(|pose| pose.rotation))?;
-    let vectors: Vec<Vector3<f64>> = poses.iter().map(|pose| (mean.inverse() * pose.rotation).scaled_axis()).collect();
+    let sum: Matrix3<f64> = poses
+        .iter()
+        .map(|pose| pose.rotation.to_rotation_matrix().into_inner())
+        .sum();
+    let mean = super::closed_form::nearest_rotation(&sum)
+        .or_else(|| poses.first().map(|pose| pose.rotation))?;
+    let vectors: Vec<Vector3<f64>> = poses
+        .iter()
+        .map(|pose| (mean.inverse() * pose.rotation).scaled_axis())
+        .collect();
     let n = vectors.len() as f64;
     let center = vectors.iter().sum::<Vector3<f64>>() / n;
-    let covariance: Matrix3<f64> =
-        vectors.iter().map(|vector| (vector - center) * (vector - center).transpose()).sum::<Matrix3<f64>>() / n;
+    let covariance: Matrix3<f64> = vectors
+        .iter()
+        .map(|vector| (vector - center) * (vector - center).transpose())
+        .sum::<Matrix3<f64>>()
+        / n;
     if !covariance.iter().all(|value| value.is_finite()) {
         return None;
     }
@@ -94,7 +113,10 @@ pub(super) fn rotation_spread(poses: &[Transform]) -> Option<([f64; 3], Matrix3<
     let mut order = [0, 1, 2];
     order.sort_by(|&i, &j| eigen.eigenvalues[j].total_cmp(&eigen.eigenvalues[i]));
     let spreads = order.map(|ix| eigen.eigenvalues[ix].max(0.0).sqrt());
-    Some((spreads, Matrix3::from_columns(&order.map(|ix| eigen.eigenvectors.column(ix).into_owned()))))
+    Some((
+        spreads,
+        Matrix3::from_columns(&order.map(|ix| eigen.eigenvectors.column(ix).into_owned())),
+    ))
 }
 
 /// Checks the predicted uncertainty of position and rotation along every direction.
@@ -111,7 +133,10 @@ pub(super) fn check_uncertainty(
     let worst = |first: usize| {
         let eigen = SymmetricEigen::new(covariance.fixed_view::<3, 3>(first, first).into_owned());
         let ix = eigen.eigenvalues.imax();
-        (sigma_of(eigen.eigenvalues[ix]), eigen.eigenvectors.column(ix).into_owned())
+        (
+            sigma_of(eigen.eigenvalues[ix]),
+            eigen.eigenvectors.column(ix).into_owned(),
+        )
     };
     let ((sigma_rad, rotation_axis), (sigma_m, direction)) = (worst(0), worst(3));
     // Written so that NaN is refused.
@@ -119,15 +144,26 @@ pub(super) fn check_uncertainty(
         return Ok(());
     }
     let (in_camera, what) = if sigma_m > max_sigma_m {
-        let what =
-            format!("the position is uncertain by {:.1} mm (at most {:.1} mm) along", 1e3 * sigma_m, 1e3 * max_sigma_m);
+        let what = format!(
+            "the position is uncertain by {:.1} mm (at most {:.1} mm) along",
+            1e3 * sigma_m,
+            1e3 * max_sigma_m
+        );
         (direction, what)
     } else {
         let (is, at_most) = (sigma_rad.to_degrees(), max_sigma_rad.to_degrees());
-        (rotation_axis, format!("the rotation is uncertain by {is:.2} degrees (at most {at_most:.2} degrees) around"))
+        (
+            rotation_axis,
+            format!(
+                "the rotation is uncertain by {is:.2} degrees (at most {at_most:.2} degrees) around"
+            ),
+        )
     };
-    let (axis, body) =
-        if camera_in_flange { (solution.x.rotation * in_camera, "flange") } else { (in_camera, "camera") };
+    let (axis, body) = if camera_in_flange {
+        (solution.x.rotation * in_camera, "flange")
+    } else {
+        (in_camera, "camera")
+    };
     Err(Refusal {
         why: format!("{what} {}", axis_name(&axis, body)),
         axis: camera_in_flange.then(|| axis.into()),
@@ -138,7 +174,8 @@ pub(super) fn check_uncertainty(
     })
 }
 
-/// Name of an axis: "the flange's z axis", or its components if it is not close to a coordinate axis.
+/// Name of an axis: "the flange's z axis", or its components if it is not close to a coordinate
+/// axis.
 pub(super) fn axis_name(axis: &Vector3<f64>, body: &str) -> String {
     const CLOSE_RAD: f64 = 0.26;
     let largest = axis.iamax();
@@ -147,7 +184,10 @@ pub(super) fn axis_name(axis: &Vector3<f64>, body: &str) -> String {
     }
     // Adding zero turns a negative zero into a positive one.
     let signed = axis.map(|value| (100.0 * value * axis[largest].signum()).round() / 100.0 + 0.0);
-    format!("the axis [{:.2}, {:.2}, {:.2}] of the {body}", signed.x, signed.y, signed.z)
+    format!(
+        "the axis [{:.2}, {:.2}, {:.2}] of the {body}",
+        signed.x, signed.y, signed.z
+    )
 }
 
 /// Names of the axes across an axis.
@@ -161,25 +201,50 @@ mod tests {
     use super::*;
 
     fn poses(axes: &[[f64; 3]]) -> Vec<Transform> {
-        axes.iter().map(|axis| Transform::new(Vector3::zeros(), Vector3::from(*axis))).collect()
+        axes.iter()
+            .map(|axis| Transform::new(Vector3::zeros(), Vector3::from(*axis)))
+            .collect()
     }
 
     #[test]
     fn single_axis_is_named() {
-        let refusal =
-            check_rotations(&poses(&[[0.0, 0.0, -1.0], [0.01, 0.0, 0.5], [0.0, 0.02, 1.5]]), "flange").unwrap_err();
-        assert!(refusal.why.contains("around the flange's z axis"), "{refusal}");
-        assert!(refusal.motion.contains("the flange's x or y axis"), "{refusal}");
+        let refusal = check_rotations(
+            &poses(&[[0.0, 0.0, -1.0], [0.01, 0.0, 0.5], [0.0, 0.02, 1.5]]),
+            "flange",
+        )
+        .unwrap_err();
+        assert!(
+            refusal.why.contains("around the flange's z axis"),
+            "{refusal}"
+        );
+        assert!(
+            refusal.motion.contains("the flange's x or y axis"),
+            "{refusal}"
+        );
         assert!(refusal.axis.unwrap()[2].abs() > 0.99);
-        let tilted =
-            check_rotations(&poses(&[[0.5, 0.5, 0.0], [0.1, 0.1, 0.0], [-0.4, -0.4, 0.0]]), "flange").unwrap_err();
+        let tilted = check_rotations(
+            &poses(&[[0.5, 0.5, 0.0], [0.1, 0.1, 0.0], [-0.4, -0.4, 0.0]]),
+            "flange",
+        )
+        .unwrap_err();
         assert!(tilted.why.contains("[0.71, 0.71, 0.00]"), "{tilted}");
     }
 
     #[test]
     fn two_axes_are_accepted_and_small_rotations_are_refused() {
-        check_rotations(&poses(&[[0.3, 0.0, 0.0], [-0.3, 0.3, 0.0], [0.0, -0.3, 0.0]]), "flange").unwrap();
-        let still = check_rotations(&poses(&[[0.01, 0.0, 0.0], [-0.01, 0.01, 0.0], [0.0; 3]]), "flange").unwrap_err();
-        assert!(still.why.contains("hardly rotates") && still.axis.is_none(), "{still}");
+        check_rotations(
+            &poses(&[[0.3, 0.0, 0.0], [-0.3, 0.3, 0.0], [0.0, -0.3, 0.0]]),
+            "flange",
+        )
+        .unwrap();
+        let still = check_rotations(
+            &poses(&[[0.01, 0.0, 0.0], [-0.01, 0.01, 0.0], [0.0; 3]]),
+            "flange",
+        )
+        .unwrap_err();
+        assert!(
+            still.why.contains("hardly rotates") && still.axis.is_none(),
+            "{still}"
+        );
     }
 }

@@ -13,8 +13,8 @@ pub(super) const N_PARAMS: usize = 12;
 
 /// Solution of `a_i x camera_from_board_i = y`.
 ///
-/// Eye in hand: `a` is `base_from_flange`, `x` is `flange_from_camera`, `y` is `base_from_board`. Eye to hand: `a` is
-/// `flange_from_base`, `x` is `base_from_camera`, `y` is `flange_from_board`.
+/// Eye in hand: `a` is `base_from_flange`, `x` is `flange_from_camera`, `y` is `base_from_board`.
+/// Eye to hand: `a` is `flange_from_base`, `x` is `base_from_camera`, `y` is `flange_from_board`.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Solution {
     pub(super) x: Transform,
@@ -22,13 +22,20 @@ pub(super) struct Solution {
 }
 
 impl Solution {
-    /// The solution after a rotation and a translation of `x` in camera axes (6 values), and of `y` in board axes.
+    /// The solution after a rotation and a translation of `x` in camera axes (6 values), and of `y`
+    /// in board axes.
     pub(super) fn moved(&self, step: &[f64]) -> Self {
         let part = |first: usize| {
             let rotation = Vector3::new(step[first], step[first + 1], step[first + 2]);
-            Transform::new(Vector3::new(step[first + 3], step[first + 4], step[first + 5]), rotation)
+            Transform::new(
+                Vector3::new(step[first + 3], step[first + 4], step[first + 5]),
+                rotation,
+            )
         };
-        Self { x: self.x * part(0), y: self.y * part(6) }
+        Self {
+            x: self.x * part(0),
+            y: self.y * part(6),
+        }
     }
 
     /// `camera_from_board` at the pose `a`.
@@ -45,11 +52,19 @@ pub(super) fn a_of(setup: Setup, base_from_flange: &Transform) -> Transform {
     }
 }
 
-/// Rotation (in camera axes, radians) and translation (meters) from the measured to the predicted `camera_from_board`.
+/// Rotation (in camera axes, radians) and translation (meters) from the measured to the predicted
+/// `camera_from_board`.
 pub(super) fn residual(predicted: &Transform, measured: &Transform) -> Vector6<f64> {
     let rotation = (predicted.rotation * measured.rotation.inverse()).scaled_axis();
     let translation = predicted.translation.vector - measured.translation.vector;
-    Vector6::new(rotation.x, rotation.y, rotation.z, translation.x, translation.y, translation.z)
+    Vector6::new(
+        rotation.x,
+        rotation.y,
+        rotation.z,
+        translation.x,
+        translation.y,
+        translation.z,
+    )
 }
 
 /// Derivatives of [`residual`] with respect to the parameters of [`Solution::moved`].
@@ -58,7 +73,9 @@ pub(super) fn residual_jacobian(predicted: &Transform, residual: &Vector6<f64>) 
     let rotation = predicted.rotation.to_rotation_matrix().into_inner();
     let mut jacobian = Matrix6x12::zeros();
     let mut put = |row: usize, column: usize, block: Matrix3<f64>| {
-        jacobian.fixed_view_mut::<3, 3>(row, column).copy_from(&block);
+        jacobian
+            .fixed_view_mut::<3, 3>(row, column)
+            .copy_from(&block);
     };
     put(0, 0, -left);
     put(0, 6, left * rotation);
@@ -68,18 +85,33 @@ pub(super) fn residual_jacobian(predicted: &Transform, residual: &Vector6<f64>) 
     jacobian
 }
 
-/// Derivatives of [`residual`] with respect to a small motion of the flange in flange axes: the predicted pose of a
-/// flange at `base_from_flange * exp(motion)`; rotation first.
-pub(super) fn residual_by_flange(setup: Setup, solution: &Solution, predicted: &Transform) -> Matrix6<f64> {
-    // For the eye in hand, points at rest move against the flange; for the eye to hand, the board moves with it.
+/// Derivatives of [`residual`] with respect to a small motion of the flange in flange axes: the
+/// predicted pose of a flange at `base_from_flange * exp(motion)`; rotation first.
+pub(super) fn residual_by_flange(
+    setup: Setup,
+    solution: &Solution,
+    predicted: &Transform,
+) -> Matrix6<f64> {
+    // For the eye in hand, points at rest move against the flange; for the eye to hand, the board
+    // moves with it.
     let (rotation, board_in_flange, sign) = match setup {
-        Setup::EyeInHand => (solution.x.rotation.inverse(), (solution.x * predicted).translation.vector, -1.0),
-        Setup::EyeToHand => (predicted.rotation * solution.y.rotation.inverse(), solution.y.translation.vector, 1.0),
+        Setup::EyeInHand => (
+            solution.x.rotation.inverse(),
+            (solution.x * predicted).translation.vector,
+            -1.0,
+        ),
+        Setup::EyeToHand => (
+            predicted.rotation * solution.y.rotation.inverse(),
+            solution.y.translation.vector,
+            1.0,
+        ),
     };
     let rotation = rotation.to_rotation_matrix().into_inner() * sign;
     let mut jacobian = Matrix6::zeros();
     jacobian.fixed_view_mut::<3, 3>(0, 0).copy_from(&rotation);
-    jacobian.fixed_view_mut::<3, 3>(3, 0).copy_from(&(-rotation * board_in_flange.cross_matrix()));
+    jacobian
+        .fixed_view_mut::<3, 3>(3, 0)
+        .copy_from(&(-rotation * board_in_flange.cross_matrix()));
     jacobian.fixed_view_mut::<3, 3>(3, 3).copy_from(&rotation);
     jacobian
 }
@@ -99,8 +131,15 @@ fn inverse_left_jacobian(rotation_vector: &Vector3<f64>) -> Matrix3<f64> {
 
 /// Mean position and mean rotation (least squares over rotation matrices).
 pub(super) fn mean(poses: &[Transform]) -> Option<Transform> {
-    let translation = poses.iter().map(|pose| pose.translation.vector).sum::<Vector3<f64>>() / poses.len() as f64;
-    let sum: Matrix3<f64> = poses.iter().map(|pose| pose.rotation.to_rotation_matrix().into_inner()).sum();
+    let translation = poses
+        .iter()
+        .map(|pose| pose.translation.vector)
+        .sum::<Vector3<f64>>()
+        / poses.len() as f64;
+    let sum: Matrix3<f64> = poses
+        .iter()
+        .map(|pose| pose.rotation.to_rotation_matrix().into_inner())
+        .sum();
     let rotation: UnitQuaternion<f64> = super::closed_form::nearest_rotation(&sum)?;
     Some(Transform::from_parts(translation.into(), rotation))
 }
@@ -117,7 +156,10 @@ pub(super) fn add_whitened(
 ) {
     let (residual, rows) = (whitening * residual, (whitening * jacobian).transpose());
     let row = |ix: usize| &rows.as_slice()[N_PARAMS * ix..N_PARAMS * (ix + 1)];
-    sums.add(residual.into(), [row(0), row(1), row(2), row(3), row(4), row(5)]);
+    sums.add(
+        residual.into(),
+        [row(0), row(1), row(2), row(3), row(4), row(5)],
+    );
 }
 
 #[cfg(test)]
@@ -134,9 +176,13 @@ mod tests {
         };
         let measured = Transform::new(Vector3::new(0.1, 0.0, 0.5), Vector3::new(0.2, -0.4, 0.1));
         for setup in [Setup::EyeInHand, Setup::EyeToHand] {
-            let base_from_flange = Transform::new(Vector3::new(0.4, -0.1, 0.5), Vector3::new(1.0, 2.0, -0.5));
+            let base_from_flange =
+                Transform::new(Vector3::new(0.4, -0.1, 0.5), Vector3::new(1.0, 2.0, -0.5));
             let at = |solution: &Solution, base_from_flange: &Transform| {
-                residual(&solution.camera_from_board(&a_of(setup, base_from_flange)), &measured)
+                residual(
+                    &solution.camera_from_board(&a_of(setup, base_from_flange)),
+                    &measured,
+                )
             };
             let value = at(&solution, &base_from_flange);
             let predicted = solution.camera_from_board(&a_of(setup, &base_from_flange));
@@ -148,21 +194,32 @@ mod tests {
                     at(&solution.moved(&step), &base_from_flange)
                 };
                 let numeric = (moved(NUDGE) - moved(-NUDGE)) / (2.0 * NUDGE);
-                assert!((numeric - jacobian.column(ix)).norm() < CLOSE, "{setup:?}, parameter {ix}");
+                assert!(
+                    (numeric - jacobian.column(ix)).norm() < CLOSE,
+                    "{setup:?}, parameter {ix}"
+                );
             }
-            // Derivatives by the flange are used as weights only; they are exact for small residuals.
+            // Derivatives by the flange are used as weights only; they are exact for small
+            // residuals.
             let close = measured_close_to(&predicted);
             let by_flange = residual_by_flange(setup, &solution, &predicted);
             for ix in 0..6 {
                 let moved = |nudge: f64| {
                     let mut step = Vector6::zeros();
                     step[ix] = nudge;
-                    let motion = Transform::new(step.fixed_rows::<3>(3).into(), step.fixed_rows::<3>(0).into());
-                    let pose = solution.camera_from_board(&a_of(setup, &(base_from_flange * motion)));
+                    let motion = Transform::new(
+                        step.fixed_rows::<3>(3).into(),
+                        step.fixed_rows::<3>(0).into(),
+                    );
+                    let pose =
+                        solution.camera_from_board(&a_of(setup, &(base_from_flange * motion)));
                     residual(&pose, &close)
                 };
                 let numeric = (moved(NUDGE) - moved(-NUDGE)) / (2.0 * NUDGE);
-                assert!((numeric - by_flange.column(ix)).norm() < CLOSE, "{setup:?}, flange {ix}");
+                assert!(
+                    (numeric - by_flange.column(ix)).norm() < CLOSE,
+                    "{setup:?}, flange {ix}"
+                );
             }
         }
     }

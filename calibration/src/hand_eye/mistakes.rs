@@ -1,4 +1,5 @@
-//! Names common mistakes in the input: wrong units, inverted transforms, mirrored boards, lists that are off by one.
+//! Names common mistakes in the input: wrong units, inverted transforms, mirrored boards, lists
+//! that are off by one.
 
 use super::closed_form::{self, ClosedForm};
 use super::consensus::{self, Consensus};
@@ -9,7 +10,8 @@ use super::samples::{self, Sample};
 use super::{BoardObservation, HandEyeInput, HandEyeSample, Setup};
 use kinematics::Transform;
 
-/// Positions of a robot or distances of a board in meters do not exceed this; in millimeters they do.
+/// Positions of a robot or distances of a board in meters do not exceed this; in millimeters they
+/// do.
 const MAX_POSITION_M: f64 = 20.0;
 
 /// A variant of the input explains it if it fits better by this factor.
@@ -20,14 +22,19 @@ const MUCH_BETTER: f64 = 5.0;
 /// # Errors
 /// If most of them are too large.
 pub(super) fn check_magnitudes(samples: &[HandEyeSample]) -> Result<(), Refusal> {
-    let robot: Vec<f64> = samples.iter().map(|sample| sample.base_from_flange.translation.vector.norm()).collect();
+    let robot: Vec<f64> = samples
+        .iter()
+        .map(|sample| sample.base_from_flange.translation.vector.norm())
+        .collect();
     let board: Vec<f64> = samples
         .iter()
         .filter_map(|sample| match &sample.board {
             BoardObservation::Pose(pose) => Some(pose.translation.vector.norm()),
-            BoardObservation::View(view) => {
-                view.points.iter().map(|point| point.point_in_board.norm()).reduce(f64::max)
-            }
+            BoardObservation::View(view) => view
+                .points
+                .iter()
+                .map(|point| point.point_in_board.norm())
+                .reduce(f64::max),
         })
         .collect();
     for (name, values) in [("base_from_flange", robot), ("the board", board)] {
@@ -44,31 +51,59 @@ pub(super) fn check_magnitudes(samples: &[HandEyeSample]) -> Result<(), Refusal>
     Ok(())
 }
 
-/// The mistake that explains why the samples disagree. `None` if they agree or no known mistake explains it.
-pub(super) fn explain(input: &HandEyeInput<'_>, samples: &[Sample], consensus: Option<&Consensus>) -> Option<Refusal> {
+/// The mistake that explains why the samples disagree. `None` if they agree or no known mistake
+/// explains it.
+pub(super) fn explain(
+    input: &HandEyeInput<'_>,
+    samples: &[Sample],
+    consensus: Option<&Consensus>,
+) -> Option<Refusal> {
     /// A calibrated camera predicts the board within this fraction of its distance.
     const GOOD_FRAC: f64 = 0.02;
-    let distances: Vec<f64> =
-        samples.iter().map(|sample| sample.candidates[0].camera_from_board.translation.vector.norm()).collect();
+    let distances: Vec<f64> = samples
+        .iter()
+        .map(|sample| {
+            sample.candidates[0]
+                .camera_from_board
+                .translation
+                .vector
+                .norm()
+        })
+        .collect();
     let distance_m = kinematics::quantile::median(&distances)?;
     let found_m = consensus.map_or(f64::INFINITY, Consensus::median_m);
     let residual = if found_m.is_finite() {
-        format!("the samples disagree by {:.0} mm (median, board at {:.0} mm)", 1e3 * found_m, 1e3 * distance_m)
+        format!(
+            "the samples disagree by {:.0} mm (median, board at {:.0} mm)",
+            1e3 * found_m,
+            1e3 * distance_m
+        )
     } else {
         "no hand-eye transform explains three of the samples".to_owned()
     };
-    let has_poses = samples.iter().all(|sample| sample.candidates.iter().all(|candidate| candidate.corners.is_none()));
+    let has_poses = samples.iter().all(|sample| {
+        sample
+            .candidates
+            .iter()
+            .all(|candidate| candidate.corners.is_none())
+    });
     if let Some(refusal) = shift_mistake(input, samples, found_m, distance_m) {
         return Some(refusal);
     }
     if let Some(scale) = scale_mistake(samples, consensus) {
-        return Some(Refusal::new(format!("{residual}, and {}", scale.0), scale.1));
+        return Some(Refusal::new(
+            format!("{residual}, and {}", scale.0),
+            scale.1,
+        ));
     }
     if found_m <= GOOD_FRAC * distance_m {
-        // If both poses of each sample are inverted, the samples agree on the inverse of another transform.
-        let is_behind = |sample: &&Sample| sample.candidates[0].camera_from_board.translation.z <= 0.0;
+        // If both poses of each sample are inverted, the samples agree on the inverse of another
+        // transform.
+        let is_behind =
+            |sample: &&Sample| sample.candidates[0].camera_from_board.translation.z <= 0.0;
         let n_behind = samples.iter().filter(is_behind).count();
-        let is_inverted = input.options.board_is_seen && has_poses && 5 * n_behind > 4 * samples.len();
+        let is_inverted =
+            input.options.board_is_seen && has_poses && 5 * n_behind > 4 * samples.len();
         return is_inverted.then(|| {
             Refusal::new(
                 format!(
@@ -79,11 +114,18 @@ pub(super) fn explain(input: &HandEyeInput<'_>, samples: &[Sample], consensus: O
             )
         });
     }
-    // Inverting either transform swaps the unknowns, so the data do not determine which one was inverted.
-    let variant: Vec<Sample> =
-        samples.iter().map(|sample| Sample { a: sample.a.inverse(), ..sample.clone() }).collect();
+    // Inverting either transform swaps the unknowns, so the data do not determine which one was
+    // inverted.
+    let variant: Vec<Sample> = samples
+        .iter()
+        .map(|sample| Sample {
+            a: sample.a.inverse(),
+            ..sample.clone()
+        })
+        .collect();
     let variant_m = consensus::find(&variant)?.median_m();
-    if variant_m * MUCH_BETTER > found_m.min(distance_m) || variant_m > 2.0 * GOOD_FRAC * distance_m {
+    if variant_m * MUCH_BETTER > found_m.min(distance_m) || variant_m > 2.0 * GOOD_FRAC * distance_m
+    {
         return None;
     }
     let fits = format!("{residual}; they agree within {:.1} mm if", 1e3 * variant_m);
@@ -91,8 +133,9 @@ pub(super) fn explain(input: &HandEyeInput<'_>, samples: &[Sample], consensus: O
         Setup::EyeInHand => "eye to hand",
         Setup::EyeToHand => "eye in hand",
     };
-    let robot =
-        format!("base_from_flange is inverted: the given matrices are flange_from_base, or the setup is {other}");
+    let robot = format!(
+        "base_from_flange is inverted: the given matrices are flange_from_base, or the setup is {other}"
+    );
     let robot_remedy = format!("invert the robot poses, or choose the setup {other}");
     let board = "camera_from_board is inverted: the given matrices are board_from_camera";
     // The camera sees only boards in front of it.
@@ -103,13 +146,19 @@ pub(super) fn explain(input: &HandEyeInput<'_>, samples: &[Sample], consensus: O
         };
         samples.iter().filter(|sample| z(sample) > 0.0).count()
     };
-    Some(match (n_in_front(false) == samples.len() || !has_poses, has_poses && n_in_front(true) == samples.len()) {
-        (true, false) => Refusal::new(format!("{fits} {robot}"), robot_remedy),
-        (false, _) => Refusal::new(format!("{fits} {board}"), "invert the board poses"),
-        (true, true) => {
-            Refusal::new(format!("{fits} {robot}; or if {board}"), format!("{robot_remedy}, or invert the board poses"))
-        }
-    })
+    Some(
+        match (
+            n_in_front(false) == samples.len() || !has_poses,
+            has_poses && n_in_front(true) == samples.len(),
+        ) {
+            (true, false) => Refusal::new(format!("{fits} {robot}"), robot_remedy),
+            (false, _) => Refusal::new(format!("{fits} {board}"), "invert the board poses"),
+            (true, true) => Refusal::new(
+                format!("{fits} {robot}; or if {board}"),
+                format!("{robot_remedy}, or invert the board poses"),
+            ),
+        },
+    )
 }
 
 /// Positions of the robot or the board that are in another unit than the others.
@@ -119,12 +168,16 @@ pub(super) fn unit_mistake(input: &HandEyeInput<'_>) -> Option<Refusal> {
     Some(Refusal::new(why, remedy))
 }
 
-/// Samples that contradict each other, which more samples do not change. `scatter_mm` is the scatter of the board.
+/// Samples that contradict each other, which more samples do not change. `scatter_mm` is the
+/// scatter of the board.
 pub(super) fn contradiction(refined: &Refined, scatter_mm: f64) -> Option<Refusal> {
     /// Scatter of the board relative to its distance. Detections and robots are far more accurate.
     const MAX_FRAC: f64 = 0.05;
-    let distances: Vec<f64> =
-        refined.measurements().iter().map(|found| found.camera_from_board.translation.vector.norm()).collect();
+    let distances: Vec<f64> = refined
+        .measurements()
+        .iter()
+        .map(|found| found.camera_from_board.translation.vector.norm())
+        .collect();
     let distance_m = kinematics::quantile::median(&distances)?;
     (scatter_mm > 1e3 * MAX_FRAC * distance_m).then(|| {
         Refusal::new(
@@ -137,9 +190,14 @@ pub(super) fn contradiction(refined: &Refined, scatter_mm: f64) -> Option<Refusa
     })
 }
 
-/// Explanation by lists of robot poses and images that are off by one, if pairing each image with the robot pose of the
-/// next or the previous sample makes the samples agree.
-fn shift_mistake(input: &HandEyeInput<'_>, samples: &[Sample], found_m: f64, distance_m: f64) -> Option<Refusal> {
+/// Explanation by lists of robot poses and images that are off by one, if pairing each image with
+/// the robot pose of the next or the previous sample makes the samples agree.
+fn shift_mistake(
+    input: &HandEyeInput<'_>,
+    samples: &[Sample],
+    found_m: f64,
+    distance_m: f64,
+) -> Option<Refusal> {
     /// A shift by chance does not fit this many samples better.
     const MIN_SAMPLES: usize = 6;
     /// Better fits cannot be improved by a shift.
@@ -149,14 +207,24 @@ fn shift_mistake(input: &HandEyeInput<'_>, samples: &[Sample], found_m: f64, dis
     }
     let shifted_m = |shift: isize| {
         let moved = |sample: &Sample| {
-            let other = input.samples.get(sample.sample_ix.checked_add_signed(shift)?)?;
-            Some(Sample { a: geometry::a_of(input.setup, &other.base_from_flange), ..sample.clone() })
+            let other = input
+                .samples
+                .get(sample.sample_ix.checked_add_signed(shift)?)?;
+            Some(Sample {
+                a: geometry::a_of(input.setup, &other.base_from_flange),
+                ..sample.clone()
+            })
         };
         let moved: Vec<Sample> = samples.iter().filter_map(moved).collect();
         let is_enough = moved.len() + 1 >= MIN_SAMPLES;
-        is_enough.then(|| consensus::find(&moved)).flatten().map_or(f64::INFINITY, |found| found.median_m())
+        is_enough
+            .then(|| consensus::find(&moved))
+            .flatten()
+            .map_or(f64::INFINITY, |found| found.median_m())
     };
-    let (shift, best_m) = [(1, shifted_m(1)), (-1, shifted_m(-1))].into_iter().min_by(|a, b| a.1.total_cmp(&b.1))?;
+    let (shift, best_m) = [(1, shifted_m(1)), (-1, shifted_m(-1))]
+        .into_iter()
+        .min_by(|a, b| a.1.total_cmp(&b.1))?;
     if best_m * MUCH_BETTER > found_m.min(distance_m) {
         return None;
     }
@@ -165,15 +233,26 @@ fn shift_mistake(input: &HandEyeInput<'_>, samples: &[Sample], found_m: f64, dis
     } else {
         ("previous", "the first robot pose is missing")
     };
-    let before = if found_m.is_finite() { format!("within {:.1} mm", 1e3 * found_m) } else { "not at all".to_owned() };
-    let has_images = samples.iter().any(|sample| sample.candidates.iter().any(|candidate| candidate.corners.is_some()));
+    let before = if found_m.is_finite() {
+        format!("within {:.1} mm", 1e3 * found_m)
+    } else {
+        "not at all".to_owned()
+    };
+    let has_images = samples.iter().any(|sample| {
+        sample
+            .candidates
+            .iter()
+            .any(|candidate| candidate.corners.is_some())
+    });
     let board = if has_images { "image" } else { "board pose" };
     Some(Refusal::new(
         format!(
             "the robot poses and {board}s are off by one: the samples agree {before} (median), but within {:.1} mm if each {board} is paired with the robot pose of the {other} sample",
             1e3 * best_m
         ),
-        format!("check that both lists start with the same sample: {missing}, or one list counts from 1"),
+        format!(
+            "check that both lists start with the same sample: {missing}, or one list counts from 1"
+        ),
     ))
 }
 
@@ -192,7 +271,10 @@ fn scale_mistake(samples: &[Sample], consensus: Option<&Consensus>) -> Option<(S
     let rotation = ClosedForm::ParkMartin.solve(&motions)?.rotation;
     let (scale, sigma) = closed_form::relative_scale(&motions, rotation)?;
     // Unrelated motions have a scale near 0.
-    if scale.is_nan() || scale.abs() <= MIN_SIGMAS * sigma || (scale - 1.0).abs() < MIN_CHANGE.max(MIN_SIGMAS * sigma) {
+    if scale.is_nan()
+        || scale.abs() <= MIN_SIGMAS * sigma
+        || (scale - 1.0).abs() < MIN_CHANGE.max(MIN_SIGMAS * sigma)
+    {
         return None;
     }
     // The scale must explain the disagreement.
@@ -205,9 +287,17 @@ fn scale_mistake(samples: &[Sample], consensus: Option<&Consensus>) -> Option<(S
         return None;
     }
     /// Units and how many make a meter.
-    const UNITS: [(&str, f64); 3] = [("millimeters", 1000.0), ("centimeters", 100.0), ("inches", 39.37)];
+    const UNITS: [(&str, f64); 3] = [
+        ("millimeters", 1000.0),
+        ("centimeters", 100.0),
+        ("inches", 39.37),
+    ];
     let near = |expected: f64| (scale / expected - 1.0).abs() < 0.1;
-    let unit_of = |value: f64| UNITS.into_iter().find(|(_, per_m)| (value / per_m - 1.0).abs() < 0.1);
+    let unit_of = |value: f64| {
+        UNITS
+            .into_iter()
+            .find(|(_, per_m)| (value / per_m - 1.0).abs() < 0.1)
+    };
     let why = |body: &str, other: &str, unit: &str, per_m: f64| {
         format!(
             "the positions of {body} are {per_m} times too large relative to those of {other}: they are probably in {unit}"
@@ -220,24 +310,41 @@ fn scale_mistake(samples: &[Sample], consensus: Option<&Consensus>) -> Option<(S
             "turn off mirroring in the camera, or print the target again".to_owned(),
         )
     } else if let Some((unit, per_m)) = unit_of(scale) {
-        (why("the robot", "the board", unit, per_m), format!("divide the positions of base_from_flange by {per_m}"))
+        (
+            why("the robot", "the board", unit, per_m),
+            format!("divide the positions of base_from_flange by {per_m}"),
+        )
     } else if let Some((unit, per_m)) = unit_of(1.0 / scale) {
         (
             why("the board", "the robot", unit, per_m),
-            format!("divide the positions of camera_from_board, or the size of the board, by {per_m}"),
+            format!(
+                "divide the positions of camera_from_board, or the size of the board, by {per_m}"
+            ),
         )
     } else {
         (
-            format!("the motions of the robot are {scale:.3} times (+-{sigma:.3}) those of the board"),
+            format!(
+                "the motions of the robot are {scale:.3} times (+-{sigma:.3}) those of the board"
+            ),
             format!("check the size of the squares: it seems to be {scale:.3} times the given one"),
         )
     })
 }
 
-/// Names of the samples whose board is seen from the other side than in most samples: its corners are mirrored.
-pub(super) fn mirrored<'a>(samples: &'a [HandEyeSample], poses: &[(usize, Transform)]) -> Vec<&'a str> {
-    let is_front = |pose: &Transform| (pose.rotation * nalgebra::Vector3::z()).dot(&pose.translation.vector) > 0.0;
+/// Names of the samples whose board is seen from the other side than in most samples: its corners
+/// are mirrored.
+pub(super) fn mirrored<'a>(
+    samples: &'a [HandEyeSample],
+    poses: &[(usize, Transform)],
+) -> Vec<&'a str> {
+    let is_front = |pose: &Transform| {
+        (pose.rotation * nalgebra::Vector3::z()).dot(&pose.translation.vector) > 0.0
+    };
     let n_front = poses.iter().filter(|(_, pose)| is_front(pose)).count();
     let majority = 2 * n_front >= poses.len();
-    poses.iter().filter(|(_, pose)| is_front(pose) != majority).map(|(ix, _)| samples[*ix].name.as_str()).collect()
+    poses
+        .iter()
+        .filter(|(_, pose)| is_front(pose) != majority)
+        .map(|(ix, _)| samples[*ix].name.as_str())
+        .collect()
 }

@@ -1,10 +1,11 @@
 //! Hand-eye calibration with a target: pose of a camera on the flange or beside the robot.
 //!
-//! [`calibrate_hand_eye`] takes robot poses and, for each, the pose of a board in the camera or its corners in the image.
-//! Closed-form solutions of sample triples give an initial solution that most samples agree with. It is
-//! refined from board poses by generalized least squares, with noise variances estimated by restricted maximum
-//! likelihood, or from corners by minimizing the reprojection error, with a small unknown error of each robot pose. The
-//! result has an uncertainty and the errors of held-out samples. Input that does not determine the result is refused.
+//! [`calibrate_hand_eye`] takes robot poses and, for each, the pose of a board in the camera or its
+//! corners in the image. Closed-form solutions of sample triples give an initial solution that most
+//! samples agree with. It is refined from board poses by generalized least squares, with noise
+//! variances estimated by restricted maximum likelihood, or from corners by minimizing the
+//! reprojection error, with a small unknown error of each robot pose. The result has an uncertainty
+//! and the errors of held-out samples. Input that does not determine the result is refused.
 
 mod arm_plan;
 mod closed_form;
@@ -91,12 +92,13 @@ pub struct HandEyeInput<'a> {
     pub samples: Vec<HandEyeSample>,
     /// Lens parameters. Needed for corners; initial values if they are estimated.
     pub intrinsics: Option<Intrinsics>,
-    /// Covariance of the given intrinsics in the order of [`Intrinsics::params`], which enlarges that of the result. `None`:
-    /// the intrinsics are taken as exact. Not used if they are estimated.
+    /// Covariance of the given intrinsics in the order of [`Intrinsics::params`], which enlarges
+    /// that of the result. `None`: the intrinsics are taken as exact. Not used if they are
+    /// estimated.
     pub intrinsics_covariance: Option<DMatrix<f64>>,
-    /// Rotations of the board after which it looks the same, `board_from_equivalent_board`: for example a half turn
-    /// about the center of a chessboard whose numbers of inner corners are both even or both odd. Empty if the
-    /// orientation is unique.
+    /// Rotations of the board after which it looks the same, `board_from_equivalent_board`: for
+    /// example a half turn about the center of a chessboard whose numbers of inner corners are both
+    /// even or both odd. Empty if the orientation is unique.
     pub board_symmetries: &'a [Transform],
     /// The arm, for joint offsets.
     pub chain: Option<&'a Chain>,
@@ -109,11 +111,14 @@ pub struct HandEyeInput<'a> {
 pub struct HandEyeOptions {
     /// Estimates the intrinsics together with the hand-eye transform. Needs corners.
     pub estimate_intrinsics: bool,
-    /// Estimates offsets of the joints except the first and the last. Needs corners, joint values and a chain.
+    /// Estimates offsets of the joints except the first and the last. Needs corners, joint values
+    /// and a chain.
     pub estimate_joint_offsets: bool,
-    /// Whether the second poses are those of a board that a camera sees, so that it must be in front of the camera.
+    /// Whether the second poses are those of a board that a camera sees, so that it must be in
+    /// front of the camera.
     pub board_is_seen: bool,
-    /// Refuses a result with a larger standard deviation of the position along any direction, meters.
+    /// Refuses a result with a larger standard deviation of the position along any direction,
+    /// meters.
     pub max_sigma_m: f64,
     /// Refuses a result with a larger standard deviation of the rotation around any axis, radians.
     pub max_sigma_rad: f64,
@@ -134,11 +139,12 @@ impl Default for HandEyeOptions {
 /// Minimum number of samples.
 pub const MIN_SAMPLES: usize = 3;
 
-/// Estimates the pose of the camera on the flange (eye in hand) or in the base (eye to hand), and that of the board.
+/// Estimates the pose of the camera on the flange (eye in hand) or in the base (eye to hand), and
+/// that of the board.
 ///
 /// # Errors
-/// [`Error::Refused`] if the samples do not determine the result or contain a mistake: the message names the reason and
-/// the remedy. [`Error::HandEyeInput`] if the input is invalid.
+/// [`Error::Refused`] if the samples do not determine the result or contain a mistake: the message
+/// names the reason and the remedy. [`Error::HandEyeInput`] if the input is invalid.
 ///
 /// ```
 /// use calibration::hand_eye::{BoardObservation, HandEyeInput, HandEyeOptions, HandEyeSample, Setup, calibrate_hand_eye};
@@ -172,17 +178,33 @@ pub fn calibrate_hand_eye(input: &HandEyeInput<'_>) -> Result<HandEyeCalibration
     if let Err(refusal) = mistakes::check_magnitudes(&input.samples) {
         return Err(refused(mistakes::unit_mistake(input).unwrap_or(refusal)));
     }
-    let robot_poses: Vec<Transform> = input.samples.iter().map(|sample| sample.base_from_flange).collect();
+    let robot_poses: Vec<Transform> = input
+        .samples
+        .iter()
+        .map(|sample| sample.base_from_flange)
+        .collect();
     excitation::check_rotations(&robot_poses, "flange").map_err(refused)?;
 
-    let Sorted { usable: samples, without_board, repeated } = samples::samples(input, input.intrinsics.as_ref());
+    let Sorted {
+        usable: samples,
+        without_board,
+        repeated,
+    } = samples::samples(input, input.intrinsics.as_ref());
     if samples.len() < MIN_SAMPLES {
-        let different = if repeated.is_empty() { "" } else { "different " };
+        let different = if repeated.is_empty() {
+            ""
+        } else {
+            "different "
+        };
         let n = samples.len();
         return Err(refused(too_few(
             n,
             different,
-            if n == 1 { "has a usable view of the board" } else { "have a usable view of the board" },
+            if n == 1 {
+                "has a usable view of the board"
+            } else {
+                "have a usable view of the board"
+            },
         )));
     }
     let consensus = consensus::find(&samples);
@@ -196,7 +218,10 @@ pub fn calibrate_hand_eye(input: &HandEyeInput<'_>) -> Result<HandEyeCalibration
         )));
     };
     let refined = refine::refine(input, samples, consensus)?;
-    let used: Vec<Transform> = refined.used().map(|sample| input.samples[sample.sample_ix].base_from_flange).collect();
+    let used: Vec<Transform> = refined
+        .used()
+        .map(|sample| input.samples[sample.sample_ix].base_from_flange)
+        .collect();
     excitation::check_rotations(&used, "flange").map_err(refused)?;
     let calibration = report::report(input, &refined, &without_board, &repeated)?;
     excitation::check_uncertainty(
@@ -208,18 +233,27 @@ pub fn calibrate_hand_eye(input: &HandEyeInput<'_>) -> Result<HandEyeCalibration
     )
     .map_err(|refusal| {
         let doubt = refined.intrinsics_doubt.as_deref();
-        if let Some(refusal) = mistakes::contradiction(&refined, calibration.scatter.mm).filter(|_| doubt.is_none()) {
+        if let Some(refusal) =
+            mistakes::contradiction(&refined, calibration.scatter.mm).filter(|_| doubt.is_none())
+        {
             return refused(refusal);
         }
-        refused(with_doubt(refusal.with_warnings(&calibration.warnings, doubt), doubt))
+        refused(with_doubt(
+            refusal.with_warnings(&calibration.warnings, doubt),
+            doubt,
+        ))
     })?;
     Ok(calibration)
 }
 
-/// The refusal of an uncertain result. Wrong intrinsics are the more likely reason if the corners contradict them.
+/// The refusal of an uncertain result. Wrong intrinsics are the more likely reason if the corners
+/// contradict them.
 fn with_doubt(refusal: Refusal, doubt: Option<&str>) -> Refusal {
     match doubt {
-        Some(doubt) => Refusal { motion: format!("{doubt}; otherwise, {}", refusal.motion), ..refusal },
+        Some(doubt) => Refusal {
+            motion: format!("{doubt}; otherwise, {}", refusal.motion),
+            ..refusal
+        },
         None => refusal,
     }
 }
@@ -227,7 +261,9 @@ fn with_doubt(refusal: Refusal, doubt: Option<&str>) -> Refusal {
 fn too_few(n: usize, kind: &str, what: &str) -> Refusal {
     let samples = if n == 1 { "sample" } else { "samples" };
     Refusal::new(
-        format!("{n} {kind}{samples} {what}; at least {MIN_SAMPLES} are needed, and 12 or more are recommended"),
+        format!(
+            "{n} {kind}{samples} {what}; at least {MIN_SAMPLES} are needed, and 12 or more are recommended"
+        ),
         "add poses that rotate the flange by at least 20 degrees around different axes",
     )
 }
@@ -237,10 +273,18 @@ fn check(input: &HandEyeInput<'_>) -> Result<(), Error> {
     let invalid = |why: String| Err(Error::HandEyeInput { why });
     if input.samples.len() < MIN_SAMPLES {
         let n = input.samples.len();
-        return Err(Error::Refused(Box::new(too_few(n, "", if n == 1 { "was given" } else { "were given" }))));
+        return Err(Error::Refused(Box::new(too_few(
+            n,
+            "",
+            if n == 1 { "was given" } else { "were given" },
+        ))));
     }
     let is_view = |sample: &HandEyeSample| matches!(sample.board, BoardObservation::View(_));
-    let n_views = input.samples.iter().filter(|sample| is_view(sample)).count();
+    let n_views = input
+        .samples
+        .iter()
+        .filter(|sample| is_view(sample))
+        .count();
     if n_views != 0 && n_views != input.samples.len() {
         return invalid(format!(
             "{n_views} of {} samples have corners; give corners or poses for all",
@@ -249,21 +293,35 @@ fn check(input: &HandEyeInput<'_>) -> Result<(), Error> {
     }
     for sample in &input.samples {
         let is_rigid = |pose: &Transform| {
-            transform::is_finite(pose) && (pose.rotation.norm() - 1.0).abs() < transform::RIGID_TOLERANCE
+            transform::is_finite(pose)
+                && (pose.rotation.norm() - 1.0).abs() < transform::RIGID_TOLERANCE
         };
         if !is_rigid(&sample.base_from_flange) {
-            return invalid(format!("sample {:?}: base_from_flange is not a finite rigid transform", sample.name));
+            return invalid(format!(
+                "sample {:?}: base_from_flange is not a finite rigid transform",
+                sample.name
+            ));
         }
         match &sample.board {
             BoardObservation::Pose(pose) if !is_rigid(pose) => {
-                return invalid(format!("sample {:?}: camera_from_board is not a finite rigid transform", sample.name));
+                return invalid(format!(
+                    "sample {:?}: camera_from_board is not a finite rigid transform",
+                    sample.name
+                ));
             }
             BoardObservation::View(view) => {
                 let is_finite = |point: &crate::BoardPoint| {
-                    point.point_in_board.iter().chain(&point.pixel).all(|value| value.is_finite())
+                    point
+                        .point_in_board
+                        .iter()
+                        .chain(&point.pixel)
+                        .all(|value| value.is_finite())
                 };
                 if let Some(ix) = view.points.iter().position(|point| !is_finite(point)) {
-                    return invalid(format!("sample {:?}: corner {ix} is not finite", sample.name));
+                    return invalid(format!(
+                        "sample {:?}: corner {ix} is not finite",
+                        sample.name
+                    ));
                 }
             }
             BoardObservation::Pose(_) => (),
@@ -272,14 +330,22 @@ fn check(input: &HandEyeInput<'_>) -> Result<(), Error> {
     let options = &input.options;
     let needs_corners = options.estimate_intrinsics || options.estimate_joint_offsets;
     if needs_corners && n_views == 0 {
-        return invalid("intrinsics and joint offsets need corners, but the samples have board poses".to_owned());
+        return invalid(
+            "intrinsics and joint offsets need corners, but the samples have board poses"
+                .to_owned(),
+        );
     }
     match &input.intrinsics {
-        Some(intrinsics) => intrinsics.validate().map_err(|error| Error::HandEyeInput { why: error.to_string() })?,
-        None if n_views > 0 => return invalid("the samples have corners, but the intrinsics are missing".to_owned()),
+        Some(intrinsics) => intrinsics.validate().map_err(|error| Error::HandEyeInput {
+            why: error.to_string(),
+        })?,
+        None if n_views > 0 => {
+            return invalid("the samples have corners, but the intrinsics are missing".to_owned());
+        }
         None => (),
     }
-    if let (Some(intrinsics), Some(covariance)) = (&input.intrinsics, &input.intrinsics_covariance) {
+    if let (Some(intrinsics), Some(covariance)) = (&input.intrinsics, &input.intrinsics_covariance)
+    {
         check_covariance(covariance, intrinsics.params().len()).or_else(invalid)?;
     }
     if options.estimate_joint_offsets {
@@ -309,18 +375,27 @@ fn check_covariance(covariance: &DMatrix<f64>, n: usize) -> Result<(), String> {
     const ROUNDING: f64 = 1e-6;
     let [rows, columns] = [covariance.nrows(), covariance.ncols()];
     if [rows, columns] != [n, n] {
-        return Err(format!("the covariance of the intrinsics is {rows} x {columns}, but there are {n} parameters"));
+        return Err(format!(
+            "the covariance of the intrinsics is {rows} x {columns}, but there are {n} parameters"
+        ));
     }
     if covariance.iter().any(|value| !value.is_finite()) {
         return Err("the covariance of the intrinsics is not finite".to_owned());
     }
-    let scales = covariance.diagonal().map(|variance| variance.abs().max(f64::MIN_POSITIVE).sqrt());
-    let correlation = DMatrix::from_fn(n, n, |row, column| covariance[(row, column)] / (scales[row] * scales[column]));
+    let scales = covariance
+        .diagonal()
+        .map(|variance| variance.abs().max(f64::MIN_POSITIVE).sqrt());
+    let correlation = DMatrix::from_fn(n, n, |row, column| {
+        covariance[(row, column)] / (scales[row] * scales[column])
+    });
     let is_symmetric = (&correlation - correlation.transpose()).amax() < ROUNDING;
     let is_positive = SymmetricEigen::new(correlation).eigenvalues.min() > -ROUNDING;
     match is_symmetric && is_positive && covariance.diagonal().min() >= 0.0 {
         true => Ok(()),
-        false => Err("the covariance of the intrinsics is not symmetric and positive; copy all its digits".to_owned()),
+        false => Err(
+            "the covariance of the intrinsics is not symmetric and positive; copy all its digits"
+                .to_owned(),
+        ),
     }
 }
 
@@ -330,11 +405,19 @@ fn check_joints(samples: &[HandEyeSample], chain: &Chain) -> Result<(), Error> {
     const MAX_ROTATION_RAD: f64 = 0.1;
     let median_angle = |factor: f64| {
         let tip_from_flange = |sample: &HandEyeSample| {
-            let joints: Vec<f64> = sample.joints.iter().flatten().map(|value| factor * value).collect();
+            let joints: Vec<f64> = sample
+                .joints
+                .iter()
+                .flatten()
+                .map(|value| factor * value)
+                .collect();
             Some((chain.forward(&joints).ok()?.inverse() * sample.base_from_flange).rotation)
         };
         let rotations: Vec<_> = samples.iter().filter_map(tip_from_flange).collect();
-        let angles: Vec<f64> = rotations.iter().map(|rotation| rotation.angle_to(&rotations[0])).collect();
+        let angles: Vec<f64> = rotations
+            .iter()
+            .map(|rotation| rotation.angle_to(&rotations[0]))
+            .collect();
         kinematics::quantile::median(&angles).unwrap_or(0.0)
     };
     let found = median_angle(1.0);
@@ -347,6 +430,8 @@ fn check_joints(samples: &[HandEyeSample], chain: &Chain) -> Result<(), Error> {
     };
     let degrees = found.to_degrees();
     Err(Error::HandEyeInput {
-        why: format!("the joints and base_from_flange disagree by {degrees:.0} degrees (median); {hint}"),
+        why: format!(
+            "the joints and base_from_flange disagree by {degrees:.0} degrees (median); {hint}"
+        ),
     })
 }

@@ -1,7 +1,8 @@
 //! Suggests the next robot poses by information gain.
 //!
-//! Candidates keep the board in view at a distance and tilt at which it is detected well. Poses are selected greedily such
-//! that the volume of the hand-eye uncertainty shrinks most (D-optimality; Fedorov 1972, section 2.2).
+//! Candidates keep the board in view at a distance and tilt at which it is detected well. Poses are
+//! selected greedily such that the volume of the hand-eye uncertainty shrinks most (D-optimality;
+//! Fedorov 1972, section 2.2).
 
 use super::excitation;
 use super::geometry;
@@ -39,7 +40,8 @@ pub struct NextPose {
     pub joints: Option<Vec<f64>>,
     /// The motion from the closest sample, as a sentence.
     pub motion: String,
-    /// Its rotation relative to this sample, for example `rotated by 20 degrees about the camera's x axis relative to pose 3`.
+    /// Its rotation relative to this sample, for example `rotated by 20 degrees about the camera's
+    /// x axis relative to pose 3`.
     pub relation: String,
     /// Factor by which the standard deviations of the hand-eye transform shrink on average, 0 to 1.
     pub sigma_frac: f64,
@@ -47,15 +49,20 @@ pub struct NextPose {
 
 /// Suggests poses for a finished calibration. `input` must be that of the calibration.
 ///
-/// With a [`Reach`], candidates are poses around the board to which the arm moves within it. With a chain and joint values,
-/// they are configurations near those of the samples, within the joint limits. Without, they are flange poses that rotate
-/// the camera around the board or about its own axes; the caller must check that the arm reaches them.
+/// With a [`Reach`], candidates are poses around the board to which the arm moves within it. With a
+/// chain and joint values, they are configurations near those of the samples, within the joint
+/// limits. Without, they are flange poses that rotate the camera around the board or about its own
+/// axes; the caller must check that the arm reaches them.
 pub fn suggest_next_poses(
     input: &HandEyeInput<'_>,
     calibration: &HandEyeCalibration,
     options: &NextPoseOptions<'_>,
 ) -> Vec<NextPose> {
-    let scene = Scene { input, calibration, options };
+    let scene = Scene {
+        input,
+        calibration,
+        options,
+    };
     let mut information = match calibration.refined.covariance.clone().try_inverse() {
         Some(information) => information,
         None => return Vec::new(),
@@ -63,20 +70,26 @@ pub fn suggest_next_poses(
     let candidates = scene.candidates();
     let mut suggested: Vec<NextPose> = Vec::new();
     for _ in 0..options.n_poses {
-        let Some(before) = log_volume(&information) else { break };
+        let Some(before) = log_volume(&information) else {
+            break;
+        };
         let gain = |candidate: &Candidate| {
             let with = &information + &candidate.information;
             log_volume(&with).map_or(0.0, |after| before - after)
         };
         let is_new = |candidate: &&Candidate| {
-            suggested.iter().all(|earlier| earlier.base_from_flange != candidate.base_from_flange)
+            suggested
+                .iter()
+                .all(|earlier| earlier.base_from_flange != candidate.base_from_flange)
         };
         let best = candidates
             .iter()
             .filter(is_new)
             .map(|candidate| (gain(candidate), candidate))
             .max_by(|a, b| a.0.total_cmp(&b.0));
-        let Some((gain, best)) = best.filter(|(gain, _)| *gain > 0.0) else { break };
+        let Some((gain, best)) = best.filter(|(gain, _)| *gain > 0.0) else {
+            break;
+        };
         information += &best.information;
         let [motion, relation] = scene.motion(best);
         suggested.push(NextPose {
@@ -116,9 +129,13 @@ impl Scene<'_> {
         const TRIALS: usize = 1500;
         let refined = &self.calibration.refined;
         let used: Vec<usize> = refined.used().map(|sample| sample.sample_ix).collect();
-        let distances: Vec<f64> =
-            refined.measurements().iter().map(|m| m.camera_from_board.translation.vector.norm()).collect();
-        let (Some(distance_m), false) = (kinematics::quantile::median(&distances), used.is_empty()) else {
+        let distances: Vec<f64> = refined
+            .measurements()
+            .iter()
+            .map(|m| m.camera_from_board.translation.vector.norm())
+            .collect();
+        let (Some(distance_m), false) = (kinematics::quantile::median(&distances), used.is_empty())
+        else {
             return Vec::new();
         };
         let unit_covariance = self.mean_unit_covariance();
@@ -129,20 +146,35 @@ impl Scene<'_> {
                 let (base_from_flange, joints) = self.moved(sample_ix, &mut random)?;
                 let a = geometry::a_of(self.input.setup, &base_from_flange);
                 let camera_from_board = refined.solution.camera_from_board(&a);
-                self.is_well_visible(&camera_from_board, distance_m).then_some(())?;
+                self.is_well_visible(&camera_from_board, distance_m)
+                    .then_some(())?;
                 // Inverse kinematics last, because it takes longest.
                 let joints = match &self.options.reach {
                     Some((reach, current)) => Some(reach.joints_for(&base_from_flange, current)?),
                     None => joints,
                 };
-                let measurement =
-                    Measurement { stop_ix: usize::MAX, weight: 1.0, a, camera_from_board, unit_covariance };
-                let (jacobian, weight) =
-                    report::residual_information(self.input.setup, &measurement, &refined.solution, &refined.noise)?;
+                let measurement = Measurement {
+                    stop_ix: usize::MAX,
+                    weight: 1.0,
+                    a,
+                    camera_from_board,
+                    unit_covariance,
+                };
+                let (jacobian, weight) = report::residual_information(
+                    self.input.setup,
+                    &measurement,
+                    &refined.solution,
+                    &refined.noise,
+                )?;
                 let information = DMatrix::from_fn(12, 12, |row, column| {
                     (jacobian.column(row).transpose() * weight * jacobian.column(column))[0]
                 });
-                Some(Candidate { base_from_flange, joints, sample_ix, information })
+                Some(Candidate {
+                    base_from_flange,
+                    joints,
+                    sample_ix,
+                    information,
+                })
             })
             .collect()
     }
@@ -151,19 +183,33 @@ impl Scene<'_> {
     fn mean_unit_covariance(&self) -> Option<Matrix6<f64>> {
         let measurements = self.calibration.refined.measurements();
         let n = measurements.len() as f64;
-        measurements.iter().map(|m| m.unit_covariance).sum::<Option<Matrix6<f64>>>().map(|sum| sum / n)
+        measurements
+            .iter()
+            .map(|m| m.unit_covariance)
+            .sum::<Option<Matrix6<f64>>>()
+            .map(|sum| sum / n)
     }
 
     /// A random pose near that of a sample.
-    fn moved(&self, sample_ix: usize, random: &mut Random) -> Option<(Transform, Option<Vec<f64>>)> {
+    fn moved(
+        &self,
+        sample_ix: usize,
+        random: &mut Random,
+    ) -> Option<(Transform, Option<Vec<f64>>)> {
         const MAX_JOINT_CHANGE: f64 = 0.8;
         const MAX_ROTATION_RAD: f64 = 0.9;
         let sample = &self.input.samples[sample_ix];
-        if let (None, Some(chain), Some(joints)) = (&self.options.reach, self.input.chain, &sample.joints) {
-            let moved: Vec<f64> =
-                joints.iter().map(|joint| joint + MAX_JOINT_CHANGE * random.uniform(-1.0, 1.0)).collect();
-            let is_allowed =
-                moved.iter().zip(chain.limits()).all(|(joint, limit)| (limit.lower..=limit.upper).contains(joint));
+        if let (None, Some(chain), Some(joints)) =
+            (&self.options.reach, self.input.chain, &sample.joints)
+        {
+            let moved: Vec<f64> = joints
+                .iter()
+                .map(|joint| joint + MAX_JOINT_CHANGE * random.uniform(-1.0, 1.0))
+                .collect();
+            let is_allowed = moved
+                .iter()
+                .zip(chain.limits())
+                .all(|(joint, limit)| (limit.lower..=limit.upper).contains(joint));
             let before = chain.forward(joints).ok()?;
             let pose = chain.forward(&moved).ok()? * before.inverse() * sample.base_from_flange;
             return is_allowed.then_some((pose, Some(moved)));
@@ -182,11 +228,17 @@ impl Scene<'_> {
         if self.options.reach.is_none() {
             return Some((turned, None));
         }
-        // An arm also changes the distance and the place of the board in the image, which a person does anyway.
-        let distance_m =
-            (solution.camera_from_board(&geometry::a_of(self.input.setup, &turned))).translation.vector.norm();
+        // An arm also changes the distance and the place of the board in the image, which a person
+        // does anyway.
+        let distance_m = (solution.camera_from_board(&geometry::a_of(self.input.setup, &turned)))
+            .translation
+            .vector
+            .norm();
         let shift = Vector3::from_fn(|_, _| 0.1 * distance_m * random.uniform(-1.0, 1.0));
-        Some((Transform::from_parts((turned.translation.vector + shift).into(), turned.rotation), None))
+        Some((
+            Transform::from_parts((turned.translation.vector + shift).into(), turned.rotation),
+            None,
+        ))
     }
 
     fn is_well_visible(&self, camera_from_board: &Transform, distance_m: f64) -> bool {
@@ -208,10 +260,15 @@ impl Scene<'_> {
         }
         let rim = (0..8).map(|step| {
             let (sine, cosine) = (f64::from(step) * std::f64::consts::FRAC_PI_4).sin_cos();
-            let point = self.options.center_in_board + Vector3::new(cosine, sine, 0.0) * self.options.radius_m;
+            let point = self.options.center_in_board
+                + Vector3::new(cosine, sine, 0.0) * self.options.radius_m;
             (camera_from_board * Point3::from(point)).coords
         });
-        let margin_frac = if self.options.reach.is_some() { ARM_MARGIN_FRAC } else { MARGIN_FRAC };
+        let margin_frac = if self.options.reach.is_some() {
+            ARM_MARGIN_FRAC
+        } else {
+            MARGIN_FRAC
+        };
         let is_inside = |intrinsics: &Intrinsics, point: &Vector3<f64>| {
             intrinsics.project(point).is_some_and(|pixel| {
                 (0..2).all(|axis| {
@@ -222,7 +279,9 @@ impl Scene<'_> {
         };
         match &self.calibration.refined.intrinsics {
             Some(intrinsics) => rim.into_iter().all(|point| is_inside(intrinsics, &point)),
-            None => rim.into_iter().all(|point| point.z > 0.0 && point.xy().norm() < HALF_VIEW_RAD.tan() * point.z),
+            None => rim
+                .into_iter()
+                .all(|point| point.z > 0.0 && point.xy().norm() < HALF_VIEW_RAD.tan() * point.z),
         }
     }
 
@@ -238,7 +297,11 @@ impl Scene<'_> {
         };
         let vector = rotation.rotation.scaled_axis();
         let angle_deg = vector.norm().to_degrees();
-        let axis = if vector.norm() > 0.0 { vector.normalize() } else { Vector3::z() };
+        let axis = if vector.norm() > 0.0 {
+            vector.normalize()
+        } else {
+            Vector3::z()
+        };
         let signed_deg = angle_deg * axis[axis.iamax()].signum();
         let name = excitation::axis_name(&axis, body);
         let moved = match self.input.setup {
@@ -246,8 +309,12 @@ impl Scene<'_> {
             Setup::EyeToHand => old_from_new.translation.vector,
         };
         // Adding zero turns a negative zero into a positive one.
-        let [right, down, forward]: [f64; 3] = moved.map(|meters| (1e3 * meters).round() + 0.0).into();
-        let relation = format!("rotated by {signed_deg:.0} degrees about {name} relative to {}", sample.name);
+        let [right, down, forward]: [f64; 3] =
+            moved.map(|meters| (1e3 * meters).round() + 0.0).into();
+        let relation = format!(
+            "rotated by {signed_deg:.0} degrees about {name} relative to {}",
+            sample.name
+        );
         let motion = format!(
             "from the pose of {:?}, rotate the flange by {signed_deg:.0} degrees around {name} and move it by ({right}, {down}, {forward}) mm along the {body}'s x, y and z axes",
             sample.name

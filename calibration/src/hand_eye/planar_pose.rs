@@ -1,7 +1,9 @@
-//! Pose of a planar board from its corners in one image, with both solutions of the two-fold ambiguity.
+//! Pose of a planar board from its corners in one image, with both solutions of the two-fold
+//! ambiguity.
 //!
-//! The initial poses follow from the homography at the center of the board (Collins and Bartoli 2014, "Infinitesimal
-//! plane-based pose estimation", section 4.3). Both are refined by minimizing the reprojection error.
+//! The initial poses follow from the homography at the center of the board (Collins and Bartoli
+//! 2014, "Infinitesimal plane-based pose estimation", section 4.3). Both are refined by minimizing
+//! the reprojection error.
 
 use super::closed_form::nearest_rotation;
 use crate::intrinsics::board_pose::moved;
@@ -10,20 +12,24 @@ use crate::least_squares::{self, BlockSums, Loss};
 use crate::{BoardPoint, BoardView};
 use kinematics::random::Random;
 use kinematics::{Intrinsics, Transform};
-use nalgebra::{DVector, Matrix2, Matrix2x3, Matrix3, Matrix6, Rotation3, UnitQuaternion, Vector2, Vector3, Vector6};
+use nalgebra::{
+    DVector, Matrix2, Matrix2x3, Matrix3, Matrix6, Rotation3, UnitQuaternion, Vector2, Vector3,
+    Vector6,
+};
 
 /// Minimum number of corners for a pose.
 pub(super) const MIN_CORNERS: usize = 4;
 
-/// Threshold of the robust loss, pixels. Corners of sharp images are accurate to a tenth of a pixel.
+/// Threshold of the robust loss, pixels. Corners of sharp images are accurate to a tenth of a
+/// pixel.
 const LOSS_THRESHOLD_PX: f64 = 1.0;
 
 /// A pose of the board and its quality.
 #[derive(Clone, Debug)]
 pub(super) struct BoardPose {
     pub(super) camera_from_board: Transform,
-    /// Information about a small rotation (in camera axes) and translation of the board for corners with an error of
-    /// one pixel: see [`moved`].
+    /// Information about a small rotation (in camera axes) and translation of the board for corners
+    /// with an error of one pixel: see [`moved`].
     pub(super) information: Matrix6<f64>,
     /// Sum of the squared residuals of the inliers, square pixels.
     pub(super) squares_px2: f64,
@@ -33,43 +39,73 @@ pub(super) struct BoardPose {
 
 impl BoardPose {
     pub(super) fn n_inliers(&self) -> usize {
-        self.is_inlier.iter().filter(|is_inlier| **is_inlier).count()
+        self.is_inlier
+            .iter()
+            .filter(|is_inlier| **is_inlier)
+            .count()
     }
 }
 
-/// The poses that explain the corners, best first: one or two. Empty if the corners do not determine a pose. Corners
-/// beyond the range of the lens model are outliers.
+/// The poses that explain the corners, best first: one or two. Empty if the corners do not
+/// determine a pose. Corners beyond the range of the lens model are outliers.
 pub(super) fn board_poses(view: &BoardView, intrinsics: &Intrinsics) -> Vec<BoardPose> {
     let ray = |point: &BoardPoint| intrinsics.unproject(point.pixel).map(|ray| ray.xy());
     let rays: Vec<Option<Vector2<f64>>> = view.points.iter().map(ray).collect();
-    let seen = view.points.iter().zip(&rays).filter(|(_, ray)| ray.is_some()).map(|(point, _)| *point);
+    let seen = view
+        .points
+        .iter()
+        .zip(&rays)
+        .filter(|(_, ray)| ray.is_some())
+        .map(|(point, _)| *point);
     let seen: Vec<BoardPoint> = seen.collect();
-    let mut poses = poses_in_range(&seen, &rays.iter().flatten().copied().collect::<Vec<_>>(), intrinsics);
+    let mut poses = poses_in_range(
+        &seen,
+        &rays.iter().flatten().copied().collect::<Vec<_>>(),
+        intrinsics,
+    );
     for pose in &mut poses {
         let mut of_seen = std::mem::take(&mut pose.is_inlier).into_iter();
-        pose.is_inlier = rays.iter().map(|ray| ray.is_some() && of_seen.next().unwrap_or(false)).collect();
+        pose.is_inlier = rays
+            .iter()
+            .map(|ray| ray.is_some() && of_seen.next().unwrap_or(false))
+            .collect();
     }
     poses
 }
 
 /// [`board_poses`] of corners in the range of the lens model.
-fn poses_in_range(points: &[BoardPoint], rays: &[Vector2<f64>], intrinsics: &Intrinsics) -> Vec<BoardPose> {
-    let Some(plane) = Plane::new(points) else { return Vec::new() };
+fn poses_in_range(
+    points: &[BoardPoint],
+    rays: &[Vector2<f64>],
+    intrinsics: &Intrinsics,
+) -> Vec<BoardPose> {
+    let Some(plane) = Plane::new(points) else {
+        return Vec::new();
+    };
     let all = vec![true; points.len()];
     let attempt = |is_inlier: &[bool]| -> Vec<BoardPose> {
-        let Some(homography) = homography(&plane.points, rays, is_inlier) else { return Vec::new() };
+        let Some(homography) = homography(&plane.points, rays, is_inlier) else {
+            return Vec::new();
+        };
         let mut poses: Vec<BoardPose> = initial_rotations(&homography)
             .into_iter()
             .filter_map(|rotation| {
                 let camera_from_plane = with_translation(rotation, &plane.points, rays, is_inlier)?;
-                refine(camera_from_plane * plane.plane_from_board, points, intrinsics, is_inlier)
+                refine(
+                    camera_from_plane * plane.plane_from_board,
+                    points,
+                    intrinsics,
+                    is_inlier,
+                )
             })
             .collect();
         poses.sort_by(|a, b| a.squares_px2.total_cmp(&b.squares_px2));
         poses
     };
     let mut poses = attempt(&all);
-    let has_outliers = poses.first().is_none_or(|best| best.n_inliers() < points.len());
+    let has_outliers = poses
+        .first()
+        .is_none_or(|best| best.n_inliers() < points.len());
     if has_outliers && let Some(consensus) = consensus_corners(&plane.points, rays, intrinsics) {
         let robust = attempt(&consensus);
         let n_inliers = |poses: &[BoardPose]| poses.first().map_or(0, BoardPose::n_inliers);
@@ -100,10 +136,16 @@ impl Plane {
     fn new(points: &[BoardPoint]) -> Option<Self> {
         const MIN_WIDTH_RATIO: f64 = 1e-3;
         (points.len() >= MIN_CORNERS).then_some(())?;
-        let centroid = points.iter().map(|point| point.point_in_board).sum::<Vector3<f64>>() / points.len() as f64;
+        let centroid = points
+            .iter()
+            .map(|point| point.point_in_board)
+            .sum::<Vector3<f64>>()
+            / points.len() as f64;
         let spread: Matrix3<f64> = points
             .iter()
-            .map(|point| (point.point_in_board - centroid) * (point.point_in_board - centroid).transpose())
+            .map(|point| {
+                (point.point_in_board - centroid) * (point.point_in_board - centroid).transpose()
+            })
             .sum();
         if !spread.iter().all(|value| value.is_finite()) {
             return None;
@@ -112,25 +154,48 @@ impl Plane {
         let mut order = [0, 1, 2];
         order.sort_by(|&i, &j| eigen.eigenvalues[j].total_cmp(&eigen.eigenvalues[i]));
         let [first, second, _] = order;
-        (eigen.eigenvalues[second] > MIN_WIDTH_RATIO.powi(2) * eigen.eigenvalues[first]).then_some(())?;
-        let (x, y) = (eigen.eigenvectors.column(first).into_owned(), eigen.eigenvectors.column(second).into_owned());
+        (eigen.eigenvalues[second] > MIN_WIDTH_RATIO.powi(2) * eigen.eigenvalues[first])
+            .then_some(())?;
+        let (x, y) = (
+            eigen.eigenvectors.column(first).into_owned(),
+            eigen.eigenvectors.column(second).into_owned(),
+        );
         let axes = Matrix3::from_rows(&[x.transpose(), y.transpose(), x.cross(&y).transpose()]);
-        let rotation = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(axes));
+        let rotation =
+            UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(axes));
         let plane_from_board = Transform::from_parts((rotation * -centroid).into(), rotation);
-        let in_plane =
-            |point: &BoardPoint| (plane_from_board * nalgebra::Point3::from(point.point_in_board)).coords.xy();
-        Some(Self { plane_from_board, points: points.iter().map(in_plane).collect() })
+        let in_plane = |point: &BoardPoint| {
+            (plane_from_board * nalgebra::Point3::from(point.point_in_board))
+                .coords
+                .xy()
+        };
+        Some(Self {
+            plane_from_board,
+            points: points.iter().map(in_plane).collect(),
+        })
     }
 }
 
-/// Homography from the plane to the plane `z = 1` of the camera, scaled such that the last element is 1. `None` if it is
-/// not determined.
-fn homography(points: &[Vector2<f64>], rays: &[Vector2<f64>], is_used: &[bool]) -> Option<Matrix3<f64>> {
-    let used: Vec<(Vector2<f64>, Vector2<f64>)> =
-        points.iter().zip(rays).zip(is_used).filter(|(_, used)| **used).map(|((p, r), _)| (*p, *r)).collect();
+/// Homography from the plane to the plane `z = 1` of the camera, scaled such that the last element
+/// is 1. `None` if it is not determined.
+fn homography(
+    points: &[Vector2<f64>],
+    rays: &[Vector2<f64>],
+    is_used: &[bool],
+) -> Option<Matrix3<f64>> {
+    let used: Vec<(Vector2<f64>, Vector2<f64>)> = points
+        .iter()
+        .zip(rays)
+        .zip(is_used)
+        .filter(|(_, used)| **used)
+        .map(|((p, r), _)| (*p, *r))
+        .collect();
     let matrix = homography::homography(&used)?;
     let scaled = matrix / matrix[(2, 2)];
-    scaled.iter().all(|value| value.is_finite()).then_some(scaled)
+    scaled
+        .iter()
+        .all(|value| value.is_finite())
+        .then_some(scaled)
 }
 
 /// Both rotations that the homography allows at the origin of the plane.
@@ -143,9 +208,12 @@ fn initial_rotations(homography: &Matrix3<f64>) -> Vec<UnitQuaternion<f64>> {
         h[(1, 0)] - h[(2, 0)] * v.y,
         h[(1, 1)] - h[(2, 1)] * v.y,
     );
-    let to_ray = Rotation3::rotation_between(&Vector3::z(), &v.push(1.0)).unwrap_or_else(Rotation3::identity);
+    let to_ray = Rotation3::rotation_between(&Vector3::z(), &v.push(1.0))
+        .unwrap_or_else(Rotation3::identity);
     let projection = Matrix2x3::new(1.0, 0.0, -v.x, 0.0, 1.0, -v.y) * to_ray.matrix();
-    let Some(inverse) = projection.fixed_view::<2, 2>(0, 0).try_inverse() else { return Vec::new() };
+    let Some(inverse) = projection.fixed_view::<2, 2>(0, 0).try_inverse() else {
+        return Vec::new();
+    };
     let scaled = inverse * jacobian;
     let largest = scaled.singular_values().max();
     if largest.is_nan() || largest <= 0.0 {
@@ -153,7 +221,10 @@ fn initial_rotations(homography: &Matrix3<f64>) -> Vec<UnitQuaternion<f64>> {
     }
     let upper = scaled / largest;
     let rest = Matrix2::identity() - upper.transpose() * upper;
-    let (b0, b1) = (rest[(0, 0)].max(0.0).sqrt(), rest[(1, 1)].max(0.0).sqrt() * rest[(0, 1)].signum());
+    let (b0, b1) = (
+        rest[(0, 0)].max(0.0).sqrt(),
+        rest[(1, 1)].max(0.0).sqrt() * rest[(0, 1)].signum(),
+    );
     [1.0, -1.0]
         .into_iter()
         .filter_map(|sign| {
@@ -165,7 +236,8 @@ fn initial_rotations(homography: &Matrix3<f64>) -> Vec<UnitQuaternion<f64>> {
         .collect()
 }
 
-/// Adds the translation with the least squared algebraic error. `None` if it places the board behind the camera.
+/// Adds the translation with the least squared algebraic error. `None` if it places the board
+/// behind the camera.
 fn with_translation(
     rotation: UnitQuaternion<f64>,
     points: &[Vector2<f64>],
@@ -173,7 +245,12 @@ fn with_translation(
     is_used: &[bool],
 ) -> Option<Transform> {
     let (mut normal, mut right) = (Matrix3::zeros(), Vector3::zeros());
-    for ((point, ray), _) in points.iter().zip(rays).zip(is_used).filter(|(_, used)| **used) {
+    for ((point, ray), _) in points
+        .iter()
+        .zip(rays)
+        .zip(is_used)
+        .filter(|(_, used)| **used)
+    {
         let rotated = rotation * point.push(0.0);
         let rows = Matrix2x3::new(1.0, 0.0, -ray.x, 0.0, 1.0, -ray.y);
         normal += rows.transpose() * rows;
@@ -218,34 +295,75 @@ impl least_squares::Problem for Reprojection<'_> {
     }
 }
 
-/// Reprojection error in pixels and its derivatives with respect to the step of [`moved`], one array per component.
-fn residual(pose: &Transform, point: &BoardPoint, intrinsics: &Intrinsics) -> Option<([f64; 2], [[f64; 6]; 2])> {
+/// Reprojection error in pixels and its derivatives with respect to the step of [`moved`], one
+/// array per component.
+fn residual(
+    pose: &Transform,
+    point: &BoardPoint,
+    intrinsics: &Intrinsics,
+) -> Option<([f64; 2], [[f64; 6]; 2])> {
     let rotated = pose.rotation * point.point_in_board;
-    let (pixel, by_point) = intrinsics.project_with_jacobian(&(rotated + pose.translation.vector))?;
+    let (pixel, by_point) =
+        intrinsics.project_with_jacobian(&(rotated + pose.translation.vector))?;
     let by_rotation = -by_point * rotated.cross_matrix();
-    let row =
-        |axis: usize| std::array::from_fn(|ix| if ix < 3 { by_rotation[(axis, ix)] } else { by_point[(axis, ix - 3)] });
-    Some(([pixel[0] - point.pixel[0], pixel[1] - point.pixel[1]], [row(0), row(1)]))
+    let row = |axis: usize| {
+        std::array::from_fn(|ix| {
+            if ix < 3 {
+                by_rotation[(axis, ix)]
+            } else {
+                by_point[(axis, ix - 3)]
+            }
+        })
+    };
+    Some((
+        [pixel[0] - point.pixel[0], pixel[1] - point.pixel[1]],
+        [row(0), row(1)],
+    ))
 }
 
-fn refine(initial: Transform, points: &[BoardPoint], intrinsics: &Intrinsics, is_used: &[bool]) -> Option<BoardPose> {
-    let used = points.iter().zip(is_used).filter(|(_, used)| **used).map(|(point, _)| point);
-    let problem = Reprojection { points: used.collect(), intrinsics, distance_m: initial.translation.vector.norm() };
+fn refine(
+    initial: Transform,
+    points: &[BoardPoint],
+    intrinsics: &Intrinsics,
+    is_used: &[bool],
+) -> Option<BoardPose> {
+    let used = points
+        .iter()
+        .zip(is_used)
+        .filter(|(_, used)| **used)
+        .map(|(point, _)| point);
+    let problem = Reprojection {
+        points: used.collect(),
+        intrinsics,
+        distance_m: initial.translation.vector.norm(),
+    };
     let options = least_squares::Options {
-        loss: Loss::Huber { threshold: LOSS_THRESHOLD_PX },
+        loss: Loss::Huber {
+            threshold: LOSS_THRESHOLD_PX,
+        },
         max_steps: 50,
         ..least_squares::Options::default()
     };
-    let pose = least_squares::minimize(&problem, initial, &options).ok()?.state;
+    let pose = least_squares::minimize(&problem, initial, &options)
+        .ok()?
+        .state;
     let errors: Vec<f64> = points
         .iter()
-        .map(|point| residual(&pose, point, intrinsics).map_or(f64::INFINITY, |(error, _)| error[0].hypot(error[1])))
+        .map(|point| {
+            residual(&pose, point, intrinsics)
+                .map_or(f64::INFINITY, |(error, _)| error[0].hypot(error[1]))
+        })
         .collect();
     let limit = inlier_limit(&errors);
     let is_inlier: Vec<bool> = errors.iter().map(|error| *error <= limit).collect();
     let mut information = Matrix6::zeros();
     let mut squares_px2 = 0.0;
-    for ((point, error), _) in points.iter().zip(&errors).zip(&is_inlier).filter(|(_, is_inlier)| **is_inlier) {
+    for ((point, error), _) in points
+        .iter()
+        .zip(&errors)
+        .zip(&is_inlier)
+        .filter(|(_, is_inlier)| **is_inlier)
+    {
         let (_, rows) = residual(&pose, point, intrinsics)?;
         for row in rows {
             let row = Vector6::from(row);
@@ -254,12 +372,18 @@ fn refine(initial: Transform, points: &[BoardPoint], intrinsics: &Intrinsics, is
         squares_px2 += error * error;
     }
     information.cholesky()?;
-    Some(BoardPose { camera_from_board: pose, information, squares_px2, is_inlier })
+    Some(BoardPose {
+        camera_from_board: pose,
+        information,
+        squares_px2,
+        is_inlier,
+    })
 }
 
-/// The pose after one Gauss-Newton step from `predicted`, and the covariance of the step for corners with an error of one
-/// pixel. For a board that faces the camera, a pose near the true one describes the corners better than the best one,
-/// because small tilts change the corners only in second order.
+/// The pose after one Gauss-Newton step from `predicted`, and the covariance of the step for
+/// corners with an error of one pixel. For a board that faces the camera, a pose near the true one
+/// describes the corners better than the best one, because small tilts change the corners only in
+/// second order.
 pub(super) fn stepped(
     predicted: &Transform,
     points: &[BoardPoint],
@@ -289,9 +413,13 @@ fn inlier_limit(errors: &[f64]) -> f64 {
     (DEVIATIONS * median / MEDIAN_OF_NORM).max(MIN_PX)
 }
 
-/// The largest set of corners found that agrees with a homography of four of them (Fischler and Bolles 1981). `None` if
-/// it has fewer than half of the corners.
-fn consensus_corners(points: &[Vector2<f64>], rays: &[Vector2<f64>], intrinsics: &Intrinsics) -> Option<Vec<bool>> {
+/// The largest set of corners found that agrees with a homography of four of them (Fischler and
+/// Bolles 1981). `None` if it has fewer than half of the corners.
+fn consensus_corners(
+    points: &[Vector2<f64>],
+    rays: &[Vector2<f64>],
+    intrinsics: &Intrinsics,
+) -> Option<Vec<bool>> {
     const TRIALS: usize = 150; // Finds four good corners with 99.99 % probability if half of them are wrong.
     const ALLOWED_PX: f64 = 3.0;
     let n = points.len();
@@ -303,8 +431,12 @@ fn consensus_corners(points: &[Vector2<f64>], rays: &[Vector2<f64>], intrinsics:
     for _ in 0..TRIALS {
         random.shuffle(&mut order);
         let mut is_used = vec![false; n];
-        order[..MIN_CORNERS].iter().for_each(|&ix| is_used[ix] = true);
-        let Some(matrix) = homography(points, rays, &is_used) else { continue };
+        order[..MIN_CORNERS]
+            .iter()
+            .for_each(|&ix| is_used[ix] = true);
+        let Some(matrix) = homography(points, rays, &is_used) else {
+            continue;
+        };
         let agrees = |(point, ray): (&Vector2<f64>, &Vector2<f64>)| {
             let image = matrix * point.push(1.0);
             image.z > 0.0 && (image.xy() / image.z - ray).norm() < allowed
@@ -326,19 +458,38 @@ mod tests {
     fn only_the_corner_beyond_the_lens_model_is_dropped() {
         // With this distortion, no point is imaged far from the center.
         let lens = kinematics::Lens::BrownConrady([-0.3, 0.0, 0.0, 0.0, 0.0]);
-        let intrinsics = Intrinsics { lens, ..scene::intrinsics() };
+        let intrinsics = Intrinsics {
+            lens,
+            ..scene::intrinsics()
+        };
         let pose = Transform::new(Vector3::new(-0.05, 0.02, 0.6), Vector3::new(0.4, -0.3, 0.2));
         let image = |point_in_board: Vector3<f64>| {
-            let pixel = intrinsics.project(&(pose * nalgebra::Point3::from(point_in_board)).coords)?;
-            Some(BoardPoint { point_in_board, pixel })
+            let pixel =
+                intrinsics.project(&(pose * nalgebra::Point3::from(point_in_board)).coords)?;
+            Some(BoardPoint {
+                point_in_board,
+                pixel,
+            })
         };
-        let points: Vec<BoardPoint> = scene::board_points().into_iter().filter_map(image).collect();
-        let mut view = BoardView { name: "view".to_owned(), points };
+        let points: Vec<BoardPoint> = scene::board_points()
+            .into_iter()
+            .filter_map(image)
+            .collect();
+        let mut view = BoardView {
+            name: "view".to_owned(),
+            points,
+        };
         view.points[7].pixel = [1e4, -2e4];
         assert!(intrinsics.unproject(view.points[7].pixel).is_none());
         let found = &board_poses(&view, &intrinsics)[0];
-        assert!((found.camera_from_board.translation.vector - pose.translation.vector).norm() < 1e-8);
-        assert!(!found.is_inlier[7] && found.n_inliers() == view.points.len() - 1, "{:?}", found.is_inlier);
+        assert!(
+            (found.camera_from_board.translation.vector - pose.translation.vector).norm() < 1e-8
+        );
+        assert!(
+            !found.is_inlier[7] && found.n_inliers() == view.points.len() - 1,
+            "{:?}",
+            found.is_inlier
+        );
     }
 
     #[test]
@@ -348,7 +499,10 @@ mod tests {
             let pose = Transform::new(Vector3::new(-0.05, 0.02, 0.6), rotation.into());
             let view = scene::view(&pose, 0.0, &mut Random::new(1));
             let found = &board_poses(&view, &intrinsics)[0];
-            assert!((found.camera_from_board.translation.vector - pose.translation.vector).norm() < 1e-8);
+            assert!(
+                (found.camera_from_board.translation.vector - pose.translation.vector).norm()
+                    < 1e-8
+            );
             assert!(found.camera_from_board.rotation.angle_to(&pose.rotation) < 1e-7);
         }
     }
@@ -360,9 +514,17 @@ mod tests {
         let view = scene::view(&pose, 0.1, &mut Random::new(2));
         let found = board_poses(&view, &intrinsics);
         assert_eq!(found.len(), 2);
-        let closest = found.iter().map(|found| found.camera_from_board.rotation.angle_to(&pose.rotation));
+        let closest = found
+            .iter()
+            .map(|found| found.camera_from_board.rotation.angle_to(&pose.rotation));
         assert!(closest.fold(f64::INFINITY, f64::min) < 0.1);
-        assert!(found[0].camera_from_board.rotation.angle_to(&found[1].camera_from_board.rotation) > 0.2);
+        assert!(
+            found[0]
+                .camera_from_board
+                .rotation
+                .angle_to(&found[1].camera_from_board.rotation)
+                > 0.2
+        );
     }
 
     #[test]
@@ -375,8 +537,16 @@ mod tests {
             point.pixel = [random.uniform(0.0, 1280.0), random.uniform(0.0, 720.0)];
         }
         let found = &board_poses(&view, &intrinsics)[0];
-        assert!((found.camera_from_board.translation.vector - pose.translation.vector).norm() < 1e-3);
-        assert!(found.is_inlier.iter().step_by(3).all(|is_inlier| !is_inlier));
+        assert!(
+            (found.camera_from_board.translation.vector - pose.translation.vector).norm() < 1e-3
+        );
+        assert!(
+            found
+                .is_inlier
+                .iter()
+                .step_by(3)
+                .all(|is_inlier| !is_inlier)
+        );
     }
 
     #[test]

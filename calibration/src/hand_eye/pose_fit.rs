@@ -1,7 +1,9 @@
-//! Generalized least squares over board poses, with noise variances estimated by restricted maximum likelihood.
+//! Generalized least squares over board poses, with noise variances estimated by restricted maximum
+//! likelihood.
 //!
-//! Source of the variance estimate: Patterson and Thompson 1971; its iteration: Rao and Kleffe 1988, section 8.2, with
-//! square roots, which keep the variances positive and increase the likelihood monotonically.
+//! Source of the variance estimate: Patterson and Thompson 1971; its iteration: Rao and Kleffe
+//! 1988, section 8.2, with square roots, which keep the variances positive and increase the
+//! likelihood monotonically.
 
 use super::Setup;
 use super::geometry::{self, Matrix6x12, N_PARAMS, Solution};
@@ -14,26 +16,35 @@ use nalgebra::{DMatrix, DVector, Matrix6, SMatrix, Vector6};
 /// Standard deviations of the measurement errors.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct HandEyeNoise {
-    /// Error of the corners, pixels along each axis. `None` if poses of the board were given. Errors of the lens model
-    /// and blur are common to the corners of one image; they count as if independent errors of this size caused their
-    /// effect on the pose of the board.
+    /// Error of the corners, pixels along each axis. `None` if poses of the board were given.
+    /// Errors of the lens model and blur are common to the corners of one image; they count as if
+    /// independent errors of this size caused their effect on the pose of the board.
     pub corner_px: Option<f64>,
-    /// Residual of the corners after a separate fit of each image, pixels along each axis. At most `corner_px`.
+    /// Residual of the corners after a separate fit of each image, pixels along each axis. At most
+    /// `corner_px`.
     pub residual_px: Option<f64>,
-    /// Rotation error about each axis, radians: of the robot poses if corners were given, otherwise of the board poses
-    /// including the robot's error.
+    /// Rotation error about each axis, radians: of the robot poses if corners were given, otherwise
+    /// of the board poses including the robot's error.
     pub rotation_rad: f64,
     /// Translation error along each axis, meters; likewise.
     pub translation_m: f64,
 }
 
 impl HandEyeNoise {
-    /// Errors that no robot or board is below: they keep variances positive and limit the stated accuracy.
-    const MIN: Self = Self { corner_px: None, residual_px: None, rotation_rad: 1e-7, translation_m: 1e-7 };
+    /// Errors that no robot or board is below: they keep variances positive and limit the stated
+    /// accuracy.
+    const MIN: Self = Self {
+        corner_px: None,
+        residual_px: None,
+        rotation_rad: 1e-7,
+        translation_m: 1e-7,
+    };
 
     /// Variances of rotation, translation and, if there are corners, corners.
     fn variances(&self) -> Vec<f64> {
-        let sigmas = [self.rotation_rad, self.translation_m].into_iter().chain(self.corner_px);
+        let sigmas = [self.rotation_rad, self.translation_m]
+            .into_iter()
+            .chain(self.corner_px);
         sigmas.map(|sigma| sigma * sigma).collect()
     }
 
@@ -52,7 +63,9 @@ impl HandEyeNoise {
         Self {
             rotation_rad: sigma(0, Self::MIN.rotation_rad),
             translation_m: sigma(1, Self::MIN.translation_m),
-            corner_px: self.corner_px.map(|_| sigma(2, self.residual_px.unwrap_or(0.0))),
+            corner_px: self
+                .corner_px
+                .map(|_| sigma(2, self.residual_px.unwrap_or(0.0))),
             residual_px: self.residual_px,
         }
     }
@@ -63,8 +76,8 @@ impl HandEyeNoise {
 pub(super) struct Measurement {
     /// See [`Sample`].
     pub(super) stop_ix: usize,
-    /// One divided by the number of measurements of the stop. The error of the robot pose is common to them, so that a
-    /// stop counts once.
+    /// One divided by the number of measurements of the stop. The error of the robot pose is common
+    /// to them, so that a stop counts once.
     pub(super) weight: f64,
     pub(super) a: Transform,
     pub(super) camera_from_board: Transform,
@@ -81,7 +94,10 @@ pub(super) fn measurements(samples: &[Sample], choice: &[usize]) -> Vec<Measurem
             weight: 1.0,
             a: sample.a,
             camera_from_board: candidate.camera_from_board,
-            unit_covariance: candidate.corners.as_ref().map(|corners| corners.unit_covariance),
+            unit_covariance: candidate
+                .corners
+                .as_ref()
+                .map(|corners| corners.unit_covariance),
         }
     };
     with_weights(samples.iter().zip(choice).map(of).collect())
@@ -145,8 +161,11 @@ fn fit_with(
 ) -> Result<PoseFit, Error> {
     const CONVERGED: f64 = 1e-3; // Relative change of the information about the parameters.
     let (mut solution, mut noise) = (initial, noise);
-    let options =
-        least_squares::Options { loss: geometry::SAMPLE_LOSS, max_steps: 30, ..least_squares::Options::default() };
+    let options = least_squares::Options {
+        loss: geometry::SAMPLE_LOSS,
+        max_steps: 30,
+        ..least_squares::Options::default()
+    };
     let mut last: Option<(least_squares::Fit<Solution>, f64)> = None;
     for _ in 0..max_rounds {
         let problem = Whitened::new(setup, measurements, &solution, &noise);
@@ -157,20 +176,38 @@ fn fit_with(
         let diagonal = fit.information.diagonal();
         let is_settled = last.as_ref().is_some_and(|(before, _)| {
             let before = before.information.diagonal();
-            diagonal.iter().zip(&before).all(|(now, before)| (now / before - 1.0).abs() < CONVERGED)
+            diagonal
+                .iter()
+                .zip(&before)
+                .all(|(now, before)| (now / before - 1.0).abs() < CONVERGED)
         });
         last = Some((fit, update.n_free));
         if is_settled {
             break;
         }
     }
-    let Some((fit, n_free)) = last else { return Err(Error::TooFewResiduals { n_residuals: 0, n_params: N_PARAMS }) };
+    let Some((fit, n_free)) = last else {
+        return Err(Error::TooFewResiduals {
+            n_residuals: 0,
+            n_params: N_PARAMS,
+        });
+    };
     // The whitened residuals have unit variance by construction.
-    let covariance = fit.information.clone().try_inverse().unwrap_or_else(|| fit.covariance.clone());
-    Ok(PoseFit { solution, noise, covariance, n_free })
+    let covariance = fit
+        .information
+        .clone()
+        .try_inverse()
+        .unwrap_or_else(|| fit.covariance.clone());
+    Ok(PoseFit {
+        solution,
+        noise,
+        covariance,
+        n_free,
+    })
 }
 
-/// Covariance of the parameters of a fit whose weights follow from `weighting`, if the true noise is `noise` (Huber 1967).
+/// Covariance of the parameters of a fit whose weights follow from `weighting`, if the true noise
+/// is `noise` (Huber 1967).
 pub(super) fn sandwich_covariance(
     setup: Setup,
     measurements: &[Measurement],
@@ -178,24 +215,38 @@ pub(super) fn sandwich_covariance(
     weighting: &HandEyeNoise,
     noise: &HandEyeNoise,
 ) -> Option<DMatrix<f64>> {
-    let (mut information, mut scatter) = (SMatrix::<f64, 12, 12>::zeros(), SMatrix::<f64, 12, 12>::zeros());
+    let (mut information, mut scatter) = (
+        SMatrix::<f64, 12, 12>::zeros(),
+        SMatrix::<f64, 12, 12>::zeros(),
+    );
     for measurement in measurements {
         let predicted = solution.camera_from_board(&measurement.a);
         let residual = geometry::residual(&predicted, &measurement.camera_from_board);
         let jacobian = geometry::residual_jacobian(&predicted, &residual);
-        let weighted = covariance(setup, measurement, solution, weighting).cholesky()?.inverse() * jacobian;
+        let weighted = covariance(setup, measurement, solution, weighting)
+            .cholesky()?
+            .inverse()
+            * jacobian;
         information += jacobian.transpose() * weighted * measurement.weight;
         // The errors at one stop are taken as equal.
-        scatter +=
-            weighted.transpose() * covariance(setup, measurement, solution, noise) * weighted * measurement.weight;
+        scatter += weighted.transpose()
+            * covariance(setup, measurement, solution, noise)
+            * weighted
+            * measurement.weight;
     }
     let inverse = information.try_inverse()?;
     let covariance = inverse * scatter * inverse;
-    Some(DMatrix::from_fn(N_PARAMS, N_PARAMS, |row, column| covariance[(row, column)]))
+    Some(DMatrix::from_fn(N_PARAMS, N_PARAMS, |row, column| {
+        covariance[(row, column)]
+    }))
 }
 
 /// Noise that is consistent with an initial solution: from medians of the residuals.
-pub(super) fn initial_noise(measurements: &[Measurement], solution: &Solution, corner_px: Option<f64>) -> HandEyeNoise {
+pub(super) fn initial_noise(
+    measurements: &[Measurement],
+    solution: &Solution,
+    corner_px: Option<f64>,
+) -> HandEyeNoise {
     /// Median of the norm of three normal numbers with deviation 1.
     const MEDIAN_OF_NORM: f64 = 1.538;
     let residuals: Vec<Vector6<f64>> = measurements
@@ -203,10 +254,18 @@ pub(super) fn initial_noise(measurements: &[Measurement], solution: &Solution, c
         .map(|m| geometry::residual(&solution.camera_from_board(&m.a), &m.camera_from_board))
         .collect();
     let sigma = |first: usize, min: f64| {
-        let norms: Vec<f64> = residuals.iter().map(|residual| residual.fixed_rows::<3>(first).norm()).collect();
+        let norms: Vec<f64> = residuals
+            .iter()
+            .map(|residual| residual.fixed_rows::<3>(first).norm())
+            .collect();
         (kinematics::quantile::median(&norms).unwrap_or(0.0) / MEDIAN_OF_NORM).max(min)
     };
-    HandEyeNoise { corner_px, residual_px: corner_px, rotation_rad: sigma(0, 1e-6), translation_m: sigma(3, 1e-6) }
+    HandEyeNoise {
+        corner_px,
+        residual_px: corner_px,
+        rotation_rad: sigma(0, 1e-6),
+        translation_m: sigma(3, 1e-6),
+    }
 }
 
 /// Derivatives of the covariance of a residual with respect to the variances, in the order of
@@ -228,8 +287,11 @@ fn covariance_parts(
             vec![part(0), part(3), *unit]
         }
         _ => {
-            let block =
-                |first: usize| Matrix6::from_diagonal(&Vector6::from_fn(|ix, _| f64::from(u8::from(ix / 3 == first))));
+            let block = |first: usize| {
+                Matrix6::from_diagonal(&Vector6::from_fn(|ix, _| {
+                    f64::from(u8::from(ix / 3 == first))
+                }))
+            };
             vec![block(0), block(1)]
         }
     }
@@ -237,7 +299,11 @@ fn covariance_parts(
 
 /// Sum of the parts, times their variances.
 fn total(parts: &[Matrix6<f64>], variances: &[f64]) -> Matrix6<f64> {
-    parts.iter().zip(variances).map(|(part, variance)| part * *variance).sum()
+    parts
+        .iter()
+        .zip(variances)
+        .map(|(part, variance)| part * *variance)
+        .sum()
 }
 
 /// Covariance of the residual of a measurement.
@@ -247,19 +313,29 @@ pub(super) fn covariance(
     solution: &Solution,
     noise: &HandEyeNoise,
 ) -> Matrix6<f64> {
-    total(&covariance_parts(setup, measurement, solution, noise), &noise.variances())
+    total(
+        &covariance_parts(setup, measurement, solution, noise),
+        &noise.variances(),
+    )
 }
 
 /// Squared Mahalanobis distance of a measurement; it has six degrees of freedom.
 ///
-/// * `fit`: a fit with or without the measurement. Without it, the uncertainty of the prediction counts, too.
-pub(super) fn squared_distance(setup: Setup, measurement: &Measurement, fit: &PoseFit, is_used: bool) -> f64 {
+/// * `fit`: a fit with or without the measurement. Without it, the uncertainty of the prediction
+///   counts, too.
+pub(super) fn squared_distance(
+    setup: Setup,
+    measurement: &Measurement,
+    fit: &PoseFit,
+    is_used: bool,
+) -> f64 {
     let predicted = fit.solution.camera_from_board(&measurement.a);
     let residual = geometry::residual(&predicted, &measurement.camera_from_board);
     let mut total = covariance(setup, measurement, &fit.solution, &fit.noise);
     if !is_used {
         let jacobian = geometry::residual_jacobian(&predicted, &Vector6::zeros());
-        total += jacobian * fit.covariance.fixed_view::<N_PARAMS, N_PARAMS>(0, 0) * jacobian.transpose();
+        total +=
+            jacobian * fit.covariance.fixed_view::<N_PARAMS, N_PARAMS>(0, 0) * jacobian.transpose();
     }
     match total.cholesky() {
         Some(factor) => residual.dot(&factor.solve(&residual)),
@@ -275,14 +351,28 @@ struct Whitened<'a> {
 }
 
 impl<'a> Whitened<'a> {
-    fn new(setup: Setup, measurements: &'a [Measurement], solution: &Solution, noise: &HandEyeNoise) -> Self {
+    fn new(
+        setup: Setup,
+        measurements: &'a [Measurement],
+        solution: &Solution,
+        noise: &HandEyeNoise,
+    ) -> Self {
         let whitening = |measurement: &Measurement| {
             let factor = covariance(setup, measurement, solution, noise).cholesky();
-            let whitening = factor.and_then(|factor| factor.l().try_inverse()).unwrap_or_else(Matrix6::zeros);
+            let whitening = factor
+                .and_then(|factor| factor.l().try_inverse())
+                .unwrap_or_else(Matrix6::zeros);
             whitening * measurement.weight.sqrt()
         };
-        let lever_m = measurements.iter().map(|m| m.camera_from_board.translation.vector.norm()).fold(0.01, f64::max);
-        Self { measurements, whitening: measurements.iter().map(whitening).collect(), lever_m }
+        let lever_m = measurements
+            .iter()
+            .map(|m| m.camera_from_board.translation.vector.norm())
+            .fold(0.01, f64::max);
+        Self {
+            measurements,
+            whitening: measurements.iter().map(whitening).collect(),
+            lever_m,
+        }
     }
 }
 
@@ -290,7 +380,10 @@ impl least_squares::Problem for Whitened<'_> {
     type State = Solution;
 
     fn scales(&self) -> DVector<f64> {
-        DVector::from_fn(N_PARAMS, |ix, _| if ix % 6 < 3 { 1.0 } else { self.lever_m })
+        DVector::from_fn(
+            N_PARAMS,
+            |ix, _| if ix % 6 < 3 { 1.0 } else { self.lever_m },
+        )
     }
 
     fn n_blocks(&self) -> usize {
@@ -310,7 +403,12 @@ impl least_squares::Problem for Whitened<'_> {
         Some(())
     }
 
-    fn moved(&self, solution: &Solution, shared: &DVector<f64>, _local: &[DVector<f64>]) -> Solution {
+    fn moved(
+        &self,
+        solution: &Solution,
+        shared: &DVector<f64>,
+        _local: &[DVector<f64>],
+    ) -> Solution {
         solution.moved(shared.as_slice())
     }
 }
@@ -330,7 +428,10 @@ fn update_variances(
 ) -> Update {
     let variances = noise.variances();
     let n_variances = variances.len();
-    let inverse = information.clone().try_inverse().unwrap_or_else(|| DMatrix::zeros(N_PARAMS, N_PARAMS));
+    let inverse = information
+        .clone()
+        .try_inverse()
+        .unwrap_or_else(|| DMatrix::zeros(N_PARAMS, N_PARAMS));
     let x_information = inverse.view((0, 0), (6, 6)).into_owned().try_inverse();
     let (mut squares, mut expected) = (vec![0.0; n_variances], vec![0.0; n_variances]);
     let mut fisher = DMatrix::<f64>::zeros(n_variances, n_variances);
@@ -338,7 +439,12 @@ fn update_variances(
     for measurement in measurements {
         let count = measurement.weight;
         let parts = covariance_parts(setup, measurement, solution, noise);
-        let Some(weight) = total(&parts, &variances).cholesky().map(|factor| factor.inverse()) else { continue };
+        let Some(weight) = total(&parts, &variances)
+            .cholesky()
+            .map(|factor| factor.inverse())
+        else {
+            continue;
+        };
         let predicted = solution.camera_from_board(&measurement.a);
         let residual = geometry::residual(&predicted, &measurement.camera_from_board);
         let jacobian: Matrix6x12 = geometry::residual_jacobian(&predicted, &residual);
@@ -355,24 +461,41 @@ fn update_variances(
             }
             if let Some(x_information) = &x_information {
                 let change = &projected * *part * projected.transpose();
-                log_volume_by_variance[k] += count * (x_information * change.view((0, 0), (6, 6))).trace() / 6.0;
+                log_volume_by_variance[k] +=
+                    count * (x_information * change.view((0, 0), (6, 6))).trace() / 6.0;
             }
         }
     }
     // A part of the residuals' information is spent on the parameters.
-    let n_scalars = 6.0 * measurements.iter().map(|measurement| measurement.weight).sum::<f64>();
+    let n_scalars = 6.0
+        * measurements
+            .iter()
+            .map(|measurement| measurement.weight)
+            .sum::<f64>();
     fisher *= ((n_scalars - N_PARAMS as f64) / n_scalars).max(0.05);
     let updated: Vec<f64> = (0..n_variances)
         .map(|k| {
             let factor: f64 = f64::sqrt(squares[k] / expected[k]);
-            variances[k] * if factor.is_finite() { factor.clamp(0.2, 5.0) } else { 1.0 }
+            variances[k]
+                * if factor.is_finite() {
+                    factor.clamp(0.2, 5.0)
+                } else {
+                    1.0
+                }
         })
         .collect();
-    let relative_variance = fisher
-        .try_inverse()
-        .map_or(f64::INFINITY, |covariance| log_volume_by_variance.dot(&(covariance * &log_volume_by_variance)));
-    let n_free = if relative_variance > 0.0 { (2.0 / relative_variance).clamp(1.0, 1e6) } else { 1e6 };
-    Update { noise: noise.with_variances(&updated), n_free }
+    let relative_variance = fisher.try_inverse().map_or(f64::INFINITY, |covariance| {
+        log_volume_by_variance.dot(&(covariance * &log_volume_by_variance))
+    });
+    let n_free = if relative_variance > 0.0 {
+        (2.0 / relative_variance).clamp(1.0, 1e6)
+    } else {
+        1e6
+    };
+    Update {
+        noise: noise.with_variances(&updated),
+        n_free,
+    }
 }
 
 /// Weight of [`geometry::SAMPLE_LOSS`], divided by its mean for normal residuals.

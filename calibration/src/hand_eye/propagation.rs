@@ -5,19 +5,31 @@ use super::geometry::N_PARAMS;
 use crate::least_squares::Fit;
 use nalgebra::DMatrix;
 
-/// Covariance of the solution due to errors of the other shared parameters of a fit: intrinsics, then joint offsets.
+/// Covariance of the solution due to errors of the other shared parameters of a fit: intrinsics,
+/// then joint offsets.
 ///
-/// With the others fixed at values that are wrong by `e`, the solution moves by `-A e` with `A` the inverse of its own
-/// information times the information that it shares with the others. The covariance of a solution with all parameters free
-/// is the sum of this and of the covariance with fixed ones.
+/// With the others fixed at values that are wrong by `e`, the solution moves by `-A e` with `A` the
+/// inverse of its own information times the information that it shares with the others. The
+/// covariance of a solution with all parameters free is the sum of this and of the covariance with
+/// fixed ones.
 ///
 /// * `covariance`: covariance of the others; that of the fit itself if `None`.
-pub(super) fn propagated(free: &Fit<CornerState>, covariance: Option<&DMatrix<f64>>) -> Option<DMatrix<f64>> {
+pub(super) fn propagated(
+    free: &Fit<CornerState>,
+    covariance: Option<&DMatrix<f64>>,
+) -> Option<DMatrix<f64>> {
     let n_others = free.information.nrows() - N_PARAMS;
-    let own = free.information.view((0, 0), (N_PARAMS, N_PARAMS)).into_owned();
+    let own = free
+        .information
+        .view((0, 0), (N_PARAMS, N_PARAMS))
+        .into_owned();
     let shared = free.information.view((0, N_PARAMS), (N_PARAMS, n_others));
     let by_others = own.cholesky()?.solve(&shared.into_owned());
-    let of_fit = free.covariance.view((N_PARAMS, N_PARAMS), (n_others, n_others)).into_owned();
+    let of_fit = free
+        .covariance
+        .view((N_PARAMS, N_PARAMS), (n_others, n_others))
+        .into_owned();
     let covariance = covariance.unwrap_or(&of_fit);
-    (covariance.shape() == (n_others, n_others)).then(|| &by_others * covariance * by_others.transpose())
+    (covariance.shape() == (n_others, n_others))
+        .then(|| &by_others * covariance * by_others.transpose())
 }

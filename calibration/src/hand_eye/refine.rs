@@ -10,7 +10,9 @@ use super::planar_pose;
 use super::pose_fit::{self, HandEyeNoise, Measurement, PoseFit};
 use super::propagation::propagated;
 use super::samples::{self, Sample};
-use super::selection::{Free, Selection, Stage, corner_fit, corner_noise, corners, reject_and_fit, select};
+use super::selection::{
+    Free, Selection, Stage, corner_fit, corner_noise, corners, reject_and_fit, select,
+};
 use super::{HandEyeInput, Refusal};
 use crate::Error;
 use crate::least_squares::Fit;
@@ -24,7 +26,8 @@ pub(super) struct Refined {
     pub(super) noise: HandEyeNoise,
     /// Noise that determines the weights of the fit.
     pub(super) weighting: HandEyeNoise,
-    /// Covariance of the parameters of [`Solution::moved`], enlarged for the uncertainty of the noise.
+    /// Covariance of the parameters of [`Solution::moved`], enlarged for the uncertainty of the
+    /// noise.
     pub(super) covariance: DMatrix<f64>,
     /// All samples with a board pose, and the candidate of each.
     pub(super) samples: Vec<Sample>,
@@ -45,12 +48,19 @@ pub(super) struct Refined {
 impl Refined {
     /// Samples that agree with the solution.
     pub(super) fn used(&self) -> impl Iterator<Item = &Sample> {
-        self.samples.iter().zip(&self.is_inlier).filter(|(_, is_inlier)| **is_inlier).map(|(sample, _)| sample)
+        self.samples
+            .iter()
+            .zip(&self.is_inlier)
+            .filter(|(_, is_inlier)| **is_inlier)
+            .map(|(sample, _)| sample)
     }
 
     /// Measurements of the samples that agree.
     pub(super) fn measurements(&self) -> Vec<Measurement> {
-        select(&pose_fit::measurements(&self.samples, &self.choice), &self.is_inlier)
+        select(
+            &pose_fit::measurements(&self.samples, &self.choice),
+            &self.is_inlier,
+        )
     }
 }
 
@@ -72,23 +82,66 @@ pub(super) fn refine(
     let mut stage = reject_and_fit(input, &samples, &mut choice, is_inlier, initial, noise)?;
 
     let Some(given) = input.intrinsics.clone().filter(|_| corner_px.is_some()) else {
-        return Ok(finish(samples, choice, stage, closed_form, input.intrinsics.clone()));
+        return Ok(finish(
+            samples,
+            choice,
+            stage,
+            closed_form,
+            input.intrinsics.clone(),
+        ));
     };
     relinearize(input, &mut samples, &choice, &stage, &given);
     let (solution, noise) = (stage.fit.solution, stage.fit.noise);
-    stage = reject_and_fit(input, &samples, &mut choice, stage.is_inlier, solution, noise)?;
+    stage = reject_and_fit(
+        input,
+        &samples,
+        &mut choice,
+        stage.is_inlier,
+        solution,
+        noise,
+    )?;
 
     let is_free = input.options.estimate_intrinsics || input.options.estimate_joint_offsets;
     if !is_free {
-        let selection = Selection { input, samples: &samples, choice: &choice, stage: &stage };
+        let selection = Selection {
+            input,
+            samples: &samples,
+            choice: &choice,
+            stage: &stage,
+        };
         let lens = input.intrinsics_covariance.as_ref();
-        let free = corner_fit(selection, &given, &[], Free { intrinsics: true, joints: false }).ok();
-        let doubt = free.as_ref().and_then(|free| IntrinsicsDoubt::new(selection, &given, free, lens));
+        let free = corner_fit(
+            selection,
+            &given,
+            &[],
+            Free {
+                intrinsics: true,
+                joints: false,
+            },
+        )
+        .ok();
+        let doubt = free
+            .as_ref()
+            .and_then(|free| IntrinsicsDoubt::new(selection, &given, free, lens));
         let by_lens = free.as_ref().and_then(|free| propagated(free, Some(lens?)));
-        (stage.fit, stage.weighting) =
-            choose_weights(Selection { input, samples: &samples, choice: &choice, stage: &stage }, &given)?;
-        stage.fit.solution =
-            minimize_corners(Selection { input, samples: &samples, choice: &choice, stage: &stage }, &given)?;
+        (stage.fit, stage.weighting) = choose_weights(
+            Selection {
+                input,
+                samples: &samples,
+                choice: &choice,
+                stage: &stage,
+            },
+            &given,
+        )?;
+        stage.fit.solution = minimize_corners(
+            Selection {
+                input,
+                samples: &samples,
+                choice: &choice,
+                stage: &stage,
+            },
+            &given,
+        )?;
         if let Some(doubt) = &doubt {
             stage.fit.covariance += doubt.covariance(&stage.fit.solution);
         } else if let Some(by_lens) = by_lens {
@@ -102,26 +155,45 @@ pub(super) fn refine(
     let corrected = with_offsets(input, &free.state.joint_offsets);
     let intrinsics = free.state.intrinsics.clone();
     (stage.fit, stage.weighting) = choose_weights(
-        Selection { input: &corrected, samples: &samples, choice: &choice, stage: &stage },
+        Selection {
+            input: &corrected,
+            samples: &samples,
+            choice: &choice,
+            stage: &stage,
+        },
         &intrinsics,
     )?;
     stage.fit.solution = minimize_corners(
-        Selection { input: &corrected, samples: &samples, choice: &choice, stage: &stage },
+        Selection {
+            input: &corrected,
+            samples: &samples,
+            choice: &choice,
+            stage: &stage,
+        },
         &intrinsics,
     )?;
     match propagated(&free, None) {
         Some(by_others) => stage.fit.covariance += by_others,
         None => stage.fit.covariance += free.covariance.view((0, 0), (N_PARAMS, N_PARAMS)),
     }
-    let n_intrinsics = if input.options.estimate_intrinsics { intrinsics.params().len() } else { 0 };
+    let n_intrinsics = if input.options.estimate_intrinsics {
+        intrinsics.params().len()
+    } else {
+        0
+    };
     let mut refined = finish(samples, choice, stage, closed_form, Some(intrinsics));
-    refined.intrinsics_sigma = (0..n_intrinsics).map(|ix| free.sigma(N_PARAMS + ix)).collect();
+    refined.intrinsics_sigma = (0..n_intrinsics)
+        .map(|ix| free.sigma(N_PARAMS + ix))
+        .collect();
     let offsets = free.state.joint_offsets.iter().enumerate();
-    refined.joint_offsets = offsets.map(|(ix, offset)| (*offset, free.sigma(N_PARAMS + n_intrinsics + ix))).collect();
+    refined.joint_offsets = offsets
+        .map(|(ix, offset)| (*offset, free.sigma(N_PARAMS + n_intrinsics + ix)))
+        .collect();
     Ok(refined)
 }
 
-/// Estimates intrinsics and joint offsets. The variances depend on the poses of the board, and those on the intrinsics.
+/// Estimates intrinsics and joint offsets. The variances depend on the poses of the board, and
+/// those on the intrinsics.
 fn minimize_free(
     input: &HandEyeInput<'_>,
     samples: &mut Vec<Sample>,
@@ -132,8 +204,21 @@ fn minimize_free(
     const ROUNDS: usize = 3;
     let (mut intrinsics, mut offsets) = (given, Vec::new());
     for round in 0.. {
-        let free = Free { intrinsics: input.options.estimate_intrinsics, joints: input.options.estimate_joint_offsets };
-        let fit = corner_fit(Selection { input, samples, choice, stage }, &intrinsics, &offsets, free)?;
+        let free = Free {
+            intrinsics: input.options.estimate_intrinsics,
+            joints: input.options.estimate_joint_offsets,
+        };
+        let fit = corner_fit(
+            Selection {
+                input,
+                samples,
+                choice,
+                stage,
+            },
+            &intrinsics,
+            &offsets,
+            free,
+        )?;
         stage.fit.solution = fit.state.solution;
         intrinsics = fit.state.intrinsics.clone();
         offsets.clone_from(&fit.state.joint_offsets);
@@ -147,8 +232,18 @@ fn minimize_free(
         }
         *samples = usable;
         *choice = consensus::choose(samples, &stage.fit.solution);
-        let noise = HandEyeNoise { residual_px: corner_noise(samples, choice, &stage.is_inlier), ..stage.fit.noise };
-        *stage = reject_and_fit(&corrected, samples, choice, stage.is_inlier.clone(), stage.fit.solution, noise)?;
+        let noise = HandEyeNoise {
+            residual_px: corner_noise(samples, choice, &stage.is_inlier),
+            ..stage.fit.noise
+        };
+        *stage = reject_and_fit(
+            &corrected,
+            samples,
+            choice,
+            stage.is_inlier.clone(),
+            stage.fit.solution,
+            noise,
+        )?;
         relinearize(&corrected, samples, choice, stage, &intrinsics);
         if round + 1 == ROUNDS {
             return Ok(fit);
@@ -159,8 +254,13 @@ fn minimize_free(
 
 /// Minimizes the reprojection error with the chosen noise model.
 fn minimize_corners(selection: Selection<'_>, intrinsics: &Intrinsics) -> Result<Solution, Error> {
-    let fixed = Free { intrinsics: false, joints: false };
-    Ok(corner_fit(selection, intrinsics, &[], fixed)?.state.solution)
+    let fixed = Free {
+        intrinsics: false,
+        joints: false,
+    };
+    Ok(corner_fit(selection, intrinsics, &[], fixed)?
+        .state
+        .solution)
 }
 
 /// Replaces the poses of the samples by steps from the predicted ones.
@@ -180,9 +280,10 @@ fn relinearize(
         let points = corners(input, &samples[ix], choice[ix]);
         let predicted = predicted(&stage.fit.solution, &samples[ix]);
         let candidate = &mut samples[ix].candidates[choice[ix]];
-        if let (Some((pose, covariance)), Some(corners)) =
-            (planar_pose::stepped(&predicted, &points, intrinsics), &mut candidate.corners)
-        {
+        if let (Some((pose, covariance)), Some(corners)) = (
+            planar_pose::stepped(&predicted, &points, intrinsics),
+            &mut candidate.corners,
+        ) {
             candidate.camera_from_board = pose;
             corners.unit_covariance = covariance;
         }
@@ -191,13 +292,22 @@ fn relinearize(
 
 /// Chooses how far the weights allow for errors of the robot.
 ///
-/// Errors of the lens model that are common to all images look like errors of the robot. Then smaller robot errors
-/// predict held-out images better; without any, the fit minimizes the reprojection error. The alternatives are compared
-/// by the product of three held-out errors, which does not depend on units: reprojection, position of the board, and its
-/// rotation. The covariance follows from the estimated noise in all cases.
-fn choose_weights(selection: Selection<'_>, intrinsics: &Intrinsics) -> Result<(PoseFit, HandEyeNoise), Error> {
+/// Errors of the lens model that are common to all images look like errors of the robot. Then
+/// smaller robot errors predict held-out images better; without any, the fit minimizes the
+/// reprojection error. The alternatives are compared by the product of three held-out errors, which
+/// does not depend on units: reprojection, position of the board, and its rotation. The covariance
+/// follows from the estimated noise in all cases.
+fn choose_weights(
+    selection: Selection<'_>,
+    intrinsics: &Intrinsics,
+) -> Result<(PoseFit, HandEyeNoise), Error> {
     const FACTORS: [f64; 5] = [1.0, 0.5, 0.25, 0.1, 0.0];
-    let Selection { input, samples, choice, stage } = selection;
+    let Selection {
+        input,
+        samples,
+        choice,
+        stage,
+    } = selection;
     let estimated = &stage.fit;
     let measurements = select(&pose_fit::measurements(samples, choice), &stage.is_inlier);
     let used: Vec<(&Sample, usize)> = samples
@@ -208,14 +318,23 @@ fn choose_weights(selection: Selection<'_>, intrinsics: &Intrinsics) -> Result<(
         .map(|((sample, choice), _)| (sample, *choice))
         .collect();
     let held_out_error = |weighting: HandEyeNoise| -> Option<f64> {
-        let folds = evaluation::held_out_solutions(input.setup, &measurements, estimated.solution, weighting, true);
+        let folds = evaluation::held_out_solutions(
+            input.setup,
+            &measurements,
+            estimated.solution,
+            weighting,
+            true,
+        );
         let folds: Vec<Solution> = folds.into_iter().collect::<Option<_>>()?;
         let squares_px2 = used.iter().zip(&folds).map(|((sample, choice), solution)| {
             let points = corners(input, sample, *choice);
             evaluation::reprojection_squares(&predicted(solution, sample), &points, intrinsics)
         });
-        let boards: Vec<Transform> =
-            folds.iter().zip(&measurements).map(|(solution, m)| board_in_parent(solution, m)).collect();
+        let boards: Vec<Transform> = folds
+            .iter()
+            .zip(&measurements)
+            .map(|(solution, m)| board_in_parent(solution, m))
+            .collect();
         let scatter = evaluation::scatter(&boards)?;
         Some(squares_px2.sum::<f64>().sqrt() * scatter.mm * scatter.deg)
     };
@@ -224,19 +343,40 @@ fn choose_weights(selection: Selection<'_>, intrinsics: &Intrinsics) -> Result<(
         .map(|factor| estimated.noise.with_robot_errors(factor))
         .filter_map(|weighting| Some((held_out_error(weighting)?, weighting)))
         .min_by(|a, b| a.0.total_cmp(&b.0));
-    let Some((_, weighting)) = best else { return Ok((estimated.clone(), estimated.noise)) };
-    let solution = pose_fit::fit_with_known_noise(input.setup, &measurements, estimated.solution, weighting)?.solution;
-    let covariance = pose_fit::sandwich_covariance(input.setup, &measurements, &solution, &weighting, &estimated.noise)
-        .unwrap_or_else(|| estimated.covariance.clone());
-    Ok((PoseFit { solution, covariance, ..*estimated }, weighting))
+    let Some((_, weighting)) = best else {
+        return Ok((estimated.clone(), estimated.noise));
+    };
+    let solution =
+        pose_fit::fit_with_known_noise(input.setup, &measurements, estimated.solution, weighting)?
+            .solution;
+    let covariance = pose_fit::sandwich_covariance(
+        input.setup,
+        &measurements,
+        &solution,
+        &weighting,
+        &estimated.noise,
+    )
+    .unwrap_or_else(|| estimated.covariance.clone());
+    Ok((
+        PoseFit {
+            solution,
+            covariance,
+            ..*estimated
+        },
+        weighting,
+    ))
 }
 
 /// The input with corrected joints applied to the robot poses.
 fn with_offsets<'a>(input: &HandEyeInput<'a>, offsets: &[f64]) -> HandEyeInput<'a> {
     let mut corrected = input.clone();
-    let Some(chain) = input.chain.filter(|_| !offsets.is_empty()) else { return corrected };
+    let Some(chain) = input.chain.filter(|_| !offsets.is_empty()) else {
+        return corrected;
+    };
     for sample in &mut corrected.samples {
-        let Some(joints) = &sample.joints else { continue };
+        let Some(joints) = &sample.joints else {
+            continue;
+        };
         let forward = |joints: &[f64]| chain.forward(joints).ok();
         let moved = corner_fit::corrected_joints(joints, offsets);
         if let (Some(before), Some(after)) = (forward(joints), forward(&moved)) {
@@ -249,7 +389,10 @@ fn with_offsets<'a>(input: &HandEyeInput<'a>, offsets: &[f64]) -> HandEyeInput<'
 /// The closed form with the smallest leave-one-out scatter, and its solution.
 fn best_closed_form(measurements: &[Measurement], fallback: Solution) -> (ClosedForm, Solution) {
     const MAX_FOLDS: usize = 20;
-    let pairs: Vec<(Transform, Transform)> = measurements.iter().map(|m| (m.a, m.camera_from_board)).collect();
+    let pairs: Vec<(Transform, Transform)> = measurements
+        .iter()
+        .map(|m| (m.a, m.camera_from_board))
+        .collect();
     let stride = pairs.len().div_ceil(MAX_FOLDS).max(1);
     let score = |solver: ClosedForm| -> Option<f64> {
         let boards: Option<Vec<Transform>> = (0..pairs.len())
@@ -266,7 +409,10 @@ fn best_closed_form(measurements: &[Measurement], fallback: Solution) -> (Closed
         .into_iter()
         .filter_map(|solver| Some((score(solver)?, solver, consensus::solve(&pairs, solver)?)))
         .min_by(|a, b| a.0.total_cmp(&b.0))
-        .map_or((ClosedForm::ParkMartin, fallback), |(_, solver, solution)| (solver, solution))
+        .map_or(
+            (ClosedForm::ParkMartin, fallback),
+            |(_, solver, solution)| (solver, solution),
+        )
 }
 
 fn finish(
@@ -276,7 +422,8 @@ fn finish(
     closed_form: ClosedForm,
     intrinsics: Option<Intrinsics>,
 ) -> Refined {
-    // The 95 % quantile of F with 6 and n degrees of freedom relative to that of chi squared / 6, to first order.
+    // The 95 % quantile of F with 6 and n degrees of freedom relative to that of chi squared / 6,
+    // to first order.
     const CHI_SQUARED_95: f64 = 12.59;
     let enlarged = 1.0 + (CHI_SQUARED_95 - 4.0) / (2.0 * stage.fit.n_free);
     Refined {
@@ -308,5 +455,8 @@ pub(super) fn predicted(solution: &Solution, sample: &Sample) -> Transform {
 
 /// Residual of a sample: rotation in radians and translation in meters.
 pub(super) fn sample_residual(solution: &Solution, sample: &Sample, choice: usize) -> Vector6<f64> {
-    geometry::residual(&predicted(solution, sample), &sample.candidates[choice].camera_from_board)
+    geometry::residual(
+        &predicted(solution, sample),
+        &sample.candidates[choice].camera_from_board,
+    )
 }

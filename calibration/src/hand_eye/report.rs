@@ -24,8 +24,9 @@ pub struct HandEyeCalibration {
     pub parent_from_camera: Transform,
     /// `base_from_board` (eye in hand) or `flange_from_board` (eye to hand).
     pub parent_from_board: Transform,
-    /// Covariance of `parent_from_camera`: position in meters along the camera's x, y and z axes, then rotation in
-    /// radians around them. The squared Mahalanobis distance of the error is below 12.59 with a probability of 95 %.
+    /// Covariance of `parent_from_camera`: position in meters along the camera's x, y and z axes,
+    /// then rotation in radians around them. The squared Mahalanobis distance of the error is below
+    /// 12.59 with a probability of 95 %.
     pub covariance: Matrix6<f64>,
     /// Standard deviations of the position along the camera's axes, millimeters.
     pub sigma_mm: [f64; 3],
@@ -33,10 +34,12 @@ pub struct HandEyeCalibration {
     pub sigma_deg: [f64; 3],
     /// Scatter of the board over the used samples, with the result of all of them.
     pub scatter: Scatter,
-    /// The same for held-out samples: each sample is evaluated with a calibration from others. Leave-one-out, or with more
-    /// than [`MAX_FOLDS`](super::MAX_FOLDS) samples, cross-validation with as many folds.
+    /// The same for held-out samples: each sample is evaluated with a calibration from others.
+    /// Leave-one-out, or with more than [`MAX_FOLDS`](super::MAX_FOLDS) samples, cross-validation
+    /// with as many folds.
     pub held_out_scatter: Option<Scatter>,
-    /// RMS length of the reprojection error of the used corners, pixels. The robot poses are taken as exact.
+    /// RMS length of the reprojection error of the used corners, pixels. The robot poses are taken
+    /// as exact.
     pub rms_px: Option<f64>,
     /// The same for held-out samples.
     pub held_out_rms_px: Option<f64>,
@@ -44,7 +47,8 @@ pub struct HandEyeCalibration {
     pub noise: HandEyeNoise,
     /// Closed form that gave the initial solution: that with the smallest leave-one-out scatter.
     pub closed_form: ClosedForm,
-    /// Intrinsics, if they were estimated, and their standard deviations in the order of [`Intrinsics::params`].
+    /// Intrinsics, if they were estimated, and their standard deviations in the order of
+    /// [`Intrinsics::params`].
     pub intrinsics: Option<(Intrinsics, Vec<f64>)>,
     /// Offsets of the joints, if they were estimated, in the order of the chain.
     pub joint_offsets: Vec<JointOffset>,
@@ -61,8 +65,9 @@ pub struct HandEyeCalibration {
 pub struct JointOffset {
     /// Name of the joint.
     pub joint: String,
-    /// Offset and its standard deviation, radians or meters. `None` if it is not observable. Offsets of the
-    /// first and the last joint are equivalent to motions of the board and the camera.
+    /// Offset and its standard deviation, radians or meters. `None` if it is not observable.
+    /// Offsets of the first and the last joint are equivalent to motions of the board and the
+    /// camera.
     pub estimate: Option<[f64; 2]>,
 }
 
@@ -86,7 +91,8 @@ pub struct SampleReport {
     pub name: String,
     /// Use.
     pub status: SampleStatus,
-    /// Distance between measured and predicted board origin, millimeters. `None` without a board pose.
+    /// Distance between measured and predicted board origin, millimeters. `None` without a board
+    /// pose.
     pub position_mm: Option<f64>,
     /// Angle between measured and predicted board, degrees.
     pub rotation_deg: Option<f64>,
@@ -94,8 +100,8 @@ pub struct SampleReport {
     pub normalized: Option<f64>,
     /// RMS reprojection error, pixels.
     pub rms_px: Option<f64>,
-    /// Origin of the board according to this sample minus that of the result, millimeters along the axes of the base
-    /// (eye in hand) or the flange (eye to hand).
+    /// Origin of the board according to this sample minus that of the result, millimeters along the
+    /// axes of the base (eye in hand) or the flange (eye to hand).
     pub board_offset_mm: Option<[f64; 3]>,
     /// Corners without outliers, with their reprojection errors. Empty for given poses.
     pub points: Vec<PointFit>,
@@ -112,14 +118,22 @@ pub(super) fn report(
     repeated: &[usize],
 ) -> Result<HandEyeCalibration, Error> {
     let measurements = refined.measurements();
-    let boards = measurements.iter().map(|m| refine::board_in_parent(&refined.solution, m));
-    let internal = || Error::HandEyeInput { why: "the board poses have no mean rotation".to_owned() };
+    let boards = measurements
+        .iter()
+        .map(|m| refine::board_in_parent(&refined.solution, m));
+    let internal = || Error::HandEyeInput {
+        why: "the board poses have no mean rotation".to_owned(),
+    };
     let scatter = evaluation::scatter(&boards.collect::<Vec<_>>()).ok_or_else(internal)?;
     let held_out = HeldOut::new(input, refined, &measurements);
     let covariance = position_first(&refined.covariance.fixed_view::<6, 6>(0, 0).into_owned());
-    let sigma = |first: usize| [0, 1, 2].map(|axis| sigma_of(covariance[(first + axis, first + axis)]));
+    let sigma =
+        |first: usize| [0, 1, 2].map(|axis| sigma_of(covariance[(first + axis, first + axis)]));
     let mut samples = sample_reports(input, refined);
-    debug_assert_eq!(refined.samples.len() + without_board.len() + repeated.len(), samples.len());
+    debug_assert_eq!(
+        refined.samples.len() + without_board.len() + repeated.len(),
+        samples.len()
+    );
     for ix in repeated {
         samples[*ix].status = SampleStatus::Repeated;
     }
@@ -167,32 +181,48 @@ impl HeldOut {
     fn new(input: &HandEyeInput<'_>, refined: &Refined, measurements: &[Measurement]) -> Self {
         // With corners, the weights were chosen by held-out errors.
         let knows_noise = refined.noise.corner_px.is_some();
-        let folds =
-            evaluation::held_out_solutions(input.setup, measurements, refined.solution, refined.weighting, knows_noise);
+        let folds = evaluation::held_out_solutions(
+            input.setup,
+            measurements,
+            refined.solution,
+            refined.weighting,
+            knows_noise,
+        );
         let boards: Option<Vec<Transform>> = folds
             .iter()
             .zip(measurements)
             .map(|(solution, m)| Some(refine::board_in_parent(solution.as_ref()?, m)))
             .collect();
-        let scatter = boards.filter(|boards| !boards.is_empty()).and_then(|boards| evaluation::scatter(&boards));
+        let scatter = boards
+            .filter(|boards| !boards.is_empty())
+            .and_then(|boards| evaluation::scatter(&boards));
         let rms_px = scatter.and_then(|_| rms_px(input, refined, |used_ix| folds[used_ix]));
         Self { scatter, rms_px }
     }
 }
 
-/// RMS reprojection error of the used samples, with one solution per used sample. `None` for given poses.
+/// RMS reprojection error of the used samples, with one solution per used sample. `None` for given
+/// poses.
 fn rms_px(
     input: &HandEyeInput<'_>,
     refined: &Refined,
     solution: impl Fn(usize) -> Option<geometry::Solution>,
 ) -> Option<f64> {
     let intrinsics = refined.intrinsics.as_ref()?;
-    let used = refined.samples.iter().zip(&refined.choice).zip(&refined.is_inlier).filter(|(_, is_inlier)| **is_inlier);
+    let used = refined
+        .samples
+        .iter()
+        .zip(&refined.choice)
+        .zip(&refined.is_inlier)
+        .filter(|(_, is_inlier)| **is_inlier);
     let (mut squares, mut n) = (0.0, 0);
     for (used_ix, ((sample, choice), _)) in used.enumerate() {
         let points = selection::corners(input, sample, *choice);
-        squares +=
-            evaluation::reprojection_squares(&refine::predicted(&solution(used_ix)?, sample), &points, intrinsics);
+        squares += evaluation::reprojection_squares(
+            &refine::predicted(&solution(used_ix)?, sample),
+            &points,
+            intrinsics,
+        );
         n += points.len();
     }
     (n > 0).then(|| (squares / n as f64).sqrt())
@@ -216,22 +246,35 @@ fn sample_reports(input: &HandEyeInput<'_>, refined: &Refined) -> Vec<SampleRepo
     for (ix, sample) in refined.samples.iter().enumerate() {
         let report = &mut reports[sample.sample_ix];
         let residual = refine::sample_residual(&refined.solution, sample, refined.choice[ix]);
-        report.status = if refined.is_inlier[ix] { SampleStatus::Used } else { SampleStatus::Outlier };
+        report.status = if refined.is_inlier[ix] {
+            SampleStatus::Used
+        } else {
+            SampleStatus::Outlier
+        };
         report.rotation_deg = Some(residual.fixed_rows::<3>(0).norm().to_degrees());
         report.position_mm = Some(1e3 * residual.fixed_rows::<3>(3).norm());
         report.normalized = Some((refined.squared_distances[ix] / 6.0).sqrt());
-        let board = sample.a * refined.solution.x * sample.candidates[refined.choice[ix]].camera_from_board;
+        let board =
+            sample.a * refined.solution.x * sample.candidates[refined.choice[ix]].camera_from_board;
         report.board_offset_mm =
             Some(((board.translation.vector - refined.solution.y.translation.vector) * 1e3).into());
         let points = selection::corners(input, sample, refined.choice[ix]);
         let pose = refine::predicted(&refined.solution, sample);
-        report.rms_px = refined.intrinsics.as_ref().filter(|_| !points.is_empty()).map(|intrinsics| {
-            (evaluation::reprojection_squares(&pose, &points, intrinsics) / points.len() as f64).sqrt()
-        });
+        report.rms_px = refined
+            .intrinsics
+            .as_ref()
+            .filter(|_| !points.is_empty())
+            .map(|intrinsics| {
+                (evaluation::reprojection_squares(&pose, &points, intrinsics) / points.len() as f64)
+                    .sqrt()
+            });
         let fit = |point: &BoardPoint| {
             let in_camera = (pose * nalgebra::Point3::from(point.point_in_board)).coords;
             let [u, v] = refined.intrinsics.as_ref()?.project(&in_camera)?;
-            Some(PointFit { pixel: point.pixel, residual_px: [point.pixel[0] - u, point.pixel[1] - v] })
+            Some(PointFit {
+                pixel: point.pixel,
+                residual_px: [point.pixel[0] - u, point.pixel[1] - v],
+            })
         };
         report.points = points.iter().filter_map(fit).collect();
     }
@@ -239,15 +282,23 @@ fn sample_reports(input: &HandEyeInput<'_>, refined: &Refined) -> Vec<SampleRepo
 }
 
 fn joint_offsets(input: &HandEyeInput<'_>, refined: &Refined) -> Vec<JointOffset> {
-    let Some(chain) = input.chain.filter(|_| input.options.estimate_joint_offsets) else { return Vec::new() };
+    let Some(chain) = input.chain.filter(|_| input.options.estimate_joint_offsets) else {
+        return Vec::new();
+    };
     let last_ix = chain.n_joints().saturating_sub(1);
     let names = chain.joint_names().iter().enumerate();
     names
         .map(|(ix, joint)| {
-            let inner = (ix > 0 && ix < last_ix).then(|| refined.joint_offsets.get(ix - 1)).flatten();
-            let estimate =
-                inner.filter(|(_, sigma)| *sigma <= MAX_JOINT_SIGMA).map(|(offset, sigma)| [*offset, *sigma]);
-            JointOffset { joint: joint.clone(), estimate }
+            let inner = (ix > 0 && ix < last_ix)
+                .then(|| refined.joint_offsets.get(ix - 1))
+                .flatten();
+            let estimate = inner
+                .filter(|(_, sigma)| *sigma <= MAX_JOINT_SIGMA)
+                .map(|(offset, sigma)| [*offset, *sigma]);
+            JointOffset {
+                joint: joint.clone(),
+                estimate,
+            }
         })
         .collect()
 }
@@ -255,7 +306,11 @@ fn joint_offsets(input: &HandEyeInput<'_>, refined: &Refined) -> Vec<JointOffset
 fn problems(input: &HandEyeInput<'_>, refined: &Refined, reports: &[SampleReport]) -> Vec<String> {
     let mut warnings: Vec<String> = refined.intrinsics_doubt.clone().into_iter().collect();
     let named = |status: SampleStatus| -> Vec<&str> {
-        reports.iter().filter(|report| report.status == status).map(|report| report.name.as_str()).collect()
+        reports
+            .iter()
+            .filter(|report| report.status == status)
+            .map(|report| report.name.as_str())
+            .collect()
     };
     let outliers = named(SampleStatus::Outlier);
     if !outliers.is_empty() {
@@ -277,22 +332,39 @@ fn problems(input: &HandEyeInput<'_>, refined: &Refined, reports: &[SampleReport
         .samples
         .iter()
         .zip(&refined.choice)
-        .map(|(sample, choice)| (sample.sample_ix, sample.candidates[*choice].camera_from_board))
+        .map(|(sample, choice)| {
+            (
+                sample.sample_ix,
+                sample.candidates[*choice].camera_from_board,
+            )
+        })
         .collect();
     let mirrored = mistakes::mirrored(&input.samples, &poses);
     if !mirrored.is_empty() {
-        warnings.push(format!("{} samples show the board mirrored: {}", mirrored.len(), mirrored.join(", ")));
+        warnings.push(format!(
+            "{} samples show the board mirrored: {}",
+            mirrored.len(),
+            mirrored.join(", ")
+        ));
     }
     let repeated = named(SampleStatus::Repeated);
     if !repeated.is_empty() {
-        let what = if repeated.len() == 1 { "sample is" } else { "samples are" };
+        let what = if repeated.len() == 1 {
+            "sample is"
+        } else {
+            "samples are"
+        };
         warnings.push(format!(
             "{} {what} identical to an earlier one and not used again: {}",
             repeated.len(),
             repeated.join(", ")
         ));
     }
-    let n_used = refined.is_inlier.iter().filter(|is_inlier| **is_inlier).count();
+    let n_used = refined
+        .is_inlier
+        .iter()
+        .filter(|is_inlier| **is_inlier)
+        .count();
     let n_stops = samples::n_stops(&refined.samples, &refined.is_inlier);
     if n_stops < n_used {
         warnings.push(format!(
@@ -306,14 +378,25 @@ fn problems(input: &HandEyeInput<'_>, refined: &Refined, reports: &[SampleReport
     warnings
 }
 
-/// Distance of a calibration from the truth in its own uncertainty: 95 % of the results stay below 12.59.
+/// Distance of a calibration from the truth in its own uncertainty: 95 % of the results stay below
+/// 12.59.
 #[cfg(test)]
 pub(super) fn squared_error(calibration: &HandEyeCalibration, truth: &Transform) -> f64 {
     let difference = calibration.parent_from_camera.inverse() * truth;
     let rotation = difference.rotation.scaled_axis();
     let translation = difference.translation.vector;
-    let error = nalgebra::Vector6::new(translation.x, translation.y, translation.z, rotation.x, rotation.y, rotation.z);
-    calibration.covariance.cholesky().map_or(f64::INFINITY, |factor| error.dot(&factor.solve(&error)))
+    let error = nalgebra::Vector6::new(
+        translation.x,
+        translation.y,
+        translation.z,
+        rotation.x,
+        rotation.y,
+        rotation.z,
+    );
+    calibration
+        .covariance
+        .cholesky()
+        .map_or(f64::INFINITY, |factor| error.dot(&factor.solve(&error)))
 }
 
 /// Covariance of a residual, for information gains.
@@ -325,6 +408,8 @@ pub(super) fn residual_information(
 ) -> Option<(geometry::Matrix6x12, Matrix6<f64>)> {
     let predicted = solution.camera_from_board(&measurement.a);
     let jacobian = geometry::residual_jacobian(&predicted, &nalgebra::Vector6::zeros());
-    let weight = pose_fit::covariance(setup, measurement, solution, noise).cholesky()?.inverse();
+    let weight = pose_fit::covariance(setup, measurement, solution, noise)
+        .cholesky()?
+        .inverse();
     Some((jacobian, weight))
 }

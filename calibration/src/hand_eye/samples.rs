@@ -22,7 +22,8 @@ pub(super) struct Sample {
 #[derive(Clone, Debug)]
 pub(super) struct Candidate {
     pub(super) camera_from_board: Transform,
-    /// Equivalent rotation of the board: the corners are at `board_from_equivalent.inverse() * point_in_board`.
+    /// Equivalent rotation of the board: the corners are at `board_from_equivalent.inverse() *
+    /// point_in_board`.
     pub(super) board_from_equivalent: Transform,
     /// Accuracy; `None` for a pose that was given.
     pub(super) corners: Option<CornerStatistics>,
@@ -31,7 +32,8 @@ pub(super) struct Candidate {
 /// What the corners of one image say about the pose of the board.
 #[derive(Clone, Debug)]
 pub(super) struct CornerStatistics {
-    /// Covariance of the pose for corners with an error of one pixel, in the parameters of [`geometry::residual`].
+    /// Covariance of the pose for corners with an error of one pixel, in the parameters of
+    /// [`geometry::residual`].
     pub(super) unit_covariance: Matrix6<f64>,
     /// Sum of squared residuals of the inliers, square pixels.
     pub(super) squares_px2: f64,
@@ -45,16 +47,27 @@ pub(super) struct Sorted {
     pub(super) usable: Vec<Sample>,
     /// Indices of samples whose measurement allows no pose of the board.
     pub(super) without_board: Vec<usize>,
-    /// Indices of samples that are identical to an earlier one. They contain no further information.
+    /// Indices of samples that are identical to an earlier one. They contain no further
+    /// information.
     pub(super) repeated: Vec<usize>,
 }
 
 /// Candidates of all samples that differ from each other.
-pub(super) fn samples(input: &HandEyeInput<'_>, intrinsics: Option<&kinematics::Intrinsics>) -> Sorted {
-    let mut sorted = Sorted { usable: Vec::new(), without_board: Vec::new(), repeated: Vec::new() };
+pub(super) fn samples(
+    input: &HandEyeInput<'_>,
+    intrinsics: Option<&kinematics::Intrinsics>,
+) -> Sorted {
+    let mut sorted = Sorted {
+        usable: Vec::new(),
+        without_board: Vec::new(),
+        repeated: Vec::new(),
+    };
     let mut stops: Vec<Transform> = Vec::new();
     for (sample_ix, sample) in input.samples.iter().enumerate() {
-        if input.samples[..sample_ix].iter().any(|earlier| is_same(earlier, sample)) {
+        if input.samples[..sample_ix]
+            .iter()
+            .any(|earlier| is_same(earlier, sample))
+        {
             sorted.repeated.push(sample_ix);
             continue;
         }
@@ -65,7 +78,10 @@ pub(super) fn samples(input: &HandEyeInput<'_>, intrinsics: Option<&kinematics::
                 corners: None,
             }],
             (BoardObservation::View(view), Some(intrinsics)) => {
-                likely(planar_pose::board_poses(view, intrinsics)).into_iter().filter_map(of_corners).collect()
+                likely(planar_pose::board_poses(view, intrinsics))
+                    .into_iter()
+                    .filter_map(of_corners)
+                    .collect()
             }
             (BoardObservation::View(_), None) => Vec::new(),
         };
@@ -76,20 +92,35 @@ pub(super) fn samples(input: &HandEyeInput<'_>, intrinsics: Option<&kinematics::
         let mut candidates = Vec::new();
         for pose in &poses {
             candidates.push(pose.clone());
-            candidates.extend(input.board_symmetries.iter().filter(|symmetry| !is_identity(symmetry)).map(
-                |symmetry| {
-                    let camera_from_board = pose.camera_from_board * symmetry;
-                    Candidate { camera_from_board, board_from_equivalent: *symmetry, ..pose.clone() }
-                },
-            ));
+            candidates.extend(
+                input
+                    .board_symmetries
+                    .iter()
+                    .filter(|symmetry| !is_identity(symmetry))
+                    .map(|symmetry| {
+                        let camera_from_board = pose.camera_from_board * symmetry;
+                        Candidate {
+                            camera_from_board,
+                            board_from_equivalent: *symmetry,
+                            ..pose.clone()
+                        }
+                    }),
+            );
         }
         let a = geometry::a_of(input.setup, &sample.base_from_flange);
-        let stop_ix = stops.iter().position(|stop| is_same_stop(stop, &sample.base_from_flange));
+        let stop_ix = stops
+            .iter()
+            .position(|stop| is_same_stop(stop, &sample.base_from_flange));
         let stop_ix = stop_ix.unwrap_or_else(|| {
             stops.push(sample.base_from_flange);
             stops.len() - 1
         });
-        sorted.usable.push(Sample { sample_ix, stop_ix, a, candidates });
+        sorted.usable.push(Sample {
+            sample_ix,
+            stop_ix,
+            a,
+            candidates,
+        });
     }
     sorted
 }
@@ -114,8 +145,13 @@ fn is_same_stop(a: &Transform, b: &Transform) -> bool {
 
 /// Number of different stops of the samples that are selected.
 pub(super) fn n_stops(samples: &[Sample], is_inlier: &[bool]) -> usize {
-    let used = samples.iter().zip(is_inlier).filter(|(_, is_inlier)| **is_inlier);
-    used.map(|(sample, _)| sample.stop_ix).collect::<std::collections::BTreeSet<_>>().len()
+    let used = samples
+        .iter()
+        .zip(is_inlier)
+        .filter(|(_, is_inlier)| **is_inlier);
+    used.map(|(sample, _)| sample.stop_ix)
+        .collect::<std::collections::BTreeSet<_>>()
+        .len()
 }
 
 fn is_identity(transform: &Transform) -> bool {
@@ -125,12 +161,15 @@ fn is_identity(transform: &Transform) -> bool {
 
 /// Removes the second solution if the corners exclude it.
 fn likely(mut poses: Vec<BoardPose>) -> Vec<BoardPose> {
-    /// Ratio of sums of squares; for a board of normal size, a wrong solution exceeds it by orders of magnitude.
+    /// Ratio of sums of squares; for a board of normal size, a wrong solution exceeds it by orders
+    /// of magnitude.
     const MAX_RATIO: f64 = 4.0;
     const MIN_PX: f64 = 0.05; // Residuals of an exact simulation do not exclude anything.
     if let [best, second] = poses.as_slice() {
         let floor = best.is_inlier.len() as f64 * MIN_PX * MIN_PX;
-        if second.squares_px2 > MAX_RATIO * (best.squares_px2 + floor) || 2 * second.n_inliers() < best.n_inliers() {
+        if second.squares_px2 > MAX_RATIO * (best.squares_px2 + floor)
+            || 2 * second.n_inliers() < best.n_inliers()
+        {
             poses.truncate(1);
         }
     }
@@ -142,6 +181,10 @@ fn of_corners(pose: BoardPose) -> Option<Candidate> {
     Some(Candidate {
         camera_from_board: pose.camera_from_board,
         board_from_equivalent: Transform::identity(),
-        corners: Some(CornerStatistics { unit_covariance, squares_px2: pose.squares_px2, is_inlier: pose.is_inlier }),
+        corners: Some(CornerStatistics {
+            unit_covariance,
+            squares_px2: pose.squares_px2,
+            is_inlier: pose.is_inlier,
+        }),
     })
 }

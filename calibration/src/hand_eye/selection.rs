@@ -38,35 +38,57 @@ pub(super) fn reject_and_fit(
         let n_used = is_inlier.iter().filter(|is_inlier| **is_inlier).count();
         if 2 * n_used < samples.len() || samples::n_stops(samples, &is_inlier) < MIN_SAMPLES {
             return Err(Error::Refused(Box::new(Refusal::new(
-                format!("only {n_used} of {} samples agree with each other", samples.len()),
+                format!(
+                    "only {n_used} of {} samples agree with each other",
+                    samples.len()
+                ),
                 "check that each robot pose belongs to its image and that neither board nor camera was moved",
             ))));
         }
         let measurements = pose_fit::measurements(samples, choice);
-        let fit = pose_fit::fit(input.setup, &select(&measurements, &is_inlier), solution, noise)?;
+        let fit = pose_fit::fit(
+            input.setup,
+            &select(&measurements, &is_inlier),
+            solution,
+            noise,
+        )?;
         (solution, noise) = (fit.solution, fit.noise);
         let next_choice = consensus::choose(samples, &solution);
         let measurements = pose_fit::measurements(samples, &next_choice);
         let squared_distances: Vec<f64> = measurements
             .iter()
             .zip(&is_inlier)
-            .map(|(measurement, is_used)| pose_fit::squared_distance(input.setup, measurement, &fit, *is_used))
+            .map(|(measurement, is_used)| {
+                pose_fit::squared_distance(input.setup, measurement, &fit, *is_used)
+            })
             .collect();
-        let next: Vec<bool> = squared_distances.iter().map(|squared| *squared <= MAX_SQUARED_DISTANCE).collect();
+        let next: Vec<bool> = squared_distances
+            .iter()
+            .map(|squared| *squared <= MAX_SQUARED_DISTANCE)
+            .collect();
         let is_settled = next == is_inlier && next_choice == *choice;
-        stage = Some(Stage { weighting: fit.noise, fit, is_inlier: is_inlier.clone(), squared_distances });
+        stage = Some(Stage {
+            weighting: fit.noise,
+            fit,
+            is_inlier: is_inlier.clone(),
+            squared_distances,
+        });
         if is_settled {
             break;
         }
         (is_inlier, *choice) = (next, next_choice);
     }
-    stage.ok_or(Error::TooFewResiduals { n_residuals: 0, n_params: N_PARAMS })
+    stage.ok_or(Error::TooFewResiduals {
+        n_residuals: 0,
+        n_params: N_PARAMS,
+    })
 }
 
 /// Corners of a sample in the chosen board frame, without outliers.
 pub(super) fn corners(input: &HandEyeInput<'_>, sample: &Sample, choice: usize) -> Vec<BoardPoint> {
     let candidate = &sample.candidates[choice];
-    let (BoardObservation::View(view), Some(corners)) = (&input.samples[sample.sample_ix].board, &candidate.corners)
+    let (BoardObservation::View(view), Some(corners)) =
+        (&input.samples[sample.sample_ix].board, &candidate.corners)
     else {
         return Vec::new();
     };
@@ -76,7 +98,8 @@ pub(super) fn corners(input: &HandEyeInput<'_>, sample: &Sample, choice: usize) 
         .zip(&corners.is_inlier)
         .filter(|(_, is_inlier)| **is_inlier)
         .map(|(point, _)| BoardPoint {
-            point_in_board: (equivalent_from_board * nalgebra::Point3::from(point.point_in_board)).coords,
+            point_in_board: (equivalent_from_board * nalgebra::Point3::from(point.point_in_board))
+                .coords,
             pixel: point.pixel,
         })
         .collect()
@@ -104,14 +127,27 @@ pub(super) fn corner_fit(
     offsets: &[f64],
     free: Free,
 ) -> Result<Fit<CornerState>, Error> {
-    let Selection { input, samples, choice, stage } = selection;
-    let used = samples.iter().zip(choice).zip(&stage.is_inlier).filter(|(_, is_inlier)| **is_inlier);
+    let Selection {
+        input,
+        samples,
+        choice,
+        stage,
+    } = selection;
+    let used = samples
+        .iter()
+        .zip(choice)
+        .zip(&stage.is_inlier)
+        .filter(|(_, is_inlier)| **is_inlier);
     let chain = input.chain.filter(|_| free.joints);
     let mut by_stop = std::collections::BTreeMap::<usize, Vec<View>>::new();
     for ((sample, choice), _) in used {
         let given = &input.samples[sample.sample_ix];
         let joints = chain.and(given.joints.clone()).unwrap_or_default();
-        let view = View { base_from_flange: given.base_from_flange, points: corners(input, sample, *choice), joints };
+        let view = View {
+            base_from_flange: given.base_from_flange,
+            points: corners(input, sample, *choice),
+            joints,
+        };
         by_stop.entry(sample.stop_ix).or_default().push(view);
     }
     let stops: Vec<Vec<View>> = by_stop.into_values().collect();
@@ -119,11 +155,19 @@ pub(super) fn corner_fit(
         setup: input.setup,
         stops: &stops,
         noise: stage.weighting,
-        n_intrinsics: if free.intrinsics { intrinsics.params().len() } else { 0 },
+        n_intrinsics: if free.intrinsics {
+            intrinsics.params().len()
+        } else {
+            0
+        },
         chain,
     };
     let n_inner = chain.map_or(0, |chain| chain.n_joints().saturating_sub(2));
-    let joint_offsets = if offsets.len() == n_inner { offsets.to_vec() } else { vec![0.0; n_inner] };
+    let joint_offsets = if offsets.len() == n_inner {
+        offsets.to_vec()
+    } else {
+        vec![0.0; n_inner]
+    };
     let pose_errors = vec![Vector6::zeros(); stops.len()];
     problem.minimize(CornerState {
         solution: stage.fit.solution,
@@ -133,20 +177,43 @@ pub(super) fn corner_fit(
     })
 }
 
-/// Standard deviation of the corners from the residuals of the single images, pixels. `None` for given poses.
-pub(super) fn corner_noise(samples: &[Sample], choice: &[usize], is_inlier: &[bool]) -> Option<f64> {
+/// Standard deviation of the corners from the residuals of the single images, pixels. `None` for
+/// given poses.
+pub(super) fn corner_noise(
+    samples: &[Sample],
+    choice: &[usize],
+    is_inlier: &[bool],
+) -> Option<f64> {
     const MIN_PX: f64 = 0.003; // Exact corners of a simulation.
     let (mut squares, mut n_free) = (0.0, 0.0);
-    for ((sample, choice), _) in samples.iter().zip(choice).zip(is_inlier).filter(|(_, is_inlier)| **is_inlier) {
+    for ((sample, choice), _) in samples
+        .iter()
+        .zip(choice)
+        .zip(is_inlier)
+        .filter(|(_, is_inlier)| **is_inlier)
+    {
         let corners = sample.candidates[*choice].corners.as_ref()?;
         squares += corners.squares_px2;
-        n_free += 2.0 * corners.is_inlier.iter().filter(|is_inlier| **is_inlier).count() as f64 - 6.0;
+        n_free += 2.0
+            * corners
+                .is_inlier
+                .iter()
+                .filter(|is_inlier| **is_inlier)
+                .count() as f64
+            - 6.0;
     }
     Some((squares / f64::max(n_free, 1.0)).sqrt().max(MIN_PX))
 }
 
 /// The selected measurements, weighted such that each stop counts once.
 pub(super) fn select(measurements: &[Measurement], is_inlier: &[bool]) -> Vec<Measurement> {
-    let selected = measurements.iter().zip(is_inlier).filter(|(_, is_inlier)| **is_inlier);
-    pose_fit::with_weights(selected.map(|(measurement, _)| measurement.clone()).collect())
+    let selected = measurements
+        .iter()
+        .zip(is_inlier)
+        .filter(|(_, is_inlier)| **is_inlier);
+    pose_fit::with_weights(
+        selected
+            .map(|(measurement, _)| measurement.clone())
+            .collect(),
+    )
 }

@@ -17,23 +17,34 @@ pub struct FlangeMotion<'a> {
     pub parent_from_camera: Transform,
 }
 
-/// Moves the corners in one image of a target to where a global shutter would see them at mid-exposure.
+/// Moves the corners in one image of a target to where a global shutter would see them at
+/// mid-exposure.
 ///
-/// The correction is the predicted image motion of each corner between mid-exposure and the exposure of its row. It is
-/// small, so approximate intrinsics and an approximate camera pose suffice. Returns the corners unchanged if they do not
-/// determine the pose of the target.
+/// The correction is the predicted image motion of each corner between mid-exposure and the
+/// exposure of its row. It is small, so approximate intrinsics and an approximate camera pose
+/// suffice. Returns the corners unchanged if they do not determine the pose of the target.
 pub fn corners_at_mid_exposure(
     intrinsics: &Intrinsics,
     points: &[BoardPoint],
     motion: &FlangeMotion<'_>,
 ) -> Vec<BoardPoint> {
-    let Some(pose) = board_pose(intrinsics, points) else { return points.to_vec() };
+    let Some(pose) = board_pose(intrinsics, points) else {
+        return points.to_vec();
+    };
     let corrected = |point: &BoardPoint| {
         let at_mid = pose.camera_from_board * Point3::from(point.point_in_board);
-        let at_row = motion.row_from_mid(point.pixel[1] / f64::from(intrinsics.size_px[1])) * at_mid;
-        let pixels = intrinsics.project(&at_mid.coords).zip(intrinsics.project(&at_row.coords));
-        let Some((mid, row)) = pixels else { return *point };
-        BoardPoint { pixel: [0, 1].map(|axis| point.pixel[axis] + mid[axis] - row[axis]), ..*point }
+        let at_row =
+            motion.row_from_mid(point.pixel[1] / f64::from(intrinsics.size_px[1])) * at_mid;
+        let pixels = intrinsics
+            .project(&at_mid.coords)
+            .zip(intrinsics.project(&at_row.coords));
+        let Some((mid, row)) = pixels else {
+            return *point;
+        };
+        BoardPoint {
+            pixel: [0, 1].map(|axis| point.pixel[axis] + mid[axis] - row[axis]),
+            ..*point
+        }
     };
     points.iter().map(corrected).collect()
 }
@@ -63,23 +74,35 @@ mod tests {
         for setup in [Setup::EyeInHand, Setup::EyeToHand] {
             let scene = Scene::new(setup, 1, 0.4, 3);
             let mid = scene.base_from_flange[0];
-            let twist =
-                Twist { linear_m_s: Vector3::new(0.05, -0.08, 0.03), angular_rad_s: Vector3::new(0.1, 0.05, -0.2) };
+            let twist = Twist {
+                linear_m_s: Vector3::new(0.05, -0.08, 0.03),
+                angular_rad_s: Vector3::new(0.1, 0.05, -0.2),
+            };
             let at = |row_frac: f64| mid * transform::exp(&twist, READOUT_SECS * (row_frac - 0.5));
             let intrinsics = scene::intrinsics();
             let pixel = |flange: &Transform, point: &Vector3<f64>| {
                 let point = scene.camera_from_board(flange) * Point3::from(*point);
-                intrinsics.project(&point.coords).expect("in front of the camera")
+                intrinsics
+                    .project(&point.coords)
+                    .expect("in front of the camera")
             };
             let height = f64::from(intrinsics.size_px[1]);
             let seen = |point_in_board: Vector3<f64>| {
                 // The row in which the moving corner is exposed.
-                let row = (0..5).fold(0.5, |row_frac, _| pixel(&at(row_frac), &point_in_board)[1] / height);
-                BoardPoint { point_in_board, pixel: pixel(&at(row), &point_in_board) }
+                let row = (0..5).fold(0.5, |row_frac, _| {
+                    pixel(&at(row_frac), &point_in_board)[1] / height
+                });
+                BoardPoint {
+                    point_in_board,
+                    pixel: pixel(&at(row), &point_in_board),
+                }
             };
             let points: Vec<BoardPoint> = scene::board_points().into_iter().map(seen).collect();
             // The pose of the camera is wrong by 2 degrees and 10 mm.
-            let wrong = Transform::new(Vector3::new(0.006, -0.008, 0.0), Vector3::new(0.0, 0.035, 0.0));
+            let wrong = Transform::new(
+                Vector3::new(0.006, -0.008, 0.0),
+                Vector3::new(0.0, 0.035, 0.0),
+            );
             let corrected = |error: Transform| {
                 let motion = FlangeMotion {
                     setup,
@@ -97,9 +120,13 @@ mod tests {
                 points.iter().map(error).fold(0.0, f64::max)
             };
             let before = largest(&points);
-            let [approximate, exact] = [wrong, Transform::identity()].map(|error| largest(&corrected(error)));
+            let [approximate, exact] =
+                [wrong, Transform::identity()].map(|error| largest(&corrected(error)));
             assert!(before > 0.5, "{setup:?}: {before} px");
-            assert!(approximate < 0.1 * before && exact < 0.02 * before, "{setup:?}: {approximate} px, {exact} px");
+            assert!(
+                approximate < 0.1 * before && exact < 0.02 * before,
+                "{setup:?}: {approximate} px, {exact} px"
+            );
         }
     }
 }

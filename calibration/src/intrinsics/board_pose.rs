@@ -3,7 +3,9 @@
 use super::homography::{self, homography};
 use crate::BoardPoint;
 use kinematics::{Intrinsics, Lens, Transform};
-use nalgebra::{Matrix3, Matrix6, Point3, SVector, Translation3, UnitQuaternion, Vector2, Vector3, Vector6};
+use nalgebra::{
+    Matrix3, Matrix6, Point3, SVector, Translation3, UnitQuaternion, Vector2, Vector3, Vector6,
+};
 
 /// Pose of a target and its reprojection error.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -16,17 +18,27 @@ pub struct BoardPose {
 
 /// Estimates the pose of a flat target by minimizing the reprojection error.
 ///
-/// The initial value is the pose of a homography. A flat target far away or seen at a small angle looks almost the same
-/// with its normal mirrored at the line of sight, so the minimum that starts there is found too, and the better one
-/// is returned.
+/// The initial value is the pose of a homography. A flat target far away or seen at a small angle
+/// looks almost the same with its normal mirrored at the line of sight, so the minimum that starts
+/// there is found too, and the better one is returned.
 ///
-/// * `points`: at least four points that are not on a line, with the same z coordinate in the frame of the target.
+/// * `points`: at least four points that are not on a line, with the same z coordinate in the frame
+///   of the target.
 ///
-/// Returns `None` if the points do not determine a pose, or if the lens cannot image the target there.
+/// Returns `None` if the points do not determine a pose, or if the lens cannot image the target
+/// there.
 pub fn board_pose(intrinsics: &Intrinsics, points: &[BoardPoint]) -> Option<BoardPose> {
     let first = refine(intrinsics, points, initial_pose(intrinsics, points)?)?;
-    let mirrored = refine(intrinsics, points, mirrored(&first.camera_from_board, points));
-    Some(mirrored.filter(|mirrored| mirrored.rms_px < first.rms_px).unwrap_or(first))
+    let mirrored = refine(
+        intrinsics,
+        points,
+        mirrored(&first.camera_from_board, points),
+    );
+    Some(
+        mirrored
+            .filter(|mirrored| mirrored.rms_px < first.rms_px)
+            .unwrap_or(first),
+    )
 }
 
 /// The pose of the homography from the target to the plane `z = 1`.
@@ -35,7 +47,12 @@ pub(super) fn initial_pose(intrinsics: &Intrinsics, points: &[BoardPoint]) -> Op
     const MAX_RADIUS: f64 = 2.5;
     const MIN_ACCURATE: usize = 8;
     // Points beyond the lens model are left out.
-    let on_plane = |point: &BoardPoint| Some((point.point_in_board.xy(), unproject(intrinsics, point.pixel)?));
+    let on_plane = |point: &BoardPoint| {
+        Some((
+            point.point_in_board.xy(),
+            unproject(intrinsics, point.pixel)?,
+        ))
+    };
     let mut pairs: Vec<_> = points.iter().filter_map(on_plane).collect();
     // Errors of directions close to 90 degrees are large on the plane `z = 1`.
     let is_accurate = |pair: &(_, Vector2<f64>)| pair.1.norm() < MAX_RADIUS;
@@ -51,41 +68,68 @@ fn unproject(intrinsics: &Intrinsics, pixel: [f64; 2]) -> Option<Vector2<f64>> {
     let Lens::KannalaBrandt([0.0, 0.0, 0.0, 0.0]) = intrinsics.lens else {
         return intrinsics.unproject(pixel).map(|ray| ray.xy());
     };
-    let [x, y] = [0, 1].map(|axis| (pixel[axis] - intrinsics.principal_px[axis]) / intrinsics.focal_px[axis]);
+    let [x, y] = [0, 1]
+        .map(|axis| (pixel[axis] - intrinsics.principal_px[axis]) / intrinsics.focal_px[axis]);
     let angle = x.hypot(y);
     let is_in_front = angle < std::f64::consts::FRAC_PI_2;
-    is_in_front.then(|| Vector2::new(x, y) * if angle > 0.0 { angle.tan() / angle } else { 1.0 })
+    is_in_front.then(|| {
+        Vector2::new(x, y)
+            * if angle > 0.0 {
+                angle.tan() / angle
+            } else {
+                1.0
+            }
+    })
 }
 
 /// The pose with the normal of the target mirrored at the line of sight to its center.
 ///
 /// Source: Schweighofer and Pinz 2006, section 4.
 fn mirrored(camera_from_board: &Transform, points: &[BoardPoint]) -> Transform {
-    let center_in_board = points.iter().map(|point| point.point_in_board).sum::<Vector3<f64>>() / points.len() as f64;
+    let center_in_board = points
+        .iter()
+        .map(|point| point.point_in_board)
+        .sum::<Vector3<f64>>()
+        / points.len() as f64;
     let center = (camera_from_board * Point3::from(center_in_board)).coords;
     let normal = camera_from_board.rotation * Vector3::z();
     let sight = center.normalize();
     let mirrored_normal = sight * (2.0 * sight.dot(&normal)) - normal;
     let turn = UnitQuaternion::rotation_between(&normal, &mirrored_normal).unwrap_or_default();
     let rotation = turn * camera_from_board.rotation;
-    Transform::from_parts(Translation3::from(center - rotation * center_in_board), rotation)
+    Transform::from_parts(
+        Translation3::from(center - rotation * center_in_board),
+        rotation,
+    )
 }
 
-/// Step of a pose: rotation vector in the camera frame about the origin of the target, then translation.
+/// Step of a pose: rotation vector in the camera frame about the origin of the target, then
+/// translation.
 pub(crate) fn moved(camera_from_board: &Transform, step: &Vector6<f64>) -> Transform {
     let rotation = UnitQuaternion::from_scaled_axis(Vector3::new(step[0], step[1], step[2]));
-    let translation = camera_from_board.translation.vector + Vector3::new(step[3], step[4], step[5]);
-    Transform::from_parts(Translation3::from(translation), rotation * camera_from_board.rotation)
+    let translation =
+        camera_from_board.translation.vector + Vector3::new(step[3], step[4], step[5]);
+    Transform::from_parts(
+        Translation3::from(translation),
+        rotation * camera_from_board.rotation,
+    )
 }
 
 /// Derivative of a point in the camera frame with respect to the rotation part of [`moved`].
-pub(super) fn by_rotation(camera_from_board: &Transform, point_in_board: &Vector3<f64>) -> Matrix3<f64> {
+pub(super) fn by_rotation(
+    camera_from_board: &Transform,
+    point_in_board: &Vector3<f64>,
+) -> Matrix3<f64> {
     -(camera_from_board.rotation * point_in_board).cross_matrix()
 }
 
-/// Minimizes the reprojection error from an initial pose by Levenberg-Marquardt. `None` if the target leaves the range
-/// of the lens.
-pub(super) fn refine(intrinsics: &Intrinsics, points: &[BoardPoint], initial: Transform) -> Option<BoardPose> {
+/// Minimizes the reprojection error from an initial pose by Levenberg-Marquardt. `None` if the
+/// target leaves the range of the lens.
+pub(super) fn refine(
+    intrinsics: &Intrinsics,
+    points: &[BoardPoint],
+    initial: Transform,
+) -> Option<BoardPose> {
     const MAX_STEPS: usize = 30;
     const CONVERGED: f64 = 1e-9; // Of the squared error.
     let mut at = NormalEquations::new(intrinsics, points, &initial)?;
@@ -95,7 +139,8 @@ pub(super) fn refine(intrinsics: &Intrinsics, points: &[BoardPoint], initial: Tr
         (0..6).for_each(|ix| matrix[(ix, ix)] *= 1.0 + damping);
         let step = -matrix.cholesky()?.solve(&at.gradient);
         let trial_pose = moved(&pose, &step);
-        let trial = NormalEquations::new(intrinsics, points, &trial_pose).filter(|trial| trial.squares < at.squares);
+        let trial = NormalEquations::new(intrinsics, points, &trial_pose)
+            .filter(|trial| trial.squares < at.squares);
         match trial {
             Some(trial) => {
                 let converged = at.squares - trial.squares <= CONVERGED * at.squares;
@@ -111,7 +156,10 @@ pub(super) fn refine(intrinsics: &Intrinsics, points: &[BoardPoint], initial: Tr
             break;
         }
     }
-    Some(BoardPose { camera_from_board: pose, rms_px: (at.squares / points.len() as f64).sqrt() })
+    Some(BoardPose {
+        camera_from_board: pose,
+        rms_px: (at.squares / points.len() as f64).sqrt(),
+    })
 }
 
 struct NormalEquations {
@@ -123,7 +171,11 @@ struct NormalEquations {
 
 impl NormalEquations {
     fn new(intrinsics: &Intrinsics, points: &[BoardPoint], pose: &Transform) -> Option<Self> {
-        let mut sums = Self { matrix: Matrix6::zeros(), gradient: Vector6::zeros(), squares: 0.0 };
+        let mut sums = Self {
+            matrix: Matrix6::zeros(),
+            gradient: Vector6::zeros(),
+            squares: 0.0,
+        };
         for point in points {
             let in_camera = (pose * Point3::from(point.point_in_board)).coords;
             let (pixel, by_point) = intrinsics.project_with_jacobian(&in_camera)?;
@@ -156,12 +208,14 @@ mod tests {
     fn poses_are_recovered_for_wide_and_narrow_lenses() {
         for camera in [brown_conrady_camera(), fisheye_camera()] {
             for rotation in [[0.5, -0.3, 0.2], [-0.6, 0.1, 3.0], [0.05, 0.02, 1.5]] {
-                let truth = Transform::new(Vector3::new(-0.05, -0.08, 0.5), Vector3::from(rotation));
+                let truth =
+                    Transform::new(Vector3::new(-0.05, -0.08, 0.5), Vector3::from(rotation));
                 let points = observe(&camera, &truth, &board());
                 assert_eq!(points.len(), board().len());
                 let found = board_pose(&camera, &points).unwrap();
                 assert!(found.rms_px < 1e-6, "{}", found.rms_px);
-                let off = (found.camera_from_board.to_homogeneous() - truth.to_homogeneous()).amax();
+                let off =
+                    (found.camera_from_board.to_homogeneous() - truth.to_homogeneous()).amax();
                 assert!(off < 1e-8, "off by {off}");
             }
         }
@@ -175,8 +229,15 @@ mod tests {
         let start = mirrored(&truth, &points);
         let found = refine(&camera, &points, start).unwrap();
         let best = board_pose(&camera, &points).unwrap();
-        assert!(found.rms_px > 0.01, "the mirrored pose is not a minimum here: {}", found.rms_px);
-        assert!(best.rms_px < 1e-6 && (best.camera_from_board.rotation.angle_to(&truth.rotation)) < 1e-8);
+        assert!(
+            found.rms_px > 0.01,
+            "the mirrored pose is not a minimum here: {}",
+            found.rms_px
+        );
+        assert!(
+            best.rms_px < 1e-6
+                && (best.camera_from_board.rotation.angle_to(&truth.rotation)) < 1e-8
+        );
     }
 
     #[test]

@@ -1,4 +1,5 @@
-//! The reprojection errors of all images as a function of the intrinsics and the poses of the target.
+//! The reprojection errors of all images as a function of the intrinsics and the poses of the
+//! target.
 
 use super::board_pose;
 use super::coefficients::Coefficients;
@@ -21,29 +22,46 @@ pub(super) struct Bundle {
 }
 
 impl Bundle {
-    /// Detected minus projected position of each point. `None` where the lens cannot image the point.
-    pub(super) fn residuals(&self, image_ix: usize, points: &[BoardPoint]) -> Vec<Option<Vector2<f64>>> {
+    /// Detected minus projected position of each point. `None` where the lens cannot image the
+    /// point.
+    pub(super) fn residuals(
+        &self,
+        image_ix: usize,
+        points: &[BoardPoint],
+    ) -> Vec<Option<Vector2<f64>>> {
         let residual = |point: &BoardPoint| {
             let in_camera = self.poses[image_ix] * Point3::from(point.point_in_board);
             let projected = self.intrinsics.project(&in_camera.coords)?;
-            Some(Vector2::new(point.pixel[0] - projected[0], point.pixel[1] - projected[1]))
+            Some(Vector2::new(
+                point.pixel[0] - projected[0],
+                point.pixel[1] - projected[1],
+            ))
         };
         points.iter().map(residual).collect()
     }
 
     /// Norms of the residuals; infinite where the lens cannot image the point.
     pub(super) fn errors_px(&self, image_ix: usize, points: &[BoardPoint]) -> Vec<f64> {
-        let norm = |residual: Option<Vector2<f64>>| residual.map_or(f64::INFINITY, |residual| residual.norm());
-        self.residuals(image_ix, points).into_iter().map(norm).collect()
+        let norm = |residual: Option<Vector2<f64>>| {
+            residual.map_or(f64::INFINITY, |residual| residual.norm())
+        };
+        self.residuals(image_ix, points)
+            .into_iter()
+            .map(norm)
+            .collect()
     }
 
     /// The images with these indices only.
     pub(super) fn with_images(&self, image_ixs: impl Iterator<Item = usize>) -> Self {
-        Self { intrinsics: self.intrinsics.clone(), poses: image_ixs.map(|ix| self.poses[ix]).collect() }
+        Self {
+            intrinsics: self.intrinsics.clone(),
+            poses: image_ixs.map(|ix| self.poses[ix]).collect(),
+        }
     }
 }
 
-/// Minimizes the reprojection error over the focal lengths, the principal point, the given coefficients and all poses.
+/// Minimizes the reprojection error over the focal lengths, the principal point, the given
+/// coefficients and all poses.
 ///
 /// * `images`: points of each image, in the order of the poses.
 /// * `tolerance`: see [`Options::tolerance`].
@@ -57,9 +75,17 @@ pub(super) fn refine(
     loss: Loss,
     tolerance: f64,
 ) -> Result<Fit<Bundle>, Error> {
-    let problem =
-        Reprojection { images, params: coefficients.params(), scales: coefficients.scales(&start.intrinsics) };
-    let options = Options { loss, tolerance, max_steps: MAX_STEPS, min_noise: MIN_NOISE_PX };
+    let problem = Reprojection {
+        images,
+        params: coefficients.params(),
+        scales: coefficients.scales(&start.intrinsics),
+    };
+    let options = Options {
+        loss,
+        tolerance,
+        max_steps: MAX_STEPS,
+        min_noise: MIN_NOISE_PX,
+    };
     least_squares::minimize(&problem, start, &options)
 }
 
@@ -91,7 +117,8 @@ impl Problem for Reprojection<'_> {
         for point in self.images[image_ix] {
             let in_camera = (pose * Point3::from(point.point_in_board)).coords;
             let projection = bundle.intrinsics.project_with_derivatives(&in_camera)?;
-            let by_rotation = projection.by_point * board_pose::by_rotation(pose, &point.point_in_board);
+            let by_rotation =
+                projection.by_point * board_pose::by_rotation(pose, &point.point_in_board);
             let mut rows = [[0.0; MAX_INTRINSICS_PARAMS + 6]; 2];
             for (axis, row) in rows.iter_mut().enumerate() {
                 for (derivative, param) in row.iter_mut().zip(&self.params) {
@@ -103,7 +130,10 @@ impl Problem for Reprojection<'_> {
                 }
             }
             let residual = [0, 1].map(|axis| projection.pixel[axis] - point.pixel[axis]);
-            sums.add(residual, [&rows[0][..n_params + 6], &rows[1][..n_params + 6]]);
+            sums.add(
+                residual,
+                [&rows[0][..n_params + 6], &rows[1][..n_params + 6]],
+            );
         }
         Some(())
     }
@@ -117,13 +147,18 @@ impl Problem for Reprojection<'_> {
             board_pose::moved(pose, &Vector6::from_column_slice(step.as_slice()))
         };
         let poses = bundle.poses.iter().zip(local).map(step).collect();
-        Bundle { intrinsics: bundle.intrinsics.with_params(&params), poses }
+        Bundle {
+            intrinsics: bundle.intrinsics.with_params(&params),
+            poses,
+        }
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use super::super::tests::{board, brown_conrady_camera, fisheye_camera, observe, rational_camera};
+    use super::super::tests::{
+        board, brown_conrady_camera, fisheye_camera, observe, rational_camera,
+    };
     use super::*;
     use nalgebra::Vector3;
 
@@ -137,16 +172,29 @@ mod tests {
             (fisheye_camera(), Coefficients::KANNALA_BRANDT),
             (rational_camera(), Coefficients::RATIONAL),
         ] {
-            let pose = Transform::new(Vector3::new(-0.05, -0.08, 0.5), Vector3::new(0.4, -0.3, 0.6));
+            let pose = Transform::new(
+                Vector3::new(-0.05, -0.08, 0.5),
+                Vector3::new(0.4, -0.3, 0.6),
+            );
             let mut points = observe(&camera, &pose, &board());
             // Residuals of some pixels, so that the gradient is not zero.
-            points.iter_mut().enumerate().for_each(|(ix, point)| point.pixel[ix % 2] += ix as f64 * 0.1);
+            points
+                .iter_mut()
+                .enumerate()
+                .for_each(|(ix, point)| point.pixel[ix % 2] += ix as f64 * 0.1);
             let images = [&points[..]];
             let params = coefficients.params();
             let scales = coefficients.scales(&camera);
             let n_params = params.len();
-            let problem = Reprojection { images: &images, params, scales };
-            let bundle = Bundle { intrinsics: camera, poses: vec![pose] };
+            let problem = Reprojection {
+                images: &images,
+                params,
+                scales,
+            };
+            let bundle = Bundle {
+                intrinsics: camera,
+                poses: vec![pose],
+            };
             let cost = |step: &DVector<f64>| {
                 let local = [step.rows(n_params, 6).into_owned()];
                 let moved = problem.moved(&bundle, &step.rows(0, n_params).into_owned(), &local);
@@ -161,7 +209,10 @@ mod tests {
                 let numeric = (cost(&step) - cost(&-&step)) / (2.0 * NUDGE);
                 let analytic = sums.gradient()[ix];
                 let allowed = REL * (1.0 + analytic.abs().max(numeric.abs()));
-                assert!((analytic - numeric).abs() < allowed, "{coefficients:?} {ix}: {analytic} {numeric}");
+                assert!(
+                    (analytic - numeric).abs() < allowed,
+                    "{coefficients:?} {ix}: {analytic} {numeric}"
+                );
             }
         }
     }

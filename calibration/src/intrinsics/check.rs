@@ -10,30 +10,52 @@ use nalgebra::Vector3;
 
 /// Minimum number of images: each gives two constraints on focal lengths and principal point.
 pub(super) const MIN_IMAGES: usize = 3;
-/// Images whose corners differ by less, pixels, are repetitions. Counting them as independent would hide the uncertainty.
+/// Images whose corners differ by less, pixels, are repetitions. Counting them as independent would
+/// hide the uncertainty.
 const MIN_DISTANCE_PX: f64 = 1.0;
 
-/// Returns the indices of the images with enough points that do not repeat an earlier image, and rejects the others.
+/// Returns the indices of the images with enough points that do not repeat an earlier image, and
+/// rejects the others.
 ///
 /// # Errors
-/// If the sizes differ, a value is not finite, the target is not flat or has an implausible size, or there are too few
-/// images.
-pub(super) fn usable_images(views: &[BoardView], sizes_px: &[[u32; 2]]) -> Result<(Vec<usize>, Vec<Rejected>), Error> {
+/// If the sizes differ, a value is not finite, the target is not flat or has an implausible size,
+/// or there are too few images.
+pub(super) fn usable_images(
+    views: &[BoardView],
+    sizes_px: &[[u32; 2]],
+) -> Result<(Vec<usize>, Vec<Rejected>), Error> {
     if sizes_px.len() != views.len() {
-        return Err(Error::ImageSizes { n_images: views.len(), n_sizes: sizes_px.len() });
+        return Err(Error::ImageSizes {
+            n_images: views.len(),
+            n_sizes: sizes_px.len(),
+        });
     }
     for (view, size_px) in views.iter().zip(sizes_px) {
         if *size_px != sizes_px[0] {
             let (first, first_px) = (views[0].name.clone(), sizes_px[0]);
-            return Err(Error::MixedImageSizes { first, first_px, other: view.name.clone(), other_px: *size_px });
+            return Err(Error::MixedImageSizes {
+                first,
+                first_px,
+                other: view.name.clone(),
+                other_px: *size_px,
+            });
         }
         if size_px.contains(&0) {
-            return Err(Error::EmptyImage { image: view.name.clone() });
+            return Err(Error::EmptyImage {
+                image: view.name.clone(),
+            });
         }
-        let is_finite =
-            |point: &BoardPoint| point.pixel.iter().chain(point.point_in_board.iter()).all(|value| value.is_finite());
+        let is_finite = |point: &BoardPoint| {
+            point
+                .pixel
+                .iter()
+                .chain(point.point_in_board.iter())
+                .all(|value| value.is_finite())
+        };
         if !view.points.iter().all(is_finite) {
-            return Err(Error::NonFinitePoint { image: view.name.clone() });
+            return Err(Error::NonFinitePoint {
+                image: view.name.clone(),
+            });
         }
     }
     check_target(views.iter().flat_map(|view| &view.points))?;
@@ -41,33 +63,57 @@ pub(super) fn usable_images(views: &[BoardView], sizes_px: &[[u32; 2]]) -> Resul
     for (ix, view) in views.iter().enumerate() {
         let n_points = view.points.len();
         let distance_px = |other: &usize| median_distance_px(view, &views[*other]);
-        let same_px = usable.iter().filter_map(distance_px).find(|distance_px| *distance_px < MIN_DISTANCE_PX);
+        let same_px = usable
+            .iter()
+            .filter_map(distance_px)
+            .find(|distance_px| *distance_px < MIN_DISTANCE_PX);
         let reason = match same_px {
-            _ if n_points < MIN_POINTS => RejectionReason::TooFewPoints { n_points, min_points: MIN_POINTS },
+            _ if n_points < MIN_POINTS => RejectionReason::TooFewPoints {
+                n_points,
+                min_points: MIN_POINTS,
+            },
             Some(distance_px) => RejectionReason::Repeated { distance_px },
             None => {
                 usable.push(ix);
                 continue;
             }
         };
-        rejected.push(Rejected { image: view.name.clone(), reason });
+        rejected.push(Rejected {
+            image: view.name.clone(),
+            reason,
+        });
     }
     check_n_images(usable.len())?;
     Ok((usable, rejected))
 }
 
-/// Median distance of the points that two images share, pixels; `None` if they do not share most of them.
+/// Median distance of the points that two images share, pixels; `None` if they do not share most of
+/// them.
 fn median_distance_px(view: &BoardView, other: &BoardView) -> Option<f64> {
     let distance = |point: &BoardPoint| {
-        let same = other.points.iter().find(|other| other.point_in_board == point.point_in_board)?;
+        let same = other
+            .points
+            .iter()
+            .find(|other| other.point_in_board == point.point_in_board)?;
         Some((point.pixel[0] - same.pixel[0]).hypot(point.pixel[1] - same.pixel[1]))
     };
     let distances: Vec<f64> = view.points.iter().filter_map(distance).collect();
-    if 2 * distances.len() < view.points.len() { None } else { median(&distances) }
+    if 2 * distances.len() < view.points.len() {
+        None
+    } else {
+        median(&distances)
+    }
 }
 
 pub(super) fn check_n_images(n_images: usize) -> Result<(), Error> {
-    if n_images < MIN_IMAGES { Err(Error::TooFewImages { n_images, min_images: MIN_IMAGES }) } else { Ok(()) }
+    if n_images < MIN_IMAGES {
+        Err(Error::TooFewImages {
+            n_images,
+            min_images: MIN_IMAGES,
+        })
+    } else {
+        Ok(())
+    }
 }
 
 fn check_target<'a>(points: impl Iterator<Item = &'a BoardPoint> + Clone) -> Result<(), Error> {
@@ -76,7 +122,10 @@ fn check_target<'a>(points: impl Iterator<Item = &'a BoardPoint> + Clone) -> Res
     const MAX_BEND: f64 = 0.02;
     let infinite = Vector3::repeat(f64::INFINITY);
     let (low, high) = points.fold((infinite, -infinite), |(low, high), point| {
-        (low.inf(&point.point_in_board), high.sup(&point.point_in_board))
+        (
+            low.inf(&point.point_in_board),
+            high.sup(&point.point_in_board),
+        )
     });
     let extent = high - low;
     let size_m = extent.x.max(extent.y);
@@ -84,18 +133,22 @@ fn check_target<'a>(points: impl Iterator<Item = &'a BoardPoint> + Clone) -> Res
         return Ok(()); // No points: reported as too few images.
     }
     if !SIZES_M.contains(&size_m) {
-        return Err(Error::TargetSize { size_m: size_m.to_string() });
+        return Err(Error::TargetSize {
+            size_m: size_m.to_string(),
+        });
     }
     if extent.z > MAX_BEND * size_m {
-        return Err(Error::TargetNotFlat { depth_mm: format!("{:.1}", 1e3 * extent.z) });
+        return Err(Error::TargetNotFlat {
+            depth_mm: format!("{:.1}", 1e3 * extent.z),
+        });
     }
     Ok(())
 }
 
 /// Refuses a result whose focal length or principal point the images do not determine.
 pub(super) fn check_observable(fit: &Fit<Bundle>) -> Result<(), Error> {
-    /// Maximum standard deviation of the focal length, relative to it, and of the principal point, relative to the
-    /// focal length or to the longer side of the image.
+    /// Maximum standard deviation of the focal length, relative to it, and of the principal point,
+    /// relative to the focal length or to the longer side of the image.
     const MAX_SIGMA_FRAC: f64 = 0.05;
     /// Focal lengths, relative to the longer side of the image, that occur in cameras.
     const FOCAL_FRACS: std::ops::Range<f64> = 0.05..100.0;

@@ -22,34 +22,54 @@ pub(super) enum Family {
 impl Coefficients {
     pub(super) const PINHOLE: Self = Self::brown_conrady([false; 5]);
     pub(super) const BROWN_CONRADY: Self = Self::brown_conrady([true; 5]);
-    pub(super) const RATIONAL: Self = Self { family: Family::RationalBrownConrady, is_estimated: [true; 8] };
-    pub(super) const KANNALA_BRANDT: Self =
-        Self { family: Family::KannalaBrandt, is_estimated: [true, true, true, true, false, false, false, false] };
+    pub(super) const RATIONAL: Self = Self {
+        family: Family::RationalBrownConrady,
+        is_estimated: [true; 8],
+    };
+    pub(super) const KANNALA_BRANDT: Self = Self {
+        family: Family::KannalaBrandt,
+        is_estimated: [true, true, true, true, false, false, false, false],
+    };
 
     /// Selected coefficients of Brown-Conrady: k1, k2, p1, p2, k3.
     pub(super) const fn brown_conrady([k1, k2, p1, p2, k3]: [bool; 5]) -> Self {
-        Self { family: Family::BrownConrady, is_estimated: [k1, k2, p1, p2, k3, false, false, false] }
+        Self {
+            family: Family::BrownConrady,
+            is_estimated: [k1, k2, p1, p2, k3, false, false, false],
+        }
     }
 
-    /// The rational model with all radial coefficients, and with the tangential ones if this set has them.
+    /// The rational model with all radial coefficients, and with the tangential ones if this set
+    /// has them.
     pub(super) fn rational(self) -> Self {
         let [_, _, p1, p2, ..] = self.is_estimated;
-        Self { is_estimated: [true, true, p1, p2, true, true, true, true], ..Self::RATIONAL }
+        Self {
+            is_estimated: [true, true, p1, p2, true, true, true, true],
+            ..Self::RATIONAL
+        }
     }
 
     /// This set and the given coefficients of Brown-Conrady.
     pub(super) fn with(mut self, added: [bool; 5]) -> Self {
-        self.is_estimated.iter_mut().zip(added).for_each(|(is_estimated, added)| *is_estimated |= added);
+        self.is_estimated
+            .iter_mut()
+            .zip(added)
+            .for_each(|(is_estimated, added)| *is_estimated |= added);
         self
     }
 
     /// Indices of the estimated parameters in [`Intrinsics::params`].
     pub(super) fn params(self) -> Vec<usize> {
-        let coefficients = self.is_estimated.iter().enumerate().filter(|(_, is_estimated)| **is_estimated);
+        let coefficients = self
+            .is_estimated
+            .iter()
+            .enumerate()
+            .filter(|(_, is_estimated)| **is_estimated);
         (0..4).chain(coefficients.map(|(ix, _)| 4 + ix)).collect()
     }
 
-    /// Names of the estimated parameters: `fx`, `fy`, `cx`, `cy`, and OpenCV's names of the coefficients.
+    /// Names of the estimated parameters: `fx`, `fy`, `cx`, `cy`, and OpenCV's names of the
+    /// coefficients.
     pub(super) fn names(self) -> Vec<&'static str> {
         const PLANE: [&str; 4] = ["fx", "fy", "cx", "cy"];
         const BROWN_CONRADY: [&str; 8] = ["k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"];
@@ -58,7 +78,10 @@ impl Coefficients {
             Family::KannalaBrandt => KANNALA_BRANDT,
             Family::BrownConrady | Family::RationalBrownConrady => BROWN_CONRADY,
         };
-        self.params().into_iter().map(|param| *PLANE.iter().chain(&coefficients).nth(param).unwrap_or(&"")).collect()
+        self.params()
+            .into_iter()
+            .map(|param| *PLANE.iter().chain(&coefficients).nth(param).unwrap_or(&""))
+            .collect()
     }
 
     /// Typical magnitudes of the estimated parameters.
@@ -77,21 +100,28 @@ impl Coefficients {
         DVector::from_iterator(self.params().len(), self.params().into_iter().map(scale))
     }
 
-    /// Intrinsics with this lens model. Coefficients of the given intrinsics are kept if they exist in this model and
-    /// are estimated.
+    /// Intrinsics with this lens model. Coefficients of the given intrinsics are kept if they exist
+    /// in this model and are estimated.
     pub(super) fn applied_to(self, intrinsics: &Intrinsics) -> Intrinsics {
         let is_fisheye = |lens: &Lens| matches!(lens, Lens::KannalaBrandt(_));
         let mut k = [0.0; 8];
         if is_fisheye(&intrinsics.lens) == (self.family == Family::KannalaBrandt) {
             let known = intrinsics.lens.coefficients().iter().zip(self.is_estimated);
-            k.iter_mut().zip(known).for_each(|(k, (value, is_estimated))| *k = if is_estimated { *value } else { 0.0 });
+            k.iter_mut()
+                .zip(known)
+                .for_each(|(k, (value, is_estimated))| {
+                    *k = if is_estimated { *value } else { 0.0 }
+                });
         }
         let lens = match self.family {
             Family::BrownConrady => Lens::BrownConrady([k[0], k[1], k[2], k[3], k[4]]),
             Family::RationalBrownConrady => Lens::RationalBrownConrady(k),
             Family::KannalaBrandt => Lens::KannalaBrandt([k[0], k[1], k[2], k[3]]),
         };
-        Intrinsics { lens, ..intrinsics.clone() }
+        Intrinsics {
+            lens,
+            ..intrinsics.clone()
+        }
     }
 
     /// Name of the lens model in rig files.
@@ -108,7 +138,10 @@ impl std::fmt::Display for Coefficients {
     /// The lens model and the estimated coefficients, such as `brown_conrady k1 k2`.
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.write_str(self.model_name())?;
-        self.names().iter().skip(4).try_for_each(|name| write!(f, " {name}"))
+        self.names()
+            .iter()
+            .skip(4)
+            .try_for_each(|name| write!(f, " {name}"))
     }
 }
 
@@ -119,10 +152,19 @@ mod tests {
     #[test]
     fn sets_of_coefficients_are_named() {
         assert_eq!(Coefficients::PINHOLE.to_string(), "pinhole");
-        assert_eq!(Coefficients::BROWN_CONRADY.to_string(), "brown_conrady k1 k2 p1 p2 k3");
+        assert_eq!(
+            Coefficients::BROWN_CONRADY.to_string(),
+            "brown_conrady k1 k2 p1 p2 k3"
+        );
         let radial = Coefficients::PINHOLE.with([true, true, false, false, false]);
         assert_eq!(radial.names(), ["fx", "fy", "cx", "cy", "k1", "k2"]);
-        assert_eq!(radial.rational().to_string(), "brown_conrady k1 k2 k3 k4 k5 k6");
-        assert_eq!(Coefficients::KANNALA_BRANDT.to_string(), "kannala_brandt k1 k2 k3 k4");
+        assert_eq!(
+            radial.rational().to_string(),
+            "brown_conrady k1 k2 k3 k4 k5 k6"
+        );
+        assert_eq!(
+            Coefficients::KANNALA_BRANDT.to_string(),
+            "kannala_brandt k1 k2 k3 k4"
+        );
     }
 }

@@ -30,12 +30,20 @@ fn coverage(size_px: [u32; 2], pixels: impl Iterator<Item = [f64; 2]>) -> ImageG
         let [width, height] = size_px.map(f64::from);
         let (column, row) = (x / width * N_COLUMNS as f64, y / height * N_ROWS as f64);
         if (0.0..N_COLUMNS as f64).contains(&column) && (0.0..N_ROWS as f64).contains(&row) {
-            #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a cell of the grid")]
+            #[expect(
+                clippy::cast_possible_truncation,
+                clippy::cast_sign_loss,
+                reason = "a cell of the grid"
+            )]
             let cell = row as usize * N_COLUMNS + column as usize;
             values[cell] += 1;
         }
     }
-    ImageGrid { n_columns: N_COLUMNS, n_rows: N_ROWS, values }
+    ImageGrid {
+        n_columns: N_COLUMNS,
+        n_rows: N_ROWS,
+        values,
+    }
 }
 
 /// Centers of the cells, pixels.
@@ -43,16 +51,20 @@ fn centers(size_px: [u32; 2]) -> impl Iterator<Item = [f64; 2]> + Clone {
     let [width, height] = size_px.map(f64::from);
     (0..N_ROWS).flat_map(move |row| {
         (0..N_COLUMNS).map(move |column| {
-            [(column as f64 + 0.5) / N_COLUMNS as f64 * width, (row as f64 + 0.5) / N_ROWS as f64 * height]
+            [
+                (column as f64 + 0.5) / N_COLUMNS as f64 * width,
+                (row as f64 + 0.5) / N_ROWS as f64 * height,
+            ]
         })
     })
 }
 
-/// Derivatives of the projection of distant points with respect to the intrinsics, at the centers of the cells.
+/// Derivatives of the projection of distant points with respect to the intrinsics, at the centers
+/// of the cells.
 ///
-/// A change of the intrinsics and a rotation of the camera frame have similar effects, and the poses of the target
-/// absorb such a rotation. So each change is compensated by the rotation that minimizes the sum of the squared
-/// displacements over the grid.
+/// A change of the intrinsics and a rotation of the camera frame have similar effects, and the
+/// poses of the target absorb such a rotation. So each change is compensated by the rotation that
+/// minimizes the sum of the squared displacements over the grid.
 #[derive(Clone, Debug)]
 pub(super) struct ProjectionDerivatives {
     /// One matrix per cell, `[2, n_params]`, pixels. `None` where the lens model ends.
@@ -62,14 +74,21 @@ pub(super) struct ProjectionDerivatives {
 impl ProjectionDerivatives {
     /// * `params`: indices of the estimated parameters in [`Intrinsics::params`].
     pub(super) fn new(intrinsics: &Intrinsics, params: &[usize]) -> Self {
-        let uncompensated: Vec<Option<(DMatrix<f64>, Matrix2x3<f64>)>> = centers(intrinsics.size_px)
-            .map(|pixel| {
-                let direction = intrinsics.unproject(pixel)?.normalize();
-                let Projection { by_point, by_intrinsics, .. } = intrinsics.project_with_derivatives(&direction)?;
-                let by_params = DMatrix::from_fn(2, params.len(), |row, column| by_intrinsics[(row, params[column])]);
-                Some((by_params, by_point * -direction.cross_matrix()))
-            })
-            .collect();
+        let uncompensated: Vec<Option<(DMatrix<f64>, Matrix2x3<f64>)>> =
+            centers(intrinsics.size_px)
+                .map(|pixel| {
+                    let direction = intrinsics.unproject(pixel)?.normalize();
+                    let Projection {
+                        by_point,
+                        by_intrinsics,
+                        ..
+                    } = intrinsics.project_with_derivatives(&direction)?;
+                    let by_params = DMatrix::from_fn(2, params.len(), |row, column| {
+                        by_intrinsics[(row, params[column])]
+                    });
+                    Some((by_params, by_point * -direction.cross_matrix()))
+                })
+                .collect();
         let (mut normal_matrix, mut rhs) = (Matrix3::zeros(), Matrix3xX::zeros(params.len()));
         for (by_params, by_rotation) in uncompensated.iter().flatten() {
             normal_matrix += by_rotation.tr_mul(by_rotation);
@@ -80,9 +99,16 @@ impl ProjectionDerivatives {
         let rotation_by_params = -(inverse * rhs);
         let compensated = |(by_params, by_rotation): (DMatrix<f64>, Matrix2x3<f64>)| {
             let by_rotation = by_rotation * &rotation_by_params;
-            DMatrix::from_fn(2, params.len(), |row, column| by_params[(row, column)] + by_rotation[(row, column)])
+            DMatrix::from_fn(2, params.len(), |row, column| {
+                by_params[(row, column)] + by_rotation[(row, column)]
+            })
         };
-        Self { cells: uncompensated.into_iter().map(|cell| cell.map(compensated)).collect() }
+        Self {
+            cells: uncompensated
+                .into_iter()
+                .map(|cell| cell.map(compensated))
+                .collect(),
+        }
     }
 
     /// Standard deviation in the worst direction of the image, pixels.
@@ -93,50 +119,83 @@ impl ProjectionDerivatives {
             let eigenvalues = Matrix2::new(a, b, b, c).symmetric_eigenvalues();
             eigenvalues.max().max(0.0).sqrt()
         };
-        let values = self.cells.iter().map(|cell| cell.as_ref().map(sigma_px)).collect();
-        ImageGrid { n_columns: N_COLUMNS, n_rows: N_ROWS, values }
+        let values = self
+            .cells
+            .iter()
+            .map(|cell| cell.as_ref().map(sigma_px))
+            .collect();
+        ImageGrid {
+            n_columns: N_COLUMNS,
+            n_rows: N_ROWS,
+            values,
+        }
     }
 
-    /// Matrix `W` so that the variance along one axis of the image, averaged over both axes and all cells, is the trace
-    /// of `W` times the covariance.
+    /// Matrix `W` so that the variance along one axis of the image, averaged over both axes and all
+    /// cells, is the trace of `W` times the covariance.
     pub(super) fn mean_square(&self) -> Option<DMatrix<f64>> {
         let n_cells = self.cells.iter().flatten().count();
-        let sum = self.cells.iter().flatten().map(|cell| cell.tr_mul(cell)).reduce(|sum, product| sum + product)?;
+        let sum = self
+            .cells
+            .iter()
+            .flatten()
+            .map(|cell| cell.tr_mul(cell))
+            .reduce(|sum, product| sum + product)?;
         Some(sum / (2 * n_cells) as f64)
     }
 
     #[cfg(test)]
-    pub(super) fn displacements_px(&self, change: &nalgebra::DVector<f64>) -> Vec<Option<nalgebra::DVector<f64>>> {
-        self.cells.iter().map(|cell| cell.as_ref().map(|cell| cell * change)).collect()
+    pub(super) fn displacements_px(
+        &self,
+        change: &nalgebra::DVector<f64>,
+    ) -> Vec<Option<nalgebra::DVector<f64>>> {
+        self.cells
+            .iter()
+            .map(|cell| cell.as_ref().map(|cell| cell * change))
+            .collect()
     }
 }
 
-/// Displacement between two calibrations of the projections of distant points, after the best rotation of the camera
-/// frame, pixels. `None` where one of the lens models ends.
+/// Displacement between two calibrations of the projections of distant points, after the best
+/// rotation of the camera frame, pixels. `None` where one of the lens models ends.
 #[cfg(test)]
-pub(super) fn displacements_px(from: &Intrinsics, to: &Intrinsics) -> Vec<Option<nalgebra::Vector2<f64>>> {
+pub(super) fn displacements_px(
+    from: &Intrinsics,
+    to: &Intrinsics,
+) -> Vec<Option<nalgebra::Vector2<f64>>> {
     use nalgebra::{Rotation3, Vector2};
-    let directions: Vec<_> = centers(from.size_px).map(|pixel| from.unproject(pixel)).collect();
+    let directions: Vec<_> = centers(from.size_px)
+        .map(|pixel| from.unproject(pixel))
+        .collect();
     let mut rotation = Rotation3::identity();
     let displacement = |rotation: &Rotation3<f64>, direction: &Option<Vector3<f64>>| {
         let direction = (*direction)?;
         let ([x, y], by_point) = to.project_with_jacobian(&(rotation * direction))?;
         let [u, v] = from.project(&direction)?;
-        Some((Vector2::new(x - u, y - v), by_point * -(rotation * direction).cross_matrix()))
+        Some((
+            Vector2::new(x - u, y - v),
+            by_point * -(rotation * direction).cross_matrix(),
+        ))
     };
     for _ in 0..5 {
         let (mut normal_matrix, mut rhs) = (Matrix3::zeros(), Vector3::zeros());
-        for (residual, by_rotation) in directions.iter().filter_map(|direction| displacement(&rotation, direction)) {
+        for (residual, by_rotation) in directions
+            .iter()
+            .filter_map(|direction| displacement(&rotation, direction))
+        {
             normal_matrix += by_rotation.tr_mul(&by_rotation);
             rhs += by_rotation.tr_mul(&residual);
         }
         rotation = Rotation3::new(-(normal_matrix.try_inverse().unwrap() * rhs)) * rotation;
     }
-    directions.iter().map(|direction| displacement(&rotation, direction).map(|(residual, _)| residual)).collect()
+    directions
+        .iter()
+        .map(|direction| displacement(&rotation, direction).map(|(residual, _)| residual))
+        .collect()
 }
 
-/// Information of one image about the estimated intrinsics when its pose is free, for residuals of unit variance.
-/// `None` if a point is outside the image.
+/// Information of one image about the estimated intrinsics when its pose is free, for residuals of
+/// unit variance. `None` if a point is outside the image.
 pub(super) fn information(
     intrinsics: &Intrinsics,
     params: &[usize],
@@ -149,12 +208,19 @@ pub(super) fn information(
     let mut local = SMatrix::<f64, 6, 6>::zeros();
     for point in points_in_board {
         let in_camera = (camera_from_board * nalgebra::Point3::from(*point)).coords;
-        let projection = intrinsics.project_with_derivatives(&in_camera).filter(|p| intrinsics.contains(p.pixel))?;
-        let by_rotation = projection.by_point * super::board_pose::by_rotation(camera_from_board, point);
-        let by_params = DMatrix::from_fn(2, n, |row, column| projection.by_intrinsics[(row, params[column])]);
+        let projection = intrinsics
+            .project_with_derivatives(&in_camera)
+            .filter(|p| intrinsics.contains(p.pixel))?;
+        let by_rotation =
+            projection.by_point * super::board_pose::by_rotation(camera_from_board, point);
+        let by_params = DMatrix::from_fn(2, n, |row, column| {
+            projection.by_intrinsics[(row, params[column])]
+        });
         let mut by_pose = SMatrix::<f64, 2, 6>::zeros();
         by_pose.fixed_columns_mut::<3>(0).copy_from(&by_rotation);
-        by_pose.fixed_columns_mut::<3>(3).copy_from(&projection.by_point);
+        by_pose
+            .fixed_columns_mut::<3>(3)
+            .copy_from(&projection.by_point);
         shared.gemm_tr(1.0, &by_params, &by_params, 1.0);
         cross.gemm_tr(1.0, &by_pose, &by_params, 1.0);
         local += by_pose.tr_mul(&by_pose);
@@ -171,28 +237,47 @@ mod tests {
 
     #[test]
     fn coverage_counts_corners_in_cells() {
-        let pixels =
-            [[0.0, 0.0], [39.9, 53.0], [40.1, 0.0], [639.9, 479.9], [640.0, 0.0], [-0.1, 5.0], [f64::NAN, 1.0]];
+        let pixels = [
+            [0.0, 0.0],
+            [39.9, 53.0],
+            [40.1, 0.0],
+            [639.9, 479.9],
+            [640.0, 0.0],
+            [-0.1, 5.0],
+            [f64::NAN, 1.0],
+        ];
         let grid = coverage([640, 480], pixels.into_iter());
         assert_eq!(grid.values.iter().sum::<usize>(), 4);
-        assert_eq!((grid.values[0], grid.values[1], grid.values[143]), (2, 1, 1));
+        assert_eq!(
+            (grid.values[0], grid.values[1], grid.values[143]),
+            (2, 1, 1)
+        );
     }
 
     #[test]
     fn linear_displacements_match_the_difference_of_two_cameras() {
-        // Displacements are up to 0.2 px; the changes of the parameters, and with them the second-order terms, are about
-        // 1e-3.
+        // Displacements are up to 0.2 px; the changes of the parameters, and with them the
+        // second-order terms, are about 1e-3.
         const CLOSE_PX: f64 = 1e-3;
         let camera = brown_conrady_camera();
         let params: Vec<usize> = (0..9).collect();
-        let change = DVector::from_column_slice(&[0.2, -0.1, 0.3, -0.2, 3e-4, -1e-3, 1e-5, -1e-5, 1e-3]);
-        let moved: Vec<f64> = camera.params().iter().zip(&change).map(|(value, change)| value + change).collect();
+        let change =
+            DVector::from_column_slice(&[0.2, -0.1, 0.3, -0.2, 3e-4, -1e-3, 1e-5, -1e-5, 1e-3]);
+        let moved: Vec<f64> = camera
+            .params()
+            .iter()
+            .zip(&change)
+            .map(|(value, change)| value + change)
+            .collect();
         let exact = displacements_px(&camera, &camera.with_params(&moved));
         let linear = ProjectionDerivatives::new(&camera, &params).displacements_px(&change);
         let mut largest: f64 = 0.0;
         for (exact, linear) in exact.iter().zip(&linear) {
             let (exact, linear) = (exact.unwrap(), linear.as_ref().unwrap());
-            assert!((exact[0] - linear[0]).hypot(exact[1] - linear[1]) < CLOSE_PX, "{exact} {linear}");
+            assert!(
+                (exact[0] - linear[0]).hypot(exact[1] - linear[1]) < CLOSE_PX,
+                "{exact} {linear}"
+            );
             largest = largest.max(exact.norm());
         }
         assert!(largest > 0.1, "{largest}");
@@ -201,9 +286,17 @@ mod tests {
     #[test]
     fn rotations_of_the_camera_are_not_uncertainty() {
         // A shift of the principal point by 1 px is almost a rotation for a long focal length.
-        let camera = Intrinsics { focal_px: [6000.0; 2], lens: kinematics::Lens::Pinhole, ..brown_conrady_camera() };
+        let camera = Intrinsics {
+            focal_px: [6000.0; 2],
+            lens: kinematics::Lens::Pinhole,
+            ..brown_conrady_camera()
+        };
         let derivatives = ProjectionDerivatives::new(&camera, &[2, 3]);
         let sigmas = derivatives.sigmas_px(&DMatrix::identity(2, 2));
-        assert!(sigmas.values.iter().flatten().all(|sigma| *sigma < 0.01), "{:?}", sigmas.values);
+        assert!(
+            sigmas.values.iter().flatten().all(|sigma| *sigma < 0.01),
+            "{:?}",
+            sigmas.values
+        );
     }
 }

@@ -1,7 +1,7 @@
 //! What images of a target cover so far, and which ones to take next, without a calibration.
 //!
-//! A lens needs corners in all parts of the image, and tilts in all directions: without tilts, a longer focal length cannot
-//! be distinguished from a larger distance (Zhang 2000, section 3.3).
+//! A lens needs corners in all parts of the image, and tilts in all directions: without tilts, a
+//! longer focal length cannot be distinguished from a larger distance (Zhang 2000, section 3.3).
 
 use super::board_pose::board_pose;
 use super::grid::ImageGrid;
@@ -14,7 +14,8 @@ use std::fmt;
 pub const RECOMMENDED_IMAGES: usize = 15;
 /// A part of the image is covered if this fraction of its cells has corners.
 const MIN_COVERED_FRAC: f64 = 0.5;
-/// A tilt in a direction counts from this angle between the normal of the target and the line of sight.
+/// A tilt in a direction counts from this angle between the normal of the target and the line of
+/// sight.
 const MIN_TILT_DEG: f64 = 15.0;
 /// Number of images with each tilt.
 const MIN_TILTED: usize = 2;
@@ -87,7 +88,12 @@ impl IntrinsicsGuidance {
     ///
     /// * `intrinsics`: an approximate lens, for the tilts; its size is that of the images.
     pub fn new(views: &[BoardView], intrinsics: &Intrinsics) -> Self {
-        let pixels = || views.iter().flat_map(|view| &view.points).map(|point| point.pixel);
+        let pixels = || {
+            views
+                .iter()
+                .flat_map(|view| &view.points)
+                .map(|point| point.pixel)
+        };
         let coverage = ImageGrid::coverage(intrinsics.size_px, pixels());
         let n_covered = coverage.values.iter().filter(|n| **n > 0).count();
         Self {
@@ -99,11 +105,18 @@ impl IntrinsicsGuidance {
 }
 
 /// The first thing that is missing: tilts, then parts of the image.
-fn advice(views: &[BoardView], coverage: &ImageGrid<usize>, intrinsics: &Intrinsics) -> IntrinsicsAdvice {
+fn advice(
+    views: &[BoardView],
+    coverage: &ImageGrid<usize>,
+    intrinsics: &Intrinsics,
+) -> IntrinsicsAdvice {
     if views.is_empty() {
         return IntrinsicsAdvice::ShowTarget;
     }
-    let tilts: Vec<[f64; 2]> = views.iter().filter_map(|view| tilt_deg(view, intrinsics)).collect();
+    let tilts: Vec<[f64; 2]> = views
+        .iter()
+        .filter_map(|view| tilt_deg(view, intrinsics))
+        .collect();
     let is_tilted = |side: Side, [about_x, about_y]: [f64; 2]| {
         let angle = match side {
             Side::Left => about_y,
@@ -114,21 +127,28 @@ fn advice(views: &[BoardView], coverage: &ImageGrid<usize>, intrinsics: &Intrins
         angle >= MIN_TILT_DEG
     };
     let n_tilted = |side: Side| tilts.iter().filter(|tilt| is_tilted(side, **tilt)).count();
-    let missing_tilt =
-        [Side::Left, Side::Right, Side::Upper, Side::Lower].into_iter().find(|side| n_tilted(*side) < MIN_TILTED);
-    let missing_region = REGIONS.into_iter().find(|(_, bounds)| covered_frac(coverage, *bounds) < MIN_COVERED_FRAC);
+    let missing_tilt = [Side::Left, Side::Right, Side::Upper, Side::Lower]
+        .into_iter()
+        .find(|side| n_tilted(*side) < MIN_TILTED);
+    let missing_region = REGIONS
+        .into_iter()
+        .find(|(_, bounds)| covered_frac(coverage, *bounds) < MIN_COVERED_FRAC);
     let missing_region = missing_region.map(|(region, _)| region);
     match (missing_tilt, missing_region) {
         (Some(side), _) => IntrinsicsAdvice::Tilt(side),
         (None, Some(region)) => IntrinsicsAdvice::MoveTo(region),
-        (None, None) if views.len() < RECOMMENDED_IMAGES => IntrinsicsAdvice::More(RECOMMENDED_IMAGES - views.len()),
+        (None, None) if views.len() < RECOMMENDED_IMAGES => {
+            IntrinsicsAdvice::More(RECOMMENDED_IMAGES - views.len())
+        }
         (None, None) => IntrinsicsAdvice::Enough,
     }
 }
 
 /// Fraction of the cells with corners among those whose centers are in a part of the image.
 fn covered_frac(coverage: &ImageGrid<usize>, [columns, rows]: [[f64; 2]; 2]) -> f64 {
-    let is_inside = |ix: usize, n: usize, [low, high]: [f64; 2]| (low..high).contains(&((ix as f64 + 0.5) / n as f64));
+    let is_inside = |ix: usize, n: usize, [low, high]: [f64; 2]| {
+        (low..high).contains(&((ix as f64 + 0.5) / n as f64))
+    };
     let (mut n, mut n_covered) = (0_u32, 0_u32);
     for (ix, value) in coverage.values.iter().enumerate() {
         let (column, row) = (ix % coverage.n_columns, ix / coverage.n_columns);
@@ -140,14 +160,26 @@ fn covered_frac(coverage: &ImageGrid<usize>, [columns, rows]: [[f64; 2]; 2]) -> 
     f64::from(n_covered) / f64::from(n.max(1))
 }
 
-/// Rotation of the target about the x and the y axis of the camera relative to facing it, degrees. A positive angle about y
-/// means that the left side is farther away, a positive angle about x that the lower side is.
+/// Rotation of the target about the x and the y axis of the camera relative to facing it, degrees.
+/// A positive angle about y means that the left side is farther away, a positive angle about x that
+/// the lower side is.
 fn tilt_deg(view: &BoardView, intrinsics: &Intrinsics) -> Option<[f64; 2]> {
     let pose = board_pose(intrinsics, &view.points)?.camera_from_board;
-    let center = view.points.iter().map(|point| point.point_in_board).sum::<Vector3<f64>>() / view.points.len() as f64;
-    let sight = (pose * nalgebra::Point3::from(center)).coords.try_normalize(0.0)?;
+    let center = view
+        .points
+        .iter()
+        .map(|point| point.point_in_board)
+        .sum::<Vector3<f64>>()
+        / view.points.len() as f64;
+    let sight = (pose * nalgebra::Point3::from(center))
+        .coords
+        .try_normalize(0.0)?;
     let normal = pose.rotation * Vector3::z();
-    let normal = if normal.dot(&sight) < 0.0 { -normal } else { normal };
+    let normal = if normal.dot(&sight) < 0.0 {
+        -normal
+    } else {
+        normal
+    };
     let tilt = sight.cross(&normal);
     let angle = tilt.norm().clamp(0.0, 1.0).asin().to_degrees();
     let axis = tilt.try_normalize(0.0).unwrap_or_default();
@@ -160,10 +192,16 @@ impl fmt::Display for IntrinsicsAdvice {
             Self::ShowTarget => f.write_str("show the whole target to the camera"),
             Self::MoveTo(region) => write!(f, "move the target to {region}"),
             Self::Tilt(side) => {
-                write!(f, "tilt the target by 20 to 45 degrees, with its {side} side away from the camera")
+                write!(
+                    f,
+                    "tilt the target by 20 to 45 degrees, with its {side} side away from the camera"
+                )
             }
             Self::More(1) => f.write_str("take one more image from another direction"),
-            Self::More(n) => write!(f, "take {n} more images from other directions and distances"),
+            Self::More(n) => write!(
+                f,
+                "take {n} more images from other directions and distances"
+            ),
             Self::Enough => f.write_str("the images cover everything"),
         }
     }
@@ -211,43 +249,70 @@ mod tests {
 
     /// A board of 0.2 x 0.15 m with its center at a point, rotated about the axes of the camera.
     fn view(center: [f64; 3], rotation_deg: [f64; 3]) -> BoardView {
-        let rotation = UnitQuaternion::from_scaled_axis(Vector3::from(rotation_deg).map(f64::to_radians));
+        let rotation =
+            UnitQuaternion::from_scaled_axis(Vector3::from(rotation_deg).map(f64::to_radians));
         let pose = Transform::from_parts(Vector3::from(center).into(), rotation);
-        let points = (0..63).map(|ix| Vector3::new(f64::from(ix % 9) - 4.0, f64::from(ix / 9) - 3.0, 0.0) * 0.025);
+        let points = (0..63)
+            .map(|ix| Vector3::new(f64::from(ix % 9) - 4.0, f64::from(ix / 9) - 3.0, 0.0) * 0.025);
         let points = points.map(|point_in_board| {
-            let pixel = camera().project(&(pose * Point3::from(point_in_board)).coords).expect("in front");
-            BoardPoint { point_in_board, pixel }
+            let pixel = camera()
+                .project(&(pose * Point3::from(point_in_board)).coords)
+                .expect("in front");
+            BoardPoint {
+                point_in_board,
+                pixel,
+            }
         });
-        BoardView { name: String::new(), points: points.collect() }
+        BoardView {
+            name: String::new(),
+            points: points.collect(),
+        }
     }
 
     #[test]
     fn tilts_have_the_signs_of_their_sides() {
-        // A positive rotation about y moves the left side (negative x) to larger z: z' = -x sin(angle).
-        let [about_x, about_y] = tilt_deg(&view([0.0, 0.0, 0.5], [0.0, 30.0, 0.0]), &camera()).unwrap();
-        assert!(about_x.abs() < 0.1 && (about_y - 30.0).abs() < 0.1, "{about_x} {about_y}");
+        // A positive rotation about y moves the left side (negative x) to larger z: z' = -x
+        // sin(angle).
+        let [about_x, about_y] =
+            tilt_deg(&view([0.0, 0.0, 0.5], [0.0, 30.0, 0.0]), &camera()).unwrap();
+        assert!(
+            about_x.abs() < 0.1 && (about_y - 30.0).abs() < 0.1,
+            "{about_x} {about_y}"
+        );
         let left = view([0.0, 0.0, 0.5], [0.0, 30.0, 0.0]);
         let spread = |view: &BoardView, is_left: bool| {
-            let side = view.points.iter().filter(|point| (point.point_in_board.x < -0.09) == is_left);
-            let ys: Vec<f64> =
-                side.filter(|point| point.point_in_board.x.abs() > 0.09).map(|point| point.pixel[1]).collect();
+            let side = view
+                .points
+                .iter()
+                .filter(|point| (point.point_in_board.x < -0.09) == is_left);
+            let ys: Vec<f64> = side
+                .filter(|point| point.point_in_board.x.abs() > 0.09)
+                .map(|point| point.pixel[1])
+                .collect();
             ys.iter().fold(f64::MIN, |a, b| a.max(*b)) - ys.iter().fold(f64::MAX, |a, b| a.min(*b))
         };
-        assert!(spread(&left, true) < spread(&left, false), "the left side looks smaller");
+        assert!(
+            spread(&left, true) < spread(&left, false),
+            "the left side looks smaller"
+        );
     }
 
     #[test]
     fn advice_leads_to_images_that_cover_everything() {
-        assert_eq!(IntrinsicsGuidance::new(&[], &camera()).advice, IntrinsicsAdvice::ShowTarget);
+        assert_eq!(
+            IntrinsicsGuidance::new(&[], &camera()).advice,
+            IntrinsicsAdvice::ShowTarget
+        );
         let mut views = Vec::new();
         let mut seen = Vec::new();
         for _ in 0..40 {
             let guidance = IntrinsicsGuidance::new(&views, &camera());
             seen.push(guidance.advice);
             views.push(match guidance.advice {
-                IntrinsicsAdvice::ShowTarget | IntrinsicsAdvice::More(_) => {
-                    view([0.0, 0.0, 0.4 + 0.01 * views.len() as f64], [1.0, 2.0, 10.0])
-                }
+                IntrinsicsAdvice::ShowTarget | IntrinsicsAdvice::More(_) => view(
+                    [0.0, 0.0, 0.4 + 0.01 * views.len() as f64],
+                    [1.0, 2.0, 10.0],
+                ),
                 IntrinsicsAdvice::MoveTo(region) => {
                     let [x, y] = match region {
                         ImageRegion::Center => [0.0, 0.0],
@@ -271,20 +336,41 @@ mod tests {
             });
         }
         let last = IntrinsicsGuidance::new(&views, &camera());
-        assert_eq!((last.advice, last.n_images), (IntrinsicsAdvice::Enough, RECOMMENDED_IMAGES), "{seen:?}");
+        assert_eq!(
+            (last.advice, last.n_images),
+            (IntrinsicsAdvice::Enough, RECOMMENDED_IMAGES),
+            "{seen:?}"
+        );
         assert!(last.covered_frac > 0.6, "{}", last.covered_frac);
         for side in [Side::Left, Side::Right, Side::Upper, Side::Lower] {
-            assert!(seen.contains(&IntrinsicsAdvice::Tilt(side)), "{side}: {seen:?}");
+            assert!(
+                seen.contains(&IntrinsicsAdvice::Tilt(side)),
+                "{side}: {seen:?}"
+            );
         }
-        assert!(seen.contains(&IntrinsicsAdvice::MoveTo(ImageRegion::UpperLeft)), "{seen:?}");
+        assert!(
+            seen.contains(&IntrinsicsAdvice::MoveTo(ImageRegion::UpperLeft)),
+            "{seen:?}"
+        );
     }
 
     #[test]
     fn frontal_images_never_suffice() {
-        let views: Vec<BoardView> =
-            (0..30).map(|ix| view([0.01 * f64::from(ix % 5), 0.0, 0.4], [0.0, 0.0, f64::from(ix)])).collect();
+        let views: Vec<BoardView> = (0..30)
+            .map(|ix| {
+                view(
+                    [0.01 * f64::from(ix % 5), 0.0, 0.4],
+                    [0.0, 0.0, f64::from(ix)],
+                )
+            })
+            .collect();
         let advice = IntrinsicsGuidance::new(&views, &camera()).advice;
         assert!(matches!(advice, IntrinsicsAdvice::Tilt(_)), "{advice}");
-        assert!(advice.to_string().starts_with("tilt the target by 20 to 45 degrees, with its left side"), "{advice}");
+        assert!(
+            advice
+                .to_string()
+                .starts_with("tilt the target by 20 to 45 degrees, with its left side"),
+            "{advice}"
+        );
     }
 }

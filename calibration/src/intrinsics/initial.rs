@@ -8,8 +8,8 @@ use kinematics::quantile::median;
 use kinematics::{Intrinsics, Lens, Transform};
 use nalgebra::{Matrix2, Matrix3, Matrix6, Translation3, Vector2, Vector6};
 
-/// Focal lengths that are tried, relative to the longer side of the image: fields of view of about 20 to 100 degrees
-/// for a pinhole, and of 20 to 200 degrees for an equidistant fisheye.
+/// Focal lengths that are tried, relative to the longer side of the image: fields of view of about
+/// 20 to 100 degrees for a pinhole, and of 20 to 200 degrees for an equidistant fisheye.
 const PINHOLE_FOCAL_FRACS: [f64; 6] = [0.4, 0.6, 0.9, 1.3, 2.0, 3.0];
 const FISHEYE_FOCAL_FRACS: [f64; 9] = [0.27, 0.33, 0.4, 0.5, 0.65, 0.8, 1.1, 1.6, 2.4];
 
@@ -23,15 +23,32 @@ pub(super) struct Start {
 }
 
 impl Start {
-    fn new(intrinsics: Intrinsics, poses: Vec<Option<Transform>>, images: &[&[BoardPoint]]) -> Self {
+    fn new(
+        intrinsics: Intrinsics,
+        poses: Vec<Option<Transform>>,
+        images: &[&[BoardPoint]],
+    ) -> Self {
         let error_px = |(pose, points): (&Option<Transform>, &&[BoardPoint])| {
-            let Some(pose) = pose else { return f64::INFINITY };
-            let bundle = Bundle { intrinsics: intrinsics.clone(), poses: vec![*pose] };
-            let squares = bundle.errors_px(0, points).into_iter().map(|error| error * error).sum::<f64>();
+            let Some(pose) = pose else {
+                return f64::INFINITY;
+            };
+            let bundle = Bundle {
+                intrinsics: intrinsics.clone(),
+                poses: vec![*pose],
+            };
+            let squares = bundle
+                .errors_px(0, points)
+                .into_iter()
+                .map(|error| error * error)
+                .sum::<f64>();
             (squares / points.len() as f64).sqrt()
         };
         let errors_px = poses.iter().zip(images).map(error_px).collect();
-        Self { intrinsics, poses, errors_px }
+        Self {
+            intrinsics,
+            poses,
+            errors_px,
+        }
     }
 
     /// Median over the images, so that up to half of them may be wrong.
@@ -40,14 +57,20 @@ impl Start {
     }
 }
 
-/// Initial values for lenses that are close to a pinhole: the best of Zhang's closed form, of the closed form with the
-/// principal point at the center of the image, and of a set of focal lengths.
+/// Initial values for lenses that are close to a pinhole: the best of Zhang's closed form, of the
+/// closed form with the principal point at the center of the image, and of a set of focal lengths.
 ///
 /// Returns `None` if fewer than half of the images have a homography that fits one of them.
 pub(super) fn pinhole(images: &[&[BoardPoint]], size_px: [u32; 2]) -> Option<Start> {
-    let homographies: Vec<Option<Matrix3<f64>>> = images.iter().map(|points| pixel_from_plane(points)).collect();
+    let homographies: Vec<Option<Matrix3<f64>>> = images
+        .iter()
+        .map(|points| pixel_from_plane(points))
+        .collect();
     let known: Vec<Matrix3<f64>> = homographies.iter().flatten().copied().collect();
-    let normalized: Vec<Matrix3<f64>> = known.iter().map(|homography| centered(homography, size_px)).collect();
+    let normalized: Vec<Matrix3<f64>> = known
+        .iter()
+        .map(|homography| centered(homography, size_px))
+        .collect();
     let closed_forms = [zhang(&normalized), single_focal(&normalized)];
     let scan = PINHOLE_FOCAL_FRACS.map(|frac| Some(([frac; 2], [0.0; 2])));
     let candidates = closed_forms.into_iter().chain(scan).flatten();
@@ -69,12 +92,16 @@ pub(super) fn pinhole(images: &[&[BoardPoint]], size_px: [u32; 2]) -> Option<Sta
 
 /// Initial values for fisheye lenses: the best of a set of equidistant lenses.
 pub(super) fn fisheye(images: &[&[BoardPoint]], size_px: [u32; 2]) -> Option<Start> {
-    /// Number of candidates whose poses are refined, because those of homographies are inaccurate for wide angles.
+    /// Number of candidates whose poses are refined, because those of homographies are inaccurate
+    /// for wide angles.
     const N_REFINED: usize = 3;
     let lens = Lens::KannalaBrandt([0.0; 4]);
     let starts = FISHEYE_FOCAL_FRACS.into_iter().filter_map(|frac| {
         let intrinsics = denormalized(([frac; 2], [0.0; 2]), size_px, lens)?;
-        let poses = images.iter().map(|points| board_pose::initial_pose(&intrinsics, points)).collect();
+        let poses = images
+            .iter()
+            .map(|points| board_pose::initial_pose(&intrinsics, points))
+            .collect();
         Some(Start::new(intrinsics, poses, images))
     });
     let mut starts: Vec<Start> = starts.collect();
@@ -95,28 +122,45 @@ fn best(starts: impl Iterator<Item = Start>) -> Option<Start> {
 }
 
 fn pixel_from_plane(points: &[BoardPoint]) -> Option<Matrix3<f64>> {
-    let pairs: Vec<_> = points.iter().map(|point| (point.point_in_board.xy(), Vector2::from(point.pixel))).collect();
+    let pairs: Vec<_> = points
+        .iter()
+        .map(|point| (point.point_in_board.xy(), Vector2::from(point.pixel)))
+        .collect();
     homography(&pairs)
 }
 
-/// A homography to pixels, moved to the center of the image and divided by its longer side, with columns of about
-/// unit length.
+/// A homography to pixels, moved to the center of the image and divided by its longer side, with
+/// columns of about unit length.
 fn centered(homography: &Matrix3<f64>, size_px: [u32; 2]) -> Matrix3<f64> {
     let (center, side) = frame(size_px);
-    let normalize = Matrix3::new(1.0 / side, 0.0, -center[0] / side, 0.0, 1.0 / side, -center[1] / side, 0.0, 0.0, 1.0);
+    let normalize = Matrix3::new(
+        1.0 / side,
+        0.0,
+        -center[0] / side,
+        0.0,
+        1.0 / side,
+        -center[1] / side,
+        0.0,
+        0.0,
+        1.0,
+    );
     let homography = normalize * homography;
     let length = (homography.column(0).norm() * homography.column(1).norm()).sqrt();
     homography / length
 }
 
 fn frame(size_px: [u32; 2]) -> ([f64; 2], f64) {
-    (size_px.map(|side| 0.5 * f64::from(side)), f64::from(size_px[0].max(size_px[1])))
+    (
+        size_px.map(|side| 0.5 * f64::from(side)),
+        f64::from(size_px[0].max(size_px[1])),
+    )
 }
 
 /// Focal lengths and principal point of a centered and normalized image.
 type Plane = ([f64; 2], [f64; 2]);
 
-/// Converts to pixels. `None` if the focal lengths are implausible or the principal point is outside the image.
+/// Converts to pixels. `None` if the focal lengths are implausible or the principal point is
+/// outside the image.
 fn denormalized((focal, principal): Plane, size_px: [u32; 2], lens: Lens) -> Option<Intrinsics> {
     const FOCAL_FRACS: std::ops::Range<f64> = 0.05..100.0;
     const MAX_ASPECT: f64 = 2.0;
@@ -126,7 +170,13 @@ fn denormalized((focal, principal): Plane, size_px: [u32; 2], lens: Lens) -> Opt
         && (1.0 / MAX_ASPECT..MAX_ASPECT).contains(&(focal[0] / focal[1]))
         && (0..2).all(|axis| (0.0..=2.0 * center[axis]).contains(&principal_px[axis]));
     let focal_px = focal.map(|focal| focal * side);
-    is_plausible.then_some(Intrinsics { size_px, focal_px, principal_px, lens, rectified: false })
+    is_plausible.then_some(Intrinsics {
+        size_px,
+        focal_px,
+        principal_px,
+        lens,
+        rectified: false,
+    })
 }
 
 /// Closed form for focal lengths and principal point, without skew.
@@ -165,12 +215,17 @@ fn zhang(homographies: &[Matrix3<f64>]) -> Option<Plane> {
     let fy = (lambda * b11 / determinant).sqrt();
     let skew = -b12 * fx * fx * fy / lambda;
     let cx = skew * cy / fy - b13 * fx * fx / lambda;
-    [fx, fy, cx, cy].iter().all(|value| value.is_finite()).then_some(([fx, fy], [cx, cy]))
+    [fx, fy, cx, cy]
+        .iter()
+        .all(|value| value.is_finite())
+        .then_some(([fx, fy], [cx, cy]))
 }
 
-/// Closed form for one focal length, with the principal point at the center of the image and square pixels.
+/// Closed form for one focal length, with the principal point at the center of the image and square
+/// pixels.
 ///
-/// The two constraints of Zhang 2000, section 2.3, are linear in the inverse of the squared focal length.
+/// The two constraints of Zhang 2000, section 2.3, are linear in the inverse of the squared focal
+/// length.
 fn single_focal(homographies: &[Matrix3<f64>]) -> Option<Plane> {
     let mut sums = Matrix2::<f64>::zeros();
     for homography in homographies {
@@ -194,19 +249,39 @@ mod tests {
 
     #[test]
     fn closed_forms_recover_a_pinhole() {
-        let camera = Intrinsics { lens: Lens::Pinhole, ..brown_conrady_camera() };
+        let camera = Intrinsics {
+            lens: Lens::Pinhole,
+            ..brown_conrady_camera()
+        };
         let images = observed_images(&camera, &poses(8, 1), 0.0, 1);
         let images: Vec<&[BoardPoint]> = images.iter().map(|view| &view.points[..]).collect();
         let start = pinhole(&images, camera.size_px).unwrap();
-        assert!((start.intrinsics.focal_px[0] - camera.focal_px[0]).abs() < 1e-4, "{:?}", start.intrinsics);
-        assert!((start.intrinsics.principal_px[1] - camera.principal_px[1]).abs() < 1e-4, "{:?}", start.intrinsics);
+        assert!(
+            (start.intrinsics.focal_px[0] - camera.focal_px[0]).abs() < 1e-4,
+            "{:?}",
+            start.intrinsics
+        );
+        assert!(
+            (start.intrinsics.principal_px[1] - camera.principal_px[1]).abs() < 1e-4,
+            "{:?}",
+            start.intrinsics
+        );
         assert!(start.median_error_px() < 1e-4);
 
-        let centered_camera = Intrinsics { focal_px: [600.0; 2], principal_px: [320.0, 240.0], ..camera };
+        let centered_camera = Intrinsics {
+            focal_px: [600.0; 2],
+            principal_px: [320.0, 240.0],
+            ..camera
+        };
         let images = observed_images(&centered_camera, &poses(2, 1), 0.0, 1);
         let homographies: Vec<_> = images
             .iter()
-            .map(|view| centered(&pixel_from_plane(&view.points).unwrap(), centered_camera.size_px))
+            .map(|view| {
+                centered(
+                    &pixel_from_plane(&view.points).unwrap(),
+                    centered_camera.size_px,
+                )
+            })
             .collect();
         let (focal, _) = single_focal(&homographies).unwrap();
         assert!((focal[0] * 640.0 - 600.0).abs() < 1e-6);
@@ -224,7 +299,10 @@ mod tests {
 
     #[test]
     fn images_without_homographies_have_no_start() {
-        let points = [BoardPoint { point_in_board: nalgebra::Vector3::zeros(), pixel: [1.0, 2.0] }; 9];
+        let points = [BoardPoint {
+            point_in_board: nalgebra::Vector3::zeros(),
+            pixel: [1.0, 2.0],
+        }; 9];
         assert!(pinhole(&[&points[..]; 4], [640, 480]).is_none());
         assert!(fisheye(&[&points[..]; 4], [640, 480]).is_none());
         assert!(pinhole(&[], [640, 480]).is_none());

@@ -1,6 +1,8 @@
-//! Calibration of focal length, principal point and lens of one camera from images of a flat target.
+//! Calibration of focal length, principal point and lens of one camera from images of a flat
+//! target.
 //!
-//! Sources: Zhang 2000 for the approach; OpenCV for the lens models; mrcal for the projection uncertainty.
+//! Sources: Zhang 2000 for the approach; OpenCV for the lens models; mrcal for the projection
+//! uncertainty.
 
 pub(crate) mod board_pose;
 mod bundle;
@@ -21,7 +23,9 @@ pub use board_pose::{BoardPose, board_pose};
 pub use grid::ImageGrid;
 pub use guidance::{ImageRegion, IntrinsicsAdvice, IntrinsicsGuidance, RECOMMENDED_IMAGES, Side};
 pub use next_view::NextView;
-pub use report::{EstimatedParam, ImageFit, IntrinsicsCalibration, PointFit, Rejected, RejectionReason};
+pub use report::{
+    EstimatedParam, ImageFit, IntrinsicsCalibration, PointFit, Rejected, RejectionReason,
+};
 pub use selection::LensTrial;
 
 use crate::{BoardPoint, BoardView, Error, MIN_VALIDATION_IMAGES};
@@ -31,7 +35,8 @@ use robust::RobustFit;
 /// Detected points and the lens model to estimate.
 #[derive(Clone, Copy, Debug)]
 pub struct IntrinsicsInput<'a> {
-    /// The target in each image. Any consistent numbering of its points is fine, also a mirrored or rotated one.
+    /// The target in each image. Any consistent numbering of its points is fine, also a mirrored or
+    /// rotated one.
     pub views: &'a [BoardView],
     /// Width and height of each image, pixels; all equal.
     pub sizes_px: &'a [[u32; 2]],
@@ -42,9 +47,9 @@ pub struct IntrinsicsInput<'a> {
 /// A lens model to estimate.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum LensModel {
-    /// The simplest model that explains the images: a coefficient is estimated only if it lowers the error on held-out
-    /// corners significantly. With fewer than four images, all coefficients of the better of Brown-Conrady (k1, k2, p1,
-    /// p2, k3) and Kannala-Brandt are estimated.
+    /// The simplest model that explains the images: a coefficient is estimated only if it lowers
+    /// the error on held-out corners significantly. With fewer than four images, all coefficients
+    /// of the better of Brown-Conrady (k1, k2, p1, p2, k3) and Kannala-Brandt are estimated.
     #[default]
     Auto,
     /// No distortion.
@@ -59,22 +64,43 @@ pub enum LensModel {
 
 /// Estimates the intrinsics of a camera from images of a flat target, with their uncertainty.
 ///
-/// Images may show parts of the target. Images and corners that are inconsistent with the others are rejected and
-/// named; up to half of the images may be.
+/// Images may show parts of the target. Images and corners that are inconsistent with the others
+/// are rejected and named; up to half of the images may be.
 ///
 /// # Errors
-/// If the input is malformed, if too few images are usable, if no lens model fits, or if the images do not determine
-/// the focal length or the principal point. The message contains the remedy.
+/// If the input is malformed, if too few images are usable, if no lens model fits, or if the images
+/// do not determine the focal length or the principal point. The message contains the remedy.
 pub fn calibrate_intrinsics(input: &IntrinsicsInput<'_>) -> Result<IntrinsicsCalibration, Error> {
     let (usable, mut rejected) = check::usable_images(input.views, input.sizes_px)?;
-    let images: Vec<&[BoardPoint]> = usable.iter().map(|ix| &input.views[*ix].points[..]).collect();
+    let images: Vec<&[BoardPoint]> = usable
+        .iter()
+        .map(|ix| &input.views[*ix].points[..])
+        .collect();
     let size_px = input.sizes_px[0];
     let start_points = robust::without_gross_errors(&images);
     let starts: Vec<&[BoardPoint]> = start_points.iter().map(|points| &points[..]).collect();
-    let near_pinhole = |coefficients| robust::fit(&images, &starts, &initial::pinhole(&starts, size_px)?, coefficients);
-    let fisheye = || robust::fit(&images, &starts, &initial::fisheye(&starts, size_px)?, Coefficients::KANNALA_BRANDT);
+    let near_pinhole = |coefficients| {
+        robust::fit(
+            &images,
+            &starts,
+            &initial::pinhole(&starts, size_px)?,
+            coefficients,
+        )
+    };
+    let fisheye = || {
+        robust::fit(
+            &images,
+            &starts,
+            &initial::fisheye(&starts, size_px)?,
+            Coefficients::KANNALA_BRANDT,
+        )
+    };
     let (fit, trials) = match input.model {
-        LensModel::Auto => select(&images, near_pinhole(Coefficients::BROWN_CONRADY), fisheye())?,
+        LensModel::Auto => select(
+            &images,
+            near_pinhole(Coefficients::BROWN_CONRADY),
+            fisheye(),
+        )?,
         LensModel::Pinhole => (near_pinhole(Coefficients::PINHOLE), Vec::new()),
         LensModel::BrownConrady5 => (near_pinhole(Coefficients::BROWN_CONRADY), Vec::new()),
         LensModel::BrownConrady8 => (near_pinhole(Coefficients::RATIONAL), Vec::new()),
@@ -89,20 +115,30 @@ pub fn calibrate_intrinsics(input: &IntrinsicsInput<'_>) -> Result<IntrinsicsCal
     Ok(report::report(&views, fit, rejected, trials))
 }
 
-/// Selects the lens model, with the images and corners that the better of two fits keeps. With too few images for a
-/// comparison, the better fit is the result.
+/// Selects the lens model, with the images and corners that the better of two fits keeps. With too
+/// few images for a comparison, the better fit is the result.
 fn select(
     images: &[&[BoardPoint]],
     near_pinhole: Option<RobustFit>,
     fisheye: Option<RobustFit>,
 ) -> Result<(Option<RobustFit>, Vec<LensTrial>), Error> {
     const MAX_ERROR_RATIO: f64 = 3.0;
-    // A fit that rejects images is not better than one that explains them, and one with large errors explains none.
-    let fits = || [near_pinhole.as_ref(), fisheye.as_ref()].into_iter().flatten();
-    let max_error_px = MAX_ERROR_RATIO * fits().map(|fit| fit.typical_px).fold(f64::INFINITY, f64::min);
+    // A fit that rejects images is not better than one that explains them, and one with large
+    // errors explains none.
+    let fits = || {
+        [near_pinhole.as_ref(), fisheye.as_ref()]
+            .into_iter()
+            .flatten()
+    };
+    let max_error_px = MAX_ERROR_RATIO
+        * fits()
+            .map(|fit| fit.typical_px)
+            .fold(f64::INFINITY, f64::min);
     let reference = fits().max_by(|a, b| {
         let n_explained = |fit: &RobustFit| fit.n_explained(max_error_px);
-        n_explained(a).cmp(&n_explained(b)).then(b.typical_px.total_cmp(&a.typical_px))
+        n_explained(a)
+            .cmp(&n_explained(b))
+            .then(b.typical_px.total_cmp(&a.typical_px))
     });
     let reference = reference.ok_or(Error::NoLensFits)?;
     check_match(reference, reference.fit.state.intrinsics.size_px)?;
@@ -114,7 +150,10 @@ fn select(
     }
     let selected = selection::select(&reference.kept, near_pinhole.as_ref(), fisheye.as_ref());
     let (coefficients, bundle, trials) = selected.ok_or(Error::NoLensFits)?;
-    Ok((robust::refit(images, reference.kept.clone(), bundle, coefficients), trials))
+    Ok((
+        robust::refit(images, reference.kept.clone(), bundle, coefficients),
+        trials,
+    ))
 }
 
 /// Refuses a fit with errors that no corner detector has.
@@ -123,6 +162,8 @@ fn check_match(fit: &RobustFit, size_px: [u32; 2]) -> Result<(), Error> {
     let side_px = f64::from(size_px[0].max(size_px[1]));
     match fit.typical_px < MAX_ERROR_FRAC * side_px {
         true => Ok(()),
-        false => Err(Error::TargetMismatch { error_px: format!("{:.1}", fit.typical_px) }),
+        false => Err(Error::TargetMismatch {
+            error_px: format!("{:.1}", fit.typical_px),
+        }),
     }
 }

@@ -10,8 +10,8 @@ use nalgebra::{DMatrix, Translation3, UnitQuaternion, Vector3};
 pub struct NextView {
     /// The suggested pose of the target.
     pub camera_from_board: Transform,
-    /// What to do, such as `tilt the target 35 degrees with its left side away from the camera, at the upper right of
-    /// the image, 0.42 m away`.
+    /// What to do, such as `tilt the target 35 degrees with its left side away from the camera, at
+    /// the upper right of the image, 0.42 m away`.
     pub instruction: String,
     /// Root mean square over the image of the projection uncertainty now, pixels.
     pub sigma_px: f64,
@@ -59,10 +59,12 @@ pub(super) struct Known<'a> {
     pub(super) variance: f64,
 }
 
-/// Evaluates poses of the target in a fixed set of regions, tilts and distances, and returns the one with the smallest
-/// predicted projection uncertainty. `None` if the target does not fit into the image or the information is singular.
+/// Evaluates poses of the target in a fixed set of regions, tilts and distances, and returns the
+/// one with the smallest predicted projection uncertainty. `None` if the target does not fit into
+/// the image or the information is singular.
 ///
-/// Source: A-optimal design (Pukelsheim 1993, chapter 6) with the projection uncertainty as the criterion.
+/// Source: A-optimal design (Pukelsheim 1993, chapter 6) with the projection uncertainty as the
+/// criterion.
 pub(super) fn suggest(
     known: &Known<'_>,
     derivatives: &ProjectionDerivatives,
@@ -79,22 +81,46 @@ pub(super) fn suggest(
     for (region, region_words) in REGIONS {
         for (axis, side) in TILTS {
             for extent_frac in EXTENT_FRACS {
-                let Some(camera_from_board) = board.pose(known.intrinsics, region, axis, extent_frac) else { continue };
-                let added = grid::information(known.intrinsics, known.params, &camera_from_board, &board.points);
-                let predicted_sigma_px = added.and_then(|added| sigma_px(known.information + added));
-                let Some(predicted_sigma_px) = predicted_sigma_px.filter(|sigma_px| sigma_px.is_finite()) else {
+                let Some(camera_from_board) =
+                    board.pose(known.intrinsics, region, axis, extent_frac)
+                else {
                     continue;
                 };
-                if best.as_ref().is_none_or(|best| predicted_sigma_px < best.predicted_sigma_px) {
+                let added = grid::information(
+                    known.intrinsics,
+                    known.params,
+                    &camera_from_board,
+                    &board.points,
+                );
+                let predicted_sigma_px =
+                    added.and_then(|added| sigma_px(known.information + added));
+                let Some(predicted_sigma_px) =
+                    predicted_sigma_px.filter(|sigma_px| sigma_px.is_finite())
+                else {
+                    continue;
+                };
+                if best
+                    .as_ref()
+                    .is_none_or(|best| predicted_sigma_px < best.predicted_sigma_px)
+                {
                     let tilt = match side {
                         Some(side) => {
-                            format!("tilt the target {TILT_DEG:.0} degrees with its {side} away from the camera")
+                            format!(
+                                "tilt the target {TILT_DEG:.0} degrees with its {side} away from the camera"
+                            )
                         }
                         None => "hold the target facing the camera".to_owned(),
                     };
-                    let distance_m = (camera_from_board * nalgebra::Point3::from(board.center)).coords.norm();
+                    let distance_m = (camera_from_board * nalgebra::Point3::from(board.center))
+                        .coords
+                        .norm();
                     let instruction = format!("{tilt}, {region_words}, {distance_m:.2} m away");
-                    best = Some(NextView { camera_from_board, instruction, sigma_px: current_px, predicted_sigma_px });
+                    best = Some(NextView {
+                        camera_from_board,
+                        instruction,
+                        sigma_px: current_px,
+                        predicted_sigma_px,
+                    });
                 }
             }
         }
@@ -111,33 +137,58 @@ struct Board {
 
 impl Board {
     fn new(images: &[&[BoardPoint]]) -> Option<Self> {
-        let mut points: Vec<Vector3<f64>> =
-            images.iter().flat_map(|points| *points).map(|p| p.point_in_board).collect();
-        let key = |point: &Vector3<f64>| [point.x, point.y, point.z];
-        points.sort_by(|a, b| key(a).partial_cmp(&key(b)).unwrap_or(std::cmp::Ordering::Equal));
-        points.dedup();
-        let (low, high) = points
+        let mut points: Vec<Vector3<f64>> = images
             .iter()
-            .fold((*points.first()?, *points.first()?), |(low, high), point| (low.inf(point), high.sup(point)));
-        Some(Self { points, center: 0.5 * (low + high), extent: high - low })
+            .flat_map(|points| *points)
+            .map(|p| p.point_in_board)
+            .collect();
+        let key = |point: &Vector3<f64>| [point.x, point.y, point.z];
+        points.sort_by(|a, b| {
+            key(a)
+                .partial_cmp(&key(b))
+                .unwrap_or(std::cmp::Ordering::Equal)
+        });
+        points.dedup();
+        let (low, high) = points.iter().fold(
+            (*points.first()?, *points.first()?),
+            |(low, high), point| (low.inf(point), high.sup(point)),
+        );
+        Some(Self {
+            points,
+            center: 0.5 * (low + high),
+            extent: high - low,
+        })
     }
 
     /// Pose with the center of the target in a region of the image, tilted from facing the camera.
-    fn pose(&self, intrinsics: &Intrinsics, region: [f64; 2], [x, y]: [f64; 2], extent_frac: f64) -> Option<Transform> {
+    fn pose(
+        &self,
+        intrinsics: &Intrinsics,
+        region: [f64; 2],
+        [x, y]: [f64; 2],
+        extent_frac: f64,
+    ) -> Option<Transform> {
         let size_px = intrinsics.size_px.map(f64::from);
-        let distance_for = |axis: usize| intrinsics.focal_px[axis] * self.extent[axis] / (extent_frac * size_px[axis]);
+        let distance_for = |axis: usize| {
+            intrinsics.focal_px[axis] * self.extent[axis] / (extent_frac * size_px[axis])
+        };
         let distance_m = f64::max(distance_for(0), distance_for(1));
         let pixel = [0, 1].map(|axis| {
             let half_extent_px = 0.5 * intrinsics.focal_px[axis] * self.extent[axis] / distance_m;
-            // Slightly more than the target at this distance, because tilted targets look larger on one side.
+            // Slightly more than the target at this distance, because tilted targets look larger on
+            // one side.
             const MARGIN: f64 = 1.15;
             let reach_px = (0.5 * size_px[axis] - MARGIN * half_extent_px).max(0.0);
             0.5 * size_px[axis] + region[axis] * reach_px
         });
         let sight = intrinsics.unproject(pixel)?.normalize();
         let facing = UnitQuaternion::rotation_between(&Vector3::z(), &sight)?;
-        let tilt = UnitQuaternion::from_scaled_axis(Vector3::new(x, y, 0.0) * TILT_DEG.to_radians());
+        let tilt =
+            UnitQuaternion::from_scaled_axis(Vector3::new(x, y, 0.0) * TILT_DEG.to_radians());
         let rotation = facing * tilt;
-        Some(Transform::from_parts(Translation3::from(sight * distance_m - rotation * self.center), rotation))
+        Some(Transform::from_parts(
+            Translation3::from(sight * distance_m - rotation * self.center),
+            rotation,
+        ))
     }
 }

@@ -23,13 +23,14 @@ pub struct IntrinsicsCalibration {
     pub params: Vec<EstimatedParam>,
     /// Covariance of [`Self::params`].
     pub covariance: DMatrix<f64>,
-    /// Root mean square of the distances between detected and projected points, pixels; over the points in use, as in
-    /// OpenCV.
+    /// Root mean square of the distances between detected and projected points, pixels; over the
+    /// points in use, as in OpenCV.
     pub rms_px: f64,
-    /// Standard deviation of a detected corner along one axis, estimated from the residuals, pixels.
+    /// Standard deviation of a detected corner along one axis, estimated from the residuals,
+    /// pixels.
     pub noise_px: f64,
-    /// Ratio of the observed variance between images to the variance expected from independent corner errors. The
-    /// covariance is multiplied by this ratio if it is above 1.
+    /// Ratio of the observed variance between images to the variance expected from independent
+    /// corner errors. The covariance is multiplied by this ratio if it is above 1.
     pub dispersion: f64,
     /// The images in use.
     pub images: Vec<ImageFit>,
@@ -39,13 +40,13 @@ pub struct IntrinsicsCalibration {
     pub trials: Vec<LensTrial>,
     /// Number of corners in use in each part of the image.
     pub coverage: ImageGrid<usize>,
-    /// Standard deviation of the projection of a distant point in each part of the image, in the worst direction,
-    /// pixels. `None` beyond the range of the lens model.
+    /// Standard deviation of the projection of a distant point in each part of the image, in the
+    /// worst direction, pixels. `None` beyond the range of the lens model.
     ///
-    /// The uncertainty of the intrinsics is propagated to the pixel after the rotation of the camera frame that absorbs
-    /// most of each change, because such a rotation does not matter for images of unknown pose. mrcal 2.4 ("projection
-    /// uncertainty") derives this rotation from the poses of the target; here it minimizes the squared displacements
-    /// over the whole image.
+    /// The uncertainty of the intrinsics is propagated to the pixel after the rotation of the
+    /// camera frame that absorbs most of each change, because such a rotation does not matter for
+    /// images of unknown pose. mrcal 2.4 ("projection uncertainty") derives this rotation from the
+    /// poses of the target; here it minimizes the squared displacements over the whole image.
     pub uncertainty_px: ImageGrid<Option<f64>>,
     /// The pose of the target that would lower the projection uncertainty the most.
     pub next_view: Option<NextView>,
@@ -151,7 +152,10 @@ pub enum RejectionReason {
 impl std::fmt::Display for RejectionReason {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self {
-            Self::TooFewPoints { n_points, min_points } => {
+            Self::TooFewPoints {
+                n_points,
+                min_points,
+            } => {
                 write!(f, "{n_points} points, expected at least {min_points}")
             }
             Self::Repeated { distance_px } => {
@@ -160,12 +164,19 @@ impl std::fmt::Display for RejectionReason {
                     "repeats an earlier image: the corners differ by {distance_px:.1} px; move the target or the camera"
                 )
             }
-            Self::Inconsistent { median_px, typical_px } => write!(
+            Self::Inconsistent {
+                median_px,
+                typical_px,
+            } => write!(
                 f,
                 "median error {median_px:.2} px, {typical_px:.2} px in a typical image: the target was detected wrongly, \
                  or its layout differs"
             ),
-            Self::Corners { n_corners, max_px, typical_px } => write!(
+            Self::Corners {
+                n_corners,
+                max_px,
+                typical_px,
+            } => write!(
                 f,
                 "{n_corners} corners off by up to {max_px:.2} px, {typical_px:.2} px in a typical image; its other \
                  corners are used"
@@ -179,32 +190,54 @@ pub(super) fn rejections(views: &[&BoardView], fit: &RobustFit) -> Vec<Rejected>
     let (kept, intrinsics) = (&fit.kept, &fit.fit.state.intrinsics);
     let typical_px = fit.typical_px;
     let reason = |(image_ix, view): (usize, &&BoardView)| {
-        let position = kept.image_ixs.iter().position(|kept_ix| *kept_ix == image_ix);
+        let position = kept
+            .image_ixs
+            .iter()
+            .position(|kept_ix| *kept_ix == image_ix);
         let pose = match position {
             Some(position) => Some(fit.fit.state.poses[position]),
             None => board_pose(intrinsics, &view.points).map(|pose| pose.camera_from_board),
         };
         let errors_px = pose.map_or(vec![f64::INFINITY], |pose| {
-            let single = Bundle { intrinsics: intrinsics.clone(), poses: vec![pose] };
+            let single = Bundle {
+                intrinsics: intrinsics.clone(),
+                poses: vec![pose],
+            };
             single.errors_px(0, &view.points)
         });
         let Some(position) = position else {
             let median_px = median(&errors_px).unwrap_or(f64::INFINITY);
-            return Some(RejectionReason::Inconsistent { median_px, typical_px });
+            return Some(RejectionReason::Inconsistent {
+                median_px,
+                typical_px,
+            });
         };
         let n_corners = view.points.len() - kept.points[position].len();
         let max_px = errors_px.iter().copied().fold(0.0, f64::max);
-        (n_corners > 0).then_some(RejectionReason::Corners { n_corners, max_px, typical_px })
+        (n_corners > 0).then_some(RejectionReason::Corners {
+            n_corners,
+            max_px,
+            typical_px,
+        })
     };
-    let rejected =
-        |(ix, view): (usize, &&BoardView)| Some(Rejected { image: view.name.clone(), reason: reason((ix, view))? });
+    let rejected = |(ix, view): (usize, &&BoardView)| {
+        Some(Rejected {
+            image: view.name.clone(),
+            reason: reason((ix, view))?,
+        })
+    };
     views.iter().enumerate().filter_map(rejected).collect()
 }
 
 /// Summarizes a fit.
 pub(super) fn report(
     views: &[&BoardView],
-    RobustFit { fit, coefficients, kept, .. }: RobustFit,
+    RobustFit {
+        fit,
+        coefficients,
+        kept,
+        ..
+    }: RobustFit,
     rejected: Vec<Rejected>,
     trials: Vec<LensTrial>,
 ) -> IntrinsicsCalibration {
@@ -225,7 +258,10 @@ pub(super) fn report(
             let points = &kept.points[ix];
             let residuals = fit.state.residuals(ix, points).into_iter().flatten();
             let points = points.iter().zip(residuals);
-            let points = points.map(|(point, residual)| PointFit { pixel: point.pixel, residual_px: residual.into() });
+            let points = points.map(|(point, residual)| PointFit {
+                pixel: point.pixel,
+                residual_px: residual.into(),
+            });
             let points: Vec<PointFit> = points.collect();
             ImageFit {
                 name: views[*view_ix].name.clone(),
@@ -252,11 +288,18 @@ pub(super) fn report(
         dispersion: fit.dispersion,
         rejected,
         trials,
-        coverage: ImageGrid::coverage(fit.state.intrinsics.size_px, points().map(|point| point.pixel)),
+        coverage: ImageGrid::coverage(
+            fit.state.intrinsics.size_px,
+            points().map(|point| point.pixel),
+        ),
         uncertainty_px: derivatives.sigmas_px(&fit.covariance),
         next_view: next_view::suggest(&known, &derivatives, &kept.images()),
         intrinsics: Intrinsics {
-            lens: if is_pinhole { Lens::Pinhole } else { fit.state.intrinsics.lens },
+            lens: if is_pinhole {
+                Lens::Pinhole
+            } else {
+                fit.state.intrinsics.lens
+            },
             ..fit.state.intrinsics
         },
         covariance: fit.covariance,
@@ -266,6 +309,14 @@ pub(super) fn report(
 
 /// Root mean square of the norms of the residuals.
 fn rms_px<'a>(points: impl Iterator<Item = &'a PointFit> + Clone) -> f64 {
-    let squares: f64 = points.clone().map(|PointFit { residual_px: [x, y], .. }| x * x + y * y).sum();
+    let squares: f64 = points
+        .clone()
+        .map(
+            |PointFit {
+                 residual_px: [x, y],
+                 ..
+             }| x * x + y * y,
+        )
+        .sum();
     (squares / points.count().max(1) as f64).sqrt()
 }

@@ -11,7 +11,8 @@ use kinematics::quantile::median;
 use kinematics::random::Random;
 use nalgebra::{Matrix3, Vector2};
 
-/// Minimum number of corners that an image keeps; with fewer, its pose has no redundancy worth using.
+/// Minimum number of corners that an image keeps; with fewer, its pose has no redundancy worth
+/// using.
 pub(super) const MIN_POINTS: usize = 6;
 /// A corner is rejected if its error exceeds this multiple of the standard deviation of the others.
 const MAX_SIGMAS: f64 = 6.0;
@@ -19,10 +20,11 @@ const MAX_SIGMAS: f64 = 6.0;
 const MAX_MEDIAN_RATIO: f64 = 6.0;
 /// An image is rejected if more than this fraction of its corners are.
 const MAX_OUTLIER_FRAC: f64 = 0.5;
-/// Ratio between the median and the standard deviation per axis of the norm of a normal error (Rayleigh distribution).
+/// Ratio between the median and the standard deviation per axis of the norm of a normal error
+/// (Rayleigh distribution).
 const MEDIAN_PER_SIGMA: f64 = 1.177_410_022_515_474_7;
-/// Tolerances of fits between which outliers are searched, a tenth of a standard deviation of the parameters, and of the
-/// last one.
+/// Tolerances of fits between which outliers are searched, a tenth of a standard deviation of the
+/// parameters, and of the last one.
 const ROUGH: f64 = 1e-5;
 const EXACT: f64 = 1e-12;
 
@@ -40,9 +42,12 @@ pub(super) struct RobustFit {
 impl RobustFit {
     /// Number of images with a median error up to a limit.
     pub(super) fn n_explained(&self, max_error_px: f64) -> usize {
-        let errors = |(ix, points): (usize, &Vec<BoardPoint>)| median(&self.fit.state.errors_px(ix, points));
+        let errors =
+            |(ix, points): (usize, &Vec<BoardPoint>)| median(&self.fit.state.errors_px(ix, points));
         let medians = self.kept.points.iter().enumerate().filter_map(errors);
-        medians.filter(|median_px| *median_px <= max_error_px).count()
+        medians
+            .filter(|median_px| *median_px <= max_error_px)
+            .count()
     }
 }
 
@@ -67,8 +72,9 @@ impl Kept {
 
 /// Fits a lens model to all consistent images. `None` if there is no solution.
 ///
-/// Corners are weighted by Huber's loss until the outliers are found; the last fit weights all that remain equally,
-/// which is optimal for normal errors. A rejected image or corner returns if a later fit agrees with it.
+/// Corners are weighted by Huber's loss until the outliers are found; the last fit weights all that
+/// remain equally, which is optimal for normal errors. A rejected image or corner returns if a
+/// later fit agrees with it.
 ///
 /// * `start_images`: the points of the start; see [`without_gross_errors`].
 pub(super) fn fit(
@@ -77,34 +83,61 @@ pub(super) fn fit(
     start: &Start,
     coefficients: Coefficients,
 ) -> Option<RobustFit> {
-    /// Images with a larger initial error than this multiple of the median are left out of the first fit.
+    /// Images with a larger initial error than this multiple of the median are left out of the
+    /// first fit.
     const MAX_START_RATIO: f64 = 8.0;
     let max_error_px = MAX_START_RATIO * start.median_error_px();
-    let image_ixs: Vec<usize> = (0..images.len()).filter(|ix| start.errors_px[*ix] <= max_error_px).collect();
-    let poses = image_ixs.iter().map(|ix| start.poses[*ix]).collect::<Option<Vec<_>>>()?;
-    let kept = Kept { points: image_ixs.iter().map(|ix| start_images[*ix].to_vec()).collect(), image_ixs };
-    // The coefficients of the rational model are nearly redundant, so they start from the polynomial's.
-    let first =
-        if coefficients.family == Family::RationalBrownConrady { Coefficients::BROWN_CONRADY } else { coefficients };
-    let bundle = Bundle { intrinsics: first.applied_to(&start.intrinsics), poses };
+    let image_ixs: Vec<usize> = (0..images.len())
+        .filter(|ix| start.errors_px[*ix] <= max_error_px)
+        .collect();
+    let poses = image_ixs
+        .iter()
+        .map(|ix| start.poses[*ix])
+        .collect::<Option<Vec<_>>>()?;
+    let kept = Kept {
+        points: image_ixs
+            .iter()
+            .map(|ix| start_images[*ix].to_vec())
+            .collect(),
+        image_ixs,
+    };
+    // The coefficients of the rational model are nearly redundant, so they start from the
+    // polynomial's.
+    let first = if coefficients.family == Family::RationalBrownConrady {
+        Coefficients::BROWN_CONRADY
+    } else {
+        coefficients
+    };
+    let bundle = Bundle {
+        intrinsics: first.applied_to(&start.intrinsics),
+        poses,
+    };
     let bundle = huber(&kept, bundle, first)?;
     refit(images, kept, bundle, coefficients)
 }
 
-/// The points of each image that are consistent with one homography, up to a smooth distortion. For most images, these
-/// are all points.
+/// The points of each image that are consistent with one homography, up to a smooth distortion. For
+/// most images, these are all points.
 ///
-/// Half of the points may be wrong: the homography has the least median of errors over random samples (Rousseeuw 1984).
+/// Half of the points may be wrong: the homography has the least median of errors over random
+/// samples (Rousseeuw 1984).
 pub(super) fn without_gross_errors(images: &[&[BoardPoint]]) -> Vec<Vec<BoardPoint>> {
-    images.iter().map(|points| consistent_points(points)).collect()
+    images
+        .iter()
+        .map(|points| consistent_points(points))
+        .collect()
 }
 
 fn consistent_points(points: &[BoardPoint]) -> Vec<BoardPoint> {
-    /// Samples of four points. With 45 % wrong points, one of them is free of errors with a probability of 99.9 %.
+    /// Samples of four points. With 45 % wrong points, one of them is free of errors with a
+    /// probability of 99.9 %.
     const N_SAMPLES: usize = 75;
     /// Points are kept up to this multiple of the median error; distortion bends the plane by less.
     const MAX_MEDIAN_RATIO: f64 = 8.0;
-    let pairs: Vec<_> = points.iter().map(|point| (point.point_in_board.xy(), Vector2::from(point.pixel))).collect();
+    let pairs: Vec<_> = points
+        .iter()
+        .map(|point| (point.point_in_board.xy(), Vector2::from(point.pixel)))
+        .collect();
     let errors = |homography: &Matrix3<f64>| -> Vec<f64> {
         let error = |(from, to): &(Vector2<f64>, Vector2<f64>)| {
             let mapped = homography * from.push(1.0);
@@ -118,23 +151,39 @@ fn consistent_points(points: &[BoardPoint]) -> Vec<BoardPoint> {
     const MAX_SMOOTH_FRAC: f64 = 0.015;
     if let Some(all) = homography(&pairs) {
         let errors = errors(&all);
-        let (max_px, median_px) =
-            (errors.iter().copied().fold(0.0, f64::max), median(&errors).unwrap_or(f64::INFINITY));
+        let (max_px, median_px) = (
+            errors.iter().copied().fold(0.0, f64::max),
+            median(&errors).unwrap_or(f64::INFINITY),
+        );
         let first = pairs[0].1;
-        let extent_px = pairs.iter().map(|(_, to)| (to - first).norm()).fold(0.0, f64::max);
-        if max_px <= MAX_SMOOTH_RATIO * median_px.max(MIN_NOISE_PX) && median_px <= MAX_SMOOTH_FRAC * extent_px {
+        let extent_px = pairs
+            .iter()
+            .map(|(_, to)| (to - first).norm())
+            .fold(0.0, f64::max);
+        if max_px <= MAX_SMOOTH_RATIO * median_px.max(MIN_NOISE_PX)
+            && median_px <= MAX_SMOOTH_FRAC * extent_px
+        {
             return points.to_vec();
         }
     }
     let mut random = Random::new(points.len() as u64);
     let sampled = (0..N_SAMPLES).filter_map(|_| {
-        let sample: Vec<_> = (0..homography::MIN_POINTS).map(|_| pairs[random.below(pairs.len())]).collect();
+        let sample: Vec<_> = (0..homography::MIN_POINTS)
+            .map(|_| pairs[random.below(pairs.len())])
+            .collect();
         let errors = errors(&homography(&sample)?);
         Some((median(&errors)?, errors))
     });
-    let Some((median_px, errors)) = sampled.min_by(|a, b| a.0.total_cmp(&b.0)) else { return points.to_vec() };
+    let Some((median_px, errors)) = sampled.min_by(|a, b| a.0.total_cmp(&b.0)) else {
+        return points.to_vec();
+    };
     let max_error_px = MAX_MEDIAN_RATIO * median_px.max(MIN_NOISE_PX);
-    points.iter().zip(errors).filter(|(_, error)| *error <= max_error_px).map(|(point, _)| *point).collect()
+    points
+        .iter()
+        .zip(errors)
+        .filter(|(_, error)| *error <= max_error_px)
+        .map(|(point, _)| *point)
+        .collect()
 }
 
 /// Fits a lens model from parameters that are close to the solution.
@@ -144,7 +193,8 @@ pub(super) fn refit(
     mut bundle: Bundle,
     coefficients: Coefficients,
 ) -> Option<RobustFit> {
-    /// The thresholds shrink with the errors until no outlier remains, usually in two to five rounds.
+    /// The thresholds shrink with the errors until no outlier remains, usually in two to five
+    /// rounds.
     const MAX_ROUNDS: usize = 20;
     let mut typical_px = f64::INFINITY;
     for round in 0..MAX_ROUNDS {
@@ -164,66 +214,125 @@ pub(super) fn refit(
         };
     }
     let mut fit = squared(&kept, bundle, coefficients, EXACT)?;
-    // Errors of the corners of one image are correlated: blur, a bent target, a lens that no model describes.
+    // Errors of the corners of one image are correlated: blur, a bent target, a lens that no model
+    // describes.
     fit.covariance *= fit.dispersion.max(1.0);
-    Some(RobustFit { fit, coefficients, kept, typical_px })
+    Some(RobustFit {
+        fit,
+        coefficients,
+        kept,
+        typical_px,
+    })
 }
 
 fn huber(kept: &Kept, bundle: Bundle, coefficients: Coefficients) -> Option<Bundle> {
     const THRESHOLD_SIGMAS: f64 = 2.5;
-    let errors: Vec<f64> = (0..kept.points.len()).flat_map(|ix| bundle.errors_px(ix, &kept.points[ix])).collect();
+    let errors: Vec<f64> = (0..kept.points.len())
+        .flat_map(|ix| bundle.errors_px(ix, &kept.points[ix]))
+        .collect();
     let sigma_px = (median(&errors)? / MEDIAN_PER_SIGMA).max(MIN_NOISE_PX);
-    let loss = Loss::Huber { threshold: THRESHOLD_SIGMAS * sigma_px };
-    Some(bundle::refine(&kept.images(), bundle, coefficients, loss, ROUGH).ok()?.state)
+    let loss = Loss::Huber {
+        threshold: THRESHOLD_SIGMAS * sigma_px,
+    };
+    Some(
+        bundle::refine(&kept.images(), bundle, coefficients, loss, ROUGH)
+            .ok()?
+            .state,
+    )
 }
 
-fn squared(kept: &Kept, bundle: Bundle, coefficients: Coefficients, tolerance: f64) -> Option<Fit<Bundle>> {
-    bundle::refine(&kept.images(), bundle, coefficients, Loss::Squared, tolerance).ok()
+fn squared(
+    kept: &Kept,
+    bundle: Bundle,
+    coefficients: Coefficients,
+    tolerance: f64,
+) -> Option<Fit<Bundle>> {
+    bundle::refine(
+        &kept.images(),
+        bundle,
+        coefficients,
+        Loss::Squared,
+        tolerance,
+    )
+    .ok()
 }
 
-/// Selects the images and corners that agree with the intrinsics, and returns the poses of these images and the typical
-/// error.
+/// Selects the images and corners that agree with the intrinsics, and returns the poses of these
+/// images and the typical error.
 fn judge(images: &[&[BoardPoint]], kept: &Kept, bundle: &Bundle) -> Option<(Kept, Bundle, f64)> {
     let poses: Vec<_> = (0..images.len())
         .map(|image_ix| {
-            let position = kept.image_ixs.iter().position(|kept_ix| *kept_ix == image_ix);
+            let position = kept
+                .image_ixs
+                .iter()
+                .position(|kept_ix| *kept_ix == image_ix);
             let known = position.map(|position| bundle.poses[position]);
-            known.or_else(|| Some(board_pose(&bundle.intrinsics, images[image_ix])?.camera_from_board))
+            known.or_else(|| {
+                Some(board_pose(&bundle.intrinsics, images[image_ix])?.camera_from_board)
+            })
         })
         .collect();
     let errors = |image_ix: usize, pose| {
-        let single = Bundle { intrinsics: bundle.intrinsics.clone(), poses: vec![pose] };
+        let single = Bundle {
+            intrinsics: bundle.intrinsics.clone(),
+            poses: vec![pose],
+        };
         single.errors_px(0, images[image_ix])
     };
-    let mut located: Vec<Option<_>> = (0..images.len()).map(|ix| Some((poses[ix]?, errors(ix, poses[ix]?)))).collect();
-    let median_of = |located: &Option<(_, Vec<f64>)>| located.as_ref().and_then(|(_, errors)| median(errors));
-    let medians: Vec<f64> = kept.image_ixs.iter().filter_map(|ix| median_of(&located[*ix])).collect();
+    let mut located: Vec<Option<_>> = (0..images.len())
+        .map(|ix| Some((poses[ix]?, errors(ix, poses[ix]?))))
+        .collect();
+    let median_of =
+        |located: &Option<(_, Vec<f64>)>| located.as_ref().and_then(|(_, errors)| median(errors));
+    let medians: Vec<f64> = kept
+        .image_ixs
+        .iter()
+        .filter_map(|ix| median_of(&located[*ix]))
+        .collect();
     let typical_px = median(&medians)?.max(MIN_NOISE_PX);
     let max_median_px = MAX_MEDIAN_RATIO * typical_px;
     for (image_ix, located) in located.iter_mut().enumerate() {
         // The pose may be in the wrong minimum.
         if median_of(located).is_some_and(|median_px| median_px > max_median_px) {
-            let other = board_pose(&bundle.intrinsics, images[image_ix]).map(|found| found.camera_from_board);
+            let other = board_pose(&bundle.intrinsics, images[image_ix])
+                .map(|found| found.camera_from_board);
             let other = other.map(|pose| (pose, errors(image_ix, pose)));
             if median_of(&other).is_some_and(|median_px| median_px <= max_median_px) {
                 *located = other;
             }
         }
     }
-    let (mut judged, mut judged_poses) = (Kept { image_ixs: Vec::new(), points: Vec::new() }, Vec::new());
+    let (mut judged, mut judged_poses) = (
+        Kept {
+            image_ixs: Vec::new(),
+            points: Vec::new(),
+        },
+        Vec::new(),
+    );
     for (image_ix, located) in located.into_iter().enumerate() {
-        let Some((pose, errors)) = located else { continue };
+        let Some((pose, errors)) = located else {
+            continue;
+        };
         let median_px = median(&errors)?;
         let max_error_px = MAX_SIGMAS * median_px.max(typical_px) / MEDIAN_PER_SIGMA;
-        let inliers = images[image_ix].iter().zip(&errors).filter(|(_, error)| **error <= max_error_px);
+        let inliers = images[image_ix]
+            .iter()
+            .zip(&errors)
+            .filter(|(_, error)| **error <= max_error_px);
         let points: Vec<BoardPoint> = inliers.map(|(point, _)| *point).collect();
         let min_points = (1.0 - MAX_OUTLIER_FRAC) * images[image_ix].len() as f64;
-        if median_px <= max_median_px && points.len() >= MIN_POINTS && points.len() as f64 >= min_points {
+        if median_px <= max_median_px
+            && points.len() >= MIN_POINTS
+            && points.len() as f64 >= min_points
+        {
             judged.image_ixs.push(image_ix);
             judged.points.push(points);
             judged_poses.push(pose);
         }
     }
-    let judged_bundle = Bundle { intrinsics: bundle.intrinsics.clone(), poses: judged_poses };
+    let judged_bundle = Bundle {
+        intrinsics: bundle.intrinsics.clone(),
+        poses: judged_poses,
+    };
     (judged.n_points() > 0).then_some((judged, judged_bundle, typical_px))
 }

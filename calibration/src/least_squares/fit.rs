@@ -16,12 +16,15 @@ pub struct Fit<S> {
     pub n_params: usize,
     /// Variance of a scalar residual, estimated from the residuals.
     pub variance: f64,
-    /// How much larger the scatter of the blocks' gradients is than independent residuals explain. Above 1, residuals of
-    /// a block share errors, and the covariance times this factor is more honest.
+    /// How much larger the scatter of the blocks' gradients is than independent residuals explain.
+    /// Above 1, residuals of a block share errors, and the covariance times this factor is more
+    /// honest.
     pub dispersion: f64,
-    /// Information about the shared parameters with free local parameters, for residuals of unit variance.
+    /// Information about the shared parameters with free local parameters, for residuals of unit
+    /// variance.
     pub information: DMatrix<f64>,
-    /// Covariance of the shared parameters. Entries of unobservable parameters are very large, but finite.
+    /// Covariance of the shared parameters. Entries of unobservable parameters are very large, but
+    /// finite.
     pub covariance: DMatrix<f64>,
     /// Orthogonal directions of the shared parameters, the least observable first.
     pub directions: Vec<Direction>,
@@ -36,8 +39,8 @@ pub struct Fit<S> {
 pub struct Direction {
     /// Unit vector; component `i` is the change of shared parameter `i` divided by its scale.
     pub components: DVector<f64>,
-    /// Standard deviation along the vector, as a multiple of the scales. Above about 1, the residuals do not
-    /// determine this direction.
+    /// Standard deviation along the vector, as a multiple of the scales. Above about 1, the
+    /// residuals do not determine this direction.
     pub sigma: f64,
 }
 
@@ -48,10 +51,15 @@ impl<S> Fit<S> {
     }
 }
 
-/// The standard deviation of a variance; infinite if the variance is NaN or negative beyond rounding errors.
+/// The standard deviation of a variance; infinite if the variance is NaN or negative beyond
+/// rounding errors.
 pub(crate) fn sigma_of(variance: f64) -> f64 {
     const TINY: f64 = 1e-15;
-    if variance >= -TINY { variance.max(0.0).sqrt() } else { f64::INFINITY }
+    if variance >= -TINY {
+        variance.max(0.0).sqrt()
+    } else {
+        f64::INFINITY
+    }
 }
 
 /// Relative size of an eigenvalue that cannot be distinguished from zero.
@@ -69,11 +77,15 @@ pub(super) fn fit<S>(
     let scaled = DMatrix::from_diagonal(scales) * &information * DMatrix::from_diagonal(scales);
     // An empty matrix has no decomposition.
     let eigen = if scales.is_empty() {
-        SymmetricEigen { eigenvectors: scaled, eigenvalues: DVector::zeros(0) }
+        SymmetricEigen {
+            eigenvectors: scaled,
+            eigenvalues: DVector::zeros(0),
+        }
     } else {
         SymmetricEigen::new(scaled)
     };
-    let floor = (ROUNDING * eigen.eigenvalues.iter().copied().fold(0.0, f64::max)).max(f64::MIN_POSITIVE / ROUNDING);
+    let floor = (ROUNDING * eigen.eigenvalues.iter().copied().fold(0.0, f64::max))
+        .max(f64::MIN_POSITIVE / ROUNDING);
     let mut directions: Vec<Direction> = eigen
         .eigenvalues
         .iter()
@@ -104,8 +116,8 @@ pub(super) fn fit<S>(
     }
 }
 
-/// Variance of a scalar residual, and the factor between the inverse of the weighted information and the covariance.
-/// Both are equal for the squared loss.
+/// Variance of a scalar residual, and the factor between the inverse of the weighted information
+/// and the covariance. Both are equal for the squared loss.
 ///
 /// Source: Huber 1981, section 7.6, equation 6.7 without the factor `K`, which is close to 1.
 fn variances<S>(at: &Evaluation<S>, n_params: usize, min_noise: f64) -> (f64, f64) {
@@ -115,6 +127,7 @@ fn variances<S>(at: &Evaluation<S>, n_params: usize, min_noise: f64) -> (f64, f6
     // More than 95 % outliers would make the derivative too small to divide by.
     let influence_derivative = (totals.influence_derivatives / n_vectors).max(0.05);
     let mean_weight = (totals.weights / n_vectors).max(f64::MIN_POSITIVE);
-    let variance = (totals.weighted_squares / n_free / influence_derivative.powi(2)).max(min_noise * min_noise);
+    let variance = (totals.weighted_squares / n_free / influence_derivative.powi(2))
+        .max(min_noise * min_noise);
     (variance, variance * mean_weight)
 }

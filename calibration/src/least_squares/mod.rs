@@ -1,9 +1,9 @@
 //! Robust nonlinear least squares with shared parameters and local parameters per block.
 //!
-//! Levenberg-Marquardt (Marquardt 1963) with the damping schedule of Nielsen 1999 and robust losses by iteratively
-//! reweighted least squares. Local parameters, such as the pose of one view, are eliminated by a Schur complement
-//! (Triggs et al. 2000, section 6.1), so the cost of a step grows linearly with the number of blocks. Without local
-//! parameters, the solver is a dense one.
+//! Levenberg-Marquardt (Marquardt 1963) with the damping schedule of Nielsen 1999 and robust losses
+//! by iteratively reweighted least squares. Local parameters, such as the pose of one view, are
+//! eliminated by a Schur complement (Triggs et al. 2000, section 6.1), so the cost of a step grows
+//! linearly with the number of blocks. Without local parameters, the solver is a dense one.
 
 mod fit;
 mod loss;
@@ -20,29 +20,37 @@ use crate::Error;
 use nalgebra::DVector;
 use normal_equations::Totals;
 
-/// A least-squares problem. The residuals of a block depend on the shared parameters and on the block's local ones.
+/// A least-squares problem. The residuals of a block depend on the shared parameters and on the
+/// block's local ones.
 pub trait Problem {
     /// Values of all parameters.
     type State: Clone;
 
-    /// Typical magnitude of each shared parameter, all positive: a change of this size is large. Its length is the
-    /// number of shared parameters.
+    /// Typical magnitude of each shared parameter, all positive: a change of this size is large.
+    /// Its length is the number of shared parameters.
     fn scales(&self) -> DVector<f64>;
 
     /// Number of blocks.
     fn n_blocks(&self) -> usize;
 
-    /// Number of local parameters of a block. 0 for residuals that depend on shared parameters only.
+    /// Number of local parameters of a block. 0 for residuals that depend on shared parameters
+    /// only.
     fn n_local(&self, block_ix: usize) -> usize;
 
-    /// Adds the residuals of a block and their derivatives with respect to a small step from this state. Returns `None`
-    /// if a residual is not defined, for example because a point lies behind the camera.
+    /// Adds the residuals of a block and their derivatives with respect to a small step from this
+    /// state. Returns `None` if a residual is not defined, for example because a point lies behind
+    /// the camera.
     fn evaluate(&self, state: &Self::State, block_ix: usize, sums: &mut BlockSums) -> Option<()>;
 
     /// The state after a step.
     ///
     /// * `local`: one vector per block.
-    fn moved(&self, state: &Self::State, shared: &DVector<f64>, local: &[DVector<f64>]) -> Self::State;
+    fn moved(
+        &self,
+        state: &Self::State,
+        shared: &DVector<f64>,
+        local: &[DVector<f64>],
+    ) -> Self::State;
 }
 
 /// Settings of [`minimize`].
@@ -52,34 +60,49 @@ pub struct Options {
     pub loss: Loss,
     /// Maximum number of steps, including rejected ones.
     pub max_steps: usize,
-    /// The minimization ends if a step is predicted to decrease the cost by less than this fraction.
+    /// The minimization ends if a step is predicted to decrease the cost by less than this
+    /// fraction.
     pub tolerance: f64,
-    /// Lower limit of the residuals' standard deviation, in units of the residuals. It limits the stated accuracy where
-    /// the residuals are smaller than any measurement could be, and decides when steps are too small to matter.
+    /// Lower limit of the residuals' standard deviation, in units of the residuals. It limits the
+    /// stated accuracy where the residuals are smaller than any measurement could be, and decides
+    /// when steps are too small to matter.
     pub min_noise: f64,
 }
 
 impl Default for Options {
     fn default() -> Self {
-        Self { loss: Loss::Squared, max_steps: 100, tolerance: 1e-12, min_noise: 1e-9 }
+        Self {
+            loss: Loss::Squared,
+            max_steps: 100,
+            tolerance: 1e-12,
+            min_noise: 1e-9,
+        }
     }
 }
 
 /// Minimizes the sum of the losses from an initial state.
 ///
 /// # Errors
-/// If a residual is not defined at the initial state, or if there are not more residuals than parameters.
-pub fn minimize<P: Problem>(problem: &P, initial: P::State, options: &Options) -> Result<Fit<P::State>, Error> {
+/// If a residual is not defined at the initial state, or if there are not more residuals than
+/// parameters.
+pub fn minimize<P: Problem>(
+    problem: &P,
+    initial: P::State,
+    options: &Options,
+) -> Result<Fit<P::State>, Error> {
     const INITIAL_DAMPING: f64 = 1e-4;
     const MIN_DAMPING: f64 = 1e-15;
     const MAX_DAMPING: f64 = 1e12;
     let scales = problem.scales();
     let n_shared = scales.len();
-    let mut at =
-        Evaluation::new(problem, initial, options.loss).map_err(|block_ix| Error::UndefinedResidual { block_ix })?;
+    let mut at = Evaluation::new(problem, initial, options.loss)
+        .map_err(|block_ix| Error::UndefinedResidual { block_ix })?;
     let n_params = n_shared + at.blocks.iter().map(BlockSums::n_local).sum::<usize>();
     if at.totals.n_scalars <= n_params {
-        return Err(Error::TooFewResiduals { n_residuals: at.totals.n_scalars, n_params });
+        return Err(Error::TooFewResiduals {
+            n_residuals: at.totals.n_scalars,
+            n_params,
+        });
     }
     let noise_floor = at.totals.n_scalars as f64 * options.min_noise.powi(2);
     let (mut damping, mut growth) = (INITIAL_DAMPING, 2.0);
@@ -96,7 +119,8 @@ pub fn minimize<P: Problem>(problem: &P, initial: P::State, options: &Options) -
         match trial {
             Some((trial, gain)) => {
                 at = trial;
-                damping = (damping * (1.0 - (2.0 * gain - 1.0).powi(3)).max(1.0 / 10.0)).max(MIN_DAMPING);
+                damping =
+                    (damping * (1.0 - (2.0 * gain - 1.0).powi(3)).max(1.0 / 10.0)).max(MIN_DAMPING);
                 growth = 2.0;
             }
             None => {
@@ -105,7 +129,13 @@ pub fn minimize<P: Problem>(problem: &P, initial: P::State, options: &Options) -
             }
         }
     }
-    Ok(fit::fit(at, &scales, n_params, options, Progress { converged, n_steps }))
+    Ok(fit::fit(
+        at,
+        &scales,
+        n_params,
+        options,
+        Progress { converged, n_steps },
+    ))
 }
 
 /// How the minimization ended.
@@ -129,13 +159,19 @@ impl<S: Clone> Evaluation<S> {
         let (mut blocks, mut totals) = (Vec::with_capacity(problem.n_blocks()), Totals::default());
         for block_ix in 0..problem.n_blocks() {
             let mut sums = BlockSums::new(loss, n_shared, problem.n_local(block_ix));
-            problem.evaluate(&state, block_ix, &mut sums).ok_or(block_ix)?;
+            problem
+                .evaluate(&state, block_ix, &mut sums)
+                .ok_or(block_ix)?;
             if !sums.totals.loss.is_finite() {
                 return Err(block_ix);
             }
             totals.add(&sums.totals);
             blocks.push(sums.summed());
         }
-        Ok(Self { state, blocks, totals })
+        Ok(Self {
+            state,
+            blocks,
+            totals,
+        })
     }
 }

@@ -1,4 +1,5 @@
-//! Normal equations of shared and local parameters, and elimination of the local ones by a Schur complement.
+//! Normal equations of shared and local parameters, and elimination of the local ones by a Schur
+//! complement.
 
 use super::loss::Loss;
 use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
@@ -9,8 +10,9 @@ pub struct BlockSums {
     loss: Loss,
     n_shared: usize,
     n_local: usize,
-    /// Derivatives of the residuals times the roots of their weights, one column per scalar residual, until they are
-    /// summed. The product of the whole matrix is several times faster than one update per residual.
+    /// Derivatives of the residuals times the roots of their weights, one column per scalar
+    /// residual, until they are summed. The product of the whole matrix is several times faster
+    /// than one update per residual.
     weighted_derivatives: Vec<f64>,
     /// Weighted products of the derivatives with respect to all parameters, shared ones first.
     products: DMatrix<f64>,
@@ -31,7 +33,8 @@ pub(super) struct Totals {
     pub(super) weighted_squares: f64,
     /// Sum of the weights.
     pub(super) weights: f64,
-    /// Sum over residual vectors of the mean derivative of the weighted residual with respect to the residual.
+    /// Sum over residual vectors of the mean derivative of the weighted residual with respect to
+    /// the residual.
     pub(super) influence_derivatives: f64,
 }
 
@@ -63,8 +66,8 @@ impl BlockSums {
 
     /// Adds one residual vector with `D` components. The robust loss depends on its norm.
     ///
-    /// * `derivatives`: per component, derivatives with respect to the shared parameters followed by those with respect
-    ///   to the block's local parameters.
+    /// * `derivatives`: per component, derivatives with respect to the shared parameters followed
+    ///   by those with respect to the block's local parameters.
     ///
     /// # Panics
     /// If a row has another length.
@@ -74,12 +77,17 @@ impl BlockSums {
         let loss = self.loss.at(squared_norm);
         let root_weight = loss.weight.sqrt();
         for (value, row) in residual.into_iter().zip(derivatives) {
-            assert_eq!(row.len(), n, "one derivative per shared and local parameter");
+            assert_eq!(
+                row.len(),
+                n,
+                "one derivative per shared and local parameter"
+            );
             let weighted = loss.weight * value;
             for (sum, derivative) in self.gradient.as_mut_slice().iter_mut().zip(row) {
                 *sum += weighted * derivative;
             }
-            self.weighted_derivatives.extend(row.iter().map(|derivative| root_weight * derivative));
+            self.weighted_derivatives
+                .extend(row.iter().map(|derivative| root_weight * derivative));
         }
         let dims = D as f64;
         self.totals.add(&Totals {
@@ -98,7 +106,8 @@ impl BlockSums {
         if n > 0 {
             let derivatives = std::mem::take(&mut self.weighted_derivatives);
             let derivatives = DMatrix::from_vec(n, derivatives.len() / n, derivatives);
-            self.products.gemm(1.0, &derivatives, &derivatives.transpose(), 0.0);
+            self.products
+                .gemm(1.0, &derivatives, &derivatives.transpose(), 0.0);
         }
         self
     }
@@ -138,33 +147,48 @@ pub(super) struct Step {
     pub(super) predicted: f64,
 }
 
-/// The damped step that minimizes the quadratic model of the cost. `None` if a matrix is not positive definite.
+/// The damped step that minimizes the quadratic model of the cost. `None` if a matrix is not
+/// positive definite.
 pub(super) fn step(blocks: &[BlockSums], n_shared: usize, damping: f64) -> Option<Step> {
     let reduced = Reduced::new(blocks, n_shared, damping)?;
-    let shared =
-        -if n_shared == 0 { DVector::zeros(0) } else { Cholesky::new(reduced.matrix)?.solve(&reduced.gradient) };
+    let shared = -if n_shared == 0 {
+        DVector::zeros(0)
+    } else {
+        Cholesky::new(reduced.matrix)?.solve(&reduced.gradient)
+    };
     let (mut local, mut predicted) = (Vec::with_capacity(blocks.len()), 0.0);
     for (block, factor) in blocks.iter().zip(&reduced.factors) {
         let step = match factor {
             Some(factor) => {
-                let cross = block.products.view((n_shared, 0), (block.n_local, n_shared));
+                let cross = block
+                    .products
+                    .view((n_shared, 0), (block.n_local, n_shared));
                 -factor.solve(&(block.gradient.rows(n_shared, block.n_local) + cross * &shared))
             }
             None => DVector::zeros(0),
         };
         for (ix, value) in shared.iter().chain(&step).enumerate() {
-            predicted += 0.5 * value * (damping * block.products[(ix, ix)] * value - block.gradient[ix]);
+            predicted +=
+                0.5 * value * (damping * block.products[(ix, ix)] * value - block.gradient[ix]);
         }
         local.push(step);
     }
-    let is_finite = shared.iter().chain(local.iter().flatten()).all(|value| value.is_finite());
-    is_finite.then_some(Step { shared, local, predicted })
+    let is_finite = shared
+        .iter()
+        .chain(local.iter().flatten())
+        .all(|value| value.is_finite());
+    is_finite.then_some(Step {
+        shared,
+        local,
+        predicted,
+    })
 }
 
-/// Information about the shared parameters when the local ones are free: the Schur complement. Symmetric. Directions of
-/// local parameters without information are left out.
+/// Information about the shared parameters when the local ones are free: the Schur complement.
+/// Symmetric. Directions of local parameters without information are left out.
 pub(super) fn information(blocks: &[BlockSums], n_shared: usize) -> DMatrix<f64> {
-    // A tiny damping keeps blocks whose local parameters are not determined from removing other blocks' information.
+    // A tiny damping keeps blocks whose local parameters are not determined from removing other
+    // blocks' information.
     const DAMPING: f64 = 1e-12;
     match Reduced::new(blocks, n_shared, DAMPING) {
         Some(reduced) => {
@@ -176,24 +200,35 @@ pub(super) fn information(blocks: &[BlockSums], n_shared: usize) -> DMatrix<f64>
     }
 }
 
-/// Ratio between the scatter of the blocks' gradients and the scatter that independent residuals of this variance would
-/// cause. About 1 for independent residuals, larger if the residuals of a block share errors. 1 if there are not enough
-/// blocks.
+/// Ratio between the scatter of the blocks' gradients and the scatter that independent residuals of
+/// this variance would cause. About 1 for independent residuals, larger if the residuals of a block
+/// share errors. 1 if there are not enough blocks.
 ///
-/// Let `g_b` and `S_b` be the gradient and the information of block b after elimination of its local parameters, `S` the
-/// sum of all `S_b`, and `P_b = inverse(S) S_b`. The ratio is the sum of `g_b' inverse(S) g_b`, divided by its
-/// expectation, which is the variance times the sum of `trace(P_b - P_b P_b)`.
+/// Let `g_b` and `S_b` be the gradient and the information of block b after elimination of its
+/// local parameters, `S` the sum of all `S_b`, and `P_b = inverse(S) S_b`. The ratio is the sum of
+/// `g_b' inverse(S) g_b`, divided by its expectation, which is the variance times the sum of
+/// `trace(P_b - P_b P_b)`.
 ///
-/// Source: Wedderburn 1974 (dispersion of quasi-likelihoods), with gradients of blocks as in the sandwich estimator
-/// (White 1980).
+/// Source: Wedderburn 1974 (dispersion of quasi-likelihoods), with gradients of blocks as in the
+/// sandwich estimator (White 1980).
 pub(super) fn dispersion(blocks: &[BlockSums], n_shared: usize, variance: f64) -> f64 {
     const DAMPING: f64 = 1e-12;
     const MIN_EXPECTED: f64 = 1.0;
-    let reduced: Option<Vec<Reduced>> =
-        blocks.iter().map(|block| Reduced::new(std::slice::from_ref(block), n_shared, DAMPING)).collect();
-    let Some(reduced) = reduced.filter(|_| n_shared > 0) else { return 1.0 };
-    let sum = reduced.iter().fold(DMatrix::zeros(n_shared, n_shared), |sum, block| sum + &block.matrix);
-    let Some(factor) = Cholesky::new(sum) else { return 1.0 };
+    let reduced: Option<Vec<Reduced>> = blocks
+        .iter()
+        .map(|block| Reduced::new(std::slice::from_ref(block), n_shared, DAMPING))
+        .collect();
+    let Some(reduced) = reduced.filter(|_| n_shared > 0) else {
+        return 1.0;
+    };
+    let sum = reduced
+        .iter()
+        .fold(DMatrix::zeros(n_shared, n_shared), |sum, block| {
+            sum + &block.matrix
+        });
+    let Some(factor) = Cholesky::new(sum) else {
+        return 1.0;
+    };
     let (mut scatter, mut expected) = (0.0, 0.0);
     for block in &reduced {
         scatter += block.gradient.dot(&factor.solve(&block.gradient));
@@ -202,7 +237,11 @@ pub(super) fn dispersion(blocks: &[BlockSums], n_shared: usize, variance: f64) -
         let share = factor.solve(&matrix);
         expected += share.trace() - share.transpose().dot(&share);
     }
-    if expected < MIN_EXPECTED { 1.0 } else { scatter / (expected * variance) }
+    if expected < MIN_EXPECTED {
+        1.0
+    } else {
+        scatter / (expected * variance)
+    }
 }
 
 /// The normal equations of the shared parameters after elimination of the local ones.
@@ -216,7 +255,8 @@ struct Reduced {
 
 impl Reduced {
     fn new(blocks: &[BlockSums], n_shared: usize, damping: f64) -> Option<Self> {
-        let (mut matrix, mut gradient) = (DMatrix::zeros(n_shared, n_shared), DVector::zeros(n_shared));
+        let (mut matrix, mut gradient) =
+            (DMatrix::zeros(n_shared, n_shared), DVector::zeros(n_shared));
         let mut factors = Vec::with_capacity(blocks.len());
         for block in blocks {
             matrix += block.products.view((0, 0), (n_shared, n_shared));
@@ -230,16 +270,25 @@ impl Reduced {
             }
             let factor = block.local_factor(damping)?;
             // With C = L L': B' inverse(C) B = (inverse(L) B)' (inverse(L) B).
-            let mut cross = block.products.view((n_shared, 0), (block.n_local, n_shared)).into_owned();
+            let mut cross = block
+                .products
+                .view((n_shared, 0), (block.n_local, n_shared))
+                .into_owned();
             let mut local_gradient = block.gradient.rows(n_shared, block.n_local).into_owned();
             let lower = factor.l_dirty();
-            if !lower.solve_lower_triangular_mut(&mut cross) || !lower.solve_lower_triangular_mut(&mut local_gradient) {
+            if !lower.solve_lower_triangular_mut(&mut cross)
+                || !lower.solve_lower_triangular_mut(&mut local_gradient)
+            {
                 return None;
             }
             matrix.gemm_tr(-1.0, &cross, &cross, 1.0);
             gradient.gemv_tr(-1.0, &cross, &local_gradient, 1.0);
             factors.push(Some(factor));
         }
-        Some(Self { matrix, gradient, factors })
+        Some(Self {
+            matrix,
+            gradient,
+            factors,
+        })
     }
 }

@@ -4,8 +4,8 @@ use super::{BlockSums, Loss, Options, Problem, minimize};
 use kinematics::random::Random;
 use nalgebra::{DMatrix, DVector, Vector2};
 
-/// Circles of one common radius: the radius is shared, the centers are local. Residuals are vectors from the nearest
-/// point of the circle at a known angle.
+/// Circles of one common radius: the radius is shared, the centers are local. Residuals are vectors
+/// from the nearest point of the circle at a known angle.
 struct Circles {
     points: Vec<Vec<(f64, Vector2<f64>)>>,
 }
@@ -20,11 +20,16 @@ impl Circles {
             let mut point = |ix: usize| {
                 let angle = 0.7 * ix as f64;
                 let error = Vector2::new(random.normal(), random.normal()) * noise;
-                (angle, center + Vector2::new(angle.cos(), angle.sin()) * RADIUS.exp() + error)
+                (
+                    angle,
+                    center + Vector2::new(angle.cos(), angle.sin()) * RADIUS.exp() + error,
+                )
             };
             (0..7).map(&mut point).collect()
         });
-        Self { points: points.collect() }
+        Self {
+            points: points.collect(),
+        }
     }
 
     fn start(&self) -> (f64, Vec<Vector2<f64>>) {
@@ -48,17 +53,34 @@ impl Problem for Circles {
         2
     }
 
-    fn evaluate(&self, (log_radius, centers): &Self::State, block_ix: usize, sums: &mut BlockSums) -> Option<()> {
+    fn evaluate(
+        &self,
+        (log_radius, centers): &Self::State,
+        block_ix: usize,
+        sums: &mut BlockSums,
+    ) -> Option<()> {
         for (angle, point) in &self.points[block_ix] {
             let arm = Vector2::new(angle.cos(), angle.sin()) * log_radius.exp();
             let residual = centers[block_ix] + arm - point;
-            sums.add([residual.x, residual.y], [&[arm.x, 1.0, 0.0], &[arm.y, 0.0, 1.0]]);
+            sums.add(
+                [residual.x, residual.y],
+                [&[arm.x, 1.0, 0.0], &[arm.y, 0.0, 1.0]],
+            );
         }
         Some(())
     }
 
-    fn moved(&self, state: &Self::State, shared: &DVector<f64>, local: &[DVector<f64>]) -> Self::State {
-        let centers = state.1.iter().zip(local).map(|(center, step)| center + Vector2::new(step[0], step[1]));
+    fn moved(
+        &self,
+        state: &Self::State,
+        shared: &DVector<f64>,
+        local: &[DVector<f64>],
+    ) -> Self::State {
+        let centers = state
+            .1
+            .iter()
+            .zip(local)
+            .map(|(center, step)| center + Vector2::new(step[0], step[1]));
         (state.0 + shared[0], centers.collect())
     }
 }
@@ -80,10 +102,22 @@ fn stated_uncertainty_matches_the_scatter_of_the_errors() {
         let mut squared = 0.0;
         for seed in 0..n_runs {
             let problem = Circles::new(4, 0.1, seed);
-            let fit = minimize(&problem, problem.start(), &Options { loss, ..Options::default() }).unwrap();
+            let fit = minimize(
+                &problem,
+                problem.start(),
+                &Options {
+                    loss,
+                    ..Options::default()
+                },
+            )
+            .unwrap();
             squared += ((fit.state.0 - RADIUS) / fit.sigma(0)).powi(2) / n_runs as f64;
         }
-        assert!((squared.sqrt() - 1.0).abs() < ALLOWED, "{loss:?}: errors are {} standard deviations", squared.sqrt());
+        assert!(
+            (squared.sqrt() - 1.0).abs() < ALLOWED,
+            "{loss:?}: errors are {} standard deviations",
+            squared.sqrt()
+        );
     }
 }
 
@@ -94,17 +128,27 @@ fn robust_losses_resist_outliers() {
         circle[2].1 += Vector2::new(3.0, -2.0);
     }
     let error = |loss| {
-        let options = Options { loss, ..Options::default() };
+        let options = Options {
+            loss,
+            ..Options::default()
+        };
         let fit = minimize(&problem, problem.start(), &options).unwrap();
         assert!(fit.converged, "{loss:?}");
         (fit.state.0 - RADIUS).abs()
     };
-    let (squared, huber, cauchy) =
-        (error(Loss::Squared), error(Loss::Huber { threshold: 0.03 }), error(Loss::Cauchy { threshold: 0.03 }));
-    assert!(squared > 0.01 && huber < 0.004 && cauchy < 0.002, "{squared} {huber} {cauchy}");
+    let (squared, huber, cauchy) = (
+        error(Loss::Squared),
+        error(Loss::Huber { threshold: 0.03 }),
+        error(Loss::Cauchy { threshold: 0.03 }),
+    );
+    assert!(
+        squared > 0.01 && huber < 0.004 && cauchy < 0.002,
+        "{squared} {huber} {cauchy}"
+    );
 }
 
-/// Linear residuals of two shared parameters without local ones; the second parameter has no influence.
+/// Linear residuals of two shared parameters without local ones; the second parameter has no
+/// influence.
 struct Line;
 
 impl Problem for Line {
@@ -130,7 +174,12 @@ impl Problem for Line {
         Some(())
     }
 
-    fn moved(&self, state: &Self::State, shared: &DVector<f64>, _local: &[DVector<f64>]) -> Self::State {
+    fn moved(
+        &self,
+        state: &Self::State,
+        shared: &DVector<f64>,
+        _local: &[DVector<f64>],
+    ) -> Self::State {
         state + shared
     }
 }
@@ -139,9 +188,16 @@ impl Problem for Line {
 fn dense_problems_and_unobservable_directions_are_handled() {
     let fit = minimize(&Line, DVector::zeros(2), &Options::default()).unwrap();
     // Sum of x y divided by the sum of x² (30).
-    assert!(fit.converged && (fit.state[0] - 90.3 / 30.0).abs() < 1e-6, "{}", fit.state);
+    assert!(
+        fit.converged && (fit.state[0] - 90.3 / 30.0).abs() < 1e-6,
+        "{}",
+        fit.state
+    );
     let weakest = &fit.directions[0];
-    assert!(weakest.components[1].abs() > 0.999 && weakest.sigma > 1e3, "{weakest:?}");
+    assert!(
+        weakest.components[1].abs() > 0.999 && weakest.sigma > 1e3,
+        "{weakest:?}"
+    );
     assert!(fit.directions[1].sigma < 0.01, "{:?}", fit.directions[1]);
     assert!((fit.information.clone() - fit.information.transpose()).amax() == 0.0);
 }

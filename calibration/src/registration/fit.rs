@@ -10,12 +10,15 @@ use nalgebra::DVector;
 
 /// Maximum number of steps at each level, the finest first.
 const MAX_ITERATIONS: [usize; 4] = [12, 4, 4, 4];
-/// Relative depth error above which a point counts as occluded, the finest level first. It is larger at coarse levels,
-/// where poses still have larger errors.
+/// Relative depth error above which a point counts as occluded, the finest level first. It is
+/// larger at coarse levels, where poses still have larger errors.
 pub(super) const OCCLUSION_FRAC: [f64; 4] = [0.04, 0.05, 0.07, 0.1];
 /// A step smaller than this number of standard deviations ends a level, the finest first.
 const CONVERGED_STEP_SIGMAS: [f64; 4] = [0.2, 2.0, 2.0, 2.0];
-pub(super) const INITIAL_NOISE: Noise = Noise { photo: 20.0, depth: 0.005 };
+pub(super) const INITIAL_NOISE: Noise = Noise {
+    photo: 20.0,
+    depth: 0.005,
+};
 
 /// Result of a fit.
 #[derive(Debug)]
@@ -27,10 +30,11 @@ pub(super) struct Fit {
 }
 
 impl Fit {
-    /// Adds the discretization error to the covariance: the change of the estimate between the finest level and the next
-    /// one. All pairs share this error, so that their scatter does not contain it. At half the pixel size, an error of
-    /// first or higher order in the pixel size is at most as large as this change. Its direction may be another one, because
-    /// the error is the sum of many, some of which do not depend on the pixel size in the same way.
+    /// Adds the discretization error to the covariance: the change of the estimate between the
+    /// finest level and the next one. All pairs share this error, so that their scatter does not
+    /// contain it. At half the pixel size, an error of first or higher order in the pixel size is
+    /// at most as large as this change. Its direction may be another one, because the error is the
+    /// sum of many, some of which do not depend on the pixel size in the same way.
     pub(super) fn add_discretization_error(&mut self, images: &[PreparedImage], pairs: &[Pair]) {
         const LEVEL: usize = 1;
         if images.iter().all(|image| image.levels.len() <= LEVEL) {
@@ -45,8 +49,15 @@ impl Fit {
         let mut corrections = self.corrections.clone();
         let mut change = DVector::zeros(self.layout.n());
         for _ in 0..MAX_ITERATIONS[LEVEL] {
-            let sums = sums::of_pairs(images, &corrections.views(images, &self.layout), pairs, &options);
-            let Some(noise) = sums::noise_of(&sums) else { return };
+            let sums = sums::of_pairs(
+                images,
+                &corrections.views(images, &self.layout),
+                pairs,
+                &options,
+            );
+            let Some(noise) = sums::noise_of(&sums) else {
+                return;
+            };
             options.noise = noise;
             let solution = step(&self.layout, &corrections, pairs, &sums);
             corrections.apply_step(&self.layout, &solution.step);
@@ -66,9 +77,14 @@ fn step(layout: &Layout, corrections: &Corrections, pairs: &[Pair], sums: &[Pair
     Solution::new(scales, &values, pairs, sums)
 }
 
-/// Estimates the parameters of a layout, starting from given corrections; `None` if the pairs have no valid
-/// residuals.
-pub(super) fn fit(images: &[PreparedImage], pairs: &[Pair], layout: Layout, start: &Corrections) -> Option<Fit> {
+/// Estimates the parameters of a layout, starting from given corrections; `None` if the pairs have
+/// no valid residuals.
+pub(super) fn fit(
+    images: &[PreparedImage],
+    pairs: &[Pair],
+    layout: Layout,
+    start: &Corrections,
+) -> Option<Fit> {
     let mut corrections = start.clone();
     let n_levels = images.iter().map(|image| image.levels.len()).max()?;
     let mut options = ResidualOptions {
@@ -77,15 +93,29 @@ pub(super) fn fit(images: &[PreparedImage], pairs: &[Pair], layout: Layout, star
         noise: INITIAL_NOISE,
         part: PixelSubset::All,
     };
-    options.noise = sums::noise_of(&sums::of_pairs(images, &corrections.views(images, &layout), pairs, &options))?;
+    options.noise = sums::noise_of(&sums::of_pairs(
+        images,
+        &corrections.views(images, &layout),
+        pairs,
+        &options,
+    ))?;
     let mut last = None;
     for level in (0..n_levels).rev() {
         (options.level, options.occlusion_frac) = (level, OCCLUSION_FRAC[level]);
         // At coarse levels, an approximate result from a subset of the pairs is sufficient.
-        let stride = if level == 0 { 1 } else { pairs.len().div_ceil(120).max(1) };
+        let stride = if level == 0 {
+            1
+        } else {
+            pairs.len().div_ceil(120).max(1)
+        };
         let subset: Vec<Pair> = pairs.iter().copied().step_by(stride).collect();
         for _ in 0..MAX_ITERATIONS[level] {
-            let sums = sums::of_pairs(images, &corrections.views(images, &layout), &subset, &options);
+            let sums = sums::of_pairs(
+                images,
+                &corrections.views(images, &layout),
+                &subset,
+                &options,
+            );
             options.noise = sums::noise_of(&sums)?;
             let solution = step(&layout, &corrections, &subset, &sums);
             corrections.apply_step(&layout, &solution.step);
@@ -101,5 +131,10 @@ pub(super) fn fit(images: &[PreparedImage], pairs: &[Pair], layout: Layout, star
             }
         }
     }
-    Some(Fit { corrections, layout, solution: last?, noise: options.noise })
+    Some(Fit {
+        corrections,
+        layout,
+        solution: last?,
+        noise: options.noise,
+    })
 }

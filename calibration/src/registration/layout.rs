@@ -5,8 +5,8 @@ use keyframe::Keyframe;
 use kinematics::Twist;
 use nalgebra::Vector3;
 
-/// Typical magnitudes of calibration errors. They set the damping of the solver and determine which directions count as
-/// observable.
+/// Typical magnitudes of calibration errors. They set the damping of the solver and determine which
+/// directions count as observable.
 mod prior {
     pub(super) const ROTATION_RAD: f64 = 0.0175; // 1 degree.
     pub(super) const TRANSLATION_M: f64 = 0.005;
@@ -20,7 +20,8 @@ mod prior {
 /// One parameter to estimate. The first number is the index of the camera or joint.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum CalibrationParam {
-    /// Motion of a camera relative to its parent, in its own axes: parts 0 to 2 in meters, 3 to 5 in radians.
+    /// Motion of a camera relative to its parent, in its own axes: parts 0 to 2 in meters, 3 to 5
+    /// in radians.
     Extrinsics(usize, usize),
     /// Time offset of a camera, seconds.
     TimeOffset(usize),
@@ -28,8 +29,8 @@ pub(super) enum CalibrationParam {
     Joint(usize),
     /// Motion of the depth frame in the axes of its camera, with the same parts as the extrinsics.
     DepthPose(usize, usize),
-    /// Parts 0 and 1: logarithm of the factors on the focal lengths; 2 and 3: offset of the principal point in focal
-    /// lengths.
+    /// Parts 0 and 1: logarithm of the factors on the focal lengths; 2 and 3: offset of the
+    /// principal point in focal lengths.
     Lens(usize, usize),
     /// Logarithm of the factor on depth.
     DepthScale(usize),
@@ -41,7 +42,9 @@ impl CalibrationParam {
     /// Typical magnitude, in the parameter's own unit.
     pub(super) fn scale(self) -> f64 {
         match self {
-            Self::Extrinsics(_, part) | Self::DepthPose(_, part) if part < 3 => prior::TRANSLATION_M,
+            Self::Extrinsics(_, part) | Self::DepthPose(_, part) if part < 3 => {
+                prior::TRANSLATION_M
+            }
             Self::Extrinsics(..) | Self::DepthPose(..) => prior::ROTATION_RAD,
             Self::TimeOffset(_) => prior::TIME_OFFSET_SECS,
             Self::Joint(_) => prior::JOINT,
@@ -72,15 +75,26 @@ pub(super) struct CameraParamOffsets {
 }
 
 impl CameraParamOffsets {
-    /// Motions of a camera, in its own axes, per unit of its extrinsics and time offset: parameter index, meters,
-    /// radians.
+    /// Motions of a camera, in its own axes, per unit of its extrinsics and time offset: parameter
+    /// index, meters, radians.
     ///
     /// * `twist`: velocity of the camera in its own axes, if known.
-    pub(super) fn motions(&self, twist: Option<&Twist>) -> Vec<(usize, Vector3<f64>, Vector3<f64>)> {
+    pub(super) fn motions(
+        &self,
+        twist: Option<&Twist>,
+    ) -> Vec<(usize, Vector3<f64>, Vector3<f64>)> {
         let mut motions = Vec::new();
         if let Some(extrinsics) = self.extrinsics {
-            motions.extend((0..3).map(|axis| (extrinsics + axis, Vector3::ith(axis, 1.0), Vector3::zeros())));
-            motions.extend((0..3).map(|axis| (extrinsics + 3 + axis, Vector3::zeros(), Vector3::ith(axis, 1.0))));
+            motions.extend(
+                (0..3).map(|axis| (extrinsics + axis, Vector3::ith(axis, 1.0), Vector3::zeros())),
+            );
+            motions.extend((0..3).map(|axis| {
+                (
+                    extrinsics + 3 + axis,
+                    Vector3::zeros(),
+                    Vector3::ith(axis, 1.0),
+                )
+            }));
         }
         if let (Some(time_offset), Some(twist)) = (self.time_offset, twist) {
             motions.push((time_offset, twist.linear_m_s, twist.angular_rad_s));
@@ -90,16 +104,25 @@ impl CameraParamOffsets {
 }
 
 impl Layout {
-    /// The parameters of a set that apply to keyframes, which are given with the index of their camera. A static camera
-    /// has no time offset, and a camera without joints has no joint offsets.
+    /// The parameters of a set that apply to keyframes, which are given with the index of their
+    /// camera. A static camera has no time offset, and a camera without joints has no joint
+    /// offsets.
     pub(super) fn new(set: ParamSet, images: &[(usize, &Keyframe)], n_cameras: usize) -> Self {
         let mut layout = Self::default();
         for camera in 0..n_cameras {
-            let keyframes = || images.iter().filter(move |image| image.0 == camera).map(|image| image.1);
+            let keyframes = || {
+                images
+                    .iter()
+                    .filter(move |image| image.0 == camera)
+                    .map(|image| image.1)
+            };
             let moves = keyframes().any(|keyframe| {
-                keyframe.twist.is_some_and(|twist| twist.linear_m_s.norm() + twist.angular_rad_s.norm() > 0.0)
+                keyframe
+                    .twist
+                    .is_some_and(|twist| twist.linear_m_s.norm() + twist.angular_rad_s.norm() > 0.0)
             });
-            let has_rolling_shutter = moves && keyframes().any(|keyframe| keyframe.readout_secs > 0.0);
+            let has_rolling_shutter =
+                moves && keyframes().any(|keyframe| keyframe.readout_secs > 0.0);
             let mut allocate = |on: bool, n: usize, param: &dyn Fn(usize) -> CalibrationParam| {
                 let at = layout.params.len();
                 on.then(|| {
@@ -117,19 +140,29 @@ impl Layout {
                 depth_pose: allocate(set.contains(ParamSet::DEPTH_POSE), 6, &|part| {
                     CalibrationParam::DepthPose(camera, part)
                 }),
-                lens: allocate(set.contains(ParamSet::LENS), 4, &|part| CalibrationParam::Lens(camera, part)),
+                lens: allocate(set.contains(ParamSet::LENS), 4, &|part| {
+                    CalibrationParam::Lens(camera, part)
+                }),
                 depth_scale: allocate(set.contains(ParamSet::DEPTH_SCALE), 1, &|_| {
                     CalibrationParam::DepthScale(camera)
                 }),
-                readout: allocate(set.contains(ParamSet::READOUT) && has_rolling_shutter, 1, &|_| {
-                    CalibrationParam::Readout(camera)
-                }),
+                readout: allocate(
+                    set.contains(ParamSet::READOUT) && has_rolling_shutter,
+                    1,
+                    &|_| CalibrationParam::Readout(camera),
+                ),
             });
         }
-        let n_joints = images.iter().map(|(_, keyframe)| keyframe.joint_twists.len()).max().unwrap_or(0);
+        let n_joints = images
+            .iter()
+            .map(|(_, keyframe)| keyframe.joint_twists.len())
+            .max()
+            .unwrap_or(0);
         if set.contains(ParamSet::JOINTS) && n_joints > 0 {
             layout.joints = Some(layout.params.len());
-            layout.params.extend((0..n_joints).map(CalibrationParam::Joint));
+            layout
+                .params
+                .extend((0..n_joints).map(CalibrationParam::Joint));
         }
         layout
     }
@@ -137,9 +170,18 @@ impl Layout {
     /// The extrinsics of one camera.
     pub(super) fn extrinsics_of(camera: usize) -> Self {
         let mut by_camera = vec![CameraParamOffsets::default(); camera];
-        by_camera.push(CameraParamOffsets { extrinsics: Some(0), ..CameraParamOffsets::default() });
-        let params = (0..6).map(|part| CalibrationParam::Extrinsics(camera, part)).collect();
-        Self { params, by_camera, joints: None }
+        by_camera.push(CameraParamOffsets {
+            extrinsics: Some(0),
+            ..CameraParamOffsets::default()
+        });
+        let params = (0..6)
+            .map(|part| CalibrationParam::Extrinsics(camera, part))
+            .collect();
+        Self {
+            params,
+            by_camera,
+            joints: None,
+        }
     }
 
     pub(super) fn n(&self) -> usize {

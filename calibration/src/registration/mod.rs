@@ -1,13 +1,14 @@
-//! Estimates calibration errors of cameras before a scene is trained, by registering pairs of keyframes with depth.
+//! Estimates calibration errors of cameras before a scene is trained, by registering pairs of
+//! keyframes with depth.
 //!
-//! Few causes explain most pose errors: extrinsics, time offsets, joint offsets, intrinsics and the pose of the depth
-//! camera. Their effect on each pair of images is known, so a few parameters explain thousands of small differences.
-//! They are estimated by Gauss-Newton steps from coarse to fine. A parameter is kept if it improves the prediction of
-//! images that were not used to estimate it. Parameters that the motion does not make observable are reported and
-//! stay at zero.
+//! Few causes explain most pose errors: extrinsics, time offsets, joint offsets, intrinsics and the
+//! pose of the depth camera. Their effect on each pair of images is known, so a few parameters
+//! explain thousands of small differences. They are estimated by Gauss-Newton steps from coarse to
+//! fine. A parameter is kept if it improves the prediction of images that were not used to estimate
+//! it. Parameters that the motion does not make observable are reported and stay at zero.
 //!
-//! All functions are pure functions of keyframes: no clock, no I/O, and sums in a fixed order for any number of
-//! threads.
+//! All functions are pure functions of keyframes: no clock, no I/O, and sums in a fixed order for
+//! any number of threads.
 
 mod corrections;
 mod covariance;
@@ -45,8 +46,8 @@ use std::collections::BTreeSet;
 use std::sync::Arc;
 use sums::PixelSubset;
 
-/// Maximum number of images for estimating the shared parameters. The next constant is the maximum number of partners
-/// of each image.
+/// Maximum number of images for estimating the shared parameters. The next constant is the maximum
+/// number of partners of each image.
 const MAX_IMAGES: usize = 100;
 const PARTNERS_PER_IMAGE: usize = 4;
 /// Maximum number of validation images.
@@ -81,18 +82,22 @@ pub fn candidates() -> Vec<ParamSet> {
     ]
 }
 
-/// Estimates the requested parameters; `None` if too few keyframes overlap. Without depth, extrinsics, time offsets and
-/// lenses are estimated from matched features, and other parameters are not.
+/// Estimates the requested parameters; `None` if too few keyframes overlap. Without depth,
+/// extrinsics, time offsets and lenses are estimated from matched features, and other parameters
+/// are not.
 ///
-/// Parameters are estimated from training keyframes and evaluated on validation keyframes; test keyframes are not
-/// used.
+/// Parameters are estimated from training keyframes and evaluated on validation keyframes; test
+/// keyframes are not used.
 pub fn align(keyframes: &[Arc<Keyframe>], choice: &CameraRefinement) -> Option<Alignment> {
     if keyframes.iter().all(|keyframe| keyframe.depth.is_none()) {
         return features::align(keyframes, choice);
     }
     let scene = AlignmentScene::new(keyframes, includes_image_poses(choice))?;
-    let uncorrected =
-        CalibrationModel { set: ParamSet::empty(), fit: None, corrections: Corrections::none(scene.cameras.len()) };
+    let uncorrected = CalibrationModel {
+        set: ParamSet::empty(),
+        fit: None,
+        corrections: Corrections::none(scene.cameras.len()),
+    };
     let (mut trials, mut unobservable) = (Vec::new(), Vec::new());
     let mut kept = match choice {
         CameraRefinement::Always(set) | CameraRefinement::AlwaysAndWatch(set, _) => {
@@ -112,7 +117,11 @@ pub fn align(keyframes: &[Arc<Keyframe>], choice: &CameraRefinement) -> Option<A
         fit.add_discretization_error(&scene.images, &scene.pairs);
         unobservable.extend(report::unobservable(&scene, fit));
     }
-    let kept = if kept.set.contains(ParamSet::IMAGE_POSES) { scene.with_validation_poses(kept) } else { kept };
+    let kept = if kept.set.contains(ParamSet::IMAGE_POSES) {
+        scene.with_validation_poses(kept)
+    } else {
+        kept
+    };
     Some(report::alignment(&scene, &kept, trials, unobservable))
 }
 
@@ -131,24 +140,43 @@ struct CalibrationModel {
 
 impl AlignmentScene {
     fn new(keyframes: &[Arc<Keyframe>], for_poses: bool) -> Option<Self> {
-        let used: Vec<&Arc<Keyframe>> =
-            keyframes.iter().filter(|keyframe| keyframe.split != Split::Test && keyframe.depth.is_some()).collect();
-        let names: BTreeSet<Arc<str>> = used.iter().map(|keyframe| keyframe.camera.clone()).collect();
+        let used: Vec<&Arc<Keyframe>> = keyframes
+            .iter()
+            .filter(|keyframe| keyframe.split != Split::Test && keyframe.depth.is_some())
+            .collect();
+        let names: BTreeSet<Arc<str>> = used
+            .iter()
+            .map(|keyframe| keyframe.camera.clone())
+            .collect();
         let cameras: Vec<Arc<str>> = names.into_iter().collect();
-        let camera_of = |keyframe: &Keyframe| cameras.partition_point(|name| *name < keyframe.camera);
-        let images: Vec<PreparedImage> =
-            used.par_iter().filter_map(|keyframe| PreparedImage::new(keyframe, camera_of(keyframe))).collect();
+        let camera_of =
+            |keyframe: &Keyframe| cameras.partition_point(|name| *name < keyframe.camera);
+        let images: Vec<PreparedImage> = used
+            .par_iter()
+            .filter_map(|keyframe| PreparedImage::new(keyframe, camera_of(keyframe)))
+            .collect();
         let images_of_split = |split: Split| -> Vec<usize> {
-            (0..images.len()).filter(|ix| images[*ix].keyframe.split == split).collect()
+            (0..images.len())
+                .filter(|ix| images[*ix].keyframe.split == split)
+                .collect()
         };
         let subsample = |ixs: &[usize], max_count: usize| -> Vec<usize> {
             let n = ixs.len().min(max_count);
             (0..n).map(|ix| ixs[ix * ixs.len() / n]).collect()
         };
-        let (train, validation_images) = (images_of_split(Split::Train), images_of_split(Split::Validation));
+        let (train, validation_images) = (
+            images_of_split(Split::Train),
+            images_of_split(Split::Validation),
+        );
         let views = Corrections::none(cameras.len()).views(&images, &Layout::default());
         let training_subset = subsample(&train, MAX_IMAGES);
-        let pairs = pairs::choose(&images, &views, &training_subset, &training_subset, PARTNERS_PER_IMAGE);
+        let pairs = pairs::choose(
+            &images,
+            &views,
+            &training_subset,
+            &training_subset,
+            PARTNERS_PER_IMAGE,
+        );
         let all_pairs = match for_poses && training_subset.len() < train.len() {
             true => pairs::choose(&images, &views, &train, &train, PARTNERS_PER_IMAGE),
             false => pairs.clone(),
@@ -160,12 +188,22 @@ impl AlignmentScene {
             &subsample(&validation_images, MAX_VALIDATION_IMAGES),
             PARTNERS_PER_IMAGE,
         );
-        (pairs.len() >= MIN_PAIRS).then_some(Self { images, cameras, pairs, all_pairs, validation_pairs })
+        (pairs.len() >= MIN_PAIRS).then_some(Self {
+            images,
+            cameras,
+            pairs,
+            all_pairs,
+            validation_pairs,
+        })
     }
 
     /// The parameters of a set that apply to the images.
     fn layout(&self, set: ParamSet) -> Layout {
-        let images: Vec<_> = self.images.iter().map(|image| (image.camera, &*image.keyframe)).collect();
+        let images: Vec<_> = self
+            .images
+            .iter()
+            .map(|image| (image.camera, &*image.keyframe))
+            .collect();
         Layout::new(set, &images, self.cameras.len())
     }
 
@@ -183,18 +221,30 @@ impl AlignmentScene {
         if set.contains(ParamSet::IMAGE_POSES) {
             corrections = poses::fit(&self.images, &self.all_pairs, &corrections)?;
         }
-        Some(CalibrationModel { set, fit, corrections })
+        Some(CalibrationModel {
+            set,
+            fit,
+            corrections,
+        })
     }
 
-    /// Also estimates individual poses of the validation images, after all decisions, because these images are trained
-    /// on later.
+    /// Also estimates individual poses of the validation images, after all decisions, because these
+    /// images are trained on later.
     fn with_validation_poses(&self, mut model: CalibrationModel) -> CalibrationModel {
         let images_of_split = |split: Split| -> Vec<usize> {
-            (0..self.images.len()).filter(|ix| self.images[*ix].keyframe.split == split).collect()
+            (0..self.images.len())
+                .filter(|ix| self.images[*ix].keyframe.split == split)
+                .collect()
         };
         let views = model.corrections.views(&self.images, &Layout::default());
         let pose_of = |to: &usize| {
-            let pairs = pairs::choose(&self.images, &views, &images_of_split(Split::Train), &[*to], PARTNERS_PER_IMAGE);
+            let pairs = pairs::choose(
+                &self.images,
+                &views,
+                &images_of_split(Split::Train),
+                &[*to],
+                PARTNERS_PER_IMAGE,
+            );
             let image = &self.images[*to];
             let correction = poses::fit_one(
                 &self.images,
@@ -203,11 +253,20 @@ impl AlignmentScene {
                 &model.corrections.by_camera[image.camera],
                 PixelSubset::All,
             )?;
-            Some((image.camera, image.keyframe.stamp.0, correction.drift_at(image.keyframe.stamp)))
+            Some((
+                image.camera,
+                image.keyframe.stamp.0,
+                correction.drift_at(image.keyframe.stamp),
+            ))
         };
-        let found: Vec<_> = images_of_split(Split::Validation).par_iter().filter_map(pose_of).collect();
+        let found: Vec<_> = images_of_split(Split::Validation)
+            .par_iter()
+            .filter_map(pose_of)
+            .collect();
         for (camera, stamp, drift) in found {
-            model.corrections.by_camera[camera].drift.insert(stamp, drift);
+            model.corrections.by_camera[camera]
+                .drift
+                .insert(stamp, drift);
         }
         model
     }
@@ -216,14 +275,18 @@ impl AlignmentScene {
     fn restricted(&self, layout: &Layout, given: &Corrections) -> Corrections {
         let mut restricted = Corrections::none(self.cameras.len());
         let values = layout.params.iter().map(|param| given.value(*param));
-        restricted.apply_step(layout, &nalgebra::DVector::from_iterator(layout.n(), values));
+        restricted.apply_step(
+            layout,
+            &nalgebra::DVector::from_iterator(layout.n(), values),
+        );
         restricted
     }
 
-    /// Adds each candidate whose gain is significant, then removes those whose gain is no longer significant.
+    /// Adds each candidate whose gain is significant, then removes those whose gain is no longer
+    /// significant.
     ///
-    /// If extrinsics are not corrected, they may still be wrong in directions that the motion does not make observable.
-    /// These directions are added to `unobservable`.
+    /// If extrinsics are not corrected, they may still be wrong in directions that the motion does
+    /// not make observable. These directions are added to `unobservable`.
     fn select_params(
         &self,
         candidates: &[ParamSet],
@@ -238,20 +301,34 @@ impl AlignmentScene {
             if layout.n() == 0 && !candidate.contains(ParamSet::IMAGE_POSES) {
                 continue;
             }
-            let Some(variant) = self.model(kept.set | *candidate, &kept) else { continue };
+            let Some(variant) = self.model(kept.set | *candidate, &kept) else {
+                continue;
+            };
             let mut trial = self.evaluate(*candidate, &kept, &variant);
-            trial.kept &= candidate.contains(ParamSet::IMAGE_POSES) || variant.has_significant(&layout);
+            trial.kept &=
+                candidate.contains(ParamSet::IMAGE_POSES) || variant.has_significant(&layout);
             if trial.kept {
                 kept_sets.push(*candidate);
                 kept = variant;
             } else if candidate.contains(ParamSet::EXTRINSICS) {
-                unobservable.extend(variant.fit.iter().flat_map(|fit| report::unobservable(self, fit)));
+                unobservable.extend(
+                    variant
+                        .fit
+                        .iter()
+                        .flat_map(|fit| report::unobservable(self, fit)),
+                );
             }
             trials.push(trial);
         }
         for kept_set in kept_sets.clone().into_iter().rev().skip(1) {
-            let other_params = kept_sets.iter().copied().filter(|other| *other != kept_set).collect();
-            let Some(baseline) = self.model(other_params, &kept) else { continue };
+            let other_params = kept_sets
+                .iter()
+                .copied()
+                .filter(|other| *other != kept_set)
+                .collect();
+            let Some(baseline) = self.model(other_params, &kept) else {
+                continue;
+            };
             let trial = self.evaluate(kept_set, &baseline, &kept);
             if !trial.kept {
                 kept_sets.retain(|other| *other != kept_set);
@@ -264,8 +341,19 @@ impl AlignmentScene {
     }
 
     /// Evaluates how much better a set of parameters predicts the validation images.
-    fn evaluate(&self, params: ParamSet, baseline: &CalibrationModel, variant: &CalibrationModel) -> Trial {
-        let noise = variant.fit.as_ref().map_or(sums::Noise { photo: 5.0, depth: 0.005 }, |fit| fit.noise);
+    fn evaluate(
+        &self,
+        params: ParamSet,
+        baseline: &CalibrationModel,
+        variant: &CalibrationModel,
+    ) -> Trial {
+        let noise = variant.fit.as_ref().map_or(
+            sums::Noise {
+                photo: 5.0,
+                depth: 0.005,
+            },
+            |fit| fit.noise,
+        );
         let comparison = validation::PairedComparison {
             images: &self.images,
             pairs: &self.validation_pairs,
@@ -278,17 +366,22 @@ impl AlignmentScene {
                 let camera = self.images[score.image_ix].camera;
                 (&*self.cameras[camera], score.variant_db - score.baseline_db)
             });
-            let (baseline_db, variant_db): (Vec<f64>, Vec<f64>) =
-                scores.iter().map(|score| (score.baseline_db, score.variant_db)).unzip();
+            let (baseline_db, variant_db): (Vec<f64>, Vec<f64>) = scores
+                .iter()
+                .map(|score| (score.baseline_db, score.variant_db))
+                .unzip();
             log::debug!("alignment: {params}: without {baseline_db:.2?}, with {variant_db:.2?} dB");
             let trial = Trial::of(Candidate::Cameras(params), &baseline_db, &variant_db);
             trial.with_enough_images().with_cameras(gains_db)
         };
-        match (params.contains(ParamSet::IMAGE_POSES), baseline.set.contains(ParamSet::IMAGE_POSES)) {
+        match (
+            params.contains(ParamSet::IMAGE_POSES),
+            baseline.set.contains(ParamSet::IMAGE_POSES),
+        ) {
             (true, _) => trial(comparison.scores_with_free_poses()),
             (false, false) => trial(comparison.scores()),
-            // Individual image poses hide shared errors, so a parameter is rejected only if neither comparison shows
-            // a gain.
+            // Individual image poses hide shared errors, so a parameter is rejected only if neither
+            // comparison shows a gain.
             (false, true) => Some(trial(comparison.scores()))
                 .filter(|trial| trial.kept)
                 .unwrap_or_else(|| trial(comparison.scores_with_free_poses())),
@@ -302,8 +395,10 @@ impl CalibrationModel {
         let Some(fit) = &self.fit else { return false };
         let is_significant = |ix: usize| {
             let value = self.corrections.value(fit.layout.params[ix]);
-            value.abs() > MIN_SIGNIFICANT_SIGMAS * fit.solution.sigma(ix) && fit.solution.unobservable_frac(ix) < 0.5
+            value.abs() > MIN_SIGNIFICANT_SIGMAS * fit.solution.sigma(ix)
+                && fit.solution.unobservable_frac(ix) < 0.5
         };
-        (0..fit.layout.n()).any(|ix| params.params.contains(&fit.layout.params[ix]) && is_significant(ix))
+        (0..fit.layout.n())
+            .any(|ix| params.params.contains(&fit.layout.params[ix]) && is_significant(ix))
     }
 }

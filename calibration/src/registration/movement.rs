@@ -1,14 +1,16 @@
 //! Detection of a camera that has moved relative to its mount.
 //!
-//! Each new image is compared with reference images, which are older than the last [`MOVEMENT_WINDOW`] images of its
-//! camera. If the camera has not moved, no motion estimated from previous new images improves the prediction of the
-//! next one. If it has moved, one motion explains all images from then on.
+//! Each new image is compared with reference images, which are older than the last
+//! [`MOVEMENT_WINDOW`] images of its camera. If the camera has not moved, no motion estimated from
+//! previous new images improves the prediction of the next one. If it has moved, one motion
+//! explains all images from then on.
 //!
-//! The test is a Shiryaev-Roberts e-detector (Shin, Ramdas and Rinaldo 2022), so it may be repeated with every image.
-//! For each possible start of the movement, a bet is placed that the motion estimated from the images since the start
-//! improves the prediction of each later image. The stake is multiplied by a factor that is at most 1 on average if the
-//! camera has not moved. The probability that the sum of all stakes reaches [`ALARM`] within `n` images is therefore at
-//! most `n / ALARM`.
+//! The test is a Shiryaev-Roberts e-detector (Shin, Ramdas and Rinaldo 2022), so it may be repeated
+//! with every image. For each possible start of the movement, a bet is placed that the motion
+//! estimated from the images since the start improves the prediction of each later image. The stake
+//! is multiplied by a factor that is at most 1 on average if the camera has not moved. The
+//! probability that the sum of all stakes reaches [`ALARM`] within `n` images is therefore at most
+//! `n / ALARM`.
 
 use super::corrections::Corrections;
 use super::fit;
@@ -38,14 +40,16 @@ const MIN_PARTNERS: usize = 2;
 const ALARM: f64 = 1e5;
 /// Fraction of the stake that is bet on each image.
 const BET_FRAC: f64 = 0.8;
-/// Prediction gain that is ignored, dB: other calibration errors may improve neighboring images by this much.
+/// Prediction gain that is ignored, dB: other calibration errors may improve neighboring images by
+/// this much.
 const MARGIN_DB: f64 = 0.2;
 /// Losses are clamped to this value, dB.
 const MAX_LOSS_DB: f64 = 0.5;
 /// Smaller movements are not reported, because they may be due to other calibration errors.
 const MIN_ROTATION_RAD: f64 = 0.005;
 const MIN_TRANSLATION_M: f64 = 0.003;
-/// Minimum share of the individual motions that a movement explains. Other calibration errors move each image differently.
+/// Minimum share of the individual motions that a movement explains. Other calibration errors move
+/// each image differently.
 const MIN_EXPLAINED_FRAC: f64 = 0.9;
 
 /// Movement of a camera relative to its mount.
@@ -57,8 +61,8 @@ pub struct CameraMovement {
     pub since_nanos: i64,
     /// Time of that image after the first keyframe, seconds.
     pub since_secs: f64,
-    /// Rotation vector (radians) and translation (meters) of the correction for images from then on, as in
-    /// [`CameraCorrection`]. It is applied before all other corrections.
+    /// Rotation vector (radians) and translation (meters) of the correction for images from then
+    /// on, as in [`CameraCorrection`]. It is applied before all other corrections.
     pub rotation_rad: [f64; 3],
     /// See `rotation_rad`.
     pub translation_m: [f64; 3],
@@ -95,14 +99,15 @@ impl std::fmt::Display for CameraMovement {
 #[derive(Debug, Default)]
 struct ImageState {
     is_reference: bool,
-    /// Individual motion of the camera relative to the reference images (meters, then radians) and its information;
-    /// `None` if the image and the references show no common surfaces.
+    /// Individual motion of the camera relative to the reference images (meters, then radians) and
+    /// its information; `None` if the image and the references show no common surfaces.
     motion: Option<(Vector6<f64>, Matrix6<f64>)>,
     /// Stake of the bets on a movement that began with this image.
     stake: f64,
 }
 
-/// Detects movements of cameras in a sequence of keyframes. A pure function of the keyframes and their order.
+/// Detects movements of cameras in a sequence of keyframes. A pure function of the keyframes and
+/// their order.
 #[derive(Debug)]
 pub struct MovementDetector {
     images: Vec<PreparedImage>,
@@ -111,32 +116,66 @@ pub struct MovementDetector {
 }
 
 impl MovementDetector {
-    /// A detector that compares later keyframes with these. Their cameras must already be corrected.
+    /// A detector that compares later keyframes with these. Their cameras must already be
+    /// corrected.
     pub fn new(references: &[Arc<Keyframe>]) -> Self {
-        let used: Vec<_> = references.iter().filter(|keyframe| is_used(keyframe)).collect();
+        let used: Vec<_> = references
+            .iter()
+            .filter(|keyframe| is_used(keyframe))
+            .collect();
         let n = used.len().min(MAX_REFERENCES);
-        let images: Vec<_> =
-            (0..n).into_par_iter().filter_map(|ix| PreparedImage::new(used[ix * used.len() / n], 0)).collect();
-        let mut detector = Self { images: Vec::new(), views: Vec::new(), states: Vec::new() };
+        let images: Vec<_> = (0..n)
+            .into_par_iter()
+            .filter_map(|ix| PreparedImage::new(used[ix * used.len() / n], 0))
+            .collect();
+        let mut detector = Self {
+            images: Vec::new(),
+            views: Vec::new(),
+            states: Vec::new(),
+        };
         for image in images {
-            detector.add(image, ImageState { is_reference: true, ..ImageState::default() });
+            detector.add(
+                image,
+                ImageState {
+                    is_reference: true,
+                    ..ImageState::default()
+                },
+            );
         }
         detector
     }
 
-    /// Tests the next keyframe, which has the same corrections as the references. Returns a movement if one is
-    /// detected; create a new detector afterwards. The movement applies to the corrected keyframes.
+    /// Tests the next keyframe, which has the same corrections as the references. Returns a
+    /// movement if one is detected; create a new detector afterwards. The movement applies to the
+    /// corrected keyframes.
     pub fn push(&mut self, keyframe: &Arc<Keyframe>) -> Option<CameraMovement> {
-        let image = is_used(keyframe).then(|| PreparedImage::new(keyframe, 0)).flatten()?;
-        self.add(image, ImageState { stake: 1.0, ..ImageState::default() });
+        let image = is_used(keyframe)
+            .then(|| PreparedImage::new(keyframe, 0))
+            .flatten()?;
+        self.add(
+            image,
+            ImageState {
+                stake: 1.0,
+                ..ImageState::default()
+            },
+        );
         let ix = self.images.len() - 1;
-        let pairs = pairs::choose(&self.images, &self.views, &self.references(), &[ix], MAX_PARTNERS);
+        let pairs = pairs::choose(
+            &self.images,
+            &self.views,
+            &self.references(),
+            &[ix],
+            MAX_PARTNERS,
+        );
         let recent = self.recent(&keyframe.camera);
         if pairs.len() >= MIN_PARTNERS {
             self.bet(ix, &pairs, &recent);
         }
         let sum = recent.iter().map(|ix| self.states[*ix].stake).sum::<f64>();
-        log::debug!("movement of camera {:?}: sum of stakes {sum:.3e}", keyframe.camera);
+        log::debug!(
+            "movement of camera {:?}: sum of stakes {sum:.3e}",
+            keyframe.camera
+        );
         if sum >= ALARM {
             if let Some(movement) = self.movement(&recent) {
                 return Some(movement);
@@ -144,14 +183,19 @@ impl MovementDetector {
             recent.iter().for_each(|ix| self.states[*ix].stake = 1.0);
         }
         if recent.len() > MOVEMENT_WINDOW {
-            self.states[recent[0]] = ImageState { is_reference: true, ..ImageState::default() };
+            self.states[recent[0]] = ImageState {
+                is_reference: true,
+                ..ImageState::default()
+            };
         }
         self.thin_references();
         None
     }
 
     fn add(&mut self, image: PreparedImage, state: ImageState) {
-        if let Some(view) = CorrectedView::new(&image, &CameraCorrection::default(), &Layout::default()) {
+        if let Some(view) =
+            CorrectedView::new(&image, &CameraCorrection::default(), &Layout::default())
+        {
             self.images.push(image);
             self.views.push(view);
             self.states.push(state);
@@ -159,45 +203,76 @@ impl MovementDetector {
     }
 
     fn references(&self) -> Vec<usize> {
-        (0..self.images.len()).filter(|ix| self.states[*ix].is_reference).collect()
+        (0..self.images.len())
+            .filter(|ix| self.states[*ix].is_reference)
+            .collect()
     }
 
     /// The images of a camera that are not references, in order of arrival.
     fn recent(&self, camera: &str) -> Vec<usize> {
-        let is_recent = |ix: &usize| !self.states[*ix].is_reference && *self.images[*ix].keyframe.camera == *camera;
+        let is_recent = |ix: &usize| {
+            !self.states[*ix].is_reference && *self.images[*ix].keyframe.camera == *camera
+        };
         (0..self.images.len()).filter(is_recent).collect()
     }
 
     /// Bets on an image, then estimates its own motion.
     fn bet(&mut self, ix: usize, pairs: &[Pair], recent: &[usize]) {
-        let Some(noise) = self.noise(pairs) else { return };
+        let Some(noise) = self.noise(pairs) else {
+            return;
+        };
         for (position, start) in recent.iter().enumerate().filter(|(_, start)| **start != ix) {
-            let Some(motion) = self.mean_motion(&recent[position..]) else { continue };
-            let Some(gain_db) = self.gain_db(pairs, noise, &motion) else { continue };
+            let Some(motion) = self.mean_motion(&recent[position..]) else {
+                continue;
+            };
+            let Some(gain_db) = self.gain_db(pairs, noise, &motion) else {
+                continue;
+            };
             self.states[*start].stake *= factor(gain_db);
         }
         self.states[ix].motion = self.own_motion(ix, pairs);
     }
 
     fn noise(&self, pairs: &[Pair]) -> Option<Noise> {
-        sums::noise_of(&sums::of_free_pairs(&self.images, &self.views, pairs, &finest(fit::INITIAL_NOISE)))
+        sums::noise_of(&sums::of_free_pairs(
+            &self.images,
+            &self.views,
+            pairs,
+            &finest(fit::INITIAL_NOISE),
+        ))
     }
 
     /// Motion of the camera at one image relative to the reference images, and its information.
     fn own_motion(&self, ix: usize, pairs: &[Pair]) -> Option<(Vector6<f64>, Matrix6<f64>)> {
-        let correction =
-            poses::fit_one(&self.images, &self.views, pairs, &CameraCorrection::default(), PixelSubset::All)?;
+        let correction = poses::fit_one(
+            &self.images,
+            &self.views,
+            pairs,
+            &CameraCorrection::default(),
+            PixelSubset::All,
+        )?;
         let image = &self.images[ix];
         let view = CorrectedView::new(image, &correction, &Layout::default())?;
         let mut views = self.views.clone();
         views[ix] = view;
         let sums = |noise| sums::of_free_pairs(&self.images, &views, pairs, &finest(noise));
         let noise = sums::noise_of(&sums(fit::INITIAL_NOISE))?;
-        let information = sums(noise).iter().map(|pair| pair.information.fixed_view::<6, 6>(6, 6).into_owned()).sum();
+        let information = sums(noise)
+            .iter()
+            .map(|pair| pair.information.fixed_view::<6, 6>(6, 6).into_owned())
+            .sum();
         let [a, b, c, x, y, z] = correction.drift_at(image.keyframe.stamp);
-        let twist = transform::log(&rigid_transform([a, b, c].into(), [x, y, z].into()).inverse(), 1.0);
+        let twist = transform::log(
+            &rigid_transform([a, b, c].into(), [x, y, z].into()).inverse(),
+            1.0,
+        );
         let (linear, angular) = (twist.linear_m_s, twist.angular_rad_s);
-        Some((Vector6::new(linear.x, linear.y, linear.z, angular.x, angular.y, angular.z), information))
+        Some((
+            Vector6::new(
+                linear.x, linear.y, linear.z, angular.x, angular.y, angular.z,
+            ),
+            information,
+        ))
     }
 
     /// Mean of the motions of several images, weighted by their information.
@@ -207,7 +282,9 @@ impl MovementDetector {
             information += weight;
             weighted += weight * motion;
         }
-        information.try_inverse().map(|covariance| covariance * weighted)
+        information
+            .try_inverse()
+            .map(|covariance| covariance * weighted)
     }
 
     /// Share of the individual motions that their mean explains, weighted by information.
@@ -215,31 +292,45 @@ impl MovementDetector {
         let mean = self.mean_motion(ixs)?;
         let squares = |motion: &dyn Fn(&Vector6<f64>) -> Vector6<f64>| {
             let motions = ixs.iter().filter_map(|ix| self.states[*ix].motion.as_ref());
-            motions.map(|(own, weight)| motion(own).dot(&(weight * motion(own)))).sum::<f64>()
+            motions
+                .map(|(own, weight)| motion(own).dot(&(weight * motion(own))))
+                .sum::<f64>()
         };
         Some(1.0 - squares(&|own| own - mean) / squares(&|own| *own))
     }
 
-    /// Gain in the prediction of an image from reference images if its camera has moved by `motion`, dB; `None` if too
-    /// few samples are visible.
+    /// Gain in the prediction of an image from reference images if its camera has moved by
+    /// `motion`, dB; `None` if too few samples are visible.
     fn gain_db(&self, pairs: &[Pair], noise: Noise, motion: &Vector6<f64>) -> Option<f64> {
         let ix = pairs.first()?.to;
-        let moved = CorrectedView::new(&self.images[ix], &correction_of(motion), &Layout::default())?;
+        let moved =
+            CorrectedView::new(&self.images[ix], &correction_of(motion), &Layout::default())?;
         validation::gain_db(&self.images, &self.views, pairs, &moved, noise)
     }
 
-    /// The movement that explains the recent images of a camera; `None` if it is too small or explains too little.
+    /// The movement that explains the recent images of a camera; `None` if it is too small or
+    /// explains too little.
     fn movement(&mut self, recent: &[usize]) -> Option<CameraMovement> {
         let stake = |position: &usize| self.states[recent[*position]].stake;
         let start = (0..recent.len()).max_by(|one, other| stake(one).total_cmp(&stake(other)))?;
         let motion = self.mean_motion(&recent[start..])?;
         // The first image from which on the motion improves predictions the most.
         let references = self.references();
-        let pairs_of = |ix: &usize| pairs::choose(&self.images, &self.views, &references, &[*ix], MAX_PARTNERS);
+        let pairs_of = |ix: &usize| {
+            pairs::choose(&self.images, &self.views, &references, &[*ix], MAX_PARTNERS)
+        };
         let pairs: Vec<Vec<Pair>> = recent.iter().map(pairs_of).collect();
         let gain = |pairs: &Vec<Pair>| self.gain_db(pairs, self.noise(pairs)?, &motion);
-        let gains: Vec<f64> = pairs.iter().map(|pairs| gain(pairs).unwrap_or(0.0)).collect();
-        let since = |position: &usize| gains[*position..].iter().map(|gain| gain.clamp(-1.0, 1.0)).sum::<f64>();
+        let gains: Vec<f64> = pairs
+            .iter()
+            .map(|pairs| gain(pairs).unwrap_or(0.0))
+            .collect();
+        let since = |position: &usize| {
+            gains[*position..]
+                .iter()
+                .map(|gain| gain.clamp(-1.0, 1.0))
+                .sum::<f64>()
+        };
         let start = (0..recent.len()).max_by(|one, other| since(one).total_cmp(&since(other)))?;
         let moved = &recent[start..];
         let explained_frac = self.explained_frac(moved)?;
@@ -255,9 +346,15 @@ impl MovementDetector {
             self.images[*ix].camera = 0; // If the movement is rejected, they become references.
         }
         let found = found?;
-        let CameraCorrection { rotation_rad, translation_m, .. } = found.corrections.by_camera[1];
+        let CameraCorrection {
+            rotation_rad,
+            translation_m,
+            ..
+        } = found.corrections.by_camera[1];
         let sigma = |vector: [f64; 3], begin: usize| {
-            let axis = Vector3::from(vector).try_normalize(0.0).unwrap_or_else(Vector3::zeros);
+            let axis = Vector3::from(vector)
+                .try_normalize(0.0)
+                .unwrap_or_else(Vector3::zeros);
             let mut weights = DVector::zeros(6);
             weights.rows_mut(begin, 3).copy_from(&axis);
             found.solution.variance(&weights).sqrt()
@@ -273,7 +370,9 @@ impl MovementDetector {
             translation_sigma_m: sigma(translation_m, 0),
             n_images: moved.len(),
         };
-        log::debug!("{movement:?}, gains {gains:.2?} dB, {explained_frac:.3} of the motions explained");
+        log::debug!(
+            "{movement:?}, gains {gains:.2?} dB, {explained_frac:.3} of the motions explained"
+        );
         let is_large = Vector3::from(rotation_rad).norm() > MIN_ROTATION_RAD
             || Vector3::from(translation_m).norm() > MIN_TRANSLATION_M;
         (is_large && explained_frac > MIN_EXPLAINED_FRAC).then_some(movement)
@@ -298,7 +397,12 @@ fn is_used(keyframe: &Keyframe) -> bool {
 }
 
 fn finest(noise: Noise) -> ResidualOptions {
-    ResidualOptions { level: 0, occlusion_frac: fit::OCCLUSION_FRAC[0], noise, part: PixelSubset::All }
+    ResidualOptions {
+        level: 0,
+        occlusion_frac: fit::OCCLUSION_FRAC[0],
+        noise,
+        part: PixelSubset::All,
+    }
 }
 
 /// Factor on the stake of a bet after an image whose prediction has improved by `gain_db`.
@@ -312,8 +416,13 @@ fn correction_of(motion: &Vector6<f64>) -> CameraCorrection {
         linear_m_s: motion.fixed_rows::<3>(0).into_owned(),
         angular_rad_s: motion.fixed_rows::<3>(3).into_owned(),
     };
-    let (rotation_rad, translation_m) = super::corrections::rotation_and_translation(&transform::exp(&twist, -1.0));
-    CameraCorrection { rotation_rad, translation_m, ..CameraCorrection::default() }
+    let (rotation_rad, translation_m) =
+        super::corrections::rotation_and_translation(&transform::exp(&twist, -1.0));
+    CameraCorrection {
+        rotation_rad,
+        translation_m,
+        ..CameraCorrection::default()
+    }
 }
 
 #[cfg(test)]
@@ -325,7 +434,8 @@ mod tests {
     /// Index of the first image after the movement.
     const MOVED_AT: usize = 26;
 
-    /// Tests the images after the references; returns the movement, and the number of images until it was found.
+    /// Tests the images after the references; returns the movement, and the number of images until
+    /// it was found.
     fn detect(keyframes: &[Arc<Keyframe>]) -> Option<(CameraMovement, usize)> {
         let mut detector = MovementDetector::new(&keyframes[..N_REFERENCES]);
         let mut later = keyframes.iter().enumerate().skip(N_REFERENCES);
@@ -334,24 +444,53 @@ mod tests {
 
     /// A scan during which the camera is moved relative to its mount.
     fn scan_with_movement(motion: &Transform, noise: f64) -> Vec<Arc<Keyframe>> {
-        let before = capture(&Miscalibration { noise, ..Miscalibration::none() });
-        let after = capture(&Miscalibration { noise, extrinsics: motion.inverse(), ..Miscalibration::none() });
+        let before = capture(&Miscalibration {
+            noise,
+            ..Miscalibration::none()
+        });
+        let after = capture(&Miscalibration {
+            noise,
+            extrinsics: motion.inverse(),
+            ..Miscalibration::none()
+        });
         [&before[..MOVED_AT], &after[MOVED_AT..]].concat()
     }
 
     #[test]
     fn movement_is_found_and_estimated() {
-        let large = Transform::new(Vector3::new(-0.004, 0.003, 0.004), Vector3::new(0.02, -0.025, 0.018));
-        for (motion, noise, max_images) in [(wrong_extrinsics(), 1.0, 8), (large, 1.0, 7), (large, 3.0, 8)] {
+        let large = Transform::new(
+            Vector3::new(-0.004, 0.003, 0.004),
+            Vector3::new(0.02, -0.025, 0.018),
+        );
+        for (motion, noise, max_images) in [
+            (wrong_extrinsics(), 1.0, 8),
+            (large, 1.0, 7),
+            (large, 3.0, 8),
+        ] {
             let keyframes = scan_with_movement(&motion, noise);
             let (movement, n_seen) = detect(&keyframes).expect("a movement");
-            assert!(n_seen - MOVED_AT <= max_images, "found after {} images", n_seen - MOVED_AT);
-            let since = keyframes.iter().position(|keyframe| keyframe.stamp.0 == movement.since_nanos);
+            assert!(
+                n_seen - MOVED_AT <= max_images,
+                "found after {} images",
+                n_seen - MOVED_AT
+            );
+            let since = keyframes
+                .iter()
+                .position(|keyframe| keyframe.stamp.0 == movement.since_nanos);
             assert_eq!(since, Some(MOVED_AT), "{movement:?}");
             let left = movement.correction() * motion;
-            let (degrees, mm) = (left.rotation.angle().to_degrees(), 1e3 * left.translation.vector.norm());
-            assert!(degrees < 0.05 && mm < 0.7, "{degrees} degrees, {mm} mm left of {motion:?}");
-            assert!(movement.rotation_sigma_rad < 1e-3 && movement.translation_sigma_m < 1e-3, "{movement:?}");
+            let (degrees, mm) = (
+                left.rotation.angle().to_degrees(),
+                1e3 * left.translation.vector.norm(),
+            );
+            assert!(
+                degrees < 0.05 && mm < 0.7,
+                "{degrees} degrees, {mm} mm left of {motion:?}"
+            );
+            assert!(
+                movement.rotation_sigma_rad < 1e-3 && movement.translation_sigma_m < 1e-3,
+                "{movement:?}"
+            );
         }
     }
 
@@ -360,17 +499,32 @@ mod tests {
         let none = Miscalibration::none();
         let mut scans: Vec<Miscalibration> = (2..14)
             .zip([0.5, 1.0, 3.0].into_iter().cycle())
-            .map(|(seed, noise)| Miscalibration { seed, noise, ..none.clone() })
+            .map(|(seed, noise)| Miscalibration {
+                seed,
+                noise,
+                ..none.clone()
+            })
             .collect();
         // Errors that registration has not corrected yet.
         scans.extend(
-            [0.003, 0.006, -0.006, 0.01].map(|time_offset_secs| Miscalibration { time_offset_secs, ..none.clone() }),
+            [0.003, 0.006, -0.006, 0.01].map(|time_offset_secs| Miscalibration {
+                time_offset_secs,
+                ..none.clone()
+            }),
         );
-        scans.extend(
-            [0.002, -0.003].map(|error| Miscalibration { joints: [error, -error, error, 0.0], ..none.clone() }),
+        scans.extend([0.002, -0.003].map(|error| Miscalibration {
+            joints: [error, -error, error, 0.0],
+            ..none.clone()
+        }));
+        let slight = Transform::new(
+            Vector3::new(0.0005, -0.0005, 0.0005),
+            Vector3::new(0.001, 0.002, -0.001),
         );
-        let slight = Transform::new(Vector3::new(0.0005, -0.0005, 0.0005), Vector3::new(0.001, 0.002, -0.001));
-        scans.extend([1, 2].map(|seed| Miscalibration { extrinsics: slight, seed, ..none.clone() }));
+        scans.extend([1, 2].map(|seed| Miscalibration {
+            extrinsics: slight,
+            seed,
+            ..none.clone()
+        }));
         assert_eq!(scans.len(), 20);
         for scan in scans {
             let found = detect(&capture(&scan));
@@ -388,11 +542,19 @@ mod tests {
     fn images_that_cannot_be_compared_are_skipped() {
         let keyframes = capture(&Miscalibration::none());
         let mut detector = MovementDetector::new(&keyframes[1..2]);
-        let without_depth = Arc::new(Keyframe { depth: None, ..keyframes[30].as_ref().clone() });
+        let without_depth = Arc::new(Keyframe {
+            depth: None,
+            ..keyframes[30].as_ref().clone()
+        });
         assert_eq!(detector.push(&without_depth), None);
-        let far = Arc::new(keyframes[30].with_base_correction(&Transform::translation(50.0, 0.0, 0.0)));
+        let far =
+            Arc::new(keyframes[30].with_base_correction(&Transform::translation(50.0, 0.0, 0.0)));
         assert_eq!(detector.push(&far), None);
-        assert_eq!(detector.images.len(), 2, "only the image without depth is not kept");
+        assert_eq!(
+            detector.images.len(),
+            2,
+            "only the image without depth is not kept"
+        );
     }
 
     #[test]

@@ -8,11 +8,11 @@ use rayon::prelude::*;
 const MIN_OVERLAP: f64 = 0.3;
 /// Number of samples that are tested for the overlap.
 const N_PROBES: usize = 40;
-/// Readings that differ by more than this fraction belong to different surfaces. The fraction is large because poses
-/// may have errors of centimeters.
+/// Readings that differ by more than this fraction belong to different surfaces. The fraction is
+/// large because poses may have errors of centimeters.
 const SAME_SURFACE_FRAC: f64 = 0.1;
-/// Minimum distance of a partner: the rotation in radians plus the translation divided by the depth. Closer partners
-/// carry no information.
+/// Minimum distance of a partner: the rotation in radians plus the translation divided by the
+/// depth. Closer partners carry no information.
 const MIN_MOTION: f64 = 0.01;
 
 /// A pair of images: samples of image `from` are compared with image `to`.
@@ -22,8 +22,8 @@ pub(super) struct Pair {
     pub(super) to: usize,
 }
 
-/// Chooses at most `max_partners` partners among `candidates` for each image of `targets`, spread evenly over their
-/// distances.
+/// Chooses at most `max_partners` partners among `candidates` for each image of `targets`, spread
+/// evenly over their distances.
 pub(super) fn choose(
     images: &[PreparedImage],
     views: &[CorrectedView],
@@ -45,32 +45,55 @@ pub(super) fn choose(
         let picks: Vec<usize> = if n <= max_partners {
             (0..n).collect()
         } else {
-            (0..max_partners).map(|ix| ix * (n - 1) / (max_partners - 1).max(1)).collect()
+            (0..max_partners)
+                .map(|ix| ix * (n - 1) / (max_partners - 1).max(1))
+                .collect()
         };
-        picks.into_iter().map(|ix| Pair { from: overlapping[ix].1, to: *to }).collect::<Vec<Pair>>()
+        picks
+            .into_iter()
+            .map(|ix| Pair {
+                from: overlapping[ix].1,
+                to: *to,
+            })
+            .collect::<Vec<Pair>>()
     };
-    targets.par_iter().map(partners_of).collect::<Vec<_>>().concat()
+    targets
+        .par_iter()
+        .map(partners_of)
+        .collect::<Vec<_>>()
+        .concat()
 }
 
-/// Distance between two images: the rotation in radians plus the translation in mean depths; `None` without
-/// sufficient overlap.
-fn distance(images: &[PreparedImage], views: &[CorrectedView], from: usize, to: usize) -> Option<f64> {
+/// Distance between two images: the rotation in radians plus the translation in mean depths; `None`
+/// without sufficient overlap.
+fn distance(
+    images: &[PreparedImage],
+    views: &[CorrectedView],
+    from: usize,
+    to: usize,
+) -> Option<f64> {
     let (i, j) = (&views[from], &views[to]);
     let depth = images[to].keyframe.depth.as_ref()?;
     let samples = &images[from].uniform_samples;
     let stride = samples.len().div_ceil(N_PROBES).max(1);
     let (mut n_visible, mut n, mut depths_m) = (0.0, 0.0, 0.0);
     for sample in samples.iter().step_by(stride) {
-        let in_i = i.color_from_depth.apply(&point(i.depth_focal_px, i.depth_principal_px, sample));
-        let at =
-            j.color_from_depth.apply_inverse(&j.world_from_camera.apply_inverse(&i.world_from_camera.apply(&in_i)));
+        let in_i = i
+            .color_from_depth
+            .apply(&point(i.depth_focal_px, i.depth_principal_px, sample));
+        let at = j.color_from_depth.apply_inverse(
+            &j.world_from_camera
+                .apply_inverse(&i.world_from_camera.apply(&in_i)),
+        );
         n += 1.0;
         depths_m += sample.z_m;
         if at.z <= 0.0 {
             continue;
         }
         let reading = depth_at(depth, j.depth_pixel(&at));
-        n_visible += if reading.is_some_and(|sampled| (sampled.value - at.z).abs() < SAME_SURFACE_FRAC * at.z) {
+        n_visible += if reading
+            .is_some_and(|sampled| (sampled.value - at.z).abs() < SAME_SURFACE_FRAC * at.z)
+        {
             1.0
         } else {
             0.0
@@ -79,7 +102,10 @@ fn distance(images: &[PreparedImage], views: &[CorrectedView], from: usize, to: 
     if n_visible < MIN_OVERLAP * n || n == 0.0 {
         return None;
     }
-    let rotation = i.world_from_camera.rotation.tr_mul(&j.world_from_camera.rotation);
+    let rotation = i
+        .world_from_camera
+        .rotation
+        .tr_mul(&j.world_from_camera.rotation);
     let angle = (0.5 * (rotation.trace() - 1.0)).clamp(-1.0, 1.0).acos();
     let translation = (i.world_from_camera.translation - j.world_from_camera.translation).norm();
     Some(angle + translation * n / depths_m)

@@ -1,4 +1,5 @@
-//! Estimates pose corrections of individual images. There are many unknowns, but each pair constrains only two images.
+//! Estimates pose corrections of individual images. There are many unknowns, but each pair
+//! constrains only two images.
 
 use super::corrections::{Corrections, rotation_and_translation, twist};
 use super::fit::{INITIAL_NOISE, OCCLUSION_FRAC};
@@ -15,26 +16,33 @@ use kinematics::{Twist, transform};
 use nalgebra::{DVector, Matrix6, Vector6};
 use std::collections::BTreeMap;
 
-/// Bounds of the expected pose error of an image, meters and radians. The lower bound (next constant) is the accuracy
-/// of arms.
+/// Bounds of the expected pose error of an image, meters and radians. The lower bound (next
+/// constant) is the accuracy of arms.
 const MAX_POSE_ERROR: [f64; 2] = [0.02, 0.02];
 const MIN_POSE_ERROR: [f64; 2] = [2e-4, 3.5e-4];
 const MAX_ITERATIONS: [usize; 4] = [6, 4, 4, 6];
 const MAX_STEP: f64 = 2.0;
 
-/// Estimates the poses of all images that are connected by pairs, starting from given corrections. Other images get the
-/// interpolated drift of their neighbors, weighted by its predictability.
+/// Estimates the poses of all images that are connected by pairs, starting from given corrections.
+/// Other images get the interpolated drift of their neighbors, weighted by its predictability.
 ///
-/// The expected pose error is estimated from the corrections themselves at each level. If almost all poses are correct,
-/// it becomes small, so noise does not move them.
-pub(super) fn fit(images: &[PreparedImage], pairs: &[Pair], from: &Corrections) -> Option<Corrections> {
+/// The expected pose error is estimated from the corrections themselves at each level. If almost
+/// all poses are correct, it becomes small, so noise does not move them.
+pub(super) fn fit(
+    images: &[PreparedImage],
+    pairs: &[Pair],
+    from: &Corrections,
+) -> Option<Corrections> {
     let layout = Layout::default();
     let mut corrections = from.clone();
     let slot_of_image: BTreeMap<usize, usize> = {
         let mut ixs: Vec<usize> = pairs.iter().flat_map(|pair| [pair.from, pair.to]).collect();
         ixs.sort_unstable();
         ixs.dedup();
-        ixs.into_iter().enumerate().map(|(slot, ix)| (ix, slot)).collect()
+        ixs.into_iter()
+            .enumerate()
+            .map(|(slot, ix)| (ix, slot))
+            .collect()
     };
     // Meters and radians.
     let mut total = vec![Vector6::zeros(); slot_of_image.len()];
@@ -46,15 +54,25 @@ pub(super) fn fit(images: &[PreparedImage], pairs: &[Pair], from: &Corrections) 
         noise: INITIAL_NOISE,
         part: PixelSubset::All,
     };
-    options.noise = sums::noise_of(&sums::of_free_pairs(images, &corrections.views(images, &layout), pairs, &options))?;
+    options.noise = sums::noise_of(&sums::of_free_pairs(
+        images,
+        &corrections.views(images, &layout),
+        pairs,
+        &options,
+    ))?;
     for level in (0..n_levels).rev() {
         (options.level, options.occlusion_frac) = (level, OCCLUSION_FRAC[level]);
         let scales = scales(pose_error);
         for _ in 0..MAX_ITERATIONS[level] {
-            let sums = sums::of_free_pairs(images, &corrections.views(images, &layout), pairs, &options);
+            let sums =
+                sums::of_free_pairs(images, &corrections.views(images, &layout), pairs, &options);
             options.noise = sums::noise_of(&sums)?;
-            let scaled_total: Vec<Vector6<f64>> = total.iter().map(|total| total.component_div(&scales)).collect();
-            let mut steps = NormalEquations::new(pairs, &sums, &slot_of_image, &scales, &scaled_total).solve();
+            let scaled_total: Vec<Vector6<f64>> = total
+                .iter()
+                .map(|total| total.component_div(&scales))
+                .collect();
+            let mut steps =
+                NormalEquations::new(pairs, &sums, &slot_of_image, &scales, &scaled_total).solve();
             for step in &mut steps {
                 let max_component = step.amax();
                 *step = step.component_mul(&scales) * (MAX_STEP / max_component.max(MAX_STEP));
@@ -62,13 +80,22 @@ pub(super) fn fit(images: &[PreparedImage], pairs: &[Pair], from: &Corrections) 
             remove_mean(&mut steps, &total, &slot_of_image, images);
             for (ix, slot) in &slot_of_image {
                 total[*slot] += steps[*slot];
-                apply_step(&mut corrections.by_camera[images[*ix].camera], &images[*ix], &steps[*slot]);
+                apply_step(
+                    &mut corrections.by_camera[images[*ix].camera],
+                    &images[*ix],
+                    &steps[*slot],
+                );
             }
             log::debug!("alignment: poses, level {level}, {:?}", options.noise);
         }
         pose_error = [0, 1].map(|part| {
-            let squares = total.iter().map(|total| total.fixed_rows::<3>(3 * part).norm_squared()).sum::<f64>();
-            (squares / (3 * total.len()) as f64).sqrt().clamp(MIN_POSE_ERROR[part], MAX_POSE_ERROR[part])
+            let squares = total
+                .iter()
+                .map(|total| total.fixed_rows::<3>(3 * part).norm_squared())
+                .sum::<f64>();
+            (squares / (3 * total.len()) as f64)
+                .sqrt()
+                .clamp(MIN_POSE_ERROR[part], MAX_POSE_ERROR[part])
         });
     }
     let depth_m = median_depth_m(images);
@@ -78,9 +105,9 @@ pub(super) fn fit(images: &[PreparedImage], pairs: &[Pair], from: &Corrections) 
     Some(corrections)
 }
 
-/// Estimates the pose of one image relative to others that stay fixed, from a subset of its pixels. All `pairs` must
-/// lead to this image. Returns the correction of its camera with an entry for this image; `None` if the other images do
-/// not show the same surfaces.
+/// Estimates the pose of one image relative to others that stay fixed, from a subset of its pixels.
+/// All `pairs` must lead to this image. Returns the correction of its camera with an entry for this
+/// image; `None` if the other images do not show the same surfaces.
 pub(super) fn fit_one(
     images: &[PreparedImage],
     views: &[CorrectedView],
@@ -91,7 +118,10 @@ pub(super) fn fit_one(
     let image = &images[pairs.first()?.to];
     let mut image_correction = correction.clone();
     // The image gets its own entry, which starts at its current drift.
-    image_correction.drift.insert(image.keyframe.stamp.0, correction.drift_at(image.keyframe.stamp));
+    image_correction.drift.insert(
+        image.keyframe.stamp.0,
+        correction.drift_at(image.keyframe.stamp),
+    );
     let scales = scales(MAX_POSE_ERROR);
     let mut total = Vector6::zeros();
     let n_levels = image.levels.len();
@@ -101,11 +131,20 @@ pub(super) fn fit_one(
         noise: INITIAL_NOISE,
         part,
     };
-    let sums_of = |image_correction: &CameraCorrection, options: &ResidualOptions| -> Option<Vec<PairSums>> {
-        let view = CorrectedView::new(image, image_correction, &Layout::default())?;
-        let from = |pair: &Pair| Side { image: &images[pair.from], view: &views[pair.from] };
-        Some(pairs.iter().map(|pair| sums::of_second([from(pair), Side { image, view: &view }], options)).collect())
-    };
+    let sums_of =
+        |image_correction: &CameraCorrection, options: &ResidualOptions| -> Option<Vec<PairSums>> {
+            let view = CorrectedView::new(image, image_correction, &Layout::default())?;
+            let from = |pair: &Pair| Side {
+                image: &images[pair.from],
+                view: &views[pair.from],
+            };
+            Some(
+                pairs
+                    .iter()
+                    .map(|pair| sums::of_second([from(pair), Side { image, view: &view }], options))
+                    .collect(),
+            )
+        };
     options.noise = sums::noise_of(&sums_of(&image_correction, &options)?)?;
     for level in (0..n_levels).rev() {
         (options.level, options.occlusion_frac) = (level, OCCLUSION_FRAC[level]);
@@ -129,20 +168,30 @@ pub(super) fn fit_one(
 }
 
 fn scales([translation_m, rotation_rad]: [f64; 2]) -> Vector6<f64> {
-    Vector6::new(translation_m, translation_m, translation_m, rotation_rad, rotation_rad, rotation_rad)
+    Vector6::new(
+        translation_m,
+        translation_m,
+        translation_m,
+        rotation_rad,
+        rotation_rad,
+        rotation_rad,
+    )
 }
 
 fn median_depth_m(images: &[PreparedImage]) -> f64 {
-    let mut depths: Vec<f64> =
-        images.iter().flat_map(|image| &image.uniform_samples).map(|sample| sample.z_m).collect();
+    let mut depths: Vec<f64> = images
+        .iter()
+        .flat_map(|image| &image.uniform_samples)
+        .map(|sample| sample.z_m)
+        .collect();
     quantile(&mut depths, 0.5, Rank::Upper).unwrap_or(1.0)
 }
 
-/// Removes the significant part of the mean correction of a camera's images from the steps, because other parameters
-/// explain that part.
+/// Removes the significant part of the mean correction of a camera's images from the steps, because
+/// other parameters explain that part.
 ///
-/// A mean within its tolerance is not removed: independent errors have a nonzero mean, too, and removing it would leave
-/// the images misaligned.
+/// A mean within its tolerance is not removed: independent errors have a nonzero mean, too, and
+/// removing it would leave the images misaligned.
 fn remove_mean(
     steps: &mut [Vector6<f64>],
     total: &[Vector6<f64>],
@@ -158,9 +207,13 @@ fn remove_mean(
         let n = slots.len() as f64;
         let after = |slot: &usize| total[*slot] + steps[*slot];
         let mean = slots.iter().map(after).sum::<Vector6<f64>>() / n;
-        let squares = slots.iter().map(|slot| (after(slot) - mean).map(|x| x * x)).sum::<Vector6<f64>>();
+        let squares = slots
+            .iter()
+            .map(|slot| (after(slot) - mean).map(|x| x * x))
+            .sum::<Vector6<f64>>();
         let tolerance = squares.map(|squares| MAX_STANDARD_ERRORS * squares.sqrt() / n);
-        let excess = Vector6::from_fn(|row, _| mean[row] - mean[row].clamp(-tolerance[row], tolerance[row]));
+        let excess =
+            Vector6::from_fn(|row, _| mean[row] - mean[row].clamp(-tolerance[row], tolerance[row]));
         for slot in slots {
             steps[*slot] -= excess;
         }
@@ -169,21 +222,34 @@ fn remove_mean(
 
 /// Moves the camera of an image in its own axes: meters, then radians.
 fn apply_step(correction: &mut CameraCorrection, image: &PreparedImage, step: &Vector6<f64>) {
-    // Drift is applied before the extrinsics correction, so the motion is converted to the axes before that
-    // correction.
-    let extrinsics = rigid_transform(correction.rotation_rad.into(), correction.translation_m.into());
-    let motion: Twist = twist(&DVector::from_column_slice(step.as_slice()), 0).of_attached(&extrinsics);
+    // Drift is applied before the extrinsics correction, so the motion is converted to the axes
+    // before that correction.
+    let extrinsics = rigid_transform(
+        correction.rotation_rad.into(),
+        correction.translation_m.into(),
+    );
+    let motion: Twist =
+        twist(&DVector::from_column_slice(step.as_slice()), 0).of_attached(&extrinsics);
     let drift = correction.drift.entry(image.keyframe.stamp.0).or_default();
     let [x, y, z, dx, dy, dz] = *drift;
     let before = rigid_transform([x, y, z].into(), [dx, dy, dz].into());
-    let (rotation, translation) = rotation_and_translation(&(transform::exp(&motion, -1.0) * before));
-    *drift = [rotation[0], rotation[1], rotation[2], translation[0], translation[1], translation[2]];
+    let (rotation, translation) =
+        rotation_and_translation(&(transform::exp(&motion, -1.0) * before));
+    *drift = [
+        rotation[0],
+        rotation[1],
+        rotation[2],
+        translation[0],
+        translation[1],
+        translation[2],
+    ];
 }
 
 /// Blocks of the normal equations, scaled by the expected pose errors.
 struct NormalEquations {
     diagonal: Vec<Matrix6<f64>>,
-    /// For each pair, the slots of its first image (rows) and second image (columns), and the block between them.
+    /// For each pair, the slots of its first image (rows) and second image (columns), and the block
+    /// between them.
     off_diagonal: Vec<(usize, usize, Matrix6<f64>)>,
     rhs: Vec<Vector6<f64>>,
 }
@@ -204,19 +270,31 @@ impl NormalEquations {
         for (pair, sums) in pairs.iter().zip(sums) {
             let slots = [slot_of_image[&pair.from], slot_of_image[&pair.to]];
             let block = |row: usize, column: usize| {
-                Matrix6::from_fn(|y, x| sums.information[(6 * row + y, 6 * column + x)] * scales[y] * scales[x])
+                Matrix6::from_fn(|y, x| {
+                    sums.information[(6 * row + y, 6 * column + x)] * scales[y] * scales[x]
+                })
             };
             for (side, slot) in slots.into_iter().enumerate() {
                 equations.diagonal[slot] += block(side, side);
-                equations.rhs[slot] += sums.gradient.fixed_rows::<6>(6 * side).component_mul(scales);
+                equations.rhs[slot] += sums
+                    .gradient
+                    .fixed_rows::<6>(6 * side)
+                    .component_mul(scales);
             }
-            equations.off_diagonal.push((slots[0], slots[1], block(0, 1)));
+            equations
+                .off_diagonal
+                .push((slots[0], slots[1], block(0, 1)));
         }
         equations
     }
 
     fn multiply(&self, x: &[Vector6<f64>]) -> Vec<Vector6<f64>> {
-        let mut product: Vec<Vector6<f64>> = self.diagonal.iter().zip(x).map(|(block, x)| block * x).collect();
+        let mut product: Vec<Vector6<f64>> = self
+            .diagonal
+            .iter()
+            .zip(x)
+            .map(|(block, x)| block * x)
+            .collect();
         for (row, column, block) in &self.off_diagonal {
             product[*row] += block * x[*column];
             product[*column] += block.tr_mul(&x[*row]);
@@ -228,10 +306,21 @@ impl NormalEquations {
     fn solve(&self) -> Vec<Vector6<f64>> {
         const MAX_CG_ITERATIONS: usize = 60;
         const TOLERANCE: f64 = 1e-8;
-        let inverses: Vec<Matrix6<f64>> =
-            self.diagonal.iter().map(|block| block.try_inverse().unwrap_or_else(Matrix6::zeros)).collect();
-        let dot = |a: &[Vector6<f64>], b: &[Vector6<f64>]| a.iter().zip(b).map(|(a, b)| a.dot(b)).sum::<f64>();
-        let precondition = |r: &[Vector6<f64>]| inverses.iter().zip(r).map(|(block, r)| block * r).collect::<Vec<_>>();
+        let inverses: Vec<Matrix6<f64>> = self
+            .diagonal
+            .iter()
+            .map(|block| block.try_inverse().unwrap_or_else(Matrix6::zeros))
+            .collect();
+        let dot = |a: &[Vector6<f64>], b: &[Vector6<f64>]| {
+            a.iter().zip(b).map(|(a, b)| a.dot(b)).sum::<f64>()
+        };
+        let precondition = |r: &[Vector6<f64>]| {
+            inverses
+                .iter()
+                .zip(r)
+                .map(|(block, r)| block * r)
+                .collect::<Vec<_>>()
+        };
         let mut x = vec![Vector6::zeros(); self.rhs.len()];
         let mut residual = self.rhs.clone();
         let mut preconditioned = precondition(&residual);

@@ -10,15 +10,16 @@ use keyframe::{DepthMap, Keyframe};
 use nalgebra::Vector3;
 use std::sync::Arc;
 
-/// Maximum width of the finest level, pixels. At this width, errors of a hundredth of a pixel are far below the
-/// accuracy that calibration needs.
+/// Maximum width of the finest level, pixels. At this width, errors of a hundredth of a pixel are
+/// far below the accuracy that calibration needs.
 const MAX_COLUMNS: u32 = 400;
 /// Minimum side of the coarsest level.
 const MIN_SIDE: usize = 40;
 const MAX_LEVELS: usize = 4;
 /// Columns and rows of the grid of an image. Each cell contributes its most informative sample.
 const GRID_CELLS: [usize; 2] = [20, 15];
-/// Maximum relative difference of a sample's depth from its neighbors, and between readings that are interpolated.
+/// Maximum relative difference of a sample's depth from its neighbors, and between readings that
+/// are interpolated.
 const SMOOTH_FRAC: f64 = 0.03;
 
 /// A keyframe prepared for alignment.
@@ -75,8 +76,12 @@ impl PreparedImage {
             shares_lens,
         };
         let finest = image.levels.first()?;
-        let brightness_at = |sample: &DepthSample| color_pixel(keyframe, depth, sample).and_then(|at| finest.at(at));
-        let gradient_norm = |sample: &DepthSample| brightness_at(sample).map(|at| at.gradient[0].hypot(at.gradient[1]));
+        let brightness_at = |sample: &DepthSample| {
+            color_pixel(keyframe, depth, sample).and_then(|at| finest.at(at))
+        };
+        let gradient_norm = |sample: &DepthSample| {
+            brightness_at(sample).map(|at| at.gradient[0].hypot(at.gradient[1]))
+        };
         let (samples, uniform_samples) = select_samples(depth, gradient_norm);
         (image.samples, image.uniform_samples) = (samples, uniform_samples);
         Some(image)
@@ -88,16 +93,24 @@ impl PreparedImage {
     }
 }
 
-/// Pixel of a sample in the color image, with uncorrected cameras. The rolling shutter is ignored, because the pixel is
-/// used only to select samples.
+/// Pixel of a sample in the color image, with uncorrected cameras. The rolling shutter is ignored,
+/// because the pixel is used only to select samples.
 fn color_pixel(keyframe: &Keyframe, depth: &DepthMap, sample: &DepthSample) -> Option<[f64; 2]> {
     let in_depth = point(depth.focal_px, depth.principal_px, sample);
-    let at = keyframe.world_from_camera.inverse() * depth.world_from_camera * nalgebra::Point3::from(in_depth);
-    (at.z > 0.0).then(|| [0, 1].map(|axis| keyframe.focal_px[axis] * at[axis] / at.z + keyframe.principal_px[axis]))
+    let at = keyframe.world_from_camera.inverse()
+        * depth.world_from_camera
+        * nalgebra::Point3::from(in_depth);
+    (at.z > 0.0).then(|| {
+        [0, 1].map(|axis| keyframe.focal_px[axis] * at[axis] / at.z + keyframe.principal_px[axis])
+    })
 }
 
 /// Position of a sample in its depth camera, before any depth scale.
-pub(super) fn point(focal_px: [f64; 2], principal_px: [f64; 2], sample: &DepthSample) -> Vector3<f64> {
+pub(super) fn point(
+    focal_px: [f64; 2],
+    principal_px: [f64; 2],
+    sample: &DepthSample,
+) -> Vector3<f64> {
     let ray = [0, 1].map(|axis| (sample.pixel[axis] - principal_px[axis]) / focal_px[axis]);
     Vector3::new(ray[0], ray[1], 1.0) * sample.z_m
 }
@@ -116,16 +129,32 @@ fn select_samples(
         let mut middle = None;
         for candidate in 0..CANDIDATES_PER_SIDE * CANDIDATES_PER_SIDE {
             let coordinate = |cell: usize, part: usize, n_cells: usize, side: usize| {
-                ((cell * CANDIDATES_PER_SIDE + part) * side + side / 2) / (n_cells * CANDIDATES_PER_SIDE)
+                ((cell * CANDIDATES_PER_SIDE + part) * side + side / 2)
+                    / (n_cells * CANDIDATES_PER_SIDE)
             };
-            let x = coordinate(cell_x, candidate % CANDIDATES_PER_SIDE, GRID_CELLS[0], width);
-            let y = coordinate(cell_y, candidate / CANDIDATES_PER_SIDE, GRID_CELLS[1], height);
-            let Some(sample) = sample(depth, x, y) else { continue };
-            let Some(norm) = gradient_norm(&sample) else { continue };
+            let x = coordinate(
+                cell_x,
+                candidate % CANDIDATES_PER_SIDE,
+                GRID_CELLS[0],
+                width,
+            );
+            let y = coordinate(
+                cell_y,
+                candidate / CANDIDATES_PER_SIDE,
+                GRID_CELLS[1],
+                height,
+            );
+            let Some(sample) = sample(depth, x, y) else {
+                continue;
+            };
+            let Some(norm) = gradient_norm(&sample) else {
+                continue;
+            };
             if best.is_none_or(|(max, _)| norm > max) {
                 best = Some((norm, sample));
             }
-            if candidate >= CANDIDATES_PER_SIDE * CANDIDATES_PER_SIDE / 2 + CANDIDATES_PER_SIDE / 2 && middle.is_none()
+            if candidate >= CANDIDATES_PER_SIDE * CANDIDATES_PER_SIDE / 2 + CANDIDATES_PER_SIDE / 2
+                && middle.is_none()
             {
                 middle = Some(sample);
             }
@@ -155,19 +184,22 @@ fn sample(depth: &DepthMap, x: usize, y: usize) -> Option<DepthSample> {
             if (neighbor - z_m).abs() > SMOOTH_FRAC * z_m {
                 return None;
             }
-            // Readings are used in opposite pairs, so that a slanted surface does not bias the mean. Inverse depths are
-            // averaged, because they are linear on a plane.
+            // Readings are used in opposite pairs, so that a slanted surface does not bias the
+            // mean. Inverse depths are averaged, because they are linear on a plane.
             if at(x + RADIUS - dx, y + RADIUS - dy) > 0.0 {
                 sum += 1.0 / neighbor;
                 n += 1.0;
             }
         }
     }
-    Some(DepthSample { pixel: [x as f64 + 0.5, y as f64 + 0.5], z_m: n / sum })
+    Some(DepthSample {
+        pixel: [x as f64 + 0.5, y as f64 + 0.5],
+        z_m: n / sum,
+    })
 }
 
-/// Depth interpolated between pixels, and its gradient along x and y; `None` at holes and edges. Interpolates inverse
-/// depths, which are linear on a plane.
+/// Depth interpolated between pixels, and its gradient along x and y; `None` at holes and edges.
+/// Interpolates inverse depths, which are linear on a plane.
 pub(super) fn depth_at(depth: &DepthMap, pixel: [f64; 2]) -> Option<SampledValue> {
     let [width, height] = depth.size_px.map(|side| side as usize);
     let [x, y] = pixel.map(|coordinate| coordinate - 0.5);
@@ -178,14 +210,23 @@ pub(super) fn depth_at(depth: &DepthMap, pixel: [f64; 2]) -> Option<SampledValue
     let (fx, fy) = (x - left as f64, y - top as f64);
     let corner = |dx: usize, dy: usize| f64::from(depth.depth_m[(top + dy) * width + left + dx]);
     let corners = [corner(0, 0), corner(1, 0), corner(0, 1), corner(1, 1)];
-    let (min, max) = corners.iter().fold((f64::MAX, 0.0f64), |(min, max), z| (min.min(*z), max.max(*z)));
+    let (min, max) = corners.iter().fold((f64::MAX, 0.0f64), |(min, max), z| {
+        (min.min(*z), max.max(*z))
+    });
     if !(min > 0.0 && max - min <= SMOOTH_FRAC * min) {
         return None;
     }
     let [a, b, c, d] = corners.map(|z| 1.0 / z);
-    let z = 1.0 / (a * (1.0 - fx) * (1.0 - fy) + b * fx * (1.0 - fy) + c * (1.0 - fx) * fy + d * fx * fy);
-    let gradient = [(b - a) * (1.0 - fy) + (d - c) * fy, (c - a) * (1.0 - fx) + (d - b) * fx];
-    Some(SampledValue { value: z, gradient: gradient.map(|gradient| -gradient * z * z) })
+    let z = 1.0
+        / (a * (1.0 - fx) * (1.0 - fy) + b * fx * (1.0 - fy) + c * (1.0 - fx) * fy + d * fx * fy);
+    let gradient = [
+        (b - a) * (1.0 - fy) + (d - c) * fy,
+        (c - a) * (1.0 - fx) + (d - b) * fx,
+    ];
+    Some(SampledValue {
+        value: z,
+        gradient: gradient.map(|gradient| -gradient * z * z),
+    })
 }
 
 /// Size and mean brightness (0 to 255) of squares of `edge` pixels; NaN in masked areas.
@@ -196,19 +237,30 @@ pub(super) fn brightness(keyframe: &Keyframe, edge: usize) -> ([usize; 2], Vec<f
         let (x, y) = (ix % size[0], ix / size[0]);
         let (mut sum, mut is_valid) = (0u32, true);
         for row in y * edge..(y + 1) * edge {
-            for pixel in keyframe.rgba_srgb[4 * (row * width + x * edge)..].chunks_exact(4).take(edge) {
+            for pixel in keyframe.rgba_srgb[4 * (row * width + x * edge)..]
+                .chunks_exact(4)
+                .take(edge)
+            {
                 is_valid &= pixel[3] > 0;
                 // The weights sum to 256.
-                sum += 77 * u32::from(pixel[0]) + 150 * u32::from(pixel[1]) + 29 * u32::from(pixel[2]);
+                sum +=
+                    77 * u32::from(pixel[0]) + 150 * u32::from(pixel[1]) + 29 * u32::from(pixel[2]);
             }
         }
-        if is_valid { sum as f32 / (256 * edge * edge) as f32 } else { f32::NAN }
+        if is_valid {
+            sum as f32 / (256 * edge * edge) as f32
+        } else {
+            f32::NAN
+        }
     };
     (size, (0..size[0] * size[1]).map(mean).collect())
 }
 
 fn levels(keyframe: &Keyframe) -> Vec<GrayImage> {
-    let level_shift = keyframe.size_px[0].div_ceil(MAX_COLUMNS).next_power_of_two().ilog2();
+    let level_shift = keyframe.size_px[0]
+        .div_ceil(MAX_COLUMNS)
+        .next_power_of_two()
+        .ilog2();
     let edge = 1usize << level_shift;
     let (mut size, mut values) = brightness(keyframe, edge);
     let mut levels = vec![GrayImage::new(size, edge as f64, &values)];
@@ -227,16 +279,22 @@ fn levels(keyframe: &Keyframe) -> Vec<GrayImage> {
     levels
 }
 
-/// Blurs with a binomial filter, five pixels wide. Interpolated values have less noise than values at pixel centers;
-/// without the blur, this would bias estimates towards half-pixel offsets.
+/// Blurs with a binomial filter, five pixels wide. Interpolated values have less noise than values
+/// at pixel centers; without the blur, this would bias estimates towards half-pixel offsets.
 fn blurred([width, height]: [usize; 2], values_in: &[f32]) -> Vec<f32> {
     const WEIGHTS: [f32; 5] = [1.0 / 16.0, 4.0 / 16.0, 6.0 / 16.0, 4.0 / 16.0, 1.0 / 16.0];
-    let blur_along = |values: &[f32], n: usize, stride: usize, coordinate: &dyn Fn(usize) -> usize| -> Vec<f32> {
+    let blur_along = |values: &[f32],
+                      n: usize,
+                      stride: usize,
+                      coordinate: &dyn Fn(usize) -> usize|
+     -> Vec<f32> {
         let at = |ix: usize, offset: usize| {
             let neighbor_ix = (coordinate(ix) + offset).clamp(2, n + 1) - 2;
             values[ix - coordinate(ix) * stride + neighbor_ix * stride]
         };
-        (0..values.len()).map(|ix| (0..5).map(|offset| WEIGHTS[offset] * at(ix, offset)).sum()).collect()
+        (0..values.len())
+            .map(|ix| (0..5).map(|offset| WEIGHTS[offset] * at(ix, offset)).sum())
+            .collect()
     };
     let rows = blur_along(values_in, width, 1, &|ix| ix % width);
     blur_along(&rows, height, width, &|ix| ix / width)
@@ -253,9 +311,17 @@ impl GrayImage {
                 return invalid;
             }
             let scale = 0.5 / pixels as f32;
-            [values[ix], scale * (values[ix + 1] - values[ix - 1]), scale * (values[ix + width] - values[ix - width])]
+            [
+                values[ix],
+                scale * (values[ix + 1] - values[ix - 1]),
+                scale * (values[ix + width] - values[ix - width]),
+            ]
         };
-        Self { size, pixels, texels: (0..width * height).map(texel).collect() }
+        Self {
+            size,
+            pixels,
+            texels: (0..width * height).map(texel).collect(),
+        }
     }
 
     /// Pixels of the keyframe along each side of a texel.
@@ -266,7 +332,8 @@ impl GrayImage {
     /// Brightness at a pixel position of the keyframe.
     pub(super) fn at(&self, pixel: [f64; 2]) -> Option<SampledValue> {
         let [x, y] = pixel.map(|coordinate| coordinate / self.pixels - 0.5);
-        if !(x >= 1.0 && y >= 1.0 && x < (self.size[0] - 2) as f64 && y < (self.size[1] - 2) as f64) {
+        if !(x >= 1.0 && y >= 1.0 && x < (self.size[0] - 2) as f64 && y < (self.size[1] - 2) as f64)
+        {
             return None;
         }
         let (left, top) = (x as usize, y as usize);
@@ -277,7 +344,12 @@ impl GrayImage {
             let [a, b, c, d] = [a, b, c, d].map(|texel| f64::from(texel[part]));
             (a * (1.0 - fx) + b * fx) * (1.0 - fy) + (c * (1.0 - fx) + d * fx) * fy
         };
-        let interpolated = SampledValue { value: bilinear(0), gradient: [bilinear(1), bilinear(2)] };
-        (interpolated.value + interpolated.gradient[0] + interpolated.gradient[1]).is_finite().then_some(interpolated)
+        let interpolated = SampledValue {
+            value: bilinear(0),
+            gradient: [bilinear(1), bilinear(2)],
+        };
+        (interpolated.value + interpolated.gradient[0] + interpolated.gradient[1])
+            .is_finite()
+            .then_some(interpolated)
     }
 }

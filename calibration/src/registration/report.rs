@@ -7,7 +7,10 @@ use super::layout::CalibrationParam;
 use super::movement::CameraMovement;
 use super::solve::Solution;
 use super::{AlignmentScene, CalibrationModel};
-use crate::{CalibratedCamera, CameraCorrection, Candidate, MIN_VALIDATION_IMAGES, ParamSet, Trial, rigid_transform};
+use crate::{
+    CalibratedCamera, CameraCorrection, Candidate, MIN_VALIDATION_IMAGES, ParamSet, Trial,
+    rigid_transform,
+};
 use keyframe::Keyframe;
 use kinematics::{Stamp, Transform};
 use nalgebra::{DVector, Vector3};
@@ -22,15 +25,15 @@ pub struct Alignment {
     pub corrections: BTreeMap<String, CameraCorrection>,
     /// Accepted corrections with their uncertainties.
     pub estimates: Vec<Estimate>,
-    /// Directions of the accepted parameters that the motion does not make observable; corrections along them are
-    /// zero.
+    /// Directions of the accepted parameters that the motion does not make observable; corrections
+    /// along them are zero.
     pub unobservable: Vec<Unobservable>,
     /// Tested parameter sets, and how much better they predict the validation images.
     pub trials: Vec<Trial>,
     /// Number of compared pairs of images.
     pub n_pairs: usize,
-    /// Movements of cameras relative to their mounts, in order of detection. Their corrections are applied before
-    /// `corrections`.
+    /// Movements of cameras relative to their mounts, in order of detection. Their corrections are
+    /// applied before `corrections`.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub movements: Vec<CameraMovement>,
     /// Uncertainty of the extrinsics, if they were estimated. It is not saved.
@@ -44,7 +47,8 @@ pub struct Alignment {
 pub enum Estimate {
     /// Correction of the camera pose relative to its parent, in the uncorrected axes of the camera.
     HandEye(PoseEstimate),
-    /// Correction of the pose of the depth frame in the color frame, in the axes of the color frame.
+    /// Correction of the pose of the depth frame in the color frame, in the axes of the color
+    /// frame.
     DepthPose(PoseEstimate),
     /// Time from the stamps of the images to their exposure, seconds.
     TimeOffset(ScalarEstimate),
@@ -119,8 +123,8 @@ pub struct ScalarEstimate {
     pub sigma: f64,
 }
 
-/// A direction in parameter space that the motion does not make observable: changing all its parts together changes no
-/// residual.
+/// A direction in parameter space that the motion does not make observable: changing all its parts
+/// together changes no residual.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Unobservable {
     /// Descriptions of the parts.
@@ -146,7 +150,9 @@ pub(super) fn alignment(
         estimates.extend(scene.cameras.iter().enumerate().map(|(camera, name)| {
             let drift = &kept.corrections.by_camera[camera].drift;
             let rms = |parts: std::ops::Range<usize>| {
-                let squares = drift.values().map(|drift| drift[parts.clone()].iter().map(|x| x * x).sum::<f64>());
+                let squares = drift
+                    .values()
+                    .map(|drift| drift[parts.clone()].iter().map(|x| x * x).sum::<f64>());
                 (squares.sum::<f64>() / drift.len().max(1) as f64).sqrt()
             };
             Estimate::ImagePoses {
@@ -162,9 +168,15 @@ pub(super) fn alignment(
         .iter()
         .zip(&kept.corrections.by_camera)
         .map(|(name, correction)| (name.to_string(), correction.clone()));
-    let corrections = if kept.set.is_empty() { BTreeMap::new() } else { corrections.collect() };
-    let extrinsics_covariance =
-        kept.fit.as_ref().and_then(|fit| ExtrinsicsCovariance::of(scene, &fit.layout.params, &fit.solution));
+    let corrections = if kept.set.is_empty() {
+        BTreeMap::new()
+    } else {
+        corrections.collect()
+    };
+    let extrinsics_covariance = kept
+        .fit
+        .as_ref()
+        .and_then(|fit| ExtrinsicsCovariance::of(scene, &fit.layout.params, &fit.solution));
     Alignment {
         corrections,
         estimates,
@@ -176,8 +188,8 @@ pub(super) fn alignment(
     }
 }
 
-/// The estimate of the group of parameters that starts with a parameter; `None` if the parameter is not the first of
-/// its group.
+/// The estimate of the group of parameters that starts with a parameter; `None` if the parameter is
+/// not the first of its group.
 fn estimate(
     scene: &AlignmentScene,
     kept: &CalibrationModel,
@@ -187,12 +199,18 @@ fn estimate(
 ) -> Option<Estimate> {
     let correction = |camera: usize| &kept.corrections.by_camera[camera];
     let name = |camera: usize| scene.cameras[camera].to_string();
-    let number = |camera: usize, value: f64| ScalarEstimate { camera: name(camera), value, sigma: solution.sigma(ix) };
+    let number = |camera: usize, value: f64| ScalarEstimate {
+        camera: name(camera),
+        value,
+        sigma: solution.sigma(ix),
+    };
     Some(match param {
         CalibrationParam::Extrinsics(camera, 0) => {
-            let wrong_extrinsics =
-                rigid_transform(correction(camera).rotation_rad.into(), correction(camera).translation_m.into())
-                    .inverse();
+            let wrong_extrinsics = rigid_transform(
+                correction(camera).rotation_rad.into(),
+                correction(camera).translation_m.into(),
+            )
+            .inverse();
             Estimate::HandEye(pose_estimate(
                 name(camera),
                 wrong_extrinsics.rotation.scaled_axis(),
@@ -202,9 +220,17 @@ fn estimate(
             ))
         }
         CalibrationParam::DepthPose(camera, 0) => {
-            let (rotation, translation) =
-                (correction(camera).depth_rotation_rad.into(), correction(camera).depth_translation_m.into());
-            Estimate::DepthPose(pose_estimate(name(camera), rotation, translation, solution, ix))
+            let (rotation, translation) = (
+                correction(camera).depth_rotation_rad.into(),
+                correction(camera).depth_translation_m.into(),
+            );
+            Estimate::DepthPose(pose_estimate(
+                name(camera),
+                rotation,
+                translation,
+                solution,
+                ix,
+            ))
         }
         CalibrationParam::TimeOffset(camera) => {
             Estimate::TimeOffset(number(camera, correction(camera).time_offset_secs))
@@ -212,7 +238,9 @@ fn estimate(
         CalibrationParam::DepthScale(camera) => {
             Estimate::DepthScale(number(camera, correction(camera).log_depth_scale.exp_m1()))
         }
-        CalibrationParam::Readout(camera) => Estimate::Readout(number(camera, correction(camera).readout_secs)),
+        CalibrationParam::Readout(camera) => {
+            Estimate::Readout(number(camera, correction(camera).readout_secs))
+        }
         CalibrationParam::Joint(joint_ix) => Estimate::Joint {
             joint_ix,
             value: kept.corrections.value(param),
@@ -226,7 +254,9 @@ fn estimate(
             principal_offset_focals: correction(camera).principal_offset_focals,
             principal_offset_sigma: [solution.sigma(ix + 2), solution.sigma(ix + 3)],
         },
-        CalibrationParam::Extrinsics(..) | CalibrationParam::DepthPose(..) | CalibrationParam::Lens(..) => return None,
+        CalibrationParam::Extrinsics(..)
+        | CalibrationParam::DepthPose(..)
+        | CalibrationParam::Lens(..) => return None,
     })
 }
 
@@ -241,7 +271,11 @@ fn pose_estimate(
         let axis = vector.try_normalize(0.0).unwrap_or_else(Vector3::zeros);
         let mut weights = DVector::zeros(solution.step.len());
         weights.rows_mut(begin, 3).copy_from(&axis);
-        (vector.norm(), solution.variance(&weights).sqrt(), axis.into())
+        (
+            vector.norm(),
+            solution.variance(&weights).sqrt(),
+            axis.into(),
+        )
     };
     let (rotation_rad, rotation_sigma_rad, rotation_axis) = part(rotation, begin + 3);
     let (translation_m, translation_sigma_m, translation_axis) = part(translation, begin);
@@ -259,18 +293,38 @@ fn pose_estimate(
 /// Unobservable directions of a fit.
 pub(super) fn unobservable(scene: &AlignmentScene, fit: &Fit) -> Vec<Unobservable> {
     let is_not_translation = |ix: usize| {
-        !matches!(fit.layout.params[ix], CalibrationParam::Extrinsics(_, 0..3) | CalibrationParam::DepthPose(_, 0..3))
+        !matches!(
+            fit.layout.params[ix],
+            CalibrationParam::Extrinsics(_, 0..3) | CalibrationParam::DepthPose(_, 0..3)
+        )
     };
     let directions = fit.solution.unobservable(is_not_translation);
-    directions.iter().map(|direction| describe(scene, &fit.layout.params, direction)).collect()
+    directions
+        .iter()
+        .map(|direction| describe(scene, &fit.layout.params, direction))
+        .collect()
 }
 
-fn describe(scene: &AlignmentScene, params: &[CalibrationParam], direction: &DVector<f64>) -> Unobservable {
+fn describe(
+    scene: &AlignmentScene,
+    params: &[CalibrationParam],
+    direction: &DVector<f64>,
+) -> Unobservable {
     /// Parts smaller than this fraction of the largest are omitted.
     const MIN_SHARE: f64 = 0.1;
-    let scaled: Vec<f64> = params.iter().enumerate().map(|(ix, param)| direction[ix] / param.scale()).collect();
-    let largest = scaled.iter().fold(0.0f64, |largest, value| largest.max(value.abs()));
-    let is_significant = |ix: usize, n: usize| scaled[ix..ix + n].iter().any(|value| value.abs() > MIN_SHARE * largest);
+    let scaled: Vec<f64> = params
+        .iter()
+        .enumerate()
+        .map(|(ix, param)| direction[ix] / param.scale())
+        .collect();
+    let largest = scaled
+        .iter()
+        .fold(0.0f64, |largest, value| largest.max(value.abs()));
+    let is_significant = |ix: usize, n: usize| {
+        scaled[ix..ix + n]
+            .iter()
+            .any(|value| value.abs() > MIN_SHARE * largest)
+    };
     let axis = |ix: usize| {
         let along = Vector3::from_fn(|row, _| direction[ix + row]).normalize();
         format!("({:.2} {:.2} {:.2})", along.x, along.y, along.z)
@@ -279,19 +333,29 @@ fn describe(scene: &AlignmentScene, params: &[CalibrationParam], direction: &DVe
     for (ix, param) in params.iter().enumerate() {
         let name = |camera: usize| &scene.cameras[camera];
         parts.extend(match *param {
-            CalibrationParam::Extrinsics(camera, 0) if is_significant(ix, 3) => {
-                Some(format!("translation of camera {:?} along its own {} axis", name(camera), axis(ix)))
+            CalibrationParam::Extrinsics(camera, 0) if is_significant(ix, 3) => Some(format!(
+                "translation of camera {:?} along its own {} axis",
+                name(camera),
+                axis(ix)
+            )),
+            CalibrationParam::Extrinsics(camera, 3) if is_significant(ix, 3) => Some(format!(
+                "rotation of camera {:?} about its own {} axis",
+                name(camera),
+                axis(ix)
+            )),
+            CalibrationParam::DepthPose(camera, 0) if is_significant(ix, 3) => Some(format!(
+                "translation of the depth frame of camera {:?} along {}",
+                name(camera),
+                axis(ix)
+            )),
+            CalibrationParam::DepthPose(camera, 3) if is_significant(ix, 3) => Some(format!(
+                "rotation of the depth frame of camera {:?} about {}",
+                name(camera),
+                axis(ix)
+            )),
+            CalibrationParam::Joint(joint) if is_significant(ix, 1) => {
+                Some(format!("offset of joint {joint}"))
             }
-            CalibrationParam::Extrinsics(camera, 3) if is_significant(ix, 3) => {
-                Some(format!("rotation of camera {:?} about its own {} axis", name(camera), axis(ix)))
-            }
-            CalibrationParam::DepthPose(camera, 0) if is_significant(ix, 3) => {
-                Some(format!("translation of the depth frame of camera {:?} along {}", name(camera), axis(ix)))
-            }
-            CalibrationParam::DepthPose(camera, 3) if is_significant(ix, 3) => {
-                Some(format!("rotation of the depth frame of camera {:?} about {}", name(camera), axis(ix)))
-            }
-            CalibrationParam::Joint(joint) if is_significant(ix, 1) => Some(format!("offset of joint {joint}")),
             CalibrationParam::TimeOffset(camera) if is_significant(ix, 1) => {
                 Some(format!("time offset of camera {:?}", name(camera)))
             }
@@ -313,12 +377,17 @@ fn describe(scene: &AlignmentScene, params: &[CalibrationParam], direction: &DVe
             _ => None,
         });
     }
-    let moved = (0..params.len()).filter(|ix| is_significant(*ix, 1)).map(|ix| match params[ix] {
-        CalibrationParam::Extrinsics(camera, _) => Some(scene.cameras[camera].to_string()),
-        _ => None,
-    });
+    let moved = (0..params.len())
+        .filter(|ix| is_significant(*ix, 1))
+        .map(|ix| match params[ix] {
+            CalibrationParam::Extrinsics(camera, _) => Some(scene.cameras[camera].to_string()),
+            _ => None,
+        });
     let moves_cameras: Option<BTreeSet<String>> = moved.collect();
-    Unobservable { parts, moves_cameras: moves_cameras.unwrap_or_default().into_iter().collect() }
+    Unobservable {
+        parts,
+        moves_cameras: moves_cameras.unwrap_or_default().into_iter().collect(),
+    }
 }
 
 impl Alignment {
@@ -329,19 +398,34 @@ impl Alignment {
 
     /// Whether another alignment places the camera of a keyframe noticeably differently.
     pub(crate) fn differs(&self, other: &Self, keyframe: &Keyframe) -> bool {
-        self.camera(keyframe, None).differs_noticeably(&other.camera(keyframe, None))
+        self.camera(keyframe, None)
+            .differs_noticeably(&other.camera(keyframe, None))
     }
 
-    /// The camera of a keyframe with these corrections, followed by a correction that was optimized with the scene.
-    pub fn camera(&self, keyframe: &Keyframe, learned: Option<&CameraCorrection>) -> CalibratedCamera {
+    /// The camera of a keyframe with these corrections, followed by a correction that was optimized
+    /// with the scene.
+    pub fn camera(
+        &self,
+        keyframe: &Keyframe,
+        learned: Option<&CameraCorrection>,
+    ) -> CalibratedCamera {
         let correction = self.corrections.get(&*keyframe.camera);
         let color_from_depth = keyframe.depth.as_ref().map(|depth| match correction {
             Some(correction) => correction.color_from_depth(keyframe, depth),
             None => keyframe.world_from_camera.inverse() * depth.world_from_camera,
         });
-        let aligned = self.corrected(&Arc::new(Keyframe { depth: None, ..keyframe.clone() }));
-        let camera = learned.map_or_else(|| CalibratedCamera::of(&aligned), |correction| correction.apply(&aligned));
-        CalibratedCamera { color_from_depth, ..camera }
+        let aligned = self.corrected(&Arc::new(Keyframe {
+            depth: None,
+            ..keyframe.clone()
+        }));
+        let camera = learned.map_or_else(
+            || CalibratedCamera::of(&aligned),
+            |correction| correction.apply(&aligned),
+        );
+        CalibratedCamera {
+            color_from_depth,
+            ..camera
+        }
     }
 
     /// The keyframe with these corrections.
@@ -363,42 +447,66 @@ impl Alignment {
 
     /// Combined correction of a camera's movements up to a stamp; `None` if there are none.
     pub fn movement_correction(&self, camera: &str, stamp: Stamp) -> Option<CameraCorrection> {
-        let movements =
-            self.movements.iter().filter(|movement| movement.camera == camera && movement.since_nanos <= stamp.0);
-        let total = movements.map(CameraMovement::correction).reduce(|before, after| after * before)?;
+        let movements = self
+            .movements
+            .iter()
+            .filter(|movement| movement.camera == camera && movement.since_nanos <= stamp.0);
+        let total = movements
+            .map(CameraMovement::correction)
+            .reduce(|before, after| after * before)?;
         let (rotation_rad, translation_m) = rotation_and_translation(&total);
-        Some(CameraCorrection { rotation_rad, translation_m, ..CameraCorrection::default() })
+        Some(CameraCorrection {
+            rotation_rad,
+            translation_m,
+            ..CameraCorrection::default()
+        })
     }
 
-    /// Adds a movement that was estimated from keyframes with these corrections. `first` is the stamp of the first
-    /// keyframe.
+    /// Adds a movement that was estimated from keyframes with these corrections. `first` is the
+    /// stamp of the first keyframe.
     pub fn add_movement(&mut self, movement: CameraMovement, first: Stamp) {
-        let extrinsics = self.corrections.get(&movement.camera).map_or(Transform::identity(), |correction| {
-            rigid_transform(correction.rotation_rad.into(), correction.translation_m.into())
-        });
+        let extrinsics =
+            self.corrections
+                .get(&movement.camera)
+                .map_or(Transform::identity(), |correction| {
+                    rigid_transform(
+                        correction.rotation_rad.into(),
+                        correction.translation_m.into(),
+                    )
+                });
         let before_extrinsics = extrinsics.inverse() * movement.correction() * extrinsics;
         let (rotation_rad, translation_m) = rotation_and_translation(&before_extrinsics);
         let since_secs = (movement.since_nanos - first.0) as f64 * 1e-9;
-        self.movements.push(CameraMovement { rotation_rad, translation_m, since_secs, ..movement });
+        self.movements.push(CameraMovement {
+            rotation_rad,
+            translation_m,
+            since_secs,
+            ..movement
+        });
     }
 
     /// Whether there were enough validation images for decisions.
     pub fn has_enough_validation_images(&self) -> bool {
-        self.trials.iter().all(|trial| trial.n_images >= MIN_VALIDATION_IMAGES)
+        self.trials
+            .iter()
+            .all(|trial| trial.n_images >= MIN_VALIDATION_IMAGES)
     }
 
     /// Whether individual image poses were accepted.
     pub fn has_image_poses(&self) -> bool {
-        let is_image_poses =
-            |params: &Candidate| matches!(params, Candidate::Cameras(params) if params.contains(ParamSet::IMAGE_POSES));
-        self.trials.iter().any(|trial| trial.kept && is_image_poses(&trial.candidate))
+        let is_image_poses = |params: &Candidate| matches!(params, Candidate::Cameras(params) if params.contains(ParamSet::IMAGE_POSES));
+        self.trials
+            .iter()
+            .any(|trial| trial.kept && is_image_poses(&trial.candidate))
     }
 
     /// Text lines with the estimates, unobservable directions and trials.
     pub fn lines(&self) -> Vec<String> {
         let mut lines: Vec<String> = self.estimates.iter().map(ToString::to_string).collect();
         lines.extend(
-            self.unobservable.iter().map(|unobservable| format!("not observable with this motion: {unobservable}")),
+            self.unobservable
+                .iter()
+                .map(|unobservable| format!("not observable with this motion: {unobservable}")),
         );
         for trial in &self.trials {
             lines.push(format!(
@@ -442,27 +550,73 @@ impl std::fmt::Display for PoseEstimate {
 impl std::fmt::Display for Estimate {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self {
-            Self::HandEye(pose_estimate) => write!(f, "hand-eye of {}: {pose_estimate}", pose_estimate.camera),
-            Self::DepthPose(pose_estimate) => write!(f, "depth frame of {}: {pose_estimate}", pose_estimate.camera),
-            Self::TimeOffset(ScalarEstimate { camera, value, sigma }) => {
-                write!(f, "time offset of {camera}: {:.2} +- {:.2} ms", 1e3 * value, 1e3 * sigma)
+            Self::HandEye(pose_estimate) => {
+                write!(f, "hand-eye of {}: {pose_estimate}", pose_estimate.camera)
             }
-            Self::DepthScale(ScalarEstimate { camera, value, sigma }) => {
-                write!(f, "depth scale of {camera}: {:.4} +- {sigma:.4}", 1.0 + value)
+            Self::DepthPose(pose_estimate) => write!(
+                f,
+                "depth frame of {}: {pose_estimate}",
+                pose_estimate.camera
+            ),
+            Self::TimeOffset(ScalarEstimate {
+                camera,
+                value,
+                sigma,
+            }) => {
+                write!(
+                    f,
+                    "time offset of {camera}: {:.2} +- {:.2} ms",
+                    1e3 * value,
+                    1e3 * sigma
+                )
             }
-            Self::Readout(ScalarEstimate { camera, value, sigma }) => {
-                write!(f, "readout time of {camera}: {:+.2} +- {:.2} ms", 1e3 * value, 1e3 * sigma)
+            Self::DepthScale(ScalarEstimate {
+                camera,
+                value,
+                sigma,
+            }) => {
+                write!(
+                    f,
+                    "depth scale of {camera}: {:.4} +- {sigma:.4}",
+                    1.0 + value
+                )
             }
-            Self::Joint { joint_ix, value, sigma, unobservable_frac } => {
+            Self::Readout(ScalarEstimate {
+                camera,
+                value,
+                sigma,
+            }) => {
+                write!(
+                    f,
+                    "readout time of {camera}: {:+.2} +- {:.2} ms",
+                    1e3 * value,
+                    1e3 * sigma
+                )
+            }
+            Self::Joint {
+                joint_ix,
+                value,
+                sigma,
+                unobservable_frac,
+            } => {
                 let (value, sigma) = (value.to_degrees(), sigma.to_degrees());
-                write!(f, "offset of joint {joint_ix}: {value:+.3} +- {sigma:.3} degrees")?;
+                write!(
+                    f,
+                    "offset of joint {joint_ix}: {value:+.3} +- {sigma:.3} degrees"
+                )?;
                 if *unobservable_frac > 0.1 {
                     f.write_str(", partly indistinguishable from other parameters")
                 } else {
                     Ok(())
                 }
             }
-            Self::Lens { camera, focal_frac, focal_sigma, principal_offset_focals, principal_offset_sigma } => {
+            Self::Lens {
+                camera,
+                focal_frac,
+                focal_sigma,
+                principal_offset_focals,
+                principal_offset_sigma,
+            } => {
                 let percent = |value: f64| 100.0 * value;
                 write!(
                     f,
@@ -477,7 +631,12 @@ impl std::fmt::Display for Estimate {
                     percent(principal_offset_sigma[1]),
                 )
             }
-            Self::ImagePoses { camera, n_images, rms_m, rms_rad } => write!(
+            Self::ImagePoses {
+                camera,
+                n_images,
+                rms_m,
+                rms_rad,
+            } => write!(
                 f,
                 "poses of {n_images} images of {camera}: corrected by {:.2} mm and {:.3} degrees (root mean square)",
                 1e3 * rms_m,

@@ -1,9 +1,9 @@
 //! Photometric and depth residuals of a sample of one image in another image, and their Jacobians.
 //!
-//! A depth reading becomes a point in the world. Its brightness in image `i` is compared with that in image `j`, and
-//! its distance along the z axis of `j`'s depth camera with the reading there. Source: Kerbl, Sturm and Cremers 2013
-//! (the two residuals), Schoeps et al. 2019 (both cameras move). The separate pose of the depth camera and the
-//! rolling shutter are our additions.
+//! A depth reading becomes a point in the world. Its brightness in image `i` is compared with that
+//! in image `j`, and its distance along the z axis of `j`'s depth camera with the reading there.
+//! Source: Kerbl, Sturm and Cremers 2013 (the two residuals), Schoeps et al. 2019 (both cameras
+//! move). The separate pose of the depth camera and the rolling shutter are our additions.
 
 use super::prepared_image::{DepthSample, GrayImage, PreparedImage, depth_at, point};
 use super::view::CorrectedView;
@@ -38,7 +38,8 @@ struct ObservedPoint {
 pub(super) struct Correspondence {
     i: ObservedPoint,
     j: ObservedPoint,
-    /// Position of the sample in the depth camera of `i`. The next field is its position in the depth camera of `j`.
+    /// Position of the sample in the depth camera of `i`. The next field is its position in the
+    /// depth camera of `j`.
     point_in_depth_i: Vector3<f64>,
     in_depth: Vector3<f64>,
     depth_pixel: [f64; 2],
@@ -47,7 +48,8 @@ pub(super) struct Correspondence {
     depth_weight: f64,
 }
 
-/// Gain and offset that map the brightness of image `i` to that of image `j`, because their exposures differ.
+/// Gain and offset that map the brightness of image `i` to that of image `j`, because their
+/// exposures differ.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Tone {
     pub(super) gain: f64,
@@ -55,8 +57,8 @@ pub(super) struct Tone {
 }
 
 impl Correspondence {
-    /// Projects a sample; `None` if it is outside `j`, occluded, or at an edge or hole. Readings may differ by
-    /// `occlusion_frac` of the depth.
+    /// Projects a sample; `None` if it is outside `j`, occluded, or at an edge or hole. Readings
+    /// may differ by `occlusion_frac` of the depth.
     pub(super) fn new(
         i: Side<'_>,
         j: Side<'_>,
@@ -64,9 +66,13 @@ impl Correspondence {
         level: usize,
         occlusion_frac: f64,
     ) -> Option<Self> {
-        let point_in_depth_i = point(i.view.depth_focal_px, i.view.depth_principal_px, sample) * i.view.depth_factor;
+        let point_in_depth_i =
+            point(i.view.depth_focal_px, i.view.depth_principal_px, sample) * i.view.depth_factor;
         let in_i = i.view.color_from_depth.apply(&point_in_depth_i);
-        let in_j = j.view.world_from_camera.apply_inverse(&i.view.world_from_camera.apply(&in_i));
+        let in_j = j
+            .view
+            .world_from_camera
+            .apply_inverse(&i.view.world_from_camera.apply(&in_i));
         let in_depth = j.view.color_from_depth.apply_inverse(&in_j);
         if !(in_i.z > 0.0 && in_j.z > 0.0 && in_depth.z > 0.0) {
             return None;
@@ -74,12 +80,15 @@ impl Correspondence {
         let depth_pixel = j.view.depth_pixel(&in_depth);
         let reading = depth_at(j.image.keyframe.depth.as_ref()?, depth_pixel)?;
         let factor = j.view.depth_factor;
-        let (reading_m, reading_gradient) =
-            (factor * reading.value, reading.gradient.map(|gradient| factor * gradient));
+        let (reading_m, reading_gradient) = (
+            factor * reading.value,
+            reading.gradient.map(|gradient| factor * gradient),
+        );
         if (reading_m - in_depth.z).abs() > occlusion_frac * reading_m {
             return None;
         }
-        let tilt = [0, 1].map(|axis| reading_gradient[axis] * j.view.depth_focal_px[axis] / reading_m);
+        let tilt =
+            [0, 1].map(|axis| reading_gradient[axis] * j.view.depth_focal_px[axis] / reading_m);
         let [level_i, level_j] = levels([i, j], [in_i.z, in_j.z], level);
         Some(Self {
             i: ObservedPoint::new(i.view, in_i, i.image.level(level_i))?,
@@ -89,8 +98,10 @@ impl Correspondence {
             depth_pixel,
             reading_m,
             reading_gradient,
-            // Projects the difference along z onto the normal; depth noise grows with the square of the depth.
-            depth_weight: 1.0 / ((1.0 + tilt[0] * tilt[0] + tilt[1] * tilt[1]).sqrt() * reading_m * reading_m),
+            // Projects the difference along z onto the normal; depth noise grows with the square of
+            // the depth.
+            depth_weight: 1.0
+                / ((1.0 + tilt[0] * tilt[0] + tilt[1] * tilt[1]).sqrt() * reading_m * reading_m),
         })
     }
 
@@ -113,15 +124,31 @@ impl Correspondence {
         self.depth_weight * (self.reading_m - self.in_depth.z)
     }
 
-    /// Jacobian of [`Correspondence::photo`] with respect to the parameters, followed by gain and offset.
-    pub(super) fn photo_jacobian(&self, i: &ParamColumns<'_>, j: &ParamColumns<'_>, tone: Tone, row: &mut [f64]) {
+    /// Jacobian of [`Correspondence::photo`] with respect to the parameters, followed by gain and
+    /// offset.
+    pub(super) fn photo_jacobian(
+        &self,
+        i: &ParamColumns<'_>,
+        j: &ParamColumns<'_>,
+        tone: Tone,
+        row: &mut [f64],
+    ) {
         row.fill(0.0);
         let read_j = row_held_gradient(j.view, &self.j, &gradient_by_point(j.view, &self.j, 1.0));
-        let read_i = row_held_gradient(i.view, &self.i, &gradient_by_point(i.view, &self.i, -tone.gain));
-        let (gradient_j, gradient_i) =
-            (mid_exposure_gradient(j.view, &self.j, &read_j), mid_exposure_gradient(i.view, &self.i, &read_i));
-        let gradient_through_poses =
-            i.view.world_from_camera.rotation.tr_mul(&(j.view.world_from_camera.rotation * gradient_j));
+        let read_i = row_held_gradient(
+            i.view,
+            &self.i,
+            &gradient_by_point(i.view, &self.i, -tone.gain),
+        );
+        let (gradient_j, gradient_i) = (
+            mid_exposure_gradient(j.view, &self.j, &read_j),
+            mid_exposure_gradient(i.view, &self.i, &read_i),
+        );
+        let gradient_through_poses = i
+            .view
+            .world_from_camera
+            .rotation
+            .tr_mul(&(j.view.world_from_camera.rotation * gradient_j));
         add_motion(i, &self.i.still, &gradient_through_poses, 1.0, row);
         add_motion(j, &self.j.still, &gradient_j, -1.0, row);
         add_depth(i, self, &(gradient_through_poses + gradient_i), row);
@@ -129,15 +156,22 @@ impl Correspondence {
         add_lens(j, &self.j, 1.0, row);
         for (param_columns, observed, read) in [(i, &self.i, &read_i), (j, &self.j, &read_j)] {
             if let Some(readout) = param_columns.readout {
-                row[readout] += observed.share * read.dot(&param_columns.view.twist.apparent_velocity(&observed.still));
+                row[readout] += observed.share
+                    * read.dot(&param_columns.view.twist.apparent_velocity(&observed.still));
             }
         }
         let n = row.len();
         (row[n - 2], row[n - 1]) = (-self.i.brightness, -1.0);
     }
 
-    /// Jacobian of [`Correspondence::depth`] with respect to the parameters; zero for gain and offset.
-    pub(super) fn depth_jacobian(&self, i: &ParamColumns<'_>, j: &ParamColumns<'_>, row: &mut [f64]) {
+    /// Jacobian of [`Correspondence::depth`] with respect to the parameters; zero for gain and
+    /// offset.
+    pub(super) fn depth_jacobian(
+        &self,
+        i: &ParamColumns<'_>,
+        j: &ParamColumns<'_>,
+        row: &mut [f64],
+    ) {
         row.fill(0.0);
         let weight = self.depth_weight;
         let [fx, fy] = j.view.depth_focal_px;
@@ -146,8 +180,11 @@ impl Correspondence {
         let along_z = -(sx * fx * q.x + sy * fy * q.y) / (q.z * q.z) - 1.0;
         let in_depth = Vector3::new(sx * fx / q.z, sy * fy / q.z, along_z) * weight;
         let gradient_j = j.view.color_from_depth.rotation * in_depth;
-        let gradient_through_poses =
-            i.view.world_from_camera.rotation.tr_mul(&(j.view.world_from_camera.rotation * gradient_j));
+        let gradient_through_poses = i
+            .view
+            .world_from_camera
+            .rotation
+            .tr_mul(&(j.view.world_from_camera.rotation * gradient_j));
         add_motion(i, &self.i.still, &gradient_through_poses, 1.0, row);
         add_motion(j, &self.j.still, &gradient_j, -1.0, row);
         add_depth(i, self, &gradient_through_poses, row);
@@ -160,7 +197,8 @@ impl Correspondence {
         if let (Some(lens), true) = (j.lens, j.view.shares_lens) {
             for axis in 0..2 {
                 let gradient = weight * self.reading_gradient[axis];
-                row[lens + axis] += gradient * (self.depth_pixel[axis] - j.view.depth_principal_px[axis]);
+                row[lens + axis] +=
+                    gradient * (self.depth_pixel[axis] - j.view.depth_principal_px[axis]);
                 let raw_share = j.view.keyframe_focal_px[axis] / j.view.focal_px[axis];
                 row[lens + 2 + axis] += gradient * j.view.depth_focal_px[axis] * raw_share;
             }
@@ -168,12 +206,17 @@ impl Correspondence {
     }
 }
 
-/// Pyramid levels at which both images have about the same resolution on the surface, neither finer than `level`. A
-/// near view has detail that a distant view lacks.
+/// Pyramid levels at which both images have about the same resolution on the surface, neither finer
+/// than `level`. A near view has detail that a distant view lacks.
 fn levels([i, j]: [Side<'_>; 2], [z_i, z_j]: [f64; 2], level: usize) -> [usize; 2] {
-    let texel_m = |side: Side<'_>, z_m: f64| z_m * side.image.level(level).texel_px() / side.view.focal_px[0];
+    let texel_m =
+        |side: Side<'_>, z_m: f64| z_m * side.image.level(level).texel_px() / side.view.focal_px[0];
     let (of_i, of_j) = (texel_m(i, z_i), texel_m(j, z_j));
-    let octaves = |share: f64| (0..3).take_while(|octave| share > HALF_OCTAVE * f64::from(1 << octave)).count();
+    let octaves = |share: f64| {
+        (0..3)
+            .take_while(|octave| share > HALF_OCTAVE * f64::from(1 << octave))
+            .count()
+    };
     [level + octaves(of_j / of_i), level + octaves(of_i / of_j)]
 }
 
@@ -182,7 +225,14 @@ impl ObservedPoint {
         let (read, share) = view.at_readout(&still);
         let pixel = view.pixel(&read);
         let observed = gray.at(pixel)?;
-        Some(Self { still, read, share, pixel, brightness: observed.value, gradient: observed.gradient })
+        Some(Self {
+            still,
+            read,
+            share,
+            pixel,
+            brightness: observed.value,
+            gradient: observed.gradient,
+        })
     }
 }
 
@@ -222,32 +272,59 @@ impl<'a> ParamColumns<'a> {
             _ => (begin + part, Vector3::zeros(), unit(part - 3)),
         };
         let columns = (0..6).map(motion).collect();
-        Self { columns, ..Self::still(view) }
+        Self {
+            columns,
+            ..Self::still(view)
+        }
     }
 
     /// No columns, for a fixed camera.
     pub(super) fn still(view: &'a CorrectedView) -> Self {
-        Self { view, columns: Vec::new(), depth_pose: None, lens: None, depth_scale: None, readout: None }
+        Self {
+            view,
+            columns: Vec::new(),
+            depth_pose: None,
+            lens: None,
+            depth_scale: None,
+            readout: None,
+        }
     }
 }
 
 /// Gradient of `factor` times the brightness with respect to the point at its readout time.
 fn gradient_by_point(view: &CorrectedView, observed: &ObservedPoint, factor: f64) -> Vector3<f64> {
-    let [sx, sy] = [0, 1].map(|axis| factor * observed.gradient[axis] * view.focal_px[axis] / observed.read.z);
-    Vector3::new(sx, sy, -(sx * observed.read.x + sy * observed.read.y) / observed.read.z)
+    let [sx, sy] =
+        [0, 1].map(|axis| factor * observed.gradient[axis] * view.focal_px[axis] / observed.read.z);
+    Vector3::new(
+        sx,
+        sy,
+        -(sx * observed.read.x + sy * observed.read.y) / observed.read.z,
+    )
 }
 
-/// Gradient with respect to a displacement of the point at its readout time. Includes the effect that a displacement
-/// changes the row, and thus the readout time.
-fn row_held_gradient(view: &CorrectedView, observed: &ObservedPoint, gradient: &Vector3<f64>) -> Vector3<f64> {
+/// Gradient with respect to a displacement of the point at its readout time. Includes the effect
+/// that a displacement changes the row, and thus the readout time.
+fn row_held_gradient(
+    view: &CorrectedView,
+    observed: &ObservedPoint,
+    gradient: &Vector3<f64>,
+) -> Vector3<f64> {
     let drift = -view.readout_secs * view.twist.apparent_velocity(&observed.still);
     let z = observed.read.z;
-    let row = Vector3::new(0.0, view.focal_px[1] / z, -view.focal_px[1] * observed.read.y / (z * z));
+    let row = Vector3::new(
+        0.0,
+        view.focal_px[1] / z,
+        -view.focal_px[1] * observed.read.y / (z * z),
+    );
     gradient - row * (gradient.dot(&drift) / (view.height_px + row.dot(&drift)))
 }
 
 /// Gradient with respect to the point at mid-exposure.
-fn mid_exposure_gradient(view: &CorrectedView, observed: &ObservedPoint, row_held: &Vector3<f64>) -> Vector3<f64> {
+fn mid_exposure_gradient(
+    view: &CorrectedView,
+    observed: &ObservedPoint,
+    row_held: &Vector3<f64>,
+) -> Vector3<f64> {
     row_held - row_held.cross(&view.twist.angular_rad_s) * (observed.share * view.readout_secs)
 }
 
@@ -273,9 +350,19 @@ fn add_twist(row: &mut [f64], point: &Vector3<f64>, gradient: &Vector3<f64>, sig
 }
 
 /// Adds the derivatives of parameters that move the sample's point within its own color camera.
-fn add_depth(i: &ParamColumns<'_>, correspondence: &Correspondence, gradient: &Vector3<f64>, row: &mut [f64]) {
+fn add_depth(
+    i: &ParamColumns<'_>,
+    correspondence: &Correspondence,
+    gradient: &Vector3<f64>,
+    row: &mut [f64],
+) {
     if let Some(pose) = i.depth_pose {
-        add_twist(&mut row[pose..pose + 6], &correspondence.i.still, gradient, 1.0);
+        add_twist(
+            &mut row[pose..pose + 6],
+            &correspondence.i.still,
+            gradient,
+            1.0,
+        );
     }
     let in_depth = i.view.color_from_depth.rotation.tr_mul(gradient);
     if let Some(scale) = i.depth_scale {
@@ -284,17 +371,26 @@ fn add_depth(i: &ParamColumns<'_>, correspondence: &Correspondence, gradient: &V
     if let (Some(lens), true) = (i.lens, i.view.shares_lens) {
         for axis in 0..2 {
             row[lens + axis] -= in_depth[axis] * correspondence.point_in_depth_i[axis];
-            row[lens + 2 + axis] -= in_depth[axis] * correspondence.point_in_depth_i.z * i.view.keyframe_focal_px[axis]
-                / i.view.focal_px[axis];
+            row[lens + 2 + axis] -=
+                in_depth[axis] * correspondence.point_in_depth_i.z * i.view.keyframe_focal_px[axis]
+                    / i.view.focal_px[axis];
         }
     }
 }
 
-fn add_lens(param_columns: &ParamColumns<'_>, observed: &ObservedPoint, factor: f64, row: &mut [f64]) {
-    let Some(lens) = param_columns.lens else { return };
+fn add_lens(
+    param_columns: &ParamColumns<'_>,
+    observed: &ObservedPoint,
+    factor: f64,
+    row: &mut [f64],
+) {
+    let Some(lens) = param_columns.lens else {
+        return;
+    };
     for axis in 0..2 {
         let gradient = factor * observed.gradient[axis];
-        row[lens + axis] += gradient * (observed.pixel[axis] - param_columns.view.principal_px[axis]);
+        row[lens + axis] +=
+            gradient * (observed.pixel[axis] - param_columns.view.principal_px[axis]);
         row[lens + 2 + axis] += gradient * param_columns.view.keyframe_focal_px[axis];
     }
 }

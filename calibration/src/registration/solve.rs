@@ -4,11 +4,12 @@ use super::pairs::Pair;
 use super::sums::PairSums;
 use nalgebra::{DMatrix, DVector, SymmetricEigen};
 
-/// Factor by which the information of the residuals is reduced, because residuals of neighboring samples are
-/// correlated. Used only for damping and observability; reported uncertainties are measured, see
-/// [`Solution::variance`].
+/// Factor by which the information of the residuals is reduced, because residuals of neighboring
+/// samples are correlated. Used only for damping and observability; reported uncertainties are
+/// measured, see [`Solution::variance`].
 pub(super) const INFLATION: f64 = 10.0;
-/// A direction is observable if its standard deviation is below this fraction of the parameters' scales.
+/// A direction is observable if its standard deviation is below this fraction of the parameters'
+/// scales.
 const OBSERVABLE_FRAC: f64 = 0.3;
 /// Maximum step, relative to the parameters' scales.
 const MAX_STEP: f64 = 2.0;
@@ -26,30 +27,41 @@ pub(super) struct Solution {
 }
 
 impl Solution {
-    /// Computes a Gauss-Newton step that is damped towards zero. Components along unobservable directions become zero.
+    /// Computes a Gauss-Newton step that is damped towards zero. Components along unobservable
+    /// directions become zero.
     ///
     /// * `scales`: typical magnitude of each parameter.
     /// * `values`: current values of the parameters.
-    pub(super) fn new(scales: DVector<f64>, values: &DVector<f64>, pairs: &[Pair], sums: &[PairSums]) -> Self {
+    pub(super) fn new(
+        scales: DVector<f64>,
+        values: &DVector<f64>,
+        pairs: &[Pair],
+        sums: &[PairSums],
+    ) -> Self {
         let n = scales.len();
         let (mut information, mut gradient) = (DMatrix::zeros(n, n), DVector::zeros(n));
         for pair in sums {
             for (row, param) in pair.params.iter().enumerate() {
                 gradient[*param] += scales[*param] * pair.gradient[row];
                 for (column, other) in pair.params.iter().enumerate() {
-                    information[(*param, *other)] += scales[*param] * scales[*other] * pair.information[(row, column)];
+                    information[(*param, *other)] +=
+                        scales[*param] * scales[*other] * pair.information[(row, column)];
                 }
             }
         }
         let values = values.component_div(&scales);
         let eigen = SymmetricEigen::new(information);
-        let is_observable: Vec<bool> =
-            eigen.eigenvalues.iter().map(|value| *value > INFLATION / (OBSERVABLE_FRAC * OBSERVABLE_FRAC)).collect();
+        let is_observable: Vec<bool> = eigen
+            .eigenvalues
+            .iter()
+            .map(|value| *value > INFLATION / (OBSERVABLE_FRAC * OBSERVABLE_FRAC))
+            .collect();
         let mut step = DVector::zeros(n);
         for (ix, observable) in is_observable.iter().enumerate() {
             let direction = eigen.eigenvectors.column(ix);
             let length = if *observable {
-                (direction.dot(&gradient) - INFLATION * direction.dot(&values)) / (eigen.eigenvalues[ix] + INFLATION)
+                (direction.dot(&gradient) - INFLATION * direction.dot(&values))
+                    / (eigen.eigenvalues[ix] + INFLATION)
             } else {
                 -direction.dot(&values)
             };
@@ -59,20 +71,30 @@ impl Solution {
         if max_component > MAX_STEP {
             step *= MAX_STEP / max_component;
         }
-        let mut solution =
-            Self { step: step.component_mul(&scales), scales, eigen, is_observable, covariance: DMatrix::zeros(n, n) };
+        let mut solution = Self {
+            step: step.component_mul(&scales),
+            scales,
+            eigen,
+            is_observable,
+            covariance: DMatrix::zeros(n, n),
+        };
         solution.covariance = solution.covariance(pairs, sums);
         solution
     }
 
-    /// Covariance from the scatter of the pairs' gradients, in scaled units. Assumes that each pair has an independent
-    /// error, and that pairs which share an image also have a common error. If only one kind of error exists, the
-    /// covariance is too large by a factor of at most two.
+    /// Covariance from the scatter of the pairs' gradients, in scaled units. Assumes that each pair
+    /// has an independent error, and that pairs which share an image also have a common error. If
+    /// only one kind of error exists, the covariance is too large by a factor of at most two.
     ///
-    /// Source: White 1980 (sandwich estimator); Aronow, Samii and Assenova 2015 (pairs that share a member).
+    /// Source: White 1980 (sandwich estimator); Aronow, Samii and Assenova 2015 (pairs that share a
+    /// member).
     fn covariance(&self, pairs: &[Pair], sums: &[PairSums]) -> DMatrix<f64> {
         let n = self.scales.len();
-        let n_images = pairs.iter().map(|pair| pair.from.max(pair.to) + 1).max().unwrap_or(0);
+        let n_images = pairs
+            .iter()
+            .map(|pair| pair.from.max(pair.to) + 1)
+            .max()
+            .unwrap_or(0);
         let mut by_image = vec![DVector::<f64>::zeros(n); n_images];
         for (pair, sums) in pairs.iter().zip(sums) {
             for (row, param) in sums.params.iter().enumerate() {
@@ -90,9 +112,9 @@ impl Solution {
         &inverse * meat * &inverse * (n_active / (n_active - 1.0).max(1.0))
     }
 
-    /// Adds an error of the parameters that the scatter of the pairs does not contain to the covariance. Its size, in units
-    /// of the scales, is known better than its direction: half of its variance is along `error`, and half is spread evenly
-    /// over all observable directions.
+    /// Adds an error of the parameters that the scatter of the pairs does not contain to the
+    /// covariance. Its size, in units of the scales, is known better than its direction: half of
+    /// its variance is along `error`, and half is spread evenly over all observable directions.
     pub(super) fn add_error(&mut self, error: &DVector<f64>) {
         let scaled = error.component_div(&self.scales);
         self.covariance.ger(0.5, &scaled, &scaled, 1.0);
@@ -100,7 +122,8 @@ impl Solution {
         let variance = scaled.norm_squared() / observable().count().max(1) as f64;
         for ix in observable() {
             let direction = self.eigen.eigenvectors.column(ix);
-            self.covariance.ger(0.5 * variance, &direction, &direction, 1.0);
+            self.covariance
+                .ger(0.5 * variance, &direction, &direction, 1.0);
         }
     }
 
@@ -108,9 +131,19 @@ impl Solution {
     fn inverse(&self) -> DMatrix<f64> {
         let n = self.scales.len();
         let mut inverse = DMatrix::zeros(n, n);
-        for (ix, _) in self.is_observable.iter().enumerate().filter(|(_, observable)| **observable) {
+        for (ix, _) in self
+            .is_observable
+            .iter()
+            .enumerate()
+            .filter(|(_, observable)| **observable)
+        {
             let direction = self.eigen.eigenvectors.column(ix);
-            inverse.ger(1.0 / self.eigen.eigenvalues[ix], &direction, &direction, 1.0);
+            inverse.ger(
+                1.0 / self.eigen.eigenvalues[ix],
+                &direction,
+                &direction,
+                1.0,
+            );
         }
         inverse
     }
@@ -130,34 +163,49 @@ impl Solution {
 
     /// Share of a parameter that lies in unobservable directions, 0 to 1.
     pub(super) fn unobservable_frac(&self, param: usize) -> f64 {
-        self.unobservable_columns().map(|ix| self.eigen.eigenvectors[(param, ix)].powi(2)).sum()
+        self.unobservable_columns()
+            .map(|ix| self.eigen.eigenvectors[(param, ix)].powi(2))
+            .sum()
     }
 
     fn unobservable_columns(&self) -> impl Iterator<Item = usize> {
-        self.is_observable.iter().enumerate().filter(|(_, observable)| !**observable).map(|(ix, _)| ix)
+        self.is_observable
+            .iter()
+            .enumerate()
+            .filter(|(_, observable)| !**observable)
+            .map(|(ix, _)| ix)
     }
 
-    /// Unobservable directions in the units of the parameters, ordered by how little they change the parameters
-    /// selected by `to_minimize`.
+    /// Unobservable directions in the units of the parameters, ordered by how little they change
+    /// the parameters selected by `to_minimize`.
     pub(super) fn unobservable(&self, to_minimize: impl Fn(usize) -> bool) -> Vec<DVector<f64>> {
         let columns: Vec<usize> = self.unobservable_columns().collect();
         if columns.is_empty() {
             return Vec::new();
         }
         let n = self.scales.len();
-        let basis = DMatrix::from_fn(n, columns.len(), |row, column| self.eigen.eigenvectors[(row, columns[column])]);
-        let masked_basis =
-            DMatrix::from_fn(n, columns.len(), |row, column| if to_minimize(row) { basis[(row, column)] } else { 0.0 });
+        let basis = DMatrix::from_fn(n, columns.len(), |row, column| {
+            self.eigen.eigenvectors[(row, columns[column])]
+        });
+        let masked_basis = DMatrix::from_fn(n, columns.len(), |row, column| {
+            if to_minimize(row) {
+                basis[(row, column)]
+            } else {
+                0.0
+            }
+        });
         let rotated = SymmetricEigen::new(masked_basis.tr_mul(&masked_basis));
         let mut order: Vec<usize> = (0..columns.len()).collect();
         order.sort_by(|a, b| rotated.eigenvalues[*a].total_cmp(&rotated.eigenvalues[*b]));
-        let direction = |ix: usize| (&basis * rotated.eigenvectors.column(ix)).component_mul(&self.scales);
+        let direction =
+            |ix: usize| (&basis * rotated.eigenvectors.column(ix)).component_mul(&self.scales);
         order.into_iter().map(direction).collect()
     }
 
     /// Largest component of the step in standard deviations, over the observable parameters.
     pub(super) fn step_in_sigmas(&self) -> f64 {
-        let in_sigmas = |(ix, step): (usize, &f64)| step.abs() / self.sigma(ix).max(f64::MIN_POSITIVE);
+        let in_sigmas =
+            |(ix, step): (usize, &f64)| step.abs() / self.sigma(ix).max(f64::MIN_POSITIVE);
         self.step
             .iter()
             .enumerate()

@@ -1,9 +1,10 @@
-//! Correction of a mobile base's pose at a new station, by registering images of the station to earlier images.
+//! Correction of a mobile base's pose at a new station, by registering images of the station to
+//! earlier images.
 //!
-//! The six parameters of the base's pose are estimated like those of cameras: from depth samples of one image in
-//! another, differences of brightness and depth, and Gauss-Newton steps from coarse to fine. Each pair has one image
-//! from the new station and one from earlier ones. Pairs are formed in both directions, because a near view is
-//! contained in a distant one but not vice versa.
+//! The six parameters of the base's pose are estimated like those of cameras: from depth samples of
+//! one image in another, differences of brightness and depth, and Gauss-Newton steps from coarse to
+//! fine. Each pair has one image from the new station and one from earlier ones. Pairs are formed
+//! in both directions, because a near view is contained in a distant one but not vice versa.
 
 use super::corrections::Corrections;
 use super::fit::{INITIAL_NOISE, OCCLUSION_FRAC};
@@ -28,23 +29,25 @@ use std::sync::Arc;
 const PRIOR_TRANSLATION_M: f64 = 0.02;
 const PRIOR_ROTATION_RAD: f64 = 0.0175;
 
-/// Maximum number of steps at each level. Weights that depend on the residuals make convergence slower than plain
-/// Gauss-Newton.
+/// Maximum number of steps at each level. Weights that depend on the residuals make convergence
+/// slower than plain Gauss-Newton.
 const MAX_ITERATIONS: usize = 20;
 /// A step smaller than this number of standard deviations ends a level, the finest first.
 const CONVERGED_STEP_SIGMAS: [f64; 4] = [0.1, 0.3, 0.3, 0.3];
-/// Factor on the brightness noise. Near occlusions and reflections, brightness has the same errors in all pairs of two
-/// stations; depth does not.
+/// Factor on the brightness noise. Near occlusions and reflections, brightness has the same errors
+/// in all pairs of two stations; depth does not.
 const BRIGHTNESS_NOISE_INFLATION: f64 = 4.0;
 
 /// Correction of the reported pose of a base at a station. Each sigma is a standard deviation.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct StationCorrection {
-    /// Translation from the reported to the estimated position of the base, along the axes of the world, meters.
+    /// Translation from the reported to the estimated position of the base, along the axes of the
+    /// world, meters.
     pub translation_m: [f64; 3],
     /// Standard deviations, meters.
     pub translation_sigma_m: [f64; 3],
-    /// Rotation of the base about its own position: rotation vector in the axes of the world, radians.
+    /// Rotation of the base about its own position: rotation vector in the axes of the world,
+    /// radians.
     pub rotation_rad: [f64; 3],
     /// Standard deviations, radians.
     pub rotation_sigma_rad: [f64; 3],
@@ -62,12 +65,14 @@ pub struct StationCorrection {
     pub kept: bool,
 }
 
-/// Estimates the pose of the base from the keyframes of the new station (`new`) and of earlier ones (`reference`);
-/// `None` if they have no depth or too little overlap.
+/// Estimates the pose of the base from the keyframes of the new station (`new`) and of earlier ones
+/// (`reference`); `None` if they have no depth or too little overlap.
 ///
-/// Poses are estimated from training keyframes and evaluated on validation keyframes; test keyframes are not used.
+/// Poses are estimated from training keyframes and evaluated on validation keyframes; test
+/// keyframes are not used.
 ///
-/// * `world_from_base`: the reported base pose from which the poses of the new station's keyframes were computed.
+/// * `world_from_base`: the reported base pose from which the poses of the new station's keyframes
+///   were computed.
 pub fn register_station(
     reference: &[Arc<Keyframe>],
     new: &[Arc<Keyframe>],
@@ -78,7 +83,8 @@ pub fn register_station(
     let trial = scene.evaluate(&estimate, noise);
     let sigma = |begin: usize| [0, 1, 2].map(|axis| solution.sigma(begin + axis));
     let is_significant = |ix: usize| {
-        estimate[ix].abs() > MIN_SIGNIFICANT_SIGMAS * solution.sigma(ix) && solution.unobservable_frac(ix) < 0.5
+        estimate[ix].abs() > MIN_SIGNIFICANT_SIGMAS * solution.sigma(ix)
+            && solution.unobservable_frac(ix) < 0.5
     };
     let part = |begin: usize| [estimate[begin], estimate[begin + 1], estimate[begin + 2]];
     Some(StationCorrection {
@@ -86,7 +92,11 @@ pub fn register_station(
         translation_sigma_m: sigma(0),
         rotation_rad: part(3),
         rotation_sigma_rad: sigma(3),
-        unobservable: solution.unobservable(|ix| ix >= 3).iter().map(describe).collect(),
+        unobservable: solution
+            .unobservable(|ix| ix >= 3)
+            .iter()
+            .map(describe)
+            .collect(),
         gain_db: trial.gain_db,
         standard_error_db: trial.standard_error_db,
         n_validation_images: trial.n_images,
@@ -96,15 +106,18 @@ pub fn register_station(
 }
 
 impl StationCorrection {
-    /// Transform by which poses must be multiplied from the left to correct them. It is the identity unless the
-    /// correction is accepted. `world_from_base` is the reported pose of the base.
+    /// Transform by which poses must be multiplied from the left to correct them. It is the
+    /// identity unless the correction is accepted. `world_from_base` is the reported pose of the
+    /// base.
     ///
-    /// * `share`: fraction of the path to the station, 0 to 1, because the error grows along the path.
+    /// * `share`: fraction of the path to the station, 0 to 1, because the error grows along the
+    ///   path.
     pub fn map_from_odom(&self, world_from_base: &Transform, share: f64) -> Transform {
         if !self.kept {
             return Transform::identity();
         }
-        let [translation, rotation] = [self.translation_m, self.rotation_rad].map(|part| Vector3::from(part) * share);
+        let [translation, rotation] =
+            [self.translation_m, self.rotation_rad].map(|part| Vector3::from(part) * share);
         base_motion(world_from_base, &translation, &rotation)
     }
 }
@@ -127,10 +140,17 @@ impl std::fmt::Display for StationCorrection {
 }
 
 /// World-frame motion of a base that is translated, and rotated about its own position.
-fn base_motion(world_from_base: &Transform, translation_m: &Vector3<f64>, rotation_rad: &Vector3<f64>) -> Transform {
+fn base_motion(
+    world_from_base: &Transform,
+    translation_m: &Vector3<f64>,
+    rotation_rad: &Vector3<f64>,
+) -> Transform {
     let position = world_from_base.translation.vector;
     let rotation = UnitQuaternion::from_scaled_axis(*rotation_rad);
-    Transform::from_parts((position + translation_m - rotation * position).into(), rotation)
+    Transform::from_parts(
+        (position + translation_m - rotation * position).into(),
+        rotation,
+    )
 }
 
 /// Describes an unobservable direction.
@@ -138,7 +158,10 @@ fn describe(direction: &DVector<f64>) -> String {
     const MIN_SHARE: f64 = 0.1;
     let vector = |begin: usize| Vector3::from_fn(|row, _| direction[begin + row]);
     let (translation, rotation) = (vector(0), vector(3));
-    let sizes = [translation.norm() / PRIOR_TRANSLATION_M, rotation.norm() / PRIOR_ROTATION_RAD];
+    let sizes = [
+        translation.norm() / PRIOR_TRANSLATION_M,
+        rotation.norm() / PRIOR_ROTATION_RAD,
+    ];
     let along = |of: Vector3<f64>| {
         let axis = of.normalize();
         format!("({:.2} {:.2} {:.2})", axis.x, axis.y, axis.z)
@@ -167,14 +190,25 @@ struct StationScene {
 }
 
 impl StationScene {
-    fn new(reference: &[Arc<Keyframe>], new: &[Arc<Keyframe>], world_from_base: &Transform) -> Option<Self> {
-        let names: BTreeSet<Arc<str>> = reference.iter().chain(new).map(|keyframe| keyframe.camera.clone()).collect();
+    fn new(
+        reference: &[Arc<Keyframe>],
+        new: &[Arc<Keyframe>],
+        world_from_base: &Transform,
+    ) -> Option<Self> {
+        let names: BTreeSet<Arc<str>> = reference
+            .iter()
+            .chain(new)
+            .map(|keyframe| keyframe.camera.clone())
+            .collect();
         let names: Vec<Arc<str>> = names.into_iter().collect();
         let images = |keyframes: &[Arc<Keyframe>]| -> Vec<PreparedImage> {
-            let used: Vec<&Arc<Keyframe>> =
-                keyframes.iter().filter(|keyframe| keyframe.split != Split::Test && keyframe.depth.is_some()).collect();
+            let used: Vec<&Arc<Keyframe>> = keyframes
+                .iter()
+                .filter(|keyframe| keyframe.split != Split::Test && keyframe.depth.is_some())
+                .collect();
             let n = used.len().min(MAX_IMAGES);
-            let camera_of = |keyframe: &Keyframe| names.partition_point(|name| *name < keyframe.camera);
+            let camera_of =
+                |keyframe: &Keyframe| names.partition_point(|name| *name < keyframe.camera);
             (0..n)
                 .into_par_iter()
                 .filter_map(|ix| {
@@ -189,26 +223,43 @@ impl StationScene {
         let initial_views = Corrections::none(names.len()).views(&all, &Layout::default());
         let of = |in_new_station: bool, split: Split| -> Vec<usize> {
             (0..all.len())
-                .filter(|ix| (*ix >= first_new) == in_new_station && all[*ix].keyframe.split == split)
+                .filter(|ix| {
+                    (*ix >= first_new) == in_new_station && all[*ix].keyframe.split == split
+                })
                 .collect()
         };
         let pairs_across = |splits: [Split; 2]| -> Vec<Pair> {
             let (earlier, later) = (of(false, splits[0]), of(true, splits[1]));
             let pairs = |candidates: &[usize], targets: &[usize]| {
-                pairs::choose(&all, &initial_views, candidates, targets, PARTNERS_PER_IMAGE)
+                pairs::choose(
+                    &all,
+                    &initial_views,
+                    candidates,
+                    targets,
+                    PARTNERS_PER_IMAGE,
+                )
             };
             [pairs(&later, &earlier), pairs(&earlier, &later)].concat()
         };
         let pairs = pairs_across([Split::Train, Split::Train]);
-        let validation_pairs =
-            [pairs_across([Split::Train, Split::Validation]), pairs_across([Split::Validation, Split::Train])].concat();
-        let scene =
-            Self { first_new, initial_views, world_from_base: *world_from_base, pairs, validation_pairs, images: all };
+        let validation_pairs = [
+            pairs_across([Split::Train, Split::Validation]),
+            pairs_across([Split::Validation, Split::Train]),
+        ]
+        .concat();
+        let scene = Self {
+            first_new,
+            initial_views,
+            world_from_base: *world_from_base,
+            pairs,
+            validation_pairs,
+            images: all,
+        };
         (scene.pairs.len() >= MIN_PAIRS).then_some(scene)
     }
 
-    /// Views with the base moved by the estimate. Only views of the new station move; they have columns for a further
-    /// motion of the base.
+    /// Views with the base moved by the estimate. Only views of the new station move; they have
+    /// columns for a further motion of the base.
     fn views(&self, estimate: &DVector<f64>) -> Vec<CorrectedView> {
         let part = |begin: usize| Vector3::from_fn(|row, _| estimate[begin + row]);
         let motion = base_motion(&self.world_from_base, &part(0), &part(3));
@@ -218,7 +269,10 @@ impl StationScene {
             UnitQuaternion::identity(),
         );
         let view = |(ix, view): (usize, &CorrectedView)| match ix >= self.first_new {
-            true => view.moved_with_frame(&(motion * self.images[ix].keyframe.world_from_camera), &world_from_pivot),
+            true => view.moved_with_frame(
+                &(motion * self.images[ix].keyframe.world_from_camera),
+                &world_from_pivot,
+            ),
             false => view.clone(),
         };
         self.initial_views.iter().enumerate().map(view).collect()
@@ -226,11 +280,22 @@ impl StationScene {
 
     /// Estimates translation, then rotation, from coarse to fine.
     fn fit(&self) -> Option<(DVector<f64>, Solution, Noise)> {
-        let scales = DVector::from_fn(6, |ix, _| if ix < 3 { PRIOR_TRANSLATION_M } else { PRIOR_ROTATION_RAD });
+        let scales = DVector::from_fn(6, |ix, _| {
+            if ix < 3 {
+                PRIOR_TRANSLATION_M
+            } else {
+                PRIOR_ROTATION_RAD
+            }
+        });
         let mut estimate = DVector::zeros(6);
         let n_levels = self.images.iter().map(|image| image.levels.len()).max()?;
         let (level, occlusion_frac) = (n_levels - 1, OCCLUSION_FRAC[n_levels - 1]);
-        let mut options = ResidualOptions { level, occlusion_frac, noise: INITIAL_NOISE, part: PixelSubset::All };
+        let mut options = ResidualOptions {
+            level,
+            occlusion_frac,
+            noise: INITIAL_NOISE,
+            part: PixelSubset::All,
+        };
         let sums_of = |estimate: &DVector<f64>, options: &ResidualOptions| {
             let sums = sums::of_pairs(&self.images, &self.views(estimate), &self.pairs, options);
             sums::noise_of(&sums).map(|noise| (sums, noise))
@@ -240,7 +305,10 @@ impl StationScene {
         for level in (0..n_levels).rev() {
             (options.level, options.occlusion_frac) = (level, OCCLUSION_FRAC[level]);
             for _ in 0..MAX_ITERATIONS {
-                options.noise = Noise { photo: BRIGHTNESS_NOISE_INFLATION * noise.photo, ..noise };
+                options.noise = Noise {
+                    photo: BRIGHTNESS_NOISE_INFLATION * noise.photo,
+                    ..noise
+                };
                 let sums;
                 (sums, noise) = sums_of(&estimate, &options)?;
                 let solution = Solution::new(scales.clone(), &estimate, &self.pairs, &sums);
@@ -256,24 +324,47 @@ impl StationScene {
         Some((estimate, last?, noise))
     }
 
-    /// Evaluates how much the estimate improves the prediction of validation images of each station from the other.
+    /// Evaluates how much the estimate improves the prediction of validation images of each station
+    /// from the other.
     fn evaluate(&self, estimate: &DVector<f64>, noise: Noise) -> Trial {
         let views = [&DVector::zeros(6), estimate].map(|estimate| self.views(estimate));
         let validation_image_of = |pair: &Pair| {
-            if self.images[pair.to].keyframe.split == Split::Validation { pair.to } else { pair.from }
+            if self.images[pair.to].keyframe.split == Split::Validation {
+                pair.to
+            } else {
+                pair.from
+            }
         };
-        let (baseline_db, variant_db) =
-            validation::scores(&self.images, &self.validation_pairs, &views, noise, validation_image_of);
+        let (baseline_db, variant_db) = validation::scores(
+            &self.images,
+            &self.validation_pairs,
+            &views,
+            noise,
+            validation_image_of,
+        );
         log::debug!("station: without {baseline_db:.2?}, with {variant_db:.2?} dB");
-        Trial::of(Candidate::Cameras(ParamSet::empty()), &baseline_db, &variant_db).with_enough_images()
+        Trial::of(
+            Candidate::Cameras(ParamSet::empty()),
+            &baseline_db,
+            &variant_db,
+        )
+        .with_enough_images()
     }
 }
 
 /// Composes a motion with a small motion that follows it.
 fn compose_step(estimate: &DVector<f64>, step: &DVector<f64>) -> DVector<f64> {
-    let rotation = |of: &DVector<f64>| UnitQuaternion::from_scaled_axis(Vector3::from_fn(|row, _| of[3 + row]));
+    let rotation = |of: &DVector<f64>| {
+        UnitQuaternion::from_scaled_axis(Vector3::from_fn(|row, _| of[3 + row]))
+    };
     let composed_rotation = (rotation(step) * rotation(estimate)).scaled_axis();
-    DVector::from_fn(6, |ix, _| if ix < 3 { estimate[ix] + step[ix] } else { composed_rotation[ix - 3] })
+    DVector::from_fn(6, |ix, _| {
+        if ix < 3 {
+            estimate[ix] + step[ix]
+        } else {
+            composed_rotation[ix - 3]
+        }
+    })
 }
 
 #[cfg(test)]
@@ -289,17 +380,30 @@ mod tests {
 
     /// The reported pose of the base is the true one moved by this drift.
     fn drift() -> Transform {
-        base_motion(&reported_base(), &Vector3::new(0.014, -0.013, 0.004), &Vector3::new(0.005, -0.004, 0.016))
-            .inverse()
+        base_motion(
+            &reported_base(),
+            &Vector3::new(0.014, -0.013, 0.004),
+            &Vector3::new(0.005, -0.004, 0.016),
+        )
+        .inverse()
     }
 
     /// Images of two stations, those of the second one with a wrong base pose.
-    fn keyframes_of_two_stations(odom_from_true: &Transform, noise: f64) -> [Vec<Arc<Keyframe>>; 2] {
-        let all = capture(&Miscalibration { noise, ..Miscalibration::none() });
+    fn keyframes_of_two_stations(
+        odom_from_true: &Transform,
+        noise: f64,
+    ) -> [Vec<Arc<Keyframe>>; 2] {
+        let all = capture(&Miscalibration {
+            noise,
+            ..Miscalibration::none()
+        });
         let (first, second) = all.split_at(all.len() / 2);
         [
             first.to_vec(),
-            second.iter().map(|keyframe| Arc::new(keyframe.with_base_correction(odom_from_true))).collect(),
+            second
+                .iter()
+                .map(|keyframe| Arc::new(keyframe.with_base_correction(odom_from_true)))
+                .collect(),
         ]
     }
 
@@ -307,7 +411,9 @@ mod tests {
     fn pose_error(remaining: &Transform) -> (f64, f64) {
         let position = reported_base().translation.vector;
         (
-            1e3 * (remaining * nalgebra::Point3::from(position) - position).coords.norm(),
+            1e3 * (remaining * nalgebra::Point3::from(position) - position)
+                .coords
+                .norm(),
             remaining.rotation.angle().to_degrees(),
         )
     }
@@ -316,17 +422,32 @@ mod tests {
     fn wrong_station_pose_is_corrected() {
         let [reference, new] = keyframes_of_two_stations(&drift(), 1.0);
         let estimate = register_station(&reference, &new, &reported_base()).unwrap();
-        assert!(estimate.kept && estimate.unobservable.is_empty() && estimate.gain_db > 3.0, "{estimate:?}");
+        assert!(
+            estimate.kept && estimate.unobservable.is_empty() && estimate.gain_db > 3.0,
+            "{estimate:?}"
+        );
         let (mm, degrees) = pose_error(&(estimate.map_from_odom(&reported_base(), 1.0) * drift()));
         let (mm_before, degrees_before) = pose_error(&drift());
-        assert!(mm_before > 15.0 && degrees_before > 0.9, "{mm_before} mm, {degrees_before} degrees before correction");
-        assert!(mm < 0.3 && degrees < 0.03, "{mm} mm, {degrees} degrees left: {estimate}");
+        assert!(
+            mm_before > 15.0 && degrees_before > 0.9,
+            "{mm_before} mm, {degrees_before} degrees before correction"
+        );
+        assert!(
+            mm < 0.3 && degrees < 0.03,
+            "{mm} mm, {degrees} degrees left: {estimate}"
+        );
         let sigma_mm = 1e3 * Vector3::from(estimate.translation_sigma_m).norm();
-        assert!((0.02..1.0).contains(&sigma_mm), "standard deviation {sigma_mm} mm, error {mm} mm");
+        assert!(
+            (0.02..1.0).contains(&sigma_mm),
+            "standard deviation {sigma_mm} mm, error {mm} mm"
+        );
         // At half of the path, half of the error is corrected.
         let half = estimate.map_from_odom(&reported_base(), 0.5);
         let (mm_half, degrees_half) = pose_error(&half);
-        assert!((mm_half / mm_before - 0.5).abs() < 0.02 && (degrees_half / degrees_before - 0.5).abs() < 0.02);
+        assert!(
+            (mm_half / mm_before - 0.5).abs() < 0.02
+                && (degrees_half / degrees_before - 0.5).abs() < 0.02
+        );
     }
 
     #[test]
@@ -334,18 +455,32 @@ mod tests {
         for noise in [0.3, 1.0, 3.0] {
             let [reference, new] = keyframes_of_two_stations(&Transform::identity(), noise);
             let estimate = register_station(&reference, &new, &reported_base()).unwrap();
-            assert!(!estimate.kept && estimate.n_validation_images >= MIN_VALIDATION_IMAGES, "{estimate:?}");
-            assert_eq!(estimate.map_from_odom(&reported_base(), 1.0), Transform::identity());
+            assert!(
+                !estimate.kept && estimate.n_validation_images >= MIN_VALIDATION_IMAGES,
+                "{estimate:?}"
+            );
+            assert_eq!(
+                estimate.map_from_odom(&reported_base(), 1.0),
+                Transform::identity()
+            );
         }
     }
 
     #[test]
     fn station_without_overlap_gives_none() {
-        let [reference, new] = keyframes_of_two_stations(&Transform::translation(50.0, 0.0, 0.0), 1.0);
+        let [reference, new] =
+            keyframes_of_two_stations(&Transform::translation(50.0, 0.0, 0.0), 1.0);
         assert_eq!(register_station(&reference, &new, &reported_base()), None);
         assert_eq!(register_station(&[], &new, &reported_base()), None);
-        let flat: Vec<_> =
-            new.iter().map(|keyframe| Arc::new(Keyframe { depth: None, ..keyframe.as_ref().clone() })).collect();
+        let flat: Vec<_> = new
+            .iter()
+            .map(|keyframe| {
+                Arc::new(Keyframe {
+                    depth: None,
+                    ..keyframe.as_ref().clone()
+                })
+            })
+            .collect();
         assert_eq!(register_station(&reference, &flat, &reported_base()), None);
     }
 
@@ -354,40 +489,73 @@ mod tests {
         let [reference, new] = keyframes_of_two_stations(&drift(), 1.0);
         let corrupted = |keyframes: &[Arc<Keyframe>]| -> Vec<Arc<Keyframe>> {
             let corrupt = |keyframe: &Arc<Keyframe>| match keyframe.split {
-                Split::Test => Arc::new(keyframe.with_base_correction(&Transform::translation(0.1, 0.2, 0.3))),
+                Split::Test => {
+                    Arc::new(keyframe.with_base_correction(&Transform::translation(0.1, 0.2, 0.3)))
+                }
                 Split::Train | Split::Validation => keyframe.clone(),
             };
             keyframes.iter().map(corrupt).collect()
         };
         let with_threads = |n: usize, reference: &[Arc<Keyframe>], new: &[Arc<Keyframe>]| {
-            let pool = rayon::ThreadPoolBuilder::new().num_threads(n).build().unwrap();
-            pool.install(|| register_station(reference, new, &reported_base())).unwrap()
+            let pool = rayon::ThreadPoolBuilder::new()
+                .num_threads(n)
+                .build()
+                .unwrap();
+            pool.install(|| register_station(reference, new, &reported_base()))
+                .unwrap()
         };
-        assert_eq!(with_threads(1, &reference, &new), with_threads(3, &corrupted(&reference), &corrupted(&new)));
+        assert_eq!(
+            with_threads(1, &reference, &new),
+            with_threads(3, &corrupted(&reference), &corrupted(&new))
+        );
     }
 
     #[test]
     fn textureless_wall_leaves_in_plane_motion_unobservable() {
         use keyframe::scenes::{TestShape, keyframe, look_at};
         use nalgebra::Point3;
-        let wall = [TestShape::Plane { normal: Vector3::x(), offset_m: 1.5 }];
+        let wall = [TestShape::Plane {
+            normal: Vector3::x(),
+            offset_m: 1.5,
+        }];
         let at = |ix: i64| {
             let (y, z) = (0.1 * (ix as f64).sin(), 0.1 * (2.0 * ix as f64).cos());
-            let mut keyframe = keyframe(ix, &wall, look_at(Point3::new(0.0, y, z), Point3::new(1.5, 2.0 * z, y)));
-            keyframe.rgba_srgb = keyframe.rgba_srgb.chunks(4).flat_map(|_| [90, 90, 90, 255]).collect();
+            let mut keyframe = keyframe(
+                ix,
+                &wall,
+                look_at(Point3::new(0.0, y, z), Point3::new(1.5, 2.0 * z, y)),
+            );
+            keyframe.rgba_srgb = keyframe
+                .rgba_srgb
+                .chunks(4)
+                .flat_map(|_| [90, 90, 90, 255])
+                .collect();
             keyframe.split = Split::of(usize::try_from(ix).unwrap() + 1);
             Arc::new(keyframe)
         };
         let all: Vec<_> = (0..24).map(at).collect();
-        let pose_error = base_motion(&reported_base(), &Vector3::new(0.01, 0.02, 0.0), &Vector3::zeros());
-        let new: Vec<_> =
-            all[12..].iter().map(|keyframe| Arc::new(keyframe.with_base_correction(&pose_error))).collect();
+        let pose_error = base_motion(
+            &reported_base(),
+            &Vector3::new(0.01, 0.02, 0.0),
+            &Vector3::zeros(),
+        );
+        let new: Vec<_> = all[12..]
+            .iter()
+            .map(|keyframe| Arc::new(keyframe.with_base_correction(&pose_error)))
+            .collect();
         let estimate = register_station(&all[..12], &new, &reported_base()).unwrap();
         assert_eq!(estimate.unobservable.len(), 3, "{estimate:?}");
         assert!(
-            (estimate.translation_m[0] + 0.01).abs() < 3e-4 && estimate.translation_m[1].abs() < 1e-3,
+            (estimate.translation_m[0] + 0.01).abs() < 3e-4
+                && estimate.translation_m[1].abs() < 1e-3,
             "{estimate:?}"
         );
-        assert!(estimate.unobservable.iter().any(|parts| parts.contains("translation along (")), "{estimate:?}");
+        assert!(
+            estimate
+                .unobservable
+                .iter()
+                .any(|parts| parts.contains("translation along (")),
+            "{estimate:?}"
+        );
     }
 }

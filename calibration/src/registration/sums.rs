@@ -8,10 +8,11 @@ use kinematics::quantile::{Rank, quantile};
 use nalgebra::{DMatrix, DVector};
 use rayon::prelude::*;
 
-/// Number of standard deviations at which residuals get half the full weight (Cauchy weights, 95 % as efficient as
-/// least squares for normal noise).
+/// Number of standard deviations at which residuals get half the full weight (Cauchy weights, 95 %
+/// as efficient as least squares for normal noise).
 const CAUCHY_SCALE: f64 = 2.385;
-/// Standard deviation of the prior on the gain, around 1. The next constant is that of the offset, around 0.
+/// Standard deviation of the prior on the gain, around 1. The next constant is that of the offset,
+/// around 0.
 const PRIOR_GAIN_DEVIATION: f64 = 0.2;
 const PRIOR_OFFSET: f64 = 30.0;
 /// Minimum number of samples of a pair.
@@ -39,8 +40,8 @@ pub(super) struct ResidualOptions {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum PixelSubset {
     All,
-    /// Every second block, as in a checkerboard: poses are estimated on one half of the blocks and evaluated on the
-    /// other.
+    /// Every second block, as in a checkerboard: poses are estimated on one half of the blocks and
+    /// evaluated on the other.
     Blocks {
         odd: bool,
     },
@@ -73,8 +74,18 @@ pub(super) struct PairSums {
 
 impl PairSums {
     /// Sums of residuals other than brightness and depth.
-    pub(super) fn new(params: Vec<usize>, information: DMatrix<f64>, gradient: DVector<f64>) -> Self {
-        Self { params, information, gradient, photo: Vec::new(), depth: Vec::new() }
+    pub(super) fn new(
+        params: Vec<usize>,
+        information: DMatrix<f64>,
+        gradient: DVector<f64>,
+    ) -> Self {
+        Self {
+            params,
+            information,
+            gradient,
+            photo: Vec::new(),
+            depth: Vec::new(),
+        }
     }
 }
 
@@ -84,26 +95,46 @@ pub(super) fn correspondences(
     samples: &[DepthSample],
     options: &ResidualOptions,
 ) -> Vec<Option<Correspondence>> {
-    let correspondence =
-        |sample: &DepthSample| Correspondence::new(i, j, sample, options.level, options.occlusion_frac);
+    let correspondence = |sample: &DepthSample| {
+        Correspondence::new(i, j, sample, options.level, options.occlusion_frac)
+    };
     samples
         .iter()
-        .map(|sample| correspondence(sample).filter(|correspondence| options.part.includes(correspondence.pixel())))
+        .map(|sample| {
+            correspondence(sample)
+                .filter(|correspondence| options.part.includes(correspondence.pixel()))
+        })
         .collect()
 }
 
 /// The images of a pair with their views.
-pub(super) fn sides<'a>(images: &'a [PreparedImage], views: &'a [CorrectedView], pair: Pair) -> [Side<'a>; 2] {
-    [pair.from, pair.to].map(|ix| Side { image: &images[ix], view: &views[ix] })
+pub(super) fn sides<'a>(
+    images: &'a [PreparedImage],
+    views: &'a [CorrectedView],
+    pair: Pair,
+) -> [Side<'a>; 2] {
+    [pair.from, pair.to].map(|ix| Side {
+        image: &images[ix],
+        view: &views[ix],
+    })
 }
 
 /// Estimates gain and offset by iteratively reweighted least squares.
-pub(super) fn tone<'a>(correspondences: impl Iterator<Item = &'a Correspondence> + Clone, noise: f64) -> Tone {
+pub(super) fn tone<'a>(
+    correspondences: impl Iterator<Item = &'a Correspondence> + Clone,
+    noise: f64,
+) -> Tone {
     const MAX_ITERATIONS: usize = 3;
-    let mut tone = Tone { gain: 1.0, offset: 0.0 };
+    let mut tone = Tone {
+        gain: 1.0,
+        offset: 0.0,
+    };
     for _ in 0..MAX_ITERATIONS {
         // Normal equations of the changes of gain and offset.
-        let (prior_gain, prior_offset) = ((noise / PRIOR_GAIN_DEVIATION).powi(2), (noise / PRIOR_OFFSET).powi(2));
+        let (prior_gain, prior_offset) = (
+            (noise / PRIOR_GAIN_DEVIATION).powi(2),
+            (noise / PRIOR_OFFSET).powi(2),
+        );
         let (mut xx, mut x, mut n) = (prior_gain, 0.0, prior_offset);
         let (mut xr, mut r) = (prior_gain * (1.0 - tone.gain), -prior_offset * tone.offset);
         for correspondence in correspondences.clone() {
@@ -127,7 +158,8 @@ fn weight(residual: f64, noise: f64) -> f64 {
     1.0 / (1.0 + (residual / (CAUCHY_SCALE * noise)).powi(2))
 }
 
-/// Contribution of every pair to the normal equations of the views' parameters, in the order of the pairs.
+/// Contribution of every pair to the normal equations of the views' parameters, in the order of the
+/// pairs.
 pub(super) fn of_pairs(
     images: &[PreparedImage],
     views: &[CorrectedView],
@@ -140,13 +172,22 @@ pub(super) fn of_pairs(
         params.sort_unstable();
         params.dedup();
         let index_of = |param: usize| params.partition_point(|known| *known < param);
-        let param_columns = [ParamColumns::new(i, index_of), ParamColumns::new(j, index_of)];
-        of_pair(sides(images, views, *pair), &param_columns, params.clone(), options)
+        let param_columns = [
+            ParamColumns::new(i, index_of),
+            ParamColumns::new(j, index_of),
+        ];
+        of_pair(
+            sides(images, views, *pair),
+            &param_columns,
+            params.clone(),
+            options,
+        )
     };
     pairs.par_iter().map(of).collect()
 }
 
-/// Contribution of every pair to the motions of its two cameras: six parameters of the first, then six of the second.
+/// Contribution of every pair to the motions of its two cameras: six parameters of the first, then
+/// six of the second.
 pub(super) fn of_free_pairs(
     images: &[PreparedImage],
     views: &[CorrectedView],
@@ -154,15 +195,26 @@ pub(super) fn of_free_pairs(
     options: &ResidualOptions,
 ) -> Vec<PairSums> {
     let of = |pair: &Pair| {
-        let param_columns = [ParamColumns::free(&views[pair.from], 0), ParamColumns::free(&views[pair.to], 6)];
-        of_pair(sides(images, views, *pair), &param_columns, (0..12).collect(), options)
+        let param_columns = [
+            ParamColumns::free(&views[pair.from], 0),
+            ParamColumns::free(&views[pair.to], 6),
+        ];
+        of_pair(
+            sides(images, views, *pair),
+            &param_columns,
+            (0..12).collect(),
+            options,
+        )
     };
     pairs.par_iter().map(of).collect()
 }
 
 /// Contribution of a pair to the motion of its second camera, with the first one fixed.
 pub(super) fn of_second(sides: [Side<'_>; 2], options: &ResidualOptions) -> PairSums {
-    let param_columns = [ParamColumns::still(sides[0].view), ParamColumns::free(sides[1].view, 0)];
+    let param_columns = [
+        ParamColumns::still(sides[0].view),
+        ParamColumns::free(sides[1].view, 0),
+    ];
     of_pair(sides, &param_columns, (0..6).collect(), options)
 }
 
@@ -181,17 +233,27 @@ fn of_pair(
         depth: Vec::new(),
     };
     let correspondences: Vec<Correspondence> =
-        correspondences(sides, &sides[0].image.samples, options).into_iter().flatten().collect();
+        correspondences(sides, &sides[0].image.samples, options)
+            .into_iter()
+            .flatten()
+            .collect();
     if correspondences.len() < MIN_SAMPLES {
         return sums;
     }
-    let Noise { photo: photo_noise, depth: depth_noise } = options.noise;
+    let Noise {
+        photo: photo_noise,
+        depth: depth_noise,
+    } = options.noise;
     let tone = tone(correspondences.iter(), photo_noise);
     let (mut information, mut gradient) = (vec![0.0; (n + 2) * (n + 2)], vec![0.0; n + 2]);
     let mut row = vec![0.0; n + 2];
     let mut add = |row: &[f64], residual: f64, noise: f64| {
         let weight = weight(residual, noise) / (noise * noise);
-        for (ix, derivative) in row.iter().enumerate().filter(|(_, derivative)| **derivative != 0.0) {
+        for (ix, derivative) in row
+            .iter()
+            .enumerate()
+            .filter(|(_, derivative)| **derivative != 0.0)
+        {
             let scaled = weight * derivative;
             gradient[ix] -= scaled * residual;
             for (sum, other) in information[ix * (n + 2)..][..=ix].iter_mut().zip(row) {
@@ -211,14 +273,26 @@ fn of_pair(
     }
     let at = |row: usize, column: usize| information[row.max(column) * (n + 2) + row.min(column)];
     // The Schur complement of gain and offset.
-    let prior_information = [1.0 / (PRIOR_GAIN_DEVIATION * PRIOR_GAIN_DEVIATION), 1.0 / (PRIOR_OFFSET * PRIOR_OFFSET)];
-    let [gg, go, oo] = [at(n, n) + prior_information[0], at(n + 1, n), at(n + 1, n + 1) + prior_information[1]];
+    let prior_information = [
+        1.0 / (PRIOR_GAIN_DEVIATION * PRIOR_GAIN_DEVIATION),
+        1.0 / (PRIOR_OFFSET * PRIOR_OFFSET),
+    ];
+    let [gg, go, oo] = [
+        at(n, n) + prior_information[0],
+        at(n + 1, n),
+        at(n + 1, n + 1) + prior_information[1],
+    ];
     let determinant = gg * oo - go * go;
-    let solve_tone =
-        |rhs: [f64; 2]| [(oo * rhs[0] - go * rhs[1]) / determinant, (gg * rhs[1] - go * rhs[0]) / determinant];
+    let solve_tone = |rhs: [f64; 2]| {
+        [
+            (oo * rhs[0] - go * rhs[1]) / determinant,
+            (gg * rhs[1] - go * rhs[0]) / determinant,
+        ]
+    };
     for row in 0..n {
         let of_tone = solve_tone([at(n, row), at(n + 1, row)]);
-        sums.gradient[row] = gradient[row] - of_tone[0] * gradient[n] - of_tone[1] * gradient[n + 1];
+        sums.gradient[row] =
+            gradient[row] - of_tone[0] * gradient[n] - of_tone[1] * gradient[n + 1];
         for column in 0..n {
             sums.information[(row, column)] =
                 at(row, column) - of_tone[0] * at(n, column) - of_tone[1] * at(n + 1, column);
@@ -230,9 +304,15 @@ fn of_pair(
 /// Scatter of the residuals of all pairs, from their median; `None` without residuals.
 pub(super) fn noise_of(sums: &[PairSums]) -> Option<Noise> {
     /// Lower limit of the noise: rounding to bytes and to a tenth of a millimeter.
-    const MIN_NOISE: Noise = Noise { photo: 0.3, depth: 5e-5 };
+    const MIN_NOISE: Noise = Noise {
+        photo: 0.3,
+        depth: 5e-5,
+    };
     let scatter = |of: fn(&PairSums) -> &[f64]| {
-        let mut all: Vec<f64> = sums.iter().flat_map(|pair| of(pair).iter().copied()).collect();
+        let mut all: Vec<f64> = sums
+            .iter()
+            .flat_map(|pair| of(pair).iter().copied())
+            .collect();
         quantile(&mut all, 0.5, Rank::Upper).map(|median| 1.4826 * median)
     };
     Some(Noise {

@@ -1,4 +1,5 @@
-//! Evaluation of corrections: predicts validation images from training images with and without them.
+//! Evaluation of corrections: predicts validation images from training images with and without
+//! them.
 
 use super::corrections::Corrections;
 use super::layout::Layout;
@@ -11,17 +12,19 @@ use super::view::CorrectedView;
 use rayon::prelude::*;
 use std::collections::BTreeMap;
 
-/// Maximum brightness difference that counts, on a scale of 0 to 255. Larger differences come from other surfaces or
-/// highlights.
+/// Maximum brightness difference that counts, on a scale of 0 to 255. Larger differences come from
+/// other surfaces or highlights.
 const CLIP: f64 = 50.0;
-/// Noise that is added to each squared difference, on a scale of 0 to 255, so that differences below the noise of a
-/// camera image do not count. The blurred images that are compared have less noise.
+/// Noise that is added to each squared difference, on a scale of 0 to 255, so that differences
+/// below the noise of a camera image do not count. The blurred images that are compared have less
+/// noise.
 const IMAGE_NOISE: f64 = 2.0;
 const OCCLUSION_FRAC: f64 = 0.04;
 /// Minimum number of samples of a score.
 const MIN_SAMPLES: usize = 30;
 
-/// A comparison of the predictions of validation images without (baseline) and with (variant) a correction.
+/// A comparison of the predictions of validation images without (baseline) and with (variant) a
+/// correction.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct PairedComparison<'a> {
     pub(super) images: &'a [PreparedImage],
@@ -46,24 +49,31 @@ pub(super) struct ImageScore {
 impl ImageScore {
     fn new(image_ix: usize, errors: PairedErrors) -> Self {
         let (baseline_db, variant_db) = psnr(errors);
-        Self { image_ix, baseline_db, variant_db }
+        Self {
+            image_ix,
+            baseline_db,
+            variant_db,
+        }
     }
 }
 
 impl PairedComparison<'_> {
     /// PSNR in dB of each validation image for baseline and variant, at the same samples.
     pub(super) fn scores(&self) -> Vec<ImageScore> {
-        image_scores(self.images, self.pairs, &self.views(), self.noise, |pair| pair.to)
+        image_scores(self.images, self.pairs, &self.views(), self.noise, |pair| {
+            pair.to
+        })
     }
 
-    /// Like [`Self::scores`], but each validation image gets an individual pose, estimated on one half of its blocks
-    /// and evaluated on the other half, then vice versa.
+    /// Like [`Self::scores`], but each validation image gets an individual pose, estimated on one
+    /// half of its blocks and evaluated on the other half, then vice versa.
     ///
-    /// This tests whether the training images are more consistent with each other: if they are misaligned, no single
-    /// pose fits the predictions of all of them. To test nothing else, the baseline estimates the individual pose,
-    /// too, with the same residuals, prior, number of steps and partners, and both are evaluated at samples that both
-    /// show. Both therefore have the same freedom, overfitting to noise lowers the score on the other half, and the
-    /// accuracy of the validation image's own pose does not matter. The correction itself was not estimated from
+    /// This tests whether the training images are more consistent with each other: if they are
+    /// misaligned, no single pose fits the predictions of all of them. To test nothing else, the
+    /// baseline estimates the individual pose, too, with the same residuals, prior, number of steps
+    /// and partners, and both are evaluated at samples that both show. Both therefore have the same
+    /// freedom, overfitting to noise lowers the score on the other half, and the accuracy of the
+    /// validation image's own pose does not matter. The correction itself was not estimated from
     /// these images.
     pub(super) fn scores_with_free_poses(&self) -> Vec<ImageScore> {
         let views = self.views();
@@ -76,15 +86,38 @@ impl PairedComparison<'_> {
             let image = &self.images[to];
             let with_own_pose = |corrections: &Corrections, views: &[CorrectedView]| {
                 let correction = &corrections.by_camera[image.camera];
-                let correction = poses::fit_one(self.images, views, pairs, correction, PixelSubset::Blocks { odd })?;
+                let correction = poses::fit_one(
+                    self.images,
+                    views,
+                    pairs,
+                    correction,
+                    PixelSubset::Blocks { odd },
+                )?;
                 CorrectedView::new(image, &correction, &Layout::default())
             };
-            let with_own_pose = [with_own_pose(self.baseline, &views[0])?, with_own_pose(self.variant, &views[1])?];
+            let with_own_pose = [
+                with_own_pose(self.baseline, &views[0])?,
+                with_own_pose(self.variant, &views[1])?,
+            ];
             let mut sum = PairedErrors::default();
             for pair in pairs {
-                let from = |ix: usize| Side { image: &self.images[pair.from], view: &views[ix][pair.from] };
-                let sides = [0, 1].map(|ix| [from(ix), Side { image, view: &with_own_pose[ix] }]);
-                add_errors(&mut sum, errors(sides, self.noise, PixelSubset::Blocks { odd: !odd }));
+                let from = |ix: usize| Side {
+                    image: &self.images[pair.from],
+                    view: &views[ix][pair.from],
+                };
+                let sides = [0, 1].map(|ix| {
+                    [
+                        from(ix),
+                        Side {
+                            image,
+                            view: &with_own_pose[ix],
+                        },
+                    ]
+                });
+                add_errors(
+                    &mut sum,
+                    errors(sides, self.noise, PixelSubset::Blocks { odd: !odd }),
+                );
             }
             Some(sum)
         };
@@ -97,7 +130,8 @@ impl PairedComparison<'_> {
     }
 
     fn views(&self) -> [Vec<CorrectedView>; 2] {
-        [self.baseline, self.variant].map(|corrections| corrections.views(self.images, &Layout::default()))
+        [self.baseline, self.variant]
+            .map(|corrections| corrections.views(self.images, &Layout::default()))
     }
 }
 
@@ -112,7 +146,10 @@ pub(super) fn scores(
     validation_image_of: impl Fn(&Pair) -> usize + Sync,
 ) -> (Vec<f64>, Vec<f64>) {
     let scores = image_scores(images, pairs, views, noise, validation_image_of);
-    scores.into_iter().map(|score| (score.baseline_db, score.variant_db)).unzip()
+    scores
+        .into_iter()
+        .map(|score| (score.baseline_db, score.variant_db))
+        .unzip()
 }
 
 /// [`scores`] with the indices of the images.
@@ -125,18 +162,24 @@ fn image_scores(
 ) -> Vec<ImageScore> {
     let score_of = |pair: &Pair| {
         let sides = [0, 1].map(|ix: usize| sums::sides(images, &views[ix], *pair));
-        (validation_image_of(pair), errors(sides, noise, PixelSubset::All))
+        (
+            validation_image_of(pair),
+            errors(sides, noise, PixelSubset::All),
+        )
     };
     let errors: Vec<(usize, PairedErrors)> = pairs.par_iter().map(score_of).collect();
     let mut by_image: BTreeMap<usize, PairedErrors> = BTreeMap::new();
     for (validation_ix, errors) in errors.into_iter().filter(|(_, (n, ..))| *n > MIN_SAMPLES) {
         add_errors(by_image.entry(validation_ix).or_default(), errors);
     }
-    by_image.into_iter().map(|(image_ix, errors)| ImageScore::new(image_ix, errors)).collect()
+    by_image
+        .into_iter()
+        .map(|(image_ix, errors)| ImageScore::new(image_ix, errors))
+        .collect()
 }
 
-/// Gain of the prediction of an image if its view is replaced, dB; `None` if too few samples are visible. All pairs
-/// must end at this image.
+/// Gain of the prediction of an image if its view is replaced, dB; `None` if too few samples are
+/// visible. All pairs must end at this image.
 pub(super) fn gain_db(
     images: &[PreparedImage],
     views: &[CorrectedView],
@@ -147,7 +190,16 @@ pub(super) fn gain_db(
     let mut sum = PairedErrors::default();
     for pair in pairs {
         let [from, to] = sums::sides(images, views, *pair);
-        let sides = [[from, to], [from, Side { view: replaced, ..to }]];
+        let sides = [
+            [from, to],
+            [
+                from,
+                Side {
+                    view: replaced,
+                    ..to
+                },
+            ],
+        ];
         add_errors(&mut sum, errors(sides, noise, PixelSubset::All));
     }
     let (baseline, variant) = psnr(sum);
@@ -156,14 +208,26 @@ pub(super) fn gain_db(
 
 /// Errors of a pair with baseline and variant, at the samples that both show.
 fn errors(sides: [[Side<'_>; 2]; 2], noise: Noise, part: PixelSubset) -> PairedErrors {
-    let options = ResidualOptions { level: 0, occlusion_frac: OCCLUSION_FRAC, noise, part };
-    let correspondences = sides.map(|sides| sums::correspondences(sides, &sides[0].image.uniform_samples, &options));
+    let options = ResidualOptions {
+        level: 0,
+        occlusion_frac: OCCLUSION_FRAC,
+        noise,
+        part,
+    };
+    let correspondences =
+        sides.map(|sides| sums::correspondences(sides, &sides[0].image.uniform_samples, &options));
     let both_visible = || {
-        correspondences[0].iter().zip(&correspondences[1]).filter_map(|(one, other)| one.as_ref().zip(other.as_ref()))
+        correspondences[0]
+            .iter()
+            .zip(&correspondences[1])
+            .filter_map(|(one, other)| one.as_ref().zip(other.as_ref()))
     };
     let sum = |correspondences: Vec<&Correspondence>| {
         let tone = sums::tone(correspondences.iter().copied(), noise.photo);
-        correspondences.iter().map(|correspondence| correspondence.photo(tone).clamp(-CLIP, CLIP).powi(2)).sum::<f64>()
+        correspondences
+            .iter()
+            .map(|correspondence| correspondence.photo(tone).clamp(-CLIP, CLIP).powi(2))
+            .sum::<f64>()
     };
     (
         both_visible().count(),
@@ -177,6 +241,8 @@ fn add_errors(sum: &mut PairedErrors, errors: PairedErrors) {
 }
 
 fn psnr((n, baseline, variant): PairedErrors) -> (f64, f64) {
-    let psnr = |squares: f64| 10.0 * (255.0 * 255.0 / (squares / n as f64 + IMAGE_NOISE * IMAGE_NOISE)).log10();
+    let psnr = |squares: f64| {
+        10.0 * (255.0 * 255.0 / (squares / n as f64 + IMAGE_NOISE * IMAGE_NOISE)).log10()
+    };
     (psnr(baseline), psnr(variant))
 }

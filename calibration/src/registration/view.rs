@@ -1,4 +1,5 @@
-//! Views of images with the current corrections, and their derivatives with respect to each parameter.
+//! Views of images with the current corrections, and their derivatives with respect to each
+//! parameter.
 
 use super::layout::Layout;
 use super::prepared_image::PreparedImage;
@@ -45,7 +46,8 @@ pub(super) struct CorrectedView {
     pub(super) depth_focal_px: [f64; 2],
     pub(super) depth_principal_px: [f64; 2],
     pub(super) depth_factor: f64,
-    /// Motion of the camera per unit of each parameter, in the camera's axes: parameter index, meters, radians.
+    /// Motion of the camera per unit of each parameter, in the camera's axes: parameter index,
+    /// meters, radians.
     pub(super) columns: Vec<(usize, Vector3<f64>, Vector3<f64>)>,
     pub(super) depth_pose: Option<usize>,
     pub(super) lens: Option<usize>,
@@ -55,26 +57,37 @@ pub(super) struct CorrectedView {
 }
 
 impl CorrectedView {
-    pub(super) fn new(image: &PreparedImage, correction: &CameraCorrection, layout: &Layout) -> Option<Self> {
+    pub(super) fn new(
+        image: &PreparedImage,
+        correction: &CameraCorrection,
+        layout: &Layout,
+    ) -> Option<Self> {
         let keyframe = image.keyframe.as_ref();
         let depth = keyframe.depth.as_ref()?;
         let posed = correction.apply(keyframe);
         let raw_from_corrected = keyframe.world_from_camera.inverse() * posed.world_from_camera;
         let params = layout.of_camera(image.camera);
-        let twist_of_corrected = keyframe.twist.map(|twist| twist.of_attached(&raw_from_corrected));
+        let twist_of_corrected = keyframe
+            .twist
+            .map(|twist| twist.of_attached(&raw_from_corrected));
         let mut columns = params.motions(twist_of_corrected.as_ref());
         let mut add_column = |param: usize, twist: &Twist, camera_from_twist: &Transform| {
             let twist = twist.of_attached(camera_from_twist);
             columns.push((param, twist.linear_m_s, twist.angular_rad_s));
         };
         if let Some(joints) = layout.joints() {
-            let time_corrected_from_corrected = correction.time_corrected_from_input(keyframe) * raw_from_corrected;
+            let time_corrected_from_corrected =
+                correction.time_corrected_from_input(keyframe) * raw_from_corrected;
             for (joint, twist) in keyframe.joint_twists.iter().enumerate() {
                 add_column(joints + joint, twist, &time_corrected_from_corrected);
             }
         }
         let share = |values: [f64; 2], change: &dyn Fn(usize, f64) -> f64| {
-            if image.shares_lens { [change(0, values[0]), change(1, values[1])] } else { values }
+            if image.shares_lens {
+                [change(0, values[0]), change(1, values[1])]
+            } else {
+                values
+            }
         };
         Some(Self {
             world_from_camera: RigidTransform::of(&posed.world_from_camera),
@@ -83,9 +96,13 @@ impl CorrectedView {
             principal_px: posed.principal_px,
             keyframe_focal_px: keyframe.focal_px,
             height_px: f64::from(keyframe.size_px[1]),
-            twist: keyframe.twist.map_or(Twist::zero(), |twist| twist.of_attached(&raw_from_corrected)),
+            twist: keyframe.twist.map_or(Twist::zero(), |twist| {
+                twist.of_attached(&raw_from_corrected)
+            }),
             readout_secs: (keyframe.readout_secs + correction.readout_secs).max(0.0),
-            depth_focal_px: share(depth.focal_px, &|axis, focal| focal * correction.log_focal[axis].exp()),
+            depth_focal_px: share(depth.focal_px, &|axis, focal| {
+                focal * correction.log_focal[axis].exp()
+            }),
             depth_principal_px: share(depth.principal_px, &|axis, principal| {
                 principal + correction.principal_offset_focals[axis] * depth.focal_px[axis]
             }),
@@ -99,25 +116,42 @@ impl CorrectedView {
         })
     }
 
-    /// The view with another camera pose, on a camera that moves rigidly with a frame. Parameters 0 to 5 are the motion
-    /// of the frame in its own axes: meters, then radians.
-    pub(super) fn moved_with_frame(&self, world_from_camera: &Transform, world_from_frame: &Transform) -> Self {
+    /// The view with another camera pose, on a camera that moves rigidly with a frame. Parameters 0
+    /// to 5 are the motion of the frame in its own axes: meters, then radians.
+    pub(super) fn moved_with_frame(
+        &self,
+        world_from_camera: &Transform,
+        world_from_frame: &Transform,
+    ) -> Self {
         let frame_from_camera = world_from_frame.inverse() * world_from_camera;
         let unit = |axis: usize| Vector3::from_fn(|row, _| if row == axis { 1.0 } else { 0.0 });
         let column = |param: usize| {
-            let (linear_m_s, angular_rad_s) =
-                if param < 3 { (unit(param), Vector3::zeros()) } else { (Vector3::zeros(), unit(param - 3)) };
-            let twist = Twist { linear_m_s, angular_rad_s }.of_attached(&frame_from_camera);
+            let (linear_m_s, angular_rad_s) = if param < 3 {
+                (unit(param), Vector3::zeros())
+            } else {
+                (Vector3::zeros(), unit(param - 3))
+            };
+            let twist = Twist {
+                linear_m_s,
+                angular_rad_s,
+            }
+            .of_attached(&frame_from_camera);
             (param, twist.linear_m_s, twist.angular_rad_s)
         };
         let world_from_camera = RigidTransform::of(world_from_camera);
-        Self { world_from_camera, columns: (0..6).map(column).collect(), ..self.clone() }
+        Self {
+            world_from_camera,
+            columns: (0..6).map(column).collect(),
+            ..self.clone()
+        }
     }
 
     /// Indices of all parameters that affect the view, ascending.
     pub(super) fn params(&self) -> Vec<usize> {
         let mut params: Vec<usize> = self.columns.iter().map(|(param, _, _)| *param).collect();
-        let range = |begin: Option<usize>, n: usize| begin.into_iter().flat_map(move |begin| begin..begin + n);
+        let range = |begin: Option<usize>, n: usize| {
+            begin.into_iter().flat_map(move |begin| begin..begin + n)
+        };
         params.extend(range(self.depth_pose, 6));
         params.extend(range(self.lens, 4));
         params.extend(range(self.depth_scale, 1));
@@ -126,8 +160,8 @@ impl CorrectedView {
         params
     }
 
-    /// Computes the camera-frame position of a static point at the readout time of its row from its position at
-    /// mid-exposure. Also returns that time as a share of the total readout time.
+    /// Computes the camera-frame position of a static point at the readout time of its row from its
+    /// position at mid-exposure. Also returns that time as a share of the total readout time.
     pub(super) fn at_readout(&self, still: &Vector3<f64>) -> (Vector3<f64>, f64) {
         if self.readout_secs == 0.0 {
             return (*still, 0.0);
@@ -148,6 +182,8 @@ impl CorrectedView {
     }
 
     pub(super) fn depth_pixel(&self, point: &Vector3<f64>) -> [f64; 2] {
-        [0, 1].map(|axis| self.depth_focal_px[axis] * point[axis] / point.z + self.depth_principal_px[axis])
+        [0, 1].map(|axis| {
+            self.depth_focal_px[axis] * point[axis] / point.z + self.depth_principal_px[axis]
+        })
     }
 }

@@ -1,7 +1,8 @@
 //! Initial time offset by correlation of rotation rates.
 //!
-//! The magnitude of the rotation rate of rigidly joined bodies is the same in every frame (Furrer et al. 2017, "Evaluation
-//! of combined time-offset estimation and hand-eye calibration on robotic datasets").
+//! The magnitude of the rotation rate of rigidly joined bodies is the same in every frame (Furrer
+//! et al. 2017, "Evaluation of combined time-offset estimation and hand-eye calibration on robotic
+//! datasets").
 
 use super::stamps;
 use super::stream::Stream;
@@ -21,15 +22,20 @@ pub(super) struct Coarse {
 ///
 /// # Errors
 /// If the streams have no rotation, or no significant correlation.
-pub(super) fn correlate(a: &Stream, b: &Stream, max_offset_secs: Option<f64>) -> Result<Vec<Coarse>, Refusal> {
+pub(super) fn correlate(
+    a: &Stream,
+    b: &Stream,
+    max_offset_secs: Option<f64>,
+) -> Result<Vec<Coarse>, Refusal> {
     /// Lower maxima are not tried.
     const SIMILAR: f64 = 0.7;
     const MAX_OTHERS: usize = 4;
     for (name, stream) in [("A", a), ("B", b)] {
         let own = Grid::new(stream, stream);
-        if let (Some(refusal), Err(_)) =
-            (stamps::unit_mistake(name, stream.median_step_secs()), own.rates[0].check_excitation(name))
-        {
+        if let (Some(refusal), Err(_)) = (
+            stamps::unit_mistake(name, stream.median_step_secs()),
+            own.rates[0].check_excitation(name),
+        ) {
             return Err(refusal);
         }
     }
@@ -38,7 +44,10 @@ pub(super) fn correlate(a: &Stream, b: &Stream, max_offset_secs: Option<f64>) ->
         rates.check_excitation(name)?;
     }
     let correlations = grid.correlations(max_offset_secs);
-    let Some(best) = correlations.iter().max_by(|p, q| p.significance.total_cmp(&q.significance)) else {
+    let Some(best) = correlations
+        .iter()
+        .max_by(|p, q| p.significance.total_cmp(&q.significance))
+    else {
         let most = max_offset_secs.unwrap_or(f64::INFINITY);
         let nearest = grid
             .correlations(None)
@@ -52,7 +61,10 @@ pub(super) fn correlate(a: &Stream, b: &Stream, max_offset_secs: Option<f64>) ->
                 ),
                 "search larger offsets, or check the stamps",
             ),
-            None => Refusal::new("the streams do not overlap long enough", "record both streams at the same time"),
+            None => Refusal::new(
+                "the streams do not overlap long enough",
+                "record both streams at the same time",
+            ),
         });
     };
     if best.value < MIN_CORRELATION {
@@ -70,9 +82,19 @@ pub(super) fn correlate(a: &Stream, b: &Stream, max_offset_secs: Option<f64>) ->
     let others = other_maxima(&correlations, best);
     let lags = [best]
         .into_iter()
-        .chain(others.into_iter().filter(|other| other.value > SIMILAR * best.value).take(MAX_OTHERS))
+        .chain(
+            others
+                .into_iter()
+                .filter(|other| other.value > SIMILAR * best.value)
+                .take(MAX_OTHERS),
+        )
         .map(|correlation| correlation.lag);
-    Ok(lags.map(|lag| Coarse { offset_secs: grid.offset_secs(lag), step_secs: grid.step_secs }).collect())
+    Ok(lags
+        .map(|lag| Coarse {
+            offset_secs: grid.offset_secs(lag),
+            step_secs: grid.step_secs,
+        })
+        .collect())
 }
 
 /// Explanation by stamps that advance too fast or too slowly by a factor of two.
@@ -81,12 +103,19 @@ pub(super) fn clock_rate_mistake(a: &Stream, b: &Stream) -> Option<Refusal> {
     const MIN_CORRELATION: f64 = 0.7;
     let correlation = |factor: f64| {
         let correlations = Grid::new(a, &b.scaled(factor)).correlations(None);
-        correlations.iter().map(|correlation| correlation.value).fold(0.0, f64::max)
+        correlations
+            .iter()
+            .map(|correlation| correlation.value)
+            .fold(0.0, f64::max)
     };
-    let words =
-        [(0.5, "twice"), (2.0, "half")].into_iter().find(|(factor, _)| correlation(*factor) > MIN_CORRELATION)?.1;
+    let words = [(0.5, "twice"), (2.0, "half")]
+        .into_iter()
+        .find(|(factor, _)| correlation(*factor) > MIN_CORRELATION)?
+        .1;
     Some(Refusal::new(
-        format!("the stamps of stream B advance {words} as fast as those of stream A: only then do the motions agree"),
+        format!(
+            "the stamps of stream B advance {words} as fast as those of stream A: only then do the motions agree"
+        ),
         "check how the stamps were computed, for example from a frame number and a wrong frame rate",
     ))
 }
@@ -110,16 +139,27 @@ impl Grid {
         let finest = a.step_secs().max(b.step_secs());
         let step_secs = finest.max(durations[0].max(durations[1]) / MAX_POINTS);
         let rates = [a, b].map(|stream| Rates::new(stream, step_secs, 2.0 * step_secs));
-        Self { rates, step_secs, base_secs: a.start_secs() - b.start_secs() }
+        Self {
+            rates,
+            step_secs,
+            base_secs: a.start_secs() - b.start_secs(),
+        }
     }
 
-    /// Correlations at all lags with enough overlap. Without a limit, clocks with different zeros are allowed.
+    /// Correlations at all lags with enough overlap. Without a limit, clocks with different zeros
+    /// are allowed.
     pub(super) fn correlations(&self, max_offset_secs: Option<f64>) -> Vec<Correlation> {
         const MIN_OVERLAP: f64 = 0.25;
-        let [n_a, n_b] = self.rates.each_ref().map(|rates| signed(rates.values.len()));
+        let [n_a, n_b] = self
+            .rates
+            .each_ref()
+            .map(|rates| signed(rates.values.len()));
         let min_overlap = (MIN_OVERLAP * n_a.min(n_b) as f64).max(10.0);
         (-n_b..=n_a)
-            .filter(|lag| max_offset_secs.is_none_or(|most| self.offset_secs(*lag).abs() <= most.max(self.step_secs)))
+            .filter(|lag| {
+                max_offset_secs
+                    .is_none_or(|most| self.offset_secs(*lag).abs() <= most.max(self.step_secs))
+            })
             .filter_map(|lag| Correlation::new(&self.rates[0], &self.rates[1], lag, min_overlap))
             .collect()
     }
@@ -137,14 +177,25 @@ pub(super) struct Rates {
 impl Rates {
     fn new(stream: &Stream, step_secs: f64, window_secs: f64) -> Self {
         let duration = stream.end_secs() - stream.start_secs();
-        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a few thousand")]
+        #[expect(
+            clippy::cast_possible_truncation,
+            clippy::cast_sign_loss,
+            reason = "a few thousand"
+        )]
         let n = (duration / step_secs) as usize + 1;
-        let at = |ix: usize| stream.rotation_rate(stream.start_secs() + ix as f64 * step_secs, window_secs);
+        let at = |ix: usize| {
+            stream.rotation_rate(stream.start_secs() + ix as f64 * step_secs, window_secs)
+        };
         let mut values: Vec<Option<f64>> = (0..n).map(at).collect();
         // A single wrong pose gives a rate that would dominate the correlation.
         let mut sorted: Vec<f64> = values.iter().flatten().copied().collect();
-        if let Some(limit) = kinematics::quantile::quantile(&mut sorted, 0.95, kinematics::quantile::Rank::Nearest) {
-            values.iter_mut().flatten().for_each(|rate| *rate = rate.min(limit));
+        if let Some(limit) =
+            kinematics::quantile::quantile(&mut sorted, 0.95, kinematics::quantile::Rank::Nearest)
+        {
+            values
+                .iter_mut()
+                .flatten()
+                .for_each(|rate| *rate = rate.min(limit));
         }
         Self { values }
     }
@@ -152,7 +203,8 @@ impl Rates {
     /// # Errors
     /// If the rate hardly changes.
     fn check_excitation(&self, name: &str) -> Result<(), Refusal> {
-        /// A tenth of what a hand-held or slowly moving camera does; below, noise of tracking dominates.
+        /// A tenth of what a hand-held or slowly moving camera does; below, noise of tracking
+        /// dominates.
         const MIN_DEVIATION_RAD_S: f64 = 0.02;
         let rates: Vec<f64> = self.values.iter().flatten().copied().collect();
         let n = rates.len().max(1) as f64;
@@ -161,7 +213,11 @@ impl Rates {
         if deviation >= MIN_DEVIATION_RAD_S {
             return Ok(());
         }
-        let what = if mean < MIN_DEVIATION_RAD_S { "hardly rotates" } else { "rotates at a constant rate" };
+        let what = if mean < MIN_DEVIATION_RAD_S {
+            "hardly rotates"
+        } else {
+            "rotates at a constant rate"
+        };
         Err(Refusal::new(
             format!(
                 "body {name} {what} ({:.2} degrees/s, deviation {:.2}; a deviation of at least {:.1} is needed): the motion does not depend on the time offset",
@@ -199,10 +255,15 @@ impl Correlation {
         }
         (n >= min_overlap).then_some(())?;
         let variance = |ix: usize| squares[ix] / n - (sums[ix] / n).powi(2);
-        let value = (product / n - sums[0] * sums[1] / (n * n)) / (variance(0) * variance(1)).sqrt();
+        let value =
+            (product / n - sums[0] * sums[1] / (n * n)) / (variance(0) * variance(1)).sqrt();
         value.is_finite().then_some(())?;
         let significance = value * (n / (1.0 - value * value).max(1e-9)).sqrt();
-        Some(Self { lag, value, significance })
+        Some(Self {
+            lag,
+            value,
+            significance,
+        })
     }
 }
 
@@ -216,10 +277,20 @@ fn other_maxima<'a>(correlations: &'a [Correlation], best: &Correlation) -> Vec<
             && value > correlations[ix + 1].value
     };
     // The neighborhood of the maximum ends where the correlation falls to half.
-    let best_ix = correlations.iter().position(|correlation| correlation.lag == best.lag).unwrap_or(0);
+    let best_ix = correlations
+        .iter()
+        .position(|correlation| correlation.lag == best.lag)
+        .unwrap_or(0);
     let is_high = |correlation: &Correlation| correlation.value > 0.5 * best.value;
-    let n_after = correlations[best_ix..].iter().take_while(|correlation| is_high(correlation)).count();
-    let n_before = correlations[..best_ix].iter().rev().take_while(|correlation| is_high(correlation)).count();
+    let n_after = correlations[best_ix..]
+        .iter()
+        .take_while(|correlation| is_high(correlation))
+        .count();
+    let n_before = correlations[..best_ix]
+        .iter()
+        .rev()
+        .take_while(|correlation| is_high(correlation))
+        .count();
     let mut others: Vec<&Correlation> = (0..correlations.len())
         .filter(|ix| (ix + n_before < best_ix || *ix >= best_ix + n_after) && is_maximum(*ix))
         .map(|ix| &correlations[ix])

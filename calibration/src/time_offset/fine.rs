@@ -1,4 +1,5 @@
-//! Continuous-time refinement: orientations of one stream are interpolated at the times of the other.
+//! Continuous-time refinement: orientations of one stream are interpolated at the times of the
+//! other.
 
 use super::stream::Stream;
 use crate::Error;
@@ -41,13 +42,19 @@ pub(super) fn refine(a: &Stream, b: &Stream, offset_secs: f64) -> Result<Fine, E
     let initial = problem.initial_state(offset_secs)?;
     let without = problem.fit(initial)?;
     let sigma = problem.sigmas(&without);
-    let with = Orientations { has_drift: true, ..problem.clone() };
+    let with = Orientations {
+        has_drift: true,
+        ..problem.clone()
+    };
     let drifting = with.fit(without.state)?;
     let drift_sigmas = with.sigmas(&drifting);
     let drift = drifting.state.drift;
     let is_significant = drift.abs() > MIN_SIGMAS * drift_sigmas[DRIFT_IX];
-    let (fit, sigma_secs) =
-        if is_significant { (&drifting, drift_sigmas[OFFSET_IX]) } else { (&without, sigma[OFFSET_IX]) };
+    let (fit, sigma_secs) = if is_significant {
+        (&drifting, drift_sigmas[OFFSET_IX])
+    } else {
+        (&without, sigma[OFFSET_IX])
+    };
     Ok(Fine {
         offset_secs: fit.state.offset_secs,
         sigma_secs,
@@ -72,7 +79,8 @@ struct State {
 #[derive(Clone)]
 struct Orientations<'a> {
     a: &'a Stream,
-    /// Half of the window in which angular velocities are averaged. Shorter windows amplify the noise of the poses.
+    /// Half of the window in which angular velocities are averaged. Shorter windows amplify the
+    /// noise of the poses.
     rate_half_secs: f64,
     times_b: Vec<(f64, UnitQuaternion<f64>)>,
     mid_secs: f64,
@@ -92,19 +100,37 @@ impl<'a> Orientations<'a> {
         let margin = 4.0 * rate_half_secs;
         let is_inside = |secs: f64| {
             let at = secs + offset_secs;
-            [at - margin, at, at + margin].iter().all(|secs| a.at_with_rate(*secs, rate_half_secs).is_some())
+            [at - margin, at, at + margin]
+                .iter()
+                .all(|secs| a.at_with_rate(*secs, rate_half_secs).is_some())
         };
-        let times_b: Vec<(f64, UnitQuaternion<f64>)> =
-            b.samples.iter().filter(|sample| is_inside(sample.secs)).map(|s| (s.secs, s.pose.rotation)).collect();
+        let times_b: Vec<(f64, UnitQuaternion<f64>)> = b
+            .samples
+            .iter()
+            .filter(|sample| is_inside(sample.secs))
+            .map(|s| (s.secs, s.pose.rotation))
+            .collect();
         if times_b.len() < 2 * N_PARTS {
             return Err(Error::Refused(Box::new(Refusal::new(
-                format!("only {} poses of the streams overlap; at least {} are needed", times_b.len(), 2 * N_PARTS),
+                format!(
+                    "only {} poses of the streams overlap; at least {} are needed",
+                    times_b.len(),
+                    2 * N_PARTS
+                ),
                 "record both streams for at least ten seconds at the same time",
             ))));
         }
         let (first, last) = (times_b[0].0, times_b[times_b.len() - 1].0);
         let (mid_secs, half_secs) = (0.5 * (first + last), 0.5 * (last - first));
-        Ok(Self { a, rate_half_secs, times_b, mid_secs, half_secs, has_drift: false, scale_rad: 1.0 })
+        Ok(Self {
+            a,
+            rate_half_secs,
+            times_b,
+            mid_secs,
+            half_secs,
+            has_drift: false,
+            scale_rad: 1.0,
+        })
     }
 
     fn secs_a(&self, secs_b: f64, state: &State) -> f64 {
@@ -120,24 +146,42 @@ impl<'a> Orientations<'a> {
             while later_ix < self.times_b.len() && self.times_b[later_ix].0 < secs + SPAN_SECS {
                 later_ix += 1;
             }
-            let Some((later_secs, later)) = self.times_b.get(later_ix) else { break };
-            let ends = (self.a.at(secs + offset_secs), self.a.at(later_secs + offset_secs));
-            let (Some(start), Some(end)) = ends else { continue };
+            let Some((later_secs, later)) = self.times_b.get(later_ix) else {
+                break;
+            };
+            let ends = (
+                self.a.at(secs + offset_secs),
+                self.a.at(later_secs + offset_secs),
+            );
+            let (Some(start), Some(end)) = ends else {
+                continue;
+            };
             let in_a = (start.rotation.inverse() * end.rotation).scaled_axis();
             correlation += in_a * (rotation.inverse() * later).scaled_axis().transpose();
         }
-        // Rotations about one axis determine the rotation up to that axis: any completion is a start.
+        // Rotations about one axis determine the rotation up to that axis: any completion is a
+        // start.
         let smallest = 1e-6 * correlation.norm().max(f64::MIN_POSITIVE);
-        let undetermined = || Error::TimeOffsetInput { why: "the rotations of the streams have no mean".to_owned() };
-        let rotation = nearest_rotation(&(correlation + Matrix3::identity() * smallest)).ok_or_else(undetermined)?;
+        let undetermined = || Error::TimeOffsetInput {
+            why: "the rotations of the streams have no mean".to_owned(),
+        };
+        let rotation = nearest_rotation(&(correlation + Matrix3::identity() * smallest))
+            .ok_or_else(undetermined)?;
         let references: Matrix3<f64> = self
             .times_b
             .iter()
-            .filter_map(|(secs, in_b)| Some(self.a.at(secs + offset_secs)?.rotation * rotation * in_b.inverse()))
+            .filter_map(|(secs, in_b)| {
+                Some(self.a.at(secs + offset_secs)?.rotation * rotation * in_b.inverse())
+            })
             .map(|reference| reference.to_rotation_matrix().into_inner())
             .sum();
         let reference = nearest_rotation(&references).ok_or_else(undetermined)?;
-        Ok(State { a_body_from_b_body: rotation, a_reference_from_b_reference: reference, offset_secs, drift: 0.0 })
+        Ok(State {
+            a_body_from_b_body: rotation,
+            a_reference_from_b_reference: reference,
+            offset_secs,
+            drift: 0.0,
+        })
     }
 
     /// Robust fit; the scale of the residuals is estimated in three rounds.
@@ -160,19 +204,32 @@ impl<'a> Orientations<'a> {
     }
 
     fn motion_rad(&self) -> f64 {
-        let sum: Matrix3<f64> = self.times_b.iter().map(|(_, in_b)| in_b.to_rotation_matrix().into_inner()).sum();
-        let Some(mean) = nearest_rotation(&sum) else { return 0.0 };
-        let squares = self.times_b.iter().map(|(_, in_b)| in_b.angle_to(&mean).powi(2)).sum::<f64>();
+        let sum: Matrix3<f64> = self
+            .times_b
+            .iter()
+            .map(|(_, in_b)| in_b.to_rotation_matrix().into_inner())
+            .sum();
+        let Some(mean) = nearest_rotation(&sum) else {
+            return 0.0;
+        };
+        let squares = self
+            .times_b
+            .iter()
+            .map(|(_, in_b)| in_b.angle_to(&mean).powi(2))
+            .sum::<f64>();
         (squares / self.times_b.len() as f64).sqrt()
     }
 
     fn residuals(&self, state: &State) -> impl Iterator<Item = Vector3<f64>> {
-        self.times_b.iter().filter_map(|(secs, in_b)| self.residual(state, *secs, in_b).map(|found| found.0))
+        self.times_b
+            .iter()
+            .filter_map(|(secs, in_b)| self.residual(state, *secs, in_b).map(|found| found.0))
     }
 
     fn residuals_over_time(&self, state: &State) -> Vec<[f64; 2]> {
         let residual = |(secs, in_b): &(f64, UnitQuaternion<f64>)| {
-            self.residual(state, *secs, in_b).map(|(residual, _)| [*secs, residual.norm()])
+            self.residual(state, *secs, in_b)
+                .map(|(residual, _)| [*secs, residual.norm()])
         };
         self.times_b.iter().filter_map(residual).collect()
     }
@@ -180,17 +237,32 @@ impl<'a> Orientations<'a> {
     /// Standard deviation per axis from the median of the norms.
     fn median_rad(&self, state: &State) -> f64 {
         const MEDIAN_OF_NORM: f64 = 1.538;
-        let norms: Vec<f64> = self.residuals(state).map(|residual| residual.norm()).collect();
+        let norms: Vec<f64> = self
+            .residuals(state)
+            .map(|residual| residual.norm())
+            .collect();
         kinematics::quantile::median(&norms).unwrap_or(0.0) / MEDIAN_OF_NORM
     }
 
     fn rms_rad(&self, state: &State) -> f64 {
-        (self.residuals(state).map(|residual| residual.norm_squared()).sum::<f64>() / self.times_b.len() as f64).sqrt()
+        (self
+            .residuals(state)
+            .map(|residual| residual.norm_squared())
+            .sum::<f64>()
+            / self.times_b.len() as f64)
+            .sqrt()
     }
 
     /// Residual and its derivatives. `None` where A has a gap.
-    fn residual(&self, state: &State, secs_b: f64, in_b: &UnitQuaternion<f64>) -> Option<(Vector3<f64>, Derivatives)> {
-        let (pose, rate) = self.a.at_with_rate(self.secs_a(secs_b, state), self.rate_half_secs)?;
+    fn residual(
+        &self,
+        state: &State,
+        secs_b: f64,
+        in_b: &UnitQuaternion<f64>,
+    ) -> Option<(Vector3<f64>, Derivatives)> {
+        let (pose, rate) = self
+            .a
+            .at_with_rate(self.secs_a(secs_b, state), self.rate_half_secs)?;
         let x = state.a_body_from_b_body;
         let relative = (pose.rotation * x).inverse() * (state.a_reference_from_b_reference * in_b);
         let residual = relative.scaled_axis();
@@ -206,8 +278,8 @@ impl<'a> Orientations<'a> {
         ))
     }
 
-    /// Standard deviations that allow for errors that are correlated in time: the gradients of consecutive parts of the
-    /// stream are independent (Liang and Zeger 1986).
+    /// Standard deviations that allow for errors that are correlated in time: the gradients of
+    /// consecutive parts of the stream are independent (Liang and Zeger 1986).
     fn sigmas(&self, fit: &Fit<State>) -> Vec<f64> {
         let n = fit.information.nrows();
         let scale = self.median_rad(&fit.state).max(1e-7);
@@ -218,7 +290,9 @@ impl<'a> Orientations<'a> {
         for part in self.times_b.chunks(per_part) {
             let mut gradient = DVector::zeros(n);
             for (secs, in_b) in part {
-                let Some((residual, derivatives)) = self.residual(&fit.state, *secs, in_b) else { continue };
+                let Some((residual, derivatives)) = self.residual(&fit.state, *secs, in_b) else {
+                    continue;
+                };
                 let rows = derivatives.rows(self.has_drift, secs - self.mid_secs);
                 let ratio = residual.norm_squared() / (2.5 * scale).powi(2);
                 let weight = 1.0 / (1.0 + ratio);
@@ -231,7 +305,9 @@ impl<'a> Orientations<'a> {
             scatter.ger(1.0, &gradient, &gradient, 1.0);
             n_parts += 1.0;
         }
-        let Some(inverse) = information.try_inverse() else { return vec![f64::INFINITY; n] };
+        let Some(inverse) = information.try_inverse() else {
+            return vec![f64::INFINITY; n];
+        };
         // Correction for the parameters that the parts share.
         let correction = n_parts / (n_parts - 1.0 - 0.5 * n as f64).max(1.0);
         let covariance = &inverse * (scatter * correction) * &inverse;
@@ -248,7 +324,13 @@ struct Derivatives {
 impl Derivatives {
     fn rows(&self, has_drift: bool, secs_from_mid: f64) -> [Vec<f64>; 3] {
         [0, 1, 2].map(|axis| {
-            let mut row: Vec<f64> = self.by_x.row(axis).iter().chain(self.by_y.row(axis).iter()).copied().collect();
+            let mut row: Vec<f64> = self
+                .by_x
+                .row(axis)
+                .iter()
+                .chain(self.by_y.row(axis).iter())
+                .copied()
+                .collect();
             row.push(self.by_offset[axis]);
             if has_drift {
                 row.push(self.by_offset[axis] * secs_from_mid);
@@ -284,21 +366,37 @@ impl least_squares::Problem for Orientations<'_> {
             let residual = residual / self.scale_rad;
             let rows = derivatives
                 .rows(self.has_drift, secs - self.mid_secs)
-                .map(|row| row.iter().map(|value| value / self.scale_rad).collect::<Vec<f64>>());
-            sums.add(residual.into(), [rows[0].as_slice(), rows[1].as_slice(), rows[2].as_slice()]);
+                .map(|row| {
+                    row.iter()
+                        .map(|value| value / self.scale_rad)
+                        .collect::<Vec<f64>>()
+                });
+            sums.add(
+                residual.into(),
+                [rows[0].as_slice(), rows[1].as_slice(), rows[2].as_slice()],
+            );
         }
         Some(())
     }
 
     fn moved(&self, state: &State, shared: &DVector<f64>, _local: &[DVector<f64>]) -> State {
         let part = |first: usize| {
-            UnitQuaternion::from_scaled_axis(Vector3::new(shared[first], shared[first + 1], shared[first + 2]))
+            UnitQuaternion::from_scaled_axis(Vector3::new(
+                shared[first],
+                shared[first + 1],
+                shared[first + 2],
+            ))
         };
         State {
             a_body_from_b_body: state.a_body_from_b_body * part(0),
             a_reference_from_b_reference: state.a_reference_from_b_reference * part(3),
             offset_secs: state.offset_secs + shared[OFFSET_IX],
-            drift: state.drift + if self.has_drift { shared[DRIFT_IX] } else { 0.0 },
+            drift: state.drift
+                + if self.has_drift {
+                    shared[DRIFT_IX]
+                } else {
+                    0.0
+                },
         }
     }
 }

@@ -1,7 +1,9 @@
-//! Time offset between two pose streams of rigidly joined bodies, such as a camera and a tracked marker or an arm.
+//! Time offset between two pose streams of rigidly joined bodies, such as a camera and a tracked
+//! marker or an arm.
 //!
-//! The correlation of rotation rates gives an initial offset. A continuous-time fit refines it together with the rotation
-//! between the bodies. The stated uncertainty allows for errors that are correlated in time.
+//! The correlation of rotation rates gives an initial offset. A continuous-time fit refines it
+//! together with the rotation between the bodies. The stated uncertainty allows for errors that are
+//! correlated in time.
 
 mod coarse;
 mod fine;
@@ -16,7 +18,8 @@ pub use profile::{MotionProfile, motion_profile};
 
 use crate::Error;
 use crate::hand_eye::{
-    BoardObservation, HandEyeInput, HandEyeOptions, HandEyeSample, Refusal, Scatter, Setup, calibrate_hand_eye,
+    BoardObservation, HandEyeInput, HandEyeOptions, HandEyeSample, Refusal, Scatter, Setup,
+    calibrate_hand_eye,
 };
 use kinematics::Transform;
 use stream::Stream;
@@ -35,7 +38,8 @@ pub struct PoseSample {
 pub struct TimeOffsetOptions {
     /// Also estimates the rigid transform between the bodies.
     pub hand_eye: bool,
-    /// Largest absolute offset that is searched, seconds. `None` searches all offsets at which the recordings overlap.
+    /// Largest absolute offset that is searched, seconds. `None` searches all offsets at which the
+    /// recordings overlap.
     pub max_offset_secs: Option<f64>,
     /// Refuses a result with a larger standard deviation, seconds.
     pub max_sigma_secs: f64,
@@ -43,7 +47,11 @@ pub struct TimeOffsetOptions {
 
 impl Default for TimeOffsetOptions {
     fn default() -> Self {
-        Self { hand_eye: false, max_offset_secs: None, max_sigma_secs: 0.02 }
+        Self {
+            hand_eye: false,
+            max_offset_secs: None,
+            max_sigma_secs: 0.02,
+        }
     }
 }
 
@@ -54,8 +62,9 @@ pub struct TimeOffset {
     pub offset_secs: f64,
     /// Standard deviation of the offset.
     pub sigma_secs: f64,
-    /// Drift of A's clock relative to B's and its standard deviation, parts per million. `None` if it is not significant
-    /// (three standard deviations). A's clock is at `secs_b + offset_secs + 1e-6 * drift * (secs_b - mid_secs)`.
+    /// Drift of A's clock relative to B's and its standard deviation, parts per million. `None` if
+    /// it is not significant (three standard deviations). A's clock is at `secs_b + offset_secs +
+    /// 1e-6 * drift * (secs_b - mid_secs)`.
     pub drift_ppm: Option<[f64; 2]>,
     /// Middle of the overlap on B's clock.
     pub mid_secs: f64,
@@ -82,10 +91,12 @@ pub struct BodyTransform {
 
 /// Estimates the time offset between two streams of poses.
 ///
-/// The streams may have different rates, gaps, outliers and clocks with different zeros, but must overlap in time.
+/// The streams may have different rates, gaps, outliers and clocks with different zeros, but must
+/// overlap in time.
 ///
 /// # Errors
-/// [`Error::Refused`] if the motion does not determine the offset. [`Error::TimeOffsetInput`] if a stream is invalid.
+/// [`Error::Refused`] if the motion does not determine the offset. [`Error::TimeOffsetInput`] if a
+/// stream is invalid.
 ///
 /// ```
 /// use calibration::time_offset::{PoseSample, TimeOffsetOptions, estimate_time_offset};
@@ -117,18 +128,24 @@ pub fn estimate_time_offset(
 }
 
 /// The estimate for streams as they are given.
-fn estimate(a: &[PoseSample], b: &[PoseSample], options: &TimeOffsetOptions) -> Result<TimeOffset, Error> {
+fn estimate(
+    a: &[PoseSample],
+    b: &[PoseSample],
+    options: &TimeOffsetOptions,
+) -> Result<TimeOffset, Error> {
     let refused = |refusal| Error::Refused(Box::new(refusal));
     let (a, b) = (Stream::new("A", a)?, Stream::new("B", b)?);
     let coarse = coarse::correlate(&a, &b, options.max_offset_secs).map_err(refused)?;
-    // The stream with the higher rate is interpolated, because its interpolation errors are smaller.
+    // The stream with the higher rate is interpolated, because its interpolation errors are
+    // smaller.
     let is_swapped = b.step_secs() < a.step_secs();
     let (interpolated, points) = if is_swapped { (&b, &a) } else { (&a, &b) };
     let sign = if is_swapped { -1.0 } else { 1.0 };
-    let (coarse, fine) = refine_best(interpolated, points, &coarse, sign).map_err(|error| match &error {
-        Error::Refused(_) => coarse::clock_rate_mistake(&a, &b).map_or(error, refused),
-        _ => error,
-    })?;
+    let (coarse, fine) =
+        refine_best(interpolated, points, &coarse, sign).map_err(|error| match &error {
+            Error::Refused(_) => coarse::clock_rate_mistake(&a, &b).map_or(error, refused),
+            _ => error,
+        })?;
     let offset_secs = sign * fine.offset_secs;
     if (offset_secs - coarse.offset_secs).abs() > 10.0 * coarse.step_secs {
         return Err(refused(Refusal::new(
@@ -144,7 +161,9 @@ fn estimate(a: &[PoseSample], b: &[PoseSample], options: &TimeOffsetOptions) -> 
     let is_beyond = |most: &f64| offset_secs.abs() > most + MAX_SIGMAS * fine.sigma_secs;
     if let Some(most) = options.max_offset_secs.filter(is_beyond) {
         return Err(refused(Refusal::new(
-            format!("the offset is {offset_secs:.3} s, which is more than the largest offset to search ({most} s)"),
+            format!(
+                "the offset is {offset_secs:.3} s, which is more than the largest offset to search ({most} s)"
+            ),
             "search larger offsets",
         )));
     }
@@ -160,19 +179,38 @@ fn estimate(a: &[PoseSample], b: &[PoseSample], options: &TimeOffsetOptions) -> 
             "rotate the bodies faster and with more changes of direction",
         )));
     }
-    let mid_secs = if is_swapped { fine.mid_secs + fine.offset_secs } else { fine.mid_secs };
+    let mid_secs = if is_swapped {
+        fine.mid_secs + fine.offset_secs
+    } else {
+        fine.mid_secs
+    };
     let drift = fine.drift.map_or(0.0, |[drift, _]| sign * drift);
     let secs_a = |secs_b: f64| secs_b + offset_secs + drift * (secs_b - mid_secs);
-    let secs_b = |secs: f64| if is_swapped { secs + fine.offset_secs } else { secs };
-    let residuals = fine.residuals.iter().map(|[secs, rad]| [secs_b(*secs), rad.to_degrees()]).collect();
+    let secs_b = |secs: f64| {
+        if is_swapped {
+            secs + fine.offset_secs
+        } else {
+            secs
+        }
+    };
+    let residuals = fine
+        .residuals
+        .iter()
+        .map(|[secs, rad]| [secs_b(*secs), rad.to_degrees()])
+        .collect();
     Ok(TimeOffset {
         offset_secs,
         sigma_secs: fine.sigma_secs,
-        drift_ppm: fine.drift.map(|[drift, sigma]| [1e6 * sign * drift, 1e6 * sigma]),
+        drift_ppm: fine
+            .drift
+            .map(|[drift, sigma]| [1e6 * sign * drift, 1e6 * sigma]),
         mid_secs,
         rms_deg: fine.rms_rad.to_degrees(),
         residuals,
-        hand_eye: options.hand_eye.then(|| body_transform(&a, &b, secs_a)).transpose()?,
+        hand_eye: options
+            .hand_eye
+            .then(|| body_transform(&a, &b, secs_a))
+            .transpose()?,
     })
 }
 
@@ -206,7 +244,9 @@ fn refine_best(
     let refused = |why: String, motion: &str| Error::Refused(Box::new(Refusal::new(why, motion)));
     let mut ranked = found.into_iter();
     let Some((start, best)) = ranked.next() else {
-        let why = || Error::TimeOffsetInput { why: "there is no initial offset".to_owned() };
+        let why = || Error::TimeOffsetInput {
+            why: "there is no initial offset".to_owned(),
+        };
         return Err(first_error.unwrap_or_else(why));
     };
     if best.median_rad > (MAX_RESIDUAL_FRAC * best.motion_rad).min(MAX_RESIDUAL_RAD) {
@@ -219,9 +259,10 @@ fn refine_best(
             "check that both bodies are rigidly joined and recorded at the same time, and that both streams are reference_from_body with the quaternion order x, y, z, w",
         ));
     }
-    let is_other = |fine: &fine::Fine| (fine.offset_secs - best.offset_secs).abs() > 5.0 * start.step_secs;
-    if let Some((_, other)) =
-        ranked.find(|(_, fine)| is_other(fine) && fine.median_rad < SIMILAR * best.median_rad + EXACT_RAD)
+    let is_other =
+        |fine: &fine::Fine| (fine.offset_secs - best.offset_secs).abs() > 5.0 * start.step_secs;
+    if let Some((_, other)) = ranked
+        .find(|(_, fine)| is_other(fine) && fine.median_rad < SIMILAR * best.median_rad + EXACT_RAD)
     {
         return Err(refused(
             format!(
@@ -242,15 +283,21 @@ fn body_transform(
 ) -> Result<Result<BodyTransform, Refusal>, Error> {
     /// More poses of a stream are not independent of each other.
     const MAX_SAMPLES: usize = 50;
-    let pairs: Vec<(f64, Transform, Transform)> =
-        b.samples.iter().filter_map(|sample| Some((sample.secs, a.at(secs_a(sample.secs))?, sample.pose))).collect();
+    let pairs: Vec<(f64, Transform, Transform)> = b
+        .samples
+        .iter()
+        .filter_map(|sample| Some((sample.secs, a.at(secs_a(sample.secs))?, sample.pose)))
+        .collect();
     let stride = pairs.len().div_ceil(MAX_SAMPLES).max(1);
-    let samples = pairs.iter().step_by(stride).map(|(secs, a_pose, b_pose)| HandEyeSample {
-        name: format!("{secs:.3}"),
-        base_from_flange: *a_pose,
-        board: BoardObservation::Pose(b_pose.inverse()),
-        joints: None,
-    });
+    let samples = pairs
+        .iter()
+        .step_by(stride)
+        .map(|(secs, a_pose, b_pose)| HandEyeSample {
+            name: format!("{secs:.3}"),
+            base_from_flange: *a_pose,
+            board: BoardObservation::Pose(b_pose.inverse()),
+            joints: None,
+        });
     let input = HandEyeInput {
         setup: Setup::EyeInHand,
         samples: samples.collect(),
@@ -258,7 +305,10 @@ fn body_transform(
         intrinsics_covariance: None,
         board_symmetries: &[],
         chain: None,
-        options: HandEyeOptions { board_is_seen: false, ..HandEyeOptions::default() },
+        options: HandEyeOptions {
+            board_is_seen: false,
+            ..HandEyeOptions::default()
+        },
     };
     match calibrate_hand_eye(&input) {
         Ok(found) => Ok(Ok(BodyTransform {
@@ -275,8 +325,16 @@ fn body_transform(
                 ("flange", "body A"),
                 ("the board", "stream B"),
             ];
-            let named = |text: &str| names.iter().fold(text.to_owned(), |text, (from, to)| text.replace(from, to));
-            Ok(Err(Refusal { why: named(&refusal.why), axis: refusal.axis, motion: named(&refusal.motion) }))
+            let named = |text: &str| {
+                names
+                    .iter()
+                    .fold(text.to_owned(), |text, (from, to)| text.replace(from, to))
+            };
+            Ok(Err(Refusal {
+                why: named(&refusal.why),
+                axis: refusal.axis,
+                motion: named(&refusal.motion),
+            }))
         }
         Err(error) => Err(error),
     }

@@ -5,7 +5,8 @@ use crate::Error;
 use crate::hand_eye::Refusal;
 use nalgebra::{Quaternion, UnitQuaternion};
 
-/// The order w, x, y, z of the quaternions of one or both streams, if the orientations fit several times better with it.
+/// The order w, x, y, z of the quaternions of one or both streams, if the orientations fit several
+/// times better with it.
 ///
 /// * `found`: the estimate for the order x, y, z, w.
 pub(super) fn mistake(
@@ -27,15 +28,19 @@ pub(super) fn mistake(
     if found_deg <= MAX_GOOD_DEG {
         return None;
     }
-    let options = TimeOffsetOptions { hand_eye: false, ..*options };
+    let options = TimeOffsetOptions {
+        hand_eye: false,
+        ..*options
+    };
     let (w_first_a, w_first_b) = (w_first(a), w_first(b));
     let variants = [
         ("stream A", &w_first_a[..], b),
         ("stream B", a, &w_first_b[..]),
         ("both streams", &w_first_a[..], &w_first_b[..]),
     ];
-    let fits =
-        variants.into_iter().filter_map(|(name, a, b)| Some((median_deg(&estimate(a, b, &options).ok()?), name)));
+    let fits = variants
+        .into_iter()
+        .filter_map(|(name, a, b)| Some((median_deg(&estimate(a, b, &options).ok()?), name)));
     let (best_deg, name) = fits.min_by(|p, q| p.0.total_cmp(&q.0))?;
     if best_deg > MAX_EXPLAINED_DEG || best_deg * BETTER > found_deg {
         return None;
@@ -63,7 +68,8 @@ fn w_first(samples: &[PoseSample]) -> Vec<PoseSample> {
     let reordered = |sample: &PoseSample| {
         let [first, second, third, fourth]: [f64; 4] = sample.pose.rotation.coords.into();
         let mut pose = sample.pose;
-        pose.rotation = UnitQuaternion::from_quaternion(Quaternion::new(first, second, third, fourth));
+        pose.rotation =
+            UnitQuaternion::from_quaternion(Quaternion::new(first, second, third, fourth));
         PoseSample { pose, ..*sample }
     };
     samples.iter().map(reordered).collect()

@@ -1,22 +1,29 @@
-//! Names mistakes in the stamps of a stream: wrong units, rounded stamps, several bodies in one file.
+//! Names mistakes in the stamps of a stream: wrong units, rounded stamps, several bodies in one
+//! file.
 
 use super::PoseSample;
 use crate::hand_eye::Refusal;
 
 /// Units in which stamps are often given by mistake, and how many make a second.
-const UNITS: [(&str, f64); 3] = [("milliseconds", 1e3), ("microseconds", 1e6), ("nanoseconds", 1e9)];
+const UNITS: [(&str, f64); 3] = [
+    ("milliseconds", 1e3),
+    ("microseconds", 1e6),
+    ("nanoseconds", 1e9),
+];
 /// Times between poses of cameras, trackers and robots, seconds.
 const USUAL_STEPS_SECS: std::ops::RangeInclusive<f64> = 0.0004..=0.4;
 
-/// The unit of stamps that are not seconds. Real steps of several seconds look like milliseconds, so this explains only
-/// streams that are of no use otherwise.
+/// The unit of stamps that are not seconds. Real steps of several seconds look like milliseconds,
+/// so this explains only streams that are of no use otherwise.
 ///
 /// * `step_secs`: typical difference of consecutive stamps.
 pub(super) fn unit_mistake(name: &str, step_secs: f64) -> Option<Refusal> {
     if USUAL_STEPS_SECS.contains(&step_secs) {
         return None;
     }
-    let (unit, per_sec) = UNITS.into_iter().find(|(_, per_sec)| USUAL_STEPS_SECS.contains(&(step_secs / per_sec)))?;
+    let (unit, per_sec) = UNITS
+        .into_iter()
+        .find(|(_, per_sec)| USUAL_STEPS_SECS.contains(&(step_secs / per_sec)))?;
     Some(Refusal::new(
         format!(
             "the stamps of stream {name} are probably in {unit}: they advance by {} from one pose to the next, which is {:.4} s in {unit}",
@@ -28,7 +35,11 @@ pub(super) fn unit_mistake(name: &str, step_secs: f64) -> Option<Refusal> {
 }
 
 fn rounded(value: f64) -> String {
-    if value < 1e4 { format!("{value:.1}") } else { format!("{value:.3e}") }
+    if value < 1e4 {
+        format!("{value:.1}")
+    } else {
+        format!("{value:.3e}")
+    }
 }
 
 /// Describes a single stamp that is far from all others.
@@ -60,7 +71,8 @@ pub(super) fn repeated_stamps(name: &str, sorted: &[PoseSample]) -> Option<Strin
     let is_conflict = |pair: &&[PoseSample]| {
         let difference = pair[0].pose.inverse() * pair[1].pose;
         pair[0].secs == pair[1].secs
-            && (difference.rotation.angle() > SAME_RAD || difference.translation.vector.norm() > SAME_M)
+            && (difference.rotation.angle() > SAME_RAD
+                || difference.translation.vector.norm() > SAME_M)
     };
     let n_conflicts = sorted.windows(2).filter(is_conflict).count();
     if n_conflicts as f64 <= MAX_FRAC * sorted.len() as f64 {

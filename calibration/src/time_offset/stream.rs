@@ -31,7 +31,9 @@ impl Stream {
                 && (sample.pose.rotation.norm() - 1.0).abs() < transform::RIGID_TOLERANCE
         };
         if let Some(ix) = samples.iter().position(|sample| !is_valid(sample)) {
-            return invalid(format!("pose {ix} of stream {name} is not finite or its quaternion has no unit length"));
+            return invalid(format!(
+                "pose {ix} of stream {name} is not finite or its quaternion has no unit length"
+            ));
         }
         let mut sorted = samples.to_vec();
         sorted.sort_by(|a, b| a.secs.total_cmp(&b.secs));
@@ -48,13 +50,23 @@ impl Stream {
                 sorted.len()
             ));
         }
-        let steps: Vec<f64> = sorted.windows(2).map(|pair| pair[1].secs - pair[0].secs).collect();
+        let steps: Vec<f64> = sorted
+            .windows(2)
+            .map(|pair| pair[1].secs - pair[0].secs)
+            .collect();
         let step_secs = kinematics::quantile::median(&steps).unwrap_or(0.0);
-        Ok(Self { samples: sorted, max_gap_secs: GAP * step_secs })
+        Ok(Self {
+            samples: sorted,
+            max_gap_secs: GAP * step_secs,
+        })
     }
 
     pub(super) fn median_step_secs(&self) -> f64 {
-        let steps: Vec<f64> = self.samples.windows(2).map(|pair| pair[1].secs - pair[0].secs).collect();
+        let steps: Vec<f64> = self
+            .samples
+            .windows(2)
+            .map(|pair| pair[1].secs - pair[0].secs)
+            .collect();
         kinematics::quantile::median(&steps).unwrap_or(0.0)
     }
 
@@ -82,7 +94,8 @@ impl Stream {
         (self.end_secs() - self.start_secs()) / (self.samples.len() - 1) as f64
     }
 
-    /// The neighbors of a time, and the fraction between them. `None` outside the stream and in gaps.
+    /// The neighbors of a time, and the fraction between them. `None` outside the stream and in
+    /// gaps.
     fn neighbors(&self, secs: f64) -> Option<(&PoseSample, &PoseSample, f64)> {
         let after = self.samples.partition_point(|sample| sample.secs <= secs);
         let (before, after) = match after {
@@ -106,16 +119,26 @@ impl Stream {
         Some(transform::interpolate(&before.pose, &after.pose, frac))
     }
 
-    /// The pose at a time and the angular velocity of the body, in its own frame: the mean over `half_secs` before and
-    /// after.
-    pub(super) fn at_with_rate(&self, secs: f64, half_secs: f64) -> Option<(Transform, Vector3<f64>)> {
+    /// The pose at a time and the angular velocity of the body, in its own frame: the mean over
+    /// `half_secs` before and after.
+    pub(super) fn at_with_rate(
+        &self,
+        secs: f64,
+        half_secs: f64,
+    ) -> Option<(Transform, Vector3<f64>)> {
         let (before, after) = (self.at(secs - half_secs)?, self.at(secs + half_secs)?);
-        Some((self.at(secs)?, (before.rotation.inverse() * after.rotation).scaled_axis() / (2.0 * half_secs)))
+        Some((
+            self.at(secs)?,
+            (before.rotation.inverse() * after.rotation).scaled_axis() / (2.0 * half_secs),
+        ))
     }
 
     /// Magnitude of the mean rotation rate in a window around a time, rad/s.
     pub(super) fn rotation_rate(&self, secs: f64, window_secs: f64) -> Option<f64> {
-        let (before, after) = (self.at(secs - 0.5 * window_secs)?, self.at(secs + 0.5 * window_secs)?);
+        let (before, after) = (
+            self.at(secs - 0.5 * window_secs)?,
+            self.at(secs + 0.5 * window_secs)?,
+        );
         Some(before.rotation.angle_to(&after.rotation) / window_secs)
     }
 }

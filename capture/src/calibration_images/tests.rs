@@ -57,7 +57,12 @@ fn joint_at(secs: f64) -> f64 {
 }
 
 fn reading(secs: f64) -> Sample {
-    Sample::Joints(JointState { stamp: stamp(secs), position: vec![joint_at(secs)], velocity: vec![], effort: vec![] })
+    Sample::Joints(JointState {
+        stamp: stamp(secs),
+        position: vec![joint_at(secs)],
+        velocity: vec![],
+        effort: vec![],
+    })
 }
 
 /// Readings at 100 Hz from 0 to 2 s and the given images, in the order of their arrival.
@@ -70,19 +75,35 @@ fn with_readings(images: impl IntoIterator<Item = Image>) -> Vec<Sample> {
 
 fn read(rig: Rig, samples: Vec<Sample>) -> crate::Result<CalibrationImages> {
     let source = Box::new(Samples(samples.into_iter()));
-    let opened = Opened { rig, source, damage: Arc::default(), stamp_clock: StampClock::Unrelated };
+    let opened = Opened {
+        rig,
+        source,
+        damage: Arc::default(),
+        stamp_clock: StampClock::Unrelated,
+    };
     calibration_images(opened, "wrist", 3.0, |_, _| ControlFlow::Continue(()))
 }
 
 #[test]
 fn images_at_different_poses_are_kept_while_the_arm_is_slow() {
-    let found = read(arm_rig(), with_readings([0.5, 0.6, 1.2, 1.7, 1.8].map(image))).unwrap();
+    let found = read(
+        arm_rig(),
+        with_readings([0.5, 0.6, 1.2, 1.7, 1.8].map(image)),
+    )
+    .unwrap();
     // The second and the last image show the poses of the images before.
     let secs: Vec<f64> = found.images.iter().map(|image| image.secs).collect();
-    assert_eq!((secs, found.n_read, found.n_fast, found.n_unusable), (vec![0.5, 1.7], 5, 1, 0));
+    assert_eq!(
+        (secs, found.n_read, found.n_fast, found.n_unusable),
+        (vec![0.5, 1.7], 5, 1, 0)
+    );
     for (image, joint) in found.images.iter().zip([0.25, 0.65]) {
         let arm = image.arm.as_ref().expect("the rig has an arm");
-        assert!((arm.joints[0] - joint).abs() < 1e-9, "the joint offset is included: {}", arm.joints[0]);
+        assert!(
+            (arm.joints[0] - joint).abs() < 1e-9,
+            "the joint offset is included: {}",
+            arm.joints[0]
+        );
         assert!((arm.base_from_flange.rotation.angle() - joint).abs() < 1e-9);
         assert_eq!((image.size_px, image.gray.len()), (SIZE_PX, 128));
     }
@@ -92,7 +113,12 @@ fn images_at_different_poses_are_kept_while_the_arm_is_slow() {
 fn rows_have_the_poses_of_their_exposures() {
     // Fast images are kept with a large limit.
     let source = Box::new(Samples(with_readings([image(1.2)]).into_iter()));
-    let opened = Opened { rig: arm_rig(), source, damage: Arc::default(), stamp_clock: StampClock::Unrelated };
+    let opened = Opened {
+        rig: arm_rig(),
+        source,
+        damage: Arc::default(),
+        stamp_clock: StampClock::Unrelated,
+    };
     let found = calibration_images(opened, "wrist", 1e3, |_, _| ControlFlow::Continue(())).unwrap();
     let arm = found.images[0].arm.as_ref().unwrap();
     // 1 rad/s over the readout time of 10 ms.
@@ -107,33 +133,58 @@ fn images_without_readings_or_pixels_are_unusable() {
     let mut broken = image(0.5);
     broken.data = [7; 3].into();
     // Before the first reading, broken, and after the last one.
-    let found = read(arm_rig(), with_readings([image(-0.5), broken, image(1.8), image(2.5)])).unwrap();
-    assert_eq!((found.images.len(), found.n_read, found.n_unusable), (1, 4, 3));
+    let found = read(
+        arm_rig(),
+        with_readings([image(-0.5), broken, image(1.8), image(2.5)]),
+    )
+    .unwrap();
+    assert_eq!(
+        (found.images.len(), found.n_read, found.n_unusable),
+        (1, 4, 3)
+    );
 }
 
 #[test]
 fn depth_and_other_cameras_are_ignored_and_the_end_is_respected() {
     let mut depth = image(0.5);
-    depth.format = PixelFormat::DepthU16 { meters_per_count: 1e-3 };
-    let other = Image { camera: "other".into(), ..image(0.6) };
+    depth.format = PixelFormat::DepthU16 {
+        meters_per_count: 1e-3,
+    };
+    let other = Image {
+        camera: "other".into(),
+        ..image(0.6)
+    };
     let found = read(arm_rig(), with_readings([depth, other])).unwrap();
     assert_eq!((found.images.len(), found.n_read), (0, 0));
     let source = Box::new(Samples(with_readings([image(0.5), image(1.7)]).into_iter()));
-    let opened = Opened { rig: arm_rig(), source, damage: Arc::default(), stamp_clock: StampClock::Unrelated };
-    let until_one_second = |sample: &Sample, _: &[CalibrationImage]| match sample.stamp() > stamp(1.0) {
-        true => ControlFlow::Break(()),
-        false => ControlFlow::Continue(()),
+    let opened = Opened {
+        rig: arm_rig(),
+        source,
+        damage: Arc::default(),
+        stamp_clock: StampClock::Unrelated,
     };
+    let until_one_second =
+        |sample: &Sample, _: &[CalibrationImage]| match sample.stamp() > stamp(1.0) {
+            true => ControlFlow::Break(()),
+            false => ControlFlow::Continue(()),
+        };
     let found = calibration_images(opened, "wrist", 3.0, until_one_second).unwrap();
     assert_eq!(found.images.len(), 1);
 }
 
 #[test]
 fn images_of_a_robot_without_an_arm_have_an_interval() {
-    let rig = rig("[arm]\ndriver = \"none\"\nurdf = \"one.urdf\"\nflange_link = \"tool\"", "parent = \"base\"");
+    let rig = rig(
+        "[arm]\ndriver = \"none\"\nurdf = \"one.urdf\"\nflange_link = \"tool\"",
+        "parent = \"base\"",
+    );
     let images = (0..20).map(|ix| Sample::Image(image(f64::from(ix) * 0.1)));
     let found = read(rig, images.collect()).unwrap();
-    let secs: Vec<f64> = found.images.iter().map(|image| (image.secs * 10.0).round()).collect();
+    let secs: Vec<f64> = found
+        .images
+        .iter()
+        .map(|image| (image.secs * 10.0).round())
+        .collect();
     assert_eq!(secs, [0.0, 5.0, 10.0, 15.0]);
     assert!(found.images.iter().all(|image| image.arm.is_none()));
 }
@@ -141,13 +192,25 @@ fn images_of_a_robot_without_an_arm_have_an_interval() {
 #[test]
 fn unknown_cameras_and_moving_bases_are_rejected() {
     let source = || Box::new(Samples(Vec::new().into_iter()));
-    let open = |rig| Opened { rig, source: source(), damage: Arc::default(), stamp_clock: StampClock::Unrelated };
-    let error =
-        calibration_images(open(arm_rig()), "front", 3.0, |_, _| ControlFlow::Continue(())).unwrap_err().to_string();
-    assert!(error.contains("no camera \"front\"; it has wrist"), "{error}");
+    let open = |rig| Opened {
+        rig,
+        source: source(),
+        damage: Arc::default(),
+        stamp_clock: StampClock::Unrelated,
+    };
+    let error = calibration_images(open(arm_rig()), "front", 3.0, |_, _| {
+        ControlFlow::Continue(())
+    })
+    .unwrap_err()
+    .to_string();
+    assert!(
+        error.contains("no camera \"front\"; it has wrist"),
+        "{error}"
+    );
     let mut moving = arm_rig();
     moving.base.driver = crate::config::BaseDriver::Udp;
-    let error =
-        calibration_images(open(moving), "wrist", 3.0, |_, _| ControlFlow::Continue(())).unwrap_err().to_string();
+    let error = calibration_images(open(moving), "wrist", 3.0, |_, _| ControlFlow::Continue(()))
+        .unwrap_err()
+        .to_string();
     assert!(error.contains("base.driver"), "{error}");
 }

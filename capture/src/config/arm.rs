@@ -24,14 +24,15 @@ keys! {
         pub urdf_text: String => String::new();
         /// Moving joints in the order of the joint states.
         pub joints: Vec<String> = Vec::new();
-        /// Offsets added to the joint positions, in the order of `joints`, rad or m, each from -1 to 1; empty if there
-        /// are none.
+        /// Offsets added to the joint positions, in the order of `joints`, rad or m, each from -1
+        /// to 1; empty if there are none.
         pub joint_offsets: Vec<f64> = Vec::new();
         /// Settings of a simulated arm.
         pub sim: ArmSim;
         /// Link of the URDF that is the base of the robot.
         pub base_link: String = String::new();
-        /// Link of the URDF to which cameras with the parent [`Parent::Flange`](super::Parent::Flange) are attached.
+        /// Link of the URDF to which cameras with the parent
+        /// [`Parent::Flange`](super::Parent::Flange) are attached.
         pub flange_link: String = String::new();
         /// Speed limit for all joints when the arm is moved, rad/s or m/s.
         pub max_speed_rad_s: f64 = 0.5, in 0.001..=10.0;
@@ -48,8 +49,8 @@ keys! {
     /// Settings of a simulated arm.
     #[derive(Clone, Debug, Default, PartialEq)]
     pub struct ArmSim {
-        /// Offsets that must be added to the simulated readings to get the true joint positions, in the order of
-        /// `joints`, rad, each from -1 to 1; empty if the readings are right.
+        /// Offsets that must be added to the simulated readings to get the true joint positions, in
+        /// the order of `joints`, rad, each from -1 to 1; empty if the readings are right.
         pub true_joint_offsets: Vec<f64> = Vec::new();
     }
 }
@@ -73,23 +74,34 @@ choices! {
     ArmDriver { None = "none", Franka = "franka", Can = "can", Udp = "udp", Sim = "sim" }
 }
 
-/// Reads the arm without its robot description, and the path of the description, which is empty if there is none.
+/// Reads the arm without its robot description, and the path of the description, which is empty if
+/// there is none.
 pub(super) fn read(mut keys: Section<'_>) -> Option<(Arm, String)> {
     let has_flange_link = keys.has("flange_link");
     let arm = Arm::read_keys(&mut keys);
     let urdf = keys.get::<String>("urdf", ());
     let has_arm = arm.as_ref().is_none_or(|arm| arm.driver != ArmDriver::None);
     if has_arm && urdf.is_none() {
-        keys.missing("urdf", "path of the robot description, relative to the rig file");
+        keys.missing(
+            "urdf",
+            "path of the robot description, relative to the rig file",
+        );
     }
     // Without an arm and a robot description, the robot has a single link.
     let has_single_link = !has_arm && urdf.is_none();
     if !has_flange_link && !has_single_link {
-        keys.missing("flange_link", "link to which cameras with the parent flange are attached");
+        keys.missing(
+            "flange_link",
+            "link to which cameras with the parent flange are attached",
+        );
     }
     let (buses, motors) = can::read(&mut keys);
     keys.end();
-    let mut arm = Arm { buses, motors, ..arm? };
+    let mut arm = Arm {
+        buses,
+        motors,
+        ..arm?
+    };
     if !has_flange_link {
         arm.flange_link = "base".to_owned();
     }
@@ -103,33 +115,71 @@ pub(super) fn write(arm: &Arm) -> Table {
     table
 }
 
-/// Checks links and joints against the robot description and fills in the joints if the rig file lists none.
+/// Checks links and joints against the robot description and fills in the joints if the rig file
+/// lists none.
 pub(super) fn resolve_joints(file: &str, arm: &mut Arm) -> Result<(), ConfigError> {
-    let robot = |key, e: kinematics::Error| ConfigError::Robot { file: file.to_owned(), key, reason: e.to_string() };
-    let description = kinematics::urdf::Robot::parse(&arm.urdf_text).map_err(|e| robot("arm.urdf", e))?;
+    let robot = |key, e: kinematics::Error| ConfigError::Robot {
+        file: file.to_owned(),
+        key,
+        reason: e.to_string(),
+    };
+    let description =
+        kinematics::urdf::Robot::parse(&arm.urdf_text).map_err(|e| robot("arm.urdf", e))?;
     for note in description.notes() {
         log::warn!("the URDF of {file}, {note}");
     }
     if arm.base_link.is_empty() {
-        arm.base_link = description.root().map_err(|e| robot("arm.urdf", e))?.to_owned();
+        arm.base_link = description
+            .root()
+            .map_err(|e| robot("arm.urdf", e))?
+            .to_owned();
     }
-    let chain = Chain::new(&description, &arm.base_link, &arm.flange_link).map_err(|e| robot("arm.flange_link", e))?;
+    let chain = Chain::new(&description, &arm.base_link, &arm.flange_link)
+        .map_err(|e| robot("arm.flange_link", e))?;
     if arm.joints.is_empty() {
         arm.joints = chain.joint_names().to_vec();
     }
-    chain.order_in(&arm.joints).map_err(|e| robot("arm.joints", e))?;
+    chain
+        .order_in(&arm.joints)
+        .map_err(|e| robot("arm.joints", e))?;
     resolve_motors(file, arm)?;
-    check_offsets(file, "arm.joint_offsets", &arm.joint_offsets, arm.joints.len())?;
-    check_offsets(file, "arm.sim.true_joint_offsets", &arm.sim.true_joint_offsets, arm.joints.len())
+    check_offsets(
+        file,
+        "arm.joint_offsets",
+        &arm.joint_offsets,
+        arm.joints.len(),
+    )?;
+    check_offsets(
+        file,
+        "arm.sim.true_joint_offsets",
+        &arm.sim.true_joint_offsets,
+        arm.joints.len(),
+    )
 }
 
-fn check_offsets(file: &str, key: &'static str, offsets: &[f64], n_joints: usize) -> Result<(), ConfigError> {
+fn check_offsets(
+    file: &str,
+    key: &'static str,
+    offsets: &[f64],
+    n_joints: usize,
+) -> Result<(), ConfigError> {
     let n = offsets.len();
-    if n == 0 || (n == n_joints && offsets.iter().all(|offset| offset.abs() <= MAX_JOINT_OFFSET)) {
+    if n == 0
+        || (n == n_joints
+            && offsets
+                .iter()
+                .all(|offset| offset.abs() <= MAX_JOINT_OFFSET))
+    {
         return Ok(());
     }
-    let reason = format!("{n} numbers; must be {n_joints} from -{MAX_JOINT_OFFSET} to {MAX_JOINT_OFFSET}, or none");
-    Err(ConfigError::Robot { file: file.to_owned(), key, reason })
+    let reason = format!(
+        "{n} numbers; must be {n_joints} from -{MAX_JOINT_OFFSET} to {MAX_JOINT_OFFSET}, or none"
+    );
+    Err(ConfigError::Robot {
+        file: file.to_owned(),
+        key,
+        reason,
+    })
 }
 
 /// Sorts the motors by joint. An arm on CAN buses needs exactly one motor per joint.
@@ -137,20 +187,42 @@ fn resolve_motors(file: &str, arm: &mut Arm) -> Result<(), ConfigError> {
     if arm.driver != ArmDriver::Can {
         return Ok(());
     }
-    let problem = |reason| ConfigError::Robot { file: file.to_owned(), key: "arm.motor", reason };
+    let problem = |reason| ConfigError::Robot {
+        file: file.to_owned(),
+        key: "arm.motor",
+        reason,
+    };
     let index_of = |name: &String| arm.joints.iter().position(|joint| joint == name);
-    if let Some(unknown_motor) = arm.motors.iter().find(|motor| index_of(&motor.joint).is_none()) {
-        return Err(problem(format!("{:?} is not one of the joints {}", unknown_motor.joint, arm.joints.join(", "))));
+    if let Some(unknown_motor) = arm
+        .motors
+        .iter()
+        .find(|motor| index_of(&motor.joint).is_none())
+    {
+        return Err(problem(format!(
+            "{:?} is not one of the joints {}",
+            unknown_motor.joint,
+            arm.joints.join(", ")
+        )));
     }
-    if let Some(joint) = arm.joints.iter().find(|joint| !arm.motors.iter().any(|motor| motor.joint == **joint)) {
-        return Err(problem(format!("the joint {joint:?} has no table [arm.motor.{joint}]")));
+    if let Some(joint) = arm
+        .joints
+        .iter()
+        .find(|joint| !arm.motors.iter().any(|motor| motor.joint == **joint))
+    {
+        return Err(problem(format!(
+            "the joint {joint:?} has no table [arm.motor.{joint}]"
+        )));
     }
     for (ix, motor) in arm.motors.iter().enumerate() {
-        let is_same =
-            |other: &&MotorConfig| other.bus_ix == motor.bus_ix && other.protocol.conflicts_with(&*motor.protocol);
+        let is_same = |other: &&MotorConfig| {
+            other.bus_ix == motor.bus_ix && other.protocol.conflicts_with(&*motor.protocol)
+        };
         if let Some(same) = arm.motors[..ix].iter().find(is_same) {
             let interface = &arm.buses[motor.bus_ix].interface;
-            let message = format!("{:?} and {:?} have the same ID on {interface:?}", same.joint, motor.joint);
+            let message = format!(
+                "{:?} and {:?} have the same ID on {interface:?}",
+                same.joint, motor.joint
+            );
             return Err(problem(message));
         }
     }

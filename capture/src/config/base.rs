@@ -78,10 +78,16 @@ choices! {
 
 pub(super) fn read(mut keys: Section<'_>) -> Option<Base> {
     let mut base = Base::read_keys(&mut keys)?;
-    let tags = keys.named_sections("tag").into_iter().filter_map(|(id, keys)| tag(&id, base.tag_family, keys));
+    let tags = keys
+        .named_sections("tag")
+        .into_iter()
+        .filter_map(|(id, keys)| tag(&id, base.tag_family, keys));
     base.tags = tags.collect();
     if base.driver == BaseDriver::Tags && base.tags.is_empty() {
-        keys.missing("tag", "a table [base.tag.ID] for each tag, with size_m and world_from_tag");
+        keys.missing(
+            "tag",
+            "a table [base.tag.ID] for each tag, with size_m and world_from_tag",
+        );
     }
     keys.end();
     Some(base)
@@ -89,21 +95,48 @@ pub(super) fn read(mut keys: Section<'_>) -> Option<Base> {
 
 /// Reads a tag and its ID. Reports an invalid value and returns `None`.
 fn tag(id: &str, family: Family, keys: Section<'_>) -> Option<(u32, TagPlacement)> {
-    let number = id.parse().ok().filter(|number: &u32| number.to_string() == id && *number < family.n_tags());
-    let allowed = format!("ID of a tag in its family, 0 to {}, as the name of the table", family.n_tags() - 1);
+    let number = id
+        .parse()
+        .ok()
+        .filter(|number: &u32| number.to_string() == id && *number < family.n_tags());
+    let allowed = format!(
+        "ID of a tag in its family, 0 to {}, as the name of the table",
+        family.n_tags() - 1
+    );
     let id = number.or_else(|| keys.invalid("id", &Value::from(id), &allowed));
-    let TagKeys { size_m, world_from_tag } = keys.read()?;
-    Some((id?, TagPlacement { size_m, world_from_tag }))
+    let TagKeys {
+        size_m,
+        world_from_tag,
+    } = keys.read()?;
+    Some((
+        id?,
+        TagPlacement {
+            size_m,
+            world_from_tag,
+        },
+    ))
 }
 
 pub(super) fn write(base: &Base) -> Table {
     let tag = |(id, tag): (&u32, &TagPlacement)| {
-        let TagPlacement { size_m, world_from_tag } = *tag;
-        entry(&id.to_string(), &TagKeys { size_m, world_from_tag })
+        let TagPlacement {
+            size_m,
+            world_from_tag,
+        } = *tag;
+        entry(
+            &id.to_string(),
+            &TagKeys {
+                size_m,
+                world_from_tag,
+            },
+        )
     };
     let mut table = base.write_keys();
     if !base.tags.is_empty() {
-        table.insert("tag".to_owned(), Value::Table(base.tags.iter().filter_map(tag).collect()));
+        table.insert(
+            "tag".to_owned(),
+            Value::Table(base.tags.iter().filter_map(tag).collect()),
+        );
     }
     table
 }

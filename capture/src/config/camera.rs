@@ -26,11 +26,11 @@ keys! {
         pub device: String = String::new();
         /// Frame rate, Hz.
         pub rate_hz: f64, in 0.01..=1000.0, required "images per second";
-        /// Exposure time, microseconds, at most one frame period. `None`: automatic; the exposure time of each image is
-        /// then known only if the camera reports it.
+        /// Exposure time, microseconds, at most one frame period. `None`: automatic; the exposure
+        /// time of each image is then known only if the camera reports it.
         pub exposure_micros: Option<f64>, in 0.0..=period_micros(rate_hz);
-        /// Time from the first to the last row, microseconds, at most one frame period; `None` if unknown, 0 for a
-        /// global shutter.
+        /// Time from the first to the last row, microseconds, at most one frame period; `None` if
+        /// unknown, 0 for a global shutter.
         pub readout_micros: Option<f64>, in 0.0..=period_micros(rate_hz);
         /// Time added to a stamp to get mid-exposure; `None` if unknown.
         pub stamp_to_mid_exposure: Option<TimeOffset> as "stamp_to_mid_exposure_millis";
@@ -143,7 +143,8 @@ keys! {
         pub dropped_frac: f64 = 0.0, in 0.0..=0.9;
         /// Rendered samples per pixel along each axis.
         pub supersample: u32 = 1, in 1..=4;
-        /// Standard deviation of the depth noise at 1 m, meters; it grows with the square of the depth.
+        /// Standard deviation of the depth noise at 1 m, meters; it grows with the square of the
+        /// depth.
         pub depth_noise_sigma_m: f64 = 0.0015, in 0.0..=1.0;
         /// Fraction of depth pixels without a reading.
         pub depth_hole_frac: f64 = 0.02, in 0.0..=0.9;
@@ -177,7 +178,9 @@ impl Camera {
     /// Mid-exposure time of an image with this device stamp.
     pub(crate) fn mid_exposure(&self, device_stamp: Stamp) -> Stamp {
         let offset = self.stamp_to_mid_exposure.as_ref();
-        offset.map_or(device_stamp, |offset| device_stamp.plus_secs(offset.value_millis * 1e-3))
+        offset.map_or(device_stamp, |offset| {
+            device_stamp.plus_secs(offset.value_millis * 1e-3)
+        })
     }
 }
 
@@ -205,8 +208,8 @@ pub enum Parent {
     World,
 }
 
-/// Calibration values that are missing in the rig file and not yet reported by the camera. Until then, the rig contains
-/// placeholders that must not be used.
+/// Calibration values that are missing in the rig file and not yet reported by the camera. Until
+/// then, the rig contains placeholders that must not be used.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct UnknownCalibration {
     /// Whether [`Camera::intrinsics`] are unknown, except for the size.
@@ -237,24 +240,45 @@ fn period_micros(rate_hz: Option<f64>) -> f64 {
 
 pub(super) fn read(name: &str, mut keys: Section<'_>) -> Option<Camera> {
     keys.check_name(name);
-    let mut unknown = UnknownCalibration { intrinsics: !keys.has("intrinsics"), ..UnknownCalibration::default() };
+    let mut unknown = UnknownCalibration {
+        intrinsics: !keys.has("intrinsics"),
+        ..UnknownCalibration::default()
+    };
     let size_px = keys.required::<[u32; 2]>("size_px", (), "width and height of the images");
     let rectified = keys.get("rectified", ()).unwrap_or(false);
     let camera = Camera::read_keys(&mut keys);
     // RealSense cameras report their intrinsics.
-    let reports_intrinsics = camera.as_ref().is_some_and(|camera| camera.driver == CameraDriver::Realsense);
+    let reports_intrinsics = camera
+        .as_ref()
+        .is_some_and(|camera| camera.driver == CameraDriver::Realsense);
     if unknown.intrinsics && !reports_intrinsics {
-        keys.missing("intrinsics", "focal_px, principal_px and, for a lens with distortion, lens and distortion");
+        keys.missing(
+            "intrinsics",
+            "focal_px, principal_px and, for a lens with distortion, lens and distortion",
+        );
     }
-    let lens = camera.as_ref().map_or(PLACEHOLDER_INTRINSICS, |camera| camera.intrinsics.clone());
+    let lens = camera
+        .as_ref()
+        .map_or(PLACEHOLDER_INTRINSICS, |camera| camera.intrinsics.clone());
     let intrinsics = Intrinsics {
         size_px: size_px.unwrap_or(lens.size_px),
-        rectified: if unknown.intrinsics { lens.rectified } else { rectified },
+        rectified: if unknown.intrinsics {
+            lens.rectified
+        } else {
+            rectified
+        },
         ..lens
     };
-    let depth = keys.optional_section("depth").map(|keys| depth(keys, &intrinsics, &mut unknown));
+    let depth = keys
+        .optional_section("depth")
+        .map(|keys| depth(keys, &intrinsics, &mut unknown));
     keys.end();
-    let mut camera = Camera { name: name.into(), intrinsics, depth: depth.flatten(), ..camera? };
+    let mut camera = Camera {
+        name: name.into(),
+        intrinsics,
+        depth: depth.flatten(),
+        ..camera?
+    };
     if let Some(lens) = &mut camera.sim.truth.intrinsics {
         (lens.size_px, lens.rectified) = (camera.intrinsics.size_px, camera.intrinsics.rectified);
     }
@@ -264,7 +288,11 @@ pub(super) fn read(name: &str, mut keys: Section<'_>) -> Option<Camera> {
     Some(camera)
 }
 
-fn depth(mut keys: Section<'_>, color: &Intrinsics, unknown: &mut UnknownCalibration) -> Option<Depth> {
+fn depth(
+    mut keys: Section<'_>,
+    color: &Intrinsics,
+    unknown: &mut UnknownCalibration,
+) -> Option<Depth> {
     unknown.depth_intrinsics = !keys.has("intrinsics");
     unknown.camera_from_depth = !keys.has("camera_from_depth");
     let size_px = keys.get("size_px", ()).unwrap_or(color.size_px);
@@ -273,26 +301,43 @@ fn depth(mut keys: Section<'_>, color: &Intrinsics, unknown: &mut UnknownCalibra
     keys.end();
     let depth = depth?;
     let lens = match unknown.depth_intrinsics {
-        // Depth of the same size as the color image is registered to it; depth of another size is assumed to have the
-        // same field of view.
+        // Depth of the same size as the color image is registered to it; depth of another size is
+        // assumed to have the same field of view.
         true if size_px == color.size_px => color.clone(),
         true => color.resized(size_px),
         false => depth.intrinsics,
     };
-    Some(Depth { intrinsics: Intrinsics { size_px, rectified, ..lens }, ..depth })
+    Some(Depth {
+        intrinsics: Intrinsics {
+            size_px,
+            rectified,
+            ..lens
+        },
+        ..depth
+    })
 }
 
 /// Writes the keys of a camera, without calibration that only the camera reports.
 pub(super) fn write(camera: &Camera) -> Table {
-    let Camera { intrinsics, realsense, .. } = camera;
+    let Camera {
+        intrinsics,
+        realsense,
+        ..
+    } = camera;
     let mut table = camera.write_keys();
     table.extend(entry("size_px", &intrinsics.size_px));
-    table.extend(entry("rectified", &(intrinsics.rectified && !realsense.unknown.intrinsics)));
+    table.extend(entry(
+        "rectified",
+        &(intrinsics.rectified && !realsense.unknown.intrinsics),
+    ));
     if realsense.unknown.intrinsics {
         table.remove("intrinsics");
     }
     if let Some(depth) = &camera.depth {
-        table.insert("depth".to_owned(), write_depth(depth, realsense.unknown).into());
+        table.insert(
+            "depth".to_owned(),
+            write_depth(depth, realsense.unknown).into(),
+        );
     }
     table
 }

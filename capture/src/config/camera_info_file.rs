@@ -10,12 +10,20 @@ use toml::{Table, Value};
 
 const KEY: &str = "intrinsics";
 
-/// Replaces paths of camera info files by tables with their contents, for the color and depth images of all cameras of a
-/// rig. Paths are relative to `folder`. Logs notes about their contents.
-pub(super) fn insert_contents(rig: &mut Table, folder: &Path, context: &ParseContext) -> Result<(), ConfigError> {
-    let Some(Value::Table(cameras)) = rig.get_mut("camera") else { return Ok(()) };
+/// Replaces paths of camera info files by tables with their contents, for the color and depth
+/// images of all cameras of a rig. Paths are relative to `folder`. Logs notes about their contents.
+pub(super) fn insert_contents(
+    rig: &mut Table,
+    folder: &Path,
+    context: &ParseContext,
+) -> Result<(), ConfigError> {
+    let Some(Value::Table(cameras)) = rig.get_mut("camera") else {
+        return Ok(());
+    };
     for (name, camera) in cameras {
-        let Value::Table(camera) = camera else { continue };
+        let Value::Table(camera) = camera else {
+            continue;
+        };
         let files = Files { folder, context };
         files.insert(&format!("camera.{name}"), camera, &Table::new())?;
         let color = camera.clone();
@@ -32,9 +40,17 @@ struct Files<'a> {
 }
 
 impl Files<'_> {
-    /// Replaces the path in the table of a camera or of its depth. `defaults` has the keys that are absent in `table`.
-    fn insert(&self, table_path: &str, table: &mut Table, defaults: &Table) -> Result<(), ConfigError> {
-        let Some(Value::String(file)) = table.get(KEY) else { return Ok(()) };
+    /// Replaces the path in the table of a camera or of its depth. `defaults` has the keys that are
+    /// absent in `table`.
+    fn insert(
+        &self,
+        table_path: &str,
+        table: &mut Table,
+        defaults: &Table,
+    ) -> Result<(), ConfigError> {
+        let Some(Value::String(file)) = table.get(KEY) else {
+            return Ok(());
+        };
         let (key, path) = (format!("{table_path}.{KEY}"), self.folder.join(file));
         let rejected = |reason: String| ConfigError::CameraInfo {
             at: self.context.location(&key),
@@ -68,9 +84,24 @@ impl Files<'_> {
         for note in &info.notes {
             log::warn!("{key}: {}: {note}", path.display());
         }
-        let CameraInfo { size_px, focal_px, principal_px, lens, .. } = info;
+        let CameraInfo {
+            size_px,
+            focal_px,
+            principal_px,
+            lens,
+            ..
+        } = info;
         let size_px = size_px.unwrap_or_default(); // Not written: it is a key of the camera.
-        table.extend(entry(KEY, &Intrinsics { size_px, focal_px, principal_px, lens, rectified: false }));
+        table.extend(entry(
+            KEY,
+            &Intrinsics {
+                size_px,
+                focal_px,
+                principal_px,
+                lens,
+                rectified: false,
+            },
+        ));
         Ok(())
     }
 }
@@ -113,17 +144,32 @@ intrinsics = "left.yaml"
         };
         let rig = load(RIG, INFO).expect("a rig");
         assert_eq!(rig.cameras[0].intrinsics, expected);
-        let effective = Rig::parse("rig.toml", &rig.to_toml(), &rig.arm.urdf_text, &[]).expect("no file is needed");
+        let effective = Rig::parse("rig.toml", &rig.to_toml(), &rig.arm.urdf_text, &[])
+            .expect("no file is needed");
         assert_eq!(effective.cameras[0].intrinsics, expected);
 
         let depth = "[camera.front.depth]\nintrinsics = \"left.yaml\"\n";
-        let color = RIG.replace("\"left.yaml\"", "{ focal_px = [500, 500], principal_px = [320, 240] }");
+        let color = RIG.replace(
+            "\"left.yaml\"",
+            "{ focal_px = [500, 500], principal_px = [320, 240] }",
+        );
         let rig = load(&format!("{color}{depth}"), INFO).expect("a rig");
-        assert_eq!(rig.cameras[0].depth.as_ref().map(|depth| &depth.intrinsics), Some(&expected));
+        assert_eq!(
+            rig.cameras[0].depth.as_ref().map(|depth| &depth.intrinsics),
+            Some(&expected)
+        );
         assert_eq!(rig.cameras[0].intrinsics.focal_px, [500.0, 500.0]);
-        let error = load(&format!("{color}{depth}size_px = [320, 240]\n"), INFO).expect_err("another size").to_string();
-        assert!(error.starts_with("rig.toml line 11: camera.front.depth.intrinsics: "), "{error}");
-        assert!(error.contains("640x480 pixels, but size_px is [320.0, 240.0]"), "{error}");
+        let error = load(&format!("{color}{depth}size_px = [320, 240]\n"), INFO)
+            .expect_err("another size")
+            .to_string();
+        assert!(
+            error.starts_with("rig.toml line 11: camera.front.depth.intrinsics: "),
+            "{error}"
+        );
+        assert!(
+            error.contains("640x480 pixels, but size_px is [320.0, 240.0]"),
+            "{error}"
+        );
     }
 
     #[test]
@@ -132,18 +178,46 @@ intrinsics = "left.yaml"
         let rectified = RIG.replace("rate_hz", "rectified = true\nrate_hz");
         let broken = INFO.replace("plumb_bob", "omni");
         for (rig, info, line, expected) in [
-            (other_size.as_str(), INFO, 9, "640x480 pixels, but size_px is [1280.0, 960.0]; calibrate this resolution"),
-            (rectified.as_str(), INFO, 10, "raw images, but rectified = true"),
-            (RIG, broken.as_str(), 9, "distortion_model \"omni\" is not supported"),
+            (
+                other_size.as_str(),
+                INFO,
+                9,
+                "640x480 pixels, but size_px is [1280.0, 960.0]; calibrate this resolution",
+            ),
+            (
+                rectified.as_str(),
+                INFO,
+                10,
+                "raw images, but rectified = true",
+            ),
+            (
+                RIG,
+                broken.as_str(),
+                9,
+                "distortion_model \"omni\" is not supported",
+            ),
             (RIG, "image_width: [", 9, " at line "),
         ] {
             let error = load(rig, info).expect_err(expected).to_string();
-            assert!(error.starts_with(&format!("rig.toml line {line}: camera.front.intrinsics: ")), "{error}");
-            assert!(error.contains("left.yaml") && error.contains(expected), "{error}");
+            assert!(
+                error.starts_with(&format!("rig.toml line {line}: camera.front.intrinsics: ")),
+                "{error}"
+            );
+            assert!(
+                error.contains("left.yaml") && error.contains(expected),
+                "{error}"
+            );
         }
-        let missing = load(&RIG.replace("left", "right"), INFO).expect_err("missing").to_string();
-        assert!(missing.contains("cannot read the lens parameters") && missing.contains("right.yaml"), "{missing}");
-        let tiny = load(RIG, &INFO.replace("[600,", "[0.5,")).expect_err("the range is checked").to_string();
+        let missing = load(&RIG.replace("left", "right"), INFO)
+            .expect_err("missing")
+            .to_string();
+        assert!(
+            missing.contains("cannot read the lens parameters") && missing.contains("right.yaml"),
+            "{missing}"
+        );
+        let tiny = load(RIG, &INFO.replace("[600,", "[0.5,"))
+            .expect_err("the range is checked")
+            .to_string();
         assert!(tiny.contains("camera.front.intrinsics.focal_px"), "{tiny}");
     }
 }

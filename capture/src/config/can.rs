@@ -3,8 +3,8 @@
 use super::key::{Key, Keys, entry, keys};
 use super::section::Section;
 use drivers::can::{
-    AllowedValues, BusConfig, FAMILIES, FollowingLimits, Gains, MotorConfig, MotorFamily, MotorKey, MotorProtocol,
-    MotorSettings, SettingValue,
+    AllowedValues, BusConfig, FAMILIES, FollowingLimits, Gains, MotorConfig, MotorFamily, MotorKey,
+    MotorProtocol, MotorSettings, SettingValue,
 };
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -46,7 +46,12 @@ impl Key for &'static dyn MotorFamily {
     type Limits = ();
 
     fn read(keys: &mut Section<'_>, key: &'static str, (): ()) -> Option<Self> {
-        let named = |value: &Value| FAMILIES.iter().copied().find(|family| value.as_str() == Some(family.name()));
+        let named = |value: &Value| {
+            FAMILIES
+                .iter()
+                .copied()
+                .find(|family| value.as_str() == Some(family.name()))
+        };
         keys.parse(key, named, family_names)
     }
 
@@ -67,8 +72,15 @@ fn quoted<'a>(words: impl IntoIterator<Item = &'a str>) -> String {
 
 /// Reads buses and motors, ordered by name.
 pub(super) fn read(keys: &mut Section<'_>) -> (Vec<BusConfig>, Vec<MotorConfig>) {
-    let buses: Vec<_> = keys.named_sections("bus").into_iter().filter_map(|(name, keys)| bus(name, keys)).collect();
-    let motors = keys.named_sections("motor").into_iter().filter_map(|(joint, keys)| motor(joint, keys, &buses));
+    let buses: Vec<_> = keys
+        .named_sections("bus")
+        .into_iter()
+        .filter_map(|(name, keys)| bus(name, keys))
+        .collect();
+    let motors = keys
+        .named_sections("motor")
+        .into_iter()
+        .filter_map(|(joint, keys)| motor(joint, keys, &buses));
     let motors = motors.collect();
     (buses, motors)
 }
@@ -80,39 +92,85 @@ fn bus(interface: String, keys: Section<'_>) -> Option<BusConfig> {
         let allowed = "an interface name of 1 to 15 characters without spaces and slashes, as the name of the table";
         keys.invalid::<()>("interface", &Value::from(interface.as_str()), allowed);
     }
-    let BusKeys { bitrate_hz, data_bitrate_hz, accept_no_restart } = keys.read()?;
-    Some(BusConfig { interface, bitrate_hz, data_bitrate_hz, accept_no_restart })
+    let BusKeys {
+        bitrate_hz,
+        data_bitrate_hz,
+        accept_no_restart,
+    } = keys.read()?;
+    Some(BusConfig {
+        interface,
+        bitrate_hz,
+        data_bitrate_hz,
+        accept_no_restart,
+    })
 }
 
 /// Reads a motor. Reports an invalid value and returns `None`.
 fn motor(joint: String, mut keys: Section<'_>, buses: &[BusConfig]) -> Option<MotorConfig> {
     let Some(motor) = MotorKeys::read_keys(&mut keys) else {
-        // Without a valid family, the keys of all families are accepted, so that they are not reported as unknown.
-        FAMILIES.iter().flat_map(|family| family.keys()).for_each(|key| drop(keys.take(key.name)));
+        // Without a valid family, the keys of all families are accepted, so that they are not
+        // reported as unknown.
+        FAMILIES
+            .iter()
+            .flat_map(|family| family.keys())
+            .for_each(|key| drop(keys.take(key.name)));
         gains(&mut keys);
         keys.end();
         return None;
     };
-    let MotorKeys { family, bus, id, gear_ratio, reversed: is_reversed, offset_rad, .. } = motor;
+    let MotorKeys {
+        family,
+        bus,
+        id,
+        gear_ratio,
+        reversed: is_reversed,
+        offset_rad,
+        ..
+    } = motor;
     let following = FollowingLimits {
         max_error_rad: motor.max_following_error_rad,
         max_effort_nm: motor.max_effort_nm,
         is_off: motor.accept_following_errors,
     };
-    let bus_ix = buses.iter().position(|known| known.interface == bus).or_else(|| {
-        let interfaces = quoted(buses.iter().map(|bus| &*bus.interface));
-        let allowed = if interfaces.is_empty() { "the name of a table [arm.bus.NAME]".to_owned() } else { interfaces };
-        keys.invalid("bus", &Value::String(bus), &allowed)
-    });
-    let gains = if family.has_gains() { gains(&mut keys) } else { None };
+    let bus_ix = buses
+        .iter()
+        .position(|known| known.interface == bus)
+        .or_else(|| {
+            let interfaces = quoted(buses.iter().map(|bus| &*bus.interface));
+            let allowed = if interfaces.is_empty() {
+                "the name of a table [arm.bus.NAME]".to_owned()
+            } else {
+                interfaces
+            };
+            keys.invalid("bus", &Value::String(bus), &allowed)
+        });
+    let gains = if family.has_gains() {
+        gains(&mut keys)
+    } else {
+        None
+    };
     let protocol = protocol(&mut keys, family, id);
     keys.end();
     let (bus_ix, protocol) = (bus_ix?, protocol?);
-    Some(MotorConfig { joint, bus_ix, protocol, gear_ratio, is_reversed, offset_rad, gains, following })
+    Some(MotorConfig {
+        joint,
+        bus_ix,
+        protocol,
+        gear_ratio,
+        is_reversed,
+        offset_rad,
+        gains,
+        following,
+    })
 }
 
-/// Reads the keys of the family. Reports a required key that is missing or invalid, and returns `None`.
-fn protocol(keys: &mut Section<'_>, family: &dyn MotorFamily, id: u64) -> Option<Arc<dyn MotorProtocol>> {
+/// Reads the keys of the family. Reports a required key that is missing or invalid, and returns
+/// `None`.
+fn protocol(
+    keys: &mut Section<'_>,
+    family: &dyn MotorFamily,
+    id: u64,
+) -> Option<Arc<dyn MotorProtocol>> {
     let mut values = BTreeMap::new();
     for key in family.keys() {
         match (setting(keys, &key), key.required) {
@@ -137,40 +195,80 @@ fn setting(keys: &mut Section<'_>, key: &MotorKey) -> Option<SettingValue> {
         AllowedValues::Whole(range) => keys.get(key.name, range.clone()).map(SettingValue::Whole),
         AllowedValues::Number(range) => keys.get(key.name, range.clone()).map(SettingValue::Number),
         AllowedValues::Words(words) => {
-            let named = |value: &Value| words.iter().copied().find(|word| value.as_str() == Some(word));
-            keys.parse(key.name, named, || quoted(words.iter().copied())).map(SettingValue::Word)
+            let named = |value: &Value| {
+                words
+                    .iter()
+                    .copied()
+                    .find(|word| value.as_str() == Some(word))
+            };
+            keys.parse(key.name, named, || quoted(words.iter().copied()))
+                .map(SettingValue::Word)
         }
     }
 }
 
 /// Reads both gains. Reports an error if only one is set.
 fn gains(keys: &mut Section<'_>) -> Option<Gains> {
-    let GainKeys { stiffness_nm_rad, damping_nm_s_rad } = GainKeys::read_keys(keys)?;
+    let GainKeys {
+        stiffness_nm_rad,
+        damping_nm_s_rad,
+    } = GainKeys::read_keys(keys)?;
     match (stiffness_nm_rad, damping_nm_s_rad) {
         (Some(_), None) => keys.missing("damping_nm_s_rad", "required with stiffness_nm_rad"),
         (None, Some(_)) => keys.missing("stiffness_nm_rad", "required with damping_nm_s_rad"),
         _ => {}
     }
-    Some(Gains { stiffness_nm_rad: stiffness_nm_rad?, damping_nm_s_rad: damping_nm_s_rad? })
+    Some(Gains {
+        stiffness_nm_rad: stiffness_nm_rad?,
+        damping_nm_s_rad: damping_nm_s_rad?,
+    })
 }
 
 /// The tables of buses and motors that are not empty.
 pub(super) fn write(buses: &[BusConfig], motors: &[MotorConfig]) -> Table {
     let bus = |bus: &BusConfig| {
-        let BusConfig { bitrate_hz, data_bitrate_hz, accept_no_restart, .. } = *bus;
-        entry(&bus.interface, &BusKeys { bitrate_hz, data_bitrate_hz, accept_no_restart })
+        let BusConfig {
+            bitrate_hz,
+            data_bitrate_hz,
+            accept_no_restart,
+            ..
+        } = *bus;
+        entry(
+            &bus.interface,
+            &BusKeys {
+                bitrate_hz,
+                data_bitrate_hz,
+                accept_no_restart,
+            },
+        )
     };
-    let motor =
-        |motor: &MotorConfig| (motor.joint.clone(), Value::Table(write_motor(motor, &buses[motor.bus_ix].interface)));
-    let tables: [(_, Table); 2] =
-        [("bus", buses.iter().filter_map(bus).collect()), ("motor", motors.iter().map(motor).collect())];
+    let motor = |motor: &MotorConfig| {
+        (
+            motor.joint.clone(),
+            Value::Table(write_motor(motor, &buses[motor.bus_ix].interface)),
+        )
+    };
+    let tables: [(_, Table); 2] = [
+        ("bus", buses.iter().filter_map(bus).collect()),
+        ("motor", motors.iter().map(motor).collect()),
+    ];
     let filled = tables.into_iter().filter(|(_, tables)| !tables.is_empty());
-    filled.map(|(key, tables)| (key.to_owned(), Value::Table(tables))).collect()
+    filled
+        .map(|(key, tables)| (key.to_owned(), Value::Table(tables)))
+        .collect()
 }
 
 fn write_motor(motor: &MotorConfig, bus: &str) -> Table {
-    let MotorConfig { gear_ratio, is_reversed: reversed, offset_rad, gains, following, .. } = *motor;
-    let (family, MotorSettings { id, values }) = (motor.protocol.family(), motor.protocol.settings());
+    let MotorConfig {
+        gear_ratio,
+        is_reversed: reversed,
+        offset_rad,
+        gains,
+        following,
+        ..
+    } = *motor;
+    let (family, MotorSettings { id, values }) =
+        (motor.protocol.family(), motor.protocol.settings());
     let gains = GainKeys {
         stiffness_nm_rad: gains.map(|gains| gains.stiffness_nm_rad),
         damping_nm_s_rad: gains.map(|gains| gains.damping_nm_s_rad),
@@ -187,7 +285,11 @@ fn write_motor(motor: &MotorConfig, bus: &str) -> Table {
         accept_following_errors: following.is_off,
     };
     let mut table = keys.write_keys();
-    table.extend(values.into_iter().filter_map(|(name, value)| Some((name.to_owned(), write_setting(value)?))));
+    table.extend(
+        values
+            .into_iter()
+            .filter_map(|(name, value)| Some((name.to_owned(), write_setting(value)?))),
+    );
     table.extend(gains.write_keys());
     table
 }

@@ -1,7 +1,9 @@
-//! Reads, checks and writes the values of keys according to their types, and defines structs whose fields are keys.
+//! Reads, checks and writes the values of keys according to their types, and defines structs whose
+//! fields are keys.
 //!
-//! serde is not used, because its derived code has no ranges and stops at the first problem. Here, all problems are
-//! collected, so that a misspelled key is reported as unknown, and not the correct key as missing.
+//! serde is not used, because its derived code has no ranges and stops at the first problem. Here,
+//! all problems are collected, so that a misspelled key is reported as unknown, and not the correct
+//! key as missing.
 
 use super::section::Section;
 use std::borrow::Cow;
@@ -30,8 +32,8 @@ pub(super) trait Optional: Key {
 
 /// A struct whose fields are keys of one table, defined by [`keys!`].
 pub(super) trait Keys: Sized {
-    /// Reads the fields. Reports a required key that is missing, or an invalid value without default, and returns
-    /// `None`.
+    /// Reads the fields. Reports a required key that is missing, or an invalid value without
+    /// default, and returns `None`.
     fn read_keys(keys: &mut Section<'_>) -> Option<Self>;
 
     /// Writes the fields to a table.
@@ -54,17 +56,18 @@ macro_rules! choices {
 }
 pub(super) use choices;
 
-/// Defines structs whose fields are keys of one table, with everything that a rig file needs to know of a key:
+/// Defines structs whose fields are keys of one table, with everything that a rig file needs to
+/// know of a key:
 ///
 /// ```text
 /// pub name: Type as "key" = default, in limits, required "meaning" => initial;
 /// ```
 ///
 /// - `as "key"`: the key, if it differs from the name of the field.
-/// - `= default`: the value if the key is absent. It may use earlier fields. Without a default, the key is required, or
-///   the type is [`Optional`].
-/// - `in limits`: the allowed values, [`Key::Limits`]. They may use earlier fields, which are options if they have no
-///   default.
+/// - `= default`: the value if the key is absent. It may use earlier fields. Without a default, the
+///   key is required, or the type is [`Optional`].
+/// - `in limits`: the allowed values, [`Key::Limits`]. They may use earlier fields, which are
+///   options if they have no default.
 /// - `required "meaning"`: an absent key is reported, with its meaning.
 /// - `=> initial`: the field is not a key; code that reads the struct sets it afterwards.
 macro_rules! keys {
@@ -150,7 +153,11 @@ impl Section<'_> {
     }
 
     /// The value of a key that may be absent.
-    pub(super) fn get_optional<T: Optional>(&mut self, key: &'static str, limits: T::Limits) -> Option<T> {
+    pub(super) fn get_optional<T: Optional>(
+        &mut self,
+        key: &'static str,
+        limits: T::Limits,
+    ) -> Option<T> {
         T::read(self, key, limits).or_else(|| T::absent(self, key))
     }
 
@@ -198,8 +205,18 @@ impl Key for f64 {
     type Limits = RangeInclusive<Self>;
 
     fn read(keys: &mut Section<'_>, key: &'static str, limits: Self::Limits) -> Option<Self> {
-        let allowed = || format!("numbers from {} to {}", rounded(*limits.start()), rounded(*limits.end()));
-        keys.parse(key, |value| number(value).filter(|number| limits.contains(number)), allowed)
+        let allowed = || {
+            format!(
+                "numbers from {} to {}",
+                rounded(*limits.start()),
+                rounded(*limits.end())
+            )
+        };
+        keys.parse(
+            key,
+            |value| number(value).filter(|number| limits.contains(number)),
+            allowed,
+        )
     }
 
     fn write(&self) -> Option<Value> {
@@ -209,13 +226,22 @@ impl Key for f64 {
 
 /// Rounds a limit for messages, so that limits computed by a division have few digits.
 fn rounded(limit: f64) -> f64 {
-    if limit.abs() < 1.0 { limit } else { (limit * 1e3).round() / 1e3 }
+    if limit.abs() < 1.0 {
+        limit
+    } else {
+        (limit * 1e3).round() / 1e3
+    }
 }
 
 /// Converts integers and finite floats.
 pub(super) fn number(value: &Value) -> Option<f64> {
-    #[expect(clippy::cast_precision_loss, reason = "numbers of a rig file stay far below 2^53")]
-    let number = value.as_float().or_else(|| value.as_integer().map(|whole| whole as f64))?;
+    #[expect(
+        clippy::cast_precision_loss,
+        reason = "numbers of a rig file stay far below 2^53"
+    )]
+    let number = value
+        .as_float()
+        .or_else(|| value.as_integer().map(|whole| whole as f64))?;
     number.is_finite().then_some(number)
 }
 
@@ -237,7 +263,11 @@ impl Key for Vec<f64> {
     type Limits = ();
 
     fn read(keys: &mut Section<'_>, key: &'static str, (): ()) -> Option<Self> {
-        keys.parse(key, |value| list(value, number), || "a list of numbers".into())
+        keys.parse(
+            key,
+            |value| list(value, number),
+            || "a list of numbers".into(),
+        )
     }
 
     fn write(&self) -> Option<Value> {
@@ -301,16 +331,25 @@ impl<T: Choice> Key for T {
     }
 
     fn write(&self) -> Option<Value> {
-        T::NAMES.iter().find(|(_, choice)| choice == self).map(|(name, _)| (*name).into())
+        T::NAMES
+            .iter()
+            .find(|(_, choice)| choice == self)
+            .map(|(name, _)| (*name).into())
     }
 }
 
 fn choice<T: Choice>(value: &Value) -> Option<T> {
-    T::NAMES.iter().find(|(name, _)| value.as_str() == Some(name)).map(|(_, choice)| *choice)
+    T::NAMES
+        .iter()
+        .find(|(name, _)| value.as_str() == Some(name))
+        .map(|(_, choice)| *choice)
 }
 
 fn names<T: Choice>() -> String {
-    let names: Vec<_> = T::NAMES.iter().map(|(name, _)| format!("{name:?}")).collect();
+    let names: Vec<_> = T::NAMES
+        .iter()
+        .map(|(name, _)| format!("{name:?}"))
+        .collect();
     names.join(", ")
 }
 
@@ -329,8 +368,15 @@ impl<T: Choice> Key for Vec<T> {
 }
 
 /// Converts a value, or the items of a list that contains no item twice.
-pub(super) fn distinct<T: PartialEq>(value: &Value, item: impl Fn(&Value) -> Option<T>) -> Option<Vec<T>> {
-    let values = value.as_array().map_or(std::slice::from_ref(value), Vec::as_slice);
+pub(super) fn distinct<T: PartialEq>(
+    value: &Value,
+    item: impl Fn(&Value) -> Option<T>,
+) -> Option<Vec<T>> {
+    let values = value
+        .as_array()
+        .map_or(std::slice::from_ref(value), Vec::as_slice);
     let items: Vec<T> = values.iter().map(item).collect::<Option<_>>()?;
-    (1..items.len()).all(|ix| !items[..ix].contains(&items[ix])).then_some(items)
+    (1..items.len())
+        .all(|ix| !items[..ix].contains(&items[ix]))
+        .then_some(items)
 }

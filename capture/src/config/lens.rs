@@ -6,9 +6,15 @@ use super::section::Section;
 use kinematics::{Intrinsics, Lens};
 use toml::Value;
 
-/// Placeholder until the camera reports its intrinsics, and in a rig with missing keys, which is never returned.
-pub(super) const PLACEHOLDER_INTRINSICS: Intrinsics =
-    Intrinsics { size_px: [1, 1], focal_px: [1.0; 2], principal_px: [0.5; 2], lens: Lens::Pinhole, rectified: true };
+/// Placeholder until the camera reports its intrinsics, and in a rig with missing keys, which is
+/// never returned.
+pub(super) const PLACEHOLDER_INTRINSICS: Intrinsics = Intrinsics {
+    size_px: [1, 1],
+    focal_px: [1.0; 2],
+    principal_px: [0.5; 2],
+    lens: Lens::Pinhole,
+    rectified: true,
+};
 
 keys! {
     /// The keys in tables named `intrinsics`.
@@ -38,23 +44,47 @@ impl Key for Intrinsics {
     type Limits = ();
 
     fn read(keys: &mut Section<'_>, key: &'static str, (): ()) -> Option<Self> {
-        let LensKeys { focal_px, principal_px, lens, distortion } = keys.get(key, ())?;
+        let LensKeys {
+            focal_px,
+            principal_px,
+            lens,
+            distortion,
+        } = keys.get(key, ())?;
         let lens = match (lens, &distortion[..]) {
             // Some drivers print a pinhole as five zeros.
-            (LensModel::Pinhole, coefficients) if coefficients.iter().all(|k| *k == 0.0) => Ok(Lens::Pinhole),
-            (LensModel::Pinhole, _) => Err("none with lens = \"pinhole\"; set lens to brown_conrady or kannala_brandt"),
-            (LensModel::BrownConrady, [k1, k2, p1, p2, k3]) => Ok(Lens::BrownConrady([*k1, *k2, *p1, *p2, *k3])),
-            (LensModel::BrownConrady, [k1, k2, p1, p2, k3, k4, k5, k6]) => {
-                Ok(Lens::RationalBrownConrady([*k1, *k2, *p1, *p2, *k3, *k4, *k5, *k6]))
+            (LensModel::Pinhole, coefficients) if coefficients.iter().all(|k| *k == 0.0) => {
+                Ok(Lens::Pinhole)
             }
-            (LensModel::KannalaBrandt, [k1, k2, k3, k4]) => Ok(Lens::KannalaBrandt([*k1, *k2, *k3, *k4])),
+            (LensModel::Pinhole, _) => {
+                Err("none with lens = \"pinhole\"; set lens to brown_conrady or kannala_brandt")
+            }
+            (LensModel::BrownConrady, [k1, k2, p1, p2, k3]) => {
+                Ok(Lens::BrownConrady([*k1, *k2, *p1, *p2, *k3]))
+            }
+            (LensModel::BrownConrady, [k1, k2, p1, p2, k3, k4, k5, k6]) => {
+                Ok(Lens::RationalBrownConrady([
+                    *k1, *k2, *p1, *p2, *k3, *k4, *k5, *k6,
+                ]))
+            }
+            (LensModel::KannalaBrandt, [k1, k2, k3, k4]) => {
+                Ok(Lens::KannalaBrandt([*k1, *k2, *k3, *k4]))
+            }
             _ => Err(
                 "5 (k1, k2, p1, p2, k3) or 8 (k1, k2, p1, p2, k3, k4, k5, k6) for brown_conrady, 4 (k1, k2, k3, k4) for kannala_brandt",
             ),
         };
         match lens {
-            Ok(lens) => Some(Self { focal_px, principal_px, lens, ..PLACEHOLDER_INTRINSICS }),
-            Err(allowed) => keys.invalid(&format!("{key}.distortion"), &Value::from(distortion), allowed),
+            Ok(lens) => Some(Self {
+                focal_px,
+                principal_px,
+                lens,
+                ..PLACEHOLDER_INTRINSICS
+            }),
+            Err(allowed) => keys.invalid(
+                &format!("{key}.distortion"),
+                &Value::from(distortion),
+                allowed,
+            ),
         }
     }
 
@@ -65,8 +95,18 @@ impl Key for Intrinsics {
             Lens::RationalBrownConrady(k) => (LensModel::BrownConrady, k),
             Lens::KannalaBrandt(k) => (LensModel::KannalaBrandt, k),
         };
-        let Self { focal_px, principal_px, .. } = *self;
-        LensKeys { focal_px, principal_px, lens, distortion: distortion.to_vec() }.write()
+        let Self {
+            focal_px,
+            principal_px,
+            ..
+        } = *self;
+        LensKeys {
+            focal_px,
+            principal_px,
+            lens,
+            distortion: distortion.to_vec(),
+        }
+        .write()
     }
 }
 
@@ -79,7 +119,11 @@ impl Key for [u32; 2] {
         if width.fract() != 0.0 || height.fract() != 0.0 {
             return keys.invalid(key, &Value::from(vec![width, height]), "whole numbers");
         }
-        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "whole numbers up to 16384")]
+        #[expect(
+            clippy::cast_possible_truncation,
+            clippy::cast_sign_loss,
+            reason = "whole numbers up to 16384"
+        )]
         Some([width as u32, height as u32])
     }
 

@@ -1,7 +1,8 @@
 //! The rig file: TOML -> checked types, and back to the effective rig file that reproduces a run.
 //!
-//! Every key is in `docs/reference/rig.md`. Unknown keys are errors; flags override keys of the same name. In the code,
-//! a key is a field of the struct of its table, with its default and range (macro `keys!`).
+//! Every key is in `docs/reference/rig.md`. Unknown keys are errors; flags override keys of the
+//! same name. In the code, a key is a field of the struct of its table, with its default and range
+//! (macro `keys!`).
 
 mod arm;
 mod base;
@@ -24,7 +25,9 @@ mod train;
 
 pub use arm::{Arm, ArmDriver};
 pub use base::{Base, BaseDriver, BaseSim};
-pub use camera::{Camera, CameraDriver, CameraSim, Depth, Parent, Realsense, TimeOffset, UnknownCalibration, V4l2};
+pub use camera::{
+    Camera, CameraDriver, CameraSim, Depth, Parent, Realsense, TimeOffset, UnknownCalibration, V4l2,
+};
 pub use error::{ConfigError, SourceLocation};
 pub use join::JoinConfig;
 pub use motion::ArmMotion;
@@ -61,10 +64,14 @@ pub struct Override {
 }
 
 impl Override {
-    /// Creates an override of `key`, a dotted path as in `docs/reference/rig.md`, such as `train.seed`.
+    /// Creates an override of `key`, a dotted path as in `docs/reference/rig.md`, such as
+    /// `train.seed`.
     #[must_use]
     pub fn new(key: &'static str, value: impl Into<toml::Value>) -> Self {
-        Self { key, value: value.into() }
+        Self {
+            key,
+            value: value.into(),
+        }
     }
 }
 
@@ -75,21 +82,29 @@ impl Rig {
         self.base.driver != BaseDriver::Fixed
     }
 
-    /// Reads and checks a rig file, and the robot description and camera info files that it names. Paths in the rig become
-    /// absolute.
+    /// Reads and checks a rig file, and the robot description and camera info files that it names.
+    /// Paths in the rig become absolute.
     ///
     /// # Errors
     ///
-    /// If a file cannot be read, the text is not TOML, a key is unknown or missing, a value is not allowed, or the
-    /// robot description does not match. An unknown key is reported before any other problem with keys.
+    /// If a file cannot be read, the text is not TOML, a key is unknown or missing, a value is not
+    /// allowed, or the robot description does not match. An unknown key is reported before any
+    /// other problem with keys.
     pub fn load(path: &Path, overrides: &[Override]) -> Result<Self, ConfigError> {
         let text = read_file("the rig file", path)?;
-        let file =
-            path.file_name().map_or_else(|| path.display().to_string(), |name| name.to_string_lossy().into_owned());
+        let file = path.file_name().map_or_else(
+            || path.display().to_string(),
+            |name| name.to_string_lossy().into_owned(),
+        );
         let folder = path.parent().unwrap_or(Path::new("")).to_owned();
         let read_urdf = |urdf: &str| read_file("the robot description", &folder.join(urdf));
         let mut rig = rig_file::read(&file, &text, overrides, Some(&folder), read_urdf)?;
-        if let Some(motion) = rig.arm.motion.as_mut().filter(|motion| !motion.odrive_endpoints.is_empty()) {
+        if let Some(motion) = rig
+            .arm
+            .motion
+            .as_mut()
+            .filter(|motion| !motion.odrive_endpoints.is_empty())
+        {
             // An absolute path stays valid in the effective rig file, which is in another folder.
             let path = folder.join(&motion.odrive_endpoints);
             let path = std::path::absolute(&path).map_err(|source| ConfigError::Read {
@@ -99,7 +114,11 @@ impl Rig {
             })?;
             motion.odrive_endpoints = path.to_string_lossy().into_owned();
         }
-        for camera in rig.cameras.iter_mut().filter(|camera| !camera.realsense.file.as_os_str().is_empty()) {
+        for camera in rig
+            .cameras
+            .iter_mut()
+            .filter(|camera| !camera.realsense.file.as_os_str().is_empty())
+        {
             // The effective rig file is in another folder.
             let file = folder.join(&camera.realsense.file);
             camera.realsense.file = std::path::absolute(&file).unwrap_or(file);
@@ -107,33 +126,42 @@ impl Rig {
         Ok(rig)
     }
 
-    /// The folder of the robot description that a rig file names; `None` if it names none or cannot be read. Mesh files
-    /// are named relative to this folder.
+    /// The folder of the robot description that a rig file names; `None` if it names none or cannot
+    /// be read. Mesh files are named relative to this folder.
     #[must_use]
     pub fn urdf_folder(path: &Path) -> Option<PathBuf> {
         let table: toml::Table = toml::from_str(&files::read_text(path).ok()?).ok()?;
-        let urdf = path.parent().unwrap_or(Path::new("")).join(table.get("arm")?.get("urdf")?.as_str()?);
+        let urdf = path
+            .parent()
+            .unwrap_or(Path::new(""))
+            .join(table.get("arm")?.get("urdf")?.as_str()?);
         std::path::absolute(urdf).ok()?.parent().map(Path::to_owned)
     }
 
-    /// Checks the text of a rig file and the robot description `urdf_text`; `file` is the name used in messages.
+    /// Checks the text of a rig file and the robot description `urdf_text`; `file` is the name used
+    /// in messages.
     ///
     /// # Errors
     ///
     /// As for [`Rig::load`], except for errors of reading files.
-    pub fn parse(file: &str, text: &str, urdf_text: &str, overrides: &[Override]) -> Result<Self, ConfigError> {
+    pub fn parse(
+        file: &str,
+        text: &str,
+        urdf_text: &str,
+        overrides: &[Override],
+    ) -> Result<Self, ConfigError> {
         rig_file::read(file, text, overrides, None, |_| Ok(urdf_text.to_owned()))
     }
 
-    /// The effective rig file with every key, from which the same rig can be read. It expects the robot description
-    /// next to it.
+    /// The effective rig file with every key, from which the same rig can be read. It expects the
+    /// robot description next to it.
     #[must_use]
     pub fn to_toml(&self) -> String {
         rig_file::write(self)
     }
 
-    /// Whether the calibration is the same: extrinsics, intrinsics, time offsets and depth of the cameras, and joint
-    /// offsets.
+    /// Whether the calibration is the same: extrinsics, intrinsics, time offsets and depth of the
+    /// cameras, and joint offsets.
     #[must_use]
     pub fn has_same_calibration(&self, other: &Self) -> bool {
         const TOLERANCE: f64 = 1e-9; // Writing and reading a pose may change its last bit.
@@ -150,29 +178,47 @@ impl Rig {
         };
         self.arm.joint_offsets == other.arm.joint_offsets
             && self.cameras.len() == other.cameras.len()
-            && self.cameras.iter().zip(&other.cameras).all(|(one, other)| is_same(one, other))
+            && self
+                .cameras
+                .iter()
+                .zip(&other.cameras)
+                .all(|(one, other)| is_same(one, other))
     }
 
     /// Returns the same rig with a single scene model.
     #[must_use]
     pub fn with_method(&self, name: &str) -> Self {
         let methods = self.train.methods.with_single(name);
-        Self { train: Train { methods, ..self.train.clone() }, ..self.clone() }
+        Self {
+            train: Train {
+                methods,
+                ..self.train.clone()
+            },
+            ..self.clone()
+        }
     }
 
-    /// Writes the effective rig file and the robot description into a folder; returns the path of the rig file.
+    /// Writes the effective rig file and the robot description into a folder; returns the path of
+    /// the rig file.
     ///
     /// # Errors
     ///
     /// If a file cannot be written.
     pub fn write_resolved(&self, folder: &Path) -> std::io::Result<PathBuf> {
         let path = folder.join(drivers::recording::RIG_FILE);
-        files::write(&folder.join(drivers::recording::URDF_FILE), &self.arm.urdf_text)?;
+        files::write(
+            &folder.join(drivers::recording::URDF_FILE),
+            &self.arm.urdf_text,
+        )?;
         files::write(&path, self.to_toml())?;
         Ok(path)
     }
 }
 
 fn read_file(description: &'static str, path: &Path) -> Result<String, ConfigError> {
-    files::read_text(path).map_err(|source| ConfigError::Read { description, path: path.to_owned(), source })
+    files::read_text(path).map_err(|source| ConfigError::Read {
+        description,
+        path: path.to_owned(),
+        source,
+    })
 }

@@ -8,8 +8,8 @@ use toml::Value;
 
 /// Larger coordinates of poses and lenses are considered typing errors.
 pub(super) const MAX_COORDINATE: f64 = 1e4;
-/// A quaternion whose length deviates from 1 by less than this is not normalized, so that an effective rig file gives
-/// exactly the same rig.
+/// A quaternion whose length deviates from 1 by less than this is not normalized, so that an
+/// effective rig file gives exactly the same rig.
 const UNIT_NORM_TOLERANCE: f64 = 1e-12;
 
 keys! {
@@ -24,12 +24,19 @@ impl Key for Transform {
     type Limits = ();
 
     fn read(keys: &mut Section<'_>, key: &'static str, (): ()) -> Option<Self> {
-        let PoseKeys { xyz_m: [x, y, z], quat_xyzw: [i, j, k, w] } = keys.get(key, ())?;
+        let PoseKeys {
+            xyz_m: [x, y, z],
+            quat_xyzw: [i, j, k, w],
+        } = keys.get(key, ())?;
         let quaternion = Quaternion::new(w, i, j, k);
         let norm = quaternion.norm();
         if (norm - 1.0).abs() > 1e-3 {
             let got = Value::from(vec![i, j, k, w]);
-            return keys.invalid(&format!("{key}.quat_xyzw"), &got, "numbers whose squares sum to 1");
+            return keys.invalid(
+                &format!("{key}.quat_xyzw"),
+                &got,
+                "numbers whose squares sum to 1",
+            );
         }
         let rotation = match (norm - 1.0).abs() < UNIT_NORM_TOLERANCE {
             true => UnitQuaternion::new_unchecked(quaternion),
@@ -40,6 +47,10 @@ impl Key for Transform {
 
     fn write(&self) -> Option<Value> {
         let Quaternion { coords } = *self.rotation.quaternion();
-        PoseKeys { xyz_m: self.translation.vector.into(), quat_xyzw: coords.into() }.write()
+        PoseKeys {
+            xyz_m: self.translation.vector.into(),
+            quat_xyzw: coords.into(),
+        }
+        .write()
     }
 }

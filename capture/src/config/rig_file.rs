@@ -9,8 +9,8 @@ use toml::{Table, Value};
 /// Robot description of a rig without an arm, if the rig file names none.
 const EMPTY_URDF: &str = r#"<robot name="none"><link name="base"/></robot>"#;
 
-/// Reads a rig; `read_urdf` returns the robot description for the path in the file. Lens parameters may be in other files
-/// only if the folder of the rig file is given.
+/// Reads a rig; `read_urdf` returns the robot description for the path in the file. Lens parameters
+/// may be in other files only if the folder of the rig file is given.
 pub(super) fn read(
     file: &str,
     text: &str,
@@ -23,22 +23,33 @@ pub(super) fn read(
         return Err(problem);
     }
     let (mut rig, urdf_path) = rig.expect("without problems, there is a rig");
-    rig.arm.urdf_text = if urdf_path.is_empty() { EMPTY_URDF.to_owned() } else { read_urdf(&urdf_path)? };
+    rig.arm.urdf_text = if urdf_path.is_empty() {
+        EMPTY_URDF.to_owned()
+    } else {
+        read_urdf(&urdf_path)?
+    };
     arm::resolve_joints(file, &mut rig.arm)?;
     Ok(rig)
 }
 
-/// Reads all keys. Returns the rig without its robot description, the path of the description, and the problems found.
-/// Without problems, the rig is present.
+/// Reads all keys. Returns the rig without its robot description, the path of the description, and
+/// the problems found. Without problems, the rig is present.
 pub(super) fn keys(
     file: &str,
     text: &str,
     overrides: &[Override],
     folder: Option<&Path>,
 ) -> Result<(Option<(Rig, String)>, ParseContext), ConfigError> {
-    let context = ParseContext::new(file, text, overrides.iter().map(|flag| flag.key.to_owned()).collect())?;
-    let syntax =
-        |e: toml::de::Error| ConfigError::Syntax { file: file.to_owned(), line: 1, message: e.message().to_owned() };
+    let context = ParseContext::new(
+        file,
+        text,
+        overrides.iter().map(|flag| flag.key.to_owned()).collect(),
+    )?;
+    let syntax = |e: toml::de::Error| ConfigError::Syntax {
+        file: file.to_owned(),
+        line: 1,
+        message: e.message().to_owned(),
+    };
     let mut table: Table = toml::from_str(text).map_err(syntax)?;
     for flag in overrides {
         set(&mut table, flag.key, flag.value.clone());
@@ -57,9 +68,15 @@ fn rig(mut root: Section<'_>) -> Option<(Rig, String)> {
     if cameras.is_empty() {
         root.missing("camera", "at least one table [camera.NAME]");
     }
-    let cameras: Vec<_> = cameras.into_iter().map(|(name, keys)| camera::read(&name, keys)).collect();
+    let cameras: Vec<_> = cameras
+        .into_iter()
+        .map(|(name, keys)| camera::read(&name, keys))
+        .collect();
     let scanners = root.named_sections("range");
-    let scanners: Vec<_> = scanners.into_iter().map(|(name, keys)| scanner::read(&name, keys)).collect();
+    let scanners: Vec<_> = scanners
+        .into_iter()
+        .map(|(name, keys)| scanner::read(&name, keys))
+        .collect();
     let join = root.get_optional("join", ());
     let train = root.get_optional("train", ());
     let sim = sim::read(root.section("sim"));
@@ -67,7 +84,15 @@ fn rig(mut root: Section<'_>) -> Option<(Rig, String)> {
     let (arm, urdf_path) = arm?;
     let cameras = cameras.into_iter().collect::<Option<_>>()?;
     let scanners = scanners.into_iter().collect::<Option<_>>()?;
-    let rig = Rig { arm, base: base?, cameras, scanners, join: join?, train: train?, sim: sim? };
+    let rig = Rig {
+        arm,
+        base: base?,
+        cameras,
+        scanners,
+        join: join?,
+        train: train?,
+        sim: sim?,
+    };
     Some((rig, urdf_path))
 }
 
@@ -78,7 +103,9 @@ fn set(table: &mut Table, key: &str, value: Value) {
             table.insert(key.to_owned(), value);
         }
         Some((parent, rest)) => {
-            let inner = table.entry(parent.to_owned()).or_insert_with(|| Value::Table(Table::new()));
+            let inner = table
+                .entry(parent.to_owned())
+                .or_insert_with(|| Value::Table(Table::new()));
             if let Value::Table(inner) = inner {
                 set(inner, rest, value);
             }
@@ -86,10 +113,17 @@ fn set(table: &mut Table, key: &str, value: Value) {
     }
 }
 
-/// Writes the effective rig file, which contains every key of a checked rig. Reading it gives the same rig.
+/// Writes the effective rig file, which contains every key of a checked rig. Reading it gives the
+/// same rig.
 pub(super) fn write(rig: &Rig) -> String {
-    let cameras = rig.cameras.iter().map(|camera| (camera.name.to_string(), Value::Table(camera::write(camera))));
-    let scanners = rig.scanners.iter().filter_map(|scanner| entry(&scanner.name, scanner));
+    let cameras = rig
+        .cameras
+        .iter()
+        .map(|camera| (camera.name.to_string(), Value::Table(camera::write(camera))));
+    let scanners = rig
+        .scanners
+        .iter()
+        .filter_map(|scanner| entry(&scanner.name, scanner));
     let tables = [
         ("arm", arm::write(&rig.arm)),
         ("base", base::write(&rig.base)),
@@ -97,7 +131,14 @@ pub(super) fn write(rig: &Rig) -> String {
         ("range", scanners.collect()),
         ("sim", sim::write(&rig.sim)),
     ];
-    let mut file: Table = tables.into_iter().map(|(key, table)| (key.to_owned(), Value::Table(table))).collect();
-    file.extend(entry("join", &rig.join).into_iter().chain(entry("train", &rig.train)));
+    let mut file: Table = tables
+        .into_iter()
+        .map(|(key, table)| (key.to_owned(), Value::Table(table)))
+        .collect();
+    file.extend(
+        entry("join", &rig.join)
+            .into_iter()
+            .chain(entry("train", &rig.train)),
+    );
     toml::to_string(&file).expect("tables of numbers and texts always serialize")
 }

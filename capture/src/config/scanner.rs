@@ -66,5 +66,8 @@ pub(super) fn read(name: &str, mut keys: Section<'_>) -> Option<Scanner> {
     keys.check_name(name);
     let scanner = Scanner::read_keys(&mut keys);
     keys.end();
-    Some(Scanner { name: name.into(), ..scanner? })
+    Some(Scanner {
+        name: name.into(),
+        ..scanner?
+    })
 }

@@ -29,9 +29,18 @@ pub(super) struct ParseContext {
 
 impl ParseContext {
     /// Records the lines of all keys; fails if the text is not TOML.
-    pub(super) fn new(file: &str, text: &str, flags: BTreeSet<String>) -> Result<Self, ConfigError> {
+    pub(super) fn new(
+        file: &str,
+        text: &str,
+        flags: BTreeSet<String>,
+    ) -> Result<Self, ConfigError> {
         let mut lines = BTreeMap::new();
-        let ends: Vec<usize> = text.bytes().enumerate().filter(|(_, byte)| *byte == b'\n').map(|(at, _)| at).collect();
+        let ends: Vec<usize> = text
+            .bytes()
+            .enumerate()
+            .filter(|(_, byte)| *byte == b'\n')
+            .map(|(at, _)| at)
+            .collect();
         let line_of = |offset: usize| ends.partition_point(|end| *end < offset) + 1;
         let table = DeTable::parse(text).map_err(|e| ConfigError::Syntax {
             file: file.to_owned(),
@@ -49,12 +58,17 @@ impl ParseContext {
         })
     }
 
-    /// The problems, if there are any, as one error. Unknown keys come first, because they explain missing keys.
+    /// The problems, if there are any, as one error. Unknown keys come first, because they explain
+    /// missing keys.
     pub(super) fn into_problem(self) -> Option<ConfigError> {
         let is_unknown = |problem: &ConfigError| matches!(problem, ConfigError::UnknownKey { .. });
-        let (mut problems, others): (Vec<_>, Vec<_>) = self.problems.into_inner().into_iter().partition(is_unknown);
+        let (mut problems, others): (Vec<_>, Vec<_>) =
+            self.problems.into_inner().into_iter().partition(is_unknown);
         problems.sort_by_key(|problem| match problem {
-            ConfigError::UnknownKey { at: SourceLocation::Line { line, .. }, .. } => *line,
+            ConfigError::UnknownKey {
+                at: SourceLocation::Line { line, .. },
+                ..
+            } => *line,
             _ => 0,
         });
         let meant = |key: &str| {
@@ -63,13 +77,20 @@ impl ParseContext {
                 .any(|problem| matches!(problem, ConfigError::UnknownKey { nearest: Some(meant), .. } if meant == key))
         };
         let is_meant = |problem: &ConfigError| matches!(problem, ConfigError::Missing { key, .. } if meant(key));
-        let others: Vec<_> = others.into_iter().filter(|problem| !is_meant(problem)).collect();
+        let others: Vec<_> = others
+            .into_iter()
+            .filter(|problem| !is_meant(problem))
+            .collect();
         problems.extend(others);
         let first = (!problems.is_empty()).then(|| problems.remove(0))?;
         Some(if problems.is_empty() {
             first
         } else {
-            ConfigError::Several { first: Box::new(first), others: problems, n_more: self.n_more_problems.get() }
+            ConfigError::Several {
+                first: Box::new(first),
+                others: problems,
+                n_more: self.n_more_problems.get(),
+            }
         })
     }
 
@@ -97,17 +118,30 @@ impl ParseContext {
                 return SourceLocation::Flag;
             }
             if let Some(line) = self.lines.get(path) {
-                return SourceLocation::Line { file: self.file.clone(), line: *line };
+                return SourceLocation::Line {
+                    file: self.file.clone(),
+                    line: *line,
+                };
             }
             match path.rsplit_once('.') {
                 Some((parent, _)) => path = parent,
-                None => return SourceLocation::Line { file: self.file.clone(), line: 1 },
+                None => {
+                    return SourceLocation::Line {
+                        file: self.file.clone(),
+                        line: 1,
+                    };
+                }
             }
         }
     }
 }
 
-fn note_lines(line_of: &impl Fn(usize) -> usize, table: &DeTable<'_>, path: &str, lines: &mut BTreeMap<String, usize>) {
+fn note_lines(
+    line_of: &impl Fn(usize) -> usize,
+    table: &DeTable<'_>,
+    path: &str,
+    lines: &mut BTreeMap<String, usize>,
+) {
     for (key, value) in table {
         let path = join(path, key.get_ref());
         lines.insert(path.clone(), line_of(key.span().start));
@@ -118,7 +152,11 @@ fn note_lines(line_of: &impl Fn(usize) -> usize, table: &DeTable<'_>, path: &str
 }
 
 fn join(path: &str, key: &str) -> String {
-    if path.is_empty() { key.to_owned() } else { format!("{path}.{key}") }
+    if path.is_empty() {
+        key.to_owned()
+    } else {
+        format!("{path}.{key}")
+    }
 }
 
 /// One table of the rig file while its keys are read.
@@ -135,7 +173,13 @@ pub(super) struct Section<'a> {
 impl<'a> Section<'a> {
     /// The whole file.
     pub(super) fn root(context: &'a ParseContext, table: Table) -> Self {
-        Self { context, path: String::new(), documented_path: String::new(), table, known: Vec::new() }
+        Self {
+            context,
+            path: String::new(),
+            documented_path: String::new(),
+            table,
+            known: Vec::new(),
+        }
     }
 
     /// Ends the section and reports unread keys as unknown.
@@ -162,7 +206,8 @@ impl<'a> Section<'a> {
 
     /// A table inside this one. An absent table reads as an empty one.
     pub(super) fn section(&mut self, key: &'static str) -> Self {
-        self.optional_section(key).unwrap_or_else(|| self.empty_section(key))
+        self.optional_section(key)
+            .unwrap_or_else(|| self.empty_section(key))
     }
 
     /// A table inside this one; `None` if absent.
@@ -174,20 +219,28 @@ impl<'a> Section<'a> {
         }
     }
 
-    /// The tables inside this one that have free names, with their names. More than [`Budget::RIG_TABLES`] are a problem:
-    /// probably an error of the program that wrote the file.
+    /// The tables inside this one that have free names, with their names. More than
+    /// [`Budget::RIG_TABLES`] are a problem: probably an error of the program that wrote the file.
     pub(super) fn named_sections(&mut self, key: &'static str) -> Vec<(String, Self)> {
-        let Some(mut parent) = self.optional_section(key) else { return Vec::new() };
+        let Some(mut parent) = self.optional_section(key) else {
+            return Vec::new();
+        };
         let (n, budget) = (parent.table.len(), Budget::RIG_TABLES);
         if budget.check_elements(n as u64).is_err() {
             let got = Value::String(format!("{n} tables"));
-            self.invalid::<()>(key, &got, &format!("at most {} tables", budget.max_elements));
+            self.invalid::<()>(
+                key,
+                &got,
+                &format!("at most {} tables", budget.max_elements),
+            );
             parent.table.clear();
         }
         let mut sections = Vec::new();
         for (name, value) in std::mem::take(&mut parent.table) {
             match value {
-                Value::Table(table) => sections.push((name.clone(), parent.inner(&name, "NAME", table))),
+                Value::Table(table) => {
+                    sections.push((name.clone(), parent.inner(&name, "NAME", table)))
+                }
                 other => parent.invalid(&name, &other, "a table").unwrap_or_default(),
             }
         }
@@ -228,11 +281,11 @@ impl<'a> Section<'a> {
     /// Reports a missing key, unless its value was just reported as invalid.
     pub(super) fn missing(&self, key: &str, meaning: impl Into<Cow<'static, str>>) {
         let key = join(&self.path, key);
-        let is_reported =
-            |problem: &ConfigError| matches!(problem, ConfigError::InvalidValue { key: other, .. } if *other == key);
+        let is_reported = |problem: &ConfigError| matches!(problem, ConfigError::InvalidValue { key: other, .. } if *other == key);
         if !self.context.problems.borrow().iter().any(is_reported) {
             let (file, meaning) = (self.context.file.clone(), meaning.into());
-            self.context.report(ConfigError::Missing { file, key, meaning });
+            self.context
+                .report(ConfigError::Missing { file, key, meaning });
         }
     }
 
@@ -253,14 +306,21 @@ impl<'a> Section<'a> {
     pub(super) fn check_name(&self, name: &str) {
         let is_plain = |c: char| c.is_ascii_alphanumeric() || c == '_' || c == '-';
         if name.is_empty() || !name.chars().all(is_plain) {
-            self.invalid::<()>("name", &Value::String(name.to_owned()), "letters, digits, _ and -");
+            self.invalid::<()>(
+                "name",
+                &Value::String(name.to_owned()),
+                "letters, digits, _ and -",
+            );
         }
     }
 
     /// Takes the value of a key, and marks the key as known.
     pub(super) fn take(&mut self, key: &'static str) -> Option<Value> {
         self.known.push(key);
-        self.context.accessed.borrow_mut().insert(join(&self.documented_path, key));
+        self.context
+            .accessed
+            .borrow_mut()
+            .insert(join(&self.documented_path, key));
         self.table.remove(key)
     }
 }

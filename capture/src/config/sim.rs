@@ -19,7 +19,8 @@ keys! {
         pub ideal: bool = false;
         /// Whether the simulation waits for its consumer and always gives the same samples.
         pub lockstep: bool = false;
-        /// Whether an arm that is moved with `--sim` keeps its driver, which then moves emulated motors in real time.
+        /// Whether an arm that is moved with `--sim` keeps its driver, which then moves emulated
+        /// motors in real time.
         pub emulate_arm: bool = false;
         /// Speed factor of the scanning motion.
         pub speed: f64 = 1.0, in 0.01..=2.0;
@@ -27,14 +28,15 @@ keys! {
         pub azimuth_only: bool = false;
         /// Simulated time after which the samples end, seconds. `None`: unlimited.
         pub duration_secs: Option<f64>, in 0.001..=1e6;
-        /// Number of color images of the first camera after which the samples end. `None`: unlimited.
+        /// Number of color images of the first camera after which the samples end. `None`:
+        /// unlimited.
         pub n_images: Option<u64>, in 1..=1_000_000_000;
         /// Whether ground truth is delivered with the images.
         pub truth: bool = true;
         /// Whether the ground truth includes depth without noise.
         pub truth_depth: bool = false;
-        /// Brightness of the lights while a camera on the flange is inside the cabinet, relative to their brightness
-        /// otherwise.
+        /// Brightness of the lights while a camera on the flange is inside the cabinet, relative to
+        /// their brightness otherwise.
         pub light_inside_frac: f64 = 1.0, in 0.0..=4.0;
         /// Printed calibration targets in the scene, by name.
         pub targets: BTreeMap<String, SimTarget> => BTreeMap::new();
@@ -45,7 +47,8 @@ keys! {
     pub struct SimTarget {
         /// Specification of the target. The simulator checks it.
         pub spec: String, required "the target, such as \"charuco:5x7:34mm:26mm:5X5_100\"";
-        /// Pose of the board frame: x points right on the print, y down, z into the board. `None` on the flange.
+        /// Pose of the board frame: x points right on the print, y down, z into the board. `None`
+        /// on the flange.
         pub world_from_board: Option<Transform>;
         /// The same relative to the flange, for a board that the arm carries.
         pub flange_from_board: Option<Transform>;
@@ -54,10 +57,13 @@ keys! {
 
 pub(super) fn read(mut keys: Section<'_>) -> Option<Sim> {
     let mut sim = Sim::read_keys(&mut keys)?;
-    let named = keys.named_sections("target").into_iter().map(|(name, keys)| {
-        keys.check_name(&name);
-        Some((name, keys.read()?))
-    });
+    let named = keys
+        .named_sections("target")
+        .into_iter()
+        .map(|(name, keys)| {
+            keys.check_name(&name);
+            Some((name, keys.read()?))
+        });
     let targets = named.collect::<Vec<_>>();
     keys.end();
     sim.targets = targets.into_iter().collect::<Option<_>>()?;
@@ -67,7 +73,10 @@ pub(super) fn read(mut keys: Section<'_>) -> Option<Sim> {
 pub(super) fn write(sim: &Sim) -> Table {
     let mut table = sim.write_keys();
     if !sim.targets.is_empty() {
-        let targets = sim.targets.iter().filter_map(|(name, target)| entry(name, target));
+        let targets = sim
+            .targets
+            .iter()
+            .filter_map(|(name, target)| entry(name, target));
         table.insert("target".to_owned(), Value::Table(targets.collect()));
     }
     table

@@ -58,7 +58,10 @@ impl Methods {
 
     /// Returns the same key with a single method.
     pub(super) fn with_single(&self, name: &str) -> Self {
-        Self { names: vec![name.to_owned()], location: self.location.clone() }
+        Self {
+            names: vec![name.to_owned()],
+            location: self.location.clone(),
+        }
     }
 
     /// Looks up the methods by their names.
@@ -68,15 +71,22 @@ impl Methods {
     /// If a name is not among `known`. The error contains its line in the rig file.
     pub fn resolve<T: Copy>(&self, known: &[(&str, T)]) -> Result<Vec<T>, ConfigError> {
         let find = |name: &String| {
-            known.iter().find(|(known, _)| known == name).map(|(_, method)| *method).ok_or_else(|| {
-                let names: Vec<_> = known.iter().map(|(name, _)| format!("{name:?}")).collect();
-                ConfigError::InvalidValue {
-                    at: self.location.clone(),
-                    key: "train.method".into(),
-                    got: format!("{name:?}"),
-                    allowed: format!("{}, or a list of these without duplicates", names.join(", ")),
-                }
-            })
+            known
+                .iter()
+                .find(|(known, _)| known == name)
+                .map(|(_, method)| *method)
+                .ok_or_else(|| {
+                    let names: Vec<_> = known.iter().map(|(name, _)| format!("{name:?}")).collect();
+                    ConfigError::InvalidValue {
+                        at: self.location.clone(),
+                        key: "train.method".into(),
+                        got: format!("{name:?}"),
+                        allowed: format!(
+                            "{}, or a list of these without duplicates",
+                            names.join(", ")
+                        ),
+                    }
+                })
         };
         self.names.iter().map(find).collect()
     }
@@ -89,7 +99,9 @@ impl Key for Methods {
         let location = keys.location(key);
         let word = |value: &Value| value.as_str().map(str::to_owned);
         let words = |value: &Value| distinct(value, word).filter(|words| !words.is_empty());
-        let names = keys.parse(key, words, || "a word in quotes, or a list of these without duplicates".into())?;
+        let names = keys.parse(key, words, || {
+            "a word in quotes, or a list of these without duplicates".into()
+        })?;
         Some(Self { names, location })
     }
 
@@ -103,6 +115,9 @@ impl Key for Methods {
 
 impl Optional for Methods {
     fn absent(keys: &mut Section<'_>, key: &'static str) -> Option<Self> {
-        Some(Self { names: vec![DEFAULT_METHOD.to_owned()], location: keys.location(key) })
+        Some(Self {
+            names: vec![DEFAULT_METHOD.to_owned()],
+            location: keys.location(key),
+        })
     }
 }

@@ -1,4 +1,5 @@
-//! Checks for camera values in the rig file that are valid but implausible: in another unit, or left at the default.
+//! Checks for camera values in the rig file that are valid but implausible: in another unit, or
+//! left at the default.
 
 use super::Finding;
 use crate::config::{Camera, Parent, Rig};
@@ -14,15 +15,20 @@ const MIN_EXPOSURE_MICROS: f64 = 5.0;
 
 /// Checks the values of all cameras. Empty if all are plausible.
 pub(super) fn calibration(rig: &Rig) -> Vec<Finding> {
-    rig.cameras.iter().flat_map(problems).map(|(message, remedy)| Finding::warn(CHECK, message, remedy)).collect()
+    rig.cameras
+        .iter()
+        .flat_map(problems)
+        .map(|(message, remedy)| Finding::warn(CHECK, message, remedy))
+        .collect()
 }
 
 /// Implausible values of a camera: messages with remedies.
 fn problems(camera: &Camera) -> Vec<(String, String)> {
     let name = &camera.name;
     let mut problems = Vec::new();
-    let mut report =
-        |message: String, remedy: &str| problems.push((format!("camera {name:?}: {message}"), remedy.to_owned()));
+    let mut report = |message: String, remedy: &str| {
+        problems.push((format!("camera {name:?}: {message}"), remedy.to_owned()))
+    };
     if camera.parent == Parent::Flange {
         let distance_m = camera.parent_from_camera.translation.vector.norm();
         if camera.parent_from_camera == Transform::identity() {
@@ -32,30 +38,49 @@ fn problems(camera: &Camera) -> Vec<(String, String)> {
                 "set the pose of its optical frame (x right, y down, z forward), from a hand-eye calibration or a drawing",
             );
         } else if distance_m > MAX_DISTANCE_M {
-            report(format!("it is {distance_m:.1} m from the flange"), "parent_from_camera.xyz_m is in meters");
+            report(
+                format!("it is {distance_m:.1} m from the flange"),
+                "parent_from_camera.xyz_m is in meters",
+            );
         }
     }
     let intrinsics = &camera.intrinsics;
     if !camera.realsense.unknown.intrinsics {
         let size_px = intrinsics.size_px.map(f64::from);
-        let field_of_view_deg = 2.0 * (0.5 * size_px[0] / intrinsics.focal_px[0]).atan().to_degrees();
-        let has_wide_lens = matches!(intrinsics.lens, Lens::KannalaBrandt(_)) && !intrinsics.rectified;
+        let field_of_view_deg = 2.0
+            * (0.5 * size_px[0] / intrinsics.focal_px[0])
+                .atan()
+                .to_degrees();
+        let has_wide_lens =
+            matches!(intrinsics.lens, Lens::KannalaBrandt(_)) && !intrinsics.rectified;
         if !FIELD_OF_VIEW_DEG.contains(&field_of_view_deg) && !has_wide_lens {
             report(
-                format!("its focal length gives a horizontal field of view of {field_of_view_deg:.1} degrees"),
+                format!(
+                    "its focal length gives a horizontal field of view of {field_of_view_deg:.1} degrees"
+                ),
                 "intrinsics.focal_px is in pixels of images of this size",
             );
         }
-        let is_inside = (0..2).all(|axis| (0.0..=size_px[axis]).contains(&intrinsics.principal_px[axis]));
+        let is_inside =
+            (0..2).all(|axis| (0.0..=size_px[axis]).contains(&intrinsics.principal_px[axis]));
         if !is_inside {
             report(
-                format!("its principal point {:?} is outside the image", intrinsics.principal_px),
+                format!(
+                    "its principal point {:?} is outside the image",
+                    intrinsics.principal_px
+                ),
                 "intrinsics.principal_px is in pixels of images of this size, usually near their center",
             );
         }
     }
-    if let Some(exposure_micros) = camera.exposure_micros.filter(|exposure| *exposure < MIN_EXPOSURE_MICROS) {
-        report(format!("it exposes for {exposure_micros} microseconds"), "8 milliseconds are exposure_micros = 8000");
+    if let Some(exposure_micros) = camera
+        .exposure_micros
+        .filter(|exposure| *exposure < MIN_EXPOSURE_MICROS)
+    {
+        report(
+            format!("it exposes for {exposure_micros} microseconds"),
+            "8 milliseconds are exposure_micros = 8000",
+        );
     }
     problems
 }
@@ -67,19 +92,45 @@ mod tests {
 
     #[test]
     fn values_in_other_units_are_reported() {
-        assert_eq!(calibration(&bundled_rig::<&str>("static-arm.toml", &[])), []);
+        assert_eq!(
+            calibration(&bundled_rig::<&str>("static-arm.toml", &[])),
+            []
+        );
         for (key, value, word) in [
             ("camera.wrist.parent_from_camera", "{}", "identity"),
-            ("camera.wrist.parent_from_camera.xyz_m", "[0, 60, 40]", "in meters"),
-            ("camera.wrist.intrinsics.focal_px", "[3.6, 3.6]", "in pixels"),
-            ("camera.wrist.intrinsics.principal_px", "[6400, 3600]", "outside"),
+            (
+                "camera.wrist.parent_from_camera.xyz_m",
+                "[0, 60, 40]",
+                "in meters",
+            ),
+            (
+                "camera.wrist.intrinsics.focal_px",
+                "[3.6, 3.6]",
+                "in pixels",
+            ),
+            (
+                "camera.wrist.intrinsics.principal_px",
+                "[6400, 3600]",
+                "outside",
+            ),
             ("camera.wrist.exposure_micros", "0.008", "8000"),
         ] {
             let parsed: toml::Table = format!("value = {value}").parse().expect("a TOML value");
-            let findings = calibration(&bundled_rig("static-arm.toml", &[(key, parsed["value"].clone())]));
-            let text =
-                |finding: &Finding| format!("{} {}", finding.message, finding.remedy.clone().unwrap_or_default());
-            assert!(findings.len() == 1 && text(&findings[0]).contains(word), "{key}: {findings:?}");
+            let findings = calibration(&bundled_rig(
+                "static-arm.toml",
+                &[(key, parsed["value"].clone())],
+            ));
+            let text = |finding: &Finding| {
+                format!(
+                    "{} {}",
+                    finding.message,
+                    finding.remedy.clone().unwrap_or_default()
+                )
+            };
+            assert!(
+                findings.len() == 1 && text(&findings[0]).contains(word),
+                "{key}: {findings:?}"
+            );
         }
     }
 }

@@ -5,20 +5,27 @@ use crate::config::Rig;
 use drivers::can::{BusConfig, Link, interfaces};
 use std::path::Path;
 
-/// Checks the settings of CAN interfaces. Interfaces in the rig file must match it; for the others, general settings
-/// are checked.
+/// Checks the settings of CAN interfaces. Interfaces in the rig file must match it; for the others,
+/// general settings are checked.
 pub(super) fn can(rig: Option<&Rig>) -> Vec<Finding> {
     let named = rig.map_or(&[][..], |rig| &rig.arm.buses);
-    let others =
-        interfaces(Path::new("/sys")).into_iter().filter(|name| !named.iter().any(|bus| bus.interface == *name));
+    let others = interfaces(Path::new("/sys"))
+        .into_iter()
+        .filter(|name| !named.iter().any(|bus| bus.interface == *name));
     let mut findings = Vec::new();
-    for (interface, bus) in
-        named.iter().map(|bus| (bus.interface.clone(), Some(bus))).chain(others.map(|name| (name, None)))
+    for (interface, bus) in named
+        .iter()
+        .map(|bus| (bus.interface.clone(), Some(bus)))
+        .chain(others.map(|name| (name, None)))
     {
         let link = match Link::read(&interface) {
             Ok(link) => link,
             Err(error) => {
-                findings.push(Finding::fail("can", error.to_string(), "list the CAN interfaces with fieldrig devices"));
+                findings.push(Finding::fail(
+                    "can",
+                    error.to_string(),
+                    "list the CAN interfaces with fieldrig devices",
+                ));
                 continue;
             }
         };

@@ -4,7 +4,8 @@ use super::Finding;
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-/// Maximum step of the clock. It must be short compared with the readout time of an image row, tens of microseconds.
+/// Maximum step of the clock. It must be short compared with the readout time of an image row, tens
+/// of microseconds.
 const MAX_CLOCK_STEP: Duration = Duration::from_micros(1);
 
 /// Measures the smallest step of the monotonic clock.
@@ -24,7 +25,11 @@ pub(super) fn clock() -> Finding {
     if min_step <= MAX_CLOCK_STEP {
         Finding::ok("clock", message)
     } else {
-        Finding::warn("clock", message, "stamps are equally coarse: use another clock source, see below")
+        Finding::warn(
+            "clock",
+            message,
+            "stamps are equally coarse: use another clock source, see below",
+        )
     }
 }
 
@@ -36,7 +41,10 @@ pub(super) fn clock_source(sys: &Path) -> Finding {
     };
     let current = current.trim();
     if matches!(current, "hpet" | "acpi_pm" | "pit" | "jiffies") {
-        let remedy = format!("echo tsc | sudo tee {}", folder.join("current_clocksource").display());
+        let remedy = format!(
+            "echo tsc | sudo tee {}",
+            folder.join("current_clocksource").display()
+        );
         return Finding::warn("clock source", format!("{current}: slow to read"), remedy);
     }
     Finding::ok("clock source", current)
@@ -51,7 +59,13 @@ mod tests {
     #[test]
     fn slow_clock_source_is_reported() {
         let path = "devices/system/clocksource/clocksource0/current_clocksource";
-        assert_eq!(clock_source(folder_with(path, "hpet\n").path()).verdict, Verdict::Warn);
-        assert_eq!(clock_source(folder_with(path, "tsc\n").path()).verdict, Verdict::Ok);
+        assert_eq!(
+            clock_source(folder_with(path, "hpet\n").path()).verdict,
+            Verdict::Warn
+        );
+        assert_eq!(
+            clock_source(folder_with(path, "tsc\n").path()).verdict,
+            Verdict::Ok
+        );
     }
 }

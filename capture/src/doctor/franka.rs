@@ -1,5 +1,5 @@
-//! Checks this computer and the network for a rig with a Franka arm, without occupying the robot's only client
-//! connection.
+//! Checks this computer and the network for a rig with a Franka arm, without occupying the robot's
+//! only client connection.
 
 use super::{Finding, Verdict, field};
 use crate::config::{ArmDriver, Rig};
@@ -19,9 +19,17 @@ const N_PINGS: &str = "10";
 
 /// Checks kernel, limits and network; empty if the rig has another kind of arm.
 pub(super) fn franka(rig: Option<&Rig>) -> Vec<Finding> {
-    let Some(arm) = rig.map(|rig| &rig.arm).filter(|arm| arm.driver == ArmDriver::Franka) else { return Vec::new() };
+    let Some(arm) = rig
+        .map(|rig| &rig.arm)
+        .filter(|arm| arm.driver == ArmDriver::Franka)
+    else {
+        return Vec::new();
+    };
     let os_release = std::fs::read_to_string("/etc/os-release").unwrap_or_default();
-    let mut findings = vec![kernel(Path::new("/sys"), &os_release), locked_memory(Path::new("/proc"))];
+    let mut findings = vec![
+        kernel(Path::new("/sys"), &os_release),
+        locked_memory(Path::new("/proc")),
+    ];
     if arm.address.is_empty() {
         let remedy = "set arm.address in the rig file, such as \"172.16.0.2\"; Desk shows it under Settings, Network";
         findings.push(Finding::fail("robot", "arm.address is missing", remedy));
@@ -36,11 +44,18 @@ pub(super) fn franka(rig: Option<&Rig>) -> Vec<Finding> {
         output_of("ip", &["-o", "route", "get", host])
             .map(|command_output| route(Path::new("/sys"), host, &command_output)),
     );
-    let pinged = match output_of("ping", &["-n", "-q", "-i", "0.2", "-W", "1", "-c", N_PINGS, host]) {
+    let pinged = match output_of(
+        "ping",
+        &["-n", "-q", "-i", "0.2", "-W", "1", "-c", N_PINGS, host],
+    ) {
         Some(command_output) => pings(host, &command_output),
         None => {
             let remedy = "sudo apt-get install -y iputils-ping";
-            Finding::warn("robot", format!("cannot check whether {host} responds: ping is not installed"), remedy)
+            Finding::warn(
+                "robot",
+                format!("cannot check whether {host} responds: ping is not installed"),
+                remedy,
+            )
         }
     };
     let is_reachable = pinged.verdict != Verdict::Fail;
@@ -49,11 +64,15 @@ pub(super) fn franka(rig: Option<&Rig>) -> Vec<Finding> {
     findings
 }
 
-/// Checks that the controller accepts clients, by opening a connection and closing it without sending anything, which
-/// does not occupy the robot.
+/// Checks that the controller accepts clients, by opening a connection and closing it without
+/// sending anything, which does not occupy the robot.
 fn port(address: &str) -> Finding {
     let has_no_port = host_of(address) == address;
-    let found = if has_no_port { (address, FCI_PORT).to_socket_addrs() } else { address.to_socket_addrs() };
+    let found = if has_no_port {
+        (address, FCI_PORT).to_socket_addrs()
+    } else {
+        address.to_socket_addrs()
+    };
     let connected = found.and_then(|mut all| {
         let address = all.next().ok_or(ErrorKind::AddrNotAvailable)?;
         TcpStream::connect_timeout(&address, CONNECT_TIMEOUT)
@@ -61,15 +80,23 @@ fn port(address: &str) -> Finding {
     match connected {
         Ok(_) => Finding::ok("FCI", format!("{address} accepts clients")),
         Err(error) => {
-            let remedy = "activate FCI in Desk and unlock the joints; the robot must have the FCI feature";
-            Finding::fail("FCI", format!("{address} accepts no client: {error}"), remedy)
+            let remedy =
+                "activate FCI in Desk and unlock the joints; the robot must have the FCI feature";
+            Finding::fail(
+                "FCI",
+                format!("{address} accepts no client: {error}"),
+                remedy,
+            )
         }
     }
 }
 
 /// The host part of an address. IPv6 addresses with a port are in brackets.
 fn host_of(address: &str) -> &str {
-    match address.strip_prefix('[').and_then(|rest| rest.split_once(']')) {
+    match address
+        .strip_prefix('[')
+        .and_then(|rest| rest.split_once(']'))
+    {
         Some((host, _)) => host,
         None if address.matches(':').count() == 1 => address.split(':').next().unwrap_or(address),
         None => address,
@@ -77,7 +104,8 @@ fn host_of(address: &str) -> &str {
 }
 
 fn kernel(sys: &Path, os_release: &str) -> Finding {
-    let is_realtime = std::fs::read_to_string(sys.join("kernel/realtime")).is_ok_and(|text| text.trim() == "1");
+    let is_realtime =
+        std::fs::read_to_string(sys.join("kernel/realtime")).is_ok_and(|text| text.trim() == "1");
     if is_realtime {
         return Finding::ok("kernel", "PREEMPT_RT");
     }
@@ -85,7 +113,11 @@ fn kernel(sys: &Path, os_release: &str) -> Finding {
         true => "sudo pro enable realtime-kernel, then boot into it",
         false => "sudo apt-get install -y linux-image-rt-amd64, then boot into it",
     };
-    Finding::warn("kernel", "without PREEMPT_RT: states at 1 kHz are sometimes read some ms late", remedy)
+    Finding::warn(
+        "kernel",
+        "without PREEMPT_RT: states at 1 kHz are sometimes read some ms late",
+        remedy,
+    )
 }
 
 /// Checks how much memory this user may lock.
@@ -94,10 +126,10 @@ fn locked_memory(proc: &Path) -> Finding {
         None => Finding::ok("memory lock", "not reported by the kernel"),
         Some("unlimited") => Finding::ok("memory lock", "unlimited"),
         Some(bytes) => {
-            let message =
-                format!("at most {bytes} bytes may be locked: the arm's thread may have to wait for the disk");
-            let remedy =
-                r#"echo "$USER - memlock unlimited" | sudo tee -a /etc/security/limits.conf, then log in again"#;
+            let message = format!(
+                "at most {bytes} bytes may be locked: the arm's thread may have to wait for the disk"
+            );
+            let remedy = r#"echo "$USER - memlock unlimited" | sudo tee -a /etc/security/limits.conf, then log in again"#;
             Finding::warn("memory lock", message, remedy)
         }
     }
@@ -106,21 +138,38 @@ fn locked_memory(proc: &Path) -> Finding {
 /// Checks the route to the robot in the output of `ip -o route get`.
 fn route(sys: &Path, host: &str, command_output: &str) -> Finding {
     let after = |word: &str| {
-        let mut words = command_output.split_whitespace().skip_while(|found| *found != word);
+        let mut words = command_output
+            .split_whitespace()
+            .skip_while(|found| *found != word);
         words.nth(1)
     };
     let Some(interface) = after("dev") else {
         let remedy = "sudo ip addr add 172.16.0.1/24 dev INTERFACE   (the interface with the robot's cable; an unused address in the robot's network)";
         return Finding::fail("route", format!("no route to {host}"), remedy);
     };
-    if sys.join("class/net").join(interface).join("wireless").exists() {
-        let message = format!("{host} is reached via {interface}, a wireless network: states arrive late or get lost");
-        return Finding::warn("route", message, "connect the robot's cable to this computer");
+    if sys
+        .join("class/net")
+        .join(interface)
+        .join("wireless")
+        .exists()
+    {
+        let message = format!(
+            "{host} is reached via {interface}, a wireless network: states arrive late or get lost"
+        );
+        return Finding::warn(
+            "route",
+            message,
+            "connect the robot's cable to this computer",
+        );
     }
     match after("via") {
         Some(router) => {
             let message = format!("{host} is reached via the router {router} ({interface})");
-            Finding::warn("route", message, "connect the robot's cable to this computer, in a separate network")
+            Finding::warn(
+                "route",
+                message,
+                "connect the robot's cable to this computer, in a separate network",
+            )
         }
         None => Finding::ok("route", format!("{host} is on {interface}")),
     }
@@ -131,8 +180,11 @@ fn pings(host: &str, command_output: &str) -> Finding {
     let loss_percent: Option<f64> = command_output
         .split_once("% packet loss")
         .and_then(|(before, _)| before.split_whitespace().last()?.parse().ok());
-    let times = command_output.split_once("mdev = ").and_then(|(_, times)| times.split_whitespace().next());
-    let times: Option<Vec<f64>> = times.and_then(|times| times.split('/').map(|time| time.parse().ok()).collect());
+    let times = command_output
+        .split_once("mdev = ")
+        .and_then(|(_, times)| times.split_whitespace().next());
+    let times: Option<Vec<f64>> =
+        times.and_then(|times| times.split('/').map(|time| time.parse().ok()).collect());
     let latency_remedy = "connect without a switch; sudo ethtool -C INTERFACE rx-usecs 0; use the governor performance";
     match (loss_percent, times.as_deref()) {
         (Some(loss_percent), Some([_, average, max_millis, ..])) => {
@@ -175,42 +227,71 @@ mod tests {
         assert_eq!(port(&address).verdict, Verdict::Ok);
         drop(listener);
         let finding = port(&address);
-        assert!(finding.message.contains(&address) && finding.remedy.is_some_and(|remedy| remedy.contains("Desk")));
+        assert!(
+            finding.message.contains(&address)
+                && finding.remedy.is_some_and(|remedy| remedy.contains("Desk"))
+        );
     }
 
     #[test]
     fn kernel_and_limits_are_reported_with_remedies() {
         let folder = tempfile::tempdir().expect("a folder");
-        for (name, text) in
-            [("kernel/realtime", "1\n"), ("self/limits", "Max locked memory  8388608  8388608  bytes\n")]
-        {
+        for (name, text) in [
+            ("kernel/realtime", "1\n"),
+            (
+                "self/limits",
+                "Max locked memory  8388608  8388608  bytes\n",
+            ),
+        ] {
             let path = folder.path().join(name);
-            std::fs::create_dir_all(path.parent().expect("inside the folder")).expect("the folder is writable");
+            std::fs::create_dir_all(path.parent().expect("inside the folder"))
+                .expect("the folder is writable");
             std::fs::write(path, text).expect("the folder is writable");
         }
         assert_eq!(kernel(folder.path(), "").verdict, Verdict::Ok);
-        for (os_release, remedy) in [("ID=ubuntu\n", "pro enable"), ("ID=debian\n", "linux-image-rt")] {
+        for (os_release, remedy) in [
+            ("ID=ubuntu\n", "pro enable"),
+            ("ID=debian\n", "linux-image-rt"),
+        ] {
             let finding = kernel(Path::new("/nowhere"), os_release);
             assert_eq!(finding.verdict, Verdict::Warn);
             assert!(finding.remedy.expect("a remedy").contains(remedy));
         }
         let finding = locked_memory(folder.path());
-        assert!(finding.message.contains("8388608") && finding.remedy.expect("a remedy").contains("memlock"));
-        std::fs::write(folder.path().join("self/limits"), "Max locked memory  unlimited  unlimited  bytes\n")
-            .expect("the folder is writable");
+        assert!(
+            finding.message.contains("8388608")
+                && finding.remedy.expect("a remedy").contains("memlock")
+        );
+        std::fs::write(
+            folder.path().join("self/limits"),
+            "Max locked memory  unlimited  unlimited  bytes\n",
+        )
+        .expect("the folder is writable");
         assert_eq!(locked_memory(folder.path()).verdict, Verdict::Ok);
     }
 
     #[test]
     fn route_to_the_robot_is_checked() {
         let sys = tempfile::tempdir().expect("a folder");
-        std::fs::create_dir_all(sys.path().join("class/net/wlan0/wireless")).expect("the folder is writable");
+        std::fs::create_dir_all(sys.path().join("class/net/wlan0/wireless"))
+            .expect("the folder is writable");
         let route_finding = |command_output: &str| route(sys.path(), "172.16.0.2", command_output);
         let direct = route_finding("172.16.0.2 dev eth0 src 172.16.0.1 uid 0 \\    cache ");
-        assert_eq!((direct.verdict, direct.message.contains("eth0")), (Verdict::Ok, true));
-        let routed = route_finding("172.16.0.2 via 10.0.0.1 dev eth0 src 10.0.0.7 uid 0 \\    cache ");
-        assert_eq!((routed.verdict, routed.message.contains("10.0.0.1")), (Verdict::Warn, true));
-        assert!(route_finding("172.16.0.2 dev wlan0 src 172.16.0.1").message.contains("wireless"));
+        assert_eq!(
+            (direct.verdict, direct.message.contains("eth0")),
+            (Verdict::Ok, true)
+        );
+        let routed =
+            route_finding("172.16.0.2 via 10.0.0.1 dev eth0 src 10.0.0.7 uid 0 \\    cache ");
+        assert_eq!(
+            (routed.verdict, routed.message.contains("10.0.0.1")),
+            (Verdict::Warn, true)
+        );
+        assert!(
+            route_finding("172.16.0.2 dev wlan0 src 172.16.0.1")
+                .message
+                .contains("wireless")
+        );
         assert_eq!(route_finding("").verdict, Verdict::Fail);
     }
 
@@ -226,7 +307,10 @@ mod tests {
         assert_eq!(verdict(&command_output("0", "0.300")), Verdict::Ok);
         assert_eq!(verdict(&command_output("0", "1.300")), Verdict::Warn);
         assert_eq!(verdict(&command_output("10", "0.300")), Verdict::Warn);
-        assert_eq!(verdict("10 packets transmitted, 0 received, 100% packet loss, time 9000ms\n"), Verdict::Fail);
+        assert_eq!(
+            verdict("10 packets transmitted, 0 received, 100% packet loss, time 9000ms\n"),
+            Verdict::Fail
+        );
         assert_eq!(verdict(""), Verdict::Fail);
     }
 }

@@ -5,7 +5,9 @@ use std::path::Path;
 
 /// Checks the CPU frequency governor, if the machine has one.
 pub(super) fn governor(sys: &Path) -> Option<Finding> {
-    let governor = std::fs::read_to_string(sys.join("devices/system/cpu/cpu0/cpufreq/scaling_governor")).ok()?;
+    let governor =
+        std::fs::read_to_string(sys.join("devices/system/cpu/cpu0/cpufreq/scaling_governor"))
+            .ok()?;
     let governor = governor.trim();
     Some(match governor {
         "performance" => Finding::ok("governor", governor),

@@ -1,4 +1,5 @@
-//! Measures rates, latencies and losses of a rig's devices, with the drivers of `run`. Nothing is moved.
+//! Measures rates, latencies and losses of a rig's devices, with the drivers of `run`. Nothing is
+//! moved.
 
 use super::{Finding, udp};
 use crate::config::{ArmDriver, BaseDriver, Rig};
@@ -15,7 +16,8 @@ use std::time::{Duration, Instant};
 /// A device is reported if its rate is below this fraction of the rate in the rig file.
 const MIN_RATE_FRAC: f64 = 0.95;
 
-/// Minimum time between the first and the last sample for comparing the stamps with the clock of this computer.
+/// Minimum time between the first and the last sample for comparing the stamps with the clock of
+/// this computer.
 const MIN_RECEIVED_SECS: f64 = 0.5;
 
 /// Measurements of one device, or of the keyframes made from its images.
@@ -36,8 +38,8 @@ pub struct DeviceStatistics {
     pub latency: Option<Latency>,
     /// 99th percentile of the intervals between samples.
     pub gap_p99_millis: f64,
-    /// Seconds by which the stamps advance per second of this computer, normally 1. `None` for simulated devices, and if the
-    /// samples arrived within less than 0.5 s.
+    /// Seconds by which the stamps advance per second of this computer, normally 1. `None` for
+    /// simulated devices, and if the samples arrived within less than 0.5 s.
     pub stamp_secs_per_sec: Option<f64>,
 }
 
@@ -78,18 +80,32 @@ impl Track {
         self.received = Some([self.received.map_or(now, |[first, _]| first), now]);
     }
 
-    fn summarize(mut self, device: String, expected_hz: Option<f64>, is_simulated: bool) -> DeviceStatistics {
-        let mut gaps: Vec<f64> = self.stamps.windows(2).map(|pair| pair[1].secs_since(pair[0]) * 1e3).collect();
+    fn summarize(
+        mut self,
+        device: String,
+        expected_hz: Option<f64>,
+        is_simulated: bool,
+    ) -> DeviceStatistics {
+        let mut gaps: Vec<f64> = self
+            .stamps
+            .windows(2)
+            .map(|pair| pair[1].secs_since(pair[0]) * 1e3)
+            .collect();
         let span_secs = match (self.stamps.first(), self.stamps.last()) {
             (Some(first), Some(last)) => last.secs_since(*first),
             _ => 0.0,
         };
-        let quantile_of = |values: &mut [f64], frac| quantile(values, frac, Rank::Lower).unwrap_or(0.0);
+        let quantile_of =
+            |values: &mut [f64], frac| quantile(values, frac, Rank::Lower).unwrap_or(0.0);
         let n_gaps = self.stamps.len().saturating_sub(1);
         DeviceStatistics {
             device,
             samples: self.stamps.len() as u64,
-            rate_hz: if span_secs > 0.0 { n_gaps as f64 / span_secs } else { 0.0 },
+            rate_hz: if span_secs > 0.0 {
+                n_gaps as f64 / span_secs
+            } else {
+                0.0
+            },
             expected_hz,
             dropped: self.dropped,
             latency: (!is_simulated).then(|| Latency {
@@ -107,12 +123,18 @@ impl Track {
     }
 }
 
-/// Reads the rig's devices with the drivers of a run for `secs` seconds, or until `stop` is requested.
+/// Reads the rig's devices with the drivers of a run for `secs` seconds, or until `stop` is
+/// requested.
 ///
 /// # Errors
 /// A device cannot be opened.
 pub fn listen(rig: &Rig, secs: f64, stop: &Stop) -> Result<ListenResult> {
-    let (Opened { rig, mut source, .. }, monitors) = open::rig_with_monitors(rig.clone(), Devices::Real)?;
+    let (
+        Opened {
+            rig, mut source, ..
+        },
+        monitors,
+    ) = open::rig_with_monitors(rig.clone(), Devices::Real)?;
     let mut join = Join::new(&rig)?;
     let mut tracks: BTreeMap<String, Track> = BTreeMap::new();
     let mut findings = Vec::new();
@@ -122,13 +144,19 @@ pub fn listen(rig: &Rig, secs: f64, stop: &Stop) -> Result<ListenResult> {
             Ok(Some(sample)) => sample,
             Ok(None) => break,
             Err(error) => {
-                findings.push(Finding::fail("devices", error.to_string(), remedy(&error, &monitors)));
+                findings.push(Finding::fail(
+                    "devices",
+                    error.to_string(),
+                    remedy(&error, &monitors),
+                ));
                 break;
             }
         };
         let now = clock::now();
         let (device, dropped) = match &sample {
-            Sample::Image(image) if image.is_depth() => (format!("camera {:?} depth", image.camera), image.n_skipped),
+            Sample::Image(image) if image.is_depth() => {
+                (format!("camera {:?} depth", image.camera), image.n_skipped)
+            }
             Sample::Image(image) => (format!("camera {:?}", image.camera), image.n_skipped),
             Sample::Joints(_) => ("arm".to_owned(), 0),
             Sample::Base(_) => ("base".to_owned(), 0),
@@ -140,19 +168,25 @@ pub fn listen(rig: &Rig, secs: f64, stop: &Stop) -> Result<ListenResult> {
         track.dropped += dropped;
         for event in join.push(sample) {
             if let JoinEvent::Accepted(keyframe) = event {
-                let track = tracks.entry(format!("keyframes of {:?}", keyframe.camera)).or_default();
+                let track = tracks
+                    .entry(format!("keyframes of {:?}", keyframe.camera))
+                    .or_default();
                 track.note(keyframe.stamp, clock::now());
             }
         }
     }
     if let (Some(cpu_before), Some(cpu)) = (cpu_before, clock::process_cpu_time()) {
-        findings.push(Finding::ok("CPU", cpu_message(cpu - cpu_before, began.elapsed())));
+        findings.push(Finding::ok(
+            "CPU",
+            cpu_message(cpu - cpu_before, began.elapsed()),
+        ));
     }
     // A simulation has its own clock.
     let is_simulated = open::is_any_simulated(&rig);
     let expected = expected(&rig);
     findings.extend(missing(&rig, &expected, &tracks, &monitors));
-    let of_datagrams = |monitor: &DatagramMonitor| udp::datagrams(monitor, tracks.contains_key(monitor.device()));
+    let of_datagrams =
+        |monitor: &DatagramMonitor| udp::datagrams(monitor, tracks.contains_key(monitor.device()));
     findings.extend(monitors.iter().filter_map(of_datagrams));
     let devices: Vec<_> = tracks
         .into_iter()
@@ -163,10 +197,24 @@ pub fn listen(rig: &Rig, secs: f64, stop: &Stop) -> Result<ListenResult> {
         .collect();
     findings.extend(devices.iter().filter_map(problem));
     findings.extend(devices.iter().filter_map(wrong_unit));
-    let rejected: Vec<_> = join.counts().rejected.iter().map(|(why, n)| format!("{n} {}", why.name())).collect();
-    let n_posed = join.counts().images - join.counts().rejected.get(&Rejection::NoPose).copied().unwrap_or(0);
+    let rejected: Vec<_> = join
+        .counts()
+        .rejected
+        .iter()
+        .map(|(why, n)| format!("{n} {}", why.name()))
+        .collect();
+    let n_posed = join.counts().images
+        - join
+            .counts()
+            .rejected
+            .get(&Rejection::NoPose)
+            .copied()
+            .unwrap_or(0);
     if !rejected.is_empty() {
-        let message = format!("images that did not become keyframes: {}", rejected.join(", "));
+        let message = format!(
+            "images that did not become keyframes: {}",
+            rejected.join(", ")
+        );
         findings.push(if 2 * n_posed < join.counts().images {
             let remedy =
                 "each image needs joint states, and base poses if the base moves, around its time: check their source";
@@ -184,7 +232,10 @@ fn expected(rig: &Rig) -> BTreeMap<String, Option<f64>> {
     for camera in &rig.cameras {
         expected.insert(format!("camera {:?}", camera.name), Some(camera.rate_hz));
         if camera.depth.is_some() {
-            expected.insert(format!("camera {:?} depth", camera.name), Some(camera.rate_hz));
+            expected.insert(
+                format!("camera {:?} depth", camera.name),
+                Some(camera.rate_hz),
+            );
         }
     }
     match rig.arm.driver {
@@ -197,7 +248,10 @@ fn expected(rig: &Rig) -> BTreeMap<String, Option<f64>> {
         expected.insert("base".to_owned(), None);
     }
     for scanner in &rig.scanners {
-        expected.insert(format!("range scanner {:?}", scanner.name), Some(scanner.rate_hz));
+        expected.insert(
+            format!("range scanner {:?}", scanner.name),
+            Some(scanner.rate_hz),
+        );
     }
     expected
 }
@@ -215,13 +269,17 @@ fn silent_device(error: &Error) -> Option<String> {
 /// What to do about an error of a device.
 fn remedy(error: &Error, monitors: &[DatagramMonitor]) -> &'static str {
     let device = silent_device(error);
-    match monitors.iter().any(|monitor| Some(monitor.device()) == device.as_deref()) {
+    match monitors
+        .iter()
+        .any(|monitor| Some(monitor.device()) == device.as_deref())
+    {
         true => "check its sender: docs/reference/udp.md describes the format",
         false => "check the device and its cable",
     }
 }
 
-/// The devices that sent nothing. Devices whose datagrams cannot be used have a finding of their own.
+/// The devices that sent nothing. Devices whose datagrams cannot be used have a finding of their
+/// own.
 fn missing(
     rig: &Rig,
     expected: &BTreeMap<String, Option<f64>>,
@@ -229,27 +287,43 @@ fn missing(
     monitors: &[DatagramMonitor],
 ) -> Vec<Finding> {
     let mut findings = Vec::new();
-    for device in expected.keys().filter(|device| !tracks.contains_key(*device)) {
+    for device in expected
+        .keys()
+        .filter(|device| !tracks.contains_key(*device))
+    {
         let remedy = match monitors.iter().find(|monitor| monitor.device() == device) {
             Some(monitor) if monitor.counts().n_received > 0 => continue,
             Some(monitor) => format!("start its sender, and let it send to {}", monitor.address()),
             None if rig.base.driver == BaseDriver::Tags && device == "base" => {
-                "no image gave its pose: check base.tag_family, and the sizes and poses of the tags".to_owned()
+                "no image gave its pose: check base.tag_family, and the sizes and poses of the tags"
+                    .to_owned()
             }
             None => "check it and its cable".to_owned(),
         };
-        findings.push(Finding::fail("silent", format!("no data from {device}"), remedy));
+        findings.push(Finding::fail(
+            "silent",
+            format!("no data from {device}"),
+            remedy,
+        ));
     }
     findings
 }
 
 /// Checks rate and losses of a device. Returns a finding if there is a problem.
 fn problem(statistics: &DeviceStatistics) -> Option<Finding> {
-    let DeviceStatistics { device, rate_hz, expected_hz, dropped, .. } = statistics;
+    let DeviceStatistics {
+        device,
+        rate_hz,
+        expected_hz,
+        dropped,
+        ..
+    } = statistics;
     let slow = expected_hz.filter(|expected| *rate_hz < MIN_RATE_FRAC * expected);
     let message = match (slow, dropped) {
         (None, 0) => return None,
-        (Some(expected), 0) => format!("{device}: {rate_hz:.1} Hz, expected {expected:.1} Hz by the rig file"),
+        (Some(expected), 0) => {
+            format!("{device}: {rate_hz:.1} Hz, expected {expected:.1} Hz by the rig file")
+        }
         (None, dropped) => format!("{device} dropped {dropped} images"),
         (Some(expected), dropped) => {
             format!(
@@ -257,33 +331,74 @@ fn problem(statistics: &DeviceStatistics) -> Option<Finding> {
             )
         }
     };
-    Some(Finding::warn("rate", message, "usual causes: low light with automatic exposure, a slow bus, a busy CPU"))
+    Some(Finding::warn(
+        "rate",
+        message,
+        "usual causes: low light with automatic exposure, a slow bus, a busy CPU",
+    ))
 }
 
-/// Reports stamps that advance faster or slower than time, usually because they are in another unit.
+/// Reports stamps that advance faster or slower than time, usually because they are in another
+/// unit.
 fn wrong_unit(statistics: &DeviceStatistics) -> Option<Finding> {
-    let rate = statistics.stamp_secs_per_sec.filter(|rate| !(0.5..2.0).contains(rate))?;
-    let units = [("microseconds", 1e-3), ("milliseconds", 1e-6), ("seconds", 1e-9)];
-    let unit = units.into_iter().find(|(_, of_unit)| (0.5..2.0).contains(&(rate / of_unit)));
-    let guess = unit.map_or(String::new(), |(unit, _)| format!(", as if they were in {unit}"));
-    let message = format!("{}: its stamps advance by {rate:.1e} s per second{guess}", statistics.device);
-    Some(Finding::fail("stamps", message, "send stamps in nanoseconds from a single clock"))
+    let rate = statistics
+        .stamp_secs_per_sec
+        .filter(|rate| !(0.5..2.0).contains(rate))?;
+    let units = [
+        ("microseconds", 1e-3),
+        ("milliseconds", 1e-6),
+        ("seconds", 1e-9),
+    ];
+    let unit = units
+        .into_iter()
+        .find(|(_, of_unit)| (0.5..2.0).contains(&(rate / of_unit)));
+    let guess = unit.map_or(String::new(), |(unit, _)| {
+        format!(", as if they were in {unit}")
+    });
+    let message = format!(
+        "{}: its stamps advance by {rate:.1e} s per second{guess}",
+        statistics.device
+    );
+    Some(Finding::fail(
+        "stamps",
+        message,
+        "send stamps in nanoseconds from a single clock",
+    ))
 }
 
 impl std::fmt::Display for DeviceStatistics {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let Self { device, samples, rate_hz, latency, gap_p99_millis, dropped, .. } = self;
+        let Self {
+            device,
+            samples,
+            rate_hz,
+            latency,
+            gap_p99_millis,
+            dropped,
+            ..
+        } = self;
         write!(f, "{device}: {samples} samples, {rate_hz:.1} Hz, ")?;
-        if let Some(Latency { latency_p50_millis: p50, latency_p99_millis: p99, .. }) = latency {
+        if let Some(Latency {
+            latency_p50_millis: p50,
+            latency_p99_millis: p99,
+            ..
+        }) = latency
+        {
             write!(f, "latency {p50:.1} ms (99 %: {p99:.1} ms), ")?;
         }
-        write!(f, "interval at most {gap_p99_millis:.1} ms (99 %), {dropped} dropped")
+        write!(
+            f,
+            "interval at most {gap_p99_millis:.1} ms (99 %), {dropped} dropped"
+        )
     }
 }
 
 fn cpu_message(busy: Duration, spent: Duration) -> String {
     let busy_frac = busy.as_secs_f64() / spent.as_secs_f64().max(1e-9);
-    format!("{:.1} % of one core was busy with reading and joining", 100.0 * busy_frac)
+    format!(
+        "{:.1} % of one core was busy with reading and joining",
+        100.0 * busy_frac
+    )
 }
 
 #[cfg(test)]
@@ -291,11 +406,17 @@ mod tests {
     use super::*;
 
     fn track(n: i64, period_millis: i64, dropped: u64) -> Track {
-        let mut track = Track { dropped, ..Track::default() };
+        let mut track = Track {
+            dropped,
+            ..Track::default()
+        };
         for ix in 0..n {
             let stamp = Stamp(ix * period_millis * 1_000_000);
             // One in a hundred arrives late.
-            track.note(stamp, stamp.plus_secs(if ix % 100 == 50 { 0.5 } else { 0.01 }));
+            track.note(
+                stamp,
+                stamp.plus_secs(if ix % 100 == 50 { 0.5 } else { 0.01 }),
+            );
         }
         track
     }
@@ -305,22 +426,35 @@ mod tests {
         let summarize = track(301, 100, 0).summarize("camera \"wrist\"".into(), Some(10.0), false);
         assert!((summarize.rate_hz - 10.0).abs() < 1e-9);
         let latency = summarize.latency.as_ref().expect("not simulated");
-        assert!((latency.latency_p50_millis - 10.0).abs() < 1e-6 && (latency.latency_p99_millis - 10.0).abs() < 1e-6);
+        assert!(
+            (latency.latency_p50_millis - 10.0).abs() < 1e-6
+                && (latency.latency_p99_millis - 10.0).abs() < 1e-6
+        );
         assert!((latency.latency_max_millis - 500.0).abs() < 1e-6);
         assert_eq!(problem(&summarize), None);
-        assert!(summarize.to_string().contains("301 samples, 10.0 Hz, latency 10.0 ms"), "{summarize}");
+        assert!(
+            summarize
+                .to_string()
+                .contains("301 samples, 10.0 Hz, latency 10.0 ms"),
+            "{summarize}"
+        );
         let slow = track(301, 100, 0).summarize("camera \"wrist\"".into(), Some(15.0), false);
         assert!(problem(&slow).is_some_and(|finding| finding.message.contains("expected 15.0 Hz")));
         let lossy = track(301, 100, 4).summarize("camera \"wrist\"".into(), Some(10.0), false);
-        assert!(problem(&lossy).is_some_and(|finding| finding.message.contains("dropped 4 images")));
-        for (nanos_per_sample, expected) in
-            [(100_000, "microseconds"), (100, "milliseconds"), (30_000_000, "3.0e-1 s per second")]
-        {
+        assert!(
+            problem(&lossy).is_some_and(|finding| finding.message.contains("dropped 4 images"))
+        );
+        for (nanos_per_sample, expected) in [
+            (100_000, "microseconds"),
+            (100, "milliseconds"),
+            (30_000_000, "3.0e-1 s per second"),
+        ] {
             let mut track = Track::default();
             for ix in 0..21_i64 {
                 track.note(Stamp(ix * nanos_per_sample), Stamp(ix * 100_000_000));
             }
-            let finding = wrong_unit(&track.summarize("arm".into(), None, false)).expect("not nanoseconds");
+            let finding =
+                wrong_unit(&track.summarize("arm".into(), None, false)).expect("not nanoseconds");
             assert!(finding.message.contains(expected), "{}", finding.message);
         }
         assert_eq!(wrong_unit(&lossy), None);

@@ -8,7 +8,8 @@ const SUFFICIENT_MEMORY_KIB: u64 = 4 << 20;
 
 /// Checks that the memory is sufficient for a run.
 pub(super) fn memory(proc: &Path) -> Finding {
-    let Some(available_kib) = field(&proc.join("meminfo"), "MemAvailable:").and_then(|kib| kib.parse::<u64>().ok())
+    let Some(available_kib) =
+        field(&proc.join("meminfo"), "MemAvailable:").and_then(|kib| kib.parse::<u64>().ok())
     else {
         return Finding::ok("memory", "not reported by the kernel");
     };
@@ -16,7 +17,11 @@ pub(super) fn memory(proc: &Path) -> Finding {
     if available_kib >= SUFFICIENT_MEMORY_KIB {
         Finding::ok("memory", message)
     } else {
-        Finding::warn("memory", message, "close other programs, or lower max_keyframes and max_splats in the rig file")
+        Finding::warn(
+            "memory",
+            message,
+            "close other programs, or lower max_keyframes and max_splats in the rig file",
+        )
     }
 }
 
@@ -28,10 +33,16 @@ mod tests {
 
     #[test]
     fn low_memory_is_reported() {
-        let low = folder_with("meminfo", "MemTotal:  8000000 kB\nMemAvailable:  1048576 kB\n");
+        let low = folder_with(
+            "meminfo",
+            "MemTotal:  8000000 kB\nMemAvailable:  1048576 kB\n",
+        );
         assert_eq!(memory(low.path()).verdict, Verdict::Warn);
         assert!(memory(low.path()).message.contains("1024 MiB"));
-        let plenty = folder_with("meminfo", "MemTotal:  8000000 kB\nMemAvailable:  7000000 kB\n");
+        let plenty = folder_with(
+            "meminfo",
+            "MemTotal:  8000000 kB\nMemAvailable:  7000000 kB\n",
+        );
         assert_eq!(memory(plenty.path()).verdict, Verdict::Ok);
     }
 }

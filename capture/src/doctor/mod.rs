@@ -1,4 +1,5 @@
-//! Checks this computer and the devices of a rig, and suggests a remedy for each problem. Nothing is moved.
+//! Checks this computer and the devices of a rig, and suggests a remedy for each problem. Nothing
+//! is moved.
 
 mod calibration;
 #[cfg(target_os = "linux")]
@@ -51,17 +52,40 @@ pub struct Finding {
 impl Finding {
     /// Creates a finding without a problem.
     pub fn ok(check: &'static str, message: impl Into<String>) -> Self {
-        Self { check, verdict: Verdict::Ok, message: message.into(), remedy: None }
+        Self {
+            check,
+            verdict: Verdict::Ok,
+            message: message.into(),
+            remedy: None,
+        }
     }
 
     /// Creates a finding about a problem that degrades results.
-    pub fn warn(check: &'static str, message: impl Into<String>, remedy: impl Into<String>) -> Self {
-        Self { check, verdict: Verdict::Warn, message: message.into(), remedy: Some(remedy.into()) }
+    pub fn warn(
+        check: &'static str,
+        message: impl Into<String>,
+        remedy: impl Into<String>,
+    ) -> Self {
+        Self {
+            check,
+            verdict: Verdict::Warn,
+            message: message.into(),
+            remedy: Some(remedy.into()),
+        }
     }
 
     /// Creates a finding about a problem that prevents a run.
-    pub fn fail(check: &'static str, message: impl Into<String>, remedy: impl Into<String>) -> Self {
-        Self { check, verdict: Verdict::Fail, message: message.into(), remedy: Some(remedy.into()) }
+    pub fn fail(
+        check: &'static str,
+        message: impl Into<String>,
+        remedy: impl Into<String>,
+    ) -> Self {
+        Self {
+            check,
+            verdict: Verdict::Fail,
+            message: message.into(),
+            remedy: Some(remedy.into()),
+        }
     }
 }
 
@@ -74,15 +98,25 @@ impl std::fmt::Display for Finding {
     }
 }
 
-/// Checks clocks, memory, priorities and permissions, the devices of `rig`, and connected devices in general.
+/// Checks clocks, memory, priorities and permissions, the devices of `rig`, and connected devices
+/// in general.
 pub fn check(rig: Option<&Rig>) -> Vec<Finding> {
     let (dev, proc, sys) = (Path::new("/dev"), Path::new("/proc"), Path::new("/sys"));
     let mut findings = vec![clock::clock(), clock::clock_source(sys)];
     findings.extend(governor::governor(sys));
-    findings.extend([memory::memory(proc), realtime::realtime(proc), video_devices::permissions(dev)]);
+    findings.extend([
+        memory::memory(proc),
+        realtime::realtime(proc),
+        video_devices::permissions(dev),
+    ]);
     #[cfg(target_os = "linux")]
     {
-        findings.extend(drivers::v4l2::cameras().into_iter().flatten().filter_map(|camera| usb::usb(&camera)));
+        findings.extend(
+            drivers::v4l2::cameras()
+                .into_iter()
+                .flatten()
+                .filter_map(|camera| usb::usb(&camera)),
+        );
         findings.extend(rig.into_iter().flat_map(video_devices::missing));
         findings.extend(rig.into_iter().flat_map(video_devices::unstable_nodes));
     }
@@ -92,7 +126,10 @@ pub fn check(rig: Option<&Rig>) -> Vec<Finding> {
     findings.extend(franka::franka(rig));
     findings.extend(rig.and_then(motion::motion));
     findings.extend(rig.into_iter().flat_map(calibration::calibration));
-    findings.extend(rig.into_iter().flat_map(|rig| udp::senders(rig).into_iter().chain(realsense::files(rig))));
+    findings.extend(
+        rig.into_iter()
+            .flat_map(|rig| udp::senders(rig).into_iter().chain(realsense::files(rig))),
+    );
     findings
 }
 
@@ -123,9 +160,17 @@ mod testing {
     }
 
     /// A rig file of the folder `rigs`, with changed keys.
-    pub(super) fn bundled_rig<V: Clone + Into<toml::Value>>(name: &str, overrides: &[(&'static str, V)]) -> Rig {
-        let overrides: Vec<_> = overrides.iter().map(|(key, value)| Override::new(key, value.clone())).collect();
-        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../rigs").join(name);
+    pub(super) fn bundled_rig<V: Clone + Into<toml::Value>>(
+        name: &str,
+        overrides: &[(&'static str, V)],
+    ) -> Rig {
+        let overrides: Vec<_> = overrides
+            .iter()
+            .map(|(key, value)| Override::new(key, value.clone()))
+            .collect();
+        let path = Path::new(env!("CARGO_MANIFEST_DIR"))
+            .join("../rigs")
+            .join(name);
         Rig::load(&path, &overrides).expect("a bundled rig file")
     }
 }

@@ -10,7 +10,11 @@ pub(super) fn realsense(rig: Option<&Rig>) -> Vec<Finding> {
     let found = match drivers::realsense::cameras() {
         Ok(found) => found,
         Err(problem) => {
-            return vec![Finding::fail(CHECK, problem.to_string(), "install the udev rules of the RealSense SDK")];
+            return vec![Finding::fail(
+                CHECK,
+                problem.to_string(),
+                "install the udev rules of the RealSense SDK",
+            )];
         }
     };
     let mut findings = Vec::new();
@@ -26,19 +30,37 @@ pub(super) fn realsense(rig: Option<&Rig>) -> Vec<Finding> {
         }
         if camera.has_old_firmware() {
             let recommended = camera.recommended_firmware.as_deref().unwrap_or_default();
-            let message =
-                format!("{name}: firmware {} is older than the library recommends ({recommended})", camera.firmware);
-            findings.push(Finding::warn(CHECK, message, "update it with rs-fw-update of the RealSense SDK"));
+            let message = format!(
+                "{name}: firmware {} is older than the library recommends ({recommended})",
+                camera.firmware
+            );
+            findings.push(Finding::warn(
+                CHECK,
+                message,
+                "update it with rs-fw-update of the RealSense SDK",
+            ));
         }
         if !camera.is_on_usb2() && !camera.has_old_firmware() {
-            findings.push(Finding::ok(CHECK, format!("{name}, firmware {}", camera.firmware)));
+            findings.push(Finding::ok(
+                CHECK,
+                format!("{name}, firmware {}", camera.firmware),
+            ));
         }
     }
     for camera in realsense_of(rig) {
-        let is_connected = found.iter().any(|device| camera.device.is_empty() || device.serial == camera.device);
+        let is_connected = found
+            .iter()
+            .any(|device| camera.device.is_empty() || device.serial == camera.device);
         if !is_connected {
-            let message = format!("camera {:?}: no RealSense camera {:?} is connected", camera.name, camera.device);
-            findings.push(Finding::fail(CHECK, message, "list the connected cameras with fieldrig devices"));
+            let message = format!(
+                "camera {:?}: no RealSense camera {:?} is connected",
+                camera.name, camera.device
+            );
+            findings.push(Finding::fail(
+                CHECK,
+                message,
+                "list the connected cameras with fieldrig devices",
+            ));
         }
     }
     findings
@@ -57,7 +79,9 @@ pub(super) fn realsense(rig: Option<&Rig>) -> Vec<Finding> {
 /// RealSense cameras of a rig, without those that play back a file.
 fn realsense_of(rig: Option<&Rig>) -> impl Iterator<Item = &Camera> {
     let cameras = rig.map_or(&[][..], |rig| &rig.cameras).iter();
-    cameras.filter(|camera| camera.driver == CameraDriver::Realsense && camera.realsense.file.as_os_str().is_empty())
+    cameras.filter(|camera| {
+        camera.driver == CameraDriver::Realsense && camera.realsense.file.as_os_str().is_empty()
+    })
 }
 
 /// Checks that the files that replace RealSense cameras exist.
@@ -67,10 +91,22 @@ pub(super) fn files(rig: &Rig) -> Vec<Finding> {
         camera.driver == CameraDriver::Realsense && !file.as_os_str().is_empty() && !file.is_file()
     };
     let missing_file = |camera: &Camera| {
-        let message = format!("camera {:?}: the file {} does not exist", camera.name, camera.realsense.file.display());
-        Finding::fail("realsense", message, "camera.NAME.realsense.file is relative to the folder of the rig file")
+        let message = format!(
+            "camera {:?}: the file {} does not exist",
+            camera.name,
+            camera.realsense.file.display()
+        );
+        Finding::fail(
+            "realsense",
+            message,
+            "camera.NAME.realsense.file is relative to the folder of the rig file",
+        )
     };
-    rig.cameras.iter().filter(missing).map(missing_file).collect()
+    rig.cameras
+        .iter()
+        .filter(missing)
+        .map(missing_file)
+        .collect()
 }
 
 #[cfg(test)]
@@ -80,8 +116,14 @@ mod tests {
 
     #[test]
     fn missing_files_are_reported() {
-        let overrides = [("camera.wrist.driver", "realsense"), ("camera.wrist.realsense.file", "nowhere.bag")];
+        let overrides = [
+            ("camera.wrist.driver", "realsense"),
+            ("camera.wrist.realsense.file", "nowhere.bag"),
+        ];
         let findings = files(&bundled_rig("static-arm.toml", &overrides));
-        assert!(findings.len() == 1 && findings[0].message.contains("nowhere.bag"), "{findings:?}");
+        assert!(
+            findings.len() == 1 && findings[0].message.contains("nowhere.bag"),
+            "{findings:?}"
+        );
     }
 }

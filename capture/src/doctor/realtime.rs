@@ -9,7 +9,8 @@ pub(super) fn realtime(proc: &Path) -> Finding {
     match limit.as_deref() {
         None => Finding::ok("real time", "not reported by the kernel"),
         Some("0") => {
-            let message = "real-time priority is not allowed; only arms controlled at 1 kHz need it";
+            let message =
+                "real-time priority is not allowed; only arms controlled at 1 kHz need it";
             let remedy = r#"echo "$USER - rtprio 99" | sudo tee -a /etc/security/limits.conf, then log in again"#;
             Finding::warn("real time", message, remedy)
         }
@@ -25,8 +26,10 @@ mod tests {
 
     #[test]
     fn missing_real_time_priority_is_reported_with_remedy() {
-        let denied =
-            folder_with("self/limits", "Max nice priority         0          0\nMax realtime priority     0       0\n");
+        let denied = folder_with(
+            "self/limits",
+            "Max nice priority         0          0\nMax realtime priority     0       0\n",
+        );
         let finding = realtime(denied.path());
         assert_eq!(finding.verdict, Verdict::Warn);
         assert!(finding.remedy.expect("a remedy").contains("rtprio"));

@@ -13,7 +13,10 @@ pub(super) fn permissions(dev: &Path) -> Finding {
         .into_iter()
         .flatten()
         .filter_map(|entry| Some(entry.ok()?.path()))
-        .filter(|path| path.file_name().is_some_and(|name| name.to_string_lossy().starts_with("video")))
+        .filter(|path| {
+            path.file_name()
+                .is_some_and(|name| name.to_string_lossy().starts_with("video"))
+        })
         .collect();
     nodes.sort_unstable();
     let denied: Vec<String> = nodes
@@ -25,20 +28,37 @@ pub(super) fn permissions(dev: &Path) -> Finding {
         .map(|node| node.display().to_string())
         .collect();
     if denied.is_empty() {
-        return Finding::ok("cameras", format!("{} video devices, all accessible", nodes.len()));
+        return Finding::ok(
+            "cameras",
+            format!("{} video devices, all accessible", nodes.len()),
+        );
     }
     let message = format!("no permission to open {}", denied.join(", "));
-    Finding::warn("cameras", message, "sudo usermod -aG video $USER, then log in again")
+    Finding::warn(
+        "cameras",
+        message,
+        "sudo usermod -aG video $USER, then log in again",
+    )
 }
 
 /// Reports V4L2 cameras of a rig whose device node may belong to another camera after a restart.
 #[cfg(target_os = "linux")]
 pub(super) fn unstable_nodes(rig: &Rig) -> Vec<Finding> {
-    let cameras = rig.cameras.iter().filter(|camera| camera.driver == CameraDriver::V4l2);
+    let cameras = rig
+        .cameras
+        .iter()
+        .filter(|camera| camera.driver == CameraDriver::V4l2);
     let unstable = cameras.filter(|camera| camera.device.starts_with("/dev/video"));
     let warn = |camera: &Camera| {
-        let message = format!("camera {:?}: {} may become another camera after a restart", camera.name, camera.device);
-        Finding::warn("cameras", message, "use the stable name that fieldrig devices prints")
+        let message = format!(
+            "camera {:?}: {} may become another camera after a restart",
+            camera.name, camera.device
+        );
+        Finding::warn(
+            "cameras",
+            message,
+            "use the stable name that fieldrig devices prints",
+        )
     };
     unstable.map(warn).collect()
 }
@@ -46,10 +66,15 @@ pub(super) fn unstable_nodes(rig: &Rig) -> Vec<Finding> {
 /// Reports V4L2 cameras of a rig that are not connected.
 #[cfg(target_os = "linux")]
 pub(super) fn missing(rig: &Rig) -> Vec<Finding> {
-    let cameras = rig.cameras.iter().filter(|camera| camera.driver == CameraDriver::V4l2);
+    let cameras = rig
+        .cameras
+        .iter()
+        .filter(|camera| camera.driver == CameraDriver::V4l2);
     let devices = cameras.flat_map(|camera| {
         let depth = camera.depth.as_ref().map(|depth| &depth.device);
-        std::iter::once(&camera.device).chain(depth).map(move |device| (&camera.name, device))
+        std::iter::once(&camera.device)
+            .chain(depth)
+            .map(move |device| (&camera.name, device))
     });
     let missing = devices.filter_map(|(name, device)| {
         let problem = v4l2::check_connected(device).err()?;
@@ -71,9 +96,17 @@ mod tests {
     fn absent_camera_is_reported_by_its_device() {
         let rig = bundled_rig(
             "static-arm.toml",
-            &[("camera.wrist.driver", "v4l2"), ("camera.wrist.device", "no such serial")],
+            &[
+                ("camera.wrist.driver", "v4l2"),
+                ("camera.wrist.device", "no such serial"),
+            ],
         );
         let findings = missing(&rig);
-        assert!(findings.iter().any(|finding| finding.message.contains("\"no such serial\"")), "{findings:?}");
+        assert!(
+            findings
+                .iter()
+                .any(|finding| finding.message.contains("\"no such serial\"")),
+            "{findings:?}"
+        );
     }
 }

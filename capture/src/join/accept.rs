@@ -15,8 +15,9 @@ pub(super) struct Acceptance {
     spacing: Spacing,
     is_fixed: bool,
     readout_secs: f64,
-    /// All poses accepted so far, including those of evicted keyframes. Otherwise, a full store would accept the same
-    /// views again and again. Their number is bounded by the spacing and the space that the camera can reach.
+    /// All poses accepted so far, including those of evicted keyframes. Otherwise, a full store
+    /// would accept the same views again and again. Their number is bounded by the spacing and the
+    /// space that the camera can reach.
     accepted: Vec<Transform>,
     last: Option<Stamp>,
     sharpness: SharpnessHistory,
@@ -24,7 +25,12 @@ pub(super) struct Acceptance {
 
 impl Acceptance {
     /// Creates the test for a camera. `is_fixed`: whether the camera never moves.
-    pub(super) fn new(config: &JoinConfig, camera: &config::Camera, is_fixed: bool, spacing: Spacing) -> Self {
+    pub(super) fn new(
+        config: &JoinConfig,
+        camera: &config::Camera,
+        is_fixed: bool,
+        spacing: Spacing,
+    ) -> Self {
         Self {
             config: config.clone(),
             spacing,
@@ -40,19 +46,28 @@ impl Acceptance {
         self.readout_secs
     }
 
-    /// Checks that the camera has moved enough since the nearest keyframe. For a fixed camera, checks instead that
-    /// enough time has passed.
+    /// Checks that the camera has moved enough since the nearest keyframe. For a fixed camera,
+    /// checks instead that enough time has passed.
     pub(super) fn check_motion(&self, stamp: Stamp, pose: &Transform) -> Result<(), Rejection> {
         let moved = if self.is_fixed {
-            let waited = self.last.is_none_or(|last| stamp.secs_since(last) * 1e3 >= self.config.fixed_interval_millis);
+            let waited = self.last.is_none_or(|last| {
+                stamp.secs_since(last) * 1e3 >= self.config.fixed_interval_millis
+            });
             waited && self.accepted.len() < self.config.fixed_keyframes
         } else {
-            self.accepted.iter().all(|accepted| self.spacing.between(accepted, pose) >= 1.0)
+            self.accepted
+                .iter()
+                .all(|accepted| self.spacing.between(accepted, pose) >= 1.0)
         };
-        if moved { Ok(()) } else { Err(Rejection::NotMoved) }
+        if moved {
+            Ok(())
+        } else {
+            Err(Rejection::NotMoved)
+        }
     }
 
-    /// Checks that the camera is slow enough for its exposure and readout time. `depth_m`: distance of the scene.
+    /// Checks that the camera is slow enough for its exposure and readout time. `depth_m`: distance
+    /// of the scene.
     pub(super) fn check_speed(
         &self,
         camera_pose: &CameraPose,
@@ -61,13 +76,20 @@ impl Acceptance {
         depth_m: f64,
     ) -> Result<(), Rejection> {
         let Some(twist) = &camera_pose.twist else {
-            return if self.readout_secs > 0.0 { Err(Rejection::ShearUnknown) } else { Ok(()) };
+            return if self.readout_secs > 0.0 {
+                Err(Rejection::ShearUnknown)
+            } else {
+                Ok(())
+            };
         };
         let speed_px_s = motion::image_speed_px_s(twist, pinhole, depth_m);
         let blur_px = speed_px_s * exposure_secs.unwrap_or(0.0);
         let shear_px = speed_px_s * self.readout_secs;
         // Written so that a NaN speed is rejected too.
-        match (blur_px <= self.config.max_blur_px, shear_px <= self.config.max_shear_px) {
+        match (
+            blur_px <= self.config.max_blur_px,
+            shear_px <= self.config.max_shear_px,
+        ) {
             (true, true) => Ok(()),
             (false, _) => Err(Rejection::Blur),
             (true, false) => Err(Rejection::Shear),
@@ -77,16 +99,21 @@ impl Acceptance {
     /// Checks exposure and sharpness. `rgb` is `[height, width, 3]`.
     pub(super) fn check_pixels(&mut self, rgb: &[u8], size_px: [u32; 2]) -> Result<(), Rejection> {
         let statistics = PixelStatistics::of(rgb, size_px);
-        let is_well_exposed = (self.config.min_luma_frac..=self.config.max_luma_frac).contains(&statistics.luma_frac);
+        let is_well_exposed =
+            (self.config.min_luma_frac..=self.config.max_luma_frac).contains(&statistics.luma_frac);
         if !is_well_exposed || statistics.clipped_frac > self.config.max_clipped_frac {
             return Err(Rejection::Exposure);
         }
         let relative = self.sharpness.relative(statistics.sharpness);
-        if relative >= self.config.min_sharpness_frac { Ok(()) } else { Err(Rejection::NotSharp) }
+        if relative >= self.config.min_sharpness_frac {
+            Ok(())
+        } else {
+            Err(Rejection::NotSharp)
+        }
     }
 
-    /// Adds the pose of a keyframe of the resumed run. Its stamp may come from another clock, so the interval of a
-    /// fixed camera starts again.
+    /// Adds the pose of a keyframe of the resumed run. Its stamp may come from another clock, so
+    /// the interval of a fixed camera starts again.
     pub(super) fn accept_resumed(&mut self, pose: &Transform) {
         self.accepted.push(*pose);
     }
@@ -110,12 +137,18 @@ mod tests {
         let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../rigs/static-arm.toml");
         let rig = Rig::load(&path, &[]).expect("a rig");
         let fixed = || {
-            let spacing = Spacing { translation_m: 1.0, rotation_rad: 1.0 };
+            let spacing = Spacing {
+                translation_m: 1.0,
+                rotation_rad: 1.0,
+            };
             Acceptance::new(&rig.join, &rig.cameras[0], true, spacing)
         };
         let (mut running, mut resumed, pose) = (fixed(), fixed(), Transform::identity());
         running.accept(Stamp(3_600_000_000_000), &pose);
-        assert_eq!(running.check_motion(Stamp(0), &pose), Err(Rejection::NotMoved));
+        assert_eq!(
+            running.check_motion(Stamp(0), &pose),
+            Err(Rejection::NotMoved)
+        );
         resumed.accept_resumed(&pose);
         assert_eq!(resumed.check_motion(Stamp(0), &pose), Ok(()));
     }
@@ -124,13 +157,28 @@ mod tests {
     fn unknown_velocity_is_rejected_only_for_rolling_shutters() {
         for (readout_micros, expected) in [(0, Ok(())), (15_000, Err(Rejection::ShearUnknown))] {
             let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../rigs/static-arm.toml");
-            let rig = Rig::load(&path, &[Override::new("camera.wrist.readout_micros", readout_micros)]).expect("a rig");
+            let rig = Rig::load(
+                &path,
+                &[Override::new("camera.wrist.readout_micros", readout_micros)],
+            )
+            .expect("a rig");
             let camera = &rig.cameras[0];
-            let acceptance =
-                Acceptance::new(&rig.join, camera, false, Spacing { translation_m: 1.0, rotation_rad: 1.0 });
+            let acceptance = Acceptance::new(
+                &rig.join,
+                camera,
+                false,
+                Spacing {
+                    translation_m: 1.0,
+                    rotation_rad: 1.0,
+                },
+            );
             let check = |twist| {
-                let camera_pose =
-                    CameraPose { world_from_camera: Transform::identity(), twist, joint_twists: [].into(), base: None };
+                let camera_pose = CameraPose {
+                    world_from_camera: Transform::identity(),
+                    twist,
+                    joint_twists: [].into(),
+                    base: None,
+                };
                 acceptance.check_speed(&camera_pose, &camera.intrinsics, Some(0.01), 0.5)
             };
             assert_eq!(check(None), expected);

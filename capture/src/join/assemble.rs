@@ -17,11 +17,16 @@ pub(super) struct Undistorter {
 }
 
 impl Undistorter {
-    /// Creates the maps of a camera. `scale`: factor for the width and height of the undistorted images.
+    /// Creates the maps of a camera. `scale`: factor for the width and height of the undistorted
+    /// images.
     pub(super) fn new(intrinsics: &Intrinsics, scale: f64) -> crate::Result<Self> {
         let undistortion = (!intrinsics.is_pinhole()).then(|| Undistortion::new(intrinsics));
         let full = intrinsics.undistorted();
-        Ok(Self { pinhole: downscale::intrinsics(&full, scale)?, full, undistortion })
+        Ok(Self {
+            pinhole: downscale::intrinsics(&full, scale)?,
+            full,
+            undistortion,
+        })
     }
 
     /// The pinhole camera of the undistorted images at the size of the device images.
@@ -39,10 +44,15 @@ impl Undistorter {
         self.pinhole.size_px != self.full.size_px
     }
 
-    /// Undistorts and scales `[height, width, 3]` to `[height, width, 4]`; alpha is 0 where the source image has no
-    /// pixel.
+    /// Undistorts and scales `[height, width, 3]` to `[height, width, 4]`; alpha is 0 where the
+    /// source image has no pixel.
     pub(super) fn rgba(&self, rgb: &[u8]) -> crate::Result<Arc<[u8]>> {
-        let opaque = || rgb.as_chunks::<3>().0.iter().flat_map(|[red, green, blue]| [*red, *green, *blue, 255]);
+        let opaque = || {
+            rgb.as_chunks::<3>()
+                .0
+                .iter()
+                .flat_map(|[red, green, blue]| [*red, *green, *blue, 255])
+        };
         if !self.is_downscaled() {
             return match &self.undistortion {
                 Some(undistortion) => Ok(undistortion.apply_rgb(rgb)?.into()),
@@ -73,7 +83,10 @@ pub(super) fn depth_map(
 ) -> crate::Result<DepthMap> {
     expect_size(image, &depth.intrinsics)?;
     let mut depth_m = undistorter.depth_m(image.decode_depth_m()?)?;
-    #[expect(clippy::cast_possible_truncation, reason = "f32 is precise enough for a range in meters")]
+    #[expect(
+        clippy::cast_possible_truncation,
+        reason = "f32 is precise enough for a range in meters"
+    )]
     let (factor, min_m, max_m) = (depth.factor as f32, depth.min_m as f32, depth.max_m as f32);
     for depth_m in &mut depth_m {
         *depth_m *= factor;
@@ -97,19 +110,37 @@ pub(super) fn rgb(image: &Image, intrinsics: &Intrinsics) -> crate::Result<Vec<u
 }
 
 /// The simulator's ground truth for a keyframe, undistorted with the same maps as the image.
-pub(super) fn truth(truth: &TruthImage, intrinsics: &Intrinsics, undistorter: &Undistorter) -> crate::Result<Truth> {
-    let rgba_srgb = undistorter.rgba(&rgb(&truth.image, intrinsics)?).context("the true image")?;
+pub(super) fn truth(
+    truth: &TruthImage,
+    intrinsics: &Intrinsics,
+    undistorter: &Undistorter,
+) -> crate::Result<Truth> {
+    let rgba_srgb = undistorter
+        .rgba(&rgb(&truth.image, intrinsics)?)
+        .context("the true image")?;
     // The PSNR ceiling applies to noise at full size; averaging areas removes much of the noise.
-    let psnr_ceiling = if undistorter.is_downscaled() { None } else { truth.psnr_ceiling };
-    Ok(Truth { rgba_srgb, world_from_camera: truth.world_from_camera, psnr_ceiling })
+    let psnr_ceiling = if undistorter.is_downscaled() {
+        None
+    } else {
+        truth.psnr_ceiling
+    };
+    Ok(Truth {
+        rgba_srgb,
+        world_from_camera: truth.world_from_camera,
+        psnr_ceiling,
+    })
 }
 
-/// Median of a depth map, sampled at every eighth pixel of every eighth row; `None` if there are no readings.
+/// Median of a depth map, sampled at every eighth pixel of every eighth row; `None` if there are no
+/// readings.
 pub(super) fn median_depth_m(map: &DepthMap) -> Option<f64> {
     let width = map.size_px[0] as usize;
     let rows = map.depth_m.chunks(width.max(1)).step_by(8);
-    let mut valid_depths: Vec<f64> =
-        rows.flat_map(|row| row.iter().step_by(8).copied()).filter(|depth_m| *depth_m > 0.0).map(f64::from).collect();
+    let mut valid_depths: Vec<f64> = rows
+        .flat_map(|row| row.iter().step_by(8).copied())
+        .filter(|depth_m| *depth_m > 0.0)
+        .map(f64::from)
+        .collect();
     quantile(&mut valid_depths, 0.5, Rank::Upper)
 }
 

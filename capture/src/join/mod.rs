@@ -1,7 +1,7 @@
 //! Joins images with joint readings, base poses and calibration, which gives keyframes.
 //!
-//! Samples are pushed one by one. The result depends only on their order, so a live lockstep run, its recording and the
-//! replay of that recording give bit-identical keyframes.
+//! Samples are pushed one by one. The result depends only on their order, so a live lockstep run,
+//! its recording and the replay of that recording give bit-identical keyframes.
 
 mod accept;
 mod assemble;
@@ -36,8 +36,8 @@ use waiting::{Partner, Waiting};
 
 /// Converts samples to keyframes.
 ///
-/// Samples go in one by one with [`Join::push`]; [`Join::finish`] ends the stream. The store of keyframes is bounded:
-/// beyond its limits, the most redundant keyframe is evicted.
+/// Samples go in one by one with [`Join::push`]; [`Join::finish`] ends the stream. The store of
+/// keyframes is bounded: beyond its limits, the most redundant keyframe is evicted.
 pub struct Join {
     motion: Motion,
     cameras: Vec<CameraState>,
@@ -55,8 +55,8 @@ pub struct Join {
     newest: Stamp,
     /// The latest stamp of the keyframes from the resumed run.
     newest_resumed: Option<Stamp>,
-    /// Nanoseconds added to the stamps of new keyframes so that they follow earlier ones; `None` before the first
-    /// keyframe.
+    /// Nanoseconds added to the stamps of new keyframes so that they follow earlier ones; `None`
+    /// before the first keyframe.
     stamp_offset_nanos: Option<i64>,
 }
 
@@ -117,10 +117,14 @@ impl Join {
     ///
     /// # Errors
     ///
-    /// If the robot description does not match the rig, or the scaled training images would be too small.
+    /// If the robot description does not match the rig, or the scaled training images would be too
+    /// small.
     pub fn new(rig: &Rig) -> crate::Result<Self> {
         let join = &rig.join;
-        let spacing = Spacing { translation_m: join.min_translation_m, rotation_rad: join.min_rotation_rad };
+        let spacing = Spacing {
+            translation_m: join.min_translation_m,
+            rotation_rad: join.min_rotation_rad,
+        };
         Ok(Self {
             motion: Motion::new(rig)?,
             cameras: rig
@@ -142,25 +146,39 @@ impl Join {
         })
     }
 
-    /// Accepts exactly the keyframes of a list, with its splits, without acceptance tests or store limits.
+    /// Accepts exactly the keyframes of a list, with its splits, without acceptance tests or store
+    /// limits.
     #[must_use]
     pub fn taking_only(mut self, list: KeyframeList) -> Self {
-        self.store = KeyframeStore::new(usize::MAX, u64::MAX, Spacing { translation_m: 1.0, rotation_rad: 1.0 });
+        self.store = KeyframeStore::new(
+            usize::MAX,
+            u64::MAX,
+            Spacing {
+                translation_m: 1.0,
+                rotation_rad: 1.0,
+            },
+        );
         self.list = Some(list);
         self
     }
 
-    /// Continues a run that already has these keyframes. Returns the camera and stamp of those that do not fit into the
-    /// store.
+    /// Continues a run that already has these keyframes. Returns the camera and stamp of those that
+    /// do not fit into the store.
     ///
-    /// Clocks restart when a simulation or the computer restarts. If the stamp of the first new keyframe is not later
-    /// than the earlier stamps, all new keyframes get a stamp offset.
+    /// Clocks restart when a simulation or the computer restarts. If the stamp of the first new
+    /// keyframe is not later than the earlier stamps, all new keyframes get a stamp offset.
     #[must_use]
     pub fn resume_from(mut self, keyframes: &[Arc<Keyframe>]) -> (Self, Vec<(Arc<str>, Stamp)>) {
         let mut evicted = Vec::new();
         for keyframe in keyframes {
-            if let Some(camera) = self.cameras.iter_mut().find(|camera| camera.config.name == keyframe.camera) {
-                camera.acceptance.accept_resumed(&keyframe.world_from_camera);
+            if let Some(camera) = self
+                .cameras
+                .iter_mut()
+                .find(|camera| camera.config.name == keyframe.camera)
+            {
+                camera
+                    .acceptance
+                    .accept_resumed(&keyframe.world_from_camera);
                 camera.n_accepted += 1;
             }
             evicted.extend(self.store.push(Arc::clone(keyframe)));
@@ -171,7 +189,11 @@ impl Join {
 
     /// Converts the stamp of a sample to the clock of the keyframes.
     pub(crate) fn shifted(&self, stamp: Stamp) -> Stamp {
-        Stamp(stamp.0.saturating_add(self.stamp_offset_nanos.unwrap_or_default()))
+        Stamp(
+            stamp
+                .0
+                .saturating_add(self.stamp_offset_nanos.unwrap_or_default()),
+        )
     }
 
     /// Processes one sample and returns the resulting events.
@@ -210,7 +232,11 @@ impl Join {
             Sample::BaseTruth(truth) => self.motion.push_base_truth(&truth),
             Sample::Image(image) => self.push_image(image, &mut events),
             Sample::Truth(truth) => {
-                if let Some(camera) = self.cameras.iter_mut().find(|camera| camera.config.name == truth.image.camera) {
+                if let Some(camera) = self
+                    .cameras
+                    .iter_mut()
+                    .find(|camera| camera.config.name == truth.image.camera)
+                {
                     camera.waiting.push_truth(truth);
                 }
             }
@@ -226,8 +252,8 @@ impl Join {
         events
     }
 
-    /// Accepts or rejects all pending images, because the source has restarted. Its stamps continue to increase, but
-    /// the robot jumps back, so the motion up to now is not used for later images.
+    /// Accepts or rejects all pending images, because the source has restarted. Its stamps continue
+    /// to increase, but the robot jumps back, so the motion up to now is not used for later images.
     pub(crate) fn restart(&mut self) -> Vec<JoinEvent> {
         let events = self.finish();
         self.motion.restart();
@@ -250,24 +276,39 @@ impl Join {
         self.ranges.iter()
     }
 
-    /// Compares the result with the list of [`Join::taking_only`], as [`KeyframeList::check_found`] does; `None`
-    /// without a list or a difference.
+    /// Compares the result with the list of [`Join::taking_only`], as [`KeyframeList::check_found`]
+    /// does; `None` without a list or a difference.
     ///
     /// # Errors
     ///
     /// If no keyframe of the list was found.
     pub fn check_list(&self) -> crate::Result<Option<String>> {
-        let Some(list) = &self.list else { return Ok(None) };
-        let found = self.keyframes().map(|keyframe| (&*keyframe.camera, keyframe.stamp));
-        Ok(list.check_found(found, self.first_image.as_ref().map(|(camera, stamp)| (&**camera, *stamp)))?)
+        let Some(list) = &self.list else {
+            return Ok(None);
+        };
+        let found = self
+            .keyframes()
+            .map(|keyframe| (&*keyframe.camera, keyframe.stamp));
+        Ok(list.check_found(
+            found,
+            self.first_image
+                .as_ref()
+                .map(|(camera, stamp)| (&**camera, *stamp)),
+        )?)
     }
 
     fn push_image(&mut self, image: Image, events: &mut Vec<JoinEvent>) {
         self.counts.device_skipped += image.n_skipped;
         self.counts.images += u64::from(!image.is_depth());
-        let Some(camera) = self.cameras.iter_mut().find(|camera| camera.config.name == image.camera) else {
+        let Some(camera) = self
+            .cameras
+            .iter_mut()
+            .find(|camera| camera.config.name == image.camera)
+        else {
             if !image.is_depth() {
-                self.counts.unknown_cameras.insert(Arc::clone(&image.camera));
+                self.counts
+                    .unknown_cameras
+                    .insert(Arc::clone(&image.camera));
                 self.reject(&image.camera, image.stamp, Rejection::UnknownCamera, events);
             }
             return;
@@ -281,12 +322,20 @@ impl Join {
         }
     }
 
-    /// Transforms range scans, then decides about every image that is ready, camera by camera, oldest first.
+    /// Transforms range scans, then decides about every image that is ready, camera by camera,
+    /// oldest first.
     fn process_ready(&mut self, at_end: bool, events: &mut Vec<JoinEvent>) {
-        let counts_placed = self.ranges.process_ready(&self.motion, self.newest, at_end, self.max_wait_secs);
+        let counts_placed =
+            self.ranges
+                .process_ready(&self.motion, self.newest, at_end, self.max_wait_secs);
         self.counts.range_scans += counts_placed.n_placed;
         self.counts.range_scans_rejected += counts_placed.n_rejected;
-        events.extend(self.ranges.newest(counts_placed.n_placed).cloned().map(JoinEvent::RangeScan));
+        events.extend(
+            self.ranges
+                .newest(counts_placed.n_placed)
+                .cloned()
+                .map(JoinEvent::RangeScan),
+        );
         for camera_ix in 0..self.cameras.len() {
             while let Some(ready) = self.next_ready(camera_ix, at_end) {
                 match ready {
@@ -304,9 +353,13 @@ impl Join {
         }
     }
 
-    /// The oldest waiting image of a camera, if all its data have arrived. The error identifies an image that will
-    /// never have a pose.
-    fn next_ready(&mut self, camera_ix: usize, at_end: bool) -> Option<Result<ReadyImage, (Arc<str>, Stamp)>> {
+    /// The oldest waiting image of a camera, if all its data have arrived. The error identifies an
+    /// image that will never have a pose.
+    fn next_ready(
+        &mut self,
+        camera_ix: usize,
+        at_end: bool,
+    ) -> Option<Result<ReadyImage, (Arc<str>, Stamp)>> {
         let camera = &mut self.cameras[camera_ix];
         let device_stamp = camera.waiting.oldest()?.stamp;
         let stamp = camera.config.mid_exposure(device_stamp);
@@ -325,7 +378,13 @@ impl Join {
             if let Some(depth_stamp) = depth_stamp {
                 match self.motion.at(&camera.config, depth_stamp) {
                     Err(HistoryError::NotYet { .. }) if !overdue => return None,
-                    Ok(camera_pose) => depth = camera.waiting.depth_at(depth_stamp).cloned().zip(Some(camera_pose)),
+                    Ok(camera_pose) => {
+                        depth = camera
+                            .waiting
+                            .depth_at(depth_stamp)
+                            .cloned()
+                            .zip(Some(camera_pose))
+                    }
                     Err(_) => {}
                 }
             }
@@ -339,17 +398,29 @@ impl Join {
             camera.waiting.stop_waiting_for_truth();
         }
         let image = camera.waiting.take_oldest()?;
-        camera.waiting.forget_before(stamp, device_stamp, period_secs);
+        camera
+            .waiting
+            .forget_before(stamp, device_stamp, period_secs);
         match camera_pose {
-            Ok(camera_pose) => Some(Ok(ReadyImage { image, stamp, camera_pose, depth, truth })),
+            Ok(camera_pose) => Some(Ok(ReadyImage {
+                image,
+                stamp,
+                camera_pose,
+                depth,
+                truth,
+            })),
             Err(_) => Some(Err((image.camera, stamp))),
         }
     }
 
     fn decide(&mut self, camera_ix: usize, ready: ReadyImage, events: &mut Vec<JoinEvent>) {
-        let listed = self.list.as_ref().map(|list| list.split_of(&ready.image.camera, ready.stamp));
+        let listed = self
+            .list
+            .as_ref()
+            .map(|list| list.split_of(&ready.image.camera, ready.stamp));
         let (name, stamp) = (Arc::clone(&ready.image.camera), ready.stamp);
-        self.first_image.get_or_insert_with(|| (Arc::clone(&name), stamp));
+        self.first_image
+            .get_or_insert_with(|| (Arc::clone(&name), stamp));
         let camera = &mut self.cameras[camera_ix];
         let split = match listed {
             Some(None) => return, // The image is not in the list; this does not count as a rejection.
@@ -362,14 +433,28 @@ impl Join {
         };
         camera.n_accepted += 1;
         self.counts.accepted += 1;
-        let depth_from_ranges = if camera.config.depth.is_none() { self.ranges.depth_of(&keyframe) } else { None };
-        let stamp_offset_nanos = *self.stamp_offset_nanos.get_or_insert_with(|| match self.newest_resumed {
-            Some(earlier) if stamp <= earlier => earlier.plus_secs(1.0).0.saturating_sub(stamp.0),
-            _ => 0,
-        });
+        let depth_from_ranges = if camera.config.depth.is_none() {
+            self.ranges.depth_of(&keyframe)
+        } else {
+            None
+        };
+        let stamp_offset_nanos =
+            *self
+                .stamp_offset_nanos
+                .get_or_insert_with(|| match self.newest_resumed {
+                    Some(earlier) if stamp <= earlier => {
+                        earlier.plus_secs(1.0).0.saturating_sub(stamp.0)
+                    }
+                    _ => 0,
+                });
         let stamp = Stamp(keyframe.stamp.0.saturating_add(stamp_offset_nanos));
-        let keyframe = Arc::new(Keyframe { depth: keyframe.depth.or(depth_from_ranges), stamp, ..keyframe });
-        self.counts.without_depth += u64::from(camera.config.depth.is_some() && keyframe.depth.is_none());
+        let keyframe = Arc::new(Keyframe {
+            depth: keyframe.depth.or(depth_from_ranges),
+            stamp,
+            ..keyframe
+        });
+        self.counts.without_depth +=
+            u64::from(camera.config.depth.is_some() && keyframe.depth.is_none());
         events.push(JoinEvent::Accepted(Arc::clone(&keyframe)));
         for (camera, stamp) in self.store.push(keyframe) {
             self.counts.evicted += 1;
@@ -378,7 +463,10 @@ impl Join {
     }
 
     fn reject(&mut self, camera: &str, stamp: Stamp, why: Rejection, events: &mut Vec<JoinEvent>) {
-        log::debug!("camera {camera:?}: the image at {} ns did not become a keyframe: {why}", stamp.0);
+        log::debug!(
+            "camera {camera:?}: the image at {} ns did not become a keyframe: {why}",
+            stamp.0
+        );
         self.counts.reject(why);
         events.push(JoinEvent::Rejected { why });
     }
@@ -393,17 +481,28 @@ impl CameraState {
             Parent::World => true,
         };
         if camera.readout_micros.is_none() && !is_fixed {
-            log::warn!("camera {:?}: readout_micros is not in the rig file; assuming a global shutter", camera.name);
+            log::warn!(
+                "camera {:?}: readout_micros is not in the rig file; assuming a global shutter",
+                camera.name
+            );
         }
         if camera.stamp_to_mid_exposure.is_none() && camera.driver != CameraDriver::Sim {
-            log::warn!("camera {:?}: stamp_to_mid_exposure_millis is not in the rig file; assuming 0", camera.name);
+            log::warn!(
+                "camera {:?}: stamp_to_mid_exposure_millis is not in the rig file; assuming 0",
+                camera.name
+            );
         }
-        // Depth is not scaled: it has its own intrinsics, and averages across depth edges would not lie on any surface.
-        let depth_undistorter =
-            camera.depth.as_ref().map(|depth| Undistorter::new(&depth.intrinsics, 1.0)).transpose()?;
+        // Depth is not scaled: it has its own intrinsics, and averages across depth edges would not
+        // lie on any surface.
+        let depth_undistorter = camera
+            .depth
+            .as_ref()
+            .map(|depth| Undistorter::new(&depth.intrinsics, 1.0))
+            .transpose()?;
         Ok(Self {
             config: camera.clone(),
-            color_undistorter: Undistorter::new(&camera.intrinsics, rig.train.scale).with_context(named)?,
+            color_undistorter: Undistorter::new(&camera.intrinsics, rig.train.scale)
+                .with_context(named)?,
             depth_undistorter,
             acceptance: Acceptance::new(&rig.join, camera, is_fixed, spacing),
             waiting: Waiting::new(camera.driver == CameraDriver::Sim && rig.sim.truth),
@@ -412,8 +511,8 @@ impl CameraState {
         })
     }
 
-    /// Makes a keyframe from an image, or returns the reason for rejecting it. `run_checks` is false if a list selects
-    /// the keyframes.
+    /// Makes a keyframe from an image, or returns the reason for rejecting it. `run_checks` is
+    /// false if a list selects the keyframes.
     fn keyframe(
         &mut self,
         ready: ReadyImage,
@@ -430,16 +529,32 @@ impl CameraState {
         }
         let depth = self.depth_of(&ready);
         if run_checks {
-            let depth_m = depth.as_ref().and_then(assemble::median_depth_m).unwrap_or(default_depth_m);
-            let exposure_secs = ready.image.exposure_secs.or(self.config.exposure_micros.map(|micros| micros * 1e-6));
-            self.acceptance.check_speed(&ready.camera_pose, self.color_undistorter.full(), exposure_secs, depth_m)?;
+            let depth_m = depth
+                .as_ref()
+                .and_then(assemble::median_depth_m)
+                .unwrap_or(default_depth_m);
+            let exposure_secs = ready
+                .image
+                .exposure_secs
+                .or(self.config.exposure_micros.map(|micros| micros * 1e-6));
+            self.acceptance.check_speed(
+                &ready.camera_pose,
+                self.color_undistorter.full(),
+                exposure_secs,
+                depth_m,
+            )?;
         }
-        let rgb = assemble::rgb(&ready.image, &self.config.intrinsics).map_err(|e| self.undecodable(&e))?;
+        let rgb = assemble::rgb(&ready.image, &self.config.intrinsics)
+            .map_err(|e| self.undecodable(&e))?;
         if run_checks {
-            self.acceptance.check_pixels(&rgb, self.config.intrinsics.size_px)?;
+            self.acceptance
+                .check_pixels(&rgb, self.config.intrinsics.size_px)?;
             self.acceptance.accept(ready.stamp, pose);
         }
-        let rgba_srgb = self.color_undistorter.rgba(&rgb).map_err(|e| self.undecodable(&e))?;
+        let rgba_srgb = self
+            .color_undistorter
+            .rgba(&rgb)
+            .map_err(|e| self.undecodable(&e))?;
         let truth = ready.truth.and_then(|truth| {
             assemble::truth(&truth, &self.config.intrinsics, &self.color_undistorter)
                 .map_err(|e| self.undecodable(&e))
@@ -467,8 +582,12 @@ impl CameraState {
     /// The depth of an image. If it does not decode, the keyframe is kept without depth.
     fn depth_of(&mut self, ready: &ReadyImage) -> Option<keyframe::DepthMap> {
         let (image, camera_pose) = ready.depth.as_ref()?;
-        let map =
-            assemble::depth_map(image, self.config.depth.as_ref()?, self.depth_undistorter.as_ref()?, camera_pose);
+        let map = assemble::depth_map(
+            image,
+            self.config.depth.as_ref()?,
+            self.depth_undistorter.as_ref()?,
+            camera_pose,
+        );
         map.map_err(|e| self.undecodable(&e)).ok()
     }
 

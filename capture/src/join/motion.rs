@@ -6,7 +6,9 @@ use crate::error::Context;
 use drivers::BasePose;
 use keyframe::BaseState;
 use kinematics::urdf::JointLimits;
-use kinematics::{Chain, HistoryError, Intrinsics, JointHistory, JointState, PoseHistory, Stamp, Transform, Twist};
+use kinematics::{
+    Chain, HistoryError, Intrinsics, JointHistory, JointState, PoseHistory, Stamp, Transform, Twist,
+};
 use nalgebra::Vector3;
 use std::f64::consts::TAU;
 use std::sync::Arc;
@@ -14,17 +16,18 @@ use std::time::Duration;
 
 /// Maximum number of readings kept: those of 20 s at 1 kHz, longer than any image waits.
 const MAX_READINGS: usize = 20_000;
-/// Tolerance for joint positions beyond the limits, radians or meters. Calibration errors and soft stops stay within
-/// it.
+/// Tolerance for joint positions beyond the limits, radians or meters. Calibration errors and soft
+/// stops stay within it.
 const MAX_LIMIT_EXCESS: f64 = 0.2;
-/// Joint states that imply more than this multiple of a joint's speed limit are ignored as states of another arm. The
-/// margin allows for an arm that is pushed, and for a URDF with reduced limits.
+/// Joint states that imply more than this multiple of a joint's speed limit are ignored as states
+/// of another arm. The margin allows for an arm that is pushed, and for a URDF with reduced limits.
 const MAX_SPEED_FACTOR: f64 = 3.0;
 /// Added to the time between two readings, because their stamps may be inaccurate.
 const MAX_STAMP_ERROR_SECS: f64 = 0.02;
 /// So many ignored states in a row that agree with each other are accepted.
 const MIN_CONSISTENT: u32 = 5;
-/// Maximum gap for interpolating base poses from tags, in image periods. It lets one image in between lack a pose.
+/// Maximum gap for interpolating base poses from tags, in image periods. It lets one image in
+/// between lack a pose.
 const MAX_IMAGE_INTERVALS: f64 = 2.5;
 
 /// The recent motion of the robot.
@@ -35,7 +38,8 @@ pub(crate) struct Motion {
     /// Offset added to the reading of each chain joint.
     offsets: Vec<f64>,
     joints: JointHistory,
-    /// The last joint state that was ignored because of its speed, and how many such states in a row agree.
+    /// The last joint state that was ignored because of its speed, and how many such states in a
+    /// row agree.
     ignored: Option<(JointState, u32)>,
     base: BaseMotion,
 }
@@ -43,7 +47,11 @@ pub(crate) struct Motion {
 /// Distance that a joint moved. A joint without limits may report angles that wrap around.
 fn distance(from: f64, to: f64, limits: &JointLimits) -> f64 {
     let moved = to - from;
-    let n_turns = if limits.lower.is_finite() { 0.0 } else { (moved / TAU).round() };
+    let n_turns = if limits.lower.is_finite() {
+        0.0
+    } else {
+        (moved / TAU).round()
+    };
     (moved - n_turns * TAU).abs()
 }
 
@@ -76,7 +84,8 @@ pub(crate) struct CameraPose {
     pub(crate) world_from_camera: Transform,
     /// Twist in camera axes; `None` if the joint velocities are unknown.
     pub(crate) twist: Option<Twist>,
-    /// Camera twist per unit velocity of each chain joint (1 rad/s or 1 m/s); empty if no joint moves the camera.
+    /// Camera twist per unit velocity of each chain joint (1 rad/s or 1 m/s); empty if no joint
+    /// moves the camera.
     pub(super) joint_twists: Arc<[Twist]>,
     /// State of a moving base that carries the camera.
     pub(super) base: Option<BaseState>,
@@ -85,14 +94,22 @@ pub(crate) struct CameraPose {
 impl Motion {
     /// The motion of the robot of a rig, without readings.
     pub(crate) fn new(rig: &Rig) -> crate::Result<Self> {
-        let chain =
-            Chain::from_urdf(&rig.arm.urdf_text, &rig.arm.base_link, &rig.arm.flange_link).context("the arm's URDF")?;
+        let chain = Chain::from_urdf(&rig.arm.urdf_text, &rig.arm.base_link, &rig.arm.flange_link)
+            .context("the arm's URDF")?;
         let order = chain.order_in(&rig.arm.joints).context("arm.joints")?;
         let max_gap = Duration::from_secs_f64(rig.join.max_gap_millis * 1e-3);
         // Tags give the base pose only at images, not in between.
-        let min_rate_hz = rig.cameras.iter().map(|camera| camera.rate_hz).fold(f64::INFINITY, f64::min);
+        let min_rate_hz = rig
+            .cameras
+            .iter()
+            .map(|camera| camera.rate_hz)
+            .fold(f64::INFINITY, f64::min);
         let between_images = Duration::from_secs_f64(MAX_IMAGE_INTERVALS / min_rate_hz.max(1.0));
-        let max_base_gap = if rig.base.driver == BaseDriver::Tags { max_gap.max(between_images) } else { max_gap };
+        let max_base_gap = if rig.base.driver == BaseDriver::Tags {
+            max_gap.max(between_images)
+        } else {
+            max_gap
+        };
         let base = match rig.base.driver {
             BaseDriver::Fixed => BaseMotion::Fixed(rig.base.world_from_base),
             BaseDriver::Tags | BaseDriver::Rgbd | BaseDriver::Udp | BaseDriver::Sim => {
@@ -104,13 +121,28 @@ impl Motion {
                 }))
             }
         };
-        let offsets = order.iter().map(|ix| rig.arm.joint_offsets.get(*ix).copied().unwrap_or(0.0)).collect();
-        Ok(Self { chain, order, offsets, joints: JointHistory::new(max_gap, MAX_READINGS), ignored: None, base })
+        let offsets = order
+            .iter()
+            .map(|ix| rig.arm.joint_offsets.get(*ix).copied().unwrap_or(0.0))
+            .collect();
+        Ok(Self {
+            chain,
+            order,
+            offsets,
+            joints: JointHistory::new(max_gap, MAX_READINGS),
+            ignored: None,
+            base,
+        })
     }
 
     /// A warning for the first joint whose reading lies outside its limits in the URDF.
     pub(super) fn joint_limit_warning(&self, state: &JointState) -> Option<String> {
-        let joints = self.chain.joint_names().iter().zip(self.chain.limits()).zip(self.order.iter().zip(&self.offsets));
+        let joints = self
+            .chain
+            .joint_names()
+            .iter()
+            .zip(self.chain.limits())
+            .zip(self.order.iter().zip(&self.offsets));
         joints.into_iter().find_map(|((name, limits), (ix, offset))| {
             let position = state.position.get(*ix)? + offset;
             let is_beyond_limits =
@@ -134,27 +166,51 @@ impl Motion {
             if numbers.is_empty() {
                 return Some(Vec::new());
             }
-            self.order.iter().map(|ix| numbers.get(*ix).copied()).collect()
+            self.order
+                .iter()
+                .map(|ix| numbers.get(*ix).copied())
+                .collect()
         };
         let state = match (ordered(&state.position), ordered(&state.velocity)) {
             (Some(position), Some(velocity)) if !position.is_empty() => {
-                let position = position.iter().zip(&self.offsets).map(|(reading, offset)| reading + offset).collect();
-                JointState { stamp: state.stamp, position, velocity, effort: Vec::new() }
+                let position = position
+                    .iter()
+                    .zip(&self.offsets)
+                    .map(|(reading, offset)| reading + offset)
+                    .collect();
+                JointState {
+                    stamp: state.stamp,
+                    position,
+                    velocity,
+                    effort: Vec::new(),
+                }
             }
             _ => return Err(JointsRejection::Invalid),
         };
-        let newest = self.joints.newest().and_then(|newest| self.joints.at(newest).ok());
+        let newest = self
+            .joints
+            .newest()
+            .and_then(|newest| self.joints.at(newest).ok());
         if let Some(jump) = newest.and_then(|newest| self.jump(&newest, &state)) {
             // If the states stay there, the last accepted state was the wrong one.
-            let continues = self.ignored.as_ref().is_some_and(|(ignored, _)| self.jump(ignored, &state).is_none());
-            let n_ignored = 1 + self.ignored.as_ref().filter(|_| continues).map_or(0, |(_, n_ignored)| *n_ignored);
+            let continues = self
+                .ignored
+                .as_ref()
+                .is_some_and(|(ignored, _)| self.jump(ignored, &state).is_none());
+            let n_ignored = 1 + self
+                .ignored
+                .as_ref()
+                .filter(|_| continues)
+                .map_or(0, |(_, n_ignored)| *n_ignored);
             if n_ignored < MIN_CONSISTENT {
                 self.ignored = Some((state, n_ignored));
                 return Err(JointsRejection::TooFast(jump));
             }
         }
         self.ignored = None;
-        self.joints.push(state).map_err(|_| JointsRejection::Invalid)
+        self.joints
+            .push(state)
+            .map_err(|_| JointsRejection::Invalid)
     }
 
     /// Describes the first joint that cannot have moved from one state to the other.
@@ -167,7 +223,8 @@ impl Motion {
         let mut joints = joints.zip(before.position.iter().zip(&state.position));
         let ((name, limits), (from, to)) = joints.find(|((_, limits), (from, to))| {
             let max_speed = MAX_SPEED_FACTOR * limits.velocity;
-            max_speed > 0.0 && distance(**from, **to, limits) > max_speed * (secs + MAX_STAMP_ERROR_SECS)
+            max_speed > 0.0
+                && distance(**from, **to, limits) > max_speed * (secs + MAX_STAMP_ERROR_SECS)
         })?;
         Some(format!(
             "joint {name:?} moved from {from:.3} to {to:.3} in {:.0} ms, at most {:.2} rad/s or m/s are accepted ({MAX_SPEED_FACTOR} \
@@ -182,9 +239,14 @@ impl Motion {
         match &mut self.base {
             BaseMotion::Fixed(_) => true,
             BaseMotion::ReportedPoses(reported) => {
-                let is_valid = reported.poses.push(pose.stamp, pose.world_from_base).is_ok();
+                let is_valid = reported
+                    .poses
+                    .push(pose.stamp, pose.world_from_base)
+                    .is_ok();
                 if is_valid {
-                    reported.station_detector.push(pose.stamp, &pose.world_from_base);
+                    reported
+                        .station_detector
+                        .push(pose.stamp, &pose.world_from_base);
                 }
                 is_valid
             }
@@ -217,8 +279,13 @@ impl Motion {
         }
     }
 
-    /// The pose and velocity of a camera at a stamp; `NotYet` if no reading at or after the stamp has arrived.
-    pub(crate) fn at(&self, camera: &config::Camera, stamp: Stamp) -> Result<CameraPose, HistoryError> {
+    /// The pose and velocity of a camera at a stamp; `NotYet` if no reading at or after the stamp
+    /// has arrived.
+    pub(crate) fn at(
+        &self,
+        camera: &config::Camera,
+        stamp: Stamp,
+    ) -> Result<CameraPose, HistoryError> {
         let (world_from_base, base_twist, base) = match &self.base {
             BaseMotion::Fixed(pose) => (*pose, Twist::zero(), None),
             BaseMotion::ReportedPoses(reported) if camera.parent != Parent::World => {
@@ -247,21 +314,33 @@ impl Motion {
             )),
             Parent::Flange => {
                 let joints = self.joints.at(stamp)?;
-                // Readings of the wrong length are rejected when they are pushed, so the chain cannot fail here.
+                // Readings of the wrong length are rejected when they are pushed, so the chain
+                // cannot fail here.
                 let Ok(base_from_flange) = self.chain.forward(&joints.position) else {
                     return Err(HistoryError::NotFinite);
                 };
                 let by_base = base_twist.of_attached(&base_from_flange);
-                let by_arm = self.chain.tip_twist(&joints.position, &joints.velocity).ok();
+                let by_arm = self
+                    .chain
+                    .tip_twist(&joints.position, &joints.velocity)
+                    .ok();
                 let flange_twist = by_arm.map(|by_arm| Twist {
                     linear_m_s: by_arm.linear_m_s + by_base.linear_m_s,
                     angular_rad_s: by_arm.angular_rad_s + by_base.angular_rad_s,
                 });
-                let by_joint = self.chain.tip_twists_by_joint(&joints.position).unwrap_or_default();
+                let by_joint = self
+                    .chain
+                    .tip_twists_by_joint(&joints.position)
+                    .unwrap_or_default();
                 Ok(CameraPose {
-                    world_from_camera: world_from_base * base_from_flange * camera.parent_from_camera,
+                    world_from_camera: world_from_base
+                        * base_from_flange
+                        * camera.parent_from_camera,
                     twist: flange_twist.map(|twist| twist.of_attached(&camera.parent_from_camera)),
-                    joint_twists: by_joint.iter().map(|twist| twist.of_attached(&camera.parent_from_camera)).collect(),
+                    joint_twists: by_joint
+                        .iter()
+                        .map(|twist| twist.of_attached(&camera.parent_from_camera))
+                        .collect(),
                     base,
                 })
             }
@@ -269,18 +348,26 @@ impl Motion {
     }
 }
 
-/// Mean image speed in pixels per second for a scene at a constant depth, over the image center and the centers of its
-/// quadrants.
+/// Mean image speed in pixels per second for a scene at a constant depth, over the image center and
+/// the centers of its quadrants.
 pub(super) fn image_speed_px_s(twist: &Twist, intrinsics: &Intrinsics, depth_m: f64) -> f64 {
     let [width, height] = intrinsics.size_px.map(f64::from);
     let [fx, fy] = intrinsics.focal_px;
     let [cx, cy] = intrinsics.principal_px;
-    let sample_points = [[0.5, 0.5], [0.25, 0.25], [0.75, 0.25], [0.25, 0.75], [0.75, 0.75]];
+    let sample_points = [
+        [0.5, 0.5],
+        [0.25, 0.25],
+        [0.75, 0.25],
+        [0.25, 0.75],
+        [0.75, 0.75],
+    ];
     let speed = |[x_frac, y_frac]: [f64; 2]| {
         let ray = Vector3::new((x_frac * width - cx) / fx, (y_frac * height - cy) / fy, 1.0);
         let velocity = twist.apparent_velocity(&(ray * depth_m));
-        let (du, dv) =
-            (fx * (velocity.x - ray.x * velocity.z) / depth_m, fy * (velocity.y - ray.y * velocity.z) / depth_m);
+        let (du, dv) = (
+            fx * (velocity.x - ray.x * velocity.z) / depth_m,
+            fy * (velocity.y - ray.y * velocity.z) / depth_m,
+        );
         du.hypot(dv)
     };
     sample_points.into_iter().map(speed).sum::<f64>() / 5.0
@@ -301,23 +388,40 @@ mod tests {
             rectified: false,
         };
         // Motion of 0.1 m/s at a distance of 0.3 m shears a 720p image by 4.6 px in 15 ms.
-        let sideways = Twist { linear_m_s: Vector3::new(0.1, 0.0, 0.0), angular_rad_s: Vector3::zeros() };
+        let sideways = Twist {
+            linear_m_s: Vector3::new(0.1, 0.0, 0.0),
+            angular_rad_s: Vector3::zeros(),
+        };
         assert!((image_speed_px_s(&sideways, &intrinsics, 0.3) * 0.015 - 4.6).abs() < 0.05);
 
-        let twist = Twist { linear_m_s: Vector3::new(0.1, -0.2, 0.3), angular_rad_s: Vector3::new(0.2, 0.4, -0.9) };
+        let twist = Twist {
+            linear_m_s: Vector3::new(0.1, -0.2, 0.3),
+            angular_rad_s: Vector3::new(0.2, 0.4, -0.9),
+        };
         let secs = 1e-6;
         let moved = kinematics::transform::exp(&twist, secs).inverse();
-        let numeric: f64 = [[0.5, 0.5], [0.25, 0.25], [0.75, 0.25], [0.25, 0.75], [0.75, 0.75]]
-            .map(|[x, y]| {
-                let before = [x * 1280.0, y * 720.0];
-                let point = intrinsics.unproject(before).expect("a pinhole") * 0.7;
-                let after = intrinsics.project(&(moved * nalgebra::Point3::from(point)).coords).expect("in front");
-                (after[0] - before[0]).hypot(after[1] - before[1]) / secs
-            })
-            .iter()
-            .sum::<f64>()
+        let numeric: f64 = [
+            [0.5, 0.5],
+            [0.25, 0.25],
+            [0.75, 0.25],
+            [0.25, 0.75],
+            [0.75, 0.75],
+        ]
+        .map(|[x, y]| {
+            let before = [x * 1280.0, y * 720.0];
+            let point = intrinsics.unproject(before).expect("a pinhole") * 0.7;
+            let after = intrinsics
+                .project(&(moved * nalgebra::Point3::from(point)).coords)
+                .expect("in front");
+            (after[0] - before[0]).hypot(after[1] - before[1]) / secs
+        })
+        .iter()
+        .sum::<f64>()
             / 5.0;
         let predicted = image_speed_px_s(&twist, &intrinsics, 0.7);
-        assert!((predicted - numeric).abs() < 1e-3 * numeric, "{predicted} {numeric}");
+        assert!(
+            (predicted - numeric).abs() < 1e-3 * numeric,
+            "{predicted} {numeric}"
+        );
     }
 }

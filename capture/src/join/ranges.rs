@@ -1,4 +1,5 @@
-//! Range scans: transforms each point to the world frame with the scanner pose at the time of that point.
+//! Range scans: transforms each point to the world frame with the scanner pose at the time of that
+//! point.
 
 use super::motion::Motion;
 use crate::config::{Rig, Scanner};
@@ -14,8 +15,8 @@ const MAX_WAITING: usize = 64;
 
 /// Side of a depth cell in pixels. The rings of a scanner are about ten pixels apart.
 const CELL_PX: u32 = 8;
-/// Maximum time between an image and the scans used for its depth. Older and newer scans were taken from elsewhere,
-/// with other occlusions.
+/// Maximum time between an image and the scans used for its depth. Older and newer scans were taken
+/// from elsewhere, with other occlusions.
 const MAX_TIME_DIFFERENCE_SECS: f64 = 1.0;
 /// Minimum number of filled cells for a depth map.
 const MIN_CELLS: usize = 16;
@@ -38,7 +39,12 @@ pub(super) struct PlacementCounts {
 impl RangeScans {
     pub(super) fn new(rig: &Rig) -> Self {
         let max_kept = rig.join.max_range_scans;
-        Self { scanners: rig.scanners.clone(), waiting: VecDeque::new(), kept: VecDeque::new(), max_kept }
+        Self {
+            scanners: rig.scanners.clone(),
+            waiting: VecDeque::new(),
+            kept: VecDeque::new(),
+            max_kept,
+        }
     }
 
     pub(super) fn iter(&self) -> impl Iterator<Item = &Arc<RangePoints>> {
@@ -47,32 +53,49 @@ impl RangeScans {
 
     /// The newest `n` transformed scans, oldest first; fewer if fewer are kept.
     pub(super) fn newest(&self, n: u64) -> impl Iterator<Item = &Arc<RangePoints>> {
-        let n_skipped = self.kept.len().saturating_sub(usize::try_from(n).unwrap_or(usize::MAX));
+        let n_skipped = self
+            .kept
+            .len()
+            .saturating_sub(usize::try_from(n).unwrap_or(usize::MAX));
         self.kept.iter().skip(n_skipped)
     }
 
-    /// Depth of a keyframe from the scans around its stamp; `None` if they cover too little of the image.
+    /// Depth of a keyframe from the scans around its stamp; `None` if they cover too little of the
+    /// image.
     ///
-    /// A cell of [`CELL_PX`] pixels per side takes its nearest point, because points on more distant surfaces also
-    /// project into the gaps between the rings.
+    /// A cell of [`CELL_PX`] pixels per side takes its nearest point, because points on more
+    /// distant surfaces also project into the gaps between the rings.
     pub(super) fn depth_of(&self, keyframe: &Keyframe) -> Option<DepthMap> {
         let size_px = keyframe.size_px.map(|side| side.div_ceil(CELL_PX));
         let per_cell = f64::from(CELL_PX);
         let camera_from_world = keyframe.world_from_camera.inverse();
-        let [focal_px, principal_px] = [keyframe.focal_px, keyframe.principal_px].map(|of| of.map(|px| px / per_cell));
+        let [focal_px, principal_px] =
+            [keyframe.focal_px, keyframe.principal_px].map(|of| of.map(|px| px / per_cell));
         let mut depth_m = vec![f32::INFINITY; (size_px[0] * size_px[1]) as usize];
-        let near_in_time =
-            |scan: &&Arc<RangePoints>| keyframe.stamp.secs_since(scan.stamp).abs() <= MAX_TIME_DIFFERENCE_SECS;
-        for point in self.kept.iter().filter(near_in_time).flat_map(|scan| scan.points_in_world_m.iter()) {
+        let near_in_time = |scan: &&Arc<RangePoints>| {
+            keyframe.stamp.secs_since(scan.stamp).abs() <= MAX_TIME_DIFFERENCE_SECS
+        };
+        for point in self
+            .kept
+            .iter()
+            .filter(near_in_time)
+            .flat_map(|scan| scan.points_in_world_m.iter())
+        {
             let point = camera_from_world * Point3::from(*point).cast::<f64>();
-            let cell = [0, 1].map(|axis| focal_px[axis] * point[axis] / point.z + principal_px[axis]);
-            if point.z > 0.0 && (0..2).all(|axis| cell[axis] >= 0.0 && cell[axis] < f64::from(size_px[axis])) {
+            let cell =
+                [0, 1].map(|axis| focal_px[axis] * point[axis] / point.z + principal_px[axis]);
+            if point.z > 0.0
+                && (0..2).all(|axis| cell[axis] >= 0.0 && cell[axis] < f64::from(size_px[axis]))
+            {
                 #[expect(
                     clippy::cast_possible_truncation,
                     clippy::cast_sign_loss,
                     reason = "inside the map; f32 is precise enough for a range"
                 )]
-                let (ix, z) = (cell[1] as usize * size_px[0] as usize + cell[0] as usize, point.z as f32);
+                let (ix, z) = (
+                    cell[1] as usize * size_px[0] as usize + cell[0] as usize,
+                    point.z as f32,
+                );
                 depth_m[ix] = depth_m[ix].min(z);
             }
         }
@@ -93,7 +116,10 @@ impl RangeScans {
 
     /// Queues a scan. Returns false if this scan or an older scan is dropped.
     pub(super) fn push(&mut self, scan: RangeScan) -> bool {
-        let is_known_scanner = self.scanners.iter().any(|scanner| scanner.name == scan.scanner);
+        let is_known_scanner = self
+            .scanners
+            .iter()
+            .any(|scanner| scanner.name == scan.scanner);
         if !is_known_scanner {
             return false;
         }
@@ -105,7 +131,8 @@ impl RangeScans {
         fits
     }
 
-    /// Transforms every scan whose base poses are known, in order. Drops scans that waited longer than `max_wait_secs`.
+    /// Transforms every scan whose base poses are known, in order. Drops scans that waited longer
+    /// than `max_wait_secs`.
     pub(super) fn process_ready(
         &mut self,
         motion: &Motion,
@@ -123,7 +150,11 @@ impl RangeScans {
                         self.kept.pop_front();
                     }
                 }
-                Err(HistoryError::NotYet { .. }) if !at_end && newest.secs_since(scan.stamp) <= max_wait_secs => break,
+                Err(HistoryError::NotYet { .. })
+                    if !at_end && newest.secs_since(scan.stamp) <= max_wait_secs =>
+                {
+                    break;
+                }
                 Err(_) => counts_placed.n_rejected += 1,
             }
             self.waiting.pop_front();
@@ -132,16 +163,24 @@ impl RangeScans {
     }
 
     fn in_world(&self, scan: &RangeScan, motion: &Motion) -> Result<RangePoints, HistoryError> {
-        let scanner = self.scanners.iter().find(|scanner| scanner.name == scan.scanner);
+        let scanner = self
+            .scanners
+            .iter()
+            .find(|scanner| scanner.name == scan.scanner);
         let scanner = scanner.expect("only scans of known scanners are queued");
-        let world_from_scanner = |stamp: Stamp| Ok(motion.world_from_base(stamp)? * scanner.base_from_scanner);
+        let world_from_scanner =
+            |stamp: Stamp| Ok(motion.world_from_base(stamp)? * scanner.base_from_scanner);
         let mut points = Vec::with_capacity(scan.points.len());
         // Points of one column share the same time.
         let mut column = (u32::MAX, world_from_scanner(scan.stamp)?);
         let first = column.1;
         for point in scan.points.iter() {
             if column.0 != point.offset_micros {
-                let stamp = Stamp(scan.stamp.0.saturating_add(i64::from(point.offset_micros) * 1000));
+                let stamp = Stamp(
+                    scan.stamp
+                        .0
+                        .saturating_add(i64::from(point.offset_micros) * 1000),
+                );
                 column = (point.offset_micros, world_from_scanner(stamp)?);
             }
             let in_scanner = Point3::from(point.position_m).cast::<f64>();
@@ -194,12 +233,19 @@ mod tests {
                 points_in_world_m: points.into(),
             })
         });
-        RangeScans { scanners: Vec::new(), waiting: VecDeque::new(), kept: kept.collect(), max_kept: 9 }
+        RangeScans {
+            scanners: Vec::new(),
+            waiting: VecDeque::new(),
+            kept: kept.collect(),
+            max_kept: 9,
+        }
     }
 
     /// A wall 4 m in front of the camera, one row of points every 16 pixels.
     fn wall() -> Vec<[f32; 3]> {
-        (0..10).flat_map(|column| [-1.0, 1.0].map(|y| [-3.0 + 0.64 * column as f32, y, 5.0])).collect()
+        (0..10)
+            .flat_map(|column| [-1.0, 1.0].map(|y| [-3.0 + 0.64 * column as f32, y, 5.0]))
+            .collect()
     }
 
     #[test]
@@ -209,9 +255,13 @@ mod tests {
         let ranges = ranges_of(vec![(Stamp(9_500_000_000), wall()), (now, pole.to_vec())]);
         let depth = ranges.depth_of(&keyframe(now)).expect("enough points");
         assert_eq!(depth.size_px, [20, 16]);
-        assert_eq!((depth.focal_px, depth.principal_px), ([12.5; 2], [10.0, 7.75]));
+        assert_eq!(
+            (depth.focal_px, depth.principal_px),
+            ([12.5; 2], [10.0, 7.75])
+        );
         let at = |column: usize, row: usize| depth.depth_m[row * 20 + column];
-        // 12.5 * 0.2 / 4 + 10 = 12.5 * 0.1 / 2 + 10 and 12.5 * 1.0 / 4 + 7.75 = 12.5 * 0.5 / 2 + 7.75: one cell.
+        // 12.5 * 0.2 / 4 + 10 = 12.5 * 0.1 / 2 + 10 and 12.5 * 1.0 / 4 + 7.75 = 12.5 * 0.5 / 2 +
+        // 7.75: one cell.
         assert_eq!((at(10, 10), at(10, 4)), (2.0, 4.0));
         assert_eq!(depth.depth_m.iter().filter(|z| **z == 4.0).count(), 19);
         assert_eq!(depth.depth_m.iter().filter(|z| **z == 0.0).count(), 300);
@@ -220,8 +270,16 @@ mod tests {
     #[test]
     fn newest_scans_come_in_order() {
         let ranges = ranges_of((0..3).map(|ix| (Stamp(ix), wall())).collect());
-        let stamps = |n| ranges.newest(n).map(|scan| scan.stamp.0).collect::<Vec<_>>();
-        assert_eq!([stamps(0), stamps(2), stamps(7)], [vec![], vec![1, 2], vec![0, 1, 2]]);
+        let stamps = |n| {
+            ranges
+                .newest(n)
+                .map(|scan| scan.stamp.0)
+                .collect::<Vec<_>>()
+        };
+        assert_eq!(
+            [stamps(0), stamps(2), stamps(7)],
+            [vec![], vec![1, 2], vec![0, 1, 2]]
+        );
     }
 
     #[test]
@@ -229,6 +287,10 @@ mod tests {
         let ranges = ranges_of(vec![(Stamp(0), wall())]);
         assert!(ranges.depth_of(&keyframe(Stamp(1_000_000_000))).is_some());
         assert!(ranges.depth_of(&keyframe(Stamp(1_000_000_001))).is_none());
-        assert!(ranges_of(vec![(Stamp(0), wall()[..15].to_vec())]).depth_of(&keyframe(Stamp(0))).is_none());
+        assert!(
+            ranges_of(vec![(Stamp(0), wall()[..15].to_vec())])
+                .depth_of(&keyframe(Stamp(0)))
+                .is_none()
+        );
     }
 }

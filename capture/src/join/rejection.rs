@@ -90,7 +90,8 @@ pub struct Counts {
     pub base_poses_rejected: u64,
     /// Range scans transformed to the world frame.
     pub range_scans: u64,
-    /// Range scans that had no base poses, came from unknown scanners, or were dropped because too many were waiting.
+    /// Range scans that had no base poses, came from unknown scanners, or were dropped because too
+    /// many were waiting.
     pub range_scans_rejected: u64,
     /// Images rejected, by reason.
     pub rejected: BTreeMap<Rejection, u64>,
@@ -103,8 +104,9 @@ pub struct Counts {
 pub enum SampleUse {
     /// The samples are recorded: every image counts.
     Recorded,
-    /// The samples are only processed. Dropped live images do not count, because the next image replaces them. In a
-    /// replay, drops by devices were already reported when the recording was made.
+    /// The samples are only processed. Dropped live images do not count, because the next image
+    /// replaces them. In a replay, drops by devices were already reported when the recording was
+    /// made.
     ProcessedOnly,
 }
 
@@ -118,10 +120,15 @@ impl Counts {
         }
         if self.joints_too_fast > 0 {
             let what = counted(self.joints_too_fast, "joint state");
-            data_losses.push(format!("{what} ignored, because the joints cannot move so fast"));
+            data_losses.push(format!(
+                "{what} ignored, because the joints cannot move so fast"
+            ));
         }
         if let Some(n_undecodable) = self.rejected.get(&Rejection::Undecodable) {
-            data_losses.push(format!("{} did not decode", counted(*n_undecodable, "image")));
+            data_losses.push(format!(
+                "{} did not decode",
+                counted(*n_undecodable, "image")
+            ));
         }
         data_losses
     }
@@ -139,7 +146,12 @@ fn dropped_by_devices(n_images: u64) -> String {
 
 impl std::fmt::Display for Counts {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        write!(f, "{} of {}", counted(self.accepted, "keyframe"), counted(self.images, "image"))?;
+        write!(
+            f,
+            "{} of {}",
+            counted(self.accepted, "keyframe"),
+            counted(self.images, "image")
+        )?;
         for (why, n) in &self.rejected {
             write!(f, "; {n} {why}")?;
         }
@@ -168,19 +180,33 @@ mod tests {
 
     #[test]
     fn dropped_images_are_counted_once() {
-        let mut counts = Counts { device_skipped: 2, ..Counts::default() };
+        let mut counts = Counts {
+            device_skipped: 2,
+            ..Counts::default()
+        };
         counts.reject(Rejection::Undecodable);
         counts.reject(Rejection::NotMoved);
         assert_eq!(counts.data_losses(SampleUse::Recorded).len(), 2);
-        assert_eq!(counts.data_losses(SampleUse::ProcessedOnly), ["1 image did not decode"]);
+        assert_eq!(
+            counts.data_losses(SampleUse::ProcessedOnly),
+            ["1 image did not decode"]
+        );
     }
 
     #[test]
     fn summary_lists_only_nonzero_counts() {
-        let mut counts = Counts { images: 9, accepted: 4, device_skipped: 2, ..Counts::default() };
+        let mut counts = Counts {
+            images: 9,
+            accepted: 4,
+            device_skipped: 2,
+            ..Counts::default()
+        };
         counts.reject(Rejection::NotMoved);
         counts.reject(Rejection::NotMoved);
         counts.reject(Rejection::Blur);
-        assert_eq!(counts.to_string(), "4 keyframes of 9 images; 2 not moved; 1 motion blur; 2 dropped by devices");
+        assert_eq!(
+            counts.to_string(),
+            "4 keyframes of 9 images; 2 not moved; 1 motion blur; 2 dropped by devices"
+        );
     }
 }

@@ -1,5 +1,5 @@
-//! Detects stations of the base from its reported poses. Only past poses are used, so images do not have to wait for
-//! later poses.
+//! Detects stations of the base from its reported poses. Only past poses are used, so images do not
+//! have to wait for later poses.
 
 use kinematics::{Stamp, Transform};
 use std::collections::VecDeque;
@@ -32,7 +32,10 @@ struct Span {
 impl StationDetector {
     /// Adds the next pose of the base.
     pub(super) fn push(&mut self, stamp: Stamp, world_from_base: &Transform) {
-        let Some((since, _)) = self.stationary_since.filter(|(_, pose)| is_near(pose, world_from_base)) else {
+        let Some((since, _)) = self
+            .stationary_since
+            .filter(|(_, pose)| is_near(pose, world_from_base))
+        else {
             (self.stationary_since, self.is_known) = (Some((stamp, *world_from_base)), false);
             return;
         };
@@ -41,7 +44,11 @@ impl StationDetector {
         }
         if !std::mem::replace(&mut self.is_known, true) {
             let station = self.stations.back().map_or(0, |last| last.station + 1);
-            self.stations.push_back(Span { station, from: stamp, to: stamp });
+            self.stations.push_back(Span {
+                station,
+                from: stamp,
+                to: stamp,
+            });
             if self.stations.len() > MAX_STATIONS {
                 self.stations.pop_front();
             }
@@ -56,7 +63,8 @@ impl StationDetector {
         self.stationary_since = None;
     }
 
-    /// The station at a stamp that is not later than the newest pose; `None` while the base moves or has just stopped.
+    /// The station at a stamp that is not later than the newest pose; `None` while the base moves
+    /// or has just stopped.
     pub(super) fn at(&self, stamp: Stamp) -> Option<usize> {
         let span = self.stations.iter().rev().find(|span| span.from <= stamp)?;
         (stamp <= span.to).then_some(span.station)
@@ -93,11 +101,26 @@ mod tests {
         let at = |secs: f64| station_detector.at(Stamp::from_secs(secs));
         assert_eq!(
             [0.4, 0.6, 1.9, 2.1, 3.0, 4.3, 4.7, 5.9, 6.1, 7.7].map(at),
-            [None, Some(0), Some(0), None, None, None, Some(1), Some(1), None, Some(2)]
+            [
+                None,
+                Some(0),
+                Some(0),
+                None,
+                None,
+                None,
+                Some(1),
+                Some(1),
+                None,
+                Some(2)
+            ]
         );
         assert_eq!(at(20.0), None, "no poses yet");
         // Answers given immediately equal answers given later.
-        assert!(immediate.iter().all(|(stamp, station)| station_detector.at(*stamp) == *station));
+        assert!(
+            immediate
+                .iter()
+                .all(|(stamp, station)| station_detector.at(*stamp) == *station)
+        );
     }
 
     #[test]
@@ -105,7 +128,10 @@ mod tests {
         let mut station_detector = StationDetector::default();
         let mut push = |from_tick: i32| {
             (from_tick..from_tick + 100).for_each(|tick| {
-                station_detector.push(Stamp::from_secs(0.01 * f64::from(tick)), &Transform::identity());
+                station_detector.push(
+                    Stamp::from_secs(0.01 * f64::from(tick)),
+                    &Transform::identity(),
+                );
             });
             station_detector.restart();
         };
@@ -126,6 +152,10 @@ mod tests {
         for tick in 500..700 {
             station_detector.push(Stamp::from_secs(0.01 * f64::from(tick)), &broken);
         }
-        assert!((0..700).all(|tick| station_detector.at(Stamp::from_secs(0.01 * f64::from(tick))).is_none()));
+        assert!((0..700).all(|tick| {
+            station_detector
+                .at(Stamp::from_secs(0.01 * f64::from(tick)))
+                .is_none()
+        }));
     }
 }

@@ -1,8 +1,9 @@
 //! The keyframe store, bounded in count and bytes. The most redundant keyframe is evicted first.
 //!
-//! A keyframe is evicted from the split (train, validation, test) that exceeds its share most, so that the splits keep
-//! their proportions in a long run: if test keyframes were spared, they would eventually fill the store. Within that
-//! split, the keyframe nearest to another one of its camera is evicted, and of two equally near ones the older.
+//! A keyframe is evicted from the split (train, validation, test) that exceeds its share most, so
+//! that the splits keep their proportions in a long run: if test keyframes were spared, they would
+//! eventually fill the store. Within that split, the keyframe nearest to another one of its camera
+//! is evicted, and of two equally near ones the older.
 
 use super::spacing::Spacing;
 use keyframe::{Keyframe, Split};
@@ -10,7 +11,11 @@ use kinematics::Stamp;
 use std::sync::Arc;
 
 /// Shares of the splits: of eight keyframes, one is for testing and one for validation.
-const SHARES: [(Split, f64); 3] = [(Split::Train, 6.0), (Split::Validation, 1.0), (Split::Test, 1.0)];
+const SHARES: [(Split, f64); 3] = [
+    (Split::Train, 6.0),
+    (Split::Validation, 1.0),
+    (Split::Test, 1.0),
+];
 
 /// Keyframes in order of acceptance.
 #[derive(Debug)]
@@ -32,7 +37,13 @@ struct StoreEntry {
 
 impl KeyframeStore {
     pub(super) fn new(max_keyframes: usize, max_bytes: u64, spacing: Spacing) -> Self {
-        Self { max_keyframes, max_bytes, spacing, kept: Vec::new(), bytes: 0 }
+        Self {
+            max_keyframes,
+            max_bytes,
+            spacing,
+            kept: Vec::new(),
+            bytes: 0,
+        }
     }
 
     pub(super) fn iter(&self) -> impl Iterator<Item = &Arc<Keyframe>> {
@@ -42,16 +53,29 @@ impl KeyframeStore {
     /// Adds a keyframe; returns the cameras and stamps of the evicted ones.
     pub(super) fn push(&mut self, keyframe: Arc<Keyframe>) -> Vec<(Arc<str>, Stamp)> {
         let mut nearest = f64::INFINITY;
-        for kept in self.kept.iter_mut().filter(|kept| kept.keyframe.camera == keyframe.camera) {
-            let distance = self.spacing.between(&kept.keyframe.world_from_camera, &keyframe.world_from_camera);
+        for kept in self
+            .kept
+            .iter_mut()
+            .filter(|kept| kept.keyframe.camera == keyframe.camera)
+        {
+            let distance = self.spacing.between(
+                &kept.keyframe.world_from_camera,
+                &keyframe.world_from_camera,
+            );
             kept.nearest = kept.nearest.min(distance);
             nearest = nearest.min(distance);
         }
         let bytes = keyframe.bytes();
         self.bytes += bytes;
-        self.kept.push(StoreEntry { keyframe, bytes, nearest });
+        self.kept.push(StoreEntry {
+            keyframe,
+            bytes,
+            nearest,
+        });
         let mut evicted = Vec::new();
-        while self.kept.len() > 1 && (self.kept.len() > self.max_keyframes || self.bytes > self.max_bytes) {
+        while self.kept.len() > 1
+            && (self.kept.len() > self.max_keyframes || self.bytes > self.max_bytes)
+        {
             let keyframe = self.remove(self.most_redundant());
             evicted.push((Arc::clone(&keyframe.camera), keyframe.stamp));
         }
@@ -59,24 +83,44 @@ impl KeyframeStore {
     }
 
     fn most_redundant(&self) -> usize {
-        let count = |split| self.kept.iter().filter(|kept| kept.keyframe.split == split).count();
-        #[expect(clippy::cast_precision_loss, reason = "a store holds far fewer than 2^53 keyframes")]
+        let count = |split| {
+            self.kept
+                .iter()
+                .filter(|kept| kept.keyframe.split == split)
+                .count()
+        };
+        #[expect(
+            clippy::cast_precision_loss,
+            reason = "a store holds far fewer than 2^53 keyframes"
+        )]
         let load = |(split, share): &(Split, f64)| count(*split) as f64 / share;
-        let fullest = SHARES.iter().max_by(|a, b| load(a).total_cmp(&load(b))).map(|(split, _)| *split);
-        let candidates = self.kept.iter().enumerate().filter(|(_, kept)| Some(kept.keyframe.split) == fullest);
-        candidates.min_by(|(_, a), (_, b)| a.nearest.total_cmp(&b.nearest)).map_or(0, |(ix, _)| ix)
+        let fullest = SHARES
+            .iter()
+            .max_by(|a, b| load(a).total_cmp(&load(b)))
+            .map(|(split, _)| *split);
+        let candidates = self
+            .kept
+            .iter()
+            .enumerate()
+            .filter(|(_, kept)| Some(kept.keyframe.split) == fullest);
+        candidates
+            .min_by(|(_, a), (_, b)| a.nearest.total_cmp(&b.nearest))
+            .map_or(0, |(ix, _)| ix)
     }
 
     fn remove(&mut self, ix: usize) -> Arc<Keyframe> {
         let evicted = self.kept.remove(ix);
         self.bytes -= evicted.bytes;
-        let same_camera: Vec<usize> =
-            (0..self.kept.len()).filter(|ix| self.kept[*ix].keyframe.camera == evicted.keyframe.camera).collect();
+        let same_camera: Vec<usize> = (0..self.kept.len())
+            .filter(|ix| self.kept[*ix].keyframe.camera == evicted.keyframe.camera)
+            .collect();
         let pose = |ix: usize| &self.kept[ix].keyframe.world_from_camera;
         let orphaned: Vec<(usize, f64)> = same_camera
             .iter()
             .filter(|ix| {
-                self.spacing.between(pose(**ix), &evicted.keyframe.world_from_camera) <= self.kept[**ix].nearest
+                self.spacing
+                    .between(pose(**ix), &evicted.keyframe.world_from_camera)
+                    <= self.kept[**ix].nearest
             })
             .map(|ix| {
                 let others = same_camera.iter().filter(|other| *other != ix);
@@ -117,7 +161,14 @@ mod tests {
     }
 
     fn store(max_keyframes: usize, max_bytes: u64) -> KeyframeStore {
-        KeyframeStore::new(max_keyframes, max_bytes, Spacing { translation_m: 1.0, rotation_rad: 1.0 })
+        KeyframeStore::new(
+            max_keyframes,
+            max_bytes,
+            Spacing {
+                translation_m: 1.0,
+                rotation_rad: 1.0,
+            },
+        )
     }
 
     fn stamps(store: &KeyframeStore) -> Vec<i64> {
@@ -128,18 +179,30 @@ mod tests {
     fn most_redundant_keyframe_is_evicted_at_either_bound() {
         for mut store in [store(7, u64::MAX), store(usize::MAX, 7 * 16)] {
             let mut evicted = Vec::new();
-            // 2 and 6 are close to each other. 1 and 8 are equally close but from different cameras.
-            for (ix, camera, x_m) in
-                [(1, "a", 0.0), (2, "a", 9.0), (3, "a", 20.0), (5, "a", 30.0), (6, "a", 9.1), (7, "a", 40.0)]
-            {
+            // 2 and 6 are close to each other. 1 and 8 are equally close but from different
+            // cameras.
+            for (ix, camera, x_m) in [
+                (1, "a", 0.0),
+                (2, "a", 9.0),
+                (3, "a", 20.0),
+                (5, "a", 30.0),
+                (6, "a", 9.1),
+                (7, "a", 40.0),
+            ] {
                 evicted.extend(store.push(keyframe(ix, camera, x_m)));
             }
             evicted.extend(store.push(keyframe(9, "b", 0.0)));
             assert_eq!(evicted, []);
-            assert_eq!(store.push(keyframe(10, "a", 50.0)), [("a".into(), Stamp(2))]);
+            assert_eq!(
+                store.push(keyframe(10, "a", 50.0)),
+                [("a".into(), Stamp(2))]
+            );
             assert_eq!(stamps(&store), [1, 3, 5, 6, 7, 9, 10]);
             // With 2 gone, 6 is isolated and the closest pair is the next one.
-            assert_eq!(store.push(keyframe(11, "a", 20.5)), [("a".into(), Stamp(3))]);
+            assert_eq!(
+                store.push(keyframe(11, "a", 20.5)),
+                [("a".into(), Stamp(3))]
+            );
         }
     }
 
@@ -152,14 +215,34 @@ mod tests {
             store.push(keyframe(ix, "a", x_m));
             assert!(store.kept.len() <= 40 && store.bytes == store.kept.len() as u64 * 16);
         }
-        let count = |split| store.iter().filter(|keyframe| keyframe.split == split).count();
-        assert_eq!([count(Split::Train), count(Split::Validation), count(Split::Test)], [30, 5, 5]);
+        let count = |split| {
+            store
+                .iter()
+                .filter(|keyframe| keyframe.split == split)
+                .count()
+        };
+        assert_eq!(
+            [
+                count(Split::Train),
+                count(Split::Validation),
+                count(Split::Test)
+            ],
+            [30, 5, 5]
+        );
         // The cached distances are correct.
         for (ix, kept) in store.kept.iter().enumerate() {
-            let others = store.kept.iter().enumerate().filter(|(other, _)| *other != ix);
+            let others = store
+                .kept
+                .iter()
+                .enumerate()
+                .filter(|(other, _)| *other != ix);
             let poses = others.map(|(_, other)| &other.keyframe.world_from_camera);
             let nearest = poses
-                .map(|pose| store.spacing.between(pose, &kept.keyframe.world_from_camera))
+                .map(|pose| {
+                    store
+                        .spacing
+                        .between(pose, &kept.keyframe.world_from_camera)
+                })
                 .fold(f64::INFINITY, f64::min);
             assert_eq!(kept.nearest, nearest);
         }

@@ -1,7 +1,8 @@
 //! Images of one camera that wait until all their data have arrived.
 //!
-//! Color, depth and ground truth come in any order; joint readings may come before or after. Decisions depend only on
-//! the order of the samples, never on a clock, so that a replay makes the same decisions.
+//! Color, depth and ground truth come in any order; joint readings may come before or after.
+//! Decisions depend only on the order of the samples, never on a clock, so that a replay makes the
+//! same decisions.
 
 use drivers::{Image, TruthImage};
 use kinematics::Stamp;
@@ -33,12 +34,21 @@ pub(super) enum Partner<T> {
 
 impl Waiting {
     pub(super) fn new(expects_truth: bool) -> Self {
-        Self { color: VecDeque::new(), depth: VecDeque::new(), truth: VecDeque::new(), expects_truth }
+        Self {
+            color: VecDeque::new(),
+            depth: VecDeque::new(),
+            truth: VecDeque::new(),
+            expects_truth,
+        }
     }
 
     /// Queues a color image. If too many wait, removes and returns the oldest.
     pub(super) fn push_color(&mut self, image: Image) -> Option<Image> {
-        let dropped_image = if self.color.len() == MAX_WAITING { self.color.pop_front() } else { None };
+        let dropped_image = if self.color.len() == MAX_WAITING {
+            self.color.pop_front()
+        } else {
+            None
+        };
         self.color.push_back(image);
         dropped_image
     }
@@ -61,23 +71,45 @@ impl Waiting {
         self.color.pop_front()
     }
 
-    /// Mid-exposure of the depth image nearest to a stamp, at most `max_difference_secs` away, and whether no nearer
-    /// image can follow.
-    pub(super) fn depth_near(&self, stamp: Stamp, max_difference_secs: f64) -> (Option<Stamp>, bool) {
-        let nearest = self.depth.iter().map(|(at, _)| *at).min_by_key(|at| at.nanos_since(stamp).unsigned_abs());
+    /// Mid-exposure of the depth image nearest to a stamp, at most `max_difference_secs` away, and
+    /// whether no nearer image can follow.
+    pub(super) fn depth_near(
+        &self,
+        stamp: Stamp,
+        max_difference_secs: f64,
+    ) -> (Option<Stamp>, bool) {
+        let nearest = self
+            .depth
+            .iter()
+            .map(|(at, _)| *at)
+            .min_by_key(|at| at.nanos_since(stamp).unsigned_abs());
         // Depth images arrive in order, so no nearer one follows an image at or after the stamp.
-        let is_final = self.depth.back().is_some_and(|(newest, _)| *newest >= stamp);
-        (nearest.filter(|at| at.secs_since(stamp).abs() <= max_difference_secs), is_final)
+        let is_final = self
+            .depth
+            .back()
+            .is_some_and(|(newest, _)| *newest >= stamp);
+        (
+            nearest.filter(|at| at.secs_since(stamp).abs() <= max_difference_secs),
+            is_final,
+        )
     }
 
-    /// The depth image with this mid-exposure. It stays queued, because the next color image may use it too.
+    /// The depth image with this mid-exposure. It stays queued, because the next color image may
+    /// use it too.
     pub(super) fn depth_at(&self, stamp: Stamp) -> Option<&Image> {
-        self.depth.iter().find(|(at, _)| *at == stamp).map(|(_, image)| image)
+        self.depth
+            .iter()
+            .find(|(at, _)| *at == stamp)
+            .map(|(_, image)| image)
     }
 
     /// The ground truth of a color image, found by its device stamp.
     pub(super) fn truth_of(&self, device_stamp: Stamp) -> Partner<&TruthImage> {
-        match self.truth.iter().find(|truth| truth.image.stamp == device_stamp) {
+        match self
+            .truth
+            .iter()
+            .find(|truth| truth.image.stamp == device_stamp)
+        {
             Some(truth) => Partner::Available(truth),
             None if self.expects_truth => Partner::NotYet,
             None => Partner::Never,
@@ -92,7 +124,8 @@ impl Waiting {
     /// Removes depth and truth that only earlier color images needed.
     pub(super) fn forget_before(&mut self, stamp: Stamp, device_stamp: Stamp, period_secs: f64) {
         self.truth.retain(|truth| truth.image.stamp > device_stamp);
-        self.depth.retain(|(at, _)| stamp.secs_since(*at) <= period_secs);
+        self.depth
+            .retain(|(at, _)| stamp.secs_since(*at) <= period_secs);
     }
 }
 

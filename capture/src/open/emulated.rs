@@ -1,5 +1,5 @@
-//! Opens simulated cameras on an arm whose driver is not simulated: it connects to an emulated controller, whose motors
-//! move the simulated arm in real time.
+//! Opens simulated cameras on an arm whose driver is not simulated: it connects to an emulated
+//! controller, whose motors move the simulated arm in real time.
 
 use super::real;
 use super::simulated::unlimited;
@@ -15,14 +15,16 @@ use sim::wire::{JointTrack, emulate_fci};
 use std::net::{Ipv4Addr, SocketAddr};
 use std::time::Duration;
 
-/// How long the controller waits for each answer of the driver. Both are in this process, and the motion must not depend on
-/// the load of the computer.
+/// How long the controller waits for each answer of the driver. Both are in this process, and the
+/// motion must not depend on the load of the computer.
 const ANSWER_WAIT: Duration = Duration::from_millis(15);
 
 /// Opens the camera, and the arm for motion. The address of the arm becomes that of the controller.
 pub(super) fn open(rig: &mut Rig) -> crate::Result<(Box<dyn MovableArm>, Box<dyn Camera>)> {
     if rig.arm.driver != ArmDriver::Franka {
-        bail!("sim.emulate_arm: only a controller of the driver \"franka\" can be emulated for a simulated camera");
+        bail!(
+            "sim.emulate_arm: only a controller of the driver \"franka\" can be emulated for a simulated camera"
+        );
     }
     let mut simulated = sim::open(&unlimited(rig)?)?;
     let motors = MotorHistory::default();
@@ -37,11 +39,21 @@ pub(super) fn open(rig: &mut Rig) -> crate::Result<(Box<dyn MovableArm>, Box<dyn
     let track = JointTrack::at_rest(simulated.start_position()?).map_err(crate::Error::other)?;
     let controller = emulate_fci(track, config, ANSWER_WAIT, Some(motors.clone()))?;
     rig.arm.address = controller.address().to_string();
-    log::info!("the arm is moved by an emulated Franka controller at {}", rig.arm.address);
-    let Some(camera) = simulated.into_motorized(motors, clock::now())?.into_iter().next() else {
+    log::info!(
+        "the arm is moved by an emulated Franka controller at {}",
+        rig.arm.address
+    );
+    let Some(camera) = simulated
+        .into_motorized(motors, clock::now())?
+        .into_iter()
+        .next()
+    else {
         bail!("the simulated rig has no camera");
     };
-    let arm = Box::new(EmulatedArm { arm: real::movable_arm(rig)?, _controller: controller });
+    let arm = Box::new(EmulatedArm {
+        arm: real::movable_arm(rig)?,
+        _controller: controller,
+    });
     Ok((arm, camera))
 }
 

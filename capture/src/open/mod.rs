@@ -58,15 +58,21 @@ pub struct Opened {
 }
 
 impl Opened {
-    /// Plays a recording at the speed of its devices. If the caller is too slow, images are dropped.
+    /// Plays a recording at the speed of its devices. If the caller is too slow, images are
+    /// dropped.
     #[must_use]
     pub fn in_real_time(self) -> Self {
         let playback = Playback::new(self.source);
-        Self { stamp_clock: StampClock::Playback(playback.clock()), source: Box::new(playback), ..self }
+        Self {
+            stamp_clock: StampClock::Playback(playback.clock()),
+            source: Box::new(playback),
+            ..self
+        }
     }
 
-    /// Compares the poses of cameras with the tags in the rig file, and warns once about each camera that contradicts them.
-    /// Without tags, or if the tags locate the base, nothing is compared.
+    /// Compares the poses of cameras with the tags in the rig file, and warns once about each
+    /// camera that contradicts them. Without tags, or if the tags locate the base, nothing is
+    /// compared.
     ///
     /// * `notes`: gets the warnings.
     ///
@@ -84,24 +90,34 @@ impl Opened {
         let (path, damage) = (path.to_owned(), Arc::clone(&self.damage));
         let reopen = move || -> Result<Box<dyn Source>, drivers::Error> {
             let recording = Recording::open(&path)?;
-            Ok(Box::new(RecordingSource { recording, damage: Arc::clone(&damage) }))
+            Ok(Box::new(RecordingSource {
+                recording,
+                damage: Arc::clone(&damage),
+            }))
         };
-        Self { source: Box::new(Repeating::new(self.source, reopen)), ..self }
+        Self {
+            source: Box::new(Repeating::new(self.source, reopen)),
+            ..self
+        }
     }
 }
 
-/// Opens the devices of a rig. Calibration that the rig file omits is read from the cameras that store it.
+/// Opens the devices of a rig. Calibration that the rig file omits is read from the cameras that
+/// store it.
 ///
 /// # Errors
 ///
-/// If a device cannot be opened, a driver is not part of this build, or the rig file lacks a setting that a driver
-/// needs.
+/// If a device cannot be opened, a driver is not part of this build, or the rig file lacks a
+/// setting that a driver needs.
 pub fn rig(rig: Rig, devices: Devices) -> crate::Result<Opened> {
     rig_with_monitors(rig, devices).map(|(opened, _)| opened)
 }
 
 /// Like [`rig()`], with monitors of the devices that receive datagrams.
-pub(crate) fn rig_with_monitors(mut rig: Rig, devices: Devices) -> crate::Result<(Opened, Vec<DatagramMonitor>)> {
+pub(crate) fn rig_with_monitors(
+    mut rig: Rig,
+    devices: Devices,
+) -> crate::Result<(Opened, Vec<DatagramMonitor>)> {
     if devices == Devices::Sim {
         use_simulated_devices(&mut rig);
     }
@@ -113,7 +129,8 @@ pub(crate) fn rig_with_monitors(mut rig: Rig, devices: Devices) -> crate::Result
     if devices == Devices::Sim {
         check_intrinsics(&rig)?;
     }
-    let opened = real::open(&mut rig).map_err(|error| Error::Failed(format!("{error:#}; {SIM_HINT}")));
+    let opened =
+        real::open(&mut rig).map_err(|error| Error::Failed(format!("{error:#}; {SIM_HINT}")));
     let (real, monitors) = opened?;
     let (source, stamp_clock): (Box<dyn Source>, _) = match is_any_simulated(&rig) {
         true => simulate(&rig, real)?,
@@ -123,7 +140,15 @@ pub(crate) fn rig_with_monitors(mut rig: Rig, devices: Devices) -> crate::Result
         BaseDriver::Tags => Box::new(TagBaseSource::new(&rig, source)?),
         _ => source,
     };
-    Ok((Opened { rig, source, damage: Arc::default(), stamp_clock }, monitors))
+    Ok((
+        Opened {
+            rig,
+            source,
+            damage: Arc::default(),
+            stamp_clock,
+        },
+        monitors,
+    ))
 }
 
 /// Replaces every device by its simulated twin.
@@ -142,8 +167,8 @@ fn use_simulated_devices(rig: &mut Rig) {
     }
 }
 
-/// Opens a recording with the rig stored in it, or with the given one. The joint order is the one stored in the
-/// recording.
+/// Opens a recording with the rig stored in it, or with the given one. The joint order is the one
+/// stored in the recording.
 ///
 /// # Errors
 ///
@@ -160,19 +185,36 @@ pub fn recording(path: &Path, rig: Option<Rig>, overrides: &[Override]) -> crate
             .with_context(|| format!("the recording {path:?} does not match the robot"))?;
         let in_recorded_order = |offsets: &[f64]| -> Vec<f64> {
             let of = |name: &String| rig.arm.joints.iter().position(|known| known == name);
-            let offset = |name: &String| of(name).and_then(|ix| offsets.get(ix)).copied().unwrap_or(0.0);
-            if offsets.is_empty() { Vec::new() } else { recorded.iter().map(offset).collect() }
+            let offset = |name: &String| {
+                of(name)
+                    .and_then(|ix| offsets.get(ix))
+                    .copied()
+                    .unwrap_or(0.0)
+            };
+            if offsets.is_empty() {
+                Vec::new()
+            } else {
+                recorded.iter().map(offset).collect()
+            }
         };
-        let offsets =
-            [&rig.arm.joint_offsets, &rig.arm.sim.true_joint_offsets].map(|offsets| in_recorded_order(offsets));
+        let offsets = [&rig.arm.joint_offsets, &rig.arm.sim.true_joint_offsets]
+            .map(|offsets| in_recorded_order(offsets));
         [rig.arm.joint_offsets, rig.arm.sim.true_joint_offsets] = offsets;
         rig.arm.joints = recorded.to_vec();
     }
     check_intrinsics(&rig)?;
     without_readout_if_ideal(&mut rig);
     let damage = Arc::default();
-    let source = Box::new(RecordingSource { recording, damage: Arc::clone(&damage) });
-    Ok(Opened { rig, source, damage, stamp_clock: StampClock::Unrelated })
+    let source = Box::new(RecordingSource {
+        recording,
+        damage: Arc::clone(&damage),
+    });
+    Ok(Opened {
+        rig,
+        source,
+        damage,
+        stamp_clock: StampClock::Unrelated,
+    })
 }
 
 /// Creates a recording of a rig, with the rig file and the URDF attached.
@@ -181,10 +223,17 @@ pub fn recording(path: &Path, rig: Option<Rig>, overrides: &[Override]) -> crate
 ///
 /// If the file cannot be written.
 pub fn recorder(path: &Path, rig: &Rig) -> crate::Result<Recorder> {
-    let cameras: Vec<_> = rig.cameras.iter().map(|camera| (&*camera.name, &camera.intrinsics)).collect();
+    let cameras: Vec<_> = rig
+        .cameras
+        .iter()
+        .map(|camera| (&*camera.name, &camera.intrinsics))
+        .collect();
     let resolved = rig.to_toml();
     let description = RecordingMetadata {
-        files: &[(RIG_FILE, resolved.as_bytes()), (URDF_FILE, rig.arm.urdf_text.as_bytes())],
+        files: &[
+            (RIG_FILE, resolved.as_bytes()),
+            (URDF_FILE, rig.arm.urdf_text.as_bytes()),
+        ],
         cameras: &cameras,
         joint_names: &rig.arm.joints,
     };
@@ -208,22 +257,36 @@ fn stored_rig(path: &Path, recording: &Recording, overrides: &[Override]) -> cra
                 "the recording {path:?} contains no {name}, which fieldrig stores in it; if another program removed it, give the rig file with --rig to `fieldrig train`, `eval`, `export` or `calibrate`"
             )
         })?;
-        std::str::from_utf8(bytes).with_context(|| format!("the recording {path:?}: {name} is not text"))
+        std::str::from_utf8(bytes)
+            .with_context(|| format!("the recording {path:?}: {name} is not text"))
     };
-    Ok(Rig::parse(RIG_FILE, text(RIG_FILE)?, text(URDF_FILE)?, overrides)?)
+    Ok(Rig::parse(
+        RIG_FILE,
+        text(RIG_FILE)?,
+        text(URDF_FILE)?,
+        overrides,
+    )?)
 }
 
-/// Sets the readout time of simulated cameras without imperfections to 0: they expose all rows at once.
+/// Sets the readout time of simulated cameras without imperfections to 0: they expose all rows at
+/// once.
 fn without_readout_if_ideal(rig: &mut Rig) {
     let is_ideal = rig.sim.ideal;
-    for camera in rig.cameras.iter_mut().filter(|camera| is_ideal && camera.driver == CameraDriver::Sim) {
+    for camera in rig
+        .cameras
+        .iter_mut()
+        .filter(|camera| is_ideal && camera.driver == CameraDriver::Sim)
+    {
         camera.readout_micros = Some(0.0);
     }
 }
 
 /// Checks that the rig has an arm if a camera is on the flange.
 fn check_arm(rig: &Rig) -> crate::Result<()> {
-    let on_flange = rig.cameras.iter().find(|camera| camera.parent == Parent::Flange);
+    let on_flange = rig
+        .cameras
+        .iter()
+        .find(|camera| camera.parent == Parent::Flange);
     if let (ArmDriver::None, Some(camera)) = (rig.arm.driver, on_flange) {
         bail!(
             "camera {:?} has the parent flange, but arm.driver is none: the parent must be base or world",
@@ -233,10 +296,14 @@ fn check_arm(rig: &Rig) -> crate::Result<()> {
     Ok(())
 }
 
-/// Checks that all intrinsics are known. Intrinsics that are stored in the camera are unknown unless the camera is
-/// opened.
+/// Checks that all intrinsics are known. Intrinsics that are stored in the camera are unknown
+/// unless the camera is opened.
 fn check_intrinsics(rig: &Rig) -> crate::Result<()> {
-    if let Some(camera) = rig.cameras.iter().find(|camera| camera.realsense.unknown.intrinsics) {
+    if let Some(camera) = rig
+        .cameras
+        .iter()
+        .find(|camera| camera.realsense.unknown.intrinsics)
+    {
         bail!(
             "camera.{}.intrinsics is missing: it is stored in the camera, which this command does not open",
             camera.name
@@ -250,14 +317,25 @@ fn check_intrinsics(rig: &Rig) -> crate::Result<()> {
 pub fn is_any_simulated(rig: &Rig) -> bool {
     rig.arm.driver == ArmDriver::Sim
         || rig.base.driver == BaseDriver::Sim
-        || rig.cameras.iter().any(|camera| camera.driver == CameraDriver::Sim)
-        || rig.scanners.iter().any(|scanner| scanner.driver == ScannerDriver::Sim)
+        || rig
+            .cameras
+            .iter()
+            .any(|camera| camera.driver == CameraDriver::Sim)
+        || rig
+            .scanners
+            .iter()
+            .any(|scanner| scanner.driver == ScannerDriver::Sim)
 }
 
 /// The first device of a rig that has no driver yet.
 fn unsupported_device(rig: &Rig) -> Option<String> {
     let has_none = rig.base.driver == BaseDriver::Rgbd;
-    has_none.then(|| format!("base driver {:?}", format!("{:?}", rig.base.driver).to_lowercase()))
+    has_none.then(|| {
+        format!(
+            "base driver {:?}",
+            format!("{:?}", rig.base.driver).to_lowercase()
+        )
+    })
 }
 
 #[cfg(feature = "sim")]
@@ -277,7 +355,9 @@ fn base_moves(_scene: &str) -> bool {
 
 #[cfg(not(feature = "sim"))]
 fn simulate(_rig: &Rig, _real: drivers::Devices) -> crate::Result<(Box<dyn Source>, StampClock)> {
-    bail!("this program was built without the simulator: build it with `cargo build --release --features sim`")
+    bail!(
+        "this program was built without the simulator: build it with `cargo build --release --features sim`"
+    )
 }
 
 /// A recording that reports damage when it ends.
@@ -304,15 +384,25 @@ mod tests {
     use super::*;
 
     fn load(name: &str, overrides: &[Override]) -> Rig {
-        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../rigs").join(name);
+        let path = Path::new(env!("CARGO_MANIFEST_DIR"))
+            .join("../rigs")
+            .join(name);
         Rig::load(&path, overrides).expect("a bundled rig file")
     }
 
     #[test]
     fn unsupported_driver_error_suggests_sim() {
         let rig = load("static-arm.toml", &[Override::new("base.driver", "rgbd")]);
-        let message = format!("{:#}", super::rig(rig, Devices::Real).err().expect("no such driver"));
-        assert!(message.contains("rgbd") && message.contains("--sim"), "{message}");
+        let message = format!(
+            "{:#}",
+            super::rig(rig, Devices::Real)
+                .err()
+                .expect("no such driver")
+        );
+        assert!(
+            message.contains("rgbd") && message.contains("--sim"),
+            "{message}"
+        );
     }
 
     #[test]
@@ -329,10 +419,17 @@ mod tests {
             format!("{:#}", opened.err().expect("nothing is connected"))
         };
         let message = error_of(&absent);
-        assert!(message.contains("\"wrist\" has the parent flange"), "{message}");
+        assert!(
+            message.contains("\"wrist\" has the parent flange"),
+            "{message}"
+        );
         let on_base = [&absent[..], &[Override::new("camera.wrist.parent", "base")]].concat();
         let message = error_of(&on_base);
-        assert!(message.contains("no V4L2 camera named \"no such serial\"") && message.contains("--sim"), "{message}");
+        assert!(
+            message.contains("no V4L2 camera named \"no such serial\"")
+                && message.contains("--sim"),
+            "{message}"
+        );
         let without_scale = [&on_base[..3], &on_base[5..]].concat();
         let message = error_of(&without_scale);
         assert!(message.contains("camera.wrist.depth.device"), "{message}");
@@ -342,13 +439,26 @@ mod tests {
     #[test]
     fn unsupported_nokhwa_settings_are_rejected() {
         let of = |more: &[Override]| {
-            let driver = [("arm.driver", "none"), ("camera.wrist.driver", "nokhwa"), ("camera.wrist.parent", "base")];
-            let overrides =
-                driver.map(|(key, value)| Override::new(key, value)).into_iter().chain(more.iter().cloned());
-            let opened = super::rig(load("static-arm.toml", &overrides.collect::<Vec<_>>()), Devices::Real);
+            let driver = [
+                ("arm.driver", "none"),
+                ("camera.wrist.driver", "nokhwa"),
+                ("camera.wrist.parent", "base"),
+            ];
+            let overrides = driver
+                .map(|(key, value)| Override::new(key, value))
+                .into_iter()
+                .chain(more.iter().cloned());
+            let opened = super::rig(
+                load("static-arm.toml", &overrides.collect::<Vec<_>>()),
+                Devices::Real,
+            );
             format!("{:#}", opened.err().expect("nothing is connected"))
         };
-        assert!(of(&[]).contains("nokhwa does not support depth"), "{}", of(&[]));
+        assert!(
+            of(&[]).contains("nokhwa does not support depth"),
+            "{}",
+            of(&[])
+        );
         let gain = of(&[Override::new("camera.wrist.v4l2.gain", 7_i64)]);
         assert!(gain.contains("nokhwa does not support gain"), "{gain}");
     }
@@ -363,20 +473,32 @@ mod tests {
         ];
         let opened = super::rig(load("static-arm.toml", &overrides), Devices::Real);
         let message = format!("{:#}", opened.err().expect("nothing is connected"));
-        let expected = if cfg!(feature = "realsense") { "\"no such serial\"" } else { "--features realsense" };
-        assert!(message.contains(expected) && message.contains("--sim"), "{message}");
+        let expected = if cfg!(feature = "realsense") {
+            "\"no such serial\""
+        } else {
+            "--features realsense"
+        };
+        assert!(
+            message.contains(expected) && message.contains("--sim"),
+            "{message}"
+        );
     }
 
     #[test]
     fn unreachable_network_arm_error_suggests_a_remedy() {
         let error_of = |driver: &str, address: &str| {
-            let overrides = [Override::new("arm.driver", driver), Override::new("arm.address", address)];
+            let overrides = [
+                Override::new("arm.driver", driver),
+                Override::new("arm.address", address),
+            ];
             let opened = super::rig(load("static-arm.toml", &overrides), Devices::Real);
             format!("{:#}", opened.err().expect("no such arm"))
         };
-        for (driver, address, expected) in
-            [("franka", "", "arm.address"), ("franka", "127.0.0.1:1", "FCI"), ("udp", "172.16.0.2", "arm.address")]
-        {
+        for (driver, address, expected) in [
+            ("franka", "", "arm.address"),
+            ("franka", "127.0.0.1:1", "FCI"),
+            ("udp", "172.16.0.2", "arm.address"),
+        ] {
             let message = error_of(driver, address);
             assert!(message.contains(expected), "{driver} {address}: {message}");
         }
@@ -394,7 +516,8 @@ mod tests {
         // A Franka reports poses relative to its own base link, also on a mobile base.
         for name in ["static-arm.toml", "mobile-arm.toml"] {
             let plain = load(name, &[]);
-            let chain = Chain::from_urdf(&plain.arm.urdf_text, "panda_link0", "panda_link8").expect("a Panda");
+            let chain = Chain::from_urdf(&plain.arm.urdf_text, "panda_link0", "panda_link8")
+                .expect("a Panda");
             let config = RobotConfig {
                 address: "127.0.0.1:0".parse().expect("an address"),
                 version: FciVersion::V5,
@@ -402,14 +525,26 @@ mod tests {
                 flange_from_tool: kinematics::Transform::identity(),
                 limits: Limits::panda(),
             };
-            let rest = Joints { position_rad: REST_RAD, ..Joints::default() };
-            let emulated = EmulatedRobot::start(config, Box::new(move |_, _| rest)).expect("a free port");
+            let rest = Joints {
+                position_rad: REST_RAD,
+                ..Joints::default()
+            };
+            let emulated =
+                EmulatedRobot::start(config, Box::new(move |_, _| rest)).expect("a free port");
             let address = emulated.address().to_string();
-            let overrides = [Override::new("arm.driver", "franka"), Override::new("arm.address", &*address)];
-            let mut opened =
-                super::rig(load(name, &overrides), Devices::Real).unwrap_or_else(|e| panic!("{}", format!("{e:#}")));
+            let overrides = [
+                Override::new("arm.driver", "franka"),
+                Override::new("arm.address", &*address),
+            ];
+            let mut opened = super::rig(load(name, &overrides), Devices::Real)
+                .unwrap_or_else(|e| panic!("{}", format!("{e:#}")));
             let joints = loop {
-                match opened.source.next_sample().expect("the rig works").expect("it does not end") {
+                match opened
+                    .source
+                    .next_sample()
+                    .expect("the rig works")
+                    .expect("it does not end")
+                {
                     Sample::Joints(joints) => break joints,
                     _ => continue,
                 }
@@ -420,7 +555,9 @@ mod tests {
 
     #[test]
     fn missing_recording_is_an_error() {
-        let missing = recording(Path::new("no/such.mcap"), None, &[]).err().expect("no file");
+        let missing = recording(Path::new("no/such.mcap"), None, &[])
+            .err()
+            .expect("no file");
         assert!(format!("{missing:#}").contains("no/such.mcap"));
     }
 
@@ -436,22 +573,42 @@ mod tests {
             velocity: vec![],
             effort: vec![],
         };
-        recorder.write(&Sample::Joints(joints.clone())).expect("disk space");
+        recorder
+            .write(&Sample::Joints(joints.clone()))
+            .expect("disk space");
         recorder.finish().expect("disk space");
         let mut opened = recording(&path, None, &[]).expect("a recording");
         assert_eq!(opened.rig, rig);
-        assert_eq!(opened.source.next_sample().expect("readable"), Some(Sample::Joints(joints)));
+        assert_eq!(
+            opened.source.next_sample().expect("readable"),
+            Some(Sample::Joints(joints))
+        );
         assert_eq!(opened.source.next_sample().expect("readable"), None);
         assert_eq!(opened.damage.get(), None);
-        // A different joint order in the rig file has no effect; a different joint name is an error.
+        // A different joint order in the rig file has no effect; a different joint name is an
+        // error.
         let mut reversed = rig.clone();
         reversed.arm.joints.reverse();
-        assert_eq!(recording(&path, Some(reversed), &[]).expect("the same joints").rig, rig);
+        assert_eq!(
+            recording(&path, Some(reversed), &[])
+                .expect("the same joints")
+                .rig,
+            rig
+        );
         let mut renamed = rig;
         renamed.arm.urdf_text = renamed.arm.urdf_text.replace("panda_joint3", "elbow");
-        let error_of = format!("{:#}", recording(&path, Some(renamed), &[]).err().expect("no joint of that name"));
-        assert!(error_of.contains("run.mcap") && error_of.contains("\"elbow\""), "{error_of}");
-        let overridden = recording(&path, None, &[Override::new("train.seed", 9)]).expect("a recording");
+        let error_of = format!(
+            "{:#}",
+            recording(&path, Some(renamed), &[])
+                .err()
+                .expect("no joint of that name")
+        );
+        assert!(
+            error_of.contains("run.mcap") && error_of.contains("\"elbow\""),
+            "{error_of}"
+        );
+        let overridden =
+            recording(&path, None, &[Override::new("train.seed", 9)]).expect("a recording");
         assert_eq!(overridden.rig.train.seed, 9);
     }
 }

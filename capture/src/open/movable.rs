@@ -1,7 +1,9 @@
 //! Opens a camera together with an arm that can be moved, real or simulated.
 
 use super::real;
-use super::{Devices, check_arm, check_intrinsics, use_simulated_devices, without_readout_if_ideal};
+use super::{
+    Devices, check_arm, check_intrinsics, use_simulated_devices, without_readout_if_ideal,
+};
 use crate::config::{ArmDriver, BaseDriver, Camera, CameraDriver, Rig};
 use drivers::motion::MovableArm;
 use keyframe::bail;
@@ -16,12 +18,13 @@ pub struct Movable {
     pub camera: Box<dyn drivers::Camera>,
 }
 
-/// Opens a camera of a rig and enables its arm, which holds its position. Simulated devices run as fast as they are read.
+/// Opens a camera of a rig and enables its arm, which holds its position. Simulated devices run as
+/// fast as they are read.
 ///
 /// # Errors
 ///
-/// If the rig has no such camera, a device cannot be opened, the arm cannot be moved as configured, or only one of arm and
-/// camera is simulated.
+/// If the rig has no such camera, a device cannot be opened, the arm cannot be moved as configured,
+/// or only one of arm and camera is simulated.
 pub fn movable(rig: &Rig, devices: Devices, camera: &str) -> crate::Result<Movable> {
     let mut rig = rig.clone();
     rig.cameras.retain(|other: &Camera| &*other.name == camera);
@@ -38,7 +41,9 @@ pub fn movable(rig: &Rig, devices: Devices, camera: &str) -> crate::Result<Movab
         );
     }
     if rig.base.driver != BaseDriver::Fixed {
-        bail!("base.driver: the base must be fixed; use a copy of the rig file with base.driver = \"fixed\"");
+        bail!(
+            "base.driver: the base must be fixed; use a copy of the rig file with base.driver = \"fixed\""
+        );
     }
     without_readout_if_ideal(&mut rig);
     check_arm(&rig)?;
@@ -50,7 +55,8 @@ pub fn movable(rig: &Rig, devices: Devices, camera: &str) -> crate::Result<Movab
         }
         return simulated(rig);
     }
-    // The camera first: the arm is enabled only if everything else works. It is opened for motion, not for reading.
+    // The camera first: the arm is enabled only if everything else works. It is opened for motion,
+    // not for reading.
     let driver = std::mem::replace(&mut rig.arm.driver, ArmDriver::None);
     let opened = real::open(&mut rig);
     rig.arm.driver = driver;
@@ -67,8 +73,9 @@ fn simulated(rig: Rig) -> crate::Result<Movable> {
     /// The defaults of `[arm.motion]`, which a simulated arm does not need.
     const DEFAULT_SECS: [f64; 2] = [0.5, 0.1];
     let motion = rig.arm.motion.as_ref();
-    let [acceleration_secs, jerk_secs] =
-        motion.map_or(DEFAULT_SECS, |motion| [motion.acceleration_secs, motion.jerk_secs]);
+    let [acceleration_secs, jerk_secs] = motion.map_or(DEFAULT_SECS, |motion| {
+        [motion.acceleration_secs, motion.jerk_secs]
+    });
     let limits = real::motion_limits(&rig, acceleration_secs, jerk_secs)?;
     let sim::CommandedRig { arm, cameras, .. } = super::simulated::commanded(&rig, &limits)?;
     let Some(camera) = cameras.into_iter().next() else {
@@ -85,10 +92,14 @@ fn emulated(mut rig: Rig) -> crate::Result<Movable> {
 
 #[cfg(not(all(feature = "sim", target_os = "linux")))]
 fn emulated(_rig: Rig) -> crate::Result<Movable> {
-    bail!("sim.emulate_arm needs Linux and a program built with `cargo build --release --features sim`")
+    bail!(
+        "sim.emulate_arm needs Linux and a program built with `cargo build --release --features sim`"
+    )
 }
 
 #[cfg(not(feature = "sim"))]
 fn simulated(_rig: Rig) -> crate::Result<Movable> {
-    bail!("this program was built without the simulator: build it with `cargo build --release --features sim`")
+    bail!(
+        "this program was built without the simulator: build it with `cargo build --release --features sim`"
+    )
 }

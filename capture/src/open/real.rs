@@ -25,11 +25,10 @@ use std::time::Duration;
 const DEFAULT_ARM_ADDRESS: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 7011);
 
 /// Error for an arm that this program cannot move.
-const READ_ONLY: &str =
-    "arms with this driver can only be read; to move the arm, set arm.driver = \"can\" or \"franka\"";
+const READ_ONLY: &str = "arms with this driver can only be read; to move the arm, set arm.driver = \"can\" or \"franka\"";
 
-/// Opens all real devices of a rig, possibly none, with monitors of those that receive datagrams. Fills in calibration that
-/// is stored in a camera.
+/// Opens all real devices of a rig, possibly none, with monitors of those that receive datagrams.
+/// Fills in calibration that is stored in a camera.
 pub(super) fn open(rig: &mut Rig) -> crate::Result<(Devices, Vec<DatagramMonitor>)> {
     let (mut devices, mut monitors) = (Devices::default(), Vec::new());
     for camera in &mut rig.cameras {
@@ -51,30 +50,45 @@ pub(super) fn open(rig: &mut Rig) -> crate::Result<(Devices, Vec<DatagramMonitor
         }
     };
     if rig.base.driver == BaseDriver::Udp {
-        let base = UdpBase::open(rig.base.address, [rig.base.max_sigma_m, rig.base.max_sigma_rad])?;
+        let base = UdpBase::open(
+            rig.base.address,
+            [rig.base.max_sigma_m, rig.base.max_sigma_rad],
+        )?;
         log::info!("base: listening on {}", base.address());
         monitors.push(base.monitor());
         devices.base = Some(Box::new(base) as Box<dyn Base>);
     }
-    for scanner in rig.scanners.iter().filter(|scanner| scanner.driver == ScannerDriver::Udp) {
+    for scanner in rig
+        .scanners
+        .iter()
+        .filter(|scanner| scanner.driver == ScannerDriver::Udp)
+    {
         let open = UdpScanner::open(&scanner.name, scanner.address)?;
-        log::info!("range scanner {:?}: listening on {}", scanner.name, open.address());
+        log::info!(
+            "range scanner {:?}: listening on {}",
+            scanner.name,
+            open.address()
+        );
         monitors.push(open.monitor());
-        devices.scanners.push(Box::new(open) as Box<dyn RangeScanner>);
+        devices
+            .scanners
+            .push(Box::new(open) as Box<dyn RangeScanner>);
     }
     Ok((devices, monitors))
 }
 
-/// Opens the arm for motion: enables it and holds its position. Positions of the returned arm do not include
-/// `arm.joint_offsets`.
+/// Opens the arm for motion: enables it and holds its position. Positions of the returned arm do
+/// not include `arm.joint_offsets`.
 ///
 /// # Errors
 ///
-/// If the rig file has no table `[arm.motion]`, the driver cannot move arms or does not support the settings, or the
-/// arm cannot be reached.
+/// If the rig file has no table `[arm.motion]`, the driver cannot move arms or does not support the
+/// settings, or the arm cannot be reached.
 pub fn movable_arm(rig: &Rig) -> crate::Result<Box<dyn MovableArm>> {
     let Some(motion) = &rig.arm.motion else {
-        bail!("the rig file has no table [arm.motion], so its arm is only read; see docs/guide/moving-arms.md");
+        bail!(
+            "the rig file has no table [arm.motion], so its arm is only read; see docs/guide/moving-arms.md"
+        );
     };
     match rig.arm.driver {
         ArmDriver::Can => movable_can_arm(rig, motion),
@@ -89,31 +103,43 @@ pub fn movable_arm(rig: &Rig) -> crate::Result<Box<dyn MovableArm>> {
 ///
 /// If the driver cannot move arms or does not support the settings.
 pub fn check_motion(rig: &Rig) -> crate::Result<()> {
-    let Some(motion) = &rig.arm.motion else { return Ok(()) };
+    let Some(motion) = &rig.arm.motion else {
+        return Ok(());
+    };
     match rig.arm.driver {
         #[cfg(target_os = "linux")]
         ArmDriver::Can => Ok(MovableCanArm::check(&movable_config(rig, motion)?)?),
         #[cfg(target_os = "linux")]
-        ArmDriver::Franka => Ok(MovableFrankaArm::check(&motion_config(rig, motion)?).map_err(crate::Error::Failed)?),
+        ArmDriver::Franka => {
+            Ok(MovableFrankaArm::check(&motion_config(rig, motion)?)
+                .map_err(crate::Error::Failed)?)
+        }
         _ => bail!("{READ_ONLY}"),
     }
 }
 
-/// Motion limits of each joint, in the order of `arm.joints`: positions from the URDF, speed from the rig file.
-pub(super) fn motion_limits(rig: &Rig, acceleration_secs: f64, jerk_secs: f64) -> crate::Result<Vec<MotionLimits>> {
+/// Motion limits of each joint, in the order of `arm.joints`: positions from the URDF, speed from
+/// the rig file.
+pub(super) fn motion_limits(
+    rig: &Rig,
+    acceleration_secs: f64,
+    jerk_secs: f64,
+) -> crate::Result<Vec<MotionLimits>> {
     let Rig { arm, .. } = rig;
     let chain = super::chain_of(rig)?;
     let mut limits = Vec::new();
     for (ix, name) in arm.joints.iter().enumerate() {
         let joint_ix = chain.joint_names().iter().position(|known| known == name);
-        let joint =
-            joint_ix.map(|joint_ix| chain.limits()[joint_ix]).context("a joint of the rig is not in its URDF")?;
+        let joint = joint_ix
+            .map(|joint_ix| chain.limits()[joint_ix])
+            .context("a joint of the rig is not in its URDF")?;
         if !joint.is_range_valid {
             bail!(
                 "arm.motion: the <limit> of joint {name:?} in the URDF is invalid; give finite numbers, lower at most upper"
             );
         }
-        let mut joint = MotionLimits::new(&joint, arm.max_speed_rad_s, acceleration_secs, jerk_secs);
+        let mut joint =
+            MotionLimits::new(&joint, arm.max_speed_rad_s, acceleration_secs, jerk_secs);
         // URDF positions are device positions plus the offset.
         let offset = arm.joint_offsets.get(ix).copied().unwrap_or(0.0);
         joint.position = joint.position.map(|bound| bound - offset);
@@ -126,34 +152,55 @@ pub(super) fn motion_limits(rig: &Rig, acceleration_secs: f64, jerk_secs: f64) -
 fn motion_config(rig: &Rig, motion: &ArmMotion) -> crate::Result<MotionConfig> {
     let limits = motion_limits(rig, motion.acceleration_secs, motion.jerk_secs)?;
     let timeout = Duration::from_secs_f64(motion.timeout_millis / 1000.0);
-    let ArmMotion { on_loss, accept_no_watchdog, .. } = *motion;
-    Ok(MotionConfig { limits, on_loss, timeout, accept_no_watchdog })
+    let ArmMotion {
+        on_loss,
+        accept_no_watchdog,
+        ..
+    } = *motion;
+    Ok(MotionConfig {
+        limits,
+        on_loss,
+        timeout,
+        accept_no_watchdog,
+    })
 }
 
 #[cfg(target_os = "linux")]
 fn movable_can_arm(rig: &Rig, motion: &ArmMotion) -> crate::Result<Box<dyn MovableArm>> {
-    Ok(Box::new(MovableCanArm::open(&movable_config(rig, motion)?)?))
+    Ok(Box::new(MovableCanArm::open(&movable_config(
+        rig, motion,
+    )?)?))
 }
 
 #[cfg(target_os = "linux")]
 fn movable_config(rig: &Rig, motion: &ArmMotion) -> crate::Result<MovableArmConfig> {
     let path = &motion.odrive_endpoints;
-    let endpoints = || Endpoints::parse(&files::read_text(path.as_ref())?).map_err(crate::Error::other);
+    let endpoints =
+        || Endpoints::parse(&files::read_text(path.as_ref())?).map_err(crate::Error::other);
     let odrive_endpoints = match path.as_str() {
         "" => None,
         _ => Some(endpoints().with_context(|| format!("arm.motion.odrive_endpoints {path:?}"))?),
     };
     let mut arm = can_config(rig);
     limit_efforts(&mut arm, &super::chain_of(rig)?);
-    Ok(MovableArmConfig { arm, motion: motion_config(rig, motion)?, odrive_endpoints })
+    Ok(MovableArmConfig {
+        arm,
+        motion: motion_config(rig, motion)?,
+        odrive_endpoints,
+    })
 }
 
 /// Limits the efforts that the rig file does not limit to those of the robot description.
 #[cfg(target_os = "linux")]
 fn limit_efforts(arm: &mut can::ArmConfig, chain: &kinematics::Chain) {
     for motor in &mut arm.motors {
-        let joint_ix = chain.joint_names().iter().position(|joint| *joint == motor.joint);
-        let effort = joint_ix.map(|joint_ix| chain.limits()[joint_ix].effort).filter(|effort| effort.is_finite());
+        let joint_ix = chain
+            .joint_names()
+            .iter()
+            .position(|joint| *joint == motor.joint);
+        let effort = joint_ix
+            .map(|joint_ix| chain.limits()[joint_ix].effort)
+            .filter(|effort| effort.is_finite());
         motor.following.max_effort_nm = motor.following.max_effort_nm.or(effort);
     }
 }
@@ -166,7 +213,11 @@ fn movable_can_arm(_rig: &Rig, _motion: &ArmMotion) -> crate::Result<Box<dyn Mov
 #[cfg(target_os = "linux")]
 fn can_config(rig: &Rig) -> can::ArmConfig {
     let Rig { arm, .. } = rig;
-    can::ArmConfig { buses: arm.buses.clone(), motors: arm.motors.clone(), rate_hz: arm.rate_hz }
+    can::ArmConfig {
+        buses: arm.buses.clone(),
+        motors: arm.motors.clone(),
+        rate_hz: arm.rate_hz,
+    }
 }
 
 /// Opens an arm with motors on CAN buses.
@@ -209,9 +260,15 @@ fn movable_franka_arm(_rig: &Rig, _motion: &ArmMotion) -> crate::Result<Box<dyn 
 fn franka_config(rig: &Rig) -> crate::Result<franka::ArmConfig> {
     let Rig { arm, .. } = rig;
     if arm.address.is_empty() {
-        bail!("arm.address is missing: set it to the address of the robot's controller, such as \"172.16.0.2\"");
+        bail!(
+            "arm.address is missing: set it to the address of the robot's controller, such as \"172.16.0.2\""
+        );
     }
-    Ok(franka::ArmConfig { address: arm.address.clone(), joint_names: arm.joints.clone(), chain: franka_chain(rig)? })
+    Ok(franka::ArmConfig {
+        address: arm.address.clone(),
+        joint_names: arm.joints.clone(),
+        chain: franka_chain(rig)?,
+    })
 }
 
 /// The chain from the link in which a Franka arm reports poses to its flange.
@@ -223,8 +280,11 @@ fn franka_config(rig: &Rig) -> crate::Result<franka::ArmConfig> {
 pub fn franka_chain(rig: &Rig) -> crate::Result<kinematics::Chain> {
     let Rig { arm, .. } = rig;
     let robot = kinematics::urdf::Robot::parse(&arm.urdf_text).context("the arm's URDF")?;
-    let path = robot.path(&arm.base_link, &arm.flange_link).context("the arm's URDF")?;
-    // Franka reports poses in the parent link of the arm's first joint, wherever that link is on the base.
+    let path = robot
+        .path(&arm.base_link, &arm.flange_link)
+        .context("the arm's URDF")?;
+    // Franka reports poses in the parent link of the arm's first joint, wherever that link is on
+    // the base.
     let first = path.iter().find(|joint| arm.joints.contains(&joint.name));
     let arm_base_link = first.map_or(&arm.base_link, |joint| &joint.parent);
     kinematics::Chain::new(&robot, arm_base_link, &arm.flange_link).context("the arm's URDF")
@@ -259,14 +319,23 @@ pub fn udp_arm_address(rig: &Rig) -> crate::Result<SocketAddr> {
 /// Opens the color images of a V4L2 camera, and its depth images if the rig file configures depth.
 #[cfg(target_os = "linux")]
 fn v4l2_cameras(camera: &Camera) -> crate::Result<Vec<Box<dyn drivers::Camera>>> {
-    let depth = camera.depth.as_ref().map(|depth| v4l2_depth(camera, depth)).transpose()?;
+    let depth = camera
+        .depth
+        .as_ref()
+        .map(|depth| v4l2_depth(camera, depth))
+        .transpose()?;
     let configs = std::iter::once(v4l2_color(camera)).chain(depth);
-    configs.map(|config| Ok(Box::new(V4l2Camera::open(config)?) as Box<dyn drivers::Camera>)).collect()
+    configs
+        .map(|config| Ok(Box::new(V4l2Camera::open(config)?) as Box<dyn drivers::Camera>))
+        .collect()
 }
 
 #[cfg(not(target_os = "linux"))]
 fn v4l2_cameras(camera: &Camera) -> crate::Result<Vec<Box<dyn drivers::Camera>>> {
-    bail!("camera {:?}: V4L2 is only available on Linux; use driver = \"nokhwa\" for webcams", camera.name)
+    bail!(
+        "camera {:?}: V4L2 is only available on Linux; use driver = \"nokhwa\" for webcams",
+        camera.name
+    )
 }
 
 /// Opens a camera with nokhwa, which sets only size, rate and format.
@@ -274,7 +343,9 @@ fn v4l2_cameras(camera: &Camera) -> crate::Result<Vec<Box<dyn drivers::Camera>>>
 fn nokhwa_camera(camera: &Camera) -> crate::Result<Box<dyn drivers::Camera>> {
     let Camera { name, v4l2, .. } = camera;
     if v4l2.gain.is_some() || v4l2.brightness.is_some() || v4l2.white_balance_kelvin.is_some() {
-        bail!("camera {name:?}: the driver nokhwa does not support gain, brightness or white balance: remove them");
+        bail!(
+            "camera {name:?}: the driver nokhwa does not support gain, brightness or white balance: remove them"
+        );
     }
     if camera.depth.is_some() {
         bail!("camera {name:?}: the driver nokhwa does not support depth");
@@ -322,7 +393,8 @@ fn v4l2_color(camera: &Camera) -> Config {
     }
 }
 
-/// Settings of the depth images of a camera, which come from a separate device with automatic exposure.
+/// Settings of the depth images of a camera, which come from a separate device with automatic
+/// exposure.
 #[cfg(target_os = "linux")]
 fn v4l2_depth(camera: &Camera, depth: &Depth) -> crate::Result<Config> {
     let Some(meters_per_count) = depth.meters_per_count.filter(|_| !depth.device.is_empty()) else {

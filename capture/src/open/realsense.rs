@@ -20,19 +20,35 @@ mod with_sdk {
     use kinematics::{Intrinsics, Lens};
     use std::time::Duration;
 
-    /// Maximum difference between the intrinsics in the rig file and those stored in the camera, pixels. Above it, one
-    /// of them probably belongs to another camera.
+    /// Maximum difference between the intrinsics in the rig file and those stored in the camera,
+    /// pixels. Above it, one of them probably belongs to another camera.
     const MAX_DIFFERENCE_PX: f64 = 5.0;
 
-    /// Opens a camera and copies calibration that the rig file omits from it. Values in the rig file take precedence.
+    /// Opens a camera and copies calibration that the rig file omits from it. Values in the rig
+    /// file take precedence.
     pub(in crate::open) fn open(camera: &mut Camera) -> crate::Result<Box<dyn drivers::Camera>> {
         let open = RealsenseCamera::open(config(camera))?;
         let known = open.calibration();
-        let UnknownCalibration { intrinsics, depth_intrinsics, camera_from_depth } =
-            std::mem::take(&mut camera.realsense.unknown);
-        apply_known("intrinsics", &camera.name, intrinsics, &mut camera.intrinsics, &known.intrinsics);
+        let UnknownCalibration {
+            intrinsics,
+            depth_intrinsics,
+            camera_from_depth,
+        } = std::mem::take(&mut camera.realsense.unknown);
+        apply_known(
+            "intrinsics",
+            &camera.name,
+            intrinsics,
+            &mut camera.intrinsics,
+            &known.intrinsics,
+        );
         if let (Some(depth), Some(known)) = (&mut camera.depth, &known.depth) {
-            apply_known("depth.intrinsics", &camera.name, depth_intrinsics, &mut depth.intrinsics, &known.intrinsics);
+            apply_known(
+                "depth.intrinsics",
+                &camera.name,
+                depth_intrinsics,
+                &mut depth.intrinsics,
+                &known.intrinsics,
+            );
             if camera_from_depth {
                 depth.camera_from_depth = known.camera_from_depth;
             }
@@ -65,7 +81,13 @@ mod with_sdk {
         }
     }
 
-    fn apply_known(key: &str, camera: &str, is_unknown: bool, rig: &mut Intrinsics, known: &Intrinsics) {
+    fn apply_known(
+        key: &str,
+        camera: &str,
+        is_unknown: bool,
+        rig: &mut Intrinsics,
+        known: &Intrinsics,
+    ) {
         let line = toml_line(known);
         if is_unknown {
             log::info!("camera {camera:?}: using {key} = {line} from the camera");
@@ -81,7 +103,8 @@ mod with_sdk {
         }
     }
 
-    /// Maximum distance between the projections of the same ray through two lenses, over the image, pixels.
+    /// Maximum distance between the projections of the same ray through two lenses, over the image,
+    /// pixels.
     fn difference_px(rig: &Intrinsics, known: &Intrinsics) -> f64 {
         const STEPS: u32 = 8;
         let pixels = (0..=STEPS).flat_map(|row| (0..=STEPS).map(move |column| [column, row]));
@@ -98,9 +121,14 @@ mod with_sdk {
         let lens = match &intrinsics.lens {
             Lens::Pinhole => String::new(),
             Lens::BrownConrady(k) => format!(", lens = \"brown_conrady\", distortion = {k:?}"),
-            Lens::RationalBrownConrady(k) => format!(", lens = \"brown_conrady\", distortion = {k:?}"),
+            Lens::RationalBrownConrady(k) => {
+                format!(", lens = \"brown_conrady\", distortion = {k:?}")
+            }
             Lens::KannalaBrandt(k) => format!(", lens = \"kannala_brandt\", distortion = {k:?}"),
         };
-        format!("{{ focal_px = {:?}, principal_px = {:?}{lens} }}", intrinsics.focal_px, intrinsics.principal_px)
+        format!(
+            "{{ focal_px = {:?}, principal_px = {:?}{lens} }}",
+            intrinsics.focal_px, intrinsics.principal_px
+        )
     }
 }

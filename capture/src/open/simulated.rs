@@ -1,32 +1,45 @@
 //! Opens the simulated twin of a rig: the same cameras and joints in MuJoCo.
 
 use crate::StampClock;
-use crate::config::{BaseDriver, Camera, CameraDriver, Depth, Parent, Rig, Scanner, ScannerDriver, SimTarget};
+use crate::config::{
+    BaseDriver, Camera, CameraDriver, Depth, Parent, Rig, Scanner, ScannerDriver, SimTarget,
+};
 use drivers::motion::MotionLimits;
 use drivers::{Devices, Error, Live, Sample, Source};
 use keyframe::bail;
 use kinematics::{Intrinsics, Stamp, Transform};
 use std::sync::Arc;
 
-/// Opens the simulated rig, in lockstep or in real time according to the rig file. In real time, `real` devices run in
-/// parallel. Also returns the clock of the stamps.
+/// Opens the simulated rig, in lockstep or in real time according to the rig file. In real time,
+/// `real` devices run in parallel. Also returns the clock of the stamps.
 pub(super) fn open(rig: &Rig, real: Devices) -> crate::Result<(Box<dyn Source>, StampClock)> {
     let mut config = config_of(rig)?;
-    let any_real = real.arm.is_some() || real.base.is_some() || !real.scanners.is_empty() || !real.cameras.is_empty();
+    let any_real = real.arm.is_some()
+        || real.base.is_some()
+        || !real.scanners.is_empty()
+        || !real.cameras.is_empty();
     if rig.sim.lockstep {
         if any_real {
-            bail!("sim.lockstep does not work with real devices, which cannot wait: set sim.lockstep = false");
+            bail!(
+                "sim.lockstep does not work with real devices, which cannot wait: set sim.lockstep = false"
+            );
         }
-        return Ok((Box::new(sim::open(&config)?.into_lockstep()), StampClock::Simulation));
+        return Ok((
+            Box::new(sim::open(&config)?.into_lockstep()),
+            StampClock::Simulation,
+        ));
     }
     // Real devices use the clock of this computer. Without them, the simulation starts at 0.
     let (start, stamp_clock) = match any_real {
         true => (drivers::clock::now(), StampClock::Computer),
         false => (Stamp::default(), StampClock::Simulation),
     };
-    // In real time the limits are checked here, because devices that end would look like devices that fail.
+    // In real time the limits are checked here, because devices that end would look like devices
+    // that fail.
     (config.duration_secs, config.n_images) = (None, None);
-    let sim::LiveRig { mut devices, truth, .. } = sim::open(&config)?.into_live(start)?;
+    let sim::LiveRig {
+        mut devices, truth, ..
+    } = sim::open(&config)?.into_live(start)?;
     devices.arm = real.arm.or(devices.arm);
     devices.base = devices.base.or(real.base);
     devices.scanners.extend(real.scanners);
@@ -48,7 +61,12 @@ pub(super) fn commanded(rig: &Rig, limits: &[MotionLimits]) -> crate::Result<sim
 
 /// The simulator configuration of a rig whose arm is commanded: without end and ground truth.
 pub(super) fn unlimited(rig: &Rig) -> crate::Result<sim::Config> {
-    Ok(sim::Config { duration_secs: None, n_images: None, truth: false, ..config_of(rig)? })
+    Ok(sim::Config {
+        duration_secs: None,
+        n_images: None,
+        truth: false,
+        ..config_of(rig)?
+    })
 }
 
 /// Live simulated devices with their ground truth.
@@ -89,14 +107,25 @@ impl Source for RealTime {
 fn config_of(rig: &Rig) -> crate::Result<sim::Config> {
     let Some(scene) = sim::Scene::from_name(&rig.sim.scene) else {
         let known: Vec<_> = sim::Scene::ALL.iter().map(|scene| scene.name()).collect();
-        bail!("sim.scene is {:?}; known scenes: {}", rig.sim.scene, known.join(", "));
+        bail!(
+            "sim.scene is {:?}; known scenes: {}",
+            rig.sim.scene,
+            known.join(", ")
+        );
     };
     if rig.base.world_from_base != Transform::identity() {
         bail!("a simulated base is at the world origin: base.world_from_base must be the identity");
     }
     if scene.has_moving_base() != (rig.base.driver == BaseDriver::Sim) {
-        let driver = if scene.has_moving_base() { "sim" } else { "fixed" };
-        bail!("the scene {:?} needs base.driver = {driver:?}", scene.name());
+        let driver = if scene.has_moving_base() {
+            "sim"
+        } else {
+            "fixed"
+        };
+        bail!(
+            "the scene {:?} needs base.driver = {driver:?}",
+            scene.name()
+        );
     }
     Ok(sim::Config {
         scene,
@@ -111,26 +140,51 @@ fn config_of(rig: &Rig) -> crate::Result<sim::Config> {
         joint_names: super::chain_of(rig)?.joint_names().to_vec(),
         reading_order: rig.arm.joints.clone(),
         joint_offsets: rig.arm.sim.true_joint_offsets.clone(),
-        scanners: rig.scanners.iter().filter(|scanner| scanner.driver == ScannerDriver::Sim).map(scanner_of).collect(),
+        scanners: rig
+            .scanners
+            .iter()
+            .filter(|scanner| scanner.driver == ScannerDriver::Sim)
+            .map(scanner_of)
+            .collect(),
         base: sim::BaseConfig {
             rate_hz: rig.base.rate_hz,
             drift_m: rig.base.sim.drift_m,
             drift_rad: rig.base.sim.drift_rad,
         },
         light_inside_frac: rig.sim.light_inside_frac,
-        targets: rig.sim.targets.iter().map(target_of).collect::<crate::Result<_>>()?,
-        cameras: rig.cameras.iter().filter(|camera| camera.driver == CameraDriver::Sim).map(camera_of).collect(),
+        targets: rig
+            .sim
+            .targets
+            .iter()
+            .map(target_of)
+            .collect::<crate::Result<_>>()?,
+        cameras: rig
+            .cameras
+            .iter()
+            .filter(|camera| camera.driver == CameraDriver::Sim)
+            .map(camera_of)
+            .collect(),
     })
 }
 
 fn target_of((name, target): (&String, &SimTarget)) -> crate::Result<sim::TargetConfig> {
     let (parent, parent_from_board) = match (target.world_from_board, target.flange_from_board) {
-        (Some(_), Some(_)) => bail!("sim.target.{name}: give either world_from_board or flange_from_board, not both"),
+        (Some(_), Some(_)) => {
+            bail!("sim.target.{name}: give either world_from_board or flange_from_board, not both")
+        }
         (None, Some(flange_from_board)) => (sim::TargetParent::Flange, flange_from_board),
-        (world_from_board, None) => (sim::TargetParent::World, world_from_board.unwrap_or_default()),
+        (world_from_board, None) => (
+            sim::TargetParent::World,
+            world_from_board.unwrap_or_default(),
+        ),
     };
     let (name, spec) = (format!("sim.target.{name}"), target.spec.clone());
-    Ok(sim::TargetConfig { name, spec, parent, parent_from_board })
+    Ok(sim::TargetConfig {
+        name,
+        spec,
+        parent,
+        parent_from_board,
+    })
 }
 
 fn scanner_of(scanner: &Scanner) -> sim::ScannerConfig {
@@ -161,7 +215,9 @@ fn camera_of(camera: &Camera) -> sim::CameraConfig {
             Parent::Base => sim::Parent::Base,
             Parent::World => sim::Parent::World,
         },
-        parent_from_camera: truth.parent_from_camera.unwrap_or(camera.parent_from_camera),
+        parent_from_camera: truth
+            .parent_from_camera
+            .unwrap_or(camera.parent_from_camera),
         stamps: sim::StampConfig {
             to_mid_exposure_secs: 1e-3 * truth.stamp_to_mid_exposure_millis,
             drift_frac: 1e-6 * truth.clock_drift_ppm,
@@ -171,7 +227,10 @@ fn camera_of(camera: &Camera) -> sim::CameraConfig {
             shot_frac: camera.sim.shot_frac,
             exposure_micros: camera.exposure_micros.unwrap_or(default.exposure_micros),
             blur_samples: camera.sim.blur_samples,
-            readout_micros: truth.readout_micros.or(camera.readout_micros).unwrap_or(0.0),
+            readout_micros: truth
+                .readout_micros
+                .or(camera.readout_micros)
+                .unwrap_or(0.0),
             latency_millis: camera.sim.latency_millis,
             dropped_frac: camera.sim.dropped_frac,
             supersample: camera.sim.supersample,
@@ -190,11 +249,22 @@ fn camera_of(camera: &Camera) -> sim::CameraConfig {
 
 /// The depth sensor; `None` if depth is registered to the color image.
 fn depth_sensor(camera: &Camera, depth: &Depth, color: &Intrinsics) -> Option<sim::DepthSensor> {
-    let camera_from_depth = camera.sim.truth.camera_from_depth.unwrap_or(depth.camera_from_depth);
+    let camera_from_depth = camera
+        .sim
+        .truth
+        .camera_from_depth
+        .unwrap_or(depth.camera_from_depth);
     // Depth that was resized from the color image's lens has its true lens, too.
     let size_px = depth.intrinsics.size_px;
     let shares_lens = depth.intrinsics == camera.intrinsics.resized(size_px);
-    let intrinsics = if shares_lens { color.resized(size_px) } else { depth.intrinsics.clone() };
+    let intrinsics = if shares_lens {
+        color.resized(size_px)
+    } else {
+        depth.intrinsics.clone()
+    };
     let is_registered = intrinsics == *color && camera_from_depth == Transform::identity();
-    (!is_registered).then_some(sim::DepthSensor { intrinsics, camera_from_depth })
+    (!is_registered).then_some(sim::DepthSensor {
+        intrinsics,
+        camera_from_depth,
+    })
 }

@@ -10,7 +10,8 @@ use drivers::{Error, Image, Sample, Source};
 use kinematics::{HistoryError, Stamp};
 use std::collections::{BTreeMap, VecDeque};
 
-/// Interval between the images of a camera in which tags are searched, seconds. Detection must not slow down a run.
+/// Interval between the images of a camera in which tags are searched, seconds. Detection must not
+/// slow down a run.
 const INTERVAL_SECS: f64 = 0.5;
 /// Maximum number of detections that wait for joint states.
 const MAX_WAITING: usize = 16;
@@ -35,10 +36,15 @@ struct CheckedCamera {
 }
 
 impl TagCheckSource {
-    /// Checks the images of a source. The source is returned as it is if the rig has no tags, or if they locate its base.
+    /// Checks the images of a source. The source is returned as it is if the rig has no tags, or if
+    /// they locate its base.
     ///
     /// * `notes`: gets the warnings.
-    pub(super) fn check(rig: &Rig, source: Box<dyn Source>, notes: &Notes) -> crate::Result<Box<dyn Source>> {
+    pub(super) fn check(
+        rig: &Rig,
+        source: Box<dyn Source>,
+        notes: &Notes,
+    ) -> crate::Result<Box<dyn Source>> {
         if rig.base.tags.is_empty() || rig.base.driver != BaseDriver::Fixed {
             return Ok(source);
         }
@@ -47,17 +53,39 @@ impl TagCheckSource {
             check: TagCheck::new(&config.name),
             last_image: None,
         };
-        let cameras = rig.cameras.iter().map(|camera| (camera.name.to_string(), checked(camera))).collect();
+        let cameras = rig
+            .cameras
+            .iter()
+            .map(|camera| (camera.name.to_string(), checked(camera)))
+            .collect();
         let (detector, robot) = (TagDetector::start(rig.base.tag_family)?, Motion::new(rig)?);
         let (tags, is_lockstep, notes) = (rig.base.tags.clone(), rig.sim.lockstep, notes.clone());
         let pending = VecDeque::new();
-        Ok(Box::new(Self { source, detector, is_lockstep, cameras, tags, robot, pending, notes }))
+        Ok(Box::new(Self {
+            source,
+            detector,
+            is_lockstep,
+            cameras,
+            tags,
+            robot,
+            pending,
+            notes,
+        }))
     }
 
     /// Starts detection in an image if the last one of its camera is old enough.
     fn detect(&mut self, image: &Image) {
-        let Some(camera) = self.cameras.get_mut(&*image.camera).filter(|_| !image.is_depth()) else { return };
-        if camera.last_image.is_some_and(|last| image.stamp.secs_since(last) < INTERVAL_SECS) {
+        let Some(camera) = self
+            .cameras
+            .get_mut(&*image.camera)
+            .filter(|_| !image.is_depth())
+        else {
+            return;
+        };
+        if camera
+            .last_image
+            .is_some_and(|last| image.stamp.secs_since(last) < INTERVAL_SECS)
+        {
             return;
         }
         if self.is_lockstep {
@@ -71,7 +99,12 @@ impl TagCheckSource {
 
     fn enqueue(&mut self, new_detections: Vec<Result<TagDetections, Error>>) {
         // Images that do not decode are counted elsewhere.
-        self.pending.extend(new_detections.into_iter().flatten().filter(|detections| !detections.tags.is_empty()));
+        self.pending.extend(
+            new_detections
+                .into_iter()
+                .flatten()
+                .filter(|detections| !detections.tags.is_empty()),
+        );
         while self.pending.len() > MAX_WAITING {
             self.pending.pop_front();
         }
@@ -102,12 +135,20 @@ impl CheckedCamera {
         placements: &BTreeMap<u32, TagPlacement>,
         notes: &Notes,
     ) {
-        let known: Vec<(u32, &TagPlacement, [[f64; 2]; 4])> =
-            detections.tags.iter().filter_map(|tag| Some((tag.id, placements.get(&tag.id)?, tag.corners_px))).collect();
+        let known: Vec<(u32, &TagPlacement, [[f64; 2]; 4])> = detections
+            .tags
+            .iter()
+            .filter_map(|tag| Some((tag.id, placements.get(&tag.id)?, tag.corners_px)))
+            .collect();
         let camera = rolling_shutter_camera(&self.config, pose);
-        let corners: Vec<_> = known.iter().map(|(_, placement, corners_px)| (*placement, *corners_px)).collect();
+        let corners: Vec<_> = known
+            .iter()
+            .map(|(_, placement, corners_px)| (*placement, *corners_px))
+            .collect();
         // Images in which the pose is ambiguous or no pose fits are not compared.
-        let Ok(estimate) = locate(&camera, &corners) else { return };
+        let Ok(estimate) = locate(&camera, &corners) else {
+            return;
+        };
         let observation = TagObservation {
             stamp,
             calibrated: pose.world_from_camera,

@@ -1,9 +1,11 @@
-//! Locates the base from tags that its cameras see: estimates base poses from images and adds them to the samples.
+//! Locates the base from tags that its cameras see: estimates base poses from images and adds them
+//! to the samples.
 
 use crate::config::{BaseDriver, Camera, Parent, Rig};
 use crate::join::{CameraPose, Motion};
 use drivers::tags::{
-    LocateError, RollingShutterCamera, StationaryPoseFilter, TagDetections, TagDetector, TagPlacement, locate,
+    LocateError, RollingShutterCamera, StationaryPoseFilter, TagDetections, TagDetector,
+    TagPlacement, locate,
 };
 use drivers::{BasePose, Error, Image, Sample, Source};
 use keyframe::bail;
@@ -11,10 +13,11 @@ use kinematics::{HistoryError, Stamp, Transform, Twist};
 use nalgebra::{Matrix6, Vector3, Vector6};
 use std::collections::{BTreeMap, VecDeque};
 
-/// Maximum number of detections that wait for joint states. If there are more, the arm sends nothing, which is reported
-/// elsewhere.
+/// Maximum number of detections that wait for joint states. If there are more, the arm sends
+/// nothing, which is reported elsewhere.
 const MAX_WAITING: usize = 64;
-/// After this many images in which no pose fits the tags, one of the tags is probably not where the rig file places it.
+/// After this many images in which no pose fits the tags, one of the tags is probably not where the
+/// rig file places it.
 const MIN_MISFIT_IMAGES: u64 = 3;
 /// Time without a pose after which a warning gives the reason, seconds.
 const WARN_AFTER_SECS: f64 = 5.0;
@@ -113,7 +116,9 @@ impl TagBaseSource {
     /// Computes base poses for the detections with known joint positions.
     fn process_ready(&mut self) {
         while let Some(detection) = self.pending.front() {
-            let Some(camera) = self.camera(&detection.camera) else { return };
+            let Some(camera) = self.camera(&detection.camera) else {
+                return;
+            };
             let stamp = camera.mid_exposure(detection.stamp);
             match self.arm.at(camera, stamp) {
                 Ok(camera_pose) => self.locate(stamp, &camera_pose),
@@ -126,9 +131,16 @@ impl TagBaseSource {
 
     fn locate(&mut self, stamp: Stamp, camera_pose: &CameraPose) {
         let base_from_camera = &camera_pose.world_from_camera;
-        let Some(detection) = self.pending.front() else { return };
-        let Some(camera) = self.camera(&detection.camera) else { return };
-        let known = detection.tags.iter().filter_map(|tag| Some((self.tags.get(&tag.id)?, tag.corners_px)));
+        let Some(detection) = self.pending.front() else {
+            return;
+        };
+        let Some(camera) = self.camera(&detection.camera) else {
+            return;
+        };
+        let known = detection
+            .tags
+            .iter()
+            .filter_map(|tag| Some((self.tags.get(&tag.id)?, tag.corners_px)));
         let rolling_camera = rolling_shutter_camera(camera, camera_pose);
         let estimate = locate(&rolling_camera, &known.collect::<Vec<_>>());
         match estimate {
@@ -140,7 +152,10 @@ impl TagBaseSource {
                     return;
                 }
                 let world_from_base = self.pose_filter.push(&world_from_base, &covariance);
-                self.ready.push_back(Sample::Base(BasePose { stamp, world_from_base }));
+                self.ready.push_back(Sample::Base(BasePose {
+                    stamp,
+                    world_from_base,
+                }));
                 (self.newest, self.no_pose_since) = (Some(stamp), None);
                 self.counts.n_poses += 1;
             }
@@ -148,7 +163,11 @@ impl TagBaseSource {
             Ok(_) => {}
             Err(why) => {
                 let name = camera.name.clone();
-                let visible_ids: Vec<_> = detection.tags.iter().map(|tag| tag.id.to_string()).collect();
+                let visible_ids: Vec<_> = detection
+                    .tags
+                    .iter()
+                    .map(|tag| tag.id.to_string())
+                    .collect();
                 self.count_miss(stamp, &name, &visible_ids, why);
             }
         }
@@ -175,20 +194,30 @@ impl TagBaseSource {
                 }
             }
         }
-        let since = *self.no_pose_since.get_or_insert(self.newest.unwrap_or(stamp));
+        let since = *self
+            .no_pose_since
+            .get_or_insert(self.newest.unwrap_or(stamp));
         if stamp.secs_since(since) >= WARN_AFTER_SECS {
             let others = match why {
-                LocateError::NoTag if !visible_ids.is_empty() => format!("; visible tags: {}", visible_ids.join(", ")),
+                LocateError::NoTag if !visible_ids.is_empty() => {
+                    format!("; visible tags: {}", visible_ids.join(", "))
+                }
                 _ => String::new(),
             };
-            log::warn!("base: no pose for {:.0} s; camera {camera:?}: {why}{others}", stamp.secs_since(since));
+            log::warn!(
+                "base: no pose for {:.0} s; camera {camera:?}: {why}{others}",
+                stamp.secs_since(since)
+            );
             self.no_pose_since = Some(stamp);
         }
     }
 }
 
 /// A camera during the readout of an image.
-pub(super) fn rolling_shutter_camera<'a>(camera: &'a Camera, pose: &CameraPose) -> RollingShutterCamera<'a> {
+pub(super) fn rolling_shutter_camera<'a>(
+    camera: &'a Camera,
+    pose: &CameraPose,
+) -> RollingShutterCamera<'a> {
     RollingShutterCamera {
         intrinsics: &camera.intrinsics,
         twist: pose.twist.unwrap_or_else(Twist::zero),
@@ -243,12 +272,18 @@ impl Drop for TagBaseSource {
     }
 }
 
-/// The covariance of the base pose in base axes, computed from the covariance of the pose of a camera on the base.
+/// The covariance of the base pose in base axes, computed from the covariance of the pose of a
+/// camera on the base.
 fn of_base(of_camera: &Matrix6<f64>, base_from_camera: &Transform) -> Matrix6<f64> {
     let camera_from_base = base_from_camera.inverse();
     let columns: [Vector6<f64>; 6] = std::array::from_fn(|ix| {
-        let unit = |first: usize| Vector3::from_fn(|axis, _| f64::from(u8::from(axis + first == ix)));
-        let moved = Twist { linear_m_s: unit(0), angular_rad_s: unit(3) }.of_attached(&camera_from_base);
+        let unit =
+            |first: usize| Vector3::from_fn(|axis, _| f64::from(u8::from(axis + first == ix)));
+        let moved = Twist {
+            linear_m_s: unit(0),
+            angular_rad_s: unit(3),
+        }
+        .of_attached(&camera_from_base);
         Vector6::from_iterator(moved.linear_m_s.iter().chain(&moved.angular_rad_s).copied())
     });
     let adjoint = Matrix6::from_columns(&columns);
@@ -266,9 +301,15 @@ mod tests {
         let of_base = of_base(&of_camera, &base_from_camera);
         // A rotation of 10 mrad about x at 2 m moves the base by 20 mm along y.
         assert!((of_base[(1, 1)] - (1e-6 + 4e-4)).abs() < 1e-12, "{of_base}");
-        assert!((of_base[(0, 0)] - 1e-6).abs() < 1e-12 && (of_base[(2, 2)] - 1e-6).abs() < 1e-12, "{of_base}");
+        assert!(
+            (of_base[(0, 0)] - 1e-6).abs() < 1e-12 && (of_base[(2, 2)] - 1e-6).abs() < 1e-12,
+            "{of_base}"
+        );
         let rotation_error = kinematics::transform::exp(
-            &Twist { linear_m_s: Vector3::zeros(), angular_rad_s: Vector3::new(1e-2, 0.0, 0.0) },
+            &Twist {
+                linear_m_s: Vector3::zeros(),
+                angular_rad_s: Vector3::new(1e-2, 0.0, 0.0),
+            },
             1.0,
         );
         let moved = base_from_camera * rotation_error * base_from_camera.inverse();

@@ -1,31 +1,34 @@
 //! For each pixel of an image, finds the nearest of the squares that cover it.
 //!
-//! Neighboring pixels in a row of depth usually cover the same lines of the color image. For such a run, only the
-//! columns are computed pixel by pixel, in one strip per square width. The result is then written to all lines of the
-//! run, many pixels at once.
+//! Neighboring pixels in a row of depth usually cover the same lines of the color image. For such a
+//! run, only the columns are computed pixel by pixel, in one strip per square width. The result is
+//! then written to all lines of the run, many pixels at once.
 
 use std::ops::Range;
 
 /// Value of a pixel that no square covers: larger than any count minus one.
 pub(super) const NO_DEPTH: u16 = u16::MAX;
-/// Maximum square width, in columns, with its own strip. Wider squares are rare and are written column by column.
+/// Maximum square width, in columns, with its own strip. Wider squares are rare and are written
+/// column by column.
 const MAX_STRIPS: usize = 4;
 /// Padding before the first column of a strip.
 const PAD: usize = MAX_STRIPS;
 /// Number of cells of all strips. Every 16-bit index is valid, so no access needs a bounds check.
 const N_STRIP_CELLS: usize = 1 << 16;
-/// Number of cells behind the strips for pixels without depth. They are used in rotation, because with a single cell,
-/// each write would have to wait for the previous one.
+/// Number of cells behind the strips for pixels without depth. They are used in rotation, because
+/// with a single cell, each write would have to wait for the previous one.
 const N_DISCARD_CELLS: usize = 256;
 /// Marks a square that is too wide for the strips.
 const WIDE: u16 = u16::MAX;
-/// Largest image width, in columns. Columns beyond it get no depth because they have no cell in a strip.
+/// Largest image width, in columns. Columns beyond it get no depth because they have no cell in a
+/// strip.
 pub(super) const MAX_COLUMNS: usize = N_STRIP_CELLS - 1 - N_DISCARD_CELLS - PAD - 1;
 /// Number of pixels tested at once.
 const BLOCK: usize = 32;
 
-/// First and last column and row that each pixel of one row of depth covers, clipped to the image. Indices start at 1;
-/// 0 is before the image. If a first index is greater than the corresponding last index, the pixel covers nothing.
+/// First and last column and row that each pixel of one row of depth covers, clipped to the image.
+/// Indices start at 1; 0 is before the image. If a first index is greater than the corresponding
+/// last index, the pixel covers nothing.
 pub(super) struct PixelBounds {
     pub(super) first: [Vec<u16>; 2],
     pub(super) last: [Vec<u16>; 2],
@@ -36,14 +39,14 @@ pub(super) struct NearestDepth {
     width: usize,
     /// Nearest count minus one of each pixel: `[height, width]`.
     nearest: Vec<u16>,
-    /// For each column, the minimum over the squares of the current run that start there. There is one strip per square
-    /// width: `n_strips` strips of `stride` cells, then [`N_DISCARD_CELLS`].
+    /// For each column, the minimum over the squares of the current run that start there. There is
+    /// one strip per square width: `n_strips` strips of `stride` cells, then [`N_DISCARD_CELLS`].
     strips: Box<[u16; N_STRIP_CELLS]>,
     /// Number of strips that fit.
     n_strips: usize,
     stride: usize,
-    /// For each pixel of the row: first line in the upper 16 bits, last line in the lower 16 bits; 0 if it covers
-    /// nothing.
+    /// For each pixel of the row: first line in the upper 16 bits, last line in the lower 16 bits;
+    /// 0 if it covers nothing.
     lines: Vec<u32>,
     /// For each pixel of the row: index of its cell in the strips.
     strip_cells: Vec<u16>,
@@ -84,21 +87,28 @@ impl NearestDepth {
         }
     }
 
-    /// Next run of pixels that cover the same lines. Pixels in between that cover nothing do not end the run.
+    /// Next run of pixels that cover the same lines. Pixels in between that cover nothing do not
+    /// end the run.
     #[inline(always)]
     fn next_run(&self, begin: usize) -> Option<Range<usize>> {
         let lines = &self.lines[begin..];
         let first = find_blockwise(lines, |lines| lines != 0)?;
         let run = lines[first];
-        let n = find_blockwise(&lines[first..], |lines| (lines != 0) & (lines != run)).unwrap_or(lines.len() - first);
+        let n = find_blockwise(&lines[first..], |lines| (lines != 0) & (lines != run))
+            .unwrap_or(lines.len() - first);
         Some(begin + first..begin + first + n)
     }
 
     /// Writes a run of pixels into the strips.
     #[inline(always)]
     fn fill(&mut self, run: Range<usize>, bounds: &PixelBounds) {
-        let (strip_cells, count_minus_one) = (&self.strip_cells[run.clone()], &self.count_minus_one[run.clone()]);
-        let has_too_wide = strip_cells.iter().fold(false, |any, cell| any | (*cell == WIDE));
+        let (strip_cells, count_minus_one) = (
+            &self.strip_cells[run.clone()],
+            &self.count_minus_one[run.clone()],
+        );
+        let has_too_wide = strip_cells
+            .iter()
+            .fold(false, |any, cell| any | (*cell == WIDE));
         if !has_too_wide {
             for (cell, count_minus_one) in strip_cells.iter().zip(count_minus_one) {
                 let nearest = &mut self.strips[usize::from(*cell)];
@@ -108,10 +118,15 @@ impl NearestDepth {
         }
         for (ix, (cell, count_minus_one)) in run.zip(strip_cells.iter().zip(count_minus_one)) {
             let columns = match *cell {
-                WIDE => usize::from(bounds.first[0][ix]) + PAD..usize::from(bounds.last[0][ix]) + PAD + 1,
+                WIDE => {
+                    usize::from(bounds.first[0][ix]) + PAD
+                        ..usize::from(bounds.last[0][ix]) + PAD + 1
+                }
                 cell => usize::from(cell)..usize::from(cell) + 1,
             };
-            self.strips[columns].iter_mut().for_each(|nearest| *nearest = (*count_minus_one).min(*nearest));
+            self.strips[columns]
+                .iter_mut()
+                .for_each(|nearest| *nearest = (*count_minus_one).min(*nearest));
         }
     }
 
@@ -120,7 +135,10 @@ impl NearestDepth {
     #[inline(always)]
     fn locate_row(&mut self, row: &[u16], bounds: &PixelBounds) {
         let n = row.len();
-        let PixelBounds { first: [left, top], last: [right, bottom] } = bounds;
+        let PixelBounds {
+            first: [left, top],
+            last: [right, bottom],
+        } = bounds;
         let (left, top, right, bottom) = (&left[..n], &top[..n], &right[..n], &bottom[..n]);
         let (lines, strip_cells) = (&mut self.lines[..n], &mut self.strip_cells[..n]);
         let count_minus_one = &mut self.count_minus_one[..n];
@@ -129,10 +147,21 @@ impl NearestDepth {
         for ix in 0..n {
             let is_visible = (row[ix] != 0) & (left[ix] <= right[ix]) & (top[ix] <= bottom[ix]);
             let n_more = right[ix].wrapping_sub(left[ix]);
-            let cell = n_more.wrapping_mul(stride).wrapping_add(left[ix]).wrapping_add(PAD as u16);
+            let cell = n_more
+                .wrapping_mul(stride)
+                .wrapping_add(left[ix])
+                .wrapping_add(PAD as u16);
             let cell = if n_more < n_strips { cell } else { WIDE };
-            lines[ix] = if is_visible { u32::from(top[ix]) << 16 | u32::from(bottom[ix]) } else { 0 };
-            strip_cells[ix] = if is_visible { cell } else { discard + (ix % N_DISCARD_CELLS) as u16 };
+            lines[ix] = if is_visible {
+                u32::from(top[ix]) << 16 | u32::from(bottom[ix])
+            } else {
+                0
+            };
+            strip_cells[ix] = if is_visible {
+                cell
+            } else {
+                discard + (ix % N_DISCARD_CELLS) as u16
+            };
             count_minus_one[ix] = row[ix].wrapping_sub(1);
         }
     }
@@ -142,39 +171,65 @@ impl NearestDepth {
     fn write_run(&mut self, run: Range<usize>, bounds: &PixelBounds) {
         let lines = self.lines[run.start];
         let line_bounds = self.lines[run.clone()].iter();
-        let columns = bounds.first[0][run.clone()].iter().zip(&bounds.last[0][run]);
-        let (from, to) = line_bounds.zip(columns).fold((u16::MAX, 0), |(from, to), (lines, (left, right))| {
-            let (left, right) = if *lines == 0 { (u16::MAX, 0) } else { (*left, *right) };
-            (from.min(left), to.max(right))
-        });
+        let columns = bounds.first[0][run.clone()]
+            .iter()
+            .zip(&bounds.last[0][run]);
+        let (from, to) =
+            line_bounds
+                .zip(columns)
+                .fold((u16::MAX, 0), |(from, to), (lines, (left, right))| {
+                    let (left, right) = if *lines == 0 {
+                        (u16::MAX, 0)
+                    } else {
+                        (*left, *right)
+                    };
+                    (from.min(left), to.max(right))
+                });
         if from > to {
             return;
         }
         let (from, n) = (usize::from(from), usize::from(to - from) + 1);
         for n_more in (1..self.n_strips).rev() {
-            // A square of this many columns is the union of two squares that are one column narrower.
-            let (narrower, strip) = self.strips[(n_more - 1) * self.stride..].split_at_mut(self.stride);
-            merge(&mut narrower[PAD + from..][..n], &strip[PAD + from..][..n], &strip[PAD + from - 1..][..n]);
+            // A square of this many columns is the union of two squares that are one column
+            // narrower.
+            let (narrower, strip) =
+                self.strips[(n_more - 1) * self.stride..].split_at_mut(self.stride);
+            merge(
+                &mut narrower[PAD + from..][..n],
+                &strip[PAD + from..][..n],
+                &strip[PAD + from - 1..][..n],
+            );
             strip[PAD + from..][..n].fill(NO_DEPTH);
         }
         let columns = &mut self.strips[PAD + from..][..n];
         for line in lines >> 16..=lines & 0xFFFF {
             let line = &mut self.nearest[(line as usize - 1) * self.width + from - 1..][..n];
-            line.iter_mut().zip(&*columns).for_each(|(nearest, new)| *nearest = (*new).min(*nearest));
+            line.iter_mut()
+                .zip(&*columns)
+                .for_each(|(nearest, new)| *nearest = (*new).min(*nearest));
         }
         columns.fill(NO_DEPTH);
     }
 }
 
-/// Index of the first number that fulfills the predicate. Whole blocks are tested so that the compiler can vectorize.
+/// Index of the first number that fulfills the predicate. Whole blocks are tested so that the
+/// compiler can vectorize.
 #[inline(always)]
 fn find_blockwise(numbers: &[u32], predicate: impl Fn(u32) -> bool) -> Option<usize> {
-    let has_one = |block: &&[u32]| block.iter().fold(false, |any, number| any | predicate(*number));
-    let (block_ix, block) = numbers.chunks(BLOCK).enumerate().find(|(_, block)| has_one(block))?;
+    let has_one = |block: &&[u32]| {
+        block
+            .iter()
+            .fold(false, |any, number| any | predicate(*number))
+    };
+    let (block_ix, block) = numbers
+        .chunks(BLOCK)
+        .enumerate()
+        .find(|(_, block)| has_one(block))?;
     Some(BLOCK * block_ix + block.iter().position(|number| predicate(*number))?)
 }
 
-/// Elementwise minimum of three slices. Each slice is its own argument so that the compiler vectorizes the loop.
+/// Elementwise minimum of three slices. Each slice is its own argument so that the compiler
+/// vectorizes the loop.
 #[inline(always)]
 fn merge(nearest: &mut [u16], center: &[u16], left: &[u16]) {
     let n = nearest.len();

@@ -1,10 +1,11 @@
 //! Aligns depth images to the pixels of a color camera next to the depth camera.
 //!
-//! Source: the processing block `align` of librealsense (`src/proc/align.cpp`). A depth pixel is a square. Two opposite
-//! corners are projected to the color image at the depth of the pixel, and each color pixel keeps the nearest square
-//! that covers it. We clip squares at the edge of the image, whereas librealsense drops them. The SSE path of
-//! librealsense (`src/proc/sse/sse-align.cpp`) rounds half a pixel further to the right and down, and uses only the
-//! upper left corner if color has fewer pixels per angle than depth. We follow its scalar path.
+//! Source: the processing block `align` of librealsense (`src/proc/align.cpp`). A depth pixel is a
+//! square. Two opposite corners are projected to the color image at the depth of the pixel, and
+//! each color pixel keeps the nearest square that covers it. We clip squares at the edge of the
+//! image, whereas librealsense drops them. The SSE path of librealsense
+//! (`src/proc/sse/sse-align.cpp`) rounds half a pixel further to the right and down, and uses only
+//! the upper left corner if color has fewer pixels per angle than depth. We follow its scalar path.
 
 mod cover;
 
@@ -13,14 +14,14 @@ use cover::{MAX_COLUMNS, NearestDepth, PixelBounds};
 use kinematics::{Intrinsics, Lens, Transform};
 use std::sync::Arc;
 
-/// Aligns depth images of one camera to the pixels of another. Precomputes everything that does not depend on the
-/// image.
+/// Aligns depth images of one camera to the pixels of another. Precomputes everything that does not
+/// depend on the image.
 #[derive(Clone, Debug)]
 pub struct DepthAlignment {
     depth_px: [u32; 2],
     color: ColorCamera,
-    /// Rays of the pixel corners, `z` = 1 in the depth camera, rotated to the axes of the color camera: `[height + 1,
-    /// width + 1]`.
+    /// Rays of the pixel corners, `z` = 1 in the depth camera, rotated to the axes of the color
+    /// camera: `[height + 1, width + 1]`.
     corners: [Vec<f32>; 3],
     /// Position of the depth camera in the frame of the color camera, meters.
     depth_in_color: [f64; 3],
@@ -33,7 +34,8 @@ struct ColorCamera {
     focal_px: [f32; 2],
     principal_px: [f32; 2],
     lens: ColorLens,
-    /// Square of the largest valid radius on the plane `z` = 1. Beyond it, distortion polynomials may not be monotonic.
+    /// Square of the largest valid radius on the plane `z` = 1. Beyond it, distortion polynomials
+    /// may not be monotonic.
     max_radius_squared: f32,
 }
 
@@ -88,13 +90,19 @@ impl pulp::NullaryFnOnce for Task<'_> {
 
     #[inline(always)]
     fn call(self) -> Arc<[u8]> {
-        let aligned = self.alignment.align_counts(self.counts.as_chunks().0, self.meters_per_count);
+        let aligned = self
+            .alignment
+            .align_counts(self.counts.as_chunks().0, self.meters_per_count);
         let mut data: Arc<[u8]> = std::iter::repeat_n(0, 2 * aligned.len()).collect();
         let bytes = Arc::get_mut(&mut data).expect("the buffer was just created and is not shared");
         for (bytes, count_minus_one) in bytes.as_chunks_mut::<2>().0.iter_mut().zip(aligned) {
             let count = count_minus_one.wrapping_add(1);
             // The largest count is invalid, too.
-            *bytes = if count == u16::MAX { [0; 2] } else { count.to_le_bytes() };
+            *bytes = if count == u16::MAX {
+                [0; 2]
+            } else {
+                count.to_le_bytes()
+            };
         }
         data
     }
@@ -104,7 +112,8 @@ impl DepthAlignment {
     /// Prepares the alignment of a depth camera to a color camera. Both lenses may be distorted.
     pub fn new(depth: &Intrinsics, color: &Intrinsics, color_from_depth: &Transform) -> Self {
         let [width, height] = depth.size_px;
-        let rays = (0..=height).flat_map(|row| (0..=width).map(move |column| [f64::from(column), f64::from(row)]));
+        let rays = (0..=height)
+            .flat_map(|row| (0..=width).map(move |column| [f64::from(column), f64::from(row)]));
         let rays: Vec<[f64; 3]> = rays
             .map(|corner| match depth.unproject(corner) {
                 Some(ray) => (color_from_depth.rotation * ray).into(),
@@ -119,8 +128,9 @@ impl DepthAlignment {
         }
     }
 
-    /// Resamples the depth image to the pixels of the color image. Counts keep their unit and are along the z axis of
-    /// the depth camera; 0 means no depth. Readings of 0 and of the largest count are invalid and are skipped.
+    /// Resamples the depth image to the pixels of the color image. Counts keep their unit and are
+    /// along the z axis of the depth camera; 0 means no depth. Readings of 0 and of the largest
+    /// count are invalid and are skipped.
     ///
     /// # Errors
     /// If the image contains no depth or its size differs from that of the depth camera.
@@ -137,38 +147,65 @@ impl DepthAlignment {
             });
         }
         // Runs with the widest vector instructions of this CPU.
-        let task = Task { alignment: self, counts: depth.raw_bytes()?, meters_per_count };
+        let task = Task {
+            alignment: self,
+            counts: depth.raw_bytes()?,
+            meters_per_count,
+        };
         let data = pulp::Arch::new().dispatch(task);
-        Ok(Image { size_px: self.color.size_px, data, ..depth.clone() })
+        Ok(Image {
+            size_px: self.color.size_px,
+            data,
+            ..depth.clone()
+        })
     }
 
-    /// Nearest count minus one of each color pixel. The invalid count 0 wraps to the largest number and never wins.
+    /// Nearest count minus one of each color pixel. The invalid count 0 wraps to the largest number
+    /// and never wins.
     #[inline(always)]
     fn align_counts(&self, counts: &[[u8; 2]], meters_per_count: f64) -> Vec<u16> {
         let depth_width = self.depth_px[0] as usize;
-        let mut nearest_depth = NearestDepth::new(self.color.size_px.map(|side| side as usize), depth_width);
+        let mut nearest_depth =
+            NearestDepth::new(self.color.size_px.map(|side| side as usize), depth_width);
         let pixel_bounds = || [vec![0; depth_width], vec![0; depth_width]];
         let mut work = Row {
             counts: vec![0; depth_width],
             numbers: vec![0.0; depth_width],
             positions_px: [vec![0.0; depth_width], vec![0.0; depth_width]],
-            bounds: PixelBounds { first: pixel_bounds(), last: pixel_bounds() },
+            bounds: PixelBounds {
+                first: pixel_bounds(),
+                last: pixel_bounds(),
+            },
         };
         // The position is in units of one count, so that counts need no scaling.
-        let depth_in_color = self.depth_in_color.map(|meters| narrow(meters / meters_per_count));
+        let depth_in_color = self
+            .depth_in_color
+            .map(|meters| narrow(meters / meters_per_count));
         for (row_ix, row) in counts.chunks_exact(depth_width.max(1)).enumerate() {
-            work.counts.iter_mut().zip(row).for_each(|(count, bytes)| *count = u16::from_le_bytes(*bytes));
-            work.numbers.iter_mut().zip(&work.counts).for_each(|(number, count)| *number = f32::from(*count));
+            work.counts
+                .iter_mut()
+                .zip(row)
+                .for_each(|(count, bytes)| *count = u16::from_le_bytes(*bytes));
+            work.numbers
+                .iter_mut()
+                .zip(&work.counts)
+                .for_each(|(number, count)| *number = f32::from(*count));
             let first_corner = row_ix * (depth_width + 1);
             self.project(&mut work, depth_in_color, first_corner, Corner::First);
             // The opposite corners are one row and one column further.
-            self.project(&mut work, depth_in_color, first_corner + depth_width + 2, Corner::Last);
+            self.project(
+                &mut work,
+                depth_in_color,
+                first_corner + depth_width + 2,
+                Corner::Last,
+            );
             nearest_depth.put(&work.counts, &work.bounds);
         }
         nearest_depth.into_nearest()
     }
 
-    /// Projects the corners of a row to columns and rows of the color image. `start` is the index of the first corner.
+    /// Projects the corners of a row to columns and rows of the color image. `start` is the index
+    /// of the first corner.
     #[inline(always)]
     fn project(&self, work: &mut Row, depth_in_color: [f32; 3], start: usize, corner: Corner) {
         let view = View {
@@ -185,35 +222,46 @@ impl DepthAlignment {
         let counts = &work.numbers;
         let rays = [0, 1, 2].map(|axis| &self.corners[axis][start..]);
         match self.color.lens {
-            ColorLens::Pinhole => project_by(columns, rows, counts, rays, &view, |x, y| ([x, y], true)),
+            ColorLens::Pinhole => {
+                project_by(columns, rows, counts, rays, &view, |x, y| ([x, y], true))
+            }
             ColorLens::BrownConrady(k) => project_by(columns, rows, counts, rays, &view, |x, y| {
                 let r2 = x * x + y * y;
                 (brown_conrady(k, x, y, r2), r2 <= max_radius_squared)
             }),
-            ColorLens::RationalBrownConrady(k) => project_by(columns, rows, counts, rays, &view, |x, y| {
-                let r2 = x * x + y * y;
-                (rational_brown_conrady(k, x, y, r2), r2 <= max_radius_squared)
-            }),
-            ColorLens::KannalaBrandt(k) => project_by(columns, rows, counts, rays, &view, |x, y| {
-                let r2 = x * x + y * y;
-                (kannala_brandt(k, x, y, r2), r2 <= max_radius_squared)
-            }),
+            ColorLens::RationalBrownConrady(k) => {
+                project_by(columns, rows, counts, rays, &view, |x, y| {
+                    let r2 = x * x + y * y;
+                    (
+                        rational_brown_conrady(k, x, y, r2),
+                        r2 <= max_radius_squared,
+                    )
+                })
+            }
+            ColorLens::KannalaBrandt(k) => {
+                project_by(columns, rows, counts, rays, &view, |x, y| {
+                    let r2 = x * x + y * y;
+                    (kannala_brandt(k, x, y, r2), r2 <= max_radius_squared)
+                })
+            }
         }
         let pixel_bounds = match corner {
             Corner::First => &mut work.bounds.first,
             Corner::Last => &mut work.bounds.last,
         };
-        for ((pixel_bounds, positions_px), side) in
-            pixel_bounds.iter_mut().zip(&work.positions_px).zip(self.color.size_px)
+        for ((pixel_bounds, positions_px), side) in pixel_bounds
+            .iter_mut()
+            .zip(&work.positions_px)
+            .zip(self.color.size_px)
         {
             number(pixel_bounds, positions_px, side, corner);
         }
     }
 }
 
-/// Projects rays to columns and rows of the color image. `distort` maps a point of the plane `z` = 1 to its distorted
-/// position and returns whether the lens model is valid there. Branch-free, with each slice as its own argument, so
-/// that the compiler vectorizes it.
+/// Projects rays to columns and rows of the color image. `distort` maps a point of the plane `z` =
+/// 1 to its distorted position and returns whether the lens model is valid there. Branch-free, with
+/// each slice as its own argument, so that the compiler vectorizes it.
 #[inline(always)]
 fn project_by(
     columns: &mut [f32],
@@ -224,22 +272,43 @@ fn project_by(
     distort: impl Fn(f32, f32) -> ([f32; 2], bool),
 ) {
     let n = counts.len();
-    let (xs, ys, zs, columns, rows) = (&xs[..n], &ys[..n], &zs[..n], &mut columns[..n], &mut rows[..n]);
-    let View { depth_in_color: [tx, ty, tz], focal_px: [fx, fy], principal_px: [cx, cy], hidden_px } = *view;
+    let (xs, ys, zs, columns, rows) = (
+        &xs[..n],
+        &ys[..n],
+        &zs[..n],
+        &mut columns[..n],
+        &mut rows[..n],
+    );
+    let View {
+        depth_in_color: [tx, ty, tz],
+        focal_px: [fx, fy],
+        principal_px: [cx, cy],
+        hidden_px,
+    } = *view;
     for ix in 0..n {
         let z = counts[ix] * zs[ix] + tz;
         let inverse = 1.0 / z;
-        let (x, y) = ((counts[ix] * xs[ix] + tx) * inverse, (counts[ix] * ys[ix] + ty) * inverse);
+        let (x, y) = (
+            (counts[ix] * xs[ix] + tx) * inverse,
+            (counts[ix] * ys[ix] + ty) * inverse,
+        );
         let ([distorted_x, distorted_y], is_valid) = distort(x, y);
         // Moving the column out of the image is sufficient to hide a pixel.
-        columns[ix] = if (z > 0.0) & is_valid { distorted_x * fx + cx } else { hidden_px };
+        columns[ix] = if (z > 0.0) & is_valid {
+            distorted_x * fx + cx
+        } else {
+            hidden_px
+        };
         rows[ix] = distorted_y * fy + cy;
     }
 }
 
-/// Converts positions to pixel indices that start at 1, clipped to the image and one index after it ([`Corner::First`])
-/// or before it ([`Corner::Last`]).
-#[expect(clippy::cast_possible_truncation, reason = "the low 16 bits are the index")]
+/// Converts positions to pixel indices that start at 1, clipped to the image and one index after it
+/// ([`Corner::First`]) or before it ([`Corner::Last`]).
+#[expect(
+    clippy::cast_possible_truncation,
+    reason = "the low 16 bits are the index"
+)]
 #[inline(always)]
 fn number(numbers: &mut [u16], positions_px: &[f32], side: u32, corner: Corner) {
     // Columns and rows beyond this limit get no depth.
@@ -253,7 +322,8 @@ fn number(numbers: &mut [u16], positions_px: &[f32], side: u32, corner: Corner) 
     let n = positions_px.len();
     let (numbers, positions_px) = (&mut numbers[..n], &positions_px[..n]);
     for ix in 0..n {
-        // These comparisons compile to vector instructions; `max` and `min` do not because of their NaN handling.
+        // These comparisons compile to vector instructions; `max` and `min` do not because of their
+        // NaN handling.
         let one_based = positions_px[ix] + 1.0;
         let one_based = if one_based > min { one_based } else { min };
         let one_based = if one_based < max { one_based } else { max };
@@ -272,7 +342,11 @@ impl ColorCamera {
             Lens::KannalaBrandt(k) => ColorLens::KannalaBrandt(k.map(narrow)),
             Lens::RationalBrownConrady(k) => ColorLens::RationalBrownConrady(k.map(narrow)),
         };
-        let max_radius = if matches!(lens, ColorLens::Pinhole) { f64::INFINITY } else { max_radius(camera) };
+        let max_radius = if matches!(lens, ColorLens::Pinhole) {
+            f64::INFINITY
+        } else {
+            max_radius(camera)
+        };
         Self {
             size_px: camera.size_px,
             focal_px: camera.focal_px.map(narrow),
@@ -283,13 +357,16 @@ impl ColorCamera {
     }
 }
 
-/// Largest radius on the plane `z` = 1 at the edge of the image, plus a margin for corners just outside.
+/// Largest radius on the plane `z` = 1 at the edge of the image, plus a margin for corners just
+/// outside.
 fn max_radius(camera: &Intrinsics) -> f64 {
     const MARGIN: f64 = 1.02;
     let [width, height] = camera.size_px;
     let columns = (0..=width).flat_map(|column| [[column, 0], [column, height]]);
     let rows = (0..=height).flat_map(|row| [[0, row], [width, row]]);
-    let radii = columns.chain(rows).filter_map(|pixel| Some(camera.unproject(pixel.map(f64::from))?.xy().norm()));
+    let radii = columns
+        .chain(rows)
+        .filter_map(|pixel| Some(camera.unproject(pixel.map(f64::from))?.xy().norm()));
     let largest = radii.fold(0.0, f64::max);
     largest * MARGIN
 }
@@ -299,15 +376,26 @@ fn max_radius(camera: &Intrinsics) -> f64 {
 fn brown_conrady([k1, k2, p1, p2, k3]: [f32; 5], x: f32, y: f32, r2: f32) -> [f32; 2] {
     let radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3));
     let xy2 = 2.0 * x * y;
-    [x * radial + p1 * xy2 + p2 * (r2 + 2.0 * x * x), y * radial + p1 * (r2 + 2.0 * y * y) + p2 * xy2]
+    [
+        x * radial + p1 * xy2 + p2 * (r2 + 2.0 * x * x),
+        y * radial + p1 * (r2 + 2.0 * y * y) + p2 * xy2,
+    ]
 }
 
 /// Distortion as defined in [`kinematics::Lens`].
 #[inline(always)]
-fn rational_brown_conrady([k1, k2, p1, p2, k3, k4, k5, k6]: [f32; 8], x: f32, y: f32, r2: f32) -> [f32; 2] {
+fn rational_brown_conrady(
+    [k1, k2, p1, p2, k3, k4, k5, k6]: [f32; 8],
+    x: f32,
+    y: f32,
+    r2: f32,
+) -> [f32; 2] {
     let radial = (1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1.0 + r2 * (k4 + r2 * (k5 + r2 * k6)));
     let xy2 = 2.0 * x * y;
-    [x * radial + p1 * xy2 + p2 * (r2 + 2.0 * x * x), y * radial + p1 * (r2 + 2.0 * y * y) + p2 * xy2]
+    [
+        x * radial + p1 * xy2 + p2 * (r2 + 2.0 * x * x),
+        y * radial + p1 * (r2 + 2.0 * y * y) + p2 * xy2,
+    ]
 }
 
 /// Distortion as defined in [`kinematics::Lens`].
@@ -317,11 +405,18 @@ fn kannala_brandt([k1, k2, k3, k4]: [f32; 4], x: f32, y: f32, r2: f32) -> [f32; 
     let angle = radius.atan();
     let a2 = angle * angle;
     let distorted = angle * (1.0 + a2 * (k1 + a2 * (k2 + a2 * (k3 + a2 * k4))));
-    let scale = if radius > 0.0 { distorted / radius } else { 1.0 };
+    let scale = if radius > 0.0 {
+        distorted / radius
+    } else {
+        1.0
+    };
     [x * scale, y * scale]
 }
 
-#[expect(clippy::cast_possible_truncation, reason = "f32 is accurate to 1e-4 pixels")]
+#[expect(
+    clippy::cast_possible_truncation,
+    reason = "f32 is accurate to 1e-4 pixels"
+)]
 fn narrow(number: f64) -> f32 {
     number as f32
 }
@@ -349,40 +444,68 @@ mod tests {
             camera: "wrist".into(),
             stamp: Stamp(7),
             size_px,
-            format: PixelFormat::DepthU16 { meters_per_count: METERS_PER_COUNT },
-            data: counts.iter().flat_map(|count| count.to_le_bytes()).collect(),
+            format: PixelFormat::DepthU16 {
+                meters_per_count: METERS_PER_COUNT,
+            },
+            data: counts
+                .iter()
+                .flat_map(|count| count.to_le_bytes())
+                .collect(),
             exposure_secs: None,
             n_skipped: 0,
         }
     }
 
     fn counts(image: &Image) -> Vec<u16> {
-        image.data.as_chunks::<2>().0.iter().map(|&bytes| u16::from_le_bytes(bytes)).collect()
+        image
+            .data
+            .as_chunks::<2>()
+            .0
+            .iter()
+            .map(|&bytes| u16::from_le_bytes(bytes))
+            .collect()
     }
 
     /// A slanted wall with a box in front of it, and holes.
     fn scene([width, height]: [u32; 2]) -> Vec<u16> {
         let count = |column: u32, row: u32| match (column * 7 + row * 13) % 41 {
             0 => 0,
-            _ if column > width / 3 && column < width / 2 && row > height / 4 => 600 + (column % 50),
+            _ if column > width / 3 && column < width / 2 && row > height / 4 => {
+                600 + (column % 50)
+            }
             _ => 900 + 400 * column / width + 300 * row / height,
         };
         let pixels = (0..height).flat_map(|row| (0..width).map(move |column| (column, row)));
-        pixels.map(|(column, row)| u16::try_from(count(column, row)).expect("below two meters")).collect()
+        pixels
+            .map(|(column, row)| u16::try_from(count(column, row)).expect("below two meters"))
+            .collect()
     }
 
     /// CPU twin: the same squares in f64 with the lenses of `kinematics`.
-    fn twin(depth: &Intrinsics, color: &Intrinsics, color_from_depth: &Transform, counts: &[u16]) -> Vec<u16> {
+    fn twin(
+        depth: &Intrinsics,
+        color: &Intrinsics,
+        color_from_depth: &Transform,
+        counts: &[u16],
+    ) -> Vec<u16> {
         let [width, height] = color.size_px.map(i64::from);
         let mut aligned = vec![0; color.size_px.map(|side| side as usize).iter().product()];
-        for (ix, &count) in counts.iter().enumerate().filter(|(_, count)| **count > 0 && **count < u16::MAX) {
+        for (ix, &count) in counts
+            .iter()
+            .enumerate()
+            .filter(|(_, count)| **count > 0 && **count < u16::MAX)
+        {
             let column = (ix % depth.size_px[0] as usize) as f64;
             let row = (ix / depth.size_px[0] as usize) as f64;
             let visible = |corner: [f64; 2]| {
                 let point = depth.unproject(corner)? * (f64::from(count) * METERS_PER_COUNT);
-                let pixel =
-                    color.project(&(color_from_depth.rotation * point + color_from_depth.translation.vector))?;
-                #[expect(clippy::cast_possible_truncation, reason = "the cast saturates as intended")]
+                let pixel = color.project(
+                    &(color_from_depth.rotation * point + color_from_depth.translation.vector),
+                )?;
+                #[expect(
+                    clippy::cast_possible_truncation,
+                    reason = "the cast saturates as intended"
+                )]
                 let cell = |position: f64| position.floor() as i64;
                 Some(pixel.map(cell))
             };
@@ -393,15 +516,21 @@ mod tests {
             };
             for y in top.max(0)..=bottom.min(height - 1) {
                 for x in left.max(0)..=right.min(width - 1) {
-                    let nearest: &mut u16 = &mut aligned[usize::try_from(y * width + x).expect("inside the image")];
-                    *nearest = if *nearest == 0 { count } else { count.min(*nearest) };
+                    let nearest: &mut u16 =
+                        &mut aligned[usize::try_from(y * width + x).expect("inside the image")];
+                    *nearest = if *nearest == 0 {
+                        count
+                    } else {
+                        count.min(*nearest)
+                    };
                 }
             }
         }
         aligned
     }
 
-    /// As on a D435: the color camera is 15 mm to the side of the depth camera and slightly rotated.
+    /// As on a D435: the color camera is 15 mm to the side of the depth camera and slightly
+    /// rotated.
     fn color_from_depth_like_d435() -> Transform {
         Transform::from_parts(
             Translation3::new(0.0148, 0.0002, 0.0003),
@@ -422,14 +551,28 @@ mod tests {
         let scene = scene(size_px);
         let fisheye = Lens::KannalaBrandt([-0.01, 0.02, -0.015, 0.003]);
         let d455 = Lens::BrownConrady([-0.0555, 0.0657, -0.0006, 0.0004, -0.0213]);
-        let rational = Lens::RationalBrownConrady([0.4, -0.1, 0.001, -0.0005, 0.01, 0.7, -0.02, 0.03]);
-        let lenses =
-            [(Lens::Pinhole, Lens::Pinhole), (Lens::Pinhole, d455), (d455, fisheye), (Lens::Pinhole, rational)];
+        let rational =
+            Lens::RationalBrownConrady([0.4, -0.1, 0.001, -0.0005, 0.01, 0.7, -0.02, 0.03]);
+        let lenses = [
+            (Lens::Pinhole, Lens::Pinhole),
+            (Lens::Pinhole, d455),
+            (d455, fisheye),
+            (Lens::Pinhole, rational),
+        ];
         for (depth_lens, color_lens) in lenses {
-            // Squares are at most 2, 4, 7 and 2 columns wide. In the last case, several squares share a column.
-            let cameras = [([320, 240], 300.0), ([640, 360], 455.0), ([1280, 720], 1000.0), ([160, 120], 140.0)];
+            // Squares are at most 2, 4, 7 and 2 columns wide. In the last case, several squares
+            // share a column.
+            let cameras = [
+                ([320, 240], 300.0),
+                ([640, 360], 455.0),
+                ([1280, 720], 1000.0),
+                ([160, 120], 140.0),
+            ];
             for (color_px, focal_px) in cameras {
-                let (depth, color) = (camera(size_px, 190.0, depth_lens), camera(color_px, focal_px, color_lens));
+                let (depth, color) = (
+                    camera(size_px, 190.0, depth_lens),
+                    camera(color_px, focal_px, color_lens),
+                );
                 let alignment = DepthAlignment::new(&depth, &color, &color_from_depth_like_d435());
                 let got = counts(&alignment.align(&image(size_px, &scene)).expect("depth"));
                 let expected = twin(&depth, &color, &color_from_depth_like_d435(), &scene);
@@ -440,8 +583,10 @@ mod tests {
                     "the scene is not visible"
                 );
                 // The comparison detects an offset of the camera by one centimeter.
-                let shifted =
-                    Transform::from_parts(Translation3::new(0.025, 0.0, 0.0), color_from_depth_like_d435().rotation);
+                let shifted = Transform::from_parts(
+                    Translation3::new(0.025, 0.0, 0.0),
+                    color_from_depth_like_d435().rotation,
+                );
                 assert!(equal_frac(&got, &twin(&depth, &color, &shifted, &scene)) < EQUAL_FRAC);
             }
         }
@@ -455,7 +600,11 @@ mod tests {
             let shifted = Transform::translation(0.0148, 0.0, 0.0);
             let scene = scene(depth.size_px);
             let alignment = DepthAlignment::new(&depth, &color, &shifted);
-            let got = counts(&alignment.align(&image(depth.size_px, &scene)).expect("depth"));
+            let got = counts(
+                &alignment
+                    .align(&image(depth.size_px, &scene))
+                    .expect("depth"),
+            );
             let expected = twin(&depth, &color, &shifted, &scene);
             // So far from the center, f32 is accurate to a few thousandths of a pixel.
             let equal = equal_frac(&got, &expected);
@@ -469,43 +618,95 @@ mod tests {
 
     #[test]
     fn disparity_is_baseline_over_depth_with_occlusion() {
-        // 400 px * 51.25 mm / 1 m is 20.5 px to the right. No corner lies on the edge of a pixel column.
-        let camera =
-            Intrinsics { focal_px: [400.0; 2], principal_px: [32.0, 16.25], ..camera([64, 32], 1.0, Lens::Pinhole) };
-        let color = Intrinsics { principal_px: [32.0, 16.75], ..camera.clone() };
+        // 400 px * 51.25 mm / 1 m is 20.5 px to the right. No corner lies on the edge of a pixel
+        // column.
+        let camera = Intrinsics {
+            focal_px: [400.0; 2],
+            principal_px: [32.0, 16.25],
+            ..camera([64, 32], 1.0, Lens::Pinhole)
+        };
+        let color = Intrinsics {
+            principal_px: [32.0, 16.75],
+            ..camera.clone()
+        };
         let shifted = Transform::translation(0.05125, 0.0, 0.0);
         let alignment = DepthAlignment::new(&camera, &color, &shifted);
-        let wall = alignment.align(&image([64, 32], &[1000; 64 * 32])).expect("depth");
+        let wall = alignment
+            .align(&image([64, 32], &[1000; 64 * 32]))
+            .expect("depth");
         for (ix, count) in counts(&wall).into_iter().enumerate() {
-            assert_eq!(count, if ix % 64 < 20 { 0 } else { 1000 }, "column {} row {}", ix % 64, ix / 64);
+            assert_eq!(
+                count,
+                if ix % 64 < 20 { 0 } else { 1000 },
+                "column {} row {}",
+                ix % 64,
+                ix / 64
+            );
         }
         // At 0.5 m the disparity is 41 px: columns 10 to 13 map to 51 to 54 and touch at most 55.
         let mut with_box = [1000; 64 * 32];
-        (0..64 * 32).filter(|ix| (10..14).contains(&(ix % 64))).for_each(|ix| with_box[ix] = 500);
+        (0..64 * 32)
+            .filter(|ix| (10..14).contains(&(ix % 64)))
+            .for_each(|ix| with_box[ix] = 500);
         let aligned = counts(&alignment.align(&image([64, 32], &with_box)).expect("depth"));
         for row in aligned.chunks(64) {
             assert!(row[51..54].iter().all(|count| *count == 500), "{row:?}");
-            assert!(row[56..].iter().chain(&row[20..30]).all(|count| *count == 1000), "{row:?}");
+            assert!(
+                row[56..]
+                    .iter()
+                    .chain(&row[20..30])
+                    .all(|count| *count == 1000),
+                "{row:?}"
+            );
         }
     }
 
     #[test]
     fn invalid_and_behind_camera_depth_is_dropped() {
-        let camera = camera([64, 48], 60.0, Lens::BrownConrady([0.1, 0.0, 0.0, 0.0, 0.0]));
-        // The color camera is 1 mm in front of the depth camera, so a count of 1 lies in its center.
+        let camera = camera(
+            [64, 48],
+            60.0,
+            Lens::BrownConrady([0.1, 0.0, 0.0, 0.0, 0.0]),
+        );
+        // The color camera is 1 mm in front of the depth camera, so a count of 1 lies in its
+        // center.
         for z in [-0.001, -0.000_999_99, -1.0, f64::NAN] {
-            let alignment = DepthAlignment::new(&camera, &camera, &Transform::translation(0.0, 0.0, z));
+            let alignment =
+                DepthAlignment::new(&camera, &camera, &Transform::translation(0.0, 0.0, z));
             for count in [0, 1, 2, u16::MAX] {
-                let aligned = alignment.align(&image([64, 48], &[count; 64 * 48])).expect("depth");
+                let aligned = alignment
+                    .align(&image([64, 48], &[count; 64 * 48]))
+                    .expect("depth");
                 let visible = counts(&aligned);
-                assert!(visible.iter().all(|visible| *visible == 0 || *visible == count));
-                assert!(![0, u16::MAX].contains(&count) || visible.iter().all(|visible| *visible == 0));
+                assert!(
+                    visible
+                        .iter()
+                        .all(|visible| *visible == 0 || *visible == count)
+                );
+                assert!(
+                    ![0, u16::MAX].contains(&count) || visible.iter().all(|visible| *visible == 0)
+                );
             }
         }
         let alignment = DepthAlignment::new(&camera, &camera, &Transform::identity());
-        assert!(matches!(alignment.align(&image([64, 47], &[0; 64 * 47])), Err(Error::ImageSize { .. })));
-        assert!(matches!(alignment.align(&image([64, 48], &[0; 64 * 47])), Err(Error::ImageLength { .. })));
-        let color = Image { format: PixelFormat::Gray8, ..image([64, 48], &[0; 32 * 48]) };
-        assert!(matches!(alignment.align(&color), Err(Error::WrongKind { expected: "depth", .. })));
+        assert!(matches!(
+            alignment.align(&image([64, 47], &[0; 64 * 47])),
+            Err(Error::ImageSize { .. })
+        ));
+        assert!(matches!(
+            alignment.align(&image([64, 48], &[0; 64 * 47])),
+            Err(Error::ImageLength { .. })
+        ));
+        let color = Image {
+            format: PixelFormat::Gray8,
+            ..image([64, 48], &[0; 32 * 48])
+        };
+        assert!(matches!(
+            alignment.align(&color),
+            Err(Error::WrongKind {
+                expected: "depth",
+                ..
+            })
+        ));
     }
 }

@@ -1,9 +1,10 @@
-//! The thread that moves an arm. It prepares the motors, enables them, sends setpoints, and stops permanently on any
-//! fault.
+//! The thread that moves an arm. It prepares the motors, enables them, sends setpoints, and stops
+//! permanently on any fault.
 //!
-//! It stops if a motor is silent, reports that it stopped or does not follow its commands, if a bus fails, or if this
-//! computer stalls for so long that the watchdogs of the motors have expired or are about to. After that, it discards
-//! earlier setpoints and sends no new ones until it receives [`Request::Recover`].
+//! It stops if a motor is silent, reports that it stopped or does not follow its commands, if a bus
+//! fails, or if this computer stalls for so long that the watchdogs of the motors have expired or
+//! are about to. After that, it discards earlier setpoints and sends no new ones until it receives
+//! [`Request::Recover`].
 //!
 //! It sends the fail-safe command before it ends, even if it panics.
 
@@ -27,22 +28,23 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender};
 use std::time::Duration;
 
-/// Fraction of the watchdog timeout after which this thread stops the arm. It stops before the motors do, so that no
-/// motor is commanded while others have already stopped.
+/// Fraction of the watchdog timeout after which this thread stops the arm. It stops before the
+/// motors do, so that no motor is commanded while others have already stopped.
 const SILENCE_FRAC: f64 = 0.8;
-/// A motor counts as silent only after this many cycles. If this thread was late, the answer of the motor may still
-/// arrive.
+/// A motor counts as silent only after this many cycles. If this thread was late, the answer of the
+/// motor may still arrive.
 const MIN_MISSED_CYCLES: u64 = 3;
 /// Maximum time for the motors to report their positions, and to report that they are enabled.
 const STARTUP_TIMEOUT: Duration = Duration::from_secs(2);
 /// Time in which an interface sends half of its queue, which usually holds ten frames.
 const MAX_QUEUED: Duration = Duration::from_micros(800);
-/// Maximum wait for space in the queue when sending a fail-safe command. If the queue stays full, nobody is
-/// receiving.
+/// Maximum wait for space in the queue when sending a fail-safe command. If the queue stays full,
+/// nobody is receiving.
 const MAX_FAIL_SAFE_WAIT: Duration = Duration::from_millis(5);
 /// Interval at which an idle thread checks for requests.
 const POLL: Duration = Duration::from_millis(20);
-/// Additional time, beyond the time that its limits require, in which an arm must come to rest on shutdown.
+/// Additional time, beyond the time that its limits require, in which an arm must come to rest on
+/// shutdown.
 const STOP_MARGIN: Duration = Duration::from_secs(1);
 
 type Reply<T> = SyncSender<Result<T, Error>>;
@@ -61,12 +63,22 @@ pub(super) enum Request {
 /// State of the arm.
 #[derive(Debug)]
 enum ArmState {
-    /// No setpoints are sent. The fail-safe command is resent as long as some motors may not have received it.
-    Stopped { since: Stamp, reason: String, pending_fail_safe: Option<OnLoss> },
+    /// No setpoints are sent. The fail-safe command is resent as long as some motors may not have
+    /// received it.
+    Stopped {
+        since: Stamp,
+        reason: String,
+        pending_fail_safe: Option<OnLoss>,
+    },
     /// All motors are prepared and disabled, and are polled for their positions.
     Measuring { since: Stamp, reply: Reply<()> },
     /// The motors are commanded to hold their positions, and are being enabled.
-    Enabling { since: Stamp, is_ordered: bool, generator: Box<TrajectoryGenerator>, reply: Reply<()> },
+    Enabling {
+        since: Stamp,
+        is_ordered: bool,
+        generator: Box<TrajectoryGenerator>,
+        reply: Reply<()>,
+    },
     /// The motors follow the trajectory.
     Moving { generator: Box<TrajectoryGenerator> },
 }
@@ -133,7 +145,8 @@ impl ArmLoop {
         })
     }
 
-    /// Runs until the owner drops the arm, or [`apply_fail_safe`](crate::motion::apply_fail_safe) is called.
+    /// Runs until the owner drops the arm, or [`apply_fail_safe`](crate::motion::apply_fail_safe)
+    /// is called.
     pub(super) fn run(mut self) {
         let mut next_cycle = clock::now();
         let mut shutdown_deadline = None;
@@ -142,7 +155,8 @@ impl ArmLoop {
                 break;
             }
             if self.is_shutting_down.load(Ordering::Relaxed) {
-                let shutdown_by = *shutdown_deadline.get_or_insert_with(|| clock::now() + self.max_stop_duration());
+                let shutdown_by = *shutdown_deadline
+                    .get_or_insert_with(|| clock::now() + self.max_stop_duration());
                 if self.is_at_rest() || clock::now() > shutdown_by {
                     break;
                 }
@@ -173,9 +187,12 @@ impl ArmLoop {
         // The requester may have gone away.
         match (request, &mut self.arm_state) {
             (Request::SetTarget(target, answer), ArmState::Moving { generator }) => {
-                let accepted = generator.set_target(&target).map_err(|reason| Error::Motion { reason });
+                let accepted = generator
+                    .set_target(&target)
+                    .map_err(|reason| Error::Motion { reason });
                 if accepted.is_ok() {
-                    // A requester may start waiting for the end of the motion as soon as its target is accepted.
+                    // A requester may start waiting for the end of the motion as soon as its target
+                    // is accepted.
                     *self.motion.lock() = Motion::Moving;
                 }
                 let _ = answer.try_send(accepted);
@@ -184,14 +201,19 @@ impl ArmLoop {
                 generator.stop();
                 let _ = answer.try_send(Ok(()));
             }
-            (Request::SetTarget(_, answer), arm_state) => drop(answer.try_send(Err(arm_state.refusal()))),
+            (Request::SetTarget(_, answer), arm_state) => {
+                drop(answer.try_send(Err(arm_state.refusal())))
+            }
             // The arm is not moving, so it is already at rest.
             (Request::Stop(answer), _) => drop(answer.try_send(Ok(()))),
             (Request::Recover(answer), ArmState::Stopped { .. }) => match self.prepare() {
                 Ok(prepared) => {
                     self.prepared = Some(prepared);
                     self.last_cycle = clock::now_including_suspend();
-                    self.arm_state = ArmState::Measuring { since: clock::now(), reply: answer };
+                    self.arm_state = ArmState::Measuring {
+                        since: clock::now(),
+                        reply: answer,
+                    };
                 }
                 Err(error) => {
                     self.prepared = None;
@@ -207,9 +229,15 @@ impl ArmLoop {
     /// Reopens all buses and prepares every motor without enabling it.
     fn prepare(&self) -> Result<PreparedMotors, Error> {
         let arm = &self.config.arm;
-        let buses = arm.buses.iter().map(Bus::open).collect::<Result<Vec<_>, _>>()?;
-        let movable_motors =
-            arm.motors.iter().map(|motor| MovableMotor::prepare(&buses[motor.bus_ix], motor, &self.plan));
+        let buses = arm
+            .buses
+            .iter()
+            .map(Bus::open)
+            .collect::<Result<Vec<_>, _>>()?;
+        let movable_motors = arm
+            .motors
+            .iter()
+            .map(|motor| MovableMotor::prepare(&buses[motor.bus_ix], motor, &self.plan));
         let movable_motors = movable_motors.collect::<Result<Vec<_>, _>>()?;
         let n = movable_motors.len();
         Ok(PreparedMotors {
@@ -228,7 +256,9 @@ impl ArmLoop {
         let now_including_suspend = clock::now_including_suspend();
         let stall = now_including_suspend.duration_since(self.last_cycle);
         self.last_cycle = now_including_suspend;
-        let Some(prepared) = &mut self.prepared else { return Ok(()) };
+        let Some(prepared) = &mut self.prepared else {
+            return Ok(());
+        };
         prepared.cycle_ix += 1;
         if stall > 2 * self.plan.period {
             self.n_late += 1;
@@ -236,7 +266,12 @@ impl ArmLoop {
         }
         let max_silence_allowed = self.plan.timeout.mul_f64(SILENCE_FRAC);
         let is_overdue = stall > max_silence_allowed;
-        let stall_error = || motion(format!("this computer stalled for {:.0} ms", 1e3 * stall.as_secs_f64()));
+        let stall_error = || {
+            motion(format!(
+                "this computer stalled for {:.0} ms",
+                1e3 * stall.as_secs_f64()
+            ))
+        };
         match &mut self.arm_state {
             ArmState::Stopped { since, .. } => {
                 // Polls may also reset a watchdog, so they wait until it has expired.
@@ -250,15 +285,24 @@ impl ArmLoop {
             ArmState::Measuring { since, .. } => {
                 if let Some(positions) = prepared.positions(*since) {
                     let limits = prepared.limits(&self.config.motion.limits);
-                    let generator = TrajectoryGenerator::new(&limits, &positions, self.plan.period).map_err(motion)?;
-                    prepared.movable_motors.iter_mut().for_each(MovableMotor::clear_health);
+                    let generator = TrajectoryGenerator::new(&limits, &positions, self.plan.period)
+                        .map_err(motion)?;
+                    prepared
+                        .movable_motors
+                        .iter_mut()
+                        .for_each(MovableMotor::clear_health);
                     let ArmState::Measuring { reply, .. } =
                         std::mem::replace(&mut self.arm_state, ArmState::stopped(now, None))
                     else {
                         return Ok(());
                     };
                     let generator = Box::new(generator);
-                    self.arm_state = ArmState::Enabling { since: now, is_ordered: false, generator, reply };
+                    self.arm_state = ArmState::Enabling {
+                        since: now,
+                        is_ordered: false,
+                        generator,
+                        reply,
+                    };
                     return Ok(());
                 }
                 if now.duration_since(*since) > STARTUP_TIMEOUT {
@@ -267,7 +311,12 @@ impl ArmLoop {
                 prepared.poll_disabled()?;
                 return prepared.send_sync(self.plan.host);
             }
-            ArmState::Enabling { since, is_ordered, generator, .. } => {
+            ArmState::Enabling {
+                since,
+                is_ordered,
+                generator,
+                ..
+            } => {
                 if is_overdue {
                     return Err(stall_error());
                 }
@@ -292,14 +341,19 @@ impl ArmLoop {
                 prepared.check(now, max_silence_allowed)?;
                 prepared.command(generator)?;
                 prepared.send_sync(self.plan.host)?;
-                let motion_now = if generator.is_at_rest() { Motion::Holding } else { Motion::Moving };
+                let motion_now = if generator.is_at_rest() {
+                    Motion::Holding
+                } else {
+                    Motion::Moving
+                };
                 *self.motion.lock() = motion_now;
                 return Ok(());
             }
         }
         // All motors are enabled.
-        if let ArmState::Enabling { generator, reply, .. } =
-            std::mem::replace(&mut self.arm_state, ArmState::stopped(now, None))
+        if let ArmState::Enabling {
+            generator, reply, ..
+        } = std::mem::replace(&mut self.arm_state, ArmState::stopped(now, None))
         {
             self.arm_state = ArmState::Moving { generator };
             *self.motion.lock() = Motion::Holding;
@@ -323,8 +377,8 @@ impl ArmLoop {
                     Ok(Some(arrived)) => arrived,
                     Ok(None) => break,
                     Err(_) if is_stopped => {
-                        // The failure has already been reported. A bus that stays down must not keep this thread
-                        // busy.
+                        // The failure has already been reported. A bus that stays down must not
+                        // keep this thread busy.
                         std::thread::sleep(timeout);
                         break;
                     }
@@ -340,7 +394,10 @@ impl ArmLoop {
                     (_, BusEvent::Errors(new_errors)) => {
                         prepared.errors.add(&new_errors);
                         let interface = &prepared.buses[bus_ix].config().interface;
-                        log::debug!("{interface}: errors on the wire so far: {:?}", prepared.errors);
+                        log::debug!(
+                            "{interface}: errors on the wire so far: {:?}",
+                            prepared.errors
+                        );
                         if new_errors.n_bus_off > 0 && !is_stopped {
                             return Err(motion(format!("{interface} went bus-off")));
                         }
@@ -351,8 +408,8 @@ impl ArmLoop {
         Ok(())
     }
 
-    /// Stops the arm: sends each motor the fail-safe command, which has the same effect as the expiry of its watchdog,
-    /// and logs the reason.
+    /// Stops the arm: sends each motor the fail-safe command, which has the same effect as the
+    /// expiry of its watchdog, and logs the reason.
     fn abort(&mut self, reason: &str) {
         if let ArmState::Stopped { .. } = self.arm_state {
             return;
@@ -364,16 +421,27 @@ impl ArmLoop {
         self.stopped(reason, Some(fail_safe));
     }
 
-    /// The fail-safe command of all motors: `on_loss`, or release if not all motors were enabled yet.
+    /// The fail-safe command of all motors: `on_loss`, or release if not all motors were enabled
+    /// yet.
     fn fail_safe_command(&self) -> OnLoss {
-        if matches!(self.arm_state, ArmState::Moving { .. }) { self.plan.on_loss } else { OnLoss::Release }
+        if matches!(self.arm_state, ArmState::Moving { .. }) {
+            self.plan.on_loss
+        } else {
+            OnLoss::Release
+        }
     }
 
     fn stopped(&mut self, reason: &str, pending_fail_safe: Option<OnLoss>) {
         log::warn!("the arm stopped: {reason}");
-        let stopped = ArmState::Stopped { since: clock::now(), reason: reason.to_owned(), pending_fail_safe };
+        let stopped = ArmState::Stopped {
+            since: clock::now(),
+            reason: reason.to_owned(),
+            pending_fail_safe,
+        };
         let before = std::mem::replace(&mut self.arm_state, stopped);
-        *self.motion.lock() = Motion::Stopped { reason: reason.to_owned() };
+        *self.motion.lock() = Motion::Stopped {
+            reason: reason.to_owned(),
+        };
         if let ArmState::Measuring { reply, .. } | ArmState::Enabling { reply, .. } = before {
             let _ = reply.try_send(Err(motion(reason.to_owned())));
         }
@@ -392,8 +460,16 @@ impl ArmLoop {
 
     /// Maximum time for the arm to come to rest.
     fn max_stop_duration(&self) -> Duration {
-        let secs = |joint: &MotionLimits| joint.velocity / joint.acceleration + 2.0 * joint.acceleration / joint.jerk;
-        let max_secs = self.config.motion.limits.iter().map(secs).fold(0.0, f64::max);
+        let secs = |joint: &MotionLimits| {
+            joint.velocity / joint.acceleration + 2.0 * joint.acceleration / joint.jerk
+        };
+        let max_secs = self
+            .config
+            .motion
+            .limits
+            .iter()
+            .map(secs)
+            .fold(0.0, f64::max);
         Duration::try_from_secs_f64(max_secs).unwrap_or(Duration::ZERO) + STOP_MARGIN
     }
 
@@ -416,9 +492,14 @@ impl ArmLoop {
         self.finish_fail_safe();
     }
 
-    /// Resends the fail-safe command to motors without a watchdog until each has answered, or a time limit expires.
+    /// Resends the fail-safe command to motors without a watchdog until each has answered, or a
+    /// time limit expires.
     fn finish_fail_safe(&mut self) {
-        while let ArmState::Stopped { pending_fail_safe: Some(_), .. } = self.arm_state {
+        while let ArmState::Stopped {
+            pending_fail_safe: Some(_),
+            ..
+        } = self.arm_state
+        {
             std::thread::sleep(self.plan.period);
             // A bus failure has already been reported.
             let _ = self.listen(Duration::ZERO);
@@ -426,23 +507,37 @@ impl ArmLoop {
         }
     }
 
-    /// Resends the fail-safe command once per cycle to motors without a watchdog, because a motor that misses it would
-    /// execute its last command forever. Continues until each of these motors has sent a frame after the watchdog
-    /// timeout, when the watchdogs of the other motors have expired, but for at most [`STARTUP_TIMEOUT`] after that
-    /// timeout.
+    /// Resends the fail-safe command once per cycle to motors without a watchdog, because a motor
+    /// that misses it would execute its last command forever. Continues until each of these motors
+    /// has sent a frame after the watchdog timeout, when the watchdogs of the other motors have
+    /// expired, but for at most [`STARTUP_TIMEOUT`] after that timeout.
     fn resend_fail_safe(&mut self, now: Stamp) {
-        let ArmState::Stopped { since, pending_fail_safe, .. } = &mut self.arm_state else { return };
+        let ArmState::Stopped {
+            since,
+            pending_fail_safe,
+            ..
+        } = &mut self.arm_state
+        else {
+            return;
+        };
         let (Some(prepared), Some(fail_safe)) = (&self.prepared, *pending_fail_safe) else {
             *pending_fail_safe = None;
             return;
         };
-        let has_no_watchdog =
-            |movable_motor: &MovableMotor| !movable_motor.motor().protocol().watchdog(&self.plan).is_available();
+        let has_no_watchdog = |movable_motor: &MovableMotor| {
+            !movable_motor
+                .motor()
+                .protocol()
+                .watchdog(&self.plan)
+                .is_available()
+        };
         prepared.shutdown(fail_safe, has_no_watchdog);
         let watchdog_deadline = *since + self.plan.timeout;
         let all = prepared.movable_motors.iter().zip(&prepared.last_heard);
         let silent_motors: Vec<_> = all
-            .filter(|(movable_motor, last_heard)| has_no_watchdog(movable_motor) && last_heard.0 < watchdog_deadline)
+            .filter(|(movable_motor, last_heard)| {
+                has_no_watchdog(movable_motor) && last_heard.0 < watchdog_deadline
+            })
             .collect();
         if now < watchdog_deadline + STARTUP_TIMEOUT && !silent_motors.is_empty() {
             return;
@@ -470,13 +565,19 @@ impl Drop for ArmLoop {
 
 impl ArmState {
     fn stopped(since: Stamp, pending_fail_safe: Option<OnLoss>) -> Self {
-        Self::Stopped { since, reason: String::new(), pending_fail_safe }
+        Self::Stopped {
+            since,
+            reason: String::new(),
+            pending_fail_safe,
+        }
     }
 
     /// The reason why a target is refused.
     fn refusal(&self) -> Error {
         motion(match self {
-            Self::Stopped { reason, .. } => format!("the arm stopped and has not been recovered: {reason}"),
+            Self::Stopped { reason, .. } => {
+                format!("the arm stopped and has not been recovered: {reason}")
+            }
             Self::Measuring { .. } | Self::Enabling { .. } => "the arm is being enabled".to_owned(),
             Self::Moving { .. } => "the arm is moving".to_owned(),
         })
@@ -485,7 +586,12 @@ impl ArmState {
 
 impl PreparedMotors {
     /// Updates the state of the motor that sent a frame, and returns its reading, if any.
-    fn process_frame(&mut self, bus_ix: usize, stamp: Stamp, frame: &Frame) -> Option<JointReading> {
+    fn process_frame(
+        &mut self,
+        bus_ix: usize,
+        stamp: Stamp,
+        frame: &Frame,
+    ) -> Option<JointReading> {
         for (joint_ix, movable_motor) in self.movable_motors.iter_mut().enumerate() {
             if movable_motor.config().bus_ix != bus_ix {
                 continue;
@@ -493,7 +599,11 @@ impl PreparedMotors {
             if let Some(reading) = movable_motor.process_frame(frame) {
                 self.last_heard[joint_ix] = (stamp, self.cycle_ix);
                 self.latest[joint_ix] = Some(reading);
-                return Some(JointReading { joint_ix, stamp, reading });
+                return Some(JointReading {
+                    joint_ix,
+                    stamp,
+                    reading,
+                });
             }
         }
         None
@@ -502,13 +612,19 @@ impl PreparedMotors {
     /// Positions of all joints, once every motor has reported since `since`.
     fn positions(&self, since: Stamp) -> Option<Vec<f64>> {
         let of = |(reading, last_heard): (&Option<Reading>, &(Stamp, u64))| {
-            reading.filter(|_| last_heard.0 >= since).map(|reading| reading.position_rad)
+            reading
+                .filter(|_| last_heard.0 >= since)
+                .map(|reading| reading.position_rad)
         };
         self.latest.iter().zip(&self.last_heard).map(of).collect()
     }
 
     fn limits(&self, joints: &[MotionLimits]) -> Vec<MotionLimits> {
-        self.movable_motors.iter().zip(joints).map(|(movable_motor, joint)| movable_motor.limits(joint)).collect()
+        self.movable_motors
+            .iter()
+            .zip(joints)
+            .map(|(movable_motor, joint)| movable_motor.limits(joint))
+            .collect()
     }
 
     fn bus_of(&self, movable_motor: &MovableMotor) -> &Bus {
@@ -517,7 +633,11 @@ impl PreparedMotors {
 
     fn fault(&self, movable_motor: &MovableMotor, reason: impl Into<String>) -> Error {
         let interface = self.bus_of(movable_motor).config().interface.clone();
-        Error::Motor { joint: movable_motor.config().joint.clone(), interface, reason: reason.into() }
+        Error::Motor {
+            joint: movable_motor.config().joint.clone(),
+            interface,
+            reason: reason.into(),
+        }
     }
 
     /// Polls the positions of disabled motors without enabling them.
@@ -525,8 +645,8 @@ impl PreparedMotors {
         self.poll(MovableMotor::poll_frame)
     }
 
-    /// Polls the positions of motors that are executing `on_loss`, as a read-only arm does. Sends no SYNC, because on a
-    /// SYNC, drives would accept the last target that they received.
+    /// Polls the positions of motors that are executing `on_loss`, as a read-only arm does. Sends
+    /// no SYNC, because on a SYNC, drives would accept the last target that they received.
     fn poll_stopped(&self) -> Result<(), Error> {
         self.poll(|movable_motor| movable_motor.motor().protocol().poll_frame())
     }
@@ -534,7 +654,8 @@ impl PreparedMotors {
     fn poll(&self, poll_frame: impl Fn(&MovableMotor) -> Option<Frame>) -> Result<(), Error> {
         for movable_motor in &self.movable_motors {
             if let Some(poll_frame) = poll_frame(movable_motor) {
-                self.bus_of(movable_motor).send_within(&poll_frame, MAX_QUEUED)?;
+                self.bus_of(movable_motor)
+                    .send_within(&poll_frame, MAX_QUEUED)?;
             }
         }
         Ok(())
@@ -547,7 +668,8 @@ impl PreparedMotors {
             let command = movable_motor.command(setpoint.position[ix], setpoint.velocity[ix]);
             let command = command.map_err(|error| self.fault(movable_motor, error.to_string()))?;
             // If the queue is full, the frame is dropped, because the next frame is more recent.
-            self.bus_of(movable_motor).send_within(&command, MAX_QUEUED)?;
+            self.bus_of(movable_motor)
+                .send_within(&command, MAX_QUEUED)?;
         }
         self.sent_rad = setpoint.position;
         Ok(())
@@ -555,7 +677,9 @@ impl PreparedMotors {
 
     fn enable(&self) -> Result<(), Error> {
         for movable_motor in &self.movable_motors {
-            let frames = movable_motor.enable().map_err(|error| self.fault(movable_motor, error.to_string()))?;
+            let frames = movable_motor
+                .enable()
+                .map_err(|error| self.fault(movable_motor, error.to_string()))?;
             for frame in &frames {
                 self.bus_of(movable_motor).send(frame)?;
             }
@@ -566,7 +690,10 @@ impl PreparedMotors {
     /// Sends our heartbeat, and the SYNC at which drives accept their targets.
     fn send_sync(&self, host: canopen::Node) -> Result<(), Error> {
         for bus in self.buses_with_drives() {
-            bus.send_within(&canopen::encode_heartbeat(host, NodeState::Operational), MAX_QUEUED)?;
+            bus.send_within(
+                &canopen::encode_heartbeat(host, NodeState::Operational),
+                MAX_QUEUED,
+            )?;
             bus.send_within(&canopen::encode_sync(), MAX_QUEUED)?;
         }
         Ok(())
@@ -579,17 +706,35 @@ impl PreparedMotors {
                 .filter(|movable_motor| movable_motor.config().bus_ix == bus_ix)
                 .any(|movable_motor| movable_motor.motor().protocol().canopen_node().is_some())
         };
-        self.buses.iter().enumerate().filter(move |(ix, _)| has_drives(*ix)).map(|(_, bus)| bus)
+        self.buses
+            .iter()
+            .enumerate()
+            .filter(move |(ix, _)| has_drives(*ix))
+            .map(|(_, bus)| bus)
     }
 
     fn all_enabled(&self) -> bool {
-        self.movable_motors.iter().all(|movable_motor| movable_motor.health() == Some(&Health::Enabled))
+        self.movable_motors
+            .iter()
+            .all(|movable_motor| movable_motor.health() == Some(&Health::Enabled))
     }
 
     /// Checks that no motor is silent, that all are enabled, and that all follow their commands.
     fn check(&self, now: Stamp, max_silence_allowed: Duration) -> Result<(), Error> {
-        for ((movable_motor, latest), sent_rad) in self.movable_motors.iter().zip(&self.latest).zip(&self.sent_rad) {
-            let Some(Reading { position_rad, effort_nm, .. }) = *latest else { continue };
+        for ((movable_motor, latest), sent_rad) in self
+            .movable_motors
+            .iter()
+            .zip(&self.latest)
+            .zip(&self.sent_rad)
+        {
+            let Some(Reading {
+                position_rad,
+                effort_nm,
+                ..
+            }) = *latest
+            else {
+                continue;
+            };
             let following = &movable_motor.config().following;
             if let Some(violation) = following.violation(*sent_rad, position_rad, effort_nm) {
                 return Err(self.fault(movable_motor, violation));
@@ -598,17 +743,25 @@ impl PreparedMotors {
         for (movable_motor, (stamp, cycle_ix)) in self.movable_motors.iter().zip(&self.last_heard) {
             match movable_motor.health() {
                 Some(Health::Enabled) => {}
-                Some(Health::Fault(reason)) => return Err(self.fault(movable_motor, reason.clone())),
+                Some(Health::Fault(reason)) => {
+                    return Err(self.fault(movable_motor, reason.clone()));
+                }
                 Some(Health::Off) | None => {
-                    return Err(self.fault(movable_motor, "the motor was disabled by something else"));
+                    return Err(
+                        self.fault(movable_motor, "the motor was disabled by something else")
+                    );
                 }
             }
             let silence = now.duration_since(*stamp);
-            if silence > movable_motor.max_silence(max_silence_allowed) && self.cycle_ix - cycle_ix > MIN_MISSED_CYCLES
+            if silence > movable_motor.max_silence(max_silence_allowed)
+                && self.cycle_ix - cycle_ix > MIN_MISSED_CYCLES
             {
                 return Err(self.fault(
                     movable_motor,
-                    format!("no frame from the motor for {:.0} ms", 1e3 * silence.as_secs_f64()),
+                    format!(
+                        "no frame from the motor for {:.0} ms",
+                        1e3 * silence.as_secs_f64()
+                    ),
                 ));
             }
         }
@@ -617,18 +770,27 @@ impl PreparedMotors {
 
     /// Sends the fail-safe command to the selected motors. Errors of the bus are ignored.
     fn shutdown(&self, fail_safe: OnLoss, selects: impl Fn(&MovableMotor) -> bool) {
-        for (movable_motor, sent_rad) in
-            self.movable_motors.iter().zip(&self.sent_rad).filter(|(movable_motor, _)| selects(movable_motor))
+        for (movable_motor, sent_rad) in self
+            .movable_motors
+            .iter()
+            .zip(&self.sent_rad)
+            .filter(|(movable_motor, _)| selects(movable_motor))
         {
             if let Ok(frame) = movable_motor.shutdown(fail_safe, *sent_rad) {
-                let _ = self.bus_of(movable_motor).send_within(&frame, MAX_FAIL_SAFE_WAIT);
+                let _ = self
+                    .bus_of(movable_motor)
+                    .send_within(&frame, MAX_FAIL_SAFE_WAIT);
             }
         }
     }
 
     fn silent_before_start(&self) -> Error {
-        let most_silent =
-            self.last_heard.iter().enumerate().min_by_key(|(_, (stamp, _))| *stamp).map_or(0, |(ix, _)| ix);
+        let most_silent = self
+            .last_heard
+            .iter()
+            .enumerate()
+            .min_by_key(|(_, (stamp, _))| *stamp)
+            .map_or(0, |(ix, _)| ix);
         self.fault(
             &self.movable_motors[most_silent],
             format!("the motor reported no position within {STARTUP_TIMEOUT:?}"),
@@ -636,14 +798,18 @@ impl PreparedMotors {
     }
 
     fn not_enabled(&self) -> Error {
-        let not_enabled_motor =
-            self.movable_motors.iter().find(|movable_motor| movable_motor.health() != Some(&Health::Enabled));
+        let not_enabled_motor = self
+            .movable_motors
+            .iter()
+            .find(|movable_motor| movable_motor.health() != Some(&Health::Enabled));
         match not_enabled_motor {
             Some(movable_motor) => self.fault(
                 movable_motor,
                 match movable_motor.health() {
                     Some(Health::Fault(reason)) => format!("the motor cannot be enabled: {reason}"),
-                    _ => format!("the motor did not report that it is enabled within {STARTUP_TIMEOUT:?}"),
+                    _ => format!(
+                        "the motor did not report that it is enabled within {STARTUP_TIMEOUT:?}"
+                    ),
                 },
             ),
             None => motion("the motors took too long to be enabled".to_owned()),

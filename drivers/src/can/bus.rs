@@ -10,8 +10,9 @@ use kinematics::Stamp;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::io::Errno;
 use socketcan::{
-    CanAnyFrame, CanDataFrame, CanErrorFrame, CanFdFrame, CanFdSocket, CanRemoteFrame, EmbeddedFrame, ExtendedId,
-    Id as SocketId, ShouldRetry, Socket, SocketOptions, StandardId, errors::ControllerProblems,
+    CanAnyFrame, CanDataFrame, CanErrorFrame, CanFdFrame, CanFdSocket, CanRemoteFrame,
+    EmbeddedFrame, ExtendedId, Id as SocketId, ShouldRetry, Socket, SocketOptions, StandardId,
+    errors::ControllerProblems,
 };
 use std::io;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -35,7 +36,8 @@ impl Bus {
     /// Opens an interface and checks that it is set up as in `config`.
     ///
     /// # Errors
-    /// If the interface is not set up as in `config`. The error contains the command that sets it up.
+    /// If the interface is not set up as in `config`. The error contains the command that sets it
+    /// up.
     pub fn open(config: &BusConfig) -> Result<Self, Error> {
         Link::read(&config.interface)?.check(config)?;
         let open = CanFdSocket::open(&config.interface).and_then(|socket| {
@@ -44,8 +46,15 @@ impl Bus {
             socket.set_nonblocking(true)?;
             Ok(socket)
         });
-        let socket = open.map_err(|reason| Error::CanBus { interface: config.interface.clone(), reason })?;
-        Ok(Self { config: config.clone(), socket, busy_nanos: AtomicU64::new(0) })
+        let socket = open.map_err(|reason| Error::CanBus {
+            interface: config.interface.clone(),
+            reason,
+        })?;
+        Ok(Self {
+            config: config.clone(),
+            socket,
+            busy_nanos: AtomicU64::new(0),
+        })
     }
 
     /// The configuration with which the bus was opened.
@@ -58,11 +67,12 @@ impl Bus {
         Duration::from_nanos(self.busy_nanos.load(Ordering::Relaxed))
     }
 
-    /// Sends a frame, and waits briefly while the interface's queue is full. Returns whether the kernel accepted the
-    /// frame.
+    /// Sends a frame, and waits briefly while the interface's queue is full. Returns whether the
+    /// kernel accepted the frame.
     ///
-    /// It returns `false` if the queue stayed full, which happens if no node acknowledges frames. `true` does not mean
-    /// that the frame was sent: the kernel accepts and drops frames while the controller is bus-off.
+    /// It returns `false` if the queue stayed full, which happens if no node acknowledges frames.
+    /// `true` does not mean that the frame was sent: the kernel accepts and drops frames while the
+    /// controller is bus-off.
     pub fn send(&self, frame: &Frame) -> Result<bool, Error> {
         self.send_within(frame, MAX_SENDING)
     }
@@ -91,7 +101,8 @@ impl Bus {
         let id = socket_id(frame.id());
         let invalid = || io::Error::from(io::ErrorKind::InvalidInput);
         if frame.is_remote() {
-            let socket_frame = CanRemoteFrame::new_remote(id, frame.n_bytes()).ok_or_else(invalid)?;
+            let socket_frame =
+                CanRemoteFrame::new_remote(id, frame.n_bytes()).ok_or_else(invalid)?;
             return self.socket.write_frame(&socket_frame);
         }
         if frame.is_fd() {
@@ -99,20 +110,28 @@ impl Bus {
             socket_frame.set_brs(frame.is_switched());
             return self.socket.write_frame(&socket_frame);
         }
-        self.socket.write_frame(&CanDataFrame::new(id, frame.data()).ok_or_else(invalid)?)
+        self.socket
+            .write_frame(&CanDataFrame::new(id, frame.data()).ok_or_else(invalid)?)
     }
 
     /// Waits until one of the buses has received something, or the timeout expires.
     pub fn wait_for_any(buses: &[Self], timeout: Duration) {
-        let mut polled: Vec<_> = buses.iter().map(|bus| PollFd::new(&bus.socket, PollFlags::IN)).collect();
+        let mut polled: Vec<_> = buses
+            .iter()
+            .map(|bus| PollFd::new(&bus.socket, PollFlags::IN))
+            .collect();
         // Errors are reported when the bus is read.
         let _ = poll(&mut polled, Some(&timespec(timeout)));
     }
 
     /// Waits for the next event. Returns `None` if there was none within the timeout.
     pub fn receive(&self, timeout: Duration) -> Result<Option<(Stamp, BusEvent)>, Error> {
-        // The socket's receive timeout has a resolution of a jiffy, up to 10 ms; `ppoll` has a high resolution.
-        match poll(&mut [PollFd::new(&self.socket, PollFlags::IN)], Some(&timespec(timeout))) {
+        // The socket's receive timeout has a resolution of a jiffy, up to 10 ms; `ppoll` has a high
+        // resolution.
+        match poll(
+            &mut [PollFd::new(&self.socket, PollFlags::IN)],
+            Some(&timespec(timeout)),
+        ) {
             Ok(0) | Err(Errno::INTR) => return Ok(None),
             Ok(_) => {}
             Err(error) => return Err(self.bus_error(error.into())),
@@ -123,10 +142,13 @@ impl Bus {
             Err(source) => return Err(self.bus_error(source)),
         };
         let now = clock::now();
-        // The kernel stamps frames with the wall clock. The age of the frame is used to convert the stamp to our clock.
+        // The kernel stamps frames with the wall clock. The age of the frame is used to convert the
+        // stamp to our clock.
         let stamp = at.elapsed().map_or(now, |age| now - age);
         let frame = match frame {
-            CanAnyFrame::Error(error) => return Ok(Some((stamp, BusEvent::Errors(wire_errors(error))))),
+            CanAnyFrame::Error(error) => {
+                return Ok(Some((stamp, BusEvent::Errors(wire_errors(error)))));
+            }
             CanAnyFrame::Normal(frame) => Frame::classic(id_of(&frame), frame.data()),
             CanAnyFrame::Remote(frame) => Frame::remote(id_of(&frame), frame.dlc()),
             CanAnyFrame::Fd(frame) => Frame::fd(id_of(&frame), frame.data(), frame.is_brs()),
@@ -143,7 +165,10 @@ impl Bus {
     }
 
     fn bus_error(&self, reason: io::Error) -> Error {
-        Error::CanBus { interface: self.config.interface.clone(), reason }
+        Error::CanBus {
+            interface: self.config.interface.clone(),
+            reason,
+        }
     }
 }
 
@@ -170,20 +195,28 @@ fn wire_errors(frame: CanErrorFrame) -> WireErrors {
         n_frames: 1,
         n_bus_off: error.is_bus_off().into(),
         n_restarts: error.is_restarted().into(),
-        n_warnings: (has(ControllerProblems::RX_WARNING) || has(ControllerProblems::TX_WARNING)).into(),
-        n_passive: (has(ControllerProblems::RX_PASSIVE) || has(ControllerProblems::TX_PASSIVE)).into(),
+        n_warnings: (has(ControllerProblems::RX_WARNING) || has(ControllerProblems::TX_WARNING))
+            .into(),
+        n_passive: (has(ControllerProblems::RX_PASSIVE) || has(ControllerProblems::TX_PASSIVE))
+            .into(),
         n_unacknowledged: error.is_no_ack().into(),
-        n_overflows: (has(ControllerProblems::RX_OVERFLOW) || has(ControllerProblems::TX_OVERFLOW)).into(),
+        n_overflows: (has(ControllerProblems::RX_OVERFLOW) || has(ControllerProblems::TX_OVERFLOW))
+            .into(),
     }
 }
 
 fn timespec(timeout: Duration) -> Timespec {
-    Timespec { tv_sec: i64::try_from(timeout.as_secs()).unwrap_or(i64::MAX), tv_nsec: timeout.subsec_nanos().into() }
+    Timespec {
+        tv_sec: i64::try_from(timeout.as_secs()).unwrap_or(i64::MAX),
+        tv_nsec: timeout.subsec_nanos().into(),
+    }
 }
 
 fn socket_id(id: Id) -> SocketId {
     match id.is_extended() {
-        true => SocketId::Extended(ExtendedId::new(id.value()).expect("an extended ID has at most 29 bits")),
+        true => SocketId::Extended(
+            ExtendedId::new(id.value()).expect("an extended ID has at most 29 bits"),
+        ),
         false => {
             let value = u16::try_from(id.value()).expect("a standard ID has at most 11 bits");
             SocketId::Standard(StandardId::new(value).expect("a standard ID has at most 11 bits"))

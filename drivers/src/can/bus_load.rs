@@ -4,13 +4,15 @@ use super::config::BusConfig;
 use crate::wire::can::Frame;
 use crate::wire::can::frame::{Stuffing, load_frac};
 
-/// Maximum fraction of the bus for polls, commands and answers. Errors cause retransmissions, and other nodes may
-/// send, too.
+/// Maximum fraction of the bus for polls, commands and answers. Errors cause retransmissions, and
+/// other nodes may send, too.
 const MAX_LOAD_FRAC: f64 = 0.7;
 
-/// Rate of cycles, Hz: the requested rate, or the highest rate that keeps the bus load within its limit.
+/// Rate of cycles, Hz: the requested rate, or the highest rate that keeps the bus load within its
+/// limit.
 ///
-/// `cycle_frames`: all frames of a cycle, sent and received. `unsolicited`: other frames, with their rate in Hz.
+/// `cycle_frames`: all frames of a cycle, sent and received. `unsolicited`: other frames, with
+/// their rate in Hz.
 pub(super) fn max_cycle_rate_hz(
     bus: &BusConfig,
     cycle_frames: &[Frame],
@@ -18,8 +20,16 @@ pub(super) fn max_cycle_rate_hz(
     requested_hz: f64,
 ) -> f64 {
     let bits = |frame: &Frame| frame.bits(Stuffing::Worst);
-    let unsolicited = load_frac(unsolicited.iter().map(|(frame, rate_hz)| (bits(frame), *rate_hz)), bus.rates());
-    let per_cycle = load_frac(cycle_frames.iter().map(|frame| (bits(frame), 1.0)), bus.rates());
+    let unsolicited = load_frac(
+        unsolicited
+            .iter()
+            .map(|(frame, rate_hz)| (bits(frame), *rate_hz)),
+        bus.rates(),
+    );
+    let per_cycle = load_frac(
+        cycle_frames.iter().map(|frame| (bits(frame), 1.0)),
+        bus.rates(),
+    );
     let rate_hz = requested_hz.min(((MAX_LOAD_FRAC - unsolicited) / per_cycle).max(1.0));
     let load_percent = 100.0 * (unsolicited + per_cycle * rate_hz);
     let interface = &bus.interface;
@@ -30,7 +40,9 @@ pub(super) fn max_cycle_rate_hz(
             100.0 * MAX_LOAD_FRAC
         );
     } else {
-        log::info!("{interface}: a rate of {rate_hz:.0} Hz takes at most {load_percent:.0} % of the bus");
+        log::info!(
+            "{interface}: a rate of {rate_hz:.0} Hz takes at most {load_percent:.0} % of the bus"
+        );
     }
     rate_hz
 }

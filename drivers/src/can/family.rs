@@ -1,5 +1,5 @@
-//! The interface of motor families: the traits through which the code for whole arms accesses a family, one of its
-//! motors, and the motion of that motor.
+//! The interface of motor families: the traits through which the code for whole arms accesses a
+//! family, one of its motors, and the motion of that motor.
 
 #[cfg(feature = "emulation")]
 use super::emulated::EmulatedProtocol;
@@ -20,7 +20,8 @@ pub(super) const MAX_REPORT: Duration = Duration::from_secs(1);
 pub(super) const MAX_CHANGE: Duration = Duration::from_secs(1);
 /// Fault of a motor whose watchdog has expired.
 pub(super) const COMMUNICATION_LOST: &str = "it received no command for longer than its timeout";
-/// Ranges for motors whose values need no scaling. Their gains, if they have any, have the usual ranges.
+/// Ranges for motors whose values need no scaling. Their gains, if they have any, have the usual
+/// ranges.
 pub(super) const UNLIMITED: Limits = Limits::of(f64::INFINITY, f64::INFINITY, f64::INFINITY);
 
 /// Motors that share a protocol.
@@ -35,7 +36,8 @@ pub trait MotorFamily: Debug + Sync {
     fn keys(&self) -> Vec<MotorKey> {
         Vec::new()
     }
-    /// Whether each command includes stiffness and damping (MIT mode). Other motors keep the gains stored in them.
+    /// Whether each command includes stiffness and damping (MIT mode). Other motors keep the gains
+    /// stored in them.
     fn has_gains(&self) -> bool;
     /// The motor with these settings; `None` if a required setting is missing.
     fn motor(&self, settings: &MotorSettings) -> Option<Arc<dyn MotorProtocol>>;
@@ -54,11 +56,11 @@ pub trait MotorProtocol: Debug + Send + Sync {
     fn settings(&self) -> MotorSettings;
     /// IDs that no other motor of the family may use on the same bus.
     fn addresses(&self) -> Vec<u32>;
-    /// Ranges of its raw values, infinite where there are none; `None` if [`MotorProtocol::set_up`] reads them from the
-    /// motor.
+    /// Ranges of its raw values, infinite where there are none; `None` if [`MotorProtocol::set_up`]
+    /// reads them from the motor.
     fn ranges(&self) -> Option<Limits>;
-    /// Node ID, if the motor is a CANopen node. Such a motor reports and accepts targets on each SYNC, and monitors our
-    /// heartbeat.
+    /// Node ID, if the motor is a CANopen node. Such a motor reports and accepts targets on each
+    /// SYNC, and monitors our heartbeat.
     fn canopen_node(&self) -> Option<canopen::Node> {
         None
     }
@@ -70,12 +72,13 @@ pub trait MotorProtocol: Debug + Send + Sync {
     fn set_up(&self, query: &MotorQuery<'_>) -> Result<Limits, Error>;
     /// When the motor reports its position after [`MotorProtocol::set_up`].
     fn reports(&self) -> Reports;
-    /// The frame that polls its position in each cycle; `None` if the motor sends unsolicited reports or reports on
-    /// every SYNC.
+    /// The frame that polls its position in each cycle; `None` if the motor sends unsolicited
+    /// reports or reports on every SYNC.
     fn poll_frame(&self) -> Option<Frame> {
         None
     }
-    /// A frame of the same size as its position reports, and the rate of the reports in Hz if the motor determines it.
+    /// A frame of the same size as its position reports, and the rate of the reports in Hz if the
+    /// motor determines it.
     fn typical_answer(&self) -> (Frame, Option<f64>);
     /// The reading in a frame; `None` if the frame is from another motor or has other content.
     fn read(&self, frame: &Frame, limits: &Limits) -> Option<MotorReading>;
@@ -92,8 +95,8 @@ pub trait MotorProtocol: Debug + Send + Sync {
     fn emulated(&self) -> Box<dyn EmulatedProtocol>;
 }
 
-/// Moves one motor. The motor is disabled until it receives the frames of [`MotionProtocol::enable`] or, if there are
-/// none, its first command.
+/// Moves one motor. The motor is disabled until it receives the frames of
+/// [`MotionProtocol::enable`] or, if there are none, its first command.
 pub trait MotionProtocol: Debug + Send {
     /// Disables the motor, and clears its faults after logging them.
     ///
@@ -111,7 +114,8 @@ pub trait MotionProtocol: Debug + Send {
     /// If the motor does not support the mode, or reports another one.
     fn set_mode(&self, query: &MotorQuery<'_>, plan: &WatchdogPlan) -> Result<(), Error>;
 
-    /// The frame that polls the position of the disabled motor, if it differs from [`MotorProtocol::poll_frame`].
+    /// The frame that polls the position of the disabled motor, if it differs from
+    /// [`MotorProtocol::poll_frame`].
     fn poll_disabled(&self) -> Option<Frame> {
         None
     }
@@ -125,9 +129,11 @@ pub trait MotionProtocol: Debug + Send {
     }
     /// The frame that disables the motor.
     fn release(&self) -> Result<Frame, CanError>;
-    /// The health that a frame reports; `None` if the frame contains none or comes from another motor.
+    /// The health that a frame reports; `None` if the frame contains none or comes from another
+    /// motor.
     fn health(&mut self, frame: &Frame) -> Option<Health>;
-    /// How long the motor may be silent before it counts as lost. `default_limit` applies to most families.
+    /// How long the motor may be silent before it counts as lost. `default_limit` applies to most
+    /// families.
     fn max_silence(&self, default_limit: Duration) -> Duration {
         default_limit
     }
@@ -137,7 +143,11 @@ impl dyn MotorProtocol {
     /// Whether the two motors would have conflicting IDs on the same bus.
     pub fn conflicts_with(&self, other: &Self) -> bool {
         let theirs = other.addresses();
-        self.family().name() == other.family().name() && self.addresses().iter().any(|address| theirs.contains(address))
+        self.family().name() == other.family().name()
+            && self
+                .addresses()
+                .iter()
+                .any(|address| theirs.contains(address))
     }
 }
 
@@ -160,8 +170,16 @@ pub struct MotorReading {
 
 impl From<Motion> for MotorReading {
     fn from(motion: Motion) -> Self {
-        let Motion { position_rad, velocity_rad_s, torque_nm } = motion;
-        Self { position_rad, velocity_rad_s, torque_nm: Some(torque_nm) }
+        let Motion {
+            position_rad,
+            velocity_rad_s,
+            torque_nm,
+        } = motion;
+        Self {
+            position_rad,
+            velocity_rad_s,
+            torque_nm: Some(torque_nm),
+        }
     }
 }
 
@@ -217,8 +235,13 @@ pub(super) fn short_frame() -> Frame {
 pub(super) const LIMITS: Limits = Limits::of(12.5, 30.0, 10.0);
 /// A command to move away stiffly.
 #[cfg(test)]
-pub(super) const STIFF_COMMAND: Command =
-    Command { position_rad: 1.0, velocity_rad_s: 0.0, kp_nm_rad: 200.0, kd_nm_s_rad: 2.0, torque_nm: 0.0 };
+pub(super) const STIFF_COMMAND: Command = Command {
+    position_rad: 1.0,
+    velocity_rad_s: 0.0,
+    kp_nm_rad: 200.0,
+    kd_nm_s_rad: 2.0,
+    torque_nm: 0.0,
+};
 
 /// Data of a family for fuzzing and its tests.
 #[cfg(any(test, fuzzing))]
@@ -237,7 +260,8 @@ pub struct FamilyFuzzing {
     /// Expected conversation of the driver with the motor.
     #[cfg(test)]
     pub transcript: &'static str,
-    /// For a motor that replies only to commands, a frame with which another master makes it report.
+    /// For a motor that replies only to commands, a frame with which another master makes it
+    /// report.
     #[cfg(test)]
     pub other_master: Option<Frame>,
 }

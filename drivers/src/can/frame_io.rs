@@ -9,7 +9,8 @@ use std::time::Duration;
 pub trait FrameIo {
     /// Name of the interface.
     fn interface(&self) -> &str;
-    /// Sends a frame. Returns whether it was accepted. It is not accepted if the interface's queue stays full.
+    /// Sends a frame. Returns whether it was accepted. It is not accepted if the interface's queue
+    /// stays full.
     fn send(&self, frame: &Frame) -> Result<bool, Error>;
     /// Waits for the next event. Returns `None` if there was none within the timeout.
     fn receive(&self, timeout: Duration) -> Result<Option<(Stamp, BusEvent)>, Error>;
@@ -37,9 +38,11 @@ pub struct WireErrors {
     pub n_warnings: u64,
     /// Number of times the controller became error-passive, at a counter of 128.
     pub n_passive: u64,
-    /// Number of frames that no node acknowledged: there is no other node, or none at this bit rate.
+    /// Number of frames that no node acknowledged: there is no other node, or none at this bit
+    /// rate.
     pub n_unacknowledged: u64,
-    /// Number of times a buffer of the controller or the kernel was full, so that frames were dropped.
+    /// Number of times a buffer of the controller or the kernel was full, so that frames were
+    /// dropped.
     pub n_overflows: u64,
 }
 
@@ -58,8 +61,20 @@ impl WireErrors {
 
 impl std::fmt::Display for WireErrors {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let Self { n_frames, n_bus_off, n_restarts, n_warnings, n_passive, n_unacknowledged, n_overflows } = self;
-        let bus_offs = if *n_bus_off == 1 { "bus-off" } else { "bus-offs" };
+        let Self {
+            n_frames,
+            n_bus_off,
+            n_restarts,
+            n_warnings,
+            n_passive,
+            n_unacknowledged,
+            n_overflows,
+        } = self;
+        let bus_offs = if *n_bus_off == 1 {
+            "bus-off"
+        } else {
+            "bus-offs"
+        };
         write!(
             f,
             "{n_bus_off} {bus_offs}, {n_restarts} restarts; {n_warnings} warnings, {n_passive} passive, \

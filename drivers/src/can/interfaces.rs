@@ -6,11 +6,14 @@ use std::path::Path;
 pub fn interfaces(sys: &Path) -> Vec<String> {
     let net = sys.join("class/net");
     // ARPHRD_CAN of `linux/if_arp.h`.
-    let is_can =
-        |name: &String| std::fs::read_to_string(net.join(name).join("type")).is_ok_and(|kind| kind.trim() == "280");
+    let is_can = |name: &String| {
+        std::fs::read_to_string(net.join(name).join("type")).is_ok_and(|kind| kind.trim() == "280")
+    };
     let all = std::fs::read_dir(&net).into_iter().flatten();
-    let mut names: Vec<String> =
-        all.filter_map(|entry| entry.ok()?.file_name().into_string().ok()).filter(is_can).collect();
+    let mut names: Vec<String> = all
+        .filter_map(|entry| entry.ok()?.file_name().into_string().ok())
+        .filter(is_can)
+        .collect();
     names.sort();
     names
 }

@@ -19,7 +19,9 @@ pub(super) struct Joints {
 
 impl Joints {
     pub(super) fn new(n: usize) -> Self {
-        Self { newest: vec![None; n] }
+        Self {
+            newest: vec![None; n],
+        }
     }
 
     /// Adds a reading. Once every joint has a new reading, returns a state and starts over.
@@ -34,8 +36,15 @@ impl Joints {
         Some(JointState {
             stamp,
             position: all.iter().map(at).collect(),
-            velocity: all.iter().map(|(_, reading)| reading.velocity_rad_s).collect(),
-            effort: all.iter().map(|(_, reading)| reading.effort_nm).collect::<Option<_>>().unwrap_or_default(),
+            velocity: all
+                .iter()
+                .map(|(_, reading)| reading.velocity_rad_s)
+                .collect(),
+            effort: all
+                .iter()
+                .map(|(_, reading)| reading.effort_nm)
+                .collect::<Option<_>>()
+                .unwrap_or_default(),
         })
     }
 }
@@ -45,8 +54,16 @@ mod tests {
     use super::*;
 
     fn joint_reading(joint_ix: usize, millis: i64, position_rad: f64) -> JointReading {
-        let reading = Reading { position_rad, velocity_rad_s: 2.0, effort_nm: Some(0.5) };
-        JointReading { joint_ix, stamp: Stamp(millis * 1_000_000), reading }
+        let reading = Reading {
+            position_rad,
+            velocity_rad_s: 2.0,
+            effort_nm: Some(0.5),
+        };
+        JointReading {
+            joint_ix,
+            stamp: Stamp(millis * 1_000_000),
+            reading,
+        }
     }
 
     #[test]
@@ -54,12 +71,26 @@ mod tests {
         let mut joints = Joints::new(3);
         assert_eq!(joints.take(&joint_reading(0, 1, 0.0)), None);
         assert_eq!(joints.take(&joint_reading(2, 2, 0.2)), None);
-        assert_eq!(joints.take(&joint_reading(0, 3, 0.1)), None, "the newer reading replaces the older");
+        assert_eq!(
+            joints.take(&joint_reading(0, 3, 0.1)),
+            None,
+            "the newer reading replaces the older"
+        );
         let state = joints.take(&joint_reading(1, 5, 0.3)).unwrap();
         assert_eq!(state.stamp, Stamp(5_000_000));
         let expected = [0.1 + 2.0 * 0.002, 0.3, 0.2 + 2.0 * 0.003];
-        assert!(state.position.iter().zip(expected).all(|(got, expected)| (got - expected).abs() < 1e-12));
+        assert!(
+            state
+                .position
+                .iter()
+                .zip(expected)
+                .all(|(got, expected)| (got - expected).abs() < 1e-12)
+        );
         assert_eq!((state.velocity, state.effort), (vec![2.0; 3], vec![0.5; 3]));
-        assert_eq!(joints.take(&joint_reading(1, 6, 0.3)), None, "it starts over");
+        assert_eq!(
+            joints.take(&joint_reading(1, 6, 0.3)),
+            None,
+            "it starts over"
+        );
     }
 }

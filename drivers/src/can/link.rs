@@ -18,10 +18,11 @@ pub enum State {
     Active,
     /// An error counter has reached 96.
     Warning,
-    /// An error counter has reached 128. The controller no longer sends active error flags, which would destroy the
-    /// frames of other nodes.
+    /// An error counter has reached 128. The controller no longer sends active error flags, which
+    /// would destroy the frames of other nodes.
     Passive,
-    /// The transmit error counter has exceeded 255. The controller takes no part in the bus until it is restarted.
+    /// The transmit error counter has exceeded 255. The controller takes no part in the bus until
+    /// it is restarted.
     BusOff,
     /// The controller is down or asleep.
     Stopped,
@@ -64,19 +65,26 @@ impl Link {
     /// If the interface does not exist. The error lists the existing ones.
     pub fn read(interface: &str) -> Result<Self, Error> {
         let details = CanInterface::open(interface).and_then(|open| open.details());
-        details.map(|details| Self::of(interface, &details)).map_err(|error| {
-            let reason = match io_error(error) {
-                error if error.raw_os_error() == Some(ENODEV) => missing_interface(interface),
-                error => error,
-            };
-            Error::CanBus { interface: interface.to_owned(), reason }
-        })
+        details
+            .map(|details| Self::of(interface, &details))
+            .map_err(|error| {
+                let reason = match io_error(error) {
+                    error if error.raw_os_error() == Some(ENODEV) => missing_interface(interface),
+                    error => error,
+                };
+                Error::CanBus {
+                    interface: interface.to_owned(),
+                    reason,
+                }
+            })
     }
 
     fn of(interface: &str, details: &InterfaceDetails) -> Self {
         let can = &details.can;
         let rate = |timing: Option<socketcan::nl::CanBitTiming>| {
-            timing.map(|timing| timing.bitrate).filter(|bitrate_hz| *bitrate_hz > 0)
+            timing
+                .map(|timing| timing.bitrate)
+                .filter(|bitrate_hz| *bitrate_hz > 0)
         };
         Self {
             interface: interface.to_owned(),
@@ -92,7 +100,9 @@ impl Link {
                 CanState::BusOff => State::BusOff,
                 CanState::Stopped | CanState::Sleeping => State::Stopped,
             }),
-            n_errors: can.berr_counter.map(|counter| [counter.txerr, counter.rxerr]),
+            n_errors: can
+                .berr_counter
+                .map(|counter| [counter.txerr, counter.rxerr]),
         }
     }
 
@@ -101,11 +111,17 @@ impl Link {
         self.state.is_none()
     }
 
-    /// Problems that must be fixed before motors can be read with `config`. Empty if there are none.
+    /// Problems that must be fixed before motors can be read with `config`. Empty if there are
+    /// none.
     pub fn problems(&self, config: &BusConfig) -> Vec<LinkProblem> {
         let command = set_up_command(&self.interface, self.is_virtual(), config);
         let mut problems = Vec::new();
-        let mut report = |problem: String| problems.push(LinkProblem { problem, command: command.clone() });
+        let mut report = |problem: String| {
+            problems.push(LinkProblem {
+                problem,
+                command: command.clone(),
+            })
+        };
         if !self.is_up {
             report("it is down".to_owned());
         }
@@ -118,13 +134,26 @@ impl Link {
         match self.bitrate_hz {
             Some(bitrate_hz) if bitrate_hz == config.bitrate_hz => {}
             Some(bitrate_hz) => {
-                report(format!("its bit rate is {bitrate_hz}, but the rig file requires {}", config.bitrate_hz));
+                report(format!(
+                    "its bit rate is {bitrate_hz}, but the rig file requires {}",
+                    config.bitrate_hz
+                ));
             }
-            None => report(format!("no bit rate is set; the rig file requires {}", config.bitrate_hz)),
+            None => report(format!(
+                "no bit rate is set; the rig file requires {}",
+                config.bitrate_hz
+            )),
         }
-        if let Some(data_bitrate_hz) = config.data_bitrate_hz.filter(|rate| self.data_bitrate_hz != Some(*rate)) {
-            let reported = self.data_bitrate_hz.map_or_else(|| "not set".to_owned(), |rate| rate.to_string());
-            report(format!("its bit rate for FD data is {reported}, but the rig file requires {data_bitrate_hz}"));
+        if let Some(data_bitrate_hz) = config
+            .data_bitrate_hz
+            .filter(|rate| self.data_bitrate_hz != Some(*rate))
+        {
+            let reported = self
+                .data_bitrate_hz
+                .map_or_else(|| "not set".to_owned(), |rate| rate.to_string());
+            report(format!(
+                "its bit rate for FD data is {reported}, but the rig file requires {data_bitrate_hz}"
+            ));
         }
         if self.restart_millis == Some(0) && !config.accept_no_restart {
             report(format!(
@@ -134,7 +163,10 @@ impl Link {
             ));
         }
         if self.is_up && self.state >= Some(State::BusOff) {
-            report("it is bus-off: check wiring, termination and the bit rate of the other nodes".to_owned());
+            report(
+                "it is bus-off: check wiring, termination and the bit rate of the other nodes"
+                    .to_owned(),
+            );
         }
         problems
     }
@@ -142,9 +174,11 @@ impl Link {
     /// Returns the first problem as an error.
     pub fn check(&self, config: &BusConfig) -> Result<(), Error> {
         match self.problems(config).into_iter().next() {
-            Some(LinkProblem { problem, command }) => {
-                Err(Error::CanLink { interface: self.interface.clone(), problem, command })
-            }
+            Some(LinkProblem { problem, command }) => Err(Error::CanLink {
+                interface: self.interface.clone(),
+                problem,
+                command,
+            }),
             None => Ok(()),
         }
     }
@@ -152,7 +186,12 @@ impl Link {
 
 impl std::fmt::Display for Link {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        write!(f, "{}: {}", self.interface, if self.is_up { "up" } else { "down" })?;
+        write!(
+            f,
+            "{}: {}",
+            self.interface,
+            if self.is_up { "up" } else { "down" }
+        )?;
         match (self.bitrate_hz, self.data_bitrate_hz) {
             (Some(rate), Some(data)) => write!(f, ", {rate} and {data} bit/s")?,
             (Some(rate), None) => write!(f, ", {rate} bit/s")?,
@@ -174,12 +213,20 @@ fn set_up_command(interface: &str, is_virtual: bool, config: &BusConfig) -> Stri
     if is_virtual {
         return match config.data_bitrate_hz {
             // The MTU cannot be changed while the interface is up.
-            Some(_) => format!("sudo ip link set {interface} down; sudo ip link set {interface} mtu 72 up"),
+            Some(_) => {
+                format!("sudo ip link set {interface} down; sudo ip link set {interface} mtu 72 up")
+            }
             None => format!("sudo ip link set {interface} up"),
         };
     }
-    let fd = config.data_bitrate_hz.map_or_else(String::new, |rate| format!(" dbitrate {rate} fd on"));
-    let restart = if config.accept_no_restart { String::new() } else { format!(" restart-ms {RESTART_MILLIS}") };
+    let fd = config
+        .data_bitrate_hz
+        .map_or_else(String::new, |rate| format!(" dbitrate {rate} fd on"));
+    let restart = if config.accept_no_restart {
+        String::new()
+    } else {
+        format!(" restart-ms {RESTART_MILLIS}")
+    };
     format!(
         "sudo ip link set {interface} down; sudo ip link set {interface} up type can bitrate {}{fd}{restart}",
         config.bitrate_hz
@@ -191,27 +238,35 @@ const ENODEV: i32 = 19;
 
 fn missing_interface(interface: &str) -> io::Error {
     if interface.starts_with("vcan") {
-        let create_command =
-            format!("sudo modprobe vcan; sudo ip link add dev {interface} type vcan; sudo ip link set {interface} up");
+        let create_command = format!(
+            "sudo modprobe vcan; sudo ip link add dev {interface} type vcan; sudo ip link set {interface} up"
+        );
         return io::Error::new(
             io::ErrorKind::NotFound,
             format!("no such interface; create a virtual one with: {create_command}"),
         );
     }
     let others = match interfaces(Path::new("/sys")).as_slice() {
-        [] => "this computer has none; check that the adapter is connected and its driver is loaded".to_owned(),
+        [] => {
+            "this computer has none; check that the adapter is connected and its driver is loaded"
+                .to_owned()
+        }
         names => format!("existing interfaces: {}", names.join(", ")),
     };
-    io::Error::new(io::ErrorKind::NotFound, format!("no such interface: {others}"))
+    io::Error::new(
+        io::ErrorKind::NotFound,
+        format!("no such interface: {others}"),
+    )
 }
 
 /// The error of the system, with its number if it has one.
 fn io_error(error: socketcan::Error) -> io::Error {
     match error {
         socketcan::Error::Io(error) => error,
-        socketcan::Error::Nl(error) => {
-            error.errno().map_or_else(|| io::Error::other(error.to_string()), io::Error::from_raw_os_error)
-        }
+        socketcan::Error::Nl(error) => error.errno().map_or_else(
+            || io::Error::other(error.to_string()),
+            io::Error::from_raw_os_error,
+        ),
         error => io::Error::other(error.to_string()),
     }
 }
@@ -221,7 +276,12 @@ mod tests {
     use super::*;
 
     fn config(data_bitrate_hz: Option<u32>) -> BusConfig {
-        BusConfig { interface: "can0".to_owned(), bitrate_hz: 1_000_000, data_bitrate_hz, accept_no_restart: false }
+        BusConfig {
+            interface: "can0".to_owned(),
+            bitrate_hz: 1_000_000,
+            data_bitrate_hz,
+            accept_no_restart: false,
+        }
     }
 
     fn good_link() -> Link {
@@ -239,25 +299,55 @@ mod tests {
 
     #[test]
     fn problems_come_with_the_command_that_fixes_them() {
-        const EXPECTED_COMMAND: &str =
-            "sudo ip link set can0 down; sudo ip link set can0 up type can bitrate 1000000 restart-ms 100";
+        const EXPECTED_COMMAND: &str = "sudo ip link set can0 down; sudo ip link set can0 up type can bitrate 1000000 restart-ms 100";
         assert_eq!(good_link().problems(&config(None)), []);
         let broken_links: [(Link, &str); 5] = [
-            (Link { is_up: false, state: Some(State::Stopped), ..good_link() }, "it is down"),
             (
-                Link { bitrate_hz: Some(500_000), ..good_link() },
+                Link {
+                    is_up: false,
+                    state: Some(State::Stopped),
+                    ..good_link()
+                },
+                "it is down",
+            ),
+            (
+                Link {
+                    bitrate_hz: Some(500_000),
+                    ..good_link()
+                },
                 "its bit rate is 500000, but the rig file requires 1000000",
             ),
-            (Link { bitrate_hz: None, ..good_link() }, "no bit rate is set"),
-            (Link { restart_millis: Some(0), ..good_link() }, "does not restart after a bus-off"),
-            (Link { state: Some(State::BusOff), ..good_link() }, "bus-off"),
+            (
+                Link {
+                    bitrate_hz: None,
+                    ..good_link()
+                },
+                "no bit rate is set",
+            ),
+            (
+                Link {
+                    restart_millis: Some(0),
+                    ..good_link()
+                },
+                "does not restart after a bus-off",
+            ),
+            (
+                Link {
+                    state: Some(State::BusOff),
+                    ..good_link()
+                },
+                "bus-off",
+            ),
         ];
         for (link, what) in broken_links {
             let problems = link.problems(&config(None));
             assert_eq!(problems.len(), 1, "{problems:?}");
             assert!(problems[0].problem.contains(what), "{problems:?}");
             assert_eq!(problems[0].command, EXPECTED_COMMAND);
-            assert!(link.check(&config(None)).is_err_and(|error| error.to_string().contains(EXPECTED_COMMAND)));
+            assert!(
+                link.check(&config(None))
+                    .is_err_and(|error| error.to_string().contains(EXPECTED_COMMAND))
+            );
         }
     }
 
@@ -265,18 +355,48 @@ mod tests {
     fn can_fd_requires_fd_enabled() {
         let problems = good_link().problems(&config(Some(5_000_000)));
         assert_eq!(problems.len(), 2, "{problems:?}");
-        assert!(problems[0].command.ends_with("bitrate 1000000 dbitrate 5000000 fd on restart-ms 100"));
-        let link = Link { is_fd: true, data_bitrate_hz: Some(5_000_000), ..good_link() };
+        assert!(
+            problems[0]
+                .command
+                .ends_with("bitrate 1000000 dbitrate 5000000 fd on restart-ms 100")
+        );
+        let link = Link {
+            is_fd: true,
+            data_bitrate_hz: Some(5_000_000),
+            ..good_link()
+        };
         assert_eq!(link.problems(&config(Some(5_000_000))), []);
     }
 
     #[test]
     fn virtual_interfaces_only_need_to_be_up() {
-        let slcan = BusConfig { accept_no_restart: true, ..config(None) };
-        assert_eq!(Link { restart_millis: Some(0), ..good_link() }.problems(&slcan), []);
-        let link = Link { bitrate_hz: None, restart_millis: None, state: None, n_errors: None, ..good_link() };
+        let slcan = BusConfig {
+            accept_no_restart: true,
+            ..config(None)
+        };
+        assert_eq!(
+            Link {
+                restart_millis: Some(0),
+                ..good_link()
+            }
+            .problems(&slcan),
+            []
+        );
+        let link = Link {
+            bitrate_hz: None,
+            restart_millis: None,
+            state: None,
+            n_errors: None,
+            ..good_link()
+        };
         assert_eq!(link.problems(&config(None)), []);
-        let down = Link { is_up: false, ..link };
-        assert_eq!(down.problems(&config(None))[0].command, "sudo ip link set can0 up");
+        let down = Link {
+            is_up: false,
+            ..link
+        };
+        assert_eq!(
+            down.problems(&config(None))[0].command,
+            "sudo ip link set can0 up"
+        );
     }
 }

@@ -1,14 +1,16 @@
 //! Arms whose joints are motors on CAN buses, over Linux sockets.
 //!
 //! * `config` describes buses, motors and arms.
-//! * `link` checks the configuration of an interface. `bus` transfers frames and counts errors on the wire, which code
-//!   above it accesses through the trait of `frame_io`.
-//! * `family` has the traits of a motor family, and [`FAMILIES`] lists the families. Each is a folder with its codec, its
-//!   settings in rig files, how its motors are read and moved, and their emulation.
-//! * `motor` reads one motor. `arm` combines the readings of all motors into joint states, with one thread per bus.
-//!   Neither commands a motor.
-//! * `movable_motor` is a motor that may be moved. `plan` checks how motors are configured to react when this computer
-//!   stops sending (`watchdog`). `movable` is an arm of such motors; `arm_loop` is its thread.
+//! * `link` checks the configuration of an interface. `bus` transfers frames and counts errors on
+//!   the wire, which code above it accesses through the trait of `frame_io`.
+//! * `family` has the traits of a motor family, and [`FAMILIES`] lists the families. Each is a
+//!   folder with its codec, its settings in rig files, how its motors are read and moved, and their
+//!   emulation.
+//! * `motor` reads one motor. `arm` combines the readings of all motors into joint states, with one
+//!   thread per bus. Neither commands a motor.
+//! * `movable_motor` is a motor that may be moved. `plan` checks how motors are configured to react
+//!   when this computer stops sending (`watchdog`). `movable` is an arm of such motors; `arm_loop`
+//!   is its thread.
 //! * `emulated` has emulated motors for tests and simulators, behind the feature `emulation`.
 
 #[cfg(target_os = "linux")]
@@ -58,7 +60,9 @@ pub use bus::Bus;
 pub use config::{ArmConfig, BusConfig, FollowingLimits, Gains, MotorConfig, MovableArmConfig};
 #[cfg(any(test, fuzzing))]
 pub use family::FamilyFuzzing;
-pub use family::{Health, MotionProtocol, MotorFamily, MotorProtocol, MotorReading, Reports, Traffic};
+pub use family::{
+    Health, MotionProtocol, MotorFamily, MotorProtocol, MotorReading, Reports, Traffic,
+};
 pub use frame_io::{BusEvent, FrameIo, WireErrors};
 pub use interfaces::interfaces;
 #[cfg(target_os = "linux")]

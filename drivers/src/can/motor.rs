@@ -36,9 +36,12 @@ impl Motor {
         Ok(motor)
     }
 
-    /// Like [`Motor::set_up`], but does not wait for a motor that reports only when commanded, because no node commands
-    /// it yet.
-    pub(super) fn set_up_for_motion(bus: &dyn FrameIo, config: &MotorConfig) -> Result<Self, Error> {
+    /// Like [`Motor::set_up`], but does not wait for a motor that reports only when commanded,
+    /// because no node commands it yet.
+    pub(super) fn set_up_for_motion(
+        bus: &dyn FrameIo,
+        config: &MotorConfig,
+    ) -> Result<Self, Error> {
         let query = MotorQuery::new(bus, &config.joint);
         let limits = config.protocol.set_up(&query)?;
         let motor = Self::with_limits(config.clone(), limits);
@@ -72,20 +75,29 @@ impl Motor {
         direction / self.config.gear_ratio
     }
 
-    /// Decodes the reading of the joint in a frame; `None` if the frame comes from another motor or has other content.
+    /// Decodes the reading of the joint in a frame; `None` if the frame comes from another motor or
+    /// has other content.
     pub(super) fn read(&self, frame: &Frame) -> Option<Reading> {
-        let MotorReading { position_rad, velocity_rad_s, torque_nm } = self.protocol().read(frame, &self.limits)?;
+        let MotorReading {
+            position_rad,
+            velocity_rad_s,
+            torque_nm,
+        } = self.protocol().read(frame, &self.limits)?;
         let per_turn = self.per_turn();
         let reading = Reading {
             position_rad: position_rad * per_turn + self.config.offset_rad,
             velocity_rad_s: velocity_rad_s * per_turn,
             effort_nm: torque_nm.map(|torque| torque / per_turn),
         };
-        (reading.position_rad.abs() <= MAX_RAD && reading.velocity_rad_s.abs() <= MAX_RAD).then_some(reading)
+        (reading.position_rad.abs() <= MAX_RAD && reading.velocity_rad_s.abs() <= MAX_RAD)
+            .then_some(reading)
     }
 
     /// Waits for the first reading.
     fn wait_for_reading(&self, query: &MotorQuery<'_>, timeout_reason: &str) -> Result<(), Error> {
-        query.wait(MAX_REPORT, |frame| self.read(frame))?.map(drop).ok_or_else(|| query.fault(timeout_reason))
+        query
+            .wait(MAX_REPORT, |frame| self.read(frame))?
+            .map(drop)
+            .ok_or_else(|| query.fault(timeout_reason))
     }
 }

@@ -1,7 +1,7 @@
 //! An arm of motors on CAN buses that may be moved.
 //!
-//! One thread serves all buses of the arm, so that its joints start and arrive together. In each cycle it sends every
-//! motor its setpoint, which also resets the motors' watchdogs.
+//! One thread serves all buses of the arm, so that its joints start and arrive together. In each
+//! cycle it sends every motor its setpoint, which also resets the motors' watchdogs.
 
 use super::arm::MAX_WAITING;
 use super::arm_loop::{ArmLoop, Request};
@@ -25,8 +25,9 @@ const MAX_RECOVERY: Duration = Duration::from_secs(60);
 
 /// An arm that may be moved. After opening, it holds its current position.
 ///
-/// Dropping this value brings the arm to rest within its limits. Then each motor gets the fail-safe command for
-/// `on_loss`; motors without a watchdog get it repeatedly until they answer, for a limited time.
+/// Dropping this value brings the arm to rest within its limits. Then each motor gets the fail-safe
+/// command for `on_loss`; motors without a watchdog get it repeatedly until they answer, for a
+/// limited time.
 #[derive(Debug)]
 pub struct MovableCanArm {
     names: Vec<String>,
@@ -41,27 +42,44 @@ pub struct MovableCanArm {
 }
 
 impl MovableCanArm {
-    /// Makes the checks that need no connection to the motors: the limits, and whether each motor supports the
-    /// configuration.
+    /// Makes the checks that need no connection to the motors: the limits, and whether each motor
+    /// supports the configuration.
     pub fn check(config: &MovableArmConfig) -> Result<(), Error> {
         watchdog_plan(config).map(drop)
     }
 
-    /// Checks the capabilities of the motors, sets and verifies their timeouts, and enables them, holding their
-    /// positions.
+    /// Checks the capabilities of the motors, sets and verifies their timeouts, and enables them,
+    /// holding their positions.
     ///
     /// # Errors
-    /// If another program moves motors on one of the buses; nothing is sent then. If any step fails; all motors are
-    /// then disabled.
+    /// If another program moves motors on one of the buses; nothing is sent then. If any step
+    /// fails; all motors are then disabled.
     pub fn open(config: &MovableArmConfig) -> Result<Self, Error> {
-        let names: Vec<String> = config.arm.motors.iter().map(|motor| motor.joint.clone()).collect();
+        let names: Vec<String> = config
+            .arm
+            .motors
+            .iter()
+            .map(|motor| motor.joint.clone())
+            .collect();
         let (sender, readings) = sync_channel(MAX_WAITING);
         let (requests, request_receiver) = sync_channel(1);
-        let motion = Arc::new(Mutex::new(Motion::Stopped { reason: "the arm has not been enabled yet".to_owned() }));
+        let motion = Arc::new(Mutex::new(Motion::Stopped {
+            reason: "the arm has not been enabled yet".to_owned(),
+        }));
         let is_shutting_down = Arc::new(AtomicBool::new(false));
-        let arm_loop =
-            ArmLoop::new(config, request_receiver, sender, Arc::clone(&motion), Arc::clone(&is_shutting_down))?;
-        let locks = config.arm.buses.iter().map(|bus| MotionLock::take(&bus.interface)).collect::<Result<_, _>>()?;
+        let arm_loop = ArmLoop::new(
+            config,
+            request_receiver,
+            sender,
+            Arc::clone(&motion),
+            Arc::clone(&is_shutting_down),
+        )?;
+        let locks = config
+            .arm
+            .buses
+            .iter()
+            .map(|bus| MotionLock::take(&bus.interface))
+            .collect::<Result<_, _>>()?;
         let device = "movable CAN arm".to_owned();
         let commanded = CommandedArm::new();
         let run = move || {
@@ -71,7 +89,16 @@ impl MovableCanArm {
         let thread = std::thread::Builder::new().name(device.clone()).spawn(run);
         let thread = Some(thread.map_err(|source| Error::Thread { device, source })?);
         let joints = Joints::new(names.len());
-        let mut arm = Self { names, readings, joints, requests, motion, is_shutting_down, thread, _locks: locks };
+        let mut arm = Self {
+            names,
+            readings,
+            joints,
+            requests,
+            motion,
+            is_shutting_down,
+            thread,
+            _locks: locks,
+        };
         arm.recover()?;
         Ok(arm)
     }
@@ -83,8 +110,12 @@ impl MovableCanArm {
         timeout: Duration,
     ) -> Result<T, Error> {
         let (sender, answer) = sync_channel(1);
-        let no_answer = || Error::Motion { reason: "the arm's thread does not answer".to_owned() };
-        self.requests.try_send(request(sender)).map_err(|_| no_answer())?;
+        let no_answer = || Error::Motion {
+            reason: "the arm's thread does not answer".to_owned(),
+        };
+        self.requests
+            .try_send(request(sender))
+            .map_err(|_| no_answer())?;
         answer.recv_timeout(timeout).map_err(|_| no_answer())?
     }
 }
@@ -94,12 +125,15 @@ impl Arm for MovableCanArm {
         &self.names
     }
 
-    /// Reads the arm like [`CanArm`](super::CanArm). A stopped arm can still be read if its motors report without
-    /// commands and without a SYNC.
+    /// Reads the arm like [`CanArm`](super::CanArm). A stopped arm can still be read if its motors
+    /// report without commands and without a SYNC.
     fn read(&mut self, timeout: Duration) -> Result<JointState, Error> {
         let deadline = Instant::now() + timeout;
         loop {
-            match self.readings.recv_timeout(deadline.saturating_duration_since(Instant::now())) {
+            match self
+                .readings
+                .recv_timeout(deadline.saturating_duration_since(Instant::now()))
+            {
                 Ok(reading) => {
                     if let Some(state) = self.joints.take(&reading?) {
                         return Ok(state);
@@ -115,7 +149,10 @@ impl Arm for MovableCanArm {
 
 impl MovableArm for MovableCanArm {
     fn command(&mut self, target: &JointTarget) -> Result<JointTarget, Error> {
-        self.request_and_wait(|answer| Request::SetTarget(target.clone(), answer), MAX_ANSWER)
+        self.request_and_wait(
+            |answer| Request::SetTarget(target.clone(), answer),
+            MAX_ANSWER,
+        )
     }
 
     fn motion(&self) -> Motion {

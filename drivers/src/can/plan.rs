@@ -10,15 +10,19 @@ use std::time::Duration;
 /// Minimum watchdog timeout, in cycles.
 const MIN_CYCLES: u32 = 4;
 
-/// Makes all checks that are possible before any frame is sent, and returns the watchdog configuration of the motors.
+/// Makes all checks that are possible before any frame is sent, and returns the watchdog
+/// configuration of the motors.
 ///
 /// # Errors
 /// If a motor does not support the configuration.
 pub(super) fn watchdog_plan(config: &MovableArmConfig) -> Result<WatchdogPlan, Error> {
     let (arm, motion_config) = (&config.arm, &config.motion);
     if motion_config.limits.len() != arm.motors.len() {
-        let reason =
-            format!("limits are given for {} joints, but the arm has {}", motion_config.limits.len(), arm.motors.len());
+        let reason = format!(
+            "limits are given for {} joints, but the arm has {}",
+            motion_config.limits.len(),
+            arm.motors.len()
+        );
         return Err(Error::Motion { reason });
     }
     let host = unused_node(config)?;
@@ -44,8 +48,18 @@ pub(super) fn watchdog_plan(config: &MovableArmConfig) -> Result<WatchdogPlan, E
 }
 
 /// Checks whether a motor may be moved as planned.
-pub(super) fn check_motor(plan: &WatchdogPlan, config: &MotorConfig, interface: &str) -> Result<(), Error> {
-    let fault = |reason| Err(Error::Motor { joint: config.joint.clone(), interface: interface.to_owned(), reason });
+pub(super) fn check_motor(
+    plan: &WatchdogPlan,
+    config: &MotorConfig,
+    interface: &str,
+) -> Result<(), Error> {
+    let fault = |reason| {
+        Err(Error::Motor {
+            joint: config.joint.clone(),
+            interface: interface.to_owned(),
+            reason,
+        })
+    };
     let watchdog = config.protocol.watchdog(plan);
     if let Watchdog::Missing { reason, .. } = watchdog
         && !plan.accept_no_watchdog
@@ -59,31 +73,48 @@ pub(super) fn check_motor(plan: &WatchdogPlan, config: &MotorConfig, interface: 
     if !can.contains(&plan.on_loss) {
         let can: Vec<_> = can.iter().map(|can| format!("{:?}", can.name())).collect();
         let requested = plan.on_loss.name();
-        return fault(format!("arm.motion.on_loss is {requested:?}, but this motor can only {}", can.join(" or ")));
+        return fault(format!(
+            "arm.motion.on_loss is {requested:?}, but this motor can only {}",
+            can.join(" or ")
+        ));
     }
     if config.gains.is_none() && config.protocol.family().has_gains() {
-        return fault("to move this motor, set its stiffness_nm_rad and damping_nm_s_rad".to_owned());
+        return fault(
+            "to move this motor, set its stiffness_nm_rad and damping_nm_s_rad".to_owned(),
+        );
     }
     Ok(())
 }
 
 /// An unused CANopen node number for this computer.
 fn unused_node(config: &MovableArmConfig) -> Result<canopen::Node, Error> {
-    let is_used =
-        |node: canopen::Node| config.arm.motors.iter().any(|motor| motor.protocol.canopen_node() == Some(node));
-    let mut numbers = (1..=127).rev().filter_map(|number| canopen::Node::new(number).ok());
+    let is_used = |node: canopen::Node| {
+        config
+            .arm
+            .motors
+            .iter()
+            .any(|motor| motor.protocol.canopen_node() == Some(node))
+    };
+    let mut numbers = (1..=127)
+        .rev()
+        .filter_map(|number| canopen::Node::new(number).ok());
     let unused = numbers.find(|node| !is_used(*node));
     let reason = "no free CANopen node number is left for this computer".to_owned();
     unused.ok_or(Error::Motion { reason })
 }
 
-/// Cycle period that the slowest bus allows. If there are CiA 402 drives, it is rounded up to whole milliseconds,
-/// because drives count in milliseconds.
+/// Cycle period that the slowest bus allows. If there are CiA 402 drives, it is rounded up to whole
+/// milliseconds, because drives count in milliseconds.
 fn period(config: &MovableArmConfig, host: canopen::Node) -> Duration {
     let mut rate_hz = config.arm.rate_hz;
     let is_drive = |motor: &&MotorConfig| motor.protocol.canopen_node().is_some();
     for (bus_ix, bus) in config.arm.buses.iter().enumerate() {
-        let motors: Vec<_> = config.arm.motors.iter().filter(|motor| motor.bus_ix == bus_ix).collect();
+        let motors: Vec<_> = config
+            .arm
+            .motors
+            .iter()
+            .filter(|motor| motor.bus_ix == bus_ix)
+            .collect();
         if motors.is_empty() {
             continue;
         }
@@ -93,13 +124,27 @@ fn period(config: &MovableArmConfig, host: canopen::Node) -> Duration {
             unsolicited.extend(traffic.unsolicited);
         }
         if motors.iter().any(is_drive) {
-            cycle_frames.extend([canopen::encode_sync(), canopen::encode_heartbeat(host, NodeState::Operational)]);
+            cycle_frames.extend([
+                canopen::encode_sync(),
+                canopen::encode_heartbeat(host, NodeState::Operational),
+            ]);
         }
-        rate_hz = rate_hz.min(max_cycle_rate_hz(bus, &cycle_frames, &unsolicited, config.arm.rate_hz));
+        rate_hz = rate_hz.min(max_cycle_rate_hz(
+            bus,
+            &cycle_frames,
+            &unsolicited,
+            config.arm.rate_hz,
+        ));
     }
     let period = Duration::from_secs_f64(1.0 / rate_hz);
     match config.arm.motors.iter().any(|motor| is_drive(&motor)) {
-        true => Duration::from_millis(period.as_nanos().div_ceil(1_000_000).try_into().unwrap_or(u64::MAX)),
+        true => Duration::from_millis(
+            period
+                .as_nanos()
+                .div_ceil(1_000_000)
+                .try_into()
+                .unwrap_or(u64::MAX),
+        ),
         false => period,
     }
 }
@@ -152,8 +197,16 @@ mod tests {
     #[test]
     fn cycle_keeps_bus_load_under_70_percent() {
         let host = canopen::Node::new(127).expect("a node");
-        let damiao = |ix: u16| -> Arc<dyn MotorProtocol> { Arc::new(Damiao { motor: ix, feedback: 0x10 + ix }) };
-        assert_eq!(period(&config(vec![damiao(1), damiao(2)]), host), Duration::from_millis(1));
+        let damiao = |ix: u16| -> Arc<dyn MotorProtocol> {
+            Arc::new(Damiao {
+                motor: ix,
+                feedback: 0x10 + ix,
+            })
+        };
+        assert_eq!(
+            period(&config(vec![damiao(1), damiao(2)]), host),
+            Duration::from_millis(1)
+        );
         // Seven motors with two frames each, at most 135 bits per frame.
         let seven = period(&config((1..8).map(damiao).collect()), host).as_secs_f64();
         assert!((seven - 14.0 * 135e-6 / 0.7).abs() < 1e-6, "{seven}");
@@ -162,8 +215,16 @@ mod tests {
     #[test]
     fn drives_get_whole_millisecond_period_and_unused_node() {
         let node = |number| canopen::Node::new(number).expect("a node");
-        let units = Units { counts_per_turn: 1.0, rated_torque_nm: 1.0 };
-        let drive = |number| -> Arc<dyn MotorProtocol> { Arc::new(Cia402 { node: node(number), units }) };
+        let units = Units {
+            counts_per_turn: 1.0,
+            rated_torque_nm: 1.0,
+        };
+        let drive = |number| -> Arc<dyn MotorProtocol> {
+            Arc::new(Cia402 {
+                node: node(number),
+                units,
+            })
+        };
         let arm = config(vec![drive(127), drive(126), drive(1)]);
         assert_eq!(unused_node(&arm).expect("125 are free"), node(125));
         // 9 x 135 bits, a SYNC of 55 and a heartbeat of 65 take 1.34 ms of 70 %: 1.91 ms.
@@ -176,7 +237,10 @@ mod tests {
         accept_no_watchdog: bool,
         endpoints: Option<Endpoints>,
     ) -> Option<String> {
-        let gains = Some(Gains { stiffness_nm_rad: 1.0, damping_nm_s_rad: 1.0 });
+        let gains = Some(Gains {
+            stiffness_nm_rad: 1.0,
+            damping_nm_s_rad: 1.0,
+        });
         let config = MotorConfig {
             joint: "elbow".to_owned(),
             bus_ix: 0,
@@ -195,17 +259,36 @@ mod tests {
             host: canopen::Node::new(127).expect("a node"),
             period: Duration::from_millis(5),
         };
-        check_motor(&plan, &config, "can0").err().map(|error| error.to_string())
+        check_motor(&plan, &config, "can0")
+            .err()
+            .map(|error| error.to_string())
     }
 
     #[test]
     fn unsupported_fail_safe_reports_supported_ones() {
-        let units = Units { counts_per_turn: 1.0, rated_torque_nm: 1.0 };
-        let drive: Arc<dyn MotorProtocol> = Arc::new(Cia402 { node: canopen::Node::new(1).expect("a node"), units });
-        let damiao: Arc<dyn MotorProtocol> = Arc::new(Damiao { motor: 1, feedback: 2 });
-        let robstride: Arc<dyn MotorProtocol> = Arc::new(Robstride { motor: 1, model: robstride::Model::Rs00 });
-        let odrive: Arc<dyn MotorProtocol> = Arc::new(Odrive { node: odrive::Node::new(1).expect("a node") });
-        let ak: Arc<dyn MotorProtocol> = Arc::new(TMotor { motor: 1, model: tmotor::Model::Ak80x9 });
+        let units = Units {
+            counts_per_turn: 1.0,
+            rated_torque_nm: 1.0,
+        };
+        let drive: Arc<dyn MotorProtocol> = Arc::new(Cia402 {
+            node: canopen::Node::new(1).expect("a node"),
+            units,
+        });
+        let damiao: Arc<dyn MotorProtocol> = Arc::new(Damiao {
+            motor: 1,
+            feedback: 2,
+        });
+        let robstride: Arc<dyn MotorProtocol> = Arc::new(Robstride {
+            motor: 1,
+            model: robstride::Model::Rs00,
+        });
+        let odrive: Arc<dyn MotorProtocol> = Arc::new(Odrive {
+            node: odrive::Node::new(1).expect("a node"),
+        });
+        let ak: Arc<dyn MotorProtocol> = Arc::new(TMotor {
+            motor: 1,
+            model: tmotor::Model::Ak80x9,
+        });
         for (protocol, on_loss, expected) in [
             (&damiao, OnLoss::Release, None),
             (&damiao, OnLoss::Hold, Some("can only \"release\"")),
@@ -213,8 +296,16 @@ mod tests {
             (&robstride, OnLoss::Damp, Some("can only \"release\"")),
             (&drive, OnLoss::Hold, None),
             (&drive, OnLoss::Release, None),
-            (&drive, OnLoss::Damp, Some("can only \"hold\" or \"release\"")),
-            (&odrive, OnLoss::Release, Some("arm.motion.odrive_endpoints")),
+            (
+                &drive,
+                OnLoss::Damp,
+                Some("can only \"hold\" or \"release\""),
+            ),
+            (
+                &odrive,
+                OnLoss::Release,
+                Some("arm.motion.odrive_endpoints"),
+            ),
             (&ak, OnLoss::Release, Some("accept_no_watchdog = true")),
         ] {
             let reported = reported(protocol, on_loss, false, None);
@@ -230,8 +321,14 @@ mod tests {
             assert_eq!(reported(&ak, on_loss, true, None), None, "it was accepted");
         }
         let endpoints = Some(odrive::emulated::endpoints());
-        assert_eq!(reported(&odrive, OnLoss::Release, false, endpoints.clone()), None);
-        assert!(reported(&odrive, OnLoss::Hold, true, endpoints).is_some(), "its watchdog can only release");
+        assert_eq!(
+            reported(&odrive, OnLoss::Release, false, endpoints.clone()),
+            None
+        );
+        assert!(
+            reported(&odrive, OnLoss::Hold, true, endpoints).is_some(),
+            "its watchdog can only release"
+        );
         assert_eq!(reported(&odrive, OnLoss::Hold, true, None), None);
     }
 }

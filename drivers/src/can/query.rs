@@ -1,4 +1,5 @@
-//! Sends requests to one motor and waits for the answers, before the cycle starts and while nothing else reads the bus.
+//! Sends requests to one motor and waits for the answers, before the cycle starts and while nothing
+//! else reads the bus.
 
 use super::frame_io::{BusEvent, FrameIo, WireErrors};
 use crate::wire::can::{CanError, Frame};
@@ -21,7 +22,11 @@ pub struct MotorQuery<'a> {
 impl<'a> MotorQuery<'a> {
     /// Creates access to the motor of a joint.
     pub fn new(bus: &'a dyn FrameIo, joint: &'a str) -> Self {
-        Self { bus, joint, errors: Cell::default() }
+        Self {
+            bus,
+            joint,
+            errors: Cell::default(),
+        }
     }
 
     /// Name of the motor in messages.
@@ -32,12 +37,18 @@ impl<'a> MotorQuery<'a> {
     /// Creates an error of this motor.
     pub fn fault(&self, reason: impl Into<String>) -> Error {
         let interface = self.bus.interface().to_owned();
-        Error::Motor { joint: self.joint.to_owned(), interface, reason: reason.into() }
+        Error::Motor {
+            joint: self.joint.to_owned(),
+            interface,
+            reason: reason.into(),
+        }
     }
 
     /// Creates the error for a motor that does not report that it is disabled.
     pub fn not_disabled(&self, reported: &str) -> Error {
-        self.fault(format!("the motor was disabled but does not report it: {reported}"))
+        self.fault(format!(
+            "the motor was disabled but does not report it: {reported}"
+        ))
     }
 
     /// Creates the error for a watchdog timeout that was not accepted.
@@ -65,7 +76,8 @@ impl<'a> MotorQuery<'a> {
         }
     }
 
-    /// Returns the first result of `matches` on a received frame, or `None` if there is none within the time limit.
+    /// Returns the first result of `matches` on a received frame, or `None` if there is none within
+    /// the time limit.
     pub fn wait<T>(
         &self,
         timeout_limit: Duration,
@@ -106,8 +118,8 @@ impl<'a> MotorQuery<'a> {
             }
         }
         let errors = self.errors.get();
-        // Not every driver of a CAN controller reports unacknowledged frames, but all report the resulting state of the
-        // error counters.
+        // Not every driver of a CAN controller reports unacknowledged frames, but all report the
+        // resulting state of the error counters.
         Err(self.fault(match errors.n_unacknowledged + errors.n_passive + errors.n_bus_off {
             0 => format!("no answer to {MAX_ATTEMPTS} requests; check that the motor is powered and its id is correct"),
             _ => "no node acknowledges frames: the other nodes are off or use another bit rate, or the bus is cut or not terminated"

@@ -10,7 +10,8 @@ pub struct MotorKey {
     pub name: &'static str,
     /// Allowed values.
     pub allowed: AllowedValues,
-    /// Description of the value, for the message that a required key is missing; `None` if the key is optional.
+    /// Description of the value, for the message that a required key is missing; `None` if the key
+    /// is optional.
     pub required: Option<&'static str>,
 }
 
@@ -41,14 +42,18 @@ pub enum SettingValue {
 pub struct MotorSettings {
     /// ID of the motor, axis or node.
     pub id: u64,
-    /// Values of [`MotorFamily::keys`](super::MotorFamily::keys), by name; optional keys may be absent.
+    /// Values of [`MotorFamily::keys`](super::MotorFamily::keys), by name; optional keys may be
+    /// absent.
     pub values: BTreeMap<&'static str, SettingValue>,
 }
 
 impl MotorSettings {
     /// Creates settings with an ID only.
     pub fn new(id: impl Into<u64>) -> Self {
-        Self { id: id.into(), values: BTreeMap::new() }
+        Self {
+            id: id.into(),
+            values: BTreeMap::new(),
+        }
     }
 
     /// Returns the settings with an additional value.
@@ -77,7 +82,10 @@ impl MotorSettings {
     /// The choice of a word from a table of names; `None` if absent.
     pub fn choice<T: Copy>(&self, name: &str, choices: &[(&str, T)]) -> Option<T> {
         match self.values.get(name)? {
-            SettingValue::Word(word) => choices.iter().find(|(known, _)| known == word).map(|(_, choice)| *choice),
+            SettingValue::Word(word) => choices
+                .iter()
+                .find(|(known, _)| known == word)
+                .map(|(_, choice)| *choice),
             _ => None,
         }
     }
@@ -102,17 +110,34 @@ mod tests {
     #[test]
     fn settings_recreate_motor_and_match_keys() {
         for (ix, family) in FAMILIES.iter().enumerate() {
-            assert!(FAMILIES[..ix].iter().all(|other| other.name() != family.name()), "{family:?}: its name is taken");
+            assert!(
+                FAMILIES[..ix]
+                    .iter()
+                    .all(|other| other.name() != family.name()),
+                "{family:?}: its name is taken"
+            );
             let motor = family.fuzzing().motor;
             let settings = motor.settings();
-            assert!(motor.family().name() == family.name() && family.ids().contains(&settings.id), "{motor:?}");
+            assert!(
+                motor.family().name() == family.name() && family.ids().contains(&settings.id),
+                "{motor:?}"
+            );
             let keys = family.keys();
-            assert!(settings.values.keys().eq(keys.iter().map(|key| &key.name)), "{motor:?}: {settings:?}");
+            assert!(
+                settings.values.keys().eq(keys.iter().map(|key| &key.name)),
+                "{motor:?}: {settings:?}"
+            );
             for key in &keys {
                 let is_allowed = match (settings.values[key.name], &key.allowed) {
-                    (SettingValue::Whole(number), AllowedValues::Whole(range)) => range.contains(&number),
-                    (SettingValue::Number(number), AllowedValues::Number(range)) => range.contains(&number),
-                    (SettingValue::Word(word), AllowedValues::Words(words)) => words.contains(&word),
+                    (SettingValue::Whole(number), AllowedValues::Whole(range)) => {
+                        range.contains(&number)
+                    }
+                    (SettingValue::Number(number), AllowedValues::Number(range)) => {
+                        range.contains(&number)
+                    }
+                    (SettingValue::Word(word), AllowedValues::Words(words)) => {
+                        words.contains(&word)
+                    }
                     _ => false,
                 };
                 assert!(is_allowed, "{motor:?}: {key:?}");
@@ -121,7 +146,12 @@ mod tests {
             for key in keys.iter().filter(|key| key.required.is_some()) {
                 let mut incomplete = settings.clone();
                 incomplete.values.remove(key.name);
-                assert_eq!(family.motor(&incomplete), None, "{motor:?} without {}", key.name);
+                assert_eq!(
+                    family.motor(&incomplete),
+                    None,
+                    "{motor:?} without {}",
+                    key.name
+                );
             }
         }
     }
@@ -129,15 +159,24 @@ mod tests {
     #[test]
     fn motors_conflict_if_an_address_is_taken() {
         let conflicts = |motor, feedback| {
-            let first: &dyn MotorProtocol = &Damiao { motor: 1, feedback: 0x11 };
+            let first: &dyn MotorProtocol = &Damiao {
+                motor: 1,
+                feedback: 0x11,
+            };
             first.conflicts_with(&Damiao { motor, feedback })
         };
-        assert!(conflicts(1, 0x12) && conflicts(2, 0x11) && conflicts(0x11, 0x12) && conflicts(2, 1));
+        assert!(
+            conflicts(1, 0x12) && conflicts(2, 0x11) && conflicts(0x11, 0x12) && conflicts(2, 1)
+        );
         assert!(!conflicts(2, 0x12));
         for family in FAMILIES {
             let motor = family.fuzzing().motor;
             for other in FAMILIES.iter().map(|family| family.fuzzing().motor) {
-                assert_eq!(motor.conflicts_with(&*other), motor.as_ref() == other.as_ref(), "{motor:?} {other:?}");
+                assert_eq!(
+                    motor.conflicts_with(&*other),
+                    motor.as_ref() == other.as_ref(),
+                    "{motor:?} {other:?}"
+                );
             }
         }
     }

@@ -1,8 +1,9 @@
-//! Conversations of the driver with an emulated motor of each family, compared byte by byte with `transcript.txt` of the
-//! family's folder.
+//! Conversations of the driver with an emulated motor of each family, compared byte by byte with
+//! `transcript.txt` of the family's folder.
 //!
-//! In these files, `>` is a frame to the motor, `<` a frame from it, and `=` a result of the driver. After an intended
-//! change of a protocol, replace the file with the text that the test prints.
+//! In these files, `>` is a frame to the motor, `<` a frame from it, and `=` a result of the
+//! driver. After an intended change of a protocol, replace the file with the text that the test
+//! prints.
 
 use super::emulated::EmulatedMotor;
 use super::family::{Health, LIMITS};
@@ -43,8 +44,16 @@ struct TestBus {
 impl TestBus {
     fn new(config: &MotorConfig) -> Self {
         let motor = RefCell::new(EmulatedMotor::new(&*config.protocol, LIMITS));
-        let (waiting, is_quiet, transcript) = (RefCell::default(), Cell::new(false), RefCell::default());
-        Self { motor, now: Cell::new(Stamp(0)), waiting, other_master: None, is_quiet, transcript }
+        let (waiting, is_quiet, transcript) =
+            (RefCell::default(), Cell::new(false), RefCell::default());
+        Self {
+            motor,
+            now: Cell::new(Stamp(0)),
+            waiting,
+            other_master: None,
+            is_quiet,
+            transcript,
+        }
     }
 
     fn note(&self, line: &str) {
@@ -65,7 +74,9 @@ impl TestBus {
     }
 
     fn enqueue(&self, frames: Vec<Frame>) {
-        frames.iter().for_each(|frame| self.note_often(&format!("< {}", text_of(frame))));
+        frames
+            .iter()
+            .for_each(|frame| self.note_often(&format!("< {}", text_of(frame))));
         self.waiting.borrow_mut().extend(frames);
     }
 }
@@ -92,7 +103,11 @@ impl FrameIo for TestBus {
                 self.enqueue(answers);
             }
         }
-        Ok(self.waiting.borrow_mut().pop_front().map(|frame| (self.now.get(), BusEvent::Frame(frame))))
+        Ok(self
+            .waiting
+            .borrow_mut()
+            .pop_front()
+            .map(|frame| (self.now.get(), BusEvent::Frame(frame))))
     }
 }
 
@@ -102,18 +117,36 @@ fn text_of(frame: &Frame) -> String {
     } else {
         format!("{:03X}", frame.id().value())
     };
-    let bytes: Vec<String> = frame.data().iter().map(|byte| format!("{byte:02X}")).collect();
-    format!("{id}{} {}", if frame.is_remote() { " remote" } else { "" }, bytes.join(" "))
+    let bytes: Vec<String> = frame
+        .data()
+        .iter()
+        .map(|byte| format!("{byte:02X}"))
+        .collect();
+    format!(
+        "{id}{} {}",
+        if frame.is_remote() { " remote" } else { "" },
+        bytes.join(" ")
+    )
 }
 
 /// Finds a motor as a read-only arm does, and polls it.
 fn reading(config: &MotorConfig) -> String {
-    let bus = TestBus { other_master: config.protocol.family().fuzzing().other_master, ..TestBus::new(config) };
+    let bus = TestBus {
+        other_master: config.protocol.family().fuzzing().other_master,
+        ..TestBus::new(config)
+    };
     let motor = Motor::set_up(&bus, config).unwrap();
     let (answer, rate_hz) = motor.protocol().typical_answer();
-    bus.note(&format!("= answers like {} at {rate_hz:?} Hz", text_of(&answer)));
+    bus.note(&format!(
+        "= answers like {} at {rate_hz:?} Hz",
+        text_of(&answer)
+    ));
     for _ in 0..3 {
-        motor.protocol().poll_frame().iter().for_each(|frame| drop(bus.send(frame)));
+        motor
+            .protocol()
+            .poll_frame()
+            .iter()
+            .for_each(|frame| drop(bus.send(frame)));
         if motor.protocol().canopen_node().is_some() {
             bus.send(&canopen::encode_sync()).unwrap();
         }
@@ -130,28 +163,43 @@ fn reading(config: &MotorConfig) -> String {
 
 fn plan(on_loss: OnLoss, endpoints: Option<Endpoints>) -> WatchdogPlan {
     let host = canopen::Node::new(127).unwrap();
-    WatchdogPlan { on_loss, timeout: TIMEOUT, accept_no_watchdog: true, endpoints, host, period: PERIOD }
+    WatchdogPlan {
+        on_loss,
+        timeout: TIMEOUT,
+        accept_no_watchdog: true,
+        endpoints,
+        host,
+        period: PERIOD,
+    }
 }
 
-/// Runs cycles of a moving arm. The transcript contains frames and readings of the first two cycles, and all changes of
-/// the motor's health.
+/// Runs cycles of a moving arm. The transcript contains frames and readings of the first two
+/// cycles, and all changes of the motor's health.
 fn cycles(bus: &TestBus, motor: &mut MovableMotor, n: usize, position_rad: Option<f64>) {
     for cycle in 0..n {
         bus.is_quiet.set(cycle >= 2);
         if let Some(position_rad) = position_rad {
-            bus.send(&motor.command(position_rad, 0.125).unwrap()).unwrap();
+            bus.send(&motor.command(position_rad, 0.125).unwrap())
+                .unwrap();
             if motor.motor().protocol().canopen_node().is_some() {
-                bus.send(&canopen::encode_heartbeat(canopen::Node::new(127).unwrap(), canopen::NodeState::Operational))
-                    .unwrap();
+                bus.send(&canopen::encode_heartbeat(
+                    canopen::Node::new(127).unwrap(),
+                    canopen::NodeState::Operational,
+                ))
+                .unwrap();
                 bus.send(&canopen::encode_sync()).unwrap();
             }
         }
         let end = bus.now.get() + PERIOD;
         while bus.now.get() < end {
-            let Some((_, BusEvent::Frame(frame))) = bus.receive(PERIOD).unwrap() else { continue };
+            let Some((_, BusEvent::Frame(frame))) = bus.receive(PERIOD).unwrap() else {
+                continue;
+            };
             let before = motor.health().cloned();
             let reading = motor.process_frame(&frame);
-            reading.iter().for_each(|reading| bus.note_often(&format!("= {reading:?}")));
+            reading
+                .iter()
+                .for_each(|reading| bus.note_often(&format!("= {reading:?}")));
             if motor.health() != before.as_ref() {
                 bus.note(&format!("= {:?}", motor.health()));
             }
@@ -159,18 +207,30 @@ fn cycles(bus: &TestBus, motor: &mut MovableMotor, n: usize, position_rad: Optio
     }
     bus.is_quiet.set(false);
     let emulated = bus.motor.borrow();
-    bus.note(&format!("= {:?} {:.6?} {:?}", emulated.state(), emulated.motion(), emulated.target()));
+    bus.note(&format!(
+        "= {:?} {:.6?} {:?}",
+        emulated.state(),
+        emulated.motion(),
+        emulated.target()
+    ));
 }
 
 fn start(bus: &TestBus, config: &MotorConfig, plan: &WatchdogPlan) -> Result<MovableMotor, Error> {
     bus.note("# prepare");
     let mut motor = MovableMotor::prepare(bus, config, plan)?;
     bus.note("# poll");
-    motor.poll_frame().iter().for_each(|frame| drop(bus.send(frame)));
+    motor
+        .poll_frame()
+        .iter()
+        .for_each(|frame| drop(bus.send(frame)));
     cycles(bus, &mut motor, 1, None);
     motor.clear_health();
     bus.note("# enable");
-    motor.enable().unwrap().iter().for_each(|frame| drop(bus.send(frame)));
+    motor
+        .enable()
+        .unwrap()
+        .iter()
+        .for_each(|frame| drop(bus.send(frame)));
     cycles(bus, &mut motor, 25, Some(0.375));
     Ok(motor)
 }
@@ -182,13 +242,27 @@ fn moving(config: &MotorConfig, plan: &WatchdogPlan) -> String {
         return format!("= {error}\n");
     }
     let traffic = config.protocol.traffic();
-    traffic.cycle_frames.iter().for_each(|frame| bus.note(&format!("= in each cycle {}", text_of(frame))));
-    traffic.unsolicited.iter().for_each(|(frame, rate_hz)| bus.note(&format!("= {} at {rate_hz} Hz", text_of(frame))));
+    traffic
+        .cycle_frames
+        .iter()
+        .for_each(|frame| bus.note(&format!("= in each cycle {}", text_of(frame))));
+    traffic
+        .unsolicited
+        .iter()
+        .for_each(|(frame, rate_hz)| bus.note(&format!("= {} at {rate_hz} Hz", text_of(frame))));
     let run = || {
         let mut motor = start(&bus, config, plan)?;
-        let wide = MotionLimits { position: [-1e9, f64::INFINITY], velocity: 1e9, acceleration: 1.0, jerk: 1.0 };
+        let wide = MotionLimits {
+            position: [-1e9, f64::INFINITY],
+            velocity: 1e9,
+            acceleration: 1.0,
+            jerk: 1.0,
+        };
         bus.note(&format!("= {:?}", motor.limits(&wide)));
-        bus.note(&format!("= silent for at most {:?}", motor.max_silence(Duration::from_millis(40))));
+        bus.note(&format!(
+            "= silent for at most {:?}",
+            motor.max_silence(Duration::from_millis(40))
+        ));
         bus.note("# commands stop");
         cycles(&bus, &mut motor, 40, None);
         let mut motor = start(&bus, config, plan)?;
@@ -196,7 +270,11 @@ fn moving(config: &MotorConfig, plan: &WatchdogPlan) -> String {
         bus.motor.borrow_mut().fail();
         cycles(&bus, &mut motor, 25, Some(0.5));
         let mut motor = start(&bus, config, plan)?;
-        assert!(matches!(motor.health(), Some(Health::Enabled)), "{:?}", motor.health());
+        assert!(
+            matches!(motor.health(), Some(Health::Enabled)),
+            "{:?}",
+            motor.health()
+        );
         for on_loss in [OnLoss::Hold, OnLoss::Damp, OnLoss::Release] {
             bus.note(&format!("# shut down: {}", on_loss.name()));
             bus.send(&motor.shutdown(on_loss, 0.375).unwrap()).unwrap();
@@ -209,7 +287,11 @@ fn moving(config: &MotorConfig, plan: &WatchdogPlan) -> String {
 }
 
 /// The last line of a failed preparation.
-fn rejected(config: &MotorConfig, plan: &WatchdogPlan, change: impl Fn(&mut EmulatedMotor)) -> String {
+fn rejected(
+    config: &MotorConfig,
+    plan: &WatchdogPlan,
+    change: impl Fn(&mut EmulatedMotor),
+) -> String {
     let bus = TestBus::new(config);
     change(&mut bus.motor.borrow_mut());
     match MovableMotor::prepare(&bus, config, plan) {
@@ -237,30 +319,61 @@ impl FrameIo for SilentBus {
 }
 
 fn conversation(config: &MotorConfig) -> String {
-    let gains = Some(Gains { stiffness_nm_rad: 60.0, damping_nm_s_rad: 4.0 });
-    let config = &MotorConfig { gains, ..config.clone() };
+    let gains = Some(Gains {
+        stiffness_nm_rad: 60.0,
+        damping_nm_s_rad: 4.0,
+    });
+    let config = &MotorConfig {
+        gains,
+        ..config.clone()
+    };
     let silence = Motor::set_up(&SilentBus, config).unwrap_err();
     let mut text = format!("## silent\n= {silence}\n## reading\n{}", reading(config));
     for on_loss in [OnLoss::Hold, OnLoss::Damp, OnLoss::Release] {
-        let [moved, without_endpoints] =
-            [Some(emulated::endpoints()), None].map(|endpoints| moving(config, &plan(on_loss, endpoints)));
+        let [moved, without_endpoints] = [Some(emulated::endpoints()), None]
+            .map(|endpoints| moving(config, &plan(on_loss, endpoints)));
         write!(text, "## moving, {}\n{moved}", on_loss.name()).unwrap();
         if without_endpoints != moved {
-            write!(text, "## moving without endpoints, {}\n{without_endpoints}", on_loss.name()).unwrap();
+            write!(
+                text,
+                "## moving without endpoints, {}\n{without_endpoints}",
+                on_loss.name()
+            )
+            .unwrap();
         }
     }
     text += "## rejected\n";
-    let strict = WatchdogPlan { accept_no_watchdog: false, ..plan(OnLoss::Release, None) };
-    text += &check_motor(&strict, config, "test0").map_or_else(|error| format!("= {error}\n"), |()| String::new());
-    let without_gains = MotorConfig { gains: None, ..config.clone() };
-    text +=
-        &check_motor(&strict, &without_gains, "test0").map_or_else(|error| format!("= {error}\n"), |()| String::new());
+    let strict = WatchdogPlan {
+        accept_no_watchdog: false,
+        ..plan(OnLoss::Release, None)
+    };
+    text += &check_motor(&strict, config, "test0")
+        .map_or_else(|error| format!("= {error}\n"), |()| String::new());
+    let without_gains = MotorConfig {
+        gains: None,
+        ..config.clone()
+    };
+    text += &check_motor(&strict, &without_gains, "test0")
+        .map_or_else(|error| format!("= {error}\n"), |()| String::new());
     let lenient = plan(OnLoss::Release, Some(emulated::endpoints()));
     text += &rejected(config, &lenient, EmulatedMotor::ignore_timeout);
-    let endpoints = Endpoints { firmware: "0.6.8".to_owned(), ..emulated::endpoints() };
+    let endpoints = Endpoints {
+        firmware: "0.6.8".to_owned(),
+        ..emulated::endpoints()
+    };
     text += &rejected(config, &plan(OnLoss::Release, Some(endpoints)), |_| {});
-    let gains = Some(Gains { stiffness_nm_rad: 3e4, damping_nm_s_rad: 4.0 });
-    text += &rejected(&MotorConfig { gains, ..config.clone() }, &lenient, |_| {});
+    let gains = Some(Gains {
+        stiffness_nm_rad: 3e4,
+        damping_nm_s_rad: 4.0,
+    });
+    text += &rejected(
+        &MotorConfig {
+            gains,
+            ..config.clone()
+        },
+        &lenient,
+        |_| {},
+    );
     text
 }
 
@@ -270,8 +383,18 @@ fn conversations_match_transcripts() {
         let family = config.protocol.family();
         let (text, expected) = (conversation(&config), family.fuzzing().transcript);
         for (number, (got, expected)) in (1..).zip(text.lines().zip(expected.lines())) {
-            assert_eq!(got, expected, "line {number} of transcript.txt of {}; all lines:\n{text}", family.name());
+            assert_eq!(
+                got,
+                expected,
+                "line {number} of transcript.txt of {}; all lines:\n{text}",
+                family.name()
+            );
         }
-        assert_eq!(text.lines().count(), expected.lines().count(), "lines of transcript.txt of {}", family.name());
+        assert_eq!(
+            text.lines().count(),
+            expected.lines().count(),
+            "lines of transcript.txt of {}",
+            family.name()
+        );
     }
 }

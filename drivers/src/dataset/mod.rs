@@ -17,12 +17,13 @@ pub struct Dataset {
     pub path: PathBuf,
     /// Images, sorted by file name (nerfstudio) or time (TUM); never empty.
     pub images: Vec<DatasetImage>,
-    /// PLY file of points on the surfaces of the scene, in the world frame of the images; it may not exist. `None` if the
-    /// dataset names none.
+    /// PLY file of points on the surfaces of the scene, in the world frame of the images; it may
+    /// not exist. `None` if the dataset names none.
     pub points_path: Option<PathBuf>,
     /// Number of images skipped because their file does not exist.
     pub n_missing: usize,
-    /// Number of images skipped because their file is corrupt, or no pose or depth is close enough in time.
+    /// Number of images skipped because their file is corrupt, or no pose or depth is close enough
+    /// in time.
     pub n_unusable: usize,
     /// Notes for the user: one sentence each, with the names of the first skipped images.
     pub notes: Vec<String>,
@@ -43,7 +44,9 @@ fn is_nerfstudio(path: &Path) -> bool {
 
 /// Whether [`read`] accepts `path` as a dataset folder; its contents are not checked.
 pub fn is_dataset_folder(path: &Path) -> bool {
-    [nerfstudio::FILE_NAME, tum::COLOR_LIST].iter().any(|name| path.join(name).is_file())
+    [nerfstudio::FILE_NAME, tum::COLOR_LIST]
+        .iter()
+        .any(|name| path.join(name).is_file())
 }
 
 /// Reads a dataset folder of either kind; `path` may also name a `transforms.json`.
@@ -54,10 +57,13 @@ pub fn read(path: &Path) -> Result<Dataset, Error> {
     if path.join(tum::COLOR_LIST).is_file() {
         return tum::read(path);
     }
-    Err(Error::NotADataset { path: path.to_owned() })
+    Err(Error::NotADataset {
+        path: path.to_owned(),
+    })
 }
 
-/// Describes a focal length or principal point that no camera has, such as the result of a division by almost zero.
+/// Describes a focal length or principal point that no camera has, such as the result of a division
+/// by almost zero.
 fn implausible(intrinsics: &Intrinsics) -> Option<String> {
     /// Relative to the longer side: fields of view from 0.06 to 176 degrees.
     const FOCAL: std::ops::RangeInclusive<f64> = 0.02..=1000.0;
@@ -65,7 +71,10 @@ fn implausible(intrinsics: &Intrinsics) -> Option<String> {
     const CENTER: std::ops::RangeInclusive<f64> = -1.0..=2.0;
     let [width, height] = intrinsics.size_px.map(f64::from);
     let longer = width.max(height);
-    let focal = intrinsics.focal_px.iter().any(|focal_px| !FOCAL.contains(&(focal_px / longer)));
+    let focal = intrinsics
+        .focal_px
+        .iter()
+        .any(|focal_px| !FOCAL.contains(&(focal_px / longer)));
     let [x, y] = intrinsics.principal_px;
     let center = !(CENTER.contains(&(x / width)) && CENTER.contains(&(y / height)));
     (focal || center).then(|| {
@@ -98,39 +107,77 @@ impl SkippedImages {
     fn lines(&mut self, list: &str, reasons: &[String]) {
         if !reasons.is_empty() {
             let (lines, _) = plural(reasons.len(), "line");
-            self.lost.push(format!("{list}: {lines} cannot be used: {}", first_names(reasons)));
+            self.lost.push(format!(
+                "{list}: {lines} cannot be used: {}",
+                first_names(reasons)
+            ));
         }
     }
 
     /// Builds the dataset. Fails if it is empty.
-    fn dataset(self, path: &Path, images: Vec<DatasetImage>, mut notes: Vec<String>) -> Result<Dataset, Error> {
+    fn dataset(
+        self,
+        path: &Path,
+        images: Vec<DatasetImage>,
+        mut notes: Vec<String>,
+    ) -> Result<Dataset, Error> {
         let (n_missing, n_unusable) = (self.missing.len(), self.unusable.len() + self.broken.len());
         if images.is_empty() {
             let first_broken = self.broken.iter().chain(&self.unusable).next();
             let first_broken = first_broken.map(|(name, reason)| format!(" ({name}: {reason})"));
-            let first_missing = self.missing.first().map(|name| format!(" (such as {name})"));
+            let first_missing = self
+                .missing
+                .first()
+                .map(|name| format!(" (such as {name})"));
             let first_reason = first_broken.or(first_missing).unwrap_or_default();
-            return Err(Error::EmptyDataset { path: path.to_owned(), n_missing, n_unusable, first_reason });
+            return Err(Error::EmptyDataset {
+                path: path.to_owned(),
+                n_missing,
+                n_unusable,
+                first_reason,
+            });
         }
         if n_missing > 0 {
             let (what, verb) = plural(n_missing, "image");
-            notes.push(format!("{what} {verb} missing: {}", first_names(&self.missing)));
+            notes.push(format!(
+                "{what} {verb} missing: {}",
+                first_names(&self.missing)
+            ));
         }
         notes.extend(unusable_note(&self.unusable));
-        let data_losses = self.lost.into_iter().chain(unusable_note(&self.broken)).collect();
-        Ok(Dataset { path: path.to_owned(), images, points_path: None, n_missing, n_unusable, notes, data_losses })
+        let data_losses = self
+            .lost
+            .into_iter()
+            .chain(unusable_note(&self.broken))
+            .collect();
+        Ok(Dataset {
+            path: path.to_owned(),
+            images,
+            points_path: None,
+            n_missing,
+            n_unusable,
+            notes,
+            data_losses,
+        })
     }
 }
 
 fn unusable_note(images: &[(String, String)]) -> Option<String> {
-    let named: Vec<_> = images.iter().map(|(name, reason)| format!("{name} ({reason})")).collect();
+    let named: Vec<_> = images
+        .iter()
+        .map(|(name, reason)| format!("{name} ({reason})"))
+        .collect();
     let (n_images, _) = plural(images.len(), "image");
     (!named.is_empty()).then(|| format!("{n_images} cannot be used: {}", first_names(&named)))
 }
 
 /// Returns a noun with its count, and the matching verb: `1 image` and `is`, `2 images` and `are`.
 fn plural(n: usize, noun: &str) -> (String, &'static str) {
-    if n == 1 { (format!("1 {noun}"), "is") } else { (format!("{n} {noun}s"), "are") }
+    if n == 1 {
+        (format!("1 {noun}"), "is")
+    } else {
+        (format!("{n} {noun}s"), "are")
+    }
 }
 
 /// The first names, and how many more there are.

@@ -1,10 +1,12 @@
 //! Folders with a `transforms.json`, as written by nerfstudio and instant-ngp.
 //!
-//! Cameras in these files look along -z with y up (OpenGL). Poses are converted to our convention only in this module.
+//! Cameras in these files look along -z with y up (OpenGL). Poses are converted to our convention
+//! only in this module.
 
 use super::posed_image::image_size_px;
 use super::{
-    Dataset, DatasetImage, DepthFile, ListedSplit, MAX_POSITION_M, SkippedImages, first_names, implausible, plural,
+    Dataset, DatasetImage, DepthFile, ListedSplit, MAX_POSITION_M, SkippedImages, first_names,
+    implausible, plural,
 };
 use crate::Error;
 use crate::wire::json;
@@ -47,37 +49,58 @@ const UNUSED: [&str; 14] = [
 
 /// Reads a folder, or the file itself.
 ///
-/// Images are sorted by file name. The following images are skipped and counted: duplicates, missing or broken files,
-/// poses that are not finite or not rigid, and poses that are implausibly far away. If the file lists the images of the
-/// splits, images in no list are left out. The keys are explained in docs/reference/datasets.md.
+/// Images are sorted by file name. The following images are skipped and counted: duplicates,
+/// missing or broken files, poses that are not finite or not rigid, and poses that are implausibly
+/// far away. If the file lists the images of the splits, images in no list are left out. The keys
+/// are explained in docs/reference/datasets.md.
 ///
 /// # Errors
-/// If the file cannot be parsed, no image is usable, or a frame uses an unsupported camera model; the error names the
-/// frame.
+/// If the file cannot be parsed, no image is usable, or a frame uses an unsupported camera model;
+/// the error names the frame.
 pub fn read(path: &Path) -> Result<Dataset, Error> {
-    let file = if path.is_file() { path.to_owned() } else { path.join(FILE_NAME) };
+    let file = if path.is_file() {
+        path.to_owned()
+    } else {
+        path.join(FILE_NAME)
+    };
     let folder = file.parent().unwrap_or(Path::new(".")).to_owned();
-    let text = files::read_text(&file).map_err(|source| Error::Open { path: file.clone(), source })?;
-    let file_error = |reason: String| Error::DatasetFile { path: file.clone(), reason };
+    let text = files::read_text(&file).map_err(|source| Error::Open {
+        path: file.clone(),
+        source,
+    })?;
+    let file_error = |reason: String| Error::DatasetFile {
+        path: file.clone(),
+        reason,
+    };
     if !text.trim_start().starts_with('{') {
-        return Err(file_error("not a recording (.mcap), a dataset folder or a transforms.json".to_owned()));
+        return Err(file_error(
+            "not a recording (.mcap), a dataset folder or a transforms.json".to_owned(),
+        ));
     }
-    let mut document: Document =
-        serde_json::from_str(&json::nan_as_null(&text)).map_err(|error| file_error(error.to_string()))?;
-    document.frames.sort_by(|a, b| a.file_path.cmp(&b.file_path));
+    let mut document: Document = serde_json::from_str(&json::nan_as_null(&text))
+        .map_err(|error| file_error(error.to_string()))?;
+    document
+        .frames
+        .sort_by(|a, b| a.file_path.cmp(&b.file_path));
     let splits = document.splits().map_err(file_error)?;
-    let meters_per_count = document.depth_unit_scale_factor.unwrap_or(DEFAULT_METERS_PER_COUNT);
+    let meters_per_count = document
+        .depth_unit_scale_factor
+        .unwrap_or(DEFAULT_METERS_PER_COUNT);
     if !METERS_PER_COUNT.contains(&meters_per_count) {
         return Err(file_error(format!(
             "depth_unit_scale_factor is {meters_per_count:e} meters per count, expected a number from 1e-6 to 1"
         )));
     }
 
-    let (mut images, mut skipped, mut notes) = (Vec::new(), SkippedImages::default(), document.notes());
+    let (mut images, mut skipped, mut notes) =
+        (Vec::new(), SkippedImages::default(), document.notes());
     let (mut unlisted, mut rounded, mut has_other_size) = (Vec::new(), Vec::new(), false);
     for (ix, entry) in document.frames.iter().enumerate() {
         if ix > 0 && document.frames[ix - 1].file_path == entry.file_path {
-            skipped.unusable.push((entry.file_path.clone(), "listed twice, only the first entry is used".to_owned()));
+            skipped.unusable.push((
+                entry.file_path.clone(),
+                "listed twice, only the first entry is used".to_owned(),
+            ));
             continue;
         }
         let listed = splits.get(normalized(&entry.file_path).as_str()).copied();
@@ -85,9 +108,15 @@ pub fn read(path: &Path) -> Result<Dataset, Error> {
             unlisted.push(entry.file_path.clone());
             continue;
         }
-        let frame_error = |reason: String| file_error(format!("frame {:?}: {reason}", entry.file_path));
+        let frame_error =
+            |reason: String| file_error(format!("frame {:?}: {reason}", entry.file_path));
         let rows = rows_of(&entry.transform_matrix).map_err(frame_error)?;
-        let depth_rows = entry.depth_transform_matrix.as_ref().map(rows_of).transpose().map_err(frame_error)?;
+        let depth_rows = entry
+            .depth_transform_matrix
+            .as_ref()
+            .map(rows_of)
+            .transpose()
+            .map_err(frame_error)?;
         let Some(image_path) = find_image(&folder, &entry.file_path) else {
             skipped.missing.push(entry.file_path.clone());
             continue;
@@ -95,12 +124,20 @@ pub fn read(path: &Path) -> Result<Dataset, Error> {
         let size_px = match image_size_px(&image_path) {
             Ok(size_px) => size_px,
             Err(error) => {
-                skipped.broken.push((entry.file_path.clone(), reason_of(&error)));
+                skipped
+                    .broken
+                    .push((entry.file_path.clone(), reason_of(&error)));
                 continue;
             }
         };
-        let poses = world_from_camera(&rows)
-            .and_then(|pose| Ok((pose, depth_rows.map(|rows| self::world_from_camera(&rows)).transpose()?)));
+        let poses = world_from_camera(&rows).and_then(|pose| {
+            Ok((
+                pose,
+                depth_rows
+                    .map(|rows| self::world_from_camera(&rows))
+                    .transpose()?,
+            ))
+        });
         let (world_from_camera, depth_pose) = match poses {
             Ok(((pose, is_rounded), depth_pose)) => {
                 if is_rounded {
@@ -113,8 +150,10 @@ pub fn read(path: &Path) -> Result<Dataset, Error> {
                 continue;
             }
         };
-        if let Some(excessive_distance_m) =
-            [Some(world_from_camera), depth_pose].into_iter().flatten().find_map(excessive_distance_m)
+        if let Some(excessive_distance_m) = [Some(world_from_camera), depth_pose]
+            .into_iter()
+            .flatten()
+            .find_map(excessive_distance_m)
         {
             skipped.broken.push((
                 entry.file_path.clone(),
@@ -131,12 +170,19 @@ pub fn read(path: &Path) -> Result<Dataset, Error> {
                 size_px[0], size_px[1]
             ));
         }
-        let depth_path = entry.depth_file_path.as_ref().and_then(|name| find_image(&folder, name));
+        let depth_path = entry
+            .depth_file_path
+            .as_ref()
+            .and_then(|name| find_image(&folder, name));
         images.push(DatasetImage {
             name: entry.file_path.clone(),
             intrinsics,
             world_from_camera,
-            stamp: Stamp(i64::try_from(ix).unwrap_or(i64::MAX).saturating_mul(1_000_000)),
+            stamp: Stamp(
+                i64::try_from(ix)
+                    .unwrap_or(i64::MAX)
+                    .saturating_mul(1_000_000),
+            ),
             image_path,
             depth: depth_path.map(|path| DepthFile {
                 path,
@@ -150,12 +196,26 @@ pub fn read(path: &Path) -> Result<Dataset, Error> {
             listed,
         });
     }
-    let names: BTreeSet<String> = document.frames.iter().map(|entry| normalized(&entry.file_path)).collect();
-    let mut absent: Vec<String> = splits.keys().filter(|name| !names.contains(*name)).cloned().collect();
+    let names: BTreeSet<String> = document
+        .frames
+        .iter()
+        .map(|entry| normalized(&entry.file_path))
+        .collect();
+    let mut absent: Vec<String> = splits
+        .keys()
+        .filter(|name| !names.contains(*name))
+        .cloned()
+        .collect();
     absent.sort_unstable();
     for (names, what) in [
-        (&unlisted, "not used, because train_filenames, val_filenames and test_filenames do not contain them"),
-        (&absent, "only in train_filenames, val_filenames or test_filenames, but not in frames"),
+        (
+            &unlisted,
+            "not used, because train_filenames, val_filenames and test_filenames do not contain them",
+        ),
+        (
+            &absent,
+            "only in train_filenames, val_filenames or test_filenames, but not in frames",
+        ),
     ] {
         if !names.is_empty() {
             let (images, verb) = plural(names.len(), "image");
@@ -177,15 +237,29 @@ pub fn read(path: &Path) -> Result<Dataset, Error> {
             first_names(&unlisted)
         )));
     }
-    let lacking = document.frames.iter().filter(|entry| entry.lacks_depth(&folder));
-    let missing_depth: Vec<String> = lacking.filter_map(|entry| entry.depth_file_path.clone()).collect();
+    let lacking = document
+        .frames
+        .iter()
+        .filter(|entry| entry.lacks_depth(&folder));
+    let missing_depth: Vec<String> = lacking
+        .filter_map(|entry| entry.depth_file_path.clone())
+        .collect();
     if !missing_depth.is_empty() {
         let (images, verb) = plural(missing_depth.len(), "depth image");
-        notes.push(format!("{images} {verb} missing: {}", first_names(&missing_depth)));
+        notes.push(format!(
+            "{images} {verb} missing: {}",
+            first_names(&missing_depth)
+        ));
     }
-    // The points are in the frame of the poses: nerfstudio applies `applied_transform` to both when it writes them.
-    let points_path = document.ply_file_path.map(|name| find_file(&folder, &name).unwrap_or_else(|| folder.join(name)));
-    Ok(Dataset { points_path, ..skipped.dataset(&folder, images, notes)? })
+    // The points are in the frame of the poses: nerfstudio applies `applied_transform` to both when
+    // it writes them.
+    let points_path = document
+        .ply_file_path
+        .map(|name| find_file(&folder, &name).unwrap_or_else(|| folder.join(name)));
+    Ok(Dataset {
+        points_path,
+        ..skipped.dataset(&folder, images, notes)?
+    })
 }
 
 /// The whole file.
@@ -207,10 +281,15 @@ struct Document {
 }
 
 impl Document {
-    /// The split of each listed image; empty if the file has no lists. The keys are [`normalized`]. Without test images,
-    /// the validation images are the test images, as they are scored in nerfstudio.
+    /// The split of each listed image; empty if the file has no lists. The keys are [`normalized`].
+    /// Without test images, the validation images are the test images, as they are scored in
+    /// nerfstudio.
     fn splits(&self) -> Result<HashMap<String, ListedSplit>, String> {
-        let validation = if self.test_filenames.is_empty() { ListedSplit::Test } else { ListedSplit::Validation };
+        let validation = if self.test_filenames.is_empty() {
+            ListedSplit::Test
+        } else {
+            ListedSplit::Validation
+        };
         let mut splits = HashMap::new();
         for (list, names, split) in [
             ("train_filenames", &self.train_filenames, ListedSplit::Train),
@@ -227,23 +306,41 @@ impl Document {
         }
         if self.train_filenames.is_empty() && !splits.is_empty() {
             for entry in &self.frames {
-                splits.entry(normalized(&entry.file_path)).or_insert(("train_filenames", ListedSplit::Train));
+                splits
+                    .entry(normalized(&entry.file_path))
+                    .or_insert(("train_filenames", ListedSplit::Train));
             }
         }
-        Ok(splits.into_iter().map(|(name, (_, split))| (name, split)).collect())
+        Ok(splits
+            .into_iter()
+            .map(|(name, (_, split))| (name, split))
+            .collect())
     }
 
     /// Notes about keys that are not used.
     fn notes(&self) -> Vec<String> {
         let mut notes = Vec::new();
         let unknown = |keys: &BTreeMap<String, Value>| -> Vec<String> {
-            keys.keys().filter(|key| !UNUSED.contains(&key.as_str())).map(|key| format!("{key:?}")).collect()
+            keys.keys()
+                .filter(|key| !UNUSED.contains(&key.as_str()))
+                .map(|key| format!("{key:?}"))
+                .collect()
         };
         let of_file = unknown(&self.other);
-        let of_frames: BTreeSet<String> = self.frames.iter().flat_map(|entry| unknown(&entry.other)).collect();
-        for (keys, place) in [(of_file, ""), (of_frames.into_iter().collect(), " of frames")] {
+        let of_frames: BTreeSet<String> = self
+            .frames
+            .iter()
+            .flat_map(|entry| unknown(&entry.other))
+            .collect();
+        for (keys, place) in [
+            (of_file, ""),
+            (of_frames.into_iter().collect(), " of frames"),
+        ] {
             if !keys.is_empty() {
-                notes.push(format!("unknown keys{place} are not used: {}", first_names(&keys)));
+                notes.push(format!(
+                    "unknown keys{place} are not used: {}",
+                    first_names(&keys)
+                ));
             }
         }
         notes
@@ -316,28 +413,43 @@ struct CameraEntry {
 /// Deserializes a number and rejects null, which stands for NaN. Missing keys are allowed.
 fn deserialize_finite<'de, D: Deserializer<'de>>(from: D) -> Result<Option<f64>, D::Error> {
     let number = Option::<f64>::deserialize(from)?;
-    number.map(Some).ok_or_else(|| D::Error::custom("a lens parameter is not a finite number"))
+    number
+        .map(Some)
+        .ok_or_else(|| D::Error::custom("a lens parameter is not a finite number"))
 }
 
 impl FrameEntry {
     fn lacks_depth(&self, folder: &Path) -> bool {
         let exists = |name: &String| find_image(folder, name).is_some();
-        exists(&self.file_path) && self.depth_file_path.as_ref().is_some_and(|name| !exists(name))
+        exists(&self.file_path)
+            && self
+                .depth_file_path
+                .as_ref()
+                .is_some_and(|name| !exists(name))
     }
 }
 
 fn rows_of(matrix: &Matrix) -> Result<[f64; 16], String> {
-    let mut rows: Vec<f64> = matrix.iter().flatten().map(|value| value.unwrap_or(f64::NAN)).collect();
+    let mut rows: Vec<f64> = matrix
+        .iter()
+        .flatten()
+        .map(|value| value.unwrap_or(f64::NAN))
+        .collect();
     if rows.len() == 12 {
         rows.extend([0.0, 0.0, 0.0, 1.0]);
     }
-    rows.try_into()
-        .map_err(|rows: Vec<f64>| format!("transform_matrix has {} numbers, expected 4 rows of 4", rows.len()))
+    rows.try_into().map_err(|rows: Vec<f64>| {
+        format!(
+            "transform_matrix has {} numbers, expected 4 rows of 4",
+            rows.len()
+        )
+    })
 }
 
 /// Converts an OpenGL camera pose to our convention. Also returns whether its numbers are rounded.
 fn world_from_camera(rows: &[f64; 16]) -> Result<(Transform, bool), String> {
-    let (world_from_opengl, is_rounded) = transform::from_rounded_rows(rows).map_err(|error| error.to_string())?;
+    let (world_from_opengl, is_rounded) =
+        transform::from_rounded_rows(rows).map_err(|error| error.to_string())?;
     Ok((world_from_opengl * opengl_from_camera(), is_rounded))
 }
 
@@ -347,7 +459,8 @@ fn excessive_distance_m(pose: Transform) -> Option<f64> {
     (excessive_distance_m > MAX_POSITION_M).then_some(excessive_distance_m)
 }
 
-/// Rotation by 180 degrees about x: OpenGL cameras look along -z with y up, ours along z with y down.
+/// Rotation by 180 degrees about x: OpenGL cameras look along -z with y up, ours along z with y
+/// down.
 pub fn opengl_from_camera() -> Transform {
     let half_turn = UnitQuaternion::new_unchecked(nalgebra::Quaternion::new(0.0, 1.0, 0.0, 0.0));
     Transform::from_parts(Vector3::zeros().into(), half_turn)
@@ -356,7 +469,11 @@ pub fn opengl_from_camera() -> Transform {
 impl CameraEntry {
     /// Returns these parameters, and the common ones where they are not set.
     fn or(&self, common: &Self) -> Self {
-        let model = || self.camera_model.clone().or_else(|| common.camera_model.clone());
+        let model = || {
+            self.camera_model
+                .clone()
+                .or_else(|| common.camera_model.clone())
+        };
         Self {
             camera_model: model(),
             w: self.w.or(common.w),
@@ -380,7 +497,11 @@ impl CameraEntry {
     }
 
     /// Image size that the parameters refer to, if the file contains it.
-    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "sizes are small; the cast saturates")]
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "sizes are small; the cast saturates"
+    )]
     fn size_px(&self) -> Option<[u32; 2]> {
         Some([self.w? as u32, self.h? as u32])
     }
@@ -393,12 +514,18 @@ impl CameraEntry {
             if let (name, Some(angle_rad)) = angle
                 && !(angle_rad > 0.0 && angle_rad < std::f64::consts::PI)
             {
-                return Err(format!("{name} is {angle_rad}, expected radians from 0 to pi; is it in degrees?"));
+                return Err(format!(
+                    "{name} is {angle_rad}, expected radians from 0 to pi; is it in degrees?"
+                ));
             }
-            let from_angle = angle.1.map(|angle_rad| 0.5 * side_px / (0.5 * angle_rad).tan());
+            let from_angle = angle
+                .1
+                .map(|angle_rad| 0.5 * side_px / (0.5 * angle_rad).tan());
             match (given.1, from_angle) {
                 // Angles are usually written with fewer digits.
-                (Some(focal_px), Some(from_angle)) if (from_angle / focal_px - 1.0).abs() > MAX_FOCAL_DIFFERENCE => {
+                (Some(focal_px), Some(from_angle))
+                    if (from_angle / focal_px - 1.0).abs() > MAX_FOCAL_DIFFERENCE =>
+                {
                     Err(format!(
                         "{} is {focal_px}, but {} means {from_angle:.1} for {side_px} pixels; remove the wrong one",
                         given.0, angle.0
@@ -407,13 +534,24 @@ impl CameraEntry {
                 (focal_px, from_angle) => Ok(focal_px.or(from_angle)),
             }
         };
-        let focal_x = focal_px(("fl_x", self.fl_x), ("camera_angle_x", self.camera_angle_x), width)?;
-        let focal_y = focal_px(("fl_y", self.fl_y), ("camera_angle_y", self.camera_angle_y), height)?;
+        let focal_x = focal_px(
+            ("fl_x", self.fl_x),
+            ("camera_angle_x", self.camera_angle_x),
+            width,
+        )?;
+        let focal_y = focal_px(
+            ("fl_y", self.fl_y),
+            ("camera_angle_y", self.camera_angle_y),
+            height,
+        )?;
         let focal_x = focal_x.ok_or("no focal length: neither fl_x nor camera_angle_x")?;
         let reported = Intrinsics {
             size_px,
             focal_px: [focal_x, focal_y.unwrap_or(focal_x)],
-            principal_px: [self.cx.unwrap_or(0.5 * width), self.cy.unwrap_or(0.5 * height)],
+            principal_px: [
+                self.cx.unwrap_or(0.5 * width),
+                self.cy.unwrap_or(0.5 * height),
+            ],
             lens: self.lens()?,
             rectified: false,
         };
@@ -427,7 +565,9 @@ impl CameraEntry {
     fn lens(&self) -> Result<Lens, String> {
         for (name, value) in [("k5", self.k5), ("k6", self.k6)] {
             if value.is_some_and(|value| value != 0.0) {
-                return Err(format!("{name} is not 0, but only k1 to k4, p1 and p2 are supported"));
+                return Err(format!(
+                    "{name} is not 0, but only k1 to k4, p1 and p2 are supported"
+                ));
             }
         }
         let [k1, k2, k3, k4, p1, p2] =
@@ -439,9 +579,9 @@ impl CameraEntry {
             None | Some("OPENCV" | "PINHOLE" | "SIMPLE_PINHOLE" | "SIMPLE_RADIAL" | "RADIAL") => {
                 let coefficients = [k1, k2, p1, p2, k3];
                 match (k4 == 0.0, coefficients == [0.0; 5]) {
-                    (false, _) => {
-                        Err(format!("k4 is {k4}, but a fourth radial coefficient is only supported for OPENCV_FISHEYE"))
-                    }
+                    (false, _) => Err(format!(
+                        "k4 is {k4}, but a fourth radial coefficient is only supported for OPENCV_FISHEYE"
+                    )),
                     (true, true) => Ok(Lens::Pinhole),
                     (true, false) => Ok(Lens::BrownConrady(coefficients)),
                 }
@@ -455,7 +595,10 @@ impl CameraEntry {
 
 /// Finds the file with this name. Windows programs write `\\` as separator.
 fn find_file(folder: &Path, name: &str) -> Option<PathBuf> {
-    [name, &name.replace('\\', "/")].into_iter().map(|name| folder.join(name)).find(|path| path.is_file())
+    [name, &name.replace('\\', "/")]
+        .into_iter()
+        .map(|name| folder.join(name))
+        .find(|path| path.is_file())
 }
 
 /// Finds the file with this name, or with this name plus one of the known extensions.

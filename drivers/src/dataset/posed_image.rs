@@ -17,8 +17,8 @@ pub struct DatasetImage {
     pub intrinsics: Intrinsics,
     /// Pose at `stamp`.
     pub world_from_camera: Transform,
-    /// Time at which the photo was taken. If the dataset has no times, images are 1 ms apart in the order of their
-    /// names.
+    /// Time at which the photo was taken. If the dataset has no times, images are 1 ms apart in the
+    /// order of their names.
     pub stamp: Stamp,
     /// The color image.
     pub image_path: PathBuf,
@@ -55,8 +55,8 @@ pub struct DepthFile {
 /// The decoded files of one image.
 #[derive(Clone, Debug, PartialEq)]
 pub struct LoadedImage {
-    /// `[height, width, 4]`, sRGB, still distorted. Alpha is 0 at pixels that the mask or the alpha of the photo
-    /// excludes, else 255.
+    /// `[height, width, 4]`, sRGB, still distorted. Alpha is 0 at pixels that the mask or the alpha
+    /// of the photo excludes, else 255.
     pub rgba_srgb: Vec<u8>,
     /// Depth, still distorted.
     pub depth: Option<DepthImage>,
@@ -76,7 +76,8 @@ pub struct DepthImage {
 }
 
 impl DatasetImage {
-    /// Decodes the files of this image. If only the depth image fails to decode, the photo is still returned.
+    /// Decodes the files of this image. If only the depth image fails to decode, the photo is still
+    /// returned.
     pub fn load(&self) -> Result<LoadedImage, Error> {
         let mut rgba = into_rgba(decode_file(&self.image_path, Budget::COLOR_IMAGE)?);
         self.require_size(&self.image_path, [rgba.width(), rgba.height()])?;
@@ -102,14 +103,25 @@ impl DatasetImage {
             Some(Ok(depth)) => (Some(depth), None),
             None => (None, None),
         };
-        Ok(LoadedImage { rgba_srgb: rgba.into_raw(), depth, depth_error, mask_warning })
+        Ok(LoadedImage {
+            rgba_srgb: rgba.into_raw(),
+            depth,
+            depth_error,
+            mask_warning,
+        })
     }
 
     fn load_depth(&self, file: &DepthFile) -> Result<DepthImage, Error> {
-        let DynamicImage::ImageLuma16(counts) = decode_file(&file.path, Budget::DEPTH_IMAGE)? else {
-            return Err(Error::NotDepth { path: file.path.clone() });
+        let DynamicImage::ImageLuma16(counts) = decode_file(&file.path, Budget::DEPTH_IMAGE)?
+        else {
+            return Err(Error::NotDepth {
+                path: file.path.clone(),
+            });
         };
-        #[expect(clippy::cast_possible_truncation, reason = "f32 is more precise than sensors")]
+        #[expect(
+            clippy::cast_possible_truncation,
+            reason = "f32 is more precise than sensors"
+        )]
         let meters_from_count = |count: &u16| (f64::from(*count) * file.meters_per_count) as f32;
         Ok(DepthImage {
             intrinsics: self.intrinsics.resized([counts.width(), counts.height()]),
@@ -122,11 +134,16 @@ impl DatasetImage {
         if got_px == expected_px {
             return Ok(());
         }
-        Err(Error::DatasetImageSize { path: path.to_owned(), got_px, expected_px })
+        Err(Error::DatasetImageSize {
+            path: path.to_owned(),
+            got_px,
+            expected_px,
+        })
     }
 }
 
-/// Converts an image to RGBA. An RGB image is converted in place: with 134 million pixels, a copy takes half a gigabyte.
+/// Converts an image to RGBA. An RGB image is converted in place: with 134 million pixels, a copy
+/// takes half a gigabyte.
 fn into_rgba(image: DynamicImage) -> RgbaImage {
     match image {
         DynamicImage::ImageRgb8(rgb) => {
@@ -153,36 +170,61 @@ fn is_in_alpha(mask: &DynamicImage) -> bool {
     }
     let mask = mask.to_luma_alpha8();
     let alpha = mask.pixels().next().map(|pixel| pixel.0[1]);
-    mask.pixels().all(|pixel| pixel.0[0] == 0) && mask.pixels().any(|pixel| Some(pixel.0[1]) != alpha)
+    mask.pixels().all(|pixel| pixel.0[0] == 0)
+        && mask.pixels().any(|pixel| Some(pixel.0[1]) != alpha)
 }
 
 /// Reads the width and height of an image from its header.
 pub(super) fn image_size_px(path: &Path) -> Result<[u32; 2], Error> {
-    let size = open_image(path)?.into_dimensions().map_err(|source| decode_error(path, source))?;
+    let size = open_image(path)?
+        .into_dimensions()
+        .map_err(|source| decode_error(path, source))?;
     Ok(size.into())
 }
 
 fn decode_file(path: &Path, budget: Budget) -> Result<DynamicImage, Error> {
-    let bytes = files::read(path, budget).map_err(|source| Error::Open { path: path.to_owned(), source })?;
+    let bytes = files::read(path, budget).map_err(|source| Error::Open {
+        path: path.to_owned(),
+        source,
+    })?;
     let reader = ImageReader::new(Cursor::new(&bytes)).with_guessed_format();
-    let size = reader.map_err(image::ImageError::from).and_then(ImageReader::into_dimensions);
+    let size = reader
+        .map_err(image::ImageError::from)
+        .and_then(ImageReader::into_dimensions);
     let got_px: [u32; 2] = size.map_err(|source| decode_error(path, source))?.into();
-    if budget.check_elements(u64::from(got_px[0]) * u64::from(got_px[1])).is_err() {
-        return Err(Error::TooManyPixels { path: path.to_owned(), got_px, max_px: budget.max_elements });
+    if budget
+        .check_elements(u64::from(got_px[0]) * u64::from(got_px[1]))
+        .is_err()
+    {
+        return Err(Error::TooManyPixels {
+            path: path.to_owned(),
+            got_px,
+            max_px: budget.max_elements,
+        });
     }
     decode_complete(&bytes, None).map_err(|source| decode_error(path, source))
 }
 
 fn open_image(path: &Path) -> Result<ImageReader<std::io::BufReader<std::fs::File>>, Error> {
-    let open = || ImageReader::new(std::io::BufReader::new(files::open(path)?)).with_guessed_format();
-    open().map_err(|source| Error::Open { path: path.to_owned(), source })
+    let open =
+        || ImageReader::new(std::io::BufReader::new(files::open(path)?)).with_guessed_format();
+    open().map_err(|source| Error::Open {
+        path: path.to_owned(),
+        source,
+    })
 }
 
 fn decode_error(path: &Path, source: image::ImageError) -> Error {
     if let Some(format) = unsupported_format(path) {
-        return Error::ImageFormat { path: path.to_owned(), format };
+        return Error::ImageFormat {
+            path: path.to_owned(),
+            format,
+        };
     }
-    Error::DatasetImage { path: path.to_owned(), source }
+    Error::DatasetImage {
+        path: path.to_owned(),
+        source,
+    }
 }
 
 /// Name of the format of a file, if it is a known one that cannot be read.
@@ -194,7 +236,9 @@ fn unsupported_format(path: &Path) -> Option<&'static str> {
     }
     match (&start[4..8], &start[8..]) {
         (b"ftyp", b"avif" | b"avis") => Some("AVIF"),
-        (b"ftyp", b"heic" | b"heix" | b"hevc" | b"heim" | b"heis" | b"mif1" | b"msf1") => Some("HEIC"),
+        (b"ftyp", b"heic" | b"heix" | b"hevc" | b"heim" | b"heis" | b"mif1" | b"msf1") => {
+            Some("HEIC")
+        }
         _ => None,
     }
 }
@@ -207,12 +251,17 @@ mod tests {
     #[test]
     fn conversion_in_place_gives_the_same_pixels() {
         for (width, height) in [(1, 1), (3, 2), (17, 5)] {
-            let bytes = (0..3 * width * height).map(|ix: u32| (ix * ix % 251) as u8).collect();
+            let bytes = (0..3 * width * height)
+                .map(|ix: u32| (ix * ix % 251) as u8)
+                .collect();
             let rgb = DynamicImage::from(RgbImage::from_raw(width, height, bytes).unwrap());
             let gray = DynamicImage::from(rgb.to_luma8());
             for image in [rgb, gray] {
                 let (converted, expected) = (into_rgba(image.clone()), image.to_rgba8());
-                assert_eq!((converted.dimensions(), converted.as_raw()), (expected.dimensions(), expected.as_raw()));
+                assert_eq!(
+                    (converted.dimensions(), converted.as_raw()),
+                    (expected.dimensions(), expected.as_raw())
+                );
             }
         }
     }

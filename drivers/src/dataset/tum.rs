@@ -1,10 +1,13 @@
 //! TUM RGB-D folders: `rgb.txt`, `depth.txt`, `groundtruth.txt`.
 //!
-//! Source: Sturm, Engelhard, Endres, Burgard, Cremers 2012, and the file formats documented on the web pages of the
-//! benchmark.
+//! Source: Sturm, Engelhard, Endres, Burgard, Cremers 2012, and the file formats documented on the
+//! web pages of the benchmark.
 
 use super::posed_image::image_size_px;
-use super::{Dataset, DatasetImage, DepthFile, MAX_POSITION_M, SkippedImages, first_names, implausible, plural};
+use super::{
+    Dataset, DatasetImage, DepthFile, MAX_POSITION_M, SkippedImages, first_names, implausible,
+    plural,
+};
 use crate::Error;
 use kinematics::{Intrinsics, Lens, Stamp, Transform, transform};
 use nalgebra::{Quaternion, UnitQuaternion, Vector3};
@@ -15,8 +18,8 @@ use std::path::{Path, PathBuf};
 pub const COLOR_LIST: &str = "rgb.txt";
 const DEPTH_LIST: &str = "depth.txt";
 const POSE_LIST: &str = "groundtruth.txt";
-/// Optional file with the lens parameters: `fx fy cx cy`, then optionally `k1 k2 p1 p2 k3`, with pixel centers at
-/// integers as in OpenCV.
+/// Optional file with the lens parameters: `fx fy cx cy`, then optionally `k1 k2 p1 p2 k3`, with
+/// pixel centers at integers as in OpenCV.
 const CAMERA_FILE: &str = "calibration.txt";
 /// Maximum time between an image and its depth image or pose.
 const MAX_GAP_NANOS: i64 = 20_000_000;
@@ -28,22 +31,36 @@ const METERS_PER_COUNT: f64 = 1.0 / 5000.0;
 /// Size of the images of the cameras of the benchmark.
 const BENCHMARK_PX: [u32; 2] = [640, 480];
 
-/// Lens parameters of the cameras of the benchmark, by a part of the folder name: `fx fy cx cy`, then `k1 k2 p1 p2 k3`.
+/// Lens parameters of the cameras of the benchmark, by a part of the folder name: `fx fy cx cy`,
+/// then `k1 k2 p1 p2 k3`.
 const CAMERAS: [(&str, [f64; 9]); 3] = [
-    ("freiburg1", [517.306408, 516.469215, 318.643040, 255.313989, 0.262383, -0.953104, -0.005358, 0.002628, 1.163314]),
+    (
+        "freiburg1",
+        [
+            517.306408, 516.469215, 318.643040, 255.313989, 0.262383, -0.953104, -0.005358,
+            0.002628, 1.163314,
+        ],
+    ),
     (
         "freiburg2",
-        [520.908620, 521.007327, 325.141442, 249.701764, 0.231222, -0.784899, -0.003257, -0.000105, 0.917205],
+        [
+            520.908620, 521.007327, 325.141442, 249.701764, 0.231222, -0.784899, -0.003257,
+            -0.000105, 0.917205,
+        ],
     ),
-    ("freiburg3", [535.4, 539.2, 320.1, 247.6, 0.0, 0.0, 0.0, 0.0, 0.0]),
+    (
+        "freiburg3",
+        [535.4, 539.2, 320.1, 247.6, 0.0, 0.0, 0.0, 0.0, 0.0],
+    ),
 ];
 
 /// Reads a folder.
 ///
-/// Each photo gets the depth image closest in time, within 20 ms, and the pose interpolated at its stamp between two poses
-/// that are at most 40 ms apart, or 1.5 times the usual interval of the poses, up to 110 ms. Photos without a pose, photos
-/// of another size and invalid lines are skipped and counted. Lens parameters come from `calibration.txt`, else from the
-/// folder name. The details are in docs/reference/datasets.md.
+/// Each photo gets the depth image closest in time, within 20 ms, and the pose interpolated at its
+/// stamp between two poses that are at most 40 ms apart, or 1.5 times the usual interval of the
+/// poses, up to 110 ms. Photos without a pose, photos of another size and invalid lines are skipped
+/// and counted. Lens parameters come from `calibration.txt`, else from the folder name. The details
+/// are in docs/reference/datasets.md.
 pub fn read(folder: &Path) -> Result<Dataset, Error> {
     let (camera, mut lens_px) = camera_of(folder)?;
     let mut skipped = SkippedImages::default();
@@ -54,11 +71,14 @@ pub fn read(folder: &Path) -> Result<Dataset, Error> {
     };
     let repeated_depth = depths.as_mut().map(remove_repeated).unwrap_or_default();
     let poses = Poses::read(folder, &mut skipped)?;
-    let (mut images, mut missing_depth): (Vec<DatasetImage>, Vec<String>) = (Vec::new(), Vec::new());
+    let (mut images, mut missing_depth): (Vec<DatasetImage>, Vec<String>) =
+        (Vec::new(), Vec::new());
     let (mut n_without_depth, mut depth_without_pose) = (0, Vec::new());
     for (stamp, name) in colors {
         if images.last().is_some_and(|last| last.stamp == stamp) {
-            skipped.unusable.push((name, "another photo has the same time".to_owned()));
+            skipped
+                .unusable
+                .push((name, "another photo has the same time".to_owned()));
             continue;
         }
         let Some(image_path) = find_file(folder, &name) else {
@@ -76,18 +96,25 @@ pub fn read(folder: &Path) -> Result<Dataset, Error> {
             skipped.broken.push((name, "not an image".to_owned()));
             continue;
         };
-        let intrinsics = Intrinsics { size_px, ..camera.clone() };
+        let intrinsics = Intrinsics {
+            size_px,
+            ..camera.clone()
+        };
         if images.is_empty()
             && let Some(reason) = implausible(&intrinsics)
         {
-            return Err(Error::DatasetFile { path: folder.to_owned(), reason });
+            return Err(Error::DatasetFile {
+                path: folder.to_owned(),
+                reason,
+            });
         }
         // Without another statement, the lens parameters are those of the first photo.
         let expected_px = *lens_px.get_or_insert(size_px);
         if size_px != expected_px {
             let [[width, height], [lens_width, lens_height]] = [size_px, expected_px];
-            let reason =
-                format!("it has {width}x{height} pixels, but the lens parameters are for {lens_width}x{lens_height}");
+            let reason = format!(
+                "it has {width}x{height} pixels, but the lens parameters are for {lens_width}x{lens_height}"
+            );
             skipped.broken.push((name, reason));
             continue;
         }
@@ -95,13 +122,19 @@ pub fn read(folder: &Path) -> Result<Dataset, Error> {
         match depths.as_ref().map(|depths| nearest(depths, stamp)) {
             None => {}
             Some(None) => n_without_depth += 1,
-            Some(Some((depth_stamp, depth_name))) => match (poses.at(*depth_stamp), find_file(folder, depth_name)) {
-                (Err(reason), _) => depth_without_pose.push(format!("{depth_name} ({reason})")),
-                (Ok(_), None) => missing_depth.push(depth_name.clone()),
-                (Ok(world_from_camera), Some(path)) => {
-                    depth = Some(DepthFile { path, meters_per_count: METERS_PER_COUNT, world_from_camera });
+            Some(Some((depth_stamp, depth_name))) => {
+                match (poses.at(*depth_stamp), find_file(folder, depth_name)) {
+                    (Err(reason), _) => depth_without_pose.push(format!("{depth_name} ({reason})")),
+                    (Ok(_), None) => missing_depth.push(depth_name.clone()),
+                    (Ok(world_from_camera), Some(path)) => {
+                        depth = Some(DepthFile {
+                            path,
+                            meters_per_count: METERS_PER_COUNT,
+                            world_from_camera,
+                        });
+                    }
                 }
-            },
+            }
         }
         images.push(DatasetImage {
             name,
@@ -121,8 +154,14 @@ pub fn read(folder: &Path) -> Result<Dataset, Error> {
     };
     for (names, what) in [
         (&missing_depth, "missing"),
-        (&depth_without_pose, "not used, because no pose belongs to the time"),
-        (&repeated_depth, "not used, because an earlier line has the same time; write times with more decimals"),
+        (
+            &depth_without_pose,
+            "not used, because no pose belongs to the time",
+        ),
+        (
+            &repeated_depth,
+            "not used, because an earlier line has the same time; write times with more decimals",
+        ),
     ] {
         if !names.is_empty() {
             let (images, verb) = plural(names.len(), "depth image");
@@ -139,10 +178,14 @@ fn exists(path: &Path) -> bool {
 
 /// Finds a file of a list. Windows programs write `\\` as separator.
 fn find_file(folder: &Path, name: &str) -> Option<PathBuf> {
-    [name, &name.replace('\\', "/")].into_iter().map(|name| folder.join(name)).find(|path| path.is_file())
+    [name, &name.replace('\\', "/")]
+        .into_iter()
+        .map(|name| folder.join(name))
+        .find(|path| path.is_file())
 }
 
-/// Removes entries with the time of an earlier one. Returns their names, except where they are equal.
+/// Removes entries with the time of an earlier one. Returns their names, except where they are
+/// equal.
 fn remove_repeated(entries: &mut Vec<(Stamp, String)>) -> Vec<String> {
     let mut repeated = Vec::new();
     entries.dedup_by(|later, first| {
@@ -154,38 +197,66 @@ fn remove_repeated(entries: &mut Vec<(Stamp, String)>) -> Vec<String> {
     repeated
 }
 
-/// Lens parameters of a folder, and the size of the images to which they refer if it is known. The caller sets the size
-/// to that of each photo.
+/// Lens parameters of a folder, and the size of the images to which they refer if it is known. The
+/// caller sets the size to that of each photo.
 fn camera_of(folder: &Path) -> Result<(Intrinsics, Option<[u32; 2]>), Error> {
     let path = folder.join(CAMERA_FILE);
     let (numbers, lens_px) = if exists(&path) {
-        let text = files::read_text(&path).map_err(|source| Error::Open { path: path.clone(), source })?;
-        (camera_numbers(&text).map_err(|reason| Error::DatasetFile { path, reason })?, None)
+        let text = files::read_text(&path).map_err(|source| Error::Open {
+            path: path.clone(),
+            source,
+        })?;
+        (
+            camera_numbers(&text).map_err(|reason| Error::DatasetFile { path, reason })?,
+            None,
+        )
     } else {
-        let numbers = camera_by_name(folder).ok_or_else(|| Error::NoIntrinsics { path: folder.to_owned() })?;
+        let numbers = camera_by_name(folder).ok_or_else(|| Error::NoIntrinsics {
+            path: folder.to_owned(),
+        })?;
         (numbers, Some(BENCHMARK_PX))
     };
     let [fx, fy, cx, cy, k1, k2, p1, p2, k3] = numbers;
-    let lens = if numbers[4..] == [0.0; 5] { Lens::Pinhole } else { Lens::BrownConrady([k1, k2, p1, p2, k3]) };
+    let lens = if numbers[4..] == [0.0; 5] {
+        Lens::Pinhole
+    } else {
+        Lens::BrownConrady([k1, k2, p1, p2, k3])
+    };
     // Pixel centers are at integers in these files and at half-integers in ours.
     let (focal_px, principal_px) = ([fx, fy], [cx + 0.5, cy + 0.5]);
-    let intrinsics = Intrinsics { size_px: BENCHMARK_PX, focal_px, principal_px, lens, rectified: false };
-    intrinsics
-        .validate()
-        .map_err(|error| Error::DatasetFile { path: folder.join(CAMERA_FILE), reason: error.to_string() })?;
+    let intrinsics = Intrinsics {
+        size_px: BENCHMARK_PX,
+        focal_px,
+        principal_px,
+        lens,
+        rectified: false,
+    };
+    intrinsics.validate().map_err(|error| Error::DatasetFile {
+        path: folder.join(CAMERA_FILE),
+        reason: error.to_string(),
+    })?;
     Ok((intrinsics, lens_px))
 }
 
 fn camera_numbers(text: &str) -> Result<[f64; 9], String> {
     let mut numbers = Vec::new();
-    for (line_ix, line) in text.lines().enumerate().filter(|(_, line)| !line.trim_start().starts_with('#')) {
+    for (line_ix, line) in text
+        .lines()
+        .enumerate()
+        .filter(|(_, line)| !line.trim_start().starts_with('#'))
+    {
         for word in words(line) {
-            let number: f64 = word.parse().map_err(|_| format!("line {}: {word:?} is not a number", line_ix + 1))?;
+            let number: f64 = word
+                .parse()
+                .map_err(|_| format!("line {}: {word:?} is not a number", line_ix + 1))?;
             numbers.push(number);
         }
     }
     if !matches!(numbers.len(), 4 | 8 | 9) {
-        return Err(format!("{} numbers, expected fx fy cx cy and optionally k1 k2 p1 p2 k3", numbers.len()));
+        return Err(format!(
+            "{} numbers, expected fx fy cx cy and optionally k1 k2 p1 p2 k3",
+            numbers.len()
+        ));
     }
     numbers.resize(9, 0.0);
     Ok(numbers.try_into().unwrap_or([0.0; 9]))
@@ -194,7 +265,10 @@ fn camera_numbers(text: &str) -> Result<[f64; 9], String> {
 fn camera_by_name(folder: &Path) -> Option<[f64; 9]> {
     let absolute = std::path::absolute(folder).unwrap_or_else(|_| folder.to_owned());
     let name = absolute.file_name()?.to_string_lossy().to_lowercase();
-    CAMERAS.iter().find(|(part, _)| name.contains(part)).map(|(_, numbers)| *numbers)
+    CAMERAS
+        .iter()
+        .find(|(part, _)| name.contains(part))
+        .map(|(_, numbers)| *numbers)
 }
 
 /// One line of a list.
@@ -206,7 +280,8 @@ struct Line {
     rest: String,
 }
 
-/// Whether columns are separated by this character; the programs of the benchmark accept commas, too.
+/// Whether columns are separated by this character; the programs of the benchmark accept commas,
+/// too.
 fn is_separator(c: char) -> bool {
     c.is_whitespace() || c == ','
 }
@@ -220,9 +295,16 @@ fn words(line: &str) -> impl Iterator<Item = &str> {
 ///
 /// # Errors
 /// If the file cannot be read, or no line is valid.
-fn stamped_lines(folder: &Path, list: &str, skipped: &mut SkippedImages) -> Result<Vec<Line>, Error> {
+fn stamped_lines(
+    folder: &Path,
+    list: &str,
+    skipped: &mut SkippedImages,
+) -> Result<Vec<Line>, Error> {
     let path = folder.join(list);
-    let text = files::read_text(&path).map_err(|source| Error::Open { path: path.clone(), source })?;
+    let text = files::read_text(&path).map_err(|source| Error::Open {
+        path: path.clone(),
+        source,
+    })?;
     let mut lines = Vec::new();
     let mut invalid = Vec::new();
     for (line_ix, line) in text.lines().enumerate() {
@@ -235,25 +317,42 @@ fn stamped_lines(folder: &Path, list: &str, skipped: &mut SkippedImages) -> Resu
         let rest = rest.trim_start_matches(is_separator).to_owned();
         match stamp_of(first) {
             None => invalid.push(format!("line {number}: {first:?} is not a time in seconds")),
-            Some(_) if rest.is_empty() => invalid.push(format!("line {number}: nothing follows the time")),
-            Some(stamp) => lines.push(Line { number, stamp, rest }),
+            Some(_) if rest.is_empty() => {
+                invalid.push(format!("line {number}: nothing follows the time"))
+            }
+            Some(stamp) => lines.push(Line {
+                number,
+                stamp,
+                rest,
+            }),
         }
     }
     if let (true, Some(first)) = (lines.is_empty(), invalid.first()) {
-        return Err(Error::DatasetFile { path, reason: first.clone() });
+        return Err(Error::DatasetFile {
+            path,
+            reason: first.clone(),
+        });
     }
     skipped.lines(list, &invalid);
     lines.sort_by_key(|line| line.stamp);
     Ok(lines)
 }
 
-fn stamped_names(folder: &Path, list: &str, skipped: &mut SkippedImages) -> Result<Vec<(Stamp, String)>, Error> {
+fn stamped_names(
+    folder: &Path,
+    list: &str,
+    skipped: &mut SkippedImages,
+) -> Result<Vec<(Stamp, String)>, Error> {
     let lines = stamped_lines(folder, list, skipped)?;
-    Ok(lines.into_iter().map(|line| (line.stamp, line.rest)).collect())
+    Ok(lines
+        .into_iter()
+        .map(|line| (line.stamp, line.rest))
+        .collect())
 }
 
-/// Parses a decimal number of seconds, such as `1305031102.175304` or `1.305031102175304e+09`, and rounds it down to a
-/// nanosecond. Does not use f64, which would round to a quarter of a microsecond.
+/// Parses a decimal number of seconds, such as `1305031102.175304` or `1.305031102175304e+09`, and
+/// rounds it down to a nanosecond. Does not use f64, which would round to a quarter of a
+/// microsecond.
 fn stamp_of(word: &str) -> Option<Stamp> {
     const NANOS_EXPONENT: i64 = 9;
     let (mantissa, exponent) = word.split_once(['e', 'E']).unwrap_or((word, "0"));
@@ -267,14 +366,20 @@ fn stamp_of(word: &str) -> Option<Stamp> {
         return None;
     }
     // Number of digits before the decimal point of the number of nanoseconds.
-    let n_digits = i64::try_from(integer.len()).ok()? + exponent.parse::<i32>().map(i64::from).ok()? + NANOS_EXPONENT;
+    let n_digits = i64::try_from(integer.len()).ok()?
+        + exponent.parse::<i32>().map(i64::from).ok()?
+        + NANOS_EXPONENT;
     let zeros = digits.bytes().take_while(|digit| *digit == b'0').count();
     let n_significant = n_digits - i64::try_from(zeros).ok()?;
     if zeros == digits.len() || n_significant <= 0 {
         return Some(Stamp(0));
     }
     let n_significant = usize::try_from(n_significant).ok().filter(|n| *n < 20)?;
-    let padded = digits.bytes().skip(zeros).chain(std::iter::repeat(b'0')).take(n_significant);
+    let padded = digits
+        .bytes()
+        .skip(zeros)
+        .chain(std::iter::repeat(b'0'))
+        .take(n_significant);
     let nanos = padded.fold(0_i128, |nanos, digit| 10 * nanos + i128::from(digit - b'0'));
     i64::try_from(sign * nanos).ok().map(Stamp)
 }
@@ -284,7 +389,10 @@ fn nearest<T>(entries: &[(Stamp, T)], stamp: Stamp) -> Option<&(Stamp, T)> {
     let gap = |entry: &(Stamp, T)| entry.0.nanos_since(stamp).saturating_abs();
     let after = entries.partition_point(|entry| entry.0 < stamp);
     let candidates = &entries[after.saturating_sub(1)..entries.len().min(after + 1)];
-    candidates.iter().min_by_key(|entry| gap(entry)).filter(|entry| gap(entry) <= MAX_GAP_NANOS)
+    candidates
+        .iter()
+        .min_by_key(|entry| gap(entry))
+        .filter(|entry| gap(entry) <= MAX_GAP_NANOS)
 }
 
 /// Trajectory of the color camera.
@@ -298,17 +406,29 @@ impl Poses {
     fn read(folder: &Path, skipped: &mut SkippedImages) -> Result<Self, Error> {
         let mut poses: Vec<(Stamp, Transform)> = Vec::new();
         let (mut invalid, mut repeated) = (Vec::new(), Vec::new());
-        for Line { number, stamp, rest } in stamped_lines(folder, POSE_LIST, skipped)? {
+        for Line {
+            number,
+            stamp,
+            rest,
+        } in stamped_lines(folder, POSE_LIST, skipped)?
+        {
             match pose_of(&rest) {
                 Err(reason) => invalid.push(format!("line {number}: {reason}")),
-                Ok(pose) if poses.last().is_some_and(|(last, other)| *last == stamp && *other != pose) => {
+                Ok(pose)
+                    if poses
+                        .last()
+                        .is_some_and(|(last, other)| *last == stamp && *other != pose) =>
+                {
                     repeated.push(format!("line {number}"));
                 }
                 Ok(pose) => poses.push((stamp, pose)),
             }
         }
         if let (true, Some(first)) = (poses.is_empty(), invalid.first()) {
-            return Err(Error::DatasetFile { path: folder.join(POSE_LIST), reason: first.clone() });
+            return Err(Error::DatasetFile {
+                path: folder.join(POSE_LIST),
+                reason: first.clone(),
+            });
         }
         skipped.lines(POSE_LIST, &invalid);
         if !repeated.is_empty() {
@@ -318,7 +438,10 @@ impl Poses {
                 first_names(&repeated)
             ));
         }
-        Ok(Self { max_interval_nanos: max_interval_nanos(&poses), poses })
+        Ok(Self {
+            max_interval_nanos: max_interval_nanos(&poses),
+            poses,
+        })
     }
 
     /// Pose at a stamp, interpolated between two poses. The error is the reason why there is none.
@@ -330,7 +453,9 @@ impl Poses {
         {
             return Ok(*pose);
         }
-        let (Some(after), Some(before)) = (after, after_ix.checked_sub(1).map(|ix| &self.poses[ix])) else {
+        let (Some(after), Some(before)) =
+            (after, after_ix.checked_sub(1).map(|ix| &self.poses[ix]))
+        else {
             return Err("its time is before the first or after the last pose".to_owned());
         };
         let interval_nanos = after.0.nanos_since(before.0);
@@ -346,11 +471,18 @@ impl Poses {
     }
 }
 
-/// Poses that are regularly far apart are interpolated, but a gap in dense poses is not, because tracking was lost.
+/// Poses that are regularly far apart are interpolated, but a gap in dense poses is not, because
+/// tracking was lost.
 fn max_interval_nanos(poses: &[(Stamp, Transform)]) -> i64 {
-    let mut intervals: Vec<i64> = poses.windows(2).map(|pair| pair[1].0.nanos_since(pair[0].0)).collect();
+    let mut intervals: Vec<i64> = poses
+        .windows(2)
+        .map(|pair| pair[1].0.nanos_since(pair[0].0))
+        .collect();
     intervals.sort_unstable();
-    let usual = intervals.get(intervals.len() / 2).copied().unwrap_or_default();
+    let usual = intervals
+        .get(intervals.len() / 2)
+        .copied()
+        .unwrap_or_default();
     #[expect(clippy::cast_possible_truncation, reason = "the cast saturates")]
     let max = (MAX_USUAL_INTERVALS * usual as f64) as i64;
     max.clamp(2 * MAX_GAP_NANOS, MAX_POSE_INTERVAL_NANOS)
@@ -367,5 +499,8 @@ fn pose_of(columns: &str) -> Result<Transform, &'static str> {
     if !(is_near && (rotation.norm() - 1.0).abs() <= 0.01) {
         return Err("the pose is not finite, too far away, or its quaternion is not of length 1");
     }
-    Ok(Transform::from_parts(Vector3::new(*x, *y, *z).into(), UnitQuaternion::new_normalize(rotation)))
+    Ok(Transform::from_parts(
+        Vector3::new(*x, *y, *z).into(),
+        UnitQuaternion::new_normalize(rotation),
+    ))
 }

@@ -19,17 +19,18 @@ use std::sync::Arc;
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-/// Capacity of the queue of states for a slow caller: one second. When it is full, the oldest state is dropped.
+/// Capacity of the queue of states for a slow caller: one second. When it is full, the oldest state
+/// is dropped.
 const MAX_WAITING: usize = 1000;
 /// A robot that sends nothing for this long counts as lost.
 const MAX_SILENCE: Duration = Duration::from_secs(1);
-/// Maximum difference between our forward kinematics and the robot's own. Beyond it, the description belongs to another
-/// robot.
+/// Maximum difference between our forward kinematics and the robot's own. Beyond it, the
+/// description belongs to another robot.
 const MAX_POSE_ERROR_M: f64 = 2e-3;
 const MAX_POSE_ERROR_RAD: f64 = 0.5 / 180.0 * std::f64::consts::PI;
 const NANOS_PER_STATE: i64 = 1_000_000;
-/// A robot that received no answer for this long has stopped waiting. States that arrived in the meantime are not
-/// answered.
+/// A robot that received no answer for this long has stopped waiting. States that arrived in the
+/// meantime are not answered.
 const MAX_RESPONSE_GAP: Duration = Duration::from_millis(20);
 
 /// Configuration of an arm from the rig file.
@@ -74,16 +75,22 @@ impl FrankaArm {
         Self::open_with(config, |_, _| Ok(None))
     }
 
-    /// Like [`FrankaArm::open`], with a motion loop that is created from the first state and then moves the arm.
+    /// Like [`FrankaArm::open`], with a motion loop that is created from the first state and then
+    /// moves the arm.
     pub(super) fn open_with(
         config: &ArmConfig,
         motion_loop: impl FnOnce(&Arc<Session>, &RobotState) -> Result<Option<MotionLoop>, String>,
     ) -> Result<Self, Error> {
         let address = &config.address;
-        let fault = |reason| Error::Fci { address: address.clone(), reason };
+        let fault = |reason| Error::Fci {
+            address: address.clone(),
+            reason,
+        };
         let n = config.joint_names.len();
         if n != N_JOINTS || config.chain.n_joints() != N_JOINTS {
-            return Err(fault(format!("the rig file names {n} joints, but the arm has {N_JOINTS}")));
+            return Err(fault(format!(
+                "the rig file names {n} joints, but the arm has {N_JOINTS}"
+            )));
         }
         let session = Arc::new(Session::open(address)?);
         let Session { network, version } = &*session;
@@ -112,10 +119,24 @@ impl FrankaArm {
         let device = format!("arm at {address}");
         let reading = Arc::clone(&shared);
         let name = "franka".to_owned();
-        let thread = std::thread::Builder::new().name(name).spawn(move || reader.run(&session, &reading));
-        let thread = thread.map_err(|source| Error::Thread { device: device.clone(), source })?;
-        log::info!("{device}: uses FCI version {}", if version == FciVersion::V5 { 5 } else { 10 });
-        Ok(Self { device, names: config.joint_names.clone(), version, shared, thread: Some(thread) })
+        let thread = std::thread::Builder::new()
+            .name(name)
+            .spawn(move || reader.run(&session, &reading));
+        let thread = thread.map_err(|source| Error::Thread {
+            device: device.clone(),
+            source,
+        })?;
+        log::info!(
+            "{device}: uses FCI version {}",
+            if version == FciVersion::V5 { 5 } else { 10 }
+        );
+        Ok(Self {
+            device,
+            names: config.joint_names.clone(),
+            version,
+            shared,
+            thread: Some(thread),
+        })
     }
 
     /// FCI version of the controller.
@@ -134,8 +155,8 @@ impl Arm for FrankaArm {
         &self.names
     }
 
-    /// Returns the next state. Its stamp is the robot's clock, mapped to ours. Efforts are the measured link-side
-    /// torques, including gravity.
+    /// Returns the next state. Its stamp is the robot's clock, mapped to ours. Efforts are the
+    /// measured link-side torques, including gravity.
     fn read(&mut self, timeout: Duration) -> Result<JointState, Error> {
         let deadline = Instant::now() + timeout;
         let mut state = self.shared.state.lock();
@@ -173,8 +194,13 @@ fn check_kinematics(config: &ArmConfig, state: &RobotState) -> Result<(), String
     let sequence = chain.order_in(&config.joint_names).map_err(chain_error)?;
     let q: Vec<f64> = sequence.iter().map(|ix| state.q[*ix]).collect();
     let ours = chain.forward(&q).map_err(chain_error)?;
-    let matrix = |name, matrix| pose(matrix).map_err(|error| format!("its {name} is not a valid pose: {error}"));
-    let (base_from_tool, flange_from_tool) = (matrix("O_T_EE", &state.O_T_EE)?, matrix("F_T_EE", &state.F_T_EE)?);
+    let matrix = |name, matrix| {
+        pose(matrix).map_err(|error| format!("its {name} is not a valid pose: {error}"))
+    };
+    let (base_from_tool, flange_from_tool) = (
+        matrix("O_T_EE", &state.O_T_EE)?,
+        matrix("F_T_EE", &state.F_T_EE)?,
+    );
     let reported = base_from_tool * flange_from_tool.inverse();
     let (error_m, error_rad) = difference(&ours, &reported);
     if error_m <= MAX_POSE_ERROR_M && error_rad <= MAX_POSE_ERROR_RAD {
@@ -203,11 +229,18 @@ fn check_kinematics(config: &ArmConfig, state: &RobotState) -> Result<(), String
 
 fn difference(a: &Transform, b: &Transform) -> (f64, f64) {
     let a_from_b = a.inverse() * b;
-    (a_from_b.translation.vector.norm(), a_from_b.rotation.angle())
+    (
+        a_from_b.translation.vector.norm(),
+        a_from_b.rotation.angle(),
+    )
 }
 
 fn format_difference(error_m: f64, error_rad: f64) -> String {
-    format!("{:.1} mm and {:.2} degrees", error_m * 1e3, error_rad.to_degrees())
+    format!(
+        "{:.1} mm and {:.2} degrees",
+        error_m * 1e3,
+        error_rad.to_degrees()
+    )
 }
 
 fn format_pose(pose: &Transform) -> String {
@@ -228,7 +261,13 @@ struct StateReader {
 
 impl StateReader {
     fn new(address: String, version: FciVersion, motion_loop: Option<MotionLoop>) -> Self {
-        Self { address, version, sequence: SequenceTracker::default(), mode: RobotMode::Other, motion_loop }
+        Self {
+            address,
+            version,
+            sequence: SequenceTracker::default(),
+            mode: RobotMode::Other,
+            motion_loop,
+        }
     }
 
     fn run(mut self, session: &Session, shared: &Shared) {
@@ -237,7 +276,10 @@ impl StateReader {
             if let Some(motion_loop) = &mut self.motion_loop {
                 motion_loop.handle_disconnect(&reason);
             }
-            shared.state.lock().error = Some(Error::Fci { address: self.address, reason });
+            shared.state.lock().error = Some(Error::Fci {
+                address: self.address,
+                reason,
+            });
             shared.arrived.notify_all();
         }
     }
@@ -246,8 +288,8 @@ impl StateReader {
     fn read(&mut self, session: &Session, shared: &Shared) -> Result<(), String> {
         let network = &session.network;
         let mut buffer = [0; MAX_STATE_BYTES];
-        // States that were queued in the meantime arrive all at once, so they are useless for estimating the robot's
-        // clock.
+        // States that were queued in the meantime arrive all at once, so they are useless for
+        // estimating the robot's clock.
         while let Ok(Some(_)) = network.udp.try_receive(&mut buffer) {}
         let mut last_received = clock::now();
         loop {
@@ -257,14 +299,17 @@ impl StateReader {
             let mut newest = None;
             while let Some(n) = received {
                 // Datagrams from other addresses are rejected.
-                let from = network.udp_peer().filter(|peer| peer.ip() == network.server_ip);
+                let from = network
+                    .udp_peer()
+                    .filter(|peer| peer.ip() == network.server_ip);
                 let state = from.zip(decode(self.version, &buffer[..n]));
                 if !self.handle_datagram(shared, state, at, &mut newest) {
                     return Ok(());
                 }
                 received = network.udp.try_receive(&mut buffer).unwrap_or(None);
-                // Every state gets its own arrival time. With that of an earlier state, it could seem to have arrived
-                // before it was sent, which would shift the stamps of all later states.
+                // Every state gets its own arrival time. With that of an earlier state, it could
+                // seem to have arrived before it was sent, which would shift the stamps of all
+                // later states.
                 at = clock::now();
             }
             if let Some((from, numbered, stamp)) = newest {
@@ -272,14 +317,22 @@ impl StateReader {
                 shared.arrived.notify_all();
                 self.log_mode(&numbered.state);
                 if let Some(motion_loop) = &mut self.motion_loop {
-                    motion_loop.cycle(&StampedState { numbered: &numbered, stamp, from, is_fresh });
+                    motion_loop.cycle(&StampedState {
+                        numbered: &numbered,
+                        stamp,
+                        from,
+                        is_fresh,
+                    });
                 }
                 continue;
             }
             if shared.state.lock().stop {
                 return Ok(());
             }
-            network.tcp.throw_if_connection_closed().map_err(|error| error_text(&error))?;
+            network
+                .tcp
+                .throw_if_connection_closed()
+                .map_err(|error| error_text(&error))?;
             let silence = at.duration_since(last_received);
             if silence > MAX_SILENCE {
                 return Err(format!("it has sent no states for {silence:.1?}"));
@@ -308,7 +361,12 @@ impl StateReader {
     }
 
     /// Queues a state if it is later than all earlier states, and returns its stamp on our clock.
-    fn take(&mut self, state_queue: &mut StateQueue, numbered: &NumberedState, at: Stamp) -> Option<Stamp> {
+    fn take(
+        &mut self,
+        state_queue: &mut StateQueue,
+        numbered: &NumberedState,
+        at: Stamp,
+    ) -> Option<Stamp> {
         let NumberedState { number, state } = numbered;
         let statistics = &mut state_queue.statistics;
         match self.sequence.position(*number, at) {
@@ -320,8 +378,14 @@ impl StateReader {
             }
         }
         // The robot numbers its states by its own clock, one per millisecond.
-        let stamp_nanos = i64::try_from(*number).unwrap_or(i64::MAX).saturating_mul(NANOS_PER_STATE);
-        let header = DatagramHeader { seq: *number, clock: Clock::Device, stamp_nanos };
+        let stamp_nanos = i64::try_from(*number)
+            .unwrap_or(i64::MAX)
+            .saturating_mul(NANOS_PER_STATE);
+        let header = DatagramHeader {
+            seq: *number,
+            clock: Clock::Device,
+            stamp_nanos,
+        };
         let Some(stamp) = self.sequence.stamp(&header, at) else {
             statistics.n_rejected += 1;
             return None;
@@ -340,8 +404,8 @@ impl StateReader {
         Some(stamp)
     }
 
-    /// Logs the robot's mode whenever it changes. If the arm can be moved, its motion loop reports reflexes, with the
-    /// robot's reply about the motion.
+    /// Logs the robot's mode whenever it changes. If the arm can be moved, its motion loop reports
+    /// reflexes, with the robot's reply about the motion.
     fn log_mode(&mut self, state: &RobotState) {
         if state.robot_mode == self.mode {
             return;
@@ -368,10 +432,15 @@ mod tests {
         const STALL: Duration = Duration::from_millis(50);
         // The joints rotate by up to 0.4 rad/s.
         const MAX_ERROR_RAD: f64 = 0.4 * 5e-3;
-        let emulated = robot(FciVersion::V10, Box::new(|stamp, _| swinging_joints_at(stamp)));
+        let emulated = robot(
+            FciVersion::V10,
+            Box::new(|stamp, _| swinging_joints_at(stamp)),
+        );
         let mut arm = FrankaArm::open(&config(emulated.address())).unwrap();
         let max_error_after = |arm: &mut FrankaArm, n_skipped: usize| {
-            let states: Vec<_> = (0..n_skipped + 200).map(|_| arm.read(TEST_TIMEOUT).unwrap()).collect();
+            let states: Vec<_> = (0..n_skipped + 200)
+                .map(|_| arm.read(TEST_TIMEOUT).unwrap())
+                .collect();
             let errors = states[n_skipped..].iter().flat_map(|state| {
                 let truth = swinging_joints_at(state.stamp);
                 std::iter::zip(&state.position, truth.position_rad)
@@ -385,7 +454,10 @@ mod tests {
         std::thread::sleep(STALL);
         drop(queue);
         let after = max_error_after(&mut arm, 100);
-        assert!(before < MAX_ERROR_RAD && after < MAX_ERROR_RAD, "{before} rad before, {after} rad after");
+        assert!(
+            before < MAX_ERROR_RAD && after < MAX_ERROR_RAD,
+            "{before} rad before, {after} rad after"
+        );
         assert_eq!(arm.statistics().n_rejected, n_rejected, "stamps increase");
     }
 }

@@ -6,10 +6,11 @@ use crate::motion::{JointTarget, MotionLimits};
 use franka::joint_velocity_limits::JointVelocityLimitsConfig;
 use franka::rate_limiting::{self, fer, limit_rate_joint_positions};
 
-/// Fraction of the robot's maximum velocity and acceleration that we use. The rest is a reserve for lost commands.
+/// Fraction of the robot's maximum velocity and acceleration that we use. The rest is a reserve for
+/// lost commands.
 const LIMIT_FRAC: f64 = 0.5;
-/// Fraction of the robot's maximum jerk that we use. If a command is lost and we do not notice, the next command
-/// appears to the robot with four times its jerk.
+/// Fraction of the robot's maximum jerk that we use. If a command is lost and we do not notice, the
+/// next command appears to the robot with four times its jerk.
 const JERK_LIMIT_FRAC: f64 = 0.25 * LIMIT_FRAC;
 /// Distance of targets from the ends of a joint's range.
 const MARGIN_RAD: f64 = 5e-3;
@@ -48,12 +49,18 @@ impl RobotLimits {
         }
     }
 
-    /// Limits of an FR3: position and velocity from the URDF that it serves, acceleration and jerk from
-    /// `rate_limiting.h` of libfranka 0.21.2.
+    /// Limits of an FR3: position and velocity from the URDF that it serves, acceleration and jerk
+    /// from `rate_limiting.h` of libfranka 0.21.2.
     pub(super) fn of_description(urdf: &str) -> Result<Self, String> {
-        let speed = JointVelocityLimitsConfig::from_urdf(urdf)
-            .map_err(|error| format!("cannot parse the robot description that it serves: {error}"))?;
-        let range = |ix: usize| [speed[ix].lower_position_limit, speed[ix].upper_position_limit];
+        let speed = JointVelocityLimitsConfig::from_urdf(urdf).map_err(|error| {
+            format!("cannot parse the robot description that it serves: {error}")
+        })?;
+        let range = |ix: usize| {
+            [
+                speed[ix].lower_position_limit,
+                speed[ix].upper_position_limit,
+            ]
+        };
         Ok(Self {
             position_rad: std::array::from_fn(range),
             acceleration_rad_s2: rate_limiting::MAX_JOINT_ACCELERATION,
@@ -62,19 +69,25 @@ impl RobotLimits {
         })
     }
 
-    /// Limits for our motions: at most the requested limits, and at most our fraction of the robot's limits.
+    /// Limits for our motions: at most the requested limits, and at most our fraction of the
+    /// robot's limits.
     ///
-    /// A joint that decelerates with `a` towards its target has the velocity `sqrt(2 a d)` at the distance `d`. An
-    /// FR3 allows `sqrt(2 D (d + m)) - o` there, where `m` is the distance from the target to the end of the range.
-    /// If `a` is at most `LIMIT_FRAC * D`, this suffices everywhere if `m` is at least `o² / (2 D (1 - LIMIT_FRAC))`.
+    /// A joint that decelerates with `a` towards its target has the velocity `sqrt(2 a d)` at the
+    /// distance `d`. An FR3 allows `sqrt(2 D (d + m)) - o` there, where `m` is the distance from
+    /// the target to the end of the range. If `a` is at most `LIMIT_FRAC * D`, this suffices
+    /// everywhere if `m` is at least `o² / (2 D (1 - LIMIT_FRAC))`.
     pub(super) fn allowed(&self, requested: &[MotionLimits]) -> Result<Vec<MotionLimits>, String> {
         let n = requested.len();
         if n != N_JOINTS {
-            return Err(format!("limits are given for {n} joints, but the arm has {N_JOINTS}"));
+            return Err(format!(
+                "limits are given for {n} joints, but the arm has {N_JOINTS}"
+            ));
         }
         let allowed = |(ix, requested): (usize, &MotionLimits)| {
             let (max_speed, deceleration, offset) = match &self.speed {
-                SpeedLimits::Constant(max_speed) => (max_speed[ix], self.acceleration_rad_s2[ix], 0.0),
+                SpeedLimits::Constant(max_speed) => {
+                    (max_speed[ix], self.acceleration_rad_s2[ix], 0.0)
+                }
                 SpeedLimits::PositionDependent(joints) => (
                     joints[ix].max_velocity,
                     joints[ix].deceleration_limit,
@@ -83,7 +96,10 @@ impl RobotLimits {
             };
             let margin = MARGIN_RAD + offset.powi(2) / (2.0 * deceleration * (1.0 - LIMIT_FRAC));
             let [lower, upper] = self.position_rad[ix];
-            let position = [requested.position[0].max(lower + margin), requested.position[1].min(upper - margin)];
+            let position = [
+                requested.position[0].max(lower + margin),
+                requested.position[1].min(upper - margin),
+            ];
             if position[0] >= position[1] {
                 let [min, max] = requested.position;
                 return Err(format!(
@@ -94,18 +110,20 @@ impl RobotLimits {
             Ok(MotionLimits {
                 position,
                 velocity: requested.velocity.min(LIMIT_FRAC * max_speed),
-                acceleration: requested.acceleration.min(LIMIT_FRAC * deceleration.min(self.acceleration_rad_s2[ix])),
+                acceleration: requested
+                    .acceleration
+                    .min(LIMIT_FRAC * deceleration.min(self.acceleration_rad_s2[ix])),
                 jerk: requested.jerk.min(JERK_LIMIT_FRAC * self.jerk_rad_s3[ix]),
             })
         };
         requested.iter().enumerate().map(allowed).collect()
     }
 
-    /// Limits the rates of a position to be sent, so that the robot does not trigger a reflex. Returns the position
-    /// and whether it was changed.
+    /// Limits the rates of a position to be sent, so that the robot does not trigger a reflex.
+    /// Returns the position and whether it was changed.
     ///
-    /// This is libfranka's rate limiter without its low-pass filter: our setpoints are smooth, and the filter would
-    /// only delay them.
+    /// This is libfranka's rate limiter without its low-pass filter: our setpoints are smooth, and
+    /// the filter would only delay them.
     pub(super) fn limited(
         &self,
         requested_rad: [f64; N_JOINTS],
@@ -116,7 +134,10 @@ impl RobotLimits {
             SpeedLimits::PositionDependent(joints) => {
                 let at = &reference.position_rad;
                 // A joint beyond the end of its range may stay at rest there.
-                (joints.upper_limits(at).map(|max| max.max(0.0)), joints.lower_limits(at).map(|min| min.min(0.0)))
+                (
+                    joints.upper_limits(at).map(|max| max.max(0.0)),
+                    joints.lower_limits(at).map(|min| min.min(0.0)),
+                )
             }
         };
         let limited = limit_rate_joint_positions(
@@ -130,23 +151,45 @@ impl RobotLimits {
             &reference.acceleration_rad_s2,
         );
         let limited = limited.map_err(|error| error.to_string())?;
-        let is_same =
-            limited.iter().zip(requested_rad).all(|(limited, requested)| (limited - requested).abs() <= UNCHANGED_RAD);
-        Ok(if is_same { (requested_rad, false) } else { (limited, true) })
+        let is_same = limited
+            .iter()
+            .zip(requested_rad)
+            .all(|(limited, requested)| (limited - requested).abs() <= UNCHANGED_RAD);
+        Ok(if is_same {
+            (requested_rad, false)
+        } else {
+            (limited, true)
+        })
     }
 }
 
 /// Clamps a target to the joints' ranges.
-pub(super) fn clamp_to_range(target: &JointTarget, limits: &[MotionLimits]) -> Result<JointTarget, String> {
+pub(super) fn clamp_to_range(
+    target: &JointTarget,
+    limits: &[MotionLimits],
+) -> Result<JointTarget, String> {
     let n = target.position.len();
     if n != limits.len() {
-        return Err(format!("the target has {n} joints, but the arm has {}", limits.len()));
+        return Err(format!(
+            "the target has {n} joints, but the arm has {}",
+            limits.len()
+        ));
     }
-    if let Some(ix) = target.position.iter().position(|position| !position.is_finite()) {
-        return Err(format!("the target of joint {} is not a finite number: {}", ix + 1, target.position[ix]));
+    if let Some(ix) = target
+        .position
+        .iter()
+        .position(|position| !position.is_finite())
+    {
+        return Err(format!(
+            "the target of joint {} is not a finite number: {}",
+            ix + 1,
+            target.position[ix]
+        ));
     }
     let joints = target.position.iter().zip(limits);
     Ok(JointTarget {
-        position: joints.map(|(position, joint)| position.clamp(joint.position[0], joint.position[1])).collect(),
+        position: joints
+            .map(|(position, joint)| position.clamp(joint.position[0], joint.position[1]))
+            .collect(),
     })
 }

@@ -1,4 +1,5 @@
-//! Exchanges commands and results between the caller that commands an arm and the thread that moves it.
+//! Exchanges commands and results between the caller that commands an arm and the thread that moves
+//! it.
 
 use super::MotionStatistics;
 use crate::motion::{JointTarget, Motion};
@@ -51,7 +52,10 @@ impl Default for MotionMailbox {
             mode: RobotMode::Other,
             statistics: MotionStatistics::default(),
         };
-        Self { mailbox_state: Mutex::new(mailbox_state), changed: Condvar::new() }
+        Self {
+            mailbox_state: Mutex::new(mailbox_state),
+            changed: Condvar::new(),
+        }
     }
 }
 

@@ -1,5 +1,5 @@
-//! The part of an arm's thread that moves the arm: for each state that arrives, it sends the joint positions for the
-//! next millisecond.
+//! The part of an arm's thread that moves the arm: for each state that arrives, it sends the joint
+//! positions for the next millisecond.
 
 use super::limits::RobotLimits;
 use super::mailbox::{MotionCommand, MotionMailbox};
@@ -41,8 +41,8 @@ pub(super) struct StampedState<'a> {
     pub(super) numbered: &'a NumberedState,
     pub(super) stamp: Stamp,
     pub(super) from: SocketAddr,
-    /// Whether the state has just arrived. If not, the robot may already have stopped waiting for an answer, so the
-    /// state is not answered.
+    /// Whether the state has just arrived. If not, the robot may already have stopped waiting for
+    /// an answer, so the state is not answered.
     pub(super) is_fresh: bool,
 }
 
@@ -88,7 +88,15 @@ impl MotionLoop {
         robot: RobotLimits,
         limits: Vec<MotionLimits>,
     ) -> Self {
-        Self { device, session, mailbox, robot, limits, motion_state: MotionState::Idle, mode: RobotMode::Other }
+        Self {
+            device,
+            session,
+            mailbox,
+            robot,
+            limits,
+            motion_state: MotionState::Idle,
+            mode: RobotMode::Other,
+        }
     }
 
     /// Processes the newest state.
@@ -102,34 +110,47 @@ impl MotionLoop {
             },
             MotionState::Beginning { id, n_waited } => self.start_motion(id, n_waited, stamped),
             MotionState::ActiveMotion(active) if state.robot_mode != RobotMode::Move => {
-                self.mailbox.update(|mailbox_state| mailbox_state.accepts_commands = false);
+                self.mailbox
+                    .update(|mailbox_state| mailbox_state.accepts_commands = false);
                 let summary = match state.robot_mode {
                     RobotMode::Reflex => self.summary(&active.recent, stamped.numbered.number),
                     _ => String::new(),
                 };
-                MotionState::Ending { id: active.id, n_waited: 0, reason: cause(state), summary }
+                MotionState::Ending {
+                    id: active.id,
+                    n_waited: 0,
+                    reason: cause(state),
+                    summary,
+                }
             }
             MotionState::ActiveMotion(active) => self.run(active, stamped),
-            MotionState::Ending { id, n_waited, reason, summary } => self.conclude(id, n_waited, reason, summary),
+            MotionState::Ending {
+                id,
+                n_waited,
+                reason,
+                summary,
+            } => self.conclude(id, n_waited, reason, summary),
         };
     }
 
     /// Handles the loss of the connection; the robot stops on its own.
     pub(super) fn handle_disconnect(&mut self, reason: &str) {
         self.motion_state = MotionState::Idle;
-        self.mailbox.update(|mailbox_state| mailbox_state.is_lost = true);
+        self.mailbox
+            .update(|mailbox_state| mailbox_state.is_lost = true);
         self.stop_because(format!("connection lost: {reason}"));
     }
 
-    /// Records the robot's mode. Outside of a motion, also reports a mode that stops the arm. During a motion, the
-    /// reply about the end of the motion gives more details.
+    /// Records the robot's mode. Outside of a motion, also reports a mode that stops the arm.
+    /// During a motion, the reply about the end of the motion gives more details.
     pub(super) fn take_mode(&mut self, state: &RobotState) {
         let mode = state.robot_mode;
         if mode == self.mode {
             return;
         }
         self.mode = mode;
-        self.mailbox.update(|mailbox_state| mailbox_state.mode = mode);
+        self.mailbox
+            .update(|mailbox_state| mailbox_state.mode = mode);
         if let (MotionState::Idle, RobotMode::Reflex | RobotMode::UserStopped, Some(reason)) =
             (&self.motion_state, mode, cause(state))
         {
@@ -141,17 +162,24 @@ impl MotionLoop {
         let StampedState { numbered, .. } = stamped;
         if numbered.state.robot_mode != RobotMode::Move {
             return match request::outcome(&self.session, id) {
-                Ok(None) if n_waited < MAX_STATES_UNTIL_START => MotionState::Beginning { id, n_waited: n_waited + 1 },
+                Ok(None) if n_waited < MAX_STATES_UNTIL_START => MotionState::Beginning {
+                    id,
+                    n_waited: n_waited + 1,
+                },
                 Ok(None) => self.halt(id, "it accepted a motion but did not start it".to_owned()),
-                Ok(Some(MotionResponse::Rejected(why))) => self.finish(cause(&numbered.state).or(Some(why))),
-                Ok(Some(_)) => {
-                    self.finish(cause(&numbered.state).or(Some("it ended a motion before it started".to_owned())))
+                Ok(Some(MotionResponse::Rejected(why))) => {
+                    self.finish(cause(&numbered.state).or(Some(why)))
                 }
+                Ok(Some(_)) => self.finish(
+                    cause(&numbered.state)
+                        .or(Some("it ended a motion before it started".to_owned())),
+                ),
                 Err(why) => self.finish(Some(why)),
             };
         }
         let reference = Reference::at_rest(&numbered.state);
-        let generator = match TrajectoryGenerator::new(&self.limits, &reference.position_rad, STEP) {
+        let generator = match TrajectoryGenerator::new(&self.limits, &reference.position_rad, STEP)
+        {
             Ok(generator) => generator,
             Err(why) => return self.halt(id, why),
         };
@@ -187,7 +215,12 @@ impl MotionLoop {
         if stamped.is_fresh {
             self.send(&mut active, stamped, position_rad);
         }
-        active.recent.push(stamped.numbered, fate, active.tracker.reference(), active.sent);
+        active.recent.push(
+            stamped.numbered,
+            fate,
+            active.tracker.reference(),
+            active.sent,
+        );
         MotionState::ActiveMotion(active)
     }
 
@@ -207,7 +240,9 @@ impl MotionLoop {
         mailbox_state.statistics.n_missed += fate.n_missed();
         // Until then, the window of the success rate is not full.
         if active.n_cycles > N_SUCCESS_WINDOW {
-            mailbox_state.statistics.count_robot_success(stamped.numbered.state.control_command_success_rate);
+            mailbox_state
+                .statistics
+                .count_robot_success(stamped.numbered.state.control_command_success_rate);
         }
         let command = mailbox_state.command.take();
         let is_at_rest = active.generator.is_at_rest() && command.is_none();
@@ -215,7 +250,11 @@ impl MotionLoop {
         if is_at_rest && (active.n_at_rest > MAX_AT_REST || mailbox_state.is_shutting_down) {
             (active.is_ending, mailbox_state.accepts_commands) = (true, false);
         }
-        let motion = if is_at_rest { Motion::Holding } else { Motion::Moving };
+        let motion = if is_at_rest {
+            Motion::Holding
+        } else {
+            Motion::Moving
+        };
         if mailbox_state.motion != motion {
             mailbox_state.motion = motion;
         }
@@ -229,7 +268,9 @@ impl MotionLoop {
         command: Option<&MotionCommand>,
         fate: CommandFate,
     ) -> Result<[f64; super::N_JOINTS], String> {
-        let ActiveMotion { generator, tracker, .. } = active;
+        let ActiveMotion {
+            generator, tracker, ..
+        } = active;
         let reference = tracker.reference();
         match command {
             Some(MotionCommand::SetTarget(target)) => drop(generator.set_target(target)?),
@@ -241,7 +282,9 @@ impl MotionLoop {
             generator.resume(&reference.setpoint())?;
         }
         let desired = generator.step()?.position;
-        let desired = desired.try_into().map_err(|_| "the setpoint has the wrong number of joints".to_owned())?;
+        let desired = desired
+            .try_into()
+            .map_err(|_| "the setpoint has the wrong number of joints".to_owned())?;
         let (position_rad, is_limited) = self.robot.limited(desired, reference)?;
         if is_limited {
             generator.resume(&reference.sent(position_rad).setpoint())?;
@@ -250,22 +293,39 @@ impl MotionLoop {
         Ok(position_rad)
     }
 
-    fn send(&self, active: &mut ActiveMotion, stamped: &StampedState<'_>, position_rad: [f64; super::N_JOINTS]) {
+    fn send(
+        &self,
+        active: &mut ActiveMotion,
+        stamped: &StampedState<'_>,
+        position_rad: [f64; super::N_JOINTS],
+    ) {
         let Session { network, version } = &*self.session;
         let datagram = request::command(*version, active.number, &position_rad, active.is_ending);
         match network.udp.send(stamped.from, &datagram) {
             Ok(()) => {
                 active.sent = Some(position_rad);
-                self.mailbox.lock().statistics.count(clock::now().duration_since(stamped.stamp));
+                self.mailbox
+                    .lock()
+                    .statistics
+                    .count(clock::now().duration_since(stamped.stamp));
             }
             // This has the same effect as a lost datagram: the robot extrapolates.
-            Err(error) => log::debug!("{}: a command could not be sent: {}", self.device, error_text(&error)),
+            Err(error) => log::debug!(
+                "{}: a command could not be sent: {}",
+                self.device,
+                error_text(&error)
+            ),
         }
     }
 
-    /// Summarizes and logs the last cycles of a motion. `number` is the number of the state that reported its end.
+    /// Summarizes and logs the last cycles of a motion. `number` is the number of the state that
+    /// reported its end.
     fn summary(&self, recent: &RecentCycles, number: u64) -> String {
-        log::debug!("{}: the last cycles before the stop: {}", self.device, recent.table());
+        log::debug!(
+            "{}: the last cycles before the stop: {}",
+            self.device,
+            recent.table()
+        );
         recent.summary(number)
     }
 
@@ -275,26 +335,49 @@ impl MotionLoop {
             Ok(()) => reason,
             Err(why) => format!("{reason}; {why}"),
         };
-        self.mailbox.update(|mailbox_state| mailbox_state.accepts_commands = false);
-        MotionState::Ending { id, n_waited: 0, reason: Some(reason), summary: String::new() }
+        self.mailbox
+            .update(|mailbox_state| mailbox_state.accepts_commands = false);
+        MotionState::Ending {
+            id,
+            n_waited: 0,
+            reason: Some(reason),
+            summary: String::new(),
+        }
     }
 
     /// Waits for the robot's reply about a motion that has ended.
-    fn conclude(&self, id: u32, n_waited: u32, reason: Option<String>, summary: String) -> MotionState {
+    fn conclude(
+        &self,
+        id: u32,
+        n_waited: u32,
+        reason: Option<String>,
+        summary: String,
+    ) -> MotionState {
         let reason = match request::outcome(&self.session, id) {
             Ok(None) if n_waited < MAX_STATES_UNTIL_RESPONSE => {
-                return MotionState::Ending { id, n_waited: n_waited + 1, reason, summary };
+                return MotionState::Ending {
+                    id,
+                    n_waited: n_waited + 1,
+                    reason,
+                    summary,
+                };
             }
             Ok(Some(MotionResponse::Finished)) => reason,
             Ok(Some(MotionResponse::Rejected(why))) => {
                 Some(reason.map_or(why.clone(), |reason| format!("{reason} ({why})")))
             }
-            Ok(None | Some(MotionResponse::Started)) => {
-                Some(reason.unwrap_or_else(|| "it ended a motion without giving a reason".to_owned()))
-            }
+            Ok(None | Some(MotionResponse::Started)) => Some(
+                reason.unwrap_or_else(|| "it ended a motion without giving a reason".to_owned()),
+            ),
             Err(why) => Some(reason.unwrap_or(why)),
         };
-        self.finish(reason.map(|reason| if summary.is_empty() { reason } else { format!("{reason}; {summary}") }))
+        self.finish(reason.map(|reason| {
+            if summary.is_empty() {
+                reason
+            } else {
+                format!("{reason}; {summary}")
+            }
+        }))
     }
 
     /// Ends the motion. A `reason` means that it stopped because of a problem.
@@ -302,8 +385,12 @@ impl MotionLoop {
         match reason {
             Some(reason) => self.stop_because(reason),
             None => self.mailbox.update(|mailbox_state| {
-                (mailbox_state.is_idle, mailbox_state.accepts_commands, mailbox_state.command, mailbox_state.motion) =
-                    (true, false, None, Motion::Holding);
+                (
+                    mailbox_state.is_idle,
+                    mailbox_state.accepts_commands,
+                    mailbox_state.command,
+                    mailbox_state.motion,
+                ) = (true, false, None, Motion::Holding);
             }),
         }
         MotionState::Idle
@@ -313,17 +400,25 @@ impl MotionLoop {
         log::warn!("{}: {reason}", self.device);
         self.mailbox.update(|mailbox_state| {
             // A command from before the stop must not be executed after the recovery.
-            (mailbox_state.is_idle, mailbox_state.accepts_commands, mailbox_state.command) = (true, false, None);
+            (
+                mailbox_state.is_idle,
+                mailbox_state.accepts_commands,
+                mailbox_state.command,
+            ) = (true, false, None);
             mailbox_state.motion = Motion::Stopped { reason };
         });
     }
 }
 
-/// The reason why a robot does not follow commands, according to its state; `None` if the robot is ready.
+/// The reason why a robot does not follow commands, according to its state; `None` if the robot is
+/// ready.
 fn cause(state: &RobotState) -> Option<String> {
     match state.robot_mode {
         RobotMode::Reflex => {
-            let (errors, last) = (state.current_errors.names(), state.last_motion_errors.names());
+            let (errors, last) = (
+                state.current_errors.names(),
+                state.last_motion_errors.names(),
+            );
             let names = if errors.is_empty() { last } else { errors };
             Some(format!("stopped by a reflex: {}", names.join(", ")))
         }

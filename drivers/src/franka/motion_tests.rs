@@ -1,7 +1,12 @@
-//! Tests of the movable arm over loopback sockets, against emulated robots that enforce their limits.
+//! Tests of the movable arm over loopback sockets, against emulated robots that enforce their
+//! limits.
 
-use super::emulated::{CommandedJoints, EmulatedRobot, JointSimulator, Joints, Limits, RobotConfig};
-use super::tests::{FREE_PORT, REST_RAD, TEST_TIMEOUT, VERSIONS, chain, config, ideal_joints, robot, waiting_robot};
+use super::emulated::{
+    CommandedJoints, EmulatedRobot, JointSimulator, Joints, Limits, RobotConfig,
+};
+use super::tests::{
+    FREE_PORT, REST_RAD, TEST_TIMEOUT, VERSIONS, chain, config, ideal_joints, robot, waiting_robot,
+};
 use super::{ContactConfig, FciVersion, MovableFrankaArm, N_JOINTS};
 use crate::motion::{JointTarget, Motion, MotionConfig, MotionLimits, MovableArm, OnLoss};
 use kinematics::Transform;
@@ -13,16 +18,23 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
-/// How long a robot waits for our driver, which answers no state if the one before it arrived more than 20 ms earlier.
+/// How long a robot waits for our driver, which answers no state if the one before it arrived more
+/// than 20 ms earlier.
 const ANSWER_WAIT: Duration = Duration::from_millis(15);
-/// Number of states without an answer after which a robot stops; two commands may still be on their way.
+/// Number of states without an answer after which a robot stops; two commands may still be on their
+/// way.
 const MAX_WITHOUT_ANSWER: u64 = 22;
-/// Set in the child process that [`suspended_program_triggers_reflex_and_sends_nothing_stale`] suspends and resumes.
+/// Set in the child process that [`suspended_program_triggers_reflex_and_sends_nothing_stale`]
+/// suspends and resumes.
 const CHILD: &str = "FIELDRIG_TEST_FCI";
 
 fn motion() -> MotionConfig {
     MotionConfig {
-        limits: chain("link8").limits().iter().map(|joint| MotionLimits::new(joint, 1.0, 0.5, 0.1)).collect(),
+        limits: chain("link8")
+            .limits()
+            .iter()
+            .map(|joint| MotionLimits::new(joint, 1.0, 0.5, 0.1))
+            .collect(),
         on_loss: OnLoss::Hold,
         timeout: Duration::from_millis(100),
         accept_no_watchdog: false,
@@ -57,7 +69,13 @@ fn with_counter(mut joint_simulator: JointSimulator) -> (JointSimulator, Arc<Ato
 }
 
 fn offset_from_rest(by_rad: [f64; N_JOINTS]) -> JointTarget {
-    JointTarget { position: REST_RAD.iter().zip(by_rad).map(|(rest, by)| rest + by).collect() }
+    JointTarget {
+        position: REST_RAD
+            .iter()
+            .zip(by_rad)
+            .map(|(rest, by)| rest + by)
+            .collect(),
+    }
 }
 
 /// Waits until the arm is at rest. Returns the reason if it stopped.
@@ -84,14 +102,19 @@ fn wait_until(mut condition: impl FnMut() -> bool, expected: &str) {
 
 /// Performs an action and waits until the arm is at rest.
 ///
-/// If the machine is so busy that the arm's thread answers more than 20 states in a row too late, the robot correctly
-/// triggers a reflex. The action is then retried.
-fn retry_until_settled(arm: &mut MovableFrankaArm, mut act: impl FnMut(&mut MovableFrankaArm) -> Result<(), String>) {
+/// If the machine is so busy that the arm's thread answers more than 20 states in a row too late,
+/// the robot correctly triggers a reflex. The action is then retried.
+fn retry_until_settled(
+    arm: &mut MovableFrankaArm,
+    mut act: impl FnMut(&mut MovableFrankaArm) -> Result<(), String>,
+) {
     const MAX_ATTEMPTS: usize = 5;
     for _ in 0..MAX_ATTEMPTS {
         match act(arm).and_then(|()| settle(arm)) {
             Ok(()) => return,
-            Err(why) if why.contains("communication_constraints_violation") => arm.recover().unwrap(),
+            Err(why) if why.contains("communication_constraints_violation") => {
+                arm.recover().unwrap()
+            }
             Err(why) => panic!("{why}"),
         }
     }
@@ -99,7 +122,9 @@ fn retry_until_settled(arm: &mut MovableFrankaArm, mut act: impl FnMut(&mut Mova
 }
 
 fn command_target(arm: &mut MovableFrankaArm, target: &JointTarget) -> Result<(), String> {
-    arm.command(target).map(drop).map_err(|error| error.to_string())
+    arm.command(target)
+        .map(drop)
+        .map_err(|error| error.to_string())
 }
 
 /// Commands a target until something stops the arm on its way, and returns the reason.
@@ -131,13 +156,20 @@ fn motion_of_all_joints_respects_robot_limits() {
             assert_eq!(arm.motion(), Motion::Moving);
             move_and_settle(&mut arm, &target);
             let commanded = *last_command.lock().unwrap();
-            let errors = commanded.position_rad.iter().zip(&target.position).map(|(is, target)| (is - target).abs());
+            let errors = commanded
+                .position_rad
+                .iter()
+                .zip(&target.position)
+                .map(|(is, target)| (is - target).abs());
             let worst = errors.fold(0.0, f64::max);
             assert!(worst < NEAR_RAD, "{version:?}: {worst} rad");
         }
         let statistics = arm.motion_statistics();
         eprintln!("{version:?}: {statistics}");
-        assert!(statistics.n_motions >= 1 && statistics.n_cycles > 1000, "{statistics}");
+        assert!(
+            statistics.n_motions >= 1 && statistics.n_cycles > 1000,
+            "{statistics}"
+        );
     }
 }
 
@@ -153,17 +185,35 @@ fn retargeting_and_stopping_respect_robot_limits() {
             for ix in 0..8 {
                 std::thread::sleep(Duration::from_millis(90));
                 let sign = if ix % 2 == 0 { -1.0 } else { 1.0 };
-                command_target(arm, &offset_from_rest([sign, 0.3, -sign, 0.2 * sign, 0.0, sign, 0.5]))?;
+                command_target(
+                    arm,
+                    &offset_from_rest([sign, 0.3, -sign, 0.2 * sign, 0.0, sign, 0.5]),
+                )?;
             }
             command_target(arm, &far)?;
             std::thread::sleep(Duration::from_millis(700));
             arm.stop().unwrap();
             Ok(())
         });
-        let CommandedJoints { position_rad, velocity_rad_s, .. } = *last_command.lock().unwrap();
-        let remaining = far.position.iter().zip(position_rad).map(|(far, is)| (far - is).abs()).fold(0.0, f64::max);
-        assert!(remaining > 0.1, "{version:?}: the arm did not stop before its target: {remaining} rad");
-        assert!(velocity_rad_s.iter().all(|velocity| velocity.abs() < 1e-3), "{velocity_rad_s:?}");
+        let CommandedJoints {
+            position_rad,
+            velocity_rad_s,
+            ..
+        } = *last_command.lock().unwrap();
+        let remaining = far
+            .position
+            .iter()
+            .zip(position_rad)
+            .map(|(far, is)| (far - is).abs())
+            .fold(0.0, f64::max);
+        assert!(
+            remaining > 0.1,
+            "{version:?}: the arm did not stop before its target: {remaining} rad"
+        );
+        assert!(
+            velocity_rad_s.iter().all(|velocity| velocity.abs() < 1e-3),
+            "{velocity_rad_s:?}"
+        );
     }
 }
 
@@ -181,8 +231,14 @@ fn targets_are_clamped_and_range_end_reached_slowly() {
     }
     move_and_settle(&mut arm, &out_of_range);
     assert!((last_command.lock().unwrap().position_rad[1] - accepted.position[1]).abs() < 1e-4);
-    for (wrong, text) in [(vec![0.0; 6], "6 joints"), (vec![f64::NAN; N_JOINTS], "joint 1 is not a finite number")] {
-        let open_error = arm.command(&JointTarget { position: wrong }).unwrap_err().to_string();
+    for (wrong, text) in [
+        (vec![0.0; 6], "6 joints"),
+        (vec![f64::NAN; N_JOINTS], "joint 1 is not a finite number"),
+    ] {
+        let open_error = arm
+            .command(&JointTarget { position: wrong })
+            .unwrap_err()
+            .to_string();
         assert!(open_error.contains(text), "{open_error}");
     }
     assert_eq!(arm.motion(), Motion::Holding);
@@ -190,26 +246,41 @@ fn targets_are_clamped_and_range_end_reached_slowly() {
 
 #[test]
 fn robot_can_be_hand_guided_between_motions() {
-    let (hand_position, last_command) = (Arc::new(Mutex::new(None)), Arc::new(Mutex::new(CommandedJoints::default())));
+    let (hand_position, last_command) = (
+        Arc::new(Mutex::new(None)),
+        Arc::new(Mutex::new(CommandedJoints::default())),
+    );
     let (hand_input, recorder) = (Arc::clone(&hand_position), Arc::clone(&last_command));
     let mut follow_command = ideal_joints();
     let joint_simulator: JointSimulator = Box::new(move |stamp, commanded| {
         *recorder.lock().unwrap() = *commanded;
         let joints = follow_command(stamp, commanded);
         match *hand_input.lock().unwrap() {
-            Some(position_rad) if !commanded.is_moving => Joints { position_rad, ..joints },
+            Some(position_rad) if !commanded.is_moving => Joints {
+                position_rad,
+                ..joints
+            },
             _ => joints,
         }
     });
     let emulated = waiting_robot(FciVersion::V10, ANSWER_WAIT, joint_simulator);
     let mut arm = open(emulated.address());
     move_and_settle(&mut arm, &offset_from_rest([0.1; N_JOINTS]));
-    assert!(last_command.lock().unwrap().is_moving, "the motion stays active for a while");
-    wait_until(|| !last_command.lock().unwrap().is_moving, "the motion ends");
+    assert!(
+        last_command.lock().unwrap().is_moving,
+        "the motion stays active for a while"
+    );
+    wait_until(
+        || !last_command.lock().unwrap().is_moving,
+        "the motion ends",
+    );
     assert_eq!(arm.motion(), Motion::Holding);
     let by_hand = REST_RAD.map(|rest| rest - 0.2);
     *hand_position.lock().unwrap() = Some(by_hand);
-    wait_until(|| last_command.lock().unwrap().position_rad == by_hand, "the robot notices the hand");
+    wait_until(
+        || last_command.lock().unwrap().position_rad == by_hand,
+        "the robot notices the hand",
+    );
     *hand_position.lock().unwrap() = None;
     // The motion must start there without a jump, which would trigger a reflex.
     let target = offset_from_rest([0.0; N_JOINTS]);
@@ -231,19 +302,38 @@ fn contact_triggers_reflex_until_recovery() {
             joints
         });
         let emulated = waiting_robot(version, ANSWER_WAIT, joint_simulator);
-        let contact = ContactConfig { torque_nm: [15.0; N_JOINTS], ..ContactConfig::default() };
-        let mut arm = MovableFrankaArm::open(&config(emulated.address()), &motion(), &contact).unwrap();
-        let (target, start) = (offset_from_rest([0.3; N_JOINTS]), offset_from_rest([0.0; N_JOINTS]));
+        let contact = ContactConfig {
+            torque_nm: [15.0; N_JOINTS],
+            ..ContactConfig::default()
+        };
+        let mut arm =
+            MovableFrankaArm::open(&config(emulated.address()), &motion(), &contact).unwrap();
+        let (target, start) = (
+            offset_from_rest([0.3; N_JOINTS]),
+            offset_from_rest([0.0; N_JOINTS]),
+        );
         *contact_nm.lock().unwrap() = 14.0;
         move_and_settle(&mut arm, &target);
         *contact_nm.lock().unwrap() = 16.0;
         let reason = move_until_stopped(&mut arm, &start);
-        assert!(reason.contains("reflex") && reason.contains("joint_reflex"), "{reason}");
-        assert!(reason.contains("; in the last 60 cycles, the robot missed "), "{reason}");
+        assert!(
+            reason.contains("reflex") && reason.contains("joint_reflex"),
+            "{reason}"
+        );
+        assert!(
+            reason.contains("; in the last 60 cycles, the robot missed "),
+            "{reason}"
+        );
         let open_error = arm.command(&start).unwrap_err().to_string();
-        assert!(open_error.contains("recovered") && open_error.contains("joint_reflex"), "{open_error}");
+        assert!(
+            open_error.contains("recovered") && open_error.contains("joint_reflex"),
+            "{open_error}"
+        );
         *contact_nm.lock().unwrap() = 0.0;
-        assert!(matches!(arm.motion(), Motion::Stopped { .. }), "the arm has not been recovered");
+        assert!(
+            matches!(arm.motion(), Motion::Stopped { .. }),
+            "the arm has not been recovered"
+        );
         arm.recover().unwrap();
         assert_eq!(arm.motion(), Motion::Holding);
         move_and_settle(&mut arm, &start);
@@ -253,7 +343,10 @@ fn contact_triggers_reflex_until_recovery() {
 #[test]
 fn stricter_robot_triggers_reflex_and_recovers() {
     let (joint_simulator, _) = recording_joints();
-    let limits = Limits { acceleration_rad_s2: [0.5; N_JOINTS], ..Limits::panda() };
+    let limits = Limits {
+        acceleration_rad_s2: [0.5; N_JOINTS],
+        ..Limits::panda()
+    };
     let address = FREE_PORT.parse().unwrap();
     let config_5 = RobotConfig {
         address,
@@ -265,7 +358,10 @@ fn stricter_robot_triggers_reflex_and_recovers() {
     let emulated = EmulatedRobot::start_waiting(config_5, ANSWER_WAIT, joint_simulator).unwrap();
     let mut arm = open(emulated.address());
     let reason = move_until_stopped(&mut arm, &offset_from_rest([0.5; N_JOINTS]));
-    assert!(reason.contains("joint_motion_generator_velocity_discontinuity"), "{reason}");
+    assert!(
+        reason.contains("joint_motion_generator_velocity_discontinuity"),
+        "{reason}"
+    );
     arm.recover().unwrap();
     assert_eq!(arm.motion(), Motion::Holding);
     arm.recover().unwrap();
@@ -276,15 +372,30 @@ fn stricter_robot_triggers_reflex_and_recovers() {
 fn unsupported_fail_safe_is_rejected() {
     let emulated = robot(FciVersion::V5, ideal_joints());
     let open_error = |motion: &MotionConfig| {
-        MovableFrankaArm::open(&config(emulated.address()), motion, &ContactConfig::default()).unwrap_err().to_string()
+        MovableFrankaArm::open(
+            &config(emulated.address()),
+            motion,
+            &ContactConfig::default(),
+        )
+        .unwrap_err()
+        .to_string()
     };
     for on_loss in [OnLoss::Damp, OnLoss::Release] {
-        let text = open_error(&MotionConfig { on_loss, ..motion() });
+        let text = open_error(&MotionConfig {
+            on_loss,
+            ..motion()
+        });
         assert!(text.contains("on_loss = \"hold\""), "{text}");
     }
-    let text = open_error(&MotionConfig { timeout: Duration::from_millis(5), ..motion() });
+    let text = open_error(&MotionConfig {
+        timeout: Duration::from_millis(5),
+        ..motion()
+    });
     assert!(text.contains("20ms") && text.contains("5ms"), "{text}");
-    let too_few_limits = MotionConfig { limits: motion().limits[1..].to_vec(), ..motion() };
+    let too_few_limits = MotionConfig {
+        limits: motion().limits[1..].to_vec(),
+        ..motion()
+    };
     assert!(open_error(&too_few_limits).contains("6 joints"));
     let mut other = motion();
     other.limits[3].position = [0.5, 2.0];
@@ -317,14 +428,16 @@ impl Relay {
             let mut upstream = TcpStream::connect(robot).unwrap();
             let mut hello = [0; 16];
             client.read_exact(&mut hello).unwrap();
-            let client_states = SocketAddr::new(peer.ip(), u16::from_le_bytes([hello[14], hello[15]]));
+            let client_states =
+                SocketAddr::new(peer.ip(), u16::from_le_bytes([hello[14], hello[15]]));
             let udp = UdpSocket::bind(FREE_PORT).unwrap();
             hello[14..].copy_from_slice(&udp.local_addr().unwrap().port().to_le_bytes());
             upstream.write_all(&hello).unwrap();
             for stream in [&client, &upstream] {
                 stream.set_nodelay(true).unwrap();
             }
-            let (mut from_client, mut to_robot) = (client.try_clone().unwrap(), upstream.try_clone().unwrap());
+            let (mut from_client, mut to_robot) =
+                (client.try_clone().unwrap(), upstream.try_clone().unwrap());
             std::thread::spawn(move || {
                 // Either side may disconnect at any time.
                 let _ = std::io::copy(&mut from_client, &mut to_robot);
@@ -374,8 +487,14 @@ fn lossy_network_is_reported_and_motions_complete() {
     eprintln!("5 % loss in each direction: {statistics}");
     // 0.95 for our rate and 0.95 squared for the robot's.
     let [mean, least] = statistics.robot_success_frac().unwrap();
-    assert!((0.88..0.97).contains(&statistics.success_frac()), "{statistics}");
-    assert!((0.78..0.93).contains(&mean) && least < mean && statistics.n_missed > 20, "{statistics}");
+    assert!(
+        (0.88..0.97).contains(&statistics.success_frac()),
+        "{statistics}"
+    );
+    assert!(
+        (0.78..0.93).contains(&mean) && least < mean && statistics.n_missed > 20,
+        "{statistics}"
+    );
 }
 
 #[test]
@@ -390,18 +509,30 @@ fn disconnect_triggers_reflex_and_arm_recovers() {
     std::thread::sleep(Duration::from_millis(500));
     relay.faults.is_disconnected.store(true, Ordering::Relaxed);
     let n_before = n_moving.load(Ordering::Relaxed);
-    wait_until(|| !last_command.lock().unwrap().is_moving, "the robot stops on its own");
+    wait_until(
+        || !last_command.lock().unwrap().is_moving,
+        "the robot stops on its own",
+    );
     let n_without_answer = n_moving.load(Ordering::Relaxed) - n_before;
-    assert!(n_without_answer <= MAX_WITHOUT_ANSWER, "the robot stopped after {n_without_answer} states");
+    assert!(
+        n_without_answer <= MAX_WITHOUT_ANSWER,
+        "the robot stopped after {n_without_answer} states"
+    );
     relay.faults.is_disconnected.store(false, Ordering::Relaxed);
     let reason = settle(&arm).unwrap_err();
-    assert!(reason.contains("communication_constraints_violation"), "{reason}");
+    assert!(
+        reason.contains("communication_constraints_violation"),
+        "{reason}"
+    );
     assert!(arm.command(&far).is_err(), "the arm has not been recovered");
     arm.recover().unwrap();
     move_and_settle(&mut arm, &far);
     // This time, the disconnection is permanent.
     relay.faults.is_disconnected.store(true, Ordering::Relaxed);
-    wait_until(|| matches!(arm.motion(), Motion::Stopped { .. }), "the arm notices the disconnection");
+    wait_until(
+        || matches!(arm.motion(), Motion::Stopped { .. }),
+        "the arm notices the disconnection",
+    );
     let lost = arm.recover().unwrap_err().to_string();
     assert!(lost.contains("no state"), "{lost}");
 }
@@ -409,10 +540,19 @@ fn disconnect_triggers_reflex_and_arm_recovers() {
 #[test]
 #[ignore = "child process of the test below"]
 fn child_program_moves_arm() {
-    let Ok(address) = std::env::var(CHILD) else { return };
-    let print_line = |text: &str| std::io::stdout().write_all(format!("\narm: {text}\n").as_bytes()).unwrap();
+    let Ok(address) = std::env::var(CHILD) else {
+        return;
+    };
+    let print_line = |text: &str| {
+        std::io::stdout()
+            .write_all(format!("\narm: {text}\n").as_bytes())
+            .unwrap()
+    };
     let mut arm = open(address.parse().unwrap());
-    let (target, start) = (offset_from_rest([1.5, -1.0, 1.5, 1.5, 1.5, 1.5, 1.5]), offset_from_rest([0.0; N_JOINTS]));
+    let (target, start) = (
+        offset_from_rest([1.5, -1.0, 1.5, 1.5, 1.5, 1.5, 1.5]),
+        offset_from_rest([0.0; N_JOINTS]),
+    );
     command_target(&mut arm, &target).unwrap();
     print_line("moving");
     print_line(&settle(&arm).unwrap_err());
@@ -432,7 +572,12 @@ fn suspended_program_triggers_reflex_and_sends_nothing_stale() {
     let emulated = waiting_robot(FciVersion::V10, ANSWER_WAIT, joint_simulator);
     let relay = Relay::start(emulated.address());
     let mut child = Command::new(std::env::current_exe().unwrap())
-        .args(["--ignored", "--nocapture", "--exact", "franka::motion_tests::child_program_moves_arm"])
+        .args([
+            "--ignored",
+            "--nocapture",
+            "--exact",
+            "franka::motion_tests::child_program_moves_arm",
+        ])
         .env(CHILD, relay.address.to_string())
         .stdout(Stdio::piped())
         .spawn()
@@ -440,10 +585,17 @@ fn suspended_program_triggers_reflex_and_sends_nothing_stale() {
     let mut lines = BufReader::new(child.stdout.take().unwrap()).lines();
     let signal = |name: &str| {
         // Use the shell's builtin `kill`: a minimal system has no other.
-        assert!(Command::new("sh").args(["-c", &format!("kill {name} {}", child.id())]).status().unwrap().success());
+        assert!(
+            Command::new("sh")
+                .args(["-c", &format!("kill {name} {}", child.id())])
+                .status()
+                .unwrap()
+                .success()
+        );
     };
     let mut text = || {
-        let of_arm = |reader: Result<String, _>| reader.unwrap().strip_prefix("arm: ").map(str::to_owned);
+        let of_arm =
+            |reader: Result<String, _>| reader.unwrap().strip_prefix("arm: ").map(str::to_owned);
         lines.by_ref().find_map(of_arm).expect("the program ended")
     };
     assert_eq!(text(), "moving");
@@ -452,7 +604,10 @@ fn suspended_program_triggers_reflex_and_sends_nothing_stale() {
     // Commands may still be on their way through the relay.
     let (mut n_before, mut n_commands) = (0, 0);
     let has_stopped = || {
-        let n_commands_before = std::mem::replace(&mut n_commands, relay.faults.n_commands.load(Ordering::Relaxed));
+        let n_commands_before = std::mem::replace(
+            &mut n_commands,
+            relay.faults.n_commands.load(Ordering::Relaxed),
+        );
         if n_commands > n_commands_before {
             n_before = n_moving.load(Ordering::Relaxed);
         }
@@ -460,10 +615,20 @@ fn suspended_program_triggers_reflex_and_sends_nothing_stale() {
     };
     wait_until(has_stopped, "the robot stops on its own");
     let n_without_answer = n_moving.load(Ordering::Relaxed) - n_before;
-    assert!(n_without_answer <= MAX_WITHOUT_ANSWER, "the robot stopped after {n_without_answer} states");
-    // The relay forwards the last commands after the program was stopped, late if this process is stalled, too.
+    assert!(
+        n_without_answer <= MAX_WITHOUT_ANSWER,
+        "the robot stopped after {n_without_answer} states"
+    );
+    // The relay forwards the last commands after the program was stopped, late if this process is
+    // stalled, too.
     let mut counts = vec![0];
-    while counts.iter().rev().take(4).any(|count| *count != counts[counts.len() - 1]) || counts.len() < 4 {
+    while counts
+        .iter()
+        .rev()
+        .take(4)
+        .any(|count| *count != counts[counts.len() - 1])
+        || counts.len() < 4
+    {
         std::thread::sleep(Duration::from_millis(50));
         counts.push(relay.faults.n_commands.load(Ordering::Relaxed));
     }
@@ -471,11 +636,26 @@ fn suspended_program_triggers_reflex_and_sends_nothing_stale() {
     assert!(n_commands > 50, "{n_commands}");
     signal("-CONT");
     let reason = text();
-    assert!(reason.contains("reflex") && reason.contains("communication_constraints_violation"), "{reason}");
-    let n_lost = reason.split(" states were not received").next().and_then(|text| text.rsplit(' ').next());
-    assert!(n_lost.and_then(|n| n.parse::<u64>().ok()).is_some_and(|n_lost| n_lost >= 20), "{reason}");
+    assert!(
+        reason.contains("reflex") && reason.contains("communication_constraints_violation"),
+        "{reason}"
+    );
+    let n_lost = reason
+        .split(" states were not received")
+        .next()
+        .and_then(|text| text.rsplit(' ').next());
+    assert!(
+        n_lost
+            .and_then(|n| n.parse::<u64>().ok())
+            .is_some_and(|n_lost| n_lost >= 20),
+        "{reason}"
+    );
     assert_eq!(text(), "quiet");
-    assert_eq!(relay.faults.n_commands.load(Ordering::Relaxed), n_commands, "it sent a stale command");
+    assert_eq!(
+        relay.faults.n_commands.load(Ordering::Relaxed),
+        n_commands,
+        "it sent a stale command"
+    );
     assert_eq!(text(), "held");
     assert!(child.wait().unwrap().success());
     assert!((last_command.lock().unwrap().position_rad[0] - REST_RAD[0]).abs() < 1e-4);

@@ -1,4 +1,5 @@
-//! A movable arm. A motion starts with the first target and ends one second after the arm has come to rest.
+//! A movable arm. A motion starts with the first target and ends one second after the arm has come
+//! to rest.
 
 use super::limits::{RobotLimits, clamp_to_range};
 use super::mailbox::{MailboxState, MotionCommand, MotionMailbox};
@@ -6,7 +7,9 @@ use super::motion_loop::MotionLoop;
 use super::request::{self, ContactConfig};
 use super::session::Session;
 use super::{ArmConfig, FrankaArm, MotionStatistics, StateStatistics};
-use crate::motion::{JointTarget, Motion, MotionConfig, MotionLimits, MotionLock, MovableArm, OnLoss};
+use crate::motion::{
+    JointTarget, Motion, MotionConfig, MotionLimits, MotionLock, MovableArm, OnLoss,
+};
 use crate::{Arm, Error};
 use franka::{FciVersion, RobotMode};
 use kinematics::JointState;
@@ -21,11 +24,12 @@ const STOP_TIMEOUT: Duration = Duration::from_secs(5);
 /// Maximum time until the states agree with the robot's reply.
 const SETTLE_TIMEOUT: Duration = Duration::from_secs(2);
 
-/// A Franka arm that is moved by joint positions, under the joint impedance controller of the robot.
+/// A Franka arm that is moved by joint positions, under the joint impedance controller of the
+/// robot.
 ///
-/// A motion of the robot lasts from the first target until the arm has been at rest for a second. Between motions, the
-/// robot holds the arm, and a person may guide it by hand. Dropping this value brings the arm to rest and frees the
-/// robot's interface.
+/// A motion of the robot lasts from the first target until the arm has been at rest for a second.
+/// Between motions, the robot holds the arm, and a person may guide it by hand. Dropping this value
+/// brings the arm to rest and frees the robot's interface.
 #[derive(Debug)]
 pub struct MovableFrankaArm {
     address: String,
@@ -39,8 +43,8 @@ pub struct MovableFrankaArm {
 }
 
 impl MovableFrankaArm {
-    /// Makes the checks that need no connection to the robot. The error is the reason why the arm cannot be moved as
-    /// configured.
+    /// Makes the checks that need no connection to the robot. The error is the reason why the arm
+    /// cannot be moved as configured.
     pub fn check(motion: &MotionConfig) -> Result<(), String> {
         if motion.on_loss != OnLoss::Hold {
             let reason = "without commands it brakes and holds, which cannot be changed: \
@@ -56,18 +60,31 @@ impl MovableFrankaArm {
         Ok(())
     }
 
-    /// Connects like [`FrankaArm::open`], and prepares to move. Nothing moves, and no setting of the robot changes,
-    /// before the first target.
+    /// Connects like [`FrankaArm::open`], and prepares to move. Nothing moves, and no setting of
+    /// the robot changes, before the first target.
     ///
-    /// `motion.limits` are in the order of the joints. They are reduced to at most half of the robot's limits (an
-    /// eighth for the jerk), and to slightly less than its joint ranges. A Franka arm always brakes and holds after
-    /// 20 ms without a command; other fail-safe settings are rejected.
-    pub fn open(config: &ArmConfig, motion: &MotionConfig, contact: &ContactConfig) -> Result<Self, Error> {
+    /// `motion.limits` are in the order of the joints. They are reduced to at most half of the
+    /// robot's limits (an eighth for the jerk), and to slightly less than its joint ranges. A
+    /// Franka arm always brakes and holds after 20 ms without a command; other fail-safe settings
+    /// are rejected.
+    pub fn open(
+        config: &ArmConfig,
+        motion: &MotionConfig,
+        contact: &ContactConfig,
+    ) -> Result<Self, Error> {
         let address = config.address.clone();
-        Self::check(motion).map_err(|reason| Error::Fci { address: address.clone(), reason })?;
+        Self::check(motion).map_err(|reason| Error::Fci {
+            address: address.clone(),
+            reason,
+        })?;
         // One controller may have several names.
-        let resolved = (&*address, 0).to_socket_addrs().ok().and_then(|mut resolved| resolved.next());
-        let lock = MotionLock::take(&resolved.map_or_else(|| address.clone(), |resolved| resolved.ip().to_string()))?;
+        let resolved = (&*address, 0)
+            .to_socket_addrs()
+            .ok()
+            .and_then(|mut resolved| resolved.next());
+        let lock = MotionLock::take(
+            &resolved.map_or_else(|| address.clone(), |resolved| resolved.ip().to_string()),
+        )?;
         let mailbox = Arc::new(MotionMailbox::default());
         let connected = OnceLock::new();
         let arm = FrankaArm::open_with(config, |session, first| {
@@ -79,12 +96,29 @@ impl MovableFrankaArm {
             let device = format!("arm at {}", config.address);
             // The closure is called once.
             let _ = connected.set((Arc::clone(session), limits.clone()));
-            let mut motion_loop = MotionLoop::new(device, Arc::clone(session), Arc::clone(&mailbox), robot, limits);
+            let mut motion_loop = MotionLoop::new(
+                device,
+                Arc::clone(session),
+                Arc::clone(&mailbox),
+                robot,
+                limits,
+            );
             motion_loop.take_mode(first);
             Ok(Some(motion_loop))
         })?;
-        let (session, limits) = connected.into_inner().expect("an arm that is open has a session");
-        Ok(Self { address, arm, session, mailbox, contact: contact.clone(), limits, is_set: false, _lock: lock })
+        let (session, limits) = connected
+            .into_inner()
+            .expect("an arm that is open has a session");
+        Ok(Self {
+            address,
+            arm,
+            session,
+            mailbox,
+            contact: contact.clone(),
+            limits,
+            is_set: false,
+            _lock: lock,
+        })
     }
 
     /// Statistics of the states so far.
@@ -103,13 +137,19 @@ impl MovableFrankaArm {
     }
 
     fn fault(&self, reason: impl Into<String>) -> Error {
-        Error::Fci { address: self.address.clone(), reason: reason.into() }
+        Error::Fci {
+            address: self.address.clone(),
+            reason: reason.into(),
+        }
     }
 
     /// Starts a motion towards a target.
     fn start_motion(&mut self, target: &JointTarget) -> Result<(), Error> {
         // Wait for a motion that is just ending.
-        let Some(mailbox_state) = self.mailbox.wait(STOP_TIMEOUT, |mailbox_state| mailbox_state.is_idle) else {
+        let Some(mailbox_state) = self
+            .mailbox
+            .wait(STOP_TIMEOUT, |mailbox_state| mailbox_state.is_idle)
+        else {
             return Err(self.fault("the previous motion does not end"));
         };
         let mode = mailbox_state.mode;
@@ -125,10 +165,15 @@ impl MovableFrankaArm {
         let id = request::start_motion(&self.session);
         let id = id.map_err(|why| self.fault(format!("it refused to start a motion: {why}")))?;
         self.mailbox.update(|mailbox_state| {
-            (mailbox_state.started_motion, mailbox_state.accepts_commands, mailbox_state.is_idle) =
-                (Some(id), true, false);
-            (mailbox_state.command, mailbox_state.motion) =
-                (Some(MotionCommand::SetTarget(target.clone())), Motion::Moving);
+            (
+                mailbox_state.started_motion,
+                mailbox_state.accepts_commands,
+                mailbox_state.is_idle,
+            ) = (Some(id), true, false);
+            (mailbox_state.command, mailbox_state.motion) = (
+                Some(MotionCommand::SetTarget(target.clone())),
+                Motion::Moving,
+            );
         });
         Ok(())
     }
@@ -137,7 +182,9 @@ impl MovableFrankaArm {
 /// The reason why an arm accepts no target.
 fn refusal(mailbox_state: &MailboxState) -> Option<String> {
     match &mailbox_state.motion {
-        Motion::Stopped { reason } => Some(format!("it accepts no target before it is recovered: {reason}")),
+        Motion::Stopped { reason } => Some(format!(
+            "it accepts no target before it is recovered: {reason}"
+        )),
         Motion::Holding | Motion::Moving => None,
     }
 }
@@ -161,8 +208,10 @@ impl MovableArm for MovableFrankaArm {
             return Err(self.fault(why));
         }
         if mailbox_state.accepts_commands {
-            (mailbox_state.command, mailbox_state.motion) =
-                (Some(MotionCommand::SetTarget(target.clone())), Motion::Moving);
+            (mailbox_state.command, mailbox_state.motion) = (
+                Some(MotionCommand::SetTarget(target.clone())),
+                Motion::Moving,
+            );
             return Ok(target);
         }
         drop(mailbox_state);
@@ -182,15 +231,19 @@ impl MovableArm for MovableFrankaArm {
         Ok(())
     }
 
-    /// Clears the reflex, if a reflex stopped the arm. A person must first release a user stop or locked joints; the
-    /// error names the cause.
+    /// Clears the reflex, if a reflex stopped the arm. A person must first release a user stop or
+    /// locked joints; the error names the cause.
     fn recover(&mut self) -> Result<(), Error> {
-        let Some(mailbox_state) =
-            self.mailbox.wait(STOP_TIMEOUT, |mailbox_state| mailbox_state.is_idle || mailbox_state.is_lost)
-        else {
+        let Some(mailbox_state) = self.mailbox.wait(STOP_TIMEOUT, |mailbox_state| {
+            mailbox_state.is_idle || mailbox_state.is_lost
+        }) else {
             return Err(self.fault("a motion is active"));
         };
-        let (mode, is_lost, motion) = (mailbox_state.mode, mailbox_state.is_lost, mailbox_state.motion.clone());
+        let (mode, is_lost, motion) = (
+            mailbox_state.mode,
+            mailbox_state.is_lost,
+            mailbox_state.motion.clone(),
+        );
         drop(mailbox_state);
         match (motion, mode) {
             (Motion::Stopped { reason }, _) if is_lost => return Err(self.fault(reason)),
@@ -205,9 +258,9 @@ impl MovableArm for MovableFrankaArm {
             (Motion::Holding | Motion::Moving, _) => return Ok(()),
         }
         // States from before the recovery may still be in flight.
-        let Some(mut mailbox_state) =
-            self.mailbox.wait(SETTLE_TIMEOUT, |mailbox_state| mailbox_state.mode == RobotMode::Idle)
-        else {
+        let Some(mut mailbox_state) = self.mailbox.wait(SETTLE_TIMEOUT, |mailbox_state| {
+            mailbox_state.mode == RobotMode::Idle
+        }) else {
             return Err(self.fault("it reported a successful recovery but is not ready"));
         };
         mailbox_state.motion = Motion::Holding;
@@ -219,9 +272,17 @@ impl Drop for MovableFrankaArm {
     fn drop(&mut self) {
         self.mailbox.update(|mailbox_state| {
             mailbox_state.is_shutting_down = true;
-            mailbox_state.command = mailbox_state.accepts_commands.then_some(MotionCommand::Stop);
+            mailbox_state.command = mailbox_state
+                .accepts_commands
+                .then_some(MotionCommand::Stop);
         });
-        if self.mailbox.wait(STOP_TIMEOUT, |mailbox_state| mailbox_state.is_idle || mailbox_state.is_lost).is_none() {
+        if self
+            .mailbox
+            .wait(STOP_TIMEOUT, |mailbox_state| {
+                mailbox_state.is_idle || mailbox_state.is_lost
+            })
+            .is_none()
+        {
             log::warn!("arm at {}: the motion did not end", self.address);
         }
         let statistics = self.motion_statistics();

@@ -24,7 +24,11 @@ impl Cycle {
     /// Joint with the largest commanded acceleration, and that acceleration in rad/s².
     fn largest_acceleration(&self) -> Option<(usize, f64)> {
         let sent = self.assumed.sent(self.sent_rad?);
-        let accelerations = sent.acceleration_rad_s2.map(f64::abs).into_iter().enumerate();
+        let accelerations = sent
+            .acceleration_rad_s2
+            .map(f64::abs)
+            .into_iter()
+            .enumerate();
         accelerations.max_by(|a, b| a.1.total_cmp(&b.1))
     }
 }
@@ -40,7 +44,8 @@ impl RecentCycles {
         Self(VecDeque::with_capacity(Self::MAX))
     }
 
-    /// Adds a state and our answer. `fate` is the outcome of the command before it, `assumed` our tracked reference.
+    /// Adds a state and our answer. `fate` is the outcome of the command before it, `assumed` our
+    /// tracked reference.
     pub(super) fn push(
         &mut self,
         NumberedState { number, state }: &NumberedState,
@@ -62,13 +67,21 @@ impl RecentCycles {
         });
     }
 
-    /// Reports missed and unsent commands, lost states, and the largest commanded acceleration. `last_number` is the
-    /// number of the state that reported the end of the motion.
+    /// Reports missed and unsent commands, lost states, and the largest commanded acceleration.
+    /// `last_number` is the number of the state that reported the end of the motion.
     pub(super) fn summary(&self, last_number: u64) -> String {
         let n_missed: u64 = self.0.iter().map(|cycle| cycle.fate.n_missed()).sum();
-        let n_unsent = self.0.iter().filter(|cycle| cycle.sent_rad.is_none()).count();
+        let n_unsent = self
+            .0
+            .iter()
+            .filter(|cycle| cycle.sent_rad.is_none())
+            .count();
         let numbers = self.0.iter().map(|cycle| cycle.number).chain([last_number]);
-        let n_lost: u64 = numbers.clone().zip(numbers.skip(1)).map(|(from, to)| to.saturating_sub(from + 1)).sum();
+        let n_lost: u64 = numbers
+            .clone()
+            .zip(numbers.skip(1))
+            .map(|(from, to)| to.saturating_sub(from + 1))
+            .sum();
         let mut text = format!(
             "in the last {} cycles, the robot missed {n_missed} commands, {n_unsent} were not sent in time, and {n_lost} \
              states were not received",
@@ -76,7 +89,11 @@ impl RecentCycles {
         );
         let accelerations = self.0.iter().filter_map(Cycle::largest_acceleration);
         if let Some((joint, acceleration)) = accelerations.max_by(|a, b| a.1.total_cmp(&b.1)) {
-            let _ = write!(text, "; largest commanded acceleration {acceleration:.2} rad/s² (joint {})", joint + 1);
+            let _ = write!(
+                text,
+                "; largest commanded acceleration {acceleration:.2} rad/s² (joint {})",
+                joint + 1
+            );
         }
         text
     }
@@ -87,9 +104,20 @@ impl RecentCycles {
             joint positions, rad: reported, assumed, sent; reported velocities, rad/s";
         let mut text = HEADER.to_owned();
         for cycle in &self.0 {
-            let Cycle { number, fate, success_rate, reported_rad, assumed, sent_rad, reported_rad_s } = cycle;
-            let _ =
-                write!(text, "\n{number} {fate:?} {success_rate:.2}; {reported_rad:.7?} {:.7?} ", assumed.position_rad);
+            let Cycle {
+                number,
+                fate,
+                success_rate,
+                reported_rad,
+                assumed,
+                sent_rad,
+                reported_rad_s,
+            } = cycle;
+            let _ = write!(
+                text,
+                "\n{number} {fate:?} {success_rate:.2}; {reported_rad:.7?} {:.7?} ",
+                assumed.position_rad
+            );
             let _ = write!(text, "{sent_rad:.7?}; {reported_rad_s:.6?}");
         }
         text
@@ -106,7 +134,15 @@ mod tests {
         let mut recent = RecentCycles::new();
         let reference = Reference::at_rest(&RobotState::default());
         let mut push = |number: u64, fate, sent_rad| {
-            recent.push(&NumberedState { number, state: RobotState::default() }, fate, &reference, sent_rad);
+            recent.push(
+                &NumberedState {
+                    number,
+                    state: RobotState::default(),
+                },
+                fate,
+                &reference,
+                sent_rad,
+            );
         };
         // In a millisecond, 3 micrometers are 3 rad/s².
         let mut jump = [0.0; N_JOINTS];
@@ -119,9 +155,16 @@ mod tests {
         assert_eq!(recent.summary(134), expected);
         assert_eq!(recent.table().lines().count(), 1 + 3);
         for number in 104..300 {
-            let numbered = NumberedState { number, state: RobotState::default() };
+            let numbered = NumberedState {
+                number,
+                state: RobotState::default(),
+            };
             recent.push(&numbered, CommandFate::Followed, &reference, None);
         }
-        assert!(recent.summary(300).starts_with("in the last 60 cycles, the robot missed 0 commands, 60 were not"));
+        assert!(
+            recent
+                .summary(300)
+                .starts_with("in the last 60 cycles, the robot missed 0 commands, 60 were not")
+        );
     }
 }

@@ -1,4 +1,5 @@
-//! Tracks the robot's commanded joint state from the positions that we sent and the states that it reported.
+//! Tracks the robot's commanded joint state from the positions that we sent and the states that it
+//! reported.
 
 use super::N_JOINTS;
 use crate::motion::Setpoint;
@@ -6,24 +7,24 @@ use franka::{RobotState, rate_limiting};
 
 /// Seconds between commands.
 const STEP_SECS: f64 = rate_limiting::DELTA_T;
-/// Maximum position difference between our reference and the robot's, in rad. Smaller differences come from the
-/// rounding of FCI 10, for positions up to 8 rad.
+/// Maximum position difference between our reference and the robot's, in rad. Smaller differences
+/// come from the rounding of FCI 10, for positions up to 8 rad.
 const POSITION_TOLERANCE_RAD: f64 = 4e-7;
 /// Maximum velocity difference between our reference and the robot's, for velocities up to 8 rad/s.
 const VELOCITY_TOLERANCE_RAD_S: f64 = 1e-6;
-/// Maximum number of steps by which a reported reference may be behind: `franka-sim` reports what its joint thread
-/// has processed.
+/// Maximum number of steps by which a reported reference may be behind: `franka-sim` reports what
+/// its joint thread has processed.
 const MAX_BEHIND: f64 = 3.0;
-/// Number of consecutive missing commands after which the robot stops. Source: FCI documentation, "Real-time control
-/// commands".
+/// Number of consecutive missing commands after which the robot stops. Source: FCI documentation,
+/// "Real-time control commands".
 const MAX_MISSED: u64 = 20;
 /// Number of most recent commands over which the robot computes its success rate.
 pub(super) const N_SUCCESS_WINDOW: u64 = 100;
 /// Number of missed commands that a success rate may not contain yet.
 const MAX_UNREPORTED: f64 = 3.0;
 
-/// Commanded joint positions, rad, with velocities and accelerations as differences per millisecond, as the robot
-/// computes them.
+/// Commanded joint positions, rad, with velocities and accelerations as differences per
+/// millisecond, as the robot computes them.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Reference {
     pub(super) position_rad: [f64; N_JOINTS],
@@ -63,7 +64,11 @@ pub(super) struct ReferenceTracker {
 
 impl ReferenceTracker {
     pub(super) fn new(reference: Reference) -> Self {
-        Self { reference, if_all_received: reference, n_doubtful: 0 }
+        Self {
+            reference,
+            if_all_received: reference,
+            n_doubtful: 0,
+        }
     }
 
     pub(super) fn reference(&self) -> &Reference {
@@ -72,12 +77,18 @@ impl ReferenceTracker {
 
     /// Advances over `n_states` new states. `sent` is the answer to the state before them.
     ///
-    /// If a received command is mistaken for a missed one, our reference is off by the effect of that command. The next
-    /// command is then exactly where the robot would have extrapolated to, so it looks missed as well. This repeats, and
-    /// the robot keeps its acceleration for as long as the commanded jerk is constant. The reported success rate reveals
-    /// the mistake, because it limits how many commands can have been missed. In the first [`N_SUCCESS_WINDOW`] states of
-    /// a motion, a rate that starts at 0 reveals it later.
-    pub(super) fn advance(&mut self, sent: Option<[f64; N_JOINTS]>, n_states: u64, state: &RobotState) -> CommandFate {
+    /// If a received command is mistaken for a missed one, our reference is off by the effect of
+    /// that command. The next command is then exactly where the robot would have extrapolated to,
+    /// so it looks missed as well. This repeats, and the robot keeps its acceleration for as long
+    /// as the commanded jerk is constant. The reported success rate reveals the mistake, because it
+    /// limits how many commands can have been missed. In the first [`N_SUCCESS_WINDOW`] states of a
+    /// motion, a rate that starts at 0 reveals it later.
+    pub(super) fn advance(
+        &mut self,
+        sent: Option<[f64; N_JOINTS]>,
+        n_states: u64,
+        state: &RobotState,
+    ) -> CommandFate {
         let (reference, fate) = self.reference.advance(sent, n_states, state);
         self.reference = reference;
         if fate != CommandFate::Missed(n_states) {
@@ -95,7 +106,8 @@ impl ReferenceTracker {
     }
 }
 
-/// Number of commands in the success window that the robot missed, according to its success rate. NaN if it reports NaN.
+/// Number of commands in the success window that the robot missed, according to its success rate.
+/// NaN if it reports NaN.
 fn n_reported_missed(state: &RobotState) -> f64 {
     ((1.0 - state.control_command_success_rate.clamp(0.0, 1.0)) * N_SUCCESS_WINDOW as f64).round()
 }
@@ -103,45 +115,63 @@ fn n_reported_missed(state: &RobotState) -> f64 {
 impl Reference {
     /// A reference at rest, at the commanded position that the robot reports.
     pub(super) fn at_rest(state: &RobotState) -> Self {
-        Self { position_rad: state.q_d, velocity_rad_s: [0.0; N_JOINTS], acceleration_rad_s2: [0.0; N_JOINTS] }
+        Self {
+            position_rad: state.q_d,
+            velocity_rad_s: [0.0; N_JOINTS],
+            acceleration_rad_s2: [0.0; N_JOINTS],
+        }
     }
 
     fn reported(state: &RobotState) -> Self {
-        Self { position_rad: state.q_d, velocity_rad_s: state.dq_d, acceleration_rad_s2: state.ddq_d }
+        Self {
+            position_rad: state.q_d,
+            velocity_rad_s: state.dq_d,
+            acceleration_rad_s2: state.ddq_d,
+        }
     }
 
     /// The reference a millisecond later, after a position was sent.
     pub(super) fn sent(&self, position_rad: [f64; N_JOINTS]) -> Self {
         let velocity_rad_s: [f64; N_JOINTS] =
             std::array::from_fn(|ix| (position_rad[ix] - self.position_rad[ix]) / STEP_SECS);
-        let acceleration_rad_s2 = std::array::from_fn(|ix| (velocity_rad_s[ix] - self.velocity_rad_s[ix]) / STEP_SECS);
-        Self { position_rad, velocity_rad_s, acceleration_rad_s2 }
+        let acceleration_rad_s2 =
+            std::array::from_fn(|ix| (velocity_rad_s[ix] - self.velocity_rad_s[ix]) / STEP_SECS);
+        Self {
+            position_rad,
+            velocity_rad_s,
+            acceleration_rad_s2,
+        }
     }
 
     /// The reference a millisecond later without a command: the robot keeps the acceleration.
     fn missed(&self) -> Self {
-        let velocity_rad_s: [f64; N_JOINTS] =
-            std::array::from_fn(|ix| self.velocity_rad_s[ix] + self.acceleration_rad_s2[ix] * STEP_SECS);
+        let velocity_rad_s: [f64; N_JOINTS] = std::array::from_fn(|ix| {
+            self.velocity_rad_s[ix] + self.acceleration_rad_s2[ix] * STEP_SECS
+        });
         Self {
-            position_rad: std::array::from_fn(|ix| self.position_rad[ix] + velocity_rad_s[ix] * STEP_SECS),
+            position_rad: std::array::from_fn(|ix| {
+                self.position_rad[ix] + velocity_rad_s[ix] * STEP_SECS
+            }),
             velocity_rad_s,
             ..*self
         }
     }
 
-    /// The reference after `n` new states, if the robot received the command `sent` (if any) and nothing after it.
+    /// The reference after `n` new states, if the robot received the command `sent` (if any) and
+    /// nothing after it.
     fn after(&self, sent: Option<[f64; N_JOINTS]>, n: u64) -> Self {
         let first = sent.map_or_else(|| self.missed(), |position_rad| self.sent(position_rad));
         (1..n).fold(first, |reference, _| reference.missed())
     }
 
-    /// Advances the reference over `n_states` new states, and returns the outcome of `sent`, the answer to the state
-    /// before them.
+    /// Advances the reference over `n_states` new states, and returns the outcome of `sent`, the
+    /// answer to the state before them.
     ///
-    /// Keeps our own numbers if they match the robot's up to rounding, because differences of rounded numbers are
-    /// inaccurate. If the effect of a missing command is within that rounding, the reported velocities decide, because
-    /// the effect on them is a thousand times larger. Velocities that still match the earlier reference prove nothing:
-    /// `franka-sim` reports the velocities of its joints, which start to move some time after their target.
+    /// Keeps our own numbers if they match the robot's up to rounding, because differences of
+    /// rounded numbers are inaccurate. If the effect of a missing command is within that rounding,
+    /// the reported velocities decide, because the effect on them is a thousand times larger.
+    /// Velocities that still match the earlier reference prove nothing: `franka-sim` reports the
+    /// velocities of its joints, which start to move some time after their target.
     pub(super) fn advance(
         &self,
         sent: Option<[f64; N_JOINTS]>,
@@ -153,15 +183,24 @@ impl Reference {
             return (reported, CommandFate::Unknown);
         }
         let matches_rates = |reference: &Self| {
-            let pairs = reference.velocity_rad_s.into_iter().zip(reported.velocity_rad_s);
-            pairs.into_iter().all(|(own, robot)| (own - robot).abs() <= VELOCITY_TOLERANCE_RAD_S)
+            let pairs = reference
+                .velocity_rad_s
+                .into_iter()
+                .zip(reported.velocity_rad_s);
+            pairs
+                .into_iter()
+                .all(|(own, robot)| (own - robot).abs() <= VELOCITY_TOLERANCE_RAD_S)
         };
         let n_after = n_states - 1;
         let if_sent_received = sent.map(|position_rad| self.after(Some(position_rad), n_states));
         let if_received = if_sent_received.filter(|reference| reference.is_near(state));
         let if_missed = self.after(None, n_states);
         match if_received {
-            Some(if_received) if !matches_rates(&if_received) && matches_rates(&if_missed) && !matches_rates(self) => {
+            Some(if_received)
+                if !matches_rates(&if_received)
+                    && matches_rates(&if_missed)
+                    && !matches_rates(self) =>
+            {
                 (if_missed, CommandFate::Missed(n_states))
             }
             Some(if_received) if n_after == 0 => (if_received, CommandFate::Followed),
@@ -179,12 +218,18 @@ impl Reference {
     /// Whether all positions match the reported ones up to rounding.
     fn is_near(&self, state: &RobotState) -> bool {
         let joints = self.position_rad.into_iter().zip(state.q_d);
-        joints.into_iter().all(|(own, robot)| (own - robot).abs() <= POSITION_TOLERANCE_RAD)
+        joints
+            .into_iter()
+            .all(|(own, robot)| (own - robot).abs() <= POSITION_TOLERANCE_RAD)
     }
 
     /// Whether each joint may have been at the reported position a few steps ago.
     fn is_shortly_after(&self, reported: &Self) -> bool {
-        let joints = self.position_rad.into_iter().zip(self.velocity_rad_s).zip(reported.position_rad);
+        let joints = self
+            .position_rad
+            .into_iter()
+            .zip(self.velocity_rad_s)
+            .zip(reported.position_rad);
         joints.into_iter().all(|((own, velocity), robot)| {
             (own - robot).abs() <= POSITION_TOLERANCE_RAD + MAX_BEHIND * STEP_SECS * velocity.abs()
         })
@@ -195,7 +240,9 @@ impl Reference {
         let velocity = self.velocity_rad_s.iter().zip(self.acceleration_rad_s2);
         Setpoint {
             position: self.position_rad.to_vec(),
-            velocity: velocity.map(|(velocity, acceleration)| velocity + 0.5 * STEP_SECS * acceleration).collect(),
+            velocity: velocity
+                .map(|(velocity, acceleration)| velocity + 0.5 * STEP_SECS * acceleration)
+                .collect(),
             acceleration: self.acceleration_rad_s2.to_vec(),
         }
     }
@@ -208,7 +255,9 @@ mod tests {
     impl Reference {
         /// The position a millisecond later with a constant jerk.
         fn next_position(&self, jerk_rad_s3: f64) -> [f64; N_JOINTS] {
-            self.missed().position_rad.map(|position| position + jerk_rad_s3 * STEP_SECS.powi(3) / 6.0)
+            self.missed()
+                .position_rad
+                .map(|position| position + jerk_rad_s3 * STEP_SECS.powi(3) / 6.0)
         }
     }
 
@@ -235,9 +284,9 @@ mod tests {
             velocity_rad_s: [0.3; N_JOINTS],
             acceleration_rad_s2: [0.7; N_JOINTS],
         };
-        let next = reference
-            .position_rad
-            .map(|position| position + STEP_SECS * (0.3 + STEP_SECS * (0.7 + STEP_SECS * jerk_rad_s3)));
+        let next = reference.position_rad.map(|position| {
+            position + STEP_SECS * (0.3 + STEP_SECS * (0.7 + STEP_SECS * jerk_rad_s3))
+        });
         (reference, next)
     }
 
@@ -245,15 +294,33 @@ mod tests {
     fn followed_and_missed_commands_are_distinguished() {
         let (reference, next) = moving(600.0);
         let followed = reference.sent(next);
-        assert!((followed.acceleration_rad_s2[0] - 1.3).abs() < 1e-6, "{followed:?}");
-        assert_eq!(reference.advance(Some(next), 1, &state(&followed)), (followed, CommandFate::Followed));
+        assert!(
+            (followed.acceleration_rad_s2[0] - 1.3).abs() < 1e-6,
+            "{followed:?}"
+        );
+        assert_eq!(
+            reference.advance(Some(next), 1, &state(&followed)),
+            (followed, CommandFate::Followed)
+        );
         let missed = reference.missed();
-        assert_eq!(reference.advance(Some(next), 1, &state(&missed)), (missed, CommandFate::Missed(1)));
-        assert_eq!(reference.advance(None, 1, &state(&missed)), (missed, CommandFate::Missed(1)));
+        assert_eq!(
+            reference.advance(Some(next), 1, &state(&missed)),
+            (missed, CommandFate::Missed(1))
+        );
+        assert_eq!(
+            reference.advance(None, 1, &state(&missed)),
+            (missed, CommandFate::Missed(1))
+        );
         let two_later = followed.missed().missed();
-        assert_eq!(reference.advance(Some(next), 3, &state(&two_later)), (two_later, CommandFate::Missed(2)));
+        assert_eq!(
+            reference.advance(Some(next), 3, &state(&two_later)),
+            (two_later, CommandFate::Missed(2))
+        );
         let three_later = missed.missed().missed();
-        assert_eq!(reference.advance(Some(next), 3, &state(&three_later)), (three_later, CommandFate::Missed(3)));
+        assert_eq!(
+            reference.advance(Some(next), 3, &state(&three_later)),
+            (three_later, CommandFate::Missed(3))
+        );
     }
 
     #[test]
@@ -261,12 +328,22 @@ mod tests {
         let (reference, next) = moving(20.0);
         let (missed, followed) = (reference.missed(), reference.sent(next));
         assert!((followed.position_rad[0] - missed.position_rad[0]).abs() < POSITION_TOLERANCE_RAD);
-        assert_eq!(reference.advance(Some(next), 1, &state(&missed)), (missed, CommandFate::Missed(1)));
-        assert_eq!(reference.advance(Some(next), 1, &state(&followed)), (followed, CommandFate::Followed));
-        // If the velocities of a robot match neither prediction, its position decides, and it counts as following.
+        assert_eq!(
+            reference.advance(Some(next), 1, &state(&missed)),
+            (missed, CommandFate::Missed(1))
+        );
+        assert_eq!(
+            reference.advance(Some(next), 1, &state(&followed)),
+            (followed, CommandFate::Followed)
+        );
+        // If the velocities of a robot match neither prediction, its position decides, and it
+        // counts as following.
         let mut smoothed = followed;
         smoothed.velocity_rad_s = [0.29; N_JOINTS];
-        assert_eq!(reference.advance(Some(next), 1, &state(&smoothed)), (followed, CommandFate::Followed));
+        assert_eq!(
+            reference.advance(Some(next), 1, &state(&smoothed)),
+            (followed, CommandFate::Followed)
+        );
     }
 
     #[test]
@@ -286,12 +363,26 @@ mod tests {
         .take(60)
         .collect();
         // Three are reported as missed, and three may not be reported yet.
-        let n_displaced = fates.iter().take_while(|fate| **fate != CommandFate::Followed).count();
+        let n_displaced = fates
+            .iter()
+            .take_while(|fate| **fate != CommandFate::Followed)
+            .count();
         assert_eq!(n_displaced, 7, "{fates:?}");
-        assert!(fates[n_displaced..].iter().all(|fate| *fate == CommandFate::Followed), "{fates:?}");
+        assert!(
+            fates[n_displaced..]
+                .iter()
+                .all(|fate| *fate == CommandFate::Followed),
+            "{fates:?}"
+        );
         let expected = 0.7 + (60 - n_displaced) as f64 * JERK_RAD_S3 * STEP_SECS / 6.0;
-        assert!((robot.acceleration_rad_s2[0] - expected).abs() < 5e-3, "{robot:?}, expected {expected}");
-        assert!((robot.position_rad[0] - tracker.reference().position_rad[0]).abs() < 1e-12, "{tracker:?}");
+        assert!(
+            (robot.acceleration_rad_s2[0] - expected).abs() < 5e-3,
+            "{robot:?}, expected {expected}"
+        );
+        assert!(
+            (robot.position_rad[0] - tracker.reference().position_rad[0]).abs() < 1e-12,
+            "{tracker:?}"
+        );
     }
 
     #[test]
@@ -303,7 +394,11 @@ mod tests {
                 robot = robot.after(None, n_states);
                 let sent = tracker.reference().next_position(600.0);
                 let fate = tracker.advance(Some(sent), n_states, &with_rate(state(&robot), rate));
-                assert_eq!((fate, *tracker.reference()), (CommandFate::Missed(n_states), robot), "{n_states}, {rate}");
+                assert_eq!(
+                    (fate, *tracker.reference()),
+                    (CommandFate::Missed(n_states), robot),
+                    "{n_states}, {rate}"
+                );
             }
         }
     }
@@ -316,15 +411,24 @@ mod tests {
             acceleration_rad_s2: [0.0; N_JOINTS],
         };
         let first = rest.sent([1.9 + 20.0 * STEP_SECS.powi(3) / 6.0; N_JOINTS]);
-        let reported = state(&Reference { position_rad: first.position_rad, ..rest });
-        assert_eq!(rest.advance(Some(first.position_rad), 1, &reported), (first, CommandFate::Followed));
+        let reported = state(&Reference {
+            position_rad: first.position_rad,
+            ..rest
+        });
+        assert_eq!(
+            rest.advance(Some(first.position_rad), 1, &reported),
+            (first, CommandFate::Followed)
+        );
     }
 
     #[test]
     fn delayed_reports_count_as_followed() {
         let (reference, next) = moving(20.0);
         let followed = reference.sent(next);
-        assert_eq!(reference.advance(Some(next), 1, &state(&reference)), (followed, CommandFate::Followed));
+        assert_eq!(
+            reference.advance(Some(next), 1, &state(&reference)),
+            (followed, CommandFate::Followed)
+        );
     }
 
     #[test]
@@ -333,8 +437,15 @@ mod tests {
         let mut displaced = reference.sent(next);
         displaced.position_rad[3] += 1e-2;
         let reported = state(&displaced);
-        assert_eq!(reference.advance(Some(next), 1, &reported), (Reference::reported(&reported), CommandFate::Unknown));
+        assert_eq!(
+            reference.advance(Some(next), 1, &reported),
+            (Reference::reported(&reported), CommandFate::Unknown)
+        );
         let followed = state(&reference.sent(next));
-        assert_eq!(reference.advance(Some(next), 30, &followed).1, CommandFate::Unknown, "after a long silence");
+        assert_eq!(
+            reference.advance(Some(next), 30, &followed).1,
+            CommandFate::Unknown,
+            "after a long silence"
+        );
     }
 }

@@ -13,8 +13,8 @@ use zerocopy::little_endian::U64;
 const MAX_ANSWER: Duration = Duration::from_secs(2);
 /// Maximum time for a recovery, which releases brakes.
 const MAX_RECOVERY: Duration = Duration::from_secs(10);
-/// Maximum deviation of a motion from the command: m, rad, and rad of the elbow. As in libfranka, these values allow
-/// any deviation.
+/// Maximum deviation of a motion from the command: m, rad, and rad of the elbow. As in libfranka,
+/// these values allow any deviation.
 const ANY_DEVIATION: (f64, f64, f64) = (10.0, 3.12, std::f64::consts::TAU);
 
 /// Collision thresholds and stiffness of a robot.
@@ -22,7 +22,8 @@ const ANY_DEVIATION: (f64, f64, f64) = (10.0, 3.12, std::f64::consts::TAU);
 pub struct ContactConfig {
     /// External torques at which the robot stops, Nm, from the base to the flange.
     pub torque_nm: [f64; N_JOINTS],
-    /// External forces on the end effector at which the robot stops, along x, y and z of its base, N.
+    /// External forces on the end effector at which the robot stops, along x, y and z of its base,
+    /// N.
     pub force_n: [f64; 3],
     /// External moments about the same axes at which the robot stops, Nm.
     pub moment_nm: [f64; 3],
@@ -31,7 +32,8 @@ pub struct ContactConfig {
 }
 
 impl Default for ContactConfig {
-    /// The thresholds of libfranka's examples of joint motions (`generate_joint_position_motion.cpp`).
+    /// The thresholds of libfranka's examples of joint motions
+    /// (`generate_joint_position_motion.cpp`).
     fn default() -> Self {
         Self {
             torque_nm: [20.0, 20.0, 18.0, 18.0, 16.0, 14.0, 12.0],
@@ -52,7 +54,12 @@ pub(super) enum MotionResponse {
 
 /// The URDF that an FCI 10 robot serves.
 pub(super) fn description(session: &Session) -> Result<String, String> {
-    let payload = ask(session, v10::Command::GetRobotModel.to_u32(), &[], MAX_ANSWER)?;
+    let payload = ask(
+        session,
+        v10::Command::GetRobotModel.to_u32(),
+        &[],
+        MAX_ANSWER,
+    )?;
     match payload.split_first() {
         Some((0, text)) => Ok(String::from_utf8_lossy(text).into_owned()),
         Some((status, _)) => Err(format!(
@@ -68,7 +75,9 @@ pub(super) fn set(session: &Session, contact: &ContactConfig) -> Result<(), Stri
     let ([x, y, z], [about_x, about_y, about_z]) = (contact.force_n, contact.moment_nm);
     let (torque, force) = (&contact.torque_nm, &[x, y, z, about_x, about_y, about_z]);
     // Lower thresholds are only reported. The same thresholds apply with and without acceleration.
-    let collision = v10::SetCollisionBehaviorRequest::new(torque, torque, torque, torque, force, force, force, force);
+    let collision = v10::SetCollisionBehaviorRequest::new(
+        torque, torque, torque, torque, force, force, force, force,
+    );
     let number = |v5: v5::Command, v10: v10::Command| match session.version {
         FciVersion::V5 => v5.to_u32(),
         FciVersion::V10 => v10.to_u32(),
@@ -77,23 +86,41 @@ pub(super) fn set(session: &Session, contact: &ContactConfig) -> Result<(), Stri
         let answer = ask(session, number, payload, MAX_ANSWER)?;
         match (session.version, first(&answer)?) {
             (_, 0) => Ok(()),
-            (FciVersion::V5, status) => {
-                Err(format!("{what}: {}", status_text(v5::GetterSetterStatus::from_u8(status))))
-            }
-            (FciVersion::V10, status) => {
-                Err(format!("{what}: {}", status_text(v10::GetterSetterStatus::from_u8(status))))
-            }
+            (FciVersion::V5, status) => Err(format!(
+                "{what}: {}",
+                status_text(v5::GetterSetterStatus::from_u8(status))
+            )),
+            (FciVersion::V10, status) => Err(format!(
+                "{what}: {}",
+                status_text(v10::GetterSetterStatus::from_u8(status))
+            )),
         }
     };
-    let command = number(v5::Command::SetCollisionBehavior, v10::Command::SetCollisionBehavior);
-    set("it rejected the collision thresholds", command, collision.as_bytes())?;
-    let Some(stiffness) = &contact.stiffness_nm_rad else { return Ok(()) };
-    let command = number(v5::Command::SetJointImpedance, v10::Command::SetJointImpedance);
-    set("it rejected the joint stiffness", command, v10::SetJointImpedanceRequest::new(stiffness).as_bytes())
+    let command = number(
+        v5::Command::SetCollisionBehavior,
+        v10::Command::SetCollisionBehavior,
+    );
+    set(
+        "it rejected the collision thresholds",
+        command,
+        collision.as_bytes(),
+    )?;
+    let Some(stiffness) = &contact.stiffness_nm_rad else {
+        return Ok(());
+    };
+    let command = number(
+        v5::Command::SetJointImpedance,
+        v10::Command::SetJointImpedance,
+    );
+    set(
+        "it rejected the joint stiffness",
+        command,
+        v10::SetJointImpedanceRequest::new(stiffness).as_bytes(),
+    )
 }
 
-/// Requests a joint position motion under the robot's joint impedance controller. Returns its ID once the robot has
-/// accepted it.
+/// Requests a joint position motion under the robot's joint impedance controller. Returns its ID
+/// once the robot has accepted it.
 pub(super) fn start_motion(session: &Session) -> Result<u32, String> {
     let (translation, rotation, elbow) = ANY_DEVIATION;
     let deviation = || v10::Deviation::new(translation, rotation, elbow);
@@ -101,11 +128,15 @@ pub(super) fn start_motion(session: &Session) -> Result<u32, String> {
     let request = match session.version {
         FciVersion::V5 => {
             let mode = v5::MoveMotionGeneratorMode::JointPosition;
-            v5::MoveRequest::new(impedance_mode, mode, deviation(), deviation()).as_bytes().to_vec()
+            v5::MoveRequest::new(impedance_mode, mode, deviation(), deviation())
+                .as_bytes()
+                .to_vec()
         }
         FciVersion::V10 => {
             let mode = v10::MoveMotionGeneratorMode::JointPosition;
-            v10::MoveRequest::new(impedance_mode, mode, deviation(), deviation()).as_bytes().to_vec()
+            v10::MoveRequest::new(impedance_mode, mode, deviation(), deviation())
+                .as_bytes()
+                .to_vec()
         }
     };
     let id = send(session, v10::Command::Move.to_u32(), &request)?;
@@ -123,8 +154,17 @@ pub(super) fn halt(session: &Session) -> Result<(), String> {
 
 /// Result of a motion, if the robot has reported it.
 pub(super) fn outcome(session: &Session, id: u32) -> Result<Option<MotionResponse>, String> {
-    let message = session.network.tcp.try_receive_response(id).map_err(|error| error_text(&error))?;
-    Ok(message.map(|message| decode_response(session.version, message_payload(HeaderLayout::Robot, &message))))
+    let message = session
+        .network
+        .tcp
+        .try_receive_response(id)
+        .map_err(|error| error_text(&error))?;
+    Ok(message.map(|message| {
+        decode_response(
+            session.version,
+            message_payload(HeaderLayout::Robot, &message),
+        )
+    }))
 }
 
 /// Clears a reflex.
@@ -137,28 +177,59 @@ pub(super) fn recover(session: &Session) -> Result<(), String> {
     let why = match (session.version, first(&answer)?) {
         (_, 0) => return Ok(()),
         (FciVersion::V5, status) => status_text(v5::AutomaticErrorRecoveryStatus::from_u8(status)),
-        (FciVersion::V10, status) => status_text(v10::AutomaticErrorRecoveryStatus::from_u8(status)),
+        (FciVersion::V10, status) => {
+            status_text(v10::AutomaticErrorRecoveryStatus::from_u8(status))
+        }
     };
     Err(format!("the recovery failed: {why}"))
 }
 
 /// Encodes the joint positions for the millisecond after a state as a datagram.
-pub(super) fn command(version: FciVersion, number: u64, position_rad: &[f64; N_JOINTS], is_last: bool) -> Vec<u8> {
-    let (message_id, q_c, motion_generation_finished) =
-        (U64::new(number), f64s_to_wire(position_rad), u8::from(is_last));
+pub(super) fn command(
+    version: FciVersion,
+    number: u64,
+    position_rad: &[f64; N_JOINTS],
+    is_last: bool,
+) -> Vec<u8> {
+    let (message_id, q_c, motion_generation_finished) = (
+        U64::new(number),
+        f64s_to_wire(position_rad),
+        u8::from(is_last),
+    );
     match version {
         FciVersion::V5 => {
-            let motion = v5::MotionGeneratorCommand { q_c, motion_generation_finished, ..Default::default() };
-            v5::RobotCommand { message_id, motion, ..Default::default() }.as_bytes().to_vec()
+            let motion = v5::MotionGeneratorCommand {
+                q_c,
+                motion_generation_finished,
+                ..Default::default()
+            };
+            v5::RobotCommand {
+                message_id,
+                motion,
+                ..Default::default()
+            }
+            .as_bytes()
+            .to_vec()
         }
         FciVersion::V10 => {
-            let motion = v10::MotionGeneratorCommand { q_c, motion_generation_finished, ..Default::default() };
-            v10::RobotCommand { message_id, motion, ..Default::default() }.as_bytes().to_vec()
+            let motion = v10::MotionGeneratorCommand {
+                q_c,
+                motion_generation_finished,
+                ..Default::default()
+            };
+            v10::RobotCommand {
+                message_id,
+                motion,
+                ..Default::default()
+            }
+            .as_bytes()
+            .to_vec()
         }
     }
 }
 
-/// The reason why a robot in this mode accepts no motion, and the remedy; `None` if the robot is ready.
+/// The reason why a robot in this mode accepts no motion, and the remedy; `None` if the robot is
+/// ready.
 pub(super) fn blocking_reason(mode: RobotMode) -> Option<&'static str> {
     match mode {
         RobotMode::Idle => None,
@@ -190,29 +261,45 @@ fn decode_response(version: FciVersion, payload: &[u8]) -> MotionResponse {
     }
 }
 
-fn ask(session: &Session, command: u32, payload: &[u8], timeout: Duration) -> Result<Vec<u8>, String> {
+fn ask(
+    session: &Session,
+    command: u32,
+    payload: &[u8],
+    timeout: Duration,
+) -> Result<Vec<u8>, String> {
     let id = send(session, command, payload)?;
     wait(session, id, timeout)
 }
 
 fn send(session: &Session, command: u32, payload: &[u8]) -> Result<u32, String> {
-    session.network.tcp.send_request(command, payload).map_err(|error| error_text(&error))
+    session
+        .network
+        .tcp
+        .send_request(command, payload)
+        .map_err(|error| error_text(&error))
 }
 
 /// Waits for the payload of the answer.
 fn wait(session: &Session, id: u32, timeout: Duration) -> Result<Vec<u8>, String> {
-    let response = answer(&session.network, id, timeout).map_err(|error: FrankaError| error_text(&error))?;
+    let response =
+        answer(&session.network, id, timeout).map_err(|error: FrankaError| error_text(&error))?;
     let message = response.ok_or_else(|| format!("it did not answer within {timeout:?}"))?;
     Ok(message_payload(HeaderLayout::Robot, &message).to_vec())
 }
 
 fn first(payload: &[u8]) -> Result<u8, String> {
-    payload.first().copied().ok_or_else(|| "its answer is empty".to_owned())
+    payload
+        .first()
+        .copied()
+        .ok_or_else(|| "its answer is empty".to_owned())
 }
 
 /// A status as text, from libfranka's name for it.
 fn status_text<T: std::fmt::Debug>(status: Option<T>) -> String {
-    status.map_or_else(|| "an unknown status".to_owned(), |status| split_words(&format!("{status:?}")))
+    status.map_or_else(
+        || "an unknown status".to_owned(),
+        |status| split_words(&format!("{status:?}")),
+    )
 }
 
 /// `CommandNotPossibleRejected` as "command not possible rejected".
@@ -233,8 +320,14 @@ mod tests {
 
     #[test]
     fn status_numbers_differ_between_versions() {
-        assert_eq!(decode_response(FciVersion::V5, &[1]), MotionResponse::Started);
-        assert_eq!(decode_response(FciVersion::V10, &[0]), MotionResponse::Finished);
+        assert_eq!(
+            decode_response(FciVersion::V5, &[1]),
+            MotionResponse::Started
+        );
+        assert_eq!(
+            decode_response(FciVersion::V10, &[0]),
+            MotionResponse::Finished
+        );
         let refused = |version, status| match decode_response(version, &[status]) {
             MotionResponse::Rejected(why) => why,
             other => panic!("{other:?}"),
@@ -243,6 +336,9 @@ mod tests {
         assert_eq!(refused(FciVersion::V5, 6), "reflex aborted");
         assert!(refused(FciVersion::V10, 3).contains("safety functions"));
         assert_eq!(refused(FciVersion::V10, 99), "status 99");
-        assert!(matches!(decode_response(FciVersion::V10, &[]), MotionResponse::Rejected(_)));
+        assert!(matches!(
+            decode_response(FciVersion::V10, &[]),
+            MotionResponse::Rejected(_)
+        ));
     }
 }

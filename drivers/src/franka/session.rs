@@ -8,7 +8,8 @@ use std::time::Duration;
 
 /// Interval at which a thread that waits for a state checks for other events.
 pub(super) const POLL: Duration = Duration::from_millis(100);
-/// Maximum time for the answer to a connection request; a controller that accepts us answers within milliseconds.
+/// Maximum time for the answer to a connection request; a controller that accepts us answers within
+/// milliseconds.
 const MAX_ANSWER: Duration = Duration::from_secs(2);
 /// Interval of checks for an answer.
 const POLL_INTERVAL: Duration = Duration::from_millis(1);
@@ -32,25 +33,41 @@ enum ConnectResponse {
 impl Session {
     /// Connects with FCI 10, or with FCI 5 if the controller uses that version.
     pub(super) fn open(address: &str) -> Result<Self, Error> {
-        let fault = |reason| Error::Fci { address: address.to_owned(), reason };
+        let fault = |reason| Error::Fci {
+            address: address.to_owned(),
+            reason,
+        };
         let connect = |version: FciVersion| connect(address, number(version)).map_err(fault);
         let server_version = match connect(FciVersion::V10)? {
-            ConnectResponse::Accepted(network) => return Ok(Self { network, version: FciVersion::V10 }),
+            ConnectResponse::Accepted(network) => {
+                return Ok(Self {
+                    network,
+                    version: FciVersion::V10,
+                });
+            }
             ConnectResponse::OtherVersion(server_version) => server_version,
         };
         if server_version == number(FciVersion::V5) {
-            // The controller accepts one client, and may still be serving the connection that asked for FCI 10.
+            // The controller accepts one client, and may still be serving the connection that asked
+            // for FCI 10.
             let deadline = clock::now() + MAX_ANSWER;
             loop {
                 match connect(FciVersion::V5) {
-                    Ok(ConnectResponse::Accepted(network)) => return Ok(Self { network, version: FciVersion::V5 }),
+                    Ok(ConnectResponse::Accepted(network)) => {
+                        return Ok(Self {
+                            network,
+                            version: FciVersion::V5,
+                        });
+                    }
                     Err(_) if clock::now() < deadline => std::thread::sleep(POLL),
                     Err(error) => return Err(error),
                     Ok(ConnectResponse::OtherVersion(_)) => break,
                 }
             }
         }
-        Err(fault(format!("it uses FCI version {server_version}; supported are versions 5 (Panda) and 10 (FR3)")))
+        Err(fault(format!(
+            "it uses FCI version {server_version}; supported are versions 5 (Panda) and 10 (FR3)"
+        )))
     }
 }
 
@@ -63,16 +80,27 @@ fn number(version: FciVersion) -> u16 {
 
 /// Connects and sends our FCI version.
 fn connect(address: &str, version: u16) -> Result<ConnectResponse, String> {
-    let network =
-        Network::connect_with_timeouts(address, ROBOT_COMMAND_PORT, HeaderLayout::Robot, DEFAULT_CONNECT_TIMEOUT, POLL);
+    let network = Network::connect_with_timeouts(
+        address,
+        ROBOT_COMMAND_PORT,
+        HeaderLayout::Robot,
+        DEFAULT_CONNECT_TIMEOUT,
+        POLL,
+    );
     // The host does not exist or refuses connections, so other clients are not the cause.
     let network = network.map_err(|error| error_text(&error))?;
     let mut request = version.to_le_bytes().to_vec();
     request.extend(network.udp.port().to_le_bytes());
     let disconnected = |error: FrankaError| {
-        format!("it closed the connection ({}). {ONE_CLIENT_HINT}", error_text(&error).trim_end_matches('.'))
+        format!(
+            "it closed the connection ({}). {ONE_CLIENT_HINT}",
+            error_text(&error).trim_end_matches('.')
+        )
     };
-    let id = network.tcp.send_request(robot::Command::Connect.to_u32(), &request).map_err(disconnected)?;
+    let id = network
+        .tcp
+        .send_request(robot::Command::Connect.to_u32(), &request)
+        .map_err(disconnected)?;
     let Some(message) = answer(&network, id, MAX_ANSWER).map_err(disconnected)? else {
         return Err(format!("it does not answer. {ONE_CLIENT_HINT}"));
     };
@@ -86,12 +114,18 @@ fn connect(address: &str, version: u16) -> Result<ConnectResponse, String> {
     match (status, u16::from_le_bytes([low, high])) {
         (0, server_version) if server_version == version => Ok(ConnectResponse::Accepted(network)),
         (0 | 1, server_version) => Ok(ConnectResponse::OtherVersion(server_version)),
-        (status, _) => Err(format!("it rejected the connection with status {status}. {ONE_CLIENT_HINT}")),
+        (status, _) => Err(format!(
+            "it rejected the connection with status {status}. {ONE_CLIENT_HINT}"
+        )),
     }
 }
 
 /// The answer to a request, including its header; `None` if it does not arrive in time.
-pub(super) fn answer(network: &Network, id: u32, timeout: Duration) -> Result<Option<Vec<u8>>, FrankaError> {
+pub(super) fn answer(
+    network: &Network,
+    id: u32,
+    timeout: Duration,
+) -> Result<Option<Vec<u8>>, FrankaError> {
     let deadline = clock::now() + timeout;
     loop {
         match network.tcp.try_receive_response(id)? {

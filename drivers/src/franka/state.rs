@@ -38,7 +38,11 @@ pub(super) fn decode(version: FciVersion, bytes: &[u8]) -> Option<NumberedState>
         }
     };
     let are_angles = state.q.iter().all(|angle| angle.abs() <= MAX_RAD);
-    let are_numbers = state.dq.iter().chain(&state.tau_J).all(|number| number.is_finite());
+    let are_numbers = state
+        .dq
+        .iter()
+        .chain(&state.tau_J)
+        .all(|number| number.is_finite());
     (are_angles && are_numbers).then_some(NumberedState { number, state })
 }
 

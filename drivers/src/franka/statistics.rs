@@ -26,7 +26,8 @@ pub struct StateStatistics {
 }
 
 impl StateStatistics {
-    /// Fraction of the robot's states that were received in order, 0 to 1; 1 before the first state.
+    /// Fraction of the robot's states that were received in order, 0 to 1; 1 before the first
+    /// state.
     pub fn success_frac(&self) -> f64 {
         match self.n_received + self.n_lost {
             0 => 1.0,
@@ -55,7 +56,15 @@ impl StateStatistics {
 
 impl std::fmt::Display for StateStatistics {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let Self { n_received, n_lost, n_late, n_rejected, n_dropped, n_restarts, .. } = self;
+        let Self {
+            n_received,
+            n_lost,
+            n_late,
+            n_rejected,
+            n_dropped,
+            n_restarts,
+            ..
+        } = self;
         let [median, p99, max] = self.delays.summary();
         write!(
             f,
@@ -64,7 +73,10 @@ impl std::fmt::Display for StateStatistics {
             100.0 * self.success_frac()
         )?;
         if *n_dropped + *n_restarts > 0 {
-            write!(f, "; {n_dropped} dropped from a full queue, {n_restarts} restarts of the robot's clock")?;
+            write!(
+                f,
+                "; {n_dropped} dropped from a full queue, {n_restarts} restarts of the robot's clock"
+            )?;
         }
         Ok(())
     }
@@ -83,8 +95,8 @@ pub struct MotionStatistics {
     pub n_stale: u64,
     /// States that never arrived, or arrived together with a newer one.
     pub n_lost: u64,
-    /// Commands that the robot missed, according to its reported reference. With a small jerk this is not detectable,
-    /// or a few received commands may count as missed.
+    /// Commands that the robot missed, according to its reported reference. With a small jerk this
+    /// is not detectable, or a few received commands may count as missed.
     pub n_missed: u64,
     /// Commands that were changed to stay within the limits of the robot.
     pub n_limited: u64,
@@ -101,7 +113,8 @@ struct ReportedSuccess {
 }
 
 impl MotionStatistics {
-    /// Fraction of the robot's states during motions that were answered, 0 to 1; 1 before the first motion.
+    /// Fraction of the robot's states during motions that were answered, 0 to 1; 1 before the first
+    /// motion.
     pub fn success_frac(&self) -> f64 {
         match self.n_cycles + self.n_lost {
             0 => 1.0,
@@ -109,14 +122,19 @@ impl MotionStatistics {
         }
     }
 
-    /// The `control_command_success_rate` that the robot reports, 0 to 1: the mean, and the minimum over any 100
-    /// consecutive commands. `None` if no motion was long enough.
+    /// The `control_command_success_rate` that the robot reports, 0 to 1: the mean, and the minimum
+    /// over any 100 consecutive commands. `None` if no motion was long enough.
     pub fn robot_success_frac(&self) -> Option<[f64; 2]> {
-        let ReportedSuccess { n, sum_frac, min_frac } = self.reported_success;
+        let ReportedSuccess {
+            n,
+            sum_frac,
+            min_frac,
+        } = self.reported_success;
         (n > 0).then(|| [sum_frac / n as f64, min_frac])
     }
 
-    /// Quantile of the delay of commands relative to the fastest possible arrival of their states; 1 is the maximum.
+    /// Quantile of the delay of commands relative to the fastest possible arrival of their states;
+    /// 1 is the maximum.
     pub fn delay(&self, frac: f64) -> Duration {
         self.delays.at(frac)
     }
@@ -129,7 +147,11 @@ impl MotionStatistics {
 
     /// Counts the success rate that the robot reports for its last 100 commands.
     pub(super) fn count_robot_success(&mut self, frac: f64) {
-        let ReportedSuccess { n, sum_frac, min_frac } = &mut self.reported_success;
+        let ReportedSuccess {
+            n,
+            sum_frac,
+            min_frac,
+        } = &mut self.reported_success;
         *min_frac = if *n == 0 { frac } else { min_frac.min(frac) };
         *n += 1;
         *sum_frac += frac;
@@ -138,7 +160,16 @@ impl MotionStatistics {
 
 impl std::fmt::Display for MotionStatistics {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let Self { n_motions, n_cycles, n_stale, n_lost, n_missed, n_limited, delays, .. } = self;
+        let Self {
+            n_motions,
+            n_cycles,
+            n_stale,
+            n_lost,
+            n_missed,
+            n_limited,
+            delays,
+            ..
+        } = self;
         let [median, p99, max] = delays.summary();
         write!(
             f,
@@ -148,10 +179,16 @@ impl std::fmt::Display for MotionStatistics {
         )?;
         if let Some([mean, min]) = self.robot_success_frac() {
             let [mean, min] = [mean, min].map(|frac| 100.0 * frac);
-            write!(f, "; the robot received {mean:.2} % in time, of any 100 at least {min:.0} %")?;
+            write!(
+                f,
+                "; the robot received {mean:.2} % in time, of any 100 at least {min:.0} %"
+            )?;
         }
         if *n_missed + *n_limited > 0 {
-            write!(f, "; it missed {n_missed} of them, {n_limited} were limited")?;
+            write!(
+                f,
+                "; it missed {n_missed} of them, {n_limited} were limited"
+            )?;
         }
         Ok(())
     }
@@ -167,7 +204,11 @@ struct Delays {
 
 impl Default for Delays {
     fn default() -> Self {
-        Self { n: 0, bins: vec![0; N_BINS], max_delay: Duration::ZERO }
+        Self {
+            n: 0,
+            bins: vec![0; N_BINS],
+            max_delay: Duration::ZERO,
+        }
     }
 }
 
@@ -189,7 +230,8 @@ impl Delays {
             n_left -= *n as f64;
             n_left <= 0.0
         });
-        let ix = u32::try_from(bin.unwrap_or(N_BINS - 1)).expect("the number of bins fits in 32 bits");
+        let ix =
+            u32::try_from(bin.unwrap_or(N_BINS - 1)).expect("the number of bins fits in 32 bits");
         (BIN_WIDTH * (ix + 1)).min(self.max_delay)
     }
 
@@ -210,7 +252,9 @@ mod tests {
         for micros in 0..1000 {
             statistics.count(Duration::from_micros(micros));
         }
-        let within = |delay: Duration, micros: u128| delay.as_micros().abs_diff(micros) <= BIN_WIDTH.as_micros();
+        let within = |delay: Duration, micros: u128| {
+            delay.as_micros().abs_diff(micros) <= BIN_WIDTH.as_micros()
+        };
         assert!(within(statistics.delay(0.5), 500), "{statistics}");
         assert!(within(statistics.delay(0.99), 990), "{statistics}");
         statistics.count(Duration::from_secs(7));
@@ -222,7 +266,11 @@ mod tests {
 
     #[test]
     fn robot_success_rate_is_reported() {
-        let mut statistics = MotionStatistics { n_cycles: 3, n_lost: 1, ..MotionStatistics::default() };
+        let mut statistics = MotionStatistics {
+            n_cycles: 3,
+            n_lost: 1,
+            ..MotionStatistics::default()
+        };
         assert_eq!(statistics.robot_success_frac(), None);
         statistics.count(Duration::from_millis(1));
         statistics.count_robot_success(0.98);
@@ -230,6 +278,9 @@ mod tests {
         assert_eq!(statistics.success_frac(), 0.25);
         let [mean, min] = statistics.robot_success_frac().unwrap();
         assert!((mean - 0.94).abs() < 1e-12 && min == 0.9);
-        assert!(statistics.to_string().contains("at least 90 %"), "{statistics}");
+        assert!(
+            statistics.to_string().contains("at least 90 %"),
+            "{statistics}"
+        );
     }
 }

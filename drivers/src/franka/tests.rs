@@ -1,9 +1,14 @@
-//! Tests over loopback sockets: our driver, and franka-rs as a client that moves, against emulated robots.
+//! Tests over loopback sockets: our driver, and franka-rs as a client that moves, against emulated
+//! robots.
 
-use super::emulated::{CommandedJoints, EmulatedRobot, JointSimulator, Joints, Limits, RobotConfig};
+use super::emulated::{
+    CommandedJoints, EmulatedRobot, JointSimulator, Joints, Limits, RobotConfig,
+};
 use super::{ArmConfig, FciVersion, FrankaArm, N_JOINTS};
 use crate::{Arm, Error};
-use franka::{ControllerMode, FrankaError, JointPositions, MoveStatus, RealtimeConfig, Robot, RobotMode};
+use franka::{
+    ControllerMode, FrankaError, JointPositions, MoveStatus, RealtimeConfig, Robot, RobotMode,
+};
 use kinematics::random::Random;
 use kinematics::{Chain, Stamp, Transform};
 use std::io::{Read, Write};
@@ -13,7 +18,8 @@ use std::time::{Duration, Instant};
 
 const URDF: &str = include_str!("../../../kinematics/tests/data/panda.urdf");
 pub(super) const FREE_PORT: &str = "127.0.0.1:0";
-/// Timeout of the tests. It is long because a busy machine may be slow; a successful test does not wait this long.
+/// Timeout of the tests. It is long because a busy machine may be slow; a successful test does not
+/// wait this long.
 pub(super) const TEST_TIMEOUT: Duration = Duration::from_secs(20);
 pub(super) const REST_RAD: [f64; N_JOINTS] = [0.1, -0.5, 0.2, -2.0, 0.3, 1.8, 0.7];
 /// How long a robot waits for franka-rs, which does not correct a motion after a missed answer.
@@ -35,16 +41,33 @@ pub(super) fn waiting_robot(
     answer_wait: Duration,
     joint_simulator: JointSimulator,
 ) -> EmulatedRobot {
-    let limits = if version == FciVersion::V5 { Limits::panda() } else { Limits::fr3() };
-    let flange_from_tool = Transform::new([0.0, 0.0, 0.1034].into(), [0.0, 0.0, -std::f64::consts::FRAC_PI_4].into());
+    let limits = if version == FciVersion::V5 {
+        Limits::panda()
+    } else {
+        Limits::fr3()
+    };
+    let flange_from_tool = Transform::new(
+        [0.0, 0.0, 0.1034].into(),
+        [0.0, 0.0, -std::f64::consts::FRAC_PI_4].into(),
+    );
     let address = FREE_PORT.parse().unwrap();
-    let config = RobotConfig { address, version, chain: chain("link8"), flange_from_tool, limits };
+    let config = RobotConfig {
+        address,
+        version,
+        chain: chain("link8"),
+        flange_from_tool,
+        limits,
+    };
     EmulatedRobot::start_waiting(config, answer_wait, joint_simulator).unwrap()
 }
 
 pub(super) fn config(address: SocketAddr) -> ArmConfig {
     let chain = chain("link8");
-    ArmConfig { address: address.to_string(), joint_names: chain.joint_names().to_vec(), chain }
+    ArmConfig {
+        address: address.to_string(),
+        joint_names: chain.joint_names().to_vec(),
+        chain,
+    }
 }
 
 /// Joints that swing; their motion is a function of time.
@@ -63,8 +86,16 @@ pub(super) fn swinging_joints_at(stamp: Stamp) -> Joints {
 pub(super) fn ideal_joints() -> JointSimulator {
     let mut is_first = true;
     Box::new(move |_, commanded: &CommandedJoints| {
-        let position_rad = if std::mem::take(&mut is_first) { REST_RAD } else { commanded.position_rad };
-        Joints { position_rad, velocity_rad_s: commanded.velocity_rad_s, ..Joints::default() }
+        let position_rad = if std::mem::take(&mut is_first) {
+            REST_RAD
+        } else {
+            commanded.position_rad
+        };
+        Joints {
+            position_rad,
+            velocity_rad_s: commanded.velocity_rad_s,
+            ..Joints::default()
+        }
     })
 }
 
@@ -86,16 +117,28 @@ fn ten_thousand_states_are_received_in_both_versions() {
             last = Some(state.stamp);
             let truth = swinging_joints_at(state.stamp);
             if ix > 1000 {
-                let errors = state.position.iter().zip(truth.position_rad).map(|(reported, is)| (reported - is).abs());
+                let errors = state
+                    .position
+                    .iter()
+                    .zip(truth.position_rad)
+                    .map(|(reported, is)| (reported - is).abs());
                 max_error = errors.fold(max_error, f64::max);
             }
             assert_eq!(state.effort, truth.torque_nm);
         }
         let (statistics, n_sent) = (arm.statistics(), emulated.n_states_sent());
-        eprintln!("{version:?}: {statistics}; positions at their stamps within {max_error:.1e} rad");
+        eprintln!(
+            "{version:?}: {statistics}; positions at their stamps within {max_error:.1e} rad"
+        );
         let frac = statistics.n_received as f64 / n_sent as f64;
-        assert!(frac > MIN_FRAC, "{version:?}: {statistics}; the robot sent {n_sent} states");
-        assert!(max_error < 0.4 * MAX_LATE_SECS, "{version:?}: {max_error} rad; {statistics}");
+        assert!(
+            frac > MIN_FRAC,
+            "{version:?}: {statistics}; the robot sent {n_sent} states"
+        );
+        assert!(
+            max_error < 0.4 * MAX_LATE_SECS,
+            "{version:?}: {max_error} rad; {statistics}"
+        );
     }
 }
 
@@ -103,8 +146,13 @@ fn ten_thousand_states_are_received_in_both_versions() {
 fn second_client_is_rejected_with_advice() {
     let emulated = robot(FciVersion::V5, ideal_joints());
     let first = FrankaArm::open(&config(emulated.address())).unwrap();
-    let second_client = FrankaArm::open(&config(emulated.address())).unwrap_err().to_string();
-    assert!(second_client.contains("one client") && second_client.contains("arm.driver = \"udp\""), "{second_client}");
+    let second_client = FrankaArm::open(&config(emulated.address()))
+        .unwrap_err()
+        .to_string();
+    assert!(
+        second_client.contains("one client") && second_client.contains("arm.driver = \"udp\""),
+        "{second_client}"
+    );
     drop(first);
     // The controller detects the disconnect within a few milliseconds.
     let deadline = Instant::now() + TEST_TIMEOUT;
@@ -114,7 +162,10 @@ fn second_client_is_rejected_with_advice() {
     let address = emulated.address();
     drop(emulated);
     let absent = FrankaArm::open(&config(address)).unwrap_err().to_string();
-    assert!(absent.contains(&address.to_string()) && absent.contains("FCI"), "{absent}");
+    assert!(
+        absent.contains(&address.to_string()) && absent.contains("FCI"),
+        "{absent}"
+    );
 }
 
 #[test]
@@ -122,8 +173,15 @@ fn unresponsive_or_unsupported_controller_is_error() {
     let listener = std::net::TcpListener::bind(FREE_PORT).unwrap();
     let address = listener.local_addr().unwrap();
     let no_answer = FrankaArm::open(&config(address)).unwrap_err().to_string();
-    assert!(no_answer.contains("does not answer") && no_answer.contains("udp"), "{no_answer}");
-    for (answer, expected) in [(vec![1, 7, 0], "version 7"), (vec![9, 10, 0], "status 9"), (vec![0], "too short")] {
+    assert!(
+        no_answer.contains("does not answer") && no_answer.contains("udp"),
+        "{no_answer}"
+    );
+    for (answer, expected) in [
+        (vec![1, 7, 0], "version 7"),
+        (vec![9, 10, 0], "status 9"),
+        (vec![0], "too short"),
+    ] {
         let listener = std::net::TcpListener::bind(FREE_PORT).unwrap();
         let address = listener.local_addr().unwrap();
         let thread = std::thread::spawn(move || {
@@ -131,7 +189,12 @@ fn unresponsive_or_unsupported_controller_is_error() {
             let mut request = [0; 16];
             stream.read_exact(&mut request).unwrap();
             let n = 12 + u32::try_from(answer.len()).unwrap();
-            let header = [[0; 4], [request[4], request[5], request[6], request[7]], n.to_le_bytes()].concat();
+            let header = [
+                [0; 4],
+                [request[4], request[5], request[6], request[7]],
+                n.to_le_bytes(),
+            ]
+            .concat();
             stream.write_all(&[header, answer].concat()).unwrap();
             stream
         });
@@ -144,16 +207,35 @@ fn unresponsive_or_unsupported_controller_is_error() {
 #[test]
 fn flange_mismatch_reports_both_poses() {
     let emulated = robot(FciVersion::V10, ideal_joints());
-    let with_tip = |tip| ArmConfig { chain: chain(tip), ..config(emulated.address()) };
+    let with_tip = |tip| ArmConfig {
+        chain: chain(tip),
+        ..config(emulated.address())
+    };
     let wrong_tip = FrankaArm::open(&with_tip("link7")).unwrap_err().to_string();
     for part in ["\"link7\"", "107.0 mm", "arm.flange_link", "F_T_EE", "yaw"] {
-        assert!(wrong_tip.contains(part), "{part:?} is missing in: {wrong_tip}");
+        assert!(
+            wrong_tip.contains(part),
+            "{part:?} is missing in: {wrong_tip}"
+        );
     }
     let mut swapped = config(emulated.address());
     swapped.joint_names.swap(1, 3);
-    assert!(FrankaArm::open(&swapped).unwrap_err().to_string().contains("order"));
-    let too_few_joints = ArmConfig { joint_names: vec!["joint1".to_owned()], ..config(emulated.address()) };
-    assert!(FrankaArm::open(&too_few_joints).unwrap_err().to_string().contains("1 joints"));
+    assert!(
+        FrankaArm::open(&swapped)
+            .unwrap_err()
+            .to_string()
+            .contains("order")
+    );
+    let too_few_joints = ArmConfig {
+        joint_names: vec!["joint1".to_owned()],
+        ..config(emulated.address())
+    };
+    assert!(
+        FrankaArm::open(&too_few_joints)
+            .unwrap_err()
+            .to_string()
+            .contains("1 joints")
+    );
 }
 
 #[test]
@@ -170,15 +252,20 @@ fn lost_robot_is_an_error() {
         }
     };
     assert!(matches!(lost, Error::Fci { .. }), "{lost}");
-    assert!(matches!(arm.read(Duration::from_millis(1)), Err(Error::NoJoints { .. })));
+    assert!(matches!(
+        arm.read(Duration::from_millis(1)),
+        Err(Error::NoJoints { .. })
+    ));
 }
 
-/// A smooth motion by `by_rad`, as a function of the fraction of the time (a quintic, at rest at both ends).
+/// A smooth motion by `by_rad`, as a function of the fraction of the time (a quintic, at rest at
+/// both ends).
 fn quintic(frac: f64, by_rad: f64) -> f64 {
     by_rad * frac.powi(3) * (10.0 - 15.0 * frac + 6.0 * frac * frac)
 }
 
-/// Moves the fourth joint with franka-rs, which implements libfranka's loop, without its limits and filters.
+/// Moves the fourth joint with franka-rs, which implements libfranka's loop, without its limits and
+/// filters.
 fn move_to(client: &Robot, goal_rad: f64, secs: f64) -> Result<(), FrankaError> {
     let mut start = None;
     let mut time = 0.0;
@@ -220,7 +307,11 @@ fn motion_beyond_limits_triggers_reflex_until_recovery() {
         assert_eq!(client.fci_version(), version);
         move_to(&client, REST_RAD[3] + 0.1, 1.0).unwrap();
         let arrived = client.read_once().unwrap();
-        assert!((arrived.q[3] - (REST_RAD[3] + 0.1)).abs() < 1e-6, "{:?}", arrived.q);
+        assert!(
+            (arrived.q[3] - (REST_RAD[3] + 0.1)).abs() < 1e-6,
+            "{:?}",
+            arrived.q
+        );
         assert_eq!(arrived.robot_mode, RobotMode::Idle);
         // Half a radian within a fifth of a second takes up to 72 rad/s².
         let stopped = match move_to(&client, REST_RAD[3] + 0.6, 0.2) {
@@ -228,13 +319,24 @@ fn motion_beyond_limits_triggers_reflex_until_recovery() {
             other => panic!("{other:?}"),
         };
         assert_eq!(stopped.move_status, Some(MoveStatus::ReflexAborted));
-        let reports_discontinuity =
-            |errors: &franka::Errors| errors.names().iter().any(|name| name.contains("discontinuity"));
-        assert!(reports_discontinuity(&stopped.last_motion_errors), "{:?}", stopped.last_motion_errors.names());
+        let reports_discontinuity = |errors: &franka::Errors| {
+            errors
+                .names()
+                .iter()
+                .any(|name| name.contains("discontinuity"))
+        };
+        assert!(
+            reports_discontinuity(&stopped.last_motion_errors),
+            "{:?}",
+            stopped.last_motion_errors.names()
+        );
         let state = client.read_once().unwrap();
         assert_eq!(state.robot_mode, RobotMode::Reflex);
         assert!(reports_discontinuity(&state.current_errors));
-        assert!(move_to(&client, REST_RAD[3], 1.0).is_err(), "no motion is accepted before the recovery");
+        assert!(
+            move_to(&client, REST_RAD[3], 1.0).is_err(),
+            "no motion is accepted before the recovery"
+        );
         recover(&client);
         move_to(&client, REST_RAD[3], 1.0).unwrap();
     }
@@ -248,17 +350,25 @@ fn contact_above_threshold_ends_motion() {
     let joint_simulator: JointSimulator = Box::new(move |stamp, commanded| {
         let mut joints = follow_command(stamp, commanded);
         let is_moving = commanded.velocity_rad_s[3].abs() > 0.01;
-        joints.external_torque_nm[2] = if is_moving { *contact.lock().unwrap() } else { 0.0 };
+        joints.external_torque_nm[2] = if is_moving {
+            *contact.lock().unwrap()
+        } else {
+            0.0
+        };
         joints
     });
     let emulated = waiting_robot(FciVersion::V10, CLIENT_WAIT, joint_simulator);
     let client = Robot::new(&emulated.address().to_string(), RealtimeConfig::Ignore).unwrap();
-    client.set_collision_behavior_simple([5.0; 7], [10.0; 7], [20.0; 6], [40.0; 6]).unwrap();
+    client
+        .set_collision_behavior_simple([5.0; 7], [10.0; 7], [20.0; 6], [40.0; 6])
+        .unwrap();
     *contact_nm.lock().unwrap() = 9.0;
     move_to(&client, REST_RAD[3] + 0.05, 0.5).unwrap();
     *contact_nm.lock().unwrap() = 11.0;
     match move_to(&client, REST_RAD[3], 0.5) {
-        Err(FrankaError::Control(stopped)) => assert_eq!(stopped.last_motion_errors.names(), ["joint_reflex"]),
+        Err(FrankaError::Control(stopped)) => {
+            assert_eq!(stopped.last_motion_errors.names(), ["joint_reflex"])
+        }
         other => panic!("{other:?}"),
     }
 }
@@ -275,12 +385,23 @@ fn malformed_bytes_stop_neither_robot_nor_client() {
         let mut bytes: Vec<u8> = (0..n).map(|_| byte()).collect();
         if ix % 3 > 0 {
             let port = [byte(), byte()];
-            let hello = [&[0; 8][..], &16_u32.to_le_bytes(), &10_u16.to_le_bytes(), &port].concat();
-            let size = if ix % 3 == 1 { 12 + u32::try_from(n).unwrap() } else { u32::from(byte()) << (byte() % 25) };
+            let hello = [
+                &[0; 8][..],
+                &16_u32.to_le_bytes(),
+                &10_u16.to_le_bytes(),
+                &port,
+            ]
+            .concat();
+            let size = if ix % 3 == 1 {
+                12 + u32::try_from(n).unwrap()
+            } else {
+                u32::from(byte()) << (byte() % 25)
+            };
             let header = [(ix % 16).to_le_bytes(), [byte(); 4], size.to_le_bytes()].concat();
             bytes = [hello, header, bytes].concat();
         }
-        // The robot may disconnect in the middle, and does so at once while another client is connected.
+        // The robot may disconnect in the middle, and does so at once while another client is
+        // connected.
         let _ = stream.write_all(&bytes);
     }
     let deadline = Instant::now() + TEST_TIMEOUT;
@@ -311,7 +432,9 @@ fn malformed_bytes_stop_neither_robot_nor_client() {
         let (mut stream, peer) = listener.accept().unwrap();
         let mut request = [0; 16];
         stream.read_exact(&mut request).unwrap();
-        stream.write_all(&[&[0; 8][..], &15_u32.to_le_bytes(), &[0, 10, 0]].concat()).unwrap();
+        stream
+            .write_all(&[&[0; 8][..], &15_u32.to_le_bytes(), &[0, 10, 0]].concat())
+            .unwrap();
         let to = SocketAddr::new(peer.ip(), u16::from_le_bytes([request[14], request[15]]));
         let udp = UdpSocket::bind(FREE_PORT).unwrap();
         for number in 0..200_u64 {
@@ -330,7 +453,10 @@ fn malformed_bytes_stop_neither_robot_nor_client() {
         assert_eq!(arm.read(TEST_TIMEOUT).unwrap().position.len(), N_JOINTS);
     }
     let statistics = arm.statistics();
-    assert!(statistics.n_rejected > 100 && statistics.n_lost == 0, "{statistics}");
+    assert!(
+        statistics.n_rejected > 100 && statistics.n_lost == 0,
+        "{statistics}"
+    );
     thread.join().unwrap();
 }
 
@@ -339,13 +465,23 @@ fn raw_client(emulated: &EmulatedRobot) -> (TcpStream, UdpSocket) {
     let states = UdpSocket::bind(FREE_PORT).unwrap();
     states.set_read_timeout(Some(TEST_TIMEOUT)).unwrap();
     let port = states.local_addr().unwrap().port().to_le_bytes();
-    let hello = [&[0; 8][..], &16_u32.to_le_bytes(), &10_u16.to_le_bytes(), &port].concat();
+    let hello = [
+        &[0; 8][..],
+        &16_u32.to_le_bytes(),
+        &10_u16.to_le_bytes(),
+        &port,
+    ]
+    .concat();
     let deadline = Instant::now() + TEST_TIMEOUT;
     loop {
         // The robot rejects us until the previous client is gone.
         let mut stream = TcpStream::connect(emulated.address()).unwrap();
         let mut answer = [0; 15];
-        if stream.write_all(&hello).and_then(|()| stream.read_exact(&mut answer)).is_ok() {
+        if stream
+            .write_all(&hello)
+            .and_then(|()| stream.read_exact(&mut answer))
+            .is_ok()
+        {
             return (stream, states);
         }
         assert!(Instant::now() < deadline);
@@ -357,14 +493,23 @@ fn invalid_states_are_rejected() {
     use super::state::{MAX_STATE_BYTES, decode};
     use franka::wire::robot::{v5, v10};
     use zerocopy::IntoBytes;
-    let [good_5, good_10] =
-        [v5::RobotState::default().as_bytes().to_vec(), v10::RobotState::default().as_bytes().to_vec()];
-    for (version, good, other) in [(FciVersion::V5, &good_5, &good_10), (FciVersion::V10, &good_10, &good_5)] {
+    let [good_5, good_10] = [
+        v5::RobotState::default().as_bytes().to_vec(),
+        v10::RobotState::default().as_bytes().to_vec(),
+    ];
+    for (version, good, other) in [
+        (FciVersion::V5, &good_5, &good_10),
+        (FciVersion::V10, &good_10, &good_5),
+    ] {
         assert!(decode(version, good).is_some());
         assert!(decode(version, other).is_none());
         for n in 0..MAX_STATE_BYTES {
             let bytes: Vec<u8> = good.iter().copied().chain([0]).cycle().take(n).collect();
-            assert_eq!(decode(version, &bytes).is_some(), n == good.len(), "{n} bytes");
+            assert_eq!(
+                decode(version, &bytes).is_some(),
+                n == good.len(),
+                "{n} bytes"
+            );
         }
         // Bytes of all ones are not numbers.
         let mut bytes = good.clone();

@@ -18,7 +18,8 @@ pub fn nerfstudio(bytes: &[u8]) {
     });
 }
 
-/// Reads the lists of a TUM folder, separated by lines of three equals signs: photos, depth images, poses, lens.
+/// Reads the lists of a TUM folder, separated by lines of three equals signs: photos, depth images,
+/// poses, lens.
 pub fn tum(bytes: &[u8]) {
     let text = String::from_utf8_lossy(bytes);
     let mut lists = text.splitn(4, "===\n");
@@ -31,7 +32,9 @@ pub fn tum(bytes: &[u8]) {
 }
 
 fn read(folder: &Scratch) {
-    let Ok(dataset) = dataset::read(&folder.0) else { return };
+    let Ok(dataset) = dataset::read(&folder.0) else {
+        return;
+    };
     assert!(!dataset.images.is_empty());
     for image in &dataset.images {
         assert!(transform::is_finite(&image.world_from_camera), "{image:?}");
@@ -42,8 +45,12 @@ fn read(folder: &Scratch) {
 fn folder(name: &str) -> Scratch {
     let folder = Scratch::new(name);
     let photo = image::RgbImage::from_pixel(4, 3, image::Rgb([40, 60, 7]));
-    photo.save(folder.0.join("photo.png")).expect("a small image");
+    photo
+        .save(folder.0.join("photo.png"))
+        .expect("a small image");
     let depth = image::ImageBuffer::<image::Luma<u16>, _>::from_pixel(4, 3, image::Luma([1000]));
-    depth.save(folder.0.join("depth.png")).expect("a small image");
+    depth
+        .save(folder.0.join("depth.png"))
+        .expect("a small image");
     folder
 }

@@ -8,7 +8,11 @@ pub(super) struct Scratch(pub(super) PathBuf);
 impl Scratch {
     pub(super) fn new(name: &str) -> Self {
         let memory = Path::new("/dev/shm");
-        let root = if memory.is_dir() { memory.to_owned() } else { std::env::temp_dir() };
+        let root = if memory.is_dir() {
+            memory.to_owned()
+        } else {
+            std::env::temp_dir()
+        };
         let thread = std::thread::current().id();
         let folder = root.join(format!("fieldrig-{name}-{}-{thread:?}", std::process::id()));
         std::fs::create_dir_all(&folder).expect("creating a temporary folder");

@@ -20,18 +20,27 @@ const READERS: [(&str, Reader); 9] = [
 ];
 
 fn seed_folder(name: &str) -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("../fuzz/seeds").join(name)
+    Path::new(env!("CARGO_MANIFEST_DIR"))
+        .join("../fuzz/seeds")
+        .join(name)
 }
 
 fn load_seeds(name: &str) -> Vec<Vec<u8>> {
     let folder = seed_folder(name);
-    let mut paths: Vec<_> = std::fs::read_dir(&folder).unwrap().map(|entry| entry.unwrap().path()).collect();
+    let mut paths: Vec<_> = std::fs::read_dir(&folder)
+        .unwrap()
+        .map(|entry| entry.unwrap().path())
+        .collect();
     paths.sort();
     assert!(!paths.is_empty(), "{folder:?} has no seeds");
-    paths.iter().map(|path| std::fs::read(path).unwrap()).collect()
+    paths
+        .iter()
+        .map(|path| std::fs::read(path).unwrap())
+        .collect()
 }
 
-/// Corrupts the bytes: truncates, deletes or repeats a section, swaps two sections, or changes bytes or bits at random.
+/// Corrupts the bytes: truncates, deletes or repeats a section, swaps two sections, or changes
+/// bytes or bits at random.
 fn corrupt(bytes: &mut Vec<u8>, random: &mut Random) {
     if bytes.is_empty() {
         return bytes.push(7);
@@ -44,7 +53,10 @@ fn corrupt(bytes: &mut Vec<u8>, random: &mut Random) {
         1 => drop(bytes.drain(a..b)),
         2 => drop(bytes.splice(b..b, bytes[a..b].to_vec())),
         3 => bytes[a..c].rotate_left(b - a),
-        4 => bytes[b.min(c.saturating_sub(1))..c].iter_mut().take(4).for_each(|byte| *byte = random.byte()),
+        4 => bytes[b.min(c.saturating_sub(1))..c]
+            .iter_mut()
+            .take(4)
+            .for_each(|byte| *byte = random.byte()),
         _ => bytes[a.min(positions[2].saturating_sub(1))] ^= 1 << random.below(8),
     }
 }

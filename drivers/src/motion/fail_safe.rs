@@ -10,9 +10,9 @@ static N_COMMANDED: AtomicUsize = AtomicUsize::new(0);
 /// The fail-safe command is resent for at most the largest timeout (2 s) plus 2 s.
 const MAX_WAIT: Duration = Duration::from_secs(5);
 
-/// Sends the fail-safe command to all arms with CAN motors that this process moves, without bringing them to rest first.
-/// Waits until their threads have ended, for at most 5 s. These arms accept no further commands. For use before the
-/// process ends without an orderly stop.
+/// Sends the fail-safe command to all arms with CAN motors that this process moves, without
+/// bringing them to rest first. Waits until their threads have ended, for at most 5 s. These arms
+/// accept no further commands. For use before the process ends without an orderly stop.
 ///
 /// Franka arms brake when the connection ends.
 pub fn apply_fail_safe() {

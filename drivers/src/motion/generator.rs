@@ -1,17 +1,19 @@
-//! Generates setpoints towards a target from any state of motion, with limited velocity, acceleration and jerk.
+//! Generates setpoints towards a target from any state of motion, with limited velocity,
+//! acceleration and jerk.
 //!
-//! Source: Berscheid and Kröger 2021, "Jerk-limited Real-time Trajectory Generation with Arbitrary Target States", as
-//! implemented in the crate `rsruckig`.
+//! Source: Berscheid and Kröger 2021, "Jerk-limited Real-time Trajectory Generation with Arbitrary
+//! Target States", as implemented in the crate `rsruckig`.
 
 use super::{JointTarget, MotionLimits};
 use rsruckig::prelude::{
-    ControlInterface, DataArrayOrVec, InputParameter, OutputParameter, Ruckig, RuckigError, RuckigResult,
-    Synchronization, ThrowErrorHandler,
+    ControlInterface, DataArrayOrVec, InputParameter, OutputParameter, Ruckig, RuckigError,
+    RuckigResult, Synchronization, ThrowErrorHandler,
 };
 use std::time::Duration;
 
-/// Maximum distance by which a joint may be outside its range, radians or meters. Causes are backlash, an encoder
-/// offset, or a motion that continued without commands and is too fast to stop before the end of the range.
+/// Maximum distance by which a joint may be outside its range, radians or meters. Causes are
+/// backlash, an encoder offset, or a motion that continued without commands and is too fast to stop
+/// before the end of the range.
 const MAX_OVERSHOOT: f64 = 0.02;
 
 /// Fractions by which the jerk is reduced if no trajectory is found with the full jerk.
@@ -47,11 +49,17 @@ impl std::fmt::Debug for TrajectoryGenerator {
 }
 
 impl TrajectoryGenerator {
-    /// Creates a generator at rest at `position`. A joint slightly outside its range may stay there and come back.
+    /// Creates a generator at rest at `position`. A joint slightly outside its range may stay there
+    /// and come back.
     ///
     /// # Errors
-    /// If a joint is far outside its range, a limit is not positive and finite, or the number of positions is wrong.
-    pub fn new(limits: &[MotionLimits], position: &[f64], period: Duration) -> Result<Self, String> {
+    /// If a joint is far outside its range, a limit is not positive and finite, or the number of
+    /// positions is wrong.
+    pub fn new(
+        limits: &[MotionLimits],
+        position: &[f64],
+        period: Duration,
+    ) -> Result<Self, String> {
         let n = limits.len();
         check(position, n)?;
         let mut limits = limits.to_vec();
@@ -63,9 +71,14 @@ impl TrajectoryGenerator {
                     ix + 1
                 ));
             }
-            if [joint.velocity, joint.acceleration, joint.jerk].iter().any(|limit| !limit.is_finite() || *limit <= 0.0)
+            if [joint.velocity, joint.acceleration, joint.jerk]
+                .iter()
+                .any(|limit| !limit.is_finite() || *limit <= 0.0)
             {
-                return Err(format!("the limits of joint {} must be positive and finite: {joint:?}", ix + 1));
+                return Err(format!(
+                    "the limits of joint {} must be positive and finite: {joint:?}",
+                    ix + 1
+                ));
             }
             joint.position = [lower.min(*position), upper.max(*position)];
         }
@@ -77,16 +90,28 @@ impl TrajectoryGenerator {
         input.max_acceleration = each(|joint| joint.acceleration);
         input.max_jerk = each(|joint| joint.jerk);
         let ruckig = Ruckig::new(Some(n), period.as_secs_f64());
-        Ok(Self { ruckig, input, output: OutputParameter::new(Some(n)), limits, is_at_rest: true })
+        Ok(Self {
+            ruckig,
+            input,
+            output: OutputParameter::new(Some(n)),
+            limits,
+            is_at_rest: true,
+        })
     }
 
-    /// Sets a target, clamped to the joints' ranges, and returns the clamped target. A target that is not finite or
-    /// has the wrong number of joints is an error and changes nothing.
+    /// Sets a target, clamped to the joints' ranges, and returns the clamped target. A target that
+    /// is not finite or has the wrong number of joints is an error and changes nothing.
     pub fn set_target(&mut self, target: &JointTarget) -> Result<JointTarget, String> {
         check(&target.position, self.limits.len())?;
-        let clamp_to_range =
-            |(position, joint): (&f64, &MotionLimits)| position.clamp(joint.position[0], joint.position[1]);
-        let position: Vec<f64> = target.position.iter().zip(&self.limits).map(clamp_to_range).collect();
+        let clamp_to_range = |(position, joint): (&f64, &MotionLimits)| {
+            position.clamp(joint.position[0], joint.position[1])
+        };
+        let position: Vec<f64> = target
+            .position
+            .iter()
+            .zip(&self.limits)
+            .map(clamp_to_range)
+            .collect();
         self.input.control_interface = ControlInterface::Position;
         self.input.synchronization = Synchronization::Time;
         self.input.target_position = data_array(position.iter().copied());
@@ -103,8 +128,8 @@ impl TrajectoryGenerator {
         }
     }
 
-    /// Continues towards the target from a different state of motion. Use it if the reference of the arm differs from
-    /// the last setpoint.
+    /// Continues towards the target from a different state of motion. Use it if the reference of
+    /// the arm differs from the last setpoint.
     pub fn resume(&mut self, from: &Setpoint) -> Result<(), String> {
         for values in [&from.position, &from.velocity, &from.acceleration] {
             check(values, self.limits.len())?;
@@ -119,8 +144,12 @@ impl TrajectoryGenerator {
 
     /// Keeps future trajectories within the ranges.
     fn keep_in_range(&mut self) {
-        self.input.min_position = Some(data_array(self.limits.iter().map(|joint| joint.position[0])));
-        self.input.max_position = Some(data_array(self.limits.iter().map(|joint| joint.position[1])));
+        self.input.min_position = Some(data_array(
+            self.limits.iter().map(|joint| joint.position[0]),
+        ));
+        self.input.max_position = Some(data_array(
+            self.limits.iter().map(|joint| joint.position[1]),
+        ));
     }
 
     /// Whether the joints are at rest at the end of their trajectory.
@@ -128,8 +157,8 @@ impl TrajectoryGenerator {
         self.is_at_rest
     }
 
-    /// Tries a step with slightly reduced jerk. `rsruckig` finds no trajectory if a joint reaches its full
-    /// acceleration for zero time, which happens for some round distances.
+    /// Tries a step with slightly reduced jerk. `rsruckig` finds no trajectory if a joint reaches
+    /// its full acceleration for zero time, which happens for some round distances.
     fn update_with_less_jerk(&mut self) -> Option<RuckigResult> {
         let full = self.input.max_jerk.clone();
         let result = JERK_REDUCTIONS.iter().find_map(|reduction| {
@@ -140,16 +169,24 @@ impl TrajectoryGenerator {
         result
     }
 
-    /// Tries a trajectory that leaves the ranges slightly and comes back, if none stays inside; `None` if that fails,
-    /// too. A stop is as short as possible, wherever it ends.
+    /// Tries a trajectory that leaves the ranges slightly and comes back, if none stays inside;
+    /// `None` if that fails, too. A stop is as short as possible, wherever it ends.
     fn update_with_overshoot(&mut self) -> Option<RuckigResult> {
-        let position_bounds = (self.input.min_position.take(), self.input.max_position.take());
+        let position_bounds = (
+            self.input.min_position.take(),
+            self.input.max_position.take(),
+        );
         let result = self.ruckig.update(&self.input, &mut self.output);
         let extrema = self.output.trajectory.get_position_extrema();
-        let is_within_tolerance = self.limits.iter().zip(extrema.iter()).all(|(joint, trajectory)| {
-            let [lower, upper] = joint.position;
-            trajectory.min >= lower - MAX_OVERSHOOT && trajectory.max <= upper + MAX_OVERSHOOT
-        });
+        let is_within_tolerance =
+            self.limits
+                .iter()
+                .zip(extrema.iter())
+                .all(|(joint, trajectory)| {
+                    let [lower, upper] = joint.position;
+                    trajectory.min >= lower - MAX_OVERSHOOT
+                        && trajectory.max <= upper + MAX_OVERSHOOT
+                });
         let is_stop = self.input.control_interface == ControlInterface::Velocity;
         match result {
             Ok(result) if is_within_tolerance || is_stop => Some(result),
@@ -160,17 +197,27 @@ impl TrajectoryGenerator {
         }
     }
 
-    /// Describes why no trajectory was found. `rsruckig` names only the number of the joint and repeats the input.
+    /// Describes why no trajectory was found. `rsruckig` names only the number of the joint and
+    /// repeats the input.
     fn describe(&self, error: &RuckigError) -> String {
         let message = error.to_string();
-        let number =
-            message.split("dof: ").nth(1).and_then(|rest| rest.split_whitespace().next()?.parse::<usize>().ok());
+        let number = message
+            .split("dof: ")
+            .nth(1)
+            .and_then(|rest| rest.split_whitespace().next()?.parse::<usize>().ok());
         let Some((ix, joint)) = number.and_then(|ix| Some((ix, self.limits.get(ix)?))) else {
-            return format!("found no trajectory to the target: {}", message.lines().next().unwrap_or_default());
+            return format!(
+                "found no trajectory to the target: {}",
+                message.lines().next().unwrap_or_default()
+            );
         };
         let ([lower, upper], input) = (joint.position, &self.input);
-        let [position, velocity, target] =
-            [&input.current_position, &input.current_velocity, &input.target_position].map(|joints| joints[ix]);
+        let [position, velocity, target] = [
+            &input.current_position,
+            &input.current_velocity,
+            &input.target_position,
+        ]
+        .map(|joints| joints[ix]);
         format!(
             "found no trajectory to the target: joint {} is at {position:.4} with a velocity of {velocity:.4} per second; it must \
              reach {target:.4} and stay within {lower:.4} to {upper:.4}",
@@ -208,10 +255,17 @@ impl TrajectoryGenerator {
 /// Checks that there is one finite number per joint.
 fn check(position: &[f64], n: usize) -> Result<(), String> {
     if position.len() != n {
-        return Err(format!("{} positions are given for {n} joints", position.len()));
+        return Err(format!(
+            "{} positions are given for {n} joints",
+            position.len()
+        ));
     }
     match position.iter().position(|position| !position.is_finite()) {
-        Some(ix) => Err(format!("the position of joint {} is not a finite number: {}", ix + 1, position[ix])),
+        Some(ix) => Err(format!(
+            "the position of joint {} is not a finite number: {}",
+            ix + 1,
+            position[ix]
+        )),
         None => Ok(()),
     }
 }
@@ -227,8 +281,16 @@ mod tests {
     const PERIOD: Duration = Duration::from_millis(1);
 
     fn limits() -> Vec<MotionLimits> {
-        let joint = |position, velocity| MotionLimits { position, velocity, acceleration: 2.0, jerk: 20.0 };
-        vec![joint([-1.0, 1.0], 0.5), joint([f64::NEG_INFINITY, f64::INFINITY], 0.3)]
+        let joint = |position, velocity| MotionLimits {
+            position,
+            velocity,
+            acceleration: 2.0,
+            jerk: 20.0,
+        };
+        vec![
+            joint([-1.0, 1.0], 0.5),
+            joint([f64::NEG_INFINITY, f64::INFINITY], 0.3),
+        ]
     }
 
     fn generator_at_rest() -> TrajectoryGenerator {
@@ -249,7 +311,10 @@ mod tests {
                 let acceleration = (pair[1].velocity[ix] - pair[0].velocity[ix]) / secs;
                 let jerk = (pair[1].acceleration[ix] - pair[0].acceleration[ix]) / secs;
                 assert!(speed.abs() <= joint.velocity * 1.0001, "{speed}");
-                assert!(acceleration.abs() <= joint.acceleration * 1.0001, "{acceleration}");
+                assert!(
+                    acceleration.abs() <= joint.acceleration * 1.0001,
+                    "{acceleration}"
+                );
                 assert!(jerk.abs() <= joint.jerk * 1.0001, "{jerk}");
                 assert!((joint.position[0]..=joint.position[1]).contains(&pair[1].position[ix]));
             }
@@ -260,11 +325,18 @@ mod tests {
     #[test]
     fn all_joints_arrive_together_within_their_limits() {
         let mut generator = generator_at_rest();
-        let target = JointTarget { position: vec![0.9, -0.1] };
+        let target = JointTarget {
+            position: vec![0.9, -0.1],
+        };
         assert_eq!(generator.set_target(&target).unwrap(), target);
         let trajectory = run_until_at_rest(&mut generator);
         let last = trajectory.last().unwrap();
-        assert!(last.position.iter().zip(&target.position).all(|(got, expected)| (got - expected).abs() < 1e-9));
+        assert!(
+            last.position
+                .iter()
+                .zip(&target.position)
+                .all(|(got, expected)| (got - expected).abs() < 1e-9)
+        );
         assert_eq!(last.velocity, [0.0, 0.0]);
         let before = &trajectory[trajectory.len() - 20];
         assert!(
@@ -276,11 +348,19 @@ mod tests {
     #[test]
     fn new_target_while_moving_and_stop_respect_limits() {
         let mut generator = generator_at_rest();
-        generator.set_target(&JointTarget { position: vec![0.9, -5.0] }).unwrap();
+        generator
+            .set_target(&JointTarget {
+                position: vec![0.9, -5.0],
+            })
+            .unwrap();
         for _ in 0..300 {
             generator.step().unwrap();
         }
-        generator.set_target(&JointTarget { position: vec![-0.9, 5.0] }).unwrap();
+        generator
+            .set_target(&JointTarget {
+                position: vec![-0.9, 5.0],
+            })
+            .unwrap();
         for _ in 0..400 {
             generator.step().unwrap();
         }
@@ -294,9 +374,19 @@ mod tests {
 
     #[test]
     fn joints_stop_independently() {
-        let joint = |jerk| MotionLimits { position: [-1.0, 1.0], velocity: 0.5, acceleration: 2.0, jerk };
-        let mut generator = TrajectoryGenerator::new(&[joint(20.0), joint(2.0)], &[0.0, 0.0], PERIOD).unwrap();
-        generator.set_target(&JointTarget { position: vec![0.3, 0.9] }).unwrap();
+        let joint = |jerk| MotionLimits {
+            position: [-1.0, 1.0],
+            velocity: 0.5,
+            acceleration: 2.0,
+            jerk,
+        };
+        let mut generator =
+            TrajectoryGenerator::new(&[joint(20.0), joint(2.0)], &[0.0, 0.0], PERIOD).unwrap();
+        generator
+            .set_target(&JointTarget {
+                position: vec![0.3, 0.9],
+            })
+            .unwrap();
         for _ in 0..1000 {
             generator.step().unwrap();
         }
@@ -304,32 +394,56 @@ mod tests {
         let mut n_moving = [0, 0];
         while !generator.is_at_rest() {
             let velocity = generator.step().unwrap().velocity;
-            n_moving = std::array::from_fn(|ix| n_moving[ix] + u32::from(velocity[ix].abs() > 1e-9));
+            n_moving =
+                std::array::from_fn(|ix| n_moving[ix] + u32::from(velocity[ix].abs() > 1e-9));
         }
-        assert!(n_moving[0] > 10 && 2 * n_moving[0] < n_moving[1], "{n_moving:?}");
+        assert!(
+            n_moving[0] > 10 && 2 * n_moving[0] < n_moving[1],
+            "{n_moving:?}"
+        );
     }
 
     #[test]
     fn resume_from_measured_state_respects_limits() {
         let mut generator = generator_at_rest();
-        let target = JointTarget { position: vec![0.9, -0.1] };
+        let target = JointTarget {
+            position: vec![0.9, -0.1],
+        };
         generator.set_target(&target).unwrap();
         for _ in 0..300 {
             generator.step().unwrap();
         }
-        let measured = Setpoint { position: vec![0.2, 0.1], velocity: vec![0.3, -0.2], acceleration: vec![1.0, 0.5] };
+        let measured = Setpoint {
+            position: vec![0.2, 0.1],
+            velocity: vec![0.3, -0.2],
+            acceleration: vec![1.0, 0.5],
+        };
         generator.resume(&measured).unwrap();
         let trajectory = run_until_at_rest(&mut generator);
-        assert!((trajectory[0].position[0] - 0.2003).abs() < 1e-5, "{:?}", trajectory[0]);
-        assert!((trajectory[trajectory.len() - 1].position[0] - 0.9).abs() < 1e-9, "it still moves to its target");
-        let too_short = Setpoint { velocity: vec![0.0], ..measured };
+        assert!(
+            (trajectory[0].position[0] - 0.2003).abs() < 1e-5,
+            "{:?}",
+            trajectory[0]
+        );
+        assert!(
+            (trajectory[trajectory.len() - 1].position[0] - 0.9).abs() < 1e-9,
+            "it still moves to its target"
+        );
+        let too_short = Setpoint {
+            velocity: vec![0.0],
+            ..measured
+        };
         assert!(generator.resume(&too_short).unwrap_err().contains("1 "));
     }
 
     #[test]
     fn too_fast_joint_overshoots_range_and_returns() {
         let mut generator = generator_at_rest();
-        generator.set_target(&JointTarget { position: vec![2.0, 0.2] }).unwrap();
+        generator
+            .set_target(&JointTarget {
+                position: vec![2.0, 0.2],
+            })
+            .unwrap();
         let setpoint_at = |position| Setpoint {
             position: vec![position, 0.2],
             velocity: vec![0.4, 0.0],
@@ -341,14 +455,22 @@ mod tests {
         while !generator.is_at_rest() {
             trajectory.push(generator.step().unwrap());
         }
-        let farthest = trajectory.iter().map(|setpoint| setpoint.position[0]).fold(0.0, f64::max);
+        let farthest = trajectory
+            .iter()
+            .map(|setpoint| setpoint.position[0])
+            .fold(0.0, f64::max);
         assert!(farthest > 1.005 && farthest < 1.015, "{farthest}");
         assert!((trajectory[trajectory.len() - 1].position[0] - 1.0).abs() < 1e-9);
-        assert!(trajectory.iter().all(|setpoint| setpoint.acceleration[0].abs() < 2.0001));
+        assert!(
+            trajectory
+                .iter()
+                .all(|setpoint| setpoint.acceleration[0].abs() < 2.0001)
+        );
         generator.resume(&setpoint_at(0.999)).unwrap();
         let error = generator.step().unwrap_err();
         assert!(
-            error.contains("no trajectory") && error.contains("joint 1 is at 0.9990 with a velocity of 0.4000"),
+            error.contains("no trajectory")
+                && error.contains("joint 1 is at 0.9990 with a velocity of 0.4000"),
             "it would overshoot too far: {error}"
         );
         generator.stop();
@@ -361,20 +483,40 @@ mod tests {
     fn degenerate_acceleration_phase_is_planned() {
         for (velocity, start) in [(0.5, -1.3), (0.2, 0.07), (0.1, 0.0), (1.0, 0.4)] {
             let (acceleration, jerk) = (velocity / 0.5, velocity / 0.5 / 0.1);
-            let joint = MotionLimits { position: [-2.0, 2.0], velocity, acceleration, jerk };
+            let joint = MotionLimits {
+                position: [-2.0, 2.0],
+                velocity,
+                acceleration,
+                jerk,
+            };
             for sign in [1.0, -1.0] {
                 let target = start + sign * 2.0 * acceleration.powi(3) / jerk.powi(2);
-                let mut generator = TrajectoryGenerator::new(&[joint, joint], &[start, 0.3], PERIOD).unwrap();
-                generator.set_target(&JointTarget { position: vec![target, 0.3] }).unwrap();
+                let mut generator =
+                    TrajectoryGenerator::new(&[joint, joint], &[start, 0.3], PERIOD).unwrap();
+                generator
+                    .set_target(&JointTarget {
+                        position: vec![target, 0.3],
+                    })
+                    .unwrap();
                 let mut trajectory = vec![generator.step().unwrap()];
                 while !generator.is_at_rest() {
                     trajectory.push(generator.step().unwrap());
-                    let [.., before, now] = &trajectory[..] else { continue };
-                    let jerk_now = (now.acceleration[0] - before.acceleration[0]) / PERIOD.as_secs_f64();
-                    assert!(jerk_now.abs() <= jerk * 1.0001 && now.acceleration[0].abs() <= acceleration * 1.0001);
+                    let [.., before, now] = &trajectory[..] else {
+                        continue;
+                    };
+                    let jerk_now =
+                        (now.acceleration[0] - before.acceleration[0]) / PERIOD.as_secs_f64();
+                    assert!(
+                        jerk_now.abs() <= jerk * 1.0001
+                            && now.acceleration[0].abs() <= acceleration * 1.0001
+                    );
                 }
                 // Four times the time to reach full acceleration.
-                assert!((trajectory.len() as f64 - 400.0).abs() < 3.0, "{}", trajectory.len());
+                assert!(
+                    (trajectory.len() as f64 - 400.0).abs() < 3.0,
+                    "{}",
+                    trajectory.len()
+                );
                 assert!((trajectory[trajectory.len() - 1].position[0] - target).abs() < 1e-9);
             }
         }
@@ -383,21 +525,50 @@ mod tests {
     #[test]
     fn targets_are_clamped_and_invalid_ones_rejected() {
         let mut generator = generator_at_rest();
-        let accepted = generator.set_target(&JointTarget { position: vec![3.0, 7.0] }).unwrap();
+        let accepted = generator
+            .set_target(&JointTarget {
+                position: vec![3.0, 7.0],
+            })
+            .unwrap();
         assert_eq!(accepted.position, [1.0, 7.0]);
         let before = generator.step().unwrap();
-        assert!(generator.set_target(&JointTarget { position: vec![0.0] }).unwrap_err().contains("1 positions"));
-        assert!(generator.set_target(&JointTarget { position: vec![f64::NAN, 0.0] }).unwrap_err().contains("joint 1"));
-        assert!(generator.step().unwrap().position[1] > before.position[1], "it still moves to its previous target");
+        assert!(
+            generator
+                .set_target(&JointTarget {
+                    position: vec![0.0]
+                })
+                .unwrap_err()
+                .contains("1 positions")
+        );
+        assert!(
+            generator
+                .set_target(&JointTarget {
+                    position: vec![f64::NAN, 0.0]
+                })
+                .unwrap_err()
+                .contains("joint 1")
+        );
+        assert!(
+            generator.step().unwrap().position[1] > before.position[1],
+            "it still moves to its previous target"
+        );
     }
 
     #[test]
     fn start_slightly_outside_range_is_allowed() {
         let mut generator = TrajectoryGenerator::new(&limits(), &[1.01, 0.0], PERIOD).unwrap();
-        generator.set_target(&JointTarget { position: vec![0.5, 0.0] }).unwrap();
+        generator
+            .set_target(&JointTarget {
+                position: vec![0.5, 0.0],
+            })
+            .unwrap();
         while !generator.is_at_rest() {
             generator.step().unwrap();
         }
-        assert!(TrajectoryGenerator::new(&limits(), &[1.5, 0.0], PERIOD).unwrap_err().contains("joint 1 is at 1.5"));
+        assert!(
+            TrajectoryGenerator::new(&limits(), &[1.5, 0.0], PERIOD)
+                .unwrap_err()
+                .contains("joint 1 is at 1.5")
+        );
     }
 }

@@ -5,10 +5,11 @@ use rustix::net::sockopt::socket_peercred;
 use std::os::linux::net::SocketAddrExt;
 use std::os::unix::net::{SocketAddr, UnixListener, UnixStream};
 
-/// The right to move the arms on a bus or controller. The kernel takes it back when the program ends in any way.
+/// The right to move the arms on a bus or controller. The kernel takes it back when the program
+/// ends in any way.
 ///
-/// It is a Unix socket with an abstract name: unlike a file, it needs no folder that all users may write to, and it
-/// belongs to the same network namespace as a CAN interface.
+/// It is a Unix socket with an abstract name: unlike a file, it needs no folder that all users may
+/// write to, and it belongs to the same network namespace as a CAN interface.
 #[derive(Debug)]
 pub(crate) struct MotionLock {
     _listener: UnixListener,
@@ -20,14 +21,24 @@ impl MotionLock {
     /// # Errors
     /// If another program holds it.
     pub(crate) fn take(name: &str) -> Result<Self, Error> {
-        let fail = |error: std::io::Error| Error::Motion { reason: format!("cannot lock {name}: {error}") };
-        let address = SocketAddr::from_abstract_name(format!("fieldrig-move/{name}")).map_err(fail)?;
+        let fail = |error: std::io::Error| Error::Motion {
+            reason: format!("cannot lock {name}: {error}"),
+        };
+        let address =
+            SocketAddr::from_abstract_name(format!("fieldrig-move/{name}")).map_err(fail)?;
         match UnixListener::bind_addr(&address) {
-            Ok(listener) => Ok(Self { _listener: listener }),
+            Ok(listener) => Ok(Self {
+                _listener: listener,
+            }),
             Err(error) if error.kind() == std::io::ErrorKind::AddrInUse => {
-                let owner = UnixStream::connect_addr(&address).ok().and_then(|stream| socket_peercred(stream).ok());
-                let owner = owner.map_or(String::new(), |owner| format!(" (process {})", owner.pid));
-                Err(Error::Motion { reason: format!("another program{owner} moves the arm on {name}; end it first") })
+                let owner = UnixStream::connect_addr(&address)
+                    .ok()
+                    .and_then(|stream| socket_peercred(stream).ok());
+                let owner =
+                    owner.map_or(String::new(), |owner| format!(" (process {})", owner.pid));
+                Err(Error::Motion {
+                    reason: format!("another program{owner} moves the arm on {name}; end it first"),
+                })
             }
             Err(error) => Err(fail(error)),
         }
@@ -42,8 +53,13 @@ mod tests {
     fn lock_is_free_again_after_its_owner() {
         let name = format!("test{}", std::process::id());
         let lock = MotionLock::take(&name).expect("nobody else uses this name");
-        let refusal = MotionLock::take(&name).expect_err("it is taken").to_string();
-        assert!(refusal.contains(&format!("process {}", std::process::id())) && refusal.contains(&name), "{refusal}");
+        let refusal = MotionLock::take(&name)
+            .expect_err("it is taken")
+            .to_string();
+        assert!(
+            refusal.contains(&format!("process {}", std::process::id())) && refusal.contains(&name),
+            "{refusal}"
+        );
         MotionLock::take(&format!("{name}b")).expect("another bus is free");
         drop(lock);
         MotionLock::take(&name).expect("it is free again");

@@ -1,4 +1,5 @@
-//! Arms that may be moved: targets, motion limits, and fail-safe behavior if this computer stops sending.
+//! Arms that may be moved: targets, motion limits, and fail-safe behavior if this computer stops
+//! sending.
 
 mod fail_safe;
 mod generator;
@@ -26,12 +27,13 @@ pub struct JointTarget {
 /// Motion state of a movable arm.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Motion {
-    /// The arm holds its last commanded position or, before the first command, its initial position.
+    /// The arm holds its last commanded position or, before the first command, its initial
+    /// position.
     Holding,
     /// The arm is moving to its target.
     Moving,
-    /// The arm stopped because of a fault, or the connection to it was lost. It accepts no target before
-    /// [`MovableArm::recover`].
+    /// The arm stopped because of a fault, or the connection to it was lost. It accepts no target
+    /// before [`MovableArm::recover`].
     Stopped {
         /// The reason for the stop.
         reason: String,
@@ -40,24 +42,24 @@ pub enum Motion {
 
 /// An arm that can also be moved.
 ///
-/// Before an arm is opened, the reaction of its motors to missing commands is set and verified. The owner of this
-/// trait object may move the arm; programs that only read use an [`Arm`].
+/// Before an arm is opened, the reaction of its motors to missing commands is set and verified. The
+/// owner of this trait object may move the arm; programs that only read use an [`Arm`].
 pub trait MovableArm: Arm {
-    /// Moves to a target from any position and state of motion, within the limits of [`MotionConfig`]. A later target
-    /// replaces this one.
+    /// Moves to a target from any position and state of motion, within the limits of
+    /// [`MotionConfig`]. A later target replaces this one.
     ///
     /// Returns the accepted target, clamped to the joints' ranges.
     ///
     /// # Errors
-    /// If the target is not finite or has the wrong number of joints, or the arm is [`Motion::Stopped`]. The arm's
-    /// motion does not change.
+    /// If the target is not finite or has the wrong number of joints, or the arm is
+    /// [`Motion::Stopped`]. The arm's motion does not change.
     fn command(&mut self, target: &JointTarget) -> Result<JointTarget, Error>;
     /// Current motion state.
     fn motion(&self) -> Motion;
     /// Brings the arm to rest within its limits, as soon as possible.
     fn stop(&mut self) -> Result<(), Error>;
-    /// Enables a stopped arm again, holding its current position. Call this only at the request of a person who has
-    /// checked the arm, never automatically.
+    /// Enables a stopped arm again, holding its current position. Call this only at the request of
+    /// a person who has checked the arm, never automatically.
     fn recover(&mut self) -> Result<(), Error>;
 }
 
@@ -110,11 +112,22 @@ pub struct MotionLimits {
 }
 
 impl MotionLimits {
-    /// Limits of a joint from its description, with the velocity reduced to at most `max_speed`. From rest, full
-    /// acceleration is reached in `jerk_secs`, and the maximum velocity in `acceleration_secs` at full acceleration.
-    pub fn new(joint: &JointLimits, max_speed: f64, acceleration_secs: f64, jerk_secs: f64) -> Self {
+    /// Limits of a joint from its description, with the velocity reduced to at most `max_speed`.
+    /// From rest, full acceleration is reached in `jerk_secs`, and the maximum velocity in
+    /// `acceleration_secs` at full acceleration.
+    pub fn new(
+        joint: &JointLimits,
+        max_speed: f64,
+        acceleration_secs: f64,
+        jerk_secs: f64,
+    ) -> Self {
         let velocity = joint.velocity.min(max_speed);
         let acceleration = velocity / acceleration_secs;
-        Self { position: [joint.lower, joint.upper], velocity, acceleration, jerk: acceleration / jerk_secs }
+        Self {
+            position: [joint.lower, joint.upper],
+            velocity,
+            acceleration,
+            jerk: acceleration / jerk_secs,
+        }
     }
 }

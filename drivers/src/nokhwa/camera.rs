@@ -10,23 +10,26 @@ use kinematics::Intrinsics;
 use std::sync::{Arc, Weak};
 use std::time::{Duration, Instant};
 
-/// If no image arrives for this long, or for the periods of this many images (next constant), the call is abandoned.
+/// If no image arrives for this long, or for the periods of this many images (next constant), the
+/// call is abandoned.
 const MAX_SILENCE: Duration = Duration::from_millis(1500);
 const MAX_SILENT_IMAGES: f64 = 5.0;
 /// Opening takes longer: cameras adjust the exposure first.
 const MAX_OPENING: Duration = Duration::from_secs(8);
 /// Pause between two attempts to reconnect.
 const RETRY_PAUSE: Duration = Duration::from_millis(200);
-/// Maximum number of threads that hang in a call and cannot be ended. After that, no new thread is started.
+/// Maximum number of threads that hang in a call and cannot be ended. After that, no new thread is
+/// started.
 const MAX_ABANDONED: usize = 8;
 /// Maximum time to wait until a streaming thread stops.
 const SHUTDOWN_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// A streaming camera.
 ///
-/// If the camera is disconnected or a call hangs, it is reopened for at most [`Config::reconnect_for`]. During that
-/// time, [`Camera::next_image`] returns [`Error::Reconnecting`], afterwards the cause. Images are stamped on arrival.
-/// The number of dropped images is estimated from the stamps.
+/// If the camera is disconnected or a call hangs, it is reopened for at most
+/// [`Config::reconnect_for`]. During that time, [`Camera::next_image`] returns
+/// [`Error::Reconnecting`], afterwards the cause. Images are stamped on arrival. The number of
+/// dropped images is estimated from the stamps.
 #[derive(Debug)]
 pub struct NokhwaCamera(Reconnecting<NokhwaDevice>);
 
@@ -66,8 +69,15 @@ impl NokhwaCamera {
             retry_pause: RETRY_PAUSE,
         };
         let name = config.name.as_str().into();
-        let mut device = NokhwaDevice { config, name, n_abandoned: 0, abandoned: Vec::new() };
-        let stream = device.open_and_wait().map_err(|failure| failure.into_error(|problem| device.error(problem)))?;
+        let mut device = NokhwaDevice {
+            config,
+            name,
+            n_abandoned: 0,
+            abandoned: Vec::new(),
+        };
+        let stream = device
+            .open_and_wait()
+            .map_err(|failure| failure.into_error(|problem| device.error(problem)))?;
         log::info!(
             "camera {:?}: {}; images are stamped on arrival, and dropped images are estimated from the stamps",
             device.config.name,
@@ -76,7 +86,8 @@ impl NokhwaCamera {
         Ok(Self(Reconnecting::new(device, stream, policy)))
     }
 
-    /// Statistics since the camera was opened. The number of dropped images is estimated from stamps.
+    /// Statistics since the camera was opened. The number of dropped images is estimated from
+    /// stamps.
     pub fn counts(&self) -> CameraCounts {
         self.0.counts()
     }
@@ -89,7 +100,10 @@ impl NokhwaCamera {
 
 impl NokhwaDevice {
     fn error(&self, problem: Problem) -> Error {
-        Error::Nokhwa { camera: self.config.name.clone(), problem: Box::new(problem) }
+        Error::Nokhwa {
+            camera: self.config.name.clone(),
+            problem: Box::new(problem),
+        }
     }
 
     /// Opens the camera and waits until it streams.
@@ -103,7 +117,11 @@ impl NokhwaDevice {
     }
 
     fn image_of(&self, frame: Frame, n_skipped: u64) -> Image {
-        let Frame { arrival, format, bytes } = frame;
+        let Frame {
+            arrival,
+            format,
+            bytes,
+        } = frame;
         Image {
             camera: Arc::clone(&self.name),
             stamp: arrival,
@@ -124,7 +142,10 @@ impl ReopenableCamera for NokhwaDevice {
     fn open(&mut self) -> Result<NokhwaStream, Failure<Problem>> {
         self.abandoned.retain(|alive| alive.strong_count() > 0);
         if self.abandoned.len() >= MAX_ABANDONED {
-            return Err(Problem::TooManyAbandoned { n_abandoned_threads: self.abandoned.len() }.into());
+            return Err(Problem::TooManyAbandoned {
+                n_abandoned_threads: self.abandoned.len(),
+            }
+            .into());
         }
         let thread = Arc::new(());
         Ok(NokhwaStream {
@@ -141,11 +162,17 @@ impl ReopenableCamera for NokhwaDevice {
         stream.description.clone()
     }
 
-    fn next_image(&mut self, stream: &mut NokhwaStream, deadline: Instant) -> Result<Option<Image>, Failure<Problem>> {
+    fn next_image(
+        &mut self,
+        stream: &mut NokhwaStream,
+        deadline: Instant,
+    ) -> Result<Option<Image>, Failure<Problem>> {
         let (what, timeout) = match stream.description {
             Some(_) => (
                 "get its next image",
-                MAX_SILENCE.max(Duration::from_secs_f64(MAX_SILENT_IMAGES / self.config.rate_hz)),
+                MAX_SILENCE.max(Duration::from_secs_f64(
+                    MAX_SILENT_IMAGES / self.config.rate_hz,
+                )),
             ),
             None => ("open it", MAX_OPENING),
         };
@@ -170,20 +197,28 @@ impl ReopenableCamera for NokhwaDevice {
                 stream.is_abandoned = true;
                 self.n_abandoned += 1;
                 self.abandoned.push(Weak::clone(&stream.alive));
-                Err(Problem::Hung { what, waited: timeout }.into())
+                Err(Problem::Hung {
+                    what,
+                    waited: timeout,
+                }
+                .into())
             }
             None => Ok(None),
         }
     }
 
     fn lost(&self, waited: Duration, n_tries: u32, last: Problem) -> Error {
-        self.error(Problem::Lost { waited, n_tries, last: Box::new(last) })
+        self.error(Problem::Lost {
+            waited,
+            n_tries,
+            last: Box::new(last),
+        })
     }
 }
 
 impl Drop for NokhwaStream {
-    /// Stops the thread and waits for its end, because the camera can be opened again only after that. If the thread
-    /// hangs, does not wait.
+    /// Stops the thread and waits for its end, because the camera can be opened again only after
+    /// that. If the thread hangs, does not wait.
     fn drop(&mut self) {
         self.worker.stop();
         let until = Instant::now() + SHUTDOWN_TIMEOUT;

@@ -1,9 +1,10 @@
-//! Webcams through `nokhwa`: `AVFoundation` on macOS, Media Foundation on Windows, and optionally V4L2.
+//! Webcams through `nokhwa`: `AVFoundation` on macOS, Media Foundation on Windows, and optionally
+//! V4L2.
 //!
-//! A call for an image may never return and cannot be canceled. `worker.rs` therefore calls nokhwa on a separate
-//! thread. `camera.rs` monitors the thread, abandons it if it hangs, and starts a new one. Images are the unmodified
-//! bytes of the device. They have no sequence numbers, so the number of dropped images is estimated from
-//! stamps (`gap_estimator.rs` of the crate).
+//! A call for an image may never return and cannot be canceled. `worker.rs` therefore calls nokhwa
+//! on a separate thread. `camera.rs` monitors the thread, abandons it if it hangs, and starts a new
+//! one. Images are the unmodified bytes of the device. They have no sequence numbers, so the number
+//! of dropped images is estimated from stamps (`gap_estimator.rs` of the crate).
 
 mod camera;
 mod worker;
@@ -19,7 +20,8 @@ use std::time::Duration;
 pub struct Config {
     /// Name in the rig file.
     pub name: String,
-    /// Name of the device or a part of it, its number, or on Linux the path of its node or of a link to it.
+    /// Name of the device or a part of it, its number, or on Linux the path of its node or of a
+    /// link to it.
     pub device: String,
     /// Pixel format; `None` selects the first one available at this size and rate.
     pub format: Option<V4l2Format>,
@@ -27,7 +29,8 @@ pub struct Config {
     pub intrinsics: Intrinsics,
     /// Images per second, an integer.
     pub rate_hz: f64,
-    /// Exposure time of each image, microseconds, if known. The driver does not set it on the camera.
+    /// Exposure time of each image, microseconds, if known. The driver does not set it on the
+    /// camera.
     pub exposure_micros: Option<f64>,
     /// Selects the image that the next call returns if the caller is slow.
     pub delivery: Delivery,
@@ -48,7 +51,9 @@ pub enum Problem {
         connected: String,
     },
     /// The pixel format is not supported by this driver.
-    #[error("the format {format} is not supported by the nokhwa driver, expected mjpeg, yuyv, nv12, rgb or bgr")]
+    #[error(
+        "the format {format} is not supported by the nokhwa driver, expected mjpeg, yuyv, nv12, rgb or bgr"
+    )]
     Format {
         /// Name of the format.
         format: &'static str,
@@ -88,7 +93,9 @@ pub enum Problem {
         n_abandoned_threads: usize,
     },
     /// The camera did not reconnect in time.
-    #[error("it disconnected and did not reconnect within {waited:.1?} ({n_tries} attempts): {last}")]
+    #[error(
+        "it disconnected and did not reconnect within {waited:.1?} ({n_tries} attempts): {last}"
+    )]
     Lost {
         /// Time since the camera was disconnected.
         waited: Duration,

@@ -6,7 +6,8 @@ use crate::{PixelFormat, YuvColors, YuvLayout, YuvMatrix, YuvRange, clock, jpeg}
 use kinematics::Stamp;
 use nokhwa::Camera;
 use nokhwa::utils::{
-    ApiBackend, CameraFormat, CameraIndex, CameraInfo, FrameFormat, RequestedFormat, RequestedFormatType, Resolution,
+    ApiBackend, CameraFormat, CameraIndex, CameraInfo, FrameFormat, RequestedFormat,
+    RequestedFormatType, Resolution,
 };
 use parking_lot::{Condvar, Mutex};
 use std::collections::VecDeque;
@@ -16,11 +17,28 @@ use std::time::Instant;
 /// Capacity of the queue to the caller: a quarter of a second at 30 Hz.
 const MAX_WAITING: usize = 8;
 /// Color encoding assumed for YUV formats, since cameras do not report one.
-const DEFAULT_COLORS: YuvColors = YuvColors { matrix: YuvMatrix::Bt601, range: YuvRange::Limited };
+const DEFAULT_COLORS: YuvColors = YuvColors {
+    matrix: YuvMatrix::Bt601,
+    range: YuvRange::Limited,
+};
 /// Formats by their names here and in nokhwa, in order of preference.
 const FORMATS: [(V4l2Format, FrameFormat, PixelFormat); 5] = [
-    (V4l2Format::Yuyv, FrameFormat::YUYV, PixelFormat::Yuv { layout: YuvLayout::Yuyv, colors: DEFAULT_COLORS }),
-    (V4l2Format::Nv12, FrameFormat::NV12, PixelFormat::Yuv { layout: YuvLayout::Nv12, colors: DEFAULT_COLORS }),
+    (
+        V4l2Format::Yuyv,
+        FrameFormat::YUYV,
+        PixelFormat::Yuv {
+            layout: YuvLayout::Yuyv,
+            colors: DEFAULT_COLORS,
+        },
+    ),
+    (
+        V4l2Format::Nv12,
+        FrameFormat::NV12,
+        PixelFormat::Yuv {
+            layout: YuvLayout::Nv12,
+            colors: DEFAULT_COLORS,
+        },
+    ),
     (V4l2Format::Mjpeg, FrameFormat::MJPEG, PixelFormat::Jpeg),
     (V4l2Format::Rgb, FrameFormat::RAWRGB, PixelFormat::Rgb8),
     (V4l2Format::Bgr, FrameFormat::RAWBGR, PixelFormat::Bgr8),
@@ -64,7 +82,10 @@ struct State {
 
 impl std::fmt::Debug for State {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("State").field("n_waiting", &self.queue.len()).field("stop", &self.stop).finish()
+        f.debug_struct("State")
+            .field("n_waiting", &self.queue.len())
+            .field("stop", &self.stop)
+            .finish()
     }
 }
 
@@ -73,15 +94,20 @@ impl Worker {
     pub(super) fn start(config: &Config, alive: Arc<()>) -> Result<Self, Problem> {
         let shared = Arc::new(Shared::default());
         let (config, sender) = (config.clone(), Arc::clone(&shared));
-        let thread = std::thread::Builder::new().name(format!("nokhwa {}", config.name)).spawn(move || {
-            let _alive = alive;
-            if let Err(problem) = stream(&config, &sender) {
-                sender.send(WorkerEvent::Failed(problem));
-            }
-        });
+        let thread = std::thread::Builder::new()
+            .name(format!("nokhwa {}", config.name))
+            .spawn(move || {
+                let _alive = alive;
+                if let Err(problem) = stream(&config, &sender) {
+                    sender.send(WorkerEvent::Failed(problem));
+                }
+            });
         match thread {
             Ok(_) => Ok(Self { shared }),
-            Err(error) => Err(Problem::Refused { requested: "its thread".to_owned(), reason: error.to_string() }),
+            Err(error) => Err(Problem::Refused {
+                requested: "its thread".to_owned(),
+                reason: error.to_string(),
+            }),
         }
     }
 
@@ -107,13 +133,16 @@ impl Worker {
 }
 
 impl Shared {
-    /// Queues an event and returns whether the caller is still listening. If the queue is full, the oldest image is
-    /// dropped; the gap is detected from the stamps. Other events are kept: without them, the caller would never learn
-    /// that the camera is open.
+    /// Queues an event and returns whether the caller is still listening. If the queue is full, the
+    /// oldest image is dropped; the gap is detected from the stamps. Other events are kept: without
+    /// them, the caller would never learn that the camera is open.
     fn send(&self, event: WorkerEvent) -> bool {
         let mut state = self.state.lock();
         if state.queue.len() >= MAX_WAITING
-            && let Some(ix) = state.queue.iter().position(|queued| matches!(queued, WorkerEvent::Frame(_)))
+            && let Some(ix) = state
+                .queue
+                .iter()
+                .position(|queued| matches!(queued, WorkerEvent::Frame(_)))
         {
             state.queue.remove(ix);
         }
@@ -127,20 +156,30 @@ impl Shared {
 fn stream(config: &Config, shared: &Shared) -> Result<(), Problem> {
     let index = find(&config.device)?;
     let (mut camera, format) = open(config, index)?;
-    let unplugged = |error: nokhwa::NokhwaError| Problem::Unplugged { reason: error.to_string() };
+    let unplugged = |error: nokhwa::NokhwaError| Problem::Unplugged {
+        reason: error.to_string(),
+    };
     camera.open_stream().map_err(unplugged)?;
-    let mut is_receiving =
-        shared.send(WorkerEvent::Streaming(format!("{}, {}", camera.info().human_name(), requested(config, format))));
+    let mut is_receiving = shared.send(WorkerEvent::Streaming(format!(
+        "{}, {}",
+        camera.info().human_name(),
+        requested(config, format)
+    )));
     while is_receiving {
         let buffer = camera.frame().map_err(unplugged)?;
         let arrival = clock::now();
         let bytes = trim(buffer.buffer(), format, config.intrinsics.size_px);
-        is_receiving = shared.send(WorkerEvent::Frame(Frame { arrival, format: pixels(format), bytes }));
+        is_receiving = shared.send(WorkerEvent::Frame(Frame {
+            arrival,
+            format: pixels(format),
+            bytes,
+        }));
     }
     Ok(())
 }
 
-/// Finds the camera by name. This is repeated for every connection, because the numbers of cameras may change.
+/// Finds the camera by name. This is repeated for every connection, because the numbers of cameras
+/// may change.
 fn find(device: &str) -> Result<CameraIndex, Problem> {
     if let Some(index) = number(device) {
         return Ok(CameraIndex::Index(index));
@@ -149,15 +188,26 @@ fn find(device: &str) -> Result<CameraIndex, Problem> {
     // Some cameras have several nodes; the first one delivers images.
     cameras.sort_by_key(|camera| camera.index().as_index().unwrap_or(u32::MAX));
     let is_exact_match = |camera: &&CameraInfo| camera.human_name() == device;
-    let is_partial_match = |camera: &&CameraInfo| !device.is_empty() && camera.human_name().contains(device);
-    match cameras.iter().find(is_exact_match).or_else(|| cameras.iter().find(is_partial_match)) {
+    let is_partial_match =
+        |camera: &&CameraInfo| !device.is_empty() && camera.human_name().contains(device);
+    match cameras
+        .iter()
+        .find(is_exact_match)
+        .or_else(|| cameras.iter().find(is_partial_match))
+    {
         Some(camera) => Ok(camera.index().clone()),
         None => {
-            let names = cameras.iter().map(|camera| format!("{:?} ({})", camera.human_name(), camera.index()));
+            let names = cameras
+                .iter()
+                .map(|camera| format!("{:?} ({})", camera.human_name(), camera.index()));
             let connected = names.collect::<Vec<_>>().join(", ");
             Err(Problem::NoDevice {
                 device: device.to_owned(),
-                connected: if connected.is_empty() { "none".into() } else { connected },
+                connected: if connected.is_empty() {
+                    "none".into()
+                } else {
+                    connected
+                },
             })
         }
     }
@@ -166,22 +216,30 @@ fn find(device: &str) -> Result<CameraIndex, Problem> {
 /// Parses a number, the path of a node, or a link to a node.
 fn number(device: &str) -> Option<u32> {
     let node = std::fs::canonicalize(device).ok();
-    let node = node.as_ref().and_then(|node| node.to_str()).unwrap_or(device);
+    let node = node
+        .as_ref()
+        .and_then(|node| node.to_str())
+        .unwrap_or(device);
     node.strip_prefix("/dev/video").unwrap_or(node).parse().ok()
 }
 
 /// Opens the camera in the requested format, or else in the first format that it supports.
 fn open(config: &Config, index: CameraIndex) -> Result<(Camera, V4l2Format), Problem> {
     let rate_hz = config.rate_hz;
-    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "compared with the original below")]
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "compared with the original below"
+    )]
     let whole_hz = rate_hz.round() as u32;
     if f64::from(whole_hz) != rate_hz {
         return Err(Problem::Rate { rate_hz });
     }
     let [width, height] = config.intrinsics.size_px;
     let mut reason = None;
-    for (name, format, _) in
-        FORMATS.iter().filter(|(name, ..)| config.format.is_none_or(|requested| requested == *name))
+    for (name, format, _) in FORMATS
+        .iter()
+        .filter(|(name, ..)| config.format.is_none_or(|requested| requested == *name))
     {
         let exact = CameraFormat::new(Resolution::new(width, height), *format, whole_hz);
         let formats = [*format];
@@ -192,10 +250,14 @@ fn open(config: &Config, index: CameraIndex) -> Result<(Camera, V4l2Format), Pro
         }
     }
     match (config.format, reason) {
-        (Some(format), None) => Err(Problem::Format { format: format.name() }),
+        (Some(format), None) => Err(Problem::Format {
+            format: format.name(),
+        }),
         (format, reason) => Err(Problem::Refused {
-            requested: format
-                .map_or_else(|| format!("{width}x{height} at {rate_hz} Hz"), |format| requested(config, format)),
+            requested: format.map_or_else(
+                || format!("{width}x{height} at {rate_hz} Hz"),
+                |format| requested(config, format),
+            ),
             reason: reason.unwrap_or_default(),
         }),
     }
@@ -203,15 +265,22 @@ fn open(config: &Config, index: CameraIndex) -> Result<(Camera, V4l2Format), Pro
 
 fn requested(config: &Config, format: V4l2Format) -> String {
     let [width, height] = config.intrinsics.size_px;
-    format!("{} {width}x{height} at {} Hz", format.name(), config.rate_hz)
+    format!(
+        "{} {width}x{height} at {} Hz",
+        format.name(),
+        config.rate_hz
+    )
 }
 
 fn pixels(format: V4l2Format) -> PixelFormat {
     let of_name = FORMATS.iter().find(|(name, ..)| *name == format);
-    of_name.expect("the camera was opened with one of these formats").2
+    of_name
+        .expect("the camera was opened with one of these formats")
+        .2
 }
 
-/// Removes the bytes after the image. On Linux, nokhwa returns the whole buffer even if the image in it is shorter.
+/// Removes the bytes after the image. On Linux, nokhwa returns the whole buffer even if the image
+/// in it is shorter.
 fn trim(buffer: &[u8], format: V4l2Format, size_px: [u32; 2]) -> Vec<u8> {
     let n_bytes = match pixels(format).raw_size(size_px) {
         Some([row_bytes, n_rows]) => row_bytes.saturating_mul(n_rows),

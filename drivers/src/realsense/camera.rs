@@ -9,20 +9,23 @@ use crate::{Camera, Error, Image};
 use kinematics::Intrinsics;
 use std::time::{Duration, Instant};
 
-/// Pause before every attempt to reconnect. After a reset, a camera is unavailable for a few seconds.
+/// Pause before every attempt to reconnect. After a reset, a camera is unavailable for a few
+/// seconds.
 const RETRY_PAUSE: Duration = Duration::from_millis(500);
-/// A stream without images for this long, or for the periods of this many images (next constant), is restarted, because
-/// cameras may hang.
+/// A stream without images for this long, or for the periods of this many images (next constant),
+/// is restarted, because cameras may hang.
 const MAX_SILENCE: Duration = Duration::from_secs(2);
 const MAX_SILENT_IMAGES: f64 = 10.0;
 /// Number of failed attempts after which a camera that is connected but does not stream is reset.
 const TRIES_BEFORE_RESET: u32 = 3;
 
-/// A RealSense camera that streams color or infrared and, if configured, depth; or a file that is played back.
+/// A RealSense camera that streams color or infrared and, if configured, depth; or a file that is
+/// played back.
 ///
-/// A camera that is disconnected or hangs is reopened with the same settings for at most [`Config::reconnect_for`], and
-/// reset if that does not help. During that time, [`Camera::next_image`] returns [`Error::Reconnecting`], afterwards
-/// the cause. Dropping this value stops the streams.
+/// A camera that is disconnected or hangs is reopened with the same settings for at most
+/// [`Config::reconnect_for`], and reset if that does not help. During that time,
+/// [`Camera::next_image`] returns [`Error::Reconnecting`], afterwards the cause. Dropping this
+/// value stops the streams.
 #[derive(Debug)]
 pub struct RealsenseCamera {
     camera: Reconnecting<RealsenseDevice>,
@@ -47,11 +50,20 @@ impl RealsenseCamera {
             first_pause: RETRY_PAUSE,
             retry_pause: RETRY_PAUSE,
         };
-        let mut device = RealsenseDevice { config, n_resets: 0, n_earlier_resets: 0 };
-        let session = device.open().map_err(|failure| failure.into_error(|problem| device.error(problem)))?;
+        let mut device = RealsenseDevice {
+            config,
+            n_resets: 0,
+            n_earlier_resets: 0,
+        };
+        let session = device
+            .open()
+            .map_err(|failure| failure.into_error(|problem| device.error(problem)))?;
         log::info!("camera {:?}: {}", device.config.name, session.describe());
         let calibration = session.calibration().clone();
-        Ok(Self { camera: Reconnecting::new(device, session, policy), calibration })
+        Ok(Self {
+            camera: Reconnecting::new(device, session, policy),
+            calibration,
+        })
     }
 
     /// Calibration stored in the camera.
@@ -73,7 +85,10 @@ impl RealsenseCamera {
 
 impl RealsenseDevice {
     fn error(&self, problem: Problem) -> Error {
-        Error::Realsense { camera: self.config.name.clone(), problem: Box::new(problem) }
+        Error::Realsense {
+            camera: self.config.name.clone(),
+            problem: Box::new(problem),
+        }
     }
 }
 
@@ -89,7 +104,11 @@ impl ReopenableCamera for RealsenseDevice {
         Some(session.describe().to_owned())
     }
 
-    fn next_image(&mut self, session: &mut Session, deadline: Instant) -> Result<Option<Image>, Failure<Problem>> {
+    fn next_image(
+        &mut self,
+        session: &mut Session,
+        deadline: Instant,
+    ) -> Result<Option<Image>, Failure<Problem>> {
         let camera = || self.config.name.clone();
         let is_file = self.config.file.is_some();
         match session.next(deadline) {
@@ -98,14 +117,24 @@ impl ReopenableCamera for RealsenseDevice {
                 return Ok(Some(image));
             }
             Ok(Next::End) => return Err(Failure::Final(Error::Ended { camera: camera() })),
-            Ok(Next::NotDue(remaining)) => return Err(Failure::Final(Error::NotDue { camera: camera(), remaining })),
+            Ok(Next::NotDue(remaining)) => {
+                return Err(Failure::Final(Error::NotDue {
+                    camera: camera(),
+                    remaining,
+                }));
+            }
             Ok(Next::NoImage) => {}
             // Files are not reopened.
             Err(problem) if is_file => return Err(Failure::Final(self.error(problem))),
             Err(problem) => return Err(problem.into()),
         }
         let waited = session.time_since_image();
-        if !is_file && waited > MAX_SILENCE.max(Duration::from_secs_f64(MAX_SILENT_IMAGES / self.config.rate_hz)) {
+        if !is_file
+            && waited
+                > MAX_SILENCE.max(Duration::from_secs_f64(
+                    MAX_SILENT_IMAGES / self.config.rate_hz,
+                ))
+        {
             return Err(Problem::Silent { waited }.into());
         }
         Ok(None)
@@ -118,14 +147,22 @@ impl ReopenableCamera for RealsenseDevice {
         }
         let found = Context::new().and_then(|context| find::camera(&context, &self.config.serial));
         let Ok(device) = found else { return false };
-        log::warn!("camera {:?}: it is connected but does not stream; resetting it", self.config.name);
+        log::warn!(
+            "camera {:?}: it is connected but does not stream; resetting it",
+            self.config.name
+        );
         device.reset();
         self.n_resets += 1;
         true
     }
 
     fn lost(&self, waited: Duration, n_tries: u32, last: Problem) -> Error {
-        self.error(Problem::Lost { waited, n_tries, n_resets: self.n_resets, last: Box::new(last) })
+        self.error(Problem::Lost {
+            waited,
+            n_tries,
+            n_resets: self.n_resets,
+            last: Box::new(last),
+        })
     }
 }
 

@@ -35,15 +35,15 @@ pub struct Config {
 /// Delivery times of the images of a file, and the clock of their stamps.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Pace {
-    /// Like a live camera: the first image comes immediately and is stamped on arrival. Later images follow at the
-    /// recorded intervals.
+    /// Like a live camera: the first image comes immediately and is stamped on arrival. Later
+    /// images follow at the recorded intervals.
     #[default]
     RealTime,
     /// As fast as the caller takes them, with the stamps of the file.
     Fast,
-    /// Stamps are those of the file plus [`Config::clock_offset_nanos`], on the monotonic clock of this computer. Each
-    /// image is delivered at the time of its stamp. Used by simulations that emulate other devices in parallel with the
-    /// file.
+    /// Stamps are those of the file plus [`Config::clock_offset_nanos`], on the monotonic clock of
+    /// this computer. Each image is delivered at the time of its stamp. Used by simulations that
+    /// emulate other devices in parallel with the file.
     Clock,
 }
 
@@ -57,10 +57,12 @@ pub enum Stream {
     Infrared,
 }
 
-/// Camera settings. A missing setting is automatic if the camera supports that, else it is left unchanged.
+/// Camera settings. A missing setting is automatic if the camera supports that, else it is left
+/// unchanged.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Settings {
-    /// Exposure time of [`Config::stream`], microseconds; `None` for automatic exposure without lowering the rate.
+    /// Exposure time of [`Config::stream`], microseconds; `None` for automatic exposure without
+    /// lowering the rate.
     pub exposure_micros: Option<f64>,
     /// Gain, in units of the camera.
     pub gain: Option<i32>,

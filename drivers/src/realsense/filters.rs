@@ -23,19 +23,29 @@ enum Block {
     HoleFilling(HoleFillingFilter),
 }
 
-// SAFETY: the library may be called from any thread, one at a time; blocks are never cloned, so these are the only
-// pointers.
+// SAFETY: the library may be called from any thread, one at a time; blocks are never cloned, so
+// these are the only pointers.
 #[expect(unsafe_code, reason = "the wrapper lacks a Send implementation")]
 unsafe impl Send for Filters {}
 
 impl Filters {
     pub(super) fn new(filters: &[Filter]) -> Result<Self, Problem> {
         let block = |filter: &Filter| match filter {
-            Filter::Spatial => SpatialFilter::new(1).map(Block::Spatial).map_err(filter_problem),
-            Filter::Temporal => TemporalFilter::new(1).map(Block::Temporal).map_err(filter_problem),
-            Filter::HoleFilling => HoleFillingFilter::new(1).map(Block::HoleFilling).map_err(filter_problem),
+            Filter::Spatial => SpatialFilter::new(1)
+                .map(Block::Spatial)
+                .map_err(filter_problem),
+            Filter::Temporal => TemporalFilter::new(1)
+                .map(Block::Temporal)
+                .map_err(filter_problem),
+            Filter::HoleFilling => HoleFillingFilter::new(1)
+                .map(Block::HoleFilling)
+                .map_err(filter_problem),
         };
-        filters.iter().map(block).collect::<Result<_, _>>().map(Self)
+        filters
+            .iter()
+            .map(block)
+            .collect::<Result<_, _>>()
+            .map(Self)
     }
 
     pub(super) fn is_empty(&self) -> bool {
@@ -47,9 +57,15 @@ impl Filters {
         let mut frame = as_depth(frame)?;
         for block in &mut self.0 {
             frame = match block {
-                Block::Spatial(filter) => filter.queue(frame).and_then(|()| filter.wait(FILTER_TIMEOUT)),
-                Block::Temporal(filter) => filter.queue(frame).and_then(|()| filter.wait(FILTER_TIMEOUT)),
-                Block::HoleFilling(filter) => filter.queue(frame).and_then(|()| filter.wait(FILTER_TIMEOUT)),
+                Block::Spatial(filter) => filter
+                    .queue(frame)
+                    .and_then(|()| filter.wait(FILTER_TIMEOUT)),
+                Block::Temporal(filter) => filter
+                    .queue(frame)
+                    .and_then(|()| filter.wait(FILTER_TIMEOUT)),
+                Block::HoleFilling(filter) => filter
+                    .queue(frame)
+                    .and_then(|()| filter.wait(FILTER_TIMEOUT)),
             }
             .map_err(filter_problem)?;
         }
@@ -58,5 +74,8 @@ impl Filters {
 }
 
 fn filter_problem(error: impl Display) -> Problem {
-    Problem::Library { what: "filter depth", reason: error.to_string() }
+    Problem::Library {
+        what: "filter depth",
+        reason: error.to_string(),
+    }
 }

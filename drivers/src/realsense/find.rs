@@ -21,7 +21,12 @@ pub struct FoundCamera {
 
 impl FoundCamera {
     pub(super) fn of(device: &Device) -> Self {
-        let info = |kind| device.info.info(kind).map(|text| text.to_string_lossy().into_owned());
+        let info = |kind| {
+            device
+                .info
+                .info(kind)
+                .map(|text| text.to_string_lossy().into_owned())
+        };
         Self {
             name: info(Rs2CameraInfo::Name).unwrap_or_else(|| "RealSense".into()),
             serial: info(Rs2CameraInfo::SerialNumber).unwrap_or_default(),
@@ -33,13 +38,22 @@ impl FoundCamera {
 
     /// Whether it runs at USB 2, which carries few of its modes.
     pub fn is_on_usb2(&self) -> bool {
-        self.usb.as_deref().is_some_and(|usb| usb.starts_with('2') || usb.starts_with('1'))
+        self.usb
+            .as_deref()
+            .is_some_and(|usb| usb.starts_with('2') || usb.starts_with('1'))
     }
 
     /// Whether its firmware is older than the version that the library recommends.
     pub fn has_old_firmware(&self) -> bool {
-        let numbers = |version: &str| version.split('.').map(|part| part.parse().unwrap_or(0)).collect::<Vec<u32>>();
-        self.recommended_firmware.as_deref().is_some_and(|requested| numbers(&self.firmware) < numbers(requested))
+        let numbers = |version: &str| {
+            version
+                .split('.')
+                .map(|part| part.parse().unwrap_or(0))
+                .collect::<Vec<u32>>()
+        };
+        self.recommended_firmware
+            .as_deref()
+            .is_some_and(|requested| numbers(&self.firmware) < numbers(requested))
     }
 
     /// Name and serial number for messages.
@@ -50,7 +64,11 @@ impl FoundCamera {
 
 /// All connected cameras.
 pub fn cameras() -> Result<Vec<FoundCamera>, Problem> {
-    Ok(Context::new()?.devices()?.iter().map(FoundCamera::of).collect())
+    Ok(Context::new()?
+        .devices()?
+        .iter()
+        .map(FoundCamera::of)
+        .collect())
 }
 
 /// Finds the camera with a serial number, or the only connected camera if the number is empty.
@@ -60,9 +78,19 @@ pub(super) fn camera(context: &Context, serial: &str) -> Result<Device, Problem>
     let is_match = |found: &FoundCamera| serial.is_empty() || found.serial == serial;
     let connected = || found.iter().map(FoundCamera::describe).collect();
     match found.iter().filter(|found| is_match(found)).count() {
-        0 => Err(Problem::NoDevice { serial: serial.to_owned(), connected: connected() }),
-        1 => Ok(devices.swap_remove(found.iter().position(is_match).expect("the filter found one match"))),
-        _ => Err(Problem::Ambiguous { connected: connected() }),
+        0 => Err(Problem::NoDevice {
+            serial: serial.to_owned(),
+            connected: connected(),
+        }),
+        1 => Ok(devices.swap_remove(
+            found
+                .iter()
+                .position(is_match)
+                .expect("the filter found one match"),
+        )),
+        _ => Err(Problem::Ambiguous {
+            connected: connected(),
+        }),
     }
 }
 
@@ -90,7 +118,9 @@ mod tests {
     #[test]
     fn missing_camera_error_names_it() {
         let context = Context::new().expect("the library starts without a camera");
-        let message = camera(&context, "no such serial").expect_err("no camera is connected").to_string();
+        let message = camera(&context, "no such serial")
+            .expect_err("no camera is connected")
+            .to_string();
         assert!(message.contains("no such serial"), "{message}");
     }
 }

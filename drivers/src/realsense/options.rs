@@ -1,35 +1,60 @@
-//! Exposure, gain, white balance, presets and laser of a RealSense camera: set from the rig file and read back.
+//! Exposure, gain, white balance, presets and laser of a RealSense camera: set from the rig file
+//! and read back.
 
 use super::sdk::{Device, Sensor};
 use super::{Problem, Settings};
 use realsense_rust::kind::{Rs2CameraInfo, Rs2Option};
 use realsense_sys as sys;
 
-/// Maximum relative difference of the exposure when read back: cameras round it to rows of their sensor.
+/// Maximum relative difference of the exposure when read back: cameras round it to rows of their
+/// sensor.
 const EXPOSURE_TOLERANCE_FRAC: f32 = 0.1;
-/// The RGB module of a depth camera counts exposure like a webcam; depth sensors count microseconds.
+/// The RGB module of a depth camera counts exposure like a webcam; depth sensors count
+/// microseconds.
 const RGB_MODULE: &str = "RGB Camera";
 const RGB_MICROS_PER_COUNT: f64 = 100.0;
 
 /// Microseconds per count of the exposure of a sensor.
 pub(super) fn exposure_micros_per_count(sensor: &Sensor) -> f64 {
-    let name = sensor.options.info(Rs2CameraInfo::Name).map(|name| name.to_string_lossy().into_owned());
-    if name.as_deref() == Some(RGB_MODULE) { RGB_MICROS_PER_COUNT } else { 1.0 }
+    let name = sensor
+        .options
+        .info(Rs2CameraInfo::Name)
+        .map(|name| name.to_string_lossy().into_owned());
+    if name.as_deref() == Some(RGB_MODULE) {
+        RGB_MICROS_PER_COUNT
+    } else {
+        1.0
+    }
 }
 
-/// Applies the settings and reads them back. `image_sensor` is the sensor of the images that are not depth. Returns a
-/// description of each setting.
-pub(super) fn apply(settings: &Settings, device: &mut Device, image_sensor: usize) -> Result<Vec<String>, Problem> {
+/// Applies the settings and reads them back. `image_sensor` is the sensor of the images that are
+/// not depth. Returns a description of each setting.
+pub(super) fn apply(
+    settings: &Settings,
+    device: &mut Device,
+    image_sensor: usize,
+) -> Result<Vec<String>, Problem> {
     let mut applied = Vec::new();
     for sensor in &mut device.sensors {
-        // The camera clock is mapped in `stamps.rs`. The library's own mapping is biased by late arrivals.
+        // The camera clock is mapped in `stamps.rs`. The library's own mapping is biased by late
+        // arrivals.
         set_if_supported(sensor, Rs2Option::GlobalTimeEnabled, 0.0);
     }
-    if let Some(sensor) = device.sensors.iter_mut().find(|sensor| is_supported(sensor, Rs2Option::DepthUnits)) {
+    if let Some(sensor) = device
+        .sensors
+        .iter_mut()
+        .find(|sensor| is_supported(sensor, Rs2Option::DepthUnits))
+    {
         // A preset changes other options, so it is set first.
         if let Some(name) = &settings.preset {
             let value = preset(sensor, name)?;
-            set(sensor, "realsense.preset", Rs2Option::VisualPreset, value, 0.0)?;
+            set(
+                sensor,
+                "realsense.preset",
+                Rs2Option::VisualPreset,
+                value,
+                0.0,
+            )?;
             applied.push(format!("preset {name:?}"));
         }
         if let Some(power) = settings.laser_power {
@@ -37,9 +62,14 @@ pub(super) fn apply(settings: &Settings, device: &mut Device, image_sensor: usiz
             applied.push(format!("laser power {power}"));
         }
     } else if settings.preset.is_some() || settings.laser_power.is_some() {
-        return Err(Problem::NoSetting { setting: "realsense.preset or laser_power because it has no depth sensor" });
+        return Err(Problem::NoSetting {
+            setting: "realsense.preset or laser_power because it has no depth sensor",
+        });
     }
-    applied.extend(apply_image_settings(settings, &mut device.sensors[image_sensor])?);
+    applied.extend(apply_image_settings(
+        settings,
+        &mut device.sensors[image_sensor],
+    )?);
     Ok(applied)
 }
 
@@ -54,16 +84,29 @@ fn apply_image_settings(settings: &Settings, sensor: &mut Sensor) -> Result<Vec<
             return Err(Problem::SettingRange {
                 setting: "realsense.gain",
                 requested: gain.to_string(),
-                allowed: "a gain only with exposure_micros, because automatic exposure sets both".into(),
+                allowed: "a gain only with exposure_micros, because automatic exposure sets both"
+                    .into(),
             });
         }
         (Some(micros), gain) => {
             set_if_supported(sensor, Rs2Option::EnableAutoExposure, 0.0);
             let counts = narrow(micros / exposure_micros_per_count(sensor));
-            set(sensor, "exposure_micros", Rs2Option::Exposure, counts, counts * EXPOSURE_TOLERANCE_FRAC)?;
+            set(
+                sensor,
+                "exposure_micros",
+                Rs2Option::Exposure,
+                counts,
+                counts * EXPOSURE_TOLERANCE_FRAC,
+            )?;
             applied.push(format!("exposure {micros} us"));
             if let Some(gain) = gain {
-                set(sensor, "realsense.gain", Rs2Option::Gain, narrow(gain.into()), 0.0)?;
+                set(
+                    sensor,
+                    "realsense.gain",
+                    Rs2Option::Gain,
+                    narrow(gain.into()),
+                    0.0,
+                )?;
                 applied.push(format!("gain {gain}"));
             }
         }
@@ -72,12 +115,24 @@ fn apply_image_settings(settings: &Settings, sensor: &mut Sensor) -> Result<Vec<
         None => set_if_supported(sensor, Rs2Option::EnableAutoWhiteBalance, 1.0),
         Some(kelvin) => {
             set_if_supported(sensor, Rs2Option::EnableAutoWhiteBalance, 0.0);
-            set(sensor, "realsense.white_balance_kelvin", Rs2Option::WhiteBalance, narrow(kelvin.into()), 50.0)?;
+            set(
+                sensor,
+                "realsense.white_balance_kelvin",
+                Rs2Option::WhiteBalance,
+                narrow(kelvin.into()),
+                50.0,
+            )?;
             applied.push(format!("white balance {kelvin} K"));
         }
     }
     if let Some(brightness) = settings.brightness {
-        set(sensor, "realsense.brightness", Rs2Option::Brightness, narrow(brightness.into()), 0.0)?;
+        set(
+            sensor,
+            "realsense.brightness",
+            Rs2Option::Brightness,
+            narrow(brightness.into()),
+            0.0,
+        )?;
         applied.push(format!("brightness {brightness}"));
     }
     Ok(applied)
@@ -89,7 +144,10 @@ fn laser(sensor: &mut Sensor, power: f64) -> Result<(), Problem> {
         return set(sensor, KEY, Rs2Option::EmitterEnabled, 0.0, 0.0);
     }
     set_if_supported(sensor, Rs2Option::EmitterEnabled, 1.0);
-    let step = sensor.options.get_option_range(Rs2Option::LaserPower).map_or(0.0, |range| range.step);
+    let step = sensor
+        .options
+        .get_option_range(Rs2Option::LaserPower)
+        .map_or(0.0, |range| range.step);
     set(sensor, KEY, Rs2Option::LaserPower, narrow(power), step)
 }
 
@@ -97,7 +155,10 @@ fn laser(sensor: &mut Sensor, power: f64) -> Result<(), Problem> {
 fn preset(sensor: &Sensor, name: &str) -> Result<f32, Problem> {
     const KEY: &str = "realsense.preset";
     let normalized = |name: &str| name.to_lowercase().replace(['_', '-'], " ");
-    let range = sensor.options.get_option_range(Rs2Option::VisualPreset).ok_or(Problem::NoSetting { setting: KEY })?;
+    let range = sensor
+        .options
+        .get_option_range(Rs2Option::VisualPreset)
+        .ok_or(Problem::NoSetting { setting: KEY })?;
     let mut names = Vec::new();
     let mut value = range.min;
     while value <= range.max {
@@ -109,7 +170,11 @@ fn preset(sensor: &Sensor, name: &str) -> Result<f32, Problem> {
         }
         value += range.step.max(1.0);
     }
-    Err(Problem::SettingRange { setting: KEY, requested: format!("{name:?}"), allowed: names.join(", ") })
+    Err(Problem::SettingRange {
+        setting: KEY,
+        requested: format!("{name:?}"),
+        allowed: names.join(", "),
+    })
 }
 
 fn is_supported(sensor: &Sensor, option: Rs2Option) -> bool {
@@ -125,7 +190,8 @@ fn set_if_supported(sensor: &mut Sensor, option: Rs2Option, value: f32) {
     }
 }
 
-/// Sets an option that the rig file requires, and checks the value read back. `tolerance` is the maximum difference.
+/// Sets an option that the rig file requires, and checks the value read back. `tolerance` is the
+/// maximum difference.
 fn set(
     sensor: &mut Sensor,
     setting: &'static str,
@@ -133,22 +199,38 @@ fn set(
     value: f32,
     tolerance: f32,
 ) -> Result<(), Problem> {
-    let Some(range) = sensor.options.get_option_range(option) else { return Err(Problem::NoSetting { setting }) };
+    let Some(range) = sensor.options.get_option_range(option) else {
+        return Err(Problem::NoSetting { setting });
+    };
     if !(range.min..=range.max).contains(&value) {
         let allowed = format!("{} to {} in the camera's units", range.min, range.max);
-        return Err(Problem::SettingRange { setting, requested: value.to_string(), allowed });
+        return Err(Problem::SettingRange {
+            setting,
+            requested: value.to_string(),
+            allowed,
+        });
     }
     sensor
         .options
         .set_option(option, value)
-        .map_err(|error| Problem::Library { what: setting, reason: error.to_string() })?;
+        .map_err(|error| Problem::Library {
+            what: setting,
+            reason: error.to_string(),
+        })?;
     match sensor.options.get_option(option) {
-        Some(got) if (got - value).abs() > tolerance => Err(Problem::ReadBack { setting, requested: value, got }),
+        Some(got) if (got - value).abs() > tolerance => Err(Problem::ReadBack {
+            setting,
+            requested: value,
+            got,
+        }),
         _ => Ok(()),
     }
 }
 
-#[expect(clippy::cast_possible_truncation, reason = "the library uses single precision")]
+#[expect(
+    clippy::cast_possible_truncation,
+    reason = "the library uses single precision"
+)]
 fn narrow(number: f64) -> f32 {
     number as f32
 }

@@ -91,7 +91,9 @@ pub enum Problem {
         waited: Duration,
     },
     /// The camera disconnected or hung and did not reconnect in time.
-    #[error("it disconnected and did not reconnect within {waited:?} ({n_tries} attempts, {n_resets} resets): {last}")]
+    #[error(
+        "it disconnected and did not reconnect within {waited:?} ({n_tries} attempts, {n_resets} resets): {last}"
+    )]
     Lost {
         /// Time since it disconnected.
         waited: Duration,

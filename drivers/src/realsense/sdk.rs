@@ -1,5 +1,5 @@
-//! Safe calls to the part of librealsense2 that `realsense-rust` lacks: opening sensors individually into one queue,
-//! files as devices, and names of presets.
+//! Safe calls to the part of librealsense2 that `realsense-rust` lacks: opening sensors
+//! individually into one queue, files as devices, and names of presets.
 
 #![expect(unsafe_code, reason = "FFI to a C library")]
 
@@ -16,11 +16,15 @@ use std::path::Path;
 use std::ptr::{NonNull, null_mut};
 use std::time::Duration;
 
-/// A frame of any image stream, despite the name of the wrapper type. Its profile contains the actual kind.
+/// A frame of any image stream, despite the name of the wrapper type. Its profile contains the
+/// actual kind.
 pub(super) type Frame = InfraredFrame;
 
 /// Calls the library and converts its error.
-pub(super) fn call<T>(what: &'static str, call: impl FnOnce(*mut *mut sys::rs2_error) -> T) -> Result<T, Problem> {
+pub(super) fn call<T>(
+    what: &'static str,
+    call: impl FnOnce(*mut *mut sys::rs2_error) -> T,
+) -> Result<T, Problem> {
     let mut error = null_mut();
     let result = call(&raw mut error);
     if error.is_null() {
@@ -28,7 +32,9 @@ pub(super) fn call<T>(what: &'static str, call: impl FnOnce(*mut *mut sys::rs2_e
     }
     // SAFETY: the library created the error and it is owned here; its text lives until it is freed.
     let reason = unsafe {
-        let text = CStr::from_ptr(sys::rs2_get_error_message(error)).to_string_lossy().into_owned();
+        let text = CStr::from_ptr(sys::rs2_get_error_message(error))
+            .to_string_lossy()
+            .into_owned();
         sys::rs2_free_error(error);
         text
     };
@@ -37,7 +43,10 @@ pub(super) fn call<T>(what: &'static str, call: impl FnOnce(*mut *mut sys::rs2_e
 
 /// Checks a pointer that must not be null after a successful call.
 pub(super) fn non_null<T>(what: &'static str, pointer: *mut T) -> Result<NonNull<T>, Problem> {
-    NonNull::new(pointer).ok_or_else(|| Problem::Library { what, reason: "it returned a null pointer".into() })
+    NonNull::new(pointer).ok_or_else(|| Problem::Library {
+        what,
+        reason: "it returned a null pointer".into(),
+    })
 }
 
 /// Handle of the library that lists connected devices.
@@ -47,9 +56,9 @@ pub(super) struct Context(NonNull<sys::rs2_context>);
 // SAFETY: the library may be called from any thread, and we hold the only pointer.
 unsafe impl Send for Context {}
 
-/// Locked while a device is created. The library keeps the relative poses of its streams in one list per process, and
-/// two threads that add to it concurrently write to freed memory (librealsense 2.56.5,
-/// `extrinsics_graph::register_extrinsics`).
+/// Locked while a device is created. The library keeps the relative poses of its streams in one
+/// list per process, and two threads that add to it concurrently write to freed memory
+/// (librealsense 2.56.5, `extrinsics_graph::register_extrinsics`).
 static DEVICE_CREATION: Mutex<()> = Mutex::new(());
 
 /// Prevents other threads from creating devices at the same time.
@@ -60,9 +69,8 @@ pub(super) fn device_creation_lock() -> MutexGuard<'static, ()> {
 impl Context {
     pub(super) fn new() -> Result<Self, Problem> {
         const WHAT: &str = "start";
-        // The library rejects programs compiled for another minor version, although its interface has only grown. So we
-        // pass its own version.
-        // SAFETY: only numbers are passed.
+        // The library rejects programs compiled for another minor version, although its interface
+        // has only grown. So we pass its own version. SAFETY: only numbers are passed.
         let context = unsafe {
             let version = call(WHAT, |error| sys::rs2_get_api_version(error))?;
             call(WHAT, |error| sys::rs2_create_context(version, error))?
@@ -77,11 +85,16 @@ impl Context {
         let _guard = device_creation_lock();
         // SAFETY: the context is alive; the list is freed below, and devices outlive it.
         unsafe {
-            let list = call(WHAT, |error| sys::rs2_query_devices_ex(self.0.as_ptr(), any, error))?;
+            let list = call(WHAT, |error| {
+                sys::rs2_query_devices_ex(self.0.as_ptr(), any, error)
+            })?;
             let n_devices = call(WHAT, |error| sys::rs2_get_device_count(list, error));
-            let device = |ix| Device::new(call(WHAT, |error| sys::rs2_create_device(list, ix, error))?);
-            // A camera that another program is currently resetting cannot be opened; the others can.
-            let devices = n_devices.map(|n_devices| (0..n_devices).filter_map(|ix| device(ix).ok()).collect());
+            let device =
+                |ix| Device::new(call(WHAT, |error| sys::rs2_create_device(list, ix, error))?);
+            // A camera that another program is currently resetting cannot be opened; the others
+            // can.
+            let devices = n_devices
+                .map(|n_devices| (0..n_devices).filter_map(|ix| device(ix).ok()).collect());
             sys::rs2_delete_device_list(list);
             devices
         }
@@ -89,16 +102,21 @@ impl Context {
 
     /// Opens a recorded file as a device that plays back as fast as its images are taken.
     pub(super) fn file(&self, path: &Path) -> Result<Device, Problem> {
-        let file_problem = |reason: String| Problem::File { path: path.to_owned(), reason };
+        let file_problem = |reason: String| Problem::File {
+            path: path.to_owned(),
+            reason,
+        };
         if let Err(error) = std::fs::File::open(path) {
             return Err(file_problem(error.to_string()));
         }
         let name = path_name(path).map_err(file_problem)?;
         let _guard = device_creation_lock();
-        // SAFETY: the context is alive and the name is null-terminated; the device is checked and then owned here.
+        // SAFETY: the context is alive and the name is null-terminated; the device is checked and
+        // then owned here.
         let device = unsafe {
-            let device =
-                call("open a file", |error| sys::rs2_context_add_device(self.0.as_ptr(), name.as_ptr(), error));
+            let device = call("open a file", |error| {
+                sys::rs2_context_add_device(self.0.as_ptr(), name.as_ptr(), error)
+            });
             let device = Device::new(device.map_err(|problem| file_problem(problem.to_string()))?)?;
             call("turn off real-time playback", |error| {
                 sys::rs2_playback_device_set_real_time(device.raw.as_ptr(), 0, error);
@@ -146,13 +164,21 @@ impl Device {
         let sensors = unsafe {
             let list = call(WHAT, |error| sys::rs2_query_sensors(raw.as_ptr(), error))?;
             let n_sensors = call(WHAT, |error| sys::rs2_get_sensors_count(list, error));
-            let sensor =
-                |ix| Ok(Sensor::new(non_null(WHAT, call(WHAT, |error| sys::rs2_create_sensor(list, ix, error))?)?));
+            let sensor = |ix| {
+                Ok(Sensor::new(non_null(
+                    WHAT,
+                    call(WHAT, |error| sys::rs2_create_sensor(list, ix, error))?,
+                )?))
+            };
             let sensors = n_sensors.and_then(|n_sensors| (0..n_sensors).map(sensor).collect());
             sys::rs2_delete_sensor_list(list);
             sensors
         };
-        Ok(Self { sensors: sensors?, info, raw })
+        Ok(Self {
+            sensors: sensors?,
+            info,
+            raw,
+        })
     }
 
     /// Pointer for other calls, valid while this device is alive.
@@ -197,20 +223,38 @@ pub(super) struct Sensor {
 
 impl Sensor {
     fn new(raw: NonNull<sys::rs2_sensor>) -> Self {
-        Self { raw, options: Options::from(raw) }
+        Self {
+            raw,
+            options: Options::from(raw),
+        }
     }
 
     /// All modes of its image streams.
     pub(super) fn modes(&self) -> Result<Modes, Problem> {
         const WHAT: &str = "list the modes of a sensor";
-        // SAFETY: the sensor is alive; `Modes` frees the list and keeps it as long as the pointers into it.
+        // SAFETY: the sensor is alive; `Modes` frees the list and keeps it as long as the pointers
+        // into it.
         unsafe {
-            let list = non_null(WHAT, call(WHAT, |error| sys::rs2_get_stream_profiles(self.raw.as_ptr(), error))?)?;
-            let mut modes = Modes { list, modes: Vec::new() };
-            let n_modes = call(WHAT, |error| sys::rs2_get_stream_profiles_count(list.as_ptr(), error))?;
+            let list = non_null(
+                WHAT,
+                call(WHAT, |error| {
+                    sys::rs2_get_stream_profiles(self.raw.as_ptr(), error)
+                })?,
+            )?;
+            let mut modes = Modes {
+                list,
+                modes: Vec::new(),
+            };
+            let n_modes = call(WHAT, |error| {
+                sys::rs2_get_stream_profiles_count(list.as_ptr(), error)
+            })?;
             for ix in 0..n_modes {
-                let profile = call(WHAT, |error| sys::rs2_get_stream_profile(list.as_ptr(), ix, error))?;
-                modes.modes.extend(Mode::read(non_null(WHAT, profile.cast_mut())?)?);
+                let profile = call(WHAT, |error| {
+                    sys::rs2_get_stream_profile(list.as_ptr(), ix, error)
+                })?;
+                modes
+                    .modes
+                    .extend(Mode::read(non_null(WHAT, profile.cast_mut())?)?);
             }
             Ok(modes)
         }
@@ -218,8 +262,10 @@ impl Sensor {
 
     /// Opens the given modes.
     pub(super) fn open(&self, modes: &[&Mode]) -> Result<(), Problem> {
-        let mut profiles: Vec<*const sys::rs2_stream_profile> =
-            modes.iter().map(|mode| mode.profile.as_ptr().cast_const()).collect();
+        let mut profiles: Vec<*const sys::rs2_stream_profile> = modes
+            .iter()
+            .map(|mode| mode.profile.as_ptr().cast_const())
+            .collect();
         let n_profiles = i32::try_from(profiles.len()).expect("a camera has few streams");
         // SAFETY: sensor and profiles are alive.
         call("open a stream", |error| unsafe {
@@ -230,16 +276,22 @@ impl Sensor {
     /// Starts the open streams and sends their images to a queue.
     pub(super) fn start(&self, queue: &Queue) -> Result<(), Problem> {
         // SAFETY: both are alive, and the library keeps the queue for as long as the stream runs.
-        call("start a stream", |error| unsafe { sys::rs2_start_queue(self.raw.as_ptr(), queue.0.as_ptr(), error) })
+        call("start a stream", |error| unsafe {
+            sys::rs2_start_queue(self.raw.as_ptr(), queue.0.as_ptr(), error)
+        })
     }
 
     /// Stops its streams. Does nothing if none is running.
     pub(super) fn stop(&self) {
-        // SAFETY: the sensor is alive. Errors only mean that nothing is running, because the camera is disconnected or
-        // the file has ended.
-        let _ = call("stop a stream", |error| unsafe { sys::rs2_stop(self.raw.as_ptr(), error) });
+        // SAFETY: the sensor is alive. Errors only mean that nothing is running, because the camera
+        // is disconnected or the file has ended.
+        let _ = call("stop a stream", |error| unsafe {
+            sys::rs2_stop(self.raw.as_ptr(), error)
+        });
         // SAFETY: as above.
-        let _ = call("close a stream", |error| unsafe { sys::rs2_close(self.raw.as_ptr(), error) });
+        let _ = call("close a stream", |error| unsafe {
+            sys::rs2_close(self.raw.as_ptr(), error)
+        });
     }
 
     /// Name that the camera uses for a value of an option.
@@ -247,7 +299,12 @@ impl Sensor {
         // SAFETY: sensors have options; the text is owned by the library and copied immediately.
         unsafe {
             let text = call("get the name of an option value", |error| {
-                sys::rs2_get_option_value_description(self.raw.as_ptr().cast(), option, value, error)
+                sys::rs2_get_option_value_description(
+                    self.raw.as_ptr().cast(),
+                    option,
+                    value,
+                    error,
+                )
             });
             let text = NonNull::new(text.ok()?.cast_mut())?;
             Some(CStr::from_ptr(text.as_ptr()).to_string_lossy().into_owned())
@@ -320,15 +377,32 @@ impl Mode {
                     error,
                 );
             })?;
-            if sys::rs2_stream_profile_is(profile, sys::rs2_extension_RS2_EXTENSION_VIDEO_PROFILE, null_mut()) == 0 {
+            if sys::rs2_stream_profile_is(
+                profile,
+                sys::rs2_extension_RS2_EXTENSION_VIDEO_PROFILE,
+                null_mut(),
+            ) == 0
+            {
                 return Ok(None);
             }
             call(WHAT, |error| {
-                sys::rs2_get_video_stream_resolution(profile, &raw mut width, &raw mut height, error);
+                sys::rs2_get_video_stream_resolution(
+                    profile,
+                    &raw mut width,
+                    &raw mut height,
+                    error,
+                );
             })?;
         }
         let size_px = [width, height].map(|side| u32::try_from(side).unwrap_or(0));
-        Ok(Some(Self { profile, stream, index, format, rate_hz, size_px }))
+        Ok(Some(Self {
+            profile,
+            stream,
+            index,
+            format,
+            rate_hz,
+            size_px,
+        }))
     }
 
     /// Intrinsics of this mode.
@@ -337,7 +411,11 @@ impl Mode {
         // SAFETY: the profile is alive; on success, all fields were written.
         unsafe {
             call("get intrinsics", |error| {
-                sys::rs2_get_video_stream_intrinsics(self.profile.as_ptr(), intrinsics.as_mut_ptr(), error);
+                sys::rs2_get_video_stream_intrinsics(
+                    self.profile.as_ptr(),
+                    intrinsics.as_mut_ptr(),
+                    error,
+                );
             })?;
             Ok(intrinsics.assume_init())
         }
@@ -346,12 +424,15 @@ impl Mode {
     /// Profile for use with `realsense-rust`. It must not outlive the mode.
     pub(super) fn profile(&self) -> Result<StreamProfile, Problem> {
         let what = "describe a mode";
-        StreamProfile::try_from(self.profile).map_err(|error| Problem::Library { what, reason: error.to_string() })
+        StreamProfile::try_from(self.profile).map_err(|error| Problem::Library {
+            what,
+            reason: error.to_string(),
+        })
     }
 }
 
-/// Queued images of all streams, in order of arrival. If the queue is full, a file waits, and a camera drops the oldest
-/// image.
+/// Queued images of all streams, in order of arrival. If the queue is full, a file waits, and a
+/// camera drops the oldest image.
 #[derive(Debug)]
 pub(super) struct Queue(NonNull<sys::rs2_frame_queue>);
 
@@ -365,7 +446,9 @@ impl Queue {
     pub(super) fn new(capacity: u8) -> Result<Self, Problem> {
         const WHAT: &str = "create a queue";
         // SAFETY: only numbers are passed.
-        let queue = call(WHAT, |error| unsafe { sys::rs2_create_frame_queue(capacity.into(), error) })?;
+        let queue = call(WHAT, |error| unsafe {
+            sys::rs2_create_frame_queue(capacity.into(), error)
+        })?;
         Ok(Self(non_null(WHAT, queue)?))
     }
 
@@ -376,14 +459,20 @@ impl Queue {
         let mut frame = null_mut();
         // SAFETY: the queue is alive; a received frame is owned here, and `Frame` frees it.
         unsafe {
-            let has_arrived =
-                call(WHAT, |error| sys::rs2_try_wait_for_frame(self.0.as_ptr(), millis, &raw mut frame, error))?;
-            let Some(frame) = NonNull::new(frame).filter(|_| has_arrived != 0) else { return Ok(None) };
+            let has_arrived = call(WHAT, |error| {
+                sys::rs2_try_wait_for_frame(self.0.as_ptr(), millis, &raw mut frame, error)
+            })?;
+            let Some(frame) = NonNull::new(frame).filter(|_| has_arrived != 0) else {
+                return Ok(None);
+            };
             match Frame::try_from(frame) {
                 Ok(frame) => Ok(Some(frame)),
                 Err(error) => {
                     sys::rs2_release_frame(frame.as_ptr());
-                    Err(Problem::Library { what: WHAT, reason: error.to_string() })
+                    Err(Problem::Library {
+                        what: WHAT,
+                        reason: error.to_string(),
+                    })
                 }
             }
         }
@@ -398,7 +487,9 @@ impl Queue {
             let mut frame = null_mut();
             // SAFETY: the queue is alive; a received frame is owned here.
             unsafe {
-                call("poll for an image", |error| sys::rs2_poll_for_frame(self.0.as_ptr(), &raw mut frame, error))?;
+                call("poll for an image", |error| {
+                    sys::rs2_poll_for_frame(self.0.as_ptr(), &raw mut frame, error)
+                })?;
                 if frame.is_null() {
                     return Ok(());
                 }
@@ -417,8 +508,14 @@ impl Drop for Queue {
 
 /// The bytes of a frame.
 pub(super) fn bytes<Kind>(frame: &ImageFrame<Kind>) -> &[u8] {
-    // SAFETY: the library keeps this many bytes there as long as the frame lives, and nothing writes to them.
-    unsafe { std::slice::from_raw_parts(std::ptr::from_ref(frame.get_data()).cast(), frame.get_data_size()) }
+    // SAFETY: the library keeps this many bytes there as long as the frame lives, and nothing
+    // writes to them.
+    unsafe {
+        std::slice::from_raw_parts(
+            std::ptr::from_ref(frame.get_data()).cast(),
+            frame.get_data_size(),
+        )
+    }
 }
 
 /// Converts a frame to the type that depth filters take.
@@ -429,7 +526,10 @@ pub(super) fn as_depth(frame: Frame) -> Result<DepthFrame, Problem> {
         let raw = frame.get_owned_raw();
         DepthFrame::try_from(raw).map_err(|error| {
             sys::rs2_release_frame(raw.as_ptr());
-            Problem::Library { what: WHAT, reason: error.to_string() }
+            Problem::Library {
+                what: WHAT,
+                reason: error.to_string(),
+            }
         })
     }
 }

@@ -1,4 +1,5 @@
-//! Streams from a RealSense camera or a file and converts the frames of the library to stamped images.
+//! Streams from a RealSense camera or a file and converts the frames of the library to stamped
+//! images.
 
 use super::filters::Filters;
 use super::find::{self, FoundCamera};
@@ -85,7 +86,8 @@ impl Session {
             let applied = applied.inspect_err(|_| started.stop(&device))?;
             description = format!("{description}; set and read back: {}", applied.join(", "));
         }
-        let micros_per_count = options::exposure_micros_per_count(&device.sensors[started.image_sensor]);
+        let micros_per_count =
+            options::exposure_micros_per_count(&device.sensors[started.image_sensor]);
         Ok(Self {
             camera: config.name.as_str().into(),
             stamps: Stamps::new(config),
@@ -123,19 +125,30 @@ impl Session {
     /// Returns the next image of any stream. An error means that the device was disconnected.
     pub(super) fn next(&mut self, deadline: Instant) -> Result<Next, Problem> {
         loop {
-            if let Some(image) = self.pending.take_if(|image| self.stamps.is_due(image.stamp)) {
+            if let Some(image) = self
+                .pending
+                .take_if(|image| self.stamps.is_due(image.stamp))
+            {
                 return Ok(Next::Image(self.deliver(image)));
             }
             let remaining = deadline.saturating_duration_since(Instant::now());
             if let Some(image) = &self.pending {
-                let due_in = Duration::from_nanos(image.stamp.0.saturating_sub(clock::now().0).max(0).unsigned_abs());
+                let due_in = Duration::from_nanos(
+                    image
+                        .stamp
+                        .0
+                        .saturating_sub(clock::now().0)
+                        .max(0)
+                        .unsigned_abs(),
+                );
                 if remaining.is_zero() {
                     return Ok(Next::NotDue(due_in));
                 }
                 std::thread::sleep(remaining.min(due_in));
                 continue;
             }
-            // This is checked before the queue, so that all images read until then are in the queue.
+            // This is checked before the queue, so that all images read until then are in the
+            // queue.
             let has_stopped = self.is_file && self.device.has_stopped()?;
             match self.queue.wait(remaining.min(POLL))? {
                 Some(frame) => {
@@ -145,7 +158,9 @@ impl Session {
                     }
                     self.pending = image;
                 }
-                None if has_stopped && (self.has_image || self.started_at.elapsed() > MAX_STARTUP) => {
+                None if has_stopped
+                    && (self.has_image || self.started_at.elapsed() > MAX_STARTUP) =>
+                {
                     self.warn_of_images_before_open("all");
                     return Ok(Next::End);
                 }
@@ -186,16 +201,23 @@ impl Session {
             _ => {}
         }
         let (format, secs_per_count) = match (is_depth, &self.started.calibration.depth) {
-            (true, Some(depth)) => {
-                (PixelFormat::DepthU16 { meters_per_count: depth.meters_per_count }, DEPTH_SECS_PER_COUNT)
-            }
+            (true, Some(depth)) => (
+                PixelFormat::DepthU16 {
+                    meters_per_count: depth.meters_per_count,
+                },
+                DEPTH_SECS_PER_COUNT,
+            ),
             (true, None) => return Ok(None),
             (false, _) => (self.started.format, self.image_secs_per_count),
         };
         let frame_time = FrameTime::of(&frame);
-        #[expect(clippy::cast_precision_loss, reason = "an exposure lasts less than a day")]
-        let exposure_secs =
-            frame.metadata(Rs2FrameMetadata::ActualExposure).map(|counts| counts as f64 * secs_per_count);
+        #[expect(
+            clippy::cast_precision_loss,
+            reason = "an exposure lasts less than a day"
+        )]
+        let exposure_secs = frame
+            .metadata(Rs2FrameMetadata::ActualExposure)
+            .map(|counts| counts as f64 * secs_per_count);
         let image = Image {
             camera: Arc::clone(&self.camera),
             stamp: self.stamps.stamp(&frame_time, arrival),
@@ -214,9 +236,10 @@ impl Session {
         } else {
             with_pixels(image, &frame)
         };
-        image
-            .map(Some)
-            .map_err(|error| Problem::Library { what: "deliver a complete image", reason: error.to_string() })
+        image.map(Some).map_err(|error| Problem::Library {
+            what: "deliver a complete image",
+            reason: error.to_string(),
+        })
     }
 }
 
@@ -224,7 +247,12 @@ impl Session {
 fn with_pixels<Kind>(image: Image, frame: &ImageFrame<Kind>) -> Result<Image, Error> {
     let side = |pixels: usize| u32::try_from(pixels).unwrap_or(u32::MAX);
     let size_px = [side(frame.width()), side(frame.height())];
-    Image { size_px, data: bytes(frame).into(), ..image }.pack_rows(frame.stride())
+    Image {
+        size_px,
+        data: bytes(frame).into(),
+        ..image
+    }
+    .pack_rows(frame.stride())
 }
 
 fn warn_of_device(camera: &str, found: &FoundCamera) {
@@ -243,8 +271,8 @@ fn warn_of_device(camera: &str, found: &FoundCamera) {
 }
 
 impl Drop for Session {
-    /// Stops the streams while draining the queue. Otherwise they would deadlock: stopping waits for the thread that
-    /// reads the file, and that thread waits for space in the queue.
+    /// Stops the streams while draining the queue. Otherwise they would deadlock: stopping waits
+    /// for the thread that reads the file, and that thread waits for space in the queue.
     fn drop(&mut self) {
         let (queue, is_stopped) = (&self.queue, AtomicBool::new(false));
         std::thread::scope(|scope| {

@@ -1,8 +1,9 @@
 //! Computes the time at which an image of a RealSense camera was taken, on our clock.
 //!
-//! With metadata (a patched kernel module, or the USB backend of the library), a camera reports mid-exposure on its own
-//! clock, a 32-bit count of microseconds. The library's conversion to "global time" is switched off because our mapping
-//! is robust to late arrivals. Without metadata, only the arrival time is known.
+//! With metadata (a patched kernel module, or the USB backend of the library), a camera reports
+//! mid-exposure on its own clock, a 32-bit count of microseconds. The library's conversion to
+//! "global time" is switched off because our mapping is robust to late arrivals. Without metadata,
+//! only the arrival time is known.
 
 use super::{Config, Pace};
 use crate::clock;
@@ -76,7 +77,11 @@ impl Stamps {
             Pace::Clock => Stamp(nanos.saturating_add(self.offset_nanos)),
             Pace::RealTime => {
                 let (first_nanos, started_at) = *self.first.get_or_insert((nanos, arrival));
-                Stamp(started_at.0.saturating_add(nanos.saturating_sub(first_nanos)))
+                Stamp(
+                    started_at
+                        .0
+                        .saturating_add(nanos.saturating_sub(first_nanos)),
+                )
             }
         }
     }
@@ -86,23 +91,31 @@ impl Stamps {
         matches!(self.pace, None | Some(Pace::Fast)) || stamp <= clock::now()
     }
 
-    /// Whether an image was due before the file was opened. Such images are skipped and do not count as late.
+    /// Whether an image was due before the file was opened. Such images are skipped and do not
+    /// count as late.
     pub(super) fn is_before_open(&self, stamp: Stamp) -> bool {
         self.pace == Some(Pace::Clock) && stamp < self.opened
     }
 
-    /// Camera clock in nanoseconds, or `None` if the camera does not report it, which is logged once.
+    /// Camera clock in nanoseconds, or `None` if the camera does not report it, which is logged
+    /// once.
     fn device_nanos(&mut self, frame_time: &FrameTime) -> Option<i64> {
         if let Some(micros) = frame_time.mid_exposure_micros {
             // Emulated cameras use 64-bit counts, which do not wrap.
             let is_64_bit = micros > i64::from(u32::MAX);
-            return Some(if is_64_bit { micros.saturating_mul(1000) } else { self.micros.nanos(low_bits(micros)) });
+            return Some(if is_64_bit {
+                micros.saturating_mul(1000)
+            } else {
+                self.micros.nanos(low_bits(micros))
+            });
         }
         let has_warned = std::mem::replace(&mut self.has_warned, true);
         let camera = &self.camera;
         if frame_time.is_device_clock {
             if !has_warned {
-                log::warn!("camera {camera:?}: it does not report mid-exposure; stamps are the start of the readout");
+                log::warn!(
+                    "camera {camera:?}: it does not report mid-exposure; stamps are the start of the readout"
+                );
             }
             return Some(nanos_of(frame_time.millis));
         }
@@ -117,12 +130,19 @@ impl Stamps {
 }
 
 /// Counts wrap at 2^32.
-#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "the low 32 bits are the count")]
+#[expect(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "the low 32 bits are the count"
+)]
 fn low_bits(micros: i64) -> u32 {
     micros as u32
 }
 
-#[expect(clippy::cast_possible_truncation, reason = "the cast saturates as intended")]
+#[expect(
+    clippy::cast_possible_truncation,
+    reason = "the cast saturates as intended"
+)]
 fn nanos_of(millis: f64) -> i64 {
     (millis * NANOS_PER_MILLI).round() as i64
 }
@@ -145,7 +165,11 @@ mod tests {
     }
 
     fn frame_time(micros: i64) -> FrameTime {
-        FrameTime { mid_exposure_micros: Some(micros), millis: 0.0, is_device_clock: true }
+        FrameTime {
+            mid_exposure_micros: Some(micros),
+            millis: 0.0,
+            is_device_clock: true,
+        }
     }
 
     #[test]
@@ -154,14 +178,22 @@ mod tests {
         let begin = i64::from(u32::MAX) - 500_000;
         for image in 0..100_i64 {
             let since_micros = image * 33_333;
-            // The difference is negative if mid-exposure is before the wrap and the readout after it.
+            // The difference is negative if mid-exposure is before the wrap and the readout after
+            // it.
             let wrapped = (begin + since_micros) % (1 << 32);
-            let micros = if wrapped < 20_000 { wrapped - (1 << 32) } else { wrapped };
+            let micros = if wrapped < 20_000 {
+                wrapped - (1 << 32)
+            } else {
+                wrapped
+            };
             let late_nanos = 5_000_000 + (image % 7) * 3_000_000;
             let arrival = Stamp(since_micros * 1000 + late_nanos);
             let error_nanos = stamps.stamp(&frame_time(micros), arrival).0 - since_micros * 1000;
             // The minimum latency is not observable, but jitter must be removed.
-            assert!((error_nanos - 5_000_000).abs() < 200_000, "image {image}: {error_nanos}");
+            assert!(
+                (error_nanos - 5_000_000).abs() < 200_000,
+                "image {image}: {error_nanos}"
+            );
         }
     }
 
@@ -174,27 +206,40 @@ mod tests {
             (Pace::RealTime, [99, 99 + 123_456_000]),
         ] {
             let mut stamps = stamps(Some(pace));
-            let got = [(0, 99), (later, 5_000)]
-                .map(|(since_micros, arrival)| stamps.stamp(&frame_time(7_000_000 + since_micros), Stamp(arrival)).0);
+            let got = [(0, 99), (later, 5_000)].map(|(since_micros, arrival)| {
+                stamps
+                    .stamp(&frame_time(7_000_000 + since_micros), Stamp(arrival))
+                    .0
+            });
             assert_eq!(got, expected, "{pace:?}");
             assert_eq!(stamps.is_due(Stamp(i64::MAX)), pace == Pace::Fast);
         }
         // Counts of an emulated camera do not wrap.
         let mut emulated_clock = stamps(Some(Pace::Fast));
         let wrap = i64::from(u32::MAX);
-        let got =
-            [wrap - 1, wrap + 1, wrap + 3].map(|micros| emulated_clock.stamp(&frame_time(micros), Stamp(0)).0 / 1000);
+        let got = [wrap - 1, wrap + 1, wrap + 3]
+            .map(|micros| emulated_clock.stamp(&frame_time(micros), Stamp(0)).0 / 1000);
         assert_eq!(got, [wrap - 1, wrap + 1, wrap + 3]);
     }
 
     #[test]
     fn without_metadata_library_stamp_or_arrival_is_used() {
-        let plain = |is_device_clock| FrameTime { mid_exposure_micros: None, millis: 12.5, is_device_clock };
+        let plain = |is_device_clock| FrameTime {
+            mid_exposure_micros: None,
+            millis: 12.5,
+            is_device_clock,
+        };
         assert_eq!(stamps(None).stamp(&plain(false), Stamp(77)), Stamp(77));
         let mut live = stamps(None);
         live.stamp(&plain(true), Stamp(1_000));
-        let later = FrameTime { millis: 22.5, ..plain(true) };
+        let later = FrameTime {
+            millis: 22.5,
+            ..plain(true)
+        };
         assert_eq!(live.stamp(&later, Stamp(90_000_000)), Stamp(10_001_000));
-        assert_eq!(stamps(Some(Pace::Fast)).stamp(&plain(false), Stamp(77)), Stamp(12_500_000));
+        assert_eq!(
+            stamps(Some(Pace::Fast)).stamp(&plain(false), Stamp(77)),
+            Stamp(12_500_000)
+        );
     }
 }

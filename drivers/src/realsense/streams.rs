@@ -8,12 +8,31 @@ use realsense_rust::kind::Rs2Option;
 use realsense_sys as sys;
 use std::collections::BTreeSet;
 
-/// YUV encoding as in librealsense2 (`src/proc/color-formats-converter.cpp`): BT.601, limited range.
-const YUV_COLORS: YuvColors = YuvColors { matrix: YuvMatrix::Bt601, range: YuvRange::Limited };
-/// Image formats in order of preference: native formats of the camera come before those converted by the library.
+/// YUV encoding as in librealsense2 (`src/proc/color-formats-converter.cpp`): BT.601, limited
+/// range.
+const YUV_COLORS: YuvColors = YuvColors {
+    matrix: YuvMatrix::Bt601,
+    range: YuvRange::Limited,
+};
+/// Image formats in order of preference: native formats of the camera come before those converted
+/// by the library.
 const FORMATS: [(sys::rs2_format, &str, PixelFormat); 5] = [
-    (sys::rs2_format_RS2_FORMAT_YUYV, "yuyv", PixelFormat::Yuv { layout: YuvLayout::Yuyv, colors: YUV_COLORS }),
-    (sys::rs2_format_RS2_FORMAT_UYVY, "uyvy", PixelFormat::Yuv { layout: YuvLayout::Uyvy, colors: YUV_COLORS }),
+    (
+        sys::rs2_format_RS2_FORMAT_YUYV,
+        "yuyv",
+        PixelFormat::Yuv {
+            layout: YuvLayout::Yuyv,
+            colors: YUV_COLORS,
+        },
+    ),
+    (
+        sys::rs2_format_RS2_FORMAT_UYVY,
+        "uyvy",
+        PixelFormat::Yuv {
+            layout: YuvLayout::Uyvy,
+            colors: YUV_COLORS,
+        },
+    ),
     (sys::rs2_format_RS2_FORMAT_RGB8, "rgb", PixelFormat::Rgb8),
     (sys::rs2_format_RS2_FORMAT_BGR8, "bgr", PixelFormat::Bgr8),
     (sys::rs2_format_RS2_FORMAT_Y8, "gray", PixelFormat::Gray8),
@@ -74,8 +93,8 @@ impl StreamRequest {
             && self.is_of_stream(mode)
     }
 
-    /// Whether a mode belongs to this stream. If there are two infrared cameras, only the left one matches, because
-    /// depth is in its frame.
+    /// Whether a mode belongs to this stream. If there are two infrared cameras, only the left one
+    /// matches, because depth is in its frame.
     fn is_of_stream(&self, mode: &Mode) -> bool {
         let is_infrared = mode.stream == sys::rs2_stream_RS2_STREAM_INFRARED;
         mode.stream == self.stream && (!is_infrared || mode.index <= LEFT)
@@ -87,48 +106,91 @@ impl StreamRequest {
         let rate_hz = config.file.is_none().then_some(config.rate_hz);
         let all = || {
             let of_sensor = |(sensor, modes): (usize, &'_ Modes)| {
-                (0..modes.modes.len()).map(move |mode| (sensor, mode)).collect::<Vec<_>>()
+                (0..modes.modes.len())
+                    .map(move |mode| (sensor, mode))
+                    .collect::<Vec<_>>()
             };
             modes.iter().enumerate().flat_map(of_sensor)
         };
         let mode_at = |(sensor, mode): (usize, usize)| &modes[sensor].modes[mode];
-        let rank =
-            |indices: &(usize, usize)| self.formats.iter().position(|format| *format == mode_at(*indices).format);
-        all().filter(|indices| self.fits(mode_at(*indices), rate_hz)).min_by_key(rank).ok_or_else(|| {
-            let offered: BTreeSet<String> =
-                all().map(mode_at).filter(|mode| self.is_of_stream(mode)).map(describe).collect();
-            let offered: Vec<_> = offered.into_iter().collect();
-            let [width, height] = self.size_px;
-            let rate = rate_hz.map_or(String::new(), |rate_hz| format!(" at {rate_hz} Hz"));
-            Problem::NoMode {
-                requested: format!("{} {width}x{height}{rate}", self.name),
-                offered: if offered.is_empty() { format!("no {}", self.name) } else { offered.join(", ") },
-            }
-        })
+        let rank = |indices: &(usize, usize)| {
+            self.formats
+                .iter()
+                .position(|format| *format == mode_at(*indices).format)
+        };
+        all()
+            .filter(|indices| self.fits(mode_at(*indices), rate_hz))
+            .min_by_key(rank)
+            .ok_or_else(|| {
+                let offered: BTreeSet<String> = all()
+                    .map(mode_at)
+                    .filter(|mode| self.is_of_stream(mode))
+                    .map(describe)
+                    .collect();
+                let offered: Vec<_> = offered.into_iter().collect();
+                let [width, height] = self.size_px;
+                let rate = rate_hz.map_or(String::new(), |rate_hz| format!(" at {rate_hz} Hz"));
+                Problem::NoMode {
+                    requested: format!("{} {width}x{height}{rate}", self.name),
+                    offered: if offered.is_empty() {
+                        format!("no {}", self.name)
+                    } else {
+                        offered.join(", ")
+                    },
+                }
+            })
     }
 }
 
 /// Opens the requested streams and starts them into a queue.
-pub(super) fn start(config: &Config, device: &Device, queue: &Queue) -> Result<ActiveStreams, Problem> {
-    let modes: Vec<Modes> = device.sensors.iter().map(|sensor| sensor.modes()).collect::<Result<_, _>>()?;
+pub(super) fn start(
+    config: &Config,
+    device: &Device,
+    queue: &Queue,
+) -> Result<ActiveStreams, Problem> {
+    let modes: Vec<Modes> = device
+        .sensors
+        .iter()
+        .map(|sensor| sensor.modes())
+        .collect::<Result<_, _>>()?;
     let (name, stream) = match config.stream {
         Stream::Color => ("color", sys::rs2_stream_RS2_STREAM_COLOR),
         Stream::Infrared => ("infrared", sys::rs2_stream_RS2_STREAM_INFRARED),
     };
     let formats = FORMATS.map(|(format, ..)| format).to_vec();
-    let image = StreamRequest { name, stream, size_px: config.size_px, formats }.choose(config, &modes)?;
+    let image = StreamRequest {
+        name,
+        stream,
+        size_px: config.size_px,
+        formats,
+    }
+    .choose(config, &modes)?;
     let depth = config.depth_size_px.map(|size_px| {
-        let (stream, format) = (sys::rs2_stream_RS2_STREAM_DEPTH, sys::rs2_format_RS2_FORMAT_Z16);
-        StreamRequest { name: "depth", stream, size_px, formats: vec![format] }.choose(config, &modes)
+        let (stream, format) = (
+            sys::rs2_stream_RS2_STREAM_DEPTH,
+            sys::rs2_format_RS2_FORMAT_Z16,
+        );
+        StreamRequest {
+            name: "depth",
+            stream,
+            size_px,
+            formats: vec![format],
+        }
+        .choose(config, &modes)
     });
     let depth = depth.transpose()?;
     let mode_at = |(sensor, mode): (usize, usize)| &modes[sensor].modes[mode];
     let calibration = Calibration {
         intrinsics: lens::intrinsics(&mode_at(image).intrinsics()?, name)?,
-        depth: depth.map(|depth| depth_calibration(device, depth, mode_at(depth), mode_at(image))).transpose()?,
+        depth: depth
+            .map(|depth| depth_calibration(device, depth, mode_at(depth), mode_at(image)))
+            .transpose()?,
     };
     let chosen: Vec<_> = std::iter::once(image).chain(depth).collect();
-    let description: Vec<_> = chosen.iter().map(|indices| describe(mode_at(*indices))).collect();
+    let description: Vec<_> = chosen
+        .iter()
+        .map(|indices| describe(mode_at(*indices)))
+        .collect();
     let started = ActiveStreams {
         calibration,
         format: FORMATS
@@ -142,22 +204,34 @@ pub(super) fn start(config: &Config, device: &Device, queue: &Queue) -> Result<A
         _modes: Vec::new(),
     };
     for sensor in &started.sensors {
-        let sensor_modes: Vec<_> =
-            chosen.iter().filter(|indices| indices.0 == *sensor).map(|indices| mode_at(*indices)).collect();
-        device.sensors[*sensor].open(&sensor_modes).inspect_err(|_| started.stop(device))?;
+        let sensor_modes: Vec<_> = chosen
+            .iter()
+            .filter(|indices| indices.0 == *sensor)
+            .map(|indices| mode_at(*indices))
+            .collect();
+        device.sensors[*sensor]
+            .open(&sensor_modes)
+            .inspect_err(|_| started.stop(device))?;
     }
-    started.run(device, queue, config.file.is_some()).inspect_err(|_| started.stop(device))?;
-    Ok(ActiveStreams { _modes: modes, ..started })
+    started
+        .run(device, queue, config.file.is_some())
+        .inspect_err(|_| started.stop(device))?;
+    Ok(ActiveStreams {
+        _modes: modes,
+        ..started
+    })
 }
 
 impl ActiveStreams {
-    /// Starts all open sensors. A file sends its first images to the sensors that start first, so it is paused until
-    /// all are started.
+    /// Starts all open sensors. A file sends its first images to the sensors that start first, so
+    /// it is paused until all are started.
     fn run(&self, device: &Device, queue: &Queue, is_file: bool) -> Result<(), Problem> {
         if is_file {
             device.set_paused(true)?;
         }
-        self.sensors.iter().try_for_each(|sensor| device.sensors[*sensor].start(queue))?;
+        self.sensors
+            .iter()
+            .try_for_each(|sensor| device.sensors[*sensor].start(queue))?;
         if is_file {
             device.set_paused(false)?;
         }
@@ -166,7 +240,9 @@ impl ActiveStreams {
 
     /// Stops the streams. `device` must be the device on which they were started.
     pub(super) fn stop(&self, device: &Device) {
-        self.sensors.iter().for_each(|sensor| device.sensors[*sensor].stop());
+        self.sensors
+            .iter()
+            .for_each(|sensor| device.sensors[*sensor].stop());
     }
 }
 
@@ -176,14 +252,24 @@ fn depth_calibration(
     depth: &Mode,
     image: &Mode,
 ) -> Result<DepthCalibration, Problem> {
-    let calibration_problem = |reason: String| Problem::Library { what: "get the calibration of depth", reason };
-    let extrinsics =
-        depth.profile()?.extrinsics(&image.profile()?).map_err(|error| calibration_problem(error.to_string()))?;
-    let scale = device.sensors[sensor].options.get_option(Rs2Option::DepthUnits);
-    let scale = scale.ok_or_else(|| calibration_problem("it does not report depth units".into()))?;
+    let calibration_problem = |reason: String| Problem::Library {
+        what: "get the calibration of depth",
+        reason,
+    };
+    let extrinsics = depth
+        .profile()?
+        .extrinsics(&image.profile()?)
+        .map_err(|error| calibration_problem(error.to_string()))?;
+    let scale = device.sensors[sensor]
+        .options
+        .get_option(Rs2Option::DepthUnits);
+    let scale =
+        scale.ok_or_else(|| calibration_problem("it does not report depth units".into()))?;
     // Parse the shortest decimal of the single-precision value: 0.001, not 0.001000000047.
-    let meters_per_count =
-        scale.to_string().parse().map_err(|_| calibration_problem("its depth units are not a number".into()))?;
+    let meters_per_count = scale
+        .to_string()
+        .parse()
+        .map_err(|_| calibration_problem("its depth units are not a number".into()))?;
     Ok(DepthCalibration {
         intrinsics: lens::intrinsics(&depth.intrinsics()?, "depth")?,
         camera_from_depth: lens::transform(&extrinsics.0),
@@ -195,7 +281,10 @@ fn describe(mode: &Mode) -> String {
     let [width, height] = mode.size_px;
     let format = match mode.format {
         sys::rs2_format_RS2_FORMAT_Z16 => "z16",
-        other => FORMATS.iter().find(|(format, ..)| *format == other).map_or("another format", |(_, name, _)| name),
+        other => FORMATS
+            .iter()
+            .find(|(format, ..)| *format == other)
+            .map_or("another format", |(_, name, _)| name),
     };
     format!("{format} {width}x{height} at {} Hz", mode.rate_hz)
 }

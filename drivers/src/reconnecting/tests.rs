@@ -56,12 +56,21 @@ impl ReopenableCamera for Scripted {
     type Problem = String;
 
     fn open(&mut self) -> Result<ScriptedStream, Failure<String>> {
-        assert_eq!(Arc::strong_count(&self.n_open), 1, "the camera is closed before it is opened again");
+        assert_eq!(
+            Arc::strong_count(&self.n_open),
+            1,
+            "the camera is closed before it is opened again"
+        );
         self.opened_at.push(Instant::now());
         match self.steps.pop_front() {
-            Some(Opens(mode)) => Ok(ScriptedStream { mode, _open: Arc::clone(&self.n_open) }),
+            Some(Opens(mode)) => Ok(ScriptedStream {
+                mode,
+                _open: Arc::clone(&self.n_open),
+            }),
             Some(Refuses(problem)) => Err(problem.to_owned().into()),
-            Some(Unsupported) => Err(Failure::Final(Error::Simulation { reason: "unsupported colors".into() })),
+            Some(Unsupported) => Err(Failure::Final(Error::Simulation {
+                reason: "unsupported colors".into(),
+            })),
             other => panic!("opened instead of {other:?}"),
         }
     }
@@ -70,10 +79,22 @@ impl ReopenableCamera for Scripted {
         stream.mode.map(str::to_owned)
     }
 
-    fn next_image(&mut self, stream: &mut ScriptedStream, deadline: Instant) -> Result<Option<Image>, Failure<String>> {
+    fn next_image(
+        &mut self,
+        stream: &mut ScriptedStream,
+        deadline: Instant,
+    ) -> Result<Option<Image>, Failure<String>> {
         match self.steps.pop_front() {
-            Some(Color(periods, n_skipped)) => Ok(Some(image(periods, n_skipped, PixelFormat::Gray8))),
-            Some(Depth(periods)) => Ok(Some(image(periods, 0, PixelFormat::DepthU16 { meters_per_count: 1e-3 }))),
+            Some(Color(periods, n_skipped)) => {
+                Ok(Some(image(periods, n_skipped, PixelFormat::Gray8)))
+            }
+            Some(Depth(periods)) => Ok(Some(image(
+                periods,
+                0,
+                PixelFormat::DepthU16 {
+                    meters_per_count: 1e-3,
+                },
+            ))),
             Some(Streams(mode)) => {
                 stream.mode = Some(mode);
                 Ok(None)
@@ -83,17 +104,23 @@ impl ReopenableCamera for Scripted {
                 Ok(None)
             }
             Some(Lost(problem)) => Err(problem.to_owned().into()),
-            Some(Ends) => Err(Failure::Final(Error::Ended { camera: "front".into() })),
+            Some(Ends) => Err(Failure::Final(Error::Ended {
+                camera: "front".into(),
+            })),
             other => panic!("read instead of {other:?}"),
         }
     }
 
     fn reset(&mut self, _n_tries: u32) -> bool {
-        self.steps.pop_front_if(|step| matches!(step, Resets)).is_some()
+        self.steps
+            .pop_front_if(|step| matches!(step, Resets))
+            .is_some()
     }
 
     fn lost(&self, _waited: Duration, n_tries: u32, last: String) -> Error {
-        Error::Simulation { reason: format!("lost after {n_tries} attempts: {last}") }
+        Error::Simulation {
+            reason: format!("lost after {n_tries} attempts: {last}"),
+        }
     }
 }
 
@@ -111,7 +138,10 @@ fn image(periods: i64, n_skipped: u64, format: PixelFormat) -> Image {
 }
 
 /// A camera that was opened and continues as scripted.
-fn camera(reconnect_for: Duration, steps: impl IntoIterator<Item = Step>) -> Reconnecting<Scripted> {
+fn camera(
+    reconnect_for: Duration,
+    steps: impl IntoIterator<Item = Step>,
+) -> Reconnecting<Scripted> {
     let policy = ReconnectPolicy {
         camera: "front".into(),
         rate_hz: 10.0,
@@ -120,7 +150,11 @@ fn camera(reconnect_for: Duration, steps: impl IntoIterator<Item = Step>) -> Rec
         retry_pause: RETRY_PAUSE,
     };
     let steps = std::iter::once(Opens(Some("gray8"))).chain(steps).collect();
-    let mut device = Scripted { steps, opened_at: Vec::new(), n_open: Arc::default() };
+    let mut device = Scripted {
+        steps,
+        opened_at: Vec::new(),
+        n_open: Arc::default(),
+    };
     let stream = device.open().expect("the first step opens it");
     Reconnecting::new(device, stream, policy)
 }
@@ -157,7 +191,14 @@ fn camera_that_returns_continues_and_counts_missed_images() {
     let (images, end) = read_all(&mut camera);
     assert_eq!(images, [(0, 0), (2, 1), (12, 9), (13, 0), (16, 5), (18, 1)]);
     assert!(matches!(end, Error::Ended { .. }), "{end}");
-    assert_eq!(camera.counts(), CameraCounts { n_images: 6, n_skipped: 16, n_reconnections: 2 });
+    assert_eq!(
+        camera.counts(),
+        CameraCounts {
+            n_images: 6,
+            n_skipped: 16,
+            n_reconnections: 2
+        }
+    );
 }
 
 #[test]
@@ -204,49 +245,83 @@ fn caller_learns_that_the_camera_reconnects() {
         other => panic!("{other:?}"),
     };
     assert!(is_connected(BRIEFLY), "quiet, but connected");
-    assert!(!is_connected(BRIEFLY), "unplugged, and the first attempt fails");
+    assert!(
+        !is_connected(BRIEFLY),
+        "unplugged, and the first attempt fails"
+    );
     // The pause before the second attempt ends, the camera opens, but does not stream yet.
     assert!(!is_connected(2 * RETRY_PAUSE), "opening");
     assert!(is_connected(BRIEFLY), "streaming, but without images");
     assert_eq!(camera.counts().n_reconnections, 1);
     // On a busy machine, one more wait may end before the image.
     let image = std::iter::repeat_with(|| camera.next_image(BRIEFLY)).find_map(Result::ok);
-    assert_eq!(image.map(|image| image.n_skipped), Some(0), "the first image ever");
-    assert!(matches!(camera.next_image(BRIEFLY), Err(Error::NoImage { .. })));
+    assert_eq!(
+        image.map(|image| image.n_skipped),
+        Some(0),
+        "the first image ever"
+    );
+    assert!(matches!(
+        camera.next_image(BRIEFLY),
+        Err(Error::NoImage { .. })
+    ));
 }
 
 #[test]
 fn attempts_are_paused_but_the_first_is_not() {
-    let steps = [Lost("unplugged"), Refuses("absent"), Refuses("absent"), Opens(Some("")), Ends];
+    let steps = [
+        Lost("unplugged"),
+        Refuses("absent"),
+        Refuses("absent"),
+        Opens(Some("")),
+        Ends,
+    ];
     let mut camera = camera(UNLIMITED, steps);
     read_all(&mut camera);
     let opened_at = &camera.device().opened_at;
     let pauses: Vec<Duration> = opened_at.windows(2).map(|pair| pair[1] - pair[0]).collect();
     assert_eq!(pauses.len(), 3);
-    // Pauses are counted from the start of an attempt, which is slightly before the camera is opened.
-    assert!(pauses[1..].iter().all(|pause| *pause > RETRY_PAUSE / 2), "{pauses:?}");
+    // Pauses are counted from the start of an attempt, which is slightly before the camera is
+    // opened.
+    assert!(
+        pauses[1..].iter().all(|pause| *pause > RETRY_PAUSE / 2),
+        "{pauses:?}"
+    );
 
     let mut camera = self::camera(UNLIMITED, [Lost("unplugged"), Opens(Some("")), Color(0, 0)]);
     camera.policy.retry_pause = UNLIMITED;
-    camera.next_image(Duration::from_secs(60)).expect("the first attempt is not delayed");
+    camera
+        .next_image(Duration::from_secs(60))
+        .expect("the first attempt is not delayed");
     let mut camera = self::camera(UNLIMITED, [Lost("unplugged")]);
     camera.policy.first_pause = UNLIMITED;
-    assert!(matches!(camera.next_image(BRIEFLY), Err(Error::Reconnecting { .. })), "unless the policy says so");
+    assert!(
+        matches!(camera.next_image(BRIEFLY), Err(Error::Reconnecting { .. })),
+        "unless the policy says so"
+    );
 }
 
 #[test]
 fn camera_that_stays_away_is_given_up_with_the_last_problem() {
     let steps = |n_refusals| {
         let other_modes = std::iter::repeat_with(|| Refuses("other modes")).take(n_refusals);
-        [Color(0, 0), Lost("unplugged"), Refuses("absent")].into_iter().chain(other_modes)
+        [Color(0, 0), Lost("unplugged"), Refuses("absent")]
+            .into_iter()
+            .chain(other_modes)
     };
     let (images, error) = read_all(&mut camera(ONE_ATTEMPT, steps(0)));
     assert_eq!(images, [(0, 0)]);
-    assert!(error.to_string().ends_with("lost after 1 attempts: absent"), "{error}");
-    // After five pauses, the limit is reached: the sixth attempt is the last. A busy machine makes fewer attempts.
+    assert!(
+        error.to_string().ends_with("lost after 1 attempts: absent"),
+        "{error}"
+    );
+    // After five pauses, the limit is reached: the sixth attempt is the last. A busy machine makes
+    // fewer attempts.
     let (images, error) = read_all(&mut camera(5 * RETRY_PAUSE, steps(5)));
     assert_eq!(images, [(0, 0)]);
-    assert!(error.to_string().ends_with(" attempts: other modes"), "{error}");
+    assert!(
+        error.to_string().ends_with(" attempts: other modes"),
+        "{error}"
+    );
 }
 
 #[test]
@@ -260,14 +335,28 @@ fn camera_that_opens_but_sends_nothing_is_given_up() {
     let mut camera = camera(ONE_ATTEMPT, steps);
     let (images, error) = read_all(&mut camera);
     assert_eq!(images, [(0, 0)]);
-    assert!(error.to_string().ends_with("lost after 1 attempts: silent again"), "{error}");
+    assert!(
+        error
+            .to_string()
+            .ends_with("lost after 1 attempts: silent again"),
+        "{error}"
+    );
     assert_eq!(camera.counts().n_reconnections, 1);
 }
 
 #[test]
 fn image_ends_the_outage() {
-    // With this limit, every failed attempt is the last. The disconnection itself is not an attempt.
-    let steps = [Lost("one"), Opens(Some("")), Color(0, 0), Lost("two"), Opens(Some("")), Color(1, 0), Ends];
+    // With this limit, every failed attempt is the last. The disconnection itself is not an
+    // attempt.
+    let steps = [
+        Lost("one"),
+        Opens(Some("")),
+        Color(0, 0),
+        Lost("two"),
+        Opens(Some("")),
+        Color(1, 0),
+        Ends,
+    ];
     let (images, end) = read_all(&mut camera(ONE_ATTEMPT, steps));
     assert_eq!(images, [(0, 0), (1, 0)]);
     assert!(matches!(end, Error::Ended { .. }), "{end}");
@@ -275,8 +364,20 @@ fn image_ends_the_outage() {
 
 #[test]
 fn final_error_while_reopening_is_returned_at_once() {
-    let mut camera = camera(UNLIMITED, [Lost("unplugged"), Unsupported, Opens(Some("")), Color(0, 0), Ends]);
-    let error = camera.next_image(Duration::from_secs(60)).expect_err("another attempt cannot help").to_string();
+    let mut camera = camera(
+        UNLIMITED,
+        [
+            Lost("unplugged"),
+            Unsupported,
+            Opens(Some("")),
+            Color(0, 0),
+            Ends,
+        ],
+    );
+    let error = camera
+        .next_image(Duration::from_secs(60))
+        .expect_err("another attempt cannot help")
+        .to_string();
     assert!(error.contains("unsupported colors"), "{error}");
     // A caller that insists gets another attempt.
     assert_eq!(read_all(&mut camera).0, [(0, 0)]);
@@ -286,13 +387,27 @@ fn final_error_while_reopening_is_returned_at_once() {
 fn reset_takes_the_place_of_an_attempt() {
     let mut camera = camera(
         UNLIMITED,
-        [Lost("hangs"), Refuses("hangs"), Resets, Opens(Some("")), Lost("hangs"), Resets, Opens(Some("")), Ends],
+        [
+            Lost("hangs"),
+            Refuses("hangs"),
+            Resets,
+            Opens(Some("")),
+            Lost("hangs"),
+            Resets,
+            Opens(Some("")),
+            Ends,
+        ],
     );
     read_all(&mut camera);
     assert_eq!(camera.device().opened_at.len(), 4);
     assert_eq!(camera.counts().n_reconnections, 2);
     // The reset counts as an attempt.
     let steps = [Lost("hangs"), Resets, Refuses("still hangs")];
-    let error = read_all(&mut self::camera(ONE_ATTEMPT, steps)).1.to_string();
-    assert!(error.ends_with("lost after 2 attempts: still hangs"), "{error}");
+    let error = read_all(&mut self::camera(ONE_ATTEMPT, steps))
+        .1
+        .to_string();
+    assert!(
+        error.ends_with("lost after 2 attempts: still hangs"),
+        "{error}"
+    );
 }

@@ -1,7 +1,7 @@
 //! Recordings: write samples to an MCAP file and read them back bit for bit, in the same order.
 //!
-//! `docs/reference/recording.md` lists the topics and describes which samples remain readable after a crash or with a
-//! full disk.
+//! `docs/reference/recording.md` lists the topics and describes which samples remain readable after
+//! a crash or with a full disk.
 
 mod reader;
 mod record;

@@ -1,6 +1,7 @@
 //! Reads samples from an MCAP file, one chunk at a time.
 //!
-//! The file is read sequentially without its index, so a truncated recording yields every sample before the cut.
+//! The file is read sequentially without its index, so a truncated recording yields every sample
+//! before the cut.
 
 use super::record::Record;
 use super::records::{self, RawRecord, ReadError, Records};
@@ -62,8 +63,13 @@ impl Channel {
             Topic::Joints => joint_state::unknown_fields(data),
             Topic::Calibration(_) => Vec::new(),
             topic => {
-                let schema = topic.schemas().iter().find(|schema| schema.name == self.schema_name);
-                let numbers = schema.map(|schema| schema.unknown_fields(data)).unwrap_or_default();
+                let schema = topic
+                    .schemas()
+                    .iter()
+                    .find(|schema| schema.name == self.schema_name);
+                let numbers = schema
+                    .map(|schema| schema.unknown_fields(data))
+                    .unwrap_or_default();
                 numbers.iter().map(u32::to_string).collect()
             }
         }
@@ -74,15 +80,23 @@ impl Recording {
     /// Opens a recording.
     ///
     /// # Errors
-    /// If the file does not exist, is not an MCAP file, or contains no samples recorded by this program.
+    /// If the file does not exist, is not an MCAP file, or contains no samples recorded by this
+    /// program.
     pub fn open(path: &Path) -> Result<Self, Error> {
-        let open = |source| Error::Open { path: path.to_owned(), source };
+        let open = |source| Error::Open {
+            path: path.to_owned(),
+            source,
+        };
         let mut file = files::open(path).map_err(open)?;
         let mut magic = [0; mcap::MAGIC.len()];
         match file.read_exact(&mut magic) {
             Ok(()) if magic == mcap::MAGIC => {}
             Err(e) if e.kind() != std::io::ErrorKind::UnexpectedEof => return Err(open(e)),
-            _ => return Err(Error::NotARecording { path: path.to_owned() }),
+            _ => {
+                return Err(Error::NotARecording {
+                    path: path.to_owned(),
+                });
+            }
         }
         let mut recording = Self {
             path: path.to_owned(),
@@ -104,16 +118,27 @@ impl Recording {
         };
         recording.first = recording.read_sample()?;
         if recording.first.is_none() {
-            return Err(Error::EmptyRecording { path: path.to_owned(), reason: recording.reason_for_no_samples() });
+            return Err(Error::EmptyRecording {
+                path: path.to_owned(),
+                reason: recording.reason_for_no_samples(),
+            });
         }
-        if [RIG_FILE, URDF_FILE].iter().any(|name| recording.attachment(name).is_none()) {
+        if [RIG_FILE, URDF_FILE]
+            .iter()
+            .any(|name| recording.attachment(name).is_none())
+        {
             recording.find_attachments().map_err(open)?;
         }
         Ok(recording)
     }
 
     fn reason_for_no_samples(&self) -> String {
-        let unused: Vec<&str> = self.unused.iter().take(MAX_UNUSED_IN_ERROR).map(String::as_str).collect();
+        let unused: Vec<&str> = self
+            .unused
+            .iter()
+            .take(MAX_UNUSED_IN_ERROR)
+            .map(String::as_str)
+            .collect();
         match &self.damage_kind {
             Some(kind) => format!("; it {kind}"),
             None if unused.is_empty() => String::new(),
@@ -121,23 +146,26 @@ impl Recording {
         }
     }
 
-    /// Returns the attached [`super::RIG_FILE`] or [`super::URDF_FILE`]. Other attachments are not kept.
+    /// Returns the attached [`super::RIG_FILE`] or [`super::URDF_FILE`]. Other attachments are not
+    /// kept.
     pub fn attachment(&self, name: &str) -> Option<&[u8]> {
         self.attachments.get(name).map(Vec::as_slice)
     }
 
-    /// Names of the joints in the order of the joint states, if the recording contains joint states. Available from the
-    /// first sample on.
+    /// Names of the joints in the order of the joint states, if the recording contains joint
+    /// states. Available from the first sample on.
     pub fn joint_names(&self) -> Option<&[String]> {
         self.joint_names.as_deref()
     }
 
-    /// Describes the damage of the file and how much could be read. Available after the last sample.
+    /// Describes the damage of the file and how much could be read. Available after the last
+    /// sample.
     pub fn damage(&self) -> Option<&str> {
         self.damage.as_deref()
     }
 
-    /// Finds attachments behind the first sample. `mcap filter`, `merge` and others write them at the end of the file.
+    /// Finds attachments behind the first sample. `mcap filter`, `merge` and others write them at
+    /// the end of the file.
     fn find_attachments(&mut self) -> std::io::Result<()> {
         let mut file = BufReader::new(files::open(&self.path)?);
         file.seek_relative(i64::try_from(mcap::MAGIC.len()).unwrap_or_default())?;
@@ -147,7 +175,9 @@ impl Recording {
                 Ok(_) => {}
                 Err(error) => {
                     let place = self.path.display().to_string();
-                    self.notes.add_at(place, "attachment", || format!("an attachment is not used, because {error}"));
+                    self.notes.add_at(place, "attachment", || {
+                        format!("an attachment is not used, because {error}")
+                    });
                 }
             }
         }
@@ -198,7 +228,12 @@ impl Recording {
                     }
                     Err(error) => self.end_damaged(&format!("is damaged ({error})")),
                 },
-                Err(ReadError::Read(source)) => return Err(Error::Replay { path: self.path.clone(), source }),
+                Err(ReadError::Read(source)) => {
+                    return Err(Error::Replay {
+                        path: self.path.clone(),
+                        source,
+                    });
+                }
                 Err(read_error) => self.end_damaged(&read_error.to_string()),
             }
         }
@@ -208,8 +243,10 @@ impl Recording {
     fn end_damaged(&mut self, description: &str) {
         self.ended = true;
         self.damage_kind = Some(description.to_owned());
-        self.damage =
-            Some(format!("the recording {:?} {description} after {} readable samples", self.path, self.n_samples));
+        self.damage = Some(format!(
+            "the recording {:?} {description} after {} readable samples",
+            self.path, self.n_samples
+        ));
     }
 
     /// Processes one record and returns a sample if it completes one.
@@ -218,33 +255,45 @@ impl Recording {
             Record::Schema { id, name } => {
                 self.schemas.insert(id, name.to_owned());
             }
-            Record::Channel { id, schema_id, topic: topic_name, encoding, metadata } => {
+            Record::Channel {
+                id,
+                schema_id,
+                topic: topic_name,
+                encoding,
+                metadata,
+            } => {
                 let schema_name = self.schemas.get(&schema_id).cloned().unwrap_or_default();
-                self.announce(id, topic_name, schema_name, encoding, &metadata).map_err(|reason| {
-                    Error::BrokenTopic { path: self.path.clone(), topic: topic_name.to_owned(), reason }
-                })?;
+                self.announce(id, topic_name, schema_name, encoding, &metadata)
+                    .map_err(|reason| Error::BrokenTopic {
+                        path: self.path.clone(),
+                        topic: topic_name.to_owned(),
+                        reason,
+                    })?;
             }
             Record::Attachment { name, data } => self.attach(name, data),
             Record::Metadata { name } => self.report_unused(format!("metadata {name:?}")),
             Record::Message { channel_id, data } => match self.channels.get(&channel_id).cloned() {
                 Some(channel) => {
-                    return self.decode(&channel, data).map_err(|source| Error::BrokenMessage {
-                        path: self.path.clone(),
-                        topic: channel.topic_name,
-                        source,
-                    });
+                    return self
+                        .decode(&channel, data)
+                        .map_err(|source| Error::BrokenMessage {
+                            path: self.path.clone(),
+                            topic: channel.topic_name,
+                            source,
+                        });
                 }
                 None if self.unused_channels.contains(&channel_id) => {}
-                None => {
-                    self.end_damaged(&format!("is damaged (a message on channel {channel_id}, which is not announced)"))
-                }
+                None => self.end_damaged(&format!(
+                    "is damaged (a message on channel {channel_id}, which is not announced)"
+                )),
             },
             Record::Other => {}
         }
         Ok(None)
     }
 
-    /// Takes the announcement of a channel. The error says what its topic contains instead of the expected messages.
+    /// Takes the announcement of a channel. The error says what its topic contains instead of the
+    /// expected messages.
     fn announce(
         &mut self,
         id: u16,
@@ -256,7 +305,11 @@ impl Recording {
         let Some(topic) = Topic::from_name(topic_name) else {
             self.report_unused(format!("topic {topic_name:?}"));
             self.unused_channels.insert(id);
-            return if self.channels.contains_key(&id) { Err(other_channel(id)) } else { Ok(()) };
+            return if self.channels.contains_key(&id) {
+                Err(other_channel(id))
+            } else {
+                Ok(())
+            };
         };
         let (readable, readable_encoding) = topic.readable();
         // Calibrations are not read.
@@ -268,12 +321,24 @@ impl Recording {
             ));
         }
         let used_key = topic.metadata_key();
-        let value = used_key.and_then(|key| metadata.get(key)).map(|value| (*value).to_owned());
+        let value = used_key
+            .and_then(|key| metadata.get(key))
+            .map(|value| (*value).to_owned());
         for key in metadata.keys().filter(|key| Some(**key) != used_key) {
             self.report_unused(format!("metadata {key:?} of topic {topic_name:?}"));
         }
-        let channel = Channel { topic, topic_name: topic_name.to_owned(), schema_name, metadata: value };
-        if self.unused_channels.contains(&id) || self.channels.get(&id).is_some_and(|known| *known != channel) {
+        let channel = Channel {
+            topic,
+            topic_name: topic_name.to_owned(),
+            schema_name,
+            metadata: value,
+        };
+        if self.unused_channels.contains(&id)
+            || self
+                .channels
+                .get(&id)
+                .is_some_and(|known| *known != channel)
+        {
             return Err(other_channel(id));
         }
         if channel.topic == Topic::Joints {
@@ -283,7 +348,8 @@ impl Recording {
         Ok(())
     }
 
-    /// Takes the joint names of a channel. All channels must have the same, because a rig has one arm.
+    /// Takes the joint names of a channel. All channels must have the same, because a rig has one
+    /// arm.
     fn take_joint_names(&mut self, topic_name: &str, names: &str) -> Result<(), String> {
         if names.is_empty() {
             self.notes.add(topic_name, "joint_names", || {
@@ -322,7 +388,8 @@ impl Recording {
             Topic::Color(camera) => Sample::Image(self.image(channel, camera, data)?),
             Topic::Depth(camera) => {
                 let image = self.image(channel, camera, data)?;
-                if let (PixelFormat::DepthU16 { meters_per_count }, Some(listed)) = (image.format, &channel.metadata)
+                if let (PixelFormat::DepthU16 { meters_per_count }, Some(listed)) =
+                    (image.format, &channel.metadata)
                     && listed.parse::<f64>() != Ok(meters_per_count)
                 {
                     self.notes.add(topic_name, "meters_per_count", || {
@@ -335,18 +402,30 @@ impl Recording {
             }
             Topic::Joints => {
                 let state = joint_state::decode(data)?;
-                self.notes.check_joints(topic_name, self.joint_names.as_ref().map(Vec::len), &state);
+                self.notes.check_joints(
+                    topic_name,
+                    self.joint_names.as_ref().map(Vec::len),
+                    &state,
+                );
                 Sample::Joints(state)
             }
             Topic::Base => {
-                self.notes.agree_frames(topic_name, ["world", "base"], data)?;
+                self.notes
+                    .agree_frames(topic_name, ["world", "base"], data)?;
                 let (stamp, world_from_base) = foxglove::decode_transform(data)?;
-                Sample::Base(BasePose { stamp, world_from_base })
+                Sample::Base(BasePose {
+                    stamp,
+                    world_from_base,
+                })
             }
             Topic::TrueBase => {
-                self.notes.agree_frames(topic_name, ["world", "base_truth"], data)?;
+                self.notes
+                    .agree_frames(topic_name, ["world", "base_truth"], data)?;
                 let (stamp, world_from_base) = foxglove::decode_transform(data)?;
-                Sample::BaseTruth(BasePose { stamp, world_from_base })
+                Sample::BaseTruth(BasePose {
+                    stamp,
+                    world_from_base,
+                })
             }
             Topic::Range(scanner) => {
                 let mut scan = point_cloud::decode(data)?;
@@ -363,18 +442,28 @@ impl Recording {
                 return Ok(None);
             }
             Topic::TruePose(camera) => {
-                self.notes.agree_frames(topic_name, ["world", camera.as_str()], data)?;
+                self.notes
+                    .agree_frames(topic_name, ["world", camera.as_str()], data)?;
                 let (stamp, world_from_camera, psnr_ceiling) = foxglove::decode_true_pose(data)?;
                 let depth_m = self.true_depth_m.take().unwrap_or_else(|| Arc::from([]));
                 let color = self.true_color.take();
                 let image = color
                     .filter(|image| *image.camera == **camera && image.stamp == stamp)
-                    .ok_or(Malformed::Missing { name: "true color of this pose" })?;
+                    .ok_or(Malformed::Missing {
+                        name: "true color of this pose",
+                    })?;
                 let n_px = image.size_px[0] as usize * image.size_px[1] as usize;
                 if !depth_m.is_empty() && depth_m.len() != n_px {
-                    return Err(Malformed::Missing { name: "true depth of this pose" });
+                    return Err(Malformed::Missing {
+                        name: "true depth of this pose",
+                    });
                 }
-                Sample::Truth(TruthImage { image, depth_m, world_from_camera, psnr_ceiling })
+                Sample::Truth(TruthImage {
+                    image,
+                    depth_m,
+                    world_from_camera,
+                    psnr_ceiling,
+                })
             }
         }))
     }
@@ -387,11 +476,16 @@ impl Recording {
             (Topic::Depth(_), false) => (color, depth),
             (Topic::Color(_) | Topic::TrueColor(_), true) => (depth, color),
             _ => {
-                self.notes.agree(&channel.topic_name, camera, &mut image.camera);
+                self.notes
+                    .agree(&channel.topic_name, camera, &mut image.camera);
                 return Ok(image);
             }
         };
-        Err(Malformed::Unsupported { name: "encoding", found: found.to_owned(), expected: expected.to_owned() })
+        Err(Malformed::Unsupported {
+            name: "encoding",
+            found: found.to_owned(),
+            expected: expected.to_owned(),
+        })
     }
 }
 
@@ -409,7 +503,12 @@ impl Notes {
         self.add_at(format!("topic {topic:?}"), subject, difference);
     }
 
-    fn add_at(&mut self, place: String, subject: &'static str, difference: impl FnOnce() -> String) {
+    fn add_at(
+        &mut self,
+        place: String,
+        subject: &'static str,
+        difference: impl FnOnce() -> String,
+    ) {
         if let Entry::Vacant(entry) = self.0.entry((place, subject)) {
             let place = entry.key().0.clone();
             let difference = entry.insert(difference());
@@ -431,7 +530,12 @@ impl Notes {
     }
 
     /// Compares the frames of a pose with those of its topic.
-    fn agree_frames(&mut self, topic: &str, expected: [&str; 2], data: &[u8]) -> Result<(), Malformed> {
+    fn agree_frames(
+        &mut self,
+        topic: &str,
+        expected: [&str; 2],
+        data: &[u8],
+    ) -> Result<(), Malformed> {
         let found @ [parent, child] = foxglove::decode_frames(data)?;
         if found == expected {
             return Ok(());
@@ -439,7 +543,11 @@ impl Notes {
         let [expected_parent, expected_child] = expected;
         if [child, parent] == expected {
             let expected = format!("{expected_parent:?}: the pose is inverted");
-            return Err(Malformed::Unsupported { name: "parent_frame_id", found: format!("{parent:?}"), expected });
+            return Err(Malformed::Unsupported {
+                name: "parent_frame_id",
+                found: format!("{parent:?}"),
+                expected,
+            });
         }
         self.add(topic, "frames", || {
             format!(
@@ -456,13 +564,17 @@ impl Notes {
             && n_names != n
         {
             self.add(topic, "position", || {
-                format!("position has {n} numbers, expected one for each of the {n_names} joint_names")
+                format!(
+                    "position has {n} numbers, expected one for each of the {n_names} joint_names"
+                )
             });
         }
         for (name, list) in [("velocity", &state.velocity), ("effort", &state.effort)] {
             if !list.is_empty() && list.len() != n {
                 let n_list = list.len();
-                self.add(topic, name, || format!("{name} has {n_list} numbers, expected none or {n}; it is not used"));
+                self.add(topic, name, || {
+                    format!("{name} has {n_list} numbers, expected none or {n}; it is not used")
+                });
             }
         }
     }

@@ -1,4 +1,5 @@
-//! Decodes the MCAP records that recordings consist of. Lengths are checked against the available bytes before use.
+//! Decodes the MCAP records that recordings consist of. Lengths are checked against the available
+//! bytes before use.
 //!
 //! Source: the MCAP format specification, <https://mcap.dev/spec>, "Records".
 
@@ -55,7 +56,10 @@ impl<'a> Record<'a> {
     pub(super) fn decode(opcode: u8, bytes: &'a [u8]) -> Result<Self, RecordError> {
         let mut fields = Fields(bytes);
         Ok(match opcode {
-            SCHEMA => Self::Schema { id: fields.two()?, name: fields.text()? },
+            SCHEMA => Self::Schema {
+                id: fields.two()?,
+                name: fields.text()?,
+            },
             CHANNEL => {
                 let (id, schema_id, topic) = (fields.two()?, fields.two()?, fields.text()?);
                 let encoding = fields.text()?;
@@ -65,13 +69,22 @@ impl<'a> Record<'a> {
                 while !entries.0.is_empty() {
                     metadata.insert(entries.text()?, entries.text()?);
                 }
-                Self::Channel { id, schema_id, topic, encoding, metadata }
+                Self::Channel {
+                    id,
+                    schema_id,
+                    topic,
+                    encoding,
+                    metadata,
+                }
             }
             MESSAGE => {
                 let channel_id = fields.two()?;
                 let _sequence = fields.four()?;
                 let _times = fields.bytes(8 + 8)?;
-                Self::Message { channel_id, data: fields.0 }
+                Self::Message {
+                    channel_id,
+                    data: fields.0,
+                }
             }
             ATTACHMENT => {
                 let _times = fields.bytes(8 + 8)?;
@@ -81,11 +94,15 @@ impl<'a> Record<'a> {
                 let checksummed = &bytes[..bytes.len() - fields.0.len()];
                 let stored_crc = fields.four()?;
                 if stored_crc != 0 && stored_crc != crc32fast::hash(checksummed) {
-                    return Err(RecordError::Checksum { name: name.chars().take(100).collect() });
+                    return Err(RecordError::Checksum {
+                        name: name.chars().take(100).collect(),
+                    });
                 }
                 Self::Attachment { name, data }
             }
-            METADATA => Self::Metadata { name: fields.text()? },
+            METADATA => Self::Metadata {
+                name: fields.text()?,
+            },
             _ => Self::Other,
         })
     }
@@ -97,7 +114,10 @@ struct Fields<'a>(&'a [u8]);
 impl<'a> Fields<'a> {
     fn bytes(&mut self, n_bytes: u64) -> Result<&'a [u8], RecordError> {
         let n_bytes = usize::try_from(n_bytes).map_err(|_| RecordError::Truncated)?;
-        let (field, rest) = self.0.split_at_checked(n_bytes).ok_or(RecordError::Truncated)?;
+        let (field, rest) = self
+            .0
+            .split_at_checked(n_bytes)
+            .ok_or(RecordError::Truncated)?;
         self.0 = rest;
         Ok(field)
     }
@@ -131,11 +151,22 @@ mod tests {
     use super::*;
 
     fn text(text: &str) -> Vec<u8> {
-        [&u32::try_from(text.len()).expect("short").to_le_bytes()[..], text.as_bytes()].concat()
+        [
+            &u32::try_from(text.len()).expect("short").to_le_bytes()[..],
+            text.as_bytes(),
+        ]
+        .concat()
     }
 
     fn attachment(checksum: impl Fn(&[u8]) -> u32) -> Vec<u8> {
-        let body = [&[0; 16][..], &text("rig.toml"), &text("text/plain"), &3_u64.to_le_bytes(), b"abc"].concat();
+        let body = [
+            &[0; 16][..],
+            &text("rig.toml"),
+            &text("text/plain"),
+            &3_u64.to_le_bytes(),
+            b"abc",
+        ]
+        .concat();
         [&body[..], &checksum(&body).to_le_bytes()].concat()
     }
 
@@ -143,15 +174,45 @@ mod tests {
     fn records_decode_and_truncated_ones_fail() {
         let entries = [text("joint_names"), text("a,b")].concat();
         let n_entries = u32::try_from(entries.len()).expect("short").to_le_bytes();
-        let channel = [&[7, 0, 3, 0][..], &text("/joints"), &text("json"), &n_entries, &entries].concat();
+        let channel = [
+            &[7, 0, 3, 0][..],
+            &text("/joints"),
+            &text("json"),
+            &n_entries,
+            &entries,
+        ]
+        .concat();
         let schema = [&[3, 0][..], &text("s"), &text("jsonschema"), &text("{}")].concat();
         let complete = attachment(crc32fast::hash);
         let metadata = BTreeMap::from([("joint_names", "a,b")]);
         for (opcode, bytes, expected) in [
-            (CHANNEL, &channel, Record::Channel { id: 7, schema_id: 3, topic: "/joints", encoding: "json", metadata }),
+            (
+                CHANNEL,
+                &channel,
+                Record::Channel {
+                    id: 7,
+                    schema_id: 3,
+                    topic: "/joints",
+                    encoding: "json",
+                    metadata,
+                },
+            ),
             (SCHEMA, &schema, Record::Schema { id: 3, name: "s" }),
-            (ATTACHMENT, &complete, Record::Attachment { name: "rig.toml", data: b"abc" }),
-            (METADATA, &text("calibration"), Record::Metadata { name: "calibration" }),
+            (
+                ATTACHMENT,
+                &complete,
+                Record::Attachment {
+                    name: "rig.toml",
+                    data: b"abc",
+                },
+            ),
+            (
+                METADATA,
+                &text("calibration"),
+                Record::Metadata {
+                    name: "calibration",
+                },
+            ),
         ] {
             assert_eq!(Record::decode(opcode, bytes), Ok(expected));
             for n_bytes in 0..7 {
@@ -170,13 +231,21 @@ mod tests {
         );
         let damaged = attachment(|_| 1);
         let checksum_error = Record::decode(ATTACHMENT, &damaged);
-        assert_eq!(checksum_error, Err(RecordError::Checksum { name: "rig.toml".to_owned() }));
+        assert_eq!(
+            checksum_error,
+            Err(RecordError::Checksum {
+                name: "rig.toml".to_owned()
+            })
+        );
     }
 
     #[test]
     fn huge_length_allocates_no_memory() {
         let huge = [&[7, 0, 3, 0][..], &u32::MAX.to_le_bytes(), b"/joints"].concat();
         assert_eq!(Record::decode(CHANNEL, &huge), Err(RecordError::Truncated));
-        assert_eq!(Record::decode(SCHEMA, &[1, 0, 1, 0, 0, 0, 0xff]), Err(RecordError::Text));
+        assert_eq!(
+            Record::decode(SCHEMA, &[1, 0, 1, 0, 0, 0, 0xff]),
+            Err(RecordError::Text)
+        );
     }
 }

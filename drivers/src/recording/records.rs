@@ -1,8 +1,8 @@
 //! Reads the records of an MCAP file sequentially, inside and outside of chunks.
 //!
-//! Source: the MCAP format specification, <https://mcap.dev/spec>. Memory is allocated for received bytes, not for
-//! declared lengths. The recorder writes uncompressed chunks, whose records are available as soon as they are complete;
-//! a compressed chunk is decompressed as a whole.
+//! Source: the MCAP format specification, <https://mcap.dev/spec>. Memory is allocated for received
+//! bytes, not for declared lengths. The recorder writes uncompressed chunks, whose records are
+//! available as soon as they are complete; a compressed chunk is decompressed as a whole.
 
 use crc32fast::Hasher;
 use files::Budget;
@@ -14,8 +14,8 @@ use std::io::{Cursor, Read, Seek, SeekFrom};
 const MAX_PREALLOCATED_BYTES: u64 = 1 << 20;
 /// Length of a record's header: opcode and length.
 const HEAD_BYTES: usize = 1 + 8;
-/// Length of a chunk's header up to the name of the compression: times, uncompressed length, checksum, length of the
-/// name.
+/// Length of a chunk's header up to the name of the compression: times, uncompressed length,
+/// checksum, length of the name.
 const CHUNK_HEAD_BYTES: usize = 8 + 8 + 8 + 4 + 4;
 
 const FOOTER: u8 = 0x02;
@@ -37,7 +37,9 @@ pub(super) enum ReadError {
     Decompress { reason: String },
     #[error("is damaged (a chunk decompresses to {n_bytes} bytes, expected {declared_bytes})")]
     DecompressedLength { n_bytes: u64, declared_bytes: u64 },
-    #[error("cannot be read (its chunks are compressed with {compression:?}, supported are zstd and lz4)")]
+    #[error(
+        "cannot be read (its chunks are compressed with {compression:?}, supported are zstd and lz4)"
+    )]
     Compression { compression: String },
     #[error("cannot be read")]
     Read(#[from] std::io::Error),
@@ -73,7 +75,11 @@ pub(super) struct RawRecord {
 
 impl<R: Read> Records<R> {
     pub(super) fn new(input: R) -> Self {
-        Self { input, chunk: None, ended: false }
+        Self {
+            input,
+            chunk: None,
+            ended: false,
+        }
     }
 
     /// Returns the next record, or `None` at the footer and after an error.
@@ -88,16 +94,30 @@ impl<R: Read> Records<R> {
             if let Some(chunk) = self.chunk.take_if(|chunk| chunk.n_remaining == 0) {
                 let computed = chunk.hasher.finalize();
                 if chunk.checksum != 0 && chunk.checksum != computed {
-                    return Err(ReadError::Checksum { reported: chunk.checksum, computed });
+                    return Err(ReadError::Checksum {
+                        reported: chunk.checksum,
+                        computed,
+                    });
                 }
                 self.skip(chunk.n_padding)?;
             }
-            let Some(Chunk { decompressed, n_remaining, hasher, .. }) = &mut self.chunk else {
+            let Some(Chunk {
+                decompressed,
+                n_remaining,
+                hasher,
+                ..
+            }) = &mut self.chunk
+            else {
                 let (opcode, n_bytes, _) = head_of(&mut self.input)?;
                 match opcode {
                     CHUNK => self.chunk = Some(self.begin_chunk(n_bytes)?),
                     FOOTER => return Ok(None),
-                    _ => return Ok(Some(RawRecord { opcode, bytes: bytes_of(&mut self.input, n_bytes)? })),
+                    _ => {
+                        return Ok(Some(RawRecord {
+                            opcode,
+                            bytes: bytes_of(&mut self.input, n_bytes)?,
+                        }));
+                    }
                 }
                 continue;
             };
@@ -110,7 +130,9 @@ impl<R: Read> Records<R> {
             }
             let (opcode, n_bytes, head) = head_of(&mut *input)?;
             let n_total = n_bytes.saturating_add(HEAD_BYTES as u64);
-            *n_remaining = n_remaining.checked_sub(n_total).ok_or(ReadError::ExceedsChunk)?;
+            *n_remaining = n_remaining
+                .checked_sub(n_total)
+                .ok_or(ReadError::ExceedsChunk)?;
             let bytes = bytes_of(input, n_bytes)?;
             hasher.update(&head);
             hasher.update(&bytes);
@@ -120,31 +142,53 @@ impl<R: Read> Records<R> {
 
     fn begin_chunk(&mut self, n_bytes: u64) -> Result<Chunk, ReadError> {
         let head: [u8; CHUNK_HEAD_BYTES] = array(&mut self.input)?;
-        let four = |at: usize| u32::from_le_bytes([head[at], head[at + 1], head[at + 2], head[at + 3]]);
+        let four =
+            |at: usize| u32::from_le_bytes([head[at], head[at + 1], head[at + 2], head[at + 3]]);
         let n_uncompressed = u64::from(four(16)) | u64::from(four(20)) << 32;
         let (checksum, n_name) = (four(24), u64::from(four(28)));
         let compression = bytes_of(&mut self.input, n_name)?;
         let n_stored = u64::from_le_bytes(array(&mut self.input)?);
         let n_head = CHUNK_HEAD_BYTES as u64 + n_name + 8;
-        let n_padding =
-            n_bytes.checked_sub(n_head).and_then(|n| n.checked_sub(n_stored)).ok_or(ReadError::ExceedsChunk)?;
+        let n_padding = n_bytes
+            .checked_sub(n_head)
+            .and_then(|n| n.checked_sub(n_stored))
+            .ok_or(ReadError::ExceedsChunk)?;
         let (decompressed, n_remaining) = if compression.is_empty() {
             (None, n_stored)
         } else {
             let decompress = decompressor(&compression)?;
             let stored = bytes_of(&mut self.input, n_stored)?;
-            (Some(Cursor::new(decompress_all(decompress, &stored, n_uncompressed)?)), n_uncompressed)
+            (
+                Some(Cursor::new(decompress_all(
+                    decompress,
+                    &stored,
+                    n_uncompressed,
+                )?)),
+                n_uncompressed,
+            )
         };
-        Ok(Chunk { decompressed, n_remaining, n_padding, checksum, hasher: Hasher::new() })
+        Ok(Chunk {
+            decompressed,
+            n_remaining,
+            n_padding,
+            checksum,
+            hasher: Hasher::new(),
+        })
     }
 
     fn skip(&mut self, n_bytes: u64) -> Result<(), ReadError> {
-        let n_skipped = std::io::copy(&mut self.input.by_ref().take(n_bytes), &mut std::io::sink())?;
-        if n_skipped == n_bytes { Ok(()) } else { Err(ReadError::Truncated) }
+        let n_skipped =
+            std::io::copy(&mut self.input.by_ref().take(n_bytes), &mut std::io::sink())?;
+        if n_skipped == n_bytes {
+            Ok(())
+        } else {
+            Err(ReadError::Truncated)
+        }
     }
 }
 
-/// Reads the attachments of a file after its leading magic bytes, and skips everything else. Damage ends the search.
+/// Reads the attachments of a file after its leading magic bytes, and skips everything else. Damage
+/// ends the search.
 pub(super) fn attachments(mut input: impl Read + Seek) -> Vec<RawRecord> {
     let mut attachments = Vec::new();
     while let Ok((opcode, n_bytes, _)) = head_of(&mut input) {
@@ -154,7 +198,8 @@ pub(super) fn attachments(mut input: impl Read + Seek) -> Vec<RawRecord> {
                 Ok(bytes) => attachments.push(RawRecord { opcode, bytes }),
                 Err(_) => break,
             },
-            _ => match i64::try_from(n_bytes).map(|n_bytes| input.seek(SeekFrom::Current(n_bytes))) {
+            _ => match i64::try_from(n_bytes).map(|n_bytes| input.seek(SeekFrom::Current(n_bytes)))
+            {
                 Ok(Ok(_)) => {}
                 _ => break,
             },
@@ -171,26 +216,34 @@ fn head_of(input: impl Read) -> Result<(u8, u64, [u8; HEAD_BYTES]), ReadError> {
 
 fn array<const N: usize>(mut input: impl Read) -> Result<[u8; N], ReadError> {
     let mut bytes = [0; N];
-    input.read_exact(&mut bytes).map_err(|error| match error.kind() {
-        std::io::ErrorKind::UnexpectedEof => ReadError::Truncated,
-        _ => error.into(),
-    })?;
+    input
+        .read_exact(&mut bytes)
+        .map_err(|error| match error.kind() {
+            std::io::ErrorKind::UnexpectedEof => ReadError::Truncated,
+            _ => error.into(),
+        })?;
     Ok(bytes)
 }
 
-/// Reads the given number of bytes; more than [`Budget::RECORD`] are damage. Memory grows with the bytes received.
+/// Reads the given number of bytes; more than [`Budget::RECORD`] are damage. Memory grows with the
+/// bytes received.
 fn bytes_of(input: &mut (impl Read + ?Sized), n_bytes: u64) -> Result<Vec<u8>, ReadError> {
     if Budget::RECORD.check_bytes(n_bytes).is_err() {
         return Err(ReadError::TooLong { n_bytes });
     }
-    let n_preallocated = usize::try_from(n_bytes.min(MAX_PREALLOCATED_BYTES)).expect("at most one megabyte");
+    let n_preallocated =
+        usize::try_from(n_bytes.min(MAX_PREALLOCATED_BYTES)).expect("at most one megabyte");
     let mut bytes = Vec::with_capacity(n_preallocated);
     input.take(n_bytes).read_to_end(&mut bytes)?;
-    if bytes.len() as u64 == n_bytes { Ok(bytes) } else { Err(ReadError::Truncated) }
+    if bytes.len() as u64 == n_bytes {
+        Ok(bytes)
+    } else {
+        Err(ReadError::Truncated)
+    }
 }
 
-/// A function that appends at most the given number of decompressed bytes of one frame, and advances the input past the
-/// bytes read.
+/// A function that appends at most the given number of decompressed bytes of one frame, and
+/// advances the input past the bytes read.
 type Decompress = fn(&mut &[u8], u64, &mut Vec<u8>) -> std::io::Result<()>;
 
 /// Returns the decompressor for the name of a compression in the file.
@@ -198,7 +251,9 @@ fn decompressor(compression: &[u8]) -> Result<Decompress, ReadError> {
     match compression {
         b"zstd" => Ok(decompress_zstd),
         b"lz4" => Ok(decompress_lz4),
-        other => Err(ReadError::Compression { compression: String::from_utf8_lossy(other).chars().take(20).collect() }),
+        other => Err(ReadError::Compression {
+            compression: String::from_utf8_lossy(other).chars().take(20).collect(),
+        }),
     }
 }
 
@@ -208,21 +263,43 @@ fn decompress_zstd(frames: &mut &[u8], n_bytes: u64, records: &mut Vec<u8>) -> s
 }
 
 fn decompress_lz4(frames: &mut &[u8], n_bytes: u64, records: &mut Vec<u8>) -> std::io::Result<()> {
-    FrameDecoder::new(frames).take(n_bytes).read_to_end(records).map(drop)
+    FrameDecoder::new(frames)
+        .take(n_bytes)
+        .read_to_end(records)
+        .map(drop)
 }
 
 /// Decompresses the frames of a chunk to the declared number of bytes.
-fn decompress_all(decompress: Decompress, mut frames: &[u8], declared_bytes: u64) -> Result<Vec<u8>, ReadError> {
+fn decompress_all(
+    decompress: Decompress,
+    mut frames: &[u8],
+    declared_bytes: u64,
+) -> Result<Vec<u8>, ReadError> {
     if Budget::RECORD.check_bytes(declared_bytes).is_err() {
-        return Err(ReadError::TooLong { n_bytes: declared_bytes });
+        return Err(ReadError::TooLong {
+            n_bytes: declared_bytes,
+        });
     }
     let mut records = Vec::new();
     while (records.len() as u64) < declared_bytes && !frames.is_empty() {
-        decompress(&mut frames, declared_bytes - records.len() as u64, &mut records)
-            .map_err(|error| ReadError::Decompress { reason: error.to_string() })?;
+        decompress(
+            &mut frames,
+            declared_bytes - records.len() as u64,
+            &mut records,
+        )
+        .map_err(|error| ReadError::Decompress {
+            reason: error.to_string(),
+        })?;
     }
     let n_bytes = records.len() as u64;
-    if n_bytes == declared_bytes { Ok(records) } else { Err(ReadError::DecompressedLength { n_bytes, declared_bytes }) }
+    if n_bytes == declared_bytes {
+        Ok(records)
+    } else {
+        Err(ReadError::DecompressedLength {
+            n_bytes,
+            declared_bytes,
+        })
+    }
 }
 
 #[cfg(test)]
@@ -234,9 +311,17 @@ mod tests {
         [&[opcode][..], &(bytes.len() as u64).to_le_bytes(), bytes].concat()
     }
 
-    /// A chunk with the given bytes of records, declared lengths and checksum, followed by three extra bytes.
-    fn chunk(records: &[u8], [n_stored, n_uncompressed]: [usize; 2], checksum: u32, compression: &str) -> Vec<u8> {
-        let n_name = u32::try_from(compression.len()).expect("short").to_le_bytes();
+    /// A chunk with the given bytes of records, declared lengths and checksum, followed by three
+    /// extra bytes.
+    fn chunk(
+        records: &[u8],
+        [n_stored, n_uncompressed]: [usize; 2],
+        checksum: u32,
+        compression: &str,
+    ) -> Vec<u8> {
+        let n_name = u32::try_from(compression.len())
+            .expect("short")
+            .to_le_bytes();
         let length = |n_bytes: usize| (n_bytes as u64).to_le_bytes();
         let head = [
             &[0; 16][..],
@@ -279,9 +364,12 @@ mod tests {
         let inner = [record(5, b"five"), record(4, b"")].concat();
         let checksum = crc32fast::hash(&inner);
         let footer = record(FOOTER, &[0; 20]);
-        let expected: Vec<(u8, Vec<u8>)> =
-            [(1, "one"), (5, "five"), (4, ""), (7, "seven")].map(|(opcode, text)| (opcode, text.into())).into();
-        let two_frames = |compress: fn(&[u8]) -> Vec<u8>| [compress(&inner[..9]), compress(&inner[9..])].concat();
+        let expected: Vec<(u8, Vec<u8>)> = [(1, "one"), (5, "five"), (4, ""), (7, "seven")]
+            .map(|(opcode, text)| (opcode, text.into()))
+            .into();
+        let two_frames = |compress: fn(&[u8]) -> Vec<u8>| {
+            [compress(&inner[..9]), compress(&inner[9..])].concat()
+        };
         for (stored, compression) in [
             (inner.clone(), ""),
             (zstd(&inner), "zstd"),
@@ -290,7 +378,13 @@ mod tests {
             (two_frames(lz4), "lz4"),
         ] {
             let chunk = chunk(&stored, [stored.len(), inner.len()], checksum, compression);
-            let file = [record(1, b"one"), chunk, record(7, b"seven"), footer.clone()].concat();
+            let file = [
+                record(1, b"one"),
+                chunk,
+                record(7, b"seven"),
+                footer.clone(),
+            ]
+            .concat();
             assert_eq!(read(&file), (expected.clone(), None), "{compression}");
             for n_bytes in 0..file.len() - 28 {
                 let (before, reported) = read(&file[..n_bytes]);
@@ -310,24 +404,63 @@ mod tests {
         let [zstd, lz4] = [zstd(&inner), lz4(&inner)];
         let [n_zstd, n_lz4] = [zstd.len(), lz4.len()];
         for (bytes, reason) in [
-            (chunk(&inner, [n - 1, n - 1], 0, ""), "longer than the chunk"),
-            (chunk(&inner, [n + 1, n + 1], 0, ""), "longer than the chunk"),
-            (chunk(&inner, [n + 4, n + 4], 0, ""), "longer than the chunk"),
-            (chunk(&inner, [usize::MAX, n], 0, ""), "longer than the chunk"),
+            (
+                chunk(&inner, [n - 1, n - 1], 0, ""),
+                "longer than the chunk",
+            ),
+            (
+                chunk(&inner, [n + 1, n + 1], 0, ""),
+                "longer than the chunk",
+            ),
+            (
+                chunk(&inner, [n + 4, n + 4], 0, ""),
+                "longer than the chunk",
+            ),
+            (
+                chunk(&inner, [usize::MAX, n], 0, ""),
+                "longer than the chunk",
+            ),
             (chunk(&inner, [n, n], 1, ""), "checksum"),
-            (chunk(&inner, [n, n], 0, "brotli"), "compressed with \"brotli\", supported are zstd and lz4"),
+            (
+                chunk(&inner, [n, n], 0, "brotli"),
+                "compressed with \"brotli\", supported are zstd and lz4",
+            ),
             (chunk(&zstd, [n_zstd, n], 1, "zstd"), "checksum"),
             (chunk(&lz4, [n_lz4, n], 1, "lz4"), "checksum"),
-            (chunk(&zstd, [n_zstd, n - 1], 0, "zstd"), "longer than the chunk"),
-            (chunk(&lz4, [n_lz4, n - 1], 0, "lz4"), "longer than the chunk"),
-            (chunk(&zstd, [n_zstd, n + 1], 0, "zstd"), "decompresses to 13 bytes, expected 14"),
-            (chunk(&lz4, [n_lz4, n + 1], 0, "lz4"), "decompresses to 13 bytes, expected 14"),
-            (chunk(&zstd[..n_zstd - 1], [n_zstd - 1, n], 0, "zstd"), "cannot be decompressed"),
+            (
+                chunk(&zstd, [n_zstd, n - 1], 0, "zstd"),
+                "longer than the chunk",
+            ),
+            (
+                chunk(&lz4, [n_lz4, n - 1], 0, "lz4"),
+                "longer than the chunk",
+            ),
+            (
+                chunk(&zstd, [n_zstd, n + 1], 0, "zstd"),
+                "decompresses to 13 bytes, expected 14",
+            ),
+            (
+                chunk(&lz4, [n_lz4, n + 1], 0, "lz4"),
+                "decompresses to 13 bytes, expected 14",
+            ),
+            (
+                chunk(&zstd[..n_zstd - 1], [n_zstd - 1, n], 0, "zstd"),
+                "cannot be decompressed",
+            ),
             (chunk(&inner, [n, n], 0, "zstd"), "cannot be decompressed"),
             (chunk(&inner, [n, n], 0, "lz4"), "cannot be decompressed"),
-            (chunk(&zstd, [n_zstd, usize::MAX], 0, "zstd"), "a record of 18446744073709551615 bytes"),
-            ([&[3][..], &u64::MAX.to_le_bytes()].concat(), "a record of 18446744073709551615 bytes"),
-            ([&[3][..], &(400_u64 << 20).to_le_bytes()].concat(), "is truncated"),
+            (
+                chunk(&zstd, [n_zstd, usize::MAX], 0, "zstd"),
+                "a record of 18446744073709551615 bytes",
+            ),
+            (
+                [&[3][..], &u64::MAX.to_le_bytes()].concat(),
+                "a record of 18446744073709551615 bytes",
+            ),
+            (
+                [&[3][..], &(400_u64 << 20).to_le_bytes()].concat(),
+                "is truncated",
+            ),
         ] {
             let reported = read(&[bytes, record(1, b"one")].concat()).1.expect(reason);
             assert!(reported.contains(reason), "{reported}, expected {reason}");

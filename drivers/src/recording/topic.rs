@@ -1,6 +1,8 @@
 //! Topics of a recording and their contents.
 
-use crate::wire::descriptor::{CAMERA_CALIBRATION, COMPRESSED_IMAGE, FRAME_TRANSFORM, POINT_CLOUD, RAW_IMAGE, Schema};
+use crate::wire::descriptor::{
+    CAMERA_CALIBRATION, COMPRESSED_IMAGE, FRAME_TRANSFORM, POINT_CLOUD, RAW_IMAGE, Schema,
+};
 use crate::wire::joint_state;
 
 /// Metadata key of the joint names, separated by commas, in the channel of the joints.
@@ -70,7 +72,10 @@ impl Topic {
     pub(super) fn readable(&self) -> (Vec<&'static str>, &'static str) {
         match self {
             Self::Joints => (vec![joint_state::SCHEMA_NAME], JSON),
-            _ => (self.schemas().iter().map(|schema| schema.name).collect(), PROTOBUF),
+            _ => (
+                self.schemas().iter().map(|schema| schema.name).collect(),
+                PROTOBUF,
+            ),
         }
     }
 
@@ -91,7 +96,10 @@ impl Topic {
             "/base/truth" => return Some(Self::TrueBase),
             _ => {}
         }
-        if let Some(scanner) = name.strip_prefix("/range/").and_then(|rest| rest.strip_suffix("/points")) {
+        if let Some(scanner) = name
+            .strip_prefix("/range/")
+            .and_then(|rest| rest.strip_suffix("/points"))
+        {
             return Some(Self::Range(scanner.to_owned()));
         }
         let (camera, kind) = name.strip_prefix("/camera/")?.split_once('/')?;
@@ -160,7 +168,13 @@ mod tests {
         ] {
             assert_eq!(Topic::from_name(&topic.name()), Some(topic));
         }
-        for strange in ["/camera/wrist", "/camera/wrist/infrared", "/range/lidar", "/tf", ""] {
+        for strange in [
+            "/camera/wrist",
+            "/camera/wrist/infrared",
+            "/range/lidar",
+            "/tf",
+            "",
+        ] {
             assert_eq!(Topic::from_name(strange), None, "{strange}");
         }
     }

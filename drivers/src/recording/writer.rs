@@ -29,11 +29,13 @@ pub struct RecordingMetadata<'a> {
     pub joint_names: &'a [String],
 }
 
-/// A recording being written. After an error, nothing more can be written, but earlier samples remain readable.
-/// Dropping this value completes the file. If no sample was written, the file is removed.
+/// A recording being written. After an error, nothing more can be written, but earlier samples
+/// remain readable. Dropping this value completes the file. If no sample was written, the file is
+/// removed.
 pub struct Recorder {
     path: PathBuf,
-    /// The file, which somebody may remove or rename while it is written; `None` if it cannot be watched.
+    /// The file, which somebody may remove or rename while it is written; `None` if it cannot be
+    /// watched.
     kept: Option<Kept>,
     /// Where the file was at the last check.
     place: Place,
@@ -59,11 +61,17 @@ impl Recorder {
     /// Starts a recording in a new file.
     ///
     /// # Errors
-    /// If the file cannot be created, or already exists, because it may be the recording that is being replayed.
+    /// If the file cannot be created, or already exists, because it may be the recording that is
+    /// being replayed.
     pub fn create(path: &Path, recording_metadata: &RecordingMetadata<'_>) -> Result<Self, Error> {
         let file = File::create_new(path).map_err(|source| match source.kind() {
-            ErrorKind::AlreadyExists => Error::Exists { path: path.to_owned() },
-            _ => Error::Open { path: path.to_owned(), source },
+            ErrorKind::AlreadyExists => Error::Exists {
+                path: path.to_owned(),
+            },
+            _ => Error::Open {
+                path: path.to_owned(),
+                source,
+            },
         })?;
         let recorder = Self::to(Box::new(BufWriter::new(file)), path, recording_metadata);
         if recorder.is_err() {
@@ -72,9 +80,16 @@ impl Recorder {
         recorder
     }
 
-    fn to(sink: Box<dyn Sink>, path: &Path, recording_metadata: &RecordingMetadata<'_>) -> Result<Self, Error> {
-        let recorder =
-            |error| Error::Record { path: path.to_owned(), recorded: RecordedSpan::default(), source: io_error(error) };
+    fn to(
+        sink: Box<dyn Sink>,
+        path: &Path,
+        recording_metadata: &RecordingMetadata<'_>,
+    ) -> Result<Self, Error> {
+        let recorder = |error| Error::Record {
+            path: path.to_owned(),
+            recorded: RecordedSpan::default(),
+            source: io_error(error),
+        };
         let options = mcap::WriteOptions::new()
             .profile("fieldrig")
             .compression(None)
@@ -123,9 +138,14 @@ impl Recorder {
     /// # Errors
     /// If some data could not be written.
     pub fn finish(mut self) -> Result<RecordedSpan, Error> {
-        let closed = self.close_chunk().and_then(|()| self.mcap()?.finish().map(drop));
+        let closed = self
+            .close_chunk()
+            .and_then(|()| self.mcap()?.finish().map(drop));
         closed.map_err(|error| self.fail(error))?;
-        let flushed = self.mcap.take().map_or(Ok(()), |mcap| mcap.into_inner().flush());
+        let flushed = self
+            .mcap
+            .take()
+            .map_or(Ok(()), |mcap| mcap.into_inner().flush());
         flushed.map_err(|error| self.fail(McapError::Io(error)))?;
         self.check_place();
         if self.recorded.n_samples == 0 {
@@ -149,9 +169,14 @@ impl Recorder {
         match &place {
             Place::Here => log::info!("the recording {shown} is at its path again"),
             Place::MovedTo(to) => {
-                log::warn!("the recording {shown} was moved to {}, and continues there", to.display())
+                log::warn!(
+                    "the recording {shown} was moved to {}, and continues there",
+                    to.display()
+                )
             }
-            Place::Removed => log::warn!("the recording {shown} was removed: it is written again at the end"),
+            Place::Removed => {
+                log::warn!("the recording {shown} was removed: it is written again at the end")
+            }
         }
         self.place = place;
     }
@@ -164,27 +189,37 @@ impl Recorder {
     }
 
     fn mcap(&mut self) -> mcap::McapResult<&mut mcap::Writer<Box<dyn Sink>>> {
-        self.mcap.as_mut().ok_or_else(|| McapError::Io(std::io::Error::other("an earlier write failed")))
+        self.mcap
+            .as_mut()
+            .ok_or_else(|| McapError::Io(std::io::Error::other("an earlier write failed")))
     }
 
-    /// Closes the file after a failure. The error reports how much of it is readable. A file without samples is
-    /// removed.
+    /// Closes the file after a failure. The error reports how much of it is readable. A file
+    /// without samples is removed.
     fn fail(&mut self, error: McapError) -> Error {
         if self.mcap.take().is_some() {
-            // The truncated chunk also contains readable samples, so they are counted by reading the file.
+            // The truncated chunk also contains readable samples, so they are counted by reading
+            // the file.
             self.recorded = readable(&self.path);
             if self.recorded.n_samples == 0 {
                 self.remove_stub();
             }
         }
-        Error::Record { path: self.path.clone(), recorded: self.recorded, source: io_error(error) }
+        Error::Record {
+            path: self.path.clone(),
+            recorded: self.recorded,
+            source: io_error(error),
+        }
     }
 
     /// Closes the open chunk, which writes all samples to the file.
     fn close_chunk(&mut self) -> mcap::McapResult<()> {
         self.mcap()?.flush()?;
         self.check_place();
-        self.recorded = RecordedSpan { n_samples: self.n_samples, seconds: duration_secs(self.stamps) };
+        self.recorded = RecordedSpan {
+            n_samples: self.n_samples,
+            seconds: duration_secs(self.stamps),
+        };
         self.open_bytes = 0;
         Ok(())
     }
@@ -192,17 +227,27 @@ impl Recorder {
     fn try_write(&mut self, sample: &Sample) -> mcap::McapResult<()> {
         let stamp = sample.stamp();
         if self.n_messages == 0 && !self.joint_names.is_empty() {
-            // The channel is announced before all samples, so that readers know the joints immediately.
+            // The channel is announced before all samples, so that readers know the joints
+            // immediately.
             self.joints_channel()?;
         }
         for (camera, intrinsics) in std::mem::take(&mut self.cameras) {
             let message = foxglove::encode_calibration(&camera, stamp, &intrinsics);
-            self.write_message(Topic::Calibration(camera), descriptor::CAMERA_CALIBRATION, stamp, &message)?;
+            self.write_message(
+                Topic::Calibration(camera),
+                descriptor::CAMERA_CALIBRATION,
+                stamp,
+                &message,
+            )?;
         }
         match sample {
             Sample::Image(image) => {
                 let camera = image.camera.to_string();
-                let topic = if image.is_depth() { Topic::Depth(camera) } else { Topic::Color(camera) };
+                let topic = if image.is_depth() {
+                    Topic::Depth(camera)
+                } else {
+                    Topic::Color(camera)
+                };
                 self.write_image(topic, image)?;
             }
             Sample::Joints(state) => {
@@ -210,16 +255,28 @@ impl Recorder {
                 self.append(channel, stamp, &joint_state::encode(state))?;
             }
             Sample::Base(pose) => {
-                let message = foxglove::encode_transform("world", "base", stamp, &pose.world_from_base);
+                let message =
+                    foxglove::encode_transform("world", "base", stamp, &pose.world_from_base);
                 self.write_message(Topic::Base, descriptor::FRAME_TRANSFORM, stamp, &message)?;
             }
             Sample::BaseTruth(pose) => {
-                let message = foxglove::encode_transform("world", "base_truth", stamp, &pose.world_from_base);
-                self.write_message(Topic::TrueBase, descriptor::FRAME_TRANSFORM, stamp, &message)?;
+                let message =
+                    foxglove::encode_transform("world", "base_truth", stamp, &pose.world_from_base);
+                self.write_message(
+                    Topic::TrueBase,
+                    descriptor::FRAME_TRANSFORM,
+                    stamp,
+                    &message,
+                )?;
             }
             Sample::Range(scan) => {
                 let message = point_cloud::encode(scan);
-                self.write_message(Topic::Range(scan.scanner.to_string()), descriptor::POINT_CLOUD, stamp, &message)?;
+                self.write_message(
+                    Topic::Range(scan.scanner.to_string()),
+                    descriptor::POINT_CLOUD,
+                    stamp,
+                    &message,
+                )?;
             }
             Sample::Truth(truth) => self.write_truth(truth)?,
         }
@@ -238,19 +295,38 @@ impl Recorder {
         let stamp = truth.image.stamp;
         self.write_image(Topic::TrueColor(camera()), &truth.image)?;
         if !truth.depth_m.is_empty() {
-            let message = foxglove::encode_depth_m(&camera(), stamp, truth.image.size_px, &truth.depth_m);
-            self.write_message(Topic::TrueDepth(camera()), descriptor::RAW_IMAGE, stamp, &message)?;
+            let message =
+                foxglove::encode_depth_m(&camera(), stamp, truth.image.size_px, &truth.depth_m);
+            self.write_message(
+                Topic::TrueDepth(camera()),
+                descriptor::RAW_IMAGE,
+                stamp,
+                &message,
+            )?;
         }
-        let message = foxglove::encode_true_pose(&camera(), stamp, &truth.world_from_camera, truth.psnr_ceiling);
-        self.write_message(Topic::TruePose(camera()), descriptor::FRAME_TRANSFORM, stamp, &message)
+        let message = foxglove::encode_true_pose(
+            &camera(),
+            stamp,
+            &truth.world_from_camera,
+            truth.psnr_ceiling,
+        );
+        self.write_message(
+            Topic::TruePose(camera()),
+            descriptor::FRAME_TRANSFORM,
+            stamp,
+            &message,
+        )
     }
 
     fn write_image(&mut self, topic: Topic, image: &Image) -> mcap::McapResult<()> {
         let encoding = Encoding::protobuf(foxglove::schema_of(image.format));
         let channel = match image.format {
-            PixelFormat::DepthU16 { meters_per_count } => {
-                self.channel(topic, encoding, METERS_PER_COUNT, &meters_per_count.to_string())?
-            }
+            PixelFormat::DepthU16 { meters_per_count } => self.channel(
+                topic,
+                encoding,
+                METERS_PER_COUNT,
+                &meters_per_count.to_string(),
+            )?,
             _ => self.channel(topic, encoding, "", "")?,
         };
         self.append(channel, image.stamp, &foxglove::encode_image(image))
@@ -272,17 +348,35 @@ impl Recorder {
         self.channel(Topic::Joints, Encoding::joint_state(), JOINT_NAMES, &names)
     }
 
-    /// Returns the channel of a topic and announces it in the file if it is new. `key` and `value` are added to its
-    /// metadata.
-    fn channel(&mut self, topic: Topic, encoding: Encoding, key: &str, value: &str) -> mcap::McapResult<u16> {
+    /// Returns the channel of a topic and announces it in the file if it is new. `key` and `value`
+    /// are added to its metadata.
+    fn channel(
+        &mut self,
+        topic: Topic,
+        encoding: Encoding,
+        key: &str,
+        value: &str,
+    ) -> mcap::McapResult<u16> {
         let known = (topic, encoding.schema_name);
         if let Some(channel) = self.channels.get(&known) {
             return Ok(*channel);
         }
-        let schema = self.mcap()?.add_schema(encoding.schema_name, encoding.schema_encoding, &encoding.schema)?;
-        let metadata =
-            if key.is_empty() { BTreeMap::new() } else { BTreeMap::from([(key.to_owned(), value.to_owned())]) };
-        let channel = self.mcap()?.add_channel(schema, &known.0.name(), encoding.message_encoding, &metadata)?;
+        let schema = self.mcap()?.add_schema(
+            encoding.schema_name,
+            encoding.schema_encoding,
+            &encoding.schema,
+        )?;
+        let metadata = if key.is_empty() {
+            BTreeMap::new()
+        } else {
+            BTreeMap::from([(key.to_owned(), value.to_owned())])
+        };
+        let channel = self.mcap()?.add_channel(
+            schema,
+            &known.0.name(),
+            encoding.message_encoding,
+            &metadata,
+        )?;
         self.channels.insert(known, channel);
         Ok(channel)
     }
@@ -290,7 +384,12 @@ impl Recorder {
     fn append(&mut self, channel_id: u16, stamp: Stamp, message: &[u8]) -> mcap::McapResult<()> {
         // Viewers sort by this time. The exact stamp, which may be negative, is in the message.
         let log_time = u64::try_from(stamp.0).unwrap_or(0);
-        let header = MessageHeader { channel_id, sequence: self.n_messages, log_time, publish_time: log_time };
+        let header = MessageHeader {
+            channel_id,
+            sequence: self.n_messages,
+            log_time,
+            publish_time: log_time,
+        };
         self.n_messages = self.n_messages.wrapping_add(1);
         self.open_bytes += message.len() as u64;
         self.mcap()?.write_to_known_channel(&header, message)
@@ -315,7 +414,10 @@ fn readable(path: &Path) -> RecordedSpan {
             stamps = Some(with_stamp(stamps, sample.stamp()));
         }
     }
-    RecordedSpan { n_samples, seconds: duration_secs(stamps) }
+    RecordedSpan {
+        n_samples,
+        seconds: duration_secs(stamps),
+    }
 }
 
 /// Extends a range of stamps by one stamp.
@@ -392,21 +494,42 @@ mod tests {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("run.mcap");
         let file = File::create(&path).expect("a new file");
-        let sink = Box::new(BufWriter::new(FullDisk { file, remaining: 300_000 }));
-        let mut recorder =
-            Recorder::to(sink, &path, &RecordingMetadata::default()).expect("the header fits on the disk");
+        let sink = Box::new(BufWriter::new(FullDisk {
+            file,
+            remaining: 300_000,
+        }));
+        let mut recorder = Recorder::to(sink, &path, &RecordingMetadata::default())
+            .expect("the header fits on the disk");
         let reading = |ix: i64| {
             let position = vec![0.25; 7];
-            Sample::Joints(JointState { stamp: Stamp(ix * 1_000_000), position, velocity: vec![], effort: vec![] })
+            Sample::Joints(JointState {
+                stamp: Stamp(ix * 1_000_000),
+                position,
+                velocity: vec![],
+                effort: vec![],
+            })
         };
-        let error = (0..20_000).map(|ix| recorder.write(&reading(ix))).find_map(Result::err).expect("the disk is full");
-        let Error::Record { recorded, .. } = error else { panic!("{error}") };
-        let expected_end =
-            format!("run.mcap\": the first {:.1} s ({} samples) are saved", recorded.seconds, recorded.n_samples);
+        let error = (0..20_000)
+            .map(|ix| recorder.write(&reading(ix)))
+            .find_map(Result::err)
+            .expect("the disk is full");
+        let Error::Record { recorded, .. } = error else {
+            panic!("{error}")
+        };
+        let expected_end = format!(
+            "run.mcap\": the first {:.1} s ({} samples) are saved",
+            recorded.seconds, recorded.n_samples
+        );
         assert!(error.to_string().ends_with(&expected_end), "{error}");
         let io_error = std::error::Error::source(&error).map(ToString::to_string);
-        assert!(io_error.is_some_and(|io_error| io_error.contains("no storage space")), "{error:?}");
-        assert!(recorder.write(&reading(0)).is_err(), "writing after a failure fails");
+        assert!(
+            io_error.is_some_and(|io_error| io_error.contains("no storage space")),
+            "{error:?}"
+        );
+        assert!(
+            recorder.write(&reading(0)).is_err(),
+            "writing after a failure fails"
+        );
         drop(recorder);
         let mut recording = Recording::open(&path).expect("a recording");
         let mut n_samples = 0_i64;
@@ -419,7 +542,10 @@ mod tests {
             recorded.n_samples > 1000 && n_samples.unsigned_abs() == recorded.n_samples,
             "{n_samples} of {recorded:?}"
         );
-        assert!((recorded.seconds - 1e-3 * (recorded.n_samples - 1) as f64).abs() < 1e-9, "{recorded:?}");
+        assert!(
+            (recorded.seconds - 1e-3 * (recorded.n_samples - 1) as f64).abs() < 1e-9,
+            "{recorded:?}"
+        );
         assert!(recording.damage().is_some());
     }
 
@@ -428,16 +554,33 @@ mod tests {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("run.mcap");
         let recorder = Recorder::create(&path, &RecordingMetadata::default()).expect("a new file");
-        assert_eq!(recorder.finish().expect("finishing succeeds"), RecordedSpan::default());
+        assert_eq!(
+            recorder.finish().expect("finishing succeeds"),
+            RecordedSpan::default()
+        );
         assert!(!path.exists());
-        let sink = Box::new(FullDisk { file: File::create(&path).expect("a new file"), remaining: 1000 });
-        let mut recorder =
-            Recorder::to(sink, &path, &RecordingMetadata::default()).expect("the header fits on the disk");
+        let sink = Box::new(FullDisk {
+            file: File::create(&path).expect("a new file"),
+            remaining: 1000,
+        });
+        let mut recorder = Recorder::to(sink, &path, &RecordingMetadata::default())
+            .expect("the header fits on the disk");
         let reading = |ix: i64| {
             let position = vec![0.25; 7];
-            Sample::Joints(JointState { stamp: Stamp(ix * 1_000_000), position, velocity: vec![], effort: vec![] })
+            Sample::Joints(JointState {
+                stamp: Stamp(ix * 1_000_000),
+                position,
+                velocity: vec![],
+                effort: vec![],
+            })
         };
-        let error = (0..2000).map(|ix| recorder.write(&reading(ix))).find_map(Result::err).expect("the disk is full");
-        assert!(error.to_string().ends_with("no samples were saved") && !path.exists(), "{error}");
+        let error = (0..2000)
+            .map(|ix| recorder.write(&reading(ix)))
+            .find_map(Result::err)
+            .expect("the disk is full");
+        assert!(
+            error.to_string().ends_with("no samples were saved") && !path.exists(),
+            "{error}"
+        );
     }
 }

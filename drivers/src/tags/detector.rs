@@ -7,18 +7,19 @@ use kinematics::Stamp;
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 
-/// Maximum number of wrong cells that are corrected. With two or more, noise is occasionally detected as a tag (Olson
-/// 2011, section V.B).
+/// Maximum number of wrong cells that are corrected. With two or more, noise is occasionally
+/// detected as a tag (Olson 2011, section V.B).
 const CORRECTED_BITS: usize = 1;
-/// Minimum mean difference in gray value between the cells of a tag and the decision threshold. The authors of AprilTag
-/// consider values below 10 noise; the corners of a barely visible tag are not accurate enough to use.
+/// Minimum mean difference in gray value between the cells of a tag and the decision threshold. The
+/// authors of AprilTag consider values below 10 noise; the corners of a barely visible tag are not
+/// accurate enough to use.
 const MIN_MARGIN: f32 = 20.0;
-/// Images with at least this many pixels are searched for quads at half resolution. Corners are always refined at full
-/// resolution.
+/// Images with at least this many pixels are searched for quads at half resolution. Corners are
+/// always refined at full resolution.
 const DECIMATE_ABOVE_PX: usize = 1_000_000;
 
-/// Minimum width and height. The detector reads out of bounds for images smaller than a few of its 4-pixel tiles, and
-/// such images are too small for a tag anyway.
+/// Minimum width and height. The detector reads out of bounds for images smaller than a few of its
+/// 4-pixel tiles, and such images are too small for a tag anyway.
 const MIN_SIDE_PX: usize = 16;
 
 /// Tag family to detect.
@@ -54,7 +55,8 @@ impl Family {
 pub struct TagDetection {
     /// Id in the family.
     pub id: u32,
-    /// Corners in the image, pixels: lower left, lower right, upper right, upper left of the printed tag.
+    /// Corners in the image, pixels: lower left, lower right, upper right, upper left of the
+    /// printed tag.
     pub corners_px: [[f64; 2]; 4],
 }
 
@@ -96,9 +98,18 @@ impl TagDetector {
                 }
             }
         };
-        let thread = std::thread::Builder::new().name("tags".to_owned()).spawn(detect_all);
-        thread.map_err(|source| Error::Thread { device: "tags".to_owned(), source })?;
-        Ok(Self { images, detections, n_pending: 0 })
+        let thread = std::thread::Builder::new()
+            .name("tags".to_owned())
+            .spawn(detect_all);
+        thread.map_err(|source| Error::Thread {
+            device: "tags".to_owned(),
+            source,
+        })?;
+        Ok(Self {
+            images,
+            detections,
+            n_pending: 0,
+        })
     }
 
     /// Submits a color image. Returns false if the thread is busy.
@@ -108,7 +119,8 @@ impl TagDetector {
         is_accepted
     }
 
-    /// Detects tags in a color image and waits for the result. Also returns the results of earlier images.
+    /// Detects tags in a color image and waits for the result. Also returns the results of earlier
+    /// images.
     pub fn detect_blocking(&mut self, image: Image) -> Vec<Result<TagDetections, Error>> {
         // Sending succeeds because the thread only ends after this is dropped.
         let is_accepted = self.images.send(image).is_ok();
@@ -139,7 +151,9 @@ fn detector(family: Family) -> Detector {
         Family::Standard41h12 => ApriltagFamily::tag_standard_41h12(),
         Family::Standard52h13 => ApriltagFamily::tag_standard_52h13(),
     };
-    let detector = Detector::builder().add_family_bits(tag_family, CORRECTED_BITS).build();
+    let detector = Detector::builder()
+        .add_family_bits(tag_family, CORRECTED_BITS)
+        .build();
     let mut detector = detector.expect("the detector has a family");
     detector.set_thread_number(1);
     detector
@@ -149,21 +163,34 @@ fn detector(family: Family) -> Detector {
 fn detect(detector: &mut Detector, image: &Image) -> Result<TagDetections, Error> {
     let rgb = image.decode_rgb()?;
     let [width, height] = image.size_px.map(|side| side as usize);
-    let tag_detections = |tags| TagDetections { camera: Arc::clone(&image.camera), stamp: image.stamp, tags };
+    let tag_detections = |tags| TagDetections {
+        camera: Arc::clone(&image.camera),
+        stamp: image.stamp,
+        tags,
+    };
     if width.min(height) < MIN_SIDE_PX {
         return Ok(tag_detections(Vec::new()));
     }
-    let mut gray = Gray::zeros_with_alignment(width, height, 1).map_err(|_| image.wrong_kind("color"))?;
+    let mut gray =
+        Gray::zeros_with_alignment(width, height, 1).map_err(|_| image.wrong_kind("color"))?;
     for (gray, [red, green, blue]) in gray.as_slice_mut().iter_mut().zip(rgb.as_chunks().0) {
         // Rec. 601 luma weights in units of 1/256.
         let parts = 77 * u32::from(*red) + 150 * u32::from(*green) + 29 * u32::from(*blue);
         *gray = parts.to_le_bytes()[1];
     }
-    detector.set_decimation(if width * height < DECIMATE_ABOVE_PX { 1.0 } else { 2.0 });
+    detector.set_decimation(if width * height < DECIMATE_ABOVE_PX {
+        1.0
+    } else {
+        2.0
+    });
     let new_detections = detector.detect(&gray);
     let is_clear = |tag: &&apriltag::Detection| tag.decision_margin() >= MIN_MARGIN;
-    let detection =
-        |tag: &apriltag::Detection| Some(TagDetection { id: tag.id().try_into().ok()?, corners_px: tag.corners() });
+    let detection = |tag: &apriltag::Detection| {
+        Some(TagDetection {
+            id: tag.id().try_into().ok()?,
+            corners_px: tag.corners(),
+        })
+    };
     let tags = new_detections.iter().filter(is_clear).filter_map(detection);
     Ok(tag_detections(tags.collect()))
 }
@@ -176,7 +203,15 @@ mod tests {
 
     fn image(size_px: [u32; 2], format: PixelFormat, data: Vec<u8>) -> Image {
         let (camera, stamp) = ("wrist".into(), Stamp(5));
-        Image { camera, stamp, size_px, format, data: data.into(), exposure_secs: None, n_skipped: 0 }
+        Image {
+            camera,
+            stamp,
+            size_px,
+            format,
+            data: data.into(),
+            exposure_secs: None,
+            n_skipped: 0,
+        }
     }
 
     /// Parses corners of two numbers in parentheses, four per line.
@@ -185,7 +220,9 @@ mod tests {
             let (x, y) = text.split_once(')')?.0.split_once(' ')?;
             Some([x.parse().ok()?, y.parse().ok()?])
         };
-        let line = |line: &str| <[[f64; 2]; 4]>::try_from(line.split('(').filter_map(corner).collect::<Vec<_>>()).ok();
+        let line = |line: &str| {
+            <[[f64; 2]; 4]>::try_from(line.split('(').filter_map(corner).collect::<Vec<_>>()).ok()
+        };
         text.lines().filter_map(line).collect()
     }
 
@@ -193,21 +230,37 @@ mod tests {
     fn tags_in_photo_match_annotations() {
         /// The annotations were made by an earlier version of the detector with other settings.
         const NEAR_PX: f64 = 1.5;
-        let Some(folder) = test_support::data_folder("apriltag") else { return };
+        let Some(folder) = test_support::data_folder("apriltag") else {
+            return;
+        };
         let read = |name: &str| std::fs::read(folder.join(name)).unwrap();
-        let photo = image([799, 533], PixelFormat::Jpeg, read("33369213973_9d9bb4cc96_c.jpg"));
-        let annotated = parse_annotations(&String::from_utf8(read("33369213973_9d9bb4cc96_c.txt")).unwrap());
+        let photo = image(
+            [799, 533],
+            PixelFormat::Jpeg,
+            read("33369213973_9d9bb4cc96_c.jpg"),
+        );
+        let annotated =
+            parse_annotations(&String::from_utf8(read("33369213973_9d9bb4cc96_c.txt")).unwrap());
         assert_eq!(annotated.len(), 12);
         let mut spotter = TagDetector::start(Family::Tag36h11).unwrap();
         let detections = spotter.detect_blocking(photo);
         let tag_detections = detections[0].as_ref().unwrap();
-        assert_eq!((&*tag_detections.camera, tag_detections.stamp), ("wrist", Stamp(5)));
+        assert_eq!(
+            (&*tag_detections.camera, tag_detections.stamp),
+            ("wrist", Stamp(5))
+        );
         let is_near = |a: [f64; 2], b: &[f64; 2]| (a[0] - b[0]).hypot(a[1] - b[1]) < NEAR_PX;
         let is_found = |annotated: &&[[f64; 2]; 4]| {
             let matches_annotation = |tag: &&TagDetection| {
-                tag.corners_px.iter().all(|detected| annotated.iter().any(|corner| is_near(*detected, corner)))
+                tag.corners_px
+                    .iter()
+                    .all(|detected| annotated.iter().any(|corner| is_near(*detected, corner)))
             };
-            tag_detections.tags.iter().find(matches_annotation).is_some_and(|tag| tag.id == 0)
+            tag_detections
+                .tags
+                .iter()
+                .find(matches_annotation)
+                .is_some_and(|tag| tag.id == 0)
         };
         let n_found = annotated.iter().filter(is_found).count();
         assert!(n_found >= 10, "{n_found} of 12: {:?}", tag_detections.tags);
@@ -223,7 +276,10 @@ mod tests {
             let detections = spotter.detect_blocking(image(size_px, PixelFormat::Gray8, pixels));
             assert_eq!(detections[0].as_ref().unwrap().tags, [], "{size_px:?}");
         }
-        assert!(spotter.detect_blocking(image([320, 240], PixelFormat::Jpeg, vec![1, 2, 3]))[0].is_err());
+        assert!(
+            spotter.detect_blocking(image([320, 240], PixelFormat::Jpeg, vec![1, 2, 3]))[0]
+                .is_err()
+        );
         assert!(spotter.new_detections().is_empty() && spotter.finish().is_empty());
     }
 }

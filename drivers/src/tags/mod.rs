@@ -1,8 +1,8 @@
 //! Camera poses from AprilTags at known poses.
 //!
-//! `detector` finds tags in images on a separate thread, with the reference implementation of AprilTag 3. `locate`
-//! estimates the camera pose from the corners of all tags in an image. `pose_filter` averages the poses of a stationary
-//! object.
+//! `detector` finds tags in images on a separate thread, with the reference implementation of
+//! AprilTag 3. `locate` estimates the camera pose from the corners of all tags in an image.
+//! `pose_filter` averages the poses of a stationary object.
 
 mod detector;
 mod locate;

@@ -3,11 +3,12 @@
 use kinematics::{Transform, Twist, transform};
 use nalgebra::{Matrix6, Vector6};
 
-/// Squared Mahalanobis distance from the average above which the object is assumed to have moved. Without motion, this
-/// happens once in 10 000 poses (chi-squared, 6 degrees of freedom).
+/// Squared Mahalanobis distance from the average above which the object is assumed to have moved.
+/// Without motion, this happens once in 10 000 poses (chi-squared, 6 degrees of freedom).
 const MAX_CHI_SQUARED: f64 = 27.86;
-/// Information in the average decays by this factor per pose, which limits the average to about 30 poses. More poses
-/// would not help, because errors of the lens parameters and of measured tag poses do not average out.
+/// Information in the average decays by this factor per pose, which limits the average to about 30
+/// poses. More poses would not help, because errors of the lens parameters and of measured tag
+/// poses do not average out.
 const FORGETTING_FACTOR: f64 = 0.97;
 
 /// Running average of a pose.
@@ -18,28 +19,46 @@ pub struct StationaryPoseFilter {
 }
 
 impl StationaryPoseFilter {
-    /// Adds a pose with its covariance in its own axes (meters first, then radians). Returns the average since the last
-    /// motion.
+    /// Adds a pose with its covariance in its own axes (meters first, then radians). Returns the
+    /// average since the last motion.
     pub fn push(&mut self, pose: &Transform, covariance: &Matrix6<f64>) -> Transform {
-        let (average, covariance) = self.merged(pose, covariance).unwrap_or((*pose, *covariance));
+        let (average, covariance) = self
+            .merged(pose, covariance)
+            .unwrap_or((*pose, *covariance));
         self.average = Some((average, covariance));
         average
     }
 
     /// Merges another pose into the average; `None` if that pose is too far away.
-    fn merged(&self, pose: &Transform, covariance: &Matrix6<f64>) -> Option<(Transform, Matrix6<f64>)> {
+    fn merged(
+        &self,
+        pose: &Transform,
+        covariance: &Matrix6<f64>,
+    ) -> Option<(Transform, Matrix6<f64>)> {
         let (average, average_covariance) = self.average.as_ref()?;
         let average_covariance = average_covariance / FORGETTING_FACTOR;
         let residual = transform::log(&(average.inverse() * pose), 1.0);
-        let residual = Vector6::from_iterator(residual.linear_m_s.iter().chain(&residual.angular_rad_s).copied());
+        let residual = Vector6::from_iterator(
+            residual
+                .linear_m_s
+                .iter()
+                .chain(&residual.angular_rad_s)
+                .copied(),
+        );
         let innovation_inverse = (average_covariance + covariance).try_inverse()?;
         if (residual.transpose() * innovation_inverse * residual).x > MAX_CHI_SQUARED {
             return None;
         }
         let gain = average_covariance * innovation_inverse;
         let step = gain * residual;
-        let twist = Twist { linear_m_s: step.fixed_rows::<3>(0).into(), angular_rad_s: step.fixed_rows::<3>(3).into() };
-        Some((average * transform::exp(&twist, 1.0), average_covariance - gain * average_covariance))
+        let twist = Twist {
+            linear_m_s: step.fixed_rows::<3>(0).into(),
+            angular_rad_s: step.fixed_rows::<3>(3).into(),
+        };
+        Some((
+            average * transform::exp(&twist, 1.0),
+            average_covariance - gain * average_covariance,
+        ))
     }
 }
 
@@ -49,7 +68,13 @@ mod tests {
     use nalgebra::Vector3;
 
     fn covariance(sigma_m: f64, sigma_rad: f64) -> Matrix6<f64> {
-        let variance = |ix: usize| if ix < 3 { sigma_m * sigma_m } else { sigma_rad * sigma_rad };
+        let variance = |ix: usize| {
+            if ix < 3 {
+                sigma_m * sigma_m
+            } else {
+                sigma_rad * sigma_rad
+            }
+        };
         Matrix6::from_diagonal(&Vector6::from_fn(|ix, _| variance(ix)))
     }
 
@@ -81,9 +106,15 @@ mod tests {
 
     #[test]
     fn lower_covariance_weighs_more() {
-        let (mut steady, second_pose) = (StationaryPoseFilter::default(), Transform::translation(2e-3, 0.0, 0.0));
+        let (mut steady, second_pose) = (
+            StationaryPoseFilter::default(),
+            Transform::translation(2e-3, 0.0, 0.0),
+        );
         steady.push(&Transform::identity(), &covariance(1e-3, 1e-3));
         let average = steady.push(&second_pose, &covariance(3e-3, 1e-3));
-        assert!((average.translation.x - 2e-3 * 1.0 / (1.0 + 9.0 * FORGETTING_FACTOR)).abs() < 1e-5, "{average}");
+        assert!(
+            (average.translation.x - 2e-3 * 1.0 / (1.0 + 9.0 * FORGETTING_FACTOR)).abs() < 1e-5,
+            "{average}"
+        );
     }
 }

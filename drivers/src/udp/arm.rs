@@ -18,7 +18,10 @@ pub struct UdpArm {
 impl UdpArm {
     /// Listens for states of these joints. With port 0, a free port is used.
     pub fn open(joint_names: &[String], address: SocketAddr) -> Result<Self, Error> {
-        Ok(Self { names: joint_names.to_vec(), states: DatagramReader::open("arm", "joint states", address)? })
+        Ok(Self {
+            names: joint_names.to_vec(),
+            states: DatagramReader::open("arm", "joint states", address)?,
+        })
     }
 
     /// Address it listens on.
@@ -46,6 +49,11 @@ impl Arm for UdpArm {
         let Self { names, states } = self;
         let read = states.next(timeout, |bytes| decode_joints(bytes, names))?;
         let (stamp, reported) = read.ok_or(Error::NoJoints { waited: timeout })?;
-        Ok(JointState { stamp, position: reported.position, velocity: reported.velocity, effort: reported.effort })
+        Ok(JointState {
+            stamp,
+            position: reported.position,
+            velocity: reported.velocity,
+            effort: reported.effort,
+        })
     }
 }

@@ -17,10 +17,14 @@ pub struct UdpBase {
 impl UdpBase {
     /// Listens for poses. With port 0, a free port is used.
     ///
-    /// Poses with a standard deviation above `max_sigma` are skipped. `max_sigma` contains the root mean square errors
-    /// of position (meters) and rotation (radians). Poses without covariance are accepted.
+    /// Poses with a standard deviation above `max_sigma` are skipped. `max_sigma` contains the root
+    /// mean square errors of position (meters) and rotation (radians). Poses without covariance are
+    /// accepted.
     pub fn open(address: SocketAddr, max_sigma: [f64; 2]) -> Result<Self, Error> {
-        Ok(Self { poses: DatagramReader::open("base", "poses", address)?, max_sigma })
+        Ok(Self {
+            poses: DatagramReader::open("base", "poses", address)?,
+            max_sigma,
+        })
     }
 
     /// Address it listens on.
@@ -45,14 +49,24 @@ impl Base for UdpBase {
         let decode = |bytes: &[u8]| decode_pose(bytes).map(|pose| (pose.header, Some(pose)));
         loop {
             let remaining = until.saturating_duration_since(Instant::now());
-            let (stamp, pose) = self.poses.next(remaining, decode)?.ok_or(Error::NoBasePose { waited: timeout })?;
+            let (stamp, pose) = self
+                .poses
+                .next(remaining, decode)?
+                .ok_or(Error::NoBasePose { waited: timeout })?;
             match pose.sigmas() {
                 Some([m, rad]) if m > self.max_sigma[0] || rad > self.max_sigma[1] => {
-                    let what = format_args!("skipped a pose with a standard deviation of {m:.3} m and {rad:.4} rad");
+                    let what = format_args!(
+                        "skipped a pose with a standard deviation of {m:.3} m and {rad:.4} rad"
+                    );
                     count_and_warn("base", &mut self.poses.counts.n_uncertain, 1, what);
                     self.poses.publish_counts();
                 }
-                _ => return Ok(BasePose { stamp, world_from_base: pose.world_from_base }),
+                _ => {
+                    return Ok(BasePose {
+                        stamp,
+                        world_from_base: pose.world_from_base,
+                    });
+                }
             }
         }
     }

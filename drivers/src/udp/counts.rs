@@ -29,8 +29,8 @@ pub struct DatagramCounts {
     pub n_uncertain: u64,
     /// Number of times that the sequence numbers of the sender restarted.
     pub n_restarts: u64,
-    /// Number of times that the clock of the sender restarted or jumped. If this keeps increasing, the clock does not
-    /// count nanoseconds.
+    /// Number of times that the clock of the sender restarted or jumped. If this keeps increasing,
+    /// the clock does not count nanoseconds.
     pub n_clock_restarts: u64,
 }
 
@@ -50,7 +50,11 @@ struct MonitorState {
 
 impl DatagramMonitor {
     pub(super) fn new(device: &str, address: SocketAddr) -> Self {
-        Self { device: device.to_owned(), address, state: Arc::default() }
+        Self {
+            device: device.to_owned(),
+            address,
+            state: Arc::default(),
+        }
     }
 
     /// Name of the device in messages.
@@ -83,16 +87,19 @@ impl DatagramMonitor {
 }
 
 /// Message for a restart of the sender's clock.
-pub(super) const CLOCK_RESTARTED: &str = "the sender's clock restarted or jumped, or it does not count nanoseconds";
+pub(super) const CLOCK_RESTARTED: &str =
+    "the sender's clock restarted or jumped, or it does not count nanoseconds";
 
-/// Another sender may replace the current one after this time without a datagram from it. A restarted sender usually has a
-/// new address.
+/// Another sender may replace the current one after this time without a datagram from it. A
+/// restarted sender usually has a new address.
 const MAX_SENDER_SILENCE: Duration = Duration::from_secs(2);
 
-/// This many datagrams from as many ports of one host, none of which is used twice, come from a single program that opens a
-/// socket for each datagram: up to four programs that keep their sockets would repeat a port.
+/// This many datagrams from as many ports of one host, none of which is used twice, come from a
+/// single program that opens a socket for each datagram: up to four programs that keep their
+/// sockets would repeat a port.
 const MIN_NEW_PORTS: usize = 5;
-/// Number of recent ports of such a program that are remembered. Few, because systems choose ports at random.
+/// Number of recent ports of such a program that are remembered. Few, because systems choose ports
+/// at random.
 const MAX_RECENT_PORTS: usize = 8;
 
 /// The current sender: one at a time, so that the data of two programs cannot mix.
@@ -101,16 +108,24 @@ pub(super) struct Senders {
     current: Option<(SocketAddr, Stamp)>,
     /// Whether the current sender has used its port more than once.
     keeps_port: bool,
-    /// Whether the current sender uses a new port for each datagram, so that only the host identifies it.
+    /// Whether the current sender uses a new port for each datagram, so that only the host
+    /// identifies it.
     has_new_ports: bool,
-    /// Recent ports of the current sender's host, the newest last; empty if the sender keeps its port.
+    /// Recent ports of the current sender's host, the newest last; empty if the sender keeps its
+    /// port.
     recent_ports: VecDeque<u16>,
     n_changes: u64,
 }
 
 impl Senders {
     /// Returns whether to use a datagram from this address. Counts and logs the others.
-    pub(super) fn accepts(&mut self, device: &str, from: SocketAddr, at: Stamp, n_foreign: &mut u64) -> bool {
+    pub(super) fn accepts(
+        &mut self,
+        device: &str,
+        from: SocketAddr,
+        at: Stamp,
+        n_foreign: &mut u64,
+    ) -> bool {
         match self.current {
             Some((current, last)) if !self.is_current(current, from) => {
                 let is_silent = at.duration_since(last) >= MAX_SENDER_SILENCE;
@@ -130,7 +145,11 @@ impl Senders {
                         (self.has_new_ports, self.recent_ports) = (false, VecDeque::new());
                     }
                 } else {
-                    let ports = if self.has_new_ports { ", with a new port for each datagram," } else { "" };
+                    let ports = if self.has_new_ports {
+                        ", with a new port for each datagram,"
+                    } else {
+                        ""
+                    };
                     let what = format_args!(
                         "ignored a datagram from {from}, because {current}{ports} is also sending; stop one of them"
                     );
@@ -163,8 +182,8 @@ impl Senders {
         }
     }
 
-    /// Notes a datagram from another address than the current one. Returns whether it shows that the sender uses a new port
-    /// for each datagram.
+    /// Notes a datagram from another address than the current one. Returns whether it shows that
+    /// the sender uses a new port for each datagram.
     fn finds_new_ports(&mut self, current: SocketAddr, from: SocketAddr) -> bool {
         if self.has_new_ports || self.keeps_port || current.ip() != from.ip() {
             return false;
@@ -181,8 +200,8 @@ impl Senders {
     }
 }
 
-/// Adds `more` to a count, and logs the count if it has at least doubled. Thus the first events are logged, and the log
-/// is not flooded.
+/// Adds `more` to a count, and logs the count if it has at least doubled. Thus the first events are
+/// logged, and the log is not flooded.
 pub(super) fn count_and_warn(device: &str, n: &mut u64, more: u64, what: impl fmt::Display) {
     let before = n.checked_ilog2();
     *n = n.saturating_add(more);
@@ -207,7 +226,16 @@ impl DatagramCounts {
             n_clock_restarts,
         } = self;
         // States of other joints are no problem.
-        let problems = [n_rejected, n_lost, n_foreign, n_late, n_dropped, n_uncertain, n_restarts, n_clock_restarts];
+        let problems = [
+            n_rejected,
+            n_lost,
+            n_foreign,
+            n_late,
+            n_dropped,
+            n_uncertain,
+            n_restarts,
+            n_clock_restarts,
+        ];
         if problems.iter().any(|n| **n > 0) {
             log::warn!(
                 "{device}: {n_received} datagrams: {n_rejected} rejected, {n_foreign} from another sender, {n_other} without any joint of the arm, {n_late} late or duplicate, {n_dropped} dropped because \
@@ -226,7 +254,9 @@ mod tests {
     fn second_sender_waits_until_the_first_is_silent() {
         let (mut senders, mut n_foreign) = (Senders::default(), 0);
         let [first, second] = [1, 2].map(|port| SocketAddr::from(([127, 0, 0, 1], port)));
-        let mut accepts = |from, millis: i64| senders.accepts("arm", from, Stamp(millis * 1_000_000), &mut n_foreign);
+        let mut accepts = |from, millis: i64| {
+            senders.accepts("arm", from, Stamp(millis * 1_000_000), &mut n_foreign)
+        };
         assert!(accepts(first, 0) && accepts(first, 1000));
         assert!(!accepts(second, 1001) && !accepts(second, 2999));
         assert!(accepts(second, 3000), "the first has been silent for 2 s");
@@ -239,14 +269,27 @@ mod tests {
         let (mut senders, mut n_foreign) = (Senders::default(), 0);
         let at_port = |port| SocketAddr::from(([127, 0, 0, 1], port));
         let elsewhere = SocketAddr::from(([127, 0, 0, 2], 1000));
-        let mut accepts = |from, millis: i64| senders.accepts("arm", from, Stamp(millis * 1_000_000), &mut n_foreign);
+        let mut accepts = |from, millis: i64| {
+            senders.accepts("arm", from, Stamp(millis * 1_000_000), &mut n_foreign)
+        };
         assert!(accepts(at_port(1), 0));
-        let accepted: Vec<bool> = (2..100).map(|ix| accepts(at_port(ix), 10 * i64::from(ix))).collect();
-        assert!(!accepted[..3].contains(&true) && !accepted[3..].contains(&false), "{accepted:?}");
+        let accepted: Vec<bool> = (2..100)
+            .map(|ix| accepts(at_port(ix), 10 * i64::from(ix)))
+            .collect();
+        assert!(
+            !accepted[..3].contains(&true) && !accepted[3..].contains(&false),
+            "{accepted:?}"
+        );
         assert!(!accepts(elsewhere, 1000), "another host");
-        assert!(!accepts(at_port(98), 1001), "a second program on the host, which keeps its port");
+        assert!(
+            !accepts(at_port(98), 1001),
+            "a second program on the host, which keeps its port"
+        );
         assert!(accepts(at_port(100), 1002) && !accepts(at_port(98), 1003));
-        assert!(accepts(elsewhere, 3002) && !accepts(at_port(101), 3003), "a host that was silent is replaced");
+        assert!(
+            accepts(elsewhere, 3002) && !accepts(at_port(101), 3003),
+            "a host that was silent is replaced"
+        );
         assert!(accepts(elsewhere, 3004));
         assert_eq!(n_foreign, 7);
     }
@@ -255,16 +298,24 @@ mod tests {
     fn several_senders_that_keep_their_ports_do_not_mix() {
         let (mut senders, mut n_foreign) = (Senders::default(), 0);
         let at_port = |port| SocketAddr::from(([127, 0, 0, 1], port));
-        let mut accepts = |from, millis: i64| senders.accepts("arm", from, Stamp(millis * 1_000_000), &mut n_foreign);
+        let mut accepts = |from, millis: i64| {
+            senders.accepts("arm", from, Stamp(millis * 1_000_000), &mut n_foreign)
+        };
         for round in 0..50 {
-            let n_accepted = (1..=4).filter(|port| accepts(at_port(*port), 10 * round + i64::from(*port))).count();
+            let n_accepted = (1..=4)
+                .filter(|port| accepts(at_port(*port), 10 * round + i64::from(*port)))
+                .count();
             assert_eq!(n_accepted, 1, "round {round}");
         }
         // The first one has stopped.
         let until_silent = (50..240).flat_map(|round| [2, 3].map(|port| (port, 10 * round)));
-        let n_accepted = until_silent.filter(|(port, millis)| accepts(at_port(*port), *millis)).count();
+        let n_accepted = until_silent
+            .filter(|(port, millis)| accepts(at_port(*port), *millis))
+            .count();
         assert_eq!(n_accepted, 0);
-        assert!(accepts(at_port(2), 2501) && !accepts(at_port(3), 2502) && accepts(at_port(2), 2503));
+        assert!(
+            accepts(at_port(2), 2501) && !accepts(at_port(3), 2502) && accepts(at_port(2), 2503)
+        );
     }
 
     #[test]

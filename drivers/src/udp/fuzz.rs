@@ -6,8 +6,8 @@ use super::scanner::UdpScanner;
 use super::sequence::SequenceTracker;
 use crate::RangePoint;
 use crate::wire::datagram::{
-    Clock, DatagramHeader, JointsDatagram, PoseDatagram, ScanPart, decode_joints, decode_pose, encode_joints,
-    encode_pose, encode_scan,
+    Clock, DatagramHeader, JointsDatagram, PoseDatagram, ScanPart, decode_joints, decode_pose,
+    encode_joints, encode_pose, encode_scan,
 };
 use kinematics::{Stamp, Transform};
 use std::cell::RefCell;
@@ -15,10 +15,12 @@ use std::time::Duration;
 
 /// Arrival time of the first datagram. Stamps in the seeds are close to it.
 pub(crate) const START_TIME: Stamp = Stamp(1_000_000_000_000);
-/// Limit of received values and of each point coordinate, in meters, radians or the unit of a joint.
+/// Limit of received values and of each point coordinate, in meters, radians or the unit of a
+/// joint.
 const MAX_ABS_VALUE: f64 = 1e4;
 
-/// An arm with three joints, a base, and a scanner named `lidar`. Data from their sockets are not used.
+/// An arm with three joints, a base, and a scanner named `lidar`. Data from their sockets are not
+/// used.
 struct Readers {
     names: Vec<String>,
     arm: DatagramReader,
@@ -44,10 +46,11 @@ impl Readers {
     }
 }
 
-/// Reads datagrams, one per line and one millisecond apart. A line with an integer lets that many milliseconds pass
-/// instead.
+/// Reads datagrams, one per line and one millisecond apart. A line with an integer lets that many
+/// milliseconds pass instead.
 ///
-/// Checks that stamps of each device increase and are recent, and that values are within the limits of the format.
+/// Checks that stamps of each device increase and are recent, and that values are within the limits
+/// of the format.
 pub fn datagrams(bytes: &[u8]) {
     joint_states(bytes);
 }
@@ -55,7 +58,12 @@ pub fn datagrams(bytes: &[u8]) {
 /// Positions of the arm's joints received in the datagrams; see [`datagrams`].
 pub(crate) fn joint_states(bytes: &[u8]) -> Vec<Vec<f64>> {
     READERS.with_borrow_mut(|readers| {
-        let Readers { names, arm, base, scanner } = readers;
+        let Readers {
+            names,
+            arm,
+            base,
+            scanner,
+        } = readers;
         arm.sequence = SequenceTracker::default();
         base.sequence = SequenceTracker::default();
         scanner.reset();
@@ -63,31 +71,60 @@ pub(crate) fn joint_states(bytes: &[u8]) -> Vec<Vec<f64>> {
         let mut newest = [None; 3];
         let mut reported = Vec::new();
         for line in bytes.split(|byte| *byte == b'\n') {
-            let millis = str::from_utf8(line).ok().and_then(|line| line.parse::<u32>().ok());
+            let millis = str::from_utf8(line)
+                .ok()
+                .and_then(|line| line.parse::<u32>().ok());
             at += Duration::from_millis(millis.unwrap_or(1).into());
-            let datagram =
-                ReceivedDatagram { at, from: ([127, 0, 0, 1], 7).into(), bytes: line.to_vec(), n_dropped: 0 };
+            let datagram = ReceivedDatagram {
+                at,
+                from: ([127, 0, 0, 1], 7).into(),
+                bytes: line.to_vec(),
+                n_dropped: 0,
+            };
             let read = arm.take(&datagram, |bytes| decode_joints(bytes, names));
             if let Some((stamp, state)) = read {
                 assert_monotonic(&mut newest[0], stamp, at);
                 assert_eq!(state.position.len(), names.len());
-                let numbers = state.position.iter().chain(&state.velocity).chain(&state.effort);
-                assert!(numbers.into_iter().all(|number| number.abs() <= MAX_ABS_VALUE), "{state:?}");
+                let numbers = state
+                    .position
+                    .iter()
+                    .chain(&state.velocity)
+                    .chain(&state.effort);
+                assert!(
+                    numbers
+                        .into_iter()
+                        .all(|number| number.abs() <= MAX_ABS_VALUE),
+                    "{state:?}"
+                );
                 reported.push(state.position);
             }
             let decode = |bytes: &[u8]| {
-                decode_pose(bytes).map(|PoseDatagram { header, world_from_base, .. }| (header, Some(world_from_base)))
+                decode_pose(bytes).map(
+                    |PoseDatagram {
+                         header,
+                         world_from_base,
+                         ..
+                     }| (header, Some(world_from_base)),
+                )
             };
             if let Some((stamp, pose)) = base.take(&datagram, decode) {
                 assert_monotonic(&mut newest[1], stamp, at);
                 assert!(pose.translation.vector.amax() <= MAX_ABS_VALUE, "{pose:?}");
-                assert!((pose.rotation.quaternion().norm() - 1.0).abs() < 1e-9, "{pose:?}");
+                assert!(
+                    (pose.rotation.quaternion().norm() - 1.0).abs() < 1e-9,
+                    "{pose:?}"
+                );
             }
             scanner.take(&datagram);
             while let Some(scan) = scanner.completed.pop_front() {
                 assert_monotonic(&mut newest[2], scan.stamp, at);
                 let coordinates = scan.points.iter().flat_map(|point| point.position_m);
-                assert!(coordinates.into_iter().all(|along| f64::from(along.abs()) <= MAX_ABS_VALUE), "{scan:?}");
+                assert!(
+                    coordinates
+                        .into_iter()
+                        .all(|along| f64::from(along.abs()) <= MAX_ABS_VALUE),
+                    "{scan:?}"
+                );
             }
         }
         reported
@@ -96,8 +133,14 @@ pub(crate) fn joint_states(bytes: &[u8]) -> Vec<Vec<f64>> {
 
 /// Checks that a stamp is after the previous one and not after its arrival, except for rounding.
 fn assert_monotonic(newest: &mut Option<Stamp>, stamp: Stamp, arrival: Stamp) {
-    assert!(newest.is_none_or(|newest| stamp > newest), "{newest:?}, then {stamp:?}");
-    assert!(stamp.secs_since(arrival) <= 1e-3, "{stamp:?} arrived at {arrival:?}");
+    assert!(
+        newest.is_none_or(|newest| stamp > newest),
+        "{newest:?}, then {stamp:?}"
+    );
+    assert!(
+        stamp.secs_since(arrival) <= 1e-3,
+        "{stamp:?} arrived at {arrival:?}"
+    );
     *newest = Some(stamp);
 }
 
@@ -107,16 +150,48 @@ pub(crate) fn example_traffic() -> Vec<Vec<u8>> {
     let mut lines = Vec::new();
     for seq in 0..10_u32 {
         let stamp_nanos = START_TIME.0 + i64::from(seq) * 3_000_000;
-        let header = DatagramHeader { seq: seq.into(), clock: Clock::Monotonic, stamp_nanos };
-        let position = [0.0, 1.0, 2.0].map(|zero| zero + 0.01 * f64::from(seq)).to_vec();
-        let joints = JointsDatagram { header, position, velocity: vec![0.5; 3], effort: Vec::new() };
+        let header = DatagramHeader {
+            seq: seq.into(),
+            clock: Clock::Monotonic,
+            stamp_nanos,
+        };
+        let position = [0.0, 1.0, 2.0]
+            .map(|zero| zero + 0.01 * f64::from(seq))
+            .to_vec();
+        let joints = JointsDatagram {
+            header,
+            position,
+            velocity: vec![0.5; 3],
+            effort: Vec::new(),
+        };
         lines.push(encode_joints(&joints, &names));
-        let header = DatagramHeader { clock: Clock::Device, ..header };
+        let header = DatagramHeader {
+            clock: Clock::Device,
+            ..header
+        };
         let world_from_base = Transform::translation(0.1 * f64::from(seq), 0.0, 0.5);
-        lines.push(encode_pose(&PoseDatagram { header, world_from_base, covariance: None }));
-        let point = RangePoint { position_m: [1.0, -2.0, 0.5], ring: 3, offset_micros: 7 };
-        let header = DatagramHeader { seq: u64::from(seq / 2), stamp_nanos: i64::from(seq / 2) * 6_000_000, ..header };
-        let part = ScanPart { header, frame: "lidar".to_owned(), part: seq % 2, n_parts: 2, points: vec![point; 2] };
+        lines.push(encode_pose(&PoseDatagram {
+            header,
+            world_from_base,
+            covariance: None,
+        }));
+        let point = RangePoint {
+            position_m: [1.0, -2.0, 0.5],
+            ring: 3,
+            offset_micros: 7,
+        };
+        let header = DatagramHeader {
+            seq: u64::from(seq / 2),
+            stamp_nanos: i64::from(seq / 2) * 6_000_000,
+            ..header
+        };
+        let part = ScanPart {
+            header,
+            frame: "lidar".to_owned(),
+            part: seq % 2,
+            n_parts: 2,
+            points: vec![point; 2],
+        };
         lines.push(encode_scan(&part));
     }
     lines
@@ -134,10 +209,16 @@ mod tests {
         assert_eq!(reported.len(), 10);
         let read = |lines: &[Vec<u8>]| {
             let read = joint_states(&lines.join(&b'\n'));
-            assert!(read.iter().all(|positions| reported.contains(positions)), "{read:?}");
+            assert!(
+                read.iter().all(|positions| reported.contains(positions)),
+                "{read:?}"
+            );
             read.len()
         };
-        let doubled: Vec<_> = lines.iter().flat_map(|line| [line.clone(), line.clone()]).collect();
+        let doubled: Vec<_> = lines
+            .iter()
+            .flat_map(|line| [line.clone(), line.clone()])
+            .collect();
         assert_eq!(read(&doubled), 10, "duplicates are ignored");
         let mut random = Random::new(2);
         for _ in 0..50 {
@@ -146,10 +227,17 @@ mod tests {
             assert!(read(&shuffled) <= 10);
         }
         for n_bytes in 0..lines[0].len() {
-            let cut: Vec<_> = lines.iter().map(|line| line[..line.len().min(n_bytes)].to_vec()).collect();
+            let cut: Vec<_> = lines
+                .iter()
+                .map(|line| line[..line.len().min(n_bytes)].to_vec())
+                .collect();
             assert_eq!(read(&cut), 0, "{n_bytes} bytes");
         }
         let doubled_payload: Vec<_> = lines.iter().map(|line| line.repeat(2)).collect();
-        assert_eq!(read(&doubled_payload), 0, "two messages in one datagram are rejected");
+        assert_eq!(
+            read(&doubled_payload),
+            0,
+            "two messages in one datagram are rejected"
+        );
     }
 }

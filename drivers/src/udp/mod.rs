@@ -1,5 +1,5 @@
-//! Arms, range scanners and bases that send JSON datagrams. The format is described in `docs/reference/udp.md`; its
-//! codec is `wire/datagram.rs`.
+//! Arms, range scanners and bases that send JSON datagrams. The format is described in
+//! `docs/reference/udp.md`; its codec is `wire/datagram.rs`.
 
 mod arm;
 mod base;

@@ -24,11 +24,26 @@ pub(super) struct DatagramReader {
 
 impl DatagramReader {
     /// Listens. With port 0, a free port is used.
-    pub(super) fn open(device: &str, plural: &'static str, address: SocketAddr) -> Result<Self, Error> {
+    pub(super) fn open(
+        device: &str,
+        plural: &'static str,
+        address: SocketAddr,
+    ) -> Result<Self, Error> {
         let receiver = Receiver::open(device.to_owned(), address)?;
         let monitor = DatagramMonitor::new(device, receiver.address());
-        let (sequence, counts, senders) = (SequenceTracker::default(), DatagramCounts::default(), Senders::default());
-        Ok(Self { plural, receiver, sequence, counts, monitor, senders })
+        let (sequence, counts, senders) = (
+            SequenceTracker::default(),
+            DatagramCounts::default(),
+            Senders::default(),
+        );
+        Ok(Self {
+            plural,
+            receiver,
+            sequence,
+            counts,
+            monitor,
+            senders,
+        })
     }
 
     /// Address it listens on.
@@ -51,8 +66,9 @@ impl DatagramReader {
         self.monitor.set_counts(self.counts);
     }
 
-    /// Returns the next value that `decode` accepts with its stamp on our clock, or `None` if none came in time. A datagram
-    /// without a value, such as the state of a gripper, only counts in the sequence.
+    /// Returns the next value that `decode` accepts with its stamp on our clock, or `None` if none
+    /// came in time. A datagram without a value, such as the state of a gripper, only counts in the
+    /// sequence.
     pub(super) fn next<T>(
         &mut self,
         timeout: Duration,
@@ -77,7 +93,14 @@ impl DatagramReader {
         datagram: &ReceivedDatagram,
         decode: impl Fn(&[u8]) -> Result<(DatagramHeader, Option<T>), Malformed>,
     ) -> Option<(Stamp, T)> {
-        let Self { plural, receiver, sequence, counts, monitor, senders } = self;
+        let Self {
+            plural,
+            receiver,
+            sequence,
+            counts,
+            monitor,
+            senders,
+        } = self;
         let device = receiver.device();
         counts.n_received += 1;
         count_and_warn(
@@ -89,7 +112,12 @@ impl DatagramReader {
         let (header, reading) = match decode(&datagram.bytes) {
             Ok(decoded) => decoded,
             Err(error) => {
-                count_and_warn(device, &mut counts.n_rejected, 1, format_args!("rejected a datagram: {error}"));
+                count_and_warn(
+                    device,
+                    &mut counts.n_rejected,
+                    1,
+                    format_args!("rejected a datagram: {error}"),
+                );
                 monitor.set_last_rejection(error.to_string());
                 return None;
             }
@@ -98,14 +126,25 @@ impl DatagramReader {
             return None;
         }
         match sequence.position(header.seq, datagram.at) {
-            SequencePosition::New { n_lost } => {
-                count_and_warn(device, &mut counts.n_lost, n_lost, format_args!("{plural} did not arrive"))
-            }
-            SequencePosition::Restart => {
-                count_and_warn(device, &mut counts.n_restarts, 1, "the sender's sequence numbers restarted")
-            }
+            SequencePosition::New { n_lost } => count_and_warn(
+                device,
+                &mut counts.n_lost,
+                n_lost,
+                format_args!("{plural} did not arrive"),
+            ),
+            SequencePosition::Restart => count_and_warn(
+                device,
+                &mut counts.n_restarts,
+                1,
+                "the sender's sequence numbers restarted",
+            ),
             SequencePosition::Current | SequencePosition::Late => {
-                count_and_warn(device, &mut counts.n_late, 1, format_args!("{plural} were late or duplicate"));
+                count_and_warn(
+                    device,
+                    &mut counts.n_late,
+                    1,
+                    format_args!("{plural} were late or duplicate"),
+                );
                 return None;
             }
         }
@@ -120,10 +159,20 @@ impl DatagramReader {
         };
         let n_before = sequence.n_clock_restarts();
         let stamp = sequence.stamp(&header, datagram.at);
-        count_and_warn(device, &mut counts.n_clock_restarts, sequence.n_clock_restarts() - n_before, CLOCK_RESTARTED);
+        count_and_warn(
+            device,
+            &mut counts.n_clock_restarts,
+            sequence.n_clock_restarts() - n_before,
+            CLOCK_RESTARTED,
+        );
         if stamp.is_none() {
             let reason = sequence::rejection(&header, datagram.at);
-            count_and_warn(device, &mut counts.n_rejected, 1, format_args!("rejected a datagram: {reason}"));
+            count_and_warn(
+                device,
+                &mut counts.n_rejected,
+                1,
+                format_args!("rejected a datagram: {reason}"),
+            );
             monitor.set_last_rejection(reason);
         }
         Some((stamp?, reading))

@@ -16,8 +16,8 @@ const MAX_WAITING_BYTES: usize = 16 << 20;
 const OVERHEAD_BYTES: usize = 128;
 /// Maximum length of a datagram.
 const MAX_DATAGRAM_BYTES: usize = 65_536;
-/// Maximum age of a datagram at the first read. Older datagrams are discarded, because they arrived while other devices
-/// were still being opened.
+/// Maximum age of a datagram at the first read. Older datagrams are discarded, because they arrived
+/// while other devices were still being opened.
 const MAX_BUFFERED_AGE: Duration = Duration::from_millis(200);
 /// Interval at which the thread checks whether it has to stop.
 const POLL: Duration = Duration::from_millis(100);
@@ -66,7 +66,13 @@ impl Receiver {
         });
         let (address, socket) = match bound {
             Ok(bound) => bound,
-            Err(source) => return Err(Error::Listen { device, address, source }),
+            Err(source) => {
+                return Err(Error::Listen {
+                    device,
+                    address,
+                    source,
+                });
+            }
         };
         if !address.ip().is_loopback() {
             log::warn!(
@@ -75,9 +81,16 @@ impl Receiver {
         }
         let shared = Arc::new(Shared::default());
         let reading = Arc::clone(&shared);
-        let thread = std::thread::Builder::new().name(device.clone()).spawn(move || reading.read(&socket));
+        let thread = std::thread::Builder::new()
+            .name(device.clone())
+            .spawn(move || reading.read(&socket));
         match thread {
-            Ok(thread) => Ok(Self { device, address, shared, thread: Some(thread) }),
+            Ok(thread) => Ok(Self {
+                device,
+                address,
+                shared,
+                thread: Some(thread),
+            }),
             Err(source) => Err(Error::Thread { device, source }),
         }
     }
@@ -101,10 +114,18 @@ impl Receiver {
         loop {
             if let Some((at, from, bytes)) = state.queue.pop_front() {
                 state.n_bytes -= bytes.len() + OVERHEAD_BYTES;
-                return Ok(Some(ReceivedDatagram { at, from, bytes, n_dropped: std::mem::take(&mut state.n_dropped) }));
+                return Ok(Some(ReceivedDatagram {
+                    at,
+                    from,
+                    bytes,
+                    n_dropped: std::mem::take(&mut state.n_dropped),
+                }));
             }
             if let Some(source) = state.error.take() {
-                return Err(Error::Network { device: self.device.clone(), source });
+                return Err(Error::Network {
+                    device: self.device.clone(),
+                    source,
+                });
             }
             let remaining = until.saturating_duration_since(Instant::now());
             if remaining.is_zero() {
@@ -128,7 +149,10 @@ impl Shared {
             match received {
                 Ok((n, from)) => state.put(at, from, buffer[..n].to_vec()),
                 Err(error)
-                    if matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut | ErrorKind::Interrupted) =>
+                    if matches!(
+                        error.kind(),
+                        ErrorKind::WouldBlock | ErrorKind::TimedOut | ErrorKind::Interrupted
+                    ) =>
                 {
                     continue;
                 }
@@ -184,10 +208,16 @@ mod tests {
 
     #[test]
     fn datagrams_before_first_read_are_discarded_by_age() {
-        let mut state = State { n_dropped: 3, ..State::default() };
+        let mut state = State {
+            n_dropped: 3,
+            ..State::default()
+        };
         (0..10).for_each(|ix| state.put(Stamp(ix), SENDER, vec![0; 5]));
         state.discard_before(Stamp(7));
-        assert_eq!((state.queue.len(), state.n_bytes, state.n_dropped), (3, 3 * (5 + OVERHEAD_BYTES), 0));
+        assert_eq!(
+            (state.queue.len(), state.n_bytes, state.n_dropped),
+            (3, 3 * (5 + OVERHEAD_BYTES), 0)
+        );
         state.discard_before(Stamp(100));
         assert_eq!((state.queue.len(), state.n_bytes), (0, 0));
     }

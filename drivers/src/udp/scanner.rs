@@ -13,8 +13,8 @@ use std::time::{Duration, Instant};
 
 /// A range scanner whose scans are received over UDP.
 ///
-/// A scan is returned when all its parts have arrived. If parts are missing when the next scan begins, it is returned
-/// without them.
+/// A scan is returned when all its parts have arrived. If parts are missing when the next scan
+/// begins, it is returned without them.
 #[derive(Debug)]
 pub struct UdpScanner {
     name: Arc<str>,
@@ -90,12 +90,22 @@ impl UdpScanner {
         if *part.frame != *self.name {
             return self.reject(format_args!("it belongs to another frame"));
         }
-        if !self.senders.accepts(device, datagram.from, datagram.at, &mut self.counts.n_foreign) {
+        if !self.senders.accepts(
+            device,
+            datagram.from,
+            datagram.at,
+            &mut self.counts.n_foreign,
+        ) {
             return;
         }
         match self.sequence.position(part.header.seq, datagram.at) {
             SequencePosition::New { n_lost } => {
-                count_and_warn(self.receiver.device(), &mut self.counts.n_lost, n_lost, "scans did not arrive");
+                count_and_warn(
+                    self.receiver.device(),
+                    &mut self.counts.n_lost,
+                    n_lost,
+                    "scans did not arrive",
+                );
                 self.begin(part, datagram.at);
             }
             SequencePosition::Restart => {
@@ -108,9 +118,12 @@ impl UdpScanner {
                 self.begin(part, datagram.at);
             }
             SequencePosition::Current => self.add(part),
-            SequencePosition::Late => {
-                count_and_warn(self.receiver.device(), &mut self.counts.n_late, 1, "a part of a scan was late")
-            }
+            SequencePosition::Late => count_and_warn(
+                self.receiver.device(),
+                &mut self.counts.n_late,
+                1,
+                "a part of a scan was late",
+            ),
         }
     }
 
@@ -120,12 +133,24 @@ impl UdpScanner {
         let n_before = self.sequence.n_clock_restarts();
         let stamp = self.sequence.stamp(&part.header, arrival);
         let n_new_restarts = self.sequence.n_clock_restarts() - n_before;
-        count_and_warn(self.receiver.device(), &mut self.counts.n_clock_restarts, n_new_restarts, CLOCK_RESTARTED);
+        count_and_warn(
+            self.receiver.device(),
+            &mut self.counts.n_clock_restarts,
+            n_new_restarts,
+            CLOCK_RESTARTED,
+        );
         let Some(stamp) = stamp else {
-            return self.reject(format_args!("{}", sequence::rejection(&part.header, arrival)));
+            return self.reject(format_args!(
+                "{}",
+                sequence::rejection(&part.header, arrival)
+            ));
         };
         let parts = vec![None; part.n_parts as usize];
-        self.partial_scan = Some(PartialScan { header: part.header, stamp, parts });
+        self.partial_scan = Some(PartialScan {
+            header: part.header,
+            stamp,
+            parts,
+        });
         self.add(part);
     }
 
@@ -158,11 +183,22 @@ impl UdpScanner {
     }
 
     fn finish_scan(&mut self) {
-        let Some(PartialScan { stamp, parts, .. }) = self.partial_scan.take() else { return };
+        let Some(PartialScan { stamp, parts, .. }) = self.partial_scan.take() else {
+            return;
+        };
         let n_missing = parts.iter().filter(|part| part.is_none()).count() as u64;
-        count_and_warn(self.receiver.device(), &mut self.counts.n_lost, n_missing, "parts of a scan did not arrive");
+        count_and_warn(
+            self.receiver.device(),
+            &mut self.counts.n_lost,
+            n_missing,
+            "parts of a scan did not arrive",
+        );
         let points: Arc<[RangePoint]> = parts.into_iter().flatten().flatten().collect();
-        self.completed.push_back(RangeScan { scanner: Arc::clone(&self.name), stamp, points });
+        self.completed.push_back(RangeScan {
+            scanner: Arc::clone(&self.name),
+            stamp,
+            points,
+        });
     }
 
     fn reject(&mut self, reason: std::fmt::Arguments<'_>) {
@@ -187,14 +223,19 @@ impl RangeScanner for UdpScanner {
             if let Some(scan) = self.completed.pop_front() {
                 return Ok(scan);
             }
-            let Some(datagram) = self.receiver.next(until)? else { break };
+            let Some(datagram) = self.receiver.next(until)? else {
+                break;
+            };
             self.take(&datagram);
             self.monitor.set_counts(self.counts);
             if self.completed.is_empty() && Instant::now() >= until {
                 break; // Even if invalid datagrams keep arriving.
             }
         }
-        Err(Error::NoScan { scanner: self.name.to_string(), waited: timeout })
+        Err(Error::NoScan {
+            scanner: self.name.to_string(),
+            waited: timeout,
+        })
     }
 }
 

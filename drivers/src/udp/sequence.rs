@@ -6,8 +6,8 @@ use std::time::Duration;
 
 /// Maximum gap in the sequence numbers. A larger difference means that the sender restarted.
 const MAX_SEQUENCE_GAP: u64 = 1000;
-/// Maximum delay of a reordered datagram. If the newest datagram is older than this, a lower sequence number means that
-/// the sender restarted.
+/// Maximum delay of a reordered datagram. If the newest datagram is older than this, a lower
+/// sequence number means that the sender restarted.
 const MAX_REORDER_AGE: Duration = Duration::from_secs(1);
 /// Stamps of our own clock older than this, or ahead by more than [`MAX_AHEAD`], are invalid.
 const MAX_AGE: Duration = Duration::from_secs(5);
@@ -44,9 +44,15 @@ impl SequenceTracker {
         };
         let is_near = seq.abs_diff(newest) <= MAX_SEQUENCE_GAP;
         let position = match seq > newest {
-            true if is_near => SequencePosition::New { n_lost: seq - newest - 1 },
+            true if is_near => SequencePosition::New {
+                n_lost: seq - newest - 1,
+            },
             false if is_near && arrival.duration_since(since) <= MAX_REORDER_AGE => {
-                return if seq == newest { SequencePosition::Current } else { SequencePosition::Late };
+                return if seq == newest {
+                    SequencePosition::Current
+                } else {
+                    SequencePosition::Late
+                };
             }
             _ => SequencePosition::Restart,
         };
@@ -59,7 +65,8 @@ impl SequenceTracker {
         self.clock.n_restarts()
     }
 
-    /// Stamp of a new datagram on our clock. `None` if it is impossible or not after the newest one.
+    /// Stamp of a new datagram on our clock. `None` if it is impossible or not after the newest
+    /// one.
     pub(crate) fn stamp(&mut self, header: &DatagramHeader, arrival: Stamp) -> Option<Stamp> {
         let stamp = match header.clock {
             Clock::Monotonic => Stamp(header.stamp_nanos),
@@ -120,7 +127,11 @@ mod tests {
         assert_eq!(at(2, 0), SequencePosition::New { n_lost: 0 });
         assert_eq!(at(0, 1), SequencePosition::Late, "a second later");
         assert_eq!(at(0, 2), SequencePosition::Restart, "two seconds later");
-        assert_eq!(at(0, 4), SequencePosition::Restart, "always the same number");
+        assert_eq!(
+            at(0, 4),
+            SequencePosition::Restart,
+            "always the same number"
+        );
     }
 
     #[test]
@@ -131,9 +142,21 @@ mod tests {
                 let nanos = ix * 10_000_000;
                 #[expect(clippy::cast_possible_truncation, reason = "ten seconds")]
                 let stamp_nanos = (nanos as f64 * per_nano) as i64;
-                sequence.stamp(&DatagramHeader { seq: 0, clock: Clock::Device, stamp_nanos }, Stamp(nanos));
+                sequence.stamp(
+                    &DatagramHeader {
+                        seq: 0,
+                        clock: Clock::Device,
+                        stamp_nanos,
+                    },
+                    Stamp(nanos),
+                );
             }
-            assert_eq!(sequence.n_clock_restarts() == 0, is_right, "{per_nano}: {}", sequence.n_clock_restarts());
+            assert_eq!(
+                sequence.n_clock_restarts() == 0,
+                is_right,
+                "{per_nano}: {}",
+                sequence.n_clock_restarts()
+            );
         }
     }
 
@@ -141,24 +164,71 @@ mod tests {
     fn stamps_increase_and_precede_arrival() {
         let mut sequence = SequenceTracker::default();
         let mut at = |clock, stamp_nanos, arrival| {
-            sequence.stamp(&DatagramHeader { seq: 0, clock, stamp_nanos }, Stamp(arrival))
+            sequence.stamp(
+                &DatagramHeader {
+                    seq: 0,
+                    clock,
+                    stamp_nanos,
+                },
+                Stamp(arrival),
+            )
         };
         let now = 1000 * SEC;
         assert_eq!(at(Clock::Monotonic, now - 7, now), Some(Stamp(now - 7)));
-        for wrong in [now - 7, now - 8, now - 6 * SEC, now + SEC, i64::MAX, i64::MIN, 0] {
+        for wrong in [
+            now - 7,
+            now - 8,
+            now - 6 * SEC,
+            now + SEC,
+            i64::MAX,
+            i64::MIN,
+            0,
+        ] {
             assert_eq!(at(Clock::Monotonic, wrong, now), None, "{wrong}");
         }
-        let wall_clock = DatagramHeader { seq: 0, clock: Clock::Monotonic, stamp_nanos: 1_790_000_000 * SEC };
+        let wall_clock = DatagramHeader {
+            seq: 0,
+            clock: Clock::Monotonic,
+            stamp_nanos: 1_790_000_000 * SEC,
+        };
         assert!(hint(&wall_clock, Stamp(now)).contains("device"));
-        assert_eq!(hint(&DatagramHeader { clock: Clock::Device, ..wall_clock }, Stamp(now)), "");
-        assert_eq!(hint(&DatagramHeader { stamp_nanos: now - 7, ..wall_clock }, Stamp(now)), "");
+        assert_eq!(
+            hint(
+                &DatagramHeader {
+                    clock: Clock::Device,
+                    ..wall_clock
+                },
+                Stamp(now)
+            ),
+            ""
+        );
+        assert_eq!(
+            hint(
+                &DatagramHeader {
+                    stamp_nanos: now - 7,
+                    ..wall_clock
+                },
+                Stamp(now)
+            ),
+            ""
+        );
         // A device clock may have any value.
         assert_eq!(at(Clock::Device, -5, now), Some(Stamp(now)));
-        assert_eq!(at(Clock::Device, SEC - 5, now + SEC), Some(Stamp(now + SEC)));
-        assert_eq!(at(Clock::Device, SEC - 5, now + SEC + 1000), None, "the same time again");
+        assert_eq!(
+            at(Clock::Device, SEC - 5, now + SEC),
+            Some(Stamp(now + SEC))
+        );
+        assert_eq!(
+            at(Clock::Device, SEC - 5, now + SEC + 1000),
+            None,
+            "the same time again"
+        );
         for wild in [i64::MAX, i64::MIN, 0] {
             let mapped = at(Clock::Device, wild, now + 2 * SEC);
-            assert!(mapped.is_none_or(|stamp| stamp <= Stamp(now + 2 * SEC)), "{wild}: {mapped:?}");
+            assert!(
+                mapped.is_none_or(|stamp| stamp <= Stamp(now + 2 * SEC)),
+                "{wild}: {mapped:?}"
+            );
         }
     }
 }

@@ -2,7 +2,8 @@
 
 use super::{DatagramCounts, UdpArm, UdpBase, UdpScanner};
 use crate::wire::datagram::{
-    Clock, DatagramHeader, JointsDatagram, PoseDatagram, ScanPart, encode_joints, encode_pose, encode_scan,
+    Clock, DatagramHeader, JointsDatagram, PoseDatagram, ScanPart, encode_joints, encode_pose,
+    encode_scan,
 };
 use crate::{Arm, Base, Devices, Error, Live, RangePoint, RangeScanner, Sample, Source, clock};
 use kinematics::Transform;
@@ -29,21 +30,45 @@ fn scanner() -> (UdpScanner, impl Fn(&[u8])) {
 }
 
 fn now(seq: u64) -> DatagramHeader {
-    DatagramHeader { seq, clock: Clock::Monotonic, stamp_nanos: clock::now().0 }
+    DatagramHeader {
+        seq,
+        clock: Clock::Monotonic,
+        stamp_nanos: clock::now().0,
+    }
 }
 
 /// A part of a scan with one point at the given distance.
 fn part(header: DatagramHeader, part: u32, n_parts: u32, range_m: f32) -> Vec<u8> {
-    let point = RangePoint { position_m: [range_m, 0.0, 0.0], ring: 2, offset_micros: 5 };
-    encode_scan(&ScanPart { header, frame: "lidar".into(), part, n_parts, points: vec![point] })
+    let point = RangePoint {
+        position_m: [range_m, 0.0, 0.0],
+        ring: 2,
+        offset_micros: 5,
+    };
+    encode_scan(&ScanPart {
+        header,
+        frame: "lidar".into(),
+        part,
+        n_parts,
+        points: vec![point],
+    })
 }
 
 fn ranges(scanner: &mut UdpScanner) -> Vec<f32> {
-    scanner.next_scan(LONG_TIMEOUT).unwrap().points.iter().map(|point| point.position_m[0]).collect()
+    scanner
+        .next_scan(LONG_TIMEOUT)
+        .unwrap()
+        .points
+        .iter()
+        .map(|point| point.position_m[0])
+        .collect()
 }
 
 fn pose(header: DatagramHeader, x_m: f64) -> Vec<u8> {
-    encode_pose(&PoseDatagram { header, world_from_base: Transform::translation(x_m, 0.0, 0.0), covariance: None })
+    encode_pose(&PoseDatagram {
+        header,
+        world_from_base: Transform::translation(x_m, 0.0, 0.0),
+        covariance: None,
+    })
 }
 
 #[test]
@@ -52,8 +77,15 @@ fn scans_are_assembled_with_stamps() {
     let header = now(0);
     send(&part(header, 0, 1, 1.5));
     let scan = scanner.next_scan(LONG_TIMEOUT).unwrap();
-    assert_eq!((&*scan.scanner, scan.stamp.0), ("lidar", header.stamp_nanos));
-    let expected = RangePoint { position_m: [1.5, 0.0, 0.0], ring: 2, offset_micros: 5 };
+    assert_eq!(
+        (&*scan.scanner, scan.stamp.0),
+        ("lidar", header.stamp_nanos)
+    );
+    let expected = RangePoint {
+        position_m: [1.5, 0.0, 0.0],
+        ring: 2,
+        offset_micros: 5,
+    };
     assert_eq!(*scan.points, [expected]);
     // Parts may arrive in any order.
     let header = now(1);
@@ -63,10 +95,25 @@ fn scans_are_assembled_with_stamps() {
     assert_eq!(ranges(&mut scanner), [1.0, 2.0, 3.0]);
     // With a device clock, the first stamp is the arrival time.
     let before = clock::now();
-    send(&part(DatagramHeader { seq: 2, clock: Clock::Device, stamp_nanos: -77 }, 0, 1, 1.0));
+    send(&part(
+        DatagramHeader {
+            seq: 2,
+            clock: Clock::Device,
+            stamp_nanos: -77,
+        },
+        0,
+        1,
+        1.0,
+    ));
     let scan = scanner.next_scan(LONG_TIMEOUT).unwrap();
     assert!(scan.stamp > before && scan.stamp <= clock::now());
-    assert_eq!(scanner.counts(), DatagramCounts { n_received: 5, ..DatagramCounts::default() });
+    assert_eq!(
+        scanner.counts(),
+        DatagramCounts {
+            n_received: 5,
+            ..DatagramCounts::default()
+        }
+    );
 }
 
 #[test]
@@ -86,7 +133,13 @@ fn lost_duplicate_and_late_scans_are_counted() {
     assert_eq!(ranges(&mut scanner), [2.0]);
     assert_eq!(ranges(&mut scanner), [4.5, 5.0]);
     assert_eq!(ranges(&mut scanner), [6.0]);
-    let expected = DatagramCounts { n_received: 9, n_rejected: 1, n_lost: 3, n_late: 3, ..DatagramCounts::default() };
+    let expected = DatagramCounts {
+        n_received: 9,
+        n_rejected: 1,
+        n_lost: 3,
+        n_late: 3,
+        ..DatagramCounts::default()
+    };
     assert_eq!(scanner.counts(), expected);
 }
 
@@ -107,10 +160,40 @@ fn malformed_datagrams_are_rejected() {
         junk(&good[..end]);
     }
     junk(&pose(now(0), 1.0));
-    junk(&part(DatagramHeader { stamp_nanos: i64::MAX, ..now(3) }, 0, 1, 1.0));
-    junk(&part(DatagramHeader { stamp_nanos: i64::MIN, ..now(4) }, 0, 1, 1.0));
-    junk(String::from_utf8(part(now(5), 0, 1, 1.0)).unwrap().replace("lidar", "radar").as_bytes());
-    junk(&part(DatagramHeader { seq: u64::MAX, clock: Clock::Monotonic, stamp_nanos: 0 }, 0, 1, 1.0));
+    junk(&part(
+        DatagramHeader {
+            stamp_nanos: i64::MAX,
+            ..now(3)
+        },
+        0,
+        1,
+        1.0,
+    ));
+    junk(&part(
+        DatagramHeader {
+            stamp_nanos: i64::MIN,
+            ..now(4)
+        },
+        0,
+        1,
+        1.0,
+    ));
+    junk(
+        String::from_utf8(part(now(5), 0, 1, 1.0))
+            .unwrap()
+            .replace("lidar", "radar")
+            .as_bytes(),
+    );
+    junk(&part(
+        DatagramHeader {
+            seq: u64::MAX,
+            clock: Clock::Monotonic,
+            stamp_nanos: 0,
+        },
+        0,
+        1,
+        1.0,
+    ));
     let n_junk = n_sent;
     send(&part(now(0), 0, 1, 7.0));
     assert_eq!(ranges(&mut scanner), [7.0]);
@@ -122,7 +205,10 @@ fn malformed_datagrams_are_rejected() {
     }
     let started = Instant::now();
     let timeout_error = scanner.next_scan(SHORT_TIMEOUT).unwrap_err();
-    assert!(matches!(timeout_error, Error::NoScan { .. }), "{timeout_error}");
+    assert!(
+        matches!(timeout_error, Error::NoScan { .. }),
+        "{timeout_error}"
+    );
     assert!(started.elapsed() < LONG_TIMEOUT);
 }
 
@@ -130,17 +216,28 @@ fn malformed_datagrams_are_rejected() {
 fn base_poses_are_ordered_and_drop_frees_port() {
     let mut base = UdpBase::open(FREE_PORT.parse().unwrap(), MAX_SIGMA).unwrap();
     let (address, send) = (base.address(), sender(base.address()));
-    assert!(matches!(base.next_pose(SHORT_TIMEOUT), Err(Error::NoBasePose { .. })));
+    assert!(matches!(
+        base.next_pose(SHORT_TIMEOUT),
+        Err(Error::NoBasePose { .. })
+    ));
     let heads: Vec<DatagramHeader> = (0..4).map(now).collect();
     for ix in [0, 1, 1, 3, 2] {
         send(&pose(heads[ix], ix as f64));
     }
     for ix in [0, 1, 3] {
         let reported = base.next_pose(LONG_TIMEOUT).unwrap();
-        assert_eq!((reported.stamp.0, reported.world_from_base.translation.x), (heads[ix].stamp_nanos, ix as f64));
+        assert_eq!(
+            (reported.stamp.0, reported.world_from_base.translation.x),
+            (heads[ix].stamp_nanos, ix as f64)
+        );
     }
     assert!(base.next_pose(SHORT_TIMEOUT).is_err());
-    let expected = DatagramCounts { n_received: 5, n_lost: 1, n_late: 2, ..DatagramCounts::default() };
+    let expected = DatagramCounts {
+        n_received: 5,
+        n_lost: 1,
+        n_late: 2,
+        ..DatagramCounts::default()
+    };
     assert_eq!(base.counts(), expected);
     let taken = UdpBase::open(address, MAX_SIGMA).unwrap_err();
     assert!(taken.to_string().contains(&address.to_string()), "{taken}");
@@ -157,7 +254,11 @@ fn uncertain_poses_are_skipped_and_counted() {
         let mut covariance = Box::new([0.0; 36]);
         (covariance[0], covariance[28]) = (sigma_m * sigma_m, sigma_rad * sigma_rad);
         let world_from_base = Transform::translation(ix as f64, 0.0, 0.0);
-        encode_pose(&PoseDatagram { header: header[ix], world_from_base, covariance: Some(covariance) })
+        encode_pose(&PoseDatagram {
+            header: header[ix],
+            world_from_base,
+            covariance: Some(covariance),
+        })
     };
     let [max_m, max_rad] = MAX_SIGMA;
     send(&reported(0, 0.9 * max_m, 0.9 * max_rad));
@@ -165,11 +266,25 @@ fn uncertain_poses_are_skipped_and_counted() {
     send(&reported(2, 0.0, 1.1 * max_rad));
     send(&pose(header[3], 3.0));
     for ix in [0, 3] {
-        assert_eq!(base.next_pose(LONG_TIMEOUT).unwrap().world_from_base.translation.x, f64::from(ix));
+        assert_eq!(
+            base.next_pose(LONG_TIMEOUT)
+                .unwrap()
+                .world_from_base
+                .translation
+                .x,
+            f64::from(ix)
+        );
     }
     send(&reported(4, 1.0, 0.0));
     assert!(base.next_pose(SHORT_TIMEOUT).is_err());
-    assert_eq!(base.counts(), DatagramCounts { n_received: 5, n_uncertain: 3, ..DatagramCounts::default() });
+    assert_eq!(
+        base.counts(),
+        DatagramCounts {
+            n_received: 5,
+            n_uncertain: 3,
+            ..DatagramCounts::default()
+        }
+    );
 }
 
 #[test]
@@ -178,14 +293,24 @@ fn joint_states_are_ordered_and_other_joints_ignored() {
     let mut arm = UdpArm::open(&names, FREE_PORT.parse().unwrap()).unwrap();
     let send = sender(arm.address());
     assert_eq!(arm.joint_names(), names);
-    let state =
-        |header, at: f64| JointsDatagram { header, position: vec![at, -at], velocity: vec![], effort: vec![at; 2] };
+    let state = |header, at: f64| JointsDatagram {
+        header,
+        position: vec![at, -at],
+        velocity: vec![],
+        effort: vec![at; 2],
+    };
     let other_names = ["left", "right"].map(str::to_owned);
     let heads: Vec<DatagramHeader> = (0..4).map(now).collect();
     for ix in [0, 2, 1, 3] {
         let (of_hand, of_arm) = (
-            DatagramHeader { seq: 2 * ix as u64, ..heads[ix] },
-            DatagramHeader { seq: 2 * ix as u64 + 1, ..heads[ix] },
+            DatagramHeader {
+                seq: 2 * ix as u64,
+                ..heads[ix]
+            },
+            DatagramHeader {
+                seq: 2 * ix as u64 + 1,
+                ..heads[ix]
+            },
         );
         send(&encode_joints(&state(of_hand, 9.0), &other_names));
         send(&encode_joints(&state(of_arm, ix as f64), &names));
@@ -199,8 +324,17 @@ fn joint_states_are_ordered_and_other_joints_ignored() {
         );
         assert!(reported.velocity.is_empty());
     }
-    assert!(matches!(arm.read(SHORT_TIMEOUT), Err(Error::NoJoints { .. })));
-    let expected = DatagramCounts { n_received: 8, n_other: 3, n_lost: 2, n_late: 2, ..DatagramCounts::default() };
+    assert!(matches!(
+        arm.read(SHORT_TIMEOUT),
+        Err(Error::NoJoints { .. })
+    ));
+    let expected = DatagramCounts {
+        n_received: 8,
+        n_other: 3,
+        n_lost: 2,
+        n_late: 2,
+        ..DatagramCounts::default()
+    };
     assert_eq!(arm.counts(), expected);
 }
 
@@ -209,7 +343,12 @@ fn only_one_sender_is_received_from() {
     let mut arm = UdpArm::open(&["shoulder".to_owned()], FREE_PORT.parse().unwrap()).unwrap();
     let [first, second] = [sender(arm.address()), sender(arm.address())];
     let state = |seq, at: f64| {
-        let state = JointsDatagram { header: now(seq), position: vec![at], velocity: vec![], effort: vec![] };
+        let state = JointsDatagram {
+            header: now(seq),
+            position: vec![at],
+            velocity: vec![],
+            effort: vec![],
+        };
         encode_joints(&state, &["shoulder".to_owned()])
     };
     first(&state(0, 0.25));
@@ -219,25 +358,45 @@ fn only_one_sender_is_received_from() {
         first(&state(seq, 0.25));
         assert_eq!(arm.read(LONG_TIMEOUT).unwrap().position, [0.25]);
     }
-    assert_eq!(arm.counts(), DatagramCounts { n_received: 99, n_foreign: 49, ..DatagramCounts::default() });
+    assert_eq!(
+        arm.counts(),
+        DatagramCounts {
+            n_received: 99,
+            n_foreign: 49,
+            ..DatagramCounts::default()
+        }
+    );
 }
 
 #[test]
 fn sender_with_a_new_socket_for_each_datagram_is_received_from() {
     let names = ["shoulder".to_owned()];
     let mut arm = UdpArm::open(&names, FREE_PORT.parse().unwrap()).unwrap();
-    assert!(arm.read(SHORT_TIMEOUT).is_err(), "older datagrams are discarded by the first read");
+    assert!(
+        arm.read(SHORT_TIMEOUT).is_err(),
+        "older datagrams are discarded by the first read"
+    );
     // All sockets stay open, so that their ports differ.
     let sockets: Vec<_> = (0..30).map(|_| sender(arm.address())).collect();
     for (seq, send) in (0..).zip(&sockets) {
-        let state = JointsDatagram { header: now(seq), position: vec![0.25], velocity: vec![], effort: vec![] };
+        let state = JointsDatagram {
+            header: now(seq),
+            position: vec![0.25],
+            velocity: vec![],
+            effort: vec![],
+        };
         send(&encode_joints(&state, &names));
     }
     for ix in 0..27 {
         assert_eq!(arm.read(LONG_TIMEOUT).unwrap().position, [0.25], "{ix}");
     }
     assert!(arm.read(SHORT_TIMEOUT).is_err(), "three were ignored");
-    let expected = DatagramCounts { n_received: 30, n_foreign: 3, n_lost: 3, ..DatagramCounts::default() };
+    let expected = DatagramCounts {
+        n_received: 30,
+        n_foreign: 3,
+        n_lost: 3,
+        ..DatagramCounts::default()
+    };
     assert_eq!(arm.counts(), expected);
 }
 
@@ -247,27 +406,67 @@ fn monitors_report_counts_and_the_last_rejection() {
     let mut base = UdpBase::open(FREE_PORT.parse().unwrap(), MAX_SIGMA).unwrap();
     let (mut scanner, send_scan) = scanner();
     let monitors = [arm.monitor(), base.monitor(), scanner.monitor()];
-    assert_eq!(monitors.each_ref().map(|monitor| monitor.device()), ["arm", "base", "range scanner \"lidar\""]);
+    assert_eq!(
+        monitors.each_ref().map(|monitor| monitor.device()),
+        ["arm", "base", "range scanner \"lidar\""]
+    );
     let addresses = [arm.address(), base.address(), scanner.address()];
-    assert_eq!(monitors.each_ref().map(|monitor| monitor.address()), addresses);
+    assert_eq!(
+        monitors.each_ref().map(|monitor| monitor.address()),
+        addresses
+    );
     let mut read_all = || {
         assert!(arm.read(SHORT_TIMEOUT).is_err() && base.next_pose(SHORT_TIMEOUT).is_err());
         assert!(scanner.next_scan(SHORT_TIMEOUT).is_err());
     };
     read_all(); // The first read discards older datagrams.
-    assert!(monitors.iter().all(|monitor| monitor.counts().n_received == 0 && monitor.last_rejection().is_none()));
+    assert!(
+        monitors
+            .iter()
+            .all(|monitor| monitor.counts().n_received == 0 && monitor.last_rejection().is_none())
+    );
     sender(addresses[0])(b"{\"kind\":\"joints\"}");
-    sender(addresses[1])(&pose(DatagramHeader { stamp_nanos: i64::MAX, ..now(0) }, 1.0));
-    send_scan(&part(DatagramHeader { stamp_nanos: i64::MAX, ..now(0) }, 0, 1, 1.0));
+    sender(addresses[1])(&pose(
+        DatagramHeader {
+            stamp_nanos: i64::MAX,
+            ..now(0)
+        },
+        1.0,
+    ));
+    send_scan(&part(
+        DatagramHeader {
+            stamp_nanos: i64::MAX,
+            ..now(0)
+        },
+        0,
+        1,
+        1.0,
+    ));
     let started = Instant::now();
-    while monitors.iter().any(|monitor| monitor.counts().n_received == 0) {
+    while monitors
+        .iter()
+        .any(|monitor| monitor.counts().n_received == 0)
+    {
         read_all();
         assert!(started.elapsed() < LONG_TIMEOUT, "{monitors:?}");
     }
-    let expected = DatagramCounts { n_received: 1, n_rejected: 1, ..DatagramCounts::default() };
-    assert!(monitors.iter().all(|monitor| monitor.counts() == expected), "{monitors:?}");
+    let expected = DatagramCounts {
+        n_received: 1,
+        n_rejected: 1,
+        ..DatagramCounts::default()
+    };
+    assert!(
+        monitors.iter().all(|monitor| monitor.counts() == expected),
+        "{monitors:?}"
+    );
     let reasons = monitors.map(|monitor| monitor.last_rejection().unwrap());
-    assert!(!reasons[0].is_empty() && reasons[1..].iter().all(|reason| reason.contains("\"device\"")), "{reasons:?}");
+    assert!(
+        !reasons[0].is_empty()
+            && reasons[1..]
+                .iter()
+                .all(|reason| reason.contains("\"device\"")),
+        "{reasons:?}"
+    );
 }
 
 #[test]
@@ -275,7 +474,11 @@ fn live_merges_devices_and_names_silent_one() {
     let (scanner, send_scan) = scanner();
     let base = UdpBase::open(FREE_PORT.parse().unwrap(), MAX_SIGMA).unwrap();
     let send_pose = sender(base.address());
-    let devices = Devices { base: Some(Box::new(base)), scanners: vec![Box::new(scanner)], ..Devices::default() };
+    let devices = Devices {
+        base: Some(Box::new(base)),
+        scanners: vec![Box::new(scanner)],
+        ..Devices::default()
+    };
     let mut live = Live::new(devices).unwrap();
     for seq in 0..3 {
         send_pose(&pose(now(seq), 0.0));
@@ -290,5 +493,11 @@ fn live_merges_devices_and_names_silent_one() {
         }
     }
     let timeout_error = live.next_sample().unwrap_err();
-    assert!(matches!(timeout_error, Error::NoScan { .. } | Error::NoBasePose { .. }), "{timeout_error}");
+    assert!(
+        matches!(
+            timeout_error,
+            Error::NoScan { .. } | Error::NoBasePose { .. }
+        ),
+        "{timeout_error}"
+    );
 }

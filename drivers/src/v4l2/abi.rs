@@ -1,5 +1,5 @@
-//! The part of the kernel's V4L2 interface that cameras need: structures, constants and request codes of
-//! `linux/videodev2.h` and `linux/v4l2-controls.h` on 64-bit Linux.
+//! The part of the kernel's V4L2 interface that cameras need: structures, constants and request
+//! codes of `linux/videodev2.h` and `linux/v4l2-controls.h` on 64-bit Linux.
 
 use rustix::ioctl::{Opcode, opcode};
 
@@ -58,7 +58,8 @@ pub(super) struct FormatDescription {
     pub(super) reserved: [u32; 3],
 }
 
-/// `struct v4l2_format` for video capture. The union in it is aligned to 8 bytes because other members hold pointers.
+/// `struct v4l2_format` for video capture. The union in it is aligned to 8 bytes because other
+/// members hold pointers.
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub(super) struct Format {
@@ -119,7 +120,8 @@ pub(super) struct FrameSize {
     pub(super) index: u32,
     pub(super) fourcc: u32,
     pub(super) kind: u32,
-    /// If discrete: width, height. Otherwise: minimum, maximum and step of the width, then of the height.
+    /// If discrete: width, height. Otherwise: minimum, maximum and step of the width, then of the
+    /// height.
     pub(super) numbers: [u32; 6],
     pub(super) reserved: [u32; 2],
 }
@@ -213,7 +215,8 @@ pub(super) struct Input {
     pub(super) reserved: [u32; 4],
 }
 
-/// A kernel structure that consists only of integers, so any bytes that the kernel writes are a valid value.
+/// A kernel structure that consists only of integers, so any bytes that the kernel writes are a
+/// valid value.
 pub(super) trait Plain: Copy {}
 impl Plain for Capability {}
 impl Plain for FormatDescription {}
@@ -229,7 +232,8 @@ impl Plain for QueryMenu {}
 impl Plain for Input {}
 impl Plain for u32 {}
 
-/// A request code and the type of its argument. Only this file creates them, from the list of the kernel.
+/// A request code and the type of its argument. Only this file creates them, from the list of the
+/// kernel.
 pub(super) struct Request<T> {
     code: Opcode,
     payload: std::marker::PhantomData<T>,
@@ -242,15 +246,24 @@ impl<T> Request<T> {
 }
 
 const fn read_write_request<T>(number: u8) -> Request<T> {
-    Request { code: opcode::read_write::<T>(b'V', number), payload: std::marker::PhantomData }
+    Request {
+        code: opcode::read_write::<T>(b'V', number),
+        payload: std::marker::PhantomData,
+    }
 }
 
 const fn read_request<T>(number: u8) -> Request<T> {
-    Request { code: opcode::read::<T>(b'V', number), payload: std::marker::PhantomData }
+    Request {
+        code: opcode::read::<T>(b'V', number),
+        payload: std::marker::PhantomData,
+    }
 }
 
 const fn write_request<T>(number: u8) -> Request<T> {
-    Request { code: opcode::write::<T>(b'V', number), payload: std::marker::PhantomData }
+    Request {
+        code: opcode::write::<T>(b'V', number),
+        payload: std::marker::PhantomData,
+    }
 }
 
 pub(super) const QUERYCAP: Request<Capability> = read_request(0);
@@ -273,7 +286,8 @@ pub(super) const G_INPUT: Request<u32> = read_request(38);
 pub(super) const ENUM_FRAMESIZES: Request<FrameSize> = read_write_request(74);
 pub(super) const ENUM_FRAMEINTERVALS: Request<FrameInterval> = read_write_request(75);
 
-// Request codes contain the size of the structure. The kernel rejects a wrong size as an unknown request.
+// Request codes contain the size of the structure. The kernel rejects a wrong size as an unknown
+// request.
 const _: () = {
     assert!(size_of::<Capability>() == 104);
     assert!(size_of::<FormatDescription>() == 64);
@@ -291,7 +305,10 @@ const _: () = {
 
 /// Decodes null-terminated text.
 pub(super) fn text(bytes: &[u8]) -> String {
-    let end = bytes.iter().position(|byte| *byte == 0).unwrap_or(bytes.len());
+    let end = bytes
+        .iter()
+        .position(|byte| *byte == 0)
+        .unwrap_or(bytes.len());
     String::from_utf8_lossy(&bytes[..end]).trim().to_owned()
 }
 
@@ -299,7 +316,8 @@ pub(super) fn text(bytes: &[u8]) -> String {
 mod tests {
     use super::*;
 
-    /// Compiles a C program against the kernel's header, if available, and compares request codes and field offsets.
+    /// Compiles a C program against the kernel's header, if available, and compares request codes
+    /// and field offsets.
     #[test]
     fn abi_matches_kernel_header() {
         let header = std::path::Path::new("/usr/include/linux/videodev2.h");
@@ -338,7 +356,9 @@ mod tests {
             Input.capabilities = "v4l2_input, capabilities"
         );
         let expected: Vec<(String, u64)> = codes.into_iter().chain(offsets).collect();
-        let c_print = |(what, _): &(String, u64)| format!("printf(\"%llu\\n\", (unsigned long long){what});\n");
+        let c_print = |(what, _): &(String, u64)| {
+            format!("printf(\"%llu\\n\", (unsigned long long){what});\n")
+        };
         let program = format!(
             "#include <stddef.h>\n#include <stdio.h>\n#include <linux/videodev2.h>\nint main(void) {{\n{}return 0; }}\n",
             expected.iter().map(c_print).collect::<String>()
@@ -346,14 +366,29 @@ mod tests {
         let folder = tempfile::tempdir().expect("a folder");
         let (source, built) = (folder.path().join("abi.c"), folder.path().join("abi"));
         std::fs::write(&source, program).expect("writing the C program");
-        let compiler = std::process::Command::new("cc").arg(&source).arg("-o").arg(&built).status();
-        assert!(compiler.expect("a C compiler, which Rust also needs").success());
-        let output = std::process::Command::new(&built).output().expect("running the C program");
-        let reported: Vec<u64> =
-            String::from_utf8_lossy(&output.stdout).lines().map(|line| line.parse().expect("a number")).collect();
+        let compiler = std::process::Command::new("cc")
+            .arg(&source)
+            .arg("-o")
+            .arg(&built)
+            .status();
+        assert!(
+            compiler
+                .expect("a C compiler, which Rust also needs")
+                .success()
+        );
+        let output = std::process::Command::new(&built)
+            .output()
+            .expect("running the C program");
+        let reported: Vec<u64> = String::from_utf8_lossy(&output.stdout)
+            .lines()
+            .map(|line| line.parse().expect("a number"))
+            .collect();
         assert_eq!(reported.len(), expected.len());
-        let wrong: Vec<_> =
-            expected.iter().zip(&reported).filter(|((_, ours), kernel_value)| ours != *kernel_value).collect();
+        let wrong: Vec<_> = expected
+            .iter()
+            .zip(&reported)
+            .filter(|((_, ours), kernel_value)| ours != *kernel_value)
+            .collect();
         assert!(wrong.is_empty(), "{wrong:?}");
     }
 

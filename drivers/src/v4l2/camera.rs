@@ -9,16 +9,17 @@ use std::time::{Duration, Instant};
 
 /// Pause between two attempts to reconnect.
 const RETRY_PAUSE: Duration = Duration::from_millis(100);
-/// A stream without images for this long, or for the periods of this many images (next constant), is restarted, because
-/// cameras may hang.
+/// A stream without images for this long, or for the periods of this many images (next constant),
+/// is restarted, because cameras may hang.
 const MAX_SILENCE: Duration = Duration::from_secs(2);
 const MAX_SILENT_IMAGES: f64 = 5.0;
 
 /// A streaming V4L2 camera.
 ///
-/// A camera that is disconnected or hangs is reopened with the same settings for at most [`Config::reconnect_for`].
-/// During that time, [`Camera::next_image`] returns [`Error::Reconnecting`], afterwards the cause. Images missed in the
-/// meantime count as skipped. Dropping this value stops the stream.
+/// A camera that is disconnected or hangs is reopened with the same settings for at most
+/// [`Config::reconnect_for`]. During that time, [`Camera::next_image`] returns
+/// [`Error::Reconnecting`], afterwards the cause. Images missed in the meantime count as skipped.
+/// Dropping this value stops the stream.
 #[derive(Debug)]
 pub struct V4l2Camera(Reconnecting<V4l2Device>);
 
@@ -32,7 +33,8 @@ struct V4l2Device {
 }
 
 impl V4l2Camera {
-    /// Opens a camera, applies the settings of the rig file, reads them back, and starts the stream.
+    /// Opens a camera, applies the settings of the rig file, reads them back, and starts the
+    /// stream.
     pub fn open(config: Config) -> Result<Self, Error> {
         if config.device.starts_with("/dev/video") {
             let Config { name, device, .. } = &config;
@@ -47,8 +49,14 @@ impl V4l2Camera {
             first_pause: Duration::ZERO,
             retry_pause: RETRY_PAUSE,
         };
-        let mut device = V4l2Device { config, n_damaged: 0, was_read: false };
-        let stream = device.open().map_err(|failure| failure.into_error(|problem| device.error(problem)))?;
+        let mut device = V4l2Device {
+            config,
+            n_damaged: 0,
+            was_read: false,
+        };
+        let stream = device
+            .open()
+            .map_err(|failure| failure.into_error(|problem| device.error(problem)))?;
         log::info!("camera {:?}: {}", device.config.name, stream.describe());
         Ok(Self(Reconnecting::new(device, stream, policy)))
     }
@@ -63,7 +71,8 @@ impl V4l2Camera {
         self.0.device().n_damaged
     }
 
-    /// Names and values of the settings as read back from the camera. Empty while the camera is disconnected.
+    /// Names and values of the settings as read back from the camera. Empty while the camera is
+    /// disconnected.
     pub fn read_back(&self) -> &[(&'static str, i32)] {
         self.0.stream().map_or(&[], V4l2Stream::read_back)
     }
@@ -71,7 +80,10 @@ impl V4l2Camera {
 
 impl V4l2Device {
     fn error(&self, problem: Problem) -> Error {
-        Error::V4l2 { camera: self.config.name.clone(), problem: Box::new(problem) }
+        Error::V4l2 {
+            camera: self.config.name.clone(),
+            problem: Box::new(problem),
+        }
     }
 }
 
@@ -87,7 +99,11 @@ impl ReopenableCamera for V4l2Device {
         Some(stream.describe())
     }
 
-    fn next_image(&mut self, stream: &mut V4l2Stream, deadline: Instant) -> Result<Option<Image>, Failure<Problem>> {
+    fn next_image(
+        &mut self,
+        stream: &mut V4l2Stream,
+        deadline: Instant,
+    ) -> Result<Option<Image>, Failure<Problem>> {
         if !std::mem::replace(&mut self.was_read, true) {
             stream.discard_queued()?;
         }
@@ -95,7 +111,11 @@ impl ReopenableCamera for V4l2Device {
         self.n_damaged += stream.take_n_damaged();
         let image = image?;
         let waited = stream.time_since_image();
-        if image.is_none() && waited > MAX_SILENCE.max(Duration::from_secs_f64(MAX_SILENT_IMAGES / self.config.rate_hz))
+        if image.is_none()
+            && waited
+                > MAX_SILENCE.max(Duration::from_secs_f64(
+                    MAX_SILENT_IMAGES / self.config.rate_hz,
+                ))
         {
             return Err(Problem::Silent { waited }.into());
         }
@@ -103,7 +123,11 @@ impl ReopenableCamera for V4l2Device {
     }
 
     fn lost(&self, waited: Duration, n_tries: u32, last: Problem) -> Error {
-        self.error(Problem::Lost { waited, n_tries, last: Box::new(last) })
+        self.error(Problem::Lost {
+            waited,
+            n_tries,
+            last: Box::new(last),
+        })
     }
 }
 
@@ -144,7 +168,12 @@ mod tests {
             delivery: super::super::Delivery::Every,
             reconnect_for: Duration::from_secs(1),
         };
-        let message = V4l2Camera::open(config).expect_err("the camera does not exist").to_string();
-        assert!(message.contains("\"wrist\"") && message.contains("no such serial"), "{message}");
+        let message = V4l2Camera::open(config)
+            .expect_err("the camera does not exist")
+            .to_string();
+        assert!(
+            message.contains("\"wrist\"") && message.contains("no such serial"),
+            "{message}"
+        );
     }
 }

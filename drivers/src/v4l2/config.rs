@@ -10,10 +10,11 @@ use std::time::Duration;
 pub struct Config {
     /// Name in the rig file.
     pub name: String,
-    /// A path (preferably a link under `/dev/v4l`, whose name is stable), a USB serial number, or the port as reported
-    /// by the kernel (`usb-0000:00:14.0-2`).
+    /// A path (preferably a link under `/dev/v4l`, whose name is stable), a USB serial number, or
+    /// the port as reported by the kernel (`usb-0000:00:14.0-2`).
     pub device: String,
-    /// Pixel format; `None` selects the first one available at this size and rate, see [`V4l2Format::COLOR_FORMATS`].
+    /// Pixel format; `None` selects the first one available at this size and rate, see
+    /// [`V4l2Format::COLOR_FORMATS`].
     pub format: Option<V4l2Format>,
     /// Lens parameters and size of the images.
     pub intrinsics: Intrinsics,
@@ -29,8 +30,8 @@ pub struct Config {
     pub reconnect_for: Duration,
 }
 
-/// Sets a control of a device by its kernel id, even while another process streams from it. For tests that provoke
-/// faults.
+/// Sets a control of a device by its kernel id, even while another process streams from it. For
+/// tests that provoke faults.
 ///
 /// # Errors
 /// If the kernel rejects the value.

@@ -1,6 +1,8 @@
-//! Sets exposure, gain, white balance and brightness from the rig file in the right order, and reads them back.
+//! Sets exposure, gain, white balance and brightness from the rig file in the right order, and
+//! reads them back.
 //!
-//! Source: Linux `v4l2-controls.h` and its documentation of user and camera controls. Ids are those of the kernel.
+//! Source: Linux `v4l2-controls.h` and its documentation of user and camera controls. Ids are those
+//! of the kernel.
 
 use super::Problem;
 use super::abi::{self, QueryControl};
@@ -10,7 +12,8 @@ use std::io;
 
 /// Exposure is in units of 100 us.
 const MICROS_PER_COUNT: f64 = 100.0;
-/// Maximum relative difference of the exposure when read back: cameras round it to rows of their sensor.
+/// Maximum relative difference of the exposure when read back: cameras round it to rows of their
+/// sensor.
 const EXPOSURE_TOLERANCE_FRAC: f64 = 0.1;
 
 /// Kernel id of a control.
@@ -35,8 +38,8 @@ const EXPOSURE_MANUAL: i32 = 1;
 const EXPOSURE_SHUTTER_PRIORITY: i32 = 2;
 const EXPOSURE_APERTURE_PRIORITY: i32 = 3;
 
-/// Image settings of the rig file. A missing setting is automatic if the camera supports that, else it is left
-/// unchanged.
+/// Image settings of the rig file. A missing setting is automatic if the camera supports that, else
+/// it is left unchanged.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Settings {
     /// Exposure time, microseconds; `None` for automatic exposure without lowering the rate.
@@ -86,9 +89,13 @@ impl Controls for Device {
     }
 
     fn menu(&self, id: Id) -> Vec<i32> {
-        let Some(control) = self.control(id as u32) else { return Vec::new() };
+        let Some(control) = self.control(id as u32) else {
+            return Vec::new();
+        };
         match control.kind {
-            abi::CONTROL_MENU => Self::menu(self, id as u32, control.minimum..=control.maximum.min(64)),
+            abi::CONTROL_MENU => {
+                Self::menu(self, id as u32, control.minimum..=control.maximum.min(64))
+            }
             _ => (control.minimum..=control.maximum.min(64)).collect(),
         }
     }
@@ -103,11 +110,16 @@ impl Controls for Device {
 }
 
 /// Applies the settings, reads them back, and checks them.
-pub(super) fn apply(settings: &Settings, camera: &impl Controls) -> Result<AppliedSettings, Problem> {
+pub(super) fn apply(
+    settings: &Settings,
+    camera: &impl Controls,
+) -> Result<AppliedSettings, Problem> {
     let steps = plan(settings, camera)?;
     for step in &steps {
         match camera.set(step.id, step.value) {
-            Err(error) if step.is_required || error == Errno::NODEV => return Err(refused(step.control, error)),
+            Err(error) if step.is_required || error == Errno::NODEV => {
+                return Err(refused(step.control, error));
+            }
             Err(error) => log::debug!("{}: {error}", step.control),
             Ok(()) => {}
         }
@@ -115,9 +127,12 @@ pub(super) fn apply(settings: &Settings, camera: &impl Controls) -> Result<Appli
     check(settings, camera, &steps)
 }
 
-/// Checks the settings again after the stream has started, and reapplies them if necessary, because some cameras reset
-/// them at that point.
-pub(super) fn confirm(settings: &Settings, camera: &impl Controls) -> Result<AppliedSettings, Problem> {
+/// Checks the settings again after the stream has started, and reapplies them if necessary, because
+/// some cameras reset them at that point.
+pub(super) fn confirm(
+    settings: &Settings,
+    camera: &impl Controls,
+) -> Result<AppliedSettings, Problem> {
     match check(settings, camera, &plan(settings, camera)?) {
         Err(Problem::ReadBack { .. }) => apply(settings, camera),
         other => other,
@@ -125,16 +140,26 @@ pub(super) fn confirm(settings: &Settings, camera: &impl Controls) -> Result<App
 }
 
 /// Reads the settings back and checks them.
-fn check(settings: &Settings, camera: &impl Controls, steps: &[Step]) -> Result<AppliedSettings, Problem> {
+fn check(
+    settings: &Settings,
+    camera: &impl Controls,
+    steps: &[Step],
+) -> Result<AppliedSettings, Problem> {
     let mut applied = AppliedSettings::default();
     for step in steps {
         let got = match camera.get(step.id) {
             Ok(got) => got,
-            Err(error) if step.is_required || error == Errno::NODEV => return Err(refused(step.control, error)),
+            Err(error) if step.is_required || error == Errno::NODEV => {
+                return Err(refused(step.control, error));
+            }
             Err(_) => continue,
         };
         if step.is_required && got.abs_diff(step.value) > step.tolerance.unsigned_abs() {
-            return Err(Problem::ReadBack { control: step.control, requested: step.value, got });
+            return Err(Problem::ReadBack {
+                control: step.control,
+                requested: step.value,
+                got,
+            });
         }
         if step.id == Id::ExposureAbsolute {
             applied.exposure_secs = Some(secs_of_counts(got));
@@ -163,18 +188,28 @@ fn secs_of_counts(counts: i32) -> f64 {
 
 fn refused(control: &'static str, error: Errno) -> Problem {
     match error {
-        Errno::NODEV => Problem::Unplugged { source: error.into() },
-        _ => Problem::Refused { what: control, source: io::Error::from(error) },
+        Errno::NODEV => Problem::Unplugged {
+            source: error.into(),
+        },
+        _ => Problem::Refused {
+            what: control,
+            source: io::Error::from(error),
+        },
     }
 }
 
-/// Controls to set, in order. Automatic modes come first, because a value cannot be set while its control is automatic.
+/// Controls to set, in order. Automatic modes come first, because a value cannot be set while its
+/// control is automatic.
 fn plan(settings: &Settings, camera: &impl Controls) -> Result<Vec<Step>, Problem> {
     let mut steps = Vec::new();
     exposure(settings.exposure_micros, camera, &mut steps)?;
-    let gain_id = [Id::Gain, Id::AnalogueGain].into_iter().find(|id| camera.find(*id).is_some());
-    let gain =
-        AutoControl { auto: ("automatic gain", Id::AutoGain), fixed: ("v4l2.gain", gain_id.unwrap_or(Id::Gain)) };
+    let gain_id = [Id::Gain, Id::AnalogueGain]
+        .into_iter()
+        .find(|id| camera.find(*id).is_some());
+    let gain = AutoControl {
+        auto: ("automatic gain", Id::AutoGain),
+        fixed: ("v4l2.gain", gain_id.unwrap_or(Id::Gain)),
+    };
     gain.plan(settings.gain, camera, &mut steps)?;
     let balance = AutoControl {
         auto: ("automatic white balance", Id::AutoWhiteBalance),
@@ -194,11 +229,22 @@ struct AutoControl {
 }
 
 impl AutoControl {
-    fn plan(&self, value: Option<i32>, camera: &impl Controls, steps: &mut Vec<Step>) -> Result<(), Problem> {
+    fn plan(
+        &self,
+        value: Option<i32>,
+        camera: &impl Controls,
+        steps: &mut Vec<Step>,
+    ) -> Result<(), Problem> {
         let (control, id) = self.auto;
         if camera.find(id).is_some() {
             let is_required = value.is_some();
-            steps.push(Step { control, id, value: i32::from(!is_required), tolerance: 0, is_required });
+            steps.push(Step {
+                control,
+                id,
+                value: i32::from(!is_required),
+                tolerance: 0,
+                is_required,
+            });
         }
         if let Some(value) = value {
             steps.push(fixed(self.fixed.0, self.fixed.1, value, camera)?);
@@ -208,7 +254,12 @@ impl AutoControl {
 }
 
 /// A value, after checking it against the range and step of its control.
-fn fixed(control: &'static str, id: Id, value: i32, camera: &impl Controls) -> Result<Step, Problem> {
+fn fixed(
+    control: &'static str,
+    id: Id,
+    value: i32,
+    camera: &impl Controls,
+) -> Result<Step, Problem> {
     let known = camera.find(id).ok_or(Problem::NoControl { control })?;
     let step = known.step.max(1);
     let is_known = (known.minimum..=known.maximum).contains(&value)
@@ -222,11 +273,22 @@ fn fixed(control: &'static str, id: Id, value: i32, camera: &impl Controls) -> R
             step: step.into(),
         });
     }
-    Ok(Step { control, id, value, tolerance: 0, is_required: true })
+    Ok(Step {
+        control,
+        id,
+        value,
+        tolerance: 0,
+        is_required: true,
+    })
 }
 
-/// Plans the exposure mode, the option that keeps the rate under automatic exposure, and the time if it is fixed.
-fn exposure(micros: Option<f64>, camera: &impl Controls, steps: &mut Vec<Step>) -> Result<(), Problem> {
+/// Plans the exposure mode, the option that keeps the rate under automatic exposure, and the time
+/// if it is fixed.
+fn exposure(
+    micros: Option<f64>,
+    camera: &impl Controls,
+    steps: &mut Vec<Step>,
+) -> Result<(), Problem> {
     let entries = camera.menu(Id::ExposureAuto);
     let candidates = match micros {
         // Cameras without an iris report automatic exposure as aperture priority.
@@ -235,31 +297,58 @@ fn exposure(micros: Option<f64>, camera: &impl Controls, steps: &mut Vec<Step>) 
     };
     if let Some(value) = candidates.into_iter().find(|entry| entries.contains(entry)) {
         let is_required = micros.is_some();
-        steps.push(Step { control: "exposure mode", id: Id::ExposureAuto, value, tolerance: 0, is_required });
+        steps.push(Step {
+            control: "exposure mode",
+            id: Id::ExposureAuto,
+            value,
+            tolerance: 0,
+            is_required,
+        });
     }
     if camera.find(Id::ExposureAutoPriority).is_some() {
         let control = "exposure_dynamic_framerate";
-        steps.push(Step { control, id: Id::ExposureAutoPriority, value: 0, tolerance: 0, is_required: false });
+        steps.push(Step {
+            control,
+            id: Id::ExposureAutoPriority,
+            value: 0,
+            tolerance: 0,
+            is_required: false,
+        });
     }
     let Some(micros) = micros else { return Ok(()) };
-    let Some(known) = camera.find(Id::ExposureAbsolute) else { return Ok(()) };
+    let Some(known) = camera.find(Id::ExposureAbsolute) else {
+        return Ok(());
+    };
     let step = f64::from(known.step.max(1));
-    let nearest =
-        ((micros / MICROS_PER_COUNT - f64::from(known.minimum)) / step).round() * step + f64::from(known.minimum);
+    let nearest = ((micros / MICROS_PER_COUNT - f64::from(known.minimum)) / step).round() * step
+        + f64::from(known.minimum);
     // Values that round to outside the range are rejected.
-    let counts = (f64::from(known.minimum)..=f64::from(known.maximum)).contains(&nearest).then_some(nearest);
-    #[expect(clippy::cast_possible_truncation, reason = "within the range of the control, which is 32 bits wide")]
-    let value = counts.map(|counts| counts as i32).ok_or(Problem::ControlRange {
-        control: "exposure_micros",
-        requested: micros,
-        min: f64::from(known.minimum) * MICROS_PER_COUNT,
-        max: f64::from(known.maximum) * MICROS_PER_COUNT,
-        step: step * MICROS_PER_COUNT,
-    })?;
+    let counts = (f64::from(known.minimum)..=f64::from(known.maximum))
+        .contains(&nearest)
+        .then_some(nearest);
+    #[expect(
+        clippy::cast_possible_truncation,
+        reason = "within the range of the control, which is 32 bits wide"
+    )]
+    let value = counts
+        .map(|counts| counts as i32)
+        .ok_or(Problem::ControlRange {
+            control: "exposure_micros",
+            requested: micros,
+            min: f64::from(known.minimum) * MICROS_PER_COUNT,
+            max: f64::from(known.maximum) * MICROS_PER_COUNT,
+            step: step * MICROS_PER_COUNT,
+        })?;
     #[expect(clippy::cast_possible_truncation, reason = "a tenth of 32 bits")]
     let tolerance = (f64::from(value) * EXPOSURE_TOLERANCE_FRAC) as i32;
     let tolerance = tolerance.max(known.step);
-    steps.push(Step { control: "exposure_micros", id: Id::ExposureAbsolute, value, tolerance, is_required: true });
+    steps.push(Step {
+        control: "exposure_micros",
+        id: Id::ExposureAbsolute,
+        value,
+        tolerance,
+        is_required: true,
+    });
     Ok(())
 }
 
@@ -296,7 +385,11 @@ mod tests {
                 return Err(Errno::IO);
             }
             // Sensors expose whole rows, so they round the value.
-            let taken = if id == Id::ExposureAbsolute { value - 1 } else { value };
+            let taken = if id == Id::ExposureAbsolute {
+                value - 1
+            } else {
+                value
+            };
             self.values.borrow_mut().insert(id as u32, taken);
             Ok(())
         }
@@ -308,13 +401,24 @@ mod tests {
     }
 
     fn fake_camera(controls_table: FakeControls, rejects: &'static [Id]) -> FakeCamera {
-        FakeCamera { controls_table, values: RefCell::default(), rejects }
+        FakeCamera {
+            controls_table,
+            values: RefCell::default(),
+            rejects,
+        }
     }
 
     impl Controls for FakeControls {
         fn find(&self, id: Id) -> Option<QueryControl> {
-            let (_, minimum, maximum, step) = *self.controls.iter().find(|control| control.0 == id)?;
-            Some(QueryControl { id: id as u32, minimum, maximum, step, ..Default::default() })
+            let (_, minimum, maximum, step) =
+                *self.controls.iter().find(|control| control.0 == id)?;
+            Some(QueryControl {
+                id: id as u32,
+                minimum,
+                maximum,
+                step,
+                ..Default::default()
+            })
         }
 
         fn menu(&self, _: Id) -> Vec<i32> {
@@ -346,18 +450,30 @@ mod tests {
 
     /// The test driver vivid.
     const VIVID: FakeControls = FakeControls {
-        controls: &[(Id::Brightness, 0, 255, 1), (Id::AutoGain, 0, 1, 1), (Id::Gain, 0, 255, 1)],
+        controls: &[
+            (Id::Brightness, 0, 255, 1),
+            (Id::AutoGain, 0, 1, 1),
+            (Id::Gain, 0, 255, 1),
+        ],
         exposure_modes: &[],
     };
 
     fn planned(settings: &Settings, camera: &FakeControls) -> Vec<(Id, i32)> {
-        plan(settings, camera).expect("the settings are supported").iter().map(|step| (step.id, step.value)).collect()
+        plan(settings, camera)
+            .expect("the settings are supported")
+            .iter()
+            .map(|step| (step.id, step.value))
+            .collect()
     }
 
     #[test]
     fn unset_settings_are_automatic_and_keep_rate() {
         let automatic = planned(&Settings::default(), &C920);
-        let requested = [(Id::ExposureAuto, 3), (Id::ExposureAutoPriority, 0), (Id::AutoWhiteBalance, 1)];
+        let requested = [
+            (Id::ExposureAuto, 3),
+            (Id::ExposureAutoPriority, 0),
+            (Id::AutoWhiteBalance, 1),
+        ];
         assert_eq!(automatic, requested);
         assert_eq!(planned(&Settings::default(), &VIVID), [(Id::AutoGain, 1)]);
     }
@@ -380,52 +496,99 @@ mod tests {
             (Id::Brightness, 100),
         ];
         assert_eq!(planned(&settings, &C920), requested);
-        let gain = Settings { gain: Some(12), ..Settings::default() };
+        let gain = Settings {
+            gain: Some(12),
+            ..Settings::default()
+        };
         assert_eq!(planned(&gain, &VIVID), [(Id::AutoGain, 0), (Id::Gain, 12)]);
     }
 
     #[test]
     fn unsupported_settings_report_supported_range() {
         let plan_error = |settings: &Settings, camera: &FakeControls| {
-            plan(settings, camera).expect_err("the setting is unsupported").to_string()
+            plan(settings, camera)
+                .expect_err("the setting is unsupported")
+                .to_string()
         };
-        let too_short_exposure = Settings { exposure_micros: Some(100.0), ..Settings::default() };
+        let too_short_exposure = Settings {
+            exposure_micros: Some(100.0),
+            ..Settings::default()
+        };
         assert_eq!(
             plan_error(&too_short_exposure, &C920),
             "exposure_micros is 100, allowed: 300 to 204700 in steps of 100"
         );
-        let too_high_gain = Settings { gain: Some(256), ..Settings::default() };
-        assert_eq!(plan_error(&too_high_gain, &C920), "v4l2.gain is 256, allowed: 0 to 255 in steps of 1");
-        let unsupported_white_balance = Settings { white_balance_kelvin: Some(4600), ..Settings::default() };
+        let too_high_gain = Settings {
+            gain: Some(256),
+            ..Settings::default()
+        };
+        assert_eq!(
+            plan_error(&too_high_gain, &C920),
+            "v4l2.gain is 256, allowed: 0 to 255 in steps of 1"
+        );
+        let unsupported_white_balance = Settings {
+            white_balance_kelvin: Some(4600),
+            ..Settings::default()
+        };
         assert_eq!(
             plan_error(&unsupported_white_balance, &VIVID),
             "it has no control for v4l2.white_balance_kelvin: remove the key"
         );
-        const COARSE: FakeControls = FakeControls { controls: &[(Id::Gain, 0, 100, 10)], exposure_modes: &[] };
-        let misaligned_gain = Settings { gain: Some(15), ..Settings::default() };
-        assert!(plan_error(&misaligned_gain, &COARSE).ends_with("allowed: 0 to 100 in steps of 10"));
+        const COARSE: FakeControls = FakeControls {
+            controls: &[(Id::Gain, 0, 100, 10)],
+            exposure_modes: &[],
+        };
+        let misaligned_gain = Settings {
+            gain: Some(15),
+            ..Settings::default()
+        };
+        assert!(
+            plan_error(&misaligned_gain, &COARSE).ends_with("allowed: 0 to 100 in steps of 10")
+        );
     }
 
     #[test]
     fn camera_without_exposure_control_is_accepted() {
         // The key then states the known exposure time, as described in docs/reference/rig.md.
-        let known = Settings { exposure_micros: Some(4000.0), ..Settings::default() };
+        let known = Settings {
+            exposure_micros: Some(4000.0),
+            ..Settings::default()
+        };
         assert_eq!(planned(&known, &VIVID), [(Id::AutoGain, 1)]);
     }
 
     #[test]
     fn settings_are_read_back_and_reapplied() {
-        let settings = Settings { exposure_micros: Some(4000.0), gain: Some(12), ..Settings::default() };
+        let settings = Settings {
+            exposure_micros: Some(4000.0),
+            gain: Some(12),
+            ..Settings::default()
+        };
         let camera = fake_camera(C920, &[]);
         let applied = apply(&settings, &camera).expect("all settings are accepted");
-        assert_eq!(applied.exposure_secs, Some(secs_of_counts(39)), "the value read back");
+        assert_eq!(
+            applied.exposure_secs,
+            Some(secs_of_counts(39)),
+            "the value read back"
+        );
         assert!(applied.read_back.contains(&("v4l2.gain", 12)) && !applied.reports_exposure);
         camera.values.borrow_mut().insert(Id::Gain as u32, 64);
-        assert!(confirm(&settings, &camera).expect("the setting is reapplied").read_back.contains(&("v4l2.gain", 12)));
+        assert!(
+            confirm(&settings, &camera)
+                .expect("the setting is reapplied")
+                .read_back
+                .contains(&("v4l2.gain", 12))
+        );
         assert_eq!(camera.get(Id::Gain), Ok(12));
-        assert!((secs_of_counts(39) - 0.0039).abs() < 1e-12, "counts of 100 us");
+        assert!(
+            (secs_of_counts(39) - 0.0039).abs() < 1e-12,
+            "counts of 100 us"
+        );
         // With automatic exposure, the exposure time is read with each image.
-        camera.values.borrow_mut().insert(Id::ExposureAbsolute as u32, 156);
+        camera
+            .values
+            .borrow_mut()
+            .insert(Id::ExposureAbsolute as u32, 156);
         let automatic = apply(&Settings::default(), &camera).expect("all settings are accepted");
         assert!(automatic.reports_exposure && automatic.exposure_secs.is_none());
         assert_eq!(exposure_secs(&camera), Some(secs_of_counts(156)));
@@ -433,14 +596,32 @@ mod tests {
 
     #[test]
     fn only_requested_settings_are_required() {
-        let camera = fake_camera(C920, &[Id::ExposureAuto, Id::ExposureAutoPriority, Id::AutoWhiteBalance, Id::Gain]);
-        assert!(apply(&Settings::default(), &camera).is_ok(), "no setting is required");
-        let gain = Settings { gain: Some(12), ..Settings::default() };
-        let message = apply(&gain, &camera).expect_err("the camera rejects the gain").to_string();
+        let camera = fake_camera(
+            C920,
+            &[
+                Id::ExposureAuto,
+                Id::ExposureAutoPriority,
+                Id::AutoWhiteBalance,
+                Id::Gain,
+            ],
+        );
+        assert!(
+            apply(&Settings::default(), &camera).is_ok(),
+            "no setting is required"
+        );
+        let gain = Settings {
+            gain: Some(12),
+            ..Settings::default()
+        };
+        let message = apply(&gain, &camera)
+            .expect_err("the camera rejects the gain")
+            .to_string();
         assert!(message.contains("v4l2.gain"), "{message}");
         // A camera that accepts a value but does not use it.
         let steps = plan(&gain, &C920).expect("the settings are supported");
-        let message = check(&gain, &camera, &steps).expect_err("the value read back is 0").to_string();
+        let message = check(&gain, &camera, &steps)
+            .expect_err("the value read back is 0")
+            .to_string();
         assert_eq!(message, "v4l2.gain was set to 12 and reads back as 0");
     }
 }

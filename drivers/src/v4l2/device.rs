@@ -1,4 +1,5 @@
-//! An open V4L2 device: safe calls for the requests of the kernel, and images in memory shared with the kernel.
+//! An open V4L2 device: safe calls for the requests of the kernel, and images in memory shared with
+//! the kernel.
 
 use super::abi::{self, Plain, Request};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
@@ -24,7 +25,8 @@ pub(super) struct Identity {
     pub(super) card: String,
     /// Bus address.
     pub(super) bus: String,
-    /// Whether the node supports streaming images. Other nodes of the same camera may only deliver metadata.
+    /// Whether the node supports streaming images. Other nodes of the same camera may only deliver
+    /// metadata.
     pub(super) streams_images: bool,
 }
 
@@ -49,8 +51,9 @@ struct Exchange<'a, T> {
     value: &'a mut T,
 }
 
-// SAFETY: the kernel writes at most the structure whose size is in the code, and `Request` pairs each code with its
-// structure; the sizes are asserted in `abi`. The structures consist of integers, so any written bytes are valid.
+// SAFETY: the kernel writes at most the structure whose size is in the code, and `Request` pairs
+// each code with its structure; the sizes are asserted in `abi`. The structures consist of
+// integers, so any written bytes are valid.
 #[expect(unsafe_code, reason = "system call")]
 unsafe impl<T: Plain> Ioctl for Exchange<'_, T> {
     type Output = ();
@@ -73,23 +76,31 @@ impl Device {
     /// Opens a node in nonblocking mode.
     pub(super) fn open(path: &Path) -> rustix::io::Result<Self> {
         let flags = OFlags::RDWR | OFlags::NONBLOCK | OFlags::CLOEXEC;
-        Ok(Self { fd: rustix::fs::open(path, flags, Mode::empty())? })
+        Ok(Self {
+            fd: rustix::fs::open(path, flags, Mode::empty())?,
+        })
     }
 
     /// Executes a request. It is repeated if interrupted by a signal.
     fn ioctl<T: Plain>(&self, request: &Request<T>, value: &mut T) -> rustix::io::Result<()> {
         rustix::io::retry_on_intr(|| {
-            // SAFETY: the code belongs to the structure `T` (see `Exchange`), which outlives the call; none of the
-            // structures contains a pointer that the kernel follows.
+            // SAFETY: the code belongs to the structure `T` (see `Exchange`), which outlives the
+            // call; none of the structures contains a pointer that the kernel follows.
             #[expect(unsafe_code, reason = "system call")]
             unsafe {
-                rustix::ioctl::ioctl(&self.fd, Exchange { code: request.code(), value: &mut *value })
+                rustix::ioctl::ioctl(
+                    &self.fd,
+                    Exchange {
+                        code: request.code(),
+                        value: &mut *value,
+                    },
+                )
             }
         })
     }
 
-    /// Enumerates entries with increasing indices until the device has no more. The list is empty if the device lacks
-    /// the request.
+    /// Enumerates entries with increasing indices until the device has no more. The list is empty
+    /// if the device lacks the request.
     fn list<T: Plain>(&self, request: &Request<T>, mut request_at: impl FnMut(u32) -> T) -> Vec<T> {
         const MAX_ENTRIES: u32 = 1000; // Terminates even if a driver never ends its list.
         let entry = |index| {
@@ -117,34 +128,76 @@ impl Device {
 
     /// Codes of the supported pixel formats, in the order of the device.
     pub(super) fn fourccs(&self) -> Vec<u32> {
-        let request_at = |index| abi::FormatDescription { index, kind: abi::VIDEO_CAPTURE, ..Default::default() };
-        self.list(&abi::ENUM_FMT, request_at).iter().map(|format| format.fourcc).collect()
+        let request_at = |index| abi::FormatDescription {
+            index,
+            kind: abi::VIDEO_CAPTURE,
+            ..Default::default()
+        };
+        self.list(&abi::ENUM_FMT, request_at)
+            .iter()
+            .map(|format| format.fourcc)
+            .collect()
     }
 
     /// Supported sizes of a format.
     pub(super) fn sizes(&self, fourcc: u32) -> Vec<abi::FrameSize> {
-        self.list(&abi::ENUM_FRAMESIZES, |index| abi::FrameSize { index, fourcc, ..Default::default() })
+        self.list(&abi::ENUM_FRAMESIZES, |index| abi::FrameSize {
+            index,
+            fourcc,
+            ..Default::default()
+        })
     }
 
     /// Supported intervals between images of a format at a size.
-    pub(super) fn intervals(&self, fourcc: u32, [width, height]: [u32; 2]) -> Vec<abi::FrameInterval> {
-        let request_at = |index| abi::FrameInterval { index, fourcc, width, height, ..Default::default() };
+    pub(super) fn intervals(
+        &self,
+        fourcc: u32,
+        [width, height]: [u32; 2],
+    ) -> Vec<abi::FrameInterval> {
+        let request_at = |index| abi::FrameInterval {
+            index,
+            fourcc,
+            width,
+            height,
+            ..Default::default()
+        };
         self.list(&abi::ENUM_FRAMEINTERVALS, request_at)
     }
 
     /// Requests a format and returns the format that the device selected.
-    pub(super) fn set_format(&self, fourcc: u32, [width, height]: [u32; 2]) -> rustix::io::Result<abi::PixFormat> {
-        let pix = abi::PixFormat { width, height, fourcc, field: abi::FIELD_NONE, ..Default::default() };
-        let mut format = abi::Format { kind: abi::VIDEO_CAPTURE, padding: 0, pix, rest: [0; 19] };
+    pub(super) fn set_format(
+        &self,
+        fourcc: u32,
+        [width, height]: [u32; 2],
+    ) -> rustix::io::Result<abi::PixFormat> {
+        let pix = abi::PixFormat {
+            width,
+            height,
+            fourcc,
+            field: abi::FIELD_NONE,
+            ..Default::default()
+        };
+        let mut format = abi::Format {
+            kind: abi::VIDEO_CAPTURE,
+            padding: 0,
+            pix,
+            rest: [0; 19],
+        };
         self.ioctl(&abi::S_FMT, &mut format)?;
         Ok(format.pix)
     }
 
-    /// Requests a rate in images per second and returns the rate that the device selected, or `None` if the rate cannot
-    /// be set.
+    /// Requests a rate in images per second and returns the rate that the device selected, or
+    /// `None` if the rate cannot be set.
     pub(super) fn set_rate_hz(&self, rate_hz: f64) -> rustix::io::Result<Option<f64>> {
-        let mut parm = abi::StreamParm { kind: abi::VIDEO_CAPTURE, capture: Default::default(), rest: [0; 40] };
-        if self.ioctl(&abi::G_PARM, &mut parm).is_err() || parm.capture.capability & abi::CAP_TIMEPERFRAME == 0 {
+        let mut parm = abi::StreamParm {
+            kind: abi::VIDEO_CAPTURE,
+            capture: Default::default(),
+            rest: [0; 40],
+        };
+        if self.ioctl(&abi::G_PARM, &mut parm).is_err()
+            || parm.capture.capability & abi::CAP_TIMEPERFRAME == 0
+        {
             return Ok(None);
         }
         parm.capture.time_per_frame = super::format::interval_of(rate_hz);
@@ -158,13 +211,20 @@ impl Device {
         if self.ioctl(&abi::G_INPUT, &mut index).is_err() {
             return false;
         }
-        let mut input = abi::Input { index, ..Default::default() };
-        self.ioctl(&abi::ENUMINPUT, &mut input).is_ok() && input.capabilities & abi::INPUT_DV_TIMINGS != 0
+        let mut input = abi::Input {
+            index,
+            ..Default::default()
+        };
+        self.ioctl(&abi::ENUMINPUT, &mut input).is_ok()
+            && input.capabilities & abi::INPUT_DV_TIMINGS != 0
     }
 
     /// Description of a control; `None` if the device has no writable control of this id.
     pub(super) fn control(&self, id: u32) -> Option<abi::QueryControl> {
-        let mut control = abi::QueryControl { id, ..Default::default() };
+        let mut control = abi::QueryControl {
+            id,
+            ..Default::default()
+        };
         self.ioctl(&abi::QUERYCTRL, &mut control).ok()?;
         (control.flags & (abi::CONTROL_DISABLED | abi::CONTROL_READ_ONLY) == 0).then_some(control)
     }
@@ -173,7 +233,15 @@ impl Device {
     pub(super) fn menu(&self, id: u32, range: std::ops::RangeInclusive<i32>) -> Vec<i32> {
         let has = |entry: &i32| {
             u32::try_from(*entry).is_ok_and(|index| {
-                self.ioctl(&abi::QUERYMENU, &mut abi::QueryMenu { id, index, ..Default::default() }).is_ok()
+                self.ioctl(
+                    &abi::QUERYMENU,
+                    &mut abi::QueryMenu {
+                        id,
+                        index,
+                        ..Default::default()
+                    },
+                )
+                .is_ok()
             })
         };
         range.filter(has).collect()
@@ -197,16 +265,23 @@ impl Device {
             memory: abi::MEMORY_MMAP,
             ..Default::default()
         };
-        self.ioctl(&abi::REQBUFS, &mut requested).map_err(Refused::Buffers)?;
+        self.ioctl(&abi::REQBUFS, &mut requested)
+            .map_err(Refused::Buffers)?;
         let mut buffers = Vec::new();
         for index in 0..requested.count {
             let mut buffer = buffer_of(index);
-            self.ioctl(&abi::QUERYBUF, &mut buffer).map_err(Refused::Buffers)?;
+            self.ioctl(&abi::QUERYBUF, &mut buffer)
+                .map_err(Refused::Buffers)?;
             buffers.push(Mapped::new(&self.fd, &buffer).map_err(Refused::Buffers)?);
-            self.ioctl(&abi::QBUF, &mut buffer_of(index)).map_err(Refused::Buffers)?;
+            self.ioctl(&abi::QBUF, &mut buffer_of(index))
+                .map_err(Refused::Buffers)?;
         }
-        self.ioctl(&abi::STREAMON, &mut abi::VIDEO_CAPTURE.clone()).map_err(Refused::Begin)?;
-        Ok(Stream { device: self, buffers })
+        self.ioctl(&abi::STREAMON, &mut abi::VIDEO_CAPTURE.clone())
+            .map_err(Refused::Begin)?;
+        Ok(Stream {
+            device: self,
+            buffers,
+        })
     }
 }
 
@@ -231,7 +306,8 @@ impl Stream {
         &self.device
     }
 
-    /// Waits until an image is ready (`true`) or the timeout expires. Fails if the device is disconnected.
+    /// Waits until an image is ready (`true`) or the timeout expires. Fails if the device is
+    /// disconnected.
     pub(super) fn wait(&self, timeout: Duration) -> rustix::io::Result<bool> {
         let mut poll_fds = [PollFd::new(&self.device.fd, PollFlags::IN)];
         let timeout = Timespec {
@@ -245,8 +321,8 @@ impl Stream {
         }
     }
 
-    /// Takes the oldest filled buffer out of the queue; `None` if none is filled. The buffer must be
-    /// [requeued](Self::requeue).
+    /// Takes the oldest filled buffer out of the queue; `None` if none is filled. The buffer must
+    /// be [requeued](Self::requeue).
     pub(super) fn take(&mut self) -> rustix::io::Result<Option<FilledBuffer>> {
         let mut buffer = buffer_of(0);
         match self.device.ioctl(&abi::DQBUF, &mut buffer) {
@@ -258,7 +334,10 @@ impl Stream {
             index: buffer.index,
             n_bytes: buffer.bytes_used as usize,
             sequence: buffer.sequence,
-            stamp_nanos: buffer.secs.saturating_mul(1_000_000_000).saturating_add(buffer.micros.saturating_mul(1000)),
+            stamp_nanos: buffer
+                .secs
+                .saturating_mul(1_000_000_000)
+                .saturating_add(buffer.micros.saturating_mul(1000)),
             is_monotonic: buffer.flags & abi::BUFFER_CLOCK_MASK == abi::BUFFER_CLOCK_MONOTONIC,
             is_damaged: buffer.flags & abi::BUFFER_ERROR != 0,
         }))
@@ -266,7 +345,9 @@ impl Stream {
 
     /// Bytes of a filled buffer, limited to the size of the buffer.
     pub(super) fn bytes(&self, filled: &FilledBuffer) -> &[u8] {
-        let Some(mapping) = self.buffers.get(filled.index as usize) else { return &[] };
+        let Some(mapping) = self.buffers.get(filled.index as usize) else {
+            return &[];
+        };
         let buffer_bytes = mapping.bytes();
         &buffer_bytes[..filled.n_bytes.min(buffer_bytes.len())]
     }
@@ -280,12 +361,19 @@ impl Stream {
 impl Drop for Stream {
     fn drop(&mut self) {
         // A disconnected device has already stopped.
-        let _ = self.device.ioctl(&abi::STREAMOFF, &mut abi::VIDEO_CAPTURE.clone());
+        let _ = self
+            .device
+            .ioctl(&abi::STREAMOFF, &mut abi::VIDEO_CAPTURE.clone());
     }
 }
 
 fn buffer_of(index: u32) -> abi::Buffer {
-    abi::Buffer { index, kind: abi::VIDEO_CAPTURE, memory: abi::MEMORY_MMAP, ..Default::default() }
+    abi::Buffer {
+        index,
+        kind: abi::VIDEO_CAPTURE,
+        memory: abi::MEMORY_MMAP,
+        ..Default::default()
+    }
 }
 
 /// Memory of an image buffer shared with the kernel.
@@ -318,10 +406,10 @@ impl Mapped {
     }
 
     fn bytes(&self) -> &[u8] {
-        // SAFETY: `n_bytes` are mapped for reading as long as this value lives. The device writes only between `QBUF`
-        // and `DQBUF`, and `requeue` borrows the stream mutably, so no slice exists then. A device that violates this
-        // causes torn pixels: bytes have no invalid values, and nothing here reads the same byte twice to make a
-        // decision.
+        // SAFETY: `n_bytes` are mapped for reading as long as this value lives. The device writes
+        // only between `QBUF` and `DQBUF`, and `requeue` borrows the stream mutably, so no slice
+        // exists then. A device that violates this causes torn pixels: bytes have no invalid
+        // values, and nothing here reads the same byte twice to make a decision.
         #[expect(unsafe_code, reason = "memory shared with the kernel")]
         unsafe {
             std::slice::from_raw_parts(self.start.cast::<u8>(), self.n_bytes)

@@ -29,7 +29,8 @@ impl FoundCamera {
     /// Name for the rig file: a udev link, or else the serial number, or else the bus address.
     pub fn address(&self) -> String {
         let link = self.links.first().map(|link| link.display().to_string());
-        link.or_else(|| self.serial.clone()).unwrap_or_else(|| self.bus.clone())
+        link.or_else(|| self.serial.clone())
+            .unwrap_or_else(|| self.bus.clone())
     }
 
     /// USB bandwidth available to one camera, bytes per second; `None` if not on USB.
@@ -39,7 +40,10 @@ impl FoundCamera {
 
     /// Descriptions of modes that exceed the USB bandwidth.
     pub fn modes_exceeding_usb(&self) -> Vec<String> {
-        self.usb_bytes_per_sec().map_or(Vec::new(), |bytes_per_sec| format::modes_exceeding(&self.modes, bytes_per_sec))
+        self.usb_bytes_per_sec()
+            .map_or(Vec::new(), |bytes_per_sec| {
+                format::modes_exceeding(&self.modes, bytes_per_sec)
+            })
     }
 }
 
@@ -53,16 +57,28 @@ struct Node {
     usb_mbits: Option<f64>,
 }
 
-/// All nodes that deliver images, and errors for nodes that cannot be opened. Metadata nodes are skipped.
+/// All nodes that deliver images, and errors for nodes that cannot be opened. Metadata nodes are
+/// skipped.
 pub fn cameras() -> Vec<Result<FoundCamera, Problem>> {
     let root = Path::new("/");
-    nodes(root).into_iter().filter_map(|node| describe(root, node).transpose()).collect()
+    nodes(root)
+        .into_iter()
+        .filter_map(|node| describe(root, node).transpose())
+        .collect()
 }
 
 fn describe(root: &Path, node: Node) -> Result<Option<FoundCamera>, Problem> {
-    let device =
-        Device::open(&node.path).map_err(|error| Problem::Open { path: node.path.clone(), source: error.into() })?;
-    let Some(identity) = device.identity().ok().filter(|identity| identity.streams_images) else { return Ok(None) };
+    let device = Device::open(&node.path).map_err(|error| Problem::Open {
+        path: node.path.clone(),
+        source: error.into(),
+    })?;
+    let Some(identity) = device
+        .identity()
+        .ok()
+        .filter(|identity| identity.streams_images)
+    else {
+        return Ok(None);
+    };
     Ok(Some(FoundCamera {
         name: identity.card,
         bus: identity.bus,
@@ -78,46 +94,62 @@ fn describe(root: &Path, node: Node) -> Result<Option<FoundCamera>, Problem> {
 pub(super) fn modes(device: &Device) -> Vec<Mode> {
     let mut modes = Vec::new();
     for fourcc in device.fourccs() {
-        let Some(format) = V4l2Format::from_fourcc(fourcc) else { continue };
+        let Some(format) = V4l2Format::from_fourcc(fourcc) else {
+            continue;
+        };
         for size in device.sizes(fourcc) {
             let sizes = Sizes::from_kernel(&size);
             let rates = Rates::from_kernel(&device.intervals(fourcc, sizes.max()));
-            modes.push(Mode { fourcc, format, sizes, rates });
+            modes.push(Mode {
+                fourcc,
+                format,
+                sizes,
+                rates,
+            });
         }
     }
     modes
 }
 
-/// Nodes that match `device` of a rig file, which is a path, or a serial number or bus address shared by the nodes of a
-/// camera.
+/// Nodes that match `device` of a rig file, which is a path, or a serial number or bus address
+/// shared by the nodes of a camera.
 pub(super) fn candidates(device: &str) -> Result<Vec<PathBuf>, Problem> {
     if device.starts_with('/') {
         return Ok(vec![PathBuf::from(device)]);
     }
     let has_bus_address = |node: &Node| {
-        Device::open(&node.path).and_then(|open| open.identity()).is_ok_and(|identity| identity.bus == device)
+        Device::open(&node.path)
+            .and_then(|open| open.identity())
+            .is_ok_and(|identity| identity.bus == device)
     };
     let is_match = |node: &Node| node.serial.as_deref() == Some(device) || has_bus_address(node);
     let found = nodes(Path::new("/")).into_iter().filter(is_match).collect();
     paths_of_one_camera(device, found)
 }
 
-/// Checks whether a connected device matches `device` of a rig file. Nodes are only opened to read their bus address.
+/// Checks whether a connected device matches `device` of a rig file. Nodes are only opened to read
+/// their bus address.
 pub fn check_connected(device: &str) -> Result<(), Problem> {
     match candidates(device)?.iter().any(|path| path.exists()) {
         true => Ok(()),
-        false => Err(Problem::NoDevice { device: device.to_owned() }),
+        false => Err(Problem::NoDevice {
+            device: device.to_owned(),
+        }),
     }
 }
 
-/// Checks that all nodes belong to one camera, since serial numbers are not always unique, and returns their paths.
+/// Checks that all nodes belong to one camera, since serial numbers are not always unique, and
+/// returns their paths.
 fn paths_of_one_camera(device: &str, found: Vec<Node>) -> Result<Vec<PathBuf>, Problem> {
     let device = device.to_owned();
     let is_one = found.windows(2).all(|pair| pair[0].usb == pair[1].usb);
     let paths: Vec<_> = found.into_iter().map(|node| node.path).collect();
     match paths.len() {
         0 => Err(Problem::NoDevice { device }),
-        _ if !is_one => Err(Problem::Ambiguous { device, nodes: paths }),
+        _ if !is_one => Err(Problem::Ambiguous {
+            device,
+            nodes: paths,
+        }),
         _ => Ok(paths),
     }
 }
@@ -154,12 +186,17 @@ fn nodes(root: &Path) -> Vec<Node> {
 /// Folder of the USB device that an interface belongs to.
 fn usb_folder(device: &Path) -> Option<PathBuf> {
     let folder = device.canonicalize().ok()?;
-    folder.ancestors().find(|ancestor| ancestor.join("idVendor").exists()).map(Path::to_owned)
+    folder
+        .ancestors()
+        .find(|ancestor| ancestor.join("idVendor").exists())
+        .map(Path::to_owned)
 }
 
 /// Udev links to a node: by device, then by port.
 fn stable_links(root: &Path, node: &Path) -> Vec<PathBuf> {
-    let Ok(node) = node.canonicalize() else { return Vec::new() };
+    let Ok(node) = node.canonicalize() else {
+        return Vec::new();
+    };
     let links_in = |folder: &str| {
         let mut links: Vec<PathBuf> = std::fs::read_dir(root.join("dev/v4l").join(folder))
             .into_iter()
@@ -170,7 +207,10 @@ fn stable_links(root: &Path, node: &Path) -> Vec<PathBuf> {
         links.sort_unstable();
         links
     };
-    ["by-id", "by-path"].into_iter().flat_map(links_in).collect()
+    ["by-id", "by-path"]
+        .into_iter()
+        .flat_map(links_in)
+        .collect()
 }
 
 #[cfg(test)]
@@ -184,14 +224,25 @@ mod tests {
         let root = root.path();
         let usb = root.join("sys/devices/pci0/usb1/1-2");
         let interface = usb.join("1-2:1.0");
-        for folder in [&interface, &root.join("sys/devices/platform/vivid.0"), &root.join("dev/v4l/by-id")] {
+        for folder in [
+            &interface,
+            &root.join("sys/devices/platform/vivid.0"),
+            &root.join("dev/v4l/by-id"),
+        ] {
             std::fs::create_dir_all(folder).expect("folder");
         }
         std::fs::create_dir_all(root.join("dev/v4l/by-path")).expect("folder");
-        for (name, text) in [("idVendor", "046d\n"), ("serial", "A1B2\n"), ("speed", "480\n")] {
+        for (name, text) in [
+            ("idVendor", "046d\n"),
+            ("serial", "A1B2\n"),
+            ("speed", "480\n"),
+        ] {
             std::fs::write(usb.join(name), text).expect("file");
         }
-        for (node, device) in [("video10", &interface), ("video9", &root.join("sys/devices/platform/vivid.0"))] {
+        for (node, device) in [
+            ("video10", &interface),
+            ("video9", &root.join("sys/devices/platform/vivid.0")),
+        ] {
             let folder = root.join("sys/class/video4linux").join(node);
             std::fs::create_dir_all(&folder).expect("folder");
             symlink(device, folder.join("device")).expect("link");
@@ -204,7 +255,12 @@ mod tests {
         symlink("../../video9", root.join("dev/v4l/by-path/platform")).expect("link");
         let found = nodes(root);
         let expected = [
-            Node { path: root.join("dev/video9"), usb: None, serial: None, usb_mbits: None },
+            Node {
+                path: root.join("dev/video9"),
+                usb: None,
+                serial: None,
+                usb_mbits: None,
+            },
             Node {
                 path: node.clone(),
                 usb: Some(usb.canonicalize().expect("the folder exists")),
@@ -215,7 +271,10 @@ mod tests {
         assert_eq!(found, expected);
         assert_eq!(
             stable_links(root, &node),
-            [root.join("dev/v4l/by-id/usb-A1B2"), root.join("dev/v4l/by-path/pci-2")]
+            [
+                root.join("dev/v4l/by-id/usb-A1B2"),
+                root.join("dev/v4l/by-path/pci-2")
+            ]
         );
         let mut camera = FoundCamera {
             node,
@@ -237,8 +296,16 @@ mod tests {
     fn no_device_found_when_none_connected() {
         let root = tempfile::tempdir().expect("a folder");
         assert_eq!(nodes(root.path()), []);
-        let message = candidates("no such serial").expect_err("no camera has this name").to_string();
-        assert!(message.contains("no such serial") && message.contains("fieldrig devices"), "{message}");
-        assert_eq!(candidates("/dev/video99").expect("paths are returned unchanged"), [PathBuf::from("/dev/video99")]);
+        let message = candidates("no such serial")
+            .expect_err("no camera has this name")
+            .to_string();
+        assert!(
+            message.contains("no such serial") && message.contains("fieldrig devices"),
+            "{message}"
+        );
+        assert_eq!(
+            candidates("/dev/video99").expect("paths are returned unchanged"),
+            [PathBuf::from("/dev/video99")]
+        );
     }
 }

@@ -6,7 +6,8 @@ use super::V4l2Format;
 use super::abi::{DISCRETE, Fraction, FrameInterval, FrameSize};
 use crate::{Error, PixelFormat, V4l2Colors, YuvColors, YuvLayout};
 
-/// Rates with a smaller relative difference are considered equal, because devices report fractions of integers.
+/// Rates with a smaller relative difference are considered equal, because devices report fractions
+/// of integers.
 const SAME_RATE_FRAC: f64 = 0.01;
 
 impl V4l2Format {
@@ -25,7 +26,10 @@ impl V4l2Format {
 
     /// Format of a kernel code.
     pub(super) fn from_fourcc(fourcc: u32) -> Option<Self> {
-        Self::CODES.iter().find(|(code, _)| u32::from_le_bytes(**code) == fourcc).map(|(_, format)| *format)
+        Self::CODES
+            .iter()
+            .find(|(code, _)| u32::from_le_bytes(**code) == fourcc)
+            .map(|(_, format)| *format)
     }
 
     /// Default kernel code of a format.
@@ -47,8 +51,17 @@ impl V4l2Format {
     }
 
     /// Pixel format for decoding. `meters_per_count` is only used for depth.
-    pub(super) fn pixels(self, colors: V4l2Colors, meters_per_count: f64) -> Result<PixelFormat, Error> {
-        let yuv = |layout| Ok(PixelFormat::Yuv { layout, colors: YuvColors::from_v4l2(colors)? });
+    pub(super) fn pixels(
+        self,
+        colors: V4l2Colors,
+        meters_per_count: f64,
+    ) -> Result<PixelFormat, Error> {
+        let yuv = |layout| {
+            Ok(PixelFormat::Yuv {
+                layout,
+                colors: YuvColors::from_v4l2(colors)?,
+            })
+        };
         match self {
             Self::Yuyv => yuv(YuvLayout::Yuyv),
             Self::Uyvy => yuv(YuvLayout::Uyvy),
@@ -110,7 +123,12 @@ pub enum Rates {
 impl Mode {
     /// A format at one size with a list of rates.
     pub fn new(format: V4l2Format, size_px: [u32; 2], rates_hz: &[f64]) -> Self {
-        Self { fourcc: format.fourcc(), format, sizes: Sizes::One(size_px), rates: Rates::List(rates_hz.to_vec()) }
+        Self {
+            fourcc: format.fourcc(),
+            format,
+            sizes: Sizes::One(size_px),
+            rates: Rates::List(rates_hz.to_vec()),
+        }
     }
 }
 
@@ -119,7 +137,11 @@ impl Sizes {
         let [a, b, c, d, e, f] = reported.numbers;
         match reported.kind {
             DISCRETE => Self::One([a, b]),
-            _ => Self::Range { min: [a, d], max: [b, e], step: [c, f] },
+            _ => Self::Range {
+                min: [a, d],
+                max: [b, e],
+                step: [c, f],
+            },
         }
     }
 
@@ -136,7 +158,8 @@ impl Sizes {
             Self::One(size) => *size == requested,
             Self::Range { min, max, step } => (0..2).all(|side| {
                 let (requested, min, max) = (requested[side], min[side], max[side]);
-                (min..=max).contains(&requested) && (requested - min).is_multiple_of(step[side].max(1))
+                (min..=max).contains(&requested)
+                    && (requested - min).is_multiple_of(step[side].max(1))
             }),
         }
     }
@@ -146,45 +169,70 @@ impl Rates {
     pub(super) fn from_kernel(reported: &[FrameInterval]) -> Self {
         match reported.first() {
             None => Self::Unknown,
-            Some(first) if first.kind == DISCRETE => {
-                Self::List(reported.iter().map(|interval| rate_of(interval.fractions[0])).collect())
-            }
+            Some(first) if first.kind == DISCRETE => Self::List(
+                reported
+                    .iter()
+                    .map(|interval| rate_of(interval.fractions[0]))
+                    .collect(),
+            ),
             // The longest interval is the lowest rate.
-            Some(range) => Self::Range { min_hz: rate_of(range.fractions[1]), max_hz: rate_of(range.fractions[0]) },
+            Some(range) => Self::Range {
+                min_hz: rate_of(range.fractions[1]),
+                max_hz: rate_of(range.fractions[0]),
+            },
         }
     }
 
     fn has(&self, requested_hz: f64) -> bool {
         match self {
             Self::Unknown => true,
-            Self::List(rates) => rates.iter().any(|rate_hz| is_same_rate(*rate_hz, requested_hz)),
-            Self::Range { min_hz, max_hz } => {
-                (min_hz * (1.0 - SAME_RATE_FRAC)..=max_hz * (1.0 + SAME_RATE_FRAC)).contains(&requested_hz)
-            }
+            Self::List(rates) => rates
+                .iter()
+                .any(|rate_hz| is_same_rate(*rate_hz, requested_hz)),
+            Self::Range { min_hz, max_hz } => (min_hz * (1.0 - SAME_RATE_FRAC)
+                ..=max_hz * (1.0 + SAME_RATE_FRAC))
+                .contains(&requested_hz),
         }
     }
 }
 
-/// Selects a mode of the given format, or else of the first suitable format in [`V4l2Format::COLOR_FORMATS`].
-pub(super) fn choose(modes: &[Mode], format: Option<V4l2Format>, size_px: [u32; 2], rate_hz: f64) -> Option<&Mode> {
+/// Selects a mode of the given format, or else of the first suitable format in
+/// [`V4l2Format::COLOR_FORMATS`].
+pub(super) fn choose(
+    modes: &[Mode],
+    format: Option<V4l2Format>,
+    size_px: [u32; 2],
+    rate_hz: f64,
+) -> Option<&Mode> {
     let fits = |mode: &&Mode| mode.sizes.has(size_px) && mode.rates.has(rate_hz);
-    let of = |format: V4l2Format| modes.iter().filter(move |mode| mode.format == format).find(fits);
+    let of = |format: V4l2Format| {
+        modes
+            .iter()
+            .filter(move |mode| mode.format == format)
+            .find(fits)
+    };
     match format {
         Some(format) => of(format),
-        None => V4l2Format::COLOR_FORMATS.iter().find_map(|(_, each)| of(*each)),
+        None => V4l2Format::COLOR_FORMATS
+            .iter()
+            .find_map(|(_, each)| of(*each)),
     }
 }
 
-/// Index of a format in order of preference. Depth comes last because it is only selected explicitly.
+/// Index of a format in order of preference. Depth comes last because it is only selected
+/// explicitly.
 pub(super) fn rank(format: V4l2Format) -> usize {
-    V4l2Format::COLOR_FORMATS.iter().position(|(_, each)| *each == format).unwrap_or(V4l2Format::COLOR_FORMATS.len())
+    V4l2Format::COLOR_FORMATS
+        .iter()
+        .position(|(_, each)| *each == format)
+        .unwrap_or(V4l2Format::COLOR_FORMATS.len())
 }
 
-/// USB bandwidth for one camera in bytes per second at the speed reported by sysfs: the largest isochronous transfer of
-/// an endpoint.
+/// USB bandwidth for one camera in bytes per second at the speed reported by sysfs: the largest
+/// isochronous transfer of an endpoint.
 ///
-/// Source: USB 2.0 section 5.6.3 (full speed 1023 bytes per millisecond, high speed 3072 bytes in 125 us), USB 3.2
-/// section 8.12.6 (48 KiB in 125 us; twice that at 10 Gbit/s).
+/// Source: USB 2.0 section 5.6.3 (full speed 1023 bytes per millisecond, high speed 3072 bytes in
+/// 125 us), USB 3.2 section 8.12.6 (48 KiB in 125 us; twice that at 10 Gbit/s).
 pub(super) fn usb_bytes_per_sec(mbits: f64) -> f64 {
     match mbits {
         mbits if mbits < 480.0 => 1023.0 * 1e3,
@@ -198,7 +246,8 @@ pub(super) fn usb_bytes_per_sec(mbits: f64) -> f64 {
 pub(super) fn modes_exceeding(modes: &[Mode], bytes_per_sec: f64) -> Vec<String> {
     let exceeds = |mode: &Mode| {
         let [width, height] = mode.sizes.max();
-        let required_bytes_per_sec = |rate_hz: f64| mode.format.bytes_per_sec([width, height], rate_hz);
+        let required_bytes_per_sec =
+            |rate_hz: f64| mode.format.bytes_per_sec([width, height], rate_hz);
         let rates: &[f64] = match &mode.rates {
             Rates::Unknown => &[],
             Rates::List(rates) => rates,
@@ -209,9 +258,13 @@ pub(super) fn modes_exceeding(modes: &[Mode], bytes_per_sec: f64) -> Vec<String>
             .copied()
             .filter(|hz| required_bytes_per_sec(*hz) > Some(bytes_per_sec))
             .fold(f64::INFINITY, f64::min);
-        let megabytes =
-            required_bytes_per_sec(slowest).filter(|required_bytes_per_sec| required_bytes_per_sec.is_finite())? * 1e-6;
-        Some(format!("{} {width}x{height} at {slowest:.0} Hz ({megabytes:.0} MB/s)", mode.format.name()))
+        let megabytes = required_bytes_per_sec(slowest)
+            .filter(|required_bytes_per_sec| required_bytes_per_sec.is_finite())?
+            * 1e-6;
+        Some(format!(
+            "{} {width}x{height} at {slowest:.0} Hz ({megabytes:.0} MB/s)",
+            mode.format.name()
+        ))
     };
     modes.iter().filter_map(exceeds).collect()
 }
@@ -226,14 +279,25 @@ pub(super) fn rate_of(interval: Fraction) -> f64 {
     f64::from(interval.denominator) / f64::from(interval.numerator.max(1))
 }
 
-/// Interval of a rate as a kernel fraction: exact for integer rates, otherwise accurate to one millionth.
+/// Interval of a rate as a kernel fraction: exact for integer rates, otherwise accurate to one
+/// millionth.
 pub(super) fn interval_of(rate_hz: f64) -> Fraction {
     const PARTS: f64 = 1e6;
-    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a rig's rates are 0.01 to 1000")]
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "a rig's rates are 0.01 to 1000"
+    )]
     let whole = |number: f64| number.round() as u32;
     match rate_hz.fract() == 0.0 {
-        true => Fraction { numerator: 1, denominator: whole(rate_hz) },
-        false => Fraction { numerator: whole(PARTS), denominator: whole(PARTS * rate_hz) },
+        true => Fraction {
+            numerator: 1,
+            denominator: whole(rate_hz),
+        },
+        false => Fraction {
+            numerator: whole(PARTS),
+            denominator: whole(PARTS * rate_hz),
+        },
     }
 }
 
@@ -242,7 +306,11 @@ pub fn summary(modes: &[Mode]) -> String {
     let size = |mode: &Mode| {
         let sizes = match &mode.sizes {
             Sizes::One([width, height]) => format!("{width}x{height}"),
-            Sizes::Range { min: [w0, h0], max: [w1, h1], .. } => format!("{w0}x{h0} to {w1}x{h1}"),
+            Sizes::Range {
+                min: [w0, h0],
+                max: [w1, h1],
+                ..
+            } => format!("{w0}x{h0} to {w1}x{h1}"),
         };
         let max_hz = match &mode.rates {
             Rates::Unknown => return sizes,
@@ -252,12 +320,23 @@ pub fn summary(modes: &[Mode]) -> String {
         format!("{sizes} up to {} Hz", (max_hz * 100.0).round() / 100.0)
     };
     let of_format = |format: V4l2Format| {
-        let sizes: Vec<_> = modes.iter().filter(|mode| mode.format == format).map(size).collect();
+        let sizes: Vec<_> = modes
+            .iter()
+            .filter(|mode| mode.format == format)
+            .map(size)
+            .collect();
         (!sizes.is_empty()).then(|| format!("{}: {}", format.name(), sizes.join(", ")))
     };
-    let formats = V4l2Format::COLOR_FORMATS.iter().map(|(_, format)| *format).chain([V4l2Format::Z16]);
+    let formats = V4l2Format::COLOR_FORMATS
+        .iter()
+        .map(|(_, format)| *format)
+        .chain([V4l2Format::Z16]);
     let all: Vec<_> = formats.filter_map(of_format).collect();
-    if all.is_empty() { "no supported format".to_owned() } else { all.join("; ") }
+    if all.is_empty() {
+        "no supported format".to_owned()
+    } else {
+        all.join("; ")
+    }
 }
 
 #[cfg(test)]
@@ -275,7 +354,8 @@ mod tests {
             Mode::new(Z16, [848, 480], &[30.0]),
             Mode::new(Grey, [848, 480], &[30.0]),
         ];
-        let chosen = |format, size, rate_hz| choose(&modes, format, size, rate_hz).map(|mode| mode.format);
+        let chosen =
+            |format, size, rate_hz| choose(&modes, format, size, rate_hz).map(|mode| mode.format);
         assert_eq!(chosen(None, [640, 480], 30.0), Some(Yuyv));
         assert_eq!(chosen(None, [1280, 720], 30.0), Some(Mjpeg));
         assert_eq!(chosen(None, [1280, 720], 10.0), Some(Yuyv));
@@ -283,25 +363,53 @@ mod tests {
         assert_eq!(chosen(None, [640, 480], 25.0), None);
         assert_eq!(chosen(Some(Yuyv), [1280, 720], 30.0), None);
         assert_eq!(chosen(Some(Z16), [848, 480], 30.0), Some(Z16));
-        assert_eq!(chosen(None, [848, 480], 30.0), Some(Grey), "depth is never selected as color");
+        assert_eq!(
+            chosen(None, [848, 480], 30.0),
+            Some(Grey),
+            "depth is never selected as color"
+        );
     }
 
     #[test]
     fn size_ranges_respect_steps() {
-        let sizes = Sizes::Range { min: [16, 16], max: [1920, 1080], step: [8, 2] };
+        let sizes = Sizes::Range {
+            min: [16, 16],
+            max: [1920, 1080],
+            step: [8, 2],
+        };
         assert!(sizes.has([640, 480]) && sizes.has([16, 16]) && sizes.has([1920, 1080]));
-        assert!(!sizes.has([644, 480]) && !sizes.has([640, 481]) && !sizes.has([8, 16]) && !sizes.has([1928, 1080]));
+        assert!(
+            !sizes.has([644, 480])
+                && !sizes.has([640, 481])
+                && !sizes.has([8, 16])
+                && !sizes.has([1928, 1080])
+        );
         let range = FrameInterval {
             kind: 3,
             fractions: [
-                Fraction { numerator: 1, denominator: 60 },
-                Fraction { numerator: 1, denominator: 5 },
-                Fraction { numerator: 1, denominator: 60 },
+                Fraction {
+                    numerator: 1,
+                    denominator: 60,
+                },
+                Fraction {
+                    numerator: 1,
+                    denominator: 5,
+                },
+                Fraction {
+                    numerator: 1,
+                    denominator: 60,
+                },
             ],
             ..Default::default()
         };
         let rates = Rates::from_kernel(&[range]);
-        assert_eq!(rates, Rates::Range { min_hz: 5.0, max_hz: 60.0 });
+        assert_eq!(
+            rates,
+            Rates::Range {
+                min_hz: 5.0,
+                max_hz: 60.0
+            }
+        );
         assert!(rates.has(30.0) && rates.has(60.0) && !rates.has(61.0) && !rates.has(4.9));
         assert_eq!(Rates::from_kernel(&[]), Rates::Unknown);
     }
@@ -310,15 +418,26 @@ mod tests {
     fn rates_round_trip_through_fractions() {
         for rate_hz in [0.01, 0.5, 7.5, 14.985, 29.97, 30.0, 60.0, 90.0, 1000.0] {
             let back_hz = rate_of(interval_of(rate_hz));
-            assert!((back_hz - rate_hz).abs() <= 1e-6 * rate_hz.max(1.0), "{rate_hz}: {back_hz}");
+            assert!(
+                (back_hz - rate_hz).abs() <= 1e-6 * rate_hz.max(1.0),
+                "{rate_hz}: {back_hz}"
+            );
         }
-        assert!(is_same_rate(rate_of(Fraction { numerator: 333_667, denominator: 10_000_000 }), 30.0));
+        assert!(is_same_rate(
+            rate_of(Fraction {
+                numerator: 333_667,
+                denominator: 10_000_000
+            }),
+            30.0
+        ));
         assert!(rate_of(Fraction::default()).is_finite());
     }
 
     #[test]
     fn modes_exceeding_usb_bandwidth_are_listed() {
-        let bytes = V4l2Format::Yuyv.bytes_per_sec([2560, 1440], 30.0).expect("an uncompressed format");
+        let bytes = V4l2Format::Yuyv
+            .bytes_per_sec([2560, 1440], 30.0)
+            .expect("an uncompressed format");
         assert_eq!((bytes / 1e6).round(), 221.0);
         assert_eq!(V4l2Format::Mjpeg.bytes_per_sec([2560, 1440], 30.0), None);
         let modes = [
@@ -326,9 +445,18 @@ mod tests {
             Mode::new(V4l2Format::Yuyv, [2560, 1440], &[5.0, 30.0, 15.0]),
             Mode::new(V4l2Format::Mjpeg, [2560, 1440], &[30.0]),
         ];
-        assert_eq!(modes_exceeding(&modes, usb_bytes_per_sec(480.0)), ["yuyv 2560x1440 at 5 Hz (37 MB/s)"]);
-        assert_eq!(modes_exceeding(&modes, usb_bytes_per_sec(5000.0)), Vec::<String>::new());
-        assert_eq!(modes_exceeding(&modes, 200e6), ["yuyv 2560x1440 at 30 Hz (221 MB/s)"]);
+        assert_eq!(
+            modes_exceeding(&modes, usb_bytes_per_sec(480.0)),
+            ["yuyv 2560x1440 at 5 Hz (37 MB/s)"]
+        );
+        assert_eq!(
+            modes_exceeding(&modes, usb_bytes_per_sec(5000.0)),
+            Vec::<String>::new()
+        );
+        assert_eq!(
+            modes_exceeding(&modes, 200e6),
+            ["yuyv 2560x1440 at 30 Hz (221 MB/s)"]
+        );
     }
 
     #[test]
@@ -349,7 +477,8 @@ mod tests {
             Mode::new(V4l2Format::Yuyv, [640, 480], &[14.985, 29.97]),
             Mode::new(V4l2Format::Yuyv, [1280, 720], &[10.0]),
         ];
-        let reported = "yuyv: 640x480 up to 29.97 Hz, 1280x720 up to 10 Hz; mjpeg: 1280x720 up to 30 Hz";
+        let reported =
+            "yuyv: 640x480 up to 29.97 Hz, 1280x720 up to 10 Hz; mjpeg: 1280x720 up to 30 Hz";
         assert_eq!(summary(&modes), reported);
         assert_eq!(summary(&[]), "no supported format");
     }

@@ -1,9 +1,11 @@
-//! Cameras of the kernel's `Video4Linux2`: webcams, capture cards, and depth cameras without vendor software.
+//! Cameras of the kernel's `Video4Linux2`: webcams, capture cards, and depth cameras without vendor
+//! software.
 //!
-//! `abi.rs` declares the kernel interface, and only `device.rs` calls it. `config.rs` and `problem.rs` define
-//! configuration and errors. `find.rs` lists devices; `format.rs`, `pixel_format.rs` and `controls.rs` select formats
-//! and settings; `stream.rs` and `sequence.rs` read images; `camera.rs` handles disconnections. On other systems than
-//! Linux, only the names of the formats are available, because rig files need them on every system.
+//! `abi.rs` declares the kernel interface, and only `device.rs` calls it. `config.rs` and
+//! `problem.rs` define configuration and errors. `find.rs` lists devices; `format.rs`,
+//! `pixel_format.rs` and `controls.rs` select formats and settings; `stream.rs` and `sequence.rs`
+//! read images; `camera.rs` handles disconnections. On other systems than Linux, only the names of
+//! the formats are available, because rig files need them on every system.
 
 #[cfg(target_os = "linux")]
 mod abi;

@@ -22,8 +22,8 @@ pub enum V4l2Format {
 }
 
 impl V4l2Format {
-    /// Formats of color images by their name in rig files, in order of preference: uncompressed before compressed,
-    /// color before gray.
+    /// Formats of color images by their name in rig files, in order of preference: uncompressed
+    /// before compressed, color before gray.
     pub const COLOR_FORMATS: [(&str, Self); 7] = [
         ("yuyv", Self::Yuyv),
         ("uyvy", Self::Uyvy),
@@ -36,6 +36,9 @@ impl V4l2Format {
 
     /// Name in rig files.
     pub fn name(self) -> &'static str {
-        Self::COLOR_FORMATS.iter().find(|(_, format)| *format == self).map_or("z16", |(name, _)| name)
+        Self::COLOR_FORMATS
+            .iter()
+            .find(|(_, format)| *format == self)
+            .map_or("z16", |(name, _)| name)
     }
 }

@@ -8,13 +8,17 @@ use std::time::Duration;
 #[non_exhaustive]
 pub enum Problem {
     /// No connected camera has this name.
-    #[error("no V4L2 camera named {device:?} found: `fieldrig devices` lists the connected cameras")]
+    #[error(
+        "no V4L2 camera named {device:?} found: `fieldrig devices` lists the connected cameras"
+    )]
     NoDevice {
         /// Path, serial number or bus address in the rig file.
         device: String,
     },
     /// Several cameras have this name.
-    #[error("several cameras match {device:?} ({nodes:?}): select one by its port, with a link in /dev/v4l/by-path")]
+    #[error(
+        "several cameras match {device:?} ({nodes:?}): select one by its port, with a link in /dev/v4l/by-path"
+    )]
     Ambiguous {
         /// Serial number or bus address in the rig file.
         device: String,
@@ -58,7 +62,9 @@ pub enum Problem {
         got: String,
     },
     /// The scale of depth is missing.
-    #[error("depth requires camera.NAME.depth.meters_per_count in the rig file (0.001 for a RealSense D4xx)")]
+    #[error(
+        "depth requires camera.NAME.depth.meters_per_count in the rig file (0.001 for a RealSense D4xx)"
+    )]
     NoDepthScale,
     /// Another program uses the device.
     #[error("another program uses it: `fuser -v {}` shows which", path.display())]

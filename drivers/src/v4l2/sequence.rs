@@ -7,13 +7,21 @@ pub(super) struct Sequence {
 }
 
 impl Sequence {
-    /// Records the sequence number of the next image and returns the number of images missing before it.
+    /// Records the sequence number of the next image and returns the number of images missing
+    /// before it.
     ///
-    /// Numbers may wrap. A number that repeats or decreases counts no missing images, because some devices do not
-    /// count, or restart.
+    /// Numbers may wrap. A number that repeats or decreases counts no missing images, because some
+    /// devices do not count, or restart.
     pub(super) fn n_skipped_before(&mut self, number: u32) -> u64 {
-        let ahead = self.last.replace(number).map_or(1, |last| number.wrapping_sub(last));
-        if ahead > u32::MAX / 2 { 0 } else { u64::from(ahead.saturating_sub(1)) }
+        let ahead = self
+            .last
+            .replace(number)
+            .map_or(1, |last| number.wrapping_sub(last));
+        if ahead > u32::MAX / 2 {
+            0
+        } else {
+            u64::from(ahead.saturating_sub(1))
+        }
     }
 }
 
@@ -25,8 +33,11 @@ mod tests {
     fn gaps_are_counted_across_wraparound() {
         let reported = [5, 6, 9, 10, u32::MAX - 1, 1, 1, 1, 2, 0, 1, 4];
         let mut sequence = Sequence::default();
-        let skipped: Vec<u64> = reported.map(|number| sequence.n_skipped_before(number)).into();
-        // The jump from 10 to almost the maximum is more than half of the number range, so it counts as a restart.
+        let skipped: Vec<u64> = reported
+            .map(|number| sequence.n_skipped_before(number))
+            .into();
+        // The jump from 10 to almost the maximum is more than half of the number range, so it
+        // counts as a restart.
         assert_eq!(skipped, [0, 0, 2, 0, 0, 2, 0, 0, 0, 0, 0, 2]);
     }
 }

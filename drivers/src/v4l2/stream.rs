@@ -16,8 +16,8 @@ use std::time::{Duration, Instant};
 
 /// Number of image buffers: a quarter of a second at 30 Hz.
 const N_BUFFERS: u32 = 8;
-/// A stamp that is earlier than the start of the stream or later than now by more than this comes from another clock,
-/// regardless of its flag.
+/// A stamp that is earlier than the start of the stream or later than now by more than this comes
+/// from another clock, regardless of its flag.
 const MAX_STAMP_ERROR_SECS: f64 = 1.0;
 /// Maximum duration of an exposure query, as a fraction of the time between two images.
 const MAX_EXPOSURE_QUERY_FRAC: f64 = 0.25;
@@ -46,16 +46,26 @@ impl V4l2Stream {
     /// Opens the device of a configuration and starts its stream.
     pub(super) fn start(config: &Config) -> Result<Self, Failure<Problem>> {
         let candidates = find::candidates(&config.device)?;
-        // A depth camera has nodes for color, infrared and depth under one serial number. The node with the most
-        // preferred format is used.
+        // A depth camera has nodes for color, infrared and depth under one serial number. The node
+        // with the most preferred format is used.
         let rank = |path: &&PathBuf| {
-            let modes = open(config, path).map(|device| find::modes(&device)).unwrap_or_default();
-            let mode = format::choose(&modes, config.format, config.intrinsics.size_px, config.rate_hz);
+            let modes = open(config, path)
+                .map(|device| find::modes(&device))
+                .unwrap_or_default();
+            let mode = format::choose(
+                &modes,
+                config.format,
+                config.intrinsics.size_px,
+                config.rate_hz,
+            );
             mode.map_or(usize::MAX, |mode| format::rank(mode.format))
         };
         match candidates.iter().min_by_key(rank) {
             Some(path) => Self::start_node(config, path),
-            None => Err(Problem::NoDevice { device: config.device.clone() }.into()),
+            None => Err(Problem::NoDevice {
+                device: config.device.clone(),
+            }
+            .into()),
         }
     }
 
@@ -71,12 +81,17 @@ impl V4l2Stream {
         if mode.format == V4l2Format::Z16 && config.meters_per_count.is_none() {
             return Err(Problem::NoDepthScale.into());
         }
-        let format = mode.format.pixels(colors, config.meters_per_count.unwrap_or(0.0)).map_err(Failure::Final)?;
+        let format = mode
+            .format
+            .pixels(colors, config.meters_per_count.unwrap_or(0.0))
+            .map_err(Failure::Final)?;
         controls::apply(&config.settings, &device)?;
         let requested = requested(config, Some(mode.format));
         let started_at = clock::now();
         let stream = device.stream(N_BUFFERS).map_err(|refused| {
-            let bytes_per_sec = mode.format.bytes_per_sec(config.intrinsics.size_px, config.rate_hz);
+            let bytes_per_sec = mode
+                .format
+                .bytes_per_sec(config.intrinsics.size_px, config.rate_hz);
             stream_problem(refused, path, requested.clone(), bytes_per_sec)
         })?;
         let applied = controls::confirm(&config.settings, stream.device())?;
@@ -99,8 +114,18 @@ impl V4l2Stream {
 
     /// Description of node, mode and settings for the log.
     pub(super) fn describe(&self) -> String {
-        let settings: Vec<_> = self.applied.read_back.iter().map(|(name, value)| format!("{name} {value}")).collect();
-        format!("{}, {}; read back: {}", self.path.display(), self.mode, settings.join(", "))
+        let settings: Vec<_> = self
+            .applied
+            .read_back
+            .iter()
+            .map(|(name, value)| format!("{name} {value}"))
+            .collect();
+        format!(
+            "{}, {}; read back: {}",
+            self.path.display(),
+            self.mode,
+            settings.join(", ")
+        )
     }
 
     pub(super) fn read_back(&self) -> &[(&'static str, i32)] {
@@ -120,20 +145,29 @@ impl V4l2Stream {
     /// Discards images that arrived before the first request. They do not count as lost.
     pub(super) fn discard_queued(&mut self) -> Result<(), Problem> {
         for _ in 0..N_BUFFERS {
-            let Some(filled) = self.stream.take().map_err(lost)? else { break };
+            let Some(filled) = self.stream.take().map_err(lost)? else {
+                break;
+            };
             self.stream.requeue(filled).map_err(lost)?;
         }
         self.sequence = Sequence::default();
         Ok(())
     }
 
-    /// Returns the next image, or `None` if none came before the deadline. An error means that the device was
-    /// disconnected.
-    pub(super) fn next_image(&mut self, config: &Config, deadline: Instant) -> Result<Option<Image>, Problem> {
+    /// Returns the next image, or `None` if none came before the deadline. An error means that the
+    /// device was disconnected.
+    pub(super) fn next_image(
+        &mut self,
+        config: &Config,
+        deadline: Instant,
+    ) -> Result<Option<Image>, Problem> {
         loop {
-            let Some(filled) = self.next_filled(config.delivery, deadline)? else { return Ok(None) };
+            let Some(filled) = self.next_filled(config.delivery, deadline)? else {
+                return Ok(None);
+            };
             self.n_unreported += self.sequence.n_skipped_before(filled.sequence);
-            let image = (!filled.is_damaged).then(|| self.image_of(&filled, config.intrinsics.size_px));
+            let image =
+                (!filled.is_damaged).then(|| self.image_of(&filled, config.intrinsics.size_px));
             self.stream.requeue(filled).map_err(lost)?;
             match image {
                 Some(Ok(mut image)) => {
@@ -156,8 +190,13 @@ impl V4l2Stream {
         }
     }
 
-    /// Takes the next buffer to deliver: the oldest or the newest. In the latter case, older buffers are requeued.
-    fn next_filled(&mut self, delivery: Delivery, deadline: Instant) -> Result<Option<FilledBuffer>, Problem> {
+    /// Takes the next buffer to deliver: the oldest or the newest. In the latter case, older
+    /// buffers are requeued.
+    fn next_filled(
+        &mut self,
+        delivery: Delivery,
+        deadline: Instant,
+    ) -> Result<Option<FilledBuffer>, Problem> {
         let mut taken: Option<FilledBuffer> = None;
         loop {
             match self.stream.take().map_err(lost)? {
@@ -196,12 +235,13 @@ impl V4l2Stream {
         .pack_rows(self.bytes_per_line)
     }
 
-    /// The stamp of the device if it comes from our clock, or else the current time. `stamp_to_mid_exposure_millis` of
-    /// the rig file converts the stamp to mid-exposure.
+    /// The stamp of the device if it comes from our clock, or else the current time.
+    /// `stamp_to_mid_exposure_millis` of the rig file converts the stamp to mid-exposure.
     fn stamp_of(&mut self, filled: &FilledBuffer) -> Stamp {
         let now = clock::now();
         let stamp = Stamp(filled.stamp_nanos);
-        let valid_range = self.started_at.plus_secs(-MAX_STAMP_ERROR_SECS)..now.plus_secs(MAX_STAMP_ERROR_SECS);
+        let valid_range =
+            self.started_at.plus_secs(-MAX_STAMP_ERROR_SECS)..now.plus_secs(MAX_STAMP_ERROR_SECS);
         if filled.is_monotonic && valid_range.contains(&stamp) {
             return stamp;
         }
@@ -214,7 +254,8 @@ impl V4l2Stream {
         now
     }
 
-    /// Exposure time, either fixed or read from the camera. If reading fails or takes too long, it is not read again.
+    /// Exposure time, either fixed or read from the camera. If reading fails or takes too long, it
+    /// is not read again.
     fn exposure_secs(&mut self, rate_hz: f64) -> Option<f64> {
         if !self.applied.reports_exposure {
             return self.applied.exposure_secs;
@@ -233,30 +274,58 @@ impl V4l2Stream {
     }
 }
 
-/// Converts the error of a stream that did not start. `ENOSPC` means that USB has no bandwidth left (`usb_submit_urb`).
-fn stream_problem(refused: Refused, path: &Path, mode: String, bytes_per_sec: Option<f64>) -> Problem {
+/// Converts the error of a stream that did not start. `ENOSPC` means that USB has no bandwidth left
+/// (`usb_submit_urb`).
+fn stream_problem(
+    refused: Refused,
+    path: &Path,
+    mode: String,
+    bytes_per_sec: Option<f64>,
+) -> Problem {
     match refused {
-        Refused::Begin(Errno::NOSPC) => Problem::Bandwidth { mode, bytes_per_sec },
-        Refused::Buffers(Errno::BUSY) | Refused::Begin(Errno::BUSY) => Problem::Busy { path: path.to_owned() },
-        Refused::Buffers(error) => Problem::Refused { what: "shared memory for images", source: error.into() },
-        Refused::Begin(error) => Problem::Refused { what: "the start of its stream", source: error.into() },
+        Refused::Begin(Errno::NOSPC) => Problem::Bandwidth {
+            mode,
+            bytes_per_sec,
+        },
+        Refused::Buffers(Errno::BUSY) | Refused::Begin(Errno::BUSY) => Problem::Busy {
+            path: path.to_owned(),
+        },
+        Refused::Buffers(error) => Problem::Refused {
+            what: "shared memory for images",
+            source: error.into(),
+        },
+        Refused::Begin(error) => Problem::Refused {
+            what: "the start of its stream",
+            source: error.into(),
+        },
     }
 }
 
 /// Converts an error of a streaming device to a disconnection.
 fn lost(error: Errno) -> Problem {
-    Problem::Unplugged { source: error.into() }
+    Problem::Unplugged {
+        source: error.into(),
+    }
 }
 
 fn open(config: &Config, path: &Path) -> Result<Device, Problem> {
     let device = Device::open(path).map_err(|error| match error {
-        Errno::NOENT | Errno::NXIO | Errno::NODEV => Problem::NoDevice { device: config.device.clone() },
-        Errno::BUSY => Problem::Busy { path: path.to_owned() },
-        error => Problem::Open { path: path.to_owned(), source: error.into() },
+        Errno::NOENT | Errno::NXIO | Errno::NODEV => Problem::NoDevice {
+            device: config.device.clone(),
+        },
+        Errno::BUSY => Problem::Busy {
+            path: path.to_owned(),
+        },
+        error => Problem::Open {
+            path: path.to_owned(),
+            source: error.into(),
+        },
     })?;
     match device.identity() {
         Ok(identity) if identity.streams_images => Ok(device),
-        _ => Err(Problem::NotACamera { path: path.to_owned() }),
+        _ => Err(Problem::NotACamera {
+            path: path.to_owned(),
+        }),
     }
 }
 
@@ -264,13 +333,19 @@ fn open(config: &Config, path: &Path) -> Result<Device, Problem> {
 fn set_mode(config: &Config, path: &Path, device: &Device) -> Result<(Mode, PixFormat), Problem> {
     let modes = find::modes(device);
     let (size_px, rate_hz) = (config.intrinsics.size_px, config.rate_hz);
-    let mode = format::choose(&modes, config.format, size_px, rate_hz).ok_or_else(|| Problem::NoMode {
-        requested: requested(config, config.format),
-        offered: format::summary(&modes),
-    })?;
+    let mode =
+        format::choose(&modes, config.format, size_px, rate_hz).ok_or_else(|| Problem::NoMode {
+            requested: requested(config, config.format),
+            offered: format::summary(&modes),
+        })?;
     let refused = |error| match error {
-        Errno::BUSY => Problem::Busy { path: path.to_owned() },
-        error => Problem::Refused { what: "the format", source: std::io::Error::from(error) },
+        Errno::BUSY => Problem::Busy {
+            path: path.to_owned(),
+        },
+        error => Problem::Refused {
+            what: "the format",
+            source: std::io::Error::from(error),
+        },
     };
     let pix = device.set_format(mode.fourcc, size_px).map_err(refused)?;
     let got_hz = device.set_rate_hz(rate_hz).map_err(refused)?;
@@ -279,7 +354,10 @@ fn set_mode(config: &Config, path: &Path, device: &Device) -> Result<(Mode, PixF
         let format = V4l2Format::from_fourcc(pix.fourcc).map_or("another format", V4l2Format::name);
         let rate = got_hz.map_or(String::new(), |got_hz| format!(" at {got_hz:.2} Hz"));
         let got = format!("{format} {}x{}{rate}", pix.width, pix.height);
-        return Err(Problem::OtherMode { requested: requested(config, Some(mode.format)), got });
+        return Err(Problem::OtherMode {
+            requested: requested(config, Some(mode.format)),
+            got,
+        });
     }
     if ![FIELD_ANY, FIELD_NONE].contains(&pix.field) {
         log::warn!(
@@ -288,14 +366,21 @@ fn set_mode(config: &Config, path: &Path, device: &Device) -> Result<(Mode, PixF
         );
     }
     if got_hz.is_none() {
-        log::warn!("camera {:?}: its rate cannot be set; assuming rate_hz of the rig file", config.name);
+        log::warn!(
+            "camera {:?}: its rate cannot be set; assuming rate_hz of the rig file",
+            config.name
+        );
     }
     Ok((mode.clone(), pix))
 }
 
 fn requested(config: &Config, format: Option<V4l2Format>) -> String {
     let [width, height] = config.intrinsics.size_px;
-    format!("{} {width}x{height} at {} Hz", format.map_or("color", V4l2Format::name), config.rate_hz)
+    format!(
+        "{} {width}x{height} at {} Hz",
+        format.map_or("color", V4l2Format::name),
+        config.rate_hz
+    )
 }
 
 #[cfg(test)]
@@ -307,18 +392,33 @@ mod tests {
         let reported = |refused, mode: &str, bytes| {
             stream_problem(refused, Path::new("/dev/video0"), mode.into(), bytes).to_string()
         };
-        let bandwidth_error = reported(Refused::Begin(Errno::NOSPC), "yuyv 2560x1440 at 30 Hz", Some(221.2e6));
+        let bandwidth_error = reported(
+            Refused::Begin(Errno::NOSPC),
+            "yuyv 2560x1440 at 30 Hz",
+            Some(221.2e6),
+        );
         assert!(
-            bandwidth_error.starts_with("USB has no bandwidth left for yuyv 2560x1440 at 30 Hz (221 MB/s): "),
+            bandwidth_error
+                .starts_with("USB has no bandwidth left for yuyv 2560x1440 at 30 Hz (221 MB/s): "),
             "{bandwidth_error}"
         );
         assert!(
             bandwidth_error.contains("mjpeg") && bandwidth_error.contains("another USB controller"),
             "{bandwidth_error}"
         );
-        let compressed = reported(Refused::Begin(Errno::NOSPC), "mjpeg 2560x1440 at 30 Hz", None);
-        assert!(compressed.starts_with("USB has no bandwidth left for mjpeg 2560x1440 at 30 Hz: "), "{compressed}");
+        let compressed = reported(
+            Refused::Begin(Errno::NOSPC),
+            "mjpeg 2560x1440 at 30 Hz",
+            None,
+        );
+        assert!(
+            compressed.starts_with("USB has no bandwidth left for mjpeg 2560x1440 at 30 Hz: "),
+            "{compressed}"
+        );
         assert!(reported(Refused::Buffers(Errno::BUSY), "", None).contains("fuser -v /dev/video0"));
-        assert!(reported(Refused::Begin(Errno::IO), "", None).starts_with("it rejected the start of its stream: "));
+        assert!(
+            reported(Refused::Begin(Errno::IO), "", None)
+                .starts_with("it rejected the start of its stream: ")
+        );
     }
 }

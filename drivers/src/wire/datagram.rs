@@ -1,5 +1,5 @@
-//! UDP datagrams of arms, range scanners and bases: one JSON object per datagram. `docs/reference/udp.md` documents
-//! the fields.
+//! UDP datagrams of arms, range scanners and bases: one JSON object per datagram.
+//! `docs/reference/udp.md` documents the fields.
 
 use super::{Malformed, json};
 use crate::RangePoint;
@@ -12,8 +12,8 @@ use serde::{Deserialize, Serialize};
 pub const VERSION: u32 = 1;
 /// Maximum number of datagrams per scan.
 pub const MAX_PARTS: u32 = 64;
-/// Maximum absolute value of coordinates, ranges and joint values in their units. Larger values are errors of the
-/// sender.
+/// Maximum absolute value of coordinates, ranges and joint values in their units. Larger values are
+/// errors of the sender.
 const MAX_ABS_VALUE: f64 = 1e4;
 /// Maximum absolute angle, rad. Larger angles are errors of the sender.
 const MAX_ANGLE_RAD: f64 = 100.0;
@@ -21,8 +21,8 @@ const MAX_ANGLE_RAD: f64 = 100.0;
 const MAX_ERROR_CHARS: usize = 200;
 /// Maximum length of a list of names in an error message.
 const MAX_LIST_CHARS: usize = 400;
-/// Maximum asymmetry of a covariance matrix, as a fraction of the maximum covariance. Single precision is more
-/// accurate.
+/// Maximum asymmetry of a covariance matrix, as a fraction of the maximum covariance. Single
+/// precision is more accurate.
 const SYMMETRY_TOLERANCE: f64 = 1e-4;
 /// Maximum deviation of a quaternion's norm from 1.
 const UNIT_NORM_TOLERANCE: f64 = 1e-3;
@@ -70,14 +70,15 @@ pub struct PoseDatagram {
     pub header: DatagramHeader,
     /// Pose of the base.
     pub world_from_base: Transform,
-    /// Covariance of the pose if the sender reports it, row-major: position along the world's axes, then small
-    /// rotations about them (as in `geometry_msgs/PoseWithCovariance` of ROS); m², m rad, rad².
+    /// Covariance of the pose if the sender reports it, row-major: position along the world's axes,
+    /// then small rotations about them (as in `geometry_msgs/PoseWithCovariance` of ROS); m², m
+    /// rad, rad².
     pub covariance: Option<Box<[f64; 36]>>,
 }
 
 impl PoseDatagram {
-    /// Uncertainty that the covariance reports: root mean square errors of position (meters) and rotation (radians);
-    /// `None` without a covariance.
+    /// Uncertainty that the covariance reports: root mean square errors of position (meters) and
+    /// rotation (radians); `None` without a covariance.
     pub fn sigmas(&self) -> Option<[f64; 2]> {
         let covariance = self.covariance.as_ref()?;
         let trace = |first: usize| (first..first + 3).map(|ix| covariance[7 * ix]).sum::<f64>();
@@ -178,7 +179,13 @@ fn default_parts() -> u32 {
 
 /// Encodes a part of a scan; [`decode_scan`] restores it exactly.
 pub fn encode_scan(part: &ScanPart) -> Vec<u8> {
-    let ScanPart { header, frame, part, n_parts, points } = part;
+    let ScanPart {
+        header,
+        frame,
+        part,
+        n_parts,
+        points,
+    } = part;
     let wire = WireScan {
         kind: SCAN.to_owned(),
         version: VERSION,
@@ -201,7 +208,11 @@ pub fn encode_scan(part: &ScanPart) -> Vec<u8> {
 
 /// Encodes a base pose; [`decode_pose`] restores it exactly.
 pub fn encode_pose(pose: &PoseDatagram) -> Vec<u8> {
-    let PoseDatagram { header, world_from_base, covariance } = pose;
+    let PoseDatagram {
+        header,
+        world_from_base,
+        covariance,
+    } = pose;
     let wire = WirePose {
         kind: POSE.to_owned(),
         version: VERSION,
@@ -219,7 +230,12 @@ pub fn encode_pose(pose: &PoseDatagram) -> Vec<u8> {
 
 /// Encodes the state of joints with these names; [`decode_joints`] restores it exactly.
 pub fn encode_joints(joints: &JointsDatagram, names: &[String]) -> Vec<u8> {
-    let JointsDatagram { header, position, velocity, effort } = joints;
+    let JointsDatagram {
+        header,
+        position,
+        velocity,
+        effort,
+    } = joints;
     let wire = WireJoints {
         kind: JOINTS.to_owned(),
         version: VERSION,
@@ -247,7 +263,9 @@ pub fn decode_scan(bytes: &[u8]) -> Result<ScanPart, Malformed> {
     let echo_positions = echo_positions(&wire)?;
     let n = echo_positions.len();
     let check_length = |name, len: Option<usize>| match len {
-        Some(len) if len != n => Err(invalid(format!("{name} has {len} entries, but there are {n} points or ranges"))),
+        Some(len) if len != n => Err(invalid(format!(
+            "{name} has {len} entries, but there are {n} points or ranges"
+        ))),
         _ => Ok(()),
     };
     check_length("rings", wire.rings.as_ref().map(Vec::len))?;
@@ -256,12 +274,23 @@ pub fn decode_scan(bytes: &[u8]) -> Result<ScanPart, Malformed> {
         Some(RangePoint {
             position_m: echo_position?,
             ring: wire.rings.as_ref().map_or(0, |rings| rings[ix]),
-            offset_micros: wire.offsets_micros.as_ref().map_or(0, |offsets| offsets[ix]),
+            offset_micros: wire
+                .offsets_micros
+                .as_ref()
+                .map_or(0, |offsets| offsets[ix]),
         })
     };
     Ok(ScanPart {
-        header: DatagramHeader { seq: wire.seq, clock: wire.clock, stamp_nanos: wire.stamp_nanos },
-        points: echo_positions.into_iter().enumerate().filter_map(point).collect(),
+        header: DatagramHeader {
+            seq: wire.seq,
+            clock: wire.clock,
+            stamp_nanos: wire.stamp_nanos,
+        },
+        points: echo_positions
+            .into_iter()
+            .enumerate()
+            .filter_map(point)
+            .collect(),
         frame: wire.frame,
         part: wire.part,
         n_parts: wire.parts,
@@ -272,9 +301,17 @@ pub fn decode_scan(bytes: &[u8]) -> Result<ScanPart, Malformed> {
 pub fn decode_pose(bytes: &[u8]) -> Result<PoseDatagram, Malformed> {
     check_kind(bytes, POSE)?;
     let wire: WirePose = parse_json(bytes)?;
-    let Pose { xyz_m: [x, y, z], quat_xyzw: [i, j, k, w] } = wire.world_from_base;
-    if ![x, y, z].iter().all(|coordinate| coordinate.abs() <= MAX_ABS_VALUE) {
-        return Err(invalid(format!("xyz_m has an absolute value above {MAX_ABS_VALUE} m")));
+    let Pose {
+        xyz_m: [x, y, z],
+        quat_xyzw: [i, j, k, w],
+    } = wire.world_from_base;
+    if ![x, y, z]
+        .iter()
+        .all(|coordinate| coordinate.abs() <= MAX_ABS_VALUE)
+    {
+        return Err(invalid(format!(
+            "xyz_m has an absolute value above {MAX_ABS_VALUE} m"
+        )));
     }
     let quaternion = Quaternion::new(w, i, j, k);
     // Written so that NaN is not a unit norm.
@@ -287,7 +324,11 @@ pub fn decode_pose(bytes: &[u8]) -> Result<PoseDatagram, Malformed> {
         false => UnitQuaternion::new_normalize(quaternion),
     };
     Ok(PoseDatagram {
-        header: DatagramHeader { seq: wire.seq, clock: wire.clock, stamp_nanos: wire.stamp_nanos },
+        header: DatagramHeader {
+            seq: wire.seq,
+            clock: wire.clock,
+            stamp_nanos: wire.stamp_nanos,
+        },
         world_from_base: Transform::from_parts(Translation3::new(x, y, z), rotation),
         covariance: wire.covariance.map(covariance).transpose()?,
     })
@@ -295,10 +336,13 @@ pub fn decode_pose(bytes: &[u8]) -> Result<PoseDatagram, Malformed> {
 
 fn covariance(numbers: Vec<f64>) -> Result<Box<[f64; 36]>, Malformed> {
     let n = numbers.len();
-    let covariance: Box<[f64; 36]> =
-        numbers.try_into().map_err(|_| invalid(format!("covariance has {n} numbers, expected 36")))?;
+    let covariance: Box<[f64; 36]> = numbers
+        .try_into()
+        .map_err(|_| invalid(format!("covariance has {n} numbers, expected 36")))?;
     if !(0..6).all(|ix| (0.0..=MAX_ABS_VALUE).contains(&covariance[7 * ix])) {
-        return Err(invalid(format!("covariance has a variance outside 0 to {MAX_ABS_VALUE}")));
+        return Err(invalid(format!(
+            "covariance has a variance outside 0 to {MAX_ABS_VALUE}"
+        )));
     }
     for (row, column) in (0..6).flat_map(|row| (0..row).map(move |column| (row, column))) {
         let [lower, upper] = [covariance[6 * row + column], covariance[6 * column + row]];
@@ -314,15 +358,32 @@ fn covariance(numbers: Vec<f64>) -> Result<Box<[f64; 36]>, Malformed> {
     Ok(covariance)
 }
 
-/// Decodes the state of joints with these names; `None` if the datagram names other joints only, such as those of a gripper.
+/// Decodes the state of joints with these names; `None` if the datagram names other joints only,
+/// such as those of a gripper.
 ///
-/// Joints are found by their names. Without names, the numbers must be in the order of `names`. Velocities and efforts count
-/// as not reported if one of them is null or NaN.
-pub fn decode_joints(bytes: &[u8], names: &[String]) -> Result<(DatagramHeader, Option<JointsDatagram>), Malformed> {
+/// Joints are found by their names. Without names, the numbers must be in the order of `names`.
+/// Velocities and efforts count as not reported if one of them is null or NaN.
+pub fn decode_joints(
+    bytes: &[u8],
+    names: &[String],
+) -> Result<(DatagramHeader, Option<JointsDatagram>), Malformed> {
     check_kind(bytes, JOINTS)?;
     let joints: WireJoints<Option<f64>> = parse_json(bytes)?;
-    let WireJoints { seq, clock, stamp_nanos, names: reported, position, velocity, effort, .. } = joints;
-    let header = DatagramHeader { seq, clock, stamp_nanos };
+    let WireJoints {
+        seq,
+        clock,
+        stamp_nanos,
+        names: reported,
+        position,
+        velocity,
+        effort,
+        ..
+    } = joints;
+    let header = DatagramHeader {
+        seq,
+        clock,
+        stamp_nanos,
+    };
     let (order, n) = match &reported {
         None => ((0..names.len()).collect(), names.len()),
         Some(reported) => match order_of(names, reported)? {
@@ -330,27 +391,44 @@ pub fn decode_joints(bytes: &[u8], names: &[String]) -> Result<(DatagramHeader, 
             None => return Ok((header, None)),
         },
     };
-    let numbers = |what: &str, numbers: &[Option<f64>], is_optional: bool| -> Result<Vec<f64>, Malformed> {
-        if is_optional && numbers.is_empty() {
-            return Ok(Vec::new());
-        }
-        if numbers.len() != n {
-            let per = if reported.is_some() { "name" } else { "joint" };
-            return Err(invalid(format!("{what} has {} numbers, expected {n}, one per {per}", numbers.len())));
-        }
-        let ordered: Option<Vec<f64>> = order.iter().map(|ix: &usize| numbers[*ix]).collect();
-        match ordered {
-            Some(ordered) if ordered.iter().any(|number| number.abs() > MAX_ABS_VALUE) => {
-                Err(invalid(format!("{what} has an absolute value above {MAX_ABS_VALUE}")))
+    let numbers =
+        |what: &str, numbers: &[Option<f64>], is_optional: bool| -> Result<Vec<f64>, Malformed> {
+            if is_optional && numbers.is_empty() {
+                return Ok(Vec::new());
             }
-            Some(ordered) => Ok(ordered),
-            None if is_optional => Ok(Vec::new()),
-            None => Err(invalid(format!("{what} has null or NaN"))),
-        }
-    };
-    let (position, velocity) = (numbers("position", &position, false)?, numbers("velocity", &velocity, true)?);
+            if numbers.len() != n {
+                let per = if reported.is_some() { "name" } else { "joint" };
+                return Err(invalid(format!(
+                    "{what} has {} numbers, expected {n}, one per {per}",
+                    numbers.len()
+                )));
+            }
+            let ordered: Option<Vec<f64>> = order.iter().map(|ix: &usize| numbers[*ix]).collect();
+            match ordered {
+                Some(ordered) if ordered.iter().any(|number| number.abs() > MAX_ABS_VALUE) => {
+                    Err(invalid(format!(
+                        "{what} has an absolute value above {MAX_ABS_VALUE}"
+                    )))
+                }
+                Some(ordered) => Ok(ordered),
+                None if is_optional => Ok(Vec::new()),
+                None => Err(invalid(format!("{what} has null or NaN"))),
+            }
+        };
+    let (position, velocity) = (
+        numbers("position", &position, false)?,
+        numbers("velocity", &velocity, true)?,
+    );
     let effort = numbers("effort", &effort, true)?;
-    Ok((header, Some(JointsDatagram { header, position, velocity, effort })))
+    Ok((
+        header,
+        Some(JointsDatagram {
+            header,
+            position,
+            velocity,
+            effort,
+        }),
+    ))
 }
 
 /// Index of each joint in `reported`; `None` if it contains none of the joints.
@@ -367,12 +445,21 @@ fn order_of(joints: &[String], reported: &[String]) -> Result<Option<Vec<usize>>
     if found.iter().all(Option::is_none) && !joints.is_empty() {
         return Ok(None);
     }
-    let missing = joints.iter().zip(&found).find(|(_, ix)| ix.is_none()).map(|(joint, _)| joint);
+    let missing = joints
+        .iter()
+        .zip(&found)
+        .find(|(_, ix)| ix.is_none())
+        .map(|(joint, _)| joint);
     match missing {
         None => Ok(Some(found.into_iter().flatten().collect())),
         Some(missing) => {
             let list = |names: &[String]| {
-                let names: String = names.join(", ").chars().filter(|c| !c.is_control()).take(MAX_LIST_CHARS).collect();
+                let names: String = names
+                    .join(", ")
+                    .chars()
+                    .filter(|c| !c.is_control())
+                    .take(MAX_LIST_CHARS)
+                    .collect();
                 names
             };
             Err(invalid(format!(
@@ -390,39 +477,68 @@ fn echo_positions(wire: &WireScan) -> Result<Vec<Option<[f32; 3]>>, Malformed> {
         (Some(numbers), None) => {
             let (points, rest) = numbers.as_chunks::<3>();
             if !rest.is_empty() {
-                return Err(invalid(format!("points_m has {} numbers, expected three per point", numbers.len())));
+                return Err(invalid(format!(
+                    "points_m has {} numbers, expected three per point",
+                    numbers.len()
+                )));
             }
-            match points.iter().flatten().all(|coordinate| f64::from(coordinate.abs()) <= MAX_ABS_VALUE) {
+            match points
+                .iter()
+                .flatten()
+                .all(|coordinate| f64::from(coordinate.abs()) <= MAX_ABS_VALUE)
+            {
                 true => Ok(points.iter().map(|point| Some(*point)).collect()),
-                false => Err(invalid(format!("points_m has an absolute value above {MAX_ABS_VALUE} m"))),
+                false => Err(invalid(format!(
+                    "points_m has an absolute value above {MAX_ABS_VALUE} m"
+                ))),
             }
         }
         (None, Some(ranges)) => {
             let angle = |name, angle: Option<f64>| match angle {
                 Some(angle) if angle.abs() <= MAX_ANGLE_RAD => Ok(angle),
-                _ => Err(invalid(format!("ranges_m requires {name} between -{MAX_ANGLE_RAD} and {MAX_ANGLE_RAD} rad"))),
+                _ => Err(invalid(format!(
+                    "ranges_m requires {name} between -{MAX_ANGLE_RAD} and {MAX_ANGLE_RAD} rad"
+                ))),
             };
-            let (first, step) = (angle("first_rad", wire.first_rad)?, angle("step_rad", wire.step_rad)?);
+            let (first, step) = (
+                angle("first_rad", wire.first_rad)?,
+                angle("step_rad", wire.step_rad)?,
+            );
             let elevation = angle("elevation_rad", Some(wire.elevation_rad.unwrap_or(0.0)))?;
             let echo_position = |(ix, range): (usize, &Option<f32>)| {
-                let Some(range_m) = range.map(f64::from) else { return Ok(None) };
+                let Some(range_m) = range.map(f64::from) else {
+                    return Ok(None);
+                };
                 match (0.0..=MAX_ABS_VALUE).contains(&range_m) {
-                    true => Ok(Some(position_from_polar(range_m, first + ix as f64 * step, elevation))),
-                    false => Err(invalid(format!("ranges_m has a number outside 0 to {MAX_ABS_VALUE} m"))),
+                    true => Ok(Some(position_from_polar(
+                        range_m,
+                        first + ix as f64 * step,
+                        elevation,
+                    ))),
+                    false => Err(invalid(format!(
+                        "ranges_m has a number outside 0 to {MAX_ABS_VALUE} m"
+                    ))),
                 }
             };
             ranges.iter().enumerate().map(echo_position).collect()
         }
-        _ => Err(invalid("expected either points_m or ranges_m, not both".to_owned())),
+        _ => Err(invalid(
+            "expected either points_m or ranges_m, not both".to_owned(),
+        )),
     }
 }
 
-/// Position of an echo. The azimuth is measured from x towards y, the elevation from that plane towards z.
+/// Position of an echo. The azimuth is measured from x towards y, the elevation from that plane
+/// towards z.
 #[expect(clippy::cast_possible_truncation, reason = "meters within 10 km")]
 fn position_from_polar(range_m: f64, azimuth_rad: f64, elevation_rad: f64) -> [f32; 3] {
     let horizontal_m = range_m * elevation_rad.cos();
-    [horizontal_m * azimuth_rad.cos(), horizontal_m * azimuth_rad.sin(), range_m * elevation_rad.sin()]
-        .map(|coordinate| coordinate as f32)
+    [
+        horizontal_m * azimuth_rad.cos(),
+        horizontal_m * azimuth_rad.sin(),
+        range_m * elevation_rad.sin(),
+    ]
+    .map(|coordinate| coordinate as f32)
 }
 
 fn check_kind(bytes: &[u8], expected: &'static str) -> Result<(), Malformed> {
@@ -433,22 +549,33 @@ fn check_kind(bytes: &[u8], expected: &'static str) -> Result<(), Malformed> {
     }
     match version == VERSION {
         true => Ok(()),
-        false => Err(invalid(format!("version {version} is not supported, expected {VERSION}"))),
+        false => Err(invalid(format!(
+            "version {version} is not supported, expected {VERSION}"
+        ))),
     }
 }
 
 /// Parses JSON in which `NaN` and `Infinity`, which Python writes, are read as null.
 fn parse_json<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, Malformed> {
-    let parse = |bytes: &[u8]| serde_json::from_slice(bytes).map_err(|error| invalid(reported(&error)));
+    let parse =
+        |bytes: &[u8]| serde_json::from_slice(bytes).map_err(|error| invalid(reported(&error)));
     parse(bytes).or_else(|error| match std::str::from_utf8(bytes) {
-        Ok(text) if text.contains("NaN") || text.contains("Infinity") => parse(json::nan_as_null(text).as_bytes()),
+        Ok(text) if text.contains("NaN") || text.contains("Infinity") => {
+            parse(json::nan_as_null(text).as_bytes())
+        }
         _ => Err(error),
     })
 }
 
-/// The parser may repeat the sender's text, which may be long and contain anything, and the message is logged.
+/// The parser may repeat the sender's text, which may be long and contain anything, and the message
+/// is logged.
 fn reported(error: &serde_json::Error) -> String {
-    error.to_string().chars().take(MAX_ERROR_CHARS).map(|c| if c.is_control() { '?' } else { c }).collect()
+    error
+        .to_string()
+        .chars()
+        .take(MAX_ERROR_CHARS)
+        .map(|c| if c.is_control() { '?' } else { c })
+        .collect()
 }
 
 fn invalid(reason: String) -> Malformed {
@@ -460,7 +587,11 @@ mod tests {
     use super::*;
     use kinematics::random::Random;
 
-    const HEADER: DatagramHeader = DatagramHeader { seq: 7, clock: Clock::Monotonic, stamp_nanos: 1_234_567_890_123 };
+    const HEADER: DatagramHeader = DatagramHeader {
+        seq: 7,
+        clock: Clock::Monotonic,
+        stamp_nanos: 1_234_567_890_123,
+    };
 
     fn part() -> ScanPart {
         let point = |ix: u16| RangePoint {
@@ -468,15 +599,34 @@ mod tests {
             ring: ix,
             offset_micros: 100 * u32::from(ix),
         };
-        ScanPart { header: HEADER, frame: "lidar".into(), part: 1, n_parts: 3, points: (0..5).map(point).collect() }
+        ScanPart {
+            header: HEADER,
+            frame: "lidar".into(),
+            part: 1,
+            n_parts: 3,
+            points: (0..5).map(point).collect(),
+        }
     }
 
     fn pose() -> PoseDatagram {
         let rotation = UnitQuaternion::from_euler_angles(0.1, -0.2, 3.0);
-        let world_from_base = Transform::from_parts(Translation3::new(0.1, -1.0 / 3.0, 1e3), rotation);
-        let covariance =
-            Some(Box::new(std::array::from_fn(|ix| if ix % 7 == 0 { 1e-4 } else { 1e-6 * (ix / 6 + ix % 6) as f64 })));
-        PoseDatagram { header: DatagramHeader { clock: Clock::Device, ..HEADER }, world_from_base, covariance }
+        let world_from_base =
+            Transform::from_parts(Translation3::new(0.1, -1.0 / 3.0, 1e3), rotation);
+        let covariance = Some(Box::new(std::array::from_fn(|ix| {
+            if ix % 7 == 0 {
+                1e-4
+            } else {
+                1e-6 * (ix / 6 + ix % 6) as f64
+            }
+        })));
+        PoseDatagram {
+            header: DatagramHeader {
+                clock: Clock::Device,
+                ..HEADER
+            },
+            world_from_base,
+            covariance,
+        }
     }
 
     fn names() -> Vec<String> {
@@ -501,29 +651,53 @@ mod tests {
 
     #[test]
     fn datagrams_round_trip_exactly() {
-        assert_eq!(decode_scan(&encode_scan(&part())).expect("own bytes"), part());
-        assert_eq!(decode_pose(&encode_pose(&pose())).expect("own bytes"), pose());
-        let (header, decoded) = decode_joints(&encode_joints(&joints(), &names()), &names()).expect("own bytes");
+        assert_eq!(
+            decode_scan(&encode_scan(&part())).expect("own bytes"),
+            part()
+        );
+        assert_eq!(
+            decode_pose(&encode_pose(&pose())).expect("own bytes"),
+            pose()
+        );
+        let (header, decoded) =
+            decode_joints(&encode_joints(&joints(), &names()), &names()).expect("own bytes");
         assert_eq!((header, decoded), (HEADER, Some(joints())));
     }
 
     #[test]
     fn documented_datagrams_are_decoded() {
         let page = include_str!("../../../docs/reference/udp.md");
-        let examples: Vec<&str> = page.lines().filter(|line| line.starts_with(r#"{"kind""#)).collect();
-        let scans: Vec<ScanPart> = examples.iter().filter_map(|text| decode_scan(text.as_bytes()).ok()).collect();
-        let poses = examples.iter().filter(|text| decode_pose(text.as_bytes()).is_ok()).count();
+        let examples: Vec<&str> = page
+            .lines()
+            .filter(|line| line.starts_with(r#"{"kind""#))
+            .collect();
+        let scans: Vec<ScanPart> = examples
+            .iter()
+            .filter_map(|text| decode_scan(text.as_bytes()).ok())
+            .collect();
+        let poses = examples
+            .iter()
+            .filter(|text| decode_pose(text.as_bytes()).is_ok())
+            .count();
         let names: Vec<String> = (1..=7).map(|n| format!("panda_joint{n}")).collect();
         let joints = examples
             .iter()
-            .filter(|text| decode_joints(text.as_bytes(), &names).is_ok_and(|(_, joints)| joints.is_some()))
+            .filter(|text| {
+                decode_joints(text.as_bytes(), &names).is_ok_and(|(_, joints)| joints.is_some())
+            })
             .count();
         assert_eq!((examples.len(), scans.len(), poses, joints), (5, 2, 1, 2));
         // The directions are ahead, one without echo, and to the left.
         let ranges = &scans[1].points;
         assert_eq!(ranges.len(), 2);
-        assert!((ranges[0].position_m[0] - 2.0).abs() < 1e-6 && ranges[0].position_m[1].abs() < 1e-6, "{ranges:?}");
-        assert!((ranges[1].position_m[1] - 1.5).abs() < 1e-3 && ranges[1].offset_micros == 200, "{ranges:?}");
+        assert!(
+            (ranges[0].position_m[0] - 2.0).abs() < 1e-6 && ranges[0].position_m[1].abs() < 1e-6,
+            "{ranges:?}"
+        );
+        assert!(
+            (ranges[1].position_m[1] - 1.5).abs() < 1e-3 && ranges[1].offset_micros == 200,
+            "{ranges:?}"
+        );
     }
 
     #[test]
@@ -537,7 +711,10 @@ mod tests {
             (r#""rings":[]"#, "points_m or ranges_m"),
             (r#""points_m":[1,2,3],"rings":[1,2]"#, "rings has 2"),
             (r#""points_m":[1,2,3],"rings":[70000]"#, "70000"),
-            (r#""points_m":[1,2,3],"offsets_micros":[]"#, "offsets_micros has 0"),
+            (
+                r#""points_m":[1,2,3],"offsets_micros":[]"#,
+                "offsets_micros has 0",
+            ),
             (r#""ranges_m":[1],"step_rad":0.1"#, "first_rad"),
             (r#""ranges_m":[1],"first_rad":0,"step_rad":1e9"#, "step_rad"),
             (r#""ranges_m":[-1],"first_rad":0,"step_rad":0.1"#, "outside"),
@@ -554,17 +731,43 @@ mod tests {
             (r#""version":1"#, r#""version":2"#, "version 2"),
             (r#""kind":"base""#, r#""kind":"range""#, "base"),
             (r#""clock":"device""#, r#""clock":"sundial""#, "sundial"),
-            (r#""stamp_nanos":"#, r#""stamp_nanos":1e99,"x":"#, "floating point"),
-            (r#""quat_xyzw":["#, r#""quat_xyzw":[0,0,0,0],"x":["#, "unit quaternion"),
-            (r#""xyz_m":["#, r#""xyz_m":[0,-1e300,0],"x":["#, "absolute value above"),
+            (
+                r#""stamp_nanos":"#,
+                r#""stamp_nanos":1e99,"x":"#,
+                "floating point",
+            ),
+            (
+                r#""quat_xyzw":["#,
+                r#""quat_xyzw":[0,0,0,0],"x":["#,
+                "unit quaternion",
+            ),
+            (
+                r#""xyz_m":["#,
+                r#""xyz_m":[0,-1e300,0],"x":["#,
+                "absolute value above",
+            ),
             (r#""covariance":["#, r#""covariance":[1],"x":["#, "36"),
             (r#""covariance":["#, r#""covariance":[-1],"x":["#, "36"),
-            (r#""covariance":[0.0001"#, r#""covariance":[-0.0001"#, "variance outside"),
-            (r#""covariance":[0.0001,1e-6"#, r#""covariance":[0.0001,2e-6"#, "row 1, column 0"),
-            (r#""covariance":[0.0001"#, r#""covariance":[0.0"#, "row 1, column 0"),
+            (
+                r#""covariance":[0.0001"#,
+                r#""covariance":[-0.0001"#,
+                "variance outside",
+            ),
+            (
+                r#""covariance":[0.0001,1e-6"#,
+                r#""covariance":[0.0001,2e-6"#,
+                "row 1, column 0",
+            ),
+            (
+                r#""covariance":[0.0001"#,
+                r#""covariance":[0.0"#,
+                "row 1, column 0",
+            ),
         ] {
             assert!(other.contains(from), "{from}");
-            let reported = decode_pose(other.replace(from, to).as_bytes()).expect_err(to).to_string();
+            let reported = decode_pose(other.replace(from, to).as_bytes())
+                .expect_err(to)
+                .to_string();
             assert!(reported.contains(named), "{to}: {reported}");
         }
     }
@@ -573,19 +776,57 @@ mod tests {
     fn invalid_joints_are_named() {
         let good = String::from_utf8(encode_joints(&joints(), &names())).expect("text");
         for (from, to, named) in [
-            (r#"["a","b","c"]"#, r#"["a","x","c"]"#, "names lacks \"b\"; it has a, x, c, and arm.joints has a, b, c"),
-            (r#"["a","b","c"]"#, r#"["a","b","c","b"]"#, "names has \"b\" twice"),
-            (r#"["a","b","c"]"#, r#"["a","b","c","d"]"#, "position has 3 numbers, expected 4"),
+            (
+                r#"["a","b","c"]"#,
+                r#"["a","x","c"]"#,
+                "names lacks \"b\"; it has a, x, c, and arm.joints has a, b, c",
+            ),
+            (
+                r#"["a","b","c"]"#,
+                r#"["a","b","c","b"]"#,
+                "names has \"b\" twice",
+            ),
+            (
+                r#"["a","b","c"]"#,
+                r#"["a","b","c","d"]"#,
+                "position has 3 numbers, expected 4",
+            ),
             (r#""position":["#, r#""position":[1,"#, "position has 4"),
-            (r#""position":["#, r#""position":[],"x":["#, "position has 0"),
-            (r#""position":["#, r#""position":[0,1e5,0],"x":["#, "absolute value above"),
-            (r#""position":["#, r#""position":[0,null,0],"x":["#, "position has null or NaN"),
-            (r#""position":["#, r#""position":[0,NaN,0],"x":["#, "position has null or NaN"),
-            (r#""velocity":["#, r#""velocity":[1],"x":["#, "velocity has 1"),
-            (r#""version":1"#, r#""version":1,"effort":[1,2]"#, "effort has 2"),
+            (
+                r#""position":["#,
+                r#""position":[],"x":["#,
+                "position has 0",
+            ),
+            (
+                r#""position":["#,
+                r#""position":[0,1e5,0],"x":["#,
+                "absolute value above",
+            ),
+            (
+                r#""position":["#,
+                r#""position":[0,null,0],"x":["#,
+                "position has null or NaN",
+            ),
+            (
+                r#""position":["#,
+                r#""position":[0,NaN,0],"x":["#,
+                "position has null or NaN",
+            ),
+            (
+                r#""velocity":["#,
+                r#""velocity":[1],"x":["#,
+                "velocity has 1",
+            ),
+            (
+                r#""version":1"#,
+                r#""version":1,"effort":[1,2]"#,
+                "effort has 2",
+            ),
         ] {
             assert!(good.contains(from), "{from}");
-            let reported = decode_joints(good.replace(from, to).as_bytes(), &names()).expect_err(to).to_string();
+            let reported = decode_joints(good.replace(from, to).as_bytes(), &names())
+                .expect_err(to)
+                .to_string();
             assert!(reported.contains(named), "{to}: {reported}");
         }
     }
@@ -593,17 +834,26 @@ mod tests {
     #[test]
     fn joints_are_found_by_name_and_other_joints_ignored() {
         let decode = |fields: &str| {
-            let text = format!(r#"{{"kind":"joints","version":1,"seq":1,"clock":"device","stamp_nanos":5,{fields}}}"#);
+            let text = format!(
+                r#"{{"kind":"joints","version":1,"seq":1,"clock":"device","stamp_nanos":5,{fields}}}"#
+            );
             decode_joints(text.as_bytes(), &names()).expect(fields).1
         };
         let shuffled = decode(
             r#""names":["left","c","a","right","b"],"position":[9,3,1,9,2],"velocity":[9,-3,-1,9,-2],"effort":[NaN,0,0,-Infinity,0]"#,
         );
         let shuffled = shuffled.expect("all joints");
-        assert_eq!((shuffled.position, shuffled.velocity), (vec![1.0, 2.0, 3.0], vec![-1.0, -2.0, -3.0]));
-        assert_eq!(shuffled.effort, [0.0; 3], "those of other joints do not matter");
+        assert_eq!(
+            (shuffled.position, shuffled.velocity),
+            (vec![1.0, 2.0, 3.0], vec![-1.0, -2.0, -3.0])
+        );
+        assert_eq!(
+            shuffled.effort, [0.0; 3],
+            "those of other joints do not matter"
+        );
         let unknown =
-            decode(r#""position":[1,2,3],"velocity":[0,NaN,0],"effort":[null,null,null]"#).expect("all joints");
+            decode(r#""position":[1,2,3],"velocity":[0,NaN,0],"effort":[null,null,null]"#)
+                .expect("all joints");
         assert!(unknown.velocity.is_empty() && unknown.effort.is_empty());
         assert_eq!(decode(r#""names":["left","right"],"position":[9,9]"#), None);
     }
@@ -611,22 +861,41 @@ mod tests {
     #[test]
     fn sender_text_in_errors_is_truncated() {
         let long = format!(r#""a\n{}""#, "b".repeat(50_000));
-        let text = String::from_utf8(encode_pose(&pose())).expect("text").replace(r#""device""#, &long);
-        let reported = decode_pose(text.as_bytes()).expect_err("no such clock").to_string();
-        assert!(reported.contains("unknown variant `a?b") && reported.len() <= MAX_ERROR_CHARS, "{reported}");
+        let text = String::from_utf8(encode_pose(&pose()))
+            .expect("text")
+            .replace(r#""device""#, &long);
+        let reported = decode_pose(text.as_bytes())
+            .expect_err("no such clock")
+            .to_string();
+        assert!(
+            reported.contains("unknown variant `a?b") && reported.len() <= MAX_ERROR_CHARS,
+            "{reported}"
+        );
     }
 
     #[test]
     fn corrupted_bytes_never_panic() {
-        for complete in [encode_scan(&part()), encode_pose(&pose()), encode_joints(&joints(), &names())] {
+        for complete in [
+            encode_scan(&part()),
+            encode_pose(&pose()),
+            encode_joints(&joints(), &names()),
+        ] {
             for end in 0..complete.len() {
-                assert!(decode_scan(&complete[..end]).is_err() && decode_pose(&complete[..end]).is_err(), "{end}");
+                assert!(
+                    decode_scan(&complete[..end]).is_err()
+                        && decode_pose(&complete[..end]).is_err(),
+                    "{end}"
+                );
                 assert!(decode_joints(&complete[..end], &names()).is_err(), "{end}");
             }
             for ix in 0..8 * complete.len() {
                 let mut corrupted = complete.clone();
                 corrupted[ix / 8] ^= 1 << (ix % 8);
-                let _ = (decode_scan(&corrupted), decode_pose(&corrupted), decode_joints(&corrupted, &names()));
+                let _ = (
+                    decode_scan(&corrupted),
+                    decode_pose(&corrupted),
+                    decode_joints(&corrupted, &names()),
+                );
             }
         }
         let mut random = Random::new(1);
@@ -636,6 +905,9 @@ mod tests {
             assert!(decode_joints(&bytes, &names()).is_err());
         }
         let deep = "[".repeat(60_000);
-        assert!(decode_scan(format!(r#"{{"kind":"range","version":1,"points_m":{deep}"#).as_bytes()).is_err());
+        assert!(
+            decode_scan(format!(r#"{{"kind":"range","version":1,"points_m":{deep}"#).as_bytes())
+                .is_err()
+        );
     }
 }

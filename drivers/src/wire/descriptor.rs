@@ -1,7 +1,7 @@
 //! Self-description of the protobuf messages in a recording, so that any MCAP viewer can read them.
 //!
-//! Source: `google/protobuf/descriptor.proto` for the encoding; the Foxglove schemas (docs.foxglove.dev/docs/sdk/schemas)
-//! for names and numbers. Fields from 1001 are our extensions.
+//! Source: `google/protobuf/descriptor.proto` for the encoding; the Foxglove schemas
+//! (docs.foxglove.dev/docs/sdk/schemas) for names and numbers. Fields from 1001 are our extensions.
 
 use super::protobuf::{Message, fields};
 
@@ -50,14 +50,21 @@ const fn field(name: &'static str, number: u32, kind: Kind) -> FieldSpec {
 
 const TIMESTAMP: Schema = Schema {
     name: "google.protobuf.Timestamp",
-    fields: &[field("seconds", 1, Kind::Int64), field("nanos", 2, Kind::Int32)],
+    fields: &[
+        field("seconds", 1, Kind::Int64),
+        field("nanos", 2, Kind::Int32),
+    ],
     dependencies: &[],
     enums: &[],
 };
 
 const VECTOR3: Schema = Schema {
     name: "foxglove.Vector3",
-    fields: &[field("x", 1, Kind::Double), field("y", 2, Kind::Double), field("z", 3, Kind::Double)],
+    fields: &[
+        field("x", 1, Kind::Double),
+        field("y", 2, Kind::Double),
+        field("z", 3, Kind::Double),
+    ],
     dependencies: &[],
     enums: &[],
 };
@@ -159,12 +166,18 @@ const PACKED_ELEMENT_FIELD: Schema = Schema {
     fields: &[
         field("name", 1, Kind::Text),
         field("offset", 2, Kind::Fixed32),
-        field("type", 3, Kind::Enum(".foxglove.PackedElementField.NumericType")),
+        field(
+            "type",
+            3,
+            Kind::Enum(".foxglove.PackedElementField.NumericType"),
+        ),
     ],
     dependencies: &[],
     enums: &[EnumSpec {
         name: "NumericType",
-        values: &["UNKNOWN", "UINT8", "INT8", "UINT16", "INT16", "UINT32", "INT32", "FLOAT32", "FLOAT64"],
+        values: &[
+            "UNKNOWN", "UINT8", "INT8", "UINT16", "INT16", "UINT32", "INT32", "FLOAT32", "FLOAT64",
+        ],
     }],
 };
 
@@ -179,15 +192,26 @@ pub const POINT_CLOUD: Schema = Schema {
         field("fields", 5, Kind::Messages(".foxglove.PackedElementField")),
         field("data", 6, Kind::Bytes),
     ],
-    dependencies: &[&TIMESTAMP, &VECTOR3, &QUATERNION, &POSE, &PACKED_ELEMENT_FIELD],
+    dependencies: &[
+        &TIMESTAMP,
+        &VECTOR3,
+        &QUATERNION,
+        &POSE,
+        &PACKED_ELEMENT_FIELD,
+    ],
     enums: &[],
 };
 
 impl Schema {
-    /// Numbers of the fields of an encoded message that the schema does not have, in the order of the message.
+    /// Numbers of the fields of an encoded message that the schema does not have, in the order of
+    /// the message.
     pub fn unknown_fields(&self, message: &[u8]) -> Vec<u32> {
         let is_unknown = |number: &u32| self.fields.iter().all(|field| field.number != *number);
-        fields(message).map_while(Result::ok).map(|field| field.number).filter(is_unknown).collect()
+        fields(message)
+            .map_while(Result::ok)
+            .map(|field| field.number)
+            .filter(is_unknown)
+            .collect()
     }
 
     /// The encoded `FileDescriptorSet`: the files that this message depends on, then its own file.
@@ -212,7 +236,8 @@ impl Schema {
             message.message(4, &enum_spec.encode());
         }
         let mut file = Message::default();
-        file.bytes(1, self.path().as_bytes()).bytes(2, package.as_bytes());
+        file.bytes(1, self.path().as_bytes())
+            .bytes(2, package.as_bytes());
         for dependency in self.dependencies {
             file.bytes(3, dependency.path().as_bytes());
         }
@@ -303,8 +328,15 @@ mod tests {
     #[test]
     fn fields_of_newer_versions_are_unknown() {
         let mut message = Message::default();
-        message.double(1006, 42.0).bytes(2, b"world").varint(1099, 7).double(6, 1.0);
-        assert_eq!(FRAME_TRANSFORM.unknown_fields(&message.into_bytes()), [1099, 6]);
+        message
+            .double(1006, 42.0)
+            .bytes(2, b"world")
+            .varint(1099, 7)
+            .double(6, 1.0);
+        assert_eq!(
+            FRAME_TRANSFORM.unknown_fields(&message.into_bytes()),
+            [1099, 6]
+        );
     }
 
     #[test]

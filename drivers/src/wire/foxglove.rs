@@ -1,7 +1,7 @@
 //! Foxglove messages for images, intrinsics and poses.
 //!
-//! Color images keep the bytes of the device, and depth images their raw counts. Stamps are exact to the nanosecond,
-//! and numbers are bit-exact. Field numbers are those of [`super::descriptor`].
+//! Color images keep the bytes of the device, and depth images their raw counts. Stamps are exact
+//! to the nanosecond, and numbers are bit-exact. Field numbers are those of [`super::descriptor`].
 
 use super::protobuf::{Field, Message, fields};
 use super::{Malformed, descriptor};
@@ -19,10 +19,34 @@ const PSNR_CEILING: u32 = 1006;
 const YUV_COLORS: u32 = 1007;
 /// Values of field `YUV_COLORS`.
 const YUV_COLORS_NAMES: [(&str, YuvColors); 4] = [
-    ("bt601-limited", YuvColors { matrix: YuvMatrix::Bt601, range: YuvRange::Limited }),
-    ("bt601-full", YuvColors { matrix: YuvMatrix::Bt601, range: YuvRange::Full }),
-    ("bt709-limited", YuvColors { matrix: YuvMatrix::Bt709, range: YuvRange::Limited }),
-    ("bt709-full", YuvColors { matrix: YuvMatrix::Bt709, range: YuvRange::Full }),
+    (
+        "bt601-limited",
+        YuvColors {
+            matrix: YuvMatrix::Bt601,
+            range: YuvRange::Limited,
+        },
+    ),
+    (
+        "bt601-full",
+        YuvColors {
+            matrix: YuvMatrix::Bt601,
+            range: YuvRange::Full,
+        },
+    ),
+    (
+        "bt709-limited",
+        YuvColors {
+            matrix: YuvMatrix::Bt709,
+            range: YuvRange::Limited,
+        },
+    ),
+    (
+        "bt709-full",
+        YuvColors {
+            matrix: YuvMatrix::Bt709,
+            range: YuvRange::Full,
+        },
+    ),
 ];
 /// Foxglove's names of layouts. The first name of a layout is written; all names are accepted.
 const YUV_LAYOUTS: [(&str, YuvLayout); 5] = [
@@ -54,9 +78,18 @@ pub fn encode_image(image: &Image) -> Vec<u8> {
     message.message(1, &timestamp(image.stamp));
     match image.format {
         PixelFormat::Jpeg | PixelFormat::Png => {
-            let format: &[u8] = if image.format == PixelFormat::Jpeg { b"jpeg" } else { b"png" };
-            message.bytes(2, &image.data).bytes(3, format).bytes(4, image.camera.as_bytes());
-            message.fixed32(WIDTH_PX, image.size_px[0]).fixed32(HEIGHT_PX, image.size_px[1]);
+            let format: &[u8] = if image.format == PixelFormat::Jpeg {
+                b"jpeg"
+            } else {
+                b"png"
+            };
+            message
+                .bytes(2, &image.data)
+                .bytes(3, format)
+                .bytes(4, image.camera.as_bytes());
+            message
+                .fixed32(WIDTH_PX, image.size_px[0])
+                .fixed32(HEIGHT_PX, image.size_px[1]);
         }
         PixelFormat::Rgb8 => raw_image(&mut message, image, "rgb8"),
         PixelFormat::Bgr8 => raw_image(&mut message, image, "bgr8"),
@@ -79,16 +112,29 @@ pub fn encode_image(image: &Image) -> Vec<u8> {
 
 /// The first name of a value in a table that contains all values.
 fn name_of<T: PartialEq>(names: &[(&'static str, T)], value: T) -> &'static str {
-    names.iter().find(|(_, lookup)| *lookup == value).expect("the table names every value").0
+    names
+        .iter()
+        .find(|(_, lookup)| *lookup == value)
+        .expect("the table names every value")
+        .0
 }
 
 fn lookup<T: Copy>(names: &[(&str, T)], name: &str) -> Option<T> {
-    names.iter().find(|(known, _)| *known == name).map(|(_, value)| *value)
+    names
+        .iter()
+        .find(|(known, _)| *known == name)
+        .map(|(_, value)| *value)
 }
 
 fn raw_image(message: &mut Message, image: &Image, encoding: &str) {
-    let row_bytes = image.format.raw_size(image.size_px).map_or(0, |[row_bytes, _]| row_bytes);
-    message.fixed32(2, image.size_px[0]).fixed32(3, image.size_px[1]).bytes(4, encoding.as_bytes());
+    let row_bytes = image
+        .format
+        .raw_size(image.size_px)
+        .map_or(0, |[row_bytes, _]| row_bytes);
+    message
+        .fixed32(2, image.size_px[0])
+        .fixed32(3, image.size_px[1])
+        .bytes(4, encoding.as_bytes());
     message
         .fixed32(5, u32::try_from(row_bytes).unwrap_or(u32::MAX))
         .bytes(6, &image.data)
@@ -132,7 +178,13 @@ pub fn decode_image(schema: &str, bytes: &[u8]) -> Result<Image, Malformed> {
     }
     image.stamp = stamp.ok_or(Malformed::Missing { name: "timestamp" })?;
     if size_px.contains(&0) {
-        return Err(Malformed::Missing { name: if compressed { "width_px or height_px" } else { "width or height" } });
+        return Err(Malformed::Missing {
+            name: if compressed {
+                "width_px or height_px"
+            } else {
+                "width or height"
+            },
+        });
     }
     image.size_px = size_px;
     image.format = match (format, compressed) {
@@ -142,11 +194,20 @@ pub fn decode_image(schema: &str, bytes: &[u8]) -> Result<Image, Malformed> {
         ("bgr8", false) => PixelFormat::Bgr8,
         ("mono8", false) => PixelFormat::Gray8,
         ("16UC1", false) => PixelFormat::DepthU16 {
-            meters_per_count: positive(meters_per_count.ok_or(Malformed::Missing { name: "meters_per_count" })?)?,
+            meters_per_count: positive(meters_per_count.ok_or(Malformed::Missing {
+                name: "meters_per_count",
+            })?)?,
         },
         (name, compressed) => match lookup(&YUV_LAYOUTS, name) {
-            Some(layout) if !compressed => PixelFormat::Yuv { layout, colors: yuv_colors(colors)? },
-            _ => return Err(Malformed::PixelFormat { name: name.to_owned() }),
+            Some(layout) if !compressed => PixelFormat::Yuv {
+                layout,
+                colors: yuv_colors(colors)?,
+            },
+            _ => {
+                return Err(Malformed::PixelFormat {
+                    name: name.to_owned(),
+                });
+            }
         },
     };
     without_padding(image, step)
@@ -157,35 +218,56 @@ fn positive(meters_per_count: f64) -> Result<f64, Malformed> {
         return Ok(meters_per_count);
     }
     let (found, expected) = (meters_per_count.to_string(), "a positive number".to_owned());
-    Err(Malformed::Unsupported { name: "meters_per_count", found, expected })
+    Err(Malformed::Unsupported {
+        name: "meters_per_count",
+        found,
+        expected,
+    })
 }
 
-/// Removes the padding of rows whose starts are `step` bytes apart. This program writes rows without padding.
+/// Removes the padding of rows whose starts are `step` bytes apart. This program writes rows
+/// without padding.
 fn without_padding(image: Image, step: Option<u32>) -> Result<Image, Malformed> {
-    let (Some(step), Some([row_bytes, _])) = (step, image.format.raw_size(image.size_px)) else { return Ok(image) };
+    let (Some(step), Some([row_bytes, _])) = (step, image.format.raw_size(image.size_px)) else {
+        return Ok(image);
+    };
     let row_bytes = u32::try_from(row_bytes).unwrap_or(u32::MAX);
     if step == row_bytes {
         return Ok(image);
     }
     let n_bytes = image.data.len();
-    image.pack_rows(step as usize).map_err(|_| Malformed::Unsupported {
-        name: "step",
-        found: format!("{step}, with {n_bytes} bytes of data"),
-        expected: format!("at least {row_bytes} bytes, and data for all rows"),
-    })
+    image
+        .pack_rows(step as usize)
+        .map_err(|_| Malformed::Unsupported {
+            name: "step",
+            found: format!("{step}, with {n_bytes} bytes of data"),
+            expected: format!("at least {row_bytes} bytes, and data for all rows"),
+        })
 }
 
 fn yuv_colors(name: Option<&str>) -> Result<YuvColors, Malformed> {
     let name = name.ok_or(Malformed::Missing { name: "yuv_colors" })?;
-    lookup(&YUV_COLORS_NAMES, name).ok_or_else(|| Malformed::PixelFormat { name: name.to_owned() })
+    lookup(&YUV_COLORS_NAMES, name).ok_or_else(|| Malformed::PixelFormat {
+        name: name.to_owned(),
+    })
 }
 
 /// Encodes depth in meters as a `RawImage` of 32-bit floats.
 pub fn encode_depth_m(camera: &str, stamp: Stamp, size_px: [u32; 2], depth_m: &[f32]) -> Vec<u8> {
     let mut message = Message::with_capacity(depth_m.len() * 4 + 256);
-    let data: Vec<u8> = depth_m.iter().flat_map(|depth_m| depth_m.to_le_bytes()).collect();
-    message.message(1, &timestamp(stamp)).fixed32(2, size_px[0]).fixed32(3, size_px[1]).bytes(4, DEPTH_M.as_bytes());
-    message.fixed32(5, size_px[0].saturating_mul(4)).bytes(6, &data).bytes(7, camera.as_bytes());
+    let data: Vec<u8> = depth_m
+        .iter()
+        .flat_map(|depth_m| depth_m.to_le_bytes())
+        .collect();
+    message
+        .message(1, &timestamp(stamp))
+        .fixed32(2, size_px[0])
+        .fixed32(3, size_px[1])
+        .bytes(4, DEPTH_M.as_bytes());
+    message
+        .fixed32(5, size_px[0].saturating_mul(4))
+        .bytes(6, &data)
+        .bytes(7, camera.as_bytes());
     message.into_bytes()
 }
 
@@ -204,7 +286,9 @@ pub fn decode_depth_m(bytes: &[u8]) -> Result<Arc<[f32]>, Malformed> {
     }
     let data = data.ok_or(Malformed::Missing { name: "data" })?;
     if encoding != DEPTH_M {
-        return Err(Malformed::PixelFormat { name: encoding.to_owned() });
+        return Err(Malformed::PixelFormat {
+            name: encoding.to_owned(),
+        });
     }
     let [width, height] = size_px;
     if data.len() as u128 != 4 * u128::from(width) * u128::from(height) {
@@ -214,7 +298,12 @@ pub fn decode_depth_m(bytes: &[u8]) -> Result<Arc<[f32]>, Malformed> {
             expected: format!("4 bytes for each of {width} x {height} pixels"),
         });
     }
-    Ok(data.as_chunks::<4>().0.iter().map(|meters| f32::from_le_bytes(*meters)).collect())
+    Ok(data
+        .as_chunks::<4>()
+        .0
+        .iter()
+        .map(|meters| f32::from_le_bytes(*meters))
+        .collect())
 }
 
 /// Encodes intrinsics as a `CameraCalibration`.
@@ -229,7 +318,10 @@ pub fn encode_calibration(camera: &str, stamp: Stamp, intrinsics: &Intrinsics) -
         Lens::RationalBrownConrady(k) => ("rational_polynomial", k),
     };
     let mut message = Message::default();
-    message.message(1, &timestamp(stamp)).fixed32(2, intrinsics.size_px[0]).fixed32(3, intrinsics.size_px[1]);
+    message
+        .message(1, &timestamp(stamp))
+        .fixed32(2, intrinsics.size_px[0])
+        .fixed32(3, intrinsics.size_px[1]);
     message.bytes(4, model.as_bytes()).doubles(5, distortion);
     message.doubles(6, &[fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]);
     message.doubles(7, &[1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]);
@@ -239,20 +331,28 @@ pub fn encode_calibration(camera: &str, stamp: Stamp, intrinsics: &Intrinsics) -
 }
 
 /// Encodes a pose as a `FrameTransform`.
-pub fn encode_transform(parent: &str, child: &str, stamp: Stamp, parent_from_child: &Transform) -> Vec<u8> {
+pub fn encode_transform(
+    parent: &str,
+    child: &str,
+    stamp: Stamp,
+    parent_from_child: &Transform,
+) -> Vec<u8> {
     let [x, y, z, i, j, k, w] = to_xyz_xyzw(parent_from_child);
     let mut translation = Message::default();
     translation.double(1, x).double(2, y).double(3, z);
     let mut rotation = Message::default();
     rotation.double(1, i).double(2, j).double(3, k).double(4, w);
     let mut message = Message::default();
-    message.message(1, &timestamp(stamp)).bytes(2, parent.as_bytes()).bytes(3, child.as_bytes());
+    message
+        .message(1, &timestamp(stamp))
+        .bytes(2, parent.as_bytes())
+        .bytes(3, child.as_bytes());
     message.message(4, &translation).message(5, &rotation);
     message.into_bytes()
 }
 
-/// Decodes stamp and pose from a `FrameTransform`: poses of this program bit for bit. Quaternions of other programs may
-/// be rounded and are normalized.
+/// Decodes stamp and pose from a `FrameTransform`: poses of this program bit for bit. Quaternions
+/// of other programs may be rounded and are normalized.
 pub fn decode_transform(bytes: &[u8]) -> Result<(Stamp, Transform), Malformed> {
     let mut stamp = None;
     let mut translation = None;
@@ -266,21 +366,27 @@ pub fn decode_transform(bytes: &[u8]) -> Result<(Stamp, Transform), Malformed> {
             _ => {}
         }
     }
-    let [x, y, z] = translation.ok_or(Malformed::Missing { name: "translation" })?;
+    let [x, y, z] = translation.ok_or(Malformed::Missing {
+        name: "translation",
+    })?;
     let [i, j, k, w] = rotation.ok_or(Malformed::Missing { name: "rotation" })?;
     let stamp = stamp.ok_or(Malformed::Missing { name: "timestamp" })?;
     let [i, j, k, w] = unit_quaternion([i, j, k, w])?;
     Ok((stamp, from_xyz_xyzw([x, y, z, i, j, k, w])))
 }
 
-/// Normalizes a quaternion, unless its length is 1 up to rounding: that would change its last bits. One that is not
-/// finite stays so, and the users of the pose reject it.
+/// Normalizes a quaternion, unless its length is 1 up to rounding: that would change its last bits.
+/// One that is not finite stays so, and the users of the pose reject it.
 fn unit_quaternion(quaternion: [f64; 4]) -> Result<[f64; 4], Malformed> {
     /// Products of many rotations, and quaternions in f32, stay below it.
     const EXACT: f64 = 1e-6;
     /// Quaternions with two decimals stay below it.
     const ROUNDED: f64 = 0.01;
-    let length = quaternion.iter().map(|number| number * number).sum::<f64>().sqrt();
+    let length = quaternion
+        .iter()
+        .map(|number| number * number)
+        .sum::<f64>()
+        .sqrt();
     let deviation = (length - 1.0).abs();
     if !length.is_finite() || deviation <= EXACT {
         return Ok(quaternion);
@@ -288,8 +394,15 @@ fn unit_quaternion(quaternion: [f64; 4]) -> Result<[f64; 4], Malformed> {
     if deviation <= ROUNDED {
         return Ok(quaternion.map(|number| number / length));
     }
-    let (found, expected) = (format!("a quaternion of length {length}"), "one of length 1".to_owned());
-    Err(Malformed::Unsupported { name: "rotation", found, expected })
+    let (found, expected) = (
+        format!("a quaternion of length {length}"),
+        "one of length 1".to_owned(),
+    );
+    Err(Malformed::Unsupported {
+        name: "rotation",
+        found,
+        expected,
+    })
 }
 
 /// Decodes the names of the parent and the child of a `FrameTransform`; empty if they are absent.
@@ -340,8 +453,12 @@ pub(super) fn numbers<const N: usize>(field: &Field<'_>) -> Result<[f64; N], Mal
     let mut numbers = [0.0; N];
     for inner in fields(field.bytes()?) {
         let inner = inner?;
-        let slot = (inner.number as usize).checked_sub(1).and_then(|ix| numbers.get_mut(ix));
-        *slot.ok_or(Malformed::Range { field: inner.number })? = inner.double()?;
+        let slot = (inner.number as usize)
+            .checked_sub(1)
+            .and_then(|ix| numbers.get_mut(ix));
+        *slot.ok_or(Malformed::Range {
+            field: inner.number,
+        })? = inner.double()?;
     }
     Ok(numbers)
 }
@@ -364,12 +481,17 @@ pub(super) fn stamp_from(field: &Field<'_>) -> Result<Stamp, Malformed> {
             _ => {}
         }
     }
-    let out_of_range = Malformed::Range { field: field.number };
+    let out_of_range = Malformed::Range {
+        field: field.number,
+    };
     if !(0..NANOS_PER_SEC).contains(&nanos) {
         return Err(out_of_range);
     }
     let whole = secs.checked_mul(NANOS_PER_SEC);
-    whole.and_then(|whole| whole.checked_add(nanos)).map(Stamp).ok_or(out_of_range)
+    whole
+        .and_then(|whole| whole.checked_add(nanos))
+        .map(Stamp)
+        .ok_or(out_of_range)
 }
 
 #[cfg(test)]
@@ -391,16 +513,39 @@ mod tests {
 
     #[test]
     fn images_round_trip_exactly_in_every_format() {
-        let depth = PixelFormat::DepthU16 { meters_per_count: 0.1 + 0.2 };
-        let plain = [PixelFormat::Rgb8, PixelFormat::Bgr8, PixelFormat::Gray8, PixelFormat::Jpeg, PixelFormat::Png];
+        let depth = PixelFormat::DepthU16 {
+            meters_per_count: 0.1 + 0.2,
+        };
+        let plain = [
+            PixelFormat::Rgb8,
+            PixelFormat::Bgr8,
+            PixelFormat::Gray8,
+            PixelFormat::Jpeg,
+            PixelFormat::Png,
+        ];
         let yuv = [YuvLayout::Yuyv, YuvLayout::Uyvy, YuvLayout::Nv12]
             .into_iter()
-            .flat_map(|layout| YUV_COLORS_NAMES.map(|(_, colors)| PixelFormat::Yuv { layout, colors }));
+            .flat_map(|layout| {
+                YUV_COLORS_NAMES.map(|(_, colors)| PixelFormat::Yuv { layout, colors })
+            });
         for format in plain.into_iter().chain(yuv).chain([depth]) {
             for exposure_secs in [Some(0.0), None] {
-                for stamp in [Stamp(0), Stamp(-1), Stamp(i64::MAX), Stamp(-1_500_000_000), Stamp(999_999_999)] {
-                    let sent = Image { exposure_secs, stamp, ..image(format) };
-                    assert_eq!(decode_image(schema_of(format).name, &encode_image(&sent)), Ok(sent));
+                for stamp in [
+                    Stamp(0),
+                    Stamp(-1),
+                    Stamp(i64::MAX),
+                    Stamp(-1_500_000_000),
+                    Stamp(999_999_999),
+                ] {
+                    let sent = Image {
+                        exposure_secs,
+                        stamp,
+                        ..image(format)
+                    };
+                    assert_eq!(
+                        decode_image(schema_of(format).name, &encode_image(&sent)),
+                        Ok(sent)
+                    );
                 }
             }
         }
@@ -412,7 +557,8 @@ mod tests {
             Translation3::new(0.1, -0.0, 1e-300),
             UnitQuaternion::from_euler_angles(0.3, -0.7, 2.9),
         );
-        let (stamp, read) = decode_transform(&encode_transform("world", "base", Stamp(5), &pose)).expect("own bytes");
+        let (stamp, read) = decode_transform(&encode_transform("world", "base", Stamp(5), &pose))
+            .expect("own bytes");
         assert_eq!(stamp, Stamp(5));
         let bits = |pose: &Transform| to_xyz_xyzw(pose).map(f64::to_bits);
         assert_eq!(bits(&read), bits(&pose));
@@ -424,25 +570,44 @@ mod tests {
             let mut pose = Message::default();
             let mut rotation = Message::default();
             rotation.double(1, 0.6).double(4, w);
-            pose.message(1, &timestamp(Stamp(3))).message(4, &Message::default()).message(5, &rotation);
+            pose.message(1, &timestamp(Stamp(3)))
+                .message(4, &Message::default())
+                .message(5, &rotation);
             decode_transform(&pose.into_bytes()).map(|(_, pose)| to_xyz_xyzw(&pose))
         };
         let exact = 0.8 + 1e-9;
-        assert_eq!(sent(exact), Ok([0.0, 0.0, 0.0, 0.6, 0.0, 0.0, exact]), "bit for bit");
+        assert_eq!(
+            sent(exact),
+            Ok([0.0, 0.0, 0.0, 0.6, 0.0, 0.0, exact]),
+            "bit for bit"
+        );
         let [.., x, _, _, w] = sent(0.805).expect("rounded");
-        assert!((x.hypot(w) - 1.0).abs() < 1e-12 && (w / x - 0.805 / 0.6).abs() < 1e-12, "{x} {w}");
+        assert!(
+            (x.hypot(w) - 1.0).abs() < 1e-12 && (w / x - 0.805 / 0.6).abs() < 1e-12,
+            "{x} {w}"
+        );
         for w in [0.0, 0.9, 1e9] {
             let error = sent(w).expect_err("not a rotation").to_string();
-            assert!(error.starts_with("rotation is a quaternion of length "), "{error}");
+            assert!(
+                error.starts_with("rotation is a quaternion of length "),
+                "{error}"
+            );
         }
     }
 
     #[test]
     fn padding_of_rows_is_removed() {
-        let packed = Image { data: (0..18).collect(), ..image(PixelFormat::Rgb8) };
+        let packed = Image {
+            data: (0..18).collect(),
+            ..image(PixelFormat::Rgb8)
+        };
         let with_step = |step: u32, data: &[u8]| {
             let mut message = Message::default();
-            message.message(1, &timestamp(packed.stamp)).fixed32(2, 3).fixed32(3, 2).bytes(4, b"rgb8");
+            message
+                .message(1, &timestamp(packed.stamp))
+                .fixed32(2, 3)
+                .fixed32(3, 2)
+                .bytes(4, b"rgb8");
             message
                 .fixed32(5, step)
                 .bytes(6, data)
@@ -455,29 +620,55 @@ mod tests {
         assert_eq!(with_step(12, &rows).as_ref(), Ok(&packed));
         assert_eq!(with_step(9, &packed.data).as_ref(), Ok(&packed));
         for (step, data) in [(8, &rows[..]), (12, &rows[..20]), (u32::MAX, &rows[..])] {
-            let error = with_step(step, data).expect_err("rows that do not fit").to_string();
-            assert!(error.starts_with(&format!("step is {step}, with ")), "{error}");
+            let error = with_step(step, data)
+                .expect_err("rows that do not fit")
+                .to_string();
+            assert!(
+                error.starts_with(&format!("step is {step}, with ")),
+                "{error}"
+            );
         }
     }
 
     #[test]
     fn depth_round_trips_exactly() {
         let depth_m = [0.0, 1.25, f32::NAN, f32::MIN_POSITIVE];
-        let read = decode_depth_m(&encode_depth_m("wrist", Stamp(1), [2, 2], &depth_m)).expect("own bytes");
-        assert!(read.iter().zip(depth_m).all(|(read, sent)| read.to_bits() == sent.to_bits()) && read.len() == 4);
-        let of_size = |size_px| decode_depth_m(&encode_depth_m("wrist", Stamp(1), size_px, &depth_m));
+        let read = decode_depth_m(&encode_depth_m("wrist", Stamp(1), [2, 2], &depth_m))
+            .expect("own bytes");
+        assert!(
+            read.iter()
+                .zip(depth_m)
+                .all(|(read, sent)| read.to_bits() == sent.to_bits())
+                && read.len() == 4
+        );
+        let of_size =
+            |size_px| decode_depth_m(&encode_depth_m("wrist", Stamp(1), size_px, &depth_m));
         for size_px in [[2, 1], [u32::MAX; 2]] {
-            assert!(of_size(size_px).expect_err("another size").to_string().starts_with("data is 16 bytes"));
+            assert!(
+                of_size(size_px)
+                    .expect_err("another size")
+                    .to_string()
+                    .starts_with("data is 16 bytes")
+            );
         }
     }
 
     #[test]
     fn missing_and_unknown_fields_are_named() {
-        assert_eq!(decode_image("foxglove.RawImage", &[]), Err(Malformed::Missing { name: "timestamp" }));
-        let jpeg_as_raw = decode_image("foxglove.RawImage", &encode_image(&image(PixelFormat::Jpeg)));
+        assert_eq!(
+            decode_image("foxglove.RawImage", &[]),
+            Err(Malformed::Missing { name: "timestamp" })
+        );
+        let jpeg_as_raw = decode_image(
+            "foxglove.RawImage",
+            &encode_image(&image(PixelFormat::Jpeg)),
+        );
         assert!(jpeg_as_raw.is_err(), "{jpeg_as_raw:?}");
         let truncated = &encode_image(&image(PixelFormat::Rgb8))[..30];
-        assert_eq!(decode_image("foxglove.RawImage", truncated), Err(Malformed::Truncated));
+        assert_eq!(
+            decode_image("foxglove.RawImage", truncated),
+            Err(Malformed::Truncated)
+        );
         assert!(decode_transform(&[]).is_err());
     }
 }

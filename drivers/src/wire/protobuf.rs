@@ -1,6 +1,7 @@
 //! The protobuf wire format.
 //!
-//! Source: Protocol Buffers documentation, "Encoding". Groups do not exist in proto3 and are errors.
+//! Source: Protocol Buffers documentation, "Encoding". Groups do not exist in proto3 and are
+//! errors.
 
 use super::Malformed;
 
@@ -19,7 +20,8 @@ impl Message {
         Self(Vec::with_capacity(bytes))
     }
 
-    /// Appends an integer; negative numbers of `int32` and `int64` as their 64-bit two's complement.
+    /// Appends an integer; negative numbers of `int32` and `int64` as their 64-bit two's
+    /// complement.
     pub fn varint(&mut self, field: u32, value: u64) -> &mut Self {
         self.key(field, VARINT);
         self.raw_varint(value);
@@ -44,7 +46,8 @@ impl Message {
     pub fn doubles(&mut self, field: u32, values: &[f64]) -> &mut Self {
         self.key(field, LENGTH);
         self.raw_varint(values.len() as u64 * 8);
-        self.0.extend(values.iter().flat_map(|value| value.to_le_bytes()));
+        self.0
+            .extend(values.iter().flat_map(|value| value.to_le_bytes()));
         self
     }
 
@@ -146,7 +149,10 @@ impl<'a> Field<'a> {
             Value::Fixed32(_) => FIXED32,
             Value::Length(_) => LENGTH,
         };
-        Malformed::WireType { field: self.number, wire_type }
+        Malformed::WireType {
+            field: self.number,
+            wire_type,
+        }
     }
 }
 
@@ -184,10 +190,16 @@ impl<'a> Fields<'a> {
             FIXED64 => Value::Fixed64(u64::from_le_bytes(self.array()?)),
             FIXED32 => Value::Fixed32(u32::from_le_bytes(self.array()?)),
             LENGTH => {
-                let n_bytes = usize::try_from(self.varint()?).map_err(|_| Malformed::Range { field: number })?;
+                let n_bytes = usize::try_from(self.varint()?)
+                    .map_err(|_| Malformed::Range { field: number })?;
                 Value::Length(self.take(n_bytes)?)
             }
-            _ => return Err(Malformed::WireType { field: number, wire_type }),
+            _ => {
+                return Err(Malformed::WireType {
+                    field: number,
+                    wire_type,
+                });
+            }
         };
         Ok(Field { number, value })
     }
@@ -205,7 +217,10 @@ impl<'a> Fields<'a> {
     }
 
     fn take(&mut self, n_bytes: usize) -> Result<&'a [u8], Malformed> {
-        let (chunk, rest) = self.0.split_at_checked(n_bytes).ok_or(Malformed::Truncated)?;
+        let (chunk, rest) = self
+            .0
+            .split_at_checked(n_bytes)
+            .ok_or(Malformed::Truncated)?;
         self.0 = rest;
         Ok(chunk)
     }
@@ -223,7 +238,8 @@ mod tests {
 
     #[test]
     fn documented_examples_match_published_bytes() {
-        // Protocol Buffers documentation: field 1 = 150; field 2 = "testing"; field 3 contains the first message.
+        // Protocol Buffers documentation: field 1 = 150; field 2 = "testing"; field 3 contains the
+        // first message.
         let mut inner = Message::default();
         inner.varint(1, 150);
         let mut outer = Message::default();
@@ -235,28 +251,54 @@ mod tests {
     #[test]
     fn fields_round_trip() {
         let mut message = Message::default();
-        message.varint(1, u64::MAX).fixed32(2, 7).double(16, -0.0).doubles(1005, &[1.5, f64::MIN_POSITIVE]);
+        message
+            .varint(1, u64::MAX)
+            .fixed32(2, 7)
+            .double(16, -0.0)
+            .doubles(1005, &[1.5, f64::MIN_POSITIVE]);
         let bytes = message.into_bytes();
-        let read: Vec<_> = fields(&bytes).map(|field| field.expect("own bytes")).collect();
-        assert_eq!(read.iter().map(|field| field.number).collect::<Vec<_>>(), [1, 2, 16, 1005]);
+        let read: Vec<_> = fields(&bytes)
+            .map(|field| field.expect("own bytes"))
+            .collect();
+        assert_eq!(
+            read.iter().map(|field| field.number).collect::<Vec<_>>(),
+            [1, 2, 16, 1005]
+        );
         assert_eq!(read[0].varint(), Ok(u64::MAX));
         assert_eq!(read[1].fixed32(), Ok(7));
         assert_eq!(read[2].double().map(f64::to_bits), Ok((-0.0_f64).to_bits()));
         assert_eq!(read[3].bytes().map(<[u8]>::len), Ok(16));
-        assert_eq!(read[1].varint(), Err(Malformed::WireType { field: 2, wire_type: FIXED32 }));
+        assert_eq!(
+            read[1].varint(),
+            Err(Malformed::WireType {
+                field: 2,
+                wire_type: FIXED32
+            })
+        );
     }
 
     #[test]
     fn truncation_is_detected() {
         let mut message = Message::default();
-        message.bytes(2, b"testing").double(3, 1.0).varint(4, 1 << 40);
+        message
+            .bytes(2, b"testing")
+            .double(3, 1.0)
+            .varint(4, 1 << 40);
         let bytes = message.into_bytes();
         let field_ends = [9, 18, bytes.len()]; // Ends of the three fields: a cut there leaves a valid shorter message.
         for n_bytes in 1..bytes.len() {
             let is_truncated = fields(&bytes[..n_bytes]).any(|field| field.is_err());
-            assert_eq!(is_truncated, !field_ends.contains(&n_bytes), "cut after {n_bytes} bytes");
+            assert_eq!(
+                is_truncated,
+                !field_ends.contains(&n_bytes),
+                "cut after {n_bytes} bytes"
+            );
         }
         assert!(fields(&[0xff; 11]).all(|field| field.is_err()));
-        assert!(fields(&[0x0b]).all(|field| field == Err(Malformed::WireType { field: 1, wire_type: 3 })));
+        assert!(fields(&[0x0b]).all(|field| field
+            == Err(Malformed::WireType {
+                field: 1,
+                wire_type: 3
+            })));
     }
 }

@@ -8,13 +8,14 @@ use std::collections::{BTreeMap, BTreeSet};
 /// Maximum size of a robot description.
 pub const MAX_BYTES: usize = 16 << 20;
 const MAX_NODES: u32 = 1 << 20;
-/// The parser's time grows with the square of an element's attributes, and with the cube of nested namespaces.
+/// The parser's time grows with the square of an element's attributes, and with the cube of nested
+/// namespaces.
 const MAX_ATTRIBUTES: usize = 2000;
 const MAX_NAMESPACES: usize = 100;
 const MAX_NOTES: usize = 100;
 
-/// Repairs what the parsers of other programs accept: white space before the XML declaration, and prefixes without a
-/// namespace. Lines stay as they are.
+/// Repairs what the parsers of other programs accept: white space before the XML declaration, and
+/// prefixes without a namespace. Lines stay as they are.
 pub(super) fn repaired(xml: &str) -> Cow<'_, str> {
     let mut text = Cow::Borrowed(xml);
     let begin = xml.len() - xml.trim_start().len();
@@ -26,7 +27,9 @@ pub(super) fn repaired(xml: &str) -> Cow<'_, str> {
     }
     let unbound: String = prefixes(xml)
         .into_iter()
-        .filter(|prefix| !["xml", "xmlns", "xacro"].contains(prefix) && !xml.contains(&format!("xmlns:{prefix}")))
+        .filter(|prefix| {
+            !["xml", "xmlns", "xacro"].contains(prefix) && !xml.contains(&format!("xmlns:{prefix}"))
+        })
         .map(|prefix| format!(" xmlns:{prefix}=\"{prefix}\""))
         .collect();
     if !unbound.is_empty()
@@ -41,16 +44,25 @@ pub(super) fn repaired(xml: &str) -> Cow<'_, str> {
 fn prefixes(xml: &str) -> BTreeSet<&str> {
     let is_plain = |prefix: &&str| {
         prefix.starts_with(|first: char| first.is_ascii_alphabetic() || first == '_')
-            && prefix.chars().all(|c| c.is_ascii_alphanumeric() || c == '_' || c == '-')
+            && prefix
+                .chars()
+                .all(|c| c.is_ascii_alphanumeric() || c == '_' || c == '-')
     };
     let mut found = BTreeSet::new();
     for tag in xml.split('<').skip(1) {
         let tag = tag.split('>').next().unwrap_or_default();
-        let names = tag.split_whitespace().enumerate().filter_map(|(ix, word)| match ix {
-            0 => Some(word.trim_start_matches('/')),
-            _ => word.split_once('=').map(|(name, _)| name),
-        });
-        found.extend(names.filter_map(|name| Some(name.split_once(':')?.0)).filter(is_plain));
+        let names = tag
+            .split_whitespace()
+            .enumerate()
+            .filter_map(|(ix, word)| match ix {
+                0 => Some(word.trim_start_matches('/')),
+                _ => word.split_once('=').map(|(name, _)| name),
+            });
+        found.extend(
+            names
+                .filter_map(|name| Some(name.split_once(':')?.0))
+                .filter(is_plain),
+        );
         if found.len() > MAX_NAMESPACES {
             break;
         }
@@ -62,17 +74,28 @@ fn prefixes(xml: &str) -> BTreeSet<&str> {
 pub(super) fn parse(xml: &str) -> Result<Document<'_>, Error> {
     let syntax = |why: String| Error::UrdfSyntax { why };
     let limited = |what: &str, n: usize, max: usize| match n > max {
-        true => Err(syntax(format!("its {n} {what} exceed the maximum of {max}"))),
+        true => Err(syntax(format!(
+            "its {n} {what} exceed the maximum of {max}"
+        ))),
         false => Ok(()),
     };
     limited("bytes", xml.len(), MAX_BYTES)?;
     limited("namespaces", xml.matches("xmlns").count(), MAX_NAMESPACES)?;
     let n_attributes = |element: &str| element.bytes().filter(|byte| *byte == b'=').count();
-    limited("attributes in one element", xml.split('<').map(n_attributes).max().unwrap_or(0), MAX_ATTRIBUTES)?;
-    let options = ParsingOptions { nodes_limit: MAX_NODES, ..ParsingOptions::default() };
+    limited(
+        "attributes in one element",
+        xml.split('<').map(n_attributes).max().unwrap_or(0),
+        MAX_ATTRIBUTES,
+    )?;
+    let options = ParsingOptions {
+        nodes_limit: MAX_NODES,
+        ..ParsingOptions::default()
+    };
     let document = Document::parse_with_options(xml, options).map_err(|error| {
         let hint = match &error {
-            roxmltree::Error::UnknownNamespace(prefix, _) if prefix == "xacro" => "; expand the file with xacro first",
+            roxmltree::Error::UnknownNamespace(prefix, _) if prefix == "xacro" => {
+                "; expand the file with xacro first"
+            }
             roxmltree::Error::DtdDetected => "; remove the <!DOCTYPE>",
             _ => "",
         };
@@ -80,7 +103,9 @@ pub(super) fn parse(xml: &str) -> Result<Document<'_>, Error> {
     })?;
     match document.root_element().tag_name().name() {
         "robot" => Ok(document),
-        other => Err(syntax(format!("it describes a <{other}>, expected a <robot>"))),
+        other => Err(syntax(format!(
+            "it describes a <{other}>, expected a <robot>"
+        ))),
     }
 }
 
@@ -96,7 +121,8 @@ pub(crate) struct Problem {
 pub(crate) struct Notes {
     texts: Vec<String>,
     n_omitted: usize,
-    /// First line and number of the unknown elements and attributes with one name in elements with one name.
+    /// First line and number of the unknown elements and attributes with one name in elements with
+    /// one name.
     unknown: BTreeMap<(String, String), (u32, usize)>,
 }
 
@@ -109,17 +135,30 @@ impl Notes {
     }
 
     pub(crate) fn into_texts(self) -> Vec<String> {
-        let Self { mut texts, n_omitted, unknown } = self;
+        let Self {
+            mut texts,
+            n_omitted,
+            unknown,
+        } = self;
         if n_omitted > 0 {
             texts.push(format!("{n_omitted} more notes are not shown"));
         }
         let n_kinds = unknown.len();
         for ((parent, what), (line, n)) in unknown.into_iter().take(MAX_NOTES) {
-            let others = if n > 1 { format!(" (and {} more)", n - 1) } else { String::new() };
-            texts.push(format!("line {line}{others}: {what} in <{parent}> is not used"));
+            let others = if n > 1 {
+                format!(" (and {} more)", n - 1)
+            } else {
+                String::new()
+            };
+            texts.push(format!(
+                "line {line}{others}: {what} in <{parent}> is not used"
+            ));
         }
         if n_kinds > MAX_NOTES {
-            texts.push(format!("{} more unknown names are not used", n_kinds - MAX_NOTES));
+            texts.push(format!(
+                "{} more unknown names are not used",
+                n_kinds - MAX_NOTES
+            ));
         }
         texts
     }
@@ -144,7 +183,10 @@ impl<'a> Element<'a> {
     }
 
     pub(crate) fn problem(self, why: impl Into<String>) -> Problem {
-        Problem { line: self.line(), why: why.into() }
+        Problem {
+            line: self.line(),
+            why: why.into(),
+        }
     }
 
     /// The children with this tag.
@@ -155,19 +197,28 @@ impl<'a> Element<'a> {
     pub(crate) fn children(self) -> impl Iterator<Item = Element<'a>> {
         let namespace = self.0.document().root_element().tag_name().namespace();
         // An element of another namespace, such as that of xacro, means something else.
-        self.0.children().filter(move |node| node.is_element() && node.tag_name().namespace() == namespace).map(Self)
+        self.0
+            .children()
+            .filter(move |node| node.is_element() && node.tag_name().namespace() == namespace)
+            .map(Self)
     }
 
     /// The only child with this tag. Repetitions are accepted if they have the same attributes.
     pub(crate) fn only(self, tag: &'static str) -> Result<Option<Self>, Problem> {
         let mut all = self.all(tag);
-        let Some(first) = all.next() else { return Ok(None) };
-        let attributes = |element: Element<'a>| element.0.attributes().map(|a| (a.name(), a.value()));
+        let Some(first) = all.next() else {
+            return Ok(None);
+        };
+        let attributes =
+            |element: Element<'a>| element.0.attributes().map(|a| (a.name(), a.value()));
         match all.find(|other| !attributes(first).eq(attributes(*other))) {
             None => Ok(Some(first)),
             Some(other) => {
-                let why =
-                    format!("it has two different elements <{tag}>, in lines {} and {}", first.line(), other.line());
+                let why = format!(
+                    "it has two different elements <{tag}>, in lines {} and {}",
+                    first.line(),
+                    other.line()
+                );
                 Err(self.problem(why))
             }
         }
@@ -178,24 +229,39 @@ impl<'a> Element<'a> {
     }
 
     pub(crate) fn required(self, name: &str) -> Result<&'a str, Problem> {
-        self.attribute(name).ok_or_else(|| self.problem(format!("<{}> has no attribute {name:?}", self.tag())))
+        self.attribute(name)
+            .ok_or_else(|| self.problem(format!("<{}> has no attribute {name:?}", self.tag())))
     }
 
     /// The numbers in an attribute.
     pub(crate) fn numbers<const N: usize>(self, name: &str) -> Result<Option<[f64; N]>, Problem> {
-        let Some(text) = self.attribute(name) else { return Ok(None) };
-        let numbers: Option<Vec<f64>> = text.split_whitespace().map(|word| word.parse().ok()).collect();
+        let Some(text) = self.attribute(name) else {
+            return Ok(None);
+        };
+        let numbers: Option<Vec<f64>> = text
+            .split_whitespace()
+            .map(|word| word.parse().ok())
+            .collect();
         let numbers = numbers.and_then(|numbers| <[f64; N]>::try_from(numbers).ok());
-        if let Some(numbers) = numbers.filter(|numbers| numbers.iter().all(|number| number.is_finite())) {
+        if let Some(numbers) =
+            numbers.filter(|numbers| numbers.iter().all(|number| number.is_finite()))
+        {
             return Ok(Some(numbers));
         }
         let expected = match N {
             1 => "a number".to_owned(),
             _ => format!("{N} numbers with spaces between them"),
         };
-        let xacro = if text.contains("${") { " (expand the file with xacro first)" } else { "" };
+        let xacro = if text.contains("${") {
+            " (expand the file with xacro first)"
+        } else {
+            ""
+        };
         let shown: String = text.chars().take(60).collect();
-        Err(self.problem(format!("{name} of <{}> is {shown:?}, expected {expected}{xacro}", self.tag())))
+        Err(self.problem(format!(
+            "{name} of <{}> is {shown:?}, expected {expected}{xacro}",
+            self.tag()
+        )))
     }
 
     pub(crate) fn number(self, name: &str) -> Result<Option<f64>, Problem> {
@@ -207,11 +273,16 @@ impl<'a> Element<'a> {
         let mut add = |what: String, at: usize| {
             let line = || self.0.document().text_pos_at(at).row;
             let known = notes.unknown.entry((self.tag().to_owned(), what));
-            known.and_modify(|(_, n)| *n += 1).or_insert_with(|| (line(), 1));
+            known
+                .and_modify(|(_, n)| *n += 1)
+                .or_insert_with(|| (line(), 1));
         };
         for attribute in self.0.attributes() {
             if attribute.namespace().is_none() && !attributes.contains(&attribute.name()) {
-                add(format!("the attribute {:?}", attribute.name()), attribute.range().start);
+                add(
+                    format!("the attribute {:?}", attribute.name()),
+                    attribute.range().start,
+                );
             }
         }
         for child in self.0.children().filter(Node::is_element) {
@@ -220,8 +291,14 @@ impl<'a> Element<'a> {
                 if !children.contains(&tag.name()) {
                     add(format!("<{}>", tag.name()), child.range().start);
                 }
-            } else if tag.namespace().is_some_and(|namespace| namespace.contains("xacro")) {
-                add(format!("<xacro:{}>, which xacro has not expanded,", tag.name()), child.range().start);
+            } else if tag
+                .namespace()
+                .is_some_and(|namespace| namespace.contains("xacro"))
+            {
+                add(
+                    format!("<xacro:{}>, which xacro has not expanded,", tag.name()),
+                    child.range().start,
+                );
             }
         }
     }

@@ -7,25 +7,47 @@ use nalgebra::{Quaternion, Translation3, Unit, UnitQuaternion, Vector3};
 
 const ATTRIBUTES: [&str; 2] = ["name", "type"];
 /// The last three do not affect kinematics.
-const CHILDREN: [&str; 9] =
-    ["parent", "child", "origin", "axis", "limit", "mimic", "dynamics", "calibration", "hardwareInterface"];
+const CHILDREN: [&str; 9] = [
+    "parent",
+    "child",
+    "origin",
+    "axis",
+    "limit",
+    "mimic",
+    "dynamics",
+    "calibration",
+    "hardwareInterface",
+];
 /// The last three are not used.
-const LIMIT_ATTRIBUTES: [&str; 7] = ["lower", "upper", "velocity", "effort", "acceleration", "deceleration", "jerk"];
+const LIMIT_ATTRIBUTES: [&str; 7] = [
+    "lower",
+    "upper",
+    "velocity",
+    "effort",
+    "acceleration",
+    "deceleration",
+    "jerk",
+];
 /// Shortest quaternion that is normalized instead of refused.
 const MIN_QUATERNION_NORM: f64 = 1e-6;
 
-/// Reads a joint. An invalid pose, axis, type or mimic rule is stored in [`Joint::problem`], because only chains through this
-/// joint need it.
+/// Reads a joint. An invalid pose, axis, type or mimic rule is stored in [`Joint::problem`],
+/// because only chains through this joint need it.
 ///
 /// # Errors
 /// If its name or its links are missing.
 pub(super) fn read(element: Element<'_>, notes: &mut Notes) -> Result<Joint, Error> {
-    let invalid = |what: String| move |Problem { line, why }| Error::UrdfElement { line, what, why };
-    let name = element.required("name").map_err(invalid("a joint".to_owned()))?;
+    let invalid =
+        |what: String| move |Problem { line, why }| Error::UrdfElement { line, what, why };
+    let name = element
+        .required("name")
+        .map_err(invalid("a joint".to_owned()))?;
     let what = format!("joint {name:?}");
     let link = |tag| -> Result<String, Error> {
         let read = || {
-            let link = element.only(tag)?.ok_or_else(|| element.problem(format!("it has no <{tag}>")))?;
+            let link = element
+                .only(tag)?
+                .ok_or_else(|| element.problem(format!("it has no <{tag}>")))?;
             link.required("link")
         };
         Ok(read().map_err(invalid(what.clone()))?.to_owned())
@@ -39,8 +61,24 @@ pub(super) fn read(element: Element<'_>, notes: &mut Notes) -> Result<Joint, Err
             (Motion::INVALID, Some(invalid(what)(problem)))
         }
     };
-    let Motion { kind, parent_from_joint, axis, limits, mimic } = motion;
-    Ok(Joint { name: name.to_owned(), kind, parent, child, parent_from_joint, axis, limits, mimic, problem })
+    let Motion {
+        kind,
+        parent_from_joint,
+        axis,
+        limits,
+        mimic,
+    } = motion;
+    Ok(Joint {
+        name: name.to_owned(),
+        kind,
+        parent,
+        child,
+        parent_from_joint,
+        axis,
+        limits,
+        mimic,
+        problem,
+    })
 }
 
 fn note_unknown(element: Element<'_>, notes: &mut Notes) {
@@ -70,9 +108,9 @@ impl Motion {
     const INVALID: Self = Self {
         kind: JointKind::Unsupported("invalid"),
         parent_from_joint: Transform {
-            rotation: UnitQuaternion::new_unchecked(Quaternion::from_vector(nalgebra::Vector4::new(
-                0.0, 0.0, 0.0, 1.0,
-            ))),
+            rotation: UnitQuaternion::new_unchecked(Quaternion::from_vector(
+                nalgebra::Vector4::new(0.0, 0.0, 0.0, 1.0),
+            )),
             translation: Translation3::new(0.0, 0.0, 0.0),
         },
         axis: Unit::new_unchecked(Vector3::new(1.0, 0.0, 0.0)),
@@ -96,17 +134,30 @@ impl Motion {
         let parent_from_joint = origin(element)?;
         let is_movable = matches!(kind, JointKind::Revolute | JointKind::Prismatic);
         if !is_movable {
-            return Ok(Self { kind, parent_from_joint, ..Self::INVALID });
+            return Ok(Self {
+                kind,
+                parent_from_joint,
+                ..Self::INVALID
+            });
         }
         let limits = match element.only("limit") {
             Ok(None) => JointLimits::NONE,
             Ok(Some(limit)) => read_limits(limit, type_name == "continuous", what, notes),
             Err(Problem { line, why }) => {
                 notes.add(line, &format!("{what}: {why}"));
-                JointLimits { is_range_valid: false, ..JointLimits::NONE }
+                JointLimits {
+                    is_range_valid: false,
+                    ..JointLimits::NONE
+                }
             }
         };
-        Ok(Self { kind, parent_from_joint, axis: axis(element)?, limits, mimic: mimic(element)? })
+        Ok(Self {
+            kind,
+            parent_from_joint,
+            axis: axis(element)?,
+            limits,
+            mimic: mimic(element)?,
+        })
     }
 }
 
@@ -114,36 +165,64 @@ pub(crate) const ORIGIN_ATTRIBUTES: [&str; 3] = ["xyz", "rpy", "quat_xyzw"];
 
 /// The pose in an element's `<origin>`; the identity without one.
 pub(crate) fn origin(element: Element<'_>) -> Result<Transform, Problem> {
-    let Some(origin) = element.only("origin")? else { return Ok(Transform::identity()) };
+    let Some(origin) = element.only("origin")? else {
+        return Ok(Transform::identity());
+    };
     let xyz = origin.numbers("xyz")?.unwrap_or([0.0; 3]);
     let rotation = match (origin.numbers("rpy")?, origin.numbers("quat_xyzw")?) {
-        (Some(_), Some(_)) => return Err(origin.problem("<origin> has both rpy and quat_xyzw; remove one")),
-        // Roll, pitch and yaw rotate about the parent's fixed axes x, y, z in both URDF and nalgebra.
+        (Some(_), Some(_)) => {
+            return Err(origin.problem("<origin> has both rpy and quat_xyzw; remove one"));
+        }
+        // Roll, pitch and yaw rotate about the parent's fixed axes x, y, z in both URDF and
+        // nalgebra.
         (rpy, None) => {
             let [roll, pitch, yaw] = rpy.unwrap_or([0.0; 3]);
             UnitQuaternion::from_euler_angles(roll, pitch, yaw)
         }
-        (None, Some([x, y, z, w])) => UnitQuaternion::try_new(Quaternion::new(w, x, y, z), MIN_QUATERNION_NORM)
-            .ok_or_else(|| origin.problem("quat_xyzw of <origin> is zero"))?,
+        (None, Some([x, y, z, w])) => {
+            UnitQuaternion::try_new(Quaternion::new(w, x, y, z), MIN_QUATERNION_NORM)
+                .ok_or_else(|| origin.problem("quat_xyzw of <origin> is zero"))?
+        }
     };
-    Ok(Transform::from_parts(Translation3::from(Vector3::from(xyz)), rotation))
+    Ok(Transform::from_parts(
+        Translation3::from(Vector3::from(xyz)),
+        rotation,
+    ))
 }
 
 fn axis(joint: Element<'_>) -> Result<Unit<Vector3<f64>>, Problem> {
-    let Some(axis) = joint.only("axis")? else { return Ok(Vector3::x_axis()) };
-    let Some(xyz) = axis.numbers("xyz")? else { return Ok(Vector3::x_axis()) };
+    let Some(axis) = joint.only("axis")? else {
+        return Ok(Vector3::x_axis());
+    };
+    let Some(xyz) = axis.numbers("xyz")? else {
+        return Ok(Vector3::x_axis());
+    };
     Unit::try_new(Vector3::from(xyz), f64::MIN_POSITIVE)
         .ok_or_else(|| axis.problem("xyz of <axis> is zero, expected a direction"))
 }
 
 fn mimic(joint: Element<'_>) -> Result<Option<Mimic>, Problem> {
-    let Some(mimic) = joint.only("mimic")? else { return Ok(None) };
-    let (source, multiplier) = (mimic.required("joint")?.to_owned(), mimic.number("multiplier")?.unwrap_or(1.0));
-    Ok(Some(Mimic { source, multiplier, offset: mimic.number("offset")?.unwrap_or(0.0) }))
+    let Some(mimic) = joint.only("mimic")? else {
+        return Ok(None);
+    };
+    let (source, multiplier) = (
+        mimic.required("joint")?.to_owned(),
+        mimic.number("multiplier")?.unwrap_or(1.0),
+    );
+    Ok(Some(Mimic {
+        source,
+        multiplier,
+        offset: mimic.number("offset")?.unwrap_or(0.0),
+    }))
 }
 
 /// Reads limits. Forward kinematics do not depend on them, so invalid ones are noted.
-fn read_limits(limit: Element<'_>, is_continuous: bool, what: &str, notes: &mut Notes) -> JointLimits {
+fn read_limits(
+    limit: Element<'_>,
+    is_continuous: bool,
+    what: &str,
+    notes: &mut Notes,
+) -> JointLimits {
     let mut number = |name: &str| match limit.number(name) {
         Ok(number) => number,
         Err(Problem { line, why }) => {
@@ -153,18 +232,32 @@ fn read_limits(limit: Element<'_>, is_continuous: bool, what: &str, notes: &mut 
     };
     let [lower, upper] = ["lower", "upper"].map(&mut number);
     // Zero means unknown: exporters of CAD programs write it.
-    let [velocity, effort] =
-        ["velocity", "effort"].map(|name| number(name).filter(|max| *max > 0.0).unwrap_or(f64::INFINITY));
-    let unlimited = JointLimits { velocity, effort, ..JointLimits::NONE };
+    let [velocity, effort] = ["velocity", "effort"].map(|name| {
+        number(name)
+            .filter(|max| *max > 0.0)
+            .unwrap_or(f64::INFINITY)
+    });
+    let unlimited = JointLimits {
+        velocity,
+        effort,
+        ..JointLimits::NONE
+    };
     if is_continuous || (lower.unwrap_or(0.0), upper.unwrap_or(0.0)) == (0.0, 0.0) {
         return unlimited;
     }
     let (lower, upper) = (lower.unwrap_or(0.0), upper.unwrap_or(0.0));
     if lower <= upper {
-        return JointLimits { lower, upper, ..unlimited };
+        return JointLimits {
+            lower,
+            upper,
+            ..unlimited
+        };
     }
     if !(lower.is_nan() || upper.is_nan()) {
         notes.add(limit.line(), &format!("{what}: lower of <limit> is {lower}, above upper, which is {upper}; the joint has no range and is not moved"));
     }
-    JointLimits { is_range_valid: false, ..unlimited }
+    JointLimits {
+        is_range_valid: false,
+        ..unlimited
+    }
 }

@@ -1,6 +1,7 @@
 //! Parses URDF text into a checked tree of links and joints.
 //!
-//! Source of the format: <https://wiki.ros.org/urdf/XML>, with `quat_xyzw` and `<capsule>` of later versions.
+//! Source of the format: <https://wiki.ros.org/urdf/XML>, with `quat_xyzw` and `<capsule>` of later
+//! versions.
 
 pub(crate) mod element;
 pub(crate) mod joint;
@@ -14,8 +15,8 @@ use std::collections::{HashMap, HashSet};
 pub use element::MAX_BYTES;
 pub use model::{Joint, JointKind, JointLimits, Mimic};
 
-/// Links and joints of one robot. The links of every joint exist, no link has two parents, there is no cycle, and all
-/// numbers of valid joints except limits are finite.
+/// Links and joints of one robot. The links of every joint exist, no link has two parents, there is
+/// no cycle, and all numbers of valid joints except limits are finite.
 #[derive(Clone, Debug)]
 pub struct Robot {
     name: String,
@@ -30,12 +31,13 @@ pub struct Robot {
 }
 
 impl Robot {
-    /// Parses and checks URDF text. Elements that kinematics do not depend on are left out if they are invalid; see
-    /// [`Robot::notes`].
+    /// Parses and checks URDF text. Elements that kinematics do not depend on are left out if they
+    /// are invalid; see [`Robot::notes`].
     ///
     /// # Errors
-    /// If it is not the XML of a robot, is larger than [`MAX_BYTES`], a link or joint has no name, a joint lacks a link, two
-    /// joints have one name, a link has two parents, or joints form a cycle.
+    /// If it is not the XML of a robot, is larger than [`MAX_BYTES`], a link or joint has no name,
+    /// a joint lacks a link, two joints have one name, a link has two parents, or joints form a
+    /// cycle.
     pub fn parse(xml: &str) -> Result<Self, Error> {
         let xml = element::repaired(xml);
         let document = element::parse(&xml)?;
@@ -43,23 +45,41 @@ impl Robot {
         let mut notes = Notes::default();
         root.note_unknown(
             &["name", "version"],
-            &["link", "joint", "material", "gazebo", "transmission", "ros2_control"],
+            &[
+                "link",
+                "joint",
+                "material",
+                "gazebo",
+                "transmission",
+                "ros2_control",
+            ],
             &mut notes,
         );
         let name = root.attribute("name").unwrap_or_default().to_owned();
-        let invalid =
-            |what, problem: element::Problem| Error::UrdfElement { line: problem.line, what, why: problem.why };
+        let invalid = |what, problem: element::Problem| Error::UrdfElement {
+            line: problem.line,
+            what,
+            why: problem.why,
+        };
         let name_of = |link: Element<'_>| -> Result<String, Error> {
-            Ok(link.required("name").map_err(|problem| invalid("a link".to_owned(), problem))?.to_owned())
+            Ok(link
+                .required("name")
+                .map_err(|problem| invalid("a link".to_owned(), problem))?
+                .to_owned())
         };
         // Finding a line takes time, so it is done only for notes.
         let (mut links, mut element_of) = (Vec::new(), HashMap::new());
         for element in root.all("link") {
             let link = name_of(element)?;
-            if let Some(first) = element_of.get(&link).map(|first: &Element<'_>| first.line()) {
+            if let Some(first) = element_of
+                .get(&link)
+                .map(|first: &Element<'_>| first.line())
+            {
                 notes.add(
                     element.line(),
-                    &format!("link {link:?} is defined again; its definition in line {first} is used"),
+                    &format!(
+                        "link {link:?} is defined again; its definition in line {first} is used"
+                    ),
                 );
                 continue;
             }
@@ -69,12 +89,23 @@ impl Robot {
         if links.is_empty() {
             return Err(Error::NoLinks { robot: name });
         }
-        let mut joints =
-            root.all("joint").map(|joint| joint::read(joint, &mut notes)).collect::<Result<Vec<_>, _>>()?;
+        let mut joints = root
+            .all("joint")
+            .map(|joint| joint::read(joint, &mut notes))
+            .collect::<Result<Vec<_>, _>>()?;
         for (joint, element) in joints.iter_mut().zip(root.all("joint")) {
-            if let Some(link) = [&joint.parent, &joint.child].into_iter().find(|link| !element_of.contains_key(*link)) {
-                let undefined = Error::UndefinedLink { joint: joint.name.clone(), link: link.clone() };
-                notes.add(element.line(), &format!("joint {:?}: link {link:?} is not defined", joint.name));
+            if let Some(link) = [&joint.parent, &joint.child]
+                .into_iter()
+                .find(|link| !element_of.contains_key(*link))
+            {
+                let undefined = Error::UndefinedLink {
+                    joint: joint.name.clone(),
+                    link: link.clone(),
+                };
+                notes.add(
+                    element.line(),
+                    &format!("joint {:?}: link {link:?} is not defined", joint.name),
+                );
                 joint.problem.get_or_insert(undefined);
             }
         }
@@ -83,7 +114,15 @@ impl Robot {
         reject_cycles(&links, &joints, &joint_above)?;
         let mut shapes = shape::read_all(root, &mut notes);
         drop_below_problems(&links, &joints, &joint_above, &mut shapes);
-        Ok(Self { name, links, joints, joints_by_name, joint_above, shapes, notes: notes.into_texts() })
+        Ok(Self {
+            name,
+            links,
+            joints,
+            joints_by_name,
+            joint_above,
+            shapes,
+            notes: notes.into_texts(),
+        })
     }
 
     /// Name of the robot; empty if the file has none.
@@ -108,7 +147,9 @@ impl Robot {
 
     /// Collision shapes of a link, without invalid ones.
     pub fn collisions(&self, link: &str) -> &[Shape] {
-        self.shapes.get(link).map_or(&[], |shapes| &shapes.collisions)
+        self.shapes
+            .get(link)
+            .map_or(&[], |shapes| &shapes.collisions)
     }
 
     /// One sentence, with the line, for each element that was left out or is not used.
@@ -123,10 +164,16 @@ impl Robot {
 
     /// The root link: the ancestor of all other links.
     pub fn root(&self) -> Result<&str, Error> {
-        let roots: Vec<&String> = self.links.iter().filter(|link| self.joint_above[*link].is_none()).collect();
+        let roots: Vec<&String> = self
+            .links
+            .iter()
+            .filter(|link| self.joint_above[*link].is_none())
+            .collect();
         match roots[..] {
             [root] => Ok(root),
-            _ => Err(Error::ManyRoots { roots: roots.into_iter().cloned().collect() }),
+            _ => Err(Error::ManyRoots {
+                roots: roots.into_iter().cloned().collect(),
+            }),
         }
     }
 
@@ -138,8 +185,15 @@ impl Robot {
         let mut link = tip_link;
         while link != base_link {
             let Some(above) = self.joint_above[link] else {
-                let ancestors = joints_upwards.iter().map(|joint: &&Joint| joint.parent.clone()).collect();
-                return Err(Error::NotBelow { tip: tip_link.into(), base: base_link.into(), ancestors });
+                let ancestors = joints_upwards
+                    .iter()
+                    .map(|joint: &&Joint| joint.parent.clone())
+                    .collect();
+                return Err(Error::NotBelow {
+                    tip: tip_link.into(),
+                    base: base_link.into(),
+                    ancestors,
+                });
             };
             joints_upwards.push(&self.joints[above]);
             link = &self.joints[above].parent;
@@ -152,7 +206,11 @@ impl Robot {
         if self.joint_above.contains_key(link) {
             return Ok(());
         }
-        Err(Error::UnknownLink { link: link.into(), robot: self.name.clone(), links: self.links.clone() })
+        Err(Error::UnknownLink {
+            link: link.into(),
+            robot: self.name.clone(),
+            links: self.links.clone(),
+        })
     }
 }
 
@@ -168,15 +226,23 @@ fn indices_by_name<'a>(
         let name = element.attribute("name").unwrap_or_default();
         if let Some(first_ix) = indices.insert(name.to_owned(), ix) {
             let lines = [lines[first_ix].line(), element.line()];
-            return Err(Error::Duplicate { kind, name: name.to_owned(), lines });
+            return Err(Error::Duplicate {
+                kind,
+                name: name.to_owned(),
+                lines,
+            });
         }
     }
     Ok(indices)
 }
 
 /// The joint above each link. Joints with an undefined link are left out.
-fn joints_above(links: &[String], joints: &[Joint]) -> Result<HashMap<String, Option<usize>>, Error> {
-    let mut above: HashMap<String, Option<usize>> = links.iter().map(|link| (link.clone(), None)).collect();
+fn joints_above(
+    links: &[String],
+    joints: &[Joint],
+) -> Result<HashMap<String, Option<usize>>, Error> {
+    let mut above: HashMap<String, Option<usize>> =
+        links.iter().map(|link| (link.clone(), None)).collect();
     for (joint_ix, joint) in joints.iter().enumerate() {
         if !above.contains_key(&joint.parent) || !above.contains_key(&joint.child) {
             continue;
@@ -192,7 +258,11 @@ fn joints_above(links: &[String], joints: &[Joint]) -> Result<HashMap<String, Op
     Ok(above)
 }
 
-fn reject_cycles(links: &[String], joints: &[Joint], above: &HashMap<String, Option<usize>>) -> Result<(), Error> {
+fn reject_cycles(
+    links: &[String],
+    joints: &[Joint],
+    above: &HashMap<String, Option<usize>>,
+) -> Result<(), Error> {
     // Links from which a root was reached.
     let mut sound: HashSet<&str> = HashSet::new();
     for start in links {
@@ -200,7 +270,9 @@ fn reject_cycles(links: &[String], joints: &[Joint], above: &HashMap<String, Opt
         let mut link: &str = start;
         while !sound.contains(link) {
             if !walked.insert(link) {
-                return Err(Error::Cycle { link: link.to_owned() });
+                return Err(Error::Cycle {
+                    link: link.to_owned(),
+                });
             }
             match above[link] {
                 Some(joint_ix) => link = &joints[joint_ix].parent,
@@ -226,12 +298,24 @@ fn drop_below_problems(
     for joint in joints {
         below.entry(&joint.parent).or_default().push(&joint.child);
     }
-    let is_placed = |link: &str| above[link].is_none_or(|joint_ix| joints[joint_ix].problem.is_none());
-    let mut dropped: Vec<&str> = links.iter().map(String::as_str).filter(|link| !is_placed(link)).collect();
+    let is_placed =
+        |link: &str| above[link].is_none_or(|joint_ix| joints[joint_ix].problem.is_none());
+    let mut dropped: Vec<&str> = links
+        .iter()
+        .map(String::as_str)
+        .filter(|link| !is_placed(link))
+        .collect();
     let mut seen: HashSet<&str> = dropped.iter().copied().collect();
     while let Some(link) = dropped.pop() {
         shapes.remove(link);
-        dropped.extend(below.get(link).into_iter().flatten().copied().filter(|child| seen.insert(child)));
+        dropped.extend(
+            below
+                .get(link)
+                .into_iter()
+                .flatten()
+                .copied()
+                .filter(|child| seen.insert(child)),
+        );
     }
 }
 
@@ -240,11 +324,15 @@ mod tests {
     use super::*;
 
     fn robot(body: &str) -> Result<Robot, Error> {
-        Robot::parse(&format!(r#"<robot name="r"><link name="a"/><link name="b"/><link name="c"/>{body}</robot>"#))
+        Robot::parse(&format!(
+            r#"<robot name="r"><link name="a"/><link name="b"/><link name="c"/>{body}</robot>"#
+        ))
     }
 
     fn joint_xml(name: &str, kind: &str, parent: &str, child: &str, rest: &str) -> String {
-        format!(r#"<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>{rest}</joint>"#)
+        format!(
+            r#"<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>{rest}</joint>"#
+        )
     }
 
     fn error_message(result: Result<Robot, Error>) -> String {
@@ -255,11 +343,19 @@ mod tests {
 
     #[test]
     fn files_without_links_or_xml_are_rejected() {
-        let empty = error_message(Robot::parse(r#"<robot xmlns:xacro="http://wiki.ros.org/xacro"></robot>"#));
-        assert_eq!(empty, r#"urdf: robot "" has no <link> (an export that failed or was never expanded from xacro?)"#);
+        let empty = error_message(Robot::parse(
+            r#"<robot xmlns:xacro="http://wiki.ros.org/xacro"></robot>"#,
+        ));
+        assert_eq!(
+            empty,
+            r#"urdf: robot "" has no <link> (an export that failed or was never expanded from xacro?)"#
+        );
         assert!(error_message(Robot::parse("")).starts_with("urdf: cannot be read"));
         assert!(error_message(Robot::parse("{}")).starts_with("urdf: cannot be read"));
-        assert!(error_message(Robot::parse(r#"<robot name="r"><link name="a">"#)).starts_with("urdf: cannot be read"));
+        assert!(
+            error_message(Robot::parse(r#"<robot name="r"><link name="a">"#))
+                .starts_with("urdf: cannot be read")
+        );
     }
 
     #[test]
@@ -270,38 +366,66 @@ mod tests {
             r#"urdf: joint "j" is defined twice, in lines 1 and 1"#
         );
         let two = twice.clone() + &joint_xml("k", "fixed", "c", "b", "");
-        assert_eq!(error_message(robot(&two)), r#"urdf: link "b" has two parents, through joints "j" and "k""#);
+        assert_eq!(
+            error_message(robot(&two)),
+            r#"urdf: link "b" has two parents, through joints "j" and "k""#
+        );
         let cycle = joint_xml("j", "fixed", "b", "c", "") + &joint_xml("k", "fixed", "c", "b", "");
         assert!(matches!(robot(&cycle), Err(Error::Cycle { .. })));
         let self_loop = joint_xml("j", "fixed", "c", "c", "");
-        assert_eq!(error_message(robot(&self_loop)), r#"urdf: link "c" is its own ancestor (the joints form a cycle)"#);
+        assert_eq!(
+            error_message(robot(&self_loop)),
+            r#"urdf: link "c" is its own ancestor (the joints form a cycle)"#
+        );
     }
 
     #[test]
     fn links_that_are_undefined_or_defined_twice_cost_only_their_joints() {
-        let body = joint_xml("j", "fixed", "a", "d", "") + &joint_xml("w", "fixed", "world", "a", "");
-        let undefined =
-            robot(&(body + &joint_xml("k", "fixed", "a", "b", "") + &joint_xml("l", "fixed", "b", "c", ""))).unwrap();
+        let body =
+            joint_xml("j", "fixed", "a", "d", "") + &joint_xml("w", "fixed", "world", "a", "");
+        let undefined = robot(
+            &(body
+                + &joint_xml("k", "fixed", "a", "b", "")
+                + &joint_xml("l", "fixed", "b", "c", "")),
+        )
+        .unwrap();
         assert_eq!(undefined.root().unwrap(), "a");
         assert_eq!(undefined.path("a", "c").unwrap().len(), 2);
-        let notes =
-            [r#"line 1: joint "j": link "d" is not defined"#, r#"line 1: joint "w": link "world" is not defined"#];
+        let notes = [
+            r#"line 1: joint "j": link "d" is not defined"#,
+            r#"line 1: joint "w": link "world" is not defined"#,
+        ];
         assert_eq!(undefined.notes(), notes);
-        assert!(undefined.path("a", "d").is_err() && undefined.joint("j").unwrap().problem.is_some());
+        assert!(
+            undefined.path("a", "d").is_err() && undefined.joint("j").unwrap().problem.is_some()
+        );
         let twice =
             robot("\n<link name=\"a\"><visual><geometry><sphere radius=\"1\"/></geometry></visual></link>").unwrap();
-        assert_eq!(twice.notes(), [r#"line 2: link "a" is defined again; its definition in line 1 is used"#]);
+        assert_eq!(
+            twice.notes(),
+            [r#"line 2: link "a" is defined again; its definition in line 1 is used"#]
+        );
         assert!(twice.links() == ["a", "b", "c"] && twice.visuals("a").is_empty());
     }
 
     #[test]
     fn files_that_strict_parsers_refuse_are_read() {
-        let late = "\n <?xml version=\"1.0\"?>\n<robot name=\"r\"><link name=\"a\"/><link/></robot>";
-        assert!(error_message(Robot::parse(late)).contains("line 3"), "lines are counted as in the file");
-        let unbound = r#"<robot name="r"><link name="a"/><gazebo><sensor:camera x:y="1"/></gazebo></robot>"#;
+        let late =
+            "\n <?xml version=\"1.0\"?>\n<robot name=\"r\"><link name=\"a\"/><link/></robot>";
+        assert!(
+            error_message(Robot::parse(late)).contains("line 3"),
+            "lines are counted as in the file"
+        );
+        let unbound =
+            r#"<robot name="r"><link name="a"/><gazebo><sensor:camera x:y="1"/></gazebo></robot>"#;
         assert_eq!(Robot::parse(unbound).unwrap().links(), ["a"]);
-        let unexpanded = error_message(Robot::parse(r#"<robot name="r"><xacro:include filename="a"/></robot>"#));
-        assert!(unexpanded.ends_with("expand the file with xacro first"), "{unexpanded}");
+        let unexpanded = error_message(Robot::parse(
+            r#"<robot name="r"><xacro:include filename="a"/></robot>"#,
+        ));
+        assert!(
+            unexpanded.ends_with("expand the file with xacro first"),
+            "{unexpanded}"
+        );
         let many: String = (0..3000).map(|n| format!("<p{n}:a/>")).collect();
         assert!(Robot::parse(&format!("<robot>{many}</robot>")).is_err());
     }
@@ -315,13 +439,21 @@ mod tests {
                 r#"<origin xyz="0 nan 0"/>"#,
                 r#"xyz of <origin> is "0 nan 0", expected 3 numbers with spaces"#,
             ),
-            ("revolute", r#"<origin rpy="0, 0, 1"/>"#, r#"rpy of <origin> is "0, 0, 1", expected 3 numbers"#),
+            (
+                "revolute",
+                r#"<origin rpy="0, 0, 1"/>"#,
+                r#"rpy of <origin> is "0, 0, 1", expected 3 numbers"#,
+            ),
             (
                 "fixed",
                 r#"<origin xyz="0 0 ${h}"/>"#,
                 r#""0 0 ${h}", expected 3 numbers with spaces between them (expand"#,
             ),
-            ("fixed", r#"<origin xyz="0 0"/>"#, r#"is "0 0", expected 3 numbers"#),
+            (
+                "fixed",
+                r#"<origin xyz="0 0"/>"#,
+                r#"is "0 0", expected 3 numbers"#,
+            ),
             (
                 "fixed",
                 r#"<origin rpy="0 0 1" quat_xyzw="0 0 0 1"/>"#,
@@ -332,34 +464,55 @@ mod tests {
                 r#"<origin xyz="1 0 0"/><origin xyz="2 0 0"/>"#,
                 "two different elements <origin>, in lines 2 and 2",
             ),
-            ("revolute", r#"<axis xyz="0 0 0"/>"#, "xyz of <axis> is zero, expected a direction"),
+            (
+                "revolute",
+                r#"<axis xyz="0 0 0"/>"#,
+                "xyz of <axis> is zero, expected a direction",
+            ),
             (
                 "revolute",
                 r#"<mimic joint="k" multiplier="inf"/>"#,
                 r#"multiplier of <mimic> is "inf", expected a number"#,
             ),
-            ("revolute", r#"<mimic multiplier="1"/>"#, r#"<mimic> has no attribute "joint""#),
+            (
+                "revolute",
+                r#"<mimic multiplier="1"/>"#,
+                r#"<mimic> has no attribute "joint""#,
+            ),
             (
                 "ball",
                 "",
                 r#"unknown type "ball", expected fixed, revolute, continuous, prismatic, floating, planar or spherical"#,
             ),
         ] {
-            let robot = robot(&(sound.clone() + "\n" + &joint_xml("j", kind, "a", "b", rest))).unwrap();
+            let robot =
+                robot(&(sound.clone() + "\n" + &joint_xml("j", kind, "a", "b", rest))).unwrap();
             let message = crate::Chain::new(&robot, "a", "b").unwrap_err().to_string();
-            assert!(message.starts_with(r#"urdf: line 2: joint "j": "#), "{message}");
+            assert!(
+                message.starts_with(r#"urdf: line 2: joint "j": "#),
+                "{message}"
+            );
             assert!(message.contains(reason), "{rest}: {message}");
             assert_eq!(robot.notes(), [message.strip_prefix("urdf: ").unwrap()]);
             assert!(crate::Chain::new(&robot, "a", "c").is_ok());
         }
         for (missing, reason) in [
-            (r#"<joint type="fixed"/>"#, r#"urdf: line 1: a joint: <joint> has no attribute "name""#),
+            (
+                r#"<joint type="fixed"/>"#,
+                r#"urdf: line 1: a joint: <joint> has no attribute "name""#,
+            ),
             (
                 r#"<joint name="j" type="fixed"><parent link="a"/></joint>"#,
                 r#"urdf: line 1: joint "j": it has no <child>"#,
             ),
-            (r#"<joint name="j"><parent/></joint>"#, r#"urdf: line 1: joint "j": <parent> has no attribute "link""#),
-            ("<link/>", r#"urdf: line 1: a link: <link> has no attribute "name""#),
+            (
+                r#"<joint name="j"><parent/></joint>"#,
+                r#"urdf: line 1: joint "j": <parent> has no attribute "link""#,
+            ),
+            (
+                "<link/>",
+                r#"urdf: line 1: a link: <link> has no attribute "name""#,
+            ),
         ] {
             assert_eq!(error_message(robot(missing)), reason);
         }
@@ -369,17 +522,30 @@ mod tests {
     fn invalid_parts_without_effect_on_poses_are_noted() {
         let visual = |shape: &str| format!(r#"<link name="d"><visual>{shape}</visual></link>"#);
         let sphere = r#"<geometry><sphere radius="1"/></geometry>"#;
-        let inertial = |inside: &str| format!(r#"<link name="d"><inertial>{inside}</inertial></link>"#);
+        let inertial =
+            |inside: &str| format!(r#"<link name="d"><inertial>{inside}</inertial></link>"#);
         let limit = |text: &str| joint_xml("j", "revolute", "a", "b", &format!("<limit {text}/>"));
         for (body, expected) in [
             (
                 limit(r#"lower="1" upper="-1""#),
                 r#"joint "j": lower of <limit> is 1, above upper, which is -1; the joint has no range and is not moved"#,
             ),
-            (limit(r#"lower="nan" upper="1""#), r#"joint "j": lower of <limit> is "nan", expected a number"#),
-            (limit(r#"lower="-1" upper="1" safe="2""#), r#"the attribute "safe" in <limit> is not used"#),
-            (joint_xml("j", "revolute", "a", "b", r#"<orgin xyz="1 0 0"/>"#), "<orgin> in <joint> is not used"),
-            ("<xacro:arm/>".to_owned(), "<xacro:arm>, which xacro has not expanded, in <robot> is not used"),
+            (
+                limit(r#"lower="nan" upper="1""#),
+                r#"joint "j": lower of <limit> is "nan", expected a number"#,
+            ),
+            (
+                limit(r#"lower="-1" upper="1" safe="2""#),
+                r#"the attribute "safe" in <limit> is not used"#,
+            ),
+            (
+                joint_xml("j", "revolute", "a", "b", r#"<orgin xyz="1 0 0"/>"#),
+                "<orgin> in <joint> is not used",
+            ),
+            (
+                "<xacro:arm/>".to_owned(),
+                "<xacro:arm>, which xacro has not expanded, in <robot> is not used",
+            ),
             (
                 inertial(r#"<inertia ixx="1"/>"#),
                 r#"the inertia of link "d" is invalid (it is not used): it has no <mass>"#,
@@ -389,7 +555,9 @@ mod tests {
                 r#"izz of <inertia> is "0.48ea8d", expected a number"#,
             ),
             (
-                visual(&format!(r#"{sphere}<material name="m"><texture/></material>"#)),
+                visual(&format!(
+                    r#"{sphere}<material name="m"><texture/></material>"#
+                )),
                 r#"a texture of link "d" is not drawn: """#,
             ),
         ] {
@@ -397,25 +565,47 @@ mod tests {
                 r#"<robot xmlns:xacro="http://wiki.ros.org/xacro"><link name="a"/><link name="b"/>{body}</robot>"#
             );
             let robot = Robot::parse(&robot).unwrap();
-            let [note] = robot.notes() else { panic!("{body}: {:?}", robot.notes()) };
-            assert!(note.starts_with("line 1: ") && note.ends_with(expected), "{note}");
+            let [note] = robot.notes() else {
+                panic!("{body}: {:?}", robot.notes())
+            };
+            assert!(
+                note.starts_with("line 1: ") && note.ends_with(expected),
+                "{note}"
+            );
         }
         let many = joint_xml("j", "fixed", "a", "b", "<x/><x/>\n<x/>");
-        assert_eq!(robot(&many).unwrap().notes(), ["line 1 (and 2 more): <x> in <joint> is not used"]);
-        let unnamed = visual(&format!(r#"{sphere}<material><color rgba="1 0 0 1"/></material>"#));
+        assert_eq!(
+            robot(&many).unwrap().notes(),
+            ["line 1 (and 2 more): <x> in <joint> is not used"]
+        );
+        let unnamed = visual(&format!(
+            r#"{sphere}<material><color rgba="1 0 0 1"/></material>"#
+        ));
         let unnamed = robot(&unnamed).unwrap();
-        assert_eq!((unnamed.notes().len(), unnamed.visuals("d")[0].color_srgba), (0, Some([1.0, 0.0, 0.0, 1.0])));
+        assert_eq!(
+            (unnamed.notes().len(), unnamed.visuals("d")[0].color_srgba),
+            (0, Some([1.0, 0.0, 0.0, 1.0]))
+        );
     }
 
     #[test]
     fn shapes_below_an_invalid_joint_are_not_drawn() {
         let shape = |link: &str| {
-            format!(r#"<link name="{link}"><visual><geometry><sphere radius="1"/></geometry></visual></link>"#)
+            format!(
+                r#"<link name="{link}"><visual><geometry><sphere radius="1"/></geometry></visual></link>"#
+            )
         };
         let invalid = joint_xml("j", "fixed", "a", "d", r#"<origin xyz="x"/>"#);
-        let tree = shape("d") + &shape("e") + &shape("f") + &invalid + &joint_xml("k", "fixed", "d", "e", "");
+        let tree = shape("d")
+            + &shape("e")
+            + &shape("f")
+            + &invalid
+            + &joint_xml("k", "fixed", "d", "e", "");
         let robot = robot(&(tree + &joint_xml("l", "fixed", "a", "f", ""))).unwrap();
-        assert_eq!(["d", "e", "f"].map(|link| robot.visuals(link).len()), [0, 0, 1]);
+        assert_eq!(
+            ["d", "e", "f"].map(|link| robot.visuals(link).len()),
+            [0, 0, 1]
+        );
     }
 
     #[test]
@@ -423,8 +613,18 @@ mod tests {
         const N: usize = 20_000;
         let link = |ix: usize| format!(r#"<link name="l{ix}"/>"#);
         let joint = |ix: usize| {
-            let mimic = if ix > 1 { format!(r#"<mimic joint="j{}" multiplier="1"/>"#, ix - 1) } else { String::new() };
-            joint_xml(&format!("j{ix}"), "prismatic", &format!("l{}", ix - 1), &format!("l{ix}"), &mimic)
+            let mimic = if ix > 1 {
+                format!(r#"<mimic joint="j{}" multiplier="1"/>"#, ix - 1)
+            } else {
+                String::new()
+            };
+            joint_xml(
+                &format!("j{ix}"),
+                "prismatic",
+                &format!("l{}", ix - 1),
+                &format!("l{ix}"),
+                &mimic,
+            )
         };
         let chain = format!(
             "<robot>{}{}</robot>",
@@ -437,74 +637,157 @@ mod tests {
         assert_eq!(chain.joint_names(), ["j1"]);
         assert!((chain.forward(&[0.5]).unwrap().translation.x - 0.5 * N as f64).abs() < 1e-6);
 
-        let deep = format!("<robot>{}{}<link name=\"a\"/></robot>", "<a>".repeat(200_000), "</a>".repeat(200_000));
+        let deep = format!(
+            "<robot>{}{}<link name=\"a\"/></robot>",
+            "<a>".repeat(200_000),
+            "</a>".repeat(200_000)
+        );
         assert_eq!(Robot::parse(&deep).unwrap().links(), ["a"]);
         let named: String = (0..3000).map(|ix| format!(" a{ix}=''")).collect();
         let namespaces: String = (0..200).map(|ix| format!("<a xmlns:n{ix}='x'/>")).collect();
         for (text, what) in [
-            (format!("<robot{named}/>"), "3000 attributes in one element exceed the maximum of 2000"),
-            (format!("<robot>{namespaces}</robot>"), "200 namespaces exceed the maximum of 100"),
-            (format!("<robot>{}</robot>", "<a/>".repeat(1 << 20)), "nodes limit reached"),
-            (" ".repeat(MAX_BYTES + 1), "16777217 bytes exceed the maximum of 16777216"),
-            ("<sdf/>".to_owned(), "it describes a <sdf>, expected a <robot>"),
+            (
+                format!("<robot{named}/>"),
+                "3000 attributes in one element exceed the maximum of 2000",
+            ),
+            (
+                format!("<robot>{namespaces}</robot>"),
+                "200 namespaces exceed the maximum of 100",
+            ),
+            (
+                format!("<robot>{}</robot>", "<a/>".repeat(1 << 20)),
+                "nodes limit reached",
+            ),
+            (
+                " ".repeat(MAX_BYTES + 1),
+                "16777217 bytes exceed the maximum of 16777216",
+            ),
+            (
+                "<sdf/>".to_owned(),
+                "it describes a <sdf>, expected a <robot>",
+            ),
         ] {
             let message = error_message(Robot::parse(&text));
-            assert!(message.starts_with("urdf: cannot be read: ") && message.contains(what), "{message}");
+            assert!(
+                message.starts_with("urdf: cannot be read: ") && message.contains(what),
+                "{message}"
+            );
         }
     }
 
     #[test]
     fn elements_may_be_in_any_order() {
         let visual = r#"<visual><geometry><sphere radius="1"/></geometry></visual>"#;
-        let mixed =
-            format!(r#"<link name="d">{visual}<inertial><mass value="1"/><inertia/></inertial>{visual}</link>"#);
+        let mixed = format!(
+            r#"<link name="d">{visual}<inertial><mass value="1"/><inertia/></inertial>{visual}</link>"#
+        );
         let robot = robot(&(joint_xml("j", "fixed", "a", "d", "") + &mixed)).unwrap();
         assert_eq!((robot.visuals("d").len(), robot.notes().len()), (2, 0));
     }
 
     #[test]
     fn quaternions_of_newer_versions_are_read() {
-        let pose =
-            |origin: &str| robot(&joint_xml("j", "fixed", "a", "b", origin)).unwrap().joints()[0].parent_from_joint;
+        let pose = |origin: &str| {
+            robot(&joint_xml("j", "fixed", "a", "b", origin))
+                .unwrap()
+                .joints()[0]
+                .parent_from_joint
+        };
         let (rpy, quaternion) = (
             r#"<origin xyz="1 2 3" rpy="0 0 1"/>"#,
             r#"<origin xyz="1 2 3" quat_xyzw="0 0 0.479425538604203 0.8775825618903728"/>"#,
         );
-        assert!((pose(rpy).to_homogeneous() - pose(quaternion).to_homogeneous()).abs().max() < 1e-15);
+        assert!(
+            (pose(rpy).to_homogeneous() - pose(quaternion).to_homogeneous())
+                .abs()
+                .max()
+                < 1e-15
+        );
     }
 
     #[test]
     fn root_and_path_are_found() {
-        let chain = joint_xml("j", "revolute", "b", "c", "") + &joint_xml("k", "fixed", "a", "b", "");
+        let chain =
+            joint_xml("j", "revolute", "b", "c", "") + &joint_xml("k", "fixed", "a", "b", "");
         let found = robot(&chain).unwrap();
         assert_eq!(found.root(), Ok("a"));
-        let names: Vec<&str> = found.path("a", "c").unwrap().iter().map(|joint| joint.name.as_str()).collect();
+        let names: Vec<&str> = found
+            .path("a", "c")
+            .unwrap()
+            .iter()
+            .map(|joint| joint.name.as_str())
+            .collect();
         assert_eq!(names, ["k", "j"]);
         assert!(found.path("b", "b").unwrap().is_empty());
-        assert_eq!(found.path("c", "b").unwrap_err().to_string(), r#"link "b" is not below link "c"; above it are a"#);
+        assert_eq!(
+            found.path("c", "b").unwrap_err().to_string(),
+            r#"link "b" is not below link "c"; above it are a"#
+        );
         assert_eq!(
             found.path("a", "hand").unwrap_err().to_string(),
             r#"link "hand" is not in the URDF of "r"; its links are a, b, c"#
         );
         let roots = robot("").unwrap().root().unwrap_err().to_string();
-        assert_eq!(roots, "urdf: 3 links have no parent (a, b, c), so the base link has to be named");
+        assert_eq!(
+            roots,
+            "urdf: 3 links have no parent (a, b, c), so the base link has to be named"
+        );
     }
 
     #[test]
     fn missing_limits_are_infinite() {
         let limit = r#"<limit lower="-1" upper="2" velocity="3" effort="4"/>"#;
-        let read = |kind: &str, rest: &str| robot(&joint_xml("j", kind, "a", "b", rest)).unwrap().joints()[0].limits;
-        let given = JointLimits { lower: -1.0, upper: 2.0, velocity: 3.0, effort: 4.0, is_range_valid: true };
+        let read = |kind: &str, rest: &str| {
+            robot(&joint_xml("j", kind, "a", "b", rest))
+                .unwrap()
+                .joints()[0]
+                .limits
+        };
+        let given = JointLimits {
+            lower: -1.0,
+            upper: 2.0,
+            velocity: 3.0,
+            effort: 4.0,
+            is_range_valid: true,
+        };
         let (up, down) = (f64::INFINITY, f64::NEG_INFINITY);
         assert_eq!(read("revolute", limit), given);
-        assert_eq!(read("continuous", limit), JointLimits { lower: down, upper: up, ..given });
+        assert_eq!(
+            read("continuous", limit),
+            JointLimits {
+                lower: down,
+                upper: up,
+                ..given
+            }
+        );
         assert_eq!(read("revolute", ""), JointLimits::NONE);
-        assert_eq!(read("revolute", r#"<limit lower="0" upper="0" velocity="0" effort="0"/>"#), JointLimits::NONE);
+        assert_eq!(
+            read(
+                "revolute",
+                r#"<limit lower="0" upper="0" velocity="0" effort="0"/>"#
+            ),
+            JointLimits::NONE
+        );
         assert_eq!(
             read("revolute", r#"<limit lower="-1" upper="2"/>"#),
-            JointLimits { velocity: up, effort: up, ..given }
+            JointLimits {
+                velocity: up,
+                effort: up,
+                ..given
+            }
         );
-        let swapped = read("revolute", r#"<limit lower="2" upper="-1" velocity="3" effort="4"/>"#);
-        assert_eq!(swapped, JointLimits { lower: down, upper: up, is_range_valid: false, ..given });
+        let swapped = read(
+            "revolute",
+            r#"<limit lower="2" upper="-1" velocity="3" effort="4"/>"#,
+        );
+        assert_eq!(
+            swapped,
+            JointLimits {
+                lower: down,
+                upper: up,
+                is_range_valid: false,
+                ..given
+            }
+        );
     }
 }

@@ -22,7 +22,8 @@ pub struct Joint {
     pub limits: JointLimits,
     /// The joint that this joint follows; `None` if it moves independently.
     pub mimic: Option<Mimic>,
-    /// Why the joint cannot be part of a chain. If there is an error, only the names above are valid.
+    /// Why the joint cannot be part of a chain. If there is an error, only the names above are
+    /// valid.
     pub problem: Option<Error>,
 }
 
@@ -50,8 +51,8 @@ pub struct JointLimits {
     pub velocity: f64,
     /// Largest torque or force, newton meters or newtons.
     pub effort: f64,
-    /// False if the URDF states a range that is invalid. `lower` and `upper` are then infinite, and a program should not
-    /// move the joint.
+    /// False if the URDF states a range that is invalid. `lower` and `upper` are then infinite, and
+    /// a program should not move the joint.
     pub is_range_valid: bool,
 }
 

@@ -7,8 +7,8 @@ use super::photo::{self, Photos};
 use super::scatter::{self, ScatterPoint};
 use super::{Heading, Unused, number, with_sigma};
 use calibration::hand_eye::{
-    BoardObservation, HandEyeCalibration, HandEyeSample, MAX_FOLDS, NextPose, RotationExcitation, SampleReport,
-    SampleStatus, Setup,
+    BoardObservation, HandEyeCalibration, HandEyeSample, MAX_FOLDS, NextPose, RotationExcitation,
+    SampleReport, SampleStatus, Setup,
 };
 use kinematics::Transform;
 
@@ -38,16 +38,27 @@ impl HandEyeReport<'_> {
     pub fn html(&self) -> String {
         let n_samples = self.samples.len() + self.unused.len();
         let verdict = self.calibration.map_or(String::new(), |calibration| {
-            let used = calibration.samples.iter().filter(|sample| sample.status == SampleStatus::Used);
+            let used = calibration
+                .samples
+                .iter()
+                .filter(|sample| sample.status == SampleStatus::Used);
             format!("{} of {n_samples} samples are inliers.", used.count())
         });
         let figures = match self.calibration {
             Some(calibration) => figures(calibration),
-            None => vec![("usable samples", format!("{} of {n_samples}", self.samples.len()), "")],
+            None => vec![(
+                "usable samples",
+                format!("{} of {n_samples}", self.samples.len()),
+                "",
+            )],
         };
         let mut page = Page::new("Hand-eye calibration", self.heading, &verdict, &figures);
         if let Some(calibration) = self.calibration {
-            page.table("Result", &["parameter", "value ± standard deviation"], self.parameters(calibration));
+            page.table(
+                "Result",
+                &["parameter", "value ± standard deviation"],
+                self.parameters(calibration),
+            );
             page.section("Line for the rig file", "", &page::code(self.rig_line));
         }
         page.section(
@@ -59,17 +70,32 @@ impl HandEyeReport<'_> {
             let percent = format!("{:.0} %", 100.0 * (1.0 - next.sigma_frac));
             vec![next.motion.clone(), percent]
         });
-        page.table("Next poses to add", &["motion", "reduction of the standard deviation"], next.collect());
+        page.table(
+            "Next poses to add",
+            &["motion", "reduction of the standard deviation"],
+            next.collect(),
+        );
         if let Some(calibration) = self.calibration {
             let legend = "Position of the board according to each sample, relative to the result. An elongated cloud or two clusters indicate a systematic error.";
-            page.section("Scatter of the board", legend, &page::gallery(&scatter_plots(calibration)));
-            page.section("Held-out samples", "", &page::note(Some(&held_out(calibration))));
+            page.section(
+                "Scatter of the board",
+                legend,
+                &page::gallery(&scatter_plots(calibration)),
+            );
+            page.section(
+                "Held-out samples",
+                "",
+                &page::note(Some(&held_out(calibration))),
+            );
             let legend = "Difference between the measured and predicted board pose. Bars are relative to the largest error of a used sample.";
             let columns = [("position, mm", 2), ("rotation, °", 3), ("corners, px", 3)];
             let rows: Vec<BarRow> = calibration.samples.iter().map(row).collect();
             page.section("Samples", legend, &bars::table("sample", &columns, &rows));
         }
-        let reasons = self.unused.iter().map(|unused| vec![unused.name.clone(), unused.reason.clone()]);
+        let reasons = self
+            .unused
+            .iter()
+            .map(|unused| vec![unused.name.clone(), unused.reason.clone()]);
         page.table("Not used", &["sample", "reason"], reasons.collect());
         let legend = match self.calibration {
             Some(_) => {
@@ -88,23 +114,42 @@ impl HandEyeReport<'_> {
         };
         let camera = &calibration.parent_from_camera;
         let mut rows = vec![
-            vec![format!("position of the camera in the {parent} (x, y, z), mm"), millimeters(camera)],
-            vec![format!("rotation of the camera in the {parent} (quaternion x, y, z, w)"), quaternion(camera)],
-            vec!["standard deviation along the camera's x, y, z, mm".to_owned(), three(calibration.sigma_mm, 3)],
-            vec!["standard deviation about the camera's x, y, z, degrees".to_owned(), three(calibration.sigma_deg, 4)],
+            vec![
+                format!("position of the camera in the {parent} (x, y, z), mm"),
+                millimeters(camera),
+            ],
+            vec![
+                format!("rotation of the camera in the {parent} (quaternion x, y, z, w)"),
+                quaternion(camera),
+            ],
+            vec![
+                "standard deviation along the camera's x, y, z, mm".to_owned(),
+                three(calibration.sigma_mm, 3),
+            ],
+            vec![
+                "standard deviation about the camera's x, y, z, degrees".to_owned(),
+                three(calibration.sigma_deg, 4),
+            ],
             vec![
                 format!("position of the board in the {board_parent}, mm"),
                 millimeters(&calibration.parent_from_board),
             ],
         ];
         if let Some((intrinsics, sigma)) = &calibration.intrinsics {
-            for (ix, name) in
-                ["focal length x, px", "focal length y, px", "principal point x, px", "principal point y, px"]
-                    .into_iter()
-                    .enumerate()
+            for (ix, name) in [
+                "focal length x, px",
+                "focal length y, px",
+                "principal point x, px",
+                "principal point y, px",
+            ]
+            .into_iter()
+            .enumerate()
             {
                 let sigma = sigma.get(ix).copied().unwrap_or(f64::NAN);
-                rows.push(vec![name.to_owned(), with_sigma(intrinsics.params()[ix], sigma, 2)]);
+                rows.push(vec![
+                    name.to_owned(),
+                    with_sigma(intrinsics.params()[ix], sigma, 2),
+                ]);
             }
         }
         rows.extend(calibration.joint_offsets.iter().map(|offset| {
@@ -112,51 +157,92 @@ impl HandEyeReport<'_> {
                 Some([value, sigma]) => format!("{value:.5} ± {sigma:.5}"),
                 None => "cannot be observed".to_owned(),
             };
-            vec![format!("offset of {} (radians or meters)", offset.joint), value]
+            vec![
+                format!("offset of {} (radians or meters)", offset.joint),
+                value,
+            ]
         }));
         rows
     }
 
     fn excitation(&self) -> String {
-        let poses: Vec<Transform> = self.samples.iter().map(|sample| sample.base_from_flange).collect();
-        let Some(excitation) = RotationExcitation::of(&poses) else { return String::new() };
+        let poses: Vec<Transform> = self
+            .samples
+            .iter()
+            .map(|sample| sample.base_from_flange)
+            .collect();
+        let Some(excitation) = RotationExcitation::of(&poses) else {
+            return String::new();
+        };
         let row = |(axis, rms_rad): (String, f64)| {
             let is_weak = rms_rad < excitation.min_rad;
             let tag = if is_weak { "hardly any rotation" } else { "" };
-            BarRow { name: axis, tag: tag.to_owned(), values: vec![Some(rms_rad.to_degrees())] }
+            BarRow {
+                name: axis,
+                tag: tag.to_owned(),
+                values: vec![Some(rms_rad.to_degrees())],
+            }
         };
-        let rows: Vec<BarRow> = excitation.axes.into_iter().zip(excitation.rms_rad).map(row).collect();
+        let rows: Vec<BarRow> = excitation
+            .axes
+            .into_iter()
+            .zip(excitation.rms_rad)
+            .map(row)
+            .collect();
         bars::table("rotation around", &[("RMS, °", 1)], &rows)
     }
 
     fn pictures(&self) -> Vec<String> {
         let picture = |report: &SampleReport| {
-            let tag = if report.status == SampleStatus::Used { "" } else { ", not used" };
+            let tag = if report.status == SampleStatus::Used {
+                ""
+            } else {
+                ", not used"
+            };
             let caption = format!("{}: {} px RMS{tag}", report.name, number(report.rms_px, 3));
             photo::with_corners(self.photos, &report.name, &caption, &report.points)
         };
         let pictures: Vec<String> = match self.calibration {
             Some(calibration) => {
                 let with = |status: SampleStatus| {
-                    calibration.samples.iter().filter(move |sample| sample.status == status && sample.rms_px.is_some())
+                    calibration
+                        .samples
+                        .iter()
+                        .filter(move |sample| sample.status == status && sample.rms_px.is_some())
                 };
                 let used: Vec<&SampleReport> = with(SampleStatus::Used).collect();
-                let errors: Vec<f64> = used.iter().map(|sample| sample.rms_px.unwrap_or(0.0)).collect();
-                let chosen = photo::worst_and_median(&errors).into_iter().map(|ix| used[ix]);
-                chosen.chain(with(SampleStatus::Outlier).take(2)).map(picture).collect()
+                let errors: Vec<f64> = used
+                    .iter()
+                    .map(|sample| sample.rms_px.unwrap_or(0.0))
+                    .collect();
+                let chosen = photo::worst_and_median(&errors)
+                    .into_iter()
+                    .map(|ix| used[ix]);
+                chosen
+                    .chain(with(SampleStatus::Outlier).take(2))
+                    .map(picture)
+                    .collect()
             }
             None => {
                 let view = |sample: &HandEyeSample| match &sample.board {
                     BoardObservation::View(view) => {
                         let caption = format!("{}: detected corners", sample.name);
-                        Some(photo::with_corners(self.photos, &sample.name, &caption, &detected_points(view)))
+                        Some(photo::with_corners(
+                            self.photos,
+                            &sample.name,
+                            &caption,
+                            &detected_points(view),
+                        ))
                     }
                     BoardObservation::Pose(_) => None,
                 };
                 self.samples.iter().filter_map(view).take(2).collect()
             }
         };
-        pictures.into_iter().filter(|picture| !picture.is_empty()).collect()
+        pictures
+            .into_iter()
+            .filter(|picture| !picture.is_empty())
+            .collect()
     }
 }
 
@@ -176,9 +262,21 @@ fn quaternion(pose: &Transform) -> String {
 fn figures(calibration: &HandEyeCalibration) -> Vec<page::Figure> {
     let largest = |values: [f64; 3]| values.into_iter().fold(0.0, f64::max);
     let mut figures = vec![
-        ("position, worst axis", format!("± {}", number(Some(largest(calibration.sigma_mm)), 2)), "mm"),
-        ("rotation, worst axis", format!("± {}", number(Some(largest(calibration.sigma_deg)), 3)), "°"),
-        ("scatter of the board", number(Some(calibration.scatter.mm), 2), "mm"),
+        (
+            "position, worst axis",
+            format!("± {}", number(Some(largest(calibration.sigma_mm)), 2)),
+            "mm",
+        ),
+        (
+            "rotation, worst axis",
+            format!("± {}", number(Some(largest(calibration.sigma_deg)), 3)),
+            "°",
+        ),
+        (
+            "scatter of the board",
+            number(Some(calibration.scatter.mm), 2),
+            "mm",
+        ),
     ];
     if let Some(held_out) = calibration.held_out_scatter {
         figures.push(("scatter, held out", number(Some(held_out.mm), 2), "mm"));
@@ -192,7 +290,11 @@ fn figures(calibration: &HandEyeCalibration) -> Vec<page::Figure> {
 
 /// How the held-out errors were obtained.
 fn held_out(calibration: &HandEyeCalibration) -> String {
-    let n_used = calibration.samples.iter().filter(|sample| sample.status == SampleStatus::Used).count();
+    let n_used = calibration
+        .samples
+        .iter()
+        .filter(|sample| sample.status == SampleStatus::Used)
+        .count();
     let Some(scatter) = calibration.held_out_scatter else {
         return "There are too few samples to leave one out.".to_owned();
     };
@@ -218,7 +320,11 @@ fn row(report: &SampleReport) -> BarRow {
         SampleStatus::Repeated => "identical to an earlier sample",
     };
     let values = vec![report.position_mm, report.rotation_deg, report.rms_px];
-    BarRow { name: report.name.clone(), tag: tag.to_owned(), values }
+    BarRow {
+        name: report.name.clone(),
+        tag: tag.to_owned(),
+        values,
+    }
 }
 
 fn scatter_plots(calibration: &HandEyeCalibration) -> Vec<String> {
@@ -230,7 +336,11 @@ fn scatter_plots(calibration: &HandEyeCalibration) -> Vec<String> {
         let point = |sample: &SampleReport| {
             let offset = sample.board_offset_mm?;
             let is_outlier = sample.status != SampleStatus::Used;
-            Some(ScatterPoint { name: sample.name.clone(), at: [offset[across], offset[up]], is_outlier })
+            Some(ScatterPoint {
+                name: sample.name.clone(),
+                at: [offset[across], offset[up]],
+                is_outlier,
+            })
         };
         let points: Vec<ScatterPoint> = calibration.samples.iter().filter_map(point).collect();
         let label = |axis: usize| format!("{} of the {parent}, mm", ["x", "y", "z"][axis]);

@@ -37,12 +37,19 @@ pub(super) struct ImageMap {
 
 impl ImageMap {
     pub(super) fn new(size_px: [u32; 2]) -> Self {
-        Self::of_part(ImagePart { first_px: [0, 0], size_px })
+        Self::of_part(ImagePart {
+            first_px: [0, 0],
+            size_px,
+        })
     }
 
     /// A part of an image, in the coordinates of the whole image.
     pub(super) fn of_part(ImagePart { first_px, size_px }: ImagePart) -> Self {
-        Self { first_px: first_px.map(f64::from), size_px: size_px.map(f64::from), shapes: String::new() }
+        Self {
+            first_px: first_px.map(f64::from),
+            size_px: size_px.map(f64::from),
+            shapes: String::new(),
+        }
     }
 
     /// Length in image pixels of one unit of line width.
@@ -58,13 +65,27 @@ impl ImageMap {
         ));
     }
 
-    /// Shades the cells of a grid by their value relative to the largest one. Cells without a value are hatched.
+    /// Shades the cells of a grid by their value relative to the largest one. Cells without a value
+    /// are hatched.
     pub(super) fn grid(&mut self, grid: &ImageGrid<Option<f64>>, shade: Shade, digits: usize) {
-        let largest = grid.values.iter().flatten().copied().filter(|value| value.is_finite()).fold(0.0, f64::max);
-        let (width, height) = (self.size_px[0] / grid.n_columns as f64, self.size_px[1] / grid.n_rows as f64);
+        let largest = grid
+            .values
+            .iter()
+            .flatten()
+            .copied()
+            .filter(|value| value.is_finite())
+            .fold(0.0, f64::max);
+        let (width, height) = (
+            self.size_px[0] / grid.n_columns as f64,
+            self.size_px[1] / grid.n_rows as f64,
+        );
         for (ix, value) in grid.values.iter().enumerate() {
-            let (x, y) = ((ix % grid.n_columns) as f64 * width, (ix / grid.n_columns) as f64 * height);
-            let cell = format!("x=\"{x:.1}\" y=\"{y:.1}\" width=\"{width:.1}\" height=\"{height:.1}\"");
+            let (x, y) = (
+                (ix % grid.n_columns) as f64 * width,
+                (ix / grid.n_columns) as f64 * height,
+            );
+            let cell =
+                format!("x=\"{x:.1}\" y=\"{y:.1}\" width=\"{width:.1}\" height=\"{height:.1}\"");
             self.push(&match value.filter(|value| value.is_finite()) {
                 Some(value) => {
                     let opacity = if largest > 0.0 { value / largest } else { 0.0 };
@@ -85,33 +106,51 @@ impl ImageMap {
             write!(path, "M{x:.1} {y:.1}h0").expect("writing to a string cannot fail");
         }
         let width = 2.6 * self.unit();
-        self.push(&format!("<path class=\"dots\" d=\"{path}\" stroke-width=\"{width:.2}\"/>\n"));
+        self.push(&format!(
+            "<path class=\"dots\" d=\"{path}\" stroke-width=\"{width:.2}\"/>\n"
+        ));
     }
 
     /// Draws circles around detected corners and crosses at the predicted ones.
     pub(super) fn corners(&mut self, points: &[PointFit]) {
         let (mut circles, mut crosses) = (String::new(), String::new());
         let (radius, arm) = (7.0 * self.unit(), 5.0 * self.unit());
-        for PointFit { pixel: [x, y], residual_px: [dx, dy] } in points {
+        for PointFit {
+            pixel: [x, y],
+            residual_px: [dx, dy],
+        } in points
+        {
             let (left, diameter) = (x - radius, 2.0 * radius);
             write!(circles, "M{left:.1} {y:.1}a{radius:.1} {radius:.1} 0 1 0 {diameter:.1} 0a{radius:.1} {radius:.1} 0 1 0 -{diameter:.1} 0")
                 .expect("writing to a string cannot fail");
             if dx.is_finite() && dy.is_finite() {
                 let (u, v) = (x - dx, y - dy);
                 let side = 2.0 * arm;
-                write!(crosses, "M{:.1} {:.1}l{side:.1} {side:.1}m0 -{side:.1}l-{side:.1} {side:.1}", u - arm, v - arm)
-                    .expect("writing to a string cannot fail");
+                write!(
+                    crosses,
+                    "M{:.1} {:.1}l{side:.1} {side:.1}m0 -{side:.1}l-{side:.1} {side:.1}",
+                    u - arm,
+                    v - arm
+                )
+                .expect("writing to a string cannot fail");
             }
         }
         let width = 2.0 * self.unit();
-        self.push(&format!("<path class=\"detected\" d=\"{circles}\" stroke-width=\"{width:.2}\"/>\n"));
-        self.push(&format!("<path class=\"predicted\" d=\"{crosses}\" stroke-width=\"{width:.2}\"/>\n"));
+        self.push(&format!(
+            "<path class=\"detected\" d=\"{circles}\" stroke-width=\"{width:.2}\"/>\n"
+        ));
+        self.push(&format!(
+            "<path class=\"predicted\" d=\"{crosses}\" stroke-width=\"{width:.2}\"/>\n"
+        ));
     }
 
     /// Draws a closed dashed outline.
     pub(super) fn outline(&mut self, corners: &[[f64; 2]]) {
         let unit = self.unit();
-        let points: Vec<String> = corners.iter().map(|[x, y]| format!("{x:.1},{y:.1}")).collect();
+        let points: Vec<String> = corners
+            .iter()
+            .map(|[x, y]| format!("{x:.1},{y:.1}"))
+            .collect();
         self.push(&format!(
             "<polygon class=\"outline\" points=\"{}\" stroke-width=\"{:.2}\" stroke-dasharray=\"{:.1} {:.1}\"/>\n",
             points.join(" "),
@@ -121,24 +160,35 @@ impl ImageMap {
         ));
     }
 
-    /// Draws residuals as arrows from the detected corners; returns the factor by which they are magnified.
+    /// Draws residuals as arrows from the detected corners; returns the factor by which they are
+    /// magnified.
     pub(super) fn arrows(&mut self, points: &[PointFit]) -> f64 {
         /// More arrows cannot be distinguished.
         const MAX_ARROWS: usize = 3000;
         const LONG_FRAC: f64 = 0.05; // Of the image, for the 95 % quantile.
-        let mut lengths: Vec<f64> =
-            points.iter().map(|point| point.residual_px[0].hypot(point.residual_px[1])).collect();
+        let mut lengths: Vec<f64> = points
+            .iter()
+            .map(|point| point.residual_px[0].hypot(point.residual_px[1]))
+            .collect();
         let rank = kinematics::quantile::Rank::Nearest;
         let long_px = kinematics::quantile::quantile(&mut lengths, 0.95, rank).unwrap_or(0.0);
-        let magnification = round_down(LONG_FRAC * self.size_px[0].max(self.size_px[1]) / long_px.max(1e-9));
+        let magnification =
+            round_down(LONG_FRAC * self.size_px[0].max(self.size_px[1]) / long_px.max(1e-9));
         let stride = points.len().div_ceil(MAX_ARROWS).max(1);
         let mut path = String::new();
-        for PointFit { pixel: [x, y], residual_px } in points.iter().step_by(stride) {
+        for PointFit {
+            pixel: [x, y],
+            residual_px,
+        } in points.iter().step_by(stride)
+        {
             let [dx, dy] = residual_px.map(|residual| magnification * residual);
-            write!(path, "M{x:.1} {y:.1}l{dx:.1} {dy:.1}").expect("writing to a string cannot fail");
+            write!(path, "M{x:.1} {y:.1}l{dx:.1} {dy:.1}")
+                .expect("writing to a string cannot fail");
         }
         let width = 1.2 * self.unit();
-        self.push(&format!("<path class=\"arrows\" d=\"{path}\" stroke-width=\"{width:.2}\"/>\n"));
+        self.push(&format!(
+            "<path class=\"arrows\" d=\"{path}\" stroke-width=\"{width:.2}\"/>\n"
+        ));
         self.dots(points.iter().step_by(stride).map(|point| point.pixel));
         magnification
     }
@@ -161,7 +211,11 @@ impl ImageMap {
 /// The largest of 1, 2, 5, 10, 20, 50, ... that is not larger than a factor; at least 1.
 fn round_down(factor: f64) -> f64 {
     let power = 10f64.powf(factor.max(1.0).log10().floor());
-    [5.0, 2.0].into_iter().map(|digit| digit * power).find(|value| *value <= factor).unwrap_or(power)
+    [5.0, 2.0]
+        .into_iter()
+        .map(|digit| digit * power)
+        .find(|value| *value <= factor)
+        .unwrap_or(power)
 }
 
 #[cfg(test)]
@@ -170,23 +224,44 @@ mod tests {
 
     #[test]
     fn magnification_is_a_round_number() {
-        assert_eq!([0.3, 1.0, 4.9, 5.0, 199.0, 234.0].map(round_down), [1.0, 1.0, 2.0, 5.0, 100.0, 200.0]);
+        assert_eq!(
+            [0.3, 1.0, 4.9, 5.0, 199.0, 234.0].map(round_down),
+            [1.0, 1.0, 2.0, 5.0, 100.0, 200.0]
+        );
     }
 
     #[test]
     fn arrows_are_magnified_by_the_returned_factor() {
         let mut map = ImageMap::new([640, 480]);
-        let points = [PointFit { pixel: [100.0, 50.0], residual_px: [0.1, -0.2] }];
+        let points = [PointFit {
+            pixel: [100.0, 50.0],
+            residual_px: [0.1, -0.2],
+        }];
         let factor = map.arrows(&points);
         assert_eq!(factor, 100.0, "0.22 px become 22 px, less than 5 % of 640");
-        assert!(map.svg("a <b>").contains("M100.0 50.0l10.0 -20.0"), "{}", map.shapes);
+        assert!(
+            map.svg("a <b>").contains("M100.0 50.0l10.0 -20.0"),
+            "{}",
+            map.shapes
+        );
         assert!(map.svg("a <b>").contains("a &lt;b&gt;"));
     }
 
     #[test]
     fn cells_without_a_value_are_marked() {
         let mut map = ImageMap::new([20, 10]);
-        map.grid(&ImageGrid { n_columns: 2, n_rows: 1, values: vec![Some(4.0), None] }, Shade::Bad, 1);
-        assert!(map.shapes.contains("fill-opacity=\"1.00\"><title>4.0") && map.shapes.contains("class=\"missing\""));
+        map.grid(
+            &ImageGrid {
+                n_columns: 2,
+                n_rows: 1,
+                values: vec![Some(4.0), None],
+            },
+            Shade::Bad,
+            1,
+        );
+        assert!(
+            map.shapes.contains("fill-opacity=\"1.00\"><title>4.0")
+                && map.shapes.contains("class=\"missing\"")
+        );
     }
 }

@@ -5,7 +5,9 @@ use super::image_map::{ImageMap, Shade};
 use super::page::{self, Page};
 use super::photo::{self, Photos};
 use super::{Heading, Unused, number, with_sigma};
-use calibration::{BoardView, ImageGrid, IntrinsicsCalibration, LensTrial, NextView, PointFit, RejectionReason};
+use calibration::{
+    BoardView, ImageGrid, IntrinsicsCalibration, LensTrial, NextView, PointFit, RejectionReason,
+};
 use nalgebra::{Point3, Vector3};
 
 /// Contents of the report.
@@ -33,30 +35,61 @@ impl IntrinsicsReport<'_> {
     /// The page.
     pub fn html(&self) -> String {
         let n_images = self.views.len() + self.unused.len();
-        let figures = self.calibration.map_or_else(|| self.input_figures(), figures);
+        let figures = self
+            .calibration
+            .map_or_else(|| self.input_figures(), figures);
         let verdict = self.calibration.map_or(String::new(), |calibration| {
-            let n_corners: usize = calibration.images.iter().map(|image| image.points.len()).sum();
+            let n_corners: usize = calibration
+                .images
+                .iter()
+                .map(|image| image.points.len())
+                .sum();
             format!(
                 "{} explains {n_corners} corners in {} of {n_images} images.",
                 calibration.model,
                 calibration.images.len()
             )
         });
-        let heading = Heading { input: format!("{} · {}", self.heading.input, self.target), ..self.heading.clone() };
+        let heading = Heading {
+            input: format!("{} · {}", self.heading.input, self.target),
+            ..self.heading.clone()
+        };
         let mut page = Page::new("Calibration of intrinsics", &heading, &verdict, &figures);
         if let Some(calibration) = self.calibration {
-            page.table("Result", &["parameter", "value ± standard deviation"], parameters(calibration));
+            page.table(
+                "Result",
+                &["parameter", "value ± standard deviation"],
+                parameters(calibration),
+            );
             page.section("Line for the rig file", "", &page::code(self.rig_line));
         }
-        let next = self.calibration.and_then(|calibration| calibration.next_view.as_ref());
-        page.section("Next image to take", "", &page::note(next.map(describe).as_deref()));
-        page.section("Image coverage, uncertainty and residuals", "", &page::gallery(&self.maps(next)));
+        let next = self
+            .calibration
+            .and_then(|calibration| calibration.next_view.as_ref());
+        page.section(
+            "Next image to take",
+            "",
+            &page::note(next.map(describe).as_deref()),
+        );
+        page.section(
+            "Image coverage, uncertainty and residuals",
+            "",
+            &page::gallery(&self.maps(next)),
+        );
         if let Some(calibration) = self.calibration {
-            page.table("Selection of the lens model", &TRIAL_HEAD, calibration.trials.iter().map(trial).collect());
+            page.table(
+                "Selection of the lens model",
+                &TRIAL_HEAD,
+                calibration.trials.iter().map(trial).collect(),
+            );
         }
         let legend = "RMS distance between detected and projected corners. Bars are relative to the largest error of a used image.";
         let columns = [("error, px", 3), ("corners", 0)];
-        page.section("Images", legend, &bars::table("image", &columns, &self.rows()));
+        page.section(
+            "Images",
+            legend,
+            &bars::table("image", &columns, &self.rows()),
+        );
         page.table("Not used", &["image", "reason"], self.reasons());
         let legend = match self.calibration {
             Some(_) => "Circles: detected corners. Crosses: corners predicted by the result.",
@@ -75,7 +108,11 @@ impl IntrinsicsReport<'_> {
         let n_corners: usize = self.views.iter().map(|view| view.points.len()).sum();
         let n_images = self.views.len() + self.unused.len();
         vec![
-            ("images with the target", format!("{} of {n_images}", self.views.len()), ""),
+            (
+                "images with the target",
+                format!("{} of {n_images}", self.views.len()),
+                "",
+            ),
             ("corners", n_corners.to_string(), ""),
         ]
     }
@@ -83,7 +120,12 @@ impl IntrinsicsReport<'_> {
     fn maps(&self, next: Option<&NextView>) -> Vec<String> {
         let pixels: Vec<[f64; 2]> = match self.calibration {
             Some(calibration) => corners(calibration).map(|point| point.pixel).collect(),
-            None => self.views.iter().flat_map(|view| &view.points).map(|point| point.pixel).collect(),
+            None => self
+                .views
+                .iter()
+                .flat_map(|view| &view.points)
+                .map(|point| point.pixel)
+                .collect(),
         };
         if pixels.is_empty() {
             return Vec::new();
@@ -91,18 +133,29 @@ impl IntrinsicsReport<'_> {
         let counted = ImageGrid::coverage(self.size_px, pixels.iter().copied());
         let values: Vec<Option<f64>> = counted.values.iter().map(|n| Some(*n as f64)).collect();
         let n_empty = counted.values.iter().filter(|n| **n == 0).count();
-        let coverage = ImageGrid { n_columns: counted.n_columns, n_rows: counted.n_rows, values };
+        let coverage = ImageGrid {
+            n_columns: counted.n_columns,
+            n_rows: counted.n_rows,
+            values,
+        };
         let mut map = ImageMap::new(self.size_px);
         map.grid(&coverage, Shade::Good, 0);
         map.dots(pixels.into_iter());
-        let mut caption =
-            format!("Coverage: corners per part of the image. {n_empty} of {} parts have none.", coverage.values.len());
+        let mut caption = format!(
+            "Coverage: corners per part of the image. {n_empty} of {} parts have none.",
+            coverage.values.len()
+        );
         if let Some(outline) = next.and_then(|next| self.outline(next)) {
             map.outline(&outline);
             caption.push_str(" Dashed: the target in the suggested next image.");
         }
-        let mut maps = vec![page::figure(&caption, &map.svg("corners per part of the image"))];
-        let Some(calibration) = self.calibration else { return maps };
+        let mut maps = vec![page::figure(
+            &caption,
+            &map.svg("corners per part of the image"),
+        )];
+        let Some(calibration) = self.calibration else {
+            return maps;
+        };
         let mut map = ImageMap::new(self.size_px);
         map.grid(&calibration.uncertainty_px, Shade::Bad, 2);
         let [low, high] = range(&calibration.uncertainty_px);
@@ -124,11 +177,29 @@ impl IntrinsicsReport<'_> {
     fn outline(&self, next: &NextView) -> Option<[[f64; 2]; 4]> {
         let intrinsics = &self.calibration?.intrinsics;
         let infinite = Vector3::repeat(f64::INFINITY);
-        let points = self.views.iter().flat_map(|view| &view.points).map(|point| point.point_in_board);
-        let (low, high) = points.fold((infinite, -infinite), |(low, high), point| (low.inf(&point), high.sup(&point)));
-        let corner = |[x, y]: [f64; 2]| intrinsics.project(&(next.camera_from_board * Point3::new(x, y, low.z)).coords);
-        let corners = [[low.x, low.y], [high.x, low.y], [high.x, high.y], [low.x, high.y]].map(corner);
-        corners.into_iter().collect::<Option<Vec<_>>>()?.try_into().ok()
+        let points = self
+            .views
+            .iter()
+            .flat_map(|view| &view.points)
+            .map(|point| point.point_in_board);
+        let (low, high) = points.fold((infinite, -infinite), |(low, high), point| {
+            (low.inf(&point), high.sup(&point))
+        });
+        let corner = |[x, y]: [f64; 2]| {
+            intrinsics.project(&(next.camera_from_board * Point3::new(x, y, low.z)).coords)
+        };
+        let corners = [
+            [low.x, low.y],
+            [high.x, low.y],
+            [high.x, high.y],
+            [low.x, high.y],
+        ]
+        .map(corner);
+        corners
+            .into_iter()
+            .collect::<Option<Vec<_>>>()?
+            .try_into()
+            .ok()
     }
 
     fn rows(&self) -> Vec<BarRow> {
@@ -136,7 +207,9 @@ impl IntrinsicsReport<'_> {
             return Vec::new();
         }
         let row = |view: &BoardView| {
-            let images = self.calibration.map_or(&[][..], |calibration| &calibration.images);
+            let images = self
+                .calibration
+                .map_or(&[][..], |calibration| &calibration.images);
             let used = images.iter().find(|image| image.name == view.name);
             let n_corners = used.map_or(view.points.len(), |image| image.points.len());
             let tag = match (used, self.calibration) {
@@ -145,7 +218,11 @@ impl IntrinsicsReport<'_> {
                 _ => "",
             };
             let values = vec![used.map(|image| image.rms_px), Some(n_corners as f64)];
-            BarRow { name: view.name.clone(), tag: tag.to_owned(), values }
+            BarRow {
+                name: view.name.clone(),
+                tag: tag.to_owned(),
+                values,
+            }
         };
         let without = self.unused.iter().map(|unused| BarRow {
             name: unused.name.clone(),
@@ -156,53 +233,91 @@ impl IntrinsicsReport<'_> {
     }
 
     fn reasons(&self) -> Vec<Vec<String>> {
-        let rejected = self.calibration.map_or(&[][..], |calibration| &calibration.rejected);
-        let rejected = rejected.iter().map(|rejected| vec![rejected.image.clone(), rejected.reason.to_string()]);
-        let unused = self.unused.iter().map(|unused| vec![unused.name.clone(), unused.reason.clone()]);
+        let rejected = self
+            .calibration
+            .map_or(&[][..], |calibration| &calibration.rejected);
+        let rejected = rejected
+            .iter()
+            .map(|rejected| vec![rejected.image.clone(), rejected.reason.to_string()]);
+        let unused = self
+            .unused
+            .iter()
+            .map(|unused| vec![unused.name.clone(), unused.reason.clone()]);
         unused.chain(rejected).collect()
     }
 
     fn pictures(&self) -> Vec<String> {
         let pictures = match self.calibration {
             Some(calibration) => {
-                let errors: Vec<f64> = calibration.images.iter().map(|image| image.rms_px).collect();
+                let errors: Vec<f64> = calibration
+                    .images
+                    .iter()
+                    .map(|image| image.rms_px)
+                    .collect();
                 let rejected = calibration
                     .rejected
                     .iter()
-                    .filter(|rejected| matches!(rejected.reason, RejectionReason::Inconsistent { .. }))
+                    .filter(|rejected| {
+                        matches!(rejected.reason, RejectionReason::Inconsistent { .. })
+                    })
                     .filter_map(|rejected| self.detected(&rejected.image, "not used"));
                 let chosen = photo::worst_and_median(&errors).into_iter().map(|ix| {
                     let image = &calibration.images[ix];
-                    let caption = format!("{}: {} px RMS", image.name, number(Some(image.rms_px), 3));
+                    let caption =
+                        format!("{}: {} px RMS", image.name, number(Some(image.rms_px), 3));
                     photo::with_corners(self.photos, &image.name, &caption, &image.points)
                 });
                 chosen.chain(rejected.take(1)).collect::<Vec<_>>()
             }
             None => {
-                let n_corners: Vec<f64> = self.views.iter().map(|view| view.points.len() as f64).collect();
+                let n_corners: Vec<f64> = self
+                    .views
+                    .iter()
+                    .map(|view| view.points.len() as f64)
+                    .collect();
                 let chosen = photo::worst_and_median(&n_corners).into_iter();
-                chosen.filter_map(|ix| self.detected(&self.views[ix].name, "detected corners")).collect()
+                chosen
+                    .filter_map(|ix| self.detected(&self.views[ix].name, "detected corners"))
+                    .collect()
             }
         };
         let shown = pictures.into_iter().filter(|picture| !picture.is_empty());
         let none = self.unused.first().map(|unused| {
-            photo::with_corners(self.photos, &unused.name, &format!("{}: {}", unused.name, unused.reason), &[])
+            photo::with_corners(
+                self.photos,
+                &unused.name,
+                &format!("{}: {}", unused.name, unused.reason),
+                &[],
+            )
         });
-        shown.chain(none.filter(|picture| !picture.is_empty() && self.calibration.is_none())).collect()
+        shown
+            .chain(none.filter(|picture| !picture.is_empty() && self.calibration.is_none()))
+            .collect()
     }
 
     /// The photo of a view with the detected corners only.
     fn detected(&self, name: &str, what: &str) -> Option<String> {
         let view = self.views.iter().find(|view| view.name == name)?;
         let points: Vec<PointFit> = detected_points(view);
-        Some(photo::with_corners(self.photos, name, &format!("{name}: {what}"), &points))
+        Some(photo::with_corners(
+            self.photos,
+            name,
+            &format!("{name}: {what}"),
+            &points,
+        ))
     }
 }
 
 /// Corners without a prediction.
 pub(super) fn detected_points(view: &BoardView) -> Vec<PointFit> {
     let unknown = [f64::NAN; 2];
-    view.points.iter().map(|point| PointFit { pixel: point.pixel, residual_px: unknown }).collect()
+    view.points
+        .iter()
+        .map(|point| PointFit {
+            pixel: point.pixel,
+            residual_px: unknown,
+        })
+        .collect()
 }
 
 fn corners(calibration: &IntrinsicsCalibration) -> impl Iterator<Item = &PointFit> {
@@ -210,17 +325,33 @@ fn corners(calibration: &IntrinsicsCalibration) -> impl Iterator<Item = &PointFi
 }
 
 fn range(grid: &ImageGrid<Option<f64>>) -> [f64; 2] {
-    let known = || grid.values.iter().flatten().copied().filter(|value| value.is_finite());
-    [known().fold(f64::INFINITY, f64::min), known().fold(0.0, f64::max)]
+    let known = || {
+        grid.values
+            .iter()
+            .flatten()
+            .copied()
+            .filter(|value| value.is_finite())
+    };
+    [
+        known().fold(f64::INFINITY, f64::min),
+        known().fold(0.0, f64::max),
+    ]
 }
 
 fn figures(calibration: &IntrinsicsCalibration) -> Vec<page::Figure> {
     let value = |name: &str| calibration.params.iter().find(|param| param.name == name);
-    let with_deviation =
-        |name: &str| value(name).map_or(String::new(), |param| with_sigma(param.value, param.sigma, 1));
+    let with_deviation = |name: &str| {
+        value(name).map_or(String::new(), |param| {
+            with_sigma(param.value, param.sigma, 1)
+        })
+    };
     vec![
         ("RMS error", number(Some(calibration.rms_px), 3), "px"),
-        ("projection, worst part", number(Some(range(&calibration.uncertainty_px)[1]), 2), "px"),
+        (
+            "projection, worst part",
+            number(Some(range(&calibration.uncertainty_px)[1]), 2),
+            "px",
+        ),
         ("focal length x", with_deviation("fx"), "px"),
         ("focal length y", with_deviation("fy"), "px"),
         ("principal point x", with_deviation("cx"), "px"),
@@ -239,18 +370,33 @@ fn parameters(calibration: &IntrinsicsCalibration) -> Vec<Vec<String>> {
         let meaning = MEANINGS.iter().find(|(name, _)| *name == param.name);
         let digits = if meaning.is_some() { 3 } else { 5 };
         vec![
-            meaning.map_or(param.name, |(_, meaning)| meaning).to_owned(),
+            meaning
+                .map_or(param.name, |(_, meaning)| meaning)
+                .to_owned(),
             with_sigma(param.value, param.sigma, digits),
         ]
     };
-    let noise = vec!["noise of a corner along one axis, px".to_owned(), number(Some(calibration.noise_px), 3)];
+    let noise = vec![
+        "noise of a corner along one axis, px".to_owned(),
+        number(Some(calibration.noise_px), 3),
+    ];
     calibration.params.iter().map(row).chain([noise]).collect()
 }
 
-const TRIAL_HEAD: [&str; 5] = ["from", "to", "gain on held-out corners, dB", "images", "decision"];
+const TRIAL_HEAD: [&str; 5] = [
+    "from",
+    "to",
+    "gain on held-out corners, dB",
+    "images",
+    "decision",
+];
 
 fn trial(trial: &LensTrial) -> Vec<String> {
-    let decision = if trial.kept { "accepted" } else { "not significant" };
+    let decision = if trial.kept {
+        "accepted"
+    } else {
+        "not significant"
+    };
     vec![
         trial.baseline.clone(),
         trial.variant.clone(),

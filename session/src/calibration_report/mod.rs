@@ -1,5 +1,6 @@
-//! Reports of calibrations: one page each that works offline, with the result, its uncertainty, the errors of all samples
-//! and, if the calibration was refused, the reason and the data that it is based on.
+//! Reports of calibrations: one page each that works offline, with the result, its uncertainty, the
+//! errors of all samples and, if the calibration was refused, the reason and the data that it is
+//! based on.
 
 mod bars;
 mod hand_eye;
@@ -47,8 +48,13 @@ pub struct Unused {
 /// # Errors
 /// [`Error::BadInput`] if it cannot.
 pub fn check_target_file(file: &Path) -> Result<(), Error> {
-    let folder = file.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    let is_page = file.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("html"));
+    let folder = file
+        .parent()
+        .filter(|folder| !folder.as_os_str().is_empty())
+        .unwrap_or(Path::new("."));
+    let is_page = file
+        .extension()
+        .is_some_and(|extension| extension.eq_ignore_ascii_case("html"));
     match folder.is_dir() && !file.is_dir() && is_page {
         true if is_other_file(file) => Err(Error::BadInput(format!(
             "--report {}: the file exists and is not a report of fieldrig; choose another name",

@@ -21,7 +21,11 @@ impl Page {
     ///
     /// * `verdict`: what the result is based on, if there is one.
     pub(super) fn new(title: &str, heading: &Heading, verdict: &str, figures: &[Figure]) -> Self {
-        let subtitle = [env!("CARGO_PKG_VERSION").to_owned(), run_folder::utc_now(), heading.input.clone()];
+        let subtitle = [
+            env!("CARGO_PKG_VERSION").to_owned(),
+            run_folder::utc_now(),
+            heading.input.clone(),
+        ];
         let (class, head, text) = match &heading.refused {
             Some(reason) => ("refused", "Refused", reason.as_str()),
             None if heading.warnings.is_empty() => ("accepted", "Accepted", verdict),
@@ -35,14 +39,25 @@ impl Page {
             list(&heading.warnings)
         );
         let figure = |(name, value, unit): &Figure| {
-            let unit = if unit.is_empty() { String::new() } else { format!("<small>{unit}</small>") };
-            format!("<div><dd>{}{unit}</dd><dt>{}</dt></div>\n", escaped(value), escaped(name))
+            let unit = if unit.is_empty() {
+                String::new()
+            } else {
+                format!("<small>{unit}</small>")
+            };
+            format!(
+                "<div><dd>{}{unit}</dd><dt>{}</dt></div>\n",
+                escaped(value),
+                escaped(name)
+            )
         };
         if !figures.is_empty() {
             let figures: String = figures.iter().map(figure).collect();
             html.push_str(&format!("<dl class=\"figures\">\n{figures}</dl>\n"));
         }
-        Self { title: title.to_owned(), html }
+        Self {
+            title: title.to_owned(),
+            html,
+        }
     }
 
     /// Adds a section. Without content, adds nothing.
@@ -53,16 +68,29 @@ impl Page {
         if content.is_empty() {
             return;
         }
-        let legend =
-            if legend.is_empty() { String::new() } else { format!("<p class=\"legend\">{}</p>", escaped(legend)) };
-        self.html.push_str(&format!("<h2>{}</h2>\n{legend}\n{content}\n", escaped(title)));
+        let legend = if legend.is_empty() {
+            String::new()
+        } else {
+            format!("<p class=\"legend\">{}</p>", escaped(legend))
+        };
+        self.html.push_str(&format!(
+            "<h2>{}</h2>\n{legend}\n{content}\n",
+            escaped(title)
+        ));
     }
 
     /// Adds a table. Without rows, adds nothing.
     pub(super) fn table(&mut self, title: &str, head: &[&str], rows: Vec<Vec<String>>) {
         if !rows.is_empty() {
             let head = head.iter().map(|name| (*name).to_owned()).collect();
-            self.html.push_str(&Table { title: title.to_owned(), head, rows }.html());
+            self.html.push_str(
+                &Table {
+                    title: title.to_owned(),
+                    head,
+                    rows,
+                }
+                .html(),
+            );
         }
     }
 
@@ -84,18 +112,32 @@ impl Page {
 
 /// A list of sentences; nothing if there are none.
 fn list(sentences: &[String]) -> String {
-    let items: String = sentences.iter().map(|sentence| format!("<li>{}</li>", escaped(sentence))).collect();
-    if items.is_empty() { items } else { format!("<ul>{items}</ul>") }
+    let items: String = sentences
+        .iter()
+        .map(|sentence| format!("<li>{}</li>", escaped(sentence)))
+        .collect();
+    if items.is_empty() {
+        items
+    } else {
+        format!("<ul>{items}</ul>")
+    }
 }
 
 /// A short text in a box; nothing if there is none.
 pub(super) fn note(text: Option<&str>) -> String {
-    text.map_or(String::new(), |text| format!("<p class=\"card note\">{}</p>", escaped(text)))
+    text.map_or(String::new(), |text| {
+        format!("<p class=\"card note\">{}</p>", escaped(text))
+    })
 }
 
 /// A code line to copy.
 pub(super) fn code(text: Option<&str>) -> String {
-    text.map_or(String::new(), |text| format!("<p class=\"card command\"><code>{}</code></p>", escaped(text)))
+    text.map_or(String::new(), |text| {
+        format!(
+            "<p class=\"card command\"><code>{}</code></p>",
+            escaped(text)
+        )
+    })
 }
 
 /// A chart in a box.
@@ -105,10 +147,17 @@ pub(super) fn chart(chart: &crate::chart::Chart) -> String {
 
 /// A picture with a caption.
 pub(super) fn figure(caption: &str, content: &str) -> String {
-    format!("<figure class=\"card\">{content}<figcaption>{}</figcaption></figure>\n", escaped(caption))
+    format!(
+        "<figure class=\"card\">{content}<figcaption>{}</figcaption></figure>\n",
+        escaped(caption)
+    )
 }
 
 /// Pictures next to each other.
 pub(super) fn gallery(figures: &[String]) -> String {
-    if figures.is_empty() { String::new() } else { format!("<div class=\"gallery\">\n{}</div>", figures.concat()) }
+    if figures.is_empty() {
+        String::new()
+    } else {
+        format!("<div class=\"gallery\">\n{}</div>", figures.concat())
+    }
 }

@@ -31,10 +31,17 @@ pub enum Photo {
 /// The images, by name.
 pub type Photos = BTreeMap<String, Photo>;
 
-/// The part of a photo around the corners, with the corners drawn over it, and a caption. Without corners, the whole
-/// photo. Empty if the photo cannot be read again.
-pub(super) fn with_corners(photos: &Photos, name: &str, caption: &str, points: &[PointFit]) -> String {
-    let Some(photo) = photos.get(name) else { return String::new() };
+/// The part of a photo around the corners, with the corners drawn over it, and a caption. Without
+/// corners, the whole photo. Empty if the photo cannot be read again.
+pub(super) fn with_corners(
+    photos: &Photos,
+    name: &str,
+    caption: &str,
+    points: &[PointFit],
+) -> String {
+    let Some(photo) = photos.get(name) else {
+        return String::new();
+    };
     match embedded(photo, points) {
         Ok((uri, part)) => {
             let mut map = ImageMap::of_part(part);
@@ -53,25 +60,37 @@ pub(super) fn with_corners(photos: &Photos, name: &str, caption: &str, points: &
 fn embedded(photo: &Photo, points: &[PointFit]) -> crate::Result<(String, ImagePart)> {
     let picture = match photo {
         Photo::File(file) => read(file)?,
-        Photo::Gray { size_px: [width, height], pixels } => {
+        Photo::Gray {
+            size_px: [width, height],
+            pixels,
+        } => {
             let gray = image::GrayImage::from_raw(*width, *height, pixels.clone());
-            gray.context("the image has fewer pixels than its size")?.into()
+            gray.context("the image has fewer pixels than its size")?
+                .into()
         }
     };
     let part = around(points, [picture.width(), picture.height()]);
-    let ImagePart { first_px: [x, y], size_px: [width, height] } = part;
+    let ImagePart {
+        first_px: [x, y],
+        size_px: [width, height],
+    } = part;
     let picture = picture.crop_imm(x, y, width, height);
     let small_px = fit_size(part.size_px, MAX_SIDE_PX);
     let [width, height] = small_px;
-    let small =
-        if small_px == part.size_px { picture } else { picture.resize_exact(width, height, FilterType::Triangle) };
+    let small = if small_px == part.size_px {
+        picture
+    } else {
+        picture.resize_exact(width, height, FilterType::Triangle)
+    };
     Ok((data_uri(&small.into_rgb8(), small_px, QUALITY)?, part))
 }
 
 fn read(file: &Path) -> crate::Result<DynamicImage> {
     let in_file = || format!("cannot read {}", file.display());
     let opened = std::io::BufReader::new(files::open(file).with_context(in_file)?);
-    let reader = image::ImageReader::new(opened).with_guessed_format().with_context(in_file)?;
+    let reader = image::ImageReader::new(opened)
+        .with_guessed_format()
+        .with_context(in_file)?;
     reader.decode().with_context(in_file)
 }
 
@@ -80,15 +99,29 @@ fn around(points: &[PointFit], size_px: [u32; 2]) -> ImagePart {
     const MARGIN_FRAC: f64 = 0.2;
     let range = |axis: usize| {
         let pixels = || points.iter().map(|point| point.pixel[axis]);
-        let (low, high) = (pixels().fold(f64::INFINITY, f64::min), pixels().fold(f64::NEG_INFINITY, f64::max));
+        let (low, high) = (
+            pixels().fold(f64::INFINITY, f64::min),
+            pixels().fold(f64::NEG_INFINITY, f64::max),
+        );
         let (margin, size) = (MARGIN_FRAC * (high - low), f64::from(size_px[axis]));
-        let [low, high] = [(low - margin).floor(), (high + margin).ceil()].map(|at| at.clamp(0.0, size));
-        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "inside the image")]
+        let [low, high] =
+            [(low - margin).floor(), (high + margin).ceil()].map(|at| at.clamp(0.0, size));
+        #[expect(
+            clippy::cast_possible_truncation,
+            clippy::cast_sign_loss,
+            reason = "inside the image"
+        )]
         (high > low + 1.0).then_some((low as u32, (high - low) as u32))
     };
     match (range(0), range(1)) {
-        (Some((x, width)), Some((y, height))) => ImagePart { first_px: [x, y], size_px: [width, height] },
-        _ => ImagePart { first_px: [0, 0], size_px },
+        (Some((x, width)), Some((y, height))) => ImagePart {
+            first_px: [x, y],
+            size_px: [width, height],
+        },
+        _ => ImagePart {
+            first_px: [0, 0],
+            size_px,
+        },
     }
 }
 
@@ -97,7 +130,12 @@ pub(super) fn worst_and_median(values: &[f64]) -> Vec<usize> {
     let mut order: Vec<usize> = (0..values.len()).collect();
     order.sort_by(|a, b| values[*b].total_cmp(&values[*a]));
     let mut chosen: Vec<usize> = order.first().copied().into_iter().collect();
-    chosen.extend(order.get(order.len() / 2).copied().filter(|ix| !chosen.contains(ix)));
+    chosen.extend(
+        order
+            .get(order.len() / 2)
+            .copied()
+            .filter(|ix| !chosen.contains(ix)),
+    );
     chosen
 }
 
@@ -121,16 +159,31 @@ mod tests {
 
     #[test]
     fn images_in_memory_are_shown() {
-        let photo = |pixels: Vec<u8>| Photos::from([("a".to_owned(), Photo::Gray { size_px: [8, 6], pixels })]);
+        let photo = |pixels: Vec<u8>| {
+            Photos::from([(
+                "a".to_owned(),
+                Photo::Gray {
+                    size_px: [8, 6],
+                    pixels,
+                },
+            )])
+        };
         assert!(with_corners(&photo(vec![128; 48]), "a", "a", &[]).contains("data:image/jpeg"));
         assert_eq!(with_corners(&photo(vec![128; 47]), "a", "a", &[]), "");
     }
 
     #[test]
     fn photos_are_cropped_to_the_target() {
-        let point = |x: f64, y: f64| PointFit { pixel: [x, y], residual_px: [0.0; 2] };
+        let point = |x: f64, y: f64| PointFit {
+            pixel: [x, y],
+            residual_px: [0.0; 2],
+        };
         let part = around(&[point(100.0, 50.0), point(200.0, 90.0)], [640, 96]);
-        assert_eq!((part.first_px, part.size_px), ([80, 42], [140, 54]), "the margin ends at the border");
+        assert_eq!(
+            (part.first_px, part.size_px),
+            ([80, 42], [140, 54]),
+            "the margin ends at the border"
+        );
         assert_eq!(around(&[], [640, 480]).size_px, [640, 480]);
     }
 }

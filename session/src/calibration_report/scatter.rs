@@ -17,7 +17,10 @@ pub(super) fn svg(axes: [&str; 2], points: &[ScatterPoint]) -> String {
     const SIDE: f64 = 320.0;
     const CENTER: f64 = SIDE / 2.0;
     const REACH: f64 = 125.0;
-    let used = points.iter().filter(|point| !point.is_outlier).flat_map(|point| point.at);
+    let used = points
+        .iter()
+        .filter(|point| !point.is_outlier)
+        .flat_map(|point| point.at);
     let step = tick_step(used.map(f64::abs).fold(1e-6, f64::max));
     let range = 2.0 * step;
     let to = |value: f64| REACH * (value / range).clamp(-1.12, 1.12);
@@ -37,8 +40,17 @@ pub(super) fn svg(axes: [&str; 2], points: &[ScatterPoint]) -> String {
         )
         .expect("writing to a string cannot fail");
     }
-    for ScatterPoint { name, at: [x, y], is_outlier } in points {
-        let class = if *is_outlier { "point outlier" } else { "point" };
+    for ScatterPoint {
+        name,
+        at: [x, y],
+        is_outlier,
+    } in points
+    {
+        let class = if *is_outlier {
+            "point outlier"
+        } else {
+            "point"
+        };
         writeln!(
             shapes,
             "<circle class=\"{class}\" cx=\"{:.1}\" cy=\"{:.1}\" r=\"4\"><title>{}: {x:.2}, {y:.2}</title></circle>",
@@ -64,7 +76,11 @@ pub(super) fn svg(axes: [&str; 2], points: &[ScatterPoint]) -> String {
 fn tick_step(largest: f64) -> f64 {
     let half = largest / 2.0;
     let power = 10f64.powf(half.log10().floor());
-    [1.0, 2.0, 5.0, 10.0].into_iter().map(|digit| digit * power).find(|step| *step >= half).unwrap_or(10.0 * power)
+    [1.0, 2.0, 5.0, 10.0]
+        .into_iter()
+        .map(|digit| digit * power)
+        .find(|step| *step >= half)
+        .unwrap_or(10.0 * power)
 }
 
 fn short(value: f64) -> String {
@@ -80,9 +96,22 @@ mod tests {
     fn range_contains_all_used_points() {
         assert_eq!([0.19, 3.9, 4.1, 10.0].map(tick_step), [0.1, 2.0, 5.0, 5.0]);
         assert_eq!([-0.0, 0.5, -2.0].map(short), ["0", "0.5", "-2"]);
-        let point = |name: &str, x: f64, is_outlier| ScatterPoint { name: name.to_owned(), at: [x, 0.0], is_outlier };
-        let svg = svg(["x, mm", "y, mm"], &[point("a", 3.9, false), point("<b>", 90.0, true)]);
-        assert!(svg.contains("cx=\"281.9\"") && svg.contains("cx=\"300.0\""), "{svg}");
-        assert!(svg.contains("&lt;b&gt;: 90.00") && svg.contains("point outlier"), "{svg}");
+        let point = |name: &str, x: f64, is_outlier| ScatterPoint {
+            name: name.to_owned(),
+            at: [x, 0.0],
+            is_outlier,
+        };
+        let svg = svg(
+            ["x, mm", "y, mm"],
+            &[point("a", 3.9, false), point("<b>", 90.0, true)],
+        );
+        assert!(
+            svg.contains("cx=\"281.9\"") && svg.contains("cx=\"300.0\""),
+            "{svg}"
+        );
+        assert!(
+            svg.contains("&lt;b&gt;: 90.00") && svg.contains("point outlier"),
+            "{svg}"
+        );
     }
 }

@@ -24,46 +24,108 @@ impl SceneReport<'_> {
     /// The page.
     pub fn html(&self) -> String {
         let n_images: usize = self.n_images.iter().map(|(_, n)| n).sum();
-        let mut figures: Vec<page::Figure> =
-            vec![("images", n_images.to_string(), ""), ("cameras", self.n_images.len().to_string(), "")];
+        let mut figures: Vec<page::Figure> = vec![
+            ("images", n_images.to_string(), ""),
+            ("cameras", self.n_images.len().to_string(), ""),
+        ];
         let mut verdict = String::new();
         if let Some(calibration) = self.calibration {
             let alignment = &calibration.alignment;
-            let gains_db: Vec<f64> =
-                alignment.trials.iter().filter(|trial| trial.kept).map(|trial| trial.gain_db).collect();
+            let gains_db: Vec<f64> = alignment
+                .trials
+                .iter()
+                .filter(|trial| trial.kept)
+                .map(|trial| trial.gain_db)
+                .collect();
             figures.push(("pairs of images", alignment.n_pairs.to_string(), ""));
-            figures.push(("accepted corrections", alignment.estimates.len().to_string(), ""));
+            figures.push((
+                "accepted corrections",
+                alignment.estimates.len().to_string(),
+                "",
+            ));
             if !gains_db.is_empty() {
-                figures.push(("gain on validation images", format!("{:+.2}", gains_db.iter().sum::<f64>()), "dB"));
+                figures.push((
+                    "gain on validation images",
+                    format!("{:+.2}", gains_db.iter().sum::<f64>()),
+                    "dB",
+                ));
             }
             verdict = match alignment.estimates.len() {
-                0 => "Nothing to correct: no parameter improves the prediction of validation images.".to_owned(),
+                0 => {
+                    "Nothing to correct: no parameter improves the prediction of validation images."
+                        .to_owned()
+                }
                 1 => "1 correction was accepted.".to_owned(),
                 n => format!("{n} corrections were accepted."),
             };
         }
-        let mut page = Page::new("Calibration from a static scene", self.heading, &verdict, &figures);
+        let mut page = Page::new(
+            "Calibration from a static scene",
+            self.heading,
+            &verdict,
+            &figures,
+        );
         if let Some(calibration) = self.calibration {
             let alignment = &calibration.alignment;
-            let corrections: Vec<Vec<String>> = alignment.estimates.iter().flat_map(|of| self.rows(of)).collect();
-            page.table("Corrections", &["parameter", "value ± standard deviation", "direction"], corrections);
-            let head = ["tested parameters", "gain on validation images, dB", "by camera, dB", "images", "decision"];
-            page.table("Trials", &head, alignment.trials.iter().map(trial).collect());
+            let corrections: Vec<Vec<String>> = alignment
+                .estimates
+                .iter()
+                .flat_map(|of| self.rows(of))
+                .collect();
+            page.table(
+                "Corrections",
+                &["parameter", "value ± standard deviation", "direction"],
+                corrections,
+            );
+            let head = [
+                "tested parameters",
+                "gain on validation images, dB",
+                "by camera, dB",
+                "images",
+                "decision",
+            ];
+            page.table(
+                "Trials",
+                &head,
+                alignment.trials.iter().map(trial).collect(),
+            );
         }
-        page.table("Cameras", &["camera", "images", "accepted gain, dB", "extrinsics"], self.cameras());
+        page.table(
+            "Cameras",
+            &["camera", "images", "accepted gain, dB", "extrinsics"],
+            self.cameras(),
+        );
         if let Some(calibration) = self.calibration {
-            let unobservable = calibration.alignment.unobservable.iter().map(|direction| vec![direction.to_string()]);
-            page.table("Unobservable directions", &["combination"], unobservable.collect());
+            let unobservable = calibration
+                .alignment
+                .unobservable
+                .iter()
+                .map(|direction| vec![direction.to_string()]);
+            page.table(
+                "Unobservable directions",
+                &["combination"],
+                unobservable.collect(),
+            );
             page.table("Poses of the cameras", &POSE_HEAD, self.poses(calibration));
-            page.table("Standard deviations of the poses", &SIGMA_HEAD, self.sigmas(calibration));
-            page.table("Relative camera poses", &POSE_HEAD, self.relative_poses(calibration));
+            page.table(
+                "Standard deviations of the poses",
+                &SIGMA_HEAD,
+                self.sigmas(calibration),
+            );
+            page.table(
+                "Relative camera poses",
+                &POSE_HEAD,
+                self.relative_poses(calibration),
+            );
         }
         page.finish()
     }
 
     fn cameras(&self) -> Vec<Vec<String>> {
         let row = |(name, n_images): &(String, usize)| {
-            let refused = self.calibration.and_then(|calibration| calibration.refused.get(name));
+            let refused = self
+                .calibration
+                .and_then(|calibration| calibration.refused.get(name));
             let is_corrected = |calibration: &SceneCalibration| {
                 calibration
                     .alignment
@@ -77,13 +139,19 @@ impl SceneReport<'_> {
                 (None, Some(_)) => "not changed".to_owned(),
                 (None, None) => "–".to_owned(),
             };
-            let kept = self.calibration.iter().flat_map(|calibration| &calibration.alignment.trials);
+            let kept = self
+                .calibration
+                .iter()
+                .flat_map(|calibration| &calibration.alignment.trials);
             let gains_db: Vec<f64> = kept
                 .filter(|trial| trial.kept)
                 .filter_map(|trial| trial.gain_by_camera_db.get(name).copied())
                 .collect();
-            let gain =
-                if gains_db.is_empty() { "–".to_owned() } else { format!("{:+.2}", gains_db.iter().sum::<f64>()) };
+            let gain = if gains_db.is_empty() {
+                "–".to_owned()
+            } else {
+                format!("{:+.2}", gains_db.iter().sum::<f64>())
+            };
             vec![name.clone(), n_images.to_string(), gain, state]
         };
         self.n_images.iter().map(row).collect()
@@ -91,26 +159,46 @@ impl SceneReport<'_> {
 
     /// Poses relative to the parents, before and after.
     fn poses(&self, calibration: &SceneCalibration) -> Vec<Vec<String>> {
-        let (Some(before), Some(after)) = (self.rig, &calibration.rig) else { return Vec::new() };
-        let both = before.cameras.iter().zip(&after.cameras).flat_map(|(before, after)| {
-            [
-                pose(format!("{} before, in the parent", &*before.name), &before.parent_from_camera),
-                pose(format!("{} after, in the parent", &*after.name), &after.parent_from_camera),
-            ]
-        });
+        let (Some(before), Some(after)) = (self.rig, &calibration.rig) else {
+            return Vec::new();
+        };
+        let both = before
+            .cameras
+            .iter()
+            .zip(&after.cameras)
+            .flat_map(|(before, after)| {
+                [
+                    pose(
+                        format!("{} before, in the parent", &*before.name),
+                        &before.parent_from_camera,
+                    ),
+                    pose(
+                        format!("{} after, in the parent", &*after.name),
+                        &after.parent_from_camera,
+                    ),
+                ]
+            });
         both.collect()
     }
 
-    /// Standard deviations of the poses in the parents and between cameras, along and about the axes of the camera.
+    /// Standard deviations of the poses in the parents and between cameras, along and about the
+    /// axes of the camera.
     fn sigmas(&self, calibration: &SceneCalibration) -> Vec<Vec<String>> {
         let row = |name: String, sigmas: PoseSigmas| {
             let list = |values: [f64; 3]| values.map(|value| format!("{value:.3}")).join(", ");
-            vec![name, list(sigmas.m.map(|m| 1e3 * m)), list(sigmas.rad.map(f64::to_degrees))]
+            vec![
+                name,
+                list(sigmas.m.map(|m| 1e3 * m)),
+                list(sigmas.rad.map(f64::to_degrees)),
+            ]
         };
         let of_camera = |(name, _): &(String, usize)| {
-            let own = calibration.sigmas(name).map(|sigmas| row(format!("{name} in its parent"), sigmas));
+            let own = calibration
+                .sigmas(name)
+                .map(|sigmas| row(format!("{name} in its parent"), sigmas));
             let relative = calibration.relative(name);
-            let relative = relative.and_then(|found| Some(row(format!("{name} in {}", found.first), found.sigmas?)));
+            let relative = relative
+                .and_then(|found| Some(row(format!("{name} in {}", found.first), found.sigmas?)));
             own.into_iter().chain(relative)
         };
         self.n_images.iter().flat_map(of_camera).collect()
@@ -119,56 +207,121 @@ impl SceneReport<'_> {
     fn relative_poses(&self, calibration: &SceneCalibration) -> Vec<Vec<String>> {
         let of_camera = |(name, _): &(String, usize)| {
             let relative = calibration.relative(name)?;
-            Some(pose(format!("{name} in {}", relative.first), &relative.first_from_camera))
+            Some(pose(
+                format!("{name} in {}", relative.first),
+                &relative.first_from_camera,
+            ))
         };
         self.n_images.iter().filter_map(of_camera).collect()
     }
 
     fn rows(&self, estimate: &Estimate) -> Vec<Vec<String>> {
         match estimate {
-            Estimate::HandEye(estimate) => pose_rows(&format!("camera {}", estimate.camera), estimate),
-            Estimate::DepthPose(estimate) => pose_rows(&format!("depth frame of {}", estimate.camera), estimate),
+            Estimate::HandEye(estimate) => {
+                pose_rows(&format!("camera {}", estimate.camera), estimate)
+            }
+            Estimate::DepthPose(estimate) => {
+                pose_rows(&format!("depth frame of {}", estimate.camera), estimate)
+            }
             Estimate::TimeOffset(estimate) => vec![scalar("time offset", estimate, 1e3, "ms", 3)],
             Estimate::DepthScale(estimate) => vec![scalar("depth scale", estimate, 1e2, "%", 3)],
             Estimate::Readout(estimate) => vec![scalar("readout time", estimate, 1e3, "ms", 3)],
-            Estimate::Joint { joint_ix, value, sigma, unobservable_frac } => {
-                let name = self.rig.and_then(|rig| rig.arm.joints.get(*joint_ix)).map(ToString::to_string);
+            Estimate::Joint {
+                joint_ix,
+                value,
+                sigma,
+                unobservable_frac,
+            } => {
+                let name = self
+                    .rig
+                    .and_then(|rig| rig.arm.joints.get(*joint_ix))
+                    .map(ToString::to_string);
                 let name = name.unwrap_or_else(|| joint_ix.to_string());
-                let shared = format!("{:.0} % not separable from other parameters", 100.0 * unobservable_frac);
-                vec![vec![format!("offset of joint {name}"), format!("{value:.5} ± {sigma:.5} rad or m"), shared]]
+                let shared = format!(
+                    "{:.0} % not separable from other parameters",
+                    100.0 * unobservable_frac
+                );
+                vec![vec![
+                    format!("offset of joint {name}"),
+                    format!("{value:.5} ± {sigma:.5} rad or m"),
+                    shared,
+                ]]
             }
-            Estimate::Lens { camera, focal_frac, focal_sigma, principal_offset_focals, principal_offset_sigma } => {
+            Estimate::Lens {
+                camera,
+                focal_frac,
+                focal_sigma,
+                principal_offset_focals,
+                principal_offset_sigma,
+            } => {
                 let row = |what: &str, values: &[f64; 2], sigmas: &[f64; 2], axis: usize| {
                     let (value, sigma) = (1e2 * values[axis], 1e2 * sigmas[axis]);
                     let name = format!("{what} {} of {camera}", ["x", "y"][axis]);
-                    vec![name, format!("{value:.3} ± {sigma:.3} % of the focal length"), String::new()]
+                    vec![
+                        name,
+                        format!("{value:.3} ± {sigma:.3} % of the focal length"),
+                        String::new(),
+                    ]
                 };
                 let focal = [0, 1].map(|axis| row("focal length", focal_frac, focal_sigma, axis));
-                let principal =
-                    [0, 1].map(|axis| row("principal point", principal_offset_focals, principal_offset_sigma, axis));
+                let principal = [0, 1].map(|axis| {
+                    row(
+                        "principal point",
+                        principal_offset_focals,
+                        principal_offset_sigma,
+                        axis,
+                    )
+                });
                 focal.into_iter().chain(principal).collect()
             }
-            Estimate::ImagePoses { camera, n_images, rms_m, rms_rad } => {
+            Estimate::ImagePoses {
+                camera,
+                n_images,
+                rms_m,
+                rms_rad,
+            } => {
                 let value = format!("{:.2} mm, {:.3}° RMS", 1e3 * rms_m, rms_rad.to_degrees());
-                vec![vec![format!("poses of {n_images} images of {camera}"), value, String::new()]]
+                vec![vec![
+                    format!("poses of {n_images} images of {camera}"),
+                    value,
+                    String::new(),
+                ]]
             }
         }
     }
 }
 
-const POSE_HEAD: [&str; 3] = ["camera", "position (x, y, z), mm", "rotation (quaternion x, y, z, w)"];
-const SIGMA_HEAD: [&str; 3] = ["camera", "along its axes (x, y, z), mm", "about its axes (x, y, z), °"];
+const POSE_HEAD: [&str; 3] = [
+    "camera",
+    "position (x, y, z), mm",
+    "rotation (quaternion x, y, z, w)",
+];
+const SIGMA_HEAD: [&str; 3] = [
+    "camera",
+    "along its axes (x, y, z), mm",
+    "about its axes (x, y, z), °",
+];
 
 fn pose(name: String, pose: &Transform) -> Vec<String> {
     let [x, y, z]: [f64; 3] = (1e3 * pose.translation.vector).into();
     let [qx, qy, qz, qw]: [f64; 4] = pose.rotation.coords.into();
-    vec![name, format!("{x:.2}, {y:.2}, {z:.2}"), format!("{qx:.5}, {qy:.5}, {qz:.5}, {qw:.5}")]
+    vec![
+        name,
+        format!("{x:.2}, {y:.2}, {z:.2}"),
+        format!("{qx:.5}, {qy:.5}, {qz:.5}, {qw:.5}"),
+    ]
 }
 
 fn pose_rows(what: &str, estimate: &PoseEstimate) -> Vec<Vec<String>> {
     let direction = |[x, y, z]: [f64; 3]| format!("({x:.2} {y:.2} {z:.2})");
-    let (deg, sigma_deg) = (estimate.rotation_rad.to_degrees(), estimate.rotation_sigma_rad.to_degrees());
-    let (mm, sigma_mm) = (1e3 * estimate.translation_m, 1e3 * estimate.translation_sigma_m);
+    let (deg, sigma_deg) = (
+        estimate.rotation_rad.to_degrees(),
+        estimate.rotation_sigma_rad.to_degrees(),
+    );
+    let (mm, sigma_mm) = (
+        1e3 * estimate.translation_m,
+        1e3 * estimate.translation_sigma_m,
+    );
     vec![
         vec![
             format!("rotation of {what}"),
@@ -183,14 +336,31 @@ fn pose_rows(what: &str, estimate: &PoseEstimate) -> Vec<Vec<String>> {
     ]
 }
 
-fn scalar(what: &str, estimate: &ScalarEstimate, factor: f64, unit: &str, digits: usize) -> Vec<String> {
+fn scalar(
+    what: &str,
+    estimate: &ScalarEstimate,
+    factor: f64,
+    unit: &str,
+    digits: usize,
+) -> Vec<String> {
     let value = super::with_sigma(factor * estimate.value, factor * estimate.sigma, digits);
-    vec![format!("{what} of {}", estimate.camera), format!("{value} {unit}"), String::new()]
+    vec![
+        format!("{what} of {}", estimate.camera),
+        format!("{value} {unit}"),
+        String::new(),
+    ]
 }
 
 fn trial(trial: &Trial) -> Vec<String> {
-    let decision = if trial.kept { "accepted" } else { "not significant" };
-    let by_camera = trial.gain_by_camera_db.iter().map(|(camera, gain_db)| format!("{camera} {gain_db:+.2}"));
+    let decision = if trial.kept {
+        "accepted"
+    } else {
+        "not significant"
+    };
+    let by_camera = trial
+        .gain_by_camera_db
+        .iter()
+        .map(|(camera, gain_db)| format!("{camera} {gain_db:+.2}"));
     vec![
         trial.candidate.to_string(),
         format!("{:+.2} ± {:.2}", trial.gain_db, trial.standard_error_db),
@@ -208,20 +378,43 @@ mod tests {
 
     #[test]
     fn corrections_trials_and_refused_cameras_are_listed() {
-        let estimate = ScalarEstimate { camera: "<wrist>".to_owned(), value: 0.008, sigma: 2e-5 };
+        let estimate = ScalarEstimate {
+            camera: "<wrist>".to_owned(),
+            value: 0.008,
+            sigma: 2e-5,
+        };
         let alignment = Alignment {
             estimates: vec![Estimate::TimeOffset(estimate)],
             trials: vec![
-                Trial::of_gains(Candidate::Cameras(ParamSet::TIME_OFFSET), &[0.4, 0.5, 0.3, 0.45])
-                    .with_cameras([("side", 0.4), ("side", 0.6)].into_iter()),
+                Trial::of_gains(
+                    Candidate::Cameras(ParamSet::TIME_OFFSET),
+                    &[0.4, 0.5, 0.3, 0.45],
+                )
+                .with_cameras([("side", 0.4), ("side", 0.6)].into_iter()),
             ],
             ..Alignment::default()
         };
         let refused = BTreeMap::from([("side".to_owned(), "it does not turn".to_owned())]);
-        let calibration = SceneCalibration { alignment, rig: None, refused };
-        let heading = Heading { input: "a.mcap".to_owned(), refused: None, warnings: vec!["side is kept".to_owned()] };
+        let calibration = SceneCalibration {
+            alignment,
+            rig: None,
+            refused,
+        };
+        let heading = Heading {
+            input: "a.mcap".to_owned(),
+            refused: None,
+            warnings: vec!["side is kept".to_owned()],
+        };
         let n_images = [("<wrist>".to_owned(), 30), ("side".to_owned(), 12)];
-        let with = |calibration| SceneReport { heading: &heading, rig: None, n_images: &n_images, calibration }.html();
+        let with = |calibration| {
+            SceneReport {
+                heading: &heading,
+                rig: None,
+                n_images: &n_images,
+                calibration,
+            }
+            .html()
+        };
         let page = with(Some(&calibration));
         for words in [
             "time offset of &lt;wrist&gt;",
@@ -239,7 +432,8 @@ mod tests {
         assert!(!page.contains("<wrist>"));
         let page = with(None);
         assert!(
-            page.contains("<td>side</td><td>12</td><td>–</td>") && !page.contains("accepted corrections"),
+            page.contains("<td>side</td><td>12</td><td>–</td>")
+                && !page.contains("accepted corrections"),
             "{page}"
         );
     }

@@ -25,11 +25,18 @@ impl TimeOffsetReport<'_> {
     pub fn html(&self) -> String {
         let figures = self.offset.map_or(Vec::new(), figures);
         let verdict = self.offset.map_or(String::new(), |offset| {
-            format!("Add {} s to stamps of B to get stamps of A.", with_sigma(offset.offset_secs, offset.sigma_secs, 6))
+            format!(
+                "Add {} s to stamps of B to get stamps of A.",
+                with_sigma(offset.offset_secs, offset.sigma_secs, 6)
+            )
         });
         let mut page = Page::new("Time offset", self.heading, &verdict, &figures);
         if let Some(offset) = self.offset {
-            page.table("Result", &["parameter", "value ± standard deviation"], parameters(offset));
+            page.table(
+                "Result",
+                &["parameter", "value ± standard deviation"],
+                parameters(offset),
+            );
         }
         if let Some(profile) = self.profile {
             let legend = "Correlation of the rotation rates at each offset. One high, narrow peak determines the offset; several peaks of equal height mean that the motion repeats.";
@@ -47,21 +54,35 @@ impl TimeOffsetReport<'_> {
     /// The rates in the part of the recording with the most motion.
     fn rates(&self, profile: &MotionProfile) -> String {
         let [a, b] = &profile.rates;
-        let (Some(start_a), Some(start_b)) = (a.first(), b.first()) else { return String::new() };
+        let (Some(start_a), Some(start_b)) = (a.first(), b.first()) else {
+            return String::new();
+        };
         let shown = liveliest(a);
         let part = |curve: &[[f64; 2]], secs_a: &dyn Fn(f64) -> f64| -> Vec<[f64; 2]> {
-            let moved = curve.iter().map(|[secs, rate]| [secs_a(*secs), rate.to_degrees()]);
-            let shown = moved.filter(|[secs, _]| shown.contains(secs)).map(|[secs, rate]| [secs - start_a[0], rate]);
+            let moved = curve
+                .iter()
+                .map(|[secs, rate]| [secs_a(*secs), rate.to_degrees()]);
+            let shown = moved
+                .filter(|[secs, _]| shown.contains(secs))
+                .map(|[secs, rate]| [secs - start_a[0], rate]);
             interrupted(&shown.collect::<Vec<_>>())
         };
         let from_first = |secs: f64| secs - start_b[0] + start_a[0];
         let rates_a = part(a, &|secs| secs);
-        let before =
-            rates_chart("Before: both streams from their first stamps", [rates_a.clone(), part(b, &from_first)]);
-        let Some(offset) = self.offset else { return before };
+        let before = rates_chart(
+            "Before: both streams from their first stamps",
+            [rates_a.clone(), part(b, &from_first)],
+        );
+        let Some(offset) = self.offset else {
+            return before;
+        };
         let drift = offset.drift_ppm.map_or(0.0, |[drift, _]| 1e-6 * drift);
         let on_a = |secs: f64| secs + offset.offset_secs + drift * (secs - offset.mid_secs);
-        before + &rates_chart("After: both streams on the clock of A", [rates_a, part(b, &on_a)])
+        before
+            + &rates_chart(
+                "After: both streams on the clock of A",
+                [rates_a, part(b, &on_a)],
+            )
     }
 }
 
@@ -69,13 +90,19 @@ impl TimeOffsetReport<'_> {
 fn liveliest(curve: &[[f64; 2]]) -> std::ops::RangeInclusive<f64> {
     const SHOWN_SECS: f64 = 15.0;
     let variation = |first: f64| {
-        let values =
-            || curve.iter().filter(|[secs, _]| (first..=first + SHOWN_SECS).contains(secs)).map(|[_, value]| *value);
+        let values = || {
+            curve
+                .iter()
+                .filter(|[secs, _]| (first..=first + SHOWN_SECS).contains(secs))
+                .map(|[_, value]| *value)
+        };
         let n = values().count().max(1) as f64;
         let mean = values().sum::<f64>() / n;
         values().map(|value| (value - mean).powi(2)).sum::<f64>()
     };
-    let (Some([first, _]), Some([last, _])) = (curve.first(), curve.last()) else { return 0.0..=0.0 };
+    let (Some([first, _]), Some([last, _])) = (curve.first(), curve.last()) else {
+        return 0.0..=0.0;
+    };
     let mut best = (0.0, *first);
     let mut at = *first;
     while at < (last - SHOWN_SECS).max(first + 0.5 * SHOWN_SECS) {
@@ -91,7 +118,11 @@ fn liveliest(curve: &[[f64; 2]]) -> std::ops::RangeInclusive<f64> {
 fn figures(offset: &TimeOffset) -> Vec<page::Figure> {
     let mut figures = vec![
         ("offset", number(Some(offset.offset_secs), 6), "s"),
-        ("standard deviation", number(Some(1e3 * offset.sigma_secs), 3), "ms"),
+        (
+            "standard deviation",
+            number(Some(1e3 * offset.sigma_secs), 3),
+            "ms",
+        ),
         ("residual", number(Some(offset.rms_deg), 3), "°"),
     ];
     if let Some([drift, _]) = offset.drift_ppm {
@@ -102,39 +133,78 @@ fn figures(offset: &TimeOffset) -> Vec<page::Figure> {
 
 fn parameters(offset: &TimeOffset) -> Vec<Vec<String>> {
     let mut rows = vec![
-        vec!["offset to add to stamps of B, s".to_owned(), with_sigma(offset.offset_secs, offset.sigma_secs, 6)],
-        vec!["RMS difference of the orientations, degrees".to_owned(), number(Some(offset.rms_deg), 3)],
+        vec![
+            "offset to add to stamps of B, s".to_owned(),
+            with_sigma(offset.offset_secs, offset.sigma_secs, 6),
+        ],
+        vec![
+            "RMS difference of the orientations, degrees".to_owned(),
+            number(Some(offset.rms_deg), 3),
+        ],
     ];
-    let drift = offset.drift_ppm.map_or("not significant".to_owned(), |[drift, sigma]| {
-        format!("{}, offset valid at {:.3} s on the clock of B", with_sigma(drift, sigma, 1), offset.mid_secs)
-    });
+    let drift = offset
+        .drift_ppm
+        .map_or("not significant".to_owned(), |[drift, sigma]| {
+            format!(
+                "{}, offset valid at {:.3} s on the clock of B",
+                with_sigma(drift, sigma, 1),
+                offset.mid_secs
+            )
+        });
     rows.push(vec!["drift of A relative to B, ppm".to_owned(), drift]);
     match &offset.hand_eye {
         Some(Ok(bodies)) => {
             let position: [f64; 3] = (1e3 * bodies.a_body_from_b_body.translation.vector).into();
-            let three = |values: [f64; 3], digits: usize| values.map(|value| format!("{value:.digits$}")).join(", ");
-            rows.push(vec!["position of body B in body A, mm".to_owned(), three(position, 2)]);
-            rows.push(vec!["standard deviation, mm".to_owned(), three(bodies.sigma_mm, 2)]);
-            rows.push(vec!["standard deviation, degrees".to_owned(), three(bodies.sigma_deg, 3)]);
+            let three = |values: [f64; 3], digits: usize| {
+                values.map(|value| format!("{value:.digits$}")).join(", ")
+            };
+            rows.push(vec![
+                "position of body B in body A, mm".to_owned(),
+                three(position, 2),
+            ]);
+            rows.push(vec![
+                "standard deviation, mm".to_owned(),
+                three(bodies.sigma_mm, 2),
+            ]);
+            rows.push(vec![
+                "standard deviation, degrees".to_owned(),
+                three(bodies.sigma_deg, 3),
+            ]);
         }
-        Some(Err(refusal)) => rows.push(vec!["transform between the bodies".to_owned(), format!("refused: {refusal}")]),
+        Some(Err(refusal)) => rows.push(vec![
+            "transform between the bodies".to_owned(),
+            format!("refused: {refusal}"),
+        ]),
         None => (),
     }
     rows
 }
 
 fn correlation(profile: &MotionProfile, offset: Option<&TimeOffset>) -> String {
-    let peak = profile.correlation.iter().max_by(|a, b| a[1].total_cmp(&b[1]));
-    let Some(peak) = peak else { return String::new() };
-    // Without a limit, the offset may be the difference between two clock epochs. Labels are then relative to the
-    // peak.
+    let peak = profile
+        .correlation
+        .iter()
+        .max_by(|a, b| a[1].total_cmp(&b[1]));
+    let Some(peak) = peak else {
+        return String::new();
+    };
+    // Without a limit, the offset may be the difference between two clock epochs. Labels are then
+    // relative to the peak.
     const MAX_ABSOLUTE_SECS: f64 = 1e5;
-    let base_secs = if peak[0].abs() > MAX_ABSOLUTE_SECS { peak[0].round() } else { 0.0 };
+    let base_secs = if peak[0].abs() > MAX_ABSOLUTE_SECS {
+        peak[0].round()
+    } else {
+        0.0
+    };
     let label = match base_secs == 0.0 {
         true => "offset, s".to_owned(),
         false => format!("offset relative to {base_secs:.0} s (s)"),
     };
-    let curve = profile.correlation.iter().map(|[secs, value]| [secs - base_secs, *value]).collect::<Vec<_>>();
+    let curve = profile
+        .correlation
+        .iter()
+        .map(|[secs, value]| [secs - base_secs, *value])
+        .collect::<Vec<_>>();
     let (at, what) = match offset {
         Some(offset) => (offset.offset_secs - base_secs, "result"),
         None => (peak[0] - base_secs, "highest correlation"),
@@ -146,7 +216,11 @@ fn correlation(profile: &MotionProfile, offset: Option<&TimeOffset>) -> String {
         y: linear("correlation"),
         lines: vec![line("correlation", &with_peaks(&curve))],
         thresholds: Vec::new(),
-        markers: vec![Marker { x: at, label: format!("{what}: {at:.3} s"), line_ix: 0 }],
+        markers: vec![Marker {
+            x: at,
+            label: format!("{what}: {at:.3} s"),
+            line_ix: 0,
+        }],
     })
 }
 
@@ -163,8 +237,14 @@ fn rates_chart(title: &str, [a, b]: [Vec<[f64; 2]>; 2]) -> String {
 }
 
 fn residual(offset: &TimeOffset) -> String {
-    let Some(first) = offset.residuals.first() else { return String::new() };
-    let curve: Vec<[f64; 2]> = offset.residuals.iter().map(|[secs, deg]| [secs - first[0], *deg]).collect();
+    let Some(first) = offset.residuals.first() else {
+        return String::new();
+    };
+    let curve: Vec<[f64; 2]> = offset
+        .residuals
+        .iter()
+        .map(|[secs, deg]| [secs - first[0], *deg])
+        .collect();
     page::chart(&Chart {
         title: format!("RMS {:.3}°", offset.rms_deg),
         subtitle: String::new(),
@@ -179,7 +259,10 @@ fn residual(offset: &TimeOffset) -> String {
 /// Inserts a NaN point into each gap, so that the line is interrupted.
 fn interrupted(curve: &[[f64; 2]]) -> Vec<[f64; 2]> {
     const GAP: f64 = 2.5; // Relative to the smallest step.
-    let step = curve.windows(2).map(|pair| pair[1][0] - pair[0][0]).fold(f64::INFINITY, f64::min);
+    let step = curve
+        .windows(2)
+        .map(|pair| pair[1][0] - pair[0][0])
+        .fold(f64::INFINITY, f64::min);
     let mut parts = Vec::with_capacity(curve.len());
     for (ix, point) in curve.iter().enumerate() {
         if ix > 0 && point[0] - curve[ix - 1][0] > GAP * step {
@@ -191,12 +274,28 @@ fn interrupted(curve: &[[f64; 2]]) -> Vec<[f64; 2]> {
 }
 
 fn linear(label: &str) -> Axis {
-    Axis { label: label.to_owned(), scale: Scale::Linear, ticks: Vec::new() }
+    Axis {
+        label: label.to_owned(),
+        scale: Scale::Linear,
+        ticks: Vec::new(),
+    }
 }
 
 fn line(label: &str, curve: &[[f64; 2]]) -> Line {
-    let points = curve.iter().map(|[x, y]| Point { x: *x, y: *y, low: *y, high: *y }).collect();
-    Line { label: label.to_owned(), points, is_peer: false }
+    let points = curve
+        .iter()
+        .map(|[x, y]| Point {
+            x: *x,
+            y: *y,
+            low: *y,
+            high: *y,
+        })
+        .collect();
+    Line {
+        label: label.to_owned(),
+        points,
+        is_peer: false,
+    }
 }
 
 /// A curve with fewer points: the lowest and the highest of each interval, so that no peak is lost.
@@ -211,7 +310,10 @@ fn with_peaks(curve: &[[f64; 2]]) -> Vec<[f64; 2]> {
         two.sort_by(|a, b| a[0].total_cmp(&b[0]));
         two
     };
-    curve.chunks(curve.len().div_ceil(MAX_POINTS / 2)).flat_map(extremes).collect()
+    curve
+        .chunks(curve.len().div_ceil(MAX_POINTS / 2))
+        .flat_map(extremes)
+        .collect()
 }
 
 #[cfg(test)]
@@ -223,13 +325,21 @@ mod tests {
         let mut curve: Vec<[f64; 2]> = (0..10_000).map(|ix| [f64::from(ix), 0.5]).collect();
         curve[6789][1] = 0.9;
         let reduced = with_peaks(&curve);
-        assert!(reduced.len() <= MAX_POINTS && reduced.contains(&[6789.0, 0.9]), "{}", reduced.len());
+        assert!(
+            reduced.len() <= MAX_POINTS && reduced.contains(&[6789.0, 0.9]),
+            "{}",
+            reduced.len()
+        );
         assert!(reduced.is_sorted_by(|a, b| a[0] <= b[0]));
         assert_eq!(with_peaks(&curve[..5]), curve[..5]);
         let parts = interrupted(&[[0.0, 1.0], [1.0, 2.0], [5.0, 3.0]]);
-        assert!(parts.len() == 4 && parts[2][1].is_nan() && parts[3] == [5.0, 3.0], "{parts:?}");
-        let motion: Vec<[f64; 2]> =
-            (0..1000).map(|ix| [0.1 * f64::from(ix), if ix == 605 { 1.0 } else { 0.0 }]).collect();
+        assert!(
+            parts.len() == 4 && parts[2][1].is_nan() && parts[3] == [5.0, 3.0],
+            "{parts:?}"
+        );
+        let motion: Vec<[f64; 2]> = (0..1000)
+            .map(|ix| [0.1 * f64::from(ix), if ix == 605 { 1.0 } else { 0.0 }])
+            .collect();
         assert!(liveliest(&motion).contains(&60.5) && !liveliest(&motion).contains(&30.0));
     }
 }

@@ -7,7 +7,8 @@ pub enum Scale {
     Linear,
     /// Logarithmic, for values above 0.
     Log,
-    /// Evenly spaced levels, given in ascending order. Positions between two levels are interpolated linearly.
+    /// Evenly spaced levels, given in ascending order. Positions between two levels are
+    /// interpolated linearly.
     Levels(Vec<f64>),
 }
 
@@ -66,8 +67,16 @@ impl Axis {
             Scale::Log => log_ticks(low, high),
             Scale::Levels(levels) => levels.clone(),
         };
-        let ticks = ticks.into_iter().map(|value| (value, compact_number(value))).collect();
-        AxisRange { scale: self.scale.clone(), low, high, ticks }
+        let ticks = ticks
+            .into_iter()
+            .map(|value| (value, compact_number(value)))
+            .collect();
+        AxisRange {
+            scale: self.scale.clone(),
+            low,
+            high,
+            ticks,
+        }
     }
 }
 
@@ -90,7 +99,9 @@ fn level_position(levels: &[f64], value: f64) -> f64 {
     if levels.len() < 2 {
         return 0.0;
     }
-    let next = levels.partition_point(|level| *level < value).clamp(1, levels.len() - 1);
+    let next = levels
+        .partition_point(|level| *level < value)
+        .clamp(1, levels.len() - 1);
     let (before, after) = (levels[next - 1], levels[next]);
     (next - 1) as f64 + (value - before) / (after - before)
 }
@@ -99,7 +110,10 @@ fn level_position(levels: &[f64], value: f64) -> f64 {
 fn linear_ticks(low: f64, high: f64) -> Vec<f64> {
     let rough = (high - low) / N_TICKS;
     let power = 10.0_f64.powf(rough.log10().floor());
-    let step = [1.0, 2.0, 5.0, 10.0].map(|factor| factor * power).into_iter().find(|step| *step >= rough);
+    let step = [1.0, 2.0, 5.0, 10.0]
+        .map(|factor| factor * power)
+        .into_iter()
+        .find(|step| *step >= rough);
     let step = step.unwrap_or(10.0 * power);
     let (mut ticks, mut n) = (Vec::new(), (low / step).ceil());
     while n * step <= high {
@@ -109,8 +123,8 @@ fn linear_ticks(low: f64, high: f64) -> Vec<f64> {
     ticks
 }
 
-/// Ticks at 1, 2 and 5 times powers of ten. If these are too many, only at the powers; if too few, at all multiples of
-/// the powers.
+/// Ticks at 1, 2 and 5 times powers of ten. If these are too many, only at the powers; if too few,
+/// at all multiples of the powers.
 fn log_ticks(low: f64, high: f64) -> Vec<f64> {
     let mut powers = Vec::new();
     let mut power = 10.0_f64.powf(low.log10().floor());
@@ -118,13 +132,23 @@ fn log_ticks(low: f64, high: f64) -> Vec<f64> {
         powers.push(power);
         power *= 10.0;
     }
-    let all = powers.iter().flat_map(|power| [*power, 2.0 * power, 5.0 * power]);
+    let all = powers
+        .iter()
+        .flat_map(|power| [*power, 2.0 * power, 5.0 * power]);
     let all: Vec<f64> = all.filter(|tick| (low..=high).contains(tick)).collect();
     if all.len() < 3 {
-        let multiples = powers.iter().flat_map(|power| (1..10).map(move |n| f64::from(n) * power));
-        return multiples.filter(|tick| (low..=high).contains(tick)).collect();
+        let multiples = powers
+            .iter()
+            .flat_map(|power| (1..10).map(move |n| f64::from(n) * power));
+        return multiples
+            .filter(|tick| (low..=high).contains(tick))
+            .collect();
     }
-    if all.len() as f64 <= 2.0 * N_TICKS { all } else { powers.into_iter().filter(|tick| *tick >= low).collect() }
+    if all.len() as f64 <= 2.0 * N_TICKS {
+        all
+    } else {
+        powers.into_iter().filter(|tick| *tick >= low).collect()
+    }
 }
 
 /// Formats a number for an axis: at most three decimals, thousands as k, millions as M.
@@ -144,33 +168,59 @@ mod tests {
     use super::*;
 
     fn axis(scale: Scale) -> Axis {
-        Axis { label: String::new(), scale, ticks: Vec::new() }
+        Axis {
+            label: String::new(),
+            scale,
+            ticks: Vec::new(),
+        }
     }
 
     #[test]
     fn axis_numbers_are_compact() {
         let labels = [0.25, 60.0, 0.1, 512_000.0, 1e6, 1500.0, -0.0001, 25.0].map(compact_number);
-        assert_eq!(labels, ["0.25", "60", "0.1", "512k", "1M", "1.5k", "0", "25"]);
+        assert_eq!(
+            labels,
+            ["0.25", "60", "0.1", "512k", "1M", "1.5k", "0", "25"]
+        );
     }
 
     #[test]
     fn ticks_are_round_and_within_range() {
-        let labels = |span: AxisRange| -> Vec<String> { span.ticks.into_iter().map(|(_, label)| label).collect() };
-        assert_eq!(labels(axis(Scale::Linear).span([21.0, 33.0].into_iter())), ["22", "24", "26", "28", "30", "32"]);
+        let labels = |span: AxisRange| -> Vec<String> {
+            span.ticks.into_iter().map(|(_, label)| label).collect()
+        };
+        assert_eq!(
+            labels(axis(Scale::Linear).span([21.0, 33.0].into_iter())),
+            ["22", "24", "26", "28", "30", "32"]
+        );
         let log = labels(axis(Scale::Log).span([1900.0, 70_000.0].into_iter()));
         assert_eq!(log, ["2k", "5k", "10k", "20k", "50k"]);
-        assert_eq!(labels(axis(Scale::Log).span([3.1, 7.4].into_iter())), ["4", "5", "6", "7"]);
+        assert_eq!(
+            labels(axis(Scale::Log).span([3.1, 7.4].into_iter())),
+            ["4", "5", "6", "7"]
+        );
         let flat = axis(Scale::Linear).span([24.0, 24.0].into_iter());
-        assert!(flat.ticks.len() >= 3 && (flat.frac(24.0) - 0.5).abs() < 1e-9, "{flat:?}");
+        assert!(
+            flat.ticks.len() >= 3 && (flat.frac(24.0) - 0.5).abs() < 1e-9,
+            "{flat:?}"
+        );
     }
 
     #[test]
     fn levels_are_evenly_spaced() {
         let span = axis(Scale::Levels(vec![0.0, 1.0, 10.0, 50.0])).span([0.0, 50.0].into_iter());
         let at = |value: f64| span.frac(value);
-        assert_eq!([at(0.0), at(1.0), at(10.0), at(50.0)], [0.125, 0.375, 0.625, 0.875]);
+        assert_eq!(
+            [at(0.0), at(1.0), at(10.0), at(50.0)],
+            [0.125, 0.375, 0.625, 0.875]
+        );
         assert_eq!(at(30.0), 0.75);
-        assert!(axis(Scale::Levels(Vec::new())).span([].into_iter()).frac(1.0).is_finite());
+        assert!(
+            axis(Scale::Levels(Vec::new()))
+                .span([].into_iter())
+                .frac(1.0)
+                .is_finite()
+        );
     }
 
     #[test]

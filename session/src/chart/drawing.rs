@@ -102,25 +102,55 @@ impl Drawing {
 
 fn element(shape: &VectorShape) -> String {
     match shape {
-        VectorShape::Line { points, color, width, dash } => {
-            let dash = dash.map_or(String::new(), |[dash, gap]| format!(" stroke-dasharray=\"{dash} {gap}\""));
+        VectorShape::Line {
+            points,
+            color,
+            width,
+            dash,
+        } => {
+            let dash = dash.map_or(String::new(), |[dash, gap]| {
+                format!(" stroke-dasharray=\"{dash} {gap}\"")
+            });
             format!(
                 "<polyline points=\"{}\" fill=\"none\" stroke=\"{}\" stroke-width=\"{width}\" stroke-linejoin=\"round\"{dash}/>\n",
                 coordinates(points),
                 hex(*color)
             )
         }
-        VectorShape::Area { points, color, opacity_frac } => {
-            let opacity = if *opacity_frac < 1.0 { format!(" fill-opacity=\"{opacity_frac}\"") } else { String::new() };
-            format!("<polygon points=\"{}\" fill=\"{}\"{opacity}/>\n", coordinates(points), hex(*color))
+        VectorShape::Area {
+            points,
+            color,
+            opacity_frac,
+        } => {
+            let opacity = if *opacity_frac < 1.0 {
+                format!(" fill-opacity=\"{opacity_frac}\"")
+            } else {
+                String::new()
+            };
+            format!(
+                "<polygon points=\"{}\" fill=\"{}\"{opacity}/>\n",
+                coordinates(points),
+                hex(*color)
+            )
         }
-        VectorShape::Text { at: [x, y], text, color, size, anchor, vertical } => {
+        VectorShape::Text {
+            at: [x, y],
+            text,
+            color,
+            size,
+            anchor,
+            vertical,
+        } => {
             let anchor = match anchor {
                 Anchor::Start => "start",
                 Anchor::Middle => "middle",
                 Anchor::End => "end",
             };
-            let rotation = if *vertical { format!(" transform=\"rotate(-90 {x:.2} {y:.2})\"") } else { String::new() };
+            let rotation = if *vertical {
+                format!(" transform=\"rotate(-90 {x:.2} {y:.2})\"")
+            } else {
+                String::new()
+            };
             format!(
                 "<text x=\"{x:.2}\" y=\"{y:.2}\" font-size=\"{}\" fill=\"{}\" text-anchor=\"{anchor}\" dominant-baseline=\"central\"{rotation}>{}</text>\n",
                 size.height(),
@@ -146,7 +176,10 @@ fn hex([red, green, blue]: Color) -> String {
 
 /// Escapes text for SVG and HTML, inside elements and quoted attributes.
 pub fn escaped(text: &str) -> String {
-    text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
+    text.replace('&', "&amp;")
+        .replace('<', "&lt;")
+        .replace('>', "&gt;")
+        .replace('"', "&quot;")
 }
 
 #[cfg(test)]
@@ -157,10 +190,27 @@ mod tests {
     fn svg_text_is_escaped() {
         let at = [1.0, 2.0];
         let (color, size, anchor) = ([0, 114, 178], TextSize::Normal, Anchor::Start);
-        let text = VectorShape::Text { at, text: "a<b> & \"c\"".into(), color, size, anchor, vertical: true };
-        let svg = Drawing { size: [10.0, 5.0], shapes: vec![text] }.svg();
-        assert!(svg.contains("a&lt;b&gt; &amp; &quot;c&quot;</text>"), "{svg}");
-        assert!(svg.contains("fill=\"#0072b2\"") && svg.contains("rotate(-90 1.00 2.00)"), "{svg}");
+        let text = VectorShape::Text {
+            at,
+            text: "a<b> & \"c\"".into(),
+            color,
+            size,
+            anchor,
+            vertical: true,
+        };
+        let svg = Drawing {
+            size: [10.0, 5.0],
+            shapes: vec![text],
+        }
+        .svg();
+        assert!(
+            svg.contains("a&lt;b&gt; &amp; &quot;c&quot;</text>"),
+            "{svg}"
+        );
+        assert!(
+            svg.contains("fill=\"#0072b2\"") && svg.contains("rotate(-90 1.00 2.00)"),
+            "{svg}"
+        );
         assert!(svg.starts_with("<svg ") && svg.ends_with("</svg>\n"));
     }
 }

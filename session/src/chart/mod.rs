@@ -1,7 +1,7 @@
 //! Line charts, drawn once for both SVG and PNG.
 //!
-//! The colors are the color-blind safe palette of Okabe and Ito (2008). Lines also differ in the shape of their dots,
-//! for readers of grayscale prints.
+//! The colors are the color-blind safe palette of Okabe and Ito (2008). Lines also differ in the
+//! shape of their dots, for readers of grayscale prints.
 
 mod axis;
 pub mod drawing;
@@ -65,8 +65,15 @@ pub struct Marker {
     pub line_ix: usize,
 }
 
-const COLORS: [Color; 7] =
-    [[0, 114, 178], [213, 94, 0], [0, 158, 115], [204, 121, 167], [230, 159, 0], [86, 180, 233], [0, 0, 0]];
+const COLORS: [Color; 7] = [
+    [0, 114, 178],
+    [213, 94, 0],
+    [0, 158, 115],
+    [204, 121, 167],
+    [230, 159, 0],
+    [86, 180, 233],
+    [0, 0, 0],
+];
 const INK: Color = [40, 40, 40];
 const FAINT_INK: Color = [95, 95, 95];
 const GRID: Color = [226, 226, 226];
@@ -112,12 +119,19 @@ impl Chart {
     /// Draws the chart; the legend is next to the plot and never covers it.
     pub fn draw(&self) -> Drawing {
         let legend = self.legend();
-        let longest = legend.iter().flat_map(|entry| &entry.rows).map(|row| text_width(row, TextSize::Normal));
+        let longest = legend
+            .iter()
+            .flat_map(|entry| &entry.rows)
+            .map(|row| text_width(row, TextSize::Normal));
         let legend_width = LEGEND_SWATCH + longest.fold(0.0, f64::max);
         let top = TITLE_HEIGHT + MARKER_ROW * self.markers.len() as f64;
         let points = || self.lines.iter().flat_map(|line| &line.points);
-        let ys = points().flat_map(|point| [point.low, point.high]).chain(self.thresholds.iter().map(|floor| floor.0));
-        let xs = points().map(|point| point.x).chain(self.markers.iter().map(|marker| marker.x));
+        let ys = points()
+            .flat_map(|point| [point.low, point.high])
+            .chain(self.thresholds.iter().map(|floor| floor.0));
+        let xs = points()
+            .map(|point| point.x)
+            .chain(self.markers.iter().map(|marker| marker.x));
         let plot = Plot {
             left: LEFT,
             right: WIDTH - legend_width - 2.0 * MARGIN,
@@ -159,15 +173,29 @@ impl Chart {
             shapes.push(line_between([plot.left, y], [plot.right, y], GRID, 1.0));
             shapes.push(text([plot.left - 8.0, y], label, INK, Anchor::End));
         }
-        let corners = [[plot.left, plot.top], [plot.left, plot.bottom], [plot.right, plot.bottom]];
-        shapes.push(VectorShape::Line { points: corners.to_vec(), color: FAINT_INK, width: 1.0, dash: None });
+        let corners = [
+            [plot.left, plot.top],
+            [plot.left, plot.bottom],
+            [plot.right, plot.bottom],
+        ];
+        shapes.push(VectorShape::Line {
+            points: corners.to_vec(),
+            color: FAINT_INK,
+            width: 1.0,
+            dash: None,
+        });
     }
 
     fn draw_thresholds(&self, plot: &Plot, shapes: &mut Vec<VectorShape>) {
         for (value, _) in &self.thresholds {
             let y = plot.y(*value);
             let points = vec![[plot.left, y], [plot.right, y]];
-            shapes.push(VectorShape::Line { points, color: FAINT_INK, width: 1.2, dash: Some([2.0, 3.0]) });
+            shapes.push(VectorShape::Line {
+                points,
+                color: FAINT_INK,
+                width: 1.2,
+                dash: Some([2.0, 3.0]),
+            });
         }
     }
 
@@ -177,7 +205,12 @@ impl Chart {
             let (x, color) = (plot.x(marker.x), color_of(marker.line_ix));
             let y = TITLE_HEIGHT + MARKER_ROW * (row as f64 + 0.4);
             let points = vec![[x, y + 7.0], [x, plot.bottom]];
-            shapes.push(VectorShape::Line { points, color, width: 1.2, dash: Some([5.0, 4.0]) });
+            shapes.push(VectorShape::Line {
+                points,
+                color,
+                width: 1.2,
+                dash: Some([5.0, 4.0]),
+            });
             let half = 0.5 * text_width(&marker.label, TextSize::Normal);
             let center = x.min(plot.right - half).max(plot.left + half);
             shapes.push(text([center, y], &marker.label, color, Anchor::Middle));
@@ -188,23 +221,47 @@ impl Chart {
         let size = TextSize::Title;
         let anchor = Anchor::Start;
         let at = [LEFT, 20.0];
-        shapes.push(VectorShape::Text { at, text: self.title.clone(), color: INK, size, anchor, vertical: false });
+        shapes.push(VectorShape::Text {
+            at,
+            text: self.title.clone(),
+            color: INK,
+            size,
+            anchor,
+            vertical: false,
+        });
         shapes.push(text([LEFT, 40.0], &self.subtitle, FAINT_INK, Anchor::Start));
         let middle = 0.5 * (plot.left + plot.right);
-        shapes.push(text([middle, plot.bottom + 38.0], &self.x.label, INK, Anchor::Middle));
+        shapes.push(text(
+            [middle, plot.bottom + 38.0],
+            &self.x.label,
+            INK,
+            Anchor::Middle,
+        ));
         let at = [18.0, 0.5 * (plot.top + plot.bottom)];
         let (size, anchor) = (TextSize::Normal, Anchor::Middle);
-        shapes.push(VectorShape::Text { at, text: self.y.label.clone(), color: INK, size, anchor, vertical: true });
+        shapes.push(VectorShape::Text {
+            at,
+            text: self.y.label.clone(),
+            color: INK,
+            size,
+            anchor,
+            vertical: true,
+        });
     }
 
     fn legend(&self) -> Vec<Entry> {
         let lines = self.lines.iter().enumerate().map(|(ix, line)| Entry {
-            swatch: Swatch::Line { ix, is_peer: line.is_peer },
+            swatch: Swatch::Line {
+                ix,
+                is_peer: line.is_peer,
+            },
             rows: wrap(&line.label, MAX_LEGEND_CHARS),
         });
         let thresholds = self.thresholds.iter();
-        let thresholds =
-            thresholds.map(|(_, label)| Entry { swatch: Swatch::Threshold, rows: wrap(label, MAX_LEGEND_CHARS) });
+        let thresholds = thresholds.map(|(_, label)| Entry {
+            swatch: Swatch::Threshold,
+            rows: wrap(label, MAX_LEGEND_CHARS),
+        });
         lines.chain(thresholds).collect()
     }
 }
@@ -228,11 +285,21 @@ fn draw_legend(legend: &[Entry], plot: &Plot, shapes: &mut Vec<VectorShape>) {
         match entry.swatch {
             Swatch::Line { ix, is_peer } => {
                 let dash = is_peer.then_some(PEER_DASH);
-                shapes.push(VectorShape::Line { points, color: color_of(ix), width: 2.0, dash });
+                shapes.push(VectorShape::Line {
+                    points,
+                    color: color_of(ix),
+                    width: 2.0,
+                    dash,
+                });
                 draw_dot([left + 12.0, y], ix, shapes);
             }
             Swatch::Threshold => {
-                shapes.push(VectorShape::Line { points, color: FAINT_INK, width: 1.2, dash: Some([2.0, 3.0]) });
+                shapes.push(VectorShape::Line {
+                    points,
+                    color: FAINT_INK,
+                    width: 1.2,
+                    dash: Some([2.0, 3.0]),
+                });
             }
         }
         for row in &entry.rows {
@@ -252,12 +319,28 @@ fn color_of(line_ix: usize) -> Color {
 }
 
 fn draw_band(line: &Line, color: Color, plot: &Plot, shapes: &mut Vec<VectorShape>) {
-    if line.points.len() < 2 || line.points.iter().all(|point| point.low == point.high || !point.y.is_finite()) {
+    if line.points.len() < 2
+        || line
+            .points
+            .iter()
+            .all(|point| point.low == point.high || !point.y.is_finite())
+    {
         return;
     }
-    let above = line.points.iter().map(|point| [plot.x(point.x), plot.y(point.high)]);
-    let below = line.points.iter().rev().map(|point| [plot.x(point.x), plot.y(point.low)]);
-    shapes.push(VectorShape::Area { points: above.chain(below).collect(), color, opacity_frac: 0.2 });
+    let above = line
+        .points
+        .iter()
+        .map(|point| [plot.x(point.x), plot.y(point.high)]);
+    let below = line
+        .points
+        .iter()
+        .rev()
+        .map(|point| [plot.x(point.x), plot.y(point.low)]);
+    shapes.push(VectorShape::Area {
+        points: above.chain(below).collect(),
+        color,
+        opacity_frac: 0.2,
+    });
 }
 
 /// Draws a line, with gaps at points that are not finite.
@@ -268,7 +351,12 @@ fn draw_line(line: &Line, ix: usize, plot: &Plot, shapes: &mut Vec<VectorShape>)
     for part in line.points.split(|point| !point.y.is_finite()) {
         let points: Vec<[f64; 2]> = part.iter().map(|point| plot.at(point)).collect();
         if points.len() > 1 {
-            shapes.push(VectorShape::Line { points: points.clone(), color: color_of(ix), width, dash });
+            shapes.push(VectorShape::Line {
+                points: points.clone(),
+                color: color_of(ix),
+                width,
+                dash,
+            });
         }
         if !is_dense {
             points.into_iter().for_each(|at| draw_dot(at, ix, shapes));
@@ -278,22 +366,43 @@ fn draw_line(line: &Line, ix: usize, plot: &Plot, shapes: &mut Vec<VectorShape>)
 
 /// Draws a dot whose shape identifies the line: disc, square, triangle, diamond.
 fn draw_dot([x, y]: [f64; 2], line_ix: usize, shapes: &mut Vec<VectorShape>) {
-    let (n_corners, first_angle_frac, radius) =
-        [(24, 0.0, 3.6), (4, 0.125, 4.6), (3, 0.75, 5.2), (4, 0.0, 5.0)][line_ix % 4];
+    let (n_corners, first_angle_frac, radius) = [
+        (24, 0.0, 3.6),
+        (4, 0.125, 4.6),
+        (3, 0.75, 5.2),
+        (4, 0.0, 5.0),
+    ][line_ix % 4];
     let corner = |ix: u32| {
-        let angle = std::f64::consts::TAU * (f64::from(ix) / f64::from(n_corners) + first_angle_frac);
+        let angle =
+            std::f64::consts::TAU * (f64::from(ix) / f64::from(n_corners) + first_angle_frac);
         [x + radius * angle.cos(), y + radius * angle.sin()]
     };
     let points = (0..n_corners).map(corner).collect();
-    shapes.push(VectorShape::Area { points, color: color_of(line_ix), opacity_frac: 1.0 });
+    shapes.push(VectorShape::Area {
+        points,
+        color: color_of(line_ix),
+        opacity_frac: 1.0,
+    });
 }
 
 fn line_between(from: [f64; 2], to: [f64; 2], color: Color, width: f64) -> VectorShape {
-    VectorShape::Line { points: vec![from, to], color, width, dash: None }
+    VectorShape::Line {
+        points: vec![from, to],
+        color,
+        width,
+        dash: None,
+    }
 }
 
 fn text(at: [f64; 2], text: &str, color: Color, anchor: Anchor) -> VectorShape {
-    VectorShape::Text { at, text: text.to_owned(), color, size: TextSize::Normal, anchor, vertical: false }
+    VectorShape::Text {
+        at,
+        text: text.to_owned(),
+        color,
+        size: TextSize::Normal,
+        anchor,
+        vertical: false,
+    }
 }
 
 /// Wraps text into rows of at most `max_chars`, after spaces or, for longer words, anywhere.
@@ -330,7 +439,12 @@ mod tests {
 
     #[test]
     fn drawing_stays_in_bounds() {
-        let point = |x: f64, y: f64| Point { x, y, low: y - 1.0, high: y + 0.5 };
+        let point = |x: f64, y: f64| Point {
+            x,
+            y,
+            low: y - 1.0,
+            high: y + 0.5,
+        };
         let line = |label: &str| Line {
             label: label.into(),
             points: vec![point(0.25, 11.0), point(60.0, 36.0)],
@@ -339,19 +453,44 @@ mod tests {
         let chart = Chart {
             title: "A title".into(),
             subtitle: "median".into(),
-            x: Axis { label: "seconds".into(), scale: Scale::Log, ticks: vec![0.25, 1.0, 60.0] },
-            y: Axis { label: "PSNR, dB".into(), scale: Scale::Linear, ticks: Vec::new() },
+            x: Axis {
+                label: "seconds".into(),
+                scale: Scale::Log,
+                ticks: vec![0.25, 1.0, 60.0],
+            },
+            y: Axis {
+                label: "PSNR, dB".into(),
+                scale: Scale::Linear,
+                ticks: Vec::new(),
+            },
             lines: vec![line("a"), line("a much longer name of some other data")],
             thresholds: Vec::new(),
-            markers: vec![Marker { x: 60.0, label: "a long word about the very end".into(), line_ix: 0 }],
+            markers: vec![Marker {
+                x: 60.0,
+                label: "a long word about the very end".into(),
+                line_ix: 0,
+            }],
         };
         let drawing = chart.draw();
         let [width, height] = drawing.size;
         for shape in &drawing.shapes {
             let (points, padding) = match shape {
-                VectorShape::Line { points, .. } | VectorShape::Area { points, .. } => (points.clone(), 0.0),
-                VectorShape::Text { at, text, size, anchor, vertical, .. } => {
-                    let padding = if *vertical { 0.0 } else { text_width(text, *size) };
+                VectorShape::Line { points, .. } | VectorShape::Area { points, .. } => {
+                    (points.clone(), 0.0)
+                }
+                VectorShape::Text {
+                    at,
+                    text,
+                    size,
+                    anchor,
+                    vertical,
+                    ..
+                } => {
+                    let padding = if *vertical {
+                        0.0
+                    } else {
+                        text_width(text, *size)
+                    };
                     let from = match anchor {
                         Anchor::Start => 0.0,
                         Anchor::Middle => -0.5 * padding,
@@ -361,14 +500,21 @@ mod tests {
                 }
             };
             for [x, y] in points {
-                assert!(x >= 0.0 && x + padding <= width && (0.0..=height).contains(&y), "{shape:?}");
+                assert!(
+                    x >= 0.0 && x + padding <= width && (0.0..=height).contains(&y),
+                    "{shape:?}"
+                );
             }
         }
     }
 
     #[test]
     fn an_empty_chart_can_be_drawn() {
-        let axis = |scale| Axis { label: "x".into(), scale, ticks: Vec::new() };
+        let axis = |scale| Axis {
+            label: "x".into(),
+            scale,
+            ticks: Vec::new(),
+        };
         let chart = Chart {
             title: "nothing yet".into(),
             subtitle: String::new(),

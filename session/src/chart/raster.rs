@@ -30,14 +30,27 @@ pub fn text_width(text: &str, size: TextSize) -> f64 {
 
 /// The drawing as the bytes of a PNG file.
 pub fn png(drawing: &Drawing) -> crate::Result<Vec<u8>> {
-    let options = Options { fontdb: Arc::clone(&FONTS), ..Options::default() };
-    let tree = Tree::from_str(&drawing.svg(), &options).context("cannot read the SVG of a chart")?;
-    #[expect(clippy::cast_possible_truncation, reason = "a chart is a few thousand pixels wide")]
-    let [width, height] = drawing.size.map(|units| (units.ceil() as u32) * PIXELS_PER_UNIT);
+    let options = Options {
+        fontdb: Arc::clone(&FONTS),
+        ..Options::default()
+    };
+    let tree =
+        Tree::from_str(&drawing.svg(), &options).context("cannot read the SVG of a chart")?;
+    #[expect(
+        clippy::cast_possible_truncation,
+        reason = "a chart is a few thousand pixels wide"
+    )]
+    let [width, height] = drawing
+        .size
+        .map(|units| (units.ceil() as u32) * PIXELS_PER_UNIT);
     let mut picture = Pixmap::new(width, height).context("a chart is empty or too large")?;
     picture.fill(Color::WHITE);
     let scale = PIXELS_PER_UNIT as f32;
-    resvg::render(&tree, Transform::from_scale(scale, scale), &mut picture.as_mut());
+    resvg::render(
+        &tree,
+        Transform::from_scale(scale, scale),
+        &mut picture.as_mut(),
+    );
     let mut file = Vec::new();
     PngEncoder::new(&mut file)
         .write_image(picture.data(), width, height, ExtendedColorType::Rgba8)
@@ -54,9 +67,21 @@ mod tests {
     fn shapes_and_text_are_rasterized() {
         let color = [213, 94, 0];
         let (size, anchor) = (TextSize::Normal, Anchor::Middle);
-        let text = |at, vertical| VectorShape::Text { at, text: "H".into(), color, size, anchor, vertical };
+        let text = |at, vertical| VectorShape::Text {
+            at,
+            text: "H".into(),
+            color,
+            size,
+            anchor,
+            vertical,
+        };
         let shapes = vec![
-            VectorShape::Line { points: vec![[0.0, 2.0], [40.0, 2.0]], color, width: 2.0, dash: None },
+            VectorShape::Line {
+                points: vec![[0.0, 2.0], [40.0, 2.0]],
+                color,
+                width: 2.0,
+                dash: None,
+            },
             VectorShape::Area {
                 points: vec![[0.0, 30.0], [10.0, 30.0], [10.0, 40.0], [0.0, 40.0]],
                 color,
@@ -65,13 +90,24 @@ mod tests {
             text([20.0, 15.0], false),
             text([1000.0, 15.0], true),
         ];
-        let file = png(&Drawing { size: [40.0, 40.0], shapes }).expect("a picture");
-        let picture = image::load_from_memory(&file).expect("a PNG file").into_rgb8();
+        let file = png(&Drawing {
+            size: [40.0, 40.0],
+            shapes,
+        })
+        .expect("a picture");
+        let picture = image::load_from_memory(&file)
+            .expect("a PNG file")
+            .into_rgb8();
         assert_eq!(picture.dimensions(), (80, 80));
         assert_eq!(picture.get_pixel(40, 4).0, color);
         let half = picture.get_pixel(5, 70).0;
         // Halfway to white, rounded either way.
-        assert!(half.iter().zip([234, 175, 128]).all(|(got, expected)| got.abs_diff(expected) <= 1), "{half:?}");
+        assert!(
+            half.iter()
+                .zip([234, 175, 128])
+                .all(|(got, expected)| got.abs_diff(expected) <= 1),
+            "{half:?}"
+        );
         assert_eq!(picture.get_pixel(60, 70).0, [255; 3]);
         let inked = |x: std::ops::Range<u32>, y: std::ops::Range<u32>| {
             x.flat_map(|x| y.clone().map(move |y| (x, y)))

@@ -13,8 +13,8 @@ const HINT_KEYFRAMES: usize = 5;
 const POLL_PERIOD: Duration = Duration::from_millis(2);
 
 impl Live {
-    /// Pushes new keyframes to the models: all waiting keyframes in real time, or the keyframe that is due in lockstep.
-    /// Does nothing during an evaluation.
+    /// Pushes new keyframes to the models: all waiting keyframes in real time, or the keyframe that
+    /// is due in lockstep. Does nothing during an evaluation.
     pub(super) fn take_keyframes(&mut self) -> crate::Result<()> {
         if self.is_scoring() {
             return Ok(());
@@ -25,7 +25,9 @@ impl Live {
         }
         self.apply_alignments()?;
         if let Some(first_image) = self.feed.first_image() {
-            self.sessions.iter_mut().for_each(|session| session.start_clock(first_image));
+            self.sessions
+                .iter_mut()
+                .for_each(|session| session.start_clock(first_image));
         }
         let n_before = self.keyframes.len();
         match self.pace {
@@ -40,7 +42,9 @@ impl Live {
             }
             Pace::Lockstep { steps_per_keyframe } => {
                 while !self.feed.ended() && self.is_keyframe_due() {
-                    let Some(item) = self.wait_for_change() else { break };
+                    let Some(item) = self.wait_for_change() else {
+                        break;
+                    };
                     let is_new = matches!(item.change, Change::Accepted(_));
                     self.apply(item)?;
                     if is_new && self.is_training() {
@@ -74,8 +78,8 @@ impl Live {
         Ok(())
     }
 
-    /// Waits for the next added or removed keyframe. Returns `None` if a requested picture may be drawn now, or after
-    /// [`IDLE`].
+    /// Waits for the next added or removed keyframe. Returns `None` if a requested picture may be
+    /// drawn now, or after [`IDLE`].
     fn wait_for_change(&mut self) -> Option<FeedItem> {
         if self.hub.n_clients() == 0 {
             return self.feed.next(IDLE);
@@ -83,7 +87,11 @@ impl Live {
         let started = Instant::now();
         loop {
             let before = Instant::now();
-            let timeout = if self.budget.may_render() { Duration::ZERO } else { POLL_PERIOD };
+            let timeout = if self.budget.may_render() {
+                Duration::ZERO
+            } else {
+                POLL_PERIOD
+            };
             if let Some(item) = self.feed.next(timeout) {
                 return Some(item);
             }
@@ -95,7 +103,8 @@ impl Live {
         }
     }
 
-    /// Whether each model has reached the step at which the next keyframe is due, or cannot train further without it.
+    /// Whether each model has reached the step at which the next keyframe is due, or cannot train
+    /// further without it.
     fn is_keyframe_due(&self) -> bool {
         let is_due = |(session, at): (&Session, &u64)| {
             session.progress().step >= *at || session.is_idle() || session.has_finished_steps()
@@ -110,12 +119,22 @@ impl Live {
                     Some(change) => change(keyframe),
                     None => keyframe,
                 };
-                let pushed_at_steps = self.sessions.iter().map(|session| session.progress().step).collect();
+                let pushed_at_steps = self
+                    .sessions
+                    .iter()
+                    .map(|session| session.progress().step)
+                    .collect();
                 self.keyframes.push(keyframe.clone());
                 let mut pushed = Ok(());
-                // A model that has made all its steps gets no more keyframes, so that it equals a model trained alone.
-                for session in self.sessions.iter_mut().filter(|session| !session.has_finished_steps()) {
-                    // Continues after a GPU failure, so that every session holds the keyframe for its restored model.
+                // A model that has made all its steps gets no more keyframes, so that it equals a
+                // model trained alone.
+                for session in self
+                    .sessions
+                    .iter_mut()
+                    .filter(|session| !session.has_finished_steps())
+                {
+                    // Continues after a GPU failure, so that every session holds the keyframe for
+                    // its restored model.
                     pushed = pushed.and(session.push(&keyframe));
                 }
                 if let Some(input) = times {
@@ -134,9 +153,14 @@ impl Live {
             }
             Change::Evicted { camera, stamp } => {
                 self.n_evicted += 1;
-                self.keyframes.retain(|keyframe| keyframe.camera != camera || keyframe.stamp != stamp);
+                self.keyframes
+                    .retain(|keyframe| keyframe.camera != camera || keyframe.stamp != stamp);
                 let mut removed = Ok(());
-                for session in self.sessions.iter_mut().filter(|session| !session.has_finished_steps()) {
+                for session in self
+                    .sessions
+                    .iter_mut()
+                    .filter(|session| !session.has_finished_steps())
+                {
                     removed = removed.and(session.remove(&camera, stamp));
                 }
                 removed

@@ -29,7 +29,8 @@ const IDLE: Duration = Duration::from_millis(10);
 pub enum Pace {
     /// In real time: as soon as a keyframe arrives.
     RealTime,
-    /// In lockstep with training: one keyframe per fixed number of steps, so that a seed determines the result.
+    /// In lockstep with training: one keyframe per fixed number of steps, so that a seed determines
+    /// the result.
     Lockstep {
         /// Steps between two keyframes.
         steps_per_keyframe: u64,
@@ -99,15 +100,26 @@ impl Live {
 
     /// Reports, at growing intervals, that the run has no keyframe yet, and why.
     fn warn_without_keyframes(&mut self) {
-        if !self.keyframes.is_empty() || self.feed.ended() || self.started.elapsed() < self.warn_after {
+        if !self.keyframes.is_empty()
+            || self.feed.ended()
+            || self.started.elapsed() < self.warn_after
+        {
             return;
         }
-        let rejected: Vec<String> = self.feed.rejected().iter().map(|(why, n)| format!("{n} {why}")).collect();
+        let rejected: Vec<String> = self
+            .feed
+            .rejected()
+            .iter()
+            .map(|(why, n)| format!("{n} {why}"))
+            .collect();
         let reason = match rejected.is_empty() {
             true => "no image has been joined with a pose".to_owned(),
             false => format!("images rejected: {}", rejected.join(", ")),
         };
-        log::warn!("no keyframe after {} s, so nothing is trained: {reason}", self.warn_after.as_secs());
+        log::warn!(
+            "no keyframe after {} s, so nothing is trained: {reason}",
+            self.warn_after.as_secs()
+        );
         self.warn_after *= 2;
     }
 
@@ -121,27 +133,38 @@ impl Live {
         self
     }
 
-    /// Changes all following keyframes before the models receive them, for benchmarks with disturbed data.
+    /// Changes all following keyframes before the models receive them, for benchmarks with
+    /// disturbed data.
     pub fn change_keyframes(&mut self, change: KeyframeChange) {
         self.keyframe_change = Some(change);
     }
 
-    /// Whether the run is over: a limit was reached or cannot be reached, the devices failed, or the input ended
-    /// without training data.
+    /// Whether the run is over: a limit was reached or cannot be reached, the devices failed, or
+    /// the input ended without training data.
     pub fn is_over(&self) -> bool {
         if self.is_scoring() {
             return false; // An evaluation in progress is completed first.
         }
-        // After one session has reached its limit, the run waits for all other sessions that can still reach theirs.
-        let is_done = |session: &Session| session.is_over() || (self.feed.ended() && session.is_idle());
-        let reached = self.sessions.iter().any(Session::is_over) && self.sessions.iter().all(is_done);
-        reached || self.has_exhausted_input() || self.feed.source_failed() || (self.feed.ended() && !self.can_train())
+        // After one session has reached its limit, the run waits for all other sessions that can
+        // still reach theirs.
+        let is_done =
+            |session: &Session| session.is_over() || (self.feed.ended() && session.is_idle());
+        let reached =
+            self.sessions.iter().any(Session::is_over) && self.sessions.iter().all(is_done);
+        reached
+            || self.has_exhausted_input()
+            || self.feed.source_failed()
+            || (self.feed.ended() && !self.can_train())
     }
 
-    /// Whether the input ended and a model cannot reach its step limit without more keyframes. Without a step limit,
-    /// the run does not end, so that the result stays visible.
+    /// Whether the input ended and a model cannot reach its step limit without more keyframes.
+    /// Without a step limit, the run does not end, so that the result stays visible.
     pub fn has_exhausted_input(&self) -> bool {
-        self.is_finished() && self.sessions.iter().any(|session| session.n_steps_remaining().is_some_and(|n| n > 0))
+        self.is_finished()
+            && self
+                .sessions
+                .iter()
+                .any(|session| session.n_steps_remaining().is_some_and(|n| n > 0))
     }
 
     /// The hub that clients are connected to.
@@ -189,7 +212,10 @@ impl Live {
     pub fn wait(&mut self) -> crate::Result<bool> {
         match self.sessions.iter().try_for_each(Session::wait) {
             Ok(()) => Ok(false),
-            Err(error) => self.recoveries.recover(&mut self.sessions, error).map(|()| true),
+            Err(error) => self
+                .recoveries
+                .recover(&mut self.sessions, error)
+                .map(|()| true),
         }
     }
 
@@ -198,14 +224,18 @@ impl Live {
         recoveries::describe_recoverable(&mut self.sessions)
     }
 
-    /// Trains for one slice once there are enough keyframes. During an evaluation, scores one test image instead. Does
-    /// not train if a requested picture may be drawn now.
+    /// Trains for one slice once there are enough keyframes. During an evaluation, scores one test
+    /// image instead. Does not train if a requested picture may be drawn now.
     fn step(&mut self) -> crate::Result<()> {
         self.sessions.iter().try_for_each(Session::check_gpu)?;
         if !self.is_training() {
             return Ok(());
         }
-        if let Some(session) = self.sessions.iter_mut().find(|session| session.is_scoring()) {
+        if let Some(session) = self
+            .sessions
+            .iter_mut()
+            .find(|session| session.is_scoring())
+        {
             let before = Instant::now();
             session.score_next()?;
             self.budget.add_training(before.elapsed());
@@ -213,7 +243,9 @@ impl Live {
         }
         if self.requests.is_paused {
             // Keyframes are still accepted, and checkpoints can be requested.
-            self.sessions.iter_mut().try_for_each(Session::write_checkpoint_when_due)?;
+            self.sessions
+                .iter_mut()
+                .try_for_each(Session::write_checkpoint_when_due)?;
         }
         if self.is_finished() || self.requests.is_paused {
             self.hub.wait_for_request(IDLE);
@@ -223,7 +255,9 @@ impl Live {
             return Ok(());
         }
         let is_watched = self.hub.n_clients() > 0;
-        self.sessions.iter_mut().for_each(|session| session.set_watched(is_watched));
+        self.sessions
+            .iter_mut()
+            .for_each(|session| session.set_watched(is_watched));
         let is_paced = self.pace != Pace::RealTime && !self.feed.ended();
         let due = &self.next_keyframe_at;
         let max_steps = |ix: usize, session: &Session| match is_paced {
@@ -231,7 +265,9 @@ impl Live {
             false => u64::MAX,
         };
         if self.pace == Pace::RealTime {
-            self.sessions.iter_mut().try_for_each(Session::pause_growth_when_slow)?;
+            self.sessions
+                .iter_mut()
+                .try_for_each(Session::pause_growth_when_slow)?;
         }
         let before = Instant::now();
         let step_before = self.sessions[0].progress().step;
@@ -247,7 +283,8 @@ impl Live {
 
     /// Ends the input and a search for floaters. Returns the sessions and the results of the input.
     pub fn finish(mut self) -> (Vec<Session>, crate::Result<InputResult>) {
-        // Changes only the state; the rest of the status stays visible until the scores are published.
+        // Changes only the state; the rest of the status stays visible until the scores are
+        // published.
         self.hub.set_state("saving");
         if self.erase_found(true) {
             self.publish_status();
@@ -269,17 +306,23 @@ impl Live {
         self.can_train() && (self.keyframes.len() >= self.start_keyframes || self.feed.ended())
     }
 
-    /// Whether there is a training keyframe. With several cameras, the first keyframe of each is a test keyframe.
+    /// Whether there is a training keyframe. With several cameras, the first keyframe of each is a
+    /// test keyframe.
     fn can_train(&self) -> bool {
-        self.keyframes.iter().any(|keyframe| keyframe.split == Split::Train)
+        self.keyframes
+            .iter()
+            .any(|keyframe| keyframe.split == Split::Train)
     }
 
     /// Whether no model can train before the next keyframe arrives.
     fn is_idle(&self) -> bool {
-        self.sessions.iter().all(|session| session.is_idle() || session.has_finished_steps())
+        self.sessions
+            .iter()
+            .all(|session| session.is_idle() || session.has_finished_steps())
     }
 
-    /// Whether the input ended and all training is done; the models stay visible until the user ends the run.
+    /// Whether the input ended and all training is done; the models stay visible until the user
+    /// ends the run.
     fn is_finished(&self) -> bool {
         self.feed.ended() && self.is_idle()
     }
@@ -315,5 +358,7 @@ pub struct LiveOptions {
 
 /// Index of the session of a method; of the first one if no method is given.
 fn session_for_method(sessions: &[Session], method: Option<&str>) -> Option<usize> {
-    sessions.iter().position(|session| method.is_none_or(|name| session.kind().name() == name))
+    sessions
+        .iter()
+        .position(|session| method.is_none_or(|name| session.kind().name() == name))
 }

@@ -42,14 +42,21 @@ impl Live {
             let mut queued = Vec::new();
             let mut is_any_on_gpu = false;
             while let Some(picture) = self.queue_picture() {
-                let is_on_gpu = picture.queued.as_ref().is_ok_and(|queued| !queued.is_ready());
+                let is_on_gpu = picture
+                    .queued
+                    .as_ref()
+                    .is_ok_and(|queued| !queued.is_ready());
                 is_any_on_gpu |= is_on_gpu;
                 queued.push(picture);
                 if !is_on_gpu || queued.len() == MAX_QUEUED_PICTURES {
                     break;
                 }
             }
-            let trained = if is_any_on_gpu { self.queue_steps() } else { Ok(()) };
+            let trained = if is_any_on_gpu {
+                self.queue_steps()
+            } else {
+                Ok(())
+            };
             let mut began = before;
             for picture in queued {
                 self.deliver(picture, began);
@@ -61,11 +68,15 @@ impl Live {
         Ok(())
     }
 
-    /// Queues steps behind pictures, which keeps the GPU busy while the pictures are delivered. Only for a single model in
-    /// real time, where this needs no other work.
+    /// Queues steps behind pictures, which keeps the GPU busy while the pictures are delivered.
+    /// Only for a single model in real time, where this needs no other work.
     fn queue_steps(&mut self) -> crate::Result<()> {
-        let is_training = self.is_training() && !self.is_idle() && !self.is_scoring() && !self.requests.is_paused;
-        let (Pace::RealTime, [session], true) = (self.pace, &mut self.sessions[..], is_training) else { return Ok(()) };
+        let is_training =
+            self.is_training() && !self.is_idle() && !self.is_scoring() && !self.requests.is_paused;
+        let (Pace::RealTime, [session], true) = (self.pace, &mut self.sessions[..], is_training)
+        else {
+            return Ok(());
+        };
         if !session.is_over() {
             session.train_steps(u64::MAX)?;
         }
@@ -88,16 +99,32 @@ impl Live {
             let session = &mut self.sessions[session_ix];
             pending.request.edits = Arc::clone(session.edits());
             let queued = session.queue_picture(&pending.request, pending.packing());
-            let trained_on = self.ledger.trained_keyframes(session_ix, session.progress().step);
-            return Some(QueuedRender { pending: pending.of_keyframes(trained_on), session_ix, queued });
+            let trained_on = self
+                .ledger
+                .trained_keyframes(session_ix, session.progress().step);
+            return Some(QueuedRender {
+                pending: pending.of_keyframes(trained_on),
+                session_ix,
+                queued,
+            });
         }
     }
 
     /// Waits for a picture, whose rendering began at `began`, and sends it to its client.
-    fn deliver(&mut self, QueuedRender { pending, session_ix, queued }: QueuedRender, began: Instant) {
+    fn deliver(
+        &mut self,
+        QueuedRender {
+            pending,
+            session_ix,
+            queued,
+        }: QueuedRender,
+        began: Instant,
+    ) {
         let pending = pending.began_at(began);
         let session = &mut self.sessions[session_ix];
-        match queued.and_then(|queued| session.finish_picture(queued, &pending.request, pending.packing())) {
+        match queued
+            .and_then(|queued| session.finish_picture(queued, &pending.request, pending.packing()))
+        {
             Ok(picture) => pending.deliver(picture),
             Err(error) => pending.fail(&error.to_string()),
         }

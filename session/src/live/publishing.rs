@@ -51,24 +51,43 @@ impl Publishing {
 impl Live {
     /// Publishes the keyframes and the corrections of live images, as estimated by the first model.
     pub(super) fn publish_keyframes(&mut self) {
-        let cameras: Vec<_> = self.keyframes.iter().map(|keyframe| self.sessions[0].camera_of(keyframe)).collect();
+        let cameras: Vec<_> = self
+            .keyframes
+            .iter()
+            .map(|keyframe| self.sessions[0].camera_of(keyframe))
+            .collect();
         let posed = || self.keyframes.iter().zip(&cameras);
         // Live images get the correction of their camera's newest keyframe.
         let correction = |(keyframe, camera): (&Arc<Keyframe>, &CalibratedCamera)| {
-            (keyframe.camera.clone(), keyframe.world_from_camera.inverse() * camera.world_from_camera)
+            (
+                keyframe.camera.clone(),
+                keyframe.world_from_camera.inverse() * camera.world_from_camera,
+            )
         };
-        self.hub.set_camera_corrections(posed().map(correction).collect());
+        self.hub
+            .set_camera_corrections(posed().map(correction).collect());
         self.hub.set_keyframe_sources(&self.keyframes);
-        self.hub.set_keyframes(posed().map(|(keyframe, camera)| frustum(keyframe, camera)).collect());
+        self.hub.set_keyframes(
+            posed()
+                .map(|(keyframe, camera)| frustum(keyframe, camera))
+                .collect(),
+        );
         self.publishing.cameras = cameras;
     }
 
     /// Publishes the keyframes again if corrections have moved one of them noticeably.
     fn publish_moved_keyframes(&mut self) {
         let has_moved = |(keyframe, published): (&Arc<Keyframe>, &CalibratedCamera)| {
-            self.sessions[0].camera_of(keyframe).differs_noticeably(published)
+            self.sessions[0]
+                .camera_of(keyframe)
+                .differs_noticeably(published)
         };
-        if self.keyframes.iter().zip(&self.publishing.cameras).any(has_moved) {
+        if self
+            .keyframes
+            .iter()
+            .zip(&self.publishing.cameras)
+            .any(has_moved)
+        {
             self.publish_keyframes();
         }
     }
@@ -77,13 +96,14 @@ impl Live {
     pub(super) fn publish_chunks(&mut self) {
         if !self.is_scoring() && self.budget.may_render() {
             for session in &mut self.sessions {
-                self.budget.add_render(session.publish_chunks(&mut self.publishing.chunks));
+                self.budget
+                    .add_render(session.publish_chunks(&mut self.publishing.chunks));
             }
         }
     }
 
-    /// Publishes when and how precisely each part of the scene was observed. Depth of cameras without depth is rendered with
-    /// the first model.
+    /// Publishes when and how precisely each part of the scene was observed. Depth of cameras
+    /// without depth is rendered with the first model.
     pub(super) fn publish_observations(&mut self) {
         let can_render = self.is_training() && !self.is_scoring() && self.budget.may_render();
         if !can_render || !self.publishing.observations.is_due() {
@@ -101,27 +121,42 @@ impl Live {
         let keyframes: Vec<PosedKeyframe> = self.keyframes.iter().map(posed).collect();
         let captured_at = |pose: &KeyframePose| {
             let mut newest_first = self.ledger.keyframes().iter().rev();
-            let times = newest_first.find(|times| times.camera == pose.camera && times.stamp == pose.stamp)?;
+            let times = newest_first
+                .find(|times| times.camera == pose.camera && times.stamp == pose.stamp)?;
             Some(times.captured_at())
         };
         let edits = Arc::clone(session.edits());
-        let model = ModelState { step: session.progress().step, edits: &edits, captured_at: &captured_at };
+        let model = ModelState {
+            step: session.progress().step,
+            edits: &edits,
+            captured_at: &captured_at,
+        };
         let render = |request: &RenderRequest| session.render(request);
-        let spent = self.publishing.observations.publish(&keyframes, &model, render);
+        let spent = self
+            .publishing
+            .observations
+            .publish(&keyframes, &model, render);
         self.budget.add_render(spent);
     }
 
     /// Publishes the status of the run to viewers, a few times per second.
     pub(super) fn publish(&mut self) -> crate::Result<()> {
-        if self.publishing.status_at.is_some_and(|published| published.elapsed() < PUBLISH_PERIOD) {
+        if self
+            .publishing
+            .status_at
+            .is_some_and(|published| published.elapsed() < PUBLISH_PERIOD)
+        {
             return Ok(());
         }
         self.publishing.status_at = Some(Instant::now());
         let clock_secs = self.sessions[0].secs();
-        if self.publishing.scoring_time.as_secs_f64() < SCORE_FRAC * clock_secs && !self.is_scoring() {
+        if self.publishing.scoring_time.as_secs_f64() < SCORE_FRAC * clock_secs
+            && !self.is_scoring()
+        {
             let before = Instant::now();
             // Scores only one image at a time, so that viewers do not wait.
-            self.publishing.next_refreshed = (self.publishing.next_refreshed + 1) % self.sessions.len();
+            self.publishing.next_refreshed =
+                (self.publishing.next_refreshed + 1) % self.sessions.len();
             let session = &mut self.sessions[self.publishing.next_refreshed];
             if session.progress().step > 0 {
                 session.n_total_steps()?;
@@ -138,7 +173,9 @@ impl Live {
     }
 
     pub(super) fn publish_status(&self) {
-        let movements = self.sessions[0].alignment().map_or(&[][..], |alignment| &alignment.movements[..]);
+        let movements = self.sessions[0]
+            .alignment()
+            .map_or(&[][..], |alignment| &alignment.movements[..]);
         let mut models = self.sessions.iter().map(model_status);
         self.hub.set_status(Status {
             state: self.state().to_owned(),

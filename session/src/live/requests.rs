@@ -21,7 +21,13 @@ pub(super) struct Requests {
 impl Requests {
     /// Notes on checkpoints and edits, for viewers.
     pub(super) fn notes(&self) -> impl Iterator<Item = String> {
-        [self.checkpoint_note.clone(), self.edit_note.clone(), self.editor.note()].into_iter().flatten()
+        [
+            self.checkpoint_note.clone(),
+            self.edit_note.clone(),
+            self.editor.note(),
+        ]
+        .into_iter()
+        .flatten()
     }
 }
 
@@ -41,7 +47,10 @@ impl Live {
                         is_due &= session.request_checkpoint();
                     }
                     self.requests.checkpoint_note = Some(match is_due {
-                        true => format!("checkpoint requested after {:.0} s", self.sessions[0].secs()),
+                        true => format!(
+                            "checkpoint requested after {:.0} s",
+                            self.sessions[0].secs()
+                        ),
                         false => "this run writes no checkpoints".to_owned(),
                     });
                 }
@@ -54,16 +63,21 @@ impl Live {
         self.erase_found(false);
         for request in self.hub.take_edits() {
             let edited = match session_for_method(&self.sessions, request.method()) {
-                Some(session_ix) => self.sessions[session_ix].edit(&mut self.requests.editor, &request),
+                Some(session_ix) => {
+                    self.sessions[session_ix].edit(&mut self.requests.editor, &request)
+                }
                 None => Err(self.unknown_method(request.method())),
             };
             self.report_edit(&request, edited);
         }
     }
 
-    /// Erases floaters once they are found, or waits for them if `wait`. Returns whether a search has ended.
+    /// Erases floaters once they are found, or waits for them if `wait`. Returns whether a search
+    /// has ended.
     pub(super) fn erase_found(&mut self, wait: bool) -> bool {
-        let Some((request, found)) = self.requests.editor.take_found(wait) else { return false };
+        let Some((request, found)) = self.requests.editor.take_found(wait) else {
+            return false;
+        };
         let session_ix = session_for_method(&self.sessions, request.method()).unwrap_or_default();
         let erased = found.and_then(|floaters| self.sessions[session_ix].erase_floaters(floaters));
         self.report_edit(&request, erased.map(Some));

@@ -1,9 +1,10 @@
 //! Computes when and how precisely each part of a scene was observed.
 //!
-//! Each keyframe contributes the information (inverse covariance) that it has about the position of the surface in a cell:
-//! across the ray, from the size of a pixel; along the ray, from the depth camera, if there is one. Two keyframes from
-//! different directions therefore determine a position without depth, as in triangulation (Hartley and Zisserman 2004,
-//! section 12.6). Errors that keyframes have in common, for example of the calibration, are not part of the result.
+//! Each keyframe contributes the information (inverse covariance) that it has about the position of
+//! the surface in a cell: across the ray, from the size of a pixel; along the ray, from the depth
+//! camera, if there is one. Two keyframes from different directions therefore determine a position
+//! without depth, as in triangulation (Hartley and Zisserman 2004, section 12.6). Errors that
+//! keyframes have in common, for example of the calibration, are not part of the result.
 #![expect(
     clippy::cast_possible_truncation,
     clippy::cast_sign_loss,
@@ -19,16 +20,19 @@ use viz::{ObservationMap, ObservedCell};
 
 /// Number of cells along the longest side of the grid.
 const MAX_CELLS: u32 = 96;
-/// The grid contains the points between these quantiles along each axis, and this fraction of their extent beyond.
+/// The grid contains the points between these quantiles along each axis, and this fraction of their
+/// extent beyond.
 const QUANTILES: [f64; 2] = [0.01, 0.99];
 const MARGIN_FRAC: f64 = 0.1;
 /// Number of cells by which observations are extended.
 const N_EXTENSIONS: usize = 2;
 /// Number of points that determine the quantiles.
 const MAX_SAMPLES: usize = 20_000;
-/// Standard deviation of a position across the ray, pixels of the image: includes the error of the pose.
+/// Standard deviation of a position across the ray, pixels of the image: includes the error of the
+/// pose.
 const SIGMA_PX: f64 = 1.0;
-/// Standard deviation of depth at 1 m, meters. It grows with the square of the depth, as for stereo cameras.
+/// Standard deviation of depth at 1 m, meters. It grows with the square of the depth, as for stereo
+/// cameras.
 const DEPTH_SIGMA_AT_1_M: f64 = 0.002;
 /// Positions with a larger deviation count as not determined, meters.
 const MAX_SIGMA_M: f64 = 10.0;
@@ -91,11 +95,14 @@ pub(crate) fn map_of(keyframes: &[PosedDepth]) -> Option<ObservationMap> {
     })
 }
 
-/// Adds what a keyframe shows. Each cell is counted once, however many rays meet it, so that its size does not matter.
+/// Adds what a keyframe shows. Each cell is counted once, however many rays meet it, so that its
+/// size does not matter.
 fn add_keyframe(cells: &mut SparseCells<Cell>, grid: &Grid, ix: usize, keyframe: &PosedDepth) {
     let camera = keyframe.depth.world_from_camera.translation.vector;
     for point in points(&keyframe.depth) {
-        let Some(cell_ix) = grid.index(&point) else { continue };
+        let Some(cell_ix) = grid.index(&point) else {
+            continue;
+        };
         let cell = cells.entry(cell_ix, || Cell {
             information: Matrix3::zeros(),
             newest: keyframe.stamp,
@@ -108,8 +115,13 @@ fn add_keyframe(cells: &mut SparseCells<Cell>, grid: &Grid, ix: usize, keyframe:
         let ray = point.coords - camera;
         let (distance_m, direction) = (ray.norm(), ray.normalize());
         let across = (distance_m * keyframe.pixel_rad * SIGMA_PX).powi(-2);
-        let along = if keyframe.is_measured { (DEPTH_SIGMA_AT_1_M * distance_m.powi(2)).powi(-2) } else { 0.0 };
-        cell.information += across * Matrix3::identity() + (along - across) * direction * direction.transpose();
+        let along = if keyframe.is_measured {
+            (DEPTH_SIGMA_AT_1_M * distance_m.powi(2)).powi(-2)
+        } else {
+            0.0
+        };
+        cell.information +=
+            across * Matrix3::identity() + (along - across) * direction * direction.transpose();
     }
 }
 
@@ -125,7 +137,10 @@ const NONE: u32 = u32::MAX;
 
 impl<T> SparseCells<T> {
     fn new(grid: &Grid) -> Self {
-        Self { slots: vec![NONE; grid.n_cells.iter().map(|n| *n as usize).product()], cells: Vec::new() }
+        Self {
+            slots: vec![NONE; grid.n_cells.iter().map(|n| *n as usize).product()],
+            cells: Vec::new(),
+        }
     }
 
     /// The value of a cell, which is created if it has none.
@@ -142,20 +157,40 @@ impl<T> SparseCells<T> {
 impl Cell {
     /// Standard deviation of the position in the least certain direction, meters.
     fn sigma_m(&self) -> f64 {
-        let sigma_m = self.information.symmetric_eigenvalues().min().max(0.0).sqrt().recip();
-        if sigma_m <= MAX_SIGMA_M { sigma_m } else { f64::INFINITY }
+        let sigma_m = self
+            .information
+            .symmetric_eigenvalues()
+            .min()
+            .max(0.0)
+            .sqrt()
+            .recip();
+        if sigma_m <= MAX_SIGMA_M {
+            sigma_m
+        } else {
+            f64::INFINITY
+        }
     }
 }
 
 impl Grid {
     /// The grid that contains most of the observed points; `None` if there are none.
     fn around(keyframes: &[PosedDepth]) -> Option<Self> {
-        let n_points: usize = keyframes.iter().map(|keyframe| keyframe.depth.depth_m.len()).sum();
+        let n_points: usize = keyframes
+            .iter()
+            .map(|keyframe| keyframe.depth.depth_m.len())
+            .sum();
         let stride = n_points.div_ceil(MAX_SAMPLES).max(1);
-        let sample: Vec<Point3<f64>> =
-            keyframes.iter().flat_map(|keyframe| points(&keyframe.depth)).step_by(stride).collect();
+        let sample: Vec<Point3<f64>> = keyframes
+            .iter()
+            .flat_map(|keyframe| points(&keyframe.depth))
+            .step_by(stride)
+            .collect();
         let along = |axis: usize, frac: f64| {
-            quantile(&mut sample.iter().map(|point| point[axis]).collect::<Vec<_>>(), frac, Rank::Upper)
+            quantile(
+                &mut sample.iter().map(|point| point[axis]).collect::<Vec<_>>(),
+                frac,
+                Rank::Upper,
+            )
         };
         let (mut min_m, mut extent_m) = (Vector3::zeros(), Vector3::zeros());
         for axis in 0..3 {
@@ -167,8 +202,13 @@ impl Grid {
         if !(cell_m.is_finite() && cell_m > 0.0) {
             return None;
         }
-        let n_cells = [0, 1, 2].map(|axis| ((extent_m[axis] / cell_m).ceil() as u32).clamp(1, MAX_CELLS));
-        Some(Self { min_m, cell_m, n_cells })
+        let n_cells =
+            [0, 1, 2].map(|axis| ((extent_m[axis] / cell_m).ceil() as u32).clamp(1, MAX_CELLS));
+        Some(Self {
+            min_m,
+            cell_m,
+            n_cells,
+        })
     }
 
     /// Index of the cell that contains a point.
@@ -188,21 +228,28 @@ impl Grid {
         let [nx, ny, _] = self.n_cells.map(|n| n as usize);
         let center = [ix % nx, ix / nx % ny, ix / nx / ny].map(|at| at as i64);
         let offsets = (0..27).map(|n| [n % 3 - 1, n / 3 % 3 - 1, n / 9 - 1]);
-        offsets.filter_map(move |offset| self.index_of([0, 1, 2].map(|axis| center[axis] + offset[axis])))
+        offsets.filter_map(move |offset| {
+            self.index_of([0, 1, 2].map(|axis| center[axis] + offset[axis]))
+        })
     }
 }
 
 /// The points of a depth map in world.
 fn points(depth: &DepthMap) -> impl Iterator<Item = Point3<f64>> {
     let width = depth.size_px[0];
-    let readings = depth.depth_m.iter().zip(0_u32..).filter(|(z_m, _)| **z_m > 0.0 && z_m.is_finite());
+    let readings = depth
+        .depth_m
+        .iter()
+        .zip(0_u32..)
+        .filter(|(z_m, _)| **z_m > 0.0 && z_m.is_finite());
     readings.map(move |(z_m, ix)| {
         depth.world_from_camera * Point3::from(depth.point(ix % width, ix / width, f64::from(*z_m)))
     })
 }
 
-/// Gives each cell the newest age and the smallest deviation of its neighbors, too. Otherwise, a surface along a boundary
-/// between cells would get alternating values, and cells between sparse rays none.
+/// Gives each cell the newest age and the smallest deviation of its neighbors, too. Otherwise, a
+/// surface along a boundary between cells would get alternating values, and cells between sparse
+/// rays none.
 fn extended(grid: &Grid, observed: &[ObservedCell]) -> Vec<ObservedCell> {
     let mut merged = SparseCells::new(grid);
     for cell in observed {
@@ -240,31 +287,57 @@ mod tests {
         };
         let depth_to_wall = |at_1_m: Point3<f64>| ((2.0 - eye.y) / (at_1_m.y - eye.y)) as f32;
         depth.depth_m = points(&depth).map(depth_to_wall).collect();
-        PosedDepth { stamp: Stamp(secs * 1_000_000_000), depth, pixel_rad: 1.0 / 600.0, is_measured }
+        PosedDepth {
+            stamp: Stamp(secs * 1_000_000_000),
+            depth,
+            pixel_rad: 1.0 / 600.0,
+            is_measured,
+        }
     }
 
     /// The map's entry for the cell that contains a point.
     fn at(map: &ObservationMap, point: [f64; 3]) -> Option<ObservedCell> {
-        let grid = Grid { min_m: map.min_m.into(), cell_m: map.cell_m, n_cells: map.n_cells };
+        let grid = Grid {
+            min_m: map.min_m.into(),
+            cell_m: map.cell_m,
+            n_cells: map.n_cells,
+        };
         let ix = grid.index(&Point3::from(point))?;
         map.observed.iter().find(|cell| cell.ix == ix).copied()
     }
 
     #[test]
     fn each_point_has_the_age_of_its_last_view() {
-        let views = [view(1, [-1.5, 0.0, 0.0], true), view(11, [1.5, 0.0, 0.0], true)];
+        let views = [
+            view(1, [-1.5, 0.0, 0.0], true),
+            view(11, [1.5, 0.0, 0.0], true),
+        ];
         let map = map_of(&views).expect("points");
         assert!(map.n_cells.iter().all(|n| *n <= MAX_CELLS) && map.n_cells.contains(&MAX_CELLS));
         // Each camera sees farther on the other side of the wall than on its own.
         let in_common = at(&map, [0.0, 2.0, 0.0]).expect("observed");
         assert!(in_common.age_secs.abs() < 1e-9, "{in_common:?}");
         let far_sides = [-2.0, 2.0].map(|x| at(&map, [x, 2.0, 0.0]).map(|cell| cell.age_secs));
-        let seen_by = |x: f64| views.iter().rev().find(|view| sees(view, [x, 2.0, 0.0])).map(|view| view.stamp.0);
+        let seen_by = |x: f64| {
+            views
+                .iter()
+                .rev()
+                .find(|view| sees(view, [x, 2.0, 0.0]))
+                .map(|view| view.stamp.0)
+        };
         for (x, age_secs) in [-2.0, 2.0].into_iter().zip(far_sides) {
-            assert_eq!(age_secs, seen_by(x).map(|stamp| (11e9 - stamp as f64) * 1e-9), "{x}");
+            assert_eq!(
+                age_secs,
+                seen_by(x).map(|stamp| (11e9 - stamp as f64) * 1e-9),
+                "{x}"
+            );
         }
         assert!(far_sides[0] != far_sides[1]);
-        assert_eq!(at(&map, [0.0, 0.5, 0.0]), None, "empty space is not observed");
+        assert_eq!(
+            at(&map, [0.0, 0.5, 0.0]),
+            None,
+            "empty space is not observed"
+        );
     }
 
     /// Whether a point is inside the image of a view.
@@ -287,19 +360,42 @@ mod tests {
     #[test]
     fn images_alone_need_two_directions() {
         let one = map_of(&[view(0, [0.0, 0.0, 0.0], false)]).expect("points");
-        assert_eq!(at(&one, [0.0, 2.0, 0.0]).map(|cell| cell.sigma_m), Some(f64::INFINITY));
+        assert_eq!(
+            at(&one, [0.0, 2.0, 0.0]).map(|cell| cell.sigma_m),
+            Some(f64::INFINITY)
+        );
         let repeated = map_of(&vec![view(0, [0.0, 0.0, 0.0], false); 9]).expect("points");
-        assert_eq!(at(&repeated, [0.0, 2.0, 0.0]).map(|cell| cell.sigma_m), Some(f64::INFINITY));
-        // Two rays at right angles: the covariance is that of one pixel in both directions of their plane.
-        let across = map_of(&[view(0, [-2.0, 0.0, 0.0], false), view(1, [2.0, 0.0, 0.0], false)]).expect("points");
+        assert_eq!(
+            at(&repeated, [0.0, 2.0, 0.0]).map(|cell| cell.sigma_m),
+            Some(f64::INFINITY)
+        );
+        // Two rays at right angles: the covariance is that of one pixel in both directions of their
+        // plane.
+        let across = map_of(&[
+            view(0, [-2.0, 0.0, 0.0], false),
+            view(1, [2.0, 0.0, 0.0], false),
+        ])
+        .expect("points");
         let pixel_m = 8.0_f64.sqrt() / 600.0;
         let cell = at(&across, [0.0, 2.0, 0.0]).expect("observed");
-        assert!((cell.sigma_m / pixel_m - 1.0).abs() < 0.03, "{} instead of {pixel_m}", cell.sigma_m);
+        assert!(
+            (cell.sigma_m / pixel_m - 1.0).abs() < 0.03,
+            "{} instead of {pixel_m}",
+            cell.sigma_m
+        );
         // A short baseline of b at distance z gives z / b times sqrt(2) pixels.
-        let near = map_of(&[view(0, [-0.1, 0.0, 0.0], false), view(1, [0.1, 0.0, 0.0], false)]).expect("points");
+        let near = map_of(&[
+            view(0, [-0.1, 0.0, 0.0], false),
+            view(1, [0.1, 0.0, 0.0], false),
+        ])
+        .expect("points");
         let expected = 2.0 / 0.2 * 2.0_f64.sqrt() * 2.0 / 600.0;
         let cell = at(&near, [0.0, 2.0, 0.0]).expect("observed");
-        assert!((cell.sigma_m / expected - 1.0).abs() < 0.05, "{} instead of {expected}", cell.sigma_m);
+        assert!(
+            (cell.sigma_m / expected - 1.0).abs() < 0.05,
+            "{} instead of {expected}",
+            cell.sigma_m
+        );
     }
 
     #[test]

@@ -36,8 +36,9 @@ pub(crate) struct PosedKeyframe {
     pub(crate) pose: KeyframePose,
     /// The keyframe, if it is available. If it has depth, no depth is rendered.
     pub(crate) keyframe: Option<Arc<Keyframe>>,
-    /// Pose of its depth camera in the frame of its color camera, with corrections; the identity without depth.
-    /// Corrections of the focal lengths and of the scale of depth are not applied to it.
+    /// Pose of its depth camera in the frame of its color camera, with corrections; the identity
+    /// without depth. Corrections of the focal lengths and of the scale of depth are not applied to
+    /// it.
     pub(crate) color_from_depth: Transform,
 }
 
@@ -102,8 +103,8 @@ impl ObservationPublisher {
         Instant::now() >= self.next_check
     }
 
-    /// Renders missing depth of the keyframes with `render`, a few per call, and starts to compute the map if it has
-    /// changed. Returns the time spent.
+    /// Renders missing depth of the keyframes with `render`, a few per call, and starts to compute
+    /// the map if it has changed. Returns the time spent.
     pub(crate) fn publish(
         &mut self,
         keyframes: &[PosedKeyframe],
@@ -130,15 +131,27 @@ impl ObservationPublisher {
 
     fn add_measured(&mut self, keyframes: &[PosedKeyframe]) {
         for keyframe in keyframes {
-            let Some(depth) = keyframe.keyframe.as_ref().and_then(|keyframe| keyframe.depth.as_ref()) else { continue };
-            let Entry::Vacant(entry) = self.depths.entry(keyframe.key()) else { continue };
+            let Some(depth) = keyframe
+                .keyframe
+                .as_ref()
+                .and_then(|keyframe| keyframe.depth.as_ref())
+            else {
+                continue;
+            };
+            let Entry::Vacant(entry) = self.depths.entry(keyframe.key()) else {
+                continue;
+            };
             let stride = depth.size_px[0].div_ceil(MAX_WIDTH_PX) | 1; // Must be odd.
-            entry.insert(KnownDepth { depth: depth.subsampled(stride), rendered_at: None });
+            entry.insert(KnownDepth {
+                depth: depth.subsampled(stride),
+                rendered_at: None,
+            });
             self.is_changed = true;
         }
     }
 
-    /// Renders depth for the newest keyframes that have none, and then for those whose depth is oldest.
+    /// Renders depth for the newest keyframes that have none, and then for those whose depth is
+    /// oldest.
     fn render_depths(
         &mut self,
         keyframes: &[PosedKeyframe],
@@ -146,12 +159,22 @@ impl ObservationPublisher {
         mut render: impl FnMut(&RenderRequest) -> Result<Picture, trainer::Error>,
     ) {
         #[expect(clippy::cast_precision_loss, reason = "steps are far below 2^52")]
-        let is_outdated =
-            |known: &KnownDepth| known.rendered_at.is_some_and(|at| step as f64 > STEP_FACTOR * at as f64);
+        let is_outdated = |known: &KnownDepth| {
+            known
+                .rendered_at
+                .is_some_and(|at| step as f64 > STEP_FACTOR * at as f64)
+        };
         let rendered_at = |keyframe: &PosedKeyframe| self.depths.get(&keyframe.key())?.rendered_at;
-        let mut due: Vec<_> =
-            keyframes.iter().filter(|keyframe| self.depths.get(&keyframe.key()).is_none_or(is_outdated)).collect();
-        due.sort_by_key(|keyframe| (rendered_at(keyframe), std::cmp::Reverse(keyframe.pose.stamp.0)));
+        let mut due: Vec<_> = keyframes
+            .iter()
+            .filter(|keyframe| self.depths.get(&keyframe.key()).is_none_or(is_outdated))
+            .collect();
+        due.sort_by_key(|keyframe| {
+            (
+                rendered_at(keyframe),
+                std::cmp::Reverse(keyframe.pose.stamp.0),
+            )
+        });
         let began = Instant::now();
         for keyframe in due {
             let request = depth_request(&keyframe.pose, &self.edits);
@@ -163,7 +186,13 @@ impl ObservationPublisher {
                     return;
                 }
             };
-            self.depths.insert(keyframe.key(), KnownDepth { depth, rendered_at: Some(step) });
+            self.depths.insert(
+                keyframe.key(),
+                KnownDepth {
+                    depth,
+                    rendered_at: Some(step),
+                },
+            );
             self.is_changed = true;
             if began.elapsed() >= RENDER_TIME {
                 return;
@@ -172,7 +201,11 @@ impl ObservationPublisher {
     }
 
     /// Starts to compute the map if it has changed and the last one is complete.
-    fn start_map(&mut self, keyframes: &[PosedKeyframe], captured_at: &dyn Fn(&KeyframePose) -> Option<Instant>) {
+    fn start_map(
+        &mut self,
+        keyframes: &[PosedKeyframe],
+        captured_at: &dyn Fn(&KeyframePose) -> Option<Instant>,
+    ) {
         if let Some((began, _)) = self.task.take_if(|(_, thread)| thread.is_finished()) {
             self.next_map = began + MAP_PERIOD.max(began.elapsed().div_f64(MAX_MAP_FRAC));
         }
@@ -180,15 +213,25 @@ impl ObservationPublisher {
             return;
         }
         let has_moved = |keyframe: &PosedKeyframe| match self.mapped.get(&keyframe.key()) {
-            Some(mapped) => transform::is_noticeable(&(mapped.inverse() * keyframe.world_from_depth())),
+            Some(mapped) => {
+                transform::is_noticeable(&(mapped.inverse() * keyframe.world_from_depth()))
+            }
             None => false, // It has no depth yet.
         };
         if !self.is_changed && !keyframes.iter().any(has_moved) {
             return;
         }
-        let known = keyframes.iter().filter_map(|keyframe| Some((keyframe, self.depths.get(&keyframe.key())?)));
-        let observed: Vec<_> = known.clone().map(|(keyframe, known)| known.posed(keyframe)).collect();
-        self.mapped = known.clone().map(|(keyframe, _)| (keyframe.key(), keyframe.world_from_depth())).collect();
+        let known = keyframes
+            .iter()
+            .filter_map(|keyframe| Some((keyframe, self.depths.get(&keyframe.key())?)));
+        let observed: Vec<_> = known
+            .clone()
+            .map(|(keyframe, known)| known.posed(keyframe))
+            .collect();
+        self.mapped = known
+            .clone()
+            .map(|(keyframe, _)| (keyframe.key(), keyframe.world_from_depth()))
+            .collect();
         self.is_changed = false;
         let newest = known.max_by_key(|(keyframe, _)| keyframe.pose.stamp.0);
         let newest_at = newest.and_then(|(keyframe, _)| captured_at(&keyframe.pose));
@@ -217,7 +260,10 @@ impl KnownDepth {
     fn posed(&self, keyframe: &PosedKeyframe) -> PosedDepth {
         PosedDepth {
             stamp: keyframe.pose.stamp,
-            depth: DepthMap { world_from_camera: keyframe.world_from_depth(), ..self.depth.clone() },
+            depth: DepthMap {
+                world_from_camera: keyframe.world_from_depth(),
+                ..self.depth.clone()
+            },
             pixel_rad: 1.0 / keyframe.pose.focal_px[0],
             is_measured: self.rendered_at.is_none(),
         }
@@ -227,14 +273,23 @@ impl KnownDepth {
 /// The request for the depth of a keyframe at a low resolution.
 fn depth_request(pose: &KeyframePose, edits: &Arc<Edits>) -> RenderRequest {
     let scale = f64::from(MAX_WIDTH_PX.min(pose.size_px[0])) / f64::from(pose.size_px[0]);
-    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "smaller than the image")]
-    let size_px = pose.size_px.map(|size| ((f64::from(size) * scale).round() as u32).max(1));
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "smaller than the image"
+    )]
+    let size_px = pose
+        .size_px
+        .map(|size| ((f64::from(size) * scale).round() as u32).max(1));
     let axes = [0, 1].map(|axis| f64::from(size_px[axis]) / f64::from(pose.size_px[axis]));
     let scaled = |values: [f64; 2]| [values[0] * axes[0], values[1] * axes[1]];
     RenderRequest {
         world_from_camera: pose.world_from_camera,
         size_px,
-        projection: Projection::Pinhole { focal_px: scaled(pose.focal_px), principal_px: scaled(pose.principal_px) },
+        projection: Projection::Pinhole {
+            focal_px: scaled(pose.focal_px),
+            principal_px: scaled(pose.principal_px),
+        },
         shutter: None,
         near_m: 0.01,
         far_m: 100.0,
@@ -248,7 +303,11 @@ fn depth_request(pose: &KeyframePose, edits: &Arc<Edits>) -> RenderRequest {
 
 /// The depth of a rendered picture.
 fn depth_map(request: &RenderRequest, picture: Picture) -> DepthMap {
-    let Projection::Pinhole { focal_px, principal_px } = request.projection else {
+    let Projection::Pinhole {
+        focal_px,
+        principal_px,
+    } = request.projection
+    else {
         unreachable!("depth is requested with a pinhole")
     };
     DepthMap {
@@ -275,32 +334,62 @@ mod tests {
             focal_px: [600.0, 610.0],
             principal_px: [320.0, 240.0],
         };
-        PosedKeyframe { pose, keyframe: None, color_from_depth }
+        PosedKeyframe {
+            pose,
+            keyframe: None,
+            color_from_depth,
+        }
     }
 
     #[test]
     fn requested_depth_has_the_field_of_view_of_the_image() {
         let keyframe = posed(Transform::translation(1.0, 2.0, 3.0), Transform::identity());
         let request = depth_request(&keyframe.pose, &Arc::default());
-        let Projection::Pinhole { focal_px, principal_px } = request.projection else { panic!("a pinhole") };
-        assert_eq!((request.size_px, focal_px, principal_px), ([96, 72], [90.0, 91.5], [48.0, 36.0]));
+        let Projection::Pinhole {
+            focal_px,
+            principal_px,
+        } = request.projection
+        else {
+            panic!("a pinhole")
+        };
+        assert_eq!(
+            (request.size_px, focal_px, principal_px),
+            ([96, 72], [90.0, 91.5], [48.0, 36.0])
+        );
         assert!(request.depth && request.world_from_camera == keyframe.pose.world_from_camera);
     }
 
     #[test]
     fn depth_follows_corrections_of_both_cameras() {
         let depth = depth_map(
-            &depth_request(&posed(Transform::identity(), Transform::identity()).pose, &Arc::default()),
-            Picture { size_px: [96, 72], rgba_srgb: Vec::new(), depth_m: vec![1.0; 96 * 72] },
+            &depth_request(
+                &posed(Transform::identity(), Transform::identity()).pose,
+                &Arc::default(),
+            ),
+            Picture {
+                size_px: [96, 72],
+                rgba_srgb: Vec::new(),
+                depth_m: vec![1.0; 96 * 72],
+            },
         );
-        let known = KnownDepth { depth, rendered_at: None };
+        let known = KnownDepth {
+            depth,
+            rendered_at: None,
+        };
         let world_from_camera = Transform::rotation(Vector3::new(0.0, 0.3, 0.0));
-        let color_from_depth =
-            Transform::translation(0.05, 0.0, 0.0) * Transform::rotation(Vector3::new(0.1, 0.0, 0.2));
+        let color_from_depth = Transform::translation(0.05, 0.0, 0.0)
+            * Transform::rotation(Vector3::new(0.1, 0.0, 0.2));
         let depth = known.posed(&posed(world_from_camera, color_from_depth));
-        let error = (world_from_camera * color_from_depth).inverse() * depth.depth.world_from_camera;
-        assert!(error.translation.vector.norm() < 1e-12 && error.rotation.angle() < 1e-7, "{error}");
-        assert_eq!((depth.stamp, depth.is_measured, depth.pixel_rad), (Stamp(7), true, 1.0 / 600.0));
+        let error =
+            (world_from_camera * color_from_depth).inverse() * depth.depth.world_from_camera;
+        assert!(
+            error.translation.vector.norm() < 1e-12 && error.rotation.angle() < 1e-7,
+            "{error}"
+        );
+        assert_eq!(
+            (depth.stamp, depth.is_measured, depth.pixel_rad),
+            (Stamp(7), true, 1.0 / 600.0)
+        );
     }
 
     #[test]
@@ -308,13 +397,27 @@ mod tests {
         let mut publisher = ObservationPublisher::new(Hub::new());
         let edits = Arc::default();
         let mut is_computed_at = |x_m: f64| {
-            let keyframes = [posed(Transform::translation(x_m, 0.0, 0.0), Transform::identity())];
-            let model = ModelState { step: 1000, edits: &edits, captured_at: &|_| None };
+            let keyframes = [posed(
+                Transform::translation(x_m, 0.0, 0.0),
+                Transform::identity(),
+            )];
+            let model = ModelState {
+                step: 1000,
+                edits: &edits,
+                captured_at: &|_| None,
+            };
             publisher.publish(&keyframes, &model, |request| {
                 let n = (request.size_px[0] * request.size_px[1]) as usize;
-                Ok(Picture { size_px: request.size_px, rgba_srgb: Vec::new(), depth_m: vec![1.0; n] })
+                Ok(Picture {
+                    size_px: request.size_px,
+                    rgba_srgb: Vec::new(),
+                    depth_m: vec![1.0; n],
+                })
             });
-            publisher.task.take().is_some_and(|(_, thread)| thread.join().is_ok())
+            publisher
+                .task
+                .take()
+                .is_some_and(|(_, thread)| thread.join().is_ok())
         };
         let computed = [0.0, 0.0, 1e-9, 0.01, 0.01].map(&mut is_computed_at);
         assert_eq!(computed, [true, false, false, true, false]);

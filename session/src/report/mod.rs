@@ -1,6 +1,8 @@
-//! `report.html`: one page that works offline, with test images next to renders, scores and settings of a training run.
+//! `report.html`: one page that works offline, with test images next to renders, scores and
+//! settings of a training run.
 //!
-//! The page combines the content of `report.json`, renders of test images, and suggested next commands.
+//! The page combines the content of `report.json`, renders of test images, and suggested next
+//! commands.
 
 mod pictures;
 
@@ -56,10 +58,19 @@ impl Page<'_> {
         page.push_str(&figures(done, self.primitive));
         page.push_str(&data_losses(&report["data_losses"]));
         page.push_str(&commands(self.next));
-        page.push_str(&comparison_section(self.comparisons, array(&report["per_image"]).len()));
+        page.push_str(&comparison_section(
+            self.comparisons,
+            array(&report["per_image"]).len(),
+        ));
         page.push_str(&curve(report, method));
-        page.push_str(&collapsible(&scores_of_images(report), "Scores of all test images"));
-        page.push_str(&collapsible(&evaluations_table(report, self.primitive), "Scores during training"));
+        page.push_str(&collapsible(
+            &scores_of_images(report),
+            "Scores of all test images",
+        ));
+        page.push_str(&collapsible(
+            &evaluations_table(report, self.primitive),
+            "Scores during training",
+        ));
         page.push_str(&collapsible(&latencies(&report["latencies"]), "Latency"));
         page.push_str(&trials(&report["trials"]));
         page.push_str(&self.settings_tables());
@@ -70,24 +81,45 @@ impl Page<'_> {
     /// Program version, data and device in one line.
     fn subtitle(&self) -> String {
         let text = |key: &str| self.report[key].as_str().map(str::to_owned);
-        let words = [Some(format!("fieldrig {}", env!("CARGO_PKG_VERSION"))), text("data"), text("adapter")];
+        let words = [
+            Some(format!("fieldrig {}", env!("CARGO_PKG_VERSION"))),
+            text("data"),
+            text("adapter"),
+        ];
         words.into_iter().flatten().collect::<Vec<_>>().join(" · ")
     }
 
     fn settings_tables(&self) -> String {
-        let excluded_keys = ["done", "data_losses", "evaluations", "latencies", "trials", "passes", "per_image"];
+        let excluded_keys = [
+            "done",
+            "data_losses",
+            "evaluations",
+            "latencies",
+            "trials",
+            "passes",
+            "per_image",
+        ];
         let extra = self.report.as_object().into_iter().flatten();
         let extra = extra.filter(|(key, _)| !excluded_keys.contains(&key.as_str()));
         let mut run: Vec<Vec<String>> = vec![vec!["command".to_owned(), self.command.clone()]];
         run.extend(extra.flat_map(|(key, value)| rows_of(key, value)));
-        run.extend(rows_of("model sha256", &self.report["done"]["checkpoint_sha256"]));
+        run.extend(rows_of(
+            "model sha256",
+            &self.report["done"]["checkpoint_sha256"],
+        ));
         let passes = array(&self.report["passes"]).iter().filter_map(|pass| {
-            Some(vec![format!("GPU time of {}", pass[0].as_str()?), format!("{:.3} ms", pass[1].as_f64()?)])
+            Some(vec![
+                format!("GPU time of {}", pass[0].as_str()?),
+                format!("{:.3} ms", pass[1].as_f64()?),
+            ])
         });
         run.extend(passes);
         let mut html = settings_table("This run", run, false);
         if let Value::Object(settings) = &self.settings {
-            let rows = settings.iter().flat_map(|(key, value)| rows_of(key, value)).collect();
+            let rows = settings
+                .iter()
+                .flat_map(|(key, value)| rows_of(key, value))
+                .collect();
             html.push_str(&settings_table("All settings of the model", rows, true));
         }
         html
@@ -97,16 +129,25 @@ impl Page<'_> {
 /// The main scores and sizes.
 fn figures(done: &Value, primitive: &str) -> String {
     let number = |key: &str| done[key].as_f64();
-    let scaled =
-        |key: &str, factor: f64, digits: usize| number(key).map(|value| format!("{:.digits$}", factor * value));
+    let scaled = |key: &str, factor: f64, digits: usize| {
+        number(key).map(|value| format!("{:.digits$}", factor * value))
+    };
     let primitives = format!("{primitive}s");
     let entries = [
-        ("test PSNR", scaled("psnr", 1.0, 2).or(Some("–".to_owned())), "dB"),
+        (
+            "test PSNR",
+            scaled("psnr", 1.0, 2).or(Some("–".to_owned())),
+            "dB",
+        ),
         ("SSIM", scaled("ssim", 1.0, 4), ""),
         ("LPIPS", scaled("lpips", 1.0, 4), ""),
         ("depth RMSE", scaled("depth_rmse_m", 1e3, 1), "mm"),
         ("surface error", scaled("surface_error_m", 1e3, 1), "mm"),
-        ("surface within 5 mm", scaled("surface_within_5_mm", 1e2, 1), "%"),
+        (
+            "surface within 5 mm",
+            scaled("surface_within_5_mm", 1e2, 1),
+            "%",
+        ),
         ("PSNR against truth", scaled("psnr_truth", 1.0, 2), "dB"),
         ("training time", scaled("seconds", 1.0, 1), "s"),
         ("steps", number("steps").map(grouped), ""),
@@ -116,21 +157,36 @@ fn figures(done: &Value, primitive: &str) -> String {
     let mut html = String::from("<dl class=\"figures\">\n");
     for (name, value, unit) in entries {
         let Some(value) = value else { continue };
-        let unit = if unit.is_empty() { String::new() } else { format!("<small>{unit}</small>") };
-        writeln!(html, "<div><dd>{value}{unit}</dd><dt>{}</dt></div>", escaped(name)).expect("a String never fails");
+        let unit = if unit.is_empty() {
+            String::new()
+        } else {
+            format!("<small>{unit}</small>")
+        };
+        writeln!(
+            html,
+            "<div><dd>{value}{unit}</dd><dt>{}</dt></div>",
+            escaped(name)
+        )
+        .expect("a String never fails");
     }
     for (camera, psnr) in done["psnr_per_camera"].as_object().into_iter().flatten() {
         let (camera, psnr) = (escaped(camera), psnr.as_f64().unwrap_or_default());
-        writeln!(html, "<div><dd>{psnr:.2}<small>dB</small></dd><dt>PSNR of {camera}</dt></div>")
-            .expect("a String never fails");
+        writeln!(
+            html,
+            "<div><dd>{psnr:.2}<small>dB</small></dd><dt>PSNR of {camera}</dt></div>"
+        )
+        .expect("a String never fails");
     }
     html.push_str("</dl>\n");
     html
 }
 
 fn data_losses(data_losses: &Value) -> String {
-    let items: String =
-        array(data_losses).iter().filter_map(Value::as_str).map(|loss| format!("<li>{}</li>", escaped(loss))).collect();
+    let items: String = array(data_losses)
+        .iter()
+        .filter_map(Value::as_str)
+        .map(|loss| format!("<li>{}</li>", escaped(loss)))
+        .collect();
     match items.is_empty() {
         true => String::new(),
         false => format!("<div class=\"warn\"><strong>Lost data</strong><ul>{items}</ul></div>\n"),
@@ -139,7 +195,11 @@ fn data_losses(data_losses: &Value) -> String {
 
 fn commands(next: &[NextCommand]) -> String {
     let entry = |next: &NextCommand| {
-        format!("<dt>{}</dt><dd><code>{}</code></dd>\n", escaped(&next.purpose), escaped(&next.command))
+        format!(
+            "<dt>{}</dt><dd><code>{}</code></dd>\n",
+            escaped(&next.purpose),
+            escaped(&next.command)
+        )
     };
     let entries: String = next.iter().map(entry).collect();
     if entries.is_empty() {
@@ -151,21 +211,32 @@ fn commands(next: &[NextCommand]) -> String {
 /// Test images next to renders.
 fn comparison_section(comparisons: &[Comparison], n_tests: usize) -> String {
     if comparisons.is_empty() {
-        let reason = if n_tests == 0 { "there are no test images" } else { "no test image could be drawn" };
+        let reason = if n_tests == 0 {
+            "there are no test images"
+        } else {
+            "no test image could be drawn"
+        };
         return format!("<h2>Test images</h2>\n<p class=\"legend\">No comparison: {reason}.</p>\n");
     }
     let count_note = match comparisons.len() == n_tests {
         true => String::new(),
-        false => format!("{} of {n_tests} test images, including the best and the worst. ", comparisons.len()),
+        false => format!(
+            "{} of {n_tests} test images, including the best and the worst. ",
+            comparisons.len()
+        ),
     };
     let mut html = format!(
         "<h2>Test images</h2>\n<p class=\"legend\">{count_note}Left to right: the camera image and the model's render from \
          the same pose. None of these images was used for training.</p>\n<div class=\"comparisons\">\n"
     );
     let by_psnr = |a: &&Comparison, b: &&Comparison| a.psnr.total_cmp(&b.psnr);
-    let (worst, best) = (comparisons.iter().min_by(by_psnr), comparisons.iter().max_by(by_psnr));
+    let (worst, best) = (
+        comparisons.iter().min_by(by_psnr),
+        comparisons.iter().max_by(by_psnr),
+    );
     for comparison in comparisons {
-        let is = |other: Option<&Comparison>| other.is_some_and(|other| std::ptr::eq(other, comparison));
+        let is =
+            |other: Option<&Comparison>| other.is_some_and(|other| std::ptr::eq(other, comparison));
         let tag = match comparisons.len() {
             ..3 => "",
             _ if is(worst) => "<span class=\"tag\">worst</span>",
@@ -179,7 +250,16 @@ fn comparison_section(comparisons: &[Comparison], n_tests: usize) -> String {
 }
 
 fn comparison_card(comparison: &Comparison, tag: &str) -> String {
-    let Comparison { name, psnr, ssim, size_px: [width, height], image, render, error, depth } = comparison;
+    let Comparison {
+        name,
+        psnr,
+        ssim,
+        size_px: [width, height],
+        image,
+        render,
+        error,
+        depth,
+    } = comparison;
     let name = escaped(name);
     let ssim = ssim.map_or(String::new(), |ssim| format!("<span>SSIM {ssim:.4}</span>"));
     let figure = |source: &str, caption: &str| {
@@ -190,7 +270,10 @@ fn comparison_card(comparison: &Comparison, tag: &str) -> String {
     };
     let depth = depth.as_ref().map_or(String::new(), |depth| {
         let [near, far] = depth.range_m;
-        figure(&depth.picture, &format!("depth, {near:.2} m (red) to {far:.2} m (blue)"))
+        figure(
+            &depth.picture,
+            &format!("depth, {near:.2} m (red) to {far:.2} m (blue)"),
+        )
     });
     let shape = if height > width { " tall" } else { "" };
     format!(
@@ -205,9 +288,15 @@ fn comparison_card(comparison: &Comparison, tag: &str) -> String {
 /// Accuracy over time.
 fn curve(report: &Value, method: &str) -> String {
     let point = |evaluation: &Value| {
-        Some((evaluation["seconds"].as_f64().filter(|secs| *secs > 0.0)?, evaluation["psnr"].as_f64()?))
+        Some((
+            evaluation["seconds"].as_f64().filter(|secs| *secs > 0.0)?,
+            evaluation["psnr"].as_f64()?,
+        ))
     };
-    let mut points: Vec<(f64, f64)> = array(&report["evaluations"]).iter().filter_map(point).collect();
+    let mut points: Vec<(f64, f64)> = array(&report["evaluations"])
+        .iter()
+        .filter_map(point)
+        .collect();
     let last_secs = points.last().map_or(0.0, |(secs, _)| *secs);
     points.extend(point(&report["done"]).filter(|(secs, _)| *secs > 1.01 * last_secs));
     if points.len() < 2 {
@@ -219,19 +308,36 @@ fn curve(report: &Value, method: &str) -> String {
         x: Axis {
             label: "seconds of training (log)".into(),
             scale: Scale::Log,
-            ticks: evaluation_schedule::up_to(1.1 * last_secs.max(points.last().map_or(0.0, |(secs, _)| *secs)))
-                .collect(),
+            ticks: evaluation_schedule::up_to(
+                1.1 * last_secs.max(points.last().map_or(0.0, |(secs, _)| *secs)),
+            )
+            .collect(),
         },
-        y: Axis { label: "test PSNR, dB".into(), scale: Scale::Linear, ticks: Vec::new() },
+        y: Axis {
+            label: "test PSNR, dB".into(),
+            scale: Scale::Linear,
+            ticks: Vec::new(),
+        },
         lines: vec![Line {
             label: method.to_owned(),
-            points: points.iter().map(|(x, y)| Point { x: *x, y: *y, low: *y, high: *y }).collect(),
+            points: points
+                .iter()
+                .map(|(x, y)| Point {
+                    x: *x,
+                    y: *y,
+                    low: *y,
+                    high: *y,
+                })
+                .collect(),
             is_peer: false,
         }],
         thresholds: Vec::new(),
         markers: Vec::new(),
     };
-    format!("<h2>Training curve</h2>\n<div class=\"chart card\">{}</div>\n", chart.draw().svg())
+    format!(
+        "<h2>Training curve</h2>\n<div class=\"chart card\">{}</div>\n",
+        chart.draw().svg()
+    )
 }
 
 fn scores_of_images(report: &Value) -> Table {
@@ -243,7 +349,12 @@ fn scores_of_images(report: &Value) -> Table {
         ("surface_error_m", "surface, mm", 1e3, 1),
         ("psnr_truth", "PSNR against truth, dB", 1.0, 2),
     ];
-    table("Scores of all test images", &report["per_image"], ("name", "image"), &columns)
+    table(
+        "Scores of all test images",
+        &report["per_image"],
+        ("name", "image"),
+        &columns,
+    )
 }
 
 fn evaluations_table(report: &Value, primitive: &str) -> Table {
@@ -259,7 +370,12 @@ fn evaluations_table(report: &Value, primitive: &str) -> Table {
         ("bytes", "MB", 1e-6, 1),
         ("step_millis", "ms per step", 1.0, 2),
     ];
-    table("Scores during training", &report["evaluations"], ("seconds", "seconds"), &columns)
+    table(
+        "Scores during training",
+        &report["evaluations"],
+        ("seconds", "seconds"),
+        &columns,
+    )
 }
 
 /// A column: key, header, factor, number of decimals.
@@ -280,11 +396,16 @@ fn table(title: &str, objects: &Value, (key, head): (&str, &str), columns: &[Col
         other => text_of(other),
     };
     let row = |object: &Value| -> Vec<String> {
-        std::iter::once(first(object)).chain(columns.iter().map(|column| cell(object, column))).collect()
+        std::iter::once(first(object))
+            .chain(columns.iter().map(|column| cell(object, column)))
+            .collect()
     };
     Table {
         title: title.to_owned(),
-        head: std::iter::once(head).chain(columns.iter().map(|column| column.1)).map(str::to_owned).collect(),
+        head: std::iter::once(head)
+            .chain(columns.iter().map(|column| column.1))
+            .map(str::to_owned)
+            .collect(),
         rows: objects.iter().map(row).collect(),
     }
 }
@@ -294,19 +415,40 @@ fn collapsible(table: &Table, title: &str) -> String {
     match table.rows.len() {
         0 => String::new(),
         1..=MAX_OPEN_ROWS => table.html(),
-        n => format!("<details><summary>{}: {n} rows</summary>\n{}</details>\n", escaped(title), table.html()),
+        n => format!(
+            "<details><summary>{}: {n} rows</summary>\n{}</details>\n",
+            escaped(title),
+            table.html()
+        ),
     }
 }
 
 /// Durations of a live run.
 fn latencies(latencies: &Value) -> Table {
     let row = |latency: &Value| {
-        let [name, values] = latency.as_array()?.as_slice() else { return None };
-        let millis = |key: &str| values[key].as_f64().map_or("–".to_owned(), |millis| format!("{millis:.0}"));
-        Some(vec![text_of(name), millis("p50"), millis("p99"), text_of(&values["n"])])
+        let [name, values] = latency.as_array()?.as_slice() else {
+            return None;
+        };
+        let millis = |key: &str| {
+            values[key]
+                .as_f64()
+                .map_or("–".to_owned(), |millis| format!("{millis:.0}"))
+        };
+        Some(vec![
+            text_of(name),
+            millis("p50"),
+            millis("p99"),
+            text_of(&values["n"]),
+        ])
     };
-    let head = ["duration", "median, ms", "99 %, ms", "keyframes"].map(str::to_owned).to_vec();
-    Table { title: "Latency".into(), head, rows: array(latencies).iter().filter_map(row).collect() }
+    let head = ["duration", "median, ms", "99 %, ms", "keyframes"]
+        .map(str::to_owned)
+        .to_vec();
+    Table {
+        title: "Latency".into(),
+        head,
+        rows: array(latencies).iter().filter_map(row).collect(),
+    }
 }
 
 /// The results of A/B trials.
@@ -315,25 +457,49 @@ fn trials(trials: &Value) -> String {
         .iter()
         .map(|trial| {
             let number = |key: &str| trial[key].as_f64().unwrap_or_default();
-            let kept = if trial["kept"] == Value::Bool(true) { "kept" } else { "dropped" };
-            let gain = format!("{:+.2} ± {:.2}", number("gain_db"), number("standard_error_db"));
-            vec![text_of(&trial["candidate"]), gain, text_of(&trial["n_images"]), kept.to_owned()]
+            let kept = if trial["kept"] == Value::Bool(true) {
+                "kept"
+            } else {
+                "dropped"
+            };
+            let gain = format!(
+                "{:+.2} ± {:.2}",
+                number("gain_db"),
+                number("standard_error_db")
+            );
+            vec![
+                text_of(&trial["candidate"]),
+                gain,
+                text_of(&trial["n_images"]),
+                kept.to_owned(),
+            ]
         })
         .collect();
     if rows.is_empty() {
         return String::new();
     }
-    let head = ["candidate", "gain, dB", "images", "result"].map(str::to_owned).to_vec();
-    Table { title: "Trials during training".into(), head, rows }.html()
+    let head = ["candidate", "gain, dB", "images", "result"]
+        .map(str::to_owned)
+        .to_vec();
+    Table {
+        title: "Trials during training".into(),
+        head,
+        rows,
+    }
+    .html()
 }
 
 fn settings_table(title: &str, rows: Vec<Vec<String>>, is_collapsed: bool) -> String {
     let row = |row: &Vec<String>| {
-        let cells: String = row.iter().map(|cell| format!("<td>{}</td>", escaped(cell))).collect();
+        let cells: String = row
+            .iter()
+            .map(|cell| format!("<td>{}</td>", escaped(cell)))
+            .collect();
         format!("<tr>{cells}</tr>\n")
     };
     let rows: String = rows.iter().map(row).collect();
-    let table = format!("<div class=\"wide settings\"><table><tbody>\n{rows}</tbody></table></div>\n");
+    let table =
+        format!("<div class=\"wide settings\"><table><tbody>\n{rows}</tbody></table></div>\n");
     match is_collapsed {
         true => format!("<details><summary>{title}</summary>\n{table}</details>\n"),
         false => format!("<h2>{title}</h2>\n{table}"),
@@ -352,12 +518,15 @@ fn rows_of(key: &str, value: &Value) -> Vec<Vec<String>> {
     match value {
         Value::Null => Vec::new(),
         Value::Array(items) if items.is_empty() => Vec::new(),
-        Value::Object(map) => {
-            map.iter().flat_map(|(inner, value)| rows_of(&format!("{key}: {inner}"), value)).collect()
-        }
+        Value::Object(map) => map
+            .iter()
+            .flat_map(|(inner, value)| rows_of(&format!("{key}: {inner}"), value))
+            .collect(),
         Value::Array(items) if items.iter().any(Value::is_object) => {
             let numbered = items.iter().enumerate();
-            numbered.map(|(ix, item)| vec![format!("{key} {}", ix + 1), text_of(item)]).collect()
+            numbered
+                .map(|(ix, item)| vec![format!("{key} {}", ix + 1), text_of(item)])
+                .collect()
         }
         other => vec![vec![key, text_of(other)]],
     }
@@ -367,7 +536,9 @@ fn rows_of(key: &str, value: &Value) -> Vec<Vec<String>> {
 fn text_of(value: &Value) -> String {
     let of_map = |map: &Map<String, Value>| {
         let known = map.iter().filter(|(_, value)| !value.is_null());
-        known.map(|(key, value)| format!("{} {}", key.replace('_', " "), text_of(value))).collect::<Vec<_>>()
+        known
+            .map(|(key, value)| format!("{} {}", key.replace('_', " "), text_of(value)))
+            .collect::<Vec<_>>()
     };
     match value {
         Value::Null => "–".to_owned(),
@@ -408,11 +579,19 @@ fn array(value: &Value) -> &[Value] {
     value.as_array().map_or(&[], Vec::as_slice)
 }
 
-/// The settings of a run: the first line of the newest decision log in a folder; `Null` if there is no log.
+/// The settings of a run: the first line of the newest decision log in a folder; `Null` if there is
+/// no log.
 pub(crate) fn settings_in(folder: &Path) -> Value {
-    let step_of = |name: &str| name.strip_prefix("decisions-from-")?.strip_suffix(".jsonl")?.parse::<u64>().ok();
+    let step_of = |name: &str| {
+        name.strip_prefix("decisions-from-")?
+            .strip_suffix(".jsonl")?
+            .parse::<u64>()
+            .ok()
+    };
     let names = std::fs::read_dir(folder).into_iter().flatten().flatten();
-    let newest = names.filter_map(|entry| Some((step_of(entry.file_name().to_str()?)?, entry.path()))).max();
+    let newest = names
+        .filter_map(|entry| Some((step_of(entry.file_name().to_str()?)?, entry.path())))
+        .max();
     let path = newest.map_or_else(|| folder.join("decisions.jsonl"), |(_, path)| path);
     let first_line = || -> Option<Value> {
         let text = files::read_text(&path).ok()?;
@@ -427,7 +606,10 @@ mod tests {
     use serde_json::json;
 
     fn page(report: &Value) -> String {
-        let next = NextCommand { purpose: "view the model".into(), command: "fieldrig view 'a <b>'".into() };
+        let next = NextCommand {
+            purpose: "view the model".into(),
+            command: "fieldrig view 'a <b>'".into(),
+        };
         let page = Page {
             folder: Path::new("runs/a <b>"),
             report,
@@ -473,21 +655,36 @@ mod tests {
         }
         assert!(!html.contains("<b>") && !html.contains("alignment") && !html.contains("NaN"));
         assert!(
-            !html.contains("http://") || html.matches("http://").count() == html.matches("http://www.w3.org").count()
+            !html.contains("http://")
+                || html.matches("http://").count() == html.matches("http://www.w3.org").count()
         );
     }
 
     #[test]
     fn page_without_scores_is_valid() {
-        let html = page(&json!({ "done": { "method": "tsdf", "psnr": null }, "evaluations": [], "per_image": [] }));
-        assert!(html.contains("there are no test images") && !html.contains("<svg "), "{html}");
+        let html = page(
+            &json!({ "done": { "method": "tsdf", "psnr": null }, "evaluations": [], "per_image": [] }),
+        );
+        assert!(
+            html.contains("there are no test images") && !html.contains("<svg "),
+            "{html}"
+        );
     }
 
     #[test]
     fn values_are_formatted_compactly() {
-        let texts =
-            [json!(0.000_012_34), json!(0.5), json!(7), json!([1.25, 2]), json!(true), json!({ "a_b": 1, "c": null })];
-        assert_eq!(texts.each_ref().map(text_of), ["1.234e-5", "0.5", "7", "1.25, 2", "yes", "a b 1"]);
+        let texts = [
+            json!(0.000_012_34),
+            json!(0.5),
+            json!(7),
+            json!([1.25, 2]),
+            json!(true),
+            json!({ "a_b": 1, "c": null }),
+        ];
+        assert_eq!(
+            texts.each_ref().map(text_of),
+            ["1.234e-5", "0.5", "7", "1.25, 2", "yes", "a b 1"]
+        );
         assert_eq!(
             [0.0, 999.0, 1000.0, -1_234_567.0].map(grouped),
             ["0", "999", "1\u{202f}000", "-1\u{202f}234\u{202f}567"]
@@ -499,7 +696,11 @@ mod tests {
         let folder = tempfile::tempdir().expect("a folder");
         assert_eq!(settings_in(folder.path()), Value::Null);
         let write = |name: &str, step: u64| {
-            let lines = format!("{}\n{}\n", json!({ "from_step": step }), json!({ "end": true }));
+            let lines = format!(
+                "{}\n{}\n",
+                json!({ "from_step": step }),
+                json!({ "end": true })
+            );
             std::fs::write(folder.path().join(name), lines).expect("disk space");
         };
         write("decisions.jsonl", 0);

@@ -22,7 +22,8 @@ const QUALITY: u8 = 82;
 const SMALL_QUALITY: u8 = 75;
 /// Maximum total size of all pictures, encoded as base64.
 const MAX_TEXT_BYTES: usize = 2_600_000;
-/// After this time, no further picture is drawn. On a CPU, one picture of a neural field may take half a minute.
+/// After this time, no further picture is drawn. On a CPU, one picture of a neural field may take
+/// half a minute.
 const MAX_RENDER_TIME: Duration = Duration::from_secs(10);
 /// Color difference, 0 to 255, from which the error map has its brightest color.
 const MAX_ERROR: u8 = 64;
@@ -55,14 +56,21 @@ pub(crate) struct Scored<'a> {
     pub ssim: Option<f64>,
 }
 
-/// Renders an evenly spread selection of test images, including the best and the worst, in the order of `scored`.
-pub(crate) fn compare(method: &mut dyn Method, scored: &[Scored<'_>]) -> crate::Result<Vec<Comparison>> {
+/// Renders an evenly spread selection of test images, including the best and the worst, in the
+/// order of `scored`.
+pub(crate) fn compare(
+    method: &mut dyn Method,
+    scored: &[Scored<'_>],
+) -> crate::Result<Vec<Comparison>> {
     let started = Instant::now();
     let mut comparisons: Vec<(usize, Comparison)> = Vec::new();
     let mut n_bytes = 0;
     for ix in selected(&scored.iter().map(|image| image.psnr).collect::<Vec<_>>()) {
         if !comparisons.is_empty() && started.elapsed() > MAX_RENDER_TIME {
-            log::info!("report.html shows only {} test images: rendering more takes too long", comparisons.len());
+            log::info!(
+                "report.html shows only {} test images: rendering more takes too long",
+                comparisons.len()
+            );
             break;
         }
         let comparison = Comparison::of(method, &scored[ix])?;
@@ -73,10 +81,14 @@ pub(crate) fn compare(method: &mut dyn Method, scored: &[Scored<'_>]) -> crate::
         comparisons.push((ix, comparison));
     }
     comparisons.sort_by_key(|(ix, _)| *ix);
-    Ok(comparisons.into_iter().map(|(_, comparison)| comparison).collect())
+    Ok(comparisons
+        .into_iter()
+        .map(|(_, comparison)| comparison)
+        .collect())
 }
 
-/// Indices of the images to show, the most important first: the worst, the best, and others evenly spread.
+/// Indices of the images to show, the most important first: the worst, the best, and others evenly
+/// spread.
 fn selected(psnr: &[f64]) -> Vec<usize> {
     let by_psnr = |a: &usize, b: &usize| psnr[*a].total_cmp(&psnr[*b]);
     let mut selected: Vec<usize> = (0..psnr.len()).min_by(by_psnr).into_iter().collect();
@@ -85,7 +97,12 @@ fn selected(psnr: &[f64]) -> Vec<usize> {
     let mut spread: Vec<usize> = (0..n_spread).collect();
     spread.sort_by_key(|n| n.reverse_bits());
     let spread = spread.into_iter().map(|n| n * psnr.len() / n_spread);
-    for ix in (0..psnr.len()).max_by(by_psnr).into_iter().chain(spread).chain(0..psnr.len()) {
+    for ix in (0..psnr.len())
+        .max_by(by_psnr)
+        .into_iter()
+        .chain(spread)
+        .chain(0..psnr.len())
+    {
         if ix < psnr.len() && selected.len() < MAX_IMAGES && !selected.contains(&ix) {
             selected.push(ix);
         }
@@ -97,11 +114,15 @@ impl Comparison {
     fn of(method: &mut dyn Method, scored: &Scored<'_>) -> crate::Result<Self> {
         let keyframe = scored.keyframe;
         let rendered = evaluate::draw(method, keyframe, true)?;
-        let [size_px, small_px] = [MAX_SIDE_PX, MAX_SMALL_SIDE_PX].map(|side| fit_size(keyframe.size_px, side));
+        let [size_px, small_px] =
+            [MAX_SIDE_PX, MAX_SMALL_SIDE_PX].map(|side| fit_size(keyframe.size_px, side));
         let small = |rgba: &[u8], to_px| downscale::rgba(rgba.to_vec(), keyframe.size_px, to_px);
         let image = small(&keyframe.rgba_srgb, size_px);
         let render = mask_colors(&small(&opaque(&rendered.rgba_srgb), size_px), &image);
-        let error = errors(&small(&opaque(&rendered.rgba_srgb), small_px), &small(&keyframe.rgba_srgb, small_px));
+        let error = errors(
+            &small(&opaque(&rendered.rgba_srgb), small_px),
+            &small(&keyframe.rgba_srgb, small_px),
+        );
         Ok(Self {
             name: scored.name.clone(),
             psnr: scored.psnr,
@@ -124,70 +145,148 @@ impl DepthPicture {
     /// `None` if nothing was drawn.
     fn of(picture: &Picture, size_px: [u32; 2]) -> crate::Result<Option<Self>> {
         let subsampled = nearest_pixels(&picture.depth_m, picture.size_px, size_px);
-        let valid = subsampled.iter().copied().filter(|z| *z > 0.0 && z.is_finite());
+        let valid = subsampled
+            .iter()
+            .copied()
+            .filter(|z| *z > 0.0 && z.is_finite());
         let mut known: Vec<f64> = valid.map(f64::from).collect();
-        let Some(range_m) = trimmed_range(&mut known, OUTSIDE_FRAC).map(f32s_of) else { return Ok(None) };
+        let Some(range_m) = trimmed_range(&mut known, OUTSIDE_FRAC).map(f32s_of) else {
+            return Ok(None);
+        };
         let span_m = (range_m[1] - range_m[0]).max(1e-6);
-        let color = |z: f32| if z > 0.0 && z.is_finite() { turbo((z - range_m[0]) / span_m) } else { [0; 3] };
+        let color = |z: f32| {
+            if z > 0.0 && z.is_finite() {
+                turbo((z - range_m[0]) / span_m)
+            } else {
+                [0; 3]
+            }
+        };
         let pixels: Vec<u8> = subsampled.into_iter().flat_map(color).collect();
-        Ok(Some(Self { picture: data_uri(&pixels, size_px, SMALL_QUALITY)?, range_m }))
+        Ok(Some(Self {
+            picture: data_uri(&pixels, size_px, SMALL_QUALITY)?,
+            range_m,
+        }))
     }
 }
 
 /// A render over a black background, as in scoring.
 fn opaque(rgba: &[u8]) -> Vec<u8> {
-    rgba.as_chunks::<4>().0.iter().flat_map(|[r, g, b, _]| [*r, *g, *b, 255]).collect()
+    rgba.as_chunks::<4>()
+        .0
+        .iter()
+        .flat_map(|[r, g, b, _]| [*r, *g, *b, 255])
+        .collect()
 }
 
 /// The colors of `rgba`; black where `image` is masked.
 fn mask_colors(rgba: &[u8], image: &[u8]) -> Vec<u8> {
     let pixels = rgba.as_chunks::<4>().0.iter().zip(image.as_chunks::<4>().0);
-    pixels.flat_map(|([r, g, b, _], [.., alpha])| if *alpha > 0 { [*r, *g, *b] } else { [0; 3] }).collect()
+    pixels
+        .flat_map(|([r, g, b, _], [.., alpha])| if *alpha > 0 { [*r, *g, *b] } else { [0; 3] })
+        .collect()
 }
 
 fn rgb(rgba: &[u8]) -> Vec<u8> {
     mask_colors(rgba, rgba)
 }
 
-/// The largest channel difference of each pixel in the colors of [`heat`]; black where the image is masked.
+/// The largest channel difference of each pixel in the colors of [`heat`]; black where the image is
+/// masked.
 fn errors(render: &[u8], image: &[u8]) -> Vec<u8> {
-    let pixels = render.as_chunks::<4>().0.iter().zip(image.as_chunks::<4>().0);
+    let pixels = render
+        .as_chunks::<4>()
+        .0
+        .iter()
+        .zip(image.as_chunks::<4>().0);
     let error = |(render, image): (&[u8; 4], &[u8; 4])| {
-        let largest = (0..3).map(|channel| render[channel].abs_diff(image[channel])).max().unwrap_or_default();
-        if image[3] > 0 { heat(f32::from(largest) / f32::from(MAX_ERROR)) } else { [0; 3] }
+        let largest = (0..3)
+            .map(|channel| render[channel].abs_diff(image[channel]))
+            .max()
+            .unwrap_or_default();
+        if image[3] > 0 {
+            heat(f32::from(largest) / f32::from(MAX_ERROR))
+        } else {
+            [0; 3]
+        }
     };
     pixels.flat_map(error).collect()
 }
 
 /// A color map of increasing brightness: black, purple, red, orange, light yellow, evenly spaced.
 fn heat(value_frac: f32) -> [u8; 3] {
-    const STOPS: [[f32; 3]; 5] =
-        [[0.0, 0.0, 4.0], [87.0, 16.0, 110.0], [188.0, 55.0, 84.0], [249.0, 142.0, 9.0], [252.0, 255.0, 164.0]];
+    const STOPS: [[f32; 3]; 5] = [
+        [0.0, 0.0, 4.0],
+        [87.0, 16.0, 110.0],
+        [188.0, 55.0, 84.0],
+        [249.0, 142.0, 9.0],
+        [252.0, 255.0, 164.0],
+    ];
     let at = value_frac.clamp(0.0, 1.0) * 4.0;
-    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "0 to 3")]
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "0 to 3"
+    )]
     let ix = (at.floor() as usize).min(3);
     let frac = at - ix as f32;
-    std::array::from_fn(|channel| byte(STOPS[ix][channel] + frac * (STOPS[ix + 1][channel] - STOPS[ix][channel])))
+    std::array::from_fn(|channel| {
+        byte(STOPS[ix][channel] + frac * (STOPS[ix + 1][channel] - STOPS[ix][channel]))
+    })
 }
 
-/// Color map from red (near) to blue (far): the polynomial of Mikhailov 2019, "Turbo, an improved rainbow colormap",
-/// reversed.
+/// Color map from red (near) to blue (far): the polynomial of Mikhailov 2019, "Turbo, an improved
+/// rainbow colormap", reversed.
 fn turbo(value_frac: f32) -> [u8; 3] {
-    const RED: [f32; 6] = [0.135_721_4, 4.615_392_6, -42.660_32, 132.131_08, -152.942_4, 59.286_38];
-    const GREEN: [f32; 6] = [0.091_402_61, 2.194_188_4, 4.842_966_6, -14.185_033, 4.277_298_5, 2.829_566];
-    const BLUE: [f32; 6] = [0.106_673_3, 12.641_946, -60.582_05, 110.362_77, -89.903_11, 27.348_25];
+    const RED: [f32; 6] = [
+        0.135_721_4,
+        4.615_392_6,
+        -42.660_32,
+        132.131_08,
+        -152.942_4,
+        59.286_38,
+    ];
+    const GREEN: [f32; 6] = [
+        0.091_402_61,
+        2.194_188_4,
+        4.842_966_6,
+        -14.185_033,
+        4.277_298_5,
+        2.829_566,
+    ];
+    const BLUE: [f32; 6] = [
+        0.106_673_3,
+        12.641_946,
+        -60.582_05,
+        110.362_77,
+        -89.903_11,
+        27.348_25,
+    ];
     let x = 1.0 - value_frac.clamp(0.0, 1.0);
-    [RED, GREEN, BLUE].map(|factors| byte(255.0 * factors.iter().rev().fold(0.0, |sum, factor| sum * x + factor)))
+    [RED, GREEN, BLUE].map(|factors| {
+        byte(
+            255.0
+                * factors
+                    .iter()
+                    .rev()
+                    .fold(0.0, |sum, factor| sum * x + factor),
+        )
+    })
 }
 
-#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to a byte")]
+#[expect(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "clamped to a byte"
+)]
 fn byte(value: f32) -> u8 {
     value.round().clamp(0.0, 255.0) as u8
 }
 
-/// Samples the values at the pixel centers of a smaller picture. Averaging would put depth between surfaces.
+/// Samples the values at the pixel centers of a smaller picture. Averaging would put depth between
+/// surfaces.
 fn nearest_pixels(values: &[f32], from_px: [u32; 2], to_px: [u32; 2]) -> Vec<f32> {
-    let source_ix = |ix: u32, from: u32, to: u32| (2 * ix as usize + 1) * from as usize / (2 * to as usize);
+    let source_ix =
+        |ix: u32, from: u32, to: u32| (2 * ix as usize + 1) * from as usize / (2 * to as usize);
     let mut subsampled = Vec::with_capacity(to_px[0] as usize * to_px[1] as usize);
     for y in 0..to_px[1] {
         let row = source_ix(y, from_px[1], to_px[1]) * from_px[0] as usize;
@@ -205,8 +304,18 @@ mod tests {
         let mut psnr = vec![20.0; 100];
         (psnr[37], psnr[61]) = (11.0, 30.0);
         let selected_of_many = selected(&psnr);
-        assert_eq!((selected_of_many[0], selected_of_many[1], selected_of_many.len()), (37, 61, MAX_IMAGES));
-        assert!(selected_of_many.iter().filter(|ix| **ix < 50).count() >= 5, "{selected_of_many:?}");
+        assert_eq!(
+            (
+                selected_of_many[0],
+                selected_of_many[1],
+                selected_of_many.len()
+            ),
+            (37, 61, MAX_IMAGES)
+        );
+        assert!(
+            selected_of_many.iter().filter(|ix| **ix < 50).count() >= 5,
+            "{selected_of_many:?}"
+        );
         let mut few = selected(&psnr[..5]);
         few.sort_unstable();
         assert_eq!(few, [0, 1, 2, 3, 4]);
@@ -233,10 +342,24 @@ mod tests {
         let depth_m = [1.0, 1.0, 9.0, 9.0, 1.0, 2.0, 9.0, 8.0];
         assert_eq!(nearest_pixels(&depth_m, [4, 2], [2, 1]), [2.0, 8.0]);
         assert_eq!(nearest_pixels(&depth_m, [4, 2], [4, 2]), depth_m);
-        let picture = Picture { size_px: [4, 2], rgba_srgb: vec![0; 32], depth_m: depth_m.to_vec() };
-        let rendered = DepthPicture::of(&picture, [4, 2]).expect("a picture").expect("depth");
+        let picture = Picture {
+            size_px: [4, 2],
+            rgba_srgb: vec![0; 32],
+            depth_m: depth_m.to_vec(),
+        };
+        let rendered = DepthPicture::of(&picture, [4, 2])
+            .expect("a picture")
+            .expect("depth");
         assert_eq!(rendered.range_m, [1.0, 9.0]);
-        let empty = Picture { size_px: [4, 2], rgba_srgb: vec![0; 32], depth_m: vec![0.0; 8] };
-        assert!(DepthPicture::of(&empty, [4, 2]).expect("a picture").is_none());
+        let empty = Picture {
+            size_px: [4, 2],
+            rgba_srgb: vec![0; 32],
+            depth_m: vec![0.0; 8],
+        };
+        assert!(
+            DepthPicture::of(&empty, [4, 2])
+                .expect("a picture")
+                .is_none()
+        );
     }
 }

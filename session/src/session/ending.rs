@@ -35,7 +35,12 @@ impl FinishedModel {
     /// The saved model, for commands that use it.
     #[must_use]
     pub fn saved(&self) -> SavedModel<'_> {
-        SavedModel { kind: self.kind, folder: &self.folder, data: &self.data, n_tests: self.n_tests }
+        SavedModel {
+            kind: self.kind,
+            folder: &self.folder,
+            data: &self.data,
+            n_tests: self.n_tests,
+        }
     }
 }
 
@@ -49,13 +54,19 @@ pub struct EndingSession<P> {
     pub details: P,
 }
 
-/// Saves all models, then scores each one and writes its report. Returns the models so that they can be viewed.
+/// Saves all models, then scores each one and writes its report. Returns the models so that they
+/// can be viewed.
 ///
 /// * `hub`: its clients get pictures of each model while it is scored.
-pub fn finish(mut endings: Vec<EndingSession<impl Serialize>>, hub: Option<&Hub>) -> crate::Result<Vec<FinishedModel>> {
+pub fn finish(
+    mut endings: Vec<EndingSession<impl Serialize>>,
+    hub: Option<&Hub>,
+) -> crate::Result<Vec<FinishedModel>> {
     // All models are saved before scoring, so that a second Ctrl-C during scoring loses nothing.
-    let ended_secs: Vec<f64> =
-        endings.iter_mut().map(|ending| ending.session.stop_training()).collect::<crate::Result<_>>()?;
+    let ended_secs: Vec<f64> = endings
+        .iter_mut()
+        .map(|ending| ending.session.stop_training())
+        .collect::<crate::Result<_>>()?;
     let mut saved = Vec::new();
     // The first error is returned, all others are logged.
     let mut failed = Ok(());
@@ -66,7 +77,11 @@ pub fn finish(mut endings: Vec<EndingSession<impl Serialize>>, hub: Option<&Hub>
     for (mut ending, seconds) in endings.into_iter().zip(ended_secs) {
         // A model that cannot be saved does not prevent saving the others.
         match ending.session.save(&ending.out, seconds) {
-            Ok(Saved { folder, sha256, failed: error }) => {
+            Ok(Saved {
+                folder,
+                sha256,
+                failed: error,
+            }) => {
                 ending.out = folder;
                 ending.session.write_cameras(&ending.out);
                 error.into_iter().for_each(&mut record_error);
@@ -77,19 +92,29 @@ pub fn finish(mut endings: Vec<EndingSession<impl Serialize>>, hub: Option<&Hub>
     }
     for (ending, ..) in &mut saved {
         if let Err(error) = ending.session.persistence.wait() {
-            record_error(
-                error.with_context(format!(
-                    "the model was saved in {}, but not the last checkpoint",
-                    ending.out.display()
-                )),
-            );
+            record_error(error.with_context(format!(
+                "the model was saved in {}, but not the last checkpoint",
+                ending.out.display()
+            )));
         }
     }
-    if saved.iter().any(|(ending, ..)| ending.session.stop.requested()) {
+    if saved
+        .iter()
+        .any(|(ending, ..)| ending.session.stop.requested())
+    {
         log::info!("saved; scoring the test images (Ctrl-C again skips this)");
     }
     let mut finished = Vec::new();
-    for (EndingSession { session, out, details }, seconds, sha256) in saved {
+    for (
+        EndingSession {
+            session,
+            out,
+            details,
+        },
+        seconds,
+        sha256,
+    ) in saved
+    {
         match session.report_end(&out, seconds, &sha256, &details, hub) {
             Ok(model) => finished.push(model),
             Err(error) => record_error(error),
@@ -129,18 +154,29 @@ impl Session {
         if progress.step > 0 && progress.primitives == 0 {
             log::warn!("the model is empty: no observation could be used");
         }
-        // Saving ends a trial in progress. The checkpoint is taken before that, so that a resumed run completes the
-        // trial. An idle live run is not finished, because it may receive more keyframes after it is resumed.
+        // Saving ends a trial in progress. The checkpoint is taken before that, so that a resumed
+        // run completes the trial. An idle live run is not finished, because it may receive more
+        // keyframes after it is resumed.
         let is_live = self.persistence.keeps_keyframes();
         let is_finished = self.is_over() || (self.is_idle() && !is_live);
         let (method, keyframes, edits) = (self.method.as_mut(), &self.keyframes[..], &*self.edits);
-        let snapshot = Snapshot { method, keyframes, edits, seconds, is_finished };
+        let snapshot = Snapshot {
+            method,
+            keyframes,
+            edits,
+            seconds,
+            is_finished,
+        };
         let checkpoint = self.persistence.take_last_checkpoint(snapshot);
         let saved = run_folder::save_model(self.method.as_mut(), &self.edits, out)
             .and_then(|()| run_folder::checkpoint_sha256(out));
         self.persistence.write_checkpoint(checkpoint);
         match saved {
-            Ok(sha256) => Ok(Saved { folder: out.to_owned(), sha256, failed: None }),
+            Ok(sha256) => Ok(Saved {
+                folder: out.to_owned(),
+                sha256,
+                failed: None,
+            }),
             Err(error) if error.is_io() => self.save_elsewhere(out, error),
             Err(error) => Err(error),
         }
@@ -157,9 +193,16 @@ impl Session {
         };
         match save(self.method.as_mut()) {
             Ok((folder, sha256)) => {
-                let context =
-                    format!("cannot save the model in {}; it was saved in {}", out.display(), folder.display());
-                Ok(Saved { folder, sha256, failed: Some(save_error.with_context(context)) })
+                let context = format!(
+                    "cannot save the model in {}; it was saved in {}",
+                    out.display(),
+                    folder.display()
+                );
+                Ok(Saved {
+                    folder,
+                    sha256,
+                    failed: Some(save_error.with_context(context)),
+                })
             }
             Err(error) => {
                 let error: crate::Error = error;
@@ -173,8 +216,8 @@ impl Session {
         }
     }
 
-    /// Writes the list of camera poses with the model's corrections. Without this list, a viewer starts with an outside
-    /// view of the model.
+    /// Writes the list of camera poses with the model's corrections. Without this list, a viewer
+    /// starts with an outside view of the model.
     fn write_cameras(&mut self, out: &Path) {
         let cameras = camera_list::of_model(self.method.as_mut(), &self.keyframes);
         if let Err(error) = camera_list::write(out, &cameras) {
@@ -194,7 +237,9 @@ impl Session {
         let outcome = self.score_at_end(seconds, hub)?;
         let method = self.method.as_mut();
         // Rendered before profiling, because profiling trains the model further.
-        let comparisons = self.reporter.compare(method, self.scoreboard.tests(), &outcome.per_image);
+        let comparisons =
+            self.reporter
+                .compare(method, self.scoreboard.tests(), &outcome.per_image);
         let passes = self.reporter.profile(method)?;
         self.reporter.report_end(ScoredModel {
             out,
@@ -234,11 +279,16 @@ impl Session {
                 }
             }
             if let Some(pending) = hub.and_then(Hub::next_request) {
-                let other = pending.method().filter(|name| *name != kind.name()).map(str::to_owned);
+                let other = pending
+                    .method()
+                    .filter(|name| *name != kind.name())
+                    .map(str::to_owned);
                 match other {
                     Some(other) => {
-                        pending
-                            .fail(&format!("cannot render {other} while {} is scored; try again later", kind.name()));
+                        pending.fail(&format!(
+                            "cannot render {other} while {} is scored; try again later",
+                            kind.name()
+                        ));
                     }
                     None => viewer::answer(pending, method, edits),
                 }

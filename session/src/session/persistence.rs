@@ -1,5 +1,5 @@
-//! The persistent state of a session: checkpoints for resuming, a decision log for replaying, and data for continuing
-//! on another device.
+//! The persistent state of a session: checkpoints for resuming, a decision log for replaying, and
+//! data for continuing on another device.
 
 use crate::checkpoints::{self, CheckpointWrite, Checkpoints, Snapshot};
 use crate::decisions::DecisionLog;
@@ -20,8 +20,8 @@ pub(super) struct Persistence {
     decisions: Option<DecisionLog>,
     recovery: Option<Recovery>,
     folders: Vec<KeptFolder>,
-    /// Evicted keyframes, without pixels, that the newest complete checkpoint may contain. The first
-    /// `n_evicted_before_last` of them were evicted before the last checkpoint was started.
+    /// Evicted keyframes, without pixels, that the newest complete checkpoint may contain. The
+    /// first `n_evicted_before_last` of them were evicted before the last checkpoint was started.
     evicted: Vec<Arc<Keyframe>>,
     n_evicted_before_last: usize,
 }
@@ -58,7 +58,11 @@ impl Persistence {
     }
 
     /// Logs that a keyframe was pushed to the model.
-    pub(super) fn log_push(&mut self, method: &mut dyn Method, keyframe: &Arc<Keyframe>) -> crate::Result<()> {
+    pub(super) fn log_push(
+        &mut self,
+        method: &mut dyn Method,
+        keyframe: &Arc<Keyframe>,
+    ) -> crate::Result<()> {
         if let Some(decisions) = &mut self.decisions {
             decisions.pushed(method.n_total_steps()?, keyframe);
         }
@@ -66,7 +70,12 @@ impl Persistence {
     }
 
     /// Logs that a keyframe was removed from the model.
-    pub(super) fn log_removal(&mut self, method: &mut dyn Method, camera: &str, stamp: Stamp) -> crate::Result<()> {
+    pub(super) fn log_removal(
+        &mut self,
+        method: &mut dyn Method,
+        camera: &str,
+        stamp: Stamp,
+    ) -> crate::Result<()> {
         if let Some(decisions) = &mut self.decisions {
             decisions.removed(method.n_total_steps()?, camera, stamp);
         }
@@ -90,14 +99,19 @@ impl Persistence {
     }
 
     /// Logs that growth was paused or continued.
-    pub(super) fn log_growth_pause(&mut self, method: &mut dyn Method, is_paused: bool) -> crate::Result<()> {
+    pub(super) fn log_growth_pause(
+        &mut self,
+        method: &mut dyn Method,
+        is_paused: bool,
+    ) -> crate::Result<()> {
         if let Some(decisions) = &mut self.decisions {
             decisions.growth_paused(method.n_total_steps()?, is_paused);
         }
         Ok(())
     }
 
-    /// Logs that a picture is drawn. Drawing affects the result, because it creates splats for new keyframes.
+    /// Logs that a picture is drawn. Drawing affects the result, because it creates splats for new
+    /// keyframes.
     pub(super) fn log_render(&mut self) {
         if let Some(decisions) = &mut self.decisions {
             decisions.seeded();
@@ -130,33 +144,56 @@ impl Persistence {
 
     /// Makes the next checkpoint due now. Returns false if the run writes no checkpoints.
     pub(super) fn request_checkpoint(&mut self) -> bool {
-        self.checkpoints.as_mut().map(Checkpoints::request).is_some()
+        self.checkpoints
+            .as_mut()
+            .map(Checkpoints::request)
+            .is_some()
     }
 
     /// Starts a checkpoint if one is due.
-    pub(super) fn write_checkpoint_when_due(&mut self, snapshot: Snapshot<'_>) -> crate::Result<()> {
-        let Some(checkpoints) = &mut self.checkpoints else { return Ok(()) };
+    pub(super) fn write_checkpoint_when_due(
+        &mut self,
+        snapshot: Snapshot<'_>,
+    ) -> crate::Result<()> {
+        let Some(checkpoints) = &mut self.checkpoints else {
+            return Ok(());
+        };
         let method = snapshot.method;
-        if checkpoints.write_when_due(Snapshot { method: &mut *method, ..snapshot })? {
+        if checkpoints.write_when_due(Snapshot {
+            method: &mut *method,
+            ..snapshot
+        })? {
             if let Some(decisions) = &mut self.decisions {
                 decisions.checkpoint(method.n_total_steps()?);
             }
-            // Until this checkpoint is on disk, the previous one is the newest. Neither contains keyframes that were
-            // evicted before the previous one.
+            // Until this checkpoint is on disk, the previous one is the newest. Neither contains
+            // keyframes that were evicted before the previous one.
             self.evicted.drain(..self.n_evicted_before_last);
             self.n_evicted_before_last = self.evicted.len();
         }
         Ok(())
     }
 
-    /// Whether keyframes are stored with the checkpoints, as in a live run, which has no other copy of them.
+    /// Whether keyframes are stored with the checkpoints, as in a live run, which has no other copy
+    /// of them.
     pub(super) fn keeps_keyframes(&self) -> bool {
-        self.checkpoints.as_ref().is_some_and(Checkpoints::keeps_keyframes)
+        self.checkpoints
+            .as_ref()
+            .is_some_and(Checkpoints::keeps_keyframes)
     }
 
-    /// Copies the final state for [`Self::write_checkpoint`]. Errors are only logged, so that the model is still saved.
-    pub(super) fn take_last_checkpoint(&mut self, snapshot: Snapshot<'_>) -> Option<CheckpointWrite> {
-        match self.checkpoints.as_mut().map(|checkpoints| checkpoints.take(snapshot)).transpose() {
+    /// Copies the final state for [`Self::write_checkpoint`]. Errors are only logged, so that the
+    /// model is still saved.
+    pub(super) fn take_last_checkpoint(
+        &mut self,
+        snapshot: Snapshot<'_>,
+    ) -> Option<CheckpointWrite> {
+        match self
+            .checkpoints
+            .as_mut()
+            .map(|checkpoints| checkpoints.take(snapshot))
+            .transpose()
+        {
             Ok(checkpoint) => checkpoint,
             Err(error) => {
                 log::warn!("cannot write a checkpoint of the final state: {error:#}");
@@ -182,7 +219,8 @@ impl Persistence {
         self.recovery.is_some()
     }
 
-    /// Describes how to continue if the run fails now, as a sentence without a period; `None` without recovery.
+    /// Describes how to continue if the run fails now, as a sentence without a period; `None`
+    /// without recovery.
     pub(super) fn describe_recoverable(&mut self) -> Option<String> {
         let has_checkpoint = self.has_checkpoint();
         Some(self.recovery.as_ref()?.describe_recoverable(has_checkpoint))
@@ -191,7 +229,9 @@ impl Persistence {
     /// Describes how to continue if the model could not be saved, as a clause for an error message.
     pub(super) fn describe_unsaved(&mut self) -> String {
         match self.describe_recoverable() {
-            Some(left) if self.has_checkpoint() => format!("{left}; use --out to save the model in another folder"),
+            Some(left) if self.has_checkpoint() => {
+                format!("{left}; use --out to save the model in another folder")
+            }
             Some(left) => left,
             None => "there is no checkpoint either".to_owned(),
         }
@@ -199,14 +239,26 @@ impl Persistence {
 
     /// Whether this run has written a checkpoint.
     fn has_checkpoint(&mut self) -> bool {
-        self.checkpoints.as_mut().is_some_and(|checkpoints| checkpoints.newest().is_some())
+        self.checkpoints
+            .as_mut()
+            .is_some_and(|checkpoints| checkpoints.newest().is_some())
     }
 
-    /// Restores the model with these keyframes on another device, from the newest checkpoint or else from scratch.
-    /// Begins a new decision log.
-    pub(super) fn restore(&mut self, gpu: &Arc<Gpu>, keyframes: &[Arc<Keyframe>]) -> crate::Result<Box<dyn Method>> {
-        let Some(recovery) = &self.recovery else { keyframe::bail!("this run cannot continue on another device") };
-        let written = self.checkpoints.as_mut().and_then(Checkpoints::newest).map(Path::to_owned);
+    /// Restores the model with these keyframes on another device, from the newest checkpoint or
+    /// else from scratch. Begins a new decision log.
+    pub(super) fn restore(
+        &mut self,
+        gpu: &Arc<Gpu>,
+        keyframes: &[Arc<Keyframe>],
+    ) -> crate::Result<Box<dyn Method>> {
+        let Some(recovery) = &self.recovery else {
+            keyframe::bail!("this run cannot continue on another device")
+        };
+        let written = self
+            .checkpoints
+            .as_mut()
+            .and_then(Checkpoints::newest)
+            .map(Path::to_owned);
         let checkpoint = match (written, &recovery.resumed) {
             (Some(path), _) => Some(Checkpoint::read(&path).map_err(crate::Error::from)),
             (None, Some(folder)) => Some(checkpoints::read(folder)),
@@ -222,9 +274,15 @@ impl Persistence {
         };
         method.prepare()?;
         let is_in = |keyframes: &[Arc<Keyframe>], keyframe_ref: &Arc<Keyframe>| {
-            keyframes.iter().any(|other| Arc::ptr_eq(other, keyframe_ref))
+            keyframes
+                .iter()
+                .any(|other| Arc::ptr_eq(other, keyframe_ref))
         };
-        for keyframe in self.evicted.iter().filter(|keyframe| !is_in(&untrained, keyframe)) {
+        for keyframe in self
+            .evicted
+            .iter()
+            .filter(|keyframe| !is_in(&untrained, keyframe))
+        {
             method.remove(&keyframe.camera, keyframe.stamp)?;
         }
         let from_step = method.n_total_steps()?;
@@ -232,7 +290,9 @@ impl Persistence {
         if let Some(decisions) = self.decisions.take() {
             decisions.close_unfinished();
         }
-        let settings = recovery.settings.continued_from(is_resumed.then_some(from_step));
+        let settings = recovery
+            .settings
+            .continued_from(is_resumed.then_some(from_step));
         let mut decisions = DecisionLog::create(&recovery.folder, settings)?;
         held.iter()
             .filter(|keyframe| !is_in(&untrained, keyframe))
@@ -243,21 +303,32 @@ impl Persistence {
         }
         log::info!(
             "reopened the GPU: training continues from {}",
-            if is_resumed { format!("the checkpoint of step {from_step}") } else { "the start".to_owned() }
+            if is_resumed {
+                format!("the checkpoint of step {from_step}")
+            } else {
+                "the start".to_owned()
+            }
         );
         self.decisions = Some(decisions);
         Ok(method)
     }
 }
 
-/// Resumes a model from a checkpoint. Returns `None` if the checkpoint cannot be used, and an error if the GPU failed.
+/// Resumes a model from a checkpoint. Returns `None` if the checkpoint cannot be used, and an error
+/// if the GPU failed.
 fn resume(
     gpu: &Arc<Gpu>,
     checkpoint: crate::Result<Checkpoint>,
     keyframes: &[Arc<Keyframe>],
 ) -> crate::Result<Option<Resumed>> {
     // Keyframes that were missing at the start of this run are still missing.
-    let resume = |checkpoint| Ok(trainer::resume_without_missing(gpu.clone(), &checkpoint, keyframes)?);
+    let resume = |checkpoint| {
+        Ok(trainer::resume_without_missing(
+            gpu.clone(),
+            &checkpoint,
+            keyframes,
+        )?)
+    };
     match checkpoint.and_then(resume) {
         Ok((resumed, _)) => Ok(Some(resumed)),
         Err(error) if error.is_gpu_error() => Err(error),
@@ -270,6 +341,14 @@ fn resume(
 
 /// A copy of a keyframe without pixels, with all data that identifies the keyframe in a checkpoint.
 fn without_pixels(keyframe: &Keyframe) -> Keyframe {
-    let depth = keyframe.depth.as_ref().map(|depth| DepthMap { depth_m: [].into(), ..depth.clone() });
-    Keyframe { rgba_srgb: [].into(), depth, truth: None, ..keyframe.clone() }
+    let depth = keyframe.depth.as_ref().map(|depth| DepthMap {
+        depth_m: [].into(),
+        ..depth.clone()
+    });
+    Keyframe {
+        rgba_srgb: [].into(),
+        depth,
+        truth: None,
+        ..keyframe.clone()
+    }
 }

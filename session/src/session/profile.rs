@@ -11,7 +11,8 @@ const N_PROFILED: usize = 21;
 /// Warm-up time, because drivers are slow for a while after large buffers were freed.
 const PROFILE_WARM_UP: Duration = Duration::from_millis(700);
 
-/// GPU time of each kernel in a step in milliseconds: medians over [`N_PROFILED`] steps, in order of first execution.
+/// GPU time of each kernel in a step in milliseconds: medians over [`N_PROFILED`] steps, in order
+/// of first execution.
 pub(super) fn profile(method: &mut dyn Method) -> crate::Result<Vec<(&'static str, f64)>> {
     let mut names: Vec<&'static str> = Vec::new();
     let mut by_name: BTreeMap<&'static str, Vec<f64>> = BTreeMap::new();
@@ -27,7 +28,11 @@ pub(super) fn profile(method: &mut dyn Method) -> crate::Result<Vec<(&'static st
                 names.push(name);
             }
         }
-        sums.into_iter().for_each(|(name, millis)| by_name.entry(name).or_default().push(millis));
+        sums.into_iter()
+            .for_each(|(name, millis)| by_name.entry(name).or_default().push(millis));
     }
-    Ok(names.into_iter().filter_map(|name| Some((name, median(by_name.get(name)?)?))).collect())
+    Ok(names
+        .into_iter()
+        .filter_map(|name| Some((name, median(by_name.get(name)?)?)))
+        .collect())
 }

@@ -5,7 +5,9 @@ use super::profile::profile;
 use crate::error::Context;
 use crate::evaluate::{ImageScores, Scores};
 use crate::next_commands::{self, DataSource, SavedModel};
-use crate::observer::{DoneEvent, Evaluation, FinishedReport, Observer, ProfileEvent, SessionEvent, SessionProgress};
+use crate::observer::{
+    DoneEvent, Evaluation, FinishedReport, Observer, ProfileEvent, SessionEvent, SessionProgress,
+};
 use crate::{report, run_folder};
 use calibration::{Alignment, CameraCorrection, TrialReport};
 use keyframe::Keyframe;
@@ -77,7 +79,13 @@ pub(super) struct Reporter {
 impl Reporter {
     /// A reporter on a model of this kind that sends events to `observer`.
     pub(super) fn new(kind: ModelKind, observer: Box<dyn Observer>) -> Self {
-        Self { kind, data: DataSource::default(), observer, profiles: false, evaluations: Vec::new() }
+        Self {
+            kind,
+            data: DataSource::default(),
+            observer,
+            profiles: false,
+            evaluations: Vec::new(),
+        }
     }
 
     /// The kind of model.
@@ -103,11 +111,22 @@ impl Reporter {
     /// Reports the state of training.
     pub(super) fn report_progress(&mut self, seconds: f64, progress: Progress, psnr: Option<f64>) {
         let primitive = self.kind.entry().primitive;
-        self.observer.on_event(&SessionEvent::Progress(&SessionProgress { primitive, seconds, progress, psnr }));
+        self.observer
+            .on_event(&SessionEvent::Progress(&SessionProgress {
+                primitive,
+                seconds,
+                progress,
+                psnr,
+            }));
     }
 
     /// Reports a completed evaluation that was due at `seconds`.
-    pub(super) fn report_evaluation(&mut self, seconds: f64, images: &[ImageScores], progress: Progress) {
+    pub(super) fn report_evaluation(
+        &mut self,
+        seconds: f64,
+        images: &[ImageScores],
+        progress: Progress,
+    ) {
         let eval = Evaluation {
             event: "eval",
             method: self.kind.name(),
@@ -136,7 +155,8 @@ impl Reporter {
 
     /// Reports how many test images have been scored at the end of training.
     pub(super) fn report_scoring(&mut self, n_scored: usize, n_all: usize) {
-        self.observer.on_event(&SessionEvent::Scoring { n_scored, n_all });
+        self.observer
+            .on_event(&SessionEvent::Scoring { n_scored, n_all });
     }
 
     /// Reports that training ended.
@@ -144,7 +164,8 @@ impl Reporter {
         self.observer.on_event(&SessionEvent::TrainingEnded);
     }
 
-    /// Renders test images for the report. `scores` has one entry per test image, in the same order.
+    /// Renders test images for the report. `scores` has one entry per test image, in the same
+    /// order.
     pub(super) fn compare<'a>(
         &self,
         method: &mut dyn Method,
@@ -161,12 +182,18 @@ impl Reporter {
     }
 
     /// GPU time of each kernel in a step in milliseconds, if profiling was requested.
-    pub(super) fn profile(&self, method: &mut dyn Method) -> crate::Result<Option<Vec<(&'static str, f64)>>> {
+    pub(super) fn profile(
+        &self,
+        method: &mut dyn Method,
+    ) -> crate::Result<Option<Vec<(&'static str, f64)>>> {
         self.profiles.then(|| profile(method)).transpose()
     }
 
     /// Writes the report of a saved model and sends the final event.
-    pub(super) fn report_end(&mut self, model: ScoredModel<'_, impl Serialize>) -> crate::Result<()> {
+    pub(super) fn report_end(
+        &mut self,
+        model: ScoredModel<'_, impl Serialize>,
+    ) -> crate::Result<()> {
         let ScoredModel { out, outcome, .. } = model;
         let done = DoneEvent {
             event: "done",
@@ -184,23 +211,43 @@ impl Reporter {
             adapter: model.adapter,
             details: model.details,
             alignment: model.alignment,
-            cameras: model.cameras.into_iter().map(|(name, camera)| (name, camera.of_all_images())).collect(),
+            cameras: model
+                .cameras
+                .into_iter()
+                .map(|(name, camera)| (name, camera.of_all_images()))
+                .collect(),
             trials: model.trials,
             passes: model.passes.unwrap_or_default(),
             evaluations: &outcome.evaluations,
             per_image: self.named(&outcome.per_image),
         };
         let written = run_folder::write_json(&out.join("report.json"), &report);
-        let page = model.comparisons.and_then(|comparisons| self.write_page(out, &report, &comparisons));
+        let page = model
+            .comparisons
+            .and_then(|comparisons| self.write_page(out, &report, &comparisons));
         if let Err(error) = &page {
             log::warn!("{} was not written: {error:#}", report::FILE);
         }
         let passes = &report.passes;
-        let profile = self.profiles.then(|| ProfileEvent { event: "profile", method: self.kind.name(), passes });
+        let profile = self.profiles.then(|| ProfileEvent {
+            event: "profile",
+            method: self.kind.name(),
+            passes,
+        });
         let primitive = self.kind.entry().primitive;
-        let finished = FinishedReport { done: &done, profile, primitive, has_page: page.is_ok() };
+        let finished = FinishedReport {
+            done: &done,
+            profile,
+            primitive,
+            has_page: page.is_ok(),
+        };
         self.observer.on_event(&SessionEvent::Finished(&finished));
-        written.with_context(|| format!("the model was saved in {}, but not its report", out.display()))
+        written.with_context(|| {
+            format!(
+                "the model was saved in {}, but not its report",
+                out.display()
+            )
+        })
     }
 
     /// Writes the HTML page of the report.
@@ -211,7 +258,12 @@ impl Reporter {
         comparisons: &[report::Comparison],
     ) -> crate::Result<()> {
         let n_tests = report.per_image.len();
-        let model = SavedModel { kind: self.kind, folder: out, data: &self.data, n_tests };
+        let model = SavedModel {
+            kind: self.kind,
+            folder: out,
+            data: &self.data,
+            n_tests,
+        };
         let page = report::Page {
             folder: out,
             report: &serde_json::to_value(report)?,
@@ -225,7 +277,13 @@ impl Reporter {
     }
 
     fn named<'a>(&self, images: &'a [ImageScores]) -> Vec<NamedScores<'a>> {
-        images.iter().map(|scores| NamedScores { name: self.image_name(scores), scores }).collect()
+        images
+            .iter()
+            .map(|scores| NamedScores {
+                name: self.image_name(scores),
+                scores,
+            })
+            .collect()
     }
 
     fn image_name(&self, scores: &ImageScores) -> String {

@@ -20,10 +20,11 @@ const MAX_HISTORY: usize = 512;
 pub struct Evaluators {
     /// Evaluator for scheduled evaluations: all scores in `train`, PSNR only in a live run.
     pub during_training: Evaluator,
-    /// Maximum number of test keyframes in a scheduled evaluation, evenly spread. The final evaluation scores all.
+    /// Maximum number of test keyframes in a scheduled evaluation, evenly spread. The final
+    /// evaluation scores all.
     pub max_images_during_training: usize,
-    /// Maximum time of all scheduled evaluations, as a fraction of the training time. To stay near it, they score fewer
-    /// images, or are skipped. `None`: no limit.
+    /// Maximum time of all scheduled evaluations, as a fraction of the training time. To stay near
+    /// it, they score fewer images, or are skipped. `None`: no limit.
     pub max_frac_during_training: Option<f64>,
     /// Evaluator for the end of training.
     pub at_end: Evaluator,
@@ -85,14 +86,19 @@ impl Scoreboard {
             self.tests.push_back(keyframe.clone());
         } else {
             let Keyframe { camera, stamp, .. } = &**keyframe;
-            log::warn!("the test image of {camera} at {} ns is not scored: all of its pixels are masked", stamp.0);
+            log::warn!(
+                "the test image of {camera} at {} ns is not scored: all of its pixels are masked",
+                stamp.0
+            );
         }
     }
 
     /// Removes a keyframe and its score.
     pub(super) fn remove(&mut self, camera: &str, stamp: Stamp) {
-        self.tests.retain(|held| held.camera.as_ref() != camera || held.stamp != stamp);
-        self.newest_psnr.retain(|(of, nanos), _| of != camera || *nanos != stamp.0);
+        self.tests
+            .retain(|held| held.camera.as_ref() != camera || held.stamp != stamp);
+        self.newest_psnr
+            .retain(|(of, nanos), _| of != camera || *nanos != stamp.0);
     }
 
     /// The test keyframes, in the order of [`Self::score_all`].
@@ -107,13 +113,24 @@ impl Scoreboard {
 
     /// Begins an evaluation at this training time, unless the earlier ones have taken too long.
     pub(super) fn begin(&mut self, secs: f64) {
-        let Evaluators { max_images_during_training, max_frac_during_training, .. } = self.evaluators;
+        let Evaluators {
+            max_images_during_training,
+            max_frac_during_training,
+            ..
+        } = self.evaluators;
         let max_frac = max_frac_during_training.unwrap_or(f64::INFINITY);
-        let allowed = Duration::try_from_secs_f64(max_frac * secs).unwrap_or(Duration::MAX).saturating_sub(self.spent);
+        let allowed = Duration::try_from_secs_f64(max_frac * secs)
+            .unwrap_or(Duration::MAX)
+            .saturating_sub(self.spent);
         if !allowed.is_zero() {
             let max_spent = allowed.min(MAX_EVALUATION);
             let tests = self.tests.iter();
-            self.pending = Some(PendingEvaluation::new(secs, tests, max_images_during_training, max_spent));
+            self.pending = Some(PendingEvaluation::new(
+                secs,
+                tests,
+                max_images_during_training,
+                max_spent,
+            ));
         }
     }
 
@@ -122,7 +139,8 @@ impl Scoreboard {
         self.pending.is_some()
     }
 
-    /// Takes the evaluation in progress. It is aborted unless it is returned with [`Self::continue_with`].
+    /// Takes the evaluation in progress. It is aborted unless it is returned with
+    /// [`Self::continue_with`].
     pub(super) fn take_pending(&mut self) -> Option<PendingEvaluation> {
         self.pending.take()
     }
@@ -133,8 +151,14 @@ impl Scoreboard {
     }
 
     /// Scores a test keyframe for a scheduled evaluation.
-    pub(super) fn score(&self, method: &mut dyn Method, keyframe: &Keyframe) -> crate::Result<ImageScores> {
-        self.evaluators.during_training.score_named(method, keyframe)
+    pub(super) fn score(
+        &self,
+        method: &mut dyn Method,
+        keyframe: &Keyframe,
+    ) -> crate::Result<ImageScores> {
+        self.evaluators
+            .during_training
+            .score_named(method, keyframe)
     }
 
     /// Records the time that an evaluation took.
@@ -148,7 +172,9 @@ impl Scoreboard {
         method: &mut dyn Method,
         meanwhile: impl FnMut(&mut dyn Method, usize),
     ) -> crate::Result<Vec<ImageScores>> {
-        self.evaluators.at_end.score_all(method, self.tests.iter(), meanwhile)
+        self.evaluators
+            .at_end
+            .score_all(method, self.tests.iter(), meanwhile)
     }
 
     /// Returns the test keyframe with the oldest score and moves it to the end of the queue.
@@ -161,7 +187,8 @@ impl Scoreboard {
     /// Records the scores of images at this training time.
     pub(super) fn record(&mut self, images: &[ImageScores], secs: f64) {
         for image in images {
-            self.newest_psnr.insert((image.camera.clone(), image.stamp_nanos), image.psnr);
+            self.newest_psnr
+                .insert((image.camera.clone(), image.stamp_nanos), image.psnr);
         }
         let Some(psnr) = self.psnr() else { return };
         self.history.push((secs, psnr));
@@ -196,7 +223,12 @@ mod tests {
     fn evaluators(max_frac_during_training: Option<f64>) -> Evaluators {
         let quick = Evaluator::psnr_only;
         let max_images_during_training = usize::MAX;
-        Evaluators { during_training: quick(), max_images_during_training, max_frac_during_training, at_end: quick() }
+        Evaluators {
+            during_training: quick(),
+            max_images_during_training,
+            max_frac_during_training,
+            at_end: quick(),
+        }
     }
 
     /// Times of the evaluations up to 60 s of training, if each takes this long.
@@ -219,7 +251,14 @@ mod tests {
         let all: Vec<f64> = up_to(60.0).collect();
         assert_eq!(evaluated(None, Duration::from_secs(100)), all);
         assert_eq!(evaluated(Some(0.1), Duration::from_millis(20)), all);
-        assert_eq!(evaluated(Some(0.1), Duration::from_secs(1)), [0.25, 16.0, 32.0, 60.0]);
-        assert_eq!(evaluated(Some(0.1), Duration::from_secs(7)), [0.25], "one evaluation in any case");
+        assert_eq!(
+            evaluated(Some(0.1), Duration::from_secs(1)),
+            [0.25, 16.0, 32.0, 60.0]
+        );
+        assert_eq!(
+            evaluated(Some(0.1), Duration::from_secs(7)),
+            [0.25],
+            "one evaluation in any case"
+        );
     }
 }

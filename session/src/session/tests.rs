@@ -58,7 +58,11 @@ impl Method for Gray {
         self.n_drawn.set(self.n_drawn.get() + 1);
         assert!(!request.depth, "PSNR needs no depth");
         let n = request.size_px[0] as usize * request.size_px[1] as usize;
-        Ok(Picture { size_px: request.size_px, rgba_srgb: vec![self.level; 4 * n], depth_m: Vec::new() })
+        Ok(Picture {
+            size_px: request.size_px,
+            rgba_srgb: vec![self.level; 4 * n],
+            depth_m: Vec::new(),
+        })
     }
 
     fn calibrated_camera(&mut self, keyframe: &Keyframe) -> Result<CalibratedCamera, Error> {
@@ -82,7 +86,10 @@ impl Method for Gray {
     }
 
     fn progress(&self) -> Progress {
-        Progress { step: self.level.into(), ..Progress::default() }
+        Progress {
+            step: self.level.into(),
+            ..Progress::default()
+        }
     }
 
     fn report(&self) -> Vec<TrialReport> {
@@ -105,7 +112,9 @@ fn test_keyframe(ix: u8) -> Arc<Keyframe> {
         size_px: SIZE_PX,
         focal_px: [4.0; 2],
         principal_px: [2.0, 1.0],
-        rgba_srgb: [100_u8.wrapping_add(ix.wrapping_mul(10)), 50, 50, 255].repeat(8).into(),
+        rgba_srgb: [100_u8.wrapping_add(ix.wrapping_mul(10)), 50, 50, 255]
+            .repeat(8)
+            .into(),
         depth: None,
         world_from_camera: Transform::identity(),
         twist: None,
@@ -129,13 +138,22 @@ fn session_with_evaluation_due(stop: &Stop) -> (Session, std::rc::Rc<std::cell::
         at_end: quick(),
     };
     let gpu = Gpu::open(&GpuOptions::default()).expect("an adapter");
-    let mut session =
-        Session::new(gpu, (ModelKind::default(), Box::new(method)), evaluators, Limits::default(), Box::new(()))
-            .with_stop(stop);
+    let mut session = Session::new(
+        gpu,
+        (ModelKind::default(), Box::new(method)),
+        evaluators,
+        Limits::default(),
+        Box::new(()),
+    )
+    .with_stop(stop);
     for ix in 0..N_TESTS {
         session.push(&test_keyframe(ix)).expect("held");
     }
-    session.start_clock(Instant::now().checked_sub(Duration::from_secs(1)).expect("the machine has run for a second"));
+    session.start_clock(
+        Instant::now()
+            .checked_sub(Duration::from_secs(1))
+            .expect("the machine has run for a second"),
+    );
     session.train_steps(1).expect("a step");
     (session, n_drawn)
 }
@@ -164,10 +182,17 @@ fn stepwise_scoring_equals_scoring_at_once() {
     assert_eq!((one.n_images, one.step), (3, 1));
     assert_eq!((other.n_images, other.step), (3, 1));
     assert!(one.scores == other.scores && one.scores.psnr.is_some());
-    assert!((other.seconds - 1.0).abs() < 0.9, "{} s, expected the time when it was due", other.seconds);
+    assert!(
+        (other.seconds - 1.0).abs() < 0.9,
+        "{} s, expected the time when it was due",
+        other.seconds
+    );
     assert!(stepwise.psnr() == at_once.psnr());
     stepwise.score_next().expect("nothing to do");
-    assert_eq!((stepwise.reporter.evaluations().len(), n_drawn.get()), (1, 3));
+    assert_eq!(
+        (stepwise.reporter.evaluations().len(), n_drawn.get()),
+        (1, 3)
+    );
 }
 
 #[test]
@@ -176,14 +201,30 @@ fn scoring_in_parallel_equals_scoring_one_by_one() {
     let mut method = Gray::default();
     let mut reported = Vec::new();
     let evaluator = Evaluator::psnr_only();
-    let at_once = evaluator.score_all(&mut method, tests.iter(), |_, n| reported.push(n)).expect("scored");
-    let one_by_one: Vec<_> = tests.iter().map(|test| evaluator.score(&mut method, test).expect("scored")).collect();
+    let at_once = evaluator
+        .score_all(&mut method, tests.iter(), |_, n| reported.push(n))
+        .expect("scored");
+    let one_by_one: Vec<_> = tests
+        .iter()
+        .map(|test| evaluator.score(&mut method, test).expect("scored"))
+        .collect();
     assert_eq!(at_once, one_by_one, "in the order of the images");
-    assert!(reported.is_sorted() && reported.last() == Some(&50), "{reported:?}");
-    let broken = Arc::new(Keyframe { rgba_srgb: [].into(), ..(*tests[7]).clone() });
+    assert!(
+        reported.is_sorted() && reported.last() == Some(&50),
+        "{reported:?}"
+    );
+    let broken = Arc::new(Keyframe {
+        rgba_srgb: [].into(),
+        ..(*tests[7]).clone()
+    });
     let with_broken = [&tests[..7], &[broken], &tests[8..]].concat();
-    let error = evaluator.score_all(&mut method, with_broken.iter(), |_, _| {}).expect_err("an image has no pixels");
-    assert!(error.to_string().contains(&tests[7].stamp.0.to_string()), "{error:#}");
+    let error = evaluator
+        .score_all(&mut method, with_broken.iter(), |_, _| {})
+        .expect_err("an image has no pixels");
+    assert!(
+        error.to_string().contains(&tests[7].stamp.0.to_string()),
+        "{error:#}"
+    );
 }
 
 #[test]
@@ -195,7 +236,9 @@ fn evaluation_is_dropped_when_stopping() {
     session.score_next().expect("scored");
     stop.request();
     session.score_next().expect("dropped");
-    assert!(!session.is_scoring() && session.reporter.evaluations().is_empty() && n_drawn.get() == 1);
+    assert!(
+        !session.is_scoring() && session.reporter.evaluations().is_empty() && n_drawn.get() == 1
+    );
 }
 
 #[test]
@@ -210,10 +253,21 @@ fn size_search_ends_before_the_time_limit() {
             max_frac_during_training: None,
             at_end: quick(),
         };
-        let limits = Limits { seconds: limit_secs, steps: Some(100) };
+        let limits = Limits {
+            seconds: limit_secs,
+            steps: Some(100),
+        };
         let gpu = Gpu::open(&GpuOptions::default()).expect("an adapter");
-        let mut session = Session::new(gpu, (ModelKind::default(), Box::new(method)), evaluators, limits, Box::new(()));
-        let minute_ago = Instant::now().checked_sub(Duration::from_secs(60)).expect("the machine has run for a minute");
+        let mut session = Session::new(
+            gpu,
+            (ModelKind::default(), Box::new(method)),
+            evaluators,
+            limits,
+            Box::new(()),
+        );
+        let minute_ago = Instant::now()
+            .checked_sub(Duration::from_secs(60))
+            .expect("the machine has run for a minute");
         session.start_clock(minute_ago);
         session.train_steps(1).expect("a step");
         is_searching.set(true);
@@ -222,5 +276,8 @@ fn size_search_ends_before_the_time_limit() {
     };
     assert!(is_ended(Some(60.0)), "no time is left");
     assert!(!is_ended(Some(1e9)), "there is enough time");
-    assert!(!is_ended(None), "without a time limit, no decision depends on timing");
+    assert!(
+        !is_ended(None),
+        "without a time limit, no decision depends on timing"
+    );
 }

@@ -15,8 +15,10 @@ pub struct Limits {
 impl Limits {
     /// The limits as text, such as `8 s` or `500 steps`.
     pub fn describe(self) -> String {
-        let parts =
-            [self.seconds.map(|seconds| format!("{seconds} s")), self.steps.map(|steps| format!("{steps} steps"))];
+        let parts = [
+            self.seconds.map(|seconds| format!("{seconds} s")),
+            self.steps.map(|steps| format!("{steps} steps")),
+        ];
         parts.into_iter().flatten().collect::<Vec<_>>().join(" or ")
     }
 }
@@ -75,7 +77,8 @@ impl TrainingTime {
 
     /// Whether a limit is reached after `n_steps` steps.
     pub(super) fn is_over(&self, n_steps: u64) -> bool {
-        self.limits.seconds.is_some_and(|secs| self.secs() >= secs) || self.has_finished_steps(n_steps)
+        self.limits.seconds.is_some_and(|secs| self.secs() >= secs)
+            || self.has_finished_steps(n_steps)
     }
 
     /// Number of steps left after `n_steps` steps; `None` without a step limit.
@@ -97,7 +100,8 @@ impl TrainingTime {
         }
     }
 
-    /// Number of steps until the time limit at the average rate so far; `None` without a time limit or a rate.
+    /// Number of steps until the time limit at the average rate so far; `None` without a time limit
+    /// or a rate.
     pub(super) fn n_steps_in_time(&self) -> Option<f64> {
         let spent_secs = self.secs() - self.first_step_secs?;
         Some((self.limits.seconds? - self.secs()) * self.n_steps as f64 / spent_secs)
@@ -134,7 +138,8 @@ impl TrainingTime {
         self.finished_secs = None;
     }
 
-    /// Training time at which the session finished, or the current one if it has not finished, seconds.
+    /// Training time at which the session finished, or the current one if it has not finished,
+    /// seconds.
     pub(super) fn end_secs(&self) -> f64 {
         self.finished_secs.unwrap_or_else(|| self.secs())
     }
@@ -146,8 +151,15 @@ mod tests {
 
     #[test]
     fn remaining_steps_follow_from_the_average_rate() {
-        let mut time = TrainingTime::new(Limits { seconds: Some(40.0), steps: None });
-        time.start(Instant::now().checked_sub(Duration::from_secs(30)).expect("the machine has run for 30 s"));
+        let mut time = TrainingTime::new(Limits {
+            seconds: Some(40.0),
+            steps: None,
+        });
+        time.start(
+            Instant::now()
+                .checked_sub(Duration::from_secs(30))
+                .expect("the machine has run for 30 s"),
+        );
         assert_eq!(time.n_steps_in_time(), None, "no step yet");
         time.first_step_secs = Some(10.0); // Until then, the run waited for keyframes.
         time.add_steps(100);

@@ -1,4 +1,5 @@
-//! Emulates motors on CAN buses, one thread per bus. Shafts follow a script until a client enables a motor.
+//! Emulates motors on CAN buses, one thread per bus. Shafts follow a script until a client enables
+//! a motor.
 
 use super::JointTrack;
 use drivers::can::emulated::{EmulatedMotor, State};
@@ -32,26 +33,39 @@ struct SharedFlags {
 }
 
 impl EmulatedMotors {
-    /// Opens the buses, which must be up, and emulates all motors of the arm. The track's joints are in the order of
-    /// the motors. Once a client has enabled a motor, all motors follow client commands only.
+    /// Opens the buses, which must be up, and emulates all motors of the arm. The track's joints
+    /// are in the order of the motors. Once a client has enabled a motor, all motors follow client
+    /// commands only.
     pub fn start(track: &JointTrack, arm: &ArmConfig) -> Result<Self, Error> {
-        let mut motors = Self { flags: Arc::default(), threads: Vec::new() };
+        let mut motors = Self {
+            flags: Arc::default(),
+            threads: Vec::new(),
+        };
         for (bus_ix, bus) in arm.buses.iter().enumerate() {
-            let joints_of_bus = arm.motors.iter().enumerate().filter(|(_, motor)| motor.bus_ix == bus_ix);
+            let joints_of_bus = arm
+                .motors
+                .iter()
+                .enumerate()
+                .filter(|(_, motor)| motor.bus_ix == bus_ix);
             let joints_of_bus = joints_of_bus.map(|(joint_ix, motor)| EmulatedJoint {
                 joint_ix,
                 config: motor.clone(),
                 motor: EmulatedMotor::new(&*motor.protocol, DAMIAO_LIMITS),
             });
-            let (bus, joints_of_bus, track) = (Bus::open(bus)?, joints_of_bus.collect(), track.clone());
+            let (bus, joints_of_bus, track) =
+                (Bus::open(bus)?, joints_of_bus.collect(), track.clone());
             let flags = Arc::clone(&motors.flags);
             let device = format!("emulated motors on {}", bus.config().interface);
-            let thread = std::thread::Builder::new().name(device.clone()).spawn(move || {
-                if let Err(error) = run_bus(&bus, joints_of_bus, &track, &flags) {
-                    log::error!("{error}");
-                }
-            });
-            motors.threads.push(thread.map_err(|source| Error::Thread { device, source })?);
+            let thread = std::thread::Builder::new()
+                .name(device.clone())
+                .spawn(move || {
+                    if let Err(error) = run_bus(&bus, joints_of_bus, &track, &flags) {
+                        log::error!("{error}");
+                    }
+                });
+            motors
+                .threads
+                .push(thread.map_err(|source| Error::Thread { device, source })?);
         }
         Ok(motors)
     }
@@ -77,7 +91,12 @@ struct EmulatedJoint {
 impl EmulatedJoint {
     /// Moves the motor to the position of its joint.
     fn follow(&mut self, joints: &JointState) {
-        let MotorConfig { gear_ratio, is_reversed, offset_rad, .. } = self.config;
+        let MotorConfig {
+            gear_ratio,
+            is_reversed,
+            offset_rad,
+            ..
+        } = self.config;
         let motor_per_joint = gear_ratio * if is_reversed { -1.0 } else { 1.0 };
         let of = |numbers: &[f64]| numbers.get(self.joint_ix).copied().unwrap_or(0.0);
         self.motor.set_motion(Motion {
@@ -108,11 +127,14 @@ fn run_bus(
             };
             for frames in [answers, emulated_joint.motor.report(now)] {
                 match frames {
-                    Ok(frames) => frames.iter().try_for_each(|frame| bus.send(frame).map(drop))?,
+                    Ok(frames) => frames
+                        .iter()
+                        .try_for_each(|frame| bus.send(frame).map(drop))?,
                     Err(error) => log::debug!("joint {:?}: {error}", emulated_joint.config.joint),
                 }
             }
-            if emulated_joint.motor.state() != State::Free && !flags.is_client_controlled.swap(true, Ordering::Relaxed)
+            if emulated_joint.motor.state() != State::Free
+                && !flags.is_client_controlled.swap(true, Ordering::Relaxed)
             {
                 log::info!("a client controls the arm: it no longer follows the script");
             }

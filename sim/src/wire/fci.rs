@@ -7,7 +7,8 @@ use drivers::franka::emulated::{CommandedJoints, EmulatedRobot, Joints, RobotCon
 use kinematics::JointState;
 use std::time::Duration;
 
-/// Accepts clients until it is dropped. Once a client has moved the arm, it follows client commands only.
+/// Accepts clients until it is dropped. Once a client has moved the arm, it follows client commands
+/// only.
 ///
 /// * `answer_wait`: as in [`EmulatedRobot::start_waiting`]; zero on a real robot
 /// * `motors`: gets the joints once per millisecond.
@@ -23,11 +24,17 @@ pub fn emulate_fci(
             log::info!("a client controls the arm: it no longer follows the script");
         }
         if is_client_controlled {
-            let (position_rad, velocity_rad_s) = (client_target.position_rad, client_target.velocity_rad_s);
-            return Joints { position_rad, velocity_rad_s, ..Joints::default() };
+            let (position_rad, velocity_rad_s) =
+                (client_target.position_rad, client_target.velocity_rad_s);
+            return Joints {
+                position_rad,
+                velocity_rad_s,
+                ..Joints::default()
+            };
         }
         let state = track.at(now);
-        let to_joint_array = |numbers: Vec<f64>| std::array::from_fn(|ix| numbers.get(ix).copied().unwrap_or(0.0));
+        let to_joint_array =
+            |numbers: Vec<f64>| std::array::from_fn(|ix| numbers.get(ix).copied().unwrap_or(0.0));
         Joints {
             position_rad: to_joint_array(state.position),
             velocity_rad_s: to_joint_array(state.velocity),
@@ -38,8 +45,14 @@ pub fn emulate_fci(
     let joint_simulator = move |now, client_target: &CommandedJoints| {
         let joints = simulate_joints(now, client_target);
         if let Some(motors) = &motors {
-            let (position, velocity) = (joints.position_rad.to_vec(), joints.velocity_rad_s.to_vec());
-            motors.record(JointState { stamp: now, position, velocity, effort: Vec::new() });
+            let (position, velocity) =
+                (joints.position_rad.to_vec(), joints.velocity_rad_s.to_vec());
+            motors.record(JointState {
+                stamp: now,
+                position,
+                velocity,
+                effort: Vec::new(),
+            });
         }
         joints
     };

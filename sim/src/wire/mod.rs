@@ -1,7 +1,9 @@
-//! Emulates the devices of a recorded rig on the wire: a Franka controller, motors on CAN buses, datagrams.
+//! Emulates the devices of a recorded rig on the wire: a Franka controller, motors on CAN buses,
+//! datagrams.
 //!
-//! A [`DeviceScript`] holds the samples of a simulated or recorded rig. [`PlaybackClock`] maps their stamps to playback
-//! times. Images are not played back here; play back a file of the camera vendor's library instead.
+//! A [`DeviceScript`] holds the samples of a simulated or recorded rig. [`PlaybackClock`] maps
+//! their stamps to playback times. Images are not played back here; play back a file of the camera
+//! vendor's library instead.
 
 #[cfg(target_os = "linux")]
 mod can;
@@ -57,12 +59,21 @@ pub struct PlaybackClock {
 impl PlaybackClock {
     /// The instant of the script played back at `now`.
     pub fn script_stamp_at(&self, now: Stamp) -> Stamp {
-        Stamp(now.0.saturating_sub(self.emulated.0).saturating_add(self.scripted.0))
+        Stamp(
+            now.0
+                .saturating_sub(self.emulated.0)
+                .saturating_add(self.scripted.0),
+        )
     }
 
     /// The playback time of an instant of the script.
     pub fn playback_stamp_of(&self, scripted: Stamp) -> Stamp {
-        Stamp(scripted.0.saturating_sub(self.scripted.0).saturating_add(self.emulated.0))
+        Stamp(
+            scripted
+                .0
+                .saturating_sub(self.scripted.0)
+                .saturating_add(self.emulated.0),
+        )
     }
 }
 
@@ -76,21 +87,47 @@ pub struct JointTrack {
 
 impl JointTrack {
     /// Fails if readings are out of order or non-finite, or if the script is empty.
-    pub fn new(readings: &[JointState], playback_clock: PlaybackClock) -> Result<Self, HistoryError> {
+    pub fn new(
+        readings: &[JointState],
+        playback_clock: PlaybackClock,
+    ) -> Result<Self, HistoryError> {
         let (Some(first), Some(last)) = (readings.first(), readings.last()) else {
-            return Err(HistoryError::NotYet { newest: None, requested: playback_clock.scripted });
+            return Err(HistoryError::NotYet {
+                newest: None,
+                requested: playback_clock.scripted,
+            });
         };
         let mut history = JointHistory::new(MAX_GAP, readings.len().max(2));
-        readings.iter().try_for_each(|state| history.push(state.clone()))?;
-        let at_rest = |state: &JointState| JointState { velocity: vec![0.0; state.position.len()], ..state.clone() };
-        Ok(Self { history, end_states: [at_rest(first), at_rest(last)], playback_clock })
+        readings
+            .iter()
+            .try_for_each(|state| history.push(state.clone()))?;
+        let at_rest = |state: &JointState| JointState {
+            velocity: vec![0.0; state.position.len()],
+            ..state.clone()
+        };
+        Ok(Self {
+            history,
+            end_states: [at_rest(first), at_rest(last)],
+            playback_clock,
+        })
     }
 
     /// Joints that rest at a position.
     pub fn at_rest(position: Vec<f64>) -> Result<Self, HistoryError> {
         let velocity = vec![0.0; position.len()];
-        let state = JointState { stamp: Stamp::default(), position, velocity, effort: Vec::new() };
-        Self::new(&[state], PlaybackClock { scripted: Stamp::default(), emulated: Stamp::default() })
+        let state = JointState {
+            stamp: Stamp::default(),
+            position,
+            velocity,
+            effort: Vec::new(),
+        };
+        Self::new(
+            &[state],
+            PlaybackClock {
+                scripted: Stamp::default(),
+                emulated: Stamp::default(),
+            },
+        )
     }
 
     /// The joints at playback time `now`, which is the stamp of the result.
@@ -103,7 +140,10 @@ impl JointTrack {
             // After the end, or in a gap. Simulated scripts have no gaps.
             Err(_) => last.clone(),
         };
-        JointState { stamp: now, ..state }
+        JointState {
+            stamp: now,
+            ..state
+        }
     }
 }
 
@@ -120,15 +160,31 @@ mod tests {
             effort: vec![],
         };
         let readings: Vec<_> = (100..=200).step_by(10).map(reading).collect();
-        let playback_clock = PlaybackClock { scripted: Stamp(100_000_000), emulated: Stamp(7_000_000_000) };
+        let playback_clock = PlaybackClock {
+            scripted: Stamp(100_000_000),
+            emulated: Stamp(7_000_000_000),
+        };
         let track = JointTrack::new(&readings, playback_clock).unwrap();
         let at = |millis: i64| track.at(Stamp(7_000_000_000 + millis * 1_000_000));
-        assert_eq!((&at(-50).position[..], &at(-50).velocity[..]), (&[0.05][..], &[0.0][..]));
+        assert_eq!(
+            (&at(-50).position[..], &at(-50).velocity[..]),
+            (&[0.05][..], &[0.0][..])
+        );
         assert!((at(33).position[0] - 0.0665).abs() < 1e-12);
         assert!((at(33).velocity[0] - 0.5).abs() < 1e-9);
-        assert_eq!((&at(500).position[..], &at(500).velocity[..]), (&[0.1][..], &[0.0][..]));
-        assert_eq!(at(33).stamp, Stamp(7_033_000_000), "stamped with the playback time");
-        assert_eq!(playback_clock.script_stamp_at(playback_clock.playback_stamp_of(Stamp(123))), Stamp(123));
+        assert_eq!(
+            (&at(500).position[..], &at(500).velocity[..]),
+            (&[0.1][..], &[0.0][..])
+        );
+        assert_eq!(
+            at(33).stamp,
+            Stamp(7_033_000_000),
+            "stamped with the playback time"
+        );
+        assert_eq!(
+            playback_clock.script_stamp_at(playback_clock.playback_stamp_of(Stamp(123))),
+            Stamp(123)
+        );
         assert!(JointTrack::new(&[], playback_clock).is_err());
     }
 }

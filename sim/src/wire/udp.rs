@@ -3,7 +3,8 @@
 use super::{DeviceScript, PlaybackClock};
 use drivers::clock;
 use drivers::wire::datagram::{
-    Clock, DatagramHeader, JointsDatagram, PoseDatagram, ScanPart, encode_joints, encode_pose, encode_scan,
+    Clock, DatagramHeader, JointsDatagram, PoseDatagram, ScanPart, encode_joints, encode_pose,
+    encode_scan,
 };
 use drivers::{Error, RangeScan};
 use kinematics::{JointState, Stamp};
@@ -13,7 +14,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-/// Maximum echoes per datagram. Each takes about 60 bytes as JSON; a datagram holds at most 65 507 bytes.
+/// Maximum echoes per datagram. Each takes about 60 bytes as JSON; a datagram holds at most 65 507
+/// bytes.
 const MAX_POINTS: usize = 1000;
 /// Period at which the state at rest is resent.
 const RESEND_PERIOD: Duration = Duration::from_millis(20);
@@ -39,8 +41,8 @@ pub struct EmulatedSenders {
 }
 
 impl EmulatedSenders {
-    /// Starts sending. Before and after the playback, joints and base are at rest in the first and last state of the
-    /// script.
+    /// Starts sending. Before and after the playback, joints and base are at rest in the first and
+    /// last state of the script.
     pub fn start(
         script: &DeviceScript,
         playback_clock: PlaybackClock,
@@ -49,7 +51,11 @@ impl EmulatedSenders {
         let device = "emulated datagrams".to_owned();
         let any = SocketAddr::from((Ipv4Addr::UNSPECIFIED, 0));
         let socket = UdpSocket::bind(any);
-        let socket = socket.map_err(|source| Error::Listen { device: device.clone(), address: any, source })?;
+        let socket = socket.map_err(|source| Error::Listen {
+            device: device.clone(),
+            address: any,
+            source,
+        })?;
         let stop = Arc::new(AtomicBool::new(false));
         let sender = Sender {
             script: script.clone(),
@@ -61,9 +67,14 @@ impl EmulatedSenders {
             n_poses_sent: 0,
             stop: Arc::clone(&stop),
         };
-        let thread = std::thread::Builder::new().name(device.clone()).spawn(move || sender.run());
+        let thread = std::thread::Builder::new()
+            .name(device.clone())
+            .spawn(move || sender.run());
         let thread = thread.map_err(|source| Error::Thread { device, source })?;
-        Ok(Self { stop, thread: Some(thread) })
+        Ok(Self {
+            stop,
+            thread: Some(thread),
+        })
     }
 }
 
@@ -119,21 +130,44 @@ impl Sender {
 
     /// The script in the order in which it is sent. Scans are sent when complete.
     fn script_entries(&self) -> Vec<(Stamp, ScriptEntry)> {
-        let DeviceScript { joints, poses, scans } = &self.script;
+        let DeviceScript {
+            joints,
+            poses,
+            scans,
+        } = &self.script;
         let at = |stamp: Stamp| self.playback_clock.playback_stamp_of(stamp);
         let mut script_entries = Vec::new();
         if self.datagram_targets.joints.is_some() {
-            script_entries
-                .extend(joints.iter().enumerate().map(|(ix, state)| (at(state.stamp), ScriptEntry::Joints(ix))));
+            script_entries.extend(
+                joints
+                    .iter()
+                    .enumerate()
+                    .map(|(ix, state)| (at(state.stamp), ScriptEntry::Joints(ix))),
+            );
         }
         if self.datagram_targets.base.is_some() {
-            script_entries.extend(poses.iter().enumerate().map(|(ix, pose)| (at(pose.stamp), ScriptEntry::Pose(ix))));
+            script_entries.extend(
+                poses
+                    .iter()
+                    .enumerate()
+                    .map(|(ix, pose)| (at(pose.stamp), ScriptEntry::Pose(ix))),
+            );
         }
         for (scanner_ix, (name, _)) in self.datagram_targets.scanners.iter().enumerate() {
-            let revolutions = scans.iter().enumerate().filter(|(_, scan)| *scan.scanner == **name);
+            let revolutions = scans
+                .iter()
+                .enumerate()
+                .filter(|(_, scan)| *scan.scanner == **name);
             script_entries.extend(revolutions.map(|(ix, RangeScan { stamp, points, .. })| {
-                let last_micros = points.iter().map(|point| point.offset_micros).max().unwrap_or(0);
-                (at(stamp.plus_secs(f64::from(last_micros) * 1e-6)), ScriptEntry::Scan(scanner_ix, ix))
+                let last_micros = points
+                    .iter()
+                    .map(|point| point.offset_micros)
+                    .max()
+                    .unwrap_or(0);
+                (
+                    at(stamp.plus_secs(f64::from(last_micros) * 1e-6)),
+                    ScriptEntry::Scan(scanner_ix, ix),
+                )
             }));
         }
         script_entries.sort_by_key(|(due_stamp, _)| *due_stamp);
@@ -143,7 +177,10 @@ impl Sender {
     /// Repeatedly sends the joints and base at one end of the script, until shortly before a time.
     fn resend_end_state(&mut self, end: usize, until: Stamp) {
         let last = |n: usize| n.checked_sub(1).map(|last| last.min(end));
-        let (joints_ix, pose_ix) = (last(self.script.joints.len()), last(self.script.poses.len()));
+        let (joints_ix, pose_ix) = (
+            last(self.script.joints.len()),
+            last(self.script.poses.len()),
+        );
         let mut now = clock::now();
         while now.plus_secs(RESEND_PERIOD.as_secs_f64()) < until {
             if let Some(ix) = joints_ix {
@@ -174,21 +211,39 @@ impl Sender {
     }
 
     fn send_joints(&mut self, ix: usize, stamp: Stamp, is_at_rest: bool) {
-        let Some((to, names)) = &self.datagram_targets.joints else { return };
-        let JointState { position, mut velocity, effort, .. } = self.script.joints[ix].clone();
+        let Some((to, names)) = &self.datagram_targets.joints else {
+            return;
+        };
+        let JointState {
+            position,
+            mut velocity,
+            effort,
+            ..
+        } = self.script.joints[ix].clone();
         if is_at_rest {
             velocity.fill(0.0);
         }
-        let joints = JointsDatagram { header: header(self.n_joints_sent, stamp), position, velocity, effort };
+        let joints = JointsDatagram {
+            header: header(self.n_joints_sent, stamp),
+            position,
+            velocity,
+            effort,
+        };
         self.send(&encode_joints(&joints, names), *to);
         self.n_joints_sent += 1;
     }
 
     fn send_pose(&mut self, ix: usize, stamp: Stamp) {
-        let Some(to) = self.datagram_targets.base else { return };
+        let Some(to) = self.datagram_targets.base else {
+            return;
+        };
         let world_from_base = self.script.poses[ix].world_from_base;
         self.send(
-            &encode_pose(&PoseDatagram { header: header(self.n_poses_sent, stamp), world_from_base, covariance: None }),
+            &encode_pose(&PoseDatagram {
+                header: header(self.n_poses_sent, stamp),
+                world_from_base,
+                covariance: None,
+            }),
             to,
         );
         self.n_poses_sent += 1;
@@ -197,11 +252,24 @@ impl Sender {
     fn send_scan(&mut self, scanner_ix: usize, ix: usize) {
         let (name, to) = self.datagram_targets.scanners[scanner_ix].clone();
         let RangeScan { stamp, points, .. } = &self.script.scans[ix];
-        let header = header(self.n_sent[scanner_ix], self.playback_clock.playback_stamp_of(*stamp));
-        let chunks: Vec<_> = if points.is_empty() { vec![&points[..]] } else { points.chunks(MAX_POINTS).collect() };
+        let header = header(
+            self.n_sent[scanner_ix],
+            self.playback_clock.playback_stamp_of(*stamp),
+        );
+        let chunks: Vec<_> = if points.is_empty() {
+            vec![&points[..]]
+        } else {
+            points.chunks(MAX_POINTS).collect()
+        };
         let n_parts = u32::try_from(chunks.len()).unwrap_or(u32::MAX);
         for (part, points) in (0..).zip(chunks) {
-            let scan = ScanPart { header, frame: name.clone(), part, n_parts, points: points.to_vec() };
+            let scan = ScanPart {
+                header,
+                frame: name.clone(),
+                part,
+                n_parts,
+                points: points.to_vec(),
+            };
             self.send(&encode_scan(&scan), to);
         }
         self.n_sent[scanner_ix] += 1;
@@ -214,7 +282,11 @@ impl Sender {
 }
 
 fn header(seq: u64, stamp: Stamp) -> DatagramHeader {
-    DatagramHeader { seq, clock: Clock::Monotonic, stamp_nanos: stamp.0 }
+    DatagramHeader {
+        seq,
+        clock: Clock::Monotonic,
+        stamp_nanos: stamp.0,
+    }
 }
 
 #[cfg(test)]
@@ -227,7 +299,11 @@ mod tests {
     #[test]
     fn drivers_receive_the_emulated_samples_with_stamps() {
         const MILLI: i64 = 1_000_000;
-        let point = |ix: u16| RangePoint { position_m: [f32::from(ix), 1.0, 0.5], ring: 2, offset_micros: ix.into() };
+        let point = |ix: u16| RangePoint {
+            position_m: [f32::from(ix), 1.0, 0.5],
+            ring: 2,
+            offset_micros: ix.into(),
+        };
         let script = DeviceScript {
             joints: vec![JointState {
                 stamp: Stamp(5 * MILLI),
@@ -235,7 +311,10 @@ mod tests {
                 velocity: vec![0.5, 0.0],
                 effort: vec![],
             }],
-            poses: vec![BasePose { stamp: Stamp(6 * MILLI), world_from_base: Transform::translation(1.0, 2.0, 3.0) }],
+            poses: vec![BasePose {
+                stamp: Stamp(6 * MILLI),
+                world_from_base: Transform::translation(1.0, 2.0, 3.0),
+            }],
             scans: vec![RangeScan {
                 scanner: "lidar".into(),
                 stamp: Stamp(7 * MILLI),
@@ -253,19 +332,29 @@ mod tests {
             base: Some(base.address()),
             scanners: vec![("lidar".into(), scanner.address())],
         };
-        let playback_clock = PlaybackClock { scripted: Stamp(0), emulated };
-        let _senders = EmulatedSenders::start(&script, playback_clock, datagram_targets).expect("a socket");
+        let playback_clock = PlaybackClock {
+            scripted: Stamp(0),
+            emulated,
+        };
+        let _senders =
+            EmulatedSenders::start(&script, playback_clock, datagram_targets).expect("a socket");
         let wait = Duration::from_secs(5);
         let at_rest_state = arm.read(wait).expect("joints");
         assert_eq!(at_rest_state.position, script.joints[0].position);
-        assert!(at_rest_state.stamp < playback_clock.playback_stamp_of(Stamp(0)), "sent before playback starts");
+        assert!(
+            at_rest_state.stamp < playback_clock.playback_stamp_of(Stamp(0)),
+            "sent before playback starts"
+        );
         let mut joints = at_rest_state;
         while joints.stamp < playback_clock.playback_stamp_of(Stamp(0)) {
             joints = arm.read(wait).expect("joints");
         }
         assert_eq!(
             joints,
-            JointState { stamp: playback_clock.playback_stamp_of(Stamp(5 * MILLI)), ..script.joints[0].clone() }
+            JointState {
+                stamp: playback_clock.playback_stamp_of(Stamp(5 * MILLI)),
+                ..script.joints[0].clone()
+            }
         );
         let mut pose = base.next_pose(wait).expect("a pose");
         while pose.stamp < playback_clock.playback_stamp_of(Stamp(0)) {
@@ -278,7 +367,10 @@ mod tests {
         let scan = scanner.next_scan(wait).expect("a scan");
         assert_eq!(
             (scan.stamp, &scan.points),
-            (playback_clock.playback_stamp_of(Stamp(7 * MILLI)), &script.scans[0].points)
+            (
+                playback_clock.playback_stamp_of(Stamp(7 * MILLI)),
+                &script.scans[0].points
+            )
         );
     }
 }

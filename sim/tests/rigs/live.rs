@@ -9,9 +9,15 @@ use std::time::Duration;
 fn live_devices_deliver_until_the_rig_ends() {
     const TIMEOUT: Duration = Duration::from_secs(60);
     const START: Stamp = Stamp(5_000_000_000_000);
-    let mut config = Config { duration_secs: Some(1.0), ..Config::default() };
+    let mut config = Config {
+        duration_secs: Some(1.0),
+        ..Config::default()
+    };
     config.cameras[0].intrinsics = config.cameras[0].intrinsics.resized([160, 120]);
-    let mut rig = sim::open(&config).expect("the rig opens").into_live(START).expect("the rig starts");
+    let mut rig = sim::open(&config)
+        .expect("the rig opens")
+        .into_live(START)
+        .expect("the rig starts");
 
     let mut newest = START;
     let mut n_readings = 0;
@@ -40,8 +46,12 @@ fn live_devices_deliver_until_the_rig_ends() {
         }
     };
     assert!(matches!(end, drivers::Error::Simulation { .. }), "{end}");
-    assert!(n_color >= 1 && n_depth >= 1, "{n_color} color, {n_depth} depth");
-    // No images were taken while the joints were read. Images that did not fit in the queue were dropped and counted.
+    assert!(
+        n_color >= 1 && n_depth >= 1,
+        "{n_color} color, {n_depth} depth"
+    );
+    // No images were taken while the joints were read. Images that did not fit in the queue were
+    // dropped and counted.
     assert!(
         n_color + n_dropped <= 15 && n_color + n_depth <= 8,
         "{n_color} color, {n_depth} depth, {n_dropped} dropped"

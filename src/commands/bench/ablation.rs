@@ -1,4 +1,5 @@
-//! `fieldrig bench ablation`: measures the contribution of each part of the method by training without it.
+//! `fieldrig bench ablation`: measures the contribution of each part of the method by training
+//! without it.
 
 use super::runs_args::RunsArgs;
 use crate::exit::Exit;
@@ -10,7 +11,8 @@ use std::path::PathBuf;
 pub(crate) struct Args {
     /// A nerfstudio or TUM RGB-D folder, or a recording (.mcap)
     data: PathBuf,
-    /// Training time of each run in seconds; loading and scoring do not count [default: 16, unless --steps is given]
+    /// Training time of each run in seconds; loading and scoring do not count [default: 16, unless
+    /// --steps is given]
     #[arg(long, value_name = "S")]
     seconds: Option<f64>,
     /// Optimizer steps of each run
@@ -27,7 +29,8 @@ pub(crate) struct Args {
 }
 
 pub(super) fn run(args: &Args) -> anyhow::Result<Exit> {
-    args.runs.run(|host| bench::ablation::run(&args.options(), host))
+    args.runs
+        .run(|host| bench::ablation::run(&args.options(), host))
 }
 
 impl Args {

@@ -1,4 +1,5 @@
-//! `fieldrig bench budget`: accuracy over the number of splats, and the number that the trainer chooses.
+//! `fieldrig bench budget`: accuracy over the number of splats, and the number that the trainer
+//! chooses.
 
 use super::runs_args::RunsArgs;
 use crate::exit::Exit;
@@ -22,7 +23,8 @@ pub(crate) struct Args {
         value_parser = clap::value_parser!(u32).range(1..=MAX_CAP)
     )]
     splats: Vec<u32>,
-    /// Training time of each run in seconds; loading and scoring do not count [default: 60, unless --steps is given]
+    /// Training time of each run in seconds; loading and scoring do not count [default: 60, unless
+    /// --steps is given]
     #[arg(long, value_name = "S")]
     seconds: Option<f64>,
     /// Optimizer steps of each run
@@ -36,7 +38,8 @@ pub(crate) struct Args {
 }
 
 pub(super) fn run(args: &Args) -> anyhow::Result<Exit> {
-    args.runs.run(|host| bench::budget::run(&args.options(), host))
+    args.runs
+        .run(|host| bench::budget::run(&args.options(), host))
 }
 
 impl Args {

@@ -20,7 +20,13 @@ enum PartArg {
     Rigs,
 }
 
-const ALL_PARTS: [PartArg; 5] = [PartArg::Speed, PartArg::Coverage, PartArg::Stability, PartArg::Arm, PartArg::Rigs];
+const ALL_PARTS: [PartArg; 5] = [
+    PartArg::Speed,
+    PartArg::Coverage,
+    PartArg::Stability,
+    PartArg::Arm,
+    PartArg::Rigs,
+];
 
 impl From<PartArg> for Part {
     fn from(part: PartArg) -> Self {
@@ -76,11 +82,37 @@ pub(crate) struct Args {
 }
 
 pub(super) fn run(args: &Args) -> anyhow::Result<Exit> {
-    let Args { parts, runs, first_seed, poses, corner_px, seeds, rig, rigs, first_rig, seconds, out, .. } =
-        args.clone();
+    let Args {
+        parts,
+        runs,
+        first_seed,
+        poses,
+        corner_px,
+        seeds,
+        rig,
+        rigs,
+        first_rig,
+        seconds,
+        out,
+        ..
+    } = args.clone();
     let parts = parts.into_iter().map(Part::from).collect();
-    let coverage = CoverageScenes { runs, first_seed, n_poses: poses.into(), corner_px };
-    let options = CalibrationOptions { parts, coverage, seeds, rig, rigs, first_rig, scan_secs: seconds, out };
+    let coverage = CoverageScenes {
+        runs,
+        first_seed,
+        n_poses: poses.into(),
+        corner_px,
+    };
+    let options = CalibrationOptions {
+        parts,
+        coverage,
+        seeds,
+        rig,
+        rigs,
+        first_rig,
+        scan_secs: seconds,
+        out,
+    };
     print_result(&bench::calibration::run(&options)?, args.json)?;
     Ok(Exit::Done)
 }

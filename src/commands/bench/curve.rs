@@ -25,7 +25,8 @@ pub(crate) struct Args {
 }
 
 pub(super) fn run(args: &Args) -> anyhow::Result<Exit> {
-    args.runs.run(|host| bench::curve::run(&args.options(), host))
+    args.runs
+        .run(|host| bench::curve::run(&args.options(), host))
 }
 
 impl Args {

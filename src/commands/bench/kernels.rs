@@ -11,25 +11,28 @@ const MAX_CLOUD_SPLATS: i64 = 100_000_000;
 /// Flags of `bench kernels`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// Use the splats of an .npz file with `means`, `quats`, `log_scales`, `opacities_logit` and `sh` instead of a
-    /// synthetic cloud
+    /// Use the splats of an .npz file with `means`, `quats`, `log_scales`, `opacities_logit` and
+    /// `sh` instead of a synthetic cloud
     #[arg(long, value_name = "FILE.npz")]
     cloud: Option<PathBuf>,
-    /// Image sizes, `WIDTHxHEIGHT`, separated by commas [default: 1024x1024,1280x720,1920x1080; without a GPU 320x240]
+    /// Image sizes, `WIDTHxHEIGHT`, separated by commas [default: 1024x1024,1280x720,1920x1080;
+    /// without a GPU 320x240]
     #[arg(long, value_delimiter = ',', value_parser = parse_size)]
     size: Vec<Size>,
-    /// Numbers of splats, 1 to 100000000, separated by commas; cannot be combined with --cloud [default:
-    /// 100000,300000,1000000,3000000; without a GPU 10000,30000]
+    /// Numbers of splats, 1 to 100000000, separated by commas; cannot be combined with --cloud
+    /// [default: 100000,300000,1000000,3000000; without a GPU 10000,30000]
     #[arg(long, value_delimiter = ',', conflicts_with = "cloud", value_parser = clap::value_parser!(u32).range(1..=MAX_CLOUD_SPLATS))]
     splats: Vec<u32>,
-    /// Number of timed images and steps, 1 to 10000; the median is reported [default: 30; without a GPU 3]
+    /// Number of timed images and steps, 1 to 10000; the median is reported [default: 30; without a
+    /// GPU 3]
     #[arg(long, value_parser = clap::value_parser!(u32).range(1..=10_000))]
     repeats: Option<u32>,
     /// Put the camera in the middle of the cloud, where only some of the splats are visible
     #[arg(long)]
     inside: bool,
-    /// Measure a step that resembles those of a scan with depth: unevenly distributed splats, and a loss with D-SSIM
-    /// and depth [default: 640x480 and 400000 splats; without a GPU 160x120 and 25000]
+    /// Measure a step that resembles those of a scan with depth: unevenly distributed splats, and a
+    /// loss with D-SSIM and depth [default: 640x480 and 400000 splats; without a GPU 160x120 and
+    /// 25000]
     #[arg(long, conflicts_with_all = ["cloud", "inside"])]
     scan: bool,
     /// Print the GPU time of each pass of a step
@@ -44,7 +47,11 @@ pub(crate) struct Args {
 struct Size([u32; 2]);
 
 fn parse_size(text: &str) -> Result<Size, String> {
-    let parse = |part: &str| part.parse::<u32>().ok().filter(|size| (1..=16_384).contains(size));
+    let parse = |part: &str| {
+        part.parse::<u32>()
+            .ok()
+            .filter(|size| (1..=16_384).contains(size))
+    };
     text.split_once('x')
         .and_then(|(width, height)| Some(Size([parse(width)?, parse(height)?])))
         .ok_or_else(|| "expected WIDTHxHEIGHT in pixels, each from 1 to 16384".to_owned())
@@ -71,11 +78,19 @@ impl Args {
         if self.json {
             return print::json(row);
         }
-        let KernelsRow { size_px: [width, height], n_splats, figures, passes } = row;
+        let KernelsRow {
+            size_px: [width, height],
+            n_splats,
+            figures,
+            passes,
+        } = row;
         print::line(format_args!(
             "{width}x{height} {n_splats:>8} splats: image {:.3} ms, {}step {:.3} ms (wall {:.3}, {:.3}; only the {} splats in view {:.3} ms), mean {:.5?}, peak {} MB",
             figures.render_millis,
-            figures.packed_millis.map(|millis| format!("packed {millis:.3} ms, ")).unwrap_or_default(),
+            figures
+                .packed_millis
+                .map(|millis| format!("packed {millis:.3} ms, "))
+                .unwrap_or_default(),
             figures.step_millis,
             figures.render_wall_millis,
             figures.step_wall_millis,

@@ -1,4 +1,5 @@
-//! `fieldrig bench live`: plays a recording in real time into runs with viewers, and measures latency and accuracy.
+//! `fieldrig bench live`: plays a recording in real time into runs with viewers, and measures
+//! latency and accuracy.
 
 use super::run_flags;
 use super::runs_args::print_result;
@@ -22,11 +23,12 @@ pub(crate) struct Args {
     /// Rig file [default: the one stored in the recording]
     #[arg(long, value_name = "FILE")]
     rig: Option<PathBuf>,
-    /// Length of each run in seconds, counted from the first image. After the end of the recording, training continues
+    /// Length of each run in seconds, counted from the first image. After the end of the recording,
+    /// training continues
     #[arg(long, value_name = "S", default_value_t = 60.0, value_parser = super::super::number_in_range(1.0..=1e6))]
     seconds: f64,
-    /// Play the recording again whenever it ends. If a run takes two minutes or more, the change per hour of latency,
-    /// accuracy, training speed and memory is reported
+    /// Play the recording again whenever it ends. If a run takes two minutes or more, the change
+    /// per hour of latency, accuracy, training speed and memory is reported
     #[arg(long)]
     repeat: bool,
     /// Numbers of viewers that request pictures back to back, one run each
@@ -38,17 +40,19 @@ pub(crate) struct Args {
     /// Request panoramas (equirectangular) instead of pinhole views
     #[arg(long)]
     panorama: bool,
-    /// Pictures that each viewer requests per second, if they arrive that fast [default: back to back]
+    /// Pictures that each viewer requests per second, if they arrive that fast [default: back to
+    /// back]
     #[arg(long, value_name = "HZ", value_parser = super::super::number_in_range(0.1..=1000.0))]
     picture_rate: Option<f64>,
-    /// Repeat the run with one viewer and a wrong hand-eye calibration: degrees and millimeters in random directions
+    /// Repeat the run with one viewer and a wrong hand-eye calibration: degrees and millimeters in
+    /// random directions
     #[arg(long, value_name = "DEG,MM", value_parser = hand_eye_error)]
     hand_eye_error: Option<(f64, f64)>,
     /// Number of directions of the hand-eye error, one run each
     #[arg(long, value_name = "N", default_value_t = 1, requires = "hand_eye_error", value_parser = clap::value_parser!(u64).range(1..=100))]
     directions: u64,
-    /// Repeat the run with one viewer and each of these disturbances: `pose-noise` in mm, `clock-offset` in ms, or
-    /// `exposure`, a step in EV in the middle of the run
+    /// Repeat the run with one viewer and each of these disturbances: `pose-noise` in mm,
+    /// `clock-offset` in ms, or `exposure`, a step in EV in the middle of the run
     #[arg(long, value_name = "WHAT:SIZE,...", value_delimiter = ',', value_parser = disturbance)]
     disturb: Vec<LiveDisturbance>,
     /// Folder for charts and numbers
@@ -63,24 +67,33 @@ pub(crate) struct Args {
 }
 
 fn size(text: &str) -> Result<[u32; 2], String> {
-    let parsed = text.split_once('x').and_then(|(width, height)| Some([width.parse().ok()?, height.parse().ok()?]));
+    let parsed = text
+        .split_once('x')
+        .and_then(|(width, height)| Some([width.parse().ok()?, height.parse().ok()?]));
     parsed
         .filter(|size: &[u32; 2]| size.iter().all(|n| (1..=4096).contains(n)))
         .ok_or_else(|| "must be a width and a height from 1 to 4096, such as 1024x1024".to_owned())
 }
 
 fn hand_eye_error(text: &str) -> Result<(f64, f64), String> {
-    let parsed = text.split_once(',').and_then(|(deg, mm)| Some((deg.trim().parse().ok()?, mm.trim().parse().ok()?)));
+    let parsed = text
+        .split_once(',')
+        .and_then(|(deg, mm)| Some((deg.trim().parse().ok()?, mm.trim().parse().ok()?)));
     parsed
         .filter(|(deg, mm)| (0.0..=90.0).contains(deg) && (0.0..=1000.0).contains(mm))
-        .ok_or_else(|| "must be degrees up to 90 and millimeters up to 1000, such as 1,5".to_owned())
+        .ok_or_else(|| {
+            "must be degrees up to 90 and millimeters up to 1000, such as 1,5".to_owned()
+        })
 }
 
 fn disturbance(text: &str) -> Result<LiveDisturbance, String> {
     let parsed = text.split_once(':').and_then(|(name, level)| {
         let is_named = |disturbance: &&Disturbance| disturbance.name() == name.trim();
         let disturbance = *Disturbance::ALL.iter().find(is_named)?;
-        Some(LiveDisturbance { disturbance, level: level.trim().parse().ok()? })
+        Some(LiveDisturbance {
+            disturbance,
+            level: level.trim().parse().ok()?,
+        })
     });
     let max = |disturbance| match disturbance {
         Disturbance::PoseNoise => 1000.0,
@@ -95,8 +108,13 @@ fn disturbance(text: &str) -> Result<LiveDisturbance, String> {
 }
 
 pub(super) fn run(args: &Args) -> anyhow::Result<Exit> {
-    std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
-    let rig = args.rig.as_ref().map(|path| Rig::load(path, &[])).transpose()?;
+    std::fs::create_dir_all(&args.out)
+        .with_context(|| format!("cannot create {}", args.out.display()))?;
+    let rig = args
+        .rig
+        .as_ref()
+        .map(|path| Rig::load(path, &[]))
+        .transpose()?;
     let rig = open::recording(&args.recording, rig, &[])?.rig;
     let (mut runs, mut data_losses) = (Vec::new(), Vec::new());
     for conditions in args.conditions() {
@@ -104,7 +122,12 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Exit> {
             log::warn!("interrupted: the results do not contain the run with {conditions}");
             break;
         };
-        data_losses.extend(losses.into_iter().filter(|loss| !data_losses.contains(loss)).collect::<Vec<_>>());
+        data_losses.extend(
+            losses
+                .into_iter()
+                .filter(|loss| !data_losses.contains(loss))
+                .collect::<Vec<_>>(),
+        );
         if args.json {
             print::report_json(&serde_json::json!({ "event": "run", "run": run }))?;
         } else {
@@ -116,8 +139,16 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Exit> {
         anyhow::bail!("interrupted before the first run ended");
     }
     let [width, height] = args.size;
-    let kind = if args.panorama { "panoramas" } else { "pictures" };
-    let mut input = format!("{}, {kind} of {width}x{height}, {} s", args.recording.display(), args.seconds);
+    let kind = if args.panorama {
+        "panoramas"
+    } else {
+        "pictures"
+    };
+    let mut input = format!(
+        "{}, {kind} of {width}x{height}, {} s",
+        args.recording.display(),
+        args.seconds
+    );
     if args.repeat {
         input.push_str(", repeated");
     }
@@ -126,38 +157,77 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Exit> {
     }
     let findings = findings(&input, &runs);
     let page = findings.write(&args.out)?;
-    data_losses.iter().for_each(|loss| log::warn!("data loss: {loss}"));
+    data_losses
+        .iter()
+        .for_each(|loss| log::warn!("data loss: {loss}"));
     let exit = exit::from_losses(&data_losses);
-    print_result(&BenchResult { findings, page, data_losses }, args.json)?;
+    print_result(
+        &BenchResult {
+            findings,
+            page,
+            data_losses,
+        },
+        args.json,
+    )?;
     Ok(exit)
 }
 
 fn describe(run: &LiveRun) -> String {
     let picture = run.latency("request to complete picture");
-    let picture =
-        picture.map_or(String::new(), |latency| format!("  picture {:.1} ms (99 %: {:.1})", latency.p50, latency.p99));
-    let psnr = run.psnr.last().map_or(String::new(), |(seconds, psnr)| format!("  {psnr:.2} dB at {seconds:.0} s"));
-    format!("{}: {:.1} steps per second{picture}{psnr}", run.conditions, run.steps_per_sec)
+    let picture = picture.map_or(String::new(), |latency| {
+        format!("  picture {:.1} ms (99 %: {:.1})", latency.p50, latency.p99)
+    });
+    let psnr = run.psnr.last().map_or(String::new(), |(seconds, psnr)| {
+        format!("  {psnr:.2} dB at {seconds:.0} s")
+    });
+    format!(
+        "{}: {:.1} steps per second{picture}{psnr}",
+        run.conditions, run.steps_per_sec
+    )
 }
 
 impl Args {
     fn conditions(&self) -> Vec<Conditions> {
-        let with_one = Conditions { n_viewers: 1, hand_eye_error: None, disturbance: None };
-        let right = self.viewers.iter().map(|&n_viewers| Conditions { n_viewers, ..with_one });
-        let wrong = self.hand_eye_error.into_iter().flat_map(|(degrees, millimeters)| {
-            let error = move |seed| HandEyeError { degrees, millimeters, seed };
-            (1..=self.directions).map(move |seed| Conditions { hand_eye_error: Some(error(seed)), ..with_one })
+        let with_one = Conditions {
+            n_viewers: 1,
+            hand_eye_error: None,
+            disturbance: None,
+        };
+        let right = self.viewers.iter().map(|&n_viewers| Conditions {
+            n_viewers,
+            ..with_one
         });
-        let disturbed =
-            self.disturb.iter().map(|&disturbance| Conditions { disturbance: Some(disturbance), ..with_one });
+        let wrong = self
+            .hand_eye_error
+            .into_iter()
+            .flat_map(|(degrees, millimeters)| {
+                let error = move |seed| HandEyeError {
+                    degrees,
+                    millimeters,
+                    seed,
+                };
+                (1..=self.directions).map(move |seed| Conditions {
+                    hand_eye_error: Some(error(seed)),
+                    ..with_one
+                })
+            });
+        let disturbed = self.disturb.iter().map(|&disturbance| Conditions {
+            disturbance: Some(disturbance),
+            ..with_one
+        });
         right.chain(wrong).chain(disturbed).collect()
     }
 
-    /// Measures one run, then removes its folder. Returns its measurements and data losses, or `None` if it was
-    /// interrupted.
-    fn measure(&self, rig: &Rig, conditions: Conditions) -> anyhow::Result<Option<(LiveRun, Vec<String>)>> {
+    /// Measures one run, then removes its folder. Returns its measurements and data losses, or
+    /// `None` if it was interrupted.
+    fn measure(
+        &self,
+        rig: &Rig,
+        conditions: Conditions,
+    ) -> anyhow::Result<Option<(LiveRun, Vec<String>)>> {
         let folder = self.out.join(format!("run-{}", std::process::id()));
-        std::fs::create_dir_all(&folder).with_context(|| format!("cannot create {}", folder.display()))?;
+        std::fs::create_dir_all(&folder)
+            .with_context(|| format!("cannot create {}", folder.display()))?;
         let measured = self.measure_in(&folder, rig, conditions);
         if let Err(error) = std::fs::remove_dir_all(&folder) {
             log::warn!("cannot remove {}: {error}", folder.display());
@@ -178,32 +248,62 @@ impl Args {
         if let Some(disturbance) = conditions.disturbance {
             disturbance.apply_to_rig(&mut rig);
         }
-        rig.write_resolved(folder).with_context(|| format!("cannot write into {}", folder.display()))?;
-        let mut flags = vec!["--from".into(), self.recording.clone().into(), "--real-time".into()];
+        rig.write_resolved(folder)
+            .with_context(|| format!("cannot write into {}", folder.display()))?;
+        let mut flags = vec![
+            "--from".into(),
+            self.recording.clone().into(),
+            "--real-time".into(),
+        ];
         flags.extend(self.repeat.then(|| "--repeat".into()));
-        let (rig_file, out) = (folder.join(drivers::recording::RIG_FILE), folder.join("out"));
-        let flags = run_flags::parse(&rig_file, self.seconds, (&out, self.json), flags, &self.run_flags)?;
+        let (rig_file, out) = (
+            folder.join(drivers::recording::RIG_FILE),
+            folder.join("out"),
+        );
+        let flags = run_flags::parse(
+            &rig_file,
+            self.seconds,
+            (&out, self.json),
+            flags,
+            &self.run_flags,
+        )?;
         let mut running = run::start(&flags, None, &mut CreatedFolders::default())?;
-        let change = conditions.disturbance.and_then(|disturbance| disturbance.keyframe_change(1, 0.5 * self.seconds));
+        let change = conditions
+            .disturbance
+            .and_then(|disturbance| disturbance.keyframe_change(1, 0.5 * self.seconds));
         if let Some(change) = change {
             running.live.change_keyframes(change);
         }
         let address = running.page.address();
-        let period = self.picture_rate.map_or(Duration::ZERO, |rate_hz| Duration::from_secs_f64(1.0 / rate_hz));
-        let options = ViewerOptions { size_px: self.size, is_panorama: self.panorama, period };
-        let viewers: Vec<Viewer> =
-            (0..conditions.n_viewers).map(|_| Viewer::connect(address, options)).collect::<bench::Result<_>>()?;
+        let period = self.picture_rate.map_or(Duration::ZERO, |rate_hz| {
+            Duration::from_secs_f64(1.0 / rate_hz)
+        });
+        let options = ViewerOptions {
+            size_px: self.size,
+            is_panorama: self.panorama,
+            period,
+        };
+        let viewers: Vec<Viewer> = (0..conditions.n_viewers)
+            .map(|_| Viewer::connect(address, options))
+            .collect::<bench::Result<_>>()?;
         let mut timeline = Timeline::default();
         while running.run_time_slice()? {
             timeline.sample(&running.live, &running.gpu, &viewers);
         }
         let measured = LiveRun::of(conditions, &running.live, &viewers, &timeline);
         drop(viewers);
-        let DiscardedRun { input_result, data_losses, no_model_reason, is_interrupted } = running.discard()?;
+        let DiscardedRun {
+            input_result,
+            data_losses,
+            no_model_reason,
+            is_interrupted,
+        } = running.discard()?;
         let input = InputCounts::of(&input_result);
         match (input_result.input_error, no_model_reason) {
             _ if is_interrupted => Ok(None),
-            (Some(error), _) => Err(anyhow::Error::new(error).context("the recording cannot be read")),
+            (Some(error), _) => {
+                Err(anyhow::Error::new(error).context("the recording cannot be read"))
+            }
             (None, Some(reason)) => Err(InsufficientData(reason).into()),
             (None, None) => Ok(Some((LiveRun { input, ..measured }, data_losses))),
         }
@@ -238,15 +338,37 @@ mod tests {
             "pose-noise:0.5,exposure:1",
         ];
         let args = Flags::parse_from(line).args;
-        let conditions: Vec<String> = args.conditions().iter().map(Conditions::to_string).collect();
+        let conditions: Vec<String> = args
+            .conditions()
+            .iter()
+            .map(Conditions::to_string)
+            .collect();
         assert_eq!(conditions[..2], ["0 viewers", "4 viewers"]);
-        assert_eq!(conditions[3], "1 viewer, hand-eye off by 1 degrees, 5 mm (seed 2)");
-        assert_eq!(conditions[4..], ["1 viewer, pose-noise 0.5 mm", "1 viewer, exposure 1 EV"]);
+        assert_eq!(
+            conditions[3],
+            "1 viewer, hand-eye off by 1 degrees, 5 mm (seed 2)"
+        );
+        assert_eq!(
+            conditions[4..],
+            ["1 viewer, pose-noise 0.5 mm", "1 viewer, exposure 1 EV"]
+        );
         assert_eq!((conditions.len(), args.size), (6, [640, 480]));
-        let invalid_disturbances = [["--disturb", "keyframes:3"], ["--disturb", "exposure"], ["--disturb", "fog:1"]];
-        let invalid = [["--size", "10"], ["--size", "0x5"], ["--hand-eye-error", "1"], ["--hand-eye-error", "100,1"]];
+        let invalid_disturbances = [
+            ["--disturb", "keyframes:3"],
+            ["--disturb", "exposure"],
+            ["--disturb", "fog:1"],
+        ];
+        let invalid = [
+            ["--size", "10"],
+            ["--size", "0x5"],
+            ["--hand-eye-error", "1"],
+            ["--hand-eye-error", "100,1"],
+        ];
         for invalid in invalid.into_iter().chain(invalid_disturbances) {
-            assert!(Flags::try_parse_from(["live", "scan.mcap"].iter().chain(&invalid)).is_err(), "{invalid:?}");
+            assert!(
+                Flags::try_parse_from(["live", "scan.mcap"].iter().chain(&invalid)).is_err(),
+                "{invalid:?}"
+            );
         }
     }
 }

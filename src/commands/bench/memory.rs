@@ -1,4 +1,5 @@
-//! `fieldrig bench memory`: memory use of a long run, and its growth rate once the keyframe store is full.
+//! `fieldrig bench memory`: memory use of a long run, and its growth rate once the keyframe store
+//! is full.
 
 use super::run_flags;
 use super::runs_args::print_result;
@@ -52,10 +53,15 @@ pub(crate) struct Args {
 
 pub(super) fn run(args: &Args) -> anyhow::Result<Exit> {
     args.check()?;
-    std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
-    // Checkpoints are part of a run, so they are written here, too. Their folder is removed afterwards.
+    std::fs::create_dir_all(&args.out)
+        .with_context(|| format!("cannot create {}", args.out.display()))?;
+    // Checkpoints are part of a run, so they are written here, too. Their folder is removed
+    // afterwards.
     let run_folder = args.out.join(format!("run-{}", std::process::id()));
-    let measured = args.run_flags(&run_folder).map_err(Into::into).and_then(|flags| measure(args, &flags));
+    let measured = args
+        .run_flags(&run_folder)
+        .map_err(Into::into)
+        .and_then(|flags| measure(args, &flags));
     if run_folder.exists()
         && let Err(error) = std::fs::remove_dir_all(&run_folder)
     {
@@ -64,9 +70,18 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Exit> {
     let (measured, input_error) = measured?;
     let findings = measured.findings()?;
     let page = findings.write(&args.out)?;
-    print_result(&BenchResult { findings, page, data_losses: Vec::new() }, args.json)?;
+    print_result(
+        &BenchResult {
+            findings,
+            page,
+            data_losses: Vec::new(),
+        },
+        args.json,
+    )?;
     match input_error {
-        Some(error) => Err(anyhow::Error::new(error).context("the devices failed before the end of the run")),
+        Some(error) => {
+            Err(anyhow::Error::new(error).context("the devices failed before the end of the run"))
+        }
         None => Ok(Exit::Done),
     }
 }
@@ -75,8 +90,9 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Exit> {
 fn measure(args: &Args, flags: &run::Args) -> anyhow::Result<(MemoryRun, Option<drivers::Error>)> {
     let mut running = run::start(flags, None, &mut CreatedFolders::default())?;
     let address = running.page.address();
-    let viewers: Vec<Viewer> =
-        (0..args.viewers).map(|_| Viewer::connect(address, ViewerOptions::default())).collect::<bench::Result<_>>()?;
+    let viewers: Vec<Viewer> = (0..args.viewers)
+        .map(|_| Viewer::connect(address, ViewerOptions::default()))
+        .collect::<bench::Result<_>>()?;
     let every = Duration::from_secs_f64(args.every_secs);
     let mut measured = MemoryRun {
         input: args.input(),
@@ -95,7 +111,9 @@ fn measure(args: &Args, flags: &run::Args) -> anyhow::Result<(MemoryRun, Option<
         let sample = measured.add_sample(&running.live, &running.gpu, &viewers)?;
         if args.json {
             print::report_json(&serde_json::json!({ "event": "sample", "sample": sample }))?;
-        } else if last_printed.is_none_or(|last_printed: Instant| last_printed.elapsed() >= PRINT_PERIOD) {
+        } else if last_printed
+            .is_none_or(|last_printed: Instant| last_printed.elapsed() >= PRINT_PERIOD)
+        {
             print::report(describe(&sample));
             last_printed = Some(now);
         }
@@ -124,12 +142,15 @@ fn describe(sample: &Sample) -> String {
 
 impl Args {
     fn check(&self) -> Result<(), BadArgument> {
-        for (flag, value, allowed) in
-            [("--seconds", self.seconds, 1.0..=1e6), ("--every-secs", self.every_secs, 0.01..=3600.0)]
-        {
+        for (flag, value, allowed) in [
+            ("--seconds", self.seconds, 1.0..=1e6),
+            ("--every-secs", self.every_secs, 0.01..=3600.0),
+        ] {
             if !allowed.contains(&value) {
                 let (from, to) = (allowed.start(), allowed.end());
-                return Err(BadArgument(format!("{flag} {value}: must be a number from {from} to {to}")));
+                return Err(BadArgument(format!(
+                    "{flag} {value}: must be a number from {from} to {to}"
+                )));
             }
         }
         Ok(())
@@ -143,13 +164,23 @@ impl Args {
         if let Some(from) = &self.from {
             flags.extend(["--from".into(), from.into()]);
         }
-        run_flags::parse(&self.rig_file, self.seconds, (folder, self.json), flags, &self.run_flags)
+        run_flags::parse(
+            &self.rig_file,
+            self.seconds,
+            (folder, self.json),
+            flags,
+            &self.run_flags,
+        )
     }
 
     fn input(&self) -> String {
         match &self.from {
             Some(recording) => recording.display().to_string(),
-            None => format!("{}{}", self.rig_file.display(), if self.sim { ", simulated" } else { "" }),
+            None => format!(
+                "{}{}",
+                self.rig_file.display(),
+                if self.sim { ", simulated" } else { "" }
+            ),
         }
     }
 }
@@ -172,12 +203,28 @@ mod tests {
     #[test]
     fn run_flags_are_forwarded_and_invalid_ones_named() {
         let folder = Path::new("some");
-        assert!(args(&["--sim", "--", "--method", "tsdf"]).run_flags(folder).is_ok());
-        let error_message = args(&["--sim", "--", "--metod", "tsdf"]).run_flags(folder).expect_err("no such flag");
-        assert!(error_message.to_string().contains("--metod"), "{error_message}");
-        for flags in [["--seconds", "0"], ["--seconds", "NaN"], ["--every-secs", "-1"]] {
+        assert!(
+            args(&["--sim", "--", "--method", "tsdf"])
+                .run_flags(folder)
+                .is_ok()
+        );
+        let error_message = args(&["--sim", "--", "--metod", "tsdf"])
+            .run_flags(folder)
+            .expect_err("no such flag");
+        assert!(
+            error_message.to_string().contains("--metod"),
+            "{error_message}"
+        );
+        for flags in [
+            ["--seconds", "0"],
+            ["--seconds", "NaN"],
+            ["--every-secs", "-1"],
+        ] {
             let flags = [format!("{}={}", flags[0], flags[1])];
-            let error_message = args(&[flags[0].as_str()]).check().expect_err("out of range").to_string();
+            let error_message = args(&[flags[0].as_str()])
+                .check()
+                .expect_err("out of range")
+                .to_string();
             assert!(error_message.starts_with("--"), "{error_message}");
         }
     }

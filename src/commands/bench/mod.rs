@@ -25,7 +25,8 @@ pub(crate) struct Args {
 
 #[derive(Debug, Subcommand)]
 enum BenchCommand {
-    /// Time of an image and of a training step on a synthetic cloud of splats, by image size and number of splats
+    /// Time of an image and of a training step on a synthetic cloud of splats, by image size and
+    /// number of splats
     Kernels(kernels::Args),
     /// Time of a training step of a neural field on synthetic rays, by number of samples
     Field(field::Args),
@@ -41,8 +42,8 @@ enum BenchCommand {
     Stamps(stamps::Args),
     /// Accuracy, reported uncertainty, speed and limits of calibration with and without a target
     Calibration(calibration::Args),
-    /// Live runs with viewers: latency of pictures, time from shutter to model, and PSNR over time with right and wrong
-    /// calibration
+    /// Live runs with viewers: latency of pictures, time from shutter to model, and PSNR over time
+    /// with right and wrong calibration
     Live(live::Args),
     /// Memory use of a long run by component, and its growth rate once the keyframe store is full
     Memory(memory::Args),

@@ -13,7 +13,8 @@ struct RunFlags {
     args: run::Args,
 }
 
-/// Parses the flags of a run that writes to `out` and serves its page on a free port of this computer.
+/// Parses the flags of a run that writes to `out` and serves its page on a free port of this
+/// computer.
 ///
 /// * `given`: the flags that the user gave for the run.
 pub(super) fn parse(
@@ -26,7 +27,12 @@ pub(super) fn parse(
     let mut line: Vec<OsString> = vec!["run".into(), rig_file.into()];
     line.extend(flags);
     line.extend(["--seconds".into(), seconds.to_string().into()]);
-    line.extend(["--out".into(), out.into(), "--listen".into(), "127.0.0.1:0".into()]);
+    line.extend([
+        "--out".into(),
+        out.into(),
+        "--listen".into(),
+        "127.0.0.1:0".into(),
+    ]);
     if json {
         line.push("--json".into());
     }
@@ -34,7 +40,10 @@ pub(super) fn parse(
     let parsed = RunFlags::try_parse_from(line).map_err(|error| {
         let message = error.to_string();
         let first = message.lines().next().unwrap_or_default();
-        BadArgument(format!("flags of run: {}", first.strip_prefix("error: ").unwrap_or(first)))
+        BadArgument(format!(
+            "flags of run: {}",
+            first.strip_prefix("error: ").unwrap_or(first)
+        ))
     })?;
     Ok(parsed.args)
 }

@@ -17,8 +17,8 @@ pub(crate) struct RunsArgs {
     training: TrainingArgs,
     #[command(flatten)]
     images: DataArgs,
-    /// Folder for runs, charts and the page; finished runs of an earlier bench in this folder are not repeated
-    /// [default: a new folder in runs]
+    /// Folder for runs, charts and the page; finished runs of an earlier bench in this folder are
+    /// not repeated [default: a new folder in runs]
     #[arg(long, value_name = "FOLDER")]
     out: Option<PathBuf>,
     /// Print JSON, one object per line: each run when it ends, then the findings
@@ -29,13 +29,24 @@ pub(crate) struct RunsArgs {
 impl RunsArgs {
     /// The flags as options.
     pub(super) fn options(&self) -> RunsOptions {
-        RunsOptions { training: self.training.options(), images: self.images.options(), out: self.out.clone() }
+        RunsOptions {
+            training: self.training.options(),
+            images: self.images.options(),
+            out: self.out.clone(),
+        }
     }
 
     /// Runs a bench and prints its result.
-    pub(super) fn run(&self, bench: impl FnOnce(&Host<'_>) -> bench::Result<BenchResult>) -> anyhow::Result<Exit> {
+    pub(super) fn run(
+        &self,
+        bench: impl FnOnce(&Host<'_>) -> bench::Result<BenchResult>,
+    ) -> anyhow::Result<Exit> {
         let observer = Printer { json: self.json };
-        let result = bench(&Host { open_gpu, stop: signals::stop_on_signals()?, observer: &observer })?;
+        let result = bench(&Host {
+            open_gpu,
+            stop: signals::stop_on_signals()?,
+            observer: &observer,
+        })?;
         print_result(&result, self.json)?;
         Ok(exit::from_losses(&result.data_losses))
     }
@@ -45,7 +56,9 @@ impl RunsArgs {
 pub(super) fn print_result(result: &BenchResult, json: bool) -> anyhow::Result<()> {
     let BenchResult { findings, page, .. } = result;
     if json {
-        return print::report_json(&serde_json::json!({ "event": "done", "page": page, "findings": findings.numbers }));
+        return print::report_json(
+            &serde_json::json!({ "event": "done", "page": page, "findings": findings.numbers }),
+        );
     }
     for table in &findings.tables {
         print::report(table.text());
@@ -66,7 +79,11 @@ impl BenchObserver for Printer {
     }
 
     fn training(&self, limits: Limits) -> Box<dyn Observer> {
-        let output = if self.json { OutputMode::Nothing } else { OutputMode::Bar };
+        let output = if self.json {
+            OutputMode::Nothing
+        } else {
+            OutputMode::Bar
+        };
         Box::new(Console::new(output, limits, 1))
     }
 
@@ -76,7 +93,11 @@ impl BenchObserver for Printer {
             return;
         }
         let (run, end) = (report.run, &report.run.end);
-        let cached = if report.is_cached { ", done earlier" } else { "" };
+        let cached = if report.is_cached {
+            ", done earlier"
+        } else {
+            ""
+        };
         print::report(format_args!(
             "run {} of {}  {:40} {:7.1} s  step {:6}  {:8} primitives  {:7.2} MB  {:.2} dB{cached}",
             report.n_done,

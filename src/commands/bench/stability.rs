@@ -12,16 +12,22 @@ pub(crate) struct Args {
     /// A nerfstudio or TUM RGB-D folder, or a recording (.mcap)
     data: PathBuf,
     /// What to disturb, separated by commas
-    #[arg(long, value_name = "WHAT,...", value_delimiter = ',', default_value = "all")]
+    #[arg(
+        long,
+        value_name = "WHAT,...",
+        value_delimiter = ',',
+        default_value = "all"
+    )]
     disturb: Vec<DisturbanceArg>,
-    /// Sizes of the disturbance instead of the default ones (mm, ms, EV or keyframes), separated by commas; needs a
-    /// single disturbance
+    /// Sizes of the disturbance instead of the default ones (mm, ms, EV or keyframes), separated by
+    /// commas; needs a single disturbance
     #[arg(long, value_name = "N,...", value_delimiter = ',')]
     levels: Vec<f64>,
     /// Image rate of a folder without time stamps, Hz; required there for clock-offset
     #[arg(long, value_name = "HZ")]
     rate_hz: Option<f64>,
-    /// Training time of each run in seconds; loading and scoring do not count [default: 30, unless --steps is given]
+    /// Training time of each run in seconds; loading and scoring do not count [default: 30, unless
+    /// --steps is given]
     #[arg(long, value_name = "S")]
     seconds: Option<f64>,
     /// Optimizer steps of each run
@@ -49,13 +55,17 @@ enum DisturbanceArg {
 }
 
 pub(super) fn run(args: &Args) -> anyhow::Result<Exit> {
-    args.runs.run(|host| bench::stability::run(&args.options(), host))
+    args.runs
+        .run(|host| bench::stability::run(&args.options(), host))
 }
 
 impl Args {
     fn options(&self) -> StabilityOptions {
-        let is_selected =
-            |disturbance: &Disturbance| self.disturb.iter().any(|selected| selected.includes(*disturbance));
+        let is_selected = |disturbance: &Disturbance| {
+            self.disturb
+                .iter()
+                .any(|selected| selected.includes(*disturbance))
+        };
         StabilityOptions {
             data: self.data.clone(),
             disturbances: Disturbance::ALL.into_iter().filter(is_selected).collect(),

@@ -1,5 +1,5 @@
-//! `fieldrig bench stamps`: measures the stamp errors of images from a camera with its own clock and a link with
-//! jitter.
+//! `fieldrig bench stamps`: measures the stamp errors of images from a camera with its own clock
+//! and a link with jitter.
 
 use super::runs_args::print_result;
 use crate::exit::Exit;
@@ -10,7 +10,12 @@ use std::path::PathBuf;
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
     /// Camera rates, images per second, separated by commas
-    #[arg(long, value_name = "HZ,...", value_delimiter = ',', default_value = "30,60,200")]
+    #[arg(
+        long,
+        value_name = "HZ,...",
+        value_delimiter = ',',
+        default_value = "30,60,200"
+    )]
     rates: Vec<f64>,
     /// Minimum latency from the shutter to the arrival of an image
     #[arg(long, value_name = "MS", default_value_t = 5.0)]
@@ -19,7 +24,12 @@ pub(crate) struct Args {
     #[arg(long, value_name = "MS", default_value_t = 75.0)]
     jitter_millis: f64,
     /// How much faster this computer's clock runs than the camera's, parts per million
-    #[arg(long, value_name = "PPM", default_value_t = 50.0, allow_hyphen_values = true)]
+    #[arg(
+        long,
+        value_name = "PPM",
+        default_value_t = 50.0,
+        allow_hyphen_values = true
+    )]
     drift_ppm: f64,
     /// Length of a run in seconds
     #[arg(long, value_name = "S", default_value_t = 120.0)]

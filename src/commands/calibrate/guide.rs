@@ -20,8 +20,8 @@ pub(super) enum Purpose {
     HandEye,
 }
 
-/// Detects the target in each image as it arrives, and shows what to do next: on the page and in a progress bar, or as lines
-/// if stderr is not a terminal.
+/// Detects the target in each image as it arrives, and shows what to do next: on the page and in a
+/// progress bar, or as lines if stderr is not a terminal.
 pub(super) struct Guide<'a> {
     target: &'a TargetSpec,
     camera: &'a Camera,
@@ -42,12 +42,22 @@ impl<'a> Guide<'a> {
         page: GuidancePage,
     ) -> Self {
         let (views, base_from_flange, detected) = (Vec::new(), Vec::new(), Vec::new());
-        let guide = Self { target, camera, purpose, bar, page, views, base_from_flange, detected };
+        let guide = Self {
+            target,
+            camera,
+            purpose,
+            bar,
+            page,
+            views,
+            base_from_flange,
+            detected,
+        };
         guide.show(&guide.advice());
         guide
     }
 
-    /// Shows a sample if it is an image of the camera, and detects the target in the images that are new.
+    /// Shows a sample if it is an image of the camera, and detects the target in the images that
+    /// are new.
     pub(super) fn update(&mut self, sample: &Sample, images: &[CalibrationImage]) {
         if let Sample::Image(image) = sample {
             self.page.show_live(image);
@@ -63,7 +73,8 @@ impl<'a> Guide<'a> {
             let text = match &detected.board {
                 Ok(board) => {
                     self.views.push(board.view.clone());
-                    self.base_from_flange.extend(image.arm.as_ref().map(|arm| arm.base_from_flange));
+                    self.base_from_flange
+                        .extend(image.arm.as_ref().map(|arm| arm.base_from_flange));
                     self.advice()
                 }
                 Err(reason) => format!("{}: {reason}", detected.name),
@@ -89,7 +100,11 @@ impl<'a> Guide<'a> {
                     1 => format!("1 image of the target covers {percent:.0} % of the image"),
                     n => format!("{n} images of the target cover {percent:.0} % of the image"),
                 };
-                (so_far, guidance.advice.to_string(), guidance.advice == IntrinsicsAdvice::Enough)
+                (
+                    so_far,
+                    guidance.advice.to_string(),
+                    guidance.advice == IntrinsicsAdvice::Enough,
+                )
             }
             Purpose::HandEye => {
                 let is_on_flange = self.camera.parent == Parent::Flange;
@@ -97,13 +112,21 @@ impl<'a> Guide<'a> {
                     true => (Setup::EyeInHand, "camera"),
                     false => (Setup::EyeToHand, "flange"),
                 };
-                let guidance = HandEyeGuidance::new(&self.base_from_flange, setup, &self.camera.parent_from_camera);
+                let guidance = HandEyeGuidance::new(
+                    &self.base_from_flange,
+                    setup,
+                    &self.camera.parent_from_camera,
+                );
                 let [x, y, z] = guidance.span_deg;
                 let so_far = format!(
                     "{} with the target, rotated by {x:.0}, {y:.0} and {z:.0} degrees about the {body}'s x, y and z axes",
                     keyframe::counted(guidance.n_poses as u64, "pose")
                 );
-                (so_far, guidance.advice.to_string(), guidance.advice == HandEyeAdvice::Enough)
+                (
+                    so_far,
+                    guidance.advice.to_string(),
+                    guidance.advice == HandEyeAdvice::Enough,
+                )
             }
         };
         match is_enough {

@@ -41,7 +41,11 @@ pub(super) enum NoBoard {
 impl NoBoard {
     /// The image with this reason, for reports and messages.
     pub(super) fn unused(&self, name: String) -> Unused {
-        Unused { name, reason: self.to_string(), is_unreadable: matches!(self, Self::Unreadable(_)) }
+        Unused {
+            name,
+            reason: self.to_string(),
+            is_unreadable: matches!(self, Self::Unreadable(_)),
+        }
     }
 }
 
@@ -58,29 +62,46 @@ const EXTENSIONS: [&str; 3] = ["jpg", "jpeg", "png"];
 /// The image files in a folder, in order of their names.
 pub(super) fn files(folder: &Path) -> Result<Vec<ImageFile>, BadArgument> {
     if folder.is_file() {
-        return Err(BadArgument(format!("{} is a file, expected a folder of images", folder.display())));
+        return Err(BadArgument(format!(
+            "{} is a file, expected a folder of images",
+            folder.display()
+        )));
     }
-    let unreadable =
-        |error: std::io::Error| BadArgument(format!("cannot read the folder {}: {error}", folder.display()));
+    let unreadable = |error: std::io::Error| {
+        BadArgument(format!(
+            "cannot read the folder {}: {error}",
+            folder.display()
+        ))
+    };
     let mut files = Vec::new();
     for entry in std::fs::read_dir(folder).map_err(unreadable)? {
         let path = entry.map_err(unreadable)?.path();
-        let is_known =
-            |extension: &std::ffi::OsStr| EXTENSIONS.iter().any(|known| extension.eq_ignore_ascii_case(known));
+        let is_known = |extension: &std::ffi::OsStr| {
+            EXTENSIONS
+                .iter()
+                .any(|known| extension.eq_ignore_ascii_case(known))
+        };
         if path.extension().is_some_and(is_known) {
-            let name = path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned();
+            let name = path
+                .file_name()
+                .unwrap_or(path.as_os_str())
+                .to_string_lossy()
+                .into_owned();
             files.push(ImageFile { name, path });
         }
     }
     files.sort_by(|a, b| a.path.cmp(&b.path));
     if files.is_empty() {
-        return Err(BadArgument(format!("{}: no .jpg, .jpeg or .png image", folder.display())));
+        return Err(BadArgument(format!(
+            "{}: no .jpg, .jpeg or .png image",
+            folder.display()
+        )));
     }
     Ok(files)
 }
 
-/// Detects a target in image files, on all processors; the results are in the order of the files. Images that cannot be
-/// read are named in a warning.
+/// Detects a target in image files, on all processors; the results are in the order of the files.
+/// Images that cannot be read are named in a warning.
 ///
 /// * `is_hidden`: no progress bar.
 ///
@@ -107,7 +128,11 @@ pub(super) fn detect_each<T: Sync>(
     is_hidden: bool,
     detect: impl Fn(&T) -> DetectedImage + Sync,
 ) -> Vec<DetectedImage> {
-    let bar = print::bar(Some(images.len() as u64), "{bar:30} {pos} of {len} images", is_hidden);
+    let bar = print::bar(
+        Some(images.len() as u64),
+        "{bar:30} {pos} of {len} images",
+        is_hidden,
+    );
     let detected = images.par_iter().map(|image| {
         let detected = detect(image);
         bar.inc(1);
@@ -124,12 +149,22 @@ fn check_readable(images: &[DetectedImage]) -> Result<(), BadArgument> {
         .filter_map(|image| Some((image.name.as_str(), image.board.as_ref().err()?)))
         .filter(|(_, reason)| matches!(reason, NoBoard::Unreadable(_)))
         .collect();
-    let Some((first, reason)) = unreadable.first() else { return Ok(()) };
+    let Some((first, reason)) = unreadable.first() else {
+        return Ok(());
+    };
     if unreadable.len() == images.len() {
-        return Err(BadArgument(format!("none of {} images can be read; {first}: {reason}", images.len())));
+        return Err(BadArgument(format!(
+            "none of {} images can be read; {first}: {reason}",
+            images.len()
+        )));
     }
     let names: Vec<&str> = unreadable.iter().map(|(name, _)| *name).collect();
-    log::warn!("{} of {} images cannot be read and are skipped: {}", names.len(), images.len(), names.join(", "));
+    log::warn!(
+        "{} of {} images cannot be read and are skipped: {}",
+        names.len(),
+        images.len(),
+        names.join(", ")
+    );
     Ok(())
 }
 
@@ -164,7 +199,10 @@ pub(super) fn other_size<'a>(
             Err(_) => (),
         }
     }
-    let (found, n) = found_sizes.into_iter().max_by_key(|(_, n)| *n).filter(|(_, n)| *n >= MIN_IMAGES)?;
+    let (found, n) = found_sizes
+        .into_iter()
+        .max_by_key(|(_, n)| *n)
+        .filter(|(_, n)| *n >= MIN_IMAGES)?;
     let given = target.to_string();
     let parts: Vec<&str> = given.split(':').collect();
     let remedy = match parts[..] {
@@ -174,47 +212,83 @@ pub(super) fn other_size<'a>(
     let prevails = n > n_detected;
     let others = match n_detected {
         0 => String::new(),
-        _ => format!(", {n_detected} images seem to show a board of the given size, which may be a part of it"),
+        _ => format!(
+            ", {n_detected} images seem to show a board of the given size, which may be a part of it"
+        ),
     };
-    let text =
-        format!("{n} of {n_images} images show a board with {found} inner corners, not {given}{others}; {remedy}");
+    let text = format!(
+        "{n} of {n_images} images show a board with {found} inner corners, not {given}{others}; {remedy}"
+    );
     Some(OtherSize { text, prevails })
 }
 
 fn detect_in_file(path: &Path, name: &str, target: &TargetSpec) -> Result<Board, NoBoard> {
     let unreadable = |error: image::ImageError| NoBoard::Unreadable(error.to_string());
-    let reader = files::open(path).map(BufReader::new).and_then(|file| ImageReader::new(file).with_guessed_format());
-    let gray = reader.map_err(|error| unreadable(error.into()))?.decode().map_err(unreadable)?.into_luma8();
+    let reader = files::open(path)
+        .map(BufReader::new)
+        .and_then(|file| ImageReader::new(file).with_guessed_format());
+    let gray = reader
+        .map_err(|error| unreadable(error.into()))?
+        .decode()
+        .map_err(unreadable)?
+        .into_luma8();
     let size_px = [gray.width(), gray.height()];
-    detect_in_gray(GrayImage { size_px, pixels: gray.as_raw() }, name, target)
+    detect_in_gray(
+        GrayImage {
+            size_px,
+            pixels: gray.as_raw(),
+        },
+        name,
+        target,
+    )
 }
 
 /// Detects a target in an image of a device or recording.
 pub(super) fn detect_in_image(image: &CalibrationImage, target: &TargetSpec) -> DetectedImage {
     let name = format!("image at {:.3} s", image.secs);
-    let gray = GrayImage { size_px: image.size_px, pixels: &image.gray };
+    let gray = GrayImage {
+        size_px: image.size_px,
+        pixels: &image.gray,
+    };
     let board = detect_in_gray(gray, &name, target);
     DetectedImage { name, board }
 }
 
 /// Detects a target in an image. `name` is used in messages.
-pub(super) fn detect_in_gray(image: GrayImage<'_>, name: &str, target: &TargetSpec) -> Result<Board, NoBoard> {
-    Ok(Board { size_px: image.size_px, view: view(name, &target.detect(image)?) })
+pub(super) fn detect_in_gray(
+    image: GrayImage<'_>,
+    name: &str,
+    target: &TargetSpec,
+) -> Result<Board, NoBoard> {
+    Ok(Board {
+        size_px: image.size_px,
+        view: view(name, &target.detect(image)?),
+    })
 }
 
 fn view(name: &str, detection: &Detection) -> BoardView {
     let points = detection.corners.iter();
-    let points = points.map(|corner| BoardPoint { point_in_board: corner.point_in_board, pixel: corner.pixel });
-    BoardView { name: name.to_owned(), points: points.collect() }
+    let points = points.map(|corner| BoardPoint {
+        point_in_board: corner.point_in_board,
+        pixel: corner.pixel,
+    });
+    BoardView {
+        name: name.to_owned(),
+        points: points.collect(),
+    }
 }
 
 /// The files of images, for a report.
 pub(super) fn photos(files: &[ImageFile]) -> Photos {
-    files.iter().map(|file| (file.name.clone(), Photo::File(file.path.clone()))).collect()
+    files
+        .iter()
+        .map(|file| (file.name.clone(), Photo::File(file.path.clone())))
+        .collect()
 }
 
 /// The images without the target, for a report.
 pub(super) fn unused(images: &[DetectedImage]) -> Vec<Unused> {
-    let reason = |image: &DetectedImage| Some(image.board.as_ref().err()?.unused(image.name.clone()));
+    let reason =
+        |image: &DetectedImage| Some(image.board.as_ref().err()?.unused(image.name.clone()));
     images.iter().filter_map(reason).collect()
 }

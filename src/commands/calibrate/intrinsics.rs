@@ -9,7 +9,8 @@ use super::target_argument;
 use crate::exit::{Exit, InsufficientData};
 use crate::print;
 use calibration::{
-    BoardView, ImageGrid, IntrinsicsCalibration, IntrinsicsInput, LensModel, LensTrial, calibrate_intrinsics,
+    BoardView, ImageGrid, IntrinsicsCalibration, IntrinsicsInput, LensModel, LensTrial,
+    calibrate_intrinsics,
 };
 use serde::Serialize;
 use session::calibration_report::{IntrinsicsReport, Photos, Unused};
@@ -17,14 +18,13 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use targets::TargetSpec;
 
-const TARGET_HELP: &str =
-    "The target, such as chessboard:9x6:25mm, charuco:5x7:34mm:26mm:5X5_100 or aprilgrid:6x6:20mm:0.3";
+const TARGET_HELP: &str = "The target, such as chessboard:9x6:25mm, charuco:5x7:34mm:26mm:5X5_100 or aprilgrid:6x6:20mm:0.3";
 
 /// Flags of `calibrate intrinsics`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// Folder of images (.jpg, .png) of the target, all of one camera and one size; or a recording (.mcap) or rig file
-    /// (.toml) whose camera sees the target
+    /// Folder of images (.jpg, .png) of the target, all of one camera and one size; or a recording
+    /// (.mcap) or rig file (.toml) whose camera sees the target
     #[arg(value_name = "IMAGES|RECORDING|RIG")]
     input: PathBuf,
     #[arg(long, value_name = "SPEC", value_parser = target_argument, help = TARGET_HELP)]
@@ -71,7 +71,8 @@ struct Printed<'a> {
     images: Vec<PrintedImage<'a>>,
     /// Number of corners in each part of the image.
     coverage: PrintedGrid<usize>,
-    /// Standard deviation of the projection of a distant point in each part of the image; null beyond the lens model.
+    /// Standard deviation of the projection of a distant point in each part of the image; null
+    /// beyond the lens model.
     projection_sigma_px: PrintedGrid<Option<f64>>,
     trials: Vec<PrintedTrial<'a>>,
     next_view: Option<&'a str>,
@@ -132,8 +133,9 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         rig.expect_size(*size_px)?;
     }
     let result = args.calibrate(&detected);
-    let (calibration, written) =
-        outputs::reported(result, report, |path, result| args.write_report(path, &detected, result))?;
+    let (calibration, written) = outputs::reported(result, report, |path, result| {
+        args.write_report(path, &detected, result)
+    })?;
     let printed = printed(&calibration, &detected.unused);
     if args.json {
         print::json(&printed)?
@@ -144,7 +146,10 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         log::warn!("{warning}");
     }
     if let Some(rig) = &mut rig {
-        rig.set_intrinsics(&calibration.intrinsics, Some(&calibration.intrinsics_covariance()))?;
+        rig.set_intrinsics(
+            &calibration.intrinsics,
+            Some(&calibration.intrinsics_covariance()),
+        )?;
         rig.write()?;
     }
     written?;
@@ -153,11 +158,27 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
 
 impl Args {
     /// Reads the images and detects the target. `output` gets the calibration that devices report.
-    fn detect(&self, keeps_photos: bool, output: Option<&mut RigOutput>) -> anyhow::Result<Detected> {
-        let options = ScanOptions { keeps_photos, is_hidden: self.json, purpose: Purpose::Lens };
+    fn detect(
+        &self,
+        keeps_photos: bool,
+        output: Option<&mut RigOutput>,
+    ) -> anyhow::Result<Detected> {
+        let options = ScanOptions {
+            keeps_photos,
+            is_hidden: self.json,
+            purpose: Purpose::Lens,
+        };
         let (images, photos, no_images, warnings) =
-            match self.rig.read(&self.input, Some(&self.target), options, output)? {
-                Some(mut scan) => (scan.detected(), scan.take_photos(), scan.no_images, scan.warnings),
+            match self
+                .rig
+                .read(&self.input, Some(&self.target), options, output)?
+            {
+                Some(mut scan) => (
+                    scan.detected(),
+                    scan.take_photos(),
+                    scan.no_images,
+                    scan.warnings,
+                ),
                 None => {
                     let files = images::files(&self.input)?;
                     let images = images::detect(&files, &self.target, self.json)?;
@@ -176,26 +197,53 @@ impl Args {
             log::warn!("{}", size.text);
             warnings.push(size.text.clone());
         }
-        Ok(Detected { views, sizes_px, unused, photos, no_images, other_size, warnings })
+        Ok(Detected {
+            views,
+            sizes_px,
+            unused,
+            photos,
+            no_images,
+            other_size,
+            warnings,
+        })
     }
 
     fn calibrate(&self, detected: &Detected) -> anyhow::Result<IntrinsicsCalibration> {
-        let Detected { views, sizes_px, unused, no_images, other_size, .. } = detected;
+        let Detected {
+            views,
+            sizes_px,
+            unused,
+            no_images,
+            other_size,
+            ..
+        } = detected;
         if let Some(reason) = no_images {
             return Err(InsufficientData(reason.clone()).into());
         }
         if let Some(size) = other_size.as_ref().filter(|size| size.prevails) {
-            return Err(InsufficientData(format!("{}: {}", self.input.display(), size.text)).into());
+            return Err(
+                InsufficientData(format!("{}: {}", self.input.display(), size.text)).into(),
+            );
         }
         if views.is_empty() {
-            // All images usually fail for the same reason. Those that cannot be read were reported before.
-            let read: Vec<&Unused> = unused.iter().filter(|unused| !unused.is_unreadable).collect();
-            let reason = read.first().map_or(String::new(), |first| format!("; {}: {}", first.name, first.reason));
+            // All images usually fail for the same reason. Those that cannot be read were reported
+            // before.
+            let read: Vec<&Unused> = unused
+                .iter()
+                .filter(|unused| !unused.is_unreadable)
+                .collect();
+            let reason = read.first().map_or(String::new(), |first| {
+                format!("; {}: {}", first.name, first.reason)
+            });
             let (input, target, n) = (self.input.display(), &self.target, read.len());
             let text = format!("{input}: {target} was not detected in any of {n} images{reason}");
             return Err(InsufficientData(text).into());
         }
-        Ok(calibrate_intrinsics(&IntrinsicsInput { views, sizes_px, model: self.model.into() })?)
+        Ok(calibrate_intrinsics(&IntrinsicsInput {
+            views,
+            sizes_px,
+            model: self.model.into(),
+        })?)
     }
 
     fn write_report(
@@ -205,10 +253,21 @@ impl Args {
         result: &anyhow::Result<IntrinsicsCalibration>,
     ) -> anyhow::Result<()> {
         let calibration = result.as_ref().ok();
-        let warnings = detected.warnings.iter().cloned().chain(calibration.into_iter().flat_map(warnings)).collect();
-        let Some(heading) = outputs::heading(&self.input, result, warnings) else { return Ok(()) };
-        let rig_line =
-            calibration.map(|calibration| format!("intrinsics = {}", LensFile::of(&calibration.intrinsics).to_toml()));
+        let warnings = detected
+            .warnings
+            .iter()
+            .cloned()
+            .chain(calibration.into_iter().flat_map(warnings))
+            .collect();
+        let Some(heading) = outputs::heading(&self.input, result, warnings) else {
+            return Ok(());
+        };
+        let rig_line = calibration.map(|calibration| {
+            format!(
+                "intrinsics = {}",
+                LensFile::of(&calibration.intrinsics).to_toml()
+            )
+        });
         const NO_IMAGE_PX: [u32; 2] = [640, 480];
         let report = IntrinsicsReport {
             heading: &heading,
@@ -226,7 +285,13 @@ impl Args {
 
 /// Problems of a result, one sentence each.
 fn warnings(calibration: &IntrinsicsCalibration) -> Vec<String> {
-    [uncertainty_warning(calibration), aspect_warning(calibration.intrinsics.focal_px)].into_iter().flatten().collect()
+    [
+        uncertainty_warning(calibration),
+        aspect_warning(calibration.intrinsics.focal_px),
+    ]
+    .into_iter()
+    .flatten()
+    .collect()
 }
 
 /// A warning if pixels are not square.
@@ -254,7 +319,10 @@ fn uncertainty_warning(calibration: &IntrinsicsCalibration) -> Option<String> {
 }
 
 fn largest(values: &[Option<f64>]) -> f64 {
-    values.iter().flatten().fold(0.0f64, |largest, value| largest.max(*value))
+    values
+        .iter()
+        .flatten()
+        .fold(0.0f64, |largest, value| largest.max(*value))
 }
 
 impl From<ModelArg> for LensModel {
@@ -275,44 +343,83 @@ fn printed<'a>(calibration: &'a IntrinsicsCalibration, unused: &[Unused]) -> Pri
         reason: unused.reason.clone(),
         is_unreadable: unused.is_unreadable,
     });
-    let rejected = calibration.rejected.iter().map(|rejected| PrintedRejection {
-        image: rejected.image.clone(),
-        reason: rejected.reason.to_string(),
-        is_unreadable: false,
-    });
+    let rejected = calibration
+        .rejected
+        .iter()
+        .map(|rejected| PrintedRejection {
+            image: rejected.image.clone(),
+            reason: rejected.reason.to_string(),
+            is_unreadable: false,
+        });
     let rejected = unused.chain(rejected).collect();
     const N_PINHOLE_PARAMS: usize = 4;
     let names = calibration.params.iter().map(|param| param.name);
     Printed {
-        lens: LensFile::of(&calibration.intrinsics).with_covariance(&calibration.intrinsics_covariance()),
+        lens: LensFile::of(&calibration.intrinsics)
+            .with_covariance(&calibration.intrinsics_covariance()),
         coefficients: names.skip(N_PINHOLE_PARAMS).collect(),
         rms_px: calibration.rms_px,
         noise_px: calibration.noise_px,
-        sigma: calibration.params.iter().map(|param| (param.name, param.sigma)).collect(),
+        sigma: calibration
+            .params
+            .iter()
+            .map(|param| (param.name, param.sigma))
+            .collect(),
         rejected,
         images: calibration
             .images
             .iter()
-            .map(|image| PrintedImage { image: &image.name, n_corners: image.points.len(), rms_px: image.rms_px })
+            .map(|image| PrintedImage {
+                image: &image.name,
+                n_corners: image.points.len(),
+                rms_px: image.rms_px,
+            })
             .collect(),
         coverage: grid(&calibration.coverage),
         projection_sigma_px: grid(&calibration.uncertainty_px),
         trials: calibration.trials.iter().map(trial).collect(),
-        next_view: calibration.next_view.as_ref().map(|next| &*next.instruction),
+        next_view: calibration
+            .next_view
+            .as_ref()
+            .map(|next| &*next.instruction),
     }
 }
 
 fn grid<T: Clone>(grid: &ImageGrid<T>) -> PrintedGrid<T> {
-    PrintedGrid { columns: grid.n_columns, rows: grid.n_rows, values: grid.values.clone() }
+    PrintedGrid {
+        columns: grid.n_columns,
+        rows: grid.n_rows,
+        values: grid.values.clone(),
+    }
 }
 
 fn trial(trial: &LensTrial) -> PrintedTrial<'_> {
-    let LensTrial { baseline, variant, gain_db, standard_error_db, kept, .. } = trial;
-    PrintedTrial { baseline, variant, gain_db: *gain_db, standard_error_db: *standard_error_db, kept: *kept }
+    let LensTrial {
+        baseline,
+        variant,
+        gain_db,
+        standard_error_db,
+        kept,
+        ..
+    } = trial;
+    PrintedTrial {
+        baseline,
+        variant,
+        gain_db: *gain_db,
+        standard_error_db: *standard_error_db,
+        kept: *kept,
+    }
 }
 
 fn describe(printed: &Printed<'_>) -> anyhow::Result<()> {
-    let Printed { lens, sigma, rms_px, images, rejected, .. } = printed;
+    let Printed {
+        lens,
+        sigma,
+        rms_px,
+        images,
+        rejected,
+        ..
+    } = printed;
     let n_corners: usize = images.iter().map(|image| image.n_corners).sum();
     let [width, height] = lens.size_px.unwrap_or_default();
     print::line(format!(
@@ -326,17 +433,34 @@ fn describe(printed: &Printed<'_>) -> anyhow::Result<()> {
     };
     let [fx, fy] = lens.focal_px;
     let [cx, cy] = lens.principal_px;
-    print::line(format!("focal lengths    {}, {} px", with_sigma("fx", fx), with_sigma("fy", fy)))?;
-    print::line(format!("principal point  {}, {} px", with_sigma("cx", cx), with_sigma("cy", cy)))?;
+    print::line(format!(
+        "focal lengths    {}, {} px",
+        with_sigma("fx", fx),
+        with_sigma("fy", fy)
+    ))?;
+    print::line(format!(
+        "principal point  {}, {} px",
+        with_sigma("cx", cx),
+        with_sigma("cy", cy)
+    ))?;
     if !lens.distortion.is_empty() {
-        let distortion: Vec<String> = lens.distortion.iter().map(|value| format!("{value:.5}")).collect();
+        let distortion: Vec<String> = lens
+            .distortion
+            .iter()
+            .map(|value| format!("{value:.5}"))
+            .collect();
         print::line(format!("distortion       {}", distortion.join(", ")))?;
     }
     let worst = largest(&printed.projection_sigma_px.values);
-    print::line(format!("projection       +- {worst:.2} px (largest standard deviation in the image)"))?;
+    print::line(format!(
+        "projection       +- {worst:.2} px (largest standard deviation in the image)"
+    ))?;
     // Images that cannot be read were reported in a warning.
     for rejection in rejected.iter().filter(|rejection| !rejection.is_unreadable) {
-        print::line(format!("not used: {}: {}", rejection.image, rejection.reason))?;
+        print::line(format!(
+            "not used: {}: {}",
+            rejection.image, rejection.reason
+        ))?;
     }
     if let Some(next) = printed.next_view {
         print::line(format!("next image: {next}"))?;

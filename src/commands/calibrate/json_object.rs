@@ -7,7 +7,8 @@ use serde::de::{Deserialize, Deserializer, Error as _, MapAccess, SeqAccess, Vis
 use serde_json::{Map, Value};
 use std::fmt::Formatter;
 
-/// Parses JSON. A key that occurs twice in one object is an error: otherwise, only its last value would be used.
+/// Parses JSON. A key that occurs twice in one object is an error: otherwise, only its last value
+/// would be used.
 pub(super) fn parse(text: &str) -> serde_json::Result<Value> {
     serde_json::from_str(text).map(|Unique(value)| value)
 }
@@ -66,7 +67,9 @@ impl<'de> Visitor<'de> for UniqueVisitor {
         let mut map = Map::new();
         while let Some((key, Unique(value))) = object.next_entry::<String, Unique>()? {
             if map.contains_key(&key) {
-                return Err(A::Error::custom(format_args!("the key {key:?} occurs twice; keep one of them")));
+                return Err(A::Error::custom(format_args!(
+                    "the key {key:?} occurs twice; keep one of them"
+                )));
             }
             map.insert(key, value);
         }
@@ -85,17 +88,31 @@ pub(super) struct JsonObject<'a> {
 
 impl<'a> JsonObject<'a> {
     /// Rejects other values, and keys other than `known`.
-    pub(super) fn new(file: &'a str, path: String, value: &'a Value, known: &[&str]) -> Result<Self, BadArgument> {
-        let place = if path.is_empty() { file.to_owned() } else { format!("{file}: {path}") };
+    pub(super) fn new(
+        file: &'a str,
+        path: String,
+        value: &'a Value,
+        known: &[&str],
+    ) -> Result<Self, BadArgument> {
+        let place = if path.is_empty() {
+            file.to_owned()
+        } else {
+            format!("{file}: {path}")
+        };
         let Some(map) = value.as_object() else {
-            return Err(BadArgument(format!("{place}: {}, expected an object", kind_of(value))));
+            return Err(BadArgument(format!(
+                "{place}: {}, expected an object",
+                kind_of(value)
+            )));
         };
         if let Some(unknown) = map.keys().find(|key| !known.contains(&key.as_str())) {
             let hint = match capture::nearest_name(unknown, known.iter().copied()) {
                 Some(key) => format!("did you mean {key:?}?"),
                 None => format!("the keys are {}", known.join(", ")),
             };
-            return Err(BadArgument(format!("{place}: unknown key {unknown:?}; {hint}")));
+            return Err(BadArgument(format!(
+                "{place}: unknown key {unknown:?}; {hint}"
+            )));
         }
         Ok(Self { file, path, map })
     }
@@ -106,7 +123,11 @@ impl<'a> JsonObject<'a> {
     }
 
     fn path_of(&self, key: &str) -> String {
-        if self.path.is_empty() { key.to_owned() } else { format!("{}.{key}", self.path) }
+        if self.path.is_empty() {
+            key.to_owned()
+        } else {
+            format!("{}.{key}", self.path)
+        }
     }
 
     /// The value of a field. `null` counts as missing.
@@ -120,46 +141,67 @@ impl<'a> JsonObject<'a> {
 
     pub(super) fn text(&self, key: &str) -> Result<Option<&'a str>, BadArgument> {
         let text = |value: &'a Value| {
-            value.as_str().ok_or_else(|| self.invalid(key, format!("{}, expected a string", kind_of(value))))
+            value
+                .as_str()
+                .ok_or_else(|| self.invalid(key, format!("{}, expected a string", kind_of(value))))
         };
         self.get(key).map(text).transpose()
     }
 
     pub(super) fn numbers(&self, key: &str) -> Result<Option<Vec<f64>>, BadArgument> {
-        let Some(value) = self.get(key) else { return Ok(None) };
+        let Some(value) = self.get(key) else {
+            return Ok(None);
+        };
         let Some(list) = value.as_array() else {
-            return Err(self.invalid(key, format!("{}, expected an array of numbers", kind_of(value))));
+            return Err(self.invalid(
+                key,
+                format!("{}, expected an array of numbers", kind_of(value)),
+            ));
         };
         let numbers: Option<Vec<f64>> = list.iter().map(Value::as_f64).collect();
-        numbers.map(Some).ok_or_else(|| self.invalid(key, "expected an array of numbers"))
+        numbers
+            .map(Some)
+            .ok_or_else(|| self.invalid(key, "expected an array of numbers"))
     }
 
     pub(super) fn array<const N: usize>(&self, key: &str) -> Result<Option<[f64; N]>, BadArgument> {
-        let Some(numbers) = self.numbers(key)? else { return Ok(None) };
+        let Some(numbers) = self.numbers(key)? else {
+            return Ok(None);
+        };
         let n = numbers.len();
-        numbers.try_into().map(Some).map_err(|_| self.invalid(key, format!("{n} numbers, expected {N}")))
+        numbers
+            .try_into()
+            .map(Some)
+            .map_err(|_| self.invalid(key, format!("{n} numbers, expected {N}")))
     }
 
     pub(super) fn transform(&self, key: &str) -> Result<Option<Transform>, BadArgument> {
-        self.get(key).map(|value| transform_of(value).map_err(|why| self.invalid(key, why))).transpose()
+        self.get(key)
+            .map(|value| transform_of(value).map_err(|why| self.invalid(key, why)))
+            .transpose()
     }
 
     pub(super) fn list(&self, key: &str) -> Result<&'a [Value], BadArgument> {
         let value = self.required(key, self.get(key))?;
-        let list =
-            value.as_array().ok_or_else(|| self.invalid(key, format!("{}, expected an array", kind_of(value))))?;
+        let list = value
+            .as_array()
+            .ok_or_else(|| self.invalid(key, format!("{}, expected an array", kind_of(value))))?;
         Ok(list)
     }
 
     /// The object in a field.
     pub(super) fn object(&self, key: &str, known: &[&str]) -> Result<Option<Self>, BadArgument> {
-        self.get(key).map(|value| Self::new(self.file, self.path_of(key), value, known)).transpose()
+        self.get(key)
+            .map(|value| Self::new(self.file, self.path_of(key), value, known))
+            .transpose()
     }
 
     /// The objects in a list.
     pub(super) fn objects(&self, key: &str, known: &[&str]) -> Result<Vec<Self>, BadArgument> {
         let path = self.path_of(key);
-        let object = |(ix, value): (usize, &'a Value)| Self::new(self.file, format!("{path}[{ix}]"), value, known);
+        let object = |(ix, value): (usize, &'a Value)| {
+            Self::new(self.file, format!("{path}[{ix}]"), value, known)
+        };
         self.list(key)?.iter().enumerate().map(object).collect()
     }
 }
@@ -189,9 +231,13 @@ mod tests {
         let text = r#"{"a": [null, true, -7, 18446744073709551615, 0.1, "text", {"a": {}}], "b": {"a": []}}"#;
         let expected: Value = serde_json::from_str(text).expect("JSON");
         assert_eq!(parse(text).expect("JSON"), expected);
-        for (text, line) in [(r#"{"a": 1, "a": 1}"#, 1), ("[{},\n{\"b\": {\"a\": 1, \"c\": 2,\n\"a\": 2}}]", 3)] {
+        for (text, line) in [
+            (r#"{"a": 1, "a": 1}"#, 1),
+            ("[{},\n{\"b\": {\"a\": 1, \"c\": 2,\n\"a\": 2}}]", 3),
+        ] {
             let error = parse(text).expect_err("a repeated key").to_string();
-            let expected = format!("the key \"a\" occurs twice; keep one of them at line {line} column ");
+            let expected =
+                format!("the key \"a\" occurs twice; keep one of them at line {line} column ");
             assert!(error.starts_with(&expected), "{error}");
         }
         assert!(parse(r#"{"a": 1e999}"#).is_err() && parse("{} {}").is_err());
@@ -200,24 +246,44 @@ mod tests {
     #[test]
     fn errors_name_the_field() {
         let value = json!({"samples": [{}, {"base_from_flange": [[1, 2]], "image": 7, "joints": [1, "2"]}]});
-        let file = JsonObject::new("s.json", String::new(), &value, &["samples"]).expect("an object");
+        let file =
+            JsonObject::new("s.json", String::new(), &value, &["samples"]).expect("an object");
         let known = ["base_from_flange", "image", "joints"];
         let samples = file.objects("samples", &known).expect("objects");
-        assert_eq!(error(samples[1].text("image")), "s.json: samples[1].image: a number, expected a string");
-        assert!(error(samples[1].numbers("joints")).starts_with("s.json: samples[1].joints: expected"));
-        assert!(
-            error(samples[1].transform("base_from_flange")).contains("samples[1].base_from_flange: must be a matrix")
+        assert_eq!(
+            error(samples[1].text("image")),
+            "s.json: samples[1].image: a number, expected a string"
         );
-        assert_eq!(error(samples[0].required("image", samples[0].get("image"))), "s.json: samples[0].image: missing");
+        assert!(
+            error(samples[1].numbers("joints")).starts_with("s.json: samples[1].joints: expected")
+        );
+        assert!(
+            error(samples[1].transform("base_from_flange"))
+                .contains("samples[1].base_from_flange: must be a matrix")
+        );
+        assert_eq!(
+            error(samples[0].required("image", samples[0].get("image"))),
+            "s.json: samples[0].image: missing"
+        );
         let bad = json!({"samples": [{"base_to_flange": 1}]});
         let file = JsonObject::new("s.json", String::new(), &bad, &["samples"]).expect("an object");
         let message = error(file.objects("samples", &known));
         assert!(
-            message.contains("samples[0]: unknown key \"base_to_flange\"; did you mean \"base_from_flange\"?"),
+            message.contains(
+                "samples[0]: unknown key \"base_to_flange\"; did you mean \"base_from_flange\"?"
+            ),
             "{message}"
         );
-        let message = error(JsonObject::new("s.json", String::new(), &json!({"zzz": 1}), &["samples", "setup"]));
-        assert_eq!(message, "s.json: unknown key \"zzz\"; the keys are samples, setup");
+        let message = error(JsonObject::new(
+            "s.json",
+            String::new(),
+            &json!({"zzz": 1}),
+            &["samples", "setup"],
+        ));
+        assert_eq!(
+            message,
+            "s.json: unknown key \"zzz\"; the keys are samples, setup"
+        );
         assert_eq!(
             error(JsonObject::new("s.json", String::new(), &json!([]), &[])),
             "s.json: an array, expected an object"

@@ -9,8 +9,8 @@ use serde::Serialize;
 /// Intrinsics in JSON files, as `calibrate intrinsics` prints them. Pixel centers are at +0.5.
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct LensFile {
-    /// `pinhole`, `brown_conrady` (five or eight coefficients) or `kannala_brandt`, as in rig files; by default, pinhole
-    /// without distortion coefficients, and `brown_conrady` with them.
+    /// `pinhole`, `brown_conrady` (five or eight coefficients) or `kannala_brandt`, as in rig
+    /// files; by default, pinhole without distortion coefficients, and `brown_conrady` with them.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(super) model: Option<String>,
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -32,7 +32,8 @@ const BROWN_CONRADY: &str = "brown_conrady";
 const KANNALA_BRANDT: &str = "kannala_brandt";
 
 impl LensFile {
-    /// Keys of a file with intrinsics, including those that `calibrate intrinsics --json` prints and that are not needed.
+    /// Keys of a file with intrinsics, including those that `calibrate intrinsics --json` prints
+    /// and that are not needed.
     pub(super) const KEYS: [&'static str; 17] = [
         "focal_px",
         "principal_px",
@@ -56,8 +57,14 @@ impl LensFile {
     pub(super) fn read(object: &JsonObject<'_>) -> Result<Self, BadArgument> {
         let side = |value: f64| {
             let is_side = value.fract() == 0.0 && (1.0..=f64::from(u32::MAX)).contains(&value);
-            #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a whole number in the range")]
-            is_side.then_some(value as u32).ok_or_else(|| object.invalid("size_px", "must be whole numbers above 0"))
+            #[expect(
+                clippy::cast_possible_truncation,
+                clippy::cast_sign_loss,
+                reason = "a whole number in the range"
+            )]
+            is_side
+                .then_some(value as u32)
+                .ok_or_else(|| object.invalid("size_px", "must be whole numbers above 0"))
         };
         let size_px = match object.array::<2>("size_px")? {
             Some([width, height]) => Some([side(width)?, side(height)?]),
@@ -65,7 +72,9 @@ impl LensFile {
         };
         let model = match (object.text("model")?, object.text("lens")?) {
             (Some(model), Some(lens)) if model != lens => {
-                let why = format!("{lens:?}, but model is {model:?}; both mean the lens model: keep one of them");
+                let why = format!(
+                    "{lens:?}, but model is {model:?}; both mean the lens model: keep one of them"
+                );
                 return Err(object.invalid("lens", why));
             }
             (model, lens) => model.or(lens),
@@ -103,17 +112,26 @@ impl LensFile {
 
     pub(super) fn with_covariance(self, covariance: &DMatrix<f64>) -> Self {
         // Symmetric, so the order of rows and columns does not matter.
-        Self { covariance: covariance.as_slice().to_vec(), ..self }
+        Self {
+            covariance: covariance.as_slice().to_vec(),
+            ..self
+        }
     }
 
-    /// Covariance of [`Intrinsics::params`]. With standard deviations only, the parameters count as independent, and those
-    /// without one as exact.
-    pub(super) fn covariance(&self, intrinsics: &Intrinsics) -> Result<Option<DMatrix<f64>>, BadArgument> {
+    /// Covariance of [`Intrinsics::params`]. With standard deviations only, the parameters count as
+    /// independent, and those without one as exact.
+    pub(super) fn covariance(
+        &self,
+        intrinsics: &Intrinsics,
+    ) -> Result<Option<DMatrix<f64>>, BadArgument> {
         let n = intrinsics.params().len();
         let name = |ix: usize| param_names(self.model.as_deref())[ix];
         if let Some((ix, _)) = self.sigmas.iter().find(|(ix, _)| *ix >= n) {
             let params = param_names(self.model.as_deref())[..n].join(", ");
-            return Err(BadArgument(format!("intrinsics.sigma.{}: the lens has only {params}", name(*ix))));
+            return Err(BadArgument(format!(
+                "intrinsics.sigma.{}: the lens has only {params}",
+                name(*ix)
+            )));
         }
         let given = covariance_of(&self.covariance, intrinsics)
             .map_err(|error| BadArgument(format!("intrinsics.covariance: {error}")))?;
@@ -124,7 +142,8 @@ impl LensFile {
             }
             return Ok((!self.sigmas.is_empty()).then_some(independent));
         };
-        /// Relative difference of two standard deviations that are meant to be equal; they may be rounded.
+        /// Relative difference of two standard deviations that are meant to be equal; they may be
+        /// rounded.
         const MAX_DIFFERENCE: f64 = 0.01;
         for (ix, sigma) in &self.sigmas {
             let of_covariance = given[(*ix, *ix)].max(0.0).sqrt();
@@ -149,7 +168,9 @@ impl LensFile {
         }
         // The principal point of a lens is near the center of its images.
         const CENTRAL_FRAC: std::ops::RangeInclusive<f64> = 0.25..=0.75;
-        if (0..2).any(|axis| !CENTRAL_FRAC.contains(&(self.principal_px[axis] / f64::from(size_px[axis])))) {
+        if (0..2).any(|axis| {
+            !CENTRAL_FRAC.contains(&(self.principal_px[axis] / f64::from(size_px[axis])))
+        }) {
             return Err(BadArgument(format!(
                 "principal_px {:?} is far from the center of images of {width}x{height} pixels; the intrinsics are probably for another resolution",
                 self.principal_px
@@ -162,7 +183,9 @@ impl LensFile {
             lens: self.lens()?,
             rectified: false,
         };
-        intrinsics.validate().map_err(|error| BadArgument(format!("intrinsics: {error}")))?;
+        intrinsics
+            .validate()
+            .map_err(|error| BadArgument(format!("intrinsics: {error}")))?;
         Ok(intrinsics)
     }
 
@@ -171,7 +194,10 @@ impl LensFile {
         let default = if k.is_empty() { PINHOLE } else { BROWN_CONRADY };
         let model = self.model.as_deref().unwrap_or(default);
         let too_many = |max: usize| {
-            BadArgument(format!("intrinsics: {} distortion coefficients; {model} has at most {max}", k.len()))
+            BadArgument(format!(
+                "intrinsics: {} distortion coefficients; {model} has at most {max}",
+                k.len()
+            ))
         };
         match model {
             PINHOLE if k.is_empty() => Ok(Lens::Pinhole),
@@ -193,7 +219,13 @@ impl LensFile {
 
     /// The value of `intrinsics` in a rig file.
     pub(super) fn to_toml(&self) -> String {
-        let list = |values: &[f64]| values.iter().map(f64::to_string).collect::<Vec<_>>().join(", ");
+        let list = |values: &[f64]| {
+            values
+                .iter()
+                .map(f64::to_string)
+                .collect::<Vec<_>>()
+                .join(", ")
+        };
         let distortion = match self.distortion.is_empty() {
             true => String::new(),
             false => format!(", distortion = [{}]", list(&self.distortion)),
@@ -207,15 +239,20 @@ impl LensFile {
     }
 }
 
-/// Names of focal lengths and principal point, and of the coefficients of both kinds of lenses in OpenCV's order.
+/// Names of focal lengths and principal point, and of the coefficients of both kinds of lenses in
+/// OpenCV's order.
 const PLANE_NAMES: [&str; 4] = ["fx", "fy", "cx", "cy"];
 const BROWN_CONRADY_NAMES: [&str; 8] = ["k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"];
 const KANNALA_BRANDT_NAMES: [&str; 4] = ["k1", "k2", "k3", "k4"];
 
-/// Names of the parameters of a lens model, in the order of [`Intrinsics::params`]. A lens may have only the first ones.
+/// Names of the parameters of a lens model, in the order of [`Intrinsics::params`]. A lens may have
+/// only the first ones.
 pub(super) fn param_names(model: Option<&str>) -> Vec<&'static str> {
-    let coefficients: &[&str] =
-        if model == Some(KANNALA_BRANDT) { &KANNALA_BRANDT_NAMES } else { &BROWN_CONRADY_NAMES };
+    let coefficients: &[&str] = if model == Some(KANNALA_BRANDT) {
+        &KANNALA_BRANDT_NAMES
+    } else {
+        &BROWN_CONRADY_NAMES
+    };
     PLANE_NAMES.iter().chain(coefficients).copied().collect()
 }
 
@@ -224,20 +261,28 @@ fn sigmas(sigma: &JsonObject<'_>, model: Option<&str>) -> Result<Vec<(usize, f64
     let names = param_names(model).into_iter().enumerate();
     let given = names.filter_map(|(ix, name)| sigma.get(name).map(|value| (ix, name, value)));
     given
-        .map(|(ix, name, value)| match value.as_f64().filter(|value| *value >= 0.0) {
-            Some(value) => Ok((ix, value)),
-            None => Err(sigma.invalid(name, "expected a number of at least 0")),
-        })
+        .map(
+            |(ix, name, value)| match value.as_f64().filter(|value| *value >= 0.0) {
+                Some(value) => Ok((ix, value)),
+                None => Err(sigma.invalid(name, "expected a number of at least 0")),
+            },
+        )
         .collect()
 }
 
 /// The matrix of a list. `None` if it is empty.
-pub(super) fn covariance_of(list: &[f64], intrinsics: &Intrinsics) -> Result<Option<DMatrix<f64>>, String> {
+pub(super) fn covariance_of(
+    list: &[f64],
+    intrinsics: &Intrinsics,
+) -> Result<Option<DMatrix<f64>>, String> {
     let n = intrinsics.params().len();
     match list.len() {
         0 => Ok(None),
         n_given if n_given == n * n => Ok(Some(DMatrix::from_row_slice(n, n, list))),
-        n_given => Err(format!("{n_given} numbers, but the lens has {n} parameters: expected {} numbers", n * n)),
+        n_given => Err(format!(
+            "{n_given} numbers, but the lens has {n} parameters: expected {} numbers",
+            n * n
+        )),
     }
 }
 

@@ -1,4 +1,5 @@
-//! `fieldrig calibrate`: calibrates cameras, with a printed target or from images of any static scene.
+//! `fieldrig calibrate`: calibrates cameras, with a printed target or from images of any static
+//! scene.
 
 mod guide;
 mod hand_eye;
@@ -34,10 +35,11 @@ enum CalibrateCommand {
     Intrinsics(intrinsics::Args),
     /// Estimate the pose of a camera on a robot from robot poses and images of a target
     HandEye(hand_eye::Args),
-    /// Estimate the offset between the clocks of two pose streams, and the transform between their bodies
+    /// Estimate the offset between the clocks of two pose streams, and the transform between their
+    /// bodies
     TimeOffset(time_offset::Args),
-    /// Estimate hand-eye transforms, time offsets, lenses, joint offsets and depth errors of a rig from images of a
-    /// static scene, without a target
+    /// Estimate hand-eye transforms, time offsets, lenses, joint offsets and depth errors of a rig
+    /// from images of a static scene, without a target
     Scene(scene::Args),
 }
 
@@ -53,7 +55,8 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
 
 /// Parses the specification of a target.
 fn target_argument(text: &str) -> Result<TargetSpec, String> {
-    text.parse().map_err(|error: targets::SpecError| error.to_string())
+    text.parse()
+        .map_err(|error: targets::SpecError| error.to_string())
 }
 
 /// The matrix of a transform, row by row.

@@ -14,12 +14,12 @@ use std::path::{Path, PathBuf};
 /// Flags of commands that calibrate one camera, from files, a recording or the devices of a rig.
 #[derive(Debug, clap::Args)]
 pub(super) struct RigFlags {
-    /// The camera to calibrate, with a recording or rig file as input; the camera in the rig file, with --write-rig
-    /// [default: the only one]
+    /// The camera to calibrate, with a recording or rig file as input; the camera in the rig file,
+    /// with --write-rig [default: the only one]
     #[arg(long, value_name = "NAME")]
     pub(super) camera: Option<String>,
-    /// With a recording: read it with this rig file instead of the one stored in it. With image files: the rig file to
-    /// write the result into
+    /// With a recording: read it with this rig file instead of the one stored in it. With image
+    /// files: the rig file to write the result into
     #[arg(long, value_name = "RIG.toml")]
     pub(super) rig: Option<PathBuf>,
     /// Write the rig file with the result. An existing file is kept with the extension .old
@@ -60,7 +60,8 @@ impl InputKind {
 
 /// Whether a path is that of a rig file.
 pub(super) fn is_rig_file(path: &Path) -> bool {
-    path.extension().is_some_and(|extension| extension == "toml")
+    path.extension()
+        .is_some_and(|extension| extension == "toml")
 }
 
 impl RigFlags {
@@ -68,16 +69,22 @@ impl RigFlags {
     pub(super) fn check(&self, input: &Path) -> Result<(), BadArgument> {
         self.page.check()?;
         let kind = InputKind::of(input);
-        let problem = if kind != InputKind::Rig && (self.sim || self.seconds.is_some() || self.page.is_given()) {
+        let problem = if kind != InputKind::Rig
+            && (self.sim || self.seconds.is_some() || self.page.is_given())
+        {
             "--sim, --seconds and the flags of the page (--listen, --share) need a rig file (.toml) as input".to_owned()
         } else if kind == InputKind::Rig && self.rig.is_some() {
-            format!("--rig: the input {} is a rig file, which is used; remove --rig", input.display())
+            format!(
+                "--rig: the input {} is a rig file, which is used; remove --rig",
+                input.display()
+            )
         } else if kind != InputKind::Files {
             return Ok(());
         } else if self.write_rig.is_some() && self.rig.is_none() {
             "--write-rig: the input contains no rig file; name the one to change with --rig RIG.toml".to_owned()
         } else if self.rig.is_some() && self.write_rig.is_none() {
-            "--rig: the rig file is only used to write the result into it; add --write-rig FILE".to_owned()
+            "--rig: the rig file is only used to write the result into it; add --write-rig FILE"
+                .to_owned()
         } else if self.camera.is_some() && self.write_rig.is_none() {
             "--camera needs a recording or rig file as input, or --write-rig".to_owned()
         } else {
@@ -86,25 +93,41 @@ impl RigFlags {
         Err(BadArgument(problem))
     }
 
-    /// Reads the rig file to write the result into: the input, that of a recording, or `--rig`. `None` without
-    /// `--write-rig`.
+    /// Reads the rig file to write the result into: the input, that of a recording, or `--rig`.
+    /// `None` without `--write-rig`.
     pub(super) fn open(&self, input: &Path) -> anyhow::Result<Option<RigOutput>> {
         self.check(input)?;
-        let Some(file) = &self.write_rig else { return Ok(None) };
+        let Some(file) = &self.write_rig else {
+            return Ok(None);
+        };
         if !is_rig_file(file) {
-            return Err(BadArgument(format!("--write-rig {}: must have the extension .toml", file.display())).into());
+            return Err(BadArgument(format!(
+                "--write-rig {}: must have the extension .toml",
+                file.display()
+            ))
+            .into());
         }
         let rig = match (InputKind::of(input), &self.rig) {
             (InputKind::Recording, rig) => {
                 session::expect(input)?;
-                Data::rig_as_given(input, &DataOptions { rig: rig.clone(), ..DataOptions::default() })?
+                Data::rig_as_given(
+                    input,
+                    &DataOptions {
+                        rig: rig.clone(),
+                        ..DataOptions::default()
+                    },
+                )?
             }
             (InputKind::Files, Some(rig)) => Rig::load(rig, &[])?,
             (InputKind::Rig | InputKind::Files, _) => Rig::load(input, &[])?,
         };
         let camera = self.camera_of(&rig)?.name.to_string();
         corrected_rig::check_target_file(&rig, file)?;
-        Ok(Some(RigOutput { rig, camera, file: file.clone() }))
+        Ok(Some(RigOutput {
+            rig,
+            camera,
+            file: file.clone(),
+        }))
     }
 
     /// The camera with the given name, or the only one.
@@ -115,7 +138,10 @@ impl RigFlags {
             (None, cameras) => {
                 let names: Vec<&str> = cameras.iter().map(|camera| &*camera.name).collect();
                 let names = listed(&names, "or");
-                Err(BadArgument(format!("the rig has several cameras; choose one with --camera: {names}")).into())
+                Err(BadArgument(format!(
+                    "the rig has several cameras; choose one with --camera: {names}"
+                ))
+                .into())
             }
         }
     }
@@ -140,14 +166,20 @@ impl RigOutput {
         let arm = &mut self.rig.arm;
         arm.joint_offsets.resize(arm.joints.len(), 0.0);
         for (name, total) in arm.joints.iter().zip(&mut arm.joint_offsets) {
-            let found = offsets.iter().find(|offset| offset.joint == *name).and_then(|offset| offset.estimate);
+            let found = offsets
+                .iter()
+                .find(|offset| offset.joint == *name)
+                .and_then(|offset| offset.estimate);
             *total += found.map_or(0.0, |[offset, _]| offset);
         }
     }
 
     /// Rejects images of another size than those of the camera.
     pub(super) fn expect_size(&self, size_px: [u32; 2]) -> anyhow::Result<()> {
-        Ok(corrected_rig::expect_size(corrected_rig::camera(&self.rig, &self.camera)?, size_px)?)
+        Ok(corrected_rig::expect_size(
+            corrected_rig::camera(&self.rig, &self.camera)?,
+            size_px,
+        )?)
     }
 
     pub(super) fn set_intrinsics(
@@ -159,15 +191,25 @@ impl RigOutput {
         Ok(())
     }
 
-    pub(super) fn set_extrinsics(&mut self, setup: Setup, parent_from_camera: &Transform) -> anyhow::Result<()> {
+    pub(super) fn set_extrinsics(
+        &mut self,
+        setup: Setup,
+        parent_from_camera: &Transform,
+    ) -> anyhow::Result<()> {
         let parent = parent_of(setup);
-        self.rig = corrected_rig::with_extrinsics(&self.rig, &self.camera, parent, parent_from_camera)?;
+        self.rig =
+            corrected_rig::with_extrinsics(&self.rig, &self.camera, parent, parent_from_camera)?;
         Ok(())
     }
 
     /// Rejects a setup in which the camera is attached to another frame than in the rig file.
     pub(super) fn expect_setup(&self, setup: Setup) -> anyhow::Result<()> {
-        corrected_rig::with_extrinsics(&self.rig, &self.camera, parent_of(setup), &Transform::identity())?;
+        corrected_rig::with_extrinsics(
+            &self.rig,
+            &self.camera,
+            parent_of(setup),
+            &Transform::identity(),
+        )?;
         Ok(())
     }
 
@@ -176,8 +218,8 @@ impl RigOutput {
         const MAX_PX: f64 = 0.01;
         let given = &corrected_rig::camera(&self.rig, &self.camera)?.intrinsics;
         let pairs = given.params().into_iter().zip(used.params());
-        let differ =
-            given.params().len() != used.params().len() || pairs.into_iter().any(|(a, b)| (a - b).abs() > MAX_PX);
+        let differ = given.params().len() != used.params().len()
+            || pairs.into_iter().any(|(a, b)| (a - b).abs() > MAX_PX);
         if differ {
             log::warn!(
                 "the pose of camera {:?} was estimated with other intrinsics than those of the rig file, which are kept; update them with `fieldrig calibrate intrinsics --write-rig`",
@@ -204,8 +246,8 @@ fn parent_of(setup: Setup) -> Parent {
 /// The flag of commands that write a report.
 #[derive(Debug, clap::Args)]
 pub(super) struct ReportFlag {
-    /// Write a report with the result, its uncertainty and the errors of all samples as an HTML page; also if the
-    /// calibration is refused
+    /// Write a report with the result, its uncertainty and the errors of all samples as an HTML
+    /// page; also if the calibration is refused
     #[arg(long, value_name = "FILE.html")]
     report: Option<PathBuf>,
 }
@@ -213,7 +255,9 @@ pub(super) struct ReportFlag {
 impl ReportFlag {
     /// The file to write, if any.
     pub(super) fn open(&self) -> anyhow::Result<Option<&Path>> {
-        let Some(file) = self.report.as_deref() else { return Ok(None) };
+        let Some(file) = self.report.as_deref() else {
+            return Ok(None);
+        };
         calibration_report::check_target_file(file)?;
         Ok(Some(file))
     }
@@ -226,8 +270,8 @@ pub(super) fn write_report(file: &Path, html: &str) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Writes the report, if one is requested, on a result or on the reason why there is none. Returns the result, and whether
-/// the report was written: the result is printed even if it was not.
+/// Writes the report, if one is requested, on a result or on the reason why there is none. Returns
+/// the result, and whether the report was written: the result is printed even if it was not.
 pub(super) fn reported<T>(
     result: anyhow::Result<T>,
     report: Option<&Path>,
@@ -250,20 +294,33 @@ pub(super) fn log_failure(written: anyhow::Result<()>) {
     }
 }
 
-/// The heading of the report on a result. `None` for errors that are not a refusal: they have no report.
-pub(super) fn heading<T>(input: &Path, result: &anyhow::Result<T>, warnings: Vec<String>) -> Option<Heading> {
+/// The heading of the report on a result. `None` for errors that are not a refusal: they have no
+/// report.
+pub(super) fn heading<T>(
+    input: &Path,
+    result: &anyhow::Result<T>,
+    warnings: Vec<String>,
+) -> Option<Heading> {
     let refused = match result {
         Ok(_) => None,
         Err(error) if exit::of(error) == Exit::InsufficientData => {
             let text = format!("{error:#}");
-            Some(text.strip_prefix("calibration refused: ").map_or(text.clone(), str::to_owned))
+            Some(
+                text.strip_prefix("calibration refused: ")
+                    .map_or(text.clone(), str::to_owned),
+            )
         }
         Err(_) => return None,
     };
-    Some(Heading { input: input.display().to_string(), refused, warnings })
+    Some(Heading {
+        input: input.display().to_string(),
+        refused,
+        warnings,
+    })
 }
 
 /// The contents of a text file; a missing or unreadable file is a bad argument.
 pub(super) fn read_text(path: &Path) -> Result<String, BadArgument> {
-    files::read_text(path).map_err(|error| BadArgument(format!("cannot read {}: {error}", path.display())))
+    files::read_text(path)
+        .map_err(|error| BadArgument(format!("cannot read {}: {error}", path.display())))
 }

@@ -1,4 +1,5 @@
-//! The web page while images of a target are taken: the camera image, the corners found so far, and what to do next.
+//! The web page while images of a target are taken: the camera image, the corners found so far, and
+//! what to do next.
 
 use crate::page_args::PageArgs;
 use crate::print;
@@ -58,13 +59,28 @@ impl GuidancePage {
 
     /// Shows what to do.
     pub(super) fn guide(&self, text: &str) {
-        self.set_status("calibrating", Guidance { text: text.to_owned(), is_finished: false });
+        self.set_status(
+            "calibrating",
+            Guidance {
+                text: text.to_owned(),
+                is_finished: false,
+            },
+        );
     }
 
     /// Shows that no more images are taken. Clients keep this text when the server stops.
     pub(super) fn finish(&self) {
-        let text = format!("{} images of the target were taken; the result is in the terminal", self.n_views);
-        self.set_status("finished", Guidance { text, is_finished: true });
+        let text = format!(
+            "{} images of the target were taken; the result is in the terminal",
+            self.n_views
+        );
+        self.set_status(
+            "finished",
+            Guidance {
+                text,
+                is_finished: true,
+            },
+        );
     }
 
     fn set_status(&self, state: &str, guidance: Guidance) {
@@ -77,10 +93,15 @@ impl GuidancePage {
         });
     }
 
-    /// Shows an image of the camera with the corners of earlier images, unless no client shows images.
+    /// Shows an image of the camera with the corners of earlier images, unless no client shows
+    /// images.
     pub(super) fn show_live(&mut self, image: &Image) {
         let now = Instant::now();
-        if image.camera != self.camera || image.is_depth() || now < self.next_live || !self.hub.needs_live_images() {
+        if image.camera != self.camera
+            || image.is_depth()
+            || now < self.next_live
+            || !self.hub.needs_live_images()
+        {
             return;
         }
         self.next_live = now + INTERVAL;
@@ -91,8 +112,17 @@ impl GuidancePage {
     }
 
     /// Shows a gray image in which the target was searched, with its corners.
-    pub(super) fn show_searched(&mut self, size_px: [u32; 2], gray: &[u8], view: Option<&BoardView>) {
-        let newest: Vec<[f64; 2]> = view.iter().flat_map(|view| &view.points).map(|point| point.pixel).collect();
+    pub(super) fn show_searched(
+        &mut self,
+        size_px: [u32; 2],
+        gray: &[u8],
+        view: Option<&BoardView>,
+    ) {
+        let newest: Vec<[f64; 2]> = view
+            .iter()
+            .flat_map(|view| &view.points)
+            .map(|point| point.pixel)
+            .collect();
         let rgb = gray.iter().flat_map(|value| [*value; 3]).collect();
         // The stamp only has to differ from that of the previous image.
         let stamp = Stamp::from_secs(self.began.elapsed().as_secs_f64());
@@ -108,9 +138,10 @@ impl GuidancePage {
         // Visible if the page shows the image in the width of a phone.
         const WIDTH_PER_DOT: u32 = 320;
         let radius = size_px[0].div_ceil(2 * WIDTH_PER_DOT);
-        for (corners_px, color, radius) in
-            [(&self.corners_px[..], EARLIER_SRGB, radius), (newest_px, NEWEST_SRGB, 3 * radius)]
-        {
+        for (corners_px, color, radius) in [
+            (&self.corners_px[..], EARLIER_SRGB, radius),
+            (newest_px, NEWEST_SRGB, 3 * radius),
+        ] {
             for corner_px in corners_px {
                 draw_dot(&mut rgb, size_px, *corner_px, radius, color);
             }
@@ -131,12 +162,16 @@ impl GuidancePage {
 /// Draws a square dot; pixel centers are at +0.5.
 fn draw_dot(rgb: &mut [u8], size_px: [u32; 2], [x, y]: [f64; 2], radius: u32, color: [u8; 3]) {
     let [width, height] = size_px.map(i64::from);
-    #[expect(clippy::cast_possible_truncation, reason = "corners are within the image")]
+    #[expect(
+        clippy::cast_possible_truncation,
+        reason = "corners are within the image"
+    )]
     let (x, y) = (x.floor() as i64, y.floor() as i64);
     let radius = i64::from(radius);
     for row in (y - radius).max(0)..=(y + radius).min(height - 1) {
         for column in (x - radius).max(0)..=(x + radius).min(width - 1) {
-            let first = usize::try_from(3 * (row * width + column)).expect("the pixel is within the image");
+            let first =
+                usize::try_from(3 * (row * width + column)).expect("the pixel is within the image");
             rgb[first..first + 3].copy_from_slice(&color);
         }
     }
@@ -151,7 +186,9 @@ mod tests {
         let size_px = [4, 3];
         let mut rgb = vec![0; 3 * 4 * 3];
         draw_dot(&mut rgb, size_px, [0.5, 2.9], 1, [1, 2, 3]);
-        let drawn: Vec<usize> = (0..12).filter(|ix| rgb[3 * ix..3 * ix + 3] == [1, 2, 3]).collect();
+        let drawn: Vec<usize> = (0..12)
+            .filter(|ix| rgb[3 * ix..3 * ix + 3] == [1, 2, 3])
+            .collect();
         assert_eq!(drawn, [4, 5, 8, 9]);
         assert_eq!(rgb.iter().filter(|value| **value > 0).count(), 12);
         draw_dot(&mut rgb, size_px, [-9.0, 9.0], 1, [9; 3]);

@@ -1,5 +1,5 @@
-//! Images of a target from a recording or from the devices of a rig, as input of `calibrate intrinsics` and `calibrate
-//! hand-eye`.
+//! Images of a target from a recording or from the devices of a rig, as input of `calibrate
+//! intrinsics` and `calibrate hand-eye`.
 
 use super::guide::{Guide, Purpose};
 use super::images::{self, DetectedImage, OtherSize};
@@ -9,7 +9,9 @@ use super::page::GuidancePage;
 use crate::exit::{BadArgument, InsufficientData};
 use crate::{print, signals};
 use calibration::BoardView;
-use calibration::hand_eye::{BoardObservation, FlangeMotion, HandEyeSample, Setup, corners_at_mid_exposure};
+use calibration::hand_eye::{
+    BoardObservation, FlangeMotion, HandEyeSample, Setup, corners_at_mid_exposure,
+};
 use capture::config::{ArmDriver, Camera, Override, Parent, Rig};
 use capture::open::{self, Devices, Opened};
 use capture::{ArmDuringImage, CalibrationImage, CalibrationImages, calibration_images};
@@ -83,7 +85,11 @@ impl RigFlags {
         let opened = match kind {
             InputKind::Rig => self.open_devices(input)?,
             InputKind::Recording | InputKind::Files => {
-                let rig = self.rig.as_deref().map(|file| Rig::load(file, &[])).transpose()?;
+                let rig = self
+                    .rig
+                    .as_deref()
+                    .map(|file| Rig::load(file, &[]))
+                    .transpose()?;
                 open::recording(input, rig, &[])?
             }
         };
@@ -111,18 +117,38 @@ impl RigFlags {
             found.n_fast,
             found.n_unusable
         );
-        let no_images = found.images.is_empty().then(|| no_images(input, &rig, &camera, &found));
+        let no_images = found
+            .images
+            .is_empty()
+            .then(|| no_images(input, &rig, &camera, &found));
         let detected = detected.unwrap_or_else(|| {
-            images::detect_each(&found.images, options.is_hidden, |image| images::detect_in_image(image, target))
+            images::detect_each(&found.images, options.is_hidden, |image| {
+                images::detect_in_image(image, target)
+            })
         });
         let scan = Scan::of_images(rig, camera, found, detected, options)?;
-        Ok(Some(Scan { no_images, warnings, ..scan }))
+        Ok(Some(Scan {
+            no_images,
+            warnings,
+            ..scan
+        }))
     }
 
     fn open_devices(&self, rig_file: &Path) -> anyhow::Result<Opened> {
-        let overrides = if self.sim { vec![Override::new("sim.lockstep", true)] } else { Vec::new() };
+        let overrides = if self.sim {
+            vec![Override::new("sim.lockstep", true)]
+        } else {
+            Vec::new()
+        };
         let rig = Rig::load(rig_file, &overrides)?;
-        Ok(open::rig(rig, if self.sim { Devices::Sim } else { Devices::Real })?)
+        Ok(open::rig(
+            rig,
+            if self.sim {
+                Devices::Sim
+            } else {
+                Devices::Real
+            },
+        )?)
     }
 
     /// Reads images. From devices, the target is detected at once, to tell what to do next.
@@ -133,20 +159,35 @@ impl RigFlags {
         target: &TargetSpec,
         options: ScanOptions,
     ) -> anyhow::Result<(CalibrationImages, Option<Vec<DetectedImage>>)> {
-        let stop = signals::stop_on_signals_logging("calibrating with the images so far; Ctrl-C again exits at once")?;
+        let stop = signals::stop_on_signals_logging(
+            "calibrating with the images so far; Ctrl-C again exits at once",
+        )?;
         let is_live = !matches!(opened.stamp_clock, capture::StampClock::Unrelated);
-        let template = if is_live { "{spinner} {msg}" } else { "{spinner} {pos} images" };
+        let template = if is_live {
+            "{spinner} {msg}"
+        } else {
+            "{spinner} {pos} images"
+        };
         let bar = print::bar(None, template, options.is_hidden);
-        let page = is_live.then(|| GuidancePage::start(&self.page, camera)).transpose()?;
-        let mut guide = page.map(|page| Guide::new(target, camera, options.purpose, bar.clone(), page));
-        let limit_secs = if is_live { self.seconds.unwrap_or(DEFAULT_SECS) } else { f64::INFINITY };
+        let page = is_live
+            .then(|| GuidancePage::start(&self.page, camera))
+            .transpose()?;
+        let mut guide =
+            page.map(|page| Guide::new(target, camera, options.purpose, bar.clone(), page));
+        let limit_secs = if is_live {
+            self.seconds.unwrap_or(DEFAULT_SECS)
+        } else {
+            f64::INFINITY
+        };
         let mut first: Option<Stamp> = None;
         let on_sample = |sample: &Sample, images: &[CalibrationImage]| {
             bar.set_position(images.len() as u64);
             if let Some(guide) = &mut guide {
                 guide.update(sample, images);
             }
-            let since_first = sample.stamp().secs_since(*first.get_or_insert(sample.stamp()));
+            let since_first = sample
+                .stamp()
+                .secs_since(*first.get_or_insert(sample.stamp()));
             match since_first > limit_secs || stop.requested() {
                 true => ControlFlow::Break(()),
                 false => ControlFlow::Continue(()),
@@ -190,9 +231,17 @@ impl Scan {
     ) -> anyhow::Result<Self> {
         let (mut photos, mut images) = (Photos::new(), Vec::new());
         for (image, detected) in found.images.into_iter().zip(detected) {
-            let CalibrationImage { size_px, gray, arm, .. } = image;
+            let CalibrationImage {
+                size_px, gray, arm, ..
+            } = image;
             if options.keeps_photos {
-                photos.insert(detected.name.clone(), Photo::Gray { size_px, pixels: gray });
+                photos.insert(
+                    detected.name.clone(),
+                    Photo::Gray {
+                        size_px,
+                        pixels: gray,
+                    },
+                );
             }
             images.push((detected, arm));
         }
@@ -210,11 +259,28 @@ impl Scan {
         let (setup, parent_from_camera) = match camera.parent {
             Parent::Flange => (Setup::EyeInHand, camera.parent_from_camera),
             Parent::Base => (Setup::EyeToHand, camera.parent_from_camera),
-            Parent::World => (Setup::EyeToHand, base_from_world * camera.parent_from_camera),
+            Parent::World => (
+                Setup::EyeToHand,
+                base_from_world * camera.parent_from_camera,
+            ),
         };
-        let chain = images.iter().any(|(_, arm)| arm.is_some()).then(|| open::chain_of(&rig)).transpose()?;
+        let chain = images
+            .iter()
+            .any(|(_, arm)| arm.is_some())
+            .then(|| open::chain_of(&rig))
+            .transpose()?;
         let (no_images, warnings) = (None, Vec::new());
-        Ok(Self { rig, camera, setup, parent_from_camera, chain, images, photos, no_images, warnings })
+        Ok(Self {
+            rig,
+            camera,
+            setup,
+            parent_from_camera,
+            chain,
+            images,
+            photos,
+            no_images,
+            warnings,
+        })
     }
 
     pub(super) fn setup(&self) -> Setup {
@@ -231,7 +297,12 @@ impl Scan {
 
     /// Covariance of the intrinsics, if the rig file contains it.
     pub(super) fn intrinsics_covariance(&self) -> Result<Option<DMatrix<f64>>, BadArgument> {
-        let Camera { name, intrinsics, intrinsics_covariance, .. } = &self.camera;
+        let Camera {
+            name,
+            intrinsics,
+            intrinsics_covariance,
+            ..
+        } = &self.camera;
         covariance_of(intrinsics_covariance, intrinsics)
             .map_err(|error| BadArgument(format!("camera.{name}.intrinsics_covariance: {error}")))
     }
@@ -252,18 +323,23 @@ impl Scan {
 
     /// An error if no image can be used.
     pub(super) fn check(&self) -> Result<(), InsufficientData> {
-        self.no_images.clone().map_or(Ok(()), |reason| Err(InsufficientData(reason)))
+        self.no_images
+            .clone()
+            .map_or(Ok(()), |reason| Err(InsufficientData(reason)))
     }
 
-    /// `parent_from_camera` of the rig file for an estimated pose, which is relative to the flange or base.
+    /// `parent_from_camera` of the rig file for an estimated pose, which is relative to the flange
+    /// or base.
     pub(super) fn rig_pose(&self, parent_from_camera: &Transform) -> Transform {
         corrected_rig::parent_from_camera(&self.rig.base, self.camera.parent, parent_from_camera)
     }
 
-    /// Whether the rows of an image are exposed one after another, so that the corrections of corners depend on the pose
-    /// of the camera.
+    /// Whether the rows of an image are exposed one after another, so that the corrections of
+    /// corners depend on the pose of the camera.
     pub(super) fn is_rolling_shutter(&self) -> bool {
-        self.camera.readout_micros.is_some_and(|micros| micros > 0.0)
+        self.camera
+            .readout_micros
+            .is_some_and(|micros| micros > 0.0)
     }
 
     /// The images, with corners corrected for a rolling shutter.
@@ -278,9 +354,12 @@ impl Scan {
         images.into_iter().map(corrected).collect()
     }
 
-    /// Samples for hand-eye calibration, and the images without target with the reasons. `parent_from_camera`: pose of
-    /// the camera, if it is known better than in the rig file.
-    pub(super) fn samples(&self, parent_from_camera: Option<&Transform>) -> (Vec<HandEyeSample>, Vec<Unused>) {
+    /// Samples for hand-eye calibration, and the images without target with the reasons.
+    /// `parent_from_camera`: pose of the camera, if it is known better than in the rig file.
+    pub(super) fn samples(
+        &self,
+        parent_from_camera: Option<&Transform>,
+    ) -> (Vec<HandEyeSample>, Vec<Unused>) {
         let (mut samples, mut unused) = (Vec::new(), Vec::new());
         for (image, arm) in &self.images {
             let name = image.name.clone();
@@ -298,14 +377,23 @@ impl Scan {
                 (Err(reason), _) => unused.push(reason.unused(name)),
                 (_, None) => {
                     let reason = "the robot has no arm".to_owned();
-                    unused.push(Unused { name, reason, is_unreadable: false });
+                    unused.push(Unused {
+                        name,
+                        reason,
+                        is_unreadable: false,
+                    });
                 }
             }
         }
         (samples, unused)
     }
 
-    fn at_mid_exposure(&self, view: &BoardView, arm: &ArmDuringImage, parent_from_camera: &Transform) -> BoardView {
+    fn at_mid_exposure(
+        &self,
+        view: &BoardView,
+        arm: &ArmDuringImage,
+        parent_from_camera: &Transform,
+    ) -> BoardView {
         let motion = FlangeMotion {
             setup: self.setup,
             base_from_flange: arm.base_from_flange,
@@ -313,6 +401,9 @@ impl Scan {
             parent_from_camera: *parent_from_camera,
         };
         let points = corners_at_mid_exposure(&self.camera.intrinsics, &view.points, &motion);
-        BoardView { points, ..view.clone() }
+        BoardView {
+            points,
+            ..view.clone()
+        }
     }
 }

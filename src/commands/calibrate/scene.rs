@@ -14,7 +14,8 @@ use kinematics::Stamp;
 use serde::Serialize;
 use session::calibration_report::SceneReport;
 use session::{
-    Data, DataOptions, Purpose, Refine, RelativePose, SCENE_PARAMS, SceneCalibration, calibrate_scene, corrected_rig,
+    Data, DataOptions, Purpose, Refine, RelativePose, SCENE_PARAMS, SceneCalibration,
+    calibrate_scene, corrected_rig,
 };
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -25,7 +26,8 @@ const DEFAULT_SECS: f64 = 30.0;
 /// Flags of `calibrate scene`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// Recording (.mcap), nerfstudio or TUM RGB-D folder, or rig file (.toml) whose devices are read
+    /// Recording (.mcap), nerfstudio or TUM RGB-D folder, or rig file (.toml) whose devices are
+    /// read
     #[arg(value_name = "RIG|DATA")]
     input: PathBuf,
     /// Use exactly the keyframes listed by an earlier run (keyframes.txt)
@@ -34,8 +36,9 @@ pub(crate) struct Args {
     /// Read a recording with this rig file instead of the one stored in it
     #[arg(long, value_name = "FILE")]
     rig: Option<PathBuf>,
-    /// What to estimate: auto (the parameters that improve the prediction of validation images), or a list of
-    /// extrinsics, time-offset, lens and, with depth, joints, depth-pose, depth-scale and readout
+    /// What to estimate: auto (the parameters that improve the prediction of validation images), or
+    /// a list of extrinsics, time-offset, lens and, with depth, joints, depth-pose, depth-scale and
+    /// readout
     #[arg(long, value_name = "PARAMS", value_delimiter = ',', default_value = "auto", value_parser = scene_param)]
     params: Vec<Refine>,
     /// With a rig file: simulate all devices
@@ -44,7 +47,8 @@ pub(crate) struct Args {
     /// With a rig file: read the devices for S seconds [default: 30]
     #[arg(long, value_name = "S", value_parser = super::super::number_in_range(1.0..=3600.0))]
     seconds: Option<f64>,
-    /// Write the rig file with the accepted corrections. An existing file is kept with the extension .old
+    /// Write the rig file with the accepted corrections. An existing file is kept with the
+    /// extension .old
     #[arg(long, value_name = "FILE")]
     write_rig: Option<PathBuf>,
     #[command(flatten)]
@@ -58,10 +62,11 @@ pub(crate) struct Args {
 #[derive(Debug, Serialize)]
 struct Printed<'a> {
     n_images: usize,
-    /// Calibration after the accepted corrections, by name of the camera; without a rig file, empty.
+    /// Calibration after the accepted corrections, by name of the camera; without a rig file,
+    /// empty.
     cameras: BTreeMap<&'a str, PrintedCamera>,
-    /// For data without a rig file, the pose of each corrected camera in the frame of the given one: multiply each given
-    /// `world_from_camera` by it from the right.
+    /// For data without a rig file, the pose of each corrected camera in the frame of the given
+    /// one: multiply each given `world_from_camera` by it from the right.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     given_from_corrected: BTreeMap<&'a str, [[f64; 4]; 4]>,
     estimates: &'a [Estimate],
@@ -79,7 +84,8 @@ struct PrintedCamera {
     /// Why its extrinsics are those of the rig file.
     refused: Option<String>,
     parent_from_camera: [[f64; 4]; 4],
-    /// Standard deviations along and about the axes of the camera; null if its extrinsics were not estimated.
+    /// Standard deviations along and about the axes of the camera; null if its extrinsics were not
+    /// estimated.
     sigma_mm: Option<[f64; 3]>,
     sigma_deg: Option<[f64; 3]>,
     /// Pose in the frame of the first camera with the same parent; null for that camera.
@@ -100,26 +106,38 @@ struct PrintedRelative {
     sigma_deg: Option<[f64; 3]>,
 }
 
-/// Calibrates and prints the estimates. Exit code 4 if the data do not determine the extrinsics of any camera.
+/// Calibrates and prints the estimates. Exit code 4 if the data do not determine the extrinsics of
+/// any camera.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     if args.params.len() > 1 && args.params.contains(&Refine::Auto) {
-        return Err(BadArgument("--params: auto cannot be combined with other values".into()).into());
+        return Err(
+            BadArgument("--params: auto cannot be combined with other values".into()).into(),
+        );
     }
     let report = args.report.open()?;
     let given = args.rig_as_given()?;
     if let Some(file) = &args.write_rig {
         let Some(rig) = &given else {
             let input = args.input.display();
-            return Err(BadArgument(format!("--write-rig {}: {input} contains no rig file", file.display())).into());
+            return Err(BadArgument(format!(
+                "--write-rig {}: {input} contains no rig file",
+                file.display()
+            ))
+            .into());
         };
         corrected_rig::check_target_file(rig, file)?;
     }
     let data = args.data()?;
     // Devices may report calibration that the rig file does not contain.
-    let rig = if args.sim || data.rig.is_none() || !is_rig_file(&args.input) { given } else { data.rig.clone() };
+    let rig = if args.sim || data.rig.is_none() || !is_rig_file(&args.input) {
+        given
+    } else {
+        data.rig.clone()
+    };
     let result = calibrate_scene(&data, &args.params, rig.as_ref()).map_err(anyhow::Error::from);
-    let (calibration, written) =
-        outputs::reported(result, report, |path, result| args.write_report(path, &data, rig.as_ref(), result))?;
+    let (calibration, written) = outputs::reported(result, report, |path, result| {
+        args.write_report(path, &data, rig.as_ref(), result)
+    })?;
     let exit = exit::from_losses(&data.data_losses);
     let printed = printed(&data, &calibration, refusal(&data, &calibration));
     let is_refused = printed.refused.is_some();
@@ -138,7 +156,10 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     }
     if let (Some(file), Some(before), Some(after)) = (&args.write_rig, &rig, &calibration.rig) {
         if after.has_same_calibration(before) {
-            log::info!("no correction was accepted: {} is not written", file.display());
+            log::info!(
+                "no correction was accepted: {} is not written",
+                file.display()
+            );
         } else {
             corrected_rig::write(after, file)?;
             log::info!("rig file written to {}", file.display());
@@ -152,22 +173,39 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
 fn refusal(data: &Data, calibration: &SceneCalibration) -> Option<String> {
     let alignment = &calibration.alignment;
     if alignment.estimates.is_empty() && !alignment.has_enough_validation_images() {
-        return Some("too few validation images to accept a correction; record more images".to_owned());
+        return Some(
+            "too few validation images to accept a correction; record more images".to_owned(),
+        );
     }
-    let reasons = calibration.refused.iter().map(|(camera, reason)| format!("camera {camera:?}: {reason}"));
-    calibration.is_refused(data).then(|| reasons.collect::<Vec<_>>().join("; "))
+    let reasons = calibration
+        .refused
+        .iter()
+        .map(|(camera, reason)| format!("camera {camera:?}: {reason}"));
+    calibration
+        .is_refused(data)
+        .then(|| reasons.collect::<Vec<_>>().join("; "))
 }
 
 fn scene_param(text: &str) -> Result<Refine, String> {
-    SCENE_PARAMS.into_iter().find(|param| param.name() == text).ok_or_else(|| {
-        let names = SCENE_PARAMS.map(Refine::name);
-        format!("unknown parameter {text:?}, expected {}", listed(&names, "or"))
-    })
+    SCENE_PARAMS
+        .into_iter()
+        .find(|param| param.name() == text)
+        .ok_or_else(|| {
+            let names = SCENE_PARAMS.map(Refine::name);
+            format!(
+                "unknown parameter {text:?}, expected {}",
+                listed(&names, "or")
+            )
+        })
 }
 
 impl Args {
     fn options(&self) -> DataOptions {
-        DataOptions { keyframes: self.keyframes.clone(), rig: self.rig.clone(), ..DataOptions::default() }
+        DataOptions {
+            keyframes: self.keyframes.clone(),
+            rig: self.rig.clone(),
+            ..DataOptions::default()
+        }
     }
 
     fn write_report(
@@ -178,21 +216,30 @@ impl Args {
         result: &anyhow::Result<SceneCalibration>,
     ) -> anyhow::Result<()> {
         let calibration = result.as_ref().ok();
-        let Some(mut heading) = outputs::heading(&self.input, result, data.data_losses.clone()) else { return Ok(()) };
+        let Some(mut heading) = outputs::heading(&self.input, result, data.data_losses.clone())
+        else {
+            return Ok(());
+        };
         if let Some(calibration) = calibration {
             heading.refused = refusal(data, calibration);
-            let kept = calibration
-                .refused
-                .iter()
-                .map(|(camera, reason)| format!("camera {camera:?} keeps its extrinsics: {reason}"));
-            heading.warnings.extend(kept.filter(|_| heading.refused.is_none()));
+            let kept = calibration.refused.iter().map(|(camera, reason)| {
+                format!("camera {camera:?} keeps its extrinsics: {reason}")
+            });
+            heading
+                .warnings
+                .extend(kept.filter(|_| heading.refused.is_none()));
         }
         let mut n_images: BTreeMap<String, usize> = BTreeMap::new();
         for keyframe in &data.keyframes {
             *n_images.entry(keyframe.camera.to_string()).or_default() += 1;
         }
         let n_images: Vec<(String, usize)> = n_images.into_iter().collect();
-        let report = SceneReport { heading: &heading, rig, n_images: &n_images, calibration };
+        let report = SceneReport {
+            heading: &heading,
+            rig,
+            n_images: &n_images,
+            calibration,
+        };
         outputs::write_report(path, &report.html())
     }
 
@@ -205,67 +252,122 @@ impl Args {
             return Ok(Some(Rig::load(&self.input, &[])?));
         }
         let is_recording = session::run_folder::is_recording(&self.input);
-        Ok(is_recording.then(|| Data::rig_as_given(&self.input, &self.options())).transpose()?)
+        Ok(is_recording
+            .then(|| Data::rig_as_given(&self.input, &self.options()))
+            .transpose()?)
     }
 
     fn data(&self) -> anyhow::Result<Data> {
         let bar = ReadBar::new(self.json);
         if !is_rig_file(&self.input) {
             if self.sim || self.seconds.is_some() {
-                return Err(BadArgument("--sim and --seconds need a rig file (.toml) as input".into()).into());
+                return Err(BadArgument(
+                    "--sim and --seconds need a rig file (.toml) as input".into(),
+                )
+                .into());
             }
-            return Ok(Data::load(&self.input, &self.options(), Purpose::Training, &[], &|read| bar.show(read))?);
+            return Ok(Data::load(
+                &self.input,
+                &self.options(),
+                Purpose::Training,
+                &[],
+                &|read| bar.show(read),
+            )?);
         }
         if self.keyframes.is_some() || self.rig.is_some() {
-            return Err(BadArgument("--keyframes and --rig need a recording as input".into()).into());
+            return Err(
+                BadArgument("--keyframes and --rig need a recording as input".into()).into(),
+            );
         }
-        let stop = signals::stop_on_signals_logging("calibrating with the images so far; Ctrl-C again exits at once")?;
-        let overrides = if self.sim { vec![Override::new("sim.lockstep", true)] } else { Vec::new() };
+        let stop = signals::stop_on_signals_logging(
+            "calibrating with the images so far; Ctrl-C again exits at once",
+        )?;
+        let overrides = if self.sim {
+            vec![Override::new("sim.lockstep", true)]
+        } else {
+            Vec::new()
+        };
         let rig = Rig::load(&self.input, &overrides)?;
-        let opened = open::rig(rig, if self.sim { Devices::Sim } else { Devices::Real })?;
+        let opened = open::rig(
+            rig,
+            if self.sim {
+                Devices::Sim
+            } else {
+                Devices::Real
+            },
+        )?;
         let seconds = self.seconds.unwrap_or(DEFAULT_SECS);
         let mut first: Option<Stamp> = None;
         let is_end = |sample: &Sample| {
-            let since_first = sample.stamp().secs_since(*first.get_or_insert(sample.stamp()));
+            let since_first = sample
+                .stamp()
+                .secs_since(*first.get_or_insert(sample.stamp()));
             since_first > seconds || stop.requested()
         };
         Ok(Data::from_devices(opened, is_end, &|read| bar.show(read))?)
     }
 }
 
-fn printed<'a>(data: &Data, calibration: &'a SceneCalibration, refused: Option<String>) -> Printed<'a> {
-    let cameras = calibration.rig.iter().flat_map(|rig| &rig.cameras).map(|camera| {
-        let sigmas = calibration.sigmas(&camera.name);
-        let printed = PrintedCamera {
-            n_images: data.keyframes.iter().filter(|keyframe| *keyframe.camera == *camera.name).count(),
-            refused: calibration.refused.get(&*camera.name).cloned(),
-            parent_from_camera: matrix_of(&camera.parent_from_camera),
-            sigma_mm: sigmas.map(sigma_mm),
-            sigma_deg: sigmas.map(sigma_deg),
-            relative: calibration.relative(&camera.name).map(relative),
-            focal_px: camera.intrinsics.focal_px,
-            principal_px: camera.intrinsics.principal_px,
-            stamp_to_mid_exposure_millis: camera.stamp_to_mid_exposure.as_ref().map(|offset| offset.value_millis),
-        };
-        (&*camera.name, printed)
-    });
+fn printed<'a>(
+    data: &Data,
+    calibration: &'a SceneCalibration,
+    refused: Option<String>,
+) -> Printed<'a> {
+    let cameras = calibration
+        .rig
+        .iter()
+        .flat_map(|rig| &rig.cameras)
+        .map(|camera| {
+            let sigmas = calibration.sigmas(&camera.name);
+            let printed = PrintedCamera {
+                n_images: data
+                    .keyframes
+                    .iter()
+                    .filter(|keyframe| *keyframe.camera == *camera.name)
+                    .count(),
+                refused: calibration.refused.get(&*camera.name).cloned(),
+                parent_from_camera: matrix_of(&camera.parent_from_camera),
+                sigma_mm: sigmas.map(sigma_mm),
+                sigma_deg: sigmas.map(sigma_deg),
+                relative: calibration.relative(&camera.name).map(relative),
+                focal_px: camera.intrinsics.focal_px,
+                principal_px: camera.intrinsics.principal_px,
+                stamp_to_mid_exposure_millis: camera
+                    .stamp_to_mid_exposure
+                    .as_ref()
+                    .map(|offset| offset.value_millis),
+            };
+            (&*camera.name, printed)
+        });
     let alignment = &calibration.alignment;
     Printed {
         n_images: data.keyframes.len(),
         cameras: cameras.collect(),
         given_from_corrected: match calibration.rig {
             Some(_) => BTreeMap::new(),
-            None => alignment.corrections.iter().map(given_from_corrected).collect(),
+            None => alignment
+                .corrections
+                .iter()
+                .map(given_from_corrected)
+                .collect(),
         },
         estimates: &alignment.estimates,
         trials: &alignment.trials,
-        unobservable: alignment.unobservable.iter().map(ToString::to_string).collect(),
+        unobservable: alignment
+            .unobservable
+            .iter()
+            .map(ToString::to_string)
+            .collect(),
         refused,
     }
 }
 
 fn relative(relative: RelativePose) -> PrintedRelative {
-    let RelativePose { first, first_from_camera, sigmas } = relative;
+    let RelativePose {
+        first,
+        first_from_camera,
+        sigmas,
+    } = relative;
     PrintedRelative {
         camera: first,
         camera_from_this: matrix_of(&first_from_camera),
@@ -282,22 +384,35 @@ fn sigma_deg(sigmas: PoseSigmas) -> [f64; 3] {
     sigmas.rad.map(f64::to_degrees)
 }
 
-fn given_from_corrected<'a>((camera, correction): (&'a String, &CameraCorrection)) -> (&'a str, [[f64; 4]; 4]) {
-    let corrected_from_given = rigid_transform(correction.rotation_rad.into(), correction.translation_m.into());
+fn given_from_corrected<'a>(
+    (camera, correction): (&'a String, &CameraCorrection),
+) -> (&'a str, [[f64; 4]; 4]) {
+    let corrected_from_given = rigid_transform(
+        correction.rotation_rad.into(),
+        correction.translation_m.into(),
+    );
     (camera, matrix_of(&corrected_from_given.inverse()))
 }
 
-fn describe(printed: &Printed<'_>, calibration: &SceneCalibration, is_auto: bool) -> anyhow::Result<()> {
+fn describe(
+    printed: &Printed<'_>,
+    calibration: &SceneCalibration,
+    is_auto: bool,
+) -> anyhow::Result<()> {
     let alignment = &calibration.alignment;
     print::line(format!("{} images", printed.n_images))?;
     for line in alignment.lines() {
         print::line(line)?;
     }
     if !is_auto && alignment.trials.iter().any(|trial| !trial.kept) {
-        log::warn!("the corrections are applied as requested, but validation images do not confirm all of them");
+        log::warn!(
+            "the corrections are applied as requested, but validation images do not confirm all of them"
+        );
     }
     if printed.estimates.is_empty() && printed.refused.is_none() {
-        print::line("nothing to correct: no parameter improves the prediction of validation images")?;
+        print::line(
+            "nothing to correct: no parameter improves the prediction of validation images",
+        )?;
     }
     for (name, matrix) in &printed.given_from_corrected {
         print::line(format!(
@@ -309,11 +424,17 @@ fn describe(printed: &Printed<'_>, calibration: &SceneCalibration, is_auto: bool
         if let (Some(reason), None) = (&camera.refused, &printed.refused) {
             log::warn!("camera {name:?} keeps its extrinsics: {reason}");
         }
-        print::line(format!("parent_from_camera of {name}, row by row ({} images):", camera.n_images))?;
+        print::line(format!(
+            "parent_from_camera of {name}, row by row ({} images):",
+            camera.n_images
+        ))?;
         print_matrix(&camera.parent_from_camera)?;
         print_sigmas(camera.sigma_mm, camera.sigma_deg)?;
         if let Some(relative) = &camera.relative {
-            print::line(format!("pose of {name} in the frame of {}, row by row:", relative.camera))?;
+            print::line(format!(
+                "pose of {name} in the frame of {}, row by row:",
+                relative.camera
+            ))?;
             print_matrix(&relative.camera_from_this)?;
             print_sigmas(relative.sigma_mm, relative.sigma_deg)?;
         }
@@ -322,7 +443,9 @@ fn describe(printed: &Printed<'_>, calibration: &SceneCalibration, is_auto: bool
 }
 
 fn print_sigmas(mm: Option<[f64; 3]>, deg: Option<[f64; 3]>) -> anyhow::Result<()> {
-    let (Some(mm), Some(deg)) = (mm, deg) else { return Ok(()) };
+    let (Some(mm), Some(deg)) = (mm, deg) else {
+        return Ok(());
+    };
     let list = |values: [f64; 3]| values.map(|value| format!("{value:.3}")).join(", ");
     print::line(format!(
         "standard deviations along and about the camera's x, y and z axes: {} mm; {} degrees",

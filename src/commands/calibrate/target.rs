@@ -44,8 +44,14 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     let bad = |error: targets::PrintError| BadArgument(error.to_string());
     let paper: Paper = args.paper.parse().map_err(bad)?;
     let pdf = args.target.pdf(paper).map_err(bad)?;
-    if args.out.extension().is_none_or(|extension| !extension.eq_ignore_ascii_case("pdf")) {
-        return Err(BadArgument(format!("--out {}: must end with .pdf", args.out.display())).into());
+    if args
+        .out
+        .extension()
+        .is_none_or(|extension| !extension.eq_ignore_ascii_case("pdf"))
+    {
+        return Err(
+            BadArgument(format!("--out {}: must end with .pdf", args.out.display())).into(),
+        );
     }
     if args.out.exists() {
         return Err(BadArgument(format!("{} exists", args.out.display())).into());

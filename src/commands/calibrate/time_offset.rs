@@ -17,17 +17,19 @@ use std::path::{Path, PathBuf};
 /// Flags of `calibrate time-offset`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// Poses of the first body as rows t,x,y,z,qx,qy,qz,qw (seconds, meters); other lines that are not numbers are
-    /// skipped
+    /// Poses of the first body as rows t,x,y,z,qx,qy,qz,qw (seconds, meters); other lines that are
+    /// not numbers are skipped
     #[arg(value_name = "A.csv")]
     a: PathBuf,
-    /// Poses of the second body, which is rigidly attached to the first, in any other fixed frame and on any other clock
+    /// Poses of the second body, which is rigidly attached to the first, in any other fixed frame
+    /// and on any other clock
     #[arg(value_name = "B.csv")]
     b: PathBuf,
     /// Also estimate the transform between the bodies
     #[arg(long)]
     hand_eye: bool,
-    /// Largest absolute offset to search, seconds [default: all offsets at which the streams overlap]
+    /// Largest absolute offset to search, seconds [default: all offsets at which the streams
+    /// overlap]
     #[arg(long, value_name = "S", value_parser = super::super::number_in_range(0.001..=1e9))]
     max_offset: Option<f64>,
     #[command(flatten)]
@@ -45,7 +47,8 @@ struct Printed {
     sigma_secs: Option<f64>,
     /// RMS difference of the orientations after alignment, degrees.
     residual_deg: Option<f64>,
-    /// Rate of the clock of A relative to that of B, minus 1, in parts per million; null if it is not significant.
+    /// Rate of the clock of A relative to that of B, minus 1, in parts per million; null if it is
+    /// not significant.
     drift_ppm: Option<f64>,
     drift_sigma_ppm: Option<f64>,
     /// Time on the clock of B at which `offset_secs` holds, if there is a drift.
@@ -63,25 +66,38 @@ struct Printed {
     refused: Option<String>,
 }
 
-/// Estimates and prints the offset. Exit code 4 if the motion does not determine it, or a requested transform.
+/// Estimates and prints the offset. Exit code 4 if the motion does not determine it, or a requested
+/// transform.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let report = args.report.open()?;
     let (a, b) = (read(&args.a)?, read(&args.b)?);
-    let options =
-        TimeOffsetOptions { hand_eye: args.hand_eye, max_offset_secs: args.max_offset, ..TimeOffsetOptions::default() };
+    let options = TimeOffsetOptions {
+        hand_eye: args.hand_eye,
+        max_offset_secs: args.max_offset,
+        ..TimeOffsetOptions::default()
+    };
     let result = estimate_time_offset(&a, &b, &options).map_err(anyhow::Error::from);
     let written = match report {
-        Some(path) => args.write_report(path, motion_profile(&a, &b, &options).ok().as_ref(), &result),
+        Some(path) => args.write_report(
+            path,
+            motion_profile(&a, &b, &options).ok().as_ref(),
+            &result,
+        ),
         None => Ok(()),
     };
     let printed = match result {
         Ok(offset) => Printed::of(&offset),
-        Err(error) if exit::of(&error) == Exit::InsufficientData => {
-            Printed { refused: Some(error.to_string()), ..Printed::default() }
-        }
+        Err(error) if exit::of(&error) == Exit::InsufficientData => Printed {
+            refused: Some(error.to_string()),
+            ..Printed::default()
+        },
         Err(error) => return Err(error),
     };
-    let refused = printed.refused.as_ref().or(printed.hand_eye_refused.as_ref()).cloned();
+    let refused = printed
+        .refused
+        .as_ref()
+        .or(printed.hand_eye_refused.as_ref())
+        .cloned();
     if args.json {
         print::json(&printed)?
     } else {
@@ -105,19 +121,36 @@ impl Args {
     ) -> anyhow::Result<()> {
         let offset = result.as_ref().ok();
         let refusal = offset.and_then(|offset| offset.hand_eye.as_ref()?.as_ref().err());
-        let warning = refusal.map(|refusal| format!("the transform between the bodies is refused: {refusal}"));
+        let warning = refusal
+            .map(|refusal| format!("the transform between the bodies is refused: {refusal}"));
         let input = format!("{} and {}", self.a.display(), self.b.display());
-        let Some(heading) = outputs::heading(Path::new(&input), result, warning.into_iter().collect()) else {
+        let Some(heading) =
+            outputs::heading(Path::new(&input), result, warning.into_iter().collect())
+        else {
             return Ok(());
         };
-        outputs::write_report(path, &TimeOffsetReport { heading: &heading, profile, offset }.html())
+        outputs::write_report(
+            path,
+            &TimeOffsetReport {
+                heading: &heading,
+                profile,
+                offset,
+            }
+            .html(),
+        )
     }
 }
 
 impl Printed {
     fn of(offset: &TimeOffset) -> Self {
-        let bodies = offset.hand_eye.as_ref().and_then(|bodies| bodies.as_ref().ok());
-        let refusal = offset.hand_eye.as_ref().and_then(|bodies| bodies.as_ref().err());
+        let bodies = offset
+            .hand_eye
+            .as_ref()
+            .and_then(|bodies| bodies.as_ref().ok());
+        let refusal = offset
+            .hand_eye
+            .as_ref()
+            .and_then(|bodies| bodies.as_ref().err());
         Self {
             offset_secs: Some(offset.offset_secs),
             sigma_secs: Some(offset.sigma_secs),
@@ -134,19 +167,29 @@ impl Printed {
     }
 }
 
-/// Reads the rows of a file. Comments and a header are skipped; a row of numbers that is not a pose is an error.
+/// Reads the rows of a file. Comments and a header are skipped; a row of numbers that is not a pose
+/// is an error.
 fn read(path: &Path) -> anyhow::Result<Vec<PoseSample>> {
     let text = outputs::read_text(path)?;
     let mut samples = Vec::new();
     for (ix, line) in text.lines().enumerate() {
-        let parsed = line.split([',', ' ', ';', '\t']).filter(|field| !field.is_empty()).map(str::parse::<f64>);
-        let Ok(numbers) = parsed.collect::<Result<Vec<f64>, _>>() else { continue };
+        let parsed = line
+            .split([',', ' ', ';', '\t'])
+            .filter(|field| !field.is_empty())
+            .map(str::parse::<f64>);
+        let Ok(numbers) = parsed.collect::<Result<Vec<f64>, _>>() else {
+            continue;
+        };
         if numbers.is_empty() {
             continue;
         }
         let place = || format!("{}, line {}", path.display(), ix + 1);
         let [secs, x, y, z, qx, qy, qz, qw] = <[f64; 8]>::try_from(numbers).map_err(|numbers| {
-            BadArgument(format!("{}: {} numbers, expected 8: t,x,y,z,qx,qy,qz,qw", place(), numbers.len()))
+            BadArgument(format!(
+                "{}: {} numbers, expected 8: t,x,y,z,qx,qy,qz,qw",
+                place(),
+                numbers.len()
+            ))
         })?;
         const MAX_NORM_ERROR: f64 = 0.01;
         let quaternion = Quaternion::new(qw, qx, qy, qz);
@@ -156,9 +199,16 @@ fn read(path: &Path) -> anyhow::Result<Vec<PoseSample>> {
         let norm = quaternion.norm();
         let is_unit = (norm - 1.0).abs() < MAX_NORM_ERROR; // False for NaN.
         if !is_unit {
-            return Err(BadArgument(format!("{}: |qx,qy,qz,qw| is {norm:.3}, expected 1", place())).into());
+            return Err(BadArgument(format!(
+                "{}: |qx,qy,qz,qw| is {norm:.3}, expected 1",
+                place()
+            ))
+            .into());
         }
-        let pose = Transform::from_parts(Translation3::new(x, y, z), UnitQuaternion::from_quaternion(quaternion));
+        let pose = Transform::from_parts(
+            Translation3::new(x, y, z),
+            UnitQuaternion::from_quaternion(quaternion),
+        );
         samples.push(PoseSample { secs, pose });
     }
     if samples.is_empty() {
@@ -168,10 +218,16 @@ fn read(path: &Path) -> anyhow::Result<Vec<PoseSample>> {
 }
 
 fn describe(printed: &Printed) -> anyhow::Result<()> {
-    let (Some(offset), Some(sigma)) = (printed.offset_secs, printed.sigma_secs) else { return Ok(()) };
-    print::line(format!("add {offset:.6} +- {sigma:.6} s to the clock of B to get that of A"))?;
+    let (Some(offset), Some(sigma)) = (printed.offset_secs, printed.sigma_secs) else {
+        return Ok(());
+    };
+    print::line(format!(
+        "add {offset:.6} +- {sigma:.6} s to the clock of B to get that of A"
+    ))?;
     if let Some(residual) = printed.residual_deg {
-        print::line(format!("residual: {residual:.3} degrees (RMS difference of the orientations after alignment)"))?;
+        print::line(format!(
+            "residual: {residual:.3} degrees (RMS difference of the orientations after alignment)"
+        ))?;
     }
     if let (Some(drift), Some(sigma)) = (printed.drift_ppm, printed.drift_sigma_ppm) {
         print::line(format!("drift: {drift:.1} +- {sigma:.1} ppm"))?;

@@ -14,7 +14,10 @@ pub(super) fn gpu() -> Vec<Finding> {
                 "sudo apt-get install -y libvulkan1 mesa-vulkan-drivers   (a software adapter; a GPU needs its own driver)"
                     .to_owned()
             } else {
-                format!("unset FIELDRIG_GPU, or set it to one of: {}", numbered(&adapters))
+                format!(
+                    "unset FIELDRIG_GPU, or set it to one of: {}",
+                    numbered(&adapters)
+                )
             };
             return vec![Finding::fail("gpu", error.to_string(), remedy)];
         }
@@ -26,19 +29,33 @@ pub(super) fn gpu() -> Vec<Finding> {
         Finding::ok("gpu", gpu.describe())
     };
     let optional = gpu.optional();
-    let lanes = optional.subgroup_lanes.map_or("none".to_owned(), |lanes| lanes.to_string());
-    let timestamps = if optional.timestamps { "yes" } else { "no: times per pass are unavailable" };
+    let lanes = optional
+        .subgroup_lanes
+        .map_or("none".to_owned(), |lanes| lanes.to_string());
+    let timestamps = if optional.timestamps {
+        "yes"
+    } else {
+        "no: times per pass are unavailable"
+    };
     let mib = gpu.max_binding_bytes() >> 20;
-    let message = format!("largest buffer {mib} MiB, subgroup lanes {lanes}, timestamps {timestamps}");
+    let message =
+        format!("largest buffer {mib} MiB, subgroup lanes {lanes}, timestamps {timestamps}");
     let mut findings = vec![adapter, Finding::ok("gpu limits", message)];
     let adapters = Gpu::adapters();
     if adapters.len() > 1 {
-        findings.push(Finding::ok("gpus", format!("{}; FIELDRIG_GPU=N selects one", numbered(&adapters))));
+        findings.push(Finding::ok(
+            "gpus",
+            format!("{}; FIELDRIG_GPU=N selects one", numbered(&adapters)),
+        ));
     }
     findings
 }
 
 fn numbered(names: &[String]) -> String {
-    let names: Vec<_> = names.iter().enumerate().map(|(ix, name)| format!("{ix}: {name}")).collect();
+    let names: Vec<_> = names
+        .iter()
+        .enumerate()
+        .map(|(ix, name)| format!("{ix}: {name}"))
+        .collect();
     names.join(", ")
 }

@@ -25,7 +25,8 @@ struct CameraFile {
 impl CameraFiles {
     /// Creates an entry for each RealSense camera of the rig.
     pub(super) fn new(rig: &Rig, folder: &Path) -> anyhow::Result<Self> {
-        let folder = std::path::absolute(folder).context("cannot resolve the folder of the camera files")?;
+        let folder =
+            std::path::absolute(folder).context("cannot resolve the folder of the camera files")?;
         let camera_file = |camera: &Camera| CameraFile {
             camera: camera.clone(),
             path: folder.join(format!("{}.bag", camera.name)),
@@ -33,23 +34,37 @@ impl CameraFiles {
             writer: None,
         };
         let is_realsense = |camera: &&Camera| camera.driver == CameraDriver::Realsense;
-        Ok(Self { camera_files: rig.cameras.iter().filter(is_realsense).map(camera_file).collect() })
+        Ok(Self {
+            camera_files: rig
+                .cameras
+                .iter()
+                .filter(is_realsense)
+                .map(camera_file)
+                .collect(),
+        })
     }
 
     /// Adds an image; images of other cameras are ignored.
     pub(super) fn take(&mut self, image: Image) -> anyhow::Result<()> {
-        match self.camera_files.iter_mut().find(|camera_file| camera_file.camera.name == image.camera) {
+        match self
+            .camera_files
+            .iter_mut()
+            .find(|camera_file| camera_file.camera.name == image.camera)
+        {
             Some(camera_file) => camera_file.take(image),
             None => Ok(()),
         }
     }
 
-    /// Finishes the files and sets them as the files of the rig's cameras, paced by the clock. Returns a description of
-    /// each.
+    /// Finishes the files and sets them as the files of the rig's cameras, paced by the clock.
+    /// Returns a description of each.
     pub(super) fn finish(self, rig: &mut Rig) -> anyhow::Result<Vec<String>> {
         let mut descriptions = Vec::new();
         for camera_file in self.camera_files {
-            let (name, path) = (Arc::clone(&camera_file.camera.name), camera_file.path.clone());
+            let (name, path) = (
+                Arc::clone(&camera_file.camera.name),
+                camera_file.path.clone(),
+            );
             camera_file.finish()?;
             descriptions.push(format!("camera {name:?}: {}", path.display()));
             for camera in rig.cameras.iter_mut().filter(|camera| camera.name == name) {
@@ -66,7 +81,11 @@ impl CameraFile {
             image
         } else {
             // RealSense cameras send uncompressed images, but recordings contain compressed ones.
-            Image { data: image.decode_rgb()?.into(), format: PixelFormat::Rgb8, ..image }
+            Image {
+                data: image.decode_rgb()?.into(),
+                format: PixelFormat::Rgb8,
+                ..image
+            }
         };
         match &mut self.writer {
             Some(writer) => writer.write(&image)?,
@@ -80,7 +99,13 @@ impl CameraFile {
 
     /// Creates the file as soon as images of all expected kinds have arrived.
     fn create_writer(&mut self) -> anyhow::Result<()> {
-        let Camera { name, rate_hz, intrinsics, depth, .. } = &self.camera;
+        let Camera {
+            name,
+            rate_hz,
+            intrinsics,
+            depth,
+            ..
+        } = &self.camera;
         let meters_per_depth_count = self.pending.iter().find_map(|image| match image.format {
             PixelFormat::DepthU16 { meters_per_count } => Some(meters_per_count),
             _ => None,
@@ -98,7 +123,11 @@ impl CameraFile {
         if !has_color {
             return Ok(());
         }
-        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "rates are small numbers above 0")]
+        #[expect(
+            clippy::cast_possible_truncation,
+            clippy::cast_sign_loss,
+            reason = "rates are small numbers above 0"
+        )]
         let rate_hz = rate_hz.round().max(1.0) as u16;
         let emulated = EmulatedCamera {
             name: "fieldrig simulated camera".to_owned(),
@@ -109,14 +138,18 @@ impl CameraFile {
             depth,
         };
         let mut writer = BagWriter::create(&self.path, &emulated)?;
-        self.pending.drain(..).try_for_each(|image| writer.write(&image))?;
+        self.pending
+            .drain(..)
+            .try_for_each(|image| writer.write(&image))?;
         self.writer = Some(writer);
         Ok(())
     }
 
     fn finish(self) -> anyhow::Result<()> {
         let name = &self.camera.name;
-        let writer = self.writer.with_context(|| format!("the recording has too few images of camera {name:?}"))?;
+        let writer = self
+            .writer
+            .with_context(|| format!("the recording has too few images of camera {name:?}"))?;
         Ok(writer.finish()?)
     }
 }

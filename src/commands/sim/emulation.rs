@@ -14,7 +14,8 @@ use drivers::{Sample, can, clock};
 use kinematics::{Stamp, Transform};
 use serde::Serialize;
 use sim::wire::{
-    DatagramTargets, DeviceScript, EmulatedMotors, EmulatedSenders, JointTrack, PlaybackClock, emulate_fci,
+    DatagramTargets, DeviceScript, EmulatedMotors, EmulatedSenders, JointTrack, PlaybackClock,
+    emulate_fci,
 };
 use std::net::{SocketAddr, TcpListener, ToSocketAddrs};
 use std::path::{Path, PathBuf};
@@ -27,7 +28,11 @@ const POLL: Duration = Duration::from_millis(50);
 
 /// Scenes with a bundled rig file for emulated devices.
 const SCENES: [(&str, &str, &str); 2] = [
-    ("static-arm", include_str!("../../../rigs/wire/static-arm.toml"), include_str!("../../../rigs/robots/panda.urdf")),
+    (
+        "static-arm",
+        include_str!("../../../rigs/wire/static-arm.toml"),
+        include_str!("../../../rigs/robots/panda.urdf"),
+    ),
     (
         "mobile-arm",
         include_str!("../../../rigs/wire/mobile-arm.toml"),
@@ -54,10 +59,15 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Exit> {
     if rig.arm.driver == ArmDriver::Franka {
         // Checked before simulating for a minute.
         let address = fci_address(&rig.arm.address)?;
-        TcpListener::bind(address).with_context(|| format!("cannot emulate the controller at {address}"))?;
+        TcpListener::bind(address)
+            .with_context(|| format!("cannot emulate the controller at {address}"))?;
     }
-    let folder = args.out.clone().unwrap_or_else(|| PathBuf::from(format!("sim-{name}")));
-    std::fs::create_dir_all(&folder).with_context(|| format!("cannot create the folder {}", folder.display()))?;
+    let folder = args
+        .out
+        .clone()
+        .unwrap_or_else(|| PathBuf::from(format!("sim-{name}")));
+    std::fs::create_dir_all(&folder)
+        .with_context(|| format!("cannot create the folder {}", folder.display()))?;
     let recording = match &args.from {
         Some(path) => path.clone(),
         None => match simulate(args, &rig, &folder, &stop)? {
@@ -66,13 +76,23 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Exit> {
         },
     };
     let mut camera_files = CameraFiles::new(&rig, &folder)?;
-    let Some(script) = read(&recording, args, &mut camera_files, &stop)? else { return Ok(Exit::Done) };
+    let Some(script) = read(&recording, args, &mut camera_files, &stop)? else {
+        return Ok(Exit::Done);
+    };
     let mut descriptions = camera_files.finish(&mut rig)?;
     let first = script.joints.first().map(|state| state.stamp);
-    let first = first.or(script.poses.first().map(|pose| pose.stamp)).unwrap_or_default();
-    let playback_clock = PlaybackClock { scripted: first, emulated: clock::now().plus_secs(args.start_in) };
+    let first = first
+        .or(script.poses.first().map(|pose| pose.stamp))
+        .unwrap_or_default();
+    let playback_clock = PlaybackClock {
+        scripted: first,
+        emulated: clock::now().plus_secs(args.start_in),
+    };
     for camera in &mut rig.cameras {
-        camera.realsense.clock_offset_nanos = playback_clock.emulated.0.saturating_sub(playback_clock.scripted.0);
+        camera.realsense.clock_offset_nanos = playback_clock
+            .emulated
+            .0
+            .saturating_sub(playback_clock.scripted.0);
     }
     let rig_file = write_rig(&folder, &rig)?;
     let emulated = EmulatedDevices::start(&rig, &script, playback_clock, args)?;
@@ -109,9 +129,16 @@ fn load(rig_or_scene: &str) -> anyhow::Result<(String, Rig)> {
     let path = Path::new(rig_or_scene);
     if !path.exists() {
         let scenes: Vec<_> = SCENES.iter().map(|(name, ..)| *name).collect();
-        return Err(BadArgument(format!("there is no rig file {rig_or_scene:?}; scenes: {}", scenes.join(", "))).into());
+        return Err(BadArgument(format!(
+            "there is no rig file {rig_or_scene:?}; scenes: {}",
+            scenes.join(", ")
+        ))
+        .into());
     }
-    let name = path.file_stem().map_or_else(|| "rig".to_owned(), |stem| stem.to_string_lossy().into_owned());
+    let name = path.file_stem().map_or_else(
+        || "rig".to_owned(),
+        |stem| stem.to_string_lossy().into_owned(),
+    );
     Ok((name, Rig::load(path, &[])?))
 }
 
@@ -130,7 +157,9 @@ fn check(rig: &Rig) -> Result<(), BadArgument> {
 fn simulate(args: &Args, rig: &Rig, folder: &Path, stop: &Stop) -> anyhow::Result<Option<PathBuf>> {
     let mut simulated = rig.clone();
     simulated.sim.lockstep = true;
-    let Opened { rig, mut source, .. } = open::rig(simulated, Devices::Sim)?;
+    let Opened {
+        rig, mut source, ..
+    } = open::rig(simulated, Devices::Sim)?;
     let path = folder.join(SIMULATION_FILE);
     // A leftover of an earlier or interrupted simulation.
     match std::fs::remove_file(&path) {
@@ -143,7 +172,9 @@ fn simulate(args: &Args, rig: &Rig, folder: &Path, stop: &Stop) -> anyhow::Resul
     let bar = print::bar(None, "{spinner} {elapsed} {msg}", args.json);
     let mut first: Option<Stamp> = None;
     while let Some(sample) = source.next_sample()? {
-        let secs = sample.stamp().secs_since(*first.get_or_insert(sample.stamp()));
+        let secs = sample
+            .stamp()
+            .secs_since(*first.get_or_insert(sample.stamp()));
         if secs > args.seconds {
             break;
         }
@@ -158,19 +189,24 @@ fn simulate(args: &Args, rig: &Rig, folder: &Path, stop: &Stop) -> anyhow::Resul
     Ok(Some(path))
 }
 
-/// Reads the samples of the first `args.seconds` of a recording; images go to the camera files. `None` if interrupted.
+/// Reads the samples of the first `args.seconds` of a recording; images go to the camera files.
+/// `None` if interrupted.
 fn read(
     recording: &Path,
     args: &Args,
     camera_files: &mut CameraFiles,
     stop: &Stop,
 ) -> anyhow::Result<Option<DeviceScript>> {
-    let Opened { mut source, damage, .. } = open::recording(recording, None, &[])?;
+    let Opened {
+        mut source, damage, ..
+    } = open::recording(recording, None, &[])?;
     let bar = print::bar(None, "{spinner} {elapsed} {msg}", args.json);
     let mut script = DeviceScript::default();
     let mut first: Option<Stamp> = None;
     while let Some(sample) = source.next_sample()? {
-        let secs = sample.stamp().secs_since(*first.get_or_insert(sample.stamp()));
+        let secs = sample
+            .stamp()
+            .secs_since(*first.get_or_insert(sample.stamp()));
         if secs > args.seconds {
             break;
         }
@@ -210,8 +246,16 @@ struct EmulatedDevices {
 }
 
 impl EmulatedDevices {
-    fn start(rig: &Rig, script: &DeviceScript, playback_clock: PlaybackClock, args: &Args) -> anyhow::Result<Self> {
-        let track = || JointTrack::new(&script.joints, playback_clock).context("cannot play back the joint states");
+    fn start(
+        rig: &Rig,
+        script: &DeviceScript,
+        playback_clock: PlaybackClock,
+        args: &Args,
+    ) -> anyhow::Result<Self> {
+        let track = || {
+            JointTrack::new(&script.joints, playback_clock)
+                .context("cannot play back the joint states")
+        };
         let (mut robot, mut motors) = (None, None);
         let mut datagram_targets = DatagramTargets::default();
         let mut descriptions = Vec::new();
@@ -219,7 +263,11 @@ impl EmulatedDevices {
             ArmDriver::Franka => {
                 let answer_wait = Duration::from_secs_f64(args.answer_wait / 1000.0);
                 let open = emulate_fci(track()?, robot_config(rig, &args.fci)?, answer_wait, None)?;
-                descriptions.push(format!("arm: a Franka controller at {}, FCI {}", open.address(), args.fci));
+                descriptions.push(format!(
+                    "arm: a Franka controller at {}, FCI {}",
+                    open.address(),
+                    args.fci
+                ));
                 robot = Some(open);
             }
             ArmDriver::Can => {
@@ -230,7 +278,11 @@ impl EmulatedDevices {
                 };
                 motors = Some(EmulatedMotors::start(&track()?, &config)?);
                 let buses: Vec<_> = rig.arm.buses.iter().map(|bus| &*bus.interface).collect();
-                descriptions.push(format!("arm: {} motors on {}", rig.arm.motors.len(), buses.join(", ")));
+                descriptions.push(format!(
+                    "arm: {} motors on {}",
+                    rig.arm.motors.len(),
+                    buses.join(", ")
+                ));
             }
             ArmDriver::Udp => {
                 let address = open::udp_arm_address(rig)?;
@@ -243,12 +295,26 @@ impl EmulatedDevices {
             descriptions.push(format!("base: datagrams to {}", rig.base.address));
             datagram_targets.base = Some(rig.base.address);
         }
-        for scanner in rig.scanners.iter().filter(|scanner| scanner.driver == ScannerDriver::Udp) {
-            descriptions.push(format!("range scanner {:?}: datagrams to {}", scanner.name, scanner.address));
-            datagram_targets.scanners.push((scanner.name.to_string(), scanner.address));
+        for scanner in rig
+            .scanners
+            .iter()
+            .filter(|scanner| scanner.driver == ScannerDriver::Udp)
+        {
+            descriptions.push(format!(
+                "range scanner {:?}: datagrams to {}",
+                scanner.name, scanner.address
+            ));
+            datagram_targets
+                .scanners
+                .push((scanner.name.to_string(), scanner.address));
         }
         let senders = EmulatedSenders::start(script, playback_clock, datagram_targets)?;
-        Ok(Self { _robot: robot, _motors: motors, _senders: senders, descriptions })
+        Ok(Self {
+            _robot: robot,
+            _motors: motors,
+            _senders: senders,
+            descriptions,
+        })
     }
 }
 
@@ -260,18 +326,29 @@ fn robot_config(rig: &Rig, fci: &str) -> anyhow::Result<RobotConfig> {
     };
     let address = fci_address(&rig.arm.address)?;
     let chain = open::franka_chain(rig)?;
-    Ok(RobotConfig { address, version, chain, flange_from_tool: Transform::identity(), limits })
+    Ok(RobotConfig {
+        address,
+        version,
+        chain,
+        flange_from_tool: Transform::identity(),
+        limits,
+    })
 }
 
 /// Address at which the emulated controller listens; it must belong to this computer.
 fn fci_address(text: &str) -> anyhow::Result<SocketAddr> {
     let found = match text.parse() {
         Ok(address) => Some(address),
-        Err(_) => (text, FCI_PORT).to_socket_addrs().ok().and_then(|mut all| all.next()),
+        Err(_) => (text, FCI_PORT)
+            .to_socket_addrs()
+            .ok()
+            .and_then(|mut all| all.next()),
     };
     match found {
         Some(address) => Ok(address),
-        None => bail!("arm.address is {text:?}, expected an address of this computer, such as 127.0.0.1"),
+        None => bail!(
+            "arm.address is {text:?}, expected an address of this computer, such as 127.0.0.1"
+        ),
     }
 }
 
@@ -289,9 +366,9 @@ fn wait(stop: &Stop, starts_at: Stamp, args: &Args) -> anyhow::Result<()> {
         if secs >= args.seconds && !std::mem::replace(&mut is_over, true) {
             match args.json {
                 true => print::report_json(&serde_json::json!({ "event": "over" }))?,
-                false => {
-                    print::report("Playback has ended: the emulated devices stand still but respond until Ctrl-C.")
-                }
+                false => print::report(
+                    "Playback has ended: the emulated devices stand still but respond until Ctrl-C.",
+                ),
             }
         }
         std::thread::sleep(POLL);
@@ -309,7 +386,8 @@ mod tests {
         let rigs = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs");
         for (name, ..) in SCENES {
             let (_, wire) = load(name).expect("the scene is bundled");
-            let mut plain = Rig::load(&rigs.join(format!("{name}.toml")), &[]).expect("the rig file is bundled");
+            let mut plain = Rig::load(&rigs.join(format!("{name}.toml")), &[])
+                .expect("the rig file is bundled");
             plain.arm = wire.arm.clone();
             plain.base.driver = wire.base.driver;
             for (camera, on_wire) in plain.cameras.iter_mut().zip(&wire.cameras) {
@@ -319,7 +397,10 @@ mod tests {
                 camera.realsense = on_wire.realsense.clone();
             }
             assert!(plain == wire, "{name}");
-            assert!(Rig::load(&rigs.join(format!("wire/{name}.toml")), &[]).expect("the same file") == wire);
+            assert!(
+                Rig::load(&rigs.join(format!("wire/{name}.toml")), &[]).expect("the same file")
+                    == wire
+            );
         }
     }
 
@@ -328,8 +409,14 @@ mod tests {
         let rigs = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs");
         let plain = Rig::load(&rigs.join("static-arm.toml"), &[]).expect("the rig file is bundled");
         assert!(check(&plain).is_err_and(|error| error.to_string().contains("arm.driver is sim")));
-        assert!(load("no-such-rig").is_err_and(|error| error.to_string().contains("scenes: static-arm, mobile-arm")));
-        assert_eq!(fci_address("127.0.0.1").expect("an address").port(), FCI_PORT);
+        assert!(
+            load("no-such-rig")
+                .is_err_and(|error| error.to_string().contains("scenes: static-arm, mobile-arm"))
+        );
+        assert_eq!(
+            fci_address("127.0.0.1").expect("an address").port(),
+            FCI_PORT
+        );
         assert_eq!(fci_address("127.0.0.1:5").expect("an address").port(), 5);
         assert!(fci_address("").is_err());
     }

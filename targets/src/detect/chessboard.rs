@@ -46,8 +46,12 @@ impl Levels {
     pub(super) fn grids(&self) -> impl Iterator<Item = Lattice> {
         self.planes.iter().filter_map(|(plane, scale)| {
             let saddles = saddle::find(plane);
-            let mut grid = grid::link(plane, &saddles, MIN_CORNERS).into_iter().next()?;
-            grid.corners.values_mut().for_each(|pixel| *pixel = pixel.map(|value| value * scale));
+            let mut grid = grid::link(plane, &saddles, MIN_CORNERS)
+                .into_iter()
+                .next()?;
+            grid.corners
+                .values_mut()
+                .for_each(|pixel| *pixel = pixel.map(|value| value * scale));
             Some(grid)
         })
     }
@@ -61,19 +65,34 @@ pub(super) fn detect(
     plane: &Plane,
 ) -> Result<Detection, NotDetected> {
     let smoothed = plane.smoothed();
-    let mut failure = NotDetected::Nothing { target: target.kind() };
+    let mut failure = NotDetected::Nothing {
+        target: target.kind(),
+    };
     let mut n_best = 0;
     for mut grid in Levels::new(plane).grids() {
         match matching(&mut grid, inner, &smoothed) {
             Ok(mut lattice) => {
                 let surface = target.surface();
-                Printed { surface, square_m, first_m: [0.0; 2], side_m: square_m }.align(plane, &mut lattice);
-                let id = |cell: Cell| Some(u32::try_from(cell[1]).ok()? * inner[0] + u32::try_from(cell[0]).ok()?);
-                let pixels = lattice.corners.iter().filter_map(|(&cell, &pixel)| Some((id(cell)?, pixel)));
+                Printed {
+                    surface,
+                    square_m,
+                    first_m: [0.0; 2],
+                    side_m: square_m,
+                }
+                .align(plane, &mut lattice);
+                let id = |cell: Cell| {
+                    Some(u32::try_from(cell[1]).ok()? * inner[0] + u32::try_from(cell[0]).ok()?)
+                };
+                let pixels = lattice
+                    .corners
+                    .iter()
+                    .filter_map(|(&cell, &pixel)| Some((id(cell)?, pixel)));
                 return Ok(target.detection(pixels, false));
             }
             // At another resolution, a part of a larger board may look like this one.
-            Err(reason @ NotDetected::OtherSize { .. }) if is_complete_and_larger(&grid, inner) => return Err(reason),
+            Err(reason @ NotDetected::OtherSize { .. }) if is_complete_and_larger(&grid, inner) => {
+                return Err(reason);
+            }
             Err(reason) if grid.corners.len() > n_best => {
                 n_best = grid.corners.len();
                 failure = reason;
@@ -87,11 +106,14 @@ pub(super) fn detect(
 /// Whether almost all corners of a larger grid were found.
 fn is_complete_and_larger(grid: &Lattice, inner: [u32; 2]) -> bool {
     const MIN_PERCENT: usize = 95;
-    let Some([low, high]) = grid.range() else { return false };
+    let Some([low, high]) = grid.range() else {
+        return false;
+    };
     let size = [high[0] - low[0] + 1, high[1] - low[1] + 1].map(i32::cast_unsigned);
     let is_larger = |size: [u32; 2]| size[0] >= inner[0] && size[1] >= inner[1] && size != inner;
     let n = (size[0] * size[1]) as usize;
-    (is_larger(size) || is_larger([size[1], size[0]])) && grid.corners.len() * 100 >= n * MIN_PERCENT
+    (is_larger(size) || is_larger([size[1], size[0]]))
+        && grid.corners.len() * 100 >= n * MIN_PERCENT
 }
 
 /// Refines a grid and renumbers its corners as those of the board.
@@ -99,14 +121,24 @@ fn matching(lattice: &mut Lattice, inner: [u32; 2], plane: &Plane) -> Result<Lat
     // Lines at the edge of the board may have been missed.
     const GROWN_LINES: i32 = 1;
     if let Some([low, high]) = lattice.range() {
-        let is_smaller = (high[0] - low[0] + 1) * (high[1] - low[1] + 1) < (inner[0] * inner[1]).cast_signed();
+        let is_smaller =
+            (high[0] - low[0] + 1) * (high[1] - low[1] + 1) < (inner[0] * inner[1]).cast_signed();
         let grown = if is_smaller { GROWN_LINES } else { 0 };
-        lattice.complete(plane, [low.map(|value| value - grown), high.map(|value| value + grown)], REFINEMENT);
+        lattice.complete(
+            plane,
+            [
+                low.map(|value| value - grown),
+                high.map(|value| value + grown),
+            ],
+            REFINEMENT,
+        );
     }
     lattice.refine(plane, REFINEMENT);
     lattice.remove_outliers();
     trim(lattice);
-    let nothing = NotDetected::Nothing { target: "chessboard" };
+    let nothing = NotDetected::Nothing {
+        target: "chessboard",
+    };
     let [low, high] = lattice.range().ok_or(nothing)?;
     let size = [high[0] - low[0] + 1, high[1] - low[1] + 1].map(i32::cast_unsigned);
     if size != inner && size != [inner[1], inner[0]] {
@@ -115,39 +147,78 @@ fn matching(lattice: &mut Lattice, inner: [u32; 2], plane: &Plane) -> Result<Lat
     let expected = (inner[0] * inner[1]) as usize;
     let min = (expected * MIN_CORNER_PERCENT).div_ceil(100);
     if lattice.corners.len() < min {
-        return Err(NotDetected::TooFewCorners { found: lattice.corners.len(), min });
+        return Err(NotDetected::TooFewCorners {
+            found: lattice.corners.len(),
+            min,
+        });
     }
     let is_odd = (inner[0] + inner[1]) % 2 == 1;
-    let candidates = (0..4).filter(|&turns| inner == if turns % 2 == 0 { size } else { [size[1], size[0]] });
+    let candidates = (0..4).filter(|&turns| {
+        inner
+            == if turns % 2 == 0 {
+                size
+            } else {
+                [size[1], size[0]]
+            }
+    });
     let oriented = candidates.filter_map(|turns| {
-        let corner =
-            [if turns == 1 || turns == 2 { high[0] } else { low[0] }, if turns >= 2 { high[1] } else { low[1] }];
-        // The square at the upper left of the board's first corner is black. Without rotation, it is the one that
-        // the grid counts as upper left, and colors alternate. Rotations by 90 degrees look at another square.
+        let corner = [
+            if turns == 1 || turns == 2 {
+                high[0]
+            } else {
+                low[0]
+            },
+            if turns >= 2 { high[1] } else { low[1] },
+        ];
+        // The square at the upper left of the board's first corner is black. Without rotation, it
+        // is the one that the grid counts as upper left, and colors alternate. Rotations by 90
+        // degrees look at another square.
         let is_black = (corner[0] + corner[1] + turns).rem_euclid(2) == 0;
         (!is_odd || is_black).then_some((is_black, turns, corner))
     });
-    let oriented: Vec<_> =
-        oriented.map(|(is_black, turns, corner)| (is_black, renumber(lattice, corner, turns as usize))).collect();
-    // A square board with an odd number of corners per side changes colors with every rotation by 90 degrees.
+    let oriented: Vec<_> = oriented
+        .map(|(is_black, turns, corner)| (is_black, renumber(lattice, corner, turns as usize)))
+        .collect();
+    // A square board with an odd number of corners per side changes colors with every rotation by
+    // 90 degrees.
     let has_black = oriented.iter().any(|(is_black, _)| *is_black);
     let from_right = |lattice: &Lattice| x_axis_rad(lattice).map_or(f64::INFINITY, f64::abs);
-    let candidates = oriented.into_iter().filter(|(is_black, _)| *is_black || !has_black).map(|(_, lattice)| lattice);
+    let candidates = oriented
+        .into_iter()
+        .filter(|(is_black, _)| *is_black || !has_black)
+        .map(|(_, lattice)| lattice);
     let best = candidates.min_by(|a, b| from_right(a).total_cmp(&from_right(b)));
-    best.ok_or(NotDetected::Nothing { target: "chessboard" })
+    best.ok_or(NotDetected::Nothing {
+        target: "chessboard",
+    })
 }
 
 /// Removes outermost lines that have few corners: these are not part of the board.
 pub(super) fn trim(lattice: &mut Lattice) {
     while let Some([low, high]) = lattice.range() {
         let line = |axis: usize, at: i32| {
-            let n = lattice.corners.keys().filter(|cell| cell[axis] == at).count();
-            (n as f64 / f64::from(high[1 - axis] - low[1 - axis] + 1), axis, at)
+            let n = lattice
+                .corners
+                .keys()
+                .filter(|cell| cell[axis] == at)
+                .count();
+            (
+                n as f64 / f64::from(high[1 - axis] - low[1 - axis] + 1),
+                axis,
+                at,
+            )
         };
-        let lines = [line(0, low[0]), line(0, high[0]), line(1, low[1]), line(1, high[1])];
+        let lines = [
+            line(0, low[0]),
+            line(0, high[0]),
+            line(1, low[1]),
+            line(1, high[1]),
+        ];
         let weakest = lines.into_iter().min_by(|a, b| a.0.total_cmp(&b.0));
         match weakest {
-            Some((frac, axis, at)) if frac < MIN_LINE_FRAC => lattice.corners.retain(|cell, _| cell[axis] != at),
+            Some((frac, axis, at)) if frac < MIN_LINE_FRAC => {
+                lattice.corners.retain(|cell, _| cell[axis] != at)
+            }
             _ => return,
         }
     }
@@ -158,12 +229,22 @@ fn renumber(lattice: &Lattice, corner: Cell, turns: usize) -> Lattice {
     let (x, y) = (STEPS[turns], STEPS[(turns + 1) % 4]);
     let cell = |cell: &Cell| {
         let offset = [cell[0] - corner[0], cell[1] - corner[1]];
-        [offset[0] * x[0] + offset[1] * x[1], offset[0] * y[0] + offset[1] * y[1]]
+        [
+            offset[0] * x[0] + offset[1] * x[1],
+            offset[0] * y[0] + offset[1] * y[1],
+        ]
     };
-    Lattice { corners: lattice.corners.iter().map(|(at, &pixel)| (cell(at), pixel)).collect() }
+    Lattice {
+        corners: lattice
+            .corners
+            .iter()
+            .map(|(at, &pixel)| (cell(at), pixel))
+            .collect(),
+    }
 }
 
-/// Direction of the board's x axis in the image, from the pair of corners farthest apart in any row.
+/// Direction of the board's x axis in the image, from the pair of corners farthest apart in any
+/// row.
 fn x_axis_rad(lattice: &Lattice) -> Option<f64> {
     let mut sum = [0.0; 2];
     for (cell, pixel) in &lattice.corners {
@@ -179,7 +260,13 @@ fn wrong_size(lattice: &Lattice, size: [u32; 2], inner: [u32; 2], plane: &Plane)
     // Columns are the longer side of the target, in the message only.
     let is_swapped = (size[0] < size[1]) != (inner[0] < inner[1]);
     let [columns, rows] = if is_swapped { [size[1], size[0]] } else { size };
-    let (found, expected) = (Counts { columns, rows }, Counts { columns: inner[0], rows: inner[1] });
+    let (found, expected) = (
+        Counts { columns, rows },
+        Counts {
+            columns: inner[0],
+            rows: inner[1],
+        },
+    );
     let is_at_border = |(cell, pixel): (&Cell, &[f64; 2])| {
         let spacing_px = lattice.spacing_px(*cell).unwrap_or(0.0);
         !plane.contains(*pixel, 1.5 * spacing_px)
@@ -187,7 +274,9 @@ fn wrong_size(lattice: &Lattice, size: [u32; 2], inner: [u32; 2], plane: &Plane)
     let is_smaller = columns <= inner[0] && rows <= inner[1];
     const MIN_SIDE: u32 = 3;
     if size.iter().any(|&side| side < MIN_SIDE) {
-        NotDetected::Nothing { target: "chessboard" }
+        NotDetected::Nothing {
+            target: "chessboard",
+        }
     } else if is_smaller && lattice.corners.iter().any(is_at_border) {
         NotDetected::Partial { found, expected }
     } else {

@@ -22,37 +22,58 @@ pub(super) const MIN_SIZE_CHANGE: f64 = 0.1;
 ///
 /// Each marker measures the distance to its neighbors in units of its side.
 ///
-/// * `min_change`: smaller relative differences are ignored. Blur makes small markers look up to 10 % smaller.
-pub(super) fn marker_size(target: &TargetSpec, markers: &[Marker], min_change: f64) -> Option<NotDetected> {
+/// * `min_change`: smaller relative differences are ignored. Blur makes small markers look up to 10
+///   % smaller.
+pub(super) fn marker_size(
+    target: &TargetSpec,
+    markers: &[Marker],
+    min_change: f64,
+) -> Option<NotDetected> {
     const MIN_PAIRS: usize = 4;
     /// Pairs that measure the same size, if the markers are in the right places.
     const MIN_SAME_FRAC: f64 = 0.8;
     const SAME: f64 = 0.1;
-    let Pattern::Charuco { square_m, marker_m, .. } = target.pattern else { return None };
+    let Pattern::Charuco {
+        square_m, marker_m, ..
+    } = target.pattern
+    else {
+        return None;
+    };
     let expected_frac = marker_m / square_m;
     let measured = |layout: &Layout| -> Option<f64> {
         let fracs = neighbor_fracs(layout, markers, square_m, marker_m);
         let mut sorted = fracs.clone();
         sorted.sort_by(f64::total_cmp);
         let median = *sorted.get(sorted.len() / 2)?;
-        let n_same = fracs.iter().filter(|frac| (*frac / median - 1.0).abs() < SAME).count();
-        let is_consistent = fracs.len() >= MIN_PAIRS && n_same as f64 >= MIN_SAME_FRAC * fracs.len() as f64;
+        let n_same = fracs
+            .iter()
+            .filter(|frac| (*frac / median - 1.0).abs() < SAME)
+            .count();
+        let is_consistent =
+            fracs.len() >= MIN_PAIRS && n_same as f64 >= MIN_SAME_FRAC * fracs.len() as f64;
         is_consistent.then_some(median)
     };
     let found_frac = layouts(&target.pattern).iter().find_map(measured)?;
     let is_possible = found_frac > 0.0 && found_frac < 1.0;
-    (is_possible && (found_frac / expected_frac - 1.0).abs() > min_change).then(|| NotDetected::MarkerSize {
-        found_frac,
-        expected_frac,
-        square: Millimeters(square_m).to_string(),
-        marker: format!("{:.0}mm", 1e3 * found_frac * square_m),
+    (is_possible && (found_frac / expected_frac - 1.0).abs() > min_change).then(|| {
+        NotDetected::MarkerSize {
+            found_frac,
+            expected_frac,
+            square: Millimeters(square_m).to_string(),
+            marker: format!("{:.0}mm", 1e3 * found_frac * square_m),
+        }
     })
 }
 
-/// The counts of the board that the markers form, if they fit other counts better than those of the target.
+/// The counts of the board that the markers form, if they fit other counts better than those of the
+/// target.
 ///
 /// * `n_confirmed`: number of markers that fit those of the target.
-pub(super) fn other_counts(target: &TargetSpec, markers: &[Marker], n_confirmed: usize) -> Option<NotDetected> {
+pub(super) fn other_counts(
+    target: &TargetSpec,
+    markers: &[Marker],
+    n_confirmed: usize,
+) -> Option<NotDetected> {
     const MAX_COLUMNS: u32 = 40;
     const MIN_CONFIRMED: usize = 4;
     let (expected, what) = match target.pattern {
@@ -62,21 +83,45 @@ pub(super) fn other_counts(target: &TargetSpec, markers: &[Marker], n_confirmed:
     };
     let n_ids = markers.iter().map(|marker| marker.id + 1).max()?;
     let with = |counts: [u32; 2]| match target.pattern.clone() {
-        Pattern::Charuco { square_m, marker_m, dictionary, .. } => {
-            Pattern::Charuco { squares: counts, square_m, marker_m, dictionary }
-        }
-        Pattern::Aprilgrid { tag_m, spacing_frac, .. } => Pattern::Aprilgrid { tags: counts, tag_m, spacing_frac },
+        Pattern::Charuco {
+            square_m,
+            marker_m,
+            dictionary,
+            ..
+        } => Pattern::Charuco {
+            squares: counts,
+            square_m,
+            marker_m,
+            dictionary,
+        },
+        Pattern::Aprilgrid {
+            tag_m,
+            spacing_frac,
+            ..
+        } => Pattern::Aprilgrid {
+            tags: counts,
+            tag_m,
+            spacing_frac,
+        },
         other => other,
     };
     // The number of columns alone determines where a marker is.
-    let counts = (2..=MAX_COLUMNS).filter(|columns| *columns != expected[0]).map(|columns| {
-        let per_marker = if what == "squares" { 2 } else { 1 };
-        let needed = (per_marker * n_ids).div_ceil(columns).max(2);
-        let is_swapped = columns == expected[1] && needed <= expected[0];
-        [columns, if is_swapped { expected[0] } else { needed }]
+    let counts = (2..=MAX_COLUMNS)
+        .filter(|columns| *columns != expected[0])
+        .map(|columns| {
+            let per_marker = if what == "squares" { 2 } else { 1 };
+            let needed = (per_marker * n_ids).div_ceil(columns).max(2);
+            let is_swapped = columns == expected[1] && needed <= expected[0];
+            [columns, if is_swapped { expected[0] } else { needed }]
+        });
+    let fits = counts.filter_map(|counts| {
+        Some((
+            counts,
+            layout::fit(layouts(&with(counts)), markers)?.n_confirmed,
+        ))
     });
-    let fits = counts.filter_map(|counts| Some((counts, layout::fit(layouts(&with(counts)), markers)?.n_confirmed)));
-    let (found, n_found) = fits.max_by_key(|(counts, n)| (*n, *counts == [expected[1], expected[0]]))?;
+    let (found, n_found) =
+        fits.max_by_key(|(counts, n)| (*n, *counts == [expected[1], expected[0]]))?;
     let of = |[columns, rows]: [u32; 2]| Counts { columns, rows };
     (n_found >= MIN_CONFIRMED && n_found > 2 * n_confirmed).then(|| NotDetected::OtherCounts {
         found: of(found),
@@ -90,13 +135,23 @@ fn neighbor_fracs(layout: &Layout, markers: &[Marker], square_m: f64, marker_m: 
     const MAX_SQUARES: f64 = 1.6; // Diagonal neighbors.
     let mut fracs = Vec::new();
     for from in markers {
-        let Some(corners_m) = layout.corners_m.get(from.id as usize) else { continue };
+        let Some(corners_m) = layout.corners_m.get(from.id as usize) else {
+            continue;
+        };
         let (center_m, center_px) = (layout::center(corners_m), layout::center(&from.corners_px));
-        let relative = |quad: &Quad, [x, y]: [f64; 2]| quad.map(|corner| [corner[0] - x, corner[1] - y]);
-        let (on_board, in_image) = (relative(corners_m, center_m), relative(&from.corners_px, center_px));
-        let Some(board_from_pixel) = Homography::from_corners(&in_image, &on_board) else { continue };
+        let relative =
+            |quad: &Quad, [x, y]: [f64; 2]| quad.map(|corner| [corner[0] - x, corner[1] - y]);
+        let (on_board, in_image) = (
+            relative(corners_m, center_m),
+            relative(&from.corners_px, center_px),
+        );
+        let Some(board_from_pixel) = Homography::from_corners(&in_image, &on_board) else {
+            continue;
+        };
         for to in markers.iter().filter(|to| to.id != from.id) {
-            let Some(to_m) = layout.corners_m.get(to.id as usize) else { continue };
+            let Some(to_m) = layout.corners_m.get(to.id as usize) else {
+                continue;
+            };
             let squares = distance(layout::center(to_m), center_m) / square_m;
             let [x, y] = layout::center(&to.corners_px);
             let [across, along] = board_from_pixel.map([x - center_px[0], y - center_px[1]]);
@@ -119,40 +174,74 @@ pub(super) fn markers(
 ) -> NotDetected {
     let n_on_target = match target.pattern {
         Pattern::Tag { .. } => 1,
-        _ => layouts(&target.pattern).first().map_or(0, |layout| layout.corners_m.len()),
+        _ => layouts(&target.pattern)
+            .first()
+            .map_or(0, |layout| layout.corners_m.len()),
     };
-    let first_id = if let Pattern::Tag { id, .. } = target.pattern { id } else { 0 };
+    let first_id = if let Pattern::Tag { id, .. } = target.pattern {
+        id
+    } else {
+        0
+    };
     let expected = first_id..first_id + u32::try_from(n_on_target).unwrap_or(0);
     let mut ids: Vec<u32> = markers.iter().map(|marker| marker.id).collect();
     ids.dedup();
-    let is_plausible =
-        |n: usize, dictionary: &Dictionary| n >= MIN_MARKERS || (n > 0 && dictionary.n_bits() >= MIN_BITS_OF_SINGLE);
+    let is_plausible = |n: usize, dictionary: &Dictionary| {
+        n >= MIN_MARKERS || (n > 0 && dictionary.n_bits() >= MIN_BITS_OF_SINGLE)
+    };
     if is_plausible(ids.len(), dictionary) {
         let n_expected = ids.iter().filter(|id| expected.contains(id)).count();
         let found = Ids(ids);
         return if 2 * n_expected < found.0.len() {
-            NotDetected::OtherIds { found, expected: Ids(expected.collect()) }
+            NotDetected::OtherIds {
+                found,
+                expected: Ids(expected.collect()),
+            }
         } else {
-            let reason = other_counts(target, markers, 0).or_else(|| marker_size(target, markers, MIN_SIZE_CHANGE));
+            let reason = other_counts(target, markers, 0)
+                .or_else(|| marker_size(target, markers, MIN_SIZE_CHANGE));
             reason.unwrap_or(NotDetected::OtherArrangement { found })
         };
     }
     // Number of markers, without those that may be chance.
-    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a small positive number")]
-    let n_certain = |exact: &Exact| exact.ids.len().saturating_sub((4.0 * exact.n_by_chance).ceil() as usize);
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "a small positive number"
+    )]
+    let n_certain = |exact: &Exact| {
+        exact
+            .ids
+            .len()
+            .saturating_sub((4.0 * exact.n_by_chance).ceil() as usize)
+    };
     let mirrored = read_exactly(plane, quads, dictionary, true);
     if is_plausible(n_certain(&mirrored), dictionary) {
-        return NotDetected::Mirrored { n: mirrored.ids.len() };
+        return NotDetected::Mirrored {
+            n: mirrored.ids.len(),
+        };
     }
     let others = Dictionary::all().filter(|other| other != dictionary);
     let read = others.map(|other| (read_exactly(plane, quads, &other, false), other));
     // Of equals, the first: the smallest dictionary that contains all markers.
-    let best = read.reduce(|best, next| if next.0.ids.len() > best.0.ids.len() { next } else { best });
+    let best = read.reduce(|best, next| {
+        if next.0.ids.len() > best.0.ids.len() {
+            next
+        } else {
+            best
+        }
+    });
     match best {
         Some((exact, found)) if is_plausible(n_certain(&exact), &found) => {
             let n = exact.ids.len();
-            NotDetected::OtherDictionary { found: found.name().to_owned(), expected: dictionary.name().to_owned(), n }
+            NotDetected::OtherDictionary {
+                found: found.name().to_owned(),
+                expected: dictionary.name().to_owned(),
+                n,
+            }
         }
-        _ => NotDetected::Nothing { target: target.kind() },
+        _ => NotDetected::Nothing {
+            target: target.kind(),
+        },
     }
 }

@@ -16,7 +16,8 @@ use crate::template::{self, Neighborhood};
 const TAG_BORDERS: [usize; 2] = [1, 2];
 /// Largest difference of the size of ChArUco markers from that of the target, relative to it.
 const MAX_SIZE_CHANGE: f64 = 0.2;
-/// Largest distance of a corner from the intersection of the tag's sides, relative to the side: lenses bend them.
+/// Largest distance of a corner from the intersection of the tag's sides, relative to the side:
+/// lenses bend them.
 const MAX_MOVE_FRAC: f64 = 0.04;
 
 /// Finds a ChArUco board, an AprilGrid or a tag.
@@ -39,12 +40,16 @@ pub(super) fn detect(target: &TargetSpec, plane: &Plane) -> Result<Detection, No
         _ => Vec::new(),
     };
     if pixels.len() < MIN_CORNERS {
-        let too_few = NotDetected::TooFewCorners { found: pixels.len(), min: MIN_CORNERS };
+        let too_few = NotDetected::TooFewCorners {
+            found: pixels.len(),
+            min: MIN_CORNERS,
+        };
         let reason = diagnosis::other_counts(target, &markers, fit.n_confirmed)
             .or_else(|| diagnosis::marker_size(target, &markers, diagnosis::MIN_SIZE_CHANGE));
         return Err(reason.unwrap_or(too_few));
     }
-    // The corners do not depend on the markers, but if their size is wrong, that of the squares may be wrong, too.
+    // The corners do not depend on the markers, but if their size is wrong, that of the squares may
+    // be wrong, too.
     match diagnosis::marker_size(target, &fit.markers, MAX_SIZE_CHANGE) {
         Some(other) => Err(other),
         None => Ok(target.detection(pixels, fit.layout.is_legacy)),
@@ -52,23 +57,41 @@ pub(super) fn detect(target: &TargetSpec, plane: &Plane) -> Result<Detection, No
 }
 
 /// Corners of the largest tag with an id.
-fn tag(target: &TargetSpec, id: u32, side_m: f64, plane: &Plane, markers: &[Marker]) -> Option<Detection> {
+fn tag(
+    target: &TargetSpec,
+    id: u32,
+    side_m: f64,
+    plane: &Plane,
+    markers: &[Marker],
+) -> Option<Detection> {
     let of_id = markers.iter().filter(|marker| marker.id == id);
-    let largest = of_id.max_by(|a, b| shortest_side(&a.corners_px).total_cmp(&shortest_side(&b.corners_px)))?;
+    let largest = of_id
+        .max_by(|a, b| shortest_side(&a.corners_px).total_cmp(&shortest_side(&b.corners_px)))?;
     let corners_m = UNIT_SQUARE.map(|corner| corner.map(|frac| (frac - 0.5) * side_m));
-    Some(target.detection(corners(target, plane, largest, &corners_m, [0, 1, 2, 3], side_m), false))
+    Some(target.detection(
+        corners(target, plane, largest, &corners_m, [0, 1, 2, 3], side_m),
+        false,
+    ))
 }
 
 /// Corners of all tags of an AprilGrid.
 fn aprilgrid(target: &TargetSpec, tag_m: f64, plane: &Plane, fit: &Fit) -> Vec<(u32, [f64; 2])> {
     let of_marker = |marker: &Marker| {
         let ids = [0, 1, 2, 3].map(|corner| 4 * marker.id + corner);
-        corners(target, plane, marker, &fit.layout.corners_m[marker.id as usize], ids, tag_m)
+        corners(
+            target,
+            plane,
+            marker,
+            &fit.layout.corners_m[marker.id as usize],
+            ids,
+            tag_m,
+        )
     };
     fit.markers.iter().flat_map(of_marker).collect()
 }
 
-/// Refines the corners of a marker. `corners_m`: their positions on the board, in the order of the marker.
+/// Refines the corners of a marker. `corners_m`: their positions on the board, in the order of the
+/// marker.
 fn corners(
     target: &TargetSpec,
     plane: &Plane,
@@ -77,15 +100,19 @@ fn corners(
     ids: [u32; 4],
     side_m: f64,
 ) -> Vec<(u32, [f64; 2])> {
-    // The border of a tag and the squares between tags are the same for all tags and for this part of the side.
+    // The border of a tag and the squares between tags are the same for all tags and for this part
+    // of the side.
     const CLEAR_FRAC: f64 = 0.28;
     let center_m = layout::center(corners_m);
     let centered = corners_m.map(|corner| [corner[0] - center_m[0], corner[1] - center_m[1]]);
     let mut corners_px = marker.corners_px;
     let mut is_found = [false; 4];
-    // Sides bent by the lens displace the corners; the second time, scale and rotation are more accurate.
+    // Sides bent by the lens displace the corners; the second time, scale and rotation are more
+    // accurate.
     for reach_frac in [MAX_MOVE_FRAC, MAX_MOVE_FRAC / 4.0] {
-        let Some(pixel_from_board) = Homography::from_corners(&centered, &corners_px) else { return Vec::new() };
+        let Some(pixel_from_board) = Homography::from_corners(&centered, &corners_px) else {
+            return Vec::new();
+        };
         for at in 0..4 {
             let neighborhood = Neighborhood {
                 point_m: corners_m[at],
@@ -102,9 +129,14 @@ fn corners(
     }
     let id = |at: usize| {
         let is_here = |id: &u32| {
-            target.corner(*id).is_some_and(|corner| distance([corner.x, corner.y], corners_m[at]) < 1e-6 * side_m)
+            target
+                .corner(*id)
+                .is_some_and(|corner| distance([corner.x, corner.y], corners_m[at]) < 1e-6 * side_m)
         };
         ids.into_iter().find(is_here)
     };
-    (0..4).filter(|&at| is_found[at]).filter_map(|at| Some((id(at)?, corners_px[at]))).collect()
+    (0..4)
+        .filter(|&at| is_found[at])
+        .filter_map(|at| Some((id(at)?, corners_px[at])))
+        .collect()
 }

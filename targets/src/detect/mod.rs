@@ -18,8 +18,9 @@ pub struct Detection {
     pub corners: Vec<DetectedCorner>,
     /// Number of corners of the whole target.
     pub n_in_target: usize,
-    /// Whether a ChArUco board is printed in the arrangement used before OpenCV 4.6 ("legacy pattern"), which differs
-    /// for even numbers of rows. Ids and positions of corners are the same.
+    /// Whether a ChArUco board is printed in the arrangement used before OpenCV 4.6 ("legacy
+    /// pattern"), which differs for even numbers of rows. Ids and positions of corners are the
+    /// same.
     pub is_legacy: bool,
 }
 
@@ -40,34 +41,61 @@ const MIN_CORNERS: usize = 4;
 impl TargetSpec {
     /// Finds this target in an image.
     ///
-    /// ChArUco boards, AprilGrids and PuzzleBoards may be partly visible. Of a chessboard, some inner corners may be
-    /// missing, but its outermost rows and columns must be visible, because it could not be identified otherwise. If
-    /// the board is symmetric, the rotation is chosen whose x axis points most to the right in the image; see
-    /// [`TargetSpec::symmetry`].
+    /// ChArUco boards, AprilGrids and PuzzleBoards may be partly visible. Of a chessboard, some
+    /// inner corners may be missing, but its outermost rows and columns must be visible, because it
+    /// could not be identified otherwise. If the board is symmetric, the rotation is chosen whose x
+    /// axis points most to the right in the image; see [`TargetSpec::symmetry`].
     ///
-    /// Lines may be bent by any lens, including fisheye lenses: only neighboring corners are compared. The result
-    /// depends only on the image. The function can be called from several threads at the same time.
+    /// Lines may be bent by any lens, including fisheye lenses: only neighboring corners are
+    /// compared. The result depends only on the image. The function can be called from several
+    /// threads at the same time.
     ///
     /// # Errors
     /// [`NotDetected`] describes what was found instead.
     pub fn detect(&self, image: GrayImage<'_>) -> Result<Detection, NotDetected> {
         let plane = Plane::new(image)?;
         match &self.pattern {
-            Pattern::Chessboard { inner, square_m } => chessboard::detect(self, *inner, *square_m, &plane),
-            Pattern::Puzzleboard { squares, square_m, origin } => {
-                let board =
-                    puzzleboard::Board { target: self, squares: *squares, origin: *origin, square_m: *square_m };
+            Pattern::Chessboard { inner, square_m } => {
+                chessboard::detect(self, *inner, *square_m, &plane)
+            }
+            Pattern::Puzzleboard {
+                squares,
+                square_m,
+                origin,
+            } => {
+                let board = puzzleboard::Board {
+                    target: self,
+                    squares: *squares,
+                    origin: *origin,
+                    square_m: *square_m,
+                };
                 board.detect(&plane)
             }
-            Pattern::Charuco { .. } | Pattern::Aprilgrid { .. } | Pattern::Tag { .. } => markers::detect(self, &plane),
+            Pattern::Charuco { .. } | Pattern::Aprilgrid { .. } | Pattern::Tag { .. } => {
+                markers::detect(self, &plane)
+            }
         }
     }
 
     /// Collects corners; ids outside the target are left out.
-    fn detection(&self, pixels: impl IntoIterator<Item = (u32, [f64; 2])>, is_legacy: bool) -> Detection {
-        let corner = |(id, pixel)| Some(DetectedCorner { id, point_in_board: self.corner(id)?, pixel });
+    fn detection(
+        &self,
+        pixels: impl IntoIterator<Item = (u32, [f64; 2])>,
+        is_legacy: bool,
+    ) -> Detection {
+        let corner = |(id, pixel)| {
+            Some(DetectedCorner {
+                id,
+                point_in_board: self.corner(id)?,
+                pixel,
+            })
+        };
         let mut corners: Vec<DetectedCorner> = pixels.into_iter().filter_map(corner).collect();
         corners.sort_by_key(|corner| corner.id);
-        Detection { corners, n_in_target: self.n_corners() as usize, is_legacy }
+        Detection {
+            corners,
+            n_in_target: self.n_corners() as usize,
+            is_legacy,
+        }
     }
 }

@@ -30,7 +30,9 @@ impl Board<'_> {
     /// Finds a part of the board.
     pub(super) fn detect(&self, plane: &Plane) -> Result<Detection, NotDetected> {
         let smoothed = plane.smoothed();
-        let mut failure = NotDetected::Nothing { target: self.target.kind() };
+        let mut failure = NotDetected::Nothing {
+            target: self.target.kind(),
+        };
         let mut n_best = 0;
         for lattice in Levels::new(plane).grids() {
             let n = lattice.corners.len();
@@ -44,9 +46,21 @@ impl Board<'_> {
     }
 
     /// Reads the code of a grid and renumbers its corners.
-    fn read(&self, plane: &Plane, smoothed: &Plane, mut lattice: Lattice) -> Result<Detection, NotDetected> {
-        let Self { target, squares, origin, square_m } = *self;
-        let nothing = NotDetected::Nothing { target: target.kind() };
+    fn read(
+        &self,
+        plane: &Plane,
+        smoothed: &Plane,
+        mut lattice: Lattice,
+    ) -> Result<Detection, NotDetected> {
+        let Self {
+            target,
+            squares,
+            origin,
+            square_m,
+        } = *self;
+        let nothing = NotDetected::Nothing {
+            target: target.kind(),
+        };
         let range = lattice.range().ok_or(nothing.clone())?;
         lattice.complete(smoothed, range, REFINEMENT);
         lattice.refine(smoothed, REFINEMENT);
@@ -54,21 +68,30 @@ impl Board<'_> {
         let mut trimmed = lattice.clone();
         trim(&mut trimmed);
         let [low, high] = trimmed.range().ok_or(nothing)?;
-        let found =
-            Counts { columns: (high[0] - low[0] + 1).cast_unsigned(), rows: (high[1] - low[1] + 1).cast_unsigned() };
+        let found = Counts {
+            columns: (high[0] - low[0] + 1).cast_unsigned(),
+            rows: (high[1] - low[1] + 1).cast_unsigned(),
+        };
         let dots = dots(plane, &trimmed);
         if dots.len() < MIN_DOTS {
-            return Err(NotDetected::TooFewCorners { found: trimmed.corners.len(), min: MIN_DOTS / 2 });
+            return Err(NotDetected::TooFewCorners {
+                found: trimmed.corners.len(),
+                min: MIN_DOTS / 2,
+            });
         }
         let period = PERIOD.cast_signed();
         let inner = squares.map(|count| count.cast_signed() - 1);
         // Corner (0, 0) of the board is the lower right corner of its first square.
         let place = |cell: Cell, offset: [u32; 2]| {
-            [0, 1].map(|axis| (cell[axis] + offset[axis].cast_signed() - origin[axis].cast_signed()).rem_euclid(period))
+            [0, 1].map(|axis| {
+                (cell[axis] + offset[axis].cast_signed() - origin[axis].cast_signed())
+                    .rem_euclid(period)
+            })
         };
         let placed = (0..4).filter_map(|turns| {
             let ends = [low, high].map(|cell| turn(cell, turns));
-            let [first, last] = [i32::min, i32::max].map(|pick| [0, 1].map(|axis| pick(ends[0][axis], ends[1][axis])));
+            let [first, last] = [i32::min, i32::max]
+                .map(|pick| [0, 1].map(|axis| pick(ends[0][axis], ends[1][axis])));
             // One line next to the board may have been taken for a part of it.
             let is_possible = |offset: [u32; 2]| {
                 let at = place([first[0] + 1, first[1] + 1], offset).map(|value| value - 1);
@@ -76,34 +99,66 @@ impl Board<'_> {
             };
             Some((turns, locate(&rotated(&dots, turns), is_possible)?))
         });
-        let Some((turns, Position { offset, n_right })) = placed.max_by_key(|(_, position)| position.n_right) else {
-            let expected = Counts { columns: inner[0].cast_unsigned(), rows: inner[1].cast_unsigned() };
+        let Some((turns, Position { offset, n_right })) =
+            placed.max_by_key(|(_, position)| position.n_right)
+        else {
+            let expected = Counts {
+                columns: inner[0].cast_unsigned(),
+                rows: inner[1].cast_unsigned(),
+            };
             return Err(NotDetected::OtherSize { found, expected });
         };
         let wrong_frac = 1.0 - n_right as f64 / dots.len() as f64;
         if wrong_frac > MAX_WRONG_FRAC {
-            #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a percentage")]
+            #[expect(
+                clippy::cast_possible_truncation,
+                clippy::cast_sign_loss,
+                reason = "a percentage"
+            )]
             let wrong_percent = (100.0 * wrong_frac).round() as u32;
-            return Err(NotDetected::Code { found, wrong_percent });
+            return Err(NotDetected::Code {
+                found,
+                wrong_percent,
+            });
         }
         let cell = |cell: Cell| place(turn(cell, turns), offset);
         let is_on_board = |cell: Cell| (0..2).all(|axis| cell[axis] < inner[axis]);
-        let placed = trimmed.corners.iter().map(|(&at, &pixel)| (cell(at), pixel));
-        let mut on_board = Lattice { corners: placed.filter(|(cell, _)| is_on_board(*cell)).collect() };
+        let placed = trimmed
+            .corners
+            .iter()
+            .map(|(&at, &pixel)| (cell(at), pixel));
+        let mut on_board = Lattice {
+            corners: placed.filter(|(cell, _)| is_on_board(*cell)).collect(),
+        };
         let surface = target.surface();
-        let printed = Printed { surface, square_m, first_m: [0.0; 2], side_m: square_m };
+        let printed = Printed {
+            surface,
+            square_m,
+            first_m: [0.0; 2],
+            side_m: square_m,
+        };
         // Dots displace the corners found so far; the second time, their distances are right.
         printed.align_strictly(plane, &mut on_board);
         printed.align_strictly(plane, &mut on_board);
         if on_board.corners.len() < MIN_CORNERS {
-            return Err(NotDetected::TooFewCorners { found: on_board.corners.len(), min: MIN_CORNERS });
+            return Err(NotDetected::TooFewCorners {
+                found: on_board.corners.len(),
+                min: MIN_CORNERS,
+            });
         }
         let id = |cell: Cell| (cell[1] * inner[0] + cell[0]).cast_unsigned();
-        Ok(target.detection(on_board.corners.iter().map(|(&cell, &pixel)| (id(cell), pixel)), false))
+        Ok(target.detection(
+            on_board
+                .corners
+                .iter()
+                .map(|(&cell, &pixel)| (id(cell), pixel)),
+            false,
+        ))
     }
 }
 
-/// An edge between two corners of the lattice: the first of them, the direction to the second, and the dot's color.
+/// An edge between two corners of the lattice: the first of them, the direction to the second, and
+/// the dot's color.
 type Dot = (Cell, Cell, bool);
 
 /// Reads the dots on all edges with squares on both sides that are bounded by corners.
@@ -112,14 +167,24 @@ fn dots(plane: &Plane, lattice: &Lattice) -> Vec<Dot> {
     for (&cell, &here) in &lattice.corners {
         for at in [0, 1] {
             let (step, side) = (STEPS[at], STEPS[1 - at]);
-            let shifted = |cell: Cell, step: Cell, n: i32| [cell[0] + n * step[0], cell[1] + n * step[1]];
+            let shifted =
+                |cell: Cell, step: Cell, n: i32| [cell[0] + n * step[0], cell[1] + n * step[1]];
             let corner = |cell: Cell| lattice.corners.get(&cell).copied();
             let end = shifted(cell, step, 1);
-            let squares = [-1, 1].map(|n| Some([corner(shifted(cell, side, n))?, corner(shifted(end, side, n))?]));
-            let (Some(there), [Some(a), Some(b)]) = (corner(end), squares) else { continue };
-            let middle =
-                |points: [[f64; 2]; 4]| [0, 1].map(|axis| points.iter().map(|point| point[axis]).sum::<f64>() / 4.0);
-            let [value_a, value_b] = [a, b].map(|[c, d]| f64::from(plane.sample(middle([here, there, c, d]))));
+            let squares = [-1, 1].map(|n| {
+                Some([
+                    corner(shifted(cell, side, n))?,
+                    corner(shifted(end, side, n))?,
+                ])
+            });
+            let (Some(there), [Some(a), Some(b)]) = (corner(end), squares) else {
+                continue;
+            };
+            let middle = |points: [[f64; 2]; 4]| {
+                [0, 1].map(|axis| points.iter().map(|point| point[axis]).sum::<f64>() / 4.0)
+            };
+            let [value_a, value_b] =
+                [a, b].map(|[c, d]| f64::from(plane.sample(middle([here, there, c, d]))));
             let value = f64::from(plane.sample(middle([here, there, here, there])));
             dots.push((cell, step, value > (value_a + value_b) / 2.0));
         }
@@ -139,13 +204,24 @@ fn turn([x, y]: Cell, turns: usize) -> Cell {
 
 /// The dots as edges of the master pattern, if the lattice is rotated by quarter turns.
 ///
-/// Corner `(x, y)` is the lower right corner of square `(x, y)`, so the edge from it to the right is the horizontal
-/// edge below square `(x + 1, y)`, and the edge from it downwards the vertical edge right of square `(x, y + 1)`.
+/// Corner `(x, y)` is the lower right corner of square `(x, y)`, so the edge from it to the right
+/// is the horizontal edge below square `(x + 1, y)`, and the edge from it downwards the vertical
+/// edge right of square `(x, y + 1)`.
 fn rotated(dots: &[Dot], turns: usize) -> Vec<(Edge, bool)> {
     let edge = |&(cell, step, is_white): &Dot| {
-        let (from, to) = (turn(cell, turns), turn([cell[0] + step[0], cell[1] + step[1]], turns));
+        let (from, to) = (
+            turn(cell, turns),
+            turn([cell[0] + step[0], cell[1] + step[1]], turns),
+        );
         let (column, row) = (from[0].max(to[0]), from[1].max(to[1]));
-        (Edge { column, row, is_vertical: from[0] == to[0] }, is_white)
+        (
+            Edge {
+                column,
+                row,
+                is_vertical: from[0] == to[0],
+            },
+            is_white,
+        )
     };
     dots.iter().map(edge).collect()
 }

@@ -26,7 +26,9 @@ const SIDE_MM: [f64; 2] = [50.0, 5000.0];
 
 impl Paper {
     /// ISO A4.
-    pub const A4: Self = Self { size_mm: NAMED[0].1 };
+    pub const A4: Self = Self {
+        size_mm: NAMED[0].1,
+    };
 
     /// Width and height, millimeters.
     pub fn size_mm(&self) -> [f64; 2] {
@@ -35,17 +37,23 @@ impl Paper {
 
     /// The same paper, rotated by 90 degrees.
     pub(super) fn rotated(self) -> Self {
-        Self { size_mm: [self.size_mm[1], self.size_mm[0]] }
+        Self {
+            size_mm: [self.size_mm[1], self.size_mm[0]],
+        }
     }
 
     /// The smallest named paper into which a rectangle fits, or one of exactly this size.
     pub(super) fn for_size(need_mm: [f64; 2]) -> Self {
         let fits = |size_mm: &[f64; 2]| {
             let rotated = [size_mm[1], size_mm[0]];
-            [*size_mm, rotated].iter().any(|size_mm| (0..2).all(|axis| need_mm[axis] <= size_mm[axis]))
+            [*size_mm, rotated]
+                .iter()
+                .any(|size_mm| (0..2).all(|axis| need_mm[axis] <= size_mm[axis]))
         };
         let named = NAMED.into_iter().map(|(_, size_mm)| size_mm).find(fits);
-        Self { size_mm: named.unwrap_or_else(|| need_mm.map(|value| (value / 10.0).ceil() * 10.0)) }
+        Self {
+            size_mm: named.unwrap_or_else(|| need_mm.map(|value| (value / 10.0).ceil() * 10.0)),
+        }
     }
 }
 
@@ -65,16 +73,27 @@ impl FromStr for Paper {
         }
         let parse = || {
             let (width, height) = value.strip_suffix("mm")?.split_once('x')?;
-            let size_mm = [width.trim().parse::<f64>().ok()?, height.trim().parse::<f64>().ok()?];
-            size_mm.iter().all(|side| (SIDE_MM[0]..=SIDE_MM[1]).contains(side)).then_some(Self { size_mm })
+            let size_mm = [
+                width.trim().parse::<f64>().ok()?,
+                height.trim().parse::<f64>().ok()?,
+            ];
+            size_mm
+                .iter()
+                .all(|side| (SIDE_MM[0]..=SIDE_MM[1]).contains(side))
+                .then_some(Self { size_mm })
         };
-        parse().ok_or_else(|| PrintError::Paper { value: text.to_owned() })
+        parse().ok_or_else(|| PrintError::Paper {
+            value: text.to_owned(),
+        })
     }
 }
 
 impl fmt::Display for Paper {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match NAMED.into_iter().find(|(_, size_mm)| *size_mm == self.size_mm || *size_mm == self.rotated().size_mm) {
+        match NAMED
+            .into_iter()
+            .find(|(_, size_mm)| *size_mm == self.size_mm || *size_mm == self.rotated().size_mm)
+        {
             Some((name, _)) => f.write_str(name),
             None => write!(f, "{}x{}mm", self.size_mm[0], self.size_mm[1]),
         }
@@ -88,10 +107,28 @@ mod tests {
     #[test]
     fn names_and_sizes_are_parsed() {
         assert_eq!("A3".parse::<Paper>().unwrap().size_mm(), [297.0, 420.0]);
-        assert_eq!("600x400mm".parse::<Paper>().unwrap().to_string(), "600x400mm");
+        assert_eq!(
+            "600x400mm".parse::<Paper>().unwrap().to_string(),
+            "600x400mm"
+        );
         assert_eq!("letter".parse::<Paper>().unwrap().to_string(), "letter");
-        for wrong in ["", "a9", "600x400", "0x400mm", "NaNx400mm", "600mm", "9000x400mm"] {
-            assert!(wrong.parse::<Paper>().unwrap_err().to_string().contains("unknown paper"), "{wrong}");
+        for wrong in [
+            "",
+            "a9",
+            "600x400",
+            "0x400mm",
+            "NaNx400mm",
+            "600mm",
+            "9000x400mm",
+        ] {
+            assert!(
+                wrong
+                    .parse::<Paper>()
+                    .unwrap_err()
+                    .to_string()
+                    .contains("unknown paper"),
+                "{wrong}"
+            );
         }
         assert_eq!(Paper::for_size([400.0, 290.0]).to_string(), "a3");
         assert_eq!(Paper::for_size([4001.0, 290.0]).to_string(), "4010x290mm");

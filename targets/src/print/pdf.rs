@@ -16,7 +16,10 @@ pub(super) struct Page {
 
 impl Page {
     pub(super) fn new(size_mm: [f64; 2]) -> Self {
-        Self { size_mm, content: String::new() }
+        Self {
+            size_mm,
+            content: String::new(),
+        }
     }
 
     fn point(&self, [x, y]: [f64; 2]) -> [f64; 2] {
@@ -38,7 +41,8 @@ impl Page {
         self.operator(&[gray], "G");
     }
 
-    /// Fills rectangles (smallest x and y, largest x and y) as one path, so that common sides leave no gap.
+    /// Fills rectangles (smallest x and y, largest x and y) as one path, so that common sides leave
+    /// no gap.
     pub(super) fn fill_rectangles(&mut self, rectangles: &[[[f64; 2]; 2]]) {
         for [low, high] in rectangles {
             let [x, y] = self.point([low[0], high[1]]);
@@ -76,7 +80,9 @@ impl Page {
     /// Writes text in Helvetica, starting at the left end of its baseline.
     pub(super) fn text(&mut self, at: [f64; 2], size_mm: f64, text: &str) {
         let [x, y] = self.point(at);
-        let printable = text.chars().filter(|character| character.is_ascii_graphic() || *character == ' ');
+        let printable = text
+            .chars()
+            .filter(|character| character.is_ascii_graphic() || *character == ' ');
         let mut escaped = String::new();
         for character in printable {
             if matches!(character, '(' | ')' | '\\') {
@@ -84,7 +90,11 @@ impl Page {
             }
             escaped.push(character);
         }
-        let _ = writeln!(self.content, "BT /F1 {:.3} Tf {x:.4} {y:.4} Td ({escaped}) Tj ET", size_mm * POINTS_PER_MM);
+        let _ = writeln!(
+            self.content,
+            "BT /F1 {:.3} Tf {x:.4} {y:.4} Td ({escaped}) Tj ET",
+            size_mm * POINTS_PER_MM
+        );
     }
 
     /// The file.
@@ -96,13 +106,18 @@ impl Page {
             .collect();
         let objects = [
             // Printer dialogs that follow this preference do not scale the page.
-            "<< /Type /Catalog /Pages 2 0 R /ViewerPreferences << /PrintScaling /None >> >>".to_owned(),
+            "<< /Type /Catalog /Pages 2 0 R /ViewerPreferences << /PrintScaling /None >> >>"
+                .to_owned(),
             "<< /Type /Pages /Kids [3 0 R] /Count 1 >>".to_owned(),
             format!(
                 "<< /Type /Page /Parent 2 0 R /MediaBox [0 0 {width:.4} {height:.4}] /Contents 4 0 R \
                  /Resources << /Font << /F1 5 0 R >> >> >>"
             ),
-            format!("<< /Length {} >>\nstream\n{}endstream", self.content.len(), self.content),
+            format!(
+                "<< /Length {} >>\nstream\n{}endstream",
+                self.content.len(),
+                self.content
+            ),
             "<< /Type /Font /Subtype /Type1 /BaseFont /Helvetica >>".to_owned(),
             format!("<< /Title ({title}) /Producer (fieldrig) >>"),
         ];
@@ -118,7 +133,10 @@ impl Page {
         for offset in offsets {
             let _ = writeln!(file, "{offset:010} 00000 n ");
         }
-        let _ = write!(file, "trailer\n<< /Size {n} /Root 1 0 R /Info 6 0 R >>\nstartxref\n{start}\n%%EOF\n");
+        let _ = write!(
+            file,
+            "trailer\n<< /Size {n} /Root 1 0 R /Info 6 0 R >>\nstartxref\n{start}\n%%EOF\n"
+        );
         file.into_bytes()
     }
 }

@@ -28,13 +28,23 @@ pub(super) struct Difference {
 pub(super) fn read_samples(path: &Path) -> RecordedSamples {
     let mut recording = Recording::open(path).expect("a recording");
     let gap = Duration::from_millis(100);
-    let (joints, poses) = (JointHistory::new(gap, usize::MAX), PoseHistory::new(gap, usize::MAX));
-    let mut read_samples = RecordedSamples { images: Vec::new(), joints, poses };
+    let (joints, poses) = (
+        JointHistory::new(gap, usize::MAX),
+        PoseHistory::new(gap, usize::MAX),
+    );
+    let mut read_samples = RecordedSamples {
+        images: Vec::new(),
+        joints,
+        poses,
+    };
     while let Some(sample) = recording.next_sample().expect("it is whole") {
         match sample {
             Sample::Image(image) => read_samples.images.push(image),
             Sample::Joints(state) => read_samples.joints.push(state).expect("in order"),
-            Sample::Base(pose) => read_samples.poses.push(pose.stamp, pose.world_from_base).expect("in order"),
+            Sample::Base(pose) => read_samples
+                .poses
+                .push(pose.stamp, pose.world_from_base)
+                .expect("in order"),
             _ => {}
         }
     }
@@ -44,12 +54,18 @@ pub(super) fn read_samples(path: &Path) -> RecordedSamples {
 /// Offset added to the script's stamps during playback, from the rig file written for it.
 pub(super) fn clock_offset_nanos(recording: &Path) -> i64 {
     let recording = Recording::open(recording).expect("a recording");
-    let rig = std::str::from_utf8(recording.attachment(RIG_FILE).expect("its rig")).expect("text").to_owned();
-    let line = rig.lines().find_map(|line| line.strip_prefix("clock_offset_nanos = ")).expect("the key");
+    let rig = std::str::from_utf8(recording.attachment(RIG_FILE).expect("its rig"))
+        .expect("text")
+        .to_owned();
+    let line = rig
+        .lines()
+        .find_map(|line| line.strip_prefix("clock_offset_nanos = "))
+        .expect("the key");
     line.trim().parse().expect("a number")
 }
 
-/// Compares samples at every received color image. Every image must be identical to an emulated one.
+/// Compares samples at every received color image. Every image must be identical to an emulated
+/// one.
 pub(super) fn difference(script: &Path, wire: &Path) -> Difference {
     let offset_nanos = clock_offset_nanos(wire);
     let (script, wire) = (read_samples(script), read_samples(wire));
@@ -60,7 +76,8 @@ pub(super) fn difference(script: &Path, wire: &Path) -> Difference {
         let simulated_stamp = Stamp(image.stamp.0 - offset_nanos);
         // Stamps of cameras have a resolution of microseconds.
         let is_match = |emulated: &&Image| {
-            emulated.is_depth() == image.is_depth() && emulated.stamp.0.abs_diff(simulated_stamp.0) < 1000
+            emulated.is_depth() == image.is_depth()
+                && emulated.stamp.0.abs_diff(simulated_stamp.0) < 1000
         };
         let emulated = script
             .images
@@ -76,7 +93,10 @@ pub(super) fn difference(script: &Path, wire: &Path) -> Difference {
                 "image at {simulated_stamp:?}"
             );
         }
-        if let (Ok(received), Ok(emulated)) = (wire.joints.at(image.stamp), script.joints.at(simulated_stamp)) {
+        if let (Ok(received), Ok(emulated)) = (
+            wire.joints.at(image.stamp),
+            script.joints.at(simulated_stamp),
+        ) {
             let differences = received
                 .position
                 .iter()
@@ -84,18 +104,31 @@ pub(super) fn difference(script: &Path, wire: &Path) -> Difference {
                 .map(|(received, emulated)| (received - emulated).abs());
             joints_rad.push(differences.fold(0.0, f64::max));
         }
-        if let (Ok(received), Ok(emulated)) = (wire.poses.at(image.stamp), script.poses.at(simulated_stamp)) {
+        if let (Ok(received), Ok(emulated)) =
+            (wire.poses.at(image.stamp), script.poses.at(simulated_stamp))
+        {
             base_m = base_m.max((received.translation.vector - emulated.translation.vector).norm());
         }
     }
-    let median_rad = median(&joints_rad).expect("some image has joint readings before and after it");
+    let median_rad =
+        median(&joints_rad).expect("some image has joint readings before and after it");
     let max_rad = joints_rad.iter().copied().fold(0.0, f64::max);
-    Difference { n_images, joints_rad: [median_rad, max_rad], base_m }
+    Difference {
+        n_images,
+        joints_rad: [median_rad, max_rad],
+        base_m,
+    }
 }
 
 /// Distance from the target at which `fieldrig move --json` reports that the arm arrived, rad or m.
 pub(super) fn error_of_move(received: &str) -> f64 {
-    let done = received.lines().find(|line| line.contains("\"event\":\"done\"")).expect("it arrives");
+    let done = received
+        .lines()
+        .find(|line| line.contains("\"event\":\"done\""))
+        .expect("it arrives");
     let (_, rest) = done.split_once("\"error\":").expect("the key");
-    rest.split([',', '}']).next().and_then(|error| error.parse().ok()).expect("a number")
+    rest.split([',', '}'])
+        .next()
+        .and_then(|error| error.parse().ok())
+        .expect("a number")
 }

@@ -13,7 +13,8 @@ use tungstenite::{Message, WebSocket};
 /// Far more than a browser needs on two busy cores.
 const TIMEOUT: Duration = Duration::from_secs(300);
 
-/// A script for [`Browser::open_with`]: WebGL calls draw nothing, because drawing on the CPU takes most of the time.
+/// A script for [`Browser::open_with`]: WebGL calls draw nothing, because drawing on the CPU takes
+/// most of the time.
 pub const NO_DRAWING: &str = include_str!("no_drawing.js");
 
 /// A running browser with one page.
@@ -24,8 +25,8 @@ pub struct Browser {
     n_calls: u64,
 }
 
-/// Path of a browser for tests of the page. If Chromium or the bundled page is missing, reports the calling test as skipped
-/// and returns `None`.
+/// Path of a browser for tests of the page. If Chromium or the bundled page is missing, reports the
+/// calling test as skipped and returns `None`.
 ///
 /// # Panics
 /// Panics instead of skipping the test if [tests are demanded](crate::is_demanded).
@@ -48,7 +49,9 @@ pub fn bundle() -> PathBuf {
 fn chromium() -> Option<PathBuf> {
     let names = ["chromium", "chromium-browser", "google-chrome"];
     let folders: Vec<PathBuf> = std::env::split_paths(&std::env::var_os("PATH")?).collect();
-    let paths = names.iter().flat_map(|name| folders.iter().map(move |folder| folder.join(name)));
+    let paths = names
+        .iter()
+        .flat_map(|name| folders.iter().map(move |folder| folder.join(name)));
     paths.into_iter().find(|path| path.is_file())
 }
 
@@ -68,11 +71,31 @@ impl Browser {
     }
 
     /// [`Browser::open`]; runs a script before the page's own scripts.
-    pub fn open_with(program: &Path, profile: &Path, url: &str, [width, height]: [u32; 2], script: &str) -> Self {
+    pub fn open_with(
+        program: &Path,
+        profile: &Path,
+        url: &str,
+        [width, height]: [u32; 2],
+        script: &str,
+    ) -> Self {
         let mut process = Command::new(program)
-            .args(["--headless", "--no-sandbox", "--disable-quic", "--no-first-run", "--ignore-certificate-errors"])
-            .args(["--disable-background-networking", "--disable-component-update", "--disable-sync"])
-            .args(["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--hide-scrollbars"])
+            .args([
+                "--headless",
+                "--no-sandbox",
+                "--disable-quic",
+                "--no-first-run",
+                "--ignore-certificate-errors",
+            ])
+            .args([
+                "--disable-background-networking",
+                "--disable-component-update",
+                "--disable-sync",
+            ])
+            .args([
+                "--use-angle=swiftshader",
+                "--enable-unsafe-swiftshader",
+                "--hide-scrollbars",
+            ])
             .args(["--remote-debugging-port=0", "--force-device-scale-factor=1"])
             .arg(format!("--window-size={width},{height}"))
             .arg(format!("--user-data-dir={}", profile.display()))
@@ -85,28 +108,50 @@ impl Browser {
         let address = lines
             .by_ref()
             .map_while(Result::ok)
-            .find_map(|line| line.strip_prefix("DevTools listening on ").map(str::to_owned))
+            .find_map(|line| {
+                line.strip_prefix("DevTools listening on ")
+                    .map(str::to_owned)
+            })
             .expect("chromium prints its debugging address");
         // The pipe is drained, because the browser would block once it is full.
         std::thread::spawn(move || lines.map_while(Result::ok).for_each(drop));
-        let host = address.trim_start_matches("ws://").split('/').next().expect("a host");
+        let host = address
+            .trim_start_matches("ws://")
+            .split('/')
+            .next()
+            .expect("a host");
         let stream = TcpStream::connect(host).expect("chromium listens");
         stream.set_read_timeout(Some(TIMEOUT)).expect("a timeout");
         let (socket, _) = tungstenite::client(&address, stream).expect("a WebSocket");
-        let mut browser = Self { process, socket, session: String::new(), n_calls: 0 };
+        let mut browser = Self {
+            process,
+            socket,
+            session: String::new(),
+            n_calls: 0,
+        };
         let target = browser.call("Target.createTarget", json!({"url": "about:blank"}));
-        let attached = browser.call("Target.attachToTarget", json!({"targetId": target["targetId"], "flatten": true}));
-        browser.session = attached["sessionId"].as_str().expect("a session").to_owned();
+        let attached = browser.call(
+            "Target.attachToTarget",
+            json!({"targetId": target["targetId"], "flatten": true}),
+        );
+        browser.session = attached["sessionId"]
+            .as_str()
+            .expect("a session")
+            .to_owned();
         browser.resize([width, height]);
         browser.call("Page.enable", json!({}));
-        browser.call("Page.addScriptToEvaluateOnNewDocument", json!({"source": script}));
+        browser.call(
+            "Page.addScriptToEvaluateOnNewDocument",
+            json!({"source": script}),
+        );
         browser.call("Page.navigate", json!({"url": url}));
         browser
     }
 
     /// Changes the window's size in CSS pixels.
     pub fn resize(&mut self, [width, height]: [u32; 2]) {
-        let size = json!({"width": width, "height": height, "deviceScaleFactor": 1, "mobile": false});
+        let size =
+            json!({"width": width, "height": height, "deviceScaleFactor": 1, "mobile": false});
         self.call("Emulation.setDeviceMetricsOverride", size);
     }
 
@@ -124,9 +169,13 @@ impl Browser {
         if !self.session.is_empty() {
             message["sessionId"] = json!(self.session);
         }
-        self.socket.send(Message::text(message.to_string())).expect("sent");
+        self.socket
+            .send(Message::text(message.to_string()))
+            .expect("sent");
         loop {
-            let Message::Text(text) = self.socket.read().expect("chromium answers") else { continue };
+            let Message::Text(text) = self.socket.read().expect("chromium answers") else {
+                continue;
+            };
             let answer: Value = serde_json::from_str(&text).expect("JSON");
             if answer["id"] == json!(self.n_calls) {
                 return answer;
@@ -138,7 +187,8 @@ impl Browser {
     pub fn evaluate(&mut self, expression: &str) -> Value {
         const MAX_ATTEMPTS: u32 = 100;
         let params = json!({"expression": expression, "returnByValue": true});
-        let is_replaced = |answer: &Value| answer["error"]["message"] == "Inspected target navigated or closed";
+        let is_replaced =
+            |answer: &Value| answer["error"]["message"] == "Inspected target navigated or closed";
         let mut answer = self.answer("Runtime.evaluate", params.clone());
         for _ in 1..MAX_ATTEMPTS {
             if !is_replaced(&answer) {
@@ -149,11 +199,15 @@ impl Browser {
         }
         assert!(answer.get("error").is_none(), "{expression}: {answer}");
         let result = answer["result"].clone();
-        assert!(result.get("exceptionDetails").is_none(), "{expression}: {result}");
+        assert!(
+            result.get("exceptionDetails").is_none(),
+            "{expression}: {result}"
+        );
         result["result"]["value"].clone()
     }
 
-    /// Evaluates an expression that makes the browser load a page, which may end the evaluation with an error.
+    /// Evaluates an expression that makes the browser load a page, which may end the evaluation
+    /// with an error.
     pub fn load_by(&mut self, expression: &str) {
         self.answer("Runtime.evaluate", json!({"expression": expression}));
     }
@@ -161,12 +215,17 @@ impl Browser {
     /// Waits until all events so far are on screen.
     pub fn next_frame(&mut self) {
         let frames = "new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(() => done(1))))";
-        self.call("Runtime.evaluate", json!({"expression": frames, "awaitPromise": true}));
+        self.call(
+            "Runtime.evaluate",
+            json!({"expression": frames, "awaitPromise": true}),
+        );
     }
 
     /// Text of the element with this id.
     pub fn text(&mut self, id: &str) -> String {
-        let text = self.evaluate(&format!("document.getElementById('{id}')?.textContent ?? ''"));
+        let text = self.evaluate(&format!(
+            "document.getElementById('{id}')?.textContent ?? ''"
+        ));
         text.as_str().unwrap_or_default().to_owned()
     }
 
@@ -177,19 +236,25 @@ impl Browser {
 
     /// Moves the mouse; `kind` is `mousePressed`, `mouseMoved` or `mouseReleased`.
     pub fn mouse(&mut self, kind: &str, [x, y]: [i32; 2]) {
-        let event = json!({"type": kind, "x": x, "y": y, "button": "left", "buttons": 1, "clickCount": 1});
+        let event =
+            json!({"type": kind, "x": x, "y": y, "button": "left", "buttons": 1, "clickCount": 1});
         self.call("Input.dispatchMouseEvent", event);
     }
 
     /// The tasks of the page's main thread within this time.
     pub fn trace_tasks(&mut self, duration: Duration) -> Vec<Task> {
         let session = std::mem::take(&mut self.session); // Tracing belongs to the browser, not to the page.
-        self.call("Tracing.start", json!({"traceConfig": {"includedCategories": ["toplevel"]}}));
+        self.call(
+            "Tracing.start",
+            json!({"traceConfig": {"includedCategories": ["toplevel"]}}),
+        );
         std::thread::sleep(duration);
         self.call("Tracing.end", json!({}));
         let mut events: Vec<Value> = Vec::new();
         loop {
-            let Message::Text(text) = self.socket.read().expect("chromium answers") else { continue };
+            let Message::Text(text) = self.socket.read().expect("chromium answers") else {
+                continue;
+            };
             let mut message: Value = serde_json::from_str(&text).expect("JSON");
             match message["method"].as_str() {
                 Some("Tracing.dataCollected") => {
@@ -200,13 +265,23 @@ impl Browser {
             }
         }
         self.session = session;
-        let is_main = |event: &&Value| event["name"] == "thread_name" && event["args"]["name"] == "CrRendererMain";
-        let main_threads: Vec<_> = events.iter().filter(is_main).map(|event| (&event["pid"], &event["tid"])).collect();
+        let is_main = |event: &&Value| {
+            event["name"] == "thread_name" && event["args"]["name"] == "CrRendererMain"
+        };
+        let main_threads: Vec<_> = events
+            .iter()
+            .filter(is_main)
+            .map(|event| (&event["pid"], &event["tid"]))
+            .collect();
         let is_task = |event: &&Value| {
-            event["name"] == "ThreadControllerImpl::RunTask" && main_threads.contains(&(&event["pid"], &event["tid"]))
+            event["name"] == "ThreadControllerImpl::RunTask"
+                && main_threads.contains(&(&event["pid"], &event["tid"]))
         };
         let task = |event: &Value| {
-            Some(Task { millis: event["dur"].as_f64()? * 1e-3, cpu_millis: event["tdur"].as_f64()? * 1e-3 })
+            Some(Task {
+                millis: event["dur"].as_f64()? * 1e-3,
+                cpu_millis: event["tdur"].as_f64()? * 1e-3,
+            })
         };
         events.iter().filter(is_task).filter_map(task).collect()
     }
@@ -243,7 +318,10 @@ fn bytes_from_base64(text: &str) -> Vec<u8> {
     symbols
         .chunks(4)
         .flat_map(|group| {
-            let bits = group.iter().fold(0, |bits, symbol| bits << 6 | sextet(*symbol)) << (6 * (4 - group.len()));
+            let bits = group
+                .iter()
+                .fold(0, |bits, symbol| bits << 6 | sextet(*symbol))
+                << (6 * (4 - group.len()));
             bits.to_be_bytes()[1..group.len()].to_vec()
         })
         .collect()
@@ -261,13 +339,19 @@ pub fn wait_for(browser: &mut Browser, what: &str, mut is_there: impl FnMut(&mut
 /// Left, top, width and height of the view in the window, pixels.
 pub fn canvas_bounds(browser: &mut Browser) -> [u32; 4] {
     let bounds = browser.evaluate("(() => { const b = document.getElementById('canvas').getBoundingClientRect(); return [b.x, b.y, b.width, b.height].map(Math.round) })()");
-    [0, 1, 2, 3].map(|ix| bounds[ix].as_u64().and_then(|n| u32::try_from(n).ok()).expect("a bound"))
+    [0, 1, 2, 3].map(|ix| {
+        bounds[ix]
+            .as_u64()
+            .and_then(|n| u32::try_from(n).ok())
+            .expect("a bound")
+    })
 }
 
 /// The part of the window that the view covers.
 pub fn canvas_shot(browser: &mut Browser) -> image::RgbImage {
     browser.next_frame();
     let [x, y, width, height] = canvas_bounds(browser);
-    let shot = image::load_from_memory_with_format(&browser.screenshot(), image::ImageFormat::Png).expect("a PNG");
+    let shot = image::load_from_memory_with_format(&browser.screenshot(), image::ImageFormat::Png)
+        .expect("a PNG");
     shot.crop_imm(x, y, width, height).to_rgb8()
 }

@@ -1,8 +1,10 @@
 //! What the tests of several crates share. Only tests depend on this crate.
 //!
 //! - [`data_folder`] finds real data, [`skip`] reports a test that cannot run on this machine.
-//! - [`Stalls`] measures when the machine could not run a test, so that deadlines of real protocols can exclude this time.
-//! - `browser` drives headless Chromium, and `silhouette` compares robots in its screenshots (feature `browser`).
+//! - [`Stalls`] measures when the machine could not run a test, so that deadlines of real protocols
+//!   can exclude this time.
+//! - `browser` drives headless Chromium, and `silhouette` compares robots in its screenshots
+//!   (feature `browser`).
 //!
 //! ```
 //! # fn test() {

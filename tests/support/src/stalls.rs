@@ -6,8 +6,9 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-/// Measures when a processor could not run even a thread of high priority, for example because the host ran another
-/// virtual machine. Without real-time priority, the load of other programs and of this one counts, too.
+/// Measures when a processor could not run even a thread of high priority, for example because the
+/// host ran another virtual machine. Without real-time priority, the load of other programs and of
+/// this one counts, too.
 pub struct Stalls {
     start: Instant,
     is_over: Arc<AtomicBool>,
@@ -15,8 +16,8 @@ pub struct Stalls {
 }
 
 impl Stalls {
-    /// Starts one thread per processor, which sleeps for 1 ms at a time and records by how many milliseconds it wakes up
-    /// late.
+    /// Starts one thread per processor, which sleeps for 1 ms at a time and records by how many
+    /// milliseconds it wakes up late.
     pub fn start() -> Self {
         let is_over = Arc::new(AtomicBool::new(false));
         let start = Instant::now();
@@ -35,23 +36,35 @@ impl Stalls {
                 stalled_ms
             })
         };
-        let n_cpus = std::thread::available_parallelism().expect("the number of processors is known").get();
-        Self { start, threads: (0..n_cpus).map(start_on).collect(), is_over }
+        let n_cpus = std::thread::available_parallelism()
+            .expect("the number of processors is known")
+            .get();
+        Self {
+            start,
+            threads: (0..n_cpus).map(start_on).collect(),
+            is_over,
+        }
     }
 
     /// Stops the threads, and returns the times at which at least one processor was stalled.
     pub fn stop(mut self) -> StalledTimes {
         self.is_over.store(true, Ordering::Relaxed);
         let threads = self.threads.drain(..);
-        let stalled_ms = threads.flat_map(|thread| thread.join().expect("the thread does not panic")).collect();
-        StalledTimes { start: self.start, stalled_ms }
+        let stalled_ms = threads
+            .flat_map(|thread| thread.join().expect("the thread does not panic"))
+            .collect();
+        StalledTimes {
+            start: self.start,
+            stalled_ms,
+        }
     }
 }
 
-/// Gives this thread a high priority on one processor. If that is denied, it measures less accurately.
+/// Gives this thread a high priority on one processor. If that is denied, it measures less
+/// accurately.
 fn pin_with_high_priority(cpu: usize) {
-    /// Higher than the priority of the Franka driver and the emulated robot, so that their computing time does not count
-    /// as a stall.
+    /// Higher than the priority of the Franka driver and the emulated robot, so that their
+    /// computing time does not count as a stall.
     #[cfg(target_os = "linux")]
     const PRIORITY: i32 = 90;
     #[cfg(target_os = "linux")]
@@ -75,8 +88,8 @@ pub struct StalledTimes {
 }
 
 impl StalledTimes {
-    /// Fraction of the time between two instants in which a processor was stalled; at most 20 %, so that a stalled machine
-    /// does not excuse every failure.
+    /// Fraction of the time between two instants in which a processor was stalled; at most 20 %, so
+    /// that a stalled machine does not excuse every failure.
     pub fn frac(&self, from: Instant, to: Instant) -> f64 {
         const MAX_FRAC: f64 = 0.2;
         let ms = |time: Instant| time.duration_since(self.start).as_millis();
@@ -92,6 +105,8 @@ fn only_stalls_within_the_time_count() {
     let stalled_ms = (100..150).chain(5000..9000).collect();
     let stalled = StalledTimes { start, stalled_ms };
     let close = |frac: f64, expected: f64| (frac - expected).abs() < 1e-9;
-    assert!(close(stalled.frac(at(0), at(1000)), 0.05) && close(stalled.frac(at(300), at(500)), 0.0));
+    assert!(
+        close(stalled.frac(at(0), at(1000)), 0.05) && close(stalled.frac(at(300), at(500)), 0.0)
+    );
     assert!(close(stalled.frac(at(4000), at(9000)), 0.2), "at most");
 }

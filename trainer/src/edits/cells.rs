@@ -7,11 +7,12 @@ use serde::{Deserialize, Serialize};
 
 /// Maximum number of cells along an axis; indices have 30 bits.
 const MAX_CELLS: u32 = 1024;
-/// Smallest radius of the cube with equal cells, meters. Its inverse times any coordinate is finite in f32.
+/// Smallest radius of the cube with equal cells, meters. Its inverse times any coordinate is finite
+/// in f32.
 const MIN_RADIUS_M: f64 = 1e-6;
 
-/// A grid of cells that covers all space: cubes of equal size within a radius, and larger ones outside, as in a
-/// contracted neural field (Barron et al. 2022).
+/// A grid of cells that covers all space: cubes of equal size within a radius, and larger ones
+/// outside, as in a contracted neural field (Barron et al. 2022).
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CellGrid {
@@ -27,8 +28,13 @@ impl CellGrid {
     /// Index of the cell that contains a point in world.
     pub fn cell_at(&self, point_m: [f64; 3]) -> u32 {
         let n = f64::from(self.n_cells);
-        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "within the unit cube")]
-        let coord = contract(self.scaled(point_m)).map(|along| (along * n).clamp(0.0, n - 1.0) as u32);
+        #[expect(
+            clippy::cast_possible_truncation,
+            clippy::cast_sign_loss,
+            reason = "within the unit cube"
+        )]
+        let coord =
+            contract(self.scaled(point_m)).map(|along| (along * n).clamp(0.0, n - 1.0) as u32);
         self.index(coord)
     }
 
@@ -39,7 +45,10 @@ impl CellGrid {
 
     /// Width of the cells at a point along the narrower directions, meters.
     pub(crate) fn cell_m(&self, point_m: [f64; 3]) -> f64 {
-        let largest = self.scaled(point_m).iter().fold(1.0, |largest: f64, along| largest.max(along.abs()));
+        let largest = self
+            .scaled(point_m)
+            .iter()
+            .fold(1.0, |largest: f64, along| largest.max(along.abs()));
         4.0 * self.radius_m / f64::from(self.n_cells) * largest * largest / (2.0 * largest - 1.0)
     }
 
@@ -49,7 +58,11 @@ impl CellGrid {
         let coord = [index % n, index / n % n, index / (n * n)];
         (0..27_u32).filter(|ix| *ix != 13).filter_map(move |ix| {
             let steps = [ix % 3, ix / 3 % 3, ix / 9];
-            let moved = |axis: usize| (coord[axis] + steps[axis]).checked_sub(1).filter(|along| *along < n);
+            let moved = |axis: usize| {
+                (coord[axis] + steps[axis])
+                    .checked_sub(1)
+                    .filter(|along| *along < n)
+            };
             Some(grid.index([moved(0)?, moved(1)?, moved(2)?]))
         })
     }
@@ -95,7 +108,11 @@ impl CellMask {
             .step_by(64)
             .zip(&self.0)
             .filter(|(_, word)| **word != 0)
-            .flat_map(|(first, word)| (0..64).filter(move |bit| word >> bit & 1 == 1).map(move |bit| first + bit))
+            .flat_map(|(first, word)| {
+                (0..64)
+                    .filter(move |bit| word >> bit & 1 == 1)
+                    .map(move |bit| first + bit)
+            })
     }
 }
 
@@ -130,10 +147,17 @@ impl CellSet {
     /// Checks that kernels can compute with the set. The error is a sentence without a period.
     pub(super) fn check(&self) -> Result<(), String> {
         let Self { grid, ranges } = self;
-        let CellGrid { center_m, radius_m, n_cells } = grid;
+        let CellGrid {
+            center_m,
+            radius_m,
+            n_cells,
+        } = grid;
         // The comparisons are written so that NaN fails them.
         let is_near = center_m.iter().all(|along| along.abs() <= MAX_COORD_M);
-        if !(is_near && (MIN_RADIUS_M..=MAX_COORD_M).contains(radius_m) && (1..=MAX_CELLS).contains(n_cells)) {
+        if !(is_near
+            && (MIN_RADIUS_M..=MAX_COORD_M).contains(radius_m)
+            && (1..=MAX_CELLS).contains(n_cells))
+        {
             return Err(format!(
                 "invalid grid of erased cells: {grid:?}, expected coordinates up to {MAX_COORD_M:e} m, a radius from \
                  {MIN_RADIUS_M:e} m to {MAX_COORD_M:e} m and 1 to {MAX_CELLS} cells"
@@ -141,8 +165,15 @@ impl CellSet {
         }
         let end = n_cells.pow(3);
         let is_ordered = ranges.windows(2).all(|pair| pair[0][1] <= pair[1][0]);
-        if ranges.is_empty() || !is_ordered || ranges.iter().any(|[first, after]| first >= after || *after > end) {
-            return Err(format!("erased cells need at least one range, in increasing order, disjoint and up to {end}"));
+        if ranges.is_empty()
+            || !is_ordered
+            || ranges
+                .iter()
+                .any(|[first, after]| first >= after || *after > end)
+        {
+            return Err(format!(
+                "erased cells need at least one range, in increasing order, disjoint and up to {end}"
+            ));
         }
         Ok(())
     }
@@ -151,7 +182,9 @@ impl CellSet {
     pub fn contains(&self, point_m: [f64; 3]) -> bool {
         let cell = self.grid.cell_at(point_m);
         let n_before = self.ranges.partition_point(|[_, end]| *end <= cell);
-        self.ranges.get(n_before).is_some_and(|[first, _]| *first <= cell)
+        self.ranges
+            .get(n_before)
+            .is_some_and(|[first, _]| *first <= cell)
     }
 
     /// The ranges, two per group of four words.
@@ -163,12 +196,21 @@ impl CellSet {
         })
     }
 
-    /// The data of the set: rows of the transform to units of the radius, number of cells along an axis, the group
-    /// where the ranges begin, and their number.
-    pub(super) fn words(&self, world_from_drawn: &Matrix4<f64>, first: u32) -> [[u32; 4]; GROUPS_PER_EDIT] {
-        let CellGrid { center_m, radius_m, n_cells } = self.grid;
+    /// The data of the set: rows of the transform to units of the radius, number of cells along an
+    /// axis, the group where the ranges begin, and their number.
+    pub(super) fn words(
+        &self,
+        world_from_drawn: &Matrix4<f64>,
+        first: u32,
+    ) -> [[u32; 4]; GROUPS_PER_EDIT] {
+        let CellGrid {
+            center_m,
+            radius_m,
+            n_cells,
+        } = self.grid;
         let scale = Matrix4::new_scaling(1.0 / radius_m);
-        let [x, y, z] = rows(&(scale * Matrix4::new_translation(&-Vector3::from(center_m)) * world_from_drawn));
+        let [x, y, z] =
+            rows(&(scale * Matrix4::new_translation(&-Vector3::from(center_m)) * world_from_drawn));
         let n_ranges = u32::try_from(self.ranges.len()).unwrap_or(u32::MAX);
         [x, y, z, [n_cells, 0, 0, first], [0, 0, 0, n_ranges]]
     }

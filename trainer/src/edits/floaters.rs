@@ -4,10 +4,11 @@ use super::cells::{CellGrid, CellMask, CellSet};
 use super::groups::Groups;
 use crate::pending::Pending;
 
-/// A part with less than this fraction (1 / divisor) of the cells or triangles of the whole is a floater.
+/// A part with less than this fraction (1 / divisor) of the cells or triangles of the whole is a
+/// floater.
 ///
-/// In a room of radius R, this is a patch of surface about 0.16 R wide. Without scale, it resembles the diameter of
-/// 10 % of the scene below which `MeshLab` removes isolated pieces by default.
+/// In a room of radius R, this is a patch of surface about 0.16 R wide. Without scale, it resembles
+/// the diameter of 10 % of the scene below which `MeshLab` removes isolated pieces by default.
 const SIZE_DIVISOR: usize = 500;
 
 /// Whether a part of this size is a floater.
@@ -41,13 +42,19 @@ pub(crate) struct CellLabels {
 impl CellLabels {
     /// No cell contains a part of the model.
     pub(crate) fn none(grid: &CellGrid) -> Self {
-        Self { kept: CellMask::none(grid), floating: CellMask::none(grid) }
+        Self {
+            kept: CellMask::none(grid),
+            floating: CellMask::none(grid),
+        }
     }
 
-    /// Divides occupied cells into groups, after connecting adjacent ones. Groups with few cells are floaters.
+    /// Divides occupied cells into groups, after connecting adjacent ones. Groups with few cells
+    /// are floaters.
     pub(crate) fn of_occupied(grid: &CellGrid, occupied: &CellMask, mut groups: Groups) -> Self {
         for cell in occupied.cells() {
-            grid.neighbors(cell).filter(|other| occupied.contains(*other)).for_each(|other| groups.join(cell, other));
+            grid.neighbors(cell)
+                .filter(|other| occupied.contains(*other))
+                .for_each(|other| groups.join(cell, other));
         }
         let mut sizes = vec![0; grid.n()];
         for cell in occupied.cells() {
@@ -55,8 +62,14 @@ impl CellLabels {
         }
         let (mut labels, n_occupied) = (Self::none(grid), occupied.n_marked());
         for cell in occupied.cells() {
-            let is_floating = is_floater_size(sizes[groups.representative(cell) as usize], n_occupied);
-            if is_floating { &mut labels.floating } else { &mut labels.kept }.insert(cell);
+            let is_floating =
+                is_floater_size(sizes[groups.representative(cell) as usize], n_occupied);
+            if is_floating {
+                &mut labels.floating
+            } else {
+                &mut labels.kept
+            }
+            .insert(cell);
         }
         labels
     }
@@ -64,15 +77,19 @@ impl CellLabels {
     /// Also keeps the cells around those of large parts.
     pub(crate) fn keep_around(&mut self, grid: &CellGrid) {
         let inner = self.kept.clone();
-        self.kept.extend(inner.cells().flat_map(|cell| grid.neighbors(cell)));
+        self.kept
+            .extend(inner.cells().flat_map(|cell| grid.neighbors(cell)));
     }
 
-    /// The cells to erase: those of floaters and, because floaters move in training, the cells around them, except for
-    /// kept cells. `None` if there are none.
+    /// The cells to erase: those of floaters and, because floaters move in training, the cells
+    /// around them, except for kept cells. `None` if there are none.
     pub(crate) fn erased(&self, grid: &CellGrid) -> Option<CellSet> {
         let mut erased = self.floating.clone();
         erased.extend(self.floating.cells().flat_map(|cell| grid.neighbors(cell)));
-        let mut cells = erased.cells().filter(|cell| !self.kept.contains(*cell)).peekable();
+        let mut cells = erased
+            .cells()
+            .filter(|cell| !self.kept.contains(*cell))
+            .peekable();
         cells.peek().is_some().then(|| CellSet::new(*grid, cells))
     }
 }

@@ -3,14 +3,17 @@
 /// Items that are connected by pairs form groups (union-find; Galler and Fischer 1964).
 #[derive(Debug)]
 pub(crate) struct Groups {
-    /// For each item, another item of its group that is closer to the group's representative, which refers to itself.
+    /// For each item, another item of its group that is closer to the group's representative, which
+    /// refers to itself.
     parents: Vec<u32>,
 }
 
 impl Groups {
     /// `n` items that are not connected.
     pub(crate) fn new(n: usize) -> Self {
-        Self { parents: (0..).take(n).collect() }
+        Self {
+            parents: (0..).take(n).collect(),
+        }
     }
 
     /// Connects two items.

@@ -1,7 +1,7 @@
 //! Edits of a model: space that an operator has erased.
 //!
-//! Edits do not change the model. Erased space is left out of pictures, chunks and exports, and undoing an edit shows it
-//! again.
+//! Edits do not change the model. Erased space is left out of pictures, chunks and exports, and
+//! undoing an edit shows it again.
 
 mod cells;
 mod floaters;
@@ -57,14 +57,25 @@ impl Edit {
     }
 }
 
-fn check_box(Aabb { world_from_box, min_m, max_m }: &Aabb) -> Result<(), String> {
+fn check_box(
+    Aabb {
+        world_from_box,
+        min_m,
+        max_m,
+    }: &Aabb,
+) -> Result<(), String> {
     // The comparisons are written so that NaN fails them.
     let is_increasing = (0..3).all(|axis| min_m[axis] < max_m[axis]);
     if !is_increasing {
-        return Err(format!("an erased box from {min_m:?} to {max_m:?}, expected increasing corners"));
+        return Err(format!(
+            "an erased box from {min_m:?} to {max_m:?}, expected increasing corners"
+        ));
     }
     let origin_m: [f64; 3] = world_from_box.translation.vector.into();
-    let is_near = [&origin_m, min_m, max_m].into_iter().flatten().all(|along| along.abs() <= MAX_COORD_M);
+    let is_near = [&origin_m, min_m, max_m]
+        .into_iter()
+        .flatten()
+        .all(|along| along.abs() <= MAX_COORD_M);
     if !is_near {
         return Err(format!(
             "an erased box at {origin_m:?} from {min_m:?} to {max_m:?} m, expected coordinates up to {MAX_COORD_M:e} m"
@@ -90,12 +101,14 @@ impl Edits {
     ///
     /// # Errors
     ///
-    /// Fails if there are [`MAX_EDITS`] already, or if the edit is too large or too far away to be computed with.
+    /// Fails if there are [`MAX_EDITS`] already, or if the edit is too large or too far away to be
+    /// computed with.
     pub fn push(&mut self, edit: Edit) -> Result<(), Error> {
         if self.0.len() >= MAX_EDITS {
             return Err(Error::TooManyEdits);
         }
-        edit.check().map_err(|reason| Error::InvalidEdit { reason })?;
+        edit.check()
+            .map_err(|reason| Error::InvalidEdit { reason })?;
         self.0.push(edit);
         Ok(())
     }
@@ -127,21 +140,27 @@ impl Edits {
         self.0.iter().any(|edit| edit.erases(point_m))
     }
 
-    /// Reads the edits in the folder of a saved model; none if the folder has no such file, or for a single file.
+    /// Reads the edits in the folder of a saved model; none if the folder has no such file, or for
+    /// a single file.
     ///
     /// # Errors
     ///
     /// Fails if the file cannot be read or is damaged.
     pub fn read(model: &Path) -> Result<Self, Error> {
         let path = model.join(FILE);
-        // Anything else with this name, such as a broken link, is an error: erased parts would return without it.
+        // Anything else with this name, such as a broken link, is an error: erased parts would
+        // return without it.
         if let Err(error) = path.symlink_metadata()
             && matches!(error.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory)
         {
             return Ok(Self::default());
         }
-        let text = files::read_text(&path).map_err(|source| Error::Read { path: path.clone(), source })?;
-        let file: File = serde_json::from_str(&text).map_err(|source| Error::ModelMetadata { path, source })?;
+        let text = files::read_text(&path).map_err(|source| Error::Read {
+            path: path.clone(),
+            source,
+        })?;
+        let file: File =
+            serde_json::from_str(&text).map_err(|source| Error::ModelMetadata { path, source })?;
         Ok(file.edits)
     }
 
@@ -154,16 +173,24 @@ impl Edits {
         let path = folder.join(FILE);
         if self.is_empty() {
             return match std::fs::remove_file(&path) {
-                Err(source) if source.kind() != std::io::ErrorKind::NotFound => Err(Error::Write { path, source }),
+                Err(source) if source.kind() != std::io::ErrorKind::NotFound => {
+                    Err(Error::Write { path, source })
+                }
                 _ => Ok(()),
             };
         }
-        let text = serde_json::to_string(&File { edits: self.clone() });
-        let text = text.map_err(|error| Error::Write { path: path.clone(), source: error.into() })?;
+        let text = serde_json::to_string(&File {
+            edits: self.clone(),
+        });
+        let text = text.map_err(|error| Error::Write {
+            path: path.clone(),
+            source: error.into(),
+        })?;
         files::write(&path, format!("{text}\n")).map_err(|source| Error::Write { path, source })
     }
 
-    /// The data of shared/erased.wgsl, for kernels whose points are in a frame, and in units, other than the world's.
+    /// The data of shared/erased.wgsl, for kernels whose points are in a frame, and in units, other
+    /// than the world's.
     ///
     /// * `world_from_drawn`: maps points of the kernel to world, meters.
     pub(crate) fn words(&self, world_from_drawn: &Matrix4<f64>) -> Vec<[u32; 4]> {
@@ -198,7 +225,9 @@ fn box_words(aabb: &Aabb, world_from_drawn: &Matrix4<f64>) -> [[u32; 4]; GROUPS_
 
 /// The upper three rows of a matrix, as bits of f32.
 fn rows(matrix: &Matrix4<f64>) -> [[u32; 4]; 3] {
-    std::array::from_fn(|row| std::array::from_fn(|column| crate::gpu::f32_of(matrix[(row, column)]).to_bits()))
+    std::array::from_fn(|row| {
+        std::array::from_fn(|column| crate::gpu::f32_of(matrix[(row, column)]).to_bits())
+    })
 }
 
 #[cfg(test)]

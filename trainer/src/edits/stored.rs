@@ -10,16 +10,29 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub(super) enum StoredEdit {
-    Box { world_from_box: [f64; 16], min_m: [f64; 3], max_m: [f64; 3] },
-    Cells { grid: CellGrid, ranges: Vec<[u32; 2]> },
+    Box {
+        world_from_box: [f64; 16],
+        min_m: [f64; 3],
+        max_m: [f64; 3],
+    },
+    Cells {
+        grid: CellGrid,
+        ranges: Vec<[u32; 2]>,
+    },
 }
 
 impl From<Edits> for Vec<StoredEdit> {
     fn from(edits: Edits) -> Self {
         let stored = |edit| match edit {
-            Edit::Box(Aabb { world_from_box, min_m, max_m }) => {
-                StoredEdit::Box { world_from_box: to_rows(&world_from_box), min_m, max_m }
-            }
+            Edit::Box(Aabb {
+                world_from_box,
+                min_m,
+                max_m,
+            }) => StoredEdit::Box {
+                world_from_box: to_rows(&world_from_box),
+                min_m,
+                max_m,
+            },
             Edit::Cells(CellSet { grid, ranges }) => StoredEdit::Cells { grid, ranges },
         };
         edits.0.into_iter().map(stored).collect()
@@ -31,9 +44,16 @@ impl TryFrom<Vec<StoredEdit>> for Edits {
 
     fn try_from(stored: Vec<StoredEdit>) -> Result<Self, String> {
         if stored.len() > MAX_EDITS {
-            return Err(format!("{} edits, expected at most {MAX_EDITS}", stored.len()));
+            return Err(format!(
+                "{} edits, expected at most {MAX_EDITS}",
+                stored.len()
+            ));
         }
-        stored.into_iter().map(Edit::try_from).collect::<Result<_, _>>().map(Self)
+        stored
+            .into_iter()
+            .map(Edit::try_from)
+            .collect::<Result<_, _>>()
+            .map(Self)
     }
 }
 
@@ -42,9 +62,18 @@ impl TryFrom<StoredEdit> for Edit {
 
     fn try_from(stored: StoredEdit) -> Result<Self, String> {
         let edit = match stored {
-            StoredEdit::Box { world_from_box, min_m, max_m } => {
-                let world_from_box = from_rows(&world_from_box).map_err(|error| error.to_string())?;
-                Self::Box(Aabb { world_from_box, min_m, max_m })
+            StoredEdit::Box {
+                world_from_box,
+                min_m,
+                max_m,
+            } => {
+                let world_from_box =
+                    from_rows(&world_from_box).map_err(|error| error.to_string())?;
+                Self::Box(Aabb {
+                    world_from_box,
+                    min_m,
+                    max_m,
+                })
             }
             StoredEdit::Cells { grid, ranges } => Self::Cells(CellSet { grid, ranges }),
         };

@@ -8,11 +8,20 @@ use serde_json::{Value, json};
 use std::collections::BTreeSet;
 use std::path::Path;
 
-const GRID: CellGrid = CellGrid { center_m: [1.0, 0.0, -2.0], radius_m: 0.5, n_cells: 40 };
+const GRID: CellGrid = CellGrid {
+    center_m: [1.0, 0.0, -2.0],
+    radius_m: 0.5,
+    n_cells: 40,
+};
 
 fn rotated_box() -> Aabb {
-    let world_from_box = Transform::new(Vector3::new(0.5, -2.0, 1.25), Vector3::new(0.3, -1.1, 0.7));
-    Aabb { world_from_box, min_m: [-1.0, 0.0, 0.5], max_m: [1.0, 2.0, 0.75] }
+    let world_from_box =
+        Transform::new(Vector3::new(0.5, -2.0, 1.25), Vector3::new(0.3, -1.1, 0.7));
+    Aabb {
+        world_from_box,
+        min_m: [-1.0, 0.0, 0.5],
+        max_m: [1.0, 2.0, 0.75],
+    }
 }
 
 #[test]
@@ -20,11 +29,18 @@ fn boxes_are_erased_in_their_frame() {
     let aabb = rotated_box();
     let mut edits = Edits::default();
     edits.push(Edit::Box(aabb)).unwrap();
-    for (in_box, is_inside) in
-        [([0.0, 1.0, 0.6], true), ([0.99, 0.01, 0.51], true), ([0.0, 1.0, 0.8], false), ([-1.01, 1.0, 0.6], false)]
-    {
+    for (in_box, is_inside) in [
+        ([0.0, 1.0, 0.6], true),
+        ([0.99, 0.01, 0.51], true),
+        ([0.0, 1.0, 0.8], false),
+        ([-1.01, 1.0, 0.6], false),
+    ] {
         let in_world = aabb.world_from_box * nalgebra::Point3::from(in_box);
-        assert_eq!(edits.erases(in_world.coords.into()), is_inside, "{in_box:?}");
+        assert_eq!(
+            edits.erases(in_world.coords.into()),
+            is_inside,
+            "{in_box:?}"
+        );
     }
     edits.undo().unwrap();
     assert!(edits.is_empty() && matches!(edits.undo(), Err(Error::NothingToUndo)));
@@ -37,19 +53,34 @@ fn number_of_edits_is_limited() {
         edits.push(Edit::Box(rotated_box())).unwrap();
     }
     let error = edits.push(Edit::Box(rotated_box())).unwrap_err();
-    assert_eq!((edits.len(), error.to_string().as_str()), (64, "a model has at most 64 edits; undo one first"));
+    assert_eq!(
+        (edits.len(), error.to_string().as_str()),
+        (64, "a model has at most 64 edits; undo one first")
+    );
 }
 
 #[test]
 fn cells_cover_all_space() {
     // Cells inside the radius are 4 r / n = 5 cm wide.
     assert!((GRID.cell_m([1.2, 0.3, -2.0]) - 0.05).abs() < 1e-12);
-    assert_eq!(GRID.cell_at([1.01, 0.01, -1.99]), GRID.cell_at([1.04, 0.04, -1.96]));
-    assert_ne!(GRID.cell_at([1.01, 0.01, -1.99]), GRID.cell_at([0.99, 0.01, -1.99]));
+    assert_eq!(
+        GRID.cell_at([1.01, 0.01, -1.99]),
+        GRID.cell_at([1.04, 0.04, -1.96])
+    );
+    assert_ne!(
+        GRID.cell_at([1.01, 0.01, -1.99]),
+        GRID.cell_at([0.99, 0.01, -1.99])
+    );
     let corner = GRID.cell_at([-1e9; 3]);
     assert_eq!((corner, GRID.cell_at([1e9; 3])), (0, 40 * 40 * 40 - 1));
-    assert_eq!(GRID.neighbors(corner).collect::<BTreeSet<_>>(), BTreeSet::from([1, 40, 41, 1600, 1601, 1640, 1641]));
-    assert_eq!(GRID.neighbors(GRID.cell_at([1.01, 0.01, -1.99])).count(), 26);
+    assert_eq!(
+        GRID.neighbors(corner).collect::<BTreeSet<_>>(),
+        BTreeSet::from([1, 40, 41, 1600, 1601, 1640, 1641])
+    );
+    assert_eq!(
+        GRID.neighbors(GRID.cell_at([1.01, 0.01, -1.99])).count(),
+        26
+    );
     let cells = BTreeSet::from([3, 4, 5, 9, 11, corner]);
     let mut mask = CellMask::none(&GRID);
     mask.extend(cells.iter().rev().copied());
@@ -66,13 +97,21 @@ fn small_groups_of_cells_are_floaters() {
     occupied.extend((5..35).flat_map(|x| (5..35).map(move |y| cell(x, y, 10))));
     occupied.extend([cell(4, 4, 11), cell(20, 20, 14)]);
     let labels = CellLabels::of_occupied(&GRID, &occupied, Groups::new(GRID.n()));
-    assert_eq!((labels.floating.n_marked(), labels.kept.n_marked()), (1, 901));
+    assert_eq!(
+        (labels.floating.n_marked(), labels.kept.n_marked()),
+        (1, 901)
+    );
     let erased = labels.erased(&GRID).unwrap();
     let n_erased: u32 = erased.ranges.iter().map(|[first, end]| end - first).sum();
     assert_eq!(n_erased, 27, "the floater and the cells around it");
     let mut connected = Groups::new(GRID.n());
     connected.join(cell(20, 20, 14), cell(20, 20, 10));
-    assert!(CellLabels::of_occupied(&GRID, &occupied, connected).erased(&GRID).is_none(), "connected by a splat");
+    assert!(
+        CellLabels::of_occupied(&GRID, &occupied, connected)
+            .erased(&GRID)
+            .is_none(),
+        "connected by a splat"
+    );
     occupied.insert(cell(21, 20, 14));
     let labels = CellLabels::of_occupied(&GRID, &occupied, Groups::new(GRID.n()));
     assert!(labels.erased(&GRID).is_none(), "more than one in 500");
@@ -83,20 +122,33 @@ fn files_round_trip() {
     let folder = tempfile::tempdir().unwrap();
     assert!(Edits::read(folder.path()).unwrap().is_empty(), "no file");
     let mut edits = Edits::default();
-    let aabb = Aabb { world_from_box: Transform::translation(0.1, 0.2, 0.3), ..rotated_box() };
+    let aabb = Aabb {
+        world_from_box: Transform::translation(0.1, 0.2, 0.3),
+        ..rotated_box()
+    };
     edits.push(Edit::Box(aabb)).unwrap();
-    edits.push(Edit::Cells(CellSet::new(GRID, [7, 8, 100]))).unwrap();
+    edits
+        .push(Edit::Cells(CellSet::new(GRID, [7, 8, 100])))
+        .unwrap();
     edits.write(folder.path()).unwrap();
     assert!(Edits::read(folder.path()).unwrap() == edits);
     Edits::default().write(folder.path()).unwrap();
-    assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0, "no edits, no file");
+    assert_eq!(
+        std::fs::read_dir(folder.path()).unwrap().count(),
+        0,
+        "no edits, no file"
+    );
 }
 
 #[test]
 fn damaged_files_are_rejected_with_the_reason() {
     let folder = tempfile::tempdir().unwrap();
     let error_of = |edits: &str| {
-        std::fs::write(folder.path().join("edits.json"), format!("{{\"edits\": {edits}}}")).unwrap();
+        std::fs::write(
+            folder.path().join("edits.json"),
+            format!("{{\"edits\": {edits}}}"),
+        )
+        .unwrap();
         let error = Edits::read(folder.path()).unwrap_err();
         format!("{error}: {}", std::error::Error::source(&error).unwrap())
     };
@@ -105,15 +157,41 @@ fn damaged_files_are_rejected_with_the_reason() {
     for (edits, named) in [
         ("[", "expected value"),
         (r#"[{"ball": {}}]"#, "ball"),
-        (r#"[{"box": {"world_from_box": [0], "min_m": [0, 0, 0], "max_m": [1, 1, 1]}}]"#, "16"),
-        (&format!(r#"[{{"box": {{"world_from_box": {pose}, "min_m": [0, 0, 0], "max_m": [1, 0, 1]}}}}]"#), "corners"),
-        (&format!(r#"[{{"cells": {{{grid}, "ranges": [[5, 7], [6, 8]]}}}}]"#), "disjoint"),
-        (&format!(r#"[{{"cells": {{{grid}, "ranges": [[999, 1001]]}}}}]"#), "1000"),
-        (&format!(r#"[{{"cells": {{{grid}, "ranges": []}}}}]"#), "at least one range"),
-        (&format!(r#"[{{"cells": {{{}, "ranges": [[0, 1]]}}}}]"#, grid.replace("10}", "4096}")), "invalid grid"),
+        (
+            r#"[{"box": {"world_from_box": [0], "min_m": [0, 0, 0], "max_m": [1, 1, 1]}}]"#,
+            "16",
+        ),
+        (
+            &format!(
+                r#"[{{"box": {{"world_from_box": {pose}, "min_m": [0, 0, 0], "max_m": [1, 0, 1]}}}}]"#
+            ),
+            "corners",
+        ),
+        (
+            &format!(r#"[{{"cells": {{{grid}, "ranges": [[5, 7], [6, 8]]}}}}]"#),
+            "disjoint",
+        ),
+        (
+            &format!(r#"[{{"cells": {{{grid}, "ranges": [[999, 1001]]}}}}]"#),
+            "1000",
+        ),
+        (
+            &format!(r#"[{{"cells": {{{grid}, "ranges": []}}}}]"#),
+            "at least one range",
+        ),
+        (
+            &format!(
+                r#"[{{"cells": {{{}, "ranges": [[0, 1]]}}}}]"#,
+                grid.replace("10}", "4096}")
+            ),
+            "invalid grid",
+        ),
     ] {
         let error = error_of(edits);
-        assert!(error.contains(named) && error.contains("edits.json"), "{edits}: {error}");
+        assert!(
+            error.contains(named) && error.contains("edits.json"),
+            "{edits}: {error}"
+        );
     }
     let one = format!(r#"{{"cells": {{{grid}, "ranges": [[0, 1]]}}}}"#);
     assert!(error_of(&format!("[{}]", vec![one; 65].join(","))).contains("at most 64"));
@@ -132,17 +210,25 @@ fn valid_file() -> Value {
 /// Reads a file with these contents. The error includes its cause.
 fn read(folder: &Path, file: &Value) -> Result<Edits, String> {
     std::fs::write(folder.join("edits.json"), file.to_string()).unwrap();
-    Edits::read(folder).map_err(|error| format!("{error}: {}", std::error::Error::source(&error).unwrap()))
+    Edits::read(folder)
+        .map_err(|error| format!("{error}: {}", std::error::Error::source(&error).unwrap()))
 }
 
 /// Which points of a lattice are erased, near the edits of [`valid_file`] and far away.
 fn erased(edits: &Edits) -> Vec<bool> {
-    const ALONG_M: [f64; 11] = [-1e4, -100.0, -20.0, -5.0, -1.0, 0.5, 1.5, 3.0, 9.5, 12.0, 50.0];
-    let points = ALONG_M.into_iter().flat_map(|x| ALONG_M.into_iter().flat_map(move |y| ALONG_M.map(|z| [x, y, z])));
+    const ALONG_M: [f64; 11] = [
+        -1e4, -100.0, -20.0, -5.0, -1.0, 0.5, 1.5, 3.0, 9.5, 12.0, 50.0,
+    ];
+    let points = ALONG_M.into_iter().flat_map(|x| {
+        ALONG_M
+            .into_iter()
+            .flat_map(move |y| ALONG_M.map(|z| [x, y, z]))
+    });
     points.map(|point_m| edits.erases(point_m)).collect()
 }
 
-/// A field of the table in docs/reference/files.md, a valid value, and invalid values with words of their errors.
+/// A field of the table in docs/reference/files.md, a valid value, and invalid values with words of
+/// their errors.
 type Case = (&'static str, Value, Vec<(Value, &'static str)>);
 
 fn cases() -> [Case; 8] {
@@ -150,20 +236,60 @@ fn cases() -> [Case; 8] {
     let scaled = json!([2, 0, 0, 0, 0, 2, 0, 0, 0, 0, 2, 0, 0, 0, 0, 1]);
     let one = valid_file()["edits"][0].clone();
     [
-        ("edits", json!([one]), vec![(vec![one; 65].into(), "at most 64"), (json!({}), "invalid type")]),
-        ("box.world_from_box", at(-2.0), vec![(scaled, "not rigid"), (at(1e10), "1e9 m"), (json!([1]), "16")]),
-        ("box.min_m", json!([-2, -2, -2]), vec![(json!([1, 0, 0]), "corners"), (json!([-1e300, 0, 0]), "1e9 m")]),
-        ("box.max_m", json!([4, 4, 4]), vec![(json!([-1, 1, 1]), "corners"), (json!([1, 1, 1.1e9]), "1e9 m")]),
-        ("cells.grid.center_m", json!([60, 0, 0]), vec![(json!([0, -1e10, 0]), "1e9 m"), (json!([0, 0]), "3")]),
+        (
+            "edits",
+            json!([one]),
+            vec![
+                (vec![one; 65].into(), "at most 64"),
+                (json!({}), "invalid type"),
+            ],
+        ),
+        (
+            "box.world_from_box",
+            at(-2.0),
+            vec![
+                (scaled, "not rigid"),
+                (at(1e10), "1e9 m"),
+                (json!([1]), "16"),
+            ],
+        ),
+        (
+            "box.min_m",
+            json!([-2, -2, -2]),
+            vec![
+                (json!([1, 0, 0]), "corners"),
+                (json!([-1e300, 0, 0]), "1e9 m"),
+            ],
+        ),
+        (
+            "box.max_m",
+            json!([4, 4, 4]),
+            vec![
+                (json!([-1, 1, 1]), "corners"),
+                (json!([1, 1, 1.1e9]), "1e9 m"),
+            ],
+        ),
+        (
+            "cells.grid.center_m",
+            json!([60, 0, 0]),
+            vec![(json!([0, -1e10, 0]), "1e9 m"), (json!([0, 0]), "3")],
+        ),
         (
             "cells.grid.radius_m",
             json!(60),
-            [0.0, -1.0, 1e-7, 1e10].map(|radius_m| (json!(radius_m), "a radius from 1e-6 m to 1e9 m")).to_vec(),
+            [0.0, -1.0, 1e-7, 1e10]
+                .map(|radius_m| (json!(radius_m), "a radius from 1e-6 m to 1e9 m"))
+                .to_vec(),
         ),
         (
             "cells.grid.n_cells",
             json!(5),
-            vec![(json!(0), "1 to 1024"), (json!(1025), "1 to 1024"), (json!(-1), "u32"), (json!(2.5), "u32")],
+            vec![
+                (json!(0), "1 to 1024"),
+                (json!(1025), "1 to 1024"),
+                (json!(-1), "u32"),
+                (json!(2.5), "u32"),
+            ],
         ),
         (
             "cells.ranges",
@@ -183,34 +309,64 @@ fn cases() -> [Case; 8] {
 #[test]
 fn every_documented_field_is_used_and_other_values_are_refused() {
     let page = include_str!("../../../docs/reference/files.md");
-    let section = page.split("### `edits.json`").nth(1).and_then(|rest| rest.split("\n##").next()).unwrap();
-    let rows = section.lines().filter_map(|line| line.strip_prefix("| `")?.split('`').next());
-    assert_eq!(rows.collect::<Vec<_>>(), cases().each_ref().map(|(field, ..)| *field));
+    let section = page
+        .split("### `edits.json`")
+        .nth(1)
+        .and_then(|rest| rest.split("\n##").next())
+        .unwrap();
+    let rows = section
+        .lines()
+        .filter_map(|line| line.strip_prefix("| `")?.split('`').next());
+    assert_eq!(
+        rows.collect::<Vec<_>>(),
+        cases().each_ref().map(|(field, ..)| *field)
+    );
     let folder = tempfile::tempdir().unwrap();
     let unchanged = erased(&read(folder.path(), &valid_file()).unwrap());
     for (field, valid, invalid) in cases() {
         let kind = usize::from(field.starts_with("cells"));
-        let pointer =
-            if field == "edits" { "/edits".to_owned() } else { format!("/edits/{kind}/{}", field.replace('.', "/")) };
+        let pointer = if field == "edits" {
+            "/edits".to_owned()
+        } else {
+            format!("/edits/{kind}/{}", field.replace('.', "/"))
+        };
         let with = |value: &Value| {
             let mut file = valid_file();
             *file.pointer_mut(&pointer).unwrap() = value.clone();
             read(folder.path(), &file)
         };
         assert_ne!(erased(&with(&valid).unwrap()), unchanged, "{field}");
-        for (value, words) in invalid.iter().chain(&[(Value::Null, "null"), ("1".into(), "string")]) {
+        for (value, words) in invalid
+            .iter()
+            .chain(&[(Value::Null, "null"), ("1".into(), "string")])
+        {
             let error = with(value).unwrap_err();
-            assert!(error.contains(words) && error.contains("edits.json"), "{field} is {value}: {error}");
+            assert!(
+                error.contains(words) && error.contains("edits.json"),
+                "{field} is {value}: {error}"
+            );
         }
         let mut without = valid_file();
         let (parent, key) = pointer.rsplit_once('/').unwrap();
-        without.pointer_mut(parent).unwrap().as_object_mut().unwrap().remove(key).unwrap();
+        without
+            .pointer_mut(parent)
+            .unwrap()
+            .as_object_mut()
+            .unwrap()
+            .remove(key)
+            .unwrap();
         let error = read(folder.path(), &without).unwrap_err();
-        assert!(error.contains(&format!("missing field `{key}`")), "{field}: {error}");
+        assert!(
+            error.contains(&format!("missing field `{key}`")),
+            "{field}: {error}"
+        );
         let mut with_more = valid_file();
         with_more.pointer_mut(parent).unwrap()["color"] = 1.into();
         let error = read(folder.path(), &with_more).unwrap_err();
-        assert!(error.contains("unknown field `color`"), "beside {field}: {error}");
+        assert!(
+            error.contains("unknown field `color`"),
+            "beside {field}: {error}"
+        );
     }
     let mut both = valid_file();
     both["edits"][0]["cells"] = both["edits"][1]["cells"].clone();
@@ -220,8 +376,19 @@ fn every_documented_field_is_used_and_other_values_are_refused() {
 #[test]
 fn boxes_that_cannot_be_stored_are_not_added() {
     let mut edits = Edits::default();
-    for (min_m, max_m) in [([-1e300; 3], [1e300; 3]), ([0.0; 3], [0.0; 3]), ([f64::NAN; 3], [1.0; 3])] {
-        let error = edits.push(Edit::Box(Aabb { min_m, max_m, ..rotated_box() })).unwrap_err().to_string();
+    for (min_m, max_m) in [
+        ([-1e300; 3], [1e300; 3]),
+        ([0.0; 3], [0.0; 3]),
+        ([f64::NAN; 3], [1.0; 3]),
+    ] {
+        let error = edits
+            .push(Edit::Box(Aabb {
+                min_m,
+                max_m,
+                ..rotated_box()
+            }))
+            .unwrap_err()
+            .to_string();
         assert!(error.starts_with("invalid edit: an erased box "), "{error}");
     }
     assert!(edits.is_empty());
@@ -233,14 +400,33 @@ fn only_an_absent_file_means_no_edits() {
     let folder = tempfile::tempdir().unwrap();
     let at = |name: &str| folder.path().join(name);
     std::fs::write(at("scene.ply"), "ply").unwrap();
-    assert!(Edits::read(&at("scene.ply")).unwrap().is_empty(), "a single file has no edits");
+    assert!(
+        Edits::read(&at("scene.ply")).unwrap().is_empty(),
+        "a single file has no edits"
+    );
     assert!(Edits::read(&at("gone")).unwrap().is_empty());
     std::fs::write(at("edits.json"), format!("\u{FEFF}{}", valid_file())).unwrap();
-    assert_eq!(Edits::read(folder.path()).unwrap().len(), 2, "with a byte order mark");
+    assert_eq!(
+        Edits::read(folder.path()).unwrap().len(),
+        2,
+        "with a byte order mark"
+    );
     std::fs::remove_file(at("edits.json")).unwrap();
     std::os::unix::fs::symlink(at("gone"), at("edits.json")).unwrap();
-    assert!(Edits::read(folder.path()).unwrap_err().to_string().contains("edits.json"), "a broken link");
+    assert!(
+        Edits::read(folder.path())
+            .unwrap_err()
+            .to_string()
+            .contains("edits.json"),
+        "a broken link"
+    );
     std::fs::remove_file(at("edits.json")).unwrap();
     std::fs::create_dir(at("edits.json")).unwrap();
-    assert!(Edits::read(folder.path()).unwrap_err().to_string().contains("edits.json"), "a folder");
+    assert!(
+        Edits::read(folder.path())
+            .unwrap_err()
+            .to_string()
+            .contains("edits.json"),
+        "a folder"
+    );
 }

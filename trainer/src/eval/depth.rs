@@ -3,12 +3,16 @@
 use crate::Error;
 use keyframe::DepthMap;
 
-/// Root mean squared difference of two depth images in meters, over pixels where both have a depth above 0.
+/// Root mean squared difference of two depth images in meters, over pixels where both have a depth
+/// above 0.
 ///
 /// Returns `None` if there is no such pixel; fails if the images differ in size.
 pub fn depth_rmse_m(rendered_m: &[f32], truth_m: &[f32]) -> Result<Option<f64>, Error> {
     if rendered_m.len() != truth_m.len() {
-        return Err(Error::DepthSizeMismatch { rendered: rendered_m.len(), truth: truth_m.len() });
+        return Err(Error::DepthSizeMismatch {
+            rendered: rendered_m.len(),
+            truth: truth_m.len(),
+        });
     }
     let (mut squares, mut n_known) = (0.0_f64, 0_u32);
     for (&rendered, &truth) in rendered_m.iter().zip(truth_m) {
@@ -23,8 +27,8 @@ pub fn depth_rmse_m(rendered_m: &[f32], truth_m: &[f32]) -> Result<Option<f64>, 
 /// Distance of a rendered surface from a measured one.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SurfaceError {
-    /// Mean distance along the normal of the measured surface, meters, over measured pixels with a rendered depth;
-    /// `None` if there are none.
+    /// Mean distance along the normal of the measured surface, meters, over measured pixels with a
+    /// rendered depth; `None` if there are none.
     pub mean_m: Option<f64>,
     /// Fraction of the measured pixels whose rendered surface is within [`SurfaceError::NEAR_M`].
     pub near_frac: f64,
@@ -35,32 +39,45 @@ impl SurfaceError {
     pub const NEAR_M: f64 = 0.005;
 }
 
-/// Distance of a rendered surface from a measured one; both are depth images of the same camera, meters.
+/// Distance of a rendered surface from a measured one; both are depth images of the same camera,
+/// meters.
 ///
-/// Only measured pixels with a known surface normal count: all four neighbors must have a reading, and none may differ
-/// by more than 4 % (an edge). Returns `None` if there is no such pixel. Fails if the images differ in size.
-pub fn surface_error(rendered_m: &[f32], measured: &DepthMap) -> Result<Option<SurfaceError>, Error> {
+/// Only measured pixels with a known surface normal count: all four neighbors must have a reading,
+/// and none may differ by more than 4 % (an edge). Returns `None` if there is no such pixel. Fails
+/// if the images differ in size.
+pub fn surface_error(
+    rendered_m: &[f32],
+    measured: &DepthMap,
+) -> Result<Option<SurfaceError>, Error> {
     const EDGE_FRAC: f64 = 0.04;
     let [width, height] = measured.size_px;
     let n_pixels = width as usize * height as usize;
     for depth_m in [rendered_m, &measured.depth_m] {
         if depth_m.len() != n_pixels {
-            return Err(Error::DepthSizeMismatch { rendered: depth_m.len(), truth: n_pixels });
+            return Err(Error::DepthSizeMismatch {
+                rendered: depth_m.len(),
+                truth: n_pixels,
+            });
         }
     }
     let pixel = |x: u32, y: u32| y as usize * width as usize + x as usize;
     let z_m = |x: u32, y: u32| f64::from(measured.depth_m[pixel(x, y)]);
     let point = |x: u32, y: u32| measured.point(x, y, z_m(x, y));
     let (mut sum_m, mut n_rendered, mut n_near, mut n_measured) = (0.0, 0_u32, 0_u32, 0_u32);
-    for (y, x) in (1..height.saturating_sub(1)).flat_map(|y| (1..width.saturating_sub(1)).map(move |x| (y, x))) {
+    for (y, x) in (1..height.saturating_sub(1))
+        .flat_map(|y| (1..width.saturating_sub(1)).map(move |x| (y, x)))
+    {
         let z = z_m(x, y);
         let is_on_surface = |neighbor: f64| neighbor > 0.0 && (neighbor - z).abs() <= EDGE_FRAC * z;
         let around = [z_m(x - 1, y), z_m(x + 1, y), z_m(x, y - 1), z_m(x, y + 1)];
         if !(z > 0.0 && z.is_finite() && around.into_iter().all(is_on_surface)) {
             continue;
         }
-        let normal = (point(x + 1, y) - point(x - 1, y)).cross(&(point(x, y + 1) - point(x, y - 1)));
-        let Some(normal) = normal.try_normalize(0.0) else { continue };
+        let normal =
+            (point(x + 1, y) - point(x - 1, y)).cross(&(point(x, y + 1) - point(x, y - 1)));
+        let Some(normal) = normal.try_normalize(0.0) else {
+            continue;
+        };
         n_measured += 1;
         let rendered = f64::from(rendered_m[pixel(x, y)]);
         if rendered > 0.0 {
@@ -109,15 +126,27 @@ mod tests {
             (error.mean_m.unwrap(), error.near_frac)
         };
         let (mean_m, near_frac) = score(&plane(normal, 1.004));
-        assert!((mean_m - 0.004).abs() < 1e-5 && near_frac == 1.0, "{mean_m} {near_frac}");
+        assert!(
+            (mean_m - 0.004).abs() < 1e-5 && near_frac == 1.0,
+            "{mean_m} {near_frac}"
+        );
         let (mean_m, near_frac) = score(&plane(normal, 0.994));
-        assert!((mean_m - 0.006).abs() < 1e-5 && near_frac == 0.0, "{mean_m} {near_frac}");
+        assert!(
+            (mean_m - 0.006).abs() < 1e-5 && near_frac == 0.0,
+            "{mean_m} {near_frac}"
+        );
         // Pixels that are not rendered reduce completeness but have no error.
         let mut half = plane(normal, 1.004);
         half[..600].fill(0.0);
         let (mean_m, near_frac) = score(&half);
-        assert!((mean_m - 0.004).abs() < 1e-5 && (near_frac - 0.5).abs() < 0.01, "{mean_m} {near_frac}");
-        let nothing = SurfaceError { mean_m: None, near_frac: 0.0 };
+        assert!(
+            (mean_m - 0.004).abs() < 1e-5 && (near_frac - 0.5).abs() < 0.01,
+            "{mean_m} {near_frac}"
+        );
+        let nothing = SurfaceError {
+            mean_m: None,
+            near_frac: 0.0,
+        };
         assert_eq!(surface_error(&[0.0; 1200], &truth).unwrap(), Some(nothing));
     }
 
@@ -127,8 +156,10 @@ mod tests {
         depth_m[..600].fill(2.0); // Rows 0 to 14.
         depth_m[20 * 40 + 7] = 0.0;
         let truth = measured(depth_m.clone());
-        let near_frac = |rendered: &[f32]| surface_error(rendered, &truth).unwrap().unwrap().near_frac;
-        // 28 rows of 38 pixels, minus two rows at the edge, minus five pixels on or next to the hole.
+        let near_frac =
+            |rendered: &[f32]| surface_error(rendered, &truth).unwrap().unwrap().near_frac;
+        // 28 rows of 38 pixels, minus two rows at the edge, minus five pixels on or next to the
+        // hole.
         let n = 26.0 * 38.0 - 5.0;
         let mut rendered = depth_m.clone();
         rendered[10 * 40 + 10] = 3.0;
@@ -137,19 +168,30 @@ mod tests {
         rendered[14 * 40 + 10] = 3.0;
         rendered[20 * 40 + 7] = 3.0;
         assert!((near_frac(&rendered) - 1.0).abs() < 1e-12);
-        assert_eq!(surface_error(&depth_m, &measured(vec![0.0; 1200])).unwrap(), None);
+        assert_eq!(
+            surface_error(&depth_m, &measured(vec![0.0; 1200])).unwrap(),
+            None
+        );
         assert!(surface_error(&[1.0], &truth).is_err());
     }
 
     #[test]
     fn only_pixels_with_both_depths_count() {
-        let rmse = depth_rmse_m(&[1.0, 2.5, 0.0, 9.0], &[1.5, 2.0, 7.0, 0.0]).unwrap().unwrap();
+        let rmse = depth_rmse_m(&[1.0, 2.5, 0.0, 9.0], &[1.5, 2.0, 7.0, 0.0])
+            .unwrap()
+            .unwrap();
         assert!((rmse - 0.5).abs() < 1e-12);
         assert_eq!(depth_rmse_m(&[0.0, 1.0], &[1.0, 0.0]).unwrap(), None);
     }
 
     #[test]
     fn different_sizes_are_rejected() {
-        assert!(matches!(depth_rmse_m(&[1.0], &[1.0, 2.0]), Err(Error::DepthSizeMismatch { rendered: 1, truth: 2 })));
+        assert!(matches!(
+            depth_rmse_m(&[1.0], &[1.0, 2.0]),
+            Err(Error::DepthSizeMismatch {
+                rendered: 1,
+                truth: 2
+            })
+        ));
     }
 }

@@ -13,15 +13,22 @@ const CHANNEL_MEAN: [f32; 3] = [-0.030, -0.088, -0.188];
 const CHANNEL_DEVIATION: [f32; 3] = [0.458, 0.448, 0.450];
 /// Keeps the normalization of an all-zero feature finite.
 const EPSILON: f64 = 1e-10;
-/// Stages of the network; features are compared after each stage. `true`: halve the size before the fire module.
-const STAGES: [&[(usize, bool)]; 6] =
-    [&[(3, true), (4, false)], &[(6, true), (7, false)], &[(9, true)], &[(10, false)], &[(11, false)], &[(12, false)]];
+/// Stages of the network; features are compared after each stage. `true`: halve the size before the
+/// fire module.
+const STAGES: [&[(usize, bool)]; 6] = [
+    &[(3, true), (4, false)],
+    &[(6, true), (7, false)],
+    &[(9, true)],
+    &[(10, false)],
+    &[(11, false)],
+    &[(12, false)],
+];
 
 /// The learned perceptual distance of two pictures; 0 for equal ones.
 ///
-/// Features of seven depths of `SqueezeNet` 1.1 are normalized per pixel; squared differences are weighted per channel,
-/// averaged over pixels and summed over depths. Source: Zhang, Isola, Efros, Shechtman, Wang 2018, section 3; Iandola
-/// et al. 2016.
+/// Features of seven depths of `SqueezeNet` 1.1 are normalized per pixel; squared differences are
+/// weighted per channel, averaged over pixels and summed over depths. Source: Zhang, Isola, Efros,
+/// Shechtman, Wang 2018, section 3; Iandola et al. 2016.
 #[derive(Debug)]
 pub struct Lpips {
     first: Convolution,
@@ -31,23 +38,40 @@ pub struct Lpips {
 }
 
 impl Lpips {
-    /// Reads the weights: a safetensors file with `features.*` of `SqueezeNet` 1.1 and `lin0..6.weight`.
+    /// Reads the weights: a safetensors file with `features.*` of `SqueezeNet` 1.1 and
+    /// `lin0..6.weight`.
     pub fn load(path: &Path) -> Result<Self, Error> {
-        let bytes =
-            files::read(path, files::Budget::PLAIN).map_err(|source| Error::Read { path: path.to_owned(), source })?;
-        Self::from_bytes(&bytes).map_err(|source| Error::LpipsWeights { path: path.to_owned(), source: source.into() })
+        let bytes = files::read(path, files::Budget::PLAIN).map_err(|source| Error::Read {
+            path: path.to_owned(),
+            source,
+        })?;
+        Self::from_bytes(&bytes).map_err(|source| Error::LpipsWeights {
+            path: path.to_owned(),
+            source: source.into(),
+        })
     }
 
     fn from_bytes(bytes: &[u8]) -> candle_core::Result<Self> {
         let tensors = candle_core::safetensors::load_buffer(bytes, &Device::Cpu)?;
         let stages = STAGES
             .iter()
-            .map(|fires| fires.iter().map(|&(ix, halve)| Fire::of(&tensors, ix, halve)).collect())
+            .map(|fires| {
+                fires
+                    .iter()
+                    .map(|&(ix, halve)| Fire::of(&tensors, ix, halve))
+                    .collect()
+            })
             .collect::<candle_core::Result<_>>()?;
         let channel_weights = (0..=STAGES.len())
-            .map(|depth| tensor_by_name(&tensors, &format!("lin{depth}.weight"))?.reshape((1, (), 1, 1)))
+            .map(|depth| {
+                tensor_by_name(&tensors, &format!("lin{depth}.weight"))?.reshape((1, (), 1, 1))
+            })
             .collect::<candle_core::Result<_>>()?;
-        Ok(Self { first: Convolution::of(&tensors, "features.0")?, stages, channel_weights })
+        Ok(Self {
+            first: Convolution::of(&tensors, "features.0")?,
+            stages,
+            channel_weights,
+        })
     }
 
     /// The distance between two pictures. Masked pixels are mid-gray in both.
@@ -58,12 +82,17 @@ impl Lpips {
         if !(0..pair.truth_rgba.len() / 4).any(|ix| pair.is_visible(ix)) {
             return Err(Error::AllPixelsMasked);
         }
-        self.distance_in_network(pair).map_err(|source| Error::LpipsNetwork(source.into()))
+        self.distance_in_network(pair)
+            .map_err(|source| Error::LpipsNetwork(source.into()))
     }
 
     fn distance_in_network(&self, pair: &PixelPair<'_>) -> candle_core::Result<f64> {
-        let mut rendered = self.first.forward(&network_input(pair, pair.rendered_rgba)?, 0, 2)?;
-        let mut truth = self.first.forward(&network_input(pair, pair.truth_rgba)?, 0, 2)?;
+        let mut rendered = self
+            .first
+            .forward(&network_input(pair, pair.rendered_rgba)?, 0, 2)?;
+        let mut truth = self
+            .first
+            .forward(&network_input(pair, pair.truth_rgba)?, 0, 2)?;
         let mut total = feature_distance(&rendered, &truth, &self.channel_weights[0])?;
         for (stage, weights) in self.stages.iter().zip(&self.channel_weights[1..]) {
             for fire in stage {
@@ -82,7 +111,11 @@ fn network_input(pair: &PixelPair<'_>, rgba: &[u8]) -> candle_core::Result<Tenso
     let mut planes = Vec::with_capacity(3 * n_pixels);
     for color in 0..3 {
         planes.extend((0..n_pixels).map(|ix| {
-            let value = if pair.is_visible(ix) { f32::from(rgba[4 * ix + color]) / 127.5 - 1.0 } else { 0.0 };
+            let value = if pair.is_visible(ix) {
+                f32::from(rgba[4 * ix + color]) / 127.5 - 1.0
+            } else {
+                0.0
+            };
             (value - CHANNEL_MEAN[color]) / CHANNEL_DEVIATION[color]
         }));
     }
@@ -91,10 +124,18 @@ fn network_input(pair: &PixelPair<'_>, rgba: &[u8]) -> candle_core::Result<Tenso
 }
 
 /// Squared difference of features normalized per pixel, weighted per channel, averaged over pixels.
-fn feature_distance(rendered: &Tensor, truth: &Tensor, channel_weights: &Tensor) -> candle_core::Result<f64> {
+fn feature_distance(
+    rendered: &Tensor,
+    truth: &Tensor,
+    channel_weights: &Tensor,
+) -> candle_core::Result<f64> {
     let difference = (normalized(rendered)? - normalized(truth)?)?;
-    let per_pixel =
-        difference.sqr()?.broadcast_mul(channel_weights)?.sum_keepdim(1)?.flatten_all()?.to_vec1::<f32>()?;
+    let per_pixel = difference
+        .sqr()?
+        .broadcast_mul(channel_weights)?
+        .sum_keepdim(1)?
+        .flatten_all()?
+        .to_vec1::<f32>()?;
     Ok(per_pixel.iter().copied().map(f64::from).sum::<f64>() / per_pixel.len() as f64)
 }
 
@@ -117,12 +158,21 @@ impl Convolution {
         Ok(Self { weight, bias })
     }
 
-    fn forward(&self, input: &Tensor, padding: usize, stride: usize) -> candle_core::Result<Tensor> {
-        input.conv2d(&self.weight, padding, stride, 1, 1)?.broadcast_add(&self.bias)?.relu()
+    fn forward(
+        &self,
+        input: &Tensor,
+        padding: usize,
+        stride: usize,
+    ) -> candle_core::Result<Tensor> {
+        input
+            .conv2d(&self.weight, padding, stride, 1, 1)?
+            .broadcast_add(&self.bias)?
+            .relu()
     }
 }
 
-/// The fire module of `SqueezeNet`: a 1x1 convolution to few channels, then 1x1 and 3x3 convolutions in parallel.
+/// The fire module of `SqueezeNet`: a 1x1 convolution to few channels, then 1x1 and 3x3
+/// convolutions in parallel.
 #[derive(Debug)]
 struct Fire {
     halve: bool,
@@ -134,23 +184,41 @@ struct Fire {
 impl Fire {
     fn of(tensors: &HashMap<String, Tensor>, ix: usize, halve: bool) -> candle_core::Result<Self> {
         let part = |name: &str| Convolution::of(tensors, &format!("features.{ix}.{name}"));
-        Ok(Self { halve, squeeze: part("squeeze")?, expand_1x1: part("expand1x1")?, expand_3x3: part("expand3x3")? })
+        Ok(Self {
+            halve,
+            squeeze: part("squeeze")?,
+            expand_1x1: part("expand1x1")?,
+            expand_3x3: part("expand3x3")?,
+        })
     }
 
     fn forward(&self, input: &Tensor) -> candle_core::Result<Tensor> {
-        let input = if self.halve { halved(input)? } else { input.clone() };
+        let input = if self.halve {
+            halved(input)?
+        } else {
+            input.clone()
+        };
         let squeezed = self.squeeze.forward(&input, 0, 1)?;
-        Tensor::cat(&[self.expand_1x1.forward(&squeezed, 0, 1)?, self.expand_3x3.forward(&squeezed, 1, 1)?], 1)
+        Tensor::cat(
+            &[
+                self.expand_1x1.forward(&squeezed, 0, 1)?,
+                self.expand_3x3.forward(&squeezed, 1, 1)?,
+            ],
+            1,
+        )
     }
 }
 
-/// Max pooling over 3 x 3 windows with a stride of two; for even sizes, the last window reaches past the edge.
+/// Max pooling over 3 x 3 windows with a stride of two; for even sizes, the last window reaches
+/// past the edge.
 ///
 /// Features are not negative, so the zeros that pad such a window do not change a maximum.
 fn halved(feature: &Tensor) -> candle_core::Result<Tensor> {
     let (_, _, height, width) = feature.dims4()?;
     let past_edge = |side: usize| 1 - side % 2;
-    let padded = feature.pad_with_zeros(2, 0, past_edge(height))?.pad_with_zeros(3, 0, past_edge(width))?;
+    let padded = feature
+        .pad_with_zeros(2, 0, past_edge(height))?
+        .pad_with_zeros(3, 0, past_edge(width))?;
     padded.max_pool2d_with_stride(3, 2)
 }
 
@@ -165,8 +233,16 @@ mod tests {
 
     #[test]
     fn pooling_of_even_sides_pads_the_far_edge() {
-        let feature = Tensor::arange(0_f32, 16.0, &Device::Cpu).unwrap().reshape((1, 1, 4, 4)).unwrap();
-        let pooled = halved(&feature).unwrap().flatten_all().unwrap().to_vec1::<f32>().unwrap();
+        let feature = Tensor::arange(0_f32, 16.0, &Device::Cpu)
+            .unwrap()
+            .reshape((1, 1, 4, 4))
+            .unwrap();
+        let pooled = halved(&feature)
+            .unwrap()
+            .flatten_all()
+            .unwrap()
+            .to_vec1::<f32>()
+            .unwrap();
         assert_eq!(pooled, [10.0, 11.0, 14.0, 15.0]);
     }
 
@@ -183,6 +259,11 @@ mod tests {
             Tensor::zeros(64, candle_core::DType::F32, &Device::Cpu).unwrap(),
         )]);
         candle_core::safetensors::save(&empty, &path).unwrap();
-        assert!(Lpips::load(&path).unwrap_err().to_string().contains("features.3.squeeze.weight"));
+        assert!(
+            Lpips::load(&path)
+                .unwrap_err()
+                .to_string()
+                .contains("features.3.squeeze.weight")
+        );
     }
 }

@@ -4,7 +4,8 @@ use super::PixelPair;
 use crate::Error;
 use std::path::Path;
 
-/// The learned perceptual distance of two pictures. This build cannot compute it, so the type has no values.
+/// The learned perceptual distance of two pictures. This build cannot compute it, so the type has
+/// no values.
 #[derive(Debug)]
 pub enum Lpips {}
 

@@ -3,17 +3,25 @@
 use super::PixelPair;
 use crate::Error;
 
-/// Peak signal-to-noise ratio in decibels over the three colors of the unmasked pixels; infinite for equal pictures.
+/// Peak signal-to-noise ratio in decibels over the three colors of the unmasked pixels; infinite
+/// for equal pictures.
 ///
-/// `10 log10(255^2 / mean squared difference)`, on values already rounded to 8 bits. Fails if all pixels are masked.
+/// `10 log10(255^2 / mean squared difference)`, on values already rounded to 8 bits. Fails if all
+/// pixels are masked.
 pub fn psnr(pair: &PixelPair<'_>) -> Result<f64, Error> {
     let (mut squares, mut n_visible) = (0_u64, 0_u64);
-    for (rendered, truth) in pair.rendered_rgba.chunks_exact(4).zip(pair.truth_rgba.chunks_exact(4)) {
+    for (rendered, truth) in pair
+        .rendered_rgba
+        .chunks_exact(4)
+        .zip(pair.truth_rgba.chunks_exact(4))
+    {
         if truth[3] == 0 {
             continue;
         }
         n_visible += 1;
-        squares += (0..3).map(|color| u64::from(rendered[color].abs_diff(truth[color])).pow(2)).sum::<u64>();
+        squares += (0..3)
+            .map(|color| u64::from(rendered[color].abs_diff(truth[color])).pow(2))
+            .sum::<u64>();
     }
     if n_visible == 0 {
         return Err(Error::AllPixelsMasked);
@@ -30,7 +38,10 @@ mod tests {
     #[test]
     fn known_difference_gives_known_psnr() {
         // Every color differs by 5: 20 log10(255 / 5).
-        let (a, b) = ([100, 100, 100, 255].repeat(12), [105, 95, 105, 255].repeat(12));
+        let (a, b) = (
+            [100, 100, 100, 255].repeat(12),
+            [105, 95, 105, 255].repeat(12),
+        );
         let pair = PixelPair::new([4, 3], &a, &b).unwrap();
         assert!((psnr(&pair).unwrap() - 20.0 * 51.0_f64.log10()).abs() < 1e-12);
     }
@@ -38,7 +49,10 @@ mod tests {
     #[test]
     fn equal_pictures_have_infinite_psnr() {
         let a = [7, 8, 9, 255].repeat(4);
-        assert_eq!(psnr(&PixelPair::new([2, 2], &a, &a).unwrap()).unwrap(), f64::INFINITY);
+        assert_eq!(
+            psnr(&PixelPair::new([2, 2], &a, &a).unwrap()).unwrap(),
+            f64::INFINITY
+        );
     }
 
     #[test]
@@ -54,8 +68,20 @@ mod tests {
     #[test]
     fn invalid_input_is_rejected() {
         let a = [1, 2, 3, 0].repeat(4);
-        assert!(matches!(psnr(&PixelPair::new([2, 2], &a, &a).unwrap()), Err(Error::AllPixelsMasked)));
-        assert!(matches!(PixelPair::new([2, 3], &a, &a), Err(Error::PictureBytes { what: "rendered", .. })));
-        assert!(matches!(PixelPair::new([2, 2], &a, &a[1..]), Err(Error::PictureBytes { what: "true", .. })));
+        assert!(matches!(
+            psnr(&PixelPair::new([2, 2], &a, &a).unwrap()),
+            Err(Error::AllPixelsMasked)
+        ));
+        assert!(matches!(
+            PixelPair::new([2, 3], &a, &a),
+            Err(Error::PictureBytes {
+                what: "rendered",
+                ..
+            })
+        ));
+        assert!(matches!(
+            PixelPair::new([2, 2], &a, &a[1..]),
+            Err(Error::PictureBytes { what: "true", .. })
+        ));
     }
 }

@@ -1,4 +1,5 @@
-//! Structural similarity with a Gaussian window of 11 pixels, sigma 1.5, over windows inside the picture.
+//! Structural similarity with a Gaussian window of 11 pixels, sigma 1.5, over windows inside the
+//! picture.
 
 use super::PixelPair;
 use crate::Error;
@@ -13,8 +14,8 @@ const C2: f32 = 0.03 * 0.03;
 
 /// Structural similarity: the mean over the three colors and over all windows inside the picture.
 ///
-/// Windows that touch a masked pixel are left out. Source: Wang, Bovik, Sheikh, Simoncelli 2004, section III. Fails for
-/// pictures smaller than a window, and if no window remains.
+/// Windows that touch a masked pixel are left out. Source: Wang, Bovik, Sheikh, Simoncelli 2004,
+/// section III. Fails for pictures smaller than a window, and if no window remains.
 pub fn ssim(pair: &PixelPair<'_>) -> Result<f64, Error> {
     pair.require_side("SSIM", WINDOW_PX)?;
     let width = pair.size_px[0] as usize;
@@ -24,7 +25,10 @@ pub fn ssim(pair: &PixelPair<'_>) -> Result<f64, Error> {
     // Rows are summed in order, so that the result does not depend on the number of threads.
     let rows: Vec<(f64, usize)> = (0..n_rows)
         .into_par_iter()
-        .map_init(|| RowScratch::new(width), |scratch, y| scratch.ssim_of_row(&signal, masked.as_deref(), y))
+        .map_init(
+            || RowScratch::new(width),
+            |scratch, y| scratch.ssim_of_row(&signal, masked.as_deref(), y),
+        )
         .collect();
     let n_windows: usize = rows.iter().map(|row| row.1).sum();
     if n_windows == 0 {
@@ -35,8 +39,9 @@ pub fn ssim(pair: &PixelPair<'_>) -> Result<f64, Error> {
 
 /// `rendered + truth` and `rendered - truth`, colors interleaved, each picture in 0 to 1.
 ///
-/// SSIM follows from the local variances of these two signals: the sum of the variances is twice the sum of the
-/// pictures' variances, and their difference is four times the covariance. This takes four blurs instead of five.
+/// SSIM follows from the local variances of these two signals: the sum of the variances is twice
+/// the sum of the pictures' variances, and their difference is four times the covariance. This
+/// takes four blurs instead of five.
 struct SumAndDifference {
     row_len: usize,
     sum: Vec<f32>,
@@ -46,19 +51,34 @@ struct SumAndDifference {
 impl SumAndDifference {
     fn of(pair: &PixelPair<'_>) -> Self {
         let n_pixels = pair.truth_rgba.len() / 4;
-        let (mut sum, mut difference) = (Vec::with_capacity(3 * n_pixels), Vec::with_capacity(3 * n_pixels));
-        for (rendered, truth) in pair.rendered_rgba.chunks_exact(4).zip(pair.truth_rgba.chunks_exact(4)) {
+        let (mut sum, mut difference) = (
+            Vec::with_capacity(3 * n_pixels),
+            Vec::with_capacity(3 * n_pixels),
+        );
+        for (rendered, truth) in pair
+            .rendered_rgba
+            .chunks_exact(4)
+            .zip(pair.truth_rgba.chunks_exact(4))
+        {
             for color in 0..3 {
-                let (rendered, truth) = (f32::from(rendered[color]) / 255.0, f32::from(truth[color]) / 255.0);
+                let (rendered, truth) = (
+                    f32::from(rendered[color]) / 255.0,
+                    f32::from(truth[color]) / 255.0,
+                );
                 sum.push(rendered + truth);
                 difference.push(rendered - truth);
             }
         }
-        Self { row_len: 3 * pair.size_px[0] as usize, sum, difference }
+        Self {
+            row_len: 3 * pair.size_px[0] as usize,
+            sum,
+            difference,
+        }
     }
 }
 
-/// For each column of each row of windows, the number of masked pixels among its 11; `None` if no pixel is masked.
+/// For each column of each row of windows, the number of masked pixels among its 11; `None` if no
+/// pixel is masked.
 fn masked_counts(pair: &PixelPair<'_>) -> Option<Vec<u8>> {
     let [width, height] = pair.size_px.map(|side| side as usize);
     if (0..width * height).all(|ix| pair.is_visible(ix)) {
@@ -96,8 +116,14 @@ impl RowScratch {
         }
     }
 
-    /// The sum of SSIM over the windows whose first row is `y` and over the three colors, and the number of windows.
-    fn ssim_of_row(&mut self, signal: &SumAndDifference, masked: Option<&[u8]>, y: usize) -> (f64, usize) {
+    /// The sum of SSIM over the windows whose first row is `y` and over the three colors, and the
+    /// number of windows.
+    fn ssim_of_row(
+        &mut self,
+        signal: &SumAndDifference,
+        masked: Option<&[u8]>,
+        y: usize,
+    ) -> (f64, usize) {
         self.blur_along_y(signal, y);
         self.blur_along_x();
         let n_columns = self.width - WINDOW + 1;
@@ -108,7 +134,9 @@ impl RowScratch {
                 continue;
             }
             n_windows += 1;
-            total += (3 * x..3 * x + 3).map(|ix| f64::from(self.ssim_at(ix))).sum::<f64>();
+            total += (3 * x..3 * x + 3)
+                .map(|ix| f64::from(self.ssim_at(ix)))
+                .sum::<f64>();
         }
         (total, n_windows)
     }
@@ -121,7 +149,12 @@ impl RowScratch {
         for (offset, &weight) in self.weights.iter().enumerate() {
             let row = (y + offset) * signal.row_len..(y + offset + 1) * signal.row_len;
             add_weighted(sum, sum_square, &signal.sum[row.clone()], weight);
-            add_weighted(difference, difference_square, &signal.difference[row], weight);
+            add_weighted(
+                difference,
+                difference_square,
+                &signal.difference[row],
+                weight,
+            );
         }
     }
 
@@ -138,8 +171,12 @@ impl RowScratch {
 
     /// SSIM of one color of one window.
     fn ssim_at(&self, ix: usize) -> f32 {
-        let [sum, difference, sum_square, difference_square] = self.blurred.each_ref().map(|blurred| blurred[ix]);
-        let (sum_variance, difference_variance) = (sum_square - sum * sum, difference_square - difference * difference);
+        let [sum, difference, sum_square, difference_square] =
+            self.blurred.each_ref().map(|blurred| blurred[ix]);
+        let (sum_variance, difference_variance) = (
+            sum_square - sum * sum,
+            difference_square - difference * difference,
+        );
         let twice_product = (sum * sum - difference * difference) / 2.0;
         let squares = (sum * sum + difference * difference) / 2.0;
         let twice_covariance = (sum_variance - difference_variance) / 2.0;
@@ -159,7 +196,8 @@ fn add_weighted(blurred: &mut [f32], blurred_square: &mut [f32], row: &[f32], we
 #[expect(clippy::cast_possible_truncation, reason = "weights between 0 and 1")]
 fn gaussian() -> [f32; WINDOW] {
     let half = (WINDOW / 2) as f64;
-    let raw: [f64; WINDOW] = std::array::from_fn(|ix| (-((ix as f64 - half) / SIGMA_PX).powi(2) / 2.0).exp());
+    let raw: [f64; WINDOW] =
+        std::array::from_fn(|ix| (-((ix as f64 - half) / SIGMA_PX).powi(2) / 2.0).exp());
     let total: f64 = raw.iter().sum();
     raw.map(|weight| (weight / total) as f32)
 }
@@ -172,7 +210,9 @@ mod tests {
     /// A picture of reproducible noise.
     fn noise(n_pixels: usize, seed: u64) -> Vec<u8> {
         let mut random = Random::new(seed);
-        (0..n_pixels).flat_map(|_| [random.byte(), random.byte(), random.byte(), 255]).collect()
+        (0..n_pixels)
+            .flat_map(|_| [random.byte(), random.byte(), random.byte(), 255])
+            .collect()
     }
 
     #[test]
@@ -197,7 +237,8 @@ mod tests {
         assert!((masked - 1.0).abs() < 1e-6, "{masked}");
         let counted = ssim(&PixelPair::new([40, 30], &rendered, &a).unwrap()).unwrap();
         assert!(counted < 0.999_9, "{counted}");
-        // A wrong pixel eight columns to the right still counts in the windows that do not reach the mask.
+        // A wrong pixel eight columns to the right still counts in the windows that do not reach
+        // the mask.
         rendered[pixel + 4 * 8] ^= 0x80;
         let with_wrong_pixel = ssim(&PixelPair::new([40, 30], &rendered, &truth).unwrap()).unwrap();
         assert!(with_wrong_pixel < 0.999_9, "{with_wrong_pixel}");
@@ -207,9 +248,19 @@ mod tests {
     fn small_and_fully_masked_pictures_are_rejected() {
         let a = noise(10 * 30, 1);
         let pair = PixelPair::new([10, 30], &a, &a).unwrap();
-        assert!(matches!(ssim(&pair), Err(Error::PictureTooSmall { min_px: 11, width: 10, .. })));
+        assert!(matches!(
+            ssim(&pair),
+            Err(Error::PictureTooSmall {
+                min_px: 11,
+                width: 10,
+                ..
+            })
+        ));
         let mut masked = noise(11 * 11, 1);
         masked[3] = 0;
-        assert!(matches!(ssim(&PixelPair::new([11, 11], &masked, &masked).unwrap()), Err(Error::AllPixelsMasked)));
+        assert!(matches!(
+            ssim(&PixelPair::new([11, 11], &masked, &masked).unwrap()),
+            Err(Error::AllPixelsMasked)
+        ));
     }
 }

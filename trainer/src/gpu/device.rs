@@ -14,9 +14,11 @@ use std::time::Duration;
 
 /// Interval between checks of the device while waiting for a read-back.
 const CHECK_PERIOD: Duration = Duration::from_millis(100);
-/// Size of the memory blocks that small buffers share on a software adapter: the smallest size that wgpu accepts.
+/// Size of the memory blocks that small buffers share on a software adapter: the smallest size that
+/// wgpu accepts.
 const SOFTWARE_BLOCK_BYTES: u64 = 4 << 20;
-/// Maximum total size of read-back buffers kept for reuse. A 1024x1024 picture with depth takes 8 MiB.
+/// Maximum total size of read-back buffers kept for reuse. A 1024x1024 picture with depth takes 8
+/// MiB.
 const MAX_IDLE_STAGING_BYTES: u64 = 32 << 20;
 /// Maximum number of read-back buffers kept for reuse.
 const MAX_IDLE_STAGING: usize = 8;
@@ -52,7 +54,9 @@ impl LiveBuffers {
     /// Counts a new buffer; returns its label and the total bytes of all buffers.
     fn add(&self, label: &str, bytes: u64) -> (Arc<str>, u64) {
         let mut by_label = self.by_label.lock();
-        let key = by_label.get_key_value(label).map_or_else(|| label.into(), |(key, _)| Arc::clone(key));
+        let key = by_label
+            .get_key_value(label)
+            .map_or_else(|| label.into(), |(key, _)| Arc::clone(key));
         *by_label.entry(Arc::clone(&key)).or_default() += bytes;
         (key, self.bytes.fetch_add(bytes, Ordering::Relaxed) + bytes)
     }
@@ -66,7 +70,8 @@ impl LiveBuffers {
     }
 }
 
-/// Errors that the device reports outside of any call. They are permanent: only a new device can continue.
+/// Errors that the device reports outside of any call. They are permanent: only a new device can
+/// continue.
 #[derive(Debug, Default)]
 struct Health {
     /// Why the device was lost.
@@ -109,7 +114,9 @@ impl Health {
 }
 
 /// Backends that support compute kernels.
-const BACKENDS: wgpu::Backends = wgpu::Backends::VULKAN.union(wgpu::Backends::METAL).union(wgpu::Backends::DX12);
+const BACKENDS: wgpu::Backends = wgpu::Backends::VULKAN
+    .union(wgpu::Backends::METAL)
+    .union(wgpu::Backends::DX12);
 
 fn instance() -> wgpu::Instance {
     wgpu::Instance::new(wgpu::InstanceDescriptor {
@@ -127,10 +134,11 @@ fn all_adapters(instance: &wgpu::Instance) -> Vec<wgpu::Adapter> {
 
 /// Allocation strategy for buffers.
 ///
-/// By default, wgpu places buffers in shared blocks of 128 MiB or more. Buffers that grow with the scene leave holes in
-/// these blocks, and a block is freed only when it is empty. In long runs, blocks took more than twice the memory in
-/// use. On a software adapter, blocks are host memory, so each large buffer gets its own block at the cost of a
-/// `malloc`. Drivers of real GPUs allocate blocks far more slowly and limit their number, so there we keep the default.
+/// By default, wgpu places buffers in shared blocks of 128 MiB or more. Buffers that grow with the
+/// scene leave holes in these blocks, and a block is freed only when it is empty. In long runs,
+/// blocks took more than twice the memory in use. On a software adapter, blocks are host memory, so
+/// each large buffer gets its own block at the cost of a `malloc`. Drivers of real GPUs allocate
+/// blocks far more slowly and limit their number, so there we keep the default.
 fn memory_hints(device_type: wgpu::DeviceType) -> wgpu::MemoryHints {
     match device_type {
         wgpu::DeviceType::Cpu => wgpu::MemoryHints::Manual {
@@ -143,17 +151,24 @@ fn memory_hints(device_type: wgpu::DeviceType) -> wgpu::MemoryHints {
 impl Gpu {
     /// Names of all adapters, software ones too, in the order in which the drivers list them.
     pub fn adapters() -> Vec<String> {
-        all_adapters(&instance()).iter().map(|adapter| adapter.get_info().name).collect()
+        all_adapters(&instance())
+            .iter()
+            .map(|adapter| adapter.get_info().name)
+            .collect()
     }
 
-    /// Opens the requested adapter, or the fastest one; uses a software adapter if there is no other.
+    /// Opens the requested adapter, or the fastest one; uses a software adapter if there is no
+    /// other.
     pub fn open(options: &GpuOptions) -> Result<Arc<Self>, Error> {
         let instance = instance();
         let adapter = match options.adapter {
             Some(ix) => {
                 let mut adapters = all_adapters(&instance);
                 if ix >= adapters.len() {
-                    return Err(Error::NoSuchAdapter { ix, n_adapters: adapters.len() });
+                    return Err(Error::NoSuchAdapter {
+                        ix,
+                        n_adapters: adapters.len(),
+                    });
                 }
                 adapters.swap_remove(ix)
             }
@@ -166,10 +181,12 @@ impl Gpu {
         let optional = Optional::of(&adapter, options);
         let mut limits = adapter.limits();
         if let Some(bytes) = options.max_binding_bytes {
-            limits.max_storage_buffer_binding_size = limits.max_storage_buffer_binding_size.min(bytes);
+            limits.max_storage_buffer_binding_size =
+                limits.max_storage_buffer_binding_size.min(bytes);
         }
         let experimental_features = if optional.half_matrices {
-            // SAFETY: kernels with cooperative matrices are our own; each load and store stays within its array.
+            // SAFETY: kernels with cooperative matrices are our own; each load and store stays
+            // within its array.
             #[expect(unsafe_code, reason = "cooperative matrices are experimental in wgpu")]
             unsafe {
                 wgpu::ExperimentalFeatures::enabled()
@@ -185,7 +202,10 @@ impl Gpu {
             memory_hints: memory_hints(adapter.get_info().device_type),
             ..wgpu::DeviceDescriptor::default()
         }))
-        .map_err(|source| Error::NoDevice { adapter: adapter.get_info().name, source })?;
+        .map_err(|source| Error::NoDevice {
+            adapter: adapter.get_info().name,
+            source,
+        })?;
         let health = Health::of(&device);
         Ok(Arc::new(Self {
             device,
@@ -207,10 +227,22 @@ impl Gpu {
     /// Name, type, driver and optional features of the adapter as text.
     pub fn describe(&self) -> String {
         let info = &self.info;
-        let subgroups =
-            self.optional.subgroup_lanes.map_or("no subgroups".to_owned(), |lanes| format!("subgroups of {lanes}"));
-        let timestamps = if self.optional.timestamps { "timestamps" } else { "no timestamps" };
-        let matrices = if self.optional.half_matrices { "f16 matrices" } else { "no f16 matrices" };
+        let subgroups = self
+            .optional
+            .subgroup_lanes
+            .map_or("no subgroups".to_owned(), |lanes| {
+                format!("subgroups of {lanes}")
+            });
+        let timestamps = if self.optional.timestamps {
+            "timestamps"
+        } else {
+            "no timestamps"
+        };
+        let matrices = if self.optional.half_matrices {
+            "f16 matrices"
+        } else {
+            "no f16 matrices"
+        };
         format!(
             "{} ({:?}, {:?}, {} {}), {subgroups}, {timestamps}, {matrices}",
             info.name, info.device_type, info.backend, info.driver, info.driver_info
@@ -229,7 +261,9 @@ impl Gpu {
 
     /// Largest buffer that a kernel can bind, bytes.
     pub fn max_binding_bytes(&self) -> u64 {
-        self.limits.max_storage_buffer_binding_size.min(self.limits.max_buffer_size)
+        self.limits
+            .max_storage_buffer_binding_size
+            .min(self.limits.max_buffer_size)
     }
 
     /// Maximum workgroup memory, bytes.
@@ -245,7 +279,11 @@ impl Gpu {
     /// Bytes of all live buffers by label.
     pub fn live_bytes_by_label(&self) -> BTreeMap<Arc<str>, u64> {
         let by_label = self.live.by_label.lock();
-        by_label.iter().filter(|(_, bytes)| **bytes > 0).map(|(label, bytes)| (Arc::clone(label), *bytes)).collect()
+        by_label
+            .iter()
+            .filter(|(_, bytes)| **bytes > 0)
+            .map(|(label, bytes)| (Arc::clone(label), *bytes))
+            .collect()
     }
 
     /// Largest value of [`Self::live_bytes`] so far.
@@ -253,10 +291,14 @@ impl Gpu {
         self.peak_bytes.load(Ordering::Relaxed)
     }
 
-    /// Bytes that the allocator reserves for buffers, including unused memory; `None` if the backend does not report
-    /// them. Slow, because it lists every allocation.
+    /// Bytes that the allocator reserves for buffers, including unused memory; `None` if the
+    /// backend does not report them. Slow, because it lists every allocation.
     pub fn reserved_bytes(&self) -> Option<u64> {
-        Some(self.device.generate_allocator_report()?.total_reserved_bytes)
+        Some(
+            self.device
+                .generate_allocator_report()?
+                .total_reserved_bytes,
+        )
     }
 
     /// Whether the device was lost. If so, nothing that was created on it can be used.
@@ -264,15 +306,22 @@ impl Gpu {
         self.health.lost.get().is_some()
     }
 
-    /// Returns an error if the device was lost, ran out of memory, failed or got an invalid command since it was opened.
+    /// Returns an error if the device was lost, ran out of memory, failed or got an invalid command
+    /// since it was opened.
     pub fn check(&self) -> Result<(), Error> {
         let failed = self.health.failed.get();
         if matches!(failed, Some(Failure::Invalid(_))) && !self.is_lost() {
-            // Commands for a lost device are invalid, too, and wgpu may report the loss only when it is polled.
-            let _ = std::panic::catch_unwind(AssertUnwindSafe(|| self.device.poll(wgpu::PollType::Poll)));
+            // Commands for a lost device are invalid, too, and wgpu may report the loss only when
+            // it is polled.
+            let _ = std::panic::catch_unwind(AssertUnwindSafe(|| {
+                self.device.poll(wgpu::PollType::Poll)
+            }));
         }
         match failed {
-            Some(Failure::OutOfMemory) => Err(Error::OutOfMemory { label: String::new(), bytes: 0 }),
+            Some(Failure::OutOfMemory) => Err(Error::OutOfMemory {
+                label: String::new(),
+                bytes: 0,
+            }),
             _ if self.is_lost() => Err(Error::DeviceLost),
             Some(Failure::Driver(message)) => Err(Error::DriverFailed(message.clone())),
             Some(Failure::Invalid(message)) => Err(Error::internal(message)),
@@ -282,13 +331,18 @@ impl Gpu {
 
     /// Loses the device on purpose, like a driver reset; for tests of recovery.
     pub fn lose(&self) {
-        // Unlike a driver reset, `destroy` frees memory at once, so wait for readers and copies first.
+        // Unlike a driver reset, `destroy` frees memory at once, so wait for readers and copies
+        // first.
         let _no_reader = self.mapped.write();
-        let _ = self.device.poll(wgpu::PollType::Wait { submission_index: None, timeout: None });
+        let _ = self.device.poll(wgpu::PollType::Wait {
+            submission_index: None,
+            timeout: None,
+        });
         self.device.destroy();
     }
 
-    /// Creates a zeroed storage buffer. Fails if the adapter cannot bind it or has no memory for it.
+    /// Creates a zeroed storage buffer. Fails if the adapter cannot bind it or has no memory for
+    /// it.
     pub fn storage(&self, label: &str, bytes: u64) -> Result<Buffer, Error> {
         let bytes = bytes.max(16).next_multiple_of(16);
         if bytes > self.max_binding_bytes() {
@@ -298,11 +352,16 @@ impl Gpu {
                 limit_bytes: self.max_binding_bytes(),
             });
         }
-        let full = || Error::OutOfMemory { label: label.to_owned(), bytes };
+        let full = || Error::OutOfMemory {
+            label: label.to_owned(),
+            bytes,
+        };
         if self.live_bytes().saturating_add(bytes) > self.memory_limit_bytes {
             return Err(full());
         }
-        let usage = wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_SRC | wgpu::BufferUsages::COPY_DST;
+        let usage = wgpu::BufferUsages::STORAGE
+            | wgpu::BufferUsages::COPY_SRC
+            | wgpu::BufferUsages::COPY_DST;
         let memory = self.device.push_error_scope(wgpu::ErrorFilter::OutOfMemory);
         let buffer = self.buffer(label, bytes, usage);
         pollster::block_on(memory.pop()).map_or(Ok(buffer), |_| Err(full()))
@@ -318,7 +377,11 @@ impl Gpu {
     /// Creates a uniform buffer that holds `contents`.
     pub fn uniform_with<T: bytemuck::Pod>(&self, label: &str, contents: &T) -> Buffer {
         let bytes = bytemuck::bytes_of(contents);
-        let buffer = self.buffer(label, bytes.len() as u64, wgpu::BufferUsages::UNIFORM | wgpu::BufferUsages::COPY_DST);
+        let buffer = self.buffer(
+            label,
+            bytes.len() as u64,
+            wgpu::BufferUsages::UNIFORM | wgpu::BufferUsages::COPY_DST,
+        );
         self.write(&buffer, 0, bytes);
         buffer
     }
@@ -330,27 +393,34 @@ impl Gpu {
         self.buffer(label, bytes, usage)
     }
 
-    /// Writes to a buffer before the next submit. Pads `contents` with zeros to a multiple of 4 bytes.
+    /// Writes to a buffer before the next submit. Pads `contents` with zeros to a multiple of 4
+    /// bytes.
     pub fn write(&self, buffer: &Buffer, offset_bytes: u64, contents: &[u8]) {
         let whole = contents.len() / 4 * 4;
-        self.queue.write_buffer(&buffer.raw, offset_bytes, &contents[..whole]);
+        self.queue
+            .write_buffer(&buffer.raw, offset_bytes, &contents[..whole]);
         if whole < contents.len() {
             let mut tail = [0; 4];
             tail[..contents.len() - whole].copy_from_slice(&contents[whole..]);
-            self.queue.write_buffer(&buffer.raw, offset_bytes + whole as u64, &tail);
+            self.queue
+                .write_buffer(&buffer.raw, offset_bytes + whole as u64, &tail);
         }
     }
 
     /// Fills part of a buffer with zeros, without waiting for the next submit.
     pub fn clear(&self, buffer: &Buffer, offset_bytes: u64, bytes: u64) {
-        let mut encoder = self.device.create_command_encoder(&wgpu::CommandEncoderDescriptor::default());
+        let mut encoder = self
+            .device
+            .create_command_encoder(&wgpu::CommandEncoderDescriptor::default());
         encoder.clear_buffer(&buffer.raw, offset_bytes, Some(bytes));
         self.queue.submit([encoder.finish()]);
     }
 
     /// Copies `bytes` bytes from one buffer to another, without waiting for the next submit.
     pub fn copy(&self, from: (&Buffer, u64), to: (&Buffer, u64), bytes: u64) {
-        let mut encoder = self.device.create_command_encoder(&wgpu::CommandEncoderDescriptor::default());
+        let mut encoder = self
+            .device
+            .create_command_encoder(&wgpu::CommandEncoderDescriptor::default());
         encoder.copy_buffer_to_buffer(&from.0.raw, from.1, &to.0.raw, to.1, bytes);
         self.queue.submit([encoder.finish()]);
     }
@@ -360,23 +430,33 @@ impl Gpu {
         if n == 0 {
             return Ok(Vec::new());
         }
-        self.submit_reading(self.encoder(), &[(buffer, n * size_of::<T>())]).finish(self)
+        self.submit_reading(self.encoder(), &[(buffer, n * size_of::<T>())])
+            .finish(self)
     }
 
-    /// Begins to read the first `n` words of `buffer`, as they will be after all work submitted so far.
+    /// Begins to read the first `n` words of `buffer`, as they will be after all work submitted so
+    /// far.
     pub fn begin_read(&self, buffer: &Buffer, n: usize) -> PendingRead {
         self.submit_reading(self.encoder(), &[(buffer, 4 * n)])
     }
 
     pub(super) fn encoder(&self) -> wgpu::CommandEncoder {
-        self.device.create_command_encoder(&wgpu::CommandEncoderDescriptor::default())
+        self.device
+            .create_command_encoder(&wgpu::CommandEncoderDescriptor::default())
     }
 
-    /// Submits the encoded commands, followed by a copy of the first bytes of each of these buffers. All copies share
-    /// one read-back, so there is one wait and one mapping.
-    pub(super) fn submit_reading(&self, mut encoder: wgpu::CommandEncoder, reads: &[(&Buffer, usize)]) -> PendingRead {
+    /// Submits the encoded commands, followed by a copy of the first bytes of each of these
+    /// buffers. All copies share one read-back, so there is one wait and one mapping.
+    pub(super) fn submit_reading(
+        &self,
+        mut encoder: wgpu::CommandEncoder,
+        reads: &[(&Buffer, usize)],
+    ) -> PendingRead {
         let padded = |n_bytes: usize| n_bytes.next_multiple_of(4);
-        let n_all_bytes = reads.iter().map(|(_, n_bytes)| padded(*n_bytes) as u64).sum();
+        let n_all_bytes = reads
+            .iter()
+            .map(|(_, n_bytes)| padded(*n_bytes) as u64)
+            .sum();
         let Some(staging) = self.staging(n_all_bytes) else {
             self.queue.submit([encoder.finish()]); // The encoded commands still run.
             return PendingRead(Err(n_all_bytes));
@@ -384,7 +464,13 @@ impl Gpu {
         let mut parts = Vec::with_capacity(reads.len());
         let mut begin = 0;
         for (buffer, n_bytes) in reads {
-            encoder.copy_buffer_to_buffer(&buffer.raw, 0, &staging, begin as u64, padded(*n_bytes) as u64);
+            encoder.copy_buffer_to_buffer(
+                &buffer.raw,
+                0,
+                &staging,
+                begin as u64,
+                padded(*n_bytes) as u64,
+            );
             parts.push(begin..begin + n_bytes);
             begin += padded(*n_bytes);
         }
@@ -394,7 +480,12 @@ impl Gpu {
             // Sending fails if the read was dropped.
             let _ = sender.send(result);
         });
-        PendingRead(Ok(Reading { staging, submission, mapped, parts }))
+        PendingRead(Ok(Reading {
+            staging,
+            submission,
+            mapped,
+            parts,
+        }))
     }
 
     /// Returns a read-back buffer, reused if one fits; `None` if no memory is left.
@@ -402,7 +493,11 @@ impl Gpu {
         let bytes = bytes.max(4);
         let mut idle = self.idle_staging.lock();
         let fits = |buffer: &wgpu::Buffer| (bytes..=4 * bytes).contains(&buffer.size());
-        let found = idle.iter().enumerate().filter(|(_, buffer)| fits(buffer)).min_by_key(|(_, buffer)| buffer.size());
+        let found = idle
+            .iter()
+            .enumerate()
+            .filter(|(_, buffer)| fits(buffer))
+            .min_by_key(|(_, buffer)| buffer.size());
         if let Some(buffer) = found.map(|(ix, _)| ix).and_then(|ix| idle.remove(ix)) {
             return Some(buffer);
         }
@@ -414,7 +509,9 @@ impl Gpu {
             usage: wgpu::BufferUsages::MAP_READ | wgpu::BufferUsages::COPY_DST,
             mapped_at_creation: false,
         });
-        pollster::block_on(memory.pop()).is_none().then_some(staging)
+        pollster::block_on(memory.pop())
+            .is_none()
+            .then_some(staging)
     }
 
     #[cfg(test)]
@@ -422,12 +519,13 @@ impl Gpu {
         self.idle_staging.lock().len()
     }
 
-    /// Keeps a read-back buffer for reuse, within [`MAX_IDLE_STAGING_BYTES`]; the least recently used ones are dropped
-    /// first.
+    /// Keeps a read-back buffer for reuse, within [`MAX_IDLE_STAGING_BYTES`]; the least recently
+    /// used ones are dropped first.
     fn keep_staging(&self, buffer: wgpu::Buffer) {
         let mut idle = self.idle_staging.lock();
         idle.push_back(buffer);
-        while idle.len() > MAX_IDLE_STAGING || idle.iter().map(wgpu::Buffer::size).sum::<u64>() > MAX_IDLE_STAGING_BYTES
+        while idle.len() > MAX_IDLE_STAGING
+            || idle.iter().map(wgpu::Buffer::size).sum::<u64>() > MAX_IDLE_STAGING_BYTES
         {
             idle.pop_front();
         }
@@ -435,7 +533,10 @@ impl Gpu {
 
     /// Waits until everything submitted is done.
     pub fn wait(&self) -> Result<(), Error> {
-        self.poll(wgpu::PollType::Wait { submission_index: None, timeout: None })?;
+        self.poll(wgpu::PollType::Wait {
+            submission_index: None,
+            timeout: None,
+        })?;
         self.check()
     }
 
@@ -453,7 +554,9 @@ impl Gpu {
 
     /// The recorded failure of the device, or an internal error if it works.
     pub(crate) fn failure_or(&self, internal: &str) -> Error {
-        self.check().err().unwrap_or_else(|| Error::internal(internal))
+        self.check()
+            .err()
+            .unwrap_or_else(|| Error::internal(internal))
     }
 
     /// The recorded failure, or [`Error::DeviceLost`] if there is none.
@@ -474,7 +577,13 @@ impl Gpu {
         });
         let (label, live_bytes) = self.live.add(label, bytes);
         self.peak_bytes.fetch_max(live_bytes, Ordering::Relaxed);
-        Buffer { id: self.next_unique_id(), raw, bytes, label, live: self.live.clone() }
+        Buffer {
+            id: self.next_unique_id(),
+            raw,
+            bytes,
+            label,
+            live: self.live.clone(),
+        }
     }
 }
 
@@ -499,11 +608,23 @@ impl PendingRead {
 
     /// Waits for the data and passes the bytes of each buffer, in the requested order, to `take`.
     pub fn finish_with<R>(self, gpu: &Gpu, take: impl FnOnce(&[&[u8]]) -> R) -> Result<R, Error> {
-        let reading = self.0.map_err(|bytes| Error::OutOfMemory { label: "readback".to_owned(), bytes })?;
-        let Reading { staging, submission, mapped, parts } = reading;
-        gpu.poll(wgpu::PollType::Wait { submission_index: Some(submission), timeout: None })?;
+        let reading = self.0.map_err(|bytes| Error::OutOfMemory {
+            label: "readback".to_owned(),
+            bytes,
+        })?;
+        let Reading {
+            staging,
+            submission,
+            mapped,
+            parts,
+        } = reading;
+        gpu.poll(wgpu::PollType::Wait {
+            submission_index: Some(submission),
+            timeout: None,
+        })?;
         let is_mapped = loop {
-            // The callback may run on another waiting thread, and may never run if the device is lost.
+            // The callback may run on another waiting thread, and may never run if the device is
+            // lost.
             match mapped.recv_timeout(CHECK_PERIOD) {
                 Ok(result) => break result.is_ok(),
                 Err(RecvTimeoutError::Timeout) => gpu.check()?,
@@ -558,15 +679,24 @@ mod tests {
     fn live_bytes_are_counted_by_label() {
         let gpu = Gpu::open(&GpuOptions::default()).unwrap();
         let kept = gpu.storage("kept", 64).unwrap();
-        let dropped: Vec<Buffer> = (0..3).map(|_| gpu.storage("dropped", 32).unwrap()).collect();
-        assert_eq!(gpu.live_bytes_by_label(), BTreeMap::from([("dropped".into(), 96), ("kept".into(), 64)]));
+        let dropped: Vec<Buffer> = (0..3)
+            .map(|_| gpu.storage("dropped", 32).unwrap())
+            .collect();
+        assert_eq!(
+            gpu.live_bytes_by_label(),
+            BTreeMap::from([("dropped".into(), 96), ("kept".into(), 64)])
+        );
         drop(dropped);
-        assert_eq!(gpu.live_bytes_by_label(), BTreeMap::from([("kept".into(), kept.bytes())]));
+        assert_eq!(
+            gpu.live_bytes_by_label(),
+            BTreeMap::from([("kept".into(), kept.bytes())])
+        );
         assert_eq!((gpu.live_bytes(), gpu.peak_bytes()), (64, 160));
         assert!(gpu.reserved_bytes().is_none_or(|bytes| bytes >= 64));
     }
 
-    /// A bug must not look like a failing GPU, because a session would then restart on another device.
+    /// A bug must not look like a failing GPU, because a session would then restart on another
+    /// device.
     #[test]
     fn invalid_commands_are_internal_errors_and_lost_devices_are_gpu_errors() {
         let gpu = Gpu::open(&GpuOptions::default()).unwrap();
@@ -574,13 +704,19 @@ mod tests {
         assert!(gpu.wait().is_ok());
         gpu.clear(&buffer, 0, 32); // Beyond the end.
         let error = gpu.wait().unwrap_err();
-        assert!(matches!(error, Error::Internal(_)) && !error.is_gpu_error(), "{error}");
+        assert!(
+            matches!(error, Error::Internal(_)) && !error.is_gpu_error(),
+            "{error}"
+        );
 
         let lost = Gpu::open(&GpuOptions::default()).unwrap();
         let buffer = lost.storage("lost", 16).unwrap();
         lost.lose();
         let error = lost.read::<u32>(&buffer, 4).unwrap_err();
-        assert!(matches!(error, Error::DeviceLost) && error.is_gpu_error(), "{error}");
+        assert!(
+            matches!(error, Error::DeviceLost) && error.is_gpu_error(),
+            "{error}"
+        );
         assert!(matches!(lost.failure_or("unused"), Error::DeviceLost));
     }
 
@@ -591,7 +727,9 @@ mod tests {
             eprintln!("skipped: buffers are in host memory only on a software adapter");
             return;
         }
-        let mut buffers: Vec<Buffer> = (0..8).map(|_| gpu.storage("growing", 16).unwrap()).collect();
+        let mut buffers: Vec<Buffer> = (0..8)
+            .map(|_| gpu.storage("growing", 16).unwrap())
+            .collect();
         for mib in 1..=24 {
             for buffer in &mut buffers {
                 *buffer = gpu.storage("growing", mib << 20).unwrap();

@@ -1,4 +1,5 @@
-//! GPU access: one device, pipelines that bind buffers by reflection, and lists of passes. Independent of splats.
+//! GPU access: one device, pipelines that bind buffers by reflection, and lists of passes.
+//! Independent of splats.
 
 mod device;
 mod options;

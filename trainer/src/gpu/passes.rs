@@ -18,14 +18,27 @@ pub struct PassTiming {
 }
 
 enum Pass {
-    Dispatch { pipeline: wgpu::ComputePipeline, bind_group: wgpu::BindGroup, groups: [u32; 2], name: &'static str },
-    Clear { buffer: wgpu::Buffer, bytes: Range<u64> },
-    Copy { from: (wgpu::Buffer, u64), to: (wgpu::Buffer, u64), bytes: u64 },
+    Dispatch {
+        pipeline: wgpu::ComputePipeline,
+        bind_group: wgpu::BindGroup,
+        groups: [u32; 2],
+        name: &'static str,
+    },
+    Clear {
+        buffer: wgpu::Buffer,
+        bytes: Range<u64>,
+    },
+    Copy {
+        from: (wgpu::Buffer, u64),
+        to: (wgpu::Buffer, u64),
+        bytes: u64,
+    },
 }
 
 /// A list of GPU passes. Adding a pass does not touch the GPU.
 ///
-/// Bind groups are cached across submits, keyed by kernel and buffers; [`Passes::clear_bindings`] drops them.
+/// Bind groups are cached across submits, keyed by kernel and buffers; [`Passes::clear_bindings`]
+/// drops them.
 #[derive(Default)]
 pub struct Passes {
     list: Vec<Pass>,
@@ -36,7 +49,9 @@ impl std::fmt::Debug for Passes {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.debug_list()
             .entries(self.list.iter().map(|pass| match pass {
-                Pass::Dispatch { name, groups, .. } => format!("{name} {}x{}", groups[0], groups[1]),
+                Pass::Dispatch { name, groups, .. } => {
+                    format!("{name} {}x{}", groups[0], groups[1])
+                }
                 Pass::Clear { .. } => "clear".to_owned(),
                 Pass::Copy { .. } => "copy".to_owned(),
             }))
@@ -45,21 +60,46 @@ impl std::fmt::Debug for Passes {
 }
 
 impl Passes {
-    /// Adds a dispatch of `n_groups` workgroups, folded onto two axes. Buffers are bound by their names in the WGSL.
+    /// Adds a dispatch of `n_groups` workgroups, folded onto two axes. Buffers are bound by their
+    /// names in the WGSL.
     ///
     /// # Panics
-    /// Panics if the names differ from those in the kernel, which is a bug in this crate. The message lists both.
-    pub fn dispatch(&mut self, gpu: &Gpu, pipeline: &Pipeline, n_groups: u64, buffers: &[(&str, &Buffer)]) {
+    /// Panics if the names differ from those in the kernel, which is a bug in this crate. The
+    /// message lists both.
+    pub fn dispatch(
+        &mut self,
+        gpu: &Gpu,
+        pipeline: &Pipeline,
+        n_groups: u64,
+        buffers: &[(&str, &Buffer)],
+    ) {
         if n_groups == 0 {
             return;
         }
         let rows = n_groups.div_ceil(MAX_GROUPS_PER_AXIS);
         let columns = n_groups.div_ceil(rows);
-        assert!(rows <= MAX_GROUPS_PER_AXIS, "{}: {n_groups} workgroups exceed the limit of a dispatch", pipeline.name);
-        let find = |name: &str| buffers.iter().find(|(given, _)| *given == name).map(|(_, buffer)| *buffer);
-        let found: Option<Vec<&Buffer>> = pipeline.bindings.iter().map(|binding| find(&binding.name)).collect();
+        assert!(
+            rows <= MAX_GROUPS_PER_AXIS,
+            "{}: {n_groups} workgroups exceed the limit of a dispatch",
+            pipeline.name
+        );
+        let find = |name: &str| {
+            buffers
+                .iter()
+                .find(|(given, _)| *given == name)
+                .map(|(_, buffer)| *buffer)
+        };
+        let found: Option<Vec<&Buffer>> = pipeline
+            .bindings
+            .iter()
+            .map(|binding| find(&binding.name))
+            .collect();
         let Some(found) = found.filter(|found| found.len() == buffers.len()) else {
-            let reads: Vec<_> = pipeline.bindings.iter().map(|binding| binding.name.as_str()).collect();
+            let reads: Vec<_> = pipeline
+                .bindings
+                .iter()
+                .map(|binding| binding.name.as_str())
+                .collect();
             let given: Vec<_> = buffers.iter().map(|(name, _)| *name).collect();
             panic!("kernel {} binds {reads:?}, got {given:?}", pipeline.name);
         };
@@ -95,13 +135,20 @@ impl Passes {
 
     /// Adds a pass that fills part of a buffer with zeros. Start and end must be multiples of 4.
     pub fn clear_range(&mut self, buffer: &Buffer, bytes: Range<u64>) {
-        self.list.push(Pass::Clear { buffer: buffer.raw.clone(), bytes });
+        self.list.push(Pass::Clear {
+            buffer: buffer.raw.clone(),
+            bytes,
+        });
     }
 
     /// Adds a copy of bytes from one buffer to another. Offsets and length must be multiples of 4.
     pub fn copy(&mut self, from: (&Buffer, u64), to: (&Buffer, u64), bytes: u64) {
         if bytes > 0 {
-            self.list.push(Pass::Copy { from: (from.0.raw.clone(), from.1), to: (to.0.raw.clone(), to.1), bytes });
+            self.list.push(Pass::Copy {
+                from: (from.0.raw.clone(), from.1),
+                to: (to.0.raw.clone(), to.1),
+                bytes,
+            });
         }
     }
 
@@ -127,16 +174,16 @@ impl Passes {
         gpu.queue.submit([encoder.finish()]);
     }
 
-    /// Submits the list, empties it, and begins to read the first bytes of each of these buffers, as they will be after
-    /// the list. All buffers share one submit and one read-back.
+    /// Submits the list, empties it, and begins to read the first bytes of each of these buffers,
+    /// as they will be after the list. All buffers share one submit and one read-back.
     pub fn submit_reading(&mut self, gpu: &Gpu, reads: &[(&Buffer, usize)]) -> PendingRead {
         let mut encoder = gpu.encoder();
         encode_all(&mut encoder, self.list.drain(..));
         gpu.submit_reading(encoder, reads)
     }
 
-    /// Submits the list, waits, and returns the GPU time from the start of the first pass to the end of the last pass,
-    /// milliseconds.
+    /// Submits the list, waits, and returns the GPU time from the start of the first pass to the
+    /// end of the last pass, milliseconds.
     ///
     /// Returns `None` if the adapter has no timestamps.
     pub fn submit_timed_total(&mut self, gpu: &Gpu) -> Result<Option<f64>, Error> {
@@ -155,7 +202,9 @@ impl Passes {
             mapped_at_creation: false,
         });
         let copy = gpu.storage("span.copy", 16)?;
-        let mut encoder = gpu.device.create_command_encoder(&wgpu::CommandEncoderDescriptor::default());
+        let mut encoder = gpu
+            .device
+            .create_command_encoder(&wgpu::CommandEncoderDescriptor::default());
         write_timestamp(&mut encoder, queries.as_ref(), true);
         encode_all(&mut encoder, self.list.drain(..));
         write_timestamp(&mut encoder, queries.as_ref(), false);
@@ -166,10 +215,14 @@ impl Passes {
         gpu.queue.submit([encoder.finish()]);
         gpu.wait()?;
         let ticks: Vec<u64> = gpu.read(&copy, 2)?;
-        Ok(timed.then(|| ticks[1].saturating_sub(ticks[0]) as f64 * f64::from(gpu.queue.get_timestamp_period()) / 1e6))
+        Ok(timed.then(|| {
+            ticks[1].saturating_sub(ticks[0]) as f64 * f64::from(gpu.queue.get_timestamp_period())
+                / 1e6
+        }))
     }
 
-    /// Submits the list with one timestamped pass per kernel, waits, and returns the GPU time of each.
+    /// Submits the list with one timestamped pass per kernel, waits, and returns the GPU time of
+    /// each.
     ///
     /// Returns an empty list if the adapter has no timestamps.
     pub fn submit_timed(&mut self, gpu: &Gpu) -> Result<Vec<PassTiming>, Error> {
@@ -191,7 +244,9 @@ impl Passes {
             mapped_at_creation: false,
         });
         let copy = gpu.storage("timing.copy", 16 * u64::from(n.max(1)))?;
-        let mut encoder = gpu.device.create_command_encoder(&wgpu::CommandEncoderDescriptor::default());
+        let mut encoder = gpu
+            .device
+            .create_command_encoder(&wgpu::CommandEncoderDescriptor::default());
         let mut names = Vec::new();
         for pass in self.list.drain(..) {
             match &pass {
@@ -221,20 +276,30 @@ impl Passes {
         Ok(names
             .into_iter()
             .zip(ticks.chunks_exact(2))
-            .map(|(name, span)| PassTiming { name, millis: millis(span) })
+            .map(|(name, span)| PassTiming {
+                name,
+                millis: millis(span),
+            })
             .collect())
     }
 }
 
 /// Encodes an empty pass that writes one timestamp at its beginning or end.
-fn write_timestamp(encoder: &mut wgpu::CommandEncoder, queries: Option<&wgpu::QuerySet>, first: bool) {
+fn write_timestamp(
+    encoder: &mut wgpu::CommandEncoder,
+    queries: Option<&wgpu::QuerySet>,
+    first: bool,
+) {
     let Some(query_set) = queries else { return };
     let timestamp_writes = Some(wgpu::ComputePassTimestampWrites {
         query_set,
         beginning_of_pass_write_index: first.then_some(0),
         end_of_pass_write_index: (!first).then_some(1),
     });
-    drop(encoder.begin_compute_pass(&wgpu::ComputePassDescriptor { label: Some("mark"), timestamp_writes }));
+    drop(encoder.begin_compute_pass(&wgpu::ComputePassDescriptor {
+        label: Some("mark"),
+        timestamp_writes,
+    }));
 }
 
 fn encode_all(encoder: &mut wgpu::CommandEncoder, list: impl Iterator<Item = Pass>) {
@@ -243,9 +308,11 @@ fn encode_all(encoder: &mut wgpu::CommandEncoder, list: impl Iterator<Item = Pas
         match pass {
             Pass::Clear { .. } | Pass::Copy { .. } => transfer(encoder, &pass),
             first @ Pass::Dispatch { .. } => {
-                let mut compute = encoder.begin_compute_pass(&wgpu::ComputePassDescriptor::default());
+                let mut compute =
+                    encoder.begin_compute_pass(&wgpu::ComputePassDescriptor::default());
                 encode(&mut compute, &first);
-                while let Some(next) = passes.next_if(|pass| matches!(pass, Pass::Dispatch { .. })) {
+                while let Some(next) = passes.next_if(|pass| matches!(pass, Pass::Dispatch { .. }))
+                {
                     encode(&mut compute, &next);
                 }
             }
@@ -257,13 +324,25 @@ fn encode_all(encoder: &mut wgpu::CommandEncoder, list: impl Iterator<Item = Pas
 fn transfer(encoder: &mut wgpu::CommandEncoder, pass: &Pass) {
     match pass {
         Pass::Dispatch { .. } => {}
-        Pass::Clear { buffer, bytes } => encoder.clear_buffer(buffer, bytes.start, Some(bytes.end - bytes.start)),
-        Pass::Copy { from, to, bytes } => encoder.copy_buffer_to_buffer(&from.0, from.1, &to.0, to.1, *bytes),
+        Pass::Clear { buffer, bytes } => {
+            encoder.clear_buffer(buffer, bytes.start, Some(bytes.end - bytes.start))
+        }
+        Pass::Copy { from, to, bytes } => {
+            encoder.copy_buffer_to_buffer(&from.0, from.1, &to.0, to.1, *bytes)
+        }
     }
 }
 
 fn encode(compute: &mut wgpu::ComputePass<'_>, pass: &Pass) {
-    let Pass::Dispatch { pipeline, bind_group, groups, .. } = pass else { return };
+    let Pass::Dispatch {
+        pipeline,
+        bind_group,
+        groups,
+        ..
+    } = pass
+    else {
+        return;
+    };
     compute.set_pipeline(pipeline);
     compute.set_bind_group(0, bind_group, &[]);
     compute.dispatch_workgroups(groups[0], groups[1], 1);
@@ -281,8 +360,12 @@ mod tests {
     #[test]
     fn reads_are_batched_and_staging_is_reused() {
         let gpu = Gpu::open(&GpuOptions::default()).unwrap();
-        let first = gpu.storage_with("first", &[1, 2, 3, 4, 5, 6, 7, 8]).unwrap();
-        let second = gpu.storage_with("second", bytemuck::cast_slice(&[0.5f32; 1000])).unwrap();
+        let first = gpu
+            .storage_with("first", &[1, 2, 3, 4, 5, 6, 7, 8])
+            .unwrap();
+        let second = gpu
+            .storage_with("second", bytemuck::cast_slice(&[0.5f32; 1000]))
+            .unwrap();
         let mut list = Passes::default();
         for n in [3, 1000, 2, 1000] {
             // A copy in the list happens before the read.
@@ -290,12 +373,25 @@ mod tests {
             let read = list.submit_reading(&gpu, &[(&first, 7), (&second, 4 * n)]);
             assert!(list.is_empty());
             let (bytes, floats) = read
-                .finish_with(&gpu, |parts| (parts[0].to_vec(), bytemuck::pod_collect_to_vec::<u8, f32>(parts[1])))
+                .finish_with(&gpu, |parts| {
+                    (
+                        parts[0].to_vec(),
+                        bytemuck::pod_collect_to_vec::<u8, f32>(parts[1]),
+                    )
+                })
                 .unwrap();
             let half = 0.5f32.to_le_bytes();
-            assert_eq!(bytes, [1, 2, 3, 4, half[0], half[1], half[2]], "whole words are copied, bytes are returned");
+            assert_eq!(
+                bytes,
+                [1, 2, 3, 4, half[0], half[1], half[2]],
+                "whole words are copied, bytes are returned"
+            );
             assert_eq!(floats, vec![0.5; n]);
         }
-        assert_eq!(gpu.n_idle_staging(), 2, "one for small reads, one for large ones");
+        assert_eq!(
+            gpu.n_idle_staging(),
+            2,
+            "one for small reads, one for large ones"
+        );
     }
 }

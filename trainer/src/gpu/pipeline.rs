@@ -18,28 +18,48 @@ pub struct Kernel {
 }
 
 impl Pipeline {
-    /// Compiles `kernel` with the given values of its `override`s, or returns the pipeline that this device has already
-    /// compiled for them.
+    /// Compiles `kernel` with the given values of its `override`s, or returns the pipeline that
+    /// this device has already compiled for them.
     pub fn new(gpu: &Gpu, kernel: Kernel, overrides: &[(&str, f64)]) -> Result<Self, Error> {
         let text = resolve(kernel.source, kernel.shared)?;
         let key = Key::new(text.clone(), overrides);
-        gpu.pipelines.get_or_compile(key, || Self::compile(gpu, kernel.source.name, &text, overrides))
+        gpu.pipelines.get_or_compile(key, || {
+            Self::compile(gpu, kernel.source.name, &text, overrides)
+        })
     }
 
     /// Compiles WGSL that contains all imports.
-    fn compile(gpu: &Gpu, name: &'static str, text: &str, overrides: &[(&str, f64)]) -> Result<Self, Error> {
+    fn compile(
+        gpu: &Gpu,
+        name: &'static str,
+        text: &str,
+        overrides: &[(&str, f64)],
+    ) -> Result<Self, Error> {
         let module = reflect(name, text)?;
         let (bytes, limit_bytes) = (wgsl::workgroup_bytes(&module), gpu.max_workgroup_bytes());
         if bytes > limit_bytes {
-            return Err(Error::WorkgroupTooLarge { kernel: name, bytes, limit_bytes });
+            return Err(Error::WorkgroupTooLarge {
+                kernel: name,
+                bytes,
+                limit_bytes,
+            });
         }
         let bindings: Arc<[Binding]> = wgsl::bindings(&module).into();
         let device = &gpu.device;
         let source = wgpu::ShaderSource::Naga(Cow::Owned(module));
-        let described = wgpu::ShaderModuleDescriptor { label: Some(name), source };
-        let checks = wgpu::ShaderRuntimeChecks { force_loop_bounding: false, ..wgpu::ShaderRuntimeChecks::checked() };
+        let described = wgpu::ShaderModuleDescriptor {
+            label: Some(name),
+            source,
+        };
+        let checks = wgpu::ShaderRuntimeChecks {
+            force_loop_bounding: false,
+            ..wgpu::ShaderRuntimeChecks::checked()
+        };
         // SAFETY: every loop of our kernels counts to a bound that is fixed before it starts.
-        #[expect(unsafe_code, reason = "a second bound would cost time in every iteration of the innermost loops")]
+        #[expect(
+            unsafe_code,
+            reason = "a second bound would cost time in every iteration of the innermost loops"
+        )]
         let shader = unsafe { device.create_shader_module_trusted(described, checks) };
         let entries: Vec<wgpu::BindGroupLayoutEntry> = bindings
             .iter()
@@ -58,8 +78,10 @@ impl Pipeline {
                 count: None,
             })
             .collect();
-        let layout =
-            device.create_bind_group_layout(&wgpu::BindGroupLayoutDescriptor { label: Some(name), entries: &entries });
+        let layout = device.create_bind_group_layout(&wgpu::BindGroupLayoutDescriptor {
+            label: Some(name),
+            entries: &entries,
+        });
         let pipeline_layout = device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
             label: Some(name),
             bind_group_layouts: &[Some(&layout)],
@@ -76,11 +98,21 @@ impl Pipeline {
             },
             cache: None,
         });
-        Ok(Self { id: gpu.next_unique_id(), name, raw, layout, bindings })
+        Ok(Self {
+            id: gpu.next_unique_id(),
+            name,
+            raw,
+            layout,
+            bindings,
+        })
     }
 
-    /// Compiles several kernels in parallel, because drivers take up to a tenth of a second for each.
-    pub fn compile_all<const N: usize>(gpu: &Gpu, kernels: [(Kernel, &[(&str, f64)]); N]) -> Result<[Self; N], Error> {
+    /// Compiles several kernels in parallel, because drivers take up to a tenth of a second for
+    /// each.
+    pub fn compile_all<const N: usize>(
+        gpu: &Gpu,
+        kernels: [(Kernel, &[(&str, f64)]); N],
+    ) -> Result<[Self; N], Error> {
         let compiled: Vec<Self> = kernels
             .into_par_iter()
             .map(|(kernel, overrides)| Self::new(gpu, kernel, overrides))
@@ -100,15 +132,29 @@ mod tests {
         let text = "var<workgroup> wg_all: array<vec4f, 100000>;
             @compute @workgroup_size(64)
             fn main(@builtin(local_invocation_index) lane: u32) { wg_all[lane] = vec4f(0.0); }";
-        let kernel = Kernel { source: Source { name: "large", text }, shared: &[] };
+        let kernel = Kernel {
+            source: Source {
+                name: "large",
+                text,
+            },
+            shared: &[],
+        };
         for _ in 0..2 {
             let rejected = Pipeline::new(&gpu, kernel, &[]).unwrap_err();
-            let is_expected = matches!(rejected, Error::WorkgroupTooLarge { kernel: "large", bytes: 1_600_000, .. });
+            let is_expected = matches!(
+                rejected,
+                Error::WorkgroupTooLarge {
+                    kernel: "large",
+                    bytes: 1_600_000,
+                    ..
+                }
+            );
             assert!(is_expected, "{rejected}");
         }
     }
 
-    /// A pipeline is compiled once per text and overrides, also if several threads ask for it at the same time.
+    /// A pipeline is compiled once per text and overrides, also if several threads ask for it at
+    /// the same time.
     #[test]
     fn pipelines_are_compiled_once_per_text_and_overrides() {
         const FIRST: &str = "
@@ -125,10 +171,22 @@ mod tests {
         let output = gpu.storage("output", 4).unwrap();
         let mut passes = Passes::default();
         let mut result = |text: &'static str, overrides: &[(&str, f64)]| {
-            let kernel = Kernel { source: Source { name: "constant", text }, shared: &[] };
-            let compiled = (0..4).into_par_iter().map(|_| Pipeline::new(&gpu, kernel, overrides).unwrap());
+            let kernel = Kernel {
+                source: Source {
+                    name: "constant",
+                    text,
+                },
+                shared: &[],
+            };
+            let compiled = (0..4)
+                .into_par_iter()
+                .map(|_| Pipeline::new(&gpu, kernel, overrides).unwrap());
             let compiled: Vec<Pipeline> = compiled.collect();
-            assert!(compiled.iter().all(|pipeline| pipeline.id == compiled[0].id));
+            assert!(
+                compiled
+                    .iter()
+                    .all(|pipeline| pipeline.id == compiled[0].id)
+            );
             passes.dispatch(&gpu, &compiled[0], 1, &[("output", &output)]);
             passes.submit(&gpu);
             (gpu.read::<u32>(&output, 1).unwrap()[0], gpu.pipelines.len())

@@ -27,19 +27,25 @@ pub(super) struct Key {
 
 impl Key {
     pub(super) fn new(text: String, overrides: &[(&str, f64)]) -> Self {
-        let bits = overrides.iter().map(|(name, value)| ((*name).to_owned(), value.to_bits()));
-        Self { text, overrides: bits.collect() }
+        let bits = overrides
+            .iter()
+            .map(|(name, value)| ((*name).to_owned(), value.to_bits()));
+        Self {
+            text,
+            overrides: bits.collect(),
+        }
     }
 }
 
-/// The pipelines of one device. Each is compiled once, on first use, and kept as long as the device: a second model,
-/// or a model that is loaded again, takes milliseconds instead of seconds to start.
+/// The pipelines of one device. Each is compiled once, on first use, and kept as long as the
+/// device: a second model, or a model that is loaded again, takes milliseconds instead of seconds
+/// to start.
 #[derive(Debug, Default)]
 pub(super) struct PipelineCache(Mutex<HashMap<Key, Arc<Mutex<Option<Pipeline>>>>>);
 
 impl PipelineCache {
-    /// The pipeline with this key. If it is missing, compiles it; callers with the same key wait for each other,
-    /// callers with different keys do not.
+    /// The pipeline with this key. If it is missing, compiles it; callers with the same key wait
+    /// for each other, callers with different keys do not.
     pub(super) fn get_or_compile(
         &self,
         key: Key,
@@ -57,6 +63,10 @@ impl PipelineCache {
     /// Number of compiled pipelines.
     #[cfg(test)]
     pub(super) fn len(&self) -> usize {
-        self.0.lock().values().filter(|slot| slot.lock().is_some()).count()
+        self.0
+            .lock()
+            .values()
+            .filter(|slot| slot.lock().is_some())
+            .count()
     }
 }

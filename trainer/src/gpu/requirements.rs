@@ -5,9 +5,11 @@ use super::GpuOptions;
 /// Optional features of the adapter; each has a fallback.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Optional {
-    /// Smallest number of lanes per subgroup, 4 to 128; `None` if subgroup operations may not be used.
+    /// Smallest number of lanes per subgroup, 4 to 128; `None` if subgroup operations may not be
+    /// used.
     ///
-    /// Without subgroups, sorting ranks keys sequentially, and the backward pass sums over lanes in workgroup memory.
+    /// Without subgroups, sorting ranks keys sequentially, and the backward pass sums over lanes in
+    /// workgroup memory.
     pub subgroup_lanes: Option<u32>,
     /// GPU timestamps for the time of each pass; without them, only wall time is available.
     pub timestamps: bool,
@@ -16,25 +18,31 @@ pub struct Optional {
 }
 
 /// Features needed by kernels with f16 matrices.
-const HALF_MATRICES: wgpu::Features = wgpu::Features::EXPERIMENTAL_COOPERATIVE_MATRIX.union(wgpu::Features::SHADER_F16);
+const HALF_MATRICES: wgpu::Features =
+    wgpu::Features::EXPERIMENTAL_COOPERATIVE_MATRIX.union(wgpu::Features::SHADER_F16);
 
 /// Whether the adapter multiplies matrices of the size and types that our kernels use.
 fn has_half_matrices(adapter: &wgpu::Adapter) -> bool {
-    adapter.cooperative_matrix_properties().iter().any(|properties| {
-        [properties.m_size, properties.n_size, properties.k_size] == [16; 3]
-            && properties.ab_type == wgpu::CooperativeScalarType::F16
-            && properties.cr_type == wgpu::CooperativeScalarType::F32
-    })
+    adapter
+        .cooperative_matrix_properties()
+        .iter()
+        .any(|properties| {
+            [properties.m_size, properties.n_size, properties.k_size] == [16; 3]
+                && properties.ab_type == wgpu::CooperativeScalarType::F16
+                && properties.cr_type == wgpu::CooperativeScalarType::F32
+        })
 }
 
 impl Optional {
-    /// Features of `adapter` that `options` allows. With `FIELDRIG_GPU_FEATURES=none`, the caller allows none.
+    /// Features of `adapter` that `options` allows. With `FIELDRIG_GPU_FEATURES=none`, the caller
+    /// allows none.
     pub(super) fn of(adapter: &wgpu::Adapter, options: &GpuOptions) -> Self {
         let allowed = options.optional_features;
         let features = adapter.features();
         let info = adapter.get_info();
         let same_size = info.subgroup_min_size == info.subgroup_max_size;
-        let subgroups = features.contains(wgpu::Features::SUBGROUP) && same_size && info.subgroup_min_size >= 4;
+        let subgroups =
+            features.contains(wgpu::Features::SUBGROUP) && same_size && info.subgroup_min_size >= 4;
         Self {
             subgroup_lanes: (allowed && subgroups).then_some(info.subgroup_min_size),
             timestamps: allowed && features.contains(wgpu::Features::TIMESTAMP_QUERY),

@@ -1,4 +1,5 @@
-//! Test helpers that check that kernels are valid, and that their structs have the same layout in Rust and WGSL.
+//! Test helpers that check that kernels are valid, and that their structs have the same layout in
+//! Rust and WGSL.
 
 use super::{Gpu, GpuOptions, Kernel, reflect, resolve};
 use parking_lot::Mutex;
@@ -7,8 +8,9 @@ use std::sync::Arc;
 /// Devices of finished tests, with the options they were opened with.
 static DEVICES: Mutex<Vec<(GpuOptions, Arc<Gpu>)>> = Mutex::new(Vec::new());
 
-/// A device that no other test uses at the same time. It may have been used by an earlier test, so its pipelines are
-/// compiled already; it has no buffers left. Tests of the device itself open their own.
+/// A device that no other test uses at the same time. It may have been used by an earlier test, so
+/// its pipelines are compiled already; it has no buffers left. Tests of the device itself open
+/// their own.
 pub(crate) fn test_gpu() -> Arc<Gpu> {
     test_gpu_with(&GpuOptions::default())
 }
@@ -17,9 +19,13 @@ pub(crate) fn test_gpu() -> Arc<Gpu> {
 pub(crate) fn test_gpu_with(options: &GpuOptions) -> Arc<Gpu> {
     let mut devices = DEVICES.lock();
     devices.retain(|(_, gpu)| gpu.check().is_ok());
-    // The only other owners of a device are the test that uses it and its models, which may drop buffers last.
+    // The only other owners of a device are the test that uses it and its models, which may drop
+    // buffers last.
     let is_free = |gpu: &Arc<Gpu>| Arc::strong_count(gpu) == 1 && gpu.live_bytes() == 0;
-    if let Some((_, gpu)) = devices.iter().find(|(opened, gpu)| opened == options && is_free(gpu)) {
+    if let Some((_, gpu)) = devices
+        .iter()
+        .find(|(opened, gpu)| opened == options && is_free(gpu))
+    {
         return gpu.clone();
     }
     let gpu = Gpu::open(options).unwrap();
@@ -30,8 +36,8 @@ pub(crate) fn test_gpu_with(options: &GpuOptions) -> Arc<Gpu> {
     gpu
 }
 
-/// NVIDIA's driver may crash if a device is open when the process exits. The handler is registered after the driver's own
-/// handlers, so it runs before them.
+/// NVIDIA's driver may crash if a device is open when the process exits. The handler is registered
+/// after the driver's own handlers, so it runs before them.
 fn close_devices_at_exit() {
     extern "C" fn close_devices() {
         DEVICES.lock().clear();
@@ -39,27 +45,40 @@ fn close_devices_at_exit() {
     static REGISTER: std::sync::Once = std::sync::Once::new();
     REGISTER.call_once(|| {
         // SAFETY: the handler is a function without arguments that does not unwind.
-        #[expect(unsafe_code, reason = "the test harness cannot call a function after the last test")]
+        #[expect(
+            unsafe_code,
+            reason = "the test harness cannot call a function after the last test"
+        )]
         let status = unsafe { libc::atexit(close_devices) };
         assert_eq!(status, 0, "the C library keeps at least 32 handlers");
     });
 }
 
-/// If set to `demand`, tests that need a real GPU fail without one instead of being skipped. `make test-gpu` sets it.
+/// If set to `demand`, tests that need a real GPU fail without one instead of being skipped. `make
+/// test-gpu` sets it.
 const DEMAND_VARIABLE: &str = "FIELDRIG_GPU_TESTS";
 
-/// Options of a device with cooperative matrices of f16 numbers. If the adapter has none, reports the calling test as
-/// skipped and returns `None`.
+/// Options of a device with cooperative matrices of f16 numbers. If the adapter has none, reports
+/// the calling test as skipped and returns `None`.
 pub(crate) fn options_with_matrices() -> Option<GpuOptions> {
     let options = GpuOptions::default();
-    has(&options, test_gpu().optional().half_matrices, "cooperative matrices of f16 numbers").then_some(options)
+    has(
+        &options,
+        test_gpu().optional().half_matrices,
+        "cooperative matrices of f16 numbers",
+    )
+    .then_some(options)
 }
 
-/// Options of a device with subgroups of at least 16 lanes. If the adapter has none, reports the calling test as skipped
-/// and returns `None`. Lavapipe has them if `LP_NATIVE_VECTOR_WIDTH` is 512.
+/// Options of a device with subgroups of at least 16 lanes. If the adapter has none, reports the
+/// calling test as skipped and returns `None`. Lavapipe has them if `LP_NATIVE_VECTOR_WIDTH` is
+/// 512.
 pub(crate) fn options_with_large_subgroups() -> Option<GpuOptions> {
     let options = GpuOptions::default();
-    let is_large = test_gpu().optional().subgroup_lanes.is_some_and(|lanes| lanes >= 16);
+    let is_large = test_gpu()
+        .optional()
+        .subgroup_lanes
+        .is_some_and(|lanes| lanes >= 16);
     has(&options, is_large, "subgroups of 16 or more lanes").then_some(options)
 }
 
@@ -83,47 +102,83 @@ pub(crate) type StructLayout = (Vec<(String, usize)>, usize);
 pub(crate) fn assert_valid<'k>(kernels: impl IntoIterator<Item = &'k Kernel>) {
     let error = |kernel: &Kernel| {
         let validate = |text: String| reflect(kernel.source.name, &text).map(drop);
-        resolve(kernel.source, kernel.shared).and_then(validate).err()
+        resolve(kernel.source, kernel.shared)
+            .and_then(validate)
+            .err()
     };
-    let errors: Vec<String> = kernels.into_iter().filter_map(error).map(|error| error.to_string()).collect();
+    let errors: Vec<String> = kernels
+        .into_iter()
+        .filter_map(error)
+        .map(|error| error.to_string())
+        .collect();
     assert!(errors.is_empty(), "{}", errors.join("\n"));
 }
 
 /// The layout of the WGSL struct `name`. Asserts that all kernels that declare the struct agree.
 pub(crate) fn layout_in_wgsl(kernels: &[Kernel], name: &str) -> StructLayout {
     let layout = |kernel: &Kernel| {
-        let module = reflect(kernel.source.name, &resolve(kernel.source, kernel.shared).unwrap()).unwrap();
-        module.types.iter().find_map(|(_, found)| match &found.inner {
-            wgpu::naga::TypeInner::Struct { members, span } if found.name.as_deref() == Some(name) => {
-                let fields = members.iter().map(|member| (member.name.clone().unwrap(), member.offset as usize));
-                Some((fields.collect(), *span as usize))
-            }
-            _ => None,
-        })
+        let module = reflect(
+            kernel.source.name,
+            &resolve(kernel.source, kernel.shared).unwrap(),
+        )
+        .unwrap();
+        module
+            .types
+            .iter()
+            .find_map(|(_, found)| match &found.inner {
+                wgpu::naga::TypeInner::Struct { members, span }
+                    if found.name.as_deref() == Some(name) =>
+                {
+                    let fields = members
+                        .iter()
+                        .map(|member| (member.name.clone().unwrap(), member.offset as usize));
+                    Some((fields.collect(), *span as usize))
+                }
+                _ => None,
+            })
     };
     let layouts: Vec<StructLayout> = kernels.iter().filter_map(layout).collect();
-    let first = layouts.first().unwrap_or_else(|| panic!("no kernel declares {name}"));
-    assert!(layouts.iter().all(|layout| layout == first), "{name} differs between kernels: {layouts:?}");
+    let first = layouts
+        .first()
+        .unwrap_or_else(|| panic!("no kernel declares {name}"));
+    assert!(
+        layouts.iter().all(|layout| layout == first),
+        "{name} differs between kernels: {layouts:?}"
+    );
     first.clone()
 }
 
-/// The value of the WGSL constant `name`, a u32. Asserts that all kernels that declare the constant agree.
+/// The value of the WGSL constant `name`, a u32. Asserts that all kernels that declare the constant
+/// agree.
 pub(crate) fn constant_in_wgsl(kernels: &[Kernel], name: &str) -> u32 {
     let value = |kernel: &Kernel| {
-        let module = reflect(kernel.source.name, &resolve(kernel.source, kernel.shared).unwrap()).unwrap();
-        let (_, constant) = module.constants.iter().find(|(_, constant)| constant.name.as_deref() == Some(name))?;
+        let module = reflect(
+            kernel.source.name,
+            &resolve(kernel.source, kernel.shared).unwrap(),
+        )
+        .unwrap();
+        let (_, constant) = module
+            .constants
+            .iter()
+            .find(|(_, constant)| constant.name.as_deref() == Some(name))?;
         match module.global_expressions[constant.init] {
             wgpu::naga::Expression::Literal(wgpu::naga::Literal::U32(value)) => Some(value),
             ref other => panic!("{name} is {other:?}"),
         }
     };
     let values: Vec<u32> = kernels.iter().filter_map(value).collect();
-    let first = *values.first().unwrap_or_else(|| panic!("no kernel declares {name}"));
-    assert!(values.iter().all(|value| *value == first), "{name} differs between kernels: {values:?}");
+    let first = *values
+        .first()
+        .unwrap_or_else(|| panic!("no kernel declares {name}"));
+    assert!(
+        values.iter().all(|value| *value == first),
+        "{name} differs between kernels: {values:?}"
+    );
     first
 }
 
-/// Asserts that a struct has these fields, in this order and at the same offsets, in Rust and in the WGSL of `$kernels`.
+/// Asserts that a struct has these fields, in this order and at the same offsets, in Rust and in
+/// the WGSL of `$kernels`.
 macro_rules! assert_layout {
     ($kernels:expr, $type:ident, [$($field:ident),* $(,)?]) => {
         let in_rust = (

@@ -28,7 +28,8 @@ pub(super) struct Binding {
     pub(super) access: Access,
 }
 
-/// Replaces each line `#import name` with the shared source of that name, recursively; repeated imports are skipped.
+/// Replaces each line `#import name` with the shared source of that name, recursively; repeated
+/// imports are skipped.
 pub fn resolve(kernel: Source, shared: &[Source]) -> Result<String, Error> {
     let mut text = String::new();
     let mut seen = Vec::new();
@@ -36,7 +37,12 @@ pub fn resolve(kernel: Source, shared: &[Source]) -> Result<String, Error> {
     Ok(text)
 }
 
-fn append(source: Source, shared: &[Source], seen: &mut Vec<&'static str>, text: &mut String) -> Result<(), Error> {
+fn append(
+    source: Source,
+    shared: &[Source],
+    seen: &mut Vec<&'static str>,
+    text: &mut String,
+) -> Result<(), Error> {
     for line in source.text.lines() {
         let Some(name) = line.strip_prefix("#import ").map(str::trim) else {
             text.push_str(line);
@@ -46,7 +52,10 @@ fn append(source: Source, shared: &[Source], seen: &mut Vec<&'static str>, text:
         let import = shared
             .iter()
             .find(|import| import.name == name)
-            .ok_or_else(|| Error::UnknownImport { kernel: source.name, import: name.to_owned() })?;
+            .ok_or_else(|| Error::UnknownImport {
+                kernel: source.name,
+                import: name.to_owned(),
+            })?;
         if !seen.contains(&import.name) {
             seen.push(import.name);
             append(*import, shared, seen, text)?;
@@ -57,18 +66,30 @@ fn append(source: Source, shared: &[Source], seen: &mut Vec<&'static str>, text:
 
 /// Parses and validates WGSL.
 pub fn reflect(name: &'static str, text: &str) -> Result<naga::Module, Error> {
-    let rejected = |message: String| Error::Wgsl { kernel: name, message };
-    let module = naga::front::wgsl::parse_str(text).map_err(|error| rejected(error.emit_to_string(text)))?;
-    naga::valid::Validator::new(naga::valid::ValidationFlags::all(), naga::valid::Capabilities::all())
-        .validate(&module)
-        .map_err(|error| rejected(error.emit_to_string(text)))?;
+    let rejected = |message: String| Error::Wgsl {
+        kernel: name,
+        message,
+    };
+    let module =
+        naga::front::wgsl::parse_str(text).map_err(|error| rejected(error.emit_to_string(text)))?;
+    naga::valid::Validator::new(
+        naga::valid::ValidationFlags::all(),
+        naga::valid::Capabilities::all(),
+    )
+    .validate(&module)
+    .map_err(|error| rejected(error.emit_to_string(text)))?;
     Ok(module)
 }
 
 /// Workgroup memory that a kernel uses, bytes.
 pub(super) fn workgroup_bytes(module: &naga::Module) -> u32 {
-    let shared = module.global_variables.iter().filter(|(_, variable)| variable.space == naga::AddressSpace::WorkGroup);
-    shared.map(|(_, variable)| module.types[variable.ty].inner.size(module.to_ctx())).sum()
+    let shared = module
+        .global_variables
+        .iter()
+        .filter(|(_, variable)| variable.space == naga::AddressSpace::WorkGroup);
+    shared
+        .map(|(_, variable)| module.types[variable.ty].inner.size(module.to_ctx()))
+        .sum()
 }
 
 /// The buffers of group 0 in order of their numbers.
@@ -79,14 +100,20 @@ pub(super) fn bindings(module: &naga::Module) -> Vec<Binding> {
         .filter_map(|(_, variable)| {
             let access = match variable.space {
                 naga::AddressSpace::Uniform => Access::Uniform,
-                naga::AddressSpace::Storage { access } if access.contains(naga::StorageAccess::STORE) => {
+                naga::AddressSpace::Storage { access }
+                    if access.contains(naga::StorageAccess::STORE) =>
+                {
                     Access::ReadWrite
                 }
                 naga::AddressSpace::Storage { .. } => Access::Read,
                 _ => return None,
             };
             let number = variable.binding.as_ref()?.binding;
-            Some(Binding { name: variable.name.clone()?, number, access })
+            Some(Binding {
+                name: variable.name.clone()?,
+                number,
+                access,
+            })
         })
         .collect();
     found.sort_by_key(|binding| binding.number);

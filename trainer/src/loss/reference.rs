@@ -1,9 +1,9 @@
-//! Plain CPU version of the training loss in f64: absolute difference, structural similarity (SSIM) and depth, with
-//! gradients.
+//! Plain CPU version of the training loss in f64: absolute difference, structural similarity (SSIM)
+//! and depth, with gradients.
 //!
-//! Source: Kerbl et al. 2023, equation 7; SSIM of Wang et al. 2004 with a Gaussian window. We divide by the total
-//! number of pixels, including masked ones. We do not divide the depth residual by the coverage, so that it is linear
-//! in the image.
+//! Source: Kerbl et al. 2023, equation 7; SSIM of Wang et al. 2004 with a Gaussian window. We
+//! divide by the total number of pixels, including masked ones. We do not divide the depth residual
+//! by the coverage, so that it is linear in the image.
 
 use super::rendered_image::{RenderedImage, Upstream};
 
@@ -56,38 +56,59 @@ pub struct Loss {
 /// Loss of a rendered image, and its gradient with respect to the image.
 pub fn loss(image: &RenderedImage, target: &Target, weights: &Weights) -> (Loss, Upstream) {
     let n_pixels = target.rgb.len();
-    let (rendered, truth) = (composed(image, target, weights), masked(&target.rgb, target));
-    let mut upstream =
-        Upstream { rgb: vec![[0.0; 3]; n_pixels], transmittance: vec![0.0; n_pixels], depth: vec![0.0; n_pixels] };
+    let (rendered, truth) = (
+        composed(image, target, weights),
+        masked(&target.rgb, target),
+    );
+    let mut upstream = Upstream {
+        rgb: vec![[0.0; 3]; n_pixels],
+        transmittance: vec![0.0; n_pixels],
+        depth: vec![0.0; n_pixels],
+    };
     let mut loss = Loss::default();
     for channel in 0..3 {
-        let plane = |pixels: &[[f64; 3]]| pixels.iter().map(|pixel| pixel[channel]).collect::<Vec<_>>();
+        let plane = |pixels: &[[f64; 3]]| {
+            pixels
+                .iter()
+                .map(|pixel| pixel[channel])
+                .collect::<Vec<_>>()
+        };
         let (rendered, truth) = (plane(&rendered), plane(&truth));
         let (l1, v_l1) = mean_abs(&rendered, &truth);
         let (ssim, v_ssim) = mean_ssim(target.size_px, &rendered, &truth);
         loss.l1 += l1 / 3.0;
         loss.dssim += (1.0 - ssim) / 3.0;
         for pixel_ix in (0..n_pixels).filter(|&pixel_ix| target.visible[pixel_ix]) {
-            let v = ((1.0 - weights.dssim_frac) * v_l1[pixel_ix] - weights.dssim_frac * v_ssim[pixel_ix]) / 3.0;
+            let v = ((1.0 - weights.dssim_frac) * v_l1[pixel_ix]
+                - weights.dssim_frac * v_ssim[pixel_ix])
+                / 3.0;
             upstream.rgb[pixel_ix][channel] = v;
             upstream.transmittance[pixel_ix] += v * weights.background_rgb[channel];
         }
     }
     loss.depth_m = depth(image, target, weights, &mut upstream);
-    loss.total =
-        (1.0 - weights.dssim_frac) * loss.l1 + weights.dssim_frac * loss.dssim + weights.depth_per_m * loss.depth_m;
+    loss.total = (1.0 - weights.dssim_frac) * loss.l1
+        + weights.dssim_frac * loss.dssim
+        + weights.depth_per_m * loss.depth_m;
     (loss, upstream)
 }
 
-/// Mean absolute difference and its gradient with respect to `rendered`. The gradient is 0 where the values are equal.
+/// Mean absolute difference and its gradient with respect to `rendered`. The gradient is 0 where
+/// the values are equal.
 fn mean_abs(rendered: &[f64], truth: &[f64]) -> (f64, Vec<f64>) {
     let n_pixels = rendered.len() as f64;
-    let residuals = rendered.iter().zip(truth).map(|(rendered, truth)| rendered - truth);
-    (residuals.clone().map(f64::abs).sum::<f64>() / n_pixels, residuals.map(|r| sign(r) / n_pixels).collect())
+    let residuals = rendered
+        .iter()
+        .zip(truth)
+        .map(|(rendered, truth)| rendered - truth);
+    (
+        residuals.clone().map(f64::abs).sum::<f64>() / n_pixels,
+        residuals.map(|r| sign(r) / n_pixels).collect(),
+    )
 }
 
-/// Mean SSIM over all pixels of one channel and its gradient with respect to `rendered`. Both images are 0 outside
-/// their borders.
+/// Mean SSIM over all pixels of one channel and its gradient with respect to `rendered`. Both
+/// images are 0 outside their borders.
 pub fn mean_ssim(size_px: [usize; 2], rendered: &[f64], truth: &[f64]) -> (f64, Vec<f64>) {
     let n_pixels = rendered.len() as f64;
     let product = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).collect::<Vec<_>>();
@@ -102,7 +123,10 @@ pub fn mean_ssim(size_px: [usize; 2], rendered: &[f64], truth: &[f64]) -> (f64, 
     for ix in 0..rendered.len() {
         let (x, y) = (mean_x[ix], mean_y[ix]);
         let luminance = (2.0 * x * y + C1, x * x + y * y + C1);
-        let contrast = (2.0 * (mean_xy[ix] - x * y) + C2, mean_xx[ix] - x * x + mean_yy[ix] - y * y + C2);
+        let contrast = (
+            2.0 * (mean_xy[ix] - x * y) + C2,
+            mean_xx[ix] - x * x + mean_yy[ix] - y * y + C2,
+        );
         let denominator = luminance.1 * contrast.1;
         let ssim = luminance.0 * contrast.0 / denominator;
         sum += ssim;
@@ -114,16 +138,28 @@ pub fn mean_ssim(size_px: [usize; 2], rendered: &[f64], truth: &[f64]) -> (f64, 
         v_mean_xy.push(v_covariance / n_pixels);
     }
     // The window is symmetric, so blurring is its own transpose.
-    let (by_mean, by_square, by_product) = (blurred(&v_mean_x), blurred(&v_mean_xx), blurred(&v_mean_xy));
-    let v = (0..rendered.len()).map(|ix| by_mean[ix] + 2.0 * rendered[ix] * by_square[ix] + truth[ix] * by_product[ix]);
+    let (by_mean, by_square, by_product) =
+        (blurred(&v_mean_x), blurred(&v_mean_xx), blurred(&v_mean_xy));
+    let v = (0..rendered.len())
+        .map(|ix| by_mean[ix] + 2.0 * rendered[ix] * by_square[ix] + truth[ix] * by_product[ix]);
     (sum / n_pixels, v.collect())
 }
 
 /// Mean clipped depth residual over all pixels; adds its weighted gradient to `upstream`.
-fn depth(image: &RenderedImage, target: &Target, weights: &Weights, upstream: &mut Upstream) -> f64 {
+fn depth(
+    image: &RenderedImage,
+    target: &Target,
+    weights: &Weights,
+    upstream: &mut Upstream,
+) -> f64 {
     let n_pixels = target.rgb.len() as f64;
     let mut sum = 0.0;
-    for (pixel_ix, &depth_m) in target.depth_m.iter().enumerate().filter(|(_, depth_m)| **depth_m > 0.0) {
+    for (pixel_ix, &depth_m) in target
+        .depth_m
+        .iter()
+        .enumerate()
+        .filter(|(_, depth_m)| **depth_m > 0.0)
+    {
         // Compares the rendered depth with the true depth; both are weighted by the coverage.
         let residual_m = image.depth[pixel_ix] - (1.0 - image.transmittance[pixel_ix]) * depth_m;
         sum += residual_m.abs().min(weights.depth_clip_m);
@@ -139,13 +175,26 @@ fn depth(image: &RenderedImage, target: &Target, weights: &Weights, upstream: &m
 /// The render over the background; black where the target is masked.
 fn composed(image: &RenderedImage, target: &Target, weights: &Weights) -> Vec<[f64; 3]> {
     let over = |(rgb, transmittance): (&[f64; 3], &f64)| {
-        std::array::from_fn(|channel| rgb[channel] + transmittance * weights.background_rgb[channel])
+        std::array::from_fn(|channel| {
+            rgb[channel] + transmittance * weights.background_rgb[channel]
+        })
     };
-    masked(&image.rgb.iter().zip(&image.transmittance).map(over).collect::<Vec<_>>(), target)
+    masked(
+        &image
+            .rgb
+            .iter()
+            .zip(&image.transmittance)
+            .map(over)
+            .collect::<Vec<_>>(),
+        target,
+    )
 }
 
 fn masked(rgb: &[[f64; 3]], target: &Target) -> Vec<[f64; 3]> {
-    rgb.iter().zip(&target.visible).map(|(rgb, visible)| if *visible { *rgb } else { [0.0; 3] }).collect()
+    rgb.iter()
+        .zip(&target.visible)
+        .map(|(rgb, visible)| if *visible { *rgb } else { [0.0; 3] })
+        .collect()
 }
 
 /// Weights of the SSIM window along one axis; they sum to 1.
@@ -165,10 +214,16 @@ fn blurred(size_px: [usize; 2], plane: &[f64]) -> Vec<f64> {
     let along = |plane: &[f64], stride: usize, ix: usize, position: usize, side: usize| -> f64 {
         let first = WINDOW_RADIUS.saturating_sub(position);
         let end = window.len().min(side + WINDOW_RADIUS - position);
-        (first..end).map(|tap| window[tap] * plane[ix + stride * tap - stride * WINDOW_RADIUS]).sum()
+        (first..end)
+            .map(|tap| window[tap] * plane[ix + stride * tap - stride * WINDOW_RADIUS])
+            .sum()
     };
-    let by_x: Vec<_> = (0..plane.len()).map(|ix| along(plane, 1, ix, ix % width, width)).collect();
-    (0..plane.len()).map(|ix| along(&by_x, width, ix, ix / width, height)).collect()
+    let by_x: Vec<_> = (0..plane.len())
+        .map(|ix| along(plane, 1, ix, ix % width, width))
+        .collect();
+    (0..plane.len())
+        .map(|ix| along(&by_x, width, ix, ix / width, height))
+        .collect()
 }
 
 /// -1, 0 or 1.
@@ -184,36 +239,63 @@ mod tests {
 
     const SIZE_PX: [usize; 2] = [17, 14];
     const N_PIXELS: usize = SIZE_PX[0] * SIZE_PX[1];
-    const WEIGHTS: Weights =
-        Weights { dssim_frac: 0.2, depth_per_m: 0.5, depth_clip_m: 0.3, background_rgb: [0.3, 0.6, 0.1] };
+    const WEIGHTS: Weights = Weights {
+        dssim_frac: 0.2,
+        depth_per_m: 0.5,
+        depth_clip_m: 0.3,
+        background_rgb: [0.3, 0.6, 0.1],
+    };
 
-    /// A render and a target that differ, with masked pixels, pixels without depth, and large depth errors. No
-    /// residual is close to zero or to the clip threshold.
+    /// A render and a target that differ, with masked pixels, pixels without depth, and large depth
+    /// errors. No residual is close to zero or to the clip threshold.
     fn image_and_target() -> (RenderedImage, Target) {
         let mut random = F32Random::new(11);
         let mut image = RenderedImage::default();
-        let mut target = Target { size_px: SIZE_PX, ..Target::default() };
+        let mut target = Target {
+            size_px: SIZE_PX,
+            ..Target::default()
+        };
         for pixel_ix in 0..N_PIXELS {
             let truth = random.array(0.2, 0.8);
             let transmittance = random.uniform(0.05, 0.6);
-            let depth_m = if pixel_ix % 5 == 0 { 0.0 } else { random.uniform(0.5, 3.0) };
+            let depth_m = if pixel_ix % 5 == 0 {
+                0.0
+            } else {
+                random.uniform(0.5, 3.0)
+            };
             let offset = |random: &mut F32Random| {
-                random.uniform(0.02, 0.2) * if random.uniform(0.0, 1.0) < 0.5 { -1.0 } else { 1.0 }
+                random.uniform(0.02, 0.2)
+                    * if random.uniform(0.0, 1.0) < 0.5 {
+                        -1.0
+                    } else {
+                        1.0
+                    }
             };
             let rgb = truth.map(|truth: f64| truth + offset(&mut random));
-            image.rgb.push(std::array::from_fn(|c| rgb[c] - transmittance * WEIGHTS.background_rgb[c]));
+            image.rgb.push(std::array::from_fn(|c| {
+                rgb[c] - transmittance * WEIGHTS.background_rgb[c]
+            }));
             image.transmittance.push(transmittance);
-            let residual_m = if pixel_ix % 7 == 0 { 0.8 } else { offset(&mut random) };
-            image.depth.push((1.0 - transmittance) * depth_m + residual_m);
+            let residual_m = if pixel_ix % 7 == 0 {
+                0.8
+            } else {
+                offset(&mut random)
+            };
+            image
+                .depth
+                .push((1.0 - transmittance) * depth_m + residual_m);
             image.last_contributor.push(None);
             target.rgb.push(truth);
-            target.visible.push(pixel_ix % 11 != 3 && pixel_ix % SIZE_PX[0] != 2);
+            target
+                .visible
+                .push(pixel_ix % 11 != 3 && pixel_ix % SIZE_PX[0] != 2);
             target.depth_m.push(depth_m);
         }
         (image, target)
     }
 
-    /// Compares the gradient, times `factor`, with central differences. Skips values that do not affect the loss.
+    /// Compares the gradient, times `factor`, with central differences. Skips values that do not
+    /// affect the loss.
     fn checked_gradient(factor: f64) -> Mismatches {
         const NUDGE: f64 = 1e-5;
         const ABS: f64 = 1e-10; // Rounding error of a loss near 1, divided by the nudge.
@@ -234,12 +316,22 @@ mod tests {
         };
         for ix in 0..N_PIXELS {
             for c in 0..3 {
-                check(format!("rgb {ix} {c}"), upstream.rgb[ix][c], &|image, step| image.rgb[ix][c] += step);
+                check(
+                    format!("rgb {ix} {c}"),
+                    upstream.rgb[ix][c],
+                    &|image, step| image.rgb[ix][c] += step,
+                );
             }
-            check(format!("transmittance {ix}"), upstream.transmittance[ix], &|image, step| {
-                image.transmittance[ix] += step;
+            check(
+                format!("transmittance {ix}"),
+                upstream.transmittance[ix],
+                &|image, step| {
+                    image.transmittance[ix] += step;
+                },
+            );
+            check(format!("depth {ix}"), upstream.depth[ix], &|image, step| {
+                image.depth[ix] += step
             });
-            check(format!("depth {ix}"), upstream.depth[ix], &|image, step| image.depth[ix] += step);
         }
         mismatches
     }
@@ -252,7 +344,11 @@ mod tests {
     #[test]
     fn gradient_error_of_one_in_ten_thousand_is_detected() {
         let n_mismatches = checked_gradient(1.0001).n_mismatches();
-        assert!(n_mismatches > 4 * N_PIXELS * 8 / 10, "only {n_mismatches} of about {} are detected", 4 * N_PIXELS);
+        assert!(
+            n_mismatches > 4 * N_PIXELS * 8 / 10,
+            "only {n_mismatches} of about {} are detected",
+            4 * N_PIXELS
+        );
     }
 
     #[test]
@@ -261,27 +357,39 @@ mod tests {
         let plane = |pixels: &[[f64; 3]]| pixels.iter().map(|pixel| pixel[1]).collect::<Vec<_>>();
         let (x, y) = (plane(&image.rgb), plane(&target.rgb));
         let weight = |dx: i32, dy: i32| (-f64::from(dx * dx + dy * dy) / (2.0 * 1.5 * 1.5)).exp();
-        let total: f64 = (-5..=5).flat_map(|dy| (-5..=5).map(move |dx| weight(dx, dy))).sum();
+        let total: f64 = (-5..=5)
+            .flat_map(|dy| (-5..=5).map(move |dx| weight(dx, dy)))
+            .sum();
         let (width, height) = (17_i32, 14_i32);
         let at = |plane: &[f64], column: i32, row: i32| {
             let inside = (0..width).contains(&column) && (0..height).contains(&row);
-            if inside { plane[usize::try_from(row * width + column).expect("inside")] } else { 0.0 }
+            if inside {
+                plane[usize::try_from(row * width + column).expect("inside")]
+            } else {
+                0.0
+            }
         };
         let mut sum = 0.0;
-        for (row, column) in (0..height).flat_map(|row| (0..width).map(move |column| (row, column))) {
+        for (row, column) in (0..height).flat_map(|row| (0..width).map(move |column| (row, column)))
+        {
             let mean = |value: &dyn Fn(i32, i32) -> f64| -> f64 {
                 let window = (-5..=5).flat_map(|dy| (-5..=5).map(move |dx| (dx, dy)));
-                window.map(|(dx, dy)| weight(dx, dy) / total * value(column + dx, row + dy)).sum()
+                window
+                    .map(|(dx, dy)| weight(dx, dy) / total * value(column + dx, row + dy))
+                    .sum()
             };
             let (mx, my) = (mean(&|c, r| at(&x, c, r)), mean(&|c, r| at(&y, c, r)));
             let vx = mean(&|c, r| (at(&x, c, r) - mx).powi(2));
             let vy = mean(&|c, r| (at(&y, c, r) - my).powi(2));
             let vxy = mean(&|c, r| (at(&x, c, r) - mx) * (at(&y, c, r) - my));
-            sum +=
-                (2.0 * mx * my + 0.0001) * (2.0 * vxy + 0.0009) / ((mx * mx + my * my + 0.0001) * (vx + vy + 0.0009));
+            sum += (2.0 * mx * my + 0.0001) * (2.0 * vxy + 0.0009)
+                / ((mx * mx + my * my + 0.0001) * (vx + vy + 0.0009));
         }
         let (got, _) = mean_ssim(SIZE_PX, &x, &y);
-        assert!((got - sum / f64::from(width * height)).abs() < 1e-12, "{got}");
+        assert!(
+            (got - sum / f64::from(width * height)).abs() < 1e-12,
+            "{got}"
+        );
     }
 
     #[test]
@@ -295,7 +403,9 @@ mod tests {
             let transmittance = image.transmittance[ix];
             image.depth[ix] = (1.0 - transmittance) * target.depth_m[ix];
             if target.visible[ix] {
-                image.rgb[ix] = std::array::from_fn(|c| target.rgb[ix][c] - transmittance * WEIGHTS.background_rgb[c]);
+                image.rgb[ix] = std::array::from_fn(|c| {
+                    target.rgb[ix][c] - transmittance * WEIGHTS.background_rgb[c]
+                });
             }
         }
         let (perfect, _) = loss(&image, &target, &WEIGHTS);
@@ -304,12 +414,17 @@ mod tests {
 
     #[test]
     fn flat_image_gives_known_values() {
-        // A fully opaque render that is 0.25 too bright everywhere. The depth of one pixel is off by 0.1 m, and the
-        // depth of another by more than the clip threshold.
+        // A fully opaque render that is 0.25 too bright everywhere. The depth of one pixel is off
+        // by 0.1 m, and the depth of another by more than the clip threshold.
         let n = N_PIXELS;
         let mut depth_m = vec![0.0; n];
         (depth_m[3], depth_m[4]) = (2.0, 2.0);
-        let target = Target { size_px: SIZE_PX, rgb: vec![[0.5; 3]; n], visible: vec![true; n], depth_m };
+        let target = Target {
+            size_px: SIZE_PX,
+            rgb: vec![[0.5; 3]; n],
+            visible: vec![true; n],
+            depth_m,
+        };
         let mut depth = vec![0.0; n];
         (depth[3], depth[4]) = (2.1, 1.0);
         let image = RenderedImage {
@@ -320,7 +435,11 @@ mod tests {
         };
         let (loss, upstream) = loss(&image, &target, &WEIGHTS);
         assert!((loss.l1 - 0.25).abs() < 1e-12);
-        assert!((loss.depth_m - (0.1 + 0.3) / n as f64).abs() < 1e-12, "{}", loss.depth_m);
+        assert!(
+            (loss.depth_m - (0.1 + 0.3) / n as f64).abs() < 1e-12,
+            "{}",
+            loss.depth_m
+        );
         assert!((upstream.depth[3] - 0.5 / n as f64).abs() < 1e-15);
         assert_eq!(upstream.depth[4], 0.0);
     }

@@ -1,6 +1,7 @@
 //! A method for tests. Its model is one color, which moves toward the mean color of the keyframes.
 //!
-//! It is registered like any other method but needs no kernels, so it also serves as a minimal example of a method.
+//! It is registered like any other method but needs no kernels, so it also serves as a minimal
+//! example of a method.
 
 use crate::checkpoint::{Checkpoint, PendingCheckpoint};
 use crate::gpu::PassTiming;
@@ -8,7 +9,9 @@ use crate::keyframe_signature::{self, KeyframeSignature};
 use crate::method_entry::MethodEntry;
 use crate::model_metadata::METADATA_FILE;
 use crate::model_options::{MethodOptions, ModelOptions, default_options};
-use crate::{Aligned, CorrectedKeyframe, Error, Method, Picture, Progress, Recalibrate, RenderRequest};
+use crate::{
+    Aligned, CorrectedKeyframe, Error, Method, Picture, Progress, Recalibrate, RenderRequest,
+};
 use calibration::Alignment;
 use calibration::{CalibratedCamera, ParamSet, TrialReport};
 use keyframe::{Keyframe, Split};
@@ -32,7 +35,13 @@ pub(crate) static ENTRY: MethodEntry = MethodEntry {
     exports: &[],
     default_options: default_options::<MeanColorOptions>,
     check_options: |options| options.typed::<MeanColorOptions>().map(drop),
-    start: |gpu, options| Ok(Aligned::if_requested(MeanColor::new(options.typed()?), &options.common, &gpu)),
+    start: |gpu, options| {
+        Ok(Aligned::if_requested(
+            MeanColor::new(options.typed()?),
+            &options.common,
+            &gpu,
+        ))
+    },
     resume: |_, checkpoint, keyframes, placeholders| {
         Aligned::resume(checkpoint, keyframes, placeholders, MeanColor::resume)
     },
@@ -81,7 +90,12 @@ struct State {
 
 impl MeanColor {
     pub(crate) fn new(options: ModelOptions<MeanColorOptions>) -> Self {
-        Self { options, keyframes: Vec::new(), color_srgb: [0.0; 3], step: 0 }
+        Self {
+            options,
+            keyframes: Vec::new(),
+            color_srgb: [0.0; 3],
+            step: 0,
+        }
     }
 
     /// Resumes from a checkpoint. Also returns the keyframes that the model was not trained on.
@@ -100,20 +114,38 @@ impl MeanColor {
     }
 
     fn of_state(checkpoint: &Checkpoint) -> Result<(Self, Vec<KeyframeSignature>), Error> {
-        let State { options, keyframes, color_srgb, step } = State::deserialize(&checkpoint.state)
-            .map_err(|error| Error::CheckpointState { reason: error.to_string() })?;
-        Ok((Self { color_srgb, step, ..Self::new(options) }, keyframes))
+        let State {
+            options,
+            keyframes,
+            color_srgb,
+            step,
+        } = State::deserialize(&checkpoint.state).map_err(|error| Error::CheckpointState {
+            reason: error.to_string(),
+        })?;
+        Ok((
+            Self {
+                color_srgb,
+                step,
+                ..Self::new(options)
+            },
+            keyframes,
+        ))
     }
 
     fn state(&self) -> Result<Checkpoint, Error> {
         let state = State {
             options: self.options.clone(),
-            keyframes: self.keyframes.iter().map(|keyframe| KeyframeSignature::of(keyframe)).collect(),
+            keyframes: self
+                .keyframes
+                .iter()
+                .map(|keyframe| KeyframeSignature::of(keyframe))
+                .collect(),
             color_srgb: self.color_srgb,
             step: self.step,
         };
-        let state =
-            serde_json::to_value(state).map_err(|error| Error::CheckpointState { reason: error.to_string() })?;
+        let state = serde_json::to_value(state).map_err(|error| Error::CheckpointState {
+            reason: error.to_string(),
+        })?;
         Ok(Checkpoint::new(MeanColorOptions::METHOD, state, Vec::new()))
     }
 }
@@ -121,14 +153,21 @@ impl MeanColor {
 /// Mean color of an image, 0 to 255.
 fn mean_srgb(keyframe: &Keyframe) -> [f64; 3] {
     let pixels = keyframe.rgba_srgb.as_chunks::<4>().0;
-    let sum = |channel: usize| pixels.iter().map(|pixel| f64::from(pixel[channel])).sum::<f64>();
+    let sum = |channel: usize| {
+        pixels
+            .iter()
+            .map(|pixel| f64::from(pixel[channel]))
+            .sum::<f64>()
+    };
     [0, 1, 2].map(|channel| sum(channel) / pixels.len().max(1) as f64)
 }
 
 impl Recalibrate for MeanColor {
     fn recalibrate(&mut self, keyframes: &[CorrectedKeyframe], _: &Alignment) -> Result<(), Error> {
         *self = Self::new(self.options.clone());
-        keyframes.iter().try_for_each(|keyframe| self.push(keyframe.after.clone()))
+        keyframes
+            .iter()
+            .try_for_each(|keyframe| self.push(keyframe.after.clone()))
     }
 }
 
@@ -141,7 +180,8 @@ impl Method for MeanColor {
     }
 
     fn remove(&mut self, camera: &str, stamp: Stamp) -> Result<(), Error> {
-        self.keyframes.retain(|keyframe| keyframe.camera.as_ref() != camera || keyframe.stamp != stamp);
+        self.keyframes
+            .retain(|keyframe| keyframe.camera.as_ref() != camera || keyframe.stamp != stamp);
         Ok(())
     }
 
@@ -151,7 +191,11 @@ impl Method for MeanColor {
         }
         for _ in 0..n {
             let ix = usize::try_from(self.step % self.keyframes.len() as u64).expect("an index");
-            for (color, mean) in self.color_srgb.iter_mut().zip(mean_srgb(&self.keyframes[ix])) {
+            for (color, mean) in self
+                .color_srgb
+                .iter_mut()
+                .zip(mean_srgb(&self.keyframes[ix]))
+            {
                 *color += self.options.specific.rate * (mean - *color);
             }
             self.step += 1;
@@ -179,12 +223,20 @@ impl Method for MeanColor {
 
     fn render(&mut self, request: &RenderRequest) -> Result<Picture, Error> {
         let n_pixels = request.size_px.iter().map(|side| *side as usize).product();
-        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "colors are 0 to 255")]
+        #[expect(
+            clippy::cast_possible_truncation,
+            clippy::cast_sign_loss,
+            reason = "colors are 0 to 255"
+        )]
         let [red, green, blue] = self.color_srgb.map(|channel| channel.round() as u8);
         Ok(Picture {
             size_px: request.size_px,
             rgba_srgb: [red, green, blue, 255].repeat(n_pixels),
-            depth_m: if request.depth { vec![0.0; n_pixels] } else { Vec::new() },
+            depth_m: if request.depth {
+                vec![0.0; n_pixels]
+            } else {
+                Vec::new()
+            },
         })
     }
 
@@ -202,7 +254,11 @@ impl Method for MeanColor {
     }
 
     fn progress(&self) -> Progress {
-        Progress { step: self.step, primitives: 1, ..Progress::default() }
+        Progress {
+            step: self.step,
+            primitives: 1,
+            ..Progress::default()
+        }
     }
 
     fn report(&self) -> Vec<TrialReport> {
@@ -210,9 +266,13 @@ impl Method for MeanColor {
     }
 
     fn save(&mut self, folder: &Path) -> Result<(), Error> {
-        std::fs::create_dir_all(folder).map_err(|source| Error::Write { path: folder.to_owned(), source })?;
+        std::fs::create_dir_all(folder).map_err(|source| Error::Write {
+            path: folder.to_owned(),
+            source,
+        })?;
         self.state()?.write(&folder.join(COLOR_FILE))?;
-        let description = serde_json::json!({ "method": MeanColorOptions::METHOD, "steps": self.step });
+        let description =
+            serde_json::json!({ "method": MeanColorOptions::METHOD, "steps": self.step });
         let path = folder.join(METADATA_FILE);
         files::write(&path, description.to_string()).map_err(|source| Error::Write { path, source })
     }

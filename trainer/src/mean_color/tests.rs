@@ -15,10 +15,17 @@ fn kind() -> ModelKind {
 
 /// A keyframe of one gray level.
 fn gray(stamp: i64, level: u8) -> Arc<Keyframe> {
-    let [keyframe] = scenes::ring(&[scenes::floor()], nalgebra::Point3::origin(), 1).try_into().unwrap();
+    let [keyframe] = scenes::ring(&[scenes::floor()], nalgebra::Point3::origin(), 1)
+        .try_into()
+        .unwrap();
     let n_pixels = keyframe.rgba_srgb.len() / 4;
     let rgba_srgb = [level, level, level, 255].repeat(n_pixels).into();
-    Arc::new(Keyframe { stamp: Stamp(stamp), rgba_srgb, split: Split::Train, ..(*keyframe).clone() })
+    Arc::new(Keyframe {
+        stamp: Stamp(stamp),
+        rgba_srgb,
+        split: Split::Train,
+        ..(*keyframe).clone()
+    })
 }
 
 fn rendered(model: &mut dyn Method) -> Vec<u8> {
@@ -46,18 +53,27 @@ fn registered_method_trains_saves_loads_and_resumes() {
     let mut model = model_spec.start(gpu.clone()).unwrap();
     assert!(model.is_idle());
     let keyframes = [gray(1, 100), gray(2, 180)];
-    keyframes.iter().for_each(|keyframe| model.push(keyframe.clone()).unwrap());
+    keyframes
+        .iter()
+        .for_each(|keyframe| model.push(keyframe.clone()).unwrap());
     assert_eq!(model.step(3).unwrap(), 3);
     let checkpoint = model.checkpoint().unwrap().finish().unwrap();
     assert_eq!(model.step(60).unwrap(), 60);
     let level = rendered(&mut *model)[0];
-    assert!((130..150).contains(&level), "the mean of 100 and 180: {level}");
+    assert!(
+        (130..150).contains(&level),
+        "the mean of 100 and 180: {level}"
+    );
     assert_eq!(rendered(&mut *model), [level, level, level, 255].repeat(6));
 
     let later = gray(3, 50);
     let all = [keyframes.as_slice(), &[later]].concat();
-    let Resumed { model_spec: resumed_spec, method: mut resumed, untrained, .. } =
-        resume(gpu.clone(), &checkpoint, &all).unwrap();
+    let Resumed {
+        model_spec: resumed_spec,
+        method: mut resumed,
+        untrained,
+        ..
+    } = resume(gpu.clone(), &checkpoint, &all).unwrap();
     assert_eq!((resumed_spec, untrained.len()), (model_spec, 1));
     resumed.step(60).unwrap();
     let [uninterrupted, interrupted] =
@@ -75,11 +91,15 @@ fn registered_method_trains_saves_loads_and_resumes() {
         assert_eq!(rendered(&mut *loaded.method), rendered(&mut *model));
     }
     std::fs::write(folder.path().join(METADATA_FILE), "{").unwrap();
-    assert!(matches!(load(gpu, folder.path()), Err(Error::ModelMetadata { .. })));
+    assert!(matches!(
+        load(gpu, folder.path()),
+        Err(Error::ModelMetadata { .. })
+    ));
 }
 
 #[test]
 fn invalid_settings_are_rejected_before_training() {
-    let error = ModelSpec::new(kind(), CommonOptions::default(), &[("rate", "fast".into())]).unwrap_err();
+    let error =
+        ModelSpec::new(kind(), CommonOptions::default(), &[("rate", "fast".into())]).unwrap_err();
     assert!(error.to_string().contains("mean-color"), "{error}");
 }

@@ -1,7 +1,7 @@
 //! Times a training step on synthetic rays, pass by pass.
 //!
-//! Rays start at random positions in a fully occupied cube and have equal lengths, so that a step has a known number of
-//! samples. Their colors are noise. The occupancy is not updated.
+//! Rays start at random positions in a fully occupied cube and have equal lengths, so that a step
+//! has a known number of samples. Their colors are noise. The occupancy is not updated.
 
 use super::field_trainer::{Compiled, FieldTrainer, STEPS_PER_SUBMIT};
 use super::options::NerfBudget;
@@ -17,8 +17,8 @@ use nalgebra::Vector3;
 use std::sync::Arc;
 use std::time::Instant;
 
-/// Number of levels, coarsest and finest cells along an axis, and log2 of the entries per level, as in Mueller et al.
-/// 2022.
+/// Number of levels, coarsest and finest cells along an axis, and log2 of the entries per level, as
+/// in Mueller et al. 2022.
 const GRID_SHAPE: (u32, u32, u32, u32) = (16, 16, 2048, 19);
 /// Step at which no occupancy update is due.
 const STEP: u64 = 1;
@@ -30,12 +30,13 @@ pub struct StepFigures {
     pub n_rays: u32,
     /// Samples per step.
     pub n_samples: u32,
-    /// GPU time of a step, milliseconds: median of the sum over its passes; wall time if there are no timestamps.
+    /// GPU time of a step, milliseconds: median of the sum over its passes; wall time if there are
+    /// no timestamps.
     pub step_millis: f64,
     /// Wall time of a step, milliseconds: mean of consecutive steps.
     pub step_wall_millis: f64,
-    /// GPU time to render the colors of `n_samples` samples of a picture, milliseconds: median; wall time if there are
-    /// no timestamps.
+    /// GPU time to render the colors of `n_samples` samples of a picture, milliseconds: median;
+    /// wall time if there are no timestamps.
     pub colors_millis: f64,
     /// GPU time of each pass of one step; empty without timestamps.
     pub passes: Vec<PassTiming>,
@@ -44,12 +45,27 @@ pub struct StepFigures {
 }
 
 /// Times steps of `n_rays` rays with `n_samples` samples in total, which is a multiple of `n_rays`.
-pub fn time_steps(gpu: &Gpu, n_rays: u32, n_samples: u32, n_repeats: usize) -> Result<StepFigures, Error> {
+pub fn time_steps(
+    gpu: &Gpu,
+    n_rays: u32,
+    n_samples: u32,
+    n_repeats: usize,
+) -> Result<StepFigures, Error> {
     let options = ModelOptions::default();
-    let nerf_budget = NerfBudget { n_rays, n_samples, ..NerfBudget::FULL };
+    let nerf_budget = NerfBudget {
+        n_rays,
+        n_samples,
+        ..NerfBudget::FULL
+    };
     let (n_levels, coarsest, finest, log2_entries) = GRID_SHAPE;
     let shape = GridShape::between(coarsest, finest, n_levels, log2_entries);
-    let sizes = Sizes { n_cells: shape.n_cells, log2_entries, has_depth: false, can_refine: false, nerf_budget };
+    let sizes = Sizes {
+        n_cells: shape.n_cells,
+        log2_entries,
+        has_depth: false,
+        can_refine: false,
+        nerf_budget,
+    };
     let compiled = Arc::new(Compiled::new(gpu, &sizes.nerf_budget)?);
     let mut field_trainer = FieldTrainer::new(gpu, &options, sizes, compiled)?;
     let rays = synthetic_rays(nerf_budget);
@@ -73,15 +89,21 @@ pub fn time_steps(gpu: &Gpu, n_rays: u32, n_samples: u32, n_repeats: usize) -> R
         Some(last) => last.finish::<u32>(gpu)?,
         None => Vec::new(),
     };
-    let step_wall_millis = since.elapsed().as_secs_f64() * 1e3 / (n_submits * STEPS_PER_SUBMIT) as f64;
-    let timed = |field_trainer: &mut FieldTrainer, list: &dyn Fn(&mut FieldTrainer) -> Result<(), Error>| {
+    let step_wall_millis =
+        since.elapsed().as_secs_f64() * 1e3 / (n_submits * STEPS_PER_SUBMIT) as f64;
+    let timed = |field_trainer: &mut FieldTrainer,
+                 list: &dyn Fn(&mut FieldTrainer) -> Result<(), Error>| {
         let mut timed = Vec::new();
         for _ in 0..n_repeats.max(1) {
             list(field_trainer)?;
             let since = Instant::now();
             let passes = field_trainer.submit_timed(gpu)?;
             let wall = since.elapsed().as_secs_f64() * 1e3;
-            let sum = if passes.is_empty() { wall } else { passes.iter().map(|pass| pass.millis).sum() };
+            let sum = if passes.is_empty() {
+                wall
+            } else {
+                passes.iter().map(|pass| pass.millis).sum()
+            };
             timed.push((sum, passes));
         }
         timed.sort_by(|(a, _), (b, _)| a.total_cmp(b));
@@ -90,7 +112,9 @@ pub fn time_steps(gpu: &Gpu, n_rays: u32, n_samples: u32, n_repeats: usize) -> R
     let (step_millis, passes) = timed(&mut field_trainer, &|field_trainer| {
         field_trainer.record_step(gpu, &options, 0, STEP, &rays, ParamSet::empty())
     })?;
-    let (colors_millis, _) = timed(&mut field_trainer, &|field_trainer| field_trainer.record_colors(gpu))?;
+    let (colors_millis, _) = timed(&mut field_trainer, &|field_trainer| {
+        field_trainer.record_colors(gpu)
+    })?;
     Ok(StepFigures {
         n_rays,
         n_samples: counters.get(1).copied().unwrap_or(0),
@@ -104,7 +128,12 @@ pub fn time_steps(gpu: &Gpu, n_rays: u32, n_samples: u32, n_repeats: usize) -> R
 
 /// Rays with equal numbers of samples, which together fill the batch.
 fn synthetic_rays(nerf_budget: NerfBudget) -> Vec<Ray> {
-    let NerfBudget { n_rays, n_samples, n_steps, .. } = nerf_budget;
+    let NerfBudget {
+        n_rays,
+        n_samples,
+        n_steps,
+        ..
+    } = nerf_budget;
     // Half a step shorter, so that rounding does not change the count.
     let length = 2.0 / f64::from(n_steps) * (f64::from(n_samples / n_rays) - 0.5);
     let ray = |ix: u32| {
@@ -112,7 +141,8 @@ fn synthetic_rays(nerf_budget: NerfBudget) -> Vec<Ray> {
         let triple = |stream: u64| Vector3::from_fn(|axis, _| number(stream + axis as u64));
         let direction = triple(0).normalize();
         // Clamped so that the whole ray is in the region where steps have constant length.
-        let origin = (triple(3) * 0.5).map(|along| along.clamp(-0.5, 0.5)) - 0.5 * length * direction;
+        let origin =
+            (triple(3) * 0.5).map(|along| along.clamp(-0.5, 0.5)) - 0.5 * length * direction;
         let target = hash(u64::from(ix) << 8 | 6).to_le_bytes();
         Ray {
             origin: f32s_of(origin.into()),

@@ -2,8 +2,8 @@
 
 use super::kernels::{N_CHUNK, N_TILE, Widths};
 use super::params::{
-    AdamRule, Batch, IMAGE_PARAM_STRIDE, ImageParam, ImageParamRule, Level, March, OccupancyUpdate, Ray, RayLoss,
-    levels,
+    AdamRule, Batch, IMAGE_PARAM_STRIDE, ImageParam, ImageParamRule, Level, March, OccupancyUpdate,
+    Ray, RayLoss, levels,
 };
 use super::reference::grid::GridShape;
 use crate::Error;
@@ -17,7 +17,8 @@ pub(crate) struct FieldBuffers {
     pub(crate) grid: Buffer,
     /// Weights of all layers of both networks, `[outputs, inputs]` each.
     pub(crate) weights: Buffer,
-    /// The weights before the step, as two f16 numbers each; only if layers use cooperative matrices.
+    /// The weights before the step, as two f16 numbers each; only if layers use cooperative
+    /// matrices.
     pub(crate) half_weights: Option<Buffer>,
     /// Placeholder for bindings that a kernel does not use.
     pub(crate) unused_buffer: Buffer,
@@ -55,9 +56,11 @@ pub(crate) struct FieldMoments {
 /// Occupancy grid: the cells in which rays are sampled.
 #[derive(Debug)]
 pub(crate) struct Occupancy {
-    /// Two bit sets (cells to sample; solid cells), each with cells, groups and blocks; see `cell_blocks.wgsl`.
+    /// Two bit sets (cells to sample; solid cells), each with cells, groups and blocks; see
+    /// `cell_blocks.wgsl`.
     pub(crate) occupied: Buffer,
-    /// One f32 per cell: its recent opacity over one step; negative: never updated; 0: outside all views.
+    /// One f32 per cell: its recent opacity over one step; negative: never updated; 0: outside all
+    /// views.
     pub(crate) cell_occupancy: Buffer,
     pub(crate) occupancy_sum: Buffer,
     pub(crate) occupancy_update: Buffer,
@@ -65,20 +68,32 @@ pub(crate) struct Occupancy {
     pub(crate) n_cells: u32,
 }
 
-/// Words of the bits of all groups and blocks of cells, and of a whole set, as in `cell_blocks.wgsl`.
+/// Words of the bits of all groups and blocks of cells, and of a whole set, as in
+/// `cell_blocks.wgsl`.
 pub(crate) fn n_box_words(n_cells: u32) -> u32 {
     const MAX_BLOCKS: u32 = 16;
     const MAX_GROUPS: u32 = 64;
-    [MAX_GROUPS, MAX_BLOCKS].map(|max| n_cells.min(max).pow(3).div_ceil(32)).iter().sum()
+    [MAX_GROUPS, MAX_BLOCKS]
+        .map(|max| n_cells.min(max).pow(3).div_ceil(32))
+        .iter()
+        .sum()
 }
 
 impl Occupancy {
-    /// An occupancy grid with all cells marked. With depth, cells count as outside all views until hints arrive.
-    pub(crate) fn new(gpu: &Gpu, occupancy_update: &OccupancyUpdate, has_depth: bool) -> Result<Self, Error> {
+    /// An occupancy grid with all cells marked. With depth, cells count as outside all views until
+    /// hints arrive.
+    pub(crate) fn new(
+        gpu: &Gpu,
+        occupancy_update: &OccupancyUpdate,
+        has_depth: bool,
+    ) -> Result<Self, Error> {
         let n = occupancy_update.n_cells.pow(3) as usize;
         let n_set_words = n.div_ceil(32) + n_box_words(occupancy_update.n_cells) as usize;
         Ok(Self {
-            occupied: gpu.storage_with("nerf.occupied", &vec![255; 4 * (2 * n_set_words).next_multiple_of(4)])?,
+            occupied: gpu.storage_with(
+                "nerf.occupied",
+                &vec![255; 4 * (2 * n_set_words).next_multiple_of(4)],
+            )?,
             cell_occupancy: gpu.storage_with(
                 "nerf.cell_occupancy",
                 bytemuck::cast_slice(&vec![if has_depth { 0.0f32 } else { -1.0 }; n]),
@@ -99,7 +114,8 @@ pub(crate) const THREADS_PER_RAY: u32 = 8;
 pub(crate) struct RaySlot {
     pub(crate) n_rays: u32,
     pub(crate) rays: Buffer,
-    /// Number of segments found per ray; and, per thread of a ray, the number found by earlier threads.
+    /// Number of segments found per ray; and, per thread of a ray, the number found by earlier
+    /// threads.
     pub(crate) n_found: Buffer,
     pub(crate) n_before: Buffer,
     pub(crate) march: Buffer,
@@ -137,7 +153,8 @@ pub(crate) struct SampleBuffers {
 /// Intermediate values of a training step for its samples and rays.
 #[derive(Debug)]
 pub(crate) struct StepBuffers {
-    /// Inputs of each layer. The numbers in this buffer and the next have [`Widths::bytes_per_number`] bytes each.
+    /// Inputs of each layer. The numbers in this buffer and the next have
+    /// [`Widths::bytes_per_number`] bytes each.
     pub(crate) activations: Buffer,
     /// Gradients with respect to the outputs of each layer.
     pub(crate) v_activations: Buffer,
@@ -156,7 +173,8 @@ pub(crate) struct ImageParamBuffers {
     pub(crate) image_params: Buffer,
     pub(crate) rule: Buffer,
     pub(crate) n_images: u32,
-    /// Gradients with respect to the position of each sample, and with respect to the pose of each ray.
+    /// Gradients with respect to the position of each sample, and with respect to the pose of each
+    /// ray.
     pub(crate) v_points: Buffer,
     pub(crate) v_rays: Buffer,
     /// Gradients with respect to the appearance embedding, per sample.
@@ -165,7 +183,12 @@ pub(crate) struct ImageParamBuffers {
 
 impl ImageParamBuffers {
     /// All parameters start at zero: no pose correction and equal lighting.
-    pub(crate) fn new(gpu: &Gpu, rule: &ImageParamRule, n_rays: u32, n_samples: u32) -> Result<Self, Error> {
+    pub(crate) fn new(
+        gpu: &Gpu,
+        rule: &ImageParamRule,
+        n_rays: u32,
+        n_samples: u32,
+    ) -> Result<Self, Error> {
         let n_images = rule.n_images;
         Ok(Self {
             image_params: gpu.storage(
@@ -190,7 +213,10 @@ impl FieldBuffers {
             grid: gpu.storage("nerf.grid", 8 * u64::from(shape.n_entries_total()))?,
             weights: gpu.storage("nerf.weights", 4 * u64::from(widths.n_weights()))?,
             half_weights: if widths.is_half_precision {
-                Some(gpu.storage("nerf.half_weights", 4 * u64::from(widths.n_padded_weights()))?)
+                Some(gpu.storage(
+                    "nerf.half_weights",
+                    4 * u64::from(widths.n_padded_weights()),
+                )?)
             } else {
                 None
             },
@@ -217,13 +243,21 @@ impl FieldGradients {
 }
 
 impl FieldMoments {
-    pub(crate) fn new(gpu: &Gpu, shape: &GridShape, widths: &Widths, rule: &AdamRule) -> Result<Self, Error> {
+    pub(crate) fn new(
+        gpu: &Gpu,
+        shape: &GridShape,
+        widths: &Widths,
+        rule: &AdamRule,
+    ) -> Result<Self, Error> {
         Ok(Self {
             grid: gpu.storage("nerf.grid_moments", 16 * u64::from(shape.n_entries_total()))?,
             weights: gpu.storage("nerf.weight_moments", 8 * u64::from(widths.n_weights()))?,
             largest: gpu.storage("nerf.largest", 4 * shape.n_cells.len() as u64)?,
             steps: gpu.storage("nerf.steps", 8)?,
-            step_scale: gpu.storage_with("nerf.step_scale", bytemuck::bytes_of(&rule.first_step_scale()))?,
+            step_scale: gpu.storage_with(
+                "nerf.step_scale",
+                bytemuck::bytes_of(&rule.first_step_scale()),
+            )?,
         })
     }
 }
@@ -245,17 +279,35 @@ impl SampleBuffers {
 
 impl StepBuffers {
     /// Buffers for up to `n_rays` rays and `n_samples` samples.
-    pub(crate) fn new(gpu: &Gpu, widths: &Widths, n_rays: u32, n_samples: u32) -> Result<Self, Error> {
-        let floats = |name: &str, n_rows: u32, width: u32| gpu.storage(name, 4 * u64::from(n_rows) * u64::from(width));
-        let in_tiles = u64::from(n_samples.next_multiple_of(N_TILE)) * u64::from(widths.bytes_per_number());
+    pub(crate) fn new(
+        gpu: &Gpu,
+        widths: &Widths,
+        n_rays: u32,
+        n_samples: u32,
+    ) -> Result<Self, Error> {
+        let floats = |name: &str, n_rows: u32, width: u32| {
+            gpu.storage(name, 4 * u64::from(n_rows) * u64::from(width))
+        };
+        let in_tiles =
+            u64::from(n_samples.next_multiple_of(N_TILE)) * u64::from(widths.bytes_per_number());
         Ok(Self {
-            activations: gpu.storage("nerf.activations", in_tiles * u64::from(widths.n_activations()))?,
-            v_activations: gpu.storage("nerf.v_activations", in_tiles * u64::from(widths.n_gradients()))?,
+            activations: gpu.storage(
+                "nerf.activations",
+                in_tiles * u64::from(widths.n_activations()),
+            )?,
+            v_activations: gpu.storage(
+                "nerf.v_activations",
+                in_tiles * u64::from(widths.n_gradients()),
+            )?,
             v_log_density: floats("nerf.v_log_density", n_samples, 1)?,
             v_colors: floats("nerf.v_colors", n_samples, 4)?,
             ray_colors: floats("nerf.ray_colors", n_rays, 4)?,
             ray_errors: floats("nerf.ray_errors", n_rays, 2)?,
-            partial_sums: floats("nerf.partial_sums", n_samples.div_ceil(N_CHUNK), widths.n_padded_weights())?,
+            partial_sums: floats(
+                "nerf.partial_sums",
+                n_samples.div_ceil(N_CHUNK),
+                widths.n_padded_weights(),
+            )?,
         })
     }
 }

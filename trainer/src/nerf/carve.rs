@@ -12,15 +12,17 @@ use rayon::prelude::*;
 const UNBOUNDED: u32 = 0;
 const FREE: u32 = 1 << 30;
 const SURFACE: u32 = 2 << 30;
-/// Maximum distance up to which cells along rays without a reading are marked, in units of the scene radius.
+/// Maximum distance up to which cells along rays without a reading are marked, in units of the
+/// scene radius.
 const UNBOUNDED_DISTANCE: f64 = 50.0;
-/// Depth readings per ray whose free space is marked. Surfaces and missing readings are processed at a spacing of half
-/// a cell; free space needs fewer rays.
+/// Depth readings per ray whose free space is marked. Surfaces and missing readings are processed
+/// at a spacing of half a cell; free space needs fewer rays.
 const READINGS_PER_FREE_RAY: u32 = 4;
-/// Radius, in pixels, of the neighborhood that distinguishes a small hole in the depth image from a region that the
-/// depth camera cannot measure.
+/// Radius, in pixels, of the neighborhood that distinguishes a small hole in the depth image from a
+/// region that the depth camera cannot measure.
 const HOLE_RADIUS_PX: u32 = 2;
-/// Relative error of a reading. Cells closer than this in front of a reading are not marked as free.
+/// Relative error of a reading. Cells closer than this in front of a reading are not marked as
+/// free.
 const DEPTH_ERROR_FRAC: f64 = 0.03;
 
 /// Cells that images observe: along rays without a reading, as free space, or as a surface.
@@ -45,7 +47,10 @@ impl CellSet {
     }
 
     fn extend(&mut self, other: &Self) {
-        self.0.iter_mut().zip(&other.0).for_each(|(own_word, other_words)| *own_word |= other_words);
+        self.0
+            .iter_mut()
+            .zip(&other.0)
+            .for_each(|(own_word, other_words)| *own_word |= other_words);
     }
 
     /// The cells of this set that are not in `other`, in order.
@@ -54,9 +59,11 @@ impl CellSet {
         let words = (0u32..)
             .zip(self.0.iter().zip(other_words))
             .map(|(ix, (own_word, other_words))| (ix, own_word & !other_words));
-        words
-            .filter(|(_, word)| *word != 0)
-            .flat_map(|(ix, word)| (0..64).filter(move |bit| word >> bit & 1 == 1).map(move |bit| 64 * ix + bit))
+        words.filter(|(_, word)| *word != 0).flat_map(|(ix, word)| {
+            (0..64)
+                .filter(move |bit| word >> bit & 1 == 1)
+                .map(move |bit| 64 * ix + bit)
+        })
     }
 }
 
@@ -64,12 +71,17 @@ impl CellSet {
 type UnitRay = ([f64; 3], [f64; 3]);
 
 /// Spacing of the rays in pixels: half a cell at a distance of one radius.
-#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped")]
+#[expect(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "clamped"
+)]
 fn stride_of(focal_px: [f64; 2], march: &March) -> u32 {
     (2.0 / march.n_cells as f64 * focal_px[0]).clamp(1.0, 16.0) as u32
 }
 
-/// Whether a direction, given in the axes of another camera, is in the field of view of a depth image.
+/// Whether a direction, given in the axes of another camera, is in the field of view of a depth
+/// image.
 fn is_in_depth_image(depth: &DepthMap, depth_from_camera: &Transform, along: Vector3<f64>) -> bool {
     let along = depth_from_camera.rotation * along;
     let is_inside = |axis: usize| {
@@ -83,16 +95,21 @@ fn is_reading(z_m: f64) -> bool {
     z_m.is_finite() && z_m > 0.0
 }
 
-/// Whether most pixels around a pixel without a reading have one. Such a small hole is not evidence of a far or
-/// unmeasurable region.
+/// Whether most pixels around a pixel without a reading have one. Such a small hole is not evidence
+/// of a far or unmeasurable region.
 fn is_small_hole(depth: &DepthMap, [x, y]: [u32; 2]) -> bool {
     let [width, height] = depth.size_px;
     let around = |coordinate: u32, size: u32| {
         coordinate.saturating_sub(HOLE_RADIUS_PX)..(coordinate + HOLE_RADIUS_PX + 1).min(size)
     };
-    let pixels = around(y, height).flat_map(|y| around(x, width).map(move |x| (y * width + x) as usize));
-    let (n, n_read) = pixels
-        .fold((0, 0), |(n, n_read), pixel| (n + 1, n_read + usize::from(is_reading(depth.depth_m[pixel].into()))));
+    let pixels =
+        around(y, height).flat_map(|y| around(x, width).map(move |x| (y * width + x) as usize));
+    let (n, n_read) = pixels.fold((0, 0), |(n, n_read), pixel| {
+        (
+            n + 1,
+            n_read + usize::from(is_reading(depth.depth_m[pixel].into())),
+        )
+    });
     2 * n_read > n
 }
 
@@ -101,10 +118,15 @@ fn cell_width(march: &March, point: [f64; 3]) -> f64 {
     4.0 / march.n_cells as f64 * largest(point).1.max(1.0).powi(2)
 }
 
-/// Derives occupancy hints from images, at most one per cell. Cells that no image observes get none.
+/// Derives occupancy hints from images, at most one per cell. Cells that no image observes get
+/// none.
 pub(crate) fn hints(keyframes: &[&Keyframe], extent: &Extent, march: &March) -> Vec<u32> {
     let empty = || Cells::new(march.n_cells.pow(3));
-    let Cells { unbounded, free, surfaces } = keyframes
+    let Cells {
+        unbounded,
+        free,
+        surfaces,
+    } = keyframes
         .par_iter()
         .fold(empty, |mut cells, keyframe| {
             if let Some(depth) = &keyframe.depth {
@@ -117,13 +139,20 @@ pub(crate) fn hints(keyframes: &[&Keyframe], extent: &Extent, march: &March) -> 
     let unbounded = unbounded.difference(&free).map(|cell| cell | UNBOUNDED);
     let free = free.difference(&surfaces).map(|cell| cell | FREE);
     let nothing = CellSet::new(0);
-    unbounded.chain(free).chain(surfaces.difference(&nothing).map(|cell| cell | SURFACE)).collect()
+    unbounded
+        .chain(free)
+        .chain(surfaces.difference(&nothing).map(|cell| cell | SURFACE))
+        .collect()
 }
 
 impl Cells {
     fn new(n_cells: usize) -> Self {
         let [unbounded, free, surfaces] = [(); 3].map(|()| CellSet::new(n_cells));
-        Self { unbounded, free, surfaces }
+        Self {
+            unbounded,
+            free,
+            surfaces,
+        }
     }
 
     fn and(mut self, other: Self) -> Self {
@@ -136,20 +165,33 @@ impl Cells {
     /// Adds the hints of a depth image.
     fn add_depth_image(&mut self, depth: &DepthMap, extent: &Extent, march: &March) {
         let stride = stride_of(depth.focal_px, march);
-        let origin = extent.in_scene_units(&depth.world_from_camera).translation.vector.into();
+        let origin = extent
+            .in_scene_units(&depth.world_from_camera)
+            .translation
+            .vector
+            .into();
         let [width, height] = depth.size_px;
         for y in (0..height).step_by(stride as usize) {
             for x in (0..width).step_by(stride as usize) {
                 let along = depth.point(x, y, 1.0);
                 let z_m = f64::from(depth.depth_m[(y * width + x) as usize]);
-                let reading_m = if is_reading(z_m) { z_m * along.norm() } else { 0.0 };
-                let ray = (origin, (depth.world_from_camera.rotation * along.normalize()).into());
+                let reading_m = if is_reading(z_m) {
+                    z_m * along.norm()
+                } else {
+                    0.0
+                };
+                let ray = (
+                    origin,
+                    (depth.world_from_camera.rotation * along.normalize()).into(),
+                );
                 let is_unbounded = reading_m == 0.0;
                 if is_unbounded && is_small_hole(depth, [x, y]) {
                     continue;
                 }
                 if is_unbounded
-                    || [x, y].into_iter().all(|coordinate| (coordinate / stride).is_multiple_of(READINGS_PER_FREE_RAY))
+                    || [x, y].into_iter().all(|coordinate| {
+                        (coordinate / stride).is_multiple_of(READINGS_PER_FREE_RAY)
+                    })
                 {
                     self.mark_along_ray(march, ray, reading_m / extent.radius_m);
                 }
@@ -160,34 +202,65 @@ impl Cells {
         }
     }
 
-    /// Adds the rays of a color image that are outside the field of view of its depth image, as rays without a reading.
+    /// Adds the rays of a color image that are outside the field of view of its depth image, as
+    /// rays without a reading.
     fn add_color_only_rays(&mut self, keyframe: &Keyframe, extent: &Extent, march: &March) {
-        let Keyframe { size_px: [width, height], focal_px, principal_px, world_from_camera, depth, .. } = keyframe;
-        let depth = depth.as_ref().map(|depth| (depth, depth.world_from_camera.inverse() * world_from_camera));
-        let is_in_depth =
-            |along: Vector3<f64>| depth.as_ref().is_some_and(|(depth, pose)| is_in_depth_image(depth, pose, along));
+        let Keyframe {
+            size_px: [width, height],
+            focal_px,
+            principal_px,
+            world_from_camera,
+            depth,
+            ..
+        } = keyframe;
+        let depth = depth
+            .as_ref()
+            .map(|depth| (depth, depth.world_from_camera.inverse() * world_from_camera));
+        let is_in_depth = |along: Vector3<f64>| {
+            depth
+                .as_ref()
+                .is_some_and(|(depth, pose)| is_in_depth_image(depth, pose, along))
+        };
         let stride = stride_of(*focal_px, march) as usize;
-        let origin = extent.in_scene_units(world_from_camera).translation.vector.into();
+        let origin = extent
+            .in_scene_units(world_from_camera)
+            .translation
+            .vector
+            .into();
         for y in (0..*height).step_by(stride) {
             for x in (0..*width).step_by(stride) {
                 let coordinate = [x, y].map(|pixel| f64::from(pixel) + 0.5);
-                let [right, down] = [0, 1].map(|axis| (coordinate[axis] - principal_px[axis]) / focal_px[axis]);
+                let [right, down] =
+                    [0, 1].map(|axis| (coordinate[axis] - principal_px[axis]) / focal_px[axis]);
                 let along = Vector3::new(right, down, 1.0).normalize();
                 if !is_in_depth(along) {
-                    self.mark_along_ray(march, (origin, (world_from_camera.rotation * along).into()), 0.0);
+                    self.mark_along_ray(
+                        march,
+                        (origin, (world_from_camera.rotation * along).into()),
+                        0.0,
+                    );
                 }
             }
         }
     }
 
-    /// Marks the cells along a ray up to its reading, or up to [`UNBOUNDED_DISTANCE`] if `distance` is 0.
+    /// Marks the cells along a ray up to its reading, or up to [`UNBOUNDED_DISTANCE`] if `distance`
+    /// is 0.
     fn mark_along_ray(&mut self, march: &March, (origin, direction): UnitRay, distance: f64) {
         let point = |t: f64| std::array::from_fn(|axis| origin[axis] + t * direction[axis]);
         let cell = |t: f64| march.cell(point(t)).0;
         let width = |t: f64| cell_width(march, point(t));
         let is_unbounded = distance == 0.0;
-        let end = if is_unbounded { UNBOUNDED_DISTANCE } else { distance * (1.0 - DEPTH_ERROR_FRAC) - width(distance) };
-        let passed = if is_unbounded { &mut self.unbounded } else { &mut self.free };
+        let end = if is_unbounded {
+            UNBOUNDED_DISTANCE
+        } else {
+            distance * (1.0 - DEPTH_ERROR_FRAC) - width(distance)
+        };
+        let passed = if is_unbounded {
+            &mut self.unbounded
+        } else {
+            &mut self.free
+        };
         let mut t = 0.0;
         while t < end {
             passed.insert(cell(t));
@@ -200,7 +273,8 @@ impl Cells {
         let point = |t: f64| std::array::from_fn(|axis| origin[axis] + t * direction[axis]);
         let width = cell_width(march, point(distance));
         for part in [-1.0, -0.5, 0.0, 0.5, 1.0] {
-            self.surfaces.insert(march.cell(point((distance + part * width).max(0.0))).0);
+            self.surfaces
+                .insert(march.cell(point((distance + part * width).max(0.0))).0);
         }
     }
 }

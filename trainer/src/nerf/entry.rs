@@ -43,11 +43,17 @@ fn resume(
     keyframes: &[Arc<Keyframe>],
     placeholders: &[Arc<Keyframe>],
 ) -> Result<ResumedModel, Error> {
-    Aligned::resume(checkpoint, keyframes, placeholders, |own_checkpoint, keyframes| {
-        NerfModel::resume(gpu, own_checkpoint, keyframes)
-    })
+    Aligned::resume(
+        checkpoint,
+        keyframes,
+        placeholders,
+        |own_checkpoint, keyframes| NerfModel::resume(gpu, own_checkpoint, keyframes),
+    )
 }
 
 fn load(gpu: Arc<Gpu>, folder: &Path) -> Result<Box<dyn Method>, Error> {
-    Ok(Box::new(Aligned::load(NerfModel::load(gpu, folder)?, folder)?))
+    Ok(Box::new(Aligned::load(
+        NerfModel::load(gpu, folder)?,
+        folder,
+    )?))
 }

@@ -17,7 +17,8 @@ const FAR_OVER_MEDIAN: f64 = 2.0;
 /// Radius if there is no information, meters.
 const DEFAULT_RADIUS_M: f64 = 1.0;
 const MIN_RADIUS_M: f64 = 0.01;
-/// A scene that extends beyond this many radii needs a new field: contraction leaves too little resolution there.
+/// A scene that extends beyond this many radii needs a new field: contraction leaves too little
+/// resolution there.
 const MAX_REACH: f64 = 2.0;
 
 /// The cube modeled at full resolution. The space outside is contracted.
@@ -33,35 +34,55 @@ pub struct Extent {
 impl Extent {
     /// Extent around the cameras and nearly all of their depth readings.
     ///
-    /// Without depth, the center is the point closest to all optical axes, and the cameras are at the border.
+    /// Without depth, the center is the point closest to all optical axes, and the cameras are at
+    /// the border.
     pub fn of<'a>(keyframes: impl Iterator<Item = &'a Keyframe> + Clone) -> Self {
-        let cameras: Vec<Vector3<f64>> =
-            keyframes.clone().map(|keyframe| keyframe.world_from_camera.translation.vector).collect();
-        let mut visible_points: Vec<(f64, Vector3<f64>)> = keyframes.clone().flat_map(depth_samples).collect();
+        let cameras: Vec<Vector3<f64>> = keyframes
+            .clone()
+            .map(|keyframe| keyframe.world_from_camera.translation.vector)
+            .collect();
+        let mut visible_points: Vec<(f64, Vector3<f64>)> =
+            keyframes.clone().flat_map(depth_samples).collect();
         let mut depths_m: Vec<f64> = visible_points.iter().map(|(z_m, _)| *z_m).collect();
         let Some(median_m) = quantile(&mut depths_m, 0.5, Rank::Upper) else {
             return Self::without_depth(keyframes, &cameras);
         };
         visible_points.retain(|(z_m, _)| *z_m <= FAR_OVER_MEDIAN * median_m);
         let range = |axis: usize| {
-            let mut along: Vec<f64> = visible_points.iter().map(|(_, point)| point[axis]).collect();
-            let trimmed_range = trimmed_range(&mut along, OUTSIDE_FRAC).expect("readings at the median depth remain");
+            let mut along: Vec<f64> = visible_points
+                .iter()
+                .map(|(_, point)| point[axis])
+                .collect();
+            let trimmed_range = trimmed_range(&mut along, OUTSIDE_FRAC)
+                .expect("readings at the median depth remain");
             let camera_coords = cameras.iter().map(|camera| camera[axis]);
             camera_coords.fold(trimmed_range, |trimmed_range, camera| {
                 [trimmed_range[0].min(camera), trimmed_range[1].max(camera)]
             })
         };
         let ranges = [0, 1, 2].map(range);
-        let radius_m = ranges.iter().map(|[low, high]| 0.5 * (high - low)).fold(MIN_RADIUS_M, f64::max);
-        Self { center_m: ranges.map(|[low, high]| 0.5 * (low + high)), radius_m }
+        let radius_m = ranges
+            .iter()
+            .map(|[low, high]| 0.5 * (high - low))
+            .fold(MIN_RADIUS_M, f64::max);
+        Self {
+            center_m: ranges.map(|[low, high]| 0.5 * (low + high)),
+            radius_m,
+        }
     }
 
-    fn without_depth<'a>(keyframes: impl Iterator<Item = &'a Keyframe>, cameras: &[Vector3<f64>]) -> Self {
-        // The point with the smallest sum of squared distances to the optical axes, weakly regularized toward the
-        // cameras' mean.
+    fn without_depth<'a>(
+        keyframes: impl Iterator<Item = &'a Keyframe>,
+        cameras: &[Vector3<f64>],
+    ) -> Self {
+        // The point with the smallest sum of squared distances to the optical axes, weakly
+        // regularized toward the cameras' mean.
         const CENTER_REGULARIZATION: f64 = 1e-3;
         let mean = cameras.iter().sum::<Vector3<f64>>() / cameras.len().max(1) as f64;
-        let (mut normal, mut right) = (Matrix3::identity() * CENTER_REGULARIZATION, mean * CENTER_REGULARIZATION);
+        let (mut normal, mut right) = (
+            Matrix3::identity() * CENTER_REGULARIZATION,
+            mean * CENTER_REGULARIZATION,
+        );
         for keyframe in keyframes {
             let axis = keyframe.world_from_camera.rotation * Vector3::z();
             let across = Matrix3::identity() - axis * axis.transpose();
@@ -69,13 +90,23 @@ impl Extent {
             right += across * keyframe.world_from_camera.translation.vector;
         }
         let center = normal.try_inverse().map_or(mean, |inverse| inverse * right);
-        let max_offset = cameras.iter().map(|camera| (camera - center).amax()).fold(0.0, f64::max);
-        let radius_m = if max_offset > MIN_RADIUS_M { max_offset } else { DEFAULT_RADIUS_M };
-        Self { center_m: center.into(), radius_m }
+        let max_offset = cameras
+            .iter()
+            .map(|camera| (camera - center).amax())
+            .fold(0.0, f64::max);
+        let radius_m = if max_offset > MIN_RADIUS_M {
+            max_offset
+        } else {
+            DEFAULT_RADIUS_M
+        };
+        Self {
+            center_m: center.into(),
+            radius_m,
+        }
     }
 
-    /// Whether the scene has outgrown this extent, so that a field trained with it has too little resolution for the
-    /// extent `other`.
+    /// Whether the scene has outgrown this extent, so that a field trained with it has too little
+    /// resolution for the extent `other`.
     pub fn is_outgrown_by(&self, other: &Self) -> bool {
         let offset = Vector3::from(self.center_m) - Vector3::from(other.center_m);
         offset.amax() + other.radius_m > MAX_REACH * self.radius_m
@@ -84,7 +115,8 @@ impl Extent {
     /// Converts a pose: its position becomes relative to the center, in units of the radius.
     pub(crate) fn in_scene_units(&self, world_from_other: &Transform) -> Transform {
         let mut pose = *world_from_other;
-        pose.translation.vector = (pose.translation.vector - Vector3::from(self.center_m)) / self.radius_m;
+        pose.translation.vector =
+            (pose.translation.vector - Vector3::from(self.center_m)) / self.radius_m;
         pose
     }
 
@@ -96,7 +128,10 @@ impl Extent {
     /// Converts all lengths of a camera to units of the radius. Erased space stays in world.
     pub(crate) fn camera_in_scene_units(&self, camera: &Camera) -> Camera {
         let shutter = camera.shutter.map(|shutter| Shutter {
-            twist: Twist { linear_m_s: shutter.twist.linear_m_s / self.radius_m, ..shutter.twist },
+            twist: Twist {
+                linear_m_s: shutter.twist.linear_m_s / self.radius_m,
+                ..shutter.twist
+            },
             ..shutter
         });
         let crop = camera.crop.map(|crop| Aabb {
@@ -117,20 +152,31 @@ impl Extent {
 
 /// A sample of a keyframe's depth readings: depth along z in meters, and position in world.
 fn depth_samples(keyframe: &Keyframe) -> Vec<(f64, Vector3<f64>)> {
-    let Some(depth) = &keyframe.depth else { return Vec::new() };
+    let Some(depth) = &keyframe.depth else {
+        return Vec::new();
+    };
     let width = depth.size_px[0].max(1);
     // An odd step, so that samples cover all columns and rows.
     let step = (depth.depth_m.len() / SAMPLES_PER_KEYFRAME).max(1) | 1;
-    let valid = (0u32..).zip(depth.depth_m.iter()).step_by(step).filter(|(_, z)| **z > 0.0 && z.is_finite());
+    let valid = (0u32..)
+        .zip(depth.depth_m.iter())
+        .step_by(step)
+        .filter(|(_, z)| **z > 0.0 && z.is_finite());
     let point = |(ix, z): (u32, &f32)| {
         let in_camera = depth.point(ix % width, ix / width, f64::from(*z));
-        (f64::from(*z), (depth.world_from_camera * Point3::from(in_camera)).coords)
+        (
+            f64::from(*z),
+            (depth.world_from_camera * Point3::from(in_camera)).coords,
+        )
     };
     valid.map(point).collect()
 }
 
 /// Size of a pixel in the scene, meters: median over the keyframes.
-pub(crate) fn pixel_size_m<'a>(keyframes: impl Iterator<Item = &'a Keyframe>, extent: &Extent) -> f64 {
+pub(crate) fn pixel_size_m<'a>(
+    keyframes: impl Iterator<Item = &'a Keyframe>,
+    extent: &Extent,
+) -> f64 {
     let size = |keyframe: &Keyframe| {
         let typical_depth_m = crate::view::median_depth_m(keyframe).unwrap_or(extent.radius_m);
         typical_depth_m / keyframe.focal_px[0].max(1.0)

@@ -1,14 +1,15 @@
 //! Trains one field on the GPU and renders it.
 
 use super::buffers::{
-    FieldBuffers, FieldGradients, FieldMoments, ImageParamBuffers, Occupancy, RaySlot, SampleBuffers, StepBuffers,
+    FieldBuffers, FieldGradients, FieldMoments, ImageParamBuffers, Occupancy, RaySlot,
+    SampleBuffers, StepBuffers,
 };
 use super::extent::Extent;
 use super::kernels::{FieldPipelines, Widths};
 use super::options::{NerfBudget, NerfOptions};
 use super::params::{
-    AdamRule, Backdrop, Batch, EMBEDDING, IMAGE_PARAM_STRIDE, ImageParam, ImageParamRule, March, OccupancyUpdate, Ray,
-    RayLoss, image_params_of,
+    AdamRule, Backdrop, Batch, EMBEDDING, IMAGE_PARAM_STRIDE, ImageParam, ImageParamRule, March,
+    OccupancyUpdate, Ray, RayLoss, image_params_of,
 };
 use super::passes::{Canvas, FieldPasses};
 use super::reference::march as reference;
@@ -27,7 +28,8 @@ use std::sync::Arc;
 pub(crate) const STEPS_PER_SUBMIT: usize = 8;
 /// Steps between two updates of the occupancy.
 const OCCUPANCY_UPDATE_PERIOD: u64 = 16;
-/// First step that updates the occupancy if there is depth. Until then, depth is more reliable than the field.
+/// First step that updates the occupancy if there is depth. Until then, depth is more reliable than
+/// the field.
 const FIRST_OCCUPANCY_UPDATE_WITH_DEPTH: u64 = 128;
 /// Factor on a cell's previous occupancy at each update.
 const OCCUPANCY_DECAY: f32 = 0.7;
@@ -41,7 +43,8 @@ const SAMPLES_PER_ROUND: u32 = 8;
 const MAX_ROUNDS: u32 = 256;
 /// Number of rounds for the first picture.
 const FIRST_ROUNDS: u32 = 16;
-/// The prepass traces one ray per square of this many pixels; `FRONT_STRIDE` of `picture_rays.wgsl`.
+/// The prepass traces one ray per square of this many pixels; `FRONT_STRIDE` of
+/// `picture_rays.wgsl`.
 const FRONT_STRIDE: u32 = 4;
 /// Initial range of the entries (Mueller et al. 2022, section 4).
 const INITIAL_ENTRY_RANGE: f64 = 1e-4;
@@ -51,8 +54,8 @@ const DISTANCE_CLIP: f32 = 0.5;
 const DEPTH_BAND_FRAC: f32 = 0.01;
 /// Minimum distance in the distortion loss, in units of the scene radius.
 const DISTORTION_NEAR: f32 = 0.05;
-/// Initial step of an image's rotation (radians) and translation (units of the scene radius): observed surfaces are
-/// roughly a third of a radius away.
+/// Initial step of an image's rotation (radians) and translation (units of the scene radius):
+/// observed surfaces are roughly a third of a radius away.
 const ROTATION_RATE: f32 = 5e-4;
 const TRANSLATION_RATE: f32 = ROTATION_RATE / 3.0;
 /// Initial step of a component of an image's appearance embedding.
@@ -103,7 +106,15 @@ impl Compiled {
             nerf_budget.n_hidden,
             embedding_dim(),
         );
-        Ok(Self { pipelines: FieldPipelines::new(gpu, &widths, nerf_budget.n_samples, PICTURE_EMBEDDING_IX)?, widths })
+        Ok(Self {
+            pipelines: FieldPipelines::new(
+                gpu,
+                &widths,
+                nerf_budget.n_samples,
+                PICTURE_EMBEDDING_IX,
+            )?,
+            widths,
+        })
     }
 }
 
@@ -115,16 +126,26 @@ impl FieldTrainer {
         sizes: Sizes,
         compiled: Arc<Compiled>,
     ) -> Result<Self, Error> {
-        let NerfBudget { n_rays, n_samples, .. } = sizes.nerf_budget;
+        let NerfBudget {
+            n_rays, n_samples, ..
+        } = sizes.nerf_budget;
         let shape = sizes.shape();
         let widths = compiled.widths.clone();
         let field = FieldBuffers::new(gpu, &shape, &widths)?;
         let gradients = FieldGradients::new(gpu, &shape)?;
-        gpu.write(&gradients.scales, 0, bytemuck::cast_slice(&vec![INITIAL_GRADIENT_SCALE; shape.n_cells.len()]));
+        gpu.write(
+            &gradients.scales,
+            0,
+            bytemuck::cast_slice(&vec![INITIAL_GRADIENT_SCALE; shape.n_cells.len()]),
+        );
         let field_trainer = Self {
             compiled,
             moments: FieldMoments::new(gpu, &shape, &widths, &rule(options, 0.0))?,
-            occupancy: Occupancy::new(gpu, &occupancy_update_of(&sizes.nerf_budget), sizes.has_depth)?,
+            occupancy: Occupancy::new(
+                gpu,
+                &occupancy_update_of(&sizes.nerf_budget),
+                sizes.has_depth,
+            )?,
             images: None,
             samples: SampleBuffers::new(gpu, n_samples)?,
             step: StepBuffers::new(gpu, &widths, n_rays, n_samples)?,
@@ -146,14 +167,19 @@ impl FieldTrainer {
         Ok(field_trainer)
     }
 
-    /// Initializes entries with small random numbers, and weights with random numbers that preserve the variance
-    /// (Glorot and Bengio 2010).
+    /// Initializes entries with small random numbers, and weights with random numbers that preserve
+    /// the variance (Glorot and Bengio 2010).
     fn initialize(&self, gpu: &Gpu, seed: u64, widths: &Widths) {
         let uniform = |stream: u64, ix: usize, bound: f64| {
-            f32_of(bound * (2.0 * unit_from_bits(hash(seed ^ hash(stream << 40 | ix as u64))) - 1.0))
+            f32_of(
+                bound * (2.0 * unit_from_bits(hash(seed ^ hash(stream << 40 | ix as u64))) - 1.0),
+            )
         };
         let n_numbers = 2 * self.field.n_entries as usize;
-        let entries: Vec<f32> = (0..n_numbers).into_par_iter().map(|ix| uniform(1, ix, INITIAL_ENTRY_RANGE)).collect();
+        let entries: Vec<f32> = (0..n_numbers)
+            .into_par_iter()
+            .map(|ix| uniform(1, ix, INITIAL_ENTRY_RANGE))
+            .collect();
         gpu.write(&self.field.grid, 0, bytemuck::cast_slice(&entries));
         let mut weights: Vec<f32> = Vec::new();
         let layers = widths.layers().into_iter().zip(widths.used_layers());
@@ -163,7 +189,11 @@ impl FieldTrainer {
                 let (row, column) = (at / n_in, at % n_in);
                 let is_used = row < used_out && column < used_in;
                 let ix = (row * used_in + column) as usize;
-                weights.push(if is_used { uniform(stream, ix, bound) } else { 0.0 });
+                weights.push(if is_used {
+                    uniform(stream, ix, bound)
+                } else {
+                    0.0
+                });
             }
         }
         gpu.write(&self.field.weights, 0, bytemuck::cast_slice(&weights));
@@ -171,13 +201,29 @@ impl FieldTrainer {
 
     /// Bytes of the trained parameters, their gradients and moments.
     pub(crate) fn bytes(&self) -> u64 {
-        let Self { field, gradients, moments, occupancy, .. } = self;
-        let grids = [&field.grid, &gradients.grid, &moments.grid, &occupancy.cell_occupancy, &occupancy.occupied];
-        grids.into_iter().chain([&field.weights, &moments.weights]).map(Buffer::bytes).sum()
+        let Self {
+            field,
+            gradients,
+            moments,
+            occupancy,
+            ..
+        } = self;
+        let grids = [
+            &field.grid,
+            &gradients.grid,
+            &moments.grid,
+            &occupancy.cell_occupancy,
+            &occupancy.occupied,
+        ];
+        grids
+            .into_iter()
+            .chain([&field.weights, &moments.weights])
+            .map(Buffer::bytes)
+            .sum()
     }
 
-    /// Records one training step on `rays` as step `slot_ix` of a submit. The step optimizes the image parameters in
-    /// `learned`.
+    /// Records one training step on `rays` as step `slot_ix` of a submit. The step optimizes the
+    /// image parameters in `learned`.
     pub(crate) fn record_step(
         &mut self,
         gpu: &Gpu,
@@ -188,15 +234,37 @@ impl FieldTrainer {
         learned: ParamSet,
     ) -> Result<(), Error> {
         self.write_slot(gpu, options, slot_ix, step, rays)?;
-        let Self { compiled, field, samples, step: kept, occupancy, moments, gradients, images, passes: list, .. } =
-            self;
-        let image_params = images.as_ref().map_or(&field.no_image_params, |images| &images.image_params);
+        let Self {
+            compiled,
+            field,
+            samples,
+            step: kept,
+            occupancy,
+            moments,
+            gradients,
+            images,
+            passes: list,
+            ..
+        } = self;
+        let image_params = images
+            .as_ref()
+            .map_or(&field.no_image_params, |images| &images.image_params);
         let slot = &self.slots[slot_ix];
-        let passes = FieldPasses { gpu, pipelines: &compiled.pipelines, field, samples, slot, image_params };
+        let passes = FieldPasses {
+            gpu,
+            pipelines: &compiled.pipelines,
+            field,
+            samples,
+            slot,
+            image_params,
+        };
         let images = images.as_ref().filter(|_| !learned.is_empty());
         passes.convert_weights(list);
-        let first_update =
-            if self.sizes.has_depth { FIRST_OCCUPANCY_UPDATE_WITH_DEPTH } else { OCCUPANCY_UPDATE_PERIOD };
+        let first_update = if self.sizes.has_depth {
+            FIRST_OCCUPANCY_UPDATE_WITH_DEPTH
+        } else {
+            OCCUPANCY_UPDATE_PERIOD
+        };
         if step.is_multiple_of(OCCUPANCY_UPDATE_PERIOD) && step >= first_update {
             passes.occupancy_update(list, occupancy, moments);
         }
@@ -216,12 +284,18 @@ impl FieldTrainer {
             }
             passes.update_images(list, moments, images);
         }
-        passes.update(list, [&self.rules[0], &self.rules[1]], kept, gradients, moments);
+        passes.update(
+            list,
+            [&self.rules[0], &self.rules[1]],
+            kept,
+            gradients,
+            moments,
+        );
         Ok(())
     }
 
-    /// Renders rays with their given poses and with one appearance embedding per image, without training. No submit may
-    /// be in flight.
+    /// Renders rays with their given poses and with one appearance embedding per image, without
+    /// training. No submit may be in flight.
     pub(crate) fn render_rays(
         &mut self,
         gpu: &Gpu,
@@ -230,15 +304,32 @@ impl FieldTrainer {
         embeddings: &[[f64; EMBEDDING_DIM]],
     ) -> Result<Vec<RayColor>, Error> {
         self.write_slot(gpu, options, 0, 0, rays)?;
-        let Self { compiled, field, samples, step: kept, occupancy, slots, passes: list, .. } = self;
+        let Self {
+            compiled,
+            field,
+            samples,
+            step: kept,
+            occupancy,
+            slots,
+            passes: list,
+            ..
+        } = self;
         let embeddings_buffer = match embeddings {
             [] => None,
-            embeddings => {
-                Some(gpu.storage_with("nerf.terms_of_others", bytemuck::cast_slice(&image_params_of(embeddings)))?)
-            }
+            embeddings => Some(gpu.storage_with(
+                "nerf.terms_of_others",
+                bytemuck::cast_slice(&image_params_of(embeddings)),
+            )?),
         };
         let image_params = embeddings_buffer.as_ref().unwrap_or(&field.no_image_params);
-        let passes = FieldPasses { gpu, pipelines: &compiled.pipelines, field, samples, slot: &slots[0], image_params };
+        let passes = FieldPasses {
+            gpu,
+            pipelines: &compiled.pipelines,
+            field,
+            samples,
+            slot: &slots[0],
+            image_params,
+        };
         passes.convert_weights(list);
         passes.count(list, occupancy);
         passes.place_samples_in_rays(list, occupancy);
@@ -250,23 +341,41 @@ impl FieldTrainer {
         let errors: Vec<[f32; 2]> = gpu.read(&kept.ray_errors, rays.len())?;
         let background = background(options, 0);
         let rgb = |[red, green, blue, left]: [f32; 4]| {
-            let composite_over = |channel: usize, color: f32| f64::from(color + left * background[channel]);
-            [composite_over(0, red), composite_over(1, green), composite_over(2, blue)]
+            let composite_over =
+                |channel: usize, color: f32| f64::from(color + left * background[channel]);
+            [
+                composite_over(0, red),
+                composite_over(1, green),
+                composite_over(2, blue),
+            ]
         };
         Ok(ray_colors
             .into_iter()
             .zip(errors)
-            .map(|(ray_colors, [error, _])| RayColor { error: error.into(), rgb: rgb(ray_colors) })
+            .map(|(ray_colors, [error, _])| RayColor {
+                error: error.into(),
+                rgb: rgb(ray_colors),
+            })
             .collect())
     }
 
-    /// Allocates parameters for `n_images` images, keeps existing values, and sets which parameters are optimized.
-    pub(crate) fn allocate_images(&mut self, gpu: &Gpu, n_images: usize, learned: ParamSet) -> Result<(), Error> {
+    /// Allocates parameters for `n_images` images, keeps existing values, and sets which parameters
+    /// are optimized.
+    pub(crate) fn allocate_images(
+        &mut self,
+        gpu: &Gpu,
+        n_images: usize,
+        learned: ParamSet,
+    ) -> Result<(), Error> {
         let n_images = u32::try_from(n_images).expect("few images");
         let n_allocated = self.images.as_ref().map_or(0, |images| images.n_images);
         let rule = ImageParamRule {
             learned: learned_bits(learned),
-            n_images: if n_allocated >= n_images { n_allocated } else { n_images.next_power_of_two() },
+            n_images: if n_allocated >= n_images {
+                n_allocated
+            } else {
+                n_images.next_power_of_two()
+            },
             rotation_rate: ROTATION_RATE,
             translation_rate: TRANSLATION_RATE,
             embedding_rate: EMBEDDING_RATE,
@@ -278,17 +387,29 @@ impl FieldTrainer {
             return Ok(());
         }
         self.passes.clear_bindings();
-        let NerfBudget { n_rays, n_samples, .. } = self.sizes.nerf_budget;
+        let NerfBudget {
+            n_rays, n_samples, ..
+        } = self.sizes.nerf_budget;
         let images = ImageParamBuffers::new(gpu, &rule, n_rays, n_samples)?;
         if let Some(known) = self.images.take() {
-            gpu.copy((&known.image_params, 0), (&images.image_params, 0), known.image_params.bytes());
+            gpu.copy(
+                (&known.image_params, 0),
+                (&images.image_params, 0),
+                known.image_params.bytes(),
+            );
         }
         self.images = Some(images);
         Ok(())
     }
 
-    /// Sets the appearance embeddings of images `first_ix` onward, and their pose corrections to zero.
-    pub(crate) fn initialize_images(&self, gpu: &Gpu, first_ix: usize, embeddings: &[[f64; EMBEDDING_DIM]]) {
+    /// Sets the appearance embeddings of images `first_ix` onward, and their pose corrections to
+    /// zero.
+    pub(crate) fn initialize_images(
+        &self,
+        gpu: &Gpu,
+        first_ix: usize,
+        embeddings: &[[f64; EMBEDDING_DIM]],
+    ) {
         if let Some(images) = &self.images {
             let row_bytes = IMAGE_PARAM_STRIDE * size_of::<ImageParam>();
             gpu.write(
@@ -299,16 +420,22 @@ impl FieldTrainer {
         }
     }
 
-    /// Parameters of the first `n_images` images: rotation (rotation vector in world, radians), translation (in world,
-    /// units of the scene radius) and appearance embedding. Empty if no image parameters are optimized.
+    /// Parameters of the first `n_images` images: rotation (rotation vector in world, radians),
+    /// translation (in world, units of the scene radius) and appearance embedding. Empty if no
+    /// image parameters are optimized.
     pub(crate) fn image_param_values(
         &self,
         gpu: &Gpu,
         n_images: usize,
     ) -> Result<Vec<[f64; IMAGE_PARAM_STRIDE]>, Error> {
-        let Some(images) = &self.images else { return Ok(Vec::new()) };
+        let Some(images) = &self.images else {
+            return Ok(Vec::new());
+        };
         let image_params = read_image_params(gpu, images, n_images)?;
-        Ok(image_params.iter().map(|image| image.map(|[value, ..]| f64::from(value))).collect())
+        Ok(image_params
+            .iter()
+            .map(|image| image.map(|[value, ..]| f64::from(value)))
+            .collect())
     }
 
     /// Drops all parameters of images.
@@ -319,7 +446,9 @@ impl FieldTrainer {
 
     /// Removes an image and decrements the index of each later image.
     pub(crate) fn remove_image(&mut self, gpu: &Gpu, image_ix: usize) -> Result<(), Error> {
-        let Some(images) = &self.images else { return Ok(()) };
+        let Some(images) = &self.images else {
+            return Ok(());
+        };
         let mut image_params = read_image_params(gpu, images, images.n_images as usize)?;
         if image_ix < image_params.len() {
             image_params.remove(image_ix);
@@ -330,10 +459,19 @@ impl FieldTrainer {
     }
 
     /// Resets all image parameters except these to zero.
-    pub(crate) fn reset_image_params_except(&mut self, gpu: &Gpu, kept: ParamSet) -> Result<(), Error> {
-        let Some(images) = &self.images else { return Ok(()) };
+    pub(crate) fn reset_image_params_except(
+        &mut self,
+        gpu: &Gpu,
+        kept: ParamSet,
+    ) -> Result<(), Error> {
+        let Some(images) = &self.images else {
+            return Ok(());
+        };
         let mut image_params = read_image_params(gpu, images, images.n_images as usize)?;
-        for (ix, image_param) in image_params.iter_mut().flat_map(|image| image.iter_mut().enumerate()) {
+        for (ix, image_param) in image_params
+            .iter_mut()
+            .flat_map(|image| image.iter_mut().enumerate())
+        {
             if learned_bits(kept) & (1 << ix) == 0 {
                 *image_param = [0.0; 4];
             }
@@ -351,7 +489,9 @@ impl FieldTrainer {
         step: u64,
         rays: &[Ray],
     ) -> Result<(), Error> {
-        let NerfBudget { n_rays, n_samples, .. } = self.sizes.nerf_budget;
+        let NerfBudget {
+            n_rays, n_samples, ..
+        } = self.sizes.nerf_budget;
         self.make_slot(gpu, slot_ix)?;
         let slot = &self.slots[slot_ix];
         gpu.write(&slot.rays, 0, bytemuck::cast_slice(rays));
@@ -359,7 +499,10 @@ impl FieldTrainer {
         gpu.write(
             &slot.march,
             0,
-            bytemuck::bytes_of(&March { max_samples: max_samples_per_ray.max(1), ..march_of(self.sizes.nerf_budget) }),
+            bytemuck::bytes_of(&March {
+                max_samples: max_samples_per_ray.max(1),
+                ..march_of(self.sizes.nerf_budget)
+            }),
         );
         let [red, green, blue] = background(options, step);
         let loss = RayLoss {
@@ -376,18 +519,45 @@ impl FieldTrainer {
         gpu.write(&slot.loss, 0, bytemuck::bytes_of(&loss));
         let n_rays = u32::try_from(rays.len()).expect("at most the rays of a step");
         // All steps of a submit have the same number of rays.
-        gpu.write(&self.samples.batch, 0, bytemuck::bytes_of(&Batch::of(n_rays)));
+        gpu.write(
+            &self.samples.batch,
+            0,
+            bytemuck::bytes_of(&Batch::of(n_rays)),
+        );
         Ok(())
     }
 
     /// Records both networks with the kernels for rendering, for every sample of the last step.
     pub(crate) fn record_colors(&mut self, gpu: &Gpu) -> Result<(), Error> {
-        let NerfBudget { n_rays, n_samples, .. } = self.sizes.nerf_budget;
-        let canvas = Canvas::new(gpu, &self.compiled.widths, self.field.n_entries, n_rays.into(), n_rays, n_samples)?;
-        let Self { compiled, field, samples, slots, passes: list, .. } = self;
+        let NerfBudget {
+            n_rays, n_samples, ..
+        } = self.sizes.nerf_budget;
+        let canvas = Canvas::new(
+            gpu,
+            &self.compiled.widths,
+            self.field.n_entries,
+            n_rays.into(),
+            n_rays,
+            n_samples,
+        )?;
+        let Self {
+            compiled,
+            field,
+            samples,
+            slots,
+            passes: list,
+            ..
+        } = self;
         let image_params = &field.no_image_params;
-        FieldPasses { gpu, pipelines: &compiled.pipelines, field, samples, slot: &slots[0], image_params }
-            .all_picture_colors(list, &canvas);
+        FieldPasses {
+            gpu,
+            pipelines: &compiled.pipelines,
+            field,
+            samples,
+            slot: &slots[0],
+            image_params,
+        }
+        .all_picture_colors(list, &canvas);
         Ok(())
     }
 
@@ -401,29 +571,62 @@ impl FieldTrainer {
         self.passes.submit_timed(gpu)
     }
 
-    /// Halves the size of cells and steps. The new cells inherit the occupancy of the old ones. No submit may be in
-    /// flight.
+    /// Halves the size of cells and steps. The new cells inherit the occupancy of the old ones. No
+    /// submit may be in flight.
     pub(crate) fn refine_cells(&mut self, gpu: &Gpu) -> Result<(), Error> {
         let n = self.sizes.nerf_budget.n_cells as usize;
         let known: Vec<f32> = gpu.read(&self.occupancy.cell_occupancy, n.pow(3))?;
         self.sizes.nerf_budget = self.sizes.nerf_budget.refined();
         self.sizes.can_refine = false;
         self.passes.clear_bindings();
-        self.occupancy = Occupancy::new(gpu, &occupancy_update_of(&self.sizes.nerf_budget), self.sizes.has_depth)?;
-        // A step of half the length has half the opacity. Negative values mark cells that were never updated.
-        let half_step_opacity =
-            |cell_occupancy: f32| if cell_occupancy > 0.0 { 0.5 * cell_occupancy } else { cell_occupancy };
+        self.occupancy = Occupancy::new(
+            gpu,
+            &occupancy_update_of(&self.sizes.nerf_budget),
+            self.sizes.has_depth,
+        )?;
+        // A step of half the length has half the opacity. Negative values mark cells that were
+        // never updated.
+        let half_step_opacity = |cell_occupancy: f32| {
+            if cell_occupancy > 0.0 {
+                0.5 * cell_occupancy
+            } else {
+                cell_occupancy
+            }
+        };
         let row = |row: usize| {
             let (y, z) = (row % (2 * n), row / (2 * n));
             (0..2 * n).map(move |x| x / 2 + n * (y / 2 + n * (z / 2)))
         };
-        let refined: Vec<f32> =
-            (0..4 * n * n).into_par_iter().flat_map_iter(row).map(|cell| half_step_opacity(known[cell])).collect();
-        gpu.write(&self.occupancy.cell_occupancy, 0, bytemuck::cast_slice(&refined));
+        let refined: Vec<f32> = (0..4 * n * n)
+            .into_par_iter()
+            .flat_map_iter(row)
+            .map(|cell| half_step_opacity(known[cell]))
+            .collect();
+        gpu.write(
+            &self.occupancy.cell_occupancy,
+            0,
+            bytemuck::cast_slice(&refined),
+        );
         self.make_slot(gpu, 0)?;
-        let Self { compiled, field, samples, occupancy, moments, slots, passes: list, .. } = self;
+        let Self {
+            compiled,
+            field,
+            samples,
+            occupancy,
+            moments,
+            slots,
+            passes: list,
+            ..
+        } = self;
         let (slot, image_params) = (&slots[0], &field.no_image_params);
-        let passes = FieldPasses { gpu, pipelines: &compiled.pipelines, field, samples, slot, image_params };
+        let passes = FieldPasses {
+            gpu,
+            pipelines: &compiled.pipelines,
+            field,
+            samples,
+            slot,
+            image_params,
+        };
         passes.mark_occupied_cells(list, occupancy, moments);
         list.submit(gpu);
         Ok(())
@@ -431,8 +634,14 @@ impl FieldTrainer {
 
     /// Parameters for walking rays.
     pub(crate) fn march(&self) -> reference::March {
-        let NerfBudget { n_cells, n_steps, .. } = self.sizes.nerf_budget;
-        reference::March { step: 2.0 / f64::from(n_steps), max_samples: usize::MAX, n_cells: n_cells as usize }
+        let NerfBudget {
+            n_cells, n_steps, ..
+        } = self.sizes.nerf_budget;
+        reference::March {
+            step: 2.0 / f64::from(n_steps),
+            max_samples: usize::MAX,
+            n_cells: n_cells as usize,
+        }
     }
 
     /// Applies hints from depth images to the occupancy.
@@ -442,10 +651,26 @@ impl FieldTrainer {
         }
         let buffer = gpu.storage_with("nerf.hints", bytemuck::cast_slice(&pad_hints(hints)))?;
         self.make_slot(gpu, 0)?;
-        let Self { compiled, field, samples, occupancy, moments, slots, passes: list, .. } = self;
+        let Self {
+            compiled,
+            field,
+            samples,
+            occupancy,
+            moments,
+            slots,
+            passes: list,
+            ..
+        } = self;
         let (slot, image_params) = (&slots[0], &field.no_image_params);
-        FieldPasses { gpu, pipelines: &compiled.pipelines, field, samples, slot, image_params }
-            .hint(list, occupancy, moments, &buffer);
+        FieldPasses {
+            gpu,
+            pipelines: &compiled.pipelines,
+            field,
+            samples,
+            slot,
+            image_params,
+        }
+        .hint(list, occupancy, moments, &buffer);
         list.submit(gpu);
         list.clear_bindings(); // The hints are used once.
         Ok(())
@@ -453,14 +678,17 @@ impl FieldTrainer {
 
     fn make_slot(&mut self, gpu: &Gpu, slot_ix: usize) -> Result<(), Error> {
         if self.slots.len() <= slot_ix {
-            self.slots.push(RaySlot::new(gpu, self.sizes.nerf_budget.n_rays)?);
+            self.slots
+                .push(RaySlot::new(gpu, self.sizes.nerf_budget.n_rays)?);
         }
         Ok(())
     }
 
-    /// Renders a pinhole view, given in units of the radius of `extent`, with an appearance embedding.
+    /// Renders a pinhole view, given in units of the radius of `extent`, with an appearance
+    /// embedding.
     ///
-    /// Rays are sampled in rounds of a few samples, until all rays are opaque or have no occupied cells left.
+    /// Rays are sampled in rounds of a few samples, until all rays are opaque or have no occupied
+    /// cells left.
     pub(crate) fn draw(
         &mut self,
         gpu: &Gpu,
@@ -476,25 +704,65 @@ impl FieldTrainer {
             return Err(Error::internal("the canvas of a picture is missing"));
         };
         gpu.write(&canvas.view, 0, bytemuck::bytes_of(&camera.view()));
-        let backdrop = Backdrop { srgb: background_srgb, radius_m: f32_of(extent.radius_m) };
+        let backdrop = Backdrop {
+            srgb: background_srgb,
+            radius_m: f32_of(extent.radius_m),
+        };
         gpu.write(&canvas.backdrop, 0, bytemuck::bytes_of(&backdrop));
-        gpu.write(&canvas.image_params, 0, bytemuck::cast_slice(&image_params_of(&[embedding])));
-        let erased = self.erased.set(gpu, &mut self.passes, &camera.edits, extent.world_from_scene())?;
-        let Self { compiled, field, occupancy, passes: list, sizes, reader, picture_rounds, .. } = self;
+        gpu.write(
+            &canvas.image_params,
+            0,
+            bytemuck::cast_slice(&image_params_of(&[embedding])),
+        );
+        let erased = self.erased.set(
+            gpu,
+            &mut self.passes,
+            &camera.edits,
+            extent.world_from_scene(),
+        )?;
+        let Self {
+            compiled,
+            field,
+            occupancy,
+            passes: list,
+            sizes,
+            reader,
+            picture_rounds,
+            ..
+        } = self;
         let image_params = &canvas.image_params;
-        let picture_passes = FieldPasses { gpu, pipelines: &compiled.pipelines, field, samples, slot, image_params };
+        let picture_passes = FieldPasses {
+            gpu,
+            pipelines: &compiled.pipelines,
+            field,
+            samples,
+            slot,
+            image_params,
+        };
         picture_passes.convert_for_picture(list, canvas);
-        let low_px: usize = camera.size_px.map(|px| px.div_ceil(FRONT_STRIDE) as usize).iter().product();
+        let low_px: usize = camera
+            .size_px
+            .map(|px| px.div_ceil(FRONT_STRIDE) as usize)
+            .iter()
+            .product();
         let batches_of = |n_pixels: usize, stride: u32| {
             let firsts = (0..n_pixels).step_by(slot.n_rays as usize);
             firsts.map(move |first| (first, (n_pixels - first).min(slot.n_rays as usize), stride))
         };
         loop {
             let mut n_batches = 0;
-            for (first, n, stride) in batches_of(low_px, FRONT_STRIDE).chain(batches_of(n_pixels, 1)) {
-                let [first_ray, n_rays] = [first, n].map(|ix| u32::try_from(ix).expect("an image's pixels"));
+            for (first, n, stride) in
+                batches_of(low_px, FRONT_STRIDE).chain(batches_of(n_pixels, 1))
+            {
+                let [first_ray, n_rays] =
+                    [first, n].map(|ix| u32::try_from(ix).expect("an image's pixels"));
                 let max_found = SAMPLES_PER_ROUND;
-                let march = March { first_ray, max_found, pixel_stride: stride, ..march_of(sizes.nerf_budget) };
+                let march = March {
+                    first_ray,
+                    max_found,
+                    pixel_stride: stride,
+                    ..march_of(sizes.nerf_budget)
+                };
                 gpu.write(&slot.march, 0, bytemuck::bytes_of(&march));
                 for batch in [&samples.batch, &canvas.selected] {
                     gpu.write(batch, 0, bytemuck::bytes_of(&Batch::of(n_rays)));
@@ -518,27 +786,52 @@ impl FieldTrainer {
                 list.submit(gpu); // The next batch overwrites the parameters of this one.
             }
             let progress = gpu.read::<[u32; 2]>(&canvas.progress, n_batches)?;
-            let needed = progress.iter().map(|[_, n_rounds]| *n_rounds).max().unwrap_or(0);
-            let is_complete = progress.iter().all(|[n_samples, _]| *n_samples == 0) || *picture_rounds >= MAX_ROUNDS;
+            let needed = progress
+                .iter()
+                .map(|[_, n_rounds]| *n_rounds)
+                .max()
+                .unwrap_or(0);
+            let is_complete = progress.iter().all(|[n_samples, _]| *n_samples == 0)
+                || *picture_rounds >= MAX_ROUNDS;
             // Some more rounds for the next picture: without samples, they take little time.
-            *picture_rounds = if is_complete { needed + needed / 4 + 2 } else { 2 * *picture_rounds }.min(MAX_ROUNDS);
+            *picture_rounds = if is_complete {
+                needed + needed / 4 + 2
+            } else {
+                2 * *picture_rounds
+            }
+            .min(MAX_ROUNDS);
             if is_complete {
                 break;
             }
         }
-        reader.read(gpu, list, output, camera.size_px, [&canvas.pixels, &canvas.depths])
+        reader.read(
+            gpu,
+            list,
+            output,
+            camera.size_px,
+            [&canvas.pixels, &canvas.depths],
+        )
     }
 
     fn make_canvas(&mut self, gpu: &Gpu, n_pixels: u64) -> Result<(), Error> {
-        let n_rays = u32::try_from(n_pixels).unwrap_or(u32::MAX).min(self.sizes.nerf_budget.picture_rays);
-        let fits =
-            |(slot, _, canvas): &(RaySlot, SampleBuffers, Canvas)| canvas.n_pixels >= n_pixels && slot.n_rays >= n_rays;
+        let n_rays = u32::try_from(n_pixels)
+            .unwrap_or(u32::MAX)
+            .min(self.sizes.nerf_budget.picture_rays);
+        let fits = |(slot, _, canvas): &(RaySlot, SampleBuffers, Canvas)| {
+            canvas.n_pixels >= n_pixels && slot.n_rays >= n_rays
+        };
         if !self.picture.as_ref().is_some_and(fits) {
             self.passes.clear_bindings();
             self.picture = None;
             let samples = SampleBuffers::new(gpu, SAMPLES_PER_ROUND * n_rays)?;
-            let canvas =
-                Canvas::new(gpu, &self.compiled.widths, self.field.n_entries, n_pixels, n_rays, samples.n_samples)?;
+            let canvas = Canvas::new(
+                gpu,
+                &self.compiled.widths,
+                self.field.n_entries,
+                n_pixels,
+                n_rays,
+                samples.n_samples,
+            )?;
             self.picture = Some((RaySlot::new(gpu, n_rays)?, samples, canvas));
         }
         Ok(())
@@ -556,7 +849,11 @@ pub(crate) struct RayColor {
 
 /// A random background, so that the field cannot use the background to explain the images.
 fn background(options: &ModelOptions<NerfOptions>, step: u64) -> [f32; 3] {
-    [0, 1, 2].map(|ix| f32_of(unit_from_bits(hash(options.common.seed ^ hash(step << 2 | ix)))))
+    [0, 1, 2].map(|ix| {
+        f32_of(unit_from_bits(hash(
+            options.common.seed ^ hash(step << 2 | ix),
+        )))
+    })
 }
 
 /// Parameters and optimizer state of the first images.
@@ -579,21 +876,43 @@ fn learned_bits(learned: ParamSet) -> u32 {
         true => ((1 << n) - 1) << first,
         false => 0,
     };
-    bits(ParamSet::IMAGE_POSES, 0, EMBEDDING) | bits(ParamSet::IMAGE_GAINS, EMBEDDING, EMBEDDING_DIM)
+    bits(ParamSet::IMAGE_POSES, 0, EMBEDDING)
+        | bits(ParamSet::IMAGE_GAINS, EMBEDDING, EMBEDDING_DIM)
 }
 
 /// Parameters of an occupancy update.
 fn occupancy_update_of(nerf_budget: &NerfBudget) -> OccupancyUpdate {
-    let NerfBudget { n_samples, n_cells, n_steps, .. } = *nerf_budget;
-    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a fraction of a u32")]
+    let NerfBudget {
+        n_samples,
+        n_cells,
+        n_steps,
+        ..
+    } = *nerf_budget;
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "a fraction of a u32"
+    )]
     let n_points = (f64::from(n_cells.pow(3)) * UPDATED_FRAC) as u32;
-    OccupancyUpdate { n_cells, n_points: n_points.min(n_samples), decay: OCCUPANCY_DECAY, step: 2.0 / n_steps as f32 }
+    OccupancyUpdate {
+        n_cells,
+        n_points: n_points.min(n_samples),
+        decay: OCCUPANCY_DECAY,
+        step: 2.0 / n_steps as f32,
+    }
 }
 
 /// Pads the hints to a multiple of 16 bytes, as buffers require, by repeating the last one.
 fn pad_hints(hints: &[u32]) -> Vec<u32> {
     let n = hints.len().next_multiple_of(4);
-    hints.iter().chain(std::iter::repeat_n(&hints[hints.len() - 1], n - hints.len())).copied().collect()
+    hints
+        .iter()
+        .chain(std::iter::repeat_n(
+            &hints[hints.len() - 1],
+            n - hints.len(),
+        ))
+        .copied()
+        .collect()
 }
 
 fn march_of(nerf_budget: NerfBudget) -> March {

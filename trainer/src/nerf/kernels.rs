@@ -9,7 +9,10 @@ macro_rules! shared {
         shared!($name, $name)
     };
     ($name:literal, $file:expr) => {
-        Source { name: $name, text: include_str!(concat!("../shared/", $file, ".wgsl")) }
+        Source {
+            name: $name,
+            text: include_str!(concat!("../shared/", $file, ".wgsl")),
+        }
     };
 }
 
@@ -18,7 +21,13 @@ macro_rules! kernel {
         kernel!($name, SHARED)
     };
     ($name:literal, $shared:expr) => {
-        Kernel { source: Source { name: $name, text: include_str!(concat!($name, ".wgsl")) }, shared: $shared }
+        Kernel {
+            source: Source {
+                name: $name,
+                text: include_str!(concat!($name, ".wgsl")),
+            },
+            shared: $shared,
+        }
     };
 }
 
@@ -133,18 +142,19 @@ const MATRIX: u32 = 16;
 const N_DENSITY_OUT: u32 = 16;
 const N_COLORS: u32 = 4;
 
-/// Layer widths of both networks in the kernels: multiples of four, or of the matrix size with cooperative matrices.
-/// Saved fields use multiples of both, so that files work on all adapters.
+/// Layer widths of both networks in the kernels: multiples of four, or of the matrix size with
+/// cooperative matrices. Saved fields use multiples of both, so that files work on all adapters.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct Widths {
     pub(crate) n_features: u32,
     pub(crate) n_hidden: u32,
     pub(crate) n_color_in: u32,
     pub(crate) embedding_dim: u32,
-    /// Whether layers use f16 cooperative matrices ([`crate::gpu::Optional::half_matrices`]). If so, their inputs are
-    /// f16.
+    /// Whether layers use f16 cooperative matrices ([`crate::gpu::Optional::half_matrices`]). If
+    /// so, their inputs are f16.
     pub(crate) is_half_precision: bool,
-    /// Widths of features, hidden layers and inputs of the second network, without padding for matrices.
+    /// Widths of features, hidden layers and inputs of the second network, without padding for
+    /// matrices.
     used: [u32; 3],
 }
 
@@ -163,10 +173,23 @@ impl Widths {
         let inputs = u32::try_from(N_DIRECTION).expect("16") + 15 + embedding_dim;
         let is_half_precision = gpu.optional().half_matrices;
         let used = [2 * n_levels, hidden, inputs].map(|width| width.next_multiple_of(4));
-        let [n_features, n_hidden, n_color_in] =
-            if is_half_precision { used.map(|width| width.next_multiple_of(MATRIX)) } else { used };
-        assert!(n_features.max(n_hidden).max(n_color_in) <= MAX_ROWS, "a layer is wider than its rows");
-        Self { n_features, n_hidden, n_color_in, embedding_dim, is_half_precision, used }
+        let [n_features, n_hidden, n_color_in] = if is_half_precision {
+            used.map(|width| width.next_multiple_of(MATRIX))
+        } else {
+            used
+        };
+        assert!(
+            n_features.max(n_hidden).max(n_color_in) <= MAX_ROWS,
+            "a layer is wider than its rows"
+        );
+        Self {
+            n_features,
+            n_hidden,
+            n_color_in,
+            embedding_dim,
+            is_half_precision,
+            used,
+        }
     }
 
     /// Inputs and outputs of all layers of both networks, in the order of their weights.
@@ -186,10 +209,15 @@ impl Widths {
 
     /// Outputs of the last layer: three colors and padding.
     fn n_colors(&self) -> u32 {
-        if self.is_half_precision { MATRIX } else { N_COLORS }
+        if self.is_half_precision {
+            MATRIX
+        } else {
+            N_COLORS
+        }
     }
 
-    /// Number of weights of all layers, or of their gradient sums, with padding. Padding outputs come last.
+    /// Number of weights of all layers, or of their gradient sums, with padding. Padding outputs
+    /// come last.
     pub(crate) fn n_padded_weights(&self) -> u32 {
         self.n_weights() + (self.n_colors() - N_COLORS) * self.n_hidden
     }
@@ -204,9 +232,11 @@ impl Widths {
         self.layers().iter().map(|[n_in, _]| n_in).sum()
     }
 
-    /// Gradients stored per sample: with respect to the outputs of each layer, and to the grid features.
+    /// Gradients stored per sample: with respect to the outputs of each layer, and to the grid
+    /// features.
     pub(crate) fn n_gradients(&self) -> u32 {
-        self.layers().iter().map(|[_, n_out]| n_out).sum::<u32>() + self.n_colors() - N_COLORS + self.n_features
+        self.layers().iter().map(|[_, n_out]| n_out).sum::<u32>() + self.n_colors() - N_COLORS
+            + self.n_features
     }
 }
 
@@ -228,8 +258,9 @@ pub(crate) struct FieldPipelines {
     pub(crate) select_samples: Pipeline,
     pub(crate) keep_fronts: Pipeline,
     pub(crate) show_rays: Pipeline,
-    /// Variants of the networks: densities only; densities of a picture, with geometry features stored; colors from
-    /// these features; and both networks with everything stored for the backward pass.
+    /// Variants of the networks: densities only; densities of a picture, with geometry features
+    /// stored; colors from these features; and both networks with everything stored for the
+    /// backward pass.
     pub(crate) densities: Pipeline,
     pub(crate) picture_densities: Pipeline,
     pub(crate) picture_colors: Pipeline,
@@ -251,31 +282,66 @@ pub(crate) struct FieldPipelines {
 }
 
 impl FieldPipelines {
-    /// Pipelines for up to `n_samples` samples; `picture_embedding_ix` is the index of a picture's parameters in its
-    /// buffer.
-    pub(crate) fn new(gpu: &Gpu, widths: &Widths, n_samples: u32, picture_embedding_ix: u32) -> Result<Self, Error> {
-        let Widths { n_features, n_hidden, n_color_in, embedding_dim, is_half_precision, .. } = *widths;
+    /// Pipelines for up to `n_samples` samples; `picture_embedding_ix` is the index of a picture's
+    /// parameters in its buffer.
+    pub(crate) fn new(
+        gpu: &Gpu,
+        widths: &Widths,
+        n_samples: u32,
+        picture_embedding_ix: u32,
+    ) -> Result<Self, Error> {
+        let Widths {
+            n_features,
+            n_hidden,
+            n_color_in,
+            embedding_dim,
+            is_half_precision,
+            ..
+        } = *widths;
         let sizes = [
             ("N_FEATURES", f64::from(n_features)),
             ("N_HIDDEN", f64::from(n_hidden)),
             ("N_COLOR_IN", f64::from(n_color_in)),
             ("N_COLORS", f64::from(widths.n_colors())),
-            ("LANES", f64::from(if is_half_precision { HALF_LANES } else { 2 * n_hidden })),
+            (
+                "LANES",
+                f64::from(if is_half_precision {
+                    HALF_LANES
+                } else {
+                    2 * n_hidden
+                }),
+            ),
         ];
-        let select_precision = |[full, half]: [Kernel; 2]| if is_half_precision { half } else { full };
+        let select_precision =
+            |[full, half]: [Kernel; 2]| if is_half_precision { half } else { full };
         let with = |more: &[(&'static str, f64)]| [&sizes[..], more].concat();
         let networks = |[full, half]: [&'static [Source]; 2], enabled: &[&'static str]| {
             let flag = |name: &'static str| (name, f64::from(u8::from(enabled.contains(&name))));
             let kind = ["DENSITY", "COLORS", "STORE_ACTIVATIONS", "STORE_GEOMETRY"].map(flag);
-            let kernels = [kernel!("field_forward", full), kernel!("field_forward", half)];
+            let kernels = [
+                kernel!("field_forward", full),
+                kernel!("field_forward", half),
+            ];
             let embedding_dim = [("EMBEDDING_DIM", f64::from(embedding_dim))];
-            Pipeline::new(gpu, select_precision(kernels), &with(&[&kind[..], &embedding_dim].concat()))
+            Pipeline::new(
+                gpu,
+                select_precision(kernels),
+                &with(&[&kind[..], &embedding_dim].concat()),
+            )
         };
         // Each thread sums the gradients of 16 weights.
-        let max_weights = widths.layers().iter().map(|[n_in, n_out]| n_in * n_out).max().expect("five layers");
+        let max_weights = widths
+            .layers()
+            .iter()
+            .map(|[n_in, n_out]| n_in * n_out)
+            .max()
+            .expect("five layers");
         let chunk = ("CHUNK_TILES", f64::from(CHUNK_TILES));
-        let sums =
-            if is_half_precision { vec![chunk] } else { vec![chunk, ("SUM_LANES", f64::from(max_weights / 16))] };
+        let sums = if is_half_precision {
+            vec![chunk]
+        } else {
+            vec![chunk, ("SUM_LANES", f64::from(max_weights / 16))]
+        };
         let hint = |kind: f64| Pipeline::new(gpu, kernel!("hint_cells"), &[("KIND", kind)]);
         let plain = |kernel: Kernel| Pipeline::new(gpu, kernel, &[]);
         // These take long to compile, so they are compiled in parallel.
@@ -285,29 +351,39 @@ impl FieldPipelines {
                 || networks([FULL_PICTURE, HALF_PICTURE], &["COLORS"]),
             )
         };
-        let ((densities, (picture_densities, picture_colors)), (learned, (field_backward, weight_gradients))) =
-            rayon::join(
-                || rayon::join(|| networks([FULL, HALF], &["DENSITY"]), pictures),
-                || {
-                    let backward = || {
-                        let kernel =
-                            select_precision([kernel!("field_backward", FULL), kernel!("field_backward", HALF)]);
-                        Pipeline::new(gpu, kernel, &sizes)
-                    };
-                    let gradients = || {
-                        let kernel =
-                            select_precision([kernel!("weight_gradients"), kernel!("weight_gradients_half", HALF)]);
-                        Pipeline::new(gpu, kernel, &with(&sums))
-                    };
-                    rayon::join(
-                        || networks([FULL, HALF], &["DENSITY", "COLORS", "STORE_ACTIVATIONS"]),
-                        || rayon::join(backward, gradients),
-                    )
-                },
-            );
+        let (
+            (densities, (picture_densities, picture_colors)),
+            (learned, (field_backward, weight_gradients)),
+        ) = rayon::join(
+            || rayon::join(|| networks([FULL, HALF], &["DENSITY"]), pictures),
+            || {
+                let backward = || {
+                    let kernel = select_precision([
+                        kernel!("field_backward", FULL),
+                        kernel!("field_backward", HALF),
+                    ]);
+                    Pipeline::new(gpu, kernel, &sizes)
+                };
+                let gradients = || {
+                    let kernel = select_precision([
+                        kernel!("weight_gradients"),
+                        kernel!("weight_gradients_half", HALF),
+                    ]);
+                    Pipeline::new(gpu, kernel, &with(&sums))
+                };
+                rayon::join(
+                    || networks([FULL, HALF], &["DENSITY", "COLORS", "STORE_ACTIVATIONS"]),
+                    || rayon::join(backward, gradients),
+                )
+            },
+        );
         Ok(Self {
             count_samples: plain(kernel!("count_samples"))?,
-            place_samples: Pipeline::new(gpu, kernel!("place_samples"), &[("CAPACITY", n_samples.into())])?,
+            place_samples: Pipeline::new(
+                gpu,
+                kernel!("place_samples"),
+                &[("CAPACITY", n_samples.into())],
+            )?,
             write_samples: plain(kernel!("write_samples"))?,
             find_samples: plain(kernel!("find_samples"))?,
             hint_cells: [hint(0.0)?, hint(1.0)?, hint(2.0)?],
@@ -328,20 +404,28 @@ impl FieldPipelines {
             picture_densities: picture_densities?,
             picture_colors: picture_colors?,
             forward: learned?,
-            weights_to_half: is_half_precision.then(|| plain(kernel!("weights_to_half", HALF))).transpose()?,
+            weights_to_half: is_half_precision
+                .then(|| plain(kernel!("weights_to_half", HALF)))
+                .transpose()?,
             pack_grid: plain(kernel!("pack_grid"))?,
             composite: plain(kernel!("composite"))?,
             field_backward: field_backward?,
             apply_poses: plain(kernel!("apply_poses"))?,
             point_gradients: Pipeline::new(
                 gpu,
-                select_precision([kernel!("point_gradients", FULL), kernel!("point_gradients", HALF)]),
+                select_precision([
+                    kernel!("point_gradients", FULL),
+                    kernel!("point_gradients", HALF),
+                ]),
                 &sizes,
             )?,
             ray_gradients: plain(kernel!("ray_gradients"))?,
             embedding_gradients: Pipeline::new(
                 gpu,
-                select_precision([kernel!("embedding_gradients", FULL), kernel!("embedding_gradients", HALF)]),
+                select_precision([
+                    kernel!("embedding_gradients", FULL),
+                    kernel!("embedding_gradients", HALF),
+                ]),
                 &with(&[("EMBEDDING_DIM", embedding_dim.into())]),
             )?,
             update_images: plain(kernel!("update_images"))?,
@@ -349,7 +433,10 @@ impl FieldPipelines {
             update_weights: Pipeline::new(
                 gpu,
                 kernel!("update_weights"),
-                &[("CHUNK", f64::from(N_CHUNK)), ("N_SUMS", f64::from(widths.n_padded_weights() / 4))],
+                &[
+                    ("CHUNK", f64::from(N_CHUNK)),
+                    ("N_SUMS", f64::from(widths.n_padded_weights() / 4)),
+                ],
             )?,
             update_grid: plain(kernel!("update_grid"))?,
             end_step: plain(kernel!("end_step"))?,
@@ -362,7 +449,8 @@ mod tests {
     use super::KERNELS;
     use crate::gpu::testing::{assert_layout, assert_valid};
     use crate::nerf::params::{
-        AdamRule, Backdrop, Batch, ImageParamRule, Level, March, OccupancyUpdate, Ray, RayLoss, Span, StepScale,
+        AdamRule, Backdrop, Batch, ImageParamRule, Level, March, OccupancyUpdate, Ray, RayLoss,
+        Span, StepScale,
     };
 
     #[test]
@@ -387,25 +475,63 @@ mod tests {
             ]
         );
         assert_layout!(KERNELS, Span, [begin, end, ray, sample]);
-        assert_layout!(KERNELS, March, [step, max_samples, n_cells, first_ray, max_found, pixel_stride, unused]);
+        assert_layout!(
+            KERNELS,
+            March,
+            [
+                step,
+                max_samples,
+                n_cells,
+                first_ray,
+                max_found,
+                pixel_stride,
+                unused
+            ]
+        );
         assert_layout!(KERNELS, OccupancyUpdate, [n_cells, n_points, decay, step]);
         assert_layout!(KERNELS, Backdrop, [srgb, radius_m]);
         assert_layout!(KERNELS, Level, [n_cells, begin, mask, unused]);
         assert_layout!(
             KERNELS,
             RayLoss,
-            [background_srgb, distance_weight, distance_clip, distortion, near, line_of_sight, band, band_frac, unused,]
+            [
+                background_srgb,
+                distance_weight,
+                distance_clip,
+                distortion,
+                near,
+                line_of_sight,
+                band,
+                band_frac,
+                unused,
+            ]
         );
         assert_layout!(KERNELS, StepScale, [rate_frac, unused, correction]);
         assert_layout!(
             KERNELS,
             ImageParamRule,
-            [learned, n_images, rotation_rate, translation_rate, embedding_rate, weight_decay, unused]
+            [
+                learned,
+                n_images,
+                rotation_rate,
+                translation_rate,
+                embedding_rate,
+                weight_decay,
+                unused
+            ]
         );
         assert_layout!(
             KERNELS,
             AdamRule,
-            [rate, final_rate_frac, betas, epsilon, weight_decay, n_planned_steps, unused]
+            [
+                rate,
+                final_rate_frac,
+                betas,
+                epsilon,
+                weight_decay,
+                n_planned_steps,
+                unused
+            ]
         );
     }
 

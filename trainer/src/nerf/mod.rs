@@ -1,4 +1,5 @@
-//! Neural radiance fields: a hash grid and two small networks that predict density and color of any point.
+//! Neural radiance fields: a hash grid and two small networks that predict density and color of any
+//! point.
 
 #[cfg(test)]
 mod against_twin;

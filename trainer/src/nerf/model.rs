@@ -17,7 +17,8 @@ use crate::packing::{Format, Output};
 use crate::submits::Submits;
 use crate::view::Camera;
 use crate::{
-    Bounds, CorrectedKeyframe, Error, Method, Packing, Picture, Progress, Recalibrate, RenderRequest, Rendered,
+    Bounds, CorrectedKeyframe, Error, Method, Packing, Picture, Progress, Recalibrate,
+    RenderRequest, Rendered,
 };
 use calibration::Alignment;
 use calibration::TrialReport;
@@ -34,14 +35,15 @@ use std::time::Instant;
 
 /// Distance at which rays begin, in units of the scene radius.
 const NEAR_DISTANCE: f32 = 0.03;
-/// Occupancy cells are refined after this fraction (1 / divisor) of the planned steps. This is before the first trial,
-/// because trials compare fields of the same size.
+/// Occupancy cells are refined after this fraction (1 / divisor) of the planned steps. This is
+/// before the first trial, because trials compare fields of the same size.
 const REFINE_DIVISOR: u64 = 10;
-/// Depth stride on a software adapter, where a 640x480 picture takes tens of seconds early in training. Every ninth
-/// pixel is enough for depth.
+/// Depth stride on a software adapter, where a 640x480 picture takes tens of seconds early in
+/// training. Every ninth pixel is enough for depth.
 const SOFTWARE_DEPTH_STRIDE: u32 = 3;
 
-/// A neural radiance field trained on keyframes: a hash grid and two small networks, rendered along rays.
+/// A neural radiance field trained on keyframes: a hash grid and two small networks, rendered along
+/// rays.
 #[derive(Debug)]
 pub struct NerfModel {
     gpu: Arc<Gpu>,
@@ -107,19 +109,26 @@ impl NerfModel {
             self.finish_in_flight()?;
             self.corrections = Some(self.learned_corrections()?);
         }
-        Ok(self.corrections.as_ref().filter(|corrections| !corrections.is_empty()).unwrap_or(&self.loaded_corrections))
+        Ok(self
+            .corrections
+            .as_ref()
+            .filter(|corrections| !corrections.is_empty())
+            .unwrap_or(&self.loaded_corrections))
     }
 
     fn nerf_budget(&self) -> NerfBudget {
-        self.options.specific.nerf_budget.unwrap_or(if self.gpu.is_software() {
-            NerfBudget::SMALL
-        } else {
-            NerfBudget::FULL
-        })
+        self.options
+            .specific
+            .nerf_budget
+            .unwrap_or(if self.gpu.is_software() {
+                NerfBudget::SMALL
+            } else {
+                NerfBudget::FULL
+            })
     }
 
-    /// Creates a field if there is none or if the scene has outgrown it, and refines its cells when due. Returns
-    /// whether there are images to train on.
+    /// Creates a field if there is none or if the scene has outgrown it, and refines its cells when
+    /// due. Returns whether there are images to train on.
     fn begin(&mut self) -> Result<bool, Error> {
         if self.images.is_empty() {
             return Ok(false);
@@ -139,8 +148,13 @@ impl NerfModel {
     fn sizes(&self) -> Result<(Extent, Sizes), Error> {
         let keyframes = || self.images.iter().map(|image| &*image.keyframe);
         let extent = Extent::of(keyframes());
-        let sizes =
-            Sizes::choose(&self.options, self.nerf_budget(), self.gpu.max_binding_bytes(), keyframes(), &extent)?;
+        let sizes = Sizes::choose(
+            &self.options,
+            self.nerf_budget(),
+            self.gpu.max_binding_bytes(),
+            keyframes(),
+            &extent,
+        )?;
         Ok((extent, sizes))
     }
 
@@ -156,7 +170,11 @@ impl NerfModel {
 
     fn fit_extent(&mut self) -> Result<(), Error> {
         let (extent, sizes) = self.sizes()?;
-        if self.field.as_ref().is_some_and(|(known, _)| !known.is_outgrown_by(&extent)) {
+        if self
+            .field
+            .as_ref()
+            .is_some_and(|(known, _)| !known.is_outgrown_by(&extent))
+        {
             return Ok(());
         }
         log::debug!("nerf: {extent:?}, {sizes:?}");
@@ -164,12 +182,16 @@ impl NerfModel {
         self.abort_trials()?;
         self.field = None; // Free its memory before allocating the next field.
         let compiled = self.compiled()?;
-        self.field = Some((extent, FieldTrainer::new(&self.gpu, &self.options, sizes, compiled)?));
+        self.field = Some((
+            extent,
+            FieldTrainer::new(&self.gpu, &self.options, sizes, compiled)?,
+        ));
         self.n_hinted = 0;
         Ok(())
     }
 
-    /// Applies occupancy hints of new images, if any image has depth, and initializes their appearance embeddings.
+    /// Applies occupancy hints of new images, if any image has depth, and initializes their
+    /// appearance embeddings.
     fn hint(&mut self) -> Result<(), Error> {
         self.initialize_embeddings()?;
         self.hint_images(self.n_hinted..self.images.len())?;
@@ -180,33 +202,55 @@ impl NerfModel {
     }
 
     fn hint_images(&mut self, images: Range<usize>) -> Result<(), Error> {
-        let Some((extent, field_trainer)) = &mut self.field else { return Ok(()) };
+        let Some((extent, field_trainer)) = &mut self.field else {
+            return Ok(());
+        };
         if field_trainer.sizes.has_depth {
-            let keyframes: Vec<&Keyframe> = self.images[images].iter().map(|image| &*image.keyframe).collect();
-            field_trainer.hint(&self.gpu, &carve::hints(&keyframes, extent, &field_trainer.march()))?;
+            let keyframes: Vec<&Keyframe> = self.images[images]
+                .iter()
+                .map(|image| &*image.keyframe)
+                .collect();
+            field_trainer.hint(
+                &self.gpu,
+                &carve::hints(&keyframes, extent, &field_trainer.march()),
+            )?;
         }
         Ok(())
     }
 
     /// Steps until the cells are refined.
     fn steps_to_finer_cells(&self) -> u64 {
-        let is_refinement_due = self.field.as_ref().is_some_and(|(_, field_trainer)| field_trainer.sizes.can_refine);
-        if is_refinement_due { self.refinement_step().saturating_sub(self.step).max(1) } else { u64::MAX }
+        let is_refinement_due = self
+            .field
+            .as_ref()
+            .is_some_and(|(_, field_trainer)| field_trainer.sizes.can_refine);
+        if is_refinement_due {
+            self.refinement_step().saturating_sub(self.step).max(1)
+        } else {
+            u64::MAX
+        }
     }
 
     fn refinement_step(&self) -> u64 {
         (self.options.common.n_planned_steps / REFINE_DIVISOR).max(1)
     }
 
-    /// Refines the cells when due. Coarse cells need fewer updates at first; fine cells later separate empty space
-    /// better.
+    /// Refines the cells when due. Coarse cells need fewer updates at first; fine cells later
+    /// separate empty space better.
     fn refine_cells_when_due(&mut self) -> Result<(), Error> {
         let is_refinement_due = self.step >= self.refinement_step();
-        if !is_refinement_due || !self.field.as_ref().is_some_and(|(_, field_trainer)| field_trainer.sizes.can_refine) {
+        if !is_refinement_due
+            || !self
+                .field
+                .as_ref()
+                .is_some_and(|(_, field_trainer)| field_trainer.sizes.can_refine)
+        {
             return Ok(());
         }
         self.finish_in_flight()?;
-        let Some((_, field_trainer)) = &mut self.field else { return Ok(()) };
+        let Some((_, field_trainer)) = &mut self.field else {
+            return Ok(());
+        };
         field_trainer.refine_cells(&self.gpu)
     }
 
@@ -218,15 +262,29 @@ impl NerfModel {
     /// Records the next step as the `slot_ix`-th of a submit.
     fn record(&mut self, slot_ix: usize) -> Result<(), Error> {
         let learned_params = self.current_params();
-        let Some((extent, field_trainer)) = &mut self.field else { return Ok(()) };
+        let Some((extent, field_trainer)) = &mut self.field else {
+            return Ok(());
+        };
         if !learned_params.is_empty() {
             field_trainer.allocate_images(&self.gpu, self.images.len(), learned_params)?;
         }
         self.corrections = None;
         let n_rays = field_trainer.sizes.nerf_budget.n_rays;
-        let draw = RaySampling { seed: self.options.common.seed, step: self.step, n_rays, begin: NEAR_DISTANCE };
+        let draw = RaySampling {
+            seed: self.options.common.seed,
+            step: self.step,
+            n_rays,
+            begin: NEAR_DISTANCE,
+        };
         let rays = rays::draw(&self.images, extent, &draw);
-        field_trainer.record_step(&self.gpu, &self.options, slot_ix, self.step, &rays, learned_params)?;
+        field_trainer.record_step(
+            &self.gpu,
+            &self.options,
+            slot_ix,
+            self.step,
+            &rays,
+            learned_params,
+        )?;
         self.step += 1;
         Ok(())
     }
@@ -250,7 +308,14 @@ impl NerfModel {
         let Some((extent, field_trainer)) = &mut self.field else {
             return Ok(Rendered::empty(camera.size_px, background_srgb, output));
         };
-        field_trainer.draw(&self.gpu, &extent.camera_in_scene_units(camera), background_srgb, extent, embedding, output)
+        field_trainer.draw(
+            &self.gpu,
+            &extent.camera_in_scene_units(camera),
+            background_srgb,
+            extent,
+            embedding,
+            output,
+        )
     }
 }
 
@@ -267,7 +332,10 @@ impl Recalibrate for NerfModel {
         }
         (self.is_extent_stale, self.corrections) = (true, None);
         if let Some((_, field_trainer)) = &mut self.field {
-            field_trainer.reset_image_params_except(&self.gpu, self.learned_params - ParamSet::IMAGE_POSES)?;
+            field_trainer.reset_image_params_except(
+                &self.gpu,
+                self.learned_params - ParamSet::IMAGE_POSES,
+            )?;
         }
         self.hint_images(0..self.n_hinted)
     }
@@ -275,7 +343,11 @@ impl Recalibrate for NerfModel {
 
 impl Method for NerfModel {
     fn depth_stride(&self) -> u32 {
-        if self.gpu.is_software() { SOFTWARE_DEPTH_STRIDE } else { 1 }
+        if self.gpu.is_software() {
+            SOFTWARE_DEPTH_STRIDE
+        } else {
+            1
+        }
     }
 
     fn push(&mut self, keyframe: Arc<Keyframe>) -> Result<(), Error> {
@@ -295,7 +367,9 @@ impl Method for NerfModel {
     }
 
     fn remove(&mut self, camera: &str, stamp: Stamp) -> Result<(), Error> {
-        let is_match = |image: &RayImage| image.keyframe.camera.as_ref() == camera && image.keyframe.stamp == stamp;
+        let is_match = |image: &RayImage| {
+            image.keyframe.camera.as_ref() == camera && image.keyframe.stamp == stamp
+        };
         self.validation_images.retain(|image| !is_match(image));
         if let Some(ix) = self.images.iter().position(is_match) {
             self.finish_in_flight()?;
@@ -324,7 +398,9 @@ impl Method for NerfModel {
         for slot_ix in 0..n_steps {
             self.record(usize::try_from(slot_ix).expect("few steps"))?;
         }
-        let Some((_, field_trainer)) = &mut self.field else { return Err(no_field()) };
+        let Some((_, field_trainer)) = &mut self.field else {
+            return Err(no_field());
+        };
         let batch = field_trainer.submit(&self.gpu);
         self.finish_in_flight()?; // Waits for the previous submit while this one runs.
         self.submits.begin(batch, n_steps, since);
@@ -353,16 +429,25 @@ impl Method for NerfModel {
     }
 
     fn render(&mut self, request: &RenderRequest) -> Result<Picture, Error> {
-        // Rendering must not create a field: the times of pictures would then determine its initial keyframes.
+        // Rendering must not create a field: the times of pictures would then determine its initial
+        // keyframes.
         self.finish_in_flight()?;
         let embedding = self.embedding_of(request.appearance_of.as_ref())?;
-        Rendered::picture(request, |camera, output| self.draw(request, camera, embedding, output))
+        Rendered::picture(request, |camera, output| {
+            self.draw(request, camera, embedding, output)
+        })
     }
 
-    fn render_packed(&mut self, request: &RenderRequest, packing: Packing) -> Result<Rendered, Error> {
+    fn render_packed(
+        &mut self,
+        request: &RenderRequest,
+        packing: Packing,
+    ) -> Result<Rendered, Error> {
         self.finish_in_flight()?;
         let embedding = self.embedding_of(request.appearance_of.as_ref())?;
-        Rendered::of(request, Format::Packed(packing), |camera, output| self.draw(request, camera, embedding, output))
+        Rendered::of(request, Format::Packed(packing), |camera, output| {
+            self.draw(request, camera, embedding, output)
+        })
     }
 
     fn set_watched(&mut self, watched: bool) {
@@ -370,7 +455,10 @@ impl Method for NerfModel {
     }
 
     fn bounds(&mut self) -> Result<Option<Bounds>, Error> {
-        Ok(self.extent().map(|extent| Bounds { center_m: extent.center_m, radius_m: extent.radius_m }))
+        Ok(self.extent().map(|extent| Bounds {
+            center_m: extent.center_m,
+            radius_m: extent.radius_m,
+        }))
     }
 
     fn camera_corrections(&mut self) -> Result<BTreeMap<String, CameraCorrection>, Error> {
@@ -380,7 +468,10 @@ impl Method for NerfModel {
     fn calibrated_camera(&mut self, keyframe: &Keyframe) -> Result<CalibratedCamera, Error> {
         let corrections = self.current_corrections()?;
         let correction = corrections.get(keyframe.camera.as_ref());
-        Ok(correction.map_or_else(|| CalibratedCamera::of(keyframe), |correction| correction.apply(keyframe)))
+        Ok(correction.map_or_else(
+            || CalibratedCamera::of(keyframe),
+            |correction| correction.apply(keyframe),
+        ))
     }
 
     fn profile_step(&mut self) -> Result<Vec<PassTiming>, Error> {
@@ -389,7 +480,9 @@ impl Method for NerfModel {
             return Ok(Vec::new());
         }
         self.record(0)?;
-        let Some((_, field_trainer)) = &mut self.field else { return Err(no_field()) };
+        let Some((_, field_trainer)) = &mut self.field else {
+            return Err(no_field());
+        };
         field_trainer.submit_timed(&self.gpu)
     }
 

@@ -7,7 +7,8 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct NerfOptions {
-    /// Weight of the absolute distance error, per scene radius, relative to the squared color error.
+    /// Weight of the absolute distance error, per scene radius, relative to the squared color
+    /// error.
     pub distance_weight: f64,
     /// Weight of the line-of-sight loss, which penalizes opacity away from the measured depth.
     pub line_of_sight: f64,
@@ -69,14 +70,19 @@ impl NerfBudget {
 }
 
 impl NerfBudget {
-    /// Halves the size of cells and steps if they are those of [`Self::FULL`]. Does not refine other sizes: refinement
-    /// is too slow on software adapters, and even finer cells need too much memory.
+    /// Halves the size of cells and steps if they are those of [`Self::FULL`]. Does not refine
+    /// other sizes: refinement is too slow on software adapters, and even finer cells need too much
+    /// memory.
     #[must_use]
     pub(crate) fn refined(self) -> Self {
         if self.n_cells != Self::FULL.n_cells {
             return self;
         }
-        Self { n_cells: 2 * self.n_cells, n_steps: 2 * self.n_steps, ..self }
+        Self {
+            n_cells: 2 * self.n_cells,
+            n_steps: 2 * self.n_steps,
+            ..self
+        }
     }
 }
 

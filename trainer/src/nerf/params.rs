@@ -16,7 +16,12 @@ pub(crate) struct Batch {
 impl Batch {
     /// A batch of rays whose samples have not been placed yet.
     pub(crate) fn of(n_rays: u32) -> Self {
-        Self { n_rays, n_samples: 0, max_samples: 0, unused: 0 }
+        Self {
+            n_rays,
+            n_samples: 0,
+            max_samples: 0,
+            unused: 0,
+        }
     }
 }
 
@@ -139,15 +144,18 @@ pub(crate) struct ImageParamRule {
     pub(crate) unused: [u32; 2],
 }
 
-/// One of the [`IMAGE_PARAM_STRIDE`] parameters of an image: value, Adam's two moments, and the number of steps taken.
-/// The first three parameters are the rotation, the next three the translation, and the appearance embedding starts at
-/// [`EMBEDDING`], as in `shared/image_params.wgsl`.
+/// One of the [`IMAGE_PARAM_STRIDE`] parameters of an image: value, Adam's two moments, and the
+/// number of steps taken. The first three parameters are the rotation, the next three the
+/// translation, and the appearance embedding starts at [`EMBEDDING`], as in
+/// `shared/image_params.wgsl`.
 pub(crate) type ImageParam = [f32; 4];
 pub(crate) const IMAGE_PARAM_STRIDE: usize = 9;
 pub(crate) const EMBEDDING: usize = 6;
 
 /// Parameters of images with these appearance embeddings and no pose correction.
-pub(crate) fn image_params_of<const N: usize>(embeddings: &[[f64; N]]) -> Vec<[ImageParam; IMAGE_PARAM_STRIDE]> {
+pub(crate) fn image_params_of<const N: usize>(
+    embeddings: &[[f64; N]],
+) -> Vec<[ImageParam; IMAGE_PARAM_STRIDE]> {
     let params_with_embedding = |embedding: &[f64; N]| {
         let mut image_params = [[0.0; 4]; IMAGE_PARAM_STRIDE];
         image_params[EMBEDDING..]
@@ -162,7 +170,11 @@ pub(crate) fn image_params_of<const N: usize>(embeddings: &[[f64; N]]) -> Vec<[I
 impl AdamRule {
     /// Scale of the first step.
     pub(crate) fn first_step_scale(&self) -> StepScale {
-        StepScale { rate_frac: 1.0, unused: 0.0, correction: self.betas.map(|beta| 1.0 / (1.0 - beta)) }
+        StepScale {
+            rate_frac: 1.0,
+            unused: 0.0,
+            correction: self.betas.map(|beta| 1.0 / (1.0 - beta)),
+        }
     }
 }
 
@@ -170,8 +182,17 @@ impl AdamRule {
 pub(crate) fn levels(shape: &GridShape) -> Vec<Level> {
     let level = |ix: usize| {
         let is_dense = (u64::from(shape.n_cells[ix]) + 1).pow(3) <= 1 << shape.log2_entries;
-        let mask = if is_dense { 0 } else { (1 << shape.log2_entries) - 1 };
-        Level { n_cells: shape.n_cells[ix], begin: shape.begin(ix), mask, unused: 0 }
+        let mask = if is_dense {
+            0
+        } else {
+            (1 << shape.log2_entries) - 1
+        };
+        Level {
+            n_cells: shape.n_cells[ix],
+            begin: shape.begin(ix),
+            mask,
+            unused: 0,
+        }
     };
     (0..shape.n_cells.len()).map(level).collect()
 }

@@ -1,8 +1,8 @@
 //! The stages of rendering and training, as lists of passes.
 
 use super::buffers::{
-    FieldBuffers, FieldGradients, FieldMoments, ImageParamBuffers, Occupancy, RaySlot, SampleBuffers, StepBuffers,
-    THREADS_PER_RAY, n_box_words,
+    FieldBuffers, FieldGradients, FieldMoments, ImageParamBuffers, Occupancy, RaySlot,
+    SampleBuffers, StepBuffers, THREADS_PER_RAY, n_box_words,
 };
 use super::kernels::{CHUNK_TILES, FieldPipelines, N_TILE, Widths};
 use super::params::{Backdrop, Batch, IMAGE_PARAM_STRIDE, ImageParam};
@@ -58,17 +58,24 @@ impl Canvas {
         n_rays: u32,
         n_samples: u32,
     ) -> Result<Self, Error> {
-        let per_sample = |name: &str, bytes: u32| gpu.storage(name, u64::from(bytes) * u64::from(n_samples));
+        let per_sample =
+            |name: &str, bytes: u32| gpu.storage(name, u64::from(bytes) * u64::from(n_samples));
         Ok(Self {
             view: gpu.uniform_with("nerf.view", &<View as bytemuck::Zeroable>::zeroed()),
-            backdrop: gpu.uniform_with("nerf.backdrop", &<Backdrop as bytemuck::Zeroable>::zeroed()),
+            backdrop: gpu
+                .uniform_with("nerf.backdrop", &<Backdrop as bytemuck::Zeroable>::zeroed()),
             pixels: gpu.storage("nerf.pixels", 4 * n_pixels)?,
             depths: gpu.storage("nerf.depths", 4 * n_pixels)?,
-            image_params: gpu
-                .storage("nerf.picture_image_params", (IMAGE_PARAM_STRIDE * size_of::<ImageParam>()) as u64)?,
+            image_params: gpu.storage(
+                "nerf.picture_image_params",
+                (IMAGE_PARAM_STRIDE * size_of::<ImageParam>()) as u64,
+            )?,
             light: gpu.storage("nerf.light", 32 * u64::from(n_rays))?,
             fronts: gpu.storage("nerf.fronts", 4 * n_pixels)?,
-            progress: gpu.storage("nerf.progress", 8 * (2 * n_pixels.div_ceil(u64::from(n_rays)) + 1))?,
+            progress: gpu.storage(
+                "nerf.progress",
+                8 * (2 * n_pixels.div_ceil(u64::from(n_rays)) + 1),
+            )?,
             packed_grid: gpu.storage("nerf.packed_grid", 4 * u64::from(n_entries))?,
             geometry: per_sample("nerf.geometry", 16 * widths.bytes_per_number())?,
             selected: gpu.storage_with("nerf.selected", bytemuck::bytes_of(&Batch::of(0)))?,
@@ -93,7 +100,13 @@ fn groups(n: u32, size: u32) -> u64 {
 impl FieldPasses<'_> {
     /// Counts the segments of rays in occupied cells.
     pub(crate) fn count(&self, list: &mut Passes, occupancy: &Occupancy) {
-        let Self { gpu, pipelines, samples, slot, .. } = *self;
+        let Self {
+            gpu,
+            pipelines,
+            samples,
+            slot,
+            ..
+        } = *self;
         let found = [
             ("batch", &samples.batch),
             ("march", &slot.march),
@@ -102,14 +115,29 @@ impl FieldPasses<'_> {
             ("n_found", &slot.n_found),
             ("n_before", &slot.n_before),
         ];
-        list.dispatch(gpu, &pipelines.count_samples, groups(THREADS_PER_RAY * slot.n_rays, 64), &found);
+        list.dispatch(
+            gpu,
+            &pipelines.count_samples,
+            groups(THREADS_PER_RAY * slot.n_rays, 64),
+            &found,
+        );
     }
 
     /// Turns segments into samples. Run after [`FieldPasses::count`].
     pub(crate) fn place_samples_in_rays(&self, list: &mut Passes, occupancy: &Occupancy) {
-        let Self { gpu, pipelines, samples, slot, .. } = *self;
-        let shared =
-            [("batch", &samples.batch), ("march", &slot.march), ("n_found", &slot.n_found), ("rays", &slot.rays)];
+        let Self {
+            gpu,
+            pipelines,
+            samples,
+            slot,
+            ..
+        } = *self;
+        let shared = [
+            ("batch", &samples.batch),
+            ("march", &slot.march),
+            ("n_found", &slot.n_found),
+            ("rays", &slot.rays),
+        ];
         list.dispatch(gpu, &pipelines.place_samples, 1, &shared);
         let written = [
             ("n_before", &slot.n_before),
@@ -118,16 +146,44 @@ impl FieldPasses<'_> {
             ("points", &samples.points),
         ];
         let n_groups = groups(THREADS_PER_RAY * slot.n_rays, 64);
-        list.dispatch(gpu, &pipelines.write_samples, n_groups, &[&shared[..], &written].concat());
+        list.dispatch(
+            gpu,
+            &pipelines.write_samples,
+            n_groups,
+            &[&shared[..], &written].concat(),
+        );
     }
 
     /// Updates a subset of the occupancy cells. Overwrites the batch.
-    pub(crate) fn occupancy_update(&self, list: &mut Passes, occupancy: &Occupancy, moments: &FieldMoments) {
-        let Self { gpu, pipelines, samples, .. } = *self;
-        let Occupancy { cell_occupancy, occupancy_update, n_points, .. } = occupancy;
-        let (occupancy_update, steps) = (("occupancy_update", occupancy_update), ("steps", &moments.steps));
+    pub(crate) fn occupancy_update(
+        &self,
+        list: &mut Passes,
+        occupancy: &Occupancy,
+        moments: &FieldMoments,
+    ) {
+        let Self {
+            gpu,
+            pipelines,
+            samples,
+            ..
+        } = *self;
+        let Occupancy {
+            cell_occupancy,
+            occupancy_update,
+            n_points,
+            ..
+        } = occupancy;
+        let (occupancy_update, steps) = (
+            ("occupancy_update", occupancy_update),
+            ("steps", &moments.steps),
+        );
         let n_point_groups = groups(*n_points, 64);
-        let sampled = [occupancy_update, steps, ("batch", &samples.batch), ("points", &samples.points)];
+        let sampled = [
+            occupancy_update,
+            steps,
+            ("batch", &samples.batch),
+            ("points", &samples.points),
+        ];
         list.dispatch(gpu, &pipelines.sample_cells, n_point_groups, &sampled);
         self.densities(list);
         let cell_occupancy = ("cell_occupancy", cell_occupancy);
@@ -135,53 +191,116 @@ impl FieldPasses<'_> {
             gpu,
             &pipelines.update_cells,
             n_point_groups,
-            &[occupancy_update, steps, ("log_density", &samples.log_density), cell_occupancy],
+            &[
+                occupancy_update,
+                steps,
+                ("log_density", &samples.log_density),
+                cell_occupancy,
+            ],
         );
         self.mark_occupied_cells(list, occupancy, moments);
     }
 
     /// Applies hints from depth, see [`super::carve::hints`].
-    pub(crate) fn hint(&self, list: &mut Passes, occupancy: &Occupancy, moments: &FieldMoments, hints: &Buffer) {
+    pub(crate) fn hint(
+        &self,
+        list: &mut Passes,
+        occupancy: &Occupancy,
+        moments: &FieldMoments,
+        hints: &Buffer,
+    ) {
         for kernel in &self.pipelines.hint_cells {
             let n_groups = (hints.bytes() / 4).div_ceil(64);
             list.dispatch(
                 self.gpu,
                 kernel,
                 n_groups,
-                &[("hints", hints), ("cell_occupancy", &occupancy.cell_occupancy)],
+                &[
+                    ("hints", hints),
+                    ("cell_occupancy", &occupancy.cell_occupancy),
+                ],
             );
         }
         self.mark_occupied_cells(list, occupancy, moments);
     }
 
     /// Marks the cells in which rays are sampled.
-    pub(crate) fn mark_occupied_cells(&self, list: &mut Passes, occupancy: &Occupancy, moments: &FieldMoments) {
+    pub(crate) fn mark_occupied_cells(
+        &self,
+        list: &mut Passes,
+        occupancy: &Occupancy,
+        moments: &FieldMoments,
+    ) {
         let Self { gpu, pipelines, .. } = *self;
-        let Occupancy { occupied, cell_occupancy, occupancy_sum, occupancy_update, n_cells, .. } = occupancy;
-        let (cell_occupancy, steps) = (("cell_occupancy", cell_occupancy), ("steps", &moments.steps));
+        let Occupancy {
+            occupied,
+            cell_occupancy,
+            occupancy_sum,
+            occupancy_update,
+            n_cells,
+            ..
+        } = occupancy;
+        let (cell_occupancy, steps) = (
+            ("cell_occupancy", cell_occupancy),
+            ("steps", &moments.steps),
+        );
         list.clear(occupancy_sum);
-        let (sum, n_word_groups) = (("occupancy_sum", occupancy_sum), groups(n_cells.pow(3) / 32, 64));
-        list.dispatch(gpu, &pipelines.sum_cells, n_word_groups, &[cell_occupancy, sum]);
+        let (sum, n_word_groups) = (
+            ("occupancy_sum", occupancy_sum),
+            groups(n_cells.pow(3) / 32, 64),
+        );
+        list.dispatch(
+            gpu,
+            &pipelines.sum_cells,
+            n_word_groups,
+            &[cell_occupancy, sum],
+        );
         let occupancy_update = ("occupancy_update", occupancy_update);
-        let marked = [occupancy_update, cell_occupancy, sum, ("occupied", occupied), steps];
+        let marked = [
+            occupancy_update,
+            cell_occupancy,
+            sum,
+            ("occupied", occupied),
+            steps,
+        ];
         list.dispatch(gpu, &pipelines.mark_cells, n_word_groups, &marked);
         let n_words = 2 * n_box_words(*n_cells);
-        list.dispatch(gpu, &pipelines.mark_blocks, groups(n_words, 64), &[occupancy_update, ("occupied", occupied)]);
+        list.dispatch(
+            gpu,
+            &pipelines.mark_blocks,
+            groups(n_words, 64),
+            &[occupancy_update, ("occupied", occupied)],
+        );
     }
 
     /// Converts the current weights to the number type of the layers.
     pub(crate) fn convert_weights(&self, list: &mut Passes) {
-        let Self { gpu, pipelines, field, .. } = *self;
+        let Self {
+            gpu,
+            pipelines,
+            field,
+            ..
+        } = *self;
         if let (Some(kernel), Some(half)) = (&pipelines.weights_to_half, &field.half_weights) {
             let n_groups = (half.bytes() / 16).div_ceil(64);
-            list.dispatch(gpu, kernel, n_groups, &[("weights", &field.weights), ("half_weights", half)]);
+            list.dispatch(
+                gpu,
+                kernel,
+                n_groups,
+                &[("weights", &field.weights), ("half_weights", half)],
+            );
         }
     }
 
     /// Converts weights and grid to the precision used for rendering.
     pub(crate) fn convert_for_picture(&self, list: &mut Passes, canvas: &Canvas) {
         self.convert_weights(list);
-        let Self { gpu, pipelines, field, .. } = *self;
+        let Self {
+            gpu,
+            pipelines,
+            field,
+            ..
+        } = *self;
         let n_groups = (canvas.packed_grid.bytes() / 8).div_ceil(256);
         let packed = [("grid", &field.grid), ("packed_grid", &canvas.packed_grid)];
         list.dispatch(gpu, &pipelines.pack_grid, n_groups, &packed);
@@ -193,31 +312,64 @@ impl FieldPasses<'_> {
         self.networks(
             list,
             &self.pipelines.densities,
-            [&self.samples.batch, &self.field.grid, &self.samples.spans, unused, unused],
+            [
+                &self.samples.batch,
+                &self.field.grid,
+                &self.samples.spans,
+                unused,
+                unused,
+            ],
         );
     }
 
-    /// Density and color of every sample, before the exponential and the sigmoid, and everything needed for the
-    /// backward pass. Run after [`FieldPasses::convert_weights`].
+    /// Density and color of every sample, before the exponential and the sigmoid, and everything
+    /// needed for the backward pass. Run after [`FieldPasses::convert_weights`].
     pub(crate) fn forward(&self, list: &mut Passes, step: &StepBuffers) {
         let SampleBuffers { batch, spans, .. } = self.samples;
         self.networks(
             list,
             &self.pipelines.forward,
-            [batch, &self.field.grid, spans, &step.activations, &self.field.unused_buffer],
+            [
+                batch,
+                &self.field.grid,
+                spans,
+                &step.activations,
+                &self.field.unused_buffer,
+            ],
         );
     }
 
-    /// Densities of a picture's samples, and the selection of those whose colors contribute to their rays. Run after
-    /// [`FieldPasses::find`].
+    /// Densities of a picture's samples, and the selection of those whose colors contribute to
+    /// their rays. Run after [`FieldPasses::find`].
     pub(crate) fn select(&self, list: &mut Passes, canvas: &Canvas) {
-        let Self { gpu, pipelines, field, samples, slot, .. } = *self;
-        let Canvas { light, packed_grid, geometry, selected, selected_spans, selected_weights, .. } = canvas;
+        let Self {
+            gpu,
+            pipelines,
+            field,
+            samples,
+            slot,
+            ..
+        } = *self;
+        let Canvas {
+            light,
+            packed_grid,
+            geometry,
+            selected,
+            selected_spans,
+            selected_weights,
+            ..
+        } = canvas;
         let unused = &field.unused_buffer;
         self.networks(
             list,
             &pipelines.picture_densities,
-            [&samples.batch, packed_grid, &samples.spans, unused, geometry],
+            [
+                &samples.batch,
+                packed_grid,
+                &samples.spans,
+                unused,
+                geometry,
+            ],
         );
         list.clear_range(selected, N_SAMPLES_BYTES);
         let composited = [
@@ -231,21 +383,44 @@ impl FieldPasses<'_> {
             ("selected_weights", selected_weights),
             ("batch", &samples.batch),
         ];
-        list.dispatch(gpu, &pipelines.select_samples, groups(slot.n_rays, 256), &composited);
+        list.dispatch(
+            gpu,
+            &pipelines.select_samples,
+            groups(slot.n_rays, 256),
+            &composited,
+        );
     }
 
     /// Colors of the selected samples. Run after [`FieldPasses::select`].
     pub(crate) fn picture_colors(&self, list: &mut Passes, canvas: &Canvas) {
-        let Self { pipelines, field, .. } = *self;
-        let Canvas { packed_grid, geometry, selected, selected_spans, .. } = canvas;
+        let Self {
+            pipelines, field, ..
+        } = *self;
+        let Canvas {
+            packed_grid,
+            geometry,
+            selected,
+            selected_spans,
+            ..
+        } = canvas;
         let unused = &field.unused_buffer;
-        self.networks(list, &pipelines.picture_colors, [selected, packed_grid, selected_spans, unused, geometry]);
+        self.networks(
+            list,
+            &pipelines.picture_colors,
+            [selected, packed_grid, selected_spans, unused, geometry],
+        );
     }
 
     /// Like [`FieldPasses::picture_colors`], but with the colors of all samples.
     pub(crate) fn all_picture_colors(&self, list: &mut Passes, canvas: &Canvas) {
         let SampleBuffers { batch, spans, .. } = self.samples;
-        let buffers = [batch, &canvas.packed_grid, spans, &self.field.unused_buffer, &canvas.geometry];
+        let buffers = [
+            batch,
+            &canvas.packed_grid,
+            spans,
+            &self.field.unused_buffer,
+            &canvas.geometry,
+        ];
         self.networks(list, &self.pipelines.picture_densities, buffers);
         self.networks(list, &self.pipelines.picture_colors, buffers);
     }
@@ -256,7 +431,14 @@ impl FieldPasses<'_> {
         pipeline: &Pipeline,
         [batch, grid, spans, activations, geometry]: [&Buffer; 5],
     ) {
-        let Self { gpu, field, samples, slot, image_params, .. } = *self;
+        let Self {
+            gpu,
+            field,
+            samples,
+            slot,
+            image_params,
+            ..
+        } = *self;
         let buffers = [
             ("batch", batch),
             ("levels", &field.levels),
@@ -271,12 +453,23 @@ impl FieldPasses<'_> {
             ("activations", activations),
             ("geometry", geometry),
         ];
-        list.dispatch(gpu, pipeline, groups(samples.n_samples, N_TILE).min(MAX_NETWORK_GROUPS), &buffers);
+        list.dispatch(
+            gpu,
+            pipeline,
+            groups(samples.n_samples, N_TILE).min(MAX_NETWORK_GROUPS),
+            &buffers,
+        );
     }
 
     /// Finds the next samples of a picture's rays, outside erased space.
     pub(crate) fn find(&self, list: &mut Passes, occupancy: &Occupancy, erased: &Buffer) {
-        let Self { gpu, pipelines, samples, slot, .. } = *self;
+        let Self {
+            gpu,
+            pipelines,
+            samples,
+            slot,
+            ..
+        } = *self;
         list.clear_range(&samples.batch, N_SAMPLES_BYTES);
         let found = [
             ("march", &slot.march),
@@ -287,7 +480,12 @@ impl FieldPasses<'_> {
             ("points", &samples.points),
             ("erased", erased),
         ];
-        list.dispatch(gpu, &pipelines.find_samples, groups(slot.n_rays, 256), &found);
+        list.dispatch(
+            gpu,
+            &pipelines.find_samples,
+            groups(slot.n_rays, 256),
+            &found,
+        );
     }
 
     /// The rays of a picture, what they have accumulated, and their view.
@@ -303,21 +501,50 @@ impl FieldPasses<'_> {
 
     /// Keeps the distances at which the weights of the rays first reach 1/64.
     pub(crate) fn keep_fronts(&self, list: &mut Passes, canvas: &Canvas) {
-        let Self { gpu, pipelines, slot, .. } = *self;
-        let kept = [&self.picture_bindings(canvas)[..], &[("fronts", &canvas.fronts)]].concat();
+        let Self {
+            gpu,
+            pipelines,
+            slot,
+            ..
+        } = *self;
+        let kept = [
+            &self.picture_bindings(canvas)[..],
+            &[("fronts", &canvas.fronts)],
+        ]
+        .concat();
         list.dispatch(gpu, &pipelines.keep_fronts, groups(slot.n_rays, 64), &kept);
     }
 
     /// Generates the rays of a picture's pixels.
     pub(crate) fn picture_rays(&self, list: &mut Passes, canvas: &Canvas) {
-        let Self { gpu, pipelines, slot, .. } = *self;
-        let posed = [&self.picture_bindings(canvas)[..], &[("fronts", &canvas.fronts)]].concat();
-        list.dispatch(gpu, &pipelines.picture_rays, groups(slot.n_rays, 64), &posed);
+        let Self {
+            gpu,
+            pipelines,
+            slot,
+            ..
+        } = *self;
+        let posed = [
+            &self.picture_bindings(canvas)[..],
+            &[("fronts", &canvas.fronts)],
+        ]
+        .concat();
+        list.dispatch(
+            gpu,
+            &pipelines.picture_rays,
+            groups(slot.n_rays, 64),
+            &posed,
+        );
     }
 
     /// Writes the pixels of the rays. Run after [`FieldPasses::picture_colors`].
     pub(crate) fn show(&self, list: &mut Passes, canvas: &Canvas) {
-        let Self { gpu, pipelines, samples, slot, .. } = *self;
+        let Self {
+            gpu,
+            pipelines,
+            samples,
+            slot,
+            ..
+        } = *self;
         let colored = [
             ("backdrop", &canvas.backdrop),
             ("selected_weights", &canvas.selected_weights),
@@ -331,15 +558,42 @@ impl FieldPasses<'_> {
 
     /// Corrects the rays by the optimized poses of their images.
     pub(crate) fn apply_pose(&self, list: &mut Passes) {
-        let Self { gpu, pipelines, samples, slot, image_params, .. } = *self;
-        let posed = [("batch", &samples.batch), ("image_params", image_params), ("rays", &slot.rays)];
+        let Self {
+            gpu,
+            pipelines,
+            samples,
+            slot,
+            image_params,
+            ..
+        } = *self;
+        let posed = [
+            ("batch", &samples.batch),
+            ("image_params", image_params),
+            ("rays", &slot.rays),
+        ];
         list.dispatch(gpu, &pipelines.apply_poses, groups(slot.n_rays, 64), &posed);
     }
 
     /// Gradients with respect to the poses of rays. Run after [`FieldPasses::backward`].
-    pub(crate) fn pose_gradients(&self, list: &mut Passes, step: &StepBuffers, images: &ImageParamBuffers) {
-        let Self { gpu, pipelines, field, samples, slot, .. } = *self;
-        let (batch, rays, spans) = (("batch", &samples.batch), ("rays", &slot.rays), ("spans", &samples.spans));
+    pub(crate) fn pose_gradients(
+        &self,
+        list: &mut Passes,
+        step: &StepBuffers,
+        images: &ImageParamBuffers,
+    ) {
+        let Self {
+            gpu,
+            pipelines,
+            field,
+            samples,
+            slot,
+            ..
+        } = *self;
+        let (batch, rays, spans) = (
+            ("batch", &samples.batch),
+            ("rays", &slot.rays),
+            ("spans", &samples.spans),
+        );
         let v_points = ("v_points", &images.v_points);
         let looked_up = [
             batch,
@@ -351,27 +605,64 @@ impl FieldPasses<'_> {
             ("v_activations", &step.v_activations),
             v_points,
         ];
-        list.dispatch(gpu, &pipelines.point_gradients, groups(samples.n_samples, 64), &looked_up);
+        list.dispatch(
+            gpu,
+            &pipelines.point_gradients,
+            groups(samples.n_samples, 64),
+            &looked_up,
+        );
         let summed = [batch, rays, spans, v_points, ("v_rays", &images.v_rays)];
-        list.dispatch(gpu, &pipelines.ray_gradients, groups(slot.n_rays, 64), &summed);
+        list.dispatch(
+            gpu,
+            &pipelines.ray_gradients,
+            groups(slot.n_rays, 64),
+            &summed,
+        );
     }
 
     /// Gradients of samples with respect to the appearance embeddings of their images. Run after
     /// [`FieldPasses::backward`].
-    pub(crate) fn embedding_gradients(&self, list: &mut Passes, step: &StepBuffers, images: &ImageParamBuffers) {
-        let Self { gpu, pipelines, field, samples, .. } = *self;
+    pub(crate) fn embedding_gradients(
+        &self,
+        list: &mut Passes,
+        step: &StepBuffers,
+        images: &ImageParamBuffers,
+    ) {
+        let Self {
+            gpu,
+            pipelines,
+            field,
+            samples,
+            ..
+        } = *self;
         let carried = [
             ("batch", &samples.batch),
             ("weights", &field.weights),
             ("v_activations", &step.v_activations),
             ("v_embeddings", &images.v_embeddings),
         ];
-        list.dispatch(gpu, &pipelines.embedding_gradients, groups(samples.n_samples, 64), &carried);
+        list.dispatch(
+            gpu,
+            &pipelines.embedding_gradients,
+            groups(samples.n_samples, 64),
+            &carried,
+        );
     }
 
     /// One optimizer step for the parameters of all images. Run after their gradients.
-    pub(crate) fn update_images(&self, list: &mut Passes, moments: &FieldMoments, images: &ImageParamBuffers) {
-        let Self { gpu, pipelines, samples, slot, .. } = *self;
+    pub(crate) fn update_images(
+        &self,
+        list: &mut Passes,
+        moments: &FieldMoments,
+        images: &ImageParamBuffers,
+    ) {
+        let Self {
+            gpu,
+            pipelines,
+            samples,
+            slot,
+            ..
+        } = *self;
         let learned = [
             ("batch", &samples.batch),
             ("rule", &images.rule),
@@ -381,12 +672,24 @@ impl FieldPasses<'_> {
             ("v_embeddings", &images.v_embeddings),
             ("image_params", &images.image_params),
         ];
-        list.dispatch(gpu, &pipelines.update_images, images.n_images.into(), &learned);
+        list.dispatch(
+            gpu,
+            &pipelines.update_images,
+            images.n_images.into(),
+            &learned,
+        );
     }
 
-    /// Color and loss of every ray, and the gradients with respect to its samples. Run after [`FieldPasses::forward`].
+    /// Color and loss of every ray, and the gradients with respect to its samples. Run after
+    /// [`FieldPasses::forward`].
     pub(crate) fn composite(&self, list: &mut Passes, step: &StepBuffers) {
-        let Self { gpu, pipelines, samples, slot, .. } = *self;
+        let Self {
+            gpu,
+            pipelines,
+            samples,
+            slot,
+            ..
+        } = *self;
         let composited = [
             ("batch", &samples.batch),
             ("loss", &slot.loss),
@@ -399,17 +702,39 @@ impl FieldPasses<'_> {
             ("v_log_density", &step.v_log_density),
             ("v_colors", &step.v_colors),
         ];
-        list.dispatch(gpu, &pipelines.composite, groups(slot.n_rays, 64), &composited);
+        list.dispatch(
+            gpu,
+            &pipelines.composite,
+            groups(slot.n_rays, 64),
+            &composited,
+        );
     }
 
     /// Loss of every ray, and the gradients with respect to all parameters of the field. Run after
     /// [`FieldPasses::forward`].
-    pub(crate) fn backward(&self, list: &mut Passes, step: &StepBuffers, gradients: &FieldGradients) {
-        let Self { gpu, pipelines, field, samples, .. } = *self;
+    pub(crate) fn backward(
+        &self,
+        list: &mut Passes,
+        step: &StepBuffers,
+        gradients: &FieldGradients,
+    ) {
+        let Self {
+            gpu,
+            pipelines,
+            field,
+            samples,
+            ..
+        } = *self;
         self.composite(list, step);
         let batch = ("batch", &samples.batch);
-        let (v_log_density, v_colors) = (("v_log_density", &step.v_log_density), ("v_colors", &step.v_colors));
-        let (activations, v_activations) = (("activations", &step.activations), ("v_activations", &step.v_activations));
+        let (v_log_density, v_colors) = (
+            ("v_log_density", &step.v_log_density),
+            ("v_colors", &step.v_colors),
+        );
+        let (activations, v_activations) = (
+            ("activations", &step.activations),
+            ("v_activations", &step.v_activations),
+        );
         let carried = [
             batch,
             ("levels", &field.levels),
@@ -423,14 +748,29 @@ impl FieldPasses<'_> {
             ("v_grid", &gradients.grid),
             ("counts", &gradients.counts),
         ];
-        list.dispatch(gpu, &pipelines.field_backward, groups(samples.n_samples, N_TILE), &carried);
+        list.dispatch(
+            gpu,
+            &pipelines.field_backward,
+            groups(samples.n_samples, N_TILE),
+            &carried,
+        );
         let n_chunks = groups(samples.n_samples, N_TILE * CHUNK_TILES);
-        let summed = [batch, activations, v_activations, ("partial_sums", &step.partial_sums)];
-        list.dispatch(gpu, &pipelines.weight_gradients, N_LAYERS * n_chunks, &summed);
+        let summed = [
+            batch,
+            activations,
+            v_activations,
+            ("partial_sums", &step.partial_sums),
+        ];
+        list.dispatch(
+            gpu,
+            &pipelines.weight_gradients,
+            N_LAYERS * n_chunks,
+            &summed,
+        );
     }
 
-    /// One optimizer step, with separate rules for grid and weights. Resets the gradients of the grid to zero. Run
-    /// after [`FieldPasses::backward`].
+    /// One optimizer step, with separate rules for grid and weights. Resets the gradients of the
+    /// grid to zero. Run after [`FieldPasses::backward`].
     pub(crate) fn update(
         &self,
         list: &mut Passes,
@@ -439,8 +779,17 @@ impl FieldPasses<'_> {
         gradients: &FieldGradients,
         moments: &FieldMoments,
     ) {
-        let Self { gpu, pipelines, field, samples, .. } = *self;
-        let (steps, step_scale) = (("steps", &moments.steps), ("step_scale", &moments.step_scale));
+        let Self {
+            gpu,
+            pipelines,
+            field,
+            samples,
+            ..
+        } = *self;
+        let (steps, step_scale) = (
+            ("steps", &moments.steps),
+            ("step_scale", &moments.step_scale),
+        );
         let weighed = [
             ("rule", weights_rule),
             step_scale,
@@ -449,7 +798,12 @@ impl FieldPasses<'_> {
             ("weights", &field.weights),
             ("moments", &moments.weights),
         ];
-        list.dispatch(gpu, &pipelines.update_weights, (field.weights.bytes() / 16).div_ceil(16), &weighed);
+        list.dispatch(
+            gpu,
+            &pipelines.update_weights,
+            (field.weights.bytes() / 16).div_ceil(16),
+            &weighed,
+        );
         let (scales, largest) = (("scales", &gradients.scales), ("largest", &moments.largest));
         let learned = [
             ("rule", grid_rule),
@@ -461,12 +815,24 @@ impl FieldPasses<'_> {
             ("moments", &moments.grid),
             ("v_grid", &gradients.grid),
         ];
-        list.dispatch(gpu, &pipelines.update_grid, groups(field.n_entries, 256), &learned);
+        list.dispatch(
+            gpu,
+            &pipelines.update_grid,
+            groups(field.n_entries, 256),
+            &learned,
+        );
         list.dispatch(
             gpu,
             &pipelines.end_step,
             1,
-            &[("rule", grid_rule), steps, step_scale, scales, largest, ("counts", &gradients.counts)],
+            &[
+                ("rule", grid_rule),
+                steps,
+                step_scale,
+                scales,
+                largest,
+                ("counts", &gradients.counts),
+            ],
         );
     }
 }

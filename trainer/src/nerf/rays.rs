@@ -1,4 +1,5 @@
-//! Training rays: pixels of all keyframes, chosen by a hash of seed, step and position in the batch.
+//! Training rays: pixels of all keyframes, chosen by a hash of seed, step and position in the
+//! batch.
 
 use super::extent::Extent;
 use super::params;
@@ -17,8 +18,8 @@ const MAX_ATTEMPTS: u64 = 4;
 /// End of rays without a reading. Contraction leaves no resolution far beyond this distance.
 const MAX_DISTANCE: f32 = 1e3;
 
-/// Distance behind a reading up to which a ray is sampled: an offset in units of the scene radius, and a fraction of
-/// the reading's distance. The space farther back is unobserved.
+/// Distance behind a reading up to which a ray is sampled: an offset in units of the scene radius,
+/// and a fraction of the reading's distance. The space farther back is unobserved.
 const BEHIND_SURFACE: f64 = 0.03;
 const BEHIND_SURFACE_FRAC: f64 = 0.03;
 
@@ -26,39 +27,62 @@ const BEHIND_SURFACE_FRAC: f64 = 0.03;
 #[derive(Clone, Debug)]
 pub(crate) struct RayImage {
     pub(crate) keyframe: Arc<Keyframe>,
-    /// Depth of each pixel, meters along z; 0 where unknown; empty without depth. Computed on first use.
+    /// Depth of each pixel, meters along z; 0 where unknown; empty without depth. Computed on first
+    /// use.
     depth_m: OnceLock<Arc<[f32]>>,
 }
 
 impl RayImage {
     pub(crate) fn new(keyframe: Arc<Keyframe>) -> Self {
-        Self { keyframe, depth_m: OnceLock::new() }
+        Self {
+            keyframe,
+            depth_m: OnceLock::new(),
+        }
     }
 
     pub(crate) fn depth_m(&self) -> &[f32] {
-        self.depth_m.get_or_init(|| depth_in_color_view(&self.keyframe))
+        self.depth_m
+            .get_or_init(|| depth_in_color_view(&self.keyframe))
     }
 
-    /// Origin, direction of length 1, and measured distance along the ray (0 if there is no reading), in units of the
-    /// extent's radius.
+    /// Origin, direction of length 1, and measured distance along the ray (0 if there is no
+    /// reading), in units of the extent's radius.
     pub(crate) fn reading(&self, extent: &Extent, pixel_ix: usize) -> ([f64; 3], [f64; 3], f64) {
-        let Keyframe { size_px: [width, height], focal_px, principal_px, .. } = &*self.keyframe;
+        let Keyframe {
+            size_px: [width, height],
+            focal_px,
+            principal_px,
+            ..
+        } = &*self.keyframe;
         let (x, y) = (pixel_ix % *width as usize, pixel_ix / *width as usize);
-        let along = |pixel: usize, axis: usize| (pixel as f64 + 0.5 - principal_px[axis]) / focal_px[axis];
+        let along =
+            |pixel: usize, axis: usize| (pixel as f64 + 0.5 - principal_px[axis]) / focal_px[axis];
         let mut in_camera = Vector3::new(along(x, 0), along(y, 1), 1.0);
         let mut origin_m = Vector3::zeros();
         if let Some(twist) = &self.keyframe.twist {
-            // The camera motion moves a point by -tau (v + w x p) in the camera; the ray applies the inverse.
-            let tau_secs = ((y as f64 + 0.5) / f64::from(*height) - 0.5) * self.keyframe.readout_secs;
+            // The camera motion moves a point by -tau (v + w x p) in the camera; the ray applies
+            // the inverse.
+            let tau_secs =
+                ((y as f64 + 0.5) / f64::from(*height) - 0.5) * self.keyframe.readout_secs;
             in_camera += twist.angular_rad_s.cross(&in_camera) * tau_secs;
             origin_m = twist.linear_m_s * tau_secs;
         }
         let pose = &self.keyframe.world_from_camera;
-        let origin = (pose * nalgebra::Point3::from(origin_m)).coords - Vector3::from(extent.center_m);
-        let z_m = self.depth_m().get(pixel_ix).copied().filter(|z| z.is_finite()).unwrap_or(0.0);
+        let origin =
+            (pose * nalgebra::Point3::from(origin_m)).coords - Vector3::from(extent.center_m);
+        let z_m = self
+            .depth_m()
+            .get(pixel_ix)
+            .copied()
+            .filter(|z| z.is_finite())
+            .unwrap_or(0.0);
         let length = in_camera.norm();
         let distance = f64::from(z_m) * length / extent.radius_m;
-        ((origin / extent.radius_m).into(), (pose.rotation * (in_camera / length)).into(), distance.max(0.0))
+        (
+            (origin / extent.radius_m).into(),
+            (pose.rotation * (in_camera / length)).into(),
+            distance.max(0.0),
+        )
     }
 
     /// The ray through the center of a pixel, with the color and depth observed there.
@@ -101,20 +125,35 @@ pub(crate) fn draw(images: &[RayImage], extent: &Extent, draw: &RaySampling) -> 
     let ray = |ix: u64| {
         let ray_key = hash(key ^ hash(ix));
         let share = (ix as f64 + unit_from_bits(ray_key)) / f64::from(draw.n_rays);
-        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a fraction of a length")]
+        #[expect(
+            clippy::cast_possible_truncation,
+            clippy::cast_sign_loss,
+            reason = "a fraction of a length"
+        )]
         let image_ix = ((share * images.len() as f64) as usize).min(images.len() - 1);
         let image = &images[image_ix];
         let n_pixels = image.keyframe.rgba_srgb.len() as u64 / 4;
         let pick = |attempt: u64| {
             let word = hash(ray_key.wrapping_add(1 + attempt));
             // The upper half of a 64-bit product: uniform over all pixels.
-            usize::try_from((u128::from(word) * u128::from(n_pixels)) >> 64).expect("less than a length")
+            usize::try_from((u128::from(word) * u128::from(n_pixels)) >> 64)
+                .expect("less than a length")
         };
         let is_unmasked = |pixel_ix: &usize| image.keyframe.rgba_srgb[4 * pixel_ix + 3] > 0;
-        let pixel_ix = (0..MAX_ATTEMPTS).map(pick).find(is_unmasked).unwrap_or_else(|| pick(0));
+        let pixel_ix = (0..MAX_ATTEMPTS)
+            .map(pick)
+            .find(is_unmasked)
+            .unwrap_or_else(|| pick(0));
         let jitter = f32_of(unit_from_bits(hash(ray_key ^ 0x5bd1_e995)));
         let embedding = u32::try_from(image_ix).expect("few images");
-        params::Ray { embedding, ..image.ray(extent, pixel_ix, draw.begin, jitter) }
+        params::Ray {
+            embedding,
+            ..image.ray(extent, pixel_ix, draw.begin, jitter)
+        }
     };
-    (0..draw.n_rays).into_par_iter().with_min_len(RAYS_PER_TASK).map(|ix| ray(ix.into())).collect()
+    (0..draw.n_rays)
+        .into_par_iter()
+        .with_min_len(RAYS_PER_TASK)
+        .map(|ix| ray(ix.into()))
+        .collect()
 }

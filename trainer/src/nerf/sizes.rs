@@ -14,7 +14,8 @@ const N_CELLS_COARSEST: u32 = 16;
 const LEVEL_GROWTH: f64 = 1.5;
 /// Width of the finest cells in pixels. Finer cells would fit noise.
 const PIXELS_PER_CELL: f64 = 1.5;
-/// Pixels of an image per entry of a level. Images overlap, and surfaces occupy few cells of a level.
+/// Pixels of an image per entry of a level. Images overlap, and surfaces occupy few cells of a
+/// level.
 const PIXELS_PER_ENTRY: f64 = 0.5;
 /// Limits of the number of levels.
 pub(crate) const MIN_LEVELS: u32 = 4;
@@ -39,7 +40,8 @@ pub(crate) struct Sizes {
     pub(crate) nerf_budget: NerfBudget,
 }
 
-/// Whether most images have depth for most pixels. If so, few cells are occupied, and refining them costs little.
+/// Whether most images have depth for most pixels. If so, few cells are occupied, and refining them
+/// costs little.
 fn has_dense_depth<'a>(keyframes: impl Iterator<Item = &'a Keyframe>) -> bool {
     /// Only every `STRIDE`-th reading is checked.
     const STRIDE: usize = 61;
@@ -47,12 +49,15 @@ fn has_dense_depth<'a>(keyframes: impl Iterator<Item = &'a Keyframe>) -> bool {
         let readings = depth.depth_m.iter().step_by(STRIDE);
         2 * readings.clone().filter(|z| **z > 0.0).count() > readings.count()
     };
-    let known: Vec<bool> = keyframes.map(|keyframe| keyframe.depth.as_ref().is_some_and(is_known)).collect();
+    let known: Vec<bool> = keyframes
+        .map(|keyframe| keyframe.depth.as_ref().is_some_and(is_known))
+        .collect();
     2 * known.iter().filter(|is_known| **is_known).count() > known.len()
 }
 
 impl Sizes {
-    /// Chooses levels down to the size of a pixel, and an entry count for the pixels of an image, within the limits.
+    /// Chooses levels down to the size of a pixel, and an entry count for the pixels of an image,
+    /// within the limits.
     pub(crate) fn choose<'a>(
         options: &ModelOptions<NerfOptions>,
         nerf_budget: NerfBudget,
@@ -62,16 +67,34 @@ impl Sizes {
     ) -> Result<Self, Error> {
         // The unit cube covers four radii at the scale of the inner cube.
         let cell_m = PIXELS_PER_CELL * pixel_size_m(keyframes.clone(), extent);
-        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped")]
+        #[expect(
+            clippy::cast_possible_truncation,
+            clippy::cast_sign_loss,
+            reason = "clamped"
+        )]
         let finest = (4.0 * extent.radius_m / cell_m).clamp(64.0, 8192.0) as u32;
-        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a few")]
-        let n_levels = 1 + (f64::from(finest / N_CELLS_COARSEST).ln() / LEVEL_GROWTH.ln()).ceil() as u32;
+        #[expect(
+            clippy::cast_possible_truncation,
+            clippy::cast_sign_loss,
+            reason = "a few"
+        )]
         let n_levels =
-            n_levels.next_multiple_of(2).clamp(MIN_LEVELS, nerf_budget.max_levels.clamp(MIN_LEVELS, MAX_LEVELS));
+            1 + (f64::from(finest / N_CELLS_COARSEST).ln() / LEVEL_GROWTH.ln()).ceil() as u32;
+        let n_levels = n_levels.next_multiple_of(2).clamp(
+            MIN_LEVELS,
+            nerf_budget.max_levels.clamp(MIN_LEVELS, MAX_LEVELS),
+        );
         let has_depth = keyframes.clone().any(|keyframe| keyframe.depth.is_some());
         let can_refine = nerf_budget.refined() != nerf_budget && has_dense_depth(keyframes.clone());
-        let n_pixels = keyframes.map(|keyframe| keyframe.rgba_srgb.len() / 4).max().unwrap_or(0);
-        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a logarithm")]
+        let n_pixels = keyframes
+            .map(|keyframe| keyframe.rgba_srgb.len() / 4)
+            .max()
+            .unwrap_or(0);
+        #[expect(
+            clippy::cast_possible_truncation,
+            clippy::cast_sign_loss,
+            reason = "a logarithm"
+        )]
         let entries_for_pixels = (n_pixels.max(1) as f64 / PIXELS_PER_ENTRY).log2().ceil() as u32;
         let max_log2_entries_allowed = nerf_budget.max_log2_entries.max(MIN_LOG2_ENTRIES);
         let mut log2_entries = entries_for_pixels.clamp(MIN_LOG2_ENTRIES, max_log2_entries_allowed);
@@ -79,27 +102,48 @@ impl Sizes {
         loop {
             let shape = GridShape::between(N_CELLS_COARSEST, finest, n_levels, log2_entries);
             let n_entries = u64::from(shape.n_entries_total());
-            let fits =
-                n_entries * BYTES_PER_ENTRY <= max_bytes && n_entries * MOMENT_BYTES_PER_ENTRY <= max_binding_bytes;
+            let fits = n_entries * BYTES_PER_ENTRY <= max_bytes
+                && n_entries * MOMENT_BYTES_PER_ENTRY <= max_binding_bytes;
             if fits {
-                return Ok(Self { n_cells: shape.n_cells, log2_entries, has_depth, can_refine, nerf_budget });
+                return Ok(Self {
+                    n_cells: shape.n_cells,
+                    log2_entries,
+                    has_depth,
+                    can_refine,
+                    nerf_budget,
+                });
             }
             if log2_entries == MIN_LOG2_ENTRIES {
                 let min_bytes = n_entries * BYTES_PER_ENTRY;
-                return Err(Error::BudgetTooSmall { model: "neural field", max_bytes, min_bytes });
+                return Err(Error::BudgetTooSmall {
+                    model: "neural field",
+                    max_bytes,
+                    min_bytes,
+                });
             }
             log2_entries -= 1;
         }
     }
 
     pub(crate) fn shape(&self) -> GridShape {
-        GridShape { n_cells: self.n_cells.clone(), log2_entries: self.log2_entries }
+        GridShape {
+            n_cells: self.n_cells.clone(),
+            log2_entries: self.log2_entries,
+        }
     }
 
     /// Fails if a field cannot have these sizes.
     pub(crate) fn check(&self) -> Result<(), Error> {
-        let NerfBudget { n_rays, n_samples, n_hidden, n_cells, n_steps, picture_rays, max_levels, .. } =
-            self.nerf_budget;
+        let NerfBudget {
+            n_rays,
+            n_samples,
+            n_hidden,
+            n_cells,
+            n_steps,
+            picture_rays,
+            max_levels,
+            ..
+        } = self.nerf_budget;
         let is_increasing = self.n_cells.windows(2).all(|pair| pair[0] <= pair[1]);
         let is_usable = (1..=16).contains(&self.n_cells.len())
             && self.n_cells.iter().all(|n| (1..=1 << 20).contains(n))
@@ -116,7 +160,9 @@ impl Sizes {
         if is_usable {
             Ok(())
         } else {
-            Err(Error::CheckpointState { reason: format!("unsupported field sizes: {self:?}") })
+            Err(Error::CheckpointState {
+                reason: format!("unsupported field sizes: {self:?}"),
+            })
         }
     }
 }

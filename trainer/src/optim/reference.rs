@@ -1,7 +1,7 @@
 //! Plain CPU version of the optimizer in f64.
 //!
-//! Source: Kingma and Ba 2015, algorithm 1, with both bias corrections; one second moment for several parameters as in
-//! Zhang et al. 2024 (Adam-mini).
+//! Source: Kingma and Ba 2015, algorithm 1, with both bias corrections; one second moment for
+//! several parameters as in Zhang et al. 2024 (Adam-mini).
 
 /// Constants of Adam.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -17,7 +17,11 @@ pub struct Adam {
 impl Default for Adam {
     /// The constants of gsplat: `epsilon` is far below any gradient of a splat.
     fn default() -> Self {
-        Self { beta1: 0.9, beta2: 0.999, epsilon: 1e-15 }
+        Self {
+            beta1: 0.9,
+            beta2: 0.999,
+            epsilon: 1e-15,
+        }
     }
 }
 
@@ -32,7 +36,14 @@ pub struct Moments {
 
 impl Adam {
     /// Takes one step for a parameter at the given `rate`; `step` counts from 1.
-    pub fn update(&self, step: u32, rate: f64, param: &mut f64, gradient: f64, moments: &mut Moments) {
+    pub fn update(
+        &self,
+        step: u32,
+        rate: f64,
+        param: &mut f64,
+        gradient: f64,
+        moments: &mut Moments,
+    ) {
         moments.first = self.beta1 * moments.first + (1.0 - self.beta1) * gradient;
         moments.second = self.beta2 * moments.second + (1.0 - self.beta2) * gradient * gradient;
         let steps = f64::from(step);
@@ -44,7 +55,14 @@ impl Adam {
     /// Takes one step for several parameters, each at its own rate.
     ///
     /// All slices have the length of `params`.
-    pub fn update_all(&self, step: u32, rates: &[f64], params: &mut [f64], gradients: &[f64], moments: &mut [Moments]) {
+    pub fn update_all(
+        &self,
+        step: u32,
+        rates: &[f64],
+        params: &mut [f64],
+        gradients: &[f64],
+        moments: &mut [Moments],
+    ) {
         assert_eq!(
             [rates.len(), gradients.len(), moments.len()],
             [params.len(); 3],
@@ -55,9 +73,21 @@ impl Adam {
         }
     }
 
-    /// Takes one step for parameters that share one running mean of the squared gradient and have no first moment.
-    pub fn update_shared(&self, step: u32, rate: f64, params: &mut [f64], gradients: &[f64], second: &mut f64) {
-        let mean_square = gradients.iter().map(|gradient| gradient * gradient).sum::<f64>() / gradients.len() as f64;
+    /// Takes one step for parameters that share one running mean of the squared gradient and have
+    /// no first moment.
+    pub fn update_shared(
+        &self,
+        step: u32,
+        rate: f64,
+        params: &mut [f64],
+        gradients: &[f64],
+        second: &mut f64,
+    ) {
+        let mean_square = gradients
+            .iter()
+            .map(|gradient| gradient * gradient)
+            .sum::<f64>()
+            / gradients.len() as f64;
         *second = self.beta2 * *second + (1.0 - self.beta2) * mean_square;
         let unbiased = *second / (1.0 - self.beta2.powf(f64::from(step)));
         for (param, gradient) in params.iter_mut().zip(gradients) {
@@ -84,8 +114,12 @@ mod tests {
             // The bias-corrected means are weighted means of all previous gradients, newest first.
             let mean = |beta: f64, power: i32| {
                 let weight = |age: usize| beta.powi(i32::try_from(age).expect("a few steps"));
-                let sum: f64 =
-                    gradients[..=ix].iter().rev().enumerate().map(|(age, g)| weight(age) * g.powi(power)).sum();
+                let sum: f64 = gradients[..=ix]
+                    .iter()
+                    .rev()
+                    .enumerate()
+                    .map(|(age, g)| weight(age) * g.powi(power))
+                    .sum();
                 sum / (0..=ix).map(weight).sum::<f64>()
             };
             expected -= 0.01 * mean(0.9, 1) / mean(0.999, 2).sqrt();
@@ -96,12 +130,25 @@ mod tests {
 
     #[test]
     fn each_parameter_uses_its_own_rate() {
-        // The first step equals the rate for any gradient magnitude; a zero gradient changes nothing.
+        // The first step equals the rate for any gradient magnitude; a zero gradient changes
+        // nothing.
         let mut params = [1.0, 2.0, 3.0];
         let mut moments = [Moments::default(); 3];
-        Adam::default().update_all(1, &[0.1, 0.02, 0.5], &mut params, &[1e-6, -40.0, 0.0], &mut moments);
+        Adam::default().update_all(
+            1,
+            &[0.1, 0.02, 0.5],
+            &mut params,
+            &[1e-6, -40.0, 0.0],
+            &mut moments,
+        );
         let expected = [0.9, 2.02, 3.0];
-        assert!(params.iter().zip(expected).all(|(got, expected)| (got - expected).abs() < 1e-8), "{params:?}");
+        assert!(
+            params
+                .iter()
+                .zip(expected)
+                .all(|(got, expected)| (got - expected).abs() < 1e-8),
+            "{params:?}"
+        );
     }
 
     #[test]
@@ -112,6 +159,9 @@ mod tests {
             let rate = 0.05 * 0.997_f64.powf(f64::from(step));
             Adam::default().update_all(step, &[rate; 2], &mut params, &gradients, &mut moments);
         }
-        assert!((params[0] - 1.0).abs() < 1e-3 && (params[1] + 0.5).abs() < 1e-3, "{params:?}");
+        assert!(
+            (params[0] - 1.0).abs() < 1e-3 && (params[1] + 0.5).abs() < 1e-3,
+            "{params:?}"
+        );
     }
 }

@@ -1,5 +1,5 @@
-//! Packs pictures on the GPU for viewers: color as JPEG, depth as 16-bit counts at half resolution. This reduces the
-//! read-back to about a fifth, and the CPU no longer encodes.
+//! Packs pictures on the GPU for viewers: color as JPEG, depth as 16-bit counts at half resolution.
+//! This reduces the read-back to about a fifth, and the CPU no longer encodes.
 
 mod panorama;
 mod tables;
@@ -39,12 +39,18 @@ pub(crate) struct Output {
 impl Output {
     /// A pinhole picture with or without depth.
     pub(crate) fn picture(depth: bool) -> Self {
-        Self { format: Format::Picture { depth }, face: None }
+        Self {
+            format: Format::Picture { depth },
+            face: None,
+        }
     }
 
     /// A packed pinhole picture.
     pub(crate) fn packed(packing: Packing) -> Self {
-        Self { format: Format::Packed(packing), face: None }
+        Self {
+            format: Format::Packed(packing),
+            face: None,
+        }
     }
 
     /// Size of the picture, if the view has `view_px`.
@@ -78,8 +84,8 @@ pub struct PackedPicture {
     pub depth: Option<PackedDepth>,
 }
 
-/// Depth at half size, rounded up. Each square of 2 x 2 pixels keeps its nearest depth, so that thin objects in front
-/// stay visible.
+/// Depth at half size, rounded up. Each square of 2 x 2 pixels keeps its nearest depth, so that
+/// thin objects in front stay visible.
 #[derive(Clone, Debug)]
 pub struct PackedDepth {
     /// Width and height.
@@ -112,7 +118,8 @@ pub struct QueuedPicture(Queued);
 #[derive(Debug)]
 enum Queued {
     Ready(Rendered),
-    /// The first part of `read` has the counters that `is_complete` checks; the others are from [`Packer::record`].
+    /// The first part of `read` has the counters that `is_complete` checks; the others are from
+    /// [`Packer::record`].
     Packed {
         read: PendingRead,
         is_complete: fn(&[u8]) -> bool,
@@ -127,15 +134,20 @@ impl QueuedPicture {
         Self(Queued::Ready(rendered))
     }
 
-    /// A picture on the GPU. From the first part of `read`, `is_complete` determines whether the buffers were large
-    /// enough; the other parts are from [`Packer::record`].
+    /// A picture on the GPU. From the first part of `read`, `is_complete` determines whether the
+    /// buffers were large enough; the other parts are from [`Packer::record`].
     pub(crate) fn packed(
         read: PendingRead,
         is_complete: fn(&[u8]) -> bool,
         packing: Packing,
         size_px: [u32; 2],
     ) -> Self {
-        Self(Queued::Packed { read, is_complete, packing, size_px })
+        Self(Queued::Packed {
+            read,
+            is_complete,
+            packing,
+            size_px,
+        })
     }
 
     /// Whether the picture is finished.
@@ -143,8 +155,8 @@ impl QueuedPicture {
         matches!(self.0, Queued::Ready(_))
     }
 
-    /// Waits for the picture. `None` if a buffer was too small: [`Method::render_packed`](crate::Method::render_packed)
-    /// makes it larger.
+    /// Waits for the picture. `None` if a buffer was too small:
+    /// [`Method::render_packed`](crate::Method::render_packed) makes it larger.
     ///
     /// # Errors
     ///
@@ -152,7 +164,12 @@ impl QueuedPicture {
     pub fn finish(self, gpu: &Gpu) -> Result<Option<Rendered>, Error> {
         match self.0 {
             Queued::Ready(rendered) => Ok(Some(rendered)),
-            Queued::Packed { read, is_complete, packing, size_px } => read.finish_with(gpu, |parts| {
+            Queued::Packed {
+                read,
+                is_complete,
+                packing,
+                size_px,
+            } => read.finish_with(gpu, |parts| {
                 let packed = is_complete(parts[0]).then(|| unpack(packing, size_px, &parts[1..]));
                 packed.flatten().map(Rendered::Packed)
             }),
@@ -161,7 +178,8 @@ impl QueuedPicture {
 }
 
 impl Rendered {
-    /// Renders a request with `draw`, which draws a pinhole view and returns the picture if it is complete.
+    /// Renders a request with `draw`, which draws a pinhole view and returns the picture if it is
+    /// complete.
     pub(crate) fn of(
         request: &RenderRequest,
         format: Format,
@@ -169,13 +187,22 @@ impl Rendered {
     ) -> Result<Self, Error> {
         let mut rendered = None;
         match request.projection {
-            Projection::Pinhole { focal_px, principal_px } => {
+            Projection::Pinhole {
+                focal_px,
+                principal_px,
+            } => {
                 let camera = Camera::from_request(request, focal_px, principal_px);
                 rendered = draw(&camera, Output { format, face: None })?;
             }
             Projection::Equirectangular => {
                 for face in Face::all(request.size_px) {
-                    rendered = draw(&face.camera(request), Output { format, face: Some(face) })?;
+                    rendered = draw(
+                        &face.camera(request),
+                        Output {
+                            format,
+                            face: Some(face),
+                        },
+                    )?;
                 }
             }
         }
@@ -187,7 +214,14 @@ impl Rendered {
         request: &RenderRequest,
         draw: impl FnMut(&Camera, Output) -> Result<Option<Self>, Error>,
     ) -> Result<Picture, Error> {
-        Self::of(request, Format::Picture { depth: request.depth }, draw)?.into_picture()
+        Self::of(
+            request,
+            Format::Picture {
+                depth: request.depth,
+            },
+            draw,
+        )?
+        .into_picture()
     }
 
     /// The pixels and depths, if the picture is not packed.
@@ -199,10 +233,16 @@ impl Rendered {
     }
 
     /// A picture that shows only the background.
-    pub(crate) fn empty(view_px: [u32; 2], background_srgb: [f32; 3], output: Output) -> Option<Self> {
+    pub(crate) fn empty(
+        view_px: [u32; 2],
+        background_srgb: [f32; 3],
+        output: Output,
+    ) -> Option<Self> {
         let (Format::Picture { depth } | Format::Packed(Packing { depth, .. })) = output.format;
         let size_px = output.size_px(view_px);
-        output.is_complete().then(|| Self::Picture(Picture::empty(size_px, background_srgb, depth)))
+        output
+            .is_complete()
+            .then(|| Self::Picture(Picture::empty(size_px, background_srgb, depth)))
     }
 
     /// Width and height, pixels.
@@ -254,15 +294,27 @@ impl Sizes {
 }
 
 const SHARED: &[Source] = &[
-    Source { name: "packing", text: include_str!("packing.wgsl") },
-    Source { name: "folded", text: include_str!("../shared/folded.wgsl") },
-    Source { name: "scan", text: include_str!("../shared/scan.wgsl") },
+    Source {
+        name: "packing",
+        text: include_str!("packing.wgsl"),
+    },
+    Source {
+        name: "folded",
+        text: include_str!("../shared/folded.wgsl"),
+    },
+    Source {
+        name: "scan",
+        text: include_str!("../shared/scan.wgsl"),
+    },
 ];
 
 macro_rules! kernel {
     ($name:literal) => {
         crate::gpu::Kernel {
-            source: crate::gpu::Source { name: $name, text: include_str!(concat!($name, ".wgsl")) },
+            source: crate::gpu::Source {
+                name: $name,
+                text: include_str!(concat!($name, ".wgsl")),
+            },
             shared: crate::packing::SHARED,
         }
     };
@@ -336,7 +388,9 @@ impl Packer {
 
     /// Allocates buffers for pictures of this size.
     fn reserve(&mut self, gpu: &Gpu, passes: &mut Passes, sizes: Sizes) -> Result<(), Error> {
-        let fits = |buffers: &Buffers| buffers.n_mcus >= sizes.n_mcus() && buffers.n_squares >= sizes.n_squares();
+        let fits = |buffers: &Buffers| {
+            buffers.n_mcus >= sizes.n_mcus() && buffers.n_squares >= sizes.n_squares()
+        };
         if !self.buffers.as_ref().is_some_and(fits) {
             passes.clear_bindings();
             self.buffers = None; // Freed before the larger ones are allocated.
@@ -345,8 +399,8 @@ impl Packer {
         Ok(())
     }
 
-    /// Records the passes that pack a picture of `size_px`: `pixels` (rgba8) and `depths` (meters). Returns the buffers to
-    /// read back for [`unpack`].
+    /// Records the passes that pack a picture of `size_px`: `pixels` (rgba8) and `depths` (meters).
+    /// Returns the buffers to read back for [`unpack`].
     pub(crate) fn record(
         &mut self,
         gpu: &Gpu,
@@ -362,34 +416,81 @@ impl Packer {
         {
             passes.clear_bindings();
             let tables = tables::transform_tables(quality);
-            self.tables = Some((quality, gpu.storage_with("packing.tables", bytemuck::cast_slice(&tables))?));
+            self.tables = Some((
+                quality,
+                gpu.storage_with("packing.tables", bytemuck::cast_slice(&tables))?,
+            ));
         }
-        let Self { transform, code, offsets, join, halve, count, codes, tables, buffers } = self;
-        let buffers = buffers.as_ref().ok_or_else(|| Error::internal("the buffers of the packer are missing"))?;
+        let Self {
+            transform,
+            code,
+            offsets,
+            join,
+            halve,
+            count,
+            codes,
+            tables,
+            buffers,
+        } = self;
+        let buffers = buffers
+            .as_ref()
+            .ok_or_else(|| Error::internal("the buffers of the packer are missing"))?;
         gpu.write(&buffers.packing, 0, bytemuck::bytes_of(&sizes));
         let uniform = ("packing", &buffers.packing);
         let packed = ("packed", &buffers.packed);
-        let [coefficients, non_zero] = [("coefficients", &buffers.coefficients), ("non_zero", &buffers.non_zero)];
+        let [coefficients, non_zero] = [
+            ("coefficients", &buffers.coefficients),
+            ("non_zero", &buffers.non_zero),
+        ];
         let [coded, n_coded] = [("coded", &buffers.coded), ("n_coded", &buffers.n_coded)];
         passes.clear_range(&buffers.packed, 0..4 * u64::from(HEADER_WORDS));
         let mut n_words = HEADER_WORDS;
         if let Some((_, tables)) = tables.as_ref().filter(|_| packing.jpeg_quality.is_some()) {
             n_words += sizes.n_words;
             let n_intervals = u64::from(sizes.n_intervals);
-            let transformed = [uniform, ("pixels", pixels), ("tables", tables), coefficients, non_zero];
+            let transformed = [
+                uniform,
+                ("pixels", pixels),
+                ("tables", tables),
+                coefficients,
+                non_zero,
+            ];
             passes.dispatch(gpu, transform, sizes.n_mcus().into(), &transformed);
-            let encoded = [uniform, coefficients, non_zero, ("codes", &*codes), coded, n_coded, packed];
+            let encoded = [
+                uniform,
+                coefficients,
+                non_zero,
+                ("codes", &*codes),
+                coded,
+                n_coded,
+                packed,
+            ];
             passes.dispatch(gpu, code, n_intervals.div_ceil(32), &encoded);
             passes.dispatch(gpu, offsets, 1, &[uniform, n_coded, packed]);
-            passes.dispatch(gpu, join, n_intervals.div_ceil(8), &[uniform, coded, n_coded, packed]);
+            passes.dispatch(
+                gpu,
+                join,
+                n_intervals.div_ceil(8),
+                &[uniform, coded, n_coded, packed],
+            );
         }
         let mut reads = vec![(packed.1, 4 * n_words as usize)];
         if packing.depth {
             let n_squares = u64::from(sizes.n_squares());
             let halved = ("halved", &buffers.halved);
             let counts = ("depth_counts", &buffers.depth_counts);
-            passes.dispatch(gpu, halve, n_squares.div_ceil(256), &[uniform, ("depths", depths), halved, packed]);
-            passes.dispatch(gpu, count, n_squares.div_ceil(512), &[uniform, halved, packed, counts]);
+            passes.dispatch(
+                gpu,
+                halve,
+                n_squares.div_ceil(256),
+                &[uniform, ("depths", depths), halved, packed],
+            );
+            passes.dispatch(
+                gpu,
+                count,
+                n_squares.div_ceil(512),
+                &[uniform, halved, packed, counts],
+            );
             reads.push((counts.1, 2 * sizes.n_squares() as usize));
         }
         Ok(reads)
@@ -404,7 +505,8 @@ pub(crate) struct Reader {
 }
 
 impl Reader {
-    /// The same output, or an unpacked picture if the adapter is a CPU or GPU memory is too small for packing.
+    /// The same output, or an unpacked picture if the adapter is a CPU or GPU memory is too small
+    /// for packing.
     pub(crate) fn available(
         &mut self,
         gpu: &Gpu,
@@ -412,19 +514,29 @@ impl Reader {
         output: Output,
         view_px: [u32; 2],
     ) -> Result<Output, Error> {
-        let Format::Packed(Packing { depth, .. }) = output.format else { return Ok(output) };
-        let unpacked = Output { format: Format::Picture { depth }, ..output };
+        let Format::Packed(Packing { depth, .. }) = output.format else {
+            return Ok(output);
+        };
+        let unpacked = Output {
+            format: Format::Picture { depth },
+            ..output
+        };
         if gpu.is_software() {
             return Ok(unpacked); // Kernels would take longer than the encoders of the server.
         }
-        match created(&mut self.packer, gpu)?.reserve(gpu, passes, Sizes::of(output.size_px(view_px))) {
+        match created(&mut self.packer, gpu)?.reserve(
+            gpu,
+            passes,
+            Sizes::of(output.size_px(view_px)),
+        ) {
             Err(error) if error.is_out_of_memory() => Ok(unpacked),
             reserved => reserved.map(|()| output),
         }
     }
 
-    /// Records the passes after those that draw a view into `canvas`: pixels (rgba8) and depths (meters). Returns the
-    /// buffers to read back for [`Self::take`], none if the picture is not complete.
+    /// Records the passes after those that draw a view into `canvas`: pixels (rgba8) and depths
+    /// (meters). Returns the buffers to read back for [`Self::take`], none if the picture is not
+    /// complete.
     pub(crate) fn record<'a>(
         &'a mut self,
         gpu: &Gpu,
@@ -441,12 +553,19 @@ impl Reader {
         let size_px = output.size_px(view_px);
         match output.format {
             _ if !output.is_complete() => Ok(Vec::new()),
-            Format::Picture { depth } => Ok(Picture::buffers(size_px, canvas[0], depth.then_some(canvas[1]))),
-            Format::Packed(packing) => created(packer, gpu)?.record(gpu, passes, packing, size_px, canvas),
+            Format::Picture { depth } => Ok(Picture::buffers(
+                size_px,
+                canvas[0],
+                depth.then_some(canvas[1]),
+            )),
+            Format::Packed(packing) => {
+                created(packer, gpu)?.record(gpu, passes, packing, size_px, canvas)
+            }
         }
     }
 
-    /// The picture from the data read back after [`Self::record`]; `None` if it could not be packed.
+    /// The picture from the data read back after [`Self::record`]; `None` if it could not be
+    /// packed.
     pub(crate) fn take(output: Output, view_px: [u32; 2], parts: &[&[u8]]) -> Option<Rendered> {
         let size_px = output.size_px(view_px);
         match output.format {
@@ -470,11 +589,17 @@ impl Reader {
             _ => canvas,
         };
         let size_px = output.size_px(view_px);
-        let read = passes.submit_reading(gpu, &Picture::buffers(size_px, pixels, depth.then_some(depths)));
-        read.finish_with(gpu, |parts| Rendered::Picture(Picture::from_parts(size_px, parts)))
+        let read = passes.submit_reading(
+            gpu,
+            &Picture::buffers(size_px, pixels, depth.then_some(depths)),
+        );
+        read.finish_with(gpu, |parts| {
+            Rendered::Picture(Picture::from_parts(size_px, parts))
+        })
     }
 
-    /// Submits the passes that draw a view into `canvas`, and reads the picture back if it is complete.
+    /// Submits the passes that draw a view into `canvas`, and reads the picture back if it is
+    /// complete.
     pub(crate) fn read(
         &mut self,
         gpu: &Gpu,
@@ -491,7 +616,12 @@ impl Reader {
         }
         let read = passes.submit_reading(gpu, &reads);
         let taken = read.finish_with(gpu, |parts| Self::take(output, view_px, parts))?;
-        taken.map_or_else(|| self.read_unpacked(gpu, passes, output, view_px, canvas), Ok).map(Some)
+        taken
+            .map_or_else(
+                || self.read_unpacked(gpu, passes, output, view_px, canvas),
+                Ok,
+            )
+            .map(Some)
     }
 }
 
@@ -500,20 +630,30 @@ fn created<'a>(packer: &'a mut Option<Packer>, gpu: &Gpu) -> Result<&'a mut Pack
     if packer.is_none() {
         *packer = Some(Packer::new(gpu)?);
     }
-    packer.as_mut().ok_or_else(|| Error::internal("the packer is missing"))
+    packer
+        .as_mut()
+        .ok_or_else(|| Error::internal("the packer is missing"))
 }
 
 /// Assembles the data read back from [`Packer::record`]. `None` if the JPEG file was too long.
-pub(crate) fn unpack(packing: Packing, size_px: [u32; 2], parts: &[&[u8]]) -> Option<PackedPicture> {
+pub(crate) fn unpack(
+    packing: Packing,
+    size_px: [u32; 2],
+    parts: &[&[u8]],
+) -> Option<PackedPicture> {
     let (header, coded) = parts[0].split_at(4 * HEADER_WORDS as usize);
     let header: Vec<u32> = bytemuck::pod_collect_to_vec(header);
-    let [n_words, overflow, furthest, _] = header[..] else { return None };
+    let [n_words, overflow, furthest, _] = header[..] else {
+        return None;
+    };
     if overflow != 0 {
         return None;
     }
     let jpeg = match packing.jpeg_quality {
         Some(quality) => {
-            let [Ok(width), Ok(height)] = size_px.map(u16::try_from) else { return None };
+            let [Ok(width), Ok(height)] = size_px.map(u16::try_from) else {
+                return None;
+            };
             let interval = u16::try_from(MCUS_PER_INTERVAL).ok()?;
             let mut file = tables::file_header([width, height], quality, interval);
             file.extend_from_slice(coded.get(..4 * n_words as usize)?);
@@ -525,11 +665,19 @@ pub(crate) fn unpack(packing: Packing, size_px: [u32; 2], parts: &[&[u8]]) -> Op
         let furthest_m = f64::from(f32::from_bits(furthest));
         PackedDepth {
             size_px: Sizes::of(size_px).half_size_px(),
-            meters_per_count: if furthest_m > 0.0 { furthest_m / f64::from(u16::MAX) } else { 1.0 },
+            meters_per_count: if furthest_m > 0.0 {
+                furthest_m / f64::from(u16::MAX)
+            } else {
+                1.0
+            },
             counts: counts.to_vec(),
         }
     });
-    Some(PackedPicture { size_px, jpeg, depth })
+    Some(PackedPicture {
+        size_px,
+        jpeg,
+        depth,
+    })
 }
 
 #[cfg(test)]
@@ -556,7 +704,14 @@ mod tests {
         assert_layout!(
             KERNELS,
             Packing,
-            [size_px, n_mcus, n_intervals, mcus_per_interval, words_per_interval, n_words]
+            [
+                size_px,
+                n_mcus,
+                n_intervals,
+                mcus_per_interval,
+                words_per_interval,
+                n_words
+            ]
         );
     }
 
@@ -569,21 +724,35 @@ mod tests {
     impl Fixture {
         fn new() -> Self {
             let gpu = test_gpu();
-            Self { packer: Packer::new(&gpu).unwrap(), passes: Passes::default(), gpu }
+            Self {
+                packer: Packer::new(&gpu).unwrap(),
+                passes: Passes::default(),
+                gpu,
+            }
         }
 
         fn pack(&mut self, packing: Packing, picture: &Picture) -> Option<PackedPicture> {
             let pixels = self.gpu.storage_with("pixels", &picture.rgba_srgb).unwrap();
-            let depths = self.gpu.storage_with("depths", bytemuck::cast_slice(&picture.depth_m)).unwrap();
+            let depths = self
+                .gpu
+                .storage_with("depths", bytemuck::cast_slice(&picture.depth_m))
+                .unwrap();
             let read = {
                 let reads = self
                     .packer
-                    .record(&self.gpu, &mut self.passes, packing, picture.size_px, [&pixels, &depths])
+                    .record(
+                        &self.gpu,
+                        &mut self.passes,
+                        packing,
+                        picture.size_px,
+                        [&pixels, &depths],
+                    )
                     .unwrap();
                 self.passes.submit_reading(&self.gpu, &reads)
             };
             self.passes.clear_bindings();
-            read.finish_with(&self.gpu, |parts| unpack(packing, picture.size_px, parts)).unwrap()
+            read.finish_with(&self.gpu, |parts| unpack(packing, picture.size_px, parts))
+                .unwrap()
         }
     }
 
@@ -594,7 +763,12 @@ mod tests {
         let px = || (0..height).flat_map(move |y| (0..width).map(move |x| (x, y)));
         let color = |(x, y): (u32, u32)| {
             let stripe = if (x / 13 + y / 7) % 5 == 0 { 90 } else { 0 };
-            [byte(x * 160 / width + stripe), byte(y * 160 / height + stripe), byte(40 + x / 3), 9]
+            [
+                byte(x * 160 / width + stripe),
+                byte(y * 160 / height + stripe),
+                byte(40 + x / 3),
+                9,
+            ]
         };
         let depth = |(x, y): (u32, u32)| match (x + 3 * y) % 11 {
             0 => 0.0,
@@ -602,33 +776,74 @@ mod tests {
             2 => f32::NAN,
             n => n as f32 + 0.01 * (x % 50) as f32,
         };
-        Picture { size_px, rgba_srgb: px().flat_map(color).collect(), depth_m: px().map(depth).collect() }
+        Picture {
+            size_px,
+            rgba_srgb: px().flat_map(color).collect(),
+            depth_m: px().map(depth).collect(),
+        }
     }
 
     fn mean_abs_error(jpeg: &[u8], picture: &Picture) -> f64 {
-        let decoded = image::load_from_memory_with_format(jpeg, image::ImageFormat::Jpeg).unwrap().to_rgb8();
+        let decoded = image::load_from_memory_with_format(jpeg, image::ImageFormat::Jpeg)
+            .unwrap()
+            .to_rgb8();
         assert_eq!([decoded.width(), decoded.height()], picture.size_px);
-        let source = picture.rgba_srgb.chunks_exact(4).flat_map(|pixel| &pixel[..3]);
-        let sum: f64 = decoded.as_raw().iter().zip(source).map(|(a, b)| f64::from(a.abs_diff(*b))).sum();
+        let source = picture
+            .rgba_srgb
+            .chunks_exact(4)
+            .flat_map(|pixel| &pixel[..3]);
+        let sum: f64 = decoded
+            .as_raw()
+            .iter()
+            .zip(source)
+            .map(|(a, b)| f64::from(a.abs_diff(*b)))
+            .sum();
         sum / decoded.as_raw().len() as f64
     }
 
     #[test]
     fn jpeg_files_are_as_good_as_those_of_a_library() {
         let mut fixture = Fixture::new();
-        for size_px in [[160, 128], [161, 129], [1, 1], [7, 50], [16, 17], [333, 255], [15, 1000], [64, 8]] {
+        for size_px in [
+            [160, 128],
+            [161, 129],
+            [1, 1],
+            [7, 50],
+            [16, 17],
+            [333, 255],
+            [15, 1000],
+            [64, 8],
+        ] {
             let picture = picture(size_px);
             for quality in [60, 92] {
-                let packing = Packing { jpeg_quality: Some(quality), depth: false };
+                let packing = Packing {
+                    jpeg_quality: Some(quality),
+                    depth: false,
+                };
                 let jpeg = fixture.pack(packing, &picture).unwrap().jpeg.unwrap();
-                let rgb: Vec<u8> = picture.rgba_srgb.chunks_exact(4).flat_map(|pixel| pixel[..3].to_vec()).collect();
+                let rgb: Vec<u8> = picture
+                    .rgba_srgb
+                    .chunks_exact(4)
+                    .flat_map(|pixel| pixel[..3].to_vec())
+                    .collect();
                 let mut by_library = Vec::new();
                 image::codecs::jpeg::JpegEncoder::new_with_quality(&mut by_library, quality)
                     .encode(&rgb, size_px[0], size_px[1], image::ExtendedColorType::Rgb8)
                     .unwrap();
-                let (ours, library) = (mean_abs_error(&jpeg, &picture), mean_abs_error(&by_library, &picture));
-                assert!(ours < library + 0.1, "{size_px:?}, quality {quality}: {ours}, by a library {library}");
-                assert!(jpeg.len() < by_library.len() * 5 / 4 + 512, "{} bytes, {}", jpeg.len(), by_library.len());
+                let (ours, library) = (
+                    mean_abs_error(&jpeg, &picture),
+                    mean_abs_error(&by_library, &picture),
+                );
+                assert!(
+                    ours < library + 0.1,
+                    "{size_px:?}, quality {quality}: {ours}, by a library {library}"
+                );
+                assert!(
+                    jpeg.len() < by_library.len() * 5 / 4 + 512,
+                    "{} bytes, {}",
+                    jpeg.len(),
+                    by_library.len()
+                );
             }
         }
     }
@@ -640,8 +855,28 @@ mod tests {
         for (at, value) in (0u32..).zip(&mut picture.rgba_srgb) {
             *value = at.wrapping_mul(2_654_435_761).to_be_bytes()[1];
         }
-        assert!(fixture.pack(Packing { jpeg_quality: Some(100), depth: false }, &picture).is_none());
-        assert!(fixture.pack(Packing { jpeg_quality: Some(20), depth: false }, &picture).is_some());
+        assert!(
+            fixture
+                .pack(
+                    Packing {
+                        jpeg_quality: Some(100),
+                        depth: false
+                    },
+                    &picture
+                )
+                .is_none()
+        );
+        assert!(
+            fixture
+                .pack(
+                    Packing {
+                        jpeg_quality: Some(20),
+                        depth: false
+                    },
+                    &picture
+                )
+                .is_some()
+        );
     }
 
     #[test]
@@ -649,13 +884,24 @@ mod tests {
         let mut fixture = Fixture::new();
         for size_px in [[64, 32], [33, 17], [1, 1], [3, 2]] {
             let picture = picture(size_px);
-            let packed = fixture.pack(Packing { jpeg_quality: None, depth: true }, &picture).unwrap();
+            let packed = fixture
+                .pack(
+                    Packing {
+                        jpeg_quality: None,
+                        depth: true,
+                    },
+                    &picture,
+                )
+                .unwrap();
             let depth = packed.depth.unwrap();
             assert!(packed.jpeg.is_none());
             let [width, height] = depth.size_px;
             assert_eq!(depth.size_px, size_px.map(|n| n.div_ceil(2)));
             assert_eq!(depth.counts.len(), 2 * (width * height) as usize);
-            let counts = depth.counts.chunks_exact(2).map(|pair| u16::from_le_bytes([pair[0], pair[1]]));
+            let counts = depth
+                .counts
+                .chunks_exact(2)
+                .map(|pair| u16::from_le_bytes([pair[0], pair[1]]));
             for (count, at) in counts.zip(0..) {
                 let nearest_m = [[0, 0], [1, 0], [0, 1], [1, 1]]
                     .map(|[x, y]| [2 * (at % width) + x, 2 * (at / width) + y])
@@ -666,7 +912,10 @@ mod tests {
                     .fold(f32::INFINITY, f32::min);
                 let got_m = f64::from(count) * depth.meters_per_count;
                 match nearest_m.is_finite() {
-                    true => assert!((got_m - f64::from(nearest_m)).abs() < depth.meters_per_count, "{at}"),
+                    true => assert!(
+                        (got_m - f64::from(nearest_m)).abs() < depth.meters_per_count,
+                        "{at}"
+                    ),
                     false => assert_eq!(count, 0),
                 }
             }

@@ -1,4 +1,5 @@
-//! Panoramas: the six faces of a cube, drawn as pinhole views and copied into one equirectangular picture on the GPU.
+//! Panoramas: the six faces of a cube, drawn as pinhole views and copied into one equirectangular
+//! picture on the GPU.
 
 use super::kernel;
 use crate::gpu::{Buffer, Gpu, Passes, Pipeline, f32s_of};
@@ -53,7 +54,8 @@ impl Face {
         let rotation = UnitQuaternion::from_rotation_matrix(&self.rotation());
         let edge_px = self.edge_px();
         Camera {
-            world_from_camera: request.world_from_camera * Transform::from_parts(Translation3::identity(), rotation),
+            world_from_camera: request.world_from_camera
+                * Transform::from_parts(Translation3::identity(), rotation),
             size_px: [edge_px; 2],
             focal_px: [f64::from(edge_px) / 2.0; 2],
             principal_px: [f64::from(edge_px) / 2.0; 2],
@@ -106,8 +108,8 @@ pub(crate) struct Panorama {
 }
 
 impl Panorama {
-    /// Records the pass that copies a face from `canvas` (pixels and depths) into the panorama, which is allocated if
-    /// `panorama` is too small. Returns the panorama's pixels and depths.
+    /// Records the pass that copies a face from `canvas` (pixels and depths) into the panorama,
+    /// which is allocated if `panorama` is too small. Returns the panorama's pixels and depths.
     pub(super) fn record<'a>(
         panorama: &'a mut Option<Self>,
         gpu: &Gpu,
@@ -116,13 +118,24 @@ impl Panorama {
         [face_pixels, face_depths]: [&Buffer; 2],
     ) -> Result<[&'a Buffer; 2], Error> {
         let n_pixels = face.panorama_px.map(u64::from).iter().product();
-        if panorama.as_ref().is_none_or(|panorama| panorama.n_pixels < n_pixels) {
+        if panorama
+            .as_ref()
+            .is_none_or(|panorama| panorama.n_pixels < n_pixels)
+        {
             passes.clear_bindings();
             *panorama = None; // Freed before the larger one is allocated.
             *panorama = Some(Self::new(gpu, n_pixels)?);
         }
-        let panorama = panorama.as_ref().ok_or_else(|| Error::internal("the panorama is missing"))?;
-        let Self { copy_face, face: params, pixels, depths, .. } = panorama;
+        let panorama = panorama
+            .as_ref()
+            .ok_or_else(|| Error::internal("the panorama is missing"))?;
+        let Self {
+            copy_face,
+            face: params,
+            pixels,
+            depths,
+            ..
+        } = panorama;
         gpu.write(params, 0, bytemuck::bytes_of(&face.params()));
         let buffers = [
             ("face", params),
@@ -138,7 +151,10 @@ impl Panorama {
     fn new(gpu: &Gpu, n_pixels: u64) -> Result<Self, Error> {
         Ok(Self {
             copy_face: Pipeline::new(gpu, kernel!("panorama_face"), &[])?,
-            face: gpu.uniform_with("packing.face", &<FaceParams as bytemuck::Zeroable>::zeroed()),
+            face: gpu.uniform_with(
+                "packing.face",
+                &<FaceParams as bytemuck::Zeroable>::zeroed(),
+            ),
             n_pixels,
             pixels: gpu.storage("packing.panorama_pixels", 4 * n_pixels)?,
             depths: gpu.storage("packing.panorama_depths", 4 * n_pixels)?,

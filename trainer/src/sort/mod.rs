@@ -1,8 +1,9 @@
-//! Stable radix sort of 32-bit keys on the GPU in two passes of eight bits. Keys are first reduced to 16 bits, relative
-//! to the smallest and the largest key. Returns the original indices of the sorted keys.
+//! Stable radix sort of 32-bit keys on the GPU in two passes of eight bits. Keys are first reduced
+//! to 16 bits, relative to the smallest and the largest key. Returns the original indices of the
+//! sorted keys.
 //!
-//! Two variants give the same result: `parallel` ranks keys by subgroup ballots, `sequential` assigns one block of keys
-//! to each thread.
+//! Two variants give the same result: `parallel` ranks keys by subgroup ballots, `sequential`
+//! assigns one block of keys to each thread.
 
 use crate::Error;
 use crate::gpu::{Buffer, Gpu, Kernel, Passes, Pipeline, Source};
@@ -25,7 +26,13 @@ macro_rules! kernel {
         kernel!($name, SHARED)
     };
     ($name:literal, $shared:expr) => {
-        Kernel { source: Source { name: $name, text: include_str!(concat!($name, ".wgsl")) }, shared: $shared }
+        Kernel {
+            source: Source {
+                name: $name,
+                text: include_str!(concat!($name, ".wgsl")),
+            },
+            shared: $shared,
+        }
     };
 }
 
@@ -77,20 +84,35 @@ pub struct SortBuffers {
 impl RadixSort {
     /// Compiles the variant that suits the adapter.
     pub fn new(gpu: &Gpu) -> Result<Self, Error> {
-        let parallel = !gpu.is_software() && gpu.optional().subgroup_lanes.is_some_and(|lanes| lanes >= 16);
+        let parallel = !gpu.is_software()
+            && gpu
+                .optional()
+                .subgroup_lanes
+                .is_some_and(|lanes| lanes >= 16);
         Self::with_form(gpu, parallel)
     }
 
     fn with_form(gpu: &Gpu, parallel: bool) -> Result<Self, Error> {
-        let wide = gpu.optional().subgroup_lanes.is_some_and(|lanes| lanes > 32);
+        let wide = gpu
+            .optional()
+            .subgroup_lanes
+            .is_some_and(|lanes| lanes > 32);
         let [count, scan, scatter] = if parallel {
             [
                 kernel!("radix_count_parallel"),
                 kernel!("radix_scan_parallel"),
-                if wide { kernel!("radix_scatter_parallel", SHARED_WIDE) } else { kernel!("radix_scatter_parallel") },
+                if wide {
+                    kernel!("radix_scatter_parallel", SHARED_WIDE)
+                } else {
+                    kernel!("radix_scatter_parallel")
+                },
             ]
         } else {
-            [kernel!("radix_count_sequential"), kernel!("radix_scan_sequential"), kernel!("radix_scatter_sequential")]
+            [
+                kernel!("radix_count_sequential"),
+                kernel!("radix_scan_sequential"),
+                kernel!("radix_scatter_sequential"),
+            ]
         };
         Ok(Self {
             parallel,
@@ -101,9 +123,9 @@ impl RadixSort {
         })
     }
 
-    /// Allocates buffers for up to `n_max` keys. When sorting, `status[counter]` must hold the number of keys,
-    /// `status[largest]` the largest key, and the next word the smallest key, inverted. Keys with all bits set are
-    /// excluded from this range and sorted last.
+    /// Allocates buffers for up to `n_max` keys. When sorting, `status[counter]` must hold the
+    /// number of keys, `status[largest]` the largest key, and the next word the smallest key,
+    /// inverted. Keys with all bits set are excluded from this range and sorted last.
     pub fn buffers(
         &self,
         gpu: &Gpu,
@@ -113,8 +135,19 @@ impl RadixSort {
         largest: u32,
     ) -> Result<SortBuffers, Error> {
         let max_blocks = n_max.div_ceil(self.block()).max(1);
-        let words = |name: &str, n: u32| gpu.storage(&format!("{label}.{name}"), 4 * u64::from(n.max(1)));
-        let digits = [0, 8].map(|shift| gpu.uniform_with("sort.digit", &Digit { shift, counter, largest, max_blocks }));
+        let words =
+            |name: &str, n: u32| gpu.storage(&format!("{label}.{name}"), 4 * u64::from(n.max(1)));
+        let digits = [0, 8].map(|shift| {
+            gpu.uniform_with(
+                "sort.digit",
+                &Digit {
+                    shift,
+                    counter,
+                    largest,
+                    max_blocks,
+                },
+            )
+        });
         Ok(SortBuffers {
             keys: [words("keys_a", n_max)?, words("keys_b", n_max)?],
             values: [words("values_a", n_max)?, words("values_b", n_max)?],
@@ -125,21 +158,52 @@ impl RadixSort {
         })
     }
 
-    /// Records the passes of a sort. The results are in the first keys and values buffers. The values are replaced by
-    /// the original indices of the keys; their previous content does not matter.
+    /// Records the passes of a sort. The results are in the first keys and values buffers. The
+    /// values are replaced by the original indices of the keys; their previous content does not
+    /// matter.
     pub fn sort(&self, gpu: &Gpu, passes: &mut Passes, buffers: &SortBuffers, status: &Buffer) {
-        let n_groups = if self.parallel { buffers.max_blocks } else { buffers.max_blocks.div_ceil(8) };
+        let n_groups = if self.parallel {
+            buffers.max_blocks
+        } else {
+            buffers.max_blocks.div_ceil(8)
+        };
         for (pass, digit) in buffers.digits.iter().enumerate() {
             let (from, to) = (pass % 2, 1 - pass % 2);
             let keys = &buffers.keys[from];
-            let base: [(&str, &Buffer); 3] = [("digit", digit), ("status", status), ("counts", &buffers.counts)];
-            passes.dispatch(gpu, &self.count, n_groups.into(), &[base[0], base[1], base[2], ("keys", keys)]);
-            let scatter = if pass == 0 { &self.scatter_indices } else { &self.scatter };
-            let mut scatter_buffers =
-                vec![base[0], base[1], base[2], ("keys", keys), ("values", &buffers.values[from])];
-            scatter_buffers.extend([("keys_out", &buffers.keys[to]), ("values_out", &buffers.values[to])]);
+            let base: [(&str, &Buffer); 3] = [
+                ("digit", digit),
+                ("status", status),
+                ("counts", &buffers.counts),
+            ];
+            passes.dispatch(
+                gpu,
+                &self.count,
+                n_groups.into(),
+                &[base[0], base[1], base[2], ("keys", keys)],
+            );
+            let scatter = if pass == 0 {
+                &self.scatter_indices
+            } else {
+                &self.scatter
+            };
+            let mut scatter_buffers = vec![
+                base[0],
+                base[1],
+                base[2],
+                ("keys", keys),
+                ("values", &buffers.values[from]),
+            ];
+            scatter_buffers.extend([
+                ("keys_out", &buffers.keys[to]),
+                ("values_out", &buffers.values[to]),
+            ]);
             if self.parallel {
-                passes.dispatch(gpu, &self.scan, 256, &[base[0], base[1], base[2], ("totals", &buffers.totals)]);
+                passes.dispatch(
+                    gpu,
+                    &self.scan,
+                    256,
+                    &[base[0], base[1], base[2], ("totals", &buffers.totals)],
+                );
                 scatter_buffers.push(("totals", &buffers.totals));
             } else {
                 passes.dispatch(gpu, &self.scan, 1, &base);
@@ -164,12 +228,20 @@ mod tests {
         let sort = RadixSort::with_form(&gpu, parallel).unwrap();
         let n = u32::try_from(keys.len()).unwrap();
         let buffers = sort.buffers(&gpu, "test", n, 0, 1).unwrap();
-        let status = gpu.storage_with("status", bytemuck::cast_slice(&[n, key_range[1], !key_range[0]])).unwrap();
+        let status = gpu
+            .storage_with(
+                "status",
+                bytemuck::cast_slice(&[n, key_range[1], !key_range[0]]),
+            )
+            .unwrap();
         gpu.write(&buffers.keys[0], 0, bytemuck::cast_slice(keys));
         let mut passes = Passes::default();
         sort.sort(&gpu, &mut passes, &buffers, &status);
         passes.submit(&gpu);
-        (gpu.read(&buffers.keys[0], keys.len()).unwrap(), gpu.read(&buffers.values[0], keys.len()).unwrap())
+        (
+            gpu.read(&buffers.keys[0], keys.len()).unwrap(),
+            gpu.read(&buffers.values[0], keys.len()).unwrap(),
+        )
     }
 
     fn check(n: u32, span: u32, parallel: bool) {

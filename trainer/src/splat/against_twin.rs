@@ -1,5 +1,8 @@
 //! Tests of the kernels against their f64 twin: pictures, gradients and invalid input.
-#![expect(clippy::needless_range_loop, reason = "channels and axes index several arrays at once")]
+#![expect(
+    clippy::needless_range_loop,
+    reason = "channels and axes index several arrays at once"
+)]
 
 use super::arrays::SplatArrays;
 use super::buffers::{ImageBuffers, Scratch, ScratchSize, SplatBuffers, n_bins, n_tiles};
@@ -19,7 +22,8 @@ use kinematics::{Stamp, Transform, Twist};
 use nalgebra::Vector3;
 use std::sync::Arc;
 
-/// Colors are near 1 and f32 has 24 bits of precision; sums of a few dozen terms and `exp` lose a few bits.
+/// Colors are near 1 and f32 has 24 bits of precision; sums of a few dozen terms and `exp` lose a
+/// few bits.
 const COLOR_ABS: f64 = 2e-5;
 /// Gradients are f32 sums over hundreds of pixels.
 const GRADIENT_REL: f64 = 2e-3;
@@ -43,8 +47,14 @@ pub(super) fn arrays_of(splats: &[Splat]) -> SplatArrays {
     SplatArrays {
         means: splats.iter().map(|splat| f(splat.mean)).collect(),
         log_scales: splats.iter().map(|splat| f(splat.log_scale)).collect(),
-        rotations_wxyz: splats.iter().map(|splat| splat.rotation_wxyz.map(f32_of)).collect(),
-        opacity_logits: splats.iter().map(|splat| f32_of(splat.opacity_logit)).collect(),
+        rotations_wxyz: splats
+            .iter()
+            .map(|splat| splat.rotation_wxyz.map(f32_of))
+            .collect(),
+        opacity_logits: splats
+            .iter()
+            .map(|splat| f32_of(splat.opacity_logit))
+            .collect(),
         sh: splats
             .iter()
             .flat_map(|splat| (0..16).map(|ix| splat.sh.get(ix).map_or([0.0; 3], |rgb| f(*rgb))))
@@ -55,13 +65,19 @@ pub(super) fn arrays_of(splats: &[Splat]) -> SplatArrays {
 }
 
 fn camera_of(view: &View) -> Camera {
-    let twist = Twist { linear_m_s: Vector3::from(view.linear_m), angular_rad_s: Vector3::from(view.angular_rad) };
+    let twist = Twist {
+        linear_m_s: Vector3::from(view.linear_m),
+        angular_rad_s: Vector3::from(view.angular_rad),
+    };
     Camera {
         world_from_camera: view.camera_from_world.inverse(),
         size_px: view.size_px,
         focal_px: view.focal_px,
         principal_px: view.principal_px,
-        shutter: Some(Shutter { twist, readout_secs: 1.0 }),
+        shutter: Some(Shutter {
+            twist,
+            readout_secs: 1.0,
+        }),
         near_m: view.near_m,
         far_m: 1e6,
         crop: None,
@@ -82,15 +98,33 @@ impl KernelFixture {
         let scratch = Scratch::new(
             &gpu,
             &draw,
-            ScratchSize { n_splats, n_entries: 1 << 15, n_slots: 1 << 17, n_bins: n_bins(view.size_px) },
+            ScratchSize {
+                n_splats,
+                n_entries: 1 << 15,
+                n_slots: 1 << 17,
+                n_bins: n_bins(view.size_px),
+            },
         )
         .unwrap();
-        let image_buffers = ImageBuffers::new(&gpu, view.size_px[0] * view.size_px[1], tiles, true).unwrap();
+        let image_buffers =
+            ImageBuffers::new(&gpu, view.size_px[0] * view.size_px[1], tiles, true).unwrap();
         let mut counters = [0u32; status::LEN];
         counters[status::N_SPLATS as usize] = n_splats;
-        let status = gpu.storage_with("status", bytemuck::cast_slice(&counters)).unwrap();
+        let status = gpu
+            .storage_with("status", bytemuck::cast_slice(&counters))
+            .unwrap();
         let view_buffer = gpu.uniform_with("view", &camera_of(view).view());
-        Self { draw, train, splats, scratch, image_buffers, status, view: view_buffer, size_px: view.size_px, gpu }
+        Self {
+            draw,
+            train,
+            splats,
+            scratch,
+            image_buffers,
+            status,
+            view: view_buffer,
+            size_px: view.size_px,
+            gpu,
+        }
     }
 
     pub(super) fn passes(&self) -> ViewPasses<'_> {
@@ -111,20 +145,36 @@ impl KernelFixture {
         self.passes().draw(&mut passes, &self.draw);
         passes.submit(&self.gpu);
         let n = (self.size_px[0] * self.size_px[1]) as usize;
-        (self.gpu.read(&self.image_buffers.image, n).unwrap(), self.gpu.read(&self.image_buffers.depth, n).unwrap())
+        (
+            self.gpu.read(&self.image_buffers.image, n).unwrap(),
+            self.gpu.read(&self.image_buffers.depth, n).unwrap(),
+        )
     }
 }
 
 /// Options for both kernel variants: with and without the adapter's optional features.
 fn adapter_options() -> [GpuOptions; 2] {
-    [GpuOptions::default(), GpuOptions { optional_features: false, ..GpuOptions::default() }]
+    [
+        GpuOptions::default(),
+        GpuOptions {
+            optional_features: false,
+            ..GpuOptions::default()
+        },
+    ]
 }
 
 pub(super) fn unambiguous_pixels(view: &View, splats: &[Splat]) -> Vec<bool> {
-    let unambiguous: Vec<bool> =
-        reference::rasterize::threshold_margins(view, splats).iter().map(|margin| *margin > MARGIN).collect();
+    let unambiguous: Vec<bool> = reference::rasterize::threshold_margins(view, splats)
+        .iter()
+        .map(|margin| *margin > MARGIN)
+        .collect();
     assert!(
-        unambiguous.iter().filter(|unambiguous| **unambiguous).count() * 10 > unambiguous.len() * 9,
+        unambiguous
+            .iter()
+            .filter(|unambiguous| **unambiguous)
+            .count()
+            * 10
+            > unambiguous.len() * 9,
         "too many pixels of the scene are close to a threshold"
     );
     unambiguous
@@ -133,16 +183,36 @@ pub(super) fn unambiguous_pixels(view: &View, splats: &[Splat]) -> Vec<bool> {
 fn check_pictures(options: &GpuOptions) {
     for (view, seed) in [(scene::tilted_view(), 1), (scene::rolling_view(), 2)] {
         let mut splats = scene::small_scene(seed, 40);
-        check_picture(&KernelFixture::new(options, &view, &arrays_of(&splats)), &view, &splats);
+        check_picture(
+            &KernelFixture::new(options, &view, &arrays_of(&splats)),
+            &view,
+            &splats,
+        );
         // Some splats are thinner than the low-pass.
         splats
             .iter_mut()
             .step_by(2)
             .for_each(|splat| splat.log_scale = splat.log_scale.map(|log_scale| log_scale - 2.0));
-        let view = View { is_antialiased: true, ..view };
-        let arrays = SplatArrays { is_antialiased: true, ..arrays_of(&splats) };
-        let plain = reference::render(&View { is_antialiased: false, ..view.clone() }, &splats);
-        assert_ne!(reference::render(&view, &splats), plain, "the correction has an effect");
+        let view = View {
+            is_antialiased: true,
+            ..view
+        };
+        let arrays = SplatArrays {
+            is_antialiased: true,
+            ..arrays_of(&splats)
+        };
+        let plain = reference::render(
+            &View {
+                is_antialiased: false,
+                ..view.clone()
+            },
+            &splats,
+        );
+        assert_ne!(
+            reference::render(&view, &splats),
+            plain,
+            "the correction has an effect"
+        );
         check_picture(&KernelFixture::new(options, &view, &arrays), &view, &splats);
     }
 }
@@ -159,16 +229,27 @@ fn pictures_with_dropped_splats_match_the_twin() {
     const SEED: u32 = 7;
     let view = scene::tilted_view();
     let mut splats = scene::small_scene(1, 40);
-    splats.iter_mut().for_each(|splat| splat.opacity_logit = splat.opacity_logit.min(0.5));
+    splats
+        .iter_mut()
+        .for_each(|splat| splat.opacity_logit = splat.opacity_logit.min(0.5));
     let fixture = KernelFixture::new(&GpuOptions::default(), &view, &arrays_of(&splats));
-    let write =
-        |counter: usize, value: u32| fixture.gpu.write(&fixture.status, 4 * counter as u64, &value.to_le_bytes());
+    let write = |counter: usize, value: u32| {
+        fixture
+            .gpu
+            .write(&fixture.status, 4 * counter as u64, &value.to_le_bytes())
+    };
     write(status::DROP_FRAC, DROP_FRAC.to_bits());
     write(status::DROP_SEED, SEED);
     let kept_at = |step: u32| -> Vec<u32> {
-        (0..40).filter(|splat_ix| uniform3([*splat_ix, step, SEED])[0] >= DROP_FRAC.into()).collect()
+        (0..40)
+            .filter(|splat_ix| uniform3([*splat_ix, step, SEED])[0] >= DROP_FRAC.into())
+            .collect()
     };
-    assert!((20..40).contains(&kept_at(0).len()) && kept_at(0) != kept_at(1), "{:?}", kept_at(0));
+    assert!(
+        (20..40).contains(&kept_at(0).len()) && kept_at(0) != kept_at(1),
+        "{:?}",
+        kept_at(0)
+    );
     for step in [0, 1] {
         write(status::STEP, step);
         let more_opaque = |splat_ix: u32| {
@@ -205,20 +286,35 @@ fn check_picture(fixture: &KernelFixture, view: &View, splats: &[Splat]) {
             COLOR_ABS,
             0.0,
         );
-        mismatches.check(format!("depth {pixel}"), depth[pixel].into(), expected.depth[pixel], 10.0 * COLOR_ABS, 0.0);
+        mismatches.check(
+            format!("depth {pixel}"),
+            depth[pixel].into(),
+            expected.depth[pixel],
+            10.0 * COLOR_ABS,
+            0.0,
+        );
     }
     mismatches.assert_none();
 }
 
 pub(super) fn target_of(image: &RenderedImage, size_px: [u32; 2]) -> loss_reference::Target {
     let n = image.rgb.len();
-    // The target differs so much from the picture that rounding cannot change the sign of any absolute difference.
+    // The target differs so much from the picture that rounding cannot change the sign of any
+    // absolute difference.
     let byte = |value: f64| ((value + 0.25).rem_euclid(1.0) * 255.0).round() / 255.0;
     loss_reference::Target {
         size_px: size_px.map(|size| size as usize),
         rgb: image.rgb.iter().map(|rgb| rgb.map(byte)).collect(),
         visible: (0..n).map(|pixel| pixel % 37 != 0).collect(),
-        depth_m: (0..n).map(|pixel| if pixel % 3 == 0 { 0.0 } else { 1.5 + 0.01 * (pixel % 50) as f64 }).collect(),
+        depth_m: (0..n)
+            .map(|pixel| {
+                if pixel % 3 == 0 {
+                    0.0
+                } else {
+                    1.5 + 0.01 * (pixel % 50) as f64
+                }
+            })
+            .collect(),
     }
 }
 
@@ -237,11 +333,21 @@ fn check_long_lists(variants: &[GpuOptions]) {
 /// Pixels that end in different segments of the same list.
 fn check_ends_in_long_lists(variants: &[GpuOptions]) {
     let (view, splats) = long_lists(1000, 0.5, -3.7);
-    let mut n_contributors: Vec<usize> = reference::decide(&view, &splats).contributors.iter().map(Vec::len).collect();
+    let mut n_contributors: Vec<usize> = reference::decide(&view, &splats)
+        .contributors
+        .iter()
+        .map(Vec::len)
+        .collect();
     n_contributors.sort_unstable();
     let n_pixels = n_contributors.len();
-    let [low, high] = [n_contributors[n_pixels / 10], n_contributors[n_pixels * 9 / 10]];
-    assert!(low > 256 && high > low + 100 && high < 900, "{low} to {high} splats per pixel");
+    let [low, high] = [
+        n_contributors[n_pixels / 10],
+        n_contributors[n_pixels * 9 / 10],
+    ];
+    assert!(
+        low > 256 && high > low + 100 && high < 900,
+        "{low} to {high} splats per pixel"
+    );
     check_gradients_with_loss(&view, &splats, variants);
 }
 
@@ -259,7 +365,9 @@ fn long_lists(n: usize, log_scale: f64, opacity_logit: f64) -> (View, Vec<Splat>
     for (ix, splat) in splats.iter_mut().enumerate() {
         // Depths that differ, in an order unlike that of the indices.
         let z = 1.5 + 0.0025 * (ix * 149 % n) as f64;
-        splat.mean = (world_from_camera * nalgebra::Point3::new(splat.mean[0], splat.mean[1], z)).coords.into();
+        splat.mean = (world_from_camera * nalgebra::Point3::new(splat.mean[0], splat.mean[1], z))
+            .coords
+            .into();
         splat.log_scale = splat.log_scale.map(|variation| log_scale + 0.5 * variation);
         splat.opacity_logit = opacity_logit + 0.1 * splat.opacity_logit;
     }
@@ -275,7 +383,11 @@ fn check_gradients_with_loss(view: &View, splats: &[Splat], variants: &[GpuOptio
         *visible &= unambiguous;
     }
     for (depth_m, unambiguous) in target.depth_m.iter_mut().zip(&unambiguous) {
-        *depth_m = if *unambiguous { f64::from(f32_of(*depth_m)) } else { 0.0 };
+        *depth_m = if *unambiguous {
+            f64::from(f32_of(*depth_m))
+        } else {
+            0.0
+        };
     }
     let weights = loss_reference::Weights {
         dssim_frac: 0.25,
@@ -298,19 +410,34 @@ pub(super) struct TargetBuffers {
 }
 
 impl TargetBuffers {
-    pub(super) fn new(gpu: &Gpu, target: &loss_reference::Target, weights: &loss_reference::Weights) -> Self {
+    pub(super) fn new(
+        gpu: &Gpu,
+        target: &loss_reference::Target,
+        weights: &loss_reference::Weights,
+    ) -> Self {
         let byte = |value: f64| u32::from(format!("{:.0}", value * 255.0).parse::<u8>().unwrap());
         let packed: Vec<u32> = target
             .rgb
             .iter()
             .zip(&target.visible)
             .map(|(rgb, visible)| {
-                byte(rgb[0]) | byte(rgb[1]) << 8 | byte(rgb[2]) << 16 | if *visible { 0xff00_0000 } else { 0 }
+                byte(rgb[0])
+                    | byte(rgb[1]) << 8
+                    | byte(rgb[2]) << 16
+                    | if *visible { 0xff00_0000 } else { 0 }
             })
             .collect();
-        let depth: Vec<f32> = target.depth_m.iter().map(|depth_m| f32_of(*depth_m)).collect();
-        let image = gpu.storage_with("target", bytemuck::cast_slice(&packed)).unwrap();
-        let depth = gpu.storage_with("target depth", bytemuck::cast_slice(&depth)).unwrap();
+        let depth: Vec<f32> = target
+            .depth_m
+            .iter()
+            .map(|depth_m| f32_of(*depth_m))
+            .collect();
+        let image = gpu
+            .storage_with("target", bytemuck::cast_slice(&packed))
+            .unwrap();
+        let depth = gpu
+            .storage_with("target depth", bytemuck::cast_slice(&depth))
+            .unwrap();
         let supervision = Supervision {
             background_srgb: [0, 1, 2, 0].map(|channel| f32_of(weights.background_rgb[channel])),
             dssim_frac: f32_of(weights.dssim_frac),
@@ -318,8 +445,15 @@ impl TargetBuffers {
             depth_clip_m: f32_of(weights.depth_clip_m),
             random_background: 0.0,
         };
-        let gains = gpu.storage_with("gains", bytemuck::cast_slice(&[1.0f32; 4])).unwrap();
-        Self { image, depth, supervision: gpu.uniform_with("supervision", &supervision), gains }
+        let gains = gpu
+            .storage_with("gains", bytemuck::cast_slice(&[1.0f32; 4]))
+            .unwrap();
+        Self {
+            image,
+            depth,
+            supervision: gpu.uniform_with("supervision", &supervision),
+            gains,
+        }
     }
 
     pub(super) fn target(&self) -> Target<'_> {
@@ -353,18 +487,32 @@ fn check_gradients(
     view_passes.compare(&mut passes, &fixture.train, &target_buffers.target());
     view_passes.backward(&mut passes, &fixture.train);
     view_passes.update(&mut passes, &gradients_only, &rule, true);
-    let all =
-        ParamSet::EXTRINSICS | ParamSet::TIME_OFFSET | ParamSet::LENS | ParamSet::IMAGE_POSES | ParamSet::IMAGE_GAINS;
+    let all = ParamSet::EXTRINSICS
+        | ParamSet::TIME_OFFSET
+        | ParamSet::LENS
+        | ParamSet::IMAGE_POSES
+        | ParamSet::IMAGE_GAINS;
     let mut cameras = CameraParams::new(gpu, all).unwrap();
     let lens = cameras.lens(gpu, &moving_keyframe()).unwrap();
     let refine = TrainPipelines::camera_gradients_only(gpu).unwrap();
     cameras.refine_with(&view_passes, &mut passes, &refine, &lens);
     passes.submit(gpu);
-    check_camera_gradients(&cameras.param_values(gpu), view, splats, &expected.view, upstream, weights.background_rgb);
+    check_camera_gradients(
+        &cameras.param_values(gpu),
+        view,
+        splats,
+        &expected.view,
+        upstream,
+        weights.background_rgb,
+    );
     let n = target.rgb.len();
     let param_values: Vec<[f32; 4]> = gpu.read(&fixture.image_buffers.upstream, n).unwrap();
     let mut mismatches = Mismatches::default();
-    let largest = upstream.rgb.iter().flatten().fold(0.0f64, |max, value| max.max(value.abs()));
+    let largest = upstream
+        .rgb
+        .iter()
+        .flatten()
+        .fold(0.0f64, |max, value| max.max(value.abs()));
     for (pixel, gradient) in param_values.iter().enumerate() {
         for channel in 0..3 {
             mismatches.check(
@@ -375,14 +523,24 @@ fn check_gradients(
                 1e-3,
             );
         }
-        mismatches.check(format!("upstream depth {pixel}"), gradient[3].into(), upstream.depth[pixel], 1e-9, 1e-5);
+        mismatches.check(
+            format!("upstream depth {pixel}"),
+            gradient[3].into(),
+            upstream.depth[pixel],
+            1e-9,
+            1e-5,
+        );
     }
     mismatches.assert_none();
 
     let got = fixture.splats.read(gpu).unwrap();
     let mut mismatches = Mismatches::default();
     let largest = |of: fn(&Splat) -> Vec<f64>| {
-        expected.splats.iter().flat_map(of).fold(1e-12f64, |max, value| max.max(value.abs()))
+        expected
+            .splats
+            .iter()
+            .flat_map(of)
+            .fold(1e-12f64, |max, value| max.max(value.abs()))
     };
     let [mean, scale, rotation, opacity, sh] = [
         largest(|splat| splat.mean.to_vec()),
@@ -409,8 +567,17 @@ fn check_gradients(
             );
         }
         for part in 0..4 {
-            let (gpu, twin) = (got.rotations_wxyz[ix][part].into(), splat.rotation_wxyz[part]);
-            mismatches.check(format!("rotation {ix} {part}"), gpu, twin, GRADIENT_REL * rotation, GRADIENT_REL);
+            let (gpu, twin) = (
+                got.rotations_wxyz[ix][part].into(),
+                splat.rotation_wxyz[part],
+            );
+            mismatches.check(
+                format!("rotation {ix} {part}"),
+                gpu,
+                twin,
+                GRADIENT_REL * rotation,
+                GRADIENT_REL,
+            );
         }
         mismatches.check(
             format!("opacity {ix}"),
@@ -457,7 +624,8 @@ fn moving_keyframe() -> Keyframe {
     }
 }
 
-/// Checks pose gradients against the twin, and lens gradients against central differences of the twin's picture.
+/// Checks pose gradients against the twin, and lens gradients against central differences of the
+/// twin's picture.
 fn check_camera_gradients(
     got: &[f64],
     view: &View,
@@ -476,9 +644,17 @@ fn check_camera_gradients(
         };
         let (high, low) = (image(STEP), image(-STEP));
         let dot = |high: &RenderedImage, sign: f64| {
-            let rgb = high.rgb.as_flattened().iter().zip(upstream.rgb.as_flattened()).map(|(x, v)| x * v).sum::<f64>();
+            let rgb = high
+                .rgb
+                .as_flattened()
+                .iter()
+                .zip(upstream.rgb.as_flattened())
+                .map(|(x, v)| x * v)
+                .sum::<f64>();
             let of = |x: &[f64], v: &[f64]| x.iter().zip(v).map(|(x, v)| x * v).sum::<f64>();
-            sign * (rgb + of(&high.depth, &upstream.depth) + of(&high.transmittance, &upstream.transmittance))
+            sign * (rgb
+                + of(&high.depth, &upstream.depth)
+                + of(&high.transmittance, &upstream.transmittance))
         };
         (dot(&high, 1.0) + dot(&low, -1.0)) / (2.0 * STEP)
     };
@@ -492,16 +668,26 @@ fn check_camera_gradients(
         expected.push(along(&|view, step| view.focal_px[axis] *= step.exp()));
     }
     for axis in 0..2 {
-        expected.push(along(&|view, step| view.principal_px[axis] += step * view.focal_px[axis]));
+        expected.push(along(&|view, step| {
+            view.principal_px[axis] += step * view.focal_px[axis]
+        }));
     }
     let image = reference::render_decided(view, splats, &decisions);
     for channel in 0..3 {
-        let picture = |pixel: usize| image.rgb[pixel][channel] + image.transmittance[pixel] * background_rgb[channel];
-        expected.push((0..image.rgb.len()).map(|pixel| upstream.rgb[pixel][channel] * picture(pixel)).sum());
+        let picture = |pixel: usize| {
+            image.rgb[pixel][channel] + image.transmittance[pixel] * background_rgb[channel]
+        };
+        expected.push(
+            (0..image.rgb.len())
+                .map(|pixel| upstream.rgb[pixel][channel] * picture(pixel))
+                .sum(),
+        );
     }
     let mut mismatches = Mismatches::default();
     for group in [0..3, 3..6, 6..7, 7..9, 9..11, 11..14] {
-        let largest = expected[group.clone()].iter().fold(1e-12f64, |max, value| max.max(value.abs()));
+        let largest = expected[group.clone()]
+            .iter()
+            .fold(1e-12f64, |max, value| max.max(value.abs()));
         for param in group {
             mismatches.check(
                 format!("camera {param}"),
@@ -515,8 +701,8 @@ fn check_camera_gradients(
     mismatches.assert_none();
 }
 
-/// The first few splats in a stack of opaque splats saturate every tile. The splats behind them must get no gradient,
-/// even if their slots contain gradients of an earlier step.
+/// The first few splats in a stack of opaque splats saturate every tile. The splats behind them
+/// must get no gradient, even if their slots contain gradients of an earlier step.
 fn check_hidden_splats(variants: &[GpuOptions]) {
     const N_VISIBLE: usize = 8;
     let view = scene::tilted_view();
@@ -525,8 +711,11 @@ fn check_hidden_splats(variants: &[GpuOptions]) {
     let mut stack = vec![scene::small_scene(6, 1)[0].clone(); 600];
     for (ix, splat) in stack.iter_mut().enumerate() {
         let z = 2.0 + 0.001 * ix as f64;
-        let on_axis = [0, 1].map(|axis| (size[axis] - view.principal_px[axis]) / view.focal_px[axis] * z);
-        splat.mean = (world_from_camera * nalgebra::Point3::new(on_axis[0], on_axis[1], z)).coords.into();
+        let on_axis =
+            [0, 1].map(|axis| (size[axis] - view.principal_px[axis]) / view.focal_px[axis] * z);
+        splat.mean = (world_from_camera * nalgebra::Point3::new(on_axis[0], on_axis[1], z))
+            .coords
+            .into();
         splat.log_scale = [3.0; 3]; // Far larger than the image.
         splat.opacity_logit = 8.0;
     }
@@ -534,9 +723,21 @@ fn check_hidden_splats(variants: &[GpuOptions]) {
         let fixture = KernelFixture::new(options, &view, &arrays_of(&stack));
         let gpu = &fixture.gpu;
         let n_pixels = (view.size_px[0] * view.size_px[1]) as usize;
-        gpu.write(&fixture.scratch.gradients, 0, bytemuck::cast_slice(&vec![1.0f32; 12 << 14]));
-        gpu.write(&fixture.image_buffers.upstream, 0, bytemuck::cast_slice(&vec![1.0f32; 4 * n_pixels]));
-        gpu.write(&fixture.image_buffers.pixel_totals, 0, bytemuck::cast_slice(&vec![1.0f32; 2 * n_pixels]));
+        gpu.write(
+            &fixture.scratch.gradients,
+            0,
+            bytemuck::cast_slice(&vec![1.0f32; 12 << 14]),
+        );
+        gpu.write(
+            &fixture.image_buffers.upstream,
+            0,
+            bytemuck::cast_slice(&vec![1.0f32; 4 * n_pixels]),
+        );
+        gpu.write(
+            &fixture.image_buffers.pixel_totals,
+            0,
+            bytemuck::cast_slice(&vec![1.0f32; 2 * n_pixels]),
+        );
         let rule = gpu.uniform_with("rule", &<Rule as bytemuck::Zeroable>::zeroed());
         let gradients_only = TrainPipelines::gradients_only(gpu).unwrap();
         let mut passes = Passes::default();
@@ -548,8 +749,13 @@ fn check_hidden_splats(variants: &[GpuOptions]) {
         let got = fixture.splats.read(gpu).unwrap();
         let has_gradient = |ix: usize| got.sh[16 * ix].iter().any(|value| *value != 0.0);
         assert!(has_gradient(0), "the front splat is visible");
-        let hidden: Vec<usize> = (N_VISIBLE..stack.len()).filter(|ix| has_gradient(*ix)).collect();
-        assert!(hidden.is_empty(), "hidden splats have gradients: {hidden:?}");
+        let hidden: Vec<usize> = (N_VISIBLE..stack.len())
+            .filter(|ix| has_gradient(*ix))
+            .collect();
+        assert!(
+            hidden.is_empty(),
+            "hidden splats have gradients: {hidden:?}"
+        );
     }
 }
 
@@ -574,12 +780,19 @@ fn invalid_splats_are_not_drawn() {
     let mut on_camera_plane = splats[1].clone();
     on_camera_plane.mean = view.camera_from_world.inverse().translation.vector.into();
     invalid_splats.push(on_camera_plane);
-    let (image, depth) = KernelFixture::new(&GpuOptions::default(), &view, &arrays_of(&invalid_splats)).render();
-    assert!(image.as_flattened().iter().chain(&depth).all(|value| value.is_finite()));
+    let (image, depth) =
+        KernelFixture::new(&GpuOptions::default(), &view, &arrays_of(&invalid_splats)).render();
+    assert!(
+        image
+            .as_flattened()
+            .iter()
+            .chain(&depth)
+            .all(|value| value.is_finite())
+    );
 }
 
-/// Camera parameters of zero do not change the view. Adam's first step changes each enabled parameter by its learning
-/// rate, and no other parameter.
+/// Camera parameters of zero do not change the view. Adam's first step changes each enabled
+/// parameter by its learning rate, and no other parameter.
 #[test]
 fn camera_params_start_at_zero_and_step_by_their_rate() {
     let view = scene::tilted_view();
@@ -602,22 +815,42 @@ fn camera_params_start_at_zero_and_step_by_their_rate() {
         let rule = gpu.uniform_with("rule", &<Rule as bytemuck::Zeroable>::zeroed());
         let mut passes = Passes::default();
         cameras.correct(gpu, &mut passes, &fixture.train, &fixture.view, &lens);
-        let view_passes = ViewPasses { view: &cameras.corrected, ..fixture.passes() };
+        let view_passes = ViewPasses {
+            view: &cameras.corrected,
+            ..fixture.passes()
+        };
         view_passes.draw_for_backward(&mut passes, &fixture.draw, &fixture.train);
-        view_passes.compare(&mut passes, &fixture.train, &Target { gains: &cameras.gains, ..target_buffers.target() });
+        view_passes.compare(
+            &mut passes,
+            &fixture.train,
+            &Target {
+                gains: &cameras.gains,
+                ..target_buffers.target()
+            },
+        );
         view_passes.backward(&mut passes, &fixture.train);
         view_passes.update(&mut passes, &fixture.train.update_with_camera, &rule, true);
         cameras.refine(&view_passes, &mut passes, &fixture.train, &lens);
         passes.submit(gpu);
         let corrected: Vec<f32> = gpu.read(&cameras.corrected, 20).unwrap();
         let base = camera_of(&view).view();
-        for (ix, (got, expected)) in corrected.iter().zip(bytemuck::cast_slice::<_, f32>(&[base])).enumerate() {
-            assert!((got - expected).abs() <= 1e-6 * expected.abs().max(1.0), "word {ix}: {got}, expected {expected}");
+        for (ix, (got, expected)) in corrected
+            .iter()
+            .zip(bytemuck::cast_slice::<_, f32>(&[base]))
+            .enumerate()
+        {
+            assert!(
+                (got - expected).abs() <= 1e-6 * expected.abs().max(1.0),
+                "word {ix}: {got}, expected {expected}"
+            );
         }
         let steps: Vec<f64> = cameras.param_values(gpu);
         for (param, step) in steps.iter().enumerate() {
             let rate = if (7..11).contains(&param) { 1e-3 } else { 0.0 };
-            assert!((step.abs() - rate).abs() < 1e-5, "camera parameter {param} changed by {step}");
+            assert!(
+                (step.abs() - rate).abs() < 1e-5,
+                "camera parameter {param} changed by {step}"
+            );
         }
     }
 }

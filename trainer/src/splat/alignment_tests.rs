@@ -1,5 +1,5 @@
-//! Tests of training with alignment: the correction is applied to every camera, and resuming from a checkpoint is
-//! bit-exact.
+//! Tests of training with alignment: the correction is applied to every camera, and resuming from a
+//! checkpoint is bit-exact.
 
 use super::{SplatOptions, SplatTrainer, ply};
 use crate::gpu::Gpu;
@@ -18,8 +18,12 @@ fn new_model(gpu: &Arc<Gpu>, keyframes: &[Arc<Keyframe>]) -> Aligned<SplatTraine
         n_planned_steps: N_PLANNED_STEPS,
         ..CommonOptions::default()
     };
-    let specific =
-        SplatOptions { max_splats: 2000, coarse_steps: Some([1000, 1000]), sh_degree: 0, ..SplatOptions::default() };
+    let specific = SplatOptions {
+        max_splats: 2000,
+        coarse_steps: Some([1000, 1000]),
+        sh_degree: 0,
+        ..SplatOptions::default()
+    };
     let align = CameraRefinement::Try(vec![ParamSet::EXTRINSICS]);
     let trainer = SplatTrainer::new(gpu.clone(), ModelOptions { common, specific }).unwrap();
     let mut model = Aligned::new(trainer, align, true, N_PLANNED_STEPS);
@@ -39,21 +43,35 @@ fn train_to(model: &mut dyn Method, step: u64) {
 fn wrong_extrinsics_are_corrected_and_resuming_is_exact() {
     const ALIGNMENT_STEP: u64 = 30;
     let gpu = test_gpu();
-    let miscalibration = Miscalibration { extrinsics: wrong_extrinsics(), ..Miscalibration::none() };
+    let miscalibration = Miscalibration {
+        extrinsics: wrong_extrinsics(),
+        ..Miscalibration::none()
+    };
     let keyframes = capture(&miscalibration);
     let mut uninterrupted = new_model(&gpu, &keyframes);
     train_to(&mut uninterrupted, ALIGNMENT_STEP);
     assert!(uninterrupted.alignment().is_none());
     uninterrupted.step(1).unwrap();
-    assert_eq!(uninterrupted.progress().step, ALIGNMENT_STEP + 1, "training continues");
+    assert_eq!(
+        uninterrupted.progress().step,
+        ALIGNMENT_STEP + 1,
+        "training continues"
+    );
     let correction = uninterrupted.alignment().unwrap().corrections["wrist"].clone();
     let (degrees, mm) = remaining(&correction, &miscalibration.extrinsics);
     assert!(degrees < 0.05 && mm < 0.5, "{degrees} degrees, {mm} mm");
-    let test = keyframes.iter().find(|keyframe| keyframe.split == Split::Test).unwrap();
-    assert_eq!(uninterrupted.calibrated_camera(test).unwrap(), correction.apply(test));
+    let test = keyframes
+        .iter()
+        .find(|keyframe| keyframe.split == Split::Test)
+        .unwrap();
+    assert_eq!(
+        uninterrupted.calibrated_camera(test).unwrap(),
+        correction.apply(test)
+    );
     train_to(&mut uninterrupted, ALIGNMENT_STEP + 10);
 
-    // Interrupt training before and after the alignment is applied. Stored keyframes are not in the order of arrival.
+    // Interrupt training before and after the alignment is applied. Stored keyframes are not in the
+    // order of arrival.
     let mut stored = keyframes.clone();
     stored.reverse();
     let mut interrupted: Box<dyn Method> = Box::new(new_model(&gpu, &keyframes));
@@ -83,5 +101,8 @@ fn wrong_extrinsics_are_corrected_and_resuming_is_exact() {
     let trainer = SplatTrainer::from_arrays(gpu, ModelOptions::default(), &arrays).unwrap();
     let trainer = trainer.with_saved_metadata(folder.path()).unwrap();
     let mut loaded = Aligned::load(trainer, folder.path()).unwrap();
-    assert_eq!(loaded.calibrated_camera(test).unwrap(), correction.apply(test));
+    assert_eq!(
+        loaded.calibrated_camera(test).unwrap(),
+        correction.apply(test)
+    );
 }

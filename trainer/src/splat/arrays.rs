@@ -9,9 +9,11 @@ use std::path::Path;
 const MAX_COEFFICIENTS: usize = 16;
 /// Splats that are more transparent are not drawn, see shared/projection.wgsl.
 const MIN_ALPHA: f64 = 1.0 / 255.0;
-/// Maximum absolute coordinate of a mean in a file: beyond the size of the Earth, also in millimeters.
+/// Maximum absolute coordinate of a mean in a file: beyond the size of the Earth, also in
+/// millimeters.
 const MAX_MEAN: f32 = 1e11;
-/// Logarithm of the maximum standard deviation in a file, 1000 km: larger splats cover every picture.
+/// Logarithm of the maximum standard deviation in a file, 1000 km: larger splats cover every
+/// picture.
 const MAX_LOG_SCALE: f32 = 13.8;
 /// Maximum absolute color coefficient in a file. The sum of 16 larger ones might not be finite.
 const MAX_COLOR: f32 = 1e6;
@@ -27,12 +29,14 @@ pub struct SplatArrays {
     pub rotations_wxyz: Vec<[f32; 4]>,
     /// Opacities before the logistic function.
     pub opacity_logits: Vec<f32>,
-    /// Spherical-harmonic coefficients of red, green and blue. Each splat has a contiguous range, constant term first.
+    /// Spherical-harmonic coefficients of red, green and blue. Each splat has a contiguous range,
+    /// constant term first.
     pub sh: Vec<[f32; 3]>,
     /// Degree of the spherical harmonics, 0 to 3.
     pub sh_degree: u32,
-    /// Whether opacities are corrected for the low-pass filter (Mip-Splatting, Yu et al. 2024, equation 12). True only for
-    /// files of other programs that were trained this way; false for splats trained by fieldrig.
+    /// Whether opacities are corrected for the low-pass filter (Mip-Splatting, Yu et al. 2024,
+    /// equation 12). True only for files of other programs that were trained this way; false for
+    /// splats trained by fieldrig.
     pub is_antialiased: bool,
 }
 
@@ -41,7 +45,8 @@ impl SplatArrays {
     ///
     /// # Errors
     ///
-    /// Fails if lengths differ, the degree exceeds 3, a value is not finite, or a rotation has length zero.
+    /// Fails if lengths differ, the degree exceeds 3, a value is not finite, or a rotation has
+    /// length zero.
     ///
     /// ```
     /// use trainer::splat::arrays::SplatArrays;
@@ -60,34 +65,51 @@ impl SplatArrays {
     /// ```
     pub fn checked(self) -> Result<Self, Error> {
         if self.n_coefficients() > MAX_COEFFICIENTS {
-            return Err(Error::SplatArrays(format!("SH degree {}, expected at most 3", self.sh_degree)));
+            return Err(Error::SplatArrays(format!(
+                "SH degree {}, expected at most 3",
+                self.sh_degree
+            )));
         }
         self.check_lengths()?;
         self.check_finite()?;
-        match self.rotations_wxyz.iter().position(|rotation| rotation.iter().all(|&part| part == 0.0)) {
-            Some(splat_ix) => Err(Error::SplatArrays(format!("rotation of splat {splat_ix} has length zero"))),
+        match self
+            .rotations_wxyz
+            .iter()
+            .position(|rotation| rotation.iter().all(|&part| part == 0.0))
+        {
+            Some(splat_ix) => Err(Error::SplatArrays(format!(
+                "rotation of splat {splat_ix} has length zero"
+            ))),
             None => Ok(self),
         }
     }
 
-    /// Like [`Self::checked`], but leaves out splats with invalid or absurd numbers and names the first of them in a
-    /// warning. An infinite opacity is limited.
+    /// Like [`Self::checked`], but leaves out splats with invalid or absurd numbers and names the
+    /// first of them in a warning. An infinite opacity is limited.
     ///
     /// # Errors
     /// If the lengths of the arrays do not match, or there are splats but none is valid.
     pub(crate) fn without_invalid(mut self, path: &Path) -> Result<Self, Error> {
         const MAX_LOGIT: f32 = 30.0;
         self.check_lengths()?;
-        for logit in self.opacity_logits.iter_mut().filter(|logit| logit.is_infinite()) {
+        for logit in self
+            .opacity_logits
+            .iter_mut()
+            .filter(|logit| logit.is_infinite())
+        {
             *logit = MAX_LOGIT.copysign(*logit);
         }
         let n_splats = self.n_splats();
         let mut invalid = (0..n_splats).filter_map(|ix| Some((ix, self.fault(ix)?)));
-        let Some((first, fault)) = invalid.next() else { return self.checked() };
+        let Some((first, fault)) = invalid.next() else {
+            return self.checked();
+        };
         let n_invalid = 1 + invalid.count();
         if n_invalid == n_splats {
             self.checked()?;
-            return Err(Error::SplatArrays(format!("none of {n_splats} can be used; splat {first}: {fault}")));
+            return Err(Error::SplatArrays(format!(
+                "none of {n_splats} can be used; splat {first}: {fault}"
+            )));
         }
         log::warn!(
             "{}: left out {n_invalid} of {n_splats} splats with invalid numbers; the first has index {first}: {fault}",
@@ -99,19 +121,47 @@ impl SplatArrays {
     /// Why a splat of a file cannot be drawn sensibly; `None` if it can.
     fn fault(&self, ix: usize) -> Option<&'static str> {
         let n_coeffs = self.n_coefficients();
-        let (mean, log_scales, rotation) = (&self.means[ix], &self.log_scales[ix], &self.rotations_wxyz[ix]);
+        let (mean, log_scales, rotation) = (
+            &self.means[ix],
+            &self.log_scales[ix],
+            &self.rotations_wxyz[ix],
+        );
         let color = self.sh[ix * n_coeffs..(ix + 1) * n_coeffs].as_flattened();
-        let mut all = mean.iter().chain(log_scales).chain(rotation).chain(color).chain([&self.opacity_logits[ix]]);
+        let mut all = mean
+            .iter()
+            .chain(log_scales)
+            .chain(rotation)
+            .chain(color)
+            .chain([&self.opacity_logits[ix]]);
         let squared_length: f32 = rotation.iter().map(|part| part * part).sum();
         // Each condition describes valid numbers, so that it is false for NaN.
         let checks = [
             (all.all(|value| value.is_finite()), "a number is not finite"),
-            (mean.iter().all(|meters| meters.abs() <= MAX_MEAN), "the mean is more than 1e11 m from the origin"),
-            (log_scales.iter().all(|log_scale| *log_scale <= MAX_LOG_SCALE), "a standard deviation exceeds 1e6 m"),
-            (squared_length.is_normal(), "the length of the rotation is zero, or its square exceeds the range of f32"),
-            (color.iter().all(|coefficient| coefficient.abs() <= MAX_COLOR), "a color coefficient exceeds 1e6"),
+            (
+                mean.iter().all(|meters| meters.abs() <= MAX_MEAN),
+                "the mean is more than 1e11 m from the origin",
+            ),
+            (
+                log_scales
+                    .iter()
+                    .all(|log_scale| *log_scale <= MAX_LOG_SCALE),
+                "a standard deviation exceeds 1e6 m",
+            ),
+            (
+                squared_length.is_normal(),
+                "the length of the rotation is zero, or its square exceeds the range of f32",
+            ),
+            (
+                color
+                    .iter()
+                    .all(|coefficient| coefficient.abs() <= MAX_COLOR),
+                "a color coefficient exceeds 1e6",
+            ),
         ];
-        checks.into_iter().find(|(is_valid, _)| !is_valid).map(|(_, fault)| fault)
+        checks
+            .into_iter()
+            .find(|(is_valid, _)| !is_valid)
+            .map(|(_, fault)| fault)
     }
 
     /// Number of splats.
@@ -132,24 +182,38 @@ impl SplatArrays {
     /// Indices of the splats that are drawn. Splats with values that are not finite are not.
     pub(crate) fn visible(&self) -> Vec<u32> {
         let is_finite = |ix: usize| {
-            let shape = self.means[ix].iter().chain(&self.log_scales[ix]).chain(&self.rotations_wxyz[ix]);
-            shape.chain(&self.sh[ix * self.n_coefficients()]).all(|value| value.is_finite())
+            let shape = self.means[ix]
+                .iter()
+                .chain(&self.log_scales[ix])
+                .chain(&self.rotations_wxyz[ix]);
+            shape
+                .chain(&self.sh[ix * self.n_coefficients()])
+                .all(|value| value.is_finite())
         };
-        let is_visible = |ix: &u32| self.opacity(*ix as usize) > MIN_ALPHA && is_finite(*ix as usize);
-        (0..u32::try_from(self.n_splats()).unwrap_or(u32::MAX)).filter(is_visible).collect()
+        let is_visible =
+            |ix: &u32| self.opacity(*ix as usize) > MIN_ALPHA && is_finite(*ix as usize);
+        (0..u32::try_from(self.n_splats()).unwrap_or(u32::MAX))
+            .filter(is_visible)
+            .collect()
     }
 
     /// The splats for which `is_kept` is true of the index.
     #[must_use]
     pub(crate) fn filtered(&self, is_kept: impl Fn(usize) -> bool + Sync) -> Self {
-        let kept: Vec<usize> = (0..self.n_splats()).into_par_iter().filter(|ix| is_kept(*ix)).collect();
+        let kept: Vec<usize> = (0..self.n_splats())
+            .into_par_iter()
+            .filter(|ix| is_kept(*ix))
+            .collect();
         let n_coeffs = self.n_coefficients();
         Self {
             means: kept.iter().map(|ix| self.means[*ix]).collect(),
             log_scales: kept.iter().map(|ix| self.log_scales[*ix]).collect(),
             rotations_wxyz: kept.iter().map(|ix| self.rotations_wxyz[*ix]).collect(),
             opacity_logits: kept.iter().map(|ix| self.opacity_logits[*ix]).collect(),
-            sh: kept.iter().flat_map(|ix| self.sh[ix * n_coeffs..(ix + 1) * n_coeffs].iter().copied()).collect(),
+            sh: kept
+                .iter()
+                .flat_map(|ix| self.sh[ix * n_coeffs..(ix + 1) * n_coeffs].iter().copied())
+                .collect(),
             sh_degree: self.sh_degree,
             is_antialiased: self.is_antialiased,
         }
@@ -158,7 +222,11 @@ impl SplatArrays {
     /// The splats whose means are not in erased space.
     #[must_use]
     pub(crate) fn without_erased(self, edits: &Edits) -> Self {
-        if edits.is_empty() { self } else { self.filtered(|ix| !edits.erases(self.means[ix].map(f64::from))) }
+        if edits.is_empty() {
+            self
+        } else {
+            self.filtered(|ix| !edits.erases(self.means[ix].map(f64::from)))
+        }
     }
 
     fn check_lengths(&self) -> Result<(), Error> {
@@ -167,11 +235,17 @@ impl SplatArrays {
             ("log scales", self.log_scales.len(), n_splats),
             ("rotations", self.rotations_wxyz.len(), n_splats),
             ("opacities", self.opacity_logits.len(), n_splats),
-            ("color coefficients", self.sh.len(), n_splats * self.n_coefficients()),
+            (
+                "color coefficients",
+                self.sh.len(),
+                n_splats * self.n_coefficients(),
+            ),
         ];
         for (what, got, expected) in arrays {
             if got != expected {
-                return Err(Error::SplatArrays(format!("{got} {what} for {n_splats} means, expected {expected}")));
+                return Err(Error::SplatArrays(format!(
+                    "{got} {what} for {n_splats} means, expected {expected}"
+                )));
             }
         }
         Ok(())
@@ -182,14 +256,24 @@ impl SplatArrays {
         let arrays = [
             ("mean", not_finite(self.means.as_flattened()), 3),
             ("log scale", not_finite(self.log_scales.as_flattened()), 3),
-            ("rotation", not_finite(self.rotations_wxyz.as_flattened()), 4),
+            (
+                "rotation",
+                not_finite(self.rotations_wxyz.as_flattened()),
+                4,
+            ),
             ("opacity", not_finite(&self.opacity_logits), 1),
-            ("color", not_finite(self.sh.as_flattened()), 3 * self.n_coefficients()),
+            (
+                "color",
+                not_finite(self.sh.as_flattened()),
+                3 * self.n_coefficients(),
+            ),
         ];
         for (what, position, values_per_splat) in arrays {
             if let Some(position) = position {
                 let splat_ix = position / values_per_splat;
-                return Err(Error::SplatArrays(format!("{what} of splat {splat_ix} is not finite")));
+                return Err(Error::SplatArrays(format!(
+                    "{what} of splat {splat_ix} is not finite"
+                )));
             }
         }
         Ok(())
@@ -212,7 +296,8 @@ mod tests {
         }
     }
 
-    /// Applies `change` to two valid splats and returns the error message of [`SplatArrays::checked`].
+    /// Applies `change` to two valid splats and returns the error message of
+    /// [`SplatArrays::checked`].
     fn error_after(change: impl FnOnce(&mut SplatArrays)) -> String {
         let mut splats = two_splats();
         change(&mut splats);
@@ -227,12 +312,30 @@ mod tests {
 
     #[test]
     fn error_names_the_invalid_array() {
-        assert_eq!(error_after(|s| s.log_scales.truncate(1)), "splats: 1 log scales for 2 means, expected 2");
-        assert_eq!(error_after(|s| s.sh.truncate(5)), "splats: 5 color coefficients for 2 means, expected 8");
-        assert_eq!(error_after(|s| s.sh_degree = 4), "splats: SH degree 4, expected at most 3");
-        assert_eq!(error_after(|s| s.means[1][2] = f32::NAN), "splats: mean of splat 1 is not finite");
-        assert_eq!(error_after(|s| s.sh[4][0] = f32::INFINITY), "splats: color of splat 1 is not finite");
-        assert_eq!(error_after(|s| s.rotations_wxyz[0] = [0.0; 4]), "splats: rotation of splat 0 has length zero");
+        assert_eq!(
+            error_after(|s| s.log_scales.truncate(1)),
+            "splats: 1 log scales for 2 means, expected 2"
+        );
+        assert_eq!(
+            error_after(|s| s.sh.truncate(5)),
+            "splats: 5 color coefficients for 2 means, expected 8"
+        );
+        assert_eq!(
+            error_after(|s| s.sh_degree = 4),
+            "splats: SH degree 4, expected at most 3"
+        );
+        assert_eq!(
+            error_after(|s| s.means[1][2] = f32::NAN),
+            "splats: mean of splat 1 is not finite"
+        );
+        assert_eq!(
+            error_after(|s| s.sh[4][0] = f32::INFINITY),
+            "splats: color of splat 1 is not finite"
+        );
+        assert_eq!(
+            error_after(|s| s.rotations_wxyz[0] = [0.0; 4]),
+            "splats: rotation of splat 0 has length zero"
+        );
     }
 
     type Change<'a> = &'a dyn Fn(&mut SplatArrays);
@@ -251,7 +354,11 @@ mod tests {
             s.sh[1][2] = -MAX_COLOR;
             s.opacity_logits[0] = 1e30;
         };
-        assert_eq!(valid_after(&limits).unwrap().n_splats(), 2, "values at the limits are kept");
+        assert_eq!(
+            valid_after(&limits).unwrap().n_splats(),
+            2,
+            "values at the limits are kept"
+        );
         let faults: [(&str, Change<'_>); 8] = [
             ("not finite", &|s| s.opacity_logits[0] = f32::NAN),
             ("not finite", &|s| s.sh[3][0] = f32::NEG_INFINITY),
@@ -264,13 +371,26 @@ mod tests {
         ];
         for (what, change) in faults {
             let splats = valid_after(change).unwrap();
-            assert_eq!((splats.n_splats(), splats.means[0]), (1, two_splats().means[1]), "{what}");
+            assert_eq!(
+                (splats.n_splats(), splats.means[0]),
+                (1, two_splats().means[1]),
+                "{what}"
+            );
             let mut splats = two_splats();
             change(&mut splats);
-            assert!(splats.fault(0).is_some_and(|fault| fault.contains(what)) && splats.fault(1).is_none(), "{what}");
+            assert!(
+                splats.fault(0).is_some_and(|fault| fault.contains(what))
+                    && splats.fault(1).is_none(),
+                "{what}"
+            );
         }
-        let error = valid_after(&|s| s.log_scales.fill([200.0; 3])).unwrap_err().to_string();
-        assert_eq!(error, "splats: none of 2 can be used; splat 0: a standard deviation exceeds 1e6 m");
+        let error = valid_after(&|s| s.log_scales.fill([200.0; 3]))
+            .unwrap_err()
+            .to_string();
+        assert_eq!(
+            error,
+            "splats: none of 2 can be used; splat 0: a standard deviation exceeds 1e6 m"
+        );
         let limited = valid_after(&|s| s.opacity_logits[0] = f32::INFINITY).unwrap();
         assert_eq!(limited.opacity_logits[0], 30.0);
     }

@@ -1,8 +1,9 @@
 //! Detects that exposure or white balance changes during a live run.
 //!
-//! Each training keyframe is compared with a rendered picture when it arrives, before the model is trained on it: without
-//! gains, and with the gains of the previous keyframe of its camera. If the camera changes its exposure, in a step or
-//! slowly, then the previous gains predict those of the next keyframes better than no gains do.
+//! Each training keyframe is compared with a rendered picture when it arrives, before the model is
+//! trained on it: without gains, and with the gains of the previous keyframe of its camera. If the
+//! camera changes its exposure, in a step or slowly, then the previous gains predict those of the
+//! next keyframes better than no gains do.
 
 use calibration::{Candidate, MIN_VALIDATION_IMAGES, ParamSet, Trial};
 use serde::{Deserialize, Serialize};
@@ -12,7 +13,8 @@ use std::collections::{BTreeMap, VecDeque};
 const MAX_SCORED: usize = 8;
 /// Minimum mean gain, dB. Smaller gains may come from areas that the model does not show yet.
 const MIN_MEAN_GAIN_DB: f64 = 1.0;
-/// Minimum PSNR with the best gains, dB. If it is lower, the picture differs in more than brightness.
+/// Minimum PSNR with the best gains, dB. If it is lower, the picture differs in more than
+/// brightness.
 const MIN_PSNR_DB: f64 = 18.0;
 
 /// Scores of the latest keyframes.
@@ -40,11 +42,15 @@ impl ArrivalGains {
             return None;
         }
         let previous = self.last_log_gains.insert(camera.to_owned(), log_gains)?;
-        self.differences_db.push_back(psnr(previous.map(f64::exp))? - psnr([1.0; 3])?);
+        self.differences_db
+            .push_back(psnr(previous.map(f64::exp))? - psnr([1.0; 3])?);
         if self.differences_db.len() > MAX_SCORED {
             self.differences_db.pop_front();
         }
-        let trial = Trial::of_gains(Candidate::Cameras(ParamSet::IMAGE_GAINS), self.differences_db.make_contiguous());
+        let trial = Trial::of_gains(
+            Candidate::Cameras(ParamSet::IMAGE_GAINS),
+            self.differences_db.make_contiguous(),
+        );
         let is_clear = trial.n_images >= MIN_VALIDATION_IMAGES && trial.gain_db >= MIN_MEAN_GAIN_DB;
         (trial.kept && is_clear).then_some(trial)
     }
@@ -54,8 +60,8 @@ impl ArrivalGains {
 mod tests {
     use super::*;
 
-    /// Number of keyframes up to the decision, if the keyframes have these log gains and the model has none. The picture
-    /// matches up to 30 dB.
+    /// Number of keyframes up to the decision, if the keyframes have these log gains and the model
+    /// has none. The picture matches up to 30 dB.
     fn n_until_decision(log_gains: impl IntoIterator<Item = f64>) -> Option<usize> {
         let mut arrivals = ArrivalGains::default();
         let is_decided = |log_gain: f64| {
@@ -65,7 +71,11 @@ mod tests {
             };
             arrivals.add("wrist", [log_gain; 3], psnr).is_some()
         };
-        log_gains.into_iter().map(is_decided).position(|decided| decided).map(|ix| ix + 1)
+        log_gains
+            .into_iter()
+            .map(is_decided)
+            .position(|decided| decided)
+            .map(|ix| ix + 1)
     }
 
     #[test]
@@ -79,15 +89,23 @@ mod tests {
 
     #[test]
     fn noise_and_single_outliers_are_no_change_of_exposure() {
-        let noise = |ix: u32| 0.02 * f64::from(ix.wrapping_mul(2_654_435_761) >> 16) / 65536.0 - 0.01;
+        let noise =
+            |ix: u32| 0.02 * f64::from(ix.wrapping_mul(2_654_435_761) >> 16) / 65536.0 - 0.01;
         assert_eq!(n_until_decision((0..400).map(noise)), None);
-        assert_eq!(n_until_decision((0..40).map(|ix| if ix == 20 { 0.7 } else { 0.0 })), None);
+        assert_eq!(
+            n_until_decision((0..40).map(|ix| if ix == 20 { 0.7 } else { 0.0 })),
+            None
+        );
     }
 
     #[test]
     fn pictures_that_differ_in_more_than_brightness_are_not_scored() {
         let mut arrivals = ArrivalGains::default();
-        let is_any = (0..20).any(|_| arrivals.add("wrist", [0.7; 3], |gains| Some(10.0 + gains[0])).is_some());
+        let is_any = (0..20).any(|_| {
+            arrivals
+                .add("wrist", [0.7; 3], |gains| Some(10.0 + gains[0]))
+                .is_some()
+        });
         assert!(!is_any && arrivals == ArrivalGains::default());
     }
 }

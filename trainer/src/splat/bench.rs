@@ -1,8 +1,9 @@
 //! Times rendering and training steps on a given cloud, in total and pass by pass.
 //!
-//! The setup matches the benchmark of the peer implementation: a pinhole camera at [`Eye::Outside`] looking along z
-//! with a focal length of 0.9 image widths, a target of uniform noise, L1 loss, and an update of every splat per step.
-//! [`Losses::Training`] adds the other losses of training with depth.
+//! The setup matches the benchmark of the peer implementation: a pinhole camera at [`Eye::Outside`]
+//! looking along z with a focal length of 0.9 image widths, a target of uniform noise, L1 loss, and
+//! an update of every splat per step. [`Losses::Training`] adds the other losses of training with
+//! depth.
 
 use super::arrays::SplatArrays;
 use super::buffers::{ImageBuffers, Scratch, ScratchSize, SplatBuffers, n_bins, n_tiles};
@@ -36,11 +37,11 @@ pub struct KernelFigures {
     /// Lists of the tiles.
     #[serde(flatten)]
     pub work: WorkCounts,
-    /// Median GPU time of a picture, from the first pass to the last, milliseconds. Wall time if timestamps are
-    /// unavailable.
+    /// Median GPU time of a picture, from the first pass to the last, milliseconds. Wall time if
+    /// timestamps are unavailable.
     pub render_millis: f64,
-    /// Median GPU time of a picture that is also packed as JPEG and depth for a viewer, milliseconds; `None` on the
-    /// CPU, where pictures are not packed.
+    /// Median GPU time of a picture that is also packed as JPEG and depth for a viewer,
+    /// milliseconds; `None` on the CPU, where pictures are not packed.
     pub packed_millis: Option<f64>,
     /// Median GPU time of a step that updates every splat, milliseconds.
     pub step_millis: f64,
@@ -56,7 +57,8 @@ pub struct KernelFigures {
     pub mean_rgb: [f64; 3],
     /// Peak size of all GPU buffers, bytes.
     pub peak_bytes: u64,
-    /// GPU time of each pass of one step, then of each pass that packs a picture; empty without timestamps.
+    /// GPU time of each pass of one step, then of each pass that packs a picture; empty without
+    /// timestamps.
     #[serde(skip)]
     pub passes: Vec<PassTiming>,
 }
@@ -146,21 +148,34 @@ pub fn time_kernels(
     bench.size_buffers()?;
     let mut passes = Passes::default();
     let mean_rgb = bench.mean_rgb(&mut passes)?;
-    let (render_millis, render_wall_millis) = bench.time(&mut passes, repeats, KernelBench::record_picture)?;
-    let (step_millis, step_wall_millis) = bench.time(&mut passes, repeats, KernelBench::record_step)?;
+    let (render_millis, render_wall_millis) =
+        bench.time(&mut passes, repeats, KernelBench::record_picture)?;
+    let (step_millis, step_wall_millis) =
+        bench.time(&mut passes, repeats, KernelBench::record_step)?;
     bench.record_step(&mut passes)?;
     let mut timings = passes.submit_timed(gpu)?;
     let mut packed_millis = None;
     if !gpu.is_software() {
-        packed_millis = Some(bench.time(&mut passes, repeats, KernelBench::record_packed_picture)?.0);
+        packed_millis = Some(
+            bench
+                .time(&mut passes, repeats, KernelBench::record_packed_picture)?
+                .0,
+        );
         bench.record_packing(&mut passes)?;
         timings.extend(passes.submit_timed(gpu)?);
     }
     let peak_bytes = gpu.peak_bytes();
-    let (step_visible_millis, _) = bench.time(&mut passes, repeats, KernelBench::record_step_visible)?;
+    let (step_visible_millis, _) =
+        bench.time(&mut passes, repeats, KernelBench::record_step_visible)?;
     let n_splats_in_view = bench.n_splats_in_view()?;
     Ok(KernelFigures {
-        work: WorkCounts::read(gpu, &bench.scratch, &bench.image_buffers, bench.splats.n_splats, setup.size_px)?,
+        work: WorkCounts::read(
+            gpu,
+            &bench.scratch,
+            &bench.image_buffers,
+            bench.splats.n_splats,
+            setup.size_px,
+        )?,
         render_millis,
         packed_millis,
         step_millis,
@@ -176,11 +191,15 @@ pub fn time_kernels(
 
 impl KernelBench {
     fn new(gpu: Arc<Gpu>, cloud: &SplatArrays, setup: KernelSetup) -> Result<Self, Error> {
-        let KernelSetup { size_px, eye, losses } = setup;
+        let KernelSetup {
+            size_px,
+            eye,
+            losses,
+        } = setup;
         let draw = DrawPipelines::new(&gpu)?;
         let train = TrainPipelines::new(&gpu)?;
-        let n_splats =
-            u32::try_from(cloud.n_splats()).map_err(|_| Error::SplatArrays("more than 2^32 splats".to_owned()))?;
+        let n_splats = u32::try_from(cloud.n_splats())
+            .map_err(|_| Error::SplatArrays("more than 2^32 splats".to_owned()))?;
         let mut splats = SplatBuffers::new(&gpu, n_splats, cloud.sh_degree)?;
         splats.append(&gpu, cloud);
         let n_pixels = size_px[0] * size_px[1];
@@ -198,16 +217,28 @@ impl KernelBench {
             low_pass_px2: LOW_PASS_PX2,
         };
         let noise: Vec<u32> = (0..n_pixels)
-            .map(|pixel| pixel.wrapping_mul(2_654_435_761).rotate_left(11).wrapping_mul(0x85eb_ca6b) | 0xff00_0000)
+            .map(|pixel| {
+                pixel
+                    .wrapping_mul(2_654_435_761)
+                    .rotate_left(11)
+                    .wrapping_mul(0x85eb_ca6b)
+                    | 0xff00_0000
+            })
             .collect();
         let (depth_m, supervision) = match losses {
             Losses::L1 => (0.0, <Supervision as bytemuck::Zeroable>::zeroed()),
-            Losses::Training => {
-                (DEPTH_M, Scarcity::of_images(N_IMAGES).supervision(&SplatOptions::default(), [0.0; 3]))
-            }
+            Losses::Training => (
+                DEPTH_M,
+                Scarcity::of_images(N_IMAGES).supervision(&SplatOptions::default(), [0.0; 3]),
+            ),
         };
         let tiles = n_tiles(size_px);
-        let initial_size = ScratchSize { n_splats, n_entries: 1 << 14, n_slots: 1 << 14, n_bins: n_bins(size_px) };
+        let initial_size = ScratchSize {
+            n_splats,
+            n_entries: 1 << 14,
+            n_slots: 1 << 14,
+            n_bins: n_bins(size_px),
+        };
         let mut counters = [0u32; status::LEN];
         counters[status::N_SPLATS as usize] = n_splats;
         Ok(Self {
@@ -216,11 +247,20 @@ impl KernelBench {
             status: gpu.storage_with("bench.status", bytemuck::cast_slice(&counters))?,
             view: gpu.uniform_with("bench.view", &camera.view()),
             image: gpu.storage_with("bench.target", bytemuck::cast_slice(&noise))?,
-            depth: gpu.storage_with("bench.depth", bytemuck::cast_slice(&vec![depth_m; n_pixels as usize]))?,
+            depth: gpu.storage_with(
+                "bench.depth",
+                bytemuck::cast_slice(&vec![depth_m; n_pixels as usize]),
+            )?,
             supervision: gpu.uniform_with("bench.supervision", &supervision),
             gains: gpu.storage_with("bench.gains", bytemuck::cast_slice(&[1.0f32; 4]))?,
             rule: gpu.uniform_with("bench.rule", &rule()),
-            rule_visible: gpu.uniform_with("bench.rule_touched", &Rule { update_all: 0, ..rule() }),
+            rule_visible: gpu.uniform_with(
+                "bench.rule_touched",
+                &Rule {
+                    update_all: 0,
+                    ..rule()
+                },
+            ),
             reader: RefCell::default(),
             draw,
             train,
@@ -246,10 +286,19 @@ impl KernelBench {
                 n_bins: n_bins(self.size_px),
             };
             drop(passes);
-            self.scratch =
-                Scratch::new(&self.gpu, &self.draw, ScratchSize { n_splats: 1, n_entries: 1, n_slots: 1, n_bins: 1 })?;
+            self.scratch = Scratch::new(
+                &self.gpu,
+                &self.draw,
+                ScratchSize {
+                    n_splats: 1,
+                    n_entries: 1,
+                    n_slots: 1,
+                    n_bins: 1,
+                },
+            )?;
             self.scratch = Scratch::new(&self.gpu, &self.draw, size)?;
-            self.gpu.write(&self.status, 4 * status::FAILED as u64, &[0; 12]);
+            self.gpu
+                .write(&self.status, 4 * status::FAILED as u64, &[0; 12]);
         }
         Ok(())
     }
@@ -279,12 +328,18 @@ impl KernelBench {
 
     /// Records the passes that convert and pack a picture.
     fn record_packing(&self, passes: &mut Passes) -> Result<(), Error> {
-        self.view_passes().finish(passes, &self.draw, &self.supervision);
+        self.view_passes()
+            .finish(passes, &self.draw, &self.supervision);
         let ImageBuffers { pixels, depths, .. } = &self.image_buffers;
-        let packing = Packing { jpeg_quality: Some(JPEG_QUALITY), depth: true };
+        let packing = Packing {
+            jpeg_quality: Some(JPEG_QUALITY),
+            depth: true,
+        };
         let mut reader = self.reader.borrow_mut();
         let output = reader.available(&self.gpu, passes, Output::packed(packing), self.size_px)?;
-        reader.record(&self.gpu, passes, output, self.size_px, [pixels, depths]).map(drop)
+        reader
+            .record(&self.gpu, passes, output, self.size_px, [pixels, depths])
+            .map(drop)
     }
 
     fn record_step(&self, passes: &mut Passes) -> Result<(), Error> {
@@ -322,19 +377,34 @@ impl KernelBench {
     }
 
     fn record_end(&self, passes: &mut Passes) {
-        passes.dispatch(&self.gpu, &self.train.advance, 1, &[("status", &self.status)]);
+        passes.dispatch(
+            &self.gpu,
+            &self.train.advance,
+            1,
+            &[("status", &self.status)],
+        );
     }
 
     fn n_splats_in_view(&self) -> Result<u64, Error> {
-        let tile_counts: Vec<u32> = self.gpu.read(&self.scratch.tile_counts, self.splats.n_splats as usize)?;
+        let tile_counts: Vec<u32> = self
+            .gpu
+            .read(&self.scratch.tile_counts, self.splats.n_splats as usize)?;
         Ok(tile_counts.iter().filter(|n_tiles| **n_tiles > 0).count() as u64)
     }
 
-    fn time(&self, passes: &mut Passes, repeats: Repeats, record: Recorded) -> Result<(f64, f64), Error> {
-        // Warm up, because some GPUs stay busy for tenths of a second after large buffers are freed.
+    fn time(
+        &self,
+        passes: &mut Passes,
+        repeats: Repeats,
+        record: Recorded,
+    ) -> Result<(f64, f64), Error> {
+        // Warm up, because some GPUs stay busy for tenths of a second after large buffers are
+        // freed.
         let warming = Instant::now();
         let mut n_warm = 0;
-        while n_warm < repeats.n_warm_up || (warming.elapsed() < repeats.warm_up && n_warm < 100 * repeats.n_warm_up) {
+        while n_warm < repeats.n_warm_up
+            || (warming.elapsed() < repeats.warm_up && n_warm < 100 * repeats.n_warm_up)
+        {
             record(self, passes)?;
             passes.submit(&self.gpu);
             self.gpu.wait()?;
@@ -367,7 +437,13 @@ impl KernelBench {
         passes.submit(&self.gpu);
         let n = (self.size_px[0] * self.size_px[1]) as usize;
         let image: Vec<[f32; 4]> = self.gpu.read(&self.image_buffers.image, n)?;
-        Ok(std::array::from_fn(|channel| image.iter().map(|pixel| f64::from(pixel[channel])).sum::<f64>() / n as f64))
+        Ok(std::array::from_fn(|channel| {
+            image
+                .iter()
+                .map(|pixel| f64::from(pixel[channel]))
+                .sum::<f64>()
+                / n as f64
+        }))
     }
 }
 

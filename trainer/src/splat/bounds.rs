@@ -8,10 +8,22 @@ const MIN_OPAQUE_FRAC: f64 = 0.02;
 
 /// Bounds around the median of the splats that are at least half opaque; `None` without splats.
 pub(super) fn bounds(splats: &SplatArrays) -> Option<Bounds> {
-    let n_opaque = splats.opacity_logits.iter().filter(|logit| **logit > 0.0).count();
+    let n_opaque = splats
+        .opacity_logits
+        .iter()
+        .filter(|logit| **logit > 0.0)
+        .count();
     let uses_all = (n_opaque as f64) < MIN_OPAQUE_FRAC * splats.n_splats() as f64;
-    let selected = splats.means.iter().zip(&splats.opacity_logits).filter(|(_, logit)| uses_all || **logit > 0.0);
-    Bounds::of_points(&selected.map(|(mean, _)| mean.map(f64::from)).collect::<Vec<_>>())
+    let selected = splats
+        .means
+        .iter()
+        .zip(&splats.opacity_logits)
+        .filter(|(_, logit)| uses_all || **logit > 0.0);
+    Bounds::of_points(
+        &selected
+            .map(|(mean, _)| mean.map(f64::from))
+            .collect::<Vec<_>>(),
+    )
 }
 
 #[cfg(test)]
@@ -41,17 +53,29 @@ mod tests {
             points.push(([2.0 + radius * angle.cos(), radius * angle.sin(), 1.0], 3.0));
         }
         let alone = bounds(&splats(&points)).expect("splats");
-        assert!((alone.center_m[0] - 2.0).abs() < 0.1 && (alone.radius_m - 0.9).abs() < 0.1, "{alone:?}");
+        assert!(
+            (alone.center_m[0] - 2.0).abs() < 0.1 && (alone.radius_m - 0.9).abs() < 0.1,
+            "{alone:?}"
+        );
         points.extend([([500.0, 0.0, 0.0], 3.0); 5]);
         points.extend([([-50.0, 9.0, 0.0], -4.0); 300]);
         let with_strays = bounds(&splats(&points)).expect("splats");
-        assert!((with_strays.center_m[0] - 2.0).abs() < 0.2 && with_strays.radius_m < 1.2, "{with_strays:?}");
+        assert!(
+            (with_strays.center_m[0] - 2.0).abs() < 0.2 && with_strays.radius_m < 1.2,
+            "{with_strays:?}"
+        );
     }
 
     #[test]
     fn bounds_of_few_or_no_splats() {
         assert_eq!(bounds(&splats(&[])), None);
         let one = bounds(&splats(&[([1.0, 2.0, 3.0], -9.0)])).expect("a splat");
-        assert_eq!(one, Bounds { center_m: [1.0, 2.0, 3.0], radius_m: MIN_RADIUS_M });
+        assert_eq!(
+            one,
+            Bounds {
+                center_m: [1.0, 2.0, 3.0],
+                radius_m: MIN_RADIUS_M
+            }
+        );
     }
 }

@@ -7,7 +7,8 @@ use crate::Error;
 use crate::gpu::{Buffer, Gpu, Passes, PendingRead};
 use crate::sort::SortBuffers;
 
-/// Splats per block, consecutive in depth. This constant and the next two are those of shared/bins.wgsl.
+/// Splats per block, consecutive in depth. This constant and the next two are those of
+/// shared/bins.wgsl.
 pub(crate) const BLOCK: u32 = 256;
 /// Bins per workgroup.
 pub(crate) const WINDOW_BINS: u32 = 256;
@@ -90,7 +91,10 @@ impl SplatBuffers {
 
     /// Bytes of parameters and moments.
     pub(crate) fn bytes(&self) -> u64 {
-        self.planes().iter().map(|(buffer, _, _)| buffer.bytes()).sum()
+        self.planes()
+            .iter()
+            .map(|(buffer, _, _)| buffer.bytes())
+            .sum()
     }
 
     /// Returns a copy with capacity for `capacity` splats of `sh_degree`, including the moments.
@@ -98,7 +102,9 @@ impl SplatBuffers {
         let mut larger = Self::new(gpu, capacity, sh_degree)?;
         let (stride_from, stride_to) = (u64::from(self.capacity), u64::from(larger.capacity));
         let mut copies = Passes::default();
-        for ((from, n_planes, bytes), (to, n_planes_to, _)) in self.planes().iter().zip(larger.planes()) {
+        for ((from, n_planes, bytes), (to, n_planes_to, _)) in
+            self.planes().iter().zip(larger.planes())
+        {
             for plane in 0..u64::from(*n_planes.min(&n_planes_to)) {
                 copies.copy(
                     (from, plane * stride_from * bytes),
@@ -148,16 +154,30 @@ impl SplatBuffers {
         gpu.write(&self.model, 0, bytemuck::bytes_of(&sizes));
     }
 
-    /// Appends splats; the caller must reserve capacity. Drops coefficients above this model's degree, and sets missing
-    /// coefficients to zero. `is_antialiased` of `arrays` then applies to all splats of the model.
+    /// Appends splats; the caller must reserve capacity. Drops coefficients above this model's
+    /// degree, and sets missing coefficients to zero. `is_antialiased` of `arrays` then applies to
+    /// all splats of the model.
     pub(crate) fn append(&mut self, gpu: &Gpu, arrays: &SplatArrays) {
         let first = u64::from(self.n_splats);
         let n_new = arrays.means.len();
-        let means: Vec<[f32; 4]> = arrays.means.iter().map(|[x, y, z]| [*x, *y, *z, 0.0]).collect();
+        let means: Vec<[f32; 4]> = arrays
+            .means
+            .iter()
+            .map(|[x, y, z]| [*x, *y, *z, 0.0])
+            .collect();
         let shape = |(scale, opacity): (&[f32; 3], &f32)| [scale[0], scale[1], scale[2], *opacity];
-        let shapes: Vec<[f32; 4]> = arrays.log_scales.iter().zip(&arrays.opacity_logits).map(shape).collect();
+        let shapes: Vec<[f32; 4]> = arrays
+            .log_scales
+            .iter()
+            .zip(&arrays.opacity_logits)
+            .map(shape)
+            .collect();
         gpu.write(&self.means, 16 * first, bytemuck::cast_slice(&means));
-        gpu.write(&self.rotations, 16 * first, bytemuck::cast_slice(&arrays.rotations_wxyz));
+        gpu.write(
+            &self.rotations,
+            16 * first,
+            bytemuck::cast_slice(&arrays.rotations_wxyz),
+        );
         gpu.write(&self.shapes, 16 * first, bytemuck::cast_slice(&shapes));
         let n_coeffs = arrays.n_coefficients();
         let plane = |function: usize, channel: usize| -> Vec<f32> {
@@ -169,13 +189,21 @@ impl SplatBuffers {
         };
         let stride = u64::from(self.capacity);
         for channel in 0..3 {
-            gpu.write(&self.sh_dc, 4 * (channel as u64 * stride + first), bytemuck::cast_slice(&plane(0, channel)));
+            gpu.write(
+                &self.sh_dc,
+                4 * (channel as u64 * stride + first),
+                bytemuck::cast_slice(&plane(0, channel)),
+            );
         }
         let mut zeros = Passes::default();
         for ix in 0..n_sh_rest(self.sh_degree) as usize {
             let at = 4 * (ix as u64 * stride + first);
             if 1 + ix / 3 < n_coeffs {
-                gpu.write(&self.sh_rest, at, bytemuck::cast_slice(&plane(1 + ix / 3, ix % 3)));
+                gpu.write(
+                    &self.sh_rest,
+                    at,
+                    bytemuck::cast_slice(&plane(1 + ix / 3, ix % 3)),
+                );
             } else {
                 zeros.clear_range(&self.sh_rest, at..at + 4 * n_new as u64);
             }
@@ -192,12 +220,17 @@ impl SplatBuffers {
     pub(crate) fn read(&self, gpu: &Gpu) -> Result<SplatArrays, Error> {
         if self.n_splats == 0 {
             let (sh_degree, is_antialiased) = (self.sh_degree, self.is_antialiased);
-            return Ok(SplatArrays { sh_degree, is_antialiased, ..SplatArrays::default() });
+            return Ok(SplatArrays {
+                sh_degree,
+                is_antialiased,
+                ..SplatArrays::default()
+            });
         }
         self.begin_read(gpu, self.sh_degree).finish(gpu)
     }
 
-    /// Begins to read the parameters of at least one splat, with color coefficients up to this degree.
+    /// Begins to read the parameters of at least one splat, with color coefficients up to this
+    /// degree.
     pub(crate) fn begin_read(&self, gpu: &Gpu, max_sh_degree: u32) -> PendingSplats {
         let (n, stride) = (self.n_splats as usize, self.capacity as usize);
         let sh_degree = self.sh_degree.min(max_sh_degree);
@@ -228,7 +261,11 @@ impl SplatBuffers {
 
     /// The optimizer's moments, with their binding names in the kernels.
     pub(crate) fn all_moments(&self) -> [(&'static str, &Buffer); 3] {
-        [("moments", &self.moments), ("sh_dc_moments", &self.sh_dc_moments), ("sh_rest_moments", &self.sh_rest_moments)]
+        [
+            ("moments", &self.moments),
+            ("sh_dc_moments", &self.sh_dc_moments),
+            ("sh_rest_moments", &self.sh_rest_moments),
+        ]
     }
 
     /// Every per-splat buffer with its number of planes and its bytes per entry.
@@ -265,7 +302,13 @@ pub(crate) struct PendingSplats {
 impl PendingSplats {
     /// Waits for the parameters.
     pub(crate) fn finish(self, gpu: &Gpu) -> Result<SplatArrays, Error> {
-        let Self { n, stride, sh_degree, is_antialiased, .. } = self;
+        let Self {
+            n,
+            stride,
+            sh_degree,
+            is_antialiased,
+            ..
+        } = self;
         let means: Vec<[f32; 4]> = self.means.finish(gpu)?;
         let rotations_wxyz: Vec<[f32; 4]> = self.rotations.finish(gpu)?;
         let shapes: Vec<[f32; 4]> = self.shapes.finish(gpu)?;
@@ -323,7 +366,8 @@ pub(crate) struct Scratch {
     pub(crate) segments: Buffer,
     pub(crate) segment_counts: Buffer,
     pub(crate) segment_states: Buffer,
-    /// Capacity for segments and for pieces of the hidden ends of lists, not counting one or two per tile.
+    /// Capacity for segments and for pieces of the hidden ends of lists, not counting one or two
+    /// per tile.
     pub(crate) n_segments: [u32; 2],
 }
 
@@ -339,47 +383,95 @@ pub(crate) struct ScratchSize {
 }
 
 impl Scratch {
-    pub(crate) fn new(gpu: &Gpu, pipelines: &DrawPipelines, size: ScratchSize) -> Result<Self, Error> {
+    pub(crate) fn new(
+        gpu: &Gpu,
+        pipelines: &DrawPipelines,
+        size: ScratchSize,
+    ) -> Result<Self, Error> {
         let words = |name: &str, n: u32| gpu.storage(name, 4 * u64::from(n.max(1)));
-        let ScratchSize { n_splats, n_entries, n_slots, n_bins } = size;
+        let ScratchSize {
+            n_splats,
+            n_entries,
+            n_slots,
+            n_bins,
+        } = size;
         let n_blocks = n_splats.div_ceil(BLOCK);
-        let n_segments = if n_slots > 0 && pipelines.has_segments { n_segments(n_entries, n_slots) } else { [0; 2] };
+        let n_segments = if n_slots > 0 && pipelines.has_segments {
+            n_segments(n_entries, n_slots)
+        } else {
+            [0; 2]
+        };
         let n_of_tiles = 3 * TILES_PER_BIN * n_bins; // The first segment and two pieces of each tile.
-        let segment_bytes = 16 * (u64::from(n_segments[0]) + u64::from(n_segments[1]) + u64::from(n_of_tiles));
+        let segment_bytes =
+            16 * (u64::from(n_segments[0]) + u64::from(n_segments[1]) + u64::from(n_of_tiles));
         let state_bytes = u64::from(4 * N_STATE_PARTS * 2 * STATE_PAIRS);
-        let per_bin = |name: &str, n: u32| gpu.storage(name, 4 * u64::from(n_bins) * u64::from(n.max(1)));
-        let capacity = Capacity { n_entries, n_slots, n_segments: n_segments[0], unused: 0 };
+        let per_bin =
+            |name: &str, n: u32| gpu.storage(name, 4 * u64::from(n_bins) * u64::from(n.max(1)));
+        let capacity = Capacity {
+            n_entries,
+            n_slots,
+            n_segments: n_segments[0],
+            unused: 0,
+        };
         Ok(Self {
             n_entries,
             capacity: gpu.uniform_with("splat.capacity", &capacity),
-            capacity_for_drawing: gpu.uniform_with("splat.capacity_for_drawing", &Capacity { n_slots: 0, ..capacity }),
+            capacity_for_drawing: gpu.uniform_with(
+                "splat.capacity_for_drawing",
+                &Capacity {
+                    n_slots: 0,
+                    ..capacity
+                },
+            ),
             projected_splats: gpu.storage("splat.projected_splats", 48 * u64::from(n_splats))?,
             tile_counts: words("splat.tile_counts", n_splats)?,
             touched: gpu.storage("splat.touched", 12 * u64::from(n_splats))?,
             slot_offsets: words("splat.slot_offsets", n_splats)?,
             slot_begins: words("splat.slot_begins", n_splats)?,
             block_slots: words("splat.block_slots", n_blocks)?,
-            by_depth: pipelines.sort.buffers(gpu, "splat.by_depth", n_splats, status::N_SPLATS, status::FURTHEST)?,
+            by_depth: pipelines.sort.buffers(
+                gpu,
+                "splat.by_depth",
+                n_splats,
+                status::N_SPLATS,
+                status::FURTHEST,
+            )?,
             bin_counts: per_bin("splat.bin_counts", n_blocks)?,
             group_counts: per_bin("splat.group_counts", n_blocks.div_ceil(GROUP))?,
             bin_totals: words("splat.bin_totals", n_bins)?,
             bin_starts: words("splat.bin_starts", n_bins + 1)?,
             entries: gpu.storage("splat.entries", 16 * u64::from(n_entries.max(1)))?,
-            tile_bits: gpu.storage("splat.tile_bits", 64 * u64::from(n_entries.div_ceil(32).max(1)))?,
+            tile_bits: gpu.storage(
+                "splat.tile_bits",
+                64 * u64::from(n_entries.div_ceil(32).max(1)),
+            )?,
             gradients: gpu.storage("splat.gradients", 48 * u64::from(n_slots))?,
-            camera_sums: gpu.storage("splat.camera_sums", if n_slots > 0 { 48 * u64::from(n_blocks) } else { 0 })?,
+            camera_sums: gpu.storage(
+                "splat.camera_sums",
+                if n_slots > 0 {
+                    48 * u64::from(n_blocks)
+                } else {
+                    0
+                },
+            )?,
             segments: gpu.storage("splat.segments", segment_bytes)?,
             segment_counts: words("splat.segment_counts", 2)?,
-            segment_states: gpu.storage("splat.segment_states", state_bytes * u64::from(n_segments[0]))?,
+            segment_states: gpu.storage(
+                "splat.segment_states",
+                state_bytes * u64::from(n_segments[0]),
+            )?,
             n_segments,
         })
     }
 }
 
-/// Maximum number of segments after the first of each tile, and of pieces of hidden ends (without two per tile), for
-/// lists of this length; see shared/segment.wgsl.
+/// Maximum number of segments after the first of each tile, and of pieces of hidden ends (without
+/// two per tile), for lists of this length; see shared/segment.wgsl.
 fn n_segments(n_entries: u32, n_slots: u32) -> [u32; 2] {
-    [(n_slots / SEGMENT_SPLATS).min(2 * TARGET_SEGMENTS), n_entries.div_ceil(HIDDEN_ENTRIES / TILES_PER_BIN)]
+    [
+        (n_slots / SEGMENT_SPLATS).min(2 * TARGET_SEGMENTS),
+        n_entries.div_ceil(HIDDEN_ENTRIES / TILES_PER_BIN),
+    ]
 }
 
 /// Buffers of one picture, and of its gradients in training.
@@ -400,11 +492,25 @@ pub(crate) struct ImageBuffers {
 }
 
 impl ImageBuffers {
-    /// Allocates buffers for pictures of up to `n_pixels` and `n_tiles`, including gradients if `for_training`.
-    pub(crate) fn new(gpu: &Gpu, n_pixels: u32, n_tiles: u32, for_training: bool) -> Result<Self, Error> {
+    /// Allocates buffers for pictures of up to `n_pixels` and `n_tiles`, including gradients if
+    /// `for_training`.
+    pub(crate) fn new(
+        gpu: &Gpu,
+        n_pixels: u32,
+        n_tiles: u32,
+        for_training: bool,
+    ) -> Result<Self, Error> {
         let each = |name: &str, bytes: u64| gpu.storage(name, bytes * u64::from(n_pixels));
-        let gradient_buffer =
-            |name: &str, bytes: u64| gpu.storage(name, if for_training { bytes * u64::from(n_pixels) } else { 0 });
+        let gradient_buffer = |name: &str, bytes: u64| {
+            gpu.storage(
+                name,
+                if for_training {
+                    bytes * u64::from(n_pixels)
+                } else {
+                    0
+                },
+            )
+        };
         let tiles = |name: &str, bytes: u64| gpu.storage(name, bytes * u64::from(n_tiles));
         Ok(Self {
             n_pixels,
@@ -454,6 +560,10 @@ mod tests {
         for (name, value) in in_rust {
             assert_eq!(constant_in_wgsl(KERNELS, name), value, "{name}");
         }
-        assert_eq!(constant_in_wgsl(KERNELS, "BIN_TILES").pow(2), TILES_PER_BIN, "along both axes of the image");
+        assert_eq!(
+            constant_in_wgsl(KERNELS, "BIN_TILES").pow(2),
+            TILES_PER_BIN,
+            "along both axes of the image"
+        );
     }
 }

@@ -1,7 +1,9 @@
-//! Per-camera parameters that are optimized together with the splats: extrinsics, time offset, lens and exposure.
+//! Per-camera parameters that are optimized together with the splats: extrinsics, time offset, lens
+//! and exposure.
 //!
-//! All images of a camera share its parameters. Each image can have additional ones. The parameters stay on the GPU
-//! during training: `correct_view` applies them to the view of a step, and `refine_camera` updates them.
+//! All images of a camera share its parameters. Each image can have additional ones. The parameters
+//! stay on the GPU during training: `correct_view` applies them to the view of a step, and
+//! `refine_camera` updates them.
 
 use super::kernels::TrainPipelines;
 use super::params::{CameraRule, Lens, N_PARAMS};
@@ -19,7 +21,9 @@ use std::sync::Arc;
 /// Bit mask of the parameters that all images of a camera share.
 fn camera_mask(set: ParamSet) -> u32 {
     let bits = |params: ParamSet, bits: u32| if set.contains(params) { bits } else { 0 };
-    bits(ParamSet::EXTRINSICS, 0b11_1111) | bits(ParamSet::TIME_OFFSET, 1 << 6) | bits(ParamSet::LENS, 0b1111 << 7)
+    bits(ParamSet::EXTRINSICS, 0b11_1111)
+        | bits(ParamSet::TIME_OFFSET, 1 << 6)
+        | bits(ParamSet::LENS, 0b1111 << 7)
 }
 
 /// Bit mask of the per-image parameters.
@@ -49,7 +53,8 @@ pub(crate) struct CameraParams {
     n_used: u32,
 }
 
-/// Slots of each camera by name: the camera's slot, and the slots of its images by stamp in nanoseconds.
+/// Slots of each camera by name: the camera's slot, and the slots of its images by stamp in
+/// nanoseconds.
 #[derive(Clone, Debug, Default, PartialEq, serde::Serialize, serde::Deserialize)]
 pub(crate) struct CameraSlots(BTreeMap<String, (u32, BTreeMap<i64, u32>)>);
 
@@ -65,8 +70,14 @@ impl CameraParams {
         Ok(Self {
             set,
             params: gpu.storage("splat.camera_params", SLOT_BYTES)?,
-            rule: gpu.uniform_with("splat.camera_rule", &<CameraRule as bytemuck::Zeroable>::zeroed()),
-            corrected: gpu.uniform_and_storage("splat.corrected_view", size_of::<super::params::View>() as u64),
+            rule: gpu.uniform_with(
+                "splat.camera_rule",
+                &<CameraRule as bytemuck::Zeroable>::zeroed(),
+            ),
+            corrected: gpu.uniform_and_storage(
+                "splat.corrected_view",
+                size_of::<super::params::View>() as u64,
+            ),
             gains: gpu.storage_with("splat.gains", bytemuck::cast_slice(&[1.0f32; 4]))?,
             cameras: BTreeMap::new(),
             n_used: 0,
@@ -78,16 +89,26 @@ impl CameraParams {
         self.set |= more;
     }
 
-    /// Uploads the lens of a keyframe. Allocates parameter slots for the camera and the image if they are new.
+    /// Uploads the lens of a keyframe. Allocates parameter slots for the camera and the image if
+    /// they are new.
     pub(crate) fn lens(&mut self, gpu: &Gpu, keyframe: &Keyframe) -> Result<Buffer, Error> {
         let camera = match self.cameras.get(&keyframe.camera) {
             Some(slots) => slots.camera,
             None => {
-                let slots = Slots { camera: self.allocate_slot(gpu)?, images: BTreeMap::new() };
-                self.cameras.entry(keyframe.camera.clone()).or_insert(slots).camera
+                let slots = Slots {
+                    camera: self.allocate_slot(gpu)?,
+                    images: BTreeMap::new(),
+                };
+                self.cameras
+                    .entry(keyframe.camera.clone())
+                    .or_insert(slots)
+                    .camera
             }
         };
-        let known = self.cameras.get(&keyframe.camera).and_then(|slots| slots.images.get(&keyframe.stamp).copied());
+        let known = self
+            .cameras
+            .get(&keyframe.camera)
+            .and_then(|slots| slots.images.get(&keyframe.stamp).copied());
         let image = match known {
             Some(slot) => slot,
             None => self.allocate_slot(gpu)?,
@@ -96,7 +117,10 @@ impl CameraParams {
             slots.images.insert(keyframe.stamp, image);
         }
         let part = |of: fn(&Twist) -> Vector3<f64>| {
-            let [x, y, z] = keyframe.twist.as_ref().map_or([0.0; 3], |twist| f32s_of(of(twist).into()));
+            let [x, y, z] = keyframe
+                .twist
+                .as_ref()
+                .map_or([0.0; 3], |twist| f32s_of(of(twist).into()));
             [x, y, z, 0.0]
         };
         let lens = Lens {
@@ -111,7 +135,10 @@ impl CameraParams {
 
     /// Sets the initial log gains of an image.
     pub(crate) fn initialize_gains(&self, gpu: &Gpu, keyframe: &Keyframe, log_gains: [f64; 3]) {
-        let slot = self.cameras.get(&keyframe.camera).and_then(|slots| slots.images.get(&keyframe.stamp));
+        let slot = self
+            .cameras
+            .get(&keyframe.camera)
+            .and_then(|slots| slots.images.get(&keyframe.stamp));
         let values = log_gains.map(|value| [f32_of(value), 0.0, 0.0, 0.0]);
         if let Some(slot) = slot {
             gpu.write(
@@ -129,8 +156,13 @@ impl CameraParams {
         Ok(copy)
     }
 
-    /// Restores a copy. Slots allocated after the copy was made remain allocated, and their parameters become zero.
-    pub(crate) fn restore_snapshot(&mut self, gpu: &Gpu, (set, params): (ParamSet, Buffer)) -> Result<(), Error> {
+    /// Restores a copy. Slots allocated after the copy was made remain allocated, and their
+    /// parameters become zero.
+    pub(crate) fn restore_snapshot(
+        &mut self,
+        gpu: &Gpu,
+        (set, params): (ParamSet, Buffer),
+    ) -> Result<(), Error> {
         self.set = set;
         if params.bytes() < self.used_bytes() {
             self.params = gpu.storage("splat.camera_params", self.used_bytes())?; // Zeros.
@@ -189,11 +221,23 @@ impl CameraParams {
     }
 
     /// Records the pass that updates the parameters.
-    pub(crate) fn refine(&self, view: &ViewPasses<'_>, passes: &mut Passes, pipelines: &TrainPipelines, lens: &Buffer) {
+    pub(crate) fn refine(
+        &self,
+        view: &ViewPasses<'_>,
+        passes: &mut Passes,
+        pipelines: &TrainPipelines,
+        lens: &Buffer,
+    ) {
         self.refine_with(view, passes, &pipelines.refine_camera, lens);
     }
 
-    pub(crate) fn refine_with(&self, view: &ViewPasses<'_>, passes: &mut Passes, refine: &Pipeline, lens: &Buffer) {
+    pub(crate) fn refine_with(
+        &self,
+        view: &ViewPasses<'_>,
+        passes: &mut Passes,
+        refine: &Pipeline,
+        lens: &Buffer,
+    ) {
         let buffers = [
             ("view", view.view),
             ("model", &view.splats.model),
@@ -221,9 +265,18 @@ impl CameraParams {
 
     /// Slot assignment, for a checkpoint.
     pub(crate) fn slots(&self) -> CameraSlots {
-        let images = |slots: &Slots| slots.images.iter().map(|(stamp, slot)| (stamp.0, *slot)).collect();
+        let images = |slots: &Slots| {
+            slots
+                .images
+                .iter()
+                .map(|(stamp, slot)| (stamp.0, *slot))
+                .collect()
+        };
         CameraSlots(
-            self.cameras.iter().map(|(name, slots)| (name.to_string(), (slots.camera, images(slots)))).collect(),
+            self.cameras
+                .iter()
+                .map(|(name, slots)| (name.to_string(), (slots.camera, images(slots))))
+                .collect(),
         )
     }
 
@@ -236,10 +289,15 @@ impl CameraParams {
         checkpoint: &Checkpoint,
     ) -> Result<(), Error> {
         let n_slots: usize = slots.0.values().map(|(_, images)| 1 + images.len()).sum();
-        let all = slots.0.values().flat_map(|(camera, images)| std::iter::once(camera).chain(images.values()));
+        let all = slots
+            .0
+            .values()
+            .flat_map(|(camera, images)| std::iter::once(camera).chain(images.values()));
         self.n_used = all.map(|slot| slot + 1).max().unwrap_or(0);
         if (self.n_used as usize) < n_slots {
-            return Err(Error::CheckpointState { reason: "two cameras or images share a parameter slot".to_owned() });
+            return Err(Error::CheckpointState {
+                reason: "two cameras or images share a parameter slot".to_owned(),
+            });
         }
         let bytes = checkpoint.array("camera_params", self.used_bytes())?;
         self.params = gpu.storage_with("splat.camera_params", bytes)?;
@@ -248,14 +306,24 @@ impl CameraParams {
             .0
             .iter()
             .map(|(name, (camera, images))| {
-                let images = images.iter().map(|(stamp, slot)| (Stamp(*stamp), *slot)).collect();
-                (Arc::from(name.as_str()), Slots { camera: *camera, images })
+                let images = images
+                    .iter()
+                    .map(|(stamp, slot)| (Stamp(*stamp), *slot))
+                    .collect();
+                (
+                    Arc::from(name.as_str()),
+                    Slots {
+                        camera: *camera,
+                        images,
+                    },
+                )
             })
             .collect();
         Ok(())
     }
 
-    /// Computes the corrections of all cameras from `params`, which is the parameter buffer or a copy of it.
+    /// Computes the corrections of all cameras from `params`, which is the parameter buffer or a
+    /// copy of it.
     pub(crate) fn corrections(
         &self,
         gpu: &Gpu,
@@ -264,19 +332,33 @@ impl CameraParams {
         scene_size_m: f64,
     ) -> Result<BTreeMap<String, CameraCorrection>, Error> {
         // A copy may lack the newest slots.
-        let mut params: Vec<[f32; 4]> = gpu.read(params, (self.used_bytes().min(params.bytes()) / 16) as usize)?;
+        let mut params: Vec<[f32; 4]> = gpu.read(
+            params,
+            (self.used_bytes().min(params.bytes()) / 16) as usize,
+        )?;
         params.resize((self.n_used * N_PARAMS) as usize, [0.0; 4]);
         let value = |slot: u32, param: u32, learned: u32| {
             let on = learned & (1 << param) != 0;
-            if on { f64::from(params[(slot * N_PARAMS + param) as usize][0]) } else { 0.0 }
+            if on {
+                f64::from(params[(slot * N_PARAMS + param) as usize][0])
+            } else {
+                0.0
+            }
         };
         let correction_of = |slots: &Slots| {
             let camera_value = |param| value(slots.camera, param, camera_mask(set));
-            let drift = |slot: &u32| [0, 1, 2, 3, 4, 5].map(|param| value(*slot, param, image_mask(set)));
-            let log_gains =
-                |slot: &u32| [LOG_GAIN, LOG_GAIN + 1, LOG_GAIN + 2].map(|param| value(*slot, param, image_mask(set)));
+            let drift =
+                |slot: &u32| [0, 1, 2, 3, 4, 5].map(|param| value(*slot, param, image_mask(set)));
+            let log_gains = |slot: &u32| {
+                [LOG_GAIN, LOG_GAIN + 1, LOG_GAIN + 2]
+                    .map(|param| value(*slot, param, image_mask(set)))
+            };
             let drift: BTreeMap<i64, [f64; 6]> = if set.contains(ParamSet::IMAGE_POSES) {
-                slots.images.iter().map(|(stamp, slot)| (stamp.0, drift(slot))).collect()
+                slots
+                    .images
+                    .iter()
+                    .map(|(stamp, slot)| (stamp.0, drift(slot)))
+                    .collect()
             } else {
                 BTreeMap::new()
             };
@@ -293,14 +375,22 @@ impl CameraParams {
                 },
                 drift,
                 log_gains: if set.contains(ParamSet::IMAGE_GAINS) {
-                    slots.images.iter().map(|(stamp, slot)| (stamp.0, log_gains(slot))).collect()
+                    slots
+                        .images
+                        .iter()
+                        .map(|(stamp, slot)| (stamp.0, log_gains(slot)))
+                        .collect()
                 } else {
                     BTreeMap::new()
                 },
                 ..CameraCorrection::default()
             }
         };
-        Ok(self.cameras.iter().map(|(name, slots)| (name.to_string(), correction_of(slots))).collect())
+        Ok(self
+            .cameras
+            .iter()
+            .map(|(name, slots)| (name.to_string(), correction_of(slots)))
+            .collect())
     }
 }
 

@@ -9,7 +9,8 @@ use crate::{Error, Method};
 use keyframe::Keyframe;
 use std::sync::Arc;
 
-/// Steps at which training stops: before the first change of splat count and SH degree, and between later changes.
+/// Steps at which training stops: before the first change of splat count and SH degree, and between
+/// later changes.
 const STOPS: [u64; 3] = [7, 230, 310];
 const END: u64 = 340;
 
@@ -29,7 +30,8 @@ fn new_trainer(gpu: &Arc<Gpu>, keyframes: &[Arc<Keyframe>], max_splats: u32) -> 
     trainer
 }
 
-/// Compares the whole state. Prints only the names of arrays, because a difference could be megabytes long.
+/// Compares the whole state. Prints only the names of arrays, because a difference could be
+/// megabytes long.
 fn assert_same(one: &Checkpoint, other: &Checkpoint) {
     assert_eq!(one.state, other.state);
     for (one, other) in one.arrays.iter().zip(&other.arrays) {
@@ -49,13 +51,25 @@ fn paused_growth_continues_on_request_and_after_resuming() {
     assert!(!trainer.pause_growth(true).unwrap(), "already paused");
     let paused_at = n_splats(&trainer);
     train(&mut trainer, 100);
-    assert_eq!(n_splats(&trainer), paused_at, "no splats are added at step 200");
+    assert_eq!(
+        n_splats(&trainer),
+        paused_at,
+        "no splats are added at step 200"
+    );
     let checkpoint = checkpoint_of(&mut trainer);
-    let mut resumed = SplatTrainer::resume(gpu, &checkpoint, &keyframes).unwrap().0;
-    assert!(!resumed.pause_growth(true).unwrap(), "the pause is in the checkpoint");
+    let mut resumed = SplatTrainer::resume(gpu, &checkpoint, &keyframes)
+        .unwrap()
+        .0;
+    assert!(
+        !resumed.pause_growth(true).unwrap(),
+        "the pause is in the checkpoint"
+    );
     assert!(resumed.pause_growth(false).unwrap());
     train(&mut resumed, 100);
-    assert!(n_splats(&resumed) > paused_at, "splats are added at step 300");
+    assert!(
+        n_splats(&resumed) > paused_at,
+        "splats are added at step 300"
+    );
 }
 
 #[test]
@@ -71,7 +85,11 @@ fn resuming_is_bit_exact() {
         train(&mut uninterrupted, END - 100);
 
         let mut interrupted = new_trainer(&gpu, &keyframes[..8], 3000);
-        for stop in STOPS.into_iter().chain([100, END]).collect::<std::collections::BTreeSet<u64>>() {
+        for stop in STOPS
+            .into_iter()
+            .chain([100, END])
+            .collect::<std::collections::BTreeSet<u64>>()
+        {
             let step = interrupted.progress().step;
             train(&mut interrupted, stop - step);
             if stop == 100 {
@@ -82,12 +100,24 @@ fn resuming_is_bit_exact() {
             drop(interrupted);
             let untrained;
             (interrupted, untrained) =
-                SplatTrainer::resume(gpu.clone(), &Checkpoint::read(&path).unwrap(), &keyframes).unwrap();
-            assert_eq!(untrained.len(), if stop < 100 { 3 } else { 2 }, "two are test images, one has not arrived yet");
+                SplatTrainer::resume(gpu.clone(), &Checkpoint::read(&path).unwrap(), &keyframes)
+                    .unwrap();
+            assert_eq!(
+                untrained.len(),
+                if stop < 100 { 3 } else { 2 },
+                "two are test images, one has not arrived yet"
+            );
             assert_same(&checkpoint_of(&mut interrupted), &before);
         }
-        assert_same(&checkpoint_of(&mut interrupted), &checkpoint_of(&mut uninterrupted));
-        assert!(interrupted.progress().primitives > 400, "{:?}", interrupted.progress());
+        assert_same(
+            &checkpoint_of(&mut interrupted),
+            &checkpoint_of(&mut uninterrupted),
+        );
+        assert!(
+            interrupted.progress().primitives > 400,
+            "{:?}",
+            interrupted.progress()
+        );
         assert_eq!(interrupted.progress().bytes, uninterrupted.progress().bytes);
         assert!(interrupted.arrays().unwrap() == uninterrupted.arrays().unwrap());
     }
@@ -102,7 +132,10 @@ fn checkpoint_and_training_do_not_affect_each_other() {
     train(&mut watched, 195);
     let pending = watched.checkpoint().unwrap();
     train(&mut watched, 15);
-    assert_same(&checkpoint_of(&mut watched), &checkpoint_of(&mut undisturbed));
+    assert_same(
+        &checkpoint_of(&mut watched),
+        &checkpoint_of(&mut undisturbed),
+    );
     let early = pending.finish().unwrap();
     assert_eq!(early.state["step"], 195);
     let (mut again, _) = SplatTrainer::resume(gpu, &early, &keyframes).unwrap();
@@ -131,15 +164,25 @@ fn different_data_and_invalid_states_are_rejected() {
         resume_error(&checkpoint, &other).to_string()
     };
     assert!(
-        error_with_changed_keyframe(&|keyframe| keyframe.size_px = [48, 40]).contains("has 48x40 pixels, had 96x80")
+        error_with_changed_keyframe(&|keyframe| keyframe.size_px = [48, 40])
+            .contains("has 48x40 pixels, had 96x80")
     );
-    assert!(error_with_changed_keyframe(&|keyframe| keyframe.depth = None).contains("different depth image"));
-    assert!(error_with_changed_keyframe(&|keyframe| keyframe.focal_px[0] += 1.0).contains("different intrinsics"));
+    assert!(
+        error_with_changed_keyframe(&|keyframe| keyframe.depth = None)
+            .contains("different depth image")
+    );
+    assert!(
+        error_with_changed_keyframe(&|keyframe| keyframe.focal_px[0] += 1.0)
+            .contains("different intrinsics")
+    );
     assert!(
         error_with_changed_keyframe(&|keyframe| keyframe.world_from_camera.translation.x += 1e-6)
             .contains("different pose")
     );
-    assert!(error_with_changed_keyframe(&|keyframe| keyframe.camera = "other".into()).contains("is missing"));
+    assert!(
+        error_with_changed_keyframe(&|keyframe| keyframe.camera = "other".into())
+            .contains("is missing")
+    );
 
     let error_with_changed_checkpoint = |change: &dyn Fn(&mut Checkpoint)| {
         let mut other = checkpoint.clone();
@@ -148,17 +191,27 @@ fn different_data_and_invalid_states_are_rejected() {
         assert!(matches!(error, Error::CheckpointState { .. }), "{error}");
         error.to_string()
     };
-    assert!(error_with_changed_checkpoint(&|other| other.method = "nerf".into()).contains("\"nerf\""));
     assert!(
-        error_with_changed_checkpoint(&|other| other.state["future"] = 1.into()).contains("unknown field `future`")
+        error_with_changed_checkpoint(&|other| other.method = "nerf".into()).contains("\"nerf\"")
+    );
+    assert!(
+        error_with_changed_checkpoint(&|other| other.state["future"] = 1.into())
+            .contains("unknown field `future`")
     );
     assert!(
         error_with_changed_checkpoint(&|other| other.state["model"]["n_splats"] = 4_000_000.into())
             .contains("do not fit")
     );
     assert!(
-        error_with_changed_checkpoint(&|other| other.state["model"]["active_degree"] = 3.into()).contains("do not fit")
+        error_with_changed_checkpoint(&|other| other.state["model"]["active_degree"] = 3.into())
+            .contains("do not fit")
     );
-    assert!(error_with_changed_checkpoint(&|other| other.state["unseeded"] = vec![99].into()).contains("view"));
-    assert!(error_with_changed_checkpoint(&|other| other.arrays[2].bytes.truncate(1)).contains("\"shapes\" has"));
+    assert!(
+        error_with_changed_checkpoint(&|other| other.state["unseeded"] = vec![99].into())
+            .contains("view")
+    );
+    assert!(
+        error_with_changed_checkpoint(&|other| other.arrays[2].bytes.truncate(1))
+            .contains("\"shapes\" has")
+    );
 }

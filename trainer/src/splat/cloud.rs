@@ -15,8 +15,12 @@ const SH_DEGREE: u32 = 3;
 const N_COEFFICIENTS: usize = 16;
 
 /// Patches of [`scan_cloud`]: center and standard deviation, meters.
-const PATCHES: [([f64; 2], f64); 4] =
-    [([-0.5, 0.2], 0.1), ([0.3, -0.3], 0.14), ([0.7, 0.4], 0.2), ([-1.1, -0.6], 0.14)];
+const PATCHES: [([f64; 2], f64); 4] = [
+    ([-0.5, 0.2], 0.1),
+    ([0.3, -0.3], 0.14),
+    ([0.7, 0.4], 0.2),
+    ([-1.1, -0.6], 0.14),
+];
 /// Fraction of splats in patches, and fraction of large splats.
 const PATCH_FRAC: f64 = 0.25;
 const LARGE_FRAC: f64 = 0.005;
@@ -29,18 +33,28 @@ const LARGE_SIZE: f64 = 60.0;
 
 /// Generates `n_splats` random splats of SH degree 3. Equal seeds give equal splats.
 ///
-/// Means are uniform in the cube from -1 to 1. All other values are normally distributed. Log scales have a mean of
-/// `ln(0.6 / n^(1/3))` and a standard deviation of 0.3. The standard deviation is 1 for quaternion components, 1.5 for
-/// opacity logits, 0.5 for the constant color coefficient, and 0.2 for the other coefficients.
+/// Means are uniform in the cube from -1 to 1. All other values are normally distributed. Log
+/// scales have a mean of `ln(0.6 / n^(1/3))` and a standard deviation of 0.3. The standard
+/// deviation is 1 for quaternion components, 1.5 for opacity logits, 0.5 for the constant color
+/// coefficient, and 0.2 for the other coefficients.
 #[expect(clippy::cast_possible_truncation, reason = "drawn in f64, used in f32")]
 pub fn synthetic_cloud(n_splats: usize, seed: u64) -> SplatArrays {
     let mut random = Random::new(seed);
     let typical_log_scale = (0.6 / (n_splats as f64).cbrt()).ln();
-    let mut splats = SplatArrays { sh_degree: SH_DEGREE, ..SplatArrays::default() };
+    let mut splats = SplatArrays {
+        sh_degree: SH_DEGREE,
+        ..SplatArrays::default()
+    };
     for _ in 0..n_splats {
-        splats.means.push(std::array::from_fn(|_| (2.0 * random.unit() - 1.0) as f32));
-        splats.log_scales.push(std::array::from_fn(|_| (typical_log_scale + 0.3 * random.normal()) as f32));
-        splats.rotations_wxyz.push(std::array::from_fn(|_| random.normal() as f32));
+        splats
+            .means
+            .push(std::array::from_fn(|_| (2.0 * random.unit() - 1.0) as f32));
+        splats.log_scales.push(std::array::from_fn(|_| {
+            (typical_log_scale + 0.3 * random.normal()) as f32
+        }));
+        splats
+            .rotations_wxyz
+            .push(std::array::from_fn(|_| random.normal() as f32));
         splats.opacity_logits.push((1.5 * random.normal()) as f32);
         splats.sh.extend(random_color(&mut random));
     }
@@ -56,46 +70,73 @@ fn random_color(random: &mut Random) -> [[f32; 3]; N_COEFFICIENTS] {
     })
 }
 
-/// Generates `n_splats` splats like those of a scan with depth, for a camera at z = -3.2 that looks along z. Equal seeds
-/// give equal splats.
+/// Generates `n_splats` splats like those of a scan with depth, for a camera at z = -3.2 that looks
+/// along z. Equal seeds give equal splats.
 ///
-/// Most splats are flat and lie on an uneven wall around z = 0, whose edges lie outside an image with a focal length of
-/// 0.9 image widths. `PATCH_FRAC` of them are smaller and lie in a few `PATCHES`, where the lists of the tiles are
-/// several times longer. `LARGE_FRAC` of them are large, and `N_HUGE` cover the whole image.
+/// Most splats are flat and lie on an uneven wall around z = 0, whose edges lie outside an image
+/// with a focal length of 0.9 image widths. `PATCH_FRAC` of them are smaller and lie in a few
+/// `PATCHES`, where the lists of the tiles are several times longer. `LARGE_FRAC` of them are
+/// large, and `N_HUGE` cover the whole image.
 #[expect(clippy::cast_possible_truncation, reason = "drawn in f64, used in f32")]
 pub fn scan_cloud(n_splats: usize, seed: u64) -> SplatArrays {
     let mut random = Random::new(seed);
     // The same number of splats per pixel gives the same size in pixels.
     let scale_m = 1.0 / (n_splats as f64).sqrt();
-    let mut splats = SplatArrays { sh_degree: SH_DEGREE, ..SplatArrays::default() };
+    let mut splats = SplatArrays {
+        sh_degree: SH_DEGREE,
+        ..SplatArrays::default()
+    };
     for splat_ix in 0..n_splats {
         let kind = random.unit();
         let (xy_m, size_m, depth_m) = if splat_ix < N_HUGE {
             ([0.2 * random.normal(), 0.2 * random.normal()], 3.0, 0.0)
         } else if kind < PATCH_FRAC {
             let ([x_m, y_m], spread_m) = PATCHES[splat_ix % PATCHES.len()];
-            let xy_m = [x_m + spread_m * random.normal(), y_m + spread_m * random.normal()];
+            let xy_m = [
+                x_m + spread_m * random.normal(),
+                y_m + spread_m * random.normal(),
+            ];
             (xy_m, PATCH_SIZE * scale_m, 0.02 * random.normal())
         } else {
-            let xy_m = [2.3 * (2.0 * random.unit() - 1.0), 1.8 * (2.0 * random.unit() - 1.0)];
-            let size = if kind > 1.0 - LARGE_FRAC { LARGE_SIZE } else { WALL_SIZE };
+            let xy_m = [
+                2.3 * (2.0 * random.unit() - 1.0),
+                1.8 * (2.0 * random.unit() - 1.0),
+            ];
+            let size = if kind > 1.0 - LARGE_FRAC {
+                LARGE_SIZE
+            } else {
+                WALL_SIZE
+            };
             (xy_m, size * scale_m, 0.01 * random.normal())
         };
         let [x_m, y_m] = xy_m;
-        splats.means.push([x_m, y_m, 0.3 * (2.0 * x_m).sin() * (1.7 * y_m).cos() + depth_m].map(|m| m as f32));
+        splats.means.push(
+            [
+                x_m,
+                y_m,
+                0.3 * (2.0 * x_m).sin() * (1.7 * y_m).cos() + depth_m,
+            ]
+            .map(|m| m as f32),
+        );
         let log_size = size_m.ln() + 0.5 * random.normal();
         let flatness = [0.0, 0.4 * random.normal(), -2.0];
-        splats.log_scales.push(flatness.map(|along| (log_size + along) as f32));
+        splats
+            .log_scales
+            .push(flatness.map(|along| (log_size + along) as f32));
         // Roughly parallel to the wall.
-        splats.rotations_wxyz.push([1.0, 0.2, 0.2, 1.0].map(|deviation| (deviation * random.normal()) as f32));
-        splats.opacity_logits.push((1.5 * random.normal() - 1.5) as f32);
+        splats
+            .rotations_wxyz
+            .push([1.0, 0.2, 0.2, 1.0].map(|deviation| (deviation * random.normal()) as f32));
+        splats
+            .opacity_logits
+            .push((1.5 * random.normal() - 1.5) as f32);
         splats.sh.extend(random_color(&mut random));
     }
     splats
 }
 
-/// Reads a cloud written with numpy's `savez`: `means`, `quats` (w first), `log_scales`, `opacities_logit`, `sh` (n, 16,
-/// 3), all f32.
+/// Reads a cloud written with numpy's `savez`: `means`, `quats` (w first), `log_scales`,
+/// `opacities_logit`, `sh` (n, 16, 3), all f32.
 pub fn load_cloud_npz(path: &Path) -> Result<SplatArrays, Error> {
     let read = || -> io::Result<SplatArrays> {
         let mut file = ZipArchive::new(BufReader::new(files::open(path)?))?;
@@ -109,7 +150,12 @@ pub fn load_cloud_npz(path: &Path) -> Result<SplatArrays, Error> {
             is_antialiased: false,
         })
     };
-    read().map_err(|error| Error::SplatFile { path: path.to_owned(), reason: error.to_string() })?.checked()
+    read()
+        .map_err(|error| Error::SplatFile {
+            path: path.to_owned(),
+            reason: error.to_string(),
+        })?
+        .checked()
 }
 
 /// Reads an f32 array of shape (n, `inner_shape`) as rows of `N`.
@@ -118,17 +164,28 @@ fn rows<const N: usize>(
     name: &str,
     inner_shape: &[u64],
 ) -> io::Result<Vec<[f32; N]>> {
-    let member = file.by_name(&file_name_from_array_name(name)).map_err(|error| match error {
-        ZipError::FileNotFound => io::Error::other(format!("array {name:?} is missing")),
-        error => error.into(),
-    })?;
+    let member = file
+        .by_name(&file_name_from_array_name(name))
+        .map_err(|error| match error {
+            ZipError::FileNotFound => io::Error::other(format!("array {name:?} is missing")),
+            error => error.into(),
+        })?;
     let array = NpyFile::new(member)?;
-    if array.shape().split_first().is_none_or(|(_, inner)| inner != inner_shape) {
-        let message = format!("array {name:?} has shape {:?}, expected n followed by {inner_shape:?}", array.shape());
+    if array
+        .shape()
+        .split_first()
+        .is_none_or(|(_, inner)| inner != inner_shape)
+    {
+        let message = format!(
+            "array {name:?} has shape {:?}, expected n followed by {inner_shape:?}",
+            array.shape()
+        );
         return Err(io::Error::other(message));
     }
     if array.order() != Order::C {
-        return Err(io::Error::other(format!("array {name:?} is in Fortran order, expected C order")));
+        return Err(io::Error::other(format!(
+            "array {name:?} is in Fortran order, expected C order"
+        )));
     }
     Ok(array.into_vec::<f32>()?.as_chunks::<N>().0.to_vec())
 }
@@ -142,7 +199,11 @@ mod tests {
     fn moments(values: &[f32]) -> (f64, f64) {
         let n = values.len() as f64;
         let mean = values.iter().copied().map(f64::from).sum::<f64>() / n;
-        let variance = values.iter().map(|&value| (f64::from(value) - mean).powi(2)).sum::<f64>() / n;
+        let variance = values
+            .iter()
+            .map(|&value| (f64::from(value) - mean).powi(2))
+            .sum::<f64>()
+            / n;
         (mean, variance.sqrt())
     }
 
@@ -151,8 +212,14 @@ mod tests {
 
     fn assert_spread(what: &str, values: &[f32], mean: f64, deviation: f64) {
         let (got_mean, got_deviation) = moments(values);
-        assert!((got_mean - mean).abs() < DEVIATION_FRAC * deviation.max(0.1), "{what}: mean {got_mean}");
-        assert!((got_deviation / deviation - 1.0).abs() < DEVIATION_FRAC, "{what}: deviation {got_deviation}");
+        assert!(
+            (got_mean - mean).abs() < DEVIATION_FRAC * deviation.max(0.1),
+            "{what}: mean {got_mean}"
+        );
+        assert!(
+            (got_deviation / deviation - 1.0).abs() < DEVIATION_FRAC,
+            "{what}: deviation {got_deviation}"
+        );
     }
 
     #[test]
@@ -160,15 +227,33 @@ mod tests {
         let n_splats = 20_000;
         let cloud = synthetic_cloud(n_splats, 0).checked().unwrap();
         assert_eq!(cloud.n_splats(), n_splats);
-        assert_spread("means", cloud.means.as_flattened(), 0.0, 1.0 / 3.0_f64.sqrt());
-        assert!(cloud.means.as_flattened().iter().all(|x| (-1.0..1.0).contains(x)));
+        assert_spread(
+            "means",
+            cloud.means.as_flattened(),
+            0.0,
+            1.0 / 3.0_f64.sqrt(),
+        );
+        assert!(
+            cloud
+                .means
+                .as_flattened()
+                .iter()
+                .all(|x| (-1.0..1.0).contains(x))
+        );
         let typical = (0.6 / (n_splats as f64).cbrt()).ln();
         assert_spread("log scales", cloud.log_scales.as_flattened(), typical, 0.3);
         assert_spread("rotations", cloud.rotations_wxyz.as_flattened(), 0.0, 1.0);
         assert_spread("opacities", &cloud.opacity_logits, 0.0, 1.5);
-        let (constant, rest): (Vec<_>, Vec<_>) =
-            cloud.sh.iter().enumerate().partition(|(ix, _)| ix % N_COEFFICIENTS == 0);
-        let flat = |part: Vec<(usize, &[f32; 3])>| part.iter().flat_map(|(_, color)| **color).collect::<Vec<_>>();
+        let (constant, rest): (Vec<_>, Vec<_>) = cloud
+            .sh
+            .iter()
+            .enumerate()
+            .partition(|(ix, _)| ix % N_COEFFICIENTS == 0);
+        let flat = |part: Vec<(usize, &[f32; 3])>| {
+            part.iter()
+                .flat_map(|(_, color)| **color)
+                .collect::<Vec<_>>()
+        };
         assert_spread("constant color", &flat(constant), 0.0, 0.5);
         assert_spread("color", &flat(rest), 0.0, 0.2);
     }
@@ -183,7 +268,11 @@ mod tests {
     fn write_npz(path: &Path, arrays: &[(&str, &[f32], &[u64])]) {
         let mut file = zip::ZipWriter::new(File::create(path).unwrap());
         for (name, values, shape) in arrays {
-            file.start_file(file_name_from_array_name(name), zip::write::SimpleFileOptions::default()).unwrap();
+            file.start_file(
+                file_name_from_array_name(name),
+                zip::write::SimpleFileOptions::default(),
+            )
+            .unwrap();
             let options = npyz::WriteOptions::new().default_dtype().shape(shape);
             let mut array = options.writer(&mut file).begin_nd().unwrap();
             array.extend(values.iter().copied()).unwrap();
@@ -214,11 +303,27 @@ mod tests {
         write_cloud(&path, &cloud, "");
         assert_eq!(load_cloud_npz(&path).unwrap(), cloud);
         write_cloud(&path, &cloud, "quats");
-        assert!(load_cloud_npz(&path).unwrap_err().to_string().contains("array \"quats\" is missing"));
+        assert!(
+            load_cloud_npz(&path)
+                .unwrap_err()
+                .to_string()
+                .contains("array \"quats\" is missing")
+        );
         write_npz(&path, &[("means", &[0.0; 9 * 4], &[9, 4])]);
-        assert!(load_cloud_npz(&path).unwrap_err().to_string().contains("has shape [9, 4]"));
+        assert!(
+            load_cloud_npz(&path)
+                .unwrap_err()
+                .to_string()
+                .contains("has shape [9, 4]")
+        );
         std::fs::write(&path, b"not a zip").unwrap();
-        assert!(matches!(load_cloud_npz(&path), Err(Error::SplatFile { .. })));
-        assert!(matches!(load_cloud_npz(&folder.path().join("none.npz")), Err(Error::SplatFile { .. })));
+        assert!(matches!(
+            load_cloud_npz(&path),
+            Err(Error::SplatFile { .. })
+        ));
+        assert!(matches!(
+            load_cloud_npz(&folder.path().join("none.npz")),
+            Err(Error::SplatFile { .. })
+        ));
     }
 }

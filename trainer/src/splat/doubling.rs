@@ -1,8 +1,9 @@
 //! Schedule of the trials that double the number of splats while images arrive.
 //!
-//! The trials run while the model grows, so the number of splats rises only as long as this improves the scores of
-//! validation images. Models with few splats converge sooner, so an early trial may reject a useful doubling. Rejected
-//! doublings are therefore tried again after more training, and when many images are new.
+//! The trials run while the model grows, so the number of splats rises only as long as this
+//! improves the scores of validation images. Models with few splats converge sooner, so an early
+//! trial may reject a useful doubling. Rejected doublings are therefore tried again after more
+//! training, and when many images are new.
 
 use super::schedule::GROWTH_PERIOD;
 use super::trial_steps::TrialSteps;
@@ -10,8 +11,8 @@ use serde::{Deserialize, Serialize};
 
 /// A rejected doubling is tried again at this multiple of the step at which it was rejected.
 const RETRY_FACTOR: f64 = 1.5;
-/// Maximum share of the planned steps, or of the steps so far if these are more, that are spent on the discarded halves
-/// of trials.
+/// Maximum share of the planned steps, or of the steps so far if these are more, that are spent on
+/// the discarded halves of trials.
 const MAX_SHARE: f64 = 0.15;
 /// The search for the number of splats restarts when this share of the images is new.
 const NEW_SHARE: f64 = 0.25;
@@ -29,11 +30,15 @@ pub(crate) struct Doubling {
 }
 
 impl Doubling {
-    /// Whether a trial may start at `step`. Trials start only at multiples of [`GROWTH_PERIOD`], where submits end.
+    /// Whether a trial may start at `step`. Trials start only at multiples of [`GROWTH_PERIOD`],
+    /// where submits end.
     pub(crate) fn is_due(&self, step: u64, n_planned_steps: u64, steps: &TrialSteps) -> bool {
         let max_discarded = MAX_SHARE * step.max(n_planned_steps) as f64;
-        let is_affordable = self.n_trials == 0 || ((self.n_trials + 1) * steps.doubling_half) as f64 <= max_discarded;
-        step >= steps.first_doubling.max(self.not_before) && step.is_multiple_of(GROWTH_PERIOD) && is_affordable
+        let is_affordable = self.n_trials == 0
+            || ((self.n_trials + 1) * steps.doubling_half) as f64 <= max_discarded;
+        step >= steps.first_doubling.max(self.not_before)
+            && step.is_multiple_of(GROWTH_PERIOD)
+            && is_affordable
     }
 
     /// Counts a trial that starts.
@@ -43,12 +48,17 @@ impl Doubling {
 
     /// Postpones the next trial after a rejection at `step`.
     pub(crate) fn reject(&mut self, step: u64) {
-        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a multiple of a step")]
+        #[expect(
+            clippy::cast_possible_truncation,
+            clippy::cast_sign_loss,
+            reason = "a multiple of a step"
+        )]
         let retry = (RETRY_FACTOR * step as f64) as u64;
         self.not_before = retry;
     }
 
-    /// Whether the search must restart, because many of the `n_images` images are new. If so, allows the next trial.
+    /// Whether the search must restart, because many of the `n_images` images are new. If so,
+    /// allows the next trial.
     pub(crate) fn restart(&mut self, n_images: usize) -> bool {
         let n_new = n_images.saturating_sub(self.n_images); // Images are pushed again after resuming.
         let is_due = n_new > 0 && n_new as f64 >= NEW_SHARE * n_images as f64;
@@ -83,9 +93,20 @@ mod tests {
             n
         };
         assert_eq!(due_at(0..steps().first_doubling), 0);
-        assert_eq!(due_at(steps().first_doubling..N_PLANNED), 3, "15 % of the planned steps");
-        assert_eq!(due_at(N_PLANNED..4 * N_PLANNED), 10, "15 % of the steps so far");
-        assert!(Doubling::default().is_due(900, 1000, &steps()), "one trial is always affordable");
+        assert_eq!(
+            due_at(steps().first_doubling..N_PLANNED),
+            3,
+            "15 % of the planned steps"
+        );
+        assert_eq!(
+            due_at(N_PLANNED..4 * N_PLANNED),
+            10,
+            "15 % of the steps so far"
+        );
+        assert!(
+            Doubling::default().is_due(900, 1000, &steps()),
+            "one trial is always affordable"
+        );
     }
 
     #[test]
@@ -94,7 +115,10 @@ mod tests {
         assert!(doubling.restart(40));
         doubling.reject(1000);
         let is_due = |doubling: &Doubling, step| doubling.is_due(step, N_PLANNED, &steps());
-        assert_eq!([1000, 1400, 1500, 1550].map(|step| is_due(&doubling, step)), [false, false, true, false]);
+        assert_eq!(
+            [1000, 1400, 1500, 1550].map(|step| is_due(&doubling, step)),
+            [false, false, true, false]
+        );
         assert!((1..=53).all(|n_images| !doubling.restart(n_images)) && !is_due(&doubling, 1000));
         assert!(doubling.restart(54) && is_due(&doubling, 1000));
         assert!(!doubling.restart(54), "no image is new");

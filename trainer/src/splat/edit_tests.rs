@@ -34,7 +34,11 @@ fn is_same(one: &Picture, other: &Picture) -> bool {
 /// A part of the scene that is in view.
 fn erased_box(at: [f64; 3]) -> Edit {
     let world_from_box = Transform::new(at.into(), Vector3::new(0.2, 0.4, -0.3));
-    Edit::Box(Aabb { world_from_box, min_m: [-2.0, -2.5, -2.0], max_m: [2.0, 2.5, 2.0] })
+    Edit::Box(Aabb {
+        world_from_box,
+        min_m: [-2.0, -2.5, -2.0],
+        max_m: [2.0, 2.5, 2.0],
+    })
 }
 
 fn edits_of(edits: impl IntoIterator<Item = Edit>) -> Arc<Edits> {
@@ -54,7 +58,9 @@ fn scene_with_floaters() -> SplatArrays {
     let mut random = Random::new(5);
     for ix in 0..20 {
         let offset = [0; 3].map(|_| f32_of(0.03 * random.normal()));
-        arrays.means.push([0.5 + offset[0], 0.3 + offset[1], 1.0 + offset[2]]);
+        arrays
+            .means
+            .push([0.5 + offset[0], 0.3 + offset[1], 1.0 + offset[2]]);
         arrays.rotations_wxyz.push([1.0, 0.0, 0.0, 0.0]);
         arrays.log_scales.push([-4.0; 3]);
         arrays.opacity_logits.push(3.0);
@@ -78,13 +84,30 @@ fn pictures_equal_those_of_a_model_without_the_erased_splats() {
     let two = edits_of([erased_box([1.0, 0.0, 5.5]), erased_box([-2.0, 0.5, 5.0])]);
     for edits in [&one, &two] {
         let left = arrays.clone().without_erased(edits);
-        assert!(left.n_splats() < arrays.n_splats() && left.n_splats() > 300, "{} splats", left.n_splats());
+        assert!(
+            left.n_splats() < arrays.n_splats() && left.n_splats() > 300,
+            "{} splats",
+            left.n_splats()
+        );
         let erased = picture(&mut model, edits);
-        assert!(is_same(&erased, &picture(&mut model_of(&left), &Arc::default())));
-        let n_uncovered = erased.rgba_srgb.chunks_exact(4).filter(|pixel| pixel[3] < 64).count();
-        assert!(n_uncovered > 100, "{n_uncovered} pixels show the background");
+        assert!(is_same(
+            &erased,
+            &picture(&mut model_of(&left), &Arc::default())
+        ));
+        let n_uncovered = erased
+            .rgba_srgb
+            .chunks_exact(4)
+            .filter(|pixel| pixel[3] < 64)
+            .count();
+        assert!(
+            n_uncovered > 100,
+            "{n_uncovered} pixels show the background"
+        );
     }
-    assert!(is_same(&picture(&mut model, &Arc::default()), &whole), "after an undo");
+    assert!(
+        is_same(&picture(&mut model, &Arc::default()), &whole),
+        "after an undo"
+    );
 }
 
 #[test]
@@ -95,7 +118,9 @@ fn training_and_scores_ignore_edits() {
     let none = Arc::default();
     let mut trained = [false, true].map(|has_edits| {
         let mut trainer = SplatTrainer::new(gpu.clone(), options()).unwrap();
-        keyframes.iter().for_each(|keyframe| trainer.push(keyframe.clone()).unwrap());
+        keyframes
+            .iter()
+            .for_each(|keyframe| trainer.push(keyframe.clone()).unwrap());
         for n_steps in [5, 10, 15] {
             picture(&mut trainer, if has_edits { &edits } else { &none });
             train(&mut trainer, n_steps);
@@ -105,7 +130,10 @@ fn training_and_scores_ignore_edits() {
     let [without, with] = &mut trained;
     assert!(without.arrays().unwrap() == with.arrays().unwrap());
     let view = request(pose(0));
-    assert_eq!(without.psnr(&view, &keyframes[0]).unwrap(), with.psnr(&view, &keyframes[0]).unwrap());
+    assert_eq!(
+        without.psnr(&view, &keyframes[0]).unwrap(),
+        with.psnr(&view, &keyframes[0]).unwrap()
+    );
 }
 
 #[test]
@@ -115,27 +143,60 @@ fn chunks_and_exports_lack_erased_splats() {
     let left = arrays.clone().without_erased(&edits);
     let mut model = model_of(&arrays);
     let mut n_in_chunks = |edits: &Arc<Edits>| -> usize {
-        let chunks = model.queue_chunks(false, edits).unwrap().unwrap().finish().unwrap();
+        let chunks = model
+            .queue_chunks(false, edits)
+            .unwrap()
+            .unwrap()
+            .finish()
+            .unwrap();
         let n_splats = |layout: &ChunkLayout| match layout {
             ChunkLayout::Splats { n_splats, .. } => *n_splats,
             ChunkLayout::Mesh { .. } => panic!("splats"),
         };
-        chunks.chunks.iter().map(|chunk| n_splats(&chunk.fine.layout)).sum()
+        chunks
+            .chunks
+            .iter()
+            .map(|chunk| n_splats(&chunk.fine.layout))
+            .sum()
     };
     assert_eq!(n_in_chunks(&edits), left.n_splats());
     assert_eq!(n_in_chunks(&Arc::default()), arrays.n_splats());
-    let undone = model.queue_chunks(true, &edits).unwrap().unwrap().finish().unwrap();
-    assert!(!undone.is_complete && !undone.chunks.is_empty(), "only changed chunks are sent after an edit");
+    let undone = model
+        .queue_chunks(true, &edits)
+        .unwrap()
+        .unwrap()
+        .finish()
+        .unwrap();
+    assert!(
+        !undone.is_complete && !undone.chunks.is_empty(),
+        "only changed chunks are sent after an edit"
+    );
 
     let folder = tempfile::tempdir().unwrap();
     model.save(folder.path()).unwrap();
     edits.write(folder.path()).unwrap();
-    assert_eq!(file::read(folder.path()).unwrap().n_splats(), arrays.n_splats(), "the folder holds the complete model");
+    assert_eq!(
+        file::read(folder.path()).unwrap().n_splats(),
+        arrays.n_splats(),
+        "the folder holds the complete model"
+    );
     let kind = ModelKind::of_saved(folder.path()).unwrap().unwrap();
     let out = folder.path().join("exported.ply");
-    let export = kind.entry().exports.iter().find(|export| export.format == "ply").unwrap();
-    let ExportWriter::Cpu(write) = export.write else { panic!("no GPU is needed") };
-    write(&ExportRequest { model: folder.path(), out: &out, cell_m: None }).unwrap();
+    let export = kind
+        .entry()
+        .exports
+        .iter()
+        .find(|export| export.format == "ply")
+        .unwrap();
+    let ExportWriter::Cpu(write) = export.write else {
+        panic!("no GPU is needed")
+    };
+    write(&ExportRequest {
+        model: folder.path(),
+        out: &out,
+        cell_m: None,
+    })
+    .unwrap();
     assert_eq!(ply::read(&out).unwrap().means, left.means);
 }
 
@@ -148,9 +209,15 @@ fn floaters_are_found_and_the_rest_is_kept() {
     let edits = edits_of([Edit::Cells(floaters.cells)]);
     assert_eq!(arrays.clone().without_erased(&edits).means, scene().means);
     let alone = picture(&mut model_of(&scene()), &Arc::default());
-    assert!(!is_same(&picture(&mut model, &Arc::default()), &alone), "the floaters are in view");
+    assert!(
+        !is_same(&picture(&mut model, &Arc::default()), &alone),
+        "the floaters are in view"
+    );
     assert!(is_same(&picture(&mut model, &edits), &alone));
-    assert!(matches!(find_floaters(&mut model, &edits), Err(Error::NoFloaters)), "they are erased already");
+    assert!(
+        matches!(find_floaters(&mut model, &edits), Err(Error::NoFloaters)),
+        "they are erased already"
+    );
 }
 
 #[test]
@@ -159,8 +226,12 @@ fn background_far_away_is_not_a_floater() {
     const FACTOR: f32 = 10.0;
     let mut arrays = scene();
     for ix in (0..arrays.n_splats()).step_by(8) {
-        arrays.means.push(arrays.means[ix].map(|along| FACTOR * along));
-        arrays.log_scales.push(arrays.log_scales[ix].map(|log_scale| log_scale + (2.8 * FACTOR).ln()));
+        arrays
+            .means
+            .push(arrays.means[ix].map(|along| FACTOR * along));
+        arrays
+            .log_scales
+            .push(arrays.log_scales[ix].map(|log_scale| log_scale + (2.8 * FACTOR).ln()));
         arrays.rotations_wxyz.push(arrays.rotations_wxyz[ix]);
         arrays.opacity_logits.push(4.0);
         arrays.sh.extend_from_within(16 * ix..16 * (ix + 1));
@@ -170,7 +241,8 @@ fn background_far_away_is_not_a_floater() {
     assert_eq!(n_erased, 0);
 }
 
-/// Prints how long a search takes: `cargo test --release -- --ignored --nocapture time_of_a_search`.
+/// Prints how long a search takes: `cargo test --release -- --ignored --nocapture
+/// time_of_a_search`.
 #[test]
 #[ignore = "measures time"]
 fn time_of_a_search() {
@@ -178,6 +250,10 @@ fn time_of_a_search() {
         let arrays = super::cloud::scan_cloud(n_splats, 3);
         let began = std::time::Instant::now();
         let found = super::floaters::floaters(&arrays);
-        eprintln!("{n_splats} splats: {:?}, {:?} erased", began.elapsed(), found.map(|found| found.n_erased));
+        eprintln!(
+            "{n_splats} splats: {:?}, {:?} erased",
+            began.elapsed(),
+            found.map(|found| found.n_erased)
+        );
     }
 }

@@ -34,8 +34,18 @@ pub(crate) static ENTRY: MethodEntry = MethodEntry {
         .union(ParamSet::IMAGE_POSES)
         .union(ParamSet::IMAGE_GAINS),
     exports: &[
-        Export { format: "spz", contents: "splats", has_cells: false, write: ExportWriter::Cpu(write_spz) },
-        Export { format: "ply", contents: "splats", has_cells: false, write: ExportWriter::Cpu(write_ply) },
+        Export {
+            format: "spz",
+            contents: "splats",
+            has_cells: false,
+            write: ExportWriter::Cpu(write_spz),
+        },
+        Export {
+            format: "ply",
+            contents: "splats",
+            has_cells: false,
+            write: ExportWriter::Cpu(write_ply),
+        },
     ],
     default_options: default_options::<SplatOptions>,
     check_options: |options| options.typed::<SplatOptions>().map(drop),
@@ -55,16 +65,22 @@ fn resume(
     keyframes: &[Arc<Keyframe>],
     placeholders: &[Arc<Keyframe>],
 ) -> Result<ResumedModel, Error> {
-    Aligned::resume(checkpoint, keyframes, placeholders, |own_checkpoint, keyframes| {
-        SplatTrainer::resume(gpu, own_checkpoint, keyframes)
-    })
+    Aligned::resume(
+        checkpoint,
+        keyframes,
+        placeholders,
+        |own_checkpoint, keyframes| SplatTrainer::resume(gpu, own_checkpoint, keyframes),
+    )
 }
 
 fn load(gpu: Arc<Gpu>, model: &Path) -> Result<Box<dyn Method>, Error> {
     let splats = file::read(model)?;
     // The limit applies only to training. A saved model is always loaded completely.
     let max_splats = u32::try_from(splats.n_splats()).unwrap_or(u32::MAX);
-    let options = SplatOptions { max_splats, ..SplatOptions::default() };
+    let options = SplatOptions {
+        max_splats,
+        ..SplatOptions::default()
+    };
     let trainer = SplatTrainer::from_arrays(gpu, options.into(), &splats)?;
     Ok(match model.is_dir() {
         true => Box::new(Aligned::load(trainer.with_saved_metadata(model)?, model)?),
@@ -85,7 +101,11 @@ fn write(request: &ExportRequest<'_>, format: Format) -> Result<Exported, Error>
     let splats = file::read(request.model)?.without_erased(&Edits::read(request.model)?);
     file::write(request.out, format, &splats)?;
     let detail = format!("of SH degree {}", splats.sh_degree);
-    Ok(Exported { n_items: splats.n_splats() as u64, item: "splat", detail })
+    Ok(Exported {
+        n_items: splats.n_splats() as u64,
+        item: "splat",
+        detail,
+    })
 }
 
 #[cfg(test)]

@@ -1,5 +1,5 @@
-//! Regularization of models trained on few images. It fades out as the number of images rises, because it costs detail
-//! with many images.
+//! Regularization of models trained on few images. It fades out as the number of images rises,
+//! because it costs detail with many images.
 
 use super::growth_search::FEW_IMAGES;
 use super::options::SplatOptions;
@@ -8,13 +8,14 @@ use crate::gpu::f32_of;
 
 /// Up to this number of images, the regularization is complete.
 const VERY_FEW_IMAGES: usize = 20;
-/// Completed fraction of the planned steps from which on splats are dropped at the full rate. Earlier, dropping would
-/// only slow down training.
+/// Completed fraction of the planned steps from which on splats are dropped at the full rate.
+/// Earlier, dropping would only slow down training.
 const DROP_RAMP_FRAC: f64 = 0.2;
 /// Depth residuals above this limit have no gradient.
 const DEPTH_CLIP_M: f64 = 0.2;
-/// Limit for few images. Splats that float in front of a surface are often farther from it than [`DEPTH_CLIP_M`]. With
-/// many images, the color loss removes them; with few images, only the depth loss does.
+/// Limit for few images. Splats that float in front of a surface are often farther from it than
+/// [`DEPTH_CLIP_M`]. With many images, the color loss removes them; with few images, only the depth
+/// loss does.
 const FEW_DEPTH_CLIP_M: f64 = 1.0;
 /// Weight of the depth loss for few images, relative to the usual weight.
 const FEW_DEPTH_WEIGHT: f64 = 3.0;
@@ -30,7 +31,8 @@ impl Scarcity {
         Self(missing.min(1.0))
     }
 
-    /// Fraction of the splats that a step leaves out, given its maximum (Park et al. 2025, `DropGaussian`).
+    /// Fraction of the splats that a step leaves out, given its maximum (Park et al. 2025,
+    /// `DropGaussian`).
     pub(crate) fn drop_frac(self, max: f64, completed_frac: f64) -> f64 {
         self.0 * max * (completed_frac / DROP_RAMP_FRAC).min(1.0)
     }
@@ -57,15 +59,19 @@ impl Scarcity {
         self.between(1.0, FEW_DEPTH_WEIGHT)
     }
 
-    /// Background of pictures: the mean color of the images, the best guess for unobserved areas. Black with many images.
+    /// Background of pictures: the mean color of the images, the best guess for unobserved areas.
+    /// Black with many images.
     pub(crate) fn background_srgb(self, mean_srgb: [f32; 3]) -> [f32; 3] {
         mean_srgb.map(|color| f32_of(self.0) * color)
     }
 
-    /// Lower end of the random background's range of colors during training. With few images, the range is centered at the
-    /// mean color, as far as it fits into 0 to 1; with many images, it begins at black.
+    /// Lower end of the random background's range of colors during training. With few images, the
+    /// range is centered at the mean color, as far as it fits into 0 to 1; with many images, it
+    /// begins at black.
     fn min_background_srgb(self, mean_srgb: [f32; 3], range: f64) -> [f32; 3] {
-        mean_srgb.map(|color| f32_of(self.0 * (f64::from(color) - 0.5 * range).clamp(0.0, (1.0 - range).max(0.0))))
+        mean_srgb.map(|color| {
+            f32_of(self.0 * (f64::from(color) - 0.5 * range).clamp(0.0, (1.0 - range).max(0.0)))
+        })
     }
 
     fn between(self, many: f64, few: f64) -> f64 {
@@ -82,17 +88,32 @@ mod tests {
         let drop_frac = |n| Scarcity::of_images(n).drop_frac(0.2, 0.5);
         assert_eq!([1, 20, 40, 300].map(drop_frac), [0.2, 0.2, 0.0, 0.0]);
         assert!((drop_frac(30) - 0.1).abs() < 1e-12);
-        assert_eq!(Scarcity::of_images(5).drop_frac(0.2, 0.0), 0.0, "no splats are dropped at the start");
+        assert_eq!(
+            Scarcity::of_images(5).drop_frac(0.2, 0.0),
+            0.0,
+            "no splats are dropped at the start"
+        );
         let background = |n, color| {
             let scarcity = Scarcity::of_images(n);
-            (scarcity.background_srgb([color; 3])[0], scarcity.min_background_srgb([color; 3], 0.25)[0])
+            (
+                scarcity.background_srgb([color; 3])[0],
+                scarcity.min_background_srgb([color; 3], 0.25)[0],
+            )
         };
         assert_eq!(
             [background(8, 0.5), background(8, 0.0), background(8, 1.0)],
             [(0.5, 0.375), (0.0, 0.0), (1.0, 0.75)]
         );
         assert_eq!(background(40, 0.5), (0.0, 0.0));
-        let depth = |n| (Scarcity::of_images(n).depth_clip_m(), Scarcity::of_images(n).depth_weight());
-        assert_eq!((depth(40), depth(8)), ((DEPTH_CLIP_M, 1.0), (FEW_DEPTH_CLIP_M, FEW_DEPTH_WEIGHT)));
+        let depth = |n| {
+            (
+                Scarcity::of_images(n).depth_clip_m(),
+                Scarcity::of_images(n).depth_weight(),
+            )
+        };
+        assert_eq!(
+            (depth(40), depth(8)),
+            ((DEPTH_CLIP_M, 1.0), (FEW_DEPTH_CLIP_M, FEW_DEPTH_WEIGHT))
+        );
     }
 }

@@ -1,4 +1,5 @@
-//! Reads splats from a `.ply`, `.spz` or `.splat` file or the folder of a saved model, and writes `.ply` and `.spz`.
+//! Reads splats from a `.ply`, `.spz` or `.splat` file or the folder of a saved model, and writes
+//! `.ply` and `.spz`.
 
 use super::arrays::SplatArrays;
 use super::{antimatter15, ply, spz};
@@ -26,16 +27,31 @@ pub(super) enum Format {
 /// Reads splats from a file or from a model folder.
 pub(super) fn read(model: &Path) -> Result<SplatArrays, Error> {
     let is_file = model.is_file();
-    let path: PathBuf = if is_file { model.to_owned() } else { model.join(IN_FOLDER) };
+    let path: PathBuf = if is_file {
+        model.to_owned()
+    } else {
+        model.join(IN_FOLDER)
+    };
     let splats = read_file(&path);
     let is_in_model = is_file && path.file_name().is_some_and(|name| name == IN_FOLDER);
-    let hint = if is_in_model { "; for a saved model, give its folder" } else { "" };
-    splats.map_err(|source| Error::NoSplats { path: model.to_owned(), hint, source: Box::new(source) })
+    let hint = if is_in_model {
+        "; for a saved model, give its folder"
+    } else {
+        ""
+    };
+    splats.map_err(|source| Error::NoSplats {
+        path: model.to_owned(),
+        hint,
+        source: Box::new(source),
+    })
 }
 
 /// Reads splats from a file; its extension determines the format.
 fn read_file(path: &Path) -> Result<SplatArrays, Error> {
-    let extension = path.extension().and_then(OsStr::to_str).map(str::to_ascii_lowercase);
+    let extension = path
+        .extension()
+        .and_then(OsStr::to_str)
+        .map(str::to_ascii_lowercase);
     match extension.as_deref() {
         Some("spz") => spz::read(path),
         Some("splat") => antimatter15::read(path),
@@ -45,7 +61,10 @@ fn read_file(path: &Path) -> Result<SplatArrays, Error> {
                 "the format .{other} is not supported (supported: .{supported}); convert the file to .ply, for example with \
                  SuperSplat"
             );
-            Err(Error::SplatFile { path: path.to_owned(), reason })
+            Err(Error::SplatFile {
+                path: path.to_owned(),
+                reason,
+            })
         }
         _ => ply::read(path),
     }
@@ -74,9 +93,18 @@ mod tests {
         for (name, reason) in [
             ("a.ply", "it has no PLY header"),
             ("a", "it has no PLY header"),
-            ("a.SPZ", "it begins neither with a gzip stream nor with \"NGSP\""),
-            ("a.splat", "it has 33 bytes, expected a multiple of 32 above 0"),
-            ("a.sog", "the format .sog is not supported (supported: .ply, .spz, .splat); convert the file to .ply"),
+            (
+                "a.SPZ",
+                "it begins neither with a gzip stream nor with \"NGSP\"",
+            ),
+            (
+                "a.splat",
+                "it has 33 bytes, expected a multiple of 32 above 0",
+            ),
+            (
+                "a.sog",
+                "the format .sog is not supported (supported: .ply, .spz, .splat); convert the file to .ply",
+            ),
             ("a.KSPLAT", "the format .ksplat is not supported"),
         ] {
             let error = of(name);

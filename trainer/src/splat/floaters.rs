@@ -1,8 +1,9 @@
 //! Finds small parts of a splat model that are not connected to its large parts.
 //!
-//! Space is divided into cells. A cell is occupied if its splats, together, are about half opaque. Groups of adjacent
-//! occupied cells are the parts of the model; a splat that is half opaque also connects the cells that it covers. Splats
-//! that are too faint to occupy a cell are floaters, too, unless they are next to a large part.
+//! Space is divided into cells. A cell is occupied if its splats, together, are about half opaque.
+//! Groups of adjacent occupied cells are the parts of the model; a splat that is half opaque also
+//! connects the cells that it covers. Splats that are too faint to occupy a cell are floaters, too,
+//! unless they are next to a large part.
 
 use super::arrays::SplatArrays;
 use super::bounds::bounds;
@@ -24,23 +25,45 @@ const MAX_TOTAL_SAMPLES: f64 = 5e7;
 /// The small parts of a splat model; `None` if there are none.
 pub(super) fn floaters(splats: &SplatArrays) -> Option<Floaters> {
     let Bounds { center_m, radius_m } = bounds(splats)?;
-    let grid = CellGrid { center_m, radius_m, n_cells: N_CELLS };
+    let grid = CellGrid {
+        center_m,
+        radius_m,
+        n_cells: N_CELLS,
+    };
     let visible: Vec<usize> = splats.visible().into_iter().map(|ix| ix as usize).collect();
     let (occupied, connected) = occupied(splats, &visible, &grid);
     let mut labels = CellLabels::of_occupied(&grid, &occupied, connected);
     labels.keep_around(&grid);
     let mean_m = |ix: usize| splats.means[ix].map(f64::from);
     let cells = visible.iter().map(|ix| grid.cell_at(mean_m(*ix)));
-    labels.floating.extend(cells.filter(|cell| !labels.kept.contains(*cell)));
+    labels
+        .floating
+        .extend(cells.filter(|cell| !labels.kept.contains(*cell)));
     let cells = labels.erased(&grid)?;
-    let n_erased = visible.iter().filter(|ix| cells.contains(mean_m(**ix))).count() as u64;
-    (n_erased > 0).then_some(Floaters { cells, n_erased, item: "splat" })
+    let n_erased = visible
+        .iter()
+        .filter(|ix| cells.contains(mean_m(**ix)))
+        .count() as u64;
+    (n_erased > 0).then_some(Floaters {
+        cells,
+        n_erased,
+        item: "splat",
+    })
 }
 
-/// The occupied cells, and the cells that opaque splats connect: large splats cover cells between their points, too.
+/// The occupied cells, and the cells that opaque splats connect: large splats cover cells between
+/// their points, too.
 fn occupied(splats: &SplatArrays, visible: &[usize], grid: &CellGrid) -> (CellMask, Groups) {
-    let steps: Vec<[f64; 3]> = visible.iter().map(|ix| n_steps(splats, *ix, grid)).collect();
-    let total = |max: f64| steps.iter().map(|steps| n_samples(steps).min(max)).sum::<f64>();
+    let steps: Vec<[f64; 3]> = visible
+        .iter()
+        .map(|ix| n_steps(splats, *ix, grid))
+        .collect();
+    let total = |max: f64| {
+        steps
+            .iter()
+            .map(|steps| n_samples(steps).min(max))
+            .sum::<f64>()
+    };
     let mut max_samples = MAX_SAMPLES;
     while max_samples > 1.0 && total(max_samples) > MAX_TOTAL_SAMPLES {
         max_samples /= 2.0;
@@ -64,7 +87,12 @@ fn occupied(splats: &SplatArrays, visible: &[usize], grid: &CellGrid) -> (CellMa
     }
     let is_occupied = |(_, opacity): &(u32, &f32)| **opacity >= MIN_CELL_OPACITY;
     let mut occupied = CellMask::none(grid);
-    occupied.extend((0..).zip(&opacities).filter(is_occupied).map(|(cell, _)| cell));
+    occupied.extend(
+        (0..)
+            .zip(&opacities)
+            .filter(is_occupied)
+            .map(|(cell, _)| cell),
+    );
     (occupied, connected)
 }
 
@@ -82,12 +110,19 @@ fn n_samples(steps: &[f64; 3]) -> f64 {
 /// The steps of a splat, fewer if it has more than `max_samples` points.
 fn limited(steps: &[f64; 3], max_samples: f64) -> [f64; 3] {
     let n_axes = steps.iter().filter(|n| **n > 0.0).count().max(1);
-    let factor = (max_samples / n_samples(steps)).min(1.0).powf(1.0 / n_axes as f64);
+    let factor = (max_samples / n_samples(steps))
+        .min(1.0)
+        .powf(1.0 / n_axes as f64);
     steps.map(|n| ((factor * (2.0 * n + 1.0) - 1.0) / 2.0).floor().max(0.0))
 }
 
-/// Points of a splat in world, meters, those near its center first along each axis, and the falloff of opacity there.
-fn samples(splats: &SplatArrays, ix: usize, steps: &[f64; 3]) -> impl Iterator<Item = ([f64; 3], f64)> + use<> {
+/// Points of a splat in world, meters, those near its center first along each axis, and the falloff
+/// of opacity there.
+fn samples(
+    splats: &SplatArrays,
+    ix: usize,
+    steps: &[f64; 3],
+) -> impl Iterator<Item = ([f64; 3], f64)> + use<> {
     let [w, x, y, z] = splats.rotations_wxyz[ix].map(f64::from);
     let rotation = UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z));
     let deviations_m = splats.log_scales[ix].map(|log_scale| f64::from(log_scale).exp());
@@ -95,18 +130,32 @@ fn samples(splats: &SplatArrays, ix: usize, steps: &[f64; 3]) -> impl Iterator<I
     let [xs, ys, zs] = steps.map(offsets);
     let offsets = zs.into_iter().flat_map(move |z| {
         let xs = xs.clone();
-        ys.clone().into_iter().flat_map(move |y| xs.clone().into_iter().map(move |x| [x, y, z]))
+        ys.clone()
+            .into_iter()
+            .flat_map(move |y| xs.clone().into_iter().map(move |x| [x, y, z]))
     });
     offsets.map(move |offset| {
-        let in_splat = Vector3::from(std::array::from_fn::<f64, 3, _>(|axis| offset[axis] * deviations_m[axis]));
-        let squared: f64 = offset.iter().map(|deviations| deviations * deviations).sum();
-        ((mean_m + rotation * in_splat).into(), (-0.5 * squared).exp())
+        let in_splat = Vector3::from(std::array::from_fn::<f64, 3, _>(|axis| {
+            offset[axis] * deviations_m[axis]
+        }));
+        let squared: f64 = offset
+            .iter()
+            .map(|deviations| deviations * deviations)
+            .sum();
+        (
+            (mean_m + rotation * in_splat).into(),
+            (-0.5 * squared).exp(),
+        )
     })
 }
 
 /// Positions along an axis of a splat, in standard deviations: 0, then alternating on both sides.
 fn offsets(n_steps: f64) -> Vec<f64> {
-    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a small whole number")]
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "a small whole number"
+    )]
     let n = n_steps as u32;
     let both = |step: u32| [1.0, -1.0].map(|sign| sign * REACH * f64::from(step) / n_steps);
     std::iter::once(0.0).chain((1..=n).flat_map(both)).collect()

@@ -1,5 +1,5 @@
-//! Tests of the growth search: few images limit the number of splats, many images do not, and interruptions of a search
-//! have no effect.
+//! Tests of the growth search: few images limit the number of splats, many images do not, and
+//! interruptions of a search have no effect.
 
 use super::growth_search::FEW_IMAGES;
 use super::training_tests::{FEW_STEPS, n_keyframes, noisy, options, train};
@@ -25,16 +25,26 @@ fn tested() -> ModelOptions<SplatOptions> {
     })
 }
 
-fn new_trainer(gpu: &Arc<Gpu>, options: ModelOptions<SplatOptions>, keyframes: &[Arc<Keyframe>]) -> SplatTrainer {
+fn new_trainer(
+    gpu: &Arc<Gpu>,
+    options: ModelOptions<SplatOptions>,
+    keyframes: &[Arc<Keyframe>],
+) -> SplatTrainer {
     let mut trainer = SplatTrainer::new(gpu.clone(), options).unwrap();
-    keyframes.iter().for_each(|keyframe| trainer.push(keyframe.clone()).unwrap());
+    keyframes
+        .iter()
+        .for_each(|keyframe| trainer.push(keyframe.clone()).unwrap());
     trainer
 }
 
-/// Keyframes without validation keyframes, because releasing them during the search would add splats.
+/// Keyframes without validation keyframes, because releasing them during the search would add
+/// splats.
 fn without_validation(keyframes: Vec<Arc<Keyframe>>) -> Vec<Arc<Keyframe>> {
     let train = |keyframe: Arc<Keyframe>| match keyframe.split {
-        Split::Validation => Arc::new(Keyframe { split: Split::Train, ..keyframe.as_ref().clone() }),
+        Split::Validation => Arc::new(Keyframe {
+            split: Split::Train,
+            ..keyframe.as_ref().clone()
+        }),
         Split::Train | Split::Test => keyframe,
     };
     keyframes.into_iter().map(train).collect()
@@ -42,7 +52,12 @@ fn without_validation(keyframes: Vec<Arc<Keyframe>>) -> Vec<Arc<Keyframe>> {
 
 fn doublings(trainer: &SplatTrainer) -> Vec<Trial> {
     let is_doubling = |trial: &&Trial| matches!(trial.candidate, Candidate::Doubled { .. });
-    trainer.trials().iter().filter(is_doubling).cloned().collect()
+    trainer
+        .trials()
+        .iter()
+        .filter(is_doubling)
+        .cloned()
+        .collect()
 }
 
 fn checkpoint_of(trainer: &mut SplatTrainer) -> Checkpoint {
@@ -54,20 +69,46 @@ fn checkpoint_of(trainer: &mut SplatTrainer) -> Checkpoint {
 fn few_noisy_images_stop_growth() {
     let gpu = test_gpu();
     let keyframes = without_validation(noisy(&n_keyframes(&gpu, 9, true)));
-    let n_images = keyframes.iter().filter(|keyframe| keyframe.split != Split::Test).count();
+    let n_images = keyframes
+        .iter()
+        .filter(|keyframe| keyframe.split != Split::Test)
+        .count();
     let mut trainer = new_trainer(&gpu, tested(), &keyframes);
     train(&mut trainer, FEW_STEPS.search);
     let n_before = trainer.progress().primitives;
     train(&mut trainer, 10);
     let reported = doublings(&trainer);
-    let [Trial { gain_db, n_images: n_scored, kept: false, .. }] = reported[..] else { panic!("{reported:?}") };
-    assert!(gain_db < 0.1 && n_scored == n_images, "every image is scored once: {reported:?}");
+    let [
+        Trial {
+            gain_db,
+            n_images: n_scored,
+            kept: false,
+            ..
+        },
+    ] = reported[..]
+    else {
+        panic!("{reported:?}")
+    };
+    assert!(
+        gain_db < 0.1 && n_scored == n_images,
+        "every image is scored once: {reported:?}"
+    );
     train(&mut trainer, N_PLANNED_STEPS - FEW_STEPS.search - 10);
-    assert_eq!((trainer.progress().primitives, trainer.n_active_views()), (n_before, n_images));
-    let mut unlimited =
-        new_trainer(&gpu, tested().with(|options| options.specific.count = CountPolicy::ToCap), &keyframes);
+    assert_eq!(
+        (trainer.progress().primitives, trainer.n_active_views()),
+        (n_before, n_images)
+    );
+    let mut unlimited = new_trainer(
+        &gpu,
+        tested().with(|options| options.specific.count = CountPolicy::ToCap),
+        &keyframes,
+    );
     train(&mut unlimited, N_PLANNED_STEPS);
-    assert!(unlimited.progress().primitives > n_before, "{:?}", unlimited.progress());
+    assert!(
+        unlimited.progress().primitives > n_before,
+        "{:?}",
+        unlimited.progress()
+    );
 }
 
 /// Without noise, a model with too few splats for the details of the scene improves if it grows.
@@ -85,14 +126,27 @@ fn useful_growth_continues() {
     }
     let n_both_rounds: u64 = 3 * (FEW_STEPS.search + 2 * 2 * FEW_STEPS.comparison);
     let n_needed = trainer.n_steps_for_size_search();
-    assert!((n_both_rounds..=n_both_rounds + 3 * 2 * FEW_STEPS.comparison).contains(&n_needed), "{n_needed}");
+    assert!(
+        (n_both_rounds..=n_both_rounds + 3 * 2 * FEW_STEPS.comparison).contains(&n_needed),
+        "{n_needed}"
+    );
     // A search that ends early keeps the accepted doubling.
     assert!(trainer.end_size_search().unwrap() && trainer.n_steps_for_size_search() == 0);
     let reported = doublings(&trainer);
-    assert!(reported.len() == 1 && reported[0].kept && reported[0].gain_db > 0.1, "{reported:?}");
-    assert_eq!(trainer.growth_limit().map(|n| n as usize), Some(2 * n_before));
+    assert!(
+        reported.len() == 1 && reported[0].kept && reported[0].gain_db > 0.1,
+        "{reported:?}"
+    );
+    assert_eq!(
+        trainer.growth_limit().map(|n| n as usize),
+        Some(2 * n_before)
+    );
     train(&mut trainer, 300);
-    assert!(trainer.arrays().unwrap().n_splats() > n_before, "{:?}", trainer.progress());
+    assert!(
+        trainer.arrays().unwrap().n_splats() > n_before,
+        "{:?}",
+        trainer.progress()
+    );
 }
 
 /// A search that ends early leaves the model as if the search had not started.
@@ -114,7 +168,10 @@ fn search_without_enough_time_ends_at_the_current_number() {
         }
         assert_eq!(trainer.n_steps_for_size_search(), 2 * N_SEARCH - n_searched);
         assert!(trainer.end_size_search().unwrap() && !trainer.is_growth_search_running());
-        assert_eq!(trainer.n_total_steps().unwrap(), FEW_STEPS.search + n_searched);
+        assert_eq!(
+            trainer.n_total_steps().unwrap(),
+            FEW_STEPS.search + n_searched
+        );
         train(&mut trainer, 250);
         assert!(trainer.trials().is_empty());
         let arrays = trainer.arrays().unwrap();
@@ -131,11 +188,16 @@ fn many_images_are_not_tested() {
     let options = tested().with(|options| options.specific.max_splats = 3000);
     let mut trainer = new_trainer(&gpu, options, &keyframes);
     train(&mut trainer, FEW_STEPS.search + 20);
-    assert!(trainer.trials().is_empty() && !trainer.is_growth_search_running() && trainer.growth_limit().is_none());
+    assert!(
+        trainer.trials().is_empty()
+            && !trainer.is_growth_search_running()
+            && trainer.growth_limit().is_none()
+    );
     assert_eq!(trainer.n_total_steps().unwrap(), FEW_STEPS.search + 20);
 }
 
-/// A keyframe that arrives during a search restarts it. A checkpoint continues with the same result.
+/// A keyframe that arrives during a search restarts it. A checkpoint continues with the same
+/// result.
 #[test]
 fn interrupted_search_is_repeated() {
     const END: u64 = FEW_STEPS.search + FEW_STEPS.search_pause + 50;
@@ -168,8 +230,11 @@ fn interrupted_search_is_repeated() {
     let mut uninterrupted = start_search();
     let checkpoint = checkpoint_of(&mut uninterrupted);
     assert!(uninterrupted.is_growth_search_running());
-    let (mut resumed, untrained) = SplatTrainer::resume(gpu.clone(), &checkpoint, &keyframes[..11]).unwrap();
-    untrained.into_iter().for_each(|keyframe| resumed.push(keyframe).unwrap());
+    let (mut resumed, untrained) =
+        SplatTrainer::resume(gpu.clone(), &checkpoint, &keyframes[..11]).unwrap();
+    untrained
+        .into_iter()
+        .for_each(|keyframe| resumed.push(keyframe).unwrap());
     let (one, other) = (finish(&mut uninterrupted), finish(&mut resumed));
     assert_eq!(one.state, other.state);
     assert!(one.arrays == other.arrays, "the models differ");
@@ -178,5 +243,11 @@ fn interrupted_search_is_repeated() {
     let n_before = saved.progress().primitives;
     saved.save(tempfile::tempdir().unwrap().path()).unwrap();
     assert_eq!(saved.arrays().unwrap().n_splats() as u64, n_before);
-    assert_eq!((saved.progress().step, saved.n_total_steps().unwrap() > FEW_STEPS.search), (FEW_STEPS.search, true));
+    assert_eq!(
+        (
+            saved.progress().step,
+            saved.n_total_steps().unwrap() > FEW_STEPS.search
+        ),
+        (FEW_STEPS.search, true)
+    );
 }

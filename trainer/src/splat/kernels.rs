@@ -6,7 +6,10 @@ use crate::sort::RadixSort;
 
 macro_rules! source {
     ($name:literal, $file:literal) => {
-        Source { name: $name, text: include_str!(concat!("../shared/", $file, ".wgsl")) }
+        Source {
+            name: $name,
+            text: include_str!(concat!("../shared/", $file, ".wgsl")),
+        }
     };
     ($name:literal) => {
         source!($name, $name)
@@ -71,7 +74,12 @@ macro_rules! update_sources {
 const WITH_CAMERA: &[Source] = update_sources!("camera_sums_tree");
 
 /// Imports of `erase`.
-const ERASE: &[Source] = &[source!("folded"), MODEL, source!("space"), source!("erased")];
+const ERASE: &[Source] = &[
+    source!("folded"),
+    MODEL,
+    source!("space"),
+    source!("erased"),
+];
 
 /// Imports of the per-pixel kernels.
 macro_rules! blend_sources {
@@ -100,11 +108,20 @@ macro_rules! kernel {
         kernel!($name, SHARED)
     };
     ($name:literal, $shared:expr) => {
-        Kernel { source: Source { name: $name, text: include_str!(concat!($name, ".wgsl")) }, shared: $shared }
+        Kernel {
+            source: Source {
+                name: $name,
+                text: include_str!(concat!($name, ".wgsl")),
+            },
+            shared: $shared,
+        }
     };
     ($folder:literal, $name:literal, $shared:expr) => {
         Kernel {
-            source: Source { name: $name, text: include_str!(concat!("../", $folder, "/", $name, ".wgsl")) },
+            source: Source {
+                name: $name,
+                text: include_str!(concat!("../", $folder, "/", $name, ".wgsl")),
+            },
             shared: $shared,
         }
     };
@@ -181,7 +198,8 @@ pub(crate) const KERNELS: &[Kernel] = &[
     kernel!("gather"),
 ];
 
-/// Creates `Self` from fields that are computed as given, and from pipelines, which are compiled in parallel to them.
+/// Creates `Self` from fields that are computed as given, and from pipelines, which are compiled in
+/// parallel to them.
 macro_rules! compile {
     ($gpu:expr, { $($given:ident: $value:expr),* $(,)? }, { $($field:ident: $kernel:expr, $overrides:expr);* $(;)? }) => {{
         let others = || -> Result<_, Error> { Ok(($($value),*)) };
@@ -249,11 +267,19 @@ pub(crate) enum Ssim {
 impl Ssim {
     fn new(gpu: &Gpu, in_strips: bool) -> Result<Self, Error> {
         if !in_strips {
-            return Ok(Self::Tiles(Pipeline::new(gpu, kernel!("loss", "ssim", SHARED), &[])?));
+            return Ok(Self::Tiles(Pipeline::new(
+                gpu,
+                kernel!("loss", "ssim", SHARED),
+                &[],
+            )?));
         }
         Ok(Self::Strips {
             means: Pipeline::new(gpu, kernel!("loss", "ssim_strips", LOSS_STRIPS), &[])?,
-            upstream: Pipeline::new(gpu, kernel!("loss", "ssim_upstream_strips", LOSS_STRIPS), &[])?,
+            upstream: Pipeline::new(
+                gpu,
+                kernel!("loss", "ssim_upstream_strips", LOSS_STRIPS),
+                &[],
+            )?,
         })
     }
 }
@@ -264,7 +290,8 @@ pub(crate) struct TrainPipelines {
     pub(crate) ssim: Ssim,
     pub(crate) loss: Pipeline,
     pub(crate) loss_without_ssim: Pipeline,
-    /// Also divides the lists of the tiles into segments for `backward`. `None` if `backward` needs no segments.
+    /// Also divides the lists of the tiles into segments for `backward`. `None` if `backward` needs
+    /// no segments.
     pub(crate) rasterize_segments: Option<Pipeline>,
     pub(crate) backward: Pipeline,
     pub(crate) update: Pipeline,
@@ -284,9 +311,17 @@ pub(crate) struct TrainPipelines {
 impl TrainPipelines {
     pub(crate) fn new(gpu: &Gpu) -> Result<Self, Error> {
         let blend = blend(gpu);
-        let lanes: Vec<_> = blend.subgroup.map(|lanes| ("SUBGROUP", f64::from(lanes))).into_iter().collect();
+        let lanes: Vec<_> = blend
+            .subgroup
+            .map(|lanes| ("SUBGROUP", f64::from(lanes)))
+            .into_iter()
+            .collect();
         let in_strips = blend.rasterize_segments.is_none();
-        let loss = kernel!("loss", "loss_backward", if in_strips { LOSS_STRIPS } else { SHARED });
+        let loss = kernel!(
+            "loss",
+            "loss_backward",
+            if in_strips { LOSS_STRIPS } else { SHARED }
+        );
         compile!(gpu, {
             ssim: Ssim::new(gpu, in_strips)?,
             rasterize_segments: blend.rasterize_segments.map(|kernel| Pipeline::new(gpu, kernel, &[])).transpose()?,
@@ -309,13 +344,19 @@ impl TrainPipelines {
         })
     }
 
-    /// The update kernel in a variant that writes gradients instead of new values, for comparison with the twin.
+    /// The update kernel in a variant that writes gradients instead of new values, for comparison
+    /// with the twin.
     #[cfg(test)]
     pub(crate) fn gradients_only(gpu: &Gpu) -> Result<Pipeline, Error> {
-        Pipeline::new(gpu, kernel!("update", WITH_CAMERA), &[("GRADIENTS_ONLY", 1.0)])
+        Pipeline::new(
+            gpu,
+            kernel!("update", WITH_CAMERA),
+            &[("GRADIENTS_ONLY", 1.0)],
+        )
     }
 
-    /// The kernel of the camera parameters in a variant that writes gradients instead of new values.
+    /// The kernel of the camera parameters in a variant that writes gradients instead of new
+    /// values.
     #[cfg(test)]
     pub(crate) fn camera_gradients_only(gpu: &Gpu) -> Result<Pipeline, Error> {
         Pipeline::new(gpu, kernel!("refine_camera"), &[("GRADIENTS_ONLY", 1.0)])
@@ -329,7 +370,9 @@ mod tests {
 
     #[test]
     fn structs_have_the_same_layout_in_rust_and_wgsl() {
-        use crate::splat::params::{CameraRule, Capacity, Gathering, Growth, Lens, Model, Rule, Supervision, View};
+        use crate::splat::params::{
+            CameraRule, Capacity, Gathering, Growth, Lens, Model, Rule, Supervision, View,
+        };
         assert_layout!(
             KERNELS,
             View,
@@ -354,7 +397,16 @@ mod tests {
         assert_layout!(
             KERNELS,
             Model,
-            [n_splats, capacity, sh_degree, n_sh_rest, is_antialiased, unused_0, unused_1, unused_2]
+            [
+                n_splats,
+                capacity,
+                sh_degree,
+                n_sh_rest,
+                is_antialiased,
+                unused_0,
+                unused_1,
+                unused_2
+            ]
         );
         assert_layout!(
             KERNELS,
@@ -383,14 +435,33 @@ mod tests {
         assert_layout!(
             KERNELS,
             Supervision,
-            [background_srgb, dssim_frac, depth_weight, depth_clip_m, random_background]
+            [
+                background_srgb,
+                dssim_frac,
+                depth_weight,
+                depth_clip_m,
+                random_background
+            ]
         );
         assert_layout!(
             KERNELS,
             Growth,
-            [n_before, n_after, key, capacity, n_sh_rest, child_spread, min_opacity, unused]
+            [
+                n_before,
+                n_after,
+                key,
+                capacity,
+                n_sh_rest,
+                child_spread,
+                min_opacity,
+                unused
+            ]
         );
-        assert_layout!(KERNELS, Lens, [linear, angular, camera_params, image_params, unused]);
+        assert_layout!(
+            KERNELS,
+            Lens,
+            [linear, angular, camera_params, image_params, unused]
+        );
         assert_layout!(
             KERNELS,
             CameraRule,
@@ -406,7 +477,11 @@ mod tests {
             ]
         );
         assert_layout!(KERNELS, Capacity, [n_entries, n_slots, n_segments, unused]);
-        assert_layout!(KERNELS, Gathering, [n_kept, n_planes, words, from_capacity, to_capacity]);
+        assert_layout!(
+            KERNELS,
+            Gathering,
+            [n_kept, n_planes, words, from_capacity, to_capacity]
+        );
     }
 
     #[test]

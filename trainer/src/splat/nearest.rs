@@ -5,14 +5,18 @@ use rayon::prelude::*;
 /// Number of nearest points whose distances are averaged, as in Kerbl et al. 2023.
 const N_NEAREST: usize = 3;
 
-/// Mean distance of each point to its three nearest ones, meters; `None` for a single point. The points must be distinct.
+/// Mean distance of each point to its three nearest ones, meters; `None` for a single point. The
+/// points must be distinct.
 pub(crate) fn mean_spacings_m(points: &[[f32; 3]]) -> Vec<Option<f64>> {
     let tree = Tree::new(points);
-    points.par_iter().map(|point| tree.mean_spacing_m(point)).collect()
+    points
+        .par_iter()
+        .map(|point| tree.mean_spacing_m(point))
+        .collect()
 }
 
-/// A balanced tree without nodes: of each range of `order`, the middle point separates those with smaller coordinates
-/// along one axis from those with larger ones. The axes take turns.
+/// A balanced tree without nodes: of each range of `order`, the middle point separates those with
+/// smaller coordinates along one axis from those with larger ones. The axes take turns.
 struct Tree<'a> {
     points: &'a [[f32; 3]],
     /// Indices of the points.
@@ -21,7 +25,8 @@ struct Tree<'a> {
 
 impl<'a> Tree<'a> {
     fn new(points: &'a [[f32; 3]]) -> Self {
-        let n = u32::try_from(points.len()).expect("at most as many points as splats, whose number is a u32");
+        let n = u32::try_from(points.len())
+            .expect("at most as many points as splats, whose number is a u32");
         let mut order: Vec<u32> = (0..n).collect();
         separate(points, &mut order, 0);
         Self { points, order }
@@ -30,11 +35,16 @@ impl<'a> Tree<'a> {
     fn mean_spacing_m(&self, from: &[f32; 3]) -> Option<f64> {
         let mut nearest = [f64::INFINITY; N_NEAREST];
         self.search(&self.order, 0, from, &mut nearest);
-        let distances: Vec<f64> = nearest.into_iter().filter(|squared| squared.is_finite()).map(f64::sqrt).collect();
+        let distances: Vec<f64> = nearest
+            .into_iter()
+            .filter(|squared| squared.is_finite())
+            .map(f64::sqrt)
+            .collect();
         (!distances.is_empty()).then(|| distances.iter().sum::<f64>() / distances.len() as f64)
     }
 
-    /// Replaces larger squared distances in `nearest`, which ascend, by those of the points in `range`.
+    /// Replaces larger squared distances in `nearest`, which ascend, by those of the points in
+    /// `range`.
     fn search(&self, range: &[u32], axis: usize, from: &[f32; 3], nearest: &mut [f64; N_NEAREST]) {
         let middle = range.len() / 2;
         let Some(ix) = range.get(middle) else { return };
@@ -47,7 +57,11 @@ impl<'a> Tree<'a> {
             nearest.sort_unstable_by(f64::total_cmp);
         }
         let (smaller, larger) = (&range[..middle], &range[middle + 1..]);
-        let (near, far) = if offset(axis) < 0.0 { (smaller, larger) } else { (larger, smaller) };
+        let (near, far) = if offset(axis) < 0.0 {
+            (smaller, larger)
+        } else {
+            (larger, smaller)
+        };
         let next_axis = (axis + 1) % 3;
         self.search(near, next_axis, from, nearest);
         if offset(axis) * offset(axis) < nearest[N_NEAREST - 1] {
@@ -62,7 +76,9 @@ fn separate(points: &[[f32; 3]], range: &mut [u32], axis: usize) {
         return;
     }
     let middle = range.len() / 2;
-    range.select_nth_unstable_by(middle, |a, b| points[*a as usize][axis].total_cmp(&points[*b as usize][axis]));
+    range.select_nth_unstable_by(middle, |a, b| {
+        points[*a as usize][axis].total_cmp(&points[*b as usize][axis])
+    });
     let (smaller, rest) = range.split_at_mut(middle);
     let next_axis = (axis + 1) % 3;
     separate(points, smaller, next_axis);
@@ -80,9 +96,16 @@ mod tests {
 
     fn by_comparing_all(points: &[[f32; 3]], from: &[f32; 3]) -> f64 {
         let distance = |point: &[f32; 3]| {
-            (0..3).map(|axis| (f64::from(point[axis]) - f64::from(from[axis])).powi(2)).sum::<f64>().sqrt()
+            (0..3)
+                .map(|axis| (f64::from(point[axis]) - f64::from(from[axis])).powi(2))
+                .sum::<f64>()
+                .sqrt()
         };
-        let mut distances: Vec<f64> = points.iter().map(distance).filter(|distance| *distance > 0.0).collect();
+        let mut distances: Vec<f64> = points
+            .iter()
+            .map(distance)
+            .filter(|distance| *distance > 0.0)
+            .collect();
         distances.sort_by(f64::total_cmp);
         distances[..3].iter().sum::<f64>() / 3.0
     }
@@ -90,17 +113,27 @@ mod tests {
     #[test]
     fn spacings_match_a_search_through_all_points() {
         let mut random = Random::new(5);
-        let mut points: Vec<[f32; 3]> =
-            (0..500).map(|_| std::array::from_fn(|_| f32_of(2.0 * random.unit() - 1.0))).collect();
+        let mut points: Vec<[f32; 3]> = (0..500)
+            .map(|_| std::array::from_fn(|_| f32_of(2.0 * random.unit() - 1.0)))
+            .collect();
         // A plane, on which many coordinates are equal, and a dense cluster far away.
         points.extend((0..400).map(|ix| [0.25 * (ix % 20) as f32, 3.0, 0.25 * (ix / 20) as f32]));
-        points.extend((0..100).map(|_| std::array::from_fn(|_| f32_of(500.0 + 1e-2 * random.unit()))));
+        points.extend(
+            (0..100).map(|_| std::array::from_fn(|_| f32_of(500.0 + 1e-2 * random.unit()))),
+        );
         let spacings_m = mean_spacings_m(&points);
         for (point, spacing_m) in points.iter().zip(&spacings_m) {
             let (got, expected) = (spacing_m.unwrap(), by_comparing_all(&points, point));
-            assert!((got - expected).abs() <= TOLERANCE * expected, "{point:?}: {got}, expected {expected}");
+            assert!(
+                (got - expected).abs() <= TOLERANCE * expected,
+                "{point:?}: {got}, expected {expected}"
+            );
         }
-        assert!(spacings_m[500..900].iter().all(|spacing_m| spacing_m.is_some_and(|m| (0.25..0.31).contains(&m))));
+        assert!(
+            spacings_m[500..900]
+                .iter()
+                .all(|spacing_m| spacing_m.is_some_and(|m| (0.25..0.31).contains(&m)))
+        );
         assert_eq!(mean_spacings_m(&points), spacings_m, "repeated");
     }
 
@@ -108,7 +141,13 @@ mod tests {
     fn few_points_have_fewer_neighbors() {
         assert!(mean_spacings_m(&[]).is_empty());
         assert_eq!(mean_spacings_m(&[[1.0, 2.0, 3.0]]), [None]);
-        assert_eq!(mean_spacings_m(&[[0.0; 3], [0.0, 3.0, 4.0]]), [Some(5.0), Some(5.0)]);
-        assert_eq!(mean_spacings_m(&[[0.0; 3], [1.0, 0.0, 0.0], [5.0, 0.0, 0.0]]), [Some(3.0), Some(2.5), Some(4.5)]);
+        assert_eq!(
+            mean_spacings_m(&[[0.0; 3], [0.0, 3.0, 4.0]]),
+            [Some(5.0), Some(5.0)]
+        );
+        assert_eq!(
+            mean_spacings_m(&[[0.0; 3], [1.0, 0.0, 0.0], [5.0, 0.0, 0.0]]),
+            [Some(3.0), Some(2.5), Some(4.5)]
+        );
     }
 }

@@ -1,4 +1,5 @@
-//! Tests with invalid keyframes and splats: training continues, and no non-finite value reaches a parameter.
+//! Tests with invalid keyframes and splats: training continues, and no non-finite value reaches a
+//! parameter.
 
 use super::SplatTrainer;
 use super::cloud::synthetic_cloud;
@@ -11,7 +12,8 @@ use kinematics::{Stamp, Transform, Twist};
 use nalgebra::{Point3, Vector3};
 use std::sync::Arc;
 
-/// Trains on valid and corrupted keyframes. The result must be about as good as with the valid keyframes alone.
+/// Trains on valid and corrupted keyframes. The result must be about as good as with the valid
+/// keyframes alone.
 #[test]
 fn invalid_keyframes_do_not_affect_training() {
     const N_STEPS: u64 = 120;
@@ -20,8 +22,16 @@ fn invalid_keyframes_do_not_affect_training() {
     let with_depth = |of: fn(usize, f32) -> f32| {
         let corrupted = valid_keyframes[1].as_ref().clone();
         let depth = corrupted.depth.clone().unwrap();
-        let depth_m = depth.depth_m.iter().enumerate().map(|(ix, z)| of(ix, *z)).collect();
-        Keyframe { depth: Some(DepthMap { depth_m, ..depth }), ..corrupted }
+        let depth_m = depth
+            .depth_m
+            .iter()
+            .enumerate()
+            .map(|(ix, z)| of(ix, *z))
+            .collect();
+        Keyframe {
+            depth: Some(DepthMap { depth_m, ..depth }),
+            ..corrupted
+        }
     };
     let plain = valid_keyframes[1].as_ref().clone();
     let one_pixel = |depth: Option<DepthMap>| Keyframe {
@@ -37,11 +47,23 @@ fn invalid_keyframes_do_not_affect_training() {
         with_depth(|ix, z| if ix % 3 == 0 { -z } else { f32::MAX }),
         one_pixel(None),
         one_pixel(plain.depth.clone()),
-        Keyframe { focal_px: [f64::NAN; 2], ..plain.clone() },
-        Keyframe { world_from_camera: Transform::translation(f64::NAN, 0.0, 0.0), ..plain.clone() },
-        Keyframe { world_from_camera: Transform::translation(f64::INFINITY, 0.0, 0.0), ..plain.clone() },
         Keyframe {
-            twist: Some(Twist { linear_m_s: Vector3::repeat(f64::NAN), angular_rad_s: Vector3::zeros() }),
+            focal_px: [f64::NAN; 2],
+            ..plain.clone()
+        },
+        Keyframe {
+            world_from_camera: Transform::translation(f64::NAN, 0.0, 0.0),
+            ..plain.clone()
+        },
+        Keyframe {
+            world_from_camera: Transform::translation(f64::INFINITY, 0.0, 0.0),
+            ..plain.clone()
+        },
+        Keyframe {
+            twist: Some(Twist {
+                linear_m_s: Vector3::repeat(f64::NAN),
+                angular_rad_s: Vector3::zeros(),
+            }),
             readout_secs: 0.015,
             ..plain.clone()
         },
@@ -52,17 +74,26 @@ fn invalid_keyframes_do_not_affect_training() {
             trainer.push(keyframe.clone()).unwrap();
         }
         for (keyframe, stamp) in corrupted.iter().zip(900..) {
-            trainer.push(Arc::new(Keyframe { stamp: Stamp(stamp), ..keyframe.clone() })).unwrap();
+            trainer
+                .push(Arc::new(Keyframe {
+                    stamp: Stamp(stamp),
+                    ..keyframe.clone()
+                }))
+                .unwrap();
         }
         train(&mut trainer, N_STEPS);
         assert!(trainer.arrays().unwrap().checked().is_ok());
         test_psnr(&mut trainer, &valid_keyframes)
     };
     let (without, with) = (learned(&[]), learned(&corrupted));
-    assert!(with > without - 1.5, "{with:.2} dB with corrupted keyframes, {without:.2} dB without");
+    assert!(
+        with > without - 1.5,
+        "{with:.2} dB with corrupted keyframes, {without:.2} dB without"
+    );
 }
 
-/// Extreme splats that a file may contain: on the camera plane, with a zero quaternion, huge, or almost transparent.
+/// Extreme splats that a file may contain: on the camera plane, with a zero quaternion, huge, or
+/// almost transparent.
 #[test]
 fn invalid_splats_stay_finite_in_training() {
     let gpu = test_gpu();
@@ -94,6 +125,14 @@ fn invalid_splats_stay_finite_in_training() {
         learned.sh.as_flattened(),
         &learned.opacity_logits,
     ];
-    assert!(numbers.into_iter().flatten().all(|number| number.is_finite()));
-    assert!(learned.means[20..] != arrays.means[20..], "the other splats are trained");
+    assert!(
+        numbers
+            .into_iter()
+            .flatten()
+            .all(|number| number.is_finite())
+    );
+    assert!(
+        learned.means[20..] != arrays.means[20..],
+        "the other splats are trained"
+    );
 }

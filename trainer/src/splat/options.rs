@@ -19,25 +19,28 @@ pub struct SplatOptions {
     pub dssim_frac: f64,
     /// Weight of the depth loss, per meter.
     pub depth_per_m: f64,
-    /// Maximum brightness of the background. It is random in every step, which keeps dark objects opaque. A value of
-    /// 1 costs 1 dB in the first few hundred steps, while large parts of the image are uncovered.
+    /// Maximum brightness of the background. It is random in every step, which keeps dark objects
+    /// opaque. A value of 1 costs 1 dB in the first few hundred steps, while large parts of the
+    /// image are uncovered.
     pub random_background: f64,
-    /// Determines the costs of opacity and size: `(cost_images / n_images)^2`, relative to the color loss. The fewer
-    /// images there are, the more each splat must reduce the color loss to persist. 0 disables the costs.
+    /// Determines the costs of opacity and size: `(cost_images / n_images)^2`, relative to the
+    /// color loss. The fewer images there are, the more each splat must reduce the color loss to
+    /// persist. 0 disables the costs.
     pub cost_images: f64,
     /// Growth at each change of the splat count, as a fraction of the count.
     pub growth_frac: f64,
-    /// Scale of the noise added to the means, relative to their learning rate. The noise is largest for transparent
-    /// splats.
+    /// Scale of the noise added to the means, relative to their learning rate. The noise is largest
+    /// for transparent splats.
     pub noise: f64,
-    /// Maximum fraction of the splats that a step leaves out at random. It is reached if there are few images, and zero
-    /// if there are many.
+    /// Maximum fraction of the splats that a step leaves out at random. It is reached if there are
+    /// few images, and zero if there are many.
     pub drop_frac: f64,
-    /// Steps at which training switches from a quarter to half of the resolution, and from half to the full
-    /// resolution. `None` selects a default for the adapter. It is higher on a CPU, where the duration of a step is
-    /// proportional to the number of pixels.
+    /// Steps at which training switches from a quarter to half of the resolution, and from half to
+    /// the full resolution. `None` selects a default for the adapter. It is higher on a CPU, where
+    /// the duration of a step is proportional to the number of pixels.
     pub coarse_steps: Option<[u64; 2]>,
-    /// Maximum number of splats added for one depth image. `None` selects a default, which is lower on a CPU.
+    /// Maximum number of splats added for one depth image. `None` selects a default, which is lower
+    /// on a CPU.
     pub seeds_per_image: Option<f64>,
     /// When parts of the model are tested.
     #[serde(default)]
@@ -69,7 +72,8 @@ impl Default for SplatOptions {
 }
 
 impl SplatOptions {
-    /// Bytes per splat: parameters, Adam's moments and the error sum. The higher SH coefficients share one moment.
+    /// Bytes per splat: parameters, Adam's moments and the error sum. The higher SH coefficients
+    /// share one moment.
     pub fn bytes_per_splat(&self) -> u64 {
         let n_floats = 12 + 3; // Means, rotations and shapes are padded to 4 each.
         4 * (3 * n_floats + u64::from(super::buffers::n_sh_rest(self.sh_degree)) + 1 + 1)
@@ -79,7 +83,13 @@ impl SplatOptions {
 impl ModelOptions<SplatOptions> {
     /// Maximum number of splats that satisfies both the limit on splats and the limit on bytes.
     pub(crate) fn cap(&self) -> u32 {
-        let by_bytes = self.common.max_bytes.map_or(u64::MAX, |bytes| bytes / self.specific.bytes_per_splat());
-        self.specific.max_splats.min(u32::try_from(by_bytes).unwrap_or(u32::MAX)).max(1)
+        let by_bytes = self
+            .common
+            .max_bytes
+            .map_or(u64::MAX, |bytes| bytes / self.specific.bytes_per_splat());
+        self.specific
+            .max_splats
+            .min(u32::try_from(by_bytes).unwrap_or(u32::MAX))
+            .max(1)
     }
 }

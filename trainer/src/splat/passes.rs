@@ -1,6 +1,8 @@
 //! The stages of drawing and training, as lists of passes.
 
-use super::buffers::{BLOCK, GROUP, ImageBuffers, Scratch, SplatBuffers, WINDOW_BINS, n_bins, n_tiles};
+use super::buffers::{
+    BLOCK, GROUP, ImageBuffers, Scratch, SplatBuffers, WINDOW_BINS, n_bins, n_tiles,
+};
 use super::kernels::{DrawPipelines, Ssim, TrainPipelines};
 use super::params::{Growth, TILE_PX};
 use crate::Error;
@@ -58,8 +60,8 @@ impl GrowthBuffers {
     }
 }
 
-/// Replaces dead splats with children of other splats and appends children up to `n_after`. The probability of a parent
-/// is proportional to its error.
+/// Replaces dead splats with children of other splats and appends children up to `n_after`. The
+/// probability of a parent is proportional to its error.
 pub(crate) fn grow(
     gpu: &Gpu,
     passes: &mut Passes,
@@ -121,8 +123,8 @@ pub(crate) fn grow(
     );
 }
 
-/// Number of workgroups of the kernels that import `rows_and_columns`. Each workgroup handles one color of two
-/// vertically adjacent tiles.
+/// Number of workgroups of the kernels that import `rows_and_columns`. Each workgroup handles one
+/// color of two vertically adjacent tiles.
 fn n_color_strips(size_px: [u32; 2]) -> u64 {
     3 * u64::from(size_px[0].div_ceil(TILE_PX)) * u64::from(size_px[1].div_ceil(2 * TILE_PX))
 }
@@ -131,11 +133,21 @@ impl ViewPasses<'_> {
     /// Projects, sorts, bins and rasterizes the splats. Needs no memory for gradients.
     pub(crate) fn draw(&self, passes: &mut Passes, pipelines: &DrawPipelines) {
         self.list(passes, pipelines, &self.scratch.capacity_for_drawing);
-        passes.dispatch(self.gpu, &pipelines.rasterize, u64::from(n_tiles(self.size_px)), &self.rasterized());
+        passes.dispatch(
+            self.gpu,
+            &pipelines.rasterize,
+            u64::from(n_tiles(self.size_px)),
+            &self.rasterized(),
+        );
     }
 
     /// [`ViewPasses::draw`], followed by [`ViewPasses::backward`].
-    pub(crate) fn draw_for_backward(&self, passes: &mut Passes, draw: &DrawPipelines, train: &TrainPipelines) {
+    pub(crate) fn draw_for_backward(
+        &self,
+        passes: &mut Passes,
+        draw: &DrawPipelines,
+        train: &TrainPipelines,
+    ) {
         self.list(passes, draw, &self.scratch.capacity);
         let mut buffers = self.rasterized();
         let rasterize = match &train.rasterize_segments {
@@ -145,7 +157,12 @@ impl ViewPasses<'_> {
             }
             None => &draw.rasterize,
         };
-        passes.dispatch(self.gpu, rasterize, u64::from(n_tiles(self.size_px)), &buffers);
+        passes.dispatch(
+            self.gpu,
+            rasterize,
+            u64::from(n_tiles(self.size_px)),
+            &buffers,
+        );
     }
 
     /// Buffers of shared/tile.wgsl, and the buffer `last`.
@@ -180,7 +197,15 @@ impl ViewPasses<'_> {
 
     /// Projects, sorts and bins the splats, if they fit into this capacity.
     fn list(&self, passes: &mut Passes, pipelines: &DrawPipelines, capacity: &Buffer) {
-        let Self { gpu, splats, scratch, status, view, size_px, .. } = *self;
+        let Self {
+            gpu,
+            splats,
+            scratch,
+            status,
+            view,
+            size_px,
+            ..
+        } = *self;
         let n_blocks = u64::from(splats.n_splats.div_ceil(BLOCK));
         let [view, model] = [("view", view), ("model", &splats.model)];
         passes.dispatch(
@@ -200,18 +225,37 @@ impl ViewPasses<'_> {
             .concat(),
         );
         if let Some(erased) = self.erased {
-            let (means, keys) = (("means", &splats.means), ("depth_keys", &scratch.by_depth.keys[0]));
-            passes.dispatch(gpu, &pipelines.erase, n_blocks, &[model, means, ("erased", erased), keys]);
+            let (means, keys) = (
+                ("means", &splats.means),
+                ("depth_keys", &scratch.by_depth.keys[0]),
+            );
+            passes.dispatch(
+                gpu,
+                &pipelines.erase,
+                n_blocks,
+                &[model, means, ("erased", erased), keys],
+            );
         }
         pipelines.sort.sort(gpu, passes, &scratch.by_depth, status);
         let by_depth = ("by_depth", &scratch.by_depth.values[0]);
         let n_windows = u64::from(n_bins(size_px).div_ceil(WINDOW_BINS));
-        let [projected_splats, tile_counts] =
-            [("projected_splats", &scratch.projected_splats), ("tile_counts", &scratch.tile_counts)];
-        let [bin_counts, group_counts] = [("bin_counts", &scratch.bin_counts), ("group_counts", &scratch.group_counts)];
-        let [bin_totals, bin_starts] = [("bin_totals", &scratch.bin_totals), ("bin_starts", &scratch.bin_starts)];
+        let [projected_splats, tile_counts] = [
+            ("projected_splats", &scratch.projected_splats),
+            ("tile_counts", &scratch.tile_counts),
+        ];
+        let [bin_counts, group_counts] = [
+            ("bin_counts", &scratch.bin_counts),
+            ("group_counts", &scratch.group_counts),
+        ];
+        let [bin_totals, bin_starts] = [
+            ("bin_totals", &scratch.bin_totals),
+            ("bin_starts", &scratch.bin_starts),
+        ];
         let [block_slots, status] = [("block_slots", &scratch.block_slots), ("status", status)];
-        let [touched, slot_offsets] = [("touched", &scratch.touched), ("slot_offsets", &scratch.slot_offsets)];
+        let [touched, slot_offsets] = [
+            ("touched", &scratch.touched),
+            ("slot_offsets", &scratch.slot_offsets),
+        ];
         let keys = ("depth_keys", &scratch.by_depth.keys[0]);
         let counted = [
             view,
@@ -227,9 +271,19 @@ impl ViewPasses<'_> {
         ];
         passes.dispatch(gpu, &pipelines.count_bins, n_blocks * n_windows, &counted);
         let n_groups = n_blocks.div_ceil(u64::from(GROUP));
-        passes.dispatch(gpu, &pipelines.sum_bins, n_groups * n_windows, &[view, model, bin_counts, group_counts]);
+        passes.dispatch(
+            gpu,
+            &pipelines.sum_bins,
+            n_groups * n_windows,
+            &[view, model, bin_counts, group_counts],
+        );
         let scanned = [view, model, group_counts, bin_totals];
-        passes.dispatch(gpu, &pipelines.scan_bins, u64::from(n_bins(size_px)), &scanned);
+        passes.dispatch(
+            gpu,
+            &pipelines.scan_bins,
+            u64::from(n_bins(size_px)),
+            &scanned,
+        );
         let allocated = [
             view,
             model,
@@ -259,11 +313,21 @@ impl ViewPasses<'_> {
         passes.dispatch(gpu, &pipelines.emit, n_blocks * n_windows, &emitted);
         let tile_bits = ("tile_bits", &scratch.tile_bits);
         let n_groups = u64::from(scratch.n_entries.div_ceil(512));
-        passes.dispatch(gpu, &pipelines.tile_bits, n_groups, &[status, entries, tile_bits]);
+        passes.dispatch(
+            gpu,
+            &pipelines.tile_bits,
+            n_groups,
+            &[status, entries, tile_bits],
+        );
     }
 
     /// Packs the picture for display.
-    pub(crate) fn finish(&self, passes: &mut Passes, pipelines: &DrawPipelines, supervision: &Buffer) {
+    pub(crate) fn finish(
+        &self,
+        passes: &mut Passes,
+        pipelines: &DrawPipelines,
+        supervision: &Buffer,
+    ) {
         let n_pixels = self.size_px[0] * self.size_px[1];
         passes.dispatch(
             self.gpu,
@@ -281,8 +345,19 @@ impl ViewPasses<'_> {
     }
 
     /// Compares the picture with its target and computes the gradient with respect to every pixel.
-    pub(crate) fn compare(&self, passes: &mut Passes, pipelines: &TrainPipelines, target: &Target<'_>) {
-        let Self { gpu, image_buffers, status, view, .. } = *self;
+    pub(crate) fn compare(
+        &self,
+        passes: &mut Passes,
+        pipelines: &TrainPipelines,
+        target: &Target<'_>,
+    ) {
+        let Self {
+            gpu,
+            image_buffers,
+            status,
+            view,
+            ..
+        } = *self;
         let n_groups = u64::from(n_tiles(self.size_px));
         let base = [
             ("view", view),
@@ -316,7 +391,11 @@ impl ViewPasses<'_> {
         ]);
         passes.dispatch(
             gpu,
-            if target.ssim { &pipelines.loss } else { &pipelines.loss_without_ssim },
+            if target.ssim {
+                &pipelines.loss
+            } else {
+                &pipelines.loss_without_ssim
+            },
             n_groups,
             &buffers,
         );
@@ -324,7 +403,12 @@ impl ViewPasses<'_> {
 
     /// Propagates the gradients from the pixels to the intersections.
     pub(crate) fn backward(&self, passes: &mut Passes, pipelines: &TrainPipelines) {
-        let Self { gpu, scratch, image_buffers, .. } = *self;
+        let Self {
+            gpu,
+            scratch,
+            image_buffers,
+            ..
+        } = *self;
         let n_tiles = u64::from(n_tiles(self.size_px));
         let mut buffers = self.lists().to_vec();
         buffers.extend([
@@ -341,9 +425,14 @@ impl ViewPasses<'_> {
         passes.dispatch(gpu, &pipelines.backward, n_groups, &buffers);
     }
 
-    /// Adds each splat's contribution to the picture to `contributions`. Requires a previous [`ViewPasses::backward`]
-    /// with an error of one at every pixel.
-    pub(crate) fn contribute(&self, passes: &mut Passes, pipelines: &TrainPipelines, contributions: &Buffer) {
+    /// Adds each splat's contribution to the picture to `contributions`. Requires a previous
+    /// [`ViewPasses::backward`] with an error of one at every pixel.
+    pub(crate) fn contribute(
+        &self,
+        passes: &mut Passes,
+        pipelines: &TrainPipelines,
+        contributions: &Buffer,
+    ) {
         let buffers = [
             ("model", &self.splats.model),
             ("status", self.status),
@@ -356,11 +445,27 @@ impl ViewPasses<'_> {
         passes.dispatch(self.gpu, &pipelines.contribute, n_blocks.into(), &buffers);
     }
 
-    /// Propagates the gradients from the intersections to the parameters and takes one optimizer step. Set `camera`
-    /// if the kernel `update` also sums the camera gradients.
-    pub(crate) fn update(&self, passes: &mut Passes, update: &Pipeline, rule: &Buffer, camera: bool) {
-        let Self { gpu, splats, scratch, status, view, .. } = *self;
-        let mut buffers = vec![("slot_begins", &scratch.slot_begins), ("gradients", &scratch.gradients)];
+    /// Propagates the gradients from the intersections to the parameters and takes one optimizer
+    /// step. Set `camera` if the kernel `update` also sums the camera gradients.
+    pub(crate) fn update(
+        &self,
+        passes: &mut Passes,
+        update: &Pipeline,
+        rule: &Buffer,
+        camera: bool,
+    ) {
+        let Self {
+            gpu,
+            splats,
+            scratch,
+            status,
+            view,
+            ..
+        } = *self;
+        let mut buffers = vec![
+            ("slot_begins", &scratch.slot_begins),
+            ("gradients", &scratch.gradients),
+        ];
         if camera {
             buffers.push(("camera_sums", &scratch.camera_sums));
         }
@@ -375,6 +480,11 @@ impl ViewPasses<'_> {
         ]);
         buffers.extend(splats.parameters());
         buffers.extend(splats.all_moments());
-        passes.dispatch(gpu, update, u64::from(splats.n_splats.div_ceil(BLOCK)), &buffers);
+        passes.dispatch(
+            gpu,
+            update,
+            u64::from(splats.n_splats.div_ceil(BLOCK)),
+            &buffers,
+        );
     }
 }

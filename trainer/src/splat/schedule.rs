@@ -1,4 +1,5 @@
-//! The training schedule: progress, and the steps at which the splat count and the SH degree change.
+//! The training schedule: progress, and the steps at which the splat count and the SH degree
+//! change.
 
 /// Steps between changes of the splat count.
 pub(crate) const GROWTH_PERIOD: u64 = 100;
@@ -25,18 +26,30 @@ pub(crate) struct Schedule {
 impl Schedule {
     /// The start of training.
     pub(super) fn new(n_planned_steps: u64) -> Self {
-        Self { step: 0, start: 0, last_growth_step: 0, n_planned_steps }
+        Self {
+            step: 0,
+            start: 0,
+            last_growth_step: 0,
+            n_planned_steps,
+        }
     }
 
-    /// Moves the planned steps forward when a keyframe arrives, so that at least half of them remain. This keeps the
-    /// learning rates large enough for the new keyframe and continues growth.
+    /// Moves the planned steps forward when a keyframe arrives, so that at least half of them
+    /// remain. This keeps the learning rates large enough for the new keyframe and continues
+    /// growth.
     pub(super) fn extend_for_arrival(&mut self) {
-        self.start = self.start.max(self.step.saturating_sub(self.n_planned_steps / 2));
+        self.start = self
+            .start
+            .max(self.step.saturating_sub(self.n_planned_steps / 2));
     }
 
     /// Step at which growth ends.
     fn growth_end(&self) -> u64 {
-        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a fraction of a u64")]
+        #[expect(
+            clippy::cast_possible_truncation,
+            clippy::cast_sign_loss,
+            reason = "a fraction of a u64"
+        )]
         let n_growth_steps = (GROWTH_END_FRAC * self.n_planned_steps as f64) as u64;
         (self.start + n_growth_steps).next_multiple_of(GROWTH_PERIOD) // Submits end at these steps.
     }
@@ -64,8 +77,9 @@ impl Schedule {
         u32::try_from((self.step / SH_PERIOD).min(MAX_SH_DEGREE)).expect("at most 3")
     }
 
-    /// Completed fraction of the planned steps at the last multiple of [`GROWTH_PERIOD`]. Values that are set once per
-    /// submit use this fraction, because the first step of a submit depends on timing.
+    /// Completed fraction of the planned steps at the last multiple of [`GROWTH_PERIOD`]. Values
+    /// that are set once per submit use this fraction, because the first step of a submit depends
+    /// on timing.
     pub(super) fn completed_frac(&self) -> f64 {
         let step = self.step - self.step % GROWTH_PERIOD;
         step.saturating_sub(self.start) as f64 / self.n_planned_steps.max(1) as f64
@@ -78,13 +92,32 @@ mod tests {
 
     #[test]
     fn progress_counts_from_the_start_in_whole_periods() {
-        let at = |step| Schedule { step, start: 1000, ..Schedule::new(4000) }.completed_frac();
-        assert_eq!([at(500), at(1000), at(1199), at(1200), at(5000)], [0.0, 0.0, 0.025, 0.05, 1.0]);
+        let at = |step| {
+            Schedule {
+                step,
+                start: 1000,
+                ..Schedule::new(4000)
+            }
+            .completed_frac()
+        };
+        assert_eq!(
+            [at(500), at(1000), at(1199), at(1200), at(5000)],
+            [0.0, 0.0, 0.025, 0.05, 1.0]
+        );
     }
 
     #[test]
     fn sh_degree_rises_to_three() {
-        let at = |step| Schedule { step, ..Schedule::new(4000) }.active_degree();
-        assert_eq!([0, 299, 300, 600, 899, 900, 5000].map(at), [0, 0, 1, 2, 2, 3, 3]);
+        let at = |step| {
+            Schedule {
+                step,
+                ..Schedule::new(4000)
+            }
+            .active_degree()
+        };
+        assert_eq!(
+            [0, 299, 300, 600, 899, 900, 5000].map(at),
+            [0, 0, 1, 2, 2, 3, 3]
+        );
     }
 }

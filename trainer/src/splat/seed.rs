@@ -1,5 +1,5 @@
-//! Initial splats: flat discs at depth readings, or balls at given points and a random cloud in the cameras' common field
-//! of view.
+//! Initial splats: flat discs at depth readings, or balls at given points and a random cloud in the
+//! cameras' common field of view.
 #![expect(
     clippy::cast_possible_truncation,
     reason = "pixels, cells and random draws are rounded down on purpose, within ranges that are checked"
@@ -65,25 +65,37 @@ impl Density {
     /// Distance between discs in pixels, a whole number.
     fn stride_px(self, size_px: [u32; 2]) -> f64 {
         let n_pixels = f64::from(size_px[0]) * f64::from(size_px[1]);
-        let n = self.max_discs.min((n_pixels / self.px_per_disc).max(MIN_DISCS));
+        let n = self
+            .max_discs
+            .min((n_pixels / self.px_per_disc).max(MIN_DISCS));
         (n_pixels / n).sqrt().round().max(1.0)
     }
 }
 
 impl Seeder {
-    /// Creates discs at depth readings that no disc of similar spacing covers yet. Ignores keyframes without depth.
+    /// Creates discs at depth readings that no disc of similar spacing covers yet. Ignores
+    /// keyframes without depth.
     ///
-    /// Keyframes are processed in batches. The keyframes of a batch propose discs in parallel, given the discs of all
-    /// earlier batches. Positions are then claimed sequentially, so the result does not depend on thread scheduling.
+    /// Keyframes are processed in batches. The keyframes of a batch propose discs in parallel,
+    /// given the discs of all earlier batches. Positions are then claimed sequentially, so the
+    /// result does not depend on thread scheduling.
     pub(crate) fn discs(&mut self, keyframes: &[Arc<Keyframe>], density: Density) -> SplatArrays {
         const BATCH: usize = 32;
         let mut seeds = Seeds::new();
         for batch in keyframes.chunks(BATCH) {
-            let candidate_discs: Vec<Vec<Disc>> =
-                batch.par_iter().map(|keyframe| self.candidate_discs(keyframe, density)).collect();
+            let candidate_discs: Vec<Vec<Disc>> = batch
+                .par_iter()
+                .map(|keyframe| self.candidate_discs(keyframe, density))
+                .collect();
             for disc in candidate_discs.into_iter().flatten() {
                 if self.claim(&disc.position, disc.spacing_m) {
-                    seeds.push(&disc.position, &disc.normal, disc.size_m, SEED_OPACITY, disc.color);
+                    seeds.push(
+                        &disc.position,
+                        &disc.normal,
+                        disc.size_m,
+                        SEED_OPACITY,
+                        disc.color,
+                    );
                 }
             }
         }
@@ -92,7 +104,9 @@ impl Seeder {
 
     /// Proposes discs at the unoccupied positions of a keyframe.
     fn candidate_discs(&self, keyframe: &Keyframe, density: Density) -> Vec<Disc> {
-        let Some(depth) = &keyframe.depth else { return Vec::new() };
+        let Some(depth) = &keyframe.depth else {
+            return Vec::new();
+        };
         let mut discs = Vec::new();
         let [width, height] = depth.size_px;
         let stride = density.stride_px(depth.size_px) as u32;
@@ -100,11 +114,24 @@ impl Seeder {
         for y in (stride / 2..height).step_by(stride as usize) {
             for x in (stride / 2..width).step_by(stride as usize) {
                 let z = at(x, y);
-                if !(z > 0.0 && z <= FAR_M) || x < stride || y < stride || x + stride >= width || y + stride >= height {
+                if !(z > 0.0 && z <= FAR_M)
+                    || x < stride
+                    || y < stride
+                    || x + stride >= width
+                    || y + stride >= height
+                {
                     continue;
                 }
-                let neighbors = [at(x - stride, y), at(x + stride, y), at(x, y - stride), at(x, y + stride)];
-                if neighbors.iter().any(|near| (near - z).abs() > EDGE_FRAC * z && *near > 0.0) {
+                let neighbors = [
+                    at(x - stride, y),
+                    at(x + stride, y),
+                    at(x, y - stride),
+                    at(x, y + stride),
+                ];
+                if neighbors
+                    .iter()
+                    .any(|near| (near - z).abs() > EDGE_FRAC * z && *near > 0.0)
+                {
                     continue;
                 }
                 let here = depth.point(x, y, z);
@@ -113,26 +140,45 @@ impl Seeder {
                 if self.is_occupied(&position, spacing_m) {
                     continue;
                 }
-                let Some(color) = color_at(keyframe, &position) else { continue };
+                let Some(color) = color_at(keyframe, &position) else {
+                    continue;
+                };
                 let filled = |near: f64| if near > 0.0 { near } else { z };
-                let across =
-                    depth.point(x + stride, y, filled(neighbors[1])) - depth.point(x - stride, y, filled(neighbors[0]));
-                let down =
-                    depth.point(x, y + stride, filled(neighbors[3])) - depth.point(x, y - stride, filled(neighbors[2]));
-                let normal = across.cross(&down).try_normalize(1e-12).unwrap_or_else(Vector3::z);
+                let across = depth.point(x + stride, y, filled(neighbors[1]))
+                    - depth.point(x - stride, y, filled(neighbors[0]));
+                let down = depth.point(x, y + stride, filled(neighbors[3]))
+                    - depth.point(x, y - stride, filled(neighbors[2]));
+                let normal = across
+                    .cross(&down)
+                    .try_normalize(1e-12)
+                    .unwrap_or_else(Vector3::z);
                 // On an oblique surface, the grid points are farther apart.
                 let slant = (normal.dot(&here.normalize()).abs()).max(0.3);
-                let size_m =
-                    [SPREAD * spacing_m / slant.sqrt(), SPREAD * spacing_m / slant.sqrt(), THICKNESS * spacing_m];
-                discs.push(Disc { position, spacing_m, normal: depth.world_from_camera * normal, size_m, color });
+                let size_m = [
+                    SPREAD * spacing_m / slant.sqrt(),
+                    SPREAD * spacing_m / slant.sqrt(),
+                    THICKNESS * spacing_m,
+                ];
+                discs.push(Disc {
+                    position,
+                    spacing_m,
+                    normal: depth.world_from_camera * normal,
+                    size_m,
+                    color,
+                });
             }
         }
         discs
     }
 
-    /// Creates discs for the uncovered parts of a keyframe without depth. Their depths come from the nearest discs in
-    /// the image, or are `default_m` if there are none.
-    pub(crate) fn discs_without_depth(&mut self, keyframe: &Keyframe, density: Density, default_m: f64) -> SplatArrays {
+    /// Creates discs for the uncovered parts of a keyframe without depth. Their depths come from
+    /// the nearest discs in the image, or are `default_m` if there are none.
+    pub(crate) fn discs_without_depth(
+        &mut self,
+        keyframe: &Keyframe,
+        density: Density,
+        default_m: f64,
+    ) -> SplatArrays {
         let mut seeds = Seeds::new();
         let [width, height] = keyframe.size_px.map(f64::from);
         let stride = density.stride_px(keyframe.size_px);
@@ -142,10 +188,13 @@ impl Seeder {
         for position in &self.positions {
             let point = camera_from_world * position;
             let cell = [0, 1].map(|axis| {
-                let px = keyframe.focal_px[axis] * point[axis] / point.z + keyframe.principal_px[axis];
+                let px =
+                    keyframe.focal_px[axis] * point[axis] / point.z + keyframe.principal_px[axis];
                 (px / stride).floor()
             });
-            if point.z > 0.0 && (0..2).all(|axis| cell[axis] >= 0.0 && cell[axis] < n_cells[axis] as f64) {
+            if point.z > 0.0
+                && (0..2).all(|axis| cell[axis] >= 0.0 && cell[axis] < n_cells[axis] as f64)
+            {
                 inverse_depths.set_nearest([cell[0] as usize, cell[1] as usize], 1.0 / point.z);
             }
         }
@@ -157,15 +206,23 @@ impl Seeder {
                 }
                 let px = [(column as f64 + 0.5) * stride, (row as f64 + 0.5) * stride];
                 let z = 1.0 / filled[row * n_cells[0] + column];
-                let ray = [0, 1].map(|axis| (px[axis] - keyframe.principal_px[axis]) / keyframe.focal_px[axis]);
-                let position = keyframe.world_from_camera * Point3::from(Vector3::new(ray[0], ray[1], 1.0) * z);
-                let Some(color) = color_at(keyframe, &position) else { continue };
+                let ray = [0, 1]
+                    .map(|axis| (px[axis] - keyframe.principal_px[axis]) / keyframe.focal_px[axis]);
+                let position = keyframe.world_from_camera
+                    * Point3::from(Vector3::new(ray[0], ray[1], 1.0) * z);
+                let Some(color) = color_at(keyframe, &position) else {
+                    continue;
+                };
                 let spacing_m = stride * z / keyframe.focal_px[0];
                 if !self.claim(&position, spacing_m) {
                     continue;
                 }
                 let towards = keyframe.world_from_camera.translation.vector - position.coords;
-                let size = [SPREAD * spacing_m, SPREAD * spacing_m, THICKNESS * spacing_m];
+                let size = [
+                    SPREAD * spacing_m,
+                    SPREAD * spacing_m,
+                    THICKNESS * spacing_m,
+                ];
                 seeds.push(&position, &towards.normalize(), size, SEED_OPACITY, color);
             }
         }
@@ -184,23 +241,47 @@ impl Seeder {
 
     /// Copies the state for a checkpoint.
     pub(crate) fn snapshot(&self) -> SeedSnapshot {
-        SeedSnapshot { positions: self.positions.clone(), cells: self.occupied_cells.iter().copied().collect() }
+        SeedSnapshot {
+            positions: self.positions.clone(),
+            cells: self.occupied_cells.iter().copied().collect(),
+        }
     }
 
-    /// Restores the state from the output of [`SeedSnapshot::into_bytes`]. Ignores incomplete positions and cells.
+    /// Restores the state from the output of [`SeedSnapshot::into_bytes`]. Ignores incomplete
+    /// positions and cells.
     pub(crate) fn from_bytes(positions: &[u8], cells: &[u8]) -> Self {
-        let positions = positions.as_chunks::<8>().0.iter().map(|bytes| f64::from_le_bytes(*bytes));
-        let cells = cells.as_chunks::<4>().0.iter().map(|bytes| i32::from_le_bytes(*bytes));
+        let positions = positions
+            .as_chunks::<8>()
+            .0
+            .iter()
+            .map(|bytes| f64::from_le_bytes(*bytes));
+        let cells = cells
+            .as_chunks::<4>()
+            .0
+            .iter()
+            .map(|bytes| i32::from_le_bytes(*bytes));
         let (positions, cells) = (positions.collect::<Vec<_>>(), cells.collect::<Vec<_>>());
         Self {
-            occupied_cells: cells.as_chunks().0.iter().map(|[octave, x, y, z]| (*octave, [*x, *y, *z])).collect(),
-            positions: positions.as_chunks().0.iter().map(|[x, y, z]| Point3::new(*x, *y, *z)).collect(),
+            occupied_cells: cells
+                .as_chunks()
+                .0
+                .iter()
+                .map(|[octave, x, y, z]| (*octave, [*x, *y, *z]))
+                .collect(),
+            positions: positions
+                .as_chunks()
+                .0
+                .iter()
+                .map(|[x, y, z]| Point3::new(*x, *y, *z))
+                .collect(),
         }
     }
 
     fn is_occupied(&self, position: &Point3<f64>, spacing_m: f64) -> bool {
         let octave = octave_of(spacing_m);
-        [octave - 1, octave, octave + 1].iter().any(|octave| self.occupied_cells.contains(&cell_of(position, *octave)))
+        [octave - 1, octave, octave + 1]
+            .iter()
+            .any(|octave| self.occupied_cells.contains(&cell_of(position, *octave)))
     }
 
     fn claim(&mut self, position: &Point3<f64>, spacing_m: f64) -> bool {
@@ -208,7 +289,8 @@ impl Seeder {
             return false;
         }
         self.positions.push(*position);
-        self.occupied_cells.insert(cell_of(position, octave_of(spacing_m)))
+        self.occupied_cells
+            .insert(cell_of(position, octave_of(spacing_m)))
     }
 }
 
@@ -217,7 +299,10 @@ fn octave_of(spacing_m: f64) -> i32 {
 }
 
 fn cell_of(position: &Point3<f64>, octave: i32) -> (i32, [i32; 3]) {
-    (octave, std::array::from_fn(|axis| (position[axis] / 2f64.powi(octave)).floor() as i32))
+    (
+        octave,
+        std::array::from_fn(|axis| (position[axis] / 2f64.powi(octave)).floor() as i32),
+    )
 }
 
 /// The state of a [`Seeder`] for a checkpoint.
@@ -227,13 +312,20 @@ pub(crate) struct SeedSnapshot {
 }
 
 impl SeedSnapshot {
-    /// Returns the positions (x, y, z as f64) in seeding order, and the cells (octave, x, y, z as i32) in ascending
-    /// order.
+    /// Returns the positions (x, y, z as f64) in seeding order, and the cells (octave, x, y, z as
+    /// i32) in ascending order.
     pub(crate) fn into_bytes(mut self) -> (Vec<u8>, Vec<u8>) {
         self.cells.sort_unstable();
-        let positions =
-            self.positions.iter().flat_map(|position| [position.x, position.y, position.z]).flat_map(f64::to_le_bytes);
-        let cells = self.cells.iter().flat_map(|(octave, [x, y, z])| [*octave, *x, *y, *z]).flat_map(i32::to_le_bytes);
+        let positions = self
+            .positions
+            .iter()
+            .flat_map(|position| [position.x, position.y, position.z])
+            .flat_map(f64::to_le_bytes);
+        let cells = self
+            .cells
+            .iter()
+            .flat_map(|(octave, [x, y, z])| [*octave, *x, *y, *z])
+            .flat_map(i32::to_le_bytes);
         (positions.collect(), cells.collect())
     }
 }
@@ -246,7 +338,10 @@ struct InverseDepths {
 
 impl InverseDepths {
     fn new(n_cells: [usize; 2]) -> Self {
-        Self { n_cells, per_m: vec![0.0; n_cells[0] * n_cells[1]] }
+        Self {
+            n_cells,
+            per_m: vec![0.0; n_cells[0] * n_cells[1]],
+        }
     }
 
     /// Sets a cell's inverse depth unless a nearer one is known.
@@ -260,48 +355,81 @@ impl InverseDepths {
         let rows = row.saturating_sub(1)..(row + 2).min(self.n_cells[1]);
         rows.into_iter().any(|row| {
             let columns = column.saturating_sub(1)..(column + 2).min(self.n_cells[0]);
-            self.per_m[row * self.n_cells[0]..][columns].iter().any(|per_m| *per_m > 0.0)
+            self.per_m[row * self.n_cells[0]..][columns]
+                .iter()
+                .any(|per_m| *per_m > 0.0)
         })
     }
 
-    /// Fills each unknown cell with a mean of known cells. The mean is over the smallest enclosing square (2, 4, 8, ...
-    /// cells wide) that contains a known cell.
+    /// Fills each unknown cell with a mean of known cells. The mean is over the smallest enclosing
+    /// square (2, 4, 8, ... cells wide) that contains a known cell.
     fn filled(&self, default_per_m: f64) -> Vec<f64> {
         let [width, height] = self.n_cells;
         if width * height <= 1 {
-            return self.per_m.iter().map(|per_m| if *per_m > 0.0 { *per_m } else { default_per_m }).collect();
+            return self
+                .per_m
+                .iter()
+                .map(|per_m| if *per_m > 0.0 { *per_m } else { default_per_m })
+                .collect();
         }
         let mut coarse = Self::new([width.div_ceil(2), height.div_ceil(2)]);
         for (ix, mean) in coarse.per_m.iter_mut().enumerate() {
             let [column, row] = [2 * (ix % coarse.n_cells[0]), 2 * (ix / coarse.n_cells[0])];
-            let square = (row..(row + 2).min(height))
-                .flat_map(|row| (column..(column + 2).min(width)).map(move |column| row * width + column));
-            let known: Vec<f64> = square.map(|at| self.per_m[at]).filter(|per_m| *per_m > 0.0).collect();
+            let square = (row..(row + 2).min(height)).flat_map(|row| {
+                (column..(column + 2).min(width)).map(move |column| row * width + column)
+            });
+            let known: Vec<f64> = square
+                .map(|at| self.per_m[at])
+                .filter(|per_m| *per_m > 0.0)
+                .collect();
             *mean = known.iter().sum::<f64>() / known.len().max(1) as f64;
         }
         let neighbors = coarse.filled(default_per_m);
         let of_coarse = |ix: usize| neighbors[ix / width / 2 * coarse.n_cells[0] + ix % width / 2];
-        self.per_m.iter().enumerate().map(|(ix, per_m)| if *per_m > 0.0 { *per_m } else { of_coarse(ix) }).collect()
+        self.per_m
+            .iter()
+            .enumerate()
+            .map(|(ix, per_m)| if *per_m > 0.0 { *per_m } else { of_coarse(ix) })
+            .collect()
     }
 }
 
-/// Creates balls at given points. Their standard deviation is the mean distance to the three nearest points (Kerbl et al.
-/// 2023, section 5.1). Of more than `n_max` points, those at regular intervals of the list are used. Points without a color
-/// get the color of the first keyframe that shows them.
+/// Creates balls at given points. Their standard deviation is the mean distance to the three
+/// nearest points (Kerbl et al. 2023, section 5.1). Of more than `n_max` points, those at regular
+/// intervals of the list are used. Points without a color get the color of the first keyframe that
+/// shows them.
 pub(crate) fn balls(points: &InitialPoints, keyframes: &[&Keyframe], n_max: usize) -> SplatArrays {
     // Of several points at one position, the first is used: a distance of zero is no size.
     let mut seen = HashSet::new();
     let is_first = |ix: &usize| seen.insert(points.points_in_world_m[*ix].map(f32::to_bits));
-    let distinct: Vec<usize> = (0..points.points_in_world_m.len()).filter(is_first).collect();
+    let distinct: Vec<usize> = (0..points.points_in_world_m.len())
+        .filter(is_first)
+        .collect();
     let n = distinct.len().min(n_max);
     let chosen: Vec<usize> = (0..n).map(|ix| distinct[ix * distinct.len() / n]).collect();
-    let positions: Vec<[f32; 3]> = chosen.iter().map(|ix| points.points_in_world_m[*ix]).collect();
-    let colors: Vec<[f64; 3]> = chosen.par_iter().map(|ix| color_of_point(points, *ix, keyframes)).collect();
+    let positions: Vec<[f32; 3]> = chosen
+        .iter()
+        .map(|ix| points.points_in_world_m[*ix])
+        .collect();
+    let colors: Vec<[f64; 3]> = chosen
+        .par_iter()
+        .map(|ix| color_of_point(points, *ix, keyframes))
+        .collect();
     let mut seeds = Seeds::new();
-    for ((position, color), spacing_m) in positions.iter().zip(colors).zip(mean_spacings_m(&positions)) {
+    for ((position, color), spacing_m) in positions
+        .iter()
+        .zip(colors)
+        .zip(mean_spacings_m(&positions))
+    {
         let Some(spacing_m) = spacing_m else { continue };
         let position = Point3::from(position.map(f64::from));
-        seeds.push(&position, &Vector3::z(), [spacing_m; 3], POINT_OPACITY, color);
+        seeds.push(
+            &position,
+            &Vector3::z(),
+            [spacing_m; 3],
+            POINT_OPACITY,
+            color,
+        );
     }
     seeds.arrays
 }
@@ -312,7 +440,10 @@ fn color_of_point(points: &InitialPoints, ix: usize, keyframes: &[&Keyframe]) ->
         return color.map(|channel| f64::from(channel) / 255.0);
     }
     let position = Point3::from(points.points_in_world_m[ix].map(f64::from));
-    keyframes.iter().find_map(|keyframe| color_at(keyframe, &position)).unwrap_or(GRAY)
+    keyframes
+        .iter()
+        .find_map(|keyframe| color_at(keyframe, &position))
+        .unwrap_or(GRAY)
 }
 
 /// Creates a random cloud along the rays of all keyframes, densest around their common focus.
@@ -322,15 +453,22 @@ pub(crate) fn random_cloud(keyframes: &[&Keyframe], seed: u64, n_max: usize) -> 
     let mut random = Random::new(seed ^ 0x5eed_5eed);
     let n = N_RANDOM.min(n_max);
     for _ in 0..n {
-        let keyframe = keyframes[((random.unit() * keyframes.len() as f64) as usize).min(keyframes.len() - 1)];
+        let keyframe =
+            keyframes[((random.unit() * keyframes.len() as f64) as usize).min(keyframes.len() - 1)];
         let [width, height] = keyframe.size_px;
         let x = ((random.unit() * f64::from(width)) as u32).min(width - 1);
         let y = ((random.unit() * f64::from(height)) as u32).min(height - 1);
         let camera = keyframe.world_from_camera.translation.vector;
         let distance_m = (focus - camera).norm().max(1e-3);
-        // Depths range from a third to three times the distance. Beyond the focus, they are uniform in inverse depth.
+        // Depths range from a third to three times the distance. Beyond the focus, they are uniform
+        // in inverse depth.
         let share = random.unit();
-        let z = distance_m * if share < 0.5 { 0.35 + 1.3 * share } else { 1.0 / (1.0 - 0.66 * (2.0 * share - 1.0)) };
+        let z = distance_m
+            * if share < 0.5 {
+                0.35 + 1.3 * share
+            } else {
+                1.0 / (1.0 - 0.66 * (2.0 * share - 1.0))
+            };
         let ray = Vector3::new(
             (f64::from(x) + 0.5 - keyframe.principal_px[0]) / keyframe.focal_px[0],
             (f64::from(y) + 0.5 - keyframe.principal_px[1]) / keyframe.focal_px[1],
@@ -342,7 +480,8 @@ pub(crate) fn random_cloud(keyframes: &[&Keyframe], seed: u64, n_max: usize) -> 
             continue;
         }
         let position = keyframe.world_from_camera * Point3::from(ray * z);
-        let spacing_px = (f64::from(width) * f64::from(height) * keyframes.len() as f64 / n as f64).sqrt();
+        let spacing_px =
+            (f64::from(width) * f64::from(height) * keyframes.len() as f64 / n as f64).sqrt();
         let size = 0.3 * spacing_px * z / keyframe.focal_px[0];
         let color = [0, 1, 2].map(|channel| f64::from(rgb[channel]) / 255.0);
         seeds.push(&position, &Vector3::z(), [size; 3], RANDOM_OPACITY, color);
@@ -361,19 +500,26 @@ pub(crate) fn common_focus(keyframes: &[&Keyframe]) -> Vector3<f64> {
         normal_matrix += across;
         rhs += across * camera;
     }
-    normal_matrix.lu().solve(&rhs).unwrap_or_else(Vector3::zeros)
+    normal_matrix
+        .lu()
+        .solve(&rhs)
+        .unwrap_or_else(Vector3::zeros)
 }
 
-/// Color of the keyframe at the projection of `position`; `None` outside the image and in masked areas.
+/// Color of the keyframe at the projection of `position`; `None` outside the image and in masked
+/// areas.
 fn color_at(keyframe: &Keyframe, position: &Point3<f64>) -> Option<[f64; 3]> {
     let point = keyframe.world_from_camera.inverse() * position;
     if point.z <= 0.0 {
         return None;
     }
-    let pixel =
-        [0, 1].map(|axis| (keyframe.focal_px[axis] * point[axis] / point.z + keyframe.principal_px[axis]).floor());
-    let inside = (0..2).all(|axis| pixel[axis] >= 0.0 && pixel[axis] < f64::from(keyframe.size_px[axis]));
-    let at = inside.then(|| 4 * (pixel[1] as usize * keyframe.size_px[0] as usize + pixel[0] as usize))?;
+    let pixel = [0, 1].map(|axis| {
+        (keyframe.focal_px[axis] * point[axis] / point.z + keyframe.principal_px[axis]).floor()
+    });
+    let inside =
+        (0..2).all(|axis| pixel[axis] >= 0.0 && pixel[axis] < f64::from(keyframe.size_px[axis]));
+    let at = inside
+        .then(|| 4 * (pixel[1] as usize * keyframe.size_px[0] as usize + pixel[0] as usize))?;
     let rgba = &keyframe.rgba_srgb[at..at + 4];
     (rgba[3] > 0).then(|| [0, 1, 2].map(|channel| f64::from(rgba[channel]) / 255.0))
 }
@@ -385,19 +531,41 @@ struct Seeds {
 impl Seeds {
     /// Creates an empty list of splats with view-independent colors.
     fn new() -> Self {
-        Self { arrays: SplatArrays { sh_degree: 0, ..SplatArrays::default() } }
+        Self {
+            arrays: SplatArrays {
+                sh_degree: 0,
+                ..SplatArrays::default()
+            },
+        }
     }
 
-    fn push(&mut self, position: &Point3<f64>, normal: &Vector3<f64>, size_m: [f64; 3], opacity: f64, color: [f64; 3]) {
-        let rotation_matrix = Rotation3::rotation_between(&Vector3::z(), normal)
-            .unwrap_or_else(|| Rotation3::from_axis_angle(&Vector3::x_axis(), std::f64::consts::PI));
+    fn push(
+        &mut self,
+        position: &Point3<f64>,
+        normal: &Vector3<f64>,
+        size_m: [f64; 3],
+        opacity: f64,
+        color: [f64; 3],
+    ) {
+        let rotation_matrix =
+            Rotation3::rotation_between(&Vector3::z(), normal).unwrap_or_else(|| {
+                Rotation3::from_axis_angle(&Vector3::x_axis(), std::f64::consts::PI)
+            });
         let rotation = UnitQuaternion::from_rotation_matrix(&rotation_matrix);
         let arrays = &mut self.arrays;
         arrays.means.push(f32s_of(position.coords.into()));
-        arrays.log_scales.push(f32s_of(size_m.map(|size| size.max(1e-7).ln())));
-        arrays.rotations_wxyz.push(f32s_of([rotation.w, rotation.i, rotation.j, rotation.k]));
-        arrays.opacity_logits.push(f32_of((opacity / (1.0 - opacity)).ln()));
-        arrays.sh.push(f32s_of(color.map(|value| (value - 0.5) / SH_0)));
+        arrays
+            .log_scales
+            .push(f32s_of(size_m.map(|size| size.max(1e-7).ln())));
+        arrays
+            .rotations_wxyz
+            .push(f32s_of([rotation.w, rotation.i, rotation.j, rotation.k]));
+        arrays
+            .opacity_logits
+            .push(f32_of((opacity / (1.0 - opacity)).ln()));
+        arrays
+            .sh
+            .push(f32s_of(color.map(|value| (value - 0.5) / SH_0)));
     }
 }
 
@@ -408,7 +576,10 @@ mod tests {
     use kinematics::{Stamp, Transform};
 
     const WALL_M: f64 = 2.0;
-    const DENSE: Density = Density { max_discs: 2000.0, px_per_disc: 1.0 };
+    const DENSE: Density = Density {
+        max_discs: 2000.0,
+        px_per_disc: 1.0,
+    };
 
     /// A keyframe that shows a white wall. The principal point is at the center of the image.
     fn wall_keyframe(size_px: [u32; 2], with_depth: bool) -> Keyframe {
@@ -416,7 +587,13 @@ mod tests {
         let n = (size_px[0] * size_px[1]) as usize;
         let world_from_camera = Transform::identity();
         let depth_m = vec![f32_of(WALL_M); n].into();
-        let depth = DepthMap { size_px, focal_px: [100.0; 2], principal_px, depth_m, world_from_camera };
+        let depth = DepthMap {
+            size_px,
+            focal_px: [100.0; 2],
+            principal_px,
+            depth_m,
+            world_from_camera,
+        };
         Keyframe {
             camera: "test".into(),
             stamp: Stamp(0),
@@ -438,18 +615,45 @@ mod tests {
     #[test]
     fn balls_have_the_positions_and_colors_of_their_points() {
         let points = InitialPoints {
-            points_in_world_m: vec![[0.0; 3], [3.0, 0.0, 0.0], [0.0, 4.0, 0.0], [3.0, 4.0, 0.0], [0.0; 3]],
+            points_in_world_m: vec![
+                [0.0; 3],
+                [3.0, 0.0, 0.0],
+                [0.0, 4.0, 0.0],
+                [3.0, 4.0, 0.0],
+                [0.0; 3],
+            ],
             colors_srgb: vec![[255, 0, 51], [0; 3], [1; 3], [2; 3], [3; 3]],
         };
         let seeds = balls(&points, &[], 10);
-        assert_eq!(seeds.means, points.points_in_world_m[..4], "a repeated position is used once");
+        assert_eq!(
+            seeds.means,
+            points.points_in_world_m[..4],
+            "a repeated position is used once"
+        );
         let color = seeds.sh[0].map(|coefficient| SH_0 * f64::from(coefficient) + 0.5);
-        assert!((0..3).all(|ix| (color[ix] - [1.0, 0.0, 0.2][ix]).abs() < 1e-6), "{color:?}");
+        assert!(
+            (0..3).all(|ix| (color[ix] - [1.0, 0.0, 0.2][ix]).abs() < 1e-6),
+            "{color:?}"
+        );
         let size_m = (3.0 + 4.0 + 5.0) / 3.0;
-        assert!(seeds.log_scales.as_flattened().iter().all(|log_scale| (log_scale.exp() - size_m).abs() < 1e-5));
+        assert!(
+            seeds
+                .log_scales
+                .as_flattened()
+                .iter()
+                .all(|log_scale| (log_scale.exp() - size_m).abs() < 1e-5)
+        );
         assert!((0..4).all(|ix| (seeds.opacity(ix) - POINT_OPACITY).abs() < 1e-6));
-        assert_eq!(balls(&points, &[], 2).means, [[0.0; 3], [0.0, 4.0, 0.0]], "every second one");
-        assert_eq!(balls(&points, &[], 1).n_splats(), 0, "a single point has no size");
+        assert_eq!(
+            balls(&points, &[], 2).means,
+            [[0.0; 3], [0.0, 4.0, 0.0]],
+            "every second one"
+        );
+        assert_eq!(
+            balls(&points, &[], 1).n_splats(),
+            0,
+            "a single point has no size"
+        );
         assert_eq!(balls(&InitialPoints::default(), &[], 10).n_splats(), 0);
         seeds.checked().unwrap();
     }
@@ -457,27 +661,42 @@ mod tests {
     #[test]
     fn points_without_colors_get_those_of_keyframes() {
         let mut keyframe = wall_keyframe([100, 80], false);
-        let half_red = |ix: usize| if ix % 100 < 50 { [255, 0, 0, 255] } else { [0, 0, 255, 255] };
+        let half_red = |ix: usize| {
+            if ix % 100 < 50 {
+                [255, 0, 0, 255]
+            } else {
+                [0, 0, 255, 255]
+            }
+        };
         keyframe.rgba_srgb = (0..8000).flat_map(half_red).collect();
         let points = InitialPoints {
             points_in_world_m: vec![[-0.5, 0.0, 2.0], [0.5, 0.0, 2.0], [0.0, 0.0, -2.0]],
             colors_srgb: Vec::new(),
         };
         let seeds = balls(&points, &[&keyframe], 10);
-        for (ix, expected) in [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.5; 3]].into_iter().enumerate() {
+        for (ix, expected) in [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.5; 3]]
+            .into_iter()
+            .enumerate()
+        {
             let color = seeds.sh[ix].map(|coefficient| SH_0 * f64::from(coefficient) + 0.5);
-            assert!((0..3).all(|channel| (color[channel] - expected[channel]).abs() < 1e-6), "{ix}: {color:?}");
+            assert!(
+                (0..3).all(|channel| (color[channel] - expected[channel]).abs() < 1e-6),
+                "{ix}: {color:?}"
+            );
         }
     }
 
     #[test]
     fn batch_and_single_seeding_agree() {
-        let keyframes: Vec<Arc<Keyframe>> =
-            (0..40).map(|ix| Arc::new(wall_keyframe([100 + 8 * (ix % 7), 80 + 4 * (ix % 5)], true))).collect();
+        let keyframes: Vec<Arc<Keyframe>> = (0..40)
+            .map(|ix| Arc::new(wall_keyframe([100 + 8 * (ix % 7), 80 + 4 * (ix % 5)], true)))
+            .collect();
         let at_once = Seeder::default().discs(&keyframes, DENSE);
         let mut seeder = Seeder::default();
-        let one_by_one: Vec<[f32; 3]> =
-            keyframes.iter().flat_map(|keyframe| seeder.discs(std::slice::from_ref(keyframe), DENSE).means).collect();
+        let one_by_one: Vec<[f32; 3]> = keyframes
+            .iter()
+            .flat_map(|keyframe| seeder.discs(std::slice::from_ref(keyframe), DENSE).means)
+            .collect();
         assert!(at_once.means.len() > 1500, "{} discs", at_once.means.len());
         assert_eq!(at_once.means, one_by_one);
     }
@@ -489,15 +708,42 @@ mod tests {
         let discs = seeder.discs(&[Arc::new(near)], DENSE);
         assert!(discs.means.len() > 1000);
         let wide = wall_keyframe([200, 80], false);
-        let new_discs = seeder.discs_without_depth(&wide, Density { max_discs: 4000.0, px_per_disc: 1.0 }, 7.0);
+        let new_discs = seeder.discs_without_depth(
+            &wide,
+            Density {
+                max_discs: 4000.0,
+                px_per_disc: 1.0,
+            },
+            7.0,
+        );
         // Half of the wide image is uncovered. One or two cells at the border count as covered.
-        assert!((1500..=2100).contains(&new_discs.means.len()), "{} discs", new_discs.means.len());
+        assert!(
+            (1500..=2100).contains(&new_discs.means.len()),
+            "{} discs",
+            new_discs.means.len()
+        );
         for mean in &new_discs.means {
-            assert!((f64::from(mean[2]) - WALL_M).abs() < 1e-3, "expected at the depth of the wall: {mean:?}");
-            assert!(f64::from(mean[0]).abs() > 0.9, "expected outside the view of the camera with depth: {mean:?}");
+            assert!(
+                (f64::from(mean[2]) - WALL_M).abs() < 1e-3,
+                "expected at the depth of the wall: {mean:?}"
+            );
+            assert!(
+                f64::from(mean[0]).abs() > 0.9,
+                "expected outside the view of the camera with depth: {mean:?}"
+            );
         }
         assert!(
-            seeder.discs_without_depth(&wide, Density { max_discs: 4000.0, px_per_disc: 1.0 }, 7.0).means.is_empty(),
+            seeder
+                .discs_without_depth(
+                    &wide,
+                    Density {
+                        max_discs: 4000.0,
+                        px_per_disc: 1.0
+                    },
+                    7.0
+                )
+                .means
+                .is_empty(),
             "a second pass finds no uncovered area"
         );
     }
@@ -506,7 +752,10 @@ mod tests {
     fn discs_without_neighbors_lie_at_the_default_depth() {
         let discs = Seeder::default().discs_without_depth(
             &wall_keyframe([40, 40], false),
-            Density { max_discs: 100.0, px_per_disc: 1.0 },
+            Density {
+                max_discs: 100.0,
+                px_per_disc: 1.0,
+            },
             7.0,
         );
         assert_eq!(discs.means.len(), 100);

@@ -28,6 +28,10 @@ pub(crate) struct ObservedScene {
 
 impl Default for ObservedScene {
     fn default() -> Self {
-        Self { seeder: Seeder::default(), size_m: 1.0, has_depth: false }
+        Self {
+            seeder: Seeder::default(),
+            size_m: 1.0,
+            has_depth: false,
+        }
     }
 }

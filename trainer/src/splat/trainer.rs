@@ -43,8 +43,8 @@ use crate::model_metadata::{METADATA_FILE, read_metadata};
 use crate::model_options::{MethodOptions, ModelOptions};
 use crate::packing::{Format, Output};
 use crate::{
-    Bounds, Error, InitialPoints, Method, Packing, Picture, Progress, Projection, QueuedPicture, RenderRequest,
-    Rendered,
+    Bounds, Error, InitialPoints, Method, Packing, Picture, Progress, Projection, QueuedPicture,
+    RenderRequest, Rendered,
 };
 use calibration::{Alignment, CalibratedCamera, CameraCorrection, Trial, TrialReport};
 use keyframe::{Keyframe, Split};
@@ -85,7 +85,8 @@ pub struct SplatTrainer {
 }
 
 impl SplatTrainer {
-    /// Creates an empty model. Drawing works immediately; the training pipelines are compiled on another thread.
+    /// Creates an empty model. Drawing works immediately; the training pipelines are compiled on
+    /// another thread.
     pub fn new(gpu: Arc<Gpu>, options: ModelOptions<SplatOptions>) -> Result<Self, Error> {
         let pipelines = LazyPipelines::start(&gpu);
         Self::with_pipelines(gpu, options, pipelines)
@@ -104,7 +105,11 @@ impl SplatTrainer {
             schedule: Schedule::new(options.common.n_planned_steps),
             views: ViewSet::new(&options, is_software),
             seeding: Seeding::new(&options, is_software),
-            trials: SplatTrials::new(&options.common.cameras, options.specific.count, options.specific.trial_steps),
+            trials: SplatTrials::new(
+                &options.common.cameras,
+                options.specific.count,
+                options.specific.trial_steps,
+            ),
             growth_search: GrowthSearch::new(options.specific.count == CountPolicy::Tested),
             skipped: SkippedSteps::default(),
             saved_corrections: BTreeMap::new(),
@@ -115,8 +120,8 @@ impl SplatTrainer {
         })
     }
 
-    /// Creates a model from existing splats, for drawing or further training. The training pipelines are compiled at
-    /// the first step.
+    /// Creates a model from existing splats, for drawing or further training. The training
+    /// pipelines are compiled at the first step.
     pub fn from_arrays(
         gpu: Arc<Gpu>,
         options: ModelOptions<SplatOptions>,
@@ -131,10 +136,13 @@ impl SplatTrainer {
     /// Loads the camera corrections and the background of a saved model from its `model.json`.
     pub fn with_saved_metadata(mut self, folder: &Path) -> Result<Self, Error> {
         let metadata = read_metadata(folder)?;
-        for difference in metadata.differences(self.progress().primitives, self.options.specific.sh_degree) {
+        for difference in
+            metadata.differences(self.progress().primitives, self.options.specific.sh_degree)
+        {
             log::warn!("{}: {difference}", folder.display());
         }
-        (self.saved_corrections, self.saved_background_srgb) = (metadata.cameras, metadata.background_srgb);
+        (self.saved_corrections, self.saved_background_srgb) =
+            (metadata.cameras, metadata.background_srgb);
         Ok(self)
     }
 
@@ -179,10 +187,12 @@ impl SplatTrainer {
 
     /// Adds splats, up to the limit.
     fn add(&mut self, arrays: &SplatArrays) -> Result<(), Error> {
-        self.model.add(&mut self.recorder, &mut self.renderer, arrays)
+        self.model
+            .add(&mut self.recorder, &mut self.renderer, arrays)
     }
 
-    /// Seeds discs at the uncovered depth readings of the keyframes that arrived since the last call.
+    /// Seeds discs at the uncovered depth readings of the keyframes that arrived since the last
+    /// call.
     fn seed_from_depth(&mut self) -> Result<(), Error> {
         match self.seeding.discs_from_depth(&self.views) {
             Some(discs) => self.add(&discs),
@@ -190,8 +200,8 @@ impl SplatTrainer {
         }
     }
 
-    /// Seeds the areas that depth does not cover. Uses discs if any keyframe has depth; otherwise balls at the initial
-    /// points, if there are any, and a random cloud.
+    /// Seeds the areas that depth does not cover. Uses discs if any keyframe has depth; otherwise
+    /// balls at the initial points, if there are any, and a random cloud.
     fn prepare_training(&mut self) -> Result<(), Error> {
         self.seed_from_depth()?;
         for keyframe in self.seeding.take_unseeded() {
@@ -200,15 +210,19 @@ impl SplatTrainer {
             }
         }
         if !self.model.cameras.set.is_empty() {
-            self.views.assign_lenses(&self.recorder.gpu, &mut self.model.cameras)?;
+            self.views
+                .assign_lenses(&self.recorder.gpu, &mut self.model.cameras)?;
         }
         if self.model.splats.n_splats == 0 && !self.views.is_empty() {
             let keyframes: Vec<&Keyframe> = self.views.keyframes().map(AsRef::as_ref).collect();
             let n_max = self.options.cap() as usize;
             let points = self.seeding.points.as_deref();
-            let balls = points.map(|points| seed::balls(points, &keyframes, n_max)).unwrap_or_default();
+            let balls = points
+                .map(|points| seed::balls(points, &keyframes, n_max))
+                .unwrap_or_default();
             let cloud = seed::random_cloud(&keyframes, self.options.common.seed, n_max);
-            // Points are missing where images have no texture, so there are at least as many splats as without points.
+            // Points are missing where images have no texture, so there are at least as many splats
+            // as without points.
             let n_random = cloud.n_splats().saturating_sub(balls.n_splats());
             self.add(&balls)?;
             self.add(&cloud.filtered(|ix| ix < n_random))?;
@@ -224,7 +238,15 @@ impl SplatTrainer {
         output: Output,
     ) -> Result<Option<Rendered>, Error> {
         let splats = displayed(&self.growth_search, &self.trials, &self.model);
-        self.renderer.picture(&mut self.recorder, DrawnView { splats, camera, background_srgb }, output)
+        self.renderer.picture(
+            &mut self.recorder,
+            DrawnView {
+                splats,
+                camera,
+                background_srgb,
+            },
+            output,
+        )
     }
 
     /// Starts to draw and pack a view, on any adapter.
@@ -236,7 +258,15 @@ impl SplatTrainer {
     ) -> Result<QueuedPicture, Error> {
         self.seed_from_depth()?;
         let splats = displayed(&self.growth_search, &self.trials, &self.model);
-        self.renderer.queue(&mut self.recorder, DrawnView { splats, camera, background_srgb }, packing)
+        self.renderer.queue(
+            &mut self.recorder,
+            DrawnView {
+                splats,
+                camera,
+                background_srgb,
+            },
+            packing,
+        )
     }
 }
 
@@ -256,7 +286,10 @@ impl Method for SplatTrainer {
         }
         self.abort_growth_search()?; // It is repeated with this keyframe.
         if keyframe.split == Split::Validation && self.trials.holds_validation() {
-            self.trials.validation.push(ValidationImage { keyframe, image: None });
+            self.trials.validation.push(ValidationImage {
+                keyframe,
+                image: None,
+            });
             self.update_growth_search();
             return Ok(());
         }
@@ -272,7 +305,8 @@ impl Method for SplatTrainer {
     fn remove(&mut self, camera: &str, stamp: Stamp) -> Result<(), Error> {
         self.finish_in_flight()?; // The step of the removal must be exact.
         self.abort_growth_search()?;
-        let is_removed = |keyframe: &Keyframe| keyframe.camera.as_ref() == camera && keyframe.stamp == stamp;
+        let is_removed =
+            |keyframe: &Keyframe| keyframe.camera.as_ref() == camera && keyframe.stamp == stamp;
         self.views.retain(|keyframe| !is_removed(keyframe));
         self.seeding.remove(is_removed);
         self.trials.remove(is_removed);
@@ -296,7 +330,10 @@ impl Method for SplatTrainer {
 
     fn n_total_steps(&mut self) -> Result<u64, Error> {
         self.finish_in_flight()?;
-        Ok(self.schedule.step.wrapping_add(self.trials.n_reverted_steps))
+        Ok(self
+            .schedule
+            .step
+            .wrapping_add(self.trials.n_reverted_steps))
     }
 
     fn background_srgb(&self) -> [f32; 3] {
@@ -320,28 +357,53 @@ impl Method for SplatTrainer {
 
     fn render(&mut self, request: &RenderRequest) -> Result<Picture, Error> {
         self.seed_from_depth()?;
-        Rendered::picture(request, |camera, output| self.draw_view(camera, request.background_srgb, output))
+        Rendered::picture(request, |camera, output| {
+            self.draw_view(camera, request.background_srgb, output)
+        })
     }
 
-    fn render_packed(&mut self, request: &RenderRequest, packing: Packing) -> Result<Rendered, Error> {
+    fn render_packed(
+        &mut self,
+        request: &RenderRequest,
+        packing: Packing,
+    ) -> Result<Rendered, Error> {
         self.seed_from_depth()?;
         Rendered::of(request, Format::Packed(packing), |camera, output| {
             self.draw_view(camera, request.background_srgb, output)
         })
     }
 
-    fn queue_packed(&mut self, request: &RenderRequest, packing: Packing) -> Result<QueuedPicture, Error> {
-        let Projection::Pinhole { focal_px, principal_px } = request.projection else {
-            return self.render_packed(request, packing).map(QueuedPicture::ready);
+    fn queue_packed(
+        &mut self,
+        request: &RenderRequest,
+        packing: Packing,
+    ) -> Result<QueuedPicture, Error> {
+        let Projection::Pinhole {
+            focal_px,
+            principal_px,
+        } = request.projection
+        else {
+            return self
+                .render_packed(request, packing)
+                .map(QueuedPicture::ready);
         };
-        if !self.renderer.may_pack(&mut self.recorder, packing, request.size_px)? {
-            return self.render_packed(request, packing).map(QueuedPicture::ready);
+        if !self
+            .renderer
+            .may_pack(&mut self.recorder, packing, request.size_px)?
+        {
+            return self
+                .render_packed(request, packing)
+                .map(QueuedPicture::ready);
         }
         let camera = Camera::from_request(request, focal_px, principal_px);
         self.queue_view(&camera, request.background_srgb, packing)
     }
 
-    fn queue_chunks(&mut self, only_changed: bool, edits: &Arc<Edits>) -> Result<Option<PendingChunks>, Error> {
+    fn queue_chunks(
+        &mut self,
+        only_changed: bool,
+        edits: &Arc<Edits>,
+    ) -> Result<Option<PendingChunks>, Error> {
         let splats = displayed(&self.growth_search, &self.trials, &self.model);
         if splats.n_splats == 0 {
             return Ok(None);
@@ -373,8 +435,18 @@ impl Method for SplatTrainer {
 
     fn psnr(&mut self, request: &RenderRequest, keyframe: &Keyframe) -> Result<Option<f64>, Error> {
         self.seed_from_depth()?;
-        let Projection::Pinhole { focal_px, principal_px } = request.projection else { return Ok(None) };
-        self.psnr_of_view(&Camera::from_request(request, focal_px, principal_px), request.background_srgb, keyframe)
+        let Projection::Pinhole {
+            focal_px,
+            principal_px,
+        } = request.projection
+        else {
+            return Ok(None);
+        };
+        self.psnr_of_view(
+            &Camera::from_request(request, focal_px, principal_px),
+            request.background_srgb,
+            keyframe,
+        )
     }
 
     fn bounds(&mut self) -> Result<Option<Bounds>, Error> {
@@ -386,7 +458,9 @@ impl Method for SplatTrainer {
         self.finish_in_flight()?;
         let cameras = &self.model.cameras;
         let displayed = self.displayed_state().map(|snapshot| &snapshot.cameras);
-        let (set, params) = displayed.map_or((cameras.set, &cameras.params), |(set, params)| (*set, params));
+        let (set, params) = displayed.map_or((cameras.set, &cameras.params), |(set, params)| {
+            (*set, params)
+        });
         if set.is_empty() {
             return Ok(self.saved_corrections.clone());
         }
@@ -396,7 +470,10 @@ impl Method for SplatTrainer {
     fn calibrated_camera(&mut self, keyframe: &Keyframe) -> Result<CalibratedCamera, Error> {
         let corrections = self.camera_corrections()?;
         let correction = corrections.get(keyframe.camera.as_ref());
-        Ok(correction.map_or_else(|| CalibratedCamera::of(keyframe), |correction| correction.apply(keyframe)))
+        Ok(correction.map_or_else(
+            || CalibratedCamera::of(keyframe),
+            |correction| correction.apply(keyframe),
+        ))
     }
 
     fn alignment(&self) -> Option<&Alignment> {
@@ -412,7 +489,8 @@ impl Method for SplatTrainer {
     }
 
     fn pause_growth(&mut self, is_paused: bool) -> Result<bool, Error> {
-        let is_compared = self.trials.running_trial().is_some() || self.growth_search.running().is_some();
+        let is_compared =
+            self.trials.running_trial().is_some() || self.growth_search.running().is_some();
         if self.model.is_growth_paused == is_paused || is_compared {
             return Ok(false);
         }
@@ -439,7 +517,10 @@ impl Method for SplatTrainer {
         self.finish_in_flight()?;
         self.cancel_trial()?;
         let arrays = self.arrays()?;
-        std::fs::create_dir_all(folder).map_err(|source| Error::Write { path: folder.to_owned(), source })?;
+        std::fs::create_dir_all(folder).map_err(|source| Error::Write {
+            path: folder.to_owned(),
+            source,
+        })?;
         ply::write(&folder.join(IN_FOLDER), &arrays)?;
         let metadata = serde_json::json!({
             "method": SplatOptions::METHOD,
@@ -452,7 +533,8 @@ impl Method for SplatTrainer {
             "background_srgb": self.background_srgb(),
         });
         let path = folder.join(METADATA_FILE);
-        files::write(&path, format!("{metadata:#}\n")).map_err(|source| Error::Write { path, source })
+        files::write(&path, format!("{metadata:#}\n"))
+            .map_err(|source| Error::Write { path, source })
     }
 
     fn checkpoint(&mut self) -> Result<PendingCheckpoint, Error> {
@@ -461,8 +543,15 @@ impl Method for SplatTrainer {
 }
 
 /// The splats to display: during a growth search or a trial, those without the tested change.
-fn displayed<'a>(search: &'a GrowthSearch, trials: &'a SplatTrials, model: &'a TrainedModel) -> &'a SplatBuffers {
-    search.running().map_or_else(|| trials.displayed(&model.splats), |models| &models.main.splats)
+fn displayed<'a>(
+    search: &'a GrowthSearch,
+    trials: &'a SplatTrials,
+    model: &'a TrainedModel,
+) -> &'a SplatBuffers {
+    search.running().map_or_else(
+        || trials.displayed(&model.splats),
+        |models| &models.main.splats,
+    )
 }
 
 /// Accessors for tests.
@@ -487,7 +576,11 @@ impl SplatTrainer {
     }
 
     pub(super) fn n_steps_on_gpu(&self) -> u64 {
-        self.recorder.gpu.read::<u32>(&self.optimizer.status, status::LEN).unwrap()[status::STEP].into()
+        self.recorder
+            .gpu
+            .read::<u32>(&self.optimizer.status, status::LEN)
+            .unwrap()[status::STEP]
+            .into()
     }
 
     /// Number of seeded positions.
@@ -496,6 +589,9 @@ impl SplatTrainer {
     }
 
     pub(super) fn n_views_of(&self, keyframe: &Keyframe) -> usize {
-        self.views.keyframes().filter(|other| other.stamp == keyframe.stamp).count()
+        self.views
+            .keyframes()
+            .filter(|other| other.stamp == keyframe.stamp)
+            .count()
     }
 }

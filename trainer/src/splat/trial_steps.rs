@@ -5,7 +5,8 @@ use serde::{Deserialize, Serialize};
 
 /// Steps at which trials and searches start, and how many steps they take.
 ///
-/// They are options, not constants, so that a checkpoint keeps them, and so that tests can use fewer steps.
+/// They are options, not constants, so that a checkpoint keeps them, and so that tests can use
+/// fewer steps.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TrialSteps {
@@ -13,20 +14,23 @@ pub struct TrialSteps {
     pub first_trial: u64,
     /// Steps of each half of a trial.
     pub trial_half: u64,
-    /// Steps per image in each half of a trial of per-image parameters, if these are more than [`Self::trial_half`].
+    /// Steps per image in each half of a trial of per-image parameters, if these are more than
+    /// [`Self::trial_half`].
     pub per_image: u64,
     /// Maximum number of steps of each half of a trial.
     pub max_trial_half: u64,
-    /// Step of the first trial that doubles the number of splats while images arrive. Before it, the number grows without
-    /// trials.
+    /// Step of the first trial that doubles the number of splats while images arrive. Before it,
+    /// the number grows without trials.
     pub first_doubling: u64,
-    /// Steps of each half of a trial that doubles the number of splats. Both halves end just before a densification step,
-    /// which would lower the scores for some steps.
+    /// Steps of each half of a trial that doubles the number of splats. Both halves end just before
+    /// a densification step, which would lower the scores for some steps.
     pub doubling_half: u64,
-    /// Step at which the search for the number of splats for few images starts. Earlier, the models are too coarse for a
-    /// decision. The models of folds are trained for at most twice as many steps before the first comparison.
+    /// Step at which the search for the number of splats for few images starts. Earlier, the models
+    /// are too coarse for a decision. The models of folds are trained for at most twice as many
+    /// steps before the first comparison.
     pub search: u64,
-    /// Steps that the model on all images is trained for between a change of the images and the search.
+    /// Steps that the model on all images is trained for between a change of the images and the
+    /// search.
     pub search_pause: u64,
     /// Steps that train each of the two models of a comparison.
     pub comparison: u64,

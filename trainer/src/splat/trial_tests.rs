@@ -1,5 +1,5 @@
-//! Tests of trials while keyframes arrive and are removed: both halves train on the same data, no seed is lost, and a
-//! checkpoint contains the whole trial.
+//! Tests of trials while keyframes arrive and are removed: both halves train on the same data, no
+//! seed is lost, and a checkpoint contains the whole trial.
 
 use super::training_tests::{n_keyframes, options};
 use super::trials::MAX_SCORED;
@@ -25,13 +25,20 @@ fn trainer_with_candidate(gpu: &Arc<Gpu>, candidate: ParamSet) -> SplatTrainer {
         options.specific.growth_frac = 0.0;
         options.specific.max_splats = 20_000;
         options.specific.seeds_per_image = Some(300.0);
-        options.specific.trial_steps = TrialSteps { first_trial: START, trial_half: HALF, ..TrialSteps::default() };
+        options.specific.trial_steps = TrialSteps {
+            first_trial: START,
+            trial_half: HALF,
+            ..TrialSteps::default()
+        };
     });
     SplatTrainer::new(gpu.clone(), options).unwrap()
 }
 
 fn with_split(keyframe: &Arc<Keyframe>, split: Split) -> Arc<Keyframe> {
-    Arc::new(Keyframe { split, ..keyframe.as_ref().clone() })
+    Arc::new(Keyframe {
+        split,
+        ..keyframe.as_ref().clone()
+    })
 }
 
 /// Trains up to a total number of updates, including updates that trials reverted.
@@ -50,16 +57,33 @@ const N_EARLY: usize = 30;
 
 /// Keyframes all around the scene. Every fourth is a validation keyframe.
 fn around(gpu: &Arc<Gpu>) -> Vec<Arc<Keyframe>> {
-    let split = |ix: usize| if ix.is_multiple_of(4) { Split::Validation } else { Split::Train };
-    n_keyframes(gpu, 46, true).iter().enumerate().map(|(ix, keyframe)| with_split(keyframe, split(ix))).collect()
+    let split = |ix: usize| {
+        if ix.is_multiple_of(4) {
+            Split::Validation
+        } else {
+            Split::Train
+        }
+    };
+    n_keyframes(gpu, 46, true)
+        .iter()
+        .enumerate()
+        .map(|(ix, keyframe)| with_split(keyframe, split(ix)))
+        .collect()
 }
 
-/// Adds keyframes before a trial, in its first half and in its second half, and trains past the end of the trial.
-fn trial_with_arrivals(gpu: &Arc<Gpu>, candidate: ParamSet, keyframes: &[Arc<Keyframe>]) -> SplatTrainer {
+/// Adds keyframes before a trial, in its first half and in its second half, and trains past the end
+/// of the trial.
+fn trial_with_arrivals(
+    gpu: &Arc<Gpu>,
+    candidate: ParamSet,
+    keyframes: &[Arc<Keyframe>],
+) -> SplatTrainer {
     let (early, late) = keyframes.split_at(N_EARLY);
     let (first_half, second_half) = late.split_at(8);
     let mut trainer = trainer_with_candidate(gpu, candidate);
-    early.iter().for_each(|keyframe| trainer.push(keyframe.clone()).unwrap());
+    early
+        .iter()
+        .for_each(|keyframe| trainer.push(keyframe.clone()).unwrap());
     for (begin, arriving) in [(START, first_half), (START + HALF, second_half)] {
         for (ix, keyframe) in arriving.iter().enumerate() {
             train_to(&mut trainer, begin + 10 + 10 * ix as u64);
@@ -71,8 +95,15 @@ fn trial_with_arrivals(gpu: &Arc<Gpu>, candidate: ParamSet, keyframes: &[Arc<Key
 }
 
 fn assert_all_seeds_kept(trainer: &SplatTrainer, keyframes: &[Arc<Keyframe>]) {
-    assert_eq!(trainer.progress().primitives, trainer.n_seeds() as u64, "splats against seeded positions");
-    for keyframe in keyframes.iter().filter(|keyframe| keyframe.split == Split::Train) {
+    assert_eq!(
+        trainer.progress().primitives,
+        trainer.n_seeds() as u64,
+        "splats against seeded positions"
+    );
+    for keyframe in keyframes
+        .iter()
+        .filter(|keyframe| keyframe.split == Split::Train)
+    {
         assert_eq!(trainer.n_views_of(keyframe), 1, "{:?}", keyframe.stamp);
     }
     assert!(trainer.n_seeds() > 500, "{}", trainer.n_seeds());
@@ -83,11 +114,24 @@ fn no_op_trial_has_zero_gain_while_keyframes_arrive() {
     let gpu = test_gpu();
     let keyframes = around(&gpu);
     let trainer = trial_with_arrivals(&gpu, ParamSet::empty(), &keyframes);
-    let [Trial { gain_db, standard_error_db, n_images, kept, .. }] = trainer.trials() else {
+    let [
+        Trial {
+            gain_db,
+            standard_error_db,
+            n_images,
+            kept,
+            ..
+        },
+    ] = trainer.trials()
+    else {
         panic!("{:?}", trainer.trials())
     };
     assert_eq!((*gain_db, *standard_error_db, *kept), (0.0, 0.0, false));
-    assert_eq!(*n_images, N_EARLY.div_ceil(4), "validation keyframes at the start of the trial");
+    assert_eq!(
+        *n_images,
+        N_EARLY.div_ceil(4),
+        "validation keyframes at the start of the trial"
+    );
     assert_all_seeds_kept(&trainer, &keyframes);
 }
 
@@ -98,11 +142,18 @@ fn accepted_trial_keeps_seeds_of_arrived_keyframes() {
         .iter()
         .map(|keyframe| {
             let focal_px = keyframe.focal_px.map(|focal| 1.1 * focal);
-            Arc::new(Keyframe { focal_px, ..keyframe.as_ref().clone() })
+            Arc::new(Keyframe {
+                focal_px,
+                ..keyframe.as_ref().clone()
+            })
         })
         .collect();
     let trainer = trial_with_arrivals(&gpu, lens(), &miscalibrated);
-    assert!(trainer.trials().len() == 1 && trainer.trials()[0].kept, "{:?}", trainer.trials());
+    assert!(
+        trainer.trials().len() == 1 && trainer.trials()[0].kept,
+        "{:?}",
+        trainer.trials()
+    );
     assert_all_seeds_kept(&trainer, &miscalibrated);
 }
 
@@ -111,12 +162,19 @@ fn both_halves_score_the_same_images() {
     const N_FIRST: usize = 20;
     let gpu = test_gpu();
     let keyframes = n_keyframes(&gpu, 60, true);
-    let train = keyframes.iter().step_by(5).map(|keyframe| with_split(keyframe, Split::Train));
-    let validation: Vec<_> =
-        (0..keyframes.len()).filter(|ix| ix % 5 != 0).map(|ix| with_split(&keyframes[ix], Split::Validation)).collect();
+    let train = keyframes
+        .iter()
+        .step_by(5)
+        .map(|keyframe| with_split(keyframe, Split::Train));
+    let validation: Vec<_> = (0..keyframes.len())
+        .filter(|ix| ix % 5 != 0)
+        .map(|ix| with_split(&keyframes[ix], Split::Validation))
+        .collect();
     let mut trainer = trainer_with_candidate(&gpu, ParamSet::empty());
     let (early, late) = validation.split_at(N_FIRST);
-    train.chain(early.iter().cloned()).for_each(|keyframe| trainer.push(keyframe).unwrap());
+    train
+        .chain(early.iter().cloned())
+        .for_each(|keyframe| trainer.push(keyframe).unwrap());
     // Validation keyframes arrive in both halves, and each half loses one of the scored keyframes.
     for (ix, keyframe) in late.iter().enumerate() {
         train_to(&mut trainer, START + 5 + 12 * ix as u64);
@@ -129,10 +187,21 @@ fn both_halves_score_the_same_images() {
     }
     assert!(validation.len() > MAX_SCORED + 4);
     train_to(&mut trainer, END + 3);
-    let [Trial { gain_db, standard_error_db, n_images, .. }] = trainer.trials() else {
+    let [
+        Trial {
+            gain_db,
+            standard_error_db,
+            n_images,
+            ..
+        },
+    ] = trainer.trials()
+    else {
         panic!("{:?}", trainer.trials())
     };
-    assert_eq!((*gain_db, *standard_error_db, *n_images), (0.0, 0.0, N_FIRST - 2));
+    assert_eq!(
+        (*gain_db, *standard_error_db, *n_images),
+        (0.0, 0.0, N_FIRST - 2)
+    );
 }
 
 #[test]
@@ -140,13 +209,32 @@ fn resuming_in_either_trial_half_is_bit_exact() {
     let gpu = test_gpu();
     let keyframes = n_keyframes(&gpu, 42, true);
     // Arrivals of keyframes and interruptions of training, in total updates.
-    let arrivals: Vec<u64> = (0..42).map(|ix| if ix < 36 { 0 } else { START - 30 + 60 * (ix - 35) }).collect();
-    let stops = [START - 5, START + 35, START + HALF + 15, START + HALF + 70, END + 10];
+    let arrivals: Vec<u64> = (0..42)
+        .map(|ix| {
+            if ix < 36 {
+                0
+            } else {
+                START - 30 + 60 * (ix - 35)
+            }
+        })
+        .collect();
+    let stops = [
+        START - 5,
+        START + 35,
+        START + HALF + 15,
+        START + HALF + 70,
+        END + 10,
+    ];
     let run = |stops: &[u64]| {
         let mut trainer = trainer_with_candidate(&gpu, lens());
         let mut n_taken_before = 0; // Reverted updates, which a checkpoint does not count.
         let mut n_pushed = 0;
-        let times: std::collections::BTreeSet<u64> = arrivals.iter().chain(stops).copied().chain([END + 20]).collect();
+        let times: std::collections::BTreeSet<u64> = arrivals
+            .iter()
+            .chain(stops)
+            .copied()
+            .chain([END + 20])
+            .collect();
         for time in times {
             train_to(&mut trainer, time - n_taken_before);
             while n_pushed < arrivals.len() && arrivals[n_pushed] <= time {
@@ -155,12 +243,19 @@ fn resuming_in_either_trial_half_is_bit_exact() {
             }
             if stops.contains(&time) {
                 let checkpoint = trainer.checkpoint().unwrap().finish().unwrap();
-                let n_other_arrays = checkpoint.arrays.iter().filter(|array| array.name.starts_with("other_")).count();
+                let n_other_arrays = checkpoint
+                    .arrays
+                    .iter()
+                    .filter(|array| array.name.starts_with("other_"))
+                    .count();
                 let is_in_trial = (START..END).contains(&time);
                 assert_eq!(n_other_arrays > 0, is_in_trial, "at {time}");
                 let untrained;
-                (trainer, untrained) = SplatTrainer::resume(gpu.clone(), &checkpoint, &keyframes[..n_pushed]).unwrap();
-                untrained.into_iter().for_each(|keyframe| trainer.push(keyframe).unwrap());
+                (trainer, untrained) =
+                    SplatTrainer::resume(gpu.clone(), &checkpoint, &keyframes[..n_pushed]).unwrap();
+                untrained
+                    .into_iter()
+                    .for_each(|keyframe| trainer.push(keyframe).unwrap());
                 n_taken_before = time - trainer.n_total_steps().unwrap();
             }
         }

@@ -1,12 +1,13 @@
-//! A/B trials that decide whether a change of the model is kept. Each change is tested on a copy of the model and
-//! evaluated on validation images, which are excluded from training.
+//! A/B trials that decide whether a change of the model is kept. Each change is tested on a copy of
+//! the model and evaluated on validation images, which are excluded from training.
 //!
-//! The baseline and the variant with the change are trained from the same state for the same number of steps.
-//! Keyframes that arrive during the first half of a trial are added to both at the same step; later ones wait for the
-//! end of the trial. An addition is accepted if its mean gain over the validation keyframes exceeds both a minimum and
-//! two standard errors. A reduction is accepted if its loss plus half a standard error stays within a limit, and the
-//! total loss of all reductions is at most [`MAX_TOTAL_LOSS_DB`]. After the last trial, the validation keyframes become
-//! training keyframes.
+//! The baseline and the variant with the change are trained from the same state for the same number
+//! of steps. Keyframes that arrive during the first half of a trial are added to both at the same
+//! step; later ones wait for the end of the trial. An addition is accepted if its mean gain over
+//! the validation keyframes exceeds both a minimum and two standard errors. A reduction is accepted
+//! if its loss plus half a standard error stays within a limit, and the total loss of all
+//! reductions is at most [`MAX_TOTAL_LOSS_DB`]. After the last trial, the validation keyframes
+//! become training keyframes.
 
 use super::arrival_gains::ArrivalGains;
 use super::buffers::SplatBuffers;
@@ -29,7 +30,8 @@ pub(crate) const MAX_SCORED: usize = 24;
 /// Halving ends once the number of splats is at most this value.
 const MIN_SPLATS: u32 = 1000;
 
-/// Per-image gains. Their trial needs no training, because their effect follows from sums over pixels.
+/// Per-image gains. Their trial needs no training, because their effect follows from sums over
+/// pixels.
 const GAINS: ParamSet = ParamSet::IMAGE_GAINS;
 
 /// How the number of splats is chosen.
@@ -38,11 +40,11 @@ pub enum CountPolicy {
     /// Grows up to the limit.
     #[default]
     ToCap,
-    /// Grows up to the limit, or less if there are few images. Then halves the number repeatedly while this costs less
-    /// than 0.1 dB on validation images.
+    /// Grows up to the limit, or less if there are few images. Then halves the number repeatedly
+    /// while this costs less than 0.1 dB on validation images.
     Tested,
-    /// Doubles the number as long as this gains more than 0.1 dB on validation images, then halves it like
-    /// [`Self::Tested`]. Restarts when many images are new.
+    /// Doubles the number as long as this gains more than 0.1 dB on validation images, then halves
+    /// it like [`Self::Tested`]. Restarts when many images are new.
     TestedGrowth,
 }
 
@@ -76,7 +78,10 @@ fn id_of(keyframe: &Keyframe) -> ImageId {
 
 /// Scores of the images that both maps contain.
 fn pair_scores(baseline_db: &Scores, variant_db: &Scores) -> (Vec<f64>, Vec<f64>) {
-    baseline_db.iter().filter_map(|(id, baseline)| Some((*baseline, *variant_db.get(id)?))).unzip()
+    baseline_db
+        .iter()
+        .filter_map(|(id, baseline)| Some((*baseline, *variant_db.get(id)?)))
+        .unzip()
 }
 
 /// A training keyframe that arrived during a trial, and the step of its arrival.
@@ -131,12 +136,13 @@ pub(crate) struct RunningTrial {
     pub(crate) candidate: Candidate,
     /// Last step of this half.
     pub(crate) until: u64,
-    /// The state that is not in training. In the first half of a trial, this is the state at the start of the trial; in
-    /// the second half, the state at the end of the first half.
+    /// The state that is not in training. In the first half of a trial, this is the state at the
+    /// start of the trial; in the second half, the state at the end of the first half.
     pub(crate) other: Box<Snapshot>,
     /// The validation keyframes on which both halves are scored.
     pub(crate) scored: Vec<ImageId>,
-    /// Keyframes that arrived in the first half. The second half takes them from this queue at the same steps.
+    /// Keyframes that arrived in the first half. The second half takes them from this queue at the
+    /// same steps.
     pub(crate) arrivals: VecDeque<Arrival>,
     /// Scores at the end of the first half, which trains the baseline.
     pub(crate) baseline_db: Option<Scores>,
@@ -204,8 +210,8 @@ pub(crate) struct TrialContext {
     /// Maximum number of splats.
     pub(crate) max_splats: u32,
     pub(crate) n_planned_steps: u64,
-    /// Whether growth has ended. Before that, a small model may score as well as a large one only because it converges
-    /// faster.
+    /// Whether growth has ended. Before that, a small model may score as well as a large one only
+    /// because it converges faster.
     pub(crate) is_mature: bool,
     /// SH degree.
     pub(crate) sh_degree: u32,
@@ -219,7 +225,10 @@ impl RunningTrial {
 
     /// Step at which the second half adds the next keyframe that arrived in the first half.
     fn next_arrival_step(&self) -> u64 {
-        self.arrivals.front().filter(|_| self.is_second_half()).map_or(u64::MAX, |next_due| next_due.step)
+        self.arrivals
+            .front()
+            .filter(|_| self.is_second_half())
+            .map_or(u64::MAX, |next_due| next_due.step)
     }
 
     fn due(&self, step: u64) -> Due {
@@ -241,7 +250,11 @@ impl SplatTrials {
             CountPolicy::Tested | CountPolicy::TestedGrowth => CountState::Growing,
         };
         let is_finished = candidates.is_empty() && count == CountState::ToCap;
-        let trial_phase = if is_finished { SplatTrialPhase::Finished } else { SplatTrialPhase::Waiting };
+        let trial_phase = if is_finished {
+            SplatTrialPhase::Finished
+        } else {
+            SplatTrialPhase::Waiting
+        };
         Self {
             steps,
             candidates,
@@ -251,7 +264,10 @@ impl SplatTrials {
             validation: Vec::new(),
             finished: Vec::new(),
             n_reverted_steps: 0,
-            arrival_gains: cameras.watched().contains(GAINS).then(ArrivalGains::default),
+            arrival_gains: cameras
+                .watched()
+                .contains(GAINS)
+                .then(ArrivalGains::default),
             trial_phase,
         }
     }
@@ -266,13 +282,23 @@ impl SplatTrials {
         if self.doubling.is_some() && step >= self.steps.first_doubling {
             return false;
         }
-        let is_halving = matches!(self.running_trial(), Some(RunningTrial { candidate: Candidate::Halved { .. }, .. }));
+        let is_halving = matches!(
+            self.running_trial(),
+            Some(RunningTrial {
+                candidate: Candidate::Halved { .. },
+                ..
+            })
+        );
         matches!(self.count, CountState::ToCap | CountState::Growing) && !is_halving
     }
 
     /// The trial in progress.
     pub(crate) fn running_trial(&self) -> Option<&RunningTrial> {
-        if let SplatTrialPhase::Running(trial) = &self.trial_phase { Some(trial) } else { None }
+        if let SplatTrialPhase::Running(trial) = &self.trial_phase {
+            Some(trial)
+        } else {
+            None
+        }
     }
 
     pub(crate) fn due(&self, context: TrialContext) -> Due {
@@ -289,22 +315,37 @@ impl SplatTrials {
         }
         if self.validation.len() < MIN_VALIDATION_IMAGES {
             // Wait for more images, but not indefinitely.
-            let waits = context.step < 2 * self.steps.first_trial || (self.doubling.is_some() && !context.is_mature);
-            return if waits { Due::Nothing } else { Due::ReleaseValidation };
+            let waits = context.step < 2 * self.steps.first_trial
+                || (self.doubling.is_some() && !context.is_mature);
+            return if waits {
+                Due::Nothing
+            } else {
+                Due::ReleaseValidation
+            };
         }
         if let Some(params) = self.candidates.front() {
-            return if *params == GAINS { Due::Gains } else { Due::Begin(Candidate::Cameras(*params)) };
+            return if *params == GAINS {
+                Due::Gains
+            } else {
+                Due::Begin(Candidate::Cameras(*params))
+            };
         }
-        let halved = Candidate::Halved { from: context.n_splats, to: context.n_splats.div_ceil(2) };
+        let halved = Candidate::Halved {
+            from: context.n_splats,
+            to: context.n_splats.div_ceil(2),
+        };
         let doubled = Candidate::Doubled {
             from: context.n_splats,
             to: context.n_splats.saturating_mul(2).min(context.max_splats),
         };
         let is_doubling_due = context.n_splats < context.max_splats
-            && self
-                .doubling
-                .is_some_and(|doubling| doubling.is_due(context.step, context.n_planned_steps, &self.steps));
-        let lower = Candidate::ShDegree { from: context.sh_degree, to: self.degree };
+            && self.doubling.is_some_and(|doubling| {
+                doubling.is_due(context.step, context.n_planned_steps, &self.steps)
+            });
+        let lower = Candidate::ShDegree {
+            from: context.sh_degree,
+            to: self.degree,
+        };
         match self.count {
             CountState::ToCap => Due::ReleaseValidation,
             CountState::Finished if self.degree < context.sh_degree => Due::Begin(lower),
@@ -319,27 +360,45 @@ impl SplatTrials {
     /// Number of steps until work may be due again.
     pub(crate) fn steps_left(&self, step: u64) -> u64 {
         match &self.trial_phase {
-            SplatTrialPhase::Waiting if step < self.steps.first_trial => self.steps.first_trial - step,
-            SplatTrialPhase::Running(trial) => trial.until.min(trial.next_arrival_step()).saturating_sub(step).max(1),
+            SplatTrialPhase::Waiting if step < self.steps.first_trial => {
+                self.steps.first_trial - step
+            }
+            SplatTrialPhase::Running(trial) => trial
+                .until
+                .min(trial.next_arrival_step())
+                .saturating_sub(step)
+                .max(1),
             _ => u64::MAX,
         }
     }
 
-    /// Records a training keyframe that arrives at this step. Returns whether it must wait for the end of a trial.
+    /// Records a training keyframe that arrives at this step. Returns whether it must wait for the
+    /// end of a trial.
     pub(crate) fn defer_arrival(&mut self, keyframe: &Arc<Keyframe>, step: u64) -> bool {
-        let SplatTrialPhase::Running(trial) = &mut self.trial_phase else { return false };
+        let SplatTrialPhase::Running(trial) = &mut self.trial_phase else {
+            return false;
+        };
         let is_deferred = trial.is_second_half();
         match is_deferred {
             true => trial.deferred.push(keyframe.clone()),
-            false => trial.arrivals.push_back(Arrival { step, keyframe: keyframe.clone() }),
+            false => trial.arrivals.push_back(Arrival {
+                step,
+                keyframe: keyframe.clone(),
+            }),
         }
         is_deferred
     }
 
-    /// If growth depends on trials and many of the `n_images` images are new, restarts the search for the number of
-    /// splats, and excludes validation keyframes that arrive from now on from training. Has no effect during a trial.
+    /// If growth depends on trials and many of the `n_images` images are new, restarts the search
+    /// for the number of splats, and excludes validation keyframes that arrive from now on from
+    /// training. Has no effect during a trial.
     pub(crate) fn restart_growth(&mut self, n_images: usize) {
-        if self.running_trial().is_none() && self.doubling.as_mut().is_some_and(|doubling| doubling.restart(n_images)) {
+        if self.running_trial().is_none()
+            && self
+                .doubling
+                .as_mut()
+                .is_some_and(|doubling| doubling.restart(n_images))
+        {
             self.count = CountState::Growing;
             self.trial_phase = SplatTrialPhase::Waiting;
         }
@@ -347,15 +406,25 @@ impl SplatTrials {
 
     /// Next keyframe to add in the second half of a trial.
     pub(crate) fn next_arrival(&mut self) -> Option<Arc<Keyframe>> {
-        let SplatTrialPhase::Running(trial) = &mut self.trial_phase else { return None };
+        let SplatTrialPhase::Running(trial) = &mut self.trial_phase else {
+            return None;
+        };
         trial.arrivals.pop_front().map(|arrival| arrival.keyframe)
     }
 
-    /// The validation keyframes to score: those of the running trial, or else an evenly spaced subset.
+    /// The validation keyframes to score: those of the running trial, or else an evenly spaced
+    /// subset.
     pub(crate) fn scored(&self) -> Vec<ImageId> {
         let stride = self.validation.len().div_ceil(MAX_SCORED).max(1);
-        let spread = || self.validation.iter().step_by(stride).map(|validation| id_of(&validation.keyframe)).collect();
-        self.running_trial().map_or_else(spread, |trial| trial.scored.clone())
+        let spread = || {
+            self.validation
+                .iter()
+                .step_by(stride)
+                .map(|validation| id_of(&validation.keyframe))
+                .collect()
+        };
+        self.running_trial()
+            .map_or_else(spread, |trial| trial.scored.clone())
     }
 
     /// A validation keyframe, unless it was removed.
@@ -368,8 +437,11 @@ impl SplatTrials {
 
     pub(crate) fn begin(&mut self, candidate: Candidate, from: Snapshot, n_views: usize) {
         let n_steps = match candidate {
-            Candidate::Cameras(params) if params.intersects(ParamSet::IMAGE_POSES | ParamSet::IMAGE_GAINS) => {
-                (self.steps.per_image * n_views as u64).clamp(self.steps.trial_half, self.steps.max_trial_half)
+            Candidate::Cameras(params)
+                if params.intersects(ParamSet::IMAGE_POSES | ParamSet::IMAGE_GAINS) =>
+            {
+                (self.steps.per_image * n_views as u64)
+                    .clamp(self.steps.trial_half, self.steps.max_trial_half)
             }
             Candidate::Doubled { .. } => self.steps.doubling_half,
             _ => self.steps.trial_half,
@@ -391,36 +463,67 @@ impl SplatTrials {
     }
 
     /// Starts the second half.
-    pub(crate) fn begin_second_half(&mut self, baseline: Snapshot, baseline_db: Scores) -> Option<SecondHalf> {
-        let SplatTrialPhase::Running(trial) = &mut self.trial_phase else { return None };
+    pub(crate) fn begin_second_half(
+        &mut self,
+        baseline: Snapshot,
+        baseline_db: Scores,
+    ) -> Option<SecondHalf> {
+        let SplatTrialPhase::Running(trial) = &mut self.trial_phase else {
+            return None;
+        };
         trial.baseline_db = Some(baseline_db);
         Some(SecondHalf {
             from: std::mem::replace(&mut *trial.other, baseline),
             candidate: trial.candidate,
-            arrived: trial.arrivals.iter().map(|arrival| arrival.keyframe.clone()).collect(),
+            arrived: trial
+                .arrivals
+                .iter()
+                .map(|arrival| arrival.keyframe.clone())
+                .collect(),
         })
     }
 
     /// Accepts or rejects the change.
     pub(crate) fn end(&mut self, variant_db: &Scores) -> Option<TrialEnd> {
-        let RunningTrial { candidate, until, other, baseline_db, deferred, .. } = self.take_second_half()?;
+        let RunningTrial {
+            candidate,
+            until,
+            other,
+            baseline_db,
+            deferred,
+            ..
+        } = self.take_second_half()?;
         let (baseline_db, variant_db) = pair_scores(&baseline_db?, variant_db);
         let kept = self.evaluate(candidate, &baseline_db, &variant_db);
         match candidate {
             Candidate::Cameras(_) => drop(self.candidates.pop_front()),
             Candidate::Doubled { .. } if kept => {}
-            Candidate::Doubled { .. } => self.doubling.iter_mut().for_each(|doubling| doubling.reject(until)),
-            Candidate::Halved { to, .. } if kept && to > MIN_SPLATS => self.count = CountState::Halving,
+            Candidate::Doubled { .. } => self
+                .doubling
+                .iter_mut()
+                .for_each(|doubling| doubling.reject(until)),
+            Candidate::Halved { to, .. } if kept && to > MIN_SPLATS => {
+                self.count = CountState::Halving
+            }
             Candidate::Halved { .. } => self.count = CountState::Finished,
             Candidate::ShDegree { from, to } => self.degree = if kept { from } else { to + 1 },
         }
-        Some(TrialEnd { restored: (!kept).then_some(*other), seeded: Vec::new(), deferred })
+        Some(TrialEnd {
+            restored: (!kept).then_some(*other),
+            seeded: Vec::new(),
+            deferred,
+        })
     }
 
     /// Decides on per-image gains. Returns them if they are significant.
-    pub(crate) fn decide_gains(&mut self, baseline_db: &[f64], variant_db: &[f64]) -> Option<ParamSet> {
+    pub(crate) fn decide_gains(
+        &mut self,
+        baseline_db: &[f64],
+        variant_db: &[f64],
+    ) -> Option<ParamSet> {
         self.candidates.retain(|params| *params != GAINS);
-        self.evaluate(Candidate::Cameras(GAINS), baseline_db, variant_db).then_some(GAINS)
+        self.evaluate(Candidate::Cameras(GAINS), baseline_db, variant_db)
+            .then_some(GAINS)
     }
 
     /// Whether arriving keyframes must be compared with pictures, see [`Self::add_arrival_gains`].
@@ -428,15 +531,18 @@ impl SplatTrials {
         self.arrival_gains.is_some()
     }
 
-    /// Adds a keyframe that was compared with a picture before training on it; see [`ArrivalGains::add`]. Returns the image
-    /// gains if they are needed.
+    /// Adds a keyframe that was compared with a picture before training on it; see
+    /// [`ArrivalGains::add`]. Returns the image gains if they are needed.
     pub(crate) fn add_arrival_gains(
         &mut self,
         keyframe: &Keyframe,
         log_gains: [f64; 3],
         psnr: impl Fn([f64; 3]) -> Option<f64>,
     ) -> Option<ParamSet> {
-        let trial = self.arrival_gains.as_mut()?.add(&keyframe.camera, log_gains, psnr)?;
+        let trial = self
+            .arrival_gains
+            .as_mut()?
+            .add(&keyframe.camera, log_gains, psnr)?;
         trial.log_result();
         self.finished.push(trial);
         self.arrival_gains = None;
@@ -444,13 +550,24 @@ impl SplatTrials {
     }
 
     fn evaluate(&mut self, candidate: Candidate, baseline_db: &[f64], variant_db: &[f64]) -> bool {
-        log::debug!("{candidate}: PSNR without the change {baseline_db:.3?} dB, with it {variant_db:.3?} dB");
+        log::debug!(
+            "{candidate}: PSNR without the change {baseline_db:.3?} dB, with it {variant_db:.3?} dB"
+        );
         let mut trial = Trial::of(candidate, baseline_db, variant_db);
-        let is_growth = |trial: &&Trial| trial.kept && matches!(trial.candidate, Candidate::Doubled { .. });
-        let since_growth = self.finished.iter().rev().take_while(|trial| !is_growth(trial));
-        let reductions = since_growth.filter(|finished| finished.kept && finished.candidate.reduces_model());
-        let total_loss_db: f64 = reductions.map(|finished| (-finished.gain_db).max(0.0)).sum();
-        trial.kept &= !candidate.reduces_model() || total_loss_db - trial.gain_db <= MAX_TOTAL_LOSS_DB;
+        let is_growth =
+            |trial: &&Trial| trial.kept && matches!(trial.candidate, Candidate::Doubled { .. });
+        let since_growth = self
+            .finished
+            .iter()
+            .rev()
+            .take_while(|trial| !is_growth(trial));
+        let reductions =
+            since_growth.filter(|finished| finished.kept && finished.candidate.reduces_model());
+        let total_loss_db: f64 = reductions
+            .map(|finished| (-finished.gain_db).max(0.0))
+            .sum();
+        trial.kept &=
+            !candidate.reduces_model() || total_loss_db - trial.gain_db <= MAX_TOTAL_LOSS_DB;
         trial.log_result();
         let kept = trial.kept;
         self.finished.push(trial);
@@ -459,9 +576,21 @@ impl SplatTrials {
 
     /// Cancels a trial that is in its second half. The trial is repeated if training continues.
     pub(crate) fn cancel(&mut self) -> Option<TrialEnd> {
-        let RunningTrial { other, arrivals, deferred, .. } = self.take_second_half()?;
-        let seeded = arrivals.into_iter().map(|arrival| arrival.keyframe).collect();
-        Some(TrialEnd { restored: Some(*other), seeded, deferred })
+        let RunningTrial {
+            other,
+            arrivals,
+            deferred,
+            ..
+        } = self.take_second_half()?;
+        let seeded = arrivals
+            .into_iter()
+            .map(|arrival| arrival.keyframe)
+            .collect();
+        Some(TrialEnd {
+            restored: Some(*other),
+            seeded,
+            deferred,
+        })
     }
 
     /// Ends the trial in progress, in either half; it is repeated.
@@ -487,17 +616,23 @@ impl SplatTrials {
     /// Ends all trials and returns the validation keyframes, which become training keyframes.
     pub(crate) fn finish(&mut self) -> Vec<Arc<Keyframe>> {
         self.trial_phase = SplatTrialPhase::Finished;
-        std::mem::take(&mut self.validation).into_iter().map(|validation| validation.keyframe).collect()
+        std::mem::take(&mut self.validation)
+            .into_iter()
+            .map(|validation| validation.keyframe)
+            .collect()
     }
 
     /// The state without the change, during the second half of a trial.
     pub(crate) fn baseline(&self) -> Option<&Snapshot> {
-        self.running_trial().filter(|trial| trial.is_second_half()).map(|trial| &*trial.other)
+        self.running_trial()
+            .filter(|trial| trial.is_second_half())
+            .map(|trial| &*trial.other)
     }
 
     /// The splats to display. During a trial, these are the splats without the change.
     pub(crate) fn displayed<'a>(&'a self, in_training: &'a SplatBuffers) -> &'a SplatBuffers {
-        self.baseline().map_or(in_training, |snapshot| &snapshot.splats)
+        self.baseline()
+            .map_or(in_training, |snapshot| &snapshot.splats)
     }
 
     /// State for a checkpoint, without the running trial.
@@ -514,8 +649,11 @@ impl SplatTrials {
 
     /// Restores the state from a checkpoint.
     pub(crate) fn restore(&mut self, remaining_trials: RemainingTrials, finished: Vec<Trial>) {
-        self.trial_phase =
-            if remaining_trials.is_finished { SplatTrialPhase::Finished } else { SplatTrialPhase::Waiting };
+        self.trial_phase = if remaining_trials.is_finished {
+            SplatTrialPhase::Finished
+        } else {
+            SplatTrialPhase::Waiting
+        };
         self.candidates = remaining_trials.params.into();
         self.arrival_gains = remaining_trials.arrival_gains;
         (self.count, self.doubling) = (remaining_trials.count, remaining_trials.doubling);
@@ -536,9 +674,12 @@ impl SplatTrials {
 
     /// Removes a keyframe.
     pub(crate) fn remove(&mut self, is_removed: impl Fn(&Keyframe) -> bool) {
-        self.validation.retain(|validation| !is_removed(&validation.keyframe));
+        self.validation
+            .retain(|validation| !is_removed(&validation.keyframe));
         if let SplatTrialPhase::Running(trial) = &mut self.trial_phase {
-            trial.arrivals.retain(|arrival| !is_removed(&arrival.keyframe));
+            trial
+                .arrivals
+                .retain(|arrival| !is_removed(&arrival.keyframe));
             trial.deferred.retain(|keyframe| !is_removed(keyframe));
         }
     }
@@ -548,7 +689,10 @@ impl SplatTrials {
 mod tests {
     use super::*;
 
-    const HALVED: Candidate = Candidate::Halved { from: 20_000, to: 10_000 };
+    const HALVED: Candidate = Candidate::Halved {
+        from: 20_000,
+        to: 10_000,
+    };
     const CONTEXT: TrialContext = TrialContext {
         step: 0,
         n_splats: 5000,
@@ -564,12 +708,27 @@ mod tests {
 
     #[test]
     fn gain_must_exceed_its_standard_error() {
-        let trial = |variant: &[f64]| Trial::of(Candidate::Cameras(poses()), &[20.0, 22.0, 24.0, 21.0], variant);
+        let trial = |variant: &[f64]| {
+            Trial::of(
+                Candidate::Cameras(poses()),
+                &[20.0, 22.0, 24.0, 21.0],
+                variant,
+            )
+        };
         assert!(trial(&[20.5, 22.4, 24.6, 21.5]).kept);
-        assert!(!trial(&[20.03, 22.04, 24.02, 21.03]).kept, "significant, but too small");
-        assert!(!trial(&[23.0, 20.5, 25.5, 19.5]).kept, "large, but not significant");
+        assert!(
+            !trial(&[20.03, 22.04, 24.02, 21.03]).kept,
+            "significant, but too small"
+        );
+        assert!(
+            !trial(&[23.0, 20.5, 25.5, 19.5]).kept,
+            "large, but not significant"
+        );
         assert!(!trial(&[19.0, 21.0, 23.0, 20.0]).kept);
-        assert!(!Trial::of(Candidate::Cameras(poses()), &[20.0], &[25.0]).kept, "one image has no standard error");
+        assert!(
+            !Trial::of(Candidate::Cameras(poses()), &[20.0], &[25.0]).kept,
+            "one image has no standard error"
+        );
         let gain = trial(&[20.5, 22.5, 24.5, 21.5]);
         assert!((gain.gain_db - 0.5).abs() < 1e-12 && gain.standard_error_db < 1e-12);
     }
@@ -578,30 +737,60 @@ mod tests {
     fn reductions_with_small_loss_are_kept() {
         let trial = |variant: &[f64]| Trial::of(HALVED, &[20.0, 22.0, 24.0, 21.0], variant);
         assert!(trial(&[19.94, 21.95, 23.93, 20.94]).kept);
-        assert!(!trial(&[19.6, 22.1, 23.9, 21.1]).kept, "the mean is -0.075 dB, but the loss may be twice as large");
-        assert!(trial(&[20.5, 22.4, 24.6, 21.5]).kept, "a reduction may even improve the score");
+        assert!(
+            !trial(&[19.6, 22.1, 23.9, 21.1]).kept,
+            "the mean is -0.075 dB, but the loss may be twice as large"
+        );
+        assert!(
+            trial(&[20.5, 22.4, 24.6, 21.5]).kept,
+            "a reduction may even improve the score"
+        );
         assert!(!trial(&[19.8, 21.7, 23.8, 20.7]).kept);
-        assert!(!Trial::of(HALVED, &[20.0], &[20.0]).kept, "one image is not sufficient");
+        assert!(
+            !Trial::of(HALVED, &[20.0], &[20.0]).kept,
+            "one image is not sufficient"
+        );
         let report = trial(&[19.8, 21.7, 23.8, 20.7]).report();
-        assert!((report.gain_db - 0.25).abs() < 1e-12 && report.kept, "{report:?}");
+        assert!(
+            (report.gain_db - 0.25).abs() < 1e-12 && report.kept,
+            "{report:?}"
+        );
         assert!(!trial(&[19.94, 21.95, 23.93, 20.94]).report().kept);
     }
 
     #[test]
     fn no_trials_without_candidates() {
-        let trials = SplatTrials::new(&CameraRefinement::default(), CountPolicy::ToCap, TrialSteps::default());
+        let trials = SplatTrials::new(
+            &CameraRefinement::default(),
+            CountPolicy::ToCap,
+            TrialSteps::default(),
+        );
         assert!(!trials.holds_validation() && trials.may_grow(0));
-        assert_eq!(trials.due(TrialContext { step: 10_000, is_mature: true, ..CONTEXT }), Due::Nothing);
+        assert_eq!(
+            trials.due(TrialContext {
+                step: 10_000,
+                is_mature: true,
+                ..CONTEXT
+            }),
+            Due::Nothing
+        );
     }
 
     #[test]
     fn too_few_validation_images_are_released() {
         for count in [CountPolicy::ToCap, CountPolicy::Tested] {
-            let trials = SplatTrials::new(&CameraRefinement::Try(vec![poses()]), count, TrialSteps::default());
+            let trials = SplatTrials::new(
+                &CameraRefinement::Try(vec![poses()]),
+                count,
+                TrialSteps::default(),
+            );
             assert!(trials.holds_validation());
             let due = |step| trials.due(TrialContext { step, ..CONTEXT });
             assert_eq!(due(TrialSteps::default().first_trial), Due::Nothing);
-            assert_eq!(due(2 * TrialSteps::default().first_trial), Due::ReleaseValidation);
+            assert_eq!(
+                due(2 * TrialSteps::default().first_trial),
+                Due::ReleaseValidation
+            );
         }
     }
 
@@ -611,6 +800,9 @@ mod tests {
             SplatTrials::new(&cameras, CountPolicy::ToCap, TrialSteps::default()).watches_gains()
         };
         assert!(watches(CameraRefinement::AlwaysAndWatch(poses(), GAINS)));
-        assert!(!watches(CameraRefinement::AlwaysAndWatch(GAINS, poses())) && !watches(CameraRefinement::default()));
+        assert!(
+            !watches(CameraRefinement::AlwaysAndWatch(GAINS, poses()))
+                && !watches(CameraRefinement::default())
+        );
     }
 }

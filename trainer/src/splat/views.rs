@@ -45,7 +45,11 @@ pub(crate) struct Order {
 
 impl Order {
     pub(crate) fn new(seed: u64) -> Self {
-        Self { seed, round: 0, order: Vec::new() }
+        Self {
+            seed,
+            round: 0,
+            order: Vec::new(),
+        }
     }
 
     pub(crate) fn pick(&mut self, step: u64, n_views: usize) -> usize {
@@ -58,12 +62,16 @@ impl Order {
     }
 }
 
-/// Returns a random order. Source: Durstenfeld 1964, with the linear congruential generator of Knuth (MMIX).
+/// Returns a random order. Source: Durstenfeld 1964, with the linear congruential generator of
+/// Knuth (MMIX).
 fn shuffled(round: u64, n_views: usize, seed: u64) -> Vec<usize> {
     let mut order: Vec<usize> = (0..n_views).collect();
-    let mut state = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) ^ round.wrapping_mul(0xd134_2543_de82_ef95);
+    let mut state =
+        seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) ^ round.wrapping_mul(0xd134_2543_de82_ef95);
     for at in (1..n_views).rev() {
-        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        state = state
+            .wrapping_mul(6_364_136_223_846_793_005)
+            .wrapping_add(1_442_695_040_888_963_407);
         order.swap(at, ((state >> 33) % (at as u64 + 1)) as usize);
     }
     order
@@ -102,8 +110,9 @@ pub(crate) struct Keep<'a> {
 
 /// Removes images from the GPU and returns their buffers for reuse.
 ///
-/// First removes images coarser than [`Keep::coarsest`]. If the rest still exceeds `max_bytes`, removes the most
-/// recently used images, because every view is used once per round and the other images are therefore needed sooner.
+/// First removes images coarser than [`Keep::coarsest`]. If the rest still exceeds `max_bytes`,
+/// removes the most recently used images, because every view is used once per round and the other
+/// images are therefore needed sooner.
 pub(crate) fn drop_levels(views: &mut [TrainView], keep: Keep<'_>) -> Vec<Level> {
     let mut dropped = Vec::new();
     let mut candidates = Vec::new();
@@ -124,7 +133,8 @@ pub(crate) fn drop_levels(views: &mut [TrainView], keep: Keep<'_>) -> Vec<Level>
     }
     if bytes > keep.max_bytes {
         candidates.sort_unstable();
-        while let (true, Some((_, view_ix, level_ix))) = (bytes > keep.max_bytes, candidates.pop()) {
+        while let (true, Some((_, view_ix, level_ix))) = (bytes > keep.max_bytes, candidates.pop())
+        {
             if let Some(level) = views[view_ix].levels[level_ix].take() {
                 bytes -= level.bytes();
                 dropped.push(level);
@@ -150,8 +160,8 @@ impl TrainView {
         self.mean_srgb
     }
 
-    /// Replaces the camera by that of the same keyframe with other corrections. Uploaded images are kept unless the
-    /// correction changes them.
+    /// Replaces the camera by that of the same keyframe with other corrections. Uploaded images are
+    /// kept unless the correction changes them.
     pub(crate) fn replace_camera(&mut self, gpu: &Gpu, keyframe: Arc<Keyframe>) {
         let has_same_depth = has_same_depth(&self.keyframe, &keyframe);
         self.lens = None;
@@ -169,7 +179,11 @@ impl TrainView {
     }
 
     /// Allocates slots for the camera parameters of this view.
-    pub(crate) fn assign_lens(&mut self, gpu: &Gpu, cameras: &mut CameraParams) -> Result<(), Error> {
+    pub(crate) fn assign_lens(
+        &mut self,
+        gpu: &Gpu,
+        cameras: &mut CameraParams,
+    ) -> Result<(), Error> {
         if self.lens.is_none() {
             self.lens = Some(cameras.lens(gpu, &self.keyframe)?);
         }
@@ -178,7 +192,10 @@ impl TrainView {
 
     /// The lens, if any, and a level. The images of the level must be uploaded.
     pub(crate) fn ready_level(&self, level: usize) -> Result<(Option<&Buffer>, &Level), Error> {
-        Ok((self.lens.as_ref(), self.levels[level].as_ref().ok_or_else(not_uploaded)?))
+        Ok((
+            self.lens.as_ref(),
+            self.levels[level].as_ref().ok_or_else(not_uploaded)?,
+        ))
     }
 
     /// Returns `level`, or a finer level if a side of the image would be smaller than a tile.
@@ -208,7 +225,8 @@ impl TrainView {
         }
     }
 
-    /// Uploads the images of a level. `reused` is a dropped level of the same size whose buffers are overwritten.
+    /// Uploads the images of a level. `reused` is a dropped level of the same size whose buffers
+    /// are overwritten.
     pub(crate) fn upload(
         &mut self,
         gpu: &Gpu,
@@ -234,7 +252,10 @@ impl TrainView {
                 image: gpu.storage_with("splat.target_image", &images.image)?,
                 depth: match depth_bytes {
                     // New buffers are zeroed, which means unknown depth.
-                    [] => gpu.storage("splat.target_depth", 4 * u64::from(size_px[0]) * u64::from(size_px[1]))?,
+                    [] => gpu.storage(
+                        "splat.target_depth",
+                        4 * u64::from(size_px[0]) * u64::from(size_px[1]),
+                    )?,
                     _ => gpu.storage_with("splat.target_depth", depth_bytes)?,
                 },
                 used_at: 0,
@@ -244,7 +265,8 @@ impl TrainView {
     }
 }
 
-/// A keyframe at one resolution, in host memory. At full resolution, it shares the keyframe's pixels.
+/// A keyframe at one resolution, in host memory. At full resolution, it shares the keyframe's
+/// pixels.
 #[derive(Debug)]
 pub(crate) struct LevelImages {
     camera: Camera,
@@ -260,7 +282,11 @@ impl LevelImages {
             downscaled_image(keyframe, camera.size_px, level as u32),
             downscaled_depth(keyframe, camera.size_px, level as u32),
         );
-        Self { camera, image, depth_m }
+        Self {
+            camera,
+            image,
+            depth_m,
+        }
     }
 
     /// Required GPU memory of the images, bytes.
@@ -284,17 +310,20 @@ fn has_same_depth(a: &Keyframe, b: &Keyframe) -> bool {
     let is_same_frame = match (color_from_depth(a), color_from_depth(b)) {
         (Some(a), Some(b)) => {
             let rounding = a.inverse() * b;
-            rounding.translation.vector.norm() < MAX_ROUNDING && rounding.rotation.angle() < MAX_ROUNDING
+            rounding.translation.vector.norm() < MAX_ROUNDING
+                && rounding.rotation.angle() < MAX_ROUNDING
         }
         (a, b) => a.is_none() && b.is_none(),
     };
-    let is_same_lens = |a: &DepthMap, b: &DepthMap| a.focal_px == b.focal_px && a.principal_px == b.principal_px;
-    let has_same_readings = a
-        .depth
-        .as_ref()
-        .zip(b.depth.as_ref())
-        .is_none_or(|(a, b)| is_same_lens(a, b) && (Arc::ptr_eq(&a.depth_m, &b.depth_m) || a.depth_m == b.depth_m));
-    is_same_frame && has_same_readings && a.focal_px == b.focal_px && a.principal_px == b.principal_px
+    let is_same_lens =
+        |a: &DepthMap, b: &DepthMap| a.focal_px == b.focal_px && a.principal_px == b.principal_px;
+    let has_same_readings = a.depth.as_ref().zip(b.depth.as_ref()).is_none_or(|(a, b)| {
+        is_same_lens(a, b) && (Arc::ptr_eq(&a.depth_m, &b.depth_m) || a.depth_m == b.depth_m)
+    });
+    is_same_frame
+        && has_same_readings
+        && a.focal_px == b.focal_px
+        && a.principal_px == b.principal_px
 }
 
 /// The uncorrected camera of a keyframe.
@@ -317,9 +346,18 @@ pub(crate) fn camera_of(keyframe: &Keyframe) -> Camera {
 fn mean_srgb(keyframe: &Keyframe) -> Option<[f64; 3]> {
     const STRIDE: usize = 61; // A prime, so that the sample covers all columns.
     let (mut sums, mut n) = ([0.0; 3], 0.0);
-    for pixel in keyframe.rgba_srgb.as_chunks::<4>().0.iter().step_by(STRIDE).filter(|pixel| pixel[3] > 0) {
+    for pixel in keyframe
+        .rgba_srgb
+        .as_chunks::<4>()
+        .0
+        .iter()
+        .step_by(STRIDE)
+        .filter(|pixel| pixel[3] > 0)
+    {
         n += 1.0;
-        sums.iter_mut().zip(pixel).for_each(|(sum, color)| *sum += f64::from(*color) / 255.0);
+        sums.iter_mut()
+            .zip(pixel)
+            .for_each(|(sum, color)| *sum += f64::from(*color) / 255.0);
     }
     (n > 0.0).then(|| sums.map(|sum| sum / n))
 }
@@ -337,7 +375,10 @@ fn downscaled_image(keyframe: &Keyframe, size_px: [u32; 2], level: u32) -> Arc<[
             let mut sums = [0u32; 3];
             let mut is_visible = true;
             for row in y * edge..(y + 1) * edge {
-                for pixel in keyframe.rgba_srgb[4 * (row * width + x * edge)..].chunks_exact(4).take(edge) {
+                for pixel in keyframe.rgba_srgb[4 * (row * width + x * edge)..]
+                    .chunks_exact(4)
+                    .take(edge)
+                {
                     is_visible &= pixel[3] > 0;
                     for (sum, value) in sums.iter_mut().zip(pixel) {
                         *sum += u32::from(*value);
@@ -345,16 +386,17 @@ fn downscaled_image(keyframe: &Keyframe, size_px: [u32; 2], level: u32) -> Arc<[
                 }
             }
             let area = (edge * edge) as u32;
-            downscaled
-                .extend(sums.map(|sum| u8::try_from((sum + area / 2) / area).expect("a mean of bytes is a byte")));
+            downscaled.extend(sums.map(|sum| {
+                u8::try_from((sum + area / 2) / area).expect("a mean of bytes is a byte")
+            }));
             downscaled.push(if is_visible { 255 } else { 0 });
         }
     }
     downscaled.into()
 }
 
-/// Samples the depth at the center of each square, because averages would create surfaces between near and far objects.
-/// Returns an empty array for a keyframe without depth.
+/// Samples the depth at the center of each square, because averages would create surfaces between
+/// near and far objects. Returns an empty array for a keyframe without depth.
 fn downscaled_depth(keyframe: &Keyframe, size_px: [u32; 2], level: u32) -> Arc<[f32]> {
     let full = depth_in_color_view(keyframe);
     if full.is_empty() || level == 0 {
@@ -383,8 +425,14 @@ mod tests {
             for level in 0..8 {
                 let clamped = clamped(level, size_px);
                 let shorter_px = size_px[0].min(size_px[1]);
-                assert!(clamped == 0 || shorter_px >> clamped >= TILE_PX, "{size_px:?} at {level}");
-                assert!(clamped == level as usize || shorter_px >> (clamped + 1) < TILE_PX, "{size_px:?} at {level}");
+                assert!(
+                    clamped == 0 || shorter_px >> clamped >= TILE_PX,
+                    "{size_px:?} at {level}"
+                );
+                assert!(
+                    clamped == level as usize || shorter_px >> (clamped + 1) < TILE_PX,
+                    "{size_px:?} at {level}"
+                );
             }
         }
     }

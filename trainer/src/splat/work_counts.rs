@@ -18,7 +18,8 @@ pub struct WorkCounts {
     pub n_tiles: u64,
     /// Length of the longest tile list.
     pub longest_list: u64,
-    /// Maximum number of visible intersections in a tile; not necessarily the tile of `longest_list`.
+    /// Maximum number of visible intersections in a tile; not necessarily the tile of
+    /// `longest_list`.
     pub longest_visible: u64,
     /// Tiles that the largest splat touches.
     pub largest_splat: u64,
@@ -36,7 +37,8 @@ impl WorkCounts {
         let bin_starts: Vec<u32> = gpu.read(&scratch.bin_starts, n_bins(size_px) as usize + 1)?;
         let n_entries = bin_starts.last().copied().unwrap_or(0);
         let entries: Vec<[u32; 4]> = gpu.read(&scratch.entries, n_entries as usize)?;
-        // One past the last splat that contributes to each pixel, counted from the start of the bin's list.
+        // One past the last splat that contributes to each pixel, counted from the start of the
+        // bin's list.
         let last: Vec<u32> = gpu.read(&image_buffers.last, (size_px[0] * size_px[1]) as usize)?;
         let tile_counts: Vec<u32> = gpu.read(&scratch.tile_counts, n_splats as usize)?;
         let columns = size_px[0].div_ceil(TILE_PX);
@@ -56,7 +58,8 @@ impl WorkCounts {
             let bin = (row / 4 * bin_columns + column / 4) as usize;
             let mask = 1 << (row % 4 * 4 + column % 4);
             let list = &entries[bin_starts[bin] as usize..bin_starts[bin + 1] as usize];
-            let touching = |part: &[[u32; 4]]| part.iter().filter(|entry| entry[1] & mask != 0).count() as u64;
+            let touching =
+                |part: &[[u32; 4]]| part.iter().filter(|entry| entry[1] & mask != 0).count() as u64;
             let (n, n_visible) = (touching(list), touching(&list[..past_last as usize]));
             counts.n_intersections += n;
             counts.n_visible += n_visible;
@@ -69,7 +72,14 @@ impl WorkCounts {
 
 impl fmt::Display for WorkCounts {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { n_intersections, n_visible, n_tiles, longest_list, longest_visible, largest_splat } = self;
+        let Self {
+            n_intersections,
+            n_visible,
+            n_tiles,
+            longest_list,
+            longest_visible,
+            largest_splat,
+        } = self;
         let visible_percent = 100.0 * *n_visible as f64 / (*n_intersections).max(1) as f64;
         let mean_list = n_intersections / (*n_tiles).max(1);
         write!(

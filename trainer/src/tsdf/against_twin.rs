@@ -66,7 +66,8 @@ fn fused_voxels_match_twin() {
     compare(&got, &twin, &voxel_grid);
 }
 
-/// Fuses the keyframes one after the other, on the GPU and in the twin, which allocates the same blocks.
+/// Fuses the keyframes one after the other, on the GPU and in the twin, which allocates the same
+/// blocks.
 fn fused_with_twin(keyframes: &[Arc<Keyframe>]) -> (Blocks, VoxelBlocks, VoxelGrid) {
     let mut model = TsdfModel::new(test_gpu(), scenes::options()).unwrap();
     let mut twin = VoxelBlocks::new();
@@ -75,7 +76,8 @@ fn fused_with_twin(keyframes: &[Arc<Keyframe>]) -> (Blocks, VoxelBlocks, VoxelGr
         fuse_all(&mut model);
         let voxel_grid = model.voxel_grid().unwrap().clone();
         for block_coord in model.blocks().unwrap().into_keys() {
-            twin.entry(block_coord).or_insert_with(reference::unobserved);
+            twin.entry(block_coord)
+                .or_insert_with(reference::unobserved);
         }
         let readings = reference::readings(keyframe.depth.as_ref().unwrap(), &voxel_grid);
         reference::integrate(&mut twin, keyframe, &readings, &voxel_grid);
@@ -95,18 +97,26 @@ fn compare(got: &Blocks, twin: &VoxelBlocks, voxel_grid: &VoxelGrid) {
             n_observed += usize::from(expected.weight > 0.0);
             let mut is_equal = (weight - expected.weight).abs() <= 3.0
                 && (expected.weight == 0.0
-                    || (distance_m - expected.distance_m).abs() <= quantum_m + 1e-3 * expected.distance_m.abs());
+                    || (distance_m - expected.distance_m).abs()
+                        <= quantum_m + 1e-3 * expected.distance_m.abs());
             if let Some(color) = block.color_srgb(ix) {
                 n_colored += 1;
-                is_equal &= (0..3).all(|part| (color[part] - expected.color_srgb[part]).abs() <= COLOR_ABS);
+                is_equal &=
+                    (0..3).all(|part| (color[part] - expected.color_srgb[part]).abs() <= COLOR_ABS);
             } else {
                 is_equal &= expected.color_weight == 0.0;
             }
             n_off += usize::from(!is_equal);
         }
     }
-    assert!(n_observed > 50 * N_VOXELS && n_colored > 20 * N_VOXELS, "{n_observed} {n_colored}");
-    assert!((n_off as f64) < MAX_UNDECIDED_FRAC * n_observed as f64, "{n_off} of {n_observed} voxels differ");
+    assert!(
+        n_observed > 50 * N_VOXELS && n_colored > 20 * N_VOXELS,
+        "{n_observed} {n_colored}"
+    );
+    assert!(
+        (n_off as f64) < MAX_UNDECIDED_FRAC * n_observed as f64,
+        "{n_off} of {n_observed} voxels differ"
+    );
 }
 
 #[test]
@@ -147,7 +157,13 @@ fn pictures_match_twin() {
 fn pictures_without_erased_space_match_twin() {
     let mut edits = Edits::default();
     let world_from_box = scenes::look_at(Point3::new(0.3, -0.2, 0.3), Point3::new(1.0, 0.4, 0.6));
-    edits.push(Edit::Box(Aabb { world_from_box, min_m: [-0.2; 3], max_m: [0.2; 3] })).unwrap();
+    edits
+        .push(Edit::Box(Aabb {
+            world_from_box,
+            min_m: [-0.2; 3],
+            max_m: [0.2; 3],
+        }))
+        .unwrap();
     check_pictures(&Arc::new(edits), 1500);
 }
 
@@ -156,8 +172,13 @@ fn check_pictures(edits: &Arc<Edits>, min_hits: usize) {
     let keyframes = scene();
     let (blocks, voxel_grid, mut model) = fused(&keyframes);
     let pose = scenes::look_at(Point3::new(1.3, 0.4, 0.6), Point3::new(0.3, -0.2, 0.1));
-    let picture =
-        model.render(&RenderRequest { far_m: 3.0, edits: Arc::clone(edits), ..scenes::request(pose) }).unwrap();
+    let picture = model
+        .render(&RenderRequest {
+            far_m: 3.0,
+            edits: Arc::clone(edits),
+            ..scenes::request(pose)
+        })
+        .unwrap();
     let (mut n_hits, mut n_off) = (0_usize, 0_usize);
     let mut mismatches = Mismatches::default();
     for (ix, ray) in rays(&pose, &voxel_grid).iter().enumerate() {
@@ -166,8 +187,9 @@ fn check_pictures(edits: &Arc<Edits>, min_hits: usize) {
         n_hits += usize::from(hit.is_some());
         let rgba = &picture.rgba_srgb[4 * ix..4 * ix + 4];
         assert_eq!(rgba[3] == 255, got > 0.0);
-        let Some(hit) = hit.filter(|hit| got > 0.0 && (f64::from(got) - hit.depth_m).abs() < 0.2 * voxel_grid.voxel_m)
-        else {
+        let Some(hit) = hit.filter(|hit| {
+            got > 0.0 && (f64::from(got) - hit.depth_m).abs() < 0.2 * voxel_grid.voxel_m
+        }) else {
             n_off += usize::from(hit.is_some() || got > 0.0);
             continue;
         };
@@ -176,7 +198,10 @@ fn check_pictures(edits: &Arc<Edits>, min_hits: usize) {
         }
     }
     assert!(n_hits > min_hits, "{n_hits}");
-    assert!((n_off as f64) < 0.01 * n_hits as f64, "{n_off} of {n_hits} pixels differ");
+    assert!(
+        (n_off as f64) < 0.01 * n_hits as f64,
+        "{n_off} of {n_hits} pixels differ"
+    );
     mismatches.assert_none();
 }
 
@@ -189,20 +214,53 @@ fn readings_match_twin() {
     let depth = keyframe.depth.as_ref().unwrap();
     let gpu = test_gpu();
     let voxel_grid = VoxelGrid::choose(&scenes::options().specific, None, depth).unwrap();
-    let field = FieldBuffers::new(&gpu, &voxel_grid, Capacity { n_blocks: 2048, n_chunks: 256 }).unwrap();
+    let field = FieldBuffers::new(
+        &gpu,
+        &voxel_grid,
+        Capacity {
+            n_blocks: 2048,
+            n_chunks: 256,
+        },
+    )
+    .unwrap();
     assert_eq!(field.field.bytes(), size_of::<Field>() as u64);
     let n = depth.depth_m.len();
-    let mut slot = KeyframeSlot::new(&gpu, n as u64, u64::from(keyframe.size_px[0] * keyframe.size_px[1])).unwrap();
-    slot.upload(&gpu, keyframe, &DepthView::of(keyframe, &voxel_grid).unwrap());
+    let mut slot = KeyframeSlot::new(
+        &gpu,
+        n as u64,
+        u64::from(keyframe.size_px[0] * keyframe.size_px[1]),
+    )
+    .unwrap();
+    slot.upload(
+        &gpu,
+        keyframe,
+        &DepthView::of(keyframe, &voxel_grid).unwrap(),
+    );
     let mut list = crate::gpu::Passes::default();
     let pipelines = Pipelines::new(&gpu).unwrap();
     super::passes::fuse(&gpu, &mut list, &pipelines, &field, &slot);
     list.submit(&gpu);
     let got: Vec<[f32; 2]> = gpu.read(slot.readings(), n).unwrap();
     let mut mismatches = Mismatches::default();
-    for (ix, (got, expected)) in got.iter().zip(reference::readings(depth, &voxel_grid)).enumerate() {
-        mismatches.check(format!("depth {ix}"), got[0].into(), expected.depth_m, 1e-9, 1e-6);
-        mismatches.check(format!("ray_dot_normal {ix}"), got[1].into(), expected.ray_dot_normal, 2e-4, 1e-4);
+    for (ix, (got, expected)) in got
+        .iter()
+        .zip(reference::readings(depth, &voxel_grid))
+        .enumerate()
+    {
+        mismatches.check(
+            format!("depth {ix}"),
+            got[0].into(),
+            expected.depth_m,
+            1e-9,
+            1e-6,
+        );
+        mismatches.check(
+            format!("ray_dot_normal {ix}"),
+            got[1].into(),
+            expected.ray_dot_normal,
+            2e-4,
+            1e-4,
+        );
     }
     mismatches.assert_none();
 }
@@ -211,15 +269,37 @@ fn readings_match_twin() {
 fn non_finite_depth_is_ignored() {
     let finite = scene();
     let mut non_finite = finite.clone();
-    let bad_values = [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, -1.0, 1e30, f32::MIN_POSITIVE, -0.0];
+    let bad_values = [
+        f32::NAN,
+        f32::INFINITY,
+        f32::NEG_INFINITY,
+        -1.0,
+        1e30,
+        f32::MIN_POSITIVE,
+        -0.0,
+    ];
     let replace_depth = |keyframe: &mut Arc<Keyframe>, fill: &dyn Fn(usize, f32) -> f32| {
         let depth = Arc::make_mut(keyframe).depth.as_mut().unwrap();
-        depth.depth_m = depth.depth_m.iter().enumerate().map(|(ix, z)| fill(ix, *z)).collect::<Vec<_>>().into();
+        depth.depth_m = depth
+            .depth_m
+            .iter()
+            .enumerate()
+            .map(|(ix, z)| fill(ix, *z))
+            .collect::<Vec<_>>()
+            .into();
     };
     // Holes in one copy, non-finite values at the same pixels in the other.
     let mut with_holes = finite.clone();
-    replace_depth(&mut with_holes[1], &|ix, z| if ix % 11 == 3 { 0.0 } else { z });
-    replace_depth(&mut non_finite[1], &|ix, z| if ix % 11 == 3 { bad_values[ix % bad_values.len()] } else { z });
+    replace_depth(&mut with_holes[1], &|ix, z| {
+        if ix % 11 == 3 { 0.0 } else { z }
+    });
+    replace_depth(&mut non_finite[1], &|ix, z| {
+        if ix % 11 == 3 {
+            bad_values[ix % bad_values.len()]
+        } else {
+            z
+        }
+    });
     let expected = fused(&with_holes).0;
     assert!(fused(&non_finite).0 == expected);
     let all_non_finite: Vec<_> = non_finite
@@ -253,24 +333,56 @@ fn edge_of(vertex: &Vertex) -> u32 {
 }
 
 /// Records all differences between a block's triangles and its twin's.
-fn compare_triangles(mismatches: &mut Mismatches, block_coord: GridCoord, got: &BlockMesh, twin: &BlockTriangles) {
+fn compare_triangles(
+    mismatches: &mut Mismatches,
+    block_coord: GridCoord,
+    got: &BlockMesh,
+    twin: &BlockTriangles,
+) {
     let edges = |corners: &[u32; 3]| corners.map(|ix| got.vertices[ix as usize].edge);
     let got_edges: Vec<_> = got.triangles.iter().map(edges).collect();
-    let twin_edges: Vec<_> = twin.triangles.iter().map(|ixs| ixs.map(|ix| edge_of(&twin.vertices[ix]))).collect();
+    let twin_edges: Vec<_> = twin
+        .triangles
+        .iter()
+        .map(|ixs| ixs.map(|ix| edge_of(&twin.vertices[ix])))
+        .collect();
     assert_eq!(got_edges, twin_edges, "{block_coord:?}");
     assert_eq!(got.vertices.len(), twin.vertices.len(), "{block_coord:?}");
-    let by_edge: BTreeMap<u32, &MeshVertex> = got.vertices.iter().map(|vertex| (vertex.edge, vertex)).collect();
+    let by_edge: BTreeMap<u32, &MeshVertex> = got
+        .vertices
+        .iter()
+        .map(|vertex| (vertex.edge, vertex))
+        .collect();
     for expected in &twin.vertices {
         let vertex = by_edge[&edge_of(expected)];
         let color = vertex.color.to_le_bytes();
         let normal = unit_of(vertex.normal);
         for axis in 0..3 {
-            let label = |what: &str| format!("{what} {axis} at {block_coord:?} {:?}", expected.between);
+            let label =
+                |what: &str| format!("{what} {axis} at {block_coord:?} {:?}", expected.between);
             let along_m = f64::from(vertex.position_m[axis]);
-            mismatches.check(label("position"), along_m, expected.position_m[axis], POSITION_ABS_M, 0.0);
-            mismatches.check(label("normal"), f64::from(normal[axis]), expected.normal[axis], NORMAL_ABS, 0.0);
+            mismatches.check(
+                label("position"),
+                along_m,
+                expected.position_m[axis],
+                POSITION_ABS_M,
+                0.0,
+            );
+            mismatches.check(
+                label("normal"),
+                f64::from(normal[axis]),
+                expected.normal[axis],
+                NORMAL_ABS,
+                0.0,
+            );
             let part = f64::from(color[axis]) / 255.0;
-            mismatches.check(label("color"), part, expected.color_srgb[axis], MESH_COLOR_ABS, 0.0);
+            mismatches.check(
+                label("color"),
+                part,
+                expected.color_srgb[axis],
+                MESH_COLOR_ABS,
+                0.0,
+            );
         }
     }
 }
@@ -278,16 +390,35 @@ fn compare_triangles(mismatches: &mut Mismatches, block_coord: GridCoord, got: &
 #[test]
 fn triangles_match_twin() {
     // The second capacity processes a few blocks at a time and must grow first.
-    let capacities = [MeshCapacity::default(), MeshCapacity { n_blocks: 100, n_vertices: 1, n_triangles: 1 }];
+    let capacities = [
+        MeshCapacity::default(),
+        MeshCapacity {
+            n_blocks: 100,
+            n_vertices: 1,
+            n_triangles: 1,
+        },
+    ];
     for mesh_capacity in capacities {
         let (blocks, voxel_grid, _) = fused(&scene());
         let gpu = test_gpu();
         let pipelines = Pipelines::new(&gpu).unwrap();
-        let capacity = Capacity { n_blocks: 1, n_chunks: 64 };
-        let field = FieldBuffers::with_blocks(&gpu, &pipelines, &voxel_grid, &blocks, capacity).unwrap();
+        let capacity = Capacity {
+            n_blocks: 1,
+            n_chunks: 64,
+        };
+        let field =
+            FieldBuffers::with_blocks(&gpu, &pipelines, &voxel_grid, &blocks, capacity).unwrap();
         let mut buffers = MeshBuffers::new(&gpu, mesh_capacity, field.capacity.n_blocks).unwrap();
-        assert!(buffers.mesh_changed(&gpu, &pipelines, &field).unwrap().is_empty(), "nothing changed");
-        field.set_changed(&gpu, &blocks.keys().copied().collect()).unwrap();
+        assert!(
+            buffers
+                .mesh_changed(&gpu, &pipelines, &field)
+                .unwrap()
+                .is_empty(),
+            "nothing changed"
+        );
+        field
+            .set_changed(&gpu, &blocks.keys().copied().collect())
+            .unwrap();
         let made = buffers.mesh_changed(&gpu, &pipelines, &field).unwrap();
         let done: BTreeSet<GridCoord> = made.iter().map(|(block_coord, _)| *block_coord).collect();
         assert!(made.len() == blocks.len() && done.into_iter().eq(blocks.keys().copied()));
@@ -300,7 +431,12 @@ fn triangles_match_twin() {
                 &reference::march(&blocks, *block_coord, voxel_grid.voxel_m),
             );
         }
-        assert!(made.iter().map(|(_, mesh)| mesh.triangles.len()).sum::<usize>() > 5000);
+        assert!(
+            made.iter()
+                .map(|(_, mesh)| mesh.triangles.len())
+                .sum::<usize>()
+                > 5000
+        );
         mismatches.assert_none();
     }
 }

@@ -1,5 +1,8 @@
 //! Blocks of 8x8x8 voxels on the host, and the format of their words.
-#![expect(clippy::cast_possible_truncation, reason = "words are split on purpose")]
+#![expect(
+    clippy::cast_possible_truncation,
+    reason = "words are split on purpose"
+)]
 
 use std::collections::BTreeMap;
 
@@ -10,7 +13,8 @@ pub const N_VOXELS: usize = 512;
 /// Weight of one observation, from 1 m, of a surface that faces the camera.
 pub const WEIGHT_ONE: f64 = 256.0;
 
-/// Coordinates of a block in blocks, or of a voxel in voxels, relative to the field's anchor along the world's axes.
+/// Coordinates of a block in blocks, or of a voxel in voxels, relative to the field's anchor along
+/// the world's axes.
 pub type GridCoord = [i32; 3];
 
 /// Blocks ordered by their coordinates.
@@ -19,17 +23,21 @@ pub type Blocks = BTreeMap<GridCoord, Block>;
 /// The voxels of one block in the format of the GPU, x fastest.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Block {
-    /// Low half: signed distance as a fraction of the field's scale, times 32767; high half: weight in 256ths, 0 if not
-    /// observed.
+    /// Low half: signed distance as a fraction of the field's scale, times 32767; high half: weight
+    /// in 256ths, 0 if not observed.
     pub geometry: Vec<u32>,
-    /// 16 bits each, low half first: red, green; blue, weight in 256ths. Colors are scaled by 65535.
+    /// 16 bits each, low half first: red, green; blue, weight in 256ths. Colors are scaled by
+    /// 65535.
     pub colors: Vec<[u32; 2]>,
 }
 
 impl Block {
     /// A block of voxels that were never observed.
     pub fn unobserved() -> Self {
-        Self { geometry: vec![0; N_VOXELS], colors: vec![[0; 2]; N_VOXELS] }
+        Self {
+            geometry: vec![0; N_VOXELS],
+            colors: vec![[0; 2]; N_VOXELS],
+        }
     }
 
     /// Distance as a fraction of the field's scale; `None` if the voxel was not observed.
@@ -41,7 +49,8 @@ impl Block {
     /// Color, sRGB 0 to 1; `None` if the voxel has none.
     pub fn color_srgb(&self, voxel_ix: usize) -> Option<[f64; 3]> {
         let [low, high] = self.colors[voxel_ix];
-        (high >> 16 != 0).then(|| [low & 0xffff, low >> 16, high & 0xffff].map(|part| f64::from(part) / 65535.0))
+        (high >> 16 != 0)
+            .then(|| [low & 0xffff, low >> 16, high & 0xffff].map(|part| f64::from(part) / 65535.0))
     }
 }
 

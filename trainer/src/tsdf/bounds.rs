@@ -5,9 +5,14 @@ use super::chosen_grid::VoxelGrid;
 use crate::Bounds;
 
 /// Bounds around the blocks of a field; `None` without blocks.
-pub(super) fn bounds<'a>(blocks: impl Iterator<Item = &'a GridCoord>, voxel_grid: &VoxelGrid) -> Option<Bounds> {
+pub(super) fn bounds<'a>(
+    blocks: impl Iterator<Item = &'a GridCoord>,
+    voxel_grid: &VoxelGrid,
+) -> Option<Bounds> {
     let center = |block: &GridCoord| {
-        let coordinate = |axis: usize| (f64::from(block[axis]) + 0.5) * f64::from(BLOCK_EDGE) * voxel_grid.voxel_m;
+        let coordinate = |axis: usize| {
+            (f64::from(block[axis]) + 0.5) * f64::from(BLOCK_EDGE) * voxel_grid.voxel_m
+        };
         [0, 1, 2].map(|axis| voxel_grid.anchor_m[axis] + coordinate(axis))
     };
     Bounds::of_points(&blocks.map(center).collect::<Vec<_>>())

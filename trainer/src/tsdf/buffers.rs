@@ -25,7 +25,11 @@ pub(crate) struct FieldBuffers {
 
 impl FieldBuffers {
     /// An empty field.
-    pub(crate) fn new(gpu: &Gpu, voxel_grid: &VoxelGrid, capacity: Capacity) -> Result<Self, Error> {
+    pub(crate) fn new(
+        gpu: &Gpu,
+        voxel_grid: &VoxelGrid,
+        capacity: Capacity,
+    ) -> Result<Self, Error> {
         let n = u64::from(capacity.n_blocks);
         let field = Field::new(voxel_grid, capacity.n_chunks, capacity.n_blocks);
         Ok(Self {
@@ -82,9 +86,16 @@ impl FieldBuffers {
     }
 
     /// Marks exactly these blocks as changed.
-    pub(crate) fn set_changed(&self, gpu: &Gpu, changed: &BTreeSet<GridCoord>) -> Result<(), Error> {
-        let flags: Vec<u32> =
-            self.block_coords(gpu)?.iter().map(|block_coord| u32::from(changed.contains(block_coord))).collect();
+    pub(crate) fn set_changed(
+        &self,
+        gpu: &Gpu,
+        changed: &BTreeSet<GridCoord>,
+    ) -> Result<(), Error> {
+        let flags: Vec<u32> = self
+            .block_coords(gpu)?
+            .iter()
+            .map(|block_coord| u32::from(changed.contains(block_coord)))
+            .collect();
         gpu.write(&self.changed, 0, bytemuck::cast_slice(&flags));
         Ok(())
     }

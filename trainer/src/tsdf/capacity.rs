@@ -3,7 +3,8 @@
 use super::block::N_VOXELS;
 use crate::gpu::Gpu;
 
-/// Bytes per block on the GPU: distances, colors, coordinates, and the flags `changed` and `visible`.
+/// Bytes per block on the GPU: distances, colors, coordinates, and the flags `changed` and
+/// `visible`.
 pub(crate) const BYTES_PER_BLOCK: u64 = 512 * (4 + 8) + 16 + 4 + 4;
 /// Bytes per chunk: a key and the slots of its blocks.
 pub(crate) const BYTES_PER_CHUNK: u64 = 4 + 4 * 512;
@@ -18,12 +19,19 @@ pub(crate) struct Capacity {
 
 /// Maximum number of blocks that the adapter can bind.
 pub(crate) fn max_blocks(gpu: &Gpu) -> u32 {
-    u32::try_from(gpu.max_binding_bytes() / (8 * N_VOXELS as u64)).unwrap_or(u32::MAX).max(1)
+    u32::try_from(gpu.max_binding_bytes() / (8 * N_VOXELS as u64))
+        .unwrap_or(u32::MAX)
+        .max(1)
 }
 
-/// Maximum number of blocks that the adapter can bind and that fit into `max_bytes` together with the table.
+/// Maximum number of blocks that the adapter can bind and that fit into `max_bytes` together with
+/// the table.
 pub(crate) fn max_blocks_within(gpu: &Gpu, max_bytes: Option<u64>, n_chunks: u32) -> u32 {
     let table_bytes = u64::from(n_chunks) * BYTES_PER_CHUNK;
-    let by_bytes = max_bytes.map_or(u64::MAX, |bytes| bytes.saturating_sub(table_bytes) / BYTES_PER_BLOCK);
-    max_blocks(gpu).min(u32::try_from(by_bytes).unwrap_or(u32::MAX)).max(1)
+    let by_bytes = max_bytes.map_or(u64::MAX, |bytes| {
+        bytes.saturating_sub(table_bytes) / BYTES_PER_BLOCK
+    });
+    max_blocks(gpu)
+        .min(u32::try_from(by_bytes).unwrap_or(u32::MAX))
+        .max(1)
 }

@@ -15,8 +15,8 @@ const VOXEL_RANGE_M: [f64; 2] = [0.001, 0.2];
 const TRUNCATION_VOXELS: f64 = 4.0;
 /// Maximum factor by which depth noise increases the truncation.
 const MAX_TRUNCATION_FACTOR: f64 = 4.0;
-/// Fraction of `max_bytes` that the surface in one image may take when the voxel size is chosen. The scene is larger
-/// than one image.
+/// Fraction of `max_bytes` that the surface in one image may take when the voxel size is chosen.
+/// The scene is larger than one image.
 const ONE_IMAGE_FRAC: f64 = 0.1;
 
 /// Voxel size and related settings of a field.
@@ -35,37 +35,54 @@ pub struct VoxelGrid {
     pub max_depth_m: f64,
     /// Maximum weight of a voxel, in 256ths.
     pub max_weight: u32,
-    /// Origin of the field's coordinates, in world, meters. It is near the first camera, where f32 is precise.
+    /// Origin of the field's coordinates, in world, meters. It is near the first camera, where f32
+    /// is precise.
     pub anchor_m: [f64; 3],
 }
 
 impl VoxelGrid {
-    /// Chooses the settings that the options leave open, based on the first depth image. Returns `None` if the image
-    /// has no valid readings.
+    /// Chooses the settings that the options leave open, based on the first depth image. Returns
+    /// `None` if the image has no valid readings.
     ///
-    /// The voxel size is the size of a pixel at the median depth, but at least the noise there, and large enough that
-    /// the surface in this image takes at most a tenth of `max_bytes`. Noise is the deviation of depth from a plane
-    /// through its neighbors: the 90th percentile of `|z[-1] - 2 z[0] + z[1]|`, divided by `1.6449 sqrt(6)`. The median
-    /// would be 0 for sensors that report depth in discrete steps.
-    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a weight is clamped to 16 bits")]
+    /// The voxel size is the size of a pixel at the median depth, but at least the noise there, and
+    /// large enough that the surface in this image takes at most a tenth of `max_bytes`. Noise is
+    /// the deviation of depth from a plane through its neighbors: the 90th percentile of `|z[-1] -
+    /// 2 z[0] + z[1]|`, divided by `1.6449 sqrt(6)`. The median would be 0 for sensors that report
+    /// depth in discrete steps.
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "a weight is clamped to 16 bits"
+    )]
     pub fn choose(options: &TsdfOptions, max_bytes: Option<u64>, depth: &DepthMap) -> Option<Self> {
         let mut depths: Vec<f64> = valid_depths(options, depth).map(|(_, z)| z).collect();
         let n_valid = depths.len();
         let median_m = quantile(&mut depths, 0.5, Rank::Upper)?;
-        let noise_per_m2 = positive(options.noise_per_m2).unwrap_or_else(|| noise_per_m2(options, depth));
+        let noise_per_m2 =
+            positive(options.noise_per_m2).unwrap_or_else(|| noise_per_m2(options, depth));
         let px_m = median_m / (0.5 * (depth.focal_px[0] + depth.focal_px[1]));
         let by_noise_m = noise_per_m2 * median_m * median_m;
-        // A surface of n pixels has n (px / voxel)^2 voxels, and its truncation band has about a 16th as many blocks.
+        // A surface of n pixels has n (px / voxel)^2 voxels, and its truncation band has about a
+        // 16th as many blocks.
         let area_m2 = n_valid as f64 * px_m * px_m;
         let by_bytes_m = max_bytes.map_or(0.0, |bytes| {
             let n_blocks = ONE_IMAGE_FRAC * bytes as f64 / BYTES_PER_BLOCK as f64;
             (area_m2 / (16.0 * n_blocks.max(1.0))).sqrt()
         });
-        let chosen_grid = px_m.max(by_noise_m).max(by_bytes_m).clamp(VOXEL_RANGE_M[0], VOXEL_RANGE_M[1]);
+        let chosen_grid = px_m
+            .max(by_noise_m)
+            .max(by_bytes_m)
+            .clamp(VOXEL_RANGE_M[0], VOXEL_RANGE_M[1]);
         let voxel_m = positive(options.voxel_m).unwrap_or_else(|| (chosen_grid * 2e3).ceil() / 2e3);
-        let truncation_m = positive(options.truncation_m).unwrap_or(TRUNCATION_VOXELS * voxel_m).max(2.0 * voxel_m);
+        let truncation_m = positive(options.truncation_m)
+            .unwrap_or(TRUNCATION_VOXELS * voxel_m)
+            .max(2.0 * voxel_m);
         let chunk_m = 64.0 * voxel_m;
-        let anchor = depth.world_from_camera.translation.vector.map(|along| (along / chunk_m).round() * chunk_m);
+        let anchor = depth
+            .world_from_camera
+            .translation
+            .vector
+            .map(|along| (along / chunk_m).round() * chunk_m);
         let voxel_grid = Self {
             voxel_m,
             truncation_m,
@@ -101,15 +118,23 @@ fn positive(given: Option<f64>) -> Option<f64> {
 }
 
 /// Index and depth of the valid pixels.
-fn valid_depths<'a>(options: &'a TsdfOptions, depth: &'a DepthMap) -> impl Iterator<Item = (usize, f64)> + 'a {
+fn valid_depths<'a>(
+    options: &'a TsdfOptions,
+    depth: &'a DepthMap,
+) -> impl Iterator<Item = (usize, f64)> + 'a {
     let depths = depth.depth_m.iter().map(|z| f64::from(*z)).enumerate();
     depths.filter(|(_, z)| *z > 0.01 && *z <= options.max_depth_m)
 }
 
 fn noise_per_m2(options: &TsdfOptions, depth: &DepthMap) -> f64 {
     let width = depth.size_px[0] as usize;
-    let at =
-        |ix: usize| depth.depth_m.get(ix).map(|z| f64::from(*z)).filter(|z| *z > 0.01 && *z <= options.max_depth_m);
+    let at = |ix: usize| {
+        depth
+            .depth_m
+            .get(ix)
+            .map(|z| f64::from(*z))
+            .filter(|z| *z > 0.01 && *z <= options.max_depth_m)
+    };
     let mut second_differences: Vec<f64> = valid_depths(options, depth)
         .filter(|(ix, _)| ix % width > 0 && ix % width + 1 < width)
         .filter_map(|(ix, z)| Some((at(ix - 1)? - 2.0 * z + at(ix + 1)?).abs() / (z * z)))

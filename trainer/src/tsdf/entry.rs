@@ -58,13 +58,19 @@ fn resume(
     keyframes: &[Arc<Keyframe>],
     placeholders: &[Arc<Keyframe>],
 ) -> Result<ResumedModel, Error> {
-    Aligned::resume(checkpoint, keyframes, placeholders, |own_checkpoint, keyframes| {
-        TsdfModel::resume(gpu, own_checkpoint, keyframes)
-    })
+    Aligned::resume(
+        checkpoint,
+        keyframes,
+        placeholders,
+        |own_checkpoint, keyframes| TsdfModel::resume(gpu, own_checkpoint, keyframes),
+    )
 }
 
 fn load(gpu: Arc<Gpu>, folder: &Path) -> Result<Box<dyn Method>, Error> {
-    Ok(Box::new(Aligned::load(TsdfModel::load(gpu, folder)?, folder)?))
+    Ok(Box::new(Aligned::load(
+        TsdfModel::load(gpu, folder)?,
+        folder,
+    )?))
 }
 
 /// Extracts the mesh from the voxels and writes it.
@@ -74,14 +80,26 @@ fn export(
     write: fn(&Path, &Mesh) -> Result<(), Error>,
 ) -> Result<Exported, Error> {
     let mesh = TsdfModel::load(gpu, request.model)?.mesh_without(&Edits::read(request.model)?)?;
-    let simplified = request.cell_m.map(|cell_m| (cell_m, mesh.clustered(cell_m)));
+    let simplified = request
+        .cell_m
+        .map(|cell_m| (cell_m, mesh.clustered(cell_m)));
     if let Some((cell_m, simplified)) = &simplified
         && simplified.triangles.is_empty()
     {
         return Err(Error::EmptyMesh { cell_m: *cell_m });
     }
-    let written = simplified.as_ref().map_or(&mesh, |(_, simplified)| simplified);
+    let written = simplified
+        .as_ref()
+        .map_or(&mesh, |(_, simplified)| simplified);
     write(request.out, written)?;
-    let detail = if simplified.is_some() { format!("instead of {}", mesh.triangles.len()) } else { String::new() };
-    Ok(Exported { n_items: written.triangles.len() as u64, item: "triangle", detail })
+    let detail = if simplified.is_some() {
+        format!("instead of {}", mesh.triangles.len())
+    } else {
+        String::new()
+    };
+    Ok(Exported {
+        n_items: written.triangles.len() as u64,
+        item: "triangle",
+        detail,
+    })
 }

@@ -5,7 +5,10 @@ use crate::gpu::{Gpu, Kernel, Pipeline, Source};
 
 macro_rules! source {
     ($name:literal) => {
-        Source { name: $name, text: include_str!(concat!("../shared/", $name, ".wgsl")) }
+        Source {
+            name: $name,
+            text: include_str!(concat!("../shared/", $name, ".wgsl")),
+        }
     };
 }
 
@@ -26,7 +29,13 @@ const SHARED: &[Source] = &[
 
 macro_rules! kernel {
     ($name:literal) => {
-        Kernel { source: Source { name: $name, text: include_str!(concat!($name, ".wgsl")) }, shared: SHARED }
+        Kernel {
+            source: Source {
+                name: $name,
+                text: include_str!(concat!($name, ".wgsl")),
+            },
+            shared: SHARED,
+        }
     };
 }
 
@@ -89,7 +98,16 @@ mod tests {
         assert_layout!(
             KERNELS,
             Field,
-            [voxel_m, truncation_m, scale_m, noise_per_m2, max_depth_m, max_weight, n_chunk_slots, n_block_slots]
+            [
+                voxel_m,
+                truncation_m,
+                scale_m,
+                noise_per_m2,
+                max_depth_m,
+                max_weight,
+                n_chunk_slots,
+                n_block_slots
+            ]
         );
         assert_layout!(
             KERNELS,
@@ -114,7 +132,17 @@ mod tests {
         );
         assert_layout!(KERNELS, Backdrop, [srgb]);
         assert_layout!(KERNELS, MeshBatch, [first, max_blocks]);
-        assert_layout!(KERNELS, BlockMeshRange, [block_coord, first_vertex, n_vertices, first_triangle, n_triangles]);
+        assert_layout!(
+            KERNELS,
+            BlockMeshRange,
+            [
+                block_coord,
+                first_vertex,
+                n_vertices,
+                first_triangle,
+                n_triangles
+            ]
+        );
         assert_layout!(KERNELS, MeshVertex, [position_m, edge, normal, color]);
         assert_eq!(layout_in_wgsl(KERNELS, "View").1, size_of::<View>());
     }

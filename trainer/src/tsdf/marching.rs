@@ -32,7 +32,11 @@ impl MeshBuffers {
         field: &FieldBuffers,
         slots: &[u32],
     ) -> Result<Vec<(GridCoord, BlockMesh)>, Error> {
-        gpu.write(&self.stale, 0, bytemuck::bytes_of(&u32::try_from(slots.len()).unwrap_or(u32::MAX)));
+        gpu.write(
+            &self.stale,
+            0,
+            bytemuck::bytes_of(&u32::try_from(slots.len()).unwrap_or(u32::MAX)),
+        );
         gpu.write(&self.stale, 4, bytemuck::cast_slice(slots));
         self.mesh_listed(gpu, pipelines, field)
     }
@@ -44,7 +48,14 @@ impl MeshBuffers {
         pipelines: &Pipelines,
         field: &FieldBuffers,
     ) -> Result<Vec<PassTiming>, Error> {
-        gpu.write(&self.batch, 0, bytemuck::bytes_of(&MeshBatch { first: 0, max_blocks: self.mesh_capacity.n_blocks }));
+        gpu.write(
+            &self.batch,
+            0,
+            bytemuck::bytes_of(&MeshBatch {
+                first: 0,
+                max_blocks: self.mesh_capacity.n_blocks,
+            }),
+        );
         let mut list = Passes::default();
         passes::list_stale(gpu, &mut list, pipelines, field, self);
         passes::march(gpu, &mut list, pipelines, field, self);
@@ -63,7 +74,10 @@ impl MeshBuffers {
             gpu.write(
                 &self.batch,
                 0,
-                bytemuck::bytes_of(&MeshBatch { first, max_blocks: self.mesh_capacity.n_blocks }),
+                bytemuck::bytes_of(&MeshBatch {
+                    first,
+                    max_blocks: self.mesh_capacity.n_blocks,
+                }),
             );
             let mut list = Passes::default();
             passes::march(gpu, &mut list, pipelines, field, self);
@@ -71,11 +85,15 @@ impl MeshBuffers {
             let n_stale = gpu.begin_read(&self.stale, 1);
             let needed: Vec<u32> = gpu.read(&self.needed, N_NEEDED)?;
             let n_stale = n_stale.finish::<u32>(gpu)?[0];
-            if needed[0] > self.mesh_capacity.n_vertices || needed[1] > self.mesh_capacity.n_triangles {
+            if needed[0] > self.mesh_capacity.n_vertices
+                || needed[1] > self.mesh_capacity.n_triangles
+            {
                 self.grow(gpu, &needed)?;
                 continue;
             }
-            let n_done = n_stale.saturating_sub(first).min(self.mesh_capacity.n_blocks);
+            let n_done = n_stale
+                .saturating_sub(first)
+                .min(self.mesh_capacity.n_blocks);
             self.read_back(gpu, n_done as usize, &needed, &mut block_meshes)?;
             first += n_done;
             if first >= n_stale {
@@ -90,7 +108,10 @@ impl MeshBuffers {
         self.mesh_capacity.n_triangles = self.mesh_capacity.n_triangles.max(n_triangles);
         let n_bytes = size_of::<MeshVertex>() as u64 * u64::from(self.mesh_capacity.n_vertices);
         self.vertices = gpu.storage("tsdf.mesh.vertices", n_bytes)?;
-        self.triangles = gpu.storage("tsdf.mesh.triangles", 12 * u64::from(self.mesh_capacity.n_triangles))?;
+        self.triangles = gpu.storage(
+            "tsdf.mesh.triangles",
+            12 * u64::from(self.mesh_capacity.n_triangles),
+        )?;
         Ok(())
     }
 
@@ -103,7 +124,10 @@ impl MeshBuffers {
         block_meshes: &mut Vec<(GridCoord, BlockMesh)>,
     ) -> Result<(), Error> {
         let parts = gpu.begin_read(&self.parts, n_blocks * size_of::<BlockMeshRange>() / 4);
-        let vertices = gpu.begin_read(&self.vertices, needed[0] as usize * size_of::<MeshVertex>() / 4);
+        let vertices = gpu.begin_read(
+            &self.vertices,
+            needed[0] as usize * size_of::<MeshVertex>() / 4,
+        );
         let triangles: Vec<[u32; 3]> = gpu.read(&self.triangles, needed[1] as usize)?;
         let vertices: Vec<MeshVertex> = vertices.finish(gpu)?;
         let parts: Vec<BlockMeshRange> = parts.finish(gpu)?;

@@ -18,7 +18,11 @@ pub(crate) struct MeshCapacity {
 
 impl Default for MeshCapacity {
     fn default() -> Self {
-        Self { n_blocks: 8192, n_vertices: 1 << 18, n_triangles: 1 << 19 }
+        Self {
+            n_blocks: 8192,
+            n_vertices: 1 << 18,
+            n_triangles: 1 << 19,
+        }
     }
 }
 
@@ -41,19 +45,36 @@ pub(super) const N_NEEDED: usize = 2;
 
 impl MeshBuffers {
     /// Buffers for a pool of `n_block_slots` blocks.
-    pub(crate) fn new(gpu: &Gpu, mesh_capacity: MeshCapacity, n_block_slots: u32) -> Result<Self, Error> {
+    pub(crate) fn new(
+        gpu: &Gpu,
+        mesh_capacity: MeshCapacity,
+        n_block_slots: u32,
+    ) -> Result<Self, Error> {
         Ok(Self {
             mesh_capacity,
-            batch: gpu.uniform_with("tsdf.mesh.batch", &MeshBatch { first: 0, max_blocks: mesh_capacity.n_blocks }),
+            batch: gpu.uniform_with(
+                "tsdf.mesh.batch",
+                &MeshBatch {
+                    first: 0,
+                    max_blocks: mesh_capacity.n_blocks,
+                },
+            ),
             cases: gpu.storage_with("tsdf.mesh.cases", bytemuck::cast_slice(&case_words()))?,
             is_stale: gpu.storage("tsdf.mesh.is_stale", 4 * u64::from(n_block_slots))?,
             stale: gpu.storage("tsdf.mesh.stale", 4 + 4 * u64::from(n_block_slots))?,
             needed: gpu.storage("tsdf.mesh.needed", 4 * N_NEEDED as u64)?,
-            parts: gpu
-                .storage("tsdf.mesh.parts", size_of::<BlockMeshRange>() as u64 * u64::from(mesh_capacity.n_blocks))?,
-            vertices: gpu
-                .storage("tsdf.mesh.vertices", size_of::<MeshVertex>() as u64 * u64::from(mesh_capacity.n_vertices))?,
-            triangles: gpu.storage("tsdf.mesh.triangles", 12 * u64::from(mesh_capacity.n_triangles))?,
+            parts: gpu.storage(
+                "tsdf.mesh.parts",
+                size_of::<BlockMeshRange>() as u64 * u64::from(mesh_capacity.n_blocks),
+            )?,
+            vertices: gpu.storage(
+                "tsdf.mesh.vertices",
+                size_of::<MeshVertex>() as u64 * u64::from(mesh_capacity.n_vertices),
+            )?,
+            triangles: gpu.storage(
+                "tsdf.mesh.triangles",
+                12 * u64::from(mesh_capacity.n_triangles),
+            )?,
         })
     }
 
@@ -63,7 +84,8 @@ impl MeshBuffers {
     }
 }
 
-/// The 256 cases in the format of the kernel: number of triangles; then three edges per triangle, five bits each.
+/// The 256 cases in the format of the kernel: number of triangles; then three edges per triangle,
+/// five bits each.
 fn case_words() -> Vec<u32> {
     CASES
         .iter()
@@ -71,7 +93,8 @@ fn case_words() -> Vec<u32> {
             let mut words = [0_u32; 6];
             words[0] = u32::try_from(triangles.len()).unwrap_or(0);
             for (word, edges) in words[1..].iter_mut().zip(triangles) {
-                let codes = edges.map(|edge| u32::try_from(edge.corner | edge.axis << 3).unwrap_or(0));
+                let codes =
+                    edges.map(|edge| u32::try_from(edge.corner | edge.axis << 3).unwrap_or(0));
                 *word = codes[0] | codes[1] << 5 | codes[2] << 10;
             }
             words

@@ -26,7 +26,10 @@ use crate::model_chunks::PendingChunks;
 use crate::model_options::ModelOptions;
 use crate::packing::{Format, Reader};
 use crate::view::ErasedSpace;
-use crate::{CorrectedKeyframe, Error, Method, Packing, Picture, Progress, Recalibrate, RenderRequest, Rendered};
+use crate::{
+    CorrectedKeyframe, Error, Method, Packing, Picture, Progress, Recalibrate, RenderRequest,
+    Rendered,
+};
 use calibration::Alignment;
 use calibration::CalibratedCamera;
 use calibration::TrialReport;
@@ -41,8 +44,8 @@ use std::path::Path;
 use std::sync::Arc;
 use std::time::Instant;
 
-/// Minimum number of blocks that the budget must allow. The voxel size is chosen so that one image takes a tenth of the
-/// budget.
+/// Minimum number of blocks that the budget must allow. The voxel size is chosen so that one image
+/// takes a tenth of the budget.
 const MIN_BLOCKS: u32 = 256;
 /// Minimum budget: the initial table and the minimum number of blocks.
 pub(super) const MIN_BYTES: u64 =
@@ -71,15 +74,20 @@ impl TsdfModel {
     /// An empty model. Fails if `max_bytes` is below the minimum.
     pub fn new(gpu: Arc<Gpu>, options: ModelOptions<TsdfOptions>) -> Result<Self, Error> {
         match options.common.max_bytes {
-            Some(max_bytes) if max_bytes < MIN_BYTES => {
-                Err(Error::BudgetTooSmall { model: "distance field", max_bytes, min_bytes: MIN_BYTES })
-            }
+            Some(max_bytes) if max_bytes < MIN_BYTES => Err(Error::BudgetTooSmall {
+                model: "distance field",
+                max_bytes,
+                min_bytes: MIN_BYTES,
+            }),
             _ => Self::without_budget_check(gpu, options),
         }
     }
 
     /// An empty model. If `max_bytes` is below the minimum, it skips depth images that do not fit.
-    pub(super) fn without_budget_check(gpu: Arc<Gpu>, options: ModelOptions<TsdfOptions>) -> Result<Self, Error> {
+    pub(super) fn without_budget_check(
+        gpu: Arc<Gpu>,
+        options: ModelOptions<TsdfOptions>,
+    ) -> Result<Self, Error> {
         Ok(Self {
             pipelines: Pipelines::new(&gpu)?,
             passes: Passes::default(),
@@ -117,13 +125,17 @@ impl TsdfModel {
 
     /// Number of blocks in host memory.
     pub fn n_host_blocks(&self) -> usize {
-        self.store.as_ref().map_or(0, |store| store.host_blocks.len())
+        self.store
+            .as_ref()
+            .map_or(0, |store| store.host_blocks.len())
     }
 
     /// All blocks, ordered by their coordinates.
     pub fn blocks(&mut self) -> Result<Blocks, Error> {
         self.finish_in_flight()?;
-        self.store.as_ref().map_or(Ok(Blocks::new()), |store| store.blocks(&self.gpu, &self.pipelines))
+        self.store.as_ref().map_or(Ok(Blocks::new()), |store| {
+            store.blocks(&self.gpu, &self.pipelines)
+        })
     }
 
     /// The current surface in world. Meshes only blocks that changed since the last call.
@@ -134,48 +146,72 @@ impl TsdfModel {
     /// [`Self::mesh`] without the triangles whose centers are in erased space.
     pub fn mesh_without(&mut self, edits: &Edits) -> Result<Mesh, Error> {
         self.update_mesh()?;
-        Ok(self
-            .voxel_grid()
-            .map_or_else(Mesh::default, |voxel_grid| mesh::joined(self.meshing.blocks(), voxel_grid, edits)))
+        Ok(self.voxel_grid().map_or_else(Mesh::default, |voxel_grid| {
+            mesh::joined(self.meshing.blocks(), voxel_grid, edits)
+        }))
     }
 
-    /// Meshes the blocks that changed since the last call and reads their triangles back, without joining them into one
-    /// mesh. Returns the number of blocks.
+    /// Meshes the blocks that changed since the last call and reads their triangles back, without
+    /// joining them into one mesh. Returns the number of blocks.
     pub fn update_mesh(&mut self) -> Result<usize, Error> {
         self.finish_in_flight()?;
-        let Some(store) = &mut self.store else { return Ok(0) };
+        let Some(store) = &mut self.store else {
+            return Ok(0);
+        };
         self.meshing.update(&self.gpu, &self.pipelines, store)
     }
 
-    /// GPU time of meshing the blocks that changed since the last [`Self::update_mesh`]. The blocks stay marked as
-    /// changed, and nothing is read back. Empty if the adapter has no timestamps, or if blocks are in host memory.
+    /// GPU time of meshing the blocks that changed since the last [`Self::update_mesh`]. The blocks
+    /// stay marked as changed, and nothing is read back. Empty if the adapter has no timestamps, or
+    /// if blocks are in host memory.
     pub fn profile_mesh(&mut self) -> Result<Vec<PassTiming>, Error> {
         self.finish_in_flight()?;
-        match self.store.as_ref().filter(|store| store.host_blocks.is_empty()) {
-            Some(store) => self.meshing.profile(&self.gpu, &self.pipelines, &store.buffers),
+        match self
+            .store
+            .as_ref()
+            .filter(|store| store.host_blocks.is_empty())
+        {
+            Some(store) => self
+                .meshing
+                .profile(&self.gpu, &self.pipelines, &store.buffers),
             None => Ok(Vec::new()),
         }
     }
 
-    /// Chooses the voxel size from the first depth image with valid readings and discards earlier ones. Returns whether
-    /// there was one.
+    /// Chooses the voxel size from the first depth image with valid readings and discards earlier
+    /// ones. Returns whether there was one.
     fn begin(&mut self) -> Result<bool, Error> {
         // The maximum size of a binding limits the field, just like a budget.
-        let max_blocks =
-            capacity::max_blocks_within(&self.gpu, self.options.common.max_bytes, INITIAL_CAPACITY.n_chunks);
+        let max_blocks = capacity::max_blocks_within(
+            &self.gpu,
+            self.options.common.max_bytes,
+            INITIAL_CAPACITY.n_chunks,
+        );
         let max_bytes = Some(u64::from(max_blocks) * BYTES_PER_BLOCK);
         while self.store.is_none() {
-            let Some(first) = self.queue.pending.front() else { return Ok(false) };
-            match first.depth.as_ref().and_then(|depth| VoxelGrid::choose(&self.options.specific, max_bytes, depth)) {
-                Some(grid) => self.store = Some(FieldStore::new(&self.gpu, grid, self.options.common.max_bytes)?),
+            let Some(first) = self.queue.pending.front() else {
+                return Ok(false);
+            };
+            match first
+                .depth
+                .as_ref()
+                .and_then(|depth| VoxelGrid::choose(&self.options.specific, max_bytes, depth))
+            {
+                Some(grid) => {
+                    self.store = Some(FieldStore::new(
+                        &self.gpu,
+                        grid,
+                        self.options.common.max_bytes,
+                    )?)
+                }
                 None => self.queue.complete_first(),
             }
         }
         Ok(!self.queue.pending.is_empty())
     }
 
-    /// Fuses one keyframe if none was fused yet, so that there is something to render. Fuses only one, because
-    /// rendering must not train the model.
+    /// Fuses one keyframe if none was fused yet, so that there is something to render. Fuses only
+    /// one, because rendering must not train the model.
     fn fuse_one(&mut self) -> Result<(), Error> {
         while self.queue.step() == 0 && !self.queue.pending.is_empty() {
             self.step(1)?;
@@ -185,8 +221,18 @@ impl TsdfModel {
 
     /// Records the passes of a pending keyframe.
     fn record(&mut self, pending_ix: usize, slot_ix: usize) -> Result<(), Error> {
-        let (Some(store), Some(keyframe)) = (&self.store, self.queue.pending.get(pending_ix)) else { return Ok(()) };
-        self.fusion.record(&self.gpu, &mut self.passes, &self.pipelines, store, keyframe, slot_ix)
+        let (Some(store), Some(keyframe)) = (&self.store, self.queue.pending.get(pending_ix))
+        else {
+            return Ok(());
+        };
+        self.fusion.record(
+            &self.gpu,
+            &mut self.passes,
+            &self.pipelines,
+            store,
+            keyframe,
+            slot_ix,
+        )
     }
 
     /// Fuses the first pending keyframe after loading the blocks that it could change.
@@ -200,15 +246,24 @@ impl TsdfModel {
         }
         self.record(0, 0)?;
         self.passes.submit(&self.gpu);
-        let counters = self.store.as_ref().ok_or_else(no_blocks)?.buffers.counters(&self.gpu)?;
+        let counters = self
+            .store
+            .as_ref()
+            .ok_or_else(no_blocks)?
+            .buffers
+            .counters(&self.gpu)?;
         self.apply_counters(&counters)?;
         Ok(1)
     }
 
     /// Loads the blocks that the first pending keyframe could change. Returns whether they fit.
     fn load_blocks_of_first(&mut self) -> Result<bool, Error> {
-        let (Some(store), Some(keyframe)) = (&mut self.store, self.queue.pending.front()) else { return Ok(true) };
-        let Some(frustum) = ViewFrustum::of_depth(keyframe, &store.voxel_grid) else { return Ok(true) };
+        let (Some(store), Some(keyframe)) = (&mut self.store, self.queue.pending.front()) else {
+            return Ok(true);
+        };
+        let Some(frustum) = ViewFrustum::of_depth(keyframe, &store.voxel_grid) else {
+            return Ok(true);
+        };
         store.load_visible(&self.gpu, &self.pipelines, &frustum, false)
     }
 
@@ -219,7 +274,8 @@ impl TsdfModel {
         }
     }
 
-    /// Waits for the submit in flight and applies its counters. Returns whether the buffers overflowed.
+    /// Waits for the submit in flight and applies its counters. Returns whether the buffers
+    /// overflowed.
     fn finish_in_flight(&mut self) -> Result<bool, Error> {
         match self.fusion.submits.finish(&self.gpu)? {
             Some(counters) => self.apply_counters(&counters),
@@ -232,7 +288,9 @@ impl TsdfModel {
         for _ in 0..self.fusion.apply_counters(counters) {
             self.queue.complete_first();
         }
-        let Some(store) = &mut self.store else { return Ok(false) };
+        let Some(store) = &mut self.store else {
+            return Ok(false);
+        };
         store.n_resident = counters[status::N_BLOCKS];
         let failed = counters[status::STOPPED] != 0;
         if failed {
@@ -241,10 +299,12 @@ impl TsdfModel {
         Ok(failed)
     }
 
-    /// Grows a field that overflowed, on the GPU or by moving blocks to host memory before the next depth image; skips
-    /// the image if that is not possible.
+    /// Grows a field that overflowed, on the GPU or by moving blocks to host memory before the next
+    /// depth image; skips the image if that is not possible.
     fn grow(&mut self, counters: &[u32]) -> Result<(), Error> {
-        let Some(store) = &mut self.store else { return Ok(()) };
+        let Some(store) = &mut self.store else {
+            return Ok(());
+        };
         let n_excess = store.grow(&self.gpu, &self.pipelines, counters)?;
         self.passes.clear_bindings();
         if n_excess > 0
@@ -266,7 +326,9 @@ impl Recalibrate for TsdfModel {
         let is_watched = self.fusion.submits.is_watched();
         *self = Self::new(self.gpu.clone(), self.options.clone())?;
         self.set_watched(is_watched);
-        keyframes.iter().try_for_each(|keyframe| self.push(keyframe.after.clone()))
+        keyframes
+            .iter()
+            .try_for_each(|keyframe| self.push(keyframe.after.clone()))
     }
 }
 
@@ -280,8 +342,8 @@ impl Method for TsdfModel {
         Ok(())
     }
 
-    /// Removes a keyframe that was not fused yet. The contribution of fused keyframes stays, because it is not stored
-    /// separately; it fades as later keyframes observe the same place.
+    /// Removes a keyframe that was not fused yet. The contribution of fused keyframes stays,
+    /// because it is not stored separately; it fades as later keyframes observe the same place.
     fn remove(&mut self, camera: &str, stamp: Stamp) -> Result<(), Error> {
         self.finish_in_flight()?;
         self.queue.remove(camera, stamp);
@@ -298,11 +360,14 @@ impl Method for TsdfModel {
             self.finish_in_flight()?;
             return self.step_with_host_blocks(n);
         }
-        let n_in_flight = usize::try_from(self.fusion.submits.n_steps_in_flight()).expect("few keyframes");
+        let n_in_flight =
+            usize::try_from(self.fusion.submits.n_steps_in_flight()).expect("few keyframes");
         let n_left = self.queue.pending.len().saturating_sub(n_in_flight) as u64;
         let n_asked = n.saturating_sub(n_in_flight as u64); // `progress` does not include keyframes in flight.
         let n_per_submit = self.fusion.keyframes_per_submit();
-        let n_keyframes = usize::try_from(n_asked.min(n_left)).unwrap_or(usize::MAX).min(n_per_submit);
+        let n_keyframes = usize::try_from(n_asked.min(n_left))
+            .unwrap_or(usize::MAX)
+            .min(n_per_submit);
         if n_keyframes == 0 {
             self.finish_in_flight()?;
             return Ok(self.queue.step() - before);
@@ -312,10 +377,14 @@ impl Method for TsdfModel {
             self.record(n_in_flight + ix, ix)?;
         }
         let field = &self.store.as_ref().ok_or_else(no_blocks)?.buffers;
-        let counters = self.passes.submit_reading(&self.gpu, &[(&field.status, 4 * status::LEN)]);
+        let counters = self
+            .passes
+            .submit_reading(&self.gpu, &[(&field.status, 4 * status::LEN)]);
         let failed = self.finish_in_flight()?; // Waits for the previous submit while this one runs.
         if !failed {
-            self.fusion.submits.begin(counters, n_keyframes as u64, since);
+            self.fusion
+                .submits
+                .begin(counters, n_keyframes as u64, since);
         } // After a failure, the new submit had no effect.
         if n_keyframes as u64 == n_asked || n_keyframes as u64 == n_left {
             self.finish_in_flight()?; // The caller expects a correct count.
@@ -328,7 +397,9 @@ impl Method for TsdfModel {
     }
 
     fn bounds(&mut self) -> Result<Option<Bounds>, Error> {
-        let Some(voxel_grid) = self.voxel_grid().cloned() else { return Ok(None) };
+        let Some(voxel_grid) = self.voxel_grid().cloned() else {
+            return Ok(None);
+        };
         Ok(bounds(self.blocks()?.keys(), &voxel_grid))
     }
 
@@ -349,10 +420,16 @@ impl Method for TsdfModel {
     fn render(&mut self, request: &RenderRequest) -> Result<Picture, Error> {
         self.finish_in_flight()?;
         self.fuse_one()?;
-        Rendered::picture(request, |camera, output| self.draw_view(camera, request.background_srgb, output))
+        Rendered::picture(request, |camera, output| {
+            self.draw_view(camera, request.background_srgb, output)
+        })
     }
 
-    fn render_packed(&mut self, request: &RenderRequest, packing: Packing) -> Result<Rendered, Error> {
+    fn render_packed(
+        &mut self,
+        request: &RenderRequest,
+        packing: Packing,
+    ) -> Result<Rendered, Error> {
         self.finish_in_flight()?;
         self.fuse_one()?;
         Rendered::of(request, Format::Packed(packing), |camera, output| {
@@ -360,11 +437,19 @@ impl Method for TsdfModel {
         })
     }
 
-    fn queue_chunks(&mut self, only_changed: bool, edits: &Arc<Edits>) -> Result<Option<PendingChunks>, Error> {
+    fn queue_chunks(
+        &mut self,
+        only_changed: bool,
+        edits: &Arc<Edits>,
+    ) -> Result<Option<PendingChunks>, Error> {
         self.update_mesh()?;
-        let Some(voxel_grid) = self.voxel_grid().cloned() else { return Ok(None) };
+        let Some(voxel_grid) = self.voxel_grid().cloned() else {
+            return Ok(None);
+        };
         let chunks = self.meshing.take_chunks(&voxel_grid, edits, only_changed);
-        Ok(Some(PendingChunks::new(move || Ok(chunks.encode(&voxel_grid)))))
+        Ok(Some(PendingChunks::new(move || {
+            Ok(chunks.encode(&voxel_grid))
+        })))
     }
 
     fn find_floaters(&mut self, edits: &Arc<Edits>) -> Result<PendingFloaters, Error> {
@@ -396,7 +481,12 @@ impl Method for TsdfModel {
         }
         self.record(0, 0)?;
         let timings = self.passes.submit_timed(&self.gpu)?;
-        let counters = self.store.as_ref().ok_or_else(no_blocks)?.buffers.counters(&self.gpu)?;
+        let counters = self
+            .store
+            .as_ref()
+            .ok_or_else(no_blocks)?
+            .buffers
+            .counters(&self.gpu)?;
         self.apply_counters(&counters)?;
         Ok(timings)
     }
@@ -409,7 +499,10 @@ impl Method for TsdfModel {
         Progress {
             step: self.queue.step(),
             primitives: self.store.as_ref().map_or(0, FieldStore::n_blocks),
-            bytes: self.store.as_ref().map_or(0, |store| store.buffers.bytes(store.n_resident.into())),
+            bytes: self
+                .store
+                .as_ref()
+                .map_or(0, |store| store.buffers.bytes(store.n_resident.into())),
             step_millis: self.fusion.submits.step_millis(),
         }
     }

@@ -3,22 +3,23 @@
 use crate::model_options::MethodOptions;
 use serde::{Deserialize, Serialize};
 
-/// Options specific to a [`super::TsdfModel`]. Of the common options, only the maximum number of bytes and the
-/// alignment are used; nothing is random.
+/// Options specific to a [`super::TsdfModel`]. Of the common options, only the maximum number of
+/// bytes and the alignment are used; nothing is random.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TsdfOptions {
-    /// Edge of a voxel, meters; `None`: chosen from the first depth image, see [`super::VoxelGrid::choose`].
+    /// Edge of a voxel, meters; `None`: chosen from the first depth image, see
+    /// [`super::VoxelGrid::choose`].
     pub voxel_m: Option<f64>,
     /// Minimum truncation distance, meters; `None`: four voxels.
     pub truncation_m: Option<f64>,
-    /// Standard deviation of depth at 1 m, meters; it grows with the square of depth. `None`: estimated from the first
-    /// depth image.
+    /// Standard deviation of depth at 1 m, meters; it grows with the square of depth. `None`:
+    /// estimated from the first depth image.
     pub noise_per_m2: Option<f64>,
     /// Readings beyond this depth are ignored, meters.
     pub max_depth_m: f64,
-    /// Maximum weight of a voxel, in observations from 1 m; up to 255. With a smaller maximum, moved objects fade
-    /// sooner.
+    /// Maximum weight of a voxel, in observations from 1 m; up to 255. With a smaller maximum,
+    /// moved objects fade sooner.
     pub max_weight: f64,
 }
 
@@ -28,6 +29,12 @@ impl MethodOptions for TsdfOptions {
 
 impl Default for TsdfOptions {
     fn default() -> Self {
-        Self { voxel_m: None, truncation_m: None, noise_per_m2: None, max_depth_m: 10.0, max_weight: 64.0 }
+        Self {
+            voxel_m: None,
+            truncation_m: None,
+            noise_per_m2: None,
+            max_depth_m: 10.0,
+            max_weight: 64.0,
+        }
     }
 }

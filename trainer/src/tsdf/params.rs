@@ -61,7 +61,8 @@ impl DepthView {
     pub(crate) fn of(keyframe: &Keyframe, voxel_grid: &VoxelGrid) -> Option<Self> {
         let depth = keyframe.depth.as_ref()?;
         let field_from_depth = voxel_grid.field_from_world() * depth.world_from_camera;
-        let field_from_color = voxel_grid.field_from_world() * CalibratedCamera::of(keyframe).world_from_camera;
+        let field_from_color =
+            voxel_grid.field_from_world() * CalibratedCamera::of(keyframe).world_from_camera;
         let to_depth = rows_of(&field_from_depth.inverse());
         let from_depth = rows_of(&field_from_depth);
         let to_color = rows_of(&field_from_color.inverse());

@@ -26,7 +26,10 @@ impl KeyframeSlot {
     /// Buffers for images of these sizes.
     pub(crate) fn new(gpu: &Gpu, n_depth_pixels: u64, n_color_pixels: u64) -> Result<Self, Error> {
         Ok(Self {
-            depth_view: gpu.uniform_with("tsdf.depth_view", &<DepthView as bytemuck::Zeroable>::zeroed()),
+            depth_view: gpu.uniform_with(
+                "tsdf.depth_view",
+                &<DepthView as bytemuck::Zeroable>::zeroed(),
+            ),
             depth: gpu.storage("tsdf.depth", 4 * n_depth_pixels)?,
             image: gpu.storage("tsdf.image", 4 * n_color_pixels)?,
             readings: gpu.storage("tsdf.readings", 8 * n_depth_pixels)?,
@@ -55,15 +58,43 @@ impl KeyframeSlot {
 }
 
 /// Fuses a depth image.
-pub(crate) fn fuse(gpu: &Gpu, list: &mut Passes, pipelines: &Pipelines, buffers: &FieldBuffers, slot: &KeyframeSlot) {
-    let FieldBuffers { capacity, field, status, keys, entries, coords, geometry, colors, changed, visible } = buffers;
-    let KeyframeSlot { depth_view, depth, image, readings, n_pixels } = slot;
+pub(crate) fn fuse(
+    gpu: &Gpu,
+    list: &mut Passes,
+    pipelines: &Pipelines,
+    buffers: &FieldBuffers,
+    slot: &KeyframeSlot,
+) {
+    let FieldBuffers {
+        capacity,
+        field,
+        status,
+        keys,
+        entries,
+        coords,
+        geometry,
+        colors,
+        changed,
+        visible,
+    } = buffers;
+    let KeyframeSlot {
+        depth_view,
+        depth,
+        image,
+        readings,
+        n_pixels,
+    } = slot;
     let n_groups = n_pixels.div_ceil(64);
     list.dispatch(
         gpu,
         &pipelines.readings,
         n_groups,
-        &[("field", field), ("depth_view", depth_view), ("depth", depth), ("readings", readings)],
+        &[
+            ("field", field),
+            ("depth_view", depth_view),
+            ("depth", depth),
+            ("readings", readings),
+        ],
     );
     list.dispatch(
         gpu,
@@ -83,7 +114,13 @@ pub(crate) fn fuse(gpu: &Gpu, list: &mut Passes, pipelines: &Pipelines, buffers:
         gpu,
         &pipelines.find_visible,
         u64::from(capacity.n_blocks).div_ceil(64),
-        &[("field", field), ("depth_view", depth_view), ("coords", coords), ("status", status), ("visible", visible)],
+        &[
+            ("field", field),
+            ("depth_view", depth_view),
+            ("coords", coords),
+            ("status", status),
+            ("visible", visible),
+        ],
     );
     list.dispatch(
         gpu,
@@ -106,13 +143,32 @@ pub(crate) fn fuse(gpu: &Gpu, list: &mut Passes, pipelines: &Pipelines, buffers:
 }
 
 /// Inserts the first `n` blocks into the empty table.
-pub(crate) fn index(gpu: &Gpu, list: &mut Passes, pipelines: &Pipelines, buffers: &FieldBuffers, n: u32) {
-    let FieldBuffers { field, status, keys, entries, coords, .. } = buffers;
+pub(crate) fn index(
+    gpu: &Gpu,
+    list: &mut Passes,
+    pipelines: &Pipelines,
+    buffers: &FieldBuffers,
+    n: u32,
+) {
+    let FieldBuffers {
+        field,
+        status,
+        keys,
+        entries,
+        coords,
+        ..
+    } = buffers;
     list.dispatch(
         gpu,
         &pipelines.index_blocks,
         u64::from(n).div_ceil(64),
-        &[("field", field), ("coords", coords), ("status", status), ("keys", keys), ("entries", entries)],
+        &[
+            ("field", field),
+            ("coords", coords),
+            ("status", status),
+            ("keys", keys),
+            ("entries", entries),
+        ],
     );
 }
 
@@ -148,7 +204,16 @@ pub(crate) fn list_stale(
     buffers: &FieldBuffers,
     mesh: &MeshBuffers,
 ) {
-    let FieldBuffers { capacity, field, status, keys, entries, coords, changed, .. } = buffers;
+    let FieldBuffers {
+        capacity,
+        field,
+        status,
+        keys,
+        entries,
+        coords,
+        changed,
+        ..
+    } = buffers;
     list.clear(&mesh.is_stale);
     list.clear_range(&mesh.stale, 0..4);
     list.dispatch(
@@ -169,8 +234,23 @@ pub(crate) fn list_stale(
 }
 
 /// Extracts the triangles of a batch of the list.
-pub(crate) fn march(gpu: &Gpu, list: &mut Passes, pipelines: &Pipelines, buffers: &FieldBuffers, mesh: &MeshBuffers) {
-    let FieldBuffers { capacity, field, keys, entries, coords, geometry, colors, .. } = buffers;
+pub(crate) fn march(
+    gpu: &Gpu,
+    list: &mut Passes,
+    pipelines: &Pipelines,
+    buffers: &FieldBuffers,
+    mesh: &MeshBuffers,
+) {
+    let FieldBuffers {
+        capacity,
+        field,
+        keys,
+        entries,
+        coords,
+        geometry,
+        colors,
+        ..
+    } = buffers;
     list.clear(&mesh.needed);
     list.dispatch(
         gpu,
@@ -208,7 +288,8 @@ impl Canvas {
     pub(crate) fn new(gpu: &Gpu, n_pixels: u64) -> Result<Self, Error> {
         Ok(Self {
             view: gpu.uniform_with("tsdf.view", &<View as bytemuck::Zeroable>::zeroed()),
-            backdrop: gpu.uniform_with("tsdf.backdrop", &<Backdrop as bytemuck::Zeroable>::zeroed()),
+            backdrop: gpu
+                .uniform_with("tsdf.backdrop", &<Backdrop as bytemuck::Zeroable>::zeroed()),
             pixels: gpu.storage("tsdf.pixels", 4 * n_pixels)?,
             depths: gpu.storage("tsdf.depths", 4 * n_pixels)?,
             n_pixels,
@@ -218,7 +299,13 @@ impl Canvas {
     pub(crate) fn set_view(&self, gpu: &Gpu, view: &View, background_srgb: [f32; 3]) {
         let [red, green, blue] = background_srgb;
         gpu.write(&self.view, 0, bytemuck::bytes_of(view));
-        gpu.write(&self.backdrop, 0, bytemuck::bytes_of(&Backdrop { srgb: [red, green, blue, 0.0] }));
+        gpu.write(
+            &self.backdrop,
+            0,
+            bytemuck::bytes_of(&Backdrop {
+                srgb: [red, green, blue, 0.0],
+            }),
+        );
     }
 }
 

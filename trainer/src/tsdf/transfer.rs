@@ -15,8 +15,8 @@ use std::collections::BTreeSet;
 const GATHER_BATCH: usize = 2048;
 
 impl FieldBuffers {
-    /// Copies the field to buffers of another capacity. Drops requests for blocks that did not fit, so that their depth
-    /// images can be fused again.
+    /// Copies the field to buffers of another capacity. Drops requests for blocks that did not fit,
+    /// so that their depth images can be fused again.
     pub(crate) fn resized(
         &self,
         gpu: &Gpu,
@@ -82,12 +82,25 @@ impl FieldBuffers {
     fn write_block(&self, gpu: &Gpu, slot: u64, block_coord: GridCoord, block: &Block) {
         let [x, y, z] = block_coord;
         gpu.write(&self.coords, 16 * slot, bytemuck::cast_slice(&[x, y, z, 0]));
-        gpu.write(&self.geometry, 4 * 512 * slot, bytemuck::cast_slice(&block.geometry));
-        gpu.write(&self.colors, 8 * 512 * slot, bytemuck::cast_slice(&block.colors));
+        gpu.write(
+            &self.geometry,
+            4 * 512 * slot,
+            bytemuck::cast_slice(&block.geometry),
+        );
+        gpu.write(
+            &self.colors,
+            8 * 512 * slot,
+            bytemuck::cast_slice(&block.colors),
+        );
     }
 
     /// Reads the blocks in these slots.
-    pub(crate) fn read(&self, gpu: &Gpu, pipelines: &Pipelines, slots: &[u32]) -> Result<Vec<Block>, Error> {
+    pub(crate) fn read(
+        &self,
+        gpu: &Gpu,
+        pipelines: &Pipelines,
+        slots: &[u32],
+    ) -> Result<Vec<Block>, Error> {
         let mut blocks = Vec::with_capacity(slots.len());
         for part in slots.chunks(GATHER_BATCH) {
             let n = part.len();
@@ -95,7 +108,15 @@ impl FieldBuffers {
             let geometry = gpu.storage("tsdf.gathered_geometry", (4 * N_VOXELS * n) as u64)?;
             let colors = gpu.storage("tsdf.gathered_colors", (8 * N_VOXELS * n) as u64)?;
             let mut list = Passes::default();
-            passes::gather(gpu, &mut list, pipelines, self, &listed, (&geometry, &colors), n);
+            passes::gather(
+                gpu,
+                &mut list,
+                pipelines,
+                self,
+                &listed,
+                (&geometry, &colors),
+                n,
+            );
             list.submit(gpu);
             let geometry: Vec<u32> = gpu.read(&geometry, N_VOXELS * n)?;
             let colors: Vec<[u32; 2]> = gpu.read(&colors, N_VOXELS * n)?;
@@ -103,7 +124,10 @@ impl FieldBuffers {
                 geometry
                     .chunks_exact(N_VOXELS)
                     .zip(colors.chunks_exact(N_VOXELS))
-                    .map(|(geometry, colors)| Block { geometry: geometry.to_vec(), colors: colors.to_vec() }),
+                    .map(|(geometry, colors)| Block {
+                        geometry: geometry.to_vec(),
+                        colors: colors.to_vec(),
+                    }),
             );
         }
         Ok(blocks)
@@ -113,11 +137,14 @@ impl FieldBuffers {
     pub(crate) fn read_all(&self, gpu: &Gpu, pipelines: &Pipelines) -> Result<Blocks, Error> {
         let block_coords = self.block_coords(gpu)?;
         let slots: Vec<u32> = (0..).take(block_coords.len()).collect();
-        Ok(block_coords.into_iter().zip(self.read(gpu, pipelines, &slots)?).collect())
+        Ok(block_coords
+            .into_iter()
+            .zip(self.read(gpu, pipelines, &slots)?)
+            .collect())
     }
 
-    /// Removes the blocks of `evicted` (slots, in order) from the pool and adds `added`, which must fit. No submit may
-    /// be in flight, and all changes must have been taken.
+    /// Removes the blocks of `evicted` (slots, in order) from the pool and adds `added`, which must
+    /// fit. No submit may be in flight, and all changes must have been taken.
     pub(crate) fn swap_blocks(
         &mut self,
         gpu: &Gpu,
@@ -131,14 +158,24 @@ impl FieldBuffers {
         let gone: BTreeSet<u32> = evicted.iter().copied().collect();
         // Blocks past the new end move into the holes; added blocks fill the rest.
         let end = u32::try_from(n_after).unwrap_or(u32::MAX);
-        let moved_slots: Vec<u32> = (end.min(n_before)..n_before).filter(|slot| !gone.contains(slot)).collect();
+        let moved_slots: Vec<u32> = (end.min(n_before)..n_before)
+            .filter(|slot| !gone.contains(slot))
+            .collect();
         let moved = self.read(gpu, pipelines, &moved_slots)?;
-        let moved = moved_slots.iter().map(|slot| block_coords[*slot as usize]).zip(moved);
-        let free_slots = gone.iter().copied().filter(|slot| *slot < end).chain(n_before..end);
-        let incoming = moved
-            .collect::<Vec<_>>()
-            .into_iter()
-            .chain(added.iter().map(|(block_coord, block)| (*block_coord, block.clone())));
+        let moved = moved_slots
+            .iter()
+            .map(|slot| block_coords[*slot as usize])
+            .zip(moved);
+        let free_slots = gone
+            .iter()
+            .copied()
+            .filter(|slot| *slot < end)
+            .chain(n_before..end);
+        let incoming = moved.collect::<Vec<_>>().into_iter().chain(
+            added
+                .iter()
+                .map(|(block_coord, block)| (*block_coord, block.clone())),
+        );
         for (slot, (block_coord, block)) in free_slots.zip(incoming) {
             self.write_block(gpu, slot.into(), block_coord, &block);
         }
@@ -170,7 +207,8 @@ impl FieldBuffers {
     }
 }
 
-/// Clears the flags of a failed depth image, and the bounds and number of chunks, which are recounted.
+/// Clears the flags of a failed depth image, and the bounds and number of chunks, which are
+/// recounted.
 fn clear_failure(counters: &mut [u32]) {
     for ix in [status::FAILED, status::TABLE_FULL, status::STOPPED] {
         counters[ix] = 0;

@@ -52,7 +52,11 @@ pub(crate) const LOW_PASS_PX2: f64 = 0.3;
 
 impl Camera {
     /// The pinhole camera of a requested picture.
-    pub(crate) fn from_request(request: &RenderRequest, focal_px: [f64; 2], principal_px: [f64; 2]) -> Self {
+    pub(crate) fn from_request(
+        request: &RenderRequest,
+        focal_px: [f64; 2],
+        principal_px: [f64; 2],
+    ) -> Self {
         Self {
             world_from_camera: request.world_from_camera,
             size_px: request.size_px,
@@ -67,7 +71,8 @@ impl Camera {
         }
     }
 
-    /// The same camera with an image smaller by `2^level`. Leftover rows and columns at the far edges are cropped.
+    /// The same camera with an image smaller by `2^level`. Leftover rows and columns at the far
+    /// edges are cropped.
     pub(crate) fn at_level(&self, level: u32) -> Self {
         let share = 0.5f64.powi(i32::try_from(level).expect("a few levels"));
         Self {
@@ -82,7 +87,9 @@ impl Camera {
     /// The view that the kernels read.
     pub(crate) fn view(&self) -> View {
         let shutter = |of: fn(&Shutter) -> nalgebra::Vector3<f64>| {
-            self.shutter.as_ref().map_or([0.0; 3], |shutter| f32s_of((of(shutter) * shutter.readout_secs).into()))
+            self.shutter.as_ref().map_or([0.0; 3], |shutter| {
+                f32s_of((of(shutter) * shutter.readout_secs).into())
+            })
         };
         let linear = shutter(|shutter| shutter.twist.linear_m_s);
         let angular = shutter(|shutter| shutter.twist.angular_rad_s);
@@ -90,7 +97,11 @@ impl Camera {
         let with = |xyz: [f32; 3], w: f32| [xyz[0], xyz[1], xyz[2], w];
         let crop_w = if self.crop.is_some() { 1.0 } else { 0.0 };
         let camera = rows_of(&self.world_from_camera.inverse());
-        let crop = rows_of(&self.crop.map_or(Transform::identity(), |crop| crop.world_from_box.inverse()));
+        let crop = rows_of(
+            &self
+                .crop
+                .map_or(Transform::identity(), |crop| crop.world_from_box.inverse()),
+        );
         View {
             camera_row_0: camera[0],
             camera_row_1: camera[1],
@@ -105,7 +116,10 @@ impl Camera {
             crop_row_0: crop[0],
             crop_row_1: crop[1],
             crop_row_2: crop[2],
-            crop_min: with(self.crop.map_or([0.0; 3], |crop| f32s_of(crop.min_m)), crop_w),
+            crop_min: with(
+                self.crop.map_or([0.0; 3], |crop| f32s_of(crop.min_m)),
+                crop_w,
+            ),
             crop_max: with(self.crop.map_or([0.0; 3], |crop| f32s_of(crop.max_m)), 0.0),
         }
     }

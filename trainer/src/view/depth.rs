@@ -14,17 +14,31 @@ use std::sync::Arc;
 /// Median of the depth of a keyframe, meters; `None` without depth.
 pub(crate) fn median_depth_m(keyframe: &Keyframe) -> Option<f64> {
     let depth = keyframe.depth.as_ref()?;
-    // A prime stride samples all columns and rows. Small images use a shorter stride, to get enough samples.
+    // A prime stride samples all columns and rows. Small images use a shorter stride, to get enough
+    // samples.
     let step = 997.min(depth.depth_m.len() / 64).max(1);
-    let sample = depth.depth_m.iter().copied().step_by(step).filter(|z| *z > 0.0);
-    quantile(&mut sample.map(f64::from).collect::<Vec<_>>(), 0.5, Rank::Upper)
+    let sample = depth
+        .depth_m
+        .iter()
+        .copied()
+        .step_by(step)
+        .filter(|z| *z > 0.0);
+    quantile(
+        &mut sample.map(f64::from).collect::<Vec<_>>(),
+        0.5,
+        Rank::Upper,
+    )
 }
 
-/// Depth along the color camera's z axis for each of its pixels; empty if the keyframe has no depth.
+/// Depth along the color camera's z axis for each of its pixels; empty if the keyframe has no
+/// depth.
 ///
-/// Depth from a camera with another lens, pose or time is reprojected point by point. The nearest point wins.
+/// Depth from a camera with another lens, pose or time is reprojected point by point. The nearest
+/// point wins.
 pub(crate) fn depth_in_color_view(keyframe: &Keyframe) -> Arc<[f32]> {
-    let Some(depth) = &keyframe.depth else { return [].into() };
+    let Some(depth) = &keyframe.depth else {
+        return [].into();
+    };
     let same_lens = depth.size_px == keyframe.size_px
         && depth.focal_px == keyframe.focal_px
         && depth.principal_px == keyframe.principal_px;
@@ -35,15 +49,26 @@ pub(crate) fn depth_in_color_view(keyframe: &Keyframe) -> Arc<[f32]> {
     let [width, height] = keyframe.size_px;
     let mut reprojected = vec![0.0f32; (width * height) as usize];
     for (ix, z) in depth.depth_m.iter().enumerate().filter(|(_, z)| **z > 0.0) {
-        let (x, y) = ((ix as u32 % depth.size_px[0]), (ix as u32 / depth.size_px[0]));
-        let ray = |pixel: u32, axis: usize| (f64::from(pixel) + 0.5 - depth.principal_px[axis]) / depth.focal_px[axis];
+        let (x, y) = (
+            (ix as u32 % depth.size_px[0]),
+            (ix as u32 / depth.size_px[0]),
+        );
+        let ray = |pixel: u32, axis: usize| {
+            (f64::from(pixel) + 0.5 - depth.principal_px[axis]) / depth.focal_px[axis]
+        };
         let z = f64::from(*z);
         let point = color_from_depth * Point3::new(ray(x, 0) * z, ray(y, 1) * z, z);
         if point.z <= 0.0 {
             continue;
         }
-        let pixel = [0, 1].map(|axis| keyframe.focal_px[axis] * point[axis] / point.z + keyframe.principal_px[axis]);
-        if pixel[0] < 0.0 || pixel[1] < 0.0 || pixel[0] >= f64::from(width) || pixel[1] >= f64::from(height) {
+        let pixel = [0, 1].map(|axis| {
+            keyframe.focal_px[axis] * point[axis] / point.z + keyframe.principal_px[axis]
+        });
+        if pixel[0] < 0.0
+            || pixel[1] < 0.0
+            || pixel[0] >= f64::from(width)
+            || pixel[1] >= f64::from(height)
+        {
             continue;
         }
         let nearest_m = &mut reprojected[pixel[1] as usize * width as usize + pixel[0] as usize];

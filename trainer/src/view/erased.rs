@@ -6,8 +6,8 @@ use crate::gpu::{Buffer, Gpu, Passes};
 use nalgebra::Matrix4;
 use std::sync::Arc;
 
-/// The buffers of shared/erased.wgsl: views without edits have one of their own, so that alternating views with and
-/// without edits replace neither.
+/// The buffers of shared/erased.wgsl: views without edits have one of their own, so that
+/// alternating views with and without edits replace neither.
 #[derive(Debug)]
 pub(crate) struct ErasedSpace {
     nothing: Buffer,
@@ -25,7 +25,10 @@ struct Erased {
 impl ErasedSpace {
     /// Nothing is erased.
     pub(crate) fn none(gpu: &Gpu) -> Result<Self, Error> {
-        Ok(Self { nothing: buffer(gpu, &Edits::default(), &Matrix4::identity())?, newest: None })
+        Ok(Self {
+            nothing: buffer(gpu, &Edits::default(), &Matrix4::identity())?,
+            newest: None,
+        })
     }
 
     /// The buffer of these edits. Replaces the previous one if the edits or the frame have changed.
@@ -49,7 +52,11 @@ impl ErasedSpace {
             Some(erased) => erased,
             None => {
                 passes.clear_bindings(); // Frees the previous buffer.
-                Erased { edits: Arc::clone(edits), world_from_drawn, buffer: buffer(gpu, edits, &world_from_drawn)? }
+                Erased {
+                    edits: Arc::clone(edits),
+                    world_from_drawn,
+                    buffer: buffer(gpu, edits, &world_from_drawn)?,
+                }
             }
         };
         Ok(&self.newest.insert(erased).buffer)
@@ -57,7 +64,10 @@ impl ErasedSpace {
 }
 
 fn buffer(gpu: &Gpu, edits: &Edits, world_from_drawn: &Matrix4<f64>) -> Result<Buffer, Error> {
-    gpu.storage_with("erased", bytemuck::cast_slice(&edits.words(world_from_drawn)))
+    gpu.storage_with(
+        "erased",
+        bytemuck::cast_slice(&edits.words(world_from_drawn)),
+    )
 }
 
 #[cfg(test)]
@@ -74,13 +84,20 @@ mod tests {
         let mut passes = Passes::default();
         let mut erased = ErasedSpace::none(&gpu).unwrap();
         let with_boxes = |n: usize| {
-            let aabb = Aabb { world_from_box: Transform::identity(), min_m: [0.0; 3], max_m: [1.0; 3] };
+            let aabb = Aabb {
+                world_from_box: Transform::identity(),
+                min_m: [0.0; 3],
+                max_m: [1.0; 3],
+            };
             let mut edits = Edits::default();
             (0..n).for_each(|_| edits.push(Edit::Box(aabb)).unwrap());
             Arc::new(edits)
         };
         let mut id_of = |edits: &Arc<Edits>, scale: f64| {
-            erased.set(&gpu, &mut passes, edits, Matrix4::new_scaling(scale)).unwrap().id
+            erased
+                .set(&gpu, &mut passes, edits, Matrix4::new_scaling(scale))
+                .unwrap()
+                .id
         };
         let (none, one, other) = (Arc::default(), with_boxes(1), with_boxes(2));
         let ids = [id_of(&none, 1.0), id_of(&one, 1.0)];

@@ -1,8 +1,9 @@
 //! The depth format `compact_half`: differences of logarithmic counts, compressed to a zlib stream.
 //!
-//! Logarithmic counts have the same relative error at all distances. Most differences between neighbors are then 0, and
-//! zlib finds the patterns that repeat from row to row. Predicting from three neighbors gains nothing on real pictures.
-//! `web/src/layers/compact_depth.ts` is the decoder.
+//! Logarithmic counts have the same relative error at all distances. Most differences between
+//! neighbors are then 0, and zlib finds the patterns that repeat from row to row. Predicting from
+//! three neighbors gains nothing on real pictures. `web/src/layers/compact_depth.ts` is the
+//! decoder.
 
 use flate2::Compression;
 use flate2::write::ZlibEncoder;
@@ -10,8 +11,8 @@ use std::io::Write;
 use std::sync::LazyLock;
 use trainer::PackedDepth;
 
-/// Ratio of two consecutive counts, minus 1: depths are wrong by at most half of it, 0.2 %. The models' own errors are
-/// larger.
+/// Ratio of two consecutive counts, minus 1: depths are wrong by at most half of it, 0.2 %. The
+/// models' own errors are larger.
 const LOG_STEP: f64 = 0.004;
 /// Symbol of a pixel whose count follows in the second part.
 const ESCAPE: u8 = 255;
@@ -23,14 +24,16 @@ const LEVEL: u32 = 3;
 /// How much time is spent on compression.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Effort {
-    /// About 1 ms per megapixel of the picture, for connections on which more bytes take less time than that.
+    /// About 1 ms per megapixel of the picture, for connections on which more bytes take less time
+    /// than that.
     Fast,
     /// About 5 ms per megapixel.
     Small,
 }
 
 /// Natural logarithms of all counts.
-static LOGARITHMS: LazyLock<Vec<f32>> = LazyLock::new(|| (0..=u16::MAX).map(|count| f32::from(count).ln()).collect());
+static LOGARITHMS: LazyLock<Vec<f32>> =
+    LazyLock::new(|| (0..=u16::MAX).map(|count| f32::from(count).ln()).collect());
 
 /// A compressed depth map.
 #[derive(Debug)]
@@ -41,13 +44,17 @@ pub(crate) struct CompactDepth {
     pub(crate) min_m: f64,
     /// Natural logarithm of the ratio of two consecutive counts.
     pub(crate) log_step: f64,
-    /// A zlib stream of symbols, one byte per pixel, and the counts of escaped pixels, 16 bits each.
+    /// A zlib stream of symbols, one byte per pixel, and the counts of escaped pixels, 16 bits
+    /// each.
     pub(crate) bytes: Vec<u8>,
 }
 
 /// Compresses a depth map.
 pub(crate) fn compress(depth: &PackedDepth, effort: Effort) -> std::io::Result<CompactDepth> {
-    let counts = depth.counts.chunks_exact(2).map(|count| u16::from_le_bytes([count[0], count[1]]));
+    let counts = depth
+        .counts
+        .chunks_exact(2)
+        .map(|count| u16::from_le_bytes([count[0], count[1]]));
     let nearest = counts.clone().filter(|count| *count > 0).min().unwrap_or(1);
     let min_m = f64::from(nearest) * depth.meters_per_count;
     let log_step = LOG_STEP.ln_1p();
@@ -74,16 +81,28 @@ pub(crate) fn compress(depth: &PackedDepth, effort: Effort) -> std::io::Result<C
     let bytes = match effort {
         Effort::Fast => fdeflate::compress_to_vec(&symbols),
         Effort::Small => {
-            let mut encoder = ZlibEncoder::new(Vec::with_capacity(symbols.len() / 4), Compression::new(LEVEL));
+            let mut encoder = ZlibEncoder::new(
+                Vec::with_capacity(symbols.len() / 4),
+                Compression::new(LEVEL),
+            );
             encoder.write_all(&symbols)?;
             encoder.finish()?
         }
     };
-    Ok(CompactDepth { size_px: depth.size_px, min_m, log_step, bytes })
+    Ok(CompactDepth {
+        size_px: depth.size_px,
+        min_m,
+        log_step,
+        bytes,
+    })
 }
 
 /// The logarithmic count, relative to the nearest count; 0 if there is no surface.
-#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "ln(65535) / log_step is below 3000")]
+#[expect(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "ln(65535) / log_step is below 3000"
+)]
 fn log_count(count: u16, nearest: u16, log_step: f64) -> u16 {
     if count < nearest {
         return 0;
@@ -92,14 +111,20 @@ fn log_count(count: u16, nearest: u16, log_step: f64) -> u16 {
     (above / log_step as f32 + 1.5) as u16
 }
 
-/// The difference to the prediction: 0, -1, 1, -2, 2, ...; `None` if it is too large, or the pixel or its prediction
-/// has no surface but not both.
+/// The difference to the prediction: 0, -1, 1, -2, 2, ...; `None` if it is too large, or the pixel
+/// or its prediction has no surface but not both.
 fn symbol(code: u16, predicted: u16) -> Option<u8> {
     if (code == 0) != (predicted == 0) {
         return None;
     }
-    let symbol = if code >= predicted { 2 * u32::from(code - predicted) } else { 2 * u32::from(predicted - code) - 1 };
-    u8::try_from(symbol).ok().filter(|symbol| u16::from(*symbol) <= MAX_SYMBOL)
+    let symbol = if code >= predicted {
+        2 * u32::from(code - predicted)
+    } else {
+        2 * u32::from(predicted - code) - 1
+    };
+    u8::try_from(symbol)
+        .ok()
+        .filter(|symbol| u16::from(*symbol) <= MAX_SYMBOL)
 }
 
 #[cfg(test)]
@@ -114,29 +139,52 @@ pub(crate) mod tests {
     pub(crate) fn decode(compact: &CompactDepth) -> Vec<f64> {
         let n = compact.size_px[0] as usize * compact.size_px[1] as usize;
         let mut bytes = Vec::new();
-        ZlibDecoder::new(&*compact.bytes).read_to_end(&mut bytes).expect("a zlib stream");
-        let mut escaped = bytes[n..].chunks_exact(2).map(|count| u16::from_le_bytes([count[0], count[1]]));
+        ZlibDecoder::new(&*compact.bytes)
+            .read_to_end(&mut bytes)
+            .expect("a zlib stream");
+        let mut escaped = bytes[n..]
+            .chunks_exact(2)
+            .map(|count| u16::from_le_bytes([count[0], count[1]]));
         let width = compact.size_px[0] as usize;
         let mut codes: Vec<u16> = Vec::new();
         for (ix, &symbol) in bytes[..n].iter().enumerate() {
-            let before = if ix.is_multiple_of(width) { ix.checked_sub(width) } else { ix.checked_sub(1) };
+            let before = if ix.is_multiple_of(width) {
+                ix.checked_sub(width)
+            } else {
+                ix.checked_sub(1)
+            };
             let predicted = before.map_or(0, |before| i32::from(codes[before]));
             codes.push(match symbol {
                 ESCAPE => escaped.next().expect("a count"),
                 symbol => {
                     let half = i32::from(symbol.div_ceil(2));
-                    u16::try_from(predicted + if symbol % 2 == 0 { half } else { -half }).expect("a count")
+                    u16::try_from(predicted + if symbol % 2 == 0 { half } else { -half })
+                        .expect("a count")
                 }
             });
         }
         assert_eq!(escaped.next(), None, "all counts are used");
         let meters = |code: u16| compact.min_m * (compact.log_step * (f64::from(code) - 1.0)).exp();
-        codes.into_iter().map(|code| if code == 0 { 0.0 } else { meters(code) }).collect()
+        codes
+            .into_iter()
+            .map(|code| if code == 0 { 0.0 } else { meters(code) })
+            .collect()
     }
 
-    fn packed(size_px: [u32; 2], meters_per_count: f64, count: impl FnMut(u32) -> u16) -> PackedDepth {
-        let counts = (0..size_px[0] * size_px[1]).map(count).flat_map(u16::to_le_bytes).collect();
-        PackedDepth { size_px, meters_per_count, counts }
+    fn packed(
+        size_px: [u32; 2],
+        meters_per_count: f64,
+        count: impl FnMut(u32) -> u16,
+    ) -> PackedDepth {
+        let counts = (0..size_px[0] * size_px[1])
+            .map(count)
+            .flat_map(u16::to_le_bytes)
+            .collect();
+        PackedDepth {
+            size_px,
+            meters_per_count,
+            counts,
+        }
     }
 
     /// Compresses with both efforts, and returns the numbers of bytes.
@@ -148,8 +196,12 @@ pub(crate) mod tests {
         let compact = compress(depth, effort).expect("compressed");
         let decoded = decode(&compact);
         for (got, count) in decoded.iter().zip(depth.counts.chunks_exact(2)) {
-            let meters = f64::from(u16::from_le_bytes([count[0], count[1]])) * depth.meters_per_count;
-            assert!((got - meters).abs() <= 0.0021 * meters, "{got} instead of {meters}");
+            let meters =
+                f64::from(u16::from_le_bytes([count[0], count[1]])) * depth.meters_per_count;
+            assert!(
+                (got - meters).abs() <= 0.0021 * meters,
+                "{got} instead of {meters}"
+            );
         }
         compact.bytes.len()
     }
@@ -160,11 +212,21 @@ pub(crate) mod tests {
         for size_px in [[1, 1], [1, 7], [9, 1], [32, 17]] {
             check(&packed(size_px, 1e-4, |_| 0));
             check(&packed(size_px, 1e-4, |_| u16::MAX));
-            check(&packed(size_px, 3e-5, |_| u16::try_from(random.below(65_536)).expect("16 bits")));
-            check(&packed(size_px, 3e-5, |ix| if ix % 3 == 0 { 0 } else { 1 + u16::try_from(ix * 7).expect("small") }));
+            check(&packed(size_px, 3e-5, |_| {
+                u16::try_from(random.below(65_536)).expect("16 bits")
+            }));
+            check(&packed(size_px, 3e-5, |ix| {
+                if ix % 3 == 0 {
+                    0
+                } else {
+                    1 + u16::try_from(ix * 7).expect("small")
+                }
+            }));
         }
         // Every count once.
-        check(&packed([256, 256], 1e-4, |ix| u16::try_from(ix).expect("16 bits")));
+        check(&packed([256, 256], 1e-4, |ix| {
+            u16::try_from(ix).expect("16 bits")
+        }));
     }
 
     #[test]
@@ -174,13 +236,24 @@ pub(crate) mod tests {
         let depth = packed(size_px, 1e-4, |ix| {
             let (x, y) = (f64::from(ix % 640), f64::from(ix / 640));
             let from_center = (x - 300.0).hypot(y - 200.0) / 90.0;
-            let meters =
-                if from_center < 1.0 { 0.9 - 0.1 * (1.0 - from_center * from_center).sqrt() } else { 6.0 - y / 72.0 };
-            #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "below 6.5 m")]
+            let meters = if from_center < 1.0 {
+                0.9 - 0.1 * (1.0 - from_center * from_center).sqrt()
+            } else {
+                6.0 - y / 72.0
+            };
+            #[expect(
+                clippy::cast_possible_truncation,
+                clippy::cast_sign_loss,
+                reason = "below 6.5 m"
+            )]
             let count = (meters / 1e-4).round() as u16;
             count
         });
         let [fast, small] = check(&depth);
-        assert!(small < 12_000 && fast < 60_000, "{small} and {fast} bytes of {}", depth.counts.len());
+        assert!(
+            small < 12_000 && fast < 60_000,
+            "{small} and {fast} bytes of {}",
+            depth.counts.len()
+        );
     }
 }

@@ -41,8 +41,15 @@ pub(crate) struct Pixels<'a> {
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum JpegError {
     #[error("a {width} x {height} image needs {needed} values but has {got}")]
-    Length { width: u32, height: u32, needed: usize, got: usize },
-    #[error("a {width} x {height} image cannot be encoded as JPEG, which allows 1 to 65535 pixels each way")]
+    Length {
+        width: u32,
+        height: u32,
+        needed: usize,
+        got: usize,
+    },
+    #[error(
+        "a {width} x {height} image cannot be encoded as JPEG, which allows 1 to 65535 pixels each way"
+    )]
     Size { width: u32, height: u32 },
     #[error("the image cannot be encoded: {0}")]
     Encode(#[from] jpeg_encoder::EncodingError),
@@ -64,27 +71,53 @@ impl Pixels<'_> {
         let [width, height] = self.size_px;
         let needed = width as usize * height as usize * self.layout.n_channels();
         let got = self.bytes.len();
-        if got == needed { Ok(()) } else { Err(JpegError::Length { width, height, needed, got }) }
+        if got == needed {
+            Ok(())
+        } else {
+            Err(JpegError::Length {
+                width,
+                height,
+                needed,
+                got,
+            })
+        }
     }
 }
 
 /// Number of threads for encoding a picture.
 pub(crate) fn n_threads() -> usize {
-    std::thread::available_parallelism().map_or(1, NonZero::get).min(MAX_THREADS)
+    std::thread::available_parallelism()
+        .map_or(1, NonZero::get)
+        .min(MAX_THREADS)
 }
 
 /// Encodes a baseline JPEG file.
-pub(crate) fn encode(pixels: &Pixels<'_>, quality: u8, chroma: Chroma) -> Result<Vec<u8>, JpegError> {
+pub(crate) fn encode(
+    pixels: &Pixels<'_>,
+    quality: u8,
+    chroma: Chroma,
+) -> Result<Vec<u8>, JpegError> {
     let n_px = pixels.size_px[0] as usize * pixels.size_px[1] as usize;
-    encode_in_strips(pixels, quality, chroma, n_threads().min(n_px / MIN_STRIP_PX))
+    encode_in_strips(
+        pixels,
+        quality,
+        chroma,
+        n_threads().min(n_px / MIN_STRIP_PX),
+    )
 }
 
 /// Encodes about `n_strips` strips in parallel.
 ///
-/// A strip is a separate image with complete rows of blocks. Its scan starts and ends at a byte boundary and does not
-/// depend on the previous strip, exactly as at a restart marker. Joined with restart markers, the scans therefore form
-/// the scan of the whole image with a restart interval of one strip (ITU-T T.81, sections B.2.4.4 and F.1.1.5).
-fn encode_in_strips(pixels: &Pixels<'_>, quality: u8, chroma: Chroma, n_strips: usize) -> Result<Vec<u8>, JpegError> {
+/// A strip is a separate image with complete rows of blocks. Its scan starts and ends at a byte
+/// boundary and does not depend on the previous strip, exactly as at a restart marker. Joined with
+/// restart markers, the scans therefore form the scan of the whole image with a restart interval of
+/// one strip (ITU-T T.81, sections B.2.4.4 and F.1.1.5).
+fn encode_in_strips(
+    pixels: &Pixels<'_>,
+    quality: u8,
+    chroma: Chroma,
+    n_strips: usize,
+) -> Result<Vec<u8>, JpegError> {
     pixels.check()?;
     let [width, height] = pixels.size_px;
     let (Ok(width_px), Ok(height_px)) = (u16::try_from(width), u16::try_from(height)) else {
@@ -100,10 +133,17 @@ fn encode_in_strips(pixels: &Pixels<'_>, quality: u8, chroma: Chroma, n_strips: 
     let max_rows = usize::from(u16::MAX / blocks_per_row);
     let rows_per_strip = n_block_rows.div_ceil(n_strips.max(1));
     if rows_per_strip >= n_block_rows {
-        return encode_strip(pixels.bytes, pixels.layout, [width_px, height_px], quality, chroma);
+        return encode_strip(
+            pixels.bytes,
+            pixels.layout,
+            [width_px, height_px],
+            quality,
+            chroma,
+        );
     }
     let rows_per_strip = rows_per_strip.min(max_rows);
-    let strip_bytes = rows_per_strip * usize::from(block_px) * width as usize * pixels.layout.n_channels();
+    let strip_bytes =
+        rows_per_strip * usize::from(block_px) * width as usize * pixels.layout.n_channels();
     let strips = std::thread::scope(|scope| {
         let tasks: Vec<_> = pixels
             .bytes
@@ -111,10 +151,14 @@ fn encode_in_strips(pixels: &Pixels<'_>, quality: u8, chroma: Chroma, n_strips: 
             .map(|bytes| {
                 let rows = bytes.len() / (width as usize * pixels.layout.n_channels());
                 let rows = u16::try_from(rows).expect("a strip is not higher than its image");
-                scope.spawn(move || encode_strip(bytes, pixels.layout, [width_px, rows], quality, chroma))
+                scope.spawn(move || {
+                    encode_strip(bytes, pixels.layout, [width_px, rows], quality, chroma)
+                })
             })
             .collect();
-        let results = tasks.into_iter().map(|task| task.join().expect("encoding a strip does not panic"));
+        let results = tasks
+            .into_iter()
+            .map(|task| task.join().expect("encoding a strip does not panic"));
         results.collect::<Result<Vec<_>, _>>()
     })?;
     let interval = u16::try_from(rows_per_strip).expect("bounded by max_rows") * blocks_per_row;
@@ -163,7 +207,8 @@ struct Parts {
 fn join(strips: &[Vec<u8>], height_px: u16, interval: u16) -> Vec<u8> {
     let first = &strips[0];
     let parts = parts_of(first);
-    let mut file = Vec::with_capacity(strips.iter().map(|strip| strip.len() + 2).sum::<usize>() + 6);
+    let mut file =
+        Vec::with_capacity(strips.iter().map(|strip| strip.len() + 2).sum::<usize>() + 6);
     file.extend_from_slice(&first[..parts.scan_header]);
     file[parts.height..parts.height + 2].copy_from_slice(&height_px.to_be_bytes());
     file.extend_from_slice(&[0xFF, DEFINE_RESTART_INTERVAL, 0, 4]);
@@ -188,7 +233,13 @@ fn parts_of(file: &[u8]) -> Parts {
         let length = usize::from(u16::from_be_bytes([file[at + 2], file[at + 3]]));
         match file[at + 1] {
             START_OF_FRAME => height = at + 5,
-            START_OF_SCAN => return Parts { height, scan_header: at, scan: at + 2 + length },
+            START_OF_SCAN => {
+                return Parts {
+                    height,
+                    scan_header: at,
+                    scan: at + 2 + length,
+                };
+            }
             _ => {}
         }
         at += 2 + length;
@@ -207,7 +258,10 @@ pub(crate) fn downscale(pixels: &Pixels<'_>, size_px: [u32; 2]) -> Result<Vec<u8
     for row in 0..size_px[1] {
         row_sums.fill(0.0);
         for (y, weight) in rows.of(row) {
-            for (sum, &value) in row_sums.iter_mut().zip(&pixels.bytes[y * row_bytes..][..row_bytes]) {
+            for (sum, &value) in row_sums
+                .iter_mut()
+                .zip(&pixels.bytes[y * row_bytes..][..row_bytes])
+            {
                 *sum += weight * f32::from(value);
             }
         }
@@ -218,7 +272,11 @@ pub(crate) fn downscale(pixels: &Pixels<'_>, size_px: [u32; 2]) -> Result<Vec<u8
                     *sum += weight * value;
                 }
             }
-            #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "averages of bytes")]
+            #[expect(
+                clippy::cast_possible_truncation,
+                clippy::cast_sign_loss,
+                reason = "averages of bytes"
+            )]
             rgb.extend(color.map(|value| (value + 0.5) as u8));
         }
     }
@@ -234,11 +292,18 @@ struct Spans {
 
 impl Spans {
     fn new(n_source: u32, n_target: u32) -> Self {
-        Self { n_source, scale: f64::from(n_source) / f64::from(n_target.max(1)) }
+        Self {
+            n_source,
+            scale: f64::from(n_source) / f64::from(n_target.max(1)),
+        }
     }
 
     /// Index and weight of the source pixels of a target pixel. The weights add up to 1.
-    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "positions in the source image")]
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "positions in the source image"
+    )]
     fn of(&self, target: u32) -> impl Iterator<Item = (usize, f32)> + use<> {
         let (begin, scale) = (f64::from(target) * self.scale, self.scale);
         let end = (begin + scale).min(f64::from(self.n_source));
@@ -261,29 +326,53 @@ mod tests {
             .flat_map(|y| (0..width).map(move |x| (x, y)))
             .flat_map(|(x, y)| {
                 let stripe = if (x / 13 + y / 7) % 5 == 0 { 90 } else { 0 };
-                let pixel =
-                    [channel(x * 160 / width + stripe), channel(y * 160 / height + stripe), channel(40 + x / 3), 9];
+                let pixel = [
+                    channel(x * 160 / width + stripe),
+                    channel(y * 160 / height + stripe),
+                    channel(40 + x / 3),
+                    9,
+                ];
                 pixel.into_iter().take(layout.n_channels())
             })
             .collect()
     }
 
     fn decode(jpeg: &[u8]) -> image::RgbImage {
-        image::load_from_memory_with_format(jpeg, image::ImageFormat::Jpeg).expect("a JPEG file").to_rgb8()
+        image::load_from_memory_with_format(jpeg, image::ImageFormat::Jpeg)
+            .expect("a JPEG file")
+            .to_rgb8()
     }
 
     #[test]
     fn strips_decode_like_one_image() {
-        for (width, height) in [(160, 128), (161, 129), (1, 1), (7, 50), (16, 17), (333, 255), (15, 1000), (64, 8)] {
+        for (width, height) in [
+            (160, 128),
+            (161, 129),
+            (1, 1),
+            (7, 50),
+            (16, 17),
+            (333, 255),
+            (15, 1000),
+            (64, 8),
+        ] {
             for layout in [Layout::Rgb, Layout::Rgba] {
                 let bytes = scene(width, height, layout);
-                let pixels = Pixels { size_px: [width, height], layout, bytes: &bytes };
+                let pixels = Pixels {
+                    size_px: [width, height],
+                    layout,
+                    bytes: &bytes,
+                };
                 for chroma in [Chroma::Full, Chroma::Halved] {
                     let whole = decode(&encode_in_strips(&pixels, 92, chroma, 1).expect("encoded"));
                     assert_eq!((whole.width(), whole.height()), (width, height));
                     for n_strips in [2, 3, 7, 64] {
-                        let joined = decode(&encode_in_strips(&pixels, 92, chroma, n_strips).expect("encoded"));
-                        assert!(joined == whole, "{width} x {height}, {layout:?}, {chroma:?}, {n_strips} strips");
+                        let joined = decode(
+                            &encode_in_strips(&pixels, 92, chroma, n_strips).expect("encoded"),
+                        );
+                        assert!(
+                            joined == whole,
+                            "{width} x {height}, {layout:?}, {chroma:?}, {n_strips} strips"
+                        );
                     }
                 }
             }
@@ -294,26 +383,54 @@ mod tests {
     fn decoded_colors_are_close_to_the_source() {
         // Misalignment, a swapped channel or a shifted row would give errors in the tens.
         const MEAN_ABS: f64 = 4.0;
-        for (layout, chroma) in
-            [(Layout::Rgb, Chroma::Full), (Layout::Rgba, Chroma::Full), (Layout::Rgba, Chroma::Halved)]
-        {
+        for (layout, chroma) in [
+            (Layout::Rgb, Chroma::Full),
+            (Layout::Rgba, Chroma::Full),
+            (Layout::Rgba, Chroma::Halved),
+        ] {
             let bytes = scene(301, 203, layout);
-            let pixels = Pixels { size_px: [301, 203], layout, bytes: &bytes };
+            let pixels = Pixels {
+                size_px: [301, 203],
+                layout,
+                bytes: &bytes,
+            };
             let decoded = decode(&encode_in_strips(&pixels, 92, chroma, 4).expect("encoded"));
-            let source = bytes.chunks_exact(layout.n_channels()).flat_map(|pixel| &pixel[..3]);
-            let off: f64 = decoded.as_raw().iter().zip(source).map(|(a, b)| f64::from(a.abs_diff(*b))).sum();
+            let source = bytes
+                .chunks_exact(layout.n_channels())
+                .flat_map(|pixel| &pixel[..3]);
+            let off: f64 = decoded
+                .as_raw()
+                .iter()
+                .zip(source)
+                .map(|(a, b)| f64::from(a.abs_diff(*b)))
+                .sum();
             let mean = off / f64::from(301 * 203 * 3);
-            assert!(mean < MEAN_ABS, "{layout:?}, {chroma:?}: colors differ by {mean} on average");
+            assert!(
+                mean < MEAN_ABS,
+                "{layout:?}, {chroma:?}: colors differ by {mean} on average"
+            );
         }
     }
 
     #[test]
     fn wrong_length_or_size_is_an_error() {
         let encode = |size_px, bytes: &[u8]| {
-            encode_in_strips(&Pixels { size_px, layout: Layout::Rgba, bytes }, 90, Chroma::Full, 2)
+            encode_in_strips(
+                &Pixels {
+                    size_px,
+                    layout: Layout::Rgba,
+                    bytes,
+                },
+                90,
+                Chroma::Full,
+                2,
+            )
         };
         let error = encode([4, 4], &[0; 63]).expect_err("63 bytes");
-        assert_eq!(error.to_string(), "a 4 x 4 image needs 64 values but has 63");
+        assert_eq!(
+            error.to_string(),
+            "a 4 x 4 image needs 64 values but has 63"
+        );
         assert!(encode([4, 4], &[0; 64]).is_ok());
         assert!(encode([0, 4], &[]).is_err());
         assert!(encode([70_000, 1], &vec![0; 280_000]).is_err());
@@ -325,23 +442,50 @@ mod tests {
             10, 0, 0, 255, 20, 0, 0, 255, 99, 99, 99, 255, //
             30, 4, 0, 255, 40, 0, 8, 255, 99, 99, 99, 255,
         ];
-        let pixels = Pixels { size_px: [3, 2], layout: Layout::Rgba, bytes: &rgba };
+        let pixels = Pixels {
+            size_px: [3, 2],
+            layout: Layout::Rgba,
+            bytes: &rgba,
+        };
         // Columns of 1.5 pixels: (10 + 30 + (20 + 40) / 2) / 3 and ((20 + 40) / 2 + 2 * 99) / 3.
         let rgb = downscale(&pixels, [2, 1]).expect("downscaled");
         assert_eq!(rgb, [23, 1, 1, 76, 66, 67]);
-        assert_eq!(downscale(&pixels, [3, 2]).expect("unchanged")[3..6], [20, 0, 0]);
-        assert!(downscale(&Pixels { size_px: [4, 2], ..pixels }, [2, 1]).is_err());
+        assert_eq!(
+            downscale(&pixels, [3, 2]).expect("unchanged")[3..6],
+            [20, 0, 0]
+        );
+        assert!(
+            downscale(
+                &Pixels {
+                    size_px: [4, 2],
+                    ..pixels
+                },
+                [2, 1]
+            )
+            .is_err()
+        );
     }
 
     #[test]
     fn downscaling_keeps_the_mean() {
         let bytes = scene(301, 203, Layout::Rgb);
-        let mean = |bytes: &[u8]| bytes.iter().map(|value| f64::from(*value)).sum::<f64>() / bytes.len() as f64;
+        let mean = |bytes: &[u8]| {
+            bytes.iter().map(|value| f64::from(*value)).sum::<f64>() / bytes.len() as f64
+        };
         for size_px in [[240, 161], [97, 65], [1, 1], [301, 1]] {
-            let pixels = Pixels { size_px: [301, 203], layout: Layout::Rgb, bytes: &bytes };
+            let pixels = Pixels {
+                size_px: [301, 203],
+                layout: Layout::Rgb,
+                bytes: &bytes,
+            };
             let small = downscale(&pixels, size_px).expect("downscaled");
             assert_eq!(small.len(), 3 * (size_px[0] * size_px[1]) as usize);
-            assert!((mean(&small) - mean(&bytes)).abs() < 0.6, "{size_px:?}: {} {}", mean(&small), mean(&bytes));
+            assert!(
+                (mean(&small) - mean(&bytes)).abs() < 0.6,
+                "{size_px:?}: {} {}",
+                mean(&small),
+                mean(&bytes)
+            );
         }
     }
 }

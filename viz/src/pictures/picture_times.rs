@@ -5,12 +5,14 @@ use std::ops::Range;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-/// Maximum number of sent pictures per view and model of which a client can still report when they were shown.
+/// Maximum number of sent pictures per view and model of which a client can still report when they
+/// were shown.
 const MAX_UNREPORTED: usize = 16;
-/// Maximum number of pairs of a view and a model per client; the one that was sent longest ago is dropped.
+/// Maximum number of pairs of a view and a model per client; the one that was sent longest ago is
+/// dropped.
 const MAX_STREAMS: usize = 8;
-/// A client has waited for the keyframes of a picture that it has not reported if less than this passed between the
-/// picture before that one and the next picture that it reports.
+/// A client has waited for the keyframes of a picture that it has not reported if less than this
+/// passed between the picture before that one and the next picture that it reports.
 const MAX_WAIT: Duration = Duration::from_secs(10);
 /// Maximum number of shown pictures that wait for the run; the oldest are dropped.
 const MAX_SHOWN: usize = 1024;
@@ -38,12 +40,14 @@ pub struct NewestKeyframe {
 pub struct ShownPicture {
     /// Requested model; the first if `None`.
     pub method: Option<String>,
-    /// The keyframes that the client had not shown in this view of this model before, counted from the start of the run.
-    /// Keyframes of pictures that it has not reported belong to the next picture that it reports, unless they are old.
+    /// The keyframes that the client had not shown in this view of this model before, counted from
+    /// the start of the run. Keyframes of pictures that it has not reported belong to the next
+    /// picture that it reports, unless they are old.
     pub new_keyframes: Range<u64>,
     /// When the server began to send it.
     pub sent_at: Instant,
-    /// When the client showed it, as reported by the client, but not before `sent_at` and not after its report.
+    /// When the client showed it, as reported by the client, but not before `sent_at` and not after
+    /// its report.
     pub shown_at: Instant,
 }
 
@@ -78,16 +82,22 @@ struct Stream {
     pictures: VecDeque<Unreported>,
 }
 
-/// Pictures that were sent to one client and that it has not reported as shown. The stream of the last one is the last.
+/// Pictures that were sent to one client and that it has not reported as shown. The stream of the
+/// last one is the last.
 #[derive(Debug, Default)]
 pub(crate) struct UnreportedPictures(VecDeque<Stream>);
 
 impl UnreportedPictures {
-    /// Adds a picture that is about to be sent. The first picture of a model in a view has no new keyframes: the client
-    /// did not wait for them.
+    /// Adds a picture that is about to be sent. The first picture of a model in a view has no new
+    /// keyframes: the client did not wait for them.
     pub(crate) fn sent(&mut self, picture: SentPicture) {
-        let found = self.0.iter().position(|stream| stream.view == picture.view && stream.method == picture.method);
-        let mut stream = found.and_then(|ix| self.0.remove(ix)).unwrap_or_else(|| Stream::before(&picture));
+        let found = self
+            .0
+            .iter()
+            .position(|stream| stream.view == picture.view && stream.method == picture.method);
+        let mut stream = found
+            .and_then(|ix| self.0.remove(ix))
+            .unwrap_or_else(|| Stream::before(&picture));
         stream.push(picture);
         if self.0.len() == MAX_STREAMS {
             self.0.pop_front();
@@ -95,13 +105,26 @@ impl UnreportedPictures {
         self.0.push_back(stream);
     }
 
-    /// Removes a picture that its client has shown. `None` if the picture is unknown or was reported before.
+    /// Removes a picture that its client has shown. `None` if the picture is unknown or was
+    /// reported before.
     pub(crate) fn shown(&mut self, id: u64, view: &str, shown_at: Instant) -> Option<ShownPicture> {
         let mut streams = self.0.iter_mut().filter(|stream| *stream.view == *view);
-        streams.find_map(|stream| stream.take(id)).map(|(SentPicture { method, sent_at, .. }, new_keyframes)| {
-            let shown_at = shown_at.min(Instant::now()).max(sent_at);
-            ShownPicture { method, new_keyframes, sent_at, shown_at }
-        })
+        streams.find_map(|stream| stream.take(id)).map(
+            |(
+                SentPicture {
+                    method, sent_at, ..
+                },
+                new_keyframes,
+            )| {
+                let shown_at = shown_at.min(Instant::now()).max(sent_at);
+                ShownPicture {
+                    method,
+                    new_keyframes,
+                    sent_at,
+                    shown_at,
+                }
+            },
+        )
     }
 }
 
@@ -124,16 +147,32 @@ impl Stream {
         if self.pictures.len() == MAX_UNREPORTED {
             self.pictures.pop_front();
         }
-        self.pictures.push_back(Unreported { picture, new_keyframes, waits_since });
+        self.pictures.push_back(Unreported {
+            picture,
+            new_keyframes,
+            waits_since,
+        });
     }
 
-    /// Removes a picture and those that were sent before it. Their new keyframes become those of the picture.
+    /// Removes a picture and those that were sent before it. Their new keyframes become those of
+    /// the picture.
     fn take(&mut self, id: u64) -> Option<(SentPicture, Range<u64>)> {
-        let ix = self.pictures.iter().rposition(|unreported| unreported.picture.id == id)?;
+        let ix = self
+            .pictures
+            .iter()
+            .rposition(|unreported| unreported.picture.id == id)?;
         let older: Vec<Unreported> = self.pictures.drain(..ix).collect();
-        let Unreported { picture, new_keyframes, .. } = self.pictures.pop_front()?;
-        let waited = older.iter().filter(|old| picture.sent_at - old.waits_since <= MAX_WAIT);
-        let start = waited.map(|old| old.new_keyframes.start).fold(new_keyframes.start, u64::min);
+        let Unreported {
+            picture,
+            new_keyframes,
+            ..
+        } = self.pictures.pop_front()?;
+        let waited = older
+            .iter()
+            .filter(|old| picture.sent_at - old.waits_since <= MAX_WAIT);
+        let start = waited
+            .map(|old| old.new_keyframes.start)
+            .fold(new_keyframes.start, u64::min);
         Some((picture, start..new_keyframes.end))
     }
 }
@@ -157,11 +196,19 @@ impl ShownPictures {
 
 #[cfg(test)]
 mod tests {
-    use super::{MAX_STREAMS, MAX_UNREPORTED, MAX_WAIT, SentPicture, ShownPicture, UnreportedPictures};
+    use super::{
+        MAX_STREAMS, MAX_UNREPORTED, MAX_WAIT, SentPicture, ShownPicture, UnreportedPictures,
+    };
     use std::time::{Duration, Instant};
 
     fn picture(id: u64, view: &str, n_keyframes: u64, sent_at: Instant) -> SentPicture {
-        SentPicture { id, view: view.into(), method: None, n_keyframes, sent_at }
+        SentPicture {
+            id,
+            view: view.into(),
+            method: None,
+            n_keyframes,
+            sent_at,
+        }
     }
 
     #[test]
@@ -171,15 +218,44 @@ mod tests {
         (1..=3).for_each(|id| unreported.sent(picture(id, "", 10 + id, sent_at)));
         unreported.sent(picture(3, "inset", 20, sent_at));
         unreported.sent(picture(4, "inset", 21, sent_at));
-        assert_eq!(unreported.shown(4, "", sent_at), None, "this picture was not sent");
-        assert_eq!(unreported.shown(2, "inset", sent_at), None, "nor was this one");
-        let early = sent_at.checked_sub(Duration::from_millis(1)).expect("the machine has run for longer");
-        assert_eq!(unreported.shown(2, "", early).map(|shown| shown.shown_at), Some(sent_at));
+        assert_eq!(
+            unreported.shown(4, "", sent_at),
+            None,
+            "this picture was not sent"
+        );
+        assert_eq!(
+            unreported.shown(2, "inset", sent_at),
+            None,
+            "nor was this one"
+        );
+        let early = sent_at
+            .checked_sub(Duration::from_millis(1))
+            .expect("the machine has run for longer");
+        assert_eq!(
+            unreported.shown(2, "", early).map(|shown| shown.shown_at),
+            Some(sent_at)
+        );
         let late = Instant::now() + Duration::from_secs(60);
-        assert!(unreported.shown(3, "", late).is_some_and(|shown| shown.shown_at < late && shown.shown_at >= sent_at));
+        assert!(
+            unreported
+                .shown(3, "", late)
+                .is_some_and(|shown| shown.shown_at < late && shown.shown_at >= sent_at)
+        );
         let shown = unreported.shown(4, "inset", sent_at);
-        assert_eq!(shown, Some(ShownPicture { method: None, new_keyframes: 20..21, sent_at, shown_at: sent_at }));
-        assert_eq!(unreported.shown(4, "inset", sent_at), None, "it was reported before");
+        assert_eq!(
+            shown,
+            Some(ShownPicture {
+                method: None,
+                new_keyframes: 20..21,
+                sent_at,
+                shown_at: sent_at
+            })
+        );
+        assert_eq!(
+            unreported.shown(4, "inset", sent_at),
+            None,
+            "it was reported before"
+        );
     }
 
     #[test]
@@ -187,8 +263,14 @@ mod tests {
         let sent_at = Instant::now();
         let mut unreported = UnreportedPictures::default();
         let mut new_keyframes = |id: u64, method: Option<&str>, n_keyframes: u64| {
-            unreported.sent(SentPicture { method: method.map(str::to_owned), ..picture(id, "", n_keyframes, sent_at) });
-            unreported.shown(id, "", sent_at).expect("it was sent").new_keyframes
+            unreported.sent(SentPicture {
+                method: method.map(str::to_owned),
+                ..picture(id, "", n_keyframes, sent_at)
+            });
+            unreported
+                .shown(id, "", sent_at)
+                .expect("it was sent")
+                .new_keyframes
         };
         assert_eq!(new_keyframes(1, None, 500), 500..500);
         assert_eq!(new_keyframes(2, None, 503), 500..503);
@@ -207,7 +289,12 @@ mod tests {
             unreported.sent(picture(id, "surroundings", n_keyframes, sent_at));
         }
         unreported.sent(picture(2, "", 9, sent_at));
-        assert_eq!(unreported.shown(2, "", sent_at).map(|shown| shown.new_keyframes), Some(5..9));
+        assert_eq!(
+            unreported
+                .shown(2, "", sent_at)
+                .map(|shown| shown.new_keyframes),
+            Some(5..9)
+        );
     }
 
     #[test]
@@ -215,17 +302,42 @@ mod tests {
         let began = Instant::now();
         let mut unreported = UnreportedPictures::default();
         let mut send = |id: u64, n_keyframes: u64, secs: u64| {
-            unreported.sent(picture(id, "", n_keyframes, began + Duration::from_secs(secs)));
+            unreported.sent(picture(
+                id,
+                "",
+                n_keyframes,
+                began + Duration::from_secs(secs),
+            ));
         };
         let away = 5 + MAX_WAIT.as_secs();
-        for (id, n_keyframes, secs) in [(1, 10, 0), (2, 12, 1), (3, 13, 2), (4, 90, away), (5, 91, away), (6, 95, away)]
-        {
+        for (id, n_keyframes, secs) in [
+            (1, 10, 0),
+            (2, 12, 1),
+            (3, 13, 2),
+            (4, 90, away),
+            (5, 91, away),
+            (6, 95, away),
+        ] {
             send(id, n_keyframes, secs);
         }
-        assert_eq!(unreported.shown(3, "", began).map(|shown| shown.new_keyframes), Some(10..13));
-        assert_eq!(unreported.shown(2, "", began), None, "its keyframes were reported");
+        assert_eq!(
+            unreported
+                .shown(3, "", began)
+                .map(|shown| shown.new_keyframes),
+            Some(10..13)
+        );
+        assert_eq!(
+            unreported.shown(2, "", began),
+            None,
+            "its keyframes were reported"
+        );
         // The client did not wait for the keyframes of the fourth picture.
-        assert_eq!(unreported.shown(6, "", began).map(|shown| shown.new_keyframes), Some(90..95));
+        assert_eq!(
+            unreported
+                .shown(6, "", began)
+                .map(|shown| shown.new_keyframes),
+            Some(90..95)
+        );
     }
 
     #[test]
@@ -234,7 +346,10 @@ mod tests {
         let mut unreported = UnreportedPictures::default();
         (0..1000).for_each(|id| unreported.sent(picture(id, "", id, sent_at)));
         assert_eq!(unreported.0[0].pictures.len(), MAX_UNREPORTED);
-        assert!(unreported.shown(999, "", sent_at).is_some() && unreported.shown(0, "", sent_at).is_none());
+        assert!(
+            unreported.shown(999, "", sent_at).is_some()
+                && unreported.shown(0, "", sent_at).is_none()
+        );
         (0..100).for_each(|id| unreported.sent(picture(id, &id.to_string(), id, sent_at)));
         assert_eq!(unreported.0.len(), MAX_STREAMS);
     }

@@ -1,5 +1,5 @@
-//! Render requests by client and view: the newest request of each view, stage by stage. Clients take turns, and so do
-//! the views of a client.
+//! Render requests by client and view: the newest request of each view, stage by stage. Clients
+//! take turns, and so do the views of a client.
 
 use crate::pictures::picture_times::{TrainedKeyframes, UnreportedPictures};
 use crate::pictures::view_request::ViewRequest;
@@ -12,16 +12,17 @@ use std::sync::Arc;
 use tokio::sync::Notify;
 use trainer::Rendered;
 
-/// Maximum number of pictures per client that are being rendered or sent. It limits rendering for slow clients.
+/// Maximum number of pictures per client that are being rendered or sent. It limits rendering for
+/// slow clients.
 const MAX_UNSENT: usize = 2;
 /// Memory that each client may use for these pictures, bytes. Any picture without f32 depth fits.
 const CLIENT_BYTES: usize = 16 << 20;
-/// Additional memory for larger pictures, bytes, shared by all clients of a role. Viewers and operators have separate
-/// shares, so that slow viewers do not delay operators.
+/// Additional memory for larger pictures, bytes, shared by all clients of a role. Viewers and
+/// operators have separate shares, so that slow viewers do not delay operators.
 const SHARED_BYTES: usize = 256 << 20;
 
-/// Maximum number of results that wait to be sent to a client. A client that does not read misses the reasons of further
-/// failed edits.
+/// Maximum number of results that wait to be sent to a client. A client that does not read misses
+/// the reasons of further failed edits.
 const MAX_OUTBOX: usize = 64;
 
 /// Maximum number of views per client.
@@ -84,7 +85,11 @@ pub(crate) enum Outgoing {
     /// A rendered stage that is not encoded yet.
     Picture(Box<DrawnPicture>),
     /// A stage that could not be rendered.
-    Failed { id: u64, view: Arc<str>, reason: String },
+    Failed {
+        id: u64,
+        view: Arc<str>,
+        reason: String,
+    },
     /// An edit that could not be made.
     Rejected { id: Option<u64>, reason: String },
 }
@@ -120,19 +125,34 @@ impl Queue {
         self.clients.len()
     }
 
-    /// Adds a request. Stages of the older request for the same view that have not been started are dropped. Returns
-    /// false if all of the client's views have pending requests, so that there is no room for another view.
+    /// Adds a request. Stages of the older request for the same view that have not been started are
+    /// dropped. Returns false if all of the client's views have pending requests, so that there is
+    /// no room for another view.
     ///
     /// Only the last stage is kept if it is expected to be fast.
     pub(crate) fn view_request(&mut self, client: u64, mut view_request: ViewRequest) -> bool {
-        let Some(waiting) = self.clients.get_mut(&client) else { return true };
+        let Some(waiting) = self.clients.get_mut(&client) else {
+            return true;
+        };
         if !waiting.views.contains_key(&view_request.view) && waiting.views.len() >= MAX_VIEWS {
-            let idle = waiting.views.iter().find(|(_, view)| view.view_request.is_none());
-            let Some(name) = idle.map(|(name, _)| Arc::clone(name)) else { return false };
+            let idle = waiting
+                .views
+                .iter()
+                .find(|(_, view)| view.view_request.is_none());
+            let Some(name) = idle.map(|(name, _)| Arc::clone(name)) else {
+                return false;
+            };
             waiting.views.remove(&name);
         }
-        let view = waiting.views.entry(Arc::clone(&view_request.view)).or_default();
-        if view.last_full.as_ref().is_some_and(|last| last.expected_millis(&view_request) < FAST_MILLIS) {
+        let view = waiting
+            .views
+            .entry(Arc::clone(&view_request.view))
+            .or_default();
+        if view
+            .last_full
+            .as_ref()
+            .is_some_and(|last| last.expected_millis(&view_request) < FAST_MILLIS)
+        {
             view_request.stages.drain(..view_request.stages.len() - 1);
         }
         view.view_request = Some(Arc::new(view_request));
@@ -142,35 +162,60 @@ impl Queue {
 
     /// Whether [`take`](Self::take) would return a stage.
     pub(crate) fn has_work(&self) -> bool {
-        self.clients.values().any(|waiting| self.next_view(waiting).is_some())
+        self.clients
+            .values()
+            .any(|waiting| self.next_view(waiting).is_some())
     }
 
-    /// The next stage to render: clients in turn, the views of a client in turn, and the stages of a view in order.
+    /// The next stage to render: clients in turn, the views of a client in turn, and the stages of
+    /// a view in order.
     pub(crate) fn take(&mut self) -> Option<RenderJob> {
-        let (after, before) = (self.clients.range(self.last_served + 1..), self.clients.range(..=self.last_served));
-        let (client, name) = after.chain(before).find_map(|(&id, waiting)| Some((id, self.next_view(waiting)?)))?;
+        let (after, before) = (
+            self.clients.range(self.last_served + 1..),
+            self.clients.range(..=self.last_served),
+        );
+        let (client, name) = after
+            .chain(before)
+            .find_map(|(&id, waiting)| Some((id, self.next_view(waiting)?)))?;
         self.last_served = client;
         self.clients.get_mut(&client)?.take(client, name)
     }
 
-    /// The view whose picture a client gets next; `None` if there is none, or if there is no room for its pictures.
+    /// The view whose picture a client gets next; `None` if there is none, or if there is no room
+    /// for its pictures.
     fn next_view(&self, waiting: &ClientQueue) -> Option<Arc<str>> {
-        let same_role = self.clients.values().filter(|other| other.role == waiting.role);
-        let n_shared = same_role.map(|other| other.n_unsent_bytes().saturating_sub(CLIENT_BYTES)).sum();
+        let same_role = self
+            .clients
+            .values()
+            .filter(|other| other.role == waiting.role);
+        let n_shared = same_role
+            .map(|other| other.n_unsent_bytes().saturating_sub(CLIENT_BYTES))
+            .sum();
         waiting.next_view(SHARED_BYTES.saturating_sub(n_shared))
     }
 
     /// Records the render time of the last stage of a request.
     pub(crate) fn record_render_time(&mut self, job: &RenderJob, millis: f64) {
-        let view = self.clients.get_mut(&job.client).and_then(|waiting| waiting.views.get_mut(&job.view_request.view));
+        let view = self
+            .clients
+            .get_mut(&job.client)
+            .and_then(|waiting| waiting.views.get_mut(&job.view_request.view));
         if let Some(view) = view {
-            let (method, n_px) = (job.view_request.method.clone(), n_px_of_last_stage(&job.view_request));
-            view.last_full = Some(FullPicture { method, n_px, millis });
+            let (method, n_px) = (
+                job.view_request.method.clone(),
+                n_px_of_last_stage(&job.view_request),
+            );
+            view.last_full = Some(FullPicture {
+                method,
+                n_px,
+                millis,
+            });
         }
     }
 
-    /// Puts a result into a client's outbox and wakes the client's session. Drops the reason of a failed edit if the
-    /// outbox is full; the number of the other results is limited by [`MAX_UNSENT`].
+    /// Puts a result into a client's outbox and wakes the client's session. Drops the reason of a
+    /// failed edit if the outbox is full; the number of the other results is limited by
+    /// [`MAX_UNSENT`].
     pub(crate) fn push_outgoing(&mut self, client: u64, outgoing: Outgoing) {
         if let Some(waiting) = self.clients.get_mut(&client) {
             if waiting.outbox.len() >= MAX_OUTBOX && matches!(outgoing, Outgoing::Rejected { .. }) {
@@ -189,7 +234,9 @@ impl Queue {
 
     /// The pictures that were sent to a client and that it has not reported as shown.
     pub(crate) fn unreported(&mut self, client: u64) -> Option<&mut UnreportedPictures> {
-        self.clients.get_mut(&client).map(|waiting| &mut waiting.unreported)
+        self.clients
+            .get_mut(&client)
+            .map(|waiting| &mut waiting.unreported)
     }
 
     /// Records that a stage was sent or will never be rendered.
@@ -217,19 +264,25 @@ impl ClientQueue {
         self.unsent.iter().sum()
     }
 
-    /// The next view in turn whose picture fits into [`CLIENT_BYTES`]. If the client has no other picture, `n_shared_bytes` are
-    /// added.
+    /// The next view in turn whose picture fits into [`CLIENT_BYTES`]. If the client has no other
+    /// picture, `n_shared_bytes` are added.
     fn next_view(&self, n_shared_bytes: usize) -> Option<Arc<str>> {
         if self.unsent.len() >= MAX_UNSENT {
             return None;
         }
-        let n_more = if self.unsent.is_empty() { n_shared_bytes } else { 0 };
+        let n_more = if self.unsent.is_empty() {
+            n_shared_bytes
+        } else {
+            0
+        };
         let n_free = (CLIENT_BYTES + n_more).saturating_sub(self.n_unsent_bytes());
         let last = Bound::Excluded(Arc::clone(&self.last_served));
         let after = self.views.range::<Arc<str>, _>((last, Bound::Unbounded));
         let mut in_turn = after.chain(&self.views);
         let fits = |view: &ViewQueue| view.n_bytes_of_next().is_some_and(|n| n <= n_free);
-        in_turn.find(|(_, view)| fits(view)).map(|(name, _)| Arc::clone(name))
+        in_turn
+            .find(|(_, view)| fits(view))
+            .map(|(name, _)| Arc::clone(name))
     }
 
     fn take(&mut self, client: u64, name: Arc<str>) -> Option<RenderJob> {
@@ -242,24 +295,40 @@ impl ClientQueue {
             view.view_request = None;
         }
         self.last_served = name;
-        Some(RenderJob { client, view_request, stage })
+        Some(RenderJob {
+            client,
+            view_request,
+            stage,
+        })
     }
 }
 
 impl ViewQueue {
-    /// Memory that the picture of the next stage needs until it is sent, bytes: JPEG and packed depth take less than a byte
-    /// per pixel together; with depth as f32, color is not packed on the GPU either.
+    /// Memory that the picture of the next stage needs until it is sent, bytes: JPEG and packed
+    /// depth take less than a byte per pixel together; with depth as f32, color is not packed on
+    /// the GPU either.
     fn n_bytes_of_next(&self) -> Option<usize> {
         let view_request = self.view_request.as_ref()?;
-        let [width, height] = view_request.stage_request(self.next_stage).size_px.map(|n| n as usize);
+        let [width, height] = view_request
+            .stage_request(self.next_stage)
+            .size_px
+            .map(|n| n as usize);
         let is_f32 = view_request.depth == Some(DepthFormat::F32);
-        Some(width * height * if is_f32 { 4 + 4 * usize::from(view_request.color) } else { 1 })
+        Some(
+            width
+                * height
+                * if is_f32 {
+                    4 + 4 * usize::from(view_request.color)
+                } else {
+                    1
+                },
+        )
     }
 }
 
 impl FullPicture {
-    /// Expected render time of the last stage of a request: the time of the previous picture, scaled up if the
-    /// request has more pixels.
+    /// Expected render time of the last stage of a request: the time of the previous picture,
+    /// scaled up if the request has more pixels.
     fn expected_millis(&self, view_request: &ViewRequest) -> f64 {
         if self.method != view_request.method {
             return f64::INFINITY;
@@ -269,7 +338,9 @@ impl FullPicture {
 }
 
 fn n_px_of_last_stage(view_request: &ViewRequest) -> f64 {
-    let size_px = view_request.stage_request(view_request.stages.len() - 1).size_px;
+    let size_px = view_request
+        .stage_request(view_request.stages.len() - 1)
+        .size_px;
     f64::from(size_px[0]) * f64::from(size_px[1])
 }
 
@@ -307,7 +378,17 @@ mod tests {
         queue.view_request(a, view_request(10));
         queue.view_request(b, view_request(20));
         let served = drain(&mut queue);
-        assert_eq!(served, [(a, 10, 0), (b, 20, 0), (a, 10, 1), (b, 20, 1), (a, 10, 2), (b, 20, 2)]);
+        assert_eq!(
+            served,
+            [
+                (a, 10, 0),
+                (b, 20, 0),
+                (a, 10, 1),
+                (b, 20, 1),
+                (a, 10, 2),
+                (b, 20, 2)
+            ]
+        );
     }
 
     #[test]
@@ -345,7 +426,8 @@ mod tests {
     fn memory_of_unsent_pictures_is_bounded() {
         let large = |id, view: &str| {
             let mut large = view_request(id);
-            (large.view, large.stages, large.depth) = (view.into(), vec![1.0], Some(DepthFormat::F32));
+            (large.view, large.stages, large.depth) =
+                (view.into(), vec![1.0], Some(DepthFormat::F32));
             large.request.size_px = [4096, 4096];
             large
         };
@@ -354,16 +436,32 @@ mod tests {
         for viewer in &viewers {
             (0..8).for_each(|n| _ = queue.view_request(*viewer, large(n, &n.to_string())));
         }
-        let served: Vec<u64> = std::iter::from_fn(|| queue.take()).map(|job| job.client).collect();
-        assert_eq!(served, viewers[..2], "one large picture each, of two clients");
-        let n_bytes: usize = queue.clients.values().map(super::ClientQueue::n_unsent_bytes).sum();
+        let served: Vec<u64> = std::iter::from_fn(|| queue.take())
+            .map(|job| job.client)
+            .collect();
+        assert_eq!(
+            served,
+            viewers[..2],
+            "one large picture each, of two clients"
+        );
+        let n_bytes: usize = queue
+            .clients
+            .values()
+            .map(super::ClientQueue::n_unsent_bytes)
+            .sum();
         assert!(n_bytes <= viewers.len() * CLIENT_BYTES + SHARED_BYTES);
         let (operator, _) = queue.join(Role::Operator);
         queue.view_request(operator, large(1, ""));
-        assert_eq!(queue.take().expect("viewers do not delay operators").client, operator);
+        assert_eq!(
+            queue.take().expect("viewers do not delay operators").client,
+            operator
+        );
         let (other, _) = queue.join(Role::Viewer);
         queue.view_request(other, view_request(5));
-        assert_eq!(queue.take().expect("a small picture always fits").client, other);
+        assert_eq!(
+            queue.take().expect("a small picture always fits").client,
+            other
+        );
         queue.release(viewers[0]);
         assert!(viewers.contains(&queue.take().expect("there is room again").client));
     }
@@ -386,34 +484,79 @@ mod tests {
             }
             scales
         };
-        assert_eq!(draw(&mut queue, 1, 29.0, |_| ()), [0.1, 0.5, 1.0], "there is no earlier picture");
-        assert_eq!(draw(&mut queue, 2, 31.0, |_| ()), [1.0], "the last one was fast");
-        assert_eq!(draw(&mut queue, 3, 3.0, |_| ()), [0.1, 0.5, 1.0], "the last one was slow");
-        assert_eq!(draw(&mut queue, 4, 3.0, |view_request| view_request.stages = vec![0.5]), [0.5]);
-        assert_eq!(draw(&mut queue, 5, 8.0, |_| ()), [1.0], "four times the pixels in 12 ms");
         assert_eq!(
-            draw(&mut queue, 6, 6.0, |view_request| view_request.request.size_px = [200, 200]),
+            draw(&mut queue, 1, 29.0, |_| ()),
+            [0.1, 0.5, 1.0],
+            "there is no earlier picture"
+        );
+        assert_eq!(
+            draw(&mut queue, 2, 31.0, |_| ()),
+            [1.0],
+            "the last one was fast"
+        );
+        assert_eq!(
+            draw(&mut queue, 3, 3.0, |_| ()),
+            [0.1, 0.5, 1.0],
+            "the last one was slow"
+        );
+        assert_eq!(
+            draw(&mut queue, 4, 3.0, |view_request| view_request.stages =
+                vec![0.5]),
+            [0.5]
+        );
+        assert_eq!(
+            draw(&mut queue, 5, 8.0, |_| ()),
+            [1.0],
+            "four times the pixels in 12 ms"
+        );
+        assert_eq!(
+            draw(&mut queue, 6, 6.0, |view_request| view_request
+                .request
+                .size_px = [200, 200]),
             [0.1, 0.5, 1.0],
             "32 ms"
         );
         assert_eq!(
-            draw(&mut queue, 7, 1.0, |view_request| view_request.method = Some("nerf".to_owned())),
+            draw(&mut queue, 7, 1.0, |view_request| view_request.method =
+                Some("nerf".to_owned())),
             [0.1, 0.5, 1.0]
         );
-        assert_eq!(draw(&mut queue, 8, 1.0, |view_request| view_request.method = Some("nerf".to_owned())), [1.0]);
+        assert_eq!(
+            draw(&mut queue, 8, 1.0, |view_request| view_request.method =
+                Some("nerf".to_owned())),
+            [1.0]
+        );
     }
 
     #[test]
     fn client_that_does_not_read_gets_a_limited_number_of_results() {
         let mut queue = Queue::default();
         let (a, _) = queue.join(Role::Operator);
-        let rejected = |id| Outgoing::Rejected { id: Some(id), reason: String::new() };
+        let rejected = |id| Outgoing::Rejected {
+            id: Some(id),
+            reason: String::new(),
+        };
         (0..1000).for_each(|id| queue.push_outgoing(a, rejected(id)));
-        queue.push_outgoing(a, Outgoing::Failed { id: 5, view: "".into(), reason: String::new() });
+        queue.push_outgoing(
+            a,
+            Outgoing::Failed {
+                id: 5,
+                view: "".into(),
+                reason: String::new(),
+            },
+        );
         let sent: Vec<Outgoing> = std::iter::from_fn(|| queue.collect(a)).collect();
         assert_eq!(sent.len(), MAX_OUTBOX + 1);
-        assert!(matches!(sent[63], Outgoing::Rejected { id: Some(63), .. }), "the oldest are kept: {:?}", sent[63]);
-        assert!(matches!(sent[64], Outgoing::Failed { .. }), "pictures are never dropped: {:?}", sent[64]);
+        assert!(
+            matches!(sent[63], Outgoing::Rejected { id: Some(63), .. }),
+            "the oldest are kept: {:?}",
+            sent[63]
+        );
+        assert!(
+            matches!(sent[64], Outgoing::Failed { .. }),
+            "pictures are never dropped: {:?}",
+            sent[64]
+        );
         queue.push_outgoing(a, rejected(7));
         assert!(queue.collect(a).is_some(), "there is room again");
     }

@@ -54,12 +54,17 @@ pub(crate) enum InvalidRequest {
     Background,
     #[error("the name of the view has {got} bytes, expected at most {MAX_VIEW_BYTES}")]
     ViewName { got: usize },
-    #[error("{max} views have pending requests, which is the maximum; wait for a picture of one of them")]
+    #[error(
+        "{max} views have pending requests, which is the maximum; wait for a picture of one of them"
+    )]
     Views { max: usize },
     #[error("shown_millis is {got}, expected a time on the server's clock, 0 or more")]
     ShownTime { got: f64 },
     #[error("topic is {got:?}, expected one of {}", quoted(known))]
-    Topic { got: String, known: Vec<&'static str> },
+    Topic {
+        got: String,
+        known: Vec<&'static str>,
+    },
     #[error("rate_hz is {got}, expected 0 to {max}", max = crate::session::protocol::MAX_RATE_HZ)]
     Rate { got: f64 },
     #[error("camera and size_px apply only to the topic live_images")]
@@ -72,7 +77,9 @@ pub(crate) enum InvalidRequest {
     ByteRate { got: f64 },
     #[error("size_px is {got:?}, each side must be at least {min}")]
     ImageSize { got: [u32; 2], min: u32 },
-    #[error("at most {max} cameras can have a subscription of their own, with names of at most {max_bytes} bytes")]
+    #[error(
+        "at most {max} cameras can have a subscription of their own, with names of at most {max_bytes} bytes"
+    )]
     Cameras { max: usize, max_bytes: usize },
 }
 
@@ -110,8 +117,10 @@ impl ViewRequest {
             return Err(InvalidRequest::NoOutput);
         }
         let size_px = checked_size(message.size_px)?;
-        let (near_m, far_m) =
-            checked_range(message.near_m.unwrap_or(DEFAULT_NEAR_M), message.far_m.unwrap_or(DEFAULT_FAR_M))?;
+        let (near_m, far_m) = checked_range(
+            message.near_m.unwrap_or(DEFAULT_NEAR_M),
+            message.far_m.unwrap_or(DEFAULT_FAR_M),
+        )?;
         Ok(Self {
             id: message.id,
             view: checked_view(message.view.as_deref().unwrap_or_default())?,
@@ -124,7 +133,11 @@ impl ViewRequest {
                 shutter: None,
                 near_m,
                 far_m,
-                crop: message.crop.as_ref().map(|crop| checked_box(crop, "crop")).transpose()?,
+                crop: message
+                    .crop
+                    .as_ref()
+                    .map(|crop| checked_box(crop, "crop"))
+                    .transpose()?,
                 edits: Arc::default(),
                 background_srgb: checked_background(message.background_srgb.unwrap_or([0.0; 3]))?,
                 appearance_of: None,
@@ -132,7 +145,9 @@ impl ViewRequest {
             },
             stages: checked_stages(message.stages.as_deref().unwrap_or(&DEFAULT_STAGES))?,
             color: outputs.contains(&Output::Color),
-            depth: outputs.contains(&Output::Depth).then(|| message.depth_format.unwrap_or_default()),
+            depth: outputs
+                .contains(&Output::Depth)
+                .then(|| message.depth_format.unwrap_or_default()),
         })
     }
 
@@ -141,19 +156,33 @@ impl ViewRequest {
         let full = self.request.size_px.map(f64::from);
         let scale = self.stages[stage];
         let size_px = self.request.size_px.map(|n| scaled(n, scale));
-        let ratio = [f64::from(size_px[0]) / full[0], f64::from(size_px[1]) / full[1]];
+        let ratio = [
+            f64::from(size_px[0]) / full[0],
+            f64::from(size_px[1]) / full[1],
+        ];
         let projection = match self.request.projection {
-            Projection::Pinhole { focal_px, principal_px } => Projection::Pinhole {
+            Projection::Pinhole {
+                focal_px,
+                principal_px,
+            } => Projection::Pinhole {
                 focal_px: [focal_px[0] * ratio[0], focal_px[1] * ratio[1]],
                 principal_px: [principal_px[0] * ratio[0], principal_px[1] * ratio[1]],
             },
             Projection::Equirectangular => Projection::Equirectangular,
         };
-        RenderRequest { size_px, projection, ..self.request.clone() }
+        RenderRequest {
+            size_px,
+            projection,
+            ..self.request.clone()
+        }
     }
 }
 
-#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "0 < scale <= 1 keeps the product in u32")]
+#[expect(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "0 < scale <= 1 keeps the product in u32"
+)]
 fn scaled(n: u32, scale: f64) -> u32 {
     (f64::from(n) * scale).round().max(1.0) as u32
 }
@@ -163,48 +192,94 @@ fn rigid(rows: &[f64; 16], field: &'static str) -> Result<Transform, InvalidRequ
 }
 
 fn checked_view(name: &str) -> Result<Arc<str>, InvalidRequest> {
-    if name.len() <= MAX_VIEW_BYTES { Ok(name.into()) } else { Err(InvalidRequest::ViewName { got: name.len() }) }
+    if name.len() <= MAX_VIEW_BYTES {
+        Ok(name.into())
+    } else {
+        Err(InvalidRequest::ViewName { got: name.len() })
+    }
 }
 
 fn checked_size(size_px: [u32; 2]) -> Result<[u32; 2], InvalidRequest> {
     let fits = size_px.iter().all(|n| (1..=MAX_SIZE_PX).contains(n));
-    if fits { Ok(size_px) } else { Err(InvalidRequest::Size { got: size_px }) }
+    if fits {
+        Ok(size_px)
+    } else {
+        Err(InvalidRequest::Size { got: size_px })
+    }
 }
 
 fn checked_range(near_m: f64, far_m: f64) -> Result<(f64, f64), InvalidRequest> {
     let fits = near_m > 0.0 && near_m < far_m && far_m.is_finite();
-    if fits { Ok((near_m, far_m)) } else { Err(InvalidRequest::NearFar { near_m, far_m }) }
+    if fits {
+        Ok((near_m, far_m))
+    } else {
+        Err(InvalidRequest::NearFar { near_m, far_m })
+    }
 }
 
 fn checked_stages(stages: &[f64]) -> Result<Vec<f64>, InvalidRequest> {
-    let fits = (1..=MAX_STAGES).contains(&stages.len()) && stages.iter().all(|scale| *scale > 0.0 && *scale <= 1.0);
-    if fits { Ok(stages.to_vec()) } else { Err(InvalidRequest::Stages) }
+    let fits = (1..=MAX_STAGES).contains(&stages.len())
+        && stages.iter().all(|scale| *scale > 0.0 && *scale <= 1.0);
+    if fits {
+        Ok(stages.to_vec())
+    } else {
+        Err(InvalidRequest::Stages)
+    }
 }
 
-fn checked_projection(message: &ProjectionMessage, size_px: [u32; 2]) -> Result<Projection, InvalidRequest> {
-    let ProjectionMessage::Pinhole { focal_px, principal_px, vertical_fov_rad } = *message else {
+fn checked_projection(
+    message: &ProjectionMessage,
+    size_px: [u32; 2],
+) -> Result<Projection, InvalidRequest> {
+    let ProjectionMessage::Pinhole {
+        focal_px,
+        principal_px,
+        vertical_fov_rad,
+    } = *message
+    else {
         return Ok(Projection::Equirectangular);
     };
     let [width, height] = size_px.map(f64::from);
     let focal_px = match (focal_px, vertical_fov_rad) {
         (Some(focal_px), None) => focal_px,
-        (None, Some(angle)) if angle > 0.0 && angle < std::f64::consts::PI => [0.5 * height / (0.5 * angle).tan(); 2],
+        (None, Some(angle)) if angle > 0.0 && angle < std::f64::consts::PI => {
+            [0.5 * height / (0.5 * angle).tan(); 2]
+        }
         _ => return Err(InvalidRequest::Pinhole),
     };
     let principal_px = principal_px.unwrap_or([0.5 * width, 0.5 * height]);
-    let fits = focal_px.iter().all(|f| *f > 0.0 && f.is_finite()) && principal_px.iter().all(|c| c.is_finite());
-    if fits { Ok(Projection::Pinhole { focal_px, principal_px }) } else { Err(InvalidRequest::Pinhole) }
+    let fits = focal_px.iter().all(|f| *f > 0.0 && f.is_finite())
+        && principal_px.iter().all(|c| c.is_finite());
+    if fits {
+        Ok(Projection::Pinhole {
+            focal_px,
+            principal_px,
+        })
+    } else {
+        Err(InvalidRequest::Pinhole)
+    }
 }
 
 /// Checks a box in the field of this name.
-pub(crate) fn checked_box(message: &BoxMessage, field: &'static str) -> Result<Aabb, InvalidRequest> {
+pub(crate) fn checked_box(
+    message: &BoxMessage,
+    field: &'static str,
+) -> Result<Aabb, InvalidRequest> {
     let world_from_box = match &message.world_from_box {
         Some(rows) => rigid(rows, "world_from_box")?,
         None => Transform::identity(),
     };
-    let fits = message.min_m.iter().zip(&message.max_m).all(|(min, max)| min < max && (max - min).is_finite());
+    let fits = message
+        .min_m
+        .iter()
+        .zip(&message.max_m)
+        .all(|(min, max)| min < max && (max - min).is_finite());
     if fits {
-        Ok(Aabb { world_from_box, min_m: message.min_m, max_m: message.max_m })
+        Ok(Aabb {
+            world_from_box,
+            min_m: message.min_m,
+            max_m: message.max_m,
+        })
     } else {
         Err(InvalidRequest::Corners { field })
     }
@@ -212,7 +287,11 @@ pub(crate) fn checked_box(message: &BoxMessage, field: &'static str) -> Result<A
 
 fn checked_background(color: [f32; 3]) -> Result<[f32; 3], InvalidRequest> {
     let fits = color.iter().all(|c| (0.0..=1.0).contains(c));
-    if fits { Ok(color) } else { Err(InvalidRequest::Background) }
+    if fits {
+        Ok(color)
+    } else {
+        Err(InvalidRequest::Background)
+    }
 }
 
 #[cfg(test)]
@@ -236,12 +315,22 @@ mod tests {
     fn stages_keep_the_field_of_view() {
         let view_request = message(|_| ()).expect("valid");
         assert_eq!(view_request.stages, [0.1, 0.5, 1.0]);
-        let sizes: Vec<_> = (0..3).map(|stage| view_request.stage_request(stage).size_px).collect();
+        let sizes: Vec<_> = (0..3)
+            .map(|stage| view_request.stage_request(stage).size_px)
+            .collect();
         assert_eq!(sizes, [[128, 72], [640, 360], [1280, 720]]);
-        let Projection::Pinhole { focal_px, principal_px } = view_request.stage_request(0).projection else {
+        let Projection::Pinhole {
+            focal_px,
+            principal_px,
+        } = view_request.stage_request(0).projection
+        else {
             panic!("a pinhole stays one");
         };
-        for (got, expected) in focal_px.iter().chain(&principal_px).zip([90.0, 91.0, 63.0, 36.5]) {
+        for (got, expected) in focal_px
+            .iter()
+            .chain(&principal_px)
+            .zip([90.0, 91.0, 63.0, 36.5])
+        {
             assert!((got - expected).abs() < 1e-9, "{got} instead of {expected}");
         }
         assert!(view_request.color && view_request.depth.is_none());
@@ -253,7 +342,10 @@ mod tests {
             value["size_px"] = json!([3, 1]);
             value["stages"] = json!([0.01]);
         });
-        assert_eq!(view_request.expect("valid").stage_request(0).size_px, [1, 1]);
+        assert_eq!(
+            view_request.expect("valid").stage_request(0).size_px,
+            [1, 1]
+        );
     }
 
     #[test]
@@ -261,10 +353,19 @@ mod tests {
         for (degrees, expected_px) in [(90.0_f64, 360.0), (45.0, 360.0 / (2.0_f64.sqrt() - 1.0))] {
             let projection = json!({"kind": "pinhole", "vertical_fov_rad": degrees.to_radians()});
             let view_request = message(|value| value["projection"] = projection).expect("valid");
-            let Projection::Pinhole { focal_px, principal_px } = view_request.request.projection else {
+            let Projection::Pinhole {
+                focal_px,
+                principal_px,
+            } = view_request.request.projection
+            else {
                 panic!("a pinhole stays one");
             };
-            assert!(focal_px.iter().all(|focal| (focal - expected_px).abs() < 1e-9), "{focal_px:?}");
+            assert!(
+                focal_px
+                    .iter()
+                    .all(|focal| (focal - expected_px).abs() < 1e-9),
+                "{focal_px:?}"
+            );
             assert_eq!(principal_px, [640.0, 360.0]);
         }
     }
@@ -273,7 +374,11 @@ mod tests {
     fn errors_name_the_invalid_field() {
         let cases: [(&str, Value, &str); 13] = [
             ("view", json!("v".repeat(65)), "view has 65 bytes"),
-            ("world_from_camera", json!([2, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]), "world_from_camera"),
+            (
+                "world_from_camera",
+                json!([2, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]),
+                "world_from_camera",
+            ),
             ("world_from_camera", json!([1, 2, 3]), "length"),
             ("size_px", json!([0, 720]), "size_px"),
             ("size_px", json!([1280, 5000]), "size_px"),
@@ -282,12 +387,18 @@ mod tests {
             ("near_m", json!(-1.0), "near_m"),
             ("projection", json!({"kind": "pinhole"}), "focal_px"),
             ("projection", json!({"kind": "fisheye"}), "fisheye"),
-            ("crop", json!({"min_m": [0, 0, 0], "max_m": [1, 0, 1]}), "crop"),
+            (
+                "crop",
+                json!({"min_m": [0, 0, 0], "max_m": [1, 0, 1]}),
+                "crop",
+            ),
             ("background_srgb", json!([0.0, 2.0, 0.0]), "background_srgb"),
             ("colour", json!(true), "colour"),
         ];
         for (field, wrong, named) in cases {
-            let error = message(|value| value[field] = wrong.clone()).expect_err(field).to_string();
+            let error = message(|value| value[field] = wrong.clone())
+                .expect_err(field)
+                .to_string();
             assert!(error.contains(named), "{field} = {wrong}: {error}");
         }
     }

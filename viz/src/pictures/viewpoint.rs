@@ -1,4 +1,5 @@
-//! Where a client looks from, and in which direction. It decides which chunks of a model the client gets first.
+//! Where a client looks from, and in which direction. It decides which chunks of a model the client
+//! gets first.
 
 use crate::pictures::view_request::ViewRequest;
 use kinematics::Transform;
@@ -20,10 +21,19 @@ impl Viewpoint {
         if !view_request.view.is_empty() {
             return None;
         }
-        let Projection::Pinhole { focal_px, principal_px } = request.projection else { return None };
+        let Projection::Pinhole {
+            focal_px,
+            principal_px,
+        } = request.projection
+        else {
+            return None;
+        };
         let farthest = |axis: usize| {
             let side = f64::from(request.size_px[axis]);
-            principal_px[axis].abs().max((side - principal_px[axis]).abs()) / focal_px[axis]
+            principal_px[axis]
+                .abs()
+                .max((side - principal_px[axis]).abs())
+                / focal_px[axis]
         };
         Some(Self {
             camera_from_world: request.world_from_camera.inverse(),
@@ -31,14 +41,16 @@ impl Viewpoint {
         })
     }
 
-    /// A chunk with a lower rank is needed earlier: those in view first, and the nearest of them first.
+    /// A chunk with a lower rank is needed earlier: those in view first, and the nearest of them
+    /// first.
     pub(crate) fn rank(&self, world_from_model: &Transform, layout: &ChunkLayout) -> (bool, f64) {
         let (center, radius_m) = bounds(layout);
         let in_camera = (self.camera_from_world * world_from_model * center).coords;
         let distance_m = in_camera.norm();
         let is_around = distance_m <= radius_m;
-        let is_in_view =
-            is_around || in_camera.angle(&Vector3::z()) - (radius_m / distance_m).asin() <= self.half_angle_rad;
+        let is_in_view = is_around
+            || in_camera.angle(&Vector3::z()) - (radius_m / distance_m).asin()
+                <= self.half_angle_rad;
         (!is_in_view, distance_m)
     }
 }
@@ -46,10 +58,17 @@ impl Viewpoint {
 /// Center and radius of a sphere around a chunk, in the frame of the model.
 fn bounds(layout: &ChunkLayout) -> (Point3<f64>, f64) {
     let [min, max] = match layout {
-        ChunkLayout::Mesh { origin_m, meters_per_count, .. } => {
-            [*origin_m, origin_m.map(|origin| origin + f64::from(MAX_MESH_COUNT) * meters_per_count)]
+        ChunkLayout::Mesh {
+            origin_m,
+            meters_per_count,
+            ..
+        } => [
+            *origin_m,
+            origin_m.map(|origin| origin + f64::from(MAX_MESH_COUNT) * meters_per_count),
+        ],
+        ChunkLayout::Splats { min_m, max_m, .. } => {
+            [min_m, max_m].map(|corner| corner.map(f64::from))
         }
-        ChunkLayout::Splats { min_m, max_m, .. } => [min_m, max_m].map(|corner| corner.map(f64::from)),
     }
     .map(Point3::from);
     (nalgebra::center(&min, &max), 0.5 * (max - min).norm())
@@ -63,7 +82,8 @@ pub(crate) mod tests {
     use serde_json::json;
     use trainer::{ChunkLayout, MAX_MESH_COUNT};
 
-    /// A camera at the origin that looks along z, with a field of view of 90 degrees, moved and turned about y.
+    /// A camera at the origin that looks along z, with a field of view of 90 degrees, moved and
+    /// turned about y.
     pub(crate) fn viewpoint(x_m: f64, angle_rad: f64) -> Viewpoint {
         Viewpoint::of(&request("", x_m, angle_rad)).expect("a pinhole")
     }
@@ -95,7 +115,8 @@ pub(crate) mod tests {
     #[test]
     fn named_views_are_no_viewpoints() {
         assert!(
-            Viewpoint::of(&request("", 0.0, 0.0)).is_some() && Viewpoint::of(&request("inset", 0.0, 0.0)).is_none()
+            Viewpoint::of(&request("", 0.0, 0.0)).is_some()
+                && Viewpoint::of(&request("inset", 0.0, 0.0)).is_none()
         );
     }
 
@@ -109,25 +130,46 @@ pub(crate) mod tests {
             n_triangles: 1,
         };
         let (is_outside, distance_m) = viewpoint(0.0, 0.0).rank(&Transform::identity(), &layout);
-        assert!((distance_m - 1.5_f64.sqrt()).abs() < 1e-9, "{distance_m} m to the center");
+        assert!(
+            (distance_m - 1.5_f64.sqrt()).abs() < 1e-9,
+            "{distance_m} m to the center"
+        );
         assert!(is_outside, "the chunk ends behind the camera");
     }
 
     #[test]
     fn chunks_in_view_come_first_and_the_nearest_of_them() {
-        let rank = |viewpoint: &Viewpoint, center| viewpoint.rank(&Transform::identity(), &cube(center));
+        let rank =
+            |viewpoint: &Viewpoint, center| viewpoint.rank(&Transform::identity(), &cube(center));
         let ahead = viewpoint(0.0, 0.0);
-        let cases = [([0.0, 0.0, 1.0], 1.0), ([4.9, 0.0, 5.0], 7.0), ([0.1, 0.0, 0.0], 0.1), ([1.05, 0.0, 1.0], 1.45)];
+        let cases = [
+            ([0.0, 0.0, 1.0], 1.0),
+            ([4.9, 0.0, 5.0], 7.0),
+            ([0.1, 0.0, 0.0], 0.1),
+            ([1.05, 0.0, 1.0], 1.45),
+        ];
         for (center, distance_m) in cases {
             let (is_outside, got_m) = rank(&ahead, center);
-            assert!(!is_outside && (got_m - distance_m).abs() < 0.01, "{center:?}: {is_outside}, {got_m} m");
+            assert!(
+                !is_outside && (got_m - distance_m).abs() < 0.01,
+                "{center:?}: {is_outside}, {got_m} m"
+            );
         }
         for center in [[0.0, 0.0, -1.0], [1.3, 0.0, 1.0], [0.0, 2.0, 1.0]] {
             assert!(rank(&ahead, center).0, "{center:?} is not in view");
-            assert!(rank(&ahead, center) > rank(&ahead, [0.0, 0.0, 50.0]), "it comes after all that are");
+            assert!(
+                rank(&ahead, center) > rank(&ahead, [0.0, 0.0, 50.0]),
+                "it comes after all that are"
+            );
         }
-        assert!(!rank(&viewpoint(0.0, std::f64::consts::PI), [0.0, 0.0, -1.0]).0, "the view has turned");
+        assert!(
+            !rank(&viewpoint(0.0, std::f64::consts::PI), [0.0, 0.0, -1.0]).0,
+            "the view has turned"
+        );
         let moved = Transform::translation(0.0, 0.0, 3.0);
-        assert!((ahead.rank(&moved, &cube([0.0, 0.0, 1.0])).1 - 4.0).abs() < 1e-6, "the model has moved");
+        assert!(
+            (ahead.rank(&moved, &cube([0.0, 0.0, 1.0])).1 - 4.0).abs() < 1e-6,
+            "the model has moved"
+        );
     }
 }

@@ -7,8 +7,8 @@ use subtle::ConstantTimeEq;
 
 /// Length of a token, random bytes.
 const TOKEN_BYTES: usize = 16;
-/// The page keeps its token in a cookie whose name starts like this and ends in the port. Cookies do not distinguish
-/// ports, so a browser sends those of all servers of a computer.
+/// The page keeps its token in a cookie whose name starts like this and ends in the port. Cookies
+/// do not distinguish ports, so a browser sends those of all servers of a computer.
 const COOKIE_PREFIX: &str = "__Host-fieldrig-";
 
 /// What a client may do.
@@ -40,7 +40,9 @@ impl Token {
     pub fn random() -> std::io::Result<Self> {
         let mut bytes = [0; TOKEN_BYTES];
         getrandom::fill(&mut bytes).map_err(std::io::Error::from)?;
-        Ok(Self(bytes.iter().map(|byte| format!("{byte:02x}")).collect()))
+        Ok(Self(
+            bytes.iter().map(|byte| format!("{byte:02x}")).collect(),
+        ))
     }
 
     /// The token as text for the fragment of a URL.
@@ -72,12 +74,19 @@ pub struct Tokens {
 impl Tokens {
     /// New tokens.
     pub fn random() -> std::io::Result<Self> {
-        Ok(Self { operator: Token::random()?, viewer: Token::random()? })
+        Ok(Self {
+            operator: Token::random()?,
+            viewer: Token::random()?,
+        })
     }
 
     fn role_of(&self, token: &str) -> Option<Role> {
         let (is_operator, is_viewer) = (self.operator.is(token), self.viewer.is(token));
-        if is_operator { Some(Role::Operator) } else { is_viewer.then_some(Role::Viewer) }
+        if is_operator {
+            Some(Role::Operator)
+        } else {
+            is_viewer.then_some(Role::Viewer)
+        }
     }
 }
 
@@ -97,7 +106,9 @@ pub(crate) enum Refusal {
     ForeignOrigin,
     #[error("only pages of this server may use it")]
     ForeignPage,
-    #[error("this server requires a token: open the complete address that fieldrig printed when it started")]
+    #[error(
+        "this server requires a token: open the complete address that fieldrig printed when it started"
+    )]
     NoToken,
     #[error("invalid token: tokens change at each start; open the most recently printed address")]
     WrongToken,
@@ -106,8 +117,8 @@ pub(crate) enum Refusal {
 impl Access {
     /// Allows only pages of this server: other web sites in the same browser can also reach it.
     ///
-    /// The `Host` of a local server must be a loopback address, because the domain of another site may resolve to this
-    /// computer. Such a site has neither a token nor a valid certificate.
+    /// The `Host` of a local server must be a loopback address, because the domain of another site
+    /// may resolve to this computer. Such a site has neither a token nor a valid certificate.
     pub(crate) fn check_origin(&self, headers: &HeaderMap) -> Result<(), Refusal> {
         let text = |name| headers.get(name).and_then(|value| value.to_str().ok());
         let (scheme, refusal) = match self {
@@ -117,15 +128,23 @@ impl Access {
         let host = text(header::HOST).ok_or(refusal)?;
         let has_same_origin = match headers.get(header::ORIGIN) {
             None => true, // Not a browser.
-            Some(_) => text(header::ORIGIN).and_then(|origin| origin.strip_prefix(scheme)) == Some(host),
+            Some(_) => {
+                text(header::ORIGIN).and_then(|origin| origin.strip_prefix(scheme)) == Some(host)
+            }
         };
         let is_known_host = matches!(self, Self::Tokens(_)) || is_loopback(host);
-        if has_same_origin && is_known_host { Ok(()) } else { Err(refusal) }
+        if has_same_origin && is_known_host {
+            Ok(())
+        } else {
+            Err(refusal)
+        }
     }
 
     /// The role of a request, from its `Authorization` header or its cookies.
     pub(crate) fn role_of(&self, headers: &HeaderMap) -> Result<Role, Refusal> {
-        let Self::Tokens(tokens) = self else { return Ok(Role::Operator) };
+        let Self::Tokens(tokens) = self else {
+            return Ok(Role::Operator);
+        };
         let mut refusal = Refusal::NoToken;
         for token in tokens_in(headers) {
             match tokens.role_of(token) {
@@ -139,18 +158,32 @@ impl Access {
 
 /// Whether a `Host` header names this computer.
 fn is_loopback(host: &str) -> bool {
-    let name = host.rsplit_once(':').filter(|(_, port)| port.parse::<u16>().is_ok()).map_or(host, |(name, _)| name);
-    let address = name.trim_start_matches('[').trim_end_matches(']').parse::<IpAddr>();
+    let name = host
+        .rsplit_once(':')
+        .filter(|(_, port)| port.parse::<u16>().is_ok())
+        .map_or(host, |(name, _)| name);
+    let address = name
+        .trim_start_matches('[')
+        .trim_end_matches(']')
+        .parse::<IpAddr>();
     name.eq_ignore_ascii_case("localhost") || address.is_ok_and(|address| address.is_loopback())
 }
 
 /// The tokens in a request.
 fn tokens_in(headers: &HeaderMap) -> impl Iterator<Item = &str> {
-    let text = |name| headers.get_all(name).into_iter().filter_map(|value| value.to_str().ok());
+    let text = |name| {
+        headers
+            .get_all(name)
+            .into_iter()
+            .filter_map(|value| value.to_str().ok())
+    };
     let bearer = text(header::AUTHORIZATION).filter_map(|value| value.strip_prefix("Bearer "));
     let cookies = text(header::COOKIE).flat_map(|value| value.split(';'));
-    let from_cookies = cookies.filter_map(|cookie| cookie.trim().strip_prefix(COOKIE_PREFIX)?.split_once('='));
-    bearer.chain(from_cookies.map(|(_, token)| token)).map(str::trim)
+    let from_cookies =
+        cookies.filter_map(|cookie| cookie.trim().strip_prefix(COOKIE_PREFIX)?.split_once('='));
+    bearer
+        .chain(from_cookies.map(|(_, token)| token))
+        .map(str::trim)
 }
 
 #[cfg(test)]
@@ -159,7 +192,10 @@ mod tests {
     use axum::http::{HeaderMap, HeaderName, HeaderValue, header};
 
     fn headers(pairs: &[(HeaderName, &str)]) -> HeaderMap {
-        pairs.iter().map(|(name, value)| (name.clone(), HeaderValue::from_str(value).expect("text"))).collect()
+        pairs
+            .iter()
+            .map(|(name, value)| (name.clone(), HeaderValue::from_str(value).expect("text")))
+            .collect()
     }
 
     fn host_and_origin(host: &str, origin: Option<&str>) -> HeaderMap {
@@ -186,7 +222,10 @@ mod tests {
             let checked = Access::Local.check_origin(&host_and_origin(host, origin));
             assert_eq!(checked.is_ok(), expected, "{host} {origin:?}");
         }
-        assert_eq!(Access::Local.check_origin(&HeaderMap::new()), Err(Refusal::ForeignOrigin));
+        assert_eq!(
+            Access::Local.check_origin(&HeaderMap::new()),
+            Err(Refusal::ForeignOrigin)
+        );
     }
 
     #[test]
@@ -201,26 +240,52 @@ mod tests {
             ("robot.local:7007", Some("null"), false),
         ];
         for (host, origin, expected) in cases {
-            assert_eq!(access.check_origin(&host_and_origin(host, origin)).is_ok(), expected, "{host} {origin:?}");
+            assert_eq!(
+                access.check_origin(&host_and_origin(host, origin)).is_ok(),
+                expected,
+                "{host} {origin:?}"
+            );
         }
-        assert_eq!(access.check_origin(&HeaderMap::new()), Err(Refusal::ForeignPage));
+        assert_eq!(
+            access.check_origin(&HeaderMap::new()),
+            Err(Refusal::ForeignPage)
+        );
     }
 
     #[test]
     fn tokens_give_roles() {
         let tokens = Tokens::random().expect("random numbers");
-        let (operator, viewer) = (tokens.operator.text().to_owned(), tokens.viewer.text().to_owned());
+        let (operator, viewer) = (
+            tokens.operator.text().to_owned(),
+            tokens.viewer.text().to_owned(),
+        );
         let access = Access::Tokens(tokens);
         let bearer = |token: &str| headers(&[(header::AUTHORIZATION, &format!("Bearer {token}"))]);
         let cookie = |text: &str| headers(&[(header::COOKIE, text)]);
         assert_eq!(access.role_of(&bearer(&operator)), Ok(Role::Operator));
         assert_eq!(access.role_of(&bearer(&viewer)), Ok(Role::Viewer));
-        let other_server = format!("theme=dark; __Host-fieldrig-8080=0123; __Host-fieldrig-7007={viewer}");
+        let other_server =
+            format!("theme=dark; __Host-fieldrig-8080=0123; __Host-fieldrig-7007={viewer}");
         assert_eq!(access.role_of(&cookie(&other_server)), Ok(Role::Viewer));
-        for wrong in ["", "0", &operator[1..], &operator.to_uppercase(), &format!("{operator}0"), &"f".repeat(32)] {
-            assert_eq!(access.role_of(&bearer(wrong)), Err(Refusal::WrongToken), "{wrong}");
+        for wrong in [
+            "",
+            "0",
+            &operator[1..],
+            &operator.to_uppercase(),
+            &format!("{operator}0"),
+            &"f".repeat(32),
+        ] {
+            assert_eq!(
+                access.role_of(&bearer(wrong)),
+                Err(Refusal::WrongToken),
+                "{wrong}"
+            );
         }
-        for missing in [HeaderMap::new(), cookie("theme=dark"), cookie(&format!("fieldrig={operator}"))] {
+        for missing in [
+            HeaderMap::new(),
+            cookie("theme=dark"),
+            cookie(&format!("fieldrig={operator}")),
+        ] {
             assert_eq!(access.role_of(&missing), Err(Refusal::NoToken));
         }
         assert_eq!(Access::Local.role_of(&HeaderMap::new()), Ok(Role::Operator));
@@ -228,7 +293,10 @@ mod tests {
 
     #[test]
     fn tokens_are_random_and_hidden_in_logs() {
-        let (a, b) = (Token::random().expect("a token"), Token::random().expect("a token"));
+        let (a, b) = (
+            Token::random().expect("a token"),
+            Token::random().expect("a token"),
+        );
         assert_eq!((a.text().len(), a.text() == b.text()), (32, false));
         assert!(!format!("{a:?}").contains(a.text()));
     }

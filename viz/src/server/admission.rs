@@ -1,7 +1,8 @@
-//! Limits the number of open connections, so that enough file descriptors remain and connections in use stay open.
+//! Limits the number of open connections, so that enough file descriptors remain and connections in
+//! use stay open.
 //!
-//! Addresses do not distinguish viewers from idle sockets: on this computer, all are the same. At a limit, a new
-//! connection replaces the least active one.
+//! Addresses do not distinguish viewers from idle sockets: on this computer, all are the same. At a
+//! limit, a new connection replaces the least active one.
 
 use parking_lot::{Mutex, MutexGuard};
 use std::collections::BTreeMap;
@@ -19,7 +20,8 @@ use tokio::net::TcpStream;
 const MAX_CONNECTIONS: usize = 256;
 /// Maximum number of WebSocket clients.
 const MAX_CLIENTS: usize = 32;
-/// The process may open this many files per connection: connections use at most a quarter of the limit.
+/// The process may open this many files per connection: connections use at most a quarter of the
+/// limit.
 const DESCRIPTORS_PER_CONNECTION: usize = 4;
 /// A connection whose peer accepts no bytes for this long is closed.
 const WRITE_TIMEOUT: Duration = Duration::from_secs(5);
@@ -29,7 +31,8 @@ const IDLE_TIMEOUT: Duration = Duration::from_secs(10);
 const PONG_TIMEOUT: Duration = Duration::from_secs(8);
 /// A client that has not answered a ping for this long may be replaced by a new one.
 const UNRESPONSIVE_AFTER: Duration = Duration::from_secs(1);
-/// A client that has sent no message for this long may be replaced by a new one; the page sends two per second.
+/// A client that has sent no message for this long may be replaced by a new one; the page sends two
+/// per second.
 const IDLE_CLIENT_AFTER: Duration = Duration::from_secs(3);
 
 /// Limits on the number of connections.
@@ -45,7 +48,10 @@ impl Limits {
     /// The limits of a process that may open this many files.
     pub(crate) fn of_descriptors(n_descriptors: usize) -> Self {
         let connections = (n_descriptors / DESCRIPTORS_PER_CONNECTION).clamp(8, MAX_CONNECTIONS);
-        Self { connections, clients: MAX_CLIENTS.min(connections / 2) }
+        Self {
+            connections,
+            clients: MAX_CLIENTS.min(connections / 2),
+        }
     }
 
     /// The limits of this process.
@@ -57,7 +63,9 @@ impl Limits {
 #[cfg(unix)]
 fn max_descriptors() -> usize {
     let limit = rustix::process::getrlimit(rustix::process::Resource::Nofile).current;
-    limit.map_or(usize::MAX, |limit| usize::try_from(limit).unwrap_or(usize::MAX))
+    limit.map_or(usize::MAX, |limit| {
+        usize::try_from(limit).unwrap_or(usize::MAX)
+    })
 }
 
 #[cfg(not(unix))]
@@ -108,7 +116,8 @@ struct ConnectionState {
 
 #[derive(Debug)]
 struct Client {
-    /// Operators are replaced only if they are inactive. Active viewers are replaced if an operator needs the place.
+    /// Operators are replaced only if they are inactive. Active viewers are replaced if an operator
+    /// needs the place.
     is_operator: bool,
     admitted: Instant,
     /// Time of the last message. Pongs do not count, because libraries send them automatically.
@@ -120,34 +129,52 @@ struct Client {
 }
 
 impl ConnectionState {
-    /// Time of the last request or of the last bytes of a response; of the connection before the first request.
+    /// Time of the last request or of the last bytes of a response; of the connection before the
+    /// first request.
     fn idle_since(&self) -> Instant {
         self.requested.max(self.written).unwrap_or(self.opened)
     }
 }
 
-/// Eviction order of clients: unresponsive first, then never used, then idle; within a group by time.
+/// Eviction order of clients: unresponsive first, then never used, then idle; within a group by
+/// time.
 type Dispensability = (u8, Duration);
 
 impl Admission {
     /// Creates an admission without connections.
     pub(crate) fn new(limits: Limits) -> Arc<Self> {
-        Arc::new(Self { limits, registry: Mutex::default() })
+        Arc::new(Self {
+            limits,
+            registry: Mutex::default(),
+        })
     }
 
     /// Adds an accepted connection. Returns whether another one was closed to make room.
     pub(crate) fn admit(self: &Arc<Self>, stream: TcpStream) -> (GuardedStream, bool) {
-        let is_loopback = stream.peer_addr().is_ok_and(|peer| peer.ip().to_canonical().is_loopback());
-        let has_evicted = self.registry().connections.len() >= self.limits.connections && self.evict();
+        let is_loopback = stream
+            .peer_addr()
+            .is_ok_and(|peer| peer.ip().to_canonical().is_loopback());
+        let has_evicted =
+            self.registry().connections.len() >= self.limits.connections && self.evict();
         let mut registry = self.registry();
         registry.n_opened += 1;
         let connection = Arc::new(Connection::new(registry.n_opened, is_loopback));
-        registry.connections.insert(connection.number, Arc::clone(&connection));
+        registry
+            .connections
+            .insert(connection.number, Arc::clone(&connection));
         drop(registry);
-        (GuardedStream { stream, connection, admission: Arc::clone(self) }, has_evicted)
+        (
+            GuardedStream {
+                stream,
+                connection,
+                admission: Arc::clone(self),
+            },
+            has_evicted,
+        )
     }
 
-    /// Closes the connection without a client that has been idle longest. Half-open requests come first.
+    /// Closes the connection without a client that has been idle longest. Half-open requests come
+    /// first.
     pub(crate) fn evict(&self) -> bool {
         let registry = self.registry();
         let candidates = registry.connections.values().filter_map(|connection| {
@@ -156,17 +183,26 @@ impl Admission {
             is_candidate.then_some((state.requested.is_some(), state.idle_since(), connection))
         });
         let oldest = candidates.min_by_key(|(has_requested, since, _)| (*has_requested, *since));
-        oldest.inspect(|(.., connection)| connection.close("replaced by a new connection")).is_some()
+        oldest
+            .inspect(|(.., connection)| connection.close("replaced by a new connection"))
+            .is_some()
     }
 
-    /// Registers a WebSocket client on its connection. At the limit, it replaces the most dispensable client. If all are
-    /// active, an operator replaces the viewer that connected last, so that viewers cannot lock operators out.
+    /// Registers a WebSocket client on its connection. At the limit, it replaces the most
+    /// dispensable client. If all are active, an operator replaces the viewer that connected last,
+    /// so that viewers cannot lock operators out.
     pub(crate) fn admit_client(&self, connection: &Connection, is_operator: bool) -> bool {
         // Held until the client is registered, so that two clients cannot take the same free slot.
         let registry = self.registry();
         let now = Instant::now();
-        let admitted = registry.connections.values().filter(|other| other.is_admitted());
-        let (mut n_admitted, mut most_dispensable): (usize, Option<(Dispensability, &Arc<Connection>)>) = (0, None);
+        let admitted = registry
+            .connections
+            .values()
+            .filter(|other| other.is_admitted());
+        let (mut n_admitted, mut most_dispensable): (
+            usize,
+            Option<(Dispensability, &Arc<Connection>)>,
+        ) = (0, None);
         let mut last_viewer: Option<(Instant, &Arc<Connection>)> = None;
         for other in admitted {
             n_admitted += 1;
@@ -183,11 +219,18 @@ impl Admission {
         }
         if n_admitted >= self.limits.clients {
             let last_viewer = last_viewer.filter(|_| is_operator).map(|(_, other)| other);
-            let Some(other) = most_dispensable.map(|(_, other)| other).or(last_viewer) else { return false };
+            let Some(other) = most_dispensable.map(|(_, other)| other).or(last_viewer) else {
+                return false;
+            };
             other.close("replaced by a new client");
         }
-        connection.state().client =
-            Some(Client { is_operator, admitted: now, last_message: None, pinged: None, has_answered: false });
+        connection.state().client = Some(Client {
+            is_operator,
+            admitted: now,
+            last_message: None,
+            pinged: None,
+            has_answered: false,
+        });
         true
     }
 
@@ -207,8 +250,8 @@ impl Admission {
         self.registry().connections.len()
     }
 
-    /// Locks the registry. It holds plain values that are valid after every statement, so it stays usable after a
-    /// panic elsewhere.
+    /// Locks the registry. It holds plain values that are valid after every statement, so it stays
+    /// usable after a panic elsewhere.
     fn registry(&self) -> MutexGuard<'_, Registry> {
         self.registry.lock()
     }
@@ -226,7 +269,12 @@ impl Connection {
             opened: Instant::now(),
             client: None,
         };
-        Self { number, is_loopback, send_buffer_bytes: AtomicUsize::new(0), state: Mutex::new(state) }
+        Self {
+            number,
+            is_loopback,
+            send_buffer_bytes: AtomicUsize::new(0),
+            state: Mutex::new(state),
+        }
     }
 
     /// Whether the peer has a loopback address.
@@ -250,7 +298,9 @@ impl Connection {
     pub(crate) fn silence(&self) -> Duration {
         let state = self.state();
         let client = state.client.as_ref();
-        client.map_or(Duration::ZERO, |client| client.last_message.unwrap_or(client.admitted).elapsed())
+        client.map_or(Duration::ZERO, |client| {
+            client.last_message.unwrap_or(client.admitted).elapsed()
+        })
     }
 
     /// Sets the size of the kernel's send buffer from the next write on.
@@ -285,20 +335,30 @@ impl Connection {
     /// Time at which the client was admitted as a viewer; `None` if it is an operator.
     fn viewer_since(&self) -> Option<Instant> {
         let state = self.state();
-        state.client.as_ref().filter(|client| !client.is_operator).map(|client| client.admitted)
+        state
+            .client
+            .as_ref()
+            .filter(|client| !client.is_operator)
+            .map(|client| client.admitted)
     }
 
     /// Eviction order of the client; `None` for a client in use.
     fn dispensability(&self, now: Instant) -> Option<Dispensability> {
         let state = self.state();
         let client = state.client.as_ref()?;
-        let stuck_for = [client.pinged, state.blocked_since].into_iter().flatten().map(|since| now - since).max();
+        let stuck_for = [client.pinged, state.blocked_since]
+            .into_iter()
+            .flatten()
+            .map(|since| now - since)
+            .max();
         if let Some(stuck_for) = stuck_for.filter(|time| *time >= UNRESPONSIVE_AFTER) {
             return Some((2, stuck_for));
         }
         match client.last_message.filter(|_| client.has_answered) {
             None => Some((1, now - client.admitted)),
-            Some(last_message) if now - last_message >= IDLE_CLIENT_AFTER => Some((0, now - last_message)),
+            Some(last_message) if now - last_message >= IDLE_CLIENT_AFTER => {
+                Some((0, now - last_message))
+            }
             Some(_) => None,
         }
     }
@@ -306,13 +366,17 @@ impl Connection {
     /// Returns the reason to close the connection now, if any.
     fn timeout_reason(&self, now: Instant) -> Option<&'static str> {
         let state = self.state();
-        let is_timed_out = |since: Option<Instant>, timeout| since.is_some_and(|since| now - since > timeout);
+        let is_timed_out =
+            |since: Option<Instant>, timeout| since.is_some_and(|since| now - since > timeout);
         if is_timed_out(state.blocked_since, WRITE_TIMEOUT) {
             return Some("its peer does not read");
         }
         match &state.client {
-            Some(client) => is_timed_out(client.pinged, PONG_TIMEOUT).then_some("it does not answer pings"),
-            None => is_timed_out(Some(state.idle_since()), IDLE_TIMEOUT).then_some("it has been idle for too long"),
+            Some(client) => {
+                is_timed_out(client.pinged, PONG_TIMEOUT).then_some("it does not answer pings")
+            }
+            None => is_timed_out(Some(state.idle_since()), IDLE_TIMEOUT)
+                .then_some("it has been idle for too long"),
         }
     }
 
@@ -361,7 +425,11 @@ impl GuardedStream {
             self.stream.poll_peek(context, &mut ReadBuf::new(&mut byte))
         })
         .await?;
-        if n_bytes == 0 { Err(io::ErrorKind::UnexpectedEof.into()) } else { Ok(byte[0]) }
+        if n_bytes == 0 {
+            Err(io::ErrorKind::UnexpectedEof.into())
+        } else {
+            Ok(byte[0])
+        }
     }
 
     /// Applies [`Connection::set_send_buffer`]. A failure affects only latency.
@@ -371,7 +439,8 @@ impl GuardedStream {
         if n_bytes == 0 {
             return;
         }
-        if let Err(error) = rustix::net::sockopt::set_socket_send_buffer_size(&self.stream, n_bytes) {
+        if let Err(error) = rustix::net::sockopt::set_socket_send_buffer_size(&self.stream, n_bytes)
+        {
             log::debug!("cannot resize a socket's buffer: {error}");
         }
     }
@@ -426,7 +495,11 @@ impl AsyncRead for GuardedStream {
 }
 
 impl AsyncWrite for GuardedStream {
-    fn poll_write(mut self: Pin<&mut Self>, context: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
+    fn poll_write(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+        bytes: &[u8],
+    ) -> Poll<io::Result<usize>> {
         self.write(context, |stream, context| stream.poll_write(context, bytes))
     }
 
@@ -435,7 +508,9 @@ impl AsyncWrite for GuardedStream {
         context: &mut Context<'_>,
         slices: &[io::IoSlice<'_>],
     ) -> Poll<io::Result<usize>> {
-        self.write(context, |stream, context| stream.poll_write_vectored(context, slices))
+        self.write(context, |stream, context| {
+            stream.poll_write_vectored(context, slices)
+        })
     }
 
     fn is_write_vectored(&self) -> bool {
@@ -459,22 +534,28 @@ impl Drop for GuardedStream {
                 log::debug!("cannot discard unread bytes: {error}");
             }
         }
-        self.admission.registry().connections.remove(&self.connection.number);
+        self.admission
+            .registry()
+            .connections
+            .remove(&self.connection.number);
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::{
-        Admission, GuardedStream, IDLE_CLIENT_AFTER, IDLE_TIMEOUT, Limits, PONG_TIMEOUT, UNRESPONSIVE_AFTER,
-        WRITE_TIMEOUT,
+        Admission, GuardedStream, IDLE_CLIENT_AFTER, IDLE_TIMEOUT, Limits, PONG_TIMEOUT,
+        UNRESPONSIVE_AFTER, WRITE_TIMEOUT,
     };
     use std::sync::Arc;
     use std::time::{Duration, Instant};
     use tokio::io::{AsyncReadExt, AsyncWriteExt};
     use tokio::net::TcpStream;
 
-    const LIMITS: Limits = Limits { connections: 4, clients: 2 };
+    const LIMITS: Limits = Limits {
+        connections: 4,
+        clients: 2,
+    };
 
     /// An admission and a listening port that creates both ends of connections.
     struct Port {
@@ -485,7 +566,10 @@ mod tests {
     impl Port {
         fn open() -> Self {
             let listener = std::net::TcpListener::bind("127.0.0.1:0").expect("a free port exists");
-            Self { admission: Admission::new(LIMITS), listener }
+            Self {
+                admission: Admission::new(LIMITS),
+                listener,
+            }
         }
 
         /// Both ends of a new connection.
@@ -497,12 +581,17 @@ mod tests {
                 stream.set_nonblocking(true).expect("a socket");
             }
             let stream = TcpStream::from_std(stream).expect("a runtime");
-            (self.admission.admit(stream).0, TcpStream::from_std(peer).expect("a runtime"))
+            (
+                self.admission.admit(stream).0,
+                TcpStream::from_std(peer).expect("a runtime"),
+            )
         }
     }
 
     fn run(test: impl Future<Output = ()>) {
-        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
+        let runtime = tokio::runtime::Builder::new_current_thread()
+            .enable_all()
+            .build();
         runtime.expect("a runtime").block_on(test);
     }
 
@@ -519,10 +608,34 @@ mod tests {
 
     #[test]
     fn connections_leave_descriptors_for_files() {
-        assert_eq!(Limits::of_descriptors(1024), Limits { connections: 256, clients: 32 });
-        assert_eq!(Limits::of_descriptors(1_000_000), Limits { connections: 256, clients: 32 });
-        assert_eq!(Limits::of_descriptors(128), Limits { connections: 32, clients: 16 });
-        assert_eq!(Limits::of_descriptors(16), Limits { connections: 8, clients: 4 });
+        assert_eq!(
+            Limits::of_descriptors(1024),
+            Limits {
+                connections: 256,
+                clients: 32
+            }
+        );
+        assert_eq!(
+            Limits::of_descriptors(1_000_000),
+            Limits {
+                connections: 256,
+                clients: 32
+            }
+        );
+        assert_eq!(
+            Limits::of_descriptors(128),
+            Limits {
+                connections: 32,
+                clients: 16
+            }
+        );
+        assert_eq!(
+            Limits::of_descriptors(16),
+            Limits {
+                connections: 8,
+                clients: 4
+            }
+        );
     }
 
     #[test]
@@ -536,7 +649,10 @@ mod tests {
             let (_newest, _d) = port.connect();
             let (_one_more, _e) = port.connect();
             assert!(is_closed(&half_open) && !is_closed(&served));
-            assert!(half_open.read_u8().await.is_err(), "the serving task sees the end");
+            assert!(
+                half_open.read_u8().await.is_err(),
+                "the serving task sees the end"
+            );
             drop(half_open);
             assert_eq!(port.admission.n_open(), 4);
         });
@@ -552,14 +668,31 @@ mod tests {
             idle.connection().requested();
             let requested = Instant::now();
             tokio::time::sleep(Duration::from_millis(50)).await;
-            downloading.write_all(b"the next bytes of a mesh").await.expect("the peer reads");
+            downloading
+                .write_all(b"the next bytes of a mesh")
+                .await
+                .expect("the peer reads");
             assert_eq!(peer.read_u8().await.expect("a byte"), b't');
-            assert!(idle.connection().timeout_reason(requested + IDLE_TIMEOUT + Duration::from_millis(10)).is_some());
+            assert!(
+                idle.connection()
+                    .timeout_reason(requested + IDLE_TIMEOUT + Duration::from_millis(10))
+                    .is_some()
+            );
             let connection = downloading.connection();
-            assert_eq!(connection.timeout_reason(requested + IDLE_TIMEOUT + Duration::from_millis(10)), None);
-            assert!(connection.timeout_reason(Instant::now() + IDLE_TIMEOUT + Duration::from_millis(10)).is_some());
+            assert_eq!(
+                connection.timeout_reason(requested + IDLE_TIMEOUT + Duration::from_millis(10)),
+                None
+            );
+            assert!(
+                connection
+                    .timeout_reason(Instant::now() + IDLE_TIMEOUT + Duration::from_millis(10))
+                    .is_some()
+            );
             assert!(port.admission.evict());
-            assert!(is_closed(&idle) && !is_closed(&downloading), "the connection in use stays");
+            assert!(
+                is_closed(&idle) && !is_closed(&downloading),
+                "the connection in use stays"
+            );
         });
     }
 
@@ -574,7 +707,10 @@ mod tests {
                 assert!(port.admission.admit_client(stream.connection(), false));
                 act_like_page(stream);
             }
-            assert!(!port.admission.admit_client(c.connection(), false), "both clients are in use");
+            assert!(
+                !port.admission.admit_client(c.connection(), false),
+                "both clients are in use"
+            );
             drop(a);
             assert!(port.admission.admit_client(c.connection(), false));
             assert!(!is_closed(&b));
@@ -593,11 +729,17 @@ mod tests {
                 act_like_page(viewer);
             }
             for operator in [&c, &d] {
-                assert!(port.admission.admit_client(operator.connection(), true), "a viewer makes room");
+                assert!(
+                    port.admission.admit_client(operator.connection(), true),
+                    "a viewer makes room"
+                );
                 act_like_page(operator);
             }
             assert!(is_closed(&a) && is_closed(&b));
-            assert!(!port.admission.admit_client(e.connection(), true), "operators in use stay");
+            assert!(
+                !port.admission.admit_client(e.connection(), true),
+                "operators in use stay"
+            );
             assert!(!port.admission.admit_client(e.connection(), false));
             assert!(!is_closed(&c) && !is_closed(&d));
         });
@@ -625,10 +767,17 @@ mod tests {
             let now = Instant::now();
             let connection = speaking.connection();
             assert_eq!(connection.dispensability(now), None);
-            let idle = connection.dispensability(now + IDLE_CLIENT_AFTER).expect("idle");
+            let idle = connection
+                .dispensability(now + IDLE_CLIENT_AFTER)
+                .expect("idle");
             let silent = newcomer.connection().dispensability(now).expect("silent");
-            assert!(connection.start_ping() && !connection.start_ping(), "one ping at a time");
-            let unresponsive = connection.dispensability(Instant::now() + UNRESPONSIVE_AFTER).expect("unresponsive");
+            assert!(
+                connection.start_ping() && !connection.start_ping(),
+                "one ping at a time"
+            );
+            let unresponsive = connection
+                .dispensability(Instant::now() + UNRESPONSIVE_AFTER)
+                .expect("unresponsive");
             assert!(idle < silent && silent < unresponsive);
             connection.record_pong();
             assert_eq!(connection.dispensability(now), None);
@@ -641,17 +790,39 @@ mod tests {
             let port = Port::open();
             let (mut stuck, _a) = port.connect();
             let filling = async { while stuck.write_all(&[0; 65536]).await.is_ok() {} };
-            assert!(tokio::time::timeout(Duration::from_millis(500), filling).await.is_err(), "the peer never reads");
+            assert!(
+                tokio::time::timeout(Duration::from_millis(500), filling)
+                    .await
+                    .is_err(),
+                "the peer never reads"
+            );
             let soon = Instant::now() + Duration::from_millis(100);
             assert_eq!(stuck.connection().timeout_reason(soon), None);
-            assert!(stuck.connection().timeout_reason(soon + WRITE_TIMEOUT).is_some());
+            assert!(
+                stuck
+                    .connection()
+                    .timeout_reason(soon + WRITE_TIMEOUT)
+                    .is_some()
+            );
 
             let (client, _b) = port.connect();
-            assert!(port.admission.admit_client(client.connection(), false) && client.connection().start_ping());
+            assert!(
+                port.admission.admit_client(client.connection(), false)
+                    && client.connection().start_ping()
+            );
             assert_eq!(client.connection().timeout_reason(soon), None);
-            assert!(client.connection().timeout_reason(soon + PONG_TIMEOUT).is_some());
+            assert!(
+                client
+                    .connection()
+                    .timeout_reason(soon + PONG_TIMEOUT)
+                    .is_some()
+            );
             client.connection().record_pong();
-            assert_eq!(client.connection().timeout_reason(soon + 2 * PONG_TIMEOUT), None, "a quiet client may stay");
+            assert_eq!(
+                client.connection().timeout_reason(soon + 2 * PONG_TIMEOUT),
+                None,
+                "a quiet client may stay"
+            );
         });
     }
 }

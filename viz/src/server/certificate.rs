@@ -1,7 +1,9 @@
 //! The TLS certificate of a server: self-signed and kept across runs, or the user's own.
 
 use crate::Error;
-use rcgen::{CertificateParams, DistinguishedName, DnType, ExtendedKeyUsagePurpose, KeyPair, date_time_ymd};
+use rcgen::{
+    CertificateParams, DistinguishedName, DnType, ExtendedKeyUsagePurpose, KeyPair, date_time_ymd,
+};
 use rustls::pki_types::pem::PemObject;
 use rustls::pki_types::{CertificateDer, PrivateKeyDer};
 use sha2::{Digest, Sha256};
@@ -9,10 +11,11 @@ use std::io::{ErrorKind, Write};
 use std::path::Path;
 use std::sync::Arc;
 
-/// Name of the file with the self-signed certificate and its private key. One file, so that they always match.
+/// Name of the file with the self-signed certificate and its private key. One file, so that they
+/// always match.
 const FILE: &str = "page-certificate.pem";
-/// Years of validity. The period is so long because browsers cannot renew their trust in a self-signed certificate, and
-/// the clocks of robots may be wrong.
+/// Years of validity. The period is so long because browsers cannot renew their trust in a
+/// self-signed certificate, and the clocks of robots may be wrong.
 const VALID_YEARS: std::ops::Range<i32> = 2020..2100;
 
 /// A certificate and its private key.
@@ -23,50 +26,77 @@ pub struct Certificate {
 
 impl std::fmt::Debug for Certificate {
     fn fmt(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        formatter.debug_struct("Certificate").field("fingerprint", &self.fingerprint()).finish_non_exhaustive()
+        formatter
+            .debug_struct("Certificate")
+            .field("fingerprint", &self.fingerprint())
+            .finish_non_exhaustive()
     }
 }
 
 impl Certificate {
-    /// The self-signed certificate in this folder. It is created if the folder has none, so that browsers need to trust
-    /// a computer only once.
+    /// The self-signed certificate in this folder. It is created if the folder has none, so that
+    /// browsers need to trust a computer only once.
     pub fn kept_in(folder: &Path) -> Result<Self, Error> {
         let file = folder.join(FILE);
-        if !file.try_exists().map_err(|source| Error::WriteCertificate { file: file.clone(), source })? {
-            let pem = self_signed_pem(&host_name())
-                .map_err(|error| Error::Certificate { file: file.clone(), reason: error.to_string() })?;
-            create(folder, &file, &pem).map_err(|source| Error::WriteCertificate { file: file.clone(), source })?;
+        if !file
+            .try_exists()
+            .map_err(|source| Error::WriteCertificate {
+                file: file.clone(),
+                source,
+            })?
+        {
+            let pem = self_signed_pem(&host_name()).map_err(|error| Error::Certificate {
+                file: file.clone(),
+                reason: error.to_string(),
+            })?;
+            create(folder, &file, &pem).map_err(|source| Error::WriteCertificate {
+                file: file.clone(),
+                source,
+            })?;
         }
         check_is_private(&file, GROUP_AND_OTHERS)?;
         Self::read(&file, &file)
     }
 
-    /// Reads a certificate with its chain, and its private key, from PEM files. They may be the same file. A key that every
-    /// user can read is refused; a group may read it, as is usual for keys that several programs use.
+    /// Reads a certificate with its chain, and its private key, from PEM files. They may be the
+    /// same file. A key that every user can read is refused; a group may read it, as is usual for
+    /// keys that several programs use.
     pub fn read(certificate_file: &Path, key_file: &Path) -> Result<Self, Error> {
         let failed = |file: &Path, error: &dyn std::fmt::Display| Error::Certificate {
             file: file.to_owned(),
             reason: error.to_string(),
         };
-        let read = |file: &Path| files::read(file, files::Budget::TEXT).map_err(|error| failed(file, &error));
+        let read = |file: &Path| {
+            files::read(file, files::Budget::TEXT).map_err(|error| failed(file, &error))
+        };
         let chain = CertificateDer::pem_slice_iter(&read(certificate_file)?)
             .collect::<Result<Vec<_>, _>>()
             .map_err(|error| failed(certificate_file, &error))?;
         if chain.is_empty() {
-            return Err(failed(certificate_file, &"it contains no certificate in PEM format"));
+            return Err(failed(
+                certificate_file,
+                &"it contains no certificate in PEM format",
+            ));
         }
         check_is_private(key_file, OTHERS)?;
-        let key = PrivateKeyDer::from_pem_slice(&read(key_file)?).map_err(|error| failed(key_file, &error))?;
+        let key = PrivateKeyDer::from_pem_slice(&read(key_file)?)
+            .map_err(|error| failed(key_file, &error))?;
         let certificate = Self { chain, key };
         // Detects a key of another certificate.
-        certificate.server_config().map_err(|error| failed(certificate_file, &error))?;
+        certificate
+            .server_config()
+            .map_err(|error| failed(certificate_file, &error))?;
         Ok(certificate)
     }
 
     /// SHA-256 of the certificate as browsers display it, such as `AB:CD:...`.
     pub fn fingerprint(&self) -> String {
         let digest = Sha256::digest(&self.chain[0]);
-        digest.iter().map(|byte| format!("{byte:02X}")).collect::<Vec<_>>().join(":")
+        digest
+            .iter()
+            .map(|byte| format!("{byte:02X}"))
+            .collect::<Vec<_>>()
+            .join(":")
     }
 
     /// The TLS settings of a server with this certificate: TLS 1.3, HTTP/1.1.
@@ -83,14 +113,23 @@ impl Certificate {
 
 /// A new certificate for this computer and its private key.
 fn self_signed_pem(host_name: &str) -> Result<String, rcgen::Error> {
-    let is_dns_name = !host_name.is_empty() && host_name.chars().all(|c| c.is_ascii_alphanumeric() || "-.".contains(c));
-    let mut names = vec!["localhost".to_owned(), "127.0.0.1".to_owned(), "::1".to_owned()];
+    let is_dns_name = !host_name.is_empty()
+        && host_name
+            .chars()
+            .all(|c| c.is_ascii_alphanumeric() || "-.".contains(c));
+    let mut names = vec![
+        "localhost".to_owned(),
+        "127.0.0.1".to_owned(),
+        "::1".to_owned(),
+    ];
     if is_dns_name {
         names.extend([host_name.to_owned(), format!("{host_name}.local")]);
     }
     let mut params = CertificateParams::new(names)?;
     params.distinguished_name = DistinguishedName::new();
-    params.distinguished_name.push(DnType::CommonName, "fieldrig");
+    params
+        .distinguished_name
+        .push(DnType::CommonName, "fieldrig");
     params.extended_key_usages = vec![ExtendedKeyUsagePurpose::ServerAuth];
     params.not_before = date_time_ymd(VALID_YEARS.start, 1, 1);
     params.not_after = date_time_ymd(VALID_YEARS.end, 1, 1);
@@ -100,7 +139,10 @@ fn self_signed_pem(host_name: &str) -> Result<String, rcgen::Error> {
 
 #[cfg(unix)]
 fn host_name() -> String {
-    rustix::system::uname().nodename().to_string_lossy().into_owned()
+    rustix::system::uname()
+        .nodename()
+        .to_string_lossy()
+        .into_owned()
 }
 
 #[cfg(not(unix))]
@@ -132,12 +174,16 @@ const OTHERS: u32 = 0o007;
 #[cfg(unix)]
 fn check_is_private(file: &Path, forbidden: u32) -> Result<(), Error> {
     use std::os::unix::fs::PermissionsExt;
-    let metadata =
-        file.metadata().map_err(|error| Error::Certificate { file: file.to_owned(), reason: error.to_string() })?;
+    let metadata = file.metadata().map_err(|error| Error::Certificate {
+        file: file.to_owned(),
+        reason: error.to_string(),
+    })?;
     if metadata.permissions().mode() & forbidden == 0 {
         Ok(())
     } else {
-        Err(Error::PublicKeyFile { file: file.to_owned() })
+        Err(Error::PublicKeyFile {
+            file: file.to_owned(),
+        })
     }
 }
 
@@ -156,25 +202,48 @@ mod tests {
     fn certificate_is_kept_and_private() {
         let root = tempfile::tempdir().expect("a folder");
         let folder = root.path().join("fieldrig");
-        let first = Certificate::kept_in(&folder).expect("created").fingerprint();
-        assert_eq!(Certificate::kept_in(&folder).expect("read").fingerprint(), first);
+        let first = Certificate::kept_in(&folder)
+            .expect("created")
+            .fingerprint();
+        assert_eq!(
+            Certificate::kept_in(&folder).expect("read").fingerprint(),
+            first
+        );
         assert_eq!((first.len(), first.split(':').count()), (95, 32), "{first}");
-        let mode = |path: &std::path::Path| path.metadata().expect("it exists").permissions().mode() & 0o777;
+        let mode = |path: &std::path::Path| {
+            path.metadata().expect("it exists").permissions().mode() & 0o777
+        };
         assert_eq!((mode(&folder), mode(&folder.join(FILE))), (0o700, 0o600));
-        assert_eq!(folder.read_dir().expect("a folder").count(), 1, "no temporary files remain");
-        let other = Certificate::kept_in(&root.path().join("other")).expect("created").fingerprint();
+        assert_eq!(
+            folder.read_dir().expect("a folder").count(),
+            1,
+            "no temporary files remain"
+        );
+        let other = Certificate::kept_in(&root.path().join("other"))
+            .expect("created")
+            .fingerprint();
         assert_ne!(other, first);
     }
 
     #[test]
     fn all_processes_get_the_same_certificate() {
         let root = tempfile::tempdir().expect("a folder");
-        let fingerprint = || Certificate::kept_in(root.path()).expect("created").fingerprint();
+        let fingerprint = || {
+            Certificate::kept_in(root.path())
+                .expect("created")
+                .fingerprint()
+        };
         let fingerprints: Vec<_> = std::thread::scope(|scope| {
             let threads: Vec<_> = (0..8).map(|_| scope.spawn(fingerprint)).collect();
-            threads.into_iter().map(|thread| thread.join().expect("no panic")).collect()
+            threads
+                .into_iter()
+                .map(|thread| thread.join().expect("no panic"))
+                .collect()
         });
-        assert!(fingerprints.iter().all(|other| *other == fingerprints[0]), "{fingerprints:?}");
+        assert!(
+            fingerprints.iter().all(|other| *other == fingerprints[0]),
+            "{fingerprints:?}"
+        );
     }
 
     #[test]
@@ -187,24 +256,39 @@ mod tests {
         Certificate::read(&a, &a).expect("its own key");
         let garbage = root.path().join("garbage");
         // Only the permissions of a key matter.
-        std::fs::write(&garbage, "-----BEGIN CERTIFICATE-----\n!!\n-----END CERTIFICATE-----\n").expect("written");
+        std::fs::write(
+            &garbage,
+            "-----BEGIN CERTIFICATE-----\n!!\n-----END CERTIFICATE-----\n",
+        )
+        .expect("written");
         for (certificate, key, named) in [
             (&a, &b, &a),
             (&garbage, &a, &garbage),
             (&a, &garbage, &garbage),
             (&root.path().join("c"), &a, &root.path().join("c")),
         ] {
-            let error = Certificate::read(certificate, key).expect_err("unusable").to_string();
-            assert!(error.contains(&named.display().to_string()) && !error.contains('\n'), "{error}");
+            let error = Certificate::read(certificate, key)
+                .expect_err("unusable")
+                .to_string();
+            assert!(
+                error.contains(&named.display().to_string()) && !error.contains('\n'),
+                "{error}"
+            );
         }
-        let set_mode = |mode| std::fs::set_permissions(&b, std::fs::Permissions::from_mode(mode)).expect("permitted");
+        let set_mode = |mode| {
+            std::fs::set_permissions(&b, std::fs::Permissions::from_mode(mode)).expect("permitted")
+        };
         set_mode(0o640);
         Certificate::read(&b, &b).expect("a group may read the key of the user");
         set_mode(0o644);
         let error = Certificate::read(&b, &b).expect_err("everybody can read the key");
         assert!(matches!(error, Error::PublicKeyFile { .. }), "{error}");
         set_mode(0o640);
-        let error = Certificate::kept_in(b.parent().expect("a folder")).expect_err("readable by the group");
-        assert!(matches!(error, Error::PublicKeyFile { .. }) && error.to_string().contains("chmod 600"), "{error}");
+        let error =
+            Certificate::kept_in(b.parent().expect("a folder")).expect_err("readable by the group");
+        assert!(
+            matches!(error, Error::PublicKeyFile { .. }) && error.to_string().contains("chmod 600"),
+            "{error}"
+        );
     }
 }

@@ -4,7 +4,8 @@ use parking_lot::Mutex;
 use std::fmt::Arguments;
 use std::time::{Duration, Instant};
 
-/// Maximum number of lines per [`PERIOD`], for all clients together: a client could reconnect for new lines.
+/// Maximum number of lines per [`PERIOD`], for all clients together: a client could reconnect for
+/// new lines.
 const MAX_LINES: u32 = 100;
 const PERIOD: Duration = Duration::from_secs(10);
 
@@ -22,10 +23,16 @@ struct Budget {
 
 impl ClientLog {
     pub(crate) fn new() -> Self {
-        Self { budget: Mutex::new(Budget { since: Instant::now(), n_lines: 0 }) }
+        Self {
+            budget: Mutex::new(Budget {
+                since: Instant::now(),
+                n_lines: 0,
+            }),
+        }
     }
 
-    /// Logs a line, unless there were too many. The first line of the next period is preceded by the number of omitted lines.
+    /// Logs a line, unless there were too many. The first line of the next period is preceded by
+    /// the number of omitted lines.
     pub(crate) fn line(&self, text: Arguments<'_>) {
         let (n_omitted, is_logged) = self.budget.lock().count(Instant::now());
         if n_omitted > 0 {
@@ -41,13 +48,16 @@ impl ClientLog {
 }
 
 impl Budget {
-    /// Counts a line. Returns how many lines of the last period were left out, when a new period begins, and whether this
-    /// line is logged.
+    /// Counts a line. Returns how many lines of the last period were left out, when a new period
+    /// begins, and whether this line is logged.
     fn count(&mut self, now: Instant) -> (u32, bool) {
         let mut n_omitted = 0;
         if now.saturating_duration_since(self.since) >= PERIOD {
             n_omitted = self.n_lines.saturating_sub(MAX_LINES);
-            *self = Self { since: now, n_lines: 0 };
+            *self = Self {
+                since: now,
+                n_lines: 0,
+            };
         }
         self.n_lines = self.n_lines.saturating_add(1);
         (n_omitted, self.n_lines <= MAX_LINES)
@@ -62,8 +72,13 @@ mod tests {
     #[test]
     fn lines_beyond_the_limit_are_counted_and_left_out() {
         let start = Instant::now();
-        let mut budget = Budget { since: start, n_lines: 0 };
-        let logged = (0..5000).filter(|n| budget.count(start + Duration::from_millis(n % 9999)).1).count();
+        let mut budget = Budget {
+            since: start,
+            n_lines: 0,
+        };
+        let logged = (0..5000)
+            .filter(|n| budget.count(start + Duration::from_millis(n % 9999)).1)
+            .count();
         assert_eq!(logged, MAX_LINES as usize);
         assert_eq!(budget.count(start + PERIOD), (4900, true));
         assert_eq!(budget.count(start + PERIOD), (0, true));

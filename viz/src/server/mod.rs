@@ -41,8 +41,8 @@ use tokio_rustls::TlsAcceptor;
 
 /// Maximum time that a stopping server waits until its clients have received the goodbye.
 const GOODBYE_TIMEOUT: Duration = Duration::from_millis(500);
-/// A connection is closed if the headers of a request take longer than this, or the next request arrives later than
-/// this.
+/// A connection is closed if the headers of a request take longer than this, or the next request
+/// arrives later than this.
 const HEADER_TIMEOUT: Duration = Duration::from_secs(3);
 /// Maximum size of a request including its headers, bytes.
 const MAX_REQUEST_BYTES: usize = 32 * 1024;
@@ -50,8 +50,8 @@ const MAX_REQUEST_BYTES: usize = 32 * 1024;
 const SWEEP_PERIOD: Duration = Duration::from_millis(250);
 /// Pause after a failed accept.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(50);
-/// Size of the kernel's send buffer per connection, bytes; Linux doubles it. For slow clients, data in a larger buffer
-/// would only become outdated.
+/// Size of the kernel's send buffer per connection, bytes; Linux doubles it. For slow clients, data
+/// in a larger buffer would only become outdated.
 #[cfg(unix)]
 const SEND_BUFFER_BYTES: usize = 64 * 1024;
 /// Maximum number of connections waiting to be accepted.
@@ -70,7 +70,9 @@ pub struct ServerConfig {
 
 impl Default for ServerConfig {
     fn default() -> Self {
-        Self { listen: SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 7007) }
+        Self {
+            listen: SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 7007),
+        }
     }
 }
 
@@ -93,7 +95,8 @@ pub struct Server {
 }
 
 impl Server {
-    /// Starts listening on a loopback address, and serves the hub's data to everybody on this computer until dropped.
+    /// Starts listening on a loopback address, and serves the hub's data to everybody on this
+    /// computer until dropped.
     pub fn start(config: ServerConfig, hub: Hub) -> Result<Self, Error> {
         let address = config.listen;
         if !address.ip().is_loopback() {
@@ -102,13 +105,27 @@ impl Server {
         Self::spawn(address, hub, Access::Local, None)
     }
 
-    /// Starts listening on any address, and serves the hub's data over TLS to clients with a token until dropped.
+    /// Starts listening on any address, and serves the hub's data over TLS to clients with a token
+    /// until dropped.
     pub fn start_shared(config: ServerConfig, sharing: Sharing, hub: Hub) -> Result<Self, Error> {
-        let tls = sharing.certificate.server_config().map_err(|source| Error::Tls { source })?;
-        Self::spawn(config.listen, hub, Access::Tokens(sharing.tokens), Some(tls.into()))
+        let tls = sharing
+            .certificate
+            .server_config()
+            .map_err(|source| Error::Tls { source })?;
+        Self::spawn(
+            config.listen,
+            hub,
+            Access::Tokens(sharing.tokens),
+            Some(tls.into()),
+        )
     }
 
-    fn spawn(listen_address: SocketAddr, hub: Hub, access: Access, tls: Option<TlsAcceptor>) -> Result<Self, Error> {
+    fn spawn(
+        listen_address: SocketAddr,
+        hub: Hub,
+        access: Access,
+        tls: Option<TlsAcceptor>,
+    ) -> Result<Self, Error> {
         let (listener, address) = listen(listen_address)?;
         let scheme = if tls.is_some() { "https" } else { "http" };
         let (stop, stopped) = watch::channel(false);
@@ -126,7 +143,12 @@ impl Server {
                 runtime.shutdown_background();
             })
             .map_err(|source| Error::Thread { source })?;
-        Ok(Self { address, scheme, stop, thread: Some(thread) })
+        Ok(Self {
+            address,
+            scheme,
+            stop,
+            thread: Some(thread),
+        })
     }
 
     /// The actual address, with the selected port.
@@ -143,7 +165,11 @@ impl Server {
 impl Drop for Server {
     fn drop(&mut self) {
         self.stop.send_replace(true);
-        if self.thread.take().is_some_and(|thread| thread.join().is_err()) {
+        if self
+            .thread
+            .take()
+            .is_some_and(|thread| thread.join().is_err())
+        {
             log::error!("the server thread on {} panicked", self.address);
         }
     }
@@ -172,10 +198,22 @@ async fn serve(
     let listener = tokio::net::TcpListener::from_std(listener)?;
     let clock = ServerClock::start();
     let (topics, publisher) = (topics::start_all(&hub), Publisher::default());
-    tokio::spawn(topics::encode_all(hub.clone(), clock, Arc::clone(&topics), publisher.clone()));
+    tokio::spawn(topics::encode_all(
+        hub.clone(),
+        clock,
+        Arc::clone(&topics),
+        publisher.clone(),
+    ));
     let admission = Admission::new(Limits::of_process());
     let log = Arc::new(ClientLog::new());
-    let server_context = ServerContext { hub: hub.clone(), clock, topics, publisher, log, stopped: stopped.clone() };
+    let server_context = ServerContext {
+        hub: hub.clone(),
+        clock,
+        topics,
+        publisher,
+        log,
+        stopped: stopped.clone(),
+    };
     let app = TowerToHyperService::new(router(AppState {
         server_context,
         admission: Arc::clone(&admission),
@@ -192,7 +230,10 @@ async fn serve(
             tokio::time::sleep(Duration::from_millis(5)).await;
         }
     };
-    if tokio::time::timeout(GOODBYE_TIMEOUT, all_disconnected).await.is_err() {
+    if tokio::time::timeout(GOODBYE_TIMEOUT, all_disconnected)
+        .await
+        .is_err()
+    {
         log::debug!("{} clients did not disconnect in time", hub.n_clients());
     }
     Ok(())
@@ -220,21 +261,28 @@ async fn accept(
         match listener.accept().await {
             Ok((stream, _)) => {
                 is_failing = false;
-                // Small messages must not wait for the acknowledgment of large ones. A failure affects only latency.
+                // Small messages must not wait for the acknowledgment of large ones. A failure
+                // affects only latency.
                 if let Err(error) = stream.set_nodelay(true) {
                     log::debug!("cannot disable Nagle's algorithm: {error}");
                 }
                 let (stream, has_evicted) = admission.admit(stream);
                 tokio::spawn(serve_connection(stream, tls.cloned(), app.clone()));
                 if has_evicted {
-                    // Lets the task of the closed connection release its descriptor before the next accept.
+                    // Lets the task of the closed connection release its descriptor before the next
+                    // accept.
                     tokio::task::yield_now().await;
                 }
             }
             // The peer has already disconnected.
-            Err(error) if matches!(error.kind(), ErrorKind::ConnectionAborted | ErrorKind::ConnectionReset) => {}
+            Err(error)
+                if matches!(
+                    error.kind(),
+                    ErrorKind::ConnectionAborted | ErrorKind::ConnectionReset
+                ) => {}
             Err(error) => {
-                // Most likely all file descriptors are in use: free one, and pause to avoid a busy loop.
+                // Most likely all file descriptors are in use: free one, and pause to avoid a busy
+                // loop.
                 if !is_failing {
                     log::warn!("cannot accept a connection: {error}");
                 }
@@ -254,7 +302,11 @@ async fn sweep(admission: &Admission) {
     }
 }
 
-async fn serve_connection(stream: GuardedStream, tls: Option<TlsAcceptor>, app: TowerToHyperService<Router>) {
+async fn serve_connection(
+    stream: GuardedStream,
+    tls: Option<TlsAcceptor>,
+    app: TowerToHyperService<Router>,
+) {
     let connection = Arc::clone(stream.connection());
     match tls {
         None => serve_requests(stream, connection, app).await,
@@ -303,10 +355,16 @@ fn router(app_state: AppState) -> Router {
         .route_layer(from_fn_with_state(app_state.clone(), require_token));
     // The files of the page contain no data.
     for file in FILES {
-        router = router.route(file.path, get(move |headers: HeaderMap| async move { file.response(&headers) }));
+        router = router.route(
+            file.path,
+            get(move |headers: HeaderMap| async move { file.response(&headers) }),
+        );
     }
     router
-        .layer(from_fn_with_state(app_state.clone(), reject_foreign_origins))
+        .layer(from_fn_with_state(
+            app_state.clone(),
+            reject_foreign_origins,
+        ))
         .layer(from_fn(add_security_headers))
         .with_state(app_state)
 }
@@ -319,32 +377,58 @@ async fn status(State(app_state): State<AppState>) -> Response {
     };
     match json {
         Ok(json) => {
-            let headers = [(header::CONTENT_TYPE, "application/json"), (header::CACHE_CONTROL, "no-store")];
+            let headers = [
+                (header::CONTENT_TYPE, "application/json"),
+                (header::CACHE_CONTROL, "no-store"),
+            ];
             (headers, json).into_response()
         }
         Err(error) => (StatusCode::INTERNAL_SERVER_ERROR, error.to_string()).into_response(),
     }
 }
 
-/// A mesh file of the robot, or 304 if the client has this version. Names are numbers in a list, so that no other file
-/// can be requested.
-async fn robot_mesh(Path(name): Path<String>, State(app_state): State<AppState>, request: HeaderMap) -> Response {
-    let robot = app_state.server_context.hub.latest::<Option<Arc<RobotDescription>>>().borrow().clone();
+/// A mesh file of the robot, or 304 if the client has this version. Names are numbers in a list, so
+/// that no other file can be requested.
+async fn robot_mesh(
+    Path(name): Path<String>,
+    State(app_state): State<AppState>,
+    request: HeaderMap,
+) -> Response {
+    let robot = app_state
+        .server_context
+        .hub
+        .latest::<Option<Arc<RobotDescription>>>()
+        .borrow()
+        .clone();
     let mesh = robot.as_deref().and_then(|robot| robot.mesh_at(&name));
     let Some((format, bytes)) = mesh.map(|mesh| (mesh.format, Arc::clone(&mesh.bytes))) else {
-        return (StatusCode::NOT_FOUND, "the robot has no mesh with this name").into_response();
+        return (
+            StatusCode::NOT_FOUND,
+            "the robot has no mesh with this name",
+        )
+            .into_response();
     };
     let hashed = Arc::clone(&bytes);
     let etag = match tokio::task::spawn_blocking(move || etag(&hashed)).await {
         Ok(etag) => etag,
-        Err(error) => return (StatusCode::INTERNAL_SERVER_ERROR, error.to_string()).into_response(),
+        Err(error) => {
+            return (StatusCode::INTERNAL_SERVER_ERROR, error.to_string()).into_response();
+        }
     };
-    let shared = [(header::ETAG, etag.as_str()), (header::CACHE_CONTROL, "no-cache")];
+    let shared = [
+        (header::ETAG, etag.as_str()),
+        (header::CACHE_CONTROL, "no-cache"),
+    ];
     if has_version(&request, &etag) {
         return (StatusCode::NOT_MODIFIED, shared).into_response();
     }
     let content_type = [(header::CONTENT_TYPE, format.content_type())];
-    (shared, content_type, Body::from(axum::body::Bytes::from_owner(bytes))).into_response()
+    (
+        shared,
+        content_type,
+        Body::from(axum::body::Bytes::from_owner(bytes)),
+    )
+        .into_response()
 }
 
 /// A checksum that only this program needs to reproduce.
@@ -360,13 +444,22 @@ async fn connect(
     Extension(role): Extension<Role>,
     State(app_state): State<AppState>,
 ) -> Response {
-    if !app_state.admission.admit_client(&connection, role == Role::Operator) {
-        return (StatusCode::SERVICE_UNAVAILABLE, "too many clients are connected, try again later").into_response();
+    if !app_state
+        .admission
+        .admit_client(&connection, role == Role::Operator)
+    {
+        return (
+            StatusCode::SERVICE_UNAVAILABLE,
+            "too many clients are connected, try again later",
+        )
+            .into_response();
     }
     upgrade
         .max_message_size(MAX_MESSAGE_BYTES)
         .max_frame_size(MAX_MESSAGE_BYTES)
-        .on_upgrade(move |socket| session::serve(socket, connection, role, app_state.server_context))
+        .on_upgrade(move |socket| {
+            session::serve(socket, connection, role, app_state.server_context)
+        })
 }
 
 /// Adds headers that keep other web sites from embedding or reading the responses.
@@ -377,13 +470,20 @@ async fn add_security_headers(request: Request, next: Next) -> Response {
         (header::CONTENT_SECURITY_POLICY, CONTENT_SECURITY_POLICY),
         (header::X_CONTENT_TYPE_OPTIONS, "nosniff"),
         (header::REFERRER_POLICY, "no-referrer"),
-        (HeaderName::from_static("cross-origin-resource-policy"), "same-origin"),
+        (
+            HeaderName::from_static("cross-origin-resource-policy"),
+            "same-origin",
+        ),
     ];
     headers.extend(policies.map(|(name, value)| (name, HeaderValue::from_static(value))));
     response
 }
 
-async fn reject_foreign_origins(State(app_state): State<AppState>, request: Request, next: Next) -> Response {
+async fn reject_foreign_origins(
+    State(app_state): State<AppState>,
+    request: Request,
+    next: Next,
+) -> Response {
     match app_state.access.check_origin(request.headers()) {
         Ok(()) => next.run(request).await,
         Err(refusal) => (StatusCode::FORBIDDEN, refusal.to_string()).into_response(),
@@ -391,7 +491,11 @@ async fn reject_foreign_origins(State(app_state): State<AppState>, request: Requ
 }
 
 /// Refuses requests without a token, and stores the role of the others.
-async fn require_token(State(app_state): State<AppState>, mut request: Request, next: Next) -> Response {
+async fn require_token(
+    State(app_state): State<AppState>,
+    mut request: Request,
+    next: Next,
+) -> Response {
     match app_state.access.role_of(request.headers()) {
         Ok(role) => {
             request.extensions_mut().insert(role);

@@ -27,40 +27,79 @@ macro_rules! page_file {
 /// The page bundled by `scripts/build-web.sh`.
 #[cfg(web_bundle)]
 pub(crate) const FILES: &[PageFile] = &[
-    page_file!("/", "text/html; charset=utf-8", "../../web/dist/", "index.html"),
-    page_file!("/app.js", "text/javascript; charset=utf-8", "../../web/dist/", "app.js"),
-    page_file!("/splat_worker.js", "text/javascript; charset=utf-8", "../../web/dist/", "splat_worker.js"),
-    page_file!("/video_worker.js", "text/javascript; charset=utf-8", "../../web/dist/", "video_worker.js"),
-    page_file!("/app.css", "text/css; charset=utf-8", "../../web/dist/", "app.css"),
+    page_file!(
+        "/",
+        "text/html; charset=utf-8",
+        "../../web/dist/",
+        "index.html"
+    ),
+    page_file!(
+        "/app.js",
+        "text/javascript; charset=utf-8",
+        "../../web/dist/",
+        "app.js"
+    ),
+    page_file!(
+        "/splat_worker.js",
+        "text/javascript; charset=utf-8",
+        "../../web/dist/",
+        "splat_worker.js"
+    ),
+    page_file!(
+        "/video_worker.js",
+        "text/javascript; charset=utf-8",
+        "../../web/dist/",
+        "video_worker.js"
+    ),
+    page_file!(
+        "/app.css",
+        "text/css; charset=utf-8",
+        "../../web/dist/",
+        "app.css"
+    ),
 ];
 
 /// The page of binaries built without Node.js.
 #[cfg(not(web_bundle))]
 pub(crate) const FILES: &[PageFile] = &[
     page_file!("/", "text/html; charset=utf-8", "", "without_bundle.html"),
-    page_file!("/app.css", "text/css; charset=utf-8", "", "without_bundle.css"),
+    page_file!(
+        "/app.css",
+        "text/css; charset=utf-8",
+        "",
+        "without_bundle.css"
+    ),
 ];
 
 impl PageFile {
-    /// The response to a GET request: the file, compressed if the client accepts it, or 304 if the client has this
-    /// version.
+    /// The response to a GET request: the file, compressed if the client accepts it, or 304 if the
+    /// client has this version.
     pub(crate) fn response(&self, request: &HeaderMap) -> Response {
         let etag = self.etag();
-        let shared: [(HeaderName, &str); 3] =
-            [(header::ETAG, &etag), (header::CACHE_CONTROL, "no-cache"), (header::VARY, "accept-encoding")];
+        let shared: [(HeaderName, &str); 3] = [
+            (header::ETAG, &etag),
+            (header::CACHE_CONTROL, "no-cache"),
+            (header::VARY, "accept-encoding"),
+        ];
         if has_version(request, &etag) {
             return (StatusCode::NOT_MODIFIED, shared).into_response();
         }
         let content_type = [(header::CONTENT_TYPE, self.content_type)];
         if accepts_gzip(request) {
-            (shared, content_type, [(header::CONTENT_ENCODING, "gzip")], self.gzip).into_response()
+            (
+                shared,
+                content_type,
+                [(header::CONTENT_ENCODING, "gzip")],
+                self.gzip,
+            )
+                .into_response()
         } else {
             (shared, content_type, self.bytes).into_response()
         }
     }
 
-    /// Checksum and size of the file, taken from the last bytes of its gzip form. The tag is weak because both
-    /// encodings share it.
+    /// Checksum and size of the file, taken from the last bytes of its gzip form. The tag is weak
+    /// because both encodings share it.
     fn etag(&self) -> String {
         let trailer = &self.gzip[self.gzip.len() - 8..];
         let hex: String = trailer.iter().map(|byte| format!("{byte:02x}")).collect();
@@ -70,7 +109,10 @@ impl PageFile {
 
 /// Items of a comma-separated header.
 fn items(request: &HeaderMap, name: HeaderName) -> impl Iterator<Item = &str> {
-    let values = request.get_all(name).into_iter().filter_map(|value| value.to_str().ok());
+    let values = request
+        .get_all(name)
+        .into_iter()
+        .filter_map(|value| value.to_str().ok());
     values.flat_map(|value| value.split(',')).map(str::trim)
 }
 
@@ -83,7 +125,11 @@ pub(crate) fn has_version(request: &HeaderMap, etag: &str) -> bool {
 fn accepts_gzip(request: &HeaderMap) -> bool {
     items(request, header::ACCEPT_ENCODING).any(|item| {
         let (coding, weight) = item.split_once(';').unwrap_or((item, ""));
-        let is_excluded = weight.trim().strip_prefix("q=").and_then(|q| q.parse::<f64>().ok()) == Some(0.0);
+        let is_excluded = weight
+            .trim()
+            .strip_prefix("q=")
+            .and_then(|q| q.parse::<f64>().ok())
+            == Some(0.0);
         coding.trim().eq_ignore_ascii_case("gzip") && !is_excluded
     })
 }
@@ -103,7 +149,8 @@ mod tests {
             ("gzip; q=0.0, br", false),
             ("x-gzip", false),
         ] {
-            let headers = HeaderMap::from_iter([(header::ACCEPT_ENCODING, HeaderValue::from_static(value))]);
+            let headers =
+                HeaderMap::from_iter([(header::ACCEPT_ENCODING, HeaderValue::from_static(value))]);
             assert_eq!(accepts_gzip(&headers), expected, "{value}");
         }
         assert!(!accepts_gzip(&HeaderMap::new()));
@@ -111,8 +158,11 @@ mod tests {
 
     /// Id and title of each button of the page.
     fn buttons() -> Vec<(&'static str, &'static str)> {
-        let tags = include_str!("../../web/src/index.html").split("<button ").skip(1);
-        let attribute = |tag: &'static str, name: &str| Some(tag.split_once(name)?.1.split_once('"')?.0);
+        let tags = include_str!("../../web/src/index.html")
+            .split("<button ")
+            .skip(1);
+        let attribute =
+            |tag: &'static str, name: &str| Some(tag.split_once(name)?.1.split_once('"')?.0);
         tags.filter_map(|tag| {
             let tag = tag.split_once('>')?.0;
             Some((attribute(tag, "id=\"")?, attribute(tag, "title=\"")?))
@@ -122,14 +172,22 @@ mod tests {
 
     /// The key in a title, such as X in `Crop (X)`.
     fn key_of(title: &'static str) -> Option<&'static str> {
-        title.split('(').skip(1).filter_map(|rest| rest.split_once(')')).map(|(key, _)| key).find(|key| key.len() == 1)
+        title
+            .split('(')
+            .skip(1)
+            .filter_map(|rest| rest.split_once(')'))
+            .map(|(key, _)| key)
+            .find(|key| key.len() == 1)
     }
 
     #[test]
     fn keys_in_titles_are_unique_and_have_actions() {
         let main = include_str!("../../web/src/main.ts");
         let help = include_str!("../../web/src/panels/help.ts");
-        let keys: Vec<_> = buttons().into_iter().filter_map(|(id, title)| Some((id, key_of(title)?))).collect();
+        let keys: Vec<_> = buttons()
+            .into_iter()
+            .filter_map(|(id, title)| Some((id, key_of(title)?)))
+            .collect();
         assert!(keys.len() > 20, "{keys:?}");
         for (ix, (id, key)) in keys.iter().enumerate() {
             let other = keys[..ix].iter().find(|(_, earlier)| earlier == key);
@@ -141,14 +199,23 @@ mod tests {
                 format!("{{ id: \"{id}\", key: \"{lower}\""),
             ];
             let is_help = *key == "?" && help.contains("event.key === \"?\"");
-            assert!(is_help || actions.iter().any(|action| main.contains(action)), "{id}: {key} has no action");
+            assert!(
+                is_help || actions.iter().any(|action| main.contains(action)),
+                "{id}: {key} has no action"
+            );
         }
     }
 
     #[test]
     fn a_version_is_recognized_in_a_list() {
-        for (value, expected) in [("\"a\", W/\"b\"", true), ("\"b\"", true), ("*", true), ("\"c\"", false)] {
-            let headers = HeaderMap::from_iter([(header::IF_NONE_MATCH, HeaderValue::from_static(value))]);
+        for (value, expected) in [
+            ("\"a\", W/\"b\"", true),
+            ("\"b\"", true),
+            ("*", true),
+            ("\"c\"", false),
+        ] {
+            let headers =
+                HeaderMap::from_iter([(header::IF_NONE_MATCH, HeaderValue::from_static(value))]);
             assert_eq!(has_version(&headers, "W/\"b\""), expected, "{value}");
         }
     }

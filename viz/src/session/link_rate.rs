@@ -3,8 +3,8 @@
 use crate::pictures::compact_depth::Effort;
 use std::time::Duration;
 
-/// Data handed to the kernel at once, and data in the kernel's buffer, as transfer times. Together they stay below
-/// 100 ms, even if the estimate is too high by a half.
+/// Data handed to the kernel at once, and data in the kernel's buffer, as transfer times. Together
+/// they stay below 100 ms, even if the estimate is too high by a half.
 const PART_TIME: f64 = 0.02;
 const BUFFER_TIME: f64 = 0.04;
 /// Limits of both, bytes. Larger parts and buffers do not make fast connections faster.
@@ -18,12 +18,13 @@ const FAST_BYTES_PER_SEC: f64 = 6e6;
 const LOCAL_BYTES_PER_SEC: f64 = 3e7;
 /// Shorter sends do not measure the link, but the memory of this computer.
 const MIN_SEND_SECS: f64 = 2e-4;
-/// Parts of less than half the usual size measure the link only if they take at least this long. Otherwise, the time
-/// is mostly that of the call.
+/// Parts of less than half the usual size measure the link only if they take at least this long.
+/// Otherwise, the time is mostly that of the call.
 const MIN_SHORT_SEND_SECS: f64 = 5e-3;
 /// The estimate follows decreases quickly, but increases slowly.
 const MAX_INCREASE: f64 = 1.25;
-/// After a longer pause, the kernel's buffer may be empty. Data that fits into it then seems to be sent at once.
+/// After a longer pause, the kernel's buffer may be empty. Data that fits into it then seems to be
+/// sent at once.
 const MAX_PAUSE: Duration = Duration::from_millis(5);
 
 /// Transfer rate of a connection.
@@ -37,7 +38,11 @@ pub(crate) struct LinkRate {
 
 impl Default for LinkRate {
     fn default() -> Self {
-        Self { bytes_per_sec: INITIAL_BYTES_PER_SEC, burst_bytes: 0.0, burst_secs: 0.0 }
+        Self {
+            bytes_per_sec: INITIAL_BYTES_PER_SEC,
+            burst_bytes: 0.0,
+            burst_secs: 0.0,
+        }
     }
 }
 
@@ -65,7 +70,8 @@ impl LinkRate {
         }
     }
 
-    /// How to compress data for this connection. `None` within a computer, where compression takes longer than it saves.
+    /// How to compress data for this connection. `None` within a computer, where compression takes
+    /// longer than it saves.
     pub(crate) fn effort(self, is_loopback: bool) -> Option<Effort> {
         match self.bytes_per_sec {
             rate if is_loopback && rate > LOCAL_BYTES_PER_SEC => None,
@@ -85,7 +91,11 @@ impl LinkRate {
     }
 }
 
-#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "limited to a range of sizes")]
+#[expect(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "limited to a range of sizes"
+)]
 fn bytes_in(bytes: f64, range: std::ops::RangeInclusive<f64>) -> usize {
     bytes.clamp(*range.start(), *range.end()) as usize
 }
@@ -95,7 +105,8 @@ mod tests {
     use super::{Effort, LinkRate};
     use std::time::Duration;
 
-    /// Simulates a link with a kernel buffer. Returns the largest time that data waits once the estimate has settled.
+    /// Simulates a link with a kernel buffer. Returns the largest time that data waits once the
+    /// estimate has settled.
     fn longest_wait_secs(link_bytes_per_sec: f64) -> f64 {
         let mut rate = LinkRate::default();
         let (mut buffered, mut longest) = (0.0_f64, 0.0_f64);
@@ -110,7 +121,11 @@ mod tests {
             }
             // A pause now and then empties the buffer.
             let pause = if ix % 37 == 0 { 0.5 } else { 0.0 };
-            rate.observe(part, Duration::from_secs_f64(secs), Duration::from_secs_f64(pause));
+            rate.observe(
+                part,
+                Duration::from_secs_f64(secs),
+                Duration::from_secs_f64(pause),
+            );
             buffered = (buffered - pause * link_bytes_per_sec).max(0.0);
         }
         longest
@@ -131,7 +146,10 @@ mod tests {
             rate.observe(rate.part_bytes(), Duration::from_micros(20), Duration::ZERO);
         }
         assert_eq!((rate.part_bytes(), rate.buffer_bytes()), (65_536, 65_536));
-        assert_eq!([true, false].map(|is_loopback| rate.effort(is_loopback)), [None, Some(Effort::Fast)]);
+        assert_eq!(
+            [true, false].map(|is_loopback| rate.effort(is_loopback)),
+            [None, Some(Effort::Fast)]
+        );
         assert_eq!(LinkRate::default().effort(true), Some(Effort::Small));
         // The short ends of messages do not look like a slow link.
         for _ in 0..40 {
@@ -146,6 +164,10 @@ mod tests {
         for _ in 0..40 {
             rate.observe(5000, Duration::from_millis(20), Duration::from_millis(50));
         }
-        assert!(rate.buffer_bytes() <= 11_000, "{} bytes at 250 kB/s", rate.buffer_bytes());
+        assert!(
+            rate.buffer_bytes() <= 11_000,
+            "{} bytes at 250 kB/s",
+            rate.buffer_bytes()
+        );
     }
 }

@@ -1,13 +1,13 @@
-//! Checks the messages of viewers: every accepted request must be safe to render, and every accepted subscription must
-//! keep its limits. The fuzz target `page` calls it.
+//! Checks the messages of viewers: every accepted request must be safe to render, and every
+//! accepted subscription must keep its limits. The fuzz target `page` calls it.
 
 use crate::clock::ServerClock;
 use crate::edit::{EditAction, EditRequest};
 use crate::pictures::view_request::{MAX_SIZE_PX, ViewRequest};
 use crate::session::negotiation::{CAPABILITIES, negotiate};
 use crate::session::protocol::{
-    BASE_PROTOCOL_VERSION, ClientHello, ClientMessage, EditMessage, MAX_RATE_HZ, PROTOCOL_VERSION, RenderMessage,
-    ShownMessage, SubscribeMessage,
+    BASE_PROTOCOL_VERSION, ClientHello, ClientMessage, EditMessage, MAX_RATE_HZ, PROTOCOL_VERSION,
+    RenderMessage, ShownMessage, SubscribeMessage,
 };
 use crate::topics::TOPICS;
 use crate::topics::subscriptions::{Subscriptions, fitted};
@@ -20,10 +20,13 @@ pub(crate) fn check_session(session: &str) {
         match serde_json::from_str(text) {
             Ok(ClientMessage::Hello(hello)) => check_hello(&hello),
             Ok(ClientMessage::Render(message)) => check_render(&message),
-            Ok(ClientMessage::Subscribe(message)) => check_subscription(&mut subscriptions, message),
+            Ok(ClientMessage::Subscribe(message)) => {
+                check_subscription(&mut subscriptions, message)
+            }
             Ok(ClientMessage::Shown(message)) => check_shown(&message),
             Ok(ClientMessage::Edit(message)) => check_edit(&message),
-            Ok(ClientMessage::Control(_) | ClientMessage::Ping(_) | ClientMessage::Goodbye(_)) | Err(_) => {}
+            Ok(ClientMessage::Control(_) | ClientMessage::Ping(_) | ClientMessage::Goodbye(_))
+            | Err(_) => {}
         }
     }
 }
@@ -33,20 +36,41 @@ fn check_hello(hello: &ClientHello) {
         Ok(agreement) => {
             assert!((BASE_PROTOCOL_VERSION..=PROTOCOL_VERSION).contains(&agreement.protocol));
             assert!(agreement.names.len() <= CAPABILITIES.len());
-            assert!(agreement.names.iter().all(|name| hello.capabilities.iter().any(|wanted| wanted == name)));
+            assert!(
+                agreement
+                    .names
+                    .iter()
+                    .all(|name| hello.capabilities.iter().any(|wanted| wanted == name))
+            );
         }
         Err(reason) => assert!(!reason.is_empty() && !reason.contains('\n')),
     }
 }
 
 fn check_render(message: &RenderMessage) {
-    let Ok(request) = ViewRequest::check(message) else { return };
+    let Ok(request) = ViewRequest::check(message) else {
+        return;
+    };
     for stage in 0..request.stages.len() {
-        let RenderRequest { size_px, projection, world_from_camera, .. } = request.stage_request(stage);
+        let RenderRequest {
+            size_px,
+            projection,
+            world_from_camera,
+            ..
+        } = request.stage_request(stage);
         assert!(size_px.iter().all(|n| (1..=MAX_SIZE_PX).contains(n)));
         assert!(kinematics::transform::is_finite(&world_from_camera));
-        if let Projection::Pinhole { focal_px, principal_px } = projection {
-            assert!(focal_px.iter().chain(&principal_px).all(|number| number.is_finite()));
+        if let Projection::Pinhole {
+            focal_px,
+            principal_px,
+        } = projection
+        {
+            assert!(
+                focal_px
+                    .iter()
+                    .chain(&principal_px)
+                    .all(|number| number.is_finite())
+            );
         }
     }
 }
@@ -56,15 +80,31 @@ fn check_shown(message: &ShownMessage) {
     if let Some(shown_at) = clock.instant(message.shown_millis) {
         assert!(shown_at >= clock.instant(0.0).expect("the start"));
         let error = (clock.millis(shown_at) - message.shown_millis).abs();
-        assert!(error <= 1e-3 + 1e-12 * message.shown_millis, "{} ms became {shown_at:?}", message.shown_millis);
+        assert!(
+            error <= 1e-3 + 1e-12 * message.shown_millis,
+            "{} ms became {shown_at:?}",
+            message.shown_millis
+        );
     }
 }
 
 fn check_edit(message: &EditMessage) {
-    let Ok(request) = EditRequest::check(1, message) else { return };
-    if let EditAction::Erase(Aabb { world_from_box, min_m, max_m }) = request.action() {
+    let Ok(request) = EditRequest::check(1, message) else {
+        return;
+    };
+    if let EditAction::Erase(Aabb {
+        world_from_box,
+        min_m,
+        max_m,
+    }) = request.action()
+    {
         assert!(kinematics::transform::is_finite(world_from_box));
-        assert!(min_m.iter().zip(max_m).all(|(min, max)| min < max && min.is_finite() && max.is_finite()));
+        assert!(
+            min_m
+                .iter()
+                .zip(max_m)
+                .all(|(min, max)| min < max && min.is_finite() && max.is_finite())
+        );
     }
 }
 
@@ -72,18 +112,34 @@ fn check_subscription(subscriptions: &mut Subscriptions, message: SubscribeMessa
     let camera = message.camera.clone().unwrap_or_default();
     let before = subscriptions.clone();
     if subscriptions.apply(message).is_err() {
-        assert!(*subscriptions == before, "a rejected message changes nothing");
+        assert!(
+            *subscriptions == before,
+            "a rejected message changes nothing"
+        );
         return;
     }
     let images = subscriptions.images_of(&camera);
     let chunks = subscriptions.model_chunks.as_ref();
-    let of_topics = TOPICS.iter().filter_map(|row| subscriptions.period(row.name));
-    let periods = of_topics.chain(images.period).chain(chunks.map(|chunks| chunks.period));
-    assert!(chunks.is_none_or(|chunks| chunks.method.len() <= 256 && chunks.max_bytes_per_sec >= 1e4));
-    assert!(periods.into_iter().all(|period| period.as_secs_f64() >= 0.999 / MAX_RATE_HZ));
+    let of_topics = TOPICS
+        .iter()
+        .filter_map(|row| subscriptions.period(row.name));
+    let periods = of_topics
+        .chain(images.period)
+        .chain(chunks.map(|chunks| chunks.period));
+    assert!(
+        chunks.is_none_or(|chunks| chunks.method.len() <= 256 && chunks.max_bytes_per_sec >= 1e4)
+    );
+    assert!(
+        periods
+            .into_iter()
+            .all(|period| period.as_secs_f64() >= 0.999 / MAX_RATE_HZ)
+    );
     for size_px in [[640, 480], [1, 4000], [4096, 1]] {
         let fitted = fitted(size_px, images.max_px);
-        assert!((0..2).all(|axis| (1..=size_px[axis]).contains(&fitted[axis])), "{size_px:?} became {fitted:?}");
+        assert!(
+            (0..2).all(|axis| (1..=size_px[axis]).contains(&fitted[axis])),
+            "{size_px:?} became {fitted:?}"
+        );
     }
 }
 

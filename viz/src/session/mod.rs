@@ -1,4 +1,5 @@
-//! The session of one client, from hello to goodbye: a reader and a writer that never wait for each other.
+//! The session of one client, from hello to goodbye: a reader and a writer that never wait for each
+//! other.
 
 pub(crate) mod link_rate;
 #[cfg(any(test, fuzzing))]
@@ -31,18 +32,28 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 use tokio::sync::{mpsc, watch};
 
-/// Maximum number of replies that wait to be sent. Further messages of the client are read only when there is room.
+/// Maximum number of replies that wait to be sent. Further messages of the client are read only
+/// when there is room.
 const MAX_REPLIES: usize = 64;
 /// A client that leaves [`MAX_REPLIES`] replies unread for this long is disconnected.
 const MAX_REPLY_WAIT: Duration = Duration::from_secs(2);
-/// After a goodbye, the connection stays open until the client closes it, but at most for this time. If it were closed while
-/// something from the client is unread, the kernel would reset it and discard what was not sent yet, including the goodbye.
+/// After a goodbye, the connection stays open until the client closes it, but at most for this
+/// time. If it were closed while something from the client is unread, the kernel would reset it and
+/// discard what was not sent yet, including the goodbye.
 const LINGER: Duration = Duration::from_millis(300);
 
 /// Serves one client until either side disconnects.
-pub(crate) async fn serve(socket: WebSocket, connection: Arc<Connection>, role: Role, server_context: ServerContext) {
+pub(crate) async fn serve(
+    socket: WebSocket,
+    connection: Arc<Connection>,
+    role: Role,
+    server_context: ServerContext,
+) {
     let (client, wake) = server_context.hub.join(role);
-    let client_guard = ClientGuard { hub: &server_context.hub, client };
+    let client_guard = ClientGuard {
+        hub: &server_context.hub,
+        client,
+    };
     let log = &server_context.log;
     log.line(format_args!("client {client} connected as {}", role.name()));
     let (sink, stream) = socket.split();
@@ -120,9 +131,12 @@ impl Reader<'_> {
                     continue;
                 }
                 Message::Ping(_) => continue,
-                Message::Text(text) => self
-                    .answer(&text)
-                    .unwrap_or_else(|error| Some(Reply::Error { id: id_of(&text), message: error.to_string() })),
+                Message::Text(text) => self.answer(&text).unwrap_or_else(|error| {
+                    Some(Reply::Error {
+                        id: id_of(&text),
+                        message: error.to_string(),
+                    })
+                }),
                 Message::Binary(_) => Some(Reply::Error {
                     id: None,
                     message: "binary messages are not supported, send JSON as text".to_owned(),
@@ -147,7 +161,8 @@ impl Reader<'_> {
         }
     }
 
-    /// Reads until the client disconnects, and ignores what it sends: the writer ends the session, or has ended it.
+    /// Reads until the client disconnects, and ignores what it sends: the writer ends the session,
+    /// or has ended it.
     async fn discard(&mut self) {
         while let Some(Ok(message)) = self.stream.next().await {
             if matches!(message, Message::Close(_)) {
@@ -176,7 +191,8 @@ impl Reader<'_> {
             ClientMessage::Render(message) => {
                 let view_request = ViewRequest::check(&message)?;
                 if let Some(viewpoint) = Viewpoint::of(&view_request) {
-                    self.demand.send_modify(|demand| demand.viewpoint = Some(viewpoint));
+                    self.demand
+                        .send_modify(|demand| demand.viewpoint = Some(viewpoint));
                 }
                 if !self.hub.view_request(self.client, view_request) {
                     return Err(InvalidRequest::Views { max: MAX_VIEWS });
@@ -188,26 +204,44 @@ impl Reader<'_> {
                 None
             }
             ClientMessage::Control(ControlMessage { action }) => {
-                self.log.line(format_args!("client {}: {action:?}", self.client));
+                self.log
+                    .line(format_args!("client {}: {action:?}", self.client));
                 self.hub.control(action);
                 None
             }
-            ClientMessage::Shown(ShownMessage { id, view, shown_millis }) => {
+            ClientMessage::Shown(ShownMessage {
+                id,
+                view,
+                shown_millis,
+            }) => {
                 let shown_at = self.clock.instant(shown_millis);
                 let shown_at = shown_at.ok_or(InvalidRequest::ShownTime { got: shown_millis })?;
-                self.hub.picture_shown(self.client, id, view.as_deref().unwrap_or_default(), shown_at);
+                self.hub.picture_shown(
+                    self.client,
+                    id,
+                    view.as_deref().unwrap_or_default(),
+                    shown_at,
+                );
                 None
             }
             ClientMessage::Edit(message) => {
                 let request = EditRequest::check(self.client, &message)?;
-                self.log.line(format_args!("client {}: edit: {}", self.client, request.action()));
+                self.log.line(format_args!(
+                    "client {}: edit: {}",
+                    self.client,
+                    request.action()
+                ));
                 if !self.hub.edit(request) {
-                    return Err(InvalidRequest::Edits { max: MAX_WAITING_EDITS });
+                    return Err(InvalidRequest::Edits {
+                        max: MAX_WAITING_EDITS,
+                    });
                 }
                 None
             }
             ClientMessage::Ping(ping) => Some(Reply::Pong { t: ping.t }),
-            ClientMessage::Goodbye(_) => Some(Reply::Goodbye { reason: "the client disconnected".to_owned() }),
+            ClientMessage::Goodbye(_) => Some(Reply::Goodbye {
+                reason: "the client disconnected".to_owned(),
+            }),
         })
     }
 
@@ -220,7 +254,8 @@ impl Reader<'_> {
 
     fn change_demand(&self, change: impl FnOnce(&mut Demand)) {
         self.demand.send_modify(change);
-        self.hub.set_demand(self.client, self.demand.borrow().clone());
+        self.hub
+            .set_demand(self.client, self.demand.borrow().clone());
     }
 }
 
@@ -230,5 +265,7 @@ fn id_of(text: &str) -> Option<u64> {
     struct Numbered {
         id: u64,
     }
-    serde_json::from_str::<Numbered>(text).ok().map(|message| message.id)
+    serde_json::from_str::<Numbered>(text)
+        .ok()
+        .map(|message| message.id)
 }

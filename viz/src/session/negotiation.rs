@@ -35,7 +35,8 @@ pub(crate) struct Negotiated {
     pub(crate) has_heartbeat: bool,
 }
 
-/// The reply to a client's hello: the version, the capabilities by name, and those that change the server's behavior.
+/// The reply to a client's hello: the version, the capabilities by name, and those that change the
+/// server's behavior.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct Agreement {
     /// Protocol version of the connection.
@@ -46,36 +47,56 @@ pub(crate) struct Agreement {
     pub(crate) negotiated: Negotiated,
 }
 
-/// Agrees on the newest version that both sides support. The error is the reason why there is none, in one sentence.
+/// Agrees on the newest version that both sides support. The error is the reason why there is none,
+/// in one sentence.
 pub(crate) fn negotiate(hello: &ClientHello) -> Result<Agreement, String> {
     let [oldest, newest] = match (hello.protocols, hello.protocol) {
         (Some([oldest, newest]), _) if oldest <= newest => [oldest, newest],
         (None, Some(only)) => [only, only],
         (Some([oldest, newest]), _) => {
-            return Err(format!("protocols is [{oldest}, {newest}], expected the oldest version, then the newest"));
+            return Err(format!(
+                "protocols is [{oldest}, {newest}], expected the oldest version, then the newest"
+            ));
         }
         (None, None) => {
-            return Err("hello needs protocol or protocols, the versions that the client supports".to_owned());
+            return Err(
+                "hello needs protocol or protocols, the versions that the client supports"
+                    .to_owned(),
+            );
         }
     };
     let protocol = newest.min(PROTOCOL_VERSION);
     if protocol < oldest.max(BASE_PROTOCOL_VERSION) {
-        let client = if oldest == newest { oldest.to_string() } else { format!("{oldest} to {newest}") };
-        let outdated = if newest < BASE_PROTOCOL_VERSION { "update the client" } else { "update fieldrig" };
+        let client = if oldest == newest {
+            oldest.to_string()
+        } else {
+            format!("{oldest} to {newest}")
+        };
+        let outdated = if newest < BASE_PROTOCOL_VERSION {
+            "update the client"
+        } else {
+            "update fieldrig"
+        };
         return Err(format!(
             "the client supports protocol version {client}, this server {BASE_PROTOCOL_VERSION} to {PROTOCOL_VERSION}: \
              {outdated}"
         ));
     }
-    let names: Vec<_> =
-        CAPABILITIES.into_iter().filter(|name| hello.capabilities.iter().any(|wanted| wanted == name)).collect();
+    let names: Vec<_> = CAPABILITIES
+        .into_iter()
+        .filter(|name| hello.capabilities.iter().any(|wanted| wanted == name))
+        .collect();
     let has = |name| names.contains(&name);
     let negotiated = Negotiated {
         has_keyframe_changes: has(KEYFRAME_CHANGES),
         has_parts: has(PARTS),
         has_heartbeat: has(HEARTBEAT),
     };
-    Ok(Agreement { protocol, names, negotiated })
+    Ok(Agreement {
+        protocol,
+        names,
+        negotiated,
+    })
 }
 
 #[cfg(test)]
@@ -92,12 +113,25 @@ mod tests {
     fn newest_common_version_is_used() {
         let future = PROTOCOL_VERSION + 3;
         for (message, expected) in [
-            (json!({"protocol": BASE_PROTOCOL_VERSION}), BASE_PROTOCOL_VERSION),
+            (
+                json!({"protocol": BASE_PROTOCOL_VERSION}),
+                BASE_PROTOCOL_VERSION,
+            ),
             (json!({"protocol": PROTOCOL_VERSION}), PROTOCOL_VERSION),
-            (json!({"protocols": [1, BASE_PROTOCOL_VERSION]}), BASE_PROTOCOL_VERSION),
-            (json!({"protocols": [BASE_PROTOCOL_VERSION, future], "new_field": [1]}), PROTOCOL_VERSION),
+            (
+                json!({"protocols": [1, BASE_PROTOCOL_VERSION]}),
+                BASE_PROTOCOL_VERSION,
+            ),
+            (
+                json!({"protocols": [BASE_PROTOCOL_VERSION, future], "new_field": [1]}),
+                PROTOCOL_VERSION,
+            ),
         ] {
-            assert_eq!(negotiate(&hello(message.clone())).expect("agreed").protocol, expected, "{message}");
+            assert_eq!(
+                negotiate(&hello(message.clone())).expect("agreed").protocol,
+                expected,
+                "{message}"
+            );
         }
     }
 
@@ -106,7 +140,10 @@ mod tests {
         let future = PROTOCOL_VERSION + 1;
         for (message, named) in [
             (json!({"protocol": 1}), "update the client"),
-            (json!({"protocols": [future, future + 4]}), "update fieldrig"),
+            (
+                json!({"protocols": [future, future + 4]}),
+                "update fieldrig",
+            ),
             (json!({"protocols": [4, 3]}), "oldest"),
             (json!({}), "hello needs protocol"),
         ] {
@@ -117,9 +154,16 @@ mod tests {
 
     #[test]
     fn unknown_capabilities_are_ignored() {
-        let message = json!({"protocols": [3, 9], "capabilities": ["parts", "telepathy", "parts", "views"]});
+        let message =
+            json!({"protocols": [3, 9], "capabilities": ["parts", "telepathy", "parts", "views"]});
         let agreement = negotiate(&hello(message)).expect("agreed");
         assert_eq!(agreement.names, ["views", "parts"]);
-        assert_eq!(agreement.negotiated, Negotiated { has_parts: true, ..Negotiated::default() });
+        assert_eq!(
+            agreement.negotiated,
+            Negotiated {
+                has_parts: true,
+                ..Negotiated::default()
+            }
+        );
     }
 }

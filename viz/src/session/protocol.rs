@@ -6,8 +6,8 @@ use serde::{Deserialize, Serialize};
 /// Newest protocol version of the server.
 pub const PROTOCOL_VERSION: u32 = 4;
 
-/// Protocol version of a connection whose client has not negotiated another one. It is also the oldest version that
-/// the server supports.
+/// Protocol version of a connection whose client has not negotiated another one. It is also the
+/// oldest version that the server supports.
 pub const BASE_PROTOCOL_VERSION: u32 = 3;
 
 /// Maximum length of a client's text message, bytes.
@@ -42,7 +42,8 @@ pub(crate) enum ClientMessage {
 }
 
 impl ClientMessage {
-    /// The role that a client needs to send this message. Whatever changes the run requires an operator.
+    /// The role that a client needs to send this message. Whatever changes the run requires an
+    /// operator.
     pub(crate) fn required_role(&self) -> Role {
         match self {
             Self::Hello(_)

@@ -27,15 +27,27 @@ pub(crate) enum ServerMessage<'a> {
         clock_millis: f64,
     },
     /// Reply to the client's hello: what the connection uses from now on.
-    Welcome { protocol: u32, capabilities: Vec<&'static str> },
+    Welcome {
+        protocol: u32,
+        capabilities: Vec<&'static str>,
+    },
     /// Status of the run.
     Status(&'a Status),
     /// Scene extent and initial view.
-    Scene { center_m: [f64; 3], radius_m: f64, world_from_camera: [f64; 16] },
+    Scene {
+        center_m: [f64; 3],
+        radius_m: f64,
+        world_from_camera: [f64; 16],
+    },
     /// Poses of all stored keyframes.
     Keyframes { keyframes: Vec<KeyframeMessage<'a>> },
     /// Keyframes that were added, changed or removed since a version of the list.
-    KeyframeChanges { from_version: u64, version: u64, keyframes: Vec<NumberedKeyframe<'a>>, removed: Vec<u64> },
+    KeyframeChanges {
+        from_version: u64,
+        version: u64,
+        keyframes: Vec<NumberedKeyframe<'a>>,
+        removed: Vec<u64>,
+    },
     /// Links, joints and shapes of the robot.
     Robot(&'a RobotMessage<'a>),
     /// Joint positions and base pose of the robot.
@@ -93,7 +105,11 @@ pub(crate) struct NumberedKeyframe<'a> {
 impl<'a> NumberedKeyframe<'a> {
     /// A keyframe with its number.
     pub(crate) fn new(id: u64, keyframe: &'a KeyframePose) -> Self {
-        Self { id, stamp_nanos: keyframe.stamp.0, keyframe: keyframe.into() }
+        Self {
+            id,
+            stamp_nanos: keyframe.stamp.0,
+            keyframe: keyframe.into(),
+        }
     }
 }
 
@@ -274,7 +290,8 @@ impl ServerMessage<'_> {
 
     /// The message as JSON.
     pub(crate) fn to_json(&self) -> String {
-        serde_json::to_string(self).expect("these types hold only strings, numbers and maps with string keys")
+        serde_json::to_string(self)
+            .expect("these types hold only strings, numbers and maps with string keys")
     }
 }
 

@@ -1,8 +1,8 @@
 //! Sends data to one client, the most urgent first.
 //!
-//! Long messages are sent in parts if the client can join them, so that urgent messages wait for at most one part. The
-//! parts and the kernel's buffer are so small that their transfer takes less than 100 ms. Everything else waits here,
-//! where newer data replaces older data.
+//! Long messages are sent in parts if the client can join them, so that urgent messages wait for at
+//! most one part. The parts and the kernel's buffer are so small that their transfer takes less
+//! than 100 ms. Everything else waits here, where newer data replaces older data.
 
 use crate::hub::Demand;
 use crate::pictures::compact_depth::Effort;
@@ -35,10 +35,11 @@ use tokio::time::MissedTickBehavior;
 const HEARTBEAT_PERIOD: Duration = Duration::from_millis(250);
 /// Period of WebSocket pings. The next one is sent only if the last one was answered.
 const PING_PERIOD: Duration = Duration::from_secs(1);
-/// Pictures take precedence over live images and keyframe lists, but delay them by at most this time.
+/// Pictures take precedence over live images and keyframe lists, but delay them by at most this
+/// time.
 const MAX_UPDATE_DELAY: Duration = Duration::from_millis(500);
-/// A client with the capability `heartbeat` that has been silent for longer gets no pictures, images and robot states:
-/// they would be outdated when the connection works again.
+/// A client with the capability `heartbeat` that has been silent for longer gets no pictures,
+/// images and robot states: they would be outdated when the connection works again.
 const MAX_SILENCE: Duration = Duration::from_secs(2);
 
 /// A message that the reader asks the writer to send.
@@ -86,7 +87,8 @@ type EncodingResult = Result<Result<PackedPicture, PackError>, JoinError>;
 impl Writer<'_> {
     /// Sends until the connection fails or a goodbye is sent.
     ///
-    /// Order: replies, robot states, heartbeats, short updates, pictures, live images and keyframes in turn.
+    /// Order: replies, robot states, heartbeats, short updates, pictures, live images and keyframes
+    /// in turn.
     pub(crate) async fn run(
         mut self,
         wake: &Notify,
@@ -95,7 +97,11 @@ impl Writer<'_> {
     ) -> SessionFlow {
         let mut stopped = self.server_context.stopped.clone();
         let mut published = self.server_context.publisher.changed();
-        let mut robot_state = self.server_context.hub.latest::<Option<Arc<RobotState>>>().subscribe();
+        let mut robot_state = self
+            .server_context
+            .hub
+            .latest::<Option<Arc<RobotState>>>()
+            .subscribe();
         robot_state.mark_changed();
         let mut robot_state_sent: Option<Instant> = None;
         let mut updates = ClientUpdates::new(&self.server_context.topics);
@@ -106,7 +112,12 @@ impl Writer<'_> {
         let mut n_transfers = 0;
         let mut start_transfer = |bytes: Bytes, is_picture| {
             n_transfers += 1;
-            Some(Transfer { number: n_transfers, bytes, n_sent: 0, is_picture })
+            Some(Transfer {
+                number: n_transfers,
+                bytes,
+                n_sent: 0,
+                is_picture,
+            })
         };
         let mut heartbeat = tokio::time::interval(HEARTBEAT_PERIOD);
         let mut ping = tokio::time::interval(PING_PERIOD);
@@ -114,14 +125,18 @@ impl Writer<'_> {
         ping.set_missed_tick_behavior(MissedTickBehavior::Delay);
         self.send_hello().await?;
         loop {
-            let is_heard = !self.negotiated.has_heartbeat || self.connection.silence() <= MAX_SILENCE;
+            let is_heard =
+                !self.negotiated.has_heartbeat || self.connection.silence() <= MAX_SILENCE;
             if encoding.is_none()
                 && is_heard
                 && let Some(outgoing) = self.server_context.hub.collect(self.client)
             {
                 match outgoing {
                     Outgoing::Picture(drawn) => {
-                        encoding = Some(encode(drawn, self.link.effort(self.connection.is_loopback())))
+                        encoding = Some(encode(
+                            drawn,
+                            self.link.effort(self.connection.is_loopback()),
+                        ))
                     }
                     Outgoing::Failed { id, view, reason } => {
                         let sent = self.send_error(Some(id), &view, &reason).await;
@@ -138,7 +153,10 @@ impl Writer<'_> {
             let (subscriptions, settles_at) = {
                 let demand = demand.borrow_and_update();
                 updates.viewpoint = demand.viewpoint;
-                (Arc::clone(&demand.subscriptions), demand.settles_at(Instant::now()))
+                (
+                    Arc::clone(&demand.subscriptions),
+                    demand.settles_at(Instant::now()),
+                )
             };
             let mut update_due = settles_at;
             let allows_long = is_heard
@@ -151,7 +169,9 @@ impl Writer<'_> {
                 match updates.next(&subscriptions, has_changes, Instant::now(), allows_long) {
                     Next::Short(message) => waiting_update = Some((message, false)),
                     Next::Long(message) => waiting_update = Some((message, true)),
-                    Next::WaitUntil(time) => update_due = Some(update_due.map_or(time, |due| due.min(time))),
+                    Next::WaitUntil(time) => {
+                        update_due = Some(update_due.map_or(time, |due| due.min(time)))
+                    }
                     Next::Wait => {}
                 }
             }
@@ -159,8 +179,16 @@ impl Writer<'_> {
             // A waiting short message may be the robot, which comes before its states.
             let state_period = subscriptions.period(Description::NAME);
             let state_due = state_period
-                .filter(|_| is_heard && updates.has_sent(Description::NAME) && is_waiting_long != Some(false))
-                .map(|period| robot_state_sent.and_then(|sent| sent.checked_add(period)).unwrap_or_else(Instant::now));
+                .filter(|_| {
+                    is_heard
+                        && updates.has_sent(Description::NAME)
+                        && is_waiting_long != Some(false)
+                })
+                .map(|period| {
+                    robot_state_sent
+                        .and_then(|sent| sent.checked_add(period))
+                        .unwrap_or_else(Instant::now)
+                });
             tokio::select! {
                 biased;
                 _ = stopped.changed() => return self.send_goodbye_when_stopped().await,
@@ -232,9 +260,22 @@ impl Writer<'_> {
         let message = packed.message(sent_at, self.server_context.clock);
         let request = &packed.job.view_request;
         // Depth alone shows no keyframes.
-        if let Some(trained_on) = packed.trained_on.filter(|_| packed.header.last && request.color) {
-            let (id, view, method) = (request.id, Arc::clone(&request.view), request.method.clone());
-            let picture = SentPicture { id, view, method, n_keyframes: trained_on.n, sent_at };
+        if let Some(trained_on) = packed
+            .trained_on
+            .filter(|_| packed.header.last && request.color)
+        {
+            let (id, view, method) = (
+                request.id,
+                Arc::clone(&request.view),
+                request.method.clone(),
+            );
+            let picture = SentPicture {
+                id,
+                view,
+                method,
+                n_keyframes: trained_on.n,
+                sent_at,
+            };
             self.server_context.hub.picture_sent(self.client, picture);
         }
         message
@@ -257,14 +298,23 @@ impl Writer<'_> {
 
     async fn reply(&mut self, reply: Reply) -> SessionFlow {
         match reply {
-            Reply::Welcome(Agreement { protocol, names, negotiated }) => {
+            Reply::Welcome(Agreement {
+                protocol,
+                names,
+                negotiated,
+            }) => {
                 self.negotiated = negotiated;
-                self.send_message(&ServerMessage::Welcome { protocol, capabilities: names }).await
+                self.send_message(&ServerMessage::Welcome {
+                    protocol,
+                    capabilities: names,
+                })
+                .await
             }
             Reply::Error { id, message } => self.send_error(id, "", &message).await,
             Reply::Pong { t } => {
                 let clock_millis = self.server_context.clock.now_millis();
-                self.send_message(&ServerMessage::Pong { t, clock_millis }).await
+                self.send_message(&ServerMessage::Pong { t, clock_millis })
+                    .await
             }
             Reply::Goodbye { reason } => self.send_goodbye(&reason).await,
         }
@@ -273,20 +323,32 @@ impl Writer<'_> {
     /// Sends the next part, or the whole message if the client cannot join parts.
     async fn send_part(&mut self, transfer: &mut Transfer) -> SessionFlow {
         let n_bytes = transfer.bytes.len();
-        let n_part = if self.negotiated.has_parts { self.link.part_bytes() } else { usize::MAX };
+        let n_part = if self.negotiated.has_parts {
+            self.link.part_bytes()
+        } else {
+            usize::MAX
+        };
         let begin = transfer.n_sent;
         let end = n_bytes.min(begin.saturating_add(n_part));
         let message = if begin == 0 && end == n_bytes {
             Message::Binary(transfer.bytes.clone())
         } else {
-            let header = PartHeader { message: transfer.number, offset: begin, bytes: n_bytes };
-            Message::binary(frame(&BinaryHeader::Part(header), &[&transfer.bytes[begin..end]]))
+            let header = PartHeader {
+                message: transfer.number,
+                offset: begin,
+                bytes: n_bytes,
+            };
+            Message::binary(frame(
+                &BinaryHeader::Part(header),
+                &[&transfer.bytes[begin..end]],
+            ))
         };
         let began = Instant::now();
         let pause = began - self.part_sent;
         self.send(message).await?;
         self.part_sent = Instant::now();
-        self.link.observe(end - begin, self.part_sent - began, pause);
+        self.link
+            .observe(end - begin, self.part_sent - began, pause);
         self.connection.set_send_buffer(self.link.buffer_bytes());
         transfer.n_sent = end;
         ControlFlow::Continue(())
@@ -303,11 +365,13 @@ impl Writer<'_> {
 
     async fn send_error(&mut self, id: Option<u64>, view: &str, message: &str) -> SessionFlow {
         let view = (!view.is_empty()).then_some(view);
-        self.send_message(&ServerMessage::Error { id, view, message }).await
+        self.send_message(&ServerMessage::Error { id, view, message })
+            .await
     }
 
     async fn send_goodbye(&mut self, reason: &str) -> SessionFlow {
-        self.send_message(&ServerMessage::Goodbye { reason }).await?;
+        self.send_message(&ServerMessage::Goodbye { reason })
+            .await?;
         self.send(Message::Close(None)).await?;
         ControlFlow::Break(())
     }
@@ -342,11 +406,15 @@ async fn finished(encoding: &mut Option<EncodingTask>) -> EncodingResult {
     }
 }
 
-/// The time at which something counts as sent: when it was due, so that inaccurate timers do not lower its rate, or now
-/// if that is more than a period ago.
+/// The time at which something counts as sent: when it was due, so that inaccurate timers do not
+/// lower its rate, or now if that is more than a period ago.
 fn on_schedule((due, period): (Instant, Duration)) -> Instant {
     let now = Instant::now();
-    if now.saturating_duration_since(due) < period { due } else { now }
+    if now.saturating_duration_since(due) < period {
+        due
+    } else {
+        now
+    }
 }
 
 /// Waits until this time; forever without one.

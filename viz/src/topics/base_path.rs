@@ -28,7 +28,13 @@ impl ItemTopic for BasePathTopic {
     type Source = BasePath;
 
     fn encode(&mut self, path: &BasePath, _: ServerClock) -> Vec<(Arc<str>, Message)> {
-        vec![("".into(), ServerMessage::BasePath { points_m: path.rounded() }.to_message())]
+        vec![(
+            "".into(),
+            ServerMessage::BasePath {
+                points_m: path.rounded(),
+            }
+            .to_message(),
+        )]
     }
 }
 
@@ -43,7 +49,11 @@ pub(crate) struct BasePath {
 
 impl Default for BasePath {
     fn default() -> Self {
-        Self { points_m: Vec::new(), spacing_m: INITIAL_SPACING_M, extended: None }
+        Self {
+            points_m: Vec::new(),
+            spacing_m: INITIAL_SPACING_M,
+            extended: None,
+        }
     }
 }
 
@@ -52,7 +62,11 @@ impl BasePath {
     pub(crate) fn push(&mut self, position_m: [f64; 3]) -> bool {
         self.extended = Some(Instant::now());
         let distance = |last: &[f64; 3]| (Vector3::from(*last) - Vector3::from(position_m)).norm();
-        if self.points_m.last().is_some_and(|last| distance(last) < self.spacing_m) {
+        if self
+            .points_m
+            .last()
+            .is_some_and(|last| distance(last) < self.spacing_m)
+        {
             return false;
         }
         if self.points_m.len() == MAX_POINTS {
@@ -69,13 +83,17 @@ impl BasePath {
 
     /// Whether the next position is due.
     pub(crate) fn is_due(&self) -> bool {
-        self.extended.is_none_or(|at| at.elapsed() >= POSITION_PERIOD)
+        self.extended
+            .is_none_or(|at| at.elapsed() >= POSITION_PERIOD)
     }
 
     /// The path, rounded to millimeters, which shortens the message.
     pub(crate) fn rounded(&self) -> Vec<[f64; 3]> {
         let rounded = |value: f64| (value * 1e3).round() / 1e3;
-        self.points_m.iter().map(|point| point.map(rounded)).collect()
+        self.points_m
+            .iter()
+            .map(|point| point.map(rounded))
+            .collect()
     }
 }
 
@@ -91,14 +109,22 @@ mod tests {
             let angle = f64::from(step) * 1e-3;
             n_added += u32::from(path.push([10.0 * angle.cos(), 10.0 * angle.sin(), 0.0]));
         }
-        assert!(n_added > 600 && path.points_m.len() <= MAX_POINTS, "{n_added}, {}", path.points_m.len());
+        assert!(
+            n_added > 600 && path.points_m.len() <= MAX_POINTS,
+            "{n_added}, {}",
+            path.points_m.len()
+        );
         assert_eq!(path.rounded()[0], [10.0, 0.0, 0.0]);
         let largest_gap = path.points_m.windows(2).map(|pair| {
             let between = nalgebra::Vector3::from(pair[1]) - nalgebra::Vector3::from(pair[0]);
             between.norm()
         });
         let largest_gap = largest_gap.fold(0.0, f64::max);
-        assert!(largest_gap < 3.0 * path.spacing_m, "{largest_gap} with a spacing of {}", path.spacing_m);
+        assert!(
+            largest_gap < 3.0 * path.spacing_m,
+            "{largest_gap} with a spacing of {}",
+            path.spacing_m
+        );
     }
 
     #[test]

@@ -1,5 +1,6 @@
-//! Decides which chunk of a model a client receives next: first all chunks coarsely, then all in full, then the chunks
-//! that have changed most, within a budget. While the client's copy is incomplete, chunks in its view come first.
+//! Decides which chunk of a model a client receives next: first all chunks coarsely, then all in
+//! full, then the chunks that have changed most, within a budget. While the client's copy is
+//! incomplete, chunks in its view come first.
 
 use crate::pictures::viewpoint::Viewpoint;
 use crate::pose::row_major;
@@ -57,7 +58,10 @@ impl ChunkSender {
         now: Instant,
     ) -> NextChunk {
         if subscription.number != self.n_subscriptions {
-            *self = Self { n_subscriptions: subscription.number, ..Self::default() };
+            *self = Self {
+                n_subscriptions: subscription.number,
+                ..Self::default()
+            };
         }
         self.refill(subscription.max_bytes_per_sec, now);
         let unsent = |chunk: &&Arc<VersionedChunk>| !self.sent.contains_key(&chunk.chunk.id);
@@ -67,22 +71,36 @@ impl ChunkSender {
         }
         // Removed chunks were replaced by others, which the client has by now.
         if self.sent.keys().any(|id| !list.chunks.contains_key(id)) {
-            let (kept, removed): (BTreeMap<_, _>, BTreeMap<_, _>) =
-                std::mem::take(&mut self.sent).into_iter().partition(|(id, _)| list.chunks.contains_key(id));
+            let (kept, removed): (BTreeMap<_, _>, BTreeMap<_, _>) = std::mem::take(&mut self.sent)
+                .into_iter()
+                .partition(|(id, _)| list.chunks.contains_key(id));
             self.sent = kept;
             let ids = removed.into_keys().collect();
-            let message = ServerMessage::ModelChunksRemoved { method: &subscription.method, ids };
+            let message = ServerMessage::ModelChunksRemoved {
+                method: &subscription.method,
+                ids,
+            };
             return NextChunk::Send(message.to_message());
         }
-        let is_coarse = |chunk: &&Arc<VersionedChunk>| self.sent.get(&chunk.chunk.id).is_some_and(|sent| !sent.is_fine);
+        let is_coarse = |chunk: &&Arc<VersionedChunk>| {
+            self.sent
+                .get(&chunk.chunk.id)
+                .is_some_and(|sent| !sent.is_fine)
+        };
         if let Some(chunk) = first_needed(list, viewpoint, is_coarse) {
             return self.send(list, &chunk, true, subscription);
         }
         let missed = |chunk: &VersionedChunk| {
-            chunk.total_change - self.sent.get(&chunk.chunk.id).map_or(0.0, |sent| sent.total_change)
+            chunk.total_change
+                - self
+                    .sent
+                    .get(&chunk.chunk.id)
+                    .map_or(0.0, |sent| sent.total_change)
         };
         let is_outdated = |chunk: &&Arc<VersionedChunk>| {
-            self.sent.get(&chunk.chunk.id).is_some_and(|sent| sent.version != chunk.version)
+            self.sent
+                .get(&chunk.chunk.id)
+                .is_some_and(|sent| sent.version != chunk.version)
         };
         let Some(chunk) = most_changed(list.chunks.values().filter(is_outdated), missed) else {
             return NextChunk::Wait;
@@ -95,9 +113,12 @@ impl ChunkSender {
     }
 
     fn refill(&mut self, bytes_per_sec: f64, now: Instant) {
-        let secs = self.updated.map_or(0.0, |updated| (now - updated).as_secs_f64());
+        let secs = self
+            .updated
+            .map_or(0.0, |updated| (now - updated).as_secs_f64());
         self.updated = Some(now);
-        self.balance_bytes = (self.balance_bytes + secs * bytes_per_sec).min(MAX_SAVED_SECS * bytes_per_sec);
+        self.balance_bytes =
+            (self.balance_bytes + secs * bytes_per_sec).min(MAX_SAVED_SECS * bytes_per_sec);
     }
 
     fn send(
@@ -107,10 +128,29 @@ impl ChunkSender {
         is_fine: bool,
         subscription: &ChunkSubscription,
     ) -> NextChunk {
-        let VersionedChunk { version, total_change, chunk } = chunk;
-        self.sent.insert(chunk.id, SentChunk { version: *version, is_fine, total_change: *total_change });
-        let n_incomplete = list.chunks.keys().filter(|id| !self.sent.get(id).is_some_and(|sent| sent.is_fine)).count();
-        let data = if is_fine { &chunk.fine } else { chunk.coarse.as_ref().unwrap_or(&chunk.fine) };
+        let VersionedChunk {
+            version,
+            total_change,
+            chunk,
+        } = chunk;
+        self.sent.insert(
+            chunk.id,
+            SentChunk {
+                version: *version,
+                is_fine,
+                total_change: *total_change,
+            },
+        );
+        let n_incomplete = list
+            .chunks
+            .keys()
+            .filter(|id| !self.sent.get(id).is_some_and(|sent| sent.is_fine))
+            .count();
+        let data = if is_fine {
+            &chunk.fine
+        } else {
+            chunk.coarse.as_ref().unwrap_or(&chunk.fine)
+        };
         let header = ChunkHeader {
             method: &subscription.method,
             id: chunk.id,
@@ -134,10 +174,18 @@ fn first_needed(
     is_candidate: impl Fn(&&Arc<VersionedChunk>) -> bool,
 ) -> Option<Arc<VersionedChunk>> {
     let candidates = list.chunks.values().filter(is_candidate);
-    let Some(viewpoint) = viewpoint else { return most_changed(candidates, |chunk| chunk.total_change) };
-    let ranked = candidates.map(|chunk| (viewpoint.rank(&list.world_from_model, &chunk.chunk.fine.layout), chunk));
-    let first =
-        ranked.min_by(|((a_hidden, a_m), _), ((b_hidden, b_m), _)| a_hidden.cmp(b_hidden).then(a_m.total_cmp(b_m)));
+    let Some(viewpoint) = viewpoint else {
+        return most_changed(candidates, |chunk| chunk.total_change);
+    };
+    let ranked = candidates.map(|chunk| {
+        (
+            viewpoint.rank(&list.world_from_model, &chunk.chunk.fine.layout),
+            chunk,
+        )
+    });
+    let first = ranked.min_by(|((a_hidden, a_m), _), ((b_hidden, b_m), _)| {
+        a_hidden.cmp(b_hidden).then(a_m.total_cmp(b_m))
+    });
     first.map(|(_, chunk)| Arc::clone(chunk))
 }
 
@@ -145,7 +193,9 @@ fn most_changed<'a>(
     chunks: impl Iterator<Item = &'a Arc<VersionedChunk>>,
     change: impl Fn(&VersionedChunk) -> f64,
 ) -> Option<Arc<VersionedChunk>> {
-    chunks.max_by(|a, b| change(a).total_cmp(&change(b))).map(Arc::clone)
+    chunks
+        .max_by(|a, b| change(a).total_cmp(&change(b)))
+        .map(Arc::clone)
 }
 
 #[cfg(test)]
@@ -162,11 +212,20 @@ mod tests {
     use trainer::ModelChunks;
 
     fn subscription(number: u64) -> ChunkSubscription {
-        ChunkSubscription { number, method: "tsdf".into(), period: Duration::from_secs(1), max_bytes_per_sec: 1e5 }
+        ChunkSubscription {
+            number,
+            method: "tsdf".into(),
+            period: Duration::from_secs(1),
+            max_bytes_per_sec: 1e5,
+        }
     }
 
     fn changes(chunks: Vec<trainer::ModelChunk>, removed: Vec<u64>) -> ModelChunks {
-        ModelChunks { is_complete: false, chunks, removed }
+        ModelChunks {
+            is_complete: false,
+            chunks,
+            removed,
+        }
     }
 
     /// A client that receives everything at once.
@@ -180,28 +239,46 @@ mod tests {
 
     impl Receiver {
         fn new() -> Self {
-            Self { sender: ChunkSender::default(), number: 1, viewpoint: None, now: Instant::now(), n_bytes: 0 }
+            Self {
+                sender: ChunkSender::default(),
+                number: 1,
+                viewpoint: None,
+                now: Instant::now(),
+                n_bytes: 0,
+            }
         }
 
-        /// Receives until nothing more is sent now. Returns `id` or `id coarse` of chunks, and `- ids` of removed ones.
+        /// Receives until nothing more is sent now. Returns `id` or `id coarse` of chunks, and `-
+        /// ids` of removed ones.
         fn receive(&mut self, list: &ChunkList) -> Vec<String> {
             std::iter::from_fn(|| self.receive_one(list)).collect()
         }
 
         fn receive_one(&mut self, list: &ChunkList) -> Option<String> {
             let subscription = subscription(self.number);
-            let next = self.sender.next(list, &subscription, self.viewpoint.as_ref(), self.now);
-            let NextChunk::Send(message) = next else { return None };
+            let next = self
+                .sender
+                .next(list, &subscription, self.viewpoint.as_ref(), self.now);
+            let NextChunk::Send(message) = next else {
+                return None;
+            };
             Some(match message {
                 Message::Binary(bytes) => {
                     self.n_bytes += bytes.len();
-                    let n_header = u32::from_le_bytes(bytes[..4].try_into().expect("4 bytes")) as usize;
-                    let header: Value = serde_json::from_slice(&bytes[4..4 + n_header]).expect("JSON");
-                    let suffix = if header["is_coarse"] == true { " coarse" } else { "" };
+                    let n_header =
+                        u32::from_le_bytes(bytes[..4].try_into().expect("4 bytes")) as usize;
+                    let header: Value =
+                        serde_json::from_slice(&bytes[4..4 + n_header]).expect("JSON");
+                    let suffix = if header["is_coarse"] == true {
+                        " coarse"
+                    } else {
+                        ""
+                    };
                     format!("{}{suffix}", header["id"])
                 }
                 other => {
-                    let text: Value = serde_json::from_str(&other.into_text().expect("text")).expect("JSON");
+                    let text: Value =
+                        serde_json::from_str(&other.into_text().expect("text")).expect("JSON");
                     format!("- {}", text["ids"])
                 }
             })
@@ -212,12 +289,23 @@ mod tests {
     fn all_chunks_come_coarsely_first_then_in_full() {
         let mut list = ChunkList::default();
         let mut client = Receiver::new();
-        list.apply(complete(vec![chunk(1, 1.0, 100_000), chunk(2, 3.0, 100_000), chunk(3, 2.0, 100_000)]));
+        list.apply(complete(vec![
+            chunk(1, 1.0, 100_000),
+            chunk(2, 3.0, 100_000),
+            chunk(3, 2.0, 100_000),
+        ]));
         // The budget does not apply to chunks that the client does not have.
-        assert_eq!(client.receive(&list), ["2 coarse", "3 coarse", "1 coarse", "2", "3", "1"]);
+        assert_eq!(
+            client.receive(&list),
+            ["2 coarse", "3 coarse", "1 coarse", "2", "3", "1"]
+        );
         assert!(client.receive(&list).is_empty());
         client.number = 2;
-        assert_eq!(client.receive(&list).len(), 6, "a new subscription begins with all chunks");
+        assert_eq!(
+            client.receive(&list).len(),
+            6,
+            "a new subscription begins with all chunks"
+        );
     }
 
     #[test]
@@ -228,16 +316,31 @@ mod tests {
             chunk.fine.layout = cube([0.0, 0.0, z]);
             chunk
         };
-        list.apply(complete(vec![at(1, 1.0, 2.0), at(2, 9.0, 5.0), at(3, 5.0, -1.0), at(4, 7.0, -3.0)]));
-        let mut client = Receiver { viewpoint: Some(viewpoint(0.0, 0.0)), ..Receiver::new() };
+        list.apply(complete(vec![
+            at(1, 1.0, 2.0),
+            at(2, 9.0, 5.0),
+            at(3, 5.0, -1.0),
+            at(4, 7.0, -3.0),
+        ]));
+        let mut client = Receiver {
+            viewpoint: Some(viewpoint(0.0, 0.0)),
+            ..Receiver::new()
+        };
         let coarse: Vec<_> = (0..4).filter_map(|_| client.receive_one(&list)).collect();
         assert_eq!(coarse, ["1 coarse", "2 coarse", "3 coarse", "4 coarse"]);
         assert_eq!(client.receive_one(&list).as_deref(), Some("1"));
         client.viewpoint = Some(viewpoint(0.0, std::f64::consts::PI));
-        assert_eq!(client.receive(&list), ["3", "4", "2"], "the view has turned");
+        assert_eq!(
+            client.receive(&list),
+            ["3", "4", "2"],
+            "the view has turned"
+        );
         // A complete copy is updated where it has changed most.
         client.now += Duration::from_secs(10);
-        list.apply(changes(vec![at(1, 1.0, 2.0), at(2, 9.0, 5.0), at(3, 5.0, -1.0)], Vec::new()));
+        list.apply(changes(
+            vec![at(1, 1.0, 2.0), at(2, 9.0, 5.0), at(3, 5.0, -1.0)],
+            Vec::new(),
+        ));
         assert_eq!(client.receive(&list), ["2", "3", "1"]);
     }
 
@@ -247,8 +350,14 @@ mod tests {
         let mut client = Receiver::new();
         list.apply(complete(vec![chunk(1, 1.0, 1000), chunk(2, 1.0, 1000)]));
         client.receive(&list);
-        list.apply(changes(vec![chunk(10, 1.0, 1000), chunk(11, 2.0, 1000)], vec![1]));
-        assert_eq!(client.receive(&list), ["11 coarse", "10 coarse", "- [1]", "11", "10"]);
+        list.apply(changes(
+            vec![chunk(10, 1.0, 1000), chunk(11, 2.0, 1000)],
+            vec![1],
+        ));
+        assert_eq!(
+            client.receive(&list),
+            ["11 coarse", "10 coarse", "- [1]", "11", "10"]
+        );
         list.apply(complete(Vec::new()));
         assert_eq!(client.receive(&list), ["- [2,10,11]"]);
     }
@@ -257,7 +366,11 @@ mod tests {
     fn changes_stay_within_the_budget_and_the_largest_come_first() {
         let mut list = ChunkList::default();
         let mut client = Receiver::new();
-        let model = |change: fn(u64) -> f64| (0..50).map(|id| chunk(id, change(id), 20_000)).collect::<Vec<_>>();
+        let model = |change: fn(u64) -> f64| {
+            (0..50)
+                .map(|id| chunk(id, change(id), 20_000))
+                .collect::<Vec<_>>()
+        };
         list.apply(complete(model(|_| 1.0)));
         client.receive(&list);
         client.n_bytes = 0;
@@ -266,12 +379,22 @@ mod tests {
             client.now += Duration::from_millis(100);
             if step % 10 == 0 {
                 // Ten chunks change five times as much as the others.
-                list.apply(changes(model(|id| if id < 10 { 5.0 } else { 1.0 }), Vec::new()));
+                list.apply(changes(
+                    model(|id| if id < 10 { 5.0 } else { 1.0 }),
+                    Vec::new(),
+                ));
             }
-            client.receive(&list).into_iter().for_each(|id| *times.entry(id).or_default() += 1);
+            client
+                .receive(&list)
+                .into_iter()
+                .for_each(|id| *times.entry(id).or_default() += 1);
         }
         // 60 s at 100 kB/s, with at most one chunk and a tenth of a second too many.
-        assert!((5_700_000..6_040_000).contains(&client.n_bytes), "{} bytes", client.n_bytes);
+        assert!(
+            (5_700_000..6_040_000).contains(&client.n_bytes),
+            "{} bytes",
+            client.n_bytes
+        );
         assert_eq!(times.len(), 50, "every chunk is updated at some time");
         let mean = |ids: std::ops::Range<u64>| {
             let n = ids.end - ids.start;

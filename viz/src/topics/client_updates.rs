@@ -50,10 +50,16 @@ impl ClientUpdates {
     }
 
     fn of_feeds(feeds: Vec<NamedFeed>) -> Self {
-        Self { feeds, keyframes: KeyframeProgress::default(), was_live: false, viewpoint: None }
+        Self {
+            feeds,
+            keyframes: KeyframeProgress::default(),
+            was_live: false,
+            viewpoint: None,
+        }
     }
 
-    /// The next message, which counts as sent. Short messages come first; long ones follow only if `allows_long` is set.
+    /// The next message, which counts as sent. Short messages come first; long ones follow only if
+    /// `allows_long` is set.
     pub(crate) fn next(
         &mut self,
         subscriptions: &Subscriptions,
@@ -69,7 +75,10 @@ impl ClientUpdates {
                 viewpoint: updates.viewpoint.as_ref(),
                 keyframes: &mut updates.keyframes,
             };
-            let mut feeds = updates.feeds.iter_mut().filter(|named| named.priority == priority);
+            let mut feeds = updates
+                .feeds
+                .iter_mut()
+                .filter(|named| named.priority == priority);
             feeds.find_map(|named| named.feed.next(&mut client, &mut timer))
         };
         if let Some(message) = next_of(self, Priority::Short) {
@@ -96,7 +105,9 @@ impl ClientUpdates {
 
     /// Whether the client has received anything of a topic.
     pub(crate) fn has_sent(&self, topic: &str) -> bool {
-        self.feeds.iter().any(|named| named.name == topic && named.feed.has_sent())
+        self.feeds
+            .iter()
+            .any(|named| named.name == topic && named.feed.has_sent())
     }
 }
 
@@ -126,7 +137,10 @@ mod tests {
     const DEFAULT_PX: [u32; 2] = [640, u32::MAX];
 
     fn item(number: u64) -> Item {
-        Item { number, message: Message::text(number.to_string()) }
+        Item {
+            number,
+            message: Message::text(number.to_string()),
+        }
     }
 
     /// Topics whose messages the tests set without encoding.
@@ -165,8 +179,15 @@ mod tests {
                 ("keyframe_points", self.points.clone()),
             ];
             let feeds = topics.into_iter().map(|(name, topic)| {
-                let row = TOPICS.iter().find(|row| row.name == name).expect("a topic of the table");
-                NamedFeed { name: row.name, priority: row.priority, feed: topic.feed() }
+                let row = TOPICS
+                    .iter()
+                    .find(|row| row.name == name)
+                    .expect("a topic of the table");
+                NamedFeed {
+                    name: row.name,
+                    priority: row.priority,
+                    feed: topic.feed(),
+                }
             });
             ClientUpdates::of_feeds(feeds.collect())
         }
@@ -181,7 +202,11 @@ mod tests {
 
     impl Client {
         fn of(latest: &Latest) -> Self {
-            Self { updates: latest.updates(), subscriptions: Subscriptions::default(), now: Instant::now() }
+            Self {
+                updates: latest.updates(),
+                subscriptions: Subscriptions::default(),
+                now: Instant::now(),
+            }
         }
 
         fn subscribe(&mut self, message: Value) {
@@ -190,8 +215,13 @@ mod tests {
         }
 
         fn next(&mut self, allows_long: bool) -> Option<String> {
-            match self.updates.next(&self.subscriptions, false, self.now, allows_long) {
-                Next::Short(message) | Next::Long(message) => Some(message.into_text().expect("text").to_string()),
+            match self
+                .updates
+                .next(&self.subscriptions, false, self.now, allows_long)
+            {
+                Next::Short(message) | Next::Long(message) => {
+                    Some(message.into_text().expect("text").to_string())
+                }
                 Next::WaitUntil(_) | Next::Wait => None,
             }
         }
@@ -211,8 +241,16 @@ mod tests {
         assert_eq!(client.next(false), None, "only long messages are left");
         assert_eq!(client.next(true).as_deref(), Some("3"));
         latest.images.set("left", DEFAULT_PX, item(6));
-        assert_eq!(client.next(true).as_deref(), Some("2"), "keyframes come after at most one image");
-        assert_eq!(client.next(true).as_deref(), Some("5"), "the other camera comes next");
+        assert_eq!(
+            client.next(true).as_deref(),
+            Some("2"),
+            "keyframes come after at most one image"
+        );
+        assert_eq!(
+            client.next(true).as_deref(),
+            Some("5"),
+            "the other camera comes next"
+        );
         client.now += Duration::from_millis(200);
         assert_eq!(client.next(true).as_deref(), Some("6"));
         assert_eq!(client.next(true), None);
@@ -255,7 +293,10 @@ mod tests {
         latest.status.set("", item(1));
         assert_eq!(client.next(true).as_deref(), Some("1"));
         let now = client.now;
-        assert_eq!(client.updates.next(&client.subscriptions, false, now, true), Next::Wait);
+        assert_eq!(
+            client.updates.next(&client.subscriptions, false, now, true),
+            Next::Wait
+        );
         latest.status.set("", item(2));
         let next = client.updates.next(&client.subscriptions, false, now, true);
         assert_eq!(next, Next::WaitUntil(now + Duration::from_millis(190)));
@@ -315,12 +356,24 @@ mod tests {
         fn set_keyframes(&mut self, n: i64) {
             self.log.set(&keyframes(n));
             let points = |number: u64| (number, Some(Message::text(number.to_string())));
-            self.latest.points.set(self.log.newest_first().map(|(number, _)| points(number)).collect());
-            self.latest.hub.latest::<SharedLog>().send_replace(Some(Arc::new(self.log.clone())));
+            self.latest.points.set(
+                self.log
+                    .newest_first()
+                    .map(|(number, _)| points(number))
+                    .collect(),
+            );
+            self.latest
+                .hub
+                .latest::<SharedLog>()
+                .send_replace(Some(Arc::new(self.log.clone())));
         }
 
         fn next(&mut self) -> Next {
-            let Client { updates, subscriptions, now } = &mut self.client;
+            let Client {
+                updates,
+                subscriptions,
+                now,
+            } = &mut self.client;
             updates.next(subscriptions, true, *now, true)
         }
 
@@ -349,7 +402,11 @@ mod tests {
                         self.keyframes.clear();
                     }
                     let list = |name: &str| changes[name].as_array().expect("a list").clone();
-                    self.keyframes.extend(list("keyframes").iter().filter_map(|keyframe| keyframe["id"].as_u64()));
+                    self.keyframes.extend(
+                        list("keyframes")
+                            .iter()
+                            .filter_map(|keyframe| keyframe["id"].as_u64()),
+                    );
                     for number in list("removed").iter().filter_map(Value::as_u64) {
                         self.keyframes.remove(&number);
                     }
@@ -367,7 +424,14 @@ mod tests {
             viewer.receive(100);
         }
         viewer.receive(1000);
-        assert_eq!((viewer.keyframes.len(), viewer.points.len(), viewer.n_dropped), (60, 60, 0));
+        assert_eq!(
+            (
+                viewer.keyframes.len(),
+                viewer.points.len(),
+                viewer.n_dropped
+            ),
+            (60, 60, 0)
+        );
     }
 
     #[test]
@@ -376,33 +440,56 @@ mod tests {
         viewer.set_keyframes(50);
         viewer.receive(4000);
         assert_eq!(viewer.points.len(), 50);
-        viewer.client.subscribe(json!({"topic": "keyframes", "rate_hz": 2}));
+        viewer
+            .client
+            .subscribe(json!({"topic": "keyframes", "rate_hz": 2}));
         viewer.receive(4000);
-        assert_eq!((viewer.keyframes.len(), viewer.points.len()), (50, 50), "after a new list");
+        assert_eq!(
+            (viewer.keyframes.len(), viewer.points.len()),
+            (50, 50),
+            "after a new list"
+        );
         // Off and on again, faster than the server looks.
         viewer.points.clear();
-        viewer.client.subscribe(json!({"topic": "keyframe_points", "rate_hz": 0}));
-        viewer.client.subscribe(json!({"topic": "keyframe_points", "rate_hz": 20}));
+        viewer
+            .client
+            .subscribe(json!({"topic": "keyframe_points", "rate_hz": 0}));
+        viewer
+            .client
+            .subscribe(json!({"topic": "keyframe_points", "rate_hz": 20}));
         viewer.receive(4000);
-        assert_eq!((viewer.points.len(), viewer.n_dropped), (50, 0), "after a new subscription");
+        assert_eq!(
+            (viewer.points.len(), viewer.n_dropped),
+            (50, 0),
+            "after a new subscription"
+        );
     }
 
     #[test]
     fn keyframes_are_sent_between_images() {
         let mut viewer = PointsClient::new();
-        viewer.client.subscribe(json!({"topic": "live_images", "rate_hz": 100}));
+        viewer
+            .client
+            .subscribe(json!({"topic": "live_images", "rate_hz": 100}));
         viewer.set_keyframes(200);
         let mut n_images = 0_u64;
         while viewer.keyframes.len() < 200 {
             // The link is so slow that a new image always waits.
             viewer.client.now += Duration::from_millis(200);
-            viewer.latest.images.set("left", DEFAULT_PX, item(1 + n_images));
+            viewer
+                .latest
+                .images
+                .set("left", DEFAULT_PX, item(1 + n_images));
             match viewer.next() {
                 Next::Long(message) if message == item(1 + n_images).message => n_images += 1,
                 Next::Long(message) => viewer.apply(&message.into_text().expect("text")),
                 other => panic!("{other:?} instead of a message"),
             }
-            assert!(n_images <= 20, "only {} keyframes after {n_images} images", viewer.keyframes.len());
+            assert!(
+                n_images <= 20,
+                "only {} keyframes after {n_images} images",
+                viewer.keyframes.len()
+            );
         }
         assert!(n_images >= 6, "images are sent, too");
     }

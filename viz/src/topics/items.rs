@@ -1,10 +1,11 @@
-//! Topics of which all clients receive the same messages: the latest one, or the latest one per key.
+//! Topics of which all clients receive the same messages: the latest one, or the latest one per
+//! key.
 
 use crate::Hub;
 use crate::clock::ServerClock;
 use crate::topics::{
-    ClientState, DefaultRate, EncodeContext, Feed, Item, Priority, Row, Sent, Throttle, Timer, Topic, receiver,
-    take_if_changed,
+    ClientState, DefaultRate, EncodeContext, Feed, Item, Priority, Row, Sent, Throttle, Timer,
+    Topic, receiver, take_if_changed,
 };
 use axum::extract::ws::Message;
 use parking_lot::Mutex;
@@ -26,13 +27,19 @@ pub(crate) trait ItemTopic: Default + Send + 'static {
     /// The data in the hub.
     type Source: Clone + Default + Send + Sync + 'static;
 
-    /// The messages that have changed with the data, by key. A topic with a single message uses the empty key.
+    /// The messages that have changed with the data, by key. A topic with a single message uses the
+    /// empty key.
     fn encode(&mut self, source: &Self::Source, clock: ServerClock) -> Vec<(Arc<str>, Message)>;
 }
 
 /// The row of a topic.
 pub(crate) const fn row<T: ItemTopic>() -> Row {
-    Row { name: T::NAME, default: T::DEFAULT, priority: T::PRIORITY, start: |hub| Arc::new(Items::<T>::new(hub)) }
+    Row {
+        name: T::NAME,
+        default: T::DEFAULT,
+        priority: T::PRIORITY,
+        start: |hub| Arc::new(Items::<T>::new(hub)),
+    }
 }
 
 /// The latest messages of a topic.
@@ -51,7 +58,14 @@ impl<T: ItemTopic> Items<T> {
     /// A topic for the data of a hub.
     pub(crate) fn new(hub: &Hub) -> Self {
         let (topic, source, encoded) = (T::default(), receiver(hub), Throttle::new(T::PERIOD));
-        Self { state: Mutex::new(State { topic, source, encoded, items: BTreeMap::new() }) }
+        Self {
+            state: Mutex::new(State {
+                topic,
+                source,
+                encoded,
+                items: BTreeMap::new(),
+            }),
+        }
     }
 
     /// Sets a message without encoding.
@@ -67,14 +81,23 @@ impl<T: ItemTopic> Topic for Items<T> {
             return;
         }
         let mut state = self.state.lock();
-        let State { topic, source, encoded, items } = &mut *state;
+        let State {
+            topic,
+            source,
+            encoded,
+            items,
+        } = &mut *state;
         if !encoded.is_due(context.now) {
             return;
         }
-        let Some(source) = take_if_changed(source) else { return };
+        let Some(source) = take_if_changed(source) else {
+            return;
+        };
         encoded.begin(context.now);
         for (key, message) in topic.encode(&source, context.clock) {
-            context.publisher.publish(|number| _ = items.insert(key, Item { number, message }));
+            context
+                .publisher
+                .publish(|number| _ = items.insert(key, Item { number, message }));
         }
     }
 
@@ -87,7 +110,10 @@ impl<T: ItemTopic> Topic for Items<T> {
     }
 
     fn feed(self: Arc<Self>) -> Box<dyn Feed> {
-        Box::new(ItemFeed { items: self, sent: BTreeMap::new() })
+        Box::new(ItemFeed {
+            items: self,
+            sent: BTreeMap::new(),
+        })
     }
 }
 
@@ -107,10 +133,20 @@ impl<T: ItemTopic> Feed for ItemFeed<T> {
         let state = self.items.state.lock();
         let waiting = state.items.iter().filter_map(|(key, item)| {
             let sent = self.sent.get(key).copied().unwrap_or_default();
-            (item.number > sent.number && timer.is_due(sent.at, period)).then_some((sent.number, key, item))
+            (item.number > sent.number && timer.is_due(sent.at, period)).then_some((
+                sent.number,
+                key,
+                item,
+            ))
         });
         let (_, key, item) = waiting.min_by_key(|(number, ..)| *number)?;
-        self.sent.insert(Arc::clone(key), Sent { number: item.number, at: Some(timer.now) });
+        self.sent.insert(
+            Arc::clone(key),
+            Sent {
+                number: item.number,
+                at: Some(timer.now),
+            },
+        );
         Some(item.message.clone())
     }
 

@@ -6,7 +6,8 @@ use crate::topics::updates::KeyframePose;
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 
-/// Maximum number of remembered removals. A client that has not received older ones gets the complete list.
+/// Maximum number of remembered removals. A client that has not received older ones gets the
+/// complete list.
 const MAX_REMOVALS: usize = 1024;
 
 /// The keyframes, and which version of the list changed them. The version counts single changes.
@@ -81,7 +82,8 @@ impl KeyframeLog {
     /// Whether a client at this position certainly has the keyframe with this number.
     pub(crate) fn is_sent(&self, number: u64, position: ListPosition) -> bool {
         // Keyframes that have changed since the list was complete still count as sent.
-        let is_sent = |entry: &Entry| entry.changed <= position.version || entry.added <= position.complete;
+        let is_sent =
+            |entry: &Entry| entry.changed <= position.version || entry.added <= position.complete;
         self.keyframes.get(&number).is_some_and(is_sent)
     }
 
@@ -92,7 +94,10 @@ impl KeyframeLog {
 
     /// Number, camera and stamp of all keyframes, the newest first.
     pub(crate) fn newest_first(&self) -> impl Iterator<Item = (u64, &KeyframePose)> {
-        self.keyframes.iter().rev().map(|(number, entry)| (*number, &entry.keyframe))
+        self.keyframes
+            .iter()
+            .rev()
+            .map(|(number, entry)| (*number, &entry.keyframe))
     }
 
     /// Replaces the list.
@@ -100,7 +105,9 @@ impl KeyframeLog {
         let mut numbers = BTreeMap::new();
         let mut n_same: BTreeMap<(&str, i64), u32> = BTreeMap::new();
         for keyframe in keyframes {
-            let n_before = n_same.entry((&*keyframe.camera, keyframe.stamp.0)).or_default();
+            let n_before = n_same
+                .entry((&*keyframe.camera, keyframe.stamp.0))
+                .or_default();
             let key = (Arc::clone(&keyframe.camera), keyframe.stamp.0, *n_before);
             *n_before += 1;
             let number = self.numbers.remove(&key).unwrap_or_else(|| {
@@ -111,7 +118,11 @@ impl KeyframeLog {
             if before.is_none_or(|entry| has_changed(&entry.keyframe, keyframe)) {
                 self.version += 1;
                 let added = before.map_or(self.version, |entry| entry.added);
-                let entry = Entry { added, changed: self.version, keyframe: keyframe.clone() };
+                let entry = Entry {
+                    added,
+                    changed: self.version,
+                    keyframe: keyframe.clone(),
+                };
                 self.keyframes.insert(number, entry);
             }
             numbers.insert(key, number);
@@ -123,21 +134,34 @@ impl KeyframeLog {
             self.removals.push_back((self.version, number));
         }
         while self.removals.len() > MAX_REMOVALS {
-            self.forgotten = self.removals.pop_front().map_or(self.forgotten, |(version, _)| version);
+            self.forgotten = self
+                .removals
+                .pop_front()
+                .map_or(self.forgotten, |(version, _)| version);
         }
     }
 
-    /// The next message for a client at this position; `None` if it is up to date. A message from version 0 replaces
-    /// the client's list.
+    /// The next message for a client at this position; `None` if it is up to date. A message from
+    /// version 0 replaces the client's list.
     pub(crate) fn next_changes(&self, position: ListPosition) -> Option<Changes> {
-        // A list does not contain keyframes that were removed before it was started, so it needs only later removals.
-        let is_outdated = position.version.max(position.began) < self.forgotten || position.version > self.version;
-        let position = if is_outdated { ListPosition::default() } else { position };
+        // A list does not contain keyframes that were removed before it was started, so it needs
+        // only later removals.
+        let is_outdated = position.version.max(position.began) < self.forgotten
+            || position.version > self.version;
+        let position = if is_outdated {
+            ListPosition::default()
+        } else {
+            position
+        };
         let from_version = position.version;
         if from_version == self.version {
             return None;
         }
-        let mut changed: Vec<_> = self.keyframes.iter().filter(|(_, entry)| entry.changed > from_version).collect();
+        let mut changed: Vec<_> = self
+            .keyframes
+            .iter()
+            .filter(|(_, entry)| entry.changed > from_version)
+            .collect();
         changed.sort_unstable_by_key(|(_, entry)| entry.changed);
         // A long list is sent in several messages, so that others can be sent in between.
         let version = match changed.get(MAX_CHANGED_KEYFRAMES) {
@@ -145,22 +169,52 @@ impl KeyframeLog {
             None => self.version,
         };
         let keyframes = changed.into_iter().take(MAX_CHANGED_KEYFRAMES);
-        let keyframes = keyframes.map(|(number, entry)| NumberedKeyframe::new(*number, &entry.keyframe)).collect();
-        let is_new = |(at, _): &&(u64, u64)| from_version > 0 && *at > from_version && *at <= version;
-        let removed = self.removals.iter().filter(is_new).map(|(_, number)| *number).collect();
+        let keyframes = keyframes
+            .map(|(number, entry)| NumberedKeyframe::new(*number, &entry.keyframe))
+            .collect();
+        let is_new =
+            |(at, _): &&(u64, u64)| from_version > 0 && *at > from_version && *at <= version;
+        let removed = self
+            .removals
+            .iter()
+            .filter(is_new)
+            .map(|(_, number)| *number)
+            .collect();
         let is_new_list = from_version == 0;
-        let began = if is_new_list { self.version } else { position.began };
-        let complete = if version == self.version { version } else { position.complete };
-        let json = ServerMessage::KeyframeChanges { from_version, version, keyframes, removed }.to_json();
-        Some(Changes { json, position: ListPosition { version, began, complete }, is_new_list })
+        let began = if is_new_list {
+            self.version
+        } else {
+            position.began
+        };
+        let complete = if version == self.version {
+            version
+        } else {
+            position.complete
+        };
+        let json = ServerMessage::KeyframeChanges {
+            from_version,
+            version,
+            keyframes,
+            removed,
+        }
+        .to_json();
+        Some(Changes {
+            json,
+            position: ListPosition {
+                version,
+                began,
+                complete,
+            },
+            is_new_list,
+        })
     }
 }
 
 /// Smaller motions are not sent, because optimization makes them all the time.
 fn has_changed(before: &KeyframePose, after: &KeyframePose) -> bool {
     let motion = before.world_from_camera.inverse() * after.world_from_camera;
-    let is_same_lens =
-        (before.size_px, before.focal_px, before.principal_px) == (after.size_px, after.focal_px, after.principal_px);
+    let is_same_lens = (before.size_px, before.focal_px, before.principal_px)
+        == (after.size_px, after.focal_px, after.principal_px);
     !is_same_lens || kinematics::transform::is_noticeable(&motion)
 }
 
@@ -206,9 +260,23 @@ mod tests {
 
         /// Applies the next message. Returns false if there is none.
         fn receive_one(&mut self, log: &KeyframeLog) -> bool {
-            let Some(Changes { json, position, is_new_list }) = log.next_changes(self.position) else { return false };
+            let Some(Changes {
+                json,
+                position,
+                is_new_list,
+            }) = log.next_changes(self.position)
+            else {
+                return false;
+            };
             let message: Value = serde_json::from_str(&json).expect("JSON");
-            assert_eq!(message["from_version"], if is_new_list { 0 } else { self.position.version });
+            assert_eq!(
+                message["from_version"],
+                if is_new_list {
+                    0
+                } else {
+                    self.position.version
+                }
+            );
             if is_new_list {
                 self.keyframes.clear();
             }
@@ -218,18 +286,35 @@ mod tests {
             for keyframe in list("keyframes") {
                 let number = keyframe["id"].as_u64().expect("a number");
                 let stamp = keyframe["stamp_nanos"].as_i64().expect("a stamp");
-                self.keyframes.insert(number, (stamp, keyframe["world_from_camera"][3].as_f64().expect("x")));
+                self.keyframes.insert(
+                    number,
+                    (stamp, keyframe["world_from_camera"][3].as_f64().expect("x")),
+                );
             }
             for number in list("removed") {
                 self.keyframes.remove(&number.as_u64().expect("a number"));
             }
             assert_eq!(message["version"].as_u64(), Some(position.version));
-            assert!(position.version > self.position.version || is_new_list, "no progress");
+            assert!(
+                position.version > self.position.version || is_new_list,
+                "no progress"
+            );
             self.position = position;
             for (number, _) in log.newest_first() {
-                let (is_sent, has_it) = (log.is_sent(number, self.position), self.keyframes.contains_key(&number));
-                assert!(has_it || !is_sent, "keyframe {number} at {:?}", self.position);
-                assert!(is_sent || !log.is_up_to_date(self.position), "keyframe {number} at {:?}", self.position);
+                let (is_sent, has_it) = (
+                    log.is_sent(number, self.position),
+                    self.keyframes.contains_key(&number),
+                );
+                assert!(
+                    has_it || !is_sent,
+                    "keyframe {number} at {:?}",
+                    self.position
+                );
+                assert!(
+                    is_sent || !log.is_up_to_date(self.position),
+                    "keyframe {number} at {:?}",
+                    self.position
+                );
             }
             true
         }
@@ -259,7 +344,12 @@ mod tests {
             if random.below(4) == 0 {
                 list.iter_mut().for_each(|(_, x)| *x += 0.25);
             }
-            log.set(&list.iter().map(|(stamp, x)| keyframe(*stamp, *x)).collect::<Vec<_>>());
+            log.set(
+                &list
+                    .iter()
+                    .map(|(stamp, x)| keyframe(*stamp, *x))
+                    .collect::<Vec<_>>(),
+            );
             // The last client receives messages only sometimes.
             let n_up_to_date = if round % 57 == 56 { 3 } else { 2 };
             for replica in &mut replicas[..n_up_to_date] {
@@ -282,7 +372,10 @@ mod tests {
         assert_eq!(replica.n_received, 400);
         log.set(&list(1e-4));
         replica.update(&log);
-        assert_eq!(replica.n_received, 400, "a tenth of a millimeter is not sent");
+        assert_eq!(
+            replica.n_received, 400,
+            "a tenth of a millimeter is not sent"
+        );
         log.set(&[list(1e-4), vec![keyframe(400, 0.0)]].concat());
         replica.update(&log);
         assert_eq!(replica.n_received, 401, "only the new keyframe is sent");
@@ -299,7 +392,11 @@ mod tests {
         let mut replica = Replica::default();
         replica.update(&log);
         log.set(&[keyframe(3, 0.0)]);
-        assert!(log.next_changes(replica.position).expect("changes").is_new_list);
+        assert!(
+            log.next_changes(replica.position)
+                .expect("changes")
+                .is_new_list
+        );
         replica.update(&log);
         assert_eq!(replica.sorted(), [(3, 0.0)]);
     }
@@ -307,8 +404,14 @@ mod tests {
     #[test]
     fn a_new_client_learns_that_the_list_is_empty() {
         let log = KeyframeLog::default();
-        let changes = log.next_changes(ListPosition::default()).expect("a message");
-        assert!(changes.json.contains("\"keyframes\":[]"), "{}", changes.json);
+        let changes = log
+            .next_changes(ListPosition::default())
+            .expect("a message");
+        assert!(
+            changes.json.contains("\"keyframes\":[]"),
+            "{}",
+            changes.json
+        );
         assert!(log.next_changes(changes.position).is_none());
     }
 
@@ -333,7 +436,10 @@ mod tests {
         // `receive_one` checks that only received keyframes count as sent.
         for n_sent in 1..=20 {
             let x = f64::from(n_sent);
-            log.set(&list(100 + 3 * i64::from(n_sent), if n_sent % 2 == 0 { x } else { x - 1.0 }));
+            log.set(&list(
+                100 + 3 * i64::from(n_sent),
+                if n_sent % 2 == 0 { x } else { x - 1.0 },
+            ));
             assert!(replica.receive_one(&log));
         }
         replica.update(&log);
@@ -344,8 +450,17 @@ mod tests {
     fn keyframes_with_the_same_stamp_are_distinct() {
         let mut log = KeyframeLog::default();
         let mut replica = Replica::default();
-        for list in [vec![(5, 0.0), (5, 1.0), (5, 2.0)], vec![(5, 0.0), (5, 1.0)], vec![]] {
-            log.set(&list.iter().map(|(stamp, x)| keyframe(*stamp, *x)).collect::<Vec<_>>());
+        for list in [
+            vec![(5, 0.0), (5, 1.0), (5, 2.0)],
+            vec![(5, 0.0), (5, 1.0)],
+            vec![],
+        ] {
+            log.set(
+                &list
+                    .iter()
+                    .map(|(stamp, x)| keyframe(*stamp, *x))
+                    .collect::<Vec<_>>(),
+            );
             replica.update(&log);
             assert_eq!(replica.sorted(), list);
         }

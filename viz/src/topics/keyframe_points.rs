@@ -5,7 +5,8 @@ use crate::session::server_message::{BinaryHeader, PointsHeader, frame};
 use crate::topics::keyframes::SharedLog;
 use crate::topics::positions::pack_positions;
 use crate::topics::{
-    ClientState, DefaultRate, EncodeContext, Feed, Priority, Publisher, Row, Timer, Topic, receiver, take_if_changed,
+    ClientState, DefaultRate, EncodeContext, Feed, Priority, Publisher, Row, Timer, Topic,
+    receiver, take_if_changed,
 };
 use axum::extract::ws::Message;
 use keyframe::{DepthMap, Keyframe};
@@ -19,8 +20,8 @@ use tokio::sync::watch;
 
 /// Maximum number of points per keyframe. A run has hundreds of keyframes that overlap.
 const MAX_POINTS: usize = 2500;
-/// Points whose depth differs from that of a neighbor by more than this fraction are left out: they lie on edges, where
-/// depth cameras report values in between.
+/// Points whose depth differs from that of a neighbor by more than this fraction are left out: they
+/// lie on edges, where depth cameras report values in between.
 const MAX_EDGE_FRAC: f64 = 0.05;
 
 /// Name in `subscribe`.
@@ -34,7 +35,8 @@ pub(crate) const ROW: Row = Row {
     start: |hub| Arc::new(PointTopic::new(hub)),
 };
 
-/// Keyframes whose points clients can draw, by camera and stamp. The run owns them and may drop them at any time.
+/// Keyframes whose points clients can draw, by camera and stamp. The run owns them and may drop
+/// them at any time.
 type KeyframeSources = BTreeMap<(Arc<str>, i64), Weak<Keyframe>>;
 
 /// The topic.
@@ -54,7 +56,10 @@ struct Points {
 impl PointTopic {
     /// A topic for the keyframes of a hub.
     pub(crate) fn new(hub: &Hub) -> Self {
-        Self { log: Mutex::new(receiver(hub)), points: Arc::default() }
+        Self {
+            log: Mutex::new(receiver(hub)),
+            points: Arc::default(),
+        }
     }
 
     /// Sets the messages of all keyframes without packing.
@@ -71,18 +76,26 @@ impl Topic for PointTopic {
         if let Some(Some(log)) = take_if_changed(&mut log) {
             points.messages.retain(|number, _| log.contains(*number));
         }
-        let is_wanted = context.settled().any(|demand| demand.subscriptions.period(NAME).is_some());
+        let is_wanted = context
+            .settled()
+            .any(|demand| demand.subscriptions.period(NAME).is_some());
         if !is_wanted || points.is_running {
             return;
         }
         let log = log.borrow();
         let mut newest_first = log.iter().flat_map(|log| log.newest_first());
-        let Some((number, pose)) = newest_first.find(|(number, _)| !points.messages.contains_key(number)) else {
+        let Some((number, pose)) =
+            newest_first.find(|(number, _)| !points.messages.contains_key(number))
+        else {
             return;
         };
         points.is_running = true;
         let source = context.hub.keyframe_source(&pose.camera, pose.stamp);
-        let task = PackingTask { number, points: Arc::clone(&self.points), publisher: context.publisher.clone() };
+        let task = PackingTask {
+            number,
+            points: Arc::clone(&self.points),
+            publisher: context.publisher.clone(),
+        };
         tokio::task::spawn_blocking(move || task.run(source.as_deref()));
     }
 
@@ -93,11 +106,19 @@ impl Topic for PointTopic {
     fn feed(self: Arc<Self>) -> Box<dyn Feed> {
         let log = self.log.lock().clone();
         let points = Arc::clone(&self.points);
-        Box::new(PointFeed { log, points, sent: BTreeSet::new(), sent_at: None, n_subscriptions: 0, n_lists: 0 })
+        Box::new(PointFeed {
+            log,
+            points,
+            sent: BTreeSet::new(),
+            sent_at: None,
+            n_subscriptions: 0,
+            n_lists: 0,
+        })
     }
 }
 
-/// Packs the points of one keyframe. If that panics, the keyframe has no points, because another attempt would fail, too.
+/// Packs the points of one keyframe. If that panics, the keyframe has no points, because another
+/// attempt would fail, too.
 struct PackingTask {
     number: u64,
     points: Arc<Mutex<Points>>,
@@ -108,7 +129,10 @@ impl PackingTask {
     fn run(self, keyframe: Option<&Keyframe>) {
         let packed = keyframe.and_then(|keyframe| pack_points(self.number, keyframe));
         self.publisher.publish(|_| {
-            self.points.lock().messages.insert(self.number, packed.map(Message::binary));
+            self.points
+                .lock()
+                .messages
+                .insert(self.number, packed.map(Message::binary));
         });
     }
 }
@@ -136,8 +160,10 @@ struct PointFeed {
 impl Feed for PointFeed {
     /// The points of the newest keyframe that the client has without points.
     fn next(&mut self, client: &mut ClientState<'_>, timer: &mut Timer) -> Option<Message> {
-        // Clients discard points together with their keyframes, and a new subscription begins with all points.
-        let (n_subscriptions, n_lists) = (client.subscriptions.number(NAME), client.keyframes.n_lists);
+        // Clients discard points together with their keyframes, and a new subscription begins with
+        // all points.
+        let (n_subscriptions, n_lists) =
+            (client.subscriptions.number(NAME), client.keyframes.n_lists);
         if n_subscriptions != self.n_subscriptions || n_lists != self.n_lists {
             (self.n_subscriptions, self.n_lists) = (n_subscriptions, n_lists);
             self.sent.clear();
@@ -146,10 +172,12 @@ impl Feed for PointFeed {
         let log = self.log.borrow();
         let log = log.as_ref().filter(|_| client.has_keyframe_changes)?;
         let points = self.points.lock();
-        self.sent.retain(|number| points.messages.contains_key(number));
+        self.sent
+            .retain(|number| points.messages.contains_key(number));
         let mut newest_first = points.messages.iter().rev();
         let (number, message) = newest_first.find_map(|(number, message)| {
-            let is_next = !self.sent.contains(number) && log.is_sent(*number, client.keyframes.position);
+            let is_next =
+                !self.sent.contains(number) && log.is_sent(*number, client.keyframes.position);
             Some((number, message.as_ref()?)).filter(|_| is_next)
         })?;
         if !timer.is_due(self.sent_at, period) {
@@ -165,13 +193,19 @@ impl Hub {
     /// Sets the keyframes of which clients can draw points. They are not kept alive.
     pub fn set_keyframe_sources<'a>(&self, keyframes: impl IntoIterator<Item = &'a Arc<Keyframe>>) {
         let key = |keyframe: &Keyframe| (Arc::clone(&keyframe.camera), keyframe.stamp.0);
-        let sources = keyframes.into_iter().map(|keyframe| (key(keyframe), Arc::downgrade(keyframe)));
-        self.latest::<KeyframeSources>().send_replace(sources.collect());
+        let sources = keyframes
+            .into_iter()
+            .map(|keyframe| (key(keyframe), Arc::downgrade(keyframe)));
+        self.latest::<KeyframeSources>()
+            .send_replace(sources.collect());
     }
 
     /// The keyframe with this camera and stamp, if the run still has it.
     fn keyframe_source(&self, camera: &Arc<str>, stamp: Stamp) -> Option<Arc<Keyframe>> {
-        self.latest::<KeyframeSources>().borrow().get(&(Arc::clone(camera), stamp.0))?.upgrade()
+        self.latest::<KeyframeSources>()
+            .borrow()
+            .get(&(Arc::clone(camera), stamp.0))?
+            .upgrade()
     }
 }
 
@@ -180,32 +214,54 @@ fn pack_points(id: u64, keyframe: &Keyframe) -> Option<Vec<u8>> {
     let is_complete = |depth: &&DepthMap| depth.depth_m.len() == n_pixels(depth.size_px);
     let (points, colors) = points_in_camera(keyframe, keyframe.depth.as_ref().filter(is_complete)?);
     let (positions, meters_per_count) = pack_positions(&points)?;
-    let header = PointsHeader { id, n_points: points.len(), meters_per_count };
-    Some(frame(&BinaryHeader::KeyframePoints(header), &[&positions, &colors]))
+    let header = PointsHeader {
+        id,
+        n_points: points.len(),
+        meters_per_count,
+    };
+    Some(frame(
+        &BinaryHeader::KeyframePoints(header),
+        &[&positions, &colors],
+    ))
 }
 
 fn n_pixels([width, height]: [u32; 2]) -> usize {
     width as usize * height as usize
 }
 
-/// Points on a regular grid of the depth map, in the frame of the keyframe's color camera, and their colors.
+/// Points on a regular grid of the depth map, in the frame of the keyframe's color camera, and
+/// their colors.
 fn points_in_camera(keyframe: &Keyframe, depth: &DepthMap) -> (Vec<Vector3<f64>>, Vec<u8>) {
     let [width, height] = depth.size_px;
     let n_px = n_pixels(depth.size_px);
-    let stride = (1..).find(|stride: &usize| n_px / (stride * stride) <= MAX_POINTS).unwrap_or(1);
+    let stride = (1..)
+        .find(|stride: &usize| n_px / (stride * stride) <= MAX_POINTS)
+        .unwrap_or(1);
     let camera_from_depth = keyframe.world_from_camera.inverse() * depth.world_from_camera;
     let depth_at = |x: u32, y: u32| f64::from(depth.depth_m[(y * width + x) as usize]);
     let (mut points, mut colors) = (Vec::new(), Vec::new());
-    for y in (stride as u64 / 2..u64::from(height)).step_by(stride).filter_map(|y| u32::try_from(y).ok()) {
-        for x in (stride as u64 / 2..u64::from(width)).step_by(stride).filter_map(|x| u32::try_from(x).ok()) {
+    for y in (stride as u64 / 2..u64::from(height))
+        .step_by(stride)
+        .filter_map(|y| u32::try_from(y).ok())
+    {
+        for x in (stride as u64 / 2..u64::from(width))
+            .step_by(stride)
+            .filter_map(|x| u32::try_from(x).ok())
+        {
             let z_m = depth_at(x, y);
-            let neighbors = [(x + 1, y), (x, y + 1)].into_iter().filter(|(x, y)| *x < width && *y < height);
-            let is_edge = neighbors.map(|(x, y)| depth_at(x, y)).any(|other| (other - z_m).abs() > MAX_EDGE_FRAC * z_m);
+            let neighbors = [(x + 1, y), (x, y + 1)]
+                .into_iter()
+                .filter(|(x, y)| *x < width && *y < height);
+            let is_edge = neighbors
+                .map(|(x, y)| depth_at(x, y))
+                .any(|other| (other - z_m).abs() > MAX_EDGE_FRAC * z_m);
             if z_m.is_nan() || z_m <= 0.0 || is_edge {
                 continue;
             }
             let point = camera_from_depth * Point3::from(depth.point(x, y, z_m));
-            let Some(color) = color_at(keyframe, &point) else { continue };
+            let Some(color) = color_at(keyframe, &point) else {
+                continue;
+            };
             points.push(point.coords);
             colors.extend(color);
         }
@@ -214,12 +270,18 @@ fn points_in_camera(keyframe: &Keyframe, depth: &DepthMap) -> (Vec<Vector3<f64>>
 }
 
 /// Color of the pixel onto which a point projects; `None` outside the image.
-#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "pixels inside the image")]
+#[expect(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "pixels inside the image"
+)]
 fn color_at(keyframe: &Keyframe, point: &Point3<f64>) -> Option<[u8; 3]> {
     let [width, height] = keyframe.size_px;
     let u = keyframe.focal_px[0] * point.x / point.z + keyframe.principal_px[0];
     let v = keyframe.focal_px[1] * point.y / point.z + keyframe.principal_px[1];
-    let is_inside = point.z > 0.0 && (0.0..f64::from(width)).contains(&u) && (0.0..f64::from(height)).contains(&v);
+    let is_inside = point.z > 0.0
+        && (0.0..f64::from(width)).contains(&u)
+        && (0.0..f64::from(height)).contains(&v);
     if !is_inside {
         return None;
     }
@@ -237,7 +299,13 @@ mod tests {
     fn wall(size_px: [u32; 2]) -> Keyframe {
         let is_right = |ix: u32| ix % size_px[0] >= size_px[0] / 2;
         let pixels = || 0..size_px[0] * size_px[1];
-        let rgba = pixels().flat_map(|ix| if is_right(ix) { [0, 0, 200, 255] } else { [200, 0, 0, 255] });
+        let rgba = pixels().flat_map(|ix| {
+            if is_right(ix) {
+                [0, 0, 200, 255]
+            } else {
+                [200, 0, 0, 255]
+            }
+        });
         let world_from_camera = Transform::translation(5.0, 0.0, 0.0);
         let (focal_px, principal_px) = ([100.0; 2], size_px.map(|side| 0.5 * f64::from(side)));
         Keyframe {
@@ -251,7 +319,9 @@ mod tests {
                 size_px,
                 focal_px,
                 principal_px,
-                depth_m: pixels().map(|ix| if is_right(ix) { 1.0 } else { 2.0 }).collect(),
+                depth_m: pixels()
+                    .map(|ix| if is_right(ix) { 1.0 } else { 2.0 })
+                    .collect(),
                 world_from_camera,
             }),
             world_from_camera,
@@ -268,9 +338,13 @@ mod tests {
     fn points_have_positions_and_colors_of_the_surface() {
         let message = pack_points(7, &wall([160, 120])).expect("points");
         let n_header = u32::from_le_bytes(message[..4].try_into().expect("4 bytes")) as usize;
-        let header: serde_json::Value = serde_json::from_slice(&message[4..4 + n_header]).expect("JSON");
+        let header: serde_json::Value =
+            serde_json::from_slice(&message[4..4 + n_header]).expect("JSON");
         let n = usize::try_from(header["n_points"].as_u64().expect("a number")).expect("small");
-        assert!(header["id"] == 7 && n <= MAX_POINTS && n > MAX_POINTS / 4, "{header}");
+        assert!(
+            header["id"] == 7 && n <= MAX_POINTS && n > MAX_POINTS / 4,
+            "{header}"
+        );
         let (positions, colors) = message[4 + n_header..].split_at(6 * n);
         assert_eq!(colors.len(), 3 * n);
         let scale = header["meters_per_count"].as_f64().expect("a scale");
@@ -279,8 +353,15 @@ mod tests {
         for (position, color) in positions.chunks_exact(6).zip(colors.chunks_exact(3)) {
             let [x, z] = [coordinate(&position[..2]), coordinate(&position[4..])];
             // In the camera's frame, not in the world's.
-            let (expected_z, expected_color) = if x < 0.0 { (2.0, [200, 0, 0]) } else { (1.0, [0, 0, 200]) };
-            assert!((z - expected_z).abs() < 1e-3 && color == expected_color, "{x} {z} {color:?}");
+            let (expected_z, expected_color) = if x < 0.0 {
+                (2.0, [200, 0, 0])
+            } else {
+                (1.0, [0, 0, 200])
+            };
+            assert!(
+                (z - expected_z).abs() < 1e-3 && color == expected_color,
+                "{x} {z} {color:?}"
+            );
             *(if x < 0.0 { &mut n_left } else { &mut n_right }) += 1;
         }
         assert!(n_left > n / 3 && n_right > n / 3, "{n_left} {n_right}");
@@ -289,10 +370,25 @@ mod tests {
     #[test]
     fn keyframes_without_depth_have_no_points() {
         let mut keyframe = wall([16, 12]);
-        keyframe.depth = keyframe.depth.map(|depth| DepthMap { depth_m: vec![0.0; 192].into(), ..depth });
+        keyframe.depth = keyframe.depth.map(|depth| DepthMap {
+            depth_m: vec![0.0; 192].into(),
+            ..depth
+        });
         assert!(pack_points(1, &keyframe).is_none());
-        keyframe.depth = wall([16, 12]).depth.map(|depth| DepthMap { depth_m: vec![1.0; 191].into(), ..depth });
+        keyframe.depth = wall([16, 12]).depth.map(|depth| DepthMap {
+            depth_m: vec![1.0; 191].into(),
+            ..depth
+        });
         assert!(pack_points(1, &keyframe).is_none(), "a value is missing");
-        assert!(pack_points(1, &Keyframe { depth: None, ..keyframe }).is_none());
+        assert!(
+            pack_points(
+                1,
+                &Keyframe {
+                    depth: None,
+                    ..keyframe
+                }
+            )
+            .is_none()
+        );
     }
 }

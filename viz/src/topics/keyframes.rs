@@ -1,12 +1,13 @@
-//! The poses of the keyframes: the changes of the list, or the complete list for clients that do not know changes.
+//! The poses of the keyframes: the changes of the list, or the complete list for clients that do
+//! not know changes.
 
 use crate::Hub;
 use crate::session::server_message::{KeyframeMessage, ServerMessage};
 use crate::topics::keyframe_log::{Changes, KeyframeLog, ListPosition};
 use crate::topics::updates::KeyframePose;
 use crate::topics::{
-    ClientState, DefaultRate, EncodeContext, Feed, Item, Priority, Publisher, Row, Sent, Throttle, Timer, Topic,
-    receiver, take_if_changed,
+    ClientState, DefaultRate, EncodeContext, Feed, Item, Priority, Publisher, Row, Sent, Throttle,
+    Timer, Topic, receiver, take_if_changed,
 };
 use axum::extract::ws::Message;
 use parking_lot::Mutex;
@@ -32,8 +33,8 @@ pub(crate) const ROW: Row = Row {
 /// The poses of all keyframes.
 pub(crate) type KeyframePoses = Arc<[KeyframePose]>;
 
-/// The source of changes of the list; `None` before the first list. Points follow their keyframes, so their topic uses it,
-/// too.
+/// The source of changes of the list; `None` before the first list. Points follow their keyframes,
+/// so their topic uses it, too.
 pub(crate) type SharedLog = Option<Arc<KeyframeLog>>;
 
 /// The topic.
@@ -68,7 +69,11 @@ impl KeyframeTopic {
             list_made: Throttle::new(LIST_PERIOD),
             is_list_outdated: true,
         };
-        Self { state: Mutex::new(state), shared_log: hub.latest(), list: Arc::default() }
+        Self {
+            state: Mutex::new(state),
+            shared_log: hub.latest(),
+            list: Arc::default(),
+        }
     }
 
     /// Sets the complete list without encoding.
@@ -89,14 +94,19 @@ impl Topic for KeyframeTopic {
             state.log.set(&list);
             state.is_list_outdated = true;
             let log = Arc::new(state.log.clone());
-            context.publisher.publish(|_| _ = self.shared_log.send_replace(Some(log)));
+            context
+                .publisher
+                .publish(|_| _ = self.shared_log.send_replace(Some(log)));
         }
         let needs_list = context.settled().any(|demand| !demand.has_keyframe_changes);
         let is_due = state.is_list_outdated && state.list_made.is_due(context.now);
         if needs_list && is_due && !std::mem::replace(&mut self.list.lock().is_running, true) {
             state.list_made.begin(context.now);
             state.is_list_outdated = false;
-            let task = ListTask { list: Arc::clone(&self.list), publisher: context.publisher.clone() };
+            let task = ListTask {
+                list: Arc::clone(&self.list),
+                publisher: context.publisher.clone(),
+            };
             let keyframes = state.source.borrow().clone();
             tokio::task::spawn_blocking(move || task.run(&keyframes));
         }
@@ -113,7 +123,12 @@ impl Topic for KeyframeTopic {
     }
 
     fn feed(self: Arc<Self>) -> Box<dyn Feed> {
-        Box::new(KeyframeFeed { topic: self, n_subscriptions: 0, list: Sent::default(), changes_at: None })
+        Box::new(KeyframeFeed {
+            topic: self,
+            n_subscriptions: 0,
+            list: Sent::default(),
+            changes_at: None,
+        })
     }
 }
 
@@ -127,7 +142,8 @@ impl ListTask {
     fn run(self, keyframes: &[KeyframePose]) {
         let keyframes = keyframes.iter().map(KeyframeMessage::from).collect();
         let message = ServerMessage::Keyframes { keyframes }.to_message();
-        self.publisher.publish(|number| self.list.lock().item = Some(Item { number, message }));
+        self.publisher
+            .publish(|number| self.list.lock().item = Some(Item { number, message }));
     }
 }
 
@@ -169,21 +185,38 @@ impl Feed for KeyframeFeed {
 impl KeyframeFeed {
     fn next_list(&mut self, period: Duration, timer: &mut Timer) -> Option<Message> {
         let list = self.topic.list.lock();
-        let item = list.item.as_ref().filter(|item| item.number > self.list.number)?;
+        let item = list
+            .item
+            .as_ref()
+            .filter(|item| item.number > self.list.number)?;
         if !timer.is_due(self.list.at, period) {
             return None;
         }
-        self.list = Sent { number: item.number, at: Some(timer.now) };
+        self.list = Sent {
+            number: item.number,
+            at: Some(timer.now),
+        };
         Some(item.message.clone())
     }
 
-    fn next_changes(&mut self, client: &mut ClientState<'_>, period: Duration, timer: &mut Timer) -> Option<Message> {
+    fn next_changes(
+        &mut self,
+        client: &mut ClientState<'_>,
+        period: Duration,
+        timer: &mut Timer,
+    ) -> Option<Message> {
         let log = self.topic.shared_log.borrow();
-        let log = log.as_ref().filter(|log| !log.is_up_to_date(client.keyframes.position))?;
+        let log = log
+            .as_ref()
+            .filter(|log| !log.is_up_to_date(client.keyframes.position))?;
         if !timer.is_due(self.changes_at, period) {
             return None;
         }
-        let Changes { json, position, is_new_list } = log.next_changes(client.keyframes.position)?;
+        let Changes {
+            json,
+            position,
+            is_new_list,
+        } = log.next_changes(client.keyframes.position)?;
         client.keyframes.n_lists += u64::from(is_new_list);
         client.keyframes.position = position;
         // The parts of a long list follow each other.
@@ -195,7 +228,8 @@ impl KeyframeFeed {
 impl Hub {
     /// Replaces the keyframe frustums. Call this when the keyframes have changed.
     pub fn set_keyframes(&self, keyframes: Vec<KeyframePose>) {
-        self.latest::<KeyframePoses>().send_replace(keyframes.into());
+        self.latest::<KeyframePoses>()
+            .send_replace(keyframes.into());
     }
 
     /// The keyframe frustums.

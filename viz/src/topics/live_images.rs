@@ -8,7 +8,8 @@ use crate::session::server_message::ServerMessage;
 use crate::topics::subscriptions::{Subscriptions, fitted};
 use crate::topics::updates::LiveImage;
 use crate::topics::{
-    ClientState, DefaultRate, EncodeContext, Feed, Item, Priority, Publisher, Row, Sent, Timer, Topic, receiver,
+    ClientState, DefaultRate, EncodeContext, Feed, Item, Priority, Publisher, Row, Sent, Timer,
+    Topic, receiver,
 };
 use axum::extract::ws::Message;
 use kinematics::Transform;
@@ -18,7 +19,8 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 use tokio::sync::watch;
 
-/// Maximum number of images of a camera that are encoded at the same time. Clients may want many different sizes.
+/// Maximum number of images of a camera that are encoded at the same time. Clients may want many
+/// different sizes.
 const MAX_IMAGE_ENCODINGS: usize = 4;
 
 /// Name in `subscribe`.
@@ -66,13 +68,19 @@ struct ImageEncoding {
 impl LiveImageTopic {
     /// A topic for the images of a hub.
     pub(crate) fn new(hub: &Hub) -> Self {
-        Self { source: Mutex::new(receiver(hub)), images: Arc::default() }
+        Self {
+            source: Mutex::new(receiver(hub)),
+            images: Arc::default(),
+        }
     }
 
     /// Sets an image without encoding.
     #[cfg(test)]
     pub(crate) fn set(&self, camera: &str, max_px: [u32; 2], item: Item) {
-        self.images.lock().items.insert((camera.into(), max_px), item);
+        self.images
+            .lock()
+            .items
+            .insert((camera.into(), max_px), item);
     }
 }
 
@@ -87,9 +95,17 @@ impl Topic for LiveImageTopic {
         encodings.retain(|key, encoding| encoding.is_running || wanted.contains_key(key));
         items.retain(|key, _| wanted.contains_key(key));
         for (key, image) in images_to_encode(wanted, encodings, &live_images, context.now) {
-            let encoding = ImageEncoding { image: Arc::clone(&image), at: context.now, is_running: true };
+            let encoding = ImageEncoding {
+                image: Arc::clone(&image),
+                at: context.now,
+                is_running: true,
+            };
             encodings.insert(key.clone(), encoding);
-            let task = EncodingTask { key, images: Arc::clone(&self.images), publisher: context.publisher.clone() };
+            let task = EncodingTask {
+                key,
+                images: Arc::clone(&self.images),
+                publisher: context.publisher.clone(),
+            };
             let clock = context.clock;
             tokio::task::spawn_blocking(move || task.run(&image, clock));
         }
@@ -102,11 +118,15 @@ impl Topic for LiveImageTopic {
     }
 
     fn feed(self: Arc<Self>) -> Box<dyn Feed> {
-        Box::new(ImageFeed { images: Arc::clone(&self.images), sent: BTreeMap::new() })
+        Box::new(ImageFeed {
+            images: Arc::clone(&self.images),
+            sent: BTreeMap::new(),
+        })
     }
 }
 
-/// Encodes one image. When it is dropped, the next image with the same key may be encoded, even after a panic.
+/// Encodes one image. When it is dropped, the next image with the same key may be encoded, even
+/// after a panic.
 struct EncodingTask {
     key: ImageKey,
     images: Arc<Mutex<EncodedImages>>,
@@ -117,7 +137,10 @@ impl EncodingTask {
     fn run(self, image: &LiveImage, clock: ServerClock) {
         let message = live_message(image, self.key.1, clock);
         self.publisher.publish(|number| {
-            self.images.lock().items.insert(self.key.clone(), Item { number, message });
+            self.images
+                .lock()
+                .items
+                .insert(self.key.clone(), Item { number, message });
         });
     }
 }
@@ -135,7 +158,12 @@ fn live_message(image: &LiveImage, max_px: [u32; 2], clock: ServerClock) -> Mess
         Ok(bytes) => Message::binary(bytes),
         Err(error) => {
             let message = format!("live image of camera {:?}: {error}", image.camera);
-            ServerMessage::Error { id: None, view: None, message: &message }.to_message()
+            ServerMessage::Error {
+                id: None,
+                view: None,
+                message: &message,
+            }
+            .to_message()
         }
     }
 }
@@ -149,16 +177,20 @@ fn wanted_images<'a>(
     for demand in demands {
         for camera in cameras.clone() {
             let subscription = demand.subscriptions.images_of(camera);
-            let Some(period) = subscription.period else { continue };
-            let shortest = wanted.entry((Arc::clone(camera), subscription.max_px)).or_insert(period);
+            let Some(period) = subscription.period else {
+                continue;
+            };
+            let shortest = wanted
+                .entry((Arc::clone(camera), subscription.max_px))
+                .or_insert(period);
             *shortest = period.min(*shortest);
         }
     }
     wanted
 }
 
-/// The new images whose encoding can begin now. If a camera's images are wanted in many sizes, those come first that were
-/// encoded longest ago.
+/// The new images whose encoding can begin now. If a camera's images are wanted in many sizes,
+/// those come first that were encoded longest ago.
 fn images_to_encode(
     wanted: BTreeMap<ImageKey, Duration>,
     encodings: &BTreeMap<ImageKey, ImageEncoding>,
@@ -206,18 +238,26 @@ impl Feed for ImageFeed {
             is_next.then_some((sent.number, camera, item))
         });
         let (_, camera, item) = waiting.min_by_key(|(number, ..)| *number)?;
-        self.sent.insert(Arc::clone(camera), Sent { number: item.number, at: Some(timer.now) });
+        self.sent.insert(
+            Arc::clone(camera),
+            Sent {
+                number: item.number,
+                at: Some(timer.now),
+            },
+        );
         Some(item.message.clone())
     }
 }
 
 impl Hub {
-    /// Sets the latest image of a camera. It is encoded later, on another thread, and only while clients are
-    /// connected. Its pose is corrected as set by [`Self::set_camera_corrections`].
+    /// Sets the latest image of a camera. It is encoded later, on another thread, and only while
+    /// clients are connected. Its pose is corrected as set by [`Self::set_camera_corrections`].
     pub fn set_live_image(&self, mut image: LiveImage) {
         let corrections = self.latest::<CameraCorrections>();
-        if let (Some(pose), Some(correction)) = (&mut image.world_from_camera, corrections.borrow().get(&image.camera))
-        {
+        if let (Some(pose), Some(correction)) = (
+            &mut image.world_from_camera,
+            corrections.borrow().get(&image.camera),
+        ) {
             *pose *= correction;
         }
         self.latest::<LiveImages>().send_modify(|images| {
@@ -225,7 +265,8 @@ impl Hub {
         });
     }
 
-    /// Sets `reported_from_corrected` of each camera, with which the poses of later live images are corrected.
+    /// Sets `reported_from_corrected` of each camera, with which the poses of later live images are
+    /// corrected.
     pub fn set_camera_corrections(&self, corrections: BTreeMap<Arc<str>, Transform>) {
         self.latest::<CameraCorrections>().send_replace(corrections);
     }
@@ -274,17 +315,36 @@ mod tests {
             let images = [image("left"), image("right")].into();
             now += Duration::from_millis(20);
             let started = images_to_encode(wanted.clone(), &encodings, &images, now);
-            let n_left = started.iter().filter(|((camera, _), _)| &**camera == "left").count();
-            assert_eq!((n_left, started.len()), (MAX_IMAGE_ENCODINGS, MAX_IMAGE_ENCODINGS + 1), "round {round}");
+            let n_left = started
+                .iter()
+                .filter(|((camera, _), _)| &**camera == "left")
+                .count();
+            assert_eq!(
+                (n_left, started.len()),
+                (MAX_IMAGE_ENCODINGS, MAX_IMAGE_ENCODINGS + 1),
+                "round {round}"
+            );
             for (key, image) in started {
                 encoded.insert(key.clone());
                 // The encodings begin one after another.
                 now += Duration::from_micros(1);
-                encodings.insert(key, ImageEncoding { image, at: now, is_running: true });
+                encodings.insert(
+                    key,
+                    ImageEncoding {
+                        image,
+                        at: now,
+                        is_running: true,
+                    },
+                );
             }
             let images = [image("left"), image("right")].into();
-            assert!(images_to_encode(wanted.clone(), &encodings, &images, now).is_empty(), "all slots are in use");
-            encodings.values_mut().for_each(|encoding| encoding.is_running = false);
+            assert!(
+                images_to_encode(wanted.clone(), &encodings, &images, now).is_empty(),
+                "all slots are in use"
+            );
+            encodings
+                .values_mut()
+                .for_each(|encoding| encoding.is_running = false);
         }
         assert_eq!(encoded.len(), wanted.len(), "no size has to wait longer");
     }

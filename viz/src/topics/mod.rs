@@ -1,11 +1,12 @@
 //! The kinds of data that clients receive besides pictures, each of which is a topic.
 //!
-//! A topic has two halves. [`Topic`] takes new data from the hub, and encodes it once for all clients. [`Feed`] decides what
-//! one client receives next. What the halves share is known to the topic alone.
+//! A topic has two halves. [`Topic`] takes new data from the hub, and encodes it once for all
+//! clients. [`Feed`] decides what one client receives next. What the halves share is known to the
+//! topic alone.
 //!
-//! To add a topic, write a module and a row of [`TOPICS`]. If all clients receive the same messages, implement
-//! [`ItemTopic`](items::ItemTopic), which needs a name, a period and a function that encodes. `docs/reference/protocol.md`
-//! lists the topics.
+//! To add a topic, write a module and a row of [`TOPICS`]. If all clients receive the same
+//! messages, implement [`ItemTopic`](items::ItemTopic), which needs a name, a period and a function
+//! that encodes. `docs/reference/protocol.md` lists the topics.
 
 mod base_path;
 pub(crate) mod chunk_list;
@@ -84,8 +85,8 @@ pub(crate) enum DefaultRate {
 pub(crate) enum Priority {
     /// Short messages, before pictures.
     Short,
-    /// Long messages about what the devices see now. They take turns with keyframes, so that neither delays the other for
-    /// long.
+    /// Long messages about what the devices see now. They take turns with keyframes, so that
+    /// neither delays the other for long.
     Live,
     /// Long messages about keyframes.
     Keyframes,
@@ -93,13 +94,15 @@ pub(crate) enum Priority {
     Background,
 }
 
-/// The half of a topic that encodes new data once for all clients. It works outside the sessions, on the server's thread.
+/// The half of a topic that encodes new data once for all clients. It works outside the sessions,
+/// on the server's thread.
 pub(crate) trait Topic: Send + Sync {
-    /// Encodes what is new and due, if a client receives it. Work that takes more than a millisecond belongs on a thread
-    /// for blocking tasks.
+    /// Encodes what is new and due, if a client receives it. Work that takes more than a
+    /// millisecond belongs on a thread for blocking tasks.
     fn encode(&self, context: &EncodeContext<'_>);
 
-    /// Forgets what was encoded, because no client is connected. The next client receives everything.
+    /// Forgets what was encoded, because no client is connected. The next client receives
+    /// everything.
     fn clear(&self);
 
     /// The half for a client that has received nothing.
@@ -130,12 +133,16 @@ pub(crate) struct EncodeContext<'a> {
 impl EncodeContext<'_> {
     /// What those clients receive that have said what they want, or have had time to.
     pub(crate) fn settled(&self) -> impl Iterator<Item = &Demand> {
-        self.demands.iter().filter(|demand| demand.settles_at(self.now).is_none())
+        self.demands
+            .iter()
+            .filter(|demand| demand.settles_at(self.now).is_none())
     }
 
     /// Whether a client receives a topic.
     pub(crate) fn is_wanted(&self, topic: &str) -> bool {
-        self.demands.iter().any(|demand| demand.subscriptions.period(topic).is_some())
+        self.demands
+            .iter()
+            .any(|demand| demand.subscriptions.period(topic).is_some())
     }
 }
 
@@ -166,7 +173,8 @@ pub(crate) struct Publisher {
 }
 
 impl Publisher {
-    /// Calls `store` with the number of a new message, and then wakes up the sessions. Later messages have larger numbers.
+    /// Calls `store` with the number of a new message, and then wakes up the sessions. Later
+    /// messages have larger numbers.
     pub(crate) fn publish(&self, store: impl FnOnce(u64)) {
         store(1 + self.n_messages.fetch_add(1, Ordering::Relaxed));
         self.changed.send_replace(());
@@ -201,12 +209,17 @@ pub(crate) struct Timer {
 
 impl Timer {
     pub(crate) fn new(now: Instant) -> Self {
-        Self { now, earliest: None }
+        Self {
+            now,
+            earliest: None,
+        }
     }
 
     /// Whether a message may be sent after this period since the last one.
     pub(crate) fn is_due(&mut self, last: Option<Instant>, period: Duration) -> bool {
-        let due = last.and_then(|at| at.checked_add(period)).unwrap_or(self.now);
+        let due = last
+            .and_then(|at| at.checked_add(period))
+            .unwrap_or(self.now);
         if due > self.now {
             self.wait_until(due);
         }
@@ -237,7 +250,8 @@ impl Throttle {
     }
 
     pub(crate) fn is_due(&self, now: Instant) -> bool {
-        self.last.is_none_or(|last| now.saturating_duration_since(last) >= self.period)
+        self.last
+            .is_none_or(|last| now.saturating_duration_since(last) >= self.period)
     }
 
     pub(crate) fn begin(&mut self, now: Instant) {
@@ -258,7 +272,12 @@ pub(crate) fn start_all(hub: &Hub) -> Arc<[Arc<dyn Topic>]> {
 }
 
 /// Encodes new data while clients are connected. Runs until the server stops.
-pub(crate) async fn encode_all(hub: Hub, clock: ServerClock, topics: Arc<[Arc<dyn Topic>]>, publisher: Publisher) {
+pub(crate) async fn encode_all(
+    hub: Hub,
+    clock: ServerClock,
+    topics: Arc<[Arc<dyn Topic>]>,
+    publisher: Publisher,
+) {
     let mut check = tokio::time::interval(CHECK_PERIOD);
     check.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
     loop {
@@ -268,17 +287,26 @@ pub(crate) async fn encode_all(hub: Hub, clock: ServerClock, topics: Arc<[Arc<dy
             continue;
         }
         let (demands, now) = (hub.demands(), Instant::now());
-        let context = EncodeContext { hub: &hub, clock, publisher: &publisher, now, demands };
+        let context = EncodeContext {
+            hub: &hub,
+            clock,
+            publisher: &publisher,
+            now,
+            demands,
+        };
         for topic in topics.iter() {
             topic.encode(&context);
         }
     }
 }
 
-/// Returns the value if it changed since the last call. An error would mean that the hub was dropped, but the hub
-/// outlives the server.
+/// Returns the value if it changed since the last call. An error would mean that the hub was
+/// dropped, but the hub outlives the server.
 fn take_if_changed<T: Clone>(receiver: &mut watch::Receiver<T>) -> Option<T> {
-    receiver.has_changed().unwrap_or(false).then(|| receiver.borrow_and_update().clone())
+    receiver
+        .has_changed()
+        .unwrap_or(false)
+        .then(|| receiver.borrow_and_update().clone())
 }
 
 /// A receiver of data of the hub that also returns what was set earlier.

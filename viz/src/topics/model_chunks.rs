@@ -4,7 +4,8 @@ use crate::Hub;
 use crate::topics::chunk_list::ChunkList;
 use crate::topics::chunk_sender::{ChunkSender, NextChunk};
 use crate::topics::{
-    ClientState, DefaultRate, EncodeContext, Feed, Priority, Row, Timer, Topic, receiver, take_if_changed,
+    ClientState, DefaultRate, EncodeContext, Feed, Priority, Row, Timer, Topic, receiver,
+    take_if_changed,
 };
 use axum::extract::ws::Message;
 use kinematics::Transform;
@@ -23,7 +24,11 @@ pub(crate) const ROW: Row = Row {
     name: NAME,
     default: DefaultRate::Off,
     priority: Priority::Background,
-    start: |hub| Arc::new(ChunkTopic { lists: Mutex::new(receiver(hub)) }),
+    start: |hub| {
+        Arc::new(ChunkTopic {
+            lists: Mutex::new(receiver(hub)),
+        })
+    },
 };
 
 /// Chunks of models by method.
@@ -47,7 +52,10 @@ impl Topic for ChunkTopic {
     fn clear(&self) {}
 
     fn feed(self: Arc<Self>) -> Box<dyn Feed> {
-        Box::new(ChunkFeed { lists: self.lists.lock().clone(), sender: ChunkSender::default() })
+        Box::new(ChunkFeed {
+            lists: self.lists.lock().clone(),
+            sender: ChunkSender::default(),
+        })
     }
 }
 
@@ -62,7 +70,10 @@ impl Feed for ChunkFeed {
     fn next(&mut self, client: &mut ClientState<'_>, timer: &mut Timer) -> Option<Message> {
         let subscription = client.subscriptions.model_chunks.as_ref()?;
         let list = self.lists.borrow().get(&subscription.method).cloned()?;
-        match self.sender.next(&list, subscription, client.viewpoint, timer.now) {
+        match self
+            .sender
+            .next(&list, subscription, client.viewpoint, timer.now)
+        {
             NextChunk::Send(message) => Some(message),
             NextChunk::WaitUntil(due) => {
                 timer.wait_until(due);
@@ -74,10 +85,14 @@ impl Feed for ChunkFeed {
 }
 
 impl Hub {
-    /// The minimum time between two calls of [`Self::set_model_chunks`] for a model; `None` if no client draws it.
+    /// The minimum time between two calls of [`Self::set_model_chunks`] for a model; `None` if no
+    /// client draws it.
     pub fn chunk_period(&self, method: &str) -> Option<Duration> {
         self.min_over_subscriptions(|subscriptions| {
-            let chunks = subscriptions.model_chunks.as_ref().filter(|chunks| &*chunks.method == method);
+            let chunks = subscriptions
+                .model_chunks
+                .as_ref()
+                .filter(|chunks| &*chunks.method == method);
             chunks.map(|chunks| chunks.period)
         })
     }
@@ -87,14 +102,18 @@ impl Hub {
         self.latest::<ModelLists>().borrow().contains_key(method)
     }
 
-    /// Sets the chunks of a model, or those that have changed. They are kept only while a client draws the model.
+    /// Sets the chunks of a model, or those that have changed. They are kept only while a client
+    /// draws the model.
     pub fn set_model_chunks(&self, method: &str, chunks: ModelChunks) {
         if self.chunk_period(method).is_none() {
             return;
         }
         let world_from_model = self.latest::<WorldFromModel>().borrow().unwrap_or_default();
         self.latest::<ModelLists>().send_modify(|lists| {
-            let mut list = lists.get(method).map(|list| (**list).clone()).unwrap_or_default();
+            let mut list = lists
+                .get(method)
+                .map(|list| (**list).clone())
+                .unwrap_or_default();
             list.world_from_model = world_from_model;
             if list.apply(chunks) {
                 lists.insert(method.into(), Arc::new(list));
@@ -102,9 +121,11 @@ impl Hub {
         });
     }
 
-    /// Sets the pose of models in the world of the clients, for chunks; by default, the two frames are the same.
+    /// Sets the pose of models in the world of the clients, for chunks; by default, the two frames
+    /// are the same.
     pub fn set_world_from_model(&self, world_from_model: Transform) {
-        self.latest::<WorldFromModel>().send_replace(Some(world_from_model));
+        self.latest::<WorldFromModel>()
+            .send_replace(Some(world_from_model));
     }
 
     /// Frees the chunks of models that no client draws any longer.

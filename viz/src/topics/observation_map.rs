@@ -19,7 +19,8 @@ const UNDETERMINED: u8 = 255;
 /// Number represented by code 1.
 const MIN_AGE_SECS: f64 = 0.1;
 const MIN_SIGMA_M: f64 = 1e-5;
-/// Natural logarithm of the ratio of two consecutive codes: code 254 stands for 31 hours and for 11 m.
+/// Natural logarithm of the ratio of two consecutive codes: code 254 stands for 31 hours and for 11
+/// m.
 const LOG_STEP: f64 = 0.055;
 /// Neighboring cells have similar codes, so higher levels gain little.
 const LEVEL: u32 = 3;
@@ -48,8 +49,8 @@ pub struct ObservedCell {
     pub ix: usize,
     /// Time from its last observation to the newest view, seconds.
     pub age_secs: f64,
-    /// Standard deviation of the position of its surface in the least certain direction, meters; infinite if one
-    /// direction was not measured.
+    /// Standard deviation of the position of its surface in the least certain direction, meters;
+    /// infinite if one direction was not measured.
     pub sigma_m: f64,
 }
 
@@ -64,8 +65,13 @@ impl ItemTopic for Observations {
     type Source = Option<Arc<PackedObservations>>;
 
     fn encode(&mut self, source: &Self::Source, clock: ServerClock) -> Vec<(Arc<str>, Message)> {
-        let message = source.as_ref().map(|packed| Message::binary(packed.message(clock)));
-        message.map(|message| ("".into(), message)).into_iter().collect()
+        let message = source
+            .as_ref()
+            .map(|packed| Message::binary(packed.message(clock)));
+        message
+            .map(|message| ("".into(), message))
+            .into_iter()
+            .collect()
     }
 }
 
@@ -78,7 +84,11 @@ impl Hub {
     /// Sets the map of observations. Compresses it, which takes some milliseconds.
     pub fn set_observations(&self, map: &ObservationMap) {
         match PackedObservations::new(map) {
-            Ok(packed) => _ = self.latest::<Option<Arc<PackedObservations>>>().send_replace(Some(Arc::new(packed))),
+            Ok(packed) => {
+                _ = self
+                    .latest::<Option<Arc<PackedObservations>>>()
+                    .send_replace(Some(Arc::new(packed)))
+            }
             Err(error) => log::error!("cannot compress the map of observations: {error}"),
         }
     }
@@ -136,8 +146,16 @@ impl PackedObservations {
 /// The logarithmic code of a number.
 fn code(value: f64, min: f64) -> u8 {
     let steps = (value.max(min) / min).ln() / LOG_STEP;
-    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "between 1 and 254")]
-    if steps < f64::from(UNDETERMINED - 2) + 0.5 { 1 + steps.round() as u8 } else { UNDETERMINED }
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "between 1 and 254"
+    )]
+    if steps < f64::from(UNDETERMINED - 2) + 0.5 {
+        1 + steps.round() as u8
+    } else {
+        UNDETERMINED
+    }
 }
 
 #[cfg(test)]
@@ -148,7 +166,11 @@ mod tests {
 
     #[test]
     fn codes_keep_ages_and_deviations_within_three_percent() {
-        let cell = |ix, age_secs, sigma_m| ObservedCell { ix, age_secs, sigma_m };
+        let cell = |ix, age_secs, sigma_m| ObservedCell {
+            ix,
+            age_secs,
+            sigma_m,
+        };
         let observed = vec![
             cell(0, 0.0, 0.0),
             cell(2, 12.0, 3e-4),
@@ -156,16 +178,32 @@ mod tests {
             cell(11, 1e9, f64::INFINITY),
             cell(12, 1.0, 1.0), // Outside.
         ];
-        let map = ObservationMap { cell_m: 0.1, n_cells: [2, 3, 2], observed, ..ObservationMap::default() };
+        let map = ObservationMap {
+            cell_m: 0.1,
+            n_cells: [2, 3, 2],
+            observed,
+            ..ObservationMap::default()
+        };
         let packed = PackedObservations::new(&map).expect("packed");
         let mut codes = Vec::new();
-        ZlibDecoder::new(&packed.payload[..]).read_to_end(&mut codes).expect("a zlib stream");
+        ZlibDecoder::new(&packed.payload[..])
+            .read_to_end(&mut codes)
+            .expect("a zlib stream");
         assert_eq!(codes.len(), 24);
         let number = |code: u8, min: f64| min * (LOG_STEP * f64::from(code - 1)).exp();
         let is_close = |got: f64, expected: f64| (got / expected - 1.0).abs() < 0.03;
-        assert_eq!((codes[0], codes[1], codes[12], codes[13]), (1, UNOBSERVED, 1, UNOBSERVED));
-        assert!(is_close(number(codes[2], MIN_AGE_SECS), 12.0) && is_close(number(codes[14], MIN_SIGMA_M), 3e-4));
-        assert!(is_close(number(codes[5], MIN_AGE_SECS), 90_000.0) && is_close(number(codes[17], MIN_SIGMA_M), 2.5));
+        assert_eq!(
+            (codes[0], codes[1], codes[12], codes[13]),
+            (1, UNOBSERVED, 1, UNOBSERVED)
+        );
+        assert!(
+            is_close(number(codes[2], MIN_AGE_SECS), 12.0)
+                && is_close(number(codes[14], MIN_SIGMA_M), 3e-4)
+        );
+        assert!(
+            is_close(number(codes[5], MIN_AGE_SECS), 90_000.0)
+                && is_close(number(codes[17], MIN_SIGMA_M), 2.5)
+        );
         assert_eq!((codes[11], codes[23]), (UNDETERMINED, UNDETERMINED));
     }
 }

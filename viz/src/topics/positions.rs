@@ -2,15 +2,28 @@
 
 use nalgebra::Vector3;
 
-/// Packs positions relative to an origin: 3 signed little-endian counts each. Returns them with the meters per count;
-/// `None` if there is no point away from the origin, or a coordinate is not finite.
+/// Packs positions relative to an origin: 3 signed little-endian counts each. Returns them with the
+/// meters per count; `None` if there is no point away from the origin, or a coordinate is not
+/// finite.
 pub(crate) fn pack_positions(points_m: &[Vector3<f64>]) -> Option<(Vec<u8>, f64)> {
-    let extent_m = points_m.iter().flat_map(|point| point.iter()).fold(0.0_f64, |max, value| max.max(value.abs()));
+    let extent_m = points_m
+        .iter()
+        .flat_map(|point| point.iter())
+        .fold(0.0_f64, |max, value| max.max(value.abs()));
     if extent_m <= 0.0 || !extent_m.is_finite() {
         return None;
     }
     let meters_per_count = extent_m / f64::from(i16::MAX);
-    #[expect(clippy::cast_possible_truncation, reason = "the largest coordinate is i16::MAX counts")]
+    #[expect(
+        clippy::cast_possible_truncation,
+        reason = "the largest coordinate is i16::MAX counts"
+    )]
     let count = |value: &f64| ((value / meters_per_count).round() as i16).to_le_bytes();
-    Some((points_m.iter().flat_map(|point| point.iter().flat_map(count)).collect(), meters_per_count))
+    Some((
+        points_m
+            .iter()
+            .flat_map(|point| point.iter().flat_map(count))
+            .collect(),
+        meters_per_count,
+    ))
 }

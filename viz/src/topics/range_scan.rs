@@ -56,8 +56,8 @@ impl ItemTopic for RangeScanTopic {
 }
 
 impl Hub {
-    /// Sets the latest scan of a range scanner. It is encoded later, on another thread, and only for clients that show
-    /// it.
+    /// Sets the latest scan of a range scanner. It is encoded later, on another thread, and only
+    /// for clients that show it.
     pub fn set_range_scan(&self, range_scan: RangeScan) {
         self.latest::<RangeScans>().send_modify(|scans| {
             scans.insert(Arc::clone(&range_scan.scan.scanner), Arc::new(range_scan));
@@ -67,11 +67,20 @@ impl Hub {
 
 /// The binary message with a scan; `None` without points.
 fn pack_range_scan(range_scan: &RangeScan) -> Option<Vec<u8>> {
-    let RangeScan { scan, map_from_odom } = range_scan;
+    let RangeScan {
+        scan,
+        map_from_odom,
+    } = range_scan;
     let origin = map_from_odom * Point3::from(scan.world_from_scanner.translation.vector);
     let stride = scan.points_in_world_m.len().div_ceil(MAX_POINTS).max(1);
-    let from_origin = |point: &[f32; 3]| map_from_odom * Point3::from(*point).cast::<f64>() - origin;
-    let points: Vec<Vector3<f64>> = scan.points_in_world_m.iter().step_by(stride).map(from_origin).collect();
+    let from_origin =
+        |point: &[f32; 3]| map_from_odom * Point3::from(*point).cast::<f64>() - origin;
+    let points: Vec<Vector3<f64>> = scan
+        .points_in_world_m
+        .iter()
+        .step_by(stride)
+        .map(from_origin)
+        .collect();
     let (positions, meters_per_count) = pack_positions(&points)?;
     let header = RangeScanHeader {
         scanner: &scan.scanner,
@@ -113,7 +122,8 @@ mod tests {
         let range_scan = scan(20_000);
         let message = pack_range_scan(&range_scan).expect("points");
         let n_header = u32::from_le_bytes(message[..4].try_into().expect("4 bytes")) as usize;
-        let header: serde_json::Value = serde_json::from_slice(&message[4..4 + n_header]).expect("JSON");
+        let header: serde_json::Value =
+            serde_json::from_slice(&message[4..4 + n_header]).expect("JSON");
         let n = usize::try_from(header["n_points"].as_u64().expect("a number")).expect("small");
         assert!(n <= MAX_POINTS && n > MAX_POINTS / 2, "{header}");
         let numbers = |name: &str| header[name].as_f64().expect("a number");
@@ -123,11 +133,16 @@ mod tests {
         let stride = range_scan.scan.points_in_world_m.len().div_ceil(n);
         for (ix, bytes) in payload.chunks_exact(6).enumerate() {
             let count = |axis: usize| i16::from_le_bytes([bytes[2 * axis], bytes[2 * axis + 1]]);
-            let got = Vector3::from(
-                [0, 1, 2].map(|axis| origin[axis] + f64::from(count(axis)) * numbers("meters_per_count")),
+            let got =
+                Vector3::from([0, 1, 2].map(|axis| {
+                    origin[axis] + f64::from(count(axis)) * numbers("meters_per_count")
+                }));
+            let point = nalgebra::Point3::from(range_scan.scan.points_in_world_m[ix * stride])
+                .cast::<f64>();
+            assert!(
+                (got - (range_scan.map_from_odom * point).coords).norm() < 2e-4,
+                "{ix}: {got}"
             );
-            let point = nalgebra::Point3::from(range_scan.scan.points_in_world_m[ix * stride]).cast::<f64>();
-            assert!((got - (range_scan.map_from_odom * point).coords).norm() < 2e-4, "{ix}: {got}");
         }
     }
 

@@ -22,14 +22,15 @@ pub struct RobotDescription {
     pub robot: Robot,
     /// The link whose pose is `world_from_base` in a [`RobotState`].
     pub base_link: String,
-    /// Names of the joints, in the order of the positions in a [`RobotState`]. All other joints stay at 0.
+    /// Names of the joints, in the order of the positions in a [`RobotState`]. All other joints
+    /// stay at 0.
     pub joint_names: Vec<String>,
     /// The mesh files that the shapes name.
     pub meshes: Vec<RobotMesh>,
 }
 
-/// The robot's description, which clients need before its states. Sessions send the states themselves, as soon as they
-/// arrive.
+/// The robot's description, which clients need before its states. Sessions send the states
+/// themselves, as soon as they arrive.
 #[derive(Default)]
 pub(crate) struct Description;
 
@@ -40,26 +41,36 @@ impl ItemTopic for Description {
     type Source = Option<Arc<RobotDescription>>;
 
     fn encode(&mut self, source: &Self::Source, _: ServerClock) -> Vec<(Arc<str>, Message)> {
-        let message = source.as_ref().map(|robot| ServerMessage::Robot(&RobotMessage::from(&**robot)).to_message());
-        message.map(|message| ("".into(), message)).into_iter().collect()
+        let message = source
+            .as_ref()
+            .map(|robot| ServerMessage::Robot(&RobotMessage::from(&**robot)).to_message());
+        message
+            .map(|message| ("".into(), message))
+            .into_iter()
+            .collect()
     }
 }
 
 impl Hub {
     /// Sets the robot that clients draw.
     pub fn set_robot(&self, robot: RobotDescription) {
-        self.latest::<Option<Arc<RobotDescription>>>().send_replace(Some(Arc::new(robot)));
+        self.latest::<Option<Arc<RobotDescription>>>()
+            .send_replace(Some(Arc::new(robot)));
     }
 
     /// Sets the current state of the robot.
     pub fn set_robot_state(&self, state: RobotState) {
-        self.latest::<BasePath>().send_if_modified(|path| path.push(state.world_from_base.translation.vector.into()));
-        self.latest::<Option<Arc<RobotState>>>().send_replace(Some(Arc::new(state)));
+        self.latest::<BasePath>()
+            .send_if_modified(|path| path.push(state.world_from_base.translation.vector.into()));
+        self.latest::<Option<Arc<RobotState>>>()
+            .send_replace(Some(Arc::new(state)));
     }
 
     /// Whether a client draws the robot, or the path of its base is due.
     pub fn needs_robot_state(&self) -> bool {
-        self.is_observed() || self.latest::<BasePath>().borrow().is_due() || self.is_wanted(Description::NAME)
+        self.is_observed()
+            || self.latest::<BasePath>().borrow().is_due()
+            || self.is_wanted(Description::NAME)
     }
 }
 
@@ -90,7 +101,9 @@ impl MeshFormat {
     /// The format of a file with this name; `None` if it is not supported.
     pub fn of_file(file: &str) -> Option<Self> {
         let (_, extension) = file.rsplit_once('.')?;
-        [Self::Stl, Self::Dae, Self::Obj].into_iter().find(|format| extension.eq_ignore_ascii_case(format.extension()))
+        [Self::Stl, Self::Dae, Self::Obj]
+            .into_iter()
+            .find(|format| extension.eq_ignore_ascii_case(format.extension()))
     }
 
     pub(crate) fn extension(self) -> &'static str {
@@ -117,7 +130,8 @@ pub struct RobotState {
     pub stamp: Stamp,
     /// The same time on this process's clock, from which the age of the state is computed.
     ///
-    /// Recordings and simulations stamp with other clocks. For them, pass the time at which the state was read.
+    /// Recordings and simulations stamp with other clocks. For them, pass the time at which the
+    /// state was read.
     pub captured_at: Instant,
     /// Pose of the base link.
     pub world_from_base: Transform,
@@ -135,7 +149,8 @@ pub(crate) struct RobotStateMessage {
 }
 
 impl RobotStateMessage {
-    /// Numbers are rounded to 10 micrometers or microradians, which shortens the message to a third.
+    /// Numbers are rounded to 10 micrometers or microradians, which shortens the message to a
+    /// third.
     pub(crate) fn new(state: &RobotState, clock: ServerClock) -> Self {
         let rounded = |value: f64| (value * 1e5).round() / 1e5;
         Self {
@@ -192,11 +207,25 @@ struct ShapeMessage {
 #[derive(Debug, Serialize)]
 #[serde(tag = "kind", rename_all = "snake_case")]
 enum GeometryMessage {
-    Box { size_m: [f64; 3] },
-    Cylinder { radius_m: f64, length_m: f64 },
-    Capsule { radius_m: f64, length_m: f64 },
-    Sphere { radius_m: f64 },
-    Mesh { url: String, format: MeshFormat, scale: [f64; 3] },
+    Box {
+        size_m: [f64; 3],
+    },
+    Cylinder {
+        radius_m: f64,
+        length_m: f64,
+    },
+    Capsule {
+        radius_m: f64,
+        length_m: f64,
+    },
+    Sphere {
+        radius_m: f64,
+    },
+    Mesh {
+        url: String,
+        format: MeshFormat,
+        scale: [f64; 3],
+    },
 }
 
 impl<'a> From<&'a RobotDescription> for RobotMessage<'a> {
@@ -221,7 +250,11 @@ impl<'a> From<&'a RobotDescription> for RobotMessage<'a> {
         });
         let links = robot.links().iter().map(|name| LinkMessage {
             name,
-            shapes: robot.visuals(name).iter().filter_map(|shape| description.shape_message(shape)).collect(),
+            shapes: robot
+                .visuals(name)
+                .iter()
+                .filter_map(|shape| description.shape_message(shape))
+                .collect(),
         });
         Self {
             name: robot.name(),
@@ -245,21 +278,33 @@ impl RobotDescription {
     fn shape_message(&self, shape: &Shape) -> Option<ShapeMessage> {
         let geometry = match &shape.geometry {
             Geometry::Box { size_m } => GeometryMessage::Box { size_m: *size_m },
-            Geometry::Cylinder { radius_m, length_m } => {
-                GeometryMessage::Cylinder { radius_m: *radius_m, length_m: *length_m }
-            }
-            Geometry::Capsule { radius_m, length_m } => {
-                GeometryMessage::Capsule { radius_m: *radius_m, length_m: *length_m }
-            }
-            Geometry::Sphere { radius_m } => GeometryMessage::Sphere { radius_m: *radius_m },
+            Geometry::Cylinder { radius_m, length_m } => GeometryMessage::Cylinder {
+                radius_m: *radius_m,
+                length_m: *length_m,
+            },
+            Geometry::Capsule { radius_m, length_m } => GeometryMessage::Capsule {
+                radius_m: *radius_m,
+                length_m: *length_m,
+            },
+            Geometry::Sphere { radius_m } => GeometryMessage::Sphere {
+                radius_m: *radius_m,
+            },
             Geometry::Mesh { file, scale } => {
                 let ix = self.meshes.iter().position(|mesh| mesh.file == *file)?;
                 let format = self.meshes[ix].format;
-                GeometryMessage::Mesh { url: format!("robot/{ix}.{}", format.extension()), format, scale: *scale }
+                GeometryMessage::Mesh {
+                    url: format!("robot/{ix}.{}", format.extension()),
+                    format,
+                    scale: *scale,
+                }
             }
         };
         let link_from_shape = row_major(&shape.link_from_shape);
-        Some(ShapeMessage { link_from_shape, color_srgba: shape.color_srgba, geometry })
+        Some(ShapeMessage {
+            link_from_shape,
+            color_srgba: shape.color_srgba,
+            geometry,
+        })
     }
 }
 
@@ -292,15 +337,35 @@ mod tests {
         let message = serde_json::to_value(RobotMessage::from(&description)).expect("JSON");
         let shapes = message["links"][0]["shapes"].as_array().expect("a list");
         assert_eq!(shapes.len(), 1, "the missing mesh is left out");
-        assert_eq!((&shapes[0]["url"], &shapes[0]["scale"][0]), (&"robot/0.stl".into(), &2.0.into()));
-        assert_eq!(message["joints"][0]["axis"], serde_json::json!([0.0, 1.0, 0.0]));
+        assert_eq!(
+            (&shapes[0]["url"], &shapes[0]["scale"][0]),
+            (&"robot/0.stl".into(), &2.0.into())
+        );
+        assert_eq!(
+            message["joints"][0]["axis"],
+            serde_json::json!([0.0, 1.0, 0.0])
+        );
     }
 
     #[test]
     fn only_meshes_of_the_robot_are_found() {
         let description = description();
-        assert_eq!(description.mesh_at("0.stl").map(|mesh| mesh.bytes.len()), Some(2));
-        for name in ["0.dae", "1.stl", "stl", "0", "", "..", "../0.stl", "+0.stl.stl", "-1.stl", "a.stl"] {
+        assert_eq!(
+            description.mesh_at("0.stl").map(|mesh| mesh.bytes.len()),
+            Some(2)
+        );
+        for name in [
+            "0.dae",
+            "1.stl",
+            "stl",
+            "0",
+            "",
+            "..",
+            "../0.stl",
+            "+0.stl.stl",
+            "-1.stl",
+            "a.stl",
+        ] {
             assert!(description.mesh_at(name).is_none(), "{name}");
         }
     }

@@ -20,14 +20,20 @@ impl ItemTopic for Scene {
     type Source = Option<Arc<SceneHint>>;
 
     fn encode(&mut self, source: &Self::Source, _: ServerClock) -> Vec<(Arc<str>, Message)> {
-        let message = source.as_ref().map(|hint| ServerMessage::from(&**hint).to_message());
-        message.map(|message| ("".into(), message)).into_iter().collect()
+        let message = source
+            .as_ref()
+            .map(|hint| ServerMessage::from(&**hint).to_message());
+        message
+            .map(|message| ("".into(), message))
+            .into_iter()
+            .collect()
     }
 }
 
 impl Hub {
     /// Sets the scene extent and the initial view.
     pub fn set_scene_hint(&self, hint: SceneHint) {
-        self.latest::<Option<Arc<SceneHint>>>().send_replace(Some(Arc::new(hint)));
+        self.latest::<Option<Arc<SceneHint>>>()
+            .send_replace(Some(Arc::new(hint)));
     }
 }

@@ -22,18 +22,25 @@ impl ItemTopic for RunStatus {
     type Source = Option<Arc<Status>>;
 
     fn encode(&mut self, source: &Self::Source, _: ServerClock) -> Vec<(Arc<str>, Message)> {
-        let message = source.as_ref().map(|status| ServerMessage::Status(status).to_message());
-        message.map(|message| ("".into(), message)).into_iter().collect()
+        let message = source
+            .as_ref()
+            .map(|status| ServerMessage::Status(status).to_message());
+        message
+            .map(|message| ("".into(), message))
+            .into_iter()
+            .collect()
     }
 }
 
 impl Hub {
     /// Sets the run status that clients receive.
     pub fn set_status(&self, status: Status) {
-        self.latest::<Option<Arc<Status>>>().send_replace(Some(Arc::new(status.thinned())));
+        self.latest::<Option<Arc<Status>>>()
+            .send_replace(Some(Arc::new(status.thinned())));
     }
 
-    /// Replaces the state in the latest status and keeps its numbers, for example while the model is saved.
+    /// Replaces the state in the latest status and keeps its numbers, for example while the model
+    /// is saved.
     pub fn set_state(&self, state: &str) {
         self.change_status(|status| state.clone_into(&mut status.state));
     }

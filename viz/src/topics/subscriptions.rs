@@ -11,12 +11,14 @@ use std::time::Duration;
 const MAX_CAMERAS: usize = 64;
 /// Maximum length of a camera name, bytes.
 const MAX_NAME_BYTES: usize = 256;
-/// Maximum size of live images unless a client subscribes to another one: 640 pixels wide, any height.
+/// Maximum size of live images unless a client subscribes to another one: 640 pixels wide, any
+/// height.
 const DEFAULT_IMAGE_PX: [u32; 2] = [640, u32::MAX];
-/// Minimum size of live images, pixels. Larger sizes are rounded down to multiples of it, so that clients of similar
-/// sizes share images.
+/// Minimum size of live images, pixels. Larger sizes are rounded down to multiples of it, so that
+/// clients of similar sizes share images.
 const MIN_IMAGE_PX: u32 = 16;
-/// Default and limits of the rate at which changed chunks are sent: 4.8 Mbit/s leaves room on ordinary wireless links.
+/// Default and limits of the rate at which changed chunks are sent: 4.8 Mbit/s leaves room on
+/// ordinary wireless links.
 const DEFAULT_CHUNK_BYTES_PER_SEC: f64 = 6e5;
 const CHUNK_BYTES_PER_SEC: std::ops::RangeInclusive<f64> = 1e4..=1e9;
 /// Longest period. Slower subscriptions get one message a day.
@@ -80,7 +82,10 @@ impl Default for Subscriptions {
         Self {
             topics: topics.collect(),
             model_chunks: None,
-            live_images: ImageSubscription { period, max_px: DEFAULT_IMAGE_PX },
+            live_images: ImageSubscription {
+                period,
+                max_px: DEFAULT_IMAGE_PX,
+            },
             cameras: BTreeMap::new(),
         }
     }
@@ -89,7 +94,14 @@ impl Default for Subscriptions {
 impl Subscriptions {
     /// Applies a client's message.
     pub(crate) fn apply(&mut self, message: SubscribeMessage) -> Result<(), InvalidRequest> {
-        let SubscribeMessage { topic, rate_hz, camera, size_px, method, max_bytes_per_sec } = message;
+        let SubscribeMessage {
+            topic,
+            rate_hz,
+            camera,
+            size_px,
+            method,
+            max_bytes_per_sec,
+        } = message;
         let Some((&topic, _)) = self.topics.get_key_value(&*topic) else {
             let known = self.topics.keys().copied().collect();
             return Err(InvalidRequest::Topic { got: topic, known });
@@ -103,17 +115,27 @@ impl Subscriptions {
         if topic != model_chunks::NAME && (method.is_some() || max_bytes_per_sec.is_some()) {
             return Err(InvalidRequest::NotChunks);
         }
-        if let Some(got) = size_px.filter(|size_px| size_px.iter().any(|side| *side < MIN_IMAGE_PX)) {
-            return Err(InvalidRequest::ImageSize { got, min: MIN_IMAGE_PX });
+        if let Some(got) = size_px.filter(|size_px| size_px.iter().any(|side| *side < MIN_IMAGE_PX))
+        {
+            return Err(InvalidRequest::ImageSize {
+                got,
+                min: MIN_IMAGE_PX,
+            });
         }
-        let period = Duration::try_from_secs_f64(1.0 / rate_hz).unwrap_or(MAX_PERIOD).min(MAX_PERIOD);
+        let period = Duration::try_from_secs_f64(1.0 / rate_hz)
+            .unwrap_or(MAX_PERIOD)
+            .min(MAX_PERIOD);
         let period = (rate_hz > 0.0).then_some(period);
         if topic == model_chunks::NAME {
             self.model_chunks = self.chunk_subscription(period, method, max_bytes_per_sec)?;
         }
         if topic == live_images::NAME {
-            let rounded = |size_px: [u32; 2]| size_px.map(|side| side / MIN_IMAGE_PX * MIN_IMAGE_PX);
-            let images = ImageSubscription { period, max_px: size_px.map_or(DEFAULT_IMAGE_PX, rounded) };
+            let rounded =
+                |size_px: [u32; 2]| size_px.map(|side| side / MIN_IMAGE_PX * MIN_IMAGE_PX);
+            let images = ImageSubscription {
+                period,
+                max_px: size_px.map_or(DEFAULT_IMAGE_PX, rounded),
+            };
             match camera {
                 None => self.live_images = images,
                 Some(camera) => self.set_camera(camera, images)?,
@@ -131,7 +153,9 @@ impl Subscriptions {
 
     /// Number of subscriptions to a topic so far.
     pub(crate) fn number(&self, topic: &str) -> u64 {
-        self.topics.get(topic).map_or(0, |subscription| subscription.number)
+        self.topics
+            .get(topic)
+            .map_or(0, |subscription| subscription.number)
     }
 
     fn chunk_subscription(
@@ -140,39 +164,66 @@ impl Subscriptions {
         method: Option<String>,
         max_bytes_per_sec: Option<f64>,
     ) -> Result<Option<ChunkSubscription>, InvalidRequest> {
-        let Some(period) = period else { return Ok(None) };
-        let method = method.filter(|name| name.len() <= MAX_NAME_BYTES).ok_or(InvalidRequest::NoMethod)?;
+        let Some(period) = period else {
+            return Ok(None);
+        };
+        let method = method
+            .filter(|name| name.len() <= MAX_NAME_BYTES)
+            .ok_or(InvalidRequest::NoMethod)?;
         let max_bytes_per_sec = max_bytes_per_sec.unwrap_or(DEFAULT_CHUNK_BYTES_PER_SEC);
         if !CHUNK_BYTES_PER_SEC.contains(&max_bytes_per_sec) {
-            return Err(InvalidRequest::ByteRate { got: max_bytes_per_sec });
+            return Err(InvalidRequest::ByteRate {
+                got: max_bytes_per_sec,
+            });
         }
         let number = 1 + self.number(model_chunks::NAME);
-        Ok(Some(ChunkSubscription { number, method: method.into(), period, max_bytes_per_sec }))
+        Ok(Some(ChunkSubscription {
+            number,
+            method: method.into(),
+            period,
+            max_bytes_per_sec,
+        }))
     }
 
     /// The subscription to the images of a camera.
     pub(crate) fn images_of(&self, camera: &str) -> ImageSubscription {
-        self.cameras.get(camera).copied().unwrap_or(self.live_images)
+        self.cameras
+            .get(camera)
+            .copied()
+            .unwrap_or(self.live_images)
     }
 
     /// Whether the images of any camera are sent.
     pub(crate) fn has_live_images(&self) -> bool {
-        std::iter::once(&self.live_images).chain(self.cameras.values()).any(|images| images.period.is_some())
+        std::iter::once(&self.live_images)
+            .chain(self.cameras.values())
+            .any(|images| images.period.is_some())
     }
 
-    fn set_camera(&mut self, camera: String, images: ImageSubscription) -> Result<(), InvalidRequest> {
+    fn set_camera(
+        &mut self,
+        camera: String,
+        images: ImageSubscription,
+    ) -> Result<(), InvalidRequest> {
         let is_known = self.cameras.contains_key(&*camera);
         if camera.len() > MAX_NAME_BYTES || (!is_known && self.cameras.len() >= MAX_CAMERAS) {
-            return Err(InvalidRequest::Cameras { max: MAX_CAMERAS, max_bytes: MAX_NAME_BYTES });
+            return Err(InvalidRequest::Cameras {
+                max: MAX_CAMERAS,
+                max_bytes: MAX_NAME_BYTES,
+            });
         }
         self.cameras.insert(camera.into(), images);
         Ok(())
     }
 }
 
-/// The largest size within `max_px` that has the aspect ratio of `size_px`, and at least one pixel. Images are never
-/// enlarged.
-#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "smaller than the image")]
+/// The largest size within `max_px` that has the aspect ratio of `size_px`, and at least one pixel.
+/// Images are never enlarged.
+#[expect(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "smaller than the image"
+)]
 pub(crate) fn fitted(size_px: [u32; 2], max_px: [u32; 2]) -> [u32; 2] {
     let ratio = |axis: usize| f64::from(max_px[axis]) / f64::from(size_px[axis].max(1));
     let scale = ratio(0).min(ratio(1)).min(1.0);
@@ -187,59 +238,127 @@ mod tests {
     use std::time::Duration;
 
     fn apply(subscriptions: &mut Subscriptions, message: Value) -> Result<(), String> {
-        let message = serde_json::from_value::<SubscribeMessage>(message).map_err(|error| error.to_string())?;
-        subscriptions.apply(message).map_err(|error| error.to_string())
+        let message = serde_json::from_value::<SubscribeMessage>(message)
+            .map_err(|error| error.to_string())?;
+        subscriptions
+            .apply(message)
+            .map_err(|error| error.to_string())
     }
 
     #[test]
     fn cameras_have_their_own_size_and_rate() {
         let mut subscriptions = Subscriptions::default();
         assert_eq!(subscriptions.images_of("wrist").max_px[0], 640);
-        apply(&mut subscriptions, json!({"topic": "live_images", "rate_hz": 2.0, "size_px": [240, 255]}))
-            .expect("valid");
-        apply(&mut subscriptions, json!({"topic": "live_images", "rate_hz": 0, "camera": "rear"})).expect("valid");
+        apply(
+            &mut subscriptions,
+            json!({"topic": "live_images", "rate_hz": 2.0, "size_px": [240, 255]}),
+        )
+        .expect("valid");
+        apply(
+            &mut subscriptions,
+            json!({"topic": "live_images", "rate_hz": 0, "camera": "rear"}),
+        )
+        .expect("valid");
         assert_eq!(subscriptions.images_of("wrist").max_px, [240, 240]);
-        assert_eq!(subscriptions.images_of("wrist").period, Some(Duration::from_millis(500)));
+        assert_eq!(
+            subscriptions.images_of("wrist").period,
+            Some(Duration::from_millis(500))
+        );
         assert_eq!(subscriptions.images_of("rear").period, None);
         assert!(subscriptions.has_live_images());
-        apply(&mut subscriptions, json!({"topic": "live_images", "rate_hz": 0})).expect("valid");
-        assert!(!subscriptions.has_live_images(), "neither the rear camera nor the others");
-        apply(&mut subscriptions, json!({"topic": "live_images", "rate_hz": 1, "camera": "front"})).expect("valid");
+        apply(
+            &mut subscriptions,
+            json!({"topic": "live_images", "rate_hz": 0}),
+        )
+        .expect("valid");
+        assert!(
+            !subscriptions.has_live_images(),
+            "neither the rear camera nor the others"
+        );
+        apply(
+            &mut subscriptions,
+            json!({"topic": "live_images", "rate_hz": 1, "camera": "front"}),
+        )
+        .expect("valid");
         assert!(subscriptions.has_live_images(), "the front camera");
-        assert_eq!(subscriptions.period("robot_state"), None, "costs nothing until a client subscribes");
-        apply(&mut subscriptions, json!({"topic": "robot_state", "rate_hz": 50})).expect("valid");
-        assert_eq!(subscriptions.period("robot_state"), Some(Duration::from_millis(20)));
+        assert_eq!(
+            subscriptions.period("robot_state"),
+            None,
+            "costs nothing until a client subscribes"
+        );
+        apply(
+            &mut subscriptions,
+            json!({"topic": "robot_state", "rate_hz": 50}),
+        )
+        .expect("valid");
+        assert_eq!(
+            subscriptions.period("robot_state"),
+            Some(Duration::from_millis(20))
+        );
         // The slowest rate that a number can express is no error.
-        apply(&mut subscriptions, json!({"topic": "status", "rate_hz": 5e-324})).expect("valid");
-        assert_eq!(subscriptions.period("status"), Some(Duration::from_secs(86_400)));
+        apply(
+            &mut subscriptions,
+            json!({"topic": "status", "rate_hz": 5e-324}),
+        )
+        .expect("valid");
+        assert_eq!(
+            subscriptions.period("status"),
+            Some(Duration::from_secs(86_400))
+        );
     }
 
     #[test]
     fn invalid_subscriptions_are_rejected() {
         let mut subscriptions = Subscriptions::default();
         for (message, named) in [
-            (json!({"topic": "tides", "rate_hz": 1}), "\"tides\", expected one of \"base_path\""),
+            (
+                json!({"topic": "tides", "rate_hz": 1}),
+                "\"tides\", expected one of \"base_path\"",
+            ),
             (json!({"topic": "scene", "rate_hz": 1}), "\"scene\""),
             (json!({"topic": "status"}), "rate_hz"),
             (json!({"topic": "status", "rate_hz": -1}), "rate_hz is -1"),
             (json!({"topic": "status", "rate_hz": 101}), "rate_hz is 101"),
-            (json!({"topic": "status", "rate_hz": 1, "size_px": [9, 9]}), "live_images"),
-            (json!({"topic": "live_images", "rate_hz": 1, "size_px": [9, 100]}), "16"),
-            (json!({"topic": "live_images", "rate_hz": 1, "colour": true}), "colour"),
+            (
+                json!({"topic": "status", "rate_hz": 1, "size_px": [9, 9]}),
+                "live_images",
+            ),
+            (
+                json!({"topic": "live_images", "rate_hz": 1, "size_px": [9, 100]}),
+                "16",
+            ),
+            (
+                json!({"topic": "live_images", "rate_hz": 1, "colour": true}),
+                "colour",
+            ),
             (json!({"topic": "model_chunks", "rate_hz": 1}), "method"),
-            (json!({"topic": "model_chunks", "rate_hz": 1, "method": "m".repeat(999)}), "method"),
-            (json!({"topic": "model_chunks", "rate_hz": 1, "method": "m", "max_bytes_per_sec": 1}), "10000"),
-            (json!({"topic": "status", "rate_hz": 1, "method": "splat"}), "model_chunks"),
+            (
+                json!({"topic": "model_chunks", "rate_hz": 1, "method": "m".repeat(999)}),
+                "method",
+            ),
+            (
+                json!({"topic": "model_chunks", "rate_hz": 1, "method": "m", "max_bytes_per_sec": 1}),
+                "10000",
+            ),
+            (
+                json!({"topic": "status", "rate_hz": 1, "method": "splat"}),
+                "model_chunks",
+            ),
         ] {
             let error = apply(&mut subscriptions, message.clone()).expect_err("invalid");
             assert!(error.contains(named), "{message}: {error}");
         }
         assert_eq!(subscriptions, Subscriptions::default());
-        let of_camera = |ix: usize| json!({"topic": "live_images", "rate_hz": 1, "camera": ix.to_string()});
+        let of_camera =
+            |ix: usize| json!({"topic": "live_images", "rate_hz": 1, "camera": ix.to_string()});
         for ix in 0..MAX_CAMERAS {
             apply(&mut subscriptions, of_camera(ix)).expect("valid");
         }
-        assert!(apply(&mut subscriptions, of_camera(MAX_CAMERAS)).expect_err("too many").contains("64"));
+        assert!(
+            apply(&mut subscriptions, of_camera(MAX_CAMERAS))
+                .expect_err("too many")
+                .contains("64")
+        );
         apply(&mut subscriptions, of_camera(0)).expect("a known camera can be changed");
     }
 

@@ -1,4 +1,5 @@
-//! A topic that exists only in tests: what a new topic needs is in this file and in one row of the table.
+//! A topic that exists only in tests: what a new topic needs is in this file and in one row of the
+//! table.
 
 use crate::Hub;
 use crate::clock::ServerClock;
@@ -18,9 +19,13 @@ impl ItemTopic for Weather {
     type Source = Option<Celsius>;
 
     fn encode(&mut self, source: &Self::Source, _: ServerClock) -> Vec<(Arc<str>, Message)> {
-        let message =
-            source.map(|Celsius(celsius)| Message::text(format!(r#"{{"type":"weather","celsius":{celsius}}}"#)));
-        message.map(|message| ("".into(), message)).into_iter().collect()
+        let message = source.map(|Celsius(celsius)| {
+            Message::text(format!(r#"{{"type":"weather","celsius":{celsius}}}"#))
+        });
+        message
+            .map(|message| ("".into(), message))
+            .into_iter()
+            .collect()
     }
 }
 
@@ -30,7 +35,8 @@ pub(crate) struct Celsius(f64);
 
 impl Hub {
     fn set_temperature(&self, celsius: f64) {
-        self.latest::<Option<Celsius>>().send_replace(Some(Celsius(celsius)));
+        self.latest::<Option<Celsius>>()
+            .send_replace(Some(Celsius(celsius)));
     }
 }
 
@@ -38,15 +44,24 @@ impl Hub {
 #[test]
 fn new_topic_reaches_subscribed_clients() {
     let hub = Hub::new();
-    let server = crate::Server::start(crate::ServerConfig { listen: ([127, 0, 0, 1], 0).into() }, hub.clone());
+    let server = crate::Server::start(
+        crate::ServerConfig {
+            listen: ([127, 0, 0, 1], 0).into(),
+        },
+        hub.clone(),
+    );
     let server = server.expect("a free port");
     let url = format!("ws://{}/ws", server.address());
     let (mut client, _) = tungstenite::connect(url).expect("a server");
     hub.set_temperature(20.5);
     let mut next = |is_wanted: &dyn Fn(&serde_json::Value) -> bool| loop {
         let message = client.read().expect("a message");
-        let Ok(text) = message.to_text() else { continue };
-        let Ok(json) = serde_json::from_str::<serde_json::Value>(text) else { continue };
+        let Ok(text) = message.to_text() else {
+            continue;
+        };
+        let Ok(json) = serde_json::from_str::<serde_json::Value>(text) else {
+            continue;
+        };
         assert!(json["type"] != "error", "{json}");
         if is_wanted(&json) {
             return json;
@@ -54,11 +69,14 @@ fn new_topic_reaches_subscribed_clients() {
         assert!(json["type"] != "weather", "{json}");
         if json["type"] == "hello" {
             let subscribe = r#"{"type":"subscribe","topic":"weather","rate_hz":50}"#;
-            client.send(tungstenite::Message::text(subscribe)).expect("an open connection");
+            client
+                .send(tungstenite::Message::text(subscribe))
+                .expect("an open connection");
         }
     };
-    let temperature =
-        |celsius: f64| move |json: &serde_json::Value| json["type"] == "weather" && json["celsius"] == celsius;
+    let temperature = |celsius: f64| {
+        move |json: &serde_json::Value| json["type"] == "weather" && json["celsius"] == celsius
+    };
     next(&temperature(20.5));
     hub.set_temperature(21.0);
     next(&temperature(21.0));

@@ -36,7 +36,8 @@ pub struct Status {
     pub guidance: Option<Guidance>,
 }
 
-/// What the operator should do next. While there is guidance, the page shows the camera images instead of a model.
+/// What the operator should do next. While there is guidance, the page shows the camera images
+/// instead of a model.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Guidance {
     /// What was done so far, and what to do next.
@@ -82,8 +83,8 @@ pub struct ModelStatus {
 }
 
 impl Status {
-    /// Returns the same status with curves that are short enough to send several times per second. The first and last
-    /// points are kept.
+    /// Returns the same status with curves that are short enough to send several times per second.
+    /// The first and last points are kept.
     pub(crate) fn thinned(mut self) -> Self {
         for model in std::iter::once(&mut self.model).chain(&mut self.others) {
             let n = model.psnr_history.len();
@@ -145,7 +146,8 @@ pub struct LiveImage {
     pub stamp: Stamp,
     /// Mid-exposure on this process's clock, from which the age of the image is computed.
     ///
-    /// Recordings and simulations stamp with other clocks. For them, pass the time at which the image was read.
+    /// Recordings and simulations stamp with other clocks. For them, pass the time at which the
+    /// image was read.
     pub captured_at: Instant,
     /// Width and height, pixels.
     pub size_px: [u32; 2],
@@ -165,16 +167,33 @@ mod tests {
 
     #[test]
     fn long_curves_are_thinned_keeping_ends() {
-        let with = |psnr_history: Vec<(f64, f64)>| ModelStatus { psnr_history, ..ModelStatus::default() };
-        let long = with((0..5000).map(|ix| (f64::from(ix), f64::from(ix) * 0.5)).collect());
+        let with = |psnr_history: Vec<(f64, f64)>| ModelStatus {
+            psnr_history,
+            ..ModelStatus::default()
+        };
+        let long = with(
+            (0..5000)
+                .map(|ix| (f64::from(ix), f64::from(ix) * 0.5))
+                .collect(),
+        );
         let short = with(vec![(1.0, 2.0)]);
-        let status = Status { model: long.clone(), others: vec![short.clone(), long], ..Status::default() }.thinned();
+        let status = Status {
+            model: long.clone(),
+            others: vec![short.clone(), long],
+            ..Status::default()
+        }
+        .thinned();
         assert_eq!(status.others[0], short);
         for model in [&status.model, &status.others[1]] {
             assert_eq!(model.psnr_history.len(), MAX_HISTORY);
             assert_eq!(model.psnr_history.first(), Some(&(0.0, 0.0)));
             assert_eq!(model.psnr_history.last(), Some(&(4999.0, 2499.5)));
-            assert!(model.psnr_history.windows(2).all(|pair| pair[0].0 < pair[1].0));
+            assert!(
+                model
+                    .psnr_history
+                    .windows(2)
+                    .all(|pair| pair[0].0 < pair[1].0)
+            );
         }
     }
 }

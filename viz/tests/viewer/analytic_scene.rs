@@ -10,19 +10,36 @@ struct Ball {
     color: [f64; 3],
 }
 
-/// Red on the x axis, green on the y axis, blue above the origin, so that mirrored or rotated pictures are detected.
+/// Red on the x axis, green on the y axis, blue above the origin, so that mirrored or rotated
+/// pictures are detected.
 const BALLS: [Ball; 3] = [
-    Ball { center: Point3::new(0.5, 0.0, 0.15), radius_m: 0.15, color: [0.85, 0.2, 0.15] },
-    Ball { center: Point3::new(0.0, 0.5, 0.15), radius_m: 0.15, color: [0.2, 0.7, 0.25] },
-    Ball { center: Point3::new(0.0, 0.0, 0.5), radius_m: 0.12, color: [0.2, 0.35, 0.9] },
+    Ball {
+        center: Point3::new(0.5, 0.0, 0.15),
+        radius_m: 0.15,
+        color: [0.85, 0.2, 0.15],
+    },
+    Ball {
+        center: Point3::new(0.0, 0.5, 0.15),
+        radius_m: 0.15,
+        color: [0.2, 0.7, 0.25],
+    },
+    Ball {
+        center: Point3::new(0.0, 0.0, 0.5),
+        radius_m: 0.12,
+        color: [0.2, 0.35, 0.9],
+    },
 ];
 /// Half size of the floor. Beyond it, background is visible.
 const FLOOR_HALF_M: f64 = 1.0;
 
 /// A camera at (0, -2, 0.5) that looks along the world's y axis.
 pub(crate) fn looking_along_y() -> Isometry3<f64> {
-    let rotation = Rotation3::from_matrix_unchecked(Matrix3::new(1., 0., 0., 0., 0., 1., 0., -1., 0.));
-    Isometry3::from_parts(Translation3::new(0.0, -2.0, 0.5), UnitQuaternion::from_rotation_matrix(&rotation))
+    let rotation =
+        Rotation3::from_matrix_unchecked(Matrix3::new(1., 0., 0., 0., 0., 1., 0., -1., 0.));
+    Isometry3::from_parts(
+        Translation3::new(0.0, -2.0, 0.5),
+        UnitQuaternion::from_rotation_matrix(&rotation),
+    )
 }
 
 /// Renders a request.
@@ -45,30 +62,51 @@ pub(crate) fn draw(request: &RenderRequest) -> Picture {
             depth_m.push(hit.map_or(0.0, |hit| hit.0 as f32));
         }
     }
-    Picture { size_px: request.size_px, rgba_srgb, depth_m }
+    Picture {
+        size_px: request.size_px,
+        rgba_srgb,
+        depth_m,
+    }
 }
 
 /// Eye and direction of a pixel in world; hits of the direction are depths.
 pub(crate) fn ray_in_world(request: &RenderRequest, u: f64, v: f64) -> (Point3<f64>, Vector3<f64>) {
     let eye = Point3::from(request.world_from_camera.translation.vector);
-    (eye, request.world_from_camera.rotation * ray_in_camera(request, u, v))
+    (
+        eye,
+        request.world_from_camera.rotation * ray_in_camera(request, u, v),
+    )
 }
 
-/// Direction of a pixel; its length is 1 along z (pinhole) or 1 (equirectangular), so that hits are depths.
+/// Direction of a pixel; its length is 1 along z (pinhole) or 1 (equirectangular), so that hits are
+/// depths.
 fn ray_in_camera(request: &RenderRequest, u: f64, v: f64) -> Vector3<f64> {
     match request.projection {
-        Projection::Pinhole { focal_px, principal_px } => {
-            Vector3::new((u - principal_px[0]) / focal_px[0], (v - principal_px[1]) / focal_px[1], 1.0)
-        }
+        Projection::Pinhole {
+            focal_px,
+            principal_px,
+        } => Vector3::new(
+            (u - principal_px[0]) / focal_px[0],
+            (v - principal_px[1]) / focal_px[1],
+            1.0,
+        ),
         Projection::Equirectangular => {
             let longitude = (u / f64::from(request.size_px[0]) - 0.5) * std::f64::consts::TAU;
             let latitude = (0.5 - v / f64::from(request.size_px[1])) * std::f64::consts::PI;
-            Vector3::new(latitude.cos() * longitude.sin(), -latitude.sin(), latitude.cos() * longitude.cos())
+            Vector3::new(
+                latitude.cos() * longitude.sin(),
+                -latitude.sin(),
+                latitude.cos() * longitude.cos(),
+            )
         }
     }
 }
 
-fn nearest_hit(request: &RenderRequest, eye: Point3<f64>, direction: Vector3<f64>) -> Option<(f64, [f64; 3])> {
+fn nearest_hit(
+    request: &RenderRequest,
+    eye: Point3<f64>,
+    direction: Vector3<f64>,
+) -> Option<(f64, [f64; 3])> {
     let balls = BALLS.iter().filter_map(|ball| {
         let from_center = eye - ball.center;
         let (a, b) = (direction.norm_squared(), direction.dot(&from_center));
@@ -82,7 +120,14 @@ fn nearest_hit(request: &RenderRequest, eye: Point3<f64>, direction: Vector3<f64
     let on_floor = eye + direction * floor_depth;
     let is_on_floor = on_floor.x.abs() < FLOOR_HALF_M && on_floor.y.abs() < FLOOR_HALF_M;
     let is_dark = ((on_floor.x * 5.0).floor() + (on_floor.y * 5.0).floor()).rem_euclid(2.0) < 0.5;
-    let floor = is_on_floor.then_some((floor_depth, if is_dark { [0.42, 0.4, 0.38] } else { [0.72, 0.7, 0.66] }));
+    let floor = is_on_floor.then_some((
+        floor_depth,
+        if is_dark {
+            [0.42, 0.4, 0.38]
+        } else {
+            [0.72, 0.7, 0.66]
+        },
+    ));
     balls
         .chain(floor)
         .filter(|(depth, _)| (request.near_m..=request.far_m).contains(depth))

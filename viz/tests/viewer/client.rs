@@ -33,14 +33,23 @@ pub(crate) enum Received {
 
 impl Client {
     pub(crate) fn connect(address: SocketAddr) -> Self {
-        Self::over(TcpStream::connect(address).expect("the server listens"), address)
+        Self::over(
+            TcpStream::connect(address).expect("the server listens"),
+            address,
+        )
     }
 
     /// A client that uses this connection.
     pub(crate) fn over(stream: TcpStream, address: SocketAddr) -> Self {
         stream.set_read_timeout(Some(TIMEOUT)).expect("a timeout");
-        let (socket, _) = tungstenite::client(format!("ws://{address}/ws"), stream).expect("a WebSocket");
-        Self { socket, joined: Vec::new(), n_received: 0, is_closing: false }
+        let (socket, _) =
+            tungstenite::client(format!("ws://{address}/ws"), stream).expect("a WebSocket");
+        Self {
+            socket,
+            joined: Vec::new(),
+            n_received: 0,
+            is_closing: false,
+        }
     }
 
     /// Bytes of all messages received so far, without WebSocket headers.
@@ -78,7 +87,11 @@ impl Client {
                     self.n_received += bytes.len();
                     match unframe(&bytes) {
                         Received::Binary(header, part) if header["type"] == "part" => {
-                            assert_eq!(header["offset"].as_u64(), u64::try_from(self.joined.len()).ok(), "in order");
+                            assert_eq!(
+                                header["offset"].as_u64(),
+                                u64::try_from(self.joined.len()).ok(),
+                                "in order"
+                            );
                             self.joined.extend(part);
                             if header["bytes"].as_u64() == u64::try_from(self.joined.len()).ok() {
                                 return unframe(&std::mem::take(&mut self.joined));
@@ -89,7 +102,9 @@ impl Client {
                 }
                 Ok(Message::Close(_)) => self.is_closing = true,
                 Ok(_) => {}
-                Err(tungstenite::Error::ConnectionClosed | tungstenite::Error::Protocol(_)) => return Received::End,
+                Err(tungstenite::Error::ConnectionClosed | tungstenite::Error::Protocol(_)) => {
+                    return Received::End;
+                }
                 // The server has closed the connection before the reply to its close frame.
                 Err(tungstenite::Error::Io(error))
                     if error.kind() == ErrorKind::BrokenPipe
@@ -150,13 +165,18 @@ fn unframe(bytes: &[u8]) -> Received {
     let (length, rest) = bytes.split_at(4);
     let n_header = u32::from_le_bytes(length.try_into().expect("4 bytes")) as usize;
     let (header, payload) = rest.split_at(n_header);
-    Received::Binary(serde_json::from_slice(header).expect("a JSON header"), payload.to_vec())
+    Received::Binary(
+        serde_json::from_slice(header).expect("a JSON header"),
+        payload.to_vec(),
+    )
 }
 
 /// The bytes of one output of a picture.
 pub(crate) fn part<'a>(header: &Value, output: &str, payload: &'a [u8]) -> &'a [u8] {
     let number = |name: &str| {
-        let number = header[output][name].as_u64().and_then(|n| usize::try_from(n).ok());
+        let number = header[output][name]
+            .as_u64()
+            .and_then(|n| usize::try_from(n).ok());
         number.unwrap_or_else(|| panic!("{output}.{name} in {header}"))
     };
     &payload[number("offset")..number("offset") + number("bytes")]

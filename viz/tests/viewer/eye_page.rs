@@ -1,5 +1,6 @@
-//! Opens the bundled page in a real browser inside a room, and moves the view by wheel, drags, keys and thumbs: the
-//! eye stops before walls. WebGL calls draw nothing, because the requests show where the eye is.
+//! Opens the bundled page in a real browser inside a room, and moves the view by wheel, drags, keys
+//! and thumbs: the eye stops before walls. WebGL calls draw nothing, because the requests show
+//! where the eye is.
 //!
 //! Skipped, with a message, if Chromium or the bundle (`make web`) is missing.
 
@@ -31,38 +32,69 @@ const FIRST_EYE: Point3<f64> = Point3::new(-1.0, 0.6, 1.2);
 /// Distance of a point in the room to the nearest surface; negative in and behind walls.
 fn clearance(point: Vector3<f64>) -> f64 {
     let inside = |[min, max]: [[f64; 3]; 2]| {
-        (0..3).map(|axis| (point[axis] - min[axis]).min(max[axis] - point[axis])).fold(f64::INFINITY, f64::min)
+        (0..3)
+            .map(|axis| (point[axis] - min[axis]).min(max[axis] - point[axis]))
+            .fold(f64::INFINITY, f64::min)
     };
     inside(ROOM).min(-inside(PILLAR))
 }
 
 /// Distances along a ray at which it enters and leaves a box.
-fn crossings(eye: Point3<f64>, direction: Vector3<f64>, [min, max]: [[f64; 3]; 2]) -> Option<[f64; 2]> {
+fn crossings(
+    eye: Point3<f64>,
+    direction: Vector3<f64>,
+    [min, max]: [[f64; 3]; 2],
+) -> Option<[f64; 2]> {
     let mut range = [f64::NEG_INFINITY, f64::INFINITY];
     for axis in 0..3 {
         let at = [min, max].map(|corner| (corner[axis] - eye[axis]) / direction[axis]);
-        range = [range[0].max(at[0].min(at[1])), range[1].min(at[0].max(at[1]))];
+        range = [
+            range[0].max(at[0].min(at[1])),
+            range[1].min(at[0].max(at[1])),
+        ];
     }
     (range[0] < range[1]).then_some(range)
 }
 
-/// The room, with or without its pillar, and the depth of its surfaces, which are visible from both sides.
+/// The room, with or without its pillar, and the depth of its surfaces, which are visible from both
+/// sides.
 #[expect(clippy::cast_possible_truncation, reason = "depths are meters")]
 fn draw(request: &RenderRequest, has_pillar: bool) -> Picture {
     let [width, height] = request.size_px;
-    let outside = [ROOM[0].map(|min| min - WALL_M), ROOM[1].map(|max| max + WALL_M)];
+    let outside = [
+        ROOM[0].map(|min| min - WALL_M),
+        ROOM[1].map(|max| max + WALL_M),
+    ];
     let (mut rgba_srgb, mut depth_m) = (Vec::new(), Vec::new());
     for (x, y) in (0..height).flat_map(|y| (0..width).map(move |x| (x, y))) {
         let (eye, direction) = ray_in_world(request, f64::from(x) + 0.5, f64::from(y) + 0.5);
-        let boxes = [ROOM, outside].into_iter().chain(has_pillar.then_some(PILLAR));
+        let boxes = [ROOM, outside]
+            .into_iter()
+            .chain(has_pillar.then_some(PILLAR));
         let hits = boxes.filter_map(|corners| crossings(eye, direction, corners));
-        let depth = hits.flatten().filter(|depth| *depth > request.near_m).fold(f64::INFINITY, f64::min);
+        let depth = hits
+            .flatten()
+            .filter(|depth| *depth > request.near_m)
+            .fold(f64::INFINITY, f64::min);
         let hit = eye + direction * depth;
-        let is_dark = hit.iter().map(|along| (along * 4.0).floor()).sum::<f64>().rem_euclid(2.0) < 0.5;
-        rgba_srgb.extend(if is_dark { [90, 85, 80, 255] } else { [190, 185, 175, 255] });
+        let is_dark = hit
+            .iter()
+            .map(|along| (along * 4.0).floor())
+            .sum::<f64>()
+            .rem_euclid(2.0)
+            < 0.5;
+        rgba_srgb.extend(if is_dark {
+            [90, 85, 80, 255]
+        } else {
+            [190, 185, 175, 255]
+        });
         depth_m.push(if depth.is_finite() { depth as f32 } else { 0.0 });
     }
-    Picture { size_px: request.size_px, rgba_srgb, depth_m }
+    Picture {
+        size_px: request.size_px,
+        rgba_srgb,
+        depth_m,
+    }
 }
 
 /// Draws the room on a thread, and records the requests for the main view.
@@ -85,14 +117,23 @@ impl Renderer {
             let is_panorama = pending.request.projection == Projection::Equirectangular;
             n_received.fetch_add(usize::from(is_panorama), Ordering::Relaxed);
             if !is_panorama {
-                received.lock().expect("no panic").push(pending.request.clone());
+                received
+                    .lock()
+                    .expect("no panic")
+                    .push(pending.request.clone());
             } else if !panoramas.load(Ordering::Relaxed) {
                 return pending.fail("no panoramas");
             }
             let picture = draw(&pending.request, pillar.load(Ordering::Relaxed));
             pending.deliver(picture);
         });
-        Self { requests, n_panoramas, has_panoramas, has_pillar, _thread: thread }
+        Self {
+            requests,
+            n_panoramas,
+            has_panoramas,
+            has_pillar,
+            _thread: thread,
+        }
     }
 
     fn n_requests(&self) -> usize {
@@ -102,11 +143,19 @@ impl Renderer {
     /// Eyes of the requests after the first `n`.
     fn eyes_since(&self, n: usize) -> Vec<Vector3<f64>> {
         let requests = self.requests.lock().expect("no panic");
-        requests[n..].iter().map(|request| request.world_from_camera.translation.vector).collect()
+        requests[n..]
+            .iter()
+            .map(|request| request.world_from_camera.translation.vector)
+            .collect()
     }
 
     fn last(&self) -> RenderRequest {
-        self.requests.lock().expect("no panic").last().expect("a picture was requested").clone()
+        self.requests
+            .lock()
+            .expect("no panic")
+            .last()
+            .expect("a picture was requested")
+            .clone()
     }
 
     fn eye(&self) -> Vector3<f64> {
@@ -146,13 +195,28 @@ impl Page {
                 UnitQuaternion::face_towards(&toward, &-Vector3::z()),
             ),
         });
-        let server = Server::start(ServerConfig { listen: ([127, 0, 0, 1], 0).into() }, hub.clone()).expect("a port");
+        let server = Server::start(
+            ServerConfig {
+                listen: ([127, 0, 0, 1], 0).into(),
+            },
+            hub.clone(),
+        )
+        .expect("a port");
         let renderer = Renderer::start(hub.clone());
-        renderer.has_panoramas.store(has_panoramas, Ordering::Relaxed);
+        renderer
+            .has_panoramas
+            .store(has_panoramas, Ordering::Relaxed);
         let scratch = PathBuf::from(env!("CARGO_TARGET_TMPDIR"));
         let profile = scratch.join(format!("chromium-{name}-{}", std::process::id()));
         let browser = Browser::open_with(&program, &profile, &server.url(), WINDOW_PX, NO_DRAWING);
-        let mut page = Self { _alone: alone, browser, renderer, hub, profile, _server: server };
+        let mut page = Self {
+            _alone: alone,
+            browser,
+            renderer,
+            hub,
+            profile,
+            _server: server,
+        };
         page.rest();
         Some(page)
     }
@@ -170,7 +234,8 @@ impl Page {
     }
 
     fn wheel(&mut self, pixels: i32) {
-        let event = json!({"type": "mouseWheel", "x": 200, "y": 200, "deltaX": 0, "deltaY": pixels});
+        let event =
+            json!({"type": "mouseWheel", "x": 200, "y": 200, "deltaX": 0, "deltaY": pixels});
         self.browser.call("Input.dispatchMouseEvent", event);
         self.browser.next_frame();
     }
@@ -188,8 +253,7 @@ impl Page {
         let mut send = |kind: &str, share: i32| {
             let buttons = if button == "left" { 1 } else { 2 };
             let at = [200 + x * share / 4, 200 + y * share / 4];
-            let event =
-                json!({"type": kind, "x": at[0], "y": at[1], "button": button, "buttons": buttons, "clickCount": 1});
+            let event = json!({"type": kind, "x": at[0], "y": at[1], "button": button, "buttons": buttons, "clickCount": 1});
             self.browser.call("Input.dispatchMouseEvent", event);
         };
         send("mousePressed", 0);
@@ -200,8 +264,15 @@ impl Page {
 
     fn key(&mut self, kind: &str, code: &str) {
         let key = code.trim_start_matches("Key").to_lowercase();
-        let key = if code.starts_with("Key") { key } else { "Shift".to_owned() };
-        self.browser.call("Input.dispatchKeyEvent", json!({"type": kind, "code": code, "key": key}));
+        let key = if code.starts_with("Key") {
+            key
+        } else {
+            "Shift".to_owned()
+        };
+        self.browser.call(
+            "Input.dispatchKeyEvent",
+            json!({"type": kind, "code": code, "key": key}),
+        );
     }
 
     /// Holds keys down; returns how far the eye has moved.
@@ -209,7 +280,8 @@ impl Page {
         self.hold_timed(codes, duration).0
     }
 
-    /// Holds keys down for at least this long; returns how far the eye has moved and how long they were down.
+    /// Holds keys down for at least this long; returns how far the eye has moved and how long they
+    /// were down.
     fn hold_timed(&mut self, codes: &[&str], duration: Duration) -> (Vector3<f64>, Duration) {
         let before = self.renderer.eye();
         codes.iter().for_each(|code| self.key("keyDown", code));
@@ -227,12 +299,27 @@ impl Page {
     }
 
     fn set_model(&self, step: u64, edits: usize) {
-        let model = ModelStatus { step, edits, ..ModelStatus::default() };
-        self.hub.set_status(Status { state: "training".to_owned(), model, ..Status::default() });
+        let model = ModelStatus {
+            step,
+            edits,
+            ..ModelStatus::default()
+        };
+        self.hub.set_status(Status {
+            state: "training".to_owned(),
+            model,
+            ..Status::default()
+        });
     }
 
     fn close(self) {
-        let Self { browser, renderer, hub: _, profile, _server: server, _alone: alone } = self;
+        let Self {
+            browser,
+            renderer,
+            hub: _,
+            profile,
+            _server: server,
+            _alone: alone,
+        } = self;
         drop(browser);
         drop((renderer, server));
         std::fs::remove_dir_all(&profile).expect("the browser has left its profile");
@@ -246,14 +333,19 @@ struct Random(u64);
 impl Random {
     /// A number from `-most` to `most`.
     fn within(&mut self, most: i32) -> i32 {
-        self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        self.0 = self
+            .0
+            .wrapping_mul(6_364_136_223_846_793_005)
+            .wrapping_add(1_442_695_040_888_963_407);
         i32::try_from((self.0 >> 33) % (2 * most.unsigned_abs() + 1) as u64).expect("small") - most
     }
 }
 
 #[test]
 fn the_eye_stays_in_front_of_walls() {
-    let Some(mut page) = Page::open("eye", true, RADIUS_M) else { return };
+    let Some(mut page) = Page::open("eye", true, RADIUS_M) else {
+        return;
+    };
     assert!((page.renderer.eye() - FIRST_EYE.coords).norm() < 1e-6);
     // Straight to a wall: the eye stops close to it, and can leave.
     page.pivot([200, 200]);
@@ -262,13 +354,19 @@ fn the_eye_stays_in_front_of_walls() {
     }
     page.rest();
     let stopped = clearance(page.renderer.eye());
-    assert!((NEAR_M..0.15).contains(&stopped), "the eye stopped {stopped} m before a wall");
+    assert!(
+        (NEAR_M..0.15).contains(&stopped),
+        "the eye stopped {stopped} m before a wall"
+    );
     let before = page.renderer.eye();
     for _ in 0..20 {
         page.wheel(300);
     }
     page.rest();
-    assert!((page.renderer.eye() - before).norm() > 0.3, "the eye can move away");
+    assert!(
+        (page.renderer.eye() - before).norm() > 0.3,
+        "the eye can move away"
+    );
 
     page.browser.click("reset-view");
     page.rest();
@@ -285,8 +383,14 @@ fn the_eye_stays_in_front_of_walls() {
     page.rest();
     let eyes = page.renderer.eyes_since(n_before);
     let traveled: f64 = eyes.windows(2).map(|pair| (pair[1] - pair[0]).norm()).sum();
-    let closest = eyes.iter().map(|eye| clearance(*eye)).fold(f64::INFINITY, f64::min);
-    eprintln!("{} pictures on a way of {traveled:.1} m, at least {closest:.3} m from the walls", eyes.len());
+    let closest = eyes
+        .iter()
+        .map(|eye| clearance(*eye))
+        .fold(f64::INFINITY, f64::min);
+    eprintln!(
+        "{} pictures on a way of {traveled:.1} m, at least {closest:.3} m from the walls",
+        eyes.len()
+    );
     assert!(traveled > 5.0, "the eye moved only {traveled} m");
     assert!(closest > NEAR_M, "an eye was {closest} m from a wall");
     page.close();
@@ -294,15 +398,22 @@ fn the_eye_stays_in_front_of_walls() {
 
 #[test]
 fn an_eye_that_has_passed_an_unknown_wall_returns() {
-    let Some(mut page) = Page::open("return", false, RADIUS_M) else { return };
+    let Some(mut page) = Page::open("return", false, RADIUS_M) else {
+        return;
+    };
     // Backward, where no picture shows the wall.
     for _ in 0..12 {
         page.wheel(300);
     }
     wait_for(&mut page.browser, "an eye behind the wall", |_| {
-        page.renderer.eyes_since(0).iter().any(|eye| clearance(*eye) < -WALL_M)
+        page.renderer
+            .eyes_since(0)
+            .iter()
+            .any(|eye| clearance(*eye) < -WALL_M)
     });
-    wait_for(&mut page.browser, "an eye in the room", |_| clearance(page.renderer.eye()) > 0.0);
+    wait_for(&mut page.browser, "an eye in the room", |_| {
+        clearance(page.renderer.eye()) > 0.0
+    });
     page.rest();
     assert!(clearance(page.renderer.eye()) > 0.0, "it stays in the room");
     let before = page.renderer.eye();
@@ -318,12 +429,17 @@ fn an_eye_that_has_passed_an_unknown_wall_returns() {
 #[test]
 fn the_eye_passes_a_surface_that_is_gone() {
     for (name, step, edits) in [("erased", 1, 1), ("trained", 2, 0)] {
-        let Some(mut page) = Page::open(name, true, RADIUS_M) else { return };
+        let Some(mut page) = Page::open(name, true, RADIUS_M) else {
+            return;
+        };
         page.set_model(1, 0);
         page.browser.click("toggle-fly");
         page.hold(&["ShiftLeft", "KeyW"], Duration::from_millis(2000));
         let before = page.renderer.eye();
-        assert!(clearance(before) < 0.3 && before.x < PILLAR[0][0], "{name}: the pillar stops the eye at {before}");
+        assert!(
+            clearance(before) < 0.3 && before.x < PILLAR[0][0],
+            "{name}: the pillar stops the eye at {before}"
+        );
         page.renderer.has_pillar.store(false, Ordering::Relaxed);
         let n_panoramas = page.n_panoramas();
         page.set_model(step, edits);
@@ -333,7 +449,10 @@ fn the_eye_passes_a_surface_that_is_gone() {
         page.rest();
         page.hold(&["ShiftLeft", "KeyW"], Duration::from_millis(2000));
         let after = page.renderer.eye();
-        assert!(after.x > PILLAR[1][0] && after.x < ROOM[1][0], "{name}: the eye is at {after}");
+        assert!(
+            after.x > PILLAR[1][0] && after.x < ROOM[1][0],
+            "{name}: the eye is at {after}"
+        );
         page.close();
     }
 }
@@ -342,8 +461,12 @@ fn the_eye_passes_a_surface_that_is_gone() {
 #[test]
 fn surroundings_are_requested_only_where_they_are_needed() {
     // Half of this radius is much less than the distance of the eye to the walls.
-    let Some(mut page) = Page::open("surroundings", true, 0.6) else { return };
-    wait_for(&mut page.browser, "the first surroundings", |_| page.renderer.n_panoramas.load(Ordering::Relaxed) > 0);
+    let Some(mut page) = Page::open("surroundings", true, 0.6) else {
+        return;
+    };
+    wait_for(&mut page.browser, "the first surroundings", |_| {
+        page.renderer.n_panoramas.load(Ordering::Relaxed) > 0
+    });
     page.rest();
     let n_panoramas = page.n_panoramas();
     let before = page.renderer.eye();
@@ -354,7 +477,11 @@ fn surroundings_are_requested_only_where_they_are_needed() {
     page.rest();
     let moved_m = (page.renderer.eye() - before).norm();
     assert!((0.1..0.6).contains(&moved_m), "an orbit by {moved_m} m");
-    assert_eq!(page.n_panoramas(), n_panoramas, "the eye has moved only through space that is known to be free");
+    assert_eq!(
+        page.n_panoramas(),
+        n_panoramas,
+        "the eye has moved only through space that is known to be free"
+    );
     page.browser.click("toggle-fly");
     page.hold(&["KeyW"], Duration::from_millis(250));
     assert!(page.n_panoramas() > n_panoramas, "a flying eye needs them");
@@ -363,19 +490,35 @@ fn surroundings_are_requested_only_where_they_are_needed() {
 
 #[test]
 fn keys_and_thumbs_fly() {
-    let Some(mut page) = Page::open("fly", true, RADIUS_M) else { return };
+    let Some(mut page) = Page::open("fly", true, RADIUS_M) else {
+        return;
+    };
     const TIME: Duration = Duration::from_millis(250);
     page.browser.click("toggle-fly");
-    let [right, up, forward] =
-        [Vector3::x(), -Vector3::y(), Vector3::z()].map(|axis| page.renderer.last().world_from_camera.rotation * axis);
-    assert!((page.renderer.eye() - FIRST_EYE.coords).norm() < 1e-6, "the mode does not move the view");
-    for (code, direction) in [("KeyW", forward), ("KeyS", -forward), ("KeyD", right), ("KeyA", -right)] {
+    let [right, up, forward] = [Vector3::x(), -Vector3::y(), Vector3::z()]
+        .map(|axis| page.renderer.last().world_from_camera.rotation * axis);
+    assert!(
+        (page.renderer.eye() - FIRST_EYE.coords).norm() < 1e-6,
+        "the mode does not move the view"
+    );
+    for (code, direction) in [
+        ("KeyW", forward),
+        ("KeyS", -forward),
+        ("KeyD", right),
+        ("KeyA", -right),
+    ] {
         let motion = page.hold(&[code], TIME);
-        assert!(motion.norm() > 0.05 && motion.normalize().dot(&direction) > 0.99, "{code}: {motion}");
+        assert!(
+            motion.norm() > 0.05 && motion.normalize().dot(&direction) > 0.99,
+            "{code}: {motion}"
+        );
     }
     for (code, direction) in [("KeyE", Vector3::z()), ("KeyQ", -Vector3::z())] {
         let motion = page.hold(&[code], TIME);
-        assert!(motion.normalize().dot(&direction) > 0.99 && direction.dot(&up).abs() > 0.9, "{code}: {motion}");
+        assert!(
+            motion.normalize().dot(&direction) > 0.99 && direction.dot(&up).abs() > 0.9,
+            "{code}: {motion}"
+        );
     }
     for button in ["toggle-measure", "toggle-layers"] {
         let state = page.browser.evaluate(&format!(
@@ -390,47 +533,86 @@ fn keys_and_thumbs_fly() {
         page.rest();
         motion.norm() / held.as_secs_f64()
     });
-    assert!(fast_m_s > 2.0 * slow_m_s, "{slow_m_s} m/s, with Shift {fast_m_s} m/s");
+    assert!(
+        fast_m_s > 2.0 * slow_m_s,
+        "{slow_m_s} m/s, with Shift {fast_m_s} m/s"
+    );
     // The view turns to the left, because the scene follows the mouse to the right.
     let eye = page.renderer.eye();
     page.drag("left", [120, 0]);
     page.rest();
-    assert!(page.renderer.forward().cross(&forward).z < -0.2 && (page.renderer.eye() - eye).norm() < 1e-6);
+    assert!(
+        page.renderer.forward().cross(&forward).z < -0.2
+            && (page.renderer.eye() - eye).norm() < 1e-6
+    );
     // Into the wall, and out of it.
     page.hold(&["ShiftLeft", "KeyW"], Duration::from_millis(2000));
     let stopped = clearance(page.renderer.eye());
-    assert!((NEAR_M..0.3).contains(&stopped), "{stopped} m from the wall");
-    assert!(page.hold(&["KeyS"], TIME).norm() > 0.05, "the eye can move away");
+    assert!(
+        (NEAR_M..0.3).contains(&stopped),
+        "{stopped} m from the wall"
+    );
+    assert!(
+        page.hold(&["KeyS"], TIME).norm() > 0.05,
+        "the eye can move away"
+    );
     check_thumbs(&mut page);
     page.browser.click("toggle-fly");
     let still = page.hold(&["KeyW"], TIME);
     assert!(still.norm() < 1e-6, "the mode is off");
     page.key("keyDown", "KeyD");
-    assert_eq!(page.browser.evaluate("document.getElementById('toggle-measure').ariaPressed"), "true");
+    assert_eq!(
+        page.browser
+            .evaluate("document.getElementById('toggle-measure').ariaPressed"),
+        "true"
+    );
     page.close();
 }
 
 /// The left thumb moves the eye, the right one turns the view.
 fn check_thumbs(page: &mut Page) {
-    page.browser.call("Emulation.setTouchEmulationEnabled", json!({"enabled": true, "maxTouchPoints": 2}));
+    page.browser.call(
+        "Emulation.setTouchEmulationEnabled",
+        json!({"enabled": true, "maxTouchPoints": 2}),
+    );
     let touch = |page: &mut Page, kind: &str, points: &[[i32; 2]]| {
-        let points: Vec<_> = points.iter().map(|[x, y]| json!({"x": x, "y": y})).collect();
-        page.browser.call("Input.dispatchTouchEvent", json!({"type": kind, "touchPoints": points}));
+        let points: Vec<_> = points
+            .iter()
+            .map(|[x, y]| json!({"x": x, "y": y}))
+            .collect();
+        page.browser.call(
+            "Input.dispatchTouchEvent",
+            json!({"type": kind, "touchPoints": points}),
+        );
     };
     let (eye, forward) = (page.renderer.eye(), page.renderer.forward());
     touch(page, "touchStart", &[[60, 200]]);
     touch(page, "touchMove", &[[60, 260]]);
-    assert_eq!(page.browser.evaluate("document.getElementById('stick').hidden"), false);
+    assert_eq!(
+        page.browser
+            .evaluate("document.getElementById('stick').hidden"),
+        false
+    );
     std::thread::sleep(Duration::from_millis(250));
     touch(page, "touchEnd", &[]);
-    assert_eq!(page.browser.evaluate("document.getElementById('stick').hidden"), true);
+    assert_eq!(
+        page.browser
+            .evaluate("document.getElementById('stick').hidden"),
+        true
+    );
     page.rest();
     let motion = page.renderer.eye() - eye;
-    assert!(motion.norm() > 0.05 && motion.normalize().dot(&-forward) > 0.99, "backward: {motion}");
+    assert!(
+        motion.norm() > 0.05 && motion.normalize().dot(&-forward) > 0.99,
+        "backward: {motion}"
+    );
     let eye = page.renderer.eye();
     touch(page, "touchStart", &[[450, 200]]);
     touch(page, "touchMove", &[[380, 200]]);
     touch(page, "touchEnd", &[]);
     page.rest();
-    assert!(page.renderer.forward().cross(&forward).z > 0.1 && (page.renderer.eye() - eye).norm() < 1e-6);
+    assert!(
+        page.renderer.forward().cross(&forward).z > 0.1
+            && (page.renderer.eye() - eye).norm() < 1e-6
+    );
 }

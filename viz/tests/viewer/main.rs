@@ -1,4 +1,5 @@
-//! Tests of the server, the protocol and the page in one program, so that they are linked once and fill all processors.
+//! Tests of the server, the protocol and the page in one program, so that they are linked once and
+//! fill all processors.
 
 mod admission;
 mod analytic_scene;

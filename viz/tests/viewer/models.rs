@@ -13,21 +13,28 @@ use trainer::tsdf::{TsdfModel, TsdfOptions};
 use trainer::{Method, ModelOptions, Projection, RenderRequest};
 use viz::Hub;
 
-/// A wall of splats at y = 0 that faces -y. Without color coefficients of degree 3, which are not sent.
+/// A wall of splats at y = 0 that faces -y. Without color coefficients of degree 3, which are not
+/// sent.
 #[expect(clippy::cast_possible_truncation, reason = "splats are f32")]
 pub(crate) fn wall(n_splats: usize) -> SplatArrays {
     let mut splats = scan_cloud(n_splats, 4);
     // The wall is made for a camera that looks along z.
-    let rotation = UnitQuaternion::from_axis_angle(&Vector3::x_axis(), -std::f64::consts::FRAC_PI_2);
+    let rotation =
+        UnitQuaternion::from_axis_angle(&Vector3::x_axis(), -std::f64::consts::FRAC_PI_2);
     for mean in &mut splats.means {
-        *mean = (rotation * Vector3::from(mean.map(f64::from))).map(|along| along as f32).into();
+        *mean = (rotation * Vector3::from(mean.map(f64::from)))
+            .map(|along| along as f32)
+            .into();
     }
     for wxyz in &mut splats.rotations_wxyz {
         let [w, x, y, z] = wxyz.map(f64::from);
         let rotated = rotation.into_inner() * Quaternion::new(w, x, y, z);
         *wxyz = [rotated.w, rotated.i, rotated.j, rotated.k].map(|part| part as f32);
     }
-    splats.sh.chunks_exact_mut(16).for_each(|coefficients| coefficients[9..].fill([0.0; 3]));
+    splats
+        .sh
+        .chunks_exact_mut(16)
+        .for_each(|coefficients| coefficients[9..].fill([0.0; 3]));
     splats
 }
 
@@ -36,15 +43,25 @@ pub(crate) fn gpu() -> Arc<Gpu> {
 }
 
 pub(crate) fn splat_model(splats: &SplatArrays) -> SplatTrainer {
-    let options = ModelOptions::from(SplatOptions { max_splats: 1_000_000, ..SplatOptions::default() });
+    let options = ModelOptions::from(SplatOptions {
+        max_splats: 1_000_000,
+        ..SplatOptions::default()
+    });
     SplatTrainer::from_arrays(gpu(), options, splats).expect("a model")
 }
 
 /// A ball on the floor, seen from a few sides.
 pub(crate) fn tsdf_model(n_keyframes: usize) -> TsdfModel {
-    let options = TsdfOptions { voxel_m: Some(0.02), ..TsdfOptions::default() };
+    let options = TsdfOptions {
+        voxel_m: Some(0.02),
+        ..TsdfOptions::default()
+    };
     let mut model = TsdfModel::new(gpu(), ModelOptions::from(options)).expect("a model");
-    for keyframe in ring(&[ball(Point3::origin()), floor()], Point3::origin(), n_keyframes) {
+    for keyframe in ring(
+        &[ball(Point3::origin()), floor()],
+        Point3::origin(),
+        n_keyframes,
+    ) {
         model.push(keyframe).expect("a keyframe");
     }
     while !model.is_idle() {
@@ -71,9 +88,18 @@ impl ModelThread {
     pub(crate) fn start(hub: Hub, models: Models) -> Self {
         let requests: Arc<Mutex<Vec<ReceivedRequest>>> = Arc::default();
         let (refuses_depth, stop): (Arc<AtomicBool>, Arc<AtomicBool>) = Default::default();
-        let (received, refuses, stopped) = (Arc::clone(&requests), Arc::clone(&refuses_depth), Arc::clone(&stop));
+        let (received, refuses, stopped) = (
+            Arc::clone(&requests),
+            Arc::clone(&refuses_depth),
+            Arc::clone(&stop),
+        );
         let thread = std::thread::spawn(move || serve(&hub, models, &received, &refuses, &stopped));
-        Self { requests, refuses_depth, stop, thread: Some(thread) }
+        Self {
+            requests,
+            refuses_depth,
+            stop,
+            thread: Some(thread),
+        }
     }
 
     /// Lets requests for depth alone fail from now on.
@@ -83,18 +109,33 @@ impl ModelThread {
 
     /// The newest request.
     pub(crate) fn last_request(&self) -> RenderRequest {
-        self.requests.lock().expect("no panic").last().expect("a picture was requested").0.clone()
+        self.requests
+            .lock()
+            .expect("no panic")
+            .last()
+            .expect("a picture was requested")
+            .0
+            .clone()
     }
 
     /// Number of requests for colors.
     pub(crate) fn n_color_requests(&self) -> usize {
-        self.requests.lock().expect("no panic").iter().filter(|(_, has_color)| *has_color).count()
+        self.requests
+            .lock()
+            .expect("no panic")
+            .iter()
+            .filter(|(_, has_color)| *has_color)
+            .count()
     }
 
     /// Ends the thread.
     pub(crate) fn finish(mut self) -> Models {
         self.stop.store(true, Ordering::Relaxed);
-        self.thread.take().expect("it runs").join().expect("no panic")
+        self.thread
+            .take()
+            .expect("it runs")
+            .join()
+            .expect("no panic")
     }
 }
 
@@ -109,10 +150,15 @@ fn serve(
         hub.wait_for_request(Duration::from_millis(20));
         if let Some(pending) = hub.next_request() {
             let is_panorama = pending.request.projection == Projection::Equirectangular;
-            let has_color = pending.packing().is_none_or(|packing| packing.jpeg_quality.is_some());
+            let has_color = pending
+                .packing()
+                .is_none_or(|packing| packing.jpeg_quality.is_some());
             // Panoramas are requested for the surroundings of a view.
             if !is_panorama {
-                requests.lock().expect("no panic").push((pending.request.clone(), has_color));
+                requests
+                    .lock()
+                    .expect("no panic")
+                    .push((pending.request.clone(), has_color));
             }
             if !has_color && refuses_depth.load(Ordering::Relaxed) {
                 pending.fail("");

@@ -15,7 +15,12 @@ use viz::{Hub, KeyframePose, LiveImage, LivePixels, PendingRender, Server, Serve
 
 fn start() -> (Hub, Server) {
     let hub = Hub::new();
-    let server = Server::start(ServerConfig { listen: SocketAddr::from(([127, 0, 0, 1], 0)) }, hub.clone());
+    let server = Server::start(
+        ServerConfig {
+            listen: SocketAddr::from(([127, 0, 0, 1], 0)),
+        },
+        hub.clone(),
+    );
     (hub, server.expect("a free port exists"))
 }
 
@@ -42,7 +47,11 @@ fn keyframe(stamp: i64) -> KeyframePose {
     KeyframePose {
         camera: "wrist".into(),
         stamp: Stamp(stamp),
-        world_from_camera: Transform::translation(f64::from(i32::try_from(stamp).expect("small")), 0.0, 0.0),
+        world_from_camera: Transform::translation(
+            f64::from(i32::try_from(stamp).expect("small")),
+            0.0,
+            0.0,
+        ),
         size_px: [640, 480],
         focal_px: [600.0; 2],
         principal_px: [320.0, 240.0],
@@ -55,7 +64,10 @@ fn camera_image(stamp: i64) -> LiveImage {
     let request = trainer::RenderRequest {
         world_from_camera: analytic_scene::looking_along_y(),
         size_px,
-        projection: trainer::Projection::Pinhole { focal_px: [500.0; 2], principal_px: [320.0, 240.0] },
+        projection: trainer::Projection::Pinhole {
+            focal_px: [500.0; 2],
+            principal_px: [320.0, 240.0],
+        },
         shutter: None,
         near_m: 0.01,
         far_m: 50.0,
@@ -87,24 +99,45 @@ fn versions_and_capabilities_are_negotiated() {
     let (_hub, server) = start();
     let mut client = Client::connect(server.address());
     let hello = client.text();
-    assert_eq!(hello["protocol"], json!(viz::BASE_PROTOCOL_VERSION), "older clients expect their version here");
-    assert_eq!(hello["protocols"], json!([viz::BASE_PROTOCOL_VERSION, viz::PROTOCOL_VERSION]));
-    assert!(hello["capabilities"].as_array().is_some_and(|names| names.contains(&json!("parts"))), "{hello}");
+    assert_eq!(
+        hello["protocol"],
+        json!(viz::BASE_PROTOCOL_VERSION),
+        "older clients expect their version here"
+    );
+    assert_eq!(
+        hello["protocols"],
+        json!([viz::BASE_PROTOCOL_VERSION, viz::PROTOCOL_VERSION])
+    );
+    assert!(
+        hello["capabilities"]
+            .as_array()
+            .is_some_and(|names| names.contains(&json!("parts"))),
+        "{hello}"
+    );
     client.send_json(&json!({"type": "hello", "protocols": [2, 99], "capabilities": ["parts", "teleport"], "new": 1}));
     let welcome = client.text_of("welcome");
-    assert_eq!((&welcome["protocol"], &welcome["capabilities"]), (&json!(viz::PROTOCOL_VERSION), &json!(["parts"])));
+    assert_eq!(
+        (&welcome["protocol"], &welcome["capabilities"]),
+        (&json!(viz::PROTOCOL_VERSION), &json!(["parts"]))
+    );
     // A client of version 3.
     let mut older = Client::connect(server.address());
     older.send_json(&json!({"type": "hello", "protocol": 3}));
     assert_eq!(older.text_of("welcome")["protocol"], json!(3));
     older.settle();
-    for (hello, named) in [(json!({"protocol": 999}), "999"), (json!({"protocols": [1, 2]}), "update the client")] {
+    for (hello, named) in [
+        (json!({"protocol": 999}), "999"),
+        (json!({"protocols": [1, 2]}), "update the client"),
+    ] {
         let mut foreign = Client::connect(server.address());
         let mut message = hello;
         message["type"] = json!("hello");
         foreign.send_json(&message);
         let reason = foreign.text_of("goodbye")["reason"].clone();
-        assert!(reason.as_str().is_some_and(|reason| reason.contains(named)), "{reason}");
+        assert!(
+            reason.as_str().is_some_and(|reason| reason.contains(named)),
+            "{reason}"
+        );
         assert_eq!(foreign.receive(), Received::End);
     }
 }
@@ -121,10 +154,19 @@ fn views_are_independent_and_take_turns() {
     draw_next(&hub);
     let mut answered: Vec<_> = (0..2)
         .map(|_| client.binary_of("picture").0)
-        .map(|header| (header["view"].as_str().unwrap_or_default().to_owned(), header["id"].as_u64()))
+        .map(|header| {
+            (
+                header["view"].as_str().unwrap_or_default().to_owned(),
+                header["id"].as_u64(),
+            )
+        })
         .collect();
     answered.sort();
-    assert_eq!(answered, [("inset".to_owned(), Some(2)), ("main".to_owned(), Some(3))], "the newest of each view");
+    assert_eq!(
+        answered,
+        [("inset".to_owned(), Some(2)), ("main".to_owned(), Some(3))],
+        "the newest of each view"
+    );
     assert!(hub.next_request().is_none());
     // Errors name the view, too.
     client.send_json(&render_message(4, "inset"));
@@ -142,7 +184,11 @@ fn views_are_independent_and_take_turns() {
     }
     client.send_json(&render_message(30, "another"));
     draw_next(&hub);
-    assert_eq!(client.binary_of("picture").0["view"], json!("another"), "idle views make room");
+    assert_eq!(
+        client.binary_of("picture").0["view"],
+        json!("another"),
+        "idle views make room"
+    );
 }
 
 #[test]
@@ -151,18 +197,29 @@ fn keyframes_are_sent_as_changes() {
     hub.set_keyframes((0..300).map(keyframe).collect());
     let mut client = Client::connect(server.address());
     client.text();
-    client.send_json(&json!({"type": "hello", "protocols": [3, 4], "capabilities": ["keyframe_changes"]}));
+    client.send_json(
+        &json!({"type": "hello", "protocols": [3, 4], "capabilities": ["keyframe_changes"]}),
+    );
     client.text_of("welcome");
     let mut stamps = std::collections::BTreeSet::new();
     while stamps.len() < 300 {
         let changes = client.text_of("keyframe_changes");
         assert_eq!(changes["from_version"] == json!(0), stamps.is_empty());
         let added = changes["keyframes"].as_array().expect("a list");
-        stamps.extend(added.iter().map(|keyframe| keyframe["stamp_nanos"].as_i64()));
+        stamps.extend(
+            added
+                .iter()
+                .map(|keyframe| keyframe["stamp_nanos"].as_i64()),
+        );
     }
     hub.set_keyframes((1..302).map(keyframe).collect());
     let changes = client.text_of("keyframe_changes");
-    let added: Vec<_> = changes["keyframes"].as_array().expect("a list").iter().map(|k| &k["stamp_nanos"]).collect();
+    let added: Vec<_> = changes["keyframes"]
+        .as_array()
+        .expect("a list")
+        .iter()
+        .map(|k| &k["stamp_nanos"])
+        .collect();
     assert_eq!(added, [&json!(300), &json!(301)]);
     assert_eq!(changes["removed"].as_array().map(Vec::len), Some(1));
     // Subscribing again requests the complete list.
@@ -175,15 +232,24 @@ fn live_images_have_the_subscribed_size() {
     let (hub, server) = start();
     let mut thumbnails = Client::connect(server.address());
     let mut large = Client::connect(server.address());
-    thumbnails.send_json(&json!({"type": "subscribe", "topic": "live_images", "rate_hz": 9, "size_px": [160, 128]}));
+    thumbnails.send_json(
+        &json!({"type": "subscribe", "topic": "live_images", "rate_hz": 9, "size_px": [160, 128]}),
+    );
     thumbnails.settle();
     large.settle();
-    for (client, expected) in [(&mut thumbnails, json!([160, 120])), (&mut large, json!([640, 480]))] {
+    for (client, expected) in [
+        (&mut thumbnails, json!([160, 120])),
+        (&mut large, json!([640, 480])),
+    ] {
         let header = loop {
             hub.set_live_image(camera_image(1));
             let (header, jpeg) = client.binary_of("live_image");
-            let decoded = image::load_from_memory_with_format(&jpeg, image::ImageFormat::Jpeg).expect("a JPEG");
-            assert_eq!(header["size_px"], json!([decoded.width(), decoded.height()]));
+            let decoded = image::load_from_memory_with_format(&jpeg, image::ImageFormat::Jpeg)
+                .expect("a JPEG");
+            assert_eq!(
+                header["size_px"],
+                json!([decoded.width(), decoded.height()])
+            );
             // An image that was encoded before the subscription may come first.
             if header["size_px"] == expected {
                 break header;
@@ -195,10 +261,18 @@ fn live_images_have_the_subscribed_size() {
     let error_of = |message: Value| {
         let mut client = Client::connect(server.address());
         client.send_json(&message);
-        client.text_of("error")["message"].as_str().unwrap_or_default().to_owned()
+        client.text_of("error")["message"]
+            .as_str()
+            .unwrap_or_default()
+            .to_owned()
     };
-    assert!(error_of(json!({"type": "subscribe", "topic": "live_images", "rate_hz": 1e9})).contains("rate_hz"));
-    assert!(error_of(json!({"type": "subscribe", "topic": "rumors", "rate_hz": 1})).contains("rumors"));
+    assert!(
+        error_of(json!({"type": "subscribe", "topic": "live_images", "rate_hz": 1e9}))
+            .contains("rate_hz")
+    );
+    assert!(
+        error_of(json!({"type": "subscribe", "topic": "rumors", "rate_hz": 1})).contains("rumors")
+    );
 }
 
 /// The page's subscriptions, a camera at 30 Hz, a moving robot and a keyframe every 300 ms.
@@ -210,13 +284,23 @@ fn idle_page_receives_less_than_80_kb_per_second() {
     hub.set_keyframes((0..400).map(keyframe).collect());
     let mut client = Client::connect(server.address());
     client.text();
-    let capabilities = ["views", "subscribe", "compact_depth", "keyframe_changes", "parts", "heartbeat", "robot"];
+    let capabilities = [
+        "views",
+        "subscribe",
+        "compact_depth",
+        "keyframe_changes",
+        "parts",
+        "heartbeat",
+        "robot",
+    ];
     client.send_json(&json!({"type": "hello", "protocols": [3, 4], "capabilities": capabilities}));
     // The rates and the size of web/src/topics/.
     for (topic, rate_hz) in [("status", 2), ("keyframes", 2), ("robot_state", 60)] {
         client.send_json(&json!({"type": "subscribe", "topic": topic, "rate_hz": rate_hz}));
     }
-    client.send_json(&json!({"type": "subscribe", "topic": "live_images", "rate_hz": 4, "size_px": [640, 192]}));
+    client.send_json(
+        &json!({"type": "subscribe", "topic": "live_images", "rate_hz": 4, "size_px": [640, 192]}),
+    );
     let images: Vec<_> = (1..9).map(camera_image).collect();
     let publish = |began: Instant, until: Duration| {
         for ix in 0.. {
@@ -227,13 +311,25 @@ fn idle_page_receives_less_than_80_kb_per_second() {
             hub.set_robot_state(robot::state(elapsed.as_secs_f64()));
             if ix % 6 == 0 {
                 let image = &images[usize::try_from(ix / 6 % 8).expect("small")];
-                hub.set_live_image(LiveImage { captured_at: Instant::now(), ..image.clone() });
+                hub.set_live_image(LiveImage {
+                    captured_at: Instant::now(),
+                    ..image.clone()
+                });
             }
             if ix % 60 == 0 {
                 hub.set_keyframes((0..=400 + ix / 60).map(keyframe).collect());
-                let psnr_history = (0..512).map(|n| (f64::from(n) * 1.37, 20.0 + f64::from(n) * 0.0123)).collect();
-                let model = viz::ModelStatus { step: ix.unsigned_abs(), psnr_history, ..viz::ModelStatus::default() };
-                hub.set_status(Status { model, ..Status::default() });
+                let psnr_history = (0..512)
+                    .map(|n| (f64::from(n) * 1.37, 20.0 + f64::from(n) * 0.0123))
+                    .collect();
+                let model = viz::ModelStatus {
+                    step: ix.unsigned_abs(),
+                    psnr_history,
+                    ..viz::ModelStatus::default()
+                };
+                hub.set_status(Status {
+                    model,
+                    ..Status::default()
+                });
             }
             std::thread::sleep(Duration::from_millis(5));
         }
@@ -255,7 +351,9 @@ fn idle_page_receives_less_than_80_kb_per_second() {
                 Received::Binary(header, _) => header["type"].clone(),
                 Received::End => panic!("disconnected"),
             };
-            *counts.entry(kind.as_str().unwrap_or_default().to_owned()).or_default() += 1;
+            *counts
+                .entry(kind.as_str().unwrap_or_default().to_owned())
+                .or_default() += 1;
             std::thread::sleep(Duration::from_millis(1));
         }
         // The pings of this test are more frequent than those of the page.
@@ -264,7 +362,10 @@ fn idle_page_receives_less_than_80_kb_per_second() {
     });
     let kb_per_sec = n_bytes as f64 / 1e3 / SECS as f64;
     assert!(kb_per_sec < 80.0, "{kb_per_sec} kB/s: {counts:?}");
-    assert!(counts["live_image"] >= 2 * SECS && counts["robot_state"] >= 20 * SECS, "the data arrives: {counts:?}");
+    assert!(
+        counts["live_image"] >= 2 * SECS && counts["robot_state"] >= 20 * SECS,
+        "the data arrives: {counts:?}"
+    );
 }
 
 /// A client that reads slowly still gets replies quickly, because pictures are sent in parts.
@@ -272,7 +373,8 @@ fn idle_page_receives_less_than_80_kb_per_second() {
 fn replies_do_not_wait_for_pictures() {
     /// 20 Mbit/s.
     const BYTES_PER_SEC: f64 = 2.5e6;
-    /// 100 ms of data that the kernel has not sent yet, and a part of the next message: measured 0.1 to 0.16 MB.
+    /// 100 ms of data that the kernel has not sent yet, and a part of the next message: measured
+    /// 0.1 to 0.16 MB.
     const MAX_BYTES_BEFORE_REPLY: usize = 350_000;
     let (hub, server) = start();
     let stream = Slow::connect(server.address(), BYTES_PER_SEC);
@@ -291,23 +393,39 @@ fn replies_do_not_wait_for_pictures() {
             std::thread::sleep(Duration::from_millis(150));
             let n_arrived = counter.n_arrived();
             send(&json!({"type": "ping", "t": 7}));
-            n_before_replies.push(pongs.recv_timeout(TIMEOUT).expect("a pong").saturating_sub(n_arrived));
+            n_before_replies.push(
+                pongs
+                    .recv_timeout(TIMEOUT)
+                    .expect("a pong")
+                    .saturating_sub(n_arrived),
+            );
         }
     }
     // The first picture measures the connection.
     let most = n_before_replies[5..].iter().max().expect("replies");
     eprintln!("bytes before replies: {n_before_replies:?}");
-    assert!(*most < MAX_BYTES_BEFORE_REPLY, "{most} bytes were sent before a reply: {n_before_replies:?}");
+    assert!(
+        *most < MAX_BYTES_BEFORE_REPLY,
+        "{most} bytes were sent before a reply: {n_before_replies:?}"
+    );
 }
 
-/// A client on a slow connection. Returns a function that sends, and, for each pong, the number of bytes read until then.
-fn slow_client(stream: Slow, address: SocketAddr) -> (impl FnMut(&Value), std::sync::mpsc::Receiver<usize>) {
+/// A client on a slow connection. Returns a function that sends, and, for each pong, the number of
+/// bytes read until then.
+fn slow_client(
+    stream: Slow,
+    address: SocketAddr,
+) -> (impl FnMut(&Value), std::sync::mpsc::Receiver<usize>) {
     let (writer, counter) = (stream.descriptor(), stream.counter());
-    let Ok((mut socket, _)) = tungstenite::client(format!("ws://{address}/ws"), stream) else { panic!("no WebSocket") };
+    let Ok((mut socket, _)) = tungstenite::client(format!("ws://{address}/ws"), stream) else {
+        panic!("no WebSocket")
+    };
     let (pongs, n_read_at_pongs) = std::sync::mpsc::sync_channel(64);
     std::thread::spawn(move || {
         while let Ok(message) = socket.read() {
-            let is_pong = message.to_text().is_ok_and(|text| text.contains("\"pong\""));
+            let is_pong = message
+                .to_text()
+                .is_ok_and(|text| text.contains("\"pong\""));
             if is_pong && pongs.try_send(counter.n_read()).is_err() {
                 return;
             }
@@ -315,7 +433,11 @@ fn slow_client(stream: Slow, address: SocketAddr) -> (impl FnMut(&Value), std::s
     });
     let role = tungstenite::protocol::Role::Client;
     let mut sending = tungstenite::WebSocket::from_raw_socket(writer, role, None);
-    let send = move |message: &Value| sending.send(tungstenite::Message::text(message.to_string())).expect("sent");
+    let send = move |message: &Value| {
+        sending
+            .send(tungstenite::Message::text(message.to_string()))
+            .expect("sent")
+    };
     (send, n_read_at_pongs)
 }
 
@@ -331,7 +453,10 @@ fn silent_clients_get_no_pictures_until_they_return() {
     pending.deliver(picture);
     let began = Instant::now();
     while began.elapsed() < Duration::from_millis(600) {
-        assert!(matches!(client.receive(), Received::Text(_)), "only heartbeats");
+        assert!(
+            matches!(client.receive(), Received::Text(_)),
+            "only heartbeats"
+        );
     }
     client.send_json(&json!({"type": "ping", "t": 1}));
     assert_eq!(client.binary_of("picture").0["id"], json!(1));
@@ -349,8 +474,14 @@ fn compact_depth_is_accurate_and_small() {
         client.send_json(&message);
         draw_next(&hub);
         let (header, payload) = client.binary_of("picture");
-        assert_eq!((&header["depth"]["size_px"], header.get("view")), (&json!([640, 360]), None));
-        (header["depth"].clone(), client::part(&header, "depth", &payload).to_vec())
+        assert_eq!(
+            (&header["depth"]["size_px"], header.get("view")),
+            (&json!([640, 360]), None)
+        );
+        (
+            header["depth"].clone(),
+            client::part(&header, "depth", &payload).to_vec(),
+        )
     };
     let (header, linear) = depth_in("u16_half");
     let meters_per_count = header["meters_per_count"].as_f64().expect("a scale");
@@ -358,10 +489,18 @@ fn compact_depth_is_accurate_and_small() {
     let decoded = decode_compact(&header, &compact);
     for (got, count) in decoded.iter().zip(linear.chunks_exact(2)) {
         let meters = f64::from(u16::from_le_bytes([count[0], count[1]])) * meters_per_count;
-        assert!((got - meters).abs() <= 0.0021 * meters, "{got} instead of {meters}");
+        assert!(
+            (got - meters).abs() <= 0.0021 * meters,
+            "{got} instead of {meters}"
+        );
     }
     assert_eq!(decoded.len(), linear.len() / 2);
-    assert!(compact.len() * 20 < linear.len(), "{} of {} bytes", compact.len(), linear.len());
+    assert!(
+        compact.len() * 20 < linear.len(),
+        "{} of {} bytes",
+        compact.len(),
+        linear.len()
+    );
 }
 
 /// An independent decoder, written from `docs/reference/protocol.md`.
@@ -369,11 +508,18 @@ fn decode_compact(header: &Value, bytes: &[u8]) -> Vec<f64> {
     use std::io::Read;
     let width = usize::try_from(header["size_px"][0].as_u64().expect("a width")).expect("small");
     let height = usize::try_from(header["size_px"][1].as_u64().expect("a height")).expect("small");
-    let (min_m, log_step) = (header["min_m"].as_f64().expect("min_m"), header["log_step"].as_f64().expect("log_step"));
+    let (min_m, log_step) = (
+        header["min_m"].as_f64().expect("min_m"),
+        header["log_step"].as_f64().expect("log_step"),
+    );
     let mut stream = Vec::new();
-    flate2::read::ZlibDecoder::new(bytes).read_to_end(&mut stream).expect("a zlib stream");
+    flate2::read::ZlibDecoder::new(bytes)
+        .read_to_end(&mut stream)
+        .expect("a zlib stream");
     let (symbols, rest) = stream.split_at(width * height);
-    let mut rest = rest.chunks_exact(2).map(|count| i64::from(u16::from_le_bytes([count[0], count[1]])));
+    let mut rest = rest
+        .chunks_exact(2)
+        .map(|count| i64::from(u16::from_le_bytes([count[0], count[1]])));
     let mut counts = vec![vec![0_i64; width]; height];
     for y in 0..height {
         for x in 0..width {
@@ -389,7 +535,13 @@ fn decode_compact(header: &Value, bytes: &[u8]) -> Vec<f64> {
             };
         }
     }
-    let meters = |count: i64| if count == 0 { 0.0 } else { min_m * (log_step * (count as f64 - 1.0)).exp() };
+    let meters = |count: i64| {
+        if count == 0 {
+            0.0
+        } else {
+            min_m * (log_step * (count as f64 - 1.0)).exp()
+        }
+    };
     counts.into_iter().flatten().map(meters).collect()
 }
 
@@ -410,9 +562,13 @@ fn nothing_long_is_sent_before_a_hello_on_a_slow_link() {
             continue;
         }
         let mut kinds = Vec::new();
-        while !kinds.iter().any(|kind| kind == "keyframe_changes") || !kinds.iter().any(|kind| kind == "live_image") {
+        while !kinds.iter().any(|kind| kind == "keyframe_changes")
+            || !kinds.iter().any(|kind| kind == "live_image")
+        {
             match client.receive() {
-                Received::Text(message) => kinds.push(message["type"].as_str().unwrap_or_default().to_owned()),
+                Received::Text(message) => {
+                    kinds.push(message["type"].as_str().unwrap_or_default().to_owned())
+                }
                 Received::Binary(header, _) => {
                     assert_eq!(header["size_px"], json!([160, 120]), "the subscribed size");
                     kinds.push("live_image".to_owned());
@@ -420,9 +576,15 @@ fn nothing_long_is_sent_before_a_hello_on_a_slow_link() {
                 Received::End => panic!("disconnected after {kinds:?}"),
             }
         }
-        assert!(kinds.iter().all(|kind| kind != "keyframes"), "the list of version 3: {kinds:?}");
+        assert!(
+            kinds.iter().all(|kind| kind != "keyframes"),
+            "the list of version 3: {kinds:?}"
+        );
         let position = |name: &str| kinds.iter().position(|kind| kind == name);
-        assert!(position("welcome") < position("keyframe_changes").min(position("live_image")), "{kinds:?}");
+        assert!(
+            position("welcome") < position("keyframe_changes").min(position("live_image")),
+            "{kinds:?}"
+        );
         return;
     }
     panic!("no hello was sent in time");
@@ -437,12 +599,24 @@ fn robot_is_described_and_moves() {
     assert!(!hub.needs_robot_state(), "no client has subscribed");
     client.send_json(&json!({"type": "subscribe", "topic": "robot_state", "rate_hz": 60}));
     // The description comes before the first state.
-    let mut of_robot = std::iter::repeat_with(|| client.text())
-        .filter(|message| message["type"].as_str().is_some_and(|kind| kind.starts_with("robot")));
-    let (description, state) = (of_robot.next().expect("endless"), of_robot.next().expect("endless"));
-    assert_eq!((&description["type"], &state["type"]), (&json!("robot"), &json!("robot_state")));
+    let mut of_robot = std::iter::repeat_with(|| client.text()).filter(|message| {
+        message["type"]
+            .as_str()
+            .is_some_and(|kind| kind.starts_with("robot"))
+    });
+    let (description, state) = (
+        of_robot.next().expect("endless"),
+        of_robot.next().expect("endless"),
+    );
+    assert_eq!(
+        (&description["type"], &state["type"]),
+        (&json!("robot"), &json!("robot_state"))
+    );
     assert!(hub.needs_robot_state());
-    assert_eq!(description["links"][1]["shapes"][0]["size_m"], json!([0.3, 0.2, 0.3]));
+    assert_eq!(
+        description["links"][1]["shapes"][0]["size_m"],
+        json!([0.3, 0.2, 0.3])
+    );
     assert_eq!(description["joints"][1]["axis"], json!([0.0, 0.0, 1.0]));
     assert_eq!(state["positions"], json!([0.2, 0.0]));
     assert_eq!(state["world_from_base"][3], json!(-0.4));
@@ -462,18 +636,41 @@ fn robot_is_described_and_moves() {
             break;
         }
     }
-    assert!(f64::from(n_received) <= 60.0 * elapsed.as_secs_f64() + 3.0, "{n_received} states in {elapsed:?}");
+    assert!(
+        f64::from(n_received) <= 60.0 * elapsed.as_secs_f64() + 3.0,
+        "{n_received} states in {elapsed:?}"
+    );
     let mesh = http_get(server.address(), "/robot/0.stl", "");
-    assert!(mesh.starts_with("HTTP/1.1 200") && mesh.ends_with("solid a"), "{mesh}");
-    for path in
-        ["/robot/1.stl", "/robot/0.dae", "/robot/..%2f..%2fetc%2fpasswd", "/robot/../status.stl", "/robot/a.stl"]
-    {
-        assert!(http_get(server.address(), path, "").starts_with("HTTP/1.1 404"), "{path}");
+    assert!(
+        mesh.starts_with("HTTP/1.1 200") && mesh.ends_with("solid a"),
+        "{mesh}"
+    );
+    for path in [
+        "/robot/1.stl",
+        "/robot/0.dae",
+        "/robot/..%2f..%2fetc%2fpasswd",
+        "/robot/../status.stl",
+        "/robot/a.stl",
+    ] {
+        assert!(
+            http_get(server.address(), path, "").starts_with("HTTP/1.1 404"),
+            "{path}"
+        );
     }
     // Reloading the page does not transfer the meshes again.
-    let etag = mesh.lines().find_map(|line| line.strip_prefix("etag: ")).expect("an ETag");
-    let again = http_get(server.address(), "/robot/0.stl", &format!("If-None-Match: {etag}\r\n"));
-    assert!(again.starts_with("HTTP/1.1 304") && !again.contains("solid"), "{again}");
+    let etag = mesh
+        .lines()
+        .find_map(|line| line.strip_prefix("etag: "))
+        .expect("an ETag");
+    let again = http_get(
+        server.address(),
+        "/robot/0.stl",
+        &format!("If-None-Match: {etag}\r\n"),
+    );
+    assert!(
+        again.starts_with("HTTP/1.1 304") && !again.contains("solid"),
+        "{again}"
+    );
     let other = http_get(server.address(), "/robot/0.stl", "If-None-Match: \"0\"\r\n");
     assert!(other.starts_with("HTTP/1.1 200"), "{other}");
 }
@@ -483,7 +680,11 @@ fn http_get(address: SocketAddr, path: &str, headers: &str) -> String {
     use std::io::{Read, Write};
     let mut stream = TcpStream::connect(address).expect("the server listens");
     stream.set_read_timeout(Some(TIMEOUT)).expect("a timeout");
-    write!(stream, "GET {path} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n{headers}\r\n").expect("sent");
+    write!(
+        stream,
+        "GET {path} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n{headers}\r\n"
+    )
+    .expect("sent");
     let mut answer = Vec::new();
     stream.read_to_end(&mut answer).expect("an answer");
     String::from_utf8_lossy(&answer).into_owned()

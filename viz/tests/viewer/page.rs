@@ -16,7 +16,10 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 use test_support::browser::{Browser, browser_for_page, canvas_bounds, canvas_shot, wait_for};
 use trainer::{Projection, RenderRequest};
-use viz::{Hub, KeyframePose, LiveImage, LivePixels, ModelStatus, RunResult, SceneHint, Server, ServerConfig, Status};
+use viz::{
+    Hub, KeyframePose, LiveImage, LivePixels, ModelStatus, RunResult, SceneHint, Server,
+    ServerConfig, Status,
+};
 
 const WINDOW_PX: [u32; 2] = [1280, 760];
 /// Sizes of the screenshots in `CARGO_TARGET_TMPDIR`.
@@ -25,8 +28,8 @@ const PHONE_PX: [u32; 2] = [390, 844];
 const TURNED_PHONE_PX: [u32; 2] = [844, 390];
 /// The page shows a lost connection within this time.
 const MAX_LOSS_DISPLAY_MILLIS: f64 = 1000.0;
-/// Added to the render time of each picture. If pictures took less than 20 ms, the server would skip the coarse
-/// stages.
+/// Added to the render time of each picture. If pictures took less than 20 ms, the server would
+/// skip the coarse stages.
 const DRAWING_MILLIS: u64 = 25;
 /// A wireless link: 20 Mbit/s, and one segment in a hundred is sent again.
 const LINK: Link = Link {
@@ -35,15 +38,17 @@ const LINK: Link = Link {
     slow_period: 100,
     slow_delay: Duration::from_millis(200),
 };
-/// Maximum size of all files that the page loads before its first picture, compressed. They take 0.1 s on this link.
+/// Maximum size of all files that the page loads before its first picture, compressed. They take
+/// 0.1 s on this link.
 const MAX_PAGE_BYTES: f64 = 250_000.0;
 /// Size of all files that the page has loaded so far.
-const LOADED_BYTES: &str = "['navigation', 'resource'].flatMap((kind) => performance.getEntriesByType(kind))
+const LOADED_BYTES: &str =
+    "['navigation', 'resource'].flatMap((kind) => performance.getEntriesByType(kind))
     .reduce((sum, entry) => sum + entry.transferSize, 0)";
 /// Duration of the interruption.
 const CUT: Duration = Duration::from_secs(25);
-/// Whether a pixel contains some of the page's `--accent`, the color of live cameras. Nothing else in this scene is
-/// blue-green.
+/// Whether a pixel contains some of the page's `--accent`, the color of live cameras. Nothing else
+/// in this scene is blue-green.
 fn is_accent([red, green, blue]: [u8; 3]) -> bool {
     green >= red.saturating_add(30) && blue >= red.saturating_add(18)
 }
@@ -69,10 +74,17 @@ impl RenderThread {
         let received_requests: Arc<Mutex<Vec<ReceivedRequest>>> = Arc::default();
         let drawing_millis = Arc::new(AtomicU64::new(DRAWING_MILLIS));
         let is_paused: Arc<AtomicBool> = Arc::default();
-        let (received, drawing, paused) = (received_requests.clone(), drawing_millis.clone(), is_paused.clone());
+        let (received, drawing, paused) = (
+            received_requests.clone(),
+            drawing_millis.clone(),
+            is_paused.clone(),
+        );
         let thread = RequestThread::start(hub, move |pending| {
             let order = (pending.request.clone(), pending.method().map(str::to_owned));
-            received.lock().expect("no thread panicked while holding the lock").push(order);
+            received
+                .lock()
+                .expect("no thread panicked while holding the lock")
+                .push(order);
             let picture = draw(&pending.request);
             std::thread::sleep(Duration::from_millis(drawing.load(Ordering::Relaxed)));
             while paused.load(Ordering::Relaxed) {
@@ -80,7 +92,12 @@ impl RenderThread {
             }
             pending.deliver(picture);
         });
-        Self { received_requests, drawing_millis, is_paused, _thread: thread }
+        Self {
+            received_requests,
+            drawing_millis,
+            is_paused,
+            _thread: thread,
+        }
     }
 
     /// The requests of the main view. Panoramas are requested for its surroundings.
@@ -107,7 +124,8 @@ impl RenderThread {
 /// A camera next to the scene, so that its frustum is visible from the first view.
 fn side_camera() -> KeyframePose {
     let eye = Point3::new(-0.8, -0.3, 0.6);
-    let rotation = UnitQuaternion::face_towards(&(Point3::new(0.0, 0.2, 0.1) - eye), &-Vector3::z());
+    let rotation =
+        UnitQuaternion::face_towards(&(Point3::new(0.0, 0.2, 0.1) - eye), &-Vector3::z());
     KeyframePose {
         camera: "wrist".into(),
         stamp: Stamp(0),
@@ -138,7 +156,10 @@ fn publish_updates(hub: &Hub) {
     let request = RenderRequest {
         world_from_camera: live.world_from_camera,
         size_px: live.size_px,
-        projection: Projection::Pinhole { focal_px: live.focal_px, principal_px: live.principal_px },
+        projection: Projection::Pinhole {
+            focal_px: live.focal_px,
+            principal_px: live.principal_px,
+        },
         shutter: None,
         near_m: 0.01,
         far_m: 50.0,
@@ -149,20 +170,32 @@ fn publish_updates(hub: &Hub) {
         depth: true,
     };
     hub.set_live_image(live_image(draw(&request).rgba_srgb.into()));
-    let turned = |angle: f64| Transform::rotation(Vector3::new(0.0, 0.0, angle)) * live.world_from_camera;
-    let keyframes = (1..12).map(|ix| KeyframePose { world_from_camera: turned(0.15 * f64::from(ix)), ..live.clone() });
+    let turned =
+        |angle: f64| Transform::rotation(Vector3::new(0.0, 0.0, angle)) * live.world_from_camera;
+    let keyframes = (1..12).map(|ix| KeyframePose {
+        world_from_camera: turned(0.15 * f64::from(ix)),
+        ..live.clone()
+    });
     hub.set_keyframes(keyframes.collect());
     hub.set_scene_hint(SceneHint {
         center_m: [0.0, 0.0, 0.2],
         radius_m: 0.8,
         world_from_camera: Translation3::new(0.0, 0.0, 0.3) * looking_along_y(),
     });
-    let curve = |ix: u32| (f64::from(ix) * 2.0, 27.0 - 14.0 * (-f64::from(ix) / 12.0).exp());
+    let curve = |ix: u32| {
+        (
+            f64::from(ix) * 2.0,
+            27.0 - 14.0 * (-f64::from(ix) / 12.0).exp(),
+        )
+    };
     hub.set_status(Status {
         state: "training".to_owned(),
         seconds: 98.4,
         keyframes: 143,
-        rejected: BTreeMap::from([("too little motion".to_owned(), 812), ("blurred".to_owned(), 31)]),
+        rejected: BTreeMap::from([
+            ("too little motion".to_owned(), 812),
+            ("blurred".to_owned(), 31),
+        ]),
         model: ModelStatus {
             method: "splat".to_owned(),
             step: 1520,
@@ -188,16 +221,26 @@ fn publish_updates(hub: &Hub) {
 
 #[test]
 fn page_renders_scene_and_overlays_correctly() {
-    let Some(program) = browser_for_page() else { return };
+    let Some(program) = browser_for_page() else {
+        return;
+    };
     let hub = Hub::new();
     publish_updates(&hub);
-    let server = Server::start(ServerConfig { listen: ([127, 0, 0, 1], 0).into() }, hub.clone()).expect("a free port");
+    let server = Server::start(
+        ServerConfig {
+            listen: ([127, 0, 0, 1], 0).into(),
+        },
+        hub.clone(),
+    )
+    .expect("a free port");
     let render_thread = RenderThread::start(hub.clone());
     let scratch = PathBuf::from(env!("CARGO_TARGET_TMPDIR"));
     let profile = scratch.join(format!("chromium-{}", std::process::id()));
     let mut browser = Browser::open(&program, &profile, &server.url(), WINDOW_PX);
 
-    wait_for(&mut browser, "a full picture", |browser| browser.text("picture-text").contains("100 %"));
+    wait_for(&mut browser, "a full picture", |browser| {
+        browser.text("picture-text").contains("100 %")
+    });
     std::fs::write(scratch.join("page.png"), browser.screenshot()).expect("written");
     assert_eq!(browser.text("psnr"), "26.76");
     assert_eq!(browser.text("primitives"), "84,512");
@@ -205,11 +248,23 @@ fn page_renders_scene_and_overlays_correctly() {
     let at_rest = render_thread.requests();
     let full = at_rest.last().expect("drawn").clone();
     let widths: Vec<_> = at_rest.iter().map(|request| request.size_px[0]).collect();
-    let is_tenth = widths.iter().any(|width| (width * 10).abs_diff(full.size_px[0]) < 10);
+    let is_tenth = widths
+        .iter()
+        .any(|width| (width * 10).abs_diff(full.size_px[0]) < 10);
     let is_half = (widths[widths.len() - 2] * 2).abs_diff(full.size_px[0]) < 2;
-    assert!(is_tenth && is_half, "stages of 10, 50 and 100 %: {widths:?}");
+    assert!(
+        is_tenth && is_half,
+        "stages of 10, 50 and 100 %: {widths:?}"
+    );
     let first_view = Translation3::new(0.0, 0.0, 0.3) * looking_along_y();
-    assert!((full.world_from_camera.inverse() * first_view).translation.vector.norm() < 1e-6, "starts at the hint");
+    assert!(
+        (full.world_from_camera.inverse() * first_view)
+            .translation
+            .vector
+            .norm()
+            < 1e-6,
+        "starts at the hint"
+    );
 
     check_switch(&mut browser, &render_thread);
     check_live_frustum(&mut browser, &full);
@@ -237,7 +292,8 @@ fn reset_view(browser: &mut Browser, render_thread: &RenderThread, full: &Render
     wait_for(browser, "the first view", |browser| {
         let last = render_thread.requests().last().expect("drawn").clone();
         let motion = full.world_from_camera.inverse() * last.world_from_camera;
-        let is_full = last.size_px == full.size_px && browser.text("picture-text").contains("100 %");
+        let is_full =
+            last.size_px == full.size_px && browser.text("picture-text").contains("100 %");
         is_full && motion.translation.vector.norm() < 1e-6
     });
 }
@@ -245,17 +301,28 @@ fn reset_view(browser: &mut Browser, render_thread: &RenderThread, full: &Render
 /// Clicking another model's button requests its pictures and shows its values.
 fn check_switch(browser: &mut Browser, render_thread: &RenderThread) {
     let press = |browser: &mut Browser, method: &str| {
-        browser.evaluate(&format!("document.querySelector('#models button[data-method={method}]').click()"));
+        browser.evaluate(&format!(
+            "document.querySelector('#models button[data-method={method}]').click()"
+        ));
     };
-    assert!(render_thread.methods().iter().all(Option::is_none), "no model was chosen");
+    assert!(
+        render_thread.methods().iter().all(Option::is_none),
+        "no model was chosen"
+    );
     press(browser, "tsdf");
-    wait_for(browser, "the other model's values", |browser| browser.text("primitives-label") == "Voxel blocks");
-    wait_for(browser, "its picture", |_| render_thread.methods().last() == Some(&Some("tsdf".to_owned())));
+    wait_for(browser, "the other model's values", |browser| {
+        browser.text("primitives-label") == "Voxel blocks"
+    });
+    wait_for(browser, "its picture", |_| {
+        render_thread.methods().last() == Some(&Some("tsdf".to_owned()))
+    });
     press(browser, "splat");
     wait_for(browser, "the first model's picture", |_| {
         render_thread.methods().last() == Some(&Some("splat".to_owned()))
     });
-    wait_for(browser, "a full picture of it", |browser| browser.text("picture-text").contains("100 %"));
+    wait_for(browser, "a full picture of it", |browser| {
+        browser.text("picture-text").contains("100 %")
+    });
     assert_eq!(browser.text("primitives-label"), "Splats");
 }
 
@@ -279,14 +346,17 @@ fn check_live_frustum(browser: &mut Browser, request: &RenderRequest) {
         for share in [0.3, 0.6, 0.9] {
             let center_px = pixel_of(request, eye + (corner(u, v) - eye) * share);
             let is_near = (-REACH_PX..=REACH_PX)
-                .flat_map(|dy| (-REACH_PX..=REACH_PX).map(move |dx| (center_px.0 + dx, center_px.1 + dy)))
+                .flat_map(|dy| {
+                    (-REACH_PX..=REACH_PX).map(move |dx| (center_px.0 + dx, center_px.1 + dy))
+                })
                 .any(|(x, y)| is_accent(pixel(&shot, x, y)));
             assert!(is_near, "no line of the frustum near {center_px:?}");
         }
     }
 }
 
-/// With the lines off, the view equals the requested picture pixel for pixel, except for JPEG compression.
+/// With the lines off, the view equals the requested picture pixel for pixel, except for JPEG
+/// compression.
 fn check_picture(browser: &mut Browser, request: &RenderRequest) {
     browser.click("toggle-grid");
     let shot = canvas_shot(browser);
@@ -310,7 +380,10 @@ fn check_picture(browser: &mut Browser, request: &RenderRequest) {
         sum / n
     };
     let (there, left, right) = (off_by(0), off_by(-2), off_by(2));
-    assert!(there < 3.0, "the view differs from the scene by {there} of 255 on average");
+    assert!(
+        there < 3.0,
+        "the view differs from the scene by {there} of 255 on average"
+    );
     assert!(
         there < 0.7 * left && there < 0.7 * right,
         "a shift by 2 pixels must be detected: {there}, {left}, {right}"
@@ -322,7 +395,8 @@ fn check_picture(browser: &mut Browser, request: &RenderRequest) {
 fn click_on(browser: &mut Browser, request: &RenderRequest, point: Point3<f64>) {
     let [left, top, ..] = canvas_bounds(browser);
     let (x, y) = pixel_of(request, point);
-    let at = [x + i64::from(left), y + i64::from(top)].map(|value| i32::try_from(value).expect("inside the window"));
+    let at = [x + i64::from(left), y + i64::from(top)]
+        .map(|value| i32::try_from(value).expect("inside the window"));
     browser.mouse("mouseMoved", at);
     browser.mouse("mousePressed", at);
     browser.mouse("mouseReleased", at);
@@ -333,17 +407,31 @@ fn check_distance(browser: &mut Browser, request: &RenderRequest) {
     browser.click("toggle-measure");
     click_on(browser, request, Point3::new(-0.45, 0.2, 0.0));
     click_on(browser, request, Point3::new(0.25, 0.1, 0.0));
-    wait_for(browser, "a distance", |browser| browser.text("distance").contains("vertical"));
+    wait_for(browser, "a distance", |browser| {
+        browser.text("distance").contains("vertical")
+    });
     let text = browser.text("distance");
-    let millimeters: Vec<f64> = text.split(|c: char| !c.is_ascii_digit()).filter_map(|n| n.parse().ok()).collect();
+    let millimeters: Vec<f64> = text
+        .split(|c: char| !c.is_ascii_digit())
+        .filter_map(|n| n.parse().ok())
+        .collect();
     let expected = 707.0; // hypot(700, 100)
-    assert!((millimeters[0] - expected).abs() < 0.02 * expected, "{text}");
-    assert!((millimeters[1] - expected).abs() < 0.02 * expected && millimeters[2] < 15.0, "{text}");
+    assert!(
+        (millimeters[0] - expected).abs() < 0.02 * expected,
+        "{text}"
+    );
+    assert!(
+        (millimeters[1] - expected).abs() < 0.02 * expected && millimeters[2] < 15.0,
+        "{text}"
+    );
     save_and_restore(browser, "distance");
     click_on(browser, request, Point3::new(0.0, 50.0, 12.0));
     assert_eq!(browser.text("distance"), "no surface here");
     browser.click("toggle-measure");
-    assert_eq!(browser.evaluate("document.getElementById('distance').hidden"), true);
+    assert_eq!(
+        browser.evaluate("document.getElementById('distance').hidden"),
+        true
+    );
 }
 
 /// A click on a camera image enlarges it, and its images arrive in a larger size.
@@ -351,30 +439,58 @@ fn check_images(browser: &mut Browser) {
     let height = "document.querySelector('#live canvas').height";
     let small = browser.evaluate(height).as_u64().expect("a height");
     browser.evaluate("document.querySelector('#live figure').click()");
-    wait_for(browser, "a larger image", |browser| browser.evaluate(height).as_u64() == Some(480));
+    wait_for(browser, "a larger image", |browser| {
+        browser.evaluate(height).as_u64() == Some(480)
+    });
     assert!(small < 300, "a thumbnail of {small} rows");
     save_and_restore(browser, "enlarged");
     browser.evaluate("document.querySelector('#live figure').click()");
-    wait_for(browser, "a small image", |browser| browser.evaluate(height).as_u64() == Some(small));
+    wait_for(browser, "a small image", |browser| {
+        browser.evaluate(height).as_u64() == Some(small)
+    });
     // Images in the side panel are small.
     browser.evaluate("document.querySelector('#live figure').click()");
-    wait_for(browser, "a larger image", |browser| browser.evaluate(height).as_u64() == Some(480));
+    wait_for(browser, "a larger image", |browser| {
+        browser.evaluate(height).as_u64() == Some(480)
+    });
     let docked = "document.querySelectorAll('#docked canvas').length";
     let dock = "document.querySelector('figure[data-camera] button').click()";
     browser.evaluate(dock);
-    assert_eq!(browser.evaluate(docked), 1, "the image is in the side panel");
+    assert_eq!(
+        browser.evaluate(docked),
+        1,
+        "the image is in the side panel"
+    );
     wait_for(browser, "a small image in the side panel", |browser| {
-        browser.evaluate("document.querySelector('#docked canvas').height").as_u64() == Some(small)
+        browser
+            .evaluate("document.querySelector('#docked canvas').height")
+            .as_u64()
+            == Some(small)
     });
     save_and_restore(browser, "docked");
     browser.evaluate("window.isBeforeReload = true; void setTimeout(() => location.reload(), 0)");
-    wait_for(browser, "the reload", |browser| browser.evaluate("window.isBeforeReload ?? false") == false);
-    wait_for(browser, "the image in the side panel after a reload", |browser| browser.evaluate(docked) == 1);
-    wait_for(browser, "a full picture", |browser| browser.text("picture-text").contains("100 %"));
+    wait_for(browser, "the reload", |browser| {
+        browser.evaluate("window.isBeforeReload ?? false") == false
+    });
+    wait_for(
+        browser,
+        "the image in the side panel after a reload",
+        |browser| browser.evaluate(docked) == 1,
+    );
+    wait_for(browser, "a full picture", |browser| {
+        browser.text("picture-text").contains("100 %")
+    });
     browser.click("toggle-images");
-    assert_eq!(browser.evaluate("document.getElementById('docked-card').hidden"), true, "images are hidden there, too");
+    assert_eq!(
+        browser.evaluate("document.getElementById('docked-card').hidden"),
+        true,
+        "images are hidden there, too"
+    );
     browser.click("toggle-images");
-    assert_eq!(browser.evaluate("document.getElementById('docked-card').hidden"), false);
+    assert_eq!(
+        browser.evaluate("document.getElementById('docked-card').hidden"),
+        false
+    );
     browser.evaluate(dock);
     assert_eq!(browser.evaluate(docked), 0, "the image is back in the view");
 }
@@ -394,7 +510,9 @@ fn check_settings(browser: &mut Browser, render_thread: &RenderThread, before: &
     set(browser, "fov", "30");
     let focal_px = 0.5 * f64::from(before.size_px[1]) / 15_f64.to_radians().tan();
     wait_for(browser, "a narrower view", |_| match last().projection {
-        Projection::Pinhole { focal_px: [_, y], .. } => last().size_px == before.size_px && (y - focal_px).abs() < 1.0,
+        Projection::Pinhole {
+            focal_px: [_, y], ..
+        } => last().size_px == before.size_px && (y - focal_px).abs() < 1.0,
         Projection::Equirectangular => false,
     });
     set(browser, "fov", "50");
@@ -402,7 +520,9 @@ fn check_settings(browser: &mut Browser, render_thread: &RenderThread, before: &
     wait_for(browser, "a smaller picture", |_| last().size_px[0] == 640);
     save_and_restore(browser, "settings");
     set(browser, "picture-width", "1280");
-    wait_for(browser, "the picture of before", |_| last().size_px == before.size_px);
+    wait_for(browser, "the picture of before", |_| {
+        last().size_px == before.size_px
+    });
     browser.click("toggle-grid");
     set(browser, "opacity", "0");
     let shot = canvas_shot(browser);
@@ -418,7 +538,9 @@ fn check_refresh(browser: &mut Browser, render_thread: &RenderThread, hub: &Hub)
     /// Longer than the page needs to show a picture, so that this does not decide the rates.
     const SLOW_DRAWING_MILLIS: u64 = 400;
     const CHANGES: Duration = Duration::from_secs(6);
-    render_thread.drawing_millis.store(SLOW_DRAWING_MILLIS, Ordering::Relaxed);
+    render_thread
+        .drawing_millis
+        .store(SLOW_DRAWING_MILLIS, Ordering::Relaxed);
     let mut step = 2000;
     let [n_with_pauses, n_continuous] = ["pauses", "continuous"].map(|refresh| {
         set(browser, "refresh", refresh);
@@ -427,7 +549,11 @@ fn check_refresh(browser: &mut Browser, render_thread: &RenderThread, hub: &Hub)
             step += 1;
             hub.set_status(Status {
                 state: "training".to_owned(),
-                model: ModelStatus { method: "splat".to_owned(), step, ..ModelStatus::default() },
+                model: ModelStatus {
+                    method: "splat".to_owned(),
+                    step,
+                    ..ModelStatus::default()
+                },
                 ..Status::default()
             });
             std::thread::sleep(Duration::from_millis(50));
@@ -435,9 +561,14 @@ fn check_refresh(browser: &mut Browser, render_thread: &RenderThread, hub: &Hub)
         render_thread.requests().len() - n_before
     });
     set(browser, "refresh", "pauses");
-    render_thread.drawing_millis.store(DRAWING_MILLIS, Ordering::Relaxed);
+    render_thread
+        .drawing_millis
+        .store(DRAWING_MILLIS, Ordering::Relaxed);
     assert!(n_with_pauses >= 2, "{n_with_pauses} pictures");
-    assert!(n_continuous > n_with_pauses, "{n_continuous} pictures, with pauses {n_with_pauses}");
+    assert!(
+        n_continuous > n_with_pauses,
+        "{n_continuous} pictures, with pauses {n_with_pauses}"
+    );
     publish_updates(hub);
 }
 
@@ -450,26 +581,40 @@ fn check_camera_path(browser: &mut Browser, request: &RenderRequest) {
     browser.click("look-top");
     browser.click("path-add");
     browser.click("path-save");
-    wait_for(browser, "a file", |browser| browser.evaluate("window.savedPath !== undefined") == true);
+    wait_for(browser, "a file", |browser| {
+        browser.evaluate("window.savedPath !== undefined") == true
+    });
     let text = browser.evaluate("window.savedPath");
     let file: serde_json::Value = serde_json::from_str(text.as_str().expect("text")).expect("JSON");
     let frames = file["camera_path"].as_array().expect("frames");
     assert_eq!((frames.len(), &file["fps"]), (61, &serde_json::json!(30)));
     let pose = |frame: &serde_json::Value| {
-        let numbers: Vec<f64> = serde_json::from_value(frame["camera_to_world"].clone()).expect("a matrix, row by row");
+        let numbers: Vec<f64> =
+            serde_json::from_value(frame["camera_to_world"].clone()).expect("a matrix, row by row");
         nalgebra::Matrix4::from_row_slice(&numbers)
     };
-    let opengl_from_camera = nalgebra::Matrix4::from_diagonal(&nalgebra::Vector4::new(1.0, -1.0, -1.0, 1.0));
+    let opengl_from_camera =
+        nalgebra::Matrix4::from_diagonal(&nalgebra::Vector4::new(1.0, -1.0, -1.0, 1.0));
     let expected = request.world_from_camera.to_homogeneous();
-    assert!((pose(&frames[0]) * opengl_from_camera - expected).norm() < 1e-5, "starts at the first view");
+    assert!(
+        (pose(&frames[0]) * opengl_from_camera - expected).norm() < 1e-5,
+        "starts at the first view"
+    );
     let forward = -pose(&frames[60]).column(2).xyz();
-    assert!((forward + Vector3::z()).norm() < 0.01, "ends with the view from above: {forward}");
+    assert!(
+        (forward + Vector3::z()).norm() < 0.01,
+        "ends with the view from above: {forward}"
+    );
     browser.click("path-play");
     assert_eq!(browser.text("path-play"), "Stop");
-    wait_for(browser, "the end of the path", |browser| browser.text("path-play") == "Play");
+    wait_for(browser, "the end of the path", |browser| {
+        browser.text("path-play") == "Play"
+    });
     browser.click("path-clear");
     browser.click("reset-view");
-    wait_for(browser, "a full picture", |browser| browser.text("picture-text").contains("100 %"));
+    wait_for(browser, "a full picture", |browser| {
+        browser.text("picture-text").contains("100 %")
+    });
 }
 
 /// Drags the view to the right and down.
@@ -487,19 +632,36 @@ fn uncovered([width, height]: [u32; 2]) -> [std::ops::Range<i64>; 2] {
     [4..i64::from(width) - 4, 80..i64::from(height) - 240]
 }
 
-/// While dragging, the page requests small pictures; at rest, full ones. The camera rotates around the center.
-fn check_drag(browser: &mut Browser, render_thread: &RenderThread, before: &RenderRequest) -> RenderRequest {
+/// While dragging, the page requests small pictures; at rest, full ones. The camera rotates around
+/// the center.
+fn check_drag(
+    browser: &mut Browser,
+    render_thread: &RenderThread,
+    before: &RenderRequest,
+) -> RenderRequest {
     let n_before = render_thread.requests().len();
     drag(browser);
-    wait_for(browser, "a small picture", |browser| !browser.text("picture-text").contains("100 %"));
-    wait_for(browser, "a full picture after the drag", |browser| browser.text("picture-text").contains("100 %"));
+    wait_for(browser, "a small picture", |browser| {
+        !browser.text("picture-text").contains("100 %")
+    });
+    wait_for(browser, "a full picture after the drag", |browser| {
+        browser.text("picture-text").contains("100 %")
+    });
     let requests = render_thread.requests();
     let first = &requests[n_before];
-    assert!(first.size_px[0] * 2 <= before.size_px[0] + 1, "a moving view is drawn small: {:?}", first.size_px);
+    assert!(
+        first.size_px[0] * 2 <= before.size_px[0] + 1,
+        "a moving view is drawn small: {:?}",
+        first.size_px
+    );
     let after = requests.last().expect("drawn");
     let center = Point3::new(0.0, 0.0, 0.2);
-    let distance = |request: &RenderRequest| (request.world_from_camera.translation.vector - center.coords).norm();
-    let moved = (after.world_from_camera.translation.vector - before.world_from_camera.translation.vector).norm();
+    let distance = |request: &RenderRequest| {
+        (request.world_from_camera.translation.vector - center.coords).norm()
+    };
+    let moved = (after.world_from_camera.translation.vector
+        - before.world_from_camera.translation.vector)
+        .norm();
     assert!(moved > 0.2, "the camera moved only {moved} m");
     assert!((distance(after) - distance(before)).abs() < 0.3 && distance(after) > 1.0);
     let right = after.world_from_camera.rotation * Vector3::x();
@@ -511,32 +673,68 @@ fn check_drag(browser: &mut Browser, render_thread: &RenderThread, before: &Rend
 fn check_reconnect(browser: &mut Browser, server: Server, hub: &Hub) {
     let listen = server.address();
     drop(server);
-    wait_for(browser, "the loss", |browser| browser.text("connection").contains("the server has stopped"));
-    let server = Server::start(ServerConfig { listen }, hub.clone()).expect("the port is free again");
-    wait_for(browser, "the return", |browser| browser.text("connection").contains("connected"));
+    wait_for(browser, "the loss", |browser| {
+        browser
+            .text("connection")
+            .contains("the server has stopped")
+    });
+    let server =
+        Server::start(ServerConfig { listen }, hub.clone()).expect("the port is free again");
+    wait_for(browser, "the return", |browser| {
+        browser.text("connection").contains("connected")
+    });
     drop(server);
 }
 
-/// Runs the page through a proxy that interrupts the connection, like a wireless link, up to the end of the run.
+/// Runs the page through a proxy that interrupts the connection, like a wireless link, up to the
+/// end of the run.
 #[test]
 fn page_shows_connection_loss_and_run_result() {
-    let Some(program) = browser_for_page() else { return };
+    let Some(program) = browser_for_page() else {
+        return;
+    };
     let hub = Hub::new();
     publish_updates(&hub);
-    let server = Server::start(ServerConfig { listen: ([127, 0, 0, 1], 0).into() }, hub.clone()).expect("a free port");
+    let server = Server::start(
+        ServerConfig {
+            listen: ([127, 0, 0, 1], 0).into(),
+        },
+        hub.clone(),
+    )
+    .expect("a free port");
     let render_thread = RenderThread::start(hub.clone());
     let proxy = Proxy::start(server.address(), LINK);
     let scratch = PathBuf::from(env!("CARGO_TARGET_TMPDIR"));
     let profile = scratch.join(format!("chromium-link-{}", std::process::id()));
-    let mut browser = Browser::open(&program, &profile, &format!("http://{}/", proxy.address()), DESKTOP_PX);
-    wait_for(&mut browser, "a picture", |browser| browser.text("picture-text").contains(" ms"));
-    let first_millis = browser.evaluate("performance.now()").as_f64().expect("a time");
-    let n_bytes = browser.evaluate(LOADED_BYTES).as_f64().expect("a number of bytes");
+    let mut browser = Browser::open(
+        &program,
+        &profile,
+        &format!("http://{}/", proxy.address()),
+        DESKTOP_PX,
+    );
+    wait_for(&mut browser, "a picture", |browser| {
+        browser.text("picture-text").contains(" ms")
+    });
+    let first_millis = browser
+        .evaluate("performance.now()")
+        .as_f64()
+        .expect("a time");
+    let n_bytes = browser
+        .evaluate(LOADED_BYTES)
+        .as_f64()
+        .expect("a number of bytes");
     eprintln!("first picture after {first_millis:.0} ms and files of {n_bytes} bytes");
-    assert!((50_000.0..MAX_PAGE_BYTES).contains(&n_bytes), "the page loads {n_bytes} bytes before the first picture");
+    assert!(
+        (50_000.0..MAX_PAGE_BYTES).contains(&n_bytes),
+        "the page loads {n_bytes} bytes before the first picture"
+    );
     let camera = Camera::start(hub.clone());
-    wait_for(&mut browser, "a full picture", |browser| browser.text("picture-text").contains("100 %"));
-    wait_for(&mut browser, "a live image", |browser| label(browser) == "live");
+    wait_for(&mut browser, "a full picture", |browser| {
+        browser.text("picture-text").contains("100 %")
+    });
+    wait_for(&mut browser, "a live image", |browser| {
+        label(browser) == "live"
+    });
     browser.evaluate(RECORDER);
     assert_eq!(browser.text("banner"), "");
     save_screenshot(&mut browser, "connected");
@@ -546,24 +744,54 @@ fn page_shows_connection_loss_and_run_result() {
     proxy.cut();
     let cut_at = Instant::now();
     std::thread::sleep(Duration::from_millis(1500));
-    assert!(browser.text("banner").starts_with("No data from the server for "), "{}", browser.text("banner"));
-    wait_for(&mut browser, "attempts to reconnect", |browser| browser.text("banner").contains("reconnecting"));
-    assert_eq!(canvas_bounds(&mut browser), bounds, "the view keeps its size during an outage");
+    assert!(
+        browser
+            .text("banner")
+            .starts_with("No data from the server for "),
+        "{}",
+        browser.text("banner")
+    );
+    wait_for(&mut browser, "attempts to reconnect", |browser| {
+        browser.text("banner").contains("reconnecting")
+    });
+    assert_eq!(
+        canvas_bounds(&mut browser),
+        bounds,
+        "the view keeps its size during an outage"
+    );
     save_screenshot(&mut browser, "lost");
     std::thread::sleep(CUT.saturating_sub(cut_at.elapsed()));
     camera.stop();
     std::thread::sleep(Duration::from_millis(600)); // From here on, every image is too old to be live.
     browser.evaluate("record.isLive = false");
     proxy.restore();
-    wait_for(&mut browser, "the return", |browser| browser.text("connection").contains("connected"));
+    wait_for(&mut browser, "the return", |browser| {
+        browser.text("connection").contains("connected")
+    });
     std::thread::sleep(Duration::from_millis(1500));
     assert_eq!(browser.text("banner"), "");
-    let shown_after = browser.evaluate("record.shownAfter").as_f64().expect("the loss was shown");
-    assert!(shown_after < MAX_LOSS_DISPLAY_MILLIS, "the lost connection was shown after {shown_after} ms");
-    assert_eq!(browser.evaluate("record.isLive"), false, "an image from before the cut was labeled live");
-    assert!(label(&mut browser).contains("old"), "{}", label(&mut browser));
+    let shown_after = browser
+        .evaluate("record.shownAfter")
+        .as_f64()
+        .expect("the loss was shown");
+    assert!(
+        shown_after < MAX_LOSS_DISPLAY_MILLIS,
+        "the lost connection was shown after {shown_after} ms"
+    );
+    assert_eq!(
+        browser.evaluate("record.isLive"),
+        false,
+        "an image from before the cut was labeled live"
+    );
+    assert!(
+        label(&mut browser).contains("old"),
+        "{}",
+        label(&mut browser)
+    );
     let camera = Camera::start(hub.clone());
-    wait_for(&mut browser, "a live image", |browser| label(browser) == "live");
+    wait_for(&mut browser, "a live image", |browser| {
+        label(browser) == "live"
+    });
     camera.stop();
 
     hub.set_run_result(RunResult {
@@ -573,7 +801,9 @@ fn page_shows_connection_loss_and_run_result() {
     });
     drop(server);
     wait_for(&mut browser, "the stopped server", |browser| {
-        browser.text("connection").contains("the server has stopped")
+        browser
+            .text("connection")
+            .contains("the server has stopped")
     });
     let expected = "Finished after 98 s: model saved in runs/2026-03-01-kitchen, PSNR 26.76 dB";
     assert_eq!(browser.text("banner"), expected);
@@ -596,11 +826,13 @@ const RECORDER: &str = "
 
 /// The label of the live image, which shows its age.
 fn label(browser: &mut Browser) -> String {
-    let label = browser.evaluate("document.querySelector('#live figcaption span')?.textContent ?? ''");
+    let label =
+        browser.evaluate("document.querySelector('#live figcaption span')?.textContent ?? ''");
     label.as_str().unwrap_or_default().to_owned()
 }
 
-/// Whether every panel, if it is opened, is below the toolbar, which has several rows in narrow windows, and in the view.
+/// Whether every panel, if it is opened, is below the toolbar, which has several rows in narrow
+/// windows, and in the view.
 fn panels_are_below_toolbar(browser: &mut Browser) -> bool {
     let expression = "(() => {
         const bounds = (id) => document.getElementById(id).getBoundingClientRect();
@@ -619,11 +851,16 @@ fn panels_are_below_toolbar(browser: &mut Browser) -> bool {
 
 /// Checks the layout at every window size and saves screenshots.
 fn save_screenshot(browser: &mut Browser, name: &str) {
-    for (window, size_px) in [("turned-phone", TURNED_PHONE_PX), ("phone", PHONE_PX), ("desktop", DESKTOP_PX)] {
+    for (window, size_px) in [
+        ("turned-phone", TURNED_PHONE_PX),
+        ("phone", PHONE_PX),
+        ("desktop", DESKTOP_PX),
+    ] {
         browser.resize(size_px);
         std::thread::sleep(Duration::from_millis(400));
         assert!(panels_are_below_toolbar(browser), "{name}, {window}");
-        let file = PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join(format!("page-{name}-{window}.png"));
+        let file =
+            PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join(format!("page-{name}-{window}.png"));
         std::fs::write(file, browser.screenshot()).expect("written");
     }
 }
@@ -659,14 +896,22 @@ fn save_and_restore(browser: &mut Browser, name: &str) {
     let bounds = canvas_bounds(browser);
     save_screenshot(browser, name);
     browser.resize(WINDOW_PX);
-    wait_for(browser, "the size of before", |browser| canvas_bounds(browser) == bounds);
+    wait_for(browser, "the size of before", |browser| {
+        canvas_bounds(browser) == bounds
+    });
     std::thread::sleep(Duration::from_millis(400)); // The view no longer moves.
-    wait_for(browser, "a full picture", |browser| browser.text("picture-text").contains("100 %"));
+    wait_for(browser, "a full picture", |browser| {
+        browser.text("picture-text").contains("100 %")
+    });
 }
 
 #[expect(clippy::cast_possible_truncation, reason = "pixels of a window")]
 fn pixel_of(request: &RenderRequest, point: Point3<f64>) -> (i64, i64) {
-    let Projection::Pinhole { focal_px, principal_px } = request.projection else {
+    let Projection::Pinhole {
+        focal_px,
+        principal_px,
+    } = request.projection
+    else {
         panic!("the page requests a pinhole projection")
     };
     let point_in_camera = request.world_from_camera.inverse_transform_point(&point);
@@ -677,5 +922,7 @@ fn pixel_of(request: &RenderRequest, point: Point3<f64>) -> (i64, i64) {
 
 fn pixel(image: &image::RgbImage, x: i64, y: i64) -> [u8; 3] {
     let clamp = |at: i64, n: u32| u32::try_from(at.clamp(0, i64::from(n) - 1)).expect("inside");
-    image.get_pixel(clamp(x, image.width()), clamp(y, image.height())).0
+    image
+        .get_pixel(clamp(x, image.width()), clamp(y, image.height()))
+        .0
 }

@@ -1,7 +1,7 @@
 //! Measures the tasks of the page's main thread while it receives the data of a run.
 //!
-//! WebGL is replaced by a stub, because drawing on the CPU would dominate the tasks. Skipped, with a message, if Chromium
-//! or the bundle (`make web`) is missing.
+//! WebGL is replaced by a stub, because drawing on the CPU would dominate the tasks. Skipped, with
+//! a message, if Chromium or the bundle (`make web`) is missing.
 
 use crate::analytic_scene;
 use crate::robot;
@@ -12,20 +12,26 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 use test_support::browser::{Browser, NO_DRAWING, browser_for_page, wait_for};
 use trainer::Picture;
-use viz::{Hub, KeyframePose, LiveImage, LivePixels, ModelStatus, SceneHint, Server, ServerConfig, Status};
+use viz::{
+    Hub, KeyframePose, LiveImage, LivePixels, ModelStatus, SceneHint, Server, ServerConfig, Status,
+};
 
 const WINDOW_PX: [u32; 2] = [1280, 720];
 const N_KEYFRAMES: i64 = 400;
 const DURATION: Duration = Duration::from_secs(8);
-/// Limit of the 99th percentile of the CPU time of tasks; the goal is 4 ms. CPU time hardly depends on the tests that run beside
-/// this one.
+/// Limit of the 99th percentile of the CPU time of tasks; the goal is 4 ms. CPU time hardly depends
+/// on the tests that run beside this one.
 const MAX_P99_MILLIS: f64 = 8.0;
 
 fn keyframe(stamp: i64) -> KeyframePose {
     KeyframePose {
         camera: "wrist".into(),
         stamp: Stamp(stamp),
-        world_from_camera: Transform::translation(f64::from(i32::try_from(stamp).expect("small")) * 1e-3, 0.0, 0.5),
+        world_from_camera: Transform::translation(
+            f64::from(i32::try_from(stamp).expect("small")) * 1e-3,
+            0.0,
+            0.5,
+        ),
         size_px: [640, 480],
         focal_px: [600.0; 2],
         principal_px: [320.0, 240.0],
@@ -34,8 +40,9 @@ fn keyframe(stamp: i64) -> KeyframePose {
 
 /// Publishes robot states at 60 Hz, images at 15 Hz, and a keyframe and a status per second.
 fn publish(hub: &Hub, is_over: &AtomicBool) {
-    let rgb: std::sync::Arc<[u8]> =
-        (0..640 * 480 * 3_u32).map(|ix| (ix.wrapping_mul(2_654_435_761) >> 29) as u8).collect();
+    let rgb: std::sync::Arc<[u8]> = (0..640 * 480 * 3_u32)
+        .map(|ix| (ix.wrapping_mul(2_654_435_761) >> 29) as u8)
+        .collect();
     let started = Instant::now();
     for tick in 0.. {
         if is_over.load(Ordering::Relaxed) {
@@ -56,9 +63,19 @@ fn publish(hub: &Hub, is_over: &AtomicBool) {
         }
         if tick % 60 == 0 {
             hub.set_keyframes((0..=N_KEYFRAMES + tick / 60).map(keyframe).collect());
-            let psnr_history = (0..512).map(|n| (f64::from(n) * 1.37, 20.0 + f64::from(n) * 0.0123)).collect();
-            let model = ModelStatus { step: tick.unsigned_abs(), psnr_history, ..ModelStatus::default() };
-            hub.set_status(Status { state: "training".to_owned(), model, ..Status::default() });
+            let psnr_history = (0..512)
+                .map(|n| (f64::from(n) * 1.37, 20.0 + f64::from(n) * 0.0123))
+                .collect();
+            let model = ModelStatus {
+                step: tick.unsigned_abs(),
+                psnr_history,
+                ..ModelStatus::default()
+            };
+            hub.set_status(Status {
+                state: "training".to_owned(),
+                model,
+                ..Status::default()
+            });
         }
         std::thread::sleep(Duration::from_millis(16));
     }
@@ -70,8 +87,9 @@ fn deliver(hub: &Hub, is_over: &AtomicBool) {
     while !is_over.load(Ordering::Relaxed) {
         hub.wait_for_request(Duration::from_millis(50));
         if let Some(pending) = hub.next_request() {
-            let picture =
-                drawn.entry(pending.request.size_px).or_insert_with(|| analytic_scene::draw(&pending.request));
+            let picture = drawn
+                .entry(pending.request.size_px)
+                .or_insert_with(|| analytic_scene::draw(&pending.request));
             pending.deliver(picture.clone());
         }
     }
@@ -79,7 +97,9 @@ fn deliver(hub: &Hub, is_over: &AtomicBool) {
 
 #[test]
 fn tasks_of_the_main_thread_are_short() {
-    let Some(program) = browser_for_page() else { return };
+    let Some(program) = browser_for_page() else {
+        return;
+    };
     let hub = Hub::new();
     hub.set_robot(robot::description());
     hub.set_scene_hint(SceneHint {
@@ -87,17 +107,33 @@ fn tasks_of_the_main_thread_are_short() {
         radius_m: 0.8,
         world_from_camera: analytic_scene::looking_along_y(),
     });
-    let server = Server::start(ServerConfig { listen: ([127, 0, 0, 1], 0).into() }, hub.clone()).expect("a free port");
-    let profile = PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join(format!("chromium-tasks-{}", std::process::id()));
+    let server = Server::start(
+        ServerConfig {
+            listen: ([127, 0, 0, 1], 0).into(),
+        },
+        hub.clone(),
+    )
+    .expect("a free port");
+    let profile = PathBuf::from(env!("CARGO_TARGET_TMPDIR"))
+        .join(format!("chromium-tasks-{}", std::process::id()));
     let is_over = AtomicBool::new(false);
     let tasks = std::thread::scope(|scope| {
         scope.spawn(|| publish(&hub, &is_over));
         scope.spawn(|| deliver(&hub, &is_over));
-        let mut browser = Browser::open_with(&program, &profile, &server.url(), WINDOW_PX, NO_DRAWING);
-        wait_for(&mut browser, "a full picture", |browser| browser.text("picture-text").contains("100 %"));
+        let mut browser =
+            Browser::open_with(&program, &profile, &server.url(), WINDOW_PX, NO_DRAWING);
+        wait_for(&mut browser, "a full picture", |browser| {
+            browser.text("picture-text").contains("100 %")
+        });
         let tasks = browser.trace_tasks(DURATION);
-        assert!(browser.text("picture-text").contains("100 %"), "pictures still arrive");
-        assert!(browser.evaluate("document.querySelectorAll('#live canvas').length") == 1, "images arrive");
+        assert!(
+            browser.text("picture-text").contains("100 %"),
+            "pictures still arrive"
+        );
+        assert!(
+            browser.evaluate("document.querySelectorAll('#live canvas').length") == 1,
+            "images arrive"
+        );
         is_over.store(true, Ordering::Relaxed);
         tasks
     });
@@ -114,5 +150,9 @@ fn tasks_of_the_main_thread_are_short() {
         percentile(1000)
     );
     assert!(tasks.len() > 500, "only {} tasks", tasks.len());
-    assert!(percentile(990) < MAX_P99_MILLIS, "the 99th percentile is {:.1} ms", percentile(990));
+    assert!(
+        percentile(990) < MAX_P99_MILLIS,
+        "the 99th percentile is {:.1} ms",
+        percentile(990)
+    );
 }

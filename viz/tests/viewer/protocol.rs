@@ -1,4 +1,5 @@
-//! Tests the real server over loopback with an independent client that follows `docs/reference/protocol.md`.
+//! Tests the real server over loopback with an independent client that follows
+//! `docs/reference/protocol.md`.
 
 use crate::analytic_scene;
 use crate::analytic_scene::draw;
@@ -16,13 +17,19 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 use trainer::{Aabb, ChunkData, ChunkLayout, ModelChunk, ModelChunks};
 use viz::{
-    Control, EditAction, Error, Hub, KeyframePose, LiveImage, LivePixels, ModelStatus, ObservationMap, ObservedCell,
-    PendingRender, RangeScan, SceneHint, Server, ServerConfig, Status,
+    Control, EditAction, Error, Hub, KeyframePose, LiveImage, LivePixels, ModelStatus,
+    ObservationMap, ObservedCell, PendingRender, RangeScan, SceneHint, Server, ServerConfig,
+    Status,
 };
 
 fn start() -> (Hub, Server) {
     let hub = Hub::new();
-    let server = Server::start(ServerConfig { listen: SocketAddr::from(([127, 0, 0, 1], 0)) }, hub.clone());
+    let server = Server::start(
+        ServerConfig {
+            listen: SocketAddr::from(([127, 0, 0, 1], 0)),
+        },
+        hub.clone(),
+    );
     (hub, server.expect("a free port exists"))
 }
 
@@ -78,26 +85,50 @@ fn client_receives_hello_then_current_state() {
     }]);
     let mut client = Client::connect(server.address());
     let hello = client.text();
-    assert_eq!((&hello["type"], &hello["protocol"]), (&json!("hello"), &json!(viz::BASE_PROTOCOL_VERSION)));
+    assert_eq!(
+        (&hello["type"], &hello["protocol"]),
+        (&json!("hello"), &json!(viz::BASE_PROTOCOL_VERSION))
+    );
     assert_eq!(hello["default_stages"], json!([0.1, 0.5, 1.0]));
     let scene = client.text_of("scene");
-    assert_eq!(scene["world_from_camera"], json!([1., 0., 0., 1., 0., 1., 0., 2., 0., 0., 1., 3., 0., 0., 0., 1.]));
+    assert_eq!(
+        scene["world_from_camera"],
+        json!([
+            1., 0., 0., 1., 0., 1., 0., 2., 0., 0., 1., 3., 0., 0., 0., 1.
+        ])
+    );
     let status = client.text_of("status");
-    assert_eq!((&status["step"], &status["psnr"]), (&json!(1200), &json!(24.5)));
+    assert_eq!(
+        (&status["step"], &status["psnr"]),
+        (&json!(1200), &json!(24.5))
+    );
     assert_eq!(status["psnr_history"], json!([[1.0, 20.0], [2.0, 24.5]]));
     assert_eq!(status["rejected"], json!({"blurred": 3}));
     assert_eq!(status["primitives_label"], json!("Splats"));
-    assert_eq!((&status["others"][0]["method"], &status["others"][0]["step"]), (&json!("tsdf"), &json!(30)));
+    assert_eq!(
+        (&status["others"][0]["method"], &status["others"][0]["step"]),
+        (&json!("tsdf"), &json!(30))
+    );
     let keyframes = client.text_of("keyframes");
     assert_eq!(keyframes["keyframes"][0]["focal_px"], json!([600.0, 601.0]));
-    hub.set_status(Status { model: model_status("splat", 1300), ..Status::default() });
+    hub.set_status(Status {
+        model: model_status("splat", 1300),
+        ..Status::default()
+    });
     let status = client.text_of("status");
-    assert_eq!((&status["step"], &status["others"]), (&json!(1300), &json!([])));
+    assert_eq!(
+        (&status["step"], &status["others"]),
+        (&json!(1300), &json!([]))
+    );
 }
 
 /// A model after `step` steps.
 fn model_status(method: &str, step: u64) -> ModelStatus {
-    ModelStatus { method: method.to_owned(), step, ..ModelStatus::default() }
+    ModelStatus {
+        method: method.to_owned(),
+        step,
+        ..ModelStatus::default()
+    }
 }
 
 #[test]
@@ -133,13 +164,21 @@ fn stages_stream_and_show_the_scene() {
     for stage in 0..3 {
         draw_all(&hub, 1); // The stage arrives before the next one is rendered.
         let (header, payload) = client.binary_of("picture");
-        assert_eq!((&header["id"], &header["stage"]), (&json!(9), &json!(stage)));
+        assert_eq!(
+            (&header["id"], &header["stage"]),
+            (&json!(9), &json!(stage))
+        );
         assert_eq!(header["last"], json!(stage == 2));
         check_same_pose(&message["world_from_camera"], &header["world_from_camera"]);
         sizes.push(header["size_px"].clone());
         let color = client::part(&header, "color", &payload);
-        let picture = image::load_from_memory_with_format(color, image::ImageFormat::Jpeg).expect("a JPEG").to_rgb8();
-        assert_eq!(json!([picture.width(), picture.height()]), header["size_px"]);
+        let picture = image::load_from_memory_with_format(color, image::ImageFormat::Jpeg)
+            .expect("a JPEG")
+            .to_rgb8();
+        assert_eq!(
+            json!([picture.width(), picture.height()]),
+            header["size_px"]
+        );
         let depth = client::part(&header, "depth", &payload);
         check_against_scene(&request_of_stage(&message, &header), &picture, depth);
     }
@@ -149,22 +188,42 @@ fn stages_stream_and_show_the_scene() {
 
 /// The server stores a quaternion, so a matrix returns with rounding errors.
 fn check_same_pose(sent: &Value, returned: &Value) {
-    let numbers =
-        |value: &Value| value.as_array().map(|rows| rows.iter().filter_map(Value::as_f64).collect::<Vec<_>>());
-    let (sent, returned) = (numbers(sent).expect("numbers"), numbers(returned).expect("numbers"));
+    let numbers = |value: &Value| {
+        value
+            .as_array()
+            .map(|rows| rows.iter().filter_map(Value::as_f64).collect::<Vec<_>>())
+    };
+    let (sent, returned) = (
+        numbers(sent).expect("numbers"),
+        numbers(returned).expect("numbers"),
+    );
     assert_eq!((sent.len(), returned.len()), (16, 16));
-    assert!(sent.iter().zip(&returned).all(|(a, b)| (a - b).abs() < 1e-12), "{sent:?} became {returned:?}");
+    assert!(
+        sent.iter()
+            .zip(&returned)
+            .all(|(a, b)| (a - b).abs() < 1e-12),
+        "{sent:?} became {returned:?}"
+    );
 }
 
 /// The request of a stage as described by its header, using only data from the wire.
 fn request_of_stage(message: &Value, header: &Value) -> trainer::RenderRequest {
-    let numbers =
-        |value: &Value| value.as_array().map(|list| list.iter().filter_map(Value::as_f64).collect::<Vec<_>>());
-    let scale = header["size_px"][0].as_f64().expect("a size") / header["full_size_px"][0].as_f64().expect("a size");
+    let numbers = |value: &Value| {
+        value
+            .as_array()
+            .map(|list| list.iter().filter_map(Value::as_f64).collect::<Vec<_>>())
+    };
+    let scale = header["size_px"][0].as_f64().expect("a size")
+        / header["full_size_px"][0].as_f64().expect("a size");
     let focal = numbers(&header["projection"]["focal_px"]).expect("focal lengths");
     let principal = numbers(&header["projection"]["principal_px"]).expect("a principal point");
     assert_eq!(message["size_px"], header["full_size_px"]);
-    let size_px = [0, 1].map(|ix| header["size_px"][ix].as_u64().and_then(|n| u32::try_from(n).ok()).expect("a size"));
+    let size_px = [0, 1].map(|ix| {
+        header["size_px"][ix]
+            .as_u64()
+            .and_then(|n| u32::try_from(n).ok())
+            .expect("a size")
+    });
     trainer::RenderRequest {
         world_from_camera: analytic_scene::looking_along_y(),
         size_px,
@@ -185,15 +244,32 @@ fn request_of_stage(message: &Value, header: &Value) -> trainer::RenderRequest {
 
 fn check_against_scene(request: &trainer::RenderRequest, picture: &image::RgbImage, depth: &[u8]) {
     let expected = draw(request);
-    // JPEG at these qualities. A mirrored or shifted picture, or one of another stage, is off by tens.
+    // JPEG at these qualities. A mirrored or shifted picture, or one of another stage, is off by
+    // tens.
     const MEAN_ABS: f64 = 6.0;
-    let colors = expected.rgba_srgb.chunks_exact(4).flat_map(|pixel| &pixel[..3]);
-    let off: f64 = colors.zip(picture.as_raw()).map(|(a, b)| f64::from(a.abs_diff(*b))).sum();
+    let colors = expected
+        .rgba_srgb
+        .chunks_exact(4)
+        .flat_map(|pixel| &pixel[..3]);
+    let off: f64 = colors
+        .zip(picture.as_raw())
+        .map(|(a, b)| f64::from(a.abs_diff(*b)))
+        .sum();
     let mean_off = off / f64::from(3 * picture.width() * picture.height());
-    assert!(mean_off < MEAN_ABS, "colors differ by {mean_off} on average");
-    let depth: Vec<f32> = depth.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect();
+    assert!(
+        mean_off < MEAN_ABS,
+        "colors differ by {mean_off} on average"
+    );
+    let depth: Vec<f32> = depth
+        .chunks_exact(4)
+        .map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]]))
+        .collect();
     assert_eq!(depth.len(), expected.depth_m.len());
-    let worst = depth.iter().zip(&expected.depth_m).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+    let worst = depth
+        .iter()
+        .zip(&expected.depth_m)
+        .map(|(a, b)| (a - b).abs())
+        .fold(0.0, f32::max);
     // The focal length was sent as text and scaled once more, so only rounding may differ.
     assert!(worst < 1e-5, "depths differ by up to {worst} m");
 }
@@ -214,7 +290,15 @@ fn newer_request_replaces_unstarted_stages() {
         .map(|_| client.binary_of("picture").0)
         .map(|header| (header["id"].as_u64(), header["stage"].as_u64()))
         .collect();
-    assert_eq!(drawn, [(Some(1), Some(0)), (Some(3), Some(0)), (Some(3), Some(1)), (Some(3), Some(2))]);
+    assert_eq!(
+        drawn,
+        [
+            (Some(1), Some(0)),
+            (Some(3), Some(0)),
+            (Some(3), Some(1)),
+            (Some(3), Some(2))
+        ]
+    );
     assert!(hub.next_request().is_none());
 }
 
@@ -236,7 +320,10 @@ fn clients_alternate_and_disconnected_ones_are_skipped() {
     draw_all(&hub, 2);
     assert_eq!(second.binary_of("picture").0["stage"], json!(1));
     assert_eq!(second.binary_of("picture").0["stage"], json!(2));
-    assert!(hub.next_request().is_none(), "the remaining stages of the disconnected client are dropped");
+    assert!(
+        hub.next_request().is_none(),
+        "the remaining stages of the disconnected client are dropped"
+    );
 }
 
 #[test]
@@ -251,8 +338,16 @@ fn malformed_message_gets_error_and_connection_stays() {
         ("{".to_owned(), Value::Null, "cannot parse"),
         ("[]".to_owned(), Value::Null, "cannot parse"),
         (json!({"type": "dance"}).to_string(), Value::Null, "dance"),
-        (json!({"type": "render", "id": 30}).to_string(), json!(30), "missing field"),
-        (render_message(33).to_string().replace("-2.0", "1e999"), json!(33), "number out of range"),
+        (
+            json!({"type": "render", "id": 30}).to_string(),
+            json!(30),
+            "missing field",
+        ),
+        (
+            render_message(33).to_string().replace("-2.0", "1e999"),
+            json!(33),
+            "number out of range",
+        ),
         (wrong_size.to_string(), json!(31), "size_px"),
         (wrong_pose.to_string(), json!(32), "world_from_camera"),
     ];
@@ -261,10 +356,17 @@ fn malformed_message_gets_error_and_connection_stays() {
         let error = client.text_of("error");
         assert_eq!(error["id"], id, "{message}");
         let sentence = error["message"].as_str().unwrap_or_default();
-        assert!(sentence.contains(named) && !sentence.contains('\n'), "{message}: {sentence}");
+        assert!(
+            sentence.contains(named) && !sentence.contains('\n'),
+            "{message}: {sentence}"
+        );
     }
     client.send_raw(tungstenite::Message::binary(vec![0, 1, 2]));
-    assert!(client.text_of("error")["message"].as_str().is_some_and(|text| text.contains("binary")));
+    assert!(
+        client.text_of("error")["message"]
+            .as_str()
+            .is_some_and(|text| text.contains("binary"))
+    );
     client.send_json(&render_message(34));
     draw_all(&hub, 3);
     assert_eq!(client.binary_of("picture").0["id"], json!(34));
@@ -278,7 +380,12 @@ fn actions_of_operators_reach_the_run_once() {
         client.send_json(&json!({"type": "control", "action": action}));
     }
     client.send_json(&json!({"type": "control", "action": "explode"}));
-    assert!(client.text_of("error")["message"].as_str().expect("text").contains("explode"));
+    assert!(
+        client.text_of("error")["message"]
+            .as_str()
+            .expect("text")
+            .contains("explode")
+    );
     assert_eq!(hub.take_controls(), [Control::Pause, Control::Save]);
     assert_eq!(hub.take_controls(), []);
 }
@@ -288,25 +395,49 @@ fn edits_of_operators_reach_the_run_in_order() {
     let (hub, server) = start();
     let mut client = Client::connect(server.address());
     let erased = json!({"min_m": [-1, 0, 0], "max_m": [1, 0.5, 2]});
-    client.send_json(&json!({"type": "edit", "action": "erase", "box": erased, "method": "tsdf", "id": 7}));
+    client.send_json(
+        &json!({"type": "edit", "action": "erase", "box": erased, "method": "tsdf", "id": 7}),
+    );
     client.send_json(&json!({"type": "edit", "action": "remove_floaters"}));
     client.send_json(&json!({"type": "edit", "action": "undo", "id": 8}));
     let flat = json!({"min_m": [0, 0, 0], "max_m": [1, 0, 1]});
     for (message, named) in [
-        (json!({"type": "edit", "action": "erase", "id": 9}), "box is required"),
-        (json!({"type": "edit", "action": "undo", "box": erased, "id": 9}), "box is required"),
-        (json!({"type": "edit", "action": "erase", "box": flat, "id": 9}), "box needs finite corners"),
+        (
+            json!({"type": "edit", "action": "erase", "id": 9}),
+            "box is required",
+        ),
+        (
+            json!({"type": "edit", "action": "undo", "box": erased, "id": 9}),
+            "box is required",
+        ),
+        (
+            json!({"type": "edit", "action": "erase", "box": flat, "id": 9}),
+            "box needs finite corners",
+        ),
         (json!({"type": "edit", "action": "paint", "id": 9}), "paint"),
     ] {
         client.send_json(&message);
         let error = client.text_of("error");
-        assert!(error["id"] == 9 && error["message"].as_str().expect("text").contains(named), "{message}: {error}");
+        assert!(
+            error["id"] == 9 && error["message"].as_str().expect("text").contains(named),
+            "{message}: {error}"
+        );
     }
     let edits = hub.take_edits();
-    let box_of = |world_from_box| Aabb { world_from_box, min_m: [-1.0, 0.0, 0.0], max_m: [1.0, 0.5, 2.0] };
-    let actions: Vec<_> = edits.iter().map(|edit| (edit.method(), *edit.action())).collect();
+    let box_of = |world_from_box| Aabb {
+        world_from_box,
+        min_m: [-1.0, 0.0, 0.0],
+        max_m: [1.0, 0.5, 2.0],
+    };
+    let actions: Vec<_> = edits
+        .iter()
+        .map(|edit| (edit.method(), *edit.action()))
+        .collect();
     let expected = [
-        (Some("tsdf"), EditAction::Erase(box_of(Transform::identity()))),
+        (
+            Some("tsdf"),
+            EditAction::Erase(box_of(Transform::identity())),
+        ),
         (None, EditAction::RemoveFloaters),
         (None, EditAction::Undo),
     ];
@@ -314,15 +445,28 @@ fn edits_of_operators_reach_the_run_in_order() {
     hub.reject_edit(&edits[1], "there are none");
     hub.reject_edit(&edits[2], "there is nothing to undo");
     let errors = [client.text_of("error"), client.text_of("error")];
-    assert!(errors[0]["id"].is_null() && errors[0]["message"] == "there are none", "{errors:?}");
-    assert!(errors[1]["id"] == 8 && errors[1]["message"] == "there is nothing to undo", "{errors:?}");
+    assert!(
+        errors[0]["id"].is_null() && errors[0]["message"] == "there are none",
+        "{errors:?}"
+    );
+    assert!(
+        errors[1]["id"] == 8 && errors[1]["message"] == "there is nothing to undo",
+        "{errors:?}"
+    );
 
     // Nobody takes the edits.
     for id in 100..=164 {
         client.send_json(&json!({"type": "edit", "action": "undo", "id": id}));
     }
     let refused = client.text_of("error");
-    assert!(refused["id"] == 164 && refused["message"].as_str().expect("text").contains("64 edits"), "{refused}");
+    assert!(
+        refused["id"] == 164
+            && refused["message"]
+                .as_str()
+                .expect("text")
+                .contains("64 edits"),
+        "{refused}"
+    );
     assert_eq!(hub.take_edits().len(), 64);
 }
 
@@ -333,12 +477,19 @@ fn failed_render_sends_error_message() {
     client.send_json(&render_message(5));
     next(&hub).fail("the GPU is lost");
     let error = client.text_of("error");
-    assert_eq!((&error["id"], &error["message"]), (&json!(5), &json!("the GPU is lost")));
+    assert_eq!(
+        (&error["id"], &error["message"]),
+        (&json!(5), &json!("the GPU is lost"))
+    );
     let pending = next(&hub);
     let mut picture = draw(&pending.request);
     picture.rgba_srgb.truncate(7);
     pending.deliver(picture);
-    assert!(client.text_of("error")["message"].as_str().is_some_and(|text| text.contains("has 7")));
+    assert!(
+        client.text_of("error")["message"]
+            .as_str()
+            .is_some_and(|text| text.contains("has 7"))
+    );
     drop(next(&hub)); // Dropped without an answer: the client's later requests are still served.
     client.send_json(&render_message(6));
     draw_all(&hub, 3);
@@ -348,8 +499,9 @@ fn failed_render_sends_error_message() {
 #[test]
 fn live_images_reach_every_client_once_as_jpeg() {
     let (hub, server) = start();
-    let gradient: Arc<[u8]> =
-        (0..64 * 48_u32).flat_map(|ix| [u8::try_from(ix % 64 * 4).unwrap_or(255), 80, 20, 255]).collect();
+    let gradient: Arc<[u8]> = (0..64 * 48_u32)
+        .flat_map(|ix| [u8::try_from(ix % 64 * 4).unwrap_or(255), 80, 20, 255])
+        .collect();
     let image = |stamp| LiveImage {
         camera: "wrist".into(),
         stamp: Stamp(stamp),
@@ -361,15 +513,27 @@ fn live_images_reach_every_client_once_as_jpeg() {
         principal_px: [32.0, 24.0],
     };
     hub.set_live_image(image(5));
-    let mut clients = [Client::connect(server.address()), Client::connect(server.address())];
+    let mut clients = [
+        Client::connect(server.address()),
+        Client::connect(server.address()),
+    ];
     for client in &mut clients {
         let (header, jpeg) = client.binary_of("live_image");
-        assert_eq!((&header["camera"], &header["stamp_nanos"]), (&json!("wrist"), &json!(5)));
-        let picture = image::load_from_memory_with_format(&jpeg, image::ImageFormat::Jpeg).expect("a JPEG").to_rgb8();
-        assert!(picture.get_pixel(60, 20)[0].abs_diff(240) < 16, "{:?}", picture.get_pixel(60, 20));
+        assert_eq!(
+            (&header["camera"], &header["stamp_nanos"]),
+            (&json!("wrist"), &json!(5))
+        );
+        let picture = image::load_from_memory_with_format(&jpeg, image::ImageFormat::Jpeg)
+            .expect("a JPEG")
+            .to_rgb8();
+        assert!(
+            picture.get_pixel(60, 20)[0].abs_diff(240) < 16,
+            "{:?}",
+            picture.get_pixel(60, 20)
+        );
     }
-    let corrections =
-        [("wrist", 0.5), ("other", 2.0)].map(|(name, x)| (name.into(), Transform::translation(x, 0.0, 0.0)));
+    let corrections = [("wrist", 0.5), ("other", 2.0)]
+        .map(|(name, x)| (name.into(), Transform::translation(x, 0.0, 0.0)));
     hub.set_camera_corrections(corrections.into());
     hub.set_live_image(image(6));
     hub.set_live_image(image(7));
@@ -377,23 +541,43 @@ fn live_images_reach_every_client_once_as_jpeg() {
         let header = client.binary_of("live_image").0;
         let stamp = &header["stamp_nanos"];
         assert!(*stamp == json!(6) || *stamp == json!(7), "{stamp}");
-        assert_eq!(header["world_from_camera"][3], json!(0.5), "the pose is corrected");
+        assert_eq!(
+            header["world_from_camera"][3],
+            json!(0.5),
+            "the pose is corrected"
+        );
     }
 }
 
 #[test]
 fn every_wire_field_is_documented_and_typed() {
     let folder = std::path::PathBuf::from(env!("CARGO_MANIFEST_DIR"));
-    let docs = std::fs::read_to_string(folder.join("../docs/reference/protocol.md")).expect("the docs");
-    let page = std::fs::read_to_string(folder.join("web/src/connection/protocol.ts")).expect("the page's messages");
-    assert!(docs.contains(&format!("version **{}** of the protocol", viz::PROTOCOL_VERSION)));
+    let docs =
+        std::fs::read_to_string(folder.join("../docs/reference/protocol.md")).expect("the docs");
+    let page = std::fs::read_to_string(folder.join("web/src/connection/protocol.ts"))
+        .expect("the page's messages");
+    assert!(docs.contains(&format!(
+        "version **{}** of the protocol",
+        viz::PROTOCOL_VERSION
+    )));
     assert!(page.contains(&format!("PROTOCOL_VERSION = {};", viz::PROTOCOL_VERSION)));
     for message in one_of_each() {
         let kind = message["type"].as_str().expect("a type");
         let section = section_of(&docs, kind);
-        for name in message.as_object().expect("an object").keys().filter(|name| *name != "type") {
-            assert!(section.contains(&format!("`{name}`")), "{kind}.{name} is not in docs/reference/protocol.md");
-            assert!(page.contains(&format!("{name}:")), "{kind}.{name} is not in web/src/connection/protocol.ts");
+        for name in message
+            .as_object()
+            .expect("an object")
+            .keys()
+            .filter(|name| *name != "type")
+        {
+            assert!(
+                section.contains(&format!("`{name}`")),
+                "{kind}.{name} is not in docs/reference/protocol.md"
+            );
+            assert!(
+                page.contains(&format!("{name}:")),
+                "{kind}.{name} is not in web/src/connection/protocol.ts"
+            );
         }
     }
 }
@@ -401,8 +585,15 @@ fn every_wire_field_is_documented_and_typed() {
 /// One message of each type that the server sends.
 fn one_of_each() -> Vec<Value> {
     let (hub, server) = start();
-    hub.set_status(Status { others: vec![model_status("tsdf", 30)], ..Status::default() });
-    hub.set_scene_hint(SceneHint { center_m: [0.0; 3], radius_m: 1.0, world_from_camera: Transform::identity() });
+    hub.set_status(Status {
+        others: vec![model_status("tsdf", 30)],
+        ..Status::default()
+    });
+    hub.set_scene_hint(SceneHint {
+        center_m: [0.0; 3],
+        radius_m: 1.0,
+        world_from_camera: Transform::identity(),
+    });
     let mut client = Client::connect(server.address());
     hub.set_robot(robot::description());
     hub.set_robot_state(robot::state(0.0));
@@ -417,7 +608,10 @@ fn one_of_each() -> Vec<Value> {
     client.send_json(&json!({"type": "subscribe", "topic": "base_path", "rate_hz": 2}));
     client.send_json(&json!({"type": "subscribe", "topic": "range_scans", "rate_hz": 10}));
     hub.set_range_scan(range_scan());
-    messages.extend([client.text_of("base_path"), client.binary_of("range_scan").0]);
+    messages.extend([
+        client.text_of("base_path"),
+        client.binary_of("range_scan").0,
+    ]);
     assert!(!hub.needs_observations());
     client.send_json(&json!({"type": "subscribe", "topic": "observations", "rate_hz": 2}));
     client.settle();
@@ -440,11 +634,26 @@ fn one_of_each() -> Vec<Value> {
     client.send_json(&render_message(1));
     draw_all(&hub, 1);
     messages.push(client.binary_of("picture").0);
-    client.send_json(&json!({"type": "subscribe", "topic": "model_chunks", "rate_hz": 1, "method": "tsdf"}));
+    client.send_json(
+        &json!({"type": "subscribe", "topic": "model_chunks", "rate_hz": 1, "method": "tsdf"}),
+    );
     client.settle();
-    hub.set_model_chunks("tsdf", ModelChunks { is_complete: true, chunks: both_chunks(), removed: Vec::new() });
+    hub.set_model_chunks(
+        "tsdf",
+        ModelChunks {
+            is_complete: true,
+            chunks: both_chunks(),
+            removed: Vec::new(),
+        },
+    );
     messages.extend([(); 2].map(|()| client.binary_of("model_chunk").0));
-    hub.set_model_chunks("tsdf", ModelChunks { is_complete: true, ..ModelChunks::default() });
+    hub.set_model_chunks(
+        "tsdf",
+        ModelChunks {
+            is_complete: true,
+            ..ModelChunks::default()
+        },
+    );
     messages.push(client.text_of("model_chunks_removed"));
     client.send_raw(tungstenite::Message::text("{"));
     messages.push(client.text_of("error"));
@@ -457,7 +666,11 @@ fn observation_map() -> ObservationMap {
     ObservationMap {
         cell_m: 0.5,
         n_cells: [1, 2, 1],
-        observed: vec![ObservedCell { ix: 1, age_secs: 1.0, sigma_m: 0.002 }],
+        observed: vec![ObservedCell {
+            ix: 1,
+            age_secs: 1.0,
+            sigma_m: 0.002,
+        }],
         n_keyframes: 3,
         newest_at: Some(Instant::now()),
         ..ObservationMap::default()
@@ -478,7 +691,12 @@ fn range_scan() -> RangeScan {
 
 /// A chunk of each kind.
 fn both_chunks() -> Vec<ModelChunk> {
-    let mesh = ChunkLayout::Mesh { origin_m: [0.0; 3], meters_per_count: 0.1, n_vertices: 0, n_triangles: 0 };
+    let mesh = ChunkLayout::Mesh {
+        origin_m: [0.0; 3],
+        meters_per_count: 0.1,
+        n_vertices: 0,
+        n_triangles: 0,
+    };
     let splats = ChunkLayout::Splats {
         n_splats: 0,
         min_m: [0.0; 3],
@@ -490,8 +708,16 @@ fn both_chunks() -> Vec<ModelChunk> {
         is_antialiased: false,
     };
     let chunk = |(id, layout)| {
-        let fine = ChunkData { layout, bytes: Vec::new() };
-        ModelChunk { id, change: 1.0, coarse: None, fine }
+        let fine = ChunkData {
+            layout,
+            bytes: Vec::new(),
+        };
+        ModelChunk {
+            id,
+            change: 1.0,
+            coarse: None,
+            fine,
+        }
     };
     [(1, mesh), (2, splats)].map(chunk).into()
 }
@@ -499,7 +725,9 @@ fn both_chunks() -> Vec<ModelChunk> {
 /// The part of the docs about a message from the server.
 fn section_of<'a>(docs: &'a str, kind: &str) -> &'a str {
     let from_server = &docs[docs.find("## From the server").expect("the chapter")..];
-    let section = from_server.split("\n### ").find(|section| section.starts_with(&format!("`{kind}`")));
+    let section = from_server
+        .split("\n### ")
+        .find(|section| section.starts_with(&format!("`{kind}`")));
     section.unwrap_or_else(|| panic!("docs/reference/protocol.md has no section about {kind}"))
 }
 
@@ -510,7 +738,10 @@ fn stopping_server_sends_goodbye_and_frees_port() {
     let mut client = Client::connect(address);
     client.settle();
     drop(server);
-    assert_eq!(client.text_of("goodbye")["reason"], json!("the server has stopped"));
+    assert_eq!(
+        client.text_of("goodbye")["reason"],
+        json!("the server has stopped")
+    );
     assert_eq!(client.receive(), Received::End);
     assert_eq!(hub.n_clients(), 0);
     drop(Server::start(ServerConfig { listen: address }, hub).expect("the port is free again"));
@@ -520,23 +751,45 @@ fn stopping_server_sends_goodbye_and_frees_port() {
 fn used_port_and_public_address_are_rejected() {
     let holder = TcpListener::bind("127.0.0.1:0").expect("a free port exists");
     let used_address = holder.local_addr().expect("bound");
-    let error = Server::start(ServerConfig { listen: used_address }, Hub::new()).expect_err("taken");
+    let error = Server::start(
+        ServerConfig {
+            listen: used_address,
+        },
+        Hub::new(),
+    )
+    .expect_err("taken");
     assert!(matches!(error, Error::AddressInUse { address } if address == used_address));
-    assert!(error.to_string().contains(&used_address.to_string()), "{error}");
+    assert!(
+        error.to_string().contains(&used_address.to_string()),
+        "{error}"
+    );
     let public: SocketAddr = "0.0.0.0:0".parse().expect("an address");
     let error = Server::start(ServerConfig { listen: public }, Hub::new()).expect_err("public");
-    assert!(matches!(error, Error::NotLoopback { .. }) && error.to_string().contains("--share"), "{error}");
+    assert!(
+        matches!(error, Error::NotLoopback { .. }) && error.to_string().contains("--share"),
+        "{error}"
+    );
 }
 
 #[test]
 fn the_page_and_the_status_are_served_over_http() {
     let (hub, server) = start();
-    hub.set_status(Status { model: model_status("splat", 70_000), ..Status::default() });
+    hub.set_status(Status {
+        model: model_status("splat", 70_000),
+        ..Status::default()
+    });
     let page = get(server.address(), "/", "localhost");
-    assert!(page.starts_with("HTTP/1.1 200") && page.contains("fieldrig"), "{page}");
+    assert!(
+        page.starts_with("HTTP/1.1 200") && page.contains("fieldrig"),
+        "{page}"
+    );
     let status = get(server.address(), "/status", "localhost");
     let body = status.split("\r\n\r\n").nth(1).expect("a body");
-    assert_eq!(serde_json::from_str::<Value>(body).expect("JSON")["step"], json!(70_000), "steps may exceed 16 bits");
+    assert_eq!(
+        serde_json::from_str::<Value>(body).expect("JSON")["step"],
+        json!(70_000),
+        "steps may exceed 16 bits"
+    );
     assert!(get(server.address(), "/nothing", "localhost").starts_with("HTTP/1.1 404"));
     assert!(get(server.address(), "/status", "example.com").starts_with("HTTP/1.1 403"));
 }
@@ -544,7 +797,11 @@ fn the_page_and_the_status_are_served_over_http() {
 fn get(address: SocketAddr, path: &str, host: &str) -> String {
     let mut stream = TcpStream::connect(address).expect("the server listens");
     stream.set_read_timeout(Some(TIMEOUT)).expect("a timeout");
-    write!(stream, "GET {path} HTTP/1.1\r\nHost: {host}\r\nConnection: close\r\n\r\n").expect("sent");
+    write!(
+        stream,
+        "GET {path} HTTP/1.1\r\nHost: {host}\r\nConnection: close\r\n\r\n"
+    )
+    .expect("sent");
     let mut answer = Vec::new();
     stream.read_to_end(&mut answer).expect("an answer");
     String::from_utf8_lossy(&answer).into_owned()
@@ -569,9 +826,18 @@ fn analytic_scene_is_asymmetric() {
     let mirrored: Vec<u8> = picture
         .rgba_srgb
         .chunks_exact(4 * 80)
-        .flat_map(|row| row.chunks_exact(4).rev().flatten().copied().collect::<Vec<_>>())
+        .flat_map(|row| {
+            row.chunks_exact(4)
+                .rev()
+                .flatten()
+                .copied()
+                .collect::<Vec<_>>()
+        })
         .collect();
     assert_ne!(mirrored, picture.rgba_srgb);
     let in_world = request.world_from_camera.rotation * Vector3::new(0.0, -1.0, 0.0);
-    assert!((in_world - Vector3::z()).norm() < 1e-12, "the camera's up is the world's");
+    assert!(
+        (in_world - Vector3::z()).norm() < 1e-12,
+        "the camera's up is the world's"
+    );
 }

@@ -1,5 +1,5 @@
-//! A TCP proxy that imitates a wireless link: limited rate, delay, and delayed segments. The link can be cut: connections
-//! stay open, but nothing passes until it is restored.
+//! A TCP proxy that imitates a wireless link: limited rate, delay, and delayed segments. The link
+//! can be cut: connections stay open, but nothing passes until it is restored.
 
 use crate::slow::connect_with_buffer;
 use std::io::{Read, Write};
@@ -43,8 +43,11 @@ impl Proxy {
         let is_cut_here = Arc::clone(&is_cut);
         std::thread::spawn(move || {
             for client in listener.incoming().map_while(Result::ok) {
-                let Ok(server) = connect_with_buffer(server, RECEIVE_BUFFER_BYTES) else { continue };
-                let ends = [&client, &server].map(|stream| stream.try_clone().expect("a descriptor"));
+                let Ok(server) = connect_with_buffer(server, RECEIVE_BUFFER_BYTES) else {
+                    continue;
+                };
+                let ends =
+                    [&client, &server].map(|stream| stream.try_clone().expect("a descriptor"));
                 let [client_too, server_too] = ends;
                 for (from, to) in [(client, server_too), (server, client_too)] {
                     let (send, receive) = sync_channel(MAX_SEGMENTS);
@@ -82,7 +85,11 @@ fn receive_segments(mut from: TcpStream, link: Link, to: &SyncSender<Segment>) {
             return;
         }
         sent = sent.max(Instant::now()) + Duration::from_secs_f64(n as f64 / link.bytes_per_sec);
-        let slow = if number % link.slow_period == 0 { link.slow_delay } else { Duration::ZERO };
+        let slow = if number % link.slow_period == 0 {
+            link.slow_delay
+        } else {
+            Duration::ZERO
+        };
         arrives = arrives.max(sent + link.delay + slow);
         if to.send((arrives, bytes[..n].to_vec())).is_err() {
             return;

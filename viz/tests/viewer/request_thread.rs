@@ -23,7 +23,10 @@ impl RequestThread {
                 }
             }
         });
-        Self { stop, thread: Some(thread) }
+        Self {
+            stop,
+            thread: Some(thread),
+        }
     }
 }
 
@@ -31,7 +34,10 @@ impl Drop for RequestThread {
     fn drop(&mut self) {
         self.stop.store(true, Ordering::Relaxed);
         if let Some(thread) = self.thread.take() {
-            assert!(thread.join().is_ok() || std::thread::panicking(), "the thread panicked");
+            assert!(
+                thread.join().is_ok() || std::thread::panicking(),
+                "the thread panicked"
+            );
         }
     }
 }

@@ -7,7 +7,8 @@ use nalgebra::{Point3, Vector3};
 use std::time::Instant;
 use viz::{MeshFormat, RobotDescription, RobotMesh, RobotState};
 
-/// A pedestal, an arm that rotates about z, and a ball that slides along the arm; a mesh that only some tests load.
+/// A pedestal, an arm that rotates about z, and a ball that slides along the arm; a mesh that only
+/// some tests load.
 pub(crate) const URDF: &str = r#"<robot name="crane">
     <material name="yellow"><color rgba="0.9 0.8 0.1 1"/></material>
     <link name="world_link"/>
@@ -34,7 +35,11 @@ pub(crate) fn description() -> RobotDescription {
         robot: Robot::parse(URDF).expect("a robot"),
         base_link: "pedestal".to_owned(),
         joint_names: vec!["slide".to_owned(), "rotate".to_owned()],
-        meshes: vec![RobotMesh { file: "a.stl".to_owned(), format: MeshFormat::Stl, bytes: (*b"solid a").into() }],
+        meshes: vec![RobotMesh {
+            file: "a.stl".to_owned(),
+            format: MeshFormat::Stl,
+            bytes: (*b"solid a").into(),
+        }],
     }
 }
 
@@ -43,7 +48,8 @@ pub(crate) fn state(rotation_rad: f64) -> RobotState {
     RobotState {
         stamp: Stamp(1_000_000),
         captured_at: Instant::now(),
-        world_from_base: Transform::translation(-0.4, 0.3, 0.0) * Transform::rotation(Vector3::new(0.0, 0.0, 0.2)),
+        world_from_base: Transform::translation(-0.4, 0.3, 0.0)
+            * Transform::rotation(Vector3::new(0.0, 0.0, 0.2)),
         positions: vec![0.2, rotation_rad],
     }
 }
@@ -54,24 +60,38 @@ pub(crate) struct PosedShapes(Vec<(Transform, Geometry)>);
 impl PosedShapes {
     pub(crate) fn new(state: &RobotState) -> Self {
         let robot = Robot::parse(URDF).expect("a robot");
-        let [slide, rotate] = state.positions[..] else { panic!("two joints") };
+        let [slide, rotate] = state.positions[..] else {
+            panic!("two joints")
+        };
         let mut shapes = Vec::new();
         for link in robot.links().iter().filter(|link| *link != "world_link") {
             let chain = Chain::new(&robot, "pedestal", link).expect("a chain");
-            let positions: Vec<f64> =
-                chain.joint_names().iter().map(|name| if name == "slide" { slide } else { rotate }).collect();
-            let world_from_link = state.world_from_base * chain.forward(&positions).expect("a pose");
+            let positions: Vec<f64> = chain
+                .joint_names()
+                .iter()
+                .map(|name| if name == "slide" { slide } else { rotate })
+                .collect();
+            let world_from_link =
+                state.world_from_base * chain.forward(&positions).expect("a pose");
             for shape in robot.visuals(link) {
-                shapes.push(((world_from_link * shape.link_from_shape).inverse(), shape.geometry.clone()));
+                shapes.push((
+                    (world_from_link * shape.link_from_shape).inverse(),
+                    shape.geometry.clone(),
+                ));
             }
         }
         Self(shapes)
     }
 
-    /// Distance along `direction` at which a ray from `eye` first hits the robot, in lengths of `direction`.
+    /// Distance along `direction` at which a ray from `eye` first hits the robot, in lengths of
+    /// `direction`.
     pub(crate) fn nearest_hit(&self, eye: Point3<f64>, direction: Vector3<f64>) -> Option<f64> {
         let distances = self.0.iter().filter_map(|(shape_from_world, geometry)| {
-            hit(geometry, shape_from_world * eye, shape_from_world * direction)
+            hit(
+                geometry,
+                shape_from_world * eye,
+                shape_from_world * direction,
+            )
         });
         distances.min_by(f64::total_cmp)
     }
@@ -84,7 +104,10 @@ fn hit(geometry: &Geometry, eye: Point3<f64>, direction: Vector3<f64>) -> Option
             let (mut near, mut far) = (0.0_f64, f64::INFINITY);
             for axis in 0..3 {
                 let at = |side: f64| (0.5 * side * size_m[axis] - eye[axis]) / direction[axis];
-                (near, far) = (near.max(at(-1.0).min(at(1.0))), far.min(at(-1.0).max(at(1.0))));
+                (near, far) = (
+                    near.max(at(-1.0).min(at(1.0))),
+                    far.min(at(-1.0).max(at(1.0))),
+                );
             }
             (near < far).then_some(near)
         }

@@ -1,5 +1,5 @@
-//! Opens the bundled page in a real browser, compares the silhouette of the robot with the exact one, in front of the
-//! scene and partly behind it, and uses the controls of the view.
+//! Opens the bundled page in a real browser, compares the silhouette of the robot with the exact
+//! one, in front of the scene and partly behind it, and uses the controls of the view.
 //!
 //! Skipped, with a message, if Chromium or the bundle (`make web`) is missing.
 
@@ -40,7 +40,10 @@ impl Run {
         let renderer = RequestThread::start(hub.clone(), move |pending| {
             // Panoramas are requested for the surroundings of the view.
             if pending.request.projection != Projection::Equirectangular {
-                received.lock().expect("no panic").push(pending.request.clone());
+                received
+                    .lock()
+                    .expect("no panic")
+                    .push(pending.request.clone());
             }
             let picture = draw(&pending.request);
             pending.deliver(picture);
@@ -59,7 +62,14 @@ impl Run {
                 }
             })
         };
-        Self { angle, base_x, requests, stop, _renderer: renderer, arm: Some(arm) }
+        Self {
+            angle,
+            base_x,
+            requests,
+            stop,
+            _renderer: renderer,
+            arm: Some(arm),
+        }
     }
 
     /// Moves the base along x.
@@ -80,7 +90,10 @@ impl Drop for Run {
     fn drop(&mut self) {
         self.stop.store(true, Ordering::Relaxed);
         if let Some(arm) = self.arm.take() {
-            assert!(arm.join().is_ok() || std::thread::panicking(), "the arm panicked");
+            assert!(
+                arm.join().is_ok() || std::thread::panicking(),
+                "the arm panicked"
+            );
         }
     }
 }
@@ -90,7 +103,13 @@ fn exact_silhouette(request: &RenderRequest, state: &RobotState, is_occluded: bo
     let (scene, shapes) = (draw(request), robot::PosedShapes::new(state));
     let [width, height] = request.size_px;
     let pixels = (0..height).flat_map(|y| (0..width).map(move |x| (x, y)));
-    let depths = scene.depth_m.iter().map(|depth| if *depth > 0.0 { f64::from(*depth) } else { f64::INFINITY });
+    let depths = scene.depth_m.iter().map(|depth| {
+        if *depth > 0.0 {
+            f64::from(*depth)
+        } else {
+            f64::INFINITY
+        }
+    });
     pixels
         .zip(depths)
         .map(|((x, y), scene_depth)| {
@@ -112,7 +131,9 @@ fn drawn_silhouette(shot: &image::RgbImage) -> Vec<bool> {
 
 #[test]
 fn robot_silhouette_is_exact_in_front_and_behind() {
-    let Some(program) = browser_for_page() else { return };
+    let Some(program) = browser_for_page() else {
+        return;
+    };
     let hub = Hub::new();
     hub.set_scene_hint(SceneHint {
         center_m: [0.0, 0.0, 0.2],
@@ -120,12 +141,20 @@ fn robot_silhouette_is_exact_in_front_and_behind() {
         world_from_camera: Translation3::new(0.0, 0.0, 0.3) * looking_along_y(),
     });
     hub.set_robot(robot::description());
-    let server = Server::start(ServerConfig { listen: ([127, 0, 0, 1], 0).into() }, hub.clone()).expect("a free port");
+    let server = Server::start(
+        ServerConfig {
+            listen: ([127, 0, 0, 1], 0).into(),
+        },
+        hub.clone(),
+    )
+    .expect("a free port");
     let run = Run::start(&hub);
     let scratch = PathBuf::from(env!("CARGO_TARGET_TMPDIR"));
     let profile = scratch.join(format!("chromium-robot-{}", std::process::id()));
     let mut browser = Browser::open(&program, &profile, &server.url(), WINDOW_PX);
-    wait_for(&mut browser, "a picture", |browser| browser.text("picture-text").contains("100 %"));
+    wait_for(&mut browser, "a picture", |browser| {
+        browser.text("picture-text").contains("100 %")
+    });
     let request = full_request(&mut browser, &run, "a full picture", |_| true);
     browser.click("toggle-grid");
 
@@ -134,15 +163,22 @@ fn robot_silhouette_is_exact_in_front_and_behind() {
         run.rotate_to(angle);
         for is_occluded in [true, false] {
             let exact = exact_silhouette(&request, &robot::state(angle), is_occluded);
-            let name = format!("page-robot-{angle}-{}.png", if is_occluded { "occluded" } else { "in-front" });
-            wait_for(&mut browser, &format!("the silhouette in {name}"), |browser| {
-                let shot = canvas_shot(browser);
-                shot.save(scratch.join(&name)).expect("written");
-                assert_eq!([shot.width(), shot.height()], request.size_px);
-                let overlap = iou(request.size_px, &drawn_silhouette(&shot), &exact);
-                eprintln!("{name}: IoU {overlap:.4}");
-                overlap >= MIN_IOU
-            });
+            let name = format!(
+                "page-robot-{angle}-{}.png",
+                if is_occluded { "occluded" } else { "in-front" }
+            );
+            wait_for(
+                &mut browser,
+                &format!("the silhouette in {name}"),
+                |browser| {
+                    let shot = canvas_shot(browser);
+                    shot.save(scratch.join(&name)).expect("written");
+                    assert_eq!([shot.width(), shot.height()], request.size_px);
+                    let overlap = iou(request.size_px, &drawn_silhouette(&shot), &exact);
+                    eprintln!("{name}: IoU {overlap:.4}");
+                    overlap >= MIN_IOU
+                },
+            );
             masks.push(exact);
             browser.click("toggle-occlude");
         }
@@ -150,9 +186,16 @@ fn robot_silhouette_is_exact_in_front_and_behind() {
     // The cases differ, so that a wrong case would have been detected.
     for (a, b) in [(0, 1), (0, 2), (2, 3)] {
         let similarity = iou(request.size_px, &masks[a], &masks[b]);
-        assert!(similarity < MIN_IOU - 0.02, "cases {a} and {b} are too similar: {similarity}");
+        assert!(
+            similarity < MIN_IOU - 0.02,
+            "cases {a} and {b} are too similar: {similarity}"
+        );
     }
-    assert_eq!(browser.evaluate("document.getElementById('robot-age').hidden"), true, "the pose is live");
+    assert_eq!(
+        browser.evaluate("document.getElementById('robot-age').hidden"),
+        true,
+        "the pose is live"
+    );
     check_pivot(&mut browser, &run);
     check_views(&mut browser, &run);
     check_frames(&mut browser, &run);
@@ -164,7 +207,11 @@ fn robot_silhouette_is_exact_in_front_and_behind() {
         browser.text("robot-age").contains("s old")
             && browser.evaluate("document.getElementById('robot-age').hidden") == false
     });
-    hub.set_run_result(RunResult { folder: None, scores: String::new(), seconds: 1.0 });
+    hub.set_run_result(RunResult {
+        folder: None,
+        scores: String::new(),
+        seconds: 1.0,
+    });
     wait_for(&mut browser, "no warning after the run", |browser| {
         browser.evaluate("document.getElementById('robot-age').hidden") == true
     });
@@ -182,7 +229,9 @@ fn full_request(
     let mut full = None;
     wait_for(browser, what, |browser| {
         let [.., width, height] = canvas_bounds(browser);
-        full = run.last_request().filter(|request| request.size_px == [width, height] && is_expected(request));
+        full = run
+            .last_request()
+            .filter(|request| request.size_px == [width, height] && is_expected(request));
         full.is_some()
     });
     full.expect("the wait has ended")
@@ -232,44 +281,69 @@ fn check_frames(browser: &mut Browser, run: &Run) {
     let world_from_tip = state.world_from_base * chain.forward(&[0.9, 0.2]).expect("a pose");
     let half_length = 0.5 * 0.1 * 0.8; // Axes are 0.1 times as long as the radius of the scene.
     let middles: Vec<[i64; 2]> = [Vector3::x(), Vector3::y(), Vector3::z()]
-        .map(|axis| project(&request, &(world_from_tip * Point3::from(axis * half_length))))
+        .map(|axis| {
+            project(
+                &request,
+                &(world_from_tip * Point3::from(axis * half_length)),
+            )
+        })
         .into();
     let n_visible_axes = |shot: &image::RgbImage| {
         let has_color = |([x, y], color): (&[i64; 2], [u8; 3])| {
             let neighbors = (-2..=2).flat_map(|dy| (-2..=2).map(move |dx| [x + dx, y + dy]));
-            let pixels = neighbors.filter_map(|[x, y]| shot.get_pixel_checked(x.try_into().ok()?, y.try_into().ok()?));
-            let mut differences = pixels.map(|pixel| (0..3).map(|ix| pixel.0[ix].abs_diff(color[ix])).max());
+            let pixels = neighbors.filter_map(|[x, y]| {
+                shot.get_pixel_checked(x.try_into().ok()?, y.try_into().ok()?)
+            });
+            let mut differences =
+                pixels.map(|pixel| (0..3).map(|ix| pixel.0[ix].abs_diff(color[ix])).max());
             differences.any(|difference| difference < Some(MAX_DIFFERENCE))
         };
-        std::iter::zip(&middles, COLORS).filter(|pair| has_color(*pair)).count()
+        std::iter::zip(&middles, COLORS)
+            .filter(|pair| has_color(*pair))
+            .count()
     };
     assert_eq!(n_visible_axes(&canvas_shot(browser)), 0, "no axes");
     browser.click("toggle-frames");
-    wait_for(browser, "axes", |browser| n_visible_axes(&canvas_shot(browser)) == 3);
+    wait_for(browser, "axes", |browser| {
+        n_visible_axes(&canvas_shot(browser)) == 3
+    });
     let names = "[...document.querySelectorAll('#frame-names span')].map((name) => name.textContent).join(' ')";
     assert_eq!(browser.evaluate(names), "world_link pedestal arm tip");
     let places = "[...document.querySelectorAll('#frame-names span:not([hidden])')].map((name) => \
                   { const b = name.getBoundingClientRect(); return [b.left, b.top, b.right, b.bottom]; })";
-    let places: Vec<[f64; 4]> = serde_json::from_value(browser.evaluate(places)).expect("rectangles");
+    let places: Vec<[f64; 4]> =
+        serde_json::from_value(browser.evaluate(places)).expect("rectangles");
     assert_eq!(places.len(), 4);
     for (ix, a) in places.iter().enumerate() {
         for b in &places[..ix] {
-            let overlaps = a[0] < b[2] - 1.0 && b[0] < a[2] - 1.0 && a[1] < b[3] - 1.0 && b[1] < a[3] - 1.0;
+            let overlaps =
+                a[0] < b[2] - 1.0 && b[0] < a[2] - 1.0 && a[1] < b[3] - 1.0 && b[1] < a[3] - 1.0;
             assert!(!overlaps, "names cover each other: {places:?}");
         }
     }
     let shot = canvas_shot(browser);
-    shot.save(PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join("page-robot-frames.png")).expect("written");
+    shot.save(PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join("page-robot-frames.png"))
+        .expect("written");
     browser.click("toggle-frames");
-    wait_for(browser, "no axes", |browser| n_visible_axes(&canvas_shot(browser)) == 0);
+    wait_for(browser, "no axes", |browser| {
+        n_visible_axes(&canvas_shot(browser)) == 0
+    });
 }
 
 /// The pixel that shows a point.
 #[expect(clippy::cast_possible_truncation, reason = "pixels of a window")]
 fn project(request: &RenderRequest, point: &Point3<f64>) -> [i64; 2] {
-    let Projection::Pinhole { focal_px, principal_px } = request.projection else { panic!("a pinhole") };
+    let Projection::Pinhole {
+        focal_px,
+        principal_px,
+    } = request.projection
+    else {
+        panic!("a pinhole")
+    };
     let in_camera = request.world_from_camera.inverse_transform_point(point);
-    [0, 1].map(|axis| (focal_px[axis] * in_camera[axis] / in_camera.z + principal_px[axis]).floor() as i64)
+    [0, 1].map(|axis| {
+        (focal_px[axis] * in_camera[axis] / in_camera.z + principal_px[axis]).floor() as i64
+    })
 }
 
 /// While flying, W, A, S, D, Q and E move the eye, so titles do not show them as keys of buttons.
@@ -284,15 +358,28 @@ fn check_titles(browser: &mut Browser) {
 
 /// The crop box encloses the scene; dragging a handle moves one side and not the view.
 fn check_crop(browser: &mut Browser, run: &Run) {
-    assert_eq!(full_request(browser, run, "a full picture", |_| true).crop, None);
+    assert_eq!(
+        full_request(browser, run, "a full picture", |_| true).crop,
+        None
+    );
     browser.click("toggle-crop");
-    let before = full_request(browser, run, "a cropped picture", |request| request.crop.is_some());
+    let before = full_request(browser, run, "a cropped picture", |request| {
+        request.crop.is_some()
+    });
     let crop = before.crop.expect("a crop");
     let expected = [[-0.48, -0.48, -0.28], [0.48, 0.48, 0.68]]; // 1.2 times the radius, around the center.
     for (corner, expected) in [crop.min_m, crop.max_m].iter().zip(expected) {
-        assert!(corner.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-6), "{crop:?}");
+        assert!(
+            corner
+                .iter()
+                .zip(expected)
+                .all(|(a, b)| (a - b).abs() < 1e-6),
+            "{crop:?}"
+        );
     }
-    let Projection::Pinhole { focal_px, .. } = before.projection else { panic!("a pinhole") };
+    let Projection::Pinhole { focal_px, .. } = before.projection else {
+        panic!("a pinhole")
+    };
     let handle_m = Point3::new(0.48, 0.0, 0.2);
     let [x, y] = project(&before, &handle_m);
     let [left, top, ..] = canvas_bounds(browser);
@@ -304,32 +391,58 @@ fn check_crop(browser: &mut Browser, run: &Run) {
     }
     browser.mouse("mouseReleased", [handle[0] - 80, handle[1]]);
     // 80 pixels at the depth of the handle.
-    let expected_x = 0.48 - 80.0 * before.world_from_camera.inverse_transform_point(&handle_m).z / focal_px[0];
+    let expected_x = 0.48
+        - 80.0
+            * before
+                .world_from_camera
+                .inverse_transform_point(&handle_m)
+                .z
+            / focal_px[0];
     let after = full_request(browser, run, "a smaller box", |request| {
-        request.crop.is_some_and(|crop| (crop.max_m[0] - expected_x).abs() < 0.02)
+        request
+            .crop
+            .is_some_and(|crop| (crop.max_m[0] - expected_x).abs() < 0.02)
     });
-    assert_eq!(after.crop.map(|crop| (crop.min_m, crop.max_m[1])), Some((crop.min_m, crop.max_m[1])));
+    assert_eq!(
+        after.crop.map(|crop| (crop.min_m, crop.max_m[1])),
+        Some((crop.min_m, crop.max_m[1]))
+    );
     let motion = before.world_from_camera.inverse() * after.world_from_camera;
-    assert!(motion.translation.vector.norm() < 1e-6, "the view has not moved");
+    assert!(
+        motion.translation.vector.norm() < 1e-6,
+        "the view has not moved"
+    );
     browser.click("toggle-crop");
-    full_request(browser, run, "the whole scene", |request| request.crop.is_none());
+    full_request(browser, run, "the whole scene", |request| {
+        request.crop.is_none()
+    });
 }
 
 /// The view follows the arm.
 fn check_follow(browser: &mut Browser, run: &Run) {
     let tip = |angle: f64| {
         let chain = Chain::from_urdf(robot::URDF, "pedestal", "arm").expect("a chain");
-        (robot::state(angle).world_from_base * chain.forward(&[angle]).expect("a pose")).translation.vector
+        (robot::state(angle).world_from_base * chain.forward(&[angle]).expect("a pose"))
+            .translation
+            .vector
     };
     // The last joint rotates the arm about its own axis, so that the origin of its link stays.
     assert!((tip(0.9) - tip(0.2)).norm() < 1e-9);
-    let before = full_request(browser, run, "a full picture", |_| true).world_from_camera.translation.vector;
+    let before = full_request(browser, run, "a full picture", |_| true)
+        .world_from_camera
+        .translation
+        .vector;
     browser.click("toggle-follow");
     run.rotate_to(0.2);
     std::thread::sleep(Duration::from_millis(300));
     run.move_base(0.25);
-    full_request(browser, run, "a view that has moved with the base", |request| {
-        let moved = request.world_from_camera.translation.vector - before;
-        (moved - Vector3::new(0.25, 0.0, 0.0)).norm() < 1e-3
-    });
+    full_request(
+        browser,
+        run,
+        "a view that has moved with the base",
+        |request| {
+            let moved = request.world_from_camera.translation.vector - before;
+            (moved - Vector3::new(0.25, 0.0, 0.0)).norm() < 1e-3
+        },
+    );
 }

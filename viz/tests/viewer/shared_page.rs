@@ -10,7 +10,8 @@ use std::path::PathBuf;
 use std::time::{Duration, Instant};
 use test_support::browser::{Browser, browser_for_page, wait_for};
 use viz::{
-    Certificate, Control, EditAction, EditRequest, Hub, SceneHint, Server, ServerConfig, Sharing, Status, Tokens,
+    Certificate, Control, EditAction, EditRequest, Hub, SceneHint, Server, ServerConfig, Sharing,
+    Status, Tokens,
 };
 
 const WINDOW_PX: [u32; 2] = [1280, 760];
@@ -23,56 +24,113 @@ const BLOCKED_AFTER: Duration = Duration::from_secs(5);
 /// Chromium and an empty folder for its profile, if the test can run.
 fn chromium_and_profile(name: &str) -> Option<(PathBuf, PathBuf)> {
     let program = browser_for_page()?;
-    Some((program, PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join(format!("{name}-{}", std::process::id()))))
+    Some((
+        program,
+        PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join(format!("{name}-{}", std::process::id())),
+    ))
 }
 
 #[test]
 fn page_uses_its_token_and_shows_its_role() {
-    let Some((program, profile)) = chromium_and_profile("shared") else { return };
+    let Some((program, profile)) = chromium_and_profile("shared") else {
+        return;
+    };
     let scratch = PathBuf::from(env!("CARGO_TARGET_TMPDIR"));
     let folder = tempfile::tempdir().expect("a folder");
     let certificate = Certificate::kept_in(folder.path()).expect("a certificate");
     let tokens = Tokens::random().expect("random numbers");
-    let (operator, viewer) = (tokens.operator.text().to_owned(), tokens.viewer.text().to_owned());
-    let config = ServerConfig { listen: ([127, 0, 0, 1], 0).into() };
+    let (operator, viewer) = (
+        tokens.operator.text().to_owned(),
+        tokens.viewer.text().to_owned(),
+    );
+    let config = ServerConfig {
+        listen: ([127, 0, 0, 1], 0).into(),
+    };
     let hub = Hub::new();
-    hub.set_status(Status { state: "training".to_owned(), ..Status::default() });
+    hub.set_status(Status {
+        state: "training".to_owned(),
+        ..Status::default()
+    });
     let world_from_camera = Transform::translation(0.5, 0.0, -3.0);
-    hub.set_scene_hint(SceneHint { center_m: CENTER_M, radius_m: 2.0, world_from_camera });
-    let server = Server::start_shared(config, Sharing { certificate, tokens }, hub.clone()).expect("a free port");
+    hub.set_scene_hint(SceneHint {
+        center_m: CENTER_M,
+        radius_m: 2.0,
+        world_from_camera,
+    });
+    let server = Server::start_shared(
+        config,
+        Sharing {
+            certificate,
+            tokens,
+        },
+        hub.clone(),
+    )
+    .expect("a free port");
 
     // The sentence of the server is shown although browsers hide why a WebSocket was refused.
     let mut browser = Browser::open(&program, &profile, &server.url(), WINDOW_PX);
-    let has_banner = |text: &'static str| move |browser: &mut Browser| browser.text("banner").contains(text);
-    wait_for(&mut browser, "the reason", has_banner("This server requires a token"));
+    let has_banner =
+        |text: &'static str| move |browser: &mut Browser| browser.text("banner").contains(text);
+    wait_for(
+        &mut browser,
+        "the reason",
+        has_banner("This server requires a token"),
+    );
     std::fs::write(scratch.join("shared-no-token.png"), browser.screenshot()).expect("written");
-    let open = |browser: &mut Browser, token: &str| browser.load_by(&format!("location.hash = '#token={token}'"));
+    let open = |browser: &mut Browser, token: &str| {
+        browser.load_by(&format!("location.hash = '#token={token}'"))
+    };
     open(&mut browser, "0123");
     wait_for(&mut browser, "the reason", has_banner("Invalid token"));
     browser.resize(PHONE_PX);
-    std::fs::write(scratch.join("shared-wrong-token-phone.png"), browser.screenshot()).expect("written");
+    std::fs::write(
+        scratch.join("shared-wrong-token-phone.png"),
+        browser.screenshot(),
+    )
+    .expect("written");
     browser.resize(WINDOW_PX);
 
     open(&mut browser, &viewer);
     let connected = |browser: &mut Browser| browser.text("connection").starts_with("connected");
     wait_for(&mut browser, "a connection", connected);
-    assert_eq!(browser.evaluate("location.hash"), json!(""), "the token is not left in the address");
+    assert_eq!(
+        browser.evaluate("location.hash"),
+        json!(""),
+        "the token is not left in the address"
+    );
     assert_eq!(browser.text("banner"), "");
     assert_eq!(browser.text("role"), "viewer");
     let pause = "document.getElementById('pause')";
     let is_shown = "document.getElementById('controls').hidden === false";
-    wait_for(&mut browser, "the button", |browser| browser.evaluate(is_shown) == json!(true));
+    wait_for(&mut browser, "the button", |browser| {
+        browser.evaluate(is_shown) == json!(true)
+    });
     assert_eq!(browser.evaluate(&format!("{pause}.disabled")), json!(true));
     let edit = "document.getElementById('toggle-edit')";
-    wait_for(&mut browser, "the button", |browser| browser.evaluate(&format!("{edit}.hidden")) == json!(false));
+    wait_for(&mut browser, "the button", |browser| {
+        browser.evaluate(&format!("{edit}.hidden")) == json!(false)
+    });
     assert_eq!(browser.evaluate(&format!("{edit}.disabled")), json!(true));
     press(&mut browser, "q");
-    assert_eq!(browser.evaluate("document.getElementById('edit').hidden"), json!(true), "viewers cannot edit");
+    assert_eq!(
+        browser.evaluate("document.getElementById('edit').hidden"),
+        json!(true),
+        "viewers cannot edit"
+    );
     let reason = browser.evaluate(&format!("{pause}.title"));
-    assert!(reason.as_str().is_some_and(|reason| reason.contains("connected as viewer")), "{reason}");
+    assert!(
+        reason
+            .as_str()
+            .is_some_and(|reason| reason.contains("connected as viewer")),
+        "{reason}"
+    );
     std::fs::write(scratch.join("shared-viewer.png"), browser.screenshot()).expect("written");
     browser.resize(PHONE_PX);
-    std::fs::write(scratch.join("shared-viewer-phone.png"), browser.screenshot()).expect("written");
+    std::fs::write(
+        scratch.join("shared-viewer-phone.png"),
+        browser.screenshot(),
+    )
+    .expect("written");
     browser.resize(WINDOW_PX);
 
     // The token stays after a reload, and another one replaces it.
@@ -81,13 +139,24 @@ fn page_uses_its_token_and_shows_its_role() {
     open(&mut browser, &operator);
     browser.call("Page.reload", json!({}));
     wait_for(&mut browser, "a connection", connected);
-    wait_for(&mut browser, "the role", |browser| browser.text("role").is_empty());
-    wait_for(&mut browser, "the button", |browser| browser.evaluate(is_shown) == json!(true));
-    for (action, state, next) in [(Control::Pause, "paused", "Continue"), (Control::Resume, "training", "Pause")] {
+    wait_for(&mut browser, "the role", |browser| {
+        browser.text("role").is_empty()
+    });
+    wait_for(&mut browser, "the button", |browser| {
+        browser.evaluate(is_shown) == json!(true)
+    });
+    for (action, state, next) in [
+        (Control::Pause, "paused", "Continue"),
+        (Control::Resume, "training", "Pause"),
+    ] {
         browser.click("pause");
-        wait_for(&mut browser, "the action", |_| hub.take_controls() == [action]);
+        wait_for(&mut browser, "the action", |_| {
+            hub.take_controls() == [action]
+        });
         hub.set_state(state); // As the run does.
-        wait_for(&mut browser, "the state", |browser| browser.text("pause") == next);
+        wait_for(&mut browser, "the state", |browser| {
+            browser.text("pause") == next
+        });
     }
     std::fs::write(scratch.join("shared-operator.png"), browser.screenshot()).expect("written");
     edit_model(&mut browser, &hub);
@@ -99,7 +168,9 @@ fn page_uses_its_token_and_shows_its_role() {
 }
 
 fn press(browser: &mut Browser, key: &str) {
-    browser.evaluate(&format!("window.dispatchEvent(new KeyboardEvent('keydown', {{ key: '{key}' }}))"));
+    browser.evaluate(&format!(
+        "window.dispatchEvent(new KeyboardEvent('keydown', {{ key: '{key}' }}))"
+    ));
 }
 
 /// The edits that the page sends.
@@ -115,13 +186,21 @@ fn wait_for_edits(browser: &mut Browser, hub: &Hub) -> Vec<EditRequest> {
 /// Erases the box, removes floaters and undoes edits, with buttons and with keys.
 fn edit_model(browser: &mut Browser, hub: &Hub) {
     let is_enabled = "document.getElementById('toggle-edit').disabled === false";
-    wait_for(browser, "the button", |browser| browser.evaluate(is_enabled) == json!(true));
+    wait_for(browser, "the button", |browser| {
+        browser.evaluate(is_enabled) == json!(true)
+    });
     press(browser, "w");
     browser.click("toggle-edit");
-    assert_eq!(hub.take_edits(), [], "keys have no effect while the panel is closed");
+    assert_eq!(
+        hub.take_edits(),
+        [],
+        "keys have no effect while the panel is closed"
+    );
     browser.click("erase-box");
     let edits = wait_for_edits(browser, hub);
-    let EditAction::Erase(erased) = edits[0].action() else { panic!("{edits:?}") };
+    let EditAction::Erase(erased) = edits[0].action() else {
+        panic!("{edits:?}")
+    };
     // The box is small until the user changes it: 0.3 times the radius wide, around the center.
     let sides = erased.min_m.iter().zip(&erased.max_m).zip(CENTER_M);
     let is_expected = |((min, max), center): ((&f64, &f64), f64)| {
@@ -131,17 +210,23 @@ fn edit_model(browser: &mut Browser, hub: &Hub) {
     let set_edits = |n_edits| hub.change_status(|status| status.model.edits = n_edits);
     assert_eq!(browser.text("undo-edit"), "Undo");
     set_edits(3); // As the run does.
-    wait_for(browser, "the number of edits", |browser| browser.text("undo-edit") == "Undo (3)");
+    wait_for(browser, "the number of edits", |browser| {
+        browser.text("undo-edit") == "Undo (3)"
+    });
     press(browser, "a");
     assert_eq!(browser.text("edit-note"), "looking for floaters …");
     let edits = wait_for_edits(browser, hub);
     assert_eq!(*edits[0].action(), EditAction::RemoveFloaters);
     hub.reject_edit(&edits[0], "no floaters found");
-    wait_for(browser, "the reason", |browser| browser.text("edit-note") == "no floaters found");
+    wait_for(browser, "the reason", |browser| {
+        browser.text("edit-note") == "no floaters found"
+    });
     browser.click("undo-edit");
     assert_eq!(*wait_for_edits(browser, hub)[0].action(), EditAction::Undo);
     set_edits(2);
-    wait_for(browser, "the number of edits", |browser| browser.text("undo-edit") == "Undo (2)");
+    wait_for(browser, "the number of edits", |browser| {
+        browser.text("undo-edit") == "Undo (2)"
+    });
     assert_eq!(browser.text("edit-note"), "");
 
     press(browser, "a");
@@ -149,7 +234,9 @@ fn edit_model(browser: &mut Browser, hub: &Hub) {
     wait_for_edits(browser, hub);
     // An undo and another edit: only the revision differs.
     hub.change_status(|status| status.edit_revision += 2);
-    wait_for(browser, "the change", |browser| browser.text("edit-note").is_empty());
+    wait_for(browser, "the change", |browser| {
+        browser.text("edit-note").is_empty()
+    });
 }
 
 /// Serves one HTML document to every request, as another site.
@@ -160,7 +247,9 @@ fn serve_html(html: String) -> String {
         for mut stream in listener.incoming().flatten() {
             let _ = stream.read(&mut [0; 4096]);
             let length = html.len();
-            let head = format!("HTTP/1.1 200 OK\r\nContent-Type: text/html\r\nContent-Length: {length}\r\n");
+            let head = format!(
+                "HTTP/1.1 200 OK\r\nContent-Type: text/html\r\nContent-Length: {length}\r\n"
+            );
             let _ = write!(stream, "{head}Connection: close\r\n\r\n{html}");
         }
     });
@@ -169,9 +258,13 @@ fn serve_html(html: String) -> String {
 
 #[test]
 fn other_sites_can_neither_embed_nor_use_the_page() {
-    let Some((program, profile)) = chromium_and_profile("foreign") else { return };
+    let Some((program, profile)) = chromium_and_profile("foreign") else {
+        return;
+    };
     let hub = Hub::new();
-    let config = ServerConfig { listen: ([127, 0, 0, 1], 0).into() };
+    let config = ServerConfig {
+        listen: ([127, 0, 0, 1], 0).into(),
+    };
     let server = Server::start(config, hub.clone()).expect("a free port");
     let socket = format!("ws://{}/ws", server.address());
     let html = format!(
@@ -182,7 +275,9 @@ fn other_sites_can_neither_embed_nor_use_the_page() {
         server.url()
     );
     let mut browser = Browser::open(&program, &profile, &serve_html(html), WINDOW_PX);
-    wait_for(&mut browser, "the socket", |browser| ["open", "refused"].contains(&&*browser.text("socket")));
+    wait_for(&mut browser, "the socket", |browser| {
+        ["open", "refused"].contains(&&*browser.text("socket"))
+    });
     assert_eq!(browser.text("socket"), "refused");
     let started = Instant::now();
     while started.elapsed() < BLOCKED_AFTER {

@@ -13,9 +13,13 @@ use std::time::Duration;
 const RECEIVE_BUFFER_BYTES: usize = 8192;
 const MAX_READ_BYTES: usize = 4096;
 
-/// Connects with a receive buffer of this size. It is set before the connection is opened. Otherwise, the kernel sends segments
-/// of 64 kB over loopback, in bursts that no other link has, and enlarges the buffer to megabytes.
-pub(crate) fn connect_with_buffer(address: SocketAddr, n_bytes: usize) -> std::io::Result<TcpStream> {
+/// Connects with a receive buffer of this size. It is set before the connection is opened.
+/// Otherwise, the kernel sends segments of 64 kB over loopback, in bursts that no other link has,
+/// and enlarges the buffer to megabytes.
+pub(crate) fn connect_with_buffer(
+    address: SocketAddr,
+    n_bytes: usize,
+) -> std::io::Result<TcpStream> {
     let socket = socket(AddressFamily::INET, SocketType::STREAM, None)?;
     set_socket_recv_buffer_size(&socket, n_bytes)?;
     rustix::net::connect(&socket, &address)?;
@@ -29,7 +33,8 @@ pub(crate) struct Slow {
     n_read: Arc<AtomicUsize>,
 }
 
-/// Counts the bytes of a slow connection. Tests count bytes before a reply instead of time, because the computer may be busy.
+/// Counts the bytes of a slow connection. Tests count bytes before a reply instead of time, because
+/// the computer may be busy.
 pub(crate) struct Counter {
     stream: TcpStream,
     n_read: Arc<AtomicUsize>,
@@ -37,13 +42,21 @@ pub(crate) struct Counter {
 
 impl Slow {
     pub(crate) fn connect(address: SocketAddr, bytes_per_sec: f64) -> Self {
-        let stream = connect_with_buffer(address, RECEIVE_BUFFER_BYTES).expect("the server listens");
+        let stream =
+            connect_with_buffer(address, RECEIVE_BUFFER_BYTES).expect("the server listens");
         stream.set_read_timeout(Some(TIMEOUT)).expect("a timeout");
-        Self { stream, bytes_per_sec, n_read: Arc::default() }
+        Self {
+            stream,
+            bytes_per_sec,
+            n_read: Arc::default(),
+        }
     }
 
     pub(crate) fn counter(&self) -> Counter {
-        Counter { stream: self.descriptor(), n_read: Arc::clone(&self.n_read) }
+        Counter {
+            stream: self.descriptor(),
+            n_read: Arc::clone(&self.n_read),
+        }
     }
 
     /// Another descriptor of the same connection.
@@ -58,7 +71,8 @@ impl Counter {
         self.n_read.load(Ordering::Relaxed)
     }
 
-    /// Bytes that have arrived: those that the client has read, and those that the kernel holds for it.
+    /// Bytes that have arrived: those that the client has read, and those that the kernel holds for
+    /// it.
     pub(crate) fn n_arrived(&self) -> usize {
         self.n_read() + n_unread(&self.stream)
     }

@@ -15,7 +15,8 @@ pub(crate) const TIMEOUT: Duration = Duration::from_secs(60);
 
 pub(crate) type TlsStream = StreamOwned<ClientConnection, TcpStream>;
 
-/// Opens a connection to the server with this certificate. The handshake happens with the first read or write.
+/// Opens a connection to the server with this certificate. The handshake happens with the first
+/// read or write.
 pub(crate) fn connect(address: SocketAddr, fingerprint: &str) -> TlsStream {
     let stream = TcpStream::connect(address).expect("the server listens");
     stream.set_read_timeout(Some(TIMEOUT)).expect("a timeout");
@@ -23,9 +24,15 @@ pub(crate) fn connect(address: SocketAddr, fingerprint: &str) -> TlsStream {
 }
 
 /// TLS over this connection.
-pub(crate) fn over<S: Read + Write>(stream: S, fingerprint: &str) -> StreamOwned<ClientConnection, S> {
+pub(crate) fn over<S: Read + Write>(
+    stream: S,
+    fingerprint: &str,
+) -> StreamOwned<ClientConnection, S> {
     let provider = Arc::new(ring::default_provider());
-    let verifier = Pinned { fingerprint: fingerprint.to_owned(), provider: Arc::clone(&provider) };
+    let verifier = Pinned {
+        fingerprint: fingerprint.to_owned(),
+        provider: Arc::clone(&provider),
+    };
     let config = ClientConfig::builder_with_provider(provider)
         .with_safe_default_protocol_versions()
         .expect("TLS 1.3")
@@ -33,7 +40,10 @@ pub(crate) fn over<S: Read + Write>(stream: S, fingerprint: &str) -> StreamOwned
         .with_custom_certificate_verifier(Arc::new(verifier))
         .with_no_client_auth();
     let name = ServerName::try_from("localhost").expect("a name");
-    StreamOwned::new(ClientConnection::new(Arc::new(config), name).expect("a configuration"), stream)
+    StreamOwned::new(
+        ClientConnection::new(Arc::new(config), name).expect("a configuration"),
+        stream,
+    )
 }
 
 #[derive(Debug)]
@@ -51,7 +61,10 @@ impl ServerCertVerifier for Pinned {
         _: &[u8],
         _: UnixTime,
     ) -> Result<ServerCertVerified, rustls::Error> {
-        let digest: Vec<_> = Sha256::digest(certificate).iter().map(|byte| format!("{byte:02X}")).collect();
+        let digest: Vec<_> = Sha256::digest(certificate)
+            .iter()
+            .map(|byte| format!("{byte:02X}"))
+            .collect();
         if digest.join(":") == self.fingerprint {
             Ok(ServerCertVerified::assertion())
         } else {
@@ -65,7 +78,9 @@ impl ServerCertVerifier for Pinned {
         _: &CertificateDer<'_>,
         _: &DigitallySignedStruct,
     ) -> Result<HandshakeSignatureValid, rustls::Error> {
-        Err(rustls::Error::General("TLS 1.2 is not supported".to_owned()))
+        Err(rustls::Error::General(
+            "TLS 1.2 is not supported".to_owned(),
+        ))
     }
 
     fn verify_tls13_signature(
@@ -74,10 +89,17 @@ impl ServerCertVerifier for Pinned {
         certificate: &CertificateDer<'_>,
         signed: &DigitallySignedStruct,
     ) -> Result<HandshakeSignatureValid, rustls::Error> {
-        verify_tls13_signature(message, certificate, signed, &self.provider.signature_verification_algorithms)
+        verify_tls13_signature(
+            message,
+            certificate,
+            signed,
+            &self.provider.signature_verification_algorithms,
+        )
     }
 
     fn supported_verify_schemes(&self) -> Vec<SignatureScheme> {
-        self.provider.signature_verification_algorithms.supported_schemes()
+        self.provider
+            .signature_verification_algorithms
+            .supported_schemes()
     }
 }

@@ -1,4 +1,5 @@
-//! Opens the page in a real browser where it cannot work as usual: with a server of an older version, without WebGL 2.
+//! Opens the page in a real browser where it cannot work as usual: with a server of an older
+//! version, without WebGL 2.
 //!
 //! Skipped, with a message, if Chromium or the bundle (`make web`) is missing.
 
@@ -12,7 +13,8 @@ use tungstenite::Message;
 
 const WINDOW_PX: [u32; 2] = [1280, 760];
 
-/// A server that sends these messages to every client, like one of an older version. Returns its URL.
+/// A server that sends these messages to every client, like one of an older version. Returns its
+/// URL.
 fn serve(messages: Vec<Value>) -> String {
     let listener = TcpListener::bind("127.0.0.1:0").expect("a free port exists");
     let url = format!("http://{}/", listener.local_addr().expect("bound"));
@@ -31,8 +33,13 @@ fn answer(mut stream: TcpStream, messages: &[Value]) {
     let request = String::from_utf8_lossy(&request[..n_bytes]).into_owned();
     let path = request.split(' ').nth(1).unwrap_or_default();
     if path == "/ws" {
-        let Ok(mut socket) = tungstenite::accept(stream) else { return };
-        while messages.iter().all(|message| socket.send(Message::text(message.to_string())).is_ok()) {
+        let Ok(mut socket) = tungstenite::accept(stream) else {
+            return;
+        };
+        while messages
+            .iter()
+            .all(|message| socket.send(Message::text(message.to_string())).is_ok())
+        {
             std::thread::sleep(Duration::from_millis(200));
         }
         return;
@@ -42,13 +49,21 @@ fn answer(mut stream: TcpStream, messages: &[Value]) {
         "/app.js" => ("app.js", "text/javascript"),
         _ => ("app.css", "text/css"),
     };
-    let bytes = std::fs::read(PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("web/dist").join(file)).expect("bundled");
+    let bytes = std::fs::read(
+        PathBuf::from(env!("CARGO_MANIFEST_DIR"))
+            .join("web/dist")
+            .join(file),
+    )
+    .expect("bundled");
     let length = bytes.len();
-    let head =
-        format!("HTTP/1.1 200 OK\r\nContent-Type: {kind}\r\nContent-Length: {length}\r\nConnection: close\r\n\r\n");
+    let head = format!(
+        "HTTP/1.1 200 OK\r\nContent-Type: {kind}\r\nContent-Length: {length}\r\nConnection: close\r\n\r\n"
+    );
     // The request is read, because the browser would otherwise see a reset.
     let _ = stream.read(&mut [0; 4096]);
-    let _ = stream.write_all(head.as_bytes()).and_then(|()| stream.write_all(&bytes));
+    let _ = stream
+        .write_all(head.as_bytes())
+        .and_then(|()| stream.write_all(&bytes));
 }
 
 /// The hello of a server that supports one version and negotiates nothing.
@@ -59,11 +74,16 @@ fn hello(protocol: u32) -> Value {
 
 #[test]
 fn page_works_with_an_older_server_or_says_why_not() {
-    let Some(program) = browser_for_page() else { return };
-    let profile = PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join(format!("older-{}", std::process::id()));
+    let Some(program) = browser_for_page() else {
+        return;
+    };
+    let profile =
+        PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join(format!("older-{}", std::process::id()));
     let mut browser = Browser::open(&program, &profile, &serve(vec![hello(2)]), WINDOW_PX);
     wait_for(&mut browser, "the reason", |browser| {
-        browser.text("banner").starts_with("The server uses protocol version 2, this page 3 to 4: reload the page")
+        browser
+            .text("banner")
+            .starts_with("The server uses protocol version 2, this page 3 to 4: reload the page")
     });
 
     let status = json!({"type": "status", "state": "training", "seconds": 12.0, "method": "splat", "step": 70,
@@ -71,9 +91,14 @@ fn page_works_with_an_older_server_or_says_why_not() {
         "psnr": null, "psnr_history": [], "others": [], "notes": [], "result": null});
     let url = serve(vec![hello(3), status]);
     browser.call("Page.navigate", json!({"url": url}));
-    wait_for(&mut browser, "the status", |browser| browser.text("step") == "70");
+    wait_for(&mut browser, "the status", |browser| {
+        browser.text("step") == "70"
+    });
     assert!(browser.text("connection").starts_with("connected"));
-    assert_eq!((browser.text("banner"), browser.text("role")), (String::new(), String::new()));
+    assert_eq!(
+        (browser.text("banner"), browser.text("role")),
+        (String::new(), String::new())
+    );
     assert_eq!(
         browser.evaluate("document.getElementById('controls').hidden"),
         json!(true),
@@ -87,11 +112,22 @@ fn page_works_with_an_older_server_or_says_why_not() {
 #[test]
 fn page_without_webgl_shows_an_error() {
     const NO_WEBGL: &str = "HTMLCanvasElement.prototype.getContext = () => null";
-    let Some(program) = browser_for_page() else { return };
-    let profile = PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join(format!("no-webgl-{}", std::process::id()));
-    let mut browser = Browser::open_with(&program, &profile, &serve(vec![hello(3)]), WINDOW_PX, NO_WEBGL);
+    let Some(program) = browser_for_page() else {
+        return;
+    };
+    let profile =
+        PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join(format!("no-webgl-{}", std::process::id()));
+    let mut browser = Browser::open_with(
+        &program,
+        &profile,
+        &serve(vec![hello(3)]),
+        WINDOW_PX,
+        NO_WEBGL,
+    );
     wait_for(&mut browser, "the reason", |browser| {
-        browser.text("banner").starts_with("WebGL 2 is not available in this browser: turn on")
+        browser
+            .text("banner")
+            .starts_with("WebGL 2 is not available in this browser: turn on")
     });
     assert_eq!(browser.text("connection"), "not connected");
     drop(browser);

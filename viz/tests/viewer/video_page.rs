@@ -26,7 +26,8 @@ const KEEP_FILE: &str = "
     window.createUrl = URL.createObjectURL.bind(URL);
     URL.createObjectURL = (blob) => { window.file = blob; return window.createUrl(blob); };";
 
-/// Reads the number of frames from the table of sample sizes, and shows a frame: size, duration, and sampled colors.
+/// Reads the number of frames from the table of sample sizes, and shows a frame: size, duration,
+/// and sampled colors.
 const PLAY: &str = "(async () => {
     const bytes = new Uint8Array(await window.file.arrayBuffer());
     const table = bytes.findIndex((_, at) => String.fromCharCode(...bytes.subarray(at, at + 4)) === 'stsz');
@@ -68,27 +69,50 @@ impl Renderer {
         let requests: Arc<Mutex<Vec<RenderRequest>>> = Arc::default();
         let received = Arc::clone(&requests);
         let thread = RequestThread::start(hub, move |pending| {
-            received.lock().expect("no panic").push(pending.request.clone());
+            received
+                .lock()
+                .expect("no panic")
+                .push(pending.request.clone());
             let picture = draw(&pending.request);
             pending.deliver(picture);
         });
-        Self { requests, _thread: thread }
+        Self {
+            requests,
+            _thread: thread,
+        }
     }
 
     fn requests(&self, is_video: bool) -> Vec<RenderRequest> {
         let requests = self.requests.lock().expect("no panic");
-        requests.iter().filter(|request| request.depth != is_video).cloned().collect()
+        requests
+            .iter()
+            .filter(|request| request.depth != is_video)
+            .cloned()
+            .collect()
     }
 }
 
 #[test]
 fn a_recorded_video_has_every_frame() {
-    let Some(program) = browser_for_page() else { return };
+    let Some(program) = browser_for_page() else {
+        return;
+    };
     let hub = Hub::new();
-    hub.set_scene_hint(SceneHint { center_m: [0.0, 0.0, 0.2], radius_m: 0.8, world_from_camera: looking_along_y() });
-    let server = Server::start(ServerConfig { listen: ([127, 0, 0, 1], 0).into() }, hub.clone()).expect("a free port");
+    hub.set_scene_hint(SceneHint {
+        center_m: [0.0, 0.0, 0.2],
+        radius_m: 0.8,
+        world_from_camera: looking_along_y(),
+    });
+    let server = Server::start(
+        ServerConfig {
+            listen: ([127, 0, 0, 1], 0).into(),
+        },
+        hub.clone(),
+    )
+    .expect("a free port");
     let renderer = Renderer::start(hub);
-    let profile = PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join(format!("chromium-video-{}", std::process::id()));
+    let profile = PathBuf::from(env!("CARGO_TARGET_TMPDIR"))
+        .join(format!("chromium-video-{}", std::process::id()));
     let script = format!("{NO_DRAWING}{KEEP_FILE}");
     let mut browser = Browser::open_with(&program, &profile, &server.url(), WINDOW_PX, &script);
     // The page may not play videos, but this test does.
@@ -98,23 +122,32 @@ fn a_recorded_video_has_every_frame() {
     wait_for(&mut browser, "a full picture", |browser| {
         browser.evaluate("window.isOld") != true && browser.text("picture-text").contains("100 %")
     });
-    assert_eq!(browser.evaluate("document.getElementById('path-video').disabled"), true);
+    assert_eq!(
+        browser.evaluate("document.getElementById('path-video').disabled"),
+        true
+    );
     browser.click("path-add");
     browser.click("look-front");
     browser.click("path-add");
 
     browser.click("path-video");
     assert_eq!(browser.text("path-video"), "Cancel");
-    wait_for(&mut browser, "the first pictures", |_| renderer.requests(true).len() > 2);
+    wait_for(&mut browser, "the first pictures", |_| {
+        renderer.requests(true).len() > 2
+    });
     browser.click("look-top");
     wait_for(&mut browser, "a picture of the main view", |_| {
-        renderer
-            .requests(false)
-            .last()
-            .is_some_and(|request| (request.world_from_camera.rotation * Vector3::z() + Vector3::z()).norm() < 0.01)
+        renderer.requests(false).last().is_some_and(|request| {
+            (request.world_from_camera.rotation * Vector3::z() + Vector3::z()).norm() < 0.01
+        })
     });
-    assert!(renderer.requests(true).len() < N_FRAMES, "the main view is drawn during the recording");
-    wait_for(&mut browser, "a file", |browser| browser.evaluate("window.file !== null") == true);
+    assert!(
+        renderer.requests(true).len() < N_FRAMES,
+        "the main view is drawn during the recording"
+    );
+    wait_for(&mut browser, "a file", |browser| {
+        browser.evaluate("window.file !== null") == true
+    });
     assert_eq!(browser.text("path-video"), "Video");
     let requests = renderer.requests(true);
     assert_eq!(requests.len(), N_FRAMES, "one picture for each frame");
@@ -125,16 +158,26 @@ fn a_recorded_video_has_every_frame() {
     // A cancelled recording leaves no file.
     browser.evaluate("window.file = null");
     browser.click("path-video");
-    wait_for(&mut browser, "a picture", |browser| browser.text("path-count").starts_with("picture "));
+    wait_for(&mut browser, "a picture", |browser| {
+        browser.text("path-count").starts_with("picture ")
+    });
     browser.click("path-video");
-    wait_for(&mut browser, "the end", |browser| browser.text("path-video") == "Video");
+    wait_for(&mut browser, "the end", |browser| {
+        browser.text("path-video") == "Video"
+    });
     assert_eq!(browser.text("path-count"), "2 views");
     assert_eq!(browser.evaluate("window.file"), json!(null));
     assert_eq!(browser.text("path-note"), "");
     browser
         .evaluate("delete window.VideoEncoder; Object.defineProperty(window, 'isSecureContext', { value: false }); 0");
     browser.click("path-video");
-    assert!(browser.text("path-note").contains("start fieldrig with --share"), "{}", browser.text("path-note"));
+    assert!(
+        browser
+            .text("path-note")
+            .contains("start fieldrig with --share"),
+        "{}",
+        browser.text("path-note")
+    );
     drop(browser);
     drop(renderer);
     std::fs::remove_dir_all(&profile).expect("the browser has left its profile");
@@ -142,13 +185,20 @@ fn a_recorded_video_has_every_frame() {
 
 /// The frame of the video shows the picture of the request.
 fn check_frame(browser: &mut Browser, request: &RenderRequest, frame: usize) {
-    let script = PLAY.replace("FRAME", &frame.to_string()).replace("SAMPLES", &N_SAMPLES.to_string());
-    let played =
-        browser.call("Runtime.evaluate", json!({"expression": script, "awaitPromise": true, "returnByValue": true}));
+    let script = PLAY
+        .replace("FRAME", &frame.to_string())
+        .replace("SAMPLES", &N_SAMPLES.to_string());
+    let played = browser.call(
+        "Runtime.evaluate",
+        json!({"expression": script, "awaitPromise": true, "returnByValue": true}),
+    );
     let video = &played["result"]["value"];
     assert_eq!(video["nFrames"], json!(N_FRAMES), "{played}");
     let duration = video["duration"].as_f64().expect("a duration");
-    assert!((duration - N_FRAMES as f64 / 30.0).abs() < 0.01, "{duration} s");
+    assert!(
+        (duration - N_FRAMES as f64 / 30.0).abs() < 0.01,
+        "{duration} s"
+    );
     assert_eq!(video["size"], json!(request.size_px), "{video}");
     let colors: Vec<f64> = serde_json::from_value(video["colors"].clone()).expect("colors");
     let picture = draw(request);
@@ -156,9 +206,23 @@ fn check_frame(browser: &mut Browser, request: &RenderRequest, frame: usize) {
     let samples = (0..N_SAMPLES).flat_map(|y| (0..N_SAMPLES).map(move |x| (x, y)));
     let expected = samples.flat_map(|(x, y)| {
         let ix = 4 * (at(y, 1) * request.size_px[0] + at(x, 0)) as usize;
-        picture.rgba_srgb[ix..ix + 3].iter().map(|value| f64::from(*value)).collect::<Vec<_>>()
+        picture.rgba_srgb[ix..ix + 3]
+            .iter()
+            .map(|value| f64::from(*value))
+            .collect::<Vec<_>>()
     });
-    let mean = colors.iter().zip(expected).map(|(a, b)| (a - b).abs()).sum::<f64>() / colors.len() as f64;
-    eprintln!("frame {frame}: {mean:.1} of 255, file of {} bytes", video["bytes"]);
-    assert!(mean < MAX_DIFFERENCE, "frame {frame} differs by {mean} of 255");
+    let mean = colors
+        .iter()
+        .zip(expected)
+        .map(|(a, b)| (a - b).abs())
+        .sum::<f64>()
+        / colors.len() as f64;
+    eprintln!(
+        "frame {frame}: {mean:.1} of 255, file of {} bytes",
+        video["bytes"]
+    );
+    assert!(
+        mean < MAX_DIFFERENCE,
+        "frame {frame} differs by {mean} of 255"
+    );
 }

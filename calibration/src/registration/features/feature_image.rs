@@ -13,7 +13,8 @@ use std::sync::Arc;
 
 /// Maximum width of the finest level, pixels.
 const MAX_COLUMNS: u32 = 800;
-/// Narrower images are enlarged to about this width, because corners of small images are only a few pixels apart.
+/// Narrower images are enlarged to about this width, because corners of small images are only a few
+/// pixels apart.
 const MIN_COLUMNS: u32 = 320;
 const MAX_ENLARGEMENT: u32 = 3;
 /// Ratio of the sizes of neighboring levels.
@@ -23,8 +24,8 @@ const MAX_LEVELS: usize = 4;
 const MIN_SIDE: usize = 40;
 /// Approximate maximum number of corners of the finest level.
 const MAX_CORNERS: usize = 700;
-/// Minimum side of a cell of the grid that spreads corners over the image, texels, and maximum number of corners of a
-/// cell.
+/// Minimum side of a cell of the grid that spreads corners over the image, texels, and maximum
+/// number of corners of a cell.
 const MIN_CELL: usize = 16;
 const CORNERS_PER_CELL: usize = 3;
 /// Minimum brightness gradient, in every direction, of a corner: root mean square per texel.
@@ -39,8 +40,8 @@ pub(super) const DESCRIPTOR_LEN: usize = SIDE * SIDE;
 /// Minimum standard deviation of the samples of a descriptor.
 const MIN_CONTRAST: f32 = 4.0;
 
-/// Brightness around a corner with zero mean and unit norm, so that the dot product of two descriptors is their
-/// normalized cross-correlation.
+/// Brightness around a corner with zero mean and unit norm, so that the dot product of two
+/// descriptors is their normalized cross-correlation.
 pub(super) type Descriptor = [f32; DESCRIPTOR_LEN];
 
 /// A corner of an image.
@@ -50,7 +51,8 @@ pub(super) struct Corner {
     pub(super) px: [f64; 2],
     /// Ray through the corner with the keyframe's lens: x and y at a depth of 1.
     pub(super) ray: Vector2<f64>,
-    /// When the corner's row was read out, as a share of the readout time: -0.5 for the first row, 0.5 for the last.
+    /// When the corner's row was read out, as a share of the readout time: -0.5 for the first row,
+    /// 0.5 for the last.
     pub(super) row_share: f64,
     /// Position in texels of the level, where the center of the first texel is 0.
     texel: [f64; 2],
@@ -61,7 +63,13 @@ impl Corner {
     /// A corner without an image.
     #[cfg(test)]
     pub(super) fn at(px: [f64; 2], row_share: f64) -> Self {
-        Self { px, ray: Vector2::zeros(), row_share, texel: [0.0; 2], level: 0 }
+        Self {
+            px,
+            ray: Vector2::zeros(),
+            row_share,
+            texel: [0.0; 2],
+            level: 0,
+        }
     }
 }
 
@@ -98,27 +106,52 @@ impl FeatureImage {
         let (mut corners, mut descriptors) = (Vec::new(), Vec::new());
         for (ix, level) in levels.iter().enumerate() {
             for texel in level.corners(cell) {
-                let Some(descriptor) = level.descriptor(texel, [1.0, 0.0]) else { continue };
+                let Some(descriptor) = level.descriptor(texel, [1.0, 0.0]) else {
+                    continue;
+                };
                 let px = texel.map(|coordinate| (coordinate + 0.5) * level.texel_px);
-                let axis = |axis: usize| (px[axis] - keyframe.principal_px[axis]) / keyframe.focal_px[axis];
+                let axis = |axis: usize| {
+                    (px[axis] - keyframe.principal_px[axis]) / keyframe.focal_px[axis]
+                };
                 let row_share = px[1] / f64::from(keyframe.size_px[1]) - 0.5;
-                corners.push(Corner { px, ray: Vector2::new(axis(0), axis(1)), row_share, texel, level: ix });
+                corners.push(Corner {
+                    px,
+                    ray: Vector2::new(axis(0), axis(1)),
+                    row_share,
+                    texel,
+                    level: ix,
+                });
                 descriptors.push(descriptor);
             }
         }
-        Self { keyframe: keyframe.clone(), camera, levels, corners, descriptors }
+        Self {
+            keyframe: keyframe.clone(),
+            camera,
+            levels,
+            corners,
+            descriptors,
+        }
     }
 
-    /// Descriptor of a corner along axes that are rotated by an angle, given as cosine and sine, from those of the
-    /// image.
-    pub(super) fn rotated_descriptor(&self, corner: &Corner, rotation: [f64; 2]) -> Option<Descriptor> {
+    /// Descriptor of a corner along axes that are rotated by an angle, given as cosine and sine,
+    /// from those of the image.
+    pub(super) fn rotated_descriptor(
+        &self,
+        corner: &Corner,
+        rotation: [f64; 2],
+    ) -> Option<Descriptor> {
         self.levels[corner.level].descriptor(corner.texel, rotation)
     }
 
     /// Indices of the corners whose level differs by at most `max_difference` from a level.
     pub(super) fn corners_of_levels(&self, level: usize, max_difference: usize) -> Range<usize> {
-        let begin = self.corners.partition_point(|corner| corner.level + max_difference < level);
-        begin..self.corners.partition_point(|corner| corner.level <= level + max_difference)
+        let begin = self
+            .corners
+            .partition_point(|corner| corner.level + max_difference < level);
+        begin
+            ..self
+                .corners
+                .partition_point(|corner| corner.level <= level + max_difference)
     }
 
     /// Size of a corner's texels, radians near the image center.
@@ -139,7 +172,11 @@ impl FeatureImage {
 fn levels(keyframe: &Keyframe) -> Vec<Level> {
     let edge = keyframe.size_px[0].div_ceil(MAX_COLUMNS).max(1) as usize;
     let (size, values) = brightness(keyframe, edge);
-    let base = Level { size, texel_px: edge as f64, values };
+    let base = Level {
+        size,
+        texel_px: edge as f64,
+        values,
+    };
     let base = match MIN_COLUMNS.div_ceil(keyframe.size_px[0]) {
         ..=1 => base,
         factor => base.resized(1.0 / f64::from(factor.min(MAX_ENLARGEMENT))),
@@ -163,23 +200,34 @@ impl Level {
             let at = [ix % size[0], ix / size[0]].map(|texel| (texel as f64 + 0.5) * factor - 0.5);
             self.at(at).unwrap_or(f32::NAN)
         };
-        Self { size, texel_px: self.texel_px * factor, values: (0..size[0] * size[1]).map(value).collect() }
+        Self {
+            size,
+            texel_px: self.texel_px * factor,
+            values: (0..size[0] * size[1]).map(value).collect(),
+        }
     }
 
     /// Blurs with a binomial filter, five texels wide.
     fn blurred(&self) -> Self {
         let [width, height] = self.size;
         let mut rows = vec![f32::NAN; self.values.len()];
-        for (row, blurred) in self.values.chunks_exact(width).zip(rows.chunks_exact_mut(width)) {
+        for (row, blurred) in self
+            .values
+            .chunks_exact(width)
+            .zip(rows.chunks_exact_mut(width))
+        {
             for (window, blurred) in row.windows(5).zip(&mut blurred[2..]) {
-                *blurred = (window[0] + window[4] + 4.0 * (window[1] + window[3]) + 6.0 * window[2]) / 16.0;
+                *blurred =
+                    (window[0] + window[4] + 4.0 * (window[1] + window[3]) + 6.0 * window[2])
+                        / 16.0;
             }
         }
         let mut values = vec![f32::NAN; self.values.len()];
         for y in 2..height.saturating_sub(2) {
             for x in 0..width {
                 let at = |row: usize| rows[(y + row - 2) * width + x];
-                values[y * width + x] = (at(0) + at(4) + 4.0 * (at(1) + at(3)) + 6.0 * at(2)) / 16.0;
+                values[y * width + x] =
+                    (at(0) + at(4) + 4.0 * (at(1) + at(3)) + 6.0 * at(2)) / 16.0;
             }
         }
         Self { values, ..*self }
@@ -187,19 +235,24 @@ impl Level {
 
     /// Interpolated brightness at a position in texels, where the center of the first texel is 0.
     fn at(&self, [x, y]: [f64; 2]) -> Option<f32> {
-        if !(x >= 0.0 && y >= 0.0 && x < (self.size[0] - 1) as f64 && y < (self.size[1] - 1) as f64) {
+        if !(x >= 0.0 && y >= 0.0 && x < (self.size[0] - 1) as f64 && y < (self.size[1] - 1) as f64)
+        {
             return None;
         }
         let (left, top) = (x as usize, y as usize);
         let (fx, fy) = ((x - left as f64) as f32, (y - top as f64) as f32);
         let ix = top * self.size[0] + left;
-        let (above, below) = (&self.values[ix..ix + 2], &self.values[ix + self.size[0]..][..2]);
+        let (above, below) = (
+            &self.values[ix..ix + 2],
+            &self.values[ix + self.size[0]..][..2],
+        );
         let row = |row: &[f32]| row[0] + fx * (row[1] - row[0]);
         let (above, below) = (row(above), row(below));
         Some(above + fy * (below - above))
     }
 
-    /// Corners, spread over a grid, with positions that are finer than a texel (Shi and Tomasi 1994).
+    /// Corners, spread over a grid, with positions that are finer than a texel (Shi and Tomasi
+    /// 1994).
     fn corners(&self, cell: usize) -> Vec<[f64; 2]> {
         let [width, height] = self.size;
         if width.min(height) < MIN_SIDE {
@@ -231,15 +284,21 @@ impl Level {
             found.truncate(CORNERS_PER_CELL);
             // The vertex of a parabola through the maximum and its neighbors.
             let offset = |ix: usize, stride: usize| {
-                let [before, own, after] = [ix - stride, ix, ix + stride].map(|ix| f64::from(response[ix]));
+                let [before, own, after] =
+                    [ix - stride, ix, ix + stride].map(|ix| f64::from(response[ix]));
                 let curvature = before - 2.0 * own + after;
-                if curvature < 0.0 { (0.5 * (before - after) / curvature).clamp(-0.5, 0.5) } else { 0.0 }
+                if curvature < 0.0 {
+                    (0.5 * (before - after) / curvature).clamp(-0.5, 0.5)
+                } else {
+                    0.0
+                }
             };
-            corners.extend(
-                found
-                    .into_iter()
-                    .map(|ix| [(ix % width) as f64 + offset(ix, 1), (ix / width) as f64 + offset(ix, width)]),
-            );
+            corners.extend(found.into_iter().map(|ix| {
+                [
+                    (ix % width) as f64 + offset(ix, 1),
+                    (ix / width) as f64 + offset(ix, width),
+                ]
+            }));
         }
         corners
     }
@@ -276,7 +335,8 @@ impl Level {
         for y in WINDOW_RADIUS..height - WINDOW_RADIUS {
             for x in WINDOW_RADIUS..width - WINDOW_RADIUS {
                 let ix = y * width + x;
-                let [xx, xy, yy] = sum(&rows, ix, width).map(|sum| sum / (DIAMETER * DIAMETER) as f32);
+                let [xx, xy, yy] =
+                    sum(&rows, ix, width).map(|sum| sum / (DIAMETER * DIAMETER) as f32);
                 let smaller = 0.5 * (xx + yy) - (0.25 * (xx - yy) * (xx - yy) + xy * xy).sqrt();
                 response[ix] = if smaller.is_finite() { smaller } else { 0.0 };
             }
@@ -305,13 +365,20 @@ impl Level {
             let (column, row) = (x as u32, y as u32); // Conversions to u32 are faster than to usize.
             let (fx, fy) = (x - column as f32, y - row as f32);
             let begin = row as usize * stride + column as usize;
-            let (above, below) = (&window[begin..begin + 2], &window[begin + stride..begin + stride + 2]);
+            let (above, below) = (
+                &window[begin..begin + 2],
+                &window[begin + stride..begin + stride + 2],
+            );
             let above = above[0] + fx * (above[1] - above[0]);
             *sample = above + fy * (below[0] + fx * (below[1] - below[0]) - above);
         }
         let mean = samples.iter().sum::<f32>() / DESCRIPTOR_LEN as f32;
         samples.iter_mut().for_each(|sample| *sample -= mean);
-        let norm = samples.iter().map(|sample| sample * sample).sum::<f32>().sqrt();
+        let norm = samples
+            .iter()
+            .map(|sample| sample * sample)
+            .sum::<f32>()
+            .sqrt();
         // Also false for NaN.
         let has_contrast = norm > MIN_CONTRAST * (DESCRIPTOR_LEN as f32).sqrt();
         has_contrast.then(|| samples.map(|sample| sample / norm))

@@ -43,9 +43,16 @@ pub(super) fn matches(
     let to_from_from = cameras[1].world_from_camera.inverse() * cameras[0].world_from_camera;
     let rotation = to_from_from.rotation.to_rotation_matrix();
     // The motion of the second camera during readout is small compared with the tolerance.
-    let rays: Vec<Vector2<f64>> = to.corners.iter().map(|corner| cameras[1].sighting(corner).ray).collect();
-    let descriptors: Vec<Option<Descriptor>> =
-        to.corners.iter().map(|corner| to.rotated_descriptor(corner, roll(rotation.matrix(), &corner.ray)?)).collect();
+    let rays: Vec<Vector2<f64>> = to
+        .corners
+        .iter()
+        .map(|corner| cameras[1].sighting(corner).ray)
+        .collect();
+    let descriptors: Vec<Option<Descriptor>> = to
+        .corners
+        .iter()
+        .map(|corner| to.rotated_descriptor(corner, roll(rotation.matrix(), &corner.ray)?))
+        .collect();
     let mut best_of_to: Vec<(f32, usize)> = vec![(MIN_CORRELATION, usize::MAX); to.corners.len()];
     let mut best_of_from: Vec<Option<usize>> = vec![None; from.corners.len()];
     let mut candidates: Vec<(f32, usize)> = Vec::new();
@@ -56,49 +63,69 @@ pub(super) fn matches(
             if !band.contains(&rays[other_ix]) {
                 continue;
             }
-            let Some(descriptor) = &descriptors[other_ix] else { continue };
+            let Some(descriptor) = &descriptors[other_ix] else {
+                continue;
+            };
             let correlation = dot(&from.descriptors[ix], descriptor);
             candidates.push((correlation, other_ix));
             if correlation > best_of_to[other_ix].0 {
                 best_of_to[other_ix] = (correlation, ix);
             }
         }
-        let Some(best) = candidates.iter().copied().max_by(|a, b| a.0.total_cmp(&b.0).then(b.1.cmp(&a.1))) else {
+        let Some(best) = candidates
+            .iter()
+            .copied()
+            .max_by(|a, b| a.0.total_cmp(&b.0).then(b.1.cmp(&a.1)))
+        else {
             continue;
         };
         let best_corner = &to.corners[best.1];
         let same_rad = SAME_CORNER_TEXELS * to.texel_rad(best_corner);
         let is_distinct = |other: &Corner| (other.ray - best_corner.ray).norm() > same_rad;
-        let second = candidates.iter().filter(|(_, other)| is_distinct(&to.corners[*other]));
-        let second = second.map(|(correlation, _)| *correlation).fold(-1.0f32, f32::max);
+        let second = candidates
+            .iter()
+            .filter(|(_, other)| is_distinct(&to.corners[*other]));
+        let second = second
+            .map(|(correlation, _)| *correlation)
+            .fold(-1.0f32, f32::max);
         if best.0 > MIN_CORRELATION && 1.0 - best.0 < MAX_RATIO * (1.0 - second) {
             best_of_from[ix] = Some(best.1);
         }
     }
     let mutual = |(ix, best): (usize, &Option<usize>)| {
         let other = (*best)?;
-        let (one, other) = (best_of_to[other].1 == ix).then_some((&from.corners[ix], &to.corners[other]))?;
+        let (one, other) =
+            (best_of_to[other].1 == ix).then_some((&from.corners[ix], &to.corners[other]))?;
         let texel_rad = from.texel_rad(one).max(to.texel_rad(other));
-        Some(Match { corners: [*one, *other], texel_rad })
+        Some(Match {
+            corners: [*one, *other],
+            texel_rad,
+        })
     };
     best_of_from.iter().enumerate().filter_map(mutual).collect()
 }
 
-/// Cosine and sine of the angle from the axes of the second image at a ray to those of the first image.
+/// Cosine and sine of the angle from the axes of the second image at a ray to those of the first
+/// image.
 fn roll(to_from_from: &Matrix3<f64>, ray: &Vector2<f64>) -> Option<[f64; 2]> {
     // The axes of the first image as seen in the second: derivatives of the projection.
     let project = |axis: Vector3<f64>| axis.xy() - ray * axis.z;
-    let (x, y) = (project(to_from_from.column(0).into()), project(to_from_from.column(1).into()));
+    let (x, y) = (
+        project(to_from_from.column(0).into()),
+        project(to_from_from.column(1).into()),
+    );
     let sum = Vector2::new(x.x + y.y, x.y - y.x).try_normalize(1e-6)?;
     Some(sum.into())
 }
 
 /// The area of an image in which the match of a corner is searched.
 struct Band {
-    /// Normal of the epipolar line and its offset: the distance from the line is `normal · ray + offset`.
+    /// Normal of the epipolar line and its offset: the distance from the line is `normal · ray +
+    /// offset`.
     normal: Vector2<f64>,
     offset: f64,
-    /// Where a very distant point appears, and the unit direction in which it moves as it comes nearer.
+    /// Where a very distant point appears, and the unit direction in which it moves as it comes
+    /// nearer.
     from_infinity: Option<(Vector2<f64>, Vector2<f64>)>,
     tolerance_rad: f64,
 }
@@ -115,14 +142,19 @@ impl Band {
             let direction = (translation.xy() - position * translation.z).try_normalize(0.0);
             (position, direction.unwrap_or_default())
         });
-        Self { normal: line.xy() / scale, offset: line.z / scale, from_infinity, tolerance_rad }
+        Self {
+            normal: line.xy() / scale,
+            offset: line.z / scale,
+            from_infinity,
+            tolerance_rad,
+        }
     }
 
     fn contains(&self, ray: &Vector2<f64>) -> bool {
         (self.normal.dot(ray) + self.offset).abs() < self.tolerance_rad
-            && self
-                .from_infinity
-                .is_none_or(|(position, direction)| (ray - position).dot(&direction) > -self.tolerance_rad)
+            && self.from_infinity.is_none_or(|(position, direction)| {
+                (ray - position).dot(&direction) > -self.tolerance_rad
+            })
     }
 }
 

@@ -1,10 +1,12 @@
-//! Estimates extrinsics, time offsets and lenses of cameras from color images alone: corners are matched between images,
-//! and each match must lie near its epipolar line, which follows from the poses of the two images.
+//! Estimates extrinsics, time offsets and lenses of cameras from color images alone: corners are
+//! matched between images, and each match must lie near its epipolar line, which follows from the
+//! poses of the two images.
 //!
-//! An error of the extrinsics moves the epipolar lines of image pairs with different relative rotations differently, and
-//! a time offset those of images with different velocities, so both are observable without knowing any depth. The search
-//! for matches uses the approximately known poses: it is limited to a band around the epipolar line, and patches are
-//! rotated by the relative rotation of the images. Matches are searched again in a narrower band after each estimate.
+//! An error of the extrinsics moves the epipolar lines of image pairs with different relative
+//! rotations differently, and a time offset those of images with different velocities, so both are
+//! observable without knowing any depth. The search for matches uses the approximately known poses:
+//! it is limited to a band around the epipolar line, and patches are rotated by the relative
+//! rotation of the images. Matches are searched again in a narrower band after each estimate.
 
 mod epipolar;
 mod feature_image;
@@ -33,8 +35,8 @@ use rayon::prelude::*;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
-/// Typical errors relative to those of registration: registration starts from an approximate calibration, but without
-/// depth, transforms are often measured by hand.
+/// Typical errors relative to those of registration: registration starts from an approximate
+/// calibration, but without depth, transforms are often measured by hand.
 const SCALE: f64 = 2.0;
 
 /// Cameras with fewer training and validation images keep the given extrinsics.
@@ -56,24 +58,46 @@ struct Round {
     n_partners: usize,
 }
 
-/// Rounds of matching. A few pairs are enough for the coarse ones. The last one is repeated, because matches near the
-/// edge of the band pull the estimate towards its start.
+/// Rounds of matching. A few pairs are enough for the coarse ones. The last one is repeated,
+/// because matches near the edge of the band pull the estimate towards its start.
 const ROUNDS: [Round; 5] = [
-    Round { rotation_rad: 0.105, translation_m: 0.03, n_partners: 4 },
-    Round { rotation_rad: 0.05, translation_m: 0.02, n_partners: 4 },
-    Round { rotation_rad: 0.02, translation_m: 0.01, n_partners: 6 },
+    Round {
+        rotation_rad: 0.105,
+        translation_m: 0.03,
+        n_partners: 4,
+    },
+    Round {
+        rotation_rad: 0.05,
+        translation_m: 0.02,
+        n_partners: 4,
+    },
+    Round {
+        rotation_rad: 0.02,
+        translation_m: 0.01,
+        n_partners: 6,
+    },
     LAST_ROUND,
     LAST_ROUND,
 ];
-const LAST_ROUND: Round = Round { rotation_rad: 0.01, translation_m: 0.004, n_partners: 12 };
+const LAST_ROUND: Round = Round {
+    rotation_rad: 0.01,
+    translation_m: 0.004,
+    n_partners: 12,
+};
 /// Matching for quick trials.
-const QUICK_ROUND: Round = Round { rotation_rad: 0.02, translation_m: 0.01, n_partners: CROSS_VALIDATION_PARTNERS };
-/// The last round is not repeated if it changed the estimate by less than this fraction of the expected error.
+const QUICK_ROUND: Round = Round {
+    rotation_rad: 0.02,
+    translation_m: 0.01,
+    n_partners: CROSS_VALIDATION_PARTNERS,
+};
+/// The last round is not repeated if it changed the estimate by less than this fraction of the
+/// expected error.
 const CLOSE_FRAC: f64 = 0.1;
 /// Number of groups of images for cross-validation, and number of partners of each image.
 const N_FOLDS: usize = 4;
 const CROSS_VALIDATION_PARTNERS: usize = 8;
-/// Largest displacement along the epipolar line, in units of the focal length, for which the search band is wide enough.
+/// Largest displacement along the epipolar line, in units of the focal length, for which the search
+/// band is wide enough.
 const MAX_PARALLAX: f64 = 0.5;
 /// Minimum half width of the band, texels of the finest level.
 const MIN_BAND_TEXELS: f64 = 4.0;
@@ -89,13 +113,15 @@ const ANNEALING: f64 = 0.75;
 const MAX_ITERATIONS: usize = 40;
 /// A step smaller than this number of standard deviations ends a round.
 const CONVERGED_STEP_SIGMAS: f64 = 0.05;
-/// Minimum fraction of the last round's matches within this fraction of the band around the epipolar line. Random
-/// matches are spread evenly over the band.
+/// Minimum fraction of the last round's matches within this fraction of the band around the
+/// epipolar line. Random matches are spread evenly over the band.
 const MIN_INNER_MATCHES: f64 = 0.5;
 const MAX_INNER_FRAC: f64 = 0.25;
 
 /// Parameters that matched features determine.
-const PARAMS: ParamSet = ParamSet::EXTRINSICS.union(ParamSet::TIME_OFFSET).union(ParamSet::LENS);
+const PARAMS: ParamSet = ParamSet::EXTRINSICS
+    .union(ParamSet::TIME_OFFSET)
+    .union(ParamSet::LENS);
 
 /// Images with corners.
 struct FeatureScene {
@@ -103,20 +129,28 @@ struct FeatureScene {
     cameras: Vec<Arc<str>>,
 }
 
-/// Estimates the requested parameters from color; `None` if none of them can be estimated from color, or if too few
-/// images overlap or have corners.
+/// Estimates the requested parameters from color; `None` if none of them can be estimated from
+/// color, or if too few images overlap or have corners.
 ///
-/// Parameters are estimated from training and validation keyframes and evaluated by cross-validation; test keyframes are
-/// not used.
+/// Parameters are estimated from training and validation keyframes and evaluated by
+/// cross-validation; test keyframes are not used.
 pub(super) fn align(keyframes: &[Arc<Keyframe>], choice: &CameraRefinement) -> Option<Alignment> {
     let always = choice.always() & PARAMS;
     let candidates = choice.candidates().iter().map(|set| *set & PARAMS);
-    let sets: Vec<ParamSet> = [always].into_iter().chain(candidates).filter(|set| !set.is_empty()).collect();
+    let sets: Vec<ParamSet> = [always]
+        .into_iter()
+        .chain(candidates)
+        .filter(|set| !set.is_empty())
+        .collect();
     if sets.is_empty() {
         return None;
     }
     let scene = FeatureScene::new(keyframes);
-    let mut kept = CalibrationModel { set: ParamSet::empty(), fit: None, corrections: scene.uncorrected() };
+    let mut kept = CalibrationModel {
+        set: ParamSet::empty(),
+        fit: None,
+        corrections: scene.uncorrected(),
+    };
     let (mut trials, mut unobservable, mut pairs) = (Vec::new(), Vec::new(), None);
     // Matches near the epipolar lines of the kept model.
     let mut kept_matches: Option<Vec<PairMatches>> = None;
@@ -124,10 +158,16 @@ pub(super) fn align(keyframes: &[Arc<Keyframe>], choice: &CameraRefinement) -> O
     for set in sets.into_iter().filter(|set| scene.layout(*set).n() > 0) {
         let has_extrinsics = set.contains(ParamSet::EXTRINSICS);
         if is_optional && !has_extrinsics {
-            let matches = kept_matches.get_or_insert_with(|| scene.matches(&kept.corrections, &QUICK_ROUND));
-            let rejected = scene.quick_trial(set, &kept, matches).filter(|trial| trial.gain_db < MIN_QUICK_GAIN_DB);
+            let matches =
+                kept_matches.get_or_insert_with(|| scene.matches(&kept.corrections, &QUICK_ROUND));
+            let rejected = scene
+                .quick_trial(set, &kept, matches)
+                .filter(|trial| trial.gain_db < MIN_QUICK_GAIN_DB);
             if let Some(trial) = rejected {
-                trials.push(Trial { kept: false, ..trial });
+                trials.push(Trial {
+                    kept: false,
+                    ..trial
+                });
                 continue;
             }
         }
@@ -144,7 +184,11 @@ pub(super) fn align(keyframes: &[Arc<Keyframe>], choice: &CameraRefinement) -> O
         let is_kept = trial.kept || !is_optional;
         if has_extrinsics || (is_kept && variant.set.contains(ParamSet::EXTRINSICS)) {
             let summary = scene.summary(&variant_pairs);
-            unobservable = variant.fit.iter().flat_map(|fit| report::unobservable(&summary, fit)).collect();
+            unobservable = variant
+                .fit
+                .iter()
+                .flat_map(|fit| report::unobservable(&summary, fit))
+                .collect();
         }
         if is_optional {
             scene.reset_insignificant_extrinsics(&mut variant);
@@ -168,7 +212,10 @@ impl FeatureScene {
         let mut ixs_of_camera = BTreeMap::<Arc<str>, Vec<usize>>::new();
         for (ix, keyframe) in keyframes.iter().enumerate() {
             if keyframe.split != Split::Test {
-                ixs_of_camera.entry(keyframe.camera.clone()).or_default().push(ix);
+                ixs_of_camera
+                    .entry(keyframe.camera.clone())
+                    .or_default()
+                    .push(ix);
             }
         }
         ixs_of_camera.retain(|_, ixs| ixs.len() >= MIN_IMAGES_PER_CAMERA);
@@ -180,8 +227,12 @@ impl FeatureScene {
         let used: BTreeSet<usize> = sampled.collect();
         let used: Vec<_> = used.into_iter().map(|ix| &keyframes[ix]).collect();
         let cameras: Vec<Arc<str>> = ixs_of_camera.into_keys().collect();
-        let camera_of = |keyframe: &Keyframe| cameras.partition_point(|name| *name < keyframe.camera);
-        let images = used.par_iter().map(|keyframe| FeatureImage::new(keyframe, camera_of(keyframe))).collect();
+        let camera_of =
+            |keyframe: &Keyframe| cameras.partition_point(|name| *name < keyframe.camera);
+        let images = used
+            .par_iter()
+            .map(|keyframe| FeatureImage::new(keyframe, camera_of(keyframe)))
+            .collect();
         Self { images, cameras }
     }
 
@@ -190,7 +241,11 @@ impl FeatureScene {
     }
 
     fn layout(&self, set: ParamSet) -> Layout {
-        let images: Vec<_> = self.images.iter().map(|image| (image.camera, &*image.keyframe)).collect();
+        let images: Vec<_> = self
+            .images
+            .iter()
+            .map(|image| (image.camera, &*image.keyframe))
+            .collect();
         Layout::new(set, &images, self.cameras.len())
     }
 
@@ -207,7 +262,9 @@ impl FeatureScene {
 
     /// Cameras of the images with corrections.
     fn moving_cameras(&self, corrections: &Corrections) -> Vec<MovingCamera> {
-        let of_image = |image: &FeatureImage| MovingCamera::new(&image.keyframe, &corrections.by_camera[image.camera]);
+        let of_image = |image: &FeatureImage| {
+            MovingCamera::new(&image.keyframe, &corrections.by_camera[image.camera])
+        };
         self.images.iter().map(of_image).collect()
     }
 
@@ -242,20 +299,33 @@ impl FeatureScene {
                 band_rad,
             })
         };
-        image_pairs::choose(&self.images, &cameras, round.n_partners).into_par_iter().filter_map(of_pair).collect()
+        image_pairs::choose(&self.images, &cameras, round.n_partners)
+            .into_par_iter()
+            .filter_map(of_pair)
+            .collect()
     }
 
-    /// Estimates a set of parameters in rounds of matching, starting from another model. Also returns the pairs of the
-    /// last round. `None` without consistent matches.
-    fn model(&self, set: ParamSet, start: &CalibrationModel) -> Option<(Vec<Pair>, CalibrationModel)> {
+    /// Estimates a set of parameters in rounds of matching, starting from another model. Also
+    /// returns the pairs of the last round. `None` without consistent matches.
+    fn model(
+        &self,
+        set: ParamSet,
+        start: &CalibrationModel,
+    ) -> Option<(Vec<Pair>, CalibrationModel)> {
         let mut corrections = start.corrections.clone();
-        // Once extrinsics are known, or if they are assumed to be known, the coarsest round is not needed.
-        let is_coarse = set.contains(ParamSet::EXTRINSICS) && !start.set.contains(ParamSet::EXTRINSICS);
+        // Once extrinsics are known, or if they are assumed to be known, the coarsest round is not
+        // needed.
+        let is_coarse =
+            set.contains(ParamSet::EXTRINSICS) && !start.set.contains(ParamSet::EXTRINSICS);
         let rounds = if is_coarse { &ROUNDS[..] } else { &ROUNDS[1..] };
         let mut last = None;
         for (ix, round) in rounds.iter().enumerate() {
             // In wide bands, wrong matches disturb the less observable parameters.
-            let layout = self.layout(if ix >= 2 || !is_coarse { set } else { ParamSet::EXTRINSICS });
+            let layout = self.layout(if ix >= 2 || !is_coarse {
+                set
+            } else {
+                ParamSet::EXTRINSICS
+            });
             if layout.n() == 0 {
                 return None;
             }
@@ -265,7 +335,8 @@ impl FeatureScene {
             }
             let fit = self.fit(&matches, &layout, &corrections)?;
             let [change_rad, change_m] = self.largest_difference(&fit.corrections, &corrections);
-            let is_close = change_rad < CLOSE_FRAC * round.rotation_rad && change_m < CLOSE_FRAC * round.translation_m;
+            let is_close = change_rad < CLOSE_FRAC * round.rotation_rad
+                && change_m < CLOSE_FRAC * round.translation_m;
             corrections = fit.corrections.clone();
             last = Some((matches, fit));
             if ix + 2 == rounds.len() && is_close {
@@ -274,15 +345,29 @@ impl FeatureScene {
         }
         let (matches, fit) = last?;
         let cameras = self.moving_cameras(&corrections);
-        let is_inner = |pair: &PairMatches, distance: &f64| distance.abs() < MAX_INNER_FRAC * pair.band_rad;
+        let is_inner =
+            |pair: &PairMatches, distance: &f64| distance.abs() < MAX_INNER_FRAC * pair.band_rad;
         let of_pair = |pair: &PairMatches| {
             let distances = pair.distances_rad(&cameras);
-            (distances.iter().filter(|distance| is_inner(pair, distance)).count(), distances.len())
+            (
+                distances
+                    .iter()
+                    .filter(|distance| is_inner(pair, distance))
+                    .count(),
+                distances.len(),
+            )
         };
-        let (n_inner, n) = matches.iter().map(of_pair).fold((0, 0), |all, pair| (all.0 + pair.0, all.1 + pair.1));
+        let (n_inner, n) = matches
+            .iter()
+            .map(of_pair)
+            .fold((0, 0), |all, pair| (all.0 + pair.0, all.1 + pair.1));
         log::debug!("features: {n_inner} of {n} matches are consistent");
         let is_consistent = n_inner as f64 > MIN_INNER_MATCHES * n as f64;
-        let model = CalibrationModel { set, fit: Some(fit), corrections };
+        let model = CalibrationModel {
+            set,
+            fit: Some(fit),
+            corrections,
+        };
         is_consistent.then(|| (matches.iter().map(|pair| pair.pair).collect(), model))
     }
 
@@ -294,19 +379,31 @@ impl FeatureScene {
         let mut last = None;
         for _ in 0..MAX_ITERATIONS {
             let cameras = self.moving_cameras(&corrections);
-            let mut distances: Vec<f64> = matches.iter().flat_map(|pair| pair.distances_texels(&cameras)).collect();
-            distances.iter_mut().for_each(|distance| *distance = distance.abs());
+            let mut distances: Vec<f64> = matches
+                .iter()
+                .flat_map(|pair| pair.distances_texels(&cameras))
+                .collect();
+            distances
+                .iter_mut()
+                .for_each(|distance| *distance = distance.abs());
             let measured = 1.4826 * quantile(&mut distances, 0.5, Rank::Upper)?;
             let target = measured.clamp(MIN_NOISE_TEXELS, MAX_NOISE_TEXELS);
-            let noise_texels = assumed_noise.map_or(measured, |assumed| ANNEALING * assumed).max(target);
+            let noise_texels = assumed_noise
+                .map_or(measured, |assumed| ANNEALING * assumed)
+                .max(target);
             assumed_noise = Some(noise_texels);
-            let sums: Vec<_> = matches.par_iter().map(|pair| pair.sums(&cameras, layout, noise_texels)).collect();
+            let sums: Vec<_> = matches
+                .par_iter()
+                .map(|pair| pair.sums(&cameras, layout, noise_texels))
+                .collect();
             let scales = layout.params.iter().map(|param| SCALE * param.scale());
             let values = layout.params.iter().map(|param| corrections.value(*param));
-            let [scales, values] = [scales.collect::<Vec<f64>>(), values.collect()].map(DVector::from);
+            let [scales, values] =
+                [scales.collect::<Vec<f64>>(), values.collect()].map(DVector::from);
             let solution = Solution::new(scales, &values, &pairs, &sums);
             corrections.apply_step(layout, &solution.step);
-            let is_converged = noise_texels <= target && solution.step_in_sigmas() < CONVERGED_STEP_SIGMAS;
+            let is_converged =
+                noise_texels <= target && solution.step_in_sigmas() < CONVERGED_STEP_SIGMAS;
             log::debug!(
                 "features: {} matches, noise {noise_texels:.2} texels, step of {:.2} sigma",
                 distances.len(),
@@ -317,20 +414,32 @@ impl FeatureScene {
                 break;
             }
         }
-        Some(Fit { corrections, layout: layout.clone(), solution: last?, noise: INITIAL_NOISE })
+        Some(Fit {
+            corrections,
+            layout: layout.clone(),
+            solution: last?,
+            noise: INITIAL_NOISE,
+        })
     }
 
     /// Largest difference of an image with two corrections; see [`MovingCamera::difference`].
     fn largest_difference(&self, one: &Corrections, other: &Corrections) -> [f64; 2] {
-        let both = self.moving_cameras(one).into_iter().zip(self.moving_cameras(other));
+        let both = self
+            .moving_cameras(one)
+            .into_iter()
+            .zip(self.moving_cameras(other));
         let differences = both.map(|(one, other)| one.difference(&other));
-        differences.fold([0.0; 2], |largest, difference| [0, 1].map(|ix| largest[ix].max(difference[ix])))
+        differences.fold([0.0; 2], |largest, difference| {
+            [0, 1].map(|ix| largest[ix].max(difference[ix]))
+        })
     }
 
     /// Restores the given extrinsics of cameras whose estimate is not significant.
     fn reset_insignificant_extrinsics(&self, model: &mut CalibrationModel) {
         for camera in 0..self.cameras.len() {
-            if model.set.contains(ParamSet::EXTRINSICS) && !model.has_significant(&Layout::extrinsics_of(camera)) {
+            if model.set.contains(ParamSet::EXTRINSICS)
+                && !model.has_significant(&Layout::extrinsics_of(camera))
+            {
                 let correction = &mut model.corrections.by_camera[camera];
                 (correction.rotation_rad, correction.translation_m) = ([0.0; 3], [0.0; 3]);
             }
@@ -349,9 +458,14 @@ impl FeatureScene {
     }
 
     /// Matches for comparing two models.
-    fn validation_matches(&self, baseline: &CalibrationModel, variant: &CalibrationModel) -> Vec<PairMatches> {
+    fn validation_matches(
+        &self,
+        baseline: &CalibrationModel,
+        variant: &CalibrationModel,
+    ) -> Vec<PairMatches> {
         // The band around the epipolar lines of the baseline also contains those of the variant.
-        let [change_rad, change_m] = self.largest_difference(&baseline.corrections, &variant.corrections);
+        let [change_rad, change_m] =
+            self.largest_difference(&baseline.corrections, &variant.corrections);
         let round = Round {
             rotation_rad: LAST_ROUND.rotation_rad + change_rad,
             translation_m: LAST_ROUND.translation_m + change_m,
@@ -360,18 +474,30 @@ impl FeatureScene {
         self.matches(&baseline.corrections, &round)
     }
 
-    /// Evaluates a set of parameters with given matches. This is faster than searching for new ones, but underestimates
-    /// the gain.
-    fn quick_trial(&self, set: ParamSet, baseline: &CalibrationModel, matches: &[PairMatches]) -> Option<Trial> {
+    /// Evaluates a set of parameters with given matches. This is faster than searching for new
+    /// ones, but underestimates the gain.
+    fn quick_trial(
+        &self,
+        set: ParamSet,
+        baseline: &CalibrationModel,
+        matches: &[PairMatches],
+    ) -> Option<Trial> {
         let layout = self.layout(baseline.set | set);
-        let fit = self.fit(matches, &layout, &baseline.corrections).filter(|_| matches.len() >= MIN_PAIRS)?;
+        let fit = self
+            .fit(matches, &layout, &baseline.corrections)
+            .filter(|_| matches.len() >= MIN_PAIRS)?;
         let corrections = fit.corrections.clone();
-        let variant = CalibrationModel { set: baseline.set | set, fit: Some(fit), corrections };
+        let variant = CalibrationModel {
+            set: baseline.set | set,
+            fit: Some(fit),
+            corrections,
+        };
         Some(self.cross_validate(set, baseline, &variant, matches))
     }
 
-    /// Evaluates by cross-validation how much closer to their epipolar lines matches are with the variant than with the
-    /// baseline: both are estimated again without one group of images, and applied to the matches of this group.
+    /// Evaluates by cross-validation how much closer to their epipolar lines matches are with the
+    /// variant than with the baseline: both are estimated again without one group of images, and
+    /// applied to the matches of this group.
     fn cross_validate(
         &self,
         set: ParamSet,
@@ -380,30 +506,47 @@ impl FeatureScene {
         matches: &[PairMatches],
     ) -> Trial {
         let folds = self.folds();
-        let [baseline_layout, variant_layout] = [baseline, variant].map(|model| self.layout(model.set));
+        let [baseline_layout, variant_layout] =
+            [baseline, variant].map(|model| self.layout(model.set));
         let of_fold = |fold: usize| {
             let is_held_out = |image: usize| folds[image] == fold;
-            let (tested, used): (Vec<PairMatches>, Vec<PairMatches>) =
-                matches.iter().cloned().partition(|pair| is_held_out(pair.pair.from) || is_held_out(pair.pair.to));
+            let (tested, used): (Vec<PairMatches>, Vec<PairMatches>) = matches
+                .iter()
+                .cloned()
+                .partition(|pair| is_held_out(pair.pair.from) || is_held_out(pair.pair.to));
             let fitted = |layout: &Layout, model: &CalibrationModel| match layout.n() {
                 0 => Some(self.moving_cameras(&model.corrections)),
-                _ => self.fit(&used, layout, &model.corrections).map(|fit| self.moving_cameras(&fit.corrections)),
+                _ => self
+                    .fit(&used, layout, &model.corrections)
+                    .map(|fit| self.moving_cameras(&fit.corrections)),
             };
             let both = fitted(&baseline_layout, baseline).zip(fitted(&variant_layout, variant));
             let gain_db = |image: usize| {
                 let (baseline, variant) = both.as_ref()?;
-                let pairs = tested.iter().filter(|pair| pair.pair.from == image || pair.pair.to == image);
+                let pairs = tested
+                    .iter()
+                    .filter(|pair| pair.pair.from == image || pair.pair.to == image);
                 let gains = pairs.flat_map(|pair| {
-                    let distances = pair.distances_texels(baseline).into_iter().zip(pair.distances_texels(variant));
-                    distances
-                        .map(|(before, after)| 20.0 * (NOISE_TEXELS.hypot(before) / NOISE_TEXELS.hypot(after)).log10())
+                    let distances = pair
+                        .distances_texels(baseline)
+                        .into_iter()
+                        .zip(pair.distances_texels(variant));
+                    distances.map(|(before, after)| {
+                        20.0 * (NOISE_TEXELS.hypot(before) / NOISE_TEXELS.hypot(after)).log10()
+                    })
                 });
                 let gains: Vec<f64> = gains.collect();
                 (!gains.is_empty()).then(|| gains.iter().sum::<f64>() / gains.len() as f64)
             };
-            (0..self.images.len()).filter(|image| is_held_out(*image)).filter_map(gain_db).collect::<Vec<f64>>()
+            (0..self.images.len())
+                .filter(|image| is_held_out(*image))
+                .filter_map(gain_db)
+                .collect::<Vec<f64>>()
         };
-        let gains_db: Vec<f64> = (0..N_FOLDS).into_par_iter().flat_map_iter(of_fold).collect();
+        let gains_db: Vec<f64> = (0..N_FOLDS)
+            .into_par_iter()
+            .flat_map_iter(of_fold)
+            .collect();
         log::debug!("features: {set}: gains {gains_db:.2?} dB");
         Trial::of_gains(Candidate::Cameras(set), &gains_db).with_enough_images()
     }

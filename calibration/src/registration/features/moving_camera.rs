@@ -24,9 +24,11 @@ pub(super) struct MovingCamera {
 /// Ray of a corner, and position of the camera at the readout of its row.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Sighting {
-    /// Direction of the corner in the axes that the camera has at mid-exposure: x and y at a depth of 1.
+    /// Direction of the corner in the axes that the camera has at mid-exposure: x and y at a depth
+    /// of 1.
     pub(super) ray: Vector2<f64>,
-    /// Position of the camera when it read out the corner's row, in its frame at mid-exposure, meters.
+    /// Position of the camera when it read out the corner's row, in its frame at mid-exposure,
+    /// meters.
     pub(super) center_m: Vector3<f64>,
 }
 
@@ -47,28 +49,39 @@ impl MovingCamera {
     /// Where the camera saw a corner, to first order in the motion during readout.
     pub(super) fn sighting(&self, corner: &Corner) -> Sighting {
         let secs = self.readout_secs * corner.row_share;
-        let plane = [0, 1].map(|axis| (corner.px[axis] - self.principal_px[axis]) / self.focal_px[axis]);
+        let plane =
+            [0, 1].map(|axis| (corner.px[axis] - self.principal_px[axis]) / self.focal_px[axis]);
         let ray = Vector3::new(plane[0], plane[1], 1.0);
         let turned = ray + secs * self.twist.angular_rad_s.cross(&ray);
-        Sighting { ray: turned.xy() / turned.z, center_m: secs * self.twist.linear_m_s }
+        Sighting {
+            ray: turned.xy() / turned.z,
+            center_m: secs * self.twist.linear_m_s,
+        }
     }
 
     /// Motion of the camera per unit of each parameter; see [`CameraParamOffsets::motions`].
     ///
     /// [`CameraParamOffsets::motions`]: crate::registration::layout::CameraParamOffsets::motions
-    pub(super) fn motions(&self, layout: &Layout, camera: usize) -> Vec<(usize, Vector3<f64>, Vector3<f64>)> {
+    pub(super) fn motions(
+        &self,
+        layout: &Layout,
+        camera: usize,
+    ) -> Vec<(usize, Vector3<f64>, Vector3<f64>)> {
         layout.of_camera(camera).motions(Some(&self.twist))
     }
 
-    /// How much the rays of the image differ from those of the same image with other corrections: an angle, radians,
-    /// and the distance of the camera positions, meters.
+    /// How much the rays of the image differ from those of the same image with other corrections:
+    /// an angle, radians, and the distance of the camera positions, meters.
     pub(super) fn difference(&self, other: &Self) -> [f64; 2] {
         let motion = self.world_from_camera.inverse() * other.world_from_camera;
         let of_lens = |axis: usize| {
             let focal = (self.focal_px[axis] / other.focal_px[axis]).ln().abs();
             focal + (self.principal_px[axis] - other.principal_px[axis]).abs() / self.focal_px[axis]
         };
-        [motion.rotation.angle() + of_lens(0).max(of_lens(1)), motion.translation.vector.norm()]
+        [
+            motion.rotation.angle() + of_lens(0).max(of_lens(1)),
+            motion.translation.vector.norm(),
+        ]
     }
 
     /// Motion of a corner's ray per unit of each parameter of the lens.
@@ -78,7 +91,9 @@ impl MovingCamera {
         camera: usize,
         ray: &Vector2<f64>,
     ) -> [Option<(usize, Vector2<f64>)>; 4] {
-        let Some(lens) = layout.of_camera(camera).lens else { return [None; 4] };
+        let Some(lens) = layout.of_camera(camera).lens else {
+            return [None; 4];
+        };
         let offset = |axis: usize| -self.keyframe_focal_px[axis] / self.focal_px[axis];
         [
             Some((lens, Vector2::new(-ray.x, 0.0))),
@@ -97,8 +112,15 @@ mod tests {
 
     #[test]
     fn sightings_follow_the_motion_of_the_camera() {
-        let scan = capture(&Miscalibration { has_rolling_shutter: true, ..Miscalibration::none() });
-        let keyframe = scan.iter().find(|keyframe| keyframe.twist.is_some_and(|twist| twist.linear_m_s.norm() > 0.1));
+        let scan = capture(&Miscalibration {
+            has_rolling_shutter: true,
+            ..Miscalibration::none()
+        });
+        let keyframe = scan.iter().find(|keyframe| {
+            keyframe
+                .twist
+                .is_some_and(|twist| twist.linear_m_s.norm() > 0.1)
+        });
         let keyframe = keyframe.unwrap();
         let correction = CameraCorrection {
             rotation_rad: [0.02, -0.05, 0.03],
@@ -109,13 +131,21 @@ mod tests {
         let raw_from_corrected = keyframe.world_from_camera.inverse() * camera.world_from_camera;
         for share in [-0.5, 0.2] {
             let ray = Vector2::new(0.3, -0.2);
-            let px = [0, 1].map(|axis| ray[axis] * keyframe.focal_px[axis] + keyframe.principal_px[axis]);
+            let px = [0, 1]
+                .map(|axis| ray[axis] * keyframe.focal_px[axis] + keyframe.principal_px[axis]);
             let sighting = camera.sighting(&Corner::at(px, share));
-            let raw_from_moved_raw = transform::exp(&keyframe.twist.unwrap(), share * keyframe.readout_secs);
+            let raw_from_moved_raw =
+                transform::exp(&keyframe.twist.unwrap(), share * keyframe.readout_secs);
             let moved = raw_from_corrected.inverse() * raw_from_moved_raw * raw_from_corrected;
             let turned = moved.rotation * ray.push(1.0);
-            assert!((sighting.ray - turned.xy() / turned.z).norm() < 1e-5, "{share}");
-            assert!((sighting.center_m - moved.translation.vector).norm() < 1e-5, "{share}");
+            assert!(
+                (sighting.ray - turned.xy() / turned.z).norm() < 1e-5,
+                "{share}"
+            );
+            assert!(
+                (sighting.center_m - moved.translation.vector).norm() < 1e-5,
+                "{share}"
+            );
         }
     }
 }

@@ -1,51 +1,120 @@
 //! CiA 402: the drive profile of CANopen, with its state machine and objects.
 //!
-//! Source: CiA 402-2 (IEC 61800-7-201) section "Controlling the power drive system": figure of the states, tables of
-//! controlword (`0x6040`), statusword (`0x6041`) and modes (`0x6060`); the same masks in
-//! `ros-industrial/ros_canopen`. Positions, velocities and torques are in units that each drive defines: [`Units`].
+//! Source: CiA 402-2 (IEC 61800-7-201) section "Controlling the power drive system": figure of the
+//! states, tables of controlword (`0x6040`), statusword (`0x6041`) and modes (`0x6060`); the same
+//! masks in `ros-industrial/ros_canopen`. Positions, velocities and torques are in units that each
+//! drive defines: [`Units`].
 
 use crate::wire::can::CanError;
 use crate::wire::can::canopen::Object;
 use std::f64::consts::TAU;
 
-/// Reaction of the drive to a missing host heartbeat: 0 nothing, 1 fault, 2 disable voltage, 3 quick stop.
-pub const ABORT_CONNECTION: Object = Object { index: 0x6007, subindex: 0, n_bytes: 2 };
-/// Behavior at a quick stop: 0 releases, 1 to 3 stop and release, 5 to 7 stop and stay stopped. See [`STAY_STOPPED`].
-pub const QUICK_STOP_OPTION: Object = Object { index: 0x605A, subindex: 0, n_bytes: 2 };
-/// Value of [`QUICK_STOP_OPTION`]: slow down on the quick-stop ramp and stay in [`State::QuickStopActive`].
+/// Reaction of the drive to a missing host heartbeat: 0 nothing, 1 fault, 2 disable voltage, 3
+/// quick stop.
+pub const ABORT_CONNECTION: Object = Object {
+    index: 0x6007,
+    subindex: 0,
+    n_bytes: 2,
+};
+/// Behavior at a quick stop: 0 releases, 1 to 3 stop and release, 5 to 7 stop and stay stopped. See
+/// [`STAY_STOPPED`].
+pub const QUICK_STOP_OPTION: Object = Object {
+    index: 0x605A,
+    subindex: 0,
+    n_bytes: 2,
+};
+/// Value of [`QUICK_STOP_OPTION`]: slow down on the quick-stop ramp and stay in
+/// [`State::QuickStopActive`].
 pub const STAY_STOPPED: i64 = 6;
 /// Value of [`ABORT_CONNECTION`]: react as to [`StateCommand::DisableVoltage`].
 pub const ABORT_BY_DISABLING: i64 = 2;
 /// Value of [`ABORT_CONNECTION`]: react as to [`StateCommand::QuickStop`].
 pub const ABORT_BY_QUICK_STOP: i64 = 3;
 /// Supported modes, one bit each: [`Mode`] `n` is bit `n - 1`.
-pub const SUPPORTED_MODES: Object = Object { index: 0x6502, subindex: 0, n_bytes: 4 };
-/// Interval of targets in a cyclic mode, in units of ten to the power of [`INTERPOLATION_EXPONENT`] seconds.
-pub const INTERPOLATION_PERIOD: Object = Object { index: 0x60C2, subindex: 1, n_bytes: 1 };
+pub const SUPPORTED_MODES: Object = Object {
+    index: 0x6502,
+    subindex: 0,
+    n_bytes: 4,
+};
+/// Interval of targets in a cyclic mode, in units of ten to the power of [`INTERPOLATION_EXPONENT`]
+/// seconds.
+pub const INTERPOLATION_PERIOD: Object = Object {
+    index: 0x60C2,
+    subindex: 1,
+    n_bytes: 1,
+};
 /// See [`INTERPOLATION_PERIOD`]; -3 is milliseconds.
-pub const INTERPOLATION_EXPONENT: Object = Object { index: 0x60C2, subindex: 2, n_bytes: 1 };
+pub const INTERPOLATION_EXPONENT: Object = Object {
+    index: 0x60C2,
+    subindex: 2,
+    n_bytes: 1,
+};
 /// State commands, see [`StateCommand::controlword`].
-pub const CONTROLWORD: Object = Object { index: 0x6040, subindex: 0, n_bytes: 2 };
+pub const CONTROLWORD: Object = Object {
+    index: 0x6040,
+    subindex: 0,
+    n_bytes: 2,
+};
 /// State, see [`State::from_statusword`].
-pub const STATUSWORD: Object = Object { index: 0x6041, subindex: 0, n_bytes: 2 };
+pub const STATUSWORD: Object = Object {
+    index: 0x6041,
+    subindex: 0,
+    n_bytes: 2,
+};
 /// Requested mode, see [`Mode`].
-pub const MODE: Object = Object { index: 0x6060, subindex: 0, n_bytes: 1 };
+pub const MODE: Object = Object {
+    index: 0x6060,
+    subindex: 0,
+    n_bytes: 1,
+};
 /// Active mode.
-pub const MODE_DISPLAY: Object = Object { index: 0x6061, subindex: 0, n_bytes: 1 };
+pub const MODE_DISPLAY: Object = Object {
+    index: 0x6061,
+    subindex: 0,
+    n_bytes: 1,
+};
 /// Measured position, signed counts.
-pub const POSITION: Object = Object { index: 0x6064, subindex: 0, n_bytes: 4 };
+pub const POSITION: Object = Object {
+    index: 0x6064,
+    subindex: 0,
+    n_bytes: 4,
+};
 /// Measured velocity, signed counts per second.
-pub const VELOCITY: Object = Object { index: 0x606C, subindex: 0, n_bytes: 4 };
+pub const VELOCITY: Object = Object {
+    index: 0x606C,
+    subindex: 0,
+    n_bytes: 4,
+};
 /// Target torque, signed thousandths of the rated torque.
-pub const TARGET_TORQUE: Object = Object { index: 0x6071, subindex: 0, n_bytes: 2 };
+pub const TARGET_TORQUE: Object = Object {
+    index: 0x6071,
+    subindex: 0,
+    n_bytes: 2,
+};
 /// Rated torque, mN m.
-pub const RATED_TORQUE: Object = Object { index: 0x6076, subindex: 0, n_bytes: 4 };
+pub const RATED_TORQUE: Object = Object {
+    index: 0x6076,
+    subindex: 0,
+    n_bytes: 4,
+};
 /// Measured torque, signed thousandths of the rated torque.
-pub const TORQUE: Object = Object { index: 0x6077, subindex: 0, n_bytes: 2 };
+pub const TORQUE: Object = Object {
+    index: 0x6077,
+    subindex: 0,
+    n_bytes: 2,
+};
 /// Target position, signed counts.
-pub const TARGET_POSITION: Object = Object { index: 0x607A, subindex: 0, n_bytes: 4 };
+pub const TARGET_POSITION: Object = Object {
+    index: 0x607A,
+    subindex: 0,
+    n_bytes: 4,
+};
 /// Target velocity, signed counts per second.
-pub const TARGET_VELOCITY: Object = Object { index: 0x60FF, subindex: 0, n_bytes: 4 };
+pub const TARGET_VELOCITY: Object = Object {
+    index: 0x60FF,
+    subindex: 0,
+    n_bytes: 4,
+};
 
 /// Mode of operation, which determines the meaning of the targets.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -103,8 +172,8 @@ pub enum StateCommand {
     DisableVoltage,
     /// To [`State::QuickStopActive`].
     QuickStop,
-    /// From [`State::Fault`] to [`State::SwitchOnDisabled`]. It takes effect on the rising edge of bit 7, so another
-    /// command must precede it.
+    /// From [`State::Fault`] to [`State::SwitchOnDisabled`]. It takes effect on the rising edge of
+    /// bit 7, so another command must precede it.
     ResetFault,
 }
 
@@ -142,12 +211,15 @@ impl State {
             (0x07, false) => Ok(Self::QuickStopActive),
             (0x0F, _) => Ok(Self::FaultReactionActive),
             (0x08, _) => Ok(Self::Fault),
-            _ => Err(CanError::Undefined { field: "the state in the statusword", raw: statusword.into() }),
+            _ => Err(CanError::Undefined {
+                field: "the state in the statusword",
+                raw: statusword.into(),
+            }),
         }
     }
 
-    /// The command that advances a drive by one state towards enabled; `None` if the drive is enabled, or makes the
-    /// next transition automatically.
+    /// The command that advances a drive by one state towards enabled; `None` if the drive is
+    /// enabled, or makes the next transition automatically.
     ///
     /// A fault is reset only if `may_reset_fault` is set, because its cause may persist.
     pub fn next_enabling_command(self, may_reset_fault: bool) -> Option<StateCommand> {
@@ -157,7 +229,10 @@ impl State {
             Self::SwitchedOn => Some(StateCommand::EnableOperation),
             Self::QuickStopActive => Some(StateCommand::DisableVoltage),
             Self::Fault if may_reset_fault => Some(StateCommand::ResetFault),
-            Self::Fault | Self::NotReadyToSwitchOn | Self::FaultReactionActive | Self::OperationEnabled => None,
+            Self::Fault
+            | Self::NotReadyToSwitchOn
+            | Self::FaultReactionActive
+            | Self::OperationEnabled => None,
         }
     }
 
@@ -166,17 +241,25 @@ impl State {
     /// Automatic transitions of the drive (0, 1, automatic 12, 13, 14) are not commands.
     pub fn after(self, state_command: StateCommand) -> Self {
         match (self, state_command) {
-            (Self::SwitchOnDisabled | Self::SwitchedOn | Self::OperationEnabled, StateCommand::Shutdown) => {
-                Self::ReadyToSwitchOn
+            (
+                Self::SwitchOnDisabled | Self::SwitchedOn | Self::OperationEnabled,
+                StateCommand::Shutdown,
+            ) => Self::ReadyToSwitchOn,
+            (Self::ReadyToSwitchOn, StateCommand::SwitchOn | StateCommand::DisableOperation) => {
+                Self::SwitchedOn
             }
-            (Self::ReadyToSwitchOn, StateCommand::SwitchOn | StateCommand::DisableOperation) => Self::SwitchedOn,
-            (Self::OperationEnabled, StateCommand::SwitchOn | StateCommand::DisableOperation) => Self::SwitchedOn,
+            (Self::OperationEnabled, StateCommand::SwitchOn | StateCommand::DisableOperation) => {
+                Self::SwitchedOn
+            }
             (Self::SwitchedOn, StateCommand::EnableOperation) => Self::OperationEnabled,
             (Self::OperationEnabled, StateCommand::QuickStop) => Self::QuickStopActive,
-            (Self::ReadyToSwitchOn | Self::SwitchedOn, StateCommand::QuickStop | StateCommand::DisableVoltage) => {
+            (
+                Self::ReadyToSwitchOn | Self::SwitchedOn,
+                StateCommand::QuickStop | StateCommand::DisableVoltage,
+            ) => Self::SwitchOnDisabled,
+            (Self::OperationEnabled | Self::QuickStopActive, StateCommand::DisableVoltage) => {
                 Self::SwitchOnDisabled
             }
-            (Self::OperationEnabled | Self::QuickStopActive, StateCommand::DisableVoltage) => Self::SwitchOnDisabled,
             (Self::Fault, StateCommand::ResetFault) => Self::SwitchOnDisabled,
             (state, _) => state,
         }
@@ -200,7 +283,8 @@ impl State {
 /// Units of a drive's raw values, from its objects or the rig file.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Units {
-    /// Counts of [`POSITION`] per turn of the output shaft, and of [`VELOCITY`] per turn per second.
+    /// Counts of [`POSITION`] per turn of the output shaft, and of [`VELOCITY`] per turn per
+    /// second.
     pub counts_per_turn: f64,
     /// Torque of 1000 counts of [`TORQUE`], N m at the output shaft.
     pub rated_torque_nm: f64,
@@ -215,7 +299,8 @@ impl Units {
     /// Converts to the nearest count.
     ///
     /// # Errors
-    /// If the count does not fit into 32 bits. Positions are not clamped, because that would change the target.
+    /// If the count does not fit into 32 bits. Positions are not clamped, because that would change
+    /// the target.
     pub fn raw_from_rad(&self, field: &'static str, value: f64) -> Result<i32, CanError> {
         let count = (value * self.counts_per_turn / TAU).round();
         let range = (f64::from(i32::MIN), f64::from(i32::MAX));
@@ -234,16 +319,36 @@ impl Units {
     pub fn raw_from_nm(&self, value: f64) -> Result<i16, CanError> {
         let count = (value * 1000.0 / self.rated_torque_nm).round();
         let range = (f64::from(i16::MIN), f64::from(i16::MAX));
-        let raw = checked_count("the torque", count, range, value, self.rated_torque_nm / 1000.0)?;
+        let raw = checked_count(
+            "the torque",
+            count,
+            range,
+            value,
+            self.rated_torque_nm / 1000.0,
+        )?;
         Ok(i16::try_from(raw).expect("the count was checked to fit into 16 bits"))
     }
 }
 
-#[expect(clippy::cast_possible_truncation, reason = "within the range, which fits into 32 bits")]
-fn checked_count(field: &'static str, count: f64, range: (f64, f64), value: f64, unit: f64) -> Result<i32, CanError> {
+#[expect(
+    clippy::cast_possible_truncation,
+    reason = "within the range, which fits into 32 bits"
+)]
+fn checked_count(
+    field: &'static str,
+    count: f64,
+    range: (f64, f64),
+    value: f64,
+    unit: f64,
+) -> Result<i32, CanError> {
     match (range.0..=range.1).contains(&count) {
         true => Ok(count as i32),
-        false => Err(CanError::Range { field, value, lower: range.0 * unit, upper: range.1 * unit }),
+        false => Err(CanError::Range {
+            field,
+            value,
+            lower: range.0 * unit,
+            upper: range.1 * unit,
+        }),
     }
 }
 
@@ -266,7 +371,8 @@ mod tests {
 
     #[test]
     fn statuswords_match_standard() {
-        // Bit patterns like xxxx xxxx x0xx 0000, with x as 0 and 1; the last two are from drives in the field.
+        // Bit patterns like xxxx xxxx x0xx 0000, with x as 0 and 1; the last two are from drives in
+        // the field.
         for (statusword, state) in [
             (0x0000, State::NotReadyToSwitchOn),
             (0xFFB0, State::NotReadyToSwitchOn),
@@ -285,12 +391,18 @@ mod tests {
             (0x0250, State::SwitchOnDisabled),
             (0x1637, State::OperationEnabled),
         ] {
-            assert_eq!(State::from_statusword(statusword), Ok(state), "{statusword:#06x}");
+            assert_eq!(
+                State::from_statusword(statusword),
+                Ok(state),
+                "{statusword:#06x}"
+            );
         }
         for state in ALL {
             assert_eq!(State::from_statusword(state.statusword()), Ok(state));
         }
-        let n_defined = (0..=u16::MAX).filter(|word| State::from_statusword(*word).is_ok()).count();
+        let n_defined = (0..=u16::MAX)
+            .filter(|word| State::from_statusword(*word).is_ok())
+            .count();
         // Of the 64 values of bits 0 to 3, 5 and 6: four states ignore bit 5, four do not.
         assert_eq!(n_defined, (4 * 2 + 4) * 65_536 / 64);
         assert!(State::from_statusword(0x0003).is_err() && State::from_statusword(0x0067).is_err());
@@ -302,23 +414,44 @@ mod tests {
             let mut state = start;
             let mut n_commands = 0;
             while let Some(state_command) = state.next_enabling_command(true) {
-                assert_ne!(state.after(state_command), state, "{state:?} {state_command:?}");
+                assert_ne!(
+                    state.after(state_command),
+                    state,
+                    "{state:?} {state_command:?}"
+                );
                 state = state.after(state_command);
                 n_commands += 1;
                 assert!(n_commands <= 4, "{start:?}");
             }
-            let waits_for_drive = matches!(start, State::NotReadyToSwitchOn | State::FaultReactionActive);
-            assert_eq!(state, if waits_for_drive { start } else { State::OperationEnabled }, "{start:?}");
+            let waits_for_drive = matches!(
+                start,
+                State::NotReadyToSwitchOn | State::FaultReactionActive
+            );
+            assert_eq!(
+                state,
+                if waits_for_drive {
+                    start
+                } else {
+                    State::OperationEnabled
+                },
+                "{start:?}"
+            );
         }
         assert_eq!(State::Fault.next_enabling_command(false), None);
         for state in ALL {
-            let is_powered =
-                matches!(state.after(StateCommand::DisableVoltage), State::SwitchedOn | State::OperationEnabled);
+            let is_powered = matches!(
+                state.after(StateCommand::DisableVoltage),
+                State::SwitchedOn | State::OperationEnabled
+            );
             assert!(!is_powered, "{state:?}");
         }
         let node = Node::new(1).expect("in range");
-        let enable =
-            encode_write(node, CONTROLWORD, StateCommand::EnableOperation.controlword().into()).expect("16 bits");
+        let enable = encode_write(
+            node,
+            CONTROLWORD,
+            StateCommand::EnableOperation.controlword().into(),
+        )
+        .expect("16 bits");
         assert_eq!(enable.data(), [0x2B, 0x40, 0x60, 0, 0x0F, 0, 0, 0]);
         let mode = encode_write(node, MODE, Mode::CyclicPosition as i64).expect("8 bits");
         assert_eq!(mode.data(), [0x2F, 0x60, 0x60, 0, 8, 0, 0, 0]);
@@ -327,19 +460,34 @@ mod tests {
 
     #[test]
     fn counts_round_trip_and_out_of_range_is_rejected() {
-        let units = Units { counts_per_turn: 524_288.0, rated_torque_nm: 2.5 };
+        let units = Units {
+            counts_per_turn: 524_288.0,
+            rated_torque_nm: 2.5,
+        };
         assert_eq!(units.raw_from_rad("the position", TAU), Ok(524_288));
         assert!((units.nm_from_raw(-1000) + 2.5).abs() < 1e-12);
         let mut random = Random::new(31);
         for _ in 0..10_000 {
             let raw = random.bits_32().cast_signed();
-            assert_eq!(units.raw_from_rad("the position", units.rad_from_raw(raw)), Ok(raw));
+            assert_eq!(
+                units.raw_from_rad("the position", units.rad_from_raw(raw)),
+                Ok(raw)
+            );
             let torque = i16::from_le_bytes([random.byte(), random.byte()]);
             assert_eq!(units.raw_from_nm(units.nm_from_raw(torque)), Ok(torque));
         }
         for bad in [1e6, -1e6, f64::NAN, f64::INFINITY] {
-            assert!(matches!(units.raw_from_rad("the position", bad), Err(CanError::Range { .. })), "{bad}");
-            assert!(matches!(units.raw_from_nm(bad), Err(CanError::Range { .. })), "{bad}");
+            assert!(
+                matches!(
+                    units.raw_from_rad("the position", bad),
+                    Err(CanError::Range { .. })
+                ),
+                "{bad}"
+            );
+            assert!(
+                matches!(units.raw_from_nm(bad), Err(CanError::Range { .. })),
+                "{bad}"
+            );
         }
     }
 }

@@ -16,8 +16,8 @@ fn number(index: u16, subindex: u8) -> u32 {
     u32::from(index) << 8 | u32::from(subindex)
 }
 
-/// Decodes the command in a controlword; `None` if its bits form no command. Source: CiA 402-2, table of the
-/// controlword.
+/// Decodes the command in a controlword; `None` if its bits form no command. Source: CiA 402-2,
+/// table of the controlword.
 fn decode_controlword(controlword: u16, before: u16) -> Option<StateCommand> {
     if controlword & !before & 0x80 != 0 {
         return Some(StateCommand::ResetFault);
@@ -70,9 +70,14 @@ impl EmulatedProtocol for EmulatedCia402 {
                 drive.reset_watchdog();
                 Ok(Vec::new())
             }
-            (id, &[low, high, a, b, c, d]) if id == Pdo::First.id(Direction::Receive, node).value() => {
+            (id, &[low, high, a, b, c, d])
+                if id == Pdo::First.id(Direction::Receive, node).value() =>
+            {
                 if self.node_state == NodeState::Operational && self.accepts_targets(drive) {
-                    self.pending_command = Some((u16::from_le_bytes([low, high]), i32::from_le_bytes([a, b, c, d])));
+                    self.pending_command = Some((
+                        u16::from_le_bytes([low, high]),
+                        i32::from_le_bytes([a, b, c, d]),
+                    ));
                 }
                 Ok(Vec::new())
             }
@@ -94,14 +99,20 @@ impl EmulatedProtocol for EmulatedCia402 {
                     }
                     _ => return Ok(Vec::new()),
                 };
-                Ok(vec![Frame::classic(Id::standard(0x580 + u32::from(node.number()))?, &answer)?])
+                Ok(vec![Frame::classic(
+                    Id::standard(0x580 + u32::from(node.number()))?,
+                    &answer,
+                )?])
             }
             _ => Ok(Vec::new()),
         }
     }
 
     fn heartbeat(&self, _drive: &EmulatedDrive) -> Result<Option<Frame>, CanError> {
-        Ok(Some(canopen::encode_heartbeat(self.address.node, self.node_state)))
+        Ok(Some(canopen::encode_heartbeat(
+            self.address.node,
+            self.node_state,
+        )))
     }
 
     fn timeout(&self, drive: &EmulatedDrive) -> Option<Duration> {
@@ -155,18 +166,26 @@ impl EmulatedCia402 {
 
     /// Whether the first PDO delivers controlword and target at every SYNC.
     fn accepts_targets(&self, drive: &EmulatedDrive) -> bool {
-        let mapped = [codec::CONTROLWORD, codec::TARGET_POSITION].map(|object| Some(object.mapped()));
-        let entries = [1, 2].map(|entry| written(drive, Pdo::First.mapping(Direction::Receive, entry)));
+        let mapped =
+            [codec::CONTROLWORD, codec::TARGET_POSITION].map(|object| Some(object.mapped()));
+        let entries =
+            [1, 2].map(|entry| written(drive, Pdo::First.mapping(Direction::Receive, entry)));
         self.is_on(Pdo::First, Direction::Receive, drive) && entries == mapped
     }
 
     fn is_on(&self, pdo: Pdo, direction: Direction, drive: &EmulatedDrive) -> bool {
-        written(drive, pdo.communication(direction, 1)) == Some(pdo.id(direction, self.address.node).value())
+        written(drive, pdo.communication(direction, 1))
+            == Some(pdo.id(direction, self.address.node).value())
             && written(drive, pdo.communication(direction, 2)) == Some(1)
     }
 
     /// Applies a controlword, and a target if the drive is enabled in cyclic position mode.
-    fn state_command(&mut self, controlword: u16, target: Option<Command>, drive: &mut EmulatedDrive) {
+    fn state_command(
+        &mut self,
+        controlword: u16,
+        target: Option<Command>,
+        drive: &mut EmulatedDrive,
+    ) {
         if let Some(state_command) = decode_controlword(controlword, self.last_controlword) {
             self.change_state(self.state.after(state_command), drive);
         }
@@ -186,7 +205,10 @@ impl EmulatedCia402 {
         drive.actuation = match state {
             codec::State::OperationEnabled => {
                 let position_rad = drive.motion().position_rad;
-                Actuation::Follow(Command { position_rad, ..Command::default() })
+                Actuation::Follow(Command {
+                    position_rad,
+                    ..Command::default()
+                })
             }
             codec::State::QuickStopActive => match written(drive, codec::QUICK_STOP_OPTION) {
                 Some(5..=7) => Actuation::Stop,
@@ -203,7 +225,14 @@ impl EmulatedCia402 {
     fn synchronous(&mut self, drive: &mut EmulatedDrive) -> Result<Vec<Frame>, CanError> {
         if let Some((controlword, target)) = self.pending_command.take() {
             let position_rad = self.address.units.rad_from_raw(target);
-            self.state_command(controlword, Some(Command { position_rad, ..Command::default() }), drive);
+            self.state_command(
+                controlword,
+                Some(Command {
+                    position_rad,
+                    ..Command::default()
+                }),
+                drive,
+            );
         }
         let mut sent = Vec::new();
         for pdo in [Pdo::First, Pdo::Second] {

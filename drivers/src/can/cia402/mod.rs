@@ -1,8 +1,9 @@
 //! CiA 402 drives: CANopen nodes that send a PDO with position and velocity on each SYNC.
 //!
-//! Watchdog: consumer heartbeat (`0x1016`) with abort connection option code (`0x6007`): either a quick stop after which
-//! the drive stays stopped (`0x605A` = 6), or voltage off. Source: CiA 301, section 7.5.2.20; CiA 402-2, objects 6007h
-//! and 605Ah. The reaction of the drive to its own faults (`0x605E`) is left unchanged.
+//! Watchdog: consumer heartbeat (`0x1016`) with abort connection option code (`0x6007`): either a
+//! quick stop after which the drive stays stopped (`0x605A` = 6), or voltage off. Source: CiA 301,
+//! section 7.5.2.20; CiA 402-2, objects 6007h and 605Ah. The reaction of the drive to its own
+//! faults (`0x605E`) is left unchanged.
 
 pub mod codec;
 #[cfg(feature = "emulation")]
@@ -15,8 +16,8 @@ mod setup;
 pub use codec::Units;
 
 use super::family::{
-    MotionProtocol, MotorFamily, MotorProtocol, MotorReading, Reports, Traffic, UNLIMITED, frame_of_8_bytes,
-    short_frame,
+    MotionProtocol, MotorFamily, MotorProtocol, MotorReading, Reports, Traffic, UNLIMITED,
+    frame_of_8_bytes, short_frame,
 };
 use super::query::MotorQuery;
 use super::settings::{AllowedValues, MotorKey, MotorSettings, SettingValue};
@@ -58,7 +59,11 @@ impl MotorFamily for Cia402Family {
                 allowed: AllowedValues::Number(1.0..=1e12),
                 required: Some("position counts of the drive per turn of its encoder"),
             },
-            MotorKey { name: RATED_TORQUE_NM, allowed: AllowedValues::Number(0.0..=1e6), required: None },
+            MotorKey {
+                name: RATED_TORQUE_NM,
+                allowed: AllowedValues::Number(0.0..=1e6),
+                required: None,
+            },
         ]
     }
 
@@ -70,7 +75,13 @@ impl MotorFamily for Cia402Family {
         let node = Node::new(u8::try_from(settings.id).ok()?).ok()?;
         let counts_per_turn = settings.number(COUNTS_PER_TURN)?;
         let rated_torque_nm = settings.number(RATED_TORQUE_NM).unwrap_or(0.0);
-        Some(Arc::new(Cia402 { node, units: Units { counts_per_turn, rated_torque_nm } }))
+        Some(Arc::new(Cia402 {
+            node,
+            units: Units {
+                counts_per_turn,
+                rated_torque_nm,
+            },
+        }))
     }
 
     #[cfg(any(test, fuzzing))]
@@ -90,7 +101,10 @@ pub struct Cia402 {
 
 impl Cia402 {
     fn limits(self) -> Limits {
-        Limits { position_rad: self.units.rad_from_raw(i32::MAX), ..UNLIMITED }
+        Limits {
+            position_rad: self.units.rad_from_raw(i32::MAX),
+            ..UNLIMITED
+        }
     }
 }
 
@@ -101,8 +115,14 @@ impl MotorProtocol for Cia402 {
 
     fn settings(&self) -> MotorSettings {
         MotorSettings::new(self.node.number())
-            .with(COUNTS_PER_TURN, SettingValue::Number(self.units.counts_per_turn))
-            .with(RATED_TORQUE_NM, SettingValue::Number(self.units.rated_torque_nm))
+            .with(
+                COUNTS_PER_TURN,
+                SettingValue::Number(self.units.counts_per_turn),
+            )
+            .with(
+                RATED_TORQUE_NM,
+                SettingValue::Number(self.units.rated_torque_nm),
+            )
     }
 
     fn addresses(&self) -> Vec<u32> {
@@ -117,10 +137,12 @@ impl MotorProtocol for Cia402 {
         Some(self.node)
     }
 
-    /// Makes the drive send position and velocity at every SYNC, and starts it. The drive stays disabled.
+    /// Makes the drive send position and velocity at every SYNC, and starts it. The drive stays
+    /// disabled.
     fn set_up(&self, query: &MotorQuery<'_>) -> Result<Limits, Error> {
         let objects = [codec::POSITION, codec::VELOCITY];
-        let mut entries = setup::map_pdo_at_every_sync(Pdo::First, Direction::Transmit, self.node, &objects);
+        let mut entries =
+            setup::map_pdo_at_every_sync(Pdo::First, Direction::Transmit, self.node, &objects);
         entries.push((canopen::PRODUCER_HEARTBEAT, HEARTBEAT_MILLIS));
         setup::start_drive(query, self.node, &entries)?;
         Ok(self.limits())
@@ -131,7 +153,10 @@ impl MotorProtocol for Cia402 {
     }
 
     fn typical_answer(&self) -> (Frame, Option<f64>) {
-        (frame_of_8_bytes(Pdo::First.id(Direction::Transmit, self.node)), None)
+        (
+            frame_of_8_bytes(Pdo::First.id(Direction::Transmit, self.node)),
+            None,
+        )
     }
 
     fn read(&self, frame: &Frame, _limits: &Limits) -> Option<MotorReading> {
@@ -140,13 +165,23 @@ impl MotorProtocol for Cia402 {
         }
         let [a, b, c, d, e, f, g, h] = *<&[u8; 8]>::try_from(frame.data()).ok()?;
         let [position, velocity] = [[a, b, c, d], [e, f, g, h]].map(i32::from_le_bytes);
-        let (position_rad, velocity_rad_s) = (self.units.rad_from_raw(position), self.units.rad_from_raw(velocity));
-        Some(MotorReading { position_rad, velocity_rad_s, torque_nm: None })
+        let (position_rad, velocity_rad_s) = (
+            self.units.rad_from_raw(position),
+            self.units.rad_from_raw(velocity),
+        );
+        Some(MotorReading {
+            position_rad,
+            velocity_rad_s,
+            torque_nm: None,
+        })
     }
 
     /// Frames with target, position and state.
     fn traffic(&self) -> Traffic {
-        Traffic { cycle_frames: vec![short_frame(); 3], unsolicited: vec![] }
+        Traffic {
+            cycle_frames: vec![short_frame(); 3],
+            unsolicited: vec![],
+        }
     }
 
     fn watchdog(&self, _plan: &WatchdogPlan) -> Watchdog {
@@ -154,7 +189,10 @@ impl MotorProtocol for Cia402 {
     }
 
     fn motion(&self, _limits: &Limits) -> Box<dyn MotionProtocol> {
-        Box::new(motion::Cia402Motion { address: *self, state: codec::State::NotReadyToSwitchOn })
+        Box::new(motion::Cia402Motion {
+            address: *self,
+            state: codec::State::NotReadyToSwitchOn,
+        })
     }
 
     #[cfg(feature = "emulation")]

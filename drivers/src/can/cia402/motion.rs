@@ -26,12 +26,17 @@ pub(super) struct Cia402Motion {
 impl Cia402Motion {
     /// Encodes a state command that is sent outside the cycle.
     fn encode(&self, state_command: StateCommand) -> Result<Frame, CanError> {
-        canopen::encode_write(self.address.node, codec::CONTROLWORD, state_command.controlword().into())
+        canopen::encode_write(
+            self.address.node,
+            codec::CONTROLWORD,
+            state_command.controlword().into(),
+        )
     }
 
     /// Decodes the state in the drive's second PDO.
     fn decode_state(&self, frame: &Frame) -> Option<State> {
-        if frame.id() != Pdo::Second.id(Direction::Transmit, self.address.node) || frame.is_remote() {
+        if frame.id() != Pdo::Second.id(Direction::Transmit, self.address.node) || frame.is_remote()
+        {
             return None;
         }
         let statusword = u16::from_le_bytes(<[u8; 2]>::try_from(frame.data()).ok()?);
@@ -60,7 +65,12 @@ impl MotionProtocol for Cia402Motion {
             }
             // A reset takes effect on the rising edge of its bit.
             for state_command in [StateCommand::DisableVoltage, requested] {
-                set(query, node, codec::CONTROLWORD, state_command.controlword().into())?;
+                set(
+                    query,
+                    node,
+                    codec::CONTROLWORD,
+                    state_command.controlword().into(),
+                )?;
             }
         }
     }
@@ -93,21 +103,34 @@ impl MotionProtocol for Cia402Motion {
         let deadline = clock::now() + MAX_CHANGE;
         while get(query, node, codec::MODE_DISPLAY)? != Mode::CyclicPosition as u32 {
             if clock::now() > deadline {
-                return Err(query.fault("the drive does not change to cyclic synchronous position mode"));
+                return Err(
+                    query.fault("the drive does not change to cyclic synchronous position mode")
+                );
             }
         }
-        // For arms with drives, the period is a whole number of milliseconds. A drive that does not interpolate does
-        // not have this object.
+        // For arms with drives, the period is a whole number of milliseconds. A drive that does not
+        // interpolate does not have this object.
         let millis = i64::try_from(plan.period.as_millis()).unwrap_or(i64::MAX);
-        for (object, value) in [(codec::INTERPOLATION_PERIOD, millis), (codec::INTERPOLATION_EXPONENT, -3)] {
+        for (object, value) in [
+            (codec::INTERPOLATION_PERIOD, millis),
+            (codec::INTERPOLATION_EXPONENT, -3),
+        ] {
             match try_set(query, node, object, value)? {
-                Err(CanError::Aborted { code: NO_SUCH_OBJECT, .. }) => break,
+                Err(CanError::Aborted {
+                    code: NO_SUCH_OBJECT,
+                    ..
+                }) => break,
                 result => query.map_error(result)?,
             }
         }
         let targets = [codec::CONTROLWORD, codec::TARGET_POSITION];
         let mut entries = map_pdo_at_every_sync(Pdo::First, Direction::Receive, node, &targets);
-        entries.extend(map_pdo_at_every_sync(Pdo::Second, Direction::Transmit, node, &[codec::STATUSWORD]));
+        entries.extend(map_pdo_at_every_sync(
+            Pdo::Second,
+            Direction::Transmit,
+            node,
+            &[codec::STATUSWORD],
+        ));
         start_drive(query, node, &entries)
     }
 
@@ -116,16 +139,25 @@ impl MotionProtocol for Cia402Motion {
         Ok(Vec::new())
     }
 
-    /// Advances the drive by one state towards enabled, and keeps it there. This does not reset a fault.
+    /// Advances the drive by one state towards enabled, and keeps it there. This does not reset a
+    /// fault.
     fn command(&self, command: &Command) -> Result<Frame, CanError> {
         let state_command = match self.state {
             State::OperationEnabled => StateCommand::EnableOperation,
-            state => state.next_enabling_command(false).unwrap_or(StateCommand::DisableVoltage),
+            state => state
+                .next_enabling_command(false)
+                .unwrap_or(StateCommand::DisableVoltage),
         };
         let [low, high] = state_command.controlword().to_le_bytes();
-        let raw = self.address.units.raw_from_rad("the target position", command.position_rad)?;
+        let raw = self
+            .address
+            .units
+            .raw_from_rad("the target position", command.position_rad)?;
         let [a, b, c, d] = raw.to_le_bytes();
-        Frame::classic(Pdo::First.id(Direction::Receive, self.address.node), &[low, high, a, b, c, d])
+        Frame::classic(
+            Pdo::First.id(Direction::Receive, self.address.node),
+            &[low, high, a, b, c, d],
+        )
     }
 
     fn hold(&self, _command: &Command) -> Result<Frame, CanError> {
@@ -141,7 +173,9 @@ impl MotionProtocol for Cia402Motion {
         Some(match self.state {
             State::OperationEnabled => Health::Enabled,
             State::QuickStopActive => Health::Fault("the drive made a quick stop".to_owned()),
-            State::Fault | State::FaultReactionActive => Health::Fault("the drive reports a fault".to_owned()),
+            State::Fault | State::FaultReactionActive => {
+                Health::Fault("the drive reports a fault".to_owned())
+            }
             _ => Health::Off,
         })
     }

@@ -14,20 +14,34 @@ const PDO_OFF: i64 = 1 << 31;
 /// Reads an object. If it is shorter than the result, the upper bytes are 0.
 pub(super) fn get(query: &MotorQuery<'_>, node: Node, object: Object) -> Result<u32, Error> {
     let answer =
-        query.request_answer(&canopen::encode_read(node, object), |frame| match canopen::decode_sdo(frame) {
-            Ok((from, SdoAnswer::Value { object: reported, raw })) => (from == node
-                && (reported.index, reported.subindex) == (object.index, object.subindex))
-                .then_some(Ok(raw)),
-            Err(error @ (CanError::Aborted { index, .. } | CanError::Segmented { index, .. })) => {
-                (index == object.index).then_some(Err(error))
-            }
-            _ => None,
-        })?;
+        query.request_answer(
+            &canopen::encode_read(node, object),
+            |frame| match canopen::decode_sdo(frame) {
+                Ok((
+                    from,
+                    SdoAnswer::Value {
+                        object: reported,
+                        raw,
+                    },
+                )) => (from == node
+                    && (reported.index, reported.subindex) == (object.index, object.subindex))
+                    .then_some(Ok(raw)),
+                Err(
+                    error @ (CanError::Aborted { index, .. } | CanError::Segmented { index, .. }),
+                ) => (index == object.index).then_some(Err(error)),
+                _ => None,
+            },
+        )?;
     query.map_error(answer)
 }
 
 /// Writes an object and verifies it.
-pub(super) fn set_and_check(query: &MotorQuery<'_>, node: Node, object: Object, value: i64) -> Result<(), Error> {
+pub(super) fn set_and_check(
+    query: &MotorQuery<'_>,
+    node: Node,
+    object: Object,
+    value: i64,
+) -> Result<(), Error> {
     set(query, node, object, value)?;
     let bits = u32::MAX >> (32 - 8 * u32::from(object.n_bytes));
     let reported = get(query, node, object)? & bits;
@@ -41,7 +55,12 @@ pub(super) fn set_and_check(query: &MotorQuery<'_>, node: Node, object: Object, 
 }
 
 /// Writes an object.
-pub(super) fn set(query: &MotorQuery<'_>, node: Node, object: Object, value: i64) -> Result<(), Error> {
+pub(super) fn set(
+    query: &MotorQuery<'_>,
+    node: Node,
+    object: Object,
+    value: i64,
+) -> Result<(), Error> {
     let answer = try_set(query, node, object, value)?;
     query.map_error(answer)
 }
@@ -58,12 +77,15 @@ pub(super) fn try_set(
         Ok((from, SdoAnswer::Written { index, subindex })) => {
             (from == node && (index, subindex) == (object.index, object.subindex)).then_some(Ok(()))
         }
-        Err(error @ CanError::Aborted { index, .. }) => (index == object.index).then_some(Err(error)),
+        Err(error @ CanError::Aborted { index, .. }) => {
+            (index == object.index).then_some(Err(error))
+        }
         _ => None,
     })
 }
 
-/// The entries that map objects into a PDO of a drive, so that the drive sends or accepts the PDO on every SYNC.
+/// The entries that map objects into a PDO of a drive, so that the drive sends or accepts the PDO
+/// on every SYNC.
 ///
 /// Source: CiA 301, section 7.5.2.36: a PDO is disabled while its mapping is changed.
 pub(super) fn map_pdo_at_every_sync(
@@ -73,18 +95,34 @@ pub(super) fn map_pdo_at_every_sync(
     objects: &[Object],
 ) -> Vec<(Object, i64)> {
     let id = i64::from(pdo.id(direction, node).value());
-    let mut entries = vec![(pdo.communication(direction, 1), id | PDO_OFF), (pdo.mapping(direction, 0), 0)];
+    let mut entries = vec![
+        (pdo.communication(direction, 1), id | PDO_OFF),
+        (pdo.mapping(direction, 0), 0),
+    ];
     for (place, object) in (1..).zip(objects) {
         entries.push((pdo.mapping(direction, place), object.mapped().into()));
     }
-    entries.push((pdo.mapping(direction, 0), i64::try_from(objects.len()).expect("at most eight objects")));
-    entries.extend([(pdo.communication(direction, 2), EVERY_SYNC), (pdo.communication(direction, 1), id)]);
+    entries.push((
+        pdo.mapping(direction, 0),
+        i64::try_from(objects.len()).expect("at most eight objects"),
+    ));
+    entries.extend([
+        (pdo.communication(direction, 2), EVERY_SYNC),
+        (pdo.communication(direction, 1), id),
+    ]);
     entries
 }
 
 /// Writes entries while a drive's PDOs are inactive, then starts the PDOs.
-pub(super) fn start_drive(query: &MotorQuery<'_>, node: Node, entries: &[(Object, i64)]) -> Result<(), Error> {
-    query.send(Ok(canopen::encode_nmt(Nmt::EnterPreOperational, Some(node))))?;
+pub(super) fn start_drive(
+    query: &MotorQuery<'_>,
+    node: Node,
+    entries: &[(Object, i64)],
+) -> Result<(), Error> {
+    query.send(Ok(canopen::encode_nmt(
+        Nmt::EnterPreOperational,
+        Some(node),
+    )))?;
     for (object, value) in entries {
         set(query, node, *object, *value)?;
     }
@@ -93,5 +131,7 @@ pub(super) fn start_drive(query: &MotorQuery<'_>, node: Node, entries: &[(Object
         Ok((from, NodeState::Operational)) => (from == node).then_some(()),
         _ => None,
     })?;
-    started.ok_or_else(|| query.fault("the drive was started but did not report the operational state"))
+    started.ok_or_else(|| {
+        query.fault("the drive was started but did not report the operational state")
+    })
 }

@@ -17,7 +17,9 @@ impl EmulatedProtocol for EmulatedDamiao {
     fn take(&mut self, frame: &Frame, drive: &mut EmulatedDrive) -> Result<Vec<Frame>, CanError> {
         let Damiao { motor, feedback } = self.0;
         let answer_id = Id::standard(feedback.into())?;
-        let Ok(bytes) = <[u8; 8]>::try_from(frame.data()) else { return Ok(Vec::new()) };
+        let Ok(bytes) = <[u8; 8]>::try_from(frame.data()) else {
+            return Ok(Vec::new());
+        };
         if frame.id() == Id::standard(0x7FF)? {
             let [low, high, code, register, a, b, c, d] = bytes;
             if u16::from_le_bytes([low, high]) != motor {
@@ -28,9 +30,16 @@ impl EmulatedProtocol for EmulatedDamiao {
                 Frame::classic(answer_id, &[low, high, code, register, a, b, c, d])
             };
             return match code {
-                0x33 => register_value(drive, register).map(|value| reply(value, code)).into_iter().collect(),
+                0x33 => register_value(drive, register)
+                    .map(|value| reply(value, code))
+                    .into_iter()
+                    .collect(),
                 0x55 => {
-                    drive.set(register.into(), u32::from_le_bytes([a, b, c, d]), register == Register::Timeout as u8);
+                    drive.set(
+                        register.into(),
+                        u32::from_le_bytes([a, b, c, d]),
+                        register == Register::Timeout as u8,
+                    );
                     Ok(vec![reply(u32::from_le_bytes([a, b, c, d]), code)?])
                 }
                 0xCC => Ok(vec![self.feedback(answer_id, drive)?]),
@@ -41,7 +50,16 @@ impl EmulatedProtocol for EmulatedDamiao {
             return Ok(Vec::new());
         }
         match bytes {
-            [0xFF, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF, state_command @ 0xFB..=0xFE] => match state_command {
+            [
+                0xFF,
+                0xFF,
+                0xFF,
+                0xFF,
+                0xFF,
+                0xFF,
+                0xFF,
+                state_command @ 0xFB..=0xFE,
+            ] => match state_command {
                 0xFB => drive.faults = 0,
                 0xFC if drive.faults == 0 => drive.switch_on(),
                 0xFD => drive.actuation = Actuation::Free,
@@ -95,13 +113,25 @@ impl EmulatedDamiao {
 fn register_value(drive: &EmulatedDrive, register: u8) -> Option<u32> {
     #[expect(clippy::cast_possible_truncation, reason = "limits are small numbers")]
     let known = [
-        (Register::PositionLimit, (drive.limits.position_rad as f32).to_bits()),
-        (Register::VelocityLimit, (drive.limits.velocity_rad_s as f32).to_bits()),
-        (Register::TorqueLimit, (drive.limits.torque_nm as f32).to_bits()),
+        (
+            Register::PositionLimit,
+            (drive.limits.position_rad as f32).to_bits(),
+        ),
+        (
+            Register::VelocityLimit,
+            (drive.limits.velocity_rad_s as f32).to_bits(),
+        ),
+        (
+            Register::TorqueLimit,
+            (drive.limits.torque_nm as f32).to_bits(),
+        ),
         // Factory settings: no timeout, and a mode other than MIT.
         (Register::Timeout, 0),
         (Register::ControlMode, 2),
     ];
-    let shipped = known.into_iter().find(|(known, _)| *known as u8 == register).map(|(_, value)| value);
+    let shipped = known
+        .into_iter()
+        .find(|(known, _)| *known as u8 == register)
+        .map(|(_, value)| value);
     drive.setting(register.into()).or(shipped)
 }

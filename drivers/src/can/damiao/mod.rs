@@ -1,8 +1,9 @@
-//! Damiao motors. They answer each command and each poll with feedback; the ranges of their raw values are in their
-//! registers.
+//! Damiao motors. They answer each command and each poll with feedback; the ranges of their raw
+//! values are in their registers.
 //!
-//! Watchdog: register `TIMEOUT`; the motor leaves the enabled state and reports "communication lost". Source: Damiao
-//! DM-J4310-2EC manual V1.0, as in `jia-xie/python-damiao-driver` `docs/concept/`.
+//! Watchdog: register `TIMEOUT`; the motor leaves the enabled state and reports "communication
+//! lost". Source: Damiao DM-J4310-2EC manual V1.0, as in `jia-xie/python-damiao-driver`
+//! `docs/concept/`.
 
 pub mod codec;
 #[cfg(feature = "emulation")]
@@ -12,7 +13,8 @@ mod fuzz;
 mod motion;
 
 use super::family::{
-    MotionProtocol, MotorFamily, MotorProtocol, MotorReading, Reports, Traffic, frame_of_8_bytes, short_frame,
+    MotionProtocol, MotorFamily, MotorProtocol, MotorReading, Reports, Traffic, frame_of_8_bytes,
+    short_frame,
 };
 use super::query::MotorQuery;
 use super::settings::{AllowedValues, MotorKey, MotorSettings, SettingValue};
@@ -82,13 +84,17 @@ pub struct Damiao {
 impl Damiao {
     /// Reads a register.
     fn register(self, query: &MotorQuery<'_>, register: Register) -> Result<Value, Error> {
-        let poll_frame = RegisterMessage { motor: self.motor, access: Access::Read(register) };
+        let poll_frame = RegisterMessage {
+            motor: self.motor,
+            access: Access::Read(register),
+        };
         let poll_frame = query.map_error(codec::encode_register(&poll_frame, None))?;
         let answer_id = query.map_error(Id::standard(self.feedback.into()))?;
         query.request_answer(&poll_frame, |frame| match codec::decode_register(frame) {
-            Ok(RegisterMessage { motor: from, access: Access::Reported(reported, value) })
-                if frame.id() == answer_id && from == self.motor && reported == register =>
-            {
+            Ok(RegisterMessage {
+                motor: from,
+                access: Access::Reported(reported, value),
+            }) if frame.id() == answer_id && from == self.motor && reported == register => {
                 Some(value)
             }
             _ => None,
@@ -97,12 +103,16 @@ impl Damiao {
 
     /// The feedback in a frame; `None` if the frame is from another motor or has other content.
     fn feedback(self, frame: &Frame, limits: &Limits) -> Option<codec::Feedback> {
-        let is_from_motor = frame.id() == Id::standard(self.feedback.into()).ok()? && !self.is_register(frame);
-        let feedback = is_from_motor.then(|| codec::decode_feedback(frame, limits).ok()).flatten()?;
+        let is_from_motor =
+            frame.id() == Id::standard(self.feedback.into()).ok()? && !self.is_register(frame);
+        let feedback = is_from_motor
+            .then(|| codec::decode_feedback(frame, limits).ok())
+            .flatten()?;
         (u16::from(feedback.motor_low) == self.motor & 0xF).then_some(feedback)
     }
 
-    /// Whether a frame from the motor is a register answer. A late register answer must not be mistaken for feedback.
+    /// Whether a frame from the motor is a register answer. A late register answer must not be
+    /// mistaken for feedback.
     fn is_register(self, frame: &Frame) -> bool {
         codec::decode_register(frame).is_ok_and(|message| message.motor == self.motor)
     }
@@ -117,7 +127,8 @@ impl MotorProtocol for Damiao {
         MotorSettings::new(self.motor).with(FEEDBACK_ID, SettingValue::Whole(self.feedback.into()))
     }
 
-    /// Returns both IDs, because a motor would mistake answers of another motor with its ID for commands.
+    /// Returns both IDs, because a motor would mistake answers of another motor with its ID for
+    /// commands.
     fn addresses(&self) -> Vec<u32> {
         vec![self.motor.into(), self.feedback.into()]
     }
@@ -129,9 +140,16 @@ impl MotorProtocol for Damiao {
     fn set_up(&self, query: &MotorQuery<'_>) -> Result<Limits, Error> {
         let real = |register| match self.register(query, register)? {
             Value::Float(real) => Ok(real),
-            Value::Integer(_) => Err(query.fault(format!("register {register:?} is not a floating-point number"))),
+            Value::Integer(_) => Err(query.fault(format!(
+                "register {register:?} is not a floating-point number"
+            ))),
         };
-        let [p_max, v_max, t_max] = [Register::PositionLimit, Register::VelocityLimit, Register::TorqueLimit].map(real);
+        let [p_max, v_max, t_max] = [
+            Register::PositionLimit,
+            Register::VelocityLimit,
+            Register::TorqueLimit,
+        ]
+        .map(real);
         let limits = query.map_error(codec::limits_from_registers(p_max?, v_max?, t_max?))?;
         log::debug!("{}: ranges of raw values: {limits:?}", query.name());
         Ok(limits)
@@ -142,19 +160,33 @@ impl MotorProtocol for Damiao {
     }
 
     fn poll_frame(&self) -> Option<Frame> {
-        codec::encode_register(&RegisterMessage { motor: self.motor, access: Access::Refresh }, None).ok()
+        codec::encode_register(
+            &RegisterMessage {
+                motor: self.motor,
+                access: Access::Refresh,
+            },
+            None,
+        )
+        .ok()
     }
 
     fn typical_answer(&self) -> (Frame, Option<f64>) {
-        (Id::standard(self.feedback.into()).map_or_else(|_| short_frame(), frame_of_8_bytes), None)
+        (
+            Id::standard(self.feedback.into()).map_or_else(|_| short_frame(), frame_of_8_bytes),
+            None,
+        )
     }
 
     fn read(&self, frame: &Frame, limits: &Limits) -> Option<MotorReading> {
-        self.feedback(frame, limits).map(|feedback| feedback.motion.into())
+        self.feedback(frame, limits)
+            .map(|feedback| feedback.motion.into())
     }
 
     fn traffic(&self) -> Traffic {
-        Traffic { cycle_frames: vec![short_frame(); 2], unsolicited: vec![] }
+        Traffic {
+            cycle_frames: vec![short_frame(); 2],
+            unsolicited: vec![],
+        }
     }
 
     fn watchdog(&self, _plan: &WatchdogPlan) -> Watchdog {
@@ -162,7 +194,10 @@ impl MotorProtocol for Damiao {
     }
 
     fn motion(&self, limits: &Limits) -> Box<dyn MotionProtocol> {
-        Box::new(motion::DamiaoMotion { address: *self, limits: *limits })
+        Box::new(motion::DamiaoMotion {
+            address: *self,
+            limits: *limits,
+        })
     }
 
     #[cfg(feature = "emulation")]

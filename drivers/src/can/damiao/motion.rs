@@ -18,8 +18,16 @@ pub(super) struct DamiaoMotion {
 
 impl DamiaoMotion {
     /// Writes a register and reads it back.
-    fn set(&self, query: &MotorQuery<'_>, register: Register, value: Value) -> Result<Value, Error> {
-        let message = RegisterMessage { motor: self.address.motor, access: Access::Write(register, value) };
+    fn set(
+        &self,
+        query: &MotorQuery<'_>,
+        register: Register,
+        value: Value,
+    ) -> Result<Value, Error> {
+        let message = RegisterMessage {
+            motor: self.address.motor,
+            access: Access::Write(register, value),
+        };
         query.send(codec::encode_register(&message, None))?;
         self.address.register(query, register)
     }
@@ -28,10 +36,21 @@ impl DamiaoMotion {
 impl MotionProtocol for DamiaoMotion {
     fn switch_off(&self, query: &MotorQuery<'_>) -> Result<(), Error> {
         let mut status = Status::Enabled;
-        for state_command in [StateCommand::Disable, StateCommand::ClearError, StateCommand::Disable] {
+        for state_command in [
+            StateCommand::Disable,
+            StateCommand::ClearError,
+            StateCommand::Disable,
+        ] {
             status = query.request_answer(
-                &query.map_error(codec::encode_state_command(self.address.motor, state_command))?,
-                |frame| self.address.feedback(frame, &self.limits).map(|reported| reported.status),
+                &query.map_error(codec::encode_state_command(
+                    self.address.motor,
+                    state_command,
+                ))?,
+                |frame| {
+                    self.address
+                        .feedback(frame, &self.limits)
+                        .map(|reported| reported.status)
+                },
             )?;
             if status == Status::Disabled {
                 return Ok(());
@@ -42,7 +61,8 @@ impl MotionProtocol for DamiaoMotion {
     }
 
     fn set_watchdog(&self, query: &MotorQuery<'_>, plan: &WatchdogPlan) -> Result<(), Error> {
-        let requested = Value::Integer(query.map_error(codec::timeout_ticks(plan.timeout.as_secs_f64()))?);
+        let requested =
+            Value::Integer(query.map_error(codec::timeout_ticks(plan.timeout.as_secs_f64()))?);
         match self.set(query, Register::Timeout, requested)? {
             reported if reported == requested => Ok(()),
             reported => Err(query.timeout_mismatch(plan.timeout, &format!("{reported:?} ticks"))),
@@ -58,7 +78,10 @@ impl MotionProtocol for DamiaoMotion {
     }
 
     fn enable(&self) -> Result<Vec<Frame>, CanError> {
-        Ok(vec![codec::encode_state_command(self.address.motor, StateCommand::Enable)?])
+        Ok(vec![codec::encode_state_command(
+            self.address.motor,
+            StateCommand::Enable,
+        )?])
     }
 
     fn command(&self, command: &Command) -> Result<Frame, CanError> {

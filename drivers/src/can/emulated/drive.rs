@@ -1,5 +1,5 @@
-//! The part that emulated motors of all families share: a drive that moves the shaft, with settings, faults and a
-//! watchdog.
+//! The part that emulated motors of all families share: a drive that moves the shaft, with
+//! settings, faults and a watchdog.
 
 use super::shaft::{Actuation, Shaft};
 use crate::wire::can::mit::{Command, Limits, Motion};
@@ -30,7 +30,8 @@ pub struct EmulatedDrive {
     /// Registers, parameters, endpoints or objects that were written, by number.
     settings: BTreeMap<u32, u32>,
     pub(super) ignores_timeout: bool,
-    /// Time at which the watchdog was last reset. The next field is the time at which it last expired.
+    /// Time at which the watchdog was last reset. The next field is the time at which it last
+    /// expired.
     pub(super) watchdog_reset_at: Option<Stamp>,
     pub(super) timed_out_at: Option<Stamp>,
     /// Fault bits in the numbering of the family.
@@ -75,7 +76,8 @@ impl EmulatedDrive {
     pub(super) fn advance(&mut self, now: Stamp) {
         self.now = Some(now);
         if let Some(before) = self.simulated_until.replace(now) {
-            self.shaft.advance(now.secs_since(before), &self.actuation, &self.limits);
+            self.shaft
+                .advance(now.secs_since(before), &self.actuation, &self.limits);
         }
     }
 
@@ -115,7 +117,10 @@ impl EmulatedDrive {
 
     /// Enables the motor, holding the current position.
     pub(in crate::can) fn switch_on(&mut self) {
-        self.actuation = Actuation::Mit(Command { position_rad: self.shaft.motion.position_rad, ..Command::default() });
+        self.actuation = Actuation::Mit(Command {
+            position_rad: self.shaft.motion.position_rad,
+            ..Command::default()
+        });
         self.reset_watchdog();
     }
 }

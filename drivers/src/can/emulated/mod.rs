@@ -1,8 +1,9 @@
-//! Emulated motors for tests and simulators. They answer, report, follow commands, and stop when their watchdog
-//! expires, as the manufacturers' documents describe.
+//! Emulated motors for tests and simulators. They answer, report, follow commands, and stop when
+//! their watchdog expires, as the manufacturers' documents describe.
 //!
-//! The emulated motors were written from the same documents as the codecs. Tests against them therefore cannot show
-//! whether the documents were understood correctly; only real motors can show that.
+//! The emulated motors were written from the same documents as the codecs. Tests against them
+//! therefore cannot show whether the documents were understood correctly; only real motors can show
+//! that.
 
 mod drive;
 mod protocol;
@@ -35,14 +36,20 @@ pub struct EmulatedMotor {
 }
 
 impl EmulatedMotor {
-    /// Creates a disabled motor at rest at position 0. `limits` are the ranges of raw values that it reports; for
-    /// motors that do not report them, the ranges follow from the model.
+    /// Creates a disabled motor at rest at position 0. `limits` are the ranges of raw values that
+    /// it reports; for motors that do not report them, the ranges follow from the model.
     pub fn new(motor: &dyn MotorProtocol, limits: Limits) -> Self {
         let drive = EmulatedDrive::new(motor.ranges().unwrap_or(limits));
-        Self { protocol: motor.emulated(), drive, last_report: None, last_heartbeat: None }
+        Self {
+            protocol: motor.emulated(),
+            drive,
+            last_report: None,
+            last_heartbeat: None,
+        }
     }
 
-    /// Sets the motion of the shaft. From then on, the drive determines the motion until it is set again.
+    /// Sets the motion of the shaft. From then on, the drive determines the motion until it is set
+    /// again.
     pub fn set_motion(&mut self, motion: Motion) {
         self.drive.set_motion(motion);
     }
@@ -62,7 +69,8 @@ impl EmulatedMotor {
         self.drive.state()
     }
 
-    /// The last command that it followed. Commands of drives with their own position loop have no gains.
+    /// The last command that it followed. Commands of drives with their own position loop have no
+    /// gains.
     pub fn target(&self) -> Option<Command> {
         self.drive.target
     }
@@ -77,7 +85,8 @@ impl EmulatedMotor {
         self.drive.timed_out_at
     }
 
-    /// Makes the motor ignore writes of the timeout without reporting an error, as older firmware does.
+    /// Makes the motor ignore writes of the timeout without reporting an error, as older firmware
+    /// does.
     pub fn ignore_timeout(&mut self) {
         self.drive.ignores_timeout = true;
     }
@@ -88,8 +97,8 @@ impl EmulatedMotor {
         self.protocol.fail(&mut self.drive);
     }
 
-    /// Processes a frame at the time of the last [`EmulatedMotor::report`], and returns the answers. There are none if
-    /// the frame is not addressed to this motor.
+    /// Processes a frame at the time of the last [`EmulatedMotor::report`], and returns the
+    /// answers. There are none if the frame is not addressed to this motor.
     ///
     /// # Errors
     /// If the protocol cannot encode an answer.
@@ -101,7 +110,9 @@ impl EmulatedMotor {
     pub fn report(&mut self, now: Stamp) -> Result<Vec<Frame>, CanError> {
         self.drive.advance(now);
         let has_timed_out = |reset_at: Stamp| {
-            self.protocol.timeout(&self.drive).is_some_and(|timeout| now.duration_since(reset_at) > timeout)
+            self.protocol
+                .timeout(&self.drive)
+                .is_some_and(|timeout| now.duration_since(reset_at) > timeout)
         };
         if self.drive.watchdog_reset_at.is_some_and(has_timed_out) {
             self.time_out(now);
@@ -148,41 +159,85 @@ mod tests {
     const MILLIS: i64 = 1_000_000;
 
     /// Advances the time, then sends the frames to the motor.
-    fn advance_and_send(motor: &mut EmulatedMotor, at_millis: i64, frames: &[Result<Frame, CanError>]) {
-        motor.report(Stamp(at_millis * MILLIS)).expect("the values can be encoded");
+    fn advance_and_send(
+        motor: &mut EmulatedMotor,
+        at_millis: i64,
+        frames: &[Result<Frame, CanError>],
+    ) {
+        motor
+            .report(Stamp(at_millis * MILLIS))
+            .expect("the values can be encoded");
         for frame in frames {
-            motor.take(frame.as_ref().expect("a frame")).expect("the answer can be encoded");
+            motor
+                .take(frame.as_ref().expect("a frame"))
+                .expect("the answer can be encoded");
         }
     }
 
     fn assert_times_out_between(motor: &mut EmulatedMotor, fed_millis: i64, timeout_millis: i64) {
         advance_and_send(motor, fed_millis + timeout_millis, &[]);
-        assert_eq!((motor.state(), motor.timed_out_at()), (State::Enabled, None), "not yet");
+        assert_eq!(
+            (motor.state(), motor.timed_out_at()),
+            (State::Enabled, None),
+            "not yet"
+        );
         advance_and_send(motor, fed_millis + timeout_millis + 1, &[]);
         assert_ne!(motor.state(), State::Enabled);
-        assert_eq!(motor.timed_out_at(), Some(Stamp((fed_millis + timeout_millis + 1) * MILLIS)));
+        assert_eq!(
+            motor.timed_out_at(),
+            Some(Stamp((fed_millis + timeout_millis + 1) * MILLIS))
+        );
     }
 
     #[test]
     fn damiao_times_out_and_needs_error_cleared() {
-        let mut motor = EmulatedMotor::new(&Damiao { motor: 1, feedback: 0x11 }, LIMITS);
+        let mut motor = EmulatedMotor::new(
+            &Damiao {
+                motor: 1,
+                feedback: 0x11,
+            },
+            LIMITS,
+        );
         let write = |register, value| {
             let access = dm::Access::Write(register, dm::Value::Integer(value));
             dm::encode_register(&dm::RegisterMessage { motor: 1, access }, None)
         };
-        let command = Command { position_rad: 0.5, kp_nm_rad: 30.0, kd_nm_s_rad: 1.5, ..Command::default() };
-        let set_up = [write(dm::Register::Timeout, 2000), write(dm::Register::ControlMode, dm::MIT_MODE)];
+        let command = Command {
+            position_rad: 0.5,
+            kp_nm_rad: 30.0,
+            kd_nm_s_rad: 1.5,
+            ..Command::default()
+        };
+        let set_up = [
+            write(dm::Register::Timeout, 2000),
+            write(dm::Register::ControlMode, dm::MIT_MODE),
+        ];
         advance_and_send(&mut motor, 0, &set_up);
         advance_and_send(&mut motor, 1, &[dm::encode_command(1, &command, &LIMITS)]);
-        assert_eq!((motor.state(), motor.target()), (State::Free, None), "it is disabled");
+        assert_eq!(
+            (motor.state(), motor.target()),
+            (State::Free, None),
+            "it is disabled"
+        );
         let enable = || dm::encode_state_command(1, dm::StateCommand::Enable);
-        advance_and_send(&mut motor, 2, &[enable(), dm::encode_command(1, &command, &LIMITS)]);
+        advance_and_send(
+            &mut motor,
+            2,
+            &[enable(), dm::encode_command(1, &command, &LIMITS)],
+        );
         advance_and_send(&mut motor, 10, &[dm::encode_command(1, &command, &LIMITS)]);
         assert!(motor.motion().position_rad > 0.0);
         assert_times_out_between(&mut motor, 10, 100);
         advance_and_send(&mut motor, 200, &[enable()]);
         assert_eq!(motor.state(), State::Free, "its error has not been cleared");
-        advance_and_send(&mut motor, 201, &[dm::encode_state_command(1, dm::StateCommand::ClearError), enable()]);
+        advance_and_send(
+            &mut motor,
+            201,
+            &[
+                dm::encode_state_command(1, dm::StateCommand::ClearError),
+                enable(),
+            ],
+        );
         assert_eq!(motor.state(), State::Enabled);
     }
 
@@ -199,7 +254,10 @@ mod tests {
             advance_and_send(
                 &mut motor,
                 0,
-                &[encode(rs::Request::Write(rs::Parameter::Timeout, timeout)), encode(rs::Request::Enable)],
+                &[
+                    encode(rs::Request::Write(rs::Parameter::Timeout, timeout)),
+                    encode(rs::Request::Enable),
+                ],
             );
             match ignores {
                 false => assert_times_out_between(&mut motor, 0, 50),
@@ -211,8 +269,14 @@ mod tests {
 
     #[test]
     fn drive_quick_stops_and_holds_on_heartbeat_loss() {
-        let (node, host) = (Node::new(5).expect("a node"), Node::new(127).expect("a node"));
-        let units = Units { counts_per_turn: 65_536.0, rated_torque_nm: 1.0 };
+        let (node, host) = (
+            Node::new(5).expect("a node"),
+            Node::new(127).expect("a node"),
+        );
+        let units = Units {
+            counts_per_turn: 65_536.0,
+            rated_torque_nm: 1.0,
+        };
         let mut motor = EmulatedMotor::new(&Cia402 { node, units }, LIMITS);
         let write = |object, value| canopen::encode_write(node, object, value);
         let (direction, pdo) = (Direction::Receive, Pdo::First);
@@ -221,12 +285,21 @@ mod tests {
             &mut motor,
             0,
             &[
-                write(canopen::CONSUMER_HEARTBEAT, canopen::consumer_heartbeat(host, 100).into()),
+                write(
+                    canopen::CONSUMER_HEARTBEAT,
+                    canopen::consumer_heartbeat(host, 100).into(),
+                ),
                 write(cia402::ABORT_CONNECTION, cia402::ABORT_BY_QUICK_STOP),
                 write(cia402::QUICK_STOP_OPTION, cia402::STAY_STOPPED),
                 write(cia402::MODE, cia402::Mode::CyclicPosition as i64),
-                write(pdo.mapping(direction, 1), cia402::CONTROLWORD.mapped().into()),
-                write(pdo.mapping(direction, 2), cia402::TARGET_POSITION.mapped().into()),
+                write(
+                    pdo.mapping(direction, 1),
+                    cia402::CONTROLWORD.mapped().into(),
+                ),
+                write(
+                    pdo.mapping(direction, 2),
+                    cia402::TARGET_POSITION.mapped().into(),
+                ),
                 write(pdo.communication(direction, 2), 1),
                 write(pdo.communication(direction, 1), id.value().into()),
                 Ok(canopen::encode_nmt(Nmt::Start, Some(node))),
@@ -235,14 +308,25 @@ mod tests {
         for (at_millis, controlword) in [(1, 0x06), (2, 0x07), (3, 0x0F), (50, 0x0F)] {
             let target = Frame::classic(id, &[controlword, 0, 0, 0x40, 0, 0]);
             let heartbeat = canopen::encode_heartbeat(host, NodeState::Operational);
-            advance_and_send(&mut motor, at_millis, &[target, Ok(heartbeat), Ok(canopen::encode_sync())]);
+            advance_and_send(
+                &mut motor,
+                at_millis,
+                &[target, Ok(heartbeat), Ok(canopen::encode_sync())],
+            );
         }
         assert_eq!(motor.state(), State::Enabled);
         assert_times_out_between(&mut motor, 50, 100);
         assert_eq!(motor.state(), State::Holding);
         advance_and_send(&mut motor, 2000, &[]);
         let held_motion = motor.motion();
-        advance_and_send(&mut motor, 3000, &[Frame::classic(Id::standard(0x705).expect("11 bits"), &[5])]);
-        assert_eq!((motor.motion(), motor.motion().velocity_rad_s), (held_motion, 0.0));
+        advance_and_send(
+            &mut motor,
+            3000,
+            &[Frame::classic(Id::standard(0x705).expect("11 bits"), &[5])],
+        );
+        assert_eq!(
+            (motor.motion(), motor.motion().velocity_rad_s),
+            (held_motion, 0.0)
+        );
     }
 }

@@ -6,7 +6,8 @@ use crate::wire::can::mit::{Command, Limits, Motion};
 const INERTIA_KG_M2: f64 = 0.05;
 /// Viscous friction, N m s / rad.
 const FRICTION_NM_S_RAD: f64 = 0.25;
-/// Gain of the drive's position loop, 1 / s. The next constant is the maximum velocity of the loop, rad / s.
+/// Gain of the drive's position loop, 1 / s. The next constant is the maximum velocity of the loop,
+/// rad / s.
 const FOLLOWING_HZ: f64 = 60.0;
 const MAX_FOLLOWING_RAD_S: f64 = 40.0;
 /// Deceleration of the quick-stop ramp, rad / s2.
@@ -39,8 +40,15 @@ pub(super) struct Shaft {
 
 impl Shaft {
     pub(super) fn at_rest() -> Self {
-        let motion = Motion { position_rad: 0.0, velocity_rad_s: 0.0, torque_nm: 0.0 };
-        Self { motion, stops_rad: [f64::NEG_INFINITY, f64::INFINITY] }
+        let motion = Motion {
+            position_rad: 0.0,
+            velocity_rad_s: 0.0,
+            torque_nm: 0.0,
+        };
+        Self {
+            motion,
+            stops_rad: [f64::NEG_INFINITY, f64::INFINITY],
+        }
     }
 
     /// Advances the simulation by `secs`.
@@ -54,7 +62,11 @@ impl Shaft {
     }
 
     fn step(&mut self, secs: f64, actuation: &Actuation, limits: &Limits) {
-        let Motion { position_rad, velocity_rad_s, .. } = self.motion;
+        let Motion {
+            position_rad,
+            velocity_rad_s,
+            ..
+        } = self.motion;
         let torque_nm = match actuation {
             Actuation::Free => 0.0,
             Actuation::Mit(command) => {
@@ -64,13 +76,18 @@ impl Shaft {
                 torque.clamp(-limits.torque_nm, limits.torque_nm)
             }
             Actuation::Follow(command) => {
-                let target_velocity = command.velocity_rad_s + FOLLOWING_HZ * (command.position_rad - position_rad);
-                return self.rotate(target_velocity.clamp(-MAX_FOLLOWING_RAD_S, MAX_FOLLOWING_RAD_S), secs);
+                let target_velocity =
+                    command.velocity_rad_s + FOLLOWING_HZ * (command.position_rad - position_rad);
+                return self.rotate(
+                    target_velocity.clamp(-MAX_FOLLOWING_RAD_S, MAX_FOLLOWING_RAD_S),
+                    secs,
+                );
             }
             Actuation::Stop => {
                 let max_deceleration_step = QUICK_STOP_RAD_S2 * secs;
                 return self.rotate(
-                    velocity_rad_s - velocity_rad_s.clamp(-max_deceleration_step, max_deceleration_step),
+                    velocity_rad_s
+                        - velocity_rad_s.clamp(-max_deceleration_step, max_deceleration_step),
                     secs,
                 );
             }
@@ -83,8 +100,16 @@ impl Shaft {
     fn rotate(&mut self, velocity_rad_s: f64, secs: f64) {
         let free_rad = self.motion.position_rad + velocity_rad_s * secs;
         let position_rad = free_rad.clamp(self.stops_rad[0], self.stops_rad[1]);
-        let velocity_rad_s = if position_rad == free_rad { velocity_rad_s } else { 0.0 };
-        self.motion = Motion { position_rad, velocity_rad_s, torque_nm: 0.0 };
+        let velocity_rad_s = if position_rad == free_rad {
+            velocity_rad_s
+        } else {
+            0.0
+        };
+        self.motion = Motion {
+            position_rad,
+            velocity_rad_s,
+            torque_nm: 0.0,
+        };
     }
 }
 
@@ -96,35 +121,75 @@ mod tests {
 
     #[test]
     fn shaft_reaches_target_and_rests() {
-        let command = Command { position_rad: 0.7, kp_nm_rad: 30.0, kd_nm_s_rad: 1.5, ..Command::default() };
+        let command = Command {
+            position_rad: 0.7,
+            kp_nm_rad: 30.0,
+            kd_nm_s_rad: 1.5,
+            ..Command::default()
+        };
         for actuation in [Actuation::Mit(command), Actuation::Follow(command)] {
             let mut shaft = Shaft::at_rest();
             for _ in 0..1500 {
                 shaft.advance(2e-3, &actuation, &LIMITS);
             }
-            assert!((shaft.motion.position_rad - 0.7).abs() < 1e-6, "{actuation:?} {:?}", shaft.motion);
+            assert!(
+                (shaft.motion.position_rad - 0.7).abs() < 1e-6,
+                "{actuation:?} {:?}",
+                shaft.motion
+            );
         }
     }
 
     #[test]
     fn blocked_shaft_stays_at_its_stop_under_torque() {
-        let command = Command { position_rad: 0.7, kp_nm_rad: 10.0, kd_nm_s_rad: 1.5, ..Command::default() };
-        let mut shaft = Shaft { stops_rad: [-1.0, 0.2], ..Shaft::at_rest() };
+        let command = Command {
+            position_rad: 0.7,
+            kp_nm_rad: 10.0,
+            kd_nm_s_rad: 1.5,
+            ..Command::default()
+        };
+        let mut shaft = Shaft {
+            stops_rad: [-1.0, 0.2],
+            ..Shaft::at_rest()
+        };
         shaft.advance(0.9, &Actuation::Mit(command), &LIMITS);
-        assert!(shaft.motion.position_rad == 0.2 && shaft.motion.velocity_rad_s < 1e-9, "{:?}", shaft.motion);
-        assert!((shaft.motion.torque_nm - 5.0).abs() < 1e-9, "{:?}", shaft.motion);
+        assert!(
+            shaft.motion.position_rad == 0.2 && shaft.motion.velocity_rad_s < 1e-9,
+            "{:?}",
+            shaft.motion
+        );
+        assert!(
+            (shaft.motion.torque_nm - 5.0).abs() < 1e-9,
+            "{:?}",
+            shaft.motion
+        );
     }
 
     #[test]
     fn free_shaft_coasts_and_stopping_shaft_rests() {
-        let motion = Motion { position_rad: 0.0, velocity_rad_s: 3.0, torque_nm: 0.0 };
-        let moving = Shaft { motion, ..Shaft::at_rest() };
+        let motion = Motion {
+            position_rad: 0.0,
+            velocity_rad_s: 3.0,
+            torque_nm: 0.0,
+        };
+        let moving = Shaft {
+            motion,
+            ..Shaft::at_rest()
+        };
         let (mut free, mut stopped) = (moving, moving);
         free.advance(0.2, &Actuation::Free, &LIMITS);
         stopped.advance(0.2, &Actuation::Stop, &LIMITS);
-        assert!(free.motion.position_rad > 0.3 && free.motion.velocity_rad_s > 1.0, "{:?}", free.motion);
+        assert!(
+            free.motion.position_rad > 0.3 && free.motion.velocity_rad_s > 1.0,
+            "{:?}",
+            free.motion
+        );
         // 3 rad/s fall to 0 within a tenth of a second: half of 3 rad/s times 0.1 s.
-        assert!((stopped.motion.position_rad - 0.15).abs() < 1e-3, "{:?}", stopped.motion);
+        assert!(
+            (stopped.motion.position_rad - 0.15).abs() < 1e-3,
+            "{:?}",
+            stopped.motion
+        );
         assert_eq!(stopped.motion.velocity_rad_s, 0.0);
     }
 }

@@ -14,7 +14,14 @@ use std::time::Duration;
 pub(crate) fn encode_frames(frames: &[Frame]) -> Vec<u8> {
     let encode = |frame: &Frame| {
         let n = frame.n_bytes();
-        let code = if n <= 8 { n } else { 9 + FD_LENGTHS.iter().position(|len| *len == n).expect("an FD length") };
+        let code = if n <= 8 {
+            n
+        } else {
+            9 + FD_LENGTHS
+                .iter()
+                .position(|len| *len == n)
+                .expect("an FD length")
+        };
         let flag = |condition: bool, bit: u8| if condition { bit } else { 0 };
         let head = u8::try_from(code).expect("small")
             | flag(frame.id().is_extended(), 0x10)
@@ -28,12 +35,18 @@ pub(crate) fn encode_frames(frames: &[Frame]) -> Vec<u8> {
 
 /// All frames on the buses while an arm is set up and read for some cycles.
 pub(crate) fn example_traffic() -> Vec<Frame> {
-    record_traffic().into_iter().flat_map(|(sent_frames, _)| sent_frames).collect()
+    record_traffic()
+        .into_iter()
+        .flat_map(|(sent_frames, _)| sent_frames)
+        .collect()
 }
 
 /// For each motor, the frames on its bus and the readings that they contain.
 pub(super) fn record_traffic() -> Vec<(Vec<Frame>, Vec<Reading>)> {
-    motors().into_iter().map(|config| record_traffic_of(&config)).collect()
+    motors()
+        .into_iter()
+        .map(|config| record_traffic_of(&config))
+        .collect()
 }
 
 fn record_traffic_of(config: &MotorConfig) -> (Vec<Frame>, Vec<Reading>) {
@@ -44,15 +57,28 @@ fn record_traffic_of(config: &MotorConfig) -> (Vec<Frame>, Vec<Reading>) {
         sent_frames.extend(emulated.take(&frame).expect("a frame of the driver"));
     }
     for cycle in 0..6_u16 {
-        emulated.set_motion(Motion { position_rad: 0.4 * f64::from(cycle), velocity_rad_s: 0.5, torque_nm: -0.25 });
+        emulated.set_motion(Motion {
+            position_rad: 0.4 * f64::from(cycle),
+            velocity_rad_s: 0.5,
+            torque_nm: -0.25,
+        });
         let mut poll_frames: Vec<Frame> = config.protocol.poll_frame().into_iter().collect();
-        poll_frames.extend(config.protocol.canopen_node().map(|_| canopen::encode_sync()));
+        poll_frames.extend(
+            config
+                .protocol
+                .canopen_node()
+                .map(|_| canopen::encode_sync()),
+        );
         // In a real setup, another master commands some motors; here, the test commands them.
         poll_frames.extend(fuzzing(config).other_master);
-        let mut answers: Vec<Frame> =
-            poll_frames.iter().flat_map(|frame| emulated.take(frame).expect("a frame of the driver")).collect();
+        let mut answers: Vec<Frame> = poll_frames
+            .iter()
+            .flat_map(|frame| emulated.take(frame).expect("a frame of the driver"))
+            .collect();
         answers.extend(
-            emulated.report(Stamp(0) + Duration::from_millis(20) * u32::from(cycle)).expect("the motion is in range"),
+            emulated
+                .report(Stamp(0) + Duration::from_millis(20) * u32::from(cycle))
+                .expect("the motion is in range"),
         );
         expected_readings.extend(answers.iter().filter_map(|frame| listeners.read(frame)));
         sent_frames.extend(poll_frames);

@@ -1,10 +1,10 @@
-//! ODrive's CANSimple protocol: the 11-bit CAN ID consists of a 6-bit node ID and a 5-bit command; numbers in the
-//! payload are little-endian.
+//! ODrive's CANSimple protocol: the 11-bit CAN ID consists of a 6-bit node ID and a 5-bit command;
+//! numbers in the payload are little-endian.
 //!
-//! Sources: `odriverobotics/ODrive` `tools/odrive-cansimple.dbc` (messages since firmware 0.5); ODrive CAN protocol
-//! page and DBC of firmware 0.6.10 (heartbeat, errors, torques, endpoints, temperature). Frames contain turns; this
-//! module converts them to radians. Nodes send their messages at the rates set in `can.config` or `axis.config.can`, or
-//! in answer to a remote frame.
+//! Sources: `odriverobotics/ODrive` `tools/odrive-cansimple.dbc` (messages since firmware 0.5);
+//! ODrive CAN protocol page and DBC of firmware 0.6.10 (heartbeat, errors, torques, endpoints,
+//! temperature). Frames contain turns; this module converts them to radians. Nodes send their
+//! messages at the rates set in `can.config` or `axis.config.can`, or in answer to a remote frame.
 
 use crate::wire::can::{CanError, Frame, Id, decode_enum};
 use std::f64::consts::TAU;
@@ -27,7 +27,10 @@ impl Node {
     pub fn new(number: u8) -> Result<Self, CanError> {
         match number {
             0..=63 => Ok(Self(number)),
-            _ => Err(CanError::IdRange { id: number.into(), bits: 6 }),
+            _ => Err(CanError::IdRange {
+                id: number.into(),
+                bits: 6,
+            }),
         }
     }
 
@@ -126,7 +129,8 @@ pub enum Control {
     Position = 3,
 }
 
-/// A message to a node. Values that are not finite are errors; feedforward is clamped to its 16 bits.
+/// A message to a node. Values that are not finite are errors; feedforward is clamped to its 16
+/// bits.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Request {
     /// Requests a message of a node with a remote frame.
@@ -137,7 +141,8 @@ pub enum Request {
     ClearErrors,
     /// Changes the state of the axis.
     SetState(State),
-    /// Sets the controlled quantity, with input passed through without ramp or filter (input mode 1).
+    /// Sets the controlled quantity, with input passed through without ramp or filter (input mode
+    /// 1).
     SetMode(Control),
     /// Sets the target position.
     SetPosition {
@@ -159,7 +164,8 @@ pub enum Request {
     SetTorque(f64),
     /// Reads an endpoint, by its number in the firmware's `flat_endpoints.json`.
     ReadEndpoint(u16),
-    /// Writes an endpoint, for instance the axis' watchdog timeout; the bytes are encoded according to its type.
+    /// Writes an endpoint, for instance the axis' watchdog timeout; the bytes are encoded according
+    /// to its type.
     WriteEndpoint(u16, [u8; 4]),
 }
 
@@ -225,17 +231,29 @@ pub fn encode_request(node: Node, request: &Request) -> Result<Frame, CanError> 
         Request::ClearErrors => data(Code::ClearErrors, &[0]),
         Request::SetState(state) => data(Code::SetState, &u32::from(state as u8).to_le_bytes()),
         Request::SetMode(control) => data(Code::SetMode, &[control as u8, 0, 0, 0, 1, 0, 0, 0]),
-        Request::SetPosition { position_rad, velocity_rad_s, torque_nm } => {
+        Request::SetPosition {
+            position_rad,
+            velocity_rad_s,
+            torque_nm,
+        } => {
             let [a, b, c, d] = encode_f32("the position", position_rad / TAU)?;
             let [e, f] = encode_thousandths("the velocity", velocity_rad_s / TAU)?;
             let [g, h] = encode_thousandths("the torque", torque_nm)?;
             data(Code::SetPosition, &[a, b, c, d, e, f, g, h])
         }
-        Request::SetVelocity { velocity_rad_s, torque_nm } => {
-            let halves = [encode_f32("the velocity", velocity_rad_s / TAU)?, encode_f32("the torque", torque_nm)?];
+        Request::SetVelocity {
+            velocity_rad_s,
+            torque_nm,
+        } => {
+            let halves = [
+                encode_f32("the velocity", velocity_rad_s / TAU)?,
+                encode_f32("the torque", torque_nm)?,
+            ];
             data(Code::SetVelocity, halves.as_flattened())
         }
-        Request::SetTorque(torque_nm) => data(Code::SetTorque, &encode_f32("the torque", torque_nm)?),
+        Request::SetTorque(torque_nm) => {
+            data(Code::SetTorque, &encode_f32("the torque", torque_nm)?)
+        }
         Request::ReadEndpoint(number) => endpoint(0, number, [0; 4]),
         Request::WriteEndpoint(number, value) => endpoint(1, number, value),
     }
@@ -245,43 +263,81 @@ pub fn encode_request(node: Node, request: &Request) -> Result<Frame, CanError> 
 pub fn decode_answer(frame: &Frame) -> Result<(Node, Answer), CanError> {
     let id = frame.id();
     if frame.is_remote() || id.is_extended() {
-        return Err(CanError::UnexpectedFrame { message: MESSAGE, id: id.value() });
+        return Err(CanError::UnexpectedFrame {
+            message: MESSAGE,
+            id: id.value(),
+        });
     }
     let [.., high, low] = id.value().to_be_bytes();
     let number = high << 3 | low >> 5;
     let got_bytes = frame.data().len();
     let Ok([a, b, c, d, e, f, g, h]) = <[u8; 8]>::try_from(frame.data()) else {
-        return Err(CanError::Length { message: MESSAGE, got_bytes, expected_bytes: 8 });
+        return Err(CanError::Length {
+            message: MESSAGE,
+            got_bytes,
+            expected_bytes: 8,
+        });
     };
-    let words = (u32::from_le_bytes([a, b, c, d]), u32::from_le_bytes([e, f, g, h]));
+    let words = (
+        u32::from_le_bytes([a, b, c, d]),
+        u32::from_le_bytes([e, f, g, h]),
+    );
     let reals = || {
-        let (first, second) = (f64::from(f32::from_bits(words.0)), f64::from(f32::from_bits(words.1)));
+        let (first, second) = (
+            f64::from(f32::from_bits(words.0)),
+            f64::from(f32::from_bits(words.1)),
+        );
         match first.is_finite() && second.is_finite() {
             true => Ok((first, second)),
-            false => Err(CanError::NotFinite { field: "a value of an ODrive" }),
+            false => Err(CanError::NotFinite {
+                field: "a value of an ODrive",
+            }),
         }
     };
     let is = |code: Code| low & 0x1F == code as u8;
     let answer = if is(Code::Version) {
-        Answer::Version { hardware: [b, c, d], firmware: [e, f, g] }
+        Answer::Version {
+            hardware: [b, c, d],
+            firmware: [e, f, g],
+        }
     } else if is(Code::Heartbeat) {
-        let state = decode_enum("the state of the axis", e.into(), &State::ALL, |known| known as u32)?;
-        Answer::Heartbeat { errors: words.0, state }
+        let state = decode_enum("the state of the axis", e.into(), &State::ALL, |known| {
+            known as u32
+        })?;
+        Answer::Heartbeat {
+            errors: words.0,
+            state,
+        }
     } else if is(Code::Errors) {
-        Answer::Errors { active: words.0, disarm_reason: words.1 }
+        Answer::Errors {
+            active: words.0,
+            disarm_reason: words.1,
+        }
     } else if is(Code::EndpointAnswer) {
         Answer::Endpoint(u16::from_le_bytes([b, c]), [e, f, g, h])
     } else if is(Code::Motion) {
         let (position, velocity) = reals()?;
-        Answer::Motion { position_rad: position * TAU, velocity_rad_s: velocity * TAU }
+        Answer::Motion {
+            position_rad: position * TAU,
+            velocity_rad_s: velocity * TAU,
+        }
     } else if is(Code::Current) {
         let (target_a, measured_a) = reals()?;
-        Answer::Current { target_a, measured_a }
+        Answer::Current {
+            target_a,
+            measured_a,
+        }
     } else if is(Code::Torques) {
         let (target_nm, estimate_nm) = reals()?;
-        Answer::Torques { target_nm, estimate_nm }
+        Answer::Torques {
+            target_nm,
+            estimate_nm,
+        }
     } else {
-        return Err(CanError::Undefined { field: "the command of an ODrive", raw: u32::from(low & 0x1F) });
+        return Err(CanError::Undefined {
+            field: "the command of an ODrive",
+            raw: u32::from(low & 0x1F),
+        });
     };
     Ok((Node(number), answer))
 }
@@ -289,25 +345,55 @@ pub fn decode_answer(frame: &Frame) -> Result<(Node, Answer), CanError> {
 /// Encodes a message from an emulated axis.
 pub fn encode_answer(node: Node, answer: &Answer) -> Result<Frame, CanError> {
     let (code, halves) = match *answer {
-        Answer::Version { hardware: [b, c, d], firmware: [e, f, g] } => {
-            (Code::Version, [[PROTOCOL_VERSION, b, c, d], [e, f, g, 0]])
-        }
-        Answer::Heartbeat { errors, state } => (Code::Heartbeat, [errors.to_le_bytes(), [state as u8, 0, 0, 0]]),
-        Answer::Errors { active, disarm_reason } => (Code::Errors, [active.to_le_bytes(), disarm_reason.to_le_bytes()]),
+        Answer::Version {
+            hardware: [b, c, d],
+            firmware: [e, f, g],
+        } => (Code::Version, [[PROTOCOL_VERSION, b, c, d], [e, f, g, 0]]),
+        Answer::Heartbeat { errors, state } => (
+            Code::Heartbeat,
+            [errors.to_le_bytes(), [state as u8, 0, 0, 0]],
+        ),
+        Answer::Errors {
+            active,
+            disarm_reason,
+        } => (
+            Code::Errors,
+            [active.to_le_bytes(), disarm_reason.to_le_bytes()],
+        ),
         Answer::Endpoint(number, value) => {
             let [low, high] = number.to_le_bytes();
             (Code::EndpointAnswer, [[0, low, high, 0], value])
         }
-        Answer::Motion { position_rad, velocity_rad_s } => (
+        Answer::Motion {
+            position_rad,
+            velocity_rad_s,
+        } => (
             Code::Motion,
-            [encode_f32("the position", position_rad / TAU)?, encode_f32("the velocity", velocity_rad_s / TAU)?],
+            [
+                encode_f32("the position", position_rad / TAU)?,
+                encode_f32("the velocity", velocity_rad_s / TAU)?,
+            ],
         ),
-        Answer::Current { target_a, measured_a } => {
-            (Code::Current, [encode_f32("the current", target_a)?, encode_f32("the current", measured_a)?])
-        }
-        Answer::Torques { target_nm, estimate_nm } => {
-            (Code::Torques, [encode_f32("the torque", target_nm)?, encode_f32("the torque", estimate_nm)?])
-        }
+        Answer::Current {
+            target_a,
+            measured_a,
+        } => (
+            Code::Current,
+            [
+                encode_f32("the current", target_a)?,
+                encode_f32("the current", measured_a)?,
+            ],
+        ),
+        Answer::Torques {
+            target_nm,
+            estimate_nm,
+        } => (
+            Code::Torques,
+            [
+                encode_f32("the torque", target_nm)?,
+                encode_f32("the torque", estimate_nm)?,
+            ],
+        ),
     };
     Frame::classic(id_of(node, code)?, halves.as_flattened())
 }
@@ -316,13 +402,23 @@ fn id_of(node: Node, code: Code) -> Result<Id, CanError> {
     Id::standard(u32::from(node.0) << 5 | u32::from(code as u8))
 }
 
-#[expect(clippy::cast_possible_truncation, reason = "values out of range become infinite and are rejected")]
+#[expect(
+    clippy::cast_possible_truncation,
+    reason = "values out of range become infinite and are rejected"
+)]
 fn encode_f32(field: &'static str, value: f64) -> Result<[u8; 4], CanError> {
     let single = value as f32;
-    if single.is_finite() { Ok(single.to_le_bytes()) } else { Err(CanError::NotFinite { field }) }
+    if single.is_finite() {
+        Ok(single.to_le_bytes())
+    } else {
+        Err(CanError::NotFinite { field })
+    }
 }
 
-#[expect(clippy::cast_possible_truncation, reason = "the cast clamps, as intended")]
+#[expect(
+    clippy::cast_possible_truncation,
+    reason = "the cast clamps, as intended"
+)]
 fn encode_thousandths(field: &'static str, value: f64) -> Result<[u8; 2], CanError> {
     match value.is_nan() {
         true => Err(CanError::NotFinite { field }),
@@ -346,39 +442,99 @@ mod tests {
     fn requests_match_published_bytes() {
         let sent = |request| encode_request(NODE, &request).expect("numbers");
         // The example of odrive-can-protocol: -2.5 turns per second and 0.25 N m to node 1.
-        let velocity = Request::SetVelocity { velocity_rad_s: -2.5 * TAU, torque_nm: 0.25 };
-        assert_eq!(sent(velocity), frame(0x02D, &[0x00, 0x00, 0x20, 0xC0, 0x00, 0x00, 0x80, 0x3E]));
-        let position = Request::SetPosition { position_rad: TAU, velocity_rad_s: -0.5 * TAU, torque_nm: 99.0 };
-        assert_eq!(sent(position), frame(0x02C, &[0, 0, 0x80, 0x3F, 0x0C, 0xFE, 0xFF, 0x7F]));
-        assert_eq!(sent(Request::SetTorque(1.0)), frame(0x02E, &[0, 0, 0x80, 0x3F]));
-        assert_eq!(sent(Request::SetState(State::ClosedLoopControl)), frame(0x027, &[8, 0, 0, 0]));
-        assert_eq!(sent(Request::SetMode(Control::Position)), frame(0x02B, &[3, 0, 0, 0, 1, 0, 0, 0]));
+        let velocity = Request::SetVelocity {
+            velocity_rad_s: -2.5 * TAU,
+            torque_nm: 0.25,
+        };
+        assert_eq!(
+            sent(velocity),
+            frame(0x02D, &[0x00, 0x00, 0x20, 0xC0, 0x00, 0x00, 0x80, 0x3E])
+        );
+        let position = Request::SetPosition {
+            position_rad: TAU,
+            velocity_rad_s: -0.5 * TAU,
+            torque_nm: 99.0,
+        };
+        assert_eq!(
+            sent(position),
+            frame(0x02C, &[0, 0, 0x80, 0x3F, 0x0C, 0xFE, 0xFF, 0x7F])
+        );
+        assert_eq!(
+            sent(Request::SetTorque(1.0)),
+            frame(0x02E, &[0, 0, 0x80, 0x3F])
+        );
+        assert_eq!(
+            sent(Request::SetState(State::ClosedLoopControl)),
+            frame(0x027, &[8, 0, 0, 0])
+        );
+        assert_eq!(
+            sent(Request::SetMode(Control::Position)),
+            frame(0x02B, &[3, 0, 0, 0, 1, 0, 0, 0])
+        );
         assert_eq!(sent(Request::ClearErrors), frame(0x038, &[0]));
         assert_eq!(sent(Request::EmergencyStop), frame(0x022, &[]));
-        assert_eq!(sent(Request::ReadEndpoint(0x0182)), frame(0x024, &[0, 0x82, 0x01, 0, 0, 0, 0, 0]));
-        assert_eq!(sent(Request::WriteEndpoint(0x0182, [1, 0, 0, 0])), frame(0x024, &[1, 0x82, 0x01, 0, 1, 0, 0, 0]));
+        assert_eq!(
+            sent(Request::ReadEndpoint(0x0182)),
+            frame(0x024, &[0, 0x82, 0x01, 0, 0, 0, 0, 0])
+        );
+        assert_eq!(
+            sent(Request::WriteEndpoint(0x0182, [1, 0, 0, 0])),
+            frame(0x024, &[1, 0x82, 0x01, 0, 1, 0, 0, 0])
+        );
         let requested = sent(Request::Ask(Code::Motion));
-        assert!(requested.is_remote() && requested.id().value() == 0x029 && requested.n_bytes() == 8);
+        assert!(
+            requested.is_remote() && requested.id().value() == 0x029 && requested.n_bytes() == 8
+        );
     }
 
     #[test]
     fn answers_round_trip() {
         for (bytes, expected) in [
-            (frame(0x020, &[2, 4, 4, 58, 0, 6, 9, 0]), Answer::Version { hardware: [4, 4, 58], firmware: [0, 6, 9] }),
+            (
+                frame(0x020, &[2, 4, 4, 58, 0, 6, 9, 0]),
+                Answer::Version {
+                    hardware: [4, 4, 58],
+                    firmware: [0, 6, 9],
+                },
+            ),
             (
                 frame(0x021, &[1, 0, 0, 0x80, 8, 0, 0, 0]),
-                Answer::Heartbeat { errors: 0x8000_0001, state: State::ClosedLoopControl },
+                Answer::Heartbeat {
+                    errors: 0x8000_0001,
+                    state: State::ClosedLoopControl,
+                },
             ),
-            (frame(0x023, &[0, 0, 0, 0, 2, 0, 0, 0]), Answer::Errors { active: 0, disarm_reason: 2 }),
-            (frame(0x025, &[0, 0x82, 0x01, 0, 1, 2, 3, 4]), Answer::Endpoint(0x0182, [1, 2, 3, 4])),
+            (
+                frame(0x023, &[0, 0, 0, 0, 2, 0, 0, 0]),
+                Answer::Errors {
+                    active: 0,
+                    disarm_reason: 2,
+                },
+            ),
+            (
+                frame(0x025, &[0, 0x82, 0x01, 0, 1, 2, 3, 4]),
+                Answer::Endpoint(0x0182, [1, 2, 3, 4]),
+            ),
             (
                 frame(0x029, &[0, 0, 0x80, 0x3F, 0, 0, 0x20, 0xC0]),
-                Answer::Motion { position_rad: TAU, velocity_rad_s: -2.5 * TAU },
+                Answer::Motion {
+                    position_rad: TAU,
+                    velocity_rad_s: -2.5 * TAU,
+                },
             ),
-            (frame(0x034, &[0, 0, 0x80, 0x3F, 0, 0, 0x80, 0x3E]), Answer::Current { target_a: 1.0, measured_a: 0.25 }),
+            (
+                frame(0x034, &[0, 0, 0x80, 0x3F, 0, 0, 0x80, 0x3E]),
+                Answer::Current {
+                    target_a: 1.0,
+                    measured_a: 0.25,
+                },
+            ),
             (
                 frame(0x03C, &[0, 0, 0x80, 0x3F, 0, 0, 0x80, 0x3E]),
-                Answer::Torques { target_nm: 1.0, estimate_nm: 0.25 },
+                Answer::Torques {
+                    target_nm: 1.0,
+                    estimate_nm: 0.25,
+                },
             ),
         ] {
             assert_eq!(decode_answer(&bytes), Ok((NODE, expected)));
@@ -392,13 +548,27 @@ mod tests {
     fn motion_round_trips_in_single_precision() {
         let mut random = Random::new(19);
         for _ in 0..10_000 {
-            let (position_rad, velocity_rad_s) = (random.uniform(-5e3, 5e3), random.uniform(-5e2, 5e2));
-            let answer = Answer::Motion { position_rad, velocity_rad_s };
+            let (position_rad, velocity_rad_s) =
+                (random.uniform(-5e3, 5e3), random.uniform(-5e2, 5e2));
+            let answer = Answer::Motion {
+                position_rad,
+                velocity_rad_s,
+            };
             let node = Node::new(random.byte() & 63).expect("masked");
-            let (from, back) = decode_answer(&encode_answer(node, &answer).expect("numbers")).expect("own bytes");
-            let Answer::Motion { position_rad: position, velocity_rad_s: velocity } = back else { panic!("{back:?}") };
+            let (from, back) =
+                decode_answer(&encode_answer(node, &answer).expect("numbers")).expect("own bytes");
+            let Answer::Motion {
+                position_rad: position,
+                velocity_rad_s: velocity,
+            } = back
+            else {
+                panic!("{back:?}")
+            };
             // Tolerance: half a unit in the last of 24 bits.
-            assert!(from == node && (position - position_rad).abs() <= position_rad.abs() / f64::from(1 << 24));
+            assert!(
+                from == node
+                    && (position - position_rad).abs() <= position_rad.abs() / f64::from(1 << 24)
+            );
             assert!((velocity - velocity_rad_s).abs() <= velocity_rad_s.abs() / f64::from(1 << 24));
         }
     }
@@ -407,17 +577,41 @@ mod tests {
     fn invalid_messages_are_rejected() {
         assert_eq!(Node::new(64), Err(CanError::IdRange { id: 64, bits: 6 }));
         for malformed in truncated_and_doubled(&frame(0x029, &[0; 8])) {
-            assert!(matches!(decode_answer(&malformed), Err(CanError::Length { .. })));
+            assert!(matches!(
+                decode_answer(&malformed),
+                Err(CanError::Length { .. })
+            ));
         }
         let undefined = |field, raw| Err(CanError::Undefined { field, raw });
-        assert_eq!(decode_answer(&frame(0x021, &[0, 0, 0, 0, 15, 0, 0, 0])), undefined("the state of the axis", 15));
-        assert_eq!(decode_answer(&frame(0x03F, &[0; 8])), undefined("the command of an ODrive", 0x1F));
-        assert!(matches!(decode_answer(&frame(0x029, &[0xFF; 8])), Err(CanError::NotFinite { .. })));
+        assert_eq!(
+            decode_answer(&frame(0x021, &[0, 0, 0, 0, 15, 0, 0, 0])),
+            undefined("the state of the axis", 15)
+        );
+        assert_eq!(
+            decode_answer(&frame(0x03F, &[0; 8])),
+            undefined("the command of an ODrive", 0x1F)
+        );
+        assert!(matches!(
+            decode_answer(&frame(0x029, &[0xFF; 8])),
+            Err(CanError::NotFinite { .. })
+        ));
         for bad in [f64::NAN, f64::INFINITY, 1e300] {
-            assert!(encode_request(NODE, &Request::SetTorque(bad)).is_err(), "{bad}");
+            assert!(
+                encode_request(NODE, &Request::SetTorque(bad)).is_err(),
+                "{bad}"
+            );
         }
-        let non_finite = Request::SetPosition { position_rad: 0.0, velocity_rad_s: f64::NAN, torque_nm: 0.0 };
-        assert_eq!(encode_request(NODE, &non_finite), Err(CanError::NotFinite { field: "the velocity" }));
+        let non_finite = Request::SetPosition {
+            position_rad: 0.0,
+            velocity_rad_s: f64::NAN,
+            torque_nm: 0.0,
+        };
+        assert_eq!(
+            encode_request(NODE, &non_finite),
+            Err(CanError::NotFinite {
+                field: "the velocity"
+            })
+        );
         let mut n_read = 0;
         for frame in random_frames(23, Id::standard(0x029).expect("11 bits")) {
             if decode_answer(&frame).is_ok() {

@@ -1,5 +1,5 @@
-//! An emulated `ODrive` axis. It follows target positions with its own position loop. Its watchdog also runs while the
-//! axis is idle.
+//! An emulated `ODrive` axis. It follows target positions with its own position loop. Its watchdog
+//! also runs while the axis is idle.
 
 use super::Endpoints;
 use super::codec::{self, Answer, Code, Node};
@@ -40,7 +40,10 @@ impl EmulatedProtocol for EmulatedOdrive {
         }
         let is_object = |code: Code| id.value() & 0x1F == code as u32;
         if frame.is_remote() {
-            let version = Answer::Version { hardware: HARDWARE, firmware: FIRMWARE };
+            let version = Answer::Version {
+                hardware: HARDWARE,
+                firmware: FIRMWARE,
+            };
             return if is_object(Code::Version) {
                 Ok(vec![codec::encode_answer(self.node, &version)?])
             } else {
@@ -53,14 +56,19 @@ impl EmulatedProtocol for EmulatedOdrive {
                 [8, 0, 0, 0] if drive.faults == 0 => {
                     // It starts at its current position, whatever was requested before.
                     let position_rad = drive.motion().position_rad;
-                    drive.actuation = Actuation::Follow(Command { position_rad, ..Command::default() });
+                    drive.actuation = Actuation::Follow(Command {
+                        position_rad,
+                        ..Command::default()
+                    });
                 }
                 _ => {}
             }
         } else if is_object(Code::ClearErrors) {
             drive.faults = 0;
         } else if is_object(Code::SetPosition) {
-            let &[a, b, c, d, e, f, ..] = frame.data() else { return Ok(Vec::new()) };
+            let &[a, b, c, d, e, f, ..] = frame.data() else {
+                return Ok(Vec::new());
+            };
             let command = Command {
                 position_rad: f64::from(f32::from_le_bytes([a, b, c, d])) * TAU,
                 velocity_rad_s: f64::from(i16::from_le_bytes([e, f])) * 1e-3 * TAU,
@@ -71,13 +79,22 @@ impl EmulatedProtocol for EmulatedOdrive {
                 drive.target = Some(command);
             }
         } else if is_object(Code::EndpointRequest) {
-            let &[operation, low, high, _, a, b, c, d] = frame.data() else { return Ok(Vec::new()) };
+            let &[operation, low, high, _, a, b, c, d] = frame.data() else {
+                return Ok(Vec::new());
+            };
             let number = u16::from_le_bytes([low, high]);
             if operation == 1 {
-                drive.set(number.into(), u32::from_le_bytes([a, b, c, d]), number == WATCHDOG_TIMEOUT);
+                drive.set(
+                    number.into(),
+                    u32::from_le_bytes([a, b, c, d]),
+                    number == WATCHDOG_TIMEOUT,
+                );
             } else {
                 let value = drive.setting(number.into()).unwrap_or(0).to_le_bytes();
-                return Ok(vec![codec::encode_answer(self.node, &Answer::Endpoint(number, value))?]);
+                return Ok(vec![codec::encode_answer(
+                    self.node,
+                    &Answer::Endpoint(number, value),
+                )?]);
             }
         }
         // Any frame to the axis resets its watchdog.
@@ -90,8 +107,19 @@ impl EmulatedProtocol for EmulatedOdrive {
     }
 
     fn report(&self, drive: &EmulatedDrive) -> Result<Option<Frame>, CanError> {
-        let Motion { position_rad, velocity_rad_s, .. } = drive.motion();
-        codec::encode_answer(self.node, &Answer::Motion { position_rad, velocity_rad_s }).map(Some)
+        let Motion {
+            position_rad,
+            velocity_rad_s,
+            ..
+        } = drive.motion();
+        codec::encode_answer(
+            self.node,
+            &Answer::Motion {
+                position_rad,
+                velocity_rad_s,
+            },
+        )
+        .map(Some)
     }
 
     fn heartbeat(&self, drive: &EmulatedDrive) -> Result<Option<Frame>, CanError> {
@@ -99,13 +127,26 @@ impl EmulatedProtocol for EmulatedOdrive {
             State::Enabled => codec::State::ClosedLoopControl,
             State::Free | State::Holding => codec::State::Idle,
         };
-        codec::encode_answer(self.node, &Answer::Heartbeat { errors: drive.faults, state }).map(Some)
+        codec::encode_answer(
+            self.node,
+            &Answer::Heartbeat {
+                errors: drive.faults,
+                state,
+            },
+        )
+        .map(Some)
     }
 
     fn timeout(&self, drive: &EmulatedDrive) -> Option<Duration> {
-        let is_on = drive.setting(ENABLE_WATCHDOG.into()).is_some_and(|bytes| bytes & 1 == 1);
+        let is_on = drive
+            .setting(ENABLE_WATCHDOG.into())
+            .is_some_and(|bytes| bytes & 1 == 1);
         let secs = f32::from_bits(drive.setting(WATCHDOG_TIMEOUT.into()).unwrap_or(0));
-        if is_on { Duration::try_from_secs_f32(secs).ok() } else { None }
+        if is_on {
+            Duration::try_from_secs_f32(secs).ok()
+        } else {
+            None
+        }
     }
 
     fn time_out(&mut self, drive: &mut EmulatedDrive) {

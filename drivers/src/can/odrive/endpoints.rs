@@ -1,9 +1,9 @@
-//! Numbers of the endpoints that configure the watchdog of an axis. The numbers depend on the firmware; ODrive
-//! publishes a file for each version.
+//! Numbers of the endpoints that configure the watchdog of an axis. The numbers depend on the
+//! firmware; ODrive publishes a file for each version.
 //!
 //! Source: ODrive CAN protocol page, "Arbitrary parameter access"; `odriverobotics/ODriveResources`
-//! `can_restore_config.py`, which compares `fw_version` and `hw_version` of `flat_endpoints.json` with the versions
-//! that the axis reports (`Get_Version`) before it writes anything.
+//! `can_restore_config.py`, which compares `fw_version` and `hw_version` of `flat_endpoints.json`
+//! with the versions that the axis reports (`Get_Version`) before it writes anything.
 
 use serde::Deserialize;
 use std::collections::BTreeMap;
@@ -57,12 +57,22 @@ impl Endpoints {
     pub fn parse(text: &str) -> Result<Self, EndpointsError> {
         let flat: Flat = serde_json::from_str(text)?;
         let number = |name: &'static str, kind: &'static str| {
-            let found = flat.endpoints.get(name).filter(|endpoint| endpoint.kind == kind);
-            found.map(|endpoint| endpoint.id).ok_or(EndpointsError::Missing { name, kind })
+            let found = flat
+                .endpoints
+                .get(name)
+                .filter(|endpoint| endpoint.kind == kind);
+            found
+                .map(|endpoint| endpoint.id)
+                .ok_or(EndpointsError::Missing { name, kind })
         };
         let watchdog_timeout = number("axis0.config.watchdog_timeout", "float")?;
         let enable_watchdog = number("axis0.config.enable_watchdog", "bool")?;
-        Ok(Self { firmware: flat.fw_version, hardware: flat.hw_version, watchdog_timeout, enable_watchdog })
+        Ok(Self {
+            firmware: flat.fw_version,
+            hardware: flat.hw_version,
+            watchdog_timeout,
+            enable_watchdog,
+        })
     }
 
     /// Whether the endpoints are valid for an axis that reports these versions.
@@ -85,18 +95,38 @@ mod tests {
     #[test]
     fn watchdog_endpoints_are_found_in_manufacturer_file() {
         let endpoints = Endpoints::parse(TEXT).expect("a file");
-        assert_eq!((endpoints.watchdog_timeout, endpoints.enable_watchdog), (218, 219));
+        assert_eq!(
+            (endpoints.watchdog_timeout, endpoints.enable_watchdog),
+            (218, 219)
+        );
         assert!(endpoints.match_versions([4, 4, 58], [0, 6, 9]));
-        assert!(!endpoints.match_versions([4, 4, 58], [0, 6, 10]) && !endpoints.match_versions([4, 4, 57], [0, 6, 9]));
+        assert!(
+            !endpoints.match_versions([4, 4, 58], [0, 6, 10])
+                && !endpoints.match_versions([4, 4, 57], [0, 6, 9])
+        );
     }
 
     #[test]
     fn other_files_are_rejected() {
-        assert!(matches!(Endpoints::parse("[]"), Err(EndpointsError::Malformed(_))));
-        assert!(matches!(Endpoints::parse(&TEXT[..60]), Err(EndpointsError::Malformed(_))));
+        assert!(matches!(
+            Endpoints::parse("[]"),
+            Err(EndpointsError::Malformed(_))
+        ));
+        assert!(matches!(
+            Endpoints::parse(&TEXT[..60]),
+            Err(EndpointsError::Malformed(_))
+        ));
         let renamed = TEXT.replace("config.enable_watchdog", "config.watch");
-        assert!(Endpoints::parse(&renamed).expect_err("no watchdog").to_string().contains("enable_watchdog"));
+        assert!(
+            Endpoints::parse(&renamed)
+                .expect_err("no watchdog")
+                .to_string()
+                .contains("enable_watchdog")
+        );
         let wrong_type = TEXT.replace("\"bool\"", "\"uint32\"");
-        assert!(matches!(Endpoints::parse(&wrong_type), Err(EndpointsError::Missing { kind: "bool", .. })));
+        assert!(matches!(
+            Endpoints::parse(&wrong_type),
+            Err(EndpointsError::Missing { kind: "bool", .. })
+        ));
     }
 }

@@ -15,7 +15,11 @@ pub(super) fn fuzzing() -> FamilyFuzzing {
         set_up: Vec::new(),
         #[cfg(test)]
         command: {
-            let request = codec::Request::SetPosition { position_rad: 1.0, velocity_rad_s: 0.0, torque_nm: 0.0 };
+            let request = codec::Request::SetPosition {
+                position_rad: 1.0,
+                velocity_rad_s: 0.0,
+                torque_nm: 0.0,
+            };
             codec::encode_request(node, &request).expect("the example can be encoded")
         },
         #[cfg(test)]

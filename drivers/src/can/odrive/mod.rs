@@ -1,7 +1,7 @@
 //! `ODrive` axes with CANSimple. They send their encoder estimates and heartbeats periodically.
 //!
-//! Watchdog: `axis0.config.watchdog_timeout` and `enable_watchdog`; the axis is disarmed. Source: ODrive documentation,
-//! error `WATCHDOG_TIMER_EXPIRED`.
+//! Watchdog: `axis0.config.watchdog_timeout` and `enable_watchdog`; the axis is disarmed. Source:
+//! ODrive documentation, error `WATCHDOG_TIMER_EXPIRED`.
 
 pub mod codec;
 #[cfg(feature = "emulation")]
@@ -15,7 +15,8 @@ pub use codec::Node;
 pub use endpoints::{Endpoints, EndpointsError};
 
 use super::family::{
-    MotionProtocol, MotorFamily, MotorProtocol, MotorReading, Reports, Traffic, UNLIMITED, short_frame,
+    MotionProtocol, MotorFamily, MotorProtocol, MotorReading, Reports, Traffic, UNLIMITED,
+    short_frame,
 };
 use super::query::MotorQuery;
 use super::settings::MotorSettings;
@@ -106,16 +107,27 @@ impl MotorProtocol for Odrive {
 
     fn read(&self, frame: &Frame, _limits: &Limits) -> Option<MotorReading> {
         match codec::decode_answer(frame) {
-            Ok((from, Answer::Motion { position_rad, velocity_rad_s })) if from == self.node => {
-                Some(MotorReading { position_rad, velocity_rad_s, torque_nm: None })
-            }
+            Ok((
+                from,
+                Answer::Motion {
+                    position_rad,
+                    velocity_rad_s,
+                },
+            )) if from == self.node => Some(MotorReading {
+                position_rad,
+                velocity_rad_s,
+                torque_nm: None,
+            }),
             _ => None,
         }
     }
 
     fn traffic(&self) -> Traffic {
         let unsolicited = vec![(short_frame(), REPORT_HZ), (short_frame(), HEARTBEAT_HZ)];
-        Traffic { cycle_frames: vec![short_frame()], unsolicited }
+        Traffic {
+            cycle_frames: vec![short_frame()],
+            unsolicited,
+        }
     }
 
     fn watchdog(&self, plan: &WatchdogPlan) -> Watchdog {

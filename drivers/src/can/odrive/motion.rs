@@ -40,10 +40,11 @@ impl OdriveMotion {
 
     /// Checks that the endpoint numbers belong to the firmware of the axis.
     fn check_endpoints(&self, query: &MotorQuery<'_>, endpoints: &Endpoints) -> Result<(), Error> {
-        let (hardware, firmware) = self.ask(query, &Request::Ask(Code::Version), |answer| match answer {
-            Answer::Version { hardware, firmware } => Some((hardware, firmware)),
-            _ => None,
-        })?;
+        let (hardware, firmware) =
+            self.ask(query, &Request::Ask(Code::Version), |answer| match answer {
+                Answer::Version { hardware, firmware } => Some((hardware, firmware)),
+                _ => None,
+            })?;
         match endpoints.match_versions(hardware, firmware) {
             true => Ok(()),
             false => Err(query.fault(format!(
@@ -71,21 +72,34 @@ impl MotionProtocol for OdriveMotion {
     }
 
     fn set_watchdog(&self, query: &MotorQuery<'_>, plan: &WatchdogPlan) -> Result<(), Error> {
-        let Some(endpoints) = &plan.endpoints else { return Ok(()) };
+        let Some(endpoints) = &plan.endpoints else {
+            return Ok(());
+        };
         self.check_endpoints(query, endpoints)?;
         // A flag is one byte; the bytes after it in an answer are undefined.
         let settings = [
-            (endpoints.watchdog_timeout, plan.timeout.as_secs_f32().to_le_bytes(), 4),
+            (
+                endpoints.watchdog_timeout,
+                plan.timeout.as_secs_f32().to_le_bytes(),
+                4,
+            ),
             (endpoints.enable_watchdog, [1, 0, 0, 0], 1),
         ];
         for (number, bytes, n_bytes) in settings {
             query.send(self.encode(&Request::WriteEndpoint(number, bytes)))?;
-            let reported = self.ask(query, &Request::ReadEndpoint(number), |answer| match answer {
-                Answer::Endpoint(reported, bytes) => (reported == number).then_some(bytes),
-                _ => None,
-            })?;
+            let reported = self.ask(
+                query,
+                &Request::ReadEndpoint(number),
+                |answer| match answer {
+                    Answer::Endpoint(reported, bytes) => (reported == number).then_some(bytes),
+                    _ => None,
+                },
+            )?;
             if reported[..n_bytes] != bytes[..n_bytes] {
-                return Err(query.timeout_mismatch(plan.timeout, &format!("{reported:?} in endpoint {number}")));
+                return Err(query.timeout_mismatch(
+                    plan.timeout,
+                    &format!("{reported:?} in endpoint {number}"),
+                ));
             }
         }
         Ok(())
@@ -97,12 +111,26 @@ impl MotionProtocol for OdriveMotion {
 
     fn enable(&self) -> Result<Vec<Frame>, CanError> {
         // The watchdog of the axis may have expired while the axis was disabled.
-        [Request::ClearErrors, Request::SetState(State::ClosedLoopControl)].iter().map(|it| self.encode(it)).collect()
+        [
+            Request::ClearErrors,
+            Request::SetState(State::ClosedLoopControl),
+        ]
+        .iter()
+        .map(|it| self.encode(it))
+        .collect()
     }
 
     fn command(&self, command: &Command) -> Result<Frame, CanError> {
-        let Command { position_rad, velocity_rad_s, .. } = *command;
-        self.encode(&Request::SetPosition { position_rad, velocity_rad_s, torque_nm: 0.0 })
+        let Command {
+            position_rad,
+            velocity_rad_s,
+            ..
+        } = *command;
+        self.encode(&Request::SetPosition {
+            position_rad,
+            velocity_rad_s,
+            torque_nm: 0.0,
+        })
     }
 
     fn release(&self) -> Result<Frame, CanError> {
@@ -111,12 +139,18 @@ impl MotionProtocol for OdriveMotion {
 
     fn health(&mut self, frame: &Frame) -> Option<Health> {
         match codec::decode_answer(frame) {
-            Ok((from, Answer::Heartbeat { errors, state })) if from == self.node => Some(match (errors, state) {
-                (0, State::ClosedLoopControl) => Health::Enabled,
-                (0, _) => Health::Off,
-                (codec::WATCHDOG_TIMER_EXPIRED, _) => Health::Fault(COMMUNICATION_LOST.to_owned()),
-                (errors, _) => Health::Fault(format!("the axis reports the errors {errors:#x}")),
-            }),
+            Ok((from, Answer::Heartbeat { errors, state })) if from == self.node => {
+                Some(match (errors, state) {
+                    (0, State::ClosedLoopControl) => Health::Enabled,
+                    (0, _) => Health::Off,
+                    (codec::WATCHDOG_TIMER_EXPIRED, _) => {
+                        Health::Fault(COMMUNICATION_LOST.to_owned())
+                    }
+                    (errors, _) => {
+                        Health::Fault(format!("the axis reports the errors {errors:#x}"))
+                    }
+                })
+            }
             _ => None,
         }
     }

@@ -1,10 +1,12 @@
-//! Robstride motors with their private protocol: the 29-bit CAN ID contains a communication type, two IDs and flags.
+//! Robstride motors with their private protocol: the 29-bit CAN ID contains a communication type,
+//! two IDs and flags.
 //!
-//! Sources: `RobStride/SampleProgram` (`Robstride.cpp`: types 0 to 25 and their bytes, active report of 10 ms); RS00 to
-//! RS06 user manuals (scalings, fault bits, parameter table, `canTimeout` of 20 000 ticks per second, 0 for never).
-//! This module uses the scalings of the manuals. The table of the Python package `robstride_dynamics` differs for RS00,
-//! RS03, RS05 and RS06, and gives torques of an RS05 that are three times too high (motorbridge/motorbridge pull
-//! request 11). RS02 firmware up to 0.2.2.11 uses a range of 12.5 rad.
+//! Sources: `RobStride/SampleProgram` (`Robstride.cpp`: types 0 to 25 and their bytes, active
+//! report of 10 ms); RS00 to RS06 user manuals (scalings, fault bits, parameter table, `canTimeout`
+//! of 20 000 ticks per second, 0 for never). This module uses the scalings of the manuals. The
+//! table of the Python package `robstride_dynamics` differs for RS00, RS03, RS05 and RS06, and
+//! gives torques of an RS05 that are three times too high (motorbridge/motorbridge pull request
+//! 11). RS02 firmware up to 0.2.2.11 uses a range of 12.5 rad.
 
 pub use super::parameter::{Parameter, Value, timeout};
 
@@ -50,7 +52,13 @@ impl Model {
 
 /// Limits of the large motors, whose gains have larger ranges.
 const fn large(velocity_rad_s: f64, torque_nm: f64) -> Limits {
-    Limits { position_rad: 4.0 * PI, velocity_rad_s, torque_nm, kp_nm_rad: 5000.0, kd_nm_s_rad: 100.0 }
+    Limits {
+        position_rad: 4.0 * PI,
+        velocity_rad_s,
+        torque_nm,
+        kp_nm_rad: 5000.0,
+        kd_nm_s_rad: 100.0,
+    }
 }
 
 /// Communication type in bits 24 to 28 of the identifier.
@@ -177,29 +185,70 @@ pub struct Feedback {
 }
 
 /// Encodes a request from the host ID `host` to the motor ID `motor`.
-pub fn encode_request(host: u8, motor: u8, request: &Request, limits: &Limits) -> Result<Frame, CanError> {
+pub fn encode_request(
+    host: u8,
+    motor: u8,
+    request: &Request,
+    limits: &Limits,
+) -> Result<Frame, CanError> {
     let host_only = u16::from(host);
-    let with_magic = |last: u8| [MAGIC[0], MAGIC[1], MAGIC[2], MAGIC[3], MAGIC[4], MAGIC[5], last, 8];
+    let with_magic = |last: u8| {
+        [
+            MAGIC[0], MAGIC[1], MAGIC[2], MAGIC[3], MAGIC[4], MAGIC[5], last, 8,
+        ]
+    };
     let (kind, middle, bytes) = match *request {
         Request::Identify => (Communication::Identity, host_only, [0; 8]),
         Request::Move(command) => {
             let scales = Scales::with_bits(limits, 16);
-            let [p1, p0] = scales.position.raw_from_value("the position", command.position_rad)?.to_be_bytes();
-            let [v1, v0] = scales.velocity.raw_from_value("the velocity", command.velocity_rad_s)?.to_be_bytes();
-            let [kp1, kp0] = scales.kp.raw_from_value("kp", command.kp_nm_rad)?.to_be_bytes();
-            let [kd1, kd0] = scales.kd.raw_from_value("kd", command.kd_nm_s_rad)?.to_be_bytes();
-            let torque = scales.torque.raw_from_value("the torque", command.torque_nm)?;
-            (Communication::Motion, torque, [p1, p0, v1, v0, kp1, kp0, kd1, kd0])
+            let [p1, p0] = scales
+                .position
+                .raw_from_value("the position", command.position_rad)?
+                .to_be_bytes();
+            let [v1, v0] = scales
+                .velocity
+                .raw_from_value("the velocity", command.velocity_rad_s)?
+                .to_be_bytes();
+            let [kp1, kp0] = scales
+                .kp
+                .raw_from_value("kp", command.kp_nm_rad)?
+                .to_be_bytes();
+            let [kd1, kd0] = scales
+                .kd
+                .raw_from_value("kd", command.kd_nm_s_rad)?
+                .to_be_bytes();
+            let torque = scales
+                .torque
+                .raw_from_value("the torque", command.torque_nm)?;
+            (
+                Communication::Motion,
+                torque,
+                [p1, p0, v1, v0, kp1, kp0, kd1, kd0],
+            )
         }
         Request::Enable => (Communication::Enable, host_only, [0; 8]),
-        Request::Stop { clear_fault } => (Communication::Stop, host_only, [clear_fault.into(), 0, 0, 0, 0, 0, 0, 0]),
+        Request::Stop { clear_fault } => (
+            Communication::Stop,
+            host_only,
+            [clear_fault.into(), 0, 0, 0, 0, 0, 0, 0],
+        ),
         Request::SetZero => (Communication::SetZero, host_only, [1, 0, 0, 0, 0, 0, 0, 0]),
-        Request::Read(parameter) => (Communication::ReadParameter, host_only, parameter.bytes([0; 4])),
-        Request::Write(parameter, value) => {
-            (Communication::WriteParameter, host_only, parameter.bytes(parameter.value_bytes(value)?))
-        }
+        Request::Read(parameter) => (
+            Communication::ReadParameter,
+            host_only,
+            parameter.bytes([0; 4]),
+        ),
+        Request::Write(parameter, value) => (
+            Communication::WriteParameter,
+            host_only,
+            parameter.bytes(parameter.value_bytes(value)?),
+        ),
         Request::Store => (Communication::Store, host_only, with_magic(7)),
-        Request::ReportActively(on) => (Communication::ActiveReport, host_only, with_magic(on.into())),
+        Request::ReportActively(on) => (
+            Communication::ActiveReport,
+            host_only,
+            with_magic(on.into()),
+        ),
     };
     Frame::classic(id_of(kind, middle, motor)?, &bytes)
 }
@@ -225,9 +274,19 @@ pub fn decode_move(frame: &Frame, motor: u8, limits: &Limits) -> Option<Command>
 pub fn decode_answer(frame: &Frame, host: u8, limits: &Limits) -> Result<Answer, CanError> {
     let bytes = eight_bytes(frame, MESSAGE, true)?;
     let [kind, flags, motor, to] = frame.id().value().to_be_bytes();
-    let foreign = CanError::UnexpectedFrame { message: MESSAGE, id: frame.id().value() };
+    let foreign = CanError::UnexpectedFrame {
+        message: MESSAGE,
+        id: frame.id().value(),
+    };
     if kind == Communication::Identity as u8 {
-        return if to == BROADCAST { Ok(Answer::Identity { motor, serial: bytes }) } else { Err(foreign) };
+        return if to == BROADCAST {
+            Ok(Answer::Identity {
+                motor,
+                serial: bytes,
+            })
+        } else {
+            Err(foreign)
+        };
     }
     if to != host {
         return Err(foreign);
@@ -239,7 +298,9 @@ pub fn decode_answer(frame: &Frame, host: u8, limits: &Limits) -> Result<Answer,
         return Ok(Answer::Feedback(Feedback {
             motor,
             is_unsolicited: kind == Communication::ActiveReport as u8,
-            mode: decode_enum("the mode", (flags >> 6).into(), &modes, |known| known as u32)?,
+            mode: decode_enum("the mode", (flags >> 6).into(), &modes, |known| {
+                known as u32
+            })?,
             faults: Faults(flags & 0x3F),
             motion: Motion {
                 position_rad: scales.position.value_from_raw(u16::from_be_bytes([a, b])),
@@ -252,35 +313,77 @@ pub fn decode_answer(frame: &Frame, host: u8, limits: &Limits) -> Result<Answer,
     if kind == Communication::ReadParameter as u8 {
         let index = u16::from_le_bytes([a, b]);
         if flags != 0 {
-            return Err(CanError::Refused { parameter: index.into() });
+            return Err(CanError::Refused {
+                parameter: index.into(),
+            });
         }
         let parameter = Parameter::of_index(index)?;
         let value = parameter.value([e, f, g, h]);
-        return Ok(Answer::Parameter { motor, parameter, value });
+        return Ok(Answer::Parameter {
+            motor,
+            parameter,
+            value,
+        });
     }
     if kind == Communication::Fault as u8 {
-        let (faults, warnings) = (u32::from_le_bytes([a, b, c, d]), u32::from_le_bytes([e, f, g, h]));
-        return Ok(Answer::Fault { motor, faults, warnings });
+        let (faults, warnings) = (
+            u32::from_le_bytes([a, b, c, d]),
+            u32::from_le_bytes([e, f, g, h]),
+        );
+        return Ok(Answer::Fault {
+            motor,
+            faults,
+            warnings,
+        });
     }
-    Err(CanError::Undefined { field: "the communication type", raw: kind.into() })
+    Err(CanError::Undefined {
+        field: "the communication type",
+        raw: kind.into(),
+    })
 }
 
-/// Encodes the feedback of an emulated motor to the host ID `host`. The temperature must be 0 to 6553.5.
-#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "checked to be within 16 bits first")]
+/// Encodes the feedback of an emulated motor to the host ID `host`. The temperature must be 0 to
+/// 6553.5.
+#[expect(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "checked to be within 16 bits first"
+)]
 pub fn encode_feedback(host: u8, feedback: &Feedback, limits: &Limits) -> Result<Frame, CanError> {
     let scales = Scales::with_bits(limits, 16);
-    let [a, b] = scales.position.raw_from_value("the position", feedback.motion.position_rad)?.to_be_bytes();
-    let [c, d] = scales.velocity.raw_from_value("the velocity", feedback.motion.velocity_rad_s)?.to_be_bytes();
-    let [e, f] = scales.torque.raw_from_value("the torque", feedback.motion.torque_nm)?.to_be_bytes();
+    let [a, b] = scales
+        .position
+        .raw_from_value("the position", feedback.motion.position_rad)?
+        .to_be_bytes();
+    let [c, d] = scales
+        .velocity
+        .raw_from_value("the velocity", feedback.motion.velocity_rad_s)?
+        .to_be_bytes();
+    let [e, f] = scales
+        .torque
+        .raw_from_value("the torque", feedback.motion.torque_nm)?
+        .to_be_bytes();
     let tenths = (feedback.winding_celsius * 10.0).round();
     if !(0.0..=65_535.0).contains(&tenths) {
         let value = feedback.winding_celsius;
-        return Err(CanError::Range { field: "the temperature", value, lower: 0.0, upper: 6553.5 });
+        return Err(CanError::Range {
+            field: "the temperature",
+            value,
+            lower: 0.0,
+            upper: 6553.5,
+        });
     }
     let [g, h] = (tenths as u16).to_be_bytes();
-    let kind = if feedback.is_unsolicited { Communication::ActiveReport } else { Communication::Feedback };
+    let kind = if feedback.is_unsolicited {
+        Communication::ActiveReport
+    } else {
+        Communication::Feedback
+    };
     let flags = (feedback.mode as u8) << 6 | (feedback.faults.0 & 0x3F);
-    Frame::classic(id_of(kind, u16::from_be_bytes([flags, feedback.motor]), host)?, &[a, b, c, d, e, f, g, h])
+    Frame::classic(
+        id_of(kind, u16::from_be_bytes([flags, feedback.motor]), host)?,
+        &[a, b, c, d, e, f, g, h],
+    )
 }
 
 fn id_of(kind: Communication, middle: u16, to: u8) -> Result<Id, CanError> {
@@ -302,34 +405,64 @@ mod tests {
     #[test]
     fn requests_match_manufacturer_bytes() {
         let zero_command = Request::Move(Command::default());
-        let max =
-            Command { position_rad: 99.0, velocity_rad_s: 99.0, kp_nm_rad: 9e3, kd_nm_s_rad: 9.0, torque_nm: -99.0 };
+        let max = Command {
+            position_rad: 99.0,
+            velocity_rad_s: 99.0,
+            kp_nm_rad: 9e3,
+            kd_nm_s_rad: 9.0,
+            torque_nm: -99.0,
+        };
         for (request, id, bytes) in [
             (Request::Identify, 0x0000_FD7F, [0; 8]),
-            (zero_command, 0x017F_FF7F, [0x7F, 0xFF, 0x7F, 0xFF, 0, 0, 0, 0]),
+            (
+                zero_command,
+                0x017F_FF7F,
+                [0x7F, 0xFF, 0x7F, 0xFF, 0, 0, 0, 0],
+            ),
             (Request::Move(max), 0x0100_007F, [0xFF; 8]),
             (Request::Enable, 0x0300_FD7F, [0; 8]),
             (Request::Stop { clear_fault: false }, 0x0400_FD7F, [0; 8]),
-            (Request::Stop { clear_fault: true }, 0x0400_FD7F, [1, 0, 0, 0, 0, 0, 0, 0]),
+            (
+                Request::Stop { clear_fault: true },
+                0x0400_FD7F,
+                [1, 0, 0, 0, 0, 0, 0, 0],
+            ),
             (Request::SetZero, 0x0600_FD7F, [1, 0, 0, 0, 0, 0, 0, 0]),
             // The manual's example of type 17.
-            (Request::Read(Parameter::PositionGain), 0x1100_FD7F, [0x1E, 0x70, 0, 0, 0, 0, 0, 0]),
+            (
+                Request::Read(Parameter::PositionGain),
+                0x1100_FD7F,
+                [0x1E, 0x70, 0, 0, 0, 0, 0, 0],
+            ),
             (
                 Request::Write(Parameter::Timeout, timeout(1.0).expect("in range")),
                 0x1200_FD7F,
                 [0x28, 0x70, 0, 0, 0x20, 0x4E, 0, 0],
             ),
             (Request::Store, 0x1600_FD7F, [1, 2, 3, 4, 5, 6, 7, 8]),
-            (Request::ReportActively(true), 0x1800_FD7F, [1, 2, 3, 4, 5, 6, 1, 8]),
+            (
+                Request::ReportActively(true),
+                0x1800_FD7F,
+                [1, 2, 3, 4, 5, 6, 1, 8],
+            ),
         ] {
-            assert_eq!(encode_request(HOST, 0x7F, &request, &LIMITS), Ok(frame(id, bytes)), "{request:?}");
+            assert_eq!(
+                encode_request(HOST, 0x7F, &request, &LIMITS),
+                Ok(frame(id, bytes)),
+                "{request:?}"
+            );
         }
     }
 
     #[test]
     fn move_request_round_trips() {
-        let command =
-            Command { position_rad: 1.5, velocity_rad_s: -3.0, kp_nm_rad: 60.0, kd_nm_s_rad: 1.25, torque_nm: 0.5 };
+        let command = Command {
+            position_rad: 1.5,
+            velocity_rad_s: -3.0,
+            kp_nm_rad: 60.0,
+            kd_nm_s_rad: 1.25,
+            torque_nm: 0.5,
+        };
         let sent = encode_request(HOST, 5, &Request::Move(command), &LIMITS).expect("numbers");
         let got = decode_move(&sent, 5, &LIMITS).expect("the command is addressed to this motor");
         // Tolerances: half a quantization step of 16 bits.
@@ -346,22 +479,62 @@ mod tests {
         let read = |id, bytes| decode_answer(&frame(id, bytes), HOST, &LIMITS);
         // The manual's example of type 17: loc_kp is 30.
         let (parameter, value) = (Parameter::PositionGain, Value::Float(30.0));
-        let parameter_answer = Answer::Parameter { motor: 0x7F, parameter, value };
-        assert_eq!(read(0x1100_7FFD, [0x1E, 0x70, 0, 0, 0, 0, 0xF0, 0x41]), Ok(parameter_answer));
-        assert_eq!(read(0x1101_7FFD, [0x1E, 0x70, 0, 0, 0, 0, 0, 0]), Err(CanError::Refused { parameter: 0x701E }));
-        let mode = Answer::Parameter { motor: 1, parameter: Parameter::RunMode, value: Value::Integer(2) };
+        let parameter_answer = Answer::Parameter {
+            motor: 0x7F,
+            parameter,
+            value,
+        };
+        assert_eq!(
+            read(0x1100_7FFD, [0x1E, 0x70, 0, 0, 0, 0, 0xF0, 0x41]),
+            Ok(parameter_answer)
+        );
+        assert_eq!(
+            read(0x1101_7FFD, [0x1E, 0x70, 0, 0, 0, 0, 0, 0]),
+            Err(CanError::Refused { parameter: 0x701E })
+        );
+        let mode = Answer::Parameter {
+            motor: 1,
+            parameter: Parameter::RunMode,
+            value: Value::Integer(2),
+        };
         assert_eq!(read(0x1100_01FD, [0x05, 0x70, 0, 0, 2, 9, 9, 9]), Ok(mode));
-        assert_eq!(read(0x0000_05FE, [7; 8]), Ok(Answer::Identity { motor: 5, serial: [7; 8] }));
-        let fault = Answer::Fault { motor: 5, faults: 1 << 14, warnings: 1 };
+        assert_eq!(
+            read(0x0000_05FE, [7; 8]),
+            Ok(Answer::Identity {
+                motor: 5,
+                serial: [7; 8]
+            })
+        );
+        let fault = Answer::Fault {
+            motor: 5,
+            faults: 1 << 14,
+            warnings: 1,
+        };
         assert_eq!(read(0x1500_05FD, [0, 0x40, 0, 0, 1, 0, 0, 0]), Ok(fault));
 
-        let motion = Motion { position_rad: 4.0 * PI, velocity_rad_s: -33.0, torque_nm: 14.0 };
+        let motion = Motion {
+            position_rad: 4.0 * PI,
+            velocity_rad_s: -33.0,
+            torque_nm: 14.0,
+        };
         for (kind, is_unsolicited) in [(0x02, false), (0x18, true)] {
             let faults = Faults(Faults::UNCALIBRATED | Faults::UNDER_VOLTAGE);
-            let feedback =
-                Feedback { motor: 0x11, is_unsolicited, mode: Mode::Run, faults, motion, winding_celsius: 30.5 };
-            let sent = frame(kind << 24 | 0x00A1_11FD, [0xFF, 0xFF, 0, 0, 0xFF, 0xFF, 0x01, 0x31]);
-            assert_eq!(decode_answer(&sent, HOST, &LIMITS), Ok(Answer::Feedback(feedback)));
+            let feedback = Feedback {
+                motor: 0x11,
+                is_unsolicited,
+                mode: Mode::Run,
+                faults,
+                motion,
+                winding_celsius: 30.5,
+            };
+            let sent = frame(
+                kind << 24 | 0x00A1_11FD,
+                [0xFF, 0xFF, 0, 0, 0xFF, 0xFF, 0x01, 0x31],
+            );
+            assert_eq!(
+                decode_answer(&sent, HOST, &LIMITS),
+                Ok(Answer::Feedback(feedback))
+            );
             assert_eq!(encode_feedback(HOST, &feedback, &LIMITS), Ok(sent));
         }
     }
@@ -369,19 +542,57 @@ mod tests {
     #[test]
     fn invalid_messages_are_rejected() {
         let read = |id, bytes| decode_answer(&frame(id, bytes), HOST, &LIMITS);
-        assert!(matches!(read(0x0280_11FC, [0; 8]), Err(CanError::UnexpectedFrame { .. })));
-        assert_eq!(read(0x02C0_11FD, [0; 8]), Err(CanError::Undefined { field: "the mode", raw: 3 }));
-        assert_eq!(read(0x1F00_11FD, [0; 8]), Err(CanError::Undefined { field: "the communication type", raw: 31 }));
-        assert_eq!(read(0x1100_11FD, [1; 8]), Err(CanError::Undefined { field: "the parameter", raw: 0x0101 }));
+        assert!(matches!(
+            read(0x0280_11FC, [0; 8]),
+            Err(CanError::UnexpectedFrame { .. })
+        ));
+        assert_eq!(
+            read(0x02C0_11FD, [0; 8]),
+            Err(CanError::Undefined {
+                field: "the mode",
+                raw: 3
+            })
+        );
+        assert_eq!(
+            read(0x1F00_11FD, [0; 8]),
+            Err(CanError::Undefined {
+                field: "the communication type",
+                raw: 31
+            })
+        );
+        assert_eq!(
+            read(0x1100_11FD, [1; 8]),
+            Err(CanError::Undefined {
+                field: "the parameter",
+                raw: 0x0101
+            })
+        );
         for malformed in truncated_and_doubled(&frame(0x0280_11FD, [0x80; 8])) {
-            assert!(matches!(decode_answer(&malformed, HOST, &LIMITS), Err(CanError::Length { .. })));
+            assert!(matches!(
+                decode_answer(&malformed, HOST, &LIMITS),
+                Err(CanError::Length { .. })
+            ));
         }
         let requested = |request| encode_request(HOST, 1, &request, &LIMITS);
         assert!(requested(Request::Write(Parameter::RunMode, Value::Integer(256))).is_err());
         assert!(requested(Request::Write(Parameter::RunMode, Value::Float(0.0))).is_err());
-        assert!(requested(Request::Write(Parameter::TorqueLimit, Value::Float(f32::NAN))).is_err());
-        let non_finite = Command { torque_nm: f64::NAN, ..Command::default() };
-        assert_eq!(requested(Request::Move(non_finite)), Err(CanError::NotFinite { field: "the torque" }));
+        assert!(
+            requested(Request::Write(
+                Parameter::TorqueLimit,
+                Value::Float(f32::NAN)
+            ))
+            .is_err()
+        );
+        let non_finite = Command {
+            torque_nm: f64::NAN,
+            ..Command::default()
+        };
+        assert_eq!(
+            requested(Request::Move(non_finite)),
+            Err(CanError::NotFinite {
+                field: "the torque"
+            })
+        );
     }
 
     #[test]
@@ -390,7 +601,12 @@ mod tests {
         for frame in random_frames(17, Id::extended(0x0280_11FD).expect("29 bits")) {
             if let Ok(Answer::Feedback(feedback)) = decode_answer(&frame, HOST, &LIMITS) {
                 n_read += 1;
-                assert_eq!(encode_feedback(HOST, &feedback, &LIMITS).expect("own").data(), frame.data());
+                assert_eq!(
+                    encode_feedback(HOST, &feedback, &LIMITS)
+                        .expect("own")
+                        .data(),
+                    frame.data()
+                );
             }
         }
         assert!(n_read > 100, "{n_read}");
@@ -407,7 +623,13 @@ mod tests {
             (Model::Rs05, 50.0, 5.5, 500.0, 5.0),
             (Model::Rs06, 50.0, 36.0, 5000.0, 100.0),
         ] {
-            let limits = Limits { position_rad: 4.0 * PI, velocity_rad_s, torque_nm, kp_nm_rad: kp, kd_nm_s_rad: kd };
+            let limits = Limits {
+                position_rad: 4.0 * PI,
+                velocity_rad_s,
+                torque_nm,
+                kp_nm_rad: kp,
+                kd_nm_s_rad: kd,
+            };
             assert_eq!(model.limits(), limits, "{model:?}");
         }
     }

@@ -21,7 +21,9 @@ impl EmulatedProtocol for EmulatedRobstride {
     fn take(&mut self, frame: &Frame, drive: &mut EmulatedDrive) -> Result<Vec<Frame>, CanError> {
         let id = frame.id();
         let [kind, _, host, to] = id.value().to_be_bytes();
-        let Ok(bytes) = <[u8; 8]>::try_from(frame.data()) else { return Ok(Vec::new()) };
+        let Ok(bytes) = <[u8; 8]>::try_from(frame.data()) else {
+            return Ok(Vec::new());
+        };
         if !id.is_extended() || frame.is_remote() || to != self.motor {
             return Ok(Vec::new());
         }
@@ -30,7 +32,10 @@ impl EmulatedProtocol for EmulatedRobstride {
         match kind {
             1 => {
                 let command = codec::decode_move(frame, self.motor, &drive.limits);
-                if drive.setting(Parameter::RunMode as u32).is_none_or(|mode| mode == codec::MOTION_MODE) {
+                if drive
+                    .setting(Parameter::RunMode as u32)
+                    .is_none_or(|mode| mode == codec::MOTION_MODE)
+                {
                     command.into_iter().for_each(|command| drive.obey(command));
                 }
             }
@@ -68,7 +73,9 @@ impl EmulatedProtocol for EmulatedRobstride {
     }
 
     fn timeout(&self, drive: &EmulatedDrive) -> Option<Duration> {
-        let ticks = drive.setting(Parameter::Timeout as u32).filter(|ticks| *ticks > 0)?;
+        let ticks = drive
+            .setting(Parameter::Timeout as u32)
+            .filter(|ticks| *ticks > 0)?;
         Some(Duration::from_secs_f64(f64::from(ticks) / TICKS_HZ))
     }
 
@@ -82,7 +89,11 @@ impl EmulatedRobstride {
         let reply = codec::Feedback {
             motor: self.motor,
             is_unsolicited,
-            mode: if drive.state() == State::Enabled { Mode::Run } else { Mode::Reset },
+            mode: if drive.state() == State::Enabled {
+                Mode::Run
+            } else {
+                Mode::Reset
+            },
             faults: Faults(drive.faults.to_le_bytes()[0]),
             motion: drive.motion(),
             winding_celsius: CELSIUS.into(),

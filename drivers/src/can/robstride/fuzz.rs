@@ -6,12 +6,16 @@ use crate::can::family::{FamilyFuzzing, LIMITS};
 use crate::wire::can::Frame;
 use std::sync::Arc;
 
-const MOTOR: Robstride = Robstride { motor: 2, model: Model::Rs02 };
+const MOTOR: Robstride = Robstride {
+    motor: 2,
+    model: Model::Rs02,
+};
 
 pub(super) fn fuzzing() -> FamilyFuzzing {
     #[cfg(test)]
     let encode = |request| {
-        codec::encode_request(HOST, MOTOR.motor, &request, &MOTOR.model.limits()).expect("the example can be encoded")
+        codec::encode_request(HOST, MOTOR.motor, &request, &MOTOR.model.limits())
+            .expect("the example can be encoded")
     };
     FamilyFuzzing {
         motor: Arc::new(MOTOR),

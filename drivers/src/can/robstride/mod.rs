@@ -1,8 +1,8 @@
 //! Robstride motors with their private protocol. Once configured, they report periodically.
 //!
-//! Watchdog: parameter `canTimeout`; the motor goes to its reset mode. Do not rely on the damping of its parameter
-//! `damper`, which only protects unpowered motors against surges. Source: RS00 to RS06 user manuals, sections 4.2 and
-//! 4.3.5.
+//! Watchdog: parameter `canTimeout`; the motor goes to its reset mode. Do not rely on the damping
+//! of its parameter `damper`, which only protects unpowered motors against surges. Source: RS00 to
+//! RS06 user manuals, sections 4.2 and 4.3.5.
 
 pub mod codec;
 #[cfg(feature = "emulation")]
@@ -14,7 +14,9 @@ mod parameter;
 
 pub use codec::Model;
 
-use super::family::{MotionProtocol, MotorFamily, MotorProtocol, MotorReading, Reports, Traffic, frame_of_8_bytes};
+use super::family::{
+    MotionProtocol, MotorFamily, MotorProtocol, MotorReading, Reports, Traffic, frame_of_8_bytes,
+};
 use super::query::MotorQuery;
 use super::settings::{AllowedValues, MotorKey, MotorSettings, word};
 use super::watchdog::{Watchdog, WatchdogPlan};
@@ -62,7 +64,11 @@ impl MotorFamily for RobstrideFamily {
 
     fn keys(&self) -> Vec<MotorKey> {
         let allowed = AllowedValues::Words(MODELS.iter().map(|(name, _)| *name).collect());
-        vec![MotorKey { name: MODEL, allowed, required: Some("model printed on the motor") }]
+        vec![MotorKey {
+            name: MODEL,
+            allowed,
+            required: Some("model printed on the motor"),
+        }]
     }
 
     fn has_gains(&self) -> bool {
@@ -70,7 +76,10 @@ impl MotorFamily for RobstrideFamily {
     }
 
     fn motor(&self, settings: &MotorSettings) -> Option<Arc<dyn MotorProtocol>> {
-        let (motor, model) = (u8::try_from(settings.id).ok()?, settings.choice(MODEL, &MODELS)?);
+        let (motor, model) = (
+            u8::try_from(settings.id).ok()?,
+            settings.choice(MODEL, &MODELS)?,
+        );
         Some(Arc::new(Robstride { motor, model }))
     }
 
@@ -96,14 +105,24 @@ impl Robstride {
     }
 
     /// Reads a parameter.
-    fn parameter(self, query: &MotorQuery<'_>, parameter: Parameter, limits: &Limits) -> Result<Value, Error> {
+    fn parameter(
+        self,
+        query: &MotorQuery<'_>,
+        parameter: Parameter,
+        limits: &Limits,
+    ) -> Result<Value, Error> {
         let poll_frame = codec::encode_request(HOST, self.motor, &Request::Read(parameter), limits);
-        query.request_answer(&query.map_error(poll_frame)?, |frame| match codec::decode_answer(frame, HOST, limits) {
-            Ok(Answer::Parameter { motor: from, parameter: reported, value }) => {
-                (from == self.motor && reported == parameter).then_some(value)
-            }
-            _ => None,
-        })
+        query.request_answer(
+            &query.map_error(poll_frame)?,
+            |frame| match codec::decode_answer(frame, HOST, limits) {
+                Ok(Answer::Parameter {
+                    motor: from,
+                    parameter: reported,
+                    value,
+                }) => (from == self.motor && reported == parameter).then_some(value),
+                _ => None,
+            },
+        )
     }
 
     /// The feedback in a frame; `None` if the frame is from another motor or has other content.
@@ -152,11 +171,15 @@ impl MotorProtocol for Robstride {
     }
 
     fn read(&self, frame: &Frame, limits: &Limits) -> Option<MotorReading> {
-        self.feedback(frame, limits).map(|feedback| feedback.motion.into())
+        self.feedback(frame, limits)
+            .map(|feedback| feedback.motion.into())
     }
 
     fn traffic(&self) -> Traffic {
-        Traffic { cycle_frames: vec![long_frame(); 2], unsolicited: vec![(long_frame(), REPORT_HZ)] }
+        Traffic {
+            cycle_frames: vec![long_frame(); 2],
+            unsolicited: vec![(long_frame(), REPORT_HZ)],
+        }
     }
 
     fn watchdog(&self, _plan: &WatchdogPlan) -> Watchdog {
@@ -164,12 +187,18 @@ impl MotorProtocol for Robstride {
     }
 
     fn motion(&self, limits: &Limits) -> Box<dyn MotionProtocol> {
-        Box::new(motion::RobstrideMotion { address: *self, limits: *limits })
+        Box::new(motion::RobstrideMotion {
+            address: *self,
+            limits: *limits,
+        })
     }
 
     #[cfg(feature = "emulation")]
     fn emulated(&self) -> Box<dyn super::emulated::EmulatedProtocol> {
-        Box::new(emulated::EmulatedRobstride { motor: self.motor, reports: false })
+        Box::new(emulated::EmulatedRobstride {
+            motor: self.motor,
+            reports: false,
+        })
     }
 }
 

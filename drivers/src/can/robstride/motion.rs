@@ -22,15 +22,22 @@ impl RobstrideMotion {
     }
 
     /// Writes a parameter and reads it back.
-    fn set(&self, query: &MotorQuery<'_>, parameter: Parameter, value: Value) -> Result<Value, Error> {
-        self.address.send(query, &Request::Write(parameter, value), &self.limits)?;
+    fn set(
+        &self,
+        query: &MotorQuery<'_>,
+        parameter: Parameter,
+        value: Value,
+    ) -> Result<Value, Error> {
+        self.address
+            .send(query, &Request::Write(parameter, value), &self.limits)?;
         self.address.parameter(query, parameter, &self.limits)
     }
 }
 
 impl MotionProtocol for RobstrideMotion {
     fn switch_off(&self, query: &MotorQuery<'_>) -> Result<(), Error> {
-        self.address.send(query, &Request::Stop { clear_fault: true }, &self.limits)?;
+        self.address
+            .send(query, &Request::Stop { clear_fault: true }, &self.limits)?;
         let mut last = None;
         let off = query.wait(MAX_CHANGE, |frame| {
             let reported = self.address.feedback(frame, &self.limits)?;
@@ -74,12 +81,18 @@ impl MotionProtocol for RobstrideMotion {
                 Some(match (reported.mode, reported.faults) {
                     (Mode::Run, Faults(0)) => Health::Enabled,
                     (_, Faults(0)) => Health::Off,
-                    (_, Faults(bits)) => Health::Fault(format!("the motor reports the fault bits {bits:#08b}")),
+                    (_, Faults(bits)) => {
+                        Health::Fault(format!("the motor reports the fault bits {bits:#08b}"))
+                    }
                 })
             }
-            Ok(Answer::Fault { motor: from, faults, .. }) if from == self.address.motor && faults != 0 => {
-                Some(Health::Fault(format!("the motor reports the faults {faults:#x}")))
-            }
+            Ok(Answer::Fault {
+                motor: from,
+                faults,
+                ..
+            }) if from == self.address.motor && faults != 0 => Some(Health::Fault(format!(
+                "the motor reports the faults {faults:#x}"
+            ))),
             _ => None,
         }
     }

@@ -26,7 +26,8 @@ pub enum Parameter {
     PositionGain = 0x701E,
     /// `EPScan_time`: interval of unsolicited reports. 1 is 10 ms; each further unit adds 5 ms.
     ReportInterval = 0x7026,
-    /// `canTimeout`: time without commands after which the motor stops, 20 000 ticks per second; 0 means never.
+    /// `canTimeout`: time without commands after which the motor stops, 20 000 ticks per second; 0
+    /// means never.
     Timeout = 0x7028,
 }
 
@@ -55,7 +56,9 @@ impl Parameter {
 
     /// The parameter with this index.
     pub(super) fn of_index(index: u16) -> Result<Self, CanError> {
-        decode_enum("the parameter", index.into(), &Self::ALL, |known| known as u32)
+        decode_enum("the parameter", index.into(), &Self::ALL, |known| {
+            known as u32
+        })
     }
 
     /// Decodes the value in the last four bytes of a message.
@@ -71,11 +74,16 @@ impl Parameter {
     /// Encodes a value as the last four bytes of a message.
     pub(super) fn value_bytes(self, value: Value) -> Result<[u8; 4], CanError> {
         match (self.integer_bytes(), value) {
-            (Some(n_bytes), Value::Integer(whole)) if n_bytes == 4 || whole < 1 << (8 * n_bytes) => {
+            (Some(n_bytes), Value::Integer(whole))
+                if n_bytes == 4 || whole < 1 << (8 * n_bytes) =>
+            {
                 Ok(whole.to_le_bytes())
             }
             (None, Value::Float(real)) if real.is_finite() => Ok(real.to_le_bytes()),
-            _ => Err(CanError::Undefined { field: "the value for the parameter", raw: self as u32 }),
+            _ => Err(CanError::Undefined {
+                field: "the value for the parameter",
+                raw: self as u32,
+            }),
         }
     }
 
@@ -95,17 +103,28 @@ pub enum Value {
     Float(f32),
 }
 
-/// Converts a time to a value of [`Parameter::Timeout`], rounded up so that no motor stops too early. A time of 0
-/// disables the timeout.
-#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "within u32 by the check")]
+/// Converts a time to a value of [`Parameter::Timeout`], rounded up so that no motor stops too
+/// early. A time of 0 disables the timeout.
+#[expect(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "within u32 by the check"
+)]
 pub fn timeout(timeout_secs: f64) -> Result<Value, CanError> {
     let upper = f64::from(u32::MAX) / TIMEOUT_TICKS_HZ;
     match (0.0..=upper).contains(&timeout_secs) {
         true if timeout_secs == 0.0 => Ok(Value::Integer(0)),
-        // Subtract a small amount so that rounding errors do not add a tick. Never return 0, which would disable the
-        // timeout.
-        true => Ok(Value::Integer((timeout_secs * TIMEOUT_TICKS_HZ - 1e-6).ceil().max(1.0) as u32)),
-        false => Err(CanError::Range { field: "the timeout in seconds", value: timeout_secs, lower: 0.0, upper }),
+        // Subtract a small amount so that rounding errors do not add a tick. Never return 0, which
+        // would disable the timeout.
+        true => Ok(Value::Integer(
+            (timeout_secs * TIMEOUT_TICKS_HZ - 1e-6).ceil().max(1.0) as u32,
+        )),
+        false => Err(CanError::Range {
+            field: "the timeout in seconds",
+            value: timeout_secs,
+            lower: 0.0,
+            upper,
+        }),
     }
 }
 
@@ -116,7 +135,10 @@ mod tests {
     #[test]
     fn timeouts_round_up_to_ticks() {
         for secs in [-1e-3, f64::NAN, f64::INFINITY, 1e9] {
-            assert!(matches!(timeout(secs), Err(CanError::Range { .. })), "{secs}");
+            assert!(
+                matches!(timeout(secs), Err(CanError::Range { .. })),
+                "{secs}"
+            );
         }
         for (secs, ticks) in [(0.0, 0), (1e-12, 1), (0.1, 2000), (1.0, 20_000)] {
             assert_eq!(timeout(secs), Ok(Value::Integer(ticks)), "{secs}");

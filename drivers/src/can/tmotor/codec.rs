@@ -1,8 +1,8 @@
 //! CubeMars (T-Motor) AK motors in MIT mode.
 //!
-//! Sources: `neurobionics/TMotorCANControl` `mit_can.py` (limits, error codes, frames); CubeMars AK Series Module
-//! Product Manual, MIT mode (feedback, temperature offset of 40). The limits depend on the firmware: newer versions
-//! have different limits for some models.
+//! Sources: `neurobionics/TMotorCANControl` `mit_can.py` (limits, error codes, frames); CubeMars AK
+//! Series Module Product Manual, MIT mode (feedback, temperature offset of 40). The limits depend
+//! on the firmware: newer versions have different limits for some models.
 
 use crate::wire::can::mit::{self, Command, Limits, Motion};
 use crate::wire::can::{CanError, Frame, Id, decode_enum};
@@ -118,32 +118,76 @@ pub fn encode_command(motor: u8, command: &Command, limits: &Limits) -> Result<F
 
 /// Encodes a state command to a motor.
 pub fn encode_state_command(motor: u8, state_command: StateCommand) -> Result<Frame, CanError> {
-    Frame::classic(Id::standard(motor.into())?, &[0xFF, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF, state_command as u8])
+    Frame::classic(
+        Id::standard(motor.into())?,
+        &[
+            0xFF,
+            0xFF,
+            0xFF,
+            0xFF,
+            0xFF,
+            0xFF,
+            0xFF,
+            state_command as u8,
+        ],
+    )
 }
 
 /// Decodes a motor's answer of six or eight bytes.
-pub fn decode_feedback(frame: &Frame, limits: &Limits, thermometer: Thermometer) -> Result<Feedback, CanError> {
+pub fn decode_feedback(
+    frame: &Frame,
+    limits: &Limits,
+    thermometer: Thermometer,
+) -> Result<Feedback, CanError> {
     const MESSAGE: &str = "feedback of an AK motor";
     if frame.is_remote() || frame.id().is_extended() {
-        return Err(CanError::UnexpectedFrame { message: MESSAGE, id: frame.id().value() });
+        return Err(CanError::UnexpectedFrame {
+            message: MESSAGE,
+            id: frame.id().value(),
+        });
     }
     let (motor, motion, rest) = match *frame.data() {
-        [motor, a, b, c, d, e, ref rest @ ..] if rest.is_empty() || rest.len() == 2 => (motor, [a, b, c, d, e], rest),
-        ref other => return Err(CanError::Length { message: MESSAGE, got_bytes: other.len(), expected_bytes: 8 }),
+        [motor, a, b, c, d, e, ref rest @ ..] if rest.is_empty() || rest.len() == 2 => {
+            (motor, [a, b, c, d, e], rest)
+        }
+        ref other => {
+            return Err(CanError::Length {
+                message: MESSAGE,
+                got_bytes: other.len(),
+                expected_bytes: 8,
+            });
+        }
     };
     let health = match *rest {
         [temperature, code] => {
-            let zero = if thermometer == Thermometer::Offset40 { 40.0 } else { 0.0 };
-            let fault = decode_enum("the error code", code.into(), &Fault::ALL, |known| known as u32)?;
-            Some(Health { drive_celsius: f64::from(temperature) - zero, fault })
+            let zero = if thermometer == Thermometer::Offset40 {
+                40.0
+            } else {
+                0.0
+            };
+            let fault = decode_enum("the error code", code.into(), &Fault::ALL, |known| {
+                known as u32
+            })?;
+            Some(Health {
+                drive_celsius: f64::from(temperature) - zero,
+                fault,
+            })
         }
         _ => None,
     };
-    Ok(Feedback { motor, motion: mit::decode_motion(motion, limits), health })
+    Ok(Feedback {
+        motor,
+        motion: mit::decode_motion(motion, limits),
+        health,
+    })
 }
 
 /// Encodes the answer of an emulated motor. Its CAN ID is that of the host, `host`, by default 0.
-#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "checked to be 0 to 255 first")]
+#[expect(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "checked to be 0 to 255 first"
+)]
 pub fn encode_feedback(
     host: u8,
     feedback: &Feedback,
@@ -152,12 +196,25 @@ pub fn encode_feedback(
 ) -> Result<Frame, CanError> {
     let mut bytes = vec![feedback.motor];
     bytes.extend(mit::encode_motion(&feedback.motion, limits)?);
-    if let Some(Health { drive_celsius, fault }) = feedback.health {
-        let zero = if thermometer == Thermometer::Offset40 { 40.0 } else { 0.0 };
+    if let Some(Health {
+        drive_celsius,
+        fault,
+    }) = feedback.health
+    {
+        let zero = if thermometer == Thermometer::Offset40 {
+            40.0
+        } else {
+            0.0
+        };
         let count = (drive_celsius + zero).round();
         if !(0.0..=255.0).contains(&count) {
             let field = "the temperature";
-            return Err(CanError::Range { field, value: drive_celsius, lower: -zero, upper: 255.0 - zero });
+            return Err(CanError::Range {
+                field,
+                value: drive_celsius,
+                lower: -zero,
+                upper: 255.0 - zero,
+            });
         }
         bytes.extend([count as u8, fault as u8]);
     }
@@ -178,9 +235,22 @@ mod tests {
     #[test]
     fn commands_match_published_bytes() {
         let enable = encode_state_command(1, StateCommand::Enable).expect("a motor");
-        assert_eq!((enable.id().value(), enable.data()), (1, &[255, 255, 255, 255, 255, 255, 255, 0xFC][..]));
-        assert_eq!(encode_state_command(1, StateCommand::Disable).expect("a motor").data()[7], 0xFD);
-        assert_eq!(encode_state_command(1, StateCommand::SetZero).expect("a motor").data()[7], 0xFE);
+        assert_eq!(
+            (enable.id().value(), enable.data()),
+            (1, &[255, 255, 255, 255, 255, 255, 255, 0xFC][..])
+        );
+        assert_eq!(
+            encode_state_command(1, StateCommand::Disable)
+                .expect("a motor")
+                .data()[7],
+            0xFD
+        );
+        assert_eq!(
+            encode_state_command(1, StateCommand::SetZero)
+                .expect("a motor")
+                .data()[7],
+            0xFE
+        );
         let zero_command = encode_command(104, &Command::default(), &LIMITS).expect("numbers");
         assert_eq!(
             (zero_command.id().value(), zero_command.data()),
@@ -191,16 +261,44 @@ mod tests {
     #[test]
     fn feedback_round_trips() {
         let bytes = [0x68, 0xFF, 0xFF, 0x00, 0x0F, 0xFF, 75, 2];
-        let feedback = decode_feedback(&frame(&bytes), &LIMITS, Thermometer::Offset40).expect("feedback");
-        let motion = Motion { position_rad: 12.5, velocity_rad_s: -50.0, torque_nm: 18.0 };
-        let health = Some(Health { drive_celsius: 35.0, fault: Fault::OverCurrent });
-        assert_eq!(feedback, Feedback { motor: 0x68, motion, health });
-        assert_eq!(encode_feedback(0, &feedback, &LIMITS, Thermometer::Offset40), Ok(frame(&bytes)));
+        let feedback =
+            decode_feedback(&frame(&bytes), &LIMITS, Thermometer::Offset40).expect("feedback");
+        let motion = Motion {
+            position_rad: 12.5,
+            velocity_rad_s: -50.0,
+            torque_nm: 18.0,
+        };
+        let health = Some(Health {
+            drive_celsius: 35.0,
+            fault: Fault::OverCurrent,
+        });
+        assert_eq!(
+            feedback,
+            Feedback {
+                motor: 0x68,
+                motion,
+                health
+            }
+        );
+        assert_eq!(
+            encode_feedback(0, &feedback, &LIMITS, Thermometer::Offset40),
+            Ok(frame(&bytes))
+        );
         let plain = decode_feedback(&frame(&bytes), &LIMITS, Thermometer::Plain).expect("feedback");
         assert_eq!(plain.health.expect("eight bytes").drive_celsius, 75.0);
-        let short = decode_feedback(&frame(&bytes[..6]), &LIMITS, Thermometer::Offset40).expect("feedback");
-        assert_eq!(short, Feedback { health: None, ..feedback });
-        assert_eq!(encode_feedback(0, &short, &LIMITS, Thermometer::Offset40), Ok(frame(&bytes[..6])));
+        let short =
+            decode_feedback(&frame(&bytes[..6]), &LIMITS, Thermometer::Offset40).expect("feedback");
+        assert_eq!(
+            short,
+            Feedback {
+                health: None,
+                ..feedback
+            }
+        );
+        assert_eq!(
+            encode_feedback(0, &short, &LIMITS, Thermometer::Offset40),
+            Ok(frame(&bytes[..6]))
+        );
     }
 
     #[test]
@@ -209,23 +307,41 @@ mod tests {
         let read = |frame: &Frame| decode_feedback(frame, &LIMITS, Thermometer::Offset40);
         assert!(read(&complete).is_ok());
         for malformed in truncated_and_doubled(&complete) {
-            assert_eq!(read(&malformed).is_ok(), malformed.data().len() == 6, "{malformed:?}");
+            assert_eq!(
+                read(&malformed).is_ok(),
+                malformed.data().len() == 6,
+                "{malformed:?}"
+            );
         }
-        let undefined = CanError::Undefined { field: "the error code", raw: 7 };
+        let undefined = CanError::Undefined {
+            field: "the error code",
+            raw: 7,
+        };
         assert_eq!(read(&frame(&[1, 0, 0, 0, 0, 0, 0, 7])), Err(undefined));
         let remote = Frame::remote(complete.id(), 8).expect("classic");
-        assert!(matches!(read(&remote), Err(CanError::UnexpectedFrame { .. })));
+        assert!(matches!(
+            read(&remote),
+            Err(CanError::UnexpectedFrame { .. })
+        ));
         let too_hot = Feedback {
-            health: Some(Health { drive_celsius: 216.0, fault: Fault::None }),
+            health: Some(Health {
+                drive_celsius: 216.0,
+                fault: Fault::None,
+            }),
             ..read(&complete).expect("whole")
         };
-        assert!(matches!(encode_feedback(0, &too_hot, &LIMITS, Thermometer::Offset40), Err(CanError::Range { .. })));
+        assert!(matches!(
+            encode_feedback(0, &too_hot, &LIMITS, Thermometer::Offset40),
+            Err(CanError::Range { .. })
+        ));
         let mut n_read = 0;
         for frame in random_frames(11, complete.id()) {
             if let Ok(feedback) = read(&frame) {
                 n_read += 1;
                 assert_eq!(
-                    encode_feedback(0, &feedback, &LIMITS, Thermometer::Offset40).expect("own").data(),
+                    encode_feedback(0, &feedback, &LIMITS, Thermometer::Offset40)
+                        .expect("own")
+                        .data(),
                     frame.data()
                 );
             }
@@ -243,9 +359,25 @@ mod tests {
             (Model::Ak80x9, 50.0, 18.0),
             (Model::Ak80x64, 8.0, 144.0),
         ] {
-            let read = decode_feedback(&frame(&[1, 0, 0, 255, 255, 255]), &model.limits(), Thermometer::Offset40);
-            let motion = Motion { position_rad: -12.5, velocity_rad_s, torque_nm };
-            assert_eq!(read, Ok(Feedback { motor: 1, motion, health: None }), "{model:?}");
+            let read = decode_feedback(
+                &frame(&[1, 0, 0, 255, 255, 255]),
+                &model.limits(),
+                Thermometer::Offset40,
+            );
+            let motion = Motion {
+                position_rad: -12.5,
+                velocity_rad_s,
+                torque_nm,
+            };
+            assert_eq!(
+                read,
+                Ok(Feedback {
+                    motor: 1,
+                    motion,
+                    health: None
+                }),
+                "{model:?}"
+            );
         }
     }
 }

@@ -15,12 +15,23 @@ pub(super) struct EmulatedTMotor {
 impl EmulatedProtocol for EmulatedTMotor {
     /// Processes a frame. The motor answers every frame that is addressed to it.
     fn take(&mut self, frame: &Frame, drive: &mut EmulatedDrive) -> Result<Vec<Frame>, CanError> {
-        let Ok(bytes) = <[u8; 8]>::try_from(frame.data()) else { return Ok(Vec::new()) };
+        let Ok(bytes) = <[u8; 8]>::try_from(frame.data()) else {
+            return Ok(Vec::new());
+        };
         if frame.id() != Id::standard(self.motor.into())? {
             return Ok(Vec::new());
         }
         match bytes {
-            [0xFF, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF, state_command @ 0xFC..=0xFE] => match state_command {
+            [
+                0xFF,
+                0xFF,
+                0xFF,
+                0xFF,
+                0xFF,
+                0xFF,
+                0xFF,
+                state_command @ 0xFC..=0xFE,
+            ] => match state_command {
                 0xFC if drive.faults == 0 => drive.switch_on(),
                 0xFD => {
                     drive.actuation = Actuation::Free;
@@ -30,10 +41,26 @@ impl EmulatedProtocol for EmulatedTMotor {
             },
             command => drive.obey(mit::decode(&command, &drive.limits)),
         }
-        let fault = if drive.faults == 0 { Fault::None } else { Fault::OverCurrent };
-        let health = Some(Health { drive_celsius: CELSIUS.into(), fault });
-        let reply = codec::Feedback { motor: self.motor, motion: drive.motion(), health };
-        Ok(vec![codec::encode_feedback(0, &reply, &drive.limits, Thermometer::Offset40)?])
+        let fault = if drive.faults == 0 {
+            Fault::None
+        } else {
+            Fault::OverCurrent
+        };
+        let health = Some(Health {
+            drive_celsius: CELSIUS.into(),
+            fault,
+        });
+        let reply = codec::Feedback {
+            motor: self.motor,
+            motion: drive.motion(),
+            health,
+        };
+        Ok(vec![codec::encode_feedback(
+            0,
+            &reply,
+            &drive.limits,
+            Thermometer::Offset40,
+        )?])
     }
 
     fn timeout(&self, _drive: &EmulatedDrive) -> Option<Duration> {

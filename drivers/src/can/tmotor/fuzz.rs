@@ -6,7 +6,10 @@ use crate::can::family::{FamilyFuzzing, LIMITS};
 use crate::wire::can::Frame;
 use std::sync::Arc;
 
-const MOTOR: TMotor = TMotor { motor: 3, model: Model::Ak80x9 };
+const MOTOR: TMotor = TMotor {
+    motor: 3,
+    model: Model::Ak80x9,
+};
 
 pub(super) fn fuzzing() -> FamilyFuzzing {
     FamilyFuzzing {
@@ -15,8 +18,12 @@ pub(super) fn fuzzing() -> FamilyFuzzing {
         #[cfg(test)]
         set_up: Vec::new(),
         #[cfg(test)]
-        command: codec::encode_command(MOTOR.motor, &crate::can::family::STIFF_COMMAND, &MOTOR.model.limits())
-            .expect("the example can be encoded"),
+        command: codec::encode_command(
+            MOTOR.motor,
+            &crate::can::family::STIFF_COMMAND,
+            &MOTOR.model.limits(),
+        )
+        .expect("the example can be encoded"),
         #[cfg(test)]
         transcript: include_str!("transcript.txt"),
         #[cfg(test)]

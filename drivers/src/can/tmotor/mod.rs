@@ -1,8 +1,9 @@
-//! CubeMars (T-Motor) AK motors in MIT mode. They reply only to commands, and a command without gains would make a
-//! motor limp. A read-only arm therefore sends nothing and only listens while another master commands the motors.
+//! CubeMars (T-Motor) AK motors in MIT mode. They reply only to commands, and a command without
+//! gains would make a motor limp. A read-only arm therefore sends nothing and only listens while
+//! another master commands the motors.
 //!
-//! Watchdog: none; the motor executes its last command forever. Source: CubeMars AK Series Module Product Manual, MIT
-//! mode.
+//! Watchdog: none; the motor executes its last command forever. Source: CubeMars AK Series Module
+//! Product Manual, MIT mode.
 
 pub mod codec;
 #[cfg(feature = "emulation")]
@@ -13,7 +14,9 @@ mod motion;
 
 pub use codec::Model;
 
-use super::family::{MotionProtocol, MotorFamily, MotorProtocol, MotorReading, Reports, Traffic, short_frame};
+use super::family::{
+    MotionProtocol, MotorFamily, MotorProtocol, MotorReading, Reports, Traffic, short_frame,
+};
 use super::query::MotorQuery;
 use super::settings::{AllowedValues, MotorKey, MotorSettings, word};
 use super::watchdog::{Watchdog, WatchdogPlan};
@@ -54,7 +57,11 @@ impl MotorFamily for TMotorFamily {
 
     fn keys(&self) -> Vec<MotorKey> {
         let allowed = AllowedValues::Words(MODELS.iter().map(|(name, _)| *name).collect());
-        vec![MotorKey { name: MODEL, allowed, required: Some("model printed on the motor") }]
+        vec![MotorKey {
+            name: MODEL,
+            allowed,
+            required: Some("model printed on the motor"),
+        }]
     }
 
     fn has_gains(&self) -> bool {
@@ -62,7 +69,10 @@ impl MotorFamily for TMotorFamily {
     }
 
     fn motor(&self, settings: &MotorSettings) -> Option<Arc<dyn MotorProtocol>> {
-        let (motor, model) = (u8::try_from(settings.id).ok()?, settings.choice(MODEL, &MODELS)?);
+        let (motor, model) = (
+            u8::try_from(settings.id).ok()?,
+            settings.choice(MODEL, &MODELS)?,
+        );
         Some(Arc::new(TMotor { motor, model }))
     }
 
@@ -84,8 +94,8 @@ pub struct TMotor {
 impl TMotor {
     /// The feedback in a frame; `None` if the frame is from another motor or has other content.
     fn feedback(self, frame: &Frame, limits: &Limits) -> Option<Feedback> {
-        // The CAN ID of commands is the ID of the motor. The CAN ID of answers is the ID of the master, and their first
-        // byte is the ID of the motor.
+        // The CAN ID of commands is the ID of the motor. The CAN ID of answers is the ID of the
+        // master, and their first byte is the ID of the motor.
         if frame.id().value() == u32::from(self.motor) {
             return None;
         }
@@ -126,20 +136,30 @@ impl MotorProtocol for TMotor {
     }
 
     fn read(&self, frame: &Frame, limits: &Limits) -> Option<MotorReading> {
-        self.feedback(frame, limits).map(|feedback| feedback.motion.into())
+        self.feedback(frame, limits)
+            .map(|feedback| feedback.motion.into())
     }
 
     fn traffic(&self) -> Traffic {
-        Traffic { cycle_frames: vec![short_frame(); 2], unsolicited: vec![] }
+        Traffic {
+            cycle_frames: vec![short_frame(); 2],
+            unsolicited: vec![],
+        }
     }
 
     fn watchdog(&self, _plan: &WatchdogPlan) -> Watchdog {
         let actions = &[OnLoss::Hold, OnLoss::Damp, OnLoss::Release];
-        Watchdog::Missing { reason: "a motor of this family has no watchdog", actions }
+        Watchdog::Missing {
+            reason: "a motor of this family has no watchdog",
+            actions,
+        }
     }
 
     fn motion(&self, limits: &Limits) -> Box<dyn MotionProtocol> {
-        Box::new(motion::TMotorMotion { address: *self, limits: *limits })
+        Box::new(motion::TMotorMotion {
+            address: *self,
+            limits: *limits,
+        })
     }
 
     #[cfg(feature = "emulation")]

@@ -19,7 +19,9 @@ pub(super) struct TMotorMotion {
 impl MotionProtocol for TMotorMotion {
     fn switch_off(&self, query: &MotorQuery<'_>) -> Result<(), Error> {
         let disable = query.map_error(self.release())?;
-        query.request_answer(&disable, |frame| self.address.feedback(frame, &self.limits)).map(drop)
+        query
+            .request_answer(&disable, |frame| self.address.feedback(frame, &self.limits))
+            .map(drop)
     }
 
     fn set_watchdog(&self, _query: &MotorQuery<'_>, _plan: &WatchdogPlan) -> Result<(), Error> {
@@ -35,7 +37,10 @@ impl MotionProtocol for TMotorMotion {
     }
 
     fn enable(&self) -> Result<Vec<Frame>, CanError> {
-        Ok(vec![codec::encode_state_command(self.address.motor, StateCommand::Enable)?])
+        Ok(vec![codec::encode_state_command(
+            self.address.motor,
+            StateCommand::Enable,
+        )?])
     }
 
     fn command(&self, command: &Command) -> Result<Frame, CanError> {

@@ -5,8 +5,8 @@ use super::CommandedJoints;
 
 /// Seconds between commands.
 pub(super) const STEP_SECS: f64 = 1e-3;
-/// Tolerance for rounding. Positions are rounded to 4e-16 rad; the third difference of eight such roundings over (1
-/// ms)³ is 3e-6 rad/s³.
+/// Tolerance for rounding. Positions are rounded to 4e-16 rad; the third difference of eight such
+/// roundings over (1 ms)³ is 3e-6 rad/s³.
 const ROUNDING: f64 = 1e-5;
 
 /// Limits of the joints of one robot.
@@ -24,8 +24,8 @@ pub struct Limits {
     pub braking: Option<[BrakingLimit; N_JOINTS]>,
 }
 
-/// Velocity limit near the end of a joint's range. The joint must be slow enough to stop with `deceleration_rad_s2`:
-/// `velocity <= sqrt(2 * deceleration * remaining distance) - margin`.
+/// Velocity limit near the end of a joint's range. The joint must be slow enough to stop with
+/// `deceleration_rad_s2`: `velocity <= sqrt(2 * deceleration * remaining distance) - margin`.
 ///
 /// Source: libfranka 0.21.2, `joint_velocity_limits.h`.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -59,7 +59,8 @@ impl Violation {
 }
 
 impl Limits {
-    /// Limits of the Panda. Source: `franka_description` and the FCI documentation of libfranka 0.9.2.
+    /// Limits of the Panda. Source: `franka_description` and the FCI documentation of libfranka
+    /// 0.9.2.
     pub fn panda() -> Self {
         Self {
             position_rad: [
@@ -80,9 +81,20 @@ impl Limits {
 
     /// Limits of the FR3. Source: `franka_description` and `rate_limiting.h` of libfranka 0.21.2.
     pub fn fr3() -> Self {
-        let braking = |(deceleration_rad_s2, margin_rad_s)| BrakingLimit { deceleration_rad_s2, margin_rad_s };
-        let braking =
-            [(6.0, 0.3), (2.585, 0.2), (3.5, 0.2), (4.0, 0.3), (17.0, 0.35), (5.5, 0.35), (17.0, 0.35)].map(braking);
+        let braking = |(deceleration_rad_s2, margin_rad_s)| BrakingLimit {
+            deceleration_rad_s2,
+            margin_rad_s,
+        };
+        let braking = [
+            (6.0, 0.3),
+            (2.585, 0.2),
+            (3.5, 0.2),
+            (4.0, 0.3),
+            (17.0, 0.35),
+            (5.5, 0.35),
+            (17.0, 0.35),
+        ]
+        .map(braking);
         Self {
             position_rad: [
                 [-2.7501, 2.7501],
@@ -106,8 +118,12 @@ impl Limits {
         let max_rate = self.velocity_rad_s[ix];
         let towards = |left_rad: f64| match &self.braking {
             Some(braking) => {
-                let BrakingLimit { deceleration_rad_s2, margin_rad_s } = braking[ix];
-                ((2.0 * deceleration_rad_s2 * left_rad.max(0.0)).sqrt() - margin_rad_s).clamp(0.0, max_rate)
+                let BrakingLimit {
+                    deceleration_rad_s2,
+                    margin_rad_s,
+                } = braking[ix];
+                ((2.0 * deceleration_rad_s2 * left_rad.max(0.0)).sqrt() - margin_rad_s)
+                    .clamp(0.0, max_rate)
             }
             None => max_rate,
         };
@@ -115,8 +131,13 @@ impl Limits {
     }
 
     /// Checks the step from the previous commanded joint states to the current ones.
-    pub(super) fn check(&self, before: &CommandedJoints, now: &CommandedJoints) -> Result<(), Violation> {
-        let exceeds = |number: f64, max_rate: f64| number.is_nan() || number.abs() > max_rate + ROUNDING;
+    pub(super) fn check(
+        &self,
+        before: &CommandedJoints,
+        now: &CommandedJoints,
+    ) -> Result<(), Violation> {
+        let exceeds =
+            |number: f64, max_rate: f64| number.is_nan() || number.abs() > max_rate + ROUNDING;
         for ix in 0..N_JOINTS {
             let (position, velocity) = (now.position_rad[ix], now.velocity_rad_s[ix]);
             let [min, max] = self.position_rad[ix];
@@ -143,10 +164,19 @@ impl Limits {
 mod tests {
     use super::*;
 
-    /// Joints at rest in the middle of their ranges, where an FR3 allows full velocity, with one joint changed.
-    fn commanded_with(limits: &Limits, ix: usize, change: impl Fn(&mut CommandedJoints, usize)) -> CommandedJoints {
+    /// Joints at rest in the middle of their ranges, where an FR3 allows full velocity, with one
+    /// joint changed.
+    fn commanded_with(
+        limits: &Limits,
+        ix: usize,
+        change: impl Fn(&mut CommandedJoints, usize),
+    ) -> CommandedJoints {
         let position_rad = limits.position_rad.map(|[min, max]| 0.5 * (min + max));
-        let mut commanded = CommandedJoints { position_rad, is_moving: true, ..CommandedJoints::default() };
+        let mut commanded = CommandedJoints {
+            position_rad,
+            is_moving: true,
+            ..CommandedJoints::default()
+        };
         change(&mut commanded, ix);
         commanded
     }
@@ -163,7 +193,13 @@ mod tests {
             let rest = commanded_with(&limits, 0, |_, _| {});
             for ix in 0..N_JOINTS {
                 for frac in [0.999, 1.001, -0.999, -1.001_f64] {
-                    let expected_at = |violation| if frac.abs() < 1.0 { Ok(()) } else { Err(violation) };
+                    let expected_at = |violation| {
+                        if frac.abs() < 1.0 {
+                            Ok(())
+                        } else {
+                            Err(violation)
+                        }
+                    };
                     let of = |max_rate: [f64; N_JOINTS]| frac * max_rate[ix];
                     let fast = commanded_with(&limits, ix, |commanded, ix| {
                         commanded.velocity_rad_s[ix] = of(limits.velocity_rad_s)
@@ -172,33 +208,46 @@ mod tests {
                     let accelerating = commanded_with(&limits, ix, |commanded, ix| {
                         commanded.acceleration_rad_s2[ix] = of(limits.acceleration_rad_s2)
                     });
-                    expect(expected_at(Violation::Acceleration), accelerating, accelerating);
+                    expect(
+                        expected_at(Violation::Acceleration),
+                        accelerating,
+                        accelerating,
+                    );
                     let step = of(limits.jerk_rad_s3) * STEP_SECS;
                     let [from, to] = [-0.5, 0.5].map(|share| {
-                        commanded_with(&limits, ix, |commanded, ix| commanded.acceleration_rad_s2[ix] = share * step)
+                        commanded_with(&limits, ix, |commanded, ix| {
+                            commanded.acceleration_rad_s2[ix] = share * step
+                        })
                     });
                     expect(expected_at(Violation::Jerk), from, to);
                     let [min, max] = limits.position_rad[ix];
                     let (middle, half) = (0.5 * (min + max), 0.5 * (max - min));
-                    let far =
-                        commanded_with(&limits, ix, |commanded, ix| commanded.position_rad[ix] = middle + frac * half);
+                    let far = commanded_with(&limits, ix, |commanded, ix| {
+                        commanded.position_rad[ix] = middle + frac * half
+                    });
                     expect(expected_at(Violation::Position), rest, far);
                 }
             }
             expect(
                 Err(Violation::Position),
                 rest,
-                commanded_with(&limits, 2, |commanded, ix| commanded.position_rad[ix] = f64::NAN),
+                commanded_with(&limits, 2, |commanded, ix| {
+                    commanded.position_rad[ix] = f64::NAN
+                }),
             );
             expect(
                 Err(Violation::Velocity),
                 rest,
-                commanded_with(&limits, 2, |commanded, ix| commanded.velocity_rad_s[ix] = f64::NAN),
+                commanded_with(&limits, 2, |commanded, ix| {
+                    commanded.velocity_rad_s[ix] = f64::NAN
+                }),
             );
             expect(
                 Err(Violation::Acceleration),
                 rest,
-                commanded_with(&limits, 2, |commanded, ix| commanded.acceleration_rad_s2[ix] = f64::NAN),
+                commanded_with(&limits, 2, |commanded, ix| {
+                    commanded.acceleration_rad_s2[ix] = f64::NAN
+                }),
             );
         }
         assert!(wrong.is_empty(), "{wrong:#?}");
@@ -209,7 +258,8 @@ mod tests {
         let limits = Limits::fr3();
         let at = |position_rad: f64, velocity_rad_s: f64| {
             let commanded = commanded_with(&limits, 1, |commanded, ix| {
-                (commanded.position_rad[ix], commanded.velocity_rad_s[ix]) = (position_rad, velocity_rad_s);
+                (commanded.position_rad[ix], commanded.velocity_rad_s[ix]) =
+                    (position_rad, velocity_rad_s);
             });
             limits.check(&commanded, &commanded)
         };

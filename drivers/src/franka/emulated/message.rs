@@ -50,7 +50,8 @@ pub(super) struct Reply {
 impl Reply {
     /// Encodes the message with its header.
     pub(super) fn bytes(&self) -> Vec<u8> {
-        let mut bytes = HeaderLayout::Robot.encode_header(self.command, self.command_id, self.payload.len());
+        let mut bytes =
+            HeaderLayout::Robot.encode_header(self.command, self.command_id, self.payload.len());
         bytes.extend(&self.payload);
         bytes
     }
@@ -115,12 +116,26 @@ impl Command {
     pub(super) fn decode(version: FciVersion, bytes: &[u8]) -> Option<Self> {
         let (number, q_c, dq_c, is_last) = match version {
             FciVersion::V5 => {
-                let v5::RobotCommand { message_id, motion, .. } = v5::RobotCommand::read_from_bytes(bytes).ok()?;
-                (message_id, motion.q_c, motion.dq_c, motion.motion_generation_finished)
+                let v5::RobotCommand {
+                    message_id, motion, ..
+                } = v5::RobotCommand::read_from_bytes(bytes).ok()?;
+                (
+                    message_id,
+                    motion.q_c,
+                    motion.dq_c,
+                    motion.motion_generation_finished,
+                )
             }
             FciVersion::V10 => {
-                let v10::RobotCommand { message_id, motion, .. } = v10::RobotCommand::read_from_bytes(bytes).ok()?;
-                (message_id, motion.q_c, motion.dq_c, motion.motion_generation_finished)
+                let v10::RobotCommand {
+                    message_id, motion, ..
+                } = v10::RobotCommand::read_from_bytes(bytes).ok()?;
+                (
+                    message_id,
+                    motion.q_c,
+                    motion.dq_c,
+                    motion.motion_generation_finished,
+                )
             }
         };
         Some(Self {

@@ -1,14 +1,16 @@
-//! An emulated robot controller for tests and simulators: commands over TCP, states at 1 kHz and motions over UDP.
+//! An emulated robot controller for tests and simulators: commands over TCP, states at 1 kHz and
+//! motions over UDP.
 //!
-//! `robot` implements the controller without sockets, `limits` checks motions, `model` has the robot description,
-//! `message` and `state` encode and decode, `server` has the sockets. A callback of the owner, such as a simulator or
-//! a test, returns the actual joint states once per millisecond.
+//! `robot` implements the controller without sockets, `limits` checks motions, `model` has the
+//! robot description, `message` and `state` encode and decode, `server` has the sockets. A callback
+//! of the owner, such as a simulator or a test, returns the actual joint states once per
+//! millisecond.
 //!
-//! The emulated controller was written from the same documents as the driver. Tests with libfranka and with an
-//! independent server show that both interpret these documents correctly.
+//! The emulated controller was written from the same documents as the driver. Tests with libfranka
+//! and with an independent server show that both interpret these documents correctly.
 //!
-//! It accepts joint position and joint velocity motions, and rejects Cartesian and torque motions. It evaluates only
-//! the collision thresholds of joint torques.
+//! It accepts joint position and joint velocity motions, and rejects Cartesian and torque motions.
+//! It evaluates only the collision thresholds of joint torques.
 
 mod limits;
 mod message;
@@ -68,6 +70,6 @@ pub struct CommandedJoints {
     pub is_moving: bool,
 }
 
-/// Callback that returns the actual joint states. It is called once per millisecond, in order, with the commanded joint
-/// states.
+/// Callback that returns the actual joint states. It is called once per millisecond, in order, with
+/// the commanded joint states.
 pub type JointSimulator = Box<dyn FnMut(Stamp, &CommandedJoints) -> Joints + Send>;

@@ -3,7 +3,8 @@
 use super::Limits;
 use std::fmt::Write;
 
-/// Origin of each joint relative to the one before: x, y, z in meters, and the rotation about x in quarter turns.
+/// Origin of each joint relative to the one before: x, y, z in meters, and the rotation about x in
+/// quarter turns.
 ///
 /// Source: `franka_description`; the FR3 has the Panda's lengths.
 const JOINT_ORIGINS: [(f64, f64, f64, f64); 7] = [
@@ -18,15 +19,17 @@ const JOINT_ORIGINS: [(f64, f64, f64, f64); 7] = [
 
 /// URDF of the joints with the limits that clients read, without link geometry.
 pub(super) fn urdf(limits: &Limits) -> String {
-    let mut text = String::from("<?xml version=\"1.0\"?>\n<robot name=\"fr3\">\n<link name=\"fr3_link0\"/>\n");
+    let mut text =
+        String::from("<?xml version=\"1.0\"?>\n<robot name=\"fr3\">\n<link name=\"fr3_link0\"/>\n");
     for (ix, (x, y, z, quarters)) in JOINT_ORIGINS.into_iter().enumerate() {
         let n = ix + 1;
         let [lower, upper] = limits.position_rad[ix];
         let velocity = limits.velocity_rad_s[ix];
         let effort = if ix < 4 { 87 } else { 12 };
         let roll = quarters * std::f64::consts::FRAC_PI_2;
-        let braking =
-            limits.braking.map_or((1e3, 0.0), |braking| (braking[ix].deceleration_rad_s2, braking[ix].margin_rad_s));
+        let braking = limits.braking.map_or((1e3, 0.0), |braking| {
+            (braking[ix].deceleration_rad_s2, braking[ix].margin_rad_s)
+        });
         write!(
             text,
             "<link name=\"fr3_link{n}\"/>\n<joint name=\"fr3_joint{n}\" type=\"revolute\">\n<origin rpy=\"{roll} 0 0\" \
@@ -58,9 +61,14 @@ mod tests {
         let panda = Chain::from_urdf(panda, "link0", "link8").unwrap();
         let q = [0.3, -0.7, 0.2, -2.1, 0.4, 1.9, -0.8];
         let error = ours.forward(&q).unwrap().inverse() * panda.forward(&q).unwrap();
-        assert!(error.translation.vector.norm() < 1e-9 && error.rotation.angle() < 1e-9, "{error}");
+        assert!(
+            error.translation.vector.norm() < 1e-9 && error.rotation.angle() < 1e-9,
+            "{error}"
+        );
         // The limits that a client computes from it lie just inside the limits checked here.
-        let parsed_limits = JointVelocityLimitsConfig::from_urdf(&text).unwrap().upper_limits(&q);
+        let parsed_limits = JointVelocityLimitsConfig::from_urdf(&text)
+            .unwrap()
+            .upper_limits(&q);
         assert!((parsed_limits[1] - 2.62).abs() < 1e-2, "{parsed_limits:?}");
     }
 }

@@ -1,5 +1,5 @@
-//! The behavior of the controller: it answers requests, follows motions within their limits, triggers reflexes and
-//! recovers.
+//! The behavior of the controller: it answers requests, follows motions within their limits,
+//! triggers reflexes and recovers.
 
 use super::super::N_JOINTS;
 use super::super::state::pose;
@@ -14,15 +14,15 @@ use std::collections::VecDeque;
 use zerocopy::FromBytes;
 use zerocopy::little_endian::F64;
 
-/// Maximum number of consecutive missing answers in a motion. Source: FCI documentation, "Real-time control
-/// commands".
+/// Maximum number of consecutive missing answers in a motion. Source: FCI documentation, "Real-time
+/// control commands".
 const MAX_MISSED: u32 = 20;
 /// Number of states within which a motion must start.
 const MAX_UNTIL_FIRST: u32 = 1000;
 /// Number of states over which the success rate is computed.
 const N_SUCCESS_WINDOW: usize = 100;
-/// Maximum deviation of a robot at rest from its commanded position. A greater deviation means that the robot was moved
-/// by hand; the commanded position then follows it.
+/// Maximum deviation of a robot at rest from its commanded position. A greater deviation means that
+/// the robot was moved by hand; the commanded position then follows it.
 const MAX_SAG_RAD: f64 = 0.01;
 /// External torques that end a motion, until a client sets other thresholds, Nm.
 const DEFAULT_CONTACT_NM: f64 = 20.0;
@@ -65,7 +65,10 @@ pub(super) enum TrajectoryGenerator {
 impl Robot {
     /// Creates a robot at rest with these joints.
     pub(super) fn new(config: RobotConfig, joints: Joints) -> Self {
-        let commanded = CommandedJoints { position_rad: joints.position_rad, ..CommandedJoints::default() };
+        let commanded = CommandedJoints {
+            position_rad: joints.position_rad,
+            ..CommandedJoints::default()
+        };
         Self {
             config,
             nominal_from_tool: Transform::identity(),
@@ -79,8 +82,15 @@ impl Robot {
         }
     }
 
-    /// Executes a request other than connecting, and returns the replies. Ending a motion gives two replies.
-    pub(super) fn answer(&mut self, request: Request, command: u32, command_id: u32, payload: &[u8]) -> Vec<Reply> {
+    /// Executes a request other than connecting, and returns the replies. Ending a motion gives two
+    /// replies.
+    pub(super) fn answer(
+        &mut self,
+        request: Request,
+        command: u32,
+        command_id: u32,
+        payload: &[u8],
+    ) -> Vec<Reply> {
         let is_moving = matches!(self.mode, Mode::Move(_));
         let mut replies = Vec::new();
         let payload = match request {
@@ -96,18 +106,26 @@ impl Robot {
             Request::Recover => {
                 if matches!(self.mode, Mode::Reflex) {
                     self.mode = Mode::Idle;
-                    self.commanded =
-                        CommandedJoints { position_rad: self.joints.position_rad, ..CommandedJoints::default() };
+                    self.commanded = CommandedJoints {
+                        position_rad: self.joints.position_rad,
+                        ..CommandedJoints::default()
+                    };
                 }
                 vec![u8::from(is_moving)]
             }
             Request::Model => [&[0], model::urdf(&self.config.limits).as_bytes()].concat(),
             Request::Library => vec![v5::LoadModelLibraryStatus::Error.to_u8()],
             Request::CartesianLimit => vec![0; size_of::<v5::GetCartesianLimitResponse>()],
-            Request::Set(_) if is_moving => vec![v10::GetterSetterStatus::CommandNotPossibleRejected.to_u8()],
+            Request::Set(_) if is_moving => {
+                vec![v10::GetterSetterStatus::CommandNotPossibleRejected.to_u8()]
+            }
             Request::Set(setting) => vec![self.set(setting, payload).to_u8()],
         };
-        replies.push(Reply { command, command_id, payload });
+        replies.push(Reply {
+            command,
+            command_id,
+            payload,
+        });
         replies
     }
 
@@ -121,13 +139,18 @@ impl Robot {
             FciVersion::V10 => size_of::<v10::MoveRequest>(),
         };
         // In both versions the payload starts with the controller and the motion generator.
-        let (Ok((head, _)), true) = (<[[u8; 4]; 2]>::read_from_prefix(payload), payload.len() == n_bytes) else {
+        let (Ok((head, _)), true) = (
+            <[[u8; 4]; 2]>::read_from_prefix(payload),
+            payload.len() == n_bytes,
+        ) else {
             return MoveStatus::InvalidArgumentRejected;
         };
         let [controller, generator] = head.map(u32::from_le_bytes);
         let controller = match v10::MoveControllerMode::from_u32(controller) {
             Some(v10::MoveControllerMode::JointImpedance) => v10::ControllerMode::JointImpedance,
-            Some(v10::MoveControllerMode::CartesianImpedance) => v10::ControllerMode::CartesianImpedance,
+            Some(v10::MoveControllerMode::CartesianImpedance) => {
+                v10::ControllerMode::CartesianImpedance
+            }
             _ => return MoveStatus::InvalidArgumentRejected,
         };
         let generator = match v10::MoveMotionGeneratorMode::from_u32(generator) {
@@ -135,7 +158,13 @@ impl Robot {
             Some(v10::MoveMotionGeneratorMode::JointVelocity) => TrajectoryGenerator::Velocity,
             _ => return MoveStatus::InvalidArgumentRejected,
         };
-        self.mode = Mode::Move(Motion { command_id, generator, controller, has_begun: false, n_missed: 0 });
+        self.mode = Mode::Move(Motion {
+            command_id,
+            generator,
+            controller,
+            has_begun: false,
+            n_missed: 0,
+        });
         self.reflex_reason = Errors::default();
         self.commanded.is_moving = true;
         self.answered.clear();
@@ -149,15 +178,22 @@ impl Robot {
         }
         match setting {
             Setting::EeToStiffness | Setting::NominalToEe => {
-                let Ok(matrix) = <[F64; 16]>::read_from_bytes(payload) else { return INVALID };
-                let Ok(pose) = pose(&f64s_to_f64(&matrix)) else { return INVALID };
+                let Ok(matrix) = <[F64; 16]>::read_from_bytes(payload) else {
+                    return INVALID;
+                };
+                let Ok(pose) = pose(&f64s_to_f64(&matrix)) else {
+                    return INVALID;
+                };
                 match setting {
                     Setting::NominalToEe => self.nominal_from_tool = pose,
                     _ => self.tool_from_stiffness = pose,
                 }
             }
             Setting::Collision => {
-                let Ok(thresholds) = v10::SetCollisionBehaviorRequest::read_from_bytes(payload) else { return INVALID };
+                let Ok(thresholds) = v10::SetCollisionBehaviorRequest::read_from_bytes(payload)
+                else {
+                    return INVALID;
+                };
                 self.contact_nm = f64s_to_f64(&thresholds.upper_torque_thresholds_nominal);
             }
             Setting::JointImpedance
@@ -169,12 +205,19 @@ impl Robot {
         v10::GetterSetterStatus::Success
     }
 
-    /// Advances the motion by a millisecond, with the client's answer to the newest state, or by extrapolation if there
-    /// is none.
+    /// Advances the motion by a millisecond, with the client's answer to the newest state, or by
+    /// extrapolation if there is none.
     ///
-    /// `could_answer` is false if the client had no chance to answer because the emulator itself was late.
-    pub(super) fn follow(&mut self, command: Option<&Command>, could_answer: bool) -> Option<Reply> {
-        let Mode::Move(mut motion) = self.mode else { return None };
+    /// `could_answer` is false if the client had no chance to answer because the emulator itself
+    /// was late.
+    pub(super) fn follow(
+        &mut self,
+        command: Option<&Command>,
+        could_answer: bool,
+    ) -> Option<Reply> {
+        let Mode::Move(mut motion) = self.mode else {
+            return None;
+        };
         if command.is_some() || (could_answer && motion.has_begun) {
             self.answered.truncate(N_SUCCESS_WINDOW - 1);
             self.answered.push_front(command.is_some());
@@ -182,7 +225,11 @@ impl Robot {
         let before = self.commanded;
         let Some(command) = command else {
             motion.n_missed += u32::from(could_answer);
-            let max = if motion.has_begun { MAX_MISSED } else { MAX_UNTIL_FIRST };
+            let max = if motion.has_begun {
+                MAX_MISSED
+            } else {
+                MAX_UNTIL_FIRST
+            };
             if motion.n_missed > max {
                 return self.trigger_reflex("communication_constraints_violation");
             }
@@ -199,18 +246,32 @@ impl Robot {
             TrajectoryGenerator::Velocity => command.velocity_rad_s[ix],
         });
         if let Err(violation) = self.config.limits.check(&before, &now) {
-            let is_wrong_start = !motion.has_begun && motion.generator == TrajectoryGenerator::Position;
-            let violation = if is_wrong_start { Violation::StartPose } else { violation };
+            let is_wrong_start =
+                !motion.has_begun && motion.generator == TrajectoryGenerator::Position;
+            let violation = if is_wrong_start {
+                Violation::StartPose
+            } else {
+                violation
+            };
             return self.trigger_reflex(violation.name());
         }
         self.commanded = now;
         if !command.is_last {
-            self.mode = Mode::Move(Motion { has_begun: true, n_missed: 0, ..motion });
+            self.mode = Mode::Move(Motion {
+                has_begun: true,
+                n_missed: 0,
+                ..motion
+            });
             return None;
         }
         // From here on, the joints are at rest.
         let can_stop = |(velocity, max): (f64, f64)| velocity.abs() <= max * STEP_SECS;
-        match now.velocity_rad_s.into_iter().zip(self.config.limits.acceleration_rad_s2).all(can_stop) {
+        match now
+            .velocity_rad_s
+            .into_iter()
+            .zip(self.config.limits.acceleration_rad_s2)
+            .all(can_stop)
+        {
             true => self.end(MoveStatus::Success),
             false => self.trigger_reflex(Violation::Acceleration.name()),
         }
@@ -221,16 +282,31 @@ impl Robot {
         self.joints = joints;
         let Mode::Move(_) = self.mode else {
             let is_displaced = |(commanded, is): (f64, f64)| (commanded - is).abs() > MAX_SAG_RAD;
-            if self.commanded.position_rad.into_iter().zip(joints.position_rad).any(is_displaced) {
+            if self
+                .commanded
+                .position_rad
+                .into_iter()
+                .zip(joints.position_rad)
+                .any(is_displaced)
+            {
                 self.commanded.position_rad = joints.position_rad;
             }
             return None;
         };
-        let has_contact = joints.external_torque_nm.into_iter().zip(self.contact_nm).any(|(nm, max)| nm.abs() > max);
-        if has_contact { self.trigger_reflex("joint_reflex") } else { None }
+        let has_contact = joints
+            .external_torque_nm
+            .into_iter()
+            .zip(self.contact_nm)
+            .any(|(nm, max)| nm.abs() > max);
+        if has_contact {
+            self.trigger_reflex("joint_reflex")
+        } else {
+            None
+        }
     }
 
-    /// Handles the disconnection of the client. During a motion, it is a reflex, as after missing commands.
+    /// Handles the disconnection of the client. During a motion, it is a reflex, as after missing
+    /// commands.
     pub(super) fn abandon(&mut self) {
         if matches!(self.mode, Mode::Move(_)) {
             // No client is left to receive the reply.
@@ -238,9 +314,14 @@ impl Robot {
         }
     }
 
-    /// Fraction of the last states of a motion that were answered in time, 0 to 1; 0 without a motion.
+    /// Fraction of the last states of a motion that were answered in time, 0 to 1; 0 without a
+    /// motion.
     pub(super) fn success_frac(&self) -> f64 {
-        let n_answered = self.answered.iter().filter(|is_answered| **is_answered).count();
+        let n_answered = self
+            .answered
+            .iter()
+            .filter(|is_answered| **is_answered)
+            .count();
         n_answered as f64 / self.answered.len().max(1) as f64
     }
 
@@ -256,10 +337,19 @@ impl Robot {
 
     /// Ends the active motion, if any, and returns the reply to the request that started it.
     fn end(&mut self, status: MoveStatus) -> Option<Reply> {
-        let Mode::Move(Motion { command_id, .. }) = self.mode else { return None };
+        let Mode::Move(Motion { command_id, .. }) = self.mode else {
+            return None;
+        };
         self.mode = Mode::Idle;
-        self.commanded = CommandedJoints { position_rad: self.commanded.position_rad, ..CommandedJoints::default() };
-        Some(Reply { command: v10::Command::Move.to_u32(), command_id, payload: vec![self.move_byte(status)] })
+        self.commanded = CommandedJoints {
+            position_rad: self.commanded.position_rad,
+            ..CommandedJoints::default()
+        };
+        Some(Reply {
+            command: v10::Command::Move.to_u32(),
+            command_id,
+            payload: vec![self.move_byte(status)],
+        })
     }
 
     /// A status as numbered in the robot's FCI version.
@@ -269,21 +359,31 @@ impl Robot {
             (_, MoveStatus::Success) => v5::MoveStatus::Success.to_u8(),
             (_, MoveStatus::MotionStarted) => v5::MoveStatus::MotionStarted.to_u8(),
             (_, MoveStatus::Preempted) => v5::MoveStatus::Preempted.to_u8(),
-            (_, MoveStatus::CommandNotPossibleRejected) => v5::MoveStatus::CommandNotPossibleRejected.to_u8(),
-            (_, MoveStatus::InvalidArgumentRejected) => v5::MoveStatus::InvalidArgumentRejected.to_u8(),
+            (_, MoveStatus::CommandNotPossibleRejected) => {
+                v5::MoveStatus::CommandNotPossibleRejected.to_u8()
+            }
+            (_, MoveStatus::InvalidArgumentRejected) => {
+                v5::MoveStatus::InvalidArgumentRejected.to_u8()
+            }
             (_, MoveStatus::ReflexAborted) => v5::MoveStatus::ReflexAborted.to_u8(),
             _ => v5::MoveStatus::Aborted.to_u8(),
         }
     }
 }
 
-/// Commanded joint states a millisecond later. `rate` returns the velocity for a joint index and position.
+/// Commanded joint states a millisecond later. `rate` returns the velocity for a joint index and
+/// position.
 fn next_commanded(before: &CommandedJoints, rate: impl Fn(usize, f64) -> f64) -> CommandedJoints {
-    let velocity_rad_s: [f64; N_JOINTS] = std::array::from_fn(|ix| rate(ix, before.position_rad[ix]));
+    let velocity_rad_s: [f64; N_JOINTS] =
+        std::array::from_fn(|ix| rate(ix, before.position_rad[ix]));
     CommandedJoints {
-        position_rad: std::array::from_fn(|ix| before.position_rad[ix] + velocity_rad_s[ix] * STEP_SECS),
+        position_rad: std::array::from_fn(|ix| {
+            before.position_rad[ix] + velocity_rad_s[ix] * STEP_SECS
+        }),
         velocity_rad_s,
-        acceleration_rad_s2: std::array::from_fn(|ix| (velocity_rad_s[ix] - before.velocity_rad_s[ix]) / STEP_SECS),
+        acceleration_rad_s2: std::array::from_fn(|ix| {
+            (velocity_rad_s[ix] - before.velocity_rad_s[ix]) / STEP_SECS
+        }),
         is_moving: true,
     }
 }

@@ -21,9 +21,9 @@ use std::time::Duration;
 
 /// Interval between states.
 const STEP: Duration = Duration::from_millis(1);
-/// Maximum lag of the thread. States with a smaller lag are sent late; states with a larger lag are skipped. The receive
-/// buffer of a client holds about 40 states. For each late state of a motion, the motion is extrapolated, which a real
-/// robot does for 20 states at most.
+/// Maximum lag of the thread. States with a smaller lag are sent late; states with a larger lag are
+/// skipped. The receive buffer of a client holds about 40 states. For each late state of a motion,
+/// the motion is extrapolated, which a real robot does for 20 states at most.
 const MAX_LAG: Duration = Duration::from_millis(20);
 /// Maximum message size. Real clients stay far below it.
 const MAX_MESSAGE_BYTES: usize = 1 << 16;
@@ -45,9 +45,9 @@ impl EmulatedRobot {
         Self::start_waiting(config, Duration::ZERO, joint_simulator)
     }
 
-    /// Like [`start`](Self::start), but a motion waits up to `answer_wait` for the answer to each state. On a real
-    /// robot, an answer must arrive within a millisecond. Tests wait longer, so that their motions do not depend on the
-    /// load of the machine.
+    /// Like [`start`](Self::start), but a motion waits up to `answer_wait` for the answer to each
+    /// state. On a real robot, an answer must arrive within a millisecond. Tests wait longer, so
+    /// that their motions do not depend on the load of the machine.
     pub fn start_waiting(
         config: RobotConfig,
         answer_wait: Duration,
@@ -57,7 +57,10 @@ impl EmulatedRobot {
         let n = config.chain.n_joints();
         if n != N_JOINTS {
             let reason = format!("its chain has {n} joints, but a Franka arm has {N_JOINTS}");
-            return Err(Error::Fci { address: config.address.to_string(), reason });
+            return Err(Error::Fci {
+                address: config.address.to_string(),
+                reason,
+            });
         }
         let bind = || {
             let listener = TcpListener::bind(config.address)?;
@@ -66,7 +69,11 @@ impl EmulatedRobot {
             states.set_nonblocking(true)?;
             Ok((listener.local_addr()?, listener, states))
         };
-        let listen = |source| Error::Listen { device: device.clone(), address: config.address, source };
+        let listen = |source| Error::Listen {
+            device: device.clone(),
+            address: config.address,
+            source,
+        };
         let (address, listener, states) = bind().map_err(listen)?;
         let joints = joint_simulator(clock::now(), &CommandedJoints::default());
         let (n_states_sent, stop) = (Arc::default(), Arc::new(AtomicBool::new(false)));
@@ -80,9 +87,16 @@ impl EmulatedRobot {
             n_states_sent: Arc::clone(&n_states_sent),
             stop: Arc::clone(&stop),
         };
-        let thread = std::thread::Builder::new().name(device.clone()).spawn(move || server.run());
+        let thread = std::thread::Builder::new()
+            .name(device.clone())
+            .spawn(move || server.run());
         let thread = thread.map_err(|source| Error::Thread { device, source })?;
-        Ok(Self { address, n_states_sent, stop, thread: Some(thread) })
+        Ok(Self {
+            address,
+            n_states_sent,
+            stop,
+            thread: Some(thread),
+        })
     }
 
     /// Address on which it accepts clients.
@@ -90,7 +104,8 @@ impl EmulatedRobot {
         self.address
     }
 
-    /// Number of states that it has sent to its clients. A state that was due while its thread stalled is not sent.
+    /// Number of states that it has sent to its clients. A state that was due while its thread
+    /// stalled is not sent.
     pub fn n_states_sent(&self) -> u64 {
         self.n_states_sent.load(Ordering::Relaxed)
     }
@@ -148,7 +163,10 @@ impl Server {
             };
             if lag > max_lag {
                 let n_skipped = u32::try_from(lag.as_millis()).unwrap_or(u32::MAX);
-                (n_steps, number) = (n_steps.saturating_add(n_skipped), number + u64::from(n_skipped));
+                (n_steps, number) = (
+                    n_steps.saturating_add(n_skipped),
+                    number + u64::from(n_skipped),
+                );
                 continue;
             }
             std::thread::sleep(due.duration_since(now));
@@ -159,7 +177,11 @@ impl Server {
 
     /// Simulates one millisecond: handles requests, advances the motion, sends the state.
     fn step(&mut self, due: Stamp, number: u64, is_late: bool) {
-        let wait = if self.robot.commanded.is_moving { self.answer_wait } else { Duration::ZERO };
+        let wait = if self.robot.commanded.is_moving {
+            self.answer_wait
+        } else {
+            Duration::ZERO
+        };
         if let Some(mut client) = self.client.take() {
             match client.read_requests(&mut self.robot) {
                 Ok(()) => self.client = Some(client),
@@ -174,7 +196,10 @@ impl Server {
         let joints = (self.joint_simulator)(due, &self.robot.commanded);
         let contact = self.robot.observe(joints);
         if let Some(client) = &mut self.client {
-            let sent = finished.iter().chain(&contact).try_for_each(|reply| client.send(reply));
+            let sent = finished
+                .iter()
+                .chain(&contact)
+                .try_for_each(|reply| client.send(reply));
             if sent.is_err() {
                 self.client = None;
                 self.robot.abandon();
@@ -183,7 +208,8 @@ impl Server {
             if let Some(states_to) = client.states_to {
                 // A client notices by its number that a state could not be sent.
                 let sent = self.states.send_to(&self.robot.state(number), states_to);
-                self.n_states_sent.fetch_add(u64::from(sent.is_ok()), Ordering::Relaxed);
+                self.n_states_sent
+                    .fetch_add(u64::from(sent.is_ok()), Ordering::Relaxed);
             }
         }
     }
@@ -195,14 +221,23 @@ impl Server {
                 log::info!("emulated robot: rejected {peer}, another client is connected");
                 continue;
             }
-            if stream.set_nonblocking(true).and_then(|()| stream.set_nodelay(true)).is_ok() {
-                self.client = Some(Client { stream, ip: peer.ip(), states_to: None, buffer_in: Vec::new() });
+            if stream
+                .set_nonblocking(true)
+                .and_then(|()| stream.set_nodelay(true))
+                .is_ok()
+            {
+                self.client = Some(Client {
+                    stream,
+                    ip: peer.ip(),
+                    states_to: None,
+                    buffer_in: Vec::new(),
+                });
             }
         }
     }
 
-    /// The client's answer to the state with this number, if it arrives within `wait`. A datagram that is not a command
-    /// ends the wait.
+    /// The client's answer to the state with this number, if it arrives within `wait`. A datagram
+    /// that is not a command ends the wait.
     fn command(&self, number: u64, wait: Duration) -> Option<Command> {
         const POLL: Duration = Duration::from_micros(100);
         let deadline = clock::now() + wait;
@@ -214,17 +249,23 @@ impl Server {
         received.flatten()
     }
 
-    /// Reads the datagrams that have arrived. Returns the client's answer to the state with this number, `Some(None)` if
-    /// there is only a datagram that is not a command, and `None` if there is neither.
+    /// Reads the datagrams that have arrived. Returns the client's answer to the state with this
+    /// number, `Some(None)` if there is only a datagram that is not a command, and `None` if there
+    /// is neither.
     fn receive(&self, number: u64) -> Option<Option<Command>> {
         let mut received = None;
         let mut buffer = [0; MAX_COMMAND_BYTES];
         loop {
             match self.states.recv_from(&mut buffer) {
                 Ok((n, from)) => {
-                    let is_from_client = self.client.as_ref().is_some_and(|client| client.ip == from.ip());
+                    let is_from_client = self
+                        .client
+                        .as_ref()
+                        .is_some_and(|client| client.ip == from.ip());
                     match Command::decode(self.robot.config.version, &buffer[..n]) {
-                        Some(command) if is_from_client && command.number == number => received = Some(Some(command)),
+                        Some(command) if is_from_client && command.number == number => {
+                            received = Some(Some(command))
+                        }
                         Some(_) => {}
                         None => received = received.or(Some(None)),
                     }
@@ -249,7 +290,9 @@ impl Client {
                 Err(error) if error.kind() == ErrorKind::Interrupted => continue,
                 Err(_) => return Err(Disconnected),
             }
-            while let Some((command, command_id, size)) = HeaderLayout::Robot.decode_header(&self.buffer_in) {
+            while let Some((command, command_id, size)) =
+                HeaderLayout::Robot.decode_header(&self.buffer_in)
+            {
                 let size = usize::try_from(size).unwrap_or(usize::MAX);
                 if !(ROBOT_HEADER_LEN..=MAX_MESSAGE_BYTES).contains(&size) {
                     return Err(Disconnected);
@@ -263,12 +306,21 @@ impl Client {
         }
     }
 
-    fn answer(&mut self, robot: &mut Robot, command: u32, command_id: u32, payload: &[u8]) -> Result<(), Disconnected> {
+    fn answer(
+        &mut self,
+        robot: &mut Robot,
+        command: u32,
+        command_id: u32,
+        payload: &[u8],
+    ) -> Result<(), Disconnected> {
         match Request::from_number(robot.config.version, command) {
-            Some(Request::Connect) => self.connect(robot.config.version, command, command_id, payload),
-            Some(request) if self.states_to.is_some() => {
-                robot.answer(request, command, command_id, payload).iter().try_for_each(|reply| self.send(reply))
+            Some(Request::Connect) => {
+                self.connect(robot.config.version, command, command_id, payload)
             }
+            Some(request) if self.states_to.is_some() => robot
+                .answer(request, command, command_id, payload)
+                .iter()
+                .try_for_each(|reply| self.send(reply)),
             _ => Err(Disconnected),
         }
     }
@@ -280,22 +332,33 @@ impl Client {
         command_id: u32,
         payload: &[u8],
     ) -> Result<(), Disconnected> {
-        let [low, high, port_low, port_high] = *payload else { return Err(Disconnected) };
+        let [low, high, port_low, port_high] = *payload else {
+            return Err(Disconnected);
+        };
         let supported_version: u16 = match version {
             FciVersion::V5 => 5,
             FciVersion::V10 => 10,
         };
         let status = if u16::from_le_bytes([low, high]) == supported_version {
-            self.states_to = Some(SocketAddr::new(self.ip, u16::from_le_bytes([port_low, port_high])));
+            self.states_to = Some(SocketAddr::new(
+                self.ip,
+                u16::from_le_bytes([port_low, port_high]),
+            ));
             ConnectStatus::Success
         } else {
             ConnectStatus::IncompatibleLibraryVersion
         };
         let payload = [&[status.to_u8()][..], &supported_version.to_le_bytes()].concat();
-        self.send(&Reply { command, command_id, payload })
+        self.send(&Reply {
+            command,
+            command_id,
+            payload,
+        })
     }
 
     fn send(&mut self, reply: &Reply) -> Result<(), Disconnected> {
-        self.stream.write_all(&reply.bytes()).map_err(|_| Disconnected)
+        self.stream
+            .write_all(&reply.bytes())
+            .map_err(|_| Disconnected)
     }
 }

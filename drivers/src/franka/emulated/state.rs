@@ -17,7 +17,8 @@ macro_rules! state {
         let (joints, commanded) = (&robot.joints, &robot.commanded);
         let flange_from_nominal = robot.config.flange_from_tool;
         let flange_from_tool = flange_from_nominal * robot.nominal_from_tool;
-        let tool_at = |position_rad| columns(&(robot.base_from_flange(position_rad) * flange_from_tool));
+        let tool_at =
+            |position_rad| columns(&(robot.base_from_flange(position_rad) * flange_from_tool));
         let elbow = |position_rad: &[f64; N_JOINTS]| [position_rad[2], position_rad[3].signum()];
         let [motion_generator_mode, controller_mode, robot_mode] = robot.modes();
         let reasons = robot.reflex_reason.0.map(u8::from);
@@ -47,7 +48,11 @@ macro_rules! state {
             motion_generator_mode,
             controller_mode,
             robot_mode,
-            errors: if matches!(robot.mode, Mode::Reflex) { reasons } else { [0; franka::errors::ERROR_COUNT] },
+            errors: if matches!(robot.mode, Mode::Reflex) {
+                reasons
+            } else {
+                [0; franka::errors::ERROR_COUNT]
+            },
             reflex_reason: reasons,
             control_command_success_rate: Number::values(robot.success_frac()),
             ..$version::RobotState::default()
@@ -66,20 +71,43 @@ impl Robot {
 
     fn modes(&self) -> [u8; 3] {
         let (generator, controller, robot) = match self.mode {
-            Mode::Idle => (v10::MotionGeneratorMode::Idle, v10::ControllerMode::Other, v10::RobotMode::Idle),
-            Mode::Reflex => (v10::MotionGeneratorMode::Idle, v10::ControllerMode::Other, v10::RobotMode::Reflex),
-            Mode::Move(Motion { generator: TrajectoryGenerator::Position, controller, .. }) => {
-                (v10::MotionGeneratorMode::JointPosition, controller, v10::RobotMode::Move)
-            }
-            Mode::Move(Motion { generator: TrajectoryGenerator::Velocity, controller, .. }) => {
-                (v10::MotionGeneratorMode::JointVelocity, controller, v10::RobotMode::Move)
-            }
+            Mode::Idle => (
+                v10::MotionGeneratorMode::Idle,
+                v10::ControllerMode::Other,
+                v10::RobotMode::Idle,
+            ),
+            Mode::Reflex => (
+                v10::MotionGeneratorMode::Idle,
+                v10::ControllerMode::Other,
+                v10::RobotMode::Reflex,
+            ),
+            Mode::Move(Motion {
+                generator: TrajectoryGenerator::Position,
+                controller,
+                ..
+            }) => (
+                v10::MotionGeneratorMode::JointPosition,
+                controller,
+                v10::RobotMode::Move,
+            ),
+            Mode::Move(Motion {
+                generator: TrajectoryGenerator::Velocity,
+                controller,
+                ..
+            }) => (
+                v10::MotionGeneratorMode::JointVelocity,
+                controller,
+                v10::RobotMode::Move,
+            ),
         };
         [generator.to_u8(), controller.to_u8(), robot.to_u8()]
     }
 
     fn base_from_flange(&self, position_rad: &[f64; N_JOINTS]) -> Transform {
-        self.config.chain.forward(position_rad).expect("the chain was checked to have seven joints")
+        self.config
+            .chain
+            .forward(position_rad)
+            .expect("the chain was checked to have seven joints")
     }
 }
 

@@ -36,7 +36,9 @@ pub(super) struct VideoFrame {
 }
 
 unsafe extern "C" {
-    pub(super) fn rs2_create_software_device(error: *mut *mut sys::rs2_error) -> *mut sys::rs2_device;
+    pub(super) fn rs2_create_software_device(
+        error: *mut *mut sys::rs2_error,
+    ) -> *mut sys::rs2_device;
     pub(super) fn rs2_software_device_register_info(
         device: *mut sys::rs2_device,
         info: sys::rs2_camera_info,

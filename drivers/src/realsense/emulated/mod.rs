@@ -1,11 +1,13 @@
-//! Emulates a RealSense camera by writing a file. librealsense2 itself records one of its software devices, so the file
-//! has the same format as any other recording.
+//! Emulates a RealSense camera by writing a file. librealsense2 itself records one of its software
+//! devices, so the file has the same format as any other recording.
 
 #![expect(unsafe_code, reason = "FFI to a C library")]
 
 mod abi;
 
-use super::sdk::{Context, Device, Mode, Modes, Queue, Sensor, call, device_creation_lock, non_null, path_name};
+use super::sdk::{
+    Context, Device, Mode, Modes, Queue, Sensor, call, device_creation_lock, non_null, path_name,
+};
 use super::{Problem, lens};
 use crate::{Image, PixelFormat, YuvLayout};
 use abi::{VideoFrame, VideoStream};
@@ -19,8 +21,8 @@ use std::ptr::NonNull;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
-/// Maximum number of images that the library still has to write. If there are more, we wait, because the library drops
-/// images that it cannot store.
+/// Maximum number of images that the library still has to write. If there are more, we wait,
+/// because the library drops images that it cannot store.
 const MAX_QUEUED_IMAGES: usize = 16;
 /// If no image is written for this long, the disk is assumed to be full or disconnected.
 const MAX_WAIT: Duration = Duration::from_secs(30);
@@ -45,7 +47,8 @@ pub struct EmulatedCamera {
     pub rate_hz: u16,
     /// Lens parameters of the color images.
     pub intrinsics: Intrinsics,
-    /// Format of the color images: [`PixelFormat::Rgb8`], `Bgr8`, or `Yuv` with two bytes per pixel.
+    /// Format of the color images: [`PixelFormat::Rgb8`], `Bgr8`, or `Yuv` with two bytes per
+    /// pixel.
     pub format: PixelFormat,
     /// Its depth camera, if any.
     pub depth: Option<EmulatedDepth>,
@@ -90,7 +93,8 @@ struct EmulatedStream {
     n_images: i32,
 }
 
-// SAFETY: the library may be called from any thread, and the pointers refer to objects owned by `BagWriter::_device`.
+// SAFETY: the library may be called from any thread, and the pointers refer to objects owned by
+// `BagWriter::_device`.
 unsafe impl Send for EmulatedStream {}
 
 impl BagWriter {
@@ -99,29 +103,45 @@ impl BagWriter {
         let context = Context::new()?;
         let _ = std::fs::remove_file(path); // Usually missing. If removal fails, the library reports an error.
         let _guard = device_creation_lock();
-        // SAFETY: the device is checked and then owned here; sensors and profiles live as long as the device.
+        // SAFETY: the device is checked and then owned here; sensors and profiles live as long as
+        // the device.
         let device = unsafe {
-            let device = call("create a software device", |error| abi::rs2_create_software_device(error))?;
+            let device = call("create a software device", |error| {
+                abi::rs2_create_software_device(error)
+            })?;
             register(device, camera)?;
             device
         };
         // SAFETY: as above; added sensors live in the device.
         let (color, depth) = unsafe {
-            let depth = camera.depth.as_ref().map(|depth| EmulatedStream::depth(device, camera, depth)).transpose()?;
+            let depth = camera
+                .depth
+                .as_ref()
+                .map(|depth| EmulatedStream::depth(device, camera, depth))
+                .transpose()?;
             let color = EmulatedStream::color(device, camera)?;
             if let (Some(emulated), Some(depth)) = (&depth, &camera.depth) {
                 let extrinsics = lens::extrinsics(&depth.camera_from_depth);
                 call("register extrinsics", |error| {
-                    sys::rs2_register_extrinsics(emulated.profile.as_ptr(), color.profile.as_ptr(), extrinsics, error);
+                    sys::rs2_register_extrinsics(
+                        emulated.profile.as_ptr(),
+                        color.profile.as_ptr(),
+                        extrinsics,
+                        error,
+                    );
                 })?;
             }
             (color, depth)
         };
         // SAFETY: the device is not freed elsewhere.
         let device = unsafe { Device::new(device)? };
-        let file_problem = |reason: String| Problem::File { path: path.to_owned(), reason };
+        let file_problem = |reason: String| Problem::File {
+            path: path.to_owned(),
+            reason,
+        };
         let name = path_name(path).map_err(file_problem)?;
-        // SAFETY: device and name are alive; the recorder is then owned here and keeps the device alive.
+        // SAFETY: device and name are alive; the recorder is then owned here and keeps the device
+        // alive.
         let recorder = unsafe {
             let recorder = call("create a recorder", |error| {
                 sys::rs2_create_record_device_ex(device.as_ptr(), name.as_ptr(), 1, error)
@@ -150,33 +170,47 @@ impl BagWriter {
         for (sensor, modes) in self.recorder.sensors.iter().zip(&self._modes) {
             sensor.open(&modes.modes.iter().collect::<Vec<&Mode>>())?;
         }
-        self.recorder.sensors.iter().try_for_each(|sensor: &Sensor| sensor.start(&self.queue))
+        self.recorder
+            .sensors
+            .iter()
+            .try_for_each(|sensor: &Sensor| sensor.start(&self.queue))
     }
 
-    /// Writes one color or depth image. Its stamp is stored as mid-exposure time of the camera clock, in whole
-    /// microseconds.
+    /// Writes one color or depth image. Its stamp is stored as mid-exposure time of the camera
+    /// clock, in whole microseconds.
     ///
     /// # Errors
-    /// If the format or size of the image differs from that of the emulated camera, or the disk accepts no more data.
+    /// If the format or size of the image differs from that of the emulated camera, or the disk
+    /// accepts no more data.
     pub fn write(&mut self, image: &Image) -> Result<(), Problem> {
-        let file_problem = |reason: String| Problem::File { path: self.path.clone(), reason };
+        let file_problem = |reason: String| Problem::File {
+            path: self.path.clone(),
+            reason,
+        };
         let emulated = match (image.is_depth(), &mut self.depth) {
             (true, Some(depth)) => depth,
             (true, None) => return Err(file_problem("the emulated camera has no depth".into())),
             (false, _) => &mut self.color,
         };
         if image.format != emulated.format || image.size_px != emulated.size_px {
-            let (got, expected) =
-                (format!("{:?} {:?}", image.format, image.size_px), (emulated.format, emulated.size_px));
+            let (got, expected) = (
+                format!("{:?} {:?}", image.format, image.size_px),
+                (emulated.format, emulated.size_px),
+            );
             return Err(file_problem(format!(
                 "an image is {got}, expected {:?} {:?} for the emulated camera",
                 expected.0, expected.1
             )));
         }
-        let bytes = image.raw_bytes().map_err(|error| file_problem(error.to_string()))?;
+        let bytes = image
+            .raw_bytes()
+            .map_err(|error| file_problem(error.to_string()))?;
         emulated.send(self.number, image, bytes)?;
-        // The recorder also queues recorded images for readers and keeps their memory until the queue is emptied.
-        wait_until_written(&self.path, self.number, MAX_QUEUED_IMAGES, || self.queue.empty())
+        // The recorder also queues recorded images for readers and keeps their memory until the
+        // queue is emptied.
+        wait_until_written(&self.path, self.number, MAX_QUEUED_IMAGES, || {
+            self.queue.empty()
+        })
     }
 
     /// Completes the file and waits until all images are written.
@@ -195,13 +229,24 @@ impl BagWriter {
 /// The pointer must be a software device.
 unsafe fn register(device: *mut sys::rs2_device, camera: &EmulatedCamera) -> Result<(), Problem> {
     let text = |text: &str| {
-        CString::new(text)
-            .map_err(|error| Problem::Library { what: "use the name of a camera", reason: error.to_string() })
+        CString::new(text).map_err(|error| Problem::Library {
+            what: "use the name of a camera",
+            reason: error.to_string(),
+        })
     };
     let infos = [
-        (sys::rs2_camera_info_RS2_CAMERA_INFO_NAME, text(&camera.name)?),
-        (sys::rs2_camera_info_RS2_CAMERA_INFO_SERIAL_NUMBER, text(&camera.serial)?),
-        (sys::rs2_camera_info_RS2_CAMERA_INFO_PRODUCT_LINE, c"D400".to_owned()),
+        (
+            sys::rs2_camera_info_RS2_CAMERA_INFO_NAME,
+            text(&camera.name)?,
+        ),
+        (
+            sys::rs2_camera_info_RS2_CAMERA_INFO_SERIAL_NUMBER,
+            text(&camera.serial)?,
+        ),
+        (
+            sys::rs2_camera_info_RS2_CAMERA_INFO_PRODUCT_LINE,
+            c"D400".to_owned(),
+        ),
     ];
     for (info, value) in &infos {
         // SAFETY: the caller guarantees that the device is alive, and the text is copied.
@@ -215,22 +260,51 @@ unsafe fn register(device: *mut sys::rs2_device, camera: &EmulatedCamera) -> Res
 impl EmulatedStream {
     /// # Safety
     /// The pointer must be a software device that outlives this.
-    unsafe fn color(device: *mut sys::rs2_device, camera: &EmulatedCamera) -> Result<Self, Problem> {
+    unsafe fn color(
+        device: *mut sys::rs2_device,
+        camera: &EmulatedCamera,
+    ) -> Result<Self, Problem> {
         let format = match camera.format {
             PixelFormat::Rgb8 => Some((sys::rs2_format_RS2_FORMAT_RGB8, 3)),
             PixelFormat::Bgr8 => Some((sys::rs2_format_RS2_FORMAT_BGR8, 3)),
-            PixelFormat::Yuv { layout: YuvLayout::Yuyv, .. } => Some((sys::rs2_format_RS2_FORMAT_YUYV, 2)),
-            PixelFormat::Yuv { layout: YuvLayout::Uyvy, .. } => Some((sys::rs2_format_RS2_FORMAT_UYVY, 2)),
+            PixelFormat::Yuv {
+                layout: YuvLayout::Yuyv,
+                ..
+            } => Some((sys::rs2_format_RS2_FORMAT_YUYV, 2)),
+            PixelFormat::Yuv {
+                layout: YuvLayout::Uyvy,
+                ..
+            } => Some((sys::rs2_format_RS2_FORMAT_UYVY, 2)),
             _ => None,
         };
         let Some((format, bytes_per_pixel)) = format else {
             let reason = format!("{:?} is not a format of RealSense cameras", camera.format);
-            return Err(Problem::Library { what: "emulate a camera", reason });
+            return Err(Problem::Library {
+                what: "emulate a camera",
+                reason,
+            });
         };
-        let stream = stream(sys::rs2_stream_RS2_STREAM_COLOR, 1, camera.rate_hz, &camera.intrinsics);
-        let stream = VideoStream { bytes_per_pixel, format, ..stream };
+        let stream = stream(
+            sys::rs2_stream_RS2_STREAM_COLOR,
+            1,
+            camera.rate_hz,
+            &camera.intrinsics,
+        );
+        let stream = VideoStream {
+            bytes_per_pixel,
+            format,
+            ..stream
+        };
         // SAFETY: guaranteed by the caller.
-        unsafe { Self::add(device, IMAGE_SENSOR, stream, camera.format, IMAGE_EXPOSURE_SECS) }
+        unsafe {
+            Self::add(
+                device,
+                IMAGE_SENSOR,
+                stream,
+                camera.format,
+                IMAGE_EXPOSURE_SECS,
+            )
+        }
     }
 
     /// # Safety
@@ -240,15 +314,34 @@ impl EmulatedStream {
         camera: &EmulatedCamera,
         depth: &EmulatedDepth,
     ) -> Result<Self, Problem> {
-        let stream = stream(sys::rs2_stream_RS2_STREAM_DEPTH, 2, camera.rate_hz, &depth.intrinsics);
-        let stream = VideoStream { bytes_per_pixel: 2, format: sys::rs2_format_RS2_FORMAT_Z16, ..stream };
-        let format = PixelFormat::DepthU16 { meters_per_count: depth.meters_per_count };
+        let stream = stream(
+            sys::rs2_stream_RS2_STREAM_DEPTH,
+            2,
+            camera.rate_hz,
+            &depth.intrinsics,
+        );
+        let stream = VideoStream {
+            bytes_per_pixel: 2,
+            format: sys::rs2_format_RS2_FORMAT_Z16,
+            ..stream
+        };
+        let format = PixelFormat::DepthU16 {
+            meters_per_count: depth.meters_per_count,
+        };
         // SAFETY: guaranteed by the caller; the sensor lives in the device.
         unsafe {
             let emulated = Self::add(device, DEPTH_SENSOR, stream, format, DEPTH_EXPOSURE_SECS)?;
-            let (units, scale) = (sys::rs2_option_RS2_OPTION_DEPTH_UNITS, narrow(depth.meters_per_count));
+            let (units, scale) = (
+                sys::rs2_option_RS2_OPTION_DEPTH_UNITS,
+                narrow(depth.meters_per_count),
+            );
             call("set depth units", |error| {
-                abi::rs2_software_sensor_add_read_only_option(emulated.sensor.as_ptr(), units, scale, error);
+                abi::rs2_software_sensor_add_read_only_option(
+                    emulated.sensor.as_ptr(),
+                    units,
+                    scale,
+                    error,
+                );
             })?;
             Ok(emulated)
         }
@@ -266,11 +359,15 @@ impl EmulatedStream {
         const WHAT: &str = "create a stream";
         // SAFETY: device and name are alive; added sensors and streams live in the device.
         unsafe {
-            let sensor = call(WHAT, |error| abi::rs2_software_device_add_sensor(device, name.as_ptr(), error))?;
+            let sensor = call(WHAT, |error| {
+                abi::rs2_software_device_add_sensor(device, name.as_ptr(), error)
+            })?;
             let sensor = non_null(WHAT, sensor)?;
-            let profile =
-                call(WHAT, |error| abi::rs2_software_sensor_add_video_stream_ex(sensor.as_ptr(), stream, 1, error))?;
-            let size_px = [stream.width, stream.height].map(|side| u32::try_from(side).unwrap_or(0));
+            let profile = call(WHAT, |error| {
+                abi::rs2_software_sensor_add_video_stream_ex(sensor.as_ptr(), stream, 1, error)
+            })?;
+            let size_px =
+                [stream.width, stream.height].map(|side| u32::try_from(side).unwrap_or(0));
             Ok(Self {
                 sensor,
                 profile: non_null(WHAT, profile)?,
@@ -287,14 +384,29 @@ impl EmulatedStream {
     fn send(&mut self, file: u64, image: &Image, bytes: &[u8]) -> Result<(), Problem> {
         self.n_images += 1;
         let micros = image.stamp.0.div_euclid(NANOS_PER_MICRO);
-        self.set_metadata(sys::rs2_frame_metadata_value_RS2_FRAME_METADATA_SENSOR_TIMESTAMP, micros)?;
-        self.set_metadata(sys::rs2_frame_metadata_value_RS2_FRAME_METADATA_FRAME_COUNTER, self.n_images.into())?;
+        self.set_metadata(
+            sys::rs2_frame_metadata_value_RS2_FRAME_METADATA_SENSOR_TIMESTAMP,
+            micros,
+        )?;
+        self.set_metadata(
+            sys::rs2_frame_metadata_value_RS2_FRAME_METADATA_FRAME_COUNTER,
+            self.n_images.into(),
+        )?;
         // Without a rate, the library derives one from two stamps, which may divide by zero.
-        self.set_metadata(sys::rs2_frame_metadata_value_RS2_FRAME_METADATA_ACTUAL_FPS, 0)?;
+        self.set_metadata(
+            sys::rs2_frame_metadata_value_RS2_FRAME_METADATA_ACTUAL_FPS,
+            0,
+        )?;
         if let Some(secs) = image.exposure_secs {
-            #[expect(clippy::cast_possible_truncation, reason = "the cast saturates as intended")]
+            #[expect(
+                clippy::cast_possible_truncation,
+                reason = "the cast saturates as intended"
+            )]
             let counts = (secs / self.exposure_secs_per_count).round() as i64;
-            self.set_metadata(sys::rs2_frame_metadata_value_RS2_FRAME_METADATA_ACTUAL_EXPOSURE, counts)?;
+            self.set_metadata(
+                sys::rs2_frame_metadata_value_RS2_FRAME_METADATA_ACTUAL_EXPOSURE,
+                counts,
+            )?;
         }
         let frame = VideoFrame {
             pixels: lend_pixels(file, bytes),
@@ -310,7 +422,8 @@ impl EmulatedStream {
                 _ => 0.0,
             },
         };
-        // SAFETY: the sensor lives in the device; the pixels live until the library returns them to `reclaim_pixels`.
+        // SAFETY: the sensor lives in the device; the pixels live until the library returns them to
+        // `reclaim_pixels`.
         call("write an image", |error| unsafe {
             abi::rs2_software_sensor_on_video_frame(self.sensor.as_ptr(), frame, error);
         })
@@ -325,7 +438,12 @@ impl EmulatedStream {
 }
 
 /// Properties common to all streams. The caller sets format and bytes per pixel.
-fn stream(stream: sys::rs2_stream, unique_id: i32, rate_hz: u16, intrinsics: &Intrinsics) -> VideoStream {
+fn stream(
+    stream: sys::rs2_stream,
+    unique_id: i32,
+    rate_hz: u16,
+    intrinsics: &Intrinsics,
+) -> VideoStream {
     let intrinsics = lens::raw(intrinsics);
     VideoStream {
         stream,
@@ -369,7 +487,13 @@ fn wait_until_written(
     let started = Instant::now();
     loop {
         poll()?;
-        if LENT_PIXELS.lock().values().filter(|(owner, _)| *owner == file).count() <= max_pending {
+        if LENT_PIXELS
+            .lock()
+            .values()
+            .filter(|(owner, _)| *owner == file)
+            .count()
+            <= max_pending
+        {
             return Ok(());
         }
         if started.elapsed() > MAX_WAIT {
@@ -382,7 +506,10 @@ fn wait_until_written(
     }
 }
 
-#[expect(clippy::cast_possible_truncation, reason = "the library uses single precision")]
+#[expect(
+    clippy::cast_possible_truncation,
+    reason = "the library uses single precision"
+)]
 fn narrow(number: f64) -> f32 {
     number as f32
 }

@@ -1,11 +1,14 @@
-//! Recordings as other programs write or change them. The files are built byte by byte, because the library that writes
-//! recordings does not write invalid ones.
+//! Recordings as other programs write or change them. The files are built byte by byte, because the
+//! library that writes recordings does not write invalid ones.
 
 use super::{Notes, Recording};
 use crate::recording::{RIG_FILE, URDF_FILE};
 use crate::wire::protobuf::Message;
 use crate::wire::{descriptor, foxglove, joint_state, point_cloud};
-use crate::{Image, PixelFormat, RangePoint, RangeScan, Sample, Source, YuvColors, YuvLayout, YuvMatrix, YuvRange};
+use crate::{
+    Image, PixelFormat, RangePoint, RangeScan, Sample, Source, YuvColors, YuvLayout, YuvMatrix,
+    YuvRange,
+};
 use kinematics::{Intrinsics, JointState, Lens, Stamp, Transform};
 use std::collections::{BTreeMap, BTreeSet};
 use std::io::Write;
@@ -72,7 +75,15 @@ struct Contents {
 
 fn image(camera: &str, format: PixelFormat, data: &[u8]) -> Image {
     let (camera, data) = (camera.into(), data.into());
-    Image { camera, stamp: STAMP, size_px: [2, 2], format, data, exposure_secs: None, n_skipped: 0 }
+    Image {
+        camera,
+        stamp: STAMP,
+        size_px: [2, 2],
+        format,
+        data,
+        exposure_secs: None,
+        n_skipped: 0,
+    }
 }
 
 /// What this program writes: one message on each kind of topic.
@@ -84,10 +95,19 @@ fn contents() -> Contents {
         metadata: Vec::new(),
         message,
     };
-    let of_image =
-        |topic, image: &Image| protobuf(topic, foxglove::schema_of(image.format), foxglove::encode_image(image));
-    let state =
-        JointState { stamp: STAMP, position: vec![0.5, -2.0], velocity: vec![0.25, 0.0], effort: vec![1.0, 2.0] };
+    let of_image = |topic, image: &Image| {
+        protobuf(
+            topic,
+            foxglove::schema_of(image.format),
+            foxglove::encode_image(image),
+        )
+    };
+    let state = JointState {
+        stamp: STAMP,
+        position: vec![0.5, -2.0],
+        velocity: vec![0.25, 0.0],
+        effort: vec![1.0, 2.0],
+    };
     let joints = Part {
         topic: JOINTS,
         schema: joint_state::SCHEMA_NAME,
@@ -95,11 +115,26 @@ fn contents() -> Contents {
         metadata: vec![("joint_names", "a,b")],
         message: joint_state::encode(&state),
     };
-    let depth = image("wrist", PixelFormat::DepthU16 { meters_per_count: 0.001 }, &[7; 8]);
-    let depth = Part { metadata: vec![("meters_per_count", "0.001")], ..of_image(DEPTH, &depth) };
+    let depth = image(
+        "wrist",
+        PixelFormat::DepthU16 {
+            meters_per_count: 0.001,
+        },
+        &[7; 8],
+    );
+    let depth = Part {
+        metadata: vec![("meters_per_count", "0.001")],
+        ..of_image(DEPTH, &depth)
+    };
     let rgb: Vec<u8> = (0..12).collect();
-    let colors = YuvColors { matrix: YuvMatrix::Bt601, range: YuvRange::Full };
-    let yuv = PixelFormat::Yuv { layout: YuvLayout::Yuyv, colors };
+    let colors = YuvColors {
+        matrix: YuvMatrix::Bt601,
+        range: YuvRange::Full,
+    };
+    let yuv = PixelFormat::Yuv {
+        layout: YuvLayout::Yuyv,
+        colors,
+    };
     let intrinsics = Intrinsics {
         size_px: [2, 2],
         focal_px: [2.0, 2.0],
@@ -108,8 +143,16 @@ fn contents() -> Contents {
         rectified: false,
     };
     let pose = Transform::translation(1.0, 2.0, 3.0);
-    let point = RangePoint { position_m: [1.0, -0.5, 2.0], ring: 3, offset_micros: 70 };
-    let scan = RangeScan { scanner: "lidar".into(), stamp: STAMP, points: [point].into() };
+    let point = RangePoint {
+        position_m: [1.0, -0.5, 2.0],
+        ring: 3,
+        offset_micros: 70,
+    };
+    let scan = RangeScan {
+        scanner: "lidar".into(),
+        stamp: STAMP,
+        points: [point].into(),
+    };
     let transform = |parent, child| foxglove::encode_transform(parent, child, STAMP, &pose);
     Contents {
         profile: "fieldrig",
@@ -128,8 +171,16 @@ fn contents() -> Contents {
                 descriptor::CAMERA_CALIBRATION,
                 foxglove::encode_calibration("wrist", STAMP, &intrinsics),
             ),
-            protobuf(BASE, descriptor::FRAME_TRANSFORM, transform("world", "base")),
-            protobuf("/base/truth", descriptor::FRAME_TRANSFORM, transform("world", "base_truth")),
+            protobuf(
+                BASE,
+                descriptor::FRAME_TRANSFORM,
+                transform("world", "base"),
+            ),
+            protobuf(
+                "/base/truth",
+                descriptor::FRAME_TRANSFORM,
+                transform("world", "base_truth"),
+            ),
             protobuf(SCAN, descriptor::POINT_CLOUD, point_cloud::encode(&scan)),
             of_image(TRUE_COLOR, &image("wrist", PixelFormat::Rgb8, &rgb)),
             protobuf(
@@ -137,7 +188,11 @@ fn contents() -> Contents {
                 descriptor::RAW_IMAGE,
                 foxglove::encode_depth_m("wrist", STAMP, [2, 2], &[0.5, 1.0, 1.5, 0.0]),
             ),
-            protobuf(TRUE_POSE, descriptor::FRAME_TRANSFORM, foxglove::encode_true_pose("wrist", STAMP, &pose, None)),
+            protobuf(
+                TRUE_POSE,
+                descriptor::FRAME_TRANSFORM,
+                foxglove::encode_true_pose("wrist", STAMP, &pose, None),
+            ),
         ],
         log_time: 5,
         chunk: None,
@@ -150,28 +205,56 @@ fn record(opcode: u8, bytes: &[u8]) -> Vec<u8> {
 }
 
 fn text(text: &str) -> Vec<u8> {
-    [&u32::try_from(text.len()).expect("short").to_le_bytes()[..], text.as_bytes()].concat()
+    [
+        &u32::try_from(text.len()).expect("short").to_le_bytes()[..],
+        text.as_bytes(),
+    ]
+    .concat()
 }
 
 fn channel(id: u16, part: &Part) -> Vec<u8> {
-    let entries: Vec<u8> = part.metadata.iter().flat_map(|(key, value)| [text(key), text(value)].concat()).collect();
+    let entries: Vec<u8> = part
+        .metadata
+        .iter()
+        .flat_map(|(key, value)| [text(key), text(value)].concat())
+        .collect();
     let n_entries = u32::try_from(entries.len()).expect("short").to_le_bytes();
     let ids = [id.to_le_bytes(), id.to_le_bytes()].concat();
-    record(4, &[&ids[..], &text(part.topic), &text(part.encoding), &n_entries, &entries].concat())
+    record(
+        4,
+        &[
+            &ids[..],
+            &text(part.topic),
+            &text(part.encoding),
+            &n_entries,
+            &entries,
+        ]
+        .concat(),
+    )
 }
 
 fn message(channel_id: u16, log_time: u64, data: &[u8]) -> Vec<u8> {
     let number = u32::try_from(log_time).expect("small").to_le_bytes();
     record(
         5,
-        &[&channel_id.to_le_bytes()[..], &number, &log_time.to_le_bytes(), &log_time.to_le_bytes(), data].concat(),
+        &[
+            &channel_id.to_le_bytes()[..],
+            &number,
+            &log_time.to_le_bytes(),
+            &log_time.to_le_bytes(),
+            data,
+        ]
+        .concat(),
     )
 }
 
 impl Chunk {
     fn around(&self, records: &[u8]) -> Vec<u8> {
         let stored = match self.compression {
-            "zstd" => ruzstd::encoding::compress_to_vec(records, ruzstd::encoding::CompressionLevel::Fastest),
+            "zstd" => ruzstd::encoding::compress_to_vec(
+                records,
+                ruzstd::encoding::CompressionLevel::Fastest,
+            ),
             "lz4" => {
                 let mut encoder = lz4_flex::frame::FrameEncoder::new(Vec::new());
                 encoder.write_all(records).expect("memory");
@@ -183,7 +266,18 @@ impl Chunk {
         let length = |n_bytes: usize| (n_bytes as u64).to_le_bytes();
         let [n_records, n_stored] = [records.len(), stored.len()].map(length);
         let compression = text(self.compression);
-        record(6, &[&[0; 16][..], &n_records, &checksum.to_le_bytes(), &compression, &n_stored, &stored].concat())
+        record(
+            6,
+            &[
+                &[0; 16][..],
+                &n_records,
+                &checksum.to_le_bytes(),
+                &compression,
+                &n_stored,
+                &stored,
+            ]
+            .concat(),
+        )
     }
 }
 
@@ -193,14 +287,30 @@ impl Contents {
         file.extend(record(1, &[text(self.profile), text("library")].concat()));
         for (name, data) in &self.attachments {
             let n_bytes = (data.len() as u64).to_le_bytes();
-            let body = [&[0; 16][..], &text(name), &text("text/plain"), &n_bytes, data.as_bytes()].concat();
-            let checksum = self.attachment_checksum.unwrap_or_else(|| crc32fast::hash(&body));
+            let body = [
+                &[0; 16][..],
+                &text(name),
+                &text("text/plain"),
+                &n_bytes,
+                data.as_bytes(),
+            ]
+            .concat();
+            let checksum = self
+                .attachment_checksum
+                .unwrap_or_else(|| crc32fast::hash(&body));
             file.extend(record(9, &[&body[..], &checksum.to_le_bytes()].concat()));
         }
         let mut records = Vec::new();
         for (id, part) in (1_u16..).zip(&self.parts) {
-            let (name, encoding, body) = (text(part.schema), text(self.schema_encoding), text(self.schema_text));
-            records.extend(record(3, &[&id.to_le_bytes()[..], &name, &encoding, &body].concat()));
+            let (name, encoding, body) = (
+                text(part.schema),
+                text(self.schema_encoding),
+                text(self.schema_text),
+            );
+            records.extend(record(
+                3,
+                &[&id.to_le_bytes()[..], &name, &encoding, &body].concat(),
+            ));
             records.extend(channel(id, part));
             records.extend(message(id, self.log_time, &part.message));
         }
@@ -216,7 +326,10 @@ impl Contents {
     }
 
     fn part(&mut self, topic: &str) -> &mut Part {
-        self.parts.iter_mut().find(|part| part.topic == topic).expect("a known topic")
+        self.parts
+            .iter_mut()
+            .find(|part| part.topic == topic)
+            .expect("a known topic")
     }
 
     /// Appends fields to a message. The last field of each number counts.
@@ -246,7 +359,11 @@ fn read(contents: &Contents) -> (Read, Vec<String>, Option<String>) {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("it.mcap");
     std::fs::write(&path, contents.bytes()).expect("a file");
-    let mut read = Read { samples: Vec::new(), attachments: [None, None], joint_names: None };
+    let mut read = Read {
+        samples: Vec::new(),
+        attachments: [None, None],
+        joint_names: None,
+    };
     let mut recording = match Recording::open(&path) {
         Ok(recording) => recording,
         Err(error) => return (read, Vec::new(), Some(with_source(&error))),
@@ -258,9 +375,16 @@ fn read(contents: &Contents) -> (Read, Vec<String>, Option<String>) {
             Err(error) => break Some(with_source(&error)),
         }
     };
-    read.attachments = [RIG_FILE, URDF_FILE].map(|name| recording.attachment(name).map(<[u8]>::to_vec));
+    read.attachments =
+        [RIG_FILE, URDF_FILE].map(|name| recording.attachment(name).map(<[u8]>::to_vec));
     read.joint_names = recording.joint_names().map(<[String]>::to_vec);
-    let notes = recording.notes.0.values().chain(&recording.unused).cloned().collect();
+    let notes = recording
+        .notes
+        .0
+        .values()
+        .chain(&recording.unused)
+        .cloned()
+        .collect();
     (read, notes, refused)
 }
 
@@ -271,98 +395,271 @@ fn with_source(error: &crate::Error) -> String {
 
 type Change = fn(&mut Contents);
 
-/// A row of the table in docs/reference/recording.md, words of the note or error, and the only change to a file.
+/// A row of the table in docs/reference/recording.md, words of the note or error, and the only
+/// change to a file.
 const CASES: &[(&str, &str, Change)] = &[
-    ("profile and library of the header", "", |file| file.profile = "ros2"),
-    ("compression with zstd or lz4", "", |file| file.chunk = Some(Chunk { compression: "zstd", checksum: None })),
-    ("compression with zstd or lz4", "", |file| file.chunk = Some(Chunk { compression: "lz4", checksum: None })),
-    ("compression with zstd or lz4", "", |file| file.chunk = Some(Chunk { compression: "", checksum: Some(0) })),
-    ("other compression", "compressed with \"brotli\", supported are zstd and lz4", |file| {
-        file.chunk = Some(Chunk { compression: "brotli", checksum: None });
+    ("profile and library of the header", "", |file| {
+        file.profile = "ros2"
     }),
-    ("wrong checksum of a chunk or attachment", "a chunk has the checksum", |file| {
-        file.chunk = Some(Chunk { compression: "", checksum: Some(1) });
+    ("compression with zstd or lz4", "", |file| {
+        file.chunk = Some(Chunk {
+            compression: "zstd",
+            checksum: None,
+        })
     }),
-    ("wrong checksum of a chunk or attachment", "the checksum of attachment \"rig.toml\"", |file| {
-        file.attachment_checksum = Some(1);
+    ("compression with zstd or lz4", "", |file| {
+        file.chunk = Some(Chunk {
+            compression: "lz4",
+            checksum: None,
+        })
     }),
-    ("attachments `rig.toml` and `robot.urdf`", "", |file| file.attachments[0].1 = "[base]\n"),
-    ("attachments `rig.toml` and `robot.urdf`", "", |file| file.attachments[1].1 = "<robot name=\"b\"/>"),
-    ("another attachment of that name with other contents", "another one of this name", |file| {
-        file.attachments.push((RIG_FILE, "[base]\n"));
+    ("compression with zstd or lz4", "", |file| {
+        file.chunk = Some(Chunk {
+            compression: "",
+            checksum: Some(0),
+        })
     }),
-    ("other attachments", "attachment \"notes.txt\"", |file| file.attachments.push(("notes.txt", "hello"))),
-    ("metadata records", "metadata \"site\"", |file| file.more = record(12, &[&text("site")[..], &[0; 4]].concat())),
-    ("indices, statistics, private records", "", |file| file.more = [record(11, &[0; 46]), record(200, b"x")].concat()),
+    (
+        "other compression",
+        "compressed with \"brotli\", supported are zstd and lz4",
+        |file| {
+            file.chunk = Some(Chunk {
+                compression: "brotli",
+                checksum: None,
+            });
+        },
+    ),
+    (
+        "wrong checksum of a chunk or attachment",
+        "a chunk has the checksum",
+        |file| {
+            file.chunk = Some(Chunk {
+                compression: "",
+                checksum: Some(1),
+            });
+        },
+    ),
+    (
+        "wrong checksum of a chunk or attachment",
+        "the checksum of attachment \"rig.toml\"",
+        |file| {
+            file.attachment_checksum = Some(1);
+        },
+    ),
+    ("attachments `rig.toml` and `robot.urdf`", "", |file| {
+        file.attachments[0].1 = "[base]\n"
+    }),
+    ("attachments `rig.toml` and `robot.urdf`", "", |file| {
+        file.attachments[1].1 = "<robot name=\"b\"/>"
+    }),
+    (
+        "another attachment of that name with other contents",
+        "another one of this name",
+        |file| {
+            file.attachments.push((RIG_FILE, "[base]\n"));
+        },
+    ),
+    ("other attachments", "attachment \"notes.txt\"", |file| {
+        file.attachments.push(("notes.txt", "hello"))
+    }),
+    ("metadata records", "metadata \"site\"", |file| {
+        file.more = record(12, &[&text("site")[..], &[0; 4]].concat())
+    }),
+    ("indices, statistics, private records", "", |file| {
+        file.more = [record(11, &[0; 46]), record(200, b"x")].concat()
+    }),
     ("other topics", "topic \"/tf\"", |file| {
-        let part = Part { topic: "/tf", schema: "tf2_msgs/TFMessage", encoding: "cdr", ..file.parts[1].clone() };
+        let part = Part {
+            topic: "/tf",
+            schema: "tf2_msgs/TFMessage",
+            encoding: "cdr",
+            ..file.parts[1].clone()
+        };
         file.parts.push(part);
     }),
-    ("encoding of messages", "its messages are \"foxglove.RawImage\" in \"cdr\"", |file| {
-        file.part(COLOR).encoding = "cdr";
-    }),
-    ("name of the schema", "expected foxglove.CompressedImage or foxglove.RawImage in \"protobuf\"", |file| {
-        file.part(COMPRESSED).schema = "foxglove.CompressedVideo";
-    }),
-    ("name of the schema", "expected fieldrig.JointState in \"json\"", |file| file.part(JOINTS).schema = ""),
+    (
+        "encoding of messages",
+        "its messages are \"foxglove.RawImage\" in \"cdr\"",
+        |file| {
+            file.part(COLOR).encoding = "cdr";
+        },
+    ),
+    (
+        "name of the schema",
+        "expected foxglove.CompressedImage or foxglove.RawImage in \"protobuf\"",
+        |file| {
+            file.part(COMPRESSED).schema = "foxglove.CompressedVideo";
+        },
+    ),
+    (
+        "name of the schema",
+        "expected fieldrig.JointState in \"json\"",
+        |file| file.part(JOINTS).schema = "",
+    ),
     ("encoding and text of the schema", "", |file| {
         (file.schema_encoding, file.schema_text) = ("omgidl", "struct A {}")
     }),
-    ("`joint_names`", "", |file| file.part(JOINTS).metadata = vec![("joint_names", "b,a")]),
-    ("no `joint_names`", "does not list joint_names", |file| file.part(JOINTS).metadata.clear()),
-    ("no `joint_names`", "does not list joint_names", |file| file.part(JOINTS).metadata[0].1 = ""),
-    ("other `joint_names` in another channel", "the joint_names b,a, expected those of the first one, a,b", |file| {
-        let part = Part { metadata: vec![("joint_names", "b,a")], ..file.parts[0].clone() };
-        file.parts.push(part);
+    ("`joint_names`", "", |file| {
+        file.part(JOINTS).metadata = vec![("joint_names", "b,a")]
     }),
-    ("`meters_per_count` of the channel", "meters_per_count is 0.0001 in the metadata of the channel", |file| {
-        file.part(DEPTH).metadata[0].1 = "0.0001";
+    ("no `joint_names`", "does not list joint_names", |file| {
+        file.part(JOINTS).metadata.clear()
     }),
-    ("other metadata of a channel", "metadata \"serial\" of topic \"/camera/wrist/color\"", |file| {
-        file.part(COLOR).metadata.push(("serial", "17"));
+    ("no `joint_names`", "does not list joint_names", |file| {
+        file.part(JOINTS).metadata[0].1 = ""
     }),
-    ("another channel with the same number", "the same number, 1", |file| {
-        let part = Part { topic: "/tf", ..file.parts[1].clone() };
-        file.more = channel(1, &part);
+    (
+        "other `joint_names` in another channel",
+        "the joint_names b,a, expected those of the first one, a,b",
+        |file| {
+            let part = Part {
+                metadata: vec![("joint_names", "b,a")],
+                ..file.parts[0].clone()
+            };
+            file.parts.push(part);
+        },
+    ),
+    (
+        "`meters_per_count` of the channel",
+        "meters_per_count is 0.0001 in the metadata of the channel",
+        |file| {
+            file.part(DEPTH).metadata[0].1 = "0.0001";
+        },
+    ),
+    (
+        "other metadata of a channel",
+        "metadata \"serial\" of topic \"/camera/wrist/color\"",
+        |file| {
+            file.part(COLOR).metadata.push(("serial", "17"));
+        },
+    ),
+    (
+        "another channel with the same number",
+        "the same number, 1",
+        |file| {
+            let part = Part {
+                topic: "/tf",
+                ..file.parts[1].clone()
+            };
+            file.more = channel(1, &part);
+        },
+    ),
+    (
+        "another channel with the same number",
+        "the same number, 2",
+        |file| {
+            let part = Part {
+                topic: COMPRESSED,
+                ..file.parts[1].clone()
+            };
+            file.more = [
+                record(
+                    3,
+                    &[
+                        &2_u16.to_le_bytes()[..],
+                        &text(part.schema),
+                        &text(""),
+                        &text(""),
+                    ]
+                    .concat(),
+                ),
+                channel(2, &part),
+            ]
+            .concat();
+        },
+    ),
+    (
+        "channel that is not announced",
+        "a message on channel 99",
+        |file| file.more = message(99, 5, b"x"),
+    ),
+    ("`log_time`, `publish_time`, `sequence`", "", |file| {
+        file.log_time = 77
     }),
-    ("another channel with the same number", "the same number, 2", |file| {
-        let part = Part { topic: COMPRESSED, ..file.parts[1].clone() };
-        file.more = [
-            record(3, &[&2_u16.to_le_bytes()[..], &text(part.schema), &text(""), &text("")].concat()),
-            channel(2, &part),
-        ]
-        .concat();
+    ("`timestamp`", "", |file| {
+        file.append(
+            COLOR,
+            Message::default().message(1, Message::default().varint(1, 2)),
+        )
     }),
-    ("channel that is not announced", "a message on channel 99", |file| file.more = message(99, 5, b"x")),
-    ("`log_time`, `publish_time`, `sequence`", "", |file| file.log_time = 77),
-    ("`timestamp`", "", |file| file.append(COLOR, Message::default().message(1, Message::default().varint(1, 2)))),
-    ("`timestamp`", "", |file| file.append(BASE, Message::default().message(1, Message::default().varint(1, 2)))),
-    ("`timestamp`", "", |file| file.append(SCAN, Message::default().message(1, Message::default().varint(1, 2)))),
-    ("`timestamp`", "", |file| file.replace("\"sec\":1", "\"sec\":2")),
-    ("`timestamp` with nanoseconds beyond one second", "field 1 is outside its range", |file| {
-        file.append(COLOR, Message::default().message(1, Message::default().varint(2, 2_000_000_000)));
+    ("`timestamp`", "", |file| {
+        file.append(
+            BASE,
+            Message::default().message(1, Message::default().varint(1, 2)),
+        )
     }),
-    ("`timestamp` with nanoseconds beyond one second", "the timestamp is out of range", |file| {
-        file.replace("\"nsec\":500000000", "\"nsec\":1500000000");
+    ("`timestamp`", "", |file| {
+        file.append(
+            SCAN,
+            Message::default().message(1, Message::default().varint(1, 2)),
+        )
     }),
-    ("missing field", "the timestamp is missing", |file| file.part(COLOR).message.clear()),
-    ("missing field", "the data is missing", |file| file.part(SCAN).message.clear()),
-    ("missing field", "missing field `velocity`", |file| file.replace("velocity", "velocities")),
-    ("unknown field", "not used: 1099; a newer version", |file| file.append(COLOR, Message::default().varint(1099, 1))),
-    ("unknown field", "not used: 1099; a newer version", |file| file.append(BASE, Message::default().varint(1099, 1))),
-    ("unknown field", "not used: names; a newer version", |file| {
-        file.replace("{\"timestamp\"", "{\"names\":[],\"timestamp\"")
+    ("`timestamp`", "", |file| {
+        file.replace("\"sec\":1", "\"sec\":2")
     }),
-    ("image: `data`", "", |file| file.append(COLOR, Message::default().bytes(6, &[9; 12]))),
-    ("image: `data`", "", |file| file.append(COMPRESSED, Message::default().bytes(2, &[9; 12]))),
-    ("image: `encoding`, `format`", "", |file| file.append(COLOR, Message::default().bytes(4, b"bgr8"))),
-    ("image: `encoding`, `format`", "", |file| file.append(COMPRESSED, Message::default().bytes(3, b"jpeg"))),
-    ("image: unknown `encoding` or `format`", "the pixel format \"webp\" is unknown", |file| {
-        file.append(COMPRESSED, Message::default().bytes(3, b"webp"));
+    (
+        "`timestamp` with nanoseconds beyond one second",
+        "field 1 is outside its range",
+        |file| {
+            file.append(
+                COLOR,
+                Message::default().message(1, Message::default().varint(2, 2_000_000_000)),
+            );
+        },
+    ),
+    (
+        "`timestamp` with nanoseconds beyond one second",
+        "the timestamp is out of range",
+        |file| {
+            file.replace("\"nsec\":500000000", "\"nsec\":1500000000");
+        },
+    ),
+    ("missing field", "the timestamp is missing", |file| {
+        file.part(COLOR).message.clear()
     }),
-    ("image: unknown `encoding` or `format`", "the pixel format \"bayer_rggb8\" is unknown", |file| {
-        file.append(COLOR, Message::default().bytes(4, b"bayer_rggb8"));
+    ("missing field", "the data is missing", |file| {
+        file.part(SCAN).message.clear()
     }),
+    ("missing field", "missing field `velocity`", |file| {
+        file.replace("velocity", "velocities")
+    }),
+    ("unknown field", "not used: 1099; a newer version", |file| {
+        file.append(COLOR, Message::default().varint(1099, 1))
+    }),
+    ("unknown field", "not used: 1099; a newer version", |file| {
+        file.append(BASE, Message::default().varint(1099, 1))
+    }),
+    (
+        "unknown field",
+        "not used: names; a newer version",
+        |file| file.replace("{\"timestamp\"", "{\"names\":[],\"timestamp\""),
+    ),
+    ("image: `data`", "", |file| {
+        file.append(COLOR, Message::default().bytes(6, &[9; 12]))
+    }),
+    ("image: `data`", "", |file| {
+        file.append(COMPRESSED, Message::default().bytes(2, &[9; 12]))
+    }),
+    ("image: `encoding`, `format`", "", |file| {
+        file.append(COLOR, Message::default().bytes(4, b"bgr8"))
+    }),
+    ("image: `encoding`, `format`", "", |file| {
+        file.append(COMPRESSED, Message::default().bytes(3, b"jpeg"))
+    }),
+    (
+        "image: unknown `encoding` or `format`",
+        "the pixel format \"webp\" is unknown",
+        |file| {
+            file.append(COMPRESSED, Message::default().bytes(3, b"webp"));
+        },
+    ),
+    (
+        "image: unknown `encoding` or `format`",
+        "the pixel format \"bayer_rggb8\" is unknown",
+        |file| {
+            file.append(COLOR, Message::default().bytes(4, b"bayer_rggb8"));
+        },
+    ),
     (
         "image: depth on a color topic, or color on a depth topic",
         "encoding is 16UC1 (depth), expected a color",
@@ -377,119 +674,280 @@ const CASES: &[(&str, &str, Change)] = &[
             file.part(DEPTH).message = file.part(COLOR).message.clone();
         },
     ),
-    ("image: `width`, `height`, `width_px`, `height_px`", "", |file| {
-        file.append(COLOR, Message::default().fixed32(3, 1));
-    }),
-    ("image: `width`, `height`, `width_px`, `height_px`", "", |file| {
-        file.append(COMPRESSED, Message::default().fixed32(1003, 3));
-    }),
-    ("image: size of 0", "the width or height is missing", |file| file.append(COLOR, Message::default().fixed32(3, 0))),
-    ("image: size of 0", "the width_px or height_px is missing", |file| {
-        file.append(COMPRESSED, Message::default().fixed32(1003, 0));
-    }),
+    (
+        "image: `width`, `height`, `width_px`, `height_px`",
+        "",
+        |file| {
+            file.append(COLOR, Message::default().fixed32(3, 1));
+        },
+    ),
+    (
+        "image: `width`, `height`, `width_px`, `height_px`",
+        "",
+        |file| {
+            file.append(COMPRESSED, Message::default().fixed32(1003, 3));
+        },
+    ),
+    (
+        "image: size of 0",
+        "the width or height is missing",
+        |file| file.append(COLOR, Message::default().fixed32(3, 0)),
+    ),
+    (
+        "image: size of 0",
+        "the width_px or height_px is missing",
+        |file| {
+            file.append(COMPRESSED, Message::default().fixed32(1003, 0));
+        },
+    ),
     ("image: `step` with padding", "", |file| {
         let rgb: Vec<u8> = (0..12).collect();
         let rows = [&rgb[..6], &[77; 2], &rgb[6..], &[77; 2]].concat();
         file.append(COLOR, Message::default().fixed32(5, 8).bytes(6, &rows));
     }),
-    ("image: `step` that does not fit the data", "step is 5, with 12 bytes of data", |file| {
-        file.append(COLOR, Message::default().fixed32(5, 5));
+    (
+        "image: `step` that does not fit the data",
+        "step is 5, with 12 bytes of data",
+        |file| {
+            file.append(COLOR, Message::default().fixed32(5, 5));
+        },
+    ),
+    (
+        "image: `step` that does not fit the data",
+        "step is 8, with 12 bytes of data",
+        |file| {
+            file.append(COLOR, Message::default().fixed32(5, 8));
+        },
+    ),
+    (
+        "image, scan: `frame_id`",
+        "frame_id \"cam0\", expected \"wrist\"",
+        |file| {
+            file.append(COLOR, Message::default().bytes(7, b"cam0"));
+        },
+    ),
+    (
+        "image, scan: `frame_id`",
+        "frame_id \"laser\", expected \"lidar\"",
+        |file| {
+            file.append(SCAN, Message::default().bytes(2, b"laser"));
+        },
+    ),
+    ("image: `exposure_secs`, `n_skipped`", "", |file| {
+        file.append(COLOR, Message::default().double(1001, 0.01))
     }),
-    ("image: `step` that does not fit the data", "step is 8, with 12 bytes of data", |file| {
-        file.append(COLOR, Message::default().fixed32(5, 8));
+    ("image: `exposure_secs`, `n_skipped`", "", |file| {
+        file.append(DEPTH, Message::default().varint(1002, 3))
     }),
-    ("image, scan: `frame_id`", "frame_id \"cam0\", expected \"wrist\"", |file| {
-        file.append(COLOR, Message::default().bytes(7, b"cam0"));
+    ("image: `meters_per_count`", "", |file| {
+        file.append(DEPTH, Message::default().double(1005, 0.002))
     }),
-    ("image, scan: `frame_id`", "frame_id \"laser\", expected \"lidar\"", |file| {
-        file.append(SCAN, Message::default().bytes(2, b"laser"));
+    (
+        "image: `meters_per_count` that is not positive",
+        "meters_per_count is -0.5, expected a positive",
+        |file| {
+            file.append(DEPTH, Message::default().double(1005, -0.5));
+        },
+    ),
+    (
+        "image: `meters_per_count` that is not positive",
+        "meters_per_count is NaN, expected a positive",
+        |file| {
+            file.append(DEPTH, Message::default().double(1005, f64::NAN));
+        },
+    ),
+    ("image: `yuv_colors`", "", |file| {
+        file.append(YUV, Message::default().bytes(1007, b"bt709-full"))
     }),
-    ("image: `exposure_secs`, `n_skipped`", "", |file| file.append(COLOR, Message::default().double(1001, 0.01))),
-    ("image: `exposure_secs`, `n_skipped`", "", |file| file.append(DEPTH, Message::default().varint(1002, 3))),
-    ("image: `meters_per_count`", "", |file| file.append(DEPTH, Message::default().double(1005, 0.002))),
-    ("image: `meters_per_count` that is not positive", "meters_per_count is -0.5, expected a positive", |file| {
-        file.append(DEPTH, Message::default().double(1005, -0.5));
-    }),
-    ("image: `meters_per_count` that is not positive", "meters_per_count is NaN, expected a positive", |file| {
-        file.append(DEPTH, Message::default().double(1005, f64::NAN));
-    }),
-    ("image: `yuv_colors`", "", |file| file.append(YUV, Message::default().bytes(1007, b"bt709-full"))),
-    ("image: unknown `yuv_colors`", "\"bt2020\" is unknown", |file| {
-        file.append(YUV, Message::default().bytes(1007, b"bt2020"));
+    (
+        "image: unknown `yuv_colors`",
+        "\"bt2020\" is unknown",
+        |file| {
+            file.append(YUV, Message::default().bytes(1007, b"bt2020"));
+        },
+    ),
+    ("pose: `translation`, `rotation`", "", |file| {
+        file.append(
+            BASE,
+            Message::default().message(4, Message::default().double(1, 7.0)),
+        );
     }),
     ("pose: `translation`, `rotation`", "", |file| {
-        file.append(BASE, Message::default().message(4, Message::default().double(1, 7.0)));
+        file.append(
+            BASE,
+            Message::default().message(5, Message::default().double(3, 0.6).double(4, 0.8)),
+        );
     }),
-    ("pose: `translation`, `rotation`", "", |file| {
-        file.append(BASE, Message::default().message(5, Message::default().double(3, 0.6).double(4, 0.8)));
+    (
+        "pose: `rotation` with a length within 1 % of 1",
+        "",
+        |file| {
+            file.append(
+                BASE,
+                Message::default().message(5, Message::default().double(4, 0.995)),
+            );
+        },
+    ),
+    (
+        "pose: `rotation` with another length",
+        "rotation is a quaternion of length 2, expected",
+        |file| {
+            file.append(
+                BASE,
+                Message::default().message(5, Message::default().double(4, 2.0)),
+            );
+        },
+    ),
+    (
+        "pose: names of the frames",
+        "poses of \"base\" in \"odom\", expected \"base\" in \"world\"",
+        |file| {
+            file.append(BASE, Message::default().bytes(2, b"odom"));
+        },
+    ),
+    (
+        "pose: names of the frames exchanged",
+        "expected \"world\": the pose is inverted",
+        |file| {
+            file.append(
+                BASE,
+                Message::default().bytes(2, b"base").bytes(3, b"world"),
+            );
+        },
+    ),
+    (
+        "joint state: `position`, `velocity`, `effort`",
+        "",
+        |file| file.replace("[0.5,-2.0]", "[0.75,-2.0]"),
+    ),
+    (
+        "joint state: `position`, `velocity`, `effort`",
+        "",
+        |file| file.replace("[0.25,0.0]", "[]"),
+    ),
+    (
+        "joint state: `position`, `velocity`, `effort`",
+        "",
+        |file| file.replace("[1.0,2.0]", "[1.0,3.0]"),
+    ),
+    (
+        "joint state: other numbers of values",
+        "position has 3 numbers, expected one for each of the 2",
+        |file| {
+            file.replace("[0.5,-2.0]", "[0.5,-2.0,1.0]");
+        },
+    ),
+    (
+        "joint state: other numbers of values",
+        "velocity has 1 numbers, expected none or 2",
+        |file| {
+            file.replace("[0.25,0.0]", "[0.25]");
+        },
+    ),
+    (
+        "joint state: other numbers of values",
+        "effort has 1 numbers, expected none or 2",
+        |file| {
+            file.replace("[1.0,2.0]", "[1.0]");
+        },
+    ),
+    ("scan: `data`", "", |file| {
+        file.append(SCAN, Message::default().bytes(6, &[0; 40]))
     }),
-    ("pose: `rotation` with a length within 1 % of 1", "", |file| {
-        file.append(BASE, Message::default().message(5, Message::default().double(4, 0.995)));
-    }),
-    ("pose: `rotation` with another length", "rotation is a quaternion of length 2, expected", |file| {
-        file.append(BASE, Message::default().message(5, Message::default().double(4, 2.0)));
-    }),
-    ("pose: names of the frames", "poses of \"base\" in \"odom\", expected \"base\" in \"world\"", |file| {
-        file.append(BASE, Message::default().bytes(2, b"odom"));
-    }),
-    ("pose: names of the frames exchanged", "expected \"world\": the pose is inverted", |file| {
-        file.append(BASE, Message::default().bytes(2, b"base").bytes(3, b"world"));
-    }),
-    ("joint state: `position`, `velocity`, `effort`", "", |file| file.replace("[0.5,-2.0]", "[0.75,-2.0]")),
-    ("joint state: `position`, `velocity`, `effort`", "", |file| file.replace("[0.25,0.0]", "[]")),
-    ("joint state: `position`, `velocity`, `effort`", "", |file| file.replace("[1.0,2.0]", "[1.0,3.0]")),
-    ("joint state: other numbers of values", "position has 3 numbers, expected one for each of the 2", |file| {
-        file.replace("[0.5,-2.0]", "[0.5,-2.0,1.0]");
-    }),
-    ("joint state: other numbers of values", "velocity has 1 numbers, expected none or 2", |file| {
-        file.replace("[0.25,0.0]", "[0.25]");
-    }),
-    ("joint state: other numbers of values", "effort has 1 numbers, expected none or 2", |file| {
-        file.replace("[1.0,2.0]", "[1.0]");
-    }),
-    ("scan: `data`", "", |file| file.append(SCAN, Message::default().bytes(6, &[0; 40]))),
-    ("scan: `pose` other than the identity", "pose is [0.0, 0.0, 0.5] m", |file| {
-        let mut position = Message::default();
-        position.double(3, 0.5);
-        file.append(SCAN, Message::default().message(3, Message::default().message(1, &position)));
-    }),
-    ("scan: other `point_stride` or `fields`", "field 4 is outside its range", |file| {
-        file.append(SCAN, Message::default().fixed32(4, 16));
-    }),
-    ("scan: other `point_stride` or `fields`", "intensity at 12 of type 7", |file| {
-        let mut intensity = Message::default();
-        intensity.bytes(1, b"intensity").fixed32(2, 12).varint(3, 7);
-        file.append(SCAN, Message::default().message(5, &intensity));
-    }),
+    (
+        "scan: `pose` other than the identity",
+        "pose is [0.0, 0.0, 0.5] m",
+        |file| {
+            let mut position = Message::default();
+            position.double(3, 0.5);
+            file.append(
+                SCAN,
+                Message::default().message(3, Message::default().message(1, &position)),
+            );
+        },
+    ),
+    (
+        "scan: other `point_stride` or `fields`",
+        "field 4 is outside its range",
+        |file| {
+            file.append(SCAN, Message::default().fixed32(4, 16));
+        },
+    ),
+    (
+        "scan: other `point_stride` or `fields`",
+        "intensity at 12 of type 7",
+        |file| {
+            let mut intensity = Message::default();
+            intensity.bytes(1, b"intensity").fixed32(2, 12).varint(3, 7);
+            file.append(SCAN, Message::default().message(5, &intensity));
+        },
+    ),
     ("calibration", "", |file| {
         let part = file.part(CALIBRATION);
-        (part.schema, part.encoding, part.message) = ("sensor_msgs/CameraInfo", "cdr", vec![1, 2, 3]);
+        (part.schema, part.encoding, part.message) =
+            ("sensor_msgs/CameraInfo", "cdr", vec![1, 2, 3]);
     }),
-    ("truth: `data`, `psnr_ceiling`", "", |file| file.append(TRUE_COLOR, Message::default().bytes(6, &[9; 12]))),
-    ("truth: `data`, `psnr_ceiling`", "", |file| file.append(TRUE_DEPTH, Message::default().bytes(6, &[0; 16]))),
-    ("truth: `data`, `psnr_ceiling`", "", |file| file.append(TRUE_POSE, Message::default().double(1006, 42.0))),
-    ("truth: pose of another time or camera than its images", "the true color of this pose is missing", |file| {
-        file.append(TRUE_POSE, Message::default().message(1, Message::default().varint(1, 2)));
+    ("truth: `data`, `psnr_ceiling`", "", |file| {
+        file.append(TRUE_COLOR, Message::default().bytes(6, &[9; 12]))
     }),
-    ("truth: pose of another time or camera than its images", "the true color of this pose is missing", |file| {
-        file.part(TRUE_POSE).topic = "/camera/left/truth/pose";
+    ("truth: `data`, `psnr_ceiling`", "", |file| {
+        file.append(TRUE_DEPTH, Message::default().bytes(6, &[0; 16]))
     }),
-    ("truth: depth of another size or encoding", "the pixel format \"16UC1\" is unknown", |file| {
-        file.append(TRUE_DEPTH, Message::default().bytes(4, b"16UC1"));
+    ("truth: `data`, `psnr_ceiling`", "", |file| {
+        file.append(TRUE_POSE, Message::default().double(1006, 42.0))
     }),
-    ("truth: depth of another size or encoding", "data is 16 bytes, expected 4 bytes for each of 2 x 1", |file| {
-        file.append(TRUE_DEPTH, Message::default().fixed32(3, 1));
-    }),
-    ("truth: depth of another size or encoding", "the true depth of this pose is missing", |file| {
-        file.append(TRUE_DEPTH, Message::default().fixed32(3, 1).bytes(6, &[0; 8]));
-    }),
+    (
+        "truth: pose of another time or camera than its images",
+        "the true color of this pose is missing",
+        |file| {
+            file.append(
+                TRUE_POSE,
+                Message::default().message(1, Message::default().varint(1, 2)),
+            );
+        },
+    ),
+    (
+        "truth: pose of another time or camera than its images",
+        "the true color of this pose is missing",
+        |file| {
+            file.part(TRUE_POSE).topic = "/camera/left/truth/pose";
+        },
+    ),
+    (
+        "truth: depth of another size or encoding",
+        "the pixel format \"16UC1\" is unknown",
+        |file| {
+            file.append(TRUE_DEPTH, Message::default().bytes(4, b"16UC1"));
+        },
+    ),
+    (
+        "truth: depth of another size or encoding",
+        "data is 16 bytes, expected 4 bytes for each of 2 x 1",
+        |file| {
+            file.append(TRUE_DEPTH, Message::default().fixed32(3, 1));
+        },
+    ),
+    (
+        "truth: depth of another size or encoding",
+        "the true depth of this pose is missing",
+        |file| {
+            file.append(
+                TRUE_DEPTH,
+                Message::default().fixed32(3, 1).bytes(6, &[0; 8]),
+            );
+        },
+    ),
 ];
 
-/// Changes each part of a file alone, and compares the effect with the table in docs/reference/recording.md.
+/// Changes each part of a file alone, and compares the effect with the table in
+/// docs/reference/recording.md.
 #[test]
 fn parts_of_recordings_are_used_refused_or_named_as_documented() {
     let page = include_str!("../../../../docs/reference/recording.md");
-    let section = page.split("## Files of other programs").nth(1).and_then(|rest| rest.split("\n## ").next());
+    let section = page
+        .split("## Files of other programs")
+        .nth(1)
+        .and_then(|rest| rest.split("\n## ").next());
     let rows = section.expect("a section").lines().filter_map(|line| {
         let mut cells = line.strip_prefix("| ")?.split(" | ");
         Some((cells.next()?, cells.next()?))
@@ -498,7 +956,11 @@ fn parts_of_recordings_are_used_refused_or_named_as_documented() {
     let tested: BTreeSet<&str> = CASES.iter().map(|(part, ..)| *part).collect();
     assert_eq!(documented.keys().copied().collect::<BTreeSet<_>>(), tested);
     let (unchanged, notes, refused) = read(&contents());
-    assert_eq!((unchanged.samples.len(), notes.len(), refused), (9, 0, None), "{notes:?}");
+    assert_eq!(
+        (unchanged.samples.len(), notes.len(), refused),
+        (9, 0, None),
+        "{notes:?}"
+    );
     for (part, words, change) in CASES {
         let mut file = contents();
         change(&mut file);
@@ -507,10 +969,22 @@ fn parts_of_recordings_are_used_refused_or_named_as_documented() {
         let is_noted = notes.iter().any(|note| note.contains(words));
         match documented[part] {
             "yes" => assert!(refused.is_none() && changed != unchanged, "{context}"),
-            "yes, note" => assert!(refused.is_none() && changed != unchanged && is_noted, "{context}"),
-            "no" => assert!(refused.is_none() && changed == unchanged && notes.is_empty(), "{context}"),
-            "note" => assert!(refused.is_none() && changed == unchanged && is_noted, "{context}"),
-            "refused" => assert!(refused.is_some_and(|reason| reason.contains(words)), "{context}"),
+            "yes, note" => assert!(
+                refused.is_none() && changed != unchanged && is_noted,
+                "{context}"
+            ),
+            "no" => assert!(
+                refused.is_none() && changed == unchanged && notes.is_empty(),
+                "{context}"
+            ),
+            "note" => assert!(
+                refused.is_none() && changed == unchanged && is_noted,
+                "{context}"
+            ),
+            "refused" => assert!(
+                refused.is_some_and(|reason| reason.contains(words)),
+                "{context}"
+            ),
             other => panic!("{part}: unknown use {other:?}"),
         }
     }
@@ -525,15 +999,29 @@ fn files_without_samples_name_their_contents() {
     }
     let (_, _, refused) = read(&other);
     let refused = refused.expect("no samples");
-    assert!(refused.ends_with("recorded by this program; it contains topic \"/scan\", topic \"/tf\""), "{refused}");
+    assert!(
+        refused.ends_with("recorded by this program; it contains topic \"/scan\", topic \"/tf\""),
+        "{refused}"
+    );
 }
 
 #[test]
 fn attachments_behind_the_samples_are_read_and_damaged_ones_named() {
     let whole = contents();
     let attachment = |name: &str, checksum: u32| {
-        let body = [&[0; 16][..], &text(name), &text(""), &3_u64.to_le_bytes(), b"abc"].concat();
-        let checksum = if checksum == 0 { crc32fast::hash(&body) } else { checksum };
+        let body = [
+            &[0; 16][..],
+            &text(name),
+            &text(""),
+            &3_u64.to_le_bytes(),
+            b"abc",
+        ]
+        .concat();
+        let checksum = if checksum == 0 {
+            crc32fast::hash(&body)
+        } else {
+            checksum
+        };
         record(9, &[&body[..], &checksum.to_le_bytes()].concat())
     };
     let attached = |urdf_checksum: u32| {
@@ -550,7 +1038,8 @@ fn attachments_behind_the_samples_are_read_and_damaged_ones_named() {
     assert_eq!(attached(0), (Some(b"abc".to_vec()), Vec::new()));
     let (urdf, notes) = attached(7);
     assert!(
-        urdf.is_none() && notes[0].contains("the checksum of attachment \"robot.urdf\" does not match"),
+        urdf.is_none()
+            && notes[0].contains("the checksum of attachment \"robot.urdf\" does not match"),
         "{notes:?}"
     );
 }

@@ -1,8 +1,9 @@
 //! CANopen: network management, heartbeats, SYNC, expedited SDO transfers, and PDO mapping.
 //!
-//! Source: CiA 301 (CANopen application layer and communication profile) 4.2.0: sections 7.2.2 (PDO), 7.2.4 (SDO and its abort
-//! codes), 7.2.8 (NMT, heartbeat), 7.5.2 (objects); the same bytes in christiansandberg/canopen. Segmented and block
-//! transfers are not supported: no object that a drive needs is longer than four bytes.
+//! Source: CiA 301 (CANopen application layer and communication profile) 4.2.0: sections 7.2.2
+//! (PDO), 7.2.4 (SDO and its abort codes), 7.2.8 (NMT, heartbeat), 7.5.2 (objects); the same bytes
+//! in christiansandberg/canopen. Segmented and block transfers are not supported: no object that a
+//! drive needs is longer than four bytes.
 
 use super::{CanError, Frame, Id, decode_enum};
 
@@ -19,7 +20,12 @@ impl Node {
     pub fn new(number: u8) -> Result<Self, CanError> {
         match number {
             1..=127 => Ok(Self(number)),
-            _ => Err(CanError::Range { field: "the node", value: number.into(), lower: 1.0, upper: 127.0 }),
+            _ => Err(CanError::Range {
+                field: "the node",
+                value: number.into(),
+                lower: 1.0,
+                upper: 127.0,
+            }),
         }
     }
 
@@ -70,11 +76,19 @@ pub struct Object {
     pub n_bytes: u8,
 }
 
-/// Consumer heartbeat time, entry 1: node in bits 16 to 22, milliseconds in bits 0 to 15. It makes a drive stop when
-/// the host's heartbeat is missing.
-pub const CONSUMER_HEARTBEAT: Object = Object { index: 0x1016, subindex: 1, n_bytes: 4 };
+/// Consumer heartbeat time, entry 1: node in bits 16 to 22, milliseconds in bits 0 to 15. It makes
+/// a drive stop when the host's heartbeat is missing.
+pub const CONSUMER_HEARTBEAT: Object = Object {
+    index: 0x1016,
+    subindex: 1,
+    n_bytes: 4,
+};
 /// Producer heartbeat time, milliseconds; 0 disables it.
-pub const PRODUCER_HEARTBEAT: Object = Object { index: 0x1017, subindex: 0, n_bytes: 2 };
+pub const PRODUCER_HEARTBEAT: Object = Object {
+    index: 0x1017,
+    subindex: 0,
+    n_bytes: 2,
+};
 
 /// Number of a PDO. A node has four in each direction.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -103,7 +117,8 @@ impl Pdo {
             Direction::Receive => 0x200,
             Direction::Transmit => 0x180,
         };
-        Id::standard(base + 0x100 * u32::from(self as u8) + u32::from(node.0)).expect("the identifier is at most 0x57F")
+        Id::standard(base + 0x100 * u32::from(self as u8) + u32::from(node.0))
+            .expect("the identifier is at most 0x57F")
     }
 
     /// The mapping object: entries from 1 are mapped objects; entry 0 is their number.
@@ -112,16 +127,25 @@ impl Pdo {
             Direction::Receive => 0x1600,
             Direction::Transmit => 0x1A00,
         };
-        Object { index: base + self as u16, subindex: entry, n_bytes: if entry == 0 { 1 } else { 4 } }
+        Object {
+            index: base + self as u16,
+            subindex: entry,
+            n_bytes: if entry == 0 { 1 } else { 4 },
+        }
     }
 
-    /// The communication object: entry 1 is its identifier (bit 31 disables the PDO), entry 2 the transmission type.
+    /// The communication object: entry 1 is its identifier (bit 31 disables the PDO), entry 2 the
+    /// transmission type.
     pub fn communication(self, direction: Direction, entry: u8) -> Object {
         let base = match direction {
             Direction::Receive => 0x1400,
             Direction::Transmit => 0x1800,
         };
-        Object { index: base + self as u16, subindex: entry, n_bytes: if entry == 1 { 4 } else { 1 } }
+        Object {
+            index: base + self as u16,
+            subindex: entry,
+            n_bytes: if entry == 1 { 4 } else { 1 },
+        }
     }
 }
 
@@ -135,14 +159,21 @@ impl Object {
     pub fn from_mapped(entry: u32) -> Result<Self, CanError> {
         let [high, low, subindex, n_bits] = entry.to_be_bytes();
         match n_bits {
-            8 | 16 | 32 => Ok(Self { index: u16::from_be_bytes([high, low]), subindex, n_bytes: n_bits / 8 }),
-            _ => Err(CanError::Undefined { field: "the length of a mapped object in bits", raw: n_bits.into() }),
+            8 | 16 | 32 => Ok(Self {
+                index: u16::from_be_bytes([high, low]),
+                subindex,
+                n_bytes: n_bits / 8,
+            }),
+            _ => Err(CanError::Undefined {
+                field: "the length of a mapped object in bits",
+                raw: n_bits.into(),
+            }),
         }
     }
 }
 
-/// The value of [`CONSUMER_HEARTBEAT`] that makes a drive react after `millis` without a heartbeat from `host`; 0
-/// disables the reaction.
+/// The value of [`CONSUMER_HEARTBEAT`] that makes a drive react after `millis` without a heartbeat
+/// from `host`; 0 disables the reaction.
 pub fn consumer_heartbeat(host: Node, millis: u16) -> u32 {
     u32::from(host.0) << 16 | u32::from(millis)
 }
@@ -166,16 +197,33 @@ pub fn encode_heartbeat(node: Node, state: NodeState) -> Frame {
 pub fn decode_heartbeat(frame: &Frame) -> Result<(Node, NodeState), CanError> {
     let (node, bytes) = from_node(frame, 0x700, HEARTBEAT)?;
     let &[state] = bytes else {
-        return Err(CanError::Length { message: HEARTBEAT, got_bytes: bytes.len(), expected_bytes: 1 });
+        return Err(CanError::Length {
+            message: HEARTBEAT,
+            got_bytes: bytes.len(),
+            expected_bytes: 1,
+        });
     };
-    let states = [NodeState::BootUp, NodeState::Stopped, NodeState::Operational, NodeState::PreOperational];
-    Ok((node, decode_enum("the state of the node", state.into(), &states, |known| known as u32)?))
+    let states = [
+        NodeState::BootUp,
+        NodeState::Stopped,
+        NodeState::Operational,
+        NodeState::PreOperational,
+    ];
+    Ok((
+        node,
+        decode_enum("the state of the node", state.into(), &states, |known| {
+            known as u32
+        })?,
+    ))
 }
 
 /// Encodes a request to read an object of a node.
 pub fn encode_read(node: Node, object: Object) -> Frame {
     let [low, high] = object.index.to_le_bytes();
-    data_frame(0x600 + u32::from(node.0), &[0x40, low, high, object.subindex, 0, 0, 0, 0])
+    data_frame(
+        0x600 + u32::from(node.0),
+        &[0x40, low, high, object.subindex, 0, 0, 0, 0],
+    )
 }
 
 /// Encodes a request to write an object of a node. Negative values are encoded as two's complement.
@@ -188,13 +236,23 @@ pub fn encode_write(node: Node, object: Object, value: i64) -> Result<Frame, Can
         1 => 0x2F,
         2 => 0x2B,
         4 => 0x23,
-        n_bytes => return Err(CanError::Undefined { field: "the bytes of an object", raw: n_bytes.into() }),
+        n_bytes => {
+            return Err(CanError::Undefined {
+                field: "the bytes of an object",
+                raw: n_bytes.into(),
+            });
+        }
     };
     let (lower, upper) = (-(1_i64 << (n_bits - 1)), (1_i64 << n_bits) - 1);
     if !(lower..=upper).contains(&value) {
         #[expect(clippy::cast_precision_loss, reason = "only for the error message")]
         let [value, lower, upper] = [value, lower, upper].map(|number| number as f64);
-        return Err(CanError::Range { field: "the value of an object", value, lower, upper });
+        return Err(CanError::Range {
+            field: "the value of an object",
+            value,
+            lower,
+            upper,
+        });
     }
     let [low, high] = object.index.to_le_bytes();
     let mut bytes = [command, low, high, object.subindex, 0, 0, 0, 0];
@@ -232,22 +290,47 @@ pub fn signed(raw: u32, n_bytes: u8) -> i32 {
 pub fn decode_sdo(frame: &Frame) -> Result<(Node, SdoAnswer), CanError> {
     let (node, bytes) = from_node(frame, 0x580, SDO)?;
     let &[command, low, high, subindex, a, b, c, d] = bytes else {
-        return Err(CanError::Length { message: SDO, got_bytes: bytes.len(), expected_bytes: 8 });
+        return Err(CanError::Length {
+            message: SDO,
+            got_bytes: bytes.len(),
+            expected_bytes: 8,
+        });
     };
     let index = u16::from_le_bytes([low, high]);
     let value = u32::from_le_bytes([a, b, c, d]);
-    // The upper three bits are the command. In answers to a read, the others are: number of unused bytes, expedited,
-    // length given.
+    // The upper three bits are the command. In answers to a read, the others are: number of unused
+    // bytes, expedited, length given.
     match (command >> 5, command & 0b10 != 0, command & 0b01 != 0) {
         (3, ..) => Ok((node, SdoAnswer::Written { index, subindex })),
-        (4, ..) => Err(CanError::Aborted { index, subindex, code: value }),
+        (4, ..) => Err(CanError::Aborted {
+            index,
+            subindex,
+            code: value,
+        }),
         (2, true, has_length) => {
-            let n_bytes = if has_length { 4 - (command >> 2 & 0b11) } else { 4 };
+            let n_bytes = if has_length {
+                4 - (command >> 2 & 0b11)
+            } else {
+                4
+            };
             let raw = value & (u32::MAX >> (32 - 8 * u32::from(n_bytes)));
-            Ok((node, SdoAnswer::Value { object: Object { index, subindex, n_bytes }, raw }))
+            Ok((
+                node,
+                SdoAnswer::Value {
+                    object: Object {
+                        index,
+                        subindex,
+                        n_bytes,
+                    },
+                    raw,
+                },
+            ))
         }
         (2, false, _) | (0 | 1 | 6, ..) => Err(CanError::Segmented { index, subindex }),
-        _ => Err(CanError::Undefined { field: "the command of an SDO answer", raw: command.into() }),
+        _ => Err(CanError::Undefined {
+            field: "the command of an SDO answer",
+            raw: command.into(),
+        }),
     }
 }
 
@@ -288,11 +371,19 @@ fn data_frame(id: u32, bytes: &[u8]) -> Frame {
 }
 
 /// Returns the node and the bytes of a data frame whose identifier is `base` plus the node ID.
-fn from_node<'a>(frame: &'a Frame, base: u32, message: &'static str) -> Result<(Node, &'a [u8]), CanError> {
+fn from_node<'a>(
+    frame: &'a Frame,
+    base: u32,
+    message: &'static str,
+) -> Result<(Node, &'a [u8]), CanError> {
     let id = frame.id().value();
-    let node = id.checked_sub(base).and_then(|number| Node::new(u8::try_from(number).ok()?).ok());
+    let node = id
+        .checked_sub(base)
+        .and_then(|number| Node::new(u8::try_from(number).ok()?).ok());
     match node {
-        Some(node) if !frame.is_remote() && !frame.is_fd() && !frame.id().is_extended() => Ok((node, frame.data())),
+        Some(node) if !frame.is_remote() && !frame.is_fd() && !frame.id().is_extended() => {
+            Ok((node, frame.data()))
+        }
         _ => Err(CanError::UnexpectedFrame { message, id }),
     }
 }
@@ -303,26 +394,54 @@ mod tests {
     use super::*;
 
     const NODE: Node = Node(5);
-    const TARGET: Object = Object { index: 0x607A, subindex: 0, n_bytes: 4 };
+    const TARGET: Object = Object {
+        index: 0x607A,
+        subindex: 0,
+        n_bytes: 4,
+    };
 
     #[test]
     fn encoded_frames_match_published_bytes() {
         assert_eq!(encode_nmt(Nmt::Start, None), data_frame(0, &[1, 0]));
-        assert_eq!(encode_nmt(Nmt::ResetNode, Some(NODE)), data_frame(0, &[0x81, 5]));
+        assert_eq!(
+            encode_nmt(Nmt::ResetNode, Some(NODE)),
+            data_frame(0, &[0x81, 5])
+        );
         assert_eq!(encode_sync(), data_frame(0x80, &[]));
-        assert_eq!(encode_heartbeat(Node(127), NodeState::Operational), data_frame(0x77F, &[5]));
-        // christiansandberg/canopen, test_sdo: expedited upload of 0x1018:01 and download of 0x1017.
-        let vendor = Object { index: 0x1018, subindex: 1, n_bytes: 4 };
-        assert_eq!(encode_read(Node(2), vendor), data_frame(0x602, &[0x40, 0x18, 0x10, 0x01, 0, 0, 0, 0]));
+        assert_eq!(
+            encode_heartbeat(Node(127), NodeState::Operational),
+            data_frame(0x77F, &[5])
+        );
+        // christiansandberg/canopen, test_sdo: expedited upload of 0x1018:01 and download of
+        // 0x1017.
+        let vendor = Object {
+            index: 0x1018,
+            subindex: 1,
+            n_bytes: 4,
+        };
+        assert_eq!(
+            encode_read(Node(2), vendor),
+            data_frame(0x602, &[0x40, 0x18, 0x10, 0x01, 0, 0, 0, 0])
+        );
         assert_eq!(
             encode_write(Node(2), PRODUCER_HEARTBEAT, 4000),
             Ok(data_frame(0x602, &[0x2B, 0x17, 0x10, 0, 0xA0, 0x0F, 0, 0]))
         );
-        let mode = Object { index: 0x6060, subindex: 0, n_bytes: 1 };
-        assert_eq!(encode_write(NODE, mode, -1), Ok(data_frame(0x605, &[0x2F, 0x60, 0x60, 0, 0xFF, 0, 0, 0])));
+        let mode = Object {
+            index: 0x6060,
+            subindex: 0,
+            n_bytes: 1,
+        };
+        assert_eq!(
+            encode_write(NODE, mode, -1),
+            Ok(data_frame(0x605, &[0x2F, 0x60, 0x60, 0, 0xFF, 0, 0, 0]))
+        );
         assert_eq!(
             encode_write(NODE, TARGET, -2),
-            Ok(data_frame(0x605, &[0x23, 0x7A, 0x60, 0, 0xFE, 0xFF, 0xFF, 0xFF]))
+            Ok(data_frame(
+                0x605,
+                &[0x23, 0x7A, 0x60, 0, 0xFE, 0xFF, 0xFF, 0xFF]
+            ))
         );
         assert_eq!(consumer_heartbeat(Node(127), 100), 0x007F_0064);
         assert_eq!(TARGET.mapped(), 0x607A_0020);
@@ -330,14 +449,44 @@ mod tests {
 
     #[test]
     fn pdos_have_standard_identifiers_and_objects() {
-        let ids =
-            |direction| [Pdo::First, Pdo::Second, Pdo::Third, Pdo::Fourth].map(|pdo| pdo.id(direction, NODE).value());
+        let ids = |direction| {
+            [Pdo::First, Pdo::Second, Pdo::Third, Pdo::Fourth]
+                .map(|pdo| pdo.id(direction, NODE).value())
+        };
         assert_eq!(ids(Direction::Transmit), [0x185, 0x285, 0x385, 0x485]);
         assert_eq!(ids(Direction::Receive), [0x205, 0x305, 0x405, 0x505]);
-        assert_eq!(Pdo::First.mapping(Direction::Receive, 0), Object { index: 0x1600, subindex: 0, n_bytes: 1 });
-        assert_eq!(Pdo::Second.mapping(Direction::Transmit, 2), Object { index: 0x1A01, subindex: 2, n_bytes: 4 });
-        assert_eq!(Pdo::Third.communication(Direction::Transmit, 1), Object { index: 0x1802, subindex: 1, n_bytes: 4 });
-        assert_eq!(Pdo::Fourth.communication(Direction::Receive, 2), Object { index: 0x1403, subindex: 2, n_bytes: 1 });
+        assert_eq!(
+            Pdo::First.mapping(Direction::Receive, 0),
+            Object {
+                index: 0x1600,
+                subindex: 0,
+                n_bytes: 1
+            }
+        );
+        assert_eq!(
+            Pdo::Second.mapping(Direction::Transmit, 2),
+            Object {
+                index: 0x1A01,
+                subindex: 2,
+                n_bytes: 4
+            }
+        );
+        assert_eq!(
+            Pdo::Third.communication(Direction::Transmit, 1),
+            Object {
+                index: 0x1802,
+                subindex: 1,
+                n_bytes: 4
+            }
+        );
+        assert_eq!(
+            Pdo::Fourth.communication(Direction::Receive, 2),
+            Object {
+                index: 0x1403,
+                subindex: 2,
+                n_bytes: 1
+            }
+        );
         assert_eq!(Object::from_mapped(0x607A_0020), Ok(TARGET));
         assert!(Object::from_mapped(0x607A_0021).is_err());
     }
@@ -345,24 +494,81 @@ mod tests {
     #[test]
     fn answers_are_decoded() {
         let read = |bytes: &[u8]| decode_sdo(&data_frame(0x585, bytes)).map(|(_, answer)| answer);
-        let value = |n_bytes, raw| SdoAnswer::Value { object: Object { index: 0x6064, subindex: 0, n_bytes }, raw };
-        assert_eq!(read(&[0x43, 0x64, 0x60, 0, 1, 2, 3, 4]), Ok(value(4, 0x0403_0201)));
-        assert_eq!(read(&[0x4B, 0x64, 0x60, 0, 0xFE, 0xFF, 9, 9]), Ok(value(2, 0xFFFE)));
+        let value = |n_bytes, raw| SdoAnswer::Value {
+            object: Object {
+                index: 0x6064,
+                subindex: 0,
+                n_bytes,
+            },
+            raw,
+        };
+        assert_eq!(
+            read(&[0x43, 0x64, 0x60, 0, 1, 2, 3, 4]),
+            Ok(value(4, 0x0403_0201))
+        );
+        assert_eq!(
+            read(&[0x4B, 0x64, 0x60, 0, 0xFE, 0xFF, 9, 9]),
+            Ok(value(2, 0xFFFE))
+        );
         assert_eq!(read(&[0x4F, 0x64, 0x60, 0, 7, 9, 9, 9]), Ok(value(1, 7)));
         assert_eq!(read(&[0x42, 0x64, 0x60, 0, 1, 0, 0, 0]), Ok(value(4, 1)));
-        assert_eq!(read(&[0x60, 0x7A, 0x60, 0, 0, 0, 0, 0]), Ok(SdoAnswer::Written { index: 0x607A, subindex: 0 }));
+        assert_eq!(
+            read(&[0x60, 0x7A, 0x60, 0, 0, 0, 0, 0]),
+            Ok(SdoAnswer::Written {
+                index: 0x607A,
+                subindex: 0
+            })
+        );
         // christiansandberg/canopen, test_abort.
         let aborted = read(&[0x80, 0x18, 0x10, 0x01, 0x11, 0x00, 0x09, 0x06]);
-        assert_eq!(aborted, Err(CanError::Aborted { index: 0x1018, subindex: 1, code: 0x0609_0011 }));
-        assert!(aborted.expect_err("aborted").to_string().ends_with("0x06090011 (no such subindex)"));
+        assert_eq!(
+            aborted,
+            Err(CanError::Aborted {
+                index: 0x1018,
+                subindex: 1,
+                code: 0x0609_0011
+            })
+        );
+        assert!(
+            aborted
+                .expect_err("aborted")
+                .to_string()
+                .ends_with("0x06090011 (no such subindex)")
+        );
         let name = read(&[0x41, 0x08, 0x10, 0, 0x1A, 0, 0, 0]);
-        assert_eq!(name, Err(CanError::Segmented { index: 0x1008, subindex: 0 }));
-        assert!(name.expect_err("segmented").to_string().contains("0x1008:00 uses a segmented transfer"));
-        let states = [NodeState::BootUp, NodeState::Stopped, NodeState::Operational, NodeState::PreOperational];
+        assert_eq!(
+            name,
+            Err(CanError::Segmented {
+                index: 0x1008,
+                subindex: 0
+            })
+        );
+        assert!(
+            name.expect_err("segmented")
+                .to_string()
+                .contains("0x1008:00 uses a segmented transfer")
+        );
+        let states = [
+            NodeState::BootUp,
+            NodeState::Stopped,
+            NodeState::Operational,
+            NodeState::PreOperational,
+        ];
         for state in states {
-            assert_eq!(decode_heartbeat(&encode_heartbeat(NODE, state)), Ok((NODE, state)));
+            assert_eq!(
+                decode_heartbeat(&encode_heartbeat(NODE, state)),
+                Ok((NODE, state))
+            );
         }
-        assert_eq!([signed(0xFFFE, 2), signed(0x7FFE, 2), signed(0xFF, 1), signed(u32::MAX, 4)], [-2, 0x7FFE, -1, -1]);
+        assert_eq!(
+            [
+                signed(0xFFFE, 2),
+                signed(0x7FFE, 2),
+                signed(0xFF, 1),
+                signed(u32::MAX, 4)
+            ],
+            [-2, 0x7FFE, -1, -1]
+        );
     }
 
     #[test]
@@ -370,17 +576,51 @@ mod tests {
         for number in [0, 128, 255] {
             assert!(Node::new(number).is_err());
         }
-        for (object, value) in [(PRODUCER_HEARTBEAT, 65_536), (PRODUCER_HEARTBEAT, -32_769), (TARGET, 1 << 32)] {
-            assert!(matches!(encode_write(NODE, object, value), Err(CanError::Range { .. })), "{value}");
+        for (object, value) in [
+            (PRODUCER_HEARTBEAT, 65_536),
+            (PRODUCER_HEARTBEAT, -32_769),
+            (TARGET, 1 << 32),
+        ] {
+            assert!(
+                matches!(
+                    encode_write(NODE, object, value),
+                    Err(CanError::Range { .. })
+                ),
+                "{value}"
+            );
         }
-        assert!(encode_write(NODE, Object { n_bytes: 8, ..TARGET }, 0).is_err());
-        for malformed in truncated_and_doubled(&data_frame(0x585, &[0x43, 0x64, 0x60, 0, 1, 2, 3, 4])) {
+        assert!(
+            encode_write(
+                NODE,
+                Object {
+                    n_bytes: 8,
+                    ..TARGET
+                },
+                0
+            )
+            .is_err()
+        );
+        for malformed in
+            truncated_and_doubled(&data_frame(0x585, &[0x43, 0x64, 0x60, 0, 1, 2, 3, 4]))
+        {
             assert!(decode_sdo(&malformed).is_err(), "{malformed:?}");
         }
-        for (id, bytes) in [(0x705, &[][..]), (0x705, &[5, 5]), (0x705, &[6]), (0x700, &[5]), (0x6FF, &[5])] {
-            assert!(decode_heartbeat(&data_frame(id, bytes)).is_err(), "{id:x} {bytes:?}");
+        for (id, bytes) in [
+            (0x705, &[][..]),
+            (0x705, &[5, 5]),
+            (0x705, &[6]),
+            (0x700, &[5]),
+            (0x6FF, &[5]),
+        ] {
+            assert!(
+                decode_heartbeat(&data_frame(id, bytes)).is_err(),
+                "{id:x} {bytes:?}"
+            );
         }
-        assert!(matches!(decode_sdo(&data_frame(0x605, &[0x43; 8])), Err(CanError::UnexpectedFrame { .. })));
+        assert!(matches!(
+            decode_sdo(&data_frame(0x605, &[0x43; 8])),
+            Err(CanError::UnexpectedFrame { .. })
+        ));
         let mut n_read = 0;
         for frame in random_frames(29, Id::standard(0x585).expect("11 bits")) {
             n_read += i32::from(decode_sdo(&frame).is_ok());

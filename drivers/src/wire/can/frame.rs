@@ -1,8 +1,9 @@
 //! A CAN frame as plain data, and the time it takes on the bus.
 //!
-//! Sources: Robert Bosch, CAN Specification 2.0 (1991), parts A and B; ISO 11898-1:2015 (FD frames and their fixed stuff
-//! bits), field by field as in Linux's `include/linux/can/length.h`. Worst stuffing of classic frames: Davis, Burns, Bril and
-//! Lukkien 2007 (Controller Area Network schedulability analysis: refuted, revisited and revised), equation 1.
+//! Sources: Robert Bosch, CAN Specification 2.0 (1991), parts A and B; ISO 11898-1:2015 (FD frames
+//! and their fixed stuff bits), field by field as in Linux's `include/linux/can/length.h`. Worst
+//! stuffing of classic frames: Davis, Burns, Bril and Lukkien 2007 (Controller Area Network
+//! schedulability analysis: refuted, revisited and revised), equation 1.
 
 use super::CanError;
 
@@ -22,7 +23,10 @@ impl Id {
     /// An 11-bit identifier.
     pub const fn standard(value: u32) -> Result<Self, CanError> {
         match value {
-            0..=0x7FF => Ok(Self { value, extended: false }),
+            0..=0x7FF => Ok(Self {
+                value,
+                extended: false,
+            }),
             id => Err(CanError::IdRange { id, bits: 11 }),
         }
     }
@@ -30,7 +34,10 @@ impl Id {
     /// A 29-bit identifier.
     pub const fn extended(value: u32) -> Result<Self, CanError> {
         match value {
-            0..=0x1FFF_FFFF => Ok(Self { value, extended: true }),
+            0..=0x1FFF_FFFF => Ok(Self {
+                value,
+                extended: true,
+            }),
             id => Err(CanError::IdRange { id, bits: 29 }),
         }
     }
@@ -68,32 +75,53 @@ impl Frame {
     pub fn classic(id: Id, data: &[u8]) -> Result<Self, CanError> {
         match data.len() {
             0..=8 => Ok(Self::with_data(id, Kind::Classic, data)),
-            got_bytes => Err(CanError::PayloadLength { format: "classic", got_bytes }),
+            got_bytes => Err(CanError::PayloadLength {
+                format: "classic",
+                got_bytes,
+            }),
         }
     }
 
-    /// A remote frame: a request for the data frame with the same identifier. `n_bytes` is the expected length of the
-    /// answer.
+    /// A remote frame: a request for the data frame with the same identifier. `n_bytes` is the
+    /// expected length of the answer.
     pub fn remote(id: Id, n_bytes: usize) -> Result<Self, CanError> {
         match n_bytes {
-            0..=8 => Ok(Self { id, kind: Kind::Remote, n_bytes, bytes: [0; 64] }),
-            got_bytes => Err(CanError::PayloadLength { format: "classic", got_bytes }),
+            0..=8 => Ok(Self {
+                id,
+                kind: Kind::Remote,
+                n_bytes,
+                bytes: [0; 64],
+            }),
+            got_bytes => Err(CanError::PayloadLength {
+                format: "classic",
+                got_bytes,
+            }),
         }
     }
 
-    /// An FD frame of 0 to 8, 12, 16, 20, 24, 32, 48 or 64 bytes. `switched`: whether the data phase uses the data
-    /// bit rate.
+    /// An FD frame of 0 to 8, 12, 16, 20, 24, 32, 48 or 64 bytes. `switched`: whether the data
+    /// phase uses the data bit rate.
     pub fn fd(id: Id, data: &[u8], switched: bool) -> Result<Self, CanError> {
         match data.len() {
-            n if n <= 8 || FD_LENGTHS.contains(&n) => Ok(Self::with_data(id, Kind::Fd { switched }, data)),
-            got_bytes => Err(CanError::PayloadLength { format: "FD", got_bytes }),
+            n if n <= 8 || FD_LENGTHS.contains(&n) => {
+                Ok(Self::with_data(id, Kind::Fd { switched }, data))
+            }
+            got_bytes => Err(CanError::PayloadLength {
+                format: "FD",
+                got_bytes,
+            }),
         }
     }
 
     fn with_data(id: Id, kind: Kind, data: &[u8]) -> Self {
         let mut bytes = [0; 64];
         bytes[..data.len()].copy_from_slice(data);
-        Self { id, kind, n_bytes: data.len(), bytes }
+        Self {
+            id,
+            kind,
+            n_bytes: data.len(),
+            bytes,
+        }
     }
 
     /// The identifier.
@@ -129,11 +157,12 @@ impl Frame {
         matches!(self.kind, Kind::Fd { switched: true })
     }
 
-    /// Length in bits from the start of frame to the earliest start of the next frame, without errors and
-    /// retransmissions.
+    /// Length in bits from the start of frame to the earliest start of the next frame, without
+    /// errors and retransmissions.
     ///
-    /// The fixed stuff bits of FD frames are always included. The two bits in which the rate switches (bit rate
-    /// switch and CRC delimiter) are sent partly at each rate; they are counted at the slower nominal rate here.
+    /// The fixed stuff bits of FD frames are always included. The two bits in which the rate
+    /// switches (bit rate switch and CRC delimiter) are sent partly at each rate; they are counted
+    /// at the slower nominal rate here.
     pub fn bits(&self, stuffing: Stuffing) -> Bits {
         let n_data = u32::try_from(8 * self.data().len()).expect("at most 64 bytes");
         let n_stuff_bits = |n_bits: u32| match stuffing {
@@ -143,18 +172,28 @@ impl Frame {
         let Kind::Fd { switched } = self.kind else {
             // Start of frame, identifier, control, data and CRC are stuffed; the rest is not.
             let stuffed = if self.id.extended { 54 } else { 34 } + n_data;
-            return Bits { nominal: stuffed + n_stuff_bits(stuffed) + 1 + TAIL_BITS, data: 0 };
+            return Bits {
+                nominal: stuffed + n_stuff_bits(stuffed) + 1 + TAIL_BITS,
+                data: 0,
+            };
         };
-        // From the start of frame to the bit rate switch; then error state, length and data; then stuff count, CRC
-        // and their fixed stuff bits.
+        // From the start of frame to the bit rate switch; then error state, length and data; then
+        // stuff count, CRC and their fixed stuff bits.
         let head = if self.id.extended { 36 } else { 17 };
         let body = 5 + n_data;
-        let check = if n_data <= 8 * 16 { 4 + 17 + 6 } else { 4 + 21 + 7 };
+        let check = if n_data <= 8 * 16 {
+            4 + 17 + 6
+        } else {
+            4 + 21 + 7
+        };
         let nominal = head + n_stuff_bits(head) + 1 + TAIL_BITS;
         let data = body + n_stuff_bits(head + body) - n_stuff_bits(head) + check;
         match switched {
             true => Bits { nominal, data },
-            false => Bits { nominal: nominal + data, data: 0 },
+            false => Bits {
+                nominal: nominal + data,
+                data: 0,
+            },
         }
     }
 }
@@ -193,9 +232,13 @@ impl Bits {
     }
 }
 
-/// Fraction of the bus capacity that frames with these rates in Hz use; above 1 if the bus is overloaded.
+/// Fraction of the bus capacity that frames with these rates in Hz use; above 1 if the bus is
+/// overloaded.
 pub fn load_frac(traffic: impl IntoIterator<Item = (Bits, f64)>, rates: BitRates) -> f64 {
-    traffic.into_iter().map(|(bits, rate_hz)| bits.seconds(rates) * rate_hz).sum()
+    traffic
+        .into_iter()
+        .map(|(bits, rate_hz)| bits.seconds(rates) * rate_hz)
+        .sum()
 }
 
 #[cfg(test)]
@@ -203,11 +246,19 @@ mod tests {
     use super::*;
 
     fn standard(n_bytes: usize) -> Frame {
-        Frame::classic(Id::standard(0x123).expect("11 bits"), &[0xA5; 64][..n_bytes]).expect("classic")
+        Frame::classic(
+            Id::standard(0x123).expect("11 bits"),
+            &[0xA5; 64][..n_bytes],
+        )
+        .expect("classic")
     }
 
     fn extended(n_bytes: usize) -> Frame {
-        Frame::classic(Id::extended(0x1_2345).expect("29 bits"), &[0xA5; 64][..n_bytes]).expect("classic")
+        Frame::classic(
+            Id::extended(0x1_2345).expect("29 bits"),
+            &[0xA5; 64][..n_bytes],
+        )
+        .expect("classic")
     }
 
     #[test]
@@ -216,10 +267,34 @@ mod tests {
         for n_bytes in 0..=8_usize {
             let s = u32::try_from(n_bytes).expect("small");
             let bits = |frame: Frame, stuffing| frame.bits(stuffing);
-            assert_eq!(bits(standard(n_bytes), Stuffing::None), Bits { nominal: 47 + 8 * s, data: 0 });
-            assert_eq!(bits(extended(n_bytes), Stuffing::None), Bits { nominal: 67 + 8 * s, data: 0 });
-            assert_eq!(bits(standard(n_bytes), Stuffing::Worst), Bits { nominal: 55 + 10 * s, data: 0 });
-            assert_eq!(bits(extended(n_bytes), Stuffing::Worst), Bits { nominal: 80 + 10 * s, data: 0 });
+            assert_eq!(
+                bits(standard(n_bytes), Stuffing::None),
+                Bits {
+                    nominal: 47 + 8 * s,
+                    data: 0
+                }
+            );
+            assert_eq!(
+                bits(extended(n_bytes), Stuffing::None),
+                Bits {
+                    nominal: 67 + 8 * s,
+                    data: 0
+                }
+            );
+            assert_eq!(
+                bits(standard(n_bytes), Stuffing::Worst),
+                Bits {
+                    nominal: 55 + 10 * s,
+                    data: 0
+                }
+            );
+            assert_eq!(
+                bits(extended(n_bytes), Stuffing::Worst),
+                Bits {
+                    nominal: 80 + 10 * s,
+                    data: 0
+                }
+            );
         }
         let remote = Frame::remote(Id::standard(1).expect("11 bits"), 8).expect("classic");
         assert_eq!(remote.bits(Stuffing::None).nominal, 47);
@@ -228,44 +303,115 @@ mod tests {
 
     #[test]
     fn fd_frame_lengths_match_linux() {
-        // Computed by hand from can_frame_bits(true, is_eff, bitstuffing, true, n) of linux/can/length.h.
-        let cases = [(0, false, 62, 67), (8, false, 126, 147), (16, false, 190, 227), (20, false, 227, 272)];
-        let extended = [(64, false, 579, 712), (0, true, 81, 91), (16, true, 209, 251), (64, true, 598, 736)];
+        // Computed by hand from can_frame_bits(true, is_eff, bitstuffing, true, n) of
+        // linux/can/length.h.
+        let cases = [
+            (0, false, 62, 67),
+            (8, false, 126, 147),
+            (16, false, 190, 227),
+            (20, false, 227, 272),
+        ];
+        let extended = [
+            (64, false, 579, 712),
+            (0, true, 81, 91),
+            (16, true, 209, 251),
+            (64, true, 598, 736),
+        ];
         for (n_bytes, is_extended, unstuffed, worst) in cases.into_iter().chain(extended) {
-            let id = if is_extended { Id::extended(5) } else { Id::standard(5) }.expect("small");
-            let frame = |switched| Frame::fd(id, &[0; 64][..n_bytes], switched).expect("an FD length");
+            let id = if is_extended {
+                Id::extended(5)
+            } else {
+                Id::standard(5)
+            }
+            .expect("small");
+            let frame =
+                |switched| Frame::fd(id, &[0; 64][..n_bytes], switched).expect("an FD length");
             for (stuffing, expected) in [(Stuffing::None, unstuffed), (Stuffing::Worst, worst)] {
                 let Bits { nominal, data } = frame(true).bits(stuffing);
-                assert_eq!(nominal + data, expected, "{n_bytes} {is_extended} {stuffing:?}");
-                assert_eq!(frame(false).bits(stuffing), Bits { nominal: expected, data: 0 });
+                assert_eq!(
+                    nominal + data,
+                    expected,
+                    "{n_bytes} {is_extended} {stuffing:?}"
+                );
+                assert_eq!(
+                    frame(false).bits(stuffing),
+                    Bits {
+                        nominal: expected,
+                        data: 0
+                    }
+                );
             }
         }
-        let short = Frame::fd(Id::standard(5).expect("small"), &[0; 8], true).expect("an FD length");
-        assert_eq!(short.bits(Stuffing::None), Bits { nominal: 30, data: 96 });
+        let short =
+            Frame::fd(Id::standard(5).expect("small"), &[0; 8], true).expect("an FD length");
+        assert_eq!(
+            short.bits(Stuffing::None),
+            Bits {
+                nominal: 30,
+                data: 96
+            }
+        );
     }
 
     #[test]
     fn bus_load_is_frame_time_times_rate() {
-        let rates = BitRates { nominal_hz: 1e6, data_hz: 5e6 };
+        let rates = BitRates {
+            nominal_hz: 1e6,
+            data_hz: 5e6,
+        };
         // Six motors with one command and one answer each, 500 times per second: 135 us per frame.
         let bits = standard(8).bits(Stuffing::Worst);
         let load = load_frac([(bits, 6.0 * 500.0), (bits, 6.0 * 500.0)], rates);
         assert!((load - 0.81).abs() < 1e-12, "{load}");
-        let switched = Bits { nominal: 30, data: 100 };
+        let switched = Bits {
+            nominal: 30,
+            data: 100,
+        };
         assert!((switched.seconds(rates) - 50e-6).abs() < 1e-15);
     }
 
     #[test]
     fn invalid_ids_and_lengths_are_rejected() {
-        assert_eq!(Id::standard(0x800), Err(CanError::IdRange { id: 0x800, bits: 11 }));
-        assert_eq!(Id::extended(0x2000_0000), Err(CanError::IdRange { id: 0x2000_0000, bits: 29 }));
+        assert_eq!(
+            Id::standard(0x800),
+            Err(CanError::IdRange {
+                id: 0x800,
+                bits: 11
+            })
+        );
+        assert_eq!(
+            Id::extended(0x2000_0000),
+            Err(CanError::IdRange {
+                id: 0x2000_0000,
+                bits: 29
+            })
+        );
         let id = Id::standard(0x7FF).expect("11 bits");
-        assert_eq!(Frame::classic(id, &[0; 9]), Err(CanError::PayloadLength { format: "classic", got_bytes: 9 }));
-        assert_eq!(Frame::remote(id, 9), Err(CanError::PayloadLength { format: "classic", got_bytes: 9 }));
+        assert_eq!(
+            Frame::classic(id, &[0; 9]),
+            Err(CanError::PayloadLength {
+                format: "classic",
+                got_bytes: 9
+            })
+        );
+        assert_eq!(
+            Frame::remote(id, 9),
+            Err(CanError::PayloadLength {
+                format: "classic",
+                got_bytes: 9
+            })
+        );
         for n in 0..=65 {
             let is_valid = Frame::fd(id, &[0; 65][..n], false).is_ok();
-            assert_eq!(is_valid, n <= 8 || [12, 16, 20, 24, 32, 48, 64].contains(&n), "{n}");
+            assert_eq!(
+                is_valid,
+                n <= 8 || [12, 16, 20, 24, 32, 48, 64].contains(&n),
+                "{n}"
+            );
         }
-        assert_ne!(Id::standard(5).expect("small"), Id::extended(5).expect("small"));
+        assert_ne!(
+            Id::standard(5).expect("small"),
+            Id::extended(5).expect("small")
+        );
     }
 }

@@ -1,15 +1,15 @@
 //! MIT mode: position, velocity, two gains and a torque in the eight bytes of one frame.
 //!
-//! Source: Ben Katz, mini cheetah motor controller (`pack_cmd`, `unpack_reply`); the same bytes in `DM_CAN.py` of
-//! `cmjang/DM_Control_Python` and in `mit_can.py` of `neurobionics/TMotorCANControl`. The drive applies
-//! `torque = kp (position - measured) + kd (velocity - measured) + torque`. As in these sources, values outside the
-//! limits are clamped.
+//! Source: Ben Katz, mini cheetah motor controller (`pack_cmd`, `unpack_reply`); the same bytes in
+//! `DM_CAN.py` of `cmjang/DM_Control_Python` and in `mit_can.py` of
+//! `neurobionics/TMotorCANControl`. The drive applies `torque = kp (position - measured) + kd
+//! (velocity - measured) + torque`. As in these sources, values outside the limits are clamped.
 
 use super::CanError;
 use super::scale::Scale;
 
-/// Ranges of a motor's raw values. Gains range from 0 to these limits, and the other values from the negative to the
-/// positive limit.
+/// Ranges of a motor's raw values. Gains range from 0 to these limits, and the other values from
+/// the negative to the positive limit.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Limits {
     /// Maximum position of the output shaft, rad.
@@ -27,7 +27,13 @@ pub struct Limits {
 impl Limits {
     /// Limits with the gain limits of most motors: 500 N m / rad and 5 N m s / rad.
     pub const fn of(position_rad: f64, velocity_rad_s: f64, torque_nm: f64) -> Self {
-        Self { position_rad, velocity_rad_s, torque_nm, kp_nm_rad: 500.0, kd_nm_s_rad: 5.0 }
+        Self {
+            position_rad,
+            velocity_rad_s,
+            torque_nm,
+            kp_nm_rad: 500.0,
+            kd_nm_s_rad: 5.0,
+        }
     }
 
     /// Returns the command as it is sent, with every number clamped to its limits. NaN stays NaN.
@@ -102,13 +108,30 @@ impl Scales {
 /// If a value is NaN.
 pub fn encode(command: &Command, limits: &Limits) -> Result<[u8; 8], CanError> {
     let scales = Scales::of(limits);
-    let position = scales.position.raw_from_value("the position", command.position_rad)?;
-    let velocity = scales.velocity.raw_from_value("the velocity", command.velocity_rad_s)?;
+    let position = scales
+        .position
+        .raw_from_value("the position", command.position_rad)?;
+    let velocity = scales
+        .velocity
+        .raw_from_value("the velocity", command.velocity_rad_s)?;
     let kp = scales.kp.raw_from_value("kp", command.kp_nm_rad)?;
     let kd = scales.kd.raw_from_value("kd", command.kd_nm_s_rad)?;
-    let torque = scales.torque.raw_from_value("the torque", command.torque_nm)?;
-    let fields = [(position, 16), (velocity, 12), (kp, 12), (kd, 12), (torque, 12)];
-    Ok(fields.iter().fold(0_u64, |bits, (raw, n_bits)| bits << n_bits | u64::from(*raw)).to_be_bytes())
+    let torque = scales
+        .torque
+        .raw_from_value("the torque", command.torque_nm)?;
+    let fields = [
+        (position, 16),
+        (velocity, 12),
+        (kp, 12),
+        (kd, 12),
+        (torque, 12),
+    ];
+    Ok(fields
+        .iter()
+        .fold(0_u64, |bits, (raw, n_bits)| {
+            bits << n_bits | u64::from(*raw)
+        })
+        .to_be_bytes())
 }
 
 /// Decodes a command, for emulated motors.
@@ -124,12 +147,20 @@ pub fn decode(bytes: &[u8; 8], limits: &Limits) -> Command {
     }
 }
 
-/// Encodes the five bytes of a motion, which follow the motor's ID in the feedback of all manufacturers.
+/// Encodes the five bytes of a motion, which follow the motor's ID in the feedback of all
+/// manufacturers.
 pub fn encode_motion(motion: &Motion, limits: &Limits) -> Result<[u8; 5], CanError> {
     let scales = Scales::of(limits);
-    let [p1, p0] = scales.position.raw_from_value("the position", motion.position_rad)?.to_be_bytes();
-    let velocity = scales.velocity.raw_from_value("the velocity", motion.velocity_rad_s)?;
-    let torque = scales.torque.raw_from_value("the torque", motion.torque_nm)?;
+    let [p1, p0] = scales
+        .position
+        .raw_from_value("the position", motion.position_rad)?
+        .to_be_bytes();
+    let velocity = scales
+        .velocity
+        .raw_from_value("the velocity", motion.velocity_rad_s)?;
+    let torque = scales
+        .torque
+        .raw_from_value("the torque", motion.torque_nm)?;
     let [_, b2, b3, b4] = (u32::from(velocity) << 12 | u32::from(torque)).to_be_bytes();
     Ok([p1, p0, b2, b3, b4])
 }
@@ -164,8 +195,8 @@ mod tests {
 
     #[test]
     fn commands_match_manufacturer_sample_bytes() {
-        // DM_CAN.py, controlMIT with the limits of a DM4310: zeros, both ends of the ranges, and kp = 50, kd = 1, q =
-        // 1, dq = -3, tau = 2.5.
+        // DM_CAN.py, controlMIT with the limits of a DM4310: zeros, both ends of the ranges, and kp
+        // = 50, kd = 1, q = 1, dq = -3, tau = 2.5.
         let command = |kp_nm_rad, kd_nm_s_rad, position_rad, velocity_rad_s, torque_nm| Command {
             position_rad,
             velocity_rad_s,
@@ -174,11 +205,18 @@ mod tests {
             torque_nm,
         };
         let cases = [
-            (command(0.0, 0.0, 0.0, 0.0, 0.0), [0x7F, 0xFF, 0x7F, 0xF0, 0x00, 0x00, 0x07, 0xFF]),
+            (
+                command(0.0, 0.0, 0.0, 0.0, 0.0),
+                [0x7F, 0xFF, 0x7F, 0xF0, 0x00, 0x00, 0x07, 0xFF],
+            ),
             (command(500.0, 5.0, 12.5, 30.0, 10.0), [0xFF; 8]),
             (command(0.0, 0.0, -12.5, -30.0, -10.0), [0x00; 8]),
-            // 35388.9, 1842.75, 409.5, 819, 2559.375 are rounded to the nearest integer, and 409.5 to 409.
-            (command(50.0, 1.0, 1.0, -3.0, 2.5), [0x8A, 0x3D, 0x73, 0x31, 0x99, 0x33, 0x39, 0xFF]),
+            // 35388.9, 1842.75, 409.5, 819, 2559.375 are rounded to the nearest integer, and 409.5
+            // to 409.
+            (
+                command(50.0, 1.0, 1.0, -3.0, 2.5),
+                [0x8A, 0x3D, 0x73, 0x31, 0x99, 0x33, 0x39, 0xFF],
+            ),
         ];
         for (command, bytes) in cases {
             assert_eq!(encode(&command, &LIMITS), Ok(bytes), "{command:?}");
@@ -192,7 +230,10 @@ mod tests {
             let bytes = random.bits().to_be_bytes();
             assert_eq!(encode(&decode(&bytes, &LIMITS), &LIMITS), Ok(bytes));
             let motion = bytes[..5].try_into().expect("five");
-            assert_eq!(encode_motion(&decode_motion(motion, &LIMITS), &LIMITS), Ok(motion));
+            assert_eq!(
+                encode_motion(&decode_motion(motion, &LIMITS), &LIMITS),
+                Ok(motion)
+            );
         }
     }
 
@@ -211,13 +252,26 @@ mod tests {
             let back = decode(&encode(&command, &LIMITS).expect("numbers"), &LIMITS);
             // Tolerance: half a quantization step.
             for (name, error, range, counts) in [
-                ("position", back.position_rad - command.position_rad, 25.0, 65_535.0),
-                ("velocity", back.velocity_rad_s - command.velocity_rad_s, 60.0, 4095.0),
+                (
+                    "position",
+                    back.position_rad - command.position_rad,
+                    25.0,
+                    65_535.0,
+                ),
+                (
+                    "velocity",
+                    back.velocity_rad_s - command.velocity_rad_s,
+                    60.0,
+                    4095.0,
+                ),
                 ("kp", back.kp_nm_rad - command.kp_nm_rad, 500.0, 4095.0),
                 ("kd", back.kd_nm_s_rad - command.kd_nm_s_rad, 5.0, 4095.0),
                 ("torque", back.torque_nm - command.torque_nm, 20.0, 4095.0),
             ] {
-                assert!(error.abs() <= 0.5 * range / counts * (1.0 + 1e-9), "{name}: {error}");
+                assert!(
+                    error.abs() <= 0.5 * range / counts * (1.0 + 1e-9),
+                    "{name}: {error}"
+                );
             }
         }
     }
@@ -234,12 +288,33 @@ mod tests {
         let clamped = LIMITS.clamped(&out_of_range);
         assert_eq!(
             clamped,
-            Command { position_rad: 12.5, velocity_rad_s: -30.0, kp_nm_rad: 0.0, kd_nm_s_rad: 5.0, torque_nm: 10.0 }
+            Command {
+                position_rad: 12.5,
+                velocity_rad_s: -30.0,
+                kp_nm_rad: 0.0,
+                kd_nm_s_rad: 5.0,
+                torque_nm: 10.0
+            }
         );
         assert_eq!(encode(&out_of_range, &LIMITS), encode(&clamped, &LIMITS));
-        let non_finite = Command { kp_nm_rad: f64::NAN, ..Command::default() };
-        assert_eq!(encode(&non_finite, &LIMITS), Err(CanError::NotFinite { field: "kp" }));
-        let non_finite = Motion { position_rad: 0.0, velocity_rad_s: f64::NAN, torque_nm: 0.0 };
-        assert_eq!(encode_motion(&non_finite, &LIMITS), Err(CanError::NotFinite { field: "the velocity" }));
+        let non_finite = Command {
+            kp_nm_rad: f64::NAN,
+            ..Command::default()
+        };
+        assert_eq!(
+            encode(&non_finite, &LIMITS),
+            Err(CanError::NotFinite { field: "kp" })
+        );
+        let non_finite = Motion {
+            position_rad: 0.0,
+            velocity_rad_s: f64::NAN,
+            torque_nm: 0.0,
+        };
+        assert_eq!(
+            encode_motion(&non_finite, &LIMITS),
+            Err(CanError::NotFinite {
+                field: "the velocity"
+            })
+        );
     }
 }

@@ -1,9 +1,9 @@
-//! CAN frames as plain data, and the encodings that several motor families share. The codec of a family is in its
-//! folder of [`can`](crate::can).
+//! CAN frames as plain data, and the encodings that several motor families share. The codec of a
+//! family is in its folder of [`can`](crate::can).
 //!
-//! Every codec is pure: it converts between a [`Frame`] and SI values. Values outside the range of a field are
-//! clamped where the manufacturers' own examples clamp (MIT packing, Robstride, ODrive's feedforward), and are errors
-//! everywhere else. NaN is always an error.
+//! Every codec is pure: it converts between a [`Frame`] and SI values. Values outside the range of
+//! a field are clamped where the manufacturers' own examples clamp (MIT packing, Robstride,
+//! ODrive's feedforward), and are errors everywhere else. NaN is always an error.
 
 pub mod canopen;
 pub mod frame;
@@ -111,17 +111,32 @@ pub(crate) fn decode_enum<T: Copy>(
     all: &[T],
     number: impl Fn(T) -> u32,
 ) -> Result<T, CanError> {
-    all.iter().copied().find(|known| number(*known) == raw).ok_or(CanError::Undefined { field, raw })
+    all.iter()
+        .copied()
+        .find(|known| number(*known) == raw)
+        .ok_or(CanError::Undefined { field, raw })
 }
 
-/// Returns the eight bytes of a data frame with an 11-bit or 29-bit identifier; any other frame is an error.
-pub(crate) fn eight_bytes(frame: &Frame, message: &'static str, extended: bool) -> Result<[u8; 8], CanError> {
+/// Returns the eight bytes of a data frame with an 11-bit or 29-bit identifier; any other frame is
+/// an error.
+pub(crate) fn eight_bytes(
+    frame: &Frame,
+    message: &'static str,
+    extended: bool,
+) -> Result<[u8; 8], CanError> {
     let id = frame.id();
     if frame.is_remote() || id.is_extended() != extended {
-        return Err(CanError::UnexpectedFrame { message, id: id.value() });
+        return Err(CanError::UnexpectedFrame {
+            message,
+            id: id.value(),
+        });
     }
     let got_bytes = frame.data().len();
-    frame.data().try_into().map_err(|_| CanError::Length { message, got_bytes, expected_bytes: 8 })
+    frame.data().try_into().map_err(|_| CanError::Length {
+        message,
+        got_bytes,
+        expected_bytes: 8,
+    })
 }
 
 #[cfg(test)]
@@ -137,7 +152,11 @@ pub(crate) mod testing {
                 0 => Id::standard(random.bits_32() & 0x7FF),
                 _ => Id::extended(random.bits_32() & 0x1FFF_FFFF),
             };
-            let id = if round % 4 == 0 { id } else { identifier.expect("the identifier is masked to 11 or 29 bits") };
+            let id = if round % 4 == 0 {
+                id
+            } else {
+                identifier.expect("the identifier is masked to 11 or 29 bits")
+            };
             let bytes = random.bytes(64);
             let len = random.below(9);
             match random.below(8) {
@@ -150,12 +169,15 @@ pub(crate) mod testing {
         })
     }
 
-    /// The frame truncated to every shorter length, and twice as long as an FD frame. All of these must be rejected.
+    /// The frame truncated to every shorter length, and twice as long as an FD frame. All of these
+    /// must be rejected.
     pub(crate) fn truncated_and_doubled(frame: &Frame) -> Vec<Frame> {
         let bytes = [frame.data(), frame.data()].concat();
         let n_bytes = frame.data().len();
         let cut = (0..n_bytes).map(|len| Frame::classic(frame.id(), &bytes[..len]));
         let doubled = (n_bytes == 8).then(|| Frame::fd(frame.id(), &bytes, false));
-        cut.chain(doubled).map(|built| built.expect("the length is valid for the format")).collect()
+        cut.chain(doubled)
+            .map(|built| built.expect("the length is valid for the format"))
+            .collect()
     }
 }

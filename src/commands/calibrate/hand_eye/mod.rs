@@ -1,4 +1,5 @@
-//! `fieldrig calibrate hand-eye`: the pose of a camera on a robot, from images of a target or poses of a board.
+//! `fieldrig calibrate hand-eye`: the pose of a camera on a robot, from images of a target or poses
+//! of a board.
 
 mod moved;
 mod printed;
@@ -14,7 +15,8 @@ use crate::exit::{self, BadArgument, Exit, InsufficientData};
 use crate::print;
 use anyhow::Context;
 use calibration::hand_eye::{
-    HandEyeCalibration, HandEyeInput, HandEyeOptions, NextPose, NextPoseOptions, calibrate_hand_eye, suggest_next_poses,
+    HandEyeCalibration, HandEyeInput, HandEyeOptions, NextPose, NextPoseOptions,
+    calibrate_hand_eye, suggest_next_poses,
 };
 use kinematics::urdf::Robot;
 use kinematics::{Chain, Intrinsics, Lens, Transform};
@@ -40,9 +42,11 @@ row by row, pixel centers at +0.5, image files relative to this file.
 
 From a recording or the devices of a rig file, images are used in which the arm is slow and the target visible."#;
 
-const INPUT_HELP: &str = "Samples as JSON, a recording (.mcap), or a rig file (.toml) whose devices are read";
+const INPUT_HELP: &str =
+    "Samples as JSON, a recording (.mcap), or a rig file (.toml) whose devices are read";
 
-const TARGET_HELP: &str = "With a recording or rig file: the target, such as charuco:5x7:34mm:26mm:5X5_100";
+const TARGET_HELP: &str =
+    "With a recording or rig file: the target, such as charuco:5x7:34mm:26mm:5X5_100";
 
 /// Flags of `calibrate hand-eye`.
 #[derive(Debug, clap::Args)]
@@ -54,8 +58,8 @@ pub(crate) struct Args {
     /// Also estimate the intrinsics, starting from those in the file; needs images
     #[arg(long)]
     with_intrinsics: bool,
-    /// Also estimate the offsets of all joints except the first and the last. With samples in JSON: needs images,
-    /// "joints" in the samples, --urdf and --tip
+    /// Also estimate the offsets of all joints except the first and the last. With samples in JSON:
+    /// needs images, "joints" in the samples, --urdf and --tip
     #[arg(long)]
     with_joints: bool,
     /// Robot description of the arm
@@ -85,7 +89,8 @@ struct Calibrated {
     rig_pose: Transform,
 }
 
-/// Reads or takes the samples, calibrates and prints the result. Exit code 4 if the samples do not determine it.
+/// Reads or takes the samples, calibrates and prints the result. Exit code 4 if the samples do not
+/// determine it.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let report = args.report.open()?;
     let mut rig = args.rig.open(&args.input)?;
@@ -110,7 +115,9 @@ fn calibrate_and_print(
     if let (Some(rig), Some(size_px)) = (&rig, samples.size_px) {
         rig.expect_size(size_px)?;
     }
-    let result = args.calibrate(&source, &samples).map_err(|error| with_reason(error, &source, &samples));
+    let result = args
+        .calibrate(&source, &samples)
+        .map_err(|error| with_reason(error, &source, &samples));
     // The result is printed even if the report cannot be written.
     let written = match report {
         Some(path) => write_report(path, &args.input, &source, &samples, &result),
@@ -118,7 +125,12 @@ fn calibrate_and_print(
     };
     let mut printed = match &result {
         Ok(calibrated) => Printed {
-            next_poses: calibrated.next_poses.iter().cloned().map(PrintedPose::of).collect(),
+            next_poses: calibrated
+                .next_poses
+                .iter()
+                .cloned()
+                .map(PrintedPose::of)
+                .collect(),
             ..printed::printed(&calibrated.calibration)
         },
         Err(error) if exit::of(error) == Exit::InsufficientData && args.json => {
@@ -129,14 +141,27 @@ fn calibrate_and_print(
             return result.map(|_| Exit::Done);
         }
     };
-    printed.samples.extend(samples.unused.iter().map(PrintedSample::unused));
-    printed.warnings.extend(samples.other_size.iter().filter(|size| !size.prevails).map(|size| size.text.clone()));
+    printed
+        .samples
+        .extend(samples.unused.iter().map(PrintedSample::unused));
+    printed.warnings.extend(
+        samples
+            .other_size
+            .iter()
+            .filter(|size| !size.prevails)
+            .map(|size| size.text.clone()),
+    );
     if args.json {
         print::json(&printed)?
     } else {
         printed::describe(&printed, result.as_ref().ok().map(|found| &found.rig_pose))?
     }
-    let Ok(Calibrated { calibration, intrinsics, .. }) = result else {
+    let Ok(Calibrated {
+        calibration,
+        intrinsics,
+        ..
+    }) = result
+    else {
         outputs::log_failure(written);
         return Ok(Exit::InsufficientData);
     };
@@ -150,7 +175,9 @@ fn calibrate_and_print(
         match source {
             Source::Scan { .. } => rig.add_joint_offsets(&calibration.joint_offsets),
             Source::File(_) if !calibration.joint_offsets.is_empty() => {
-                log::warn!("joint offsets are not written into the rig file; add them to arm.joint_offsets");
+                log::warn!(
+                    "joint offsets are not written into the rig file; add them to arm.joint_offsets"
+                );
             }
             Source::File(_) => (),
         }
@@ -163,13 +190,19 @@ fn calibrate_and_print(
 /// A refusal with the reason why images were not used.
 fn with_reason(error: anyhow::Error, source: &Source, samples: &Samples) -> anyhow::Error {
     // Images that cannot be read were reported before.
-    let unused: Vec<&Unused> = samples.unused.iter().filter(|unused| !unused.is_unreadable).collect();
+    let unused: Vec<&Unused> = samples
+        .unused
+        .iter()
+        .filter(|unused| !unused.is_unreadable)
+        .collect();
     match unused.first() {
         Some(first) if exit::of(&error) == Exit::InsufficientData => {
             let n_all = source.n_samples() - (samples.unused.len() - unused.len());
             let n = unused.len();
             let (name, reason) = (&first.name, &first.reason);
-            let text = format!("{error:#}; {n} of {n_all} images do not show the target: {name}: {reason}");
+            let text = format!(
+                "{error:#}; {n} of {n_all} images do not show the target: {name}: {reason}"
+            );
             InsufficientData(text).into()
         }
         _ => error,
@@ -194,9 +227,13 @@ fn write_report(
     result: &anyhow::Result<Calibrated>,
 ) -> anyhow::Result<()> {
     let calibrated = result.as_ref().ok();
-    let found = calibrated.into_iter().flat_map(|calibrated| &calibrated.calibration.warnings);
+    let found = calibrated
+        .into_iter()
+        .flat_map(|calibrated| &calibrated.calibration.warnings);
     let warnings = source.warnings().iter().chain(found).cloned().collect();
-    let Some(heading) = outputs::heading(input, result, warnings) else { return Ok(()) };
+    let Some(heading) = outputs::heading(input, result, warnings) else {
+        return Ok(());
+    };
     let calibration = calibrated.map(|calibrated| &calibrated.calibration);
     let rig_line = calibrated
         .map(|calibrated| printed::pose_toml(&calibrated.rig_pose))
@@ -215,23 +252,40 @@ fn write_report(
 }
 
 impl Args {
-    /// Reads the samples file or the images of a recording or rig, or moves the arm to take images. `output` gets the
-    /// calibration that devices report.
-    fn source(&self, keeps_photos: bool, output: Option<&mut RigOutput>) -> anyhow::Result<(Source, Option<MovedArm>)> {
+    /// Reads the samples file or the images of a recording or rig, or moves the arm to take images.
+    /// `output` gets the calibration that devices report.
+    fn source(
+        &self,
+        keeps_photos: bool,
+        output: Option<&mut RigOutput>,
+    ) -> anyhow::Result<(Source, Option<MovedArm>)> {
         let has = |what: &str, flag: &str| BadArgument(format!("{flag}: {what}; remove the flag"));
         let (scan, arm) = if self.motion.is_requested {
             let (scan, arm) = self.motion.run(&self.request(keeps_photos)?, output)?;
             (Some(scan), Some(arm))
         } else {
-            let options = ScanOptions { keeps_photos, is_hidden: self.json, purpose: Purpose::HandEye };
-            (self.rig.read(&self.input, self.target.as_ref(), options, output)?, None)
+            let options = ScanOptions {
+                keeps_photos,
+                is_hidden: self.json,
+                purpose: Purpose::HandEye,
+            };
+            (
+                self.rig
+                    .read(&self.input, self.target.as_ref(), options, output)?,
+                None,
+            )
         };
         let source = match (scan, &self.target) {
             (Some(_), _) if self.urdf.is_some() => {
                 return Err(has("the rig file names the robot description", "--urdf").into());
             }
-            (Some(scan), Some(target)) => Source::Scan { scan: Box::new(scan), target: target.clone() },
-            (None, Some(_)) => return Err(has("the samples file contains the target", "--target").into()),
+            (Some(scan), Some(target)) => Source::Scan {
+                scan: Box::new(scan),
+                target: target.clone(),
+            },
+            (None, Some(_)) => {
+                return Err(has("the samples file contains the target", "--target").into());
+            }
             (_, None) if self.with_joints && self.urdf.is_none() => {
                 let why = "--with-joints: with samples in JSON, --urdf and --tip are needed, too";
                 return Err(BadArgument(why.to_owned()).into());
@@ -239,7 +293,9 @@ impl Args {
             (_, None) => {
                 let file = SamplesFile::read(&self.input)?;
                 let unused = file.unused(self.with_joints);
-                unused.iter().for_each(|note| log::info!("{}: {note}", self.input.display()));
+                unused
+                    .iter()
+                    .for_each(|note| log::info!("{}: {note}", self.input.display()));
                 Source::File(file)
             }
         };
@@ -256,7 +312,13 @@ impl Args {
             let why = "--urdf: the rig file names the robot description; remove the flag";
             return Err(BadArgument(why.to_owned()).into());
         }
-        Ok(Request { input: &self.input, target, rig: &self.rig, options: self.options(), keeps_photos })
+        Ok(Request {
+            input: &self.input,
+            target,
+            rig: &self.rig,
+            options: self.options(),
+            keeps_photos,
+        })
     }
 
     fn options(&self) -> HandEyeOptions {
@@ -269,17 +331,28 @@ impl Args {
 
     fn calibrate(&self, source: &Source, samples: &Samples) -> anyhow::Result<Calibrated> {
         source.check(samples)?;
-        let symmetries: Vec<Transform> = source.target().map(TargetSpec::symmetry).unwrap_or_default();
+        let symmetries: Vec<Transform> = source
+            .target()
+            .map(TargetSpec::symmetry)
+            .unwrap_or_default();
         let chain = self.chain()?;
         let intrinsics = source.intrinsics(samples.size_px)?;
         let covariance = match &intrinsics {
-            Some(intrinsics) if !self.with_intrinsics => source.intrinsics_covariance(intrinsics)?,
+            Some(intrinsics) if !self.with_intrinsics => {
+                source.intrinsics_covariance(intrinsics)?
+            }
             _ => None,
         };
         if intrinsics.is_some() && !self.with_intrinsics && covariance.is_none() {
-            log::info!("the given intrinsics are taken as exact, because their uncertainty is unknown");
+            log::info!(
+                "the given intrinsics are taken as exact, because their uncertainty is unknown"
+            );
         }
-        let intrinsics = if self.with_intrinsics { intrinsics.map(with_distortion) } else { intrinsics };
+        let intrinsics = if self.with_intrinsics {
+            intrinsics.map(with_distortion)
+        } else {
+            intrinsics
+        };
         let mut input = HandEyeInput {
             setup: source.setup(),
             samples: samples.used.clone(),
@@ -290,7 +363,8 @@ impl Args {
             options: self.options(),
         };
         let symmetry = source.target().and_then(symmetry_warning);
-        let mut calibration = calibrate_hand_eye(&input).map_err(|error| with_symmetry(error, symmetry.as_deref()))?;
+        let mut calibration = calibrate_hand_eye(&input)
+            .map_err(|error| with_symmetry(error, symmetry.as_deref()))?;
         if let Source::Scan { scan, .. } = source
             && scan.is_rolling_shutter()
         {
@@ -304,11 +378,18 @@ impl Args {
             None => Vec::new(),
         };
         let rig_pose = source.rig_pose(&calibration.parent_from_camera);
-        Ok(Calibrated { calibration, next_poses, intrinsics, rig_pose })
+        Ok(Calibrated {
+            calibration,
+            next_poses,
+            intrinsics,
+            rig_pose,
+        })
     }
 
     fn chain(&self) -> anyhow::Result<Option<Chain>> {
-        let (Some(urdf), Some(tip)) = (&self.urdf, &self.tip) else { return Ok(None) };
+        let (Some(urdf), Some(tip)) = (&self.urdf, &self.tip) else {
+            return Ok(None);
+        };
         let of_file = || urdf.display().to_string();
         let robot = Robot::parse(&outputs::read_text(urdf)?).with_context(of_file)?;
         let root = robot.root().with_context(of_file)?.to_owned();
@@ -316,11 +397,14 @@ impl Args {
     }
 }
 
-/// The start of the estimation of a lens. Without distortion, the estimate of a real lens would be wrong by more than its
-/// standard deviation.
+/// The start of the estimation of a lens. Without distortion, the estimate of a real lens would be
+/// wrong by more than its standard deviation.
 fn with_distortion(given: Intrinsics) -> Intrinsics {
     match given.lens {
-        Lens::Pinhole => Intrinsics { lens: Lens::BrownConrady([0.0; 5]), ..given },
+        Lens::Pinhole => Intrinsics {
+            lens: Lens::BrownConrady([0.0; 5]),
+            ..given
+        },
         _ => given,
     }
 }

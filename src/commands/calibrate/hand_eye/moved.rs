@@ -10,8 +10,8 @@ use crate::exit::{BadArgument, Exit, InsufficientData};
 use crate::signals;
 use calibration::BoardView;
 use calibration::hand_eye::{
-    ArmPlan, ArmPlanOptions, ArmStep, BoardObservation, FirstView, HandEyeInput, HandEyeOptions, HandEyeSample, Reach,
-    Setup, calibrate_hand_eye,
+    ArmPlan, ArmPlanOptions, ArmStep, BoardObservation, FirstView, HandEyeInput, HandEyeOptions,
+    HandEyeSample, Reach, Setup, calibrate_hand_eye,
 };
 use capture::config::{ArmDriver, Camera, Parent, Rig};
 use capture::open::{self, Devices};
@@ -32,13 +32,13 @@ const GOAL_DEG: f64 = 0.05;
 /// Flags for moving the arm.
 #[derive(Debug, clap::Args)]
 pub(super) struct MoveFlags {
-    /// With a rig file: move the arm to poses that show the target, until the result is accurate. The target must be
-    /// visible at the start; the arm returns there at the end. It does not avoid obstacles, and does not check for
-    /// collisions of the arm with itself, its base or cables
+    /// With a rig file: move the arm to poses that show the target, until the result is accurate.
+    /// The target must be visible at the start; the arm returns there at the end. It does not avoid
+    /// obstacles, and does not check for collisions of the arm with itself, its base or cables
     #[arg(long = "move")]
     pub(super) is_requested: bool,
-    /// With --move: confirm the motion: nobody is within reach of the arm, and a hand is on the emergency stop. Not needed
-    /// with --sim
+    /// With --move: confirm the motion: nobody is within reach of the arm, and a hand is on the
+    /// emergency stop. Not needed with --sim
     #[arg(long, requires = "is_requested")]
     enable_motion: bool,
     /// With --move: maximum number of poses
@@ -47,8 +47,9 @@ pub(super) struct MoveFlags {
     /// With --move: end when the standard deviations of the position are this small, millimeters
     #[arg(long, value_name = "MM", default_value_t = 0.2, requires = "is_requested", value_parser = super::super::super::number_in_range(1e-3..=100.0))]
     goal_mm: f64,
-    /// With --move: maximum distance of the flange from its position at the start, millimeters; tool, camera, target and
-    /// elbow can reach farther. Default: 300; with a camera on the flange, at most half its distance to the target
+    /// With --move: maximum distance of the flange from its position at the start, millimeters;
+    /// tool, camera, target and elbow can reach farther. Default: 300; with a camera on the flange,
+    /// at most half its distance to the target
     #[arg(long, value_name = "MM", requires = "is_requested", value_parser = super::super::super::number_in_range(10.0..=5000.0))]
     max_distance_mm: Option<f64>,
 }
@@ -64,8 +65,8 @@ pub(super) struct MovedArm {
 }
 
 impl MovedArm {
-    /// Holds an arm whose motors would release it, until Ctrl-C. Returns the result of the calibration, or why the motion
-    /// was not completed.
+    /// Holds an arm whose motors would release it, until Ctrl-C. Returns the result of the
+    /// calibration, or why the motion was not completed.
     pub(super) fn finish(mut self, result: anyhow::Result<Exit>) -> anyhow::Result<Exit> {
         let failure = self.failure.take();
         let held = self.hold_after(result.as_ref().err());
@@ -86,7 +87,8 @@ impl MovedArm {
         }
     }
 
-    /// Holds an arm whose motors would release it, until a signal. Before, logs the error that the program ends with.
+    /// Holds an arm whose motors would release it, until a signal. Before, logs the error that the
+    /// program ends with.
     ///
     /// # Errors
     /// If the arm has stopped because of a fault.
@@ -123,7 +125,10 @@ impl MoveFlags {
         let (input, flags) = (request.input.display(), request.rig);
         flags.check(request.input)?;
         if InputKind::of(request.input) != InputKind::Rig {
-            return Err(BadArgument(format!("--move needs a rig file (.toml) as input; {input} is not one")).into());
+            return Err(BadArgument(format!(
+                "--move needs a rig file (.toml) as input; {input} is not one"
+            ))
+            .into());
         }
         if flags.seconds.is_some() {
             return Err(BadArgument(
@@ -155,7 +160,11 @@ impl MoveFlags {
         if !is_simulated {
             signals::stop_when_output_closes(&stop)?;
         }
-        let devices = if flags.sim { Devices::Sim } else { Devices::Real };
+        let devices = if flags.sim {
+            Devices::Sim
+        } else {
+            Devices::Real
+        };
         let page = GuidancePage::start(&flags.page, &given_camera)?;
         let mut capture = ArmCapture::new(open::movable(&given, devices, camera)?)?;
         let rig = resolved(&given, capture.rig());
@@ -171,14 +180,35 @@ impl MoveFlags {
             Parent::Flange | Parent::Base => camera.parent_from_camera,
         };
         let (found, photos) = (Vec::new(), Photos::new());
-        let mut images = Images { camera: &camera, base_or_flange_from_camera, request, page, found, photos };
+        let mut images = Images {
+            camera: &camera,
+            base_or_flange_from_camera,
+            request,
+            page,
+            found,
+            photos,
+        };
         let failure = self.take_images(&mut capture, &mut images, &stop).err();
-        let Images { page, found, photos, .. } = images;
+        let Images {
+            page,
+            found,
+            photos,
+            ..
+        } = images;
         page.finish();
         drop(page);
-        let holds_on_exit =
-            is_simulated || given.arm.motion.as_ref().is_some_and(|motion| motion.on_loss == OnLoss::Hold);
-        let mut arm = MovedArm { capture, stop, holds_on_exit, failure: None };
+        let holds_on_exit = is_simulated
+            || given
+                .arm
+                .motion
+                .as_ref()
+                .is_some_and(|motion| motion.on_loss == OnLoss::Hold);
+        let mut arm = MovedArm {
+            capture,
+            stop,
+            holds_on_exit,
+            failure: None,
+        };
         match failure {
             // At most the first motion was tried.
             Some(error) if found.len() < 2 => {
@@ -212,15 +242,31 @@ impl MoveFlags {
         }
     }
 
-    /// Takes images until the plan is finished, then returns to the start. Ctrl-C stops the arm where it is.
-    fn take_images(&self, capture: &mut ArmCapture, images: &mut Images<'_>, stop: &Stop) -> anyhow::Result<()> {
+    /// Takes images until the plan is finished, then returns to the start. Ctrl-C stops the arm
+    /// where it is.
+    fn take_images(
+        &self,
+        capture: &mut ArmCapture,
+        images: &mut Images<'_>,
+        stop: &Stop,
+    ) -> anyhow::Result<()> {
         let start = capture.joints()?;
         let chain = capture.chain().clone();
-        let Some(first) = capture.image(stop)? else { return Ok(()) };
+        let Some(first) = capture.image(stop)? else {
+            return Ok(());
+        };
         let view = images.add(first)?;
         // Joint offsets are not part of the plan, so all poses are used for them.
-        let goal_mm = if images.request.options.estimate_joint_offsets { 0.0 } else { self.goal_mm };
-        let goals = ArmPlanOptions { max_poses: self.max_poses.into(), goal_mm, goal_deg: GOAL_DEG };
+        let goal_mm = if images.request.options.estimate_joint_offsets {
+            0.0
+        } else {
+            self.goal_mm
+        };
+        let goals = ArmPlanOptions {
+            max_poses: self.max_poses.into(),
+            goal_mm,
+            goal_deg: GOAL_DEG,
+        };
         let poses = next_pose_options(images.request.target);
         let first = FirstView {
             setup: images.setup(),
@@ -233,7 +279,12 @@ impl MoveFlags {
         let target = distance_m.map_or_else(String::new, |m| format!("target at {m:.2} m; "));
         log::info!("{target}the flange moves at most {max_distance_m:.2} m from its start");
         capture.limit_distance(max_distance_m)?;
-        let reach = Reach { chain: &chain, start: &start, max_joint_change: MAX_JOINT_CHANGE_RAD, max_distance_m };
+        let reach = Reach {
+            chain: &chain,
+            start: &start,
+            max_joint_change: MAX_JOINT_CHANGE_RAD,
+            max_distance_m,
+        };
         let mut plan = ArmPlan::new(&reach, &poses, &goals, &first);
         let symmetries = images.request.target.symmetry();
         loop {
@@ -258,7 +309,9 @@ impl MoveFlags {
             if !capture.move_to(&joints, stop)? {
                 return Ok(());
             }
-            let Some(image) = capture.image(stop)? else { return Ok(()) };
+            let Some(image) = capture.image(stop)? else {
+                return Ok(());
+            };
             match images.add(image) {
                 Ok(_) => plan.seen(),
                 Err(reason) => {
@@ -278,9 +331,16 @@ impl MoveFlags {
 fn resolved(given: &Rig, opened: &Rig) -> Rig {
     let mut rig = given.clone();
     for camera in &mut rig.cameras {
-        if let Some(resolved) = opened.cameras.iter().find(|other| other.name == camera.name) {
+        if let Some(resolved) = opened
+            .cameras
+            .iter()
+            .find(|other| other.name == camera.name)
+        {
             let driver = camera.driver;
-            *camera = Camera { driver, ..resolved.clone() };
+            *camera = Camera {
+                driver,
+                ..resolved.clone()
+            };
         }
     }
     rig
@@ -300,9 +360,18 @@ impl Images<'_> {
     /// Detects the target in an image. An error if it is not visible.
     fn add(&mut self, image: CalibrationImage) -> Result<BoardView, InsufficientData> {
         let n = self.found.len() + 1;
-        let CalibrationImage { size_px, gray, arm, .. } = image;
+        let CalibrationImage {
+            size_px, gray, arm, ..
+        } = image;
         let name = format!("pose {n}");
-        let board = images::detect_in_gray(GrayImage { size_px, pixels: &gray }, &name, self.request.target);
+        let board = images::detect_in_gray(
+            GrayImage {
+                size_px,
+                pixels: &gray,
+            },
+            &name,
+            self.request.target,
+        );
         let view = match &board {
             Ok(board) => {
                 log::info!("pose {n}: {} corners", board.view.points.len());
@@ -311,22 +380,39 @@ impl Images<'_> {
             Err(reason) if n == 1 => Err(InsufficientData(format!(
                 "the target is not visible at the start: {reason}; move the arm so that the camera sees the whole target, then start again"
             ))),
-            Err(reason) => Err(InsufficientData(format!("the target is not visible: {reason}"))),
+            Err(reason) => Err(InsufficientData(format!(
+                "the target is not visible: {reason}"
+            ))),
         };
-        self.page.show_searched(size_px, &gray, board.as_ref().ok().map(|board| &board.view));
+        self.page
+            .show_searched(size_px, &gray, board.as_ref().ok().map(|board| &board.view));
         if self.request.keeps_photos {
-            self.photos.insert(name.clone(), Photo::Gray { size_px, pixels: gray });
+            self.photos.insert(
+                name.clone(),
+                Photo::Gray {
+                    size_px,
+                    pixels: gray,
+                },
+            );
         }
         self.found.push((DetectedImage { name, board }, arm));
         view
     }
 
     fn setup(&self) -> Setup {
-        if self.camera.parent == Parent::Flange { Setup::EyeInHand } else { Setup::EyeToHand }
+        if self.camera.parent == Parent::Flange {
+            Setup::EyeInHand
+        } else {
+            Setup::EyeToHand
+        }
     }
 
     /// Input of the calibration so far.
-    fn hand_eye_input<'a>(&self, chain: &'a Chain, symmetries: &'a [Transform]) -> HandEyeInput<'a> {
+    fn hand_eye_input<'a>(
+        &self,
+        chain: &'a Chain,
+        symmetries: &'a [Transform],
+    ) -> HandEyeInput<'a> {
         let sample = |(image, arm): &(DetectedImage, Option<ArmDuringImage>)| {
             let (board, arm) = (image.board.as_ref().ok()?, arm.as_ref()?);
             Some(HandEyeSample {

@@ -10,7 +10,8 @@ use session::calibration_report::Unused;
 
 type Matrix = [[f64; 4]; 4];
 
-/// The printed result. Matrices are row by row; standard deviations along and about the axes of the camera.
+/// The printed result. Matrices are row by row; standard deviations along and about the axes of the
+/// camera.
 #[derive(Debug, Default, Serialize)]
 pub(super) struct Printed {
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -54,7 +55,8 @@ pub(super) struct PrintedPose {
 #[derive(Debug, Serialize)]
 pub(super) struct PrintedJoint {
     pub(super) joint: String,
-    /// Offset to add to the readings, radians (meters for prismatic joints); null if it cannot be observed.
+    /// Offset to add to the readings, radians (meters for prismatic joints); null if it cannot be
+    /// observed.
     pub(super) offset: Option<f64>,
     pub(super) sigma: Option<f64>,
 }
@@ -75,15 +77,27 @@ pub(super) struct PrintedSample {
 
 impl PrintedPose {
     pub(super) fn of(next: NextPose) -> Self {
-        let NextPose { base_from_flange, joints, motion, sigma_frac, .. } = next;
-        Self { base_from_flange: matrix_of(&base_from_flange), joints, motion, sigma_frac }
+        let NextPose {
+            base_from_flange,
+            joints,
+            motion,
+            sigma_frac,
+            ..
+        } = next;
+        Self {
+            base_from_flange: matrix_of(&base_from_flange),
+            joints,
+            motion,
+            sigma_frac,
+        }
     }
 }
 
 pub(super) fn printed(calibration: &HandEyeCalibration) -> Printed {
     let camera = Some(matrix_of(&calibration.parent_from_camera));
     let board = Some(matrix_of(&calibration.parent_from_board));
-    let of_setup = |setup: Setup, matrix: Option<Matrix>| (calibration.setup == setup).then_some(matrix);
+    let of_setup =
+        |setup: Setup, matrix: Option<Matrix>| (calibration.setup == setup).then_some(matrix);
     let held_out = calibration.held_out_scatter;
     Printed {
         flange_from_camera: of_setup(Setup::EyeInHand, camera),
@@ -98,7 +112,10 @@ pub(super) fn printed(calibration: &HandEyeCalibration) -> Printed {
         held_out_rms_px: calibration.held_out_rms_px,
         sigma_mm: Some(calibration.sigma_mm),
         sigma_deg: Some(calibration.sigma_deg),
-        intrinsics: calibration.intrinsics.as_ref().map(|(intrinsics, _)| LensFile::of(intrinsics)),
+        intrinsics: calibration
+            .intrinsics
+            .as_ref()
+            .map(|(intrinsics, _)| LensFile::of(intrinsics)),
         joint_offsets: calibration
             .joint_offsets
             .iter()
@@ -137,7 +154,11 @@ impl PrintedSample {
     pub(super) fn unused(unused: &Unused) -> Self {
         Self {
             name: unused.name.clone(),
-            status: if unused.is_unreadable { "unreadable" } else { "no-board" },
+            status: if unused.is_unreadable {
+                "unreadable"
+            } else {
+                "no-board"
+            },
             reason: Some(unused.reason.clone()),
             is_unreadable: unused.is_unreadable,
             ..Self::default()
@@ -162,8 +183,17 @@ impl Printed {
 
 /// The value of `parent_from_camera` in a rig file.
 pub(super) fn pose_toml(pose: &Transform) -> String {
-    let list = |values: &[f64]| values.iter().map(|value| format!("{value:.9}")).collect::<Vec<_>>().join(", ");
-    let (xyz_m, quat_xyzw) = (list(pose.translation.vector.as_slice()), list(pose.rotation.coords.as_slice()));
+    let list = |values: &[f64]| {
+        values
+            .iter()
+            .map(|value| format!("{value:.9}"))
+            .collect::<Vec<_>>()
+            .join(", ")
+    };
+    let (xyz_m, quat_xyzw) = (
+        list(pose.translation.vector.as_slice()),
+        list(pose.rotation.coords.as_slice()),
+    );
     format!("{{ xyz_m = [{xyz_m}], quat_xyzw = [{quat_xyzw}] }}")
 }
 
@@ -181,13 +211,18 @@ pub(super) fn describe(printed: &Printed, rig_pose: Option<&Transform>) -> anyho
         print_matrix(&matrix)?;
     }
     if let Some(pose) = rig_pose {
-        print::line(format!("rig file:\nparent_from_camera = {}", pose_toml(pose)))?;
+        print::line(format!(
+            "rig file:\nparent_from_camera = {}",
+            pose_toml(pose)
+        ))?;
     }
     if let Some(intrinsics) = &printed.intrinsics {
         print::line(format!("intrinsics = {}", intrinsics.to_toml()))?;
     }
     let three = |values: Option<[f64; 3]>, unit: &str| {
-        let values = values.unwrap_or_default().map(|value| format!("{value:.3}"));
+        let values = values
+            .unwrap_or_default()
+            .map(|value| format!("{value:.3}"));
         format!("{} {unit}", values.join(", "))
     };
     print::line(format!(
@@ -196,10 +231,14 @@ pub(super) fn describe(printed: &Printed, rig_pose: Option<&Transform>) -> anyho
         three(printed.sigma_deg, "degrees")
     ))?;
     if let (Some(mm), Some(deg)) = (printed.scatter_mm, printed.scatter_deg) {
-        print::line(format!("scatter of the board over the samples: {mm:.2} mm, {deg:.3} degrees"))?;
+        print::line(format!(
+            "scatter of the board over the samples: {mm:.2} mm, {deg:.3} degrees"
+        ))?;
     }
     if let (Some(mm), Some(deg)) = (printed.held_out_scatter_mm, printed.held_out_scatter_deg) {
-        print::line(format!("the same for samples that were left out: {mm:.2} mm, {deg:.3} degrees"))?;
+        print::line(format!(
+            "the same for samples that were left out: {mm:.2} mm, {deg:.3} degrees"
+        ))?;
     }
     if let Some(rms_px) = printed.rms_px {
         print::line(format!("reprojection error: {rms_px:.3} px (RMS)"))?;
@@ -207,7 +246,10 @@ pub(super) fn describe(printed: &Printed, rig_pose: Option<&Transform>) -> anyho
     for joint in &printed.joint_offsets {
         print::line(match (joint.offset, joint.sigma) {
             (Some(offset), Some(sigma)) => {
-                format!("offset of {}: {offset:.6} +- {sigma:.6} (radians or meters)", joint.joint)
+                format!(
+                    "offset of {}: {offset:.6} +- {sigma:.6} (radians or meters)",
+                    joint.joint
+                )
             }
             _ => format!("offset of {}: cannot be observed", joint.joint),
         })?;
@@ -220,7 +262,10 @@ pub(super) fn describe(printed: &Printed, rig_pose: Option<&Transform>) -> anyho
     }
     if let Some(next) = printed.next_poses.first() {
         let percent = 100.0 * (1.0 - next.sigma_frac);
-        print::line(format!("next pose: {} (lowers the standard deviations by {percent:.0} %)", next.motion))?;
+        print::line(format!(
+            "next pose: {} (lowers the standard deviations by {percent:.0} %)",
+            next.motion
+        ))?;
     }
     for warning in &printed.warnings {
         log::warn!("{warning}");

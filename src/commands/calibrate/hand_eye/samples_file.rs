@@ -66,10 +66,14 @@ impl SamplesFile {
                 let file = folder.join(file);
                 source = format!("{}: ", file.display());
                 let text = outputs::read_text(&file)?;
-                *intrinsics = camera_info::parse_value(&text).map_err(|why| invalid(format!("{source}{why}")))?;
+                *intrinsics = camera_info::parse_value(&text)
+                    .map_err(|why| invalid(format!("{source}{why}")))?;
             }
-            let notes = camera_info::convert(intrinsics).map_err(|why| invalid(format!("{source}{why}")))?;
-            notes.iter().for_each(|note| log::warn!("{name}: intrinsics: {source}{note}"));
+            let notes = camera_info::convert(intrinsics)
+                .map_err(|why| invalid(format!("{source}{why}")))?;
+            notes
+                .iter()
+                .for_each(|note| log::warn!("{name}: intrinsics: {source}{note}"));
         }
         let file = JsonObject::new(&name, String::new(), &value, &FILE_KEYS)?;
         let intrinsics = file.object("intrinsics", &LensFile::KEYS)?;
@@ -78,14 +82,23 @@ impl SamplesFile {
             None | Some("eye-in-hand") => Setup::EyeInHand,
             Some("eye-to-hand") => Setup::EyeToHand,
             Some(other) => {
-                return Err(file.invalid("setup", format!("{other:?}, expected \"eye-in-hand\" or \"eye-to-hand\"")));
+                return Err(file.invalid(
+                    "setup",
+                    format!("{other:?}, expected \"eye-in-hand\" or \"eye-to-hand\""),
+                ));
             }
         };
         let samples = file.objects("samples", &SAMPLE_KEYS)?;
         if samples.is_empty() {
-            return Err(file.invalid("samples", "the list is empty; add 12 or more robot poses with their images"));
+            return Err(file.invalid(
+                "samples",
+                "the list is empty; add 12 or more robot poses with their images",
+            ));
         }
-        let entries: Vec<Entry> = samples.iter().map(|sample| Entry::read(sample, folder)).collect::<Result<_, _>>()?;
+        let entries: Vec<Entry> = samples
+            .iter()
+            .map(|sample| Entry::read(sample, folder))
+            .collect::<Result<_, _>>()?;
         check_images(&samples, &entries)?;
         let read = Self {
             path: path.to_owned(),
@@ -112,11 +125,17 @@ impl SamplesFile {
     /// The given intrinsics, for images of this size.
     pub(super) fn intrinsics(&self, size_px: [u32; 2]) -> Result<Option<Intrinsics>, BadArgument> {
         let of_file = |error: BadArgument| BadArgument(format!("{}: {error}", self.path.display()));
-        self.intrinsics.as_ref().map(|lens| lens.intrinsics(size_px).map_err(of_file)).transpose()
+        self.intrinsics
+            .as_ref()
+            .map(|lens| lens.intrinsics(size_px).map_err(of_file))
+            .transpose()
     }
 
     /// Covariance of the given intrinsics, if the file contains it.
-    pub(super) fn intrinsics_covariance(&self, intrinsics: &Intrinsics) -> Result<Option<DMatrix<f64>>, BadArgument> {
+    pub(super) fn intrinsics_covariance(
+        &self,
+        intrinsics: &Intrinsics,
+    ) -> Result<Option<DMatrix<f64>>, BadArgument> {
         let of_file = |error: BadArgument| BadArgument(format!("{}: {error}", self.path.display()));
         Ok(match &self.intrinsics {
             Some(lens) => lens.covariance(intrinsics).map_err(of_file)?,
@@ -129,16 +148,26 @@ impl SamplesFile {
     /// * `estimates_joints`: whether the offsets of joints are estimated.
     pub(super) fn unused(&self, estimates_joints: bool) -> Vec<&'static str> {
         let without_images = self.intrinsics.is_some() && !self.has_images();
-        let without_flag = !estimates_joints && self.entries.iter().any(|entry| entry.joints.is_some());
+        let without_flag =
+            !estimates_joints && self.entries.iter().any(|entry| entry.joints.is_some());
         let notes = [
-            (without_images, "intrinsics are not used, because no sample has an image"),
+            (
+                without_images,
+                "intrinsics are not used, because no sample has an image",
+            ),
             (without_flag, "joints are only used with --with-joints"),
         ];
-        notes.into_iter().filter(|(applies, _)| *applies).map(|(_, note)| note).collect()
+        notes
+            .into_iter()
+            .filter(|(applies, _)| *applies)
+            .map(|(_, note)| note)
+            .collect()
     }
 
     fn has_images(&self) -> bool {
-        self.entries.iter().any(|entry| matches!(entry.board, EntryBoard::Image(_)))
+        self.entries
+            .iter()
+            .any(|entry| matches!(entry.board, EntryBoard::Image(_)))
     }
 
     pub(super) fn len(&self) -> usize {
@@ -160,7 +189,10 @@ impl SamplesFile {
         };
         let mut samples = Samples {
             unused: images::unused(&detected),
-            other_size: self.target.as_ref().and_then(|target| images::other_size(detected.iter(), target)),
+            other_size: self
+                .target
+                .as_ref()
+                .and_then(|target| images::other_size(detected.iter(), target)),
             photos: images::photos(&files),
             ..Samples::default()
         };
@@ -169,15 +201,25 @@ impl SamplesFile {
             let (name, board) = match &entry.board {
                 EntryBoard::Pose(pose) => (format!("sample {ix}"), BoardObservation::Pose(*pose)),
                 EntryBoard::Image(_) => {
-                    let DetectedImage { name, board, .. } = detected.next().expect("one result per image");
+                    let DetectedImage { name, board, .. } =
+                        detected.next().expect("one result per image");
                     let Ok(board) = board else { continue };
                     samples.expect_size(&name, board.size_px)?;
                     (name, BoardObservation::View(board.view))
                 }
             };
-            let Entry { base_from_flange, joints, .. } = entry;
+            let Entry {
+                base_from_flange,
+                joints,
+                ..
+            } = entry;
             let (base_from_flange, joints) = (*base_from_flange, joints.clone());
-            samples.used.push(HandEyeSample { name, base_from_flange, board, joints });
+            samples.used.push(HandEyeSample {
+                name,
+                base_from_flange,
+                board,
+                joints,
+            });
         }
         Ok(samples)
     }
@@ -185,7 +227,10 @@ impl SamplesFile {
     /// An error if no image shows the target.
     pub(super) fn check_detected(&self, samples: &Samples) -> Result<(), InsufficientData> {
         match samples.used.is_empty() && !samples.unused.is_empty() {
-            true => Err(InsufficientData(format!("{}: no image shows the target", self.path.display()))),
+            true => Err(InsufficientData(format!(
+                "{}: no image shows the target",
+                self.path.display()
+            ))),
             false => Ok(()),
         }
     }
@@ -193,7 +238,10 @@ impl SamplesFile {
 
 /// A hint at numbers that other programs write but JSON does not have.
 fn not_json_hint(text: &str) -> &'static str {
-    let has = |word: &str| text.split(|c: char| !c.is_ascii_alphabetic()).any(|found| found == word);
+    let has = |word: &str| {
+        text.split(|c: char| !c.is_ascii_alphabetic())
+            .any(|found| found == word)
+    };
     if ["NaN", "nan", "Infinity", "inf"].into_iter().any(has) {
         "; NaN and infinity are not JSON: remove the samples that contain them"
     } else if text.starts_with("%YAML:") {
@@ -213,8 +261,17 @@ impl Samples {
         if first_px == size_px {
             return Ok(());
         }
-        let first = self.used.first().map(|sample| sample.name.clone()).unwrap_or_default();
-        Err(calibration::Error::MixedImageSizes { first, first_px, other: name.to_owned(), other_px: size_px })
+        let first = self
+            .used
+            .first()
+            .map(|sample| sample.name.clone())
+            .unwrap_or_default();
+        Err(calibration::Error::MixedImageSizes {
+            first,
+            first_px,
+            other: name.to_owned(),
+            other_px: size_px,
+        })
     }
 }
 
@@ -222,10 +279,15 @@ impl Samples {
 fn check_images(samples: &[JsonObject<'_>], entries: &[Entry]) -> Result<(), BadArgument> {
     let mut first_use: BTreeMap<&Path, usize> = BTreeMap::new();
     for (ix, entry) in entries.iter().enumerate() {
-        let EntryBoard::Image(image) = &entry.board else { continue };
+        let EntryBoard::Image(image) = &entry.board else {
+            continue;
+        };
         let first = *first_use.entry(&image.path).or_insert(ix);
         if entries[first].base_from_flange != entry.base_from_flange {
-            let why = format!("{} is the image of samples[{first}], too, which has another robot pose", image.name);
+            let why = format!(
+                "{} is the image of samples[{first}], too, which has another robot pose",
+                image.name
+            );
             return Err(samples[ix].invalid("image", why));
         }
     }
@@ -239,8 +301,9 @@ fn pose(sample: &JsonObject<'_>, key: &str) -> Result<Option<Transform>, BadArgu
     let pose = sample.transform(key)?;
     let farthest_m = pose.map_or(0.0, |pose| pose.translation.vector.amax());
     if farthest_m > MAX_POSITION_M {
-        let why =
-            format!("its position is {farthest_m:e} m away, at most {MAX_POSITION_M:e} m are accepted; write meters");
+        let why = format!(
+            "its position is {farthest_m:e} m away, at most {MAX_POSITION_M:e} m are accepted; write meters"
+        );
         return Err(sample.invalid(key, why));
     }
     Ok(pose)
@@ -248,23 +311,40 @@ fn pose(sample: &JsonObject<'_>, key: &str) -> Result<Option<Transform>, BadArgu
 
 impl Entry {
     fn read(sample: &JsonObject<'_>, folder: &Path) -> Result<Self, BadArgument> {
-        let base_from_flange = sample.required("base_from_flange", pose(sample, "base_from_flange")?)?;
+        let base_from_flange =
+            sample.required("base_from_flange", pose(sample, "base_from_flange")?)?;
         let board = match (pose(sample, "camera_from_board")?, sample.text("image")?) {
             (Some(pose), None) => EntryBoard::Pose(pose),
             (None, Some(image)) => {
                 let path = folder.join(image);
                 if !path.is_file() {
-                    return Err(sample.invalid("image", format!("{} does not exist", path.display())));
+                    return Err(
+                        sample.invalid("image", format!("{} does not exist", path.display()))
+                    );
                 }
                 // The name in messages is the path from here, not from the samples file.
-                EntryBoard::Image(ImageFile { name: path.display().to_string(), path })
+                EntryBoard::Image(ImageFile {
+                    name: path.display().to_string(),
+                    path,
+                })
             }
-            (None, None) => return Err(sample.invalid("image", "missing; give \"image\" or \"camera_from_board\"")),
+            (None, None) => {
+                return Err(
+                    sample.invalid("image", "missing; give \"image\" or \"camera_from_board\"")
+                );
+            }
             (Some(_), Some(_)) => {
-                return Err(sample.invalid("image", "give either \"image\" or \"camera_from_board\", not both"));
+                return Err(sample.invalid(
+                    "image",
+                    "give either \"image\" or \"camera_from_board\", not both",
+                ));
             }
         };
-        Ok(Self { base_from_flange, board, joints: sample.numbers("joints")? })
+        Ok(Self {
+            base_from_flange,
+            board,
+            joints: sample.numbers("joints")?,
+        })
     }
 }
 

@@ -50,7 +50,10 @@ impl Source {
     }
 
     /// The given intrinsics. `None` without images.
-    pub(super) fn intrinsics(&self, size_px: Option<[u32; 2]>) -> anyhow::Result<Option<Intrinsics>> {
+    pub(super) fn intrinsics(
+        &self,
+        size_px: Option<[u32; 2]>,
+    ) -> anyhow::Result<Option<Intrinsics>> {
         match (self, size_px) {
             (Self::Scan { scan, .. }, _) => Ok(Some(scan.intrinsics().clone())),
             (Self::File(file), Some(size_px)) => Ok(file.intrinsics(size_px)?),
@@ -59,7 +62,10 @@ impl Source {
     }
 
     /// Covariance of the given intrinsics, if it is known.
-    pub(super) fn intrinsics_covariance(&self, intrinsics: &Intrinsics) -> anyhow::Result<Option<DMatrix<f64>>> {
+    pub(super) fn intrinsics_covariance(
+        &self,
+        intrinsics: &Intrinsics,
+    ) -> anyhow::Result<Option<DMatrix<f64>>> {
         Ok(match self {
             Self::Scan { scan, .. } => scan.intrinsics_covariance()?,
             Self::File(file) => file.intrinsics_covariance(intrinsics)?,
@@ -84,7 +90,13 @@ impl Source {
                 let (used, unused) = scan.samples(None);
                 let size_px = Some(scan.intrinsics().size_px);
                 let other_size = scan.other_size(target);
-                Ok(Samples { used, unused, other_size, size_px, photos: scan.take_photos() })
+                Ok(Samples {
+                    used,
+                    unused,
+                    other_size,
+                    size_px,
+                    photos: scan.take_photos(),
+                })
             }
         }
     }

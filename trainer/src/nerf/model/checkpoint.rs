@@ -57,17 +57,25 @@ fn invalid_state(reason: String) -> Error {
 impl FieldSnapshot {
     /// Number of images that the parameter array can hold.
     fn image_capacity(&self) -> Option<u32> {
-        let image_params = self.arrays.iter().find(|array| array.name == IMAGE_PARAMS)?;
-        u32::try_from(image_params.bytes.len() / (IMAGE_PARAM_STRIDE * size_of::<ImageParam>())).ok()
+        let image_params = self
+            .arrays
+            .iter()
+            .find(|array| array.name == IMAGE_PARAMS)?;
+        u32::try_from(image_params.bytes.len() / (IMAGE_PARAM_STRIDE * size_of::<ImageParam>()))
+            .ok()
     }
 }
 
 impl FieldTrainer {
     /// Buffers needed for rendering, by name.
     fn render_buffers(&self) -> Vec<(String, &Buffer)> {
-        [("grid", &self.field.grid), ("occupied", &self.occupancy.occupied), ("weights", &self.field.weights)]
-            .map(|(name, buffer)| (name.to_owned(), buffer))
-            .to_vec()
+        [
+            ("grid", &self.field.grid),
+            ("occupied", &self.occupancy.occupied),
+            ("weights", &self.field.weights),
+        ]
+        .map(|(name, buffer)| (name.to_owned(), buffer))
+        .to_vec()
     }
 
     /// Buffers needed to continue training, by name.
@@ -85,7 +93,11 @@ impl FieldTrainer {
             ]
             .map(|(name, buffer)| (name.to_owned(), buffer)),
         );
-        all.extend(self.images.iter().map(|images| (IMAGE_PARAMS.to_owned(), &images.image_params)));
+        all.extend(
+            self.images
+                .iter()
+                .map(|images| (IMAGE_PARAMS.to_owned(), &images.image_params)),
+        );
         all
     }
 }
@@ -93,24 +105,48 @@ impl FieldTrainer {
 /// Starts reading buffers back to the host.
 fn begin_read(gpu: &Gpu, buffers: Vec<(String, &Buffer)>) -> Vec<(String, PendingRead)> {
     let read = |buffer: &Buffer| {
-        gpu.begin_read(buffer, usize::try_from(buffer.bytes() / 4).expect("a buffer fits into memory"))
+        gpu.begin_read(
+            buffer,
+            usize::try_from(buffer.bytes() / 4).expect("a buffer fits into memory"),
+        )
     };
-    buffers.into_iter().map(|(name, buffer)| (name, read(buffer))).collect()
+    buffers
+        .into_iter()
+        .map(|(name, buffer)| (name, read(buffer)))
+        .collect()
 }
 
 fn finish(gpu: &Gpu, reads: Vec<(String, PendingRead)>) -> Result<Vec<Array>, Error> {
-    reads.into_iter().map(|(name, read)| Ok(Array { name, bytes: read.finish(gpu)? })).collect()
+    reads
+        .into_iter()
+        .map(|(name, read)| {
+            Ok(Array {
+                name,
+                bytes: read.finish(gpu)?,
+            })
+        })
+        .collect()
 }
 
 impl NerfModel {
     fn state(&self) -> Result<NerfState, Error> {
         Ok(NerfState {
-            options: self.options.clone().with(|options| options.specific.nerf_budget = Some(self.nerf_budget())),
+            options: self
+                .options
+                .clone()
+                .with(|options| options.specific.nerf_budget = Some(self.nerf_budget())),
             step: self.step,
-            images: self.images.iter().map(|image| KeyframeSignature::of(&image.keyframe)).collect(),
+            images: self
+                .images
+                .iter()
+                .map(|image| KeyframeSignature::of(&image.keyframe))
+                .collect(),
             is_extent_stale: self.is_extent_stale,
             n_hinted: self.n_hinted,
-            field: self.field.as_ref().map(|(extent, field_trainer)| (*extent, field_trainer.sizes.clone())),
+            field: self
+                .field
+                .as_ref()
+                .map(|(extent, field_trainer)| (*extent, field_trainer.sizes.clone())),
             learned_params: self.learned_params,
             are_trials_finished: self.trials.are_finished(),
             trials: self.trials.finished.clone(),
@@ -127,9 +163,16 @@ impl NerfModel {
         let reads = self
             .field
             .as_ref()
-            .map_or(Vec::new(), |(_, field_trainer)| begin_read(&self.gpu, field_trainer.training_buffers()));
+            .map_or(Vec::new(), |(_, field_trainer)| {
+                begin_read(&self.gpu, field_trainer.training_buffers())
+            });
         let (step, n_hinted, learned_params) = (self.step, self.n_hinted, self.learned_params);
-        Ok(FieldSnapshot { arrays: finish(&self.gpu, reads)?, step, n_hinted, learned_params })
+        Ok(FieldSnapshot {
+            arrays: finish(&self.gpu, reads)?,
+            step,
+            n_hinted,
+            learned_params,
+        })
     }
 
     /// Restores a snapshot. No submit may be in flight.
@@ -138,11 +181,15 @@ impl NerfModel {
         self.n_hinted = snapshot.n_hinted.min(self.images.len());
         self.is_extent_stale |= self.n_hinted < self.images.len(); // Their hints are added again.
         self.corrections = None;
-        let Some((_, field_trainer)) = &mut self.field else { return Ok(()) };
+        let Some((_, field_trainer)) = &mut self.field else {
+            return Ok(());
+        };
         match snapshot.image_capacity() {
-            Some(image_capacity) => {
-                field_trainer.allocate_images(&self.gpu, image_capacity as usize, snapshot.learned_params)?
-            }
+            Some(image_capacity) => field_trainer.allocate_images(
+                &self.gpu,
+                image_capacity as usize,
+                snapshot.learned_params,
+            )?,
             None => field_trainer.drop_images(),
         }
         for (name, buffer) in field_trainer.training_buffers() {
@@ -163,14 +210,20 @@ impl NerfModel {
             state.n_hinted = before.n_hinted.min(self.images.len());
             state.is_extent_stale |= state.n_hinted < self.images.len();
             let (state, arrays) = (to_json(&state)?, before.arrays.clone());
-            return Ok(PendingCheckpoint::new(move || Ok(Checkpoint::new(METHOD, state, arrays))));
+            return Ok(PendingCheckpoint::new(move || {
+                Ok(Checkpoint::new(METHOD, state, arrays))
+            }));
         }
         let state = to_json(&state)?;
         let reads = self
             .field
             .as_ref()
-            .map_or(Vec::new(), |(_, field_trainer)| begin_read(&gpu, field_trainer.training_buffers()));
-        Ok(PendingCheckpoint::new(move || Ok(Checkpoint::new(METHOD, state, finish(&gpu, reads)?))))
+            .map_or(Vec::new(), |(_, field_trainer)| {
+                begin_read(&gpu, field_trainer.training_buffers())
+            });
+        Ok(PendingCheckpoint::new(move || {
+            Ok(Checkpoint::new(METHOD, state, finish(&gpu, reads)?))
+        }))
     }
 
     /// Restores a model from a checkpoint with the given subset of buffers, without keyframes.
@@ -180,32 +233,44 @@ impl NerfModel {
         buffers: impl Fn(&FieldTrainer) -> Vec<(String, &Buffer)>,
     ) -> Result<(Self, NerfState), Error> {
         if checkpoint.method != METHOD {
-            return Err(invalid_state(format!("it was written by method {:?}", checkpoint.method)));
+            return Err(invalid_state(format!(
+                "it was written by method {:?}",
+                checkpoint.method
+            )));
         }
-        let state: NerfState =
-            serde_json::from_value(checkpoint.state.clone()).map_err(|error| invalid_state(error.to_string()))?;
+        let state: NerfState = serde_json::from_value(checkpoint.state.clone())
+            .map_err(|error| invalid_state(error.to_string()))?;
         let mut model = Self::new(gpu, state.options.clone())?;
         if let Some((extent, sizes)) = &state.field {
             sizes.check()?;
             let compiled = model.compiled()?;
-            let mut field_trainer = FieldTrainer::new(&model.gpu, &model.options, sizes.clone(), compiled)?;
+            let mut field_trainer =
+                FieldTrainer::new(&model.gpu, &model.options, sizes.clone(), compiled)?;
             if let Some(image_capacity) = state.image_capacity {
-                field_trainer.allocate_images(&model.gpu, image_capacity as usize, state.learned_params)?;
+                field_trainer.allocate_images(
+                    &model.gpu,
+                    image_capacity as usize,
+                    state.learned_params,
+                )?;
             }
             for (name, buffer) in buffers(&field_trainer) {
-                model.gpu.write(buffer, 0, checkpoint.array(&name, buffer.bytes())?);
+                model
+                    .gpu
+                    .write(buffer, 0, checkpoint.array(&name, buffer.bytes())?);
             }
             model.field = Some((*extent, field_trainer));
         }
         model.step = state.step;
         model.n_discarded_steps = state.n_discarded_steps;
         model.learned_params = state.learned_params;
-        model.trials = Trials::of(&state.options.common.cameras).after(state.trials.clone(), state.are_trials_finished);
+        model.trials = Trials::of(&state.options.common.cameras)
+            .after(state.trials.clone(), state.are_trials_finished);
         Ok((model, state))
     }
 
-    /// Resumes training exactly where the checkpoint was taken. `keyframes` must include all that the model was trained
-    /// on. Also returns the other keyframes, to be pushed or kept for testing.
+    /// Resumes training exactly where the checkpoint was taken. `keyframes` must include all that
+    /// the model was trained on. Also returns the other keyframes, to be pushed or kept for
+    /// testing.
     pub fn resume(
         gpu: Arc<Gpu>,
         checkpoint: &Checkpoint,
@@ -229,16 +294,24 @@ impl NerfModel {
 
     pub(super) fn write_folder(&mut self, folder: &Path) -> Result<(), Error> {
         self.finish_in_flight()?;
-        let write_error = |path: &Path, source| Error::Write { path: path.to_owned(), source };
+        let write_error = |path: &Path, source| Error::Write {
+            path: path.to_owned(),
+            source,
+        };
         std::fs::create_dir_all(folder).map_err(|source| write_error(folder, source))?;
         let reads = self
             .field
             .as_ref()
-            .map_or(Vec::new(), |(_, field_trainer)| begin_read(&self.gpu, field_trainer.render_buffers()));
+            .map_or(Vec::new(), |(_, field_trainer)| {
+                begin_read(&self.gpu, field_trainer.render_buffers())
+            });
         let (state, arrays) = (to_json(&self.state()?)?, finish(&self.gpu, reads)?);
         let cameras = self.camera_corrections()?;
         Checkpoint::new(METHOD, state, arrays).write(&folder.join(FIELD_FILE))?;
-        let sizes = self.field.as_ref().map(|(_, field_trainer)| &field_trainer.sizes);
+        let sizes = self
+            .field
+            .as_ref()
+            .map(|(_, field_trainer)| &field_trainer.sizes);
         let description = serde_json::json!({
             "method": METHOD,
             "steps": self.step,
@@ -248,6 +321,7 @@ impl NerfModel {
             "cameras": cameras,
         });
         let path = folder.join(METADATA_FILE);
-        files::write(&path, format!("{description:#}\n")).map_err(|source| write_error(&path, source))
+        files::write(&path, format!("{description:#}\n"))
+            .map_err(|source| write_error(&path, source))
     }
 }

@@ -1,10 +1,12 @@
-//! Image parameters optimized with the field: pose corrections and appearance embeddings (lighting and exposure).
-//! Trials decide which of them are kept. For images that were not trained on, the parameters are interpolated.
+//! Image parameters optimized with the field: pose corrections and appearance embeddings (lighting
+//! and exposure). Trials decide which of them are kept. For images that were not trained on, the
+//! parameters are interpolated.
 //!
-//! From a fixed step on, candidates are tried one after another, unless a quick check shows no gain. The field is
-//! trained for some steps with the candidate, restored, and trained for as many steps without it. The candidate is kept
-//! if it improves the prediction of validation images. The parameters of validation images are interpolated from the
-//! training images before and after them in time.
+//! From a fixed step on, candidates are tried one after another, unless a quick check shows no
+//! gain. The field is trained for some steps with the candidate, restored, and trained for as many
+//! steps without it. The candidate is kept if it improves the prediction of validation images. The
+//! parameters of validation images are interpolated from the training images before and after them
+//! in time.
 
 use super::NerfModel;
 use crate::Error;
@@ -14,8 +16,8 @@ use crate::nerf::field_trainer::RayColor;
 use crate::nerf::params::{EMBEDDING, IMAGE_PARAM_STRIDE};
 use crate::nerf::rays::{self, RayImage, RaySampling};
 use calibration::{
-    CameraCorrection, CameraRefinement, Candidate, EMBEDDING_DIM, MIN_VALIDATION_IMAGES, ParamSet, Trial, TrialReport,
-    drift_weight, interpolate,
+    CameraCorrection, CameraRefinement, Candidate, EMBEDDING_DIM, MIN_VALIDATION_IMAGES, ParamSet,
+    Trial, TrialReport, drift_weight, interpolate,
 };
 use keyframe::Keyframe;
 use kinematics::{Stamp, Transform};
@@ -23,8 +25,8 @@ use nalgebra::{Translation3, UnitQuaternion, Vector3};
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 
-/// Fractions (1 / divisor) of the planned steps: start of optimizing image parameters (earlier, the field is too
-/// coarse), start of trials, and length of each half of a trial.
+/// Fractions (1 / divisor) of the planned steps: start of optimizing image parameters (earlier, the
+/// field is too coarse), start of trials, and length of each half of a trial.
 const POSE_START_DIVISOR: u64 = 32;
 const TRIAL_START_DIVISOR: u64 = 8;
 const TRIAL_LENGTH_DIVISOR: u64 = 16;
@@ -56,7 +58,8 @@ pub(super) struct Trials {
 #[derive(Debug)]
 struct RunningTrial {
     before: FieldSnapshot,
-    /// At the end of the first half: the field, and the mean squared error of each validation image.
+    /// At the end of the first half: the field, and the mean squared error of each validation
+    /// image.
     variant: Option<(FieldSnapshot, Vec<f64>)>,
 }
 
@@ -67,15 +70,27 @@ pub(super) fn image_params_of_set(set: ParamSet) -> ParamSet {
 
 impl Trials {
     pub(super) fn of(choice: &CameraRefinement) -> Self {
-        let remaining = choice.candidates().iter().map(|set| image_params_of_set(*set)).filter(|set| !set.is_empty());
-        Self { remaining: remaining.collect(), ..Self::default() }
+        let remaining = choice
+            .candidates()
+            .iter()
+            .map(|set| image_params_of_set(*set))
+            .filter(|set| !set.is_empty());
+        Self {
+            remaining: remaining.collect(),
+            ..Self::default()
+        }
     }
 
     /// The trials that remain after some have finished.
     #[must_use]
     pub(super) fn after(mut self, finished: Vec<TrialReport>, are_finished: bool) -> Self {
-        self.remaining
-            .drain(..if are_finished { self.remaining.len() } else { finished.len().min(self.remaining.len()) });
+        self.remaining.drain(
+            ..if are_finished {
+                self.remaining.len()
+            } else {
+                finished.len().min(self.remaining.len())
+            },
+        );
         Self { finished, ..self }
     }
 
@@ -111,7 +126,8 @@ impl NerfModel {
 
     /// Steps until a trial starts or changes its phase.
     pub(super) fn steps_to_trial(&self) -> u64 {
-        self.next_trial_step().map_or(u64::MAX, |at| at.saturating_sub(self.step).max(1))
+        self.next_trial_step()
+            .map_or(u64::MAX, |at| at.saturating_sub(self.step).max(1))
     }
 
     /// When due, starts a trial, switches it to the baseline, or concludes it.
@@ -124,7 +140,9 @@ impl NerfModel {
     }
 
     fn advance_trial(&mut self) -> Result<(), Error> {
-        let Some(candidate) = self.trials.remaining.front().copied() else { return Ok(()) };
+        let Some(candidate) = self.trials.remaining.front().copied() else {
+            return Ok(());
+        };
         match self.trials.running.take() {
             None if self.validation_images.len() < MIN_VALIDATION_IMAGES => {
                 log::info!(
@@ -136,18 +154,30 @@ impl NerfModel {
             None => match self.rule_out(candidate)? {
                 Some(trial) => self.end_trial(&trial),
                 None => {
-                    self.trials.running = Some(RunningTrial { before: self.snapshot()?, variant: None });
+                    self.trials.running = Some(RunningTrial {
+                        before: self.snapshot()?,
+                        variant: None,
+                    });
                     self.learned_params |= candidate;
                 }
             },
-            Some(RunningTrial { before, variant: None }) => {
+            Some(RunningTrial {
+                before,
+                variant: None,
+            }) => {
                 let variant_errors = self.validation_errors()?;
                 let variant = self.snapshot()?;
                 self.n_discarded_steps += self.step - before.step;
                 self.restore(&before)?;
-                self.trials.running = Some(RunningTrial { before, variant: Some((variant, variant_errors)) });
+                self.trials.running = Some(RunningTrial {
+                    before,
+                    variant: Some((variant, variant_errors)),
+                });
             }
-            Some(RunningTrial { before, variant: Some((variant, variant_errors)) }) => {
+            Some(RunningTrial {
+                before,
+                variant: Some((variant, variant_errors)),
+            }) => {
                 let trial = measure_gain(candidate, &variant_errors, &self.validation_errors()?);
                 if trial.kept {
                     self.n_discarded_steps += self.step - before.step;
@@ -170,14 +200,19 @@ impl NerfModel {
 
     /// Restores the field before the running trial, which starts again at the next step.
     pub(super) fn undo_trial(&mut self) -> Result<(), Error> {
-        let Some(RunningTrial { before, .. }) = self.trials.running.take() else { return Ok(()) };
+        let Some(RunningTrial { before, .. }) = self.trials.running.take() else {
+            return Ok(());
+        };
         self.n_discarded_steps += self.step - before.step;
         self.restore(&before)
     }
 
-    /// Ends all trials. Needed when the field is recreated or loses an image, because snapshots then do not match it.
+    /// Ends all trials. Needed when the field is recreated or loses an image, because snapshots
+    /// then do not match it.
     pub(super) fn abort_trials(&mut self) -> Result<(), Error> {
-        let Some(before) = self.trials.before() else { return Ok(()) };
+        let Some(before) = self.trials.before() else {
+            return Ok(());
+        };
         self.learned_params = before.learned_params;
         if let Some((_, field_trainer)) = &mut self.field {
             field_trainer.reset_image_params_except(&self.gpu, self.learned_params)?;
@@ -194,14 +229,15 @@ impl NerfModel {
         self.is_extent_stale = true;
     }
 
-    /// Estimates the gain of a candidate without training it, and returns the result if the gain is not significant.
-    /// For appearance, checks whether scaling pictures by gains interpolated from training images brings them closer to
-    /// the validation images.
+    /// Estimates the gain of a candidate without training it, and returns the result if the gain is
+    /// not significant. For appearance, checks whether scaling pictures by gains interpolated from
+    /// training images brings them closer to the validation images.
     fn rule_out(&mut self, candidate: ParamSet) -> Result<Option<Trial>, Error> {
         if !candidate.contains(ParamSet::IMAGE_GAINS) {
             return Ok(None);
         }
-        let (training_images, validation_images) = (self.images.clone(), self.validation_images.clone());
+        let (training_images, validation_images) =
+            (self.images.clone(), self.validation_images.clone());
         let own = self.compare(&training_images, &[])?;
         let log_gains: Vec<f64> = own.iter().map(Comparison::log_gain).collect();
         // The mean over all images is the brightness of the field itself.
@@ -211,21 +247,29 @@ impl NerfModel {
             let camera_gains = known.entry(&image.keyframe.camera).or_default();
             camera_gains.insert(image.keyframe.stamp.0, [log_gain - mean]);
         }
-        let predicted =
-            |image: &RayImage| interpolate(known.get(image.keyframe.camera.as_ref())?, image.keyframe.stamp);
+        let predicted = |image: &RayImage| {
+            interpolate(
+                known.get(image.keyframe.camera.as_ref())?,
+                image.keyframe.stamp,
+            )
+        };
         let compared = self.compare(&validation_images, &[])?;
         let variant = validation_images.iter().zip(&compared).map(|(image, own)| {
             let [log_gain] = predicted(image).unwrap_or_default();
             own.error_with_gain(log_gain.exp())
         });
         let baseline = compared.iter().map(|own| own.error_with_gain(1.0));
-        let trial = measure_gain(candidate, &variant.collect::<Vec<_>>(), &baseline.collect::<Vec<_>>());
+        let trial = measure_gain(
+            candidate,
+            &variant.collect::<Vec<_>>(),
+            &baseline.collect::<Vec<_>>(),
+        );
         log::info!("estimated by scaling brightness: {trial}");
         Ok((!trial.kept).then_some(trial))
     }
 
-    /// Mean squared color error of each validation image, with its pose and embedding interpolated from training images
-    /// before and after it.
+    /// Mean squared color error of each validation image, with its pose and embedding interpolated
+    /// from training images before and after it.
     fn validation_errors(&mut self) -> Result<Vec<f64>, Error> {
         let corrections = self.learned_corrections()?;
         let correction_of = |image: &RayImage| corrections.get(image.keyframe.camera.as_ref());
@@ -233,33 +277,59 @@ impl NerfModel {
             Some(correction) => RayImage::new(correction.corrected(&image.keyframe).into()),
             None => image.clone(),
         };
-        let embedding =
-            |image: &RayImage| interpolate(&correction_of(image)?.appearance_embeddings, image.keyframe.stamp);
-        let images: Vec<RayImage> = self.validation_images.iter().map(with_predicted_pose).collect();
-        let appearance_embeddings: Vec<_> =
-            self.validation_images.iter().map(|image| embedding(image).unwrap_or_default()).collect();
+        let embedding = |image: &RayImage| {
+            interpolate(
+                &correction_of(image)?.appearance_embeddings,
+                image.keyframe.stamp,
+            )
+        };
+        let images: Vec<RayImage> = self
+            .validation_images
+            .iter()
+            .map(with_predicted_pose)
+            .collect();
+        let appearance_embeddings: Vec<_> = self
+            .validation_images
+            .iter()
+            .map(|image| embedding(image).unwrap_or_default())
+            .collect();
         let compared = self.compare(&images, &appearance_embeddings)?;
-        Ok(compared.iter().map(|own| own.error / f64::max(own.n_rays, 1.0)).collect())
+        Ok(compared
+            .iter()
+            .map(|own| own.error / f64::max(own.n_rays, 1.0))
+            .collect())
     }
 
-    /// Compares images with their renderings, using these appearance embeddings (neutral ones if empty).
+    /// Compares images with their renderings, using these appearance embeddings (neutral ones if
+    /// empty).
     fn compare(
         &mut self,
         images: &[RayImage],
         appearance_embeddings: &[[f64; EMBEDDING_DIM]],
     ) -> Result<Vec<Comparison>, Error> {
         let mut sums = vec![Comparison::default(); images.len()];
-        let Some((extent, field_trainer)) = &mut self.field else { return Ok(sums) };
+        let Some((extent, field_trainer)) = &mut self.field else {
+            return Ok(sums);
+        };
         for batch in 0..VALIDATION_BATCHES {
             let n_rays = field_trainer.sizes.nerf_budget.n_rays;
-            let draw = RaySampling { seed: VALIDATION_SEED, step: batch, n_rays, begin: super::NEAR_DISTANCE };
+            let draw = RaySampling {
+                seed: VALIDATION_SEED,
+                step: batch,
+                n_rays,
+                begin: super::NEAR_DISTANCE,
+            };
             let rays = rays::draw(images, extent, &draw);
-            for (ray, render_rays) in
-                rays.iter().zip(field_trainer.render_rays(&self.gpu, &self.options, &rays, appearance_embeddings)?)
-            {
+            for (ray, render_rays) in rays.iter().zip(field_trainer.render_rays(
+                &self.gpu,
+                &self.options,
+                &rays,
+                appearance_embeddings,
+            )?) {
                 let [rgb @ .., alpha] = ray.target_rgb.to_le_bytes();
                 if alpha > 0 && render_rays.error.is_finite() {
-                    sums[ray.embedding as usize].add(&render_rays, rgb.map(|value| f64::from(value) / 255.0));
+                    sums[ray.embedding as usize]
+                        .add(&render_rays, rgb.map(|value| f64::from(value) / 255.0));
                 }
             }
         }
@@ -268,22 +338,33 @@ impl NerfModel {
 
     /// Optimized correction of each camera; empty if none is optimized. No submit may be in flight.
     pub(super) fn learned_corrections(&self) -> Result<BTreeMap<String, CameraCorrection>, Error> {
-        let Some((extent, field_trainer)) = &self.field else { return Ok(BTreeMap::new()) };
+        let Some((extent, field_trainer)) = &self.field else {
+            return Ok(BTreeMap::new());
+        };
         let image_params = field_trainer.image_param_values(&self.gpu, self.images.len())?;
         let mut corrections: BTreeMap<String, CameraCorrection> = BTreeMap::new();
         // Later images are not part of the field yet, so they have no parameters.
         for (image, image_params) in self.images.iter().zip(&image_params).take(self.n_hinted) {
-            let correction = corrections.entry(image.keyframe.camera.to_string()).or_default();
+            let correction = corrections
+                .entry(image.keyframe.camera.to_string())
+                .or_default();
             if self.learned_params.contains(ParamSet::IMAGE_POSES) {
-                correction.drift.insert(image.keyframe.stamp.0, drift_of(&image.keyframe, image_params, extent));
+                correction.drift.insert(
+                    image.keyframe.stamp.0,
+                    drift_of(&image.keyframe, image_params, extent),
+                );
             }
             if self.learned_params.contains(ParamSet::IMAGE_GAINS) {
-                correction
-                    .appearance_embeddings
-                    .insert(image.keyframe.stamp.0, std::array::from_fn(|ix| image_params[EMBEDDING + ix]));
+                correction.appearance_embeddings.insert(
+                    image.keyframe.stamp.0,
+                    std::array::from_fn(|ix| image_params[EMBEDDING + ix]),
+                );
             }
         }
-        for correction in corrections.values_mut().filter(|_| self.learned_params.contains(ParamSet::IMAGE_POSES)) {
+        for correction in corrections
+            .values_mut()
+            .filter(|_| self.learned_params.contains(ParamSet::IMAGE_POSES))
+        {
             correction.drift_weight = drift_weight(&correction.drift, extent.radius_m);
         }
         Ok(corrections)
@@ -291,18 +372,29 @@ impl NerfModel {
 
     /// Initializes the embeddings of new images from those of images before and after them.
     pub(super) fn initialize_embeddings(&mut self) -> Result<(), Error> {
-        if !self.learned_params.contains(ParamSet::IMAGE_GAINS) || self.n_hinted == self.images.len() {
+        if !self.learned_params.contains(ParamSet::IMAGE_GAINS)
+            || self.n_hinted == self.images.len()
+        {
             return Ok(());
         }
         self.finish_in_flight()?;
         let corrections = self.learned_corrections()?;
         let learned_params = self.current_params();
-        let Some((_, field_trainer)) = &mut self.field else { return Ok(()) };
-        let predicted = |image: &RayImage| {
-            interpolate(&corrections.get(image.keyframe.camera.as_ref())?.appearance_embeddings, image.keyframe.stamp)
+        let Some((_, field_trainer)) = &mut self.field else {
+            return Ok(());
         };
-        let appearance_embeddings: Vec<_> =
-            self.images[self.n_hinted..].iter().map(|image| predicted(image).unwrap_or_default()).collect();
+        let predicted = |image: &RayImage| {
+            interpolate(
+                &corrections
+                    .get(image.keyframe.camera.as_ref())?
+                    .appearance_embeddings,
+                image.keyframe.stamp,
+            )
+        };
+        let appearance_embeddings: Vec<_> = self.images[self.n_hinted..]
+            .iter()
+            .map(|image| predicted(image).unwrap_or_default())
+            .collect();
         if field_trainer.images.is_some() {
             field_trainer.allocate_images(&self.gpu, self.images.len(), learned_params)?;
             field_trainer.initialize_images(&self.gpu, self.n_hinted, &appearance_embeddings);
@@ -310,30 +402,55 @@ impl NerfModel {
         Ok(())
     }
 
-    /// Appearance embedding for a camera and stamp, interpolated between the images before and after it. Falls back to
-    /// the mean of all embeddings.
-    pub(super) fn embedding_of(&mut self, image: Option<&(Arc<str>, Stamp)>) -> Result<[f64; EMBEDDING_DIM], Error> {
+    /// Appearance embedding for a camera and stamp, interpolated between the images before and
+    /// after it. Falls back to the mean of all embeddings.
+    pub(super) fn embedding_of(
+        &mut self,
+        image: Option<&(Arc<str>, Stamp)>,
+    ) -> Result<[f64; EMBEDDING_DIM], Error> {
         let corrections = self.current_corrections()?;
-        let embedding_of_image = image
-            .and_then(|(camera, stamp)| interpolate(&corrections.get(camera.as_ref())?.appearance_embeddings, *stamp));
-        let all = || corrections.values().flat_map(|correction| correction.appearance_embeddings.values());
+        let embedding_of_image = image.and_then(|(camera, stamp)| {
+            interpolate(
+                &corrections.get(camera.as_ref())?.appearance_embeddings,
+                *stamp,
+            )
+        });
+        let all = || {
+            corrections
+                .values()
+                .flat_map(|correction| correction.appearance_embeddings.values())
+        };
         let n = all().count().max(1) as f64;
-        Ok(embedding_of_image
-            .unwrap_or_else(|| std::array::from_fn(|ix| all().map(|embedding| embedding[ix]).sum::<f64>() / n)))
+        Ok(embedding_of_image.unwrap_or_else(|| {
+            std::array::from_fn(|ix| all().map(|embedding| embedding[ix]).sum::<f64>() / n)
+        }))
     }
 }
 
-/// Converts a field's pose correction (rotation about the camera, translation in world) to rotation and translation
-/// after `camera_from_world`, in the camera's axes.
-fn drift_of(keyframe: &Keyframe, [a, b, c, x, y, z, ..]: &[f64; IMAGE_PARAM_STRIDE], extent: &Extent) -> [f64; 6] {
+/// Converts a field's pose correction (rotation about the camera, translation in world) to rotation
+/// and translation after `camera_from_world`, in the camera's axes.
+fn drift_of(
+    keyframe: &Keyframe,
+    [a, b, c, x, y, z, ..]: &[f64; IMAGE_PARAM_STRIDE],
+    extent: &Extent,
+) -> [f64; 6] {
     let given = &keyframe.world_from_camera;
     let rotation = UnitQuaternion::from_scaled_axis(Vector3::new(*a, *b, *c));
     let translation_m = Vector3::new(*x, *y, *z) * extent.radius_m;
-    let found =
-        Transform::from_parts(Translation3::from(given.translation.vector + translation_m), rotation * given.rotation);
+    let found = Transform::from_parts(
+        Translation3::from(given.translation.vector + translation_m),
+        rotation * given.rotation,
+    );
     let drift = found.inverse() * given;
     let (rotation_rad, translation_m) = (drift.rotation.scaled_axis(), drift.translation.vector);
-    [rotation_rad.x, rotation_rad.y, rotation_rad.z, translation_m.x, translation_m.y, translation_m.z]
+    [
+        rotation_rad.x,
+        rotation_rad.y,
+        rotation_rad.z,
+        translation_m.x,
+        translation_m.y,
+        translation_m.z,
+    ]
 }
 
 /// Sums over the rays of an image; products are summed over rays and color channels.
@@ -360,12 +477,17 @@ impl Comparison {
     /// Logarithm of the gain that minimizes the squared error of the picture.
     fn log_gain(&self) -> f64 {
         let gain = self.sum_rendered_target / self.sum_rendered_sq;
-        if gain > 0.0 && gain.is_finite() { gain.ln() } else { 0.0 }
+        if gain > 0.0 && gain.is_finite() {
+            gain.ln()
+        } else {
+            0.0
+        }
     }
 
     /// Sum of squared errors of the picture scaled by `gain`.
     fn error_with_gain(&self, gain: f64) -> f64 {
-        gain * gain * self.sum_rendered_sq - 2.0 * gain * self.sum_rendered_target + self.sum_target_sq
+        gain * gain * self.sum_rendered_sq - 2.0 * gain * self.sum_rendered_target
+            + self.sum_target_sq
     }
 }
 
@@ -388,28 +510,58 @@ mod tests {
     #[test]
     fn drift_matches_pose_correction_in_field() {
         let keyframe = scenes::ring(&[scenes::floor()], nalgebra::Point3::origin(), 3)[1].clone();
-        let extent = Extent { center_m: [0.1, 0.2, 0.3], radius_m: 2.5 };
+        let extent = Extent {
+            center_m: [0.1, 0.2, 0.3],
+            radius_m: 2.5,
+        };
         let pose = [0.02, -0.03, 0.01, 0.004, -0.002, 0.006, 0.5, 0.0, 0.0];
         let drift = BTreeMap::from([(keyframe.stamp.0, drift_of(&keyframe, &pose, &extent))]);
-        let lens = CameraCorrection { drift, ..CameraCorrection::default() }.apply(&keyframe);
+        let lens = CameraCorrection {
+            drift,
+            ..CameraCorrection::default()
+        }
+        .apply(&keyframe);
         let given = &keyframe.world_from_camera;
         let rotation = UnitQuaternion::from_scaled_axis(Vector3::new(0.02, -0.03, 0.01));
         let at: Vector3<f64> = given.translation.vector + 2.5 * Vector3::new(0.004, -0.002, 0.006);
         assert!((lens.world_from_camera.translation.vector - at).norm() < 1e-12);
-        assert!(lens.world_from_camera.rotation.angle_to(&(rotation * given.rotation)) < 1e-12);
+        assert!(
+            lens.world_from_camera
+                .rotation
+                .angle_to(&(rotation * given.rotation))
+                < 1e-12
+        );
     }
 
     #[test]
     fn only_significant_gains_are_kept() {
         let baseline = [1e-3; 6];
-        assert!(measure_gain(ParamSet::IMAGE_POSES, &baseline.map(|error| 0.8 * error), &baseline).kept);
+        assert!(
+            measure_gain(
+                ParamSet::IMAGE_POSES,
+                &baseline.map(|error| 0.8 * error),
+                &baseline
+            )
+            .kept
+        );
         assert!(!measure_gain(ParamSet::IMAGE_POSES, &baseline, &baseline).kept);
         assert!(
-            !measure_gain(ParamSet::IMAGE_POSES, &baseline.map(|error| 0.999 * error), &baseline).kept,
+            !measure_gain(
+                ParamSet::IMAGE_POSES,
+                &baseline.map(|error| 0.999 * error),
+                &baseline
+            )
+            .kept,
             "below the minimum gain"
         );
         let mixed = [0.5e-3, 2e-3, 0.5e-3, 2e-3, 0.5e-3, 1.2e-3];
-        assert!(!measure_gain(ParamSet::IMAGE_POSES, &mixed, &baseline).kept, "not significant");
-        assert!(!measure_gain(ParamSet::IMAGE_POSES, &[0.5e-3; 3], &[1e-3; 3]).kept, "too few images");
+        assert!(
+            !measure_gain(ParamSet::IMAGE_POSES, &mixed, &baseline).kept,
+            "not significant"
+        );
+        assert!(
+            !measure_gain(ParamSet::IMAGE_POSES, &[0.5e-3; 3], &[1e-3; 3]).kept,
+            "too few images"
+        );
     }
 }

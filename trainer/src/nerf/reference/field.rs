@@ -4,7 +4,8 @@ use super::grid::{self, GridShape, N_FEATURES};
 use super::network::Network;
 use super::space::{contract, contract_backward};
 
-/// Geometry features: outputs of the first network, after the density, that are inputs of the second.
+/// Geometry features: outputs of the first network, after the density, that are inputs of the
+/// second.
 pub const N_GEOMETRY_FEATURES: usize = 15;
 /// Basis functions of the direction: spherical harmonics up to degree 3.
 pub const N_DIRECTION: usize = 16;
@@ -23,7 +24,8 @@ pub struct Field {
     pub table: Vec<[f64; N_FEATURES]>,
     /// Maps grid features to log density and geometry features.
     pub density: Network,
-    /// Maps direction, geometry features and the image's appearance embedding to color before the sigmoid.
+    /// Maps direction, geometry features and the image's appearance embedding to color before the
+    /// sigmoid.
     pub color: Network,
 }
 
@@ -62,30 +64,44 @@ pub struct Point {
 }
 
 impl Field {
-    /// Layer sizes of the two networks for a hidden width: one hidden layer in the first, two in the second.
+    /// Layer sizes of the two networks for a hidden width: one hidden layer in the first, two in
+    /// the second.
     pub fn sizes(shape: &GridShape, width: usize, embedding_dim: usize) -> [Vec<usize>; 2] {
         [
             vec![shape.n_outputs(), width, 1 + N_GEOMETRY_FEATURES],
-            vec![N_DIRECTION + N_GEOMETRY_FEATURES + embedding_dim, width, width, 3],
+            vec![
+                N_DIRECTION + N_GEOMETRY_FEATURES + embedding_dim,
+                width,
+                width,
+                3,
+            ],
         ]
     }
 
-    /// Density and color of a point, in units of the scene radius around its center, viewed along a direction of length
-    /// 1, with an appearance embedding.
+    /// Density and color of a point, in units of the scene radius around its center, viewed along a
+    /// direction of length 1, with an appearance embedding.
     pub fn point(&self, at: [f64; 3], direction: [f64; 3], embedding: &[f64]) -> Point {
         let contracted = contract(at);
-        let density_layers = self.density.forward(&grid::interpolate(&self.shape, &self.table, contracted));
+        let density_layers =
+            self.density
+                .forward(&grid::interpolate(&self.shape, &self.table, contracted));
         let out = density_layers.last().expect("an output layer");
         let density = (out[0] + LOG_DENSITY_BIAS).min(MAX_LOG_DENSITY).exp();
         let input = [&harmonics(direction)[..], &out[1..], embedding].concat();
         let color_layers = self.color.forward(&input);
         let out = color_layers.last().expect("an output layer");
         let rgb = std::array::from_fn(|channel| 1.0 / (1.0 + (-out[channel]).exp()));
-        Point { density, rgb, contracted, density_layers, color_layers }
+        Point {
+            density,
+            rgb,
+            contracted,
+            density_layers,
+            color_layers,
+        }
     }
 
-    /// Backpropagates gradients of density and color. Adds the parameter gradients to `gradient`; returns the gradients
-    /// of the point and of the appearance embedding.
+    /// Backpropagates gradients of density and color. Adds the parameter gradients to `gradient`;
+    /// returns the gradients of the point and of the appearance embedding.
     pub fn point_backward(
         &self,
         at: [f64; 3],
@@ -94,15 +110,34 @@ impl Field {
         v_rgb: [f64; 3],
         gradient: &mut FieldGrad,
     ) -> ([f64; 3], Vec<f64>) {
-        let v_out: Vec<f64> = point.rgb.iter().zip(v_rgb).map(|(value, v)| v * value * (1.0 - value)).collect();
-        let v_input = self.color.backward(&point.color_layers, &v_out, &mut gradient.color);
-        let (v_geometry_features, v_embedding) = v_input[N_DIRECTION..].split_at(N_GEOMETRY_FEATURES);
+        let v_out: Vec<f64> = point
+            .rgb
+            .iter()
+            .zip(v_rgb)
+            .map(|(value, v)| v * value * (1.0 - value))
+            .collect();
+        let v_input = self
+            .color
+            .backward(&point.color_layers, &v_out, &mut gradient.color);
+        let (v_geometry_features, v_embedding) =
+            v_input[N_DIRECTION..].split_at(N_GEOMETRY_FEATURES);
         let log_density = point.density_layers.last().expect("an output layer")[0];
-        let v_log = if log_density + LOG_DENSITY_BIAS < MAX_LOG_DENSITY { v_density * point.density } else { 0.0 };
+        let v_log = if log_density + LOG_DENSITY_BIAS < MAX_LOG_DENSITY {
+            v_density * point.density
+        } else {
+            0.0
+        };
         let v_out = [&[v_log][..], v_geometry_features].concat();
-        let v_found = self.density.backward(&point.density_layers, &v_out, &mut gradient.density);
-        let v_contracted =
-            grid::interpolate_backward(&self.shape, &self.table, point.contracted, &v_found, &mut gradient.table);
+        let v_found = self
+            .density
+            .backward(&point.density_layers, &v_out, &mut gradient.density);
+        let v_contracted = grid::interpolate_backward(
+            &self.shape,
+            &self.table,
+            point.contracted,
+            &v_found,
+            &mut gradient.table,
+        );
         (contract_backward(at, v_contracted), v_embedding.to_vec())
     }
 }

@@ -8,18 +8,27 @@ pub const N_FEATURES: usize = 2;
 pub struct GridShape {
     /// Cells along an axis, from the coarsest level to the finest.
     pub n_cells: Vec<u32>,
-    /// Maximum number of entries of a level, as log2. A level with fewer corners has one entry per corner; in larger
-    /// levels, corners share entries by a hash.
+    /// Maximum number of entries of a level, as log2. A level with fewer corners has one entry per
+    /// corner; in larger levels, corners share entries by a hash.
     pub log2_entries: u32,
 }
 
 impl GridShape {
     /// Levels with numbers of cells between two values, evenly spaced on a logarithmic scale.
     pub fn between(coarsest: u32, finest: u32, n_levels: u32, log2_entries: u32) -> Self {
-        let growth = (f64::from(finest) / f64::from(coarsest)).ln() / f64::from(n_levels.max(2) - 1);
-        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "rounded between two u32")]
-        let n_cells = |level: u32| (f64::from(coarsest) * (growth * f64::from(level)).exp()).round() as u32;
-        Self { n_cells: (0..n_levels).map(n_cells).collect(), log2_entries }
+        let growth =
+            (f64::from(finest) / f64::from(coarsest)).ln() / f64::from(n_levels.max(2) - 1);
+        #[expect(
+            clippy::cast_possible_truncation,
+            clippy::cast_sign_loss,
+            reason = "rounded between two u32"
+        )]
+        let n_cells =
+            |level: u32| (f64::from(coarsest) * (growth * f64::from(level)).exp()).round() as u32;
+        Self {
+            n_cells: (0..n_levels).map(n_cells).collect(),
+            log2_entries,
+        }
     }
 
     /// Number of entries of a level.
@@ -44,7 +53,8 @@ impl GridShape {
         self.n_cells.len() * N_FEATURES
     }
 
-    /// Index of a corner's entry among all entries. Source of the hash: Mueller et al. 2022, equation 4.
+    /// Index of a corner's entry among all entries. Source of the hash: Mueller et al. 2022,
+    /// equation 4.
     pub fn entry(&self, level: usize, corner: [u32; 3]) -> u32 {
         let side = self.n_cells[level] + 1;
         let [x, y, z] = corner;
@@ -52,7 +62,8 @@ impl GridShape {
         let offset = if is_dense {
             x + side * (y + side * z)
         } else {
-            (x ^ y.wrapping_mul(2_654_435_761) ^ z.wrapping_mul(805_459_861)) & ((1 << self.log2_entries) - 1)
+            (x ^ y.wrapping_mul(2_654_435_761) ^ z.wrapping_mul(805_459_861))
+                & ((1 << self.log2_entries) - 1)
         };
         self.begin(level) + offset
     }
@@ -67,39 +78,65 @@ struct Corner {
     weight_gradient: [f64; 3],
 }
 
-/// Corners of the cell of a level around a point of the unit cube. Points outside are clamped to the cube.
+/// Corners of the cell of a level around a point of the unit cube. Points outside are clamped to
+/// the cube.
 fn corners(shape: &GridShape, level: usize, at: [f64; 3]) -> [Corner; 8] {
     let n_cells = f64::from(shape.n_cells[level]);
     let scaled = at.map(|x| x.clamp(0.0, 1.0) * n_cells);
-    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "between 0 and the number of cells")]
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "between 0 and the number of cells"
+    )]
     let first = scaled.map(|x| x.floor().min(n_cells - 1.0) as u32);
     let share: [f64; 3] = std::array::from_fn(|axis| scaled[axis] - f64::from(first[axis]));
     std::array::from_fn(|ix| {
-        let step: [u32; 3] = std::array::from_fn(|axis| u32::try_from(ix >> axis & 1).expect("0 or 1"));
-        let part = |axis: usize| if step[axis] == 1 { share[axis] } else { 1.0 - share[axis] };
+        let step: [u32; 3] =
+            std::array::from_fn(|axis| u32::try_from(ix >> axis & 1).expect("0 or 1"));
+        let part = |axis: usize| {
+            if step[axis] == 1 {
+                share[axis]
+            } else {
+                1.0 - share[axis]
+            }
+        };
         let weight_gradient = std::array::from_fn(|axis| {
             let sign = if step[axis] == 1 { n_cells } else { -n_cells };
             let inside = at[axis] >= 0.0 && at[axis] <= 1.0;
-            if inside { sign * part((axis + 1) % 3) * part((axis + 2) % 3) } else { 0.0 }
+            if inside {
+                sign * part((axis + 1) % 3) * part((axis + 2) % 3)
+            } else {
+                0.0
+            }
         });
         let corner = std::array::from_fn(|axis| first[axis] + step[axis]);
-        Corner { entry: shape.entry(level, corner) as usize, weight: part(0) * part(1) * part(2), weight_gradient }
+        Corner {
+            entry: shape.entry(level, corner) as usize,
+            weight: part(0) * part(1) * part(2),
+            weight_gradient,
+        }
     })
 }
 
-/// Interpolates the features at a point of the unit cube: two per level, from the eight corners of its cell.
+/// Interpolates the features at a point of the unit cube: two per level, from the eight corners of
+/// its cell.
 pub fn interpolate(shape: &GridShape, table: &[[f64; N_FEATURES]], at: [f64; 3]) -> Vec<f64> {
     let mut features = Vec::with_capacity(shape.n_outputs());
     for level in 0..shape.n_cells.len() {
         let corners = corners(shape, level, at);
-        let sum =
-            |feature: usize| -> f64 { corners.iter().map(|corner| corner.weight * table[corner.entry][feature]).sum() };
+        let sum = |feature: usize| -> f64 {
+            corners
+                .iter()
+                .map(|corner| corner.weight * table[corner.entry][feature])
+                .sum()
+        };
         features.extend((0..N_FEATURES).map(sum));
     }
     features
 }
 
-/// Backpropagates gradients of the features. Adds the entry gradients to `v_table`; returns the gradient of the point.
+/// Backpropagates gradients of the features. Adds the entry gradients to `v_table`; returns the
+/// gradient of the point.
 pub fn interpolate_backward(
     shape: &GridShape,
     table: &[[f64; N_FEATURES]],

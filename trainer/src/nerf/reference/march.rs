@@ -1,6 +1,7 @@
 //! Walks a ray through the occupied parts of the scene.
 //!
-//! Source: occupancy of Mueller et al. 2022, appendix C; steps outside the inner cube grow to match the contraction.
+//! Source: occupancy of Mueller et al. 2022, appendix C; steps outside the inner cube grow to match
+//! the contraction.
 
 use super::space::contract;
 
@@ -56,18 +57,28 @@ impl March {
     /// Index of the cell around a point, and the distance to the cell's nearest side, in cells.
     pub fn cell(&self, at: [f64; 3]) -> (usize, f64) {
         let scaled = contract(at).map(|x| x * self.n_cells as f64);
-        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "within the cube")]
+        #[expect(
+            clippy::cast_possible_truncation,
+            clippy::cast_sign_loss,
+            reason = "within the cube"
+        )]
         let cell = scaled.map(|x| (x as usize).min(self.n_cells - 1));
-        let margin = scaled.iter().map(|x| (x - x.round()).abs()).fold(1.0, f64::min);
-        (cell[0] + self.n_cells * (cell[1] + self.n_cells * cell[2]), margin)
+        let margin = scaled
+            .iter()
+            .map(|x| (x - x.round()).abs())
+            .fold(1.0, f64::min);
+        (
+            cell[0] + self.n_cells * (cell[1] + self.n_cells * cell[2]),
+            margin,
+        )
     }
 
-    /// All segments of a ray that are within a range of distances and in occupied cells. The first step starts `jitter`
-    /// steps after `range[0]`. Also returns a margin: the smallest distance of a segment's middle to a cell's side, in
-    /// cells, or of the number of steps to an integer.
+    /// All segments of a ray that are within a range of distances and in occupied cells. The first
+    /// step starts `jitter` steps after `range[0]`. Also returns a margin: the smallest distance of
+    /// a segment's middle to a cell's side, in cells, or of the number of steps to an integer.
     ///
-    /// Steps have constant length inside the inner cube. Outside, the step at a distance u from the cube is longer by
-    /// (1 + u)^2, so that each step changes 1 / (1 + u) by the same amount.
+    /// Steps have constant length inside the inner cube. Outside, the step at a distance u from the
+    /// cube is longer by (1 + u)^2, so that each step changes 1 / (1 + u) by the same amount.
     pub fn segments(
         &self,
         (origin, direction): ([f64; 3], [f64; 3]),
@@ -77,7 +88,9 @@ impl March {
     ) -> (Vec<RaySegment>, f64) {
         let path = self.path((origin, direction), range);
         let middle = |segment: &RaySegment| {
-            std::array::from_fn(|axis| origin[axis] + (segment.begin + 0.5 * segment.length) * direction[axis])
+            std::array::from_fn(|axis| {
+                origin[axis] + (segment.begin + 0.5 * segment.length) * direction[axis]
+            })
         };
         let n_segments = (path.n_steps - jitter).ceil().max(0.0);
         let to_nearest_count = path.n_steps - jitter - (path.n_steps - jitter).round();
@@ -85,7 +98,10 @@ impl March {
         let mut ix = 0.0;
         while ix < n_segments {
             let [begin, end] = [ix, ix + 1.0].map(|ix| path.distance_at(self.step, ix + jitter));
-            let segment = RaySegment { begin, length: end - begin };
+            let segment = RaySegment {
+                begin,
+                length: end - begin,
+            };
             let (cell, margin) = self.cell(middle(&segment));
             min_margin = min_margin.min(margin);
             if is_occupied(cell) {
@@ -99,38 +115,67 @@ impl March {
     fn path(&self, (origin, direction): ([f64; 3], [f64; 3]), [begin, end]: [f64; 2]) -> Path {
         let [mut enter, mut leave] = [begin, f64::INFINITY];
         for axis in 0..3 {
-            let along = if direction[axis].abs() < MIN_DIRECTION { MIN_DIRECTION } else { direction[axis] };
+            let along = if direction[axis].abs() < MIN_DIRECTION {
+                MIN_DIRECTION
+            } else {
+                direction[axis]
+            };
             let [low, high] = [-1.0, 1.0].map(|side| (side - origin[axis]) / along);
             enter = enter.max(low.min(high));
             leave = leave.min(low.max(high));
         }
         let contracted_share = |distance: f64| 1.0 - 1.0 / (1.0 + distance);
-        let mut path = Path { enter: begin, leave: begin, n_before: 0.0, n_inside: 0.0, n_steps: 0.0 };
+        let mut path = Path {
+            enter: begin,
+            leave: begin,
+            n_before: 0.0,
+            n_inside: 0.0,
+            n_steps: 0.0,
+        };
         if leave > enter {
             let n_before = contracted_share(enter - begin) / self.step;
-            path = Path { enter, leave, n_before, n_inside: (leave - enter) / self.step, n_steps: 0.0 };
+            path = Path {
+                enter,
+                leave,
+                n_before,
+                n_inside: (leave - enter) / self.step,
+                n_steps: 0.0,
+            };
         }
         path.n_steps = if end < path.enter {
             path.n_before - contracted_share(path.enter - end) / self.step
         } else if end < path.leave {
             path.n_before + (end - path.enter) / self.step
         } else {
-            let n_after = (contracted_share(end - path.leave) / self.step).min(1.0 / self.step - 1.0);
+            let n_after =
+                (contracted_share(end - path.leave) / self.step).min(1.0 / self.step - 1.0);
             path.n_before + path.n_inside + n_after
         };
         path
     }
 
-    /// The spans of the samples selected from the segments: at most `max_samples`. Each represents the same number of
-    /// segments.
+    /// The spans of the samples selected from the segments: at most `max_samples`. Each represents
+    /// the same number of segments.
     pub fn spans(&self, segments: &[RaySegment], jitter: f64) -> Vec<[f64; 2]> {
         let stride = segments.len().div_ceil(self.max_samples).max(1);
-        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a fraction of the stride")]
+        #[expect(
+            clippy::cast_possible_truncation,
+            clippy::cast_sign_loss,
+            reason = "a fraction of the stride"
+        )]
         let phase = ((jitter * stride as f64) as usize).min(stride - 1);
         let span = |segment: &RaySegment| {
-            let (middle, reach) = (segment.begin + 0.5 * segment.length, 0.5 * segment.length * stride as f64);
+            let (middle, reach) = (
+                segment.begin + 0.5 * segment.length,
+                0.5 * segment.length * stride as f64,
+            );
             [middle - reach, middle + reach]
         };
-        segments.iter().skip(phase).step_by(stride).map(span).collect()
+        segments
+            .iter()
+            .skip(phase)
+            .step_by(stride)
+            .map(span)
+            .collect()
     }
 }

@@ -1,4 +1,5 @@
-//! A small fully connected network without biases. Hidden layers have a `ReLU`; the last layer has none.
+//! A small fully connected network without biases. Hidden layers have a `ReLU`; the last layer has
+//! none.
 
 /// Weights of a network.
 #[derive(Clone, Debug, PartialEq)]
@@ -15,7 +16,8 @@ impl Network {
         sizes.windows(2).map(|pair| pair[0] * pair[1]).sum()
     }
 
-    /// Activations of every layer for an input: the input first, then hidden layers after the `ReLU`, then the output.
+    /// Activations of every layer for an input: the input first, then hidden layers after the
+    /// `ReLU`, then the output.
     pub fn forward(&self, input: &[f64]) -> Vec<Vec<f64>> {
         let mut layers = vec![input.to_vec()];
         let mut begin = 0;
@@ -23,18 +25,30 @@ impl Network {
             let (n_in, n_out) = (pair[0], pair[1]);
             let before = &layers[ix];
             let weights = self.weights[begin..begin + n_in * n_out].chunks_exact(n_in);
-            let sums = weights.map(|row| row.iter().zip(before).map(|(weight, x)| weight * x).sum::<f64>());
+            let sums = weights.map(|row| {
+                row.iter()
+                    .zip(before)
+                    .map(|(weight, x)| weight * x)
+                    .sum::<f64>()
+            });
             let is_last = ix + 2 == self.sizes.len();
-            let layer = sums.map(|sum| if is_last { sum } else { sum.max(0.0) }).collect();
+            let layer = sums
+                .map(|sum| if is_last { sum } else { sum.max(0.0) })
+                .collect();
             layers.push(layer);
             begin += n_in * n_out;
         }
         layers
     }
 
-    /// Backpropagates gradients of the output. Adds the weight gradients to `v_weights`; returns the gradient of the
-    /// input.
-    pub fn backward(&self, layers: &[Vec<f64>], upstream: &[f64], v_weights: &mut [f64]) -> Vec<f64> {
+    /// Backpropagates gradients of the output. Adds the weight gradients to `v_weights`; returns
+    /// the gradient of the input.
+    pub fn backward(
+        &self,
+        layers: &[Vec<f64>],
+        upstream: &[f64],
+        v_weights: &mut [f64],
+    ) -> Vec<f64> {
         let mut v_out = upstream.to_vec();
         let mut end = self.weights.len();
         for (ix, pair) in self.sizes.windows(2).enumerate().rev() {

@@ -15,11 +15,14 @@ impl ImagePose {
     /// Corrected origin and direction of a ray.
     pub fn apply_pose(&self, origin: [f64; 3], direction: [f64; 3]) -> ([f64; 3], [f64; 3]) {
         let rotation = UnitQuaternion::from_scaled_axis(Vector3::from(self.rotation_rad));
-        ((Vector3::from(origin) + Vector3::from(self.translation)).into(), (rotation * Vector3::from(direction)).into())
+        (
+            (Vector3::from(origin) + Vector3::from(self.translation)).into(),
+            (rotation * Vector3::from(direction)).into(),
+        )
     }
 
-    /// Gradients with respect to a small additional rotation and translation of a ray, computed from the gradients of
-    /// its sample positions.
+    /// Gradients with respect to a small additional rotation and translation of a ray, computed
+    /// from the gradients of its sample positions.
     ///
     /// * `direction`: corrected direction of the ray, of length 1.
     /// * `sample_positions`: distance along the ray and gradient of each sample.
@@ -29,6 +32,9 @@ impl ImagePose {
             v_origin += Vector3::from(*gradient);
             v_direction += *distance * Vector3::from(*gradient);
         }
-        Self { rotation_rad: Vector3::from(direction).cross(&v_direction).into(), translation: v_origin.into() }
+        Self {
+            rotation_rad: Vector3::from(direction).cross(&v_direction).into(),
+            translation: v_origin.into(),
+        }
     }
 }

@@ -1,4 +1,5 @@
-//! Compositing of samples along a ray, and the loss of the result. Lengths are in units of the scene radius.
+//! Compositing of samples along a ray, and the loss of the result. Lengths are in units of the
+//! scene radius.
 
 /// One sample of a ray.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -36,7 +37,12 @@ pub struct RenderedRay {
 
 /// Composites the samples of a ray from front to back (Max 1995).
 pub fn composite(samples: &[Sample]) -> RenderedRay {
-    let mut rendered = RenderedRay { rgb: [0.0; 3], transmittance: 1.0, distance: 0.0, weights: Vec::new() };
+    let mut rendered = RenderedRay {
+        rgb: [0.0; 3],
+        transmittance: 1.0,
+        distance: 0.0,
+        weights: Vec::new(),
+    };
     for sample in samples {
         let transmitted = (-sample.density * sample.length()).exp();
         let weight = rendered.transmittance * (1.0 - transmitted);
@@ -64,9 +70,15 @@ pub struct Upstream {
 }
 
 /// Gradients with respect to density and color of each sample.
-pub fn composite_backward(samples: &[Sample], rendered: &RenderedRay, upstream: &Upstream) -> Vec<(f64, [f64; 3])> {
+pub fn composite_backward(
+    samples: &[Sample],
+    rendered: &RenderedRay,
+    upstream: &Upstream,
+) -> Vec<(f64, [f64; 3])> {
     let v_weight = |ix: usize| {
-        let color: f64 = (0..3).map(|channel| upstream.rgb[channel] * samples[ix].rgb[channel]).sum();
+        let color: f64 = (0..3)
+            .map(|channel| upstream.rgb[channel] * samples[ix].rgb[channel])
+            .sum();
         color + upstream.distance * samples[ix].middle() + upstream.weights[ix]
     };
     // A sample occludes all samples behind it.
@@ -74,7 +86,10 @@ pub fn composite_backward(samples: &[Sample], rendered: &RenderedRay, upstream: 
     let mut gradients = Vec::with_capacity(samples.len());
     for ix in (0..samples.len()).rev() {
         let transmittance_after: f64 = {
-            let optical_depth: f64 = samples[..=ix].iter().map(|sample| sample.density * sample.length()).sum();
+            let optical_depth: f64 = samples[..=ix]
+                .iter()
+                .map(|sample| sample.density * sample.length())
+                .sum();
             (-optical_depth).exp()
         };
         let v_density = samples[ix].length() * (transmittance_after * v_weight(ix) - behind);
@@ -85,16 +100,18 @@ pub fn composite_backward(samples: &[Sample], rendered: &RenderedRay, upstream: 
     gradients
 }
 
-/// Distortion loss: spread of the weights along a ray. Also returns its gradient with respect to each weight. Zero if
-/// all weight is at one position.
+/// Distortion loss: spread of the weights along a ray. Also returns its gradient with respect to
+/// each weight. Zero if all weight is at one position.
 ///
-/// Distances are normalized to `1 - near / t`, so that spread far away costs less. Source: Barron et al. 2022, equation
-/// 15, summed in one pass as in Sun et al. 2022.
+/// Distances are normalized to `1 - near / t`, so that spread far away costs less. Source: Barron
+/// et al. 2022, equation 15, summed in one pass as in Sun et al. 2022.
 pub fn distortion(samples: &[Sample], weights: &[f64], near: f64) -> (f64, Vec<f64>) {
     let normalized_distance = |t: f64| 1.0 - near / t.max(near);
     let middles: Vec<f64> = samples
         .iter()
-        .map(|sample| 0.5 * (normalized_distance(sample.span[0]) + normalized_distance(sample.span[1])))
+        .map(|sample| {
+            0.5 * (normalized_distance(sample.span[0]) + normalized_distance(sample.span[1]))
+        })
         .collect();
     let lengths: Vec<f64> = samples
         .iter()
@@ -103,11 +120,16 @@ pub fn distortion(samples: &[Sample], weights: &[f64], near: f64) -> (f64, Vec<f
     let total: (f64, f64) = weights
         .iter()
         .zip(&middles)
-        .fold((0.0, 0.0), |sums, (weight, middle)| (sums.0 + weight, sums.1 + weight * middle));
+        .fold((0.0, 0.0), |sums, (weight, middle)| {
+            (sums.0 + weight, sums.1 + weight * middle)
+        });
     let (mut before, mut loss) = ((0.0, 0.0), 0.0);
     let mut gradients = Vec::with_capacity(weights.len());
     for ((weight, middle), length) in weights.iter().zip(&middles).zip(&lengths) {
-        let after = (total.0 - before.0 - weight, total.1 - before.1 - weight * middle);
+        let after = (
+            total.0 - before.0 - weight,
+            total.1 - before.1 - weight * middle,
+        );
         let separation = middle * before.0 - before.1 + after.1 - middle * after.0;
         loss += weight * separation + weight * weight * length / 3.0;
         gradients.push(2.0 * separation + 2.0 * weight * length / 3.0);
@@ -138,7 +160,8 @@ pub struct Weights {
     pub near: f64,
     /// Weight of the line-of-sight loss, which penalizes opacity away from the measured depth.
     pub line_of_sight: f64,
-    /// Opacity within this band around the measured distance is allowed: a fraction of the distance, plus an offset.
+    /// Opacity within this band around the measured distance is allowed: a fraction of the
+    /// distance, plus an offset.
     pub band: [f64; 2],
     /// Color behind everything.
     pub background_rgb: [f64; 3],
@@ -146,10 +169,15 @@ pub struct Weights {
 
 /// Loss of one ray, and its gradients.
 ///
-/// If the distance is known, opacity is rewarded there and penalized elsewhere (line of sight: Rematas et al. 2022,
-/// equations 9 to 12, with a band instead of a bell curve). Some opacity elsewhere remains possible, for example for
-/// glass, which depth cameras do not measure.
-pub fn loss(samples: &[Sample], rendered: &RenderedRay, target: &Target, weights: &Weights) -> (f64, Upstream) {
+/// If the distance is known, opacity is rewarded there and penalized elsewhere (line of sight:
+/// Rematas et al. 2022, equations 9 to 12, with a band instead of a bell curve). Some opacity
+/// elsewhere remains possible, for example for glass, which depth cameras do not measure.
+pub fn loss(
+    samples: &[Sample],
+    rendered: &RenderedRay,
+    target: &Target,
+    weights: &Weights,
+) -> (f64, Upstream) {
     let (distortion_loss, v_weights) = distortion(samples, &rendered.weights, weights.near);
     let mut upstream = Upstream {
         rgb: [0.0; 3],
@@ -160,21 +188,34 @@ pub fn loss(samples: &[Sample], rendered: &RenderedRay, target: &Target, weights
     let mut loss = weights.distortion * distortion_loss;
     for channel in 0..3 {
         let background = weights.background_rgb[channel];
-        let residual = rendered.rgb[channel] + rendered.transmittance * background - target.rgb[channel];
+        let residual =
+            rendered.rgb[channel] + rendered.transmittance * background - target.rgb[channel];
         loss += residual * residual / 3.0;
         upstream.rgb[channel] = 2.0 * residual / 3.0;
         upstream.transmittance += 2.0 * residual / 3.0 * background;
     }
     if target.distance > 0.0 {
         let half_width = weights.band[0] * target.distance + weights.band[1];
-        let is_near_reading = |sample: &Sample| (sample.middle() - target.distance).abs() <= half_width;
+        let is_near_reading =
+            |sample: &Sample| (sample.middle() - target.distance).abs() <= half_width;
         let parts = || samples.iter().zip(&rendered.weights);
-        let near_weight: f64 = parts().filter(|(sample, _)| is_near_reading(sample)).map(|(_, weight)| weight).sum();
-        let elsewhere_weight_sq: f64 =
-            parts().filter(|(sample, _)| !is_near_reading(sample)).map(|(_, weight)| weight * weight).sum();
+        let near_weight: f64 = parts()
+            .filter(|(sample, _)| is_near_reading(sample))
+            .map(|(_, weight)| weight)
+            .sum();
+        let elsewhere_weight_sq: f64 = parts()
+            .filter(|(sample, _)| !is_near_reading(sample))
+            .map(|(_, weight)| weight * weight)
+            .sum();
         loss += weights.line_of_sight * ((1.0 - near_weight).powi(2) + elsewhere_weight_sq);
         for ((sample, weight), v) in parts().zip(&mut upstream.weights) {
-            *v += 2.0 * weights.line_of_sight * if is_near_reading(sample) { near_weight - 1.0 } else { *weight };
+            *v += 2.0
+                * weights.line_of_sight
+                * if is_near_reading(sample) {
+                    near_weight - 1.0
+                } else {
+                    *weight
+                };
         }
     }
     let distance_residual = rendered.distance - (1.0 - rendered.transmittance) * target.distance;

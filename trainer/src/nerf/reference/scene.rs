@@ -1,5 +1,5 @@
-//! A small field and rays through it, for tests of the reference and of the kernels. Uses numbers that f32 holds
-//! exactly.
+//! A small field and rays through it, for tests of the reference and of the kernels. Uses numbers
+//! that f32 holds exactly.
 
 use super::field::{Field, FieldGrad};
 use super::grid::GridShape;
@@ -18,7 +18,9 @@ fn shape() -> GridShape {
 }
 
 fn network(random: &mut F32Random, sizes: Vec<usize>) -> Network {
-    let weights = (0..Network::n_weights(&sizes)).map(|_| random.uniform(-0.6, 0.6)).collect();
+    let weights = (0..Network::n_weights(&sizes))
+        .map(|_| random.uniform(-0.6, 0.6))
+        .collect();
     Network { sizes, weights }
 }
 
@@ -27,7 +29,9 @@ pub(crate) fn field(seed: u64) -> Field {
     let shape = shape();
     let [density, color] = Field::sizes(&shape, 7, EMBEDDING_DIM);
     Field {
-        table: (0..shape.n_entries_total()).map(|_| random.array(-0.8, 0.8)).collect(),
+        table: (0..shape.n_entries_total())
+            .map(|_| random.array(-0.8, 0.8))
+            .collect(),
         density: network(&mut random, density),
         color: network(&mut random, color),
         shape,
@@ -45,7 +49,9 @@ pub(crate) struct Ray {
 
 pub(crate) fn ray(seed: u64) -> Ray {
     let mut random = F32Random::new(seed);
-    let direction = nalgebra::Vector3::from(random.array(-1.0, 1.0)).normalize().map(rounded);
+    let direction = nalgebra::Vector3::from(random.array(-1.0, 1.0))
+        .normalize()
+        .map(rounded);
     let mut cursor = 0.2;
     let span = |_| {
         let begin = rounded(cursor + random.uniform(0.02, 0.2));
@@ -54,9 +60,19 @@ pub(crate) fn ray(seed: u64) -> Ray {
     };
     let spans = (0..7).map(span).collect();
     let embedding = random.array::<EMBEDDING_DIM>(-0.5, 0.5).to_vec();
-    let target =
-        Target { rgb: random.array(0.1, 0.9).map(|value: f64| (255.0 * value).round() / 255.0), distance: 1.75 };
-    Ray { origin: random.array(-0.4, 0.4), direction: direction.into(), spans, embedding, target }
+    let target = Target {
+        rgb: random
+            .array(0.1, 0.9)
+            .map(|value: f64| (255.0 * value).round() / 255.0),
+        distance: 1.75,
+    };
+    Ray {
+        origin: random.array(-0.4, 0.4),
+        direction: direction.into(),
+        spans,
+        embedding,
+        target,
+    }
 }
 
 pub(crate) const WEIGHTS: Weights = Weights {
@@ -81,7 +97,11 @@ pub(crate) fn samples(field: &Field, ray: &Ray) -> Vec<Sample> {
 fn samples_viewed_along(field: &Field, ray: &Ray, direction: [f64; 3]) -> Vec<Sample> {
     let sample = |span: &[f64; 2]| {
         let point = field.point(sample_position(ray, *span), direction, &ray.embedding);
-        Sample { span: *span, density: point.density, rgb: point.rgb }
+        Sample {
+            span: *span,
+            density: point.density,
+            rgb: point.rgb,
+        }
     };
     ray.spans.iter().map(sample).collect()
 }
@@ -99,21 +119,28 @@ pub(crate) fn loss_viewed_along(field: &Field, ray: &Ray, direction: [f64; 3]) -
 /// Distance along a ray and gradient of each of its samples.
 pub(crate) type SamplePositions = Vec<(f64, [f64; 3])>;
 
-/// Gradient with respect to the parameters, the positions of the samples (with their distance along the ray), and the
-/// appearance embedding.
+/// Gradient with respect to the parameters, the positions of the samples (with their distance along
+/// the ray), and the appearance embedding.
 pub(crate) fn gradient(field: &Field, ray: &Ray) -> (FieldGrad, SamplePositions, Vec<f64>) {
     let samples = samples(field, ray);
     let rendered = ray::composite(&samples);
     let (_, upstream) = ray::loss(&samples, &rendered, &ray.target, &WEIGHTS);
     let gradients = ray::composite_backward(&samples, &rendered, &upstream);
-    let (mut gradient, mut v_positions, mut v_embedding) =
-        (FieldGrad::zeros(field), Vec::new(), vec![0.0; EMBEDDING_DIM]);
+    let (mut gradient, mut v_positions, mut v_embedding) = (
+        FieldGrad::zeros(field),
+        Vec::new(),
+        vec![0.0; EMBEDDING_DIM],
+    );
     for (span, (v_density, v_rgb)) in ray.spans.iter().zip(gradients) {
         let at = sample_position(ray, *span);
         let point = field.point(at, ray.direction, &ray.embedding);
-        let (v_at, v_ray_embedding) = field.point_backward(at, &point, v_density, v_rgb, &mut gradient);
+        let (v_at, v_ray_embedding) =
+            field.point_backward(at, &point, v_density, v_rgb, &mut gradient);
         v_positions.push((0.5 * (span[0] + span[1]), v_at));
-        v_embedding.iter_mut().zip(v_ray_embedding).for_each(|(sum, v)| *sum += v);
+        v_embedding
+            .iter_mut()
+            .zip(v_ray_embedding)
+            .for_each(|(sum, v)| *sum += v);
     }
     (gradient, v_positions, v_embedding)
 }

@@ -1,9 +1,12 @@
-//! Contraction of the world to the unit cube: near space is scaled uniformly, far space is compressed.
+//! Contraction of the world to the unit cube: near space is scaled uniformly, far space is
+//! compressed.
 
-/// Contracts a point, given in units of the scene radius around its center, to the unit cube. The inner cube from -1 to
-/// 1 fills the central half along each axis; everything outside maps to the surrounding shell.
+/// Contracts a point, given in units of the scene radius around its center, to the unit cube. The
+/// inner cube from -1 to 1 fills the central half along each axis; everything outside maps to the
+/// surrounding shell.
 ///
-/// Source: Barron et al. 2022, equation 10, with the largest coordinate in place of the length, so that cubes stay cubes.
+/// Source: Barron et al. 2022, equation 10, with the largest coordinate in place of the length, so
+/// that cubes stay cubes.
 pub fn contract(at: [f64; 3]) -> [f64; 3] {
     let (_, largest) = largest(at);
     if largest <= 1.0 {
@@ -29,7 +32,12 @@ pub fn contract_backward(at: [f64; 3], upstream: [f64; 3]) -> [f64; 3] {
 
 /// The axis with the largest absolute coordinate, and that absolute value.
 pub(crate) fn largest(point: [f64; 3]) -> (usize, f64) {
-    let larger =
-        |best: (usize, f64), axis: usize| if point[axis].abs() > best.1 { (axis, point[axis].abs()) } else { best };
+    let larger = |best: (usize, f64), axis: usize| {
+        if point[axis].abs() > best.1 {
+            (axis, point[axis].abs())
+        } else {
+            best
+        }
+    };
     (0..3).fold((0, 0.0), larger)
 }

@@ -28,28 +28,60 @@ fn ray_gradients_match_central_differences() {
         };
         for (ix, entry) in gradients.table.iter().enumerate() {
             for (feature, derivative) in entry.iter().enumerate() {
-                let numeric = central(|step| nudged(&|field, step| field.table[ix][feature] += step, step));
-                mismatches.check(format!("{seed}: entry {ix} {feature}"), *derivative, numeric, ABS, REL);
+                let numeric =
+                    central(|step| nudged(&|field, step| field.table[ix][feature] += step, step));
+                mismatches.check(
+                    format!("{seed}: entry {ix} {feature}"),
+                    *derivative,
+                    numeric,
+                    ABS,
+                    REL,
+                );
             }
         }
         for (ix, derivative) in gradients.density.iter().enumerate() {
-            let numeric = central(|step| nudged(&|field, step| field.density.weights[ix] += step, step));
-            mismatches.check(format!("{seed}: density {ix}"), *derivative, numeric, ABS, REL);
+            let numeric =
+                central(|step| nudged(&|field, step| field.density.weights[ix] += step, step));
+            mismatches.check(
+                format!("{seed}: density {ix}"),
+                *derivative,
+                numeric,
+                ABS,
+                REL,
+            );
         }
         for (ix, derivative) in gradients.color.iter().enumerate() {
-            let numeric = central(|step| nudged(&|field, step| field.color.weights[ix] += step, step));
-            mismatches.check(format!("{seed}: color {ix}"), *derivative, numeric, ABS, REL);
+            let numeric =
+                central(|step| nudged(&|field, step| field.color.weights[ix] += step, step));
+            mismatches.check(
+                format!("{seed}: color {ix}"),
+                *derivative,
+                numeric,
+                ABS,
+                REL,
+            );
         }
         let pose = ImagePose::gradients(ray.direction, &v_positions);
         for axis in 0..3 {
             let moved = |pose: ImagePose| {
                 let (origin, direction) = pose.apply_pose(ray.origin, ray.direction);
-                let moved =
-                    Ray { origin, direction, spans: ray.spans.clone(), embedding: ray.embedding.clone(), ..ray };
+                let moved = Ray {
+                    origin,
+                    direction,
+                    spans: ray.spans.clone(),
+                    embedding: ray.embedding.clone(),
+                    ..ray
+                };
                 loss_viewed_along(&field, &moved, ray.direction)
             };
-            let along = |step: f64| std::array::from_fn(|other| if other == axis { step } else { 0.0 });
-            let translated = |step: f64| moved(ImagePose { translation: along(step), ..ImagePose::default() });
+            let along =
+                |step: f64| std::array::from_fn(|other| if other == axis { step } else { 0.0 });
+            let translated = |step: f64| {
+                moved(ImagePose {
+                    translation: along(step),
+                    ..ImagePose::default()
+                })
+            };
             mismatches.check(
                 format!("{seed}: translation {axis}"),
                 pose.translation[axis],
@@ -57,16 +89,40 @@ fn ray_gradients_match_central_differences() {
                 ABS,
                 REL,
             );
-            let rotated = |step: f64| moved(ImagePose { rotation_rad: along(step), ..ImagePose::default() });
-            mismatches.check(format!("{seed}: rotation {axis}"), pose.rotation_rad[axis], central(rotated), ABS, REL);
+            let rotated = |step: f64| {
+                moved(ImagePose {
+                    rotation_rad: along(step),
+                    ..ImagePose::default()
+                })
+            };
+            mismatches.check(
+                format!("{seed}: rotation {axis}"),
+                pose.rotation_rad[axis],
+                central(rotated),
+                ABS,
+                REL,
+            );
         }
         for ix in 0..EMBEDDING_DIM {
             let moved = |step: f64| {
                 let mut embedding = ray.embedding.clone();
                 embedding[ix] += step;
-                loss(&field, &Ray { embedding, spans: ray.spans.clone(), ..ray })
+                loss(
+                    &field,
+                    &Ray {
+                        embedding,
+                        spans: ray.spans.clone(),
+                        ..ray
+                    },
+                )
             };
-            mismatches.check(format!("{seed}: embedding {ix}"), v_embedding[ix], central(moved), ABS, REL);
+            mismatches.check(
+                format!("{seed}: embedding {ix}"),
+                v_embedding[ix],
+                central(moved),
+                ABS,
+                REL,
+            );
         }
     }
     mismatches.assert_none();
@@ -77,18 +133,36 @@ fn contraction_is_linear_inside_and_bounded_outside() {
     assert_eq!(contract([0.0; 3]), [0.5; 3]);
     assert_eq!(contract([1.0, -1.0, 0.0]), [0.75, 0.25, 0.5]);
     let far = contract([1e9, 0.0, 0.0]);
-    assert!(far[0] > 0.999_999 && far[0] < 1.0 && (far[1] - 0.5).abs() < 1e-9, "{far:?}");
+    assert!(
+        far[0] > 0.999_999 && far[0] < 1.0 && (far[1] - 0.5).abs() < 1e-9,
+        "{far:?}"
+    );
     let mut mismatches = Mismatches::default();
     let upstream = [0.7, -0.4, 0.9];
-    for at in [[0.15, -0.4, 0.45], [4.0, -2.5, 0.5], [-10.5, 14.0, -26.5], [0.5, 0.25, -5.0]] {
+    for at in [
+        [0.15, -0.4, 0.45],
+        [4.0, -2.5, 0.5],
+        [-10.5, 14.0, -26.5],
+        [0.5, 0.25, -5.0],
+    ] {
         let gradients = contract_backward(at, upstream);
         for axis in 0..3 {
             let numeric = central(|step| {
                 let mut moved = at;
                 moved[axis] += step;
-                contract(moved).iter().zip(upstream).map(|(x, v)| x * v).sum()
+                contract(moved)
+                    .iter()
+                    .zip(upstream)
+                    .map(|(x, v)| x * v)
+                    .sum()
             });
-            mismatches.check(format!("{at:?} {axis}"), gradients[axis], numeric, 1e-9, 1e-6);
+            mismatches.check(
+                format!("{at:?} {axis}"),
+                gradients[axis],
+                numeric,
+                1e-9,
+                1e-6,
+            );
         }
     }
     mismatches.assert_none();
@@ -96,7 +170,10 @@ fn contraction_is_linear_inside_and_bounded_outside() {
 
 #[test]
 fn grid_interpolates_linearly_between_corners() {
-    let shape = GridShape { n_cells: vec![4], log2_entries: 10 };
+    let shape = GridShape {
+        n_cells: vec![4],
+        log2_entries: 10,
+    };
     // Interpolation reproduces a linear function everywhere.
     let linear = |at: [f64; 3]| [0.3 + at[0] - 2.0 * at[1] + 0.5 * at[2], at[0] * 3.0 - at[2]];
     let mut table = vec![[0.0; 2]; shape.n_entries_total() as usize];
@@ -107,7 +184,10 @@ fn grid_interpolates_linearly_between_corners() {
     for at in [[0.0; 3], [1.0; 3], [0.25, 0.5, 0.75], [0.13, 0.99, 0.47]] {
         let (found, expected) = (grid::interpolate(&shape, &table, at), linear(at));
         assert!(
-            found.iter().zip(expected).all(|(found, expected)| (found - expected).abs() < 1e-12),
+            found
+                .iter()
+                .zip(expected)
+                .all(|(found, expected)| (found - expected).abs() < 1e-12),
             "{at:?}: {found:?}"
         );
     }
@@ -117,23 +197,49 @@ fn grid_interpolates_linearly_between_corners() {
 fn levels_grow_evenly_and_large_levels_hash() {
     let shape = GridShape::between(16, 2048, 16, 19);
     assert_eq!((shape.n_cells[0], shape.n_cells[15]), (16, 2048));
-    assert!(shape.n_cells.windows(2).all(|pair| pair[1] > pair[0] && pair[1] < 2 * pair[0]));
-    assert_eq!((shape.n_entries(0), shape.n_entries(15)), (17 * 17 * 17, 1 << 19));
-    let hit: std::collections::BTreeSet<u32> =
-        (0..20_000).map(|ix| shape.entry(15, [ix % 29, ix / 29 % 31, ix / 899])).collect();
-    assert!(hit.len() > 19_000, "few corners may share an entry while entries are plentiful: {} distinct", hit.len());
-    assert!(hit.iter().all(|entry| *entry >= shape.begin(15) && *entry < shape.n_entries_total()));
+    assert!(
+        shape
+            .n_cells
+            .windows(2)
+            .all(|pair| pair[1] > pair[0] && pair[1] < 2 * pair[0])
+    );
+    assert_eq!(
+        (shape.n_entries(0), shape.n_entries(15)),
+        (17 * 17 * 17, 1 << 19)
+    );
+    let hit: std::collections::BTreeSet<u32> = (0..20_000)
+        .map(|ix| shape.entry(15, [ix % 29, ix / 29 % 31, ix / 899]))
+        .collect();
+    assert!(
+        hit.len() > 19_000,
+        "few corners may share an entry while entries are plentiful: {} distinct",
+        hit.len()
+    );
+    assert!(
+        hit.iter()
+            .all(|entry| *entry >= shape.begin(15) && *entry < shape.n_entries_total())
+    );
 }
 
 #[test]
 fn weights_sum_to_one_and_opaque_samples_occlude() {
-    let sample =
-        |begin: f64, density: f64, red: f64| Sample { span: [begin, begin + 0.5], density, rgb: [red, 0.0, 1.0] };
-    let samples = [sample(1.0, 0.5, 0.2), sample(1.5, 1e3, 0.9), sample(2.0, 2.0, 0.1)];
+    let sample = |begin: f64, density: f64, red: f64| Sample {
+        span: [begin, begin + 0.5],
+        density,
+        rgb: [red, 0.0, 1.0],
+    };
+    let samples = [
+        sample(1.0, 0.5, 0.2),
+        sample(1.5, 1e3, 0.9),
+        sample(2.0, 2.0, 0.1),
+    ];
     let rendered = ray::composite(&samples);
     assert!((rendered.weights.iter().sum::<f64>() + rendered.transmittance - 1.0).abs() < 1e-12);
     let first = 1.0 - (-0.25f64).exp();
-    assert!((rendered.rgb[0] - (first * 0.2 + (1.0 - first) * 0.9)).abs() < 1e-9 && rendered.weights[2] < 1e-9);
+    assert!(
+        (rendered.rgb[0] - (first * 0.2 + (1.0 - first) * 0.9)).abs() < 1e-9
+            && rendered.weights[2] < 1e-9
+    );
     assert!((rendered.distance - (first * 1.25 + (1.0 - first) * 1.75)).abs() < 1e-9);
 }
 
@@ -141,12 +247,17 @@ fn weights_sum_to_one_and_opaque_samples_occlude() {
 #[test]
 fn one_pass_distortion_equals_pairwise_sum() {
     let samples: Vec<Sample> = [[1.0, 1.4], [1.5, 1.9], [1.9, 4.0], [6.0, 7.0]]
-        .map(|span| Sample { span, density: 1.0, rgb: [0.0; 3] })
+        .map(|span| Sample {
+            span,
+            density: 1.0,
+            rgb: [0.0; 3],
+        })
         .to_vec();
     let weights = [0.1, 0.4, 0.2, 0.15];
     let normalized_distance = |t: f64| 1.0 - 0.5 / t;
-    let middle =
-        |ix: usize| 0.5 * (normalized_distance(samples[ix].span[0]) + normalized_distance(samples[ix].span[1]));
+    let middle = |ix: usize| {
+        0.5 * (normalized_distance(samples[ix].span[0]) + normalized_distance(samples[ix].span[1]))
+    };
     let mut expected = 0.0;
     for i in 0..4 {
         for j in 0..4 {
@@ -159,5 +270,9 @@ fn one_pass_distortion_equals_pairwise_sum() {
     }
     assert!((ray::distortion(&samples, &weights, 0.5).0 - expected).abs() < 1e-12);
     let alone = ray::distortion(&samples, &[0.0, 1e-9, 0.0, 0.0], 0.5);
-    assert!(alone.0 < 1e-12, "weight at one position has no distortion: {}", alone.0);
+    assert!(
+        alone.0 < 1e-12,
+        "weight at one position has no distortion: {}",
+        alone.0
+    );
 }

@@ -13,7 +13,8 @@ pub(super) const SH_0: f64 = 0.282_094_791_773_878_14;
 const MEAN_BITS: u32 = 13;
 /// Range of constant colors. View-dependent parts are added to them.
 const COLOR_RANGE: [f64; 2] = [-0.5, 1.5];
-/// Larger ranges of standard deviations are clamped at the lower end: such splats are thinner than a pixel.
+/// Larger ranges of standard deviations are clamped at the lower end: such splats are thinner than
+/// a pixel.
 const MAX_LOG_SCALE_SPAN: f64 = 10.0;
 /// Number of coefficients of degree 1, and of degree 1 and 2, per color channel.
 const N_DEGREE_1: usize = 3;
@@ -24,10 +25,18 @@ const MAX_SH_COUNT: f64 = 15.0;
 const MAX_SH_DEVIATIONS: f64 = 4.0;
 
 /// Encodes these splats in the given order.
-pub(super) fn encode(splats: &SplatArrays, members: &[u32], scale_factor: f64, sh_degree: u32) -> ChunkData {
+pub(super) fn encode(
+    splats: &SplatArrays,
+    members: &[u32],
+    scale_factor: f64,
+    sh_degree: u32,
+) -> ChunkData {
     let ranges = Ranges::of(splats, members, sh_degree);
     let words = members.iter().flat_map(|ix| ranges.base_words(splats, *ix));
-    let sh_words = members.iter().filter(|_| sh_degree > 0).flat_map(|ix| ranges.sh_words(splats, *ix));
+    let sh_words = members
+        .iter()
+        .filter(|_| sh_degree > 0)
+        .flat_map(|ix| ranges.sh_words(splats, *ix));
     let layout = ChunkLayout::Splats {
         n_splats: members.len(),
         min_m: ranges.min_m,
@@ -38,7 +47,10 @@ pub(super) fn encode(splats: &SplatArrays, members: &[u32], scale_factor: f64, s
         sh_ranges: ranges.sh,
         is_antialiased: splats.is_antialiased,
     };
-    ChunkData { layout, bytes: words.chain(sh_words).flat_map(u32::to_le_bytes).collect() }
+    ChunkData {
+        layout,
+        bytes: words.chain(sh_words).flat_map(u32::to_le_bytes).collect(),
+    }
 }
 
 /// Ranges of the values in a chunk.
@@ -54,27 +66,47 @@ impl Ranges {
     fn of(splats: &SplatArrays, members: &[u32], sh_degree: u32) -> Self {
         let means = || members.iter().map(|ix| splats.means[*ix as usize]);
         let extreme = |begin: f32, pick: fn(f32, f32) -> f32| -> [f32; 3] {
-            means().fold([begin; 3], |so_far, mean| std::array::from_fn(|axis| pick(so_far[axis], mean[axis])))
+            means().fold([begin; 3], |so_far, mean| {
+                std::array::from_fn(|axis| pick(so_far[axis], mean[axis]))
+            })
         };
-        let log_scales = || members.iter().flat_map(|ix| splats.log_scales[*ix as usize]);
+        let log_scales = || {
+            members
+                .iter()
+                .flat_map(|ix| splats.log_scales[*ix as usize])
+        };
         let largest = log_scales().fold(f32::NEG_INFINITY, f32::max);
-        let smallest = log_scales().fold(f32::INFINITY, f32::min).max(largest - f32_of(MAX_LOG_SCALE_SPAN));
+        let smallest = log_scales()
+            .fold(f32::INFINITY, f32::min)
+            .max(largest - f32_of(MAX_LOG_SCALE_SPAN));
         let sh_range = |degree: u32, functions: std::ops::Range<usize>| -> f32 {
             let values = || {
                 members
                     .iter()
                     .filter(|_| degree <= sh_degree)
-                    .flat_map(|ix| functions.clone().flat_map(|function| higher_coefficient(splats, *ix, function)))
+                    .flat_map(|ix| {
+                        functions
+                            .clone()
+                            .flat_map(|function| higher_coefficient(splats, *ix, function))
+                    })
             };
             let n_values = values().count().max(1) as f64;
             let rms = (values().map(|value| value * value).sum::<f64>() / n_values).sqrt();
-            f32_of(values().map(f64::abs).fold(0.0, f64::max).min(MAX_SH_DEVIATIONS * rms))
+            f32_of(
+                values()
+                    .map(f64::abs)
+                    .fold(0.0, f64::max)
+                    .min(MAX_SH_DEVIATIONS * rms),
+            )
         };
         Self {
             min_m: extreme(f32::INFINITY, f32::min),
             max_m: extreme(f32::NEG_INFINITY, f32::max),
             log_scale: [smallest, largest],
-            sh: [sh_range(1, 0..N_DEGREE_1), sh_range(2, N_DEGREE_1..N_DEGREE_2)],
+            sh: [
+                sh_range(1, 0..N_DEGREE_1),
+                sh_range(2, N_DEGREE_1..N_DEGREE_2),
+            ],
             sh_degree,
         }
     }
@@ -83,26 +115,39 @@ impl Ranges {
     fn base_words(&self, splats: &SplatArrays, splat_ix: u32) -> [u32; 4] {
         let ix = splat_ix as usize;
         let [x, y, z] = [0, 1, 2].map(|axis| {
-            count(splats.means[ix][axis].into(), [self.min_m[axis].into(), self.max_m[axis].into()], MEAN_BITS)
+            count(
+                splats.means[ix][axis].into(),
+                [self.min_m[axis].into(), self.max_m[axis].into()],
+                MEAN_BITS,
+            )
         });
-        let scales = splats.log_scales[ix].map(|scale| count(scale.into(), self.log_scale.map(f64::from), 8));
+        let scales = splats.log_scales[ix]
+            .map(|scale| count(scale.into(), self.log_scale.map(f64::from), 8));
         let color = splats.sh[ix * splats.n_coefficients()];
-        let [red, green, blue] = color.map(|value| count(0.5 + SH_0 * f64::from(value), COLOR_RANGE, 8));
+        let [red, green, blue] =
+            color.map(|value| count(0.5 + SH_0 * f64::from(value), COLOR_RANGE, 8));
         [
             x | y << 13 | z << 26, // The upper bits of z follow.
             z >> 6 | scales[0] << 7 | scales[1] << 15 | scales[2] << 23,
             rotation_word(splats.rotations_wxyz[ix]),
-            count(splats.opacity(splat_ix as usize), [0.0, 1.0], 8) | red << 8 | green << 16 | blue << 24,
+            count(splats.opacity(splat_ix as usize), [0.0, 1.0], 8)
+                | red << 8
+                | green << 16
+                | blue << 24,
         ]
     }
 
-    /// Coefficients of degree 1 and 2, six in each word: red, green and blue of one basis function, then of the next.
+    /// Coefficients of degree 1 and 2, six in each word: red, green and blue of one basis function,
+    /// then of the next.
     fn sh_words(&self, splats: &SplatArrays, splat_ix: u32) -> [u32; 4] {
         let mut words = [0; 4];
         for function in 0..N_DEGREE_2 {
             let degree = if function < N_DEGREE_1 { 1 } else { 2 };
             let range: f64 = self.sh[degree - 1].into();
-            for (channel, value) in higher_coefficient(splats, splat_ix, function).into_iter().enumerate() {
+            for (channel, value) in higher_coefficient(splats, splat_ix, function)
+                .into_iter()
+                .enumerate()
+            {
                 let is_present = degree <= self.sh_degree as usize && range > 0.0;
                 let share = if is_present { value / range } else { 0.0 };
                 let field = 3 * function + channel;
@@ -118,33 +163,65 @@ fn higher_coefficient(splats: &SplatArrays, splat_ix: u32, function: usize) -> [
     let n_coefficients = splats.n_coefficients();
     let is_present = function + 1 < n_coefficients;
     let at = splat_ix as usize * n_coefficients + function + 1;
-    if is_present { splats.sh[at].map(f64::from) } else { [0.0; 3] }
+    if is_present {
+        splats.sh[at].map(f64::from)
+    } else {
+        [0.0; 3]
+    }
 }
 
 /// Rounds a value in a range to the given number of bits.
-#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the bits")]
+#[expect(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "clamped to the bits"
+)]
 fn count(value: f64, [min, max]: [f64; 2], bits: u32) -> u32 {
     let max_count = f64::from((1_u32 << bits) - 1);
-    let share = if max > min { (value - min) / (max - min) } else { 0.0 };
+    let share = if max > min {
+        (value - min) / (max - min)
+    } else {
+        0.0
+    };
     (share * max_count).round().clamp(0.0, max_count) as u32
 }
 
 /// A share of the range of coefficients, from -1 to 1, as a number from 1 to 31. 16 stands for 0.
-#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to 5 bits")]
+#[expect(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "clamped to 5 bits"
+)]
 fn sh_count(share: f64) -> u32 {
-    (16.0 + (MAX_SH_COUNT * share).round().clamp(-MAX_SH_COUNT, MAX_SH_COUNT)) as u32
+    (16.0
+        + (MAX_SH_COUNT * share)
+            .round()
+            .clamp(-MAX_SH_COUNT, MAX_SH_COUNT)) as u32
 }
 
-/// A rotation in 32 bits: the index of the component with the largest magnitude in the upper two bits, then the other
-/// three, 10 bits each. The largest component is made positive.
+/// A rotation in 32 bits: the index of the component with the largest magnitude in the upper two
+/// bits, then the other three, 10 bits each. The largest component is made positive.
 ///
 /// Source of the idea: Fiedler 2015, "Snapshot compression".
 fn rotation_word(wxyz: [f32; 4]) -> u32 {
     let wxyz = wxyz.map(f64::from);
-    let length = wxyz.iter().map(|part| part * part).sum::<f64>().sqrt().max(1e-30);
-    let largest_ix = (1..4).fold(0, |largest, ix| if wxyz[ix].abs() > wxyz[largest].abs() { ix } else { largest });
+    let length = wxyz
+        .iter()
+        .map(|part| part * part)
+        .sum::<f64>()
+        .sqrt()
+        .max(1e-30);
+    let largest_ix = (1..4).fold(0, |largest, ix| {
+        if wxyz[ix].abs() > wxyz[largest].abs() {
+            ix
+        } else {
+            largest
+        }
+    });
     let sign = wxyz[largest_ix].signum() / length;
-    let others = (0..4).filter(|ix| *ix != largest_ix).map(|ix| sign * wxyz[ix]);
+    let others = (0..4)
+        .filter(|ix| *ix != largest_ix)
+        .map(|ix| sign * wxyz[ix]);
     others.fold(u32::try_from(largest_ix).unwrap_or(0), |word, part| {
         word << 10 | count(part, [-FRAC_1_SQRT_2, FRAC_1_SQRT_2], 10)
     })

@@ -1,7 +1,8 @@
 //! Splats in spatial chunks, for viewers that draw them.
 //!
-//! A chunk is a cell of an octree. Splats have no stable identity in training, because growing reorders them, but cells
-//! have. Within a chunk, the most visible splats come first, and the first few of them, enlarged, approximate the chunk.
+//! A chunk is a cell of an octree. Splats have no stable identity in training, because growing
+//! reorders them, but cells have. Within a chunk, the most visible splats come first, and the first
+//! few of them, enlarged, approximate the chunk.
 
 mod cells;
 mod codec;
@@ -25,7 +26,8 @@ const N_PARTS: usize = 64;
 /// A change that leaves the sums of all parts as they are counts as this fraction of the sums.
 const MIN_CHANGE_FRAC: f64 = 1e-3;
 
-/// Sums over the splats in each part of a cell: visible area, and the same times red, green and blue.
+/// Sums over the splats in each part of a cell: visible area, and the same times red, green and
+/// blue.
 type Sums = [[f64; 4]; N_PARTS];
 
 /// Divides the splats of successive versions of a model into chunks.
@@ -55,26 +57,47 @@ impl Chunker {
             .into_par_iter()
             .map(|(cell, range)| {
                 let sums = sums(splats, cell, &sorted[range.clone()]);
-                let mut members: Vec<u32> = sorted[range].iter().map(|(_, splat_ix)| *splat_ix).collect();
+                let mut members: Vec<u32> = sorted[range]
+                    .iter()
+                    .map(|(_, splat_ix)| *splat_ix)
+                    .collect();
                 members.sort_by(|a, b| area(splats, *b).total_cmp(&area(splats, *a)));
                 let fine = encode(splats, &members, 1.0, splats.sh_degree);
                 let mut hasher = DefaultHasher::new();
                 hasher.write(&fine.bytes);
-                let content = Content { hash: hasher.finish(), sums };
+                let content = Content {
+                    hash: hasher.finish(),
+                    sums,
+                };
                 let change = change(self.last.get(&cell), &content);
-                (cell, content, ModelChunk { id: cell.id(), change, coarse: coarse(splats, &members), fine })
+                (
+                    cell,
+                    content,
+                    ModelChunk {
+                        id: cell.id(),
+                        change,
+                        coarse: coarse(splats, &members),
+                        fine,
+                    },
+                )
             })
             .collect();
         let mut last = std::mem::take(&mut self.last);
         let mut chunks = Vec::new();
         for (cell, content, chunk) in made {
-            let is_unchanged = last.remove(&cell).is_some_and(|before| before.hash == content.hash);
+            let is_unchanged = last
+                .remove(&cell)
+                .is_some_and(|before| before.hash == content.hash);
             self.last.insert(cell, content);
             if !is_unchanged {
                 chunks.push(chunk);
             }
         }
-        ModelChunks { is_complete, chunks, removed: last.into_keys().map(Cell::id).collect() }
+        ModelChunks {
+            is_complete,
+            chunks,
+            removed: last.into_keys().map(Cell::id).collect(),
+        }
     }
 }
 
@@ -114,7 +137,11 @@ fn change(before: Option<&Content>, after: &Content) -> f64 {
     let values = |content: &Content| content.sums.as_flattened().to_vec();
     let after = values(after);
     let before = before.map_or_else(|| vec![0.0; after.len()], values);
-    let difference: f64 = after.iter().zip(&before).map(|(after, before)| (after - before).abs()).sum();
+    let difference: f64 = after
+        .iter()
+        .zip(&before)
+        .map(|(after, before)| (after - before).abs())
+        .sum();
     difference + MIN_CHANGE_FRAC * after.iter().map(|sum| sum.abs()).sum::<f64>()
 }
 

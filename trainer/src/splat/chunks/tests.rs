@@ -1,4 +1,5 @@
-//! Chunks decoded as `docs/reference/protocol.md` says: errors of the values and of pictures, and what counts as changed.
+//! Chunks decoded as `docs/reference/protocol.md` says: errors of the values and of pictures, and
+//! what counts as changed.
 
 use super::codec::{MAX_SH_DEGREE, encode};
 use super::{COARSE_STRIDE, Chunker};
@@ -9,7 +10,8 @@ use crate::splat::cloud::{scan_cloud, synthetic_cloud};
 use crate::splat::training_tests::{keyframes, options, request};
 use crate::splat::{SplatOptions, SplatTrainer};
 use crate::{
-    ChunkData, ChunkLayout, Method, ModelChunk, ModelChunks, ModelOptions, Picture, Projection, RenderRequest,
+    ChunkData, ChunkLayout, Method, ModelChunk, ModelChunks, ModelOptions, Picture, Projection,
+    RenderRequest,
 };
 use nalgebra::{Quaternion, UnitQuaternion};
 use std::collections::BTreeMap;
@@ -19,24 +21,55 @@ use std::sync::Arc;
 /// Splats of degree 2, like those that are read from the GPU for encoding.
 fn of_degree_2(splats: SplatArrays) -> SplatArrays {
     let n = (MAX_SH_DEGREE as usize + 1).pow(2);
-    let sh = splats.sh.chunks_exact(splats.n_coefficients()).flat_map(|of| of[..n].to_vec()).collect();
-    SplatArrays { sh, sh_degree: MAX_SH_DEGREE, ..splats }
+    let sh = splats
+        .sh
+        .chunks_exact(splats.n_coefficients())
+        .flat_map(|of| of[..n].to_vec())
+        .collect();
+    SplatArrays {
+        sh,
+        sh_degree: MAX_SH_DEGREE,
+        ..splats
+    }
 }
 
 #[expect(clippy::cast_possible_truncation, reason = "splats are f32")]
 fn decoded(data: &ChunkData) -> SplatArrays {
-    let ChunkLayout::Splats { n_splats, min_m, max_m, log_scale_range, scale_factor, sh_degree, sh_ranges, .. } =
-        data.layout
+    let ChunkLayout::Splats {
+        n_splats,
+        min_m,
+        max_m,
+        log_scale_range,
+        scale_factor,
+        sh_degree,
+        sh_ranges,
+        ..
+    } = data.layout
     else {
         panic!("splats")
     };
-    let words: Vec<u32> = data.bytes.as_chunks::<4>().0.iter().map(|bytes| u32::from_le_bytes(*bytes)).collect();
+    let words: Vec<u32> = data
+        .bytes
+        .as_chunks::<4>()
+        .0
+        .iter()
+        .map(|bytes| u32::from_le_bytes(*bytes))
+        .collect();
     assert_eq!(words.len(), n_splats * if sh_degree > 0 { 8 } else { 4 });
     let (base, sh_words) = words.split_at(4 * n_splats);
-    let mut splats = SplatArrays { sh_degree: MAX_SH_DEGREE, ..SplatArrays::default() };
-    let scaled = |count: u32, max: u32, [low, high]: [f64; 2]| low + f64::from(count) / f64::from(max) * (high - low);
+    let mut splats = SplatArrays {
+        sh_degree: MAX_SH_DEGREE,
+        ..SplatArrays::default()
+    };
+    let scaled = |count: u32, max: u32, [low, high]: [f64; 2]| {
+        low + f64::from(count) / f64::from(max) * (high - low)
+    };
     for (ix, word) in base.as_chunks::<4>().0.iter().enumerate() {
-        let counts = [word[0] & 8191, word[0] >> 13 & 8191, word[0] >> 26 | (word[1] & 127) << 6];
+        let counts = [
+            word[0] & 8191,
+            word[0] >> 13 & 8191,
+            word[0] >> 26 | (word[1] & 127) << 6,
+        ];
         splats.means.push(std::array::from_fn(|axis| {
             scaled(counts[axis], 8191, [min_m[axis].into(), max_m[axis].into()]) as f32
         }));
@@ -44,22 +77,37 @@ fn decoded(data: &ChunkData) -> SplatArrays {
             let log_scale = scaled(word[1] >> at & 255, 255, log_scale_range.map(f64::from));
             (log_scale + f64::from(scale_factor).ln()) as f32
         }));
-        let others = [20, 10, 0].map(|at| scaled(word[2] >> at & 1023, 1023, [-FRAC_1_SQRT_2, FRAC_1_SQRT_2]));
-        let largest = (1.0 - others.iter().map(|part| part * part).sum::<f64>()).max(0.0).sqrt();
+        let others = [20, 10, 0]
+            .map(|at| scaled(word[2] >> at & 1023, 1023, [-FRAC_1_SQRT_2, FRAC_1_SQRT_2]));
+        let largest = (1.0 - others.iter().map(|part| part * part).sum::<f64>())
+            .max(0.0)
+            .sqrt();
         let mut wxyz = others.to_vec();
         wxyz.insert((word[2] >> 30) as usize, largest);
-        splats.rotations_wxyz.push(std::array::from_fn(|part| wxyz[part] as f32));
+        splats
+            .rotations_wxyz
+            .push(std::array::from_fn(|part| wxyz[part] as f32));
         let alpha = scaled(word[3] & 255, 255, [0.0, 1.0]).min(0.999);
-        splats.opacity_logits.push((alpha / (1.0 - alpha)).ln() as f32);
-        splats.sh.push(
-            [8, 16, 24].map(|at| ((scaled(word[3] >> at & 255, 255, [-0.5, 1.5]) - 0.5) / super::codec::SH_0) as f32),
-        );
+        splats
+            .opacity_logits
+            .push((alpha / (1.0 - alpha)).ln() as f32);
+        splats.sh.push([8, 16, 24].map(|at| {
+            ((scaled(word[3] >> at & 255, 255, [-0.5, 1.5]) - 0.5) / super::codec::SH_0) as f32
+        }));
         for function in 0..8 {
             let range = f64::from(sh_ranges[usize::from(function >= 3)]);
             splats.sh.push(std::array::from_fn(|channel| {
                 let field = 3 * function + channel;
-                let word = if sh_degree > 0 { sh_words[4 * ix + field / 6] } else { 0 };
-                let count = if sh_degree > 0 { word >> (5 * (field % 6)) & 31 } else { 16 };
+                let word = if sh_degree > 0 {
+                    sh_words[4 * ix + field / 6]
+                } else {
+                    0
+                };
+                let count = if sh_degree > 0 {
+                    word >> (5 * (field % 6)) & 31
+                } else {
+                    16
+                };
                 ((f64::from(count) - 16.0) / 15.0 * range) as f32
             }));
         }
@@ -69,7 +117,10 @@ fn decoded(data: &ChunkData) -> SplatArrays {
 
 /// The splats of several chunks.
 fn joined<'a>(chunks: impl IntoIterator<Item = &'a ChunkData>) -> SplatArrays {
-    let mut all = SplatArrays { sh_degree: MAX_SH_DEGREE, ..SplatArrays::default() };
+    let mut all = SplatArrays {
+        sh_degree: MAX_SH_DEGREE,
+        ..SplatArrays::default()
+    };
     for splats in chunks.into_iter().map(decoded) {
         all.means.extend(splats.means);
         all.log_scales.extend(splats.log_scales);
@@ -85,7 +136,10 @@ fn coarse_or_fine(chunk: &ModelChunk) -> &ChunkData {
 }
 
 fn model(splats: &SplatArrays) -> SplatTrainer {
-    let options = ModelOptions::from(SplatOptions { max_splats: 1_000_000, ..SplatOptions::default() });
+    let options = ModelOptions::from(SplatOptions {
+        max_splats: 1_000_000,
+        ..SplatOptions::default()
+    });
     SplatTrainer::from_arrays(test_gpu(), options, splats).unwrap()
 }
 
@@ -94,12 +148,16 @@ fn drawn(splats: &SplatArrays, request: &RenderRequest) -> Picture {
 }
 
 fn psnr_of(request: &RenderRequest, picture: &Picture, expected: &Picture) -> f64 {
-    psnr(&PixelPair::new(request.size_px, &picture.rgba_srgb, &expected.rgba_srgb).unwrap()).unwrap()
+    psnr(&PixelPair::new(request.size_px, &picture.rgba_srgb, &expected.rgba_srgb).unwrap())
+        .unwrap()
 }
 
 fn worst(got: &[f32], expected: &[f32]) -> f64 {
     assert_eq!(got.len(), expected.len());
-    got.iter().zip(expected).map(|(got, expected)| f64::from((got - expected).abs())).fold(0.0, f64::max)
+    got.iter()
+        .zip(expected)
+        .map(|(got, expected)| f64::from((got - expected).abs()))
+        .fold(0.0, f64::max)
 }
 
 #[test]
@@ -109,24 +167,45 @@ fn values_are_rounded_within_their_steps() {
     let data = encode(&splats, &members, 1.0, 2);
     assert_eq!(data.bytes.len(), 32 * 2000);
     let got = decoded(&data);
-    let ChunkLayout::Splats { log_scale_range: [low, high], sh_ranges, .. } = data.layout else { panic!("splats") };
+    let ChunkLayout::Splats {
+        log_scale_range: [low, high],
+        sh_ranges,
+        ..
+    } = data.layout
+    else {
+        panic!("splats")
+    };
     // A cube with an edge of 2 m.
     assert!(worst(got.means.as_flattened(), splats.means.as_flattened()) < 0.51 * 2.0 / 8191.0);
     let scale_step = f64::from(high - low) / 255.0;
-    assert!(worst(got.log_scales.as_flattened(), splats.log_scales.as_flattened()) < 0.51 * scale_step);
+    assert!(
+        worst(
+            got.log_scales.as_flattened(),
+            splats.log_scales.as_flattened()
+        ) < 0.51 * scale_step
+    );
     let rotation = |wxyz: [f32; 4]| {
         let [w, x, y, z] = wxyz.map(f64::from);
         UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z))
     };
-    let angles =
-        got.rotations_wxyz.iter().zip(&splats.rotations_wxyz).map(|(a, b)| rotation(*a).angle_to(&rotation(*b)));
+    let angles = got
+        .rotations_wxyz
+        .iter()
+        .zip(&splats.rotations_wxyz)
+        .map(|(a, b)| rotation(*a).angle_to(&rotation(*b)));
     let worst_rad = angles.fold(0.0, f64::max);
     assert!(worst_rad < 0.004, "{worst_rad} rad");
     for ix in &members {
-        assert!((got.opacity(*ix as usize) - splats.opacity(*ix as usize)).abs() < 0.51 / 255.0 + 1e-3);
+        assert!(
+            (got.opacity(*ix as usize) - splats.opacity(*ix as usize)).abs() < 0.51 / 255.0 + 1e-3
+        );
     }
     let coefficients = |splats: &SplatArrays, functions: std::ops::Range<usize>| -> Vec<f32> {
-        splats.sh.chunks_exact(9).flat_map(|of| of[functions.clone()].as_flattened().to_vec()).collect()
+        splats
+            .sh
+            .chunks_exact(9)
+            .flat_map(|of| of[functions.clone()].as_flattened().to_vec())
+            .collect()
     };
     let constants = [coefficients(&got, 0..1), coefficients(&splats, 0..1)];
     let is_in_range = |value: &f32| (0.282 * value).abs() < 0.99;
@@ -140,9 +219,18 @@ fn values_are_rounded_within_their_steps() {
     });
     assert!(worst(&got_constants, &constants) < 0.51 * 2.0 / 255.0 / 0.282);
     for (functions, range) in [(1..4, sh_ranges[0]), (4..9, sh_ranges[1])] {
-        let (got, exact) = (coefficients(&got, functions.clone()), coefficients(&splats, functions));
-        let clamped: Vec<f32> = exact.iter().map(|value| value.clamp(-range, range)).collect();
-        assert!(worst(&got, &clamped) < 0.51 * f64::from(range) / 15.0, "range {range}");
+        let (got, exact) = (
+            coefficients(&got, functions.clone()),
+            coefficients(&splats, functions),
+        );
+        let clamped: Vec<f32> = exact
+            .iter()
+            .map(|value| value.clamp(-range, range))
+            .collect();
+        assert!(
+            worst(&got, &clamped) < 0.51 * f64::from(range) / 15.0,
+            "range {range}"
+        );
         // Four standard deviations of 0.2.
         assert!((0.5..=0.81).contains(&range), "{range}");
     }
@@ -153,7 +241,10 @@ fn scan_request() -> RenderRequest {
     RenderRequest {
         world_from_camera: kinematics::Transform::translation(0.0, 0.0, -3.2),
         size_px: [320, 240],
-        projection: Projection::Pinhole { focal_px: [288.0; 2], principal_px: [160.0, 120.0] },
+        projection: Projection::Pinhole {
+            focal_px: [288.0; 2],
+            principal_px: [160.0, 120.0],
+        },
         ..request(kinematics::Transform::identity())
     }
 }
@@ -167,7 +258,9 @@ fn pictures_of_decoded_chunks_are_accurate() {
     let expected = drawn(&splats, &request);
     let fine = joined(chunks.chunks.iter().map(|chunk| &chunk.fine));
     let coarse = joined(chunks.chunks.iter().map(coarse_or_fine));
-    assert!(COARSE_STRIDE * coarse.n_splats() < fine.n_splats() + COARSE_STRIDE * chunks.chunks.len());
+    assert!(
+        COARSE_STRIDE * coarse.n_splats() < fine.n_splats() + COARSE_STRIDE * chunks.chunks.len()
+    );
     let fine_db = psnr_of(&request, &drawn(&fine, &request), &expected);
     let coarse_db = psnr_of(&request, &drawn(&coarse, &request), &expected);
     eprintln!("fine {fine_db:.1} dB, coarse {coarse_db:.1} dB");
@@ -183,11 +276,20 @@ fn pictures_of_a_trained_model_are_accurate() {
     for keyframe in &keyframes {
         trainer.push(keyframe.clone()).unwrap();
     }
-    assert!(trainer.queue_chunks(true, &Arc::default()).unwrap().is_none(), "no splats yet");
+    assert!(
+        trainer
+            .queue_chunks(true, &Arc::default())
+            .unwrap()
+            .is_none(),
+        "no splats yet"
+    );
     while trainer.progress().step < 100 {
         trainer.step(20).unwrap();
     }
-    let pending = trainer.queue_chunks(true, &Arc::default()).unwrap().unwrap();
+    let pending = trainer
+        .queue_chunks(true, &Arc::default())
+        .unwrap()
+        .unwrap();
     let request = request(keyframes[3].world_from_camera);
     let expected = trainer.render(&request).unwrap();
     // Later training does not affect the result.
@@ -195,15 +297,45 @@ fn pictures_of_a_trained_model_are_accurate() {
         trainer.step(20).unwrap();
     }
     let chunks = pending.finish().unwrap();
-    let db = psnr_of(&request, &drawn(&joined(chunks.chunks.iter().map(|chunk| &chunk.fine)), &request), &expected);
+    let db = psnr_of(
+        &request,
+        &drawn(
+            &joined(chunks.chunks.iter().map(|chunk| &chunk.fine)),
+            &request,
+        ),
+        &expected,
+    );
     assert!(db > 36.0, "{db} dB");
-    let later = trainer.queue_chunks(true, &Arc::default()).unwrap().unwrap().finish().unwrap();
-    assert!(!later.is_complete && !later.chunks.is_empty(), "training changes splats");
+    let later = trainer
+        .queue_chunks(true, &Arc::default())
+        .unwrap()
+        .unwrap()
+        .finish()
+        .unwrap();
     assert!(
-        trainer.queue_chunks(true, &Arc::default()).unwrap().unwrap().finish().unwrap().chunks.is_empty(),
+        !later.is_complete && !later.chunks.is_empty(),
+        "training changes splats"
+    );
+    assert!(
+        trainer
+            .queue_chunks(true, &Arc::default())
+            .unwrap()
+            .unwrap()
+            .finish()
+            .unwrap()
+            .chunks
+            .is_empty(),
         "nothing has changed"
     );
-    assert!(trainer.queue_chunks(false, &Arc::default()).unwrap().unwrap().finish().unwrap().is_complete);
+    assert!(
+        trainer
+            .queue_chunks(false, &Arc::default())
+            .unwrap()
+            .unwrap()
+            .finish()
+            .unwrap()
+            .is_complete
+    );
 }
 
 #[test]
@@ -216,7 +348,9 @@ fn changes_are_listed_where_they_are_and_by_their_size() {
             assert!(known.remove(id).is_some(), "an unknown chunk is removed");
         }
         for chunk in &new.chunks {
-            let ChunkLayout::Splats { n_splats, .. } = chunk.fine.layout else { panic!("splats") };
+            let ChunkLayout::Splats { n_splats, .. } = chunk.fine.layout else {
+                panic!("splats")
+            };
             known.insert(chunk.id, n_splats);
         }
         known.values().sum::<usize>()
@@ -244,7 +378,11 @@ fn changes_are_listed_where_they_are_and_by_their_size() {
         splats.sh[9 * ix][0] += change;
     }
     let changed = chunker.chunks(&splats, true);
-    assert!(changed.removed.is_empty() && changed.chunks.len() == 2, "{} chunks", changed.chunks.len());
+    assert!(
+        changed.removed.is_empty() && changed.chunks.len() == 2,
+        "{} chunks",
+        changed.chunks.len()
+    );
     let mut changes: Vec<f64> = changed.chunks.iter().map(|chunk| chunk.change).collect();
     changes.sort_by(f64::total_cmp);
     assert!(changes[1] > 2.0 * changes[0], "{changes:?}");
@@ -259,5 +397,8 @@ fn changes_are_listed_where_they_are_and_by_their_size() {
     let grown = chunker.chunks(&splats, true);
     assert!(!grown.removed.is_empty());
     assert_eq!(apply(&grown), n_visible(&splats));
-    assert!(n_visible(&splats) < splats.n_splats(), "transparent splats and NaN are left out");
+    assert!(
+        n_visible(&splats) < splats.n_splats(),
+        "transparent splats and NaN are left out"
+    );
 }

@@ -118,13 +118,21 @@ impl<'a> Header<'a> {
     /// Parses the header and finds the tables.
     pub(super) fn parse(bytes: &'a [u8]) -> Result<Self, String> {
         let searched = &bytes[..bytes.len().min(MAX_HEADER_BYTES)];
-        let end = [&b"\nend_header\n"[..], b"\nend_header\r\n"].into_iter().find_map(|end| {
-            let at = searched.windows(end.len()).position(|window| window == end)?;
-            Some((at, at + end.len()))
-        });
+        let end = [&b"\nend_header\n"[..], b"\nend_header\r\n"]
+            .into_iter()
+            .find_map(|end| {
+                let at = searched
+                    .windows(end.len())
+                    .position(|window| window == end)?;
+                Some((at, at + end.len()))
+            });
         let (end, start) = end.ok_or("it has no PLY header")?;
         let text = std::str::from_utf8(&bytes[..end]).map_err(|_| "the header is not UTF-8")?;
-        let mut header = Self { elements: Vec::new(), comments: Vec::new(), n_unread: 0 };
+        let mut header = Self {
+            elements: Vec::new(),
+            comments: Vec::new(),
+            n_unread: 0,
+        };
         let mut lines = text.lines().map(|line| line.trim_end_matches('\r'));
         if lines.next() != Some("ply") {
             return Err("the header does not begin with \"ply\"".to_owned());
@@ -161,7 +169,10 @@ impl<'a> Header<'a> {
         if !element.lists.is_empty() {
             return Err(format!("element {name:?} has a list, expected numbers"));
         }
-        Ok(Table { element, rows: element.rows.as_ref().map_err(Clone::clone)? })
+        Ok(Table {
+            element,
+            rows: element.rows.as_ref().map_err(Clone::clone)?,
+        })
     }
 
     fn parse_line(&mut self, line: &str, format: &mut Option<Format>) -> Result<(), String> {
@@ -178,10 +189,19 @@ impl<'a> Header<'a> {
                 });
             }
             (["element", name, count], _) => {
-                let count = count.parse().map_err(|_| format!("element {name}: count {count:?} is not a number"))?;
+                let count = count
+                    .parse()
+                    .map_err(|_| format!("element {name}: count {count:?} is not a number"))?;
                 let (name, rows) = ((*name).to_owned(), Err("it is not in the file".to_owned()));
                 let (properties, lists) = (Vec::new(), Vec::new());
-                self.elements.push(Element { name, count, row_bytes: 0, properties, lists, rows });
+                self.elements.push(Element {
+                    name,
+                    count,
+                    row_bytes: 0,
+                    properties,
+                    lists,
+                    rows,
+                });
             }
             (["property", "list", length, word, name], Some(element)) => {
                 let types = [length, word].map(|word| NumberType::of(word));
@@ -189,15 +209,28 @@ impl<'a> Header<'a> {
                     return Err(format!("property {name}: unknown type in {line:?}"));
                 };
                 let (n_before, bytes_before) = (element.properties.len(), element.row_bytes);
-                element.lists.push(List { length, number, n_before, bytes_before });
+                element.lists.push(List {
+                    length,
+                    number,
+                    n_before,
+                    bytes_before,
+                });
             }
             (["property", word, name], Some(element)) => {
-                let number_type =
-                    NumberType::of(word).ok_or_else(|| format!("property {name}: unknown type {word:?}"))?;
-                if element.properties.iter().any(|property| property.name == *name) {
+                let number_type = NumberType::of(word)
+                    .ok_or_else(|| format!("property {name}: unknown type {word:?}"))?;
+                if element
+                    .properties
+                    .iter()
+                    .any(|property| property.name == *name)
+                {
                     return Err(format!("element {}: two properties {name:?}", element.name));
                 }
-                element.properties.push(Property { name: (*name).to_owned(), number_type, offset: element.row_bytes });
+                element.properties.push(Property {
+                    name: (*name).to_owned(),
+                    number_type,
+                    offset: element.row_bytes,
+                });
                 element.row_bytes += number_type.bytes();
             }
             _ => return Err(format!("unknown header line {line:?}")),
@@ -212,7 +245,8 @@ impl<'a> Header<'a> {
                 true => element.count.checked_mul(element.row_bytes),
                 false => bytes_with_lists(element, rest, format),
             };
-            let Some((rows, after)) = n_bytes.and_then(|n_bytes| rest.split_at_checked(n_bytes)) else {
+            let Some((rows, after)) = n_bytes.and_then(|n_bytes| rest.split_at_checked(n_bytes))
+            else {
                 element.rows = Err(truncated(element));
                 return;
             };
@@ -227,24 +261,32 @@ impl<'a> Header<'a> {
 
     /// Converts the rows of each element to binary.
     fn read_ascii(&mut self, text: &[u8]) {
-        let mut lines = text.split(|byte| *byte == b'\n').filter(|line| !line.trim_ascii().is_empty());
+        let mut lines = text
+            .split(|byte| *byte == b'\n')
+            .filter(|line| !line.trim_ascii().is_empty());
         for element in &mut self.elements {
             // A number and a space take at least two bytes.
-            let n_words = element.count.checked_mul(element.properties.len() + element.lists.len());
+            let n_words = element
+                .count
+                .checked_mul(element.properties.len() + element.lists.len());
             if n_words.is_none_or(|n_words| n_words > text.len().div_ceil(2)) {
                 element.rows = Err(truncated(element));
                 return;
             }
             let mut rows = Vec::with_capacity(element.count * element.row_bytes);
             let mut read_row = || -> Option<Result<(), String>> {
-                let mut words = std::str::from_utf8(lines.next()?).ok()?.split_ascii_whitespace();
+                let mut words = std::str::from_utf8(lines.next()?)
+                    .ok()?
+                    .split_ascii_whitespace();
                 let n_expected = element.properties.len();
                 let wrong = || Some(Err(format!("it does not have {n_expected} numbers")));
                 for (property_ix, property) in element.properties.iter().enumerate() {
                     if skip_lists(&element.lists, property_ix, &mut words).is_none() {
                         return wrong();
                     }
-                    let Some(word) = words.next() else { return wrong() };
+                    let Some(word) = words.next() else {
+                        return wrong();
+                    };
                     let Some(bytes) = property.number_type.little_endian(word) else {
                         let shown: String = word.chars().take(30).collect();
                         return Some(Err(format!(
@@ -255,7 +297,11 @@ impl<'a> Header<'a> {
                     rows.extend(bytes);
                 }
                 let is_complete = skip_lists(&element.lists, n_expected, &mut words).is_some();
-                if is_complete && words.next().is_none() { Some(Ok(())) } else { wrong() }
+                if is_complete && words.next().is_none() {
+                    Some(Ok(()))
+                } else {
+                    wrong()
+                }
             };
             let problem = (0..element.count).find_map(|row| match read_row() {
                 Some(Ok(())) => None,
@@ -273,11 +319,19 @@ impl<'a> Header<'a> {
 }
 
 fn truncated(element: &Element<'_>) -> String {
-    format!("truncated: fewer than {} rows of {:?}", element.count, element.name)
+    format!(
+        "truncated: fewer than {} rows of {:?}",
+        element.count, element.name
+    )
 }
 
-/// Skips the lists that follow the given number of other properties in a row of text; `None` if they are not complete.
-fn skip_lists<'a>(lists: &[List], n_before: usize, words: &mut impl Iterator<Item = &'a str>) -> Option<()> {
+/// Skips the lists that follow the given number of other properties in a row of text; `None` if
+/// they are not complete.
+fn skip_lists<'a>(
+    lists: &[List],
+    n_before: usize,
+    words: &mut impl Iterator<Item = &'a str>,
+) -> Option<()> {
     for _ in lists.iter().filter(|list| list.n_before == n_before) {
         let length: usize = words.next()?.parse().ok()?;
         for _ in 0..length {
@@ -295,12 +349,19 @@ fn bytes_with_lists(element: &Element<'_>, bytes: &[u8], format: Format) -> Opti
         for list in &element.lists {
             at = at.checked_add(list.bytes_before - n_passed_bytes)?;
             n_passed_bytes = list.bytes_before;
-            let mut length = bytes.get(at..at.checked_add(list.length.bytes())?)?.to_vec();
+            let mut length = bytes
+                .get(at..at.checked_add(list.length.bytes())?)?
+                .to_vec();
             if format == Format::BigEndian {
                 length.reverse();
             }
-            let n_number_bytes = list.length.length(&length)?.checked_mul(list.number.bytes())?;
-            at = at.checked_add(list.length.bytes())?.checked_add(n_number_bytes)?;
+            let n_number_bytes = list
+                .length
+                .length(&length)?
+                .checked_mul(list.number.bytes())?;
+            at = at
+                .checked_add(list.length.bytes())?
+                .checked_add(n_number_bytes)?;
         }
         at = at.checked_add(element.row_bytes - n_passed_bytes)?;
     }
@@ -331,18 +392,37 @@ impl<'a> Table<'a> {
 
     /// Names of the properties.
     pub(super) fn names(&self) -> impl Iterator<Item = &'a str> {
-        self.element.properties.iter().map(|property| property.name.as_str())
+        self.element
+            .properties
+            .iter()
+            .map(|property| property.name.as_str())
     }
 
     pub(super) fn column(&self, name: &str) -> Result<Column<'a>, String> {
-        let property = self.element.properties.iter().find(|property| property.name == name);
-        let property = property.ok_or_else(|| format!("element {:?} has no property {name:?}", self.element.name))?;
-        Ok(Column { property, row_bytes: self.element.row_bytes, rows: self.rows })
+        let property = self
+            .element
+            .properties
+            .iter()
+            .find(|property| property.name == name);
+        let property = property
+            .ok_or_else(|| format!("element {:?} has no property {name:?}", self.element.name))?;
+        Ok(Column {
+            property,
+            row_bytes: self.element.row_bytes,
+            rows: self.rows,
+        })
     }
 
-    pub(super) fn columns<const N: usize>(&self, names: [&str; N]) -> Result<[Column<'a>; N], String> {
+    pub(super) fn columns<const N: usize>(
+        &self,
+        names: [&str; N],
+    ) -> Result<[Column<'a>; N], String> {
         let columns: Result<Vec<_>, _> = names.into_iter().map(|name| self.column(name)).collect();
-        columns.map(|columns| columns.try_into().unwrap_or_else(|_| unreachable!("as many columns as names")))
+        columns.map(|columns| {
+            columns
+                .try_into()
+                .unwrap_or_else(|_| unreachable!("as many columns as names"))
+        })
     }
 }
 
@@ -383,12 +463,17 @@ impl Column<'_> {
     pub(super) fn bits(&self, row: usize) -> Result<u32, String> {
         match self.property.number_type {
             NumberType::U32 => Ok(u32::from_le_bytes(self.bytes(row))),
-            other => Err(format!("property {:?} has type {other:?}, expected uint", self.property.name)),
+            other => Err(format!(
+                "property {:?} has type {other:?}, expected uint",
+                self.property.name
+            )),
         }
     }
 
     fn bytes<const N: usize>(&self, row: usize) -> [u8; N] {
         let start = row * self.row_bytes + self.property.offset;
-        self.rows[start..start + N].try_into().expect("the slice has this length")
+        self.rows[start..start + N]
+            .try_into()
+            .expect("the slice has this length")
     }
 }

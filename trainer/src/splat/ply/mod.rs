@@ -1,5 +1,5 @@
-//! Splats in `.ply` files: reads and writes the layout of Kerbl et al. 2023, and reads the packed layout of
-//! `SuperSplat`. Reads point clouds, too.
+//! Splats in `.ply` files: reads and writes the layout of Kerbl et al. 2023, and reads the packed
+//! layout of `SuperSplat`. Reads point clouds, too.
 
 mod header;
 mod packed;
@@ -15,34 +15,45 @@ use std::path::Path;
 
 /// Constant factor of the first spherical harmonic, `1 / (2 sqrt(pi))`.
 pub(super) const SH_0: f32 = 0.282_094_8;
-/// Thickness of a flat splat (2D Gaussian splatting), relative to its smaller radius, as a logarithm.
+/// Thickness of a flat splat (2D Gaussian splatting), relative to its smaller radius, as a
+/// logarithm.
 const LOG_FLATNESS: f32 = -7.0;
-/// Properties of splats that are not used: normals, which are zero in these files, and names of other programs for numbers
-/// that do not affect pictures.
+/// Properties of splats that are not used: normals, which are zero in these files, and names of
+/// other programs for numbers that do not affect pictures.
 const UNUSED: [&str; 5] = ["nx", "ny", "nz", "label", "id"];
 
-/// Reads a `.ply` file of splats. Properties may have any order and number type, and the file any format. The number of
-/// `f_rest_*` properties determines the SH degree.
+/// Reads a `.ply` file of splats. Properties may have any order and number type, and the file any
+/// format. The number of `f_rest_*` properties determines the SH degree.
 ///
-/// Splats with invalid numbers are left out, and properties that are not used are named, both with a warning.
+/// Splats with invalid numbers are left out, and properties that are not used are named, both with
+/// a warning.
 pub fn read(path: &Path) -> Result<SplatArrays, Error> {
-    let bytes =
-        files::read(path, files::Budget::SPLATS).map_err(|source| Error::Read { path: path.to_owned(), source })?;
-    let (splats, notes) = from_bytes(&bytes).map_err(|reason| Error::SplatFile { path: path.to_owned(), reason })?;
+    let bytes = files::read(path, files::Budget::SPLATS).map_err(|source| Error::Read {
+        path: path.to_owned(),
+        source,
+    })?;
+    let (splats, notes) = from_bytes(&bytes).map_err(|reason| Error::SplatFile {
+        path: path.to_owned(),
+        reason,
+    })?;
     for note in notes {
         log::warn!("{}: {note}", path.display());
     }
     splats.without_invalid(path)
 }
 
-/// Writes a `.ply` file of splats as little-endian f32. A failed write leaves no partial file at `path`.
+/// Writes a `.ply` file of splats as little-endian f32. A failed write leaves no partial file at
+/// `path`.
 pub fn write(path: &Path, splats: &SplatArrays) -> Result<(), Error> {
     let written = files::replace(path, |file| {
         let mut file = BufWriter::new(file);
         write_to(&mut file, splats)?;
         file.flush()
     });
-    written.map_err(|source| Error::Write { path: path.to_owned(), source })
+    written.map_err(|source| Error::Write {
+        path: path.to_owned(),
+        source,
+    })
 }
 
 /// The splats, and notes about what is not used.
@@ -51,16 +62,29 @@ fn from_bytes(bytes: &[u8]) -> Result<(SplatArrays, Vec<String>), String> {
     let mut notes = Vec::new();
     let is_antialiased = is_antialiased(header.comments());
     if header.n_unread() > 0 {
-        notes.push(format!("{} bytes after the last row are not used", header.n_unread()));
+        notes.push(format!(
+            "{} bytes after the last row are not used",
+            header.n_unread()
+        ));
     }
     if header.has_element("chunk") {
-        return Ok((SplatArrays { is_antialiased, ..packed::splats(&header)? }, notes));
+        return Ok((
+            SplatArrays {
+                is_antialiased,
+                ..packed::splats(&header)?
+            },
+            notes,
+        ));
     }
     let vertices = header.table("vertex")?;
     let names: Vec<&str> = vertices.names().collect();
-    let is_splat = |name: &&str| name.starts_with("scale_") || name.starts_with("rot_") || *name == "opacity";
+    let is_splat =
+        |name: &&str| name.starts_with("scale_") || name.starts_with("rot_") || *name == "opacity";
     if !names.iter().any(is_splat) {
-        return Err("it is a point cloud or a mesh: its vertices have no scales, rotations and opacities".to_owned());
+        return Err(
+            "it is a point cloud or a mesh: its vertices have no scales, rotations and opacities"
+                .to_owned(),
+        );
     }
     let means = vertices.columns(["x", "y", "z"])?;
     let scales = Scales::of(&vertices)?;
@@ -69,17 +93,33 @@ fn from_bytes(bytes: &[u8]) -> Result<(SplatArrays, Vec<String>), String> {
     let color = ColorColumns::of(&vertices)?;
     notes.extend(color.note());
     let filter = vertices.column("filter_3D").ok();
-    let unused: Vec<&str> = names.iter().copied().filter(|name| !is_used(name, &color)).collect();
+    let unused: Vec<&str> = names
+        .iter()
+        .copied()
+        .filter(|name| !is_used(name, &color))
+        .collect();
     if !unused.is_empty() {
-        notes.push(format!("properties that are not used: {}", unused.join(", ")));
+        notes.push(format!(
+            "properties that are not used: {}",
+            unused.join(", ")
+        ));
     }
     let rows = 0..vertices.n_rows();
     let mut splats = SplatArrays {
-        means: rows.clone().map(|row| means.each_ref().map(|column| column.f32(row))).collect(),
+        means: rows
+            .clone()
+            .map(|row| means.each_ref().map(|column| column.f32(row)))
+            .collect(),
         log_scales: rows.clone().map(|row| scales.log_scales(row)).collect(),
-        rotations_wxyz: rows.clone().map(|row| rotations.each_ref().map(|column| column.f32(row))).collect(),
+        rotations_wxyz: rows
+            .clone()
+            .map(|row| rotations.each_ref().map(|column| column.f32(row)))
+            .collect(),
         opacity_logits: rows.clone().map(|row| opacity.f32(row)).collect(),
-        sh: rows.clone().flat_map(|row| color.coefficients(row)).collect(),
+        sh: rows
+            .clone()
+            .flat_map(|row| color.coefficients(row))
+            .collect(),
         sh_degree: color.degree,
         is_antialiased,
     };
@@ -89,10 +129,11 @@ fn from_bytes(bytes: &[u8]) -> Result<(SplatArrays, Vec<String>), String> {
     Ok((splats, notes))
 }
 
-/// Whether the comments name the opacity correction of Mip-Splatting, as Brush (`SplatRenderMode: mip`) and Postshot
-/// (`antialiased 1`) do. The last such comment counts.
+/// Whether the comments name the opacity correction of Mip-Splatting, as Brush (`SplatRenderMode:
+/// mip`) and Postshot (`antialiased 1`) do. The last such comment counts.
 fn is_antialiased(comments: &[String]) -> bool {
-    let by_comment = |comment: &String| match comment.to_ascii_lowercase().replace(' ', "").as_str() {
+    let by_comment = |comment: &String| match comment.to_ascii_lowercase().replace(' ', "").as_str()
+    {
         "splatrendermode:mip" | "antialiased1" => Some(true),
         "splatrendermode:default" | "splatrendermode:2dgs" | "antialiased0" => Some(false),
         _ => None,
@@ -109,15 +150,23 @@ fn is_used(name: &str, color: &ColorColumns<'_>) -> bool {
     is_color
         || known.contains(&name)
         || UNUSED.contains(&name)
-        || ["scale_", "rot_", "f_rest_"].iter().any(|start| name.starts_with(start))
+        || ["scale_", "rot_", "f_rest_"]
+            .iter()
+            .any(|start| name.starts_with(start))
 }
 
-/// Applies the 3D filter of Mip-Splatting (Yu et al. 2024), as its renderer does: adds the filter's variance
-/// to the variance along each axis, and multiplies the opacity by the ratio of the old volume to the new.
+/// Applies the 3D filter of Mip-Splatting (Yu et al. 2024), as its renderer does: adds the filter's
+/// variance to the variance along each axis, and multiplies the opacity by the ratio of the old
+/// volume to the new.
 fn widen(splats: &mut SplatArrays, row: usize, filter_m: f32) {
     let variances = splats.log_scales[row].map(|log_scale| (2.0 * log_scale).exp());
     let widened = variances.map(|variance| variance + filter_m * filter_m);
-    let ratio = variances.iter().zip(&widened).map(|(before, after)| before / after).product::<f32>().sqrt();
+    let ratio = variances
+        .iter()
+        .zip(&widened)
+        .map(|(before, after)| before / after)
+        .product::<f32>()
+        .sqrt();
     let opacity = ratio / (1.0 + (-splats.opacity_logits[row]).exp());
     splats.log_scales[row] = widened.map(|variance| 0.5 * variance.ln());
     splats.opacity_logits[row] = (opacity / (1.0 - opacity)).ln();
@@ -149,12 +198,14 @@ impl<'a> Scales<'a> {
     }
 }
 
-/// The columns of the color coefficients. Files store all higher coefficients of red, then of green, then of blue.
+/// The columns of the color coefficients. Files store all higher coefficients of red, then of
+/// green, then of blue.
 struct ColorColumns<'a> {
     degree: u32,
     constant: ConstantColor<'a>,
     rest: Vec<Column<'a>>,
-    /// Higher coefficients per channel in the file; more than are used if the file has a higher degree.
+    /// Higher coefficients per channel in the file; more than are used if the file has a higher
+    /// degree.
     n_rest: usize,
 }
 
@@ -171,38 +222,57 @@ impl<'a> ColorColumns<'a> {
         let constant = match vertices.columns(["f_dc_0", "f_dc_1", "f_dc_2"]) {
             Ok(columns) => ConstantColor::Coefficients(columns),
             Err(missing) => {
-                let channels = vertices.columns(["red", "green", "blue"]).map_err(|_| missing)?;
+                let channels = vertices
+                    .columns(["red", "green", "blue"])
+                    .map_err(|_| missing)?;
                 ConstantColor::Channels(channels)
             }
         };
-        Ok(Self { degree, constant, rest, n_rest })
+        Ok(Self {
+            degree,
+            constant,
+            rest,
+            n_rest,
+        })
     }
 
     fn note(&self) -> Option<String> {
         let n_used = (self.degree as usize + 1).pow(2) - 1;
-        (self.n_rest > n_used).then(|| "its color coefficients above degree 3 are not used".to_owned())
+        (self.n_rest > n_used)
+            .then(|| "its color coefficients above degree 3 are not used".to_owned())
     }
 
     fn coefficients(&self, row: usize) -> Vec<[f32; 3]> {
         let constant = match &self.constant {
-            ConstantColor::Coefficients(columns) => columns.each_ref().map(|column| column.f32(row)),
-            ConstantColor::Channels(columns) => columns.each_ref().map(|column| (column.channel(row) - 0.5) / SH_0),
+            ConstantColor::Coefficients(columns) => {
+                columns.each_ref().map(|column| column.f32(row))
+            }
+            ConstantColor::Channels(columns) => columns
+                .each_ref()
+                .map(|column| (column.channel(row) - 0.5) / SH_0),
         };
         let n_used = (self.degree as usize + 1).pow(2) - 1;
-        let rest = (0..n_used).map(|ix| std::array::from_fn(|color| self.rest[color * self.n_rest + ix].f32(row)));
+        let rest = (0..n_used)
+            .map(|ix| std::array::from_fn(|color| self.rest[color * self.n_rest + ix].f32(row)));
         std::iter::once(constant).chain(rest).collect()
     }
 }
 
 /// SH degree that is used, and the columns `f_rest_*`.
 fn rest_columns<'a>(table: &Table<'a>) -> Result<(u32, Vec<Column<'a>>), String> {
-    let rest: Vec<_> = (0..).map_while(|ix| table.column(&format!("f_rest_{ix}")).ok()).collect();
+    let rest: Vec<_> = (0..)
+        .map_while(|ix| table.column(&format!("f_rest_{ix}")).ok())
+        .collect();
     let degree = match rest.len() {
         0 => 0,
         9 => 1,
         24 => 2,
         45 | 72 => 3,
-        other => return Err(format!("found {other} f_rest_* properties, expected 0, 9, 24, 45 or 72")),
+        other => {
+            return Err(format!(
+                "found {other} f_rest_* properties, expected 0, 9, 24, 45 or 72"
+            ));
+        }
     };
     Ok((degree, rest))
 }
@@ -210,19 +280,43 @@ fn rest_columns<'a>(table: &Table<'a>) -> Result<(u32, Vec<Column<'a>>), String>
 fn write_to(file: &mut impl Write, splats: &SplatArrays) -> std::io::Result<()> {
     let n_coefficients = splats.n_coefficients();
     let rest = (0..3 * (n_coefficients - 1)).map(|ix| format!("f_rest_{ix}"));
-    let before = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"].map(str::to_owned);
-    let after = ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"].map(str::to_owned);
-    let comment = if splats.is_antialiased { "comment SplatRenderMode: mip\n" } else { "" };
-    writeln!(file, "ply\nformat binary_little_endian 1.0\n{comment}element vertex {}", splats.n_splats())?;
+    let before = [
+        "x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2",
+    ]
+    .map(str::to_owned);
+    let after = [
+        "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3",
+    ]
+    .map(str::to_owned);
+    let comment = if splats.is_antialiased {
+        "comment SplatRenderMode: mip\n"
+    } else {
+        ""
+    };
+    writeln!(
+        file,
+        "ply\nformat binary_little_endian 1.0\n{comment}element vertex {}",
+        splats.n_splats()
+    )?;
     for name in before.into_iter().chain(rest).chain(after) {
         writeln!(file, "property float {name}")?;
     }
     writeln!(file, "end_header")?;
     for (splat_ix, color) in splats.sh.chunks_exact(n_coefficients).enumerate() {
         let no_normal = [0.0; 3];
-        let rest = (0..3).flat_map(|channel| color[1..].iter().map(move |coefficient| coefficient[channel]));
-        let values = splats.means[splat_ix].into_iter().chain(no_normal).chain(color[0]).chain(rest);
-        let values = values.chain([splats.opacity_logits[splat_ix]]).chain(splats.log_scales[splat_ix]);
+        let rest = (0..3).flat_map(|channel| {
+            color[1..]
+                .iter()
+                .map(move |coefficient| coefficient[channel])
+        });
+        let values = splats.means[splat_ix]
+            .into_iter()
+            .chain(no_normal)
+            .chain(color[0])
+            .chain(rest);
+        let values = values
+            .chain([splats.opacity_logits[splat_ix]])
+            .chain(splats.log_scales[splat_ix]);
         for value in values.chain(splats.rotations_wxyz[splat_ix]) {
             file.write_all(&value.to_le_bytes())?;
         }

@@ -1,5 +1,5 @@
-//! The packed `.ply` layout of `SuperSplat`. A splat takes 16 bytes; each chunk of 256 splats has common bounds. Higher
-//! color coefficients have 8 bits each.
+//! The packed `.ply` layout of `SuperSplat`. A splat takes 16 bytes; each chunk of 256 splats has
+//! common bounds. Higher color coefficients have 8 bits each.
 
 use super::header::{Column, Header, Table};
 use super::{SH_0, rest_columns};
@@ -15,33 +15,59 @@ const MIN_OPACITY: f32 = 0.5 / 255.0;
 pub(super) fn splats(header: &Header<'_>) -> Result<SplatArrays, String> {
     let (chunks, vertices) = (header.table("chunk")?, header.table("vertex")?);
     if vertices.n_rows().div_ceil(SPLATS_PER_CHUNK) != chunks.n_rows() {
-        return Err(format!("{} splats do not match {} chunks of 256", vertices.n_rows(), chunks.n_rows()));
+        return Err(format!(
+            "{} splats do not match {} chunks of 256",
+            vertices.n_rows(),
+            chunks.n_rows()
+        ));
     }
     let bounds = Bounds::of(&chunks)?;
-    let packed = vertices.columns(["packed_position", "packed_rotation", "packed_scale", "packed_color"])?;
+    let packed = vertices.columns([
+        "packed_position",
+        "packed_rotation",
+        "packed_scale",
+        "packed_color",
+    ])?;
     let (sh_degree, rest) = match header.has_element("sh") {
         true => {
             let sh = header.table("sh")?;
             if sh.n_rows() != vertices.n_rows() {
-                return Err(format!("element \"sh\" has {} rows, expected {}", sh.n_rows(), vertices.n_rows()));
+                return Err(format!(
+                    "element \"sh\" has {} rows, expected {}",
+                    sh.n_rows(),
+                    vertices.n_rows()
+                ));
             }
             rest_columns(&sh)?
         }
         false => (0, Vec::new()),
     };
-    let mut splats = SplatArrays { sh_degree, ..SplatArrays::default() };
+    let mut splats = SplatArrays {
+        sh_degree,
+        ..SplatArrays::default()
+    };
     for row in 0..vertices.n_rows() {
         let chunk = row / SPLATS_PER_CHUNK;
         let [position, rotation, scale, color] = [0, 1, 2, 3].map(|ix| packed[ix].bits(row));
-        splats.means.push(bounds.position.lerp(chunk, three_fractions(position?)));
+        splats
+            .means
+            .push(bounds.position.lerp(chunk, three_fractions(position?)));
         splats.rotations_wxyz.push(rotation_wxyz(rotation?));
-        splats.log_scales.push(bounds.log_scale.lerp(chunk, three_fractions(scale?)));
+        splats
+            .log_scales
+            .push(bounds.log_scale.lerp(chunk, three_fractions(scale?)));
         let [red, green, blue, opacity] = color?.to_be_bytes().map(|byte| f32::from(byte) / 255.0);
         let opacity = opacity.clamp(MIN_OPACITY, 1.0 - MIN_OPACITY);
         splats.opacity_logits.push((opacity / (1.0 - opacity)).ln());
-        splats.sh.push(bounds.color(chunk, [red, green, blue]).map(|value| (value - 0.5) / SH_0));
+        splats.sh.push(
+            bounds
+                .color(chunk, [red, green, blue])
+                .map(|value| (value - 0.5) / SH_0),
+        );
         splats.sh.extend((0..rest.len() / 3).map(|ix| {
-            std::array::from_fn(|channel| higher_coefficient(rest[channel * (rest.len() / 3) + ix].f32(row)))
+            std::array::from_fn(|channel| {
+                higher_coefficient(rest[channel * (rest.len() / 3) + ix].f32(row))
+            })
         }));
     }
     Ok(splats)
@@ -58,7 +84,10 @@ struct Bounds<'a> {
 impl<'a> Bounds<'a> {
     fn of(chunks: &Table<'a>) -> Result<Self, String> {
         let range = |min, max| -> Result<_, String> {
-            Ok(PropertyRange { min: chunks.columns(min)?, max: chunks.columns(max)? })
+            Ok(PropertyRange {
+                min: chunks.columns(min)?,
+                max: chunks.columns(max)?,
+            })
         };
         Ok(Self {
             position: range(["min_x", "min_y", "min_z"], ["max_x", "max_y", "max_z"])?,
@@ -71,7 +100,9 @@ impl<'a> Bounds<'a> {
     }
 
     fn color(&self, chunk: usize, frac: [f32; 3]) -> [f32; 3] {
-        self.color.as_ref().map_or(frac, |range| range.lerp(chunk, frac))
+        self.color
+            .as_ref()
+            .map_or(frac, |range| range.lerp(chunk, frac))
     }
 }
 
@@ -101,11 +132,12 @@ fn frac(bits: u32, n_bits: u32) -> f32 {
     (bits & largest) as f32 / largest as f32
 }
 
-/// Unpacks a quaternion. The highest two bits select its largest component, which is positive and not stored. The other
-/// three have 10 bits each.
+/// Unpacks a quaternion. The highest two bits select its largest component, which is positive and
+/// not stored. The other three have 10 bits each.
 fn rotation_wxyz(bits: u32) -> [f32; 4] {
     let largest_ix = (bits >> 30) as usize;
-    let others = [20, 10, 0].map(|shift| (frac(bits >> shift, 10) - 0.5) * std::f32::consts::SQRT_2);
+    let others =
+        [20, 10, 0].map(|shift| (frac(bits >> shift, 10) - 0.5) * std::f32::consts::SQRT_2);
     let squares: f32 = others.iter().map(|part| part * part).sum();
     let mut wxyz = [(1.0 - squares).max(0.0).sqrt(); 4];
     for (part_ix, other) in (0..4).filter(|&ix| ix != largest_ix).zip(others) {
@@ -114,7 +146,8 @@ fn rotation_wxyz(bits: u32) -> [f32; 4] {
     wxyz
 }
 
-/// Decodes a higher color coefficient. Bytes 0 and 255 are the ends of the range, other bytes the center of a step.
+/// Decodes a higher color coefficient. Bytes 0 and 255 are the ends of the range, other bytes the
+/// center of a step.
 fn higher_coefficient(byte: f32) -> f32 {
     let frac = match byte {
         0.0 => 0.0,
@@ -131,7 +164,9 @@ mod tests {
     /// Packs a rotation as specified by the format.
     #[expect(clippy::cast_possible_truncation, reason = "a step of 10 bits")]
     fn packed(wxyz: [f32; 4]) -> u32 {
-        let largest_ix = (0..4).max_by(|&a, &b| wxyz[a].abs().total_cmp(&wxyz[b].abs())).unwrap();
+        let largest_ix = (0..4)
+            .max_by(|&a, &b| wxyz[a].abs().total_cmp(&wxyz[b].abs()))
+            .unwrap();
         let sign = wxyz[largest_ix].signum();
         let others = (0..4).filter(|&ix| ix != largest_ix);
         others.fold(u32::try_from(largest_ix).unwrap(), |bits, ix| {
@@ -142,8 +177,17 @@ mod tests {
 
     #[test]
     fn rotations_round_trip_for_any_largest_component() {
-        for rotation in [[0.9, 0.1, -0.3, 0.3], [0.1, -0.9, 0.3, 0.3], [0.3, 0.1, 0.9, -0.3], [-0.3, 0.3, 0.1, 0.9]] {
-            let norm = rotation.iter().map(|part: &f32| part * part).sum::<f32>().sqrt();
+        for rotation in [
+            [0.9, 0.1, -0.3, 0.3],
+            [0.1, -0.9, 0.3, 0.3],
+            [0.3, 0.1, 0.9, -0.3],
+            [-0.3, 0.3, 0.1, 0.9],
+        ] {
+            let norm = rotation
+                .iter()
+                .map(|part: &f32| part * part)
+                .sum::<f32>()
+                .sqrt();
             let rotation = rotation.map(|part| part / norm);
             let got = rotation_wxyz(packed(rotation));
             let dot: f32 = got.iter().zip(rotation).map(|(a, b)| a * b).sum();

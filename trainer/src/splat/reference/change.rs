@@ -1,7 +1,8 @@
-//! Plain CPU version of the kernels that change splats: the optimizer step (update.wgsl) and growth (grow_*.wgsl).
+//! Plain CPU version of the kernels that change splats: the optimizer step (update.wgsl) and growth
+//! (grow_*.wgsl).
 //!
-//! Source: Kingma and Ba 2015; Kheradmand et al. 2024 (3DGS-MCMC), sections 4.1 and 4.2. Parents are chosen by error
-//! instead of opacity, as in Bulo et al. 2024.
+//! Source: Kingma and Ba 2015; Kheradmand et al. 2024 (3DGS-MCMC), sections 4.1 and 4.2. Parents
+//! are chosen by error instead of opacity, as in Bulo et al. 2024.
 
 use super::random::{normal3, uniform3};
 use super::{Splat, SplatGrad};
@@ -9,14 +10,19 @@ use crate::optim::reference::{Adam, Moments};
 use crate::splat::params::{Growth, Rule};
 use nalgebra::{Quaternion, UnitQuaternion, Vector3};
 
-/// Adam's moments of every value of one splat, in the order of [`values`]. The higher SH coefficients share one second
-/// moment.
+/// Adam's moments of every value of one splat, in the order of [`values`]. The higher SH
+/// coefficients share one second moment.
 pub(crate) type SplatMoments = Vec<Moments>;
 
 /// Mean, log scale, rotation, opacity logit, then the color coefficients.
 fn values(splat: &Splat) -> Vec<f64> {
     let rest = splat.sh.as_flattened().iter().copied();
-    let shape = splat.mean.into_iter().chain(splat.log_scale).chain(splat.rotation_wxyz).chain([splat.opacity_logit]);
+    let shape = splat
+        .mean
+        .into_iter()
+        .chain(splat.log_scale)
+        .chain(splat.rotation_wxyz)
+        .chain([splat.opacity_logit]);
     shape.chain(rest).collect()
 }
 
@@ -33,7 +39,16 @@ pub(crate) fn update(
     step: u32,
     splat_ix: u32,
 ) -> Splat {
-    let [of_mean, of_scale, of_rotation, of_opacity, of_dc, of_rest, noise, final_frac] = [
+    let [
+        of_mean,
+        of_scale,
+        of_rotation,
+        of_opacity,
+        of_dc,
+        of_rest,
+        noise,
+        final_frac,
+    ] = [
         rule.mean_rate_m,
         rule.log_scale_rate,
         rule.rotation_rate,
@@ -49,9 +64,11 @@ pub(crate) fn update(
     let mean_rate = of_mean * final_frac.powf(progress);
     let opacity = sigmoid(splat.opacity_logit);
     let mut gradient = gradient.clone();
-    gradient.opacity_logit += (1.0 + progress) * f64::from(rule.opacity_cost) * opacity * (1.0 - opacity);
+    gradient.opacity_logit +=
+        (1.0 + progress) * f64::from(rule.opacity_cost) * opacity * (1.0 - opacity);
     for axis in 0..3 {
-        gradient.log_scale[axis] += (1.0 + progress) * f64::from(rule.scale_cost) * splat.log_scale[axis].exp();
+        gradient.log_scale[axis] +=
+            (1.0 + progress) * f64::from(rule.scale_cost) * splat.log_scale[axis].exp();
     }
     let rates: Vec<f64> = [mean_rate; 3]
         .into_iter()
@@ -62,10 +79,26 @@ pub(crate) fn update(
         .collect();
     let mut updated = values(splat);
     let gradients = values(&gradient);
-    let adam = Adam { beta1: rule.betas[0].into(), beta2: rule.betas[1].into(), epsilon: rule.epsilon.into() };
+    let adam = Adam {
+        beta1: rule.betas[0].into(),
+        beta2: rule.betas[1].into(),
+        epsilon: rule.epsilon.into(),
+    };
     let n_own = rates.len();
-    adam.update_all(step + 1, &rates, &mut updated[..n_own], &gradients[..n_own], &mut moments[..n_own]);
-    adam.update_shared(step + 1, of_rest, &mut updated[n_own..], &gradients[n_own..], &mut moments[n_own].second);
+    adam.update_all(
+        step + 1,
+        &rates,
+        &mut updated[..n_own],
+        &gradients[..n_own],
+        &mut moments[..n_own],
+    );
+    adam.update_shared(
+        step + 1,
+        of_rest,
+        &mut updated[n_own..],
+        &gradients[n_own..],
+        &mut moments[n_own].second,
+    );
 
     let [w, x, y, z] = splat.rotation_wxyz;
     let rotation = UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z));
@@ -75,7 +108,11 @@ pub(crate) fn update(
     let jitter = rotation * variance.component_mul(&along) * (noise * mean_rate * noise_weight);
 
     let range = rule.log_scale_range.map(f64::from);
-    let norm = updated[6..10].iter().map(|part| part * part).sum::<f64>().sqrt();
+    let norm = updated[6..10]
+        .iter()
+        .map(|part| part * part)
+        .sum::<f64>()
+        .sqrt();
     Splat {
         mean: std::array::from_fn(|axis| updated[axis] + jitter[axis]),
         log_scale: std::array::from_fn(|axis| updated[3 + axis].clamp(range[0], range[1])),
@@ -92,12 +129,13 @@ const MAX_FAMILY: u32 = 16;
 pub(crate) struct Grown {
     pub(crate) splats: Vec<Splat>,
     pub(crate) parents: Vec<Option<usize>>,
-    /// Smallest change of a random threshold that would select another parent, as a fraction of the total error.
+    /// Smallest change of a random threshold that would select another parent, as a fraction of the
+    /// total error.
     pub(crate) margin: f64,
 }
 
-/// Replaces dead splats and creates new ones as children of parents that are chosen by error. A child gets a position
-/// within its parent and a share of its parent's opacity.
+/// Replaces dead splats and creates new ones as children of parents that are chosen by error. A
+/// child gets a position within its parent and a share of its parent's opacity.
 pub(crate) fn grow(splats: &[Splat], errors: &[f64], growth: &Growth) -> Grown {
     let is_dead = |splat: &Splat| sigmoid(splat.opacity_logit) < f64::from(growth.min_opacity);
     let mut cumulative = Vec::with_capacity(splats.len());
@@ -118,15 +156,20 @@ pub(crate) fn grow(splats: &[Splat], errors: &[f64], growth: &Growth) -> Grown {
         }
         let threshold = uniform3([child, growth.key, 7])[0] * total;
         let parent = cumulative.partition_point(|sum| *sum <= threshold);
-        let before = if parent > 0 { cumulative[parent - 1] } else { 0.0 };
+        let before = if parent > 0 {
+            cumulative[parent - 1]
+        } else {
+            0.0
+        };
         margin = margin.min((cumulative[parent] - threshold).min(threshold - before) / total);
         parents[ix] = Some(parent);
         n_children[parent] += 1;
         let [w, x, y, z] = splats[parent].rotation_wxyz;
         let rotation = UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z));
         let normal = normal3([child, growth.key, 11]);
-        let offset_in_parent: [f64; 3] =
-            std::array::from_fn(|axis| splats[parent].log_scale[axis].exp() * normal[axis].clamp(-2.0, 2.0));
+        let offset_in_parent: [f64; 3] = std::array::from_fn(|axis| {
+            splats[parent].log_scale[axis].exp() * normal[axis].clamp(-2.0, 2.0)
+        });
         let offset = rotation * Vector3::from(offset_in_parent) * f64::from(growth.child_spread);
         grown[ix] = splats[parent].clone();
         for axis in 0..3 {
@@ -134,19 +177,31 @@ pub(crate) fn grow(splats: &[Splat], errors: &[f64], growth: &Growth) -> Grown {
         }
     }
     for (ix, splat) in grown.iter_mut().enumerate() {
-        let n = n_children.get(parents[ix].unwrap_or(ix)).copied().unwrap_or(0);
+        let n = n_children
+            .get(parents[ix].unwrap_or(ix))
+            .copied()
+            .unwrap_or(0);
         if n > 0 {
             share_opacity(splat, (n + 1).min(MAX_FAMILY));
         }
     }
-    Grown { splats: grown, parents, margin }
+    Grown {
+        splats: grown,
+        parents,
+        margin,
+    }
 }
 
-/// Sets the opacity and size of one of `n` splats so that together they look like the original splat.
+/// Sets the opacity and size of one of `n` splats so that together they look like the original
+/// splat.
 fn share_opacity(splat: &mut Splat, n: u32) {
     let opacity = sigmoid(splat.opacity_logit).clamp(1e-4, 0.9999);
     let shared = (1.0 - (1.0 - opacity).powf(1.0 / f64::from(n))).clamp(0.005, 0.9999);
-    let choose = |n: u32, k: u32| (0..k).map(|i| f64::from(n - i) / f64::from(i + 1)).product::<f64>();
+    let choose = |n: u32, k: u32| {
+        (0..k)
+            .map(|i| f64::from(n - i) / f64::from(i + 1))
+            .product::<f64>()
+    };
     let term = |i: u32, k: u32| {
         let sign = if k.is_multiple_of(2) { 1.0 } else { -1.0 };
         sign * choose(i - 1, k) * shared.powf(f64::from(k + 1)) / f64::from(k + 1).sqrt()

@@ -1,11 +1,12 @@
 //! Plain CPU version of splatting in f64. Tests compare every kernel of `splat` with it.
 //!
-//! `project` projects each splat onto the image plane, and `rasterize` composites the splats pixel by pixel; each has
-//! a backward function. Discrete decisions (visibility, depth order, contributors of each pixel) are made once, in
-//! [`decide`], and kept fixed while gradients are computed.
+//! `project` projects each splat onto the image plane, and `rasterize` composites the splats pixel
+//! by pixel; each has a backward function. Discrete decisions (visibility, depth order,
+//! contributors of each pixel) are made once, in [`decide`], and kept fixed while gradients are
+//! computed.
 //!
-//! Source: Kerbl et al. 2023 (3D Gaussian splatting) and Ye et al. 2024 (gsplat, appendix on gradients). We add a
-//! rolling shutter and a depth output, which is composited like a color.
+//! Source: Kerbl et al. 2023 (3D Gaussian splatting) and Ye et al. 2024 (gsplat, appendix on
+//! gradients). We add a rolling shutter and a depth output, which is composited like a color.
 
 #[cfg(test)]
 pub(crate) mod change;
@@ -37,7 +38,8 @@ pub struct Splat {
     pub rotation_wxyz: [f64; 4],
     /// Opacity before the sigmoid.
     pub opacity_logit: f64,
-    /// `[(degree + 1)^2, 3]` spherical-harmonic coefficients of the color minus one half, constant term first.
+    /// `[(degree + 1)^2, 3]` spherical-harmonic coefficients of the color minus one half, constant
+    /// term first.
     pub sh: Vec<[f64; 3]>,
 }
 
@@ -57,12 +59,15 @@ pub struct View {
     pub size_px: [u32; 2],
     /// Splats nearer than this along z are not drawn, meters.
     pub near_m: f64,
-    /// Translation of the camera during the whole readout in its own axes, meters: linear velocity times readout time.
+    /// Translation of the camera during the whole readout in its own axes, meters: linear velocity
+    /// times readout time.
     pub linear_m: [f64; 3],
-    /// Rotation of the camera during the whole readout in its own axes, radians: angular velocity times readout time.
+    /// Rotation of the camera during the whole readout in its own axes, radians: angular velocity
+    /// times readout time.
     pub angular_rad: [f64; 3],
     /// Whether opacities are lowered where [`BLUR_PX2`](project::BLUR_PX2) enlarges splats; see
-    /// [`SplatArrays::is_antialiased`](crate::splat::arrays::SplatArrays::is_antialiased). Gradients ignore this.
+    /// [`SplatArrays::is_antialiased`](crate::splat::arrays::SplatArrays::is_antialiased).
+    /// Gradients ignore this.
     pub is_antialiased: bool,
 }
 
@@ -75,15 +80,17 @@ impl View {
     /// Centers of the pixels, row by row.
     pub fn pixel_centers(&self) -> impl Iterator<Item = [f64; 2]> {
         let [width, height] = self.size_px;
-        (0..height).flat_map(move |row| (0..width).map(move |column| [f64::from(column) + 0.5, f64::from(row) + 0.5]))
+        (0..height).flat_map(move |row| {
+            (0..width).map(move |column| [f64::from(column) + 0.5, f64::from(row) + 0.5])
+        })
     }
 }
 
 /// Gradient of a loss with respect to a view.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct ViewGrad {
-    /// With respect to a small motion `exp(pose) * camera_from_world`: translation in meters, then rotation in
-    /// radians.
+    /// With respect to a small motion `exp(pose) * camera_from_world`: translation in meters, then
+    /// rotation in radians.
     pub pose: [f64; 6],
     /// With respect to [`View::linear_m`].
     pub linear_m: [f64; 3],
@@ -104,7 +111,8 @@ pub struct Projected {
     pub color: [f64; 3],
     /// Depth of the center along the camera's z axis, meters.
     pub depth: f64,
-    /// Half width and height of the bounding box around `mean_px`, pixels. The splat contributes nothing outside of it.
+    /// Half width and height of the bounding box around `mean_px`, pixels. The splat contributes
+    /// nothing outside of it.
     pub extent_px: [f64; 2],
 }
 
@@ -144,18 +152,26 @@ pub fn render_decided(view: &View, splats: &[Splat], decisions: &Decisions) -> R
     rasterize::composite(view, &project_decided(view, splats, decisions), decisions)
 }
 
-/// Gradient of a loss with respect to every splat and the view, given its gradient with respect to the image.
+/// Gradient of a loss with respect to every splat and the view, given its gradient with respect to
+/// the image.
 pub fn render_backward(view: &View, splats: &[Splat], upstream: &Upstream) -> RenderGrad {
     let decisions = decide(view, splats);
     let projected = project_decided(view, splats, &decisions);
     let by_projected = rasterize::composite_backward(view, &projected, &decisions, upstream);
-    let mut grad = RenderGrad { projected: by_projected, ..RenderGrad::default() };
+    let mut grad = RenderGrad {
+        projected: by_projected,
+        ..RenderGrad::default()
+    };
     for (splat_ix, splat) in splats.iter().enumerate() {
         let Some(row_share) = decisions.row_shares[splat_ix] else {
-            grad.splats.push(SplatGrad { sh: vec![[0.0; 3]; splat.sh.len()], ..SplatGrad::default() });
+            grad.splats.push(SplatGrad {
+                sh: vec![[0.0; 3]; splat.sh.len()],
+                ..SplatGrad::default()
+            });
             continue;
         };
-        let (by_splat, by_view) = project_backward(view, splat, row_share, &grad.projected[splat_ix]);
+        let (by_splat, by_view) =
+            project_backward(view, splat, row_share, &grad.projected[splat_ix]);
         grad.splats.push(by_splat);
         grad.view.add(&by_view);
     }
@@ -164,14 +180,22 @@ pub fn render_backward(view: &View, splats: &[Splat], upstream: &Upstream) -> Re
 
 fn project_decided(view: &View, splats: &[Splat], decisions: &Decisions) -> Vec<Projected> {
     let project_one = |(splat, row_share): (&Splat, &Option<f64>)| {
-        row_share.map(|row_share| project::project_at(view, splat, row_share)).unwrap_or_default()
+        row_share
+            .map(|row_share| project::project_at(view, splat, row_share))
+            .unwrap_or_default()
     };
-    splats.iter().zip(&decisions.row_shares).map(project_one).collect()
+    splats
+        .iter()
+        .zip(&decisions.row_shares)
+        .map(project_one)
+        .collect()
 }
 
 impl ViewGrad {
     fn add(&mut self, other: &Self) {
-        let sum = |to: &mut [f64], from: &[f64]| to.iter_mut().zip(from).for_each(|(to, from)| *to += from);
+        let sum = |to: &mut [f64], from: &[f64]| {
+            to.iter_mut().zip(from).for_each(|(to, from)| *to += from)
+        };
         sum(&mut self.pose, &other.pose);
         sum(&mut self.linear_m, &other.linear_m);
         sum(&mut self.angular_rad, &other.angular_rad);

@@ -1,4 +1,5 @@
-//! Comparison with an independent renderer: four splats rendered by gsplat, published with Brush (Apache-2.0).
+//! Comparison with an independent renderer: four splats rendered by gsplat, published with Brush
+//! (Apache-2.0).
 
 use super::{Splat, View, render};
 use crate::mismatches::Mismatches;
@@ -6,27 +7,40 @@ use kinematics::Transform;
 use nalgebra::Vector3;
 use safetensors::SafeTensors;
 
-/// The published picture was computed in f32. The largest difference is a quarter of these tolerances. A different
-/// decision at a splat's edge (alpha 1/255) would cause a difference a thousand times as large.
+/// The published picture was computed in f32. The largest difference is a quarter of these
+/// tolerances. A different decision at a splat's edge (alpha 1/255) would cause a difference a
+/// thousand times as large.
 const ABS: f64 = 2e-6;
 const REL: f64 = 1e-5;
 
 #[test]
 fn render_matches_a_published_picture() {
-    let Some(folder) = test_support::data_folder("splats") else { return };
-    let bytes = std::fs::read(folder.join("brush_tiny_case.safetensors")).expect("the test data contain this file");
+    let Some(folder) = test_support::data_folder("splats") else {
+        return;
+    };
+    let bytes = std::fs::read(folder.join("brush_tiny_case.safetensors"))
+        .expect("the test data contain this file");
     let tensors = SafeTensors::deserialize(&bytes).expect("a valid file");
     let floats = |name: &str| -> Vec<f64> {
-        let data = tensors.tensor(name).expect("the file contains this tensor").data();
-        data.chunks_exact(4).map(|b| f64::from(f32::from_le_bytes([b[0], b[1], b[2], b[3]]))).collect()
+        let data = tensors
+            .tensor(name)
+            .expect("the file contains this tensor")
+            .data();
+        data.chunks_exact(4)
+            .map(|b| f64::from(f32::from_le_bytes([b[0], b[1], b[2], b[3]])))
+            .collect()
     };
-    let &[height, width, 4] = tensors.tensor("out_img").expect("the file contains the picture").shape() else {
+    let &[height, width, 4] = tensors
+        .tensor("out_img")
+        .expect("the file contains the picture")
+        .shape()
+    else {
         panic!("the picture has four channels");
     };
-    // Conventions of the file: `scales` are logarithms, `opacities` logits, `quats` w first, `coeffs` as in 3DGS with
-    // the constant first. The camera has a field of view of 90 degrees, is at (0.123, 0.456, -8) and looks along z;
-    // the principal point is at the center. Colors are clamped at 0 and premultiplied, without background; the fourth
-    // channel is 1 - transmittance.
+    // Conventions of the file: `scales` are logarithms, `opacities` logits, `quats` w first,
+    // `coeffs` as in 3DGS with the constant first. The camera has a field of view of 90 degrees, is
+    // at (0.123, 0.456, -8) and looks along z; the principal point is at the center. Colors are
+    // clamped at 0 and premultiplied, without background; the fourth channel is 1 - transmittance.
     let focal_px = 0.5 * width as f64;
     let view = View {
         camera_from_world: Transform::new(Vector3::new(-0.123, -0.456, 8.0), Vector3::zeros()),
@@ -53,10 +67,22 @@ fn render_matches_a_published_picture() {
     let mut mismatches = Mismatches::default();
     for (pixel_ix, expected) in picture.as_chunks::<4>().0.iter().enumerate() {
         let [r, g, b] = image.rgb[pixel_ix];
-        for (channel, got) in [r, g, b, 1.0 - image.transmittance[pixel_ix]].into_iter().enumerate() {
-            mismatches.check(format!("pixel {pixel_ix} channel {channel}"), got, expected[channel], ABS, REL);
+        for (channel, got) in [r, g, b, 1.0 - image.transmittance[pixel_ix]]
+            .into_iter()
+            .enumerate()
+        {
+            mismatches.check(
+                format!("pixel {pixel_ix} channel {channel}"),
+                got,
+                expected[channel],
+                ABS,
+                REL,
+            );
         }
     }
-    assert!(picture.iter().filter(|value| **value > 0.1).count() > 1000, "the picture is not empty");
+    assert!(
+        picture.iter().filter(|value| **value > 0.1).count() > 1000,
+        "the picture is not empty"
+    );
     mismatches.assert_none();
 }

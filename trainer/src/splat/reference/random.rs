@@ -24,6 +24,12 @@ pub(crate) fn uniform3(key: [u32; 3]) -> [f64; 3] {
 /// Three normally distributed numbers.
 pub(crate) fn normal3(key: [u32; 3]) -> [f64; 3] {
     let a = uniform3(key);
-    let b = uniform3([key[0] ^ 0x9e37_79b9, key[1] ^ 0x85eb_ca6b, key[2] ^ 0xc2b2_ae35]);
-    std::array::from_fn(|ix| (-2.0 * (1.0 - a[ix]).ln()).sqrt() * (std::f64::consts::TAU * b[ix]).cos())
+    let b = uniform3([
+        key[0] ^ 0x9e37_79b9,
+        key[1] ^ 0x85eb_ca6b,
+        key[2] ^ 0xc2b2_ae35,
+    ]);
+    std::array::from_fn(|ix| {
+        (-2.0 * (1.0 - a[ix]).ln()).sqrt() * (std::f64::consts::TAU * b[ix]).cos()
+    })
 }

@@ -7,14 +7,15 @@ use super::{Projected, ProjectedGrad, RenderedImage, Splat, Upstream, View};
 
 /// Maximum alpha of a splat at a pixel.
 pub const MAX_ALPHA: f64 = 0.999;
-/// Compositing of a pixel stops before the splat that would lower the transmittance to this value or less.
+/// Compositing of a pixel stops before the splat that would lower the transmittance to this value
+/// or less.
 pub const MIN_TRANSMITTANCE: f64 = 1e-4;
 
 /// Results of all comparisons, stored so that forward and backward passes agree.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Decisions {
-    /// Share of the readout at which each splat is read out (see [`row_share`]); `None` for splats that are not
-    /// drawn.
+    /// Share of the readout at which each splat is read out (see [`row_share`]); `None` for splats
+    /// that are not drawn.
     pub row_shares: Vec<Option<f64>>,
     /// Indices of the splats that contribute to each pixel, front to back; pixels row by row.
     pub contributors: Vec<Vec<usize>>,
@@ -30,7 +31,10 @@ pub fn decide(view: &View, splats: &[Splat]) -> Decisions {
             .zip(splats)
             .map(|(visible_splat, splat)| visible_splat.map(|_| row_share(view, splat)))
             .collect(),
-        contributors: view.pixel_centers().map(|center_px| contributors(&front_to_back, &center_px)).collect(),
+        contributors: view
+            .pixel_centers()
+            .map(|center_px| contributors(&front_to_back, &center_px))
+            .collect(),
     }
 }
 
@@ -42,7 +46,9 @@ pub fn composite(view: &View, projected: &[Projected], decisions: &Decisions) ->
         for splat in contributors.iter().map(|&splat_ix| &projected[splat_ix]) {
             let alpha = Coverage::new(splat, &center_px).alpha();
             let weight = alpha * transmittance;
-            rgb.iter_mut().zip(splat.color).for_each(|(sum, color)| *sum += weight * color);
+            rgb.iter_mut()
+                .zip(splat.color)
+                .for_each(|(sum, color)| *sum += weight * color);
             depth += weight * splat.depth;
             transmittance *= 1.0 - alpha;
         }
@@ -54,7 +60,8 @@ pub fn composite(view: &View, projected: &[Projected], decisions: &Decisions) ->
     image
 }
 
-/// Gradient of a loss with respect to each projected splat, given its gradient with respect to the image.
+/// Gradient of a loss with respect to each projected splat, given its gradient with respect to the
+/// image.
 pub fn composite_backward(
     view: &View,
     projected: &[Projected],
@@ -72,14 +79,21 @@ pub fn composite_backward(
         }
         // Part of the loss that depends on everything behind the current splat.
         let mut behind = upstream.transmittance[pixel_ix] * transmittance;
-        for (&splat_ix, transmittance) in decisions.contributors[pixel_ix].iter().zip(in_front).rev() {
+        for (&splat_ix, transmittance) in
+            decisions.contributors[pixel_ix].iter().zip(in_front).rev()
+        {
             let (splat, grad) = (&projected[splat_ix], &mut grads[splat_ix]);
             let coverage = Coverage::new(splat, &center_px);
             let weight = coverage.alpha() * transmittance;
-            let per_weight =
-                (0..3).map(|channel| splat.color[channel] * v_rgb[channel]).sum::<f64>() + splat.depth * v_depth;
+            let per_weight = (0..3)
+                .map(|channel| splat.color[channel] * v_rgb[channel])
+                .sum::<f64>()
+                + splat.depth * v_depth;
             let v_alpha = transmittance * per_weight - behind / (1.0 - coverage.alpha());
-            grad.color.iter_mut().zip(v_rgb).for_each(|(sum, v)| *sum += weight * v);
+            grad.color
+                .iter_mut()
+                .zip(v_rgb)
+                .for_each(|(sum, v)| *sum += weight * v);
             grad.depth += weight * v_depth;
             coverage.backward(splat, v_alpha, grad);
             behind += weight * per_weight;
@@ -90,13 +104,15 @@ pub fn composite_backward(
 
 /// Smallest relative distance of each pixel's decisions from their thresholds.
 ///
-/// Compares all alphas with [`MIN_ALPHA`] and [`MAX_ALPHA`], all transmittances with [`MIN_TRANSMITTANCE`], and the
-/// depths of consecutive splats with each other unless they are equal. Arithmetic with larger rounding errors may
-/// decide differently.
+/// Compares all alphas with [`MIN_ALPHA`] and [`MAX_ALPHA`], all transmittances with
+/// [`MIN_TRANSMITTANCE`], and the depths of consecutive splats with each other unless they are
+/// equal. Arithmetic with larger rounding errors may decide differently.
 pub fn threshold_margins(view: &View, splats: &[Splat]) -> Vec<f64> {
     let projected: Vec<_> = splats.iter().map(|splat| project(view, splat)).collect();
     let front_to_back = front_to_back(&projected);
-    view.pixel_centers().map(|center_px| threshold_margin(&front_to_back, &center_px)).collect()
+    view.pixel_centers()
+        .map(|center_px| threshold_margin(&front_to_back, &center_px))
+        .collect()
 }
 
 fn threshold_margin(front_to_back: &[(usize, Projected)], center_px: &[f64; 2]) -> f64 {
@@ -104,7 +120,9 @@ fn threshold_margin(front_to_back: &[(usize, Projected)], center_px: &[f64; 2]) 
     let (mut margin, mut transmittance, mut depth_in_front) = (f64::INFINITY, 1.0, None);
     for (_, splat) in front_to_back {
         let coverage = Coverage::new(splat, center_px);
-        margin = margin.min(distance(coverage.unclamped, MIN_ALPHA)).min(distance(coverage.unclamped, MAX_ALPHA));
+        margin = margin
+            .min(distance(coverage.unclamped, MIN_ALPHA))
+            .min(distance(coverage.unclamped, MAX_ALPHA));
         if !coverage.is_drawn() {
             continue;
         }
@@ -123,15 +141,21 @@ fn threshold_margin(front_to_back: &[(usize, Projected)], center_px: &[f64; 2]) 
 
 /// Visible splats with their indices, ordered by depth rounded to f32, then by index.
 fn front_to_back(projected: &[Option<Projected>]) -> Vec<(usize, Projected)> {
-    let mut visible: Vec<_> =
-        projected.iter().enumerate().filter_map(|(ix, visible_splat)| visible_splat.map(|splat| (ix, splat))).collect();
+    let mut visible: Vec<_> = projected
+        .iter()
+        .enumerate()
+        .filter_map(|(ix, visible_splat)| visible_splat.map(|splat| (ix, splat)))
+        .collect();
     visible.sort_by_key(|(splat_ix, splat)| (depth_bits(splat.depth), *splat_ix));
     visible
 }
 
 /// Positive floats sort like their bit patterns.
 fn depth_bits(depth: f64) -> u32 {
-    #[expect(clippy::cast_possible_truncation, reason = "the kernels sort by the depth in f32")]
+    #[expect(
+        clippy::cast_possible_truncation,
+        reason = "the kernels sort by the depth in f32"
+    )]
     let depth = depth as f32;
     depth.to_bits()
 }
@@ -168,18 +192,27 @@ struct Coverage {
 
 impl Coverage {
     fn new(splat: &Projected, center_px: &[f64; 2]) -> Self {
-        let [dx, dy] = [splat.mean_px[0] - center_px[0], splat.mean_px[1] - center_px[1]];
+        let [dx, dy] = [
+            splat.mean_px[0] - center_px[0],
+            splat.mean_px[1] - center_px[1],
+        ];
         let [a, b, c] = splat.conic;
         let sigma = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy;
         let falloff = (-sigma).exp();
-        Self { offset_px: [dx, dy], sigma, falloff, unclamped: splat.opacity * falloff }
+        Self {
+            offset_px: [dx, dy],
+            sigma,
+            falloff,
+            unclamped: splat.opacity * falloff,
+        }
     }
 
     fn alpha(&self) -> f64 {
         self.unclamped.min(MAX_ALPHA)
     }
 
-    /// Whether the splat contributes. Splats whose conic is not positive definite due to rounding are not drawn.
+    /// Whether the splat contributes. Splats whose conic is not positive definite due to rounding
+    /// are not drawn.
     fn is_drawn(&self) -> bool {
         self.sigma >= 0.0 && self.alpha() >= MIN_ALPHA
     }

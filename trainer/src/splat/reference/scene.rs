@@ -8,8 +8,8 @@ use nalgebra::{Point3, Vector3};
 /// Number of spherical-harmonic coefficients for degrees 0 to 3.
 pub(crate) const N_COEFFS: [usize; 4] = [1, 4, 9, 16];
 
-/// A static camera that looks at the world's origin from 2 m away. It is rotated about all axes and has unequal focal
-/// lengths and an off-center principal point, so that no gradient term is zero.
+/// A static camera that looks at the world's origin from 2 m away. It is rotated about all axes and
+/// has unequal focal lengths and an off-center principal point, so that no gradient term is zero.
 pub(crate) fn tilted_view() -> View {
     let world_from_camera = Transform::face_towards(
         &Point3::new(1.1, -1.5, 0.8),
@@ -30,7 +30,11 @@ pub(crate) fn tilted_view() -> View {
 
 /// [`tilted_view`] with a camera that translates and rotates by a few pixels during readout.
 pub(crate) fn rolling_view() -> View {
-    View { linear_m: [0.12, -0.09, 0.15], angular_rad: [0.05, -0.08, 0.11], ..tilted_view() }
+    View {
+        linear_m: [0.12, -0.09, 0.15],
+        angular_rad: [0.05, -0.08, 0.11],
+        ..tilted_view()
+    }
 }
 
 /// `n` overlapping splats, cycling through all degrees, in front of [`tilted_view`].
@@ -93,7 +97,8 @@ impl Splat {
         params.extend((0..3).map(SplatParam::LogScale));
         params.extend((0..4).map(SplatParam::RotationWxyz));
         params.extend(
-            (0..self.sh.len()).flat_map(|coeff_ix| (0..3).map(move |channel| SplatParam::Sh(coeff_ix, channel))),
+            (0..self.sh.len())
+                .flat_map(|coeff_ix| (0..3).map(move |channel| SplatParam::Sh(coeff_ix, channel))),
         );
         params
     }
@@ -128,6 +133,9 @@ impl View {
     pub(crate) fn moved(&self, pose: &[f64; 6]) -> Self {
         let [x, y, z, a, b, c] = *pose;
         let motion = Transform::new(Vector3::new(x, y, z), Vector3::new(a, b, c));
-        Self { camera_from_world: motion * self.camera_from_world, ..self.clone() }
+        Self {
+            camera_from_world: motion * self.camera_from_world,
+            ..self.clone()
+        }
     }
 }

@@ -4,11 +4,28 @@
 
 /// Type of the extension that names the axes (`SPZ_ADOBE_coordinate_system`).
 const COORDINATE_SYSTEM: u32 = 0xadbe_0003;
-/// For each higher basis function of the spherical harmonics, the axes in which it is odd: 0 for x, 1 for y, 2 for z.
-const ODD_AXES: [&[usize]; 15] =
-    [&[1], &[2], &[0], &[0, 1], &[1, 2], &[], &[0, 2], &[], &[1], &[0, 1, 2], &[1], &[2], &[0], &[2], &[0]];
+/// For each higher basis function of the spherical harmonics, the axes in which it is odd: 0 for x,
+/// 1 for y, 2 for z.
+const ODD_AXES: [&[usize]; 15] = [
+    &[1],
+    &[2],
+    &[0],
+    &[0, 1],
+    &[1, 2],
+    &[],
+    &[0, 2],
+    &[],
+    &[1],
+    &[0, 1, 2],
+    &[1],
+    &[2],
+    &[0],
+    &[2],
+    &[0],
+];
 
-/// The axes of a file, as factors 1 or -1 of x, y and z that convert vectors between the file and a `.ply`.
+/// The axes of a file, as factors 1 or -1 of x, y and z that convert vectors between the file and a
+/// `.ply`.
 ///
 /// The axes of a `.ply`, which are also our axes, are right, down, front.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -24,8 +41,15 @@ impl Axes {
             // Not specified.
             0 => Ok(Self::RIGHT_UP_BACK),
             1..=8 => {
-                let sign = |bit: u32, if_set: f32| if (number - 1) >> bit & 1 == 1 { if_set } else { -if_set };
-                // The bits stand for right instead of left, up instead of down, and front instead of back.
+                let sign = |bit: u32, if_set: f32| {
+                    if (number - 1) >> bit & 1 == 1 {
+                        if_set
+                    } else {
+                        -if_set
+                    }
+                };
+                // The bits stand for right instead of left, up instead of down, and front instead
+                // of back.
                 Ok(Self([sign(0, 1.0), sign(1, -1.0), sign(2, 1.0)]))
             }
             9..=16 => Err(format!(
@@ -45,7 +69,11 @@ impl Axes {
     /// Converts x, y and z of a quaternion. A mirrored ellipsoid has the same scales.
     pub(super) fn rotation_xyz(self, [x, y, z]: [f32; 3]) -> [f32; 3] {
         let [x_sign, y_sign, z_sign] = self.0;
-        [y_sign * z_sign * x, x_sign * z_sign * y, x_sign * y_sign * z]
+        [
+            y_sign * z_sign * x,
+            x_sign * z_sign * y,
+            x_sign * y_sign * z,
+        ]
     }
 
     /// Factors of the higher color coefficients: -1 for basis functions that change sign.
@@ -56,17 +84,22 @@ impl Axes {
 
 /// Reads the records of extensions. Returns the axes and the number of bytes that are used.
 ///
-/// A record consists of a type, the size of its contents, and the contents. Other programs ignore what follows an
-/// incomplete record.
+/// A record consists of a type, the size of its contents, and the contents. Other programs ignore
+/// what follows an incomplete record.
 pub(super) fn from_extensions(mut records: &[u8]) -> Result<(Axes, u64), String> {
     while let Some(([t0, t1, t2, t3, n0, n1, n2, n3], rest)) = records.split_first_chunk::<8>() {
         let n_bytes = u32::from_le_bytes([*n0, *n1, *n2, *n3]) as usize;
-        let Some((contents, after)) = rest.split_at_checked(n_bytes) else { break };
+        let Some((contents, after)) = rest.split_at_checked(n_bytes) else {
+            break;
+        };
         let extension = u32::from_le_bytes([*t0, *t1, *t2, *t3]);
         if extension == COORDINATE_SYSTEM
             && let Some(number) = contents.first_chunk::<4>()
         {
-            return Ok((Axes::from_number(u32::from_le_bytes(*number))?, 8 + n_bytes as u64));
+            return Ok((
+                Axes::from_number(u32::from_le_bytes(*number))?,
+                8 + n_bytes as u64,
+            ));
         }
         records = after;
     }
@@ -86,18 +119,31 @@ mod tests {
         (1..).zip(LETTERS).map(|(number, letters)| {
             let sign = |(letter, ours): (char, char)| if letter == ours { 1.0 } else { -1.0 };
             let signs: Vec<f64> = letters.chars().zip("RDF".chars()).map(sign).collect();
-            (Axes::from_number(number).unwrap(), Vector3::from_column_slice(&signs))
+            (
+                Axes::from_number(number).unwrap(),
+                Vector3::from_column_slice(&signs),
+            )
         })
     }
 
     #[test]
     fn numbers_stand_for_the_documented_axes() {
         for (axes, signs) in all() {
-            assert_eq!(axes.vector([1.0, 2.0, 4.0]).map(f64::from), [signs.x, 2.0 * signs.y, 4.0 * signs.z]);
+            assert_eq!(
+                axes.vector([1.0, 2.0, 4.0]).map(f64::from),
+                [signs.x, 2.0 * signs.y, 4.0 * signs.z]
+            );
         }
         assert_eq!(Axes::from_number(4).unwrap(), Axes::RIGHT_UP_BACK);
-        assert!(Axes::from_number(9).unwrap_err().starts_with("its y axis points to the front or back"));
-        assert_eq!(Axes::from_number(17).unwrap_err(), "coordinate system 17, expected 1 to 16");
+        assert!(
+            Axes::from_number(9)
+                .unwrap_err()
+                .starts_with("its y axis points to the front or back")
+        );
+        assert_eq!(
+            Axes::from_number(17).unwrap_err(),
+            "coordinate system 17, expected 1 to 16"
+        );
     }
 
     /// The converted quaternion and the unchanged scales describe the flipped ellipsoid.
@@ -105,15 +151,17 @@ mod tests {
     fn ellipsoids_are_flipped() {
         let covariance = |[w, x, y, z]: [f32; 4]| {
             let rotation = Quaternion::new(w, x, y, z).cast::<f64>();
-            let rotation = *UnitQuaternion::from_quaternion(rotation).to_rotation_matrix().matrix();
+            let rotation = *UnitQuaternion::from_quaternion(rotation)
+                .to_rotation_matrix()
+                .matrix();
             rotation * Matrix3::from_diagonal(&Vector3::new(1.0, 4.0, 0.25)) * rotation.transpose()
         };
         let [w, x, y, z] = [0.5, -0.3, 0.7, 0.2];
         for (axes, signs) in all() {
             let flip = Matrix3::from_diagonal(&signs);
             let [flipped_x, flipped_y, flipped_z] = axes.rotation_xyz([x, y, z]);
-            let difference =
-                covariance([w, flipped_x, flipped_y, flipped_z]) - flip * covariance([w, x, y, z]) * flip.transpose();
+            let difference = covariance([w, flipped_x, flipped_y, flipped_z])
+                - flip * covariance([w, x, y, z]) * flip.transpose();
             assert!(difference.abs().max() < 1e-12, "{signs}: {difference}");
         }
     }
@@ -122,7 +170,9 @@ mod tests {
     #[test]
     fn colors_follow_the_flip() {
         let mut random = kinematics::random::Random::new(5);
-        let mut coefficients: Vec<[f64; 3]> = (0..16).map(|_| std::array::from_fn(|_| random.normal())).collect();
+        let mut coefficients: Vec<[f64; 3]> = (0..16)
+            .map(|_| std::array::from_fn(|_| random.normal()))
+            .collect();
         coefficients[0] = [20.0; 3]; // No color is clamped at 0.
         let offset = Vector3::new(0.3, -0.5, 0.8);
         for (axes, signs) in all() {
@@ -131,7 +181,10 @@ mod tests {
                 *rgb = rgb.map(|value| f64::from(sign) * value);
             }
             let flipped_offset = offset.component_mul(&signs);
-            for (here, there) in sh::color(&coefficients, &offset).iter().zip(sh::color(&flipped, &flipped_offset)) {
+            for (here, there) in sh::color(&coefficients, &offset)
+                .iter()
+                .zip(sh::color(&flipped, &flipped_offset))
+            {
                 assert!((here - there).abs() < 1e-12, "{signs}: {here} and {there}");
             }
         }
@@ -141,7 +194,12 @@ mod tests {
     fn axes_are_found_among_other_extensions() {
         let record = |extension: u32, contents: &[u8]| {
             let n_bytes = u32::try_from(contents.len()).unwrap();
-            [&extension.to_le_bytes()[..], &n_bytes.to_le_bytes(), contents].concat()
+            [
+                &extension.to_le_bytes()[..],
+                &n_bytes.to_le_bytes(),
+                contents,
+            ]
+            .concat()
         };
         let other = record(0xadbe_0002, &[0; 12]);
         let axes = record(COORDINATE_SYSTEM, &[6, 0, 0, 0]);
@@ -150,9 +208,21 @@ mod tests {
         assert_eq!(of(&[&other]), Ok((Axes::RIGHT_UP_BACK, 0)));
         assert_eq!(of(&[&other, &axes]), Ok((Axes([1.0; 3]), 12)));
         assert_eq!(of(&[&axes, &other]), Ok((Axes([1.0; 3]), 12)));
-        assert_eq!(of(&[&axes[..11]]), Ok((Axes::RIGHT_UP_BACK, 0)), "incomplete");
-        assert_eq!(of(&[&record(COORDINATE_SYSTEM, &[6])]), Ok((Axes::RIGHT_UP_BACK, 0)), "too short");
-        assert_eq!(of(&[&record(COORDINATE_SYSTEM, &[0; 4])]), Ok((Axes::RIGHT_UP_BACK, 12)), "not specified");
+        assert_eq!(
+            of(&[&axes[..11]]),
+            Ok((Axes::RIGHT_UP_BACK, 0)),
+            "incomplete"
+        );
+        assert_eq!(
+            of(&[&record(COORDINATE_SYSTEM, &[6])]),
+            Ok((Axes::RIGHT_UP_BACK, 0)),
+            "too short"
+        );
+        assert_eq!(
+            of(&[&record(COORDINATE_SYSTEM, &[0; 4])]),
+            Ok((Axes::RIGHT_UP_BACK, 12)),
+            "not specified"
+        );
         assert!(of(&[&record(COORDINATE_SYSTEM, &[16, 0, 0, 0])]).is_err());
     }
 }

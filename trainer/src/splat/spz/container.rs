@@ -1,5 +1,5 @@
-//! Header and containers of `.spz` files. Versions 2 and 3 are a gzip stream, or not compressed; in version 4, each
-//! attribute is a Zstandard stream.
+//! Header and containers of `.spz` files. Versions 2 and 3 are a gzip stream, or not compressed; in
+//! version 4, each attribute is a Zstandard stream.
 
 use files::Budget;
 use flate2::bufread::GzDecoder;
@@ -29,7 +29,8 @@ pub(super) const HAS_EXTENSIONS: u8 = 2;
 const MAX_SH_DEGREE: u8 = 4;
 /// Maximum degree that is used.
 pub(super) const MAX_USED_SH_DEGREE: u32 = 3;
-/// Maximum size of extensions that are searched for the axes. All known extensions together have less than 100 bytes.
+/// Maximum size of extensions that are searched for the axes. All known extensions together have
+/// less than 100 bytes.
 const MAX_EXTENSION_BYTES: u64 = 1 << 20;
 
 /// The uncompressed contents of a file.
@@ -39,8 +40,8 @@ pub(super) struct Contents<'a> {
     pub(super) body: Cow<'a, [u8]>,
     /// The records of the extensions.
     pub(super) extensions: Cow<'a, [u8]>,
-    /// Size of everything that is neither header, table nor attribute. It is larger than `extensions` if these are not
-    /// announced in the header, or exceed [`MAX_EXTENSION_BYTES`].
+    /// Size of everything that is neither header, table nor attribute. It is larger than
+    /// `extensions` if these are not announced in the header, or exceed [`MAX_EXTENSION_BYTES`].
     pub(super) n_extension_bytes: u64,
 }
 
@@ -55,26 +56,42 @@ pub(super) struct Header {
 
 impl Header {
     fn parse(bytes: [u8; HEADER_BYTES]) -> Result<Self, String> {
-        let word = |at: usize| u32::from_le_bytes([bytes[at], bytes[at + 1], bytes[at + 2], bytes[at + 3]]);
+        let word = |at: usize| {
+            u32::from_le_bytes([bytes[at], bytes[at + 1], bytes[at + 2], bytes[at + 3]])
+        };
         if bytes[..4] != MAGIC {
             return Err("the decompressed data does not begin with \"NGSP\"".to_owned());
         }
         let (version, n_splats, [sh_degree, fractional_bits, flags]) =
             (word(4), word(8), [bytes[12], bytes[13], bytes[14]]);
         if !(MIN_VERSION..=MAX_VERSION).contains(&version) {
-            return Err(format!("format version {version}, expected {MIN_VERSION} to {MAX_VERSION}"));
+            return Err(format!(
+                "format version {version}, expected {MIN_VERSION} to {MAX_VERSION}"
+            ));
         }
         if Budget::SPLATS.check_elements(n_splats.into()).is_err() {
             let max_splats = Budget::SPLATS.max_elements;
-            return Err(format!("the header specifies {n_splats} splats, expected at most {max_splats}"));
+            return Err(format!(
+                "the header specifies {n_splats} splats, expected at most {max_splats}"
+            ));
         }
         if sh_degree > MAX_SH_DEGREE {
-            return Err(format!("spherical harmonics of degree {sh_degree}, expected at most {MAX_SH_DEGREE}"));
+            return Err(format!(
+                "spherical harmonics of degree {sh_degree}, expected at most {MAX_SH_DEGREE}"
+            ));
         }
         if fractional_bits > 23 {
-            return Err(format!("means have {fractional_bits} fractional bits, expected at most 23"));
+            return Err(format!(
+                "means have {fractional_bits} fractional bits, expected at most 23"
+            ));
         }
-        Ok(Self { version, n_splats: n_splats as usize, sh_degree: sh_degree.into(), fractional_bits, flags })
+        Ok(Self {
+            version,
+            n_splats: n_splats as usize,
+            sh_degree: sh_degree.into(),
+            fractional_bits,
+            flags,
+        })
     }
 
     pub(super) fn is_antialiased(&self) -> bool {
@@ -91,8 +108,8 @@ impl Header {
         (self.sh_degree as usize + 1).pow(2) - 1
     }
 
-    /// Bytes per splat of the attributes: means, opacities, constant colors, log scales, rotations, higher color
-    /// coefficients.
+    /// Bytes per splat of the attributes: means, opacities, constant colors, log scales, rotations,
+    /// higher color coefficients.
     pub(super) fn attribute_bytes(&self) -> [usize; 6] {
         let rotation = if self.has_short_rotations() { 3 } else { 4 };
         [9, 1, 3, 3, rotation, 3 * self.n_higher_coefficients()]
@@ -102,14 +119,20 @@ impl Header {
     pub(super) fn notes(&self, n_unused_extension_bytes: u64) -> Vec<String> {
         let mut notes = Vec::new();
         if n_unused_extension_bytes > 0 {
-            notes.push(format!("{n_unused_extension_bytes} bytes of extensions are not used"));
+            notes.push(format!(
+                "{n_unused_extension_bytes} bytes of extensions are not used"
+            ));
         }
         let unknown = self.flags & !(IS_ANTIALIASED | HAS_EXTENSIONS);
         if unknown != 0 {
-            notes.push(format!("the unknown header flags {unknown:#x} are not used"));
+            notes.push(format!(
+                "the unknown header flags {unknown:#x} are not used"
+            ));
         }
         if self.sh_degree > MAX_USED_SH_DEGREE {
-            notes.push(format!("its color coefficients above degree {MAX_USED_SH_DEGREE} are not used"));
+            notes.push(format!(
+                "its color coefficients above degree {MAX_USED_SH_DEGREE} are not used"
+            ));
         }
         notes
     }
@@ -120,8 +143,11 @@ impl Header {
 
     /// Size of all attributes in bytes. Fails if a file of this size cannot contain them.
     fn n_body_bytes(&self, n_file_bytes: usize) -> Result<usize, String> {
-        let n_body_bytes = self.n_splats as u64 * self.attribute_bytes().iter().sum::<usize>() as u64;
-        let is_possible = Budget::SPLATS.check_decoded(n_body_bytes, n_file_bytes as u64).is_ok();
+        let n_body_bytes =
+            self.n_splats as u64 * self.attribute_bytes().iter().sum::<usize>() as u64;
+        let is_possible = Budget::SPLATS
+            .check_decoded(n_body_bytes, n_file_bytes as u64)
+            .is_ok();
         let n_splats = self.n_splats;
         usize::try_from(n_body_bytes).ok().filter(|_| is_possible).ok_or_else(|| {
             format!("the header specifies {n_splats} splats, which a file of {n_file_bytes} bytes cannot contain")
@@ -129,7 +155,10 @@ impl Header {
     }
 
     fn truncated(&self, n_body_bytes: usize, n_found: usize) -> String {
-        format!("truncated: {} splats need {n_body_bytes} bytes, found {n_found}", self.n_splats)
+        format!(
+            "truncated: {} splats need {n_body_bytes} bytes, found {n_found}",
+            self.n_splats
+        )
     }
 }
 
@@ -151,27 +180,43 @@ pub(super) fn contents(bytes: &[u8]) -> Result<Contents<'_>, String> {
 fn from_gzip(bytes: &[u8]) -> Result<Contents<'_>, String> {
     let mut gzip = GzDecoder::new(bytes);
     let mut header = [0; HEADER_BYTES];
-    gzip.read_exact(&mut header).map_err(|error| gzip_error(&error))?;
+    gzip.read_exact(&mut header)
+        .map_err(|error| gzip_error(&error))?;
     let header = Header::parse(header)?;
     if header.version >= FIRST_ZSTD_VERSION {
-        return Err(format!("a gzip stream of format version {}, which has no gzip stream", header.version));
+        return Err(format!(
+            "a gzip stream of format version {}, which has no gzip stream",
+            header.version
+        ));
     }
     let n_body_bytes = header.n_body_bytes(bytes.len())?;
     let mut body = Vec::new();
-    gzip.by_ref().take(n_body_bytes as u64).read_to_end(&mut body).map_err(|error| gzip_error(&error))?;
+    gzip.by_ref()
+        .take(n_body_bytes as u64)
+        .read_to_end(&mut body)
+        .map_err(|error| gzip_error(&error))?;
     if body.len() < n_body_bytes {
         return Err(header.truncated(n_body_bytes, body.len()));
     }
     let mut extensions = Vec::new();
-    gzip.by_ref().take(MAX_EXTENSION_BYTES).read_to_end(&mut extensions).map_err(|error| gzip_error(&error))?;
+    gzip.by_ref()
+        .take(MAX_EXTENSION_BYTES)
+        .read_to_end(&mut extensions)
+        .map_err(|error| gzip_error(&error))?;
     // Reading to the end also verifies the checksum of the stream.
-    let n_more = std::io::copy(&mut gzip, &mut std::io::sink()).map_err(|error| gzip_error(&error))?;
+    let n_more =
+        std::io::copy(&mut gzip, &mut std::io::sink()).map_err(|error| gzip_error(&error))?;
     let n_extension_bytes = extensions.len() as u64 + n_more;
     if n_extension_bytes > 0 && !header.has_extensions() {
         return Err(format!("{n_extension_bytes} bytes follow the last splat"));
     }
     match gzip.into_inner().len() {
-        0 => Ok(Contents { header, body: body.into(), extensions: extensions.into(), n_extension_bytes }),
+        0 => Ok(Contents {
+            header,
+            body: body.into(),
+            extensions: extensions.into(),
+            n_extension_bytes,
+        }),
         n => Err(format!("{n} bytes follow the gzip stream")),
     }
 }
@@ -193,15 +238,24 @@ fn from_uncompressed(header: Header, bytes: &[u8]) -> Result<Contents<'_>, Strin
         return Err(format!("{} bytes follow the last splat", extensions.len()));
     }
     let n_extension_bytes = extensions.len() as u64;
-    Ok(Contents { header, body: body.into(), extensions: extensions.into(), n_extension_bytes })
+    Ok(Contents {
+        header,
+        body: body.into(),
+        extensions: extensions.into(),
+        n_extension_bytes,
+    })
 }
 
 fn from_zstd(header: Header, bytes: &[u8]) -> Result<Contents<'_>, String> {
-    let long_header = bytes.first_chunk::<LONG_HEADER_BYTES>().ok_or("truncated")?;
+    let long_header = bytes
+        .first_chunk::<LONG_HEADER_BYTES>()
+        .ok_or("truncated")?;
     let n_streams = usize::from(long_header[15]);
     let table_start = u32::from_le_bytes(std::array::from_fn(|ix| long_header[16 + ix])) as usize;
     // An attribute without bytes has no stream.
-    let sizes = header.attribute_bytes().map(|per_splat| header.n_splats * per_splat);
+    let sizes = header
+        .attribute_bytes()
+        .map(|per_splat| header.n_splats * per_splat);
     let sizes: Vec<usize> = sizes.into_iter().filter(|size| *size > 0).collect();
     if n_streams != sizes.len() {
         return Err(format!("{n_streams} streams, expected {}", sizes.len()));
@@ -211,25 +265,45 @@ fn from_zstd(header: Header, bytes: &[u8]) -> Result<Contents<'_>, String> {
         format!("the table of streams begins at byte {table_start}, expected {LONG_HEADER_BYTES} to {n_bytes}")
     })?;
     let n_extension_bytes = extensions.len() as u64;
-    let (table, mut streams) = bytes[table_start..].split_at_checked(ROW_BYTES * n_streams).ok_or("truncated")?;
+    let (table, mut streams) = bytes[table_start..]
+        .split_at_checked(ROW_BYTES * n_streams)
+        .ok_or("truncated")?;
     let mut body = vec![0_u8; header.n_body_bytes(bytes.len())?];
     let mut undecoded = body.as_mut_slice();
-    for (stream_ix, (row, size)) in table.as_chunks::<ROW_BYTES>().0.iter().zip(sizes).enumerate() {
+    for (stream_ix, (row, size)) in table
+        .as_chunks::<ROW_BYTES>()
+        .0
+        .iter()
+        .zip(sizes)
+        .enumerate()
+    {
         let [n_compressed, n_uncompressed] = [0, 8].map(|at| u64_at(row, at));
         if n_uncompressed != size as u64 {
-            return Err(format!("stream {stream_ix} has {n_uncompressed} uncompressed bytes, expected {size}"));
+            return Err(format!(
+                "stream {stream_ix} has {n_uncompressed} uncompressed bytes, expected {size}"
+            ));
         }
         let n_compressed = usize::try_from(n_compressed).unwrap_or(usize::MAX);
         let (stream, others) = streams.split_at_checked(n_compressed).ok_or("truncated")?;
         let (attribute, after) = undecoded.split_at_mut(size);
-        decompress(stream, attribute).map_err(|reason| format!("stream {stream_ix} is damaged ({reason})"))?;
+        decompress(stream, attribute)
+            .map_err(|reason| format!("stream {stream_ix} is damaged ({reason})"))?;
         (streams, undecoded) = (others, after);
     }
     if !streams.is_empty() {
         return Err(format!("{} bytes follow the last stream", streams.len()));
     }
-    let extensions: &[u8] = if header.has_extensions() { extensions } else { &[] };
-    Ok(Contents { header, body: body.into(), extensions: extensions.into(), n_extension_bytes })
+    let extensions: &[u8] = if header.has_extensions() {
+        extensions
+    } else {
+        &[]
+    };
+    Ok(Contents {
+        header,
+        body: body.into(),
+        extensions: extensions.into(),
+        n_extension_bytes,
+    })
 }
 
 fn u64_at(row: &[u8; ROW_BYTES], start: usize) -> u64 {
@@ -238,10 +312,15 @@ fn u64_at(row: &[u8; ROW_BYTES], start: usize) -> u64 {
 
 /// Decompresses Zstandard frames that contain exactly the bytes of an attribute.
 fn decompress(frames: &[u8], attribute: &mut [u8]) -> Result<(), String> {
-    let n_decoded = FrameDecoder::new().decode_all(frames, attribute).map_err(|error| error.to_string())?;
+    let n_decoded = FrameDecoder::new()
+        .decode_all(frames, attribute)
+        .map_err(|error| error.to_string())?;
     match n_decoded == attribute.len() {
         true => Ok(()),
-        false => Err(format!("it contains {n_decoded} bytes, expected {}", attribute.len())),
+        false => Err(format!(
+            "it contains {n_decoded} bytes, expected {}",
+            attribute.len()
+        )),
     }
 }
 
@@ -259,10 +338,26 @@ mod tests {
         };
         let [whole, first, second] = [&b"attribute"[..], b"attri", b"bute"].map(compressed);
         assert_eq!(decompressed(&whole, 9).unwrap(), b"attribute");
-        assert_eq!(decompressed(&[&first[..], &second].concat(), 9).unwrap(), b"attribute", "two frames");
-        assert_eq!(decompressed(&whole, 10).unwrap_err(), "it contains 9 bytes, expected 10");
-        assert!(decompressed(&whole, 8).is_err(), "longer than the attribute");
-        assert_eq!(decompressed(&[], 9).unwrap_err(), "it contains 0 bytes, expected 9");
-        assert!(decompressed(&whole[..whole.len() - 1], 9).is_err(), "truncated");
+        assert_eq!(
+            decompressed(&[&first[..], &second].concat(), 9).unwrap(),
+            b"attribute",
+            "two frames"
+        );
+        assert_eq!(
+            decompressed(&whole, 10).unwrap_err(),
+            "it contains 9 bytes, expected 10"
+        );
+        assert!(
+            decompressed(&whole, 8).is_err(),
+            "longer than the attribute"
+        );
+        assert_eq!(
+            decompressed(&[], 9).unwrap_err(),
+            "it contains 0 bytes, expected 9"
+        );
+        assert!(
+            decompressed(&whole[..whole.len() - 1], 9).is_err(),
+            "truncated"
+        );
     }
 }

@@ -1,5 +1,9 @@
 //! Quantization of the values in `.spz` files.
-#![expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "ranges are clamped before each cast")]
+#![expect(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "ranges are clamped before each cast"
+)]
 
 use std::f64::consts::FRAC_1_SQRT_2;
 
@@ -16,7 +20,8 @@ fn byte(value: f64) -> u8 {
 
 pub(super) fn fixed_from_mean(meters: f32, fractional_bits: u8) -> [u8; 3] {
     let fixed = (f64::from(meters) * f64::from(1_u32 << fractional_bits)).round();
-    let [low, middle, high, _] = (fixed.clamp(-f64::from(MAX_FIXED), f64::from(MAX_FIXED)) as i32).to_le_bytes();
+    let [low, middle, high, _] =
+        (fixed.clamp(-f64::from(MAX_FIXED), f64::from(MAX_FIXED)) as i32).to_le_bytes();
     [low, middle, high]
 }
 
@@ -29,7 +34,8 @@ pub(super) fn byte_from_opacity_logit(logit: f32) -> u8 {
     byte(255.0 / (1.0 + (-f64::from(logit)).exp()))
 }
 
-/// Bytes 0 and 255 decode to the center of their half step, because opacities of 0 and 1 have no finite logit.
+/// Bytes 0 and 255 decode to the center of their half step, because opacities of 0 and 1 have no
+/// finite logit.
 pub(super) fn opacity_logit_from_byte(byte: u8) -> f32 {
     let opacity = f64::from(byte).clamp(0.25, 254.75) / 255.0;
     (opacity / (1.0 - opacity)).ln() as f32
@@ -51,8 +57,8 @@ pub(super) fn log_scale_from_byte(byte: u8) -> f32 {
     f32::from(byte) / 16.0 - 10.0
 }
 
-/// Rounds a higher color coefficient to 8 bits. Other programs use 5 bits at degree 1 and 4 bits above. Their files are
-/// a seventh smaller, but the PSNR is a sixth of a decibel lower.
+/// Rounds a higher color coefficient to 8 bits. Other programs use 5 bits at degree 1 and 4 bits
+/// above. Their files are a seventh smaller, but the PSNR is a sixth of a decibel lower.
 pub(super) fn byte_from_sh(coefficient: f32) -> u8 {
     byte(f64::from(coefficient) * 128.0 + 128.0)
 }
@@ -61,8 +67,9 @@ pub(super) fn sh_from_byte(byte: u8) -> f32 {
     (f32::from(byte) - 128.0) / 128.0
 }
 
-/// Encodes the index of the largest component in the upper two bits, followed by the sign and magnitude of each of the
-/// other three. Signs are chosen so that the omitted component is positive.
+/// Encodes the index of the largest component in the upper two bits, followed by the sign and
+/// magnitude of each of the other three. Signs are chosen so that the omitted component is
+/// positive.
 ///
 /// Source of the idea: Fiedler 2015, "Snapshot compression".
 pub(super) fn smallest_from_rotation(xyzw: [f32; 4]) -> [u8; 4] {
@@ -90,7 +97,11 @@ pub(super) fn rotation_from_smallest(bytes: [u8; 4]) -> [f32; 4] {
     let mut xyzw = [0.0; 4];
     for ix in (0..4).rev().filter(|ix| *ix != largest_ix) {
         let magnitude = f64::from(bits & MAX_COMPONENT) / f64::from(MAX_COMPONENT) * FRAC_1_SQRT_2;
-        xyzw[ix] = if bits >> 9 & 1 == 0 { magnitude } else { -magnitude };
+        xyzw[ix] = if bits >> 9 & 1 == 0 {
+            magnitude
+        } else {
+            -magnitude
+        };
         bits >>= 10;
     }
     let square = xyzw.iter().map(|part| part * part).sum::<f64>();
@@ -98,7 +109,8 @@ pub(super) fn rotation_from_smallest(bytes: [u8; 4]) -> [f32; 4] {
     xyzw.map(|part| part as f32)
 }
 
-/// Decodes a rotation of version 2: one byte each for x, y and z. w is positive and follows from the unit length.
+/// Decodes a rotation of version 2: one byte each for x, y and z. w is positive and follows from
+/// the unit length.
 pub(super) fn rotation_from_three(bytes: [u8; 3]) -> [f32; 4] {
     let [x, y, z] = bytes.map(|byte| f64::from(byte) / 127.5 - 1.0);
     [x, y, z, (1.0 - x * x - y * y - z * z).max(0.0).sqrt()].map(|part| part as f32)

@@ -1,4 +1,5 @@
-//! Checkpoints of a splat model in training. They contain all state that affects further training, without rounding.
+//! Checkpoints of a splat model in training. They contain all state that affects further training,
+//! without rounding.
 
 use super::SplatTrainer;
 use super::saved_arrays::{CAMERA_PARAMS, PendingArrays, invalid_state, read_seeds, read_splats};
@@ -71,7 +72,8 @@ struct ModelState {
     params: ParamSet,
 }
 
-/// A running trial. [`SavedState::model`] is the state in training; `other` is the state in [`RunningTrial::other`].
+/// A running trial. [`SavedState::model`] is the state in training; `other` is the state in
+/// [`RunningTrial::other`].
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct TrialState {
@@ -106,7 +108,12 @@ fn id((camera, nanos): ImageKey) -> (Arc<str>, Stamp) {
 }
 
 impl ModelState {
-    fn of(splats: &SplatBuffers, params: ParamSet, schedule: &Schedule, scene: &ObservedScene) -> Self {
+    fn of(
+        splats: &SplatBuffers,
+        params: ParamSet,
+        schedule: &Schedule,
+        scene: &ObservedScene,
+    ) -> Self {
         Self {
             schedule_start: schedule.start,
             last_growth_step: schedule.last_growth_step,
@@ -121,24 +128,53 @@ impl ModelState {
         }
     }
 
-    fn splats(&self, gpu: &Gpu, checkpoint: &Checkpoint, prefix: &str) -> Result<SplatBuffers, Error> {
-        read_splats(gpu, checkpoint, prefix, [self.n_splats, self.capacity, self.sh_degree, self.active_degree])
+    fn splats(
+        &self,
+        gpu: &Gpu,
+        checkpoint: &Checkpoint,
+        prefix: &str,
+    ) -> Result<SplatBuffers, Error> {
+        read_splats(
+            gpu,
+            checkpoint,
+            prefix,
+            [
+                self.n_splats,
+                self.capacity,
+                self.sh_degree,
+                self.active_degree,
+            ],
+        )
     }
 
     fn schedule(&self, step: u64, n_planned_steps: u64) -> Schedule {
         let (start, last_growth_step) = (self.schedule_start, self.last_growth_step);
-        Schedule { step, start, last_growth_step, ..Schedule::new(n_planned_steps) }
+        Schedule {
+            step,
+            start,
+            last_growth_step,
+            ..Schedule::new(n_planned_steps)
+        }
     }
 
     fn scene(&self, checkpoint: &Checkpoint, prefix: &str) -> Result<ObservedScene, Error> {
         let seeder = read_seeds(checkpoint, prefix, self.n_seeds)?;
-        Ok(ObservedScene { seeder, size_m: self.scene_size_m, has_depth: self.has_depth })
+        Ok(ObservedScene {
+            seeder,
+            size_m: self.scene_size_m,
+            has_depth: self.has_depth,
+        })
     }
 }
 
 impl TrialState {
     fn of(trial: &RunningTrial) -> Self {
-        let Snapshot { splats, cameras: (params, param_buffer), schedule, scene } = &*trial.other;
+        let Snapshot {
+            splats,
+            cameras: (params, param_buffer),
+            schedule,
+            scene,
+        } = &*trial.other;
         Self {
             candidate: trial.candidate,
             until: trial.until,
@@ -148,7 +184,10 @@ impl TrialState {
             arrivals: trial
                 .arrivals
                 .iter()
-                .map(|Arrival { step, keyframe }| ArrivalState { step: *step, image: KeyframeSignature::of(keyframe) })
+                .map(|Arrival { step, keyframe }| ArrivalState {
+                    step: *step,
+                    image: KeyframeSignature::of(keyframe),
+                })
                 .collect(),
             other_step: schedule.step,
             other: ModelState::of(splats, *params, schedule, scene),
@@ -164,21 +203,32 @@ impl TrialState {
         n_planned_steps: u64,
         keyframes: &[Arc<Keyframe>],
     ) -> Result<RunningTrial, Error> {
-        let params = checkpoint.array(&format!("{OTHER}{CAMERA_PARAMS}"), self.n_other_param_bytes)?;
+        let params =
+            checkpoint.array(&format!("{OTHER}{CAMERA_PARAMS}"), self.n_other_param_bytes)?;
         let state = Snapshot {
             splats: self.other.splats(gpu, checkpoint, OTHER)?,
-            cameras: (self.other.params, gpu.storage_with("splat.camera_params", params)?),
+            cameras: (
+                self.other.params,
+                gpu.storage_with("splat.camera_params", params)?,
+            ),
             schedule: self.other.schedule(self.other_step, n_planned_steps),
             scene: self.other.scene(checkpoint, OTHER)?,
         };
         let arrivals = self.arrivals.iter().zip(keyframes);
-        let scores = |scores: Vec<(ImageKey, f64)>| scores.into_iter().map(|(of, db)| (id(of), db)).collect();
+        let scores = |scores: Vec<(ImageKey, f64)>| {
+            scores.into_iter().map(|(of, db)| (id(of), db)).collect()
+        };
         Ok(RunningTrial {
             candidate: self.candidate,
             until: self.until,
             other: Box::new(state),
             scored: self.scored.into_iter().map(id).collect(),
-            arrivals: arrivals.map(|(at, keyframe)| Arrival { step: at.step, keyframe: keyframe.clone() }).collect(),
+            arrivals: arrivals
+                .map(|(at, keyframe)| Arrival {
+                    step: at.step,
+                    keyframe: keyframe.clone(),
+                })
+                .collect(),
             baseline_db: self.baseline_scores.map(scores),
             deferred: Vec::new(),
         })
@@ -186,19 +236,29 @@ impl TrialState {
 }
 
 impl SplatTrainer {
-    /// Captures the state after all queued steps. This call only copies the model within GPU memory;
-    /// [`PendingCheckpoint::finish`] copies it to the host and may run on any thread.
+    /// Captures the state after all queued steps. This call only copies the model within GPU
+    /// memory; [`PendingCheckpoint::finish`] copies it to the host and may run on any thread.
     pub(super) fn take_checkpoint(&mut self) -> Result<PendingCheckpoint, Error> {
         self.seed_from_depth()?;
         self.finish_in_flight()?;
         let (gpu, cameras) = (&self.recorder.gpu, &self.model.cameras);
         // A running growth search is not saved but repeated.
         let (splats, params, schedule, scene) = match self.growth_search.running() {
-            Some(FoldModels { main, .. }) => (&main.splats, &main.cameras.1, &main.schedule, &main.scene),
-            None => (&self.model.splats, &cameras.params, &self.schedule, &self.seeding.scene),
+            Some(FoldModels { main, .. }) => {
+                (&main.splats, &main.cameras.1, &main.schedule, &main.scene)
+            }
+            None => (
+                &self.model.splats,
+                &cameras.params,
+                &self.schedule,
+                &self.seeding.scene,
+            ),
         };
-        let position_of =
-            |keyframe: &Arc<Keyframe>| self.views.keyframes().position(|view| Arc::ptr_eq(view, keyframe));
+        let position_of = |keyframe: &Arc<Keyframe>| {
+            self.views
+                .keyframes()
+                .position(|view| Arc::ptr_eq(view, keyframe))
+        };
         let state = SavedState {
             options: self.options.clone().with(|options| {
                 options.specific.coarse_steps = Some(self.views.coarse_steps());
@@ -207,8 +267,17 @@ impl SplatTrainer {
             step: schedule.step,
             model: ModelState::of(splats, cameras.set, schedule, scene),
             n_non_finite: u32::try_from(self.optimizer.n_non_finite).unwrap_or(u32::MAX),
-            views: self.views.keyframes().map(|keyframe| KeyframeSignature::of(keyframe)).collect(),
-            unseeded: self.seeding.unseeded().iter().filter_map(position_of).collect(),
+            views: self
+                .views
+                .keyframes()
+                .map(|keyframe| KeyframeSignature::of(keyframe))
+                .collect(),
+            unseeded: self
+                .seeding
+                .unseeded()
+                .iter()
+                .filter_map(position_of)
+                .collect(),
             slots: cameras.slots(),
             remaining_trials: self.trials.remaining_trials(),
             is_full: self.model.is_full(),
@@ -217,28 +286,39 @@ impl SplatTrainer {
             growth_search: self.growth_search.saved(),
             trial: self.trials.running_trial().map(TrialState::of),
         };
-        let state =
-            serde_json::to_value(state).map_err(|error| Error::CheckpointState { reason: error.to_string() })?;
+        let state = serde_json::to_value(state).map_err(|error| Error::CheckpointState {
+            reason: error.to_string(),
+        })?;
         let params = (params, cameras.used_bytes());
         let mut halves = vec![PendingArrays::begin(gpu, "", splats, &scene.seeder, params)];
         if let Some(RunningTrial { other, .. }) = self.trials.running_trial() {
             let params = (&other.cameras.1, other.cameras.1.bytes());
-            halves.push(PendingArrays::begin(gpu, OTHER, &other.splats, &other.scene.seeder, params));
+            halves.push(PendingArrays::begin(
+                gpu,
+                OTHER,
+                &other.splats,
+                &other.scene.seeder,
+                params,
+            ));
         }
         let gpu = gpu.clone();
         Ok(PendingCheckpoint::new(move || {
             let mut arrays = Vec::new();
-            halves.into_iter().try_for_each(|half| half.finish(&gpu, &mut arrays))?;
+            halves
+                .into_iter()
+                .try_for_each(|half| half.finish(&gpu, &mut arrays))?;
             Ok(Checkpoint::new(METHOD, state, arrays))
         }))
     }
 
-    /// Resumes training from a checkpoint as if it had not been interrupted. `keyframes` must include all training
-    /// keyframes of the checkpoint. Returns the remaining keyframes, to be pushed or kept for testing.
+    /// Resumes training from a checkpoint as if it had not been interrupted. `keyframes` must
+    /// include all training keyframes of the checkpoint. Returns the remaining keyframes, to be
+    /// pushed or kept for testing.
     ///
     /// # Errors
     ///
-    /// Fails if the checkpoint is invalid, if keyframes are missing or differ, or if the GPU has too little memory.
+    /// Fails if the checkpoint is invalid, if keyframes are missing or differ, or if the GPU has
+    /// too little memory.
     pub fn resume(
         gpu: Arc<Gpu>,
         checkpoint: &Checkpoint,
@@ -250,24 +330,40 @@ impl SplatTrainer {
                 checkpoint.method
             )));
         }
-        let state: SavedState =
-            serde_json::from_value(checkpoint.state.clone()).map_err(|error| invalid_state(error.to_string()))?;
-        // In the first half of a trial, its arrivals are views. In the second half, they are added at a later step.
-        let arrivals = || state.trial.iter().flat_map(|trial| &trial.arrivals).map(|arrival| &arrival.image);
-        let is_second_half = state.trial.as_ref().is_some_and(|trial| trial.baseline_scores.is_some());
+        let state: SavedState = serde_json::from_value(checkpoint.state.clone())
+            .map_err(|error| invalid_state(error.to_string()))?;
+        // In the first half of a trial, its arrivals are views. In the second half, they are added
+        // at a later step.
+        let arrivals = || {
+            state
+                .trial
+                .iter()
+                .flat_map(|trial| &trial.arrivals)
+                .map(|arrival| &arrival.image)
+        };
+        let is_second_half = state
+            .trial
+            .as_ref()
+            .is_some_and(|trial| trial.baseline_scores.is_some());
         let yet_to_arrive = arrivals().filter(|_| is_second_half);
-        let known: Vec<KeyframeSignature> = state.views.iter().chain(yet_to_arrive).cloned().collect();
+        let known: Vec<KeyframeSignature> =
+            state.views.iter().chain(yet_to_arrive).cloned().collect();
         let (mut views, untrained) = keyframe_signature::match_keyframes(&known, keyframes)?;
         let yet_to_arrive = views.split_off(state.views.len());
-        let arrived =
-            arrivals().filter(|_| !is_second_half).map(|image| state.views.iter().position(|view| view == image));
-        let arrived = arrived.map(|ix| views.get(ix?).cloned()).collect::<Option<Vec<_>>>();
-        let arrived =
-            arrived.ok_or_else(|| invalid_state("a view that arrived during a trial is missing".to_owned()))?;
+        let arrived = arrivals()
+            .filter(|_| !is_second_half)
+            .map(|image| state.views.iter().position(|view| view == image));
+        let arrived = arrived
+            .map(|ix| views.get(ix?).cloned())
+            .collect::<Option<Vec<_>>>();
+        let arrived = arrived.ok_or_else(|| {
+            invalid_state("a view that arrived during a trial is missing".to_owned())
+        })?;
         let arrivals = [arrived, yet_to_arrive].concat();
         let unseeded = state.unseeded.iter().map(|ix| views.get(*ix).cloned());
-        let unseeded =
-            unseeded.collect::<Option<Vec<_>>>().ok_or_else(|| invalid_state("a view is missing".to_owned()))?;
+        let unseeded = unseeded
+            .collect::<Option<Vec<_>>>()
+            .ok_or_else(|| invalid_state("a view is missing".to_owned()))?;
         let step = u32::try_from(state.step)
             .map_err(|_| invalid_state(format!("step {} does not fit into 32 bits", state.step)))?;
 
@@ -275,20 +371,36 @@ impl SplatTrainer {
         let gpu = &trainer.recorder.gpu;
         trainer.model.splats = state.model.splats(gpu, checkpoint, "")?;
         trainer.optimizer.write_counter(gpu, status::STEP, step);
-        trainer.optimizer.write_counter(gpu, status::N_NON_FINITE, state.n_non_finite);
+        trainer
+            .optimizer
+            .write_counter(gpu, status::N_NON_FINITE, state.n_non_finite);
         trainer.optimizer.n_non_finite = state.n_non_finite.into();
-        trainer.model.cameras.restore(gpu, &state.slots, state.model.params, checkpoint)?;
-        trainer.trials.restore(state.remaining_trials, state.finished_trials);
+        trainer
+            .model
+            .cameras
+            .restore(gpu, &state.slots, state.model.params, checkpoint)?;
+        trainer
+            .trials
+            .restore(state.remaining_trials, state.finished_trials);
         trainer.model.set_full(state.is_full);
         trainer.model.is_growth_paused = state.is_growth_paused;
         trainer.growth_search.restore(state.growth_search);
         if let Some(trial) = state.trial {
             let n_planned_steps = trainer.options.common.n_planned_steps;
-            trainer.trials.restore_trial(trial.restored(gpu, checkpoint, n_planned_steps, &arrivals)?);
+            trainer.trials.restore_trial(trial.restored(
+                gpu,
+                checkpoint,
+                n_planned_steps,
+                &arrivals,
+            )?);
         }
         trainer.views.replace(views);
-        trainer.seeding.restore(state.model.scene(checkpoint, "")?, unseeded);
-        trainer.schedule = state.model.schedule(state.step, trainer.options.common.n_planned_steps);
+        trainer
+            .seeding
+            .restore(state.model.scene(checkpoint, "")?, unseeded);
+        trainer.schedule = state
+            .model
+            .schedule(state.step, trainer.options.common.n_planned_steps);
         Ok((trainer, untrained))
     }
 }

@@ -8,8 +8,8 @@ use crate::eval::depth_rmse_m;
 use crate::packing::Output;
 use crate::splat::buffers::SplatBuffers;
 use crate::splat::growth_search::{
-    FEW_IMAGES, FoldModels, FoldPhase, GrowthLimit, GrowthSearch, HeldOutScore, doubling_trial, folds, n_folds,
-    n_steps_of_first_round,
+    FEW_IMAGES, FoldModels, FoldPhase, GrowthLimit, GrowthSearch, HeldOutScore, doubling_trial,
+    folds, n_folds, n_steps_of_first_round,
 };
 use crate::splat::schedule::Schedule;
 use crate::splat::snapshot::{ObservedScene, Snapshot};
@@ -21,17 +21,19 @@ use calibration::{Candidate, MIN_VALIDATION_IMAGES};
 use std::collections::VecDeque;
 
 impl SplatTrainer {
-    /// Adapts the search to a change of the images, unless a trial is running, whose halves must be trained alike.
+    /// Adapts the search to a change of the images, unless a trial is running, whose halves must be
+    /// trained alike.
     pub(super) fn update_growth_search(&mut self) {
         if self.trials.running_trial().is_none() {
             self.trials.restart_growth(self.n_images());
-            self.growth_search.postpone(self.schedule.step, &self.trials.steps);
+            self.growth_search
+                .postpone(self.schedule.step, &self.trials.steps);
             self.growth_search.set_n_images(self.n_images());
         }
     }
 
-    /// Number of training and validation images. During a trial, validation images that arrive do not count, because both
-    /// halves must have the same number at each step.
+    /// Number of training and validation images. During a trial, validation images that arrive do
+    /// not count, because both halves must have the same number at each step.
     pub(super) fn n_images(&self) -> usize {
         let n_validation = match self.trials.running_trial() {
             Some(trial) => trial.scored.len(),
@@ -56,7 +58,8 @@ impl SplatTrainer {
         }
     }
 
-    /// Starts the search or its next phase. If GPU memory is insufficient, the search ends without a limit.
+    /// Starts the search or its next phase. If GPU memory is insufficient, the search ends without
+    /// a limit.
     pub(super) fn advance_growth_search(&mut self) -> Result<(), Error> {
         let advanced = match self.growth_search.running().map(|models| models.phase) {
             None => self.begin_growth_search(),
@@ -92,7 +95,8 @@ impl SplatTrainer {
         }
     }
 
-    /// Ends a search that is due or running. Growth ends at the last accepted number of splats, or at the current one.
+    /// Ends a search that is due or running. Growth ends at the last accepted number of splats, or
+    /// at the current one.
     pub(super) fn end_growth_search(&mut self) -> Result<bool, Error> {
         self.finish_in_flight()?; // A failed submit may reduce the step count.
         let n_splats = if let Some(models) = self.growth_search.running_mut() {
@@ -103,15 +107,23 @@ impl SplatTrainer {
         } else {
             return Ok(false);
         };
-        log::info!("too little training time is left to test more splats; their number is limited to {n_splats}");
+        log::info!(
+            "too little training time is left to test more splats; their number is limited to {n_splats}"
+        );
         self.abort_growth_search()?;
-        self.growth_search = GrowthSearch::Finished(GrowthLimit { n_splats, n_images: self.n_images() });
+        self.growth_search = GrowthSearch::Finished(GrowthLimit {
+            n_splats,
+            n_images: self.n_images(),
+        });
         Ok(true)
     }
 
-    /// Restores the model that is trained on all images, if a search is running. The search is repeated.
+    /// Restores the model that is trained on all images, if a search is running. The search is
+    /// repeated.
     pub(super) fn abort_growth_search(&mut self) -> Result<(), Error> {
-        let Some(models) = self.growth_search.abort() else { return Ok(()) };
+        let Some(models) = self.growth_search.abort() else {
+            return Ok(());
+        };
         self.views.hold_out(&[]);
         self.model.set_full(models.is_main_full);
         self.restore_snapshot(models.main)
@@ -121,7 +133,12 @@ impl SplatTrainer {
         if self.trials.validation.len() < MIN_VALIDATION_IMAGES && self.trials.holds_validation() {
             self.release_validation()?; // Too few for trials, but useful for training.
         }
-        let folds = folds(self.views.keyframes().map(|keyframe| (keyframe.camera.clone(), keyframe.stamp)).collect());
+        let folds = folds(
+            self.views
+                .keyframes()
+                .map(|keyframe| (keyframe.camera.clone(), keyframe.stamp))
+                .collect(),
+        );
         let n_splats = self.model.splats.n_splats;
         let until = self.schedule.step;
         let main = self.take_state()?;
@@ -145,14 +162,20 @@ impl SplatTrainer {
 
     /// Starts the model of the current fold, or continues the model of the previous round.
     fn begin_fold(&mut self) -> Result<(), Error> {
-        let Some(models) = self.growth_search.running_mut() else { return Ok(()) };
+        let Some(models) = self.growth_search.running_mut() else {
+            return Ok(());
+        };
         self.views.hold_out(&models.folds[models.fold_ix]);
         if let Some(previous) = models.previous.pop_front() {
             self.restore_snapshot(previous)?;
             return self.begin_fold_baseline();
         }
         models.phase = FoldPhase::WarmUp;
-        models.until = models.main.schedule.step.min(self.trials.steps.max_warm_up());
+        models.until = models
+            .main
+            .schedule
+            .step
+            .min(self.trials.steps.max_warm_up());
         let (set, params) = &models.main.cameras;
         let gpu = &self.recorder.gpu;
         let copy = gpu.storage("splat.camera_params", params.bytes())?;
@@ -164,7 +187,10 @@ impl SplatTrainer {
             scene: ObservedScene::default(),
         };
         self.restore_snapshot(untrained)?;
-        self.views.active_keyframes().cloned().for_each(|keyframe| self.seeding.push(keyframe));
+        self.views
+            .active_keyframes()
+            .cloned()
+            .for_each(|keyframe| self.seeding.push(keyframe));
         self.prepare_training()
     }
 
@@ -174,7 +200,8 @@ impl SplatTrainer {
         let step = self.schedule.step;
         if let Some(models) = self.growth_search.running_mut() {
             models.fork = Some(fork);
-            (models.phase, models.until) = (FoldPhase::Baseline, step + self.trials.steps.comparison);
+            (models.phase, models.until) =
+                (FoldPhase::Baseline, step + self.trials.steps.comparison);
         }
         Ok(())
     }
@@ -182,20 +209,30 @@ impl SplatTrainer {
     /// Scores the model of the current fold, and trains it with twice the number of splats.
     fn begin_fold_variant(&mut self) -> Result<(), Error> {
         let scores = self.score_held_out()?;
-        let Some(models) = self.growth_search.running_mut() else { return Ok(()) };
+        let Some(models) = self.growth_search.running_mut() else {
+            return Ok(());
+        };
         models.baseline.extend(scores);
         models.phase = FoldPhase::Variant;
         if let Some(fork) = models.fork.take() {
             self.restore_snapshot(fork)?;
         }
-        self.grow_to(self.model.splats.n_splats.saturating_mul(2).min(self.options.cap()))
+        self.grow_to(
+            self.model
+                .splats
+                .n_splats
+                .saturating_mul(2)
+                .min(self.options.cap()),
+        )
     }
 
     /// Scores the model with twice the number of splats. Continues with the next fold, or decides.
     fn end_fold_variant(&mut self) -> Result<(), Error> {
         let scores = self.score_held_out()?;
         let state = self.take_state()?;
-        let Some(models) = self.growth_search.running_mut() else { return Ok(()) };
+        let Some(models) = self.growth_search.running_mut() else {
+            return Ok(());
+        };
         models.variant.extend(scores);
         models.doubled.push_back(state);
         models.fold_ix += 1;
@@ -204,7 +241,10 @@ impl SplatTrainer {
         }
         let cap = self.options.cap();
         let to = models.n_splats.saturating_mul(2).min(cap);
-        let candidate = Candidate::Doubled { from: models.n_splats, to };
+        let candidate = Candidate::Doubled {
+            from: models.n_splats,
+            to,
+        };
         let trial = doubling_trial(candidate, &models.baseline, &models.variant);
         trial.log_result();
         if trial.kept {
@@ -220,7 +260,10 @@ impl SplatTrainer {
             return self.begin_fold();
         }
         self.trials.finished.append(&mut models.trials);
-        let limit = GrowthLimit { n_splats: models.n_splats, n_images: self.n_images() };
+        let limit = GrowthLimit {
+            n_splats: models.n_splats,
+            n_images: self.n_images(),
+        };
         self.abort_growth_search()?;
         self.growth_search = GrowthSearch::Finished(limit);
         Ok(())
@@ -242,32 +285,56 @@ impl SplatTrainer {
 
     /// Scores the images of the current fold.
     fn score_held_out(&mut self) -> Result<Vec<HeldOutScore>, Error> {
-        let (learn, corrections, background_srgb) =
-            (self.learn()?, self.learned_corrections()?, self.background_srgb());
-        let held_out: Vec<ImageId> =
-            self.growth_search.running().map(|models| models.folds[models.fold_ix].clone()).unwrap_or_default();
-        let view_ixs: Vec<usize> = held_out.iter().filter_map(|image| self.views.position(image)).collect();
+        let (learn, corrections, background_srgb) = (
+            self.learn()?,
+            self.learned_corrections()?,
+            self.background_srgb(),
+        );
+        let held_out: Vec<ImageId> = self
+            .growth_search
+            .running()
+            .map(|models| models.folds[models.fold_ix].clone())
+            .unwrap_or_default();
+        let view_ixs: Vec<usize> = held_out
+            .iter()
+            .filter_map(|image| self.views.position(image))
+            .collect();
         let mut scores = Vec::new();
         for chunk in view_ixs.chunks(view_set::VIEWS_AT_ONCE) {
             let places = chunk.iter().map(|view_ix| (*view_ix, 0)).collect();
-            self.views.upload(&mut self.recorder, &places, self.schedule.step)?;
+            self.views
+                .upload(&mut self.recorder, &places, self.schedule.step)?;
             for view_ix in chunk {
                 let keyframe = self.views.keyframe(*view_ix).clone();
                 let camera = corrected_camera(&corrections, &keyframe);
                 let (_, Level { image, .. }) = self.views.ready_level((*view_ix, 0))?;
-                let drawn = DrawnView { splats: &self.model.splats, camera: &camera, background_srgb };
-                let products = self.renderer.compare(&mut self.recorder, drawn, &learn.score, image)?;
+                let drawn = DrawnView {
+                    splats: &self.model.splats,
+                    camera: &camera,
+                    background_srgb,
+                };
+                let products =
+                    self.renderer
+                        .compare(&mut self.recorder, drawn, &learn.score, image)?;
                 let measured_m = depth_in_color_view(&keyframe);
                 let depth_rmse_m = match measured_m.is_empty() {
                     true => None,
                     false => {
-                        let picture = self.renderer.picture(&mut self.recorder, drawn, Output::picture(true))?;
-                        let picture =
-                            picture.ok_or_else(|| Error::internal("a picture was not read back"))?.into_picture()?;
+                        let picture = self.renderer.picture(
+                            &mut self.recorder,
+                            drawn,
+                            Output::picture(true),
+                        )?;
+                        let picture = picture
+                            .ok_or_else(|| Error::internal("a picture was not read back"))?
+                            .into_picture()?;
                         depth_rmse_m(&picture.depth_m, &measured_m)?
                     }
                 };
-                scores.push(HeldOutScore { psnr_db: products::psnr_with_gains(&products, [1.0; 3]), depth_rmse_m });
+                scores.push(HeldOutScore {
+                    psnr_db: products::psnr_with_gains(&products, [1.0; 3]),
+                    depth_rmse_m,
+                });
             }
         }
         Ok(scores)
@@ -275,12 +342,17 @@ impl SplatTrainer {
 
     /// The state to display: during a search or trial, the model without the tested change.
     pub(super) fn displayed_state(&self) -> Option<&Snapshot> {
-        self.growth_search.running().map(|models| &models.main).or_else(|| self.trials.baseline())
+        self.growth_search
+            .running()
+            .map(|models| &models.main)
+            .or_else(|| self.trials.baseline())
     }
 
     /// Training step of the model to display.
     pub(super) fn displayed_step(&self) -> u64 {
-        self.growth_search.running().map_or(self.schedule.step, |models| models.main.schedule.step)
+        self.growth_search
+            .running()
+            .map_or(self.schedule.step, |models| models.main.schedule.step)
     }
 
     #[cfg(test)]
@@ -295,7 +367,9 @@ impl SplatTrainer {
 
     #[cfg(test)]
     pub(in crate::splat) fn n_finished_rounds(&self) -> Option<usize> {
-        self.growth_search.running().map(|models| models.trials.len())
+        self.growth_search
+            .running()
+            .map(|models| models.trials.len())
     }
 
     #[cfg(test)]

@@ -16,8 +16,8 @@ pub(super) enum LazyPipelines {
     Failed,
 }
 
-/// A thread that compiles the pipelines. Drop waits for the thread, because NVIDIA's driver corrupts the heap if the
-/// process exits during compilation.
+/// A thread that compiles the pipelines. Drop waits for the thread, because NVIDIA's driver
+/// corrupts the heap if the process exits during compilation.
 #[derive(Debug)]
 pub(super) struct Compiling(Option<Task<Result<Box<TrainPipelines>, Error>>>);
 
@@ -43,7 +43,9 @@ impl LazyPipelines {
     /// Starts compiling on another thread.
     pub(super) fn start(gpu: &Arc<Gpu>) -> Self {
         let gpu = gpu.clone();
-        Self::Compiling(Compiling(Some(Task::start("pipelines", move || TrainPipelines::new(&gpu).map(Box::new)))))
+        Self::Compiling(Compiling(Some(Task::start("pipelines", move || {
+            TrainPipelines::new(&gpu).map(Box::new)
+        }))))
     }
 
     /// Waits for the pipelines, or compiles them on first use.
@@ -55,7 +57,9 @@ impl LazyPipelines {
             Self::Compiling(mut thread) => *thread.finish(gpu)?,
             Self::OnDemand => TrainPipelines::new(gpu)?,
             Self::Ready(_) | Self::Failed => {
-                return Err(gpu.failure_or("a step was requested although its pipelines could not be compiled"));
+                return Err(gpu.failure_or(
+                    "a step was requested although its pipelines could not be compiled",
+                ));
             }
         });
         *self = Self::Ready(ready.clone());

@@ -7,13 +7,15 @@ use crate::splat::params::Rule;
 use crate::splat::schedule::Schedule;
 use crate::splat::snapshot::ObservedScene;
 
-/// Initial learning rate of the means, in scene sizes, and the fraction that remains after the planned steps.
+/// Initial learning rate of the means, in scene sizes, and the fraction that remains after the
+/// planned steps.
 const MEAN_RATE: f32 = 1.6e-4;
 const FINAL_MEAN_RATE_FRAC: f32 = 0.01;
 const LOG_SCALE_RATE: f32 = 5e-3;
 const ROTATION_RATE: f32 = 1e-3;
 const OPACITY_RATE: f32 = 5e-2;
-/// Learning rate of the constant color term. For all other SH coefficients, it is divided by [`SH_REST_DIVISOR`].
+/// Learning rate of the constant color term. For all other SH coefficients, it is divided by
+/// [`SH_REST_DIVISOR`].
 const SH_DC_RATE: f32 = 2.5e-3;
 const SH_REST_DIVISOR: f32 = 20.0;
 /// Adam's decay rates and epsilon.
@@ -33,9 +35,14 @@ pub(super) fn rule(
     n_splats: u32,
 ) -> Rule {
     let size = f32_of(scene.size_m);
-    let cost = (options.specific.cost_images / n_views.max(1) as f64).powi(2).min(MAX_COST);
+    let cost = (options.specific.cost_images / n_views.max(1) as f64)
+        .powi(2)
+        .min(MAX_COST);
     let cost = f32_of(cost / f64::from(n_splats.max(1)));
-    #[expect(clippy::cast_possible_truncation, reason = "both halves of the seed are used")]
+    #[expect(
+        clippy::cast_possible_truncation,
+        reason = "both halves of the seed are used"
+    )]
     let seed = (options.common.seed ^ (options.common.seed >> 32)) as u32;
     Rule {
         mean_rate_m: MEAN_RATE * size,

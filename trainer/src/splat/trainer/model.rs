@@ -59,13 +59,17 @@ impl TrainedModel {
         if n_new == 0 {
             return Ok(());
         }
-        let kept = if n_new == arrays.n_splats() { arrays.clone() } else { spread_out(arrays, n_new) };
+        let kept = if n_new == arrays.n_splats() {
+            arrays.clone()
+        } else {
+            spread_out(arrays, n_new)
+        };
         self.splats.append(&recorder.gpu, &kept);
         Ok(())
     }
 
-    /// Replaces dead splats with children of other splats, then adds up to `n_more` children, within the
-    /// limit. `key` seeds the random choices.
+    /// Replaces dead splats with children of other splats, then adds up to `n_more` children,
+    /// within the limit. `key` seeds the random choices.
     pub(super) fn grow(
         &mut self,
         recorder: &mut Recorder,
@@ -75,9 +79,18 @@ impl TrainedModel {
         key: u32,
     ) -> Result<(), Error> {
         let n_before = self.splats.n_splats;
-        let n_more = if self.is_full || self.is_growth_paused { 0 } else { n_more };
-        let n_after = n_before.saturating_add(n_more).min(self.max_splats).max(n_before);
-        let n_after = self.reserve_up_to(recorder, renderer, n_after)?.max(n_before);
+        let n_more = if self.is_full || self.is_growth_paused {
+            0
+        } else {
+            n_more
+        };
+        let n_after = n_before
+            .saturating_add(n_more)
+            .min(self.max_splats)
+            .max(n_before);
+        let n_after = self
+            .reserve_up_to(recorder, renderer, n_after)?
+            .max(n_before);
         let growth = Growth {
             n_before,
             n_after,
@@ -95,14 +108,27 @@ impl TrainedModel {
             }
             buffers => buffers?,
         };
-        passes::grow(&recorder.gpu, &mut recorder.passes, learn, &self.splats, &buffers, &growth);
+        passes::grow(
+            &recorder.gpu,
+            &mut recorder.passes,
+            learn,
+            &self.splats,
+            &buffers,
+            &growth,
+        );
         recorder.submit_and_release_buffers();
         self.splats.set_n_splats(&recorder.gpu, n_after);
         Ok(())
     }
 
-    /// Reserves capacity for `n_splats`. Returns that number, or a smaller one if GPU memory is insufficient.
-    fn reserve_up_to(&mut self, recorder: &mut Recorder, renderer: &mut Renderer, n_splats: u32) -> Result<u32, Error> {
+    /// Reserves capacity for `n_splats`. Returns that number, or a smaller one if GPU memory is
+    /// insufficient.
+    fn reserve_up_to(
+        &mut self,
+        recorder: &mut Recorder,
+        renderer: &mut Renderer,
+        n_splats: u32,
+    ) -> Result<u32, Error> {
         if self.is_full {
             return Ok(n_splats.min(self.splats.capacity));
         }
@@ -116,15 +142,25 @@ impl TrainedModel {
         }
     }
 
-    fn reserve(&mut self, recorder: &mut Recorder, renderer: &mut Renderer, n_splats: u32) -> Result<(), Error> {
+    fn reserve(
+        &mut self,
+        recorder: &mut Recorder,
+        renderer: &mut Renderer,
+        n_splats: u32,
+    ) -> Result<(), Error> {
         let have = self.splats.capacity;
         if n_splats <= have {
             return Ok(());
         }
-        let capacity = n_splats.max(have.saturating_mul(3) / 2).min(self.max_splats.max(n_splats));
-        // Reserve the drawing buffers first, so that every model that fits into memory can also be drawn.
+        let capacity = n_splats
+            .max(have.saturating_mul(3) / 2)
+            .min(self.max_splats.max(n_splats));
+        // Reserve the drawing buffers first, so that every model that fits into memory can also be
+        // drawn.
         renderer.reserve_splats(recorder, capacity)?;
-        self.splats = self.splats.resized(&recorder.gpu, capacity, self.splats.sh_degree)?;
+        self.splats = self
+            .splats
+            .resized(&recorder.gpu, capacity, self.splats.sh_degree)?;
         recorder.passes.clear_bindings();
         Ok(())
     }
@@ -142,7 +178,10 @@ impl TrainedModel {
     /// Keeps the number of splats from now on, because GPU memory is too small.
     pub(super) fn stop_growing(&mut self, error: &Error) {
         if !std::mem::replace(&mut self.is_full, true) {
-            log::warn!("the model stops growing at {} splats: {error}", self.splats.n_splats);
+            log::warn!(
+                "the model stops growing at {} splats: {error}",
+                self.splats.n_splats
+            );
         }
     }
 }
@@ -156,7 +195,14 @@ fn spread_out(arrays: &SplatArrays, n: usize) -> SplatArrays {
         log_scales: picks.iter().map(|ix| arrays.log_scales[*ix]).collect(),
         rotations_wxyz: picks.iter().map(|ix| arrays.rotations_wxyz[*ix]).collect(),
         opacity_logits: picks.iter().map(|ix| arrays.opacity_logits[*ix]).collect(),
-        sh: picks.iter().flat_map(|ix| arrays.sh[ix * n_coeffs..(ix + 1) * n_coeffs].iter().copied()).collect(),
+        sh: picks
+            .iter()
+            .flat_map(|ix| {
+                arrays.sh[ix * n_coeffs..(ix + 1) * n_coeffs]
+                    .iter()
+                    .copied()
+            })
+            .collect(),
         sh_degree: arrays.sh_degree,
         is_antialiased: arrays.is_antialiased,
     }

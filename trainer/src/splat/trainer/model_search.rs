@@ -33,8 +33,9 @@ impl SplatTrainer {
         }
     }
 
-    /// Starts, advances and ends trials and the growth search until nothing is due, so that all effects of
-    /// a trial's end apply at the same step. Postponing them to the next submit would make training depend on timing.
+    /// Starts, advances and ends trials and the growth search until nothing is due, so that all
+    /// effects of a trial's end apply at the same step. Postponing them to the next submit would
+    /// make training depend on timing.
     pub(super) fn try_when_due(&mut self) -> Result<(), Error> {
         while self.is_growth_search_due() || self.due_trial() != Due::Nothing {
             self.finish_in_flight()?; // A failed submit may reduce the step count.
@@ -70,11 +71,17 @@ impl SplatTrainer {
             Ok(snapshot) => snapshot,
             Err(error) => return self.end_trials_without_memory(error),
         };
-        let Some(SecondHalf { from, candidate, arrived }) = self.trials.begin_second_half(snapshot, baseline_db) else {
+        let Some(SecondHalf {
+            from,
+            candidate,
+            arrived,
+        }) = self.trials.begin_second_half(snapshot, baseline_db)
+        else {
             return Ok(());
         };
         self.restore_snapshot(from)?;
-        self.views.retain(|keyframe| !arrived.iter().any(|other| Arc::ptr_eq(other, keyframe)));
+        self.views
+            .retain(|keyframe| !arrived.iter().any(|other| Arc::ptr_eq(other, keyframe)));
         match candidate {
             Candidate::Cameras(params) => self.model.cameras.enable(params),
             Candidate::Halved { to, .. } => self.keep_most_contributing(to)?,
@@ -98,26 +105,41 @@ impl SplatTrainer {
 
     /// Adds a keyframe in the second half, at the same step at which it arrived in the first half.
     fn add_next_arrival(&mut self) -> Result<(), Error> {
-        let Some(keyframe) = self.trials.next_arrival() else { return Ok(()) };
+        let Some(keyframe) = self.trials.next_arrival() else {
+            return Ok(());
+        };
         self.add_arrival(keyframe)?;
         self.prepare_training()
     }
 
     fn decide_trial(&mut self) -> Result<(), Error> {
         let variant_db = self.score_validation()?;
-        let Some(finished) = self.trials.end(&variant_db) else { return Ok(()) };
+        let Some(finished) = self.trials.end(&variant_db) else {
+            return Ok(());
+        };
         self.end_trial(finished)?;
         self.prepare_training()
     }
 
-    /// Ends a trial. Restores the state without the change if the change was rejected. Then adds the keyframes that
-    /// arrived in the second half.
-    fn end_trial(&mut self, TrialEnd { restored, seeded, deferred }: TrialEnd) -> Result<(), Error> {
+    /// Ends a trial. Restores the state without the change if the change was rejected. Then adds
+    /// the keyframes that arrived in the second half.
+    fn end_trial(
+        &mut self,
+        TrialEnd {
+            restored,
+            seeded,
+            deferred,
+        }: TrialEnd,
+    ) -> Result<(), Error> {
         if let Some(snapshot) = restored {
             self.restore_snapshot(snapshot)?;
-            seeded.into_iter().for_each(|keyframe| self.views.push(keyframe));
+            seeded
+                .into_iter()
+                .for_each(|keyframe| self.views.push(keyframe));
         }
-        deferred.into_iter().try_for_each(|keyframe| self.add_arrival(keyframe))?;
+        deferred
+            .into_iter()
+            .try_for_each(|keyframe| self.add_arrival(keyframe))?;
         self.update_growth_search();
         Ok(())
     }
@@ -130,7 +152,9 @@ impl SplatTrainer {
             );
         }
         self.abort_growth_search()?;
-        let Some(canceled) = self.trials.cancel() else { return Ok(()) };
+        let Some(canceled) = self.trials.cancel() else {
+            return Ok(());
+        };
         log::info!("training stopped during a trial; saving the model without the tested change");
         self.end_trial(canceled)
     }
@@ -138,10 +162,13 @@ impl SplatTrainer {
     /// Ends a growth search or a trial without a decision; it is repeated.
     pub(super) fn abort_trial(&mut self) -> Result<(), Error> {
         self.abort_growth_search()?;
-        self.trials.abort().map_or(Ok(()), |aborted| self.end_trial(aborted))
+        self.trials
+            .abort()
+            .map_or(Ok(()), |aborted| self.end_trial(aborted))
     }
 
-    /// Ends all trials, which need copies of the model, if there is no memory for them. Training continues.
+    /// Ends all trials, which need copies of the model, if there is no memory for them. Training
+    /// continues.
     fn end_trials_without_memory(&mut self, error: Error) -> Result<(), Error> {
         if !error.is_out_of_memory() {
             return Err(error);
@@ -152,7 +179,9 @@ impl SplatTrainer {
 
     pub(super) fn release_validation(&mut self) -> Result<(), Error> {
         let released: Vec<Arc<Keyframe>> = self.trials.finish();
-        released.into_iter().try_for_each(|keyframe| self.add_view(keyframe))?;
+        released
+            .into_iter()
+            .try_for_each(|keyframe| self.add_view(keyframe))?;
         self.prepare_training()
     }
 
@@ -171,11 +200,14 @@ impl SplatTrainer {
         let n_reverted = self.schedule.step.wrapping_sub(snapshot.schedule.step);
         self.trials.n_reverted_steps = self.trials.n_reverted_steps.wrapping_add(n_reverted);
         self.model.splats = snapshot.splats;
-        self.model.cameras.restore_snapshot(&self.recorder.gpu, snapshot.cameras)?;
+        self.model
+            .cameras
+            .restore_snapshot(&self.recorder.gpu, snapshot.cameras)?;
         self.schedule = snapshot.schedule;
         self.seeding.scene = snapshot.scene;
         let step = u32::try_from(self.schedule.step).unwrap_or(u32::MAX);
-        self.optimizer.write_counter(&self.recorder.gpu, status::STEP, step);
+        self.optimizer
+            .write_counter(&self.recorder.gpu, status::STEP, step);
         Ok(())
     }
 }

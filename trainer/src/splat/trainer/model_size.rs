@@ -1,5 +1,5 @@
-//! Reduces the model's size: computes the contribution of each splat, prunes the splats that contribute least, and
-//! lowers the SH degree.
+//! Reduces the model's size: computes the contribution of each splat, prunes the splats that
+//! contribute least, and lowers the SH degree.
 
 use super::SplatTrainer;
 use super::optimizer::StepContext;
@@ -17,14 +17,18 @@ impl SplatTrainer {
     /// Contribution of each splat to the views: the sum of its blending weights, in pixels.
     pub(super) fn contributions(&mut self, learn: &TrainPipelines) -> Result<Vec<f32>, Error> {
         let n_splats = self.model.splats.n_splats;
-        let contributions = self.recorder.gpu.storage("splat.contributions", 4 * u64::from(n_splats))?;
+        let contributions = self
+            .recorder
+            .gpu
+            .storage("splat.contributions", 4 * u64::from(n_splats))?;
         let stride = self.views.len().div_ceil(MAX_VIEWS).max(1);
         let sampled_views: Vec<usize> = (0..self.views.len()).step_by(stride).collect();
         for view_ix in &sampled_views {
             self.reserve_view(self.views.size_px((*view_ix, 0)))?;
         }
         if let Some(image_buffers) = &self.optimizer.image_buffers {
-            // With an error of one at every pixel, a splat's error sum equals the sum of its blending weights.
+            // With an error of one at every pixel, a splat's error sum equals the sum of its
+            // blending weights.
             self.recorder.gpu.write(
                 &image_buffers.pixel_totals,
                 0,
@@ -36,19 +40,41 @@ impl SplatTrainer {
         self.optimizer.write_drop_frac(&self.recorder.gpu, 0.0);
         for (ix, view_ix) in sampled_views.iter().copied().enumerate() {
             if ix % VIEWS_AT_ONCE == 0 {
-                let next = sampled_views[ix..].iter().take(VIEWS_AT_ONCE).map(|view_ix| (*view_ix, 0)).collect();
-                self.views.upload(&mut self.recorder, &next, self.schedule.step)?;
+                let next = sampled_views[ix..]
+                    .iter()
+                    .take(VIEWS_AT_ONCE)
+                    .map(|view_ix| (*view_ix, 0))
+                    .collect();
+                self.views
+                    .upload(&mut self.recorder, &next, self.schedule.step)?;
             }
             loop {
-                let Self { recorder: Recorder { gpu, passes }, model, renderer, optimizer, views, .. } = &mut *self;
-                let context = StepContext { gpu, learn, renderer, model };
-                let view = optimizer.prepared_view(&context, passes, views.ready_level((view_ix, 0))?)?.view;
+                let Self {
+                    recorder: Recorder { gpu, passes },
+                    model,
+                    renderer,
+                    optimizer,
+                    views,
+                    ..
+                } = &mut *self;
+                let context = StepContext {
+                    gpu,
+                    learn,
+                    renderer,
+                    model,
+                };
+                let view = optimizer
+                    .prepared_view(&context, passes, views.ready_level((view_ix, 0))?)?
+                    .view;
                 view.draw_for_backward(passes, &renderer.pipelines, learn);
                 view.backward(passes, learn);
                 view.contribute(passes, learn, &contributions); // Has no effect if a buffer was too small.
                 passes.submit(gpu);
                 let counters: Vec<u32> = gpu.read(&optimizer.status, status::LEN)?;
-                if !self.renderer.grow_scratch(&mut self.recorder, &counters, true)? {
+                if !self
+                    .renderer
+                    .grow_scratch(&mut self.recorder, &counters, true)?
+                {
                     break;
                 }
                 self.optimizer.clear_failure(&self.recorder.gpu);
@@ -63,11 +89,19 @@ impl SplatTrainer {
         let learn = self.learn()?;
         let contributions = self.contributions(&learn)?;
         let mut by_contribution: Vec<u32> = (0..self.model.splats.n_splats).collect();
-        by_contribution
-            .sort_by(|a, b| contributions[*b as usize].total_cmp(&contributions[*a as usize]).then(a.cmp(b)));
+        by_contribution.sort_by(|a, b| {
+            contributions[*b as usize]
+                .total_cmp(&contributions[*a as usize])
+                .then(a.cmp(b))
+        });
         by_contribution.truncate(n_kept as usize);
         by_contribution.sort_unstable();
-        self.model.splats = gather_splats(&mut self.recorder, &self.model.splats, &learn, &by_contribution)?;
+        self.model.splats = gather_splats(
+            &mut self.recorder,
+            &self.model.splats,
+            &learn,
+            &by_contribution,
+        )?;
         self.recorder.passes.clear_bindings();
         Ok(())
     }
@@ -102,7 +136,10 @@ fn gather_splats(
             to_capacity: fewer.capacity,
         };
         let buffers = [
-            ("gathering", &gpu.uniform_with("splat.gathering", &gathering)),
+            (
+                "gathering",
+                &gpu.uniform_with("splat.gathering", &gathering),
+            ),
             ("kept", &indices),
             ("from_words", *from),
             ("to_words", to),
@@ -130,7 +167,12 @@ mod tests {
     use keyframe::{Keyframe, Split};
     use std::sync::Arc;
 
-    fn trained(count: CountPolicy, keyframes: &[Arc<Keyframe>], gpu: Arc<Gpu>, n_steps: u64) -> SplatTrainer {
+    fn trained(
+        count: CountPolicy,
+        keyframes: &[Arc<Keyframe>],
+        gpu: Arc<Gpu>,
+        n_steps: u64,
+    ) -> SplatTrainer {
         let options = options().with(|options| {
             options.common.n_planned_steps = 1500;
             options.specific.count = count;
@@ -147,7 +189,10 @@ mod tests {
     fn some_trained(n_steps: u64) -> (SplatTrainer, Vec<Arc<Keyframe>>) {
         let gpu = test_gpu();
         let keyframes = n_keyframes(&gpu, 12, true);
-        (trained(CountPolicy::Tested, &keyframes, gpu, n_steps), keyframes)
+        (
+            trained(CountPolicy::Tested, &keyframes, gpu, n_steps),
+            keyframes,
+        )
     }
 
     /// At each pixel, the blending weights and the transmittance sum to one.
@@ -155,15 +200,23 @@ mod tests {
     fn contributions_sum_to_coverage() {
         let (mut trainer, _) = some_trained(60);
         let only = trainer.views.keyframe(0).clone();
-        trainer.views.retain(|keyframe| Arc::ptr_eq(keyframe, &only));
+        trainer
+            .views
+            .retain(|keyframe| Arc::ptr_eq(keyframe, &only));
         let learn = trainer.learn().unwrap();
         let contributions = trainer.contributions(&learn).unwrap();
         let n_pixels = only.size_px.iter().product::<u32>() as usize;
         let image = &trainer.optimizer.image_buffers.as_ref().unwrap().image;
         let colors: Vec<[f32; 4]> = trainer.recorder.gpu.read(image, n_pixels).unwrap();
-        let covered: f64 = colors.iter().map(|[.., transmittance]| 1.0 - f64::from(*transmittance)).sum();
+        let covered: f64 = colors
+            .iter()
+            .map(|[.., transmittance]| 1.0 - f64::from(*transmittance))
+            .sum();
         let reported: f64 = contributions.iter().map(|sum| f64::from(*sum)).sum();
-        assert!(covered > 0.2 * n_pixels as f64 && (reported / covered - 1.0).abs() < 1e-4, "{reported} of {covered}");
+        assert!(
+            covered > 0.2 * n_pixels as f64 && (reported / covered - 1.0).abs() < 1e-4,
+            "{reported} of {covered}"
+        );
     }
 
     #[test]
@@ -175,14 +228,22 @@ mod tests {
         let n_kept = trainer.model.splats.n_splats / 3;
         trainer.keep_most_contributing(n_kept).unwrap();
         let after = words(&trainer);
-        assert!(trainer.model.splats.n_splats == n_kept && n_kept > 50, "{n_kept}");
+        assert!(
+            trainer.model.splats.n_splats == n_kept && n_kept > 50,
+            "{n_kept}"
+        );
         let mut sorted = contributions.clone();
         sorted.sort_by(|a, b| b.total_cmp(a));
         let min_kept = sorted[n_kept as usize - 1];
-        let kept: Vec<usize> = (0..contributions.len()).filter(|ix| contributions[*ix] >= min_kept).collect();
+        let kept: Vec<usize> = (0..contributions.len())
+            .filter(|ix| contributions[*ix] >= min_kept)
+            .collect();
         assert_eq!(kept.len(), n_kept as usize, "contributions are distinct");
         for (before, after) in before.iter().zip(&after) {
-            let expected: Vec<u32> = kept.iter().flat_map(|ix| before[*ix].iter().copied()).collect();
+            let expected: Vec<u32> = kept
+                .iter()
+                .flat_map(|ix| before[*ix].iter().copied())
+                .collect();
             assert_eq!(expected, after.concat());
         }
     }
@@ -192,7 +253,11 @@ mod tests {
         let splats = &trainer.model.splats;
         let mut all = Vec::new();
         for (buffer, n_planes, bytes) in splats.planes() {
-            let words: Vec<u32> = trainer.recorder.gpu.read(buffer, (buffer.bytes() / 4) as usize).unwrap();
+            let words: Vec<u32> = trainer
+                .recorder
+                .gpu
+                .read(buffer, (buffer.bytes() / 4) as usize)
+                .unwrap();
             let per_plane = splats.capacity as usize * (bytes / 4) as usize;
             for plane in words.chunks_exact(per_plane.max(1)).take(n_planes as usize) {
                 all.push(
@@ -219,21 +284,39 @@ mod tests {
         train(&mut tested, 1900);
         let reported: Vec<Trial> = tested.trials().to_vec();
         assert!(
-            reported.iter().any(|trial| matches!(trial.candidate, Candidate::Halved { .. }) && trial.kept),
+            reported
+                .iter()
+                .any(|trial| matches!(trial.candidate, Candidate::Halved { .. }) && trial.kept),
             "{reported:?}"
         );
-        let n_learned = keyframes.iter().filter(|keyframe| keyframe.split != Split::Test).count();
-        assert!(!tested.trials.holds_validation() && tested.views.len() == n_learned, "{reported:?}");
-        assert!(tested.progress().primitives <= 2000 && tested.model.splats.sh_degree == 0, "{reported:?}");
-        let tests = keyframes.iter().zip(&clean).filter(|(keyframe, _)| keyframe.split == Split::Test);
+        let n_learned = keyframes
+            .iter()
+            .filter(|keyframe| keyframe.split != Split::Test)
+            .count();
+        assert!(
+            !tested.trials.holds_validation() && tested.views.len() == n_learned,
+            "{reported:?}"
+        );
+        assert!(
+            tested.progress().primitives <= 2000 && tested.model.splats.sh_degree == 0,
+            "{reported:?}"
+        );
+        let tests = keyframes
+            .iter()
+            .zip(&clean)
+            .filter(|(keyframe, _)| keyframe.split == Split::Test);
         let ceilings: Vec<f64> = tests
             .map(|(noisy, clean)| {
-                psnr(&PixelPair::new(noisy.size_px, &clean.rgba_srgb, &noisy.rgba_srgb).unwrap()).unwrap()
+                psnr(&PixelPair::new(noisy.size_px, &clean.rgba_srgb, &noisy.rgba_srgb).unwrap())
+                    .unwrap()
             })
             .collect();
         let ceiling = ceilings.iter().sum::<f64>() / ceilings.len() as f64;
         let reached = test_psnr(&mut tested, &keyframes);
-        assert!(reached > ceiling - 1.5, "{reached} of {ceiling} dB, {reported:?}");
+        assert!(
+            reached > ceiling - 1.5,
+            "{reached} of {ceiling} dB, {reported:?}"
+        );
     }
 
     /// While a trial tests half of the splats, all splats are still displayed.
@@ -241,12 +324,16 @@ mod tests {
     fn running_trial_is_not_displayed() {
         let (mut trainer, keyframes) = some_trained(400);
         let state = trainer.snapshot().unwrap();
-        trainer.trials.begin(Candidate::Halved { from: 0, to: 0 }, state, 1);
+        trainer
+            .trials
+            .begin(Candidate::Halved { from: 0, to: 0 }, state, 1);
         let view = request(keyframes[0].world_from_camera);
         let before = trainer.render(&view).unwrap();
         let n_before = trainer.progress().primitives;
         let baseline = trainer.snapshot().unwrap();
-        trainer.trials.begin_second_half(baseline, super::super::super::trials::Scores::new());
+        trainer
+            .trials
+            .begin_second_half(baseline, super::super::super::trials::Scores::new());
         trainer.keep_most_contributing(50).unwrap();
         assert_eq!(trainer.progress().primitives, n_before);
         assert!(trainer.render(&view).unwrap().rgba_srgb == before.rgba_srgb);

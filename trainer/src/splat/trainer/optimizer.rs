@@ -61,7 +61,10 @@ impl Optimizer {
             image_buffers: None,
             status: gpu.storage_with("splat.train_status", &[0; 4 * status::LEN])?,
             rule: gpu.uniform_with("splat.rule", &<Rule as bytemuck::Zeroable>::zeroed()),
-            supervision: gpu.uniform_with("splat.supervision", &<Supervision as bytemuck::Zeroable>::zeroed()),
+            supervision: gpu.uniform_with(
+                "splat.supervision",
+                &<Supervision as bytemuck::Zeroable>::zeroed(),
+            ),
             has_ssim: options.specific.dssim_frac > 0.0,
             n_non_finite: 0,
         })
@@ -73,7 +76,13 @@ impl Optimizer {
     }
 
     /// Uploads the loss weights of the next steps.
-    pub(super) fn write_supervision(&self, gpu: &Gpu, options: &SplatOptions, scarcity: Scarcity, mean_srgb: [f32; 3]) {
+    pub(super) fn write_supervision(
+        &self,
+        gpu: &Gpu,
+        options: &SplatOptions,
+        scarcity: Scarcity,
+        mean_srgb: [f32; 3],
+    ) {
         let supervision = scarcity.supervision(options, mean_srgb);
         gpu.write(&self.supervision, 0, bytemuck::bytes_of(&supervision));
     }
@@ -100,7 +109,9 @@ impl Optimizer {
 
     /// Buffers of the picture of the latest step.
     pub(super) fn image_buffers(&self) -> Result<&ImageBuffers, Error> {
-        self.image_buffers.as_ref().ok_or_else(|| Error::internal("no image buffers are reserved for a step"))
+        self.image_buffers
+            .as_ref()
+            .ok_or_else(|| Error::internal("no image buffers are reserved for a step"))
     }
 
     /// Allocates the buffers for training up to `capacity` splats on images of this size.
@@ -122,7 +133,12 @@ impl Optimizer {
         passes: &mut Passes,
         view: (Option<&Buffer>, &Level),
     ) -> Result<(), Error> {
-        let StepContext { gpu, learn, renderer, model } = *context;
+        let StepContext {
+            gpu,
+            learn,
+            renderer,
+            model,
+        } = *context;
         let PreparedView { view, level, lens } = self.prepared_view(context, passes, view)?;
         let target = Target {
             image: &level.image,
@@ -144,14 +160,20 @@ impl Optimizer {
         Ok(())
     }
 
-    /// Returns a view with the current camera parameters applied, and records the pass that applies them.
+    /// Returns a view with the current camera parameters applied, and records the pass that applies
+    /// them.
     pub(super) fn prepared_view<'a>(
         &'a self,
         context: &StepContext<'a>,
         passes: &mut Passes,
         (lens, level): (Option<&'a Buffer>, &'a Level),
     ) -> Result<PreparedView<'a>, Error> {
-        let StepContext { gpu, learn, renderer, model } = *context;
+        let StepContext {
+            gpu,
+            learn,
+            renderer,
+            model,
+        } = *context;
         let lens = lens.filter(|_| !model.cameras.set.is_empty());
         if let Some(lens) = lens {
             model.cameras.correct(gpu, passes, learn, &level.view, lens);
@@ -165,7 +187,11 @@ impl Optimizer {
                 .as_ref()
                 .ok_or_else(|| Error::internal("no image buffers are reserved for a step"))?,
             status: &self.status,
-            view: if lens.is_some() { &model.cameras.corrected } else { &level.view },
+            view: if lens.is_some() {
+                &model.cameras.corrected
+            } else {
+                &level.view
+            },
             size_px: level.size_px,
             erased: None,
         };
@@ -174,10 +200,13 @@ impl Optimizer {
 
     /// Submits the recorded steps and starts reading back the counters.
     pub(super) fn submit(&self, recorder: &mut Recorder) -> PendingRead {
-        recorder.passes.submit_reading(&recorder.gpu, &[(&self.status, 4 * status::LEN)])
+        recorder
+            .passes
+            .submit_reading(&recorder.gpu, &[(&self.status, 4 * status::LEN)])
     }
 
-    /// Stores the number of non-finite gradients. Logs a warning when it becomes nonzero and at each doubling.
+    /// Stores the number of non-finite gradients. Logs a warning when it becomes nonzero and at
+    /// each doubling.
     pub(super) fn log_non_finite(&mut self, n_non_finite: u64) {
         if n_non_finite.checked_ilog2() > self.n_non_finite.checked_ilog2() {
             log::warn!("dropped {n_non_finite} non-finite gradients of splats so far");

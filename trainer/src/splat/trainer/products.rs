@@ -1,4 +1,5 @@
-//! Scores and gains of a rendered picture against a camera image, from the pixel sums that `score.wgsl` computes.
+//! Scores and gains of a rendered picture against a camera image, from the pixel sums that
+//! `score.wgsl` computes.
 
 use crate::Error;
 use crate::gpu::{Buffer, Gpu, Passes, Pipeline};
@@ -18,7 +19,8 @@ pub(super) struct Products {
     n_visible: u64,
 }
 
-/// Records the comparison of a picture with an image. Returns the size of the resulting sums in bytes.
+/// Records the comparison of a picture with an image. Returns the size of the resulting sums in
+/// bytes.
 pub(super) fn record(
     gpu: &Gpu,
     passes: &mut Passes,
@@ -40,7 +42,13 @@ pub(super) fn record(
 
 /// Adds up the sums of all workgroups, for red, green and blue.
 pub(super) fn sum_up(sums: &[[u32; 4]]) -> [Products; 3] {
-    let sum = |color: usize, part: usize| sums.iter().skip(color).step_by(3).map(|of| u64::from(of[part])).sum();
+    let sum = |color: usize, part: usize| {
+        sums.iter()
+            .skip(color)
+            .step_by(3)
+            .map(|of| u64::from(of[part]))
+            .sum()
+    };
     [0, 1, 2].map(|color| Products {
         picture_picture: sum(color, 0),
         picture_image: sum(color, 1),
@@ -55,21 +63,25 @@ pub(super) fn psnr(products: &[Products; 3]) -> Result<f64, Error> {
     if n == 0 {
         return Err(Error::AllPixelsMasked);
     }
-    let squares: u64 =
-        products.iter().map(|color| color.picture_picture + color.image_image - 2 * color.picture_image).sum();
+    let squares: u64 = products
+        .iter()
+        .map(|color| color.picture_picture + color.image_image - 2 * color.picture_image)
+        .sum();
     let mean_square = squares as f64 / n as f64;
     Ok(10.0 * (255.0_f64.powi(2) / mean_square).log10())
 }
 
-/// PSNR in dB of a picture whose colors are multiplied by gains; `None` if all pixels are masked. Values above white
-/// are not clamped.
+/// PSNR in dB of a picture whose colors are multiplied by gains; `None` if all pixels are masked.
+/// Values above white are not clamped.
 pub(super) fn psnr_with_gains(products: &[Products; 3], gains: [f64; 3]) -> Option<f64> {
     let n: u64 = products.iter().map(|color| color.n_visible).sum();
     let square = |(color, gain): (&Products, f64)| {
-        gain * gain * color.picture_picture as f64 - 2.0 * gain * color.picture_image as f64 + color.image_image as f64
+        gain * gain * color.picture_picture as f64 - 2.0 * gain * color.picture_image as f64
+            + color.image_image as f64
     };
     let squares: f64 = products.iter().zip(gains).map(square).sum();
-    // The score stays finite: the squared error is at least one, that is, one level of one color at one pixel.
+    // The score stays finite: the squared error is at least one, that is, one level of one color at
+    // one pixel.
     (n > 0).then(|| 10.0 * (255.0f64.powi(2) * n as f64 / squares.max(1.0)).log10())
 }
 
@@ -78,6 +90,8 @@ pub(super) fn log_gains(products: &[Products; 3]) -> [f64; 3] {
     const MAX_LOG_GAIN: f64 = 1.5; // Two photographic stops: larger gains are not caused by exposure.
     products.map(|color| match (color.picture_image, color.picture_picture) {
         (0, _) | (_, 0) => 0.0,
-        (with_image, picture_only) => (with_image as f64 / picture_only as f64).ln().clamp(-MAX_LOG_GAIN, MAX_LOG_GAIN),
+        (with_image, picture_only) => (with_image as f64 / picture_only as f64)
+            .ln()
+            .clamp(-MAX_LOG_GAIN, MAX_LOG_GAIN),
     })
 }

@@ -1,8 +1,10 @@
-//! Corrects the cameras of a model in training: the splats move along with the keyframes that show them.
+//! Corrects the cameras of a model in training: the splats move along with the keyframes that show
+//! them.
 //!
-//! A correction moves every point that a keyframe observes. A splat moves by the weighted mean of these motions over the
-//! keyframes that observe it. The better a keyframe's depth agrees with the splat, the higher its weight.
-//! Coefficients of spherical harmonics are not rotated, because corrections are a few degrees at most.
+//! A correction moves every point that a keyframe observes. A splat moves by the weighted mean of
+//! these motions over the keyframes that observe it. The better a keyframe's depth agrees with the
+//! splat, the higher its weight. Coefficients of spherical harmonics are not rotated, because
+//! corrections are a few degrees at most.
 
 use super::SplatTrainer;
 use crate::aligned::replacement;
@@ -20,7 +22,8 @@ use std::sync::Arc;
 
 /// Maximum number of keyframes that determine the motion of the splats, spread evenly over all.
 const MAX_KEYFRAMES: usize = 64;
-/// A splat belongs to the surface of a depth reading if it is at most this fraction of its depth away.
+/// A splat belongs to the surface of a depth reading if it is at most this fraction of its depth
+/// away.
 const SURFACE_FRAC: f64 = 0.05;
 /// Depth error, as a fraction of the depth, at which the weight of a keyframe is halved.
 const AGREEMENT_FRAC: f64 = 0.001;
@@ -30,7 +33,11 @@ const WITHOUT_DEPTH: f64 = 1e-4;
 const IMAGE_PARAMS: ParamSet = ParamSet::IMAGE_POSES.union(ParamSet::IMAGE_GAINS);
 
 impl Recalibrate for SplatTrainer {
-    fn recalibrate(&mut self, keyframes: &[CorrectedKeyframe], alignment: &Alignment) -> Result<(), Error> {
+    fn recalibrate(
+        &mut self,
+        keyframes: &[CorrectedKeyframe],
+        alignment: &Alignment,
+    ) -> Result<(), Error> {
         self.finish_in_flight()?;
         self.abort_trial()?;
         let learned = match self.model.cameras.set.is_empty() {
@@ -44,12 +51,16 @@ impl Recalibrate for SplatTrainer {
         self.recorder.passes.clear_bindings();
         self.views.replace_cameras(&gpu, &corrected);
         self.seeding.replace_cameras(&corrected, &self.views);
-        self.trials.validation.iter_mut().for_each(|image| corrected(&mut image.keyframe));
+        self.trials
+            .validation
+            .iter_mut()
+            .for_each(|image| corrected(&mut image.keyframe));
         let mut params = self.model.cameras.set & IMAGE_PARAMS;
         if alignment.has_image_poses() && self.trials.remove_candidate(ParamSet::IMAGE_POSES) {
             params |= ParamSet::IMAGE_POSES; // Depth gives image poses to a few millimeters; the splats refine them.
         }
-        self.model.cameras = CameraParams::new(&gpu, self.options.common.cameras.always() | params)?;
+        self.model.cameras =
+            CameraParams::new(&gpu, self.options.common.cameras.always() | params)?;
         self.schedule.extend_for_arrival();
         Ok(())
     }
@@ -64,18 +75,45 @@ struct PosedCamera {
 
 impl PosedCamera {
     fn of(keyframe: &Keyframe) -> Self {
-        let Keyframe { world_from_camera, size_px, focal_px, principal_px, .. } = *keyframe;
+        let Keyframe {
+            world_from_camera,
+            size_px,
+            focal_px,
+            principal_px,
+            ..
+        } = *keyframe;
         Self::pinhole(world_from_camera, size_px, focal_px, principal_px)
     }
 
     fn of_depth(depth: &DepthMap) -> Self {
-        let DepthMap { world_from_camera, size_px, focal_px, principal_px, .. } = *depth;
+        let DepthMap {
+            world_from_camera,
+            size_px,
+            focal_px,
+            principal_px,
+            ..
+        } = *depth;
         Self::pinhole(world_from_camera, size_px, focal_px, principal_px)
     }
 
-    fn pinhole(world_from_camera: Transform, size_px: [u32; 2], focal_px: [f64; 2], principal_px: [f64; 2]) -> Self {
-        let intrinsics = Intrinsics { size_px, focal_px, principal_px, lens: Lens::Pinhole, rectified: true };
-        Self { world_from_camera, camera_from_world: world_from_camera.inverse(), intrinsics }
+    fn pinhole(
+        world_from_camera: Transform,
+        size_px: [u32; 2],
+        focal_px: [f64; 2],
+        principal_px: [f64; 2],
+    ) -> Self {
+        let intrinsics = Intrinsics {
+            size_px,
+            focal_px,
+            principal_px,
+            lens: Lens::Pinhole,
+            rectified: true,
+        };
+        Self {
+            world_from_camera,
+            camera_from_world: world_from_camera.inverse(),
+            intrinsics,
+        }
     }
 
     /// Pixel and depth of a point in the world, if the image contains it.
@@ -92,7 +130,11 @@ impl PosedCamera {
 }
 
 /// The reading at a pixel within the depth map, meters along z.
-#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "pixels within the image")]
+#[expect(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "pixels within the image"
+)]
 fn reading_m(depth: &DepthMap, px: [f64; 2]) -> f64 {
     let [x, y] = px.map(|px| px as usize);
     depth.depth_m[y * depth.size_px[0] as usize + x].into()
@@ -108,7 +150,8 @@ struct Motion {
 }
 
 impl Motion {
-    /// Where the correction moves a point, and the weight of this motion; `None` if the keyframe does not show the point.
+    /// Where the correction moves a point, and the weight of this motion; `None` if the keyframe
+    /// does not show the point.
     fn of_point(&self, point: &Point3<f64>) -> Option<(Point3<f64>, f64)> {
         let (px, z) = self.before.project(point)?;
         let known = self.depth.as_ref().and_then(|(camera, depth)| {
@@ -125,45 +168,69 @@ impl Motion {
     }
 }
 
-/// The motions of a subset of the keyframes. `learned` returns the correction of a camera that was learned with the splats
-/// on top of those in the keyframes.
-fn motions<'a>(keyframes: &[CorrectedKeyframe], learned: impl Fn(&str) -> Option<&'a CameraCorrection>) -> Vec<Motion> {
+/// The motions of a subset of the keyframes. `learned` returns the correction of a camera that was
+/// learned with the splats on top of those in the keyframes.
+fn motions<'a>(
+    keyframes: &[CorrectedKeyframe],
+    learned: impl Fn(&str) -> Option<&'a CameraCorrection>,
+) -> Vec<Motion> {
     let n = keyframes.len().min(MAX_KEYFRAMES);
     let subset = (0..n).map(|ix| &keyframes[ix * keyframes.len() / n]);
     let motion = |CorrectedKeyframe { before, after }: &CorrectedKeyframe| {
-        let before =
-            learned(&before.camera).map_or_else(|| before.clone(), |learned| Arc::new(learned.corrected(before)));
-        let rotation = after.world_from_camera.rotation * before.world_from_camera.rotation.inverse();
+        let before = learned(&before.camera).map_or_else(
+            || before.clone(),
+            |learned| Arc::new(learned.corrected(before)),
+        );
+        let rotation =
+            after.world_from_camera.rotation * before.world_from_camera.rotation.inverse();
         Motion {
             before: PosedCamera::of(&before),
             after: PosedCamera::of(after),
-            depth: before.depth.clone().map(|depth| (PosedCamera::of_depth(&depth), depth)),
+            depth: before
+                .depth
+                .clone()
+                .map(|depth| (PosedCamera::of_depth(&depth), depth)),
             rotation,
         }
     };
     subset.map(motion).collect()
 }
 
-/// Position and rotation of a splat after the correction: the weighted means over the keyframes that show it, or those of
-/// the nearest camera if none does.
+/// Position and rotation of a splat after the correction: the weighted means over the keyframes
+/// that show it, or those of the nearest camera if none does.
 fn moved(motions: &[Motion], point: &Point3<f64>) -> Option<(Point3<f64>, UnitQuaternion<f64>)> {
     let (mut weights, mut shift) = (0.0, Vector3::zeros());
     let mut rotations = Quaternion::from_parts(0.0, Vector3::zeros());
     for motion in motions {
-        let Some((position, weight)) = motion.of_point(point) else { continue };
+        let Some((position, weight)) = motion.of_point(point) else {
+            continue;
+        };
         let rotation = motion.rotation.into_inner();
-        rotations += if rotation.w < 0.0 { -rotation } else { rotation } * weight; // Both signs are the same rotation.
+        rotations += if rotation.w < 0.0 {
+            -rotation
+        } else {
+            rotation
+        } * weight; // Both signs are the same rotation.
         shift += (position - point) * weight;
         weights += weight;
     }
     if weights > 0.0 {
-        return Some((point + shift / weights, UnitQuaternion::from_quaternion(rotations)));
+        return Some((
+            point + shift / weights,
+            UnitQuaternion::from_quaternion(rotations),
+        ));
     }
-    let distance =
-        |motion: &&Motion| (motion.before.world_from_camera.translation.vector - point.coords).norm_squared();
-    let nearest = motions.iter().min_by(|a, b| distance(a).total_cmp(&distance(b)))?;
+    let distance = |motion: &&Motion| {
+        (motion.before.world_from_camera.translation.vector - point.coords).norm_squared()
+    };
+    let nearest = motions
+        .iter()
+        .min_by(|a, b| distance(a).total_cmp(&distance(b)))?;
     let in_camera = nearest.before.camera_from_world * point;
-    Some((nearest.after.world_from_camera * in_camera, nearest.rotation))
+    Some((
+        nearest.after.world_from_camera * in_camera,
+        nearest.rotation,
+    ))
 }
 
 /// Moves the splats on the GPU.
@@ -174,14 +241,19 @@ fn move_splats(gpu: &Gpu, splats: &SplatBuffers, motions: &[Motion]) -> Result<(
     }
     let mut means: Vec<[f32; 4]> = gpu.read(&splats.means, n)?;
     let mut rotations_wxyz: Vec<[f32; 4]> = gpu.read(&splats.rotations, n)?;
-    means.par_iter_mut().zip(&mut rotations_wxyz).for_each(|(mean, rotation_wxyz)| {
-        let [x, y, z, w] = mean.map(f64::from);
-        let Some((position, rotation)) = moved(motions, &Point3::new(x, y, z)) else { return };
-        let [qw, qx, qy, qz] = rotation_wxyz.map(f64::from);
-        let turned = rotation.into_inner() * Quaternion::new(qw, qx, qy, qz);
-        *mean = f32s_of([position.x, position.y, position.z, w]);
-        *rotation_wxyz = f32s_of([turned.w, turned.i, turned.j, turned.k]);
-    });
+    means
+        .par_iter_mut()
+        .zip(&mut rotations_wxyz)
+        .for_each(|(mean, rotation_wxyz)| {
+            let [x, y, z, w] = mean.map(f64::from);
+            let Some((position, rotation)) = moved(motions, &Point3::new(x, y, z)) else {
+                return;
+            };
+            let [qw, qx, qy, qz] = rotation_wxyz.map(f64::from);
+            let turned = rotation.into_inner() * Quaternion::new(qw, qx, qy, qz);
+            *mean = f32s_of([position.x, position.y, position.z, w]);
+            *rotation_wxyz = f32s_of([turned.w, turned.i, turned.j, turned.k]);
+        });
     gpu.write(&splats.means, 0, bytemuck::cast_slice(&means));
     gpu.write(&splats.rotations, 0, bytemuck::cast_slice(&rotations_wxyz));
     Ok(())
@@ -207,7 +279,9 @@ mod tests {
         for mean in trainer.arrays().unwrap().means {
             let point = Point3::from(mean.map(f64::from));
             for (camera, depth) in &depths {
-                let Some((px, z)) = camera.project(&point) else { continue };
+                let Some((px, z)) = camera.project(&point) else {
+                    continue;
+                };
                 let error = (reading_m(depth, px) - z).abs();
                 errors.extend((error < 0.1).then_some(error));
             }
@@ -218,17 +292,29 @@ mod tests {
     #[test]
     fn splats_move_to_the_surfaces_of_the_corrected_keyframes() {
         let gpu = test_gpu();
-        let miscalibration = Miscalibration { extrinsics: wrong_extrinsics(), ..Miscalibration::none() };
+        let miscalibration = Miscalibration {
+            extrinsics: wrong_extrinsics(),
+            ..Miscalibration::none()
+        };
         let [wrong, right] = [miscalibration, Miscalibration::none()].map(|miscalibration| {
             let mut keyframes = capture(&miscalibration);
             keyframes.retain(|keyframe| keyframe.split == keyframe::Split::Train);
             keyframes
         });
-        let specific = SplatOptions { max_splats: 4000, sh_degree: 0, ..SplatOptions::default() };
+        let specific = SplatOptions {
+            max_splats: 4000,
+            sh_degree: 0,
+            ..SplatOptions::default()
+        };
         let start = |keyframes: &[Arc<Keyframe>]| {
-            let options = ModelOptions { specific: specific.clone(), ..ModelOptions::default() };
+            let options = ModelOptions {
+                specific: specific.clone(),
+                ..ModelOptions::default()
+            };
             let mut trainer = SplatTrainer::new(gpu.clone(), options).unwrap();
-            keyframes.iter().for_each(|keyframe| trainer.push(keyframe.clone()).unwrap());
+            keyframes
+                .iter()
+                .for_each(|keyframe| trainer.push(keyframe.clone()).unwrap());
             trainer.seed().unwrap();
             trainer
         };
@@ -237,20 +323,40 @@ mod tests {
         let wrong_error_m = surface_error_m(&mut trainer, &right);
         let (n_splats, n_seeds) = (trainer.progress().primitives, trainer.n_seeds());
         let pairs = wrong.iter().zip(&right);
-        let corrected: Vec<_> =
-            pairs.map(|(before, after)| CorrectedKeyframe { before: before.clone(), after: after.clone() }).collect();
-        trainer.recalibrate(&corrected, &Alignment::default()).unwrap();
+        let corrected: Vec<_> = pairs
+            .map(|(before, after)| CorrectedKeyframe {
+                before: before.clone(),
+                after: after.clone(),
+            })
+            .collect();
+        trainer
+            .recalibrate(&corrected, &Alignment::default())
+            .unwrap();
         let moved_error_m = surface_error_m(&mut trainer, &right);
-        assert!(wrong_error_m > 3.0 * right_error_m, "{wrong_error_m} m must exceed {right_error_m} m");
-        assert!(moved_error_m < 1.5 * right_error_m, "{moved_error_m} m, seeded there: {right_error_m} m");
-        assert_eq!(trainer.progress().primitives, n_splats, "no splats are added or removed");
+        assert!(
+            wrong_error_m > 3.0 * right_error_m,
+            "{wrong_error_m} m must exceed {right_error_m} m"
+        );
+        assert!(
+            moved_error_m < 1.5 * right_error_m,
+            "{moved_error_m} m, seeded there: {right_error_m} m"
+        );
+        assert_eq!(
+            trainer.progress().primitives,
+            n_splats,
+            "no splats are added or removed"
+        );
         assert!(
             trainer.n_seeds() > n_seeds / 2 && trainer.n_seeds() < 2 * n_seeds,
             "{} of {n_seeds}",
             trainer.n_seeds()
         );
         trainer.seed().unwrap();
-        assert_eq!(trainer.progress().primitives, n_splats, "the keyframes are not seeded again");
+        assert_eq!(
+            trainer.progress().primitives,
+            n_splats,
+            "the keyframes are not seeded again"
+        );
     }
 
     #[test]
@@ -260,12 +366,18 @@ mod tests {
         let after = |keyframe: &Arc<Keyframe>| Arc::new(keyframe.with_base_correction(&shift));
         let corrected: Vec<_> = keyframes
             .iter()
-            .map(|keyframe| CorrectedKeyframe { before: keyframe.clone(), after: after(keyframe) })
+            .map(|keyframe| CorrectedKeyframe {
+                before: keyframe.clone(),
+                after: after(keyframe),
+            })
             .collect();
         let motions = motions(&corrected, |_| None);
         for point in [Point3::new(0.0, 0.0, 1e3), Point3::new(0.3, 0.1, 0.0)] {
             let (position, rotation) = moved(&motions, &point).unwrap();
-            assert!((position - shift * point).norm() < 1e-9 * point.coords.norm().max(1.0), "{position} {point}");
+            assert!(
+                (position - shift * point).norm() < 1e-9 * point.coords.norm().max(1.0),
+                "{position} {point}"
+            );
             assert!(rotation.angle_to(&shift.rotation) < 1e-9);
         }
         assert!(moved(&[], &Point3::origin()).is_none());

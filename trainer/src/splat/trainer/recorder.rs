@@ -12,7 +12,10 @@ pub(super) struct Recorder {
 
 impl Recorder {
     pub(super) fn new(gpu: Arc<Gpu>) -> Self {
-        Self { gpu, passes: Passes::default() }
+        Self {
+            gpu,
+            passes: Passes::default(),
+        }
     }
 
     /// Submits the recorded passes.

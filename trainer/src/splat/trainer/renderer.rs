@@ -1,4 +1,5 @@
-//! Draws splats from pinhole cameras. The forward pass of training uses the same pipelines and scratch buffers.
+//! Draws splats from pinhole cameras. The forward pass of training uses the same pipelines and
+//! scratch buffers.
 
 use super::products::{self, Products};
 use super::recorder::Recorder;
@@ -15,7 +16,8 @@ use nalgebra::Matrix4;
 /// Minimum capacity of the bin lists, in entries.
 const MIN_ENTRIES: u32 = 1 << 14;
 
-/// Divisors of the need that give the headroom of grown buffers, tried in this order: 1/2, 1/16, none.
+/// Divisors of the need that give the headroom of grown buffers, tried in this order: 1/2, 1/16,
+/// none.
 const HEADROOM_DIVISORS: [u32; 3] = [2, 16, u32::MAX];
 
 /// Draws pinhole views of splats.
@@ -60,7 +62,10 @@ impl Renderer {
             image_buffers: None,
             status: gpu.storage_with("splat.draw_status", &[0; 4 * status::LEN])?,
             view: gpu.uniform_with("splat.draw_view", &<View as bytemuck::Zeroable>::zeroed()),
-            background: gpu.uniform_with("splat.background", &<Supervision as bytemuck::Zeroable>::zeroed()),
+            background: gpu.uniform_with(
+                "splat.background",
+                &<Supervision as bytemuck::Zeroable>::zeroed(),
+            ),
             erased: ErasedSpace::none(gpu)?,
             compared: None,
             reader: Reader::default(),
@@ -75,12 +80,23 @@ impl Renderer {
         output: Output,
     ) -> Result<Option<Rendered>, Error> {
         let view_px = drawn.camera.size_px;
-        let output = self.reader.available(&recorder.gpu, &mut recorder.passes, output, view_px)?;
-        let take = |parts: &[&[u8]]| output.is_complete().then(|| Reader::take(output, view_px, parts));
-        match (self.draw(recorder, drawn, ReadParts::Picture(output), take)?, &self.image_buffers) {
+        let output = self
+            .reader
+            .available(&recorder.gpu, &mut recorder.passes, output, view_px)?;
+        let take = |parts: &[&[u8]]| {
+            output
+                .is_complete()
+                .then(|| Reader::take(output, view_px, parts))
+        };
+        match (
+            self.draw(recorder, drawn, ReadParts::Picture(output), take)?,
+            &self.image_buffers,
+        ) {
             (Some(None), Some(ImageBuffers { pixels, depths, .. })) => {
                 let Recorder { gpu, passes } = recorder;
-                self.reader.read_unpacked(gpu, passes, output, view_px, [pixels, depths]).map(Some)
+                self.reader
+                    .read_unpacked(gpu, passes, output, view_px, [pixels, depths])
+                    .map(Some)
             }
             (taken, _) => Ok(taken.flatten()),
         }
@@ -94,8 +110,15 @@ impl Renderer {
         score: &Pipeline,
         image: &Buffer,
     ) -> Result<[Products; 3], Error> {
-        let sum_up = |parts: &[&[u8]]| products::sum_up(&bytemuck::pod_collect_to_vec::<u8, [u32; 4]>(parts[0]));
-        self.draw(recorder, drawn, ReadParts::Comparison { score, image }, sum_up)
+        let sum_up = |parts: &[&[u8]]| {
+            products::sum_up(&bytemuck::pod_collect_to_vec::<u8, [u32; 4]>(parts[0]))
+        };
+        self.draw(
+            recorder,
+            drawn,
+            ReadParts::Comparison { score, image },
+            sum_up,
+        )
     }
 
     /// Draws a picture and compares it with an image of the same size in host memory.
@@ -128,7 +151,12 @@ impl Renderer {
         packing: Packing,
         size_px: [u32; 2],
     ) -> Result<bool, Error> {
-        let output = self.reader.available(&recorder.gpu, &mut recorder.passes, Output::packed(packing), size_px)?;
+        let output = self.reader.available(
+            &recorder.gpu,
+            &mut recorder.passes,
+            Output::packed(packing),
+            size_px,
+        )?;
         Ok(matches!(output.format, Format::Packed(_)))
     }
 
@@ -140,11 +168,16 @@ impl Renderer {
         packing: Packing,
     ) -> Result<QueuedPicture, Error> {
         let read = self.submit(recorder, drawn, ReadParts::Picture(Output::packed(packing)))?;
-        Ok(QueuedPicture::packed(read, is_complete, packing, drawn.camera.size_px))
+        Ok(QueuedPicture::packed(
+            read,
+            is_complete,
+            packing,
+            drawn.camera.size_px,
+        ))
     }
 
-    /// Draws a view and passes the bytes of the requested parts to `take`. If a buffer was too small, grows it and
-    /// draws again.
+    /// Draws a view and passes the bytes of the requested parts to `take`. If a buffer was too
+    /// small, grows it and draws again.
     fn draw<R>(
         &mut self,
         recorder: &mut Recorder,
@@ -153,15 +186,19 @@ impl Renderer {
         take: impl Fn(&[&[u8]]) -> R,
     ) -> Result<R, Error> {
         loop {
-            let (counters, taken) = self.submit(recorder, drawn, parts)?.finish_with(&recorder.gpu, |parts| {
-                let counters: Vec<u32> = bytemuck::pod_collect_to_vec(parts[0]);
-                (counters, is_complete(parts[0]).then(|| take(&parts[1..])))
-            })?;
+            let (counters, taken) =
+                self.submit(recorder, drawn, parts)?
+                    .finish_with(&recorder.gpu, |parts| {
+                        let counters: Vec<u32> = bytemuck::pod_collect_to_vec(parts[0]);
+                        (counters, is_complete(parts[0]).then(|| take(&parts[1..])))
+                    })?;
             if let Some(taken) = taken {
                 return Ok(taken);
             }
             if !self.grow_scratch(recorder, &counters, false)? {
-                return Err(Error::internal("a view failed although all of its buffers are large enough"));
+                return Err(Error::internal(
+                    "a view failed although all of its buffers are large enough",
+                ));
             }
             clear_failure(&recorder.gpu, &self.status);
         }
@@ -171,26 +208,57 @@ impl Renderer {
     fn submit(
         &mut self,
         recorder: &mut Recorder,
-        DrawnView { splats, camera, background_srgb: [red, green, blue] }: DrawnView<'_>,
+        DrawnView {
+            splats,
+            camera,
+            background_srgb: [red, green, blue],
+        }: DrawnView<'_>,
         parts: ReadParts<'_>,
     ) -> Result<PendingRead, Error> {
         let size_px = camera.size_px;
-        recorder.gpu.write(&self.view, 0, bytemuck::bytes_of(&camera.view()));
-        let background = Supervision { background_srgb: [red, green, blue, 0.0], ..bytemuck::Zeroable::zeroed() };
-        recorder.gpu.write(&self.background, 0, bytemuck::bytes_of(&background));
+        recorder
+            .gpu
+            .write(&self.view, 0, bytemuck::bytes_of(&camera.view()));
+        let background = Supervision {
+            background_srgb: [red, green, blue, 0.0],
+            ..bytemuck::Zeroable::zeroed()
+        };
+        recorder
+            .gpu
+            .write(&self.background, 0, bytemuck::bytes_of(&background));
         self.reserve_view(recorder, splats.capacity, size_px, false)?;
         reserve_image(recorder, &mut self.image_buffers, size_px, false)?;
-        let erased = self.erased.set(&recorder.gpu, &mut recorder.passes, &camera.edits, Matrix4::identity())?;
+        let erased = self.erased.set(
+            &recorder.gpu,
+            &mut recorder.passes,
+            &camera.edits,
+            Matrix4::identity(),
+        )?;
         let erased = (!camera.edits.is_empty()).then_some(erased);
         let (status, view, image_buffers) = (
             &self.status,
             &self.view,
-            self.image_buffers.as_ref().ok_or_else(|| Error::internal("no image buffers are reserved for a view"))?,
+            self.image_buffers
+                .as_ref()
+                .ok_or_else(|| Error::internal("no image buffers are reserved for a view"))?,
         );
-        let scratch = self.scratch.as_ref().map(|(_, scratch)| scratch).ok_or_else(no_scratch)?;
+        let scratch = self
+            .scratch
+            .as_ref()
+            .map(|(_, scratch)| scratch)
+            .ok_or_else(no_scratch)?;
         let Recorder { gpu, passes: list } = recorder;
         write_n_splats(gpu, status, splats.n_splats);
-        let passes = ViewPasses { gpu, splats, scratch, image_buffers, status, view, size_px, erased };
+        let passes = ViewPasses {
+            gpu,
+            splats,
+            scratch,
+            image_buffers,
+            status,
+            view,
+            size_px,
+            erased,
+        };
         passes.draw(list, &self.pipelines);
         passes.finish(list, &self.pipelines, &self.background);
         let mut read = vec![(status, 4 * status::LEN)];
@@ -200,7 +268,8 @@ impl Renderer {
                 read.extend(self.reader.record(gpu, list, output, size_px, canvas)?);
             }
             ReadParts::Comparison { score, image } => {
-                let n_bytes = products::record(gpu, list, score, (view, image_buffers), size_px, image);
+                let n_bytes =
+                    products::record(gpu, list, score, (view, image_buffers), size_px, image);
                 read.push((&image_buffers.products, n_bytes));
             }
         }
@@ -209,10 +278,14 @@ impl Renderer {
 
     /// The scratch buffers, which must be reserved first.
     pub(super) fn scratch(&self) -> Result<&Scratch, Error> {
-        self.scratch.as_ref().map(|(_, scratch)| scratch).ok_or_else(no_scratch)
+        self.scratch
+            .as_ref()
+            .map(|(_, scratch)| scratch)
+            .ok_or_else(no_scratch)
     }
 
-    /// Reserves buffers to draw a view of this size with up to `capacity` splats, and to train on it if `learned`.
+    /// Reserves buffers to draw a view of this size with up to `capacity` splats, and to train on
+    /// it if `learned`.
     pub(super) fn reserve_view(
         &mut self,
         recorder: &mut Recorder,
@@ -222,19 +295,45 @@ impl Renderer {
     ) -> Result<(), Error> {
         let n_entries = (2 * capacity).max(MIN_ENTRIES);
         let n_slots = if learned { 2 * n_entries } else { 0 };
-        self.reserve(recorder, ScratchSize { n_splats: capacity, n_entries, n_slots, n_bins: n_bins(size_px) })
+        self.reserve(
+            recorder,
+            ScratchSize {
+                n_splats: capacity,
+                n_entries,
+                n_slots,
+                n_bins: n_bins(size_px),
+            },
+        )
     }
 
     /// Reserves buffers to draw up to `capacity` splats. Does nothing before the first view.
-    pub(super) fn reserve_splats(&mut self, recorder: &mut Recorder, capacity: u32) -> Result<(), Error> {
-        let Some((have, _)) = self.scratch else { return Ok(()) };
+    pub(super) fn reserve_splats(
+        &mut self,
+        recorder: &mut Recorder,
+        capacity: u32,
+    ) -> Result<(), Error> {
+        let Some((have, _)) = self.scratch else {
+            return Ok(());
+        };
         let n_entries = have.n_entries.max(2 * capacity);
-        let n_slots = if have.n_slots > 0 { have.n_slots.max(4 * capacity) } else { 0 };
-        self.reserve(recorder, ScratchSize { n_splats: capacity, n_entries, n_slots, ..have })
+        let n_slots = if have.n_slots > 0 {
+            have.n_slots.max(4 * capacity)
+        } else {
+            0
+        };
+        self.reserve(
+            recorder,
+            ScratchSize {
+                n_splats: capacity,
+                n_entries,
+                n_slots,
+                ..have
+            },
+        )
     }
 
-    /// Grows the scratch buffers if the submit failed, beyond the need if memory permits; those for gradients only if
-    /// `learned`. Returns whether the submit failed.
+    /// Grows the scratch buffers if the submit failed, beyond the need if memory permits; those for
+    /// gradients only if `learned`. Returns whether the submit failed.
     pub(super) fn grow_scratch(
         &mut self,
         recorder: &mut Recorder,
@@ -244,7 +343,9 @@ impl Renderer {
         if counters[status::FAILED] == 0 {
             return Ok(false);
         }
-        let Some((size, _)) = self.scratch else { return Ok(false) };
+        let Some((size, _)) = self.scratch else {
+            return Ok(false);
+        };
         let mut grown = Ok(());
         for headroom_divisor in HEADROOM_DIVISORS {
             let larger = |need: u32, have: u32| match need > have {
@@ -253,7 +354,11 @@ impl Renderer {
             };
             let need = ScratchSize {
                 n_entries: larger(counters[status::NEED_ENTRIES], size.n_entries),
-                n_slots: if learned { larger(counters[status::NEED_SLOTS], size.n_slots) } else { size.n_slots },
+                n_slots: if learned {
+                    larger(counters[status::NEED_SLOTS], size.n_slots)
+                } else {
+                    size.n_slots
+                },
                 ..size
             };
             log::debug!("splat: growing the intersection buffers to {need:?}");
@@ -309,18 +414,29 @@ pub(super) fn reserve_image(
     learned: bool,
 ) -> Result<(), Error> {
     let need = (size_px[0] * size_px[1], n_tiles(size_px));
-    let have = image_buffers.as_ref().map_or((0, 0), |buffers| (buffers.n_pixels, buffers.n_tiles));
+    let have = image_buffers
+        .as_ref()
+        .map_or((0, 0), |buffers| (buffers.n_pixels, buffers.n_tiles));
     if image_buffers.is_none() || have.0 < need.0 || have.1 < need.1 {
         recorder.submit_and_release_buffers();
         *image_buffers = None; // Freed before the larger one is allocated.
-        *image_buffers = Some(ImageBuffers::new(&recorder.gpu, need.0.max(have.0), need.1.max(have.1), learned)?);
+        *image_buffers = Some(ImageBuffers::new(
+            &recorder.gpu,
+            need.0.max(have.0),
+            need.1.max(have.1),
+            learned,
+        )?);
     }
     Ok(())
 }
 
 /// Sets the number of splats for the next passes that use this status.
 pub(super) fn write_n_splats(gpu: &Gpu, status: &Buffer, n_splats: u32) {
-    gpu.write(status, 4 * u64::from(status::N_SPLATS), bytemuck::bytes_of(&n_splats));
+    gpu.write(
+        status,
+        4 * u64::from(status::N_SPLATS),
+        bytemuck::bytes_of(&n_splats),
+    );
 }
 
 /// Clears the failure flag and the requested buffer sizes.

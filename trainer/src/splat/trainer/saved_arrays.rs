@@ -7,13 +7,23 @@ use crate::splat::buffers::{N_PLANAR_BUFFERS, SplatBuffers};
 use crate::splat::seed::{SeedSnapshot, Seeder};
 
 /// Names of the arrays, in the order of [`SplatBuffers::planes`].
-const ARRAYS: [&str; N_PLANAR_BUFFERS] =
-    ["means", "rotations", "shapes", "sh_dc", "sh_rest", "moments", "sh_dc_moments", "sh_rest_moments", "error_sums"];
+const ARRAYS: [&str; N_PLANAR_BUFFERS] = [
+    "means",
+    "rotations",
+    "shapes",
+    "sh_dc",
+    "sh_rest",
+    "moments",
+    "sh_dc_moments",
+    "sh_rest_moments",
+    "error_sums",
+];
 const SEED_POSITIONS: &str = "seed_positions";
 const SEED_CELLS: &str = "seed_cells";
 pub(super) const CAMERA_PARAMS: &str = "camera_params";
 
-/// Reads splats of size `[n_splats, capacity, sh_degree, active_degree]` from the arrays with this prefix.
+/// Reads splats of size `[n_splats, capacity, sh_degree, active_degree]` from the arrays with this
+/// prefix.
 pub(super) fn read_splats(
     gpu: &Gpu,
     checkpoint: &Checkpoint,
@@ -28,7 +38,8 @@ pub(super) fn read_splats(
     let mut splats = SplatBuffers::new(gpu, capacity, sh_degree)?;
     for (name, (buffer, n_planes, bytes)) in ARRAYS.into_iter().zip(splats.planes()) {
         let used_bytes = u64::from(n_splats) * bytes;
-        let array = checkpoint.array(&format!("{prefix}{name}"), u64::from(n_planes) * used_bytes)?;
+        let array =
+            checkpoint.array(&format!("{prefix}{name}"), u64::from(n_planes) * used_bytes)?;
         for plane in 0..u64::from(n_planes) {
             let from = to_usize(plane * used_bytes);
             let at = plane * u64::from(capacity) * bytes;
@@ -40,13 +51,21 @@ pub(super) fn read_splats(
     Ok(splats)
 }
 
-pub(super) fn read_seeds(checkpoint: &Checkpoint, prefix: &str, n_seeds: u64) -> Result<Seeder, Error> {
+pub(super) fn read_seeds(
+    checkpoint: &Checkpoint,
+    prefix: &str,
+    n_seeds: u64,
+) -> Result<Seeder, Error> {
     let array = |name: &str, bytes: u64| {
-        let n_bytes =
-            n_seeds.checked_mul(bytes).ok_or_else(|| invalid_state(format!("{n_seeds} seeds are too many")))?;
+        let n_bytes = n_seeds
+            .checked_mul(bytes)
+            .ok_or_else(|| invalid_state(format!("{n_seeds} seeds are too many")))?;
         checkpoint.array(&format!("{prefix}{name}"), n_bytes)
     };
-    Ok(Seeder::from_bytes(array(SEED_POSITIONS, Seeder::POSITION_BYTES)?, array(SEED_CELLS, Seeder::CELL_BYTES)?))
+    Ok(Seeder::from_bytes(
+        array(SEED_POSITIONS, Seeder::POSITION_BYTES)?,
+        array(SEED_CELLS, Seeder::CELL_BYTES)?,
+    ))
 }
 
 /// The arrays of one model state, while they are being copied to the host.
@@ -81,14 +100,23 @@ impl PendingArrays {
     }
 
     pub(super) fn finish(self, gpu: &Gpu, arrays: &mut Vec<Array>) -> Result<(), Error> {
-        let mut add = |name: &str, bytes| arrays.push(Array { name: format!("{}{name}", self.prefix), bytes });
+        let mut add = |name: &str, bytes| {
+            arrays.push(Array {
+                name: format!("{}{name}", self.prefix),
+                bytes,
+            })
+        };
         for (name, planes) in ARRAYS.into_iter().zip(self.planes) {
             add(name, planes.finish(gpu)?);
         }
         let (positions, cells) = self.seeds.into_bytes();
         add(SEED_POSITIONS, positions);
         add(SEED_CELLS, cells);
-        add(CAMERA_PARAMS, self.params.map_or(Ok(Vec::new()), |read| read.finish(gpu))?);
+        add(
+            CAMERA_PARAMS,
+            self.params
+                .map_or(Ok(Vec::new()), |read| read.finish(gpu))?,
+        );
         Ok(())
     }
 }
@@ -104,7 +132,9 @@ struct Planes {
 impl Planes {
     /// The used parts of all planes, concatenated.
     fn finish(self, gpu: &Gpu) -> Result<Vec<u8>, Error> {
-        let Some(read) = self.read else { return Ok(Vec::new()) };
+        let Some(read) = self.read else {
+            return Ok(Vec::new());
+        };
         let all: Vec<u8> = read.finish(gpu)?;
         if self.n_planes == 1 {
             return Ok(all);
@@ -114,7 +144,13 @@ impl Planes {
     }
 }
 
-fn begin_read(gpu: &Gpu, buffer: &Buffer, n_planes: u32, bytes: u64, splats: &SplatBuffers) -> Option<PendingRead> {
+fn begin_read(
+    gpu: &Gpu,
+    buffer: &Buffer,
+    n_planes: u32,
+    bytes: u64,
+    splats: &SplatBuffers,
+) -> Option<PendingRead> {
     if n_planes == 0 || splats.n_splats == 0 {
         return None;
     }

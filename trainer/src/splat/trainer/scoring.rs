@@ -23,43 +23,67 @@ type ScoredKeyframe = (Arc<Keyframe>, [Products; 3]);
 type CameraCorrections = BTreeMap<String, CameraCorrection>;
 
 impl SplatTrainer {
-    /// PSNR in dB of a displayed view against a keyframe's image; `None` if their sizes differ or training has not
-    /// started.
+    /// PSNR in dB of a displayed view against a keyframe's image; `None` if their sizes differ or
+    /// training has not started.
     pub(super) fn psnr_of_view(
         &mut self,
         camera: &Camera,
         background_srgb: [f32; 3],
         keyframe: &Keyframe,
     ) -> Result<Option<f64>, Error> {
-        let Some(learn) = self.optimizer.pipelines.ready() else { return Ok(None) };
+        let Some(learn) = self.optimizer.pipelines.ready() else {
+            return Ok(None);
+        };
         let rgba = keyframe.rgba_srgb.as_ref();
         if rgba.len() != 4 * camera.size_px[0] as usize * camera.size_px[1] as usize {
             return Ok(None);
         }
-        let drawn =
-            DrawnView { splats: displayed(&self.growth_search, &self.trials, &self.model), camera, background_srgb };
-        let products = self.renderer.compare_with_upload(&mut self.recorder, drawn, &learn.score, rgba)?;
+        let drawn = DrawnView {
+            splats: displayed(&self.growth_search, &self.trials, &self.model),
+            camera,
+            background_srgb,
+        };
+        let products =
+            self.renderer
+                .compare_with_upload(&mut self.recorder, drawn, &learn.score, rgba)?;
         products::psnr(&products).map(Some)
     }
 
     /// PSNR in dB of the validation keyframes, or of an evenly spaced subset if there are many.
     pub(super) fn score_validation(&mut self) -> Result<Scores, Error> {
         let score = |(keyframe, products): &ScoredKeyframe| {
-            Some(((keyframe.camera.clone(), keyframe.stamp), products::psnr_with_gains(products, [1.0; 3])?))
+            Some((
+                (keyframe.camera.clone(), keyframe.stamp),
+                products::psnr_with_gains(products, [1.0; 3])?,
+            ))
         };
-        Ok(self.compare_validation()?.iter().filter_map(score).collect())
+        Ok(self
+            .compare_validation()?
+            .iter()
+            .filter_map(score)
+            .collect())
     }
 
-    /// Scores the validation keyframes with and without gains, and enables gains if their benefit is significant. The
-    /// gains of a validation keyframe are interpolated in time between the neighboring training images.
+    /// Scores the validation keyframes with and without gains, and enables gains if their benefit
+    /// is significant. The gains of a validation keyframe are interpolated in time between the
+    /// neighboring training images.
     pub(super) fn try_gains(&mut self) -> Result<(), Error> {
         let validation = self.compare_validation()?;
         let corrections = self.learned_corrections()?;
-        let neighbors: Vec<Vec<usize>> = validation.iter().map(|(keyframe, _)| self.neighbors(keyframe)).collect();
+        let neighbors: Vec<Vec<usize>> = validation
+            .iter()
+            .map(|(keyframe, _)| self.neighbors(keyframe))
+            .collect();
         let mut known: BTreeMap<usize, [f64; 3]> = BTreeMap::new();
-        self.add_gains(&mut known, neighbors.iter().flatten().copied().collect(), &corrections)?;
+        self.add_gains(
+            &mut known,
+            neighbors.iter().flatten().copied().collect(),
+            &corrections,
+        )?;
         // Subtract the mean over all images, because it is an error of the model's brightness.
-        let mean = |color: usize| known.values().map(|gains| gains[color]).sum::<f64>() / known.len().max(1) as f64;
+        let mean = |color: usize| {
+            known.values().map(|gains| gains[color]).sum::<f64>() / known.len().max(1) as f64
+        };
         let mean = [0, 1, 2].map(mean);
         let (mut baseline_db, mut variant_db) = (Vec::new(), Vec::new());
         for ((keyframe, products), neighbors) in validation.iter().zip(&neighbors) {
@@ -68,8 +92,11 @@ impl SplatTrainer {
                 let stamp = self.views.keyframe(*view_ix).stamp.0;
                 Some((stamp, [0, 1, 2].map(|color| gains[color] - mean[color])))
             };
-            let neighbor_gains: BTreeMap<i64, [f64; 3]> = neighbors.iter().filter_map(own).collect();
-            let gains = interpolate(&neighbor_gains, keyframe.stamp).unwrap_or_default().map(f64::exp);
+            let neighbor_gains: BTreeMap<i64, [f64; 3]> =
+                neighbors.iter().filter_map(own).collect();
+            let gains = interpolate(&neighbor_gains, keyframe.stamp)
+                .unwrap_or_default()
+                .map(f64::exp);
             baseline_db.extend(products::psnr_with_gains(products, [1.0; 3]));
             variant_db.extend(products::psnr_with_gains(products, gains));
         }
@@ -79,8 +106,8 @@ impl SplatTrainer {
         }
     }
 
-    /// Optimizes image gains from now on. From the view `first_ix` on, starts with the gains that best match pictures to
-    /// images, relative to `mean`; those in `known` are already computed.
+    /// Optimizes image gains from now on. From the view `first_ix` on, starts with the gains that
+    /// best match pictures to images, relative to `mean`; those in `known` are already computed.
     fn enable_gains(
         &mut self,
         gains: ParamSet,
@@ -91,32 +118,49 @@ impl SplatTrainer {
         let corrections = self.learned_corrections()?;
         self.model.cameras.enable(gains);
         self.prepare_training()?;
-        self.add_gains(&mut known, (first_ix..self.views.len()).collect(), &corrections)?;
+        self.add_gains(
+            &mut known,
+            (first_ix..self.views.len()).collect(),
+            &corrections,
+        )?;
         for (view_ix, gains) in &known {
             let log_gains = [0, 1, 2].map(|color| gains[color] - mean[color]);
             let keyframe = self.views.keyframe(*view_ix);
-            self.model.cameras.initialize_gains(&self.recorder.gpu, keyframe, log_gains);
+            self.model
+                .cameras
+                .initialize_gains(&self.recorder.gpu, keyframe, log_gains);
         }
         Ok(())
     }
 
-    /// Adds a training keyframe that arrives at the current step. If image gains are watched for or optimized, compares the
-    /// keyframe with the picture before training on it. During a trial, or if memory is too small for the picture, the
-    /// keyframe is added without a comparison.
+    /// Adds a training keyframe that arrives at the current step. If image gains are watched for or
+    /// optimized, compares the keyframe with the picture before training on it. During a trial, or
+    /// if memory is too small for the picture, the keyframe is added without a comparison.
     pub(super) fn add_live_arrival(&mut self, keyframe: Arc<Keyframe>) -> Result<(), Error> {
         let is_watched = self.trials.watches_gains();
         let is_compared = is_watched || self.model.cameras.set.contains(ParamSet::IMAGE_GAINS);
-        if !is_compared || self.schedule.step < self.trials.steps.first_trial || self.trials.running_trial().is_some() {
+        if !is_compared
+            || self.schedule.step < self.trials.steps.first_trial
+            || self.trials.running_trial().is_some()
+        {
             return self.add_arrival(keyframe);
         }
         let (learn, background_srgb) = (self.learn()?, self.background_srgb());
         let camera = corrected_camera(&self.learned_corrections()?, &keyframe);
-        let drawn = DrawnView { splats: &self.model.splats, camera: &camera, background_srgb };
-        let rgba = keyframe.rgba_srgb.as_ref();
-        let products = match self.renderer.compare_with_upload(&mut self.recorder, drawn, &learn.score, rgba) {
-            Err(error) if error.is_out_of_memory() => return self.add_arrival(keyframe),
-            products => products?,
+        let drawn = DrawnView {
+            splats: &self.model.splats,
+            camera: &camera,
+            background_srgb,
         };
+        let rgba = keyframe.rgba_srgb.as_ref();
+        let products =
+            match self
+                .renderer
+                .compare_with_upload(&mut self.recorder, drawn, &learn.score, rgba)
+            {
+                Err(error) if error.is_out_of_memory() => return self.add_arrival(keyframe),
+                products => products?,
+            };
         let log_gains = products::log_gains(&products);
         self.add_arrival(keyframe.clone())?;
         if is_watched {
@@ -124,16 +168,26 @@ impl SplatTrainer {
             let needed = self.trials.add_arrival_gains(&keyframe, log_gains, psnr);
             // The model still has the brightness of earlier views.
             let first_ix = self.views.len().saturating_sub(MAX_NEW_EXPOSURES);
-            return needed.map_or(Ok(()), |gains| self.enable_gains(gains, BTreeMap::new(), [0.0; 3], first_ix));
+            return needed.map_or(Ok(()), |gains| {
+                self.enable_gains(gains, BTreeMap::new(), [0.0; 3], first_ix)
+            });
         }
-        self.views.assign_lenses(&self.recorder.gpu, &mut self.model.cameras)?;
-        self.model.cameras.initialize_gains(&self.recorder.gpu, &keyframe, log_gains);
+        self.views
+            .assign_lenses(&self.recorder.gpu, &mut self.model.cameras)?;
+        self.model
+            .cameras
+            .initialize_gains(&self.recorder.gpu, &keyframe, log_gains);
         Ok(())
     }
 
     /// The last view before and the first view after a keyframe, from the same camera.
     fn neighbors(&self, keyframe: &Keyframe) -> Vec<usize> {
-        let of_camera = || self.views.keyframes().enumerate().filter(|(_, other)| other.camera == keyframe.camera);
+        let of_camera = || {
+            self.views
+                .keyframes()
+                .enumerate()
+                .filter(|(_, other)| other.camera == keyframe.camera)
+        };
         let before = of_camera().filter(|(_, other)| other.stamp <= keyframe.stamp);
         let after = of_camera().filter(|(_, other)| other.stamp > keyframe.stamp);
         let before = before.max_by_key(|(_, other)| other.stamp);
@@ -148,10 +202,14 @@ impl SplatTrainer {
         view_ixs: BTreeSet<usize>,
         corrections: &CameraCorrections,
     ) -> Result<(), Error> {
-        let unknown: Vec<usize> = view_ixs.into_iter().filter(|view_ix| !known.contains_key(view_ix)).collect();
+        let unknown: Vec<usize> = view_ixs
+            .into_iter()
+            .filter(|view_ix| !known.contains_key(view_ix))
+            .collect();
         for chunk in unknown.chunks(VIEWS_AT_ONCE) {
             let places = chunk.iter().map(|view_ix| (*view_ix, 0)).collect();
-            self.views.upload(&mut self.recorder, &places, self.schedule.step)?;
+            self.views
+                .upload(&mut self.recorder, &places, self.schedule.step)?;
             for view_ix in chunk {
                 known.insert(*view_ix, self.gains_of(*view_ix, corrections)?);
             }
@@ -160,47 +218,76 @@ impl SplatTrainer {
     }
 
     /// Logarithms of the gains that best match the picture of a view to its uploaded image.
-    fn gains_of(&mut self, view_ix: usize, corrections: &CameraCorrections) -> Result<[f64; 3], Error> {
+    fn gains_of(
+        &mut self,
+        view_ix: usize,
+        corrections: &CameraCorrections,
+    ) -> Result<[f64; 3], Error> {
         let learn = self.learn()?;
-        let (camera, background_srgb) =
-            (corrected_camera(corrections, self.views.keyframe(view_ix)), self.background_srgb());
+        let (camera, background_srgb) = (
+            corrected_camera(corrections, self.views.keyframe(view_ix)),
+            self.background_srgb(),
+        );
         let (_, Level { image, .. }) = self.views.ready_level((view_ix, 0))?;
-        let drawn = DrawnView { splats: &self.model.splats, camera: &camera, background_srgb };
-        let products = self.renderer.compare(&mut self.recorder, drawn, &learn.score, image)?;
+        let drawn = DrawnView {
+            splats: &self.model.splats,
+            camera: &camera,
+            background_srgb,
+        };
+        let products = self
+            .renderer
+            .compare(&mut self.recorder, drawn, &learn.score, image)?;
         Ok(products::log_gains(&products))
     }
 
     fn compare_validation(&mut self) -> Result<Vec<ScoredKeyframe>, Error> {
-        let (learn, corrections, background_srgb) =
-            (self.learn()?, self.learned_corrections()?, self.background_srgb());
+        let (learn, corrections, background_srgb) = (
+            self.learn()?,
+            self.learned_corrections()?,
+            self.background_srgb(),
+        );
         let mut compared = Vec::new();
         for id in self.trials.scored() {
-            let Some(validation) = self.trials.validation(&id) else { continue }; // Removed in the meantime.
+            let Some(validation) = self.trials.validation(&id) else {
+                continue;
+            }; // Removed in the meantime.
             let camera = corrected_camera(&corrections, &validation.keyframe);
             let image = validation.uploaded(&self.recorder.gpu)?;
-            let drawn = DrawnView { splats: &self.model.splats, camera: &camera, background_srgb };
-            let products = self.renderer.compare(&mut self.recorder, drawn, &learn.score, image)?;
+            let drawn = DrawnView {
+                splats: &self.model.splats,
+                camera: &camera,
+                background_srgb,
+            };
+            let products = self
+                .renderer
+                .compare(&mut self.recorder, drawn, &learn.score, image)?;
             compared.push((validation.keyframe.clone(), products));
         }
         Ok(compared)
     }
 
-    /// Current corrections of each camera, including those of a running trial. They apply to keyframes that alignment
-    /// has already corrected.
+    /// Current corrections of each camera, including those of a running trial. They apply to
+    /// keyframes that alignment has already corrected.
     pub(super) fn learned_corrections(&self) -> Result<CameraCorrections, Error> {
         let cameras = &self.model.cameras;
         if cameras.set.is_empty() {
             return Ok(CameraCorrections::new());
         }
-        cameras.corrections(&self.recorder.gpu, cameras.set, &cameras.params, self.seeding.scene.size_m)
+        cameras.corrections(
+            &self.recorder.gpu,
+            cameras.set,
+            &cameras.params,
+            self.seeding.scene.size_m,
+        )
     }
 }
 
 /// The camera of a keyframe with its corrections, for drawing.
 pub(super) fn corrected_camera(corrections: &CameraCorrections, keyframe: &Keyframe) -> Camera {
-    let lens = corrections
-        .get(keyframe.camera.as_ref())
-        .map_or_else(|| CalibratedCamera::of(keyframe), |correction| correction.apply(keyframe));
+    let lens = corrections.get(keyframe.camera.as_ref()).map_or_else(
+        || CalibratedCamera::of(keyframe),
+        |correction| correction.apply(keyframe),
+    );
     Camera {
         world_from_camera: lens.world_from_camera,
         focal_px: lens.focal_px,
@@ -240,16 +327,23 @@ mod tests {
         let gpu = test_gpu();
         let keyframes = n_keyframes(&gpu, 12, true);
         let mut trainer = trained(&keyframes, gpu, 60);
-        let validation: Vec<_> = keyframes.iter().filter(|keyframe| keyframe.split == Split::Validation).collect();
+        let validation: Vec<_> = keyframes
+            .iter()
+            .filter(|keyframe| keyframe.split == Split::Validation)
+            .collect();
         let scores = trainer.score_validation().unwrap();
         assert_eq!(scores.len(), validation.len());
         for ((id, score), keyframe) in scores.iter().zip(validation) {
             assert_eq!(id.1, keyframe.stamp);
             let background_srgb = trainer.background_srgb();
             assert!(background_srgb[0] > 0.1, "{background_srgb:?}");
-            let request = crate::RenderRequest { background_srgb, ..request(keyframe.world_from_camera) };
+            let request = crate::RenderRequest {
+                background_srgb,
+                ..request(keyframe.world_from_camera)
+            };
             let picture = trainer.render(&request).unwrap();
-            let pair = PixelPair::new(keyframe.size_px, &picture.rgba_srgb, &keyframe.rgba_srgb).unwrap();
+            let pair =
+                PixelPair::new(keyframe.size_px, &picture.rgba_srgb, &keyframe.rgba_srgb).unwrap();
             assert!((psnr(&pair).unwrap() - score).abs() < 1e-9);
         }
     }
@@ -262,28 +356,64 @@ mod tests {
         let mut trainer = SplatTrainer::new(gpu, options()).unwrap();
         trainer.push(keyframes[1].clone()).unwrap();
         train(&mut trainer, 20);
-        // The mask starts and ends in the middle of a workgroup. The unmasked images that follow reuse the buffer.
+        // The mask starts and ends in the middle of a workgroup. The unmasked images that follow
+        // reuse the buffer.
         let mut rgba = keyframes[0].rgba_srgb.to_vec();
-        rgba.as_chunks_mut::<4>().0[250..900].iter_mut().for_each(|pixel| pixel[3] = 0);
-        let masked = Keyframe { rgba_srgb: rgba.into(), ..keyframes[0].as_ref().clone() };
+        rgba.as_chunks_mut::<4>().0[250..900]
+            .iter_mut()
+            .for_each(|pixel| pixel[3] = 0);
+        let masked = Keyframe {
+            rgba_srgb: rgba.into(),
+            ..keyframes[0].as_ref().clone()
+        };
         for keyframe in [&masked, &keyframes[0], &keyframes[3]] {
             let picture = trainer.render(&request_for(keyframe)).unwrap();
-            let pair = PixelPair::new(keyframe.size_px, &picture.rgba_srgb, &keyframe.rgba_srgb).unwrap();
-            assert_eq!(trainer.psnr(&request_for(keyframe), keyframe).unwrap(), Some(psnr(&pair).unwrap()));
+            let pair =
+                PixelPair::new(keyframe.size_px, &picture.rgba_srgb, &keyframe.rgba_srgb).unwrap();
+            assert_eq!(
+                trainer.psnr(&request_for(keyframe), keyframe).unwrap(),
+                Some(psnr(&pair).unwrap())
+            );
         }
         // A picture compared with itself.
         let picture = trainer.render(&request_for(&keyframes[0])).unwrap();
         let mut rgba = picture.rgba_srgb;
-        rgba.as_chunks_mut::<4>().0.iter_mut().for_each(|pixel| pixel[3] = 255);
-        let same = Keyframe { rgba_srgb: rgba.into(), ..keyframes[0].as_ref().clone() };
-        assert_eq!(trainer.psnr(&request_for(&same), &same).unwrap(), Some(f64::INFINITY));
-        let fully_masked = Keyframe { rgba_srgb: vec![0; same.rgba_srgb.len()].into(), ..same.clone() };
-        assert!(matches!(trainer.psnr(&request_for(&same), &fully_masked), Err(Error::AllPixelsMasked)));
-        let small = crate::RenderRequest { size_px: [8, 8], ..request_for(&same) };
+        rgba.as_chunks_mut::<4>()
+            .0
+            .iter_mut()
+            .for_each(|pixel| pixel[3] = 255);
+        let same = Keyframe {
+            rgba_srgb: rgba.into(),
+            ..keyframes[0].as_ref().clone()
+        };
+        assert_eq!(
+            trainer.psnr(&request_for(&same), &same).unwrap(),
+            Some(f64::INFINITY)
+        );
+        let fully_masked = Keyframe {
+            rgba_srgb: vec![0; same.rgba_srgb.len()].into(),
+            ..same.clone()
+        };
+        assert!(matches!(
+            trainer.psnr(&request_for(&same), &fully_masked),
+            Err(Error::AllPixelsMasked)
+        ));
+        let small = crate::RenderRequest {
+            size_px: [8, 8],
+            ..request_for(&same)
+        };
         assert_eq!(trainer.psnr(&small, &same).unwrap(), None, "another size");
-        let mut loaded =
-            SplatTrainer::from_arrays(trainer.recorder.gpu.clone(), options(), &trainer.arrays().unwrap()).unwrap();
-        assert_eq!(loaded.psnr(&request_for(&same), &same).unwrap(), None, "the training pipelines are not compiled");
+        let mut loaded = SplatTrainer::from_arrays(
+            trainer.recorder.gpu.clone(),
+            options(),
+            &trainer.arrays().unwrap(),
+        )
+        .unwrap();
+        assert_eq!(
+            loaded.psnr(&request_for(&same), &same).unwrap(),
+            None,
+            "the training pipelines are not compiled"
+        );
     }
 
     /// Darkens the second half of the images by one stop.
@@ -296,7 +426,10 @@ mod tests {
                     .iter_mut()
                     .for_each(|pixel| pixel[..3].iter_mut().for_each(|color| *color /= 2));
             }
-            Arc::new(Keyframe { rgba_srgb: rgba.into(), ..keyframe.as_ref().clone() })
+            Arc::new(Keyframe {
+                rgba_srgb: rgba.into(),
+                ..keyframe.as_ref().clone()
+            })
         };
         keyframes.iter().enumerate().map(darken).collect()
     }
@@ -306,12 +439,23 @@ mod tests {
         let gpu = test_gpu();
         let even = n_keyframes(&gpu, 36, true);
         let trainer = trained(&even, gpu.clone(), 510);
-        assert!(trainer.trials().len() == 1 && !trainer.trials()[0].kept, "{:?}", trainer.trials());
+        assert!(
+            trainer.trials().len() == 1 && !trainer.trials()[0].kept,
+            "{:?}",
+            trainer.trials()
+        );
         let stepped = with_exposure_step(&even);
         let mut trainer = trained(&stepped, gpu, 700);
-        assert!(trainer.trials()[0].kept && trainer.trials()[0].gain_db > 1.0, "{:?}", trainer.trials());
-        let gains = |trainer: &mut SplatTrainer, ix: usize| trainer.calibrated_camera(&stepped[ix]).unwrap().gains[1];
-        // Only images near the exposure step show parts of the scene that were captured with both exposures.
+        assert!(
+            trainer.trials()[0].kept && trainer.trials()[0].gain_db > 1.0,
+            "{:?}",
+            trainer.trials()
+        );
+        let gains = |trainer: &mut SplatTrainer, ix: usize| {
+            trainer.calibrated_camera(&stepped[ix]).unwrap().gains[1]
+        };
+        // Only images near the exposure step show parts of the scene that were captured with both
+        // exposures.
         let ratio = gains(&mut trainer, 17) / gains(&mut trainer, 18);
         assert!((1.6..2.4).contains(&ratio), "{ratio}");
     }
@@ -329,7 +473,9 @@ mod tests {
         let trained_live = |keyframes: &[Arc<Keyframe>]| {
             let mut trainer = SplatTrainer::new(gpu.clone(), watching.clone()).unwrap();
             let (first, later) = keyframes.split_at(keyframes.len() / 2 - 3);
-            first.iter().for_each(|keyframe| trainer.push(keyframe.clone()).unwrap());
+            first
+                .iter()
+                .for_each(|keyframe| trainer.push(keyframe.clone()).unwrap());
             train(&mut trainer, FIRST_TRIAL);
             for keyframe in later {
                 trainer.push(keyframe.clone()).unwrap();
@@ -341,9 +487,15 @@ mod tests {
         assert!(trainer.trials().is_empty(), "{:?}", trainer.trials());
         let stepped = with_exposure_step(&even);
         let mut trainer = trained_live(&stepped);
-        assert!(trainer.trials().len() == 1 && trainer.trials()[0].kept, "{:?}", trainer.trials());
+        assert!(
+            trainer.trials().len() == 1 && trainer.trials()[0].kept,
+            "{:?}",
+            trainer.trials()
+        );
         train(&mut trainer, 100);
-        let gains = |trainer: &mut SplatTrainer, ix: usize| trainer.calibrated_camera(&stepped[ix]).unwrap().gains[1];
+        let gains = |trainer: &mut SplatTrainer, ix: usize| {
+            trainer.calibrated_camera(&stepped[ix]).unwrap().gains[1]
+        };
         let ratio = gains(&mut trainer, 17) / gains(&mut trainer, 19);
         assert!((1.4..2.6).contains(&ratio), "{ratio}");
     }

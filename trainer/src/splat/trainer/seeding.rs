@@ -11,7 +11,8 @@ use keyframe::Keyframe;
 use kinematics::quantile::{Rank, quantile};
 use std::sync::Arc;
 
-/// Maximum share of the splat limit for the seeds of one image, so that enough remains for the other images.
+/// Maximum share of the splat limit for the seeds of one image, so that enough remains for the
+/// other images.
 const SEED_SHARE: f64 = 1.0 / 8.0;
 /// Minimum number of pixels per seed. A higher density slows the first steps more than it helps.
 const PX_PER_SEED: f64 = 48.0;
@@ -36,14 +37,24 @@ pub(super) struct Seeding {
 
 impl Seeding {
     pub(super) fn new(options: &ModelOptions<SplatOptions>, is_software: bool) -> Self {
-        let default_seeds = if is_software { SOFTWARE_SEEDS_PER_IMAGE } else { SEEDS_PER_IMAGE };
-        let max_discs =
-            options.specific.seeds_per_image.unwrap_or(default_seeds).min(f64::from(options.cap()) * SEED_SHARE);
+        let default_seeds = if is_software {
+            SOFTWARE_SEEDS_PER_IMAGE
+        } else {
+            SEEDS_PER_IMAGE
+        };
+        let max_discs = options
+            .specific
+            .seeds_per_image
+            .unwrap_or(default_seeds)
+            .min(f64::from(options.cap()) * SEED_SHARE);
         Self {
             scene: ObservedScene::default(),
             pending: Vec::new(),
             unseeded: Vec::new(),
-            density: Density { max_discs, px_per_disc: PX_PER_SEED },
+            density: Density {
+                max_discs,
+                px_per_disc: PX_PER_SEED,
+            },
             points: None,
         }
     }
@@ -64,8 +75,8 @@ impl Seeding {
         self.unseeded.retain(|keyframe| !is_removed(keyframe));
     }
 
-    /// Creates discs at the uncovered depth readings of the keyframes queued since the last call; `None` if there are
-    /// none. `views` are all training views.
+    /// Creates discs at the uncovered depth readings of the keyframes queued since the last call;
+    /// `None` if there are none. `views` are all training views.
     pub(super) fn discs_from_depth(&mut self, views: &ViewSet) -> Option<SplatArrays> {
         let arrived = std::mem::take(&mut self.pending);
         if arrived.is_empty() {
@@ -73,18 +84,35 @@ impl Seeding {
         }
         self.scene.size_m = scene_size_m(views);
         let discs = self.scene.seeder.discs(&arrived, self.density);
-        self.unseeded.extend(arrived.into_iter().filter(|keyframe| keyframe.lacks_dense_depth()));
+        self.unseeded.extend(
+            arrived
+                .into_iter()
+                .filter(|keyframe| keyframe.lacks_dense_depth()),
+        );
         Some(discs)
     }
 
-    /// Replaces the cameras of all keyframes; `correct` replaces a keyframe. The corrected `views` determine which
-    /// positions have splats.
-    pub(super) fn replace_cameras(&mut self, correct: impl Fn(&mut Arc<Keyframe>), views: &ViewSet) {
-        self.pending.iter_mut().chain(&mut self.unseeded).for_each(correct);
+    /// Replaces the cameras of all keyframes; `correct` replaces a keyframe. The corrected `views`
+    /// determine which positions have splats.
+    pub(super) fn replace_cameras(
+        &mut self,
+        correct: impl Fn(&mut Arc<Keyframe>),
+        views: &ViewSet,
+    ) {
+        self.pending
+            .iter_mut()
+            .chain(&mut self.unseeded)
+            .for_each(correct);
         let is_pending = |keyframe: &Keyframe| {
-            self.pending.iter().any(|other| other.camera == keyframe.camera && other.stamp == keyframe.stamp)
+            self.pending
+                .iter()
+                .any(|other| other.camera == keyframe.camera && other.stamp == keyframe.stamp)
         };
-        let seeded: Vec<_> = views.keyframes().filter(|keyframe| !is_pending(keyframe)).cloned().collect();
+        let seeded: Vec<_> = views
+            .keyframes()
+            .filter(|keyframe| !is_pending(keyframe))
+            .cloned()
+            .collect();
         self.scene.seeder = Seeder::default();
         drop(self.scene.seeder.discs(&seeded, self.density)); // The model has them already.
     }
@@ -94,9 +122,14 @@ impl Seeding {
         std::mem::take(&mut self.unseeded)
     }
 
-    /// Discs for the areas of a keyframe that depth does not cover; `None` if there is no depth at all.
+    /// Discs for the areas of a keyframe that depth does not cover; `None` if there is no depth at
+    /// all.
     pub(super) fn discs_without_depth(&mut self, keyframe: &Keyframe) -> Option<SplatArrays> {
-        let ObservedScene { seeder, size_m, has_depth } = &mut self.scene;
+        let ObservedScene {
+            seeder,
+            size_m,
+            has_depth,
+        } = &mut self.scene;
         has_depth.then(|| seeder.discs_without_depth(keyframe, self.density, *size_m))
     }
 
@@ -111,13 +144,24 @@ impl Seeding {
     }
 }
 
-/// Scale of the scene, from the spread of the cameras and their median depth. The learning rate of the means is
-/// proportional to it.
+/// Scale of the scene, from the spread of the cameras and their median depth. The learning rate of
+/// the means is proportional to it.
 fn scene_size_m(views: &ViewSet) -> f64 {
-    let centers: Vec<_> = views.keyframes().map(|keyframe| keyframe.world_from_camera.translation.vector).collect();
+    let centers: Vec<_> = views
+        .keyframes()
+        .map(|keyframe| keyframe.world_from_camera.translation.vector)
+        .collect();
     let middle = centers.iter().sum::<nalgebra::Vector3<f64>>() / centers.len().max(1) as f64;
-    let spread = centers.iter().map(|center| (center - middle).norm()).fold(0.0, f64::max);
-    let mut depths: Vec<f64> = views.iter().filter_map(|view| view.median_depth_m).collect();
+    let spread = centers
+        .iter()
+        .map(|center| (center - middle).norm())
+        .fold(0.0, f64::max);
+    let mut depths: Vec<f64> = views
+        .iter()
+        .filter_map(|view| view.median_depth_m)
+        .collect();
     let median_depth_m = quantile(&mut depths, 0.5, Rank::Upper).unwrap_or(spread);
-    (1.1 * spread).max(0.5 * median_depth_m).max(MIN_SCENE_SIZE_M)
+    (1.1 * spread)
+        .max(0.5 * median_depth_m)
+        .max(MIN_SCENE_SIZE_M)
 }

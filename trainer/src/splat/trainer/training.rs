@@ -1,4 +1,5 @@
-//! The training loop: performs the work that is due before a submit, sends the submit, and applies its results.
+//! The training loop: performs the work that is due before a submit, sends the submit, and applies
+//! its results.
 
 use super::SplatTrainer;
 use super::learning_rates;
@@ -14,8 +15,8 @@ use std::time::Instant;
 
 /// Maximum number of steps per submit.
 const MAX_STEPS_PER_SUBMIT: u64 = 64;
-/// Number of images prepared and uploaded together while a viewer requests pictures. A larger number would delay the
-/// pictures too much.
+/// Number of images prepared and uploaded together while a viewer requests pictures. A larger
+/// number would delay the pictures too much.
 const VIEWS_AT_ONCE_WATCHED: u64 = 4;
 
 impl SplatTrainer {
@@ -32,7 +33,9 @@ impl SplatTrainer {
         self.try_when_due()?;
         self.grow_when_due(&learn)?;
         let n_steps = self.n_steps_of_submit(n);
-        self.model.splats.set_active_degree(&self.recorder.gpu, self.schedule.active_degree());
+        self.model
+            .splats
+            .set_active_degree(&self.recorder.gpu, self.schedule.active_degree());
         self.write_settings();
         let since = Instant::now();
         self.prepare_images(n_steps)?;
@@ -60,9 +63,19 @@ impl SplatTrainer {
         self.record_step(&learn, self.schedule.step)?;
         let timings = self.recorder.passes.submit_timed(&self.recorder.gpu)?;
         let place = self.views.of_step(self.schedule.step);
-        let (gpu, n_splats, size_px) = (&self.recorder.gpu, self.model.splats.n_splats, self.views.size_px(place));
+        let (gpu, n_splats, size_px) = (
+            &self.recorder.gpu,
+            self.model.splats.n_splats,
+            self.views.size_px(place),
+        );
         let image_buffers = self.optimizer.image_buffers()?;
-        let counts = WorkCounts::read(gpu, self.renderer.scratch()?, image_buffers, n_splats, size_px)?;
+        let counts = WorkCounts::read(
+            gpu,
+            self.renderer.scratch()?,
+            image_buffers,
+            n_splats,
+            size_px,
+        )?;
         log::info!("splat: {counts}");
         self.schedule.step += 1;
         Ok(timings)
@@ -80,7 +93,8 @@ impl SplatTrainer {
         self.schedule.last_growth_step = self.schedule.step;
         let key = growth_key(self.options.common.seed, self.schedule.step);
         let n_new = self.n_new_splats();
-        self.model.grow(&mut self.recorder, &mut self.renderer, learn, n_new, key)
+        self.model
+            .grow(&mut self.recorder, &mut self.renderer, learn, n_new, key)
     }
 
     /// Changes the splat count to `n_splats` outside of the schedule.
@@ -90,20 +104,31 @@ impl SplatTrainer {
     /// [`Error::OutOfMemory`] if GPU memory is insufficient.
     pub(super) fn grow_to(&mut self, n_splats: u32) -> Result<(), Error> {
         let learn = self.learn()?;
-        let (n_more, step) = (n_splats.saturating_sub(self.model.splats.n_splats), self.schedule.step);
+        let (n_more, step) = (
+            n_splats.saturating_sub(self.model.splats.n_splats),
+            self.schedule.step,
+        );
         self.schedule.last_growth_step = step;
         let key = growth_key(self.options.common.seed, step);
         let is_full = self.model.is_full();
-        self.model.grow(&mut self.recorder, &mut self.renderer, &learn, n_more, key)?;
+        self.model
+            .grow(&mut self.recorder, &mut self.renderer, &learn, n_more, key)?;
         if self.model.splats.n_splats < n_splats {
             self.model.set_full(is_full); // Freeing the copies of the model may make enough memory available.
-            return Err(Error::OutOfMemory { label: "splat.doubled".to_owned(), bytes: 0 });
+            return Err(Error::OutOfMemory {
+                label: "splat.doubled".to_owned(),
+                bytes: 0,
+            });
         }
         Ok(())
     }
 
     /// Number of splats to add at a change of the splat count.
-    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "saturates, then limited")]
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "saturates, then limited"
+    )]
     fn n_new_splats(&self) -> u32 {
         let n_splats = self.model.splats.n_splats;
         if !self.trials.may_grow(self.schedule.step) || !self.growth_search.may_grow() {
@@ -113,22 +138,36 @@ impl SplatTrainer {
         n_new.min(self.growth_search.limit().saturating_sub(n_splats))
     }
 
-    /// Number of steps of the next submit. The submit stays within its time limit and does not pass a step at which
-    /// other work is due.
+    /// Number of steps of the next submit. The submit stays within its time limit and does not pass
+    /// a step at which other work is due.
     fn n_steps_of_submit(&self, n_requested: u64) -> u64 {
         let by_time = self.optimizer.submits.n_steps_in_limit().unwrap_or(1);
         n_requested
             .min(by_time.clamp(1, MAX_STEPS_PER_SUBMIT))
             .min(self.schedule.steps_to_next_change())
             .min(self.trials.steps_left(self.schedule.step))
-            .min(self.growth_search.steps_left(self.schedule.step, &self.trials.steps))
+            .min(
+                self.growth_search
+                    .steps_left(self.schedule.step, &self.trials.steps),
+            )
     }
 
     /// Uploads the settings of the next steps.
     fn write_settings(&self) {
-        let Self { options, recorder: Recorder { gpu, .. }, model, optimizer, schedule, views, seeding, .. } = self;
+        let Self {
+            options,
+            recorder: Recorder { gpu, .. },
+            model,
+            optimizer,
+            schedule,
+            views,
+            seeding,
+            ..
+        } = self;
         if !model.cameras.set.is_empty() {
-            model.cameras.write_rule(gpu, schedule.completed_frac(), seeding.scene.size_m);
+            model
+                .cameras
+                .write_rule(gpu, schedule.completed_frac(), seeding.scene.size_m);
         }
         let n_splats = model.splats.n_splats;
         optimizer.set_n_splats(gpu, n_splats);
@@ -137,42 +176,75 @@ impl SplatTrainer {
         optimizer.write_drop_frac(gpu, f32_of(drop_frac));
         optimizer.write_counter(gpu, status::DROP_SEED, growth_key(options.common.seed, 0));
         optimizer.write_supervision(gpu, &options.specific, scarcity, views.mean_srgb());
-        optimizer.write_rule(gpu, &learning_rates::rule(options, schedule, &seeding.scene, views.n_active(), n_splats));
+        optimizer.write_rule(
+            gpu,
+            &learning_rates::rule(
+                options,
+                schedule,
+                &seeding.scene,
+                views.n_active(),
+                n_splats,
+            ),
+        );
     }
 
-    /// Uploads the missing images of the next `n` steps. On a GPU, prepares images of later steps as well, which keeps
-    /// all CPU cores busy and avoids waiting for images in each step.
+    /// Uploads the missing images of the next `n` steps. On a GPU, prepares images of later steps
+    /// as well, which keeps all CPU cores busy and avoids waiting for images in each step.
     fn prepare_images(&mut self, n: u64) -> Result<(), Error> {
-        let n_at_once = match (self.recorder.gpu.is_software(), self.optimizer.submits.is_watched()) {
+        let n_at_once = match (
+            self.recorder.gpu.is_software(),
+            self.optimizer.submits.is_watched(),
+        ) {
             (true, _) => 0,
             (false, true) => VIEWS_AT_ONCE_WATCHED,
             (false, false) => MAX_STEPS_PER_SUBMIT,
         };
         let step = self.schedule.step;
-        self.views.prepare_steps(&mut self.recorder, step..step + n, n_at_once)
+        self.views
+            .prepare_steps(&mut self.recorder, step..step + n, n_at_once)
     }
 
     /// Records the passes of one step.
     fn record_step(&mut self, learn: &TrainPipelines, step: u64) -> Result<(), Error> {
         let place = self.views.of_step(step);
-        self.views.ensure_level(&mut self.recorder, place, self.schedule.step)?;
+        self.views
+            .ensure_level(&mut self.recorder, place, self.schedule.step)?;
         self.reserve_view(self.views.size_px(place))?;
-        let Self { recorder: Recorder { gpu, passes }, model, renderer, optimizer, views, .. } = self;
-        let context = StepContext { gpu, learn, renderer, model };
+        let Self {
+            recorder: Recorder { gpu, passes },
+            model,
+            renderer,
+            optimizer,
+            views,
+            ..
+        } = self;
+        let context = StepContext {
+            gpu,
+            learn,
+            renderer,
+            model,
+        };
         optimizer.record_step(&context, passes, views.ready_level(place)?)
     }
 
     /// Allocates the buffers for training on images of this size.
     pub(super) fn reserve_view(&mut self, size_px: [u32; 2]) -> Result<(), Error> {
         let capacity = self.model.splats.capacity;
-        self.optimizer.reserve_view(&mut self.recorder, &mut self.renderer, capacity, size_px)
+        self.optimizer
+            .reserve_view(&mut self.recorder, &mut self.renderer, capacity, size_px)
     }
 
-    /// Waits for the submit in flight and applies its counters. Returns whether a buffer was too small for the submit.
+    /// Waits for the submit in flight and applies its counters. Returns whether a buffer was too
+    /// small for the submit.
     pub(super) fn finish_in_flight(&mut self) -> Result<bool, Error> {
-        let Some(counters) = self.optimizer.submits.finish(&self.recorder.gpu)? else { return Ok(false) };
-        self.optimizer.log_non_finite(counters[status::N_NON_FINITE].into());
-        let grown = self.renderer.grow_scratch(&mut self.recorder, &counters, true);
+        let Some(counters) = self.optimizer.submits.finish(&self.recorder.gpu)? else {
+            return Ok(false);
+        };
+        self.optimizer
+            .log_non_finite(counters[status::N_NON_FINITE].into());
+        let grown = self
+            .renderer
+            .grow_scratch(&mut self.recorder, &counters, true);
         if matches!(grown, Ok(false)) {
             return Ok(false);
         }
@@ -186,8 +258,8 @@ impl SplatTrainer {
         Ok(true)
     }
 
-    /// Skips the next step, because the buffers for its image cannot be allocated, and stops growing, because more splats
-    /// need even larger buffers.
+    /// Skips the next step, because the buffers for its image cannot be allocated, and stops
+    /// growing, because more splats need even larger buffers.
     ///
     /// # Errors
     ///
@@ -200,7 +272,8 @@ impl SplatTrainer {
         }
         self.schedule.step = step + 1;
         let next_step = u32::try_from(step + 1).unwrap_or(u32::MAX);
-        self.optimizer.write_counter(&self.recorder.gpu, status::STEP, next_step);
+        self.optimizer
+            .write_counter(&self.recorder.gpu, status::STEP, next_step);
         Ok(())
     }
 }
@@ -243,14 +316,23 @@ mod tests {
 
     const N_COVERING: u32 = 2000;
 
-    /// A trainer whose GPU has too little memory for 2000 splats that cover the whole image, and its keyframes.
+    /// A trainer whose GPU has too little memory for 2000 splats that cover the whole image, and
+    /// its keyframes.
     fn with_little_memory() -> (SplatTrainer, Vec<Arc<Keyframe>>) {
         const MAX_BINDING_BYTES: u64 = 1_600_000; // Slightly more than the initial buffers.
-        let gpu = test_gpu_with(&GpuOptions { max_binding_bytes: Some(MAX_BINDING_BYTES), ..GpuOptions::default() });
+        let gpu = test_gpu_with(&GpuOptions {
+            max_binding_bytes: Some(MAX_BINDING_BYTES),
+            ..GpuOptions::default()
+        });
         let keyframes = n_keyframes(&gpu, 10, true);
-        let mut trainer =
-            SplatTrainer::new(gpu, options().with(|options| options.specific.coarse_steps = Some([0, 0]))).unwrap();
-        keyframes.iter().for_each(|keyframe| trainer.push(keyframe.clone()).unwrap());
+        let mut trainer = SplatTrainer::new(
+            gpu,
+            options().with(|options| options.specific.coarse_steps = Some([0, 0])),
+        )
+        .unwrap();
+        keyframes
+            .iter()
+            .for_each(|keyframe| trainer.push(keyframe.clone()).unwrap());
         train(&mut trainer, 3);
         trainer.finish_in_flight().unwrap();
         trainer.grow_to(N_COVERING).unwrap();
@@ -265,20 +347,36 @@ mod tests {
         let [x, y, z] = crate::gpu::f32s_of(center.coords.into());
         let (gpu, splats) = (&trainer.recorder.gpu, &trainer.model.splats);
         gpu.write(&splats.means, 0, bytemuck::cast_slice(&[[x, y, z, 0.0]; N]));
-        gpu.write(&splats.shapes, 0, bytemuck::cast_slice(&[[log_scale, log_scale, log_scale, -3.0]; N]));
+        gpu.write(
+            &splats.shapes,
+            0,
+            bytemuck::cast_slice(&[[log_scale, log_scale, log_scale, -3.0]; N]),
+        );
     }
 
     #[test]
     fn image_that_needs_too_much_memory_is_skipped() {
         let (mut trainer, keyframes) = with_little_memory();
-        let covered = keyframes.iter().find(|keyframe| keyframe.split == Split::Train).unwrap();
+        let covered = keyframes
+            .iter()
+            .find(|keyframe| keyframe.split == Split::Train)
+            .unwrap();
         cover(&mut trainer, covered, 0.05_f32.ln());
         let n_splats = trainer.model.splats.n_splats;
         train(&mut trainer, 40);
         assert_eq!(trainer.n_total_steps().unwrap(), 43);
-        assert!(trainer.skipped.n_consecutive > 0, "the buffers were large enough for all images");
-        assert!(trainer.model.is_full() && trainer.model.splats.n_splats == n_splats, "the model still grows");
-        assert!(trainer.arrays().unwrap().checked().is_ok(), "a parameter is not finite");
+        assert!(
+            trainer.skipped.n_consecutive > 0,
+            "the buffers were large enough for all images"
+        );
+        assert!(
+            trainer.model.is_full() && trainer.model.splats.n_splats == n_splats,
+            "the model still grows"
+        );
+        assert!(
+            trainer.arrays().unwrap().checked().is_ok(),
+            "a parameter is not finite"
+        );
         // Pictures need no gradients, so even the covered view can be drawn.
         trainer.render(&request(covered.world_from_camera)).unwrap();
     }
@@ -287,7 +385,9 @@ mod tests {
     fn training_fails_if_no_image_fits_into_memory() {
         let (mut trainer, keyframes) = with_little_memory();
         cover(&mut trainer, &keyframes[0], 100.0_f32.ln());
-        let error = (0..100).find_map(|_| trainer.step(1).err()).expect("all images are skipped");
+        let error = (0..100)
+            .find_map(|_| trainer.step(1).err())
+            .expect("all images are skipped");
         assert!(error.is_out_of_memory(), "{error}");
     }
 }

@@ -14,7 +14,8 @@ use std::collections::BTreeSet;
 use std::ops::Range;
 use std::sync::Arc;
 
-/// Maximum bytes of images on a software adapter. It allocates host memory, which already holds all keyframes.
+/// Maximum bytes of images on a software adapter. It allocates host memory, which already holds all
+/// keyframes.
 const SOFTWARE_IMAGE_BYTES: u64 = 256 << 20;
 /// Number of images uploaded together when iterating over all views.
 pub(super) const VIEWS_AT_ONCE: usize = 16;
@@ -32,7 +33,8 @@ pub(super) struct ViewSet {
     coarse_steps: [u64; 2],
     /// Maximum bytes of the views' images on the GPU, unless a submit needs more.
     max_image_bytes: u64,
-    /// Number of image requests so far. Images store it at each use, and eviction compares the stored values.
+    /// Number of image requests so far. Images store it at each use, and eviction compares the
+    /// stored values.
     n_image_requests: u64,
 }
 
@@ -51,7 +53,11 @@ impl ViewSet {
             } else {
                 COARSE_STEPS
             }),
-            max_image_bytes: if is_software { SOFTWARE_IMAGE_BYTES } else { u64::MAX },
+            max_image_bytes: if is_software {
+                SOFTWARE_IMAGE_BYTES
+            } else {
+                u64::MAX
+            },
             n_image_requests: 0,
         }
     }
@@ -86,7 +92,9 @@ impl ViewSet {
     /// Mean color of the images, sRGB; black without images.
     pub(super) fn mean_srgb(&self) -> [f32; 3] {
         let known: Vec<[f64; 3]> = self.views.iter().filter_map(TrainView::mean_srgb).collect();
-        let mean = |color: usize| known.iter().map(|image| image[color]).sum::<f64>() / known.len().max(1) as f64;
+        let mean = |color: usize| {
+            known.iter().map(|image| image[color]).sum::<f64>() / known.len().max(1) as f64
+        };
         [0, 1, 2].map(|color| f32_of(mean(color)))
     }
 
@@ -102,13 +110,19 @@ impl ViewSet {
 
     /// Trains on all views except these images.
     pub(super) fn hold_out(&mut self, images: &[ImageId]) {
-        let held_out: BTreeSet<usize> = images.iter().filter_map(|image| self.position(image)).collect();
-        self.active = (0..self.views.len()).filter(|ix| !held_out.contains(ix)).collect();
+        let held_out: BTreeSet<usize> = images
+            .iter()
+            .filter_map(|image| self.position(image))
+            .collect();
+        self.active = (0..self.views.len())
+            .filter(|ix| !held_out.contains(ix))
+            .collect();
     }
 
     /// Index of the view of an image.
     pub(super) fn position(&self, (camera, stamp): &ImageId) -> Option<usize> {
-        self.keyframes().position(|keyframe| keyframe.camera == *camera && keyframe.stamp == *stamp)
+        self.keyframes()
+            .position(|keyframe| keyframe.camera == *camera && keyframe.stamp == *stamp)
     }
 
     pub(super) fn retain(&mut self, is_kept: impl Fn(&Arc<Keyframe>) -> bool) {
@@ -122,7 +136,8 @@ impl ViewSet {
         self.hold_out(&[]);
     }
 
-    /// Replaces the cameras of all views; `correct` replaces a keyframe. Uploaded images are kept where possible.
+    /// Replaces the cameras of all views; `correct` replaces a keyframe. Uploaded images are kept
+    /// where possible.
     pub(super) fn replace_cameras(&mut self, gpu: &Gpu, correct: impl Fn(&mut Arc<Keyframe>)) {
         for view in &mut self.views {
             let mut keyframe = view.keyframe.clone();
@@ -137,14 +152,23 @@ impl ViewSet {
     }
 
     /// Allocates slots for the camera parameters of all views.
-    pub(super) fn assign_lenses(&mut self, gpu: &Gpu, cameras: &mut CameraParams) -> Result<(), Error> {
-        self.views.iter_mut().try_for_each(|view| view.assign_lens(gpu, cameras))
+    pub(super) fn assign_lenses(
+        &mut self,
+        gpu: &Gpu,
+        cameras: &mut CameraParams,
+    ) -> Result<(), Error> {
+        self.views
+            .iter_mut()
+            .try_for_each(|view| view.assign_lens(gpu, cameras))
     }
 
     /// The view and level that a step trains on.
     pub(super) fn of_step(&mut self, step: u64) -> ViewLevel {
         let view_ix = self.active[self.order.pick(step, self.active.len())];
-        (view_ix, self.views[view_ix].clamped(level_at(step, self.coarse_steps)))
+        (
+            view_ix,
+            self.views[view_ix].clamped(level_at(step, self.coarse_steps)),
+        )
     }
 
     /// Size of the image of a view at a level, pixels.
@@ -152,13 +176,17 @@ impl ViewSet {
         self.views[view_ix].size_at(level_ix)
     }
 
-    /// The lens of a view, if any, and a level of the view. The images of the level must be uploaded.
-    pub(super) fn ready_level(&self, (view_ix, level_ix): ViewLevel) -> Result<(Option<&Buffer>, &Level), Error> {
+    /// The lens of a view, if any, and a level of the view. The images of the level must be
+    /// uploaded.
+    pub(super) fn ready_level(
+        &self,
+        (view_ix, level_ix): ViewLevel,
+    ) -> Result<(Option<&Buffer>, &Level), Error> {
         self.views[view_ix].ready_level(level_ix)
     }
 
-    /// Uploads the missing images of these steps. If any are missing, also uploads the images of later steps, so that
-    /// at least `n_at_once` steps are covered.
+    /// Uploads the missing images of these steps. If any are missing, also uploads the images of
+    /// later steps, so that at least `n_at_once` steps are covered.
     pub(super) fn prepare_steps(
         &mut self,
         recorder: &mut Recorder,
@@ -187,7 +215,11 @@ impl ViewSet {
         requested: &BTreeSet<ViewLevel>,
         step: u64,
     ) -> Result<(), Error> {
-        let missing: Vec<ViewLevel> = requested.iter().copied().filter(|place| !self.has_level(*place)).collect();
+        let missing: Vec<ViewLevel> = requested
+            .iter()
+            .copied()
+            .filter(|place| !self.has_level(*place))
+            .collect();
         if !missing.is_empty() {
             let made: Vec<LevelImages> = missing
                 .par_iter()
@@ -204,7 +236,9 @@ impl ViewSet {
                 recorder.submit(); // The recorded passes use images that are replaced below.
             }
             for ((view_ix, level), images) in missing.into_iter().zip(&made) {
-                let same_size = dropped.iter().position(|level| level.size_px == images.size_px());
+                let same_size = dropped
+                    .iter()
+                    .position(|level| level.size_px == images.size_px());
                 let reused = same_size.map(|ix| dropped.swap_remove(ix));
                 self.views[view_ix].upload(&recorder.gpu, level, images, reused)?;
             }
@@ -220,8 +254,17 @@ impl ViewSet {
     }
 
     /// Uploads the images of a view and level, if they are missing.
-    pub(super) fn ensure_level(&mut self, recorder: &mut Recorder, place: ViewLevel, step: u64) -> Result<(), Error> {
-        if self.has_level(place) { Ok(()) } else { self.upload(recorder, &BTreeSet::from([place]), step) }
+    pub(super) fn ensure_level(
+        &mut self,
+        recorder: &mut Recorder,
+        place: ViewLevel,
+        step: u64,
+    ) -> Result<(), Error> {
+        if self.has_level(place) {
+            Ok(())
+        } else {
+            self.upload(recorder, &BTreeSet::from([place]), step)
+        }
     }
 
     /// Limits the GPU memory for images, as on a software adapter.

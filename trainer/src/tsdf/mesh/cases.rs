@@ -1,8 +1,9 @@
-//! The triangles of a surface that crosses a cube, for each of the 256 combinations of inside and outside corners.
+//! The triangles of a surface that crosses a cube, for each of the 256 combinations of inside and
+//! outside corners.
 //!
-//! The method is marching cubes (Lorensen and Cline 1987), but the table is computed: on each face, one segment
-//! separates each run of inside corners from the rest. Two cubes therefore agree on a shared face, and segments join
-//! into loops.
+//! The method is marching cubes (Lorensen and Cline 1987), but the table is computed: on each face,
+//! one segment separates each run of inside corners from the rest. Two cubes therefore agree on a
+//! shared face, and segments join into loops.
 
 use std::sync::LazyLock;
 
@@ -14,13 +15,24 @@ pub(in crate::tsdf) struct Edge {
 }
 
 /// Triangles of each case, as edges; bit c of a case's number is set if corner c is inside.
-pub(in crate::tsdf) static CASES: LazyLock<[Vec<[Edge; 3]>; 256]> = LazyLock::new(|| std::array::from_fn(triangles));
+pub(in crate::tsdf) static CASES: LazyLock<[Vec<[Edge; 3]>; 256]> =
+    LazyLock::new(|| std::array::from_fn(triangles));
 
 /// Corners of the six faces, counterclockwise when viewed from outside.
-const FACES: [[usize; 4]; 6] = [[0, 4, 6, 2], [1, 3, 7, 5], [0, 1, 5, 4], [2, 6, 7, 3], [0, 2, 3, 1], [4, 5, 7, 6]];
+const FACES: [[usize; 4]; 6] = [
+    [0, 4, 6, 2],
+    [1, 3, 7, 5],
+    [0, 1, 5, 4],
+    [2, 6, 7, 3],
+    [0, 2, 3, 1],
+    [4, 5, 7, 6],
+];
 
 fn edge_between(a: usize, b: usize) -> Edge {
-    Edge { corner: a & b, axis: (a ^ b).trailing_zeros() as usize }
+    Edge {
+        corner: a & b,
+        axis: (a ^ b).trailing_zeros() as usize,
+    }
 }
 
 fn triangles(case: usize) -> Vec<[Edge; 3]> {
@@ -36,13 +48,14 @@ fn triangles(case: usize) -> Vec<[Edge; 3]> {
                 .expect("each edge ends one segment and begins one");
             end = segments.swap_remove(next).1;
         }
-        triangles.extend((1..corners.len() - 1).map(|ix| [corners[0], corners[ix], corners[ix + 1]]));
+        triangles
+            .extend((1..corners.len() - 1).map(|ix| [corners[0], corners[ix], corners[ix + 1]]));
     }
     triangles
 }
 
-/// Segments where the surface crosses the faces. The inside is on the right of each segment when viewed from outside
-/// the cube.
+/// Segments where the surface crosses the faces. The inside is on the right of each segment when
+/// viewed from outside the cube.
 fn segments(case: usize) -> Vec<(Edge, Edge)> {
     let is_inside = |corner: usize| case >> corner & 1 == 1;
     let mut segments = Vec::new();
@@ -56,7 +69,10 @@ fn segments(case: usize) -> Vec<(Edge, Edge)> {
             while is_inside(face[(along + 1) % 4]) {
                 along += 1;
             }
-            segments.push((edge_between(before, current), edge_between(face[along % 4], face[(along + 1) % 4])));
+            segments.push((
+                edge_between(before, current),
+                edge_between(face[along % 4], face[(along + 1) % 4]),
+            ));
         }
     }
     segments
@@ -72,7 +88,10 @@ mod tests {
             for corner in 0..8usize {
                 for axis in (0..3).filter(|axis| corner >> axis & 1 == 0) {
                     let crossed = (case >> corner ^ case >> (corner | 1 << axis)) & 1 == 1;
-                    let used = triangles.iter().flatten().any(|edge| *edge == Edge { corner, axis });
+                    let used = triangles
+                        .iter()
+                        .flatten()
+                        .any(|edge| *edge == Edge { corner, axis });
                     assert_eq!(used, crossed, "case {case}, corner {corner}, axis {axis}");
                 }
             }
@@ -85,7 +104,13 @@ mod tests {
     fn triangles_face_away_from_the_inside() {
         // Only corner 0 is inside: the normal points toward increasing coordinates.
         let edge_center = |edge: Edge| -> [f64; 3] {
-            std::array::from_fn(|axis| if axis == edge.axis { 0.5 } else { (edge.corner >> axis & 1) as f64 })
+            std::array::from_fn(|axis| {
+                if axis == edge.axis {
+                    0.5
+                } else {
+                    (edge.corner >> axis & 1) as f64
+                }
+            })
         };
         let [a, b, c] = CASES[1][0].map(|edge| nalgebra::Vector3::from(edge_center(edge)));
         assert!((b - a).cross(&(c - a)).dot(&nalgebra::Vector3::repeat(1.0)) > 0.0);
@@ -98,8 +123,9 @@ mod tests {
             for triangle in triangles {
                 for side in 0..3 {
                     let (from, to) = (triangle[side], triangle[(side + 1) % 3]);
-                    let back =
-                        triangles.iter().any(|other| (0..3).any(|k| (other[k], other[(k + 1) % 3]) == (to, from)));
+                    let back = triangles
+                        .iter()
+                        .any(|other| (0..3).any(|k| (other[k], other[(k + 1) % 3]) == (to, from)));
                     assert!(back || on_one_face(from, to), "{from:?} {to:?}");
                 }
             }
@@ -108,7 +134,9 @@ mod tests {
 
     fn on_one_face(a: Edge, b: Edge) -> bool {
         FACES.iter().any(|face| {
-            [a, b].iter().all(|edge| face.contains(&edge.corner) && face.contains(&(edge.corner | 1 << edge.axis)))
+            [a, b].iter().all(|edge| {
+                face.contains(&edge.corner) && face.contains(&(edge.corner | 1 << edge.axis))
+            })
         })
     }
 }

@@ -22,21 +22,37 @@ fn u16_at(bytes: &[u8], ix: usize) -> u16 {
 }
 
 fn decoded(chunk: &ModelChunk) -> Triangles {
-    let ChunkLayout::Mesh { origin_m, meters_per_count, n_vertices, n_triangles } = chunk.fine.layout else {
+    let ChunkLayout::Mesh {
+        origin_m,
+        meters_per_count,
+        n_vertices,
+        n_triangles,
+    } = chunk.fine.layout
+    else {
         panic!("a mesh")
     };
-    assert!(n_vertices <= 1 << 16, "{n_vertices} vertices: indices would have 32 bits");
+    assert!(
+        n_vertices <= 1 << 16,
+        "{n_vertices} vertices: indices would have 32 bits"
+    );
     let mut bytes = Vec::new();
-    ZlibDecoder::new(&chunk.fine.bytes[..]).read_to_end(&mut bytes).unwrap();
+    ZlibDecoder::new(&chunk.fine.bytes[..])
+        .read_to_end(&mut bytes)
+        .unwrap();
     assert_eq!(bytes.len(), 9 * n_vertices + 6 * n_triangles);
     let (positions, rest) = bytes.split_at(6 * n_vertices);
     let (colors, indices) = rest.split_at(3 * n_vertices);
     let (mut counts, mut color) = ([0_u16; 3], [0_u8; 3]);
     let vertices: Vec<Vertex> = (0..n_vertices)
         .map(|ix| {
-            counts = std::array::from_fn(|axis| counts[axis].wrapping_add(u16_at(positions, 3 * ix + axis)));
+            counts = std::array::from_fn(|axis| {
+                counts[axis].wrapping_add(u16_at(positions, 3 * ix + axis))
+            });
             color = std::array::from_fn(|part| color[part].wrapping_add(colors[3 * ix + part]));
-            (Vector3::from(origin_m) + Vector3::from(counts.map(f64::from)) * meters_per_count, color)
+            (
+                Vector3::from(origin_m) + Vector3::from(counts.map(f64::from)) * meters_per_count,
+                color,
+            )
         })
         .collect();
     let mut last = 0_u16;
@@ -75,19 +91,34 @@ impl Replica {
     fn assert_equals(&self, mesh: &Mesh, voxel_m: f64) {
         let cell_m = 0.01 * voxel_m;
         #[expect(clippy::cast_possible_truncation, reason = "cells of a small scene")]
-        let cell = |position: &Vector3<f64>| <[i64; 3]>::from(position.map(|along| (along / cell_m).floor() as i64));
+        let cell = |position: &Vector3<f64>| {
+            <[i64; 3]>::from(position.map(|along| (along / cell_m).floor() as i64))
+        };
         let mut by_cell: HashMap<[i64; 3], Vec<usize>> = HashMap::new();
-        let positions: Vec<Vector3<f64>> =
-            mesh.positions_m.iter().map(|at| Vector3::from(mesh.origin_m) + Vector3::from(at.map(f64::from))).collect();
+        let positions: Vec<Vector3<f64>> = mesh
+            .positions_m
+            .iter()
+            .map(|at| Vector3::from(mesh.origin_m) + Vector3::from(at.map(f64::from)))
+            .collect();
         for (ix, position) in positions.iter().enumerate() {
             by_cell.entry(cell(position)).or_default().push(ix);
         }
         let nearest = |(position, color): &Vertex| -> usize {
             let [x, y, z] = cell(position);
-            let near = (0..27).filter_map(|ix| by_cell.get(&[x + ix % 3 - 1, y + ix / 3 % 3 - 1, z + ix / 9 - 1]));
+            let near = (0..27).filter_map(|ix| {
+                by_cell.get(&[x + ix % 3 - 1, y + ix / 3 % 3 - 1, z + ix / 9 - 1])
+            });
             let distance = |ix: &usize| (positions[*ix] - position).norm();
-            let ix = near.flatten().copied().min_by(|a, b| distance(a).total_cmp(&distance(b))).expect("a vertex");
-            assert!(distance(&ix) <= voxel_m / 1024.0, "{} m away", distance(&ix));
+            let ix = near
+                .flatten()
+                .copied()
+                .min_by(|a, b| distance(a).total_cmp(&distance(b)))
+                .expect("a vertex");
+            assert!(
+                distance(&ix) <= voxel_m / 1024.0,
+                "{} m away",
+                distance(&ix)
+            );
             assert_eq!(mesh.colors_srgb[ix], *color);
             ix
         };
@@ -95,13 +126,24 @@ impl Replica {
             let first = (0..3).min_by_key(|at| corners[*at]).unwrap_or(0);
             [0, 1, 2].map(|at| corners[(first + at) % 3])
         };
-        let got: BTreeSet<_> =
-            self.chunks.values().flatten().map(|corners| canonical(corners.each_ref().map(nearest))).collect();
-        let expected: BTreeSet<_> =
-            mesh.triangles.iter().map(|corners| canonical(corners.map(|ix| ix as usize))).collect();
+        let got: BTreeSet<_> = self
+            .chunks
+            .values()
+            .flatten()
+            .map(|corners| canonical(corners.each_ref().map(nearest)))
+            .collect();
+        let expected: BTreeSet<_> = mesh
+            .triangles
+            .iter()
+            .map(|corners| canonical(corners.map(|ix| ix as usize)))
+            .collect();
         // Rounding may swap vertices that are closer to each other than a count.
         let n_different = got.symmetric_difference(&expected).count();
-        assert!(1000 * n_different < expected.len(), "{n_different} of {} triangles differ", expected.len());
+        assert!(
+            1000 * n_different < expected.len(),
+            "{n_different} of {} triangles differ",
+            expected.len()
+        );
     }
 }
 
@@ -110,26 +152,56 @@ fn chunks_follow_the_mesh() {
     let at = Point3::new(0.1, 0.0, 0.2);
     let keyframes = scenes::ring(&[scenes::ball(at), scenes::floor()], at, 4);
     let mut model = TsdfModel::new(test_gpu(), scenes::options()).unwrap();
-    assert!(model.queue_chunks(false, &Arc::default()).unwrap().is_none(), "an empty model");
+    assert!(
+        model
+            .queue_chunks(false, &Arc::default())
+            .unwrap()
+            .is_none(),
+        "an empty model"
+    );
     let mut replica = Replica::default();
     for keyframe in &keyframes {
         model.push(keyframe.clone()).unwrap();
         while model.step(1).unwrap() > 0 {}
-        replica.apply(&model.queue_chunks(true, &Arc::default()).unwrap().unwrap().finish().unwrap());
+        replica.apply(
+            &model
+                .queue_chunks(true, &Arc::default())
+                .unwrap()
+                .unwrap()
+                .finish()
+                .unwrap(),
+        );
     }
     let voxel_m = model.voxel_grid().unwrap().voxel_m;
     let mesh = model.mesh().unwrap();
     replica.assert_equals(&mesh, voxel_m);
-    let none = model.queue_chunks(true, &Arc::default()).unwrap().unwrap().finish().unwrap();
+    let none = model
+        .queue_chunks(true, &Arc::default())
+        .unwrap()
+        .unwrap()
+        .finish()
+        .unwrap();
     assert!(!none.is_complete && none.chunks.is_empty() && none.removed.is_empty());
     let mut complete = Replica::default();
-    let all = model.queue_chunks(false, &Arc::default()).unwrap().unwrap().finish().unwrap();
+    let all = model
+        .queue_chunks(false, &Arc::default())
+        .unwrap()
+        .unwrap()
+        .finish()
+        .unwrap();
     assert!(all.is_complete);
     complete.apply(&all);
     complete.assert_equals(&mesh, voxel_m);
     let bytes_per_triangle = complete.n_bytes as f64 / mesh.triangles.len() as f64;
-    assert!(bytes_per_triangle < 9.0, "{bytes_per_triangle} bytes per triangle");
-    eprintln!("{} triangles in {} chunks, {bytes_per_triangle:.1} bytes each", mesh.triangles.len(), all.chunks.len());
+    assert!(
+        bytes_per_triangle < 9.0,
+        "{bytes_per_triangle} bytes per triangle"
+    );
+    eprintln!(
+        "{} triangles in {} chunks, {bytes_per_triangle:.1} bytes each",
+        mesh.triangles.len(),
+        all.chunks.len()
+    );
 }
 
 #[test]
@@ -140,10 +212,18 @@ fn removed_surfaces_remove_chunks() {
     let mut model = TsdfModel::new(test_gpu(), scenes::options()).unwrap();
     let mut replica = Replica::default();
     let mut n_removed = 0;
-    for keyframe in with.iter().chain(std::iter::repeat_n(&without, 4).flatten()) {
+    for keyframe in with
+        .iter()
+        .chain(std::iter::repeat_n(&without, 4).flatten())
+    {
         model.push(keyframe.clone()).unwrap();
         while model.step(1).unwrap() > 0 {}
-        let new = model.queue_chunks(true, &Arc::default()).unwrap().unwrap().finish().unwrap();
+        let new = model
+            .queue_chunks(true, &Arc::default())
+            .unwrap()
+            .unwrap()
+            .finish()
+            .unwrap();
         n_removed += new.removed.len();
         replica.apply(&new);
     }
@@ -162,15 +242,36 @@ fn chunks_lack_erased_triangles() {
     while model.step(u64::MAX).unwrap() > 0 {}
     let mut edits = Edits::default();
     let world_from_box = Transform::translation(at.x, at.y, at.z + 0.1);
-    edits.push(Edit::Box(Aabb { world_from_box, min_m: [-0.4; 3], max_m: [0.4; 3] })).unwrap();
+    edits
+        .push(Edit::Box(Aabb {
+            world_from_box,
+            min_m: [-0.4; 3],
+            max_m: [0.4; 3],
+        }))
+        .unwrap();
     let (none, edits) = (Arc::default(), Arc::new(edits));
     let mut replica = Replica::default();
     let voxel_m = model.voxel_grid().unwrap().voxel_m;
-    let n_all = model.queue_chunks(false, &none).unwrap().unwrap().finish().unwrap().chunks.len();
+    let n_all = model
+        .queue_chunks(false, &none)
+        .unwrap()
+        .unwrap()
+        .finish()
+        .unwrap()
+        .chunks
+        .len();
     for applied in [&none, &edits, &none] {
-        let new = model.queue_chunks(!replica.chunks.is_empty(), applied).unwrap().unwrap().finish().unwrap();
+        let new = model
+            .queue_chunks(!replica.chunks.is_empty(), applied)
+            .unwrap()
+            .unwrap()
+            .finish()
+            .unwrap();
         let is_first = replica.chunks.is_empty();
-        assert!(is_first || new.chunks.len() + new.removed.len() < n_all, "only changed chunks are sent");
+        assert!(
+            is_first || new.chunks.len() + new.removed.len() < n_all,
+            "only changed chunks are sent"
+        );
         replica.apply(&new);
         replica.assert_equals(&model.mesh_without(applied).unwrap(), voxel_m);
     }

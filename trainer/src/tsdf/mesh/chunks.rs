@@ -1,7 +1,7 @@
 //! The mesh in chunks of neighboring blocks, in a compact form for viewers.
 //!
-//! Positions are rounded to a grid that all chunks share, so that neighboring chunks meet without gaps. Values are
-//! stored as differences to the previous one, which zlib compresses well.
+//! Positions are rounded to a grid that all chunks share, so that neighboring chunks meet without
+//! gaps. Values are stored as differences to the previous one, which zlib compresses well.
 
 use super::mesher::{BlockMesh, Mesher, shared_key, without_erased};
 use crate::edits::Edits;
@@ -40,7 +40,11 @@ pub(in crate::tsdf) struct ChangedChunks {
 
 impl ChangedChunks {
     /// Takes the chunks that have changed since the last call, or all of them.
-    pub(in crate::tsdf) fn take(mesher: &mut Mesher, edits: &Arc<Edits>, only_changed: bool) -> Self {
+    pub(in crate::tsdf) fn take(
+        mesher: &mut Mesher,
+        edits: &Arc<Edits>,
+        only_changed: bool,
+    ) -> Self {
         let changed = mesher.take_changed().filter(|_| only_changed);
         let is_complete = changed.is_none();
         let mut chunks: BTreeMap<GridCoord, ChunkBlocks> = BTreeMap::new();
@@ -52,20 +56,32 @@ impl ChangedChunks {
                 chunk.blocks.push((*block, Arc::clone(mesh)));
             }
         }
-        Self { is_complete, chunks, edits: Arc::clone(edits) }
+        Self {
+            is_complete,
+            chunks,
+            edits: Arc::clone(edits),
+        }
     }
 
     /// Encodes the chunks without erased space.
     pub(in crate::tsdf) fn encode(mut self, voxel_grid: &VoxelGrid) -> ModelChunks {
         for chunk in self.chunks.values_mut() {
-            chunk.blocks.par_iter_mut().for_each(|(_, mesh)| *mesh = without_erased(mesh, voxel_grid, &self.edits));
+            chunk
+                .blocks
+                .par_iter_mut()
+                .for_each(|(_, mesh)| *mesh = without_erased(mesh, voxel_grid, &self.edits));
             chunk.blocks.retain(|(_, mesh)| !mesh.triangles.is_empty());
         }
-        let (present, removed): (Vec<_>, Vec<_>) =
-            self.chunks.into_iter().partition(|(_, chunk)| !chunk.blocks.is_empty());
+        let (present, removed): (Vec<_>, Vec<_>) = self
+            .chunks
+            .into_iter()
+            .partition(|(_, chunk)| !chunk.blocks.is_empty());
         ModelChunks {
             is_complete: self.is_complete,
-            chunks: present.par_iter().map(|(coord, chunk)| encoded(*coord, chunk, voxel_grid)).collect(),
+            chunks: present
+                .par_iter()
+                .map(|(coord, chunk)| encoded(*coord, chunk, voxel_grid))
+                .collect(),
             removed: removed.into_iter().map(|(coord, _)| id_of(coord)).collect(),
         }
     }
@@ -76,17 +92,19 @@ fn chunk_of(block: GridCoord) -> GridCoord {
     block.map(|along| along.div_euclid(CHUNK_BLOCKS))
 }
 
-/// A number for the position of a chunk. Positions repeat after 2^17 chunks along an axis, which is more than a field
-/// can contain.
+/// A number for the position of a chunk. Positions repeat after 2^17 chunks along an axis, which is
+/// more than a field can contain.
 fn id_of(coord: GridCoord) -> u64 {
-    coord.iter().fold(0, |id, along| id << ID_BITS | u64::from(along.cast_unsigned() & ((1 << ID_BITS) - 1)))
+    coord.iter().fold(0, |id, along| {
+        id << ID_BITS | u64::from(along.cast_unsigned() & ((1 << ID_BITS) - 1))
+    })
 }
 
 fn encoded(coord: GridCoord, chunk: &ChunkBlocks, voxel_grid: &VoxelGrid) -> ModelChunk {
     let counts_per_voxel = f64::from(MAX_MESH_COUNT) / f64::from(CHUNK_VOXELS);
     let meters_per_count = voxel_grid.voxel_m / counts_per_voxel;
-    let origin_in_field_m =
-        coord.map(|along| f64::from(along) * f64::from(CHUNK_BLOCKS * BLOCK_EDGE) * voxel_grid.voxel_m);
+    let origin_in_field_m = coord
+        .map(|along| f64::from(along) * f64::from(CHUNK_BLOCKS * BLOCK_EDGE) * voxel_grid.voxel_m);
     let mut vertices = VertexWriter::default();
     let mut corners: Vec<u32> = Vec::new();
     let mut shared_vertices: HashMap<(GridCoord, u32), u32> = HashMap::new();
@@ -94,17 +112,25 @@ fn encoded(coord: GridCoord, chunk: &ChunkBlocks, voxel_grid: &VoxelGrid) -> Mod
         let mut ix_of_vertex = Vec::with_capacity(mesh.vertices.len());
         for vertex in &mesh.vertices {
             let next = vertices.n;
-            let ix = shared_key(*block, vertex.edge).map_or(next, |key| *shared_vertices.entry(key).or_insert(next));
+            let ix = shared_key(*block, vertex.edge)
+                .map_or(next, |key| *shared_vertices.entry(key).or_insert(next));
             if ix == next {
                 let count = |axis: usize| {
                     let offset_m = f64::from(vertex.position_m[axis]) - origin_in_field_m[axis];
-                    (offset_m / meters_per_count).round().clamp(0.0, f64::from(MAX_MESH_COUNT))
+                    (offset_m / meters_per_count)
+                        .round()
+                        .clamp(0.0, f64::from(MAX_MESH_COUNT))
                 };
                 vertices.push([0, 1, 2].map(count), vertex.color);
             }
             ix_of_vertex.push(ix);
         }
-        corners.extend(mesh.triangles.iter().flatten().map(|ix| ix_of_vertex[*ix as usize]));
+        corners.extend(
+            mesh.triangles
+                .iter()
+                .flatten()
+                .map(|ix| ix_of_vertex[*ix as usize]),
+        );
     }
     let layout = ChunkLayout::Mesh {
         origin_m: std::array::from_fn(|axis| voxel_grid.anchor_m[axis] + origin_in_field_m[axis]),
@@ -114,7 +140,12 @@ fn encoded(coord: GridCoord, chunk: &ChunkBlocks, voxel_grid: &VoxelGrid) -> Mod
     };
     let indices = index_bytes(&corners, vertices.n);
     let bytes = compressed(&[&vertices.positions, &vertices.colors, &indices]);
-    ModelChunk { id: id_of(coord), change: f64::from(chunk.n_changed), coarse: None, fine: ChunkData { layout, bytes } }
+    ModelChunk {
+        id: id_of(coord),
+        change: f64::from(chunk.n_changed),
+        coarse: None,
+        fine: ChunkData { layout, bytes },
+    }
 }
 
 /// Encodes vertices as differences to the previous vertex.
@@ -128,11 +159,16 @@ struct VertexWriter {
 }
 
 impl VertexWriter {
-    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to 16 bits")]
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "clamped to 16 bits"
+    )]
     fn push(&mut self, counts: [f64; 3], color: u32) {
         let counts = counts.map(|count| count as u16);
         for (count, last) in counts.iter().zip(self.last_counts) {
-            self.positions.extend(count.wrapping_sub(last).to_le_bytes());
+            self.positions
+                .extend(count.wrapping_sub(last).to_le_bytes());
         }
         let [red, green, blue, _] = color.to_le_bytes();
         for (part, last) in [red, green, blue].iter().zip(self.last_color) {
@@ -143,13 +179,22 @@ impl VertexWriter {
     }
 }
 
-/// Indices of the corners as differences to the previous index: 16 bits each if all indices fit, otherwise 32.
-#[expect(clippy::cast_possible_truncation, reason = "the low half, if the indices fit")]
+/// Indices of the corners as differences to the previous index: 16 bits each if all indices fit,
+/// otherwise 32.
+#[expect(
+    clippy::cast_possible_truncation,
+    reason = "the low half, if the indices fit"
+)]
 fn index_bytes(corners: &[u32], n_vertices: u32) -> Vec<u8> {
     let previous = std::iter::once(&0).chain(corners);
-    let differences = corners.iter().zip(previous).map(|(ix, previous)| ix.wrapping_sub(*previous));
+    let differences = corners
+        .iter()
+        .zip(previous)
+        .map(|(ix, previous)| ix.wrapping_sub(*previous));
     if n_vertices <= 1 << 16 {
-        differences.flat_map(|difference| (difference as u16).to_le_bytes()).collect()
+        differences
+            .flat_map(|difference| (difference as u16).to_le_bytes())
+            .collect()
     } else {
         differences.flat_map(u32::to_le_bytes).collect()
     }
@@ -159,5 +204,7 @@ fn index_bytes(corners: &[u32], n_vertices: u32) -> Vec<u8> {
 fn compressed(parts: &[&[u8]]) -> Vec<u8> {
     let mut encoder = ZlibEncoder::new(Vec::new(), Compression::fast());
     let written = parts.iter().try_for_each(|part| encoder.write_all(part));
-    written.and_then(|()| encoder.finish()).expect("writing to memory cannot fail")
+    written
+        .and_then(|()| encoder.finish())
+        .expect("writing to memory cannot fail")
 }

@@ -14,12 +14,16 @@ struct CellSum {
 }
 
 impl Mesh {
-    /// Returns the mesh with one vertex per cell of a grid of this width, at the mean of the merged vertices. Triangles
-    /// that become degenerate are removed. A width that is not a positive number leaves the mesh unchanged.
+    /// Returns the mesh with one vertex per cell of a grid of this width, at the mean of the merged
+    /// vertices. Triangles that become degenerate are removed. A width that is not a positive
+    /// number leaves the mesh unchanged.
     ///
     /// Source: Rossignac and Borrel 1993, with means instead of representatives.
     #[must_use]
-    #[expect(clippy::cast_possible_truncation, reason = "cells are rounded down on purpose, and sums are f64")]
+    #[expect(
+        clippy::cast_possible_truncation,
+        reason = "cells are rounded down on purpose, and sums are f64"
+    )]
     pub fn clustered(&self, cell_m: f64) -> Self {
         if !(cell_m > 0.0 && cell_m.is_finite()) {
             return self.clone();
@@ -43,10 +47,16 @@ impl Mesh {
         }
         Self {
             origin_m: self.origin_m,
-            positions_m: sums.iter().map(|sum| (sum.position_m / sum.n).map(|along| along as f32).into()).collect(),
+            positions_m: sums
+                .iter()
+                .map(|sum| (sum.position_m / sum.n).map(|along| along as f32).into())
+                .collect(),
             normals: sums.iter().map(normal_of).collect(),
             #[expect(clippy::cast_sign_loss, reason = "a mean of bytes")]
-            colors_srgb: sums.iter().map(|sum| (sum.color / sum.n).map(|part| part.round() as u8).into()).collect(),
+            colors_srgb: sums
+                .iter()
+                .map(|sum| (sum.color / sum.n).map(|part| part.round() as u8).into())
+                .collect(),
             triangles: merged(&self.triangles, &cell_of_vertex),
         }
     }
@@ -54,7 +64,11 @@ impl Mesh {
 
 #[expect(clippy::cast_possible_truncation, reason = "sums are f64, normals f32")]
 fn normal_of(sum: &CellSum) -> [f32; 3] {
-    sum.normal.try_normalize(1e-9).unwrap_or_else(Vector3::z).map(|along| along as f32).into()
+    sum.normal
+        .try_normalize(1e-9)
+        .unwrap_or_else(Vector3::z)
+        .map(|along| along as f32)
+        .into()
 }
 
 /// The remaining triangles, each once, regardless of which corner it starts with.

@@ -19,23 +19,44 @@ pub(in crate::tsdf) fn floaters(mesh: &Mesh, voxel_m: f64) -> Option<Floaters> {
         .map(|offset_m| std::array::from_fn(|axis| mesh.origin_m[axis] + f64::from(offset_m[axis])))
         .collect();
     let Bounds { center_m, radius_m } = Bounds::of_points(&positions_m)?;
-    let n_cells = (4.0 * radius_m / (CELL_VOXELS * voxel_m)).clamp(N_CELLS_RANGE[0], N_CELLS_RANGE[1]);
-    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped")]
-    let grid = CellGrid { center_m, radius_m, n_cells: n_cells as u32 };
+    let n_cells =
+        (4.0 * radius_m / (CELL_VOXELS * voxel_m)).clamp(N_CELLS_RANGE[0], N_CELLS_RANGE[1]);
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "clamped"
+    )]
+    let grid = CellGrid {
+        center_m,
+        radius_m,
+        n_cells: n_cells as u32,
+    };
     let mut labels = CellLabels::none(&grid);
     for corners in &mesh.triangles {
         let is_floating = is_floater_size(part_sizes[corners[0] as usize], mesh.triangles.len());
         let cells = corners.map(|ix| grid.cell_at(positions_m[ix as usize]));
-        if is_floating { &mut labels.floating } else { &mut labels.kept }.extend(cells);
+        if is_floating {
+            &mut labels.floating
+        } else {
+            &mut labels.kept
+        }
+        .extend(cells);
     }
     let cells = labels.erased(&grid)?;
     let is_erased = |corners: &&[u32; 3]| {
-        let sum: Vector3<f64> = corners.iter().map(|ix| Vector3::from(positions_m[*ix as usize])).sum();
+        let sum: Vector3<f64> = corners
+            .iter()
+            .map(|ix| Vector3::from(positions_m[*ix as usize]))
+            .sum();
         cells.contains((sum / 3.0).into())
     };
     let n_erased = mesh.triangles.iter().filter(is_erased).count() as u64;
     // Small parts right next to large ones share their cells.
-    (n_erased > 0).then_some(Floaters { cells, n_erased, item: "triangle" })
+    (n_erased > 0).then_some(Floaters {
+        cells,
+        n_erased,
+        item: "triangle",
+    })
 }
 
 /// For each vertex, the number of triangles of its connected part.
@@ -49,5 +70,8 @@ fn part_sizes(mesh: &Mesh) -> Vec<usize> {
     for [a, ..] in &mesh.triangles {
         n_triangles[groups.representative(*a) as usize] += 1;
     }
-    (0..).take(n_triangles.len()).map(|vertex| n_triangles[groups.representative(vertex) as usize]).collect()
+    (0..)
+        .take(n_triangles.len())
+        .map(|vertex| n_triangles[groups.representative(vertex) as usize])
+        .collect()
 }

@@ -13,10 +13,13 @@ const UNSIGNED_INT: u32 = 5125;
 const VERTICES: u32 = 34_962;
 const INDICES: u32 = 34_963;
 
-/// Writes a mesh. glTF has y up and z toward the viewer, while the world has z up. One node holds that rotation,
-/// another the origin.
+/// Writes a mesh. glTF has y up and z toward the viewer, while the world has z up. One node holds
+/// that rotation, another the origin.
 pub fn write(path: &Path, mesh: &Mesh) -> Result<(), Error> {
-    files::write(path, to_bytes(mesh)).map_err(|source| Error::Write { path: path.to_owned(), source })
+    files::write(path, to_bytes(mesh)).map_err(|source| Error::Write {
+        path: path.to_owned(),
+        source,
+    })
 }
 
 /// Encodes the file.
@@ -29,7 +32,11 @@ pub(super) fn to_bytes(mesh: &Mesh) -> Vec<u8> {
     let mut file = Vec::with_capacity(28 + json.len() + bin.len());
     file.extend(MAGIC.to_le_bytes());
     file.extend(2u32.to_le_bytes());
-    let n_chunks_bytes = if bin.is_empty() { 8 + json.len() } else { 16 + json.len() + bin.len() };
+    let n_chunks_bytes = if bin.is_empty() {
+        8 + json.len()
+    } else {
+        16 + json.len() + bin.len()
+    };
     file.extend(length(12 + n_chunks_bytes));
     file.extend(length(json.len()));
     file.extend(JSON_CHUNK.to_le_bytes());
@@ -44,16 +51,41 @@ pub(super) fn to_bytes(mesh: &Mesh) -> Vec<u8> {
 
 /// Positions, normals, colors and indices, each a multiple of 4 bytes.
 fn parts(mesh: &Mesh) -> [Vec<u8>; 4] {
-    let floats = |values: &[[f32; 3]]| values.iter().flatten().flat_map(|value| value.to_le_bytes()).collect();
+    let floats = |values: &[[f32; 3]]| {
+        values
+            .iter()
+            .flatten()
+            .flat_map(|value| value.to_le_bytes())
+            .collect()
+    };
     // glTF expects linear vertex colors.
-    let colors = mesh.colors_srgb.iter().flatten().flat_map(|byte| linear(*byte).to_le_bytes()).collect();
-    let indices = mesh.triangles.iter().flatten().flat_map(|ix| ix.to_le_bytes()).collect();
-    [floats(&mesh.positions_m), floats(&mesh.normals), colors, indices]
+    let colors = mesh
+        .colors_srgb
+        .iter()
+        .flatten()
+        .flat_map(|byte| linear(*byte).to_le_bytes())
+        .collect();
+    let indices = mesh
+        .triangles
+        .iter()
+        .flatten()
+        .flat_map(|ix| ix.to_le_bytes())
+        .collect();
+    [
+        floats(&mesh.positions_m),
+        floats(&mesh.normals),
+        colors,
+        indices,
+    ]
 }
 
 fn linear(byte: u8) -> f32 {
     let part = f32::from(byte) / 255.0;
-    if part <= 0.04045 { part / 12.92 } else { ((part + 0.055) / 1.055).powf(2.4) }
+    if part <= 0.04045 {
+        part / 12.92
+    } else {
+        ((part + 0.055) / 1.055).powf(2.4)
+    }
 }
 
 fn description(mesh: &Mesh, parts: &[Vec<u8>; 4]) -> serde_json::Value {
@@ -72,10 +104,18 @@ fn description(mesh: &Mesh, parts: &[Vec<u8>; 4]) -> serde_json::Value {
         })
         .collect();
     let extreme = |pick: fn(f32, f32) -> f32, begin: f32| -> Vec<f32> {
-        (0..3).map(|axis| mesh.positions_m.iter().map(|position| position[axis]).fold(begin, pick)).collect()
+        (0..3)
+            .map(|axis| {
+                mesh.positions_m
+                    .iter()
+                    .map(|position| position[axis])
+                    .fold(begin, pick)
+            })
+            .collect()
     };
     let n = mesh.positions_m.len();
-    let vec3 = |view: u32| json!({"bufferView": view, "componentType": FLOAT, "count": n, "type": "VEC3"});
+    let vec3 =
+        |view: u32| json!({"bufferView": view, "componentType": FLOAT, "count": n, "type": "VEC3"});
     let mut positions = vec3(0);
     positions["min"] = json!(extreme(f32::min, f32::INFINITY));
     positions["max"] = json!(extreme(f32::max, f32::NEG_INFINITY));

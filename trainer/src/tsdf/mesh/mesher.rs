@@ -20,17 +20,27 @@ pub(in crate::tsdf) struct BlockMesh {
 
 impl BlockMesh {
     /// Whether each triangle's center is in erased space.
-    fn erased<'a>(&'a self, voxel_grid: &'a VoxelGrid, edits: &'a Edits) -> impl Iterator<Item = bool> + 'a {
+    fn erased<'a>(
+        &'a self,
+        voxel_grid: &'a VoxelGrid,
+        edits: &'a Edits,
+    ) -> impl Iterator<Item = bool> + 'a {
         self.triangles.iter().map(|corners| {
-            let along = |axis: usize| corners.map(|ix| f64::from(self.vertices[ix as usize].position_m[axis]));
-            let center = [0, 1, 2].map(|axis| voxel_grid.anchor_m[axis] + along(axis).iter().sum::<f64>() / 3.0);
+            let along = |axis: usize| {
+                corners.map(|ix| f64::from(self.vertices[ix as usize].position_m[axis]))
+            };
+            let center = [0, 1, 2]
+                .map(|axis| voxel_grid.anchor_m[axis] + along(axis).iter().sum::<f64>() / 3.0);
             edits.erases(center)
         })
     }
 
     /// The triangles that are not erased, with their vertices.
     fn without_erased(&self, voxel_grid: &VoxelGrid, edits: &Edits) -> Self {
-        let mut kept = Self { vertices: Vec::new(), triangles: Vec::new() };
+        let mut kept = Self {
+            vertices: Vec::new(),
+            triangles: Vec::new(),
+        };
         let mut kept_ixs: Vec<Option<u32>> = vec![None; self.vertices.len()];
         let triangles = self.triangles.iter().zip(self.erased(voxel_grid, edits));
         for (corners, _) in triangles.filter(|(_, is_erased)| !is_erased) {
@@ -46,7 +56,11 @@ impl BlockMesh {
 }
 
 /// The part of a block's mesh that is not erased.
-pub(super) fn without_erased(mesh: &Arc<BlockMesh>, voxel_grid: &VoxelGrid, edits: &Edits) -> Arc<BlockMesh> {
+pub(super) fn without_erased(
+    mesh: &Arc<BlockMesh>,
+    voxel_grid: &VoxelGrid,
+    edits: &Edits,
+) -> Arc<BlockMesh> {
     match !edits.is_empty() && mesh.erased(voxel_grid, edits).any(|is_erased| is_erased) {
         true => Arc::new(mesh.without_erased(voxel_grid, edits)),
         false => Arc::clone(mesh),
@@ -68,7 +82,10 @@ pub(in crate::tsdf) struct Mesher {
 
 impl Mesher {
     /// Replaces the triangles of these blocks.
-    pub(in crate::tsdf) fn replace(&mut self, made: impl IntoIterator<Item = (GridCoord, BlockMesh)>) {
+    pub(in crate::tsdf) fn replace(
+        &mut self,
+        made: impl IntoIterator<Item = (GridCoord, BlockMesh)>,
+    ) {
         for (block_coord, mesh) in made {
             if let Some(changed) = &mut self.changed {
                 changed.insert(block_coord);
@@ -94,24 +111,37 @@ impl Mesher {
     /// Marks the blocks as replaced of which other triangles are erased than before.
     pub(in crate::tsdf) fn set_edits(&mut self, voxel_grid: &VoxelGrid, edits: &Arc<Edits>) {
         let before = std::mem::replace(&mut self.edits, Arc::clone(edits));
-        let Some(changed) = self.changed.as_mut().filter(|_| before != *edits) else { return };
-        let has_changed = |mesh: &BlockMesh| mesh.erased(voxel_grid, &before).ne(mesh.erased(voxel_grid, edits));
-        let blocks = self.meshes.par_iter().filter(|(_, mesh)| has_changed(mesh)).map(|(block_coord, _)| *block_coord);
+        let Some(changed) = self.changed.as_mut().filter(|_| before != *edits) else {
+            return;
+        };
+        let has_changed = |mesh: &BlockMesh| {
+            mesh.erased(voxel_grid, &before)
+                .ne(mesh.erased(voxel_grid, edits))
+        };
+        let blocks = self
+            .meshes
+            .par_iter()
+            .filter(|(_, mesh)| has_changed(mesh))
+            .map(|(block_coord, _)| *block_coord);
         changed.par_extend(blocks);
     }
 }
 
-/// All triangles outside erased space, in world, in the order of their blocks; vertices shared by blocks are merged.
+/// All triangles outside erased space, in world, in the order of their blocks; vertices shared by
+/// blocks are merged.
 pub(in crate::tsdf) fn joined(meshes: &BlockMeshes, voxel_grid: &VoxelGrid, edits: &Edits) -> Mesh {
-    let mut whole = Mesh { origin_m: voxel_grid.anchor_m, ..Mesh::default() };
+    let mut whole = Mesh {
+        origin_m: voxel_grid.anchor_m,
+        ..Mesh::default()
+    };
     let mut shared_vertices: HashMap<(GridCoord, u32), u32> = HashMap::new();
     for (block_coord, mesh) in meshes {
         let mesh = without_erased(mesh, voxel_grid, edits);
         let mut vertex_ixs = Vec::with_capacity(mesh.vertices.len());
         for vertex in &mesh.vertices {
             let next = u32::try_from(whole.positions_m.len()).unwrap_or(u32::MAX);
-            let at =
-                shared_key(*block_coord, vertex.edge).map_or(next, |key| *shared_vertices.entry(key).or_insert(next));
+            let at = shared_key(*block_coord, vertex.edge)
+                .map_or(next, |key| *shared_vertices.entry(key).or_insert(next));
             if at == next {
                 whole.positions_m.push(vertex.position_m);
                 whole.normals.push(unit_of(vertex.normal));
@@ -120,7 +150,11 @@ pub(in crate::tsdf) fn joined(meshes: &BlockMeshes, voxel_grid: &VoxelGrid, edit
             }
             vertex_ixs.push(at);
         }
-        whole.triangles.extend(mesh.triangles.iter().map(|corners| corners.map(|ix| vertex_ixs[ix as usize])));
+        whole.triangles.extend(
+            mesh.triangles
+                .iter()
+                .map(|corners| corners.map(|ix| vertex_ixs[ix as usize])),
+        );
     }
     whole
 }
@@ -129,18 +163,30 @@ pub(in crate::tsdf) fn joined(meshes: &BlockMeshes, voxel_grid: &VoxelGrid, edit
 pub(super) fn shared_key(block: GridCoord, edge: u32) -> Option<(GridCoord, u32)> {
     let local = [edge / 3 % 9, edge / 27 % 9, edge / 243].map(u32::cast_signed);
     let is_shared = local.iter().any(|along| matches!(*along, 0 | BLOCK_EDGE));
-    is_shared.then(|| (std::array::from_fn(|axis| BLOCK_EDGE * block[axis] + local[axis]), edge % 3))
+    is_shared.then(|| {
+        (
+            std::array::from_fn(|axis| BLOCK_EDGE * block[axis] + local[axis]),
+            edge % 3,
+        )
+    })
 }
 
 /// Decodes a unit vector from its two octahedral coordinates.
 ///
-/// Source: Cigolle et al. 2014, "A survey of efficient representations for independent unit vectors", section 3.
+/// Source: Cigolle et al. 2014, "A survey of efficient representations for independent unit
+/// vectors", section 3.
 pub(in crate::tsdf) fn unit_of(octahedral: u32) -> [f32; 3] {
     let bytes = octahedral.to_le_bytes();
-    let [low, high] =
-        [[bytes[0], bytes[1]], [bytes[2], bytes[3]]].map(|half| f64::from(i16::from_le_bytes(half)) / 32767.0);
+    let [low, high] = [[bytes[0], bytes[1]], [bytes[2], bytes[3]]]
+        .map(|half| f64::from(i16::from_le_bytes(half)) / 32767.0);
     let up = 1.0 - low.abs() - high.abs();
-    let [x, y] =
-        if up < 0.0 { [(1.0 - high.abs()) * low.signum(), (1.0 - low.abs()) * high.signum()] } else { [low, high] };
+    let [x, y] = if up < 0.0 {
+        [
+            (1.0 - high.abs()) * low.signum(),
+            (1.0 - low.abs()) * high.signum(),
+        ]
+    } else {
+        [low, high]
+    };
     Vector3::new(x, y, up).normalize().map(f32_of).into()
 }

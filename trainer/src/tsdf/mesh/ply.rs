@@ -5,7 +5,8 @@ use crate::Error;
 use std::io::{BufWriter, Write};
 use std::path::Path;
 
-/// Positions are written as doubles if the origin is farther than this from the world's origin, meters.
+/// Positions are written as doubles if the origin is farther than this from the world's origin,
+/// meters.
 const FAR_M: f64 = 1000.0;
 
 /// Writes a mesh in world, in meters.
@@ -15,13 +16,20 @@ pub fn write(path: &Path, mesh: &Mesh) -> Result<(), Error> {
         write_to(&mut file, mesh)?;
         file.flush()
     });
-    written.map_err(|source| Error::Write { path: path.to_owned(), source })
+    written.map_err(|source| Error::Write {
+        path: path.to_owned(),
+        source,
+    })
 }
 
 pub(super) fn write_to(file: &mut impl Write, mesh: &Mesh) -> std::io::Result<()> {
     let is_far = mesh.origin_m.iter().any(|along| along.abs() > FAR_M);
     let number_type = if is_far { "double" } else { "float" };
-    writeln!(file, "ply\nformat binary_little_endian 1.0\nelement vertex {}", mesh.positions_m.len())?;
+    writeln!(
+        file,
+        "ply\nformat binary_little_endian 1.0\nelement vertex {}",
+        mesh.positions_m.len()
+    )?;
     for name in ["x", "y", "z"] {
         writeln!(file, "property {number_type} {name}")?;
     }
@@ -31,7 +39,11 @@ pub(super) fn write_to(file: &mut impl Write, mesh: &Mesh) -> std::io::Result<()
     for name in ["red", "green", "blue"] {
         writeln!(file, "property uchar {name}")?;
     }
-    writeln!(file, "element face {}\nproperty list uchar int vertex_indices\nend_header", mesh.triangles.len())?;
+    writeln!(
+        file,
+        "element face {}\nproperty list uchar int vertex_indices\nend_header",
+        mesh.triangles.len()
+    )?;
     for (ix, position) in mesh.positions_m.iter().enumerate() {
         for (along, origin) in position.iter().zip(mesh.origin_m) {
             let along = origin + f64::from(*along);

@@ -23,13 +23,20 @@ fn model(options: ModelOptions<TsdfOptions>, keyframes: &[Arc<Keyframe>]) -> Tsd
 
 fn vertex_positions(mesh: &Mesh) -> impl Iterator<Item = Point3<f64>> {
     let origin = Vector3::from(mesh.origin_m);
-    mesh.positions_m.iter().map(move |vertex| (Vector3::from(vertex.map(f64::from)) + origin).into())
+    mesh.positions_m
+        .iter()
+        .map(move |vertex| (Vector3::from(vertex.map(f64::from)) + origin).into())
 }
 
 /// Mean and largest distance of the vertices from a shape, meters.
 fn errors_m(mesh: &Mesh, shape: &TestShape) -> (f64, f64) {
-    let errors: Vec<f64> = vertex_positions(mesh).map(|vertex| shape.distance_m(&vertex).abs()).collect();
-    (errors.iter().sum::<f64>() / errors.len() as f64, errors.iter().copied().fold(0.0, f64::max))
+    let errors: Vec<f64> = vertex_positions(mesh)
+        .map(|vertex| shape.distance_m(&vertex).abs())
+        .collect();
+    (
+        errors.iter().sum::<f64>() / errors.len() as f64,
+        errors.iter().copied().fold(0.0, f64::max),
+    )
 }
 
 /// Number of occurrences of each edge, in either direction.
@@ -45,8 +52,13 @@ fn edges(mesh: &Mesh) -> BTreeMap<[u32; 2], i32> {
 
 fn ball_mesh() -> (Mesh, TestShape, f64) {
     let ball = scenes::ball(Point3::new(0.31, -0.22, 0.13));
-    let TestShape::Sphere { center_m, .. } = ball else { unreachable!("a ball is a sphere") };
-    let mut model = model(scenes::options(), &scenes::all_around(&[ball], center_m, 24));
+    let TestShape::Sphere { center_m, .. } = ball else {
+        unreachable!("a ball is a sphere")
+    };
+    let mut model = model(
+        scenes::options(),
+        &scenes::all_around(&[ball], center_m, 24),
+    );
     (model.mesh().unwrap(), ball, 0.02)
 }
 
@@ -54,24 +66,35 @@ fn ball_mesh() -> (Mesh, TestShape, f64) {
 fn mesh_of_ball_is_closed_and_round() {
     let (mesh, ball, voxel_m) = ball_mesh();
     let (mean_m, max_m) = errors_m(&mesh, &ball);
-    assert!(mean_m < 0.1 * voxel_m && max_m < 0.5 * voxel_m, "mean {mean_m} m, largest {max_m} m");
+    assert!(
+        mean_m < 0.1 * voxel_m && max_m < 0.5 * voxel_m,
+        "mean {mean_m} m, largest {max_m} m"
+    );
     let open = edges(&mesh).into_values().filter(|n| *n != 2).count();
     assert_eq!(open, 0, "open edges of {} triangles", mesh.triangles.len());
     assert!(mesh.triangles.len() > 1000);
     // Euler characteristic of a closed surface without holes.
     let n_edges = edges(&mesh).len();
     assert_eq!(mesh.positions_m.len() + mesh.triangles.len(), n_edges + 2);
-    let TestShape::Sphere { center_m, .. } = ball else { unreachable!("a ball is a sphere") };
+    let TestShape::Sphere { center_m, .. } = ball else {
+        unreachable!("a ball is a sphere")
+    };
     for (vertex, normal) in vertex_positions(&mesh).zip(&mesh.normals) {
         let normal = Vector3::from(normal.map(f64::from));
         assert!((normal.norm() - 1.0).abs() < 1e-5);
-        assert!(normal.dot(&(vertex - center_m).normalize()) > 0.9, "{vertex} {normal}");
+        assert!(
+            normal.dot(&(vertex - center_m).normalize()) > 0.9,
+            "{vertex} {normal}"
+        );
     }
     let off: f64 = vertex_positions(&mesh)
         .zip(&mesh.colors_srgb)
         .map(|(vertex, color)| {
             let expected = scenes::color_srgb(&vertex);
-            (0..3).map(|part| (f64::from(color[part]) / 255.0 - expected[part]).abs()).sum::<f64>() / 3.0
+            (0..3)
+                .map(|part| (f64::from(color[part]) / 255.0 - expected[part]).abs())
+                .sum::<f64>()
+                / 3.0
         })
         .sum::<f64>()
         / mesh.positions_m.len() as f64;
@@ -81,16 +104,28 @@ fn mesh_of_ball_is_closed_and_round() {
 #[test]
 fn mesh_of_slanted_wall_is_flat() {
     let normal = Vector3::new(0.3, -0.2, 1.0).normalize();
-    let wall = TestShape::Plane { normal, offset_m: 0.05 };
-    let mut model = model(scenes::options(), &scenes::ring(&[wall], Point3::origin(), 4));
+    let wall = TestShape::Plane {
+        normal,
+        offset_m: 0.05,
+    };
+    let mut model = model(
+        scenes::options(),
+        &scenes::ring(&[wall], Point3::origin(), 4),
+    );
     let mut mesh = model.mesh().unwrap();
-    // Checks only near vertices: far away, pixels are wider than voxels and the wall is seen at an angle.
-    let is_near = vertex_positions(&mesh).map(|vertex| vertex.coords.norm() < 0.8).collect::<Vec<_>>();
+    // Checks only near vertices: far away, pixels are wider than voxels and the wall is seen at an
+    // angle.
+    let is_near = vertex_positions(&mesh)
+        .map(|vertex| vertex.coords.norm() < 0.8)
+        .collect::<Vec<_>>();
     let mut near = is_near.iter();
     mesh.positions_m.retain(|_| near.next() == Some(&true));
     assert!(mesh.positions_m.len() > 1000);
     let (mean_m, max_m) = errors_m(&mesh, &wall);
-    assert!(mean_m < 0.002 && max_m < 0.01, "mean {mean_m} m, largest {max_m} m");
+    assert!(
+        mean_m < 0.002 && max_m < 0.01,
+        "mean {mean_m} m, largest {max_m} m"
+    );
 }
 
 #[test]
@@ -120,7 +155,13 @@ fn clustered_mesh_is_smaller_and_close() {
     assert!(!coarse.triangles.is_empty());
     let (mean_m, _) = errors_m(&coarse, &ball);
     assert!(mean_m < 0.01, "{mean_m} m");
-    assert!(coarse.triangles.iter().flatten().all(|ix| (*ix as usize) < coarse.positions_m.len()));
+    assert!(
+        coarse
+            .triangles
+            .iter()
+            .flatten()
+            .all(|ix| (*ix as usize) < coarse.positions_m.len())
+    );
     for cell_m in [0.0, -1.0, f64::NAN] {
         assert!(mesh.clustered(cell_m) == mesh);
     }
@@ -128,26 +169,42 @@ fn clustered_mesh_is_smaller_and_close() {
 
 /// The text of the header, and the bytes after it.
 fn ply_parts(bytes: &[u8]) -> (String, &[u8]) {
-    let end = bytes.windows(11).position(|window| window == b"end_header\n").unwrap() + 11;
-    (String::from_utf8(bytes[..end].to_vec()).unwrap(), &bytes[end..])
+    let end = bytes
+        .windows(11)
+        .position(|window| window == b"end_header\n")
+        .unwrap()
+        + 11;
+    (
+        String::from_utf8(bytes[..end].to_vec()).unwrap(),
+        &bytes[end..],
+    )
 }
 
 #[test]
 fn ply_and_glb_files_hold_the_mesh() {
     let (mesh, _, _) = ball_mesh();
     let folder = tempfile::tempdir().unwrap();
-    let (ply, glb) = (folder.path().join("mesh.ply"), folder.path().join("mesh.glb"));
+    let (ply, glb) = (
+        folder.path().join("mesh.ply"),
+        folder.path().join("mesh.glb"),
+    );
     write_ply(&ply, &mesh).unwrap();
     write_glb(&glb, &mesh).unwrap();
     let bytes = std::fs::read(ply).unwrap();
     let (header, body) = ply_parts(&bytes);
     assert!(header.contains(&format!("element vertex {}\n", mesh.positions_m.len())));
     assert!(header.contains(&format!("element face {}\n", mesh.triangles.len())));
-    assert_eq!(body.len(), 27 * mesh.positions_m.len() + 13 * mesh.triangles.len());
+    assert_eq!(
+        body.len(),
+        27 * mesh.positions_m.len() + 13 * mesh.triangles.len()
+    );
 
     let bytes = std::fs::read(glb).unwrap();
     let word = |at: usize| u32::from_le_bytes(bytes[at..at + 4].try_into().unwrap()) as usize;
-    assert_eq!((&bytes[..4], word(4), word(8)), (&b"glTF"[..], 2, bytes.len()));
+    assert_eq!(
+        (&bytes[..4], word(4), word(8)),
+        (&b"glTF"[..], 2, bytes.len())
+    );
     assert_eq!(&bytes[16..20], b"JSON");
     let json: serde_json::Value = serde_json::from_slice(&bytes[20..20 + word(12)]).unwrap();
     let bin = 20 + word(12);
@@ -155,13 +212,25 @@ fn ply_and_glb_files_hold_the_mesh() {
     assert_eq!(json["buffers"][0]["byteLength"], word(bin));
     assert_eq!(bytes.len(), bin + 8 + word(bin));
     let views = json["bufferViews"].as_array().unwrap();
-    let lengths: Vec<_> = views.iter().map(|view| view["byteLength"].as_u64().unwrap()).collect();
+    let lengths: Vec<_> = views
+        .iter()
+        .map(|view| view["byteLength"].as_u64().unwrap())
+        .collect();
     let n = mesh.positions_m.len() as u64;
-    assert_eq!(lengths, [12 * n, 12 * n, 12 * n, 12 * mesh.triangles.len() as u64]);
+    assert_eq!(
+        lengths,
+        [12 * n, 12 * n, 12 * n, 12 * mesh.triangles.len() as u64]
+    );
     let first = bin + 8;
     let x = f32::from_le_bytes(bytes[first..first + 4].try_into().unwrap());
     assert_eq!(x.to_bits(), mesh.positions_m[0][0].to_bits());
-    assert_eq!(json["nodes"][1]["translation"], serde_json::json!(mesh.origin_m));
+    assert_eq!(
+        json["nodes"][1]["translation"],
+        serde_json::json!(mesh.origin_m)
+    );
     let empty = super::glb::to_bytes(&Mesh::default());
-    assert_eq!(u32::from_le_bytes(empty[8..12].try_into().unwrap()) as usize, empty.len());
+    assert_eq!(
+        u32::from_le_bytes(empty[8..12].try_into().unwrap()) as usize,
+        empty.len()
+    );
 }

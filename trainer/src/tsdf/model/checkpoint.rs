@@ -38,7 +38,9 @@ pub(super) struct TsdfState {
 impl TsdfModel {
     pub(super) fn take_checkpoint(&mut self) -> Result<PendingCheckpoint, Error> {
         let (state, arrays) = self.state()?;
-        Ok(PendingCheckpoint::new(move || Ok(Checkpoint::new(METHOD, state, arrays))))
+        Ok(PendingCheckpoint::new(move || {
+            Ok(Checkpoint::new(METHOD, state, arrays))
+        }))
     }
 
     /// The state, and the blocks ordered by their coordinates.
@@ -52,21 +54,32 @@ impl TsdfModel {
             n_blocks: blocks.len() as u64,
             fused: self.queue.fused.clone(),
             n_removed: self.queue.n_removed,
-            pending: self.queue.pending.iter().map(|keyframe| KeyframeSignature::of(keyframe)).collect(),
+            pending: self
+                .queue
+                .pending
+                .iter()
+                .map(|keyframe| KeyframeSignature::of(keyframe))
+                .collect(),
         };
-        let state = serde_json::to_value(state).map_err(|error| invalid_state(error.to_string()))?;
+        let state =
+            serde_json::to_value(state).map_err(|error| invalid_state(error.to_string()))?;
         Ok((state, arrays_of(&blocks)))
     }
 
-    /// Resumes training exactly where the checkpoint was taken. `keyframes` must include all that the model had
-    /// received. Also returns the other keyframes, to be pushed or kept for testing.
+    /// Resumes training exactly where the checkpoint was taken. `keyframes` must include all that
+    /// the model had received. Also returns the other keyframes, to be pushed or kept for testing.
     pub fn resume(
         gpu: Arc<Gpu>,
         checkpoint: &Checkpoint,
         keyframes: &[Arc<Keyframe>],
     ) -> Result<(Self, Vec<Arc<Keyframe>>), Error> {
         let mut model = Self::of_state(gpu, checkpoint)?;
-        let KeyframeQueue { pending, fused, unmatched, .. } = &mut model.queue;
+        let KeyframeQueue {
+            pending,
+            fused,
+            unmatched,
+            ..
+        } = &mut model.queue;
         let known: Vec<KeyframeSignature> = fused.iter().chain(&*unmatched).cloned().collect();
         let (mut found, rest) = keyframe_signature::match_keyframes(&known, keyframes)?;
         *pending = found.split_off(fused.len()).into();
@@ -77,59 +90,111 @@ impl TsdfModel {
     /// Restores a model from a checkpoint, without its pending keyframes.
     pub(super) fn of_state(gpu: Arc<Gpu>, checkpoint: &Checkpoint) -> Result<Self, Error> {
         if checkpoint.method != METHOD {
-            return Err(invalid_state(format!("it was written by method {:?}", checkpoint.method)));
+            return Err(invalid_state(format!(
+                "it was written by method {:?}",
+                checkpoint.method
+            )));
         }
-        let state: TsdfState =
-            serde_json::from_value(checkpoint.state.clone()).map_err(|error| invalid_state(error.to_string()))?;
+        let state: TsdfState = serde_json::from_value(checkpoint.state.clone())
+            .map_err(|error| invalid_state(error.to_string()))?;
         let blocks = blocks_of(checkpoint, state.n_blocks)?;
         let mut model = Self::without_budget_check(gpu, state.options)?;
         if let Some(voxel_grid) = state.voxel_grid {
             check_lattice(&voxel_grid)?;
             let max_bytes = model.options.common.max_bytes;
-            model.store = Some(FieldStore::with_blocks(&model.gpu, &model.pipelines, voxel_grid, max_bytes, blocks)?);
+            model.store = Some(FieldStore::with_blocks(
+                &model.gpu,
+                &model.pipelines,
+                voxel_grid,
+                max_bytes,
+                blocks,
+            )?);
         }
         let (fused, unmatched) = (state.fused, state.pending);
         let (n_skipped, n_removed) = (state.n_skipped, state.n_removed);
-        model.queue = KeyframeQueue { fused, unmatched, n_skipped, n_removed, ..KeyframeQueue::default() };
+        model.queue = KeyframeQueue {
+            fused,
+            unmatched,
+            n_skipped,
+            n_removed,
+            ..KeyframeQueue::default()
+        };
         Ok(model)
     }
 }
 
 fn check_lattice(voxel_grid: &VoxelGrid) -> Result<(), Error> {
-    let positive = [voxel_grid.voxel_m, voxel_grid.truncation_m, voxel_grid.scale_m, voxel_grid.max_depth_m];
-    let is_usable = positive.iter().all(|value| value.is_finite() && *value > 0.0)
+    let positive = [
+        voxel_grid.voxel_m,
+        voxel_grid.truncation_m,
+        voxel_grid.scale_m,
+        voxel_grid.max_depth_m,
+    ];
+    let is_usable = positive
+        .iter()
+        .all(|value| value.is_finite() && *value > 0.0)
         && voxel_grid.anchor_m.iter().all(|along| along.is_finite())
         && voxel_grid.noise_per_m2 >= 0.0
         && voxel_grid.truncation_m > voxel_grid.voxel_m
         && voxel_grid.max_weight <= 65_535;
-    if is_usable { Ok(()) } else { Err(invalid_state(format!("invalid voxel grid: {voxel_grid:?}"))) }
+    if is_usable {
+        Ok(())
+    } else {
+        Err(invalid_state(format!("invalid voxel grid: {voxel_grid:?}")))
+    }
 }
 
 fn arrays_of(blocks: &Blocks) -> Vec<Array> {
-    let block_coords: Vec<u8> = blocks.keys().flatten().flat_map(|along| along.to_le_bytes()).collect();
-    let geometry: Vec<u8> =
-        blocks.values().flat_map(|block| &block.geometry).flat_map(|word| word.to_le_bytes()).collect();
-    let colors: Vec<u8> =
-        blocks.values().flat_map(|block| &block.colors).flatten().flat_map(|word| word.to_le_bytes()).collect();
-    [(BLOCK_COORDS, block_coords), (GEOMETRY, geometry), (COLORS, colors)]
-        .map(|(name, bytes)| Array { name: name.to_owned(), bytes })
-        .into()
+    let block_coords: Vec<u8> = blocks
+        .keys()
+        .flatten()
+        .flat_map(|along| along.to_le_bytes())
+        .collect();
+    let geometry: Vec<u8> = blocks
+        .values()
+        .flat_map(|block| &block.geometry)
+        .flat_map(|word| word.to_le_bytes())
+        .collect();
+    let colors: Vec<u8> = blocks
+        .values()
+        .flat_map(|block| &block.colors)
+        .flatten()
+        .flat_map(|word| word.to_le_bytes())
+        .collect();
+    [
+        (BLOCK_COORDS, block_coords),
+        (GEOMETRY, geometry),
+        (COLORS, colors),
+    ]
+    .map(|(name, bytes)| Array {
+        name: name.to_owned(),
+        bytes,
+    })
+    .into()
 }
 
 fn blocks_of(checkpoint: &Checkpoint, n_blocks: u64) -> Result<Blocks, Error> {
-    let n_bytes =
-        |each: u64| n_blocks.checked_mul(each).ok_or_else(|| invalid_state(format!("too many blocks: {n_blocks}")));
+    let n_bytes = |each: u64| {
+        n_blocks
+            .checked_mul(each)
+            .ok_or_else(|| invalid_state(format!("too many blocks: {n_blocks}")))
+    };
     let block_coords = checkpoint.array(BLOCK_COORDS, n_bytes(12)?)?;
     let geometry = checkpoint.array(GEOMETRY, n_bytes(4 * 512)?)?;
     let colors = checkpoint.array(COLORS, n_bytes(8 * 512)?)?;
     let word = |bytes: &[u8]| u32::from_le_bytes([bytes[0], bytes[1], bytes[2], bytes[3]]);
-    let block_coords = block_coords
-        .chunks_exact(12)
-        .map(|bytes| -> GridCoord { std::array::from_fn(|axis| word(&bytes[4 * axis..4 * axis + 4]).cast_signed()) });
-    let blocks =
-        geometry.chunks_exact(4 * N_VOXELS).zip(colors.chunks_exact(8 * N_VOXELS)).map(|(geometry, colors)| Block {
+    let block_coords = block_coords.chunks_exact(12).map(|bytes| -> GridCoord {
+        std::array::from_fn(|axis| word(&bytes[4 * axis..4 * axis + 4]).cast_signed())
+    });
+    let blocks = geometry
+        .chunks_exact(4 * N_VOXELS)
+        .zip(colors.chunks_exact(8 * N_VOXELS))
+        .map(|(geometry, colors)| Block {
             geometry: geometry.chunks_exact(4).map(word).collect(),
-            colors: colors.chunks_exact(8).map(|both| [word(&both[..4]), word(&both[4..])]).collect(),
+            colors: colors
+                .chunks_exact(8)
+                .map(|both| [word(&both[..4]), word(&both[4..])])
+                .collect(),
         });
     let blocks: Blocks = block_coords.zip(blocks).collect();
     if blocks.len() as u64 == n_blocks {

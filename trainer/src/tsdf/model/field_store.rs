@@ -1,8 +1,8 @@
 //! The blocks of a field, on the GPU and in host memory.
 //!
-//! Blocks that do not fit on the GPU are kept in host memory until a camera observes them again. Before a depth image
-//! is fused, every block that it could change is loaded back. The field is therefore bit-identical to a field with
-//! unlimited memory.
+//! Blocks that do not fit on the GPU are kept in host memory until a camera observes them again.
+//! Before a depth image is fused, every block that it could change is loaded back. The field is
+//! therefore bit-identical to a field with unlimited memory.
 
 use super::frustum::ViewFrustum;
 use crate::Error;
@@ -16,7 +16,10 @@ use crate::tsdf::params::status;
 use std::collections::BTreeSet;
 
 /// Initial capacity.
-pub(super) const INITIAL_CAPACITY: Capacity = Capacity { n_blocks: 4096, n_chunks: 512 };
+pub(super) const INITIAL_CAPACITY: Capacity = Capacity {
+    n_blocks: 4096,
+    n_chunks: 512,
+};
 /// Fraction of the pool that is freed at once, to avoid evictions for every image.
 const EVICTED_FRAC: f64 = 0.125;
 
@@ -36,9 +39,20 @@ pub(super) struct FieldStore {
 
 impl FieldStore {
     /// An empty field.
-    pub(super) fn new(gpu: &Gpu, voxel_grid: VoxelGrid, max_bytes: Option<u64>) -> Result<Self, Error> {
+    pub(super) fn new(
+        gpu: &Gpu,
+        voxel_grid: VoxelGrid,
+        max_bytes: Option<u64>,
+    ) -> Result<Self, Error> {
         let buffers = FieldBuffers::new(gpu, &voxel_grid, initial_capacity(gpu, max_bytes))?;
-        Ok(Self { voxel_grid, buffers, host_blocks: Blocks::new(), stale: BTreeSet::new(), n_resident: 0, max_bytes })
+        Ok(Self {
+            voxel_grid,
+            buffers,
+            host_blocks: Blocks::new(),
+            stale: BTreeSet::new(),
+            n_resident: 0,
+            max_bytes,
+        })
     }
 
     /// A field with the given blocks.
@@ -49,7 +63,8 @@ impl FieldStore {
         max_bytes: Option<u64>,
         blocks: Blocks,
     ) -> Result<Self, Error> {
-        let max_resident = capacity::max_blocks_within(gpu, max_bytes, INITIAL_CAPACITY.n_chunks) as usize;
+        let max_resident =
+            capacity::max_blocks_within(gpu, max_bytes, INITIAL_CAPACITY.n_chunks) as usize;
         let stale = blocks.keys().copied().collect();
         let mut resident = blocks;
         let host_blocks = match resident.keys().nth(max_resident).copied() {
@@ -59,7 +74,14 @@ impl FieldStore {
         let capacity = initial_capacity(gpu, max_bytes);
         let buffers = FieldBuffers::with_blocks(gpu, pipelines, &voxel_grid, &resident, capacity)?;
         let n_resident = buffers.n_blocks(gpu)?;
-        Ok(Self { voxel_grid, buffers, host_blocks, stale, n_resident, max_bytes })
+        Ok(Self {
+            voxel_grid,
+            buffers,
+            host_blocks,
+            stale,
+            n_resident,
+            max_bytes,
+        })
     }
 
     /// All blocks, ordered by their coordinates.
@@ -80,7 +102,12 @@ impl FieldStore {
     }
 
     /// Grows the buffers after an overflow. Returns the number of blocks that must also be evicted.
-    pub(super) fn grow(&mut self, gpu: &Gpu, pipelines: &Pipelines, counters: &[u32]) -> Result<u32, Error> {
+    pub(super) fn grow(
+        &mut self,
+        gpu: &Gpu,
+        pipelines: &Pipelines,
+        counters: &[u32],
+    ) -> Result<u32, Error> {
         let mut capacity = self.buffers.capacity;
         if counters[status::TABLE_FULL] != 0 {
             capacity.n_chunks *= 2;
@@ -93,13 +120,15 @@ impl FieldStore {
         }
         if capacity != self.buffers.capacity {
             log::debug!("tsdf: grown to {capacity:?}");
-            self.buffers = self.buffers.resized(gpu, pipelines, &self.voxel_grid, capacity)?;
+            self.buffers = self
+                .buffers
+                .resized(gpu, pipelines, &self.voxel_grid, capacity)?;
         }
         Ok(n_needed.saturating_sub(n_allowed))
     }
 
-    /// Frees slots for at least `n` more blocks by evicting blocks outside the frustum. Returns whether that was
-    /// possible.
+    /// Frees slots for at least `n` more blocks by evicting blocks outside the frustum. Returns
+    /// whether that was possible.
     pub(super) fn evict(
         &mut self,
         gpu: &Gpu,
@@ -108,13 +137,23 @@ impl FieldStore {
         n: u32,
     ) -> Result<bool, Error> {
         let n_spare = f64::from(self.max_blocks(gpu)) * EVICTED_FRAC;
-        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a fraction of a u32")]
-        let n_evicted = self.swap_blocks(gpu, pipelines, frustum, n as usize + n_spare as usize, &Blocks::new())?;
+        #[expect(
+            clippy::cast_possible_truncation,
+            clippy::cast_sign_loss,
+            reason = "a fraction of a u32"
+        )]
+        let n_evicted = self.swap_blocks(
+            gpu,
+            pipelines,
+            frustum,
+            n as usize + n_spare as usize,
+            &Blocks::new(),
+        )?;
         Ok(n_evicted >= n as usize)
     }
 
-    /// Loads visible blocks from host memory. If not all fit, loads the nearest ones if `allows_partial`; otherwise
-    /// loads none and returns false.
+    /// Loads visible blocks from host memory. If not all fit, loads the nearest ones if
+    /// `allows_partial`; otherwise loads none and returns false.
     pub(super) fn load_visible(
         &mut self,
         gpu: &Gpu,
@@ -122,29 +161,44 @@ impl FieldStore {
         frustum: &ViewFrustum,
         allows_partial: bool,
     ) -> Result<bool, Error> {
-        let mut visible: Vec<GridCoord> =
-            self.host_blocks.keys().copied().filter(|block| frustum.may_be_visible(*block)).collect();
+        let mut visible: Vec<GridCoord> = self
+            .host_blocks
+            .keys()
+            .copied()
+            .filter(|block| frustum.may_be_visible(*block))
+            .collect();
         if visible.is_empty() {
             return Ok(true);
         }
         visible.sort_by(|a, b| frustum.distance_m(*a).total_cmp(&frustum.distance_m(*b)));
         let n_slots = self.buffers.capacity.n_blocks as usize;
         let resident = self.buffers.block_coords(gpu)?;
-        let n_observed = resident.into_iter().filter(|block| frustum.may_be_visible(*block)).count();
+        let n_observed = resident
+            .into_iter()
+            .filter(|block| frustum.may_be_visible(*block))
+            .count();
         let n_free_slots = n_slots.saturating_sub(n_observed);
         if visible.len() > n_free_slots && !allows_partial {
             return Ok(false);
         }
         visible.truncate(n_free_slots);
-        let added: Blocks =
-            visible.into_iter().filter_map(|block| Some((block, self.host_blocks.remove(&block)?))).collect();
+        let added: Blocks = visible
+            .into_iter()
+            .filter_map(|block| Some((block, self.host_blocks.remove(&block)?)))
+            .collect();
         let n_free = n_slots - self.buffers.n_blocks(gpu)? as usize;
-        self.swap_blocks(gpu, pipelines, frustum, added.len().saturating_sub(n_free), &added)?;
+        self.swap_blocks(
+            gpu,
+            pipelines,
+            frustum,
+            added.len().saturating_sub(n_free),
+            &added,
+        )?;
         Ok(true)
     }
 
-    /// Evicts up to `n` blocks outside the frustum to host memory, farthest first; then adds `added`. Returns the
-    /// number of evicted blocks.
+    /// Evicts up to `n` blocks outside the frustum to host memory, farthest first; then adds
+    /// `added`. Returns the number of evicted blocks.
     fn swap_blocks(
         &mut self,
         gpu: &Gpu,
@@ -160,13 +214,22 @@ impl FieldStore {
             .map(|(slot, block_coord)| (slot, *block_coord))
             .filter(|(_, block)| !frustum.may_be_visible(*block))
             .collect();
-        invisible_slots
-            .sort_by(|(_, a), (_, b)| frustum.distance_m(*b).total_cmp(&frustum.distance_m(*a)).then_with(|| a.cmp(b)));
+        invisible_slots.sort_by(|(_, a), (_, b)| {
+            frustum
+                .distance_m(*b)
+                .total_cmp(&frustum.distance_m(*a))
+                .then_with(|| a.cmp(b))
+        });
         invisible_slots.truncate(n);
         let evicted: BTreeSet<u32> = invisible_slots.iter().map(|(slot, _)| *slot).collect();
         let slots: Vec<u32> = evicted.iter().copied().collect();
         let blocks = self.buffers.read(gpu, pipelines, &slots)?;
-        self.host_blocks.extend(slots.iter().map(|slot| block_coords[*slot as usize]).zip(blocks));
+        self.host_blocks.extend(
+            slots
+                .iter()
+                .map(|slot| block_coords[*slot as usize])
+                .zip(blocks),
+        );
         self.buffers.swap_blocks(gpu, pipelines, &slots, added)?;
         self.n_resident = self.buffers.n_blocks(gpu)?;
         Ok(slots.len())
@@ -175,5 +238,8 @@ impl FieldStore {
 
 fn initial_capacity(gpu: &Gpu, max_bytes: Option<u64>) -> Capacity {
     let max_blocks = capacity::max_blocks_within(gpu, max_bytes, INITIAL_CAPACITY.n_chunks);
-    Capacity { n_blocks: INITIAL_CAPACITY.n_blocks.min(max_blocks), ..INITIAL_CAPACITY }
+    Capacity {
+        n_blocks: INITIAL_CAPACITY.n_blocks.min(max_blocks),
+        ..INITIAL_CAPACITY
+    }
 }

@@ -39,7 +39,13 @@ impl ViewFrustum {
     /// The frustum of a camera whose pose is in the field's frame.
     pub(super) fn of_camera(camera: &Camera, voxel_grid: &VoxelGrid) -> Self {
         let lens = [camera.focal_px, camera.principal_px];
-        Self::new(&camera.world_from_camera, lens, camera.size_px, camera.far_m, voxel_grid)
+        Self::new(
+            &camera.world_from_camera,
+            lens,
+            camera.size_px,
+            camera.far_m,
+            voxel_grid,
+        )
     }
 
     fn new(

@@ -26,15 +26,20 @@ pub(super) struct Fusion {
 
 impl Fusion {
     pub(super) fn new() -> Self {
-        Self { slots: Vec::new(), submits: Submits::new(), n_fused_on_gpu: 0, n_outside: 0 }
+        Self {
+            slots: Vec::new(),
+            submits: Submits::new(),
+            n_fused_on_gpu: 0,
+            n_outside: 0,
+        }
     }
 
     /// Number of keyframes in a submit that stays within the time limit.
     pub(super) fn keyframes_per_submit(&self) -> usize {
         match self.submits.n_steps_in_limit() {
-            Some(n) if self.submits.is_watched() => {
-                usize::try_from(n).unwrap_or(usize::MAX).clamp(1, KEYFRAMES_PER_SUBMIT)
-            }
+            Some(n) if self.submits.is_watched() => usize::try_from(n)
+                .unwrap_or(usize::MAX)
+                .clamp(1, KEYFRAMES_PER_SUBMIT),
             _ => KEYFRAMES_PER_SUBMIT,
         }
     }
@@ -49,10 +54,16 @@ impl Fusion {
         keyframe: &Keyframe,
         slot_ix: usize,
     ) -> Result<(), Error> {
-        let Some(depth_view) = DepthView::of(keyframe, &store.voxel_grid) else { return Ok(()) };
+        let Some(depth_view) = DepthView::of(keyframe, &store.voxel_grid) else {
+            return Ok(());
+        };
         let [n_depth, n_color] = [depth_view.depth_size_px, depth_view.color_size_px]
             .map(|[width, height]| u64::from(width) * u64::from(height));
-        if self.slots.get(slot_ix).is_none_or(|slot| !slot.holds(n_depth, n_color)) {
+        if self
+            .slots
+            .get(slot_ix)
+            .is_none_or(|slot| !slot.holds(n_depth, n_color))
+        {
             passes.clear_bindings();
             let slot = KeyframeSlot::new(gpu, n_depth, n_color)?;
             self.slots.truncate(slot_ix);

@@ -27,23 +27,33 @@ impl KeyframeQueue {
         self.fused.len() as u64 + self.n_removed
     }
 
-    /// Removes a keyframe. If it was fused, its effect on the field stays, but resuming does not need the keyframe.
+    /// Removes a keyframe. If it was fused, its effect on the field stays, but resuming does not
+    /// need the keyframe.
     pub(super) fn remove(&mut self, camera: &str, stamp: Stamp) {
-        self.pending.retain(|keyframe| keyframe.camera.as_ref() != camera || keyframe.stamp != stamp);
+        self.pending
+            .retain(|keyframe| keyframe.camera.as_ref() != camera || keyframe.stamp != stamp);
         let n_before = self.fused.len();
-        self.fused.retain(|signature| !signature.is_of(camera, stamp));
+        self.fused
+            .retain(|signature| !signature.is_of(camera, stamp));
         self.n_removed += (n_before - self.fused.len()) as u64;
     }
 
     /// Marks the first pending keyframe as fused.
     pub(super) fn complete_first(&mut self) {
-        self.fused.extend(self.pending.pop_front().map(|keyframe| KeyframeSignature::of(&keyframe)));
+        self.fused.extend(
+            self.pending
+                .pop_front()
+                .map(|keyframe| KeyframeSignature::of(&keyframe)),
+        );
     }
 
-    /// Skips the first pending keyframe, which observes more than the `max_blocks` voxel blocks that fit into memory.
+    /// Skips the first pending keyframe, which observes more than the `max_blocks` voxel blocks
+    /// that fit into memory.
     pub(super) fn skip_first(&mut self, max_blocks: u32) {
         self.n_skipped += 1;
-        log::warn!("tsdf: skipped an image that observes more than the {max_blocks} voxel blocks that fit into memory");
+        log::warn!(
+            "tsdf: skipped an image that observes more than the {max_blocks} voxel blocks that fit into memory"
+        );
         self.complete_first();
     }
 }

@@ -43,8 +43,14 @@ impl Meshing {
         ChangedChunks::take(&mut self.mesher, edits, only_changed)
     }
 
-    /// Meshes the blocks that changed since the last call; returns their number. No submit may be in flight.
-    pub(super) fn update(&mut self, gpu: &Gpu, pipelines: &Pipelines, store: &mut FieldStore) -> Result<usize, Error> {
+    /// Meshes the blocks that changed since the last call; returns their number. No submit may be
+    /// in flight.
+    pub(super) fn update(
+        &mut self,
+        gpu: &Gpu,
+        pipelines: &Pipelines,
+        store: &mut FieldStore,
+    ) -> Result<usize, Error> {
         let block_meshes = match store.host_blocks.is_empty() {
             true => self.mesh_on_gpu(gpu, pipelines, store)?,
             false => self.mesh_in_batches(gpu, pipelines, store)?,
@@ -71,7 +77,11 @@ impl Meshing {
         pipelines: &Pipelines,
         store: &mut FieldStore,
     ) -> Result<Vec<(GridCoord, BlockMesh)>, Error> {
-        let FieldStore { buffers: field, stale, .. } = store;
+        let FieldStore {
+            buffers: field,
+            stale,
+            ..
+        } = store;
         if !stale.is_empty() {
             stale.extend(field.take_changed(gpu)?);
             field.set_changed(gpu, stale)?;
@@ -83,35 +93,54 @@ impl Meshing {
         Ok(block_meshes)
     }
 
-    /// Meshes changed blocks if some blocks are in host memory: loads them and their neighbors, a batch at a time, into
-    /// a small temporary field.
+    /// Meshes changed blocks if some blocks are in host memory: loads them and their neighbors, a
+    /// batch at a time, into a small temporary field.
     fn mesh_in_batches(
         &mut self,
         gpu: &Gpu,
         pipelines: &Pipelines,
         store: &mut FieldStore,
     ) -> Result<Vec<(GridCoord, BlockMesh)>, Error> {
-        let FieldStore { voxel_grid, buffers: field, host_blocks, stale, .. } = store;
+        let FieldStore {
+            voxel_grid,
+            buffers: field,
+            host_blocks,
+            stale,
+            ..
+        } = store;
         stale.extend(field.take_changed(gpu)?);
-        let slots: BTreeMap<GridCoord, u32> = field.block_coords(gpu)?.into_iter().zip(0..).collect();
-        let exists = |block_coord: &GridCoord| slots.contains_key(block_coord) || host_blocks.contains_key(block_coord);
+        let slots: BTreeMap<GridCoord, u32> =
+            field.block_coords(gpu)?.into_iter().zip(0..).collect();
+        let exists = |block_coord: &GridCoord| {
+            slots.contains_key(block_coord) || host_blocks.contains_key(block_coord)
+        };
         let affected: BTreeSet<GridCoord> = stale.iter().flat_map(around).filter(exists).collect();
         let affected: Vec<GridCoord> = affected.into_iter().collect();
         let mut block_meshes = Vec::new();
         for part in affected.chunks(BLOCKS_PER_BATCH) {
-            let required_coords: BTreeSet<GridCoord> = part.iter().flat_map(around).filter(exists).collect();
-            let (resident, resident_slots): (Vec<GridCoord>, Vec<u32>) =
-                required_coords.iter().filter_map(|block_coord| Some((*block_coord, *slots.get(block_coord)?))).unzip();
-            let read = field.read(gpu, pipelines, &resident_slots)?;
-            let on_host = required_coords
+            let required_coords: BTreeSet<GridCoord> =
+                part.iter().flat_map(around).filter(exists).collect();
+            let (resident, resident_slots): (Vec<GridCoord>, Vec<u32>) = required_coords
                 .iter()
-                .filter_map(|block_coord| Some((*block_coord, host_blocks.get(block_coord)?.clone())));
+                .filter_map(|block_coord| Some((*block_coord, *slots.get(block_coord)?)))
+                .unzip();
+            let read = field.read(gpu, pipelines, &resident_slots)?;
+            let on_host = required_coords.iter().filter_map(|block_coord| {
+                Some((*block_coord, host_blocks.get(block_coord)?.clone()))
+            });
             let blocks: Blocks = resident.into_iter().zip(read).chain(on_host).collect();
             let n_blocks = u32::try_from(blocks.len()).unwrap_or(u32::MAX);
-            let capacity = Capacity { n_blocks, n_chunks: CHUNKS_PER_BATCH };
-            let batch_field = FieldBuffers::with_blocks(gpu, pipelines, voxel_grid, &blocks, capacity)?;
+            let capacity = Capacity {
+                n_blocks,
+                n_chunks: CHUNKS_PER_BATCH,
+            };
+            let batch_field =
+                FieldBuffers::with_blocks(gpu, pipelines, voxel_grid, &blocks, capacity)?;
             let batch_slots: BTreeMap<GridCoord, u32> = blocks.into_keys().zip(0..).collect();
-            let part: Vec<u32> = part.iter().map(|block_coord| batch_slots[block_coord]).collect();
+            let part: Vec<u32> = part
+                .iter()
+                .map(|block_coord| batch_slots[block_coord])
+                .collect();
             let buffers = reserve(&mut self.buffers, gpu, n_blocks)?;
             block_meshes.extend(buffers.mesh_slots(gpu, pipelines, &batch_field, &part)?);
         }
@@ -127,8 +156,15 @@ fn around(block_coord: &GridCoord) -> impl Iterator<Item = GridCoord> + use<> {
 }
 
 /// Returns the kept buffers, or allocates new ones if they are too small for a pool of this size.
-fn reserve<'a>(kept: &'a mut Option<MeshBuffers>, gpu: &Gpu, n_blocks: u32) -> Result<&'a mut MeshBuffers, Error> {
-    let buffers = match kept.take().filter(|buffers| buffers.has_capacity_for(n_blocks)) {
+fn reserve<'a>(
+    kept: &'a mut Option<MeshBuffers>,
+    gpu: &Gpu,
+    n_blocks: u32,
+) -> Result<&'a mut MeshBuffers, Error> {
+    let buffers = match kept
+        .take()
+        .filter(|buffers| buffers.has_capacity_for(n_blocks))
+    {
         Some(buffers) => buffers,
         None => MeshBuffers::new(gpu, MeshCapacity::default(), n_blocks)?,
     };

@@ -27,7 +27,9 @@ impl TsdfModel {
         let mut checkpoint = Checkpoint::read(&path)?;
         for array in &mut checkpoint.arrays {
             let mut whole = Vec::new();
-            let inflated = DeflateDecoder::new(array.bytes.as_slice()).take(MAX_ARRAY_BYTES).read_to_end(&mut whole);
+            let inflated = DeflateDecoder::new(array.bytes.as_slice())
+                .take(MAX_ARRAY_BYTES)
+                .read_to_end(&mut whole);
             inflated.map_err(|error| invalid_state(format!("array {:?}: {error}", array.name)))?;
             array.bytes = whole;
         }
@@ -45,15 +47,26 @@ impl TsdfModel {
     pub(super) fn write_folder(&mut self, folder: &Path) -> Result<(), Error> {
         self.finish_in_flight()?;
         self.fuse_one()?;
-        let write_error = |path: &Path, source| Error::Write { path: path.to_owned(), source };
+        let write_error = |path: &Path, source| Error::Write {
+            path: path.to_owned(),
+            source,
+        };
         std::fs::create_dir_all(folder).map_err(|source| write_error(folder, source))?;
         let mesh = self.write_meshes(folder, &Edits::default())?;
         let blocks = folder.join(BLOCKS_FILE);
         let (mut state, arrays) = self.state()?;
-        // Other common options do not affect a field. They are reset, so that equal fields give equal files.
-        let common = CommonOptions { max_bytes: self.options.common.max_bytes, ..CommonOptions::default() };
-        state["options"]["common"] = serde_json::to_value(common).map_err(|error| invalid_state(error.to_string()))?;
-        let arrays = arrays.into_iter().map(deflated).collect::<std::io::Result<Vec<Array>>>();
+        // Other common options do not affect a field. They are reset, so that equal fields give
+        // equal files.
+        let common = CommonOptions {
+            max_bytes: self.options.common.max_bytes,
+            ..CommonOptions::default()
+        };
+        state["options"]["common"] =
+            serde_json::to_value(common).map_err(|error| invalid_state(error.to_string()))?;
+        let arrays = arrays
+            .into_iter()
+            .map(deflated)
+            .collect::<std::io::Result<Vec<Array>>>();
         let arrays = arrays.map_err(|source| write_error(&blocks, source))?;
         Checkpoint::new(METHOD, state, arrays).write(&blocks)?;
         let description = serde_json::json!({
@@ -66,12 +79,16 @@ impl TsdfModel {
             "voxel_grid": self.voxel_grid(),
         });
         let path = folder.join(METADATA_FILE);
-        files::write(&path, format!("{description:#}\n")).map_err(|source| write_error(&path, source))
+        files::write(&path, format!("{description:#}\n"))
+            .map_err(|source| write_error(&path, source))
     }
 }
 
 fn deflated(array: Array) -> std::io::Result<Array> {
     let mut encoder = DeflateEncoder::new(Vec::new(), Compression::fast());
     encoder.write_all(&array.bytes)?;
-    Ok(Array { bytes: encoder.finish()?, ..array })
+    Ok(Array {
+        bytes: encoder.finish()?,
+        ..array
+    })
 }

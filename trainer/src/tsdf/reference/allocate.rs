@@ -1,5 +1,5 @@
-//! Twin of `allocate_blocks.wgsl`. Uses a different method to find the blocks that a ray crosses: the sorted positions
-//! at which the ray passes block faces.
+//! Twin of `allocate_blocks.wgsl`. Uses a different method to find the blocks that a ray crosses:
+//! the sorted positions at which the ray passes block faces.
 
 use super::readings::{Reading, ray_of};
 use crate::tsdf::block::GridCoord;
@@ -25,28 +25,52 @@ impl VoxelGrid {
 }
 
 /// The blocks to allocate. `margin`: tolerance for rounding, in blocks.
-#[expect(clippy::cast_possible_truncation, reason = "coordinates are rounded down on purpose")]
-pub fn required_blocks(depth: &DepthMap, readings: &[Reading], voxel_grid: &VoxelGrid, margin: f64) -> RequiredBlocks {
+#[expect(
+    clippy::cast_possible_truncation,
+    reason = "coordinates are rounded down on purpose"
+)]
+pub fn required_blocks(
+    depth: &DepthMap,
+    readings: &[Reading],
+    voxel_grid: &VoxelGrid,
+    margin: f64,
+) -> RequiredBlocks {
     let field_from_depth = voxel_grid.field_from_world() * depth.world_from_camera;
     let width = depth.size_px[0] as usize;
     let block_m = 8.0 * voxel_grid.voxel_m;
     let mut required = RequiredBlocks::default();
-    for (ix, reading) in readings.iter().enumerate().filter(|(_, reading)| reading.depth_m > 0.0) {
-        let ray = ray_of(depth, [(ix % width) as f64 + 0.5, (ix / width) as f64 + 0.5]);
+    for (ix, reading) in readings
+        .iter()
+        .enumerate()
+        .filter(|(_, reading)| reading.depth_m > 0.0)
+    {
+        let ray = ray_of(
+            depth,
+            [(ix % width) as f64 + 0.5, (ix / width) as f64 + 0.5],
+        );
         let band_m = voxel_grid.truncation_at(reading.depth_m) / ray.norm();
         let at = |z: f64| (field_from_depth * Point3::from(ray * z)).coords / block_m;
-        let (begin, end) = (at((reading.depth_m - band_m).max(0.0)), at(reading.depth_m + band_m));
+        let (begin, end) = (
+            at((reading.depth_m - band_m).max(0.0)),
+            at(reading.depth_m + band_m),
+        );
         for (enter, leave) in intervals(&begin, &end) {
             let middle = begin + (end - begin) * (0.5 * (enter + leave));
             let block_coord: GridCoord = middle.map(|along| along.floor() as i32).into();
-            if (leave - enter) * (end - begin).norm() > margin && is_clear_of_faces(&middle, margin / 8.0) {
+            if (leave - enter) * (end - begin).norm() > margin
+                && is_clear_of_faces(&middle, margin / 8.0)
+            {
                 required.definite.insert(block_coord);
             }
             for share in [enter, leave] {
                 let point = begin + (end - begin) * share;
                 for ix in 0..27 {
-                    let offset = Vector3::new(ix % 3 - 1, ix / 3 % 3 - 1, ix / 9 - 1).map(f64::from) * margin;
-                    required.possible.insert((point + offset).map(|along| along.floor() as i32).into());
+                    let offset = Vector3::new(ix % 3 - 1, ix / 3 % 3 - 1, ix / 9 - 1)
+                        .map(f64::from)
+                        * margin;
+                    required
+                        .possible
+                        .insert((point + offset).map(|along| along.floor() as i32).into());
                 }
             }
             required.possible.insert(block_coord);
@@ -57,7 +81,9 @@ pub fn required_blocks(depth: &DepthMap, readings: &[Reading], voxel_grid: &Voxe
 
 /// Whether a point is farther than `margin` from every face of the blocks.
 fn is_clear_of_faces(point: &Vector3<f64>, margin: f64) -> bool {
-    point.iter().all(|along| (margin..1.0 - margin).contains(&(along - along.floor())))
+    point
+        .iter()
+        .all(|along| (margin..1.0 - margin).contains(&(along - along.floor())))
 }
 
 /// Intervals between the faces that a line passes, as fractions of the line's length.

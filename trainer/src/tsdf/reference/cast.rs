@@ -1,4 +1,5 @@
-//! Twin of `cast_rays.wgsl`: finds the first crossing from outside to inside with small constant steps.
+//! Twin of `cast_rays.wgsl`: finds the first crossing from outside to inside with small constant
+//! steps.
 
 use crate::edits::Edits;
 use crate::tsdf::block::{Blocks, block_of, voxel_ix};
@@ -36,45 +37,74 @@ pub fn cast(blocks: &Blocks, voxel_grid: &VoxelGrid, ray: &Ray, edits: &Edits) -
     let mut before: Option<(f64, f64)> = None;
     while depth_m < ray.range_m[1] {
         let here = distance_at(blocks, &at(depth_m));
-        if let (Some((outside_m, outside)), Some(inside)) = (before, here.filter(|distance| *distance < 0.0)) {
+        if let (Some((outside_m, outside)), Some(inside)) =
+            (before, here.filter(|distance| *distance < 0.0))
+        {
             let hit_m = outside_m + (depth_m - outside_m) * outside / (outside - inside);
-            let hit_in_world = ray.origin_m + ray.along * hit_m + Vector3::from(voxel_grid.anchor_m);
+            let hit_in_world =
+                ray.origin_m + ray.along * hit_m + Vector3::from(voxel_grid.anchor_m);
             if !edits.erases(hit_in_world.coords.into()) {
-                return Some(Hit { depth_m: hit_m, color_srgb: color_at(blocks, &at(hit_m)) });
+                return Some(Hit {
+                    depth_m: hit_m,
+                    color_srgb: color_at(blocks, &at(hit_m)),
+                });
             }
         }
-        before = here.filter(|distance| *distance >= 0.0).map(|distance| (depth_m, distance));
+        before = here
+            .filter(|distance| *distance >= 0.0)
+            .map(|distance| (depth_m, distance));
         depth_m += step_m;
     }
     None
 }
 
 /// The eight voxels around a point given in voxels, and their interpolation weights.
-#[expect(clippy::cast_possible_truncation, reason = "coordinates are rounded down on purpose")]
+#[expect(
+    clippy::cast_possible_truncation,
+    reason = "coordinates are rounded down on purpose"
+)]
 fn around(point: &Vector3<f64>) -> impl Iterator<Item = ([i32; 3], f64)> {
     let corner = point.map(|along| (along - 0.5).floor());
     let share = point.map(|along| along - 0.5) - corner;
     (0..8usize).map(move |ix| {
         let is_next = |axis: usize| ix >> axis & 1 == 1;
-        let part = (0..3).map(|axis| if is_next(axis) { share[axis] } else { 1.0 - share[axis] }).product();
-        (std::array::from_fn(|axis| corner[axis] as i32 + i32::from(is_next(axis))), part)
+        let part = (0..3)
+            .map(|axis| {
+                if is_next(axis) {
+                    share[axis]
+                } else {
+                    1.0 - share[axis]
+                }
+            })
+            .product();
+        (
+            std::array::from_fn(|axis| corner[axis] as i32 + i32::from(is_next(axis))),
+            part,
+        )
     })
 }
 
 /// Distance as a fraction of the field's scale; `None` if one of the eight voxels was not observed.
 fn distance_at(blocks: &Blocks, point: &Vector3<f64>) -> Option<f64> {
-    around(point)
-        .try_fold(0.0, |sum, (voxel, part)| Some(sum + part * blocks.get(&block_of(voxel))?.distance(voxel_ix(voxel))?))
+    around(point).try_fold(0.0, |sum, (voxel, part)| {
+        Some(sum + part * blocks.get(&block_of(voxel))?.distance(voxel_ix(voxel))?)
+    })
 }
 
 fn color_at(blocks: &Blocks, point: &Vector3<f64>) -> [f64; 3] {
     let (mut sum, mut weight) = (Vector3::zeros(), 0.0);
     for (voxel, part) in around(point) {
-        let color = blocks.get(&block_of(voxel)).and_then(|block| block.color_srgb(voxel_ix(voxel)));
+        let color = blocks
+            .get(&block_of(voxel))
+            .and_then(|block| block.color_srgb(voxel_ix(voxel)));
         if let Some(color) = color {
             sum += Vector3::from(color) * part;
             weight += part;
         }
     }
-    if weight > 1e-6 { (sum / weight).into() } else { [0.5; 3] }
+    if weight > 1e-6 {
+        (sum / weight).into()
+    } else {
+        [0.5; 3]
+    }
 }

@@ -1,4 +1,5 @@
-//! Twin of `integrate.wgsl`, applied to all given blocks. Blocks outside the camera's view stay unchanged.
+//! Twin of `integrate.wgsl`, applied to all given blocks. Blocks outside the camera's view stay
+//! unchanged.
 
 use super::readings::{Reading, ray_of};
 use crate::tsdf::block::{GridCoord, N_VOXELS};
@@ -29,14 +30,20 @@ const CARVING_FAR: f64 = 4.0;
 const COLOR_VOXELS: f64 = 2.0;
 
 /// Fuses a keyframe with depth into the given blocks.
-pub fn integrate(blocks: &mut VoxelBlocks, keyframe: &Keyframe, readings: &[Reading], voxel_grid: &VoxelGrid) {
+pub fn integrate(
+    blocks: &mut VoxelBlocks,
+    keyframe: &Keyframe,
+    readings: &[Reading],
+    voxel_grid: &VoxelGrid,
+) {
     let Some(depth) = &keyframe.depth else { return };
     for (block_coord, voxels) in blocks {
         debug_assert_eq!(voxels.len(), N_VOXELS, "a block has all its voxels");
         for (ix, voxel) in voxels.iter_mut().enumerate() {
             let offset = [ix % 8, ix / 8 % 8, ix / 64];
-            let along =
-                |axis: usize| (f64::from(8 * block_coord[axis]) + offset[axis] as f64 + 0.5) * voxel_grid.voxel_m;
+            let along = |axis: usize| {
+                (f64::from(8 * block_coord[axis]) + offset[axis] as f64 + 0.5) * voxel_grid.voxel_m
+            };
             let in_field = Point3::new(along(0), along(1), along(2));
             let in_world = voxel_grid.field_from_world().inverse() * in_field;
             fuse(voxel, keyframe, depth, readings, voxel_grid, &in_world);
@@ -53,7 +60,10 @@ fn fuse(
     in_world: &Point3<f64>,
 ) {
     let point = depth.world_from_camera.inverse() * in_world;
-    let Some(position_px) = projected(&point, depth.focal_px, depth.principal_px, depth.size_px) else { return };
+    let Some(position_px) = projected(&point, depth.focal_px, depth.principal_px, depth.size_px)
+    else {
+        return;
+    };
     let reading = reading_near(depth, readings, position_px);
     if reading.depth_m <= 0.0 {
         return;
@@ -72,7 +82,9 @@ fn fuse(
         if voxel.weight > 0.0 && voxel.distance_m < 0.0 {
             let past_truncation = (distance_m / truncation_m - 1.0).min(1.0);
             let carving = CARVING_NEAR + (CARVING_FAR - CARVING_NEAR) * past_truncation;
-            let weight_loss = (carving * 256.0 * (1.0 / (point.z * point.z)).min(1.0) + 0.5).floor().max(1.0);
+            let weight_loss = (carving * 256.0 * (1.0 / (point.z * point.z)).min(1.0) + 0.5)
+                .floor()
+                .max(1.0);
             if weight_loss >= voxel.weight {
                 (voxel.distance_m, voxel.weight) = (0.0, 0.0);
             } else {
@@ -86,13 +98,30 @@ fn fuse(
     voxel.distance_m = (voxel.distance_m * voxel.weight + distance_m * weight_gain) / sum;
     voxel.weight = sum.min(f64::from(voxel_grid.max_weight));
     if distance_m.abs() <= COLOR_VOXELS * voxel_grid.voxel_m {
-        fuse_color(voxel, keyframe, weight_gain, f64::from(voxel_grid.max_weight), in_world);
+        fuse_color(
+            voxel,
+            keyframe,
+            weight_gain,
+            f64::from(voxel_grid.max_weight),
+            in_world,
+        );
     }
 }
 
-fn fuse_color(voxel: &mut Voxel, keyframe: &Keyframe, weight_gain: f64, max_weight: f64, in_world: &Point3<f64>) {
+fn fuse_color(
+    voxel: &mut Voxel,
+    keyframe: &Keyframe,
+    weight_gain: f64,
+    max_weight: f64,
+    in_world: &Point3<f64>,
+) {
     let point = keyframe.world_from_camera.inverse() * in_world;
-    let Some(position_px) = projected(&point, keyframe.focal_px, keyframe.principal_px, keyframe.size_px) else {
+    let Some(position_px) = projected(
+        &point,
+        keyframe.focal_px,
+        keyframe.principal_px,
+        keyframe.size_px,
+    ) else {
         return;
     };
     let [red, green, blue, alpha] = color_near(keyframe, position_px);
@@ -106,32 +135,58 @@ fn fuse_color(voxel: &mut Voxel, keyframe: &Keyframe, weight_gain: f64, max_weig
     voxel.color_weight = sum.min(max_weight);
 }
 
-fn projected(point: &Point3<f64>, focal: [f64; 2], principal: [f64; 2], size_px: [u32; 2]) -> Option<[f64; 2]> {
-    let block_coord: [f64; 2] = std::array::from_fn(|axis| focal[axis] * point[axis] / point.z + principal[axis]);
-    let inside = (0..2).all(|axis| block_coord[axis] >= 0.0 && block_coord[axis] < f64::from(size_px[axis]));
+fn projected(
+    point: &Point3<f64>,
+    focal: [f64; 2],
+    principal: [f64; 2],
+    size_px: [u32; 2],
+) -> Option<[f64; 2]> {
+    let block_coord: [f64; 2] =
+        std::array::from_fn(|axis| focal[axis] * point[axis] / point.z + principal[axis]);
+    let inside =
+        (0..2).all(|axis| block_coord[axis] >= 0.0 && block_coord[axis] < f64::from(size_px[axis]));
     (point.z > 0.0 && inside).then_some(block_coord)
 }
 
-/// The four pixels around a position, clamped to the image, and the weights of the right and lower pixels.
-#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the image")]
+/// The four pixels around a position, clamped to the image, and the weights of the right and lower
+/// pixels.
+#[expect(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "clamped to the image"
+)]
 fn corners(position_px: [f64; 2], size_px: [u32; 2]) -> ([usize; 4], [f64; 2]) {
     let base = position_px.map(|along| (along - 0.5).floor());
-    let clamped = |axis: usize, step: f64| (base[axis] + step).clamp(0.0, f64::from(size_px[axis]) - 1.0) as usize;
+    let clamped = |axis: usize, step: f64| {
+        (base[axis] + step).clamp(0.0, f64::from(size_px[axis]) - 1.0) as usize
+    };
     let at = |x: f64, y: f64| clamped(1, y) * size_px[0] as usize + clamped(0, x);
-    ([at(0.0, 0.0), at(1.0, 0.0), at(0.0, 1.0), at(1.0, 1.0)], [0, 1].map(|axis| position_px[axis] - 0.5 - base[axis]))
+    (
+        [at(0.0, 0.0), at(1.0, 0.0), at(0.0, 1.0), at(1.0, 1.0)],
+        [0, 1].map(|axis| position_px[axis] - 0.5 - base[axis]),
+    )
 }
 
 fn mixed(values: [f64; 4], share: [f64; 2]) -> f64 {
     let mix = |a: f64, b: f64, share: f64| a * (1.0 - share) + b * share;
-    mix(mix(values[0], values[1], share[0]), mix(values[2], values[3], share[0]), share[1])
+    mix(
+        mix(values[0], values[1], share[0]),
+        mix(values[2], values[3], share[0]),
+        share[1],
+    )
 }
 
-#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a position inside the image")]
+#[expect(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "a position inside the image"
+)]
 fn reading_near(depth: &DepthMap, readings: &[Reading], position_px: [f64; 2]) -> Reading {
     let (at, share) = corners(position_px, depth.size_px);
     let four = at.map(|ix| readings[ix]);
     if four.iter().any(|reading| reading.depth_m <= 0.0) {
-        return readings[position_px[1] as usize * depth.size_px[0] as usize + position_px[0] as usize];
+        return readings
+            [position_px[1] as usize * depth.size_px[0] as usize + position_px[0] as usize];
     }
     Reading {
         depth_m: mixed(four.map(|reading| reading.depth_m), share),
@@ -141,10 +196,21 @@ fn reading_near(depth: &DepthMap, readings: &[Reading], position_px: [f64; 2]) -
 
 fn color_near(keyframe: &Keyframe, position_px: [f64; 2]) -> [f64; 4] {
     let (at, share) = corners(position_px, keyframe.size_px);
-    std::array::from_fn(|part| mixed(at.map(|ix| f64::from(keyframe.rgba_srgb[4 * ix + part]) / 255.0), share))
+    std::array::from_fn(|part| {
+        mixed(
+            at.map(|ix| f64::from(keyframe.rgba_srgb[4 * ix + part]) / 255.0),
+            share,
+        )
+    })
 }
 
 /// A block of voxels that were never observed.
 pub fn unobserved() -> Vec<Voxel> {
-    vec![Voxel { color_srgb: Vector3::zeros().into(), ..Voxel::default() }; N_VOXELS]
+    vec![
+        Voxel {
+            color_srgb: Vector3::zeros().into(),
+            ..Voxel::default()
+        };
+        N_VOXELS
+    ]
 }

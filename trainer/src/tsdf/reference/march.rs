@@ -44,10 +44,14 @@ impl<'a> BlockNeighborhood<'a> {
             let [x, y, z] = offset(ix);
             *found = blocks.get(&[block_coord[0] + x, block_coord[1] + y, block_coord[2] + z]);
         }
-        Self { block_coord, blocks: found }
+        Self {
+            block_coord,
+            blocks: found,
+        }
     }
 
-    /// The block that contains a voxel, and the voxel's index in it. `voxel` is relative to this block, -8 to 15.
+    /// The block that contains a voxel, and the voxel's index in it. `voxel` is relative to this
+    /// block, -8 to 15.
     fn at(&self, voxel: GridCoord) -> Option<(&'a Block, usize)> {
         let [x, y, z] = voxel.map(|along| along.div_euclid(BLOCK_EDGE) + 1);
         let block = self.blocks[usize::try_from(9 * z + 3 * y + x).ok()?]?;
@@ -80,7 +84,8 @@ impl<'a> BlockNeighborhood<'a> {
         self.at(voxel).and_then(|(block, ix)| block.color_srgb(ix))
     }
 
-    /// Case of the cube that begins at `voxel`: bit c is set if corner c is inside; `None` if any was not observed.
+    /// Case of the cube that begins at `voxel`: bit c is set if corner c is inside; `None` if any
+    /// was not observed.
     fn case_of(&self, voxel: GridCoord) -> Option<usize> {
         (0..8).try_fold(0, |case, corner| {
             let is_inside = self.distance(moved(voxel, corner))? < 0.0;
@@ -104,7 +109,12 @@ impl<'a> BlockNeighborhood<'a> {
             along
         });
         let color_srgb = mixed(self.color(from), self.color(to), share);
-        Vertex { between, position_m, normal: normal.into(), color_srgb }
+        Vertex {
+            between,
+            position_m,
+            normal: normal.into(),
+            color_srgb,
+        }
     }
 }
 
@@ -125,7 +135,9 @@ pub fn march(blocks: &Blocks, block_coord: GridCoord, voxel_m: f64) -> BlockTria
                     triangles_of_block.triangles.push(triangle.map(|edge| {
                         let between = (moved(cube, edge.corner), edge.axis);
                         *known.entry(between).or_insert_with(|| {
-                            triangles_of_block.vertices.push(around.vertex(between, voxel_m));
+                            triangles_of_block
+                                .vertices
+                                .push(around.vertex(between, voxel_m));
                             triangles_of_block.vertices.len() - 1
                         })
                     }));
@@ -138,7 +150,9 @@ pub fn march(blocks: &Blocks, block_coord: GridCoord, voxel_m: f64) -> BlockTria
 
 fn mixed(from: Option<[f64; 3]>, to: Option<[f64; 3]>, share: f64) -> [f64; 3] {
     match (from, to) {
-        (Some(from), Some(to)) => std::array::from_fn(|part| from[part] + (to[part] - from[part]) * share),
+        (Some(from), Some(to)) => {
+            std::array::from_fn(|part| from[part] + (to[part] - from[part]) * share)
+        }
         (Some(only), None) | (None, Some(only)) => only,
         (None, None) => [GRAY; 3],
     }

@@ -27,7 +27,10 @@ pub(super) fn ray_of(depth: &DepthMap, position_px: [f64; 2]) -> Vector3<f64> {
 /// Determines the valid pixels and the orientation of their surface.
 pub fn readings(depth: &DepthMap, voxel_grid: &VoxelGrid) -> Vec<Reading> {
     let [width, height] = depth.size_px.map(i64::from);
-    (0..height).flat_map(|y| (0..width).map(move |x| [x, y])).map(|pixel| reading(depth, voxel_grid, pixel)).collect()
+    (0..height)
+        .flat_map(|y| (0..width).map(move |x| [x, y]))
+        .map(|pixel| reading(depth, voxel_grid, pixel))
+        .collect()
 }
 
 fn depth_at(depth: &DepthMap, voxel_grid: &VoxelGrid, [x, y]: [i64; 2]) -> Option<f64> {
@@ -36,12 +39,17 @@ fn depth_at(depth: &DepthMap, voxel_grid: &VoxelGrid, [x, y]: [i64; 2]) -> Optio
         return None;
     }
     let depth_m = f64::from(depth.depth_m[usize::try_from(y * width + x).ok()?]);
-    (MIN_DEPTH_M..=voxel_grid.max_depth_m).contains(&depth_m).then_some(depth_m)
+    (MIN_DEPTH_M..=voxel_grid.max_depth_m)
+        .contains(&depth_m)
+        .then_some(depth_m)
 }
 
 fn reading(depth: &DepthMap, voxel_grid: &VoxelGrid, pixel: [i64; 2]) -> Reading {
-    let Some(center_m) = depth_at(depth, voxel_grid, pixel) else { return Reading::default() };
-    let point = |[x, y]: [i64; 2], depth_m: f64| ray_of(depth, [x as f64 + 0.5, y as f64 + 0.5]) * depth_m;
+    let Some(center_m) = depth_at(depth, voxel_grid, pixel) else {
+        return Reading::default();
+    };
+    let point =
+        |[x, y]: [i64; 2], depth_m: f64| ray_of(depth, [x as f64 + 0.5, y as f64 + 0.5]) * depth_m;
     let tangent_along = |axis: usize| -> Option<Vector3<f64>> {
         let noise_m = voxel_grid.noise_per_m2 * center_m * center_m;
         let limit = MAX_SLOPE * center_m / depth.focal_px[axis] + 6.0 * noise_m;
@@ -58,17 +66,35 @@ fn reading(depth: &DepthMap, voxel_grid: &VoxelGrid, pixel: [i64; 2]) -> Reading
             _ => false,
         };
         let sides = [at(1), at(-1)];
-        if sides.iter().flatten().any(|(_, depth_m)| (depth_m - center_m).abs() > limit) || sides == [None, None] {
+        if sides
+            .iter()
+            .flatten()
+            .any(|(_, depth_m)| (depth_m - center_m).abs() > limit)
+            || sides == [None, None]
+        {
             return None;
         }
         let taken = if is_flat { wide_pair } else { sides };
-        let [high, low] =
-            taken.map(|side| side.map_or_else(|| point(pixel, center_m), |(at, depth_m)| point(at, depth_m)));
+        let [high, low] = taken.map(|side| {
+            side.map_or_else(
+                || point(pixel, center_m),
+                |(at, depth_m)| point(at, depth_m),
+            )
+        });
         Some(high - low)
     };
-    let (Some(x), Some(y)) = (tangent_along(0), tangent_along(1)) else { return Reading::default() };
+    let (Some(x), Some(y)) = (tangent_along(0), tangent_along(1)) else {
+        return Reading::default();
+    };
     let ray = ray_of(depth, [pixel[0] as f64 + 0.5, pixel[1] as f64 + 0.5]);
     let normal = x.cross(&y);
     let ray_dot_normal = ray.dot(&normal) / normal.norm().max(1e-30);
-    if ray_dot_normal > 0.0 { Reading { depth_m: center_m, ray_dot_normal } } else { Reading::default() }
+    if ray_dot_normal > 0.0 {
+        Reading {
+            depth_m: center_m,
+            ray_dot_normal,
+        }
+    } else {
+        Reading::default()
+    }
 }

@@ -1,4 +1,5 @@
-//! Until the next picture arrives, the page draws the last one as a surface, which moves like the scene.
+//! Until the next picture arrives, the page draws the last one as a surface, which moves like the
+//! scene.
 
 use super::{BACKGROUND, RenderThread, drag, pixel, pixel_of, reset_view, uncovered};
 use crate::analytic_scene::{draw, ray_in_world};
@@ -26,8 +27,8 @@ impl Drop for Paused<'_> {
     }
 }
 
-/// Checks that a moved view shows everything that the last picture shows, and that little is stretched over depth
-/// discontinuities.
+/// Checks that a moved view shows everything that the last picture shows, and that little is
+/// stretched over depth discontinuities.
 pub(super) fn check(browser: &mut Browser, render_thread: &RenderThread, picture: &RenderRequest) {
     /// Allows for JPEG compression and for shading within a pixel.
     const MAX_COLOR_DIFFERENCE: u8 = 40;
@@ -36,10 +37,14 @@ pub(super) fn check(browser: &mut Browser, render_thread: &RenderThread, picture
     drag(browser);
     std::thread::sleep(Duration::from_millis(800)); // The view no longer moves.
     let shot = canvas_shot(browser);
-    shot.save(PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join("page-moved-picture.png")).expect("written");
+    shot.save(PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join("page-moved-picture.png"))
+        .expect("written");
     drop(paused);
     wait_for(browser, "a full picture", |_| {
-        render_thread.requests().last().is_some_and(|request| request.size_px == picture.size_px)
+        render_thread
+            .requests()
+            .last()
+            .is_some_and(|request| request.size_px == picture.size_px)
     });
     let view = render_thread.requests().last().expect("drawn").clone();
     let expected = moved_picture(picture, &view);
@@ -47,24 +52,39 @@ pub(super) fn check(browser: &mut Browser, render_thread: &RenderThread, picture
     // The expected colors within 2 pixels.
     let near = |x: i64, y: i64| -> Vec<Option<Color>> {
         let row = |y: i64| usize::try_from(y * width + x - 2).expect("inside");
-        (y - 2..=y + 2).flat_map(|y| expected[row(y)..][..5].iter().copied()).collect()
+        (y - 2..=y + 2)
+            .flat_map(|y| expected[row(y)..][..5].iter().copied())
+            .collect()
     };
     let (mut n_seen, mut n_missing, mut n_stretched) = (0, 0, 0);
     let [columns, rows] = uncovered(view.size_px);
     for y in rows {
         for x in columns.clone() {
             let (shown, near) = (pixel(&shot, x, y), near(x, y));
-            let is_like =
-                |expected: Color| shown.iter().zip(expected).all(|(a, b)| a.abs_diff(b) < MAX_COLOR_DIFFERENCE);
+            let is_like = |expected: Color| {
+                shown
+                    .iter()
+                    .zip(expected)
+                    .all(|(a, b)| a.abs_diff(b) < MAX_COLOR_DIFFERENCE)
+            };
             let is_seen = near.iter().all(Option::is_some);
             n_seen += i32::from(is_seen);
             n_missing += i32::from(is_seen && shown == BACKGROUND);
-            n_stretched += i32::from(shown != BACKGROUND && !near.into_iter().flatten().any(is_like));
+            n_stretched +=
+                i32::from(shown != BACKGROUND && !near.into_iter().flatten().any(is_like));
         }
     }
-    eprintln!("moved picture: of {n_seen} pixels, {n_missing} are missing; {n_stretched} are stretched");
-    assert!(n_seen > 10_000 && n_missing * 50 < n_seen, "{n_missing} of {n_seen} pixels are missing");
-    assert!(n_stretched * 5 < n_seen, "{n_stretched} pixels are stretched, {n_seen} are seen");
+    eprintln!(
+        "moved picture: of {n_seen} pixels, {n_missing} are missing; {n_stretched} are stretched"
+    );
+    assert!(
+        n_seen > 10_000 && n_missing * 50 < n_seen,
+        "{n_missing} of {n_seen} pixels are missing"
+    );
+    assert!(
+        n_stretched * 5 < n_seen,
+        "{n_stretched} pixels are stretched, {n_seen} are seen"
+    );
     browser.click("toggle-grid");
     reset_view(browser, render_thread, picture);
 }
@@ -73,16 +93,39 @@ pub(super) fn check(browser: &mut Browser, render_thread: &RenderThread, picture
 fn moved_picture(picture: &RenderRequest, view: &RenderRequest) -> Vec<Option<Color>> {
     /// Samples per pixel and axis, so that a closer view has no gaps.
     const N_SAMPLES: u32 = 3;
-    let Projection::Pinhole { focal_px, principal_px } = picture.projection else { panic!("a pinhole projection") };
+    let Projection::Pinhole {
+        focal_px,
+        principal_px,
+    } = picture.projection
+    else {
+        panic!("a pinhole projection")
+    };
     let fine = |px: [f64; 2]| px.map(|px| px * f64::from(N_SAMPLES));
-    let projection = Projection::Pinhole { focal_px: fine(focal_px), principal_px: fine(principal_px) };
-    let samples = RenderRequest { size_px: picture.size_px.map(|n| n * N_SAMPLES), projection, ..picture.clone() };
+    let projection = Projection::Pinhole {
+        focal_px: fine(focal_px),
+        principal_px: fine(principal_px),
+    };
+    let samples = RenderRequest {
+        size_px: picture.size_px.map(|n| n * N_SAMPLES),
+        projection,
+        ..picture.clone()
+    };
     let drawn = draw(&samples);
     let [width, height] = view.size_px.map(i64::from);
-    let mut nearest = vec![(f64::INFINITY, None); usize::try_from(width * height).expect("positive")];
-    for (ix, depth) in drawn.depth_m.iter().enumerate().filter(|(_, depth)| **depth > 0.0) {
+    let mut nearest =
+        vec![(f64::INFINITY, None); usize::try_from(width * height).expect("positive")];
+    for (ix, depth) in drawn
+        .depth_m
+        .iter()
+        .enumerate()
+        .filter(|(_, depth)| **depth > 0.0)
+    {
         let n_columns = samples.size_px[0] as usize;
-        let (eye, ray) = ray_in_world(&samples, (ix % n_columns) as f64 + 0.5, (ix / n_columns) as f64 + 0.5);
+        let (eye, ray) = ray_in_world(
+            &samples,
+            (ix % n_columns) as f64 + 0.5,
+            (ix / n_columns) as f64 + 0.5,
+        );
         let point = eye + ray * f64::from(*depth);
         let (x, y) = pixel_of(view, point);
         if !(0..width).contains(&x) || !(0..height).contains(&y) {

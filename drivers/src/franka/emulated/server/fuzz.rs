@@ -22,10 +22,12 @@ pub(crate) const FIRST: u64 = 1_000_000;
 /// Maximum number of milliseconds to simulate without a client action; a step takes 0.1 ms.
 const MAX_STEPS: u16 = 500;
 
-/// Executes concatenated client actions. Each starts with one byte kind and two bytes length, little-endian.
+/// Executes concatenated client actions. Each starts with one byte kind and two bytes length,
+/// little-endian.
 ///
-/// Kind 0 sends that many bytes over TCP. Kind 1 sends them as a motion command over UDP. Kind 2 lets `length`
-/// milliseconds pass. Checks that the commanded joint positions never violate the limits.
+/// Kind 0 sends that many bytes over TCP. Kind 1 sends them as a motion command over UDP. Kind 2
+/// lets `length` milliseconds pass. Checks that the commanded joint positions never violate the
+/// limits.
 pub fn client(bytes: &[u8]) {
     for version in [FciVersion::V5, FciVersion::V10] {
         commanded(version, bytes);
@@ -33,11 +35,20 @@ pub fn client(bytes: &[u8]) {
 }
 
 /// Commanded joint states before and after the actions, see [`client`].
-pub(crate) fn commanded(version: FciVersion, mut bytes: &[u8]) -> (CommandedJoints, CommandedJoints) {
-    let limits = if version == FciVersion::V5 { Limits::panda() } else { Limits::fr3() };
+pub(crate) fn commanded(
+    version: FciVersion,
+    mut bytes: &[u8],
+) -> (CommandedJoints, CommandedJoints) {
+    let limits = if version == FciVersion::V5 {
+        Limits::panda()
+    } else {
+        Limits::fr3()
+    };
     let mut server = server(version, limits.clone());
     let first = server.robot.commanded;
-    let Some((mut stream, commands)) = connect(&mut server) else { return (first, first) };
+    let Some((mut stream, commands)) = connect(&mut server) else {
+        return (first, first);
+    };
     let (mut number, mut n_remaining) = (FIRST, MAX_STEPS);
     while !bytes.is_empty() {
         let [kind] = take(&mut bytes);
@@ -49,7 +60,8 @@ pub(crate) fn commanded(version: FciVersion, mut bytes: &[u8]) -> (CommandedJoin
         } else {
             let (sent, rest) = bytes.split_at(bytes.len().min(length.into()));
             bytes = rest;
-            // Writes may fail if the server disconnected or its buffers are full, as for any client.
+            // Writes may fail if the server disconnected or its buffers are full, as for any
+            // client.
             let _ = match kind % 3 {
                 0 => stream.write(sent),
                 _ => commands.send(sent),
@@ -70,16 +82,30 @@ pub(crate) fn commanded(version: FciVersion, mut bytes: &[u8]) -> (CommandedJoin
 fn server(version: FciVersion, limits: Limits) -> Server {
     let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).expect("a free port");
     let states = UdpSocket::bind((Ipv4Addr::LOCALHOST, 0)).expect("a free port");
-    listener.set_nonblocking(true).and_then(|()| states.set_nonblocking(true)).expect("an open socket");
+    listener
+        .set_nonblocking(true)
+        .and_then(|()| states.set_nonblocking(true))
+        .expect("an open socket");
     let address = listener.local_addr().expect("an open socket");
-    let config =
-        RobotConfig { address, version, chain: CHAIN.clone(), flange_from_tool: Transform::identity(), limits };
+    let config = RobotConfig {
+        address,
+        version,
+        chain: CHAIN.clone(),
+        flange_from_tool: Transform::identity(),
+        limits,
+    };
     let joint_simulator: JointSimulator = Box::new(|_, commanded: &CommandedJoints| Joints {
         position_rad: commanded.position_rad,
         velocity_rad_s: commanded.velocity_rad_s,
         ..Joints::default()
     });
-    let robot = Robot::new(config, Joints { position_rad: REST_RAD, ..Joints::default() });
+    let robot = Robot::new(
+        config,
+        Joints {
+            position_rad: REST_RAD,
+            ..Joints::default()
+        },
+    );
     Server {
         listener,
         states,
@@ -120,11 +146,15 @@ fn drain(stream: &mut TcpStream) {
     }
 }
 
-/// Checks that positions are finite and change no more than the velocity limits allow in a millisecond.
+/// Checks that positions are finite and change no more than the velocity limits allow in a
+/// millisecond.
 fn check(limits: &Limits, before: &CommandedJoints, now: &CommandedJoints) {
     for ix in 0..N_JOINTS {
         let moved_rad = (now.position_rad[ix] - before.position_rad[ix]).abs();
-        assert!(moved_rad <= limits.velocity_rad_s[ix] * 1e-3 + 1e-7, "joint {ix}: {before:?}, then {now:?}");
+        assert!(
+            moved_rad <= limits.velocity_rad_s[ix] * 1e-3 + 1e-7,
+            "joint {ix}: {before:?}, then {now:?}"
+        );
     }
 }
 
@@ -140,18 +170,35 @@ mod tests {
         for version in crate::franka::fuzz::VERSIONS {
             let records = example_traffic(version);
             let (first, last) = commanded(version, &records.concat());
-            assert_ne!(first.position_rad, last.position_rad, "the motion that is corrupted below: {version:?}");
+            assert_ne!(
+                first.position_rad, last.position_rad,
+                "the motion that is corrupted below: {version:?}"
+            );
             // Without the record that starts the motion: in any order, truncated or duplicated.
             for round in 0..30 {
-                let mut corrupted: Vec<_> = records.iter().filter(|record| **record != records[2]).cloned().collect();
+                let mut corrupted: Vec<_> = records
+                    .iter()
+                    .filter(|record| **record != records[2])
+                    .cloned()
+                    .collect();
                 random.shuffle(&mut corrupted);
                 match round % 3 {
-                    0 => corrupted = corrupted.iter().flat_map(|record| [record.clone(), record.clone()]).collect(),
-                    1 => corrupted.iter_mut().for_each(|record| record.truncate(record.len() / 2)),
+                    0 => {
+                        corrupted = corrupted
+                            .iter()
+                            .flat_map(|record| [record.clone(), record.clone()])
+                            .collect()
+                    }
+                    1 => corrupted
+                        .iter_mut()
+                        .for_each(|record| record.truncate(record.len() / 2)),
                     _ => {}
                 }
                 let (first, last) = commanded(version, &corrupted.concat());
-                assert_eq!(first.position_rad, last.position_rad, "{version:?}, round {round}");
+                assert_eq!(
+                    first.position_rad, last.position_rad,
+                    "{version:?}, round {round}"
+                );
             }
         }
     }

@@ -10,18 +10,27 @@ use zerocopy::little_endian::{F64, U64};
 
 /// States of a robot whose joints move a little from each state to the next.
 pub(crate) fn state_datagrams(version: FciVersion, n: u32) -> Vec<Vec<u8>> {
-    let limits = if version == FciVersion::V5 { Limits::panda() } else { Limits::fr3() };
+    let limits = if version == FciVersion::V5 {
+        Limits::panda()
+    } else {
+        Limits::fr3()
+    };
     let mut server = server(version, limits);
     let state = |ix: u32| {
         let position_rad = REST_RAD.map(|rest| rest + 0.002 * f64::from(ix));
-        server.robot.observe(Joints { position_rad, ..Joints::default() });
+        server.robot.observe(Joints {
+            position_rad,
+            ..Joints::default()
+        });
         server.robot.state(FIRST + u64::from(ix))
     };
     (0..n).map(state).collect()
 }
 
 fn record(kind: u8, bytes: &[u8]) -> Vec<u8> {
-    let length = u16::try_from(bytes.len()).expect("shorter than 64 kB").to_le_bytes();
+    let length = u16::try_from(bytes.len())
+        .expect("shorter than 64 kB")
+        .to_le_bytes();
     [&[kind], &length[..], bytes].concat()
 }
 
@@ -31,8 +40,8 @@ fn message(command: u32, payload: &[u8]) -> Vec<u8> {
     record(0, &bytes)
 }
 
-/// A client that connects, sets a threshold, moves the joints a little and waits: records in the format of
-/// [`super::client`].
+/// A client that connects, sets a threshold, moves the joints a little and waits: records in the
+/// format of [`super::client`].
 pub(crate) fn example_traffic(version: FciVersion) -> Vec<Vec<u8>> {
     let (number, connect, collision, begin, n_begin) = match version {
         FciVersion::V5 => (
@@ -51,13 +60,19 @@ pub(crate) fn example_traffic(version: FciVersion) -> Vec<Vec<u8>> {
         ),
     };
     let mut records = vec![message(connect, &[number.to_le_bytes(), [1, 2]].concat())];
-    records.push(message(collision, &[0x40; size_of::<v10::SetCollisionBehaviorRequest>()]));
+    records.push(message(
+        collision,
+        &[0x40; size_of::<v10::SetCollisionBehaviorRequest>()],
+    ));
     // Joint impedance and joint positions have number 0 in both versions.
     records.push(message(begin, &vec![0; n_begin]));
     for step in 0..12_u32 {
         // Within the jerk limits of both robots: a third of a microradian per cubic millisecond.
         let offset_rad = 3e-7 * f64::from(step.pow(3)) / 6.0;
-        records.push(record(1, &command(version, FIRST + 2 + u64::from(step), offset_rad)));
+        records.push(record(
+            1,
+            &command(version, FIRST + 2 + u64::from(step), offset_rad),
+        ));
     }
     records.push([&[2_u8][..], &40_u16.to_le_bytes()].concat());
     records
