@@ -65,8 +65,8 @@ pub(crate) enum Command {
 }
 
 impl Command {
-    /// Whether other users of this computer must not read its results, because they show where the
-    /// robot was.
+    /// Whether only the owner may read the results. They show where the robot was, so this is the
+    /// default.
     pub(crate) fn is_private(&self) -> bool {
         let permissions = match self {
             Self::Run(args) => args.permissions,

@@ -40,6 +40,7 @@ impl Console {
     /// A console for a session with these limits. Several sessions at once have no progress bar,
     /// because their bars would overwrite each other.
     pub(crate) fn new(output: OutputMode, limits: Limits, n_sessions: usize) -> Self {
+        // `on_event` sets the position in the same unit: steps if both limits are given.
         let length = limits.steps.or(limits.seconds.map(whole_secs));
         let template = if length.is_some() {
             "{bar:30} {elapsed} {msg}"
@@ -62,6 +63,7 @@ impl Observer for Console {
             (SessionEvent::Progress(session), _) => {
                 let progress = &session.progress;
                 let has_steps = self.limits.steps.is_some();
+                // The unit of the bar's length.
                 self.bar.set_position(if has_steps {
                     progress.step
                 } else {
@@ -76,6 +78,8 @@ impl Observer for Console {
             }
             (SessionEvent::TrainingEnded, _) => self.bar.finish_and_clear(),
             (SessionEvent::Scoring { n_scored, n_all }, _) => {
+                // The first event of the scoring. The bar of the training has ended, so the scoring
+                // gets its own.
                 if self.bar.is_finished() && n_scored < n_all {
                     let template = "{bar:30} {elapsed} scored {pos} of {len} test images";
                     self.bar = print::bar(Some(*n_all as u64), template, self.is_hidden);
@@ -172,11 +176,13 @@ impl ReadBar {
     /// Shows the progress.
     pub(crate) fn show(&self, progress: ReadProgress) {
         let mut current = self.bar.lock();
+        // Another kind of items has begun, for example depth images after the images.
         if current
             .as_ref()
             .is_none_or(|(noun, _)| *noun != progress.noun)
         {
             clear(&mut current);
+            // A recording has no known number of keyframes, so there is no bar to fill.
             let template = match progress.noun {
                 "images" => "{bar:30} {pos} of {len} images",
                 "depth images" => "{bar:30} {pos} of {len} depth images",

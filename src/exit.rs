@@ -52,6 +52,8 @@ pub(crate) struct InsufficientData(pub(crate) String);
 /// The exit code of an error.
 pub(crate) fn of(error: &anyhow::Error) -> Exit {
     let has = |class| error.chain().any(|cause| class_of(cause) == Some(class));
+    // A rejected argument counts more than its consequences, so the whole chain is searched for it
+    // first.
     if has(ErrorClass::BadInput) {
         Exit::BadArguments
     } else if has(ErrorClass::InsufficientData) {
@@ -69,6 +71,7 @@ fn class_of(error: &(dyn std::error::Error + 'static)) -> Option<ErrorClass> {
     if error.is::<InsufficientData>() {
         return Some(ErrorClass::InsufficientData);
     }
+    // The budget is an argument, so another one is a remedy.
     if let Some(trainer::Error::BudgetTooSmall { .. }) = error.downcast_ref() {
         return Some(ErrorClass::BadInput);
     }
@@ -102,6 +105,7 @@ pub(crate) fn from_losses(data_losses: &[String]) -> Exit {
 /// Whether the reader of stdout closed the pipe, as `head` does. This ends a command whose result
 /// is its output.
 pub(crate) fn is_broken_pipe(error: &anyhow::Error) -> bool {
+    // Other pipes, such as those of cameras, do not end a command in order.
     let is_pipe = |io: &std::io::Error| io.kind() == ErrorKind::BrokenPipe;
     error
         .downcast_ref::<crate::print::StdoutError>()

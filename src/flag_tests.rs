@@ -8,8 +8,8 @@ use syn::buffer::{Cursor, TokenBuffer};
 use syn::visit::Visit;
 use syn::{Attribute, Item, LitStr, Macro, Meta};
 
-/// Source files whose messages several commands print, or folders of such files, with these
-/// commands. All of them must accept the flags. Other messages must name a command that does.
+/// Source files or folders, and the commands that print their messages. All these commands must
+/// accept a flag in a message, unless the message names a command that accepts it.
 const PRINTED_BY: [(&str, &[&str]); 24] = [
     ("bench/src", &["bench"]),
     ("calibration/src/hand_eye", &["calibrate hand-eye"]),
@@ -64,7 +64,7 @@ const PRINTED_BY: [(&str, &[&str]); 24] = [
     ("src/commands/bench/run_flags.rs", &["run"]),
 ];
 
-/// Flags that are not printed by a command that lacks them, for another reason.
+/// Exceptions: flags in messages of a command that does not accept them.
 const NOT_PRINTED: [(&str, &str); 2] = [
     // A flag for `eval`, which is printed as a command to run next.
     ("src/commands/run.rs", "rig"),
@@ -99,8 +99,7 @@ fn is_in(file: &str, place: &str) -> bool {
         .is_some_and(|rest| rest.is_empty() || rest.starts_with('/'))
 }
 
-/// The sets of flags of which each must contain the flags in a file: one for each command that
-/// prints its messages.
+/// The flags of each command that prints the messages of a file.
 fn accepted_in(file: &str) -> Vec<BTreeSet<String>> {
     // The longest place is the most specific one.
     let places = PRINTED_BY.iter().filter(|(place, _)| is_in(file, place));

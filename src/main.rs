@@ -21,6 +21,8 @@ use clap::Parser;
 use std::process::ExitCode;
 
 fn main() -> ExitCode {
+    // First, while the program has a single thread: changing the environment is unsafe with
+    // several.
     keep_wayland_quiet();
     let cli = cli::Cli::parse();
     print::start_log(cli.verbose);
@@ -34,6 +36,7 @@ fn main() -> ExitCode {
     {
         print::error(error);
     }
+    // The writer threads would be killed with their queues by the exit.
     print::flush();
     match result {
         Ok(exit) => exit.or_output_loss().into(),

@@ -12,16 +12,12 @@ pub(crate) fn open_gpu() -> session::Result<Arc<Gpu>> {
     let [optional_features, matrices] =
         ["none", "no-matrices"].map(|word| features.as_ref().is_none_or(|value| value != word));
     let adapter = match std::env::var("FIELDRIG_GPU") {
-        Ok(text) => {
-            let invalid = |_| {
-                session::Error::BadInput(format!(
-                    "FIELDRIG_GPU: {text:?} is not the number of a GPU"
-                ))
-            };
-            Some(text.parse().map_err(invalid)?)
-        }
+        Ok(text) => Some(text.parse().map_err(|_| {
+            session::Error::BadInput(format!("FIELDRIG_GPU: {text:?} is not the number of a GPU"))
+        })?),
         Err(_) => None,
     };
+    // Installed before the GPU is used, because a lost device is detected at any time after that.
     hide_caught_panics();
     check_open_for_tests()?;
     // For tests: loses the GPU once, when a model reaches this step.

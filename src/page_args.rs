@@ -49,6 +49,7 @@ impl PageArgs {
     pub(crate) fn check(&self) -> Result<(), BadArgument> {
         match self.listen {
             Some(address) if !address.ip().is_loopback() && !self.share => {
+                // The user can copy the command with the missing flag.
                 let command: Vec<String> = std::env::args().skip(1).map(|word| quoted(&word)).collect();
                 Err(BadArgument(format!(
                     "other machines can reach {address}, so the page must be encrypted and require a token: run \
@@ -71,6 +72,8 @@ impl PageArgs {
 
     /// Serves the page; if the default address is in use, at a free port.
     pub(crate) fn serve_or_free_port(&self, hub: &Hub) -> anyhow::Result<ServedPage> {
+        // A user who gives an address expects the page there. The default address is only a
+        // proposal.
         let served = self.serve(hub);
         match served.as_ref().map_err(|error| error.downcast_ref()) {
             Err(Some(viz::Error::AddressInUse { address })) if self.listen.is_none() => {
@@ -83,6 +86,7 @@ impl PageArgs {
 
     fn default_address(&self) -> SocketAddr {
         let ServerConfig { mut listen } = ServerConfig::default();
+        // The default address can only be reached from this computer.
         if self.share {
             listen.set_ip(Ipv4Addr::UNSPECIFIED.into());
         }
@@ -111,10 +115,13 @@ impl PageArgs {
     fn share_at(&self, config: ServerConfig, hub: &Hub) -> anyhow::Result<(Server, Shared)> {
         let certificate = match &self.certificate {
             Some(file) => Certificate::read(file, self.certificate_key.as_ref().unwrap_or(file))?,
+            // The certificate is kept, so that browsers which have accepted it do not warn at the
+            // next run.
             None => Certificate::kept_in(&data_folder()?)?,
         };
         let tokens = Tokens::random().context("cannot create a token")?;
-        let (fingerprint, is_self_signed) = (certificate.fingerprint(), self.certificate.is_none());
+        let fingerprint = certificate.fingerprint();
+        let is_self_signed = self.certificate.is_none();
         let server = Server::start_shared(
             config,
             Sharing {
@@ -132,6 +139,7 @@ impl PageArgs {
 fn data_folder() -> Result<PathBuf, BadArgument> {
     let given = std::env::var_os("XDG_DATA_HOME")
         .map(PathBuf::from)
+        // The XDG specification says to ignore relative paths.
         .filter(|folder| folder.is_absolute());
     let in_home = || Some(std::env::home_dir()?.join(".local/share"));
     given

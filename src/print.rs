@@ -20,7 +20,7 @@ use std::fmt::Display;
 use std::io::Write;
 use std::sync::LazyLock;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::mpsc::{SyncSender, sync_channel};
+use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::time::{Duration, Instant};
 
 /// Writing to stdout failed.
@@ -36,10 +36,12 @@ static LOST_OUTPUT: AtomicBool = AtomicBool::new(false);
 /// Maximum number of output chunks that wait to be written. With a queue, a terminal that accepts
 /// no output, for example after a broken connection, does not block the program.
 const MAX_WAITING: usize = 4096;
-/// At exit, the program waits at most this long for its output to be written.
+/// At exit, the program waits at most this long for its output to be written. A slow connection needs
+/// seconds for a full queue; one that is broken never accepts it.
 const MAX_FLUSH: Duration = Duration::from_secs(5);
 
-/// A command waits at most this long for the log before it prints a line of its result.
+/// A command waits at most this long for the log before it prints a line of its result. Lines of both
+/// streams then appear in the order in which they were written, unless stderr is blocked.
 const MAX_ORDERING: Duration = Duration::from_millis(200);
 
 /// A part of the output of one stream.
@@ -68,22 +70,24 @@ static STDERR: LazyLock<SyncSender<OutputChunk>> = LazyLock::new(|| {
 /// lost.
 fn writer(write: fn(&[u8])) -> SyncSender<OutputChunk> {
     let (sender, chunks) = sync_channel(MAX_WAITING);
-    let write_all = move || {
-        for chunk in chunks {
-            match chunk {
-                OutputChunk::Bytes(bytes) => write(&bytes),
-                OutputChunk::Flush(done) => drop(done.send(())),
-            }
-        }
-    };
     if std::thread::Builder::new()
         .name("output".to_owned())
-        .spawn(write_all)
+        .spawn(move || write_chunks(chunks, write))
         .is_err()
     {
         LOST_OUTPUT.store(true, Ordering::Relaxed);
     }
     sender
+}
+
+fn write_chunks(chunks: Receiver<OutputChunk>, write: fn(&[u8])) {
+    for chunk in chunks {
+        match chunk {
+            OutputChunk::Bytes(bytes) => write(&bytes),
+            // The program may have stopped waiting.
+            OutputChunk::Flush(done) => drop(done.send(())),
+        }
+    }
 }
 
 /// Queues text for a stream; returns false if the queue is full. The progress bars are hidden
@@ -103,14 +107,16 @@ fn printable(text: &str) -> Cow<'_, str> {
         (c.is_control() && !matches!(c, '\n' | '\t'))
             || matches!(c, '\u{202A}'..='\u{202E}' | '\u{2066}'..='\u{2069}')
     };
+    // Almost all texts need no escapes, and are not copied.
     if !text.contains(is_hidden) {
         return text.into();
     }
     let mut escaped = String::with_capacity(text.len() + 16);
     for c in text.chars() {
-        match is_hidden(c) {
-            true => escaped.extend(c.escape_unicode()),
-            false => escaped.push(c),
+        if is_hidden(c) {
+            escaped.extend(c.escape_unicode())
+        } else {
+            escaped.push(c)
         }
     }
     escaped.into()
@@ -131,6 +137,8 @@ pub(crate) fn flush() {
 /// `max_stderr` from the call.
 fn flush_for(max_stderr: Duration) {
     let began = Instant::now();
+    // Both streams get the request before either is waited for, so that they are written in
+    // parallel.
     let [out, err] = [&STDOUT, &STDERR].map(|stream| {
         let (done, is_done) = sync_channel(1);
         stream
@@ -234,6 +242,7 @@ impl TermLike for BarTerm {
 
 /// Prints one line of the result.
 pub(crate) fn line(text: impl Display) -> Result<(), StdoutError> {
+    // The line is written here and not by the thread, because its errors must be returned.
     flush_for(MAX_ORDERING);
     let text = text.to_string();
     BARS.suspend(|| {
@@ -325,13 +334,16 @@ const WORKSPACE_CRATES: [&str; 9] = [
     "viz",
 ];
 
+/// Filter rules that set the level of the crates of this workspace.
+fn of_workspace(level: &str) -> String {
+    WORKSPACE_CRATES
+        .map(|name| format!(",{name}={level}"))
+        .concat()
+}
+
 /// Sends log records to stderr. `RUST_LOG` takes precedence; `verbose` counts the `-v` flags.
 pub(crate) fn start_log(verbose: u8) {
-    let of_workspace = |level| {
-        WORKSPACE_CRATES
-            .map(|name| format!(",{name}={level}"))
-            .concat()
-    };
+    // Other crates log much that concerns only their developers, so they start one level later.
     let filter = match verbose {
         0 => format!("warn{}", of_workspace("info")),
         1 => format!("info{}", of_workspace("debug")),

@@ -97,6 +97,7 @@ impl ServedPage {
 
     fn print_lines(&self) -> anyhow::Result<()> {
         self.lines().iter().for_each(print::report);
+        // A code is for phones, which cannot reach a page that only this computer can open.
         if self.shared.is_some() && std::io::stdout().is_terminal() {
             print::report_styled(qr_code(&self.url())?);
         }
@@ -144,6 +145,7 @@ fn reachable_addresses(listen: IpAddr) -> Vec<IpAddr> {
     if !listen.is_unspecified() {
         return vec![listen];
     }
+    // Without the list, the page still works on this computer, so an error is only a warning.
     let interfaces = if_addrs::get_if_addrs().unwrap_or_else(|error| {
         log::warn!("cannot list the network addresses of this computer: {error}");
         Vec::new()
@@ -154,8 +156,10 @@ fn reachable_addresses(listen: IpAddr) -> Vec<IpAddr> {
         .map(|interface| interface.ip())
         .filter(|address| address.is_ipv4() || listen.is_ipv6())
         .collect();
+    // The network with the default route is likely the one on which viewers are.
     let default = default_route_address();
     addresses.sort_by_key(|address| (Some(*address) != default, address.is_ipv6()));
+    // Without a network, only this computer can open the page.
     if addresses.is_empty() {
         addresses.push(if listen.is_ipv4() {
             Ipv4Addr::LOCALHOST.into()
@@ -168,8 +172,9 @@ fn reachable_addresses(listen: IpAddr) -> Vec<IpAddr> {
 
 /// This computer's address on the network with the default route, if there is one. No data is sent.
 fn default_route_address() -> Option<IpAddr> {
-    // An address for documentation (RFC 5737), which no network uses.
+    // Connecting a UDP socket sends nothing, but lets the kernel choose the address of the route.
     let socket = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, 0)).ok()?;
+    // An address for documentation (RFC 5737), which no network uses.
     socket.connect((Ipv4Addr::new(192, 0, 2, 1), 9)).ok()?;
     socket.local_addr().ok().map(|address| address.ip())
 }

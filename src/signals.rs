@@ -15,7 +15,7 @@ use signal_hook::consts::{SIGHUP, SIGINT, SIGQUIT, SIGTERM};
 use signal_hook::iterator::Signals;
 use signal_hook::low_level;
 use std::os::fd::AsFd;
-use std::sync::atomic::Ordering;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 /// Shells report this plus the signal number as the exit code of a process that a signal ended.
@@ -33,31 +33,35 @@ pub(crate) fn stop_on_signals() -> anyhow::Result<Stop> {
 /// As [`stop_on_signals`], for a command that saves nothing.
 pub(crate) fn stop_on_signals_logging(message: &'static str) -> anyhow::Result<Stop> {
     let (stop, [signaled, interrupted]) = Stop::with_signal_flags(message);
-    let mut signals = Signals::new(termination_signals().chain([SIGQUIT]))
+    let signals = Signals::new(termination_signals().chain([SIGQUIT]))
         .context("cannot install signal handlers")?;
-    let mut interrupted_at = Instant::now();
-    let take_signals = move || {
-        for signal in signals.forever() {
-            if signal == SIGQUIT {
-                drivers::motion::apply_fail_safe();
-                let _ = low_level::emulate_default_handler(SIGQUIT); // It does not return.
-            }
-            if signal == SIGINT {
-                if !interrupted.swap(true, Ordering::Relaxed) {
-                    interrupted_at = Instant::now();
-                } else if interrupted_at.elapsed() >= MIN_BETWEEN {
-                    drivers::motion::apply_fail_safe();
-                    low_level::exit(SIGNAL_EXIT_BASE + SIGINT);
-                }
-            }
-            signaled.store(true, Ordering::Relaxed);
-        }
-    };
     std::thread::Builder::new()
         .name("signals".into())
-        .spawn(take_signals)
+        .spawn(move || handle_signals(signals, &signaled, &interrupted))
         .context("cannot start a thread")?;
     Ok(stop)
+}
+
+/// Handles signals until the process ends. They arrive on this thread, where the fail-safe command
+/// of arms may block; a signal handler may not.
+fn handle_signals(mut signals: Signals, signaled: &AtomicBool, interrupted: &AtomicBool) {
+    let mut interrupted_at = Instant::now();
+    for signal in signals.forever() {
+        if signal == SIGQUIT {
+            drivers::motion::apply_fail_safe();
+            let _ = low_level::emulate_default_handler(SIGQUIT); // It does not return.
+        }
+        if signal == SIGINT {
+            if !interrupted.swap(true, Ordering::Relaxed) {
+                interrupted_at = Instant::now();
+            } else if interrupted_at.elapsed() >= MIN_BETWEEN {
+                drivers::motion::apply_fail_safe();
+                low_level::exit(SIGNAL_EXIT_BASE + SIGINT);
+            }
+        }
+        // Last, because `Stop::rearm` relies on this order.
+        signaled.store(true, Ordering::Relaxed);
+    }
 }
 
 /// Requests a stop when stdout or stderr is closed, for example because a terminal closed without
@@ -65,20 +69,24 @@ pub(crate) fn stop_on_signals_logging(message: &'static str) -> anyhow::Result<S
 /// per process.
 pub(crate) fn stop_when_output_closes(stop: &Stop) -> anyhow::Result<()> {
     let stop = stop.clone();
-    let watch = move || {
-        let (stdout, stderr) = (std::io::stdout(), std::io::stderr());
-        // Errors and hang-ups are reported without being requested.
-        let mut outputs = [stdout.as_fd(), stderr.as_fd()]
-            .map(|output| PollFd::from_borrowed_fd(output, PollFlags::empty()));
-        while poll(&mut outputs, None) == Err(Errno::INTR) {}
-        log::warn!("the output was closed: stopping");
-        stop.request();
-    };
     std::thread::Builder::new()
         .name("output".into())
-        .spawn(watch)
+        .spawn(move || {
+            wait_until_output_closes();
+            log::warn!("the output was closed: stopping");
+            stop.request();
+        })
         .context("cannot start a thread")?;
     Ok(())
+}
+
+fn wait_until_output_closes() {
+    let stdout = std::io::stdout();
+    let stderr = std::io::stderr();
+    // Errors and hang-ups are reported without being requested.
+    let mut outputs = [stdout.as_fd(), stderr.as_fd()]
+        .map(|output| PollFd::from_borrowed_fd(output, PollFlags::empty()));
+    while poll(&mut outputs, None) == Err(Errno::INTR) {}
 }
 
 /// Removes partial files before a signal ends the process.
@@ -87,15 +95,15 @@ pub(crate) fn stop_when_output_closes(stop: &Stop) -> anyhow::Result<()> {
 pub(crate) fn remove_partial_files_on_signals() -> anyhow::Result<()> {
     let mut signals =
         Signals::new(termination_signals()).context("cannot install signal handlers")?;
-    let remove_all = move || {
-        if let Some(signal) = signals.forever().next() {
-            let _no_new_files = partial::remove_all();
-            std::process::exit(SIGNAL_EXIT_BASE + signal);
-        }
-    };
     std::thread::Builder::new()
         .name("signals".into())
-        .spawn(remove_all)
+        .spawn(move || {
+            if let Some(signal) = signals.forever().next() {
+                // The guard keeps other threads from creating files until the process has ended.
+                let _no_new_files = partial::remove_all();
+                std::process::exit(SIGNAL_EXIT_BASE + signal);
+            }
+        })
         .context("cannot start a thread")?;
     Ok(())
 }

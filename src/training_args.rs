@@ -66,6 +66,7 @@ fn methods(text: &str) -> Result<Methods, String> {
             let known: Vec<&str> = ModelKind::ALL.iter().map(|kind| kind.name()).collect();
             format!("unknown method {name:?}, expected {}", listed(&known, "or"))
         })?;
+        // Two models of one method would share a folder.
         if kinds.contains(&kind) {
             return Err(format!("{name} is listed twice"));
         }
@@ -90,14 +91,15 @@ fn max_bytes(text: &str) -> Result<u64, String> {
 
 /// Parses a value of `--refine`.
 fn refine() -> impl TypedValueParser<Value = Refine> {
-    let find = |name: String| {
-        Refine::ALL
-            .into_iter()
-            .find(|(known, _)| *known == name)
-            .map(|(_, refine)| refine)
-    };
     PossibleValuesParser::new(Refine::ALL.map(|(name, _)| name))
-        .try_map(move |name| find(name).ok_or("unknown parameter"))
+        .try_map(|name| refine_named(&name).ok_or("unknown parameter"))
+}
+
+fn refine_named(name: &str) -> Option<Refine> {
+    Refine::ALL
+        .into_iter()
+        .find(|(known, _)| *known == name)
+        .map(|(_, refine)| refine)
 }
 
 /// Values of `--count`.

@@ -29,8 +29,10 @@ impl<T: Send + 'static> Task<T> {
     }
 
     fn start_on(builder: Builder, work: impl FnOnce() -> T + Send + 'static) -> Self {
-        // A failed start drops its closure, so the work is kept here.
+        // A failed start drops its closure, so the work is kept here. The mutex is never contended:
+        // either the thread or, after a failure, the caller takes the work.
         let kept = Arc::new(Mutex::new(Some(work)));
+        // A panic cannot happen while the lock is held, so a poisoned lock holds valid work.
         let take =
             |kept: &Mutex<Option<_>>| kept.lock().unwrap_or_else(PoisonError::into_inner).take();
         let for_thread = Arc::clone(&kept);
@@ -39,6 +41,8 @@ impl<T: Send + 'static> Task<T> {
             Ok(thread) => State::Running(thread),
             Err(error) => {
                 warn_once(&error);
+                // The caller does the work here: a slow run that saves its results is better than
+                // one that ends because a limit was reached in its last minutes.
                 State::Done(take(&kept).expect("the work was not started")())
             }
         })
@@ -74,6 +78,8 @@ pub fn start_threads() -> Result<(), Box<dyn std::error::Error + Send + Sync>> {
 /// Runs `work` in a separate thread pool, on three quarters of the processors. In the global pool,
 /// training, which downscales images on all processors, would wait for it.
 pub fn run_in_background_pool<T: Send>(work: impl FnOnce() -> T + Send) -> T {
+    // One thread in four stays free for training and for the drivers, whose queues drop samples if
+    // they wait for a processor.
     let n_processors = std::thread::available_parallelism().map_or(1, usize::from);
     match rayon::ThreadPoolBuilder::new()
         .num_threads((3 * n_processors).div_ceil(4))
@@ -89,6 +95,7 @@ pub fn run_in_background_pool<T: Send>(work: impl FnOnce() -> T + Send) -> T {
 
 fn warn_once(error: &dyn std::error::Error) {
     static HAS_WARNED: AtomicBool = AtomicBool::new(false);
+    // A limit affects every later task, too, and repeated warnings would hide other messages.
     if !HAS_WARNED.swap(true, Ordering::Relaxed) {
         log::warn!(
             "cannot start a thread: {error}; the calling thread does the work, which slows the run down; raise the limits on \

@@ -13,9 +13,11 @@ use std::path::PathBuf;
 use trainer::splat::{CountPolicy, SplatOptions};
 use trainer::{MethodOptions, ModelOptions, ModelSpec};
 
-/// Training time of a run if no flag limits it.
+/// Training time of a run if no flag limits it. The twelve variants with several seeds then take
+/// minutes. Longer runs are closer to the final quality of a model.
 const DEFAULT_SECONDS: f64 = 16.0;
-/// Times at which the table lists the PSNR, seconds.
+/// Times at which the table lists the PSNR, seconds. Some parts only speed up the beginning, and
+/// gain nothing at the end.
 const TABLE_SECS: [f64; 2] = [1.0, 4.0];
 
 /// The unchanged method, to which all variants are compared.
@@ -115,6 +117,8 @@ pub fn run(options: &AblationOptions, host: &Host<'_>) -> Result<BenchResult> {
     let is_selected = |change: &&Variant<SplatOptions>| {
         options.only.is_empty() || options.only.iter().any(|word| change.name.contains(word))
     };
+    // A variant may equal the baseline, because the part is already disabled by flags or by the
+    // data.
     let changes: Vec<&Variant<SplatOptions>> = VARIANTS
         .iter()
         .filter(|change| is_change(change, &base_options))
@@ -152,10 +156,12 @@ pub fn run(options: &AblationOptions, host: &Host<'_>) -> Result<BenchResult> {
                 is_thorough: false,
             })?);
         }
+        // The baseline comes first, because every gain is a difference from it.
         if baseline.is_empty() {
             baseline = finished.clone();
         }
         rows.extend(VariantResult::of(change.name, &baseline, finished));
+        // Written after every variant, so that an interrupted bench leaves results.
         page = Some(findings(options, &runs, &data, &rows)?);
     }
     BenchResult::of(page, data.data.data_losses)
@@ -171,6 +177,8 @@ impl VariantResult {
         let median_of = |of: &dyn Fn(&Run) -> Option<f64>| {
             median(&runs.iter().filter_map(of).collect::<Vec<_>>())
         };
+        // Runs with the same seed are compared. The seed affects both in a similar way, so their
+        // difference varies less than the difference of the medians.
         let gain: Vec<f64> = baseline
             .iter()
             .zip(&runs)
@@ -193,18 +201,6 @@ impl VariantResult {
         let number = |value: Option<f64>, places: usize| {
             value.map_or_else(|| "-".to_owned(), |value| format!("{value:.places$}"))
         };
-        let at = |secs: f64| {
-            let of_run = |run: &Run| {
-                run.curve()
-                    .into_iter()
-                    .find(|(time, _)| (time / secs - 1.0).abs() < 0.1)
-                    .map(|(_, psnr)| psnr)
-            };
-            number(
-                median(&self.runs.iter().filter_map(of_run).collect::<Vec<_>>()),
-                2,
-            )
-        };
         let gain = if self.name == BASELINE.name {
             "-".to_owned()
         } else {
@@ -214,7 +210,7 @@ impl VariantResult {
             format!("{:+.2}{spread}", self.gain_db)
         };
         let mut row = vec![self.name.to_owned()];
-        row.extend(TABLE_SECS.map(at));
+        row.extend(TABLE_SECS.map(|secs| number(self.psnr_at(secs), 2)));
         row.extend([
             format!("{:.2}", self.psnr),
             gain,
@@ -225,6 +221,26 @@ impl VariantResult {
         ]);
         row
     }
+
+    /// Median PSNR of the runs at a time of the evaluation schedule, dB.
+    fn psnr_at(&self, secs: f64) -> Option<f64> {
+        let values: Vec<f64> = self
+            .runs
+            .iter()
+            .filter_map(|run| psnr_near(run, secs))
+            .collect();
+        median(&values)
+    }
+}
+
+/// PSNR of a run at a time of the evaluation schedule, dB.
+fn psnr_near(run: &Run, secs: f64) -> Option<f64> {
+    // An evaluation begins after the step during which it became due, so it is somewhat late. The
+    // next one is twice as late.
+    run.curve()
+        .into_iter()
+        .find(|(time, _)| (time / secs - 1.0).abs() < 0.1)
+        .map(|(_, psnr)| psnr)
 }
 
 /// Writes the findings so far.

@@ -15,7 +15,9 @@ use trainer::{MethodOptions, ModelSpec};
 
 /// Training time of a run if no flag limits it.
 const DEFAULT_SECONDS: f64 = 60.0;
-/// Gain below which doubling the splats is not worthwhile, dB.
+/// Gain below which doubling the splats is not worthwhile, dB: the same value with which the trainer
+/// chooses their number, see the text of the page. Doubling the splats doubles the memory of the
+/// model.
 const MIN_GAIN_DB: f64 = 0.1;
 
 /// Options of [`run`].
@@ -87,6 +89,7 @@ pub fn run(options: &BudgetOptions, host: &Host<'_>) -> Result<BenchResult> {
         for seed in first_seed..first_seed.saturating_add(options.seeds) {
             let capped_options = base_options.clone().with(|model| {
                 model.common.seed = seed;
+                // With a cap, the number of splats is the size to measure. Tests would reduce it.
                 model.specific.count = if cap.is_some() {
                     CountPolicy::ToCap
                 } else {
@@ -143,18 +146,122 @@ impl Capped {
 /// Gains per doubling between neighboring limits, if the number of splats grew from one to the
 /// next.
 fn gains(by_cap: &[&Capped]) -> Vec<Gain> {
-    let pairs = by_cap.windows(2);
-    let gain = |pair: &[&Capped]| {
-        let [fewer, more] = [pair[0], pair[1]].map(|capped| (capped.primitives, capped.psnr));
-        let db_per_doubling = db_per_doubling(fewer, more)?;
-        Some(Gain {
-            to_cap: pair[1].cap,
-            from_primitives: fewer.0,
-            to_primitives: more.0,
-            db_per_doubling,
-        })
-    };
-    pairs.filter_map(gain).collect()
+    by_cap
+        .windows(2)
+        .filter_map(|pair| gain_between(pair[0], pair[1]))
+        .collect()
+}
+
+/// Gain from more splats; `None` if their number hardly grew, because the cap was not reached.
+fn gain_between(fewer: &Capped, more: &Capped) -> Option<Gain> {
+    let db_per_doubling =
+        db_per_doubling((fewer.primitives, fewer.psnr), (more.primitives, more.psnr))?;
+    Some(Gain {
+        to_cap: more.cap,
+        from_primitives: fewer.primitives,
+        to_primitives: more.primitives,
+        db_per_doubling,
+    })
+}
+
+/// An axis of a number of splats.
+fn size_axis(label: &str) -> Axis {
+    Axis {
+        label: label.to_owned(),
+        scale: Scale::Log,
+        ticks: Vec::new(),
+    }
+}
+
+fn line(label: &str, points: Vec<Point>) -> Line {
+    Line {
+        label: label.to_owned(),
+        points,
+        is_peer: false,
+    }
+}
+
+/// PSNR over the number of splats, and the number that the trainer has chosen.
+fn accuracy_chart(subtitle: &str, by_cap: &[&Capped], chosen: Option<&Capped>) -> Chart {
+    let own_curve_point = chosen.map(Capped::point);
+    let own_marker = chosen.map(|chosen| Marker {
+        x: chosen.primitives.max(1.0),
+        label: format!(
+            "chosen by the trainer: {} splats, {:.2} dB",
+            chosen.primitives, chosen.psnr
+        ),
+        line_ix: 1,
+    });
+    // A larger cap may give fewer splats, if neither is reached.
+    let mut points: Vec<Point> = by_cap.iter().map(|capped| capped.point()).collect();
+    points.sort_by(|a, b| a.x.total_cmp(&b.x));
+    Chart {
+        title: "PSNR of test images over the number of splats".into(),
+        subtitle: subtitle.to_owned(),
+        x: size_axis("splats at the end (log)"),
+        y: Axis {
+            label: "test PSNR, dB".into(),
+            scale: Scale::Linear,
+            ticks: Vec::new(),
+        },
+        lines: vec![
+            line("with a cap", points),
+            line("no cap", own_curve_point.into_iter().collect()),
+        ],
+        thresholds: Vec::new(),
+        markers: own_marker.into_iter().collect(),
+    }
+}
+
+/// The gain per doubling over the number of splats.
+fn gain_chart(subtitle: &str, gains: &[Gain]) -> Chart {
+    Chart {
+        title: "Gain from doubling the splats".into(),
+        subtitle: format!("{subtitle}; each point is between two neighboring caps"),
+        x: size_axis("splats (log)"),
+        y: Axis {
+            label: "gain, dB per doubling".into(),
+            scale: Scale::Linear,
+            ticks: Vec::new(),
+        },
+        lines: vec![line(
+            "gain per doubling",
+            gains.iter().map(Gain::point).collect(),
+        )],
+        thresholds: vec![(
+            MIN_GAIN_DB,
+            format!("{MIN_GAIN_DB} dB: minimum worthwhile gain"),
+        )],
+        markers: Vec::new(),
+    }
+}
+
+impl Gain {
+    fn point(&self) -> Point {
+        Point {
+            // The geometric mean is the middle on a logarithmic axis.
+            x: (self.from_primitives * self.to_primitives).sqrt(),
+            y: self.db_per_doubling,
+            low: self.db_per_doubling,
+            high: self.db_per_doubling,
+        }
+    }
+}
+
+/// The row of a cap, with the gain from the next smaller cap.
+fn table_row(capped: &Capped, gains: &[Gain]) -> Vec<String> {
+    let gain = gains
+        .iter()
+        .find(|gain| capped.cap.is_some() && gain.to_cap == capped.cap);
+    vec![
+        capped.cap_label(),
+        format!("{:.0}", capped.primitives),
+        format!("{:.2}", capped.psnr),
+        gain.map_or_else(
+            || "-".to_owned(),
+            |gain| format!("{:+.2}", gain.db_per_doubling),
+        ),
+    ]
 }
 
 /// Writes the findings so far.
@@ -180,85 +287,8 @@ fn findings(
         "one run per cap".to_owned()
     };
     let subtitle = format!("{}, splat, {length}; {spread}", data.name);
-    let x = |label: &str| Axis {
-        label: label.to_owned(),
-        scale: Scale::Log,
-        ticks: Vec::new(),
-    };
-    let line = |label: &str, points: Vec<Point>| Line {
-        label: label.to_owned(),
-        points,
-        is_peer: false,
-    };
-    let own_curve_point = chosen.map(Capped::point);
-    let own_marker = chosen.map(|chosen| Marker {
-        x: chosen.primitives.max(1.0),
-        label: format!(
-            "chosen by the trainer: {} splats, {:.2} dB",
-            chosen.primitives, chosen.psnr
-        ),
-        line_ix: 1,
-    });
-    let mut points: Vec<Point> = by_cap.iter().map(|capped| capped.point()).collect();
-    points.sort_by(|a, b| a.x.total_cmp(&b.x));
-    let accuracy = Chart {
-        title: "PSNR of test images over the number of splats".into(),
-        subtitle: subtitle.clone(),
-        x: x("splats at the end (log)"),
-        y: Axis {
-            label: "test PSNR, dB".into(),
-            scale: Scale::Linear,
-            ticks: Vec::new(),
-        },
-        lines: vec![
-            line("with a cap", points),
-            line("no cap", own_curve_point.into_iter().collect()),
-        ],
-        thresholds: Vec::new(),
-        markers: own_marker.into_iter().collect(),
-    };
-    let gain_point = |gain: &Gain| {
-        let x = (gain.from_primitives * gain.to_primitives).sqrt();
-        Point {
-            x,
-            y: gain.db_per_doubling,
-            low: gain.db_per_doubling,
-            high: gain.db_per_doubling,
-        }
-    };
-    let gain_chart = Chart {
-        title: "Gain from doubling the splats".into(),
-        subtitle: format!("{subtitle}; each point is between two neighboring caps"),
-        x: x("splats (log)"),
-        y: Axis {
-            label: "gain, dB per doubling".into(),
-            scale: Scale::Linear,
-            ticks: Vec::new(),
-        },
-        lines: vec![line(
-            "gain per doubling",
-            gains.iter().map(gain_point).collect(),
-        )],
-        thresholds: vec![(
-            MIN_GAIN_DB,
-            format!("{MIN_GAIN_DB} dB: minimum worthwhile gain"),
-        )],
-        markers: Vec::new(),
-    };
-    let row = |capped: &Capped| {
-        let gain = gains
-            .iter()
-            .find(|gain| capped.cap.is_some() && gain.to_cap == capped.cap);
-        vec![
-            capped.cap_label(),
-            format!("{:.0}", capped.primitives),
-            format!("{:.2}", capped.psnr),
-            gain.map_or_else(
-                || "-".to_owned(),
-                |gain| format!("{:+.2}", gain.db_per_doubling),
-            ),
-        ]
-    };
+    let accuracy = accuracy_chart(&subtitle, &by_cap, chosen);
+    let gain_chart = gain_chart(&subtitle, &gains);
     let head = ["cap", "splats", "PSNR, dB", "gain per doubling, dB"]
         .map(str::to_owned)
         .to_vec();
@@ -285,7 +315,10 @@ fn findings(
         tables: vec![Table {
             title: format!("After {length}"),
             head,
-            rows: capped.iter().map(row).collect(),
+            rows: capped
+                .iter()
+                .map(|capped| table_row(capped, &gains))
+                .collect(),
         }],
         numbers: serde_json::json!({
             "bench": "budget",

@@ -116,15 +116,19 @@ pub fn run(options: &CurveOptions, host: &Host<'_>) -> Result<BenchResult> {
         results: Vec::new(),
         notes: Vec::new(),
     };
-    let (mut data_losses, mut names) = (Vec::new(), HashSet::new());
+    let mut data_losses = Vec::new();
+    let mut names = HashSet::new();
     let mut page = None;
     for (path, n_left) in options.data.iter().zip((1..=options.data.len()).rev()) {
         let data = runs.load(path, &mut names)?;
         data_losses.extend(data.data.data_losses.iter().cloned());
+        // The methods of later data sets are not known yet. The estimate assumes the same number,
+        // and is corrected with each data set.
         let model_specs = bench.applicable(&data);
         runs.expect((n_left * model_specs.len()) as u64 * options.seeds);
         for model_spec in model_specs {
             let mut finished = Vec::new();
+            // An empty result, which the first run replaces.
             bench
                 .results
                 .push(CurveResult::of_runs(&data, model_spec.kind, Vec::new()));
@@ -283,17 +287,6 @@ fn median_curve(curves: &[Vec<(f64, f64)>]) -> Vec<CurvePoint> {
 
 impl Summary {
     fn of(curves: &[Vec<(f64, f64)>], ends: &FinalValues) -> Self {
-        let reached = |target_db: f64| {
-            let seconds: Vec<f64> = curves
-                .iter()
-                .filter_map(|curve| secs_to(curve, target_db))
-                .collect();
-            TimeToQuality {
-                psnr: target_db,
-                seconds: median(&seconds),
-                n_runs: seconds.len(),
-            }
-        };
         let mean_size = ends.primitives.iter().sum::<f64>() / ends.primitives.len().max(1) as f64;
         Self {
             n_runs: curves.len(),
@@ -304,7 +297,9 @@ impl Summary {
             primitives_extent: extent(&ends.primitives),
             primitives_spread: sample_std(&ends.primitives).map(|std| std / mean_size),
             bytes: median(&ends.bytes),
-            seconds_to: TARGET_DB.map(reached).into(),
+            seconds_to: TARGET_DB
+                .map(|target_db| TimeToQuality::of(curves, target_db))
+                .into(),
         }
     }
 
@@ -332,6 +327,75 @@ impl Summary {
             Some(seconds) => format!("{seconds:.2} s ({} of {})", reached.n_runs, self.n_runs),
         }));
         row
+    }
+}
+
+impl TimeToQuality {
+    fn of(curves: &[Vec<(f64, f64)>], target_db: f64) -> Self {
+        // Runs that have not reached the level have no time, and are only counted.
+        let seconds: Vec<f64> = curves
+            .iter()
+            .filter_map(|curve| secs_to(curve, target_db))
+            .collect();
+        Self {
+            psnr: target_db,
+            seconds: median(&seconds),
+            n_runs: seconds.len(),
+        }
+    }
+}
+
+/// The axis of the PSNR.
+fn psnr_axis() -> Axis {
+    Axis {
+        label: "test PSNR, dB".into(),
+        scale: Scale::Linear,
+        ticks: Vec::new(),
+    }
+}
+
+/// PSNR over time.
+fn time_chart(n_seeds: u64, all: &[&CurveResult]) -> Chart {
+    let last_secs = all
+        .iter()
+        .flat_map(|results| &results.points)
+        .map(|point| point.seconds)
+        .fold(1.0, f64::max);
+    let subtitle = if n_seeds > 1 {
+        format!("median of {n_seeds} seeds; band: minimum to maximum; dashed: peers")
+    } else {
+        "one run per line; dashed: peers".to_owned()
+    };
+    Chart {
+        title: "PSNR of test images over time".into(),
+        subtitle,
+        x: Axis {
+            label: "seconds of training (log)".into(),
+            scale: Scale::Log,
+            // The last evaluation begins slightly late. The margin includes the tick of its time.
+            ticks: evaluation_schedule::up_to(1.1 * last_secs).collect(),
+        },
+        y: psnr_axis(),
+        lines: all.iter().map(|results| results.line()).collect(),
+        thresholds: Vec::new(),
+        markers: Vec::new(),
+    }
+}
+
+/// PSNR at the end over the size of the model.
+fn size_chart(seconds: &str, all: &[&CurveResult]) -> Chart {
+    Chart {
+        title: "PSNR of test images over the size of the model".into(),
+        subtitle: format!("after {seconds} s; median of the runs"),
+        x: Axis {
+            label: "GPU memory of the model, MB (log)".into(),
+            scale: Scale::Log,
+            ticks: Vec::new(),
+        },
+        y: psnr_axis(),
+        lines: all.iter().map(|results| results.size_line()).collect(),
+        thresholds: Vec::new(),
+        markers: Vec::new(),
     }
 }
 
@@ -370,48 +434,11 @@ impl Bench<'_> {
     /// Writes the findings so far.
     fn findings(&self, runs: &Runs<'_>) -> Result<(Findings, PathBuf)> {
         let peers: Vec<CurveResult> = self.peers.iter().map(CurveResult::of_peer).collect();
-        let all = || self.results.iter().chain(&peers);
-        let last_secs = all()
-            .flat_map(|results| &results.points)
-            .map(|point| point.seconds)
-            .fold(1.0, f64::max);
-        let (n_seeds, seconds) = (self.options.seeds, compact_number(self.options.seconds));
-        let subtitle = if n_seeds > 1 {
-            format!("median of {n_seeds} seeds; band: minimum to maximum; dashed: peers")
-        } else {
-            "one run per line; dashed: peers".to_owned()
-        };
-        let psnr = || Axis {
-            label: "test PSNR, dB".into(),
-            scale: Scale::Linear,
-            ticks: Vec::new(),
-        };
-        let over_time = Chart {
-            title: "PSNR of test images over time".into(),
-            subtitle,
-            x: Axis {
-                label: "seconds of training (log)".into(),
-                scale: Scale::Log,
-                ticks: evaluation_schedule::up_to(1.1 * last_secs).collect(),
-            },
-            y: psnr(),
-            lines: all().map(CurveResult::line).collect(),
-            thresholds: Vec::new(),
-            markers: Vec::new(),
-        };
-        let over_size = Chart {
-            title: "PSNR of test images over the size of the model".into(),
-            subtitle: format!("after {seconds} s; median of the runs"),
-            x: Axis {
-                label: "GPU memory of the model, MB (log)".into(),
-                scale: Scale::Log,
-                ticks: Vec::new(),
-            },
-            y: psnr(),
-            lines: all().map(CurveResult::size_line).collect(),
-            thresholds: Vec::new(),
-            markers: Vec::new(),
-        };
+        let all: Vec<&CurveResult> = self.results.iter().chain(&peers).collect();
+        let n_seeds = self.options.seeds;
+        let seconds = compact_number(self.options.seconds);
+        let over_time = time_chart(n_seeds, &all);
+        let over_size = size_chart(&seconds, &all);
         let head = [
             "data, method",
             "runs",
@@ -430,7 +457,8 @@ impl Bench<'_> {
         let table = Table {
             title: format!("After {seconds} s (peers: after their last row)"),
             head: head.collect(),
-            rows: all()
+            rows: all
+                .iter()
                 .map(|results| results.summary.row(&results.label))
                 .collect(),
         };
@@ -464,7 +492,7 @@ impl Bench<'_> {
                 "seconds": self.options.seconds,
                 "n_seeds": n_seeds,
                 "notes": self.notes,
-                "lines": all().collect::<Vec<_>>(),
+                "lines": all,
             }),
         };
         let page = findings.write(runs.out())?;

@@ -29,7 +29,8 @@ pub enum Disturbance {
     Keyframes,
 }
 
-/// Rotation noise per translation noise, degrees per millimeter: 5 degrees at 50 mm.
+/// Rotation noise per translation noise, degrees per millimeter: 5 degrees at 50 mm. At a distance
+/// of 0.57 m, both move a point by the same length.
 const DEGREES_PER_MM: f64 = 0.1;
 
 impl Disturbance {
@@ -114,13 +115,15 @@ impl Disturbance {
     }
 }
 
+/// Copies of keyframes with a change applied.
 fn map(keyframes: &[Arc<Keyframe>], mut change: impl FnMut(&mut Keyframe)) -> Vec<Arc<Keyframe>> {
-    let change_one = |keyframe: &Arc<Keyframe>| {
+    let mut changed_keyframes = Vec::new();
+    for keyframe in keyframes {
         let mut changed = keyframe.as_ref().clone();
         change(&mut changed);
-        Arc::new(changed)
-    };
-    keyframes.iter().map(change_one).collect()
+        changed_keyframes.push(Arc::new(changed));
+    }
+    changed_keyframes
 }
 
 /// Moves a camera together with its depth sensor.
@@ -155,27 +158,28 @@ fn pose_noise(keyframes: &[Arc<Keyframe>], sigma_mm: f64, seed: u64) -> Vec<Arc<
 ///
 /// Source: Box and Muller 1958, applied to uniform numbers from a hash.
 fn six_normals(seed: u64, camera: &str, stamp: Stamp) -> [f64; 6] {
-    let block = |ix: u8| {
+    let mut normals = [0.0; 6];
+    // A hash has no state: the noise of a keyframe does not depend on the other keyframes.
+    for (ix, pair) in (0_u8..).zip(normals.chunks_exact_mut(2)) {
         let mut hash = Sha256::new();
         hash.update(seed.to_le_bytes());
         hash.update(stamp.0.to_le_bytes());
         hash.update([ix]);
         hash.update(camera.as_bytes());
-        hash.finalize()
-    };
-    // 53 bits fill the fraction of a f64; the offset of 0.5 keeps the logarithm finite.
-    let uniform = |bytes: &[u8]| {
-        let bits = u64::from_le_bytes(bytes.try_into().expect("eight bytes")) >> 11;
-        (bits as f64 + 0.5) / (1_u64 << 53) as f64
-    };
-    let mut normals = [0.0; 6];
-    for (ix, pair) in (0_u8..).zip(normals.chunks_exact_mut(2)) {
-        let bytes = block(ix);
+        let bytes = hash.finalize();
+        // Two uniform numbers give two independent normal ones.
         let radius = (-2.0 * uniform(&bytes[..8]).ln()).sqrt();
         let (sine, cosine) = (std::f64::consts::TAU * uniform(&bytes[8..16])).sin_cos();
         pair.copy_from_slice(&[radius * cosine, radius * sine]);
     }
     normals
+}
+
+/// A number from 0 to 1, without both ends, from eight bytes.
+fn uniform(bytes: &[u8]) -> f64 {
+    // 53 bits fill the fraction of a f64; the offset of 0.5 keeps the logarithm finite.
+    let bits = u64::from_le_bytes(bytes.try_into().expect("eight bytes")) >> 11;
+    (bits as f64 + 0.5) / (1_u64 << 53) as f64
 }
 
 /// Poses and velocities of one camera over time, from its keyframes.
@@ -191,6 +195,8 @@ fn clock_offset(keyframes: &[Arc<Keyframe>], offset_nanos: f64) -> Vec<Arc<Keyfr
             .or_default()
             .push(state);
     }
+    // Keyframes may be in the order of their files. Two of them with the same stamp would give an
+    // interval of length 0.
     for trajectory in trajectories.values_mut() {
         trajectory.sort_by_key(|(stamp, ..)| *stamp);
         trajectory.dedup_by_key(|(stamp, ..)| *stamp);
@@ -207,6 +213,8 @@ fn clock_offset(keyframes: &[Arc<Keyframe>], offset_nanos: f64) -> Vec<Arc<Keyfr
 /// Pose and velocity at a time, interpolated between the neighboring states or extrapolated beyond
 /// the ends.
 fn at(trajectory: &Trajectory, nanos: f64) -> Option<(Transform, Option<Twist>)> {
+    // Clamped to the first and the last interval, beyond which `frac` is below 0 or above 1. A
+    // single keyframe defines no interval.
     let next = trajectory.partition_point(|(stamp, ..)| (stamp.0 as f64) < nanos);
     let next = next.clamp(1, trajectory.len().checked_sub(1).filter(|last| *last > 0)?);
     let [(stamp_a, a, twist_a), (stamp_b, b, twist_b)] = [&trajectory[next - 1], &trajectory[next]];
@@ -221,6 +229,8 @@ fn at(trajectory: &Trajectory, nanos: f64) -> Option<(Transform, Option<Twist>)>
 /// Darkens the first half of the capture and brightens the second, by half of `step_ev` each to
 /// preserve the mean.
 fn exposure_step(keyframes: &[Arc<Keyframe>], step_ev: f64) -> Vec<Arc<Keyframe>> {
+    // The median of the stamps of training images, so that both exposures have the same number of
+    // them.
     let mut stamps: Vec<Stamp> = keyframes
         .iter()
         .filter(|keyframe| keyframe.split != Split::Test)
@@ -290,21 +300,21 @@ fn subsample(keyframes: &[Arc<Keyframe>], n: f64) -> Vec<Arc<Keyframe>> {
         .filter(|keyframe| keyframe.split != Split::Test)
         .count() as f64;
     let fraction = (n / n_all).min(1.0);
-    let mut n_visited = 0.0;
-    let mut is_kept = |keyframe: &&Arc<Keyframe>| {
+    let mut n_visited = 0.0_f64;
+    let mut kept = Vec::new();
+    for keyframe in keyframes {
         if keyframe.split == Split::Test {
-            return true;
+            kept.push(keyframe.clone());
+            continue;
         }
         // Keeps the keyframe in the middle of each of n equal segments.
         let before = (n_visited * fraction + 0.5).floor();
         n_visited += 1.0;
-        (n_visited * fraction + 0.5).floor() > before
-    };
-    keyframes
-        .iter()
-        .filter(|keyframe| is_kept(keyframe))
-        .cloned()
-        .collect()
+        if (n_visited * fraction + 0.5).floor() > before {
+            kept.push(keyframe.clone());
+        }
+    }
+    kept
 }
 
 #[cfg(test)]

@@ -7,8 +7,9 @@ use session::Context;
 use session::OpenGpu;
 use trainer::nerf::bench::time_steps;
 
-/// Default samples per step, on a GPU and on the CPU.
+/// Default samples per step on a GPU.
 const DEFAULT_SAMPLES: [u32; 2] = [1 << 17, 1 << 18];
+/// Default samples per step on the CPU, where a step would otherwise take many seconds.
 const DEFAULT_SAMPLES_ON_CPU: [u32; 1] = [1 << 14];
 /// Default number of timed steps, on a GPU and on the CPU.
 const DEFAULT_REPEATS: u32 = 100;
@@ -82,6 +83,7 @@ pub fn measure<E: From<Error>>(
         if row_ix == 0 {
             log::info!("{}", gpu.describe());
         }
+        // Every ray has the same number of samples.
         let n_samples = (n_samples / options.n_rays).max(1) * options.n_rays;
         let figures = time_steps(&gpu, options.n_rays, n_samples, n_repeats as usize)
             .with_context(|| format!("{n_samples} samples: try fewer --samples"))?;

@@ -57,6 +57,7 @@ impl Findings {
     ///
     /// If a file cannot be written.
     pub fn write(&self, folder: &Path) -> Result<PathBuf> {
+        // The numbers first: they are the only part that cannot be made again from another one.
         let path_with = |suffix: &str| folder.join(format!("{}{suffix}", self.name));
         run_folder::write_json(&path_with(".json"), &self.numbers)?;
         let mut page = self.page_head();

@@ -10,10 +10,11 @@ use session::Context;
 
 /// Time to ignore after the keyframe store is full, while buffers reach their final size.
 const SETTLE_SECS: f64 = 60.0;
-/// Minimum time over which a rate is measured.
+/// Minimum time over which a rate is measured. Over a shorter time, a rate per hour is mostly noise
+/// of the allocator.
 const MIN_SPAN_SECS: f64 = 60.0;
 /// Maximum number of samples for a rate. More samples are reduced to medians of at most this many
-/// groups.
+/// groups, because the number of pairs grows with the square: 400 groups are 80 thousand pairs.
 const MAX_GROUPS: usize = 400;
 const SECS_PER_HOUR: f64 = 3600.0;
 
@@ -66,6 +67,7 @@ impl Excluded {
             Self::Model => sample.model_bytes,
             Self::Training => sample.gpu_bytes.saturating_sub(sample.gpu_image_bytes),
         };
+        // The viewers of a bench run in the same process, and store the times of every picture.
         let times_bytes = sample.pictures * size_of::<ReceivedPicture>() as u64;
         sample.resident_bytes as f64 - (excluded_bytes + times_bytes) as f64
     }
@@ -105,21 +107,16 @@ impl Growth {
         if last.seconds - counted.first()?.seconds < MIN_SPAN_SECS {
             return None;
         }
-        let of_group = |group: &[&Sample]| {
-            let seconds: Vec<f64> = group.iter().map(|sample| sample.seconds).collect();
-            let bytes: Vec<f64> = group.iter().map(|sample| excluded.bytes(sample)).collect();
-            median(&seconds).zip(median(&bytes))
-        };
         let groups: Vec<(f64, f64)> = counted
             .chunks(counted.len().div_ceil(MAX_GROUPS))
-            .filter_map(of_group)
+            .filter_map(|group| medians(group, excluded))
             .collect();
         let resident: Vec<f64> = counted
             .iter()
             .map(|sample| sample.resident_bytes as f64)
             .collect();
-        let (resident_bytes, bytes_per_hour) =
-            (median(&resident)?, theil_sen(&groups)? * SECS_PER_HOUR);
+        let resident_bytes = median(&resident)?;
+        let bytes_per_hour = theil_sen(&groups)? * SECS_PER_HOUR;
         Some(Self {
             store_was_full: full_at.is_some(),
             from_seconds: counted.first()?.seconds,
@@ -129,6 +126,13 @@ impl Growth {
             percent_per_hour: 100.0 * bytes_per_hour / resident_bytes,
         })
     }
+}
+
+/// Median time and median memory of a group of samples.
+fn medians(group: &[&Sample], excluded: Excluded) -> Option<(f64, f64)> {
+    let seconds: Vec<f64> = group.iter().map(|sample| sample.seconds).collect();
+    let bytes: Vec<f64> = group.iter().map(|sample| excluded.bytes(sample)).collect();
+    median(&seconds).zip(median(&bytes))
 }
 
 /// Current and peak resident memory of this process, bytes.

@@ -97,6 +97,7 @@ pub fn measure<E: From<Error>>(
         .as_deref()
         .map(|path| load_cloud_npz(path).with_context(|| format!("cloud {path:?}")))
         .transpose()?;
+    // Only the kind of the device is needed here. It is closed before the first row.
     let defaults = match (options.scan, open_gpu()?.is_software()) {
         (false, false) => DEFAULTS,
         (false, true) => DEFAULTS_ON_CPU,
@@ -128,9 +129,23 @@ pub fn measure<E: From<Error>>(
     } else {
         Eye::Outside
     };
-    let (losses, generate): (_, fn(usize, u64) -> SplatArrays) = match options.scan {
-        true => (Losses::Training, scan_cloud),
-        false => (Losses::L1, synthetic_cloud),
+    let losses = if options.scan {
+        Losses::Training
+    } else {
+        Losses::L1
+    };
+    let generate: fn(usize, u64) -> SplatArrays = if options.scan {
+        scan_cloud
+    } else {
+        synthetic_cloud
+    };
+    // The warm-up has a minimum duration, because drivers are slow for a while after large buffers
+    // were allocated, and the steps of a GPU are short.
+    let repeats = Repeats {
+        n_warm_up: n_repeats.div_ceil(3),
+        warm_up: Duration::from_millis(300),
+        n_timed: n_repeats,
+        n_consecutive: 3 * n_repeats,
     };
     for (size_ix, size_px) in sizes_px.iter().enumerate() {
         for n_splats in &counts {
@@ -139,6 +154,7 @@ pub fn measure<E: From<Error>>(
             if size_ix == 0 && counts.first() == Some(n_splats) {
                 log::info!("{}", gpu.describe());
             }
+            // A synthetic cloud is made for each row, and lives as long as the row.
             let synthetic;
             let cloud: &SplatArrays = match &given {
                 Some(cloud) => cloud,
@@ -146,12 +162,6 @@ pub fn measure<E: From<Error>>(
                     synthetic = generate(*n_splats, 0);
                     &synthetic
                 }
-            };
-            let repeats = Repeats {
-                n_warm_up: n_repeats.div_ceil(3),
-                warm_up: Duration::from_millis(300),
-                n_timed: n_repeats,
-                n_consecutive: 3 * n_repeats,
             };
             let setup = KernelSetup {
                 size_px: *size_px,

@@ -150,8 +150,10 @@ impl LiveRun {
         viewers: &[Viewer],
         timeline: &Timeline,
     ) -> Self {
+        // Only the first model is measured; it is the one that viewers see.
         let session = &live.sessions()[0];
-        let (progress, seconds) = (session.progress(), session.secs());
+        let progress = session.progress();
+        let seconds = session.secs();
         let pictures: Vec<Vec<ReceivedPicture>> = viewers.iter().map(Viewer::pictures).collect();
         Self {
             conditions,
@@ -197,14 +199,6 @@ fn latencies(
         (name, Latency::of(pictures.iter().flatten().map(millis)))
     };
     let cameras: BTreeSet<&str> = keyframes.iter().map(|keyframe| &*keyframe.camera).collect();
-    let of_camera = |camera: &&str| {
-        let keyframes = keyframes
-            .iter()
-            .filter(|keyframe| *keyframe.camera == **camera);
-        let pushed =
-            Latency::of(keyframes.filter_map(|keyframe| keyframe.millis_until(keyframe.pushed)));
-        Some((format!("shutter to model, camera {camera}"), pushed?))
-    };
     let to_picture = pictures
         .first()
         .and_then(|pictures| Latency::of(shutter_to_picture(pictures, keyframes)));
@@ -226,6 +220,7 @@ fn latencies(
     let named = named
         .into_iter()
         .filter_map(|(name, latency)| Some((name.to_owned(), latency?)));
+    // In the order in which they occur: a picture is received before it is shown.
     let mut since_shutter = session::latencies(keyframes);
     let shown_at = since_shutter
         .iter()
@@ -236,9 +231,21 @@ fn latencies(
     }
     let of_cameras = cameras
         .iter()
-        .filter_map(of_camera)
+        .filter_map(|camera| camera_latency(camera, keyframes))
         .filter(|_| cameras.len() > 1);
     named.chain(since_shutter).chain(of_cameras).collect()
+}
+
+/// Time from mid-exposure until the keyframes of a camera are added to the models, with its name.
+fn camera_latency(camera: &str, keyframes: &[KeyframeTimes]) -> Option<(String, Latency)> {
+    let pushed = keyframes
+        .iter()
+        .filter(|keyframe| *keyframe.camera == *camera)
+        .filter_map(|keyframe| keyframe.millis_until(keyframe.pushed));
+    Some((
+        format!("shutter to model, camera {camera}"),
+        Latency::of(pushed)?,
+    ))
 }
 
 /// For each keyframe, the time from mid-exposure to the arrival of the first picture that contains
@@ -247,6 +254,8 @@ fn shutter_to_picture<'a>(
     pictures: &'a [ReceivedPicture],
     keyframes: &'a [KeyframeTimes],
 ) -> impl Iterator<Item = f64> + 'a {
+    // The number of keyframes in a picture never falls, so the search for the next keyframe
+    // continues where the last one ended.
     let mut rest = pictures;
     (1..).zip(keyframes).filter_map(move |(n, keyframe)| {
         let first = rest.iter().position(|picture| picture.n_keyframes >= n)?;
@@ -259,20 +268,19 @@ fn millis(duration: Duration) -> f64 {
     duration.as_secs_f64() * 1e3
 }
 
-/// A table and a chart of runs on the same recording.
-///
-/// * `input`: the recording and the pictures, for the page.
-#[must_use]
-pub fn findings(input: &str, runs: &[LiveRun]) -> Findings {
+/// A row of a table: the name of a quantity, and its value in each run.
+fn row(name: &str, runs: &[LiveRun], value: &dyn Fn(&LiveRun) -> String) -> Vec<String> {
+    std::iter::once(name.to_owned())
+        .chain(runs.iter().map(value))
+        .collect()
+}
+
+/// The rows of all quantities that at least one run has.
+fn rows(runs: &[LiveRun]) -> Vec<Vec<String>> {
     let mut rows: Vec<Vec<String>> = Vec::new();
-    let mut add = |name: &str, value: &dyn Fn(&LiveRun) -> String| {
-        rows.push(
-            [name.to_owned()]
-                .into_iter()
-                .chain(runs.iter().map(value))
-                .collect(),
-        );
-    };
+    let mut add =
+        |name: &str, value: &dyn Fn(&LiveRun) -> String| rows.push(row(name, runs, value));
+    // Runs without viewers have no latencies of pictures, so the names of all runs are collected.
     let mut names: Vec<&str> = Vec::new();
     for (name, _) in runs.iter().flat_map(|run| &run.latencies) {
         if !names.contains(&&**name) {
@@ -303,6 +311,7 @@ pub fn findings(input: &str, runs: &[LiveRun]) -> Findings {
     if is_any(|input| input.stations > 0) {
         add("stations registered", &|run| run.input.stations.to_string());
     }
+    // Every run has the same schedule, but some may have ended earlier.
     let marks = runs
         .iter()
         .map(|run| &run.psnr)
@@ -325,87 +334,102 @@ pub fn findings(input: &str, runs: &[LiveRun]) -> Findings {
                 .map_or(String::new(), |psnr| format!("{psnr:.2}"))
         });
     }
-    let head: Vec<String> = ["quantity".to_owned()]
-        .into_iter()
+    rows
+}
+
+impl LiveRun {
+    /// PSNR over time.
+    fn line(&self) -> Line {
+        let point = |(x, y): (f64, f64)| Point {
+            x,
+            y,
+            low: y,
+            high: y,
+        };
+        Line {
+            label: self.conditions.to_string(),
+            points: self.psnr.iter().copied().map(point).collect(),
+            is_peer: false,
+        }
+    }
+}
+
+/// PSNR over time of all runs.
+fn accuracy_chart(input: &str, runs: &[LiveRun]) -> Chart {
+    Chart {
+        title: "Accuracy of a live run".to_owned(),
+        subtitle: input.to_owned(),
+        x: Axis {
+            label: "seconds of training".to_owned(),
+            scale: Scale::Log,
+            ticks: Vec::new(),
+        },
+        y: Axis {
+            label: "test PSNR, dB".to_owned(),
+            scale: Scale::Linear,
+            ticks: Vec::new(),
+        },
+        lines: runs
+            .iter()
+            .map(LiveRun::line)
+            .filter(|line| !line.points.is_empty())
+            .collect(),
+        thresholds: Vec::new(),
+        markers: Vec::new(),
+    }
+}
+
+/// All quantities of a run over time.
+fn over_time_chart(input: &str, run: &LiveRun) -> Chart {
+    Chart {
+        title: "Live run over time".to_owned(),
+        subtitle: format!("{}: {input}", run.conditions),
+        x: Axis {
+            label: "minutes of training".to_owned(),
+            scale: Scale::Linear,
+            ticks: Vec::new(),
+        },
+        y: Axis {
+            label: "% of the median in the second half".to_owned(),
+            scale: Scale::Linear,
+            ticks: Vec::new(),
+        },
+        lines: run.over_time.lines(),
+        thresholds: Vec::new(),
+        markers: Vec::new(),
+    }
+}
+
+/// A table and a chart of runs on the same recording.
+///
+/// * `input`: the recording and the pictures, for the page.
+#[must_use]
+pub fn findings(input: &str, runs: &[LiveRun]) -> Findings {
+    let head: Vec<String> = std::iter::once("quantity".to_owned())
         .chain(runs.iter().map(|run| run.conditions.to_string()))
         .collect();
     let mut tables = vec![Table {
         title: "Live run (durations: median / 99th percentile)".to_owned(),
         head: head.clone(),
-        rows,
+        rows: rows(runs),
     }];
-    let rows = OverTime::rows(&runs.iter().map(|run| &run.over_time).collect::<Vec<_>>());
-    if !rows.is_empty() {
+    let trends = OverTime::rows(&runs.iter().map(|run| &run.over_time).collect::<Vec<_>>());
+    if !trends.is_empty() {
         tables.push(Table {
             title: "Second half of the run: median and change per hour".to_owned(),
             head,
-            rows,
+            rows: trends,
         });
     }
-    let line = |run: &LiveRun| Line {
-        label: run.conditions.to_string(),
-        points: run
-            .psnr
-            .iter()
-            .map(|&(x, y)| Point {
-                x,
-                y,
-                low: y,
-                high: y,
-            })
-            .collect(),
-        is_peer: false,
-    };
-    let mut charts = vec![(
-        "",
-        Chart {
-            title: "Accuracy of a live run".to_owned(),
-            subtitle: input.to_owned(),
-            x: Axis {
-                label: "seconds of training".to_owned(),
-                scale: Scale::Log,
-                ticks: Vec::new(),
-            },
-            y: Axis {
-                label: "test PSNR, dB".to_owned(),
-                scale: Scale::Linear,
-                ticks: Vec::new(),
-            },
-            lines: runs
-                .iter()
-                .map(line)
-                .filter(|line| !line.points.is_empty())
-                .collect(),
-            thresholds: Vec::new(),
-            markers: Vec::new(),
-        },
-    )];
-    // The first run with viewers; without viewers, there is no latency.
+    let mut charts = vec![("", accuracy_chart(input, runs))];
+    // The first run with viewers; without viewers, there is no latency. `max_by_key` returns the
+    // last of several equal runs, hence the reversed order.
     let charted = runs
         .iter()
         .rev()
         .max_by_key(|run| run.over_time.trends.len());
     if let Some(run) = charted.filter(|run| !run.over_time.trends.is_empty()) {
-        charts.push((
-            "-over-time",
-            Chart {
-                title: "Live run over time".to_owned(),
-                subtitle: format!("{}: {input}", run.conditions),
-                x: Axis {
-                    label: "minutes of training".to_owned(),
-                    scale: Scale::Linear,
-                    ticks: Vec::new(),
-                },
-                y: Axis {
-                    label: "% of the median in the second half".to_owned(),
-                    scale: Scale::Linear,
-                    ticks: Vec::new(),
-                },
-                lines: run.over_time.lines(),
-                thresholds: Vec::new(),
-                markers: Vec::new(),
-            },
-        ));
+        charts.push(("-over-time", over_time_chart(input, run)));
     }
     Findings {
         name: "live",

@@ -49,6 +49,8 @@ impl LiveDisturbance {
                     .remove(0)
             })),
             Disturbance::Exposure => {
+                // The middle of the capture is not known during a live run, so the time of the step
+                // is given.
                 let tables =
                     [-0.5, 0.5].map(|fraction| exposure_table(2.0_f64.powf(fraction * self.level)));
                 let mut step_at: Option<Stamp> = None;

@@ -61,18 +61,7 @@ impl MemoryRun {
     /// If the system does not report the memory of this process.
     pub fn findings(&self) -> Result<Findings> {
         let samples = &self.samples;
-        let growths: Vec<(&str, Growth)> = match self.is_software {
-            true => {
-                vec![
-                    ("without the model", Excluded::Model),
-                    ("without model and training buffers", Excluded::Training),
-                ]
-            }
-            false => vec![("of the host", Excluded::Nothing)],
-        }
-        .into_iter()
-        .filter_map(|(name, excluded)| Some((name, Growth::of(samples, excluded)?)))
-        .collect();
+        let growths = self.growths();
         let rate = growths.first().map_or(
             "too short to measure a growth rate".to_owned(),
             |(name, growth)| {
@@ -94,37 +83,14 @@ impl MemoryRun {
             .filter(|line| !line.points.is_empty())
             .collect();
         let full = samples.iter().find(|sample| sample.evicted > 0);
+        // Until the store is full, keyframes are the part that grows. The marker has the color of
+        // their line.
         let markers = full.map(|sample| Marker {
             x: sample.seconds / SECS_PER_MINUTE,
             label: format!("store full: {} keyframes", sample.keyframes),
             line_ix: 2,
         });
-        let mut rows = Vec::new();
-        let mut add = |name: &str, value: String| rows.push(vec![name.to_owned(), value]);
-        let mb = |bytes: f64| format!("{:.1} MB", bytes / BYTES_PER_MB);
-        if let Some(last) = samples.last() {
-            for component in &COMPONENTS {
-                if let Some(bytes) = (component.bytes)(last) {
-                    add(&format!("{} at the end", component.label), mb(bytes as f64));
-                }
-            }
-            add("peak of resident memory", mb(resident_bytes()?.1 as f64));
-            add(
-                "keyframes",
-                format!("{}, {} evicted", last.keyframes, last.evicted),
-            );
-            add("steps", last.step.to_string());
-            add("pictures for viewers", last.pictures.to_string());
-        }
-        for (name, growth) in &growths {
-            let (from, to) = (growth.from_seconds, growth.to_seconds);
-            let of = format!(
-                "{} per hour, {:+.2} %",
-                mb(growth.bytes_per_hour),
-                growth.percent_per_hour
-            );
-            add(&format!("growth {name}, {from:.0} s to {to:.0} s"), of);
-        }
+        let rows = self.rows(&growths)?;
         let mut gpu_buffers: Vec<(&Arc<str>, u64)> = self
             .gpu_buffers
             .iter()
@@ -175,6 +141,60 @@ impl MemoryRun {
             }),
         })
     }
+
+    /// The growth rates of this run, with the memory that they are about.
+    fn growths(&self) -> Vec<(&'static str, Growth)> {
+        // On a CPU, buffers of the GPU are in the memory of the process. They grow with the model,
+        // which would hide a leak.
+        let kinds = if self.is_software {
+            vec![
+                ("without the model", Excluded::Model),
+                ("without model and training buffers", Excluded::Training),
+            ]
+        } else {
+            vec![("of the host", Excluded::Nothing)]
+        };
+        kinds
+            .into_iter()
+            .filter_map(|(name, excluded)| Some((name, Growth::of(&self.samples, excluded)?)))
+            .collect()
+    }
+
+    /// The rows of the table: memory at the end, counts, growth rates.
+    fn rows(&self, growths: &[(&str, Growth)]) -> Result<Vec<Vec<String>>> {
+        let mut rows = Vec::new();
+        let mut add = |name: &str, value: String| rows.push(vec![name.to_owned(), value]);
+        if let Some(last) = self.samples.last() {
+            for component in &COMPONENTS {
+                if let Some(bytes) = (component.bytes)(last) {
+                    add(&format!("{} at the end", component.label), mb(bytes as f64));
+                }
+            }
+            add("peak of resident memory", mb(resident_bytes()?.1 as f64));
+            add(
+                "keyframes",
+                format!("{}, {} evicted", last.keyframes, last.evicted),
+            );
+            add("steps", last.step.to_string());
+            add("pictures for viewers", last.pictures.to_string());
+        }
+        for (name, growth) in growths {
+            let from = growth.from_seconds;
+            let to = growth.to_seconds;
+            let of = format!(
+                "{} per hour, {:+.2} %",
+                mb(growth.bytes_per_hour),
+                growth.percent_per_hour
+            );
+            add(&format!("growth {name}, {from:.0} s to {to:.0} s"), of);
+        }
+        Ok(rows)
+    }
+}
+
+/// A size as text.
+fn mb(bytes: f64) -> String {
+    format!("{:.1} MB", bytes / BYTES_PER_MB)
 }
 
 /// Memory of a run in progress, and its GPU buffers, bytes by label.
@@ -252,26 +272,32 @@ const COMPONENTS: [MemoryComponent; 6] = [
 
 /// The line of one component: median and range of each group of samples.
 fn line(component: &MemoryComponent, samples: &[Sample]) -> Line {
-    let of_group = |group: &[Sample]| {
+    let n_each = samples.len().div_ceil(MAX_POINTS).max(1);
+    Line {
+        label: component.label.to_owned(),
+        points: samples
+            .chunks(n_each)
+            .filter_map(|group| component.point(group))
+            .collect(),
+        is_peer: false,
+    }
+}
+
+impl MemoryComponent {
+    /// Median and range of a group of samples; `None` if the backend does not report this memory.
+    fn point(&self, group: &[Sample]) -> Option<Point> {
         let mut mb: Vec<f64> = group
             .iter()
-            .filter_map(component.bytes)
+            .filter_map(self.bytes)
             .map(|bytes| bytes as f64 / BYTES_PER_MB)
             .collect();
         let [low, high] = extent(&mb)?;
-        let x = group[group.len() / 2].seconds / SECS_PER_MINUTE;
         Some(Point {
-            x,
+            x: group[group.len() / 2].seconds / SECS_PER_MINUTE,
             y: quantile(&mut mb, 0.5, Rank::Upper)?,
             low,
             high,
         })
-    };
-    let n_each = samples.len().div_ceil(MAX_POINTS).max(1);
-    Line {
-        label: component.label.to_owned(),
-        points: samples.chunks(n_each).filter_map(of_group).collect(),
-        is_peer: false,
     }
 }
 

@@ -14,7 +14,8 @@ use trainer::gpu::Gpu;
 
 /// Time between two samples.
 const SAMPLE_PERIOD: Duration = Duration::from_secs(1);
-/// Maximum number of time buckets.
+/// Maximum number of time buckets. A run of an hour then has one per minute, whose medians are not
+/// affected by single slow pictures.
 const MAX_BUCKETS: usize = 60;
 /// Minimum duration for trends: nearly two minutes, measured at the last sample.
 const MIN_SECS: f64 = 115.0;
@@ -40,12 +41,14 @@ struct Moment {
 impl Timeline {
     /// Samples a run in progress if a second has passed since the last sample.
     pub fn sample(&mut self, live: &Live, gpu: &Gpu, viewers: &[Viewer]) {
-        let (at, session) = (Instant::now(), &live.sessions()[0]);
-        let (seconds, step, psnr) = (session.secs(), session.progress().step, session.psnr());
+        let at = Instant::now();
+        let session = &live.sessions()[0];
+        let seconds = session.secs();
         let is_due = self
             .moments
             .last()
             .is_none_or(|last| at - last.at >= SAMPLE_PERIOD);
+        // Before the first image, the training time is 0.
         if is_due && seconds > 0.0 {
             // On a software adapter, the model and its working memory are in host memory, too.
             let excluded = if gpu.is_software() {
@@ -59,8 +62,8 @@ impl Timeline {
             self.moments.push(Moment {
                 at,
                 seconds,
-                step,
-                psnr,
+                step: session.progress().step,
+                psnr: session.psnr(),
                 host_bytes,
             });
         }
@@ -70,6 +73,8 @@ impl Timeline {
     ///
     /// * `pictures`: the pictures of each viewer.
     pub(crate) fn over_time(&self, pictures: &[Vec<ReceivedPicture>]) -> OverTime {
+        // The pictures of all viewers in one list, ordered by time, so that those of a bucket are a
+        // range of it.
         let mut received: Vec<(Instant, f64)> = pictures
             .iter()
             .flatten()
@@ -83,38 +88,24 @@ impl Timeline {
         received.sort_by_key(|(complete, _)| *complete);
         let last_ix = self.moments.len().saturating_sub(1);
         let n_each = last_ix.div_ceil(MAX_BUCKETS).max(1);
-        let bucket = |from_ix: usize| {
-            let moments = &self.moments[from_ix..=last_ix.min(from_ix + n_each)];
-            let (from, to) = (moments[0], moments[moments.len() - 1]);
-            let [first, end] = [from, to]
-                .map(|moment| received.partition_point(|(complete, _)| *complete < moment.at));
-            let millis: Vec<f64> = received[first..end]
-                .iter()
-                .map(|(_, millis)| *millis)
-                .collect();
-            let median_of = |value: fn(&Moment) -> Option<f64>| {
-                median(&moments.iter().filter_map(value).collect::<Vec<f64>>())
-            };
-            let elapsed_secs = (to.at - from.at).as_secs_f64();
-            Bucket {
-                seconds: 0.5 * (from.seconds + to.seconds),
-                picture_millis: median(&millis),
-                psnr: median_of(|moment| moment.psnr),
-                steps_per_sec: to.step.saturating_sub(from.step) as f64 / elapsed_secs.max(1e-9),
-                host_mb: median_of(|moment| moment.host_bytes).map(|bytes| bytes / BYTES_PER_MB),
-            }
-        };
-        let buckets: Vec<Bucket> = (0..last_ix).step_by(n_each).map(bucket).collect();
+        // Neighboring buckets share the moment between them: rates need both ends.
+        let buckets: Vec<Bucket> = (0..last_ix)
+            .step_by(n_each)
+            .map(|from_ix| {
+                let moments = &self.moments[from_ix..=last_ix.min(from_ix + n_each)];
+                Bucket::of(moments, &received)
+            })
+            .collect();
         let last_secs = self.moments.last().map_or(0.0, |last| last.seconds);
-        let trend = |quantity: &Quantity| {
-            let mut points = quantity.points(&buckets);
-            points.retain(|(seconds, _)| *seconds >= 0.5 * last_secs);
-            Some((quantity.name, Trend::of(&points)?))
-        };
-        let trends = match last_secs >= MIN_SECS {
-            true => QUANTITIES.iter().filter_map(trend).collect(),
-            false => Vec::new(),
-        };
+        // The first half is the time in which the model and the buffers grow.
+        let mut trends = Vec::new();
+        if last_secs >= MIN_SECS {
+            for quantity in &QUANTITIES {
+                let mut points = quantity.points(&buckets);
+                points.retain(|(seconds, _)| *seconds >= 0.5 * last_secs);
+                trends.extend(Trend::of(&points).map(|trend| (quantity.name, trend)));
+            }
+        }
         OverTime { buckets, trends }
     }
 }
@@ -133,6 +124,32 @@ pub struct Bucket {
     /// Resident memory without the picture timings that the viewers of a benchmark store and, on a
     /// software adapter, without the buffers of training; `None` if the system does not report it.
     pub host_mb: Option<f64>,
+}
+
+impl Bucket {
+    /// * `received`: times and durations (milliseconds) of pictures, ordered by time.
+    fn of(moments: &[Moment], received: &[(Instant, f64)]) -> Self {
+        let from = moments[0];
+        let to = moments[moments.len() - 1];
+        let [first, end] = [from, to]
+            .map(|moment| received.partition_point(|(complete, _)| *complete < moment.at));
+        let millis: Vec<f64> = received[first..end]
+            .iter()
+            .map(|(_, millis)| *millis)
+            .collect();
+        let median_of = |value: fn(&Moment) -> Option<f64>| {
+            median(&moments.iter().filter_map(value).collect::<Vec<f64>>())
+        };
+        let elapsed_secs = (to.at - from.at).as_secs_f64();
+        Self {
+            seconds: 0.5 * (from.seconds + to.seconds),
+            picture_millis: median(&millis),
+            psnr: median_of(|moment| moment.psnr),
+            // A rejected trial restores an earlier step, so the difference may be negative.
+            steps_per_sec: to.step.saturating_sub(from.step) as f64 / elapsed_secs.max(1e-9),
+            host_mb: median_of(|moment| moment.host_bytes).map(|bytes| bytes / BYTES_PER_MB),
+        }
+    }
 }
 
 /// Median and change of a quantity in the second half of a run.
@@ -211,62 +228,73 @@ impl OverTime {
     /// Rows of a table: a quantity, and its median and change in each of the runs. Empty if all
     /// runs are short.
     pub(crate) fn rows(runs: &[&Self]) -> Vec<Vec<String>> {
-        let cell = |run: &Self,
-                    Quantity {
-                        name, n_decimals, ..
-                    }: &Quantity| {
-            let (_, trend) = run.trends.iter().find(|(known, _)| known == name)?;
-            let Trend {
-                median,
-                per_hour,
-                percent_per_hour,
-            } = trend;
-            Some(format!(
-                "{median:.n_decimals$}, {per_hour:+.n_decimals$} per hour ({percent_per_hour:+.1} %)"
-            ))
-        };
-        let row = |quantity: &Quantity| {
-            let cells: Vec<Option<String>> = runs.iter().map(|run| cell(run, quantity)).collect();
-            cells.iter().any(Option::is_some).then(|| {
+        let mut rows = Vec::new();
+        for quantity in &QUANTITIES {
+            let cells: Vec<Option<String>> = runs.iter().map(|run| run.cell(quantity)).collect();
+            // A run without viewers has no times of pictures.
+            if cells.iter().any(Option::is_some) {
                 let cells = cells.into_iter().map(Option::unwrap_or_default);
-                [quantity.name.to_owned()]
-                    .into_iter()
-                    .chain(cells)
-                    .collect()
-            })
-        };
-        QUANTITIES.iter().filter_map(row).collect()
+                rows.push(
+                    std::iter::once(quantity.name.to_owned())
+                        .chain(cells)
+                        .collect(),
+                );
+            }
+        }
+        rows
+    }
+
+    /// Median and change of a quantity as text; `None` if they are unknown.
+    fn cell(&self, quantity: &Quantity) -> Option<String> {
+        let n_decimals = quantity.n_decimals;
+        let (_, trend) = self
+            .trends
+            .iter()
+            .find(|(known, _)| *known == quantity.name)?;
+        let Trend {
+            median,
+            per_hour,
+            percent_per_hour,
+        } = trend;
+        Some(format!(
+            "{median:.n_decimals$}, {per_hour:+.n_decimals$} per hour ({percent_per_hour:+.1} %)"
+        ))
     }
 
     /// Each quantity as a percentage of its median in the second half, over minutes.
     pub(crate) fn lines(&self) -> Vec<Line> {
-        let line = |(name, trend): &(&'static str, Trend)| {
-            let quantity = QUANTITIES.iter().find(|quantity| quantity.name == *name)?;
-            let point = |(seconds, value): (f64, f64)| {
-                let y = 100.0 * value / trend.median;
-                Point {
-                    x: seconds / 60.0,
-                    y,
-                    low: y,
-                    high: y,
-                }
-            };
-            let label = name
-                .split_once(',')
-                .map_or(*name, |(label, _)| label)
-                .to_owned();
-            let points = quantity
+        self.trends
+            .iter()
+            .filter_map(|(name, trend)| self.line(name, trend))
+            .collect()
+    }
+
+    /// The line of one quantity; `None` for an unknown name.
+    fn line(&self, name: &str, trend: &Trend) -> Option<Line> {
+        let quantity = QUANTITIES.iter().find(|quantity| quantity.name == name)?;
+        // The unit at the end of the name does not apply to percentages.
+        let label = name.split_once(',').map_or(name, |(label, _)| label);
+        let point = |(seconds, value): (f64, f64)| percent_point(seconds, value, trend.median);
+        Some(Line {
+            label: label.to_owned(),
+            points: quantity
                 .points(&self.buckets)
                 .into_iter()
                 .map(point)
-                .collect();
-            Some(Line {
-                label,
-                points,
-                is_peer: false,
-            })
-        };
-        self.trends.iter().filter_map(line).collect()
+                .collect(),
+            is_peer: false,
+        })
+    }
+}
+
+/// A value as a percentage of a median, over minutes.
+fn percent_point(seconds: f64, value: f64, median: f64) -> Point {
+    let y = 100.0 * value / median;
+    Point {
+        x: seconds / 60.0,
+        y,
+        low: y,
+        high: y,
     }
 }
 

@@ -44,6 +44,7 @@ impl Peer {
                 "expected an object with rows of seconds and psnr ({error})"
             ))
         })?;
+        // The time axis of the charts is logarithmic.
         if file.rows.is_empty() || file.rows.iter().any(|row| row.seconds <= 0.0) {
             return Err(invalid(
                 "expected at least one row, and seconds above 0 in each",

@@ -182,7 +182,8 @@ impl Run {
     /// Points `(seconds, dB)` at the evaluations and at the end.
     #[must_use]
     pub fn curve(&self) -> Vec<(f64, f64)> {
-        /// Minimum ratio of the end to the last evaluation for the end to be a separate point.
+        /// Minimum ratio of the end to the last evaluation for the end to be a separate point. At
+        /// smaller ratios, both score almost the same model, and noise would look like a step.
         const MIN_SECONDS_RATIO: f64 = 1.02;
         let is_new = self
             .evaluations
@@ -200,7 +201,7 @@ pub(crate) struct NamedData {
     pub(crate) name: String,
     pub(crate) path: PathBuf,
     pub(crate) data: Data,
-    /// Points from which models without depth start.
+    /// Points at which the training of models without depth starts.
     initial_points: Option<Arc<InitialPoints>>,
     /// The scene models requested by the flags and the recording.
     pub(crate) model_specs: Vec<ModelSpec>,
@@ -259,14 +260,14 @@ impl NamedData {
             [one] => one.options_of()?,
             _ => None,
         };
-        let wrong_method = || {
-            let (data, methods) = (&self.name, self.methods());
-            let needed = SplatOptions::METHOD;
+        options.ok_or_else(|| {
             Error::BadInput(format!(
-                "{data}: this bench needs the method {needed}, but the method is {methods}"
+                "{}: this bench needs the method {}, but the method is {}",
+                self.name,
+                SplatOptions::METHOD,
+                self.methods()
             ))
-        };
-        options.ok_or_else(wrong_method)
+        })
     }
 
     fn methods(&self) -> String {
@@ -338,6 +339,7 @@ impl<'a> Runs<'a> {
             &training.overrides(),
             &on_progress,
         )?;
+        // Ends the progress bar before the next message.
         drop(on_progress);
         if data.of_split(Split::Test).is_empty() {
             let reason = "there are no test images, so nothing can be scored; see --holdout";
@@ -347,9 +349,9 @@ impl<'a> Runs<'a> {
             )));
         }
         let model_specs = session::model_specs(training, &data, None, self.gpu.is_software())?;
-        let (name, initial_points) = (unique_name(path, used_names), data.initial_points());
+        let initial_points = data.initial_points();
         Ok(NamedData {
-            name,
+            name: unique_name(path, used_names),
             path: path.to_owned(),
             data,
             initial_points,
@@ -366,6 +368,7 @@ impl<'a> Runs<'a> {
             .join(RUNS)
             .join(format!("{}.json", file_name(&job.name)));
         if path.exists() {
+            // A run with other settings must not appear among these results.
             let cached = read(&path)?;
             if let Some(difference) = difference(&cached.settings, &settings)? {
                 return Err(Error::BadInput(format!(
@@ -408,6 +411,7 @@ impl<'a> Runs<'a> {
         } else {
             Evaluator::psnr_only()
         };
+        // The schedule of a model, such as the end of its growth, depends on the planned steps.
         let mut model_spec = job.model_spec.clone();
         if let Some(steps) = job.limits.steps {
             model_spec.options.common.n_planned_steps = steps;
@@ -437,6 +441,7 @@ impl<'a> Runs<'a> {
             &self.host.stop,
             self.host.open_gpu,
         )?;
+        // An interrupted run is not saved, because it would count as a complete one.
         ensure!(
             session.is_over() || !self.host.stop.requested(),
             "stopped early; to continue the bench, run the same command with --out {}",
@@ -446,7 +451,8 @@ impl<'a> Runs<'a> {
     }
 
     fn settings(&self, job: &Job<'_>) -> RunSettings {
-        let (data, images) = (&job.data.data, self.options.images.clone());
+        let data = &job.data.data;
+        let images = self.options.images.clone();
         let n_test = data.of_split(Split::Test).len();
         RunSettings {
             data: job.data.path.clone(),
@@ -511,9 +517,11 @@ fn read(path: &Path) -> Result<Run> {
 
 /// Description of the first setting that differs.
 fn difference(cached: &RunSettings, requested: &RunSettings) -> Result<Option<String>> {
+    // Compared as JSON, which has the names of the settings for the message.
     let fields =
         |settings: &RunSettings| serde_json::to_value(settings).context("settings are plain data");
-    let (cached, requested) = (fields(cached)?, fields(requested)?);
+    let cached = fields(cached)?;
+    let requested = fields(requested)?;
     let requested = requested
         .as_object()
         .ok_or_else(|| failed!("settings are an object"))?;

@@ -19,7 +19,8 @@ use trainer::{ModelOptions, ModelSpec};
 
 /// Training time of a run if no flag limits it.
 const DEFAULT_SECONDS: f64 = 30.0;
-/// Losses of PSNR for which the size of the disturbance is reported, dB.
+/// Losses of PSNR for which the size of the disturbance is reported, dB: a visible loss, and half of
+/// the accuracy (twice the mean squared error).
 const BREAKS_DB: [f64; 2] = [1.0, 3.0];
 const NANOS_PER_SEC: f64 = 1e9;
 /// Difference between consecutive stamps that only count images, nanoseconds.
@@ -306,27 +307,31 @@ impl StabilityOptions {
             }
         };
         ensure!(!selected.is_empty(), "no disturbance is left to measure");
-        let plan = |disturbance: Disturbance| {
+        let mut plans = Vec::new();
+        for disturbance in selected {
             let requested = if self.levels.is_empty() {
                 disturbance.default_levels()
             } else {
                 &self.levels
             };
-            let rate_hz = rate_hz.filter(|_| disturbance == Disturbance::ClockOffset);
-            DisturbancePlan {
+            plans.push(DisturbancePlan {
                 disturbance,
                 levels: levels(disturbance, requested, n_train(data)),
                 nanos_per_sec,
-                rate_hz,
-            }
-        };
-        Ok(selected.into_iter().map(plan).collect())
+                // Stored with each run. Other disturbances do not depend on the rate, so their runs
+                // stay valid if it changes.
+                rate_hz: rate_hz.filter(|_| disturbance == Disturbance::ClockOffset),
+            });
+        }
+        Ok(plans)
     }
 }
 
 /// The sizes to measure, from none to the largest.
 fn levels(disturbance: Disturbance, requested: &[f64], n_train: usize) -> Vec<f64> {
     let mut levels = requested.to_vec();
+    // Undisturbed data come first, whether they are requested or not: the other results are
+    // compared with them.
     if disturbance == Disturbance::Keyframes {
         levels.iter_mut().for_each(|level| *level = level.round());
         levels.retain(|level| *level < n_train as f64);
@@ -386,48 +391,13 @@ impl Curve {
 impl DisturbanceResult {
     /// `of_one` is the label of the line if there is only one variant.
     fn chart(&self, subtitle: &str, of_one: &str) -> Chart {
-        let levels = || {
-            let mut levels: Vec<f64> = self
-                .variants
-                .iter()
-                .flat_map(|curve| &curve.points)
-                .map(|point| point.level)
-                .collect();
-            levels.sort_by(f64::total_cmp);
-            levels.dedup();
-            levels
-        };
         let (scale, ticks) = match self.disturbance.interpolation() {
-            Interpolation::Log => (Scale::Log, levels()),
-            Interpolation::Linear => (Scale::Levels(levels()), Vec::new()),
-        };
-        let marker = |line_ix: usize, at: &Break| {
-            let level = at.level?;
-            let label = format!(
-                "-{} dB at {} {}",
-                at.drop_db,
-                significant_digits(level),
-                self.unit
-            );
-            let label = if self.variants.len() > 1 {
-                format!("{}: {label}", self.variants[line_ix].name)
-            } else {
-                label
-            };
-            Some(Marker {
-                x: level,
-                label,
-                line_ix,
-            })
+            Interpolation::Log => (Scale::Log, self.levels()),
+            // Evenly spaced levels: the small ones would be on top of each other on a linear scale,
+            // and a logarithmic one has no 0.
+            Interpolation::Linear => (Scale::Levels(self.levels()), Vec::new()),
         };
         let curves = self.variants.iter().enumerate();
-        let label = |curve: &Curve| {
-            if self.variants.len() > 1 {
-                curve.name
-            } else {
-                of_one
-            }
-        };
         Chart {
             title: format!("PSNR of test images with {}", describe(self.disturbance)),
             subtitle: subtitle.to_owned(),
@@ -444,13 +414,74 @@ impl DisturbanceResult {
             lines: self
                 .variants
                 .iter()
-                .map(|curve| curve.line(label(curve)))
+                .map(|curve| {
+                    curve.line(if self.variants.len() > 1 {
+                        curve.name
+                    } else {
+                        of_one
+                    })
+                })
                 .collect(),
             thresholds: Vec::new(),
             markers: curves
-                .flat_map(|(ix, curve)| curve.breaks.iter().filter_map(move |at| marker(ix, at)))
+                .flat_map(|(ix, curve)| {
+                    curve
+                        .breaks
+                        .iter()
+                        .filter_map(move |at| self.marker(ix, at))
+                })
                 .collect(),
         }
+    }
+
+    /// All measured sizes, in ascending order.
+    fn levels(&self) -> Vec<f64> {
+        let mut levels: Vec<f64> = self
+            .variants
+            .iter()
+            .flat_map(|curve| &curve.points)
+            .map(|point| point.level)
+            .collect();
+        levels.sort_by(f64::total_cmp);
+        levels.dedup();
+        levels
+    }
+
+    /// The marker of a break point; `None` if it was not reached.
+    fn marker(&self, line_ix: usize, at: &Break) -> Option<Marker> {
+        let level = at.level?;
+        let label = format!(
+            "-{} dB at {} {}",
+            at.drop_db,
+            significant_digits(level),
+            self.unit
+        );
+        let label = if self.variants.len() > 1 {
+            format!("{}: {label}", self.variants[line_ix].name)
+        } else {
+            label
+        };
+        Some(Marker {
+            x: level,
+            label,
+            line_ix,
+        })
+    }
+
+    /// A row for each variant and size.
+    fn level_rows(&self) -> Vec<Vec<String>> {
+        let mut rows = Vec::new();
+        for curve in &self.variants {
+            for point in &curve.points {
+                rows.push(vec![
+                    format!("{}, {}", self.name, curve.name),
+                    format!("{} {}", compact_number(point.level), self.unit),
+                    format!("{:.2}", point.psnr),
+                    format!("{:+.2}", point.psnr - curve.points[0].psnr),
+                ]);
+            }
+        }
+        rows
     }
 
     fn rows(&self) -> impl Iterator<Item = Vec<String>> {
@@ -488,6 +519,16 @@ fn significant_digits(level: f64) -> String {
     }
 }
 
+/// Suffix of the file names of a chart.
+fn file_suffix(disturbance: Disturbance) -> &'static str {
+    match disturbance {
+        Disturbance::PoseNoise => "-pose-noise",
+        Disturbance::ClockOffset => "-clock-offset",
+        Disturbance::Exposure => "-exposure",
+        Disturbance::Keyframes => "-keyframes",
+    }
+}
+
 /// Writes the findings so far.
 fn findings(
     options: &StabilityOptions,
@@ -506,15 +547,12 @@ fn findings(
     };
     let subtitle = format!("after {length}; {spread}");
     let label = format!("{}, {}", data.name, data.single_model_spec()?.kind.name());
-    let part = |disturbance: Disturbance| match disturbance {
-        Disturbance::PoseNoise => "-pose-noise",
-        Disturbance::ClockOffset => "-clock-offset",
-        Disturbance::Exposure => "-exposure",
-        Disturbance::Keyframes => "-keyframes",
-    };
-    let charts = results
-        .iter()
-        .map(|result| (part(result.disturbance), result.chart(&subtitle, &label)));
+    let charts = results.iter().map(|result| {
+        (
+            file_suffix(result.disturbance),
+            result.chart(&subtitle, &label),
+        )
+    });
     let head = [
         "disturbance",
         "variant",
@@ -524,18 +562,7 @@ fn findings(
     ]
     .map(str::to_owned)
     .to_vec();
-    let level_rows = results.iter().flat_map(|result| {
-        result.variants.iter().flat_map(|curve| {
-            curve.points.iter().map(|point| {
-                vec![
-                    format!("{}, {}", result.name, curve.name),
-                    format!("{} {}", compact_number(point.level), result.unit),
-                    format!("{:.2}", point.psnr),
-                    format!("{:+.2}", point.psnr - curve.points[0].psnr),
-                ]
-            })
-        })
-    });
+    let level_rows = results.iter().flat_map(DisturbanceResult::level_rows);
     let level_head = ["disturbance, variant", "size", "PSNR, dB", "change, dB"]
         .map(str::to_owned)
         .to_vec();

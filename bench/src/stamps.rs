@@ -13,16 +13,17 @@ use session::chart::{Axis, Chart, Line, Point, Scale};
 use std::path::PathBuf;
 use std::time::Duration;
 
-/// Width of a histogram bin, milliseconds.
+/// Width of a histogram bin, milliseconds: a tenth of the error up to which a stamp counts as
+/// correct.
 const BIN_MILLIS: f64 = 0.1;
 /// Range of the histogram to either side, milliseconds. Larger errors are counted in the outermost
-/// bins.
+/// bins. An unknown fixed latency of a few milliseconds is inside.
 const HISTOGRAM_RANGE_MILLIS: f64 = 8.0;
 /// Joint states per second.
 const JOINT_RATE_HZ: u32 = 1000;
 /// Speed of the joint, rad/s. The joint angle encodes the time.
 const SPEED_RAD_S: f64 = 1.0;
-/// Error up to which a stamp counts as correct.
+/// Error up to which a stamp counts as correct. At 1 rad/s, it is an error of the pose of 1 mrad.
 const MAX_ERROR_MILLIS: f64 = 1.0;
 
 /// Options of [`run`] and [`measure`].
@@ -160,6 +161,7 @@ fn check(options: &StampsOptions) -> Result<()> {
 fn errors_millis(options: &StampsOptions, rate_hz: f64, seed: u64) -> Vec<f64> {
     let mut random = Random::new(seed);
     let mut clock = ClockMap::new();
+    // Joint states until after the last image could arrive: a stamp may be as late as its arrival.
     let n_readings =
         (options.seconds + options.fixed_millis * 1e-3 + options.jitter_millis * 1e-3 + 1.0)
             * f64::from(JOINT_RATE_HZ);
@@ -180,9 +182,11 @@ fn errors_millis(options: &StampsOptions, rate_hz: f64, seed: u64) -> Vec<f64> {
     let mut errors = Vec::new();
     for ix in 0..(options.seconds * rate_hz) as i64 {
         let shutter_secs = ix as f64 / rate_hz;
+        // The clock of the camera is slower by the drift.
         let device_nanos = (shutter_secs / (1.0 + options.drift_ppm * 1e-6) * 1e9) as i64;
         let latency_millis = options.fixed_millis + options.jitter_millis * random.unit();
         let arrival = Stamp(((shutter_secs + latency_millis * 1e-3) * 1e9) as i64);
+        // Also during the settling time, in which the map learns offset and drift.
         let stamp = clock.stamp(device_nanos, arrival);
         if shutter_secs < options.settle_seconds {
             continue;
@@ -236,47 +240,62 @@ impl StampErrors {
         };
         format!("{} Hz{suffix}", self.rate_hz)
     }
-}
 
-fn findings(options: &StampsOptions, results: &[StampErrors]) -> Result<Findings> {
-    let point = |(ix, fraction): (usize, &f64)| {
-        let y = 100.0 * fraction;
-        Point {
-            x: (ix as f64 + 0.5) * BIN_MILLIS - HISTOGRAM_RANGE_MILLIS,
-            y,
-            low: y,
-            high: y,
-        }
-    };
-    let line = |results: &StampErrors| {
+    /// The histogram as a line.
+    fn line(&self) -> Line {
         // Draws one empty bin on either side of the nonempty ones.
-        let first = results
+        let first = self
             .bars
             .iter()
             .position(|fraction| *fraction > 0.0)
             .unwrap_or(0)
             .saturating_sub(1);
-        let n_empty_after = results
+        let n_empty_after = self
             .bars
             .iter()
             .rev()
             .position(|fraction| *fraction > 0.0)
             .unwrap_or(0)
             .saturating_sub(1);
-        let n_drawn = results.bars.len() - n_empty_after - first;
+        let n_drawn = self.bars.len() - n_empty_after - first;
         Line {
-            label: results.label(),
-            points: results
+            label: self.label(),
+            points: self
                 .bars
                 .iter()
                 .enumerate()
                 .skip(first)
                 .take(n_drawn)
-                .map(point)
+                .map(|(ix, fraction)| bin_point(ix, *fraction))
                 .collect(),
-            is_peer: !results.is_calibrated,
+            is_peer: !self.is_calibrated,
         }
-    };
+    }
+
+    fn row(&self) -> Vec<String> {
+        vec![
+            self.label(),
+            format!("{}", self.images),
+            format!("{:.2}", 100.0 * self.within_1_ms_frac),
+            format!("{:+.3}", self.median_millis),
+            format!("{:.3}", self.p99_abs_millis),
+            format!("{:.3}", self.max_abs_millis),
+        ]
+    }
+}
+
+/// The point of a bin, in percent, at the middle of the bin.
+fn bin_point(bin_ix: usize, fraction: f64) -> Point {
+    let y = 100.0 * fraction;
+    Point {
+        x: (bin_ix as f64 + 0.5) * BIN_MILLIS - HISTOGRAM_RANGE_MILLIS,
+        y,
+        low: y,
+        high: y,
+    }
+}
+
+fn findings(options: &StampsOptions, results: &[StampErrors]) -> Result<Findings> {
     let conditions = format!(
         "{} ms fixed latency, 0 to {} ms of jitter, {} ppm of drift; {} runs of {} s, without the first {} s",
         options.fixed_millis,
@@ -286,16 +305,6 @@ fn findings(options: &StampsOptions, results: &[StampErrors]) -> Result<Findings
         options.seconds,
         options.settle_seconds
     );
-    let row = |results: &StampErrors| {
-        vec![
-            results.label(),
-            format!("{}", results.images),
-            format!("{:.2}", 100.0 * results.within_1_ms_frac),
-            format!("{:+.3}", results.median_millis),
-            format!("{:.3}", results.p99_abs_millis),
-            format!("{:.3}", results.max_abs_millis),
-        ]
-    };
     let head = [
         "camera",
         "images",
@@ -320,7 +329,7 @@ fn findings(options: &StampsOptions, results: &[StampErrors]) -> Result<Findings
                 subtitle: conditions,
                 x: Axis { label: "ms".to_owned(), scale: Scale::Linear, ticks: Vec::new() },
                 y: Axis { label: "share of images, % per 0.1 ms".to_owned(), scale: Scale::Linear, ticks: Vec::new() },
-                lines: results.iter().map(line).collect(),
+                lines: results.iter().map(StampErrors::line).collect(),
                 thresholds: Vec::new(),
                 markers: Vec::new(),
             },
@@ -328,7 +337,7 @@ fn findings(options: &StampsOptions, results: &[StampErrors]) -> Result<Findings
         tables: vec![Table {
             title: "Stamps".to_owned(),
             head: head.map(str::to_owned).to_vec(),
-            rows: results.iter().map(row).collect(),
+            rows: results.iter().map(StampErrors::row).collect(),
         }],
         numbers: serde_json::to_value(results)?,
     })

@@ -34,6 +34,8 @@ pub(crate) fn sample_std(values: &[f64]) -> Option<f64> {
 pub(crate) fn secs_to(curve: &[(f64, f64)], target_db: f64) -> Option<f64> {
     let at = curve.iter().position(|(_, psnr)| *psnr >= target_db)?;
     let (secs, psnr) = curve[at];
+    // Over the logarithm of time, curves are nearly straight between two evaluations, because the
+    // gain per doubling of the time changes slowly.
     let Some((previous_secs, earlier_psnr)) = at.checked_sub(1).map(|before| curve[before]) else {
         return Some(secs);
     };
@@ -75,7 +77,9 @@ pub(crate) fn break_point(
 ) -> Option<f64> {
     let floor = curve.first()?.1 - drop_db;
     let at = curve.iter().position(|(_, psnr)| *psnr <= floor)?;
-    let ((before, psnr_before), (level, psnr)) = (curve[at.checked_sub(1)?], curve[at]);
+    let (before, psnr_before) = curve[at.checked_sub(1)?];
+    let (level, psnr) = curve[at];
+    // The point before is above the floor, so the divisor is above 0.
     let frac = (psnr_before - floor) / (psnr_before - psnr);
     Some(match interpolation {
         Interpolation::Linear => before + frac * (level - before),

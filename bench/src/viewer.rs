@@ -17,9 +17,11 @@ use std::sync::Arc;
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-/// Angle between two views on the circle around the scene, radians.
+/// Angle between two views on the circle around the scene, radians. The view changes with every
+/// request, as when an operator moves it, so that no picture can be reused.
 const STEP_RAD: f64 = 0.05;
-/// Read timeout of the connection. The server sends its status several times per second.
+/// Read timeout of the connection. The server sends its status several times per second, but on a
+/// CPU, a training step or a picture may take many seconds.
 const MAX_SILENCE: Duration = Duration::from_secs(120);
 /// Time after the connection during which the server may have no picture yet.
 const MAX_START: Duration = Duration::from_secs(2);
@@ -198,6 +200,7 @@ impl Client {
             "the server responded {:?}, expected a WebSocket",
             line.trim_end()
         );
+        // The headers end with an empty line.
         while line.trim_end() != "" {
             line.clear();
             ensure!(
@@ -222,6 +225,8 @@ impl Client {
                 TEXT => self.handle_text(n_bytes)?,
                 BINARY => self.handle_binary(n_bytes)?,
                 PING => {
+                    // A ping has at most 125 bytes (RFC 6455, section 5.5). Without the answer, the
+                    // server closes the connection.
                     let mut contents = Vec::new();
                     (&mut self.reader)
                         .take(n_bytes.min(125))
@@ -244,23 +249,19 @@ impl Client {
             .as_f64()
             .and_then(|n| Duration::try_from_secs_f64(n * 1e-3).ok())
         {
+            // Each message is late by its own delay. The earliest estimate has the smallest one.
             let started = Instant::now().checked_sub(clock);
             self.server_started = self.server_started.into_iter().chain(started).min();
         }
         match message["type"].as_str() {
             Some("scene") => {
-                let number = |value: &Value| {
-                    value
-                        .as_f64()
-                        .ok_or_else(|| failed!("a scene message lacks a number"))
-                };
                 let center = &message["center_m"];
                 self.center_m = Point3::new(
-                    number(&center[0])?,
-                    number(&center[1])?,
-                    number(&center[2])?,
+                    scene_number(&center[0])?,
+                    scene_number(&center[1])?,
+                    scene_number(&center[2])?,
                 );
-                self.radius_m = number(&message["radius_m"])?;
+                self.radius_m = scene_number(&message["radius_m"])?;
             }
             // At first, the server cannot draw a picture yet.
             Some("error") => {
@@ -268,6 +269,7 @@ impl Client {
                 if !self.pictures.lock().is_empty() || self.started.elapsed() > MAX_START {
                     log::warn!("a viewer received no picture: {message}");
                 }
+                // A request at once would get the same answer.
                 std::thread::sleep(Duration::from_millis(200));
                 self.request_picture()?;
             }
@@ -291,6 +293,8 @@ impl Client {
         if header["type"] != "part" {
             return self.handle_picture(&header, payload);
         }
+        // The server sends large messages in parts, so that others do not wait for them. The parts
+        // of one message arrive in order.
         if header["offset"] == 0 {
             self.parts.clear();
         }
@@ -322,6 +326,8 @@ impl Client {
                 encode_millis: millis("encode_millis"),
                 n_keyframes,
             });
+            // Only the first picture with a new keyframe, so that decoding takes little time from
+            // the measured run.
             if n_keyframes > self.n_keyframes {
                 self.n_keyframes = n_keyframes;
                 self.show(header, payload)?;
@@ -334,13 +340,9 @@ impl Client {
 
     /// Decodes a picture and reports that it is shown.
     fn show(&mut self, header: &Value, payload: &[u8]) -> Result<()> {
-        let number = |name: &str| {
-            header["color"][name]
-                .as_u64()
-                .and_then(|n| usize::try_from(n).ok())
-        };
-        let jpeg = number("offset")
-            .zip(number("bytes"))
+        let color = &header["color"];
+        let jpeg = index(&color["offset"])
+            .zip(index(&color["bytes"]))
             .and_then(|(offset, n)| payload.get(offset..)?.get(..n));
         let jpeg = jpeg.ok_or_else(|| failed!("a picture without color: {header}"))?;
         image::load_from_memory_with_format(jpeg, image::ImageFormat::Jpeg)
@@ -356,26 +358,30 @@ impl Client {
     /// Requests the next image on a circle around the scene.
     fn request_picture(&mut self) -> Result<()> {
         let angle = self.n_requested as f64 * STEP_RAD;
-        let (is_panorama, size_px) = (self.options.is_panorama, self.options.size_px);
+        let is_panorama = self.options.is_panorama;
+        // A panorama is taken near the center, a pinhole view from outside and above.
         let distance_m = if is_panorama { 0.2 } else { 1.5 } * self.radius_m;
         let offset = Vector3::new(angle.cos(), angle.sin(), 0.7) * distance_m;
         // The y axis of `face_towards` points up, but that of a camera points down.
         let world_from_camera =
             Transform::face_towards(&(self.center_m + offset), &self.center_m, &-Vector3::z());
+        let projection = if is_panorama {
+            json!({ "kind": "equirectangular" })
+        } else {
+            json!({ "kind": "pinhole", "vertical_fov_rad": 0.9 })
+        };
         let request = json!({
             "type": "render",
             "id": self.n_requested,
             "world_from_camera": world_from_camera.to_homogeneous().transpose().as_slice(),
-            "size_px": size_px,
-            "projection": match is_panorama {
-                true => json!({ "kind": "equirectangular" }),
-                false => json!({ "kind": "pinhole", "vertical_fov_rad": 0.9 }),
-            },
+            "size_px": self.options.size_px,
+            "projection": projection,
             "outputs": ["color", "depth"],
             "depth_format": "compact_half",
         });
         self.n_requested += 1;
-        (self.requested, self.first_stage) = (Instant::now(), None);
+        self.requested = Instant::now();
+        self.first_stage = None;
         self.send(TEXT, request.to_string().as_bytes())
     }
 
@@ -388,6 +394,8 @@ impl Client {
             is_final,
             "the server sent a fragmented message, expected one frame per message"
         );
+        // RFC 6455, section 5.2: lengths from 126 on are in the next 2 or 8 bytes. The highest bit
+        // marks a mask, which only clients use.
         let n_bytes = match head[1] {
             126 => {
                 let mut bytes = [0; 2];
@@ -443,6 +451,18 @@ impl Client {
         frame.extend(contents);
         Ok(self.stream.write_all(&frame)?)
     }
+}
+
+/// A number of a message about the scene.
+fn scene_number(value: &Value) -> Result<f64> {
+    value
+        .as_f64()
+        .ok_or_else(|| failed!("a scene message lacks a number"))
+}
+
+/// An index or a length; `None` if it is not a whole number that this computer can address.
+fn index(value: &Value) -> Option<usize> {
+    usize::try_from(value.as_u64()?).ok()
 }
 
 /// Header and payload of a binary message.

@@ -8,8 +8,10 @@ use keyframe::Keyframe;
 use kinematics::Stamp;
 use std::sync::Arc;
 
-/// Step at which training waits for the result and applies it. It is smaller on software adapters,
-/// where a step takes as long as alignment.
+/// Step at which training waits for the result and applies it.
+///
+/// A later step leaves more time for alignment, so that training waits less, but trains longer with
+/// wrong poses. It is smaller on software adapters, where a step takes as long as alignment.
 const ALIGNMENT_STEP: u64 = 400;
 const SOFTWARE_ALIGNMENT_STEP: u64 = 50;
 
@@ -20,6 +22,7 @@ pub fn alignment_step(is_software: bool, n_planned_steps: u64) -> u64 {
     } else {
         ALIGNMENT_STEP
     };
+    // Short trainings must have steps left to use the result.
     default_step.min(n_planned_steps / 4).max(1)
 }
 
@@ -90,6 +93,8 @@ impl AlignmentTask {
 
     /// Starts alignment of uncorrected keyframes on its own thread.
     pub fn begin(&mut self, keyframes: &[Arc<Keyframe>], choice: &CameraRefinement) {
+        // Movements of cameras are not estimated by alignment. Images before and after one would
+        // contradict each other without it.
         let choice = choice.clone();
         let with_movements = |keyframe: &Arc<Keyframe>| match &self.result {
             Some(result) => result.with_movements(keyframe),
@@ -120,9 +125,11 @@ impl AlignmentTask {
         {
             return Ok(false);
         }
+        // Movements may have been found while alignment ran.
         if let Some(latest) = &self.result {
             result.movements.clone_from(&latest.movements);
         }
+        // Correcting keyframes again moves the model, so it is avoided for negligible changes.
         let is_changed = match &self.result {
             None => result.has_corrections(),
             Some(latest) => keyframes
@@ -174,20 +181,26 @@ fn is_as_good(latest: &Alignment, newer: &Alignment, keyframes: &[Arc<Keyframe>]
     if !latest.has_corrections() || keyframes.iter().any(|keyframe| keyframe.depth.is_some()) {
         return false;
     }
-    let agrees = |keyframe: &Arc<Keyframe>| {
-        let [latest, newer] = [latest, newer].map(|alignment| alignment.camera(keyframe, None));
-        let motion = latest.world_from_camera.inverse() * newer.world_from_camera;
-        let has_same_lens = (0..2).all(|axis| {
-            let focal = (latest.focal_px[axis] / newer.focal_px[axis]).ln().abs();
-            let principal =
-                (latest.principal_px[axis] - newer.principal_px[axis]).abs() / newer.focal_px[axis];
-            focal.max(principal) < COLOR_ACCURACY_RAD
-        });
-        let is_same_pose = motion.rotation.angle() < COLOR_ACCURACY_RAD
-            && motion.translation.vector.norm() < COLOR_ACCURACY_M;
-        is_same_pose && has_same_lens
-    };
-    !newer.has_corrections() || keyframes.iter().all(agrees)
+    !newer.has_corrections()
+        || keyframes
+            .iter()
+            .all(|keyframe| agrees(latest, newer, keyframe))
+}
+
+/// Whether two corrections of a keyframe agree within the accuracy of estimates from color.
+fn agrees(latest: &Alignment, newer: &Alignment, keyframe: &Keyframe) -> bool {
+    let [latest, newer] = [latest, newer].map(|alignment| alignment.camera(keyframe, None));
+    let motion = latest.world_from_camera.inverse() * newer.world_from_camera;
+    // Changes of the lens are compared as the angles by which they move a pixel.
+    let has_same_lens = (0..2).all(|axis| {
+        let focal = (latest.focal_px[axis] / newer.focal_px[axis]).ln().abs();
+        let principal =
+            (latest.principal_px[axis] - newer.principal_px[axis]).abs() / newer.focal_px[axis];
+        focal.max(principal) < COLOR_ACCURACY_RAD
+    });
+    let is_same_pose = motion.rotation.angle() < COLOR_ACCURACY_RAD
+        && motion.translation.vector.norm() < COLOR_ACCURACY_M;
+    is_same_pose && has_same_lens
 }
 
 /// Detects camera movements in the background. Its keyframes already have the corrections of
@@ -199,6 +212,7 @@ pub struct MovementTask {
     pending: Vec<Arc<Keyframe>>,
 }
 
+/// Where the detector is.
 #[derive(Debug)]
 enum Worker {
     /// The detector has not yet been created from its reference keyframes.
@@ -207,6 +221,17 @@ enum Worker {
     Running(Task<(MovementDetector, Option<CameraMovement>)>),
     /// A movement was found.
     Done,
+}
+
+/// Tests keyframes until a movement is found. Later ones are compared with new references.
+fn tested(
+    mut detector: MovementDetector,
+    keyframes: &[Arc<Keyframe>],
+) -> (MovementDetector, Option<CameraMovement>) {
+    let movement = keyframes
+        .iter()
+        .find_map(|keyframe| detector.push(keyframe));
+    (detector, movement)
 }
 
 impl MovementTask {
@@ -228,6 +253,8 @@ impl MovementTask {
         if self.pending.is_empty() {
             return;
         }
+        // The detector moves to the thread and comes back with its result. Creating it prepares all
+        // references, so that is done on the thread, too.
         let detector: Box<dyn FnOnce() -> MovementDetector + Send> =
             match std::mem::replace(&mut self.worker, Worker::Done) {
                 Worker::New(references) => Box::new(move || MovementDetector::new(&references)),
@@ -235,13 +262,7 @@ impl MovementTask {
                 busy => return self.worker = busy,
             };
         let keyframes = std::mem::take(&mut self.pending);
-        let test = move || {
-            let mut detector = detector();
-            let movement = keyframes
-                .iter()
-                .find_map(|keyframe| detector.push(keyframe));
-            (detector, movement)
-        };
+        let test = move || tested(detector(), &keyframes);
         self.worker = Worker::Running(Task::start("movement", || run_in_background_pool(test)));
     }
 
@@ -255,6 +276,7 @@ impl MovementTask {
                 Worker::Running(thread) if wait || thread.is_finished() => {
                     let (detector, movement) =
                         thread.join().map_err(|_| Error::AlignmentPanicked)?;
+                    // The references of this detector are outdated, so it is dropped.
                     if movement.is_some() {
                         return Ok(movement);
                     }

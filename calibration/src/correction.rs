@@ -88,7 +88,8 @@ pub struct CalibratedCamera {
     pub gains: [f64; 3],
 }
 
-/// Maximum relative difference between two focal lengths that is negligible.
+/// Maximum relative difference between two focal lengths that is negligible: 0.6 px at the border of
+/// an image of 1280 px.
 const NOTICEABLE_FOCAL: f64 = 1e-3;
 
 impl CalibratedCamera {
@@ -135,6 +136,7 @@ impl CameraCorrection {
     /// The corrected camera of a keyframe; [`CalibratedCamera::of`] is the uncorrected one.
     pub fn apply(&self, keyframe: &Keyframe) -> CalibratedCamera {
         let lens = CalibratedCamera::of(keyframe);
+        // Each correction is a motion in camera axes, from the raw to the corrected camera.
         let time_offset = self.time_corrected_from_input(keyframe);
         let mut by_joints = Twist::zero();
         for (twist, offset) in keyframe.joint_twists.iter().zip(&self.joint_offsets) {
@@ -148,9 +150,12 @@ impl CameraCorrection {
             Vector3::new(rotation_x, rotation_y, rotation_z),
             Vector3::new(x, y, z),
         );
+        // From right to left, in the order of causes: the time of the exposure, the joints, the pose
+        // of this image, and the mount of the camera.
         let world_from_camera =
             (extrinsics * drift * joints * time_offset * lens.world_from_camera.inverse())
                 .inverse();
+        // Velocities are given at the raw camera, and differ at the corrected one by its lever arm.
         let raw_from_corrected = lens.world_from_camera.inverse() * world_from_camera;
         let shutter = |shutter: Shutter| Shutter {
             twist: shutter.twist.of_attached(&raw_from_corrected),
@@ -219,6 +224,7 @@ impl CameraCorrection {
             let principal = |axis: usize| {
                 depth.principal_px[axis] + self.principal_offset_focals[axis] * depth.focal_px[axis]
             };
+            // Without a correction, the readings are shared instead of copied.
             let factor = f32_of(self.log_depth_scale.exp());
             DepthMap {
                 size_px: depth.size_px,
@@ -295,12 +301,14 @@ pub fn drift_weight(drift: &BTreeMap<i64, [f64; 6]>, scene_size_m: f64) -> f64 {
         .iter()
         .map(|(stamp, parts)| (*stamp as f64, parts))
         .collect();
+    // Squared length of a motion.
     let squares = |parts: [f64; 6]| {
         let [rotation, translation] =
             [&parts[..3], &parts[3..]].map(|parts| parts.iter().map(|x| x * x).sum::<f64>());
         rotation * scene_size_m * scene_size_m + translation
     };
-    let (mut residual, mut all) = (0.0, 0.0);
+    let mut residual = 0.0;
+    let mut all = 0.0;
     for neighbors in known.windows(3) {
         let [(begin, from), (stamp, own), (end, to)] = [neighbors[0], neighbors[1], neighbors[2]];
         let frac = (stamp - begin) / (end - begin);
@@ -324,7 +332,8 @@ pub fn rigid_transform(rotation_rad: Vector3<f64>, translation_m: Vector3<f64>) 
 /// Whether the depth image has the same lens as the color image, for example because it was
 /// registered to the color image. If so, lens corrections apply to both.
 pub fn shares_lens(keyframe: &Keyframe, depth: &DepthMap) -> bool {
-    const TOLERANCE_FRAC: f64 = 1e-4; // Sizes are rounded to pixels.
+    // Sizes are rounded to pixels.
+    const TOLERANCE_FRAC: f64 = 1e-4;
     [0, 1].into_iter().all(|axis| {
         let share = f64::from(depth.size_px[axis]) / f64::from(keyframe.size_px[axis]);
         let difference_px = (depth.focal_px[axis] - share * keyframe.focal_px[axis]).abs()

@@ -22,10 +22,8 @@ pub type Joints = [f64; 4];
 /// Azimuth, elevation, roll (radians) and reach (meters).
 fn base_from_flange([azimuth, elevation, roll, reach]: Joints) -> Transform {
     let rotation = |axis: Vector3<f64>, angle: f64| {
-        Isometry3::from_parts(
-            Translation3::identity(),
-            UnitQuaternion::from_scaled_axis(axis * angle),
-        )
+        let rotation = UnitQuaternion::from_scaled_axis(axis * angle);
+        Isometry3::from_parts(Translation3::identity(), rotation)
     };
     let translation = |x: f64, y: f64, z: f64| Isometry3::translation(x, y, z);
     // At zero, the flange looks along x, with its x axis to the right: -y of the base.
@@ -59,14 +57,16 @@ pub fn joints_at(secs: f64, azimuth_only: bool) -> Joints {
     let wave = |size: f64, hz: f64, phase: f64| {
         size * (2.0 * std::f64::consts::PI * hz * secs + phase).sin()
     };
-    match azimuth_only {
-        true => [wave(0.5, 0.11, 0.2), 0.15, 0.2, 0.1],
-        false => [
+    if azimuth_only {
+        [wave(0.5, 0.11, 0.2), 0.15, 0.2, 0.1]
+    } else {
+        // Frequencies without a common period, so that no configuration repeats.
+        [
             wave(0.4, 0.11, 0.2),
             0.15 + wave(0.25, 0.23, 1.0),
             wave(0.5, 0.17, 2.0),
             0.1 + wave(0.1, 0.31, 0.5),
-        ],
+        ]
     }
 }
 
@@ -74,9 +74,8 @@ pub fn joints_at(secs: f64, azimuth_only: bool) -> Joints {
 fn twist_along(joints: Joints, direction: Joints) -> Twist {
     const STEP: f64 = 1e-5;
     let at = |sign: f64| {
-        camera_at(std::array::from_fn(|ix| {
-            joints[ix] + sign * STEP * direction[ix]
-        }))
+        let step = sign * STEP;
+        camera_at(std::array::from_fn(|ix| joints[ix] + step * direction[ix]))
     };
     transform::log(&(at(-1.0).inverse() * at(1.0)), 2.0 * STEP)
 }
@@ -91,16 +90,16 @@ fn cast(from: Point3<f64>, ray: Vector3<f64>) -> (f64, f64) {
         (Vector3::new(0.8, 0.2, -1.0).normalize(), 0.75),
         (Vector3::z(), 1.4),
     ];
-    let distance = |(normal, offset): &(Vector3<f64>, f64)| {
+    let mut nearest = f64::INFINITY;
+    for (normal, offset) in planes {
         let along = normal.dot(&ray);
         let distance = (offset - normal.dot(&from.coords)) / along;
+        // Planes behind the camera, or seen from outside the room, do not count.
         if along > 0.0 && distance > 0.0 {
-            distance
-        } else {
-            f64::INFINITY
+            nearest = nearest.min(distance);
         }
-    };
-    let nearest = planes.iter().map(distance).fold(f64::INFINITY, f64::min);
+    }
+    // A sum of waves in space: a texture with gradients in all directions, at several scales.
     let p = from + ray * nearest;
     let wave = |size: f64, x: f64, y: f64, z: f64, phase: f64| {
         size * (x * p.x + y * p.y + z * p.z + phase).sin()
@@ -166,78 +165,123 @@ fn noise(key: u64) -> f64 {
     Random::new(key).normal()
 }
 
+/// Distance of the nearest plane at the center of a pixel, along the optical axis, and the
+/// brightness there.
+fn cast_pixel(pose: &Transform, x: usize, y: usize) -> (f64, f64) {
+    let at = [x as f64 + 0.5, y as f64 + 0.5];
+    // With a z of 1, distances along the ray are depths.
+    let ray = Vector3::new(
+        (at[0] - PRINCIPAL_PX[0]) / FOCAL_PX[0],
+        (at[1] - PRINCIPAL_PX[1]) / FOCAL_PX[1],
+        1.0,
+    );
+    cast(Point3::from(pose.translation.vector), pose.rotation * ray)
+}
+
 /// Keyframes of a scan of the room.
-#[expect(
-    clippy::cast_possible_truncation,
-    clippy::cast_sign_loss,
-    reason = "bytes and stamps of a test"
-)]
 pub fn capture(miscalibration: &Miscalibration) -> Vec<Arc<Keyframe>> {
-    let image = |ix: usize| {
-        let secs = 0.3 * ix as f64 + 0.05 * (ix as f64 * 1.7).sin();
-        let joints = |secs: f64| joints_at(secs, miscalibration.azimuth_only);
+    (0..N_IMAGES)
+        .into_par_iter()
+        .map(|ix| {
+            let shot = Shot {
+                miscalibration,
+                ix,
+                // Irregular times: images do not fall on the same phases of the joints.
+                secs: 0.3 * ix as f64 + 0.05 * (ix as f64 * 1.7).sin(),
+            };
+            Arc::new(shot.keyframe())
+        })
+        .collect()
+}
+
+/// One image of the scan.
+struct Shot<'a> {
+    miscalibration: &'a Miscalibration,
+    ix: usize,
+    /// Time of the exposure.
+    secs: f64,
+}
+
+impl Shot<'_> {
+    /// True joint positions at a time.
+    fn joints(&self, secs: f64) -> Joints {
+        joints_at(secs, self.miscalibration.azimuth_only)
+    }
+
+    /// Noise of a pixel of the color image (stream 0) or of depth (stream 1). It does not depend on
+    /// the order of threads.
+    fn noise(&self, pixel: usize, stream: u64) -> f64 {
+        let key = self.miscalibration.seed * 1_000_003
+            + (self.ix as u64 * 100_000 + pixel as u64) * 2
+            + stream;
+        noise(key)
+    }
+
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "rounded and clamped"
+    )]
+    fn rgba(&self) -> Vec<u8> {
         let [width, height] = SIZE_PX.map(|side| side as usize);
-        let cast_pixel = |pose: &Transform, x: usize, y: usize| {
-            let at = [x as f64 + 0.5, y as f64 + 0.5];
-            let ray = Vector3::new(
-                (at[0] - PRINCIPAL_PX[0]) / FOCAL_PX[0],
-                (at[1] - PRINCIPAL_PX[1]) / FOCAL_PX[1],
-                1.0,
-            );
-            cast(Point3::from(pose.translation.vector), pose.rotation * ray)
-        };
-        let key = |pixel: usize, stream: u64| {
-            miscalibration.seed * 1_000_003 + (ix as u64 * 100_000 + pixel as u64) * 2 + stream
-        };
         let mut rgba = Vec::new();
         for y in 0..height {
+            // The middle row is exposed at the time of the image.
             let share = (y as f64 + 0.5) / height as f64 - 0.5;
-            let pose = camera_at(joints(
-                secs + if miscalibration.has_rolling_shutter {
-                    share * READOUT_SECS
-                } else {
-                    0.0
-                },
-            ));
+            let delay_secs = if self.miscalibration.has_rolling_shutter {
+                share * READOUT_SECS
+            } else {
+                0.0
+            };
+            let pose = camera_at(self.joints(self.secs + delay_secs));
             for x in 0..width {
                 let (_, value) = cast_pixel(&pose, x, y);
-                let value = (value + miscalibration.noise * noise(key(y * width + x, 0)))
+                let value = (value + self.miscalibration.noise * self.noise(y * width + x, 0))
                     .round()
                     .clamp(0.0, 255.0) as u8;
                 rgba.extend([value, value, value, 255]);
             }
         }
-        let depth_from_true = Transform::new(Vector3::new(0.02, 0.0, 0.0), Vector3::zeros());
-        let depth_pose = camera_at(joints(secs)) * depth_from_true;
-        let depth_m: Vec<f32> = (0..width * height)
+        rgba
+    }
+
+    #[expect(clippy::cast_possible_truncation, reason = "depth is stored as f32")]
+    fn depth_m(&self, depth_pose: &Transform) -> Vec<f32> {
+        let [width, height] = SIZE_PX.map(|side| side as usize);
+        (0..width * height)
             .map(|pixel| {
-                let z = cast_pixel(&depth_pose, pixel % width, pixel / width).0;
-                ((z + 0.0007 * miscalibration.noise * z * z * noise(key(pixel, 1)))
-                    * (1.0 - miscalibration.depth_frac)) as f32
+                let z = cast_pixel(depth_pose, pixel % width, pixel / width).0;
+                // The noise of stereo cameras grows with the square of the distance.
+                ((z + 0.0007 * self.miscalibration.noise * z * z * self.noise(pixel, 1))
+                    * (1.0 - self.miscalibration.depth_frac)) as f32
             })
-            .collect();
-        let reported_joints = {
-            let moved = joints(secs - miscalibration.time_offset_secs);
-            std::array::from_fn(|joint| moved[joint] - miscalibration.joints[joint])
-        };
+            .collect()
+    }
+
+    #[expect(clippy::cast_possible_truncation, reason = "the stamp of a test")]
+    fn keyframe(&self) -> Keyframe {
+        let miscalibration = self.miscalibration;
+        let depth_from_true = Transform::new(Vector3::new(0.02, 0.0, 0.0), Vector3::zeros());
+        let depth_m = self.depth_m(&(camera_at(self.joints(self.secs)) * depth_from_true));
+        // Everything that is reported contains the errors, while the images show the truth.
+        let reported_secs = self.secs - miscalibration.time_offset_secs;
+        let moved = self.joints(reported_secs);
+        let reported_joints =
+            std::array::from_fn(|joint| moved[joint] - miscalibration.joints[joint]);
         let reported = camera_at(reported_joints) * miscalibration.extrinsics;
         let attached = |twist: Twist| twist.of_attached(&miscalibration.extrinsics);
-        let rates = {
-            let (before, after) = (
-                joints(secs - miscalibration.time_offset_secs - 1e-4),
-                joints(secs - miscalibration.time_offset_secs + 1e-4),
-            );
-            std::array::from_fn(|joint| (after[joint] - before[joint]) / 2e-4)
-        };
+        let before = self.joints(reported_secs - 1e-4);
+        let after = self.joints(reported_secs + 1e-4);
+        let rates = std::array::from_fn(|joint| (after[joint] - before[joint]) / 2e-4);
         let unit =
             |joint: usize| std::array::from_fn(|other| if joint == other { 1.0 } else { 0.0 });
-        Arc::new(Keyframe {
+        Keyframe {
             camera: "wrist".into(),
-            stamp: Stamp((secs * 1e9) as i64),
+            stamp: Stamp((self.secs * 1e9) as i64),
             size_px: SIZE_PX,
             focal_px: FOCAL_PX.map(|focal| focal * (1.0 + miscalibration.focal_frac)),
             principal_px: PRINCIPAL_PX,
-            rgba_srgb: rgba.into(),
+            rgba_srgb: self.rgba().into(),
             depth: Some(DepthMap {
                 size_px: SIZE_PX,
                 focal_px: FOCAL_PX,
@@ -256,11 +300,10 @@ pub fn capture(miscalibration: &Miscalibration) -> Vec<Arc<Keyframe>> {
                 .map(|joint| attached(twist_along(reported_joints, unit(joint))))
                 .collect(),
             base: None,
-            split: Split::of(ix),
+            split: Split::of(self.ix),
             truth: None,
-        })
-    };
-    (0..N_IMAGES).into_par_iter().map(image).collect()
+        }
+    }
 }
 
 /// An extrinsics error of about 1 degree and 5 mm.

@@ -10,14 +10,18 @@ use kinematics::{Stamp, Transform, Twist, transform};
 use nalgebra::{Matrix6, Vector6};
 use std::collections::{BTreeSet, VecDeque};
 
-/// Number of images at different poses before a contradiction is reported.
+/// Number of images at different poses before a contradiction is reported. Fewer could share an
+/// error, such as a blurred tag.
 const MIN_IMAGES: usize = 8;
-/// Number of latest images that are compared.
+/// Number of latest images that are compared. More would average images from before and after a
+/// movement for longer.
 const MAX_IMAGES: usize = 24;
 /// Smaller differences are not reported: measured tags and robots are rarely more accurate.
 const MIN_TRANSLATION_M: f64 = 0.005;
 const MIN_ROTATION_RAD: f64 = 0.0087;
-/// A difference is significant from this multiple of its standard deviation.
+/// A difference is significant from this multiple of its standard deviation. The check is repeated
+/// with every image for hours, and the errors of images are not normal, so it is larger than in a
+/// single test.
 const MIN_SIGMAS: f64 = 5.0;
 /// Images of a camera that moves less than this show the same errors and count once, unless this
 /// time has passed.
@@ -110,25 +114,29 @@ impl TagCheck {
         Some(contradiction)
     }
 
+    /// Residuals of a prediction of all images.
+    fn residuals(&self, predicted: impl Fn(&TagObservation) -> Transform) -> Vec<Vector6<f64>> {
+        self.observations
+            .iter()
+            .map(|observation| twist(&(predicted(observation).inverse() * observation.seen)))
+            .collect()
+    }
+
+    /// The contradiction in the images so far, if it is significant.
     fn contradiction(&self) -> Option<TagContradiction> {
         let n = self.observations.len();
         if n < MIN_IMAGES {
             return None;
         }
+        // Two explanations: a constant motion in the frame of the camera, or in the world.
         let in_camera =
             |observation: &TagObservation| observation.calibrated.inverse() * observation.seen;
         let in_world =
             |observation: &TagObservation| observation.seen * observation.calibrated.inverse();
         let mean_in_camera = mean(self.observations.iter().map(in_camera))?;
         let mean_in_world = mean(self.observations.iter().map(in_world))?;
-        let residual = |predicted: &dyn Fn(&TagObservation) -> Transform| -> Vec<Vector6<f64>> {
-            self.observations
-                .iter()
-                .map(|observation| twist(&(predicted(observation).inverse() * observation.seen)))
-                .collect()
-        };
-        let of_camera = residual(&|observation| observation.calibrated * mean_in_camera);
-        let of_world = residual(&|observation| mean_in_world * observation.calibrated);
+        let of_camera = self.residuals(|observation| observation.calibrated * mean_in_camera);
+        let of_world = self.residuals(|observation| mean_in_world * observation.calibrated);
         let [squares_of_camera, squares_of_world] =
             [&of_camera, &of_world].map(|residuals| squares(residuals));
         let cause = if squares_of_camera * CLEARER.powi(2) < squares_of_world {
@@ -159,20 +167,14 @@ impl TagCheck {
         // A tag that has moved shows in other camera axes at each pose: those of the latest image
         // are used.
         let latest = self.observations.back()?.calibrated;
-        let difference = match squares_of_camera <= squares_of_world {
-            true => twist(&mean_in_camera),
-            false => twist(&(latest.inverse() * mean_in_world * latest)),
+        let difference = if squares_of_camera <= squares_of_world {
+            twist(&mean_in_camera)
+        } else {
+            twist(&(latest.inverse() * mean_in_world * latest))
         };
         let mean_covariance = (scatter + stated) / n as f64;
-        let with_sigma = |first: usize| {
-            let part = difference.fixed_rows::<3>(first).into_owned();
-            let direction = part.try_normalize(0.0)?;
-            let variance = (direction.transpose()
-                * mean_covariance.fixed_view::<3, 3>(first, first)
-                * direction)[0];
-            Some([part.norm(), sigma_of(variance)])
-        };
-        let (translation_m, rotation_rad) = (with_sigma(0)?, with_sigma(3)?);
+        let translation_m = norm_with_sigma(&difference, &mean_covariance, 0)?;
+        let rotation_rad = norm_with_sigma(&difference, &mean_covariance, 3)?;
         let is_significant =
             |[value, sigma]: [f64; 2], min: f64| value > min && value > MIN_SIGMAS * sigma;
         let is_off = is_significant(translation_m, MIN_TRANSLATION_M)
@@ -193,6 +195,21 @@ impl TagCheck {
     }
 }
 
+/// Norm of three components of a vector, starting with `first`, and its standard deviation. `None`
+/// if they are zero.
+fn norm_with_sigma(
+    vector: &Vector6<f64>,
+    covariance: &Matrix6<f64>,
+    first: usize,
+) -> Option<[f64; 2]> {
+    let part = vector.fixed_rows::<3>(first).into_owned();
+    let direction = part.try_normalize(0.0)?;
+    let variance =
+        (direction.transpose() * covariance.fixed_view::<3, 3>(first, first) * direction)[0];
+    Some([part.norm(), sigma_of(variance)])
+}
+
+/// Whether an image adds nothing to an earlier one.
 fn is_same_view(a: &TagObservation, b: &TagObservation) -> bool {
     let motion = a.calibrated.inverse() * b.calibrated;
     motion.translation.vector.norm() < MIN_STEP_M
@@ -209,22 +226,14 @@ fn mean(transforms: impl Iterator<Item = Transform>) -> Option<Transform> {
         .map(|other| twist(&(first.inverse() * other)))
         .sum();
     let mean = sum / transforms.len() as f64;
-    let (linear, angular) = (
-        mean.fixed_rows::<3>(0).into_owned(),
-        mean.fixed_rows::<3>(3).into_owned(),
-    );
-    Some(
-        first
-            * transform::exp(
-                &Twist {
-                    linear_m_s: linear,
-                    angular_rad_s: angular,
-                },
-                1.0,
-            ),
-    )
+    let mean = Twist {
+        linear_m_s: mean.fixed_rows::<3>(0).into_owned(),
+        angular_rad_s: mean.fixed_rows::<3>(3).into_owned(),
+    };
+    Some(first * transform::exp(&mean, 1.0))
 }
 
+/// The motion as a vector: translation, then rotation.
 fn twist(motion: &Transform) -> Vector6<f64> {
     let Twist {
         linear_m_s: linear,
@@ -235,6 +244,7 @@ fn twist(motion: &Transform) -> Vector6<f64> {
     )
 }
 
+/// Sum of the squared lengths of residuals, square meters.
 fn squares(residuals: &[Vector6<f64>]) -> f64 {
     let square = |residual: &Vector6<f64>| {
         residual.fixed_rows::<3>(0).norm_squared()

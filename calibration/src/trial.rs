@@ -5,13 +5,14 @@ use crate::ParamSet;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
-/// Minimum number of validation images for a trial.
+/// Minimum number of validation images for a trial. The standard error of fewer is too uncertain.
 pub const MIN_VALIDATION_IMAGES: usize = 4;
-/// Minimum gain of camera parameters and of a color degree, dB.
+/// Minimum gain of camera parameters and of a color degree, dB. Smaller gains are not visible.
 const MIN_GAIN_DB: f64 = 0.05;
-/// Minimum gain in standard errors.
+/// Minimum gain in standard errors: about 2 % of useless changes exceed it by chance.
 const MIN_STANDARD_ERRORS: f64 = 2.0;
-/// Minimum gain that justifies twice as many splats, dB.
+/// Minimum gain that justifies twice as many splats, dB. It is larger than the others, because more
+/// splats take more time and memory in every step.
 const MIN_GAIN_OF_DOUBLING_DB: f64 = 0.1;
 
 /// Selection of the camera parameters to optimize.
@@ -180,8 +181,10 @@ impl Trial {
             mean: gain_db,
             standard_error: standard_error_db,
         } = MeanGain::of(gains_db);
-        let (n_images, min_db) = (gains_db.len(), candidate.min_gain_db());
-        // In case of doubt, neither additions nor reductions are accepted.
+        let n_images = gains_db.len();
+        let min_db = candidate.min_gain_db();
+        // In case of doubt, neither additions nor reductions are accepted. Comparisons with NaN are
+        // false, so a failed score accepts nothing.
         let is_significant = match candidate {
             Candidate::Halved { .. } | Candidate::ShDegree { .. } => {
                 -gain_db + 0.5 * standard_error_db <= min_db
@@ -191,6 +194,7 @@ impl Trial {
                 gain_db > f64::max(min_db, MIN_STANDARD_ERRORS * standard_error_db)
             }
         };
+        // A single image has no standard error.
         let kept = n_images > 1 && is_significant;
         Self {
             candidate,

@@ -13,22 +13,29 @@ use kinematics::{Chain, JointState, Stamp, Transform};
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
-/// Largest change of a joint in one step, radians or meters.
+/// Largest change of a joint in one step, radians or meters. After each step, the position is
+/// checked, so this also bounds how far the arm pushes against an obstacle. Smaller steps are safer
+/// and slower.
 const MAX_STEP: f64 = 0.25;
 /// Time before an image during which the arm must stand still: longer than stamps are wrong and
 /// mounts vibrate.
 const SETTLE_SECS: f64 = 0.3;
 /// Largest drift of a joint during that time, radians or meters: the difference between the means
 /// of both halves, which averages the noise of encoders.
+///
+/// With a smaller value, arms that sway or have coarse encoders never count as resting. A larger one
+/// lets images of a moving camera through: 3e-4 rad at an arm's length of 1 m is 0.3 mm.
 const MAX_DRIFT: f64 = 3e-4;
 /// Maximum time until the arm stands still and an image arrives.
 const MAX_WAIT_SECS: f64 = 15.0;
 /// Largest distance of a joint from its target after a motion, and largest correction of its sag,
-/// radians or meters. Arms without gravity compensation sag.
+/// radians or meters. Arms without gravity compensation sag by their load divided by their
+/// stiffness. Larger values let the arm push harder against an obstacle before it retreats.
 const MAX_ERROR: f64 = 0.1;
-/// The measured flange may be this much farther from its start than allowed for targets, meters.
+/// The measured flange may be this much farther from its start than allowed for targets, meters. It
+/// allows for the sag that remains within [`MAX_ERROR`] of the joints.
 const DISTANCE_TOLERANCE_M: f64 = 0.03;
-/// Duration of one wait for an image.
+/// Duration of one wait for an image. It bounds the time until a fault of the arm is noticed.
 const POLL: Duration = Duration::from_millis(20);
 /// Number of joint states kept: those of four seconds at 1 kHz.
 const MAX_STATES: usize = 4000;
@@ -85,17 +92,16 @@ impl ArmCapture {
         let chain = chain_of(&rig)?;
         let order = chain.order_in(&rig.arm.joints)?;
         let arm = SupervisedArm::new(arm, &rig);
-        let (accepted, limit, recent, first) = (None, None, VecDeque::new(), None);
         Ok(Self {
             rig,
             chain,
             order,
             arm,
-            accepted,
-            limit,
+            accepted: None,
+            limit: None,
             camera,
-            recent,
-            first,
+            recent: VecDeque::new(),
+            first: None,
         })
     }
 
@@ -157,6 +163,8 @@ impl ArmCapture {
             if stop.requested() {
                 return Ok(false);
             }
+            // All joints move in proportion, so that the path is a straight line in joint space for
+            // any number of steps.
             let share = f64::from(step) / f64::from(n_steps);
             let waypoint = from
                 .iter()
@@ -172,6 +180,9 @@ impl ArmCapture {
     fn step_to(&mut self, joints: &[f64], stop: &Stop) -> crate::Result<bool> {
         let free = self.read()?.position;
         // A command to stay here: the previous target, unless someone has moved the arm since then.
+        // The sag of the last step is the best prediction for the next one, because the load
+        // changes little within a step. Commanding target plus sag brings the joint to the target
+        // itself.
         let accepted = self.accepted.get_or_insert_with(|| free.clone());
         let sag = accepted
             .iter()
@@ -184,7 +195,8 @@ impl ArmCapture {
             .map(|(actual, sag)| actual + sag)
             .collect();
         // Joints that do not move the camera keep their target.
-        let (mut target, mut expected) = (stay.clone(), free.clone());
+        let mut target = stay.clone();
+        let mut expected = free.clone();
         for (value, ix) in joints.iter().zip(&self.order) {
             target[*ix] = value + sag[*ix];
             expected[*ix] = *value;
@@ -192,6 +204,8 @@ impl ArmCapture {
         let Some(state) = self.go(&target, stop)? else {
             return Ok(false);
         };
+        // An arm that is off its target after a motion probably touches something. Continuing would
+        // increase the force, so the arm goes back first, and the error follows.
         if let Some(problem) = self.problem(&state, &expected)? {
             let end = self
                 .retreat(&stay, &free, stop)
@@ -208,6 +222,7 @@ impl ArmCapture {
             position: position.to_vec(),
         })?;
         self.accepted = Some(accepted.position);
+        // A borrow of this field alone, because the arm is borrowed at the same time.
         let recent = &mut self.recent;
         let end = self.arm.follow(stop, |state| remember(recent, state))?;
         if !end.has_arrived {
@@ -254,11 +269,14 @@ impl ArmCapture {
         expected: &[f64],
         stop: &Stop,
     ) -> crate::Result<&'static str> {
+        // The previous step was reached without contact, so the way back to it is free.
         if let Some(state) = self.go(stay, stop)?
             && largest_error(&state.position, expected).is_none_or(|(_, error)| error <= MAX_ERROR)
         {
             return Ok("the arm has returned to the previous step");
         }
+        // Back at the current position, the motors no longer push. A stop request must not prevent
+        // that.
         let here = self.read()?.position;
         self.go(&here, &Stop::default())?;
         Ok("the arm did not return to the previous step, and holds where it is")
@@ -270,6 +288,8 @@ impl ArmCapture {
     /// # Errors
     /// If a device fails, the arm does not come to rest, or no image can be decoded.
     pub fn image(&mut self, stop: &Stop) -> crate::Result<Option<CalibrationImage>> {
+        // The wait starts at the newest state, not at one that has waited in a queue since before
+        // the motion.
         self.read_queued()?;
         let began = self.read()?.stamp;
         let wait = Wait {
@@ -295,6 +315,8 @@ impl ArmCapture {
                 ) => continue,
                 Err(error) => return Err(error.into()),
             };
+            // All rows are exposed between `start` and `end`. The arm must also have been at rest
+            // for some time before, because it swings after a motion.
             let [start, end] = self.exposure(&image);
             let settling = start.plus_secs(-SETTLE_SECS);
             if image.is_depth() {
@@ -307,18 +329,8 @@ impl ArmCapture {
                 };
                 continue;
             }
-            while self.recent.back().is_none_or(|newest| newest.stamp < end) {
-                if stop.requested() {
-                    return Ok(None);
-                }
-                let now = self.read()?.stamp;
-                self.check_wait(
-                    &wait,
-                    now,
-                    &Seen::Early {
-                        secs: end.secs_since(now),
-                    },
-                )?;
+            if !self.wait_for_states(end, &wait, stop)? {
+                return Ok(None);
             }
             let joints = match self.joints_at_rest(settling, end) {
                 Ok(joints) => joints,
@@ -331,20 +343,48 @@ impl ArmCapture {
                 seen = Seen::Undecodable;
                 continue;
             };
-            let pose = self.chain.forward(&joints)?;
-            return Ok(Some(CalibrationImage {
-                secs: self
-                    .first
-                    .map_or(0.0, |first| image.stamp.secs_since(first)),
-                size_px: image.size_px,
-                gray,
-                arm: Some(ArmDuringImage {
-                    base_from_flange: pose,
-                    base_from_flange_at_rows: [pose; 2],
-                    joints,
-                }),
-            }));
+            return Ok(Some(self.calibration_image(&image, gray, joints)?));
         }
+    }
+
+    /// Waits until joint states cover an image that is exposed until `end`. Returns false if a stop
+    /// was requested.
+    fn wait_for_states(&mut self, end: Stamp, wait: &Wait, stop: &Stop) -> crate::Result<bool> {
+        while self.recent.back().is_none_or(|newest| newest.stamp < end) {
+            if stop.requested() {
+                return Ok(false);
+            }
+            let now = self.read()?.stamp;
+            // If the clocks of camera and arm differ, `end` may never come.
+            let seen = Seen::Early {
+                secs: end.secs_since(now),
+            };
+            self.check_wait(wait, now, &seen)?;
+        }
+        Ok(true)
+    }
+
+    /// The calibration image of a camera image that was exposed with the arm at rest.
+    fn calibration_image(
+        &self,
+        image: &Image,
+        gray: Vec<u8>,
+        joints: Vec<f64>,
+    ) -> crate::Result<CalibrationImage> {
+        let pose = self.chain.forward(&joints)?;
+        Ok(CalibrationImage {
+            secs: self
+                .first
+                .map_or(0.0, |first| image.stamp.secs_since(first)),
+            size_px: image.size_px,
+            gray,
+            arm: Some(ArmDuringImage {
+                base_from_flange: pose,
+                // At rest, all rows see the same pose.
+                base_from_flange_at_rows: [pose; 2],
+                joints,
+            }),
+        })
     }
 
     /// Reads the joint states that have arrived, so that a slow caller does not fall behind.
@@ -358,9 +398,11 @@ impl ArmCapture {
     }
 
     fn check_wait(&self, wait: &Wait, now: Stamp, seen: &Seen) -> crate::Result<()> {
-        let secs = match self.camera.waits_for_caller() {
-            true => now.secs_since(wait.began),
-            false => wait.since.elapsed().as_secs_f64(),
+        // Simulated devices stand still between reads, so only their own time counts.
+        let secs = if self.camera.waits_for_caller() {
+            now.secs_since(wait.began)
+        } else {
+            wait.since.elapsed().as_secs_f64()
         };
         if secs <= MAX_WAIT_SECS {
             return Ok(());
@@ -399,6 +441,8 @@ impl ArmCapture {
         let mid = camera.mid_exposure(image.stamp);
         let configured = camera.exposure_micros.map(|micros| 1e-6 * micros);
         let exposure_secs = image.exposure_secs.or(configured).unwrap_or(0.0);
+        // The first row starts half an exposure before its middle, and the last row ends half an
+        // exposure after its own.
         let half_secs = 0.5 * (1e-6 * camera.readout_micros.unwrap_or(0.0) + exposure_secs);
         [mid.plus_secs(-half_secs), mid.plus_secs(half_secs)]
     }
@@ -406,6 +450,7 @@ impl ArmCapture {
     /// Mean of the joints over a time span, in the order of the chain. An error if the states do
     /// not cover it, or if a joint moves.
     fn joints_at_rest(&self, start: Stamp, end: Stamp) -> Result<Vec<f64>, Seen> {
+        // Each half of the span needs at least two states for a mean.
         const MIN_STATES: usize = 4;
         let [oldest, newest] = [self.recent.front(), self.recent.back()];
         let covers = oldest.is_some_and(|state| state.stamp <= start)
@@ -418,6 +463,8 @@ impl ArmCapture {
         if !covers || span.len() < MIN_STATES {
             return Err(Seen::FewStates);
         }
+        // Means of both halves, because the noise of single readings may exceed the drift that
+        // matters.
         let (early, late) = span.split_at(span.len() / 2);
         match largest_error(&mean(early), &mean(late)) {
             Some((joint_ix, drift)) if drift > MAX_DRIFT => Err(Seen::Drift { joint_ix, drift }),

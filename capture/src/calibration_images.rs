@@ -19,13 +19,16 @@ use std::time::Duration;
 
 /// Maximum number of joint readings kept: those of 20 s at 1 kHz.
 const MAX_READINGS: usize = 20_000;
-/// Maximum number of images that wait for joint readings.
+/// Maximum number of images that wait for joint readings. If the arm stops reporting, older images
+/// are dropped, so that memory stays bounded.
 const MAX_WAITING: usize = 64;
-/// Maximum number of images kept.
+/// Maximum number of images kept. Calibration needs tens of images; more cost memory and time.
 const MAX_IMAGES: usize = 300;
-/// Interval between images of a robot without an arm, seconds.
+/// Interval between images of a robot without an arm, seconds. Images of a target held by hand that
+/// follow more closely show nearly the same view.
 const INTERVAL_SECS: f64 = 0.5;
-/// Uncertainty of image stamps for the check of the speed, seconds.
+/// Uncertainty of image stamps for the check of the speed, seconds. A larger value keeps only images
+/// of slower motions.
 const STAMP_SIGMA_SECS: f64 = 0.002;
 
 /// A gray image.
@@ -103,6 +106,7 @@ pub fn calibration_images(
         }
         reader.push(sample);
     }
+    // Images that still wait will never get joint readings.
     reader.found.n_unusable += reader.waiting.len();
     Ok(CalibrationImages {
         damage: damage.get().cloned(),
@@ -165,6 +169,7 @@ impl<'a> Reader<'a> {
     }
 
     fn push(&mut self, sample: Sample) {
+        // The time of all images counts from the first sample of any device.
         self.first.get_or_insert(sample.stamp());
         match sample {
             Sample::Joints(state) => {
@@ -182,6 +187,7 @@ impl<'a> Reader<'a> {
             }
             _ => return,
         }
+        // In order: while the oldest image waits for readings, later ones do, too.
         while let Some(image) = self.waiting.pop_front() {
             match self.arm_during(&image) {
                 Err(HistoryError::NotYet { .. }) => {
@@ -206,7 +212,9 @@ impl<'a> Reader<'a> {
         let half_secs = 0.5 * self.readout_secs();
         let [first, middle, last] =
             [-half_secs, 0.0, half_secs].map(|secs| arm.joints.at(mid.plus_secs(secs)));
-        let (first, middle, last) = (first?, middle?, last?);
+        let first = first?;
+        let middle = middle?;
+        let last = last?;
         // Readings have as many joints as the chain.
         let forward = |joints: &JointState| arm.chain.forward(&joints.position).unwrap_or_default();
         Ok(Some(ArmDuringImage {
@@ -220,6 +228,7 @@ impl<'a> Reader<'a> {
         let secs = self
             .first
             .map_or(0.0, |first| image.stamp.secs_since(first));
+        // From cheap to expensive: the pose is compared before the image is decoded.
         if self.found.images.len() >= MAX_IMAGES || !self.is_different(secs, arm.as_ref()) {
             return;
         }
@@ -245,7 +254,6 @@ impl<'a> Reader<'a> {
     /// Whether the pose differs from those of all images kept; without an arm, whether the last one
     /// is old enough.
     fn is_different(&self, secs: f64, arm: Option<&ArmDuringImage>) -> bool {
-        let join = &self.rig.join;
         let Some(arm) = arm else {
             return self
                 .found
@@ -253,17 +261,21 @@ impl<'a> Reader<'a> {
                 .last()
                 .is_none_or(|last| secs - last.secs >= INTERVAL_SECS);
         };
-        let is_near = |other: &ArmDuringImage| {
-            let motion = other.base_from_flange.inverse() * arm.base_from_flange;
-            motion.translation.vector.norm() < join.min_translation_m
-                && motion.rotation.angle() < join.min_rotation_rad
-        };
+        // Compared with all images, not only with the last one: a robot often returns to a pose.
         !self
             .found
             .images
             .iter()
             .filter_map(|image| image.arm.as_ref())
-            .any(is_near)
+            .any(|other| self.is_near(other, arm))
+    }
+
+    /// Whether two poses of the flange are closer than the minimum spacing of keyframes.
+    fn is_near(&self, one: &ArmDuringImage, other: &ArmDuringImage) -> bool {
+        let join = &self.rig.join;
+        let motion = one.base_from_flange.inverse() * other.base_from_flange;
+        motion.translation.vector.norm() < join.min_translation_m
+            && motion.rotation.angle() < join.min_rotation_rad
     }
 
     /// Maximum predicted image motion over readout, exposure and stamp uncertainty, pixels.
@@ -293,9 +305,13 @@ impl<'a> Reader<'a> {
             }
             _ => (first.inverse() * last, readout_secs),
         };
+        // A rotation moves every pixel by about the focal length times its angle. A translation
+        // acts like a rotation by translation over distance. The sum is an upper bound for both.
         let focal_px = self.camera.intrinsics.focal_px[0];
         let angle = motion.rotation.angle()
             + motion.translation.vector.norm() / self.rig.join.default_depth_m;
+        // Speed in pixels per second, times the time for which the position of a pixel is
+        // uncertain.
         focal_px * angle / secs * (readout_secs + exposure_secs.unwrap_or(0.0) + STAMP_SIGMA_SECS)
     }
 }
@@ -324,6 +340,8 @@ impl Arm {
             .iter()
             .map(|ix| state.velocity.get(*ix).copied())
             .collect::<Option<Vec<f64>>>();
+        // A reading with too few joints is dropped. Velocities are optional: without them,
+        // positions are interpolated linearly.
         if let Some(position) = position.collect::<Option<Vec<f64>>>() {
             let velocity = velocity.unwrap_or_default();
             let _ = self.joints.push(JointState {

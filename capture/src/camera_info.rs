@@ -24,8 +24,8 @@ pub struct CameraInfo {
     pub notes: Vec<String>,
 }
 
-/// Names of a key in files, in messages of ROS 1 and in messages of ROS 2. At most one of them may
-/// be used.
+/// Names of a key in files, in messages of ROS 1 and in messages of ROS 2. A file may use at most
+/// one of them.
 type Names = &'static [&'static str];
 
 const WIDTH: Names = &["image_width", "width"];
@@ -100,8 +100,8 @@ impl CameraInfo {
     }
 }
 
-/// Replaces a ROS `CameraInfo` object, of a message or file, by one with the keys of samples files;
-/// leaves an object without a camera matrix unchanged. Returns notes for the user.
+/// Replaces a ROS `CameraInfo` object from a message or file with an object that has the keys of
+/// samples files. Does not change objects without a camera matrix. Returns notes for the user.
 ///
 /// # Errors
 /// As for [`CameraInfo::parse`].
@@ -116,15 +116,18 @@ pub fn convert(intrinsics: &mut Value) -> Result<Vec<String>, String> {
     Ok(info.notes)
 }
 
-/// Parses YAML or JSON. The line of dashes that `rostopic echo` and `ros2 topic echo` print after a
-/// message may follow.
+/// Parses YAML or JSON. Ignores the line of dashes that `rostopic echo` and `ros2 topic echo` print
+/// after a message.
 ///
 /// # Errors
 /// If the text is neither; the message gives line and column.
 pub fn parse_value(text: &str) -> Result<Value, String> {
+    // Checked first: OpenCV's header is no valid YAML directive, and the message of the parser
+    // would not name the cause.
     if text.starts_with("%YAML:") {
         return Err("it is YAML of OpenCV, expected a camera_info file of ROS".to_owned());
     }
+    // JSON first: most of it is valid YAML, too, but its own parser is the stricter one.
     if let Ok(value) = serde_json::from_str(text) {
         return Ok(value);
     }
@@ -141,16 +144,18 @@ pub fn is_yaml(text: &str) -> bool {
     let mut lines = text
         .lines()
         .filter(|line| !line.is_empty() && !line.starts_with(['#', '%']) && *line != "---");
-    let is_key = |word: &str| {
-        !word.is_empty()
-            && word
-                .chars()
-                .all(|c| c.is_ascii_alphanumeric() || "_-".contains(c))
-    };
     lines
         .next()
         .and_then(|line| line.split_once(':'))
         .is_some_and(|(key, _)| is_key(key.trim_start_matches("- ")))
+}
+
+/// Whether a word can be a key, so that other formats with colons are not taken for YAML.
+fn is_key(word: &str) -> bool {
+    !word.is_empty()
+        && word
+            .chars()
+            .all(|c| c.is_ascii_alphanumeric() || "_-".contains(c))
 }
 
 /// The key that is used and its value; `None` if there is none. `null` counts as missing.
@@ -161,6 +166,7 @@ fn find(
     let mut found = names
         .iter()
         .filter_map(|name| Some((*name, object.get(*name).filter(|value| !value.is_null())?)));
+    // Two names of a key in one file would leave open which of them counts.
     match (found.next(), found.next()) {
         (Some((name, _)), Some((other, _))) => Err(format!(
             "{name} and {other} mean the same: keep one of them"
@@ -187,18 +193,16 @@ fn numbers(key: &str, value: &Value) -> Result<Vec<f64>, String> {
         }
         None => value,
     };
+    // One value that is no number makes the whole list invalid, instead of shifting the others.
     let numbers: Option<Vec<f64>> = list
         .as_array()
         .and_then(|list| list.iter().map(Value::as_f64).collect());
     let numbers = numbers.ok_or_else(|| format!("{key} must be a list of numbers"))?;
-    let side = |name: &str| {
-        value.get(name).map(|side| {
-            side.as_u64()
-                .ok_or_else(|| format!("{key}: {name} is {side}, expected a number"))
-        })
-    };
-    if let (Some(rows), Some(cols)) = (side("rows").transpose()?, side("cols").transpose()?)
-        && rows.checked_mul(cols) != Some(numbers.len() as u64)
+    // A file that was edited by hand may have lost a number.
+    if let (Some(rows), Some(cols)) = (
+        dimension(key, value, "rows")?,
+        dimension(key, value, "cols")?,
+    ) && rows.checked_mul(cols) != Some(numbers.len() as u64)
     {
         return Err(format!(
             "{key} has {rows} rows and {cols} columns, but {} numbers",
@@ -206,6 +210,17 @@ fn numbers(key: &str, value: &Value) -> Result<Vec<f64>, String> {
         ));
     }
     Ok(numbers)
+}
+
+/// The value of `rows` or `cols` of a matrix; `None` if it is not given.
+fn dimension(key: &str, value: &Value, name: &str) -> Result<Option<u64>, String> {
+    value
+        .get(name)
+        .map(|side| {
+            side.as_u64()
+                .ok_or_else(|| format!("{key}: {name} is {side}, expected a number"))
+        })
+        .transpose()
 }
 
 fn matrix_of<const N: usize>(key: &str, value: &Value) -> Result<[f64; N], String> {
@@ -217,18 +232,7 @@ fn matrix_of<const N: usize>(key: &str, value: &Value) -> Result<[f64; N], Strin
 }
 
 fn size_px(object: &Map<String, Value>) -> Result<Option<[u32; 2]>, String> {
-    let side = |names: Names| {
-        let Some((key, value)) = find(object, names)? else {
-            return Ok(None);
-        };
-        let px = value
-            .as_u64()
-            .and_then(|px| u32::try_from(px).ok())
-            .filter(|px| *px > 0);
-        px.map(Some)
-            .ok_or_else(|| format!("{key} is {value}, expected a number of pixels"))
-    };
-    match (side(WIDTH)?, side(HEIGHT)?) {
+    match (side_px(object, WIDTH)?, side_px(object, HEIGHT)?) {
         (Some(width), Some(height)) => Ok(Some([width, height])),
         (None, None) => Ok(None),
         (Some(_), None) => Err("the height of the images is missing".to_owned()),
@@ -236,7 +240,20 @@ fn size_px(object: &Map<String, Value>) -> Result<Option<[u32; 2]>, String> {
     }
 }
 
-/// Rejects images that are smaller than those of the camera matrix.
+/// The width or height of the images; `None` if it is not given.
+fn side_px(object: &Map<String, Value>, names: Names) -> Result<Option<u32>, String> {
+    let Some((key, value)) = find(object, names)? else {
+        return Ok(None);
+    };
+    let px = value
+        .as_u64()
+        .and_then(|px| u32::try_from(px).ok())
+        .filter(|px| *px > 0);
+    px.map(Some)
+        .ok_or_else(|| format!("{key} is {value}, expected a number of pixels"))
+}
+
+/// Rejects binned and cropped images, because the camera matrix is that of whole images.
 fn check_region(object: &Map<String, Value>, size_px: Option<[u32; 2]>) -> Result<(), String> {
     const REMEDY: &str =
         "the camera matrix is that of whole images; calibrate with images as they are recorded";
@@ -256,6 +273,7 @@ fn check_region(object: &Map<String, Value>, size_px: Option<[u32; 2]>) -> Resul
             "{key} must have the keys x_offset, y_offset, width and height"
         ));
     }
+    // Drivers write zeros for a region that is the whole image, or its full size.
     let number = |name: &str| roi.get(name).unwrap_or(&Value::Null).clone();
     let is_zero = |name: &str| number(name).is_null() || number(name) == 0;
     let is_whole = |name: &str, ix: usize| {
@@ -272,6 +290,8 @@ fn lens(object: &Map<String, Value>) -> Result<Lens, String> {
         Some((key, list)) => numbers(key, list)?,
         None => Vec::new(),
     };
+    // Zeros at the end change nothing. Without them, a longer list of coefficients fits a model
+    // with fewer.
     while coefficients.last() == Some(&0.0) {
         coefficients.pop();
     }
@@ -284,26 +304,28 @@ fn lens(object: &Map<String, Value>) -> Result<Lens, String> {
     // Drivers of cameras without distortion often leave the model empty.
     let model = if model.is_empty() { "plumb_bob" } else { model };
     let n = coefficients.len();
-    let too_many = |max: usize| {
-        Err(format!(
-            "{n} distortion coefficients that are not 0; {model} has at most {max}"
-        ))
-    };
     match model {
         "plumb_bob" | "rational_polynomial" if n == 0 => Ok(Lens::Pinhole),
         "plumb_bob" | "rational_polynomial" if n <= 5 => {
             Ok(Lens::BrownConrady(padded(&coefficients)))
         }
-        "plumb_bob" => too_many(5),
+        "plumb_bob" => too_many(n, model, 5),
         "rational_polynomial" if n <= 8 => Ok(Lens::RationalBrownConrady(padded(&coefficients))),
-        "rational_polynomial" => too_many(8),
+        "rational_polynomial" => too_many(n, model, 8),
         // Without coefficients, this is still a fisheye: the angle is proportional to the radius.
         "equidistant" | "fisheye" if n <= 4 => Ok(Lens::KannalaBrandt(padded(&coefficients))),
-        "equidistant" | "fisheye" => too_many(4),
+        "equidistant" | "fisheye" => too_many(n, model, 4),
         other => Err(format!(
             "distortion_model {other:?} is not supported, expected plumb_bob, rational_polynomial, equidistant or fisheye"
         )),
     }
+}
+
+/// The error for `n` coefficients that are not 0, where the model has at most `max`.
+fn too_many(n: usize, model: &str, max: usize) -> Result<Lens, String> {
+    Err(format!(
+        "{n} distortion coefficients that are not 0; {model} has at most {max}"
+    ))
 }
 
 /// The coefficients, followed by zeros.
@@ -321,6 +343,9 @@ fn notes(object: &Map<String, Value>, camera_matrix: &[f64; 9]) -> Result<Vec<St
     }
     if let Some((key, value)) = find(object, PROJECTION)? {
         let projection: [f64; 12] = matrix_of(key, value)?;
+        // The projection matrix of an unrectified monocular camera repeats the camera matrix, with
+        // 0 in the fourth column. Anything else describes rectified images or the baseline of a
+        // stereo pair.
         let [a, b, c, d] =
             [0, 1, 2, 3].map(|column| [0, 1, 2].map(|row| projection[4 * row + column]));
         let of_raw_images =
@@ -336,7 +361,19 @@ fn notes(object: &Map<String, Value>, camera_matrix: &[f64; 9]) -> Result<Vec<St
             rectified.join(", ")
         ));
     }
-    let known = [
+    let unknown: Vec<&String> = object.keys().filter(|key| !is_known(key)).collect();
+    if !unknown.is_empty() {
+        notes.push(format!(
+            "unknown keys are not used: {}",
+            kinematics::shortened(&unknown, MAX_NAMED, ", ")
+        ));
+    }
+    Ok(notes)
+}
+
+/// Whether a key belongs to camera info.
+fn is_known(key: &str) -> bool {
+    const KNOWN: [Names; 9] = [
         WIDTH,
         HEIGHT,
         CAMERA_MATRIX,
@@ -347,20 +384,10 @@ fn notes(object: &Map<String, Value>, camera_matrix: &[f64; 9]) -> Result<Vec<St
         ROI,
         UNUSED,
     ];
-    let is_known = |key: &str| {
-        known
-            .iter()
-            .chain(&BINNING)
-            .any(|names| names.contains(&key))
-    };
-    let unknown: Vec<&String> = object.keys().filter(|key| !is_known(key)).collect();
-    if !unknown.is_empty() {
-        notes.push(format!(
-            "unknown keys are not used: {}",
-            kinematics::shortened(&unknown, MAX_NAMED, ", ")
-        ));
-    }
-    Ok(notes)
+    KNOWN
+        .iter()
+        .chain(&BINNING)
+        .any(|names| names.contains(&key))
 }
 
 #[cfg(test)]

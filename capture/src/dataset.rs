@@ -12,8 +12,10 @@ use std::sync::{Arc, OnceLock};
 
 /// Name of the only camera of a dataset.
 const CAMERA: &str = "camera";
-/// Maximum number of pixels of the photos that are decoded at the same time, unless a single photo
-/// has more: 134 million. Each takes 4 to 12 bytes until the photo is scaled.
+/// Maximum number of pixels of the photos that are decoded at the same time: 134 million, which is
+/// also the maximum of a single photo. Each takes 4 to 12 bytes until the photo is scaled, so
+/// decoding needs at most about 1.6 GB. With a larger limit, more threads decode large photos at
+/// once, and more memory is needed.
 const MAX_PX_AT_ONCE: u64 = 1 << 27;
 
 /// The photos of a dataset as keyframes: undistorted and scaled, with the poses of the dataset.
@@ -49,7 +51,7 @@ pub fn load(
     load_few_at_once(dataset, holdout, scale_frac, MAX_PX_AT_ONCE, on_progress)
 }
 
-/// Loads as [`load`] does, and decodes photos with at most this many pixels in total at the same
+/// Like [`load`], but decodes photos with at most `max_px_at_once` pixels in total at the same
 /// time.
 fn load_few_at_once(
     dataset: &Dataset,
@@ -58,6 +60,7 @@ fn load_few_at_once(
     max_px_at_once: u64,
     on_progress: &(dyn Fn(usize) + Sync),
 ) -> crate::Result<LoadedDataset> {
+    // Errors that need no decoding are reported before minutes are spent on it.
     for image in &dataset.images {
         downscale::intrinsics(&image.intrinsics, scale_frac).with_context(|| image.name.clone())?;
     }
@@ -69,42 +72,46 @@ fn load_few_at_once(
         .iter()
         .map(|image| image.name.as_str())
         .collect();
-    let listed = || {
-        dataset
-            .images
-            .iter()
-            .map(|image| image.listed.map(split_of))
-            .collect::<Option<Vec<Split>>>()
-    };
-    let splits = match holdout.map_or_else(listed, |_| None) {
-        Some(listed) => listed,
-        None => {
+    let splits = splits_of(dataset, holdout, &names)?;
+    let results = decode_all(dataset, &splits, scale_frac, max_px_at_once, on_progress);
+    collect(dataset, results)
+}
+
+/// The split of each photo: from `holdout`, else as listed in the dataset, else the default.
+fn splits_of(
+    dataset: &Dataset,
+    holdout: Option<&Holdout>,
+    names: &[&str],
+) -> crate::Result<Vec<Split>> {
+    // The lists count only if they contain every photo.
+    let listed = dataset
+        .images
+        .iter()
+        .map(|image| image.listed.map(split_of))
+        .collect::<Option<Vec<Split>>>();
+    match (holdout, listed) {
+        (None, Some(listed)) => Ok(listed),
+        _ => {
             let holdout = holdout.cloned().unwrap_or_default();
             holdout
-                .splits(&names)
-                .with_context(|| dataset.path.display().to_string())?
+                .splits(names)
+                .with_context(|| dataset.path.display().to_string())
         }
-    };
+    }
+}
+
+/// Converts the photos in the order of the dataset; returns the name and the result of each.
+fn decode_all(
+    dataset: &Dataset,
+    splits: &[Split],
+    scale_frac: f64,
+    max_px_at_once: u64,
+    on_progress: &(dyn Fn(usize) + Sync),
+) -> Vec<(String, crate::Result<Converted>)> {
     let n_done = AtomicUsize::new(0);
     let camera: Arc<str> = CAMERA.into();
-    let load_one = |(lens, image, split): (&LensMaps, &DatasetImage, Split)| {
-        let keyframe = keyframe(lens, image, scale_frac);
-        on_progress(n_done.fetch_add(1, Ordering::Relaxed) + 1);
-        (
-            image.name.clone(),
-            keyframe.map(|converted| Converted {
-                keyframe: Keyframe {
-                    camera: camera.clone(),
-                    split,
-                    ..converted.keyframe
-                },
-                ..converted
-            }),
-        )
-    };
-
     // Photos with the same lens follow each other, so only one set of maps is in memory at a time.
-    let mut results = Vec::with_capacity(names.len());
+    let mut results = Vec::with_capacity(dataset.images.len());
     let mut start = 0;
     for run in dataset.images.chunk_by(|a, b| a.intrinsics == b.intrinsics) {
         let lens = LensMaps::of(&run[0].intrinsics);
@@ -115,22 +122,37 @@ fn load_few_at_once(
         );
         let n_at_once = n_at_once.unwrap_or(run.len());
         let run_splits = &splits[start..start + run.len()];
+        // The photos of a chunk are decoded in parallel. The next chunk waits for all of them, so
+        // that no more than one chunk is decoded but not scaled.
         for (images, image_splits) in run.chunks(n_at_once).zip(run_splits.chunks(n_at_once)) {
             let jobs = images.par_iter().zip(image_splits);
-            results.par_extend(jobs.map(|(image, split)| load_one((&lens, image, *split))));
+            results.par_extend(jobs.map(|(image, split)| {
+                let converted = keyframe(&lens, image, scale_frac);
+                on_progress(n_done.fetch_add(1, Ordering::Relaxed) + 1);
+                let converted = converted.map(|converted| converted.assigned_to(&camera, *split));
+                (image.name.clone(), converted)
+            }));
         }
         start += run.len();
     }
+    results
+}
 
-    let (notes, data_losses) = (dataset.notes.clone(), dataset.data_losses.clone());
+/// Collects the results. One photo that does not decode must not cost the others, so its error
+/// becomes a message.
+fn collect(
+    dataset: &Dataset,
+    results: Vec<(String, crate::Result<Converted>)>,
+) -> crate::Result<LoadedDataset> {
     let mut loaded = LoadedDataset {
         keyframes: Vec::new(),
         names: Vec::new(),
-        notes,
-        data_losses,
+        notes: dataset.notes.clone(),
+        data_losses: dataset.data_losses.clone(),
     };
-    let (mut image_errors, mut depth_errors, mut mask_warnings) =
-        (Vec::new(), Vec::new(), Vec::new());
+    let mut image_errors = Vec::new();
+    let mut depth_errors = Vec::new();
+    let mut mask_warnings = Vec::new();
     for (name, result) in results {
         match result {
             Ok(Converted {
@@ -171,8 +193,8 @@ fn load_few_at_once(
     Ok(loaded)
 }
 
-/// Number of photos of this size, at least 1, that are decoded at the same time, so that together
-/// they have at most `max_px` pixels; `None` if each thread may decode one.
+/// Number of photos of this size that may be decoded at the same time. It is at least 1; otherwise,
+/// the photos have at most `max_px` pixels in total. `None` if each thread may decode one.
 fn n_at_once(size_px: [u32; 2], max_px: u64, n_threads: usize) -> Option<usize> {
     let n_px: u64 = size_px.map(u64::from).iter().product();
     let n_photos = usize::try_from(max_px / n_px.max(1)).unwrap_or(usize::MAX);
@@ -199,7 +221,9 @@ fn check_memory(dataset: &Dataset, scale_frac: f64, available_bytes: u64) -> cra
     if n_bytes <= available_bytes {
         return Ok(());
     }
+    // Memory is proportional to the square of the scale.
     let fitting = scale_frac * (available_bytes as f64 / n_bytes as f64).sqrt();
+    // Rounded down, so that the suggested scale fits.
     let remedy = match (100.0 * fitting).floor() / 100.0 {
         scale if scale >= downscale::MIN_SCALE => {
             format!(
@@ -225,7 +249,7 @@ fn split_of(listed: ListedSplit) -> Split {
     }
 }
 
-/// The first messages in one line, and how many more there are.
+/// The first messages in one line, and the number of the others.
 fn first_of(errors: &[String]) -> String {
     const MAX_SHOWN: usize = 3;
     kinematics::shortened(errors, MAX_SHOWN, "; ")
@@ -249,7 +273,7 @@ impl LensMaps {
     }
 
     /// Undistorts and scales a photo. If it becomes smaller, the undistorted photo is never in
-    /// memory.
+    /// memory as a whole.
     fn scaled_color(
         &self,
         rgba: Vec<u8>,
@@ -274,15 +298,18 @@ impl LensMaps {
             return Ok(depth.depth_m.clone());
         };
         let size_px = depth.intrinsics.size_px;
+        // Depth of the same size shares the lens of the photo, and so its map.
         if color.size_px() == size_px {
             return color.apply_depth(&depth.depth_m);
         }
         let cached = self
             .depth
             .get_or_init(|| Undistortion::new(&depth.intrinsics));
-        match cached.size_px() == size_px {
-            true => cached.apply_depth(&depth.depth_m),
-            false => Undistortion::new(&depth.intrinsics).apply_depth(&depth.depth_m),
+        // Another size than that of the first depth image is rare, so its map is not kept.
+        if cached.size_px() == size_px {
+            cached.apply_depth(&depth.depth_m)
+        } else {
+            Undistortion::new(&depth.intrinsics).apply_depth(&depth.depth_m)
         }
     }
 }
@@ -292,6 +319,20 @@ struct Converted {
     keyframe: Keyframe,
     depth_error: Option<String>,
     mask_warning: Option<String>,
+}
+
+impl Converted {
+    /// Sets camera and split.
+    fn assigned_to(self, camera: &Arc<str>, split: Split) -> Self {
+        Self {
+            keyframe: Keyframe {
+                camera: Arc::clone(camera),
+                split,
+                ..self.keyframe
+            },
+            ..self
+        }
+    }
 }
 
 /// Converts one photo. The caller sets camera and split.
@@ -312,6 +353,8 @@ fn keyframe(lens: &LensMaps, image: &DatasetImage, scale_frac: f64) -> crate::Re
             })
         });
     let depth = depth.transpose()?;
+    // Only the photo is scaled. Depth keeps its size and its own intrinsics, because averages
+    // across edges would lie on no surface.
     let scaled = image.intrinsics.scaled(scale_frac);
     let rgba = lens
         .scaled_color(loaded.rgba_srgb, image.intrinsics.size_px, scaled.size_px)

@@ -33,6 +33,7 @@ pub fn parse_scale(text: &str) -> Result<f64, String> {
 /// if they become too small.
 pub(crate) fn intrinsics(full: &Intrinsics, share: f64) -> Result<Intrinsics, Error> {
     let scaled = full.scaled(share);
+    // An image that is not scaled may have any size.
     if scaled.size_px != full.size_px && scaled.size_px.iter().any(|side| *side < MIN_SIDE_PX) {
         let [[from_width, from_height], [width, height]] = [full.size_px, scaled.size_px];
         return Err(Error::BadInput(format!(
@@ -59,7 +60,7 @@ pub fn rgba(rgba: Vec<u8>, from_px: [u32; 2], to_px: [u32; 2]) -> Vec<u8> {
     })
 }
 
-/// Scales an image as [`rgba`] does, but to a smaller size, and without holding it in memory.
+/// Scales an image down as [`rgba`] does, without holding the whole image in memory.
 ///
 /// * `write_row`: writes the row of the image with the given index to `[width, 4]`. It is called
 ///   once per row, in order.
@@ -87,17 +88,19 @@ fn area_mean(
     mut write_row: impl FnMut(usize, &mut [u8]),
 ) -> Vec<u8> {
     let [from_width, to_width] = [from_px[0] as usize, to_px[0] as usize];
-    let (columns, rows) = (
-        coverage(from_px[0], to_px[0]),
-        coverage(from_px[1], to_px[1]),
-    );
+    let columns = coverage(from_px[0], to_px[0]);
+    let rows = coverage(from_px[1], to_px[1]);
     let mut out = Vec::with_capacity(4 * to_width * rows.len());
+    // The two directions are separable: rows are summed first, then columns. Only one row of the
+    // source is in memory.
     let mut sums = vec![[0.0_f32; 4]; from_width];
-    let (mut row, mut row_y) = (vec![0; 4 * from_width], None);
+    let mut row = vec![0; 4 * from_width];
+    let mut row_y = None;
     for covered_rows in &rows {
         sums.fill([0.0; 4]);
         for &(y, share) in covered_rows {
-            // The last old row of a new row may also be the first of the next one.
+            // The last source row of an output row may also be the first source row of the next
+            // one.
             if row_y != Some(y) {
                 write_row(y, &mut row);
                 row_y = Some(y);
@@ -107,46 +110,52 @@ fn area_mean(
             }
         }
         for covered_columns in &columns {
-            let mean = |channel: usize| {
-                covered_columns
-                    .iter()
-                    .map(|&(x, share)| share * sums[x][channel])
-                    .sum::<f32>()
-            };
             #[expect(
                 clippy::cast_possible_truncation,
                 clippy::cast_sign_loss,
                 reason = "a mean of bytes is a byte"
             )]
-            out.extend((0..4).map(|channel| mean(channel).round() as u8));
+            out.extend(
+                (0..4).map(|channel| channel_mean(covered_columns, &sums, channel).round() as u8),
+            );
         }
     }
     out
 }
 
+/// Weighted mean of one channel over the columns that a new pixel covers.
+fn channel_mean(covered_columns: &[(usize, f32)], sums: &[[f32; 4]], channel: usize) -> f32 {
+    covered_columns
+        .iter()
+        .map(|&(x, share)| share * sums[x][channel])
+        .sum::<f32>()
+}
+
 /// For each new pixel of a line, the old pixels it covers and their weights, which add up to 1.
+fn coverage(from: u32, to: u32) -> Vec<Vec<(usize, f32)>> {
+    let ratio = f64::from(from) / f64::from(to);
+    (0..to).map(|ix| covered_by(ix, ratio, from)).collect()
+}
+
+/// The old pixels, of `from`, that the new pixel `ix` covers, and their weights.
 #[expect(
     clippy::cast_possible_truncation,
     clippy::cast_sign_loss,
     reason = "positions lie inside the line"
 )]
-fn coverage(from: u32, to: u32) -> Vec<Vec<(usize, f32)>> {
-    let ratio = f64::from(from) / f64::from(to);
-    let covered = |ix: u32| {
-        let (start, end) = (
-            f64::from(ix) * ratio,
-            (f64::from(ix + 1) * ratio).min(f64::from(from)),
-        );
-        let overlap = |source_ix: usize| {
-            ((source_ix as f64 + 1.0).min(end) - (source_ix as f64).max(start)) / ratio
-        };
-        let source_pixels = start as usize..(end.ceil() as usize).min(from as usize);
-        source_pixels
-            .map(|source_ix| (source_ix, overlap(source_ix) as f32))
-            .filter(|(_, share)| *share > 1e-6)
-            .collect()
+fn covered_by(ix: u32, ratio: f64, from: u32) -> Vec<(usize, f32)> {
+    let start = f64::from(ix) * ratio;
+    // Rounding may put the end of the last pixel slightly beyond the line.
+    let end = (f64::from(ix + 1) * ratio).min(f64::from(from));
+    let overlap = |source_ix: usize| {
+        ((source_ix as f64 + 1.0).min(end) - (source_ix as f64).max(start)) / ratio
     };
-    (0..to).map(covered).collect()
+    let source_pixels = start as usize..(end.ceil() as usize).min(from as usize);
+    source_pixels
+        .map(|source_ix| (source_ix, overlap(source_ix) as f32))
+        // A pixel that only rounding includes would mask the new pixel if it were masked itself.
+        .filter(|(_, share)| *share > 1e-6)
+        .collect()
 }
 
 #[cfg(test)]

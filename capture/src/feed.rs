@@ -20,7 +20,8 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 /// Maximum number of keyframes that wait for the trainer. If the queue is full, the input thread
-/// waits, and live devices drop and count images.
+/// waits, and live devices drop and count images. A longer queue would hold more memory, and the
+/// trainer would see keyframes later; a shorter one would stop the input at each long step.
 const MAX_WAITING: usize = 8;
 
 /// Number of images whose arrival is remembered until they become keyframes: more than a station
@@ -274,33 +275,28 @@ impl Pump {
                 Ok(Some(sample)) => sample,
                 Ok(None) => break,
                 Err(error) => {
+                    // Reported at once, because the keyframes that are still queued may take long
+                    // to train.
                     self.shared.source_failed.store(true, Ordering::Relaxed);
                     input_error = Some(error);
                     break;
                 }
             };
+            // Before the first sample of the new round is joined, images of the old round must be
+            // decided with the motion of the old round.
             let is_restarted = self.input.source.n_restarts() > n_restarts;
             n_restarts = self.input.source.n_restarts();
             if is_restarted && self.restart().is_err() {
                 break;
             }
-            if let (Some(recorder), None) = (&mut self.input.recorder, &recording_error)
-                && let Err(error) = recorder.write(&sample)
-            {
-                let error = Error::from(error);
-                log::error!("the recording ends here, the run continues: {error:#}");
-                recording_error = Some(error);
-            }
-            if let Sample::Image(image) = &sample {
-                self.shared.first_image.get_or_init(Instant::now);
-                if !image.is_depth() {
-                    self.arrivals
-                        .push_back((image.camera.clone(), image.stamp, Instant::now()));
-                    self.arrivals
-                        .drain(..self.arrivals.len().saturating_sub(MAX_ARRIVALS));
-                }
-            }
+            // Before the join, so that a replay sees exactly what the join has seen.
+            self.record(&sample, &mut recording_error);
+            self.remember_arrival(&sample);
+            // Viewers get the readings at once; the join may hold images back for up to its longest
+            // wait.
             self.publish_robot(&sample);
+            // The time also advances the stations, because a base that sends no more keyframes must
+            // not hold the earlier ones forever.
             let newest = sample.stamp();
             let events = self.input.join.push(sample);
             let newest = self.input.join.shifted(newest);
@@ -312,9 +308,12 @@ impl Pump {
                 break;
             }
         }
+        // The input has ended. Images that wait get a decision now, and a station is registered
+        // with the keyframes that it has.
         let events = self.input.join.finish();
         // If the trainer has ended, it needs no more keyframes.
         let _ = self.forward(events).and_then(|()| self.release_held());
+        // A recording that failed before is not finished, so that its first error is reported.
         if let (Some(recorder), None) = (self.input.recorder.take(), &recording_error)
             && let Err(error) = recorder.finish()
         {
@@ -325,6 +324,35 @@ impl Pump {
             stations: self.input.stations,
             input_error,
             recording_error,
+        }
+    }
+
+    /// Records a sample. If the recording fails, for example because the disk is full, it ends, and
+    /// the run continues.
+    fn record(&mut self, sample: &Sample, recording_error: &mut Option<Error>) {
+        if recording_error.is_some() {
+            return;
+        }
+        if let Some(recorder) = &mut self.input.recorder
+            && let Err(error) = recorder.write(sample)
+        {
+            let error = Error::from(error);
+            log::error!("the recording ends here, the run continues: {error:#}");
+            *recording_error = Some(error);
+        }
+    }
+
+    /// Remembers when a color image arrived, for the times of its keyframe.
+    fn remember_arrival(&mut self, sample: &Sample) {
+        let Sample::Image(image) = sample else {
+            return;
+        };
+        self.shared.first_image.get_or_init(Instant::now);
+        if !image.is_depth() {
+            self.arrivals
+                .push_back((image.camera.clone(), image.stamp, Instant::now()));
+            self.arrivals
+                .drain(..self.arrivals.len().saturating_sub(MAX_ARRIVALS));
         }
     }
 
@@ -384,6 +412,8 @@ impl Pump {
     fn send(&self, changes: Vec<Change>) -> Result<(), TrainerGone> {
         changes.into_iter().try_for_each(|change| {
             let times = self.times(&change);
+            // Blocks while the queue is full. This is the back pressure of the trainer on the
+            // input.
             self.sender
                 .send(FeedItem { change, times })
                 .map_err(|_| TrainerGone)
@@ -430,6 +460,7 @@ impl Pump {
                     Err(_) => return,
                 }
             }
+            // Only color images are posed; depth becomes a part of their keyframes.
             PixelFormat::DepthU16 { .. } => return,
         };
         let Some(&(focal_px, principal_px)) = self.input.camera_intrinsics.get(&image.camera)

@@ -11,6 +11,7 @@ fn available_in(meminfo: &str) -> Option<u64> {
         let rest = meminfo.lines().find_map(|line| line.strip_prefix(key))?;
         rest.split_whitespace().next()?.parse().ok()
     };
+    // A system without swap has no line `SwapFree`, but every Linux since 3.14 has `MemAvailable`.
     let available_kib = kib("MemAvailable:")?.saturating_add(kib("SwapFree:").unwrap_or(0));
     Some(available_kib.saturating_mul(1024))
 }

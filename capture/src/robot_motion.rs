@@ -73,8 +73,8 @@ impl RobotMotion {
                 if self.has_moving_base
                     && kinematics::transform::is_finite(&pose.world_from_base) =>
             {
-                (self.world_from_base, self.base_stamp) =
-                    (Some(pose.world_from_base), Some(pose.stamp));
+                self.world_from_base = Some(pose.world_from_base);
+                self.base_stamp = Some(pose.stamp);
                 // Readings of the joints come more often than base poses.
                 (self.n_joints == 0).then(|| RobotReading {
                     stamp: pose.stamp,

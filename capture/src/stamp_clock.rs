@@ -4,7 +4,8 @@ use drivers::{PlaybackClock, clock};
 use kinematics::Stamp;
 use std::time::{Duration, Instant};
 
-/// A live image that appears to be older than this was stamped by another clock.
+/// A live image that appears to be older than this was stamped by another clock. No device or queue
+/// holds an image for a minute, while clocks that start at another time usually differ by more.
 const MAX_LIVE_AGE_SECS: f64 = 60.0;
 
 /// Relates stamps to the clock of this process.
@@ -28,6 +29,7 @@ impl StampClock {
         match self {
             Self::Computer => {
                 let age_secs = clock::now().secs_since(stamp);
+                // A stamp in the future is from another clock, too.
                 let is_plausible = (0.0..MAX_LIVE_AGE_SECS).contains(&age_secs);
                 is_plausible
                     .then(|| Instant::now().checked_sub(Duration::from_secs_f64(age_secs)))

@@ -20,16 +20,20 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 /// Number of keyframes with depth, excluding test keyframes, with which a station is registered. A
-/// scan of a few seconds gives so many.
+/// scan of a few seconds gives so many. With more, keyframes reach the trainer later; with fewer,
+/// the correction has fewer pairs of images and is less certain.
 const MIN_KEYFRAMES: usize = 14;
-/// Maximum time to wait for that many keyframes, seconds.
+/// Maximum time to wait for that many keyframes, seconds. Without a limit, a short visit or a camera
+/// without texture in view would hold its keyframes until the base leaves.
 const MAX_SCAN_SECS: f64 = 10.0;
-/// Maximum time to wait for a station while the base moves, seconds. Afterwards, or with
+/// Maximum time to wait for a station while the base moves, seconds. A base that drives for longer
+/// may not stop at all. Afterwards, or with
 /// [`MAX_HELD`] queued keyframes, the queued keyframes get the correction of the previous station.
 const MAX_TRAVEL_SECS: f64 = 30.0;
 const MAX_HELD: usize = 128;
-/// Maximum number of reference keyframes from earlier stations. When it is reached, every other one
-/// is removed.
+/// Maximum number of reference keyframes from earlier stations. It bounds memory and the time of a
+/// registration, which compares new keyframes with these. When it is reached, every other one is
+/// removed, so that those that remain still cover all stations.
 const MAX_REFERENCE_KEYFRAMES: usize = 160;
 
 /// Corrects keyframes for errors of the reported base poses, at each station.
@@ -56,6 +60,43 @@ pub struct Stations {
     reported: Vec<StationReport>,
     /// Total time spent on registration.
     spent: Duration,
+}
+
+/// Change of the base correction from the station that the base left to the new one.
+struct CorrectionChange<'a> {
+    /// Reported base pose at the station that the base left.
+    left: Transform,
+    /// Reported base pose at the new station.
+    arrived: Transform,
+    /// The correction before the new station.
+    before: Transform,
+    /// The correction that registration estimated in addition; `None` without overlap.
+    estimated: Option<&'a StationCorrection>,
+}
+
+impl CorrectionChange<'_> {
+    /// The correction of a base state.
+    ///
+    /// Drift accumulates with the distance traveled. On the way between the two stations, a
+    /// keyframe therefore gets a share of the correction in proportion to that distance.
+    fn of(&self, at: &BaseState) -> Transform {
+        if at.station.is_some() {
+            return self.at(&self.arrived, 1.0);
+        }
+        let from = distance(&self.left, &at.world_from_base);
+        let to = distance(&at.world_from_base, &self.arrived);
+        // A base that has not moved yet has not drifted; this also avoids 0 / 0.
+        let fraction = if from > 0.0 { from / (from + to) } else { 0.0 };
+        self.at(&at.world_from_base, fraction)
+    }
+
+    /// The correction at a reported base pose that lies at this fraction of the path.
+    fn at(&self, reported: &Transform, fraction: f64) -> Transform {
+        let guess = self.before * reported;
+        self.estimated.map_or(self.before, |correction| {
+            correction.map_from_odom(&guess, fraction) * self.before
+        })
+    }
 }
 
 /// Result of registering a station.
@@ -91,15 +132,15 @@ impl Stations {
     /// [`Base::realign`](crate::config::Base::realign) is set.
     #[must_use]
     pub fn new(rig: &Rig) -> Option<Self> {
-        let carried = || {
-            let on_base = rig
-                .cameras
-                .iter()
-                .filter(|camera| camera.parent != Parent::World);
-            on_base.map(|camera| Arc::clone(&camera.name)).collect()
-        };
-        (rig.base.driver != BaseDriver::Fixed && rig.base.realign).then(|| Self {
-            carried: carried(),
+        if rig.base.driver == BaseDriver::Fixed || !rig.base.realign {
+            return None;
+        }
+        let on_base = rig
+            .cameras
+            .iter()
+            .filter(|camera| camera.parent != Parent::World);
+        Some(Self {
+            carried: on_base.map(|camera| Arc::clone(&camera.name)).collect(),
             max_wait_secs: rig.join.max_wait_millis * 1e-3,
             station: None,
             world_from_base: Transform::identity(),
@@ -118,16 +159,16 @@ impl Stations {
     pub fn resume_from(mut self, keyframes: &[Arc<Keyframe>]) -> Self {
         /// Station index of the earlier run, different from all stations of this run.
         const PREVIOUS_RUN: usize = usize::MAX;
+        // The last keyframe has the correction that the earlier run ended with. It is the best
+        // guess for the first station, because odometry often continues between runs.
         if let Some(base_state) = keyframes
             .iter()
             .rev()
             .find_map(|keyframe| keyframe.base.as_ref())
         {
-            (self.station, self.world_from_base, self.map_from_odom) = (
-                Some(PREVIOUS_RUN),
-                base_state.world_from_base,
-                base_state.map_from_odom,
-            );
+            self.station = Some(PREVIOUS_RUN);
+            self.world_from_base = base_state.world_from_base;
+            self.map_from_odom = base_state.map_from_odom;
         }
         keyframes
             .iter()
@@ -161,6 +202,8 @@ impl Stations {
     pub(crate) fn finish(&mut self) -> Vec<Change> {
         let mut released = Vec::new();
         self.process_queue(true, &mut released);
+        // Each pass registers the station whose keyframes are at the front. Keyframes of further
+        // stations may queue behind them.
         while !self.held.is_empty() {
             self.start_search(&mut released);
             self.process_queue(true, &mut released);
@@ -173,7 +216,8 @@ impl Stations {
     pub(crate) fn restart(&mut self) -> Vec<Change> {
         let released = self.finish();
         self.station = None;
-        (self.world_from_base, self.map_from_odom) = (Transform::identity(), Transform::identity());
+        self.world_from_base = Transform::identity();
+        self.map_from_odom = Transform::identity();
         released
     }
 
@@ -185,11 +229,7 @@ impl Stations {
             released.extend(self.push(Change::Accepted(keyframe)));
         }
         released.extend(self.finish());
-        let keyframe = |change| match change {
-            Change::Accepted(keyframe) => Some(keyframe),
-            Change::Evicted { .. } => None,
-        };
-        released.into_iter().filter_map(keyframe).collect()
+        released.into_iter().filter_map(accepted_keyframe).collect()
     }
 
     /// Applies the current correction to the pose of a camera that was computed from the reported
@@ -222,6 +262,9 @@ impl Stations {
     /// Processes queued changes. `wait_for_search`: whether to wait for a registration in progress.
     fn process_queue(&mut self, wait_for_search: bool, released: &mut Vec<Change>) {
         loop {
+            // The result is applied before the next change is taken. Changes that arrived during
+            // the search were queued, so the order of keyframes does not depend on how long the
+            // search took.
             if let Some(search) = self
                 .search
                 .take_if(|search| wait_for_search || search.is_finished())
@@ -247,6 +290,9 @@ impl Stations {
     }
 
     fn take(&mut self, change: Change, released: &mut Vec<Change>) {
+        // A keyframe that shows that the scan is over starts the registration without it. It is put
+        // back and belongs to the next group. `advance_to` does the same with time alone, for a
+        // base that sends no more keyframes.
         let ends_group = match &change {
             Change::Accepted(keyframe) => {
                 self.is_overdue(keyframe.stamp) || self.leaves_station(keyframe)
@@ -259,11 +305,15 @@ impl Stations {
             return;
         }
         match change {
+            // With nothing held, keyframes of the current station pass at once, so that an arm that
+            // scans from one place trains without delay.
             Change::Accepted(keyframe)
                 if self.held.is_empty() && self.is_at_current_station(&keyframe) =>
             {
                 released.push(Change::Accepted(self.placed(keyframe)));
             }
+            // Evictions must not overtake the keyframes that they evict, so they wait behind held
+            // ones.
             change if self.held.is_empty() && matches!(change, Change::Evicted { .. }) => {
                 released.push(change)
             }
@@ -295,6 +345,8 @@ impl Stations {
     /// Whether the queued keyframes have waited too long at the time `now`.
     fn is_overdue(&self, now: Stamp) -> bool {
         let waited_secs = |first: Option<&Keyframe>| first.map(|first| now.secs_since(first.stamp));
+        // A scan has begun as soon as one held keyframe is at a station. From then on its shorter
+        // limit applies, counted from that keyframe.
         match (
             waited_secs(self.group().next()),
             waited_secs(self.held_keyframes().next()),
@@ -332,15 +384,16 @@ impl Stations {
             }
             return;
         };
+        // The keyframes are registered from the best known guess: the drift since the last station
+        // is much smaller than the drift since the start.
         let new: Vec<Arc<Keyframe>> = self
             .group()
             .filter(|keyframe| is_usable(keyframe))
             .map(|keyframe| Arc::new(keyframe.with_base_correction(&guess)))
             .collect();
-        let (reference_keyframes, world_from_base) = (
-            self.reference_keyframes.clone(),
-            guess * base_state.world_from_base,
-        );
+        // The task gets copies (of `Arc`s), so that keyframes can be queued while it runs.
+        let reference_keyframes = self.reference_keyframes.clone();
+        let world_from_base = guess * base_state.world_from_base;
         self.search = Some(Task::start("station", move || {
             let started = Instant::now();
             let correction = run_in_background_pool(|| {
@@ -365,29 +418,15 @@ impl Stations {
             .next()
             .and_then(|keyframe| keyframe.base.clone());
         let base_state = base_state.expect("the keyframes of the registered station are queued");
-        let (left, before) = (self.world_from_base, self.map_from_odom);
-        // Correction at a reported base pose that lies at this fraction of the path between the two
-        // stations.
-        let correction_at = |reported: &Transform, fraction: f64| {
-            let guess = before * reported;
-            correction.as_ref().map_or(before, |correction| {
-                correction.map_from_odom(&guess, fraction) * before
-            })
+        let before = self.map_from_odom;
+        let correction_change = CorrectionChange {
+            left: self.world_from_base,
+            arrived: base_state.world_from_base,
+            before,
+            estimated: correction.as_ref(),
         };
-        let now = correction_at(&base_state.world_from_base, 1.0);
-        let correction_of = |at: &BaseState| match at.station {
-            Some(_) => now,
-            None => {
-                let (from, to) = (
-                    distance(&left, &at.world_from_base),
-                    distance(&at.world_from_base, &base_state.world_from_base),
-                );
-                correction_at(
-                    &at.world_from_base,
-                    if from > 0.0 { from / (from + to) } else { 0.0 },
-                )
-            }
-        };
+        let now = correction_change.at(&base_state.world_from_base, 1.0);
+        // The report counts the keyframes of the group, so it is made before they are taken out.
         let report = StationReport::new(
             &base_state,
             [&before, &now],
@@ -398,10 +437,12 @@ impl Stations {
         self.reported.push(report);
         let held: Vec<Change> = std::mem::take(&mut self.held)
             .into_iter()
-            .map(|held| corrected(held, correction_of))
+            .map(|held| corrected(held, |at| correction_change.of(at)))
             .collect();
-        (self.station, self.world_from_base, self.map_from_odom) =
-            (base_state.station, base_state.world_from_base, now);
+        self.station = base_state.station;
+        self.world_from_base = base_state.world_from_base;
+        self.map_from_odom = now;
+        // Keyframes of this station become references for later ones, with their corrected poses.
         for change in &held {
             if let Change::Accepted(keyframe) = change {
                 self.add_reference(keyframe);
@@ -416,7 +457,8 @@ impl Stations {
             return keyframe;
         };
         if base_state.station.is_some() {
-            (self.station, self.world_from_base) = (base_state.station, base_state.world_from_base);
+            self.station = base_state.station;
+            self.world_from_base = base_state.world_from_base;
         }
         let keyframe = carried(&keyframe, &self.map_from_odom);
         self.add_reference(&keyframe);
@@ -439,17 +481,28 @@ impl Stations {
     }
 }
 
+/// The keyframe of a change that adds one.
+fn accepted_keyframe(change: Change) -> Option<Arc<Keyframe>> {
+    match change {
+        Change::Accepted(keyframe) => Some(keyframe),
+        Change::Evicted { .. } => None,
+    }
+}
+
 fn station_of(keyframe: &Keyframe) -> Option<usize> {
     keyframe.base.as_ref()?.station
 }
 
 /// Whether a keyframe can be used for registration.
 fn is_usable(keyframe: &Keyframe) -> bool {
+    // Test keyframes must not influence decisions, or their scores would be too good.
     keyframe.depth.is_some() && keyframe.split != Split::Test
 }
 
 /// Distance between two poses of a base; one radian counts as one meter.
 fn distance(one: &Transform, other: &Transform) -> f64 {
+    // A radian counts as a meter, because wheel odometry drifts in rotation as well as in
+    // translation, and only the ratio of two such distances is used.
     (one.translation.vector - other.translation.vector).norm()
         + one.rotation.angle_to(&other.rotation)
 }
@@ -471,6 +524,15 @@ fn corrected(change: Change, correction: impl Fn(&BaseState) -> Transform) -> Ch
         }),
         Change::Evicted { .. } => change,
     }
+}
+
+/// An error of the base pose in the units of the printed line.
+fn format_error(base_error: PoseDistance) -> String {
+    format!(
+        "{:.1} mm and {:.2} degrees",
+        1e3 * base_error.m,
+        base_error.rad.to_degrees()
+    )
 }
 
 impl StationReport {
@@ -519,13 +581,6 @@ impl std::fmt::Display for StationReport {
             write!(f, "; not observable: {unobservable}")?;
         }
         if let Some([before, after]) = self.base_error {
-            let format_error = |base_error: PoseDistance| {
-                format!(
-                    "{:.1} mm and {:.2} degrees",
-                    1e3 * base_error.m,
-                    base_error.rad.to_degrees()
-                )
-            };
             write!(
                 f,
                 "; error {} before, {} after",

@@ -11,7 +11,8 @@ use std::time::Duration;
 
 /// Duration of one wait for a joint state. It bounds the time until a request to stop is noticed.
 const POLL: Duration = Duration::from_millis(50);
-/// A movable arm that reports nothing for this long counts as lost.
+/// A movable arm that reports nothing for this long counts as lost. It is longer than pauses of a
+/// busy computer, because an error here stops a motion.
 const MAX_SILENCE: Duration = Duration::from_secs(2);
 
 /// A movable arm and its joint offsets. All positions include `arm.joint_offsets`, as everywhere
@@ -70,6 +71,8 @@ impl SupervisedArm {
     /// Reads the next joint state. `None` if none arrives in time.
     fn read_within(&mut self, timeout: Duration) -> crate::Result<Option<JointState>> {
         let state = self.arm.read(timeout);
+        // Checked after every read, also one that timed out: an arm that has stopped because of a
+        // fault may report nothing any more.
         if let Motion::Stopped { reason } = self.arm.motion() {
             bail!(
                 "the arm stopped: {reason}. Inspect it, then recover it with `fieldrig move --recover`"
@@ -94,6 +97,8 @@ impl SupervisedArm {
     /// # Errors
     /// As [`SupervisedArm::read`].
     pub fn read_queued(&mut self, mut on_state: impl FnMut(&JointState)) -> crate::Result<()> {
+        // Four seconds at 1 kHz. The limit ends the loop if states arrive faster than they are
+        // read.
         const MAX_STATES: usize = 4000;
         for _ in 0..MAX_STATES {
             match self.read_within(Duration::ZERO)? {
@@ -109,16 +114,22 @@ impl SupervisedArm {
     /// # Errors
     /// If the arm rejects it.
     pub fn command(&mut self, requested: &JointTarget) -> crate::Result<JointTarget> {
-        let with_offsets = |target: &JointTarget, sign: f64| JointTarget {
+        // The driver knows the positions of its encoders, without offsets.
+        let requested = self.with_offsets(requested, -1.0);
+        let accepted = self.arm.command(&requested)?;
+        Ok(self.with_offsets(&accepted, 1.0))
+    }
+
+    /// A target with `sign` times the offsets added to its positions.
+    fn with_offsets(&self, target: &JointTarget, sign: f64) -> JointTarget {
+        JointTarget {
             position: target
                 .position
                 .iter()
                 .zip(&self.offsets)
                 .map(|(position, offset)| position + sign * offset)
                 .collect(),
-        };
-        let accepted = self.arm.command(&with_offsets(requested, -1.0))?;
-        Ok(with_offsets(&accepted, 1.0))
+        }
     }
 
     /// Waits until the arm has arrived. If a stop is requested or the arm cannot be read, brings it
@@ -134,6 +145,8 @@ impl SupervisedArm {
         on_state: impl FnMut(&JointState),
     ) -> crate::Result<MotionEnd> {
         let end = self.follow_while_read(stop, on_state);
+        // If the program can no longer read the arm, it must not leave it moving unsupervised. An
+        // arm that has stopped by itself stays as it is.
         if end.is_err()
             && !matches!(self.arm.motion(), Motion::Stopped { .. })
             && let Err(error) = self.arm.stop()
@@ -153,6 +166,8 @@ impl SupervisedArm {
         loop {
             let state = self.read()?;
             on_state(&state);
+            // Arrival counts more than a stop that was requested at the same time: the arm is at
+            // rest already.
             if self.arm.motion() == Motion::Holding {
                 return Ok(MotionEnd {
                     state,
@@ -161,6 +176,7 @@ impl SupervisedArm {
             }
             if stop.requested() {
                 self.arm.stop().context("cannot stop the arm")?;
+                // The arm decelerates within its limits. Callers expect it at rest.
                 while self.arm.motion() == Motion::Moving {
                     on_state(&self.read()?);
                 }

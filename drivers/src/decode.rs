@@ -63,18 +63,10 @@ impl Image {
         let PixelFormat::DepthU16 { meters_per_count } = self.format else {
             return Err(self.wrong_kind("depth"));
         };
-        #[expect(
-            clippy::cast_possible_truncation,
-            reason = "f32 is more precise than the sensor"
-        )]
-        let meters_from_count = |count: &[u8]| match u16::from_le_bytes([count[0], count[1]]) {
-            u16::MAX => 0.0,
-            count => (f64::from(count) * meters_per_count) as f32,
-        };
         Ok(self
             .raw_bytes()?
             .chunks_exact(2)
-            .map(meters_from_count)
+            .map(|count| meters_from_count(count, meters_per_count))
             .collect())
     }
 
@@ -89,6 +81,8 @@ impl Image {
         let Some([row_bytes, n_rows]) = self.format.raw_size(self.size_px) else {
             return Ok(self);
         };
+        // Sizes come from devices and recordings, so products saturate instead of overflowing; the
+        // comparison below then refuses them. The padding of the last row may be missing.
         let last_row = bytes_per_line.saturating_mul(n_rows.saturating_sub(1));
         let needed_bytes = last_row.saturating_add(row_bytes);
         if bytes_per_line < row_bytes || self.data.len() < needed_bytes {
@@ -129,34 +123,38 @@ impl Image {
     }
 
     fn decompress(&self, format: ImageFormat) -> Result<Vec<u8>, Error> {
-        let (camera, stamp) = (self.camera.to_string(), self.stamp);
-        let decode = |expected_px: [u32; 2]| {
-            let file = first_complete(&self.data, format)?;
-            // The size is checked first, because a few bytes can declare a huge image that takes
-            // seconds to decode.
-            let got_px: [u32; 2] = ImageReader::with_format(Cursor::new(&*file), format)
-                .into_dimensions()?
-                .into();
-            let is_expected = got_px == expected_px;
-            let rgb = is_expected
-                .then(|| image::load_from_memory_with_format(&file, format))
-                .transpose()?;
-            Ok((got_px, rgb))
-        };
-        match decode(self.size_px) {
+        match self.decode_of_size(format) {
             Ok((_, Some(decoded))) => Ok(decoded.into_rgb8().into_raw()),
             Ok((got_px, None)) => Err(Error::ImageSize {
-                camera,
-                stamp,
+                camera: self.camera.to_string(),
+                stamp: self.stamp,
                 got_px,
                 expected_px: self.size_px,
             }),
             Err(source) => Err(Error::Undecodable {
-                camera,
-                stamp,
+                camera: self.camera.to_string(),
+                stamp: self.stamp,
                 source,
             }),
         }
+    }
+
+    /// The size of a compressed image, and the decoded image if it has the size of this one.
+    fn decode_of_size(
+        &self,
+        format: ImageFormat,
+    ) -> Result<([u32; 2], Option<DynamicImage>), ImageError> {
+        let file = first_complete(&self.data, format)?;
+        // The size is checked first, because a few bytes can declare a huge image that takes
+        // seconds to decode.
+        let got_px: [u32; 2] = ImageReader::with_format(Cursor::new(&*file), format)
+            .into_dimensions()?
+            .into();
+        if got_px != self.size_px {
+            return Ok((got_px, None));
+        }
+        let decoded = image::load_from_memory_with_format(&file, format)?;
+        Ok((got_px, Some(decoded)))
     }
 
     pub(crate) fn wrong_kind(&self, expected: &'static str) -> Error {
@@ -165,6 +163,18 @@ impl Image {
             stamp: self.stamp,
             expected,
         }
+    }
+}
+
+/// Depth of one pixel from its two bytes.
+#[expect(
+    clippy::cast_possible_truncation,
+    reason = "f32 is more precise than the sensor"
+)]
+fn meters_from_count(count: &[u8], meters_per_count: f64) -> f32 {
+    match u16::from_le_bytes([count[0], count[1]]) {
+        u16::MAX => 0.0,
+        count => (f64::from(count) * meters_per_count) as f32,
     }
 }
 
@@ -178,6 +188,7 @@ pub(crate) fn decode_complete(
     image::load_from_memory_with_format(&first_complete(bytes, format)?, format)
 }
 
+/// The first complete JPEG image of a buffer; other formats are returned unchanged.
 fn first_complete(bytes: &[u8], format: ImageFormat) -> Result<Cow<'_, [u8]>, ImageError> {
     if format != ImageFormat::Jpeg {
         return Ok(bytes.into());

@@ -3,10 +3,11 @@
 use kinematics::Stamp;
 
 /// If an image is late by more than this many periods, images were dropped before it. Smaller
-/// delays are jitter.
+/// delays are jitter. A smaller value counts jitter as lost images, a larger one misses losses.
 const LATE_PERIODS: f64 = 0.75;
 /// Fraction of the delay by which the next due time is corrected, because the actual frame rate
-/// differs from the nominal rate.
+/// differs from the nominal rate. A larger value follows the rate faster, but lets one late image
+/// move the due time; 0.05 averages over about 20 images.
 const DRIFT_GAIN: f64 = 0.05;
 
 /// Estimates when the images of a camera are due. Images may be late, but never early.
@@ -33,7 +34,8 @@ impl GapEstimator {
         let late_periods = stamp.secs_since(due) / self.period_secs;
         let lost_periods = (late_periods - LATE_PERIODS).ceil().max(0.0);
         let delayed_secs = (late_periods - lost_periods) * self.period_secs;
-        // An image before its due time means that earlier images were delayed.
+        // Images are never early. So an image before its due time means that all earlier images
+        // were delayed, and the whole difference is corrected.
         let correction_secs = if delayed_secs < 0.0 {
             delayed_secs
         } else {

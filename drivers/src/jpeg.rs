@@ -57,6 +57,8 @@ pub fn first_image(buffer: &[u8]) -> Result<Cow<'_, [u8]>, JpegError> {
                 .into());
             }
             Ok(ImageExtent { end, .. }) => return Ok(buffer[start..end].into()),
+            // Motion JPEG drivers may deliver the rest of one image and the next one in the same
+            // buffer.
             Err((error, resume)) => {
                 // The first failure is the most informative. Later ones are often caused by the
                 // remains of the first image.
@@ -102,11 +104,15 @@ fn scan_markers(buffer: &[u8], start: usize) -> Result<ImageExtent, (JpegError, 
     let mut has_tables = false;
     let mut is_sequential = false;
     loop {
-        // This also skips stray bytes, and coded data, in which 0 follows each 0xff.
+        // Instead of a marker right here, the next one is sought. This skips stray bytes between
+        // segments. It also skips coded data, in which a 0 follows each 0xff, so that no marker
+        // appears in it.
         let (marker_at, marker) =
             next_marker(buffer, position).ok_or((JpegError::Truncated, buffer.len()))?;
         position = marker_at + 2;
         match (marker, first_scan) {
+            // A start outside of a segment is another image. One inside, such as that of a
+            // thumbnail, has been skipped with its segment.
             (START_OF_IMAGE, _) => return Err((JpegError::Truncated, marker_at)),
             (END_OF_IMAGE, None) => return Err((JpegError::NoScanData, position)),
             (END_OF_IMAGE, Some(first_scan)) => {
@@ -116,6 +122,7 @@ fn scan_markers(buffer: &[u8], start: usize) -> Result<ImageExtent, (JpegError, 
                     needs_tables: is_sequential && !has_tables,
                 });
             }
+            // Tables after the first scan begins do not help to decode it.
             (HUFFMAN_TABLES, None) => has_tables = true,
             (START_OF_SCAN, None) => first_scan = Some(marker_at),
             (frame, _) if SEQUENTIAL_FRAMES.contains(&frame) => is_sequential = true,
@@ -125,6 +132,7 @@ fn scan_markers(buffer: &[u8], start: usize) -> Result<ImageExtent, (JpegError, 
         let &[high, low, ..] = &buffer[position..] else {
             return Err((JpegError::Truncated, buffer.len()));
         };
+        // A length below 2 is invalid; taking 2 still moves forward, so the loop ends.
         position += usize::from(u16::from_be_bytes([high, low])).max(2);
         if position > buffer.len() {
             return Err((JpegError::Truncated, buffer.len()));

@@ -8,13 +8,16 @@ use std::sync::Arc;
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-/// Queue capacity of a camera, in images. If it is full, the oldest image is dropped.
+/// Queue capacity of a camera, in images. If it is full, the oldest image is dropped. Eight images
+/// are a quarter of a second at 30 Hz, which bridges pauses of the caller; more would hold stale
+/// images in memory, of up to several megabytes each.
 const MAX_IMAGES: usize = 8;
 /// Queue capacity for joint states and base poses: one second at 1 kHz.
 const MAX_JOINTS: usize = 1000;
-/// Queue capacity of a range scanner, in scans.
+/// Queue capacity of a range scanner, in scans: two seconds at 10 Hz, the usual rate.
 const MAX_SCANS: usize = 20;
-/// A device that delivers no samples for this long causes an error.
+/// A device that delivers no samples for this long causes an error. Devices that need a few seconds
+/// to start must not fail, and an operator should not wait long for the message.
 const MAX_SILENCE: Duration = Duration::from_secs(5);
 /// Duration of one wait on a device. It bounds the time until its thread notices that it has to
 /// stop.
@@ -100,72 +103,84 @@ impl Live {
             }),
             threads: Vec::new(),
         };
-        for mut camera in cameras {
-            let name = camera.name().to_owned();
-            let timeout_error = move |waited| Error::NoImage {
-                camera: name.clone(),
-                waited,
-            };
-            let policy = QueuePolicy {
-                capacity: MAX_IMAGES,
-                blocks_device: camera.waits_for_caller(),
-            };
-            live.read(
-                format!("camera {:?}", camera.name()),
-                policy,
-                timeout_error,
-                move || match camera.next_image(POLL) {
-                    Err(Error::Ended { .. }) => Ok(ReadOutcome::End),
-                    Err(Error::NoImage { .. }) => Ok(ReadOutcome::NoSample),
-                    Err(Error::Reconnecting { .. } | Error::NotDue { .. }) => {
-                        Ok(ReadOutcome::Pending)
-                    }
-                    image => image.map(Sample::Image).map(ReadOutcome::Sample),
-                },
-            )?;
+        // Each device takes the queue with the index of its thread, so the number of queues is
+        // known before the first thread starts.
+        for camera in cameras {
+            live.read_camera(camera)?;
         }
-        if let Some(mut arm) = arm {
-            let timeout_error = |waited| Error::NoJoints { waited };
-            live.read(
-                "arm".to_owned(),
-                QueuePolicy::drop_oldest(MAX_JOINTS),
-                timeout_error,
-                move || match arm.read(POLL) {
-                    Err(Error::NoJoints { .. }) => Ok(ReadOutcome::NoSample),
-                    state => state.map(Sample::Joints).map(ReadOutcome::Sample),
-                },
-            )?;
+        if let Some(arm) = arm {
+            live.read_arm(arm)?;
         }
-        if let Some(mut base) = base {
-            let timeout_error = |waited| Error::NoBasePose { waited };
-            live.read(
-                "base".to_owned(),
-                QueuePolicy::drop_oldest(MAX_JOINTS),
-                timeout_error,
-                move || match base.next_pose(POLL) {
-                    Err(Error::NoBasePose { .. }) => Ok(ReadOutcome::NoSample),
-                    pose => pose.map(Sample::Base).map(ReadOutcome::Sample),
-                },
-            )?;
+        if let Some(base) = base {
+            live.read_base(base)?;
         }
-        for mut scanner in scanners {
-            let name = scanner.name().to_owned();
-            let timeout_error = move |waited| Error::NoScan {
-                scanner: name.clone(),
-                waited,
-            };
-            let device = format!("range scanner {:?}", scanner.name());
-            live.read(
-                device,
-                QueuePolicy::drop_oldest(MAX_SCANS),
-                timeout_error,
-                move || match scanner.next_scan(POLL) {
-                    Err(Error::NoScan { .. }) => Ok(ReadOutcome::NoSample),
-                    scan => scan.map(Sample::Range).map(ReadOutcome::Sample),
-                },
-            )?;
+        for scanner in scanners {
+            live.read_scanner(scanner)?;
         }
         Ok(live)
+    }
+
+    fn read_camera(&mut self, mut camera: Box<dyn Camera>) -> Result<(), Error> {
+        let name = camera.name().to_owned();
+        let timeout_error = move |waited| Error::NoImage {
+            camera: name.clone(),
+            waited,
+        };
+        let policy = QueuePolicy {
+            capacity: MAX_IMAGES,
+            blocks_device: camera.waits_for_caller(),
+        };
+        let device = format!("camera {:?}", camera.name());
+        self.read(device, policy, timeout_error, move || {
+            match camera.next_image(POLL) {
+                Err(Error::Ended { .. }) => Ok(ReadOutcome::End),
+                Err(Error::NoImage { .. }) => Ok(ReadOutcome::NoSample),
+                // The driver has its own time limit for reconnecting, and a file its own clock.
+                Err(Error::Reconnecting { .. } | Error::NotDue { .. }) => Ok(ReadOutcome::Pending),
+                image => image.map(Sample::Image).map(ReadOutcome::Sample),
+            }
+        })
+    }
+
+    fn read_arm(&mut self, mut arm: Box<dyn Arm>) -> Result<(), Error> {
+        let timeout_error = |waited| Error::NoJoints { waited };
+        let policy = QueuePolicy::drop_oldest(MAX_JOINTS);
+        self.read("arm".to_owned(), policy, timeout_error, move || {
+            match arm.read(POLL) {
+                Err(Error::NoJoints { .. }) => Ok(ReadOutcome::NoSample),
+                state => state.map(Sample::Joints).map(ReadOutcome::Sample),
+            }
+        })
+    }
+
+    fn read_base(&mut self, mut base: Box<dyn Base>) -> Result<(), Error> {
+        let timeout_error = |waited| Error::NoBasePose { waited };
+        let policy = QueuePolicy::drop_oldest(MAX_JOINTS);
+        self.read(
+            "base".to_owned(),
+            policy,
+            timeout_error,
+            move || match base.next_pose(POLL) {
+                Err(Error::NoBasePose { .. }) => Ok(ReadOutcome::NoSample),
+                pose => pose.map(Sample::Base).map(ReadOutcome::Sample),
+            },
+        )
+    }
+
+    fn read_scanner(&mut self, mut scanner: Box<dyn RangeScanner>) -> Result<(), Error> {
+        let name = scanner.name().to_owned();
+        let timeout_error = move |waited| Error::NoScan {
+            scanner: name.clone(),
+            waited,
+        };
+        let policy = QueuePolicy::drop_oldest(MAX_SCANS);
+        let device = format!("range scanner {:?}", scanner.name());
+        self.read(device, policy, timeout_error, move || {
+            match scanner.next_scan(POLL) {
+                Err(Error::NoScan { .. }) => Ok(ReadOutcome::NoSample),
+                scan => scan.map(Sample::Range).map(ReadOutcome::Sample),
+            }
+        })
     }
 
     /// Starts the thread of the next device.
@@ -192,6 +207,8 @@ impl Live {
             .name(device.clone())
             .spawn(move || {
                 read(&shared);
+                // Also after an error or at the end of a file, so that the caller does not wait for
+                // a device that will not deliver any more.
                 shared.state.lock().n_running -= 1;
                 shared.arrived.notify_all();
             });
@@ -240,6 +257,7 @@ fn read_until_stopped(
 ) {
     let mut waited = Duration::ZERO;
     loop {
+        // The device is read without the lock, so that the devices do not wait for each other.
         let sample = read();
         let mut state = shared.state.lock();
         if state.stop {
@@ -248,6 +266,7 @@ fn read_until_stopped(
         let error = match sample {
             Ok(ReadOutcome::Sample(sample)) => {
                 waited = Duration::ZERO;
+                // A file that is read as fast as possible would otherwise drop most of its images.
                 while policy.blocks_device
                     && state.queues[device_ix].len() >= policy.capacity
                     && !state.stop
@@ -260,6 +279,8 @@ fn read_until_stopped(
             }
             Ok(ReadOutcome::End) => {
                 state.n_cameras -= 1;
+                // Arm and base never end. Without images, nothing more can be done with their
+                // samples.
                 state.stop |= state.n_cameras == 0;
                 return;
             }
@@ -274,6 +295,8 @@ fn read_until_stopped(
             Ok(ReadOutcome::NoSample) => timeout_error(waited + POLL),
             Err(error) => error,
         };
+        // Only the first error is reported: later ones are often its consequence, such as two
+        // devices on one unplugged hub.
         if !state.failed {
             state.failed = true;
             state.error = Some(error);
@@ -302,6 +325,8 @@ impl State {
     /// kind.
     fn report_dropped(&mut self, device_ix: usize, dropped_image: &Image, newest: &mut Sample) {
         let same_kind = |sample: &&mut Sample| matches!(sample, Sample::Image(image) if image.is_depth() == dropped_image.is_depth());
+        // The count is carried by the next image of the same kind that is still delivered, so that
+        // it appears where the gap is, and drops of color and depth are not mixed.
         let pending = &mut self.dropped[device_ix][usize::from(dropped_image.is_depth())];
         *pending += dropped_image.n_skipped + 1;
         if let Some(Sample::Image(next)) = self.queues[device_ix]
@@ -315,6 +340,8 @@ impl State {
 
     /// Removes the oldest queued sample of all devices.
     fn take(&mut self) -> Option<Sample> {
+        // Queues are in stamp order, so the oldest sample of all is at the head of one. Equal
+        // stamps are decided by the index, and thus always alike.
         let heads = self
             .queues
             .iter()
@@ -329,6 +356,8 @@ impl Source for Live {
     fn next_sample(&mut self) -> Result<Option<Sample>, Error> {
         let mut state = self.shared.state.lock();
         loop {
+            // The error comes before queued samples: they are of no use without the device, and
+            // waiting would delay the message.
             if let Some(error) = state.error.take() {
                 return Err(error);
             }
@@ -350,6 +379,8 @@ impl Source for Live {
 
 impl Drop for Live {
     fn drop(&mut self) {
+        // Threads that wait for space in a queue are woken; the others notice it after at most
+        // `POLL`.
         self.shared.state.lock().stop = true;
         self.shared.taken.notify_all();
         for thread in self.threads.drain(..) {

@@ -21,6 +21,8 @@ impl Outage {
             n_tries: 0,
             last_try: now,
         });
+        // A camera that was opened but sent nothing starts a new pause here. It would otherwise be
+        // reopened at once, again and again.
         outage.last_try = now;
         *outage
     }
@@ -51,6 +53,8 @@ pub(crate) fn n_between(last: Stamp, next: Stamp, rate_hz: f64) -> u64 {
         clippy::cast_sign_loss,
         reason = "the cast saturates as intended"
     )]
+    // Stamps jitter by a fraction of a period, so the number of periods is rounded. One fewer image
+    // than periods lies between two images.
     let n_images = (periods.round() - 1.0).max(0.0) as u64;
     n_images
 }

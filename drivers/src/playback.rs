@@ -6,8 +6,8 @@ use std::collections::BTreeMap;
 use std::sync::{Arc, OnceLock};
 use std::time::{Duration, Instant};
 
-/// Images later than this are dropped. [`Live`](crate::Live) holds as many images of a camera at 30
-/// Hz.
+/// Images later than this are dropped: the time in which a camera at 30 Hz fills its queue in
+/// [`Live`](crate::Live). So a caller that is too slow loses images as it would with devices.
 const MAX_DELAY: Duration = Duration::from_millis(270);
 
 /// A source whose samples are returned when they are due, by their stamps and their order.
@@ -72,6 +72,8 @@ impl Playback {
         let due = self
             .clock
             .instant_of(stamp)
+            // A sample is never due before one in front of it. Unrepresentable times are taken as
+            // now.
             .max(self.last_due)
             .unwrap_or_else(Instant::now);
         self.last_due = Some(due);
@@ -85,6 +87,7 @@ impl Source for Playback {
             let Some(mut sample) = self.source.next_sample()? else {
                 return Ok(None);
             };
+            // A sample that is late is returned at once, which lets the playback catch up.
             let delay = match self
                 .due(sample.stamp())
                 .checked_duration_since(Instant::now())
@@ -98,6 +101,8 @@ impl Source for Playback {
             if let Sample::Image(image) = &mut sample {
                 let key = (image.camera.clone(), image.is_depth());
                 if delay > MAX_DELAY {
+                    // Only images are dropped: joint states are small, and without them, poses of
+                    // later images could not be interpolated.
                     *self.n_dropped.entry(key).or_default() += 1 + image.n_skipped;
                     continue;
                 }

@@ -162,6 +162,8 @@ impl<C: ReopenableCamera> Reconnecting<C> {
             if let Some(image) = self.poll_image(deadline)? {
                 return Ok(image);
             }
+            // While the camera is still being opened, this is the outage that is known already, not
+            // a new silence.
             if self.stream.is_some() && Instant::now() >= deadline {
                 return Err(match self.outage {
                     Some(outage) if !self.is_streaming => self.reconnecting(outage),
@@ -193,6 +195,9 @@ impl<C: ReopenableCamera> Reconnecting<C> {
     fn count(&mut self, mut image: Image) -> Image {
         let kind = usize::from(image.is_depth());
         let last = self.last[kind].replace(image.stamp);
+        // Sequence numbers start again when a camera is opened, so the driver cannot count across
+        // an outage. The stamps can. The larger number wins, because the driver may have counted
+        // images that were dropped after opening.
         let is_first_since_open = !std::mem::replace(&mut self.has_image[kind], true);
         if let (true, Some(last)) = (is_first_since_open, last) {
             image.n_skipped =
@@ -200,6 +205,8 @@ impl<C: ReopenableCamera> Reconnecting<C> {
                     .n_skipped
                     .max(n_between(last, image.stamp, self.policy.rate_hz));
         }
+        // The outage ends with an image, not with the opening: a camera may be opened and send
+        // nothing.
         self.outage = None;
         self.counts.n_images += 1;
         self.counts.n_skipped += image.n_skipped;
@@ -210,7 +217,10 @@ impl<C: ReopenableCamera> Reconnecting<C> {
     /// returns.
     fn disconnect(&mut self, problem: C::Problem) -> Result<(), Error> {
         let outage = Outage::of(&mut self.outage);
+        // Dropped before the warning and any wait: the device node is free from here on.
         self.stream = None;
+        // The first problem is a warning. Later ones are details until the time is over, because
+        // the log would otherwise repeat them at every attempt.
         if outage.n_tries > 0 {
             return self.fail_if_overdue(outage, problem);
         }
@@ -252,13 +262,15 @@ impl<C: ReopenableCamera> Reconnecting<C> {
         if !is_due {
             return Err(self.reconnecting(outage));
         }
+        // A reset camera disappears from the bus for a moment and cannot be opened at once.
         if self.device.reset(outage.n_tries) {
             return Ok(());
         }
         match self.device.open() {
             Ok(stream) => {
-                (self.stream, self.is_streaming, self.has_image) =
-                    (Some(stream), false, [false; 2]);
+                self.stream = Some(stream);
+                self.is_streaming = false;
+                self.has_image = [false; 2];
                 self.report_reconnection();
                 Ok(())
             }
@@ -277,7 +289,8 @@ impl<C: ReopenableCamera> Reconnecting<C> {
         let Some(description) = self.device.describe(stream) else {
             return;
         };
-        let (camera, waited) = (&self.policy.camera, since.elapsed());
+        let camera = &self.policy.camera;
+        let waited = since.elapsed();
         log::info!(
             "camera {camera:?}: reconnected after {waited:?} ({n_tries} attempts): {description}"
         );

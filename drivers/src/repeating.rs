@@ -42,6 +42,8 @@ impl<Reopen: FnMut() -> Result<Box<dyn Source>, Error> + Send> Source for Repeat
     /// Returns `None` only if a round has no images.
     fn next_sample(&mut self) -> Result<Option<Sample>, Error> {
         loop {
+            // Samples are in stamp order only as far as devices allow, so the first and last one
+            // are not necessarily the earliest and latest.
             if let Some(mut sample) = self.source.next_sample()? {
                 let stamp = sample.stamp();
                 let [earliest, latest] = self.span.unwrap_or([stamp; 2]);
@@ -54,6 +56,8 @@ impl<Reopen: FnMut() -> Result<Box<dyn Source>, Error> + Send> Source for Repeat
                 return Ok(None);
             };
             self.has_image = false;
+            // Opened before the offset changes: after an error, this source still has consistent
+            // stamps.
             self.source = (self.reopen)()?;
             let round_nanos = latest.nanos_since(earliest).saturating_add(PAUSE_NANOS);
             self.offset_nanos = self.offset_nanos.saturating_add(round_nanos);

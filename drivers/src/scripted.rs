@@ -20,13 +20,12 @@ impl Source for Scripted {
 
 /// An image of one pixel.
 pub(crate) fn image(stamp: Stamp) -> Image {
-    let (camera, format, data) = ("wrist".into(), PixelFormat::Rgb8, [0; 3].into());
     Image {
-        camera,
+        camera: "wrist".into(),
         stamp,
         size_px: [1, 1],
-        format,
-        data,
+        format: PixelFormat::Rgb8,
+        data: [0; 3].into(),
         exposure_secs: None,
         n_skipped: 0,
     }

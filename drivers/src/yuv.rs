@@ -73,7 +73,8 @@ impl YuvColors {
         const DCI_P3: u32 = 12;
         let colorspace = match (reported.colorspace, reported.is_hdtv) {
             (0, true) => REC709,
-            (0, false) => SRGB, // Same matrix and range as standard definition (SMPTE 170M).
+            // Same matrix and range as standard definition (SMPTE 170M).
+            (0, false) => SRGB,
             (colorspace, _) => colorspace,
         };
         let matrix = match (reported.ycbcr_enc, colorspace) {
@@ -108,10 +109,13 @@ impl YuvColors {
     fn coefficients(self) -> (f64, [f64; 5]) {
         let [red, blue] = self.luma_weights();
         let green = 1.0 - red - blue;
+        // Limited range uses 219 steps of luma and 224 of chroma.
         let (black, luma, chroma) = match self.range {
             YuvRange::Limited => (16.0, 255.0 / 219.0, 255.0 / 224.0),
             YuvRange::Full => (0.0, 1.0, 1.0),
         };
+        // BT.601-7, section 2.5: V is `(R - Y) / (2 (1 - red))`, U is `(B - Y) / (2 (1 - blue))`.
+        // Solved for R and B. G follows from `Y = red R + green G + blue B`.
         let v_in_red = 2.0 * (1.0 - red) * chroma;
         let u_in_blue = 2.0 * (1.0 - blue) * chroma;
         (
@@ -150,6 +154,7 @@ impl YuvLayout {
 pub(crate) fn rgb(layout: YuvLayout, colors: YuvColors, size_px: [u32; 2], data: &[u8]) -> Vec<u8> {
     let [width, height] = size_px.map(|side| side as usize);
     let mut rgb = vec![0; width * height * 3];
+    // `chunks_exact` panics for chunks of zero bytes.
     if rgb.is_empty() {
         return rgb;
     }
@@ -177,6 +182,7 @@ pub(crate) fn rgb(layout: YuvLayout, colors: YuvColors, size_px: [u32; 2], data:
                     .map(|&[u, y0, v, y1]| [y0, y1, u, v]),
             ),
             YuvLayout::Nv12 => {
+                // Two rows of pixels share one row of chroma.
                 let chroma_row = chroma[row_ix / 2 * row_bytes..][..row_bytes]
                     .as_chunks::<2>()
                     .0;
@@ -194,7 +200,8 @@ pub(crate) fn rgb(layout: YuvLayout, colors: YuvColors, size_px: [u32; 2], data:
 }
 
 /// Coefficients of [`YuvColors`] times `1 << SHIFT`. Products and sums fit in 32 bits, with errors
-/// below 0.04 counts.
+/// below 0.04 counts. Integers are faster than floats here, and give the same bytes on every
+/// machine.
 #[derive(Clone, Copy)]
 struct Fixed {
     black: i32,
@@ -205,6 +212,8 @@ struct Fixed {
     u_in_blue: i32,
 }
 
+/// The largest sum is below `3 * 255 * 2^13`, which is below `2^23`. More bits would only reduce
+/// errors that rounding to bytes hides.
 const SHIFT: u32 = 13;
 
 impl Fixed {
@@ -243,7 +252,11 @@ impl Fixed {
     #[inline(always)]
     fn pair(self, [y0, y1, u, v]: [u8; 4]) -> [u8; 6] {
         const HALF: i32 = 1 << (SHIFT - 1);
-        let (u, v) = (i32::from(u) - 128, i32::from(v) - 128);
+        // Chroma is centered at 128 in both ranges.
+        let u = i32::from(u) - 128;
+        let v = i32::from(v) - 128;
+        // The chroma parts are computed once for the two pixels that share them. `HALF` rounds the
+        // result to the nearest count.
         let red = v * self.v_in_red + HALF;
         let green = u * self.u_in_green + v * self.v_in_green + HALF;
         let blue = u * self.u_in_blue + HALF;

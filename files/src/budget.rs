@@ -1,24 +1,24 @@
-//! What the reader of one input may use: the limits of all formats, and the checks before anything
-//! is allocated.
+//! Limits for the readers of all formats, and checks that come before memory is allocated.
 
 use std::fmt;
 
-/// Memory for decoded data that any input may use, bytes.
+/// Memory for decoded data that any input may use, bytes. Small files may expand by large factors,
+/// such as an image of one color; a larger value would let many small files fill the memory.
 const FREE_BYTES: u64 = 64 << 20;
 
 /// Limits for one input. All are checked against numbers that the input declares, before memory is
 /// allocated for them.
 ///
-/// Nesting has no limit of its own here: the parsers of JSON and TOML stop at 128 levels or fewer,
+/// Nesting is not limited here, because the parsers of JSON and TOML stop at 128 levels or fewer,
 /// and robot descriptions are parsed without recursion, with the limits of `kinematics::urdf`. Time
-/// has none either, because all readers are linear in the size of their input.
+/// is not limited either, because the time of all readers is linear in the size of their input.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Budget {
     /// Size of the input, bytes.
     pub max_bytes: u64,
     /// Number of elements after decoding: pixels, splats, nodes or tables.
     pub max_elements: u64,
-    /// Memory of decoded data per byte of the input. Beyond it, 64 MiB are free.
+    /// Maximum memory of decoded data per byte of the input. Up to 64 MiB are always allowed.
     pub max_expansion: u64,
 }
 
@@ -48,11 +48,13 @@ impl Budget {
     /// Color images; elements are pixels. A small file of a uniform image can contain very many.
     pub const COLOR_IMAGE: Self = Self {
         max_bytes: 1 << 30,
+        // 134 megapixels take 512 MiB as RGBA.
         max_elements: 1 << 27,
         max_expansion: u64::MAX,
     };
     /// Depth images; elements are pixels.
     pub const DEPTH_IMAGE: Self = Self {
+        // 33 megapixels are above all depth cameras, and take 128 MiB as f32.
         max_elements: 1 << 25,
         ..Self::COLOR_IMAGE
     };
@@ -67,6 +69,7 @@ impl Budget {
     pub const SPLATS: Self = Self {
         max_bytes: u64::MAX,
         max_elements: 100_000_000,
+        // Far above the factor of real files, far below that of a file made to fill the memory.
         max_expansion: 50,
     };
     /// Point clouds from which training starts.
@@ -119,6 +122,7 @@ impl Budget {
         n_decoded_bytes: u64,
         n_input_bytes: u64,
     ) -> Result<(), OverBudget> {
+        // The product saturates, so that an expansion without limit accepts everything.
         if n_decoded_bytes > FREE_BYTES.max(self.max_expansion.saturating_mul(n_input_bytes)) {
             return Err(OverBudget::Decoded {
                 n_decoded_bytes,
@@ -128,7 +132,7 @@ impl Budget {
         Ok(())
     }
 
-    /// What is left of the size after a part of the input.
+    /// The budget for the rest of the input after a part of it.
     #[must_use]
     pub fn after(&self, n_bytes: u64) -> Self {
         Self {

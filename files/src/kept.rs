@@ -1,6 +1,6 @@
 //! A file or folder of this program that somebody may remove or rename while it is in use.
 
-use std::fs::{File, Metadata};
+use std::fs::File;
 use std::io::ErrorKind;
 use std::os::fd::AsRawFd;
 use std::os::unix::fs::MetadataExt;
@@ -43,19 +43,25 @@ impl Kept {
 
     /// Where it is now.
     pub fn place(&self) -> Place {
-        let is_this = |metadata: Metadata| {
-            self.file
-                .metadata()
-                .is_ok_and(|own| (own.dev(), own.ino()) == (metadata.dev(), metadata.ino()))
-        };
-        if self.path.metadata().is_ok_and(is_this) {
+        if self.is_at(&self.path) {
             return Place::Here;
         }
         // Only Linux reports the path of an open file. For a removed file, this path ends with "
         // (deleted)" and does not exist.
         let now = std::fs::read_link(self.in_proc());
-        let moved = now.ok().filter(|now| now.metadata().is_ok_and(is_this));
+        let moved = now.ok().filter(|now| self.is_at(now));
         moved.map_or(Place::Removed, Place::MovedTo)
+    }
+
+    /// Whether a path leads to this file or folder. Device and inode identify it: another program
+    /// may have put a different file at the path.
+    fn is_at(&self, path: &Path) -> bool {
+        let Ok(named) = path.metadata() else {
+            return false;
+        };
+        self.file
+            .metadata()
+            .is_ok_and(|own| (own.dev(), own.ino()) == (named.dev(), named.ino()))
     }
 
     /// Writes the contents of a removed file to its path again, unless something else is there.
@@ -63,7 +69,8 @@ impl Kept {
     /// # Errors
     /// If it cannot be written, or if the path is taken.
     pub fn restore(&self) -> std::io::Result<()> {
-        // Opened again, because the position of `file` may be shared.
+        // Opened again, because the position of `file` may be shared with whoever writes it.
+        // Without /proc, such as on macOS, the duplicate has to do.
         let mut contents = match File::open(self.in_proc()) {
             Err(error) if error.kind() == ErrorKind::NotFound => self.file.try_clone()?,
             opened => opened?,

@@ -13,9 +13,9 @@ use std::path::{Path, PathBuf};
 /// The files and folders that this process is writing.
 static IN_PROGRESS: Mutex<BTreeSet<PathBuf>> = Mutex::new(BTreeSet::new());
 
-/// Start and end of temporary names. No other program uses them, so what has such a name and is not
-/// locked is a leftover of this program and can be removed. A name like `scene.ply.part` could be
-/// that of an unfinished download.
+/// Start and end of temporary names. No other program uses such names. A file with such a name that
+/// is not locked is therefore a leftover of this program and can be removed. A file such as
+/// `scene.ply.part` could be an unfinished download.
 const PREFIX: &[u8] = b".";
 const SUFFIX: &[u8] = b".fieldrig.part";
 /// Maximum length of a file name on Linux and macOS.
@@ -28,8 +28,8 @@ const MAX_NAME_BYTES: usize = 255;
 /// each other.
 pub fn path_of(path: &Path) -> PathBuf {
     let name = path.file_name().unwrap_or_default().as_bytes();
-    // Very long names are cut. Two that begin with the same letters exclude each other, as if they
-    // were the same.
+    // Very long names are truncated. Files whose truncated names are equal cannot be written at the
+    // same time.
     let name = &name[..name.len().min(MAX_NAME_BYTES - PREFIX.len() - SUFFIX.len())];
     path.with_file_name(OsStr::from_bytes(&[PREFIX, name, SUFFIX].concat()))
 }
@@ -55,6 +55,8 @@ impl Registered {
 impl Drop for Registered {
     fn drop(&mut self) {
         if let Some(path) = &self.0 {
+            // The lock is held while the path is removed: otherwise, `remove_all` could return in
+            // between, and the process could exit with the file still there.
             let mut in_progress = IN_PROGRESS.lock();
             remove(path);
             in_progress.remove(path);
@@ -70,6 +72,8 @@ pub struct NoNewFiles {
 
 /// Removes all partial files. To be called before the process exits.
 pub fn remove_all() -> NoNewFiles {
+    // The lock is passed to the caller. Threads that want to start a file wait for it until the
+    // process has ended, so nothing is left behind after this call.
     let in_progress = IN_PROGRESS.lock();
     in_progress.iter().for_each(|path| remove(path));
     NoNewFiles {
@@ -84,23 +88,13 @@ pub fn remove_all() -> NoNewFiles {
 /// # Errors
 /// If the folder has other entries, or cannot be removed.
 pub fn remove_leftover(unfinished: &Path, names: &[&OsStr]) -> std::io::Result<()> {
-    let cannot_remove = |error: Error| {
-        Error::new(
-            error.kind(),
-            format!("cannot remove {}: {error}", unfinished.display()),
-        )
-    };
     if is_folder(unfinished) {
         let own_paths: Vec<PathBuf> = names.iter().map(|name| unfinished.join(name)).collect();
-        let is_own = |entry: &Path| {
-            own_paths
-                .iter()
-                .any(|own| entry == own || entry == path_of(own))
-        };
         let mut entries = std::fs::read_dir(unfinished)
-            .map_err(cannot_remove)?
+            .map_err(|error| cannot_remove(unfinished, &error))?
             .flatten();
-        if entries.any(|entry| !is_own(&entry.path())) {
+        // A folder with this name may hold files of a user, although the name is unlikely.
+        if entries.any(|entry| !is_one_of(&entry.path(), &own_paths)) {
             return Err(Error::new(
                 ErrorKind::AlreadyExists,
                 format!(
@@ -110,7 +104,22 @@ pub fn remove_leftover(unfinished: &Path, names: &[&OsStr]) -> std::io::Result<(
             ));
         }
     }
-    remove_any(unfinished).map_err(cannot_remove)
+    remove_any(unfinished).map_err(|error| cannot_remove(unfinished, &error))
+}
+
+/// Adds the path to an error.
+fn cannot_remove(unfinished: &Path, error: &Error) -> Error {
+    Error::new(
+        error.kind(),
+        format!("cannot remove {}: {error}", unfinished.display()),
+    )
+}
+
+/// Whether an entry of a folder has one of these paths, or its temporary path.
+fn is_one_of(entry: &Path, own_paths: &[PathBuf]) -> bool {
+    own_paths
+        .iter()
+        .any(|own| entry == own || entry == path_of(own))
 }
 
 /// Removes a file, a link or a folder, if it is there; warns if this fails.
@@ -130,6 +139,7 @@ fn remove_any(path: &Path) -> std::io::Result<()> {
         std::fs::remove_file(path)
     };
     match removed {
+        // The goal is reached: the writer may have published or removed it in the meantime.
         Err(error) if error.kind() == ErrorKind::NotFound => Ok(()),
         removed => removed,
     }

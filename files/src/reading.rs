@@ -14,6 +14,8 @@ pub fn open(path: &Path) -> std::io::Result<File> {
     // Opening a pipe waits for its writer, and opening a device may start it, so the type is
     // checked before, too.
     check_type(&std::fs::metadata(path)?.file_type())?;
+    // Between the check and the opening, another program may replace the file. Without waiting, a
+    // pipe is opened at once, and refused by the second check.
     let flags = rustix::fs::OFlags::NONBLOCK.bits().cast_signed();
     let file = OpenOptions::new()
         .read(true)
@@ -52,6 +54,8 @@ pub fn read(path: &Path, budget: Budget) -> std::io::Result<Vec<u8>> {
     let n_bytes = file.metadata()?.len();
     budget.check_bytes(n_bytes)?;
     let mut bytes = Vec::new();
+    // Memory is reserved before reading, so that a file that is too large for it is an error
+    // instead of an abort.
     bytes.try_reserve_exact(usize::try_from(n_bytes).unwrap_or(usize::MAX))?;
     // The file may grow, and files in /proc have no size.
     file.take(budget.max_bytes.saturating_add(1))
@@ -66,6 +70,7 @@ pub fn read(path: &Path, budget: Budget) -> std::io::Result<Vec<u8>> {
 /// As [`read`], and if the file is not UTF-8.
 pub fn read_text(path: &Path) -> std::io::Result<String> {
     let bytes = read(path, Budget::TEXT)?;
+    // Windows editors offer UTF-16 as "Unicode". The byte order mark distinguishes it.
     let is_utf_16 = [[0xFF, 0xFE], [0xFE, 0xFF]]
         .iter()
         .any(|mark| bytes.starts_with(mark));
@@ -77,6 +82,7 @@ pub fn read_text(path: &Path) -> std::io::Result<String> {
         };
         Error::new(ErrorKind::InvalidData, found)
     })?;
+    // The parsers of TOML, JSON and lists would take the mark for a part of the first word.
     if text.starts_with('\u{FEFF}') {
         text.drain(..'\u{FEFF}'.len_utf8());
     }

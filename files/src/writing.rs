@@ -64,9 +64,11 @@ pub fn create_from<T, E: From<Error>>(
     write: impl FnOnce(&Path) -> Result<T, E>,
 ) -> Result<T, E> {
     if path.symlink_metadata().is_ok() {
+        // Checked before the work, which may take minutes. `publish` checks again.
         return Err(exists().into());
     }
     let unfinished = Unfinished::folder(path)?;
+    // `write` sees the final name, whose extension selects the format of some exports.
     let inside = unfinished.path.join(path.file_name().unwrap_or_default());
     let written = write(&inside)?;
     publish(&inside, path)?;
@@ -74,13 +76,14 @@ pub fn create_from<T, E: From<Error>>(
     Ok(written)
 }
 
-/// Calls `write` with a path in a temporary folder, where it writes a folder, and moves this folder
-/// to `path`. If `path` is a folder already, those of its `entries` that were written are moved
-/// into it, in this order: a killed program may leave the first ones, so the last one should be the
-/// one that readers look for.
+/// Calls `write` with a path in a temporary folder. `write` creates a folder there, which is then
+/// moved to `path`. If `path` is a folder already, those `entries` that `write` created are moved
+/// into it, in this order. A killed program may have moved only the first entries, so the last one
+/// should be the one by which readers recognize the folder.
 ///
 /// # Errors
-/// The errors of `write`, and those of [`create`]. What has been moved is removed again.
+/// The errors of `write`, and those of [`create`]. Entries that have already been moved are removed
+/// again.
 pub fn create_folder<T, E: From<Error>>(
     path: &Path,
     entries: &[&str],
@@ -97,6 +100,8 @@ pub fn create_folder<T, E: From<Error>>(
     let mut moved = Vec::new();
     for entry in entries.iter().filter(|entry| inside.join(entry).exists()) {
         publish(&inside.join(entry), &path.join(entry))?;
+        // Until all are moved, a failure or signal removes those that have been moved, too: half an
+        // export looks like a complete one.
         moved.push(Registered::new(&path.join(entry)));
     }
     sync_parent(&contents)?;
@@ -115,6 +120,8 @@ fn write_and_publish(
 ) -> std::io::Result<()> {
     let mut unfinished = Unfinished::file(path)?;
     contents(&mut unfinished.file)?;
+    // The contents must be on the disk before the name is: after a power failure, the name would
+    // otherwise lead to an empty file.
     unfinished.file.sync_all()?;
     publish(&unfinished.path)?;
     // From here on, the temporary name may belong to another program.
@@ -190,6 +197,8 @@ impl Unfinished {
         path: &Path,
         make: impl Fn(&Path) -> std::io::Result<Option<File>>,
     ) -> std::io::Result<Self> {
+        // Each attempt fails only if another program acts between two calls of this one. A hundred
+        // times in a row means that it keeps doing so.
         const MAX_ATTEMPTS: usize = 100;
         let busy = || Error::new(ErrorKind::ResourceBusy, "another program is writing it");
         let unfinished = partial::path_of(path);
@@ -198,6 +207,9 @@ impl Unfinished {
             match make(&unfinished) {
                 Ok(None) => {}
                 Ok(Some(file)) => {
+                    // Between creation and lock, another program may have taken the file for a
+                    // leftover and removed it. Then the lock is that of a file without a name, and
+                    // the next attempt makes a new one.
                     if try_lock(&file)? && is_at(&file, &unfinished) {
                         let registered = Registered::new(&unfinished);
                         return Ok(Self {
@@ -211,6 +223,8 @@ impl Unfinished {
                     let flags =
                         OFlags::RDONLY | OFlags::NOFOLLOW | OFlags::NONBLOCK | OFlags::CLOEXEC;
                     match rustix::fs::open(&unfinished, flags, Mode::empty()).map(File::from) {
+                        // The lock tells a leftover from a file that is being written: the kernel
+                        // releases it when its program ends, however that happens.
                         Ok(leftover) if !try_lock(&leftover)? => return Err(busy()),
                         // Holding the lock keeps other programs from removing a new file at this
                         // path in the meantime.
@@ -235,6 +249,7 @@ impl Unfinished {
 /// always returns true.
 fn try_lock(file: &File) -> std::io::Result<bool> {
     match flock(file, FlockOperation::NonBlockingLockExclusive) {
+        // Refusing to write on such file systems would be worse than the rare case of two writers.
         Ok(()) | Err(rustix::io::Errno::NOTSUP | rustix::io::Errno::NOLCK) => Ok(true),
         Err(rustix::io::Errno::WOULDBLOCK) => Ok(false),
         Err(error) => Err(error.into()),
@@ -242,6 +257,7 @@ fn try_lock(file: &File) -> std::io::Result<bool> {
 }
 
 fn is_at(file: &File, path: &Path) -> bool {
+    // Device and inode: paths may be renamed.
     let id = |metadata: std::fs::Metadata| (metadata.dev(), metadata.ino());
     file.metadata().is_ok_and(|open| {
         path.symlink_metadata()

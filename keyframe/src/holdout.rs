@@ -32,6 +32,7 @@ impl Holdout {
             request: argument.to_owned(),
             reason: reason.to_owned(),
         };
+        // Signed, so that a negative number is refused as a number, and not sought as a file.
         if let Ok(every) = argument.parse::<i64>() {
             return usize::try_from(every)
                 .ok()
@@ -76,6 +77,8 @@ impl Holdout {
 fn every_nth(ix: usize, every: usize) -> Split {
     match ix % every {
         0 => Split::Test,
+        // With two photos or fewer between test photos, at least half of them would be lost to
+        // training.
         offset if every >= 4 && offset == every / 2 => Split::Validation,
         _ => Split::Train,
     }
@@ -93,16 +96,23 @@ fn splits_by_name(test_names: &[String], names: &[&str]) -> Result<Vec<Split>, E
         let mut is_test = false;
         for form in forms(name) {
             if let Some(is_matched) = requested.get_mut(form) {
-                (*is_matched, is_test) = (true, true);
+                *is_matched = true;
+                is_test = true;
             }
         }
         n_remaining += usize::from(!is_test);
-        splits.push(match is_test {
-            true => Split::Test,
-            false if n_remaining % 8 == 5 => Split::Validation,
-            false => Split::Train,
+        // Validation photos are counted among the others, so that they are spread evenly wherever
+        // the test photos are.
+        splits.push(if is_test {
+            Split::Test
+        } else if n_remaining % 8 == 5 {
+            Split::Validation
+        } else {
+            Split::Train
         });
     }
+    // A name without a photo is probably a typing error. Scores on the rest would look like those
+    // of the whole list.
     match test_names.iter().find(|name| !requested[name.as_str()]) {
         Some(name) => Err(Error::Holdout {
             request: format!("{name:?}"),

@@ -68,6 +68,7 @@ impl Keyframe {
     /// range scanner, which covers only a band.
     pub fn lacks_dense_depth(&self) -> bool {
         self.depth.as_ref().is_none_or(|depth| {
+            // NaN compares false, so it counts as unknown.
             let n_known = depth.depth_m.iter().filter(|z| **z > 0.0).count();
             2 * n_known < depth.depth_m.len()
         })
@@ -86,7 +87,8 @@ impl Keyframe {
     /// Checks that the lengths of the arrays match their sizes in pixels.
     pub fn check(&self) -> Result<(), Error> {
         let [width, height] = self.size_px;
-        let (got, expected) = (self.rgba_srgb.len(), 4 * width as usize * height as usize);
+        let got = self.rgba_srgb.len();
+        let expected = 4 * width as usize * height as usize;
         if got != expected {
             return Err(Error::ImageBytes {
                 width,
@@ -99,7 +101,8 @@ impl Keyframe {
             return Ok(());
         };
         let [width, height] = depth.size_px;
-        let (got, expected) = (depth.depth_m.len(), width as usize * height as usize);
+        let got = depth.depth_m.len();
+        let expected = width as usize * height as usize;
         if got != expected {
             return Err(Error::DepthPixels {
                 width,
@@ -130,12 +133,6 @@ impl Keyframe {
 
     /// Whether all camera parameters are finite; depth readings are not checked.
     pub fn is_finite(&self) -> bool {
-        let is_valid_lens = |focal_px: [f64; 2], principal_px: [f64; 2]| {
-            focal_px
-                .iter()
-                .all(|focal| focal.is_finite() && *focal > 0.0)
-                && principal_px.iter().all(|x| x.is_finite())
-        };
         let twists = self.twist.iter().chain(self.joint_twists.iter());
         transform::is_finite(&self.world_from_camera)
             && is_valid_lens(self.focal_px, self.principal_px)
@@ -148,6 +145,14 @@ impl Keyframe {
                     && is_valid_lens(depth.focal_px, depth.principal_px)
             })
     }
+}
+
+/// Whether focal lengths are positive and all values finite.
+fn is_valid_lens(focal_px: [f64; 2], principal_px: [f64; 2]) -> bool {
+    focal_px
+        .iter()
+        .all(|focal| focal.is_finite() && *focal > 0.0)
+        && principal_px.iter().all(|x| x.is_finite())
 }
 
 /// State of a mobile base at the time of a keyframe.
@@ -209,6 +214,8 @@ impl DepthMap {
     #[must_use]
     pub fn subsampled(&self, stride: u32) -> Self {
         let [width, height] = self.size_px.map(|size| size / stride);
+        // The center pixel keeps its ray: its position divided by the stride is the center of the
+        // small pixel, so intrinsics only have to be scaled.
         let at = |x: u32, y: u32| {
             ((y * stride + stride / 2) * self.size_px[0] + x * stride + stride / 2) as usize
         };

@@ -72,6 +72,8 @@ impl KeyframeList {
             return Ok(None);
         };
         let n_missing = 1 + missing.count();
+        // Some may be missing because a recording was cut, or images were deleted. If none is
+        // found, the list belongs to other data.
         if n_missing < self.len() {
             return Ok(Some(format!(
                 "{n_missing} of {} listed keyframes are not in the data; the first is {camera} {stamp}",
@@ -102,21 +104,13 @@ impl KeyframeList {
             .enumerate()
             .filter(|(_, line)| !line.trim().is_empty() && !line.starts_with('#'))
         {
-            let words: Vec<&str> = line.split_whitespace().collect();
-            let parsed = match words[..] {
-                [camera, stamp, split] => stamp
-                    .parse::<i64>()
-                    .ok()
-                    .zip(SPLITS.iter().position(|(_, name)| *name == split))
-                    .map(|(stamp, split)| ((camera.to_owned(), stamp), split)),
-                _ => None,
-            };
-            let Some((key, split)) = parsed else {
+            let Some((key, split)) = parse_line(line) else {
                 return Err(format!(
                     "line {}: expected a camera, a stamp in nanoseconds and train, validation or test; found {line:?}",
                     line_ix + 1
                 ));
             };
+            // The second line may name another split, and one of them would be ignored.
             if list.insert(key, split).is_some() {
                 return Err(format!("line {}: {line:?} is listed twice", line_ix + 1));
             }
@@ -128,14 +122,19 @@ impl KeyframeList {
     }
 }
 
+/// The camera and stamp of a line, and its split.
+fn parse_line(line: &str) -> Option<((String, i64), SplitIx)> {
+    let words: Vec<&str> = line.split_whitespace().collect();
+    let [camera, stamp, split] = words[..] else {
+        return None;
+    };
+    let stamp = stamp.parse().ok()?;
+    let split = SPLITS.iter().position(|(_, name)| *name == split)?;
+    Some(((camera.to_owned(), stamp), split))
+}
+
 impl FromIterator<(String, Stamp, Split)> for KeyframeList {
     fn from_iter<T: IntoIterator<Item = (String, Stamp, Split)>>(keyframes: T) -> Self {
-        let index_of = |split| {
-            SPLITS
-                .iter()
-                .position(|(known, _)| *known == split)
-                .unwrap_or_default()
-        };
         Self(
             keyframes
                 .into_iter()
@@ -143,6 +142,14 @@ impl FromIterator<(String, Stamp, Split)> for KeyframeList {
                 .collect(),
         )
     }
+}
+
+/// The index of a split in [`SPLITS`], which lists all of them.
+fn index_of(split: Split) -> SplitIx {
+    SPLITS
+        .iter()
+        .position(|(known, _)| *known == split)
+        .unwrap_or_default()
 }
 
 /// The name of a split in files.

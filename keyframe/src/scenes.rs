@@ -39,7 +39,9 @@ impl TestShape {
         let depth_m = match self {
             Self::Sphere { center_m, radius_m } => {
                 let from = origin - center_m;
-                let (a, b) = (direction.norm_squared(), direction.dot(&from));
+                // The nearer root of `a t² + 2 b t + c = 0`.
+                let a = direction.norm_squared();
+                let b = direction.dot(&from);
                 let root = b * b - a * (from.norm_squared() - radius_m * radius_m);
                 (root >= 0.0).then(|| (-b - root.sqrt()) / a)?
             }
@@ -66,12 +68,14 @@ pub fn color_srgb(point: &Point3<f64>) -> [f64; 3] {
 
 /// Pose of a camera at `eye` that faces `target`, z up.
 pub fn look_at(eye: Point3<f64>, target: Point3<f64>) -> Transform {
+    // Straight up or down, z does not determine the rotation about the line of sight.
     let up = if (target - eye).xy().norm() < 1e-9 {
         Vector3::y()
     } else {
         Vector3::z()
     };
     Transform::face_towards(&eye, &target, &up)
+        // nalgebra looks along z with y up; a camera has y down.
         * UnitQuaternion::from_axis_angle(&Vector3::z_axis(), PI)
 }
 
@@ -84,7 +88,8 @@ pub fn keyframe(ix: i64, shapes: &[TestShape], world_from_camera: Transform) -> 
             .map(|hit| hit.map_or(0.0, |(depth, _)| f32_of(depth)))
             .collect();
     let color_size = [120, 100];
-    let (color_focal, color_principal) = ([110.0, 110.0], [60.0, 50.0]);
+    let color_focal = [110.0, 110.0];
+    let color_principal = [60.0, 50.0];
     let rgba: Vec<u8> = cast_pixels(
         shapes,
         &color_pose,
@@ -123,7 +128,9 @@ pub fn keyframe(ix: i64, shapes: &[TestShape], world_from_camera: Transform) -> 
 
 /// Like [`keyframe`], in the size of a depth camera's images.
 pub fn large_keyframe(ix: i64, shapes: &[TestShape], world_from_camera: Transform) -> Keyframe {
-    let (size_px, focal_px, principal_px) = ([640, 480], [525.0; 2], [320.0, 240.0]);
+    let size_px = [640, 480];
+    let focal_px = [525.0; 2];
+    let principal_px = [320.0, 240.0];
     let mut keyframe = keyframe(ix, shapes, world_from_camera);
     let hits: Vec<_> =
         cast_pixels(shapes, &world_from_camera, size_px, focal_px, principal_px).collect();
@@ -132,8 +139,9 @@ pub fn large_keyframe(ix: i64, shapes: &[TestShape], world_from_camera: Transfor
         [red, green, blue, 255]
     });
     keyframe.rgba_srgb = colors.collect::<Vec<u8>>().into();
-    (keyframe.size_px, keyframe.focal_px, keyframe.principal_px) =
-        (size_px, focal_px, principal_px);
+    keyframe.size_px = size_px;
+    keyframe.focal_px = focal_px;
+    keyframe.principal_px = principal_px;
     keyframe.world_from_camera = world_from_camera;
     let depth_m: Vec<f32> = hits
         .iter()
@@ -205,7 +213,10 @@ pub fn all_around(shapes: &[TestShape], target: Point3<f64>, n: usize) -> Vec<Ar
     (0..n)
         .map(|ix| {
             let height = 1.0 - (2 * ix + 1) as f64 / n as f64;
-            let (angle, radius) = (ix as f64 * 2.399_963, (1.0 - height * height).sqrt());
+            // The golden angle, pi (3 - sqrt 5), which spreads neighbors in height as far apart as
+            // possible.
+            let angle = ix as f64 * 2.399_963;
+            let radius = (1.0 - height * height).sqrt();
             let eye =
                 target + 1.0 * Vector3::new(radius * angle.cos(), radius * angle.sin(), height);
             Arc::new(keyframe(

@@ -91,6 +91,8 @@ impl Intrinsics {
     /// <= 0`), it lies beyond the radius up to which the distortion polynomial is monotonic, or it
     /// is not finite.
     pub fn project(&self, point_in_camera: &Vector3<f64>) -> Option<[f64; 2]> {
+        // NaN is checked explicitly: every comparison with it is false, so `z <= 0` would accept
+        // it.
         if point_in_camera.z.is_nan() || point_in_camera.z <= 0.0 {
             return None;
         }
@@ -110,6 +112,7 @@ impl Intrinsics {
         }
         let plane = Vector2::new(x / z, y / z);
         let distorted = self.lens_in_use().distort(plane)?;
+        // The derivative of `(x / z, y / z)`.
         let plane_by_point = Matrix2x3::new(1.0, 0.0, -plane.x, 0.0, 1.0, -plane.y) / z;
         let mut pixel_by_point = distorted.jacobian * plane_by_point;
         pixel_by_point.row_mut(0).scale_mut(self.focal_px[0]);
@@ -152,6 +155,8 @@ impl Intrinsics {
 
     /// Returns the intrinsics for the image resized to `size_px`.
     pub fn resized(&self, size_px: [u32; 2]) -> Self {
+        // Pixel edges are at integers, so scaling maps them to each other without the shift by half
+        // a pixel that conventions with integer pixel centers need.
         let ratio = |axis: usize| f64::from(size_px[axis]) / f64::from(self.size_px[axis]);
         Self {
             size_px,
@@ -181,7 +186,8 @@ impl Intrinsics {
             Lens::Pinhole => true,
             Lens::BrownConrady(k) => k == [0.0; 5],
             Lens::RationalBrownConrady(k) => k == [0.0; 8],
-            Lens::KannalaBrandt(_) => false, // The projection is equidistant even if all coefficients are zero.
+            // The projection is equidistant even if all coefficients are zero.
+            Lens::KannalaBrandt(_) => false,
         }
     }
 
@@ -192,24 +198,14 @@ impl Intrinsics {
 
     /// Rejects zero sizes, focal lengths that are not positive, and non-finite values.
     pub fn validate(&self) -> Result<(), Error> {
-        let check = |what, value: f64, fine: bool, allowed| match fine {
-            true => Ok(()),
-            false => Err(Error::Intrinsics {
-                what,
-                value,
-                allowed,
-            }),
-        };
         const NAMES: [[&str; 3]; 2] = [
             ["width", "focal length x", "principal point x"],
             ["height", "focal length y", "principal point y"],
         ];
         for (axis, [size_name, focal_name, principal_name]) in NAMES.into_iter().enumerate() {
-            let (size, focal, principal) = (
-                self.size_px[axis],
-                self.focal_px[axis],
-                self.principal_px[axis],
-            );
+            let size = self.size_px[axis];
+            let focal = self.focal_px[axis];
+            let principal = self.principal_px[axis];
             check(size_name, f64::from(size), size > 0, "at least 1 px")?;
             check(
                 focal_name,
@@ -224,15 +220,12 @@ impl Intrinsics {
                 "a finite number of pixels",
             )?;
         }
-        let is_finite = |&k: &f64| {
-            check(
-                "a distortion coefficient",
-                k,
-                k.is_finite(),
-                "a finite number",
-            )
-        };
-        self.lens.coefficients().iter().try_for_each(is_finite)
+        // Coefficients of a rectified image are checked, too: a file that contains NaN is damaged.
+        for &k in self.lens.coefficients() {
+            let what = "a distortion coefficient";
+            check(what, k, k.is_finite(), "a finite number")?;
+        }
+        Ok(())
     }
 
     pub(crate) fn lens_in_use(&self) -> Lens {
@@ -246,8 +239,26 @@ impl Intrinsics {
     pub(crate) fn pixel_at(&self, distorted: Vector2<f64>) -> Option<[f64; 2]> {
         let pixel =
             [0, 1].map(|axis| self.focal_px[axis] * distorted[axis] + self.principal_px[axis]);
+        // Extreme coefficients overflow to infinity or NaN even for finite points.
         (pixel[0].is_finite() && pixel[1].is_finite()).then_some(pixel)
     }
+}
+
+/// An error that names the parameter, unless its value is fine.
+fn check(
+    what: &'static str,
+    value: f64,
+    is_fine: bool,
+    allowed: &'static str,
+) -> Result<(), Error> {
+    if is_fine {
+        return Ok(());
+    }
+    Err(Error::Intrinsics {
+        what,
+        value,
+        allowed,
+    })
 }
 
 #[cfg(test)]

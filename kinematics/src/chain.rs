@@ -1,6 +1,6 @@
 //! Forward kinematics and Jacobian from a base link to a tip link.
 
-use crate::urdf::{Joint, JointKind, JointLimits, Robot};
+use crate::urdf::{Joint, JointKind, JointLimits, Mimic, Robot};
 use crate::{Error, Transform, Twist};
 use nalgebra::{Matrix6xX, Quaternion, Translation3, Unit, UnitQuaternion, Vector3};
 use std::collections::HashMap;
@@ -56,9 +56,14 @@ impl Chain {
             segments: Vec::new(),
             last_from_tip: RigidMotion::new(&Transform::identity()),
         };
+        // The fixed transforms since the last moving joint. They become part of the next segment,
+        // so that poses take one product per moving joint.
         let mut constant = Transform::identity();
-        let (mut rules, mut indices) = (MimicRules::new(), HashMap::new());
+        let mut rules = MimicRules::new();
+        let mut indices = HashMap::new();
         for joint in robot.path(base_link, tip_link)? {
+            // Invalid joints are accepted in the file, because only chains through them need their
+            // poses. This chain does.
             if let Some(problem) = &joint.problem {
                 return Err(problem.clone());
             }
@@ -74,8 +79,12 @@ impl Chain {
                     });
                 }
             };
+            // Rotates the frame so that the joint's axis is z, where a joint motion has a closed
+            // form that is cheaper than a product. The rotation is undone after the joint, so that
+            // later frames are those of the URDF.
             let joint_from_aligned = rotation_from_z_to(&joint.axis);
             let rule = follow_mimics(robot, joint, &mut rules)?;
+            // Two mimic joints may follow the same joint, which has one value in a configuration.
             let joint_ix = *indices
                 .entry(&rule.source.name)
                 .or_insert_with(|| chain.add(rule.source));
@@ -123,17 +132,22 @@ impl Chain {
     /// Index in `names` of each joint of the chain, for devices and files with a different joint
     /// order.
     pub fn order_in(&self, names: &[String]) -> Result<Vec<usize>, Error> {
-        let find = |joint: &String| {
-            names
-                .iter()
-                .position(|name| name == joint)
-                .ok_or_else(|| Error::MissingJoint {
-                    joint: joint.clone(),
-                    tip: self.tip_link.clone(),
-                    given: names.to_vec(),
-                })
-        };
-        self.joint_names.iter().map(find).collect()
+        self.joint_names
+            .iter()
+            .map(|joint| self.position_in(names, joint))
+            .collect()
+    }
+
+    /// Index in `names` of one joint of the chain.
+    fn position_in(&self, names: &[String], joint: &str) -> Result<usize, Error> {
+        names
+            .iter()
+            .position(|name| name == joint)
+            .ok_or_else(|| Error::MissingJoint {
+                joint: joint.to_owned(),
+                tip: self.tip_link.clone(),
+                given: names.to_vec(),
+            })
     }
 
     /// Pose of the tip in the base, `base_from_tip`.
@@ -147,6 +161,7 @@ impl Chain {
     /// error. Neither function allocates memory.
     pub fn forward_into(&self, q: &[f64], base_from_tip: &mut Transform) -> Result<(), Error> {
         self.check(q)?;
+        // Computes on a copy, so that `base_from_tip` is written only once the pose is complete.
         let mut pose = RigidMotion::IDENTITY;
         for segment in &self.segments {
             pose.compose(&segment.before);
@@ -161,27 +176,27 @@ impl Chain {
     /// tip's origin (rows 0 to 2) and the angular velocity of the tip (rows 3 to 5), both in the
     /// base frame.
     pub fn jacobian(&self, q: &[f64]) -> Result<Matrix6xX<f64>, Error> {
+        // The velocity of the tip depends on its distance from each axis, so the tip comes first.
         let tip_in_base = self.forward(q)?.translation.vector;
         let mut jacobian = Matrix6xX::zeros(self.n_joints());
         let mut pose = RigidMotion::IDENTITY;
         for segment in &self.segments {
             pose.compose(&segment.before);
             let axis_in_base = rotate(&pose.rotation, &Vector3::z());
-            let (linear, angular) = match segment.is_prismatic {
-                true => (axis_in_base, Vector3::zeros()),
-                false => (
-                    axis_in_base.cross(&(tip_in_base - pose.translation)),
-                    axis_in_base,
-                ),
+            let (linear, angular) = if segment.is_prismatic {
+                (axis_in_base, Vector3::zeros())
+            } else {
+                let lever_in_base = tip_in_base - pose.translation;
+                (axis_in_base.cross(&lever_in_base), axis_in_base)
             };
+            // A joint and its mimic joints share one column, so their motions add up. A mimic joint
+            // moves `multiplier` times as fast as the joint that it follows.
             let mut column = jacobian.column_mut(segment.joint_ix);
-            let mut add = |row: usize, part: Vector3<f64>| {
-                for axis in 0..3 {
-                    column[row + axis] += segment.multiplier * part[axis];
-                }
-            };
-            add(0, linear);
-            add(3, angular);
+            for axis in 0..3 {
+                column[axis] += segment.multiplier * linear[axis];
+                column[3 + axis] += segment.multiplier * angular[axis];
+            }
+            // The axis above is the one before the joint moves: the motion itself leaves it fixed.
             pose.move_joint(segment, q);
         }
         Ok(jacobian)
@@ -202,19 +217,19 @@ impl Chain {
     /// For each joint, the velocity of the tip relative to the base, in the tip frame, when only
     /// that joint moves from `q` at unit speed (1 rad/s or 1 m/s).
     pub fn tip_twists_by_joint(&self, q: &[f64]) -> Result<Vec<Twist>, Error> {
+        // A velocity of the tip's origin only changes its axes: the two frames have the same
+        // origin.
         let tip_from_base = self.forward(q)?.rotation.inverse();
-        let in_tip = |linear: Vector3<f64>, angular: Vector3<f64>| Twist {
-            linear_m_s: tip_from_base * linear,
-            angular_rad_s: tip_from_base * angular,
-        };
         let jacobian = self.jacobian(q)?;
         let columns = jacobian.column_iter();
         Ok(columns
             .map(|column| {
-                in_tip(
-                    column.fixed_rows::<3>(0).into(),
-                    column.fixed_rows::<3>(3).into(),
-                )
+                let linear_in_base: Vector3<f64> = column.fixed_rows::<3>(0).into();
+                let angular_in_base: Vector3<f64> = column.fixed_rows::<3>(3).into();
+                Twist {
+                    linear_m_s: tip_from_base * linear_in_base,
+                    angular_rad_s: tip_from_base * angular_in_base,
+                }
             })
             .collect())
     }
@@ -227,6 +242,8 @@ impl Chain {
                 joints: self.joint_names.clone(),
             });
         }
+        // One NaN of a device would make the whole pose NaN, and later errors could not name the
+        // joint.
         match values.iter().position(|value| !value.is_finite()) {
             None => Ok(()),
             Some(at) => Err(Error::JointNotFinite {
@@ -255,11 +272,13 @@ struct MimicRule<'a> {
 /// The known rules, by joint: chains of mimic joints are followed once.
 type MimicRules<'a> = HashMap<&'a str, MimicRule<'a>>;
 
+/// The rule that expresses `joint` by an independent joint, through any number of mimic joints.
 fn follow_mimics<'a>(
     robot: &'a Robot,
     joint: &'a Joint,
     rules: &mut MimicRules<'a>,
 ) -> Result<MimicRule<'a>, Error> {
+    // Upwards: walk from the joint to one that is independent, or whose rule is known.
     let mut followers = Vec::new();
     let mut current = joint;
     let mut rule = loop {
@@ -273,26 +292,25 @@ fn follow_mimics<'a>(
                 offset: 0.0,
             };
         };
-        let rejected = |why| Error::Mimic {
-            joint: joint.name.clone(),
-            source_joint: mimic.source.clone(),
-            why,
-        };
         let source = robot
             .joint(&mimic.source)
-            .ok_or_else(|| rejected("is not in the URDF"))?;
+            .ok_or_else(|| mimic_error(joint, mimic, "is not in the URDF"))?;
         if let Some(problem) = &source.problem {
             return Err(problem.clone());
         }
         if !matches!(source.kind, JointKind::Revolute | JointKind::Prismatic) {
-            return Err(rejected("is not a revolute, continuous or prismatic joint"));
+            let why = "is not a revolute, continuous or prismatic joint";
+            return Err(mimic_error(joint, mimic, why));
         }
+        // A path without a loop visits every joint at most once.
         if followers.len() >= robot.joints().len() {
-            return Err(rejected("creates a loop of mimic joints"));
+            return Err(mimic_error(joint, mimic, "creates a loop of mimic joints"));
         }
         followers.push((current, mimic));
         current = source;
     };
+    // Back down: substitute each rule into the one of its follower, and remember it. With `source =
+    // a x + b`, the follower is `m (a x + b) + c = (m a) x + (m b + c)`.
     while let Some((follower, mimic)) = followers.pop() {
         let MimicRule {
             source,
@@ -309,6 +327,16 @@ fn follow_mimics<'a>(
     Ok(rule)
 }
 
+/// The error of a joint whose mimic rules cannot be followed; `mimic` is the rule that is at fault.
+fn mimic_error(joint: &Joint, mimic: &Mimic, why: &'static str) -> Error {
+    Error::Mimic {
+        joint: joint.name.clone(),
+        source_joint: mimic.source.clone(),
+        why,
+    }
+}
+
+/// A rotation that turns the z axis to `axis`. The angle about `axis` is arbitrary.
 fn rotation_from_z_to(axis: &Unit<Vector3<f64>>) -> UnitQuaternion<f64> {
     // Opposite directions leave the rotation axis undetermined: a half turn about any axis
     // perpendicular to z works.
@@ -316,6 +344,7 @@ fn rotation_from_z_to(axis: &Unit<Vector3<f64>>) -> UnitQuaternion<f64> {
         .unwrap_or_else(|| UnitQuaternion::from_quaternion(Quaternion::new(0.0, 1.0, 0.0, 0.0)))
 }
 
+/// `q v q*` with two cross products, which take half the operations of two quaternion products.
 fn rotate(rotation: &Quaternion<f64>, vector: &Vector3<f64>) -> Vector3<f64> {
     let twice = rotation.imag().cross(vector) * 2.0;
     vector + twice * rotation.scalar() + rotation.imag().cross(&twice)

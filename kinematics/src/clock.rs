@@ -45,10 +45,12 @@ struct Line {
     drift: f64,
 }
 
-/// Each bucket keeps one arrival.
+/// Each bucket keeps one arrival. Longer buckets take less memory and time, but have fewer points
+/// near the line; shorter ones hold more late arrivals that never touch the line.
 const BUCKET_NANOS: i64 = 250_000_000;
 /// Arrivals older than this are discarded, so that the map follows a drift that changes with
-/// temperature.
+/// temperature. A longer window averages more latency, a shorter one follows temperature faster.
+/// With [`BUCKET_NANOS`], the window has at most 481 buckets.
 const WINDOW_SECS: f64 = 120.0;
 /// Maximum drift. It exceeds the drift of any common crystal; steeper slopes are caused by latency.
 const MAX_DRIFT: f64 = 200e-6;
@@ -59,12 +61,15 @@ const FULL_DRIFT_SECS: f64 = 80.0;
 /// Smaller steps back come from reordered messages.
 const MAX_DISORDER_NANOS: i64 = 500_000_000;
 /// If a message arrives earlier than the line by more than this, in seconds, the device clock has
-/// jumped ahead.
+/// jumped ahead. Smaller differences need no restart: the line follows early arrivals at once. They
+/// also occur when the latency of a connection falls.
 const MAX_EARLY_SECS: f64 = 0.25;
 /// If all arrivals within [`MAX_LATE_NANOS`] are late by more than this, in seconds, the device
-/// clock has jumped back a little or was paused.
+/// clock has jumped back a little or was paused. A congested network also delays messages, but
+/// rarely every single one by this much.
 const MAX_LATE_SECS: f64 = 1.0;
-/// How long arrivals must be late before the clock counts as restarted.
+/// How long arrivals must be late before the clock counts as restarted. A blocked connection, whose
+/// messages arrive late together, should recover within this time.
 const MAX_LATE_NANOS: i64 = 3_000_000_000;
 
 const NANOS_PER_SEC: f64 = 1e9;
@@ -93,10 +98,14 @@ impl ClockMap {
         let Some(origin) = self.origin else {
             return self.start(device_nanos, arrival);
         };
+        // A device that restarts counts from zero again. Its old line says nothing about the new
+        // clock.
         if device_nanos < self.newest_nanos.saturating_sub(MAX_DISORDER_NANOS) {
             return self.restart(device_nanos, arrival);
         }
         self.newest_nanos = self.newest_nanos.max(device_nanos);
+        // Differences are taken in integers before the conversion: an f64 of absolute nanoseconds
+        // since 1970 has a resolution of 256 ns, and delays are differences of two such numbers.
         let since_nanos = device_nanos.saturating_sub(origin.device_nanos);
         let device_secs = since_nanos as f64 / NANOS_PER_SEC;
         let delay_secs = arrival
@@ -110,6 +119,8 @@ impl ClockMap {
         if has_line && lateness_secs < -MAX_EARLY_SECS {
             return self.restart(device_nanos, arrival);
         }
+        // The line follows early arrivals at once, but never late ones. So a clock that jumped back
+        // would make all stamps early until its old arrivals have left the window.
         if self.late_for_too_long(lateness_secs, arrival) {
             return self.restart(device_nanos, arrival);
         }
@@ -147,6 +158,7 @@ impl ClockMap {
     pub fn stamp(&mut self, device_nanos: i64, arrival: Stamp) -> Stamp {
         self.observe(device_nanos, arrival);
         self.map(device_nanos)
+            // A message cannot have been sent after it arrived.
             .map_or(arrival, |mapped| mapped.min(arrival))
     }
 
@@ -169,6 +181,7 @@ impl ClockMap {
         self.newest_nanos = device_nanos;
         self.late_since_nanos = None;
         self.line = Line::default();
+        // The first message lies on the line by definition.
         self.buckets.clear();
         self.buckets.push_back(Bucket {
             index: 0,
@@ -200,9 +213,13 @@ impl ClockMap {
             .partition_point(|bucket| bucket.index < new.index);
         match self.buckets.get_mut(at) {
             None => self.buckets.push_back(new),
+            // Only the fastest message of a bucket can touch the line; the others need not be
+            // stored.
             Some(known) if known.index == new.index && new.delay_secs < known.delay_secs => {
                 *known = new
             }
+            // Neither a slower message nor one of an earlier, empty bucket is stored. The second
+            // kind comes from reordering, and would have to be inserted in the middle.
             Some(_) => return false,
         }
         let oldest_secs = new.device_secs - WINDOW_SECS;
@@ -221,8 +238,12 @@ impl ClockMap {
             (Some(first), Some(last)) => last.device_secs - first.device_secs,
             _ => return self.line,
         };
+        // Over one second, a change of latency by 1 ms looks like a drift of 1000 ppm. Over the
+        // full span, it amounts to 12.5 ppm.
         let max_drift = MAX_DRIFT * (span_secs / FULL_DRIFT_SECS).min(1.0);
         let drift = self.hull_slope().clamp(-max_drift, max_drift);
+        // The slope may have been limited, so the offset is not that of the hull's edge. The line
+        // has to touch the arrivals from below in any case.
         let offset_secs = self
             .buckets
             .iter()
@@ -243,6 +264,8 @@ impl ClockMap {
             / self.buckets.len() as f64;
         let mut hull: Vec<&Bucket> = Vec::with_capacity(self.buckets.len());
         for bucket in &self.buckets {
+            // Andrew's monotone chain: a point above the line from its predecessor to the new point
+            // is not part of the lower hull.
             while let [.., a, b] = hull[..]
                 && slope(a, bucket) <= slope(a, b)
             {
@@ -250,6 +273,8 @@ impl ClockMap {
             }
             hull.push(bucket);
         }
+        // Of all lines below the points, this edge minimizes the sum of the distances to them: the
+        // height at the mean time decides that sum.
         let edge = hull
             .windows(2)
             .find(|edge| edge[1].device_secs >= mean_secs);
@@ -286,6 +311,7 @@ impl WrappingMicros {
         const NANOS_PER_MICRO: i64 = 1000;
         let total = match self.last {
             None => i64::from(micros),
+            // The signed difference accepts messages that arrive out of order.
             Some((last, total)) => total + i64::from(micros.wrapping_sub(last).cast_signed()),
         };
         self.last = Some((micros, total));

@@ -85,6 +85,7 @@ impl<T> Readings<T> {
     fn new(max_gap: Duration, capacity: usize) -> Self {
         Self {
             max_gap,
+            // Nothing can be interpolated with fewer than two readings.
             capacity: capacity.max(2),
             buffer: VecDeque::new(),
             n_rejected: 0,
@@ -92,6 +93,8 @@ impl<T> Readings<T> {
     }
 
     fn push(&mut self, stamp: Stamp, reading: T) -> Result<(), HistoryError> {
+        // Readings must be in order, because stamps are searched by bisection. Equal stamps would
+        // also give an interval of length zero, by which `around` divides.
         if let Some(&(newest, _)) = self.buffer.back()
             && stamp <= newest
         {
@@ -100,6 +103,7 @@ impl<T> Readings<T> {
                 pushed: stamp,
             });
         }
+        // The capacity bounds the memory of a long run.
         if self.buffer.len() == self.capacity {
             self.buffer.pop_front();
         }
@@ -112,6 +116,7 @@ impl<T> Readings<T> {
         Err(why)
     }
 
+    /// The readings between which a stamp lies.
     fn around(&self, requested: Stamp) -> Result<Bracket<'_, T>, HistoryError> {
         let (Some((oldest, _)), Some((newest, _))) = (self.buffer.front(), self.buffer.back())
         else {
@@ -120,6 +125,7 @@ impl<T> Readings<T> {
                 requested,
             });
         };
+        // Extrapolation could place a camera where it never was, so the caller has to wait.
         if requested > *newest {
             return Err(HistoryError::NotYet {
                 newest: Some(*newest),
@@ -133,35 +139,17 @@ impl<T> Readings<T> {
             });
         }
         let after_ix = self.buffer.partition_point(|(stamp, _)| *stamp < requested);
-        let reading = |ix: usize| {
-            self.buffer
-                .get(ix)
-                .map(|(stamp, reading)| (*stamp, reading))
-        };
-        let near = |a: Stamp, b: Stamp| b.duration_since(a) <= self.max_gap;
-        let after = reading(after_ix).expect("the newest reading is not before the stamp");
-        let before = after_ix.checked_sub(1).and_then(reading);
+        let after = self
+            .reading(after_ix)
+            .expect("the newest reading is not before the stamp");
+        let before = after_ix.checked_sub(1).and_then(|ix| self.reading(ix));
         if after.0 == requested {
-            return Ok(match (before, reading(after_ix + 1)) {
-                (Some(before), _) if near(before.0, requested) => Bracket {
-                    before,
-                    after,
-                    frac: 1.0,
-                },
-                (_, Some(next)) if near(requested, next.0) => Bracket {
-                    before: after,
-                    after: next,
-                    frac: 0.0,
-                },
-                _ => Bracket {
-                    before: after,
-                    after,
-                    frac: 0.0,
-                },
-            });
+            return Ok(self.around_reading(after_ix, before, after));
         }
         let before = before.expect("the oldest reading is not after the stamp");
-        if !near(before.0, after.0) {
+        // The motion between readings that are far apart is unknown: a device may have been
+        // disconnected while the arm moved.
+        if !self.is_near(before.0, after.0) {
             return Err(HistoryError::Gap {
                 before: before.0,
                 after: after.0,
@@ -174,6 +162,48 @@ impl<T> Readings<T> {
             after,
             frac,
         })
+    }
+
+    /// The bracket of a stamp that is the stamp of a reading. It exists even if both neighbors are
+    /// too far away, because nothing has to be interpolated. A neighbor is included if possible,
+    /// because callers derive velocities from it. The earlier one is preferred: with it, the result
+    /// does not depend on whether the next reading has arrived yet.
+    ///
+    /// * `before`: the reading before `reading`, if any.
+    fn around_reading<'a>(
+        &'a self,
+        reading_ix: usize,
+        before: Option<(Stamp, &'a T)>,
+        reading: (Stamp, &'a T),
+    ) -> Bracket<'a, T> {
+        match (before, self.reading(reading_ix + 1)) {
+            (Some(before), _) if self.is_near(before.0, reading.0) => Bracket {
+                before,
+                after: reading,
+                frac: 1.0,
+            },
+            (_, Some(next)) if self.is_near(reading.0, next.0) => Bracket {
+                before: reading,
+                after: next,
+                frac: 0.0,
+            },
+            _ => Bracket {
+                before: reading,
+                after: reading,
+                frac: 0.0,
+            },
+        }
+    }
+
+    fn reading(&self, ix: usize) -> Option<(Stamp, &T)> {
+        self.buffer
+            .get(ix)
+            .map(|(stamp, reading)| (*stamp, reading))
+    }
+
+    /// Whether two readings are close enough to interpolate between them.
+    fn is_near(&self, a: Stamp, b: Stamp) -> bool {
+        b.duration_since(a) <= self.max_gap
     }
 
     fn newest(&self) -> Option<Stamp> {
@@ -218,16 +248,16 @@ impl JointHistory {
     /// Adds a reading. A reading that is invalid or not later than all stored readings is dropped
     /// and counted, and an error is returned.
     pub fn push(&mut self, state: JointState) -> Result<(), HistoryError> {
-        let numbers = || {
-            state
-                .position
-                .iter()
-                .chain(&state.velocity)
-                .chain(&state.effort)
-        };
-        if !numbers().all(|number| number.is_finite()) {
+        let mut numbers = state
+            .position
+            .iter()
+            .chain(&state.velocity)
+            .chain(&state.effort);
+        if !numbers.all(|number| number.is_finite()) {
             return self.readings.reject(HistoryError::NotFinite);
         }
+        // A different number of joints comes from another device or a faulty message. Interpolation
+        // pairs joints by index.
         if let Some((_, last)) = self.readings.buffer.back()
             && last.position.len() != state.position.len()
         {
@@ -255,6 +285,7 @@ impl JointHistory {
         let span_secs = after.secs_since(before);
         let n_joints = a.position.len();
         let has_velocities = |state: &JointState| state.velocity.len() == n_joints;
+        // A reading is returned bit for bit instead of through the cubic, which would round it.
         if frac == 0.0 || frac == 1.0 {
             let mut at_reading = if frac == 0.0 { a.clone() } else { b.clone() };
             if !has_velocities(&at_reading) && before < after {
@@ -267,20 +298,21 @@ impl JointHistory {
             }
             return Ok(at_reading);
         }
+        // With velocities, the cubic is more accurate when the arm accelerates between readings. A
+        // device that reports velocities in some readings only gets the line.
         let is_cubic = has_velocities(a) && has_velocities(b);
-        let curve = |joint: usize| {
-            let (from, to) = (a.position[joint], b.position[joint]);
-            match is_cubic {
-                true => hermite(
-                    [from, to],
-                    [a.velocity[joint], b.velocity[joint]],
-                    span_secs,
-                    frac,
-                ),
-                false => (from + (to - from) * frac, (to - from) / span_secs),
-            }
-        };
-        let (position, velocity) = (0..n_joints).map(curve).unzip();
+        let (position, velocity) = (0..n_joints)
+            .map(|joint| {
+                let from = a.position[joint];
+                let to = b.position[joint];
+                if is_cubic {
+                    let velocities = [a.velocity[joint], b.velocity[joint]];
+                    hermite([from, to], velocities, span_secs, frac)
+                } else {
+                    (from + (to - from) * frac, (to - from) / span_secs)
+                }
+            })
+            .unzip();
         let effort = a
             .effort
             .iter()
@@ -319,8 +351,13 @@ impl JointHistory {
 /// Position and velocity at `frac` (0 to 1) on the cubic with the given end positions and end
 /// velocities.
 fn hermite([p0, p1]: [f64; 2], [v0, v1]: [f64; 2], span_secs: f64, frac: f64) -> (f64, f64) {
-    let (m0, m1, rise) = (v0 * span_secs, v1 * span_secs, p1 - p0);
-    let (second, third) = (3.0 * rise - 2.0 * m0 - m1, m0 + m1 - 2.0 * rise);
+    // The coefficients of `p0 + m0 f + second f² + third f³`, from the conditions at both ends.
+    // Velocities are scaled to the span first, because the curve is a function of `frac`.
+    let m0 = v0 * span_secs;
+    let m1 = v1 * span_secs;
+    let rise = p1 - p0;
+    let second = 3.0 * rise - 2.0 * m0 - m1;
+    let third = m0 + m1 - 2.0 * rise;
     let position = p0 + frac * (m0 + frac * (second + frac * third));
     let slope = m0 + frac * (2.0 * second + frac * 3.0 * third);
     (position, slope / span_secs)
@@ -378,9 +415,12 @@ impl PoseHistory {
         } = self.readings.around(stamp)?;
         let pose = self.at(stamp)?;
         let span_secs = after.secs_since(before);
+        // Both entries are the same reading: without a neighbor there is no velocity.
         if span_secs <= 0.0 {
             return Ok((pose, Twist::zero()));
         }
+        // Divides the same motion that `transform::interpolate` spreads over the span: a line for
+        // the position, a constant rate for the rotation.
         let velocity_m_s = (b.translation.vector - a.translation.vector) / span_secs;
         let angular_rad_s = (a.rotation.inverse() * b.rotation).scaled_axis() / span_secs;
         Ok((

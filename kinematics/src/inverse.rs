@@ -3,11 +3,15 @@
 use crate::{Chain, Error, Transform};
 use nalgebra::{Matrix6, Matrix6xX, Vector6};
 
-/// Maximum number of steps. From a start within half a radian, about ten are enough.
+/// Maximum number of steps. From a start within half a radian, about ten are enough; more are
+/// needed only near singular configurations and bounds.
 const MAX_STEPS: usize = 100;
-/// Largest remaining error of the pose, meters and radians.
+/// Largest remaining error of the pose, meters and radians. It is far below the repeatability of
+/// any arm, and far above the rounding errors of forward kinematics.
 const TOLERANCE: f64 = 1e-7;
-/// Damping that remains when the error is zero; it bounds the steps near singular configurations.
+/// Damping that remains when the error is zero; it bounds the steps near singular configurations. A
+/// larger value would slow down the last steps, a smaller one would let rounding errors decide the
+/// direction in which the damped matrix is nearly singular.
 const MIN_DAMPING: f64 = 1e-9;
 /// Largest step of one joint, radians or meters. The Jacobian is only valid near a configuration.
 const MAX_STEP: f64 = 0.3;
@@ -47,6 +51,8 @@ impl Chain {
             .zip(bounds)
             .map(|(value, bound)| clamped(*value, *bound))
             .collect();
+        // The pose of `start` is computed even if the clamped values differ, because `forward`
+        // rejects wrong lengths and NaN. Clamping has turned NaN into a bound.
         let mut error = pose_error(base_from_tip, &self.forward(start)?);
         if q != start {
             error = pose_error(base_from_tip, &self.forward(&q)?);
@@ -56,9 +62,16 @@ impl Chain {
             if error.norm() < TOLERANCE {
                 return Ok(Some(q));
             }
+            // Sugihara's damping falls with the squared error: far away, where the linear model is
+            // wrong, steps are short and safe; close to the target, they are Newton's and converge
+            // quickly.
             let damping = extra_damping * 0.5 * error.norm_squared() + MIN_DAMPING;
             let next = self.step(&q, &error, damping, bounds)?;
             let next_error = pose_error(base_from_tip, &self.forward(&next)?);
+            // The factor on the damping is the addition of Levenberg and Marquardt: a step that
+            // makes the error worse is discarded and tried again with more damping. The bounds keep
+            // the factor from becoming so small that it no longer reacts, and end the search where
+            // no step improves the pose.
             if next_error.norm() < error.norm() {
                 (q, error) = (next, next_error);
                 extra_damping = f64::max(0.2 * extra_damping, 1e-6);
@@ -85,6 +98,7 @@ impl Chain {
             let longest = change
                 .iter()
                 .fold(0.0f64, |longest, value| longest.max(value.abs()));
+            // All joints are scaled alike, so that the direction of the step stays the same.
             let scale = if longest > MAX_STEP {
                 MAX_STEP / longest
             } else {
@@ -108,6 +122,8 @@ impl Chain {
                     .iter()
                     .zip(bounds)
                     .map(|(value, [lower, upper])| value.max(*lower).min(*upper));
+                // A joint may still cross a bound that it was not at. It then ends at the bound,
+                // and the next step does without it if necessary.
                 return Ok(clamped.collect());
             }
             stuck
@@ -119,11 +135,15 @@ impl Chain {
 
 fn damped_change(jacobian: &Matrix6xX<f64>, error: &Vector6<f64>, damping: f64) -> Vec<f64> {
     let square: Matrix6<f64> = jacobian * jacobian.transpose() + Matrix6::identity() * damping;
+    // `J^T (J J^T + d 1)^-1 e`: the 6 x 6 form of the damped least-squares step, for any number of
+    // joints.
     match square.cholesky() {
         Some(factor) => (jacobian.transpose() * factor.solve(error))
             .iter()
             .copied()
             .collect(),
+        // The damped matrix is positive definite unless its elements overflow. No step means no
+        // improvement, which ends the search.
         None => vec![0.0; jacobian.ncols()],
     }
 }

@@ -53,10 +53,9 @@ struct RationalRadial {
 
 impl Radial for RationalRadial {
     fn factor(&self, r2: f64) -> (f64, f64) {
-        let (numerator, denominator) = (
-            evaluate(&self.numerator, r2),
-            evaluate(&self.denominator, r2),
-        );
+        let numerator = evaluate(&self.numerator, r2);
+        let denominator = evaluate(&self.denominator, r2);
+        // The quotient rule.
         let by_r2 = evaluate(&derivative(&self.numerator), r2) * denominator
             - numerator * evaluate(&derivative(&self.denominator), r2);
         (numerator / denominator, by_r2 / (denominator * denominator))
@@ -68,9 +67,13 @@ impl Radial for RationalRadial {
         let mut rise = [0.0; 7];
         for (i, n) in self.numerator.iter().enumerate() {
             for (j, d) in self.denominator.iter().enumerate() {
+                // `r2^i` times `r2^j`: with `N' = i n r2^(i - 1)`, the three products have the same
+                // power.
                 rise[i + j] += n * d * (1.0 + 2.0 * (i as f64 - j as f64));
             }
         }
+        // A zero of the denominator is a pole: the quotient jumps from one infinity to the other
+        // there, and may rise on both sides of it.
         positive_on(&self.denominator, r2) && positive_on(&rise, r2)
     }
 }
@@ -115,21 +118,28 @@ fn rational_radial(&[k1, k2, _, _, k3, k4, k5, k6]: &[f64; 8]) -> RationalRadial
     }
 }
 
+/// Distorts a point. `None` where the map is not invertible.
 fn distort(radial: &impl Radial, tangential: [f64; 2], plane: Vector2<f64>) -> Option<Distorted> {
     let distorted = distort_unchecked(radial, tangential, plane);
+    // Beyond the radius at which the curve turns back, two points have the same image. A point far
+    // outside the field of view would then appear in the image, so it must not be projected. The
+    // determinant covers folds that the tangential part causes.
     let monotonic =
         radial.is_rising_to(plane.norm_squared()) && distorted.jacobian.determinant() > 0.0;
     monotonic.then_some(distorted)
 }
 
+/// Distorts a point, even where several points have the same image.
 fn distort_unchecked(radial: &impl Radial, [p1, p2]: [f64; 2], plane: Vector2<f64>) -> Distorted {
-    let (x, y) = (plane.x, plane.y);
+    let x = plane.x;
+    let y = plane.y;
     let r2 = plane.norm_squared();
     let (factor, factor_by_r2) = radial.factor(r2);
     let value = Vector2::new(
         x * factor + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
         y * factor + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
     );
+    // Both mixed derivatives are equal: the distortion is the gradient of a potential.
     let across = 2.0 * (x * y * factor_by_r2 + p1 * x + p2 * y);
     let jacobian = Matrix2::new(
         factor + 2.0 * (x * x * factor_by_r2 + p1 * y + 3.0 * p2 * x),
@@ -140,11 +150,14 @@ fn distort_unchecked(radial: &impl Radial, [p1, p2]: [f64; 2], plane: Vector2<f6
     Distorted { value, jacobian }
 }
 
+/// The point that [`distort`] maps to `distorted`.
 fn undistort(
     radial: &impl Radial,
     tangential: [f64; 2],
     distorted: Vector2<f64>,
 ) -> Option<Vector2<f64>> {
+    // Newton's method converges in a few steps from the radial solution; the rest is a bound for
+    // points near the edge of the invertible region.
     const MAX_STEPS: usize = 50;
     let length = distorted.norm();
     if length == 0.0 && tangential == [0.0; 2] {
@@ -152,13 +165,14 @@ fn undistort(
     }
     // Without the tangential part, solving for the radius suffices. With it, that solution is the
     // initial value of Newton's method in the plane.
-    let distorted_radius = |radius: f64| {
-        let r2 = radius * radius;
-        let (factor, factor_by_r2) = radial.factor(r2);
-        (radius * factor, factor + 2.0 * r2 * factor_by_r2)
-    };
     let is_rising_to = |radius: f64| radial.is_rising_to(radius * radius);
-    let mut plane = match solve_rising(distorted_radius, is_rising_to, length, f64::INFINITY) {
+    let radius = solve_rising(
+        |radius| distorted_radius(radial, radius),
+        is_rising_to,
+        length,
+        f64::INFINITY,
+    );
+    let mut plane = match radius {
         Some(radius) if length > 0.0 => distorted * (radius / length),
         Some(_) => distorted,
         // Just outside the radial limit, the tangential part may still move the point inside.
@@ -167,20 +181,32 @@ fn undistort(
     };
     for _ in 0..MAX_STEPS {
         let guess = distort_unchecked(radial, tangential, plane);
+        // The radial solution is close already, because tangential coefficients are small. A
+        // singular Jacobian means that the point is on the edge of the invertible region.
         let step = guess.jacobian.try_inverse()? * (guess.value - distorted);
         plane -= step;
         if step.norm() <= CONVERGED * (1.0 + plane.norm()) {
             break;
         }
     }
+    // The steps may have left the invertible region, or may not have converged. Checking the
+    // solution forward covers both, so that no wrong ray is returned.
     let check = distort(radial, tangential, plane)?;
     const CLOSE: f64 = 1e-12;
     ((check.value - distorted).norm() <= CLOSE * (1.0 + length)).then_some(plane)
 }
 
+/// The distorted radius without the tangential part, and its derivative with respect to the radius.
+fn distorted_radius(radial: &impl Radial, radius: f64) -> (f64, f64) {
+    let r2 = radius * radius;
+    let (factor, factor_by_r2) = radial.factor(r2);
+    (radius * factor, factor + 2.0 * r2 * factor_by_r2)
+}
+
 /// Derivatives of [`brown_conrady`] with respect to its coefficients.
 pub(crate) fn brown_conrady_by_coefficients(plane: Vector2<f64>) -> [Vector2<f64>; 5] {
-    let (r2, [by_p1, by_p2]) = (plane.norm_squared(), tangential_by_coefficients(plane));
+    let r2 = plane.norm_squared();
+    let [by_p1, by_p2] = tangential_by_coefficients(plane);
     [
         plane * r2,
         plane * (r2 * r2),
@@ -192,9 +218,11 @@ pub(crate) fn brown_conrady_by_coefficients(plane: Vector2<f64>) -> [Vector2<f64
 
 /// Derivatives of [`rational`] with respect to its coefficients.
 pub(crate) fn rational_by_coefficients(k: &[f64; 8], plane: Vector2<f64>) -> [Vector2<f64>; 8] {
-    let (r2, [by_p1, by_p2]) = (plane.norm_squared(), tangential_by_coefficients(plane));
+    let r2 = plane.norm_squared();
+    let [by_p1, by_p2] = tangential_by_coefficients(plane);
     let radial = rational_radial(k);
     let by_numerator = plane / evaluate(&radial.denominator, r2);
+    // The derivative of `N / D` by a coefficient of D is `-N / D²` times the power.
     let by_denominator = by_numerator * -radial.factor(r2).0;
     let [first, second] =
         [by_numerator, by_denominator].map(|by| [by * r2, by * (r2 * r2), by * (r2 * r2 * r2)]);
@@ -203,8 +231,10 @@ pub(crate) fn rational_by_coefficients(k: &[f64; 8], plane: Vector2<f64>) -> [Ve
     ]
 }
 
+/// Derivatives of the tangential part with respect to p1 and p2.
 fn tangential_by_coefficients(plane: Vector2<f64>) -> [Vector2<f64>; 2] {
-    let (xy, r2) = (2.0 * plane.x * plane.y, plane.norm_squared());
+    let xy = 2.0 * plane.x * plane.y;
+    let r2 = plane.norm_squared();
     [
         Vector2::new(xy, r2 + 2.0 * plane.y * plane.y),
         Vector2::new(r2 + 2.0 * plane.x * plane.x, xy),
@@ -222,6 +252,7 @@ pub(crate) fn kannala_brandt(k: &[f64; 4], plane: Vector2<f64>) -> Option<Distor
     }
     let series = 1.0 + angle2 * (k[0] + angle2 * (k[1] + angle2 * (k[2] + angle2 * k[3])));
     let length = angle * series;
+    // The derivative of `atan r` is `1 / (1 + r²)`.
     let length_by_radius = evaluate(&angle_derivative(k), angle2) / (1.0 + radius * radius);
     // Computes length / radius, and its derivative divided by radius. Near the axis both quotients
     // lose all digits, but the map is the identity up to third order.
@@ -262,20 +293,21 @@ pub(crate) fn undistort_kannala_brandt(
     }
     let series = [1.0, k[0], k[1], k[2], k[3]];
     let derivative = angle_derivative(k);
-    let distorted_angle = |angle: f64| {
-        let angle2 = angle * angle;
-        (
-            angle * evaluate(&series, angle2),
-            evaluate(&derivative, angle2),
-        )
-    };
+    // The model is a polynomial in the angle from the axis, so the angle is solved for, and the
+    // direction is kept.
     let is_rising_to = |angle: f64| positive_on(&derivative, angle * angle);
     let angle = solve_rising(
-        distorted_angle,
+        |angle| {
+            let angle2 = angle * angle;
+            let length = angle * evaluate(&series, angle2);
+            (length, evaluate(&derivative, angle2))
+        },
         is_rising_to,
         length,
         std::f64::consts::FRAC_PI_2,
     )?;
+    // At 90 degrees the ray does not meet the plane `z = 1`, and its tangent is a huge number
+    // instead of infinity.
     (angle < std::f64::consts::FRAC_PI_2).then(|| distorted * (angle.tan() / length))
 }
 

@@ -17,12 +17,18 @@ pub(crate) fn solve_rising(
     target: f64,
     limit: f64,
 ) -> Option<f64> {
-    const MAX_STEPS: usize = 200; // Bisection alone needs about 60 steps.
+    // Bisection alone needs about 60 steps: each gains one of the 53 bits of an f64. More steps
+    // are only a guard against a bracket that stops shrinking.
+    const MAX_STEPS: usize = 200;
     let value = |x: f64| function(x).0 - target;
-    // Find a bracket: x from `low`, where the value is below the target, to `high`, where it is
-    // above or the derivative has changed sign.
-    let (mut low, mut high) = (0.0, target.min(limit));
+    // Find a bracket: from `low`, where the value is below the target, to `high`, where it is above
+    // or the derivative has changed sign. Doubling reaches any magnitude in a few steps, so callers
+    // need not know how strongly their lens distorts.
+    let mut low = 0.0;
+    let mut high = target.min(limit);
     while is_rising_to(high) && value(high) < 0.0 {
+        // The functions of callers compute squares of `high`, which would overflow after the next
+        // doubling.
         if high >= limit || high > f64::MAX.sqrt() * 0.25 {
             return None;
         }
@@ -39,7 +45,9 @@ pub(crate) fn solve_rising(
         } else {
             high = x;
         }
-        // Beyond the maximum, Newton's method could converge to another root.
+        // Newton's method converges quadratically near the root. Beyond the maximum of the
+        // function, it could converge to another root, and where the derivative is small, it jumps
+        // far away. Bisection is slower but always halves the bracket.
         let newton = x - (reached - target) / derivative;
         let next = if rising && newton > low && newton < high {
             newton
@@ -52,6 +60,10 @@ pub(crate) fn solve_rising(
             break;
         }
     }
+    // The search may also end at a point where the function stops rising below the target, or after
+    // the last step. Both fail this check, so that no wrong root is returned. The tolerance is far
+    // above the rounding errors of a few operations, and far below any error that a pixel could
+    // show.
     const CLOSE: f64 = 1e-12;
     (is_rising_to(x) && value(x).abs() <= CLOSE * target.max(1.0)).then_some(x)
 }
@@ -69,6 +81,9 @@ pub(crate) fn evaluate<const N: usize>(p: &[f64; N], s: f64) -> f64 {
 /// conclusive, the interval is halved (Lane and Riesenfeld 1981). For a point well inside the range
 /// of the lens, the first test is conclusive.
 pub(crate) fn positive_on<const N: usize>(p: &[f64; N], end: f64) -> bool {
+    // Each halving divides the distance between the coefficients and the polynomial by four, so
+    // only a polynomial that nearly touches zero needs many. It is then rejected, which is the safe
+    // answer. The bound also ends the recursion for NaN.
     const MAX_HALVINGS: u32 = 30;
     let mut power = *p;
     let mut scale = 1.0;
@@ -99,6 +114,7 @@ const fn bernstein_weights<const N: usize>() -> [[f64; N]; N] {
         let mut column = 1;
         while column <= row {
             let previous = weights[row][column - 1];
+            // From `choose(j, i) / choose(j, i - 1) = (j - i + 1) / i`, where the `i` cancels.
             weights[row][column] = previous * (row + 1 - column) as f64 / (N - column) as f64;
             column += 1;
         }
@@ -107,6 +123,7 @@ const fn bernstein_weights<const N: usize>() -> [[f64; N]; N] {
     weights
 }
 
+/// Whether the polynomial with these Bernstein coefficients is positive on its interval.
 fn all_positive<const N: usize>(bernstein: &[f64; N], halvings_left: u32) -> bool {
     if bernstein.iter().all(|&coefficient| coefficient > 0.0) {
         return true;
@@ -116,7 +133,10 @@ fn all_positive<const N: usize>(bernstein: &[f64; N], halvings_left: u32) -> boo
     if !(bernstein[0] > 0.0 && bernstein[N - 1] > 0.0) || halvings_left == 0 {
         return false;
     }
-    let (mut left, mut right) = ([0.0; N], *bernstein);
+    let mut left = [0.0; N];
+    let mut right = *bernstein;
+    // De Casteljau's algorithm at the middle: the first value of each level is a coefficient of the
+    // left half.
     for (level, first) in left.iter_mut().enumerate() {
         *first = right[0];
         for at in 0..N - 1 - level {

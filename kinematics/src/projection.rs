@@ -43,6 +43,7 @@ impl Intrinsics {
         let (plane, coefficients) = params.split_at(4);
         let mut lens = self.lens;
         match &mut lens {
+            // The coefficients of a rectified image are not parameters, and stay as they are.
             _ if self.rectified => (),
             Lens::Pinhole => (),
             Lens::BrownConrady(k) => k.copy_from_slice(coefficients),
@@ -61,6 +62,7 @@ impl Intrinsics {
     /// with respect to the intrinsics.
     pub fn project_with_derivatives(&self, point_in_camera: &Vector3<f64>) -> Option<Projection> {
         let &[x, y, z] = point_in_camera.as_ref();
+        // NaN is checked explicitly: every comparison with it is false.
         if z.is_nan() || z <= 0.0 {
             return None;
         }
@@ -69,23 +71,28 @@ impl Intrinsics {
         let distorted = lens.distort(plane)?;
         let pixel = self.pixel_at(distorted.value)?;
         let plane_by_point = Matrix2x3::new(1.0, 0.0, -plane.x, 0.0, 1.0, -plane.y) / z;
+        // The chain rule: pixel by distorted point, by point of the plane `z = 1`, by point in
+        // space.
         let mut by_point = distorted.jacobian * plane_by_point;
         let mut by_intrinsics = SMatrix::<f64, 2, MAX_INTRINSICS_PARAMS>::zeros();
-        let mut set_coefficients = |derivatives: &[Vector2<f64>]| {
-            for (ix, derivative) in derivatives.iter().enumerate() {
-                by_intrinsics.set_column(4 + ix, derivative);
-            }
-        };
+        // First the derivatives of the distorted point, which do not depend on focal lengths and
+        // principal point.
         match &lens {
             Lens::Pinhole => (),
-            Lens::BrownConrady(_) => set_coefficients(&lens::brown_conrady_by_coefficients(plane)),
-            Lens::KannalaBrandt(_) => {
-                set_coefficients(&lens::kannala_brandt_by_coefficients(plane))
-            }
-            Lens::RationalBrownConrady(k) => {
-                set_coefficients(&lens::rational_by_coefficients(k, plane))
-            }
+            Lens::BrownConrady(_) => set_coefficients(
+                &mut by_intrinsics,
+                &lens::brown_conrady_by_coefficients(plane),
+            ),
+            Lens::KannalaBrandt(_) => set_coefficients(
+                &mut by_intrinsics,
+                &lens::kannala_brandt_by_coefficients(plane),
+            ),
+            Lens::RationalBrownConrady(k) => set_coefficients(
+                &mut by_intrinsics,
+                &lens::rational_by_coefficients(k, plane),
+            ),
         }
+        // Then those of `pixel = focal_px * distorted + principal_px`, by the chain rule.
         for axis in 0..2 {
             by_point.row_mut(axis).scale_mut(self.focal_px[axis]);
             by_intrinsics.row_mut(axis).scale_mut(self.focal_px[axis]);
@@ -97,6 +104,16 @@ impl Intrinsics {
             by_point,
             by_intrinsics,
         })
+    }
+}
+
+/// Sets the columns of the lens coefficients, which follow the four of the image plane.
+fn set_coefficients(
+    by_intrinsics: &mut SMatrix<f64, 2, MAX_INTRINSICS_PARAMS>,
+    derivatives: &[Vector2<f64>],
+) {
+    for (ix, derivative) in derivatives.iter().enumerate() {
+        by_intrinsics.set_column(4 + ix, derivative);
     }
 }
 

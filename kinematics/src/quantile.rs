@@ -23,6 +23,7 @@ pub fn median(values: &[f64]) -> Option<f64> {
     let mut sorted = values.to_vec();
     sorted.sort_unstable_by(f64::total_cmp);
     let middle_ix = sorted.len() / 2;
+    // The middle is one value or lies between two.
     match sorted.len() {
         0 => None,
         n if n % 2 == 1 => Some(sorted[middle_ix]),
@@ -44,6 +45,7 @@ pub fn quantile(values: &mut [f64], frac: f64, rank: Rank) -> Option<f64> {
     let last_ix = values.len().checked_sub(1)?;
     let n = values.len() as f64;
     let ix = match rank {
+        // At a fraction of zero, this is below the first index; it is limited below.
         Rank::Lower => (frac * n).ceil() - 1.0,
         Rank::Nearest => (frac * (n - 1.0)).round(),
         Rank::Upper => (frac * n).floor(),
@@ -66,6 +68,7 @@ pub fn trimmed_range(values: &mut [f64], outside_frac: f64) -> Option<[f64; 2]> 
         clippy::cast_sign_loss,
         reason = "a fraction of a length"
     )]
+    // Both ends lose the same number, and at least one value remains.
     let n_outside = ((outside_frac * values.len() as f64) as usize).min(last_ix / 2);
     let low = *values.select_nth_unstable_by(n_outside, f64::total_cmp).1;
     let high = *values

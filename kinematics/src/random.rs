@@ -54,6 +54,8 @@ impl Random {
     /// # Panics
     /// If `bound` is 0.
     pub fn below(&mut self, bound: usize) -> usize {
+        // The bias of the modulo is accepted: rejecting values would make the number of draws, and
+        // thus all later numbers, depend on the values.
         usize::try_from(self.bits() % bound as u64).expect("less than a usize")
     }
 
@@ -72,6 +74,7 @@ impl Random {
         if let Some(spare) = self.spare_normal.take() {
             return spare;
         }
+        // `unit` may be 0 but not 1, so the logarithm is taken of its complement, which is never 0.
         let radius = (-2.0 * (1.0 - self.unit()).ln()).sqrt();
         let (sine, cosine) = (TAU * self.unit()).sin_cos();
         self.spare_normal = Some(radius * sine);
@@ -81,6 +84,7 @@ impl Random {
     /// Shuffles the items; all orders are equally likely. Source: Durstenfeld 1964.
     pub fn shuffle<T>(&mut self, items: &mut [T]) {
         for ix in (1..items.len()).rev() {
+            // Each position receives one of the remaining items, including its own.
             items.swap(ix, self.below(ix + 1));
         }
     }
@@ -88,6 +92,8 @@ impl Random {
 
 /// The bits at index `n` of the sequence of a seed, computed without the preceding ones.
 pub fn nth_bits(seed: u64, n: u64) -> u64 {
+    // The state after `n` steps is known without taking them, so any element can be computed in
+    // parallel. `n + 1`, because the generator advances before it mixes.
     let state = seed.wrapping_add(n.wrapping_add(1).wrapping_mul(GOLDEN_GAMMA));
     let mixed = (state ^ (state >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
     let mixed = (mixed ^ (mixed >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);

@@ -61,15 +61,18 @@ pub(crate) struct LinkShapes {
 /// Reads the shapes of all links that have any. Invalid shapes and colors are noted and left out.
 pub(crate) fn read_all(robot: Element<'_>, notes: &mut Notes) -> HashMap<String, LinkShapes> {
     let mut materials = Materials::new();
+    // Materials of the robot come first, so that they win over those of links with the same name.
     for material in robot.all("material") {
         read_material(material, "the robot", &mut materials, notes);
     }
     let mut by_link = HashMap::<String, LinkShapes>::new();
-    // A material that a link defines may be used by all others.
+    // Visual shapes wait until all links have been read: a material that a link defines may be used
+    // by all others, also by earlier ones.
     let mut visuals = Vec::new();
     let mut seen = HashSet::new();
     for link in robot.all("link") {
         let name = link.attribute("name").unwrap_or_default();
+        // Of several links with one name, the robot uses the first, and has noted the others.
         if !seen.insert(name) {
             continue;
         }
@@ -106,6 +109,20 @@ pub(crate) fn read_all(robot: Element<'_>, notes: &mut Notes) -> HashMap<String,
             visuals.push((name, visual, material));
         }
     }
+    add_visuals(visuals, &materials, &mut by_link, notes);
+    by_link
+}
+
+/// A visual shape with the name of its link and its material, if it has a valid one.
+type Visual<'a> = (&'a str, Element<'a>, Option<Element<'a>>);
+
+/// Reads the visual shapes and gives each its color: its own, or that of the named material.
+fn add_visuals<'a>(
+    visuals: Vec<Visual<'a>>,
+    materials: &Materials<'a>,
+    by_link: &mut HashMap<String, LinkShapes>,
+    notes: &mut Notes,
+) {
     for (link, visual, material) in visuals {
         if let Some(mut shape) = noted(
             shape(visual, notes),
@@ -125,7 +142,6 @@ pub(crate) fn read_all(robot: Element<'_>, notes: &mut Notes) -> HashMap<String,
                 .push(shape);
         }
     }
-    by_link
 }
 
 type Materials<'a> = HashMap<&'a str, [f64; 4]>;
@@ -146,6 +162,8 @@ fn read_material<'a>(
     material.note_unknown(&["name"], &["color", "texture"], notes);
     let color = noted(own_color(material), &format!("a color of {owner}"), notes).flatten();
     if let (Some(name), Some(color)) = (material.attribute("name"), color) {
+        // The first definition wins, as for links. A material without a color is a reference, and
+        // defines nothing.
         materials.entry(name).or_insert(color);
     }
     if let Some(texture) = material.all("texture").next() {
@@ -163,6 +181,7 @@ fn own_color(material: Element<'_>) -> Result<Option<[f64; 4]>, Problem> {
     };
     let rgba = color.numbers::<4>("rgba")?;
     match rgba {
+        // Values up to 255 are a likely mistake, and would be drawn as white.
         Some(rgba) if !rgba.iter().all(|channel| (0.0..=1.0).contains(channel)) => Err(color
             .problem(format!(
                 "rgba is {rgba:?}, expected four numbers from 0 to 1"
@@ -174,20 +193,7 @@ fn own_color(material: Element<'_>) -> Result<Option<[f64; 4]>, Problem> {
 /// Masses are not used, but an invalid one shows that the file is damaged or unfinished.
 fn check_inertials(link: Element<'_>, of_link: &str, notes: &mut Notes) {
     for inertial in link.all("inertial") {
-        let check = || -> Result<(), Problem> {
-            let child = |tag| {
-                inertial
-                    .only(tag)?
-                    .ok_or_else(|| inertial.problem(format!("it has no <{tag}>")))
-            };
-            child("mass")?.number("value")?;
-            let inertia = child("inertia")?;
-            for moment in ["ixx", "ixy", "ixz", "iyy", "iyz", "izz"] {
-                inertia.number(moment)?;
-            }
-            Ok(())
-        };
-        if let Err(Problem { line, why }) = check() {
+        if let Err(Problem { line, why }) = check_inertial(inertial) {
             notes.add(
                 line,
                 &format!("the inertia of {of_link} is invalid (it is not used): {why}"),
@@ -196,15 +202,32 @@ fn check_inertials(link: Element<'_>, of_link: &str, notes: &mut Notes) {
     }
 }
 
+/// Reads all numbers of an `<inertial>` element.
+fn check_inertial(inertial: Element<'_>) -> Result<(), Problem> {
+    required_child(inertial, "mass")?.number("value")?;
+    let inertia = required_child(inertial, "inertia")?;
+    for moment in ["ixx", "ixy", "ixz", "iyy", "iyz", "izz"] {
+        inertia.number(moment)?;
+    }
+    Ok(())
+}
+
+/// The only child with this tag.
+fn required_child<'a>(parent: Element<'a>, tag: &'static str) -> Result<Element<'a>, Problem> {
+    parent
+        .only(tag)?
+        .ok_or_else(|| parent.problem(format!("it has no <{tag}>")))
+}
+
+/// Reads a visual or collision shape, without its color.
 fn shape(element: Element<'_>, notes: &mut Notes) -> Result<Shape, Problem> {
     element.note_unknown(
         &["name", "group"],
         &["origin", "geometry", "material", "verbose"],
         notes,
     );
-    let geometry = element
-        .only("geometry")?
-        .ok_or_else(|| element.problem("it has no <geometry>"))?;
+    let geometry = required_child(element, "geometry")?;
+    // Only notes attributes; a problem of the element is reported when the pose is read below.
     if let Ok(Some(origin)) = element.only("origin") {
         origin.note_unknown(&ORIGIN_ATTRIBUTES, &[], notes);
     }
@@ -215,6 +238,7 @@ fn shape(element: Element<'_>, notes: &mut Notes) -> Result<Shape, Problem> {
             forms.len()
         )));
     };
+    // The tag decides which attributes are known, so it is checked before them.
     let attributes: &[&str] = match form.tag() {
         "box" => &["size"],
         "cylinder" | "capsule" => &["radius", "length"],
@@ -234,40 +258,48 @@ fn shape(element: Element<'_>, notes: &mut Notes) -> Result<Shape, Problem> {
     })
 }
 
+/// A required attribute that is a positive number.
+fn length(form: Element<'_>, attribute: &str) -> Result<f64, Problem> {
+    form.required(attribute)?;
+    positive(form, attribute, form.number(attribute)?.unwrap_or_default())
+}
+
+/// The value, or a problem if it is not positive.
+fn positive(form: Element<'_>, what: &str, value: f64) -> Result<f64, Problem> {
+    if value > 0.0 {
+        return Ok(value);
+    }
+    Err(form.problem(format!("its {what} is {value}, expected a positive number")))
+}
+
 fn read_geometry(form: Element<'_>) -> Result<Geometry, Problem> {
-    let positive = |what: &str, value: f64| match value > 0.0 {
-        true => Ok(value),
-        false => Err(form.problem(format!("its {what} is {value}, expected a positive number"))),
-    };
-    let length = |what: &str| {
-        form.required(what)?;
-        positive(what, form.number(what)?.unwrap_or_default())
-    };
     Ok(match form.tag() {
         "box" => {
             form.required("size")?;
             let [x, y, z] = form.numbers("size")?.unwrap_or_default();
             Geometry::Box {
                 size_m: [
-                    positive("size", x)?,
-                    positive("size", y)?,
-                    positive("size", z)?,
+                    positive(form, "size", x)?,
+                    positive(form, "size", y)?,
+                    positive(form, "size", z)?,
                 ],
             }
         }
         "cylinder" => Geometry::Cylinder {
-            radius_m: length("radius")?,
-            length_m: length("length")?,
+            radius_m: length(form, "radius")?,
+            length_m: length(form, "length")?,
         },
         "capsule" => Geometry::Capsule {
-            radius_m: length("radius")?,
-            length_m: length("length")?,
+            radius_m: length(form, "radius")?,
+            length_m: length(form, "length")?,
         },
         "sphere" => Geometry::Sphere {
-            radius_m: length("radius")?,
+            radius_m: length(form, "radius")?,
         },
         _ => {
             let scale = form.numbers("scale")?.unwrap_or([1.0; 3]);
+            // A scale of zero flattens the mesh, and its normals cannot be computed. Negative
+            // values are allowed: they mirror it.
             if scale.contains(&0.0) {
                 return Err(form.problem(format!(
                     "its scale is {scale:?}, expected numbers other than 0"

@@ -1,5 +1,5 @@
-//! Lists in messages, shortened. They are here because this is the lowest crate whose users name
-//! links, markers and files.
+//! Shortens lists in messages. It is in this crate because all crates with such messages depend on
+//! this crate.
 
 use std::fmt::Display;
 

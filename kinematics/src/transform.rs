@@ -50,6 +50,7 @@ pub fn from_rows(rows: &[f64; 16]) -> Result<Transform, Error> {
 /// As [`from_rows`], with [`ROUNDED_TOLERANCE`].
 pub fn from_rounded_rows(rows: &[f64; 16]) -> Result<(Transform, bool), Error> {
     match from_rows(rows) {
+        // Only a deviation may come from rounding; all other errors remain errors.
         Err(Error::NotRigid { .. }) => Ok((from_rows_within(rows, ROUNDED_TOLERANCE)?, true)),
         exact => Ok((exact?, false)),
     }
@@ -72,10 +73,14 @@ fn from_rows_within(rows: &[f64; 16], tolerance: f64) -> Result<Transform, Error
         return Err(Error::LastRow { row: last });
     }
     let given = Matrix3::from_fn(|row, column| rows[4 * row + column]);
+    // The orthogonality check comes before the projection to a rotation, which would turn any
+    // matrix, even a scaled one in millimeters, into a plausible pose.
     let off = (given.transpose() * given - Matrix3::identity())
         .abs()
         .max();
     let determinant = given.determinant();
+    // A mirrored matrix is orthogonal, too: only its determinant differs. It comes from a file with
+    // left-handed axes.
     if off > tolerance || determinant < 0.0 {
         return Err(Error::NotRigid {
             off,
@@ -93,7 +98,9 @@ fn from_rows_within(rows: &[f64; 16], tolerance: f64) -> Result<Transform, Error
 /// The orthogonal polar factor, by Newton's iteration (Higham 1986), which converges quadratically
 /// for matrices that are close to a rotation.
 fn nearest_rotation(mut matrix: Matrix3<f64>) -> Rotation3<f64> {
-    const STEPS: usize = 4; // Errors go from 1e-3 to 1e-6 and 1e-12, then below rounding; one extra step is cheap.
+    // Errors go from 1e-3 to 1e-6 and 1e-12, then below rounding. One extra step is cheap, and a
+    // fixed number of steps gives the same bits for the same file.
+    const STEPS: usize = 4;
     for _ in 0..STEPS {
         let inverse_transpose = matrix
             .try_inverse()
@@ -129,7 +136,8 @@ pub fn from_xyz_xyzw([x, y, z, i, j, k, w]: [f64; 7]) -> Transform {
     )
 }
 
-/// Smaller motions of a camera are noticeable neither in a picture nor in a map of the scene.
+/// Smaller motions of a camera are noticeable neither in a picture nor in a map of the scene: at a
+/// focal length of 600 pixels, both bounds move a point at a distance of 1 m by 0.3 pixels.
 const NOTICEABLE_M: f64 = 5e-4;
 const NOTICEABLE_RAD: f64 = 5e-4;
 
@@ -184,9 +192,12 @@ pub fn exp(twist: &Twist, secs: f64) -> Transform {
             1.0 / 6.0 - angle * angle / 120.0,
         )
     } else {
+        // `1 - cos a = 2 sin²(a / 2)` avoids the cancellation of `1 - cos a` at small angles.
         let half = (0.5 * angle).sin() / angle;
         (2.0 * half * half, (angle - angle.sin()) / angle.powi(3))
     };
+    // `v + first (w x v) + second (w x (w x v))`: the series of powers of the cross product, summed
+    // up by Rodrigues.
     let first_cross = rotation_vector.cross(&translation_part);
     let translation =
         translation_part + first_cross * first + rotation_vector.cross(&first_cross) * second;
@@ -208,6 +219,7 @@ pub fn log(transform: &Transform, secs: f64) -> Twist {
         (1.0 - 0.5 * angle / (0.5 * angle).tan()) / (angle * angle)
     };
     let translation = transform.translation.vector;
+    // The inverse of the map in `exp` is a sum of the same two cross products.
     let first_cross = rotation_vector.cross(&translation);
     let translation_part =
         translation - first_cross * 0.5 + rotation_vector.cross(&first_cross) * second;
@@ -230,6 +242,7 @@ impl Twist {
     /// (adjoint transform).
     pub fn of_attached(&self, this_from_other: &Transform) -> Self {
         let other_from_this = this_from_other.rotation.inverse();
+        // The other origin also moves because this frame rotates: `v + w x r`.
         let linear_m_s = self.linear_m_s
             + self
                 .angular_rad_s

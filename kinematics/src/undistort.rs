@@ -30,10 +30,32 @@ impl Tap {
         right: 0,
         lower: 0,
     };
+
+    /// The nearest of the four neighbors; 0 outside the image.
+    ///
+    /// * `steps`: see [`Undistortion::steps`].
+    fn nearest(&self, depth_m: &[f32], [step_right, step_down]: [usize; 2]) -> f32 {
+        if self.upper_left == u32::MAX {
+            return 0.0;
+        }
+        let right = if u32::from(self.right) * 2 >= ONE {
+            step_right
+        } else {
+            0
+        };
+        let down = if u32::from(self.lower) * 2 >= ONE {
+            step_down
+        } else {
+            0
+        };
+        depth_m[self.upper_left as usize + right + down]
+    }
 }
 
-/// The value 1 in the fixed-point format of [`Tap`]. Two 11-bit weights and 8 bits of color fit 32
-/// bits.
+/// The value 1 in the fixed-point format of [`Tap`].
+///
+/// Two 11-bit weights and 8 bits of color have 30 bits, so a weighted sum of four pixels fits 32
+/// bits. A weight is exact to 1/4096, which changes a color by at most 1/16.
 const ONE: u32 = 1 << SHARE_BITS;
 const SHARE_BITS: u32 = 11;
 
@@ -42,16 +64,9 @@ impl Undistortion {
     pub fn new(intrinsics: &Intrinsics) -> Self {
         let pinhole = intrinsics.undistorted();
         let [width, height] = intrinsics.size_px;
-        let tap = |column: u32, row: u32| {
-            let ray = pinhole.unproject([f64::from(column) + 0.5, f64::from(row) + 0.5])?;
-            let source = intrinsics
-                .project(&ray)
-                .filter(|source| intrinsics.contains(*source))?;
-            Some(tap_at(source, [width, height]))
-        };
-        let rows = (0..height).flat_map(|row| (0..width).map(move |column| (column, row)));
-        let taps = rows
-            .map(|(column, row)| tap(column, row).unwrap_or(Tap::OUTSIDE))
+        let pixels = (0..height).flat_map(|row| (0..width).map(move |column| [column, row]));
+        let taps = pixels
+            .map(|pixel| tap_of(pixel, &pinhole, intrinsics).unwrap_or(Tap::OUTSIDE))
             .collect();
         Self {
             size_px: [width, height],
@@ -110,24 +125,12 @@ impl Undistortion {
     /// lies outside the image are 0.
     pub fn apply_depth(&self, depth_m: &[f32]) -> Result<Vec<f32>, Error> {
         self.check_len(depth_m.len(), 1)?;
-        let [step_right, step_down] = self.steps();
-        let nearest = |tap: &Tap| {
-            if tap.upper_left == u32::MAX {
-                return 0.0;
-            }
-            let right = if u32::from(tap.right) * 2 >= ONE {
-                step_right
-            } else {
-                0
-            };
-            let down = if u32::from(tap.lower) * 2 >= ONE {
-                step_down
-            } else {
-                0
-            };
-            depth_m[tap.upper_left as usize + right + down]
-        };
-        Ok(self.taps.iter().map(nearest).collect())
+        let steps = self.steps();
+        Ok(self
+            .taps
+            .iter()
+            .map(|tap| tap.nearest(depth_m, steps))
+            .collect())
     }
 
     fn resample<const CHANNELS: usize>(&self, source: &[u8]) -> Vec<u8> {
@@ -136,7 +139,7 @@ impl Undistortion {
         rgba
     }
 
-    /// Samples the source for some output pixels.
+    /// Samples the source image at the given taps, one per output pixel.
     fn resample_to<const CHANNELS: usize>(&self, source: &[u8], taps: &[Tap], rgba: &mut [u8]) {
         let [step_right, step_down] = self.steps().map(|step| step * CHANNELS);
         for (tap, out) in taps.iter().zip(rgba.as_chunks_mut::<4>().0) {
@@ -144,19 +147,13 @@ impl Undistortion {
                 *out = [0; 4];
                 continue;
             }
-            let (right, lower) = (u32::from(tap.right), u32::from(tap.lower));
-            let (left, upper) = (ONE - right, ONE - lower);
+            let right = u32::from(tap.right);
+            let lower = u32::from(tap.lower);
+            let upper = ONE - lower;
             let at = tap.upper_left as usize * CHANNELS;
-            let pair = |start: usize| {
-                let (a, b) = (
-                    &source[start..start + CHANNELS],
-                    &source[start + step_right..][..CHANNELS],
-                );
-                std::array::from_fn::<u32, CHANNELS, _>(|c| {
-                    u32::from(a[c]) * left + u32::from(b[c]) * right
-                })
-            };
-            let (above, below) = (pair(at), pair(at + step_down));
+            let above = mix_pair::<CHANNELS>(&source[at..], step_right, right);
+            let below = mix_pair::<CHANNELS>(&source[at + step_down..], step_right, right);
+            // Images without alpha are opaque. With four channels, the loop overwrites this.
             out[3] = 255;
             for channel in 0..CHANNELS {
                 let sum = above[channel] * upper + below[channel] * lower;
@@ -191,36 +188,62 @@ impl Undistortion {
     }
 }
 
+/// The channels of a pixel and of the one at its right, weighted with `ONE - right` and `right`.
+///
+/// * `source`: from the first channel of the pixel on.
+fn mix_pair<const CHANNELS: usize>(
+    source: &[u8],
+    step_right: usize,
+    right: u32,
+) -> [u32; CHANNELS] {
+    let left = ONE - right;
+    let a = &source[..CHANNELS];
+    let b = &source[step_right..][..CHANNELS];
+    std::array::from_fn(|channel| u32::from(a[channel]) * left + u32::from(b[channel]) * right)
+}
+
+/// The byte closest to a sum of colors that are weighted with two shares each.
 #[expect(clippy::cast_possible_truncation, reason = "a mean of bytes is a byte")]
 fn round_share(sum: u32) -> u8 {
     ((sum + (1 << (2 * SHARE_BITS - 1))) >> (2 * SHARE_BITS)) as u8
 }
 
+/// The tap of one pixel of the pinhole image; `None` if its source is outside the distorted image.
+fn tap_of([column, row]: [u32; 2], pinhole: &Intrinsics, distorted: &Intrinsics) -> Option<Tap> {
+    let ray = pinhole.unproject([f64::from(column) + 0.5, f64::from(row) + 0.5])?;
+    let source = distorted
+        .project(&ray)
+        .filter(|source| distorted.contains(*source))?;
+    Some(tap_at(source, distorted.size_px))
+}
+
 /// The tap for a source position inside the image. Positions within half a pixel of the border take
 /// the color of the border.
-#[expect(
-    clippy::cast_possible_truncation,
-    clippy::cast_sign_loss,
-    reason = "positions lie in the image, shares in 0..=1"
-)]
 fn tap_at(source: [f64; 2], size_px: [u32; 2]) -> Tap {
-    let along = |axis: usize| {
-        let last = f64::from(size_px[axis] - 1);
-        let position = (source[axis] - 0.5).clamp(0.0, last);
-        // The last pixel is read as the right neighbor of the one before it, so that no read goes
-        // past the end.
-        let start = position.floor().min((last - 1.0).max(0.0));
-        (
-            start as u32,
-            ((position - start) * f64::from(ONE)).round() as u16,
-        )
-    };
-    let ((column, right), (row, lower)) = (along(0), along(1));
+    let (column, right) = tap_along(source[0], size_px[0]);
+    let (row, lower) = tap_along(source[1], size_px[1]);
     Tap {
         upper_left: row * size_px[0] + column,
         right,
         lower,
     }
+}
+
+/// The first of two neighbors along one axis, and the weight of the second.
+#[expect(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "positions lie in the image, shares in 0..=1"
+)]
+fn tap_along(source_px: f64, size_px: u32) -> (u32, u16) {
+    let last = f64::from(size_px - 1);
+    // From pixel edges at integers to pixel centers at integers, which are the samples to mix.
+    let position = (source_px - 0.5).clamp(0.0, last);
+    // The last pixel is read as the right neighbor of the one before it, so that no read goes past
+    // the end.
+    let start = position.floor().min((last - 1.0).max(0.0));
+    let share = (position - start) * f64::from(ONE);
+    (start as u32, share.round() as u16)
 }
 
 #[cfg(test)]

@@ -43,6 +43,7 @@ struct File {
 pub(crate) fn of_model(method: &mut dyn Method, keyframes: &[Arc<Keyframe>]) -> Vec<PosedCamera> {
     let mut cameras = Vec::new();
     for keyframe in keyframes {
+        // The list is an aid for viewers. An error, such as a lost GPU, must not prevent it.
         let lens = method.calibrated_camera(keyframe).unwrap_or_else(|error| {
             log::debug!("listing a camera without its learned correction: {error}");
             CalibratedCamera::of(keyframe)
@@ -85,7 +86,8 @@ pub fn read(folder: &Path) -> crate::Result<Option<Vec<KeyframePose>>> {
     let posed = cameras.into_iter().map(|camera| {
         let world_from_camera =
             camera_path::rigid(&camera.world_from_camera).with_context(|| {
-                let (name, stamp) = (&camera.camera, camera.stamp_nanos);
+                let name = &camera.camera;
+                let stamp = camera.stamp_nanos;
                 format!("{}: the pose of {name} {stamp}", path.display())
             })?;
         Ok(KeyframePose {

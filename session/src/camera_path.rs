@@ -33,7 +33,8 @@ pub struct CameraPath {
 
 const PERSPECTIVE: &str = "perspective";
 const EQUIRECTANGULAR: &str = "equirectangular";
-/// Largest side of a picture.
+/// Largest side of a picture: the largest texture that GPUs commonly support. A mistyped size would
+/// otherwise fail only when memory runs out.
 const MAX_SIDE_PX: f64 = 16384.0;
 /// Keys that do not change the pictures: how the path was edited, and how its video is played.
 const UNUSED: [&str; 9] = [
@@ -75,25 +76,8 @@ struct PathFileCamera {
 
 impl PathFile {
     fn size_px(&self) -> crate::Result<Option<[u32; 2]>> {
-        let side = |name: &str, side_px: Option<f64>| {
-            let Some(side_px) = side_px else {
-                return Ok(None);
-            };
-            ensure!(
-                side_px.fract() == 0.0 && (1.0..=MAX_SIDE_PX).contains(&side_px),
-                "{name} is {side_px}, must be a whole number from 1 to {MAX_SIDE_PX}"
-            );
-            #[expect(
-                clippy::cast_possible_truncation,
-                clippy::cast_sign_loss,
-                reason = "checked above"
-            )]
-            Ok::<_, crate::Error>(Some(side_px as u32))
-        };
-        let (width, height) = (
-            side("render_width", self.render_width)?,
-            side("render_height", self.render_height)?,
-        );
+        let width = whole_side("render_width", self.render_width)?;
+        let height = whole_side("render_height", self.render_height)?;
         ensure!(
             width.is_some() == height.is_some(),
             "render_width and render_height must be given together"
@@ -102,6 +86,7 @@ impl PathFile {
     }
 
     fn notes(&self) -> Vec<String> {
+        // Each camera has its own keys, so a long path could name hundreds.
         const MAX_NAMED: usize = 5;
         let of_cameras = self.camera_path.iter().flat_map(|camera| &camera.other);
         let is_unknown = |key: &str, value: &Value| !UNUSED.contains(&key) && !value.is_null();
@@ -123,6 +108,23 @@ impl PathFile {
         };
         vec![format!("unknown keys are not used: {named}{advice}")]
     }
+}
+
+/// A width or height as a whole number of pixels; `None` if it is not given.
+fn whole_side(name: &str, side_px: Option<f64>) -> crate::Result<Option<u32>> {
+    let Some(side_px) = side_px else {
+        return Ok(None);
+    };
+    ensure!(
+        side_px.fract() == 0.0 && (1.0..=MAX_SIDE_PX).contains(&side_px),
+        "{name} is {side_px}, must be a whole number from 1 to {MAX_SIDE_PX}"
+    );
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "checked above"
+    )]
+    Ok(Some(side_px as u32))
 }
 
 impl CameraPath {
@@ -159,22 +161,19 @@ impl CameraPath {
             [PERSPECTIVE, EQUIRECTANGULAR].contains(&camera_type),
             "camera_type is {camera_type:?}, but only {PERSPECTIVE:?} and {EQUIRECTANGULAR:?} are supported"
         );
-        let camera = |(ix, camera): (usize, &PathFileCamera)| {
+        let mut cameras = Vec::new();
+        for (ix, camera) in file.camera_path.iter().enumerate() {
             let world_from_opengl =
                 rigid(&camera.camera_to_world).with_context(|| format!("camera {ix}"))?;
+            // Converted here and nowhere else; all other code has z forward and y down.
             let opengl_from_camera = drivers::dataset::nerfstudio::opengl_from_camera();
-            Ok::<_, crate::Error>(PathCamera {
+            cameras.push(PathCamera {
                 world_from_camera: world_from_opengl * opengl_from_camera,
                 fov_y_rad: camera.fov.or(file.default_fov).map(f64::to_radians),
-            })
-        };
+            });
+        }
         Ok(Self {
-            cameras: file
-                .camera_path
-                .iter()
-                .enumerate()
-                .map(camera)
-                .collect::<Result<_, _>>()?,
+            cameras,
             size_px: file.size_px()?,
             is_panoramic: camera_type == EQUIRECTANGULAR,
             notes: file.notes(),

@@ -13,9 +13,12 @@ use std::time::{Duration, Instant};
 use trainer::checkpoint::{Checkpoint, PendingCheckpoint};
 use trainer::{Edits, Method, ModelKind};
 
-/// Default time between two checkpoints.
+/// Default time between two checkpoints: the training time that a killed process loses at most.
+/// Each checkpoint writes the whole state, so shorter periods write more to the disk.
 const DEFAULT_PERIOD: Duration = Duration::from_secs(60);
-/// Time between two writes of new keyframes in a live run.
+/// Time between two writes of new keyframes in a live run. It is shorter than the period of
+/// checkpoints, because images that are lost cannot be captured again, and each one is written only
+/// once.
 const KEYFRAME_PERIOD: Duration = Duration::from_secs(2);
 /// Name of the flag as stored in checkpoints.
 const CHECKPOINT_SECS: &str = "checkpoint-secs";
@@ -38,15 +41,15 @@ impl CheckpointOptions {
 
     /// These options, with the period of the earlier run if the flag was not given.
     pub fn or_previous(self, flags: &BTreeMap<String, String>) -> Self {
-        let previous = || {
-            flags
-                .get(CHECKPOINT_SECS)
-                .and_then(|text| parse_period(text).ok())
-        };
         Self {
-            period: self.period.or_else(previous),
+            period: self.period.or_else(|| period_in(flags)),
         }
     }
+}
+
+/// The period among the flags of an earlier run; `None` if it was not given or is invalid.
+fn period_in(flags: &BTreeMap<String, String>) -> Option<Duration> {
+    parse_period(flags.get(CHECKPOINT_SECS)?).ok()
 }
 
 /// Parses a number of seconds that is at least 0.
@@ -68,6 +71,7 @@ pub fn read(folder: &Path) -> crate::Result<Checkpoint> {
     expect_one_model(folder)?;
     let mut checkpoint = Checkpoint::read(&folder.join(CHECKPOINT))
         .with_context(|| format!("no checkpoint to resume from in {}", folder.display()))?;
+    // The files of a model are moved into place one by one. The last one shows that all are there.
     let last_file =
         ModelKind::from_name(&checkpoint.method).and_then(|kind| kind.entry().files.last());
     if last_file.is_some_and(|file| folder.join(file).is_file()) {
@@ -140,12 +144,9 @@ pub struct Snapshot<'a> {
 impl Checkpoints {
     /// Returns `None` if checkpoints are disabled. The first checkpoint is due after one period.
     pub fn new(folder: &Path, options: CheckpointOptions) -> Option<Self> {
-        let (period, path) = (
-            options.period.unwrap_or(DEFAULT_PERIOD),
-            folder.join(CHECKPOINT),
-        );
+        let period = options.period.unwrap_or(DEFAULT_PERIOD);
         (!period.is_zero()).then(|| Self {
-            path,
+            path: folder.join(CHECKPOINT),
             run_flags: RunFlags::default(),
             period,
             due_after: period,
@@ -181,6 +182,8 @@ impl Checkpoints {
     /// Starts a checkpoint if one is due and the previous one is complete. Returns whether a
     /// checkpoint was started. Write errors are logged and do not stop training.
     pub fn write_when_due(&mut self, now: Snapshot<'_>) -> Result<bool, trainer::Error> {
+        // Only one writer at a time: a slow disk makes checkpoints rarer, instead of collecting
+        // copies of the state in memory.
         if self
             .writer
             .as_ref()
@@ -188,6 +191,7 @@ impl Checkpoints {
         {
             return Ok(false);
         }
+        // A checkpoint of a live run without keyframes could not be resumed.
         let is_resumable = self.stored_keyframes.is_none() || !now.keyframes.is_empty();
         if self.last.elapsed() >= self.due_after && is_resumable {
             self.begin(now)?;
@@ -198,6 +202,7 @@ impl Checkpoints {
             .clone()
             .filter(|_| self.last_keyframes.elapsed() >= KEYFRAME_PERIOD)
         {
+            // The last writer has finished. This logs its error, if there was one.
             self.wait_and_warn();
             let keyframes = now.keyframes.to_vec();
             let thread = Task::start("keyframes", move || stored.add(&keyframes));
@@ -252,7 +257,10 @@ impl Checkpoints {
             thread,
             is_checkpoint: true,
         });
-        (self.last, self.last_keyframes) = (Instant::now(), Instant::now());
+        // A checkpoint also writes the new keyframes.
+        self.last = Instant::now();
+        self.last_keyframes = Instant::now();
+        // Ends an earlier due time: that of the first checkpoint, or of a request.
         self.due_after = self.period;
     }
 
@@ -298,6 +306,7 @@ impl Checkpoints {
         match thread.join() {
             Ok(written) => {
                 written?;
+                // Set only after success: `newest` must not name a file that does not exist.
                 self.has_any |= is_checkpoint;
                 Ok(())
             }
@@ -323,14 +332,15 @@ impl CheckpointWrite {
     fn write(self) -> crate::Result<()> {
         let started = Instant::now();
         let RunFlags { depth_from, flags } = self.run_flags;
+        // In this order, the files on disk form a complete state at any time: the keyframes of the
+        // new checkpoint exist before it, and those of the old one until it is replaced.
         if let Some((stored, keyframes)) = &self.keyframes {
             stored.add(keyframes)?;
         }
-        let (seconds, is_finished, edits) = (self.seconds, self.is_finished, self.edits);
         Checkpoint {
-            seconds,
-            is_finished,
-            edits,
+            seconds: self.seconds,
+            is_finished: self.is_finished,
+            edits: self.edits,
             depth_from,
             flags,
             ..self.pending.finish()?

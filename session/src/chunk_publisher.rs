@@ -10,9 +10,11 @@ use viz::Hub;
 /// Minimum time between two versions of a model, because each one is read from the GPU and encoded
 /// as a whole.
 const MIN_PERIOD: Duration = Duration::from_millis(500);
-/// Pause after a failure.
+/// Pause after a failure. Each failure is logged, and its cause, such as a lack of memory, does not
+/// pass within one version.
 const RETRY_PERIOD: Duration = Duration::from_secs(10);
-/// Maximum fraction of the time that encoding takes.
+/// Maximum fraction of the time that encoding takes. Encoding uses processors that training, devices
+/// and pictures need, too. With a larger fraction, viewers get large models more often.
 const MAX_ENCODE_FRAC: f64 = 0.25;
 
 /// Encodes chunks on another thread, one model at a time.
@@ -62,9 +64,11 @@ impl ChunkPublisher {
         self.finish();
         let name = kind.name();
         let Some(period) = self.hub.chunk_period(name) else {
+            // No client draws this model. The next one gets it at once.
             self.models.remove(name);
             return began.elapsed();
         };
+        // After a failure, the changes since the last version are lost, so all chunks are due.
         let only_changed = self.hub.has_model_chunks(name) && !self.failed.contains(name);
         let step = method.progress().step;
         let is_due = match self.models.get(name) {
@@ -111,6 +115,7 @@ impl ChunkPublisher {
         else {
             return;
         };
+        // The time from start to start is the time of encoding, divided by its allowed fraction.
         let pause = Duration::from_secs_f64(began.elapsed().as_secs_f64() / MAX_ENCODE_FRAC);
         if let Some(published) = self.models.get_mut(name) {
             published.next_at = published.next_at.max(began + pause);

@@ -51,13 +51,20 @@ impl Clock {
     /// Training time so far, seconds.
     pub fn secs(&self) -> f64 {
         let state = self.0.get();
-        let of_this_run = |started: Instant| {
+        state.previous_secs + state.secs_of_this_run()
+    }
+}
+
+impl ClockState {
+    /// Training time of this run, seconds; 0 before the start.
+    fn secs_of_this_run(self) -> f64 {
+        // Excluded time may include time before the start, so the difference may be negative.
+        self.started.map_or(0.0, |started| {
             started
                 .elapsed()
-                .saturating_sub(state.excluded)
+                .saturating_sub(self.excluded)
                 .as_secs_f64()
-        };
-        state.previous_secs + state.started.map_or(0.0, of_this_run)
+        })
     }
 }
 

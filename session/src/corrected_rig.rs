@@ -28,6 +28,8 @@ pub fn corrected(
     let unaligned = Alignment::default();
     let alignment = alignment.unwrap_or(&unaligned);
     for camera in &mut rig.cameras {
+        // A rig file has one pose per camera. After a movement, the latest pose is the right one
+        // for later runs.
         if let Some(correction) = alignment.movement_correction(&camera.name, Stamp(i64::MAX)) {
             correct(camera, &correction, &[], ALIGNED);
         }
@@ -36,14 +38,11 @@ pub fn corrected(
         }
         if let Some(correction) = learned.get(&*camera.name) {
             let mut correction = correction.clone();
-            let is_of_camera = |estimate: &Estimate| match estimate {
-                Estimate::HandEye(estimate) => *estimate.camera == *camera.name,
-                _ => false,
-            };
-            if alignment.estimates.iter().any(is_of_camera) {
+            if has_extrinsics_of(&alignment.estimates, &camera.name) {
                 // Registration is more accurate: extrinsics that are optimized with an unfinished
                 // scene adapt to it.
-                (correction.rotation_rad, correction.translation_m) = ([0.0; 3], [0.0; 3]);
+                correction.rotation_rad = [0.0; 3];
+                correction.translation_m = [0.0; 3];
             } else if correction.rotation_rad != [0.0; 3] {
                 log::info!(
                     "camera {:?}: corrected by {:.3} degrees and {:.2} mm, optimized with the scene",
@@ -55,6 +54,8 @@ pub fn corrected(
             correct(camera, &correction, &[], LEARNED);
         }
     }
+    // All cameras on the arm have the same joint offsets. Cameras that no joint carries have none,
+    // so the longest list is taken.
     let joint_offsets = alignment
         .corrections
         .values()
@@ -68,6 +69,14 @@ pub fn corrected(
         }
     }
     Ok(rig)
+}
+
+/// Whether the estimates contain the extrinsics of a camera.
+fn has_extrinsics_of(estimates: &[Estimate], camera: &str) -> bool {
+    estimates.iter().any(|estimate| match estimate {
+        Estimate::HandEye(estimate) => *estimate.camera == *camera,
+        _ => false,
+    })
 }
 
 /// A camera of a rig.
@@ -133,6 +142,7 @@ pub fn with_extrinsics(
     pose: &Transform,
 ) -> Result<Rig, Error> {
     let given = camera(rig, name)?.parent;
+    // Only a fixed base has one known pose in the world.
     let is_converted = (parent, given) == (Parent::Base, Parent::World) && !rig.has_moving_base();
     if given != parent && !is_converted {
         return Err(Error::BadInput(format!(
@@ -271,17 +281,19 @@ fn back_up(file: &Path) -> std::io::Result<()> {
 
 /// Path of a backup that does not exist yet.
 fn unused_backup(file: &Path) -> PathBuf {
-    let with = |suffix: String| {
-        let mut path = file.as_os_str().to_owned();
-        path.push(suffix);
-        PathBuf::from(path)
-    };
-    let numbered = (2..).map(|number: u32| with(format!(".old{number}")));
-    let mut names = std::iter::once(with(".old".to_owned())).chain(numbered);
-    // A broken symbolic link takes a name, too.
+    let numbered = (2..).map(|number: u32| with_suffix(file, &format!(".old{number}")));
+    let mut names = std::iter::once(with_suffix(file, ".old")).chain(numbered);
+    // A broken symbolic link also occupies a name.
     names
         .find(|path| path.symlink_metadata().is_err())
         .expect("an unused number")
+}
+
+/// A path with text appended to its file name.
+fn with_suffix(file: &Path, suffix: &str) -> PathBuf {
+    let mut path = file.as_os_str().to_owned();
+    path.push(suffix);
+    PathBuf::from(path)
 }
 
 /// Applies a correction. `estimates` contain the standard deviation of the time offset, if it is
@@ -292,13 +304,10 @@ fn correct(
     estimates: &[Estimate],
     source: &str,
 ) {
-    let moved = |rotation_rad: [f64; 3], translation_m: [f64; 3]| {
-        Transform::from_parts(
-            Translation3::from(Vector3::from(translation_m)),
-            UnitQuaternion::from_scaled_axis(Vector3::from(rotation_rad)),
-        )
-    };
-    camera.parent_from_camera *= moved(correction.rotation_rad, correction.translation_m).inverse();
+    // A correction maps points from the frame of the reported camera to that of the true one, and a
+    // rig file has the inverse direction.
+    camera.parent_from_camera *=
+        rigid_motion(correction.rotation_rad, correction.translation_m).inverse();
     if correction.time_offset_secs != 0.0 {
         let sigma = estimates.iter().find_map(|estimate| match estimate {
             Estimate::TimeOffset(time_offset) if *time_offset.camera == *camera.name => {
@@ -318,30 +327,46 @@ fn correct(
     }
     if correction.readout_secs != 0.0 {
         let readout_micros = camera.readout_micros.unwrap_or(0.0) + 1e6 * correction.readout_secs;
+        // Reading an image takes at most the time until the next one, and rig files reject other
+        // values.
         camera.readout_micros = Some(readout_micros.clamp(0.0, 1e6 / camera.rate_hz));
     }
-    let correct_lens = |intrinsics: &mut Intrinsics| {
-        for axis in 0..2 {
-            intrinsics.principal_px[axis] +=
-                correction.principal_offset_focals[axis] * intrinsics.focal_px[axis];
-            intrinsics.focal_px[axis] *= correction.log_focal[axis].exp();
-        }
-    };
     if let Some(depth) = &mut camera.depth {
+        // Compared before the lens of the color image is corrected. Depth that is aligned with
+        // color has the same lens, and must keep it.
         let shares_lens = depth.intrinsics == camera.intrinsics.resized(depth.intrinsics.size_px)
             || depth.intrinsics == camera.intrinsics;
         if shares_lens {
-            correct_lens(&mut depth.intrinsics);
+            correct_lens(&mut depth.intrinsics, correction);
         }
-        depth.camera_from_depth = moved(
+        depth.camera_from_depth = rigid_motion(
             correction.depth_rotation_rad,
             correction.depth_translation_m,
         ) * depth.camera_from_depth;
         depth.factor *= correction.log_depth_scale.exp();
     }
-    correct_lens(&mut camera.intrinsics);
+    correct_lens(&mut camera.intrinsics, correction);
+    // A covariance belongs to the values with which it was estimated.
     if (correction.log_focal, correction.principal_offset_focals) != ([0.0; 2], [0.0; 2]) {
         camera.intrinsics_covariance.clear();
+    }
+}
+
+/// A rigid motion from a rotation vector and a translation.
+fn rigid_motion(rotation_rad: [f64; 3], translation_m: [f64; 3]) -> Transform {
+    Transform::from_parts(
+        Translation3::from(Vector3::from(translation_m)),
+        UnitQuaternion::from_scaled_axis(Vector3::from(rotation_rad)),
+    )
+}
+
+/// Corrects focal length and principal point.
+fn correct_lens(intrinsics: &mut Intrinsics, correction: &CameraCorrection) {
+    for axis in 0..2 {
+        // The offset is in units of the focal length before its correction.
+        intrinsics.principal_px[axis] +=
+            correction.principal_offset_focals[axis] * intrinsics.focal_px[axis];
+        intrinsics.focal_px[axis] *= correction.log_focal[axis].exp();
     }
 }
 

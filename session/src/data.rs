@@ -12,6 +12,7 @@ use capture::{Join, JoinEvent, SampleUse, StationReport, Stations, dataset};
 use drivers::Sample;
 use keyframe::ensure;
 use keyframe::{Holdout, Keyframe, KeyframeList, Split, counted};
+use kinematics::Stamp;
 use sha2::{Digest, Sha256};
 use std::collections::{BTreeMap, HashSet};
 use std::path::{Path, PathBuf};
@@ -48,23 +49,10 @@ impl DataOptions {
 
     /// Names and values of the given flags that affect keyframes. Paths of files are absolute.
     pub fn flags(&self) -> BTreeMap<String, String> {
-        let canonical = |file: &Path| {
-            file.canonicalize()
-                .unwrap_or_else(|_| file.to_owned())
-                .display()
-                .to_string()
-        };
-        let holdout = |text: &String| {
-            if is_number(text) {
-                text.clone()
-            } else {
-                canonical(Path::new(text))
-            }
-        };
         let given = [
-            ("holdout", self.holdout.as_ref().map(holdout)),
-            ("keyframes", self.keyframes.as_deref().map(canonical)),
-            ("rig", self.rig.as_deref().map(canonical)),
+            ("holdout", self.holdout.as_deref().map(holdout_value)),
+            ("keyframes", self.keyframes.as_deref().map(absolute)),
+            ("rig", self.rig.as_deref().map(absolute)),
             ("scale", self.scale.map(|scale| scale.to_string())),
         ];
         given
@@ -140,6 +128,23 @@ impl DataOptions {
 
 fn is_number(text: &str) -> bool {
     text.parse::<f64>().is_ok()
+}
+
+/// The value of `--holdout` as it is stored: a number as given, a file with its absolute path.
+fn holdout_value(text: &str) -> String {
+    if is_number(text) {
+        text.to_owned()
+    } else {
+        absolute(Path::new(text))
+    }
+}
+
+/// The absolute path of a file, because a later run may be started in another folder.
+fn absolute(file: &Path) -> String {
+    file.canonicalize()
+        .unwrap_or_else(|_| file.to_owned())
+        .display()
+        .to_string()
 }
 
 /// Loaded keyframes and their metadata.
@@ -267,31 +272,45 @@ impl Data {
         } else {
             Self::from_folder(path, holdout.as_ref(), scale.unwrap_or(1.0), list, progress)?
         };
-        if let (true, Some(holdout)) = (is_recording, &holdout) {
+        // A folder is split when it is read. Keyframes of a recording have the splits of a live
+        // run, which `--holdout` replaces.
+        if is_recording && let Some(holdout) = &holdout {
             data.assign_splits(holdout)?;
         }
         if !use_reported_poses {
             data.realign();
         }
+        data.check_split(path, purpose)?;
+        data.check_masks(path)?;
+        Ok(data)
+    }
+
+    /// Returns an error if there is no image for this purpose.
+    fn check_split(&self, path: &Path, purpose: Purpose) -> Result<(), Error> {
         let (required_split, message) = match purpose {
             Purpose::Training => (Split::Train, "no training image"),
             Purpose::Scoring => (Split::Test, "no test image"),
         };
-        if data.of_split(required_split).is_empty() {
-            let n_images = counted(data.keyframes.len() as u64, "image");
+        if self.of_split(required_split).is_empty() {
+            let n_images = counted(self.keyframes.len() as u64, "image");
             return Err(Error::InsufficientData(format!(
                 "{}: {message} among {n_images}",
                 path.display()
             )));
         }
-        let is_masked = |keyframe: &&Arc<Keyframe>| {
-            keyframe
-                .rgba_srgb
-                .chunks_exact(4)
-                .all(|pixel| pixel[3] == 0)
-        };
-        let n_masked = data.keyframes.iter().filter(is_masked).count();
-        if n_masked == data.keyframes.len() {
+        Ok(())
+    }
+
+    /// Returns an error if all pixels of all images are masked, and logs a warning if those of some
+    /// images are.
+    fn check_masks(&self, path: &Path) -> Result<(), Error> {
+        let n_masked = self
+            .keyframes
+            .iter()
+            .filter(|keyframe| is_masked(keyframe))
+            .count();
+        // The usual cause is an inverted mask. Training would succeed with an empty model.
+        if n_masked == self.keyframes.len() {
             return Err(Error::InsufficientData(format!(
                 "{}: no pixel of any image can be used: masks, transparency or lens parameters exclude all of them (black in \
                  a mask means \"do not use\")",
@@ -305,7 +324,7 @@ impl Data {
                 path.display()
             );
         }
-        Ok(data)
+        Ok(())
     }
 
     /// The rig of a recording, before flags override its keys.
@@ -427,13 +446,7 @@ impl Data {
     ) -> crate::Result<Self> {
         let folder = drivers::dataset::read(path)?;
         let n_all = Some(folder.images.len());
-        let on_image = |n_done| {
-            progress(ReadProgress {
-                noun: "images",
-                n_done,
-                n_all,
-            })
-        };
+        let on_image = |n_done: usize| report(progress, "images", n_done, n_all);
         let loaded = dataset::load(&folder, holdout, scale, &on_image)?;
         for note in &loaded.notes {
             log::warn!("{note}");
@@ -499,33 +512,16 @@ impl Data {
             join = join.taking_only(list);
         }
         let mut keyframes: Vec<Arc<Keyframe>> = Vec::new();
-        let mut apply = |events: Vec<JoinEvent>| {
-            for event in events {
-                match event {
-                    JoinEvent::Accepted(keyframe) => keyframes.push(keyframe),
-                    JoinEvent::Evicted { camera, stamp } => {
-                        keyframes.retain(|keyframe| {
-                            keyframe.camera != camera || keyframe.stamp != stamp
-                        });
-                    }
-                    JoinEvent::PosedImage(_)
-                    | JoinEvent::RangeScan(_)
-                    | JoinEvent::Rejected { .. } => {}
-                }
-            }
-            progress(ReadProgress {
-                noun: "keyframes",
-                n_done: keyframes.len(),
-                n_all: None,
-            });
-        };
         while let Some(sample) = source.next_sample()? {
             if is_end(&sample) {
                 break;
             }
-            apply(join.push(sample));
+            apply(&mut keyframes, join.push(sample));
+            report(progress, "keyframes", keyframes.len(), None);
         }
-        apply(join.finish());
+        // Images at the end may still wait for a later pose. `finish` decides about them.
+        apply(&mut keyframes, join.finish());
+        report(progress, "keyframes", keyframes.len(), None);
         log::info!("{}", join.counts());
         let mut data_losses = join.counts().data_losses(SampleUse::ProcessedOnly);
         data_losses.extend(damage.get().cloned());
@@ -550,7 +546,8 @@ impl Data {
             return;
         };
         self.keyframes = stations.corrected(std::mem::take(&mut self.keyframes));
-        (self.stations, self.preparation_time) = (stations.reports().to_vec(), stations.spent());
+        self.stations = stations.reports().to_vec();
+        self.preparation_time = stations.spent();
     }
 
     /// Reassigns the splits, separately for each camera.
@@ -573,13 +570,13 @@ impl Data {
 
     /// Keeps only the listed keyframes, with the splits in the list.
     fn take_only(&mut self, list: &KeyframeList) -> Result<(), Error> {
-        let images = || {
-            self.keyframes
-                .iter()
-                .map(|keyframe| (&*keyframe.camera, keyframe.stamp))
-        };
-        self.data_losses
-            .extend(list.check_found(images(), images().next())?);
+        let images: Vec<(&str, Stamp)> = self
+            .keyframes
+            .iter()
+            .map(|keyframe| (&*keyframe.camera, keyframe.stamp))
+            .collect();
+        let missing = list.check_found(images.iter().copied(), images.first().copied())?;
+        self.data_losses.extend(missing);
         let all = std::mem::take(&mut self.keyframes)
             .into_iter()
             .zip(std::mem::take(&mut self.names));
@@ -592,6 +589,36 @@ impl Data {
         }
         Ok(())
     }
+}
+
+/// Adds and removes keyframes as a join has decided.
+fn apply(keyframes: &mut Vec<Arc<Keyframe>>, events: Vec<JoinEvent>) {
+    for event in events {
+        match event {
+            JoinEvent::Accepted(keyframe) => keyframes.push(keyframe),
+            JoinEvent::Evicted { camera, stamp } => {
+                keyframes.retain(|keyframe| keyframe.camera != camera || keyframe.stamp != stamp);
+            }
+            JoinEvent::PosedImage(_) | JoinEvent::RangeScan(_) | JoinEvent::Rejected { .. } => {}
+        }
+    }
+}
+
+/// Reports progress.
+fn report(progress: OnReadProgress<'_>, noun: &'static str, n_done: usize, n_all: Option<usize>) {
+    progress(ReadProgress {
+        noun,
+        n_done,
+        n_all,
+    });
+}
+
+/// Whether no pixel of an image can be used.
+fn is_masked(keyframe: &Keyframe) -> bool {
+    keyframe
+        .rgba_srgb
+        .chunks_exact(4)
+        .all(|pixel| pixel[3] == 0)
 }
 
 /// SHA-256 of positions and colors, which identifies points in decision logs.

@@ -13,7 +13,8 @@ use std::sync::Arc;
 /// Depth unit: millimeters, which readers assume if the file does not specify a unit.
 const METERS_PER_COUNT: f64 = 0.001;
 /// Maximum difference between the intrinsics of depth and color, in pixels of the depth image. If
-/// they differ more, depth is not exported.
+/// they differ more, depth is not exported. Half a pixel is the error of rounding a position to
+/// pixels, so smaller differences do not matter to readers that look up depth at a color pixel.
 const MAX_LENS_DIFFERENCE_PX: f64 = 0.5;
 /// List of the test images, one per line, in the format of `--holdout`.
 const TEST_LIST: &str = "test.txt";
@@ -44,8 +45,8 @@ pub struct Written {
 }
 
 /// Writes a dataset to a folder that does not contain one yet. The folder is written under a
-/// temporary name, so it is complete or absent even if the program is killed. Into a folder that
-/// exists already, `transforms.json` is moved last.
+/// temporary name, so it is complete or absent even if the program is killed. If the folder exists
+/// already, its files are moved into it, `transforms.json` last.
 ///
 /// Depth is rounded to millimeters and limited to 65 m. Velocities, readout times and ground truth
 /// of simulators are not exported.
@@ -63,6 +64,7 @@ pub fn write_nerfstudio(
     for entry in ENTRIES {
         files::check_no_link(&out.join(entry)).context("cannot export")?;
     }
+    // Checked before anything is created.
     let mut keyframes = keyframes.peekable();
     ensure!(keyframes.peek().is_some(), "no keyframe to export");
     let in_out = || format!("cannot write {}", out.display());
@@ -80,21 +82,17 @@ fn write_dataset(
     keyframes: impl Iterator<Item = Arc<Keyframe>>,
 ) -> crate::Result<Written> {
     let mut written = Written::default();
-    let (mut cameras, mut frames, mut splits) = (Vec::new(), Vec::new(), Vec::new());
+    let mut cameras = Vec::new();
+    let mut frames = Vec::new();
+    let mut splits = Vec::new();
+    // Keyframes are read and written one by one, because all images together may not fit into
+    // memory.
     for keyframe in keyframes {
         frames.push(write_frame(folder, &keyframe, &mut written)?);
         cameras.push(camera_keys(&keyframe));
         splits.push(keyframe.split);
     }
-    let names = |wanted_split: Split| {
-        let of_split = frames
-            .iter()
-            .zip(&splits)
-            .filter(move |(_, split)| **split == wanted_split);
-        of_split
-            .filter_map(|(frame, _)| frame["file_path"].as_str().map(str::to_owned))
-            .collect::<Vec<_>>()
-    };
+    let names = |split: Split| names_of_split(&frames, &splits, split);
     write_text(folder, TEST_LIST, &(names(Split::Test).join("\n") + "\n"))?;
     let mut document = Map::new();
     document.insert("camera_model".to_owned(), json!("PINHOLE"));
@@ -120,6 +118,16 @@ fn write_dataset(
         &serde_json::to_string_pretty(&document)?,
     )?;
     Ok(written)
+}
+
+/// File names of the images of one split, given the entries and splits of all images.
+fn names_of_split(frames: &[Map<String, Value>], splits: &[Split], wanted: Split) -> Vec<String> {
+    frames
+        .iter()
+        .zip(splits)
+        .filter(|(_, split)| **split == wanted)
+        .filter_map(|(frame, _)| frame["file_path"].as_str().map(str::to_owned))
+        .collect()
 }
 
 /// Writes the images of one keyframe and returns its entry.
@@ -148,6 +156,7 @@ fn write_frame(
         ExtendedColorType::Rgb8,
     )?;
     written.n_images += 1;
+    // Masks are separate files: a reader may take transparency for a property of the scene.
     if pixels.iter().any(|pixel| pixel[3] == 0) {
         let alpha: Vec<u8> = pixels.iter().map(|pixel| pixel[3]).collect();
         write_png(
@@ -169,6 +178,7 @@ fn write_frame(
                 ExtendedColorType::L16,
             )?;
             insert("depth_file_path", json!(depth_image));
+            // A key of this program, which other readers ignore.
             if depth.world_from_camera != keyframe.world_from_camera {
                 insert(
                     "depth_transform_matrix",
@@ -218,19 +228,18 @@ fn has_lens_of(depth: &DepthMap, keyframe: &Keyframe) -> bool {
     reason = "the range is checked first"
 )]
 fn depth_counts(depth: &DepthMap) -> Vec<u8> {
-    let count = |depth_m: &f32| {
+    let mut bytes = Vec::with_capacity(2 * depth.depth_m.len());
+    for depth_m in depth.depth_m.iter() {
         let count = (f64::from(*depth_m) / METERS_PER_COUNT).round();
-        if (0.0..=f64::from(u16::MAX)).contains(&count) {
+        // A NaN fails the comparison, too.
+        let count = if (0.0..=f64::from(u16::MAX)).contains(&count) {
             count as u16
         } else {
             0
-        }
-    };
-    depth
-        .depth_m
-        .iter()
-        .flat_map(|depth_m| count(depth_m).to_ne_bytes())
-        .collect()
+        };
+        bytes.extend(count.to_ne_bytes());
+    }
+    bytes
 }
 
 /// Writes pixels in the given format to a file with a relative path.

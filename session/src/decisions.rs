@@ -17,10 +17,14 @@ use std::sync::mpsc::{SyncSender, sync_channel};
 use std::thread::JoinHandle;
 use trainer::ModelOptions;
 
+/// Version of the format. Logs of other versions are rejected: a decision that this program does not
+/// know would be missing in the replay.
 const VERSION: u64 = 5;
 /// Name of the log in the run folder.
 const FILE: &str = "decisions.jsonl";
-/// Maximum number of decisions that wait to be written. Training waits while this queue is full.
+/// Maximum number of decisions that wait to be written. Training waits while this queue is full, so
+/// that no decision is lost. A live run makes a few decisions per keyframe, so the queue bridges
+/// minutes of a disk that does not respond. Each waiting keyframe keeps its image in memory.
 const MAX_WAITING: usize = 4096;
 
 /// The first line: the settings.
@@ -375,6 +379,8 @@ impl DecisionLog {
             .join()
             .map_err(|_| Error::Failed("the log thread panicked: this is a bug".into()))?;
         written.context("the decision log is incomplete")?;
+        // If somebody has removed or renamed the log during the run, it is written again from the
+        // file that is still open.
         match self.kept.filter(|kept| kept.place() != files::Place::Here) {
             Some(kept) => kept
                 .restore()
@@ -397,6 +403,8 @@ impl DecisionLog {
             Activity::Training => Some(Decision::Begin(True)),
             Activity::Nothing => None,
         };
+        // A replay reaches a larger step only by training, which has the same effect as the
+        // activity. At the same step, it would do nothing without this entry.
         if let Some(decision) = pending
             && self.last_step == Some(step)
         {
@@ -465,6 +473,8 @@ impl Decisions {
         let invalid = Error::BadInput;
         let mut lines = text.split_inclusive('\n').zip(1..);
         let first = lines.next().map_or("", |(line, _)| line);
+        // The version is checked before the other settings, because another version may have
+        // other settings, and the error should name the cause.
         let description: serde_json::Value =
             serde_json::from_str(first).map_err(|e| invalid(format!("line 1: {e}")))?;
         match description["version"].as_u64() {
@@ -489,6 +499,7 @@ impl Decisions {
             if before.is_some_and(|before| before.decision == Decision::End(True)) {
                 return Err(invalid(format!("line {number} comes after the end")));
             }
+            // A replay cannot go back to an earlier step.
             if before.is_some_and(|before| before.step > entry.step) {
                 return Err(invalid(format!(
                     "line {number}: step {} comes after a later step",

@@ -65,6 +65,7 @@ impl DepthSource {
         let n_all = Some(keyframes.len());
         let mut totals = Filled::default();
         let mut n_images = 0;
+        // Rendered depth is no measurement with which test images could be compared.
         let lacking = |keyframe: &&mut Arc<Keyframe>| {
             keyframe.split != Split::Test && keyframe.lacks_dense_depth()
         };
@@ -81,6 +82,7 @@ impl DepthSource {
                 n_all,
             });
         }
+        // The usual cause is a model of another scene, or in another world frame.
         if totals.n_missing > 0 && totals.n_rendered == 0 {
             let message = "the model is not visible in any image that lacks depth";
             return Err(Error::InsufficientData(format!(
@@ -138,6 +140,7 @@ struct Filled {
 /// Renders the missing depth of one keyframe at the resolution of its depth image, or of its color
 /// image if it has no depth.
 fn fill(model: &mut dyn Method, keyframe: &mut Arc<Keyframe>) -> crate::Result<Filled> {
+    // An image without depth gets an empty depth map with the lens and pose of its color image.
     let mut request_keyframe = keyframe.as_ref().clone();
     let depth = request_keyframe.depth.get_or_insert_with(|| DepthMap {
         size_px: keyframe.size_px,
@@ -175,6 +178,7 @@ fn merge_depth(own_m: &[f32], rendered: &Picture) -> (Vec<f32>, Filled) {
             return *measured;
         }
         filled.n_missing += 1;
+        // The depth of nearly transparent pixels is not that of a surface.
         if *alpha < MIN_ALPHA || !is_known(*rendered) {
             return 0.0;
         }

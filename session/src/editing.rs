@@ -38,6 +38,7 @@ impl Editor {
             EditAction::Undo => Arc::make_mut(edits)
                 .undo()
                 .map(|()| Some("undid the last edit".to_owned())),
+            // A second search would find the same floaters again.
             EditAction::RemoveFloaters if self.search.is_some() => {
                 return Err(
                     "a search for floaters is already running; wait for its result".to_owned(),

@@ -93,6 +93,8 @@ impl Error {
     pub fn is_io(&self) -> bool {
         let mut cause: Option<&(dyn StdError + 'static)> = Some(self.root());
         while let Some(error) = cause {
+            // `source` of a variant skips the wrapped error itself, so the variants that hold an
+            // error of the system are matched here.
             let is_io = match error.downcast_ref() {
                 Some(Self::Io(_)) => true,
                 Some(Self::Trainer(error)) => error

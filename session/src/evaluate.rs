@@ -24,12 +24,15 @@ const NEAR_M: f64 = 0.01;
 /// Far plane of renders, meters.
 const FAR_M: f64 = 1000.0;
 
-/// How long [`Evaluator::score_all`] waits for scores before it calls `meanwhile` again.
+/// How long [`Evaluator::score_all`] waits for scores before it calls `meanwhile` again, which draws
+/// pictures for viewers. A longer wait would delay these pictures.
 const MEANWHILE_PERIOD: Duration = Duration::from_millis(5);
 
-/// Minimum alpha of a pixel that counts as covered by the model.
+/// Minimum alpha of a pixel that counts as covered by the model: half of the range. Below it, the
+/// background contributes more to the color than the model.
 pub const MIN_ALPHA: u8 = 128;
-/// Minimum covered fraction. With less, model and images probably show different scenes.
+/// Minimum covered fraction. With less, model and images probably show different scenes. This only
+/// causes a warning, because a small object may cover as little.
 pub const MIN_COVERED_FRAC: f64 = 0.05;
 /// Hint to print if the covered fraction is below [`MIN_COVERED_FRAC`].
 pub const CHECK_SAME_SCENE: &str =
@@ -154,6 +157,7 @@ impl Evaluator {
         method: &mut dyn Method,
         keyframe: &Keyframe,
     ) -> crate::Result<ImageScores> {
+        // Scoring on the GPU needs no read-back of the picture. Other scores need the pixels.
         if !self.is_full
             && self.lpips.is_none()
             && let Some(psnr) = psnr_on_gpu(method, keyframe)?
@@ -196,11 +200,15 @@ impl Evaluator {
         tests: impl Iterator<Item = &'a Arc<Keyframe>>,
         mut meanwhile: impl FnMut(&mut dyn Method, usize),
     ) -> crate::Result<Vec<ImageScores>> {
+        // Two pictures per thread: one that is scored, and one that is ready for it. More would only
+        // use more memory.
         let max_waiting = 2 * rayon::current_num_threads();
         let (sender, receiver) = std::sync::mpsc::sync_channel(max_waiting);
         let mut scored: Vec<(usize, ImageScores)> = Vec::new();
+        // In place: the method stays on this thread, because it cannot be sent to another one.
         let all: crate::Result<()> = rayon::in_place_scope(|scope| {
             let mut n_drawn = 0;
+            // Fused, because the loop asks again after the last image.
             let mut tests = tests.fuse();
             loop {
                 let next = if n_drawn - scored.len() < max_waiting {
@@ -212,8 +220,11 @@ impl Evaluator {
                     let drawn = self
                         .draw(method, keyframe)
                         .with_context(|| name_of(keyframe))?;
-                    let (ix, sender) = (n_drawn, sender.clone());
+                    let ix = n_drawn;
+                    let sender = sender.clone();
                     scope.spawn(move |_| {
+                        // A panic is sent, too. Otherwise, the loop would wait for this result
+                        // without end.
                         let scores = catch_unwind(AssertUnwindSafe(|| drawn.scores(self)));
                         // After an error of another keyframe, this result is not used.
                         let _ = sender.send((ix, keyframe, scores));
@@ -222,6 +233,7 @@ impl Evaluator {
                 } else if scored.len() == n_drawn {
                     return Ok(());
                 }
+                // While there is something to draw, results are only collected.
                 let wait = if next.is_some() {
                     Duration::ZERO
                 } else {
@@ -235,6 +247,7 @@ impl Evaluator {
             }
         });
         all?;
+        // The threads finish in any order. With a fixed one, means do not depend on timing.
         scored.sort_by_key(|(ix, _)| *ix);
         Ok(scored.into_iter().map(|(_, scores)| scores).collect())
     }
@@ -245,13 +258,12 @@ impl Evaluator {
         method: &mut dyn Method,
         keyframe: &'a Keyframe,
     ) -> crate::Result<Drawn<'a>> {
-        let (depth, at_truth) = match self.is_full {
-            true => (
-                draw_depth(method, keyframe)?,
-                draw_at_truth(method, keyframe)?,
-            ),
-            false => (None, None),
-        };
+        let mut depth = None;
+        let mut at_truth = None;
+        if self.is_full {
+            depth = draw_depth(method, keyframe)?;
+            at_truth = draw_at_truth(method, keyframe)?;
+        }
         Ok(Drawn {
             keyframe,
             picture: draw(method, keyframe, false)?,
@@ -334,6 +346,7 @@ impl Scores {
                 .or_insert_with(Vec::new)
                 .push(image.psnr);
         }
+        // The PSNR of a single camera is the overall one.
         if psnr_per_camera.len() < 2 {
             psnr_per_camera.clear();
         }
@@ -413,7 +426,8 @@ pub fn warn_if_hardly_covered(covered_fracs: &[f64]) {
 
 /// Mean of the known values.
 fn mean(values: impl Iterator<Item = Option<f64>>) -> Option<f64> {
-    let (mut sum, mut n) = (0.0, 0.0);
+    let mut sum = 0.0;
+    let mut n = 0.0;
     for value in values.flatten() {
         sum += value;
         n += 1.0;
@@ -435,6 +449,7 @@ pub fn draw(
         background_srgb,
         ..request(keyframe, &lens)
     })?;
+    // Images of a camera with automatic exposure are compared at their own brightness.
     if lens.gains != [1.0; 3] {
         let by_byte = lens.gains.map(gain_table);
         for [red, green, blue, _] in picture.rgba_srgb.as_chunks_mut::<4>().0 {

@@ -39,6 +39,8 @@ pub(crate) fn data_uri(
 fn write_base64(bytes: &[u8], to: &mut String) {
     const SYMBOLS: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
     for group in bytes.chunks(3) {
+        // Three bytes are 24 bits, that is four symbols of 6 bits. A shorter group at the end is
+        // filled with zero bits, and its unused symbols are `=`.
         let bits = group
             .iter()
             .fold(0_u32, |bits, byte| bits << 8 | u32::from(*byte))

@@ -7,7 +7,8 @@ use files::{Kept, Place};
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-/// Period of the checks.
+/// Period of the checks. A check costs a few system calls. Files that are written between the
+/// removal of the folder and the next check are lost, or go to the moved folder.
 const PERIOD: Duration = Duration::from_secs(1);
 
 /// The list of keyframes in the folder of a run.
@@ -36,17 +37,12 @@ impl KeptFolder {
 
     /// Watches a locked folder, after the first files were written into it.
     fn new(folder: &Path) -> Self {
-        let read = |name| {
-            Some((
-                name,
-                files::read(&folder.join(name), files::Budget::TEXT).ok()?,
-            ))
-        };
         Self {
             kept: Kept::open(folder).ok(),
+            // A run has only some of these files.
             first_files: [RIG_FILE, URDF_FILE, KEYFRAME_LIST]
                 .into_iter()
-                .filter_map(read)
+                .filter_map(|name| Some((name, text_file(folder, name)?)))
                 .collect(),
             next_check: Instant::now() + PERIOD,
         }
@@ -89,12 +85,18 @@ impl KeptFolder {
     fn make_again(&self, path: &Path) -> crate::Result<Kept> {
         let in_folder = || format!("cannot write {}", path.display());
         std::fs::create_dir_all(path).with_context(in_folder)?;
+        // The lock went with the old folder. Without a new one, another run could use the folder.
         run_folder::lock(path)?;
         for (name, contents) in &self.first_files {
             files::write(&path.join(name), contents).with_context(in_folder)?;
         }
         Kept::open(path).with_context(in_folder)
     }
+}
+
+/// Contents of a file of a folder; `None` if it cannot be read.
+fn text_file(folder: &Path, name: &str) -> Option<Vec<u8>> {
+    files::read(&folder.join(name), files::Budget::TEXT).ok()
 }
 
 #[cfg(test)]

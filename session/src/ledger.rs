@@ -96,6 +96,7 @@ impl Ledger {
 
     /// Records that the first model has completed `step` steps.
     pub(crate) fn completed(&mut self, step: u64) {
+        // A rejected trial restores an earlier step, but keyframes stay trained.
         let n_trained = self.n_in_model(0, step).max(self.n_trained);
         let now = Instant::now();
         self.keyframes[self.n_trained..n_trained]
@@ -106,6 +107,7 @@ impl Ledger {
 
     /// Records that a client has shown a picture of the first model.
     pub(crate) fn shown(&mut self, picture: &ShownPicture) {
+        // A range beyond the list must not end the run.
         let [begin, end] = [picture.new_keyframes.start, picture.new_keyframes.end].map(|n| {
             usize::try_from(n)
                 .unwrap_or(usize::MAX)
@@ -118,7 +120,8 @@ impl Ledger {
             .skip(begin)
             .filter(|keyframe| keyframe.shown.is_none())
         {
-            (keyframe.sent, keyframe.shown) = (Some(picture.sent_at), Some(picture.shown_at));
+            keyframe.sent = Some(picture.sent_at);
+            keyframe.shown = Some(picture.shown_at);
         }
     }
 }
@@ -127,12 +130,10 @@ impl Ledger {
 /// this process, from the arrival of the image.
 pub fn latencies(keyframes: &[KeyframeTimes]) -> Vec<(String, Latency)> {
     let until = |name: &str, at: fn(&KeyframeTimes) -> Option<Instant>| {
-        let millis = keyframes
-            .iter()
-            .filter_map(|keyframe| keyframe.millis_until(at(keyframe)?));
-        Some((name.to_owned(), Latency::of(millis)?))
+        Some((name.to_owned(), latency_until(keyframes, at)?))
     };
     let stages = [
+        // Without the time of capture, the arrival would be compared with itself.
         until("shutter to arrival", |keyframe| {
             keyframe.input.captured.and(Some(keyframe.input.arrived))
         }),
@@ -145,6 +146,17 @@ pub fn latencies(keyframes: &[KeyframeTimes]) -> Vec<(String, Latency)> {
         until("shutter to shown", |keyframe| keyframe.shown),
     ];
     stages.into_iter().flatten().collect()
+}
+
+/// Durations from mid-exposure to a stage; `None` if no keyframe has reached it.
+fn latency_until(
+    keyframes: &[KeyframeTimes],
+    at: fn(&KeyframeTimes) -> Option<Instant>,
+) -> Option<Latency> {
+    let millis = keyframes
+        .iter()
+        .filter_map(|keyframe| keyframe.millis_until(at(keyframe)?));
+    Latency::of(millis)
 }
 
 #[cfg(test)]

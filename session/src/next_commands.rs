@@ -58,21 +58,16 @@ pub fn for_models(models: &[SavedModel<'_>]) -> Vec<NextCommand> {
         });
     let mut commands = Vec::new();
     let mut add = |purpose: &str, words: &[&str]| {
-        let words: Vec<String> = std::iter::once(&*program)
-            .chain(words.iter().copied())
-            .map(quoted)
-            .collect();
-        commands.push(NextCommand {
-            purpose: purpose.to_owned(),
-            command: words.join(" "),
-        });
+        commands.push(next_command(&program, purpose, words));
     };
     if let Some(folder) = common_folder(models) {
         add("view the model", &["view", &argument(folder)]);
     }
     for model in models {
         let folder = argument(model.folder);
+        // A live run that was not recorded has no data to score with.
         if let (Some(data), 1..) = (&model.data.path, model.n_tests) {
+            // The list has the splits of this run, so that the same images are test images.
             let list = argument(&model.folder.join("keyframes.txt"));
             let mut words = vec!["eval", &*folder];
             let data = argument(data);
@@ -92,6 +87,18 @@ pub fn for_models(models: &[SavedModel<'_>]) -> Vec<NextCommand> {
         }
     }
     commands
+}
+
+/// A command with its words quoted for a shell.
+fn next_command(program: &str, purpose: &str, words: &[&str]) -> NextCommand {
+    let words: Vec<String> = std::iter::once(program)
+        .chain(words.iter().copied())
+        .map(quoted)
+        .collect();
+    NextCommand {
+        purpose: purpose.to_owned(),
+        command: words.join(" "),
+    }
 }
 
 /// The command line of this process.
@@ -135,17 +142,20 @@ fn model_name(folder: &Path) -> String {
 
 /// An unused file name in the current folder; `export` does not overwrite files.
 fn unused_file(name: &str, extension: &str) -> PathBuf {
-    let numbered = |n: u32| {
-        PathBuf::from(if n == 1 {
-            format!("{name}.{extension}")
-        } else {
-            format!("{name}-{n}.{extension}")
-        })
-    };
+    // If all of these exist, the last name is suggested, and `export` reports the problem.
     (1..100)
-        .map(numbered)
+        .map(|n| numbered_file(name, n, extension))
         .find(|file| !file.exists())
-        .unwrap_or_else(|| numbered(100))
+        .unwrap_or_else(|| numbered_file(name, 100, extension))
+}
+
+/// File name with a number; the first one has none.
+fn numbered_file(name: &str, n: u32, extension: &str) -> PathBuf {
+    PathBuf::from(if n == 1 {
+        format!("{name}.{extension}")
+    } else {
+        format!("{name}-{n}.{extension}")
+    })
 }
 
 /// A path as a positional argument. A path that starts with a hyphen would be parsed as a flag, so

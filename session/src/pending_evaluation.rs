@@ -31,6 +31,9 @@ impl PendingEvaluation {
         let stride = tests.len().div_ceil(max_images).max(1);
         let mut selected: Vec<(usize, &Arc<Keyframe>)> =
             tests.step_by(stride).enumerate().collect();
+        // Bit-reversed indices are the van der Corput sequence: every prefix of it is spread evenly
+        // over all images. If the time limit ends the evaluation early, the scored images still
+        // represent the whole scene.
         selected.sort_by_key(|(ix, _)| ix.reverse_bits());
         let remaining = selected
             .into_iter()
@@ -62,6 +65,7 @@ impl PendingEvaluation {
 
     /// Whether no image is left to score.
     pub(crate) fn is_complete(&self) -> bool {
+        // One image is scored in any case. Otherwise, a slow model would have no scores at all.
         self.remaining.is_empty() || !self.images.is_empty() && self.spent >= self.max_spent
     }
 

@@ -8,7 +8,9 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 use trainer::gpu::Gpu;
 
-/// Maximum number of attempts to reopen the GPU.
+/// Maximum number of attempts to reopen the GPU. A driver that resets needs seconds; a device that
+/// is still missing after several attempts has probably failed for good, and the run should report
+/// this instead of recording without training.
 const MAX_RECOVERIES: u32 = 3;
 /// The attempt count is reset after this time without a failure, because a run of several days may
 /// fail occasionally.
@@ -51,6 +53,8 @@ impl Recoveries {
     /// Continues all sessions on a reopened device if the GPU caused `error`. Returns an error if
     /// the cause was another one, or if all attempts fail.
     pub fn recover(&mut self, sessions: &mut [Session], error: crate::Error) -> crate::Result<()> {
+        // Another device would not help against other errors. All models share the device, so all
+        // of them must be able to restart.
         if !error.is_gpu_error() || !sessions.iter().all(Session::can_restart) {
             return Err(error);
         }
@@ -63,6 +67,7 @@ impl Recoveries {
         }
         let mut error = error;
         while self.n < MAX_RECOVERIES {
+            // The first attempt is made at once: most failures need no pause.
             if self.n > 0 {
                 std::thread::sleep(RETRY_DELAY);
             }

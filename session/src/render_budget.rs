@@ -7,13 +7,19 @@
 use std::time::Duration;
 
 /// Maximum credit, seconds, which is the maximum length of a burst of pictures. After a longer
-/// slice of training, the maximum is the length of that slice.
+/// slice of training, the maximum is the length of that slice. With a larger credit, a viewer that
+/// connects later would delay new keyframes by a longer burst.
 const MAX_CREDIT_SECS: f64 = 0.1;
 /// Maximum debt, seconds. After a picture that takes longer, training makes up for this time only.
 const MAX_DEBT_SECS: f64 = 1.0;
 
-/// Credit per second of training.
+/// Credit per second of training on a CPU, where pictures take seconds: viewers wait long, so
+/// pictures get half of the time.
 const CREDIT_ON_SOFTWARE: f64 = 1.0;
+/// Credit per second of training on a GPU: pictures get `0.66 / 1.66`, that is 40 %, of the time.
+/// With eight viewers that request pictures back to back, training keeps about 70 % of its rate,
+/// because part of the work overlaps (`docs/benchmarks/2026-11-26-live.md`). More credit would
+/// shorten the wait for pictures at the cost of training steps.
 const CREDIT_ON_GPU: f64 = 0.66;
 
 /// The time available for pictures.
@@ -51,11 +57,14 @@ impl RenderBudget {
     /// Adds time spent on training.
     pub(crate) fn add_training(&mut self, spent: Duration) {
         let spent_secs = self.rate * spent.as_secs_f64();
+        // Credit does not accumulate over several slices without pictures. A single long slice, as
+        // on a CPU, still pays for a picture that takes as long.
         self.balance_secs = (self.balance_secs + spent_secs).min(MAX_CREDIT_SECS.max(spent_secs));
     }
 
     /// Subtracts time spent on a picture.
     pub(crate) fn add_render(&mut self, spent: Duration) {
+        // The debt is limited, so that one picture of 10 s does not stop all pictures for 10 s.
         self.balance_secs = (self.balance_secs - spent.as_secs_f64()).max(-MAX_DEBT_SECS);
     }
 }

@@ -85,6 +85,8 @@ impl Replay {
         let as_pushed: HashMap<(&str, i64), &Pushed> = pushed()
             .map(|pushed| ((&*pushed.camera, pushed.stamp_nanos), pushed))
             .collect();
+        // The data have base poses as reported. The logged run has corrected them at stations, and
+        // these corrections depend on timing, so they come from the log.
         for keyframe in &mut data.keyframes {
             if let Some(pushed) = as_pushed.get(&(&*keyframe.camera, keyframe.stamp.0)) {
                 *keyframe = pushed.corrected(keyframe);
@@ -103,9 +105,11 @@ impl Replay {
     /// Returns an error if a keyframe of the log is missing from the data or differs.
     pub fn check_data(&self, path: &Path, data: &Data) -> Result<(), Error> {
         let by_key = by_name(&data.keyframes);
-        let (name, shown) = (self.name(), path.display());
+        let name = self.name();
+        let shown = path.display();
         for pushed in self.decisions.pushed() {
-            let (camera, stamp) = (&*pushed.camera, pushed.stamp_nanos);
+            let camera = &*pushed.camera;
+            let stamp = pushed.stamp_nanos;
             let Some(keyframe) = by_key.get(&(camera, stamp)) else {
                 return Err(Error::InsufficientData(format!(
                     "{name} contains image {stamp} of camera {camera:?}, which is not in {shown}"
@@ -194,11 +198,15 @@ impl Replay {
         let by_key = by_name(keyframes);
         session.start_clock(Instant::now());
         for entry in &self.decisions.entries {
+            // Trains up to the step of the decision. Steps of rejected trials count, too, because
+            // the log contains total numbers of steps.
             while !stop.requested() {
                 let n_total_steps = session.n_total_steps()?;
                 if n_total_steps >= entry.step {
                     break;
                 }
+                // A model that needs another keyframe would make no steps, and the loop would not
+                // end.
                 if session.step(entry.step - n_total_steps)? == 0 {
                     return Err(Error::InsufficientData(format!(
                         "{} requires step {}, but there is nothing to train on",
@@ -220,10 +228,14 @@ impl Replay {
                     session.remove(&removed.camera, Stamp(removed.stamp_nanos))?
                 }
                 Decision::Seed(_) => session.seed()?,
+                // Waits: in the logged run, the result was ready at this step.
                 Decision::Align(_) => drop(session.poll_alignment(true)?),
                 Decision::EndSizeSearch(_) => session.end_size_search()?,
                 Decision::PauseGrowth(is_paused) => session.pause_growth(*is_paused)?,
+                // Starts training on the keyframes so far without a step.
                 Decision::Begin(_) => drop(session.step(0)?),
+                // Restored keyframes are in the model of the checkpoint. A replay takes its own
+                // checkpoints.
                 Decision::Restored(_) | Decision::Checkpoint(_) | Decision::End(_) => {}
             }
         }

@@ -21,11 +21,10 @@ pub fn description(rig: &Rig, rig_file: &Path) -> crate::Result<Option<RobotDesc
     let robot = Robot::parse(&rig.arm.urdf_text).context("the arm's URDF")?;
     let folder = Rig::urdf_folder(rig_file).unwrap_or_default();
     let meshes = meshes(&robot, &folder);
-    let (base_link, joint_names) = (rig.arm.base_link.clone(), rig.arm.joints.clone());
     Ok(Some(RobotDescription {
         robot,
-        base_link,
-        joint_names,
+        base_link: rig.arm.base_link.clone(),
+        joint_names: rig.arm.joints.clone(),
         meshes,
     }))
 }
@@ -40,11 +39,13 @@ fn meshes(robot: &Robot, urdf_folder: &Path) -> Vec<RobotMesh> {
         _ => None,
     });
     for file in files {
+        // Several links often share a mesh, such as that of a joint module.
         if meshes.iter().any(|mesh| mesh.file == *file) {
             continue;
         }
         match read(file, urdf_folder, budget) {
             Ok(mesh) => {
+                // All meshes together are bounded, because every client gets them.
                 budget = budget.after(mesh.bytes.len() as u64);
                 meshes.push(mesh);
             }
@@ -100,14 +101,16 @@ fn candidates(file: &str, urdf_folder: &Path) -> Vec<PathBuf> {
     let above = urdf_folder
         .ancestors()
         .filter(|folder| !folder.as_os_str().is_empty());
-    let in_folder = |folder: &Path| {
-        let is_package = folder.file_name().is_some_and(|name| name == package);
-        [
-            is_package.then(|| folder.join(rest)),
-            Some(folder.join(package).join(rest)),
-        ]
-    };
-    above.flat_map(in_folder).flatten().collect()
+    // Without ROS, there is no index of packages. A copy of a robot description keeps the layout of
+    // its packages, so the folders around the URDF are searched.
+    let mut candidates = Vec::new();
+    for folder in above {
+        if folder.file_name().is_some_and(|name| name == package) {
+            candidates.push(folder.join(rest));
+        }
+        candidates.push(folder.join(package).join(rest));
+    }
+    candidates
 }
 
 #[cfg(test)]

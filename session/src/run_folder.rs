@@ -17,7 +17,8 @@ use trainer::{Edits, Method, ModelKind};
 const RECORDING_EXTENSION: &str = "mcap";
 /// Parent folder of runs without `--out`.
 const RUNS: &str = "runs";
-/// The subfolder in which a model is saved until it is complete has the temporary name of this one.
+/// Until a model is complete, it is saved in the subfolder with the temporary name that belongs to
+/// this name.
 const MODEL: &str = "model";
 /// The checkpoint in the folder of a run.
 pub const CHECKPOINT: &str = "training.ckpt";
@@ -116,16 +117,10 @@ pub fn expect_model(model: &Path) -> crate::Result<()> {
         bail!("{shown} contains no model{hint}");
     }
     // One file of a model with several files may have the extension of a single-file model.
-    let is_part = |kind: &ModelKind| {
-        let is_complete = |file: &str| {
-            kind.entry().single_file.is_some() && kind.entry().files.last() == Some(&file)
-        };
-        kind.entry()
-            .files
-            .iter()
-            .any(|file| model.ends_with(file) && !is_complete(file))
-    };
-    if ModelKind::ALL.iter().any(is_part) || ModelKind::of_single_file(model).is_none() {
+    let is_part = ModelKind::ALL
+        .iter()
+        .any(|kind| is_part_of_model(*kind, model));
+    if is_part || ModelKind::of_single_file(model).is_none() {
         let single_files = ModelKind::ALL
             .iter()
             .filter_map(|kind| kind.entry().single_file);
@@ -140,6 +135,17 @@ pub fn expect_model(model: &Path) -> crate::Result<()> {
         return Err(Error::BadInput(message));
     }
     Ok(())
+}
+
+/// Whether a file is one of several that a model of this kind consists of.
+fn is_part_of_model(kind: ModelKind, path: &Path) -> bool {
+    let entry = kind.entry();
+    // The last file of a method with a single-file form is a complete model.
+    let is_complete = |file: &str| entry.single_file.is_some() && entry.files.last() == Some(&file);
+    entry
+        .files
+        .iter()
+        .any(|file| path.ends_with(file) && !is_complete(file))
 }
 
 /// Whether a folder contains any file of a saved model.
@@ -181,10 +187,6 @@ impl CreatedFolders {
         kinds: &[ModelKind],
         rig: Option<&Rig>,
     ) -> crate::Result<Vec<PathBuf>> {
-        let write = |rig: &Rig, folder: &Path| {
-            rig.write_resolved(folder)
-                .with_context(|| format!("cannot write into {}", folder.display()))
-        };
         let out = self.make(requested)?;
         let folders: Vec<PathBuf> = match kinds {
             [_] => vec![out.clone()],
@@ -194,9 +196,10 @@ impl CreatedFolders {
                 .collect::<crate::Result<_>>()?,
         };
         if let Some(rig) = rig {
-            write(rig, &out)?;
+            write_rig(rig, &out)?;
+            // With a single model, this replaces the same file.
             for (kind, folder) in kinds.iter().zip(&folders) {
-                write(&rig.with_method(kind.name()), folder)?;
+                write_rig(&rig.with_method(kind.name()), folder)?;
             }
         }
         Ok(folders)
@@ -205,16 +208,9 @@ impl CreatedFolders {
     /// Creates the requested folder, or `runs/<UTC time>`. A folder that already contains a model
     /// is an error.
     pub fn make(&mut self, requested: Option<&Path>) -> crate::Result<PathBuf> {
-        let is_missing = |folder: &&Path| !folder.as_os_str().is_empty() && !folder.exists();
-        let missing = |folder: &Path| {
-            folder
-                .ancestors()
-                .take_while(is_missing)
-                .map(Path::to_owned)
-                .collect::<Vec<_>>()
-        };
-        let runs = missing(Path::new(RUNS));
-        let missing_parents = requested.map_or(Vec::new(), missing);
+        // Listed before the folders exist, so that only those are removed that this run has made.
+        let runs = missing_folders(Path::new(RUNS));
+        let missing_parents = requested.map_or(Vec::new(), missing_folders);
         let created = make(requested)?;
         match (requested, missing_parents.split_first()) {
             (None, _) => {
@@ -233,16 +229,7 @@ impl CreatedFolders {
     /// Removes the created folders with their contents, unless they contain a model, a checkpoint
     /// or a recording.
     pub fn remove_created(self) {
-        let holds_recording = |folder: &PathBuf| {
-            let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
-            entries
-                .map(|entry| entry.path())
-                .any(|path| is_recording(&path))
-        };
-        let must_keep = |folder: &PathBuf| {
-            holds_recording(folder) || holds_model(folder) || folder.join(CHECKPOINT).exists()
-        };
-        if self.leaves.iter().any(must_keep) {
+        if self.leaves.iter().any(|folder| must_keep(folder)) {
             return;
         }
         let removed = self.leaves.iter().try_for_each(std::fs::remove_dir_all);
@@ -262,8 +249,38 @@ impl CreatedFolders {
     }
 }
 
+/// Writes the resolved rig file into a folder.
+fn write_rig(rig: &Rig, folder: &Path) -> crate::Result<()> {
+    rig.write_resolved(folder)
+        .with_context(|| format!("cannot write into {}", folder.display()))
+}
+
+/// A folder and its parents, as far as they do not exist, the innermost first.
+fn missing_folders(folder: &Path) -> Vec<PathBuf> {
+    folder
+        .ancestors()
+        // The last ancestor of a relative path is empty; it means the current folder.
+        .take_while(|folder| !folder.as_os_str().is_empty() && !folder.exists())
+        .map(Path::to_owned)
+        .collect()
+}
+
+/// Whether a folder contains results that must not be removed.
+fn must_keep(folder: &Path) -> bool {
+    holds_recording(folder) || holds_model(folder) || folder.join(CHECKPOINT).exists()
+}
+
+/// Whether a folder contains a recording.
+fn holds_recording(folder: &Path) -> bool {
+    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
+    entries
+        .map(|entry| entry.path())
+        .any(|path| is_recording(&path))
+}
+
 fn make(requested: Option<&Path>) -> crate::Result<PathBuf> {
     if let Some(folder) = requested {
+        // `report.json` and the next commands contain the name, and JSON is UTF-8.
         if folder.to_str().is_none() {
             return Err(Error::BadInput(format!(
                 "--out {}: the name must be valid UTF-8",
@@ -273,6 +290,7 @@ fn make(requested: Option<&Path>) -> crate::Result<PathBuf> {
         check_no_model(folder)?;
         std::fs::create_dir_all(folder)
             .with_context(|| format!("cannot create the folder {}", folder.display()))?;
+        // Two runs with the same `--out` may both have passed the check above.
         lock(folder)?;
         return Ok(folder.to_owned());
     }
@@ -302,6 +320,8 @@ fn make_in(parent: &Path, prefix: &str) -> crate::Result<PathBuf> {
             1 => parent.join(&name),
             _ => parent.join(format!("{name}-{attempt}")),
         };
+        // `create_dir` fails if the folder exists, so of two runs that start in the same second,
+        // only one gets it.
         match std::fs::create_dir(&folder) {
             Ok(()) => {
                 lock(&folder)?;
@@ -358,17 +378,18 @@ pub fn save_model(method: &mut dyn Method, edits: &Edits, folder: &Path) -> crat
     // has locked the folder.
     let model_files: Vec<&OsStr> = ModelKind::model_files().map(OsStr::new).collect();
     files::partial::remove_leftover(&partial_folder, &model_files)?;
-    let save_edited = |method: &mut dyn Method| match edits.is_empty() {
-        true => Ok(()),
-        false => method.write_for_others(&partial_folder, edits),
-    };
-    if let Err(error) = method
-        .save(&partial_folder)
-        .and_then(|()| save_edited(method))
-    {
+    let saved = method.save(&partial_folder).and_then(|()| {
+        if edits.is_empty() {
+            Ok(())
+        } else {
+            method.write_for_others(&partial_folder, edits)
+        }
+    });
+    if let Err(error) = saved {
         let _ = std::fs::remove_dir_all(&partial_folder); // Frees the disk space of the incomplete model.
         return Err(error.into());
     }
+    // Before the model: a complete model without its edits would show what was erased.
     edits.write(folder)?;
     // A model counts as complete once the last file of its method is in place.
     for name in ModelKind::model_files().filter(|name| partial_folder.join(name).exists()) {
@@ -410,6 +431,7 @@ pub fn checkpoint_sha256(folder: &Path) -> crate::Result<String> {
         }
         let bytes = files::read(&path, files::Budget::PLAIN)
             .with_context(|| format!("cannot read {}", path.display()))?;
+        // With name and length, different files cannot give the same sequence of bytes.
         hash.update(format!("{name} {}\n", bytes.len()));
         hash.update(&bytes);
         n_files += 1;
@@ -462,6 +484,7 @@ fn date_from_days(mut days: u64) -> (u64, usize, u64) {
         days -= 365 + u64::from(is_leap(year));
         year += 1;
     }
+    // Lengths of January, February and so on.
     let lengths = [
         31,
         28 + u64::from(is_leap(year)),

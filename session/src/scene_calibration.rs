@@ -108,6 +108,7 @@ pub fn calibrate_scene(
         refine: params.to_vec(),
         ..TrainingOptions::default()
     };
+    // The same rules as for training, whose messages name the flag of that command.
     let choice = match options.refining(data.available(), Refine::Auto) {
         Ok(settings) => without_image_poses(settings.align),
         Err(Error::BadInput(reason)) => {
@@ -136,14 +137,13 @@ pub fn calibrate_scene(
                 .push(direction.to_string());
         }
     }
-    let reason = |(camera, directions): (String, Vec<String>)| {
-        let text = refusal(
-            &directions,
-            rig.and_then(|rig| rig.cameras.iter().find(|other| *other.name == *camera)),
-        );
-        (camera, text)
-    };
-    let refused: BTreeMap<String, String> = refused.into_iter().map(reason).collect();
+    let mut reasons: BTreeMap<String, String> = BTreeMap::new();
+    for (camera, directions) in refused {
+        // The advice depends on where the camera is mounted.
+        let in_rig = rig.and_then(|rig| rig.cameras.iter().find(|other| *other.name == *camera));
+        reasons.insert(camera, refusal(&directions, in_rig));
+    }
+    let refused = reasons;
     let rig = rig
         .map(|given| corrected(given, &alignment, &refused))
         .transpose()?;
@@ -213,6 +213,8 @@ fn corrected(
     refused: &BTreeMap<String, String>,
 ) -> Result<Rig, Error> {
     let mut rig = corrected_rig::corrected(given, Some(alignment), &BTreeMap::new())?;
+    // An estimate along a direction that the motion does not determine is arbitrary. Other
+    // corrections of the camera, such as its time offset, are kept.
     for (camera, before) in rig.cameras.iter_mut().zip(&given.cameras) {
         if refused.contains_key(&*camera.name) {
             camera.parent_from_camera = before.parent_from_camera;

@@ -8,10 +8,13 @@ use std::sync::Arc;
 use trainer::Bounds;
 use viz::SceneHint;
 
-/// Assumed distance of the scene from each camera if the optical axes do not determine it, meters.
+/// Assumed distance of the scene from each camera if the optical axes do not determine it, meters:
+/// a typical distance between the camera of an arm and its table. With a single camera, the view
+/// turns about a point at this distance.
 const PRIOR_DISTANCE_M: f64 = 0.5;
 /// Weight of the assumed distance relative to one optical axis. It matters only in directions that
-/// the axes do not constrain.
+/// the axes do not constrain. A larger weight pulls the center away from the point where the axes
+/// meet; a smaller one leaves it undefined for nearly parallel axes.
 const PRIOR_WEIGHT: f64 = 0.01;
 
 /// Distance of an outside view, in radii of the model. Most of the model fits into a field of view
@@ -49,6 +52,8 @@ pub fn from_cameras(world_from_cameras: Vec<Transform>) -> Option<SceneHint> {
 /// A view of the whole model from outside and slightly above, z up.
 pub fn from_bounds(bounds: &Bounds) -> SceneHint {
     let view_direction = Vector3::from(VIEW_DIRECTION).normalize();
+    // The axes of a camera: x right, y down, z forward. `right` is horizontal, so that z of the
+    // world points up in the picture.
     let forward = -view_direction;
     let right = forward.cross(&Vector3::z()).normalize();
     let axes = Matrix3::from_columns(&[right, forward.cross(&right), forward]);
@@ -69,6 +74,9 @@ fn nearest_to_axes(world_from_cameras: &[Transform]) -> Option<Point3<f64>> {
     let mut right = Vector3::zeros();
     for pose in world_from_cameras {
         let axis = pose.rotation * Vector3::z();
+        // The distance of `x` from the axis through `c` is the length of `P (x - c)`, where
+        // `P = I - a a^T` removes the component along the axis. The sum of the squares over all
+        // axes is smallest where `sum P x = sum P c`. The prior adds `w (x - ahead)^2` per camera.
         let projector = Matrix3::identity() - axis * axis.transpose();
         let ahead = pose.translation.vector + PRIOR_DISTANCE_M * axis;
         normal += projector + PRIOR_WEIGHT * Matrix3::identity();

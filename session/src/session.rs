@@ -43,10 +43,16 @@ use trainer::{
 use training_time::TrainingTime;
 use viz::EditRequest;
 
-/// Approximate duration of a slice. The device is idle for a moment at the end of each slice.
+/// Approximate duration of a slice.
+///
+/// The device is idle for a moment at the end of each slice, so shorter slices train less. Longer
+/// slices delay new keyframes, the other models, and the status, which are handled between slices.
 const TIME_SLICE: Duration = Duration::from_millis(40);
 /// Step time at which a live run pauses the growth of its model. Pictures take about as long as
 /// steps.
+///
+/// Without this limit, a run of an hour on two cores grew to 400 k splats, made 0.6 steps per
+/// second, and took 6 s per picture (`docs/benchmarks/2026-11-26-live.md`, section "Two cores").
 const MAX_LIVE_STEP_MILLIS: f64 = 300.0;
 
 /// A model in training.
@@ -226,6 +232,8 @@ impl Session {
 
     /// Adds a keyframe to the model. Test keyframes are also kept for evaluation.
     pub fn push(&mut self, keyframe: &Arc<Keyframe>) -> crate::Result<()> {
+        // Held first: after a GPU failure in `push`, the restored model gets all keyframes in the
+        // store, and this one must be among them.
         self.hold(keyframe);
         self.method.push(keyframe.clone())?;
         self.persistence.log_push(self.method.as_mut(), keyframe)
@@ -241,6 +249,8 @@ impl Session {
     /// Removes a keyframe.
     pub fn remove(&mut self, camera: &str, stamp: Stamp) -> crate::Result<()> {
         let is_other = |held: &Arc<Keyframe>| held.camera.as_ref() != camera || held.stamp != stamp;
+        // The newest checkpoint may contain this keyframe. Resuming from it after a GPU failure
+        // needs its description.
         self.keyframes
             .iter()
             .filter(|held| !is_other(held))
@@ -289,6 +299,8 @@ impl Session {
     ) -> Result<Rendered, trainer::Error> {
         match (queued.finish(&self.gpu)?, packing) {
             (Some(rendered), _) => Ok(rendered),
+            // A buffer was too small for the queued picture. Rendering it again, with waiting,
+            // grows the buffer.
             (None, Some(packing)) => self.method.render_packed(request, packing),
             (None, None) => self.method.render(request).map(Rendered::Picture),
         }
@@ -358,10 +370,14 @@ impl Session {
     /// Trains for at most `max_steps` steps.
     pub fn train_steps(&mut self, max_steps: u64) -> crate::Result<u64> {
         let left = self.n_steps_remaining().unwrap_or(u64::MAX);
+        // Before the steps, so that a search that cannot be completed in time does not begin.
         self.end_size_search_when_late()?;
+        // Logged even if no step is made: the request alone starts training on the keyframes so
+        // far, which affects the model.
         self.persistence.log_step_request();
         let n = self.method.step(max_steps.min(left))?;
         self.time.add_steps(n);
+        // Tests simulate a lost GPU at a given step.
         gpu_loss::lose_when_due(&self.gpu, self.progress().step);
         Ok(n)
     }
@@ -393,6 +409,8 @@ impl Session {
     /// Pauses the growth of the model while its steps take too long for a live run. A larger model
     /// would be trained and drawn even more slowly, so that an operator would see less.
     pub(crate) fn pause_growth_when_slow(&mut self) -> crate::Result<()> {
+        // Growth continues at half of the limit only. With a single limit, each change of the load
+        // of the machine near it would pause and continue growth, and log this.
         match self.progress().step_millis {
             millis if millis > MAX_LIVE_STEP_MILLIS => self.pause_growth(true),
             millis if millis < 0.5 * MAX_LIVE_STEP_MILLIS => self.pause_growth(false),
@@ -467,11 +485,13 @@ impl Session {
         loop {
             let n = self.train_steps(max_steps(self))?;
             n_steps += n;
+            // In lockstep, 0 means that the next keyframe is due before the next step.
             let is_at_end = self.is_over() || self.is_idle() || max_steps(self) == 0;
             if n == 0 || is_at_end || started.elapsed() >= TIME_SLICE || is_render_pending() {
                 break;
             }
         }
+        // Waits for the queued steps. Otherwise, the next session would be charged for their time.
         self.method.n_total_steps()?;
         // A session that cannot train is charged a full slice, so that it is not selected every
         // time.
@@ -549,7 +569,9 @@ impl Session {
     pub fn restart_on(&mut self, gpu: &Arc<Gpu>) -> crate::Result<()> {
         self.method = self.persistence.restore(gpu, &self.keyframes)?;
         self.gpu = gpu.clone();
+        // Checkpoints do not contain the initial points.
         self.set_initial_points();
+        // The checkpoint may be older than the last step, so that steps are left to make.
         self.time.unmark_finished();
         // Drops an evaluation in progress: all of its images must be scored on the same model
         // state, which is lost.
@@ -564,13 +586,13 @@ impl Session {
 
     /// Writes a checkpoint, or the new keyframes, if they are due.
     pub(crate) fn write_checkpoint_when_due(&mut self) -> crate::Result<()> {
+        // The folder must exist before a checkpoint is written into it.
         self.persistence.check_folders_when_due();
         let seconds = self.secs();
-        let (method, keyframes, edits) = (self.method.as_mut(), &self.keyframes[..], &*self.edits);
         self.persistence.write_checkpoint_when_due(Snapshot {
-            method,
-            keyframes,
-            edits,
+            method: self.method.as_mut(),
+            keyframes: &self.keyframes,
+            edits: &self.edits,
             seconds,
             is_finished: false,
         })
@@ -607,6 +629,7 @@ impl Session {
         let Some(mut evaluation) = self.scoreboard.take_pending() else {
             return Ok(());
         };
+        // The evaluation is dropped: the model is saved and scored again at the end of the run.
         if self.stop.requested() {
             return Ok(());
         }
@@ -618,10 +641,12 @@ impl Session {
         }
         if evaluation.is_complete() {
             self.scoreboard.add_spent(evaluation.spent());
-            let (seconds, images) = (evaluation.seconds, evaluation.into_images());
+            // Reported with the time at which it was due, so that runs are compared at equal times.
+            let due_secs = evaluation.seconds;
+            let images = evaluation.into_images();
             self.scoreboard.record(&images, self.secs());
             self.reporter
-                .report_evaluation(seconds, &images, self.progress());
+                .report_evaluation(due_secs, &images, self.progress());
         } else {
             self.scoreboard.continue_with(evaluation);
         }
@@ -633,10 +658,12 @@ impl Session {
         &mut self,
         work: impl FnOnce(&Scoreboard, &mut dyn Method) -> crate::Result<T>,
     ) -> crate::Result<T> {
+        // Steps that are still queued are training time, so they are completed first.
         self.gpu.wait()?;
         self.persistence.log_render();
         let before = Instant::now();
         let done = work(&self.scoreboard, self.method.as_mut())?;
+        // Work that `work` has queued is completed before its time is taken.
         self.gpu.wait()?;
         self.time.exclude(before.elapsed());
         Ok(done)

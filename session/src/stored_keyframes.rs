@@ -14,6 +14,7 @@ use kinematics::{Stamp, Twist};
 use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
+use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use trainer::checkpoint::{Array, Checkpoint};
@@ -105,7 +106,8 @@ impl StoredKeyframes {
     /// Fails if the folder cannot be listed, or if none of its keyframes can be read.
     pub fn read(&self) -> crate::Result<Vec<Arc<Keyframe>>> {
         let names = self.names()?;
-        let (mut keyframes, mut errors) = (Vec::new(), Vec::new());
+        let mut keyframes = Vec::new();
+        let mut errors = Vec::new();
         for name in &names {
             let path = self.folder.join(name);
             let read = || keyframe_of(&Checkpoint::read(&path)?);
@@ -114,6 +116,8 @@ impl StoredKeyframes {
                 Err(error) => errors.push(error),
             }
         }
+        // Without any keyframe, the cause probably concerns the whole folder, and there is nothing
+        // to continue with.
         if keyframes.is_empty()
             && let Some(error) = errors.pop()
         {
@@ -122,18 +126,16 @@ impl StoredKeyframes {
         for error in errors {
             log::warn!("{error:#}; the run continues without it");
         }
+        // File names begin with the camera, so their order is not that of the stamps.
         keyframes.sort_by(|one, other| (one.stamp, &one.camera).cmp(&(other.stamp, &other.camera)));
         Ok(keyframes)
     }
 
     fn names(&self) -> crate::Result<BTreeSet<String>> {
-        let list = || {
-            let names =
-                std::fs::read_dir(&self.folder)?.map(|entry| entry.map(|entry| entry.file_name()));
-            names.collect::<std::io::Result<Vec<_>>>()
-        };
-        let names = list().with_context(|| format!("cannot list {}", self.folder.display()))?;
+        let names = file_names(&self.folder)
+            .with_context(|| format!("cannot list {}", self.folder.display()))?;
         let names = names.into_iter().filter_map(|name| name.into_string().ok());
+        // Other files, such as temporary ones, are neither read nor removed.
         Ok(names
             .filter(|name| {
                 Path::new(name)
@@ -144,6 +146,15 @@ impl StoredKeyframes {
     }
 }
 
+/// Names of the files in a folder.
+fn file_names(folder: &Path) -> std::io::Result<Vec<OsString>> {
+    std::fs::read_dir(folder)?
+        .map(|entry| entry.map(|entry| entry.file_name()))
+        .collect()
+}
+
+/// File name of a keyframe. The stamp is padded with zeros to 20 digits, so that the names of a
+/// camera are in the order of its stamps.
 fn name_of(keyframe: &Keyframe) -> String {
     format!("{}_{:020}.{EXTENSION}", keyframe.camera, keyframe.stamp.0)
 }
@@ -206,40 +217,17 @@ fn keyframe_of(checkpoint: &Checkpoint) -> crate::Result<Keyframe> {
         checkpoint.method
     );
     let metadata: Description = serde_json::from_value(checkpoint.state.clone())?;
-    let pixels = |name: &str, size_px: [u32; 2]| {
-        let array = checkpoint.arrays.iter().find(|array| array.name == name);
-        let png = &array
-            .with_context(|| format!("array {name:?} is missing"))?
-            .bytes;
-        let image = image::load_from_memory_with_format(png, image::ImageFormat::Png)?;
-        ensure!(
-            [image.width(), image.height()] == size_px,
-            "array {name:?} has the wrong size, expected {size_px:?}"
-        );
-        Ok(image.into_rgba8().into_raw())
-    };
-    let depth = metadata.depth.map(|depth| {
-        let bytes = pixels(DEPTH, depth.size_px)?;
-        let depth_m = bytes
-            .as_chunks::<4>()
-            .0
-            .iter()
-            .map(|bytes| f32::from_le_bytes(*bytes));
-        Ok::<_, crate::Error>(DepthMap {
-            size_px: depth.size_px,
-            focal_px: depth.focal_px,
-            principal_px: depth.principal_px,
-            depth_m: depth_m.collect(),
-            world_from_camera: from_xyz_xyzw(depth.world_from_camera),
-        })
-    });
+    let depth = metadata
+        .depth
+        .as_ref()
+        .map(|depth| depth_of(checkpoint, depth));
     Ok(Keyframe {
         camera: metadata.camera.into(),
         stamp: Stamp(metadata.stamp_nanos),
         size_px: metadata.size_px,
         focal_px: metadata.focal_px,
         principal_px: metadata.principal_px,
-        rgba_srgb: pixels(COLOR, metadata.size_px)?.into(),
+        rgba_srgb: pixels_of(checkpoint, COLOR, metadata.size_px)?.into(),
         depth: depth.transpose()?,
         world_from_camera: from_xyz_xyzw(metadata.world_from_camera),
         twist: metadata.twist.map(twist),
@@ -257,17 +245,53 @@ fn keyframe_of(checkpoint: &Checkpoint) -> crate::Result<Keyframe> {
     })
 }
 
+/// Decodes the depth map of a stored keyframe.
+fn depth_of(checkpoint: &Checkpoint, description: &DepthDescription) -> crate::Result<DepthMap> {
+    let bytes = pixels_of(checkpoint, DEPTH, description.size_px)?;
+    // The four channels of a pixel are the bytes of its depth, as `png` has encoded them.
+    let depth_m = bytes
+        .as_chunks::<4>()
+        .0
+        .iter()
+        .map(|bytes| f32::from_le_bytes(*bytes));
+    Ok(DepthMap {
+        size_px: description.size_px,
+        focal_px: description.focal_px,
+        principal_px: description.principal_px,
+        depth_m: depth_m.collect(),
+        world_from_camera: from_xyz_xyzw(description.world_from_camera),
+    })
+}
+
+/// Decodes a PNG of a stored keyframe to four bytes per pixel.
+fn pixels_of(checkpoint: &Checkpoint, name: &str, size_px: [u32; 2]) -> crate::Result<Vec<u8>> {
+    let array = checkpoint.arrays.iter().find(|array| array.name == name);
+    let png = &array
+        .with_context(|| format!("array {name:?} is missing"))?
+        .bytes;
+    let image = image::load_from_memory_with_format(png, image::ImageFormat::Png)?;
+    // Other code relies on the number of pixels, and the file may be damaged or from elsewhere.
+    ensure!(
+        [image.width(), image.height()] == size_px,
+        "array {name:?} has the wrong size, expected {size_px:?}"
+    );
+    Ok(image.into_rgba8().into_raw())
+}
+
 /// Losslessly encodes four bytes per pixel. For depth, these are the bytes of an f32, which
 /// compress well because neighboring pixels are similar.
 fn png([width, height]: [u32; 2], bytes: &[u8]) -> crate::Result<Vec<u8>> {
     let mut png = Vec::new();
+    // A fast level and one fixed filter: keyframes arrive several times per second, and this thread
+    // shares the processors with training and devices.
     let encoder = PngEncoder::new_with_quality(&mut png, CompressionType::Fast, FilterType::Sub);
     encoder.write_image(bytes, width, height, ExtendedColorType::Rgba8)?;
     Ok(png)
 }
 
 fn twist_numbers(twist: &Twist) -> [f64; 6] {
-    let ([x, y, z], [a, b, c]) = (twist.linear_m_s.into(), twist.angular_rad_s.into());
+    let [x, y, z]: [f64; 3] = twist.linear_m_s.into();
+    let [a, b, c]: [f64; 3] = twist.angular_rad_s.into();
     [x, y, z, a, b, c]
 }
 

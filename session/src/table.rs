@@ -15,15 +15,13 @@ pub struct Table {
 impl Table {
     /// The table with its title as HTML.
     pub fn html(&self) -> String {
-        let row = |cells: &[String], tag: &str| {
-            let cells: String = cells
-                .iter()
-                .map(|cell| format!("<{tag}>{}</{tag}>", escaped(cell)))
-                .collect();
-            format!("<tr>{cells}</tr>\n")
-        };
-        let rows: String = self.rows.iter().map(|cells| row(cells, "td")).collect();
-        let (title, head) = (escaped(&self.title), row(&self.head, "th"));
+        let title = escaped(&self.title);
+        let head = html_row(&self.head, "th");
+        let rows: String = self
+            .rows
+            .iter()
+            .map(|cells| html_row(cells, "td"))
+            .collect();
         format!(
             "<h2>{title}</h2>\n<div class=\"wide\"><table>\n<thead>{head}</thead>\n<tbody>{rows}</tbody></table></div>\n"
         )
@@ -32,22 +30,36 @@ impl Table {
     /// The table with aligned columns, for a terminal.
     pub fn text(&self) -> String {
         let all = || std::iter::once(&self.head).chain(&self.rows);
-        let width = |column: usize| {
-            let widths = all()
-                .filter_map(|row| row.get(column))
-                .map(|cell| cell.chars().count());
-            widths.max().unwrap_or(0)
-        };
         let mut text = format!("\n{}\n", self.title);
         for row in all() {
+            // Row headers are words, aligned left; the other columns are numbers, aligned right.
             let cells = row.iter().enumerate().map(|(column, cell)| match column {
-                0 => format!("{cell:<0$}", width(column)),
-                _ => format!("{cell:>0$}", width(column)),
+                0 => format!("{cell:<0$}", self.width(column)),
+                _ => format!("{cell:>0$}", self.width(column)),
             });
             text.push_str(&format!("  {}\n", cells.collect::<Vec<_>>().join("  ")));
         }
         text.trim_end().to_owned()
     }
+
+    /// Number of characters of the longest cell of a column.
+    fn width(&self, column: usize) -> usize {
+        std::iter::once(&self.head)
+            .chain(&self.rows)
+            .filter_map(|row| row.get(column))
+            .map(|cell| cell.chars().count())
+            .max()
+            .unwrap_or(0)
+    }
+}
+
+/// A row of an HTML table.
+pub(crate) fn html_row(cells: &[String], tag: &str) -> String {
+    let cells: String = cells
+        .iter()
+        .map(|cell| format!("<{tag}>{}</{tag}>", escaped(cell)))
+        .collect();
+    format!("<tr>{cells}</tr>\n")
 }
 
 #[cfg(test)]

@@ -27,6 +27,8 @@ pub(crate) fn train_next(
         .collect();
     if let Some((ix, min_time)) = next(&device_time) {
         if sessions.len() == 1 {
+            // A single model needs no slices. Without the wait at the end of a slice, the GPU gets
+            // the next steps before it has completed the last ones.
             sessions[ix].train_steps(max_steps(ix, &sessions[ix]))?;
         } else {
             // A session that was idle for a while does not catch up.
@@ -36,6 +38,8 @@ pub(crate) fn train_next(
             sessions[ix].run_time_slice(|session| max_steps(ix, session), is_render_pending)?;
         }
     }
+    // Of all sessions, not only of the one that has trained: the clock is common, so evaluations
+    // and checkpoints of the others become due, too.
     sessions.iter_mut().try_for_each(Session::evaluate_when_due)
 }
 

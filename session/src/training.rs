@@ -99,11 +99,15 @@ pub fn drive(
     }
     let is_done = |session: &Session| session.is_over() || session.is_idle();
     let mut recoveries = Recoveries::new(open_gpu);
+    // The outer loop repeats if the GPU fails during the last queued steps, which only the final
+    // wait detects.
     loop {
         while !stop.requested() && !sessions.iter().all(is_done) {
             if let Err(error) = time_slices::train_next(sessions, |_, _| u64::MAX, || false) {
                 recoveries.recover(sessions, error)?;
             }
+            // No more keyframes arrive, so an idle model is complete. Its training time ends here,
+            // while the other models are still trained.
             sessions
                 .iter_mut()
                 .filter(|session| session.is_idle())

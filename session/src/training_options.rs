@@ -113,7 +113,9 @@ pub struct AvailableData {
     pub many_images_per_camera: bool,
 }
 
-/// Minimum average number of images per camera for the optimization of extrinsics by default.
+/// Minimum average number of images per camera for the optimization of extrinsics by default. The
+/// error of the extrinsics is shared by all images of a camera, while the errors of its poses differ
+/// from image to image. With few images, the two cannot be told apart.
 pub(crate) const MIN_IMAGES_PER_CAMERA: usize = 10;
 
 impl TrainingOptions {
@@ -169,25 +171,10 @@ impl TrainingOptions {
         kinds: &[ModelKind],
         available: AvailableData,
     ) -> Result<(), Error> {
-        let can_align = |param: &Refine| match available.depth {
-            true => *param != Refine::ImageGains,
-            false => {
-                available.color_only
-                    && matches!(
-                        param,
-                        Refine::Extrinsics | Refine::TimeOffset | Refine::Lens
-                    )
-            }
-        };
-        let can_learn = |param: &Refine| {
-            let set = param_set(std::slice::from_ref(param));
-            !set.is_empty()
-                && kinds
-                    .iter()
-                    .any(|kind| kind.entry().learnable.contains(set))
-        };
         let is_other = |param: &Refine| matches!(param, Refine::Auto | Refine::None | Refine::Base);
-        let is_known = |param: &Refine| is_other(param) || can_align(param) || can_learn(param);
+        let is_known = |param: &Refine| {
+            is_other(param) || available.can_align(*param) || can_learn(kinds, *param)
+        };
         let Some(unknown) = self.refine.iter().find(|param| !is_known(param)) else {
             return Ok(());
         };
@@ -229,16 +216,16 @@ impl TrainingOptions {
         if has(Refine::Auto) {
             return Ok(available.auto_settings());
         }
+        // Only registration estimates these, and it compares measured surfaces.
         let needs_depth = [
             Refine::Joints,
             Refine::DepthPose,
             Refine::DepthScale,
             Refine::Readout,
         ];
-        if let (Some(param), false) = (
-            needs_depth.into_iter().find(|param| has(*param)),
-            available.depth,
-        ) {
+        if !available.depth
+            && let Some(param) = needs_depth.into_iter().find(|param| has(*param))
+        {
             let message = "needs depth images measured by a camera";
             return Err(Error::BadInput(format!(
                 "--refine {}: {message}",
@@ -251,6 +238,8 @@ impl TrainingOptions {
             ));
         }
         let set = param_set(requested);
+        // Without measured depth, features of images give a first estimate, and training with the
+        // scene continues from it. Depth that was rendered allows neither.
         if !available.depth {
             let from_features = ParamSet::EXTRINSICS | ParamSet::TIME_OFFSET | ParamSet::LENS;
             let aligned = if available.color_only {
@@ -263,6 +252,8 @@ impl TrainingOptions {
                 with_scene: CameraRefinement::Always(set),
             });
         }
+        // With depth, registration is more accurate than training with the scene. Only parameters of
+        // single images are left for the scene.
         Ok(RefineSettings {
             align: CameraRefinement::Always(set - ParamSet::IMAGE_GAINS),
             with_scene: CameraRefinement::Always(
@@ -355,7 +346,30 @@ fn param_set(requested: &[Refine]) -> ParamSet {
         .collect()
 }
 
+/// Whether one of the methods can optimize a parameter with the scene.
+fn can_learn(kinds: &[ModelKind], param: Refine) -> bool {
+    let set = param_set(&[param]);
+    !set.is_empty()
+        && kinds
+            .iter()
+            .any(|kind| kind.entry().learnable.contains(set))
+}
+
 impl AvailableData {
+    /// Whether registration, or features without depth, can estimate a parameter.
+    fn can_align(self, param: Refine) -> bool {
+        if self.depth {
+            // Registration compares geometry, which gains do not affect.
+            param != Refine::ImageGains
+        } else {
+            self.color_only
+                && matches!(
+                    param,
+                    Refine::Extrinsics | Refine::TimeOffset | Refine::Lens
+                )
+        }
+    }
+
     /// Candidates for trials, the most promising first. They are estimated by registration if there
     /// is depth, otherwise jointly with the scene.
     ///
@@ -366,6 +380,7 @@ impl AvailableData {
         let gains = ParamSet::IMAGE_GAINS;
         let poses = ParamSet::IMAGE_POSES;
         let with_scene = match self {
+            // Poses that drift have an error of their own in each image.
             Self { drifts: true, .. } => vec![gains, poses],
             Self { depth: true, .. } => vec![gains],
             Self {
@@ -388,9 +403,10 @@ impl AvailableData {
         };
         RefineSettings {
             align: CameraRefinement::Try(aligned),
-            with_scene: match self.many_images_per_camera && !self.depth {
-                true => CameraRefinement::AlwaysAndTry(ParamSet::EXTRINSICS, with_scene),
-                false => CameraRefinement::Try(with_scene),
+            with_scene: if self.many_images_per_camera && !self.depth {
+                CameraRefinement::AlwaysAndTry(ParamSet::EXTRINSICS, with_scene)
+            } else {
+                CameraRefinement::Try(with_scene)
             },
         }
     }

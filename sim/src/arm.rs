@@ -13,7 +13,9 @@ use std::sync::Arc;
 pub(crate) const STEP_NANOS: i64 = 1_000_000;
 const STEP_SECS: f64 = 1e-3;
 /// Stiffness, newton meters per radian, and damping, newton meter seconds per radian, of each
-/// joint's controller.
+/// joint's controller. The arm is stiff enough to follow the tour closely; joints near the flange
+/// move less mass, and get less of both. With much higher values, the joints could oscillate,
+/// because torques change only once per millisecond.
 const STIFFNESS: [f64; N_JOINTS] = [2000.0, 2000.0, 1600.0, 1600.0, 600.0, 600.0, 300.0];
 const DAMPING: [f64; N_JOINTS] = [120.0, 120.0, 90.0, 90.0, 35.0, 35.0, 18.0];
 
@@ -47,6 +49,7 @@ impl JointCommands {
     fn advance(&mut self) {
         let setpoint = self.commands.next_setpoint();
         for (value_ix, joint_ix) in self.joint_ixs.iter().enumerate() {
+            // Commands are in reported positions; the dynamics need true ones.
             let offset = self.joint_offsets.get(value_ix).copied().unwrap_or(0.0);
             self.position_rad[*joint_ix] = setpoint.position[value_ix] + offset;
             self.velocity_rad_s[*joint_ix] = setpoint.velocity[value_ix];
@@ -88,6 +91,7 @@ impl Arm {
         history_duration_nanos: i64,
     ) -> Result<Self, Error> {
         let mut data = MjData::new(model);
+        // A scene with other movable joints would mix up their positions.
         if data.qpos().len() != N_JOINTS {
             return Err(Error::NJoints {
                 got: data.qpos().len(),
@@ -133,6 +137,8 @@ impl Arm {
     pub(crate) fn step(&mut self) -> JointReading {
         let position_rad = self.position_rad();
         let velocity_rad_s = Joints::from_column_slice(self.data.qvel());
+        // The reading, the torque and the step belong to the same instant: the reading holds the
+        // state before the step and the torque that is applied during it.
         let torque_nm = self.control(&position_rad, &velocity_rad_s);
         let reading = JointReading {
             nanos: self.n_steps * STEP_NANOS,
@@ -166,11 +172,15 @@ impl Arm {
     fn control(&self, position_rad: &Joints, velocity_rad_s: &Joints) -> Joints {
         let position_error = self.reference.position_rad() - position_rad;
         let velocity_error = self.reference.velocity_rad_s() - velocity_rad_s;
+        // Torques that gravity and velocities cause. Added to the command, they leave only the
+        // inertia to the controller.
         let bias = self.data.qfrc_bias();
         Joints::from_fn(|ix, _| {
             let torque = bias[ix]
                 + STIFFNESS[ix] * position_error[ix]
                 + DAMPING[ix] * velocity_error[ix]
+                // The joints of the model have a damping of 1 N m s/rad (`panda::mjcf`), which this
+                // term compensates.
                 + self.reference.velocity_rad_s()[ix];
             torque.clamp(-panda::MAX_TORQUE_NM[ix], panda::MAX_TORQUE_NM[ix])
         })
@@ -180,6 +190,7 @@ impl Arm {
     /// no readings cover it.
     pub(crate) fn position_at(&self, nanos: i64) -> Option<Joints> {
         let first = self.readings.front()?;
+        // Readings are one step apart, so the index follows from the time without a search.
         let ix = usize::try_from((nanos - first.nanos).checked_div(STEP_NANOS)?).ok()?;
         if nanos < first.nanos {
             return None;
@@ -190,7 +201,10 @@ impl Arm {
         }
         let after = self.readings.get(ix + 1)?;
         let share = (nanos - before.nanos) as f64 / STEP_NANOS as f64;
-        let (square, cube) = (share * share, share * share * share);
+        // Cubic Hermite interpolation with the velocities at both ends. Linear interpolation would
+        // deviate by about a micrometer, which a calibration without noise would show.
+        let square = share * share;
+        let cube = share * share * share;
         Some(
             before.position_rad * (2.0 * cube - 3.0 * square + 1.0)
                 + before.velocity_rad_s * (STEP_SECS * (cube - 2.0 * square + share))

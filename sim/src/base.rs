@@ -21,7 +21,8 @@ pub(crate) enum BaseMotion {
 
 /// Duration of a lap at speed 1, seconds.
 const LAP_SECS: f64 = 36.0;
-/// Gait frequency at speed 1, and the body motion caused by a step.
+/// Gait frequency at speed 1, and the body motion caused by a step. A trotting quadruped of this
+/// size takes one to two steps per second and moves its body by millimeters.
 const GAIT_HZ: f64 = 1.7;
 const BOUNCE_M: f64 = 0.007;
 const ROLL_RAD: f64 = 0.008;
@@ -42,7 +43,8 @@ pub(crate) fn base_from_arm() -> Transform {
     Transform::translation(0.12, 0.0, 0.10)
 }
 
-/// Smoothstep: 0 below zero, 1 above one, with a continuous derivative in between.
+/// Smootherstep (Perlin 2002): 0 below zero, 1 above one, with continuous first and second
+/// derivatives. Velocity and acceleration are zero at both ends.
 pub(crate) fn smooth(share: f64) -> f64 {
     let share = share.clamp(0.0, 1.0);
     share.powi(3) * (10.0 - 15.0 * share + 6.0 * share * share)
@@ -127,6 +129,8 @@ fn lap_secs(secs: f64, speed: f64) -> f64 {
     const START_SECS: f64 = 1.5;
     const OSCILLATION: (f64, f64) = (0.35, 7.3);
     let at = secs * speed;
+    // The integral of the smooth ramp 3 r^2 - 2 r^3, scaled so that the walk has speed 1 after the
+    // start.
     let ramp = (at / START_SECS).clamp(0.0, 1.0);
     let started = START_SECS * (ramp.powi(3) - 0.5 * ramp.powi(4)) + (at - START_SECS).max(0.0);
     // The oscillation starts with zero derivative, so the walk starts smoothly.
@@ -135,6 +139,7 @@ fn lap_secs(secs: f64, speed: f64) -> f64 {
 
 fn lap_pose(at: f64, gait_secs: f64) -> Transform {
     let around = at / LAP_SECS * TAU + std::f64::consts::PI;
+    // Periods without a common multiple, so that no lap repeats the views of another.
     let radius_m = oscillate([2.25, 0.38, 23.0, 0.1], at);
     // The heading varies between facing the pedestal and facing past it.
     let heading_offset_rad = oscillate([0.25, 0.55, 15.7, 0.0], at);
@@ -149,6 +154,8 @@ fn lap_pose(at: f64, gait_secs: f64) -> Transform {
 /// Pose of the walking body at a position and heading, with bounce and sway.
 fn gait(secs: f64, gait_amplitude: f64, [x, y, yaw]: [f64; 3]) -> Transform {
     let step = secs * GAIT_HZ * TAU;
+    // The body bounces and pitches twice per gait cycle, once for each pair of legs, and rolls
+    // once.
     let bounce_m = BOUNCE_M * gait_amplitude * (2.0 * step).sin();
     let rotation_vector = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), yaw)
         * UnitQuaternion::from_axis_angle(
@@ -174,7 +181,8 @@ pub(crate) struct Drift {
     step_rad: [f64; 3],
 }
 
-/// Steps of the random walk over the whole walk.
+/// Steps of the random walk over the whole walk. With more steps, the drift changes more often and
+/// by less each time; the error at the end stays the same.
 const N_STEPS: f64 = 64.0;
 /// Errors of height, roll and pitch relative to the other axes: gravity and the floor constrain
 /// them.
@@ -182,17 +190,21 @@ const CONSTRAINED_AXIS_FRAC: f64 = 0.3;
 /// Identifies the random number stream.
 const DRIFT: u64 = 0xd41f;
 
+/// Standard deviations of one step along three axes, so that the sum of all steps has the root mean
+/// square `size`, distributed by the weights.
+fn step_sigmas(size: f64, weights: [f64; 3]) -> [f64; 3] {
+    let norm = weights
+        .iter()
+        .map(|weight| weight * weight)
+        .sum::<f64>()
+        .sqrt();
+    // The variances of independent steps add up.
+    weights.map(|weight| size * weight / norm / N_STEPS.sqrt())
+}
+
 impl Drift {
     /// `size_m` and `size_rad` are the root mean square errors at the end of the whole walk.
     pub(crate) fn new(seed: u64, size_m: f64, size_rad: f64) -> Self {
-        let step_sigmas = |size: f64, weights: [f64; 3]| {
-            let norm = weights
-                .iter()
-                .map(|weight| weight * weight)
-                .sum::<f64>()
-                .sqrt();
-            weights.map(|weight| size * weight / norm / N_STEPS.sqrt())
-        };
         Self {
             random: RandomStream::new(seed, &[DRIFT]),
             step_m: step_sigmas(size_m, [1.0, 1.0, CONSTRAINED_AXIS_FRAC]),
@@ -206,13 +218,16 @@ impl Drift {
     /// Reported pose, given the true pose and the completed fraction of the walk.
     pub(crate) fn reported(&self, world_from_base: &Transform, walked_frac: f64) -> Transform {
         let steps = walked_frac * N_STEPS;
-        let (mut translation_error, mut rotation_vector) = (Vector3::zeros(), Vector3::zeros());
+        let mut translation_error = Vector3::zeros();
+        let mut rotation_vector = Vector3::zeros();
         let mut step = 0_u64;
         // Summing all steps each time needs no state, and even a long run has only a few hundred
         // steps.
         while (step as f64) < steps {
+            // The last step is blended in, so that the reported pose does not jump.
             let share = smooth(steps - step as f64);
             let [a, b] =
+                // Translation and rotation use separate counters of the same stream.
                 [2 * step, 2 * step + 1].map(|counter| self.random.normals(counter).map(f64::from));
             translation_error += Vector3::from_fn(|axis, _| self.step_m[axis] * a[axis]) * share;
             rotation_vector += Vector3::from_fn(|axis, _| self.step_rad[axis] * b[axis]) * share;

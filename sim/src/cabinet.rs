@@ -59,6 +59,7 @@ fn equip(furniture: &mut Furniture) {
     let [x, y, z] = SCREEN_M;
     let box_pose = upright([x + BOX_HALF_M[0], y, z], 180.0);
     furniture.add_item(&box_pose, BOX_HALF_M, 12, 12);
+    // Slightly in front of the box, to avoid z-fighting.
     let mut screen = Mesh::default();
     let at = Point3::new(x - 0.002, y, z);
     screen.rectangle(
@@ -105,7 +106,8 @@ fn equip(furniture: &mut Furniture) {
 
 /// The sheets of the cabinet and its open door.
 fn shell() -> (Mesh, Mesh) {
-    let (mut yellow, mut plate) = (Mesh::default(), Mesh::default());
+    let mut yellow = Mesh::default();
+    let mut plate = Mesh::default();
     let middle_x = FRONT_X_M + 0.5 * DEPTH_M;
     let mut put =
         |pose: Transform, half: [f64; 3]| yellow.append_at(Mesh::cuboid(half, &[WHOLE; 6]), &pose);
@@ -145,10 +147,12 @@ fn shell() -> (Mesh, Mesh) {
 
 /// A round bar between two points.
 fn bar(from: [f64; 3], to: [f64; 3], radius_m: f64) -> Mesh {
-    let (from, to) = (Vector3::from(from), Vector3::from(to));
+    let from = Vector3::from(from);
+    let to = Vector3::from(to);
     let rotation =
         UnitQuaternion::rotation_between(&Vector3::z(), &(to - from)).unwrap_or_default();
     let length_m = (to - from).norm();
+    // The ends start at a small radius instead of 0, where normals would be undefined.
     let profile = [
         [0.0005, 0.0],
         [radius_m, 0.0],
@@ -164,7 +168,8 @@ fn bar(from: [f64; 3], to: [f64; 3], radius_m: f64) -> Mesh {
 }
 
 fn bars() -> Mesh {
-    let (x, z) = (FRONT_X_M - 0.035, 0.66);
+    let x = FRONT_X_M - 0.035;
+    let z = 0.66;
     let mut mesh = bar([x, -0.49, z], [x, 0.49, z], 0.016);
     for y in [-0.47, 0.47] {
         mesh.append(
@@ -189,15 +194,7 @@ fn lever_and_cables() -> (Mesh, Mesh) {
         .enumerate()
     {
         let depth = 2.325 - 0.02 * ix as f64;
-        let point_at = |step: i32| {
-            let share = f64::from(step) / 8.0;
-            let sag = 0.05 * (share * std::f64::consts::PI).sin();
-            [
-                depth - 0.5 * sag,
-                from_y + (to_y - from_y) * share + sag,
-                1.17 - share * 0.36 - sag,
-            ]
-        };
+        let point_at = |step| cable_point(depth, [from_y, to_y], step);
         for step in 0..8 {
             cables.append(
                 bar(point_at(step), point_at(step + 1), 0.0075),
@@ -208,6 +205,18 @@ fn lever_and_cables() -> (Mesh, Mesh) {
     (lever, cables)
 }
 
+/// Point on a cable that hangs between two y coordinates at a depth, `step` of 8 along it.
+fn cable_point(depth: f64, [from_y, to_y]: [f64; 2], step: i32) -> [f64; 3] {
+    let share = f64::from(step) / 8.0;
+    // A half sine is close enough to a catenary for a picture.
+    let sag = 0.05 * (share * std::f64::consts::PI).sin();
+    [
+        depth - 0.5 * sag,
+        from_y + (to_y - from_y) * share + sag,
+        1.17 - share * 0.36 - sag,
+    ]
+}
+
 fn flat(center: [f64; 3], right: Vector3<f64>, up: Vector3<f64>, texture: [f64; 4]) -> Mesh {
     let mut mesh = Mesh::default();
     mesh.rectangle(Point3::from(center), right, up, texture);
@@ -216,12 +225,6 @@ fn flat(center: [f64; 3], right: Vector3<f64>, up: Vector3<f64>, texture: [f64; 
 
 /// All objects except the robot.
 pub(crate) fn objects() -> Vec<Object> {
-    let object = |name, material, mesh| Object {
-        name,
-        material,
-        mesh,
-        world_from_mesh: Transform::identity(),
-    };
     let Furniture {
         things,
         posters,
@@ -231,10 +234,13 @@ pub(crate) fn objects() -> Vec<Object> {
     let (yellow, plate) = shell();
     let (lever, cables) = lever_and_cables();
     let [near, far] = ROOM_X_M;
-    let (middle_x, half_x, half_z) = (0.5 * (near + far), 0.5 * (far - near), 0.5 * ROOM_HEIGHT_M);
+    let middle_x = 0.5 * (near + far);
+    let half_x = 0.5 * (far - near);
+    let half_z = 0.5 * ROOM_HEIGHT_M;
     let mut sides = Mesh::default();
     for side in [-1.0, 1.0] {
         let right = Vector3::x() * (half_x * side);
+        // The texture of a wall is a square of the room's height, and repeats along the wall.
         let texture = [0.0, 0.0, 2.0 * half_x / ROOM_HEIGHT_M, 1.0];
         let wall = flat(
             [middle_x, side * ROOM_HALF_Y_M, half_z],
@@ -244,7 +250,8 @@ pub(crate) fn objects() -> Vec<Object> {
         );
         sides.append(wall, Vector3::zeros());
     }
-    let (right, up) = (Vector3::y() * -ROOM_HALF_Y_M, Vector3::z() * half_z);
+    let right = Vector3::y() * -ROOM_HALF_Y_M;
+    let up = Vector3::z() * half_z;
     let back = flat([far, 0.0, half_z], right, up, [0.0, 0.0, 2.0, 1.2]);
     let behind = flat([near, 0.0, half_z], -right, up, [0.0, 0.0, 1.8, 1.0]);
     sides.append(behind, Vector3::zeros());
@@ -261,26 +268,28 @@ pub(crate) fn objects() -> Vec<Object> {
         WHOLE,
     );
     vec![
-        object("things", "items", things),
-        object("posters", "posters", posters),
-        object("frames", "frame", frames),
-        object("shell", "enamel", yellow),
-        object("plate", "plate", plate),
-        object("bars", "chrome", bars()),
-        object("lever", "red", lever),
-        object("cables", "cable", cables),
-        object("sides", "painted", sides),
-        object("back", "brick", back),
-        object("floor", "tiles", floor),
-        object("ceiling", "ceiling", ceiling),
+        Object::in_world("things", "items", things),
+        Object::in_world("posters", "posters", posters),
+        Object::in_world("frames", "frame", frames),
+        Object::in_world("shell", "enamel", yellow),
+        Object::in_world("plate", "plate", plate),
+        Object::in_world("bars", "chrome", bars()),
+        Object::in_world("lever", "red", lever),
+        Object::in_world("cables", "cable", cables),
+        Object::in_world("sides", "painted", sides),
+        Object::in_world("back", "brick", back),
+        Object::in_world("floor", "tiles", floor),
+        Object::in_world("ceiling", "ceiling", ceiling),
     ]
 }
 
 /// The textures by name, with baked lighting.
 pub(crate) fn textures() -> Vec<(&'static str, Texture)> {
+    /// Distance up to which objects darken a surface, meters: about the size of the cabinet's parts.
     const AMBIENT_REACH_M: f64 = 0.3;
     let mut occluders = Occluders::new(AMBIENT_REACH_M);
     furniture().add_occluders(&mut occluders);
+    // The sheets of the cabinet darken its inside.
     let middle_x = FRONT_X_M + 0.5 * DEPTH_M;
     for side in [-1.0, 1.0] {
         let wall = upright([middle_x, side * (HALF_M - SHEET_M), CENTER_Z_M], 0.0);
@@ -291,6 +300,7 @@ pub(crate) fn textures() -> Vec<(&'static str, Texture)> {
     let [near, far] = ROOM_X_M;
     let mut tiles = lab_texture::floor_tiles([far - near, 2.0 * ROOM_HALF_Y_M], 1.1);
     tiles.shade(WHOLE, 100, |u, v, name| {
+        // v runs down in a texture, but y up on the floor.
         let point = Point3::new(
             near + (far - near) * u,
             (1.0 - 2.0 * v) * ROOM_HALF_Y_M,

@@ -39,6 +39,8 @@ impl CabinetTour {
     /// Target pose of the camera in the arm's base frame.
     pub(crate) fn arm_from_camera(&self, secs: f64) -> Transform {
         let [departure_secs, arrival_secs] = self.walk_secs;
+        // The tour is defined in the world, so that the camera stays on target although the base
+        // stands at another place and angle at each station.
         match self.motion.station_at(secs) {
             Some((station, at)) => self.at_station(station, at),
             None => {
@@ -81,8 +83,10 @@ fn far(at: f64) -> (Vector3<f64>, Vector3<f64>, f64) {
 /// Eye, look-at point and roll at the second station: before the opening, then repeatedly in and
 /// out.
 fn near(at: f64) -> (Vector3<f64>, Vector3<f64>, f64) {
+    // A cosine, so that the camera starts and turns around at rest.
     let cycle = ((at - OUTSIDE_SECS).max(0.0) / IN_AND_OUT_SECS * std::f64::consts::TAU).cos();
     let inside = 0.5 - 0.5 * cycle;
+    // Position and look-at point move from outside to inside together.
     let blend = |outside: Vector3<f64>, deep: Vector3<f64>| outside + (deep - outside) * inside;
     let eye = blend(
         Vector3::new(

@@ -18,7 +18,8 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 use std::time::Duration;
 
-/// Queue length for the images of one camera.
+/// Queue length for the images of one camera. A caller that reads only the arm must not fill the
+/// memory.
 const MAX_IMAGES: usize = 8;
 /// Queue length for joint readings: one second.
 const MAX_READINGS: usize = 1000;
@@ -63,12 +64,11 @@ impl CommandedRig {
             joint_names: info.joint_names.clone(),
         };
         let cameras = info.cameras.iter().enumerate().map(|(camera_ix, camera)| {
-            let (name, intrinsics) = (camera.name.clone(), camera.intrinsics.clone());
             Box::new(SharedCamera {
                 simulation: Arc::clone(&simulation),
                 camera_ix,
-                name,
-                intrinsics,
+                name: camera.name.clone(),
+                intrinsics: camera.intrinsics.clone(),
             }) as Box<dyn Camera>
         });
         Ok(Self {
@@ -100,6 +100,7 @@ impl Simulation {
             .nanos
             .saturating_add(i64::try_from(timeout.as_nanos()).unwrap_or(i64::MAX));
         loop {
+            // First, because a sample may have arrived while another device was read.
             if let Some(taken) = take(self) {
                 return Ok(Some(taken));
             }
@@ -113,6 +114,8 @@ impl Simulation {
                 let reason = "the simulation reached its end".to_owned();
                 return Err(drivers::Error::Simulation { reason });
             };
+            // Samples are delivered in the order of their arrival, but images have a latency, so
+            // times may go back.
             self.nanos = self.nanos.max(nanos);
             match sample {
                 Sample::Image(image) => {
@@ -125,6 +128,7 @@ impl Simulation {
                     }
                 }
                 Sample::Joints(reading) => push_bounded(&mut self.readings, MAX_READINGS, reading),
+                // Only devices of a commanded rig have queues.
                 Sample::Base(_) | Sample::Range(_) | Sample::Truth(_) | Sample::BaseTruth(_) => {}
             }
         }

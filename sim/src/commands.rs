@@ -38,6 +38,7 @@ impl Commands {
     /// The setpoint of the next period. Without a trajectory, the arm stays where it is.
     pub(crate) fn next_setpoint(&self) -> Setpoint {
         let mut motion = self.0.lock();
+        // After a fault, the arm holds the last setpoint, at rest.
         if motion.stopped.is_none() {
             match motion.generator.step() {
                 Ok(setpoint) => motion.last = setpoint,
@@ -79,6 +80,7 @@ impl Commands {
     pub(crate) fn recover(&self) -> Result<(), String> {
         let mut motion = self.0.lock();
         let at_rest = motion.last.clone();
+        // A trajectory that was interrupted must not continue when the arm is recovered.
         motion.generator.resume(&at_rest)?;
         motion.generator.stop();
         motion.stopped = None;

@@ -342,13 +342,6 @@ impl CameraConfig {
     /// A wrist RGB-D camera like a `RealSense` L515, for upright objects in front of the arm:
     /// 1280x720 color at 4 Hz, 640x480 depth with its own lens and pose, tilted by 80 degrees.
     pub fn mobile_wrist(name: &str) -> Self {
-        let pinhole = |size_px, focal_px, principal_px| Intrinsics {
-            size_px,
-            focal_px,
-            principal_px,
-            lens: Lens::Pinhole,
-            rectified: false,
-        };
         Self {
             intrinsics: pinhole([1280, 720], [905.3, 904.7], [648.2, 355.1]),
             rate_hz: 4.0,
@@ -366,6 +359,16 @@ impl CameraConfig {
             }),
             ..Self::wrist(name)
         }
+    }
+}
+
+fn pinhole(size_px: [u32; 2], focal_px: [f64; 2], principal_px: [f64; 2]) -> Intrinsics {
+    Intrinsics {
+        size_px,
+        focal_px,
+        principal_px,
+        lens: Lens::Pinhole,
+        rectified: false,
     }
 }
 
@@ -406,17 +409,20 @@ impl Default for Config {
 impl Config {
     /// Index of the joint, counted from the base, for each value of a reading.
     pub(crate) fn joint_ixs(&self) -> Result<Vec<usize>, Error> {
-        let find = |name: &String| {
-            let unknown = || Error::UnknownJoint {
-                joint: name.clone(),
+        self.reading_order
+            .iter()
+            .map(|name| self.joint_ix(name))
+            .collect()
+    }
+
+    fn joint_ix(&self, name: &str) -> Result<usize, Error> {
+        self.joint_names
+            .iter()
+            .position(|known| known == name)
+            .ok_or_else(|| Error::UnknownJoint {
+                joint: name.to_owned(),
                 known: self.joint_names.clone(),
-            };
-            self.joint_names
-                .iter()
-                .position(|known| known == name)
-                .ok_or_else(unknown)
-        };
-        self.reading_order.iter().map(find).collect()
+            })
     }
 
     /// Checks all numbers before they reach MuJoCo, which aborts the process on invalid ones.
@@ -425,6 +431,15 @@ impl Config {
         if let Some(secs) = self.duration_secs {
             check("sim", "duration_secs", secs, 0.0, 1e6)?;
         }
+        self.check_joints()?;
+        check("sim", "light_inside_frac", self.light_inside_frac, 0.0, 4.0)?;
+        self.base.check()?;
+        self.check_cameras()?;
+        self.check_scanners()?;
+        self.check_targets()
+    }
+
+    fn check_joints(&self) -> Result<(), Error> {
         let expected = if self.scene.has_arm() { N_JOINTS } else { 0 };
         if self.joint_names.len() != expected {
             return Err(Error::NJoints {
@@ -433,6 +448,7 @@ impl Config {
             });
         }
         self.joint_ixs()?;
+        // No offsets are the same as zeros, but a partial list is probably a mistake.
         if !self.joint_offsets.is_empty() && self.joint_offsets.len() != expected {
             return Err(Error::NJoints {
                 got: self.joint_offsets.len(),
@@ -441,13 +457,15 @@ impl Config {
         }
         self.joint_offsets
             .iter()
-            .try_for_each(|offset| check("arm", "joint_offsets", *offset, -1.0, 1.0))?;
-        check("sim", "light_inside_frac", self.light_inside_frac, 0.0, 4.0)?;
-        self.base.check()?;
+            .try_for_each(|offset| check("arm", "joint_offsets", *offset, -1.0, 1.0))
+    }
+
+    fn check_cameras(&self) -> Result<(), Error> {
         if self.cameras.is_empty() {
             return Err(Error::NoCamera);
         }
         for (ix, camera) in self.cameras.iter().enumerate() {
+            // Samples name their camera, so two cameras of the same name could not be told apart.
             if self.cameras[..ix]
                 .iter()
                 .any(|other| other.name == camera.name)
@@ -463,6 +481,10 @@ impl Config {
                 });
             }
         }
+        Ok(())
+    }
+
+    fn check_scanners(&self) -> Result<(), Error> {
         for (ix, scanner) in self.scanners.iter().enumerate() {
             if self.scanners[..ix]
                 .iter()
@@ -474,6 +496,10 @@ impl Config {
             }
             scanner.check()?;
         }
+        Ok(())
+    }
+
+    fn check_targets(&self) -> Result<(), Error> {
         for target in &self.targets {
             target.target()?;
             check_pose(&target.name, "parent_from_board", &target.parent_from_board)?;
@@ -502,6 +528,7 @@ impl ScannerConfig {
         check(of, "n_rings", self.n_rings.into(), 1.0, 256.0)?;
         check(of, "n_columns", self.n_columns.into(), 4.0, 4096.0)?;
         check(of, "lowest elevation", self.elevation_rad[0], -1.57, 1.57)?;
+        // The lowest elevation is the limit, so that the range is not empty.
         check(
             of,
             "highest elevation",
@@ -542,6 +569,7 @@ impl CameraConfig {
         let sensor = &self.sensor;
         check(&self.name, "noise_sigma", sensor.noise_sigma, 0.0, 100.0)?;
         check(&self.name, "shot_frac", sensor.shot_frac, 0.0, 1.0)?;
+        // An exposure ends before the next one begins.
         check(
             &self.name,
             "exposure_micros",
@@ -556,6 +584,7 @@ impl CameraConfig {
             1.0,
             64.0,
         )?;
+        // So does a readout.
         check(
             &self.name,
             "readout_micros",
@@ -629,6 +658,7 @@ fn check_pose(of: &str, key: &'static str, pose: &Transform) -> Result<(), Error
 
 /// Rejects numbers outside `lower..=upper`, and NaN.
 fn check(of: &str, key: &'static str, got: f64, lower: f64, upper: f64) -> Result<(), Error> {
+    // False for NaN, which is therefore refused.
     if got >= lower && got <= upper {
         return Ok(());
     }

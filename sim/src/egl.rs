@@ -7,9 +7,12 @@ use std::ffi::{CStr, c_char, c_void};
 
 type Egl = egl::DynamicInstance<egl::EGL1_5>;
 
+// Values of the EGL registry that the bindings do not contain: EGL_PLATFORM_DEVICE_EXT,
+// EGL_PLATFORM_SURFACELESS_MESA and EGL_EXTENSIONS.
 const PLATFORM_DEVICE: egl::Enum = 0x313f;
 const PLATFORM_SURFACELESS_MESA: egl::Enum = 0x31dd;
 const EXTENSIONS: i32 = 0x3055;
+/// More devices than any computer has; further ones are not tried.
 const MAX_DEVICES: usize = 32;
 
 /// A context without a surface. Dropping it releases the thread and destroys the context.
@@ -143,8 +146,10 @@ fn make_current(
     let config = egl
         .choose_first_config(display, &attributes)?
         .ok_or(egl::Error::BadConfig)?;
+    // The default API of EGL is OpenGL ES, but MuJoCo needs desktop OpenGL.
     egl.bind_api(egl::OPENGL_API)?;
     let context = egl.create_context(display, config, None, &[egl::NONE])?;
+    // A context that cannot be made current must not leak, because the next candidate is tried.
     if let Err(error) = egl.make_current(display, None, None, Some(context)) {
         let _ = egl.destroy_context(display, context);
         return Err(error);

@@ -90,7 +90,8 @@ struct Exposure {
     depth_picture: Option<Pending>,
 }
 
-/// First exposure of the first camera, and additional delay of each further camera.
+/// First exposure of the first camera, and additional delay of each further camera. The arm needs
+/// readings before the first exposure; cameras of a real rig are not synchronized either.
 const FIRST_NANOS: i64 = 50_000_000;
 const STAGGER_NANOS: i64 = 3_700_000;
 
@@ -120,6 +121,8 @@ impl Camera {
             ..config.sensor
         };
         let sensor = if ideal { flawless } else { config.sensor };
+        // A camera that does not move, or exposes all rows at one instant, needs no margin around
+        // its rendered images.
         let is_sharp = config.parent == Parent::World
             || (sensor.readout_micros <= 0.0 && sensor.blur_samples <= 1);
         let depth_sensor = config
@@ -178,6 +181,7 @@ impl Camera {
         let [_, height] = self.config.intrinsics.size_px;
         let mut offsets = Vec::new();
         for row in 0..height {
+            // The stamp is the mid-exposure of the middle row.
             let by_row = ((f64::from(row) + 0.5) / f64::from(height) - 0.5) * sensor.readout_micros;
             for sample in 0..sensor.blur_samples {
                 let share = (f64::from(sample) + 0.5) / f64::from(sensor.blur_samples) - 0.5;
@@ -216,15 +220,23 @@ impl Camera {
     }
 }
 
+/// Time from the first exposure of a camera's image to its arrival.
+fn longest_span_nanos(camera: &CameraConfig) -> i64 {
+    let sensor = &camera.sensor;
+    nanos_from_secs(
+        1e-6 * (sensor.readout_micros + sensor.exposure_micros) + 1e-3 * sensor.latency_millis,
+    )
+}
+
 /// Duration of the arm's history that cameras may request, nanoseconds.
 pub(crate) fn history_nanos(config: &Config) -> i64 {
-    let longest = |camera: &CameraConfig| {
-        let sensor = &camera.sensor;
-        nanos_from_secs(
-            1e-6 * (sensor.readout_micros + sensor.exposure_micros) + 1e-3 * sensor.latency_millis,
-        )
-    };
-    config.cameras.iter().map(longest).max().unwrap_or(0) + 10 * STEP_NANOS
+    config
+        .cameras
+        .iter()
+        .map(longest_span_nanos)
+        .max()
+        .unwrap_or(0)
+        + 10 * STEP_NANOS
 }
 
 /// Optics and counters of all cameras, created before the rest of the engine.
@@ -320,13 +332,11 @@ impl Engine {
         start: Stamp,
     ) -> Result<(), Error> {
         self.robot.arm_mut().ok_or(Error::NoArm)?;
-        let (joint_ixs, joint_offsets) =
-            (self.joint_ixs.clone(), self.config.joint_offsets.clone());
         self.robot.follow_motors(MotorizedArm {
             motors,
             start,
-            joint_ixs,
-            joint_offsets,
+            joint_ixs: self.joint_ixs.clone(),
+            joint_offsets: self.config.joint_offsets.clone(),
         });
         self.looks_ahead = false;
         Ok(())
@@ -348,13 +358,7 @@ impl Engine {
             if let Some(delivery) = self.ready.pop_front() {
                 return Ok(Some(delivery));
             }
-            // Commands apply to the samples that follow them, so the robot must not be ahead of its
-            // samples.
-            let is_due = |engine: &Self| match engine.looks_ahead {
-                true => engine.n_pending < engine.max_pending,
-                false => engine.slots.is_empty(),
-            };
-            while is_due(self) && !self.has_ended {
+            while self.may_step() && !self.has_ended {
                 self.step()?;
             }
             match self.slots.pop_front() {
@@ -377,6 +381,18 @@ impl Engine {
         }
     }
 
+    /// Whether the robot may move before the next sample is delivered.
+    fn may_step(&self) -> bool {
+        if self.looks_ahead {
+            // While images are rendered, the processor steps the robot.
+            self.n_pending < self.max_pending
+        } else {
+            // Commands apply to the samples that follow them, so the robot must not be ahead of
+            // its samples.
+            self.slots.is_empty()
+        }
+    }
+
     /// Moves the robot by one step and starts rendering the images that arrive by then.
     fn step(&mut self) -> Result<(), Error> {
         let (nanos, reading) = self.robot.step()?;
@@ -388,6 +404,8 @@ impl Engine {
             self.has_ended = true;
             return Ok(());
         }
+        // Slots keep the order of the arrivals: readings first, then base poses and scans, then
+        // images whose readout has ended by now.
         self.slots.extend(reading.map(Slot::Joints));
         self.queue_base_and_scans(nanos);
         for camera_ix in 0..self.cameras.len() {
@@ -414,6 +432,7 @@ impl Engine {
         }
         for (scanner_ix, scanner) in self.config.scanners.iter().enumerate() {
             let n_scans = &mut self.n_scans[scanner_ix];
+            // A revolution is delivered when it is complete.
             while FIRST_NANOS + due(*n_scans + 1, scanner.rate_hz) <= nanos {
                 self.slots.push_back(Slot::Scan(
                     scanner_ix,
@@ -427,7 +446,8 @@ impl Engine {
 
     /// Emits the base pose as reported by its SLAM system, and the ground truth.
     fn emit_base_pose(&mut self, nanos: i64) {
-        let (stamp, secs) = (Stamp(self.start.0 + nanos), nanos as f64 * 1e-9);
+        let stamp = Stamp(self.start.0 + nanos);
+        let secs = nanos as f64 * 1e-9;
         let truth = self.robot.motion().world_from_base(secs);
         let reported = self
             .drift
@@ -439,6 +459,7 @@ impl Engine {
                 world_from_base: reported,
             }),
         ));
+        // Ground truth follows its sample, so that a reader that waits for it finds it next.
         if self.config.truth {
             self.ready.push_back((
                 nanos,
@@ -479,9 +500,12 @@ impl Engine {
     /// Starts rendering a camera's next image, or drops it.
     fn expose(&mut self, camera_ix: usize) -> Result<(), Error> {
         let camera = &mut self.cameras[camera_ix];
-        let (image_ix, stamp_nanos) = (camera.n_exposed, camera.stamp_nanos());
+        let image_ix = camera.n_exposed;
+        let stamp_nanos = camera.stamp_nanos();
         let arrival_nanos = stamp_nanos + camera.delivery_delay_nanos();
         camera.n_exposed += 1;
+        // Random numbers depend on the image and not on the order of events, so that dropping one
+        // image does not change the noise of the others.
         let drop_sample = camera
             .random(self.config.seed, image_ix, DROP_STREAM)
             .unit(0);
@@ -494,6 +518,8 @@ impl Engine {
         let world_from_camera = camera.world_from_camera(&robot);
         let camera_from_world = world_from_camera.inverse();
         let mut row_motions = Vec::new();
+        // The scene is rendered once, at the stamp. The poses of the rows are needed to move its
+        // pixels to where each row sees them.
         for offset in camera.row_offsets_nanos() {
             let world_from_row = camera.world_from_camera(&robot_at(stamp_nanos + offset)?);
             row_motions.push(RowMotion::new(&(camera_from_world * world_from_row)));
@@ -502,6 +528,7 @@ impl Engine {
         // carries.
         let is_robot_visible = camera.config.parent == Parent::World;
         let robot = (is_robot_visible || self.config.has_carried_target()).then_some(robot);
+        // Only a camera on the flange enters the cabinet, so only its images change with the lamps.
         let light_frac = match self.config.scene {
             Scene::MobileArm if !self.config.ideal && camera.config.parent == Parent::Flange => {
                 light_frac(&world_from_camera, self.config.light_inside_frac)
@@ -517,6 +544,7 @@ impl Engine {
             robot.filter(|_| self.config.has_carried_target()),
         );
         let n_skipped = std::mem::take(&mut camera.n_skipped);
+        // Rendering continues on its thread while the robot moves on.
         let picture = self.renderer.submit(view)?;
         let depth_picture = depth_view
             .map(|view| self.renderer.submit(view))
@@ -547,7 +575,8 @@ impl Engine {
     fn finish_image(&mut self, exposure: Exposure) -> Result<(), Error> {
         let camera = &self.cameras[exposure.camera_ix];
         let picture = exposure.picture.wait()?;
-        let (seed, image_ix) = (self.config.seed, exposure.image_ix);
+        let seed = self.config.seed;
+        let image_ix = exposure.image_ix;
         let stamp = Stamp(self.start.0 + camera.reported_nanos(exposure.stamp_nanos));
         let depth_lens = camera
             .config
@@ -569,6 +598,8 @@ impl Engine {
             exposure_secs: Some(1e-6 * camera.sensor.exposure_micros),
             n_skipped: exposure.n_skipped,
         };
+        // Color comes first. The image without motion is also the ground truth; both are only
+        // computed if they are needed, because they take most of the time on the processor.
         let is_moving = !exposure.row_motions.is_empty();
         let motion_free = if self.config.truth || !is_moving {
             camera.optics.motion_free(&picture)
@@ -597,11 +628,15 @@ impl Engine {
         } else {
             noise::to_bytes(sensed)
         };
+        // A perfect model of the scene cannot score better than this, because it cannot predict the
+        // noise.
         let psnr_ceiling = (is_noisy && self.config.truth).then(|| noise::psnr(&data, sensed));
         self.ready.push_back((
             exposure.arrival_nanos,
             Sample::Image(image(PixelFormat::Rgb8, data)),
         ));
+        // Then depth: from the view of a separate sensor if there is one, otherwise from the color
+        // view.
         let sensor_depth_m = match (&camera.depth_optics, exposure.depth_picture) {
             (Some(optics), Some(picture)) => Some(optics.depth_m(&picture.wait()?)),
             _ => None,
@@ -628,6 +663,7 @@ impl Engine {
             self.ready
                 .push_back((exposure.arrival_nanos, Sample::Image(image(format, data))));
         }
+        // Ground truth comes last. It has the pose at the stamp, without noise and motion.
         if self.config.truth {
             let depth_m = if self.config.truth_depth {
                 depth_m

@@ -41,13 +41,17 @@ pub(crate) struct Follower {
 /// Preferred posture: far from the joint limits, elbow up.
 const REST_POSTURE_RAD: [f64; N_JOINTS] =
     [0.0, -0.3, 0.0, -2.2, 0.0, 2.2, std::f64::consts::FRAC_PI_4];
-/// Margin to the joint limits, radians.
+/// Margin to the joint limits, radians. The controller overshoots its reference slightly, and must
+/// not reach the limits.
 const LIMIT_MARGIN_RAD: f64 = 0.05;
-/// Fraction of the maximum joint speeds that the scan uses.
+/// Fraction of the maximum joint speeds that the scan uses. The rest is left for the controller,
+/// which catches up with errors.
 const SPEED_LIMIT_FRAC: f64 = 0.5;
-/// Damping of the least squares, in meters and radians.
+/// Damping of the least squares, in meters and radians. Near singular postures, it bounds the joint
+/// velocities at the price of a pose error; a larger value tracks less precisely everywhere.
 const DAMPING: f64 = 0.03;
-/// Rate at which pose errors and posture errors decay, per second.
+/// Rate at which pose errors and posture errors decay, per second. The posture has the lower rate,
+/// because it must not disturb the tracking of the pose.
 const POSE_GAIN_HZ: f64 = 8.0;
 const REST_POSTURE_GAIN_HZ: f64 = 0.6;
 /// The joint velocity follows the desired velocity as a critically damped spring of this frequency,
@@ -61,6 +65,8 @@ const DYNAMICS_LIMIT_FRAC: f64 = 0.6;
 impl Follower {
     /// Starts at rest, at the scan's first pose.
     pub(crate) fn new(scan: Tour, flange_from_camera: Transform) -> Result<Self, Error> {
+        // Meters and radians together: the first pose must be reached closely, or the scan would
+        // begin with a jump.
         const TOLERANCE: f64 = 0.02;
         let mut follower = Self {
             scan,
@@ -70,6 +76,8 @@ impl Follower {
             acceleration_rad_s2: Joints::zeros(),
         };
         let target_pose = scan.arm_from_camera(0.0);
+        // Inverse kinematics by the same least squares as during the scan, so that both find the
+        // same posture: 30 s of motion in steps of 10 ms.
         for _ in 0..3000 {
             let step = follower.desired_velocity(&target_pose, &Vector6::zeros()) * 0.01;
             follower.position_rad = clamp_to_limits(follower.position_rad + step);
@@ -78,6 +86,7 @@ impl Follower {
         if pose_error(&target_pose, &base_from_camera).norm() > TOLERANCE {
             return Err(Error::Unreachable { at_secs: 0.0 });
         }
+        // On a copy, because the check moves the arm.
         follower.clone().warn_if_tour_is_unreachable();
         Ok(follower)
     }
@@ -88,7 +97,8 @@ impl Follower {
         const CHECKED_SECS: f64 = 30.0;
         const STEP_SECS: f64 = 0.005;
         const TOLERANCE_RAD: f64 = 0.35;
-        let (mut worst_rad, mut secs) = (0.0_f64, 0.0);
+        let mut worst_rad = 0.0_f64;
+        let mut secs = 0.0;
         while secs < CHECKED_SECS {
             secs += STEP_SECS;
             self.advance(secs, STEP_SECS);
@@ -117,6 +127,8 @@ impl Follower {
     pub(crate) fn advance(&mut self, secs: f64, step_secs: f64) {
         let target_pose = self.scan.arm_from_camera(secs);
         let before = self.scan.arm_from_camera(secs - step_secs);
+        // Feedforward: without it, the camera would lag behind the tour by its velocity divided by
+        // the gain.
         let target_twist = pose_error(&target_pose, &before) / step_secs;
         let desired_velocity = self.desired_velocity(&target_pose, &target_twist);
         for ix in 0..N_JOINTS {
@@ -124,11 +136,11 @@ impl Follower {
             let velocity_error =
                 desired_velocity[ix].clamp(allowed[0], allowed[1]) - self.velocity_rad_s[ix];
             let acceleration = self.acceleration_rad_s2[ix];
+            // A critically damped spring from the current to the desired velocity, whose frequency
+            // is `SMOOTHING_RAD_S`: jerk = w^2 * error - 2 * w * acceleration.
             let jerk = (velocity_error * SMOOTHING_RAD_S - 2.0 * acceleration) * SMOOTHING_RAD_S;
-            let (max_jerk, max_acceleration) = (
-                panda::MAX_JERK_RAD_S3[ix],
-                panda::MAX_ACCELERATION_RAD_S2[ix],
-            );
+            let max_jerk = panda::MAX_JERK_RAD_S3[ix];
+            let max_acceleration = panda::MAX_ACCELERATION_RAD_S2[ix];
             let acceleration = acceleration
                 + jerk.clamp(
                     -DYNAMICS_LIMIT_FRAC * max_jerk,
@@ -146,10 +158,8 @@ impl Follower {
     /// Minimum and maximum velocity of a joint. Close to a position limit, the velocity toward it
     /// is reduced.
     fn allowed_speed_rad_s(&self, ix: usize) -> [f64; 2] {
-        let (position, fastest) = (
-            self.position_rad[ix],
-            SPEED_LIMIT_FRAC * panda::MAX_SPEED_RAD_S[ix],
-        );
+        let position = self.position_rad[ix];
+        let fastest = SPEED_LIMIT_FRAC * panda::MAX_SPEED_RAD_S[ix];
         let to_lower = position - panda::LOWER_RAD[ix] - LIMIT_MARGIN_RAD;
         let to_upper = panda::UPPER_RAD[ix] - LIMIT_MARGIN_RAD - position;
         let towards = |distance: f64| (LIMIT_APPROACH_HZ * distance).clamp(0.0, fastest);
@@ -165,11 +175,14 @@ impl Follower {
         let rest_posture_velocity =
             (Joints::from(REST_POSTURE_RAD) - self.position_rad) * REST_POSTURE_GAIN_HZ;
         let inverse = damped_inverse(&jacobian);
+        // The posture velocity is applied in full, and the least squares correct what it does to
+        // the camera. Its projection to the null space remains.
         rest_posture_velocity + inverse * (twist - jacobian * rest_posture_velocity)
     }
 }
 
 fn damped_inverse(jacobian: &Jacobian) -> SMatrix<f64, N_JOINTS, 6> {
+    // Damped least squares: J^T (J J^T + d^2 I)^-1 (Wampler 1986; Nakamura and Hanafusa 1986).
     let square = jacobian * jacobian.transpose() + Matrix6::identity() * DAMPING.powi(2);
     let inverse = square
         .try_inverse()
@@ -192,11 +205,10 @@ fn pose_error(target_pose: &Transform, actual: &Transform) -> Vector6<f64> {
 }
 
 fn clamp_to_limits(position_rad: Joints) -> Joints {
-    let clamp = |ix: usize| {
+    Joints::from_fn(|ix, _| {
         position_rad[ix].clamp(
             panda::LOWER_RAD[ix] + LIMIT_MARGIN_RAD,
             panda::UPPER_RAD[ix] - LIMIT_MARGIN_RAD,
         )
-    };
-    Joints::from_fn(|ix, _| clamp(ix))
+    })
 }

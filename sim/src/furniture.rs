@@ -45,6 +45,7 @@ impl Furniture {
 
     /// The next random number.
     fn draw_uniform(&mut self, lower: f64, upper: f64) -> f64 {
+        // Numbers are drawn by index, so each draw needs its own.
         self.n_drawn += 1;
         self.random.between(self.n_drawn, lower, upper)
     }
@@ -64,7 +65,8 @@ impl Furniture {
         front: usize,
         top: usize,
     ) {
-        let (around, above) = (picture(front), picture(top));
+        let around = picture(front);
+        let above = picture(top);
         self.add_textured_box(
             world_from_box,
             half_m,
@@ -94,6 +96,7 @@ impl Furniture {
 
     /// A flat poster on a wall whose outward normal is the x axis of `world_from_wall`.
     pub(crate) fn poster(&mut self, world_from_wall: &Transform, half_m: [f64; 2], ix: usize) {
+        /// Distance from the wall that avoids z-fighting, meters.
         const LIFT_M: f64 = 0.012;
         let mut mesh = Mesh::default();
         let center = Point3::new(LIFT_M, 0.0, 0.0);
@@ -134,14 +137,14 @@ impl Furniture {
                 self.draw_uniform(0.07, 0.24),
             ];
             y += half[1];
+            // Items are placed from one end to the other until the next one does not fit.
             if y + half[1] > half_length {
                 break;
             }
             let front = self.draw_picture(&[0, 1, 7, 8, 9, 9, 11, 13, 14, 15]);
-            let (x, yaw) = (
-                self.draw_uniform(-0.15, 0.12),
-                self.draw_uniform(-14.0, 14.0),
-            );
+            // The order of the draws decides which numbers each item gets.
+            let x = self.draw_uniform(-0.15, 0.12);
+            let yaw = self.draw_uniform(-14.0, 14.0);
             let pose = at(x, y, top_m + 0.025 + half[2]) * upright([0.0; 3], yaw);
             self.add_item(&pose, half, front, 12);
             y += half[1] + self.draw_uniform(0.03, 0.16);
@@ -167,11 +170,14 @@ impl Furniture {
         for board in 0..5 {
             let z = 0.08 + 0.42 * f64::from(board);
             self.add_item(&at(0.0, 0.0, z), [half_depth, half_length, 0.013], 2, 2);
+            // The top board only closes the shelf.
             if board == 4 {
                 break;
             }
             let mut y = -half_length + 0.03;
             loop {
+                // The random numbers are drawn in this order, so another order would change the
+                // scene.
                 let half = [
                     self.draw_uniform(0.10, 0.19),
                     self.draw_uniform(0.08, 0.26),
@@ -198,11 +204,10 @@ impl Furniture {
                 self.draw_uniform(0.22, 0.36),
                 self.draw_uniform(0.14, 0.26),
             ];
-            let (x, y, yaw) = (
-                self.draw_uniform(-0.06, 0.06),
-                self.draw_uniform(-0.06, 0.06),
-                self.draw_uniform(-20.0, 20.0),
-            );
+            let x = self.draw_uniform(-0.06, 0.06);
+            let y = self.draw_uniform(-0.06, 0.06);
+            // A little crooked, like boxes that were stacked by hand.
+            let yaw = self.draw_uniform(-20.0, 20.0);
             let front = self.draw_picture(&[0, 1, 2, 3, 10, 11]);
             let pose = world_from_boxes * upright([x, y, z + half[2]], yaw);
             self.add_item(&pose, half, front, front);
@@ -213,6 +218,8 @@ impl Furniture {
     /// Adds all larger boxes as occluders. Shadows of small items on shelves would not be visible
     /// on the floor.
     pub(crate) fn add_occluders(&self, occluders: &mut Occluders) {
+        /// Half the side from which a box counts as large, meters. More boxes make the shadows
+        /// slower to compute.
         const MIN_HALF_M: f64 = 0.22;
         let large = |half_m: &[f64; 3]| half_m.iter().any(|half_m| *half_m >= MIN_HALF_M);
         for (world_from_box, half_m) in self.solids.iter().filter(|(_, half_m)| large(half_m)) {

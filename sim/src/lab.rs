@@ -102,12 +102,6 @@ fn world_from_pedestal() -> Transform {
 
 /// All objects except the robot.
 pub(crate) fn objects() -> Vec<Object> {
-    let object = |name, material, mesh| Object {
-        name,
-        material,
-        mesh,
-        world_from_mesh: Transform::identity(),
-    };
     let Furniture {
         things,
         posters,
@@ -128,20 +122,20 @@ pub(crate) fn objects() -> Vec<Object> {
         &plinth_pose,
     );
     let mut objects = vec![
-        object("things", "items", things),
-        object("posters", "posters", posters),
-        object("frames", "frame", frames),
-        object("pedestal", "wood", pedestal),
-        object("plinth", "wood", plinth),
-        object("walls", "painted", walls()),
-        object("floor", "tiles", floor()),
-        object("ceiling", "ceiling", ceiling()),
-        object("tubes", "tube", tubes()),
-        object("bowl", "glass", bowl()),
+        Object::in_world("things", "items", things),
+        Object::in_world("posters", "posters", posters),
+        Object::in_world("frames", "frame", frames),
+        Object::in_world("pedestal", "wood", pedestal),
+        Object::in_world("plinth", "wood", plinth),
+        Object::in_world("walls", "painted", walls()),
+        Object::in_world("floor", "tiles", floor()),
+        Object::in_world("ceiling", "ceiling", ceiling()),
+        Object::in_world("tubes", "tube", tubes()),
+        Object::in_world("bowl", "glass", bowl()),
     ];
     let fruits = ["orange", "apple", "lime"];
     for (material, mesh) in fruits.into_iter().zip(fruit()) {
-        objects.push(object(material, material, mesh));
+        objects.push(Object::in_world(material, material, mesh));
     }
     objects
 }
@@ -166,6 +160,7 @@ fn bowl() -> Mesh {
         [0.001, 0.022],
     ];
     let mut mesh = Mesh::default();
+    // Two surfaces, because normals must not be smoothed across the rim.
     for part in [&outer[..], &inner[..]] {
         mesh.append(
             Mesh::lathe(part, 48, WHOLE, true),
@@ -177,27 +172,29 @@ fn bowl() -> Mesh {
 
 /// Fruit in the bowl, one mesh per color.
 fn fruit() -> [Mesh; 3] {
-    let ball = |spheres: &[[f64; 4]]| {
-        let mut mesh = Mesh::default();
-        for [x, y, z, radius] in spheres {
-            let axes = [
-                Vector3::x() * *radius,
-                Vector3::y() * *radius,
-                Vector3::z() * (0.93 * radius),
-            ];
-            mesh.add_ellipsoid(Point3::new(*x, *y, TOP_M + z), axes, 12, |_, _| 0.5, 0.5);
-        }
-        mesh
-    };
     [
-        ball(&[
+        balls(&[
             [0.055, 0.01, 0.075, 0.042],
             [-0.045, 0.045, 0.075, 0.04],
             [0.0, 0.0, 0.14, 0.041],
         ]),
-        ball(&[[-0.02, -0.06, 0.08, 0.044], [0.07, 0.065, 0.115, 0.04]]),
-        ball(&[[-0.085, -0.02, 0.105, 0.033], [0.06, -0.065, 0.12, 0.032]]),
+        balls(&[[-0.02, -0.06, 0.08, 0.044], [0.07, 0.065, 0.115, 0.04]]),
+        balls(&[[-0.085, -0.02, 0.105, 0.033], [0.06, -0.065, 0.12, 0.032]]),
     ]
+}
+
+/// Slightly flattened spheres, each given by its center above the pedestal and its radius.
+fn balls(spheres: &[[f64; 4]]) -> Mesh {
+    let mut mesh = Mesh::default();
+    for [x, y, z, radius] in spheres {
+        let axes = [
+            Vector3::x() * *radius,
+            Vector3::y() * *radius,
+            Vector3::z() * (0.93 * radius),
+        ];
+        mesh.add_ellipsoid(Point3::new(*x, *y, TOP_M + z), axes, 12, |_, _| 0.5, 0.5);
+    }
+    mesh
 }
 
 fn walls() -> Mesh {
@@ -205,10 +202,8 @@ fn walls() -> Mesh {
     for wall in 0..4 {
         let half_width = ROOM_HALF_M[usize::from(wall < 2)];
         let mut flat = Mesh::default();
-        let (right, up) = (
-            Vector3::y() * half_width,
-            Vector3::z() * (0.5 * ROOM_HEIGHT_M),
-        );
+        let right = Vector3::y() * half_width;
+        let up = Vector3::z() * (0.5 * ROOM_HEIGHT_M);
         let texture = [0.0, 0.0, 2.0 * half_width / ROOM_HEIGHT_M, 1.0];
         flat.rectangle(
             Point3::new(0.0, 0.0, 0.5 * ROOM_HEIGHT_M),

@@ -17,17 +17,16 @@ pub(crate) fn picture(ix: usize) -> TextureRect {
     /// Keeps mip levels from mixing neighboring pictures.
     const INSET: f64 = 0.004;
     let side = 1.0 / N_ACROSS as f64;
-    let (x, y) = (
-        (ix % N_ACROSS) as f64 * side,
-        (ix / N_ACROSS % N_ACROSS) as f64 * side,
-    );
+    let x = (ix % N_ACROSS) as f64 * side;
+    let y = (ix / N_ACROSS % N_ACROSS) as f64 * side;
     [x + INSET, y + INSET, x + side - INSET, y + side - INSET]
 }
 
 /// Paints a sheet. `paint` receives the picture's index and the position in it.
 fn sheet(paint: impl Fn(usize, f64, f64) -> Color + Sync) -> Texture {
     Texture::paint(3 * SIDE_PX / 2, |x, y| {
-        let (across, down) = (x * N_ACROSS as f64, y * N_ACROSS as f64);
+        let across = x * N_ACROSS as f64;
+        let down = y * N_ACROSS as f64;
         paint(
             down as usize * N_ACROSS + across as usize,
             across.fract(),
@@ -130,6 +129,7 @@ fn curves(own: f64, u: f64, v: f64) -> Color {
             0.5 - 0.36 * (-(2.0 + k) * u).exp() * ((9.0 + 4.0 * k) * (u + own)).cos() - 0.05 * k;
         ((v - y).abs(), hue(0.27 * k + own, 0.05, 0.85))
     });
+    // Of curves that overlap, the first one is on top.
     near.filter(|(distance, _)| *distance < 0.013)
         .map(|(_, color)| color)
         .next()
@@ -145,12 +145,12 @@ fn rings(own: f64, u: f64, v: f64) -> Color {
 }
 
 fn letters(each: RandomStream, u: f64, v: f64) -> Color {
-    let (column, row) = ((u * 12.0).floor(), (v * 9.0).floor());
+    let column = (u * 12.0).floor();
+    let row = (v * 9.0).floor();
     let cell = (row * 12.0 + column) as u64;
-    let (x, y) = (
-        ((u * 12.0).fract() * 5.0) as u64,
-        ((v * 9.0).fract() * 6.0) as u64,
-    );
+    let x = ((u * 12.0).fract() * 5.0) as u64;
+    let y = ((v * 9.0).fract() * 6.0) as u64;
+    // A character is a random bitmap of 4 x 5 bits; the last column and row of its cell stay free.
     let on = x < 4 && y < 5 && each.bits(900 + cell) >> (y * 4 + x) & 1 == 1;
     let paper = hue((cell % 7) as f64 / 7.0, 0.62, 0.95);
     if on { [0.08, 0.08, 0.12] } else { paper }
@@ -158,6 +158,7 @@ fn letters(each: RandomStream, u: f64, v: f64) -> Color {
 
 fn spots(each: RandomStream, ix: u64, u: f64, v: f64) -> Color {
     let ground = hue(each.unit(50 + ix), 0.25, 0.8);
+    // From the last spot to the first, so that later spots cover earlier ones.
     let top = (0..14).rev().find(|spot| {
         let at = |counter: u64| each.unit(ix * 100 + spot * 4 + counter);
         (u - at(0)).hypot(v - at(1)) < 0.04 + 0.13 * at(2)
@@ -172,6 +173,7 @@ pub(crate) fn items() -> Texture {
     let noise = Noise::new(111);
     let each = RandomStream::new(0x7e37, &[112]);
     sheet(|ix, u, v| {
+        // The offset gives each picture another part of the noise.
         let grain = 0.86 + 0.2 * noise.rough(u * 30.0 + ix as f64 * 40.0, v * 30.0, 3);
         let worn = 0.75 + 0.4 * noise.rough(u * 3.0 + ix as f64 * 11.0, v * 3.0, 4);
         let color = match ix {
@@ -197,6 +199,7 @@ fn carton(each: RandomStream, ix: u64, u: f64, v: f64) -> Color {
     let board = [0.74, 0.57, 0.38];
     let tape = (v - 0.5).abs() < 0.06;
     let label = (0.55..0.9).contains(&u) && (0.12..0.36).contains(&v);
+    // Random bits look like a bar code.
     let bars = each.bits(30 + ix) >> ((u * 120.0) as u64 % 48) & 1 == 1 && v > 0.22;
     match (label, tape) {
         (true, _) => {
@@ -238,11 +241,13 @@ fn slats(noise: &Noise, ix: usize, u: f64, v: f64) -> Color {
 fn books(each: RandomStream, ix: u64, u: f64, v: f64) -> Color {
     let mut left = 0.0;
     for book in 0..24 {
+        // Widths are random, so those of the books to the left have to be added up.
         let at = |counter: u64| each.unit(ix * 1000 + book * 8 + counter);
         let width = 0.035 + 0.055 * at(0);
         if u < left + width {
             let inside = (u - left) / width;
             let top = 0.04 + 0.22 * at(1);
+            // The dark shelf shows above a book and at its sides.
             if v < top || !(0.05..0.95).contains(&inside) {
                 return [0.05, 0.04, 0.04];
             }
@@ -275,7 +280,8 @@ fn instrument(each: RandomStream, ix: u64, u: f64, v: f64) -> Color {
             [0.03, 0.12, 0.08]
         };
     }
-    let (x, y) = ((u - 0.56) * 10.0, (v - 0.12) * 7.0);
+    let x = (u - 0.56) * 10.0;
+    let y = (v - 0.12) * 7.0;
     if u > 0.56 && u < 0.96 && v > 0.12 && v < 0.97 {
         let knob = (x.fract() - 0.5).hypot(y.fract() - 0.5);
         let cell = (x.floor() + 10.0 * y.floor()) as u64;
@@ -320,7 +326,8 @@ fn warning(u: f64, v: f64) -> Color {
 }
 
 fn drawers(u: f64, v: f64) -> Color {
-    let (x, y) = ((u * 3.0).fract(), (v * 5.0).fract());
+    let x = (u * 3.0).fract();
+    let y = (v * 5.0).fract();
     let gap = (x - 0.5).abs().max((y - 0.5).abs()) > 0.47;
     let label = (x - 0.5).abs() < 0.2 && (y - 0.35).abs() < 0.12;
     let handle = (x - 0.5).abs() < 0.14 && (y - 0.72).abs() < 0.07;
@@ -353,14 +360,19 @@ fn tin(each: RandomStream, ix: u64, u: f64, v: f64) -> Color {
 /// Worn floor tiles with a marked lane around the middle. Covers a whole room of `size_m` with
 /// tiles of 0.5 m.
 pub(crate) fn floor_tiles(size_m: [f64; 2], lane_m: f64) -> Texture {
-    let (rough, blotch) = (Noise::new(121), Noise::new(122));
+    let rough = Noise::new(121);
+    let blotch = Noise::new(122);
     let each = RandomStream::new(0x7e37, &[123]);
     Texture::paint(2 * SIDE_PX, |u, v| {
-        let (x, y) = ((u - 0.5) * size_m[0], (v - 0.5) * size_m[1]);
-        let (column, row) = ((x * 2.0).floor(), (y * 2.0).floor());
+        // In meters, so that tiles are square in a room of any shape.
+        let x = (u - 0.5) * size_m[0];
+        let y = (v - 0.5) * size_m[1];
+        let column = (x * 2.0).floor();
+        let row = (y * 2.0).floor();
         let joint = ((x * 2.0).fract().abs() - 0.5)
             .abs()
             .max(((y * 2.0).fract().abs() - 0.5).abs());
+        // The offsets make the indices positive, because the origin is in the middle of the floor.
         let own = each.unit((column + 64.0) as u64 * 128 + (row + 64.0) as u64);
         let tile = mix(
             [0.15, 0.17, 0.20],
@@ -387,7 +399,8 @@ pub(crate) fn floor_tiles(size_m: [f64; 2], lane_m: f64) -> Texture {
 
 /// A repeating texture of a painted wall, 3 m high and wide: a green dado, a rail, plaster above.
 pub(crate) fn painted_wall() -> Texture {
-    let (rough, stain) = (Noise::new(131), Noise::new(132));
+    let rough = Noise::new(131);
+    let stain = Noise::new(132);
     Texture::paint(SIDE_PX, |u, v| {
         // The noise must match at the edges where the texture repeats.
         let grain = 0.75 + 0.4 * rough.rough((u * 2.0 - 1.0).abs() * 40.0, v * 80.0, 4);
@@ -416,7 +429,8 @@ pub(crate) fn painted_wall() -> Texture {
 
 /// Scratched yellow enamel with screws along its edge, for the sides of a cabinet.
 pub(crate) fn enamel() -> Texture {
-    let (rough, scratch) = (Noise::new(141), Noise::new(142));
+    let rough = Noise::new(141);
+    let scratch = Noise::new(142);
     Texture::paint(SIDE_PX, |u, v| {
         let edge = u.min(1.0 - u).min(v.min(1.0 - v));
         let worn = step(
@@ -444,14 +458,17 @@ pub(crate) fn enamel() -> Texture {
 
 /// A galvanized mounting plate with rows of slots.
 pub(crate) fn mounting_plate() -> Texture {
-    let (spangle, rough) = (Noise::new(151), Noise::new(152));
+    let spangle = Noise::new(151);
+    let rough = Noise::new(152);
     Texture::paint(SIDE_PX, |u, v| {
+        // Few levels, because the crystals of a zinc coating have sharp borders.
         let crystals = (spangle.rough(u * 26.0, v * 26.0, 2) * 9.0).floor() / 9.0;
         let plate = scale(
             mix([0.42, 0.45, 0.49], [0.80, 0.82, 0.84], crystals),
             0.8 + 0.3 * rough.rough(u * 70.0, v * 70.0, 2),
         );
-        let (x, y) = ((u * 24.0).fract() - 0.5, (v * 16.0).fract() - 0.5);
+        let x = (u * 24.0).fract() - 0.5;
+        let y = (v * 16.0).fract() - 0.5;
         if x.abs() < 0.3 && y.abs() < 0.13 {
             [0.06, 0.06, 0.07]
         } else {

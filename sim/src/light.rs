@@ -39,11 +39,16 @@ const FILLS: [Lamp; 2] = [
 /// Ambient light, sRGB 0 to 1.
 const AMBIENT: [f64; 3] = [0.37, 0.37, 0.39];
 
-/// Tangent of half the angle that the key lamp covers.
+/// Tangent of half the angle that the key lamp covers. A larger lamp gives softer shadows, which need
+/// more rays.
 const KEY_SIZE: f64 = 0.06;
-/// Number of rays to the key lamp and of ambient rays.
+/// Number of rays to the key lamp and of ambient rays. Fewer rays give visible noise, which
+/// [`Texture::shade`](crate::texture::Texture::shade) blurs; more take longer when a scene is built.
 const N_KEY_RAYS: u64 = 12;
 const N_AMBIENT_RAYS: u64 = 20;
+
+/// The golden angle, radians: points at its multiples on a spiral never line up.
+const GOLDEN_ANGLE_RAD: f64 = 2.399_963;
 
 impl Lamp {
     fn to_lamp(&self) -> Vector3<f64> {
@@ -133,17 +138,18 @@ impl Occluders {
         direction: &Vector3<f64>,
         max_distance_m: f64,
     ) -> bool {
-        let hits_box = |(box_from_world, half_m): &(Transform, Vector3<f64>)| {
+        let is_behind_box = self.boxes.iter().any(|(box_from_world, half_m)| {
             hits_box(
                 &(box_from_world * from).coords,
                 &(box_from_world * direction),
                 half_m,
                 max_distance_m,
             )
-        };
-        if self.boxes.iter().any(hits_box) {
+        });
+        if is_behind_box {
             return true;
         }
+        // Most rays miss the sphere around all ellipsoids, which saves testing each of them.
         let (center, radius_m) = self.bounds;
         hits_sphere(
             &((from - center) / radius_m),
@@ -163,6 +169,7 @@ impl Occluders {
     ///
     /// `name` identifies the point and selects its random rays.
     pub(crate) fn light_frac(&self, point: &Point3<f64>, normal: &Vector3<f64>, name: u64) -> f64 {
+        /// Rays start this far above the surface, so that rounding does not let them hit it, meters.
         const LIFT_M: f64 = 5e-4;
         let random = RandomStream::new(0x11_6874, &[name]);
         let from = point + normal * LIFT_M;
@@ -178,6 +185,8 @@ impl Occluders {
             0.0
         };
         let other_frac = self.ambient_frac(&from, normal, random);
+        // OpenGL draws the unoccluded light, so the texture gets the ratio of the light that
+        // arrives.
         (key * key_frac + others * other_frac) / (key + others)
     }
 
@@ -188,8 +197,9 @@ impl Occluders {
         let n_free = (0..N_KEY_RAYS).filter(|ray| {
             // Spread evenly over the lamp's disc, with a random rotation (Vogel 1979).
             let radius = KEY_SIZE * ((*ray as f64 + 0.5) / N_KEY_RAYS as f64).sqrt();
-            let (sin, cos) =
-                (*ray as f64 * 2.399_963 + random.between(0, 0.0, std::f64::consts::TAU)).sin_cos();
+            let (sin, cos) = (*ray as f64 * GOLDEN_ANGLE_RAD
+                + random.between(0, 0.0, std::f64::consts::TAU))
+            .sin_cos();
             let direction = (to_lamp + side * (radius * cos) + across * (radius * sin)).normalize();
             !self.is_occluded(from, &direction, 10.0)
         });
@@ -197,6 +207,7 @@ impl Occluders {
     }
 
     fn ambient_frac(&self, from: &Point3<f64>, normal: &Vector3<f64>, random: RandomStream) -> f64 {
+        // An axis that is not parallel to the normal, or the cross product would vanish.
         let side = if normal.x.abs() < 0.7 {
             normal.cross(&Vector3::x())
         } else {
@@ -205,10 +216,13 @@ impl Occluders {
         .normalize();
         let across = normal.cross(&side);
         let n_free = (0..N_AMBIENT_RAYS).filter(|ray| {
+            // Malley's method: points spread evenly over a disc, projected up to the hemisphere.
+            // Each ray then carries the same light.
             // Cosine-weighted directions around the normal.
             let square = (*ray as f64 + random.unit(2 + ray)) / N_AMBIENT_RAYS as f64;
-            let (sin, cos) =
-                (*ray as f64 * 2.399_963 + random.between(1, 0.0, std::f64::consts::TAU)).sin_cos();
+            let (sin, cos) = (*ray as f64 * GOLDEN_ANGLE_RAD
+                + random.between(1, 0.0, std::f64::consts::TAU))
+            .sin_cos();
             let direction =
                 normal * (1.0 - square).sqrt() + (side * cos + across * sin) * square.sqrt();
             !self.is_occluded(from, &direction, self.ambient_reach_m)
@@ -219,11 +233,10 @@ impl Occluders {
 
 /// Whether a ray hits the unit sphere before `reach`, or starts inside the sphere.
 fn hits_sphere(from: &Vector3<f64>, direction: &Vector3<f64>, reach: f64) -> bool {
-    let (a, b, c) = (
-        direction.norm_squared(),
-        from.dot(direction),
-        from.norm_squared() - 1.0,
-    );
+    // The quadratic a t^2 + 2 b t + c = 0 of the distances at which the ray meets the sphere.
+    let a = direction.norm_squared();
+    let b = from.dot(direction);
+    let c = from.norm_squared() - 1.0;
     let inside = b * b - a * c;
     if inside < 0.0 {
         return false;
@@ -240,13 +253,14 @@ fn hits_box(
     half_m: &Vector3<f64>,
     reach: f64,
 ) -> bool {
-    let (mut enter, mut leave) = (0.0_f64, reach);
+    // Slabs (Kay and Kajiya 1986): the ray is in the box while it is between all three pairs of
+    // planes. A component of 0 gives infinities, which `min` and `max` handle.
+    let mut enter = 0.0_f64;
+    let mut leave = reach;
     for axis in 0..3 {
         let inverse = 1.0 / direction[axis];
-        let (a, b) = (
-            (-half_m[axis] - from[axis]) * inverse,
-            (half_m[axis] - from[axis]) * inverse,
-        );
+        let a = (-half_m[axis] - from[axis]) * inverse;
+        let b = (half_m[axis] - from[axis]) * inverse;
         enter = enter.max(a.min(b));
         leave = leave.min(a.max(b));
     }

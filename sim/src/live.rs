@@ -21,7 +21,8 @@ const MAX_READINGS: usize = 1000;
 const MAX_SCANS: usize = 20;
 /// Queue length for the ground-truth images of a camera, which are large.
 const MAX_TRUTH_IMAGES: usize = 8;
-/// Delay beyond which the simulation skips images.
+/// Delay beyond which the simulation skips images. A smaller value skips images after short pauses
+/// of the computer; with a larger one, samples arrive later than those of a real device.
 const MAX_LATE: Duration = Duration::from_millis(50);
 
 /// Simulated devices that deliver in real time.
@@ -59,6 +60,7 @@ struct SimulationThread {
 
 impl Drop for SimulationThread {
     fn drop(&mut self) {
+        // The thread checks the flag after each sample, so it ends soon.
         self.shared.state.lock().stop = true;
         if let Some(thread) = self.thread.take() {
             // The panic hook has already reported a panic of the thread.
@@ -126,12 +128,11 @@ impl LiveRig {
             thread: Some(thread.map_err(Error::Thread)?),
         });
         let cameras = info.cameras.iter().enumerate().map(|(camera_ix, camera)| {
-            let (name, intrinsics) = (camera.name.clone(), camera.intrinsics.clone());
             Box::new(LiveCamera {
                 simulation: Arc::clone(&simulation),
                 camera_ix,
-                name,
-                intrinsics,
+                name: camera.name.clone(),
+                intrinsics: camera.intrinsics.clone(),
             }) as Box<dyn Camera>
         });
         let arm = LiveArm {
@@ -146,11 +147,10 @@ impl LiveRig {
             .iter()
             .enumerate()
             .map(|(scanner_ix, name)| {
-                let (simulation, name) = (Arc::clone(&simulation), name.clone());
                 Box::new(LiveScanner {
-                    simulation,
+                    simulation: Arc::clone(&simulation),
                     scanner_ix,
-                    name,
+                    name: name.clone(),
                 }) as Box<dyn RangeScanner>
             });
         Ok(Self {
@@ -179,6 +179,8 @@ fn run_simulation(mut engine: Engine, shared: &SharedQueues, names: &DeviceNames
     engine.set_start(start);
     let started = Instant::now();
     let end = loop {
+        // If rendering is slower than real time, images are skipped, so that joint readings stay on
+        // time. Delays then do not add up.
         let skip_until = started.elapsed().saturating_sub(MAX_LATE);
         engine.skip_before(i64::try_from(skip_until.as_nanos()).unwrap_or(i64::MAX));
         match engine.next() {
@@ -192,6 +194,7 @@ fn run_simulation(mut engine: Engine, shared: &SharedQueues, names: &DeviceNames
             Err(error) => break error.to_string(),
         }
     };
+    // Set under the lock, so that a device that is about to wait cannot miss it.
     shared.state.lock().end = Some(end);
     shared.arrived.notify_all();
 }
@@ -234,6 +237,8 @@ impl SharedQueues {
             ),
             pose @ Sample::BaseTruth(_) => push_bounded(&mut state.truth_poses, MAX_READINGS, pose),
         }
+        // The lock is released before waiting devices are woken; they would otherwise block on it
+        // at once.
         let is_running = !state.stop;
         drop(state);
         self.arrived.notify_all();
@@ -251,6 +256,7 @@ impl SharedQueues {
         let until = Instant::now() + timeout;
         let mut state = self.state.lock();
         loop {
+            // Queued samples are delivered even after the end.
             if let Some(sample) = take(&mut state) {
                 return Ok(sample);
             }
@@ -279,6 +285,8 @@ impl QueueState {
         if queue.len() <= MAX_IMAGES {
             return;
         }
+        // The newest images are kept, as the drivers of real cameras do. The loss is reported by
+        // the next image of the same kind, because each kind has its own sequence.
         let Some(oldest) = queue.pop_front() else {
             return;
         };

@@ -62,19 +62,19 @@ impl Mesh {
     ) {
         let normal = half_right.cross(&half_up).normalize();
         let [left, top, right, bottom] = texture;
-        let mut corner = |across: f64, up: f64, texcoord| {
+        let corners = [
+            (-1.0, -1.0, [left, bottom]),
+            (1.0, -1.0, [right, bottom]),
+            (1.0, 1.0, [right, top]),
+            (-1.0, 1.0, [left, top]),
+        ];
+        let [a, b, c, d] = corners.map(|(across, up, texcoord)| {
             self.push(Corner {
                 point_m: center + half_right * across + half_up * up,
                 normal,
                 texcoord,
             })
-        };
-        let [a, b, c, d] = [
-            corner(-1.0, -1.0, [left, bottom]),
-            corner(1.0, -1.0, [right, bottom]),
-            corner(1.0, 1.0, [right, top]),
-            corner(-1.0, 1.0, [left, top]),
-        ];
+        });
         self.triangle([a, b, c]);
         self.triangle([a, c, d]);
     }
@@ -83,13 +83,8 @@ impl Mesh {
     pub(crate) fn cuboid(half_m: [f64; 3], textures: &[TextureRect; 6]) -> Self {
         let mut mesh = Self::default();
         for ((outward, right, up), texture) in BOX_FACES.iter().zip(textures) {
-            let scale = |axis: &[f64; 3]| {
-                Vector3::new(
-                    axis[0] * half_m[0],
-                    axis[1] * half_m[1],
-                    axis[2] * half_m[2],
-                )
-            };
+            let scale =
+                |axis: &[f64; 3]| Vector3::from(*axis).component_mul(&Vector3::from(half_m));
             mesh.rectangle(
                 Point3::from(scale(outward)),
                 scale(right),
@@ -113,6 +108,8 @@ impl Mesh {
         let n_sectors = 2 * n_rings;
         let first = i32::try_from(self.points_m.len()).expect("meshes stay small");
         for ring in 0..=n_rings {
+            // The first and the last column have the same points but different texture coordinates,
+            // so both are needed.
             for sector in 0..=n_sectors {
                 let down = f64::from(ring) / f64::from(n_rings);
                 let around = f64::from(sector) / f64::from(n_sectors);
@@ -190,6 +187,7 @@ impl Mesh {
             *point = (self_from_other.cast::<f32>() * Point3::from(*point))
                 .coords
                 .into();
+            // A rigid motion rotates normals; for a scaling, they would need the inverse transpose.
             *normal = (self_from_other.cast::<f32>() * Vector3::from(*normal)).into();
         }
         self.append(other, Vector3::zeros());
@@ -209,22 +207,7 @@ impl Mesh {
         let mut mesh = Self::default();
         let [left, top, right, bottom] = texture;
         let n_pieces = profile_m.len() - 1;
-        let slope = |piece: usize| {
-            let [a, b] = [profile_m[piece], profile_m[piece + 1]];
-            // The normal of this piece of the profile.
-            Vector3::new(b[1] - a[1], 0.0, a[0] - b[0]).normalize()
-        };
-        let bend = |piece: usize, end: usize| {
-            let other = (piece + end)
-                .checked_sub(1)
-                .filter(|other| *other < n_pieces && is_smooth);
-            let neighbor = if end == 0 {
-                other
-            } else {
-                Some(piece + 1).filter(|next| *next < n_pieces && is_smooth)
-            };
-            (slope(piece) + neighbor.map_or_else(Vector3::zeros, slope)).normalize()
-        };
+        // Pieces do not share vertices, because sharp edges need two normals at the same point.
         for piece in 0..n_pieces {
             let mut before: Option<[i32; 2]> = None;
             for sector in 0..=n_sectors {
@@ -236,7 +219,7 @@ impl Mesh {
                     let down = (piece + end) as f64 / n_pieces as f64;
                     mesh.push(Corner {
                         point_m: Point3::new(radius * cos, radius * sin, z),
-                        normal: turned(bend(piece, end)),
+                        normal: turned(profile_normal(profile_m, piece, end, is_smooth)),
                         texcoord: [left + (right - left) * share, top + (bottom - top) * down],
                     })
                 });
@@ -273,6 +256,32 @@ impl Mesh {
         }
         bytes
     }
+}
+
+/// Outward normal of a piece of a profile, in the plane y = 0.
+fn piece_normal(profile_m: &[[f64; 2]], piece: usize) -> Vector3<f64> {
+    let [a, b] = [profile_m[piece], profile_m[piece + 1]];
+    Vector3::new(b[1] - a[1], 0.0, a[0] - b[0]).normalize()
+}
+
+/// Normal at an end of a piece: 0 is its start, 1 its end. With `is_smooth`, it is the mean of the
+/// two pieces that meet there.
+fn profile_normal(
+    profile_m: &[[f64; 2]],
+    piece: usize,
+    end: usize,
+    is_smooth: bool,
+) -> Vector3<f64> {
+    let n_pieces = profile_m.len() - 1;
+    let neighbor = if end == 0 {
+        piece.checked_sub(1)
+    } else {
+        Some(piece + 1)
+    };
+    let neighbor = neighbor.filter(|neighbor| *neighbor < n_pieces && is_smooth);
+    let neighbor_normal =
+        neighbor.map_or_else(Vector3::zeros, |neighbor| piece_normal(profile_m, neighbor));
+    (piece_normal(profile_m, piece) + neighbor_normal).normalize()
 }
 
 /// Outward, right and up directions of a box's faces in the order +x, -x, +y, -y, +z, -z; sides are

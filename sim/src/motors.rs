@@ -10,7 +10,8 @@ use std::time::Duration;
 const MAX_GAP: Duration = Duration::from_secs(1);
 /// Number of states kept: those of ten seconds at 1 kHz.
 const MAX_STATES: usize = 10_000;
-/// Maximum time to wait for a state. After it, the motors count as stopped.
+/// Maximum time to wait for a state. After it, the motors count as stopped. A state comes every
+/// millisecond, so only a stopped emulator is silent for so long.
 const MAX_WAIT: Duration = Duration::from_secs(2);
 
 /// Recent positions of emulated motors, in the order of the joint readings. Clones share them.
@@ -43,6 +44,8 @@ impl MotorHistory {
     /// Waits until the positions at a stamp are known. Returns false if the motors have stopped.
     fn wait_until(&self, stamp: Stamp) -> bool {
         let mut history = self.0.history.lock();
+        // The time limit starts again with each state, so motors that lag behind are waited for,
+        // and only motors that send nothing count as stopped.
         while history.newest().is_none_or(|newest| newest < stamp) {
             if self.0.arrived.wait_for(&mut history, MAX_WAIT).timed_out() {
                 return false;

@@ -26,7 +26,10 @@ pub(crate) fn add_color_noise(
     sensor: &SensorConfig,
     random: RandomStream,
 ) -> Vec<u8> {
+    /// Pixels that one task processes: few enough for many tasks, and many enough that starting one
+    /// costs little.
     const PIXELS_A_CHUNK: usize = 640;
+    // A table of 256 square roots instead of one square root per channel.
     let sigma: [f32; 256] = std::array::from_fn(|level| noise_sigma(sensor, level as f64) as f32);
     let mut bytes = vec![0; colors.len()];
     bytes
@@ -39,6 +42,8 @@ pub(crate) fn add_color_noise(
                 .zip(colors.chunks_exact(3))
                 .enumerate()
             {
+                // The counter is the index of the pixel, so that the noise does not depend on the
+                // division into tasks.
                 let normals = random.normals((chunk * PIXELS_A_CHUNK + ix) as u64);
                 for channel in 0..3 {
                     let level = usize::from(to_byte(colors[channel]));
@@ -53,6 +58,8 @@ pub(crate) fn add_color_noise(
 pub(crate) fn noise_sigma(sensor: &SensorConfig, level: f64) -> f64 {
     const MID_GRAY: f64 = 128.0;
     sensor.noise_sigma
+        // The variance of shot noise is proportional to the brightness; that of read noise is
+        // constant.
         * (1.0 - sensor.shot_frac + sensor.shot_frac * level / MID_GRAY)
             .max(0.0)
             .sqrt()
@@ -60,6 +67,7 @@ pub(crate) fn noise_sigma(sensor: &SensorConfig, level: f64) -> f64 {
 
 /// PSNR in dB of bytes against colors rounded to bytes; infinite if they are equal.
 pub(crate) fn psnr(bytes: &[u8], colors: &[f32]) -> f64 {
+    // A chunk's sum of squares fits u32: 4096 * 255^2 < 2^32.
     const SAMPLES_A_CHUNK: usize = 4096;
     // Chunks, so that the innermost loop runs over slices.
     let squares = bytes
@@ -109,6 +117,8 @@ pub(crate) fn depth_counts(
         if in_range(meters) && !holes.contains(ix) {
             let normal = f64::from(random.normals(ix as u64)[0]);
             let meters = f64::from(meters);
+            // The depth of a stereo camera is inversely proportional to the disparity, so a
+            // constant disparity error gives a depth error that grows with the square of the depth.
             *count = to_count(meters + depth.noise_sigma_m * meters * meters * normal);
         }
     });
@@ -125,7 +135,8 @@ struct Holes {
     cluster_share: f64,
 }
 
-/// Maximum fraction of edge pixels that become holes.
+/// Maximum fraction of edge pixels that become holes. With 1, every depth edge would be missing, which
+/// real cameras do not show either.
 const MAX_EDGE_SHARE: f64 = 0.6;
 /// Side of a cluster of holes, pixels.
 const CLUSTER_PX: usize = 4;
@@ -141,6 +152,8 @@ impl Holes {
             .for_each(|(is_edge, depth_m)| mark_edges(is_edge, depth_m));
         let n_edge = is_edge.iter().filter(|is_edge| **is_edge).count() as f64;
         let n_holes_target = hole_frac * depth_m.len() as f64;
+        // Seven of ten holes are at depth edges, as long as there are enough edges. The rest is
+        // spread over the other pixels.
         let edge_share = (0.7 * n_holes_target / n_edge.max(1.0)).min(MAX_EDGE_SHARE);
         let n_rest = depth_m.len() as f64 - n_edge;
         let cluster_share =
@@ -158,7 +171,9 @@ impl Holes {
         if self.is_edge[ix] {
             return self.random.unit(HOLE_COUNTERS + ix as u64) < self.edge_share;
         }
-        let (row, column) = (ix / self.width, ix % self.width);
+        // All pixels of a cluster share a random number.
+        let row = ix / self.width;
+        let column = ix % self.width;
         let cluster = (row / CLUSTER_PX * self.width + column / CLUSTER_PX) as u64;
         self.random.unit(2 * HOLE_COUNTERS + cluster) < self.cluster_share
     }
@@ -168,9 +183,13 @@ impl Holes {
 /// only one of the two imagers.
 fn mark_edges(is_edge: &mut [bool], depth_m: &[f32]) {
     const EDGE_RADIUS_PX: usize = 2;
+    /// Depth difference that counts as an edge, as a fraction of the depth. Moderately slanted
+    /// surfaces stay below it.
     const JUMP_FRAC: f32 = 0.03;
+    // Pixels near the ends of a row have no complete window and stay unmarked.
     for (column, window) in depth_m.windows(2 * EDGE_RADIUS_PX + 1).enumerate() {
-        let (a, b) = (window[0], window[2 * EDGE_RADIUS_PX]);
+        let a = window[0];
+        let b = window[2 * EDGE_RADIUS_PX];
         is_edge[column + EDGE_RADIUS_PX] = (a - b).abs() > JUMP_FRAC * a.min(b);
     }
 }

@@ -46,6 +46,7 @@ pub fn world_from_cube() -> Transform {
 pub fn world_from_tag(id: usize) -> Transform {
     let (outward, right, up) = BOX_FACES[id];
     let [outward, right, up] = [outward, right, up].map(Vector3::from);
+    // The x axis of a tag points right, y down, and z into the cube.
     let axes = Rotation3::from_matrix_unchecked(Matrix3::from_columns(&[right, -up, -outward]));
     let cube_from_tag = Transform::from_parts(
         Translation3::from(outward * CUBE_HALF_M),
@@ -90,45 +91,70 @@ pub(crate) struct Object {
     pub(crate) world_from_mesh: Transform,
 }
 
+impl Object {
+    pub(crate) fn new(
+        name: &'static str,
+        material: &'static str,
+        mesh: Mesh,
+        world_from_mesh: Transform,
+    ) -> Self {
+        Self {
+            name,
+            material,
+            mesh,
+            world_from_mesh,
+        }
+    }
+
+    /// An object whose mesh is in world coordinates.
+    pub(crate) fn in_world(name: &'static str, material: &'static str, mesh: Mesh) -> Self {
+        Self::new(name, material, mesh, Transform::identity())
+    }
+}
+
 /// All objects except the arm.
 pub(crate) fn objects() -> Vec<Object> {
-    let object = |name, material, mesh, world_from_mesh| Object {
-        name,
-        material,
-        mesh,
-        world_from_mesh,
-    };
     let occluders = occluders();
     let toy_light = |point: &Point3<f64>, normal: &Vector3<f64>, name: u64| {
-        occluders.light_frac(
-            &(world_from_toy() * point),
-            &(world_from_toy() * normal),
-            name,
-        )
+        toy_light_frac(&occluders, point, normal, name)
     };
     let sides: [_; 6] = std::array::from_fn(texture::side_rectangle);
     let here = Transform::identity();
     vec![
-        object(
+        Object::new(
             "cube",
             "tags",
             Mesh::cuboid([CUBE_HALF_M; 3], &sides),
             world_from_cube(),
         ),
-        object(
+        Object::new(
             "block",
             "wood",
             Mesh::cuboid(BLOCK_HALF_M, &sides),
             world_from_block(),
         ),
-        object("toy_body", "fur", toy::body(&toy_light), world_from_toy()),
-        object("toy_fur", "fur", toy::fur(&toy_light), world_from_toy()),
-        object("table_top", "metal", table_top(), here),
-        object("brick_wall", "brick", wall(), world_from_wall(1.0)),
-        object("plaster_wall", "plaster", wall(), world_from_wall(-1.0)),
-        object("floor", "concrete", floor(), here),
-        object("frame", "frame", frame(), here),
+        Object::new("toy_body", "fur", toy::body(&toy_light), world_from_toy()),
+        Object::new("toy_fur", "fur", toy::fur(&toy_light), world_from_toy()),
+        Object::new("table_top", "metal", table_top(), here),
+        Object::new("brick_wall", "brick", wall(), world_from_wall(1.0)),
+        Object::new("plaster_wall", "plaster", wall(), world_from_wall(-1.0)),
+        Object::new("floor", "concrete", floor(), here),
+        Object::new("frame", "frame", frame(), here),
     ]
+}
+
+/// Fraction of light at a point of the toy, given in the toy's frame.
+fn toy_light_frac(
+    occluders: &Occluders,
+    point: &Point3<f64>,
+    normal: &Vector3<f64>,
+    name: u64,
+) -> f64 {
+    occluders.light_frac(
+        &(world_from_toy() * point),
+        &(world_from_toy() * normal),
+        name,
+    )
 }
 
 /// The textures by name, with baked lighting.
@@ -194,6 +220,7 @@ fn occluders() -> Occluders {
     let mut occluders = Occluders::new(AMBIENT_REACH_M);
     occluders.add_box(world_from_cube(), [CUBE_HALF_M; 3]);
     occluders.add_box(world_from_block(), BLOCK_HALF_M);
+    // The box is centered in the slab, whose top is at the height of the table.
     let table = table_center() - Vector3::new(0.0, 0.0, TABLE_HALF_THICKNESS_M);
     let [half_x, half_y] = TABLE_HALF_XY_M;
     occluders.add_box(
@@ -201,6 +228,7 @@ fn occluders() -> Occluders {
         [half_x, half_y, TABLE_HALF_THICKNESS_M],
     );
     for side in [1.0, -1.0] {
+        // The box lies behind the surface of the wall.
         let world_from_box =
             world_from_wall(side) * Translation3::new(-WALL_HALF_THICKNESS_M, 0.0, 0.0);
         occluders.add_box(
@@ -232,9 +260,11 @@ fn table_top() -> Mesh {
 }
 
 fn wall() -> Mesh {
-    let (right, up) = (Vector3::y() * WALL_HALF_M[0], Vector3::z() * WALL_HALF_M[1]);
+    let right = Vector3::y() * WALL_HALF_M[0];
+    let up = Vector3::z() * WALL_HALF_M[1];
     let mut mesh = Mesh::default();
     mesh.rectangle(Point3::origin(), right, up, WHOLE);
+    // The back of the wall, because faces are drawn from their front only.
     mesh.rectangle(Point3::new(-0.01, 0.0, 0.0), -right, up, WHOLE);
     mesh
 }
@@ -245,6 +275,7 @@ fn floor() -> Mesh {
         Point3::new(0.5, 0.0, -0.75),
         Vector3::x() * 3.0,
         Vector3::y() * 3.0,
+        // The texture repeats, because it would be coarse if it were stretched over the floor.
         [0.0, 0.0, 4.0, 4.0],
     );
     mesh

@@ -48,7 +48,8 @@ impl RowMotion {
     }
 }
 
-/// Maximum number of iterations that correct the pixel position until its depth matches the ray.
+/// Maximum number of iterations that correct the pixel position until its depth matches the ray. At
+/// most surfaces, one is enough; at depth edges, the search may never settle.
 const MAX_CORRECTIONS: usize = 3;
 /// Relative depth tolerance. At the speeds of the arm, it moves a point by less than 0.02 pixels.
 const SAME_DEPTH_FRAC: f32 = 0.005;
@@ -73,6 +74,7 @@ impl Optics {
         let intrinsics = intrinsics.clone();
         let [width, height] = intrinsics.size_px;
         let mut rays = Vec::with_capacity(width as usize * height as usize);
+        // The inverse of the lens model is computed once, because it is iterative and slow.
         for row in 0..height {
             for column in 0..width {
                 let pixel = [f64::from(column) + 0.5, f64::from(row) + 0.5];
@@ -113,6 +115,8 @@ impl Optics {
 
     /// Minimum and maximum coordinate at z = 1 that the image's pixels cover along an axis.
     fn bounds(&self, axis: usize) -> (f64, f64) {
+        // A pinhole maps the borders of the image directly. With distortion, the extremes lie on
+        // the border pixels, half a pixel inside.
         let half_pixel = 0.5 / self.intrinsics.focal_px[axis];
         if self.intrinsics.is_pinhole() {
             let [principal, focal] = [
@@ -168,11 +172,13 @@ impl Optics {
 
     /// Colors of one row of a pinhole camera. Each pixel covers a whole number of rendered pixels.
     fn average_blocks(&self, picture: &Picture, row: usize, colors: &mut [[f32; 3]]) {
-        let (side, stride) = (self.supersample as usize, 3 * picture.size_px[0] as usize);
+        let side = self.supersample as usize;
+        let stride = 3 * picture.size_px[0] as usize;
         let margin = (self.margin_px * self.supersample) as usize;
         let area = (side * side) as f32;
         let top = (margin + row * side) * stride + 3 * margin;
         for (column, color) in colors.iter_mut().enumerate() {
+            // At most 16 samples of 255, which fit u16.
             let mut sum = [0u16; 3];
             for y in 0..side {
                 let start = top + y * stride + 3 * column * side;
@@ -267,6 +273,8 @@ impl Optics {
         let mut depth = nearest_depth(picture, guess);
         let mut drawn = guess;
         for _ in 0..MAX_CORRECTIONS {
+            // The point at this depth in the rendered image, on the moved ray. If the surface there
+            // has another depth, the search repeats with that depth.
             let along = (depth - row_motion.translation_m.z) / direction.z;
             let at =
                 |axis: usize| (direction[axis] * along + row_motion.translation_m[axis]) / depth;
@@ -289,10 +297,15 @@ impl Optics {
         }
         let [width, height] = picture.size_px.map(|side| side as usize);
         let start = |axis: usize, size: usize| {
+            // Clamped, so that the square stays inside the picture and its first and last columns
+            // exist.
             let first = (at[axis] - 0.5 * side as f32).clamp(0.0, (size - side) as f32 - 1e-3);
             (first as usize, first.fract())
         };
-        let ((column, share_x), (row, share_y)) = (start(0, width), start(1, height));
+        let (column, share_x) = start(0, width);
+        let (row, share_y) = start(1, height);
+        // The square covers `side` pixels, but starts at a fraction, so the outer ones count
+        // partly.
         let weight = |ix: usize, share: f32| match ix {
             0 => 1.0 - share,
             ix if ix == side => share,
@@ -326,6 +339,7 @@ impl Optics {
             around.map(|[dx, dy]: [f32; 2]| nearest_depth(picture, [at[0] + dx, at[1] + dy]));
         let nearest = depths.into_iter().fold(f32::MAX, f32::min);
         let furthest = depths.into_iter().fold(0.0, f32::max);
+        // A mean across a depth edge would lie on no surface.
         if furthest - nearest < SAME_SURFACE_FRAC * nearest {
             depths.iter().sum::<f32>() / 4.0
         } else {
@@ -339,14 +353,14 @@ fn between_pixels(picture: &Picture, at: [f32; 2]) -> [f32; 3] {
     let [width, height] = picture.size_px;
     let x = (at[0] - 0.5).clamp(0.0, width as f32 - 1.001);
     let y = (at[1] - 0.5).clamp(0.0, height as f32 - 1.001);
-    let (column, row) = (x as u32 as usize, y as u32 as usize);
-    let (fx, fy) = (x - column as f32, y - row as f32);
+    let column = x as u32 as usize;
+    let row = y as u32 as usize;
+    let fx = x - column as f32;
+    let fy = y - row as f32;
     let stride = 3 * width as usize;
     let start = row * stride + 3 * column;
-    let (above, below) = (
-        &picture.rgb[start..start + 6],
-        &picture.rgb[start + stride..start + stride + 6],
-    );
+    let above = &picture.rgb[start..start + 6];
+    let below = &picture.rgb[start + stride..start + stride + 6];
     let weights = [
         (1.0 - fx) * (1.0 - fy),
         fx * (1.0 - fy),

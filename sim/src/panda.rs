@@ -119,6 +119,8 @@ pub(crate) fn jacobian(
     let base_from_tip = base_from_flange * flange_from_tip;
     let mut jacobian = Matrix6xX::zeros(N_JOINTS);
     for (ix, frame) in frames.iter().enumerate() {
+        // Each joint rotates the tip about its z axis: the angular velocity is the axis, the linear
+        // velocity its cross product with the lever.
         let axis = frame.rotation * Vector3::z();
         let arm = base_from_tip.translation.vector - frame.translation.vector;
         jacobian
@@ -271,8 +273,11 @@ pub(crate) fn mjcf(on_flange: &str) -> String {
     write_parts(&mut xml, BASE);
     for (ix, link) in LINKS.iter().enumerate() {
         let pose = pose_attributes(&link.parent_from_joint());
+        // A solid of this mass and about the size of a link. The exact inertia does not matter,
+        // because the controller is stiff.
         let [number, inertia, mass] = [ix as f64 + 1.0, 0.012 * MASS_KG[ix], MASS_KG[ix]];
-        let (lower, upper) = (LOWER_RAD[ix], UPPER_RAD[ix]);
+        let lower = LOWER_RAD[ix];
+        let upper = UPPER_RAD[ix];
         let _ = writeln!(
             xml,
             "<body name=\"panda_link{number}\" {pose} gravcomp=\"0\">\n\
@@ -282,10 +287,12 @@ pub(crate) fn mjcf(on_flange: &str) -> String {
         );
         write_parts(&mut xml, BODY[ix]);
     }
+    // Writing to a string cannot fail.
     let _ = writeln!(
         xml,
         "<body name=\"panda_link8\" pos=\"0 0 {FLANGE_M}\">\n{on_flange}</body>"
     );
+    // The links are nested, so all elements end here.
     xml.push_str(&"</body>\n".repeat(N_JOINTS + 1));
     xml
 }

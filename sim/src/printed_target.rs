@@ -31,6 +31,8 @@ pub(crate) fn print(config: &TargetConfig) -> Result<Printed, Error> {
         target: config.name.clone(),
         source,
     };
+    // The size of the raster in pixels depends on the target's shape, which only the rasterizer
+    // knows.
     // First rasterize at 1 px per mm to get the size.
     let coarse = target.raster(1000.0).map_err(failed)?;
     let longest_px = coarse.size_px.into_iter().max().unwrap_or(1);

@@ -39,6 +39,8 @@ impl RandomStream {
     pub(crate) fn normals(self, counter: u64) -> [f32; 4] {
         let bits = self.bits(counter);
         let table = &*QUANTILES;
+        // Four separate groups of 12 bits. A table lookup is much faster than the Box-Muller
+        // transform, and images need millions of normal numbers.
         [0, 12, 24, 36].map(|shift| table[(bits >> shift & 0xfff) as usize])
     }
 }
@@ -48,6 +50,7 @@ static QUANTILES: LazyLock<[f32; 4096]> = LazyLock::new(|| {
     let quantiles: Vec<f64> = (0..4096)
         .map(|ix| normal_quantile((f64::from(ix) + 0.5) / 4096.0))
         .collect();
+    // The tails beyond the table are missing, so the quantiles have a variance slightly below 1.
     let scale = (quantiles.iter().map(|q| q * q).sum::<f64>() / 4096.0).sqrt();
     #[expect(clippy::cast_possible_truncation, reason = "a table in f32")]
     std::array::from_fn(|ix| (quantiles[ix] / scale) as f32)
@@ -55,9 +58,12 @@ static QUANTILES: LazyLock<[f32; 4096]> = LazyLock::new(|| {
 
 /// Inverse of the normal distribution function, by Newton steps from a logistic guess.
 fn normal_quantile(probability: f64) -> f64 {
+    // The logistic distribution with the scale 1.702 differs from the normal one by less than 0.01.
     let mut x = (probability / (1.0 - probability)).ln() / 1.702;
     for _ in 0..60 {
         let density = (-0.5 * x * x).exp() / (2.0 * std::f64::consts::PI).sqrt();
+        // The step is limited, because the density is almost 0 far from the mean, where a full
+        // Newton step would overshoot.
         let step = ((normal_below(x) - probability) / density).clamp(-0.5, 0.5);
         x -= step;
     }

@@ -92,6 +92,7 @@ fn render_thread_stopped() -> Error {
 impl Renderer {
     /// Starts the thread and its context.
     pub(crate) fn start(model: Arc<MjModel>, near_far_m: [f64; 2]) -> Result<Self, Error> {
+        // A bounded queue, so that the simulation cannot run far ahead of the rendering.
         let (job_sender, queue) = bounded::<Job>(4);
         let (ready, started) = bounded(1);
         let thread = std::thread::Builder::new()
@@ -129,6 +130,7 @@ impl Renderer {
 
 impl Drop for Renderer {
     fn drop(&mut self) {
+        // Closing the channel ends the loop of the thread.
         self.job_sender = None;
         if let Some(thread) = self.thread.take() {
             // The panic hook has already reported a panic of the thread.
@@ -198,6 +200,7 @@ impl Canvas {
         if is_alone {
             options.geomgroup.fill(0);
         }
+        // The robot is drawn even if other geometry is hidden.
         options.geomgroup[ARM_GROUP] = 1;
         self.set_segmentation(true);
         let picture = self.draw_with(view, &options);
@@ -234,6 +237,7 @@ impl Canvas {
 
     fn draw_with(&mut self, view: &View, options: &MjvOption) -> Picture {
         if let Some(robot) = &view.robot {
+            // Only the poses are set; velocities and forces do not affect an image.
             if let Some(joints_rad) = &robot.joints_rad {
                 self.data.qpos_mut().copy_from_slice(joints_rad.as_slice());
             }
@@ -266,6 +270,8 @@ impl Canvas {
         let in_f32 = |vector: Vector3<f64>| [vector.x as f32, vector.y as f32, vector.z as f32];
         let [width, height] = view.size_px.map(f64::from);
         let at_near = |pixels: f64, axis: usize| pixels * near / view.focal_px[axis];
+        // An off-center frustum gives the principal point of the camera. OpenGL has y up, the image
+        // y down, so top and bottom change places.
         let [left, right] = [
             at_near(-view.principal_px[0], 0),
             at_near(width - view.principal_px[0], 0),
@@ -316,6 +322,7 @@ impl Canvas {
             .expect("the buffers match the viewport's size");
         let mut rgb = Vec::with_capacity(from_bottom.len());
         let mut depth_m = Vec::with_capacity(depth_from_bottom.len());
+        // OpenGL returns the bottom row first.
         for row in (0..height).rev() {
             rgb.extend_from_slice(&from_bottom[3 * width * row..3 * width * (row + 1)]);
             depth_m.extend(

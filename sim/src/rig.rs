@@ -46,8 +46,10 @@ pub struct Rig {
 
 /// Builds the scene and starts its render thread. Takes one to two seconds.
 pub fn open(config: &Config) -> Result<Rig, Error> {
+    // Before anything reaches MuJoCo, which aborts the process on invalid numbers.
     config.check()?;
     let cameras = Cameras::new(config)?;
+    // One model for dynamics, rendering and ray casting, each with its own data.
     let model = Arc::new(scene::build(config, cameras.largest_view_px())?);
     let renderer = Renderer::start(Arc::clone(&model), scene::near_far_m(config.scene))?;
     let motion = BaseMotion::of(config.scene, config.speed);

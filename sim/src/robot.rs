@@ -79,6 +79,7 @@ impl Robot {
         self.n_steps += 1;
         let reading = match &mut self.arm {
             Some(ArmMotion::Simulated(arm)) => Some(arm.step()),
+            // The motors run on another clock, which the simulation follows.
             Some(ArmMotion::Motorized(arm)) if !arm.wait_until(nanos) => {
                 return Err(Error::MotorsStopped);
             }

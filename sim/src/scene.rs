@@ -19,7 +19,8 @@ pub(crate) const ARM_GROUP: usize = 1;
 /// Group of transparent geometry.
 pub(crate) const GLASS_GROUP: usize = 2;
 
-/// Near and far plane, meters.
+/// Near and far plane, meters. The resolution of the depth buffer decreases with the ratio of both,
+/// so each scene has the narrowest range that contains it.
 pub(crate) fn near_far_m(scene: Scene) -> [f64; 2] {
     match scene {
         Scene::StaticArm | Scene::MobileArm => [0.02, 12.0],
@@ -42,6 +43,7 @@ pub(crate) fn build(config: &Config, largest_px: [u32; 2]) -> Result<MjModel, Er
     let mut assets = format!("{MATERIALS}{}", extra_materials(config.scene));
     let mut bodies = String::new();
     let scene_assets = SceneAssets::get(config.scene)?;
+    // The scene first: textures, each with a material of the same name, then meshes.
     for (name, png) in &scene_assets.textures_png {
         add_file(&mut files, &format!("{name}.png"), png)?;
         let specular = if *name == "metal" { 0.25 } else { 0.03 };
@@ -70,13 +72,12 @@ pub(crate) fn build(config: &Config, largest_px: [u32; 2]) -> Result<MjModel, Er
             "<geom type=\"mesh\" mesh=\"{name}\" material=\"{material}\" group=\"{group}\" {pose}/>"
         );
     }
+    // Then printed targets. Those on the flange become part of the arm's last body.
     let mut on_flange = String::new();
     for (ix, target) in config.targets.iter().enumerate() {
         let printed_target::Printed { png, mesh, plate } = printed_target::print(target)?;
-        let (name, pose) = (
-            format!("target{ix}"),
-            panda::pose_attributes(&target.parent_from_board),
-        );
+        let name = format!("target{ix}");
+        let pose = panda::pose_attributes(&target.parent_from_board);
         add_file(&mut files, &format!("{name}.png"), &png)?;
         add_file(&mut files, &format!("{name}.msh"), &mesh.to_msh())?;
         add_file(&mut files, &format!("{name}_plate.msh"), &plate.to_msh())?;
@@ -98,6 +99,7 @@ pub(crate) fn build(config: &Config, largest_px: [u32; 2]) -> Result<MjModel, Er
              <geom type=\"mesh\" mesh=\"{name}_plate\" material=\"frame\" group=\"0\" mass=\"0\" {pose}/>"
         );
     }
+    // Contacts and shadows are off: nothing touches, and shadows are baked into the textures.
     let [near, far] = near_far_m(config.scene);
     let [width, height] = largest_px;
     let (lamps, ambient) = light::mjcf(brightness(config.scene));
@@ -172,27 +174,21 @@ struct SceneAssets {
 impl SceneAssets {
     fn get(scene: Scene) -> Result<Arc<Self>, Error> {
         static SCENE_ASSETS: Mutex<BTreeMap<&str, Arc<SceneAssets>>> = Mutex::new(BTreeMap::new());
+        // The lock is held while assets are created, so that two rigs that open at once do not
+        // create the same ones twice.
         let mut all = SCENE_ASSETS.lock();
         if let Some(scene_assets) = all.get(scene.name()) {
             return Ok(Arc::clone(scene_assets));
         }
-        let encode = |(name, texture): (&'static str, Texture)| {
-            texture
-                .to_png()
-                .map(|png| (name, png))
-                .map_err(|source| Error::Texture {
-                    name: name.to_owned(),
-                    source,
-                })
-        };
         let (textures, objects) = match scene {
             Scene::StaticArm => (objects::textures(), objects::objects()),
             Scene::MobileBase => (lab::textures(), lab::objects()),
             Scene::MobileArm => (cabinet::textures(), cabinet::objects()),
         };
+        // Compression takes most of the time, so textures are compressed in parallel.
         let textures_png = textures
             .into_par_iter()
-            .map(encode)
+            .map(encode_texture)
             .collect::<Result<_, _>>()?;
         let scene_assets = Arc::new(Self {
             textures_png,
@@ -201,6 +197,19 @@ impl SceneAssets {
         all.insert(scene.name(), Arc::clone(&scene_assets));
         Ok(scene_assets)
     }
+}
+
+/// A texture as the bytes of a PNG file.
+fn encode_texture(
+    (name, texture): (&'static str, Texture),
+) -> Result<(&'static str, Vec<u8>), Error> {
+    texture
+        .to_png()
+        .map(|png| (name, png))
+        .map_err(|source| Error::Texture {
+            name: name.to_owned(),
+            source,
+        })
 }
 
 const MATERIALS: &str = "<material name=\"arm_white\" rgba=\"0.93 0.93 0.92 1\" specular=\"0.4\" shininess=\"0.6\"/>\n\
@@ -224,6 +233,7 @@ fn brackets(config: &Config) -> String {
         .iter()
         .filter(|camera| camera.parent == Parent::Flange)
     {
+        // The housing ends behind the optical center, so that it does not block the camera's view.
         let pose = panda::pose_attributes(
             &(camera.parent_from_camera * Translation3::new(0.0, 0.0, -0.016)),
         );

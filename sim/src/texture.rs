@@ -54,19 +54,13 @@ impl Texture {
             .into_par_iter()
             .map(|ix| share_at(inside(ix % n), inside(ix / n), ix as u64))
             .collect();
+        // Few rays per sample give noise, which the mean of neighbors reduces.
         let shares = blurred(&shares, n);
-        let smooth = |x: f64, y: f64| {
-            let (column, row) = (x.clamp(0.0, 1.0) / step, y.clamp(0.0, 1.0) / step);
-            let (left, top) = ((column as usize).min(n - 2), (row as usize).min(n - 2));
-            let (fx, fy) = (column - left as f64, row - top as f64);
-            let line =
-                |at: usize| shares[at * n + left] * (1.0 - fx) + shares[at * n + left + 1] * fx;
-            line(top) * (1.0 - fy) + line(top + 1) * fy
-        };
         let side_px = self.side_px;
         let [left, top, right, bottom] = rectangle;
         let first = |share: f64| (share * side_px as f64 + 0.5) as usize;
-        let (columns, rows) = (first(left)..first(right), first(top)..first(bottom));
+        let columns = first(left)..first(right);
+        let rows = first(top)..first(bottom);
         self.rgb
             .par_chunks_mut(3 * side_px)
             .enumerate()
@@ -75,7 +69,7 @@ impl Texture {
                 let y = ((row as f64 + 0.5) / side_px as f64 - top) / (bottom - top);
                 for column in columns.clone() {
                     let x = ((column as f64 + 0.5) / side_px as f64 - left) / (right - left);
-                    let share = smooth(x, y);
+                    let share = between_points(&shares, n, [x, y]);
                     for byte in &mut line[3 * column..3 * column + 3] {
                         *byte = (f64::from(*byte) * share + 0.5) as u8;
                     }
@@ -101,15 +95,34 @@ const EDGE: f64 = 0.005;
 
 /// Mean of each point of a square grid and its neighbors.
 fn blurred(grid: &[f64], side: usize) -> Vec<f64> {
+    (0..grid.len())
+        .map(|ix| mean_around(grid, side, ix))
+        .collect()
+}
+
+/// Mean of a point of a square grid and its neighbors; fewer at the border.
+fn mean_around(grid: &[f64], side: usize, ix: usize) -> f64 {
     let around = |at: usize| at.saturating_sub(1)..(at + 2).min(side);
-    let mean = |ix: usize| {
-        let (rows, columns) = (around(ix / side), around(ix % side));
-        let n_points = (rows.len() * columns.len()) as f64;
-        rows.flat_map(|row| grid[row * side..][columns.clone()].iter())
-            .sum::<f64>()
-            / n_points
-    };
-    (0..grid.len()).map(mean).collect()
+    let rows = around(ix / side);
+    let columns = around(ix % side);
+    let n_points = (rows.len() * columns.len()) as f64;
+    rows.flat_map(|row| grid[row * side..][columns.clone()].iter())
+        .sum::<f64>()
+        / n_points
+}
+
+/// Bilinear interpolation in a grid of `n` x `n` points that cover the square from 0 to 1.
+fn between_points(grid: &[f64], n: usize, [x, y]: [f64; 2]) -> f64 {
+    let step = 1.0 / (n - 1) as f64;
+    let column = x.clamp(0.0, 1.0) / step;
+    let row = y.clamp(0.0, 1.0) / step;
+    // The last point has no neighbor to the right, so it belongs to the cell before it.
+    let left = (column as usize).min(n - 2);
+    let top = (row as usize).min(n - 2);
+    let fx = column - left as f64;
+    let fy = row - top as f64;
+    let line = |at: usize| grid[at * n + left] * (1.0 - fx) + grid[at * n + left + 1] * fx;
+    line(top) * (1.0 - fy) + line(top + 1) * fy
 }
 
 fn to_byte(value: f64) -> u8 {
@@ -144,9 +157,13 @@ impl Noise {
     }
 
     pub(crate) fn at(&self, x: f64, y: f64) -> f64 {
-        let (column, row) = (x.floor(), y.floor());
-        let (fx, fy) = (step(0.0, 1.0, x - column), step(0.0, 1.0, y - row));
-        let (column, row) = (column as i64, row as i64);
+        let column = x.floor();
+        let row = y.floor();
+        // The smooth step hides the lattice: bilinear noise would have visible creases.
+        let fx = step(0.0, 1.0, x - column);
+        let fy = step(0.0, 1.0, y - row);
+        let column = column as i64;
+        let row = row as i64;
         let top = self.lattice(column, row) * (1.0 - fx) + self.lattice(column + 1, row) * fx;
         let bottom =
             self.lattice(column, row + 1) * (1.0 - fx) + self.lattice(column + 1, row + 1) * fx;
@@ -156,10 +173,13 @@ impl Noise {
     /// Sum of octaves of noise, each with half the size and half the amplitude of the previous one,
     /// 0 to 1.
     pub(crate) fn rough(&self, x: f64, y: f64, n_octaves: i32) -> f64 {
+        // Octaves are shifted against each other. Otherwise, all would have a lattice point at the
+        // origin.
         let octaves = (0..n_octaves).map(|octave| (f64::from(octave) * 17.3, 2f64.powi(octave)));
         let sum: f64 = octaves
             .map(|(shift, finer)| self.at(x * finer + shift, y * finer + shift) / finer)
             .sum();
+        // The sum of the amplitudes 1 + 1/2 + 1/4 + ... scales the result to 0 to 1.
         sum / (2.0 - 2f64.powi(1 - n_octaves))
     }
 }
@@ -168,12 +188,14 @@ impl Noise {
 pub(crate) fn brick_wall() -> Texture {
     const N_COURSES: f64 = 26.0;
     const N_BRICKS: f64 = 10.0;
-    let (rough, blotch) = (Noise::new(1), Noise::new(2));
+    let rough = Noise::new(1);
+    let blotch = Noise::new(2);
     let each = RandomStream::new(0x7e37, &[3]);
     Texture::paint(SIDE_PX, |x, y| {
         let course = (y * N_COURSES).floor();
         let along = x * N_BRICKS + if course as i64 % 2 == 0 { 0.0 } else { 0.5 };
-        let (in_x, in_y) = (along.fract(), (y * N_COURSES).fract());
+        let in_x = along.fract();
+        let in_y = (y * N_COURSES).fract();
         let wobble = 0.02 * (rough.rough(x * 60.0, y * 60.0, 2) - 0.5);
         let edge = (in_x.min(1.0 - in_x) * 2.3).min(in_y.min(1.0 - in_y)) + wobble;
         let brick = each.unit(course as u64 * 64 + along.floor() as u64 % 64);
@@ -194,7 +216,8 @@ pub(crate) fn brick_wall() -> Texture {
 
 /// A plaster wall with stains, a map and a striped poster.
 pub(crate) fn plaster_wall() -> Texture {
-    let (rough, stain) = (Noise::new(11), Noise::new(12));
+    let rough = Noise::new(11);
+    let stain = Noise::new(12);
     Texture::paint(SIDE_PX, |x, y| {
         let grain = rough.rough(x * 70.0, y * 70.0, 4);
         let stained = step(0.42, 0.75, stain.rough(x * 5.0, y * 5.0, 5));
@@ -221,7 +244,8 @@ fn poster(
 ) -> Color {
     const MARGIN: f64 = 0.05;
     let [left, top, right, bottom] = rectangle;
-    let (u, v) = ((x - left) / (right - left), (y - top) / (bottom - top));
+    let u = (x - left) / (right - left);
+    let v = (y - top) / (bottom - top);
     let inside = |lower: f64, upper: f64| u > lower && u < upper && v > lower && v < upper;
     if inside(MARGIN, 1.0 - MARGIN) {
         picture(
@@ -239,7 +263,8 @@ fn poster(
 }
 
 pub(crate) fn sunrise(u: f64, v: f64) -> Color {
-    let (dx, dy) = (u - 0.5, v - 0.42);
+    let dx = u - 0.5;
+    let dy = v - 0.42;
     let distance = dx.hypot(dy);
     let ray = ((dy.atan2(dx) * 16.0 / std::f64::consts::TAU).rem_euclid(1.0) - 0.5).abs();
     let sky = mix(
@@ -263,7 +288,8 @@ pub(crate) fn squares(u: f64, v: f64) -> Color {
         [0.95, 0.95, 0.92],
         [0.10, 0.55, 0.35],
     ];
-    let (column, row) = ((u * 8.0).floor(), (v * 6.0).floor());
+    let column = (u * 8.0).floor();
+    let row = (v * 6.0).floor();
     let random = RandomStream::new(0x7e37, &[21]);
     let pick = |counter: u64| COLORS[(random.bits(counter) % 6) as usize];
     let cell = (row * 8.0 + column) as u64;
@@ -320,10 +346,13 @@ pub(crate) fn stripes(u: f64, v: f64) -> Color {
 /// * `size_m`: size of the area that the texture covers, to the right and down.
 pub(crate) fn metal_table(size_m: [f64; 2]) -> Texture {
     const HOLE_PITCH_M: f64 = 0.025;
-    let (brush, blotch, scratch) = (Noise::new(31), Noise::new(32), Noise::new(33));
+    let brush = Noise::new(31);
+    let blotch = Noise::new(32);
+    let scratch = Noise::new(33);
     Texture::paint(3 * SIDE_PX / 2, |x, y| {
         // The noise parameters are chosen for a square of 0.8 m.
-        let (x, y) = (x * size_m[0] / 0.8, y * size_m[1] / 0.8);
+        let x = x * size_m[0] / 0.8;
+        let y = y * size_m[1] / 0.8;
         let brushed =
             0.6 * brush.at(x * 9.0, y * 480.0) + 0.4 * brush.rough(x * 40.0, y * 260.0, 3);
         let worn = blotch.rough(x * 6.0, y * 6.0, 5);
@@ -352,7 +381,8 @@ pub(crate) fn wood() -> Texture {
     };
     Texture::paint(SIDE_PX, |x, y| {
         let side = (y * 3.0).floor() * 3.0 + (x * 3.0).floor();
-        let (u, v) = ((x * 3.0).fract(), (y * 3.0).fract());
+        let u = (x * 3.0).fract();
+        let v = (y * 3.0).fract();
         if side < 2.0 {
             grain.end(u, v, side)
         } else {
@@ -372,10 +402,8 @@ impl Grain {
 
     fn along(&self, u: f64, v: f64, side: f64) -> Color {
         let fine = self.fiber.rough(u * 12.0, v * 90.0 + side * 31.0, 3);
-        let (knot_u, knot_v) = (
-            0.25 + 0.5 * (side * 0.37).fract(),
-            0.35 + 0.3 * (side * 0.61).fract(),
-        );
+        let knot_u = 0.25 + 0.5 * (side * 0.37).fract();
+        let knot_v = 0.35 + 0.3 * (side * 0.61).fract();
         let knot = (-((u - knot_u) / 0.09).powi(2) - ((v - knot_v) / 0.13).powi(2)).exp();
         let ring = v * 9.0
             + side * 2.3
@@ -452,7 +480,8 @@ pub(crate) fn tags() -> Texture {
     let paper = Noise::new(61);
     // Larger than the other textures, so that edges between cells stay sharp at close range.
     Texture::paint(3 * SIDE_PX / 2, |x, y| {
-        let (across, down) = (x * 3.0, y * 3.0);
+        let across = x * 3.0;
+        let down = y * 3.0;
         let light = 0.97 + 0.03 * paper.rough(x * 200.0, y * 200.0, 2);
         let id = down.floor() as usize * 3 + across.floor() as usize;
         let Some(cells) = cells.get(id) else {
@@ -475,7 +504,8 @@ pub(crate) fn tags() -> Texture {
 /// Rectangle of a box's side in its texture, two rows of three from the top left: left, top, right,
 /// bottom.
 pub(crate) fn side_rectangle(side: usize) -> [f64; 4] {
-    let (column, row) = ((side % 3) as f64, (side / 3) as f64);
+    let column = (side % 3) as f64;
+    let row = (side / 3) as f64;
     [
         column / 3.0,
         row / 3.0,
@@ -486,7 +516,8 @@ pub(crate) fn side_rectangle(side: usize) -> [f64; 4] {
 
 /// A concrete floor.
 pub(crate) fn concrete() -> Texture {
-    let (rough, blotch) = (Noise::new(71), Noise::new(72));
+    let rough = Noise::new(71);
+    let blotch = Noise::new(72);
     Texture::paint(SIDE_PX, |x, y| {
         let shade = 0.5
             + 0.35 * blotch.rough(x * 8.0, y * 8.0, 5)

@@ -61,7 +61,8 @@ impl Part {
     }
 }
 
-/// Twice the factor on the hair counts below.
+/// Twice the factor on the hair counts below. More hairs make a denser coat, and a larger mesh that
+/// takes longer to draw.
 const DENSITY: u64 = 3;
 
 /// The toy stands on z = 0, looks along x, and is 0.15 m high.
@@ -264,16 +265,19 @@ pub(crate) fn body(light: Light<'_>) -> Mesh {
         } else {
             0.5 * (tip + root)
         };
-        let texture_x = |point: &Point3<f64>, normal: &Vector3<f64>| {
-            // Brightness varies at the scale of tufts, so that skin between hairs does not look
-            // bare.
-            let tuft = RandomStream::new(0x70f7, &[point.x.to_bits(), point.z.to_bits()])
-                .between(0, 0.45, 0.9);
-            texture_x(tuft * light(point, normal, 0))
-        };
+        let texture_x =
+            |point: &Point3<f64>, normal: &Vector3<f64>| skin_texture_x(light, point, normal);
         mesh.add_ellipsoid(part.center(), part.half_axes(), 10, texture_x, texture_y);
     }
     mesh
+}
+
+/// Horizontal position in the fur texture of a point of the skin.
+fn skin_texture_x(light: Light<'_>, point: &Point3<f64>, normal: &Vector3<f64>) -> f64 {
+    // Brightness varies at the scale of tufts, so that skin between hairs does not look bare.
+    let tuft =
+        RandomStream::new(0x70f7, &[point.x.to_bits(), point.z.to_bits()]).between(0, 0.45, 0.9);
+    texture_x(tuft * light(point, normal, 0))
 }
 
 /// Horizontal position in the fur texture for a brightness.
@@ -288,12 +292,14 @@ pub(crate) fn fur(light: Light<'_>) -> Mesh {
         let random = RandomStream::new(0xf0_44, &[ix as u64]);
         let half_axes = part.half_axes();
         for hair in 0..DENSITY * part.n_hairs / 2 {
+            // Evenly distributed over a sphere: the cosine of the polar angle is uniform.
             let down = (1.0 - 2.0 * random.unit(8 * hair)).acos() / std::f64::consts::PI;
             let direction = sphere_direction(down, random.unit(8 * hair + 1));
             let root = part.center()
                 + half_axes[0] * direction.x
                 + half_axes[1] * direction.y
                 + half_axes[2] * direction.z;
+            // Hairs that start inside another part would stick out of its surface.
             if is_inside_another(&root, ix) {
                 continue;
             }
@@ -316,6 +322,8 @@ pub(crate) fn fur(light: Light<'_>) -> Mesh {
 
 fn is_inside_another(point: &Point3<f64>, own_ix: usize) -> bool {
     PARTS.iter().enumerate().any(|(ix, part)| {
+        // The axes are perpendicular, so projections on them give the coordinates in the unit
+        // sphere.
         let offset = point - part.center();
         let share: f64 = part
             .half_axes()
@@ -341,6 +349,7 @@ fn grow_hair(mesh: &mut Mesh, light: Light<'_>, random: RandomStream, counter: u
         random.between(counter + 1, -0.45, 0.45),
         random.between(counter + 2, -0.45, 0.45),
     );
+    // The coat lies back and down, with the variation of real hair.
     let combed = Vector3::new(-0.55, 0.0, -0.25);
     let start = (hair.normal * 0.9 + combed * 0.8 + jitter).normalize();
     let end = (start + combed * 0.9 + Vector3::new(0.0, 0.0, -0.35)).normalize();
@@ -348,6 +357,7 @@ fn grow_hair(mesh: &mut Mesh, light: Light<'_>, random: RandomStream, counter: u
     let tip = middle + end * (0.45 * hair.length_m);
     let side = start.cross(&Vector3::new(0.3, 0.2, 0.9)).normalize();
     let across = start.cross(&side);
+    // Light is sampled above the skin, where the hair is. At its root, the hair would shade itself.
     let share = light(
         &(hair.root + hair.normal * (0.6 * hair.length_m)),
         &hair.normal,

@@ -102,27 +102,6 @@ fn simulation() -> DeviceInfo {
 /// V4L2 capture devices with their image modes.
 #[cfg(target_os = "linux")]
 fn video_devices(cameras: Vec<Result<v4l2::FoundCamera, v4l2::Problem>>) -> Vec<DeviceInfo> {
-    let describe = |camera: v4l2::FoundCamera| {
-        let usb = camera
-            .usb_mbits
-            .map_or(String::new(), |mbits| format!(", USB at {mbits} Mbit/s"));
-        let serial = camera
-            .serial
-            .as_ref()
-            .map_or(String::new(), |serial| format!(", serial {serial}"));
-        let offers = v4l2::summary(&camera.modes);
-        DeviceInfo {
-            kind: "camera",
-            address: camera.address(),
-            usable: !camera.modes.is_empty(),
-            note: format!(
-                "driver v4l2, {}, at {}{serial}{usb}: {offers}",
-                camera.node.display(),
-                camera.bus
-            ),
-            name: camera.name,
-        }
-    };
     let unavailable = |problem: v4l2::Problem| DeviceInfo {
         kind: "camera",
         address: "unknown".into(),
@@ -132,8 +111,31 @@ fn video_devices(cameras: Vec<Result<v4l2::FoundCamera, v4l2::Problem>>) -> Vec<
     };
     cameras
         .into_iter()
-        .map(|camera| camera.map_or_else(unavailable, describe))
+        .map(|camera| camera.map_or_else(unavailable, describe_camera))
         .collect()
+}
+
+#[cfg(target_os = "linux")]
+fn describe_camera(camera: v4l2::FoundCamera) -> DeviceInfo {
+    let usb = camera
+        .usb_mbits
+        .map_or(String::new(), |mbits| format!(", USB at {mbits} Mbit/s"));
+    let serial = camera
+        .serial
+        .as_ref()
+        .map_or(String::new(), |serial| format!(", serial {serial}"));
+    let offers = v4l2::summary(&camera.modes);
+    DeviceInfo {
+        kind: "camera",
+        address: camera.address(),
+        usable: !camera.modes.is_empty(),
+        note: format!(
+            "driver v4l2, {}, at {}{serial}{usb}: {offers}",
+            camera.node.display(),
+            camera.bus
+        ),
+        name: camera.name,
+    }
 }
 
 /// RealSense cameras found by librealsense.
@@ -196,6 +198,7 @@ fn can_interfaces(sys: &Path) -> Vec<DeviceInfo> {
                 .unwrap_or_else(|| "unknown".into());
             let note =
                 format!("driver can, [arm.bus.{interface}]; `fieldrig doctor` checks its settings");
+            // Other systems have no SocketCAN.
             let usable = cfg!(target_os = "linux");
             DeviceInfo {
                 kind: "can",

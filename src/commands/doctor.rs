@@ -30,6 +30,7 @@ pub(crate) struct Args {
 
 /// Runs all checks; the exit code is 1 if one fails.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
+    // An invalid rig file is an error, not a finding: its devices would be unknown.
     let rig = args
         .rig
         .as_ref()
@@ -39,6 +40,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     findings.push(simulation());
     findings.push(page_address::page_address(DEFAULT_ADDRESS));
     findings.extend(doctor::check(rig.as_ref()));
+    // Printed before listening, which takes as long as the user asks for.
     print_findings(&findings, args.json)?;
     if let (Some(rig), Some(secs)) = (&rig, args.listen) {
         let result = doctor::listen(rig, secs, &signals::stop_on_signals()?)?;
@@ -52,6 +54,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         print_findings(&result.findings, args.json)?;
         findings.extend(result.findings);
     }
+    // Warnings do not fail: a script can use the exit code to decide whether a run can start.
     let failed = findings
         .iter()
         .any(|finding| finding.verdict == Verdict::Fail);

@@ -51,7 +51,9 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let evaluator = Evaluator::thorough(args.lpips_weights.as_deref())?;
     // Invalid flags are rejected before the data is read, which takes long.
     args.images.options().holdout()?;
+    // So is a missing path.
     session::expect(&args.data)?;
+    // The model comes before the data, too, because it may be invalid.
     let loaded = methods::load(open_gpu()?, &args.model)?;
     let is_empty = methods::note_if_empty(&args.model, &loaded).is_some();
     let mut model = loaded.method;
@@ -90,6 +92,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         scored.set_position(n_scored as u64)
     })?;
     scored.finish_and_clear();
+    // An empty model has its own note, and covers nothing anyway.
     if !is_empty {
         warn_if_hardly_covered(
             &images
@@ -99,6 +102,8 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         );
     }
     let scores = Scores::mean(&images);
+    // Scores are in the order of the test images, so names of the others are left out before both
+    // are joined.
     let is_test = |keyframe: &Keyframe| keyframe.split == Split::Test;
     let names = data
         .keyframes
@@ -125,12 +130,14 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
             format!("mean of {}", per_image.len())
         ))?;
     }
+    // Scores of incomplete data are printed, but the exit code says so.
     Ok(exit::from_losses(&data.data_losses))
 }
 
 /// Takes `base.realign` from the rig file of the model, because the base poses must be treated as
 /// in training.
 fn training_overrides(model: &Path) -> Vec<Override> {
+    // Without a rig file, as for a splat file, there is nothing to take over.
     let training_rig = Rig::load(&model.join(drivers::recording::RIG_FILE), &[]);
     training_rig
         .iter()

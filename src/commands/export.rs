@@ -91,9 +91,11 @@ enum Contents {
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let contents = contents(&args.from)?;
     let has_cells = |kind: ModelKind| kind.entry().exports.iter().any(|export| export.has_cells);
+    // A flag without an effect is probably a mistake.
     if args.cell_m.is_some() && !matches!(contents, Contents::Model(kind) if has_cells(kind)) {
         return Err(BadArgument(format!("--cell-m: {} has no mesh", args.from.display())).into());
     }
+    // Before the model is loaded, which may take long.
     check_file(args)?;
     signals::remove_partial_files_on_signals()?;
     match (contents, &*args.to) {
@@ -156,6 +158,7 @@ fn contents(path: &Path) -> anyhow::Result<Contents> {
 /// Rejects an output file that exists or has the wrong extension.
 fn check_file(args: &Args) -> Result<(), BadArgument> {
     let extension = &args.to;
+    // This output is a folder.
     if extension == NERFSTUDIO {
         return Ok(());
     }
@@ -183,24 +186,7 @@ fn unsupported(sentence: &str, args: &Args) -> anyhow::Error {
 
 /// Exports a model.
 fn export_model(export: &Export, args: &Args) -> anyhow::Result<Exit> {
-    let export = |out: &Path| -> anyhow::Result<Exported> {
-        let request = ExportRequest {
-            model: &args.from,
-            out,
-            cell_m: args.cell_m,
-        };
-        let exported = match export.write {
-            ExportWriter::Cpu(write) => write(&request),
-            ExportWriter::Gpu(write) => write(open_gpu()?, &request),
-        };
-        exported.map_err(|error| match error {
-            trainer::Error::EmptyMesh { cell_m } => anyhow::Error::new(BadArgument(format!(
-                "--cell-m {cell_m}: no triangles are left at this cell width; use a smaller one"
-            ))),
-            error => error.into(),
-        })
-    };
-    let exported = files::create_from(&args.out, export);
+    let exported = files::create_from(&args.out, |out| write_export(export, args, out));
     let Exported {
         n_items,
         item,
@@ -215,7 +201,28 @@ fn export_model(export: &Export, args: &Args) -> anyhow::Result<Exit> {
     Ok(Exit::Done)
 }
 
+/// Writes a model to the file `out`, which is renamed when it is complete.
+fn write_export(export: &Export, args: &Args, out: &Path) -> anyhow::Result<Exported> {
+    let request = ExportRequest {
+        model: &args.from,
+        out,
+        cell_m: args.cell_m,
+    };
+    let exported = match export.write {
+        ExportWriter::Cpu(write) => write(&request),
+        ExportWriter::Gpu(write) => write(open_gpu()?, &request),
+    };
+    exported.map_err(|error| match error {
+        // The cell width is an argument, so another one is a remedy.
+        trainer::Error::EmptyMesh { cell_m } => anyhow::Error::new(BadArgument(format!(
+            "--cell-m {cell_m}: no triangles are left at this cell width; use a smaller one"
+        ))),
+        error => error.into(),
+    })
+}
+
 fn export_recording(args: &Args) -> anyhow::Result<Exit> {
+    // An export has the full resolution, whatever the scale of training.
     let overrides = [Override::new("train.scale", 1.0)];
     let rig = args
         .rig
@@ -232,10 +239,12 @@ fn export_recording(args: &Args) -> anyhow::Result<Exit> {
         join.push(sample);
         bar.inc(1);
     }
+    // Images that still wait for a later joint state are decided now.
     join.finish();
     bar.finish_and_clear();
     let missing_from_list = join.check_list()?;
     let mut keyframes: Vec<_> = join.keyframes().cloned().collect();
+    // As in training, so that the exported poses are those that a model would use.
     if let Some(mut stations) = Stations::new(&opened.rig) {
         keyframes = stations.corrected(keyframes);
     }

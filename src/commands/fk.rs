@@ -75,24 +75,24 @@ fn poses(robot: &Robot, chain: &Chain, joints: &str) -> anyhow::Result<Vec<[f64;
     check_names(robot, &joints.joint_names)?;
     let order = chain.order_in(&joints.joint_names)?;
     let n_names = joints.joint_names.len();
-    let pose = |(at, values): (usize, &Vec<f64>)| {
-        ensure!(
-            values.len() == n_names,
-            "configuration {at} (from 0) has {} values, joint_names has {n_names}",
-            values.len()
-        );
-        let q: Vec<f64> = order.iter().map(|&column| values[column]).collect();
-        let base_from_tip = chain
-            .forward(&q)
-            .with_context(|| format!("configuration {at} (from 0)"))?;
-        Ok(transform::to_rows(&base_from_tip))
-    };
     let poses = joints
         .configurations
         .iter()
         .enumerate()
-        .map(pose)
+        .map(|(at, values)| {
+            ensure!(
+                values.len() == n_names,
+                "configuration {at} (from 0) has {} values, joint_names has {n_names}",
+                values.len()
+            );
+            let q: Vec<f64> = order.iter().map(|&column| values[column]).collect();
+            let base_from_tip = chain
+                .forward(&q)
+                .with_context(|| format!("configuration {at} (from 0)"))?;
+            Ok(transform::to_rows(&base_from_tip))
+        })
         .collect::<anyhow::Result<_>>()?;
+    // An error makes the warning pointless, so it comes after all poses.
     warn_outside_limits(robot, &joints);
     Ok(poses)
 }
@@ -101,11 +101,13 @@ fn poses(robot: &Robot, chain: &Chain, joints: &str) -> anyhow::Result<Vec<[f64;
 fn warn_outside_limits(robot: &Robot, joints: &JointsFile) {
     for (at, values) in joints.configurations.iter().enumerate() {
         for (name, value) in joints.joint_names.iter().zip(values) {
+            // The names were checked before.
             let Some(limits) = robot.joint(name).map(|joint| joint.limits) else {
                 continue;
             };
             if !(limits.lower..=limits.upper).contains(value) {
-                let (lower, upper) = (limits.lower, limits.upper);
+                let lower = limits.lower;
+                let upper = limits.upper;
                 log::warn!(
                     "configuration {at} (from 0): {name} is {value}, outside its limits {lower} to {upper} (radians or meters)"
                 );
@@ -117,6 +119,7 @@ fn warn_outside_limits(robot: &Robot, joints: &JointsFile) {
 
 fn check_names(robot: &Robot, names: &[String]) -> anyhow::Result<()> {
     for (at, name) in names.iter().enumerate() {
+        // Only one of the two values could be used.
         ensure!(
             !names[..at].contains(name),
             "joint {name:?} is listed twice in joint_names"

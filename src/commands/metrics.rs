@@ -35,6 +35,7 @@ fn positive(text: &str) -> Result<f64, String> {
     let number = text
         .parse::<f64>()
         .ok()
+        // With 0, all depths and their error would be 0.
         .filter(|number| number.is_finite() && *number > 0.0);
     number.ok_or_else(|| "must be a number above 0".to_owned())
 }
@@ -50,7 +51,8 @@ struct Scores {
 
 /// Prints PSNR, SSIM and LPIPS of two images, or the error of two depth images.
 pub(crate) fn run(args: Args) -> anyhow::Result<()> {
-    let (rendered, truth) = (open(&args.rendered)?, open(&args.truth)?);
+    let rendered = open(&args.rendered)?;
+    let truth = open(&args.truth)?;
     let [size_px, truth_px] =
         [&rendered, &truth].map(|picture| [picture.width(), picture.height()]);
     if size_px != truth_px {
@@ -64,12 +66,14 @@ pub(crate) fn run(args: Args) -> anyhow::Result<()> {
             truth_px[1]
         );
     }
+    // Depth images have 16 bits and one channel; everything else is color.
     let scores = match (rendered, truth) {
         (DynamicImage::ImageLuma16(rendered), DynamicImage::ImageLuma16(truth)) => {
             depth_scores([rendered.as_raw(), truth.as_raw()], args.meters_per_count)?
         }
         (rendered, truth) => {
-            let (rendered, truth) = (rendered.into_rgba8(), truth.into_rgba8());
+            let rendered = rendered.into_rgba8();
+            let truth = truth.into_rgba8();
             color_scores(
                 &PixelPair::new(size_px, &rendered, &truth)?,
                 args.lpips_weights.as_deref(),
@@ -84,14 +88,13 @@ pub(crate) fn run(args: Args) -> anyhow::Result<()> {
 }
 
 fn open(path: &Path) -> anyhow::Result<DynamicImage> {
-    let read = || {
-        anyhow::Ok(
-            ImageReader::new(BufReader::new(files::open(path)?))
-                .with_guessed_format()?
-                .decode()?,
-        )
-    };
-    read().with_context(|| format!("cannot read the image {}", path.display()))
+    decode(path).with_context(|| format!("cannot read the image {}", path.display()))
+}
+
+/// Decodes an image whose format is recognized by its contents, not by its name.
+fn decode(path: &Path) -> anyhow::Result<DynamicImage> {
+    let reader = ImageReader::new(BufReader::new(files::open(path)?)).with_guessed_format()?;
+    Ok(reader.decode()?)
 }
 
 fn color_scores(pair: &PixelPair<'_>, lpips_weights: Option<&Path>) -> anyhow::Result<Scores> {
@@ -130,6 +133,7 @@ impl Scores {
                 .map(|rmse_m| format!("depth error {:.2} mm", 1e3 * rmse_m)),
         ];
         let known: Vec<_> = parts.into_iter().flatten().collect();
+        // Color images always have a PSNR.
         if known.is_empty() {
             "no pixel has depth in both images".to_owned()
         } else {

@@ -76,6 +76,7 @@ struct ArrivedEvent<'a> {
 
 /// Moves the arm, then holds it if its motors would release it on exit.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
+    // Signals are handled before the arm is enabled, so that Ctrl-C never leaves a moving arm.
     let stop = signals::stop_on_signals_logging(
         "bringing the arm to rest; Ctrl-C again applies on_loss at once",
     )?;
@@ -85,6 +86,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     check(args, &rig)?;
     let mut arm = SupervisedArm::new(open::movable_arm(&rig)?, &rig);
     let bar = print::bar(None, "{spinner} {elapsed} {msg}", args.json);
+    // An arm with an error accepts no target, so it recovers first.
     if args.recover {
         arm.recover()?;
         log::info!("the arm has recovered");
@@ -92,6 +94,8 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let initial = arm.read()?;
     if args.to.is_some() || !args.by.is_empty() {
         let requested = target(args, &rig.arm.joints, &initial);
+        // The target is checked before it is sent. The driver would clamp it, and the arm would
+        // move although the target is a mistake.
         check_range(&rig, &requested, &initial)?;
         let target = arm.command(&requested)?;
         for (joint, (requested, accepted)) in rig
@@ -117,6 +121,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         })?;
         report_arrival(args, &rig.arm.joints, &target, &last, began)?;
     }
+    // Otherwise, the motors would release the arm when this program ends.
     if motion.on_loss != OnLoss::Hold && !args.exit_on_arrival {
         log::info!("{HOLDING}");
         arm.hold(&stop, |state| {
@@ -140,12 +145,14 @@ pub(super) fn motion_of(rig: &Rig) -> Result<&ArmMotion, BadArgument> {
 fn check(args: &Args, rig: &Rig) -> Result<(), BadArgument> {
     let joints = &rig.arm.joints;
     if let Some(to) = args.to.as_ref().filter(|to| to.len() != joints.len()) {
-        let (n, names) = (to.len(), joints.join(", "));
+        let n = to.len();
+        let names = joints.join(", ");
         return Err(BadArgument(format!(
             "--to has {n} positions, the arm has {} joints: {names}",
             joints.len()
         )));
     }
+    // Both the sum and the last of two values may be meant.
     if let Some(joint) = joints
         .iter()
         .find(|joint| args.by.iter().filter(|(by, _)| by == *joint).count() > 1)
@@ -173,11 +180,11 @@ fn check_range(rig: &Rig, requested: &JointTarget, now: &JointState) -> anyhow::
         let Some(joint_ix) = chain.joint_names().iter().position(|known| known == joint) else {
             continue;
         };
-        let (lower, upper) = (
-            chain.limits()[joint_ix].lower,
-            chain.limits()[joint_ix].upper,
-        );
-        let (requested, now) = (requested.position[ix], now.position[ix]);
+        let lower = chain.limits()[joint_ix].lower;
+        let upper = chain.limits()[joint_ix].upper;
+        let requested = requested.position[ix];
+        let now = now.position[ix];
+        // Rounded positions of a joint at its limit may lie slightly outside.
         if (requested - now).abs() > TOLERANCE_RAD
             && !(lower - TOLERANCE_RAD..=upper + TOLERANCE_RAD).contains(&requested)
         {
@@ -191,6 +198,7 @@ fn check_range(rig: &Rig, requested: &JointTarget, now: &JointState) -> anyhow::
 }
 
 fn target(args: &Args, joints: &[String], now: &JointState) -> JointTarget {
+    // Without `--to`, joints that `--by` does not name stay where they are.
     let mut position = args.to.clone().unwrap_or_else(|| now.position.clone());
     for (joint, delta) in &args.by {
         let moved = joints
@@ -216,14 +224,14 @@ fn report_arrival(
         .iter()
         .zip(&last.position)
         .map(|(target, actual)| (target - actual).abs());
-    let (error, seconds) = (errors.fold(0.0, f64::max), clock::now().secs_since(began));
+    let error = errors.fold(0.0, f64::max);
+    let seconds = clock::now().secs_since(began);
     if args.json {
-        let (target, position) = (&target.position[..], &last.position[..]);
         return print::report_json(&ArrivedEvent {
             event: "done",
             joints,
-            target,
-            position,
+            target: &target.position,
+            position: &last.position,
             error,
             seconds,
         });

@@ -152,13 +152,15 @@ impl Recorded {
 
     /// Dropped images, one message per camera.
     fn data_losses(&self) -> Vec<String> {
-        let sentence = |(camera, dropped): (&String, &DroppedImages)| {
-            format!(
-                "camera {camera:?} dropped {} color and {} depth images",
-                dropped.images, dropped.depth_images
-            )
-        };
-        self.dropped.iter().map(sentence).collect()
+        self.dropped
+            .iter()
+            .map(|(camera, dropped)| {
+                format!(
+                    "camera {camera:?} dropped {} color and {} depth images",
+                    dropped.images, dropped.depth_images
+                )
+            })
+            .collect()
     }
 }
 
@@ -185,6 +187,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         Vec::new()
     };
     let rig = Rig::load(&args.rig_file, &overrides)?;
+    // Before the devices are opened, as they may take long to start.
     check_end(args, &rig)?;
     if args.out.exists() {
         return Err(drivers::Error::Exists {
@@ -221,6 +224,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
                 break;
             }
         };
+        // The limit counts device time, so that a slow simulation records as much as a fast one.
         let since_first = sample.stamp().0 - first.get_or_insert(sample.stamp()).0;
         recorded.seconds = recorded.seconds.max(since_first as f64 * 1e-9);
         if args
@@ -229,6 +233,8 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         {
             break;
         }
+        // The file ends with its last complete chunk, so its contents are counted instead of what
+        // was written.
         if let Err(error) = recorder.write(&sample) {
             data_losses.push(format!("{:#}", anyhow::Error::new(error)));
             recorded = recorded.recount_from_file();
@@ -238,6 +244,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         bar.set_message(recorded.summary());
     }
     bar.finish_and_clear();
+    // After a write error, the file has ended already.
     let finished = data_losses.is_empty().then(|| recorder.finish());
     let n_written = match finished {
         Some(Ok(finished)) => Some(finished.n_samples),
@@ -248,6 +255,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         }
         None => None,
     };
+    // The recording is closed before errors are returned, so that its data is complete.
     if let Some(error) = input_error {
         let finished = format!(
             "a device failed; {} contains the data up to that point",
@@ -255,6 +263,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         );
         return Err(anyhow::Error::new(error).context(finished));
     }
+    // An empty file would only look like a recording.
     if n_written == Some(0) {
         return Err(InsufficientData(format!(
             "no device sent any data, so {} was not written",

@@ -135,6 +135,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         .iter()
         .map(|camera| args.request(camera, size_px))
         .collect::<Result<Vec<_>, _>>()?;
+    // Everything that can be refused is checked before the GPU is opened and the model is loaded.
     expect_model(&args.model)?;
     check_no_overwrite(&args.out, requests.len())?;
     signals::remove_partial_files_on_signals()?;
@@ -145,6 +146,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         edits,
         ..
     } = loaded;
+    // Shared by all requests, because a model may have many edits.
     let edits = Arc::new(edits);
     std::fs::create_dir_all(&args.out)
         .with_context(|| format!("cannot create the folder {}", args.out.display()))?;
@@ -155,6 +157,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     );
     let mut covered_fracs = Vec::new();
     for (ix, request) in requests.iter().enumerate() {
+        // The request is timed alone: encoding and writing files are not part of drawing.
         let since = Instant::now();
         let picture = model.render(&RenderRequest {
             edits: Arc::clone(&edits),
@@ -175,6 +178,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         }
     }
     bar.finish_and_clear();
+    // An empty model has a note of its own.
     if !is_empty {
         warn_if_hardly_covered(&covered_fracs);
     }
@@ -262,18 +266,8 @@ fn write(
     picture: &Picture,
     with_depth: bool,
 ) -> anyhow::Result<(PathBuf, Option<PathBuf>)> {
-    let [width, height] = picture.size_px;
     let [file, depth] = files(folder, ix);
-    let write_png = |inside: &Path| -> anyhow::Result<()> {
-        Ok(image::save_buffer(
-            inside,
-            &picture.rgba_srgb,
-            width,
-            height,
-            image::ExtendedColorType::Rgba8,
-        )?)
-    };
-    files::create_from(&file, write_png)
+    files::create_from(&file, |inside| write_png(inside, picture))
         .with_context(|| format!("cannot write {}", file.display()))?;
     let depth = with_depth.then_some(depth);
     if let Some(depth) = &depth {
@@ -281,6 +275,17 @@ fn write(
             .with_context(|| format!("cannot write {}", depth.display()))?;
     }
     Ok((file, depth))
+}
+
+fn write_png(file: &Path, picture: &Picture) -> anyhow::Result<()> {
+    let [width, height] = picture.size_px;
+    Ok(image::save_buffer(
+        file,
+        &picture.rgba_srgb,
+        width,
+        height,
+        image::ExtendedColorType::Rgba8,
+    )?)
 }
 
 /// Writes depth as a `[height, width]` array of 32-bit floats.

@@ -124,11 +124,14 @@ const LOCKSTEP: &str = "lockstep";
 const CORRECTED_RIG: &str = "corrected-rig.toml";
 const RECORD: &str = "record";
 
-/// Time for which the server stays up, so that connected clients receive the last status.
+/// Time for which the server stays up, so that connected clients receive the last status. They are
+/// on this computer or a local network, where a message arrives within milliseconds.
 const FINAL_STATUS_TIME: Duration = Duration::from_millis(400);
-/// Steps between two keyframes if the flag is not given.
+/// Steps between two keyframes if the flag is not given. With more, a model learns more from each
+/// keyframe before the next one, and the run takes longer.
 const DEFAULT_STEPS_PER_KEYFRAME: u64 = 10;
-/// Maximum time of the scheduled evaluations, as a fraction of the training time.
+/// Maximum time of the scheduled evaluations, as a fraction of the training time. With more, the
+/// scores are known more often, but the model is worse at the same time.
 const MAX_EVALUATION_FRAC: f64 = 0.1;
 /// Keyframes wait during an evaluation, so it must be short, especially on a software adapter.
 const MAX_IMAGES_SCORED_LIVE: usize = 12;
@@ -161,7 +164,8 @@ struct RunDetails {
 /// Runs until a limit, the end of the devices, or Ctrl-C; saves the model, its keyframes and the
 /// effective rig file.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
-    let (mut created, mut has_keyframes) = (CreatedFolders::default(), false);
+    let mut created = CreatedFolders::default();
+    let mut has_keyframes = false;
     let result = drive(args, &mut created, &mut has_keyframes);
     // The folder of a run that failed before its first keyframe contains nothing of use.
     created.keep_unless(
@@ -172,12 +176,13 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     result
 }
 
-/// Runs and saves. Sets `has_keyframes` as soon as the run is over.
+/// Runs until the end, and saves the results. Sets `has_keyframes` when the run is over.
 fn drive(
     args: &Args,
     created: &mut CreatedFolders,
     has_keyframes: &mut bool,
 ) -> anyhow::Result<Exit> {
+    // The previous run is read before anything else, because its flags decide what this run does.
     let previous = args.resume.as_deref().map(PreviousRun::read).transpose()?;
     if let Some(previous) = &previous
         && args.is_finished(previous)
@@ -191,6 +196,8 @@ fn drive(
     let args = &previous
         .as_ref()
         .map_or_else(|| args.clone(), |previous| args.with_flags_of(previous));
+    // Everything that can fail because of the arguments has failed before this line, or in `start`
+    // before the devices are opened.
     let mut running = start(args, previous.as_ref(), created)?;
     let result = loop {
         match running.run_time_slice() {
@@ -212,10 +219,14 @@ fn drive(
         page,
         ..
     } = running;
+    // From here on, the results of the run are saved whatever happens. Then the folder must stay,
+    // even after an error.
     *has_keyframes = !live.keyframes().is_empty();
     let hub = live.hub();
     if let Err(error) = result {
+        // The devices are stopped before saving, which may take minutes.
         stop.request();
+        // Without a GPU, the model cannot be read back. Its last checkpoint and the input remain.
         if error.is_gpu_error() || error.is_gpu_unrecoverable() {
             return Err(keep_input(live, &folders, error).into());
         }
@@ -230,26 +241,33 @@ fn drive(
     }
     stop.request();
     let (exit, models) = save(live, args, &rig, folders, &damage)?;
+    // After a signal, the user expects the program to end.
     if args.keeps_serving() && !models.is_empty() && !stop.signaled() {
         print::report(format_args!(
             "serving the page at {} until Ctrl-C",
             page.url()
         ));
-        let shown = |FinishedModel {
-                         kind,
-                         method,
-                         edits,
-                         folder,
-                         ..
-                     }| ServedModel {
-            kind,
-            method,
-            edits,
-            path: folder,
-        };
-        ModelViewer::new(models.into_iter().map(shown).collect(), hub).serve(&stop);
+        let models = models.into_iter().map(served_model).collect();
+        ModelViewer::new(models, hub).serve(&stop);
     }
     Ok(exit)
+}
+
+/// A finished model as the page shows it after the run.
+fn served_model(model: FinishedModel) -> ServedModel {
+    let FinishedModel {
+        kind,
+        method,
+        edits,
+        folder,
+        ..
+    } = model;
+    ServedModel {
+        kind,
+        method,
+        edits,
+        path: folder,
+    }
 }
 
 /// Publishes the result of a run to its page.
@@ -258,16 +276,13 @@ fn publish_end(hub: &Hub, models: &[FinishedModel]) {
         1 => model.scores.to_string(),
         _ => format!("{} {}", model.kind.name(), model.scores),
     };
-    let folder = |model: &FinishedModel| {
-        match models.len() {
-            1 => model.folder.as_path(),
-            _ => model.folder.parent().unwrap_or(&model.folder),
-        }
-        .display()
-        .to_string()
-    };
+    // Several models have a subfolder each.
+    let folder = models.first().map(|model| match models.len() {
+        1 => model.folder.as_path(),
+        _ => model.folder.parent().unwrap_or(&model.folder),
+    });
     hub.set_run_result(RunResult {
-        folder: models.first().map(folder),
+        folder: folder.map(|folder| folder.display().to_string()),
         scores: models.iter().map(name).collect::<Vec<_>>().join("; "),
         seconds: models.iter().map(|model| model.seconds).fold(0.0, f64::max),
     });
@@ -340,13 +355,18 @@ pub(super) fn start(
     previous: Option<&PreviousRun>,
     created: &mut CreatedFolders,
 ) -> anyhow::Result<Running> {
+    // First all checks of the arguments, so that an error of the user does not start devices,
+    // compile kernels or create folders.
     args.page.check()?;
+    // The results of another run in this folder would be overwritten.
     if let Some(out) = &args.out {
         run_folder::check_no_model(out)?;
         if args.resume.as_ref() != Some(out) {
             run_folder::check_no_unfinished_run(out)?;
         }
     }
+    // Signals are handled before the rig is read, so that Ctrl-C during a long start is an orderly
+    // end, too.
     let stop = signals::stop_on_signals()?;
     let mut overrides = args.overrides();
     overrides.extend(previous.map(PreviousRun::overrides).into_iter().flatten());
@@ -370,6 +390,8 @@ pub(super) fn start(
         serde_json::json!(training.count.unwrap_or(CountPolicy::ToCap)),
     ));
     let pace = args.pace(&rig)?;
+    // The GPU is opened before the devices: their queues fill while the GPU starts, and images
+    // would be lost.
     let gpu = open_gpu()?;
     let RefineSettings {
         align,
@@ -384,8 +406,9 @@ pub(super) fn start(
     };
     let mut models: Vec<Resumed> = match previous {
         Some(previous) => vec![previous.resume(&gpu)?],
-        None => {
-            let start = |model_spec: ModelSpec| {
+        None => methods::specs(&kinds, &common, &settings)?
+            .into_iter()
+            .map(|model_spec| {
                 let method = model_spec.start(gpu.clone())?;
                 Ok(Resumed {
                     model_spec,
@@ -393,14 +416,11 @@ pub(super) fn start(
                     untrained: Vec::new(),
                     edits: Edits::default(),
                 })
-            };
-            let model_specs = methods::specs(&kinds, &common, &settings)?;
-            model_specs
-                .into_iter()
-                .map(start)
-                .collect::<session::Result<_>>()?
-        }
+            })
+            .collect::<session::Result<_>>()?,
     };
+    // The page is served before kernels are compiled, so that its address in use is reported at
+    // once, and viewers can connect meanwhile.
     let hub = Hub::new();
     let page = args.page.serve(&hub)?;
     for finding in doctor::suspicious_values(&rig) {
@@ -410,6 +430,7 @@ pub(super) fn start(
     models
         .iter_mut()
         .try_for_each(|model| model.method.prepare())?;
+    // Only now the devices, because their data is used from the first sample on.
     let device_notes = Notes::default();
     let Opened {
         rig,
@@ -418,6 +439,8 @@ pub(super) fn start(
         stamp_clock,
     } = args.open(rig)?.with_tag_check(&device_notes)?;
     page.print(args.json, serde_json::json!({}))?;
+    // Folders come after the devices, whose rig, with the calibration that cameras report, is
+    // written there.
     let folders = created.make_each(args.out(), &kinds, Some(&rig))?;
     let held = previous.map_or(&[][..], |previous| &previous.keyframes);
     let (input, evicted) = args.input(&rig, (source, stamp_clock), held)?;
@@ -426,97 +449,27 @@ pub(super) fn start(
     }
     let feed = Feed::start(input, Box::new(Viewers(hub.clone())), stop.clone())?;
     let notes = notes(&gpu);
-    let evaluators = Evaluators {
-        during_training: Evaluator::psnr_only(),
-        max_images_during_training: match gpu.is_software() {
-            true => MAX_IMAGES_SCORED_LIVE_ON_CPU,
-            false => MAX_IMAGES_SCORED_LIVE,
-        },
-        max_frac_during_training: Some(MAX_EVALUATION_FRAC),
-        at_end: Evaluator::thorough(None)?,
-    };
+    let evaluators = evaluators(&gpu)?;
     let limits = Limits {
         seconds: args.seconds,
         steps: args.steps,
     };
-    let clock = Clock::default();
+    let setup = SessionSetup {
+        args,
+        previous,
+        gpu: &gpu,
+        rig: &rig,
+        evaluators,
+        limits,
+        clock: Clock::default(),
+        n_models: kinds.len(),
+        held,
+        evicted: &evicted,
+        stop: &stop,
+    };
     let mut sessions = Vec::new();
-    for (
-        Resumed {
-            model_spec: ModelSpec { kind, options },
-            mut method,
-            untrained,
-            edits,
-        },
-        folder,
-    ) in models.into_iter().zip(&folders)
-    {
-        let from_step = previous
-            .is_some()
-            .then(|| method.n_total_steps())
-            .transpose()?;
-        let description = RunDescription {
-            method: kind.name(),
-            data: args.record.as_deref().or(args.from.as_deref()),
-            adapter: gpu.describe(),
-            scale: rig.train.scale,
-            depth_from: None,
-            points: None,
-            from_step,
-            options: options.clone(),
-        };
-        let settings = Settings::new(description);
-        let mut decisions = DecisionLog::create(folder, settings.clone())?;
-        let is_new =
-            |keyframe: &Arc<Keyframe>| untrained.iter().any(|other| Arc::ptr_eq(other, keyframe));
-        for keyframe in held.iter().filter(|keyframe| !is_new(keyframe)) {
-            decisions.restored(from_step.unwrap_or_default(), keyframe);
-        }
-        let recovery = Recovery {
-            model_spec: ModelSpec { kind, options },
-            folder: folder.clone(),
-            resumed: previous.map(|previous| previous.folder.clone()),
-            known: Vec::new(), // The session holds all keyframes.
-            settings,
-            resume_command: args.resume_command(folder),
-        };
-        let console = Console::new(OutputMode::of_command(args.json), limits, kinds.len());
-        let checkpoints = Checkpoints::new(folder, args.checkpoints.options());
-        let run_flags = RunFlags {
-            depth_from: None,
-            flags: args.flags(limits),
-        };
-        let session = Session::new(
-            gpu.clone(),
-            (kind, method),
-            evaluators.clone(),
-            limits,
-            Box::new(console),
-        )
-        .with_stop(&stop)
-        .with_edits(edits)
-        .with_stepwise_scoring()
-        .with_checkpoints(checkpoints.map(|to| to.with_flags(run_flags).with_keyframes(folder)))
-        .with_decisions(decisions)
-        .with_data(args.data_source(folder))
-        .with_folders(KeptFolder::of_run(folder, kinds.len() > 1))
-        .with_recovery(recovery);
-        let mut session = match previous {
-            Some(previous) => session.with_elapsed_secs(previous.checkpoint.seconds),
-            None if kinds.len() == 1 => session,
-            None => session.with_shared_clock(clock.clone()),
-        };
-        for keyframe in held {
-            if is_new(keyframe) {
-                session.push(keyframe)?
-            } else {
-                session.hold(keyframe)
-            }
-        }
-        for (camera, stamp) in &evicted {
-            session.remove(camera, *stamp)?;
-        }
-        sessions.push(session);
+    for (resumed, folder) in models.into_iter().zip(&folders) {
+        sessions.push(setup.session(resumed, folder)?);
     }
     let start_keyframes = rig
         .join
@@ -544,9 +497,130 @@ pub(super) fn start(
     })
 }
 
+/// How the models of a live run are scored.
+fn evaluators(gpu: &Gpu) -> anyhow::Result<Evaluators> {
+    Ok(Evaluators {
+        during_training: Evaluator::psnr_only(),
+        max_images_during_training: if gpu.is_software() {
+            MAX_IMAGES_SCORED_LIVE_ON_CPU
+        } else {
+            MAX_IMAGES_SCORED_LIVE
+        },
+        max_frac_during_training: Some(MAX_EVALUATION_FRAC),
+        at_end: Evaluator::thorough(None)?,
+    })
+}
+
+/// What the sessions of a run have in common.
+struct SessionSetup<'a> {
+    args: &'a Args,
+    previous: Option<&'a PreviousRun>,
+    gpu: &'a Arc<Gpu>,
+    rig: &'a Rig,
+    evaluators: Evaluators,
+    limits: Limits,
+    /// Shared by several sessions, because they take turns on one GPU.
+    clock: Clock,
+    n_models: usize,
+    /// Keyframes of the previous run.
+    held: &'a [Arc<Keyframe>],
+    /// Those of them that exceed the memory limit.
+    evicted: &'a [Evicted],
+    stop: &'a Stop,
+}
+
+impl SessionSetup<'_> {
+    /// The session of one model, with the keyframes of the previous run.
+    fn session(&self, resumed: Resumed, folder: &Path) -> anyhow::Result<Session> {
+        let Resumed {
+            model_spec: ModelSpec { kind, options },
+            mut method,
+            untrained,
+            edits,
+        } = resumed;
+        let args = self.args;
+        let from_step = self
+            .previous
+            .is_some()
+            .then(|| method.n_total_steps())
+            .transpose()?;
+        let description = RunDescription {
+            method: kind.name(),
+            data: args.record.as_deref().or(args.from.as_deref()),
+            adapter: self.gpu.describe(),
+            scale: self.rig.train.scale,
+            depth_from: None,
+            points: None,
+            from_step,
+            options: options.clone(),
+        };
+        let settings = Settings::new(description);
+        // The log repeats the run, so it also lists the keyframes with which the run begins.
+        let mut decisions = DecisionLog::create(folder, settings.clone())?;
+        let is_new =
+            |keyframe: &Arc<Keyframe>| untrained.iter().any(|other| Arc::ptr_eq(other, keyframe));
+        for keyframe in self.held.iter().filter(|keyframe| !is_new(keyframe)) {
+            decisions.restored(from_step.unwrap_or_default(), keyframe);
+        }
+        let recovery = Recovery {
+            model_spec: ModelSpec { kind, options },
+            folder: folder.to_owned(),
+            resumed: self.previous.map(|previous| previous.folder.clone()),
+            known: Vec::new(), // The session holds all keyframes.
+            settings,
+            resume_command: args.resume_command(folder),
+        };
+        let console = Console::new(
+            OutputMode::of_command(args.json),
+            self.limits,
+            self.n_models,
+        );
+        let checkpoints = Checkpoints::new(folder, args.checkpoints.options());
+        let run_flags = RunFlags {
+            depth_from: None,
+            flags: args.flags(self.limits),
+        };
+        let session = Session::new(
+            self.gpu.clone(),
+            (kind, method),
+            self.evaluators.clone(),
+            self.limits,
+            Box::new(console),
+        )
+        .with_stop(self.stop)
+        .with_edits(edits)
+        .with_stepwise_scoring()
+        .with_checkpoints(checkpoints.map(|to| to.with_flags(run_flags).with_keyframes(folder)))
+        .with_decisions(decisions)
+        .with_data(args.data_source(folder))
+        .with_folders(KeptFolder::of_run(folder, self.n_models > 1))
+        .with_recovery(recovery);
+        let mut session = match self.previous {
+            // Limits count from the start of the first run.
+            Some(previous) => session.with_elapsed_secs(previous.checkpoint.seconds),
+            None if self.n_models == 1 => session,
+            None => session.with_shared_clock(self.clock.clone()),
+        };
+        // The model of the checkpoint was trained on its keyframes already; only others are pushed.
+        for keyframe in self.held {
+            if is_new(keyframe) {
+                session.push(keyframe)?
+            } else {
+                session.hold(keyframe)
+            }
+        }
+        // They exceed the memory limit of this run.
+        for (camera, stamp) in self.evicted {
+            session.remove(camera, *stamp)?;
+        }
+        Ok(session)
+    }
+}
+
 /// Closes the recording and writes the keyframe lists after a GPU failure. Returns the error with a
 /// note of what was saved.
 fn keep_input(mut live: Live, folders: &[PathBuf], error: session::Error) -> session::Error {
+    // Described while the sessions still exist.
     let recoverable = live.describe_recoverable();
     let (sessions, input_result) = live.finish();
     for (session, folder) in sessions.iter().zip(folders) {
@@ -581,6 +655,7 @@ fn save(
     folders: Vec<PathBuf>,
     damage: &OnceLock<String>,
 ) -> anyhow::Result<(Exit, Vec<FinishedModel>)> {
+    // Everything that describes the run is read first, because `finish` consumes it.
     let hub = live.hub();
     let n_keyframes = live.keyframes().len();
     let n_train = live
@@ -591,6 +666,7 @@ fn save(
     let position_error_m = max_position_error_m(live.keyframes());
     let recoverable = live.describe_recoverable();
     let mut latencies = live.ledger().latencies();
+    // Closes the recording and ends the input thread, whose counts are then final.
     let (mut sessions, input_result) = live.finish();
     sessions.iter_mut().for_each(Session::check_folders);
     let input_result = match input_result {
@@ -634,6 +710,7 @@ fn save(
             .map(|error| format!("the recording is incomplete: {error:#}")),
     );
     data_losses.extend(damage.get().cloned());
+    // Estimated before the models are saved, because saving consumes the sessions.
     let corrected = corrected_rigs(rig, &mut sessions, &folders);
     let stations = input_result
         .stations
@@ -680,6 +757,7 @@ fn save(
             print_next_commands(&models);
         }
     }
+    // The page shows the result before errors are returned, because viewers have waited for it.
     publish_end(&hub, &models);
     listed?;
     for (rig, file) in corrected? {
@@ -708,6 +786,7 @@ fn corrected_rigs(
     for (session, folder) in sessions.iter_mut().zip(folders) {
         let learned = session.camera_corrections()?;
         let corrected = corrected_rig::corrected(rig, session.alignment(), &learned)?;
+        // An unchanged file would only look like a correction.
         if !corrected.has_same_calibration(rig) {
             rigs.push((corrected, folder.join(CORRECTED_RIG)));
         }
@@ -827,6 +906,8 @@ impl Args {
     /// Returns these flags; missing ones are taken from the previous run.
     fn with_flags_of(&self, previous: &PreviousRun) -> Self {
         let flag = |name: &str| previous.checkpoint.flags.get(name);
+        // A given limit replaces both previous ones. Otherwise, `--steps` would not continue a run
+        // that had reached its `--seconds`.
         let has_limit = self.seconds.is_some() || self.steps.is_some();
         let limit = |name: &str| flag(name).filter(|_| !has_limit);
         if let (Some(file), None) = (flag(RECORD), &self.record) {
@@ -860,7 +941,8 @@ impl Args {
     }
 
     fn report_finished(&self, previous: &PreviousRun) -> anyhow::Result<Exit> {
-        let (folder, seconds) = (&previous.folder, previous.checkpoint.seconds);
+        let folder = &previous.folder;
+        let seconds = previous.checkpoint.seconds;
         if self.json {
             print::report_json(
                 &serde_json::json!({ "event": "finished", "seconds": seconds, "out": folder }),
@@ -877,12 +959,14 @@ impl Args {
 
     /// The given folder; an unfinished run continues in its previous folder.
     fn out(&self) -> Option<&Path> {
-        let unfinished = || {
-            self.resume
-                .as_deref()
-                .filter(|folder| run_folder::check_no_model(folder).is_ok())
-        };
-        self.out.as_deref().or_else(unfinished)
+        self.out.as_deref().or_else(|| self.unfinished_folder())
+    }
+
+    /// The folder of the previous run, if it contains no model yet.
+    fn unfinished_folder(&self) -> Option<&Path> {
+        self.resume
+            .as_deref()
+            .filter(|folder| run_folder::check_no_model(folder).is_ok())
     }
 
     /// The command that resumes the run in a folder.
@@ -974,6 +1058,7 @@ impl Args {
     /// Recordings and lockstep simulations wait for the trainer; everything else runs in real time.
     fn pace(&self, rig: &Rig) -> Result<Pace, BadArgument> {
         let is_simulated = self.sim || rig.arm.driver == ArmDriver::Sim;
+        // A recording waits for the trainer unless a flag says otherwise.
         let is_lockstep = match self.from {
             Some(_) => !self.real_time,
             None => is_simulated && rig.sim.lockstep,
@@ -996,15 +1081,8 @@ impl Args {
 
 /// A sentence that explains why a run ended without a model.
 fn no_model_reason(n_keyframes: usize, counts: &Counts, rig: &Rig) -> String {
-    let quoted = |names: Vec<&str>| {
-        names
-            .iter()
-            .map(|name| format!("{name:?}"))
-            .collect::<Vec<_>>()
-            .join(", ")
-    };
-    let expected = quoted(rig.cameras.iter().map(|camera| &*camera.name).collect());
-    let unknown = quoted(counts.unknown_cameras.iter().map(|name| &**name).collect());
+    let expected = quoted_names(rig.cameras.iter().map(|camera| &*camera.name));
+    let unknown = quoted_names(counts.unknown_cameras.iter().map(|name| &**name));
     let n_unknown = counts
         .rejected
         .get(&Rejection::UnknownCamera)
@@ -1028,19 +1106,30 @@ fn no_model_reason(n_keyframes: usize, counts: &Counts, rig: &Rig) -> String {
     }
 }
 
+fn quoted_names<'a>(names: impl Iterator<Item = &'a str>) -> String {
+    names
+        .map(|name| format!("{name:?}"))
+        .collect::<Vec<_>>()
+        .join(", ")
+}
+
 /// Largest position error of the keyframes; `None` if no true poses are known (only simulators
 /// report them).
 fn max_position_error_m(keyframes: &[Arc<Keyframe>]) -> Option<f64> {
-    let error_m = |keyframe: &Arc<Keyframe>| {
-        let truth = keyframe
-            .truth
-            .as_ref()?
-            .world_from_camera
-            .translation
-            .vector;
-        Some((keyframe.world_from_camera.translation.vector - truth).norm())
-    };
-    keyframes.iter().filter_map(error_m).reduce(f64::max)
+    keyframes
+        .iter()
+        .filter_map(position_error_m)
+        .reduce(f64::max)
+}
+
+fn position_error_m(keyframe: &Arc<Keyframe>) -> Option<f64> {
+    let truth = keyframe
+        .truth
+        .as_ref()?
+        .world_from_camera
+        .translation
+        .vector;
+    Some((keyframe.world_from_camera.translation.vector - truth).norm())
 }
 
 /// Notes that the page shows to its viewers.

@@ -28,7 +28,8 @@ use trainer::checkpoint::Checkpoint;
 use trainer::gpu::Gpu;
 use trainer::{Edits, ModelKind, ModelSpec, Resumed};
 
-/// Maximum time of the scheduled evaluations, as a fraction of the training time.
+/// Maximum time of the scheduled evaluations, as a fraction of the training time. With more, the
+/// scores are known more often, but training takes longer.
 const MAX_EVALUATION_FRAC: f64 = 0.1;
 /// Training time if no flag limits it.
 const DEFAULT_SECONDS: f64 = 120.0;
@@ -128,6 +129,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
 
 fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
     let started = Instant::now();
+    // First all checks that read little, so that an error of the user costs no time.
     let replay = args
         .replay_decisions
         .as_deref()
@@ -142,6 +144,7 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
         }
     }
     let stop = signals::stop_on_signals()?;
+    // Then the checkpoint of a run that is continued, whose flags complete the given ones.
     let checkpoint = args.resume.as_deref().map(checkpoints::read).transpose()?;
     let subject = args
         .resume
@@ -161,6 +164,7 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
     let args = &checkpoint
         .as_ref()
         .map_or_else(|| args.clone(), |checkpoint| args.with_flags_of(checkpoint));
+    // A replay ends with the decisions of its log, so it has no limits of its own.
     let limits = match (&replay, &checkpoint) {
         (Some(_), _) => Limits::default(),
         (None, checkpoint) => {
@@ -170,6 +174,8 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
             session::limits(args.seconds, args.steps, previous_secs + DEFAULT_SECONDS)?
         }
     };
+    // Rendered depth changes the data. A checkpoint or log therefore names the model that rendered
+    // it, and another model is refused.
     let depth_from = args
         .depth_from
         .as_deref()
@@ -179,7 +185,8 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
     if let Some(replay) = &replay {
         replay.check_depth_from(depth_model_sha256)?;
     }
-    let (mut images, mut overrides) = (args.images.options(), args.training.options().overrides());
+    let mut images = args.images.options();
+    let mut overrides = args.training.options().overrides();
     let mut realign = args.training.options().realign();
     if let Some(replay) = &replay {
         images.scale = Some(replay.decisions.settings.scale);
@@ -198,6 +205,7 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
     } else if replay.is_none() {
         session::check_before_data(&args.training.options(), &args.data, &images)?;
     }
+    // LPIPS takes far longer than PSNR and SSIM, so only the final model is scored with it.
     let evaluator = Evaluator::thorough(args.lpips_weights.as_deref())?;
     let evaluators = Evaluators {
         during_training: evaluator.without_lpips(),
@@ -205,6 +213,7 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
         max_frac_during_training: Some(MAX_EVALUATION_FRAC),
         at_end: evaluator,
     };
+    // Then the data, which may take minutes.
     let bar = ReadBar::new(args.json);
     let mut data = match &replay {
         Some(replay) => replay.load_data(&args.data, args.images.options().rig, &|read| {
@@ -228,10 +237,13 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
         };
         corrected_rig::check_target_file(rig, file)?; // Checked before training.
     }
+    // The GPU is opened after the data, so that it is not occupied while data is read.
     let gpu = open_gpu()?;
     if let Some(source) = &depth_from {
         data.render_depth(gpu.clone(), source, &|read| bar.show(read))?;
     }
+    // The data must be the same as in the run that is continued or repeated: other images or points
+    // would give another model.
     let initial_points = data.initial_points();
     let initial_points_sha256 = initial_points.as_deref().map(points_sha256);
     if let Some(replay) = &replay {
@@ -257,10 +269,12 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
         replay.check_start(from_step)?;
         replay.check_adapter(&gpu.describe());
     }
+    // Kernels are compiled now, so that the training time does not include it.
     models
         .iter_mut()
         .try_for_each(|model| model.method.prepare())?;
     let kinds: Vec<ModelKind> = models.iter().map(|model| model.model_spec.kind).collect();
+    // Folders are created only when nothing else can be refused.
     let folders = created.make_each(args.out(), &kinds, data.rig.as_ref())?;
     let mut flags = images.flags();
     flags.extend(realign.map(|is_on| (REALIGN.to_owned(), is_on.to_string())));
@@ -278,8 +292,10 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
     let untrained = models[0].untrained.clone(); // A resumed run has one model; several new models start with the same images.
     let is_untrained =
         |keyframe: &Arc<Keyframe>| untrained.iter().any(|other| Arc::ptr_eq(other, keyframe));
+    // Several models share the time, because they take turns on one GPU.
     let clock = Clock::default();
-    let (mut sessions, mut seeds) = (Vec::new(), Vec::new());
+    let mut sessions = Vec::new();
+    let mut seeds = Vec::new();
     for (
         Resumed {
             model_spec: ModelSpec { kind, options },
@@ -371,6 +387,7 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
         None => session::drive(&mut sessions, &untrained, preparation_time, &stop, open_gpu)?,
     }
 
+    // Read before the sessions are consumed. Errors are returned only after the models are saved.
     let corrected = args
         .write_rig
         .as_ref()
@@ -435,6 +452,22 @@ fn with_corrections(rig: &Rig, sessions: &mut [Session]) -> anyhow::Result<Rig> 
     Ok(rig.clone())
 }
 
+/// The path of an existing file, for a later run that may be started in another folder.
+fn canonical(file: &Path) -> String {
+    file.canonicalize()
+        .unwrap_or_else(|_| file.to_owned())
+        .display()
+        .to_string()
+}
+
+/// The path of a file to write, for the same purpose.
+fn absolute(file: &Path) -> String {
+    std::path::absolute(file)
+        .unwrap_or_else(|_| file.to_owned())
+        .display()
+        .to_string()
+}
+
 impl Args {
     /// The models to train, new or restored from a checkpoint.
     fn models(
@@ -460,39 +493,32 @@ impl Args {
                 gpu.is_software(),
             )?,
         };
-        let start = |model_spec: ModelSpec| {
-            let method = model_spec.start(gpu.clone())?;
-            Ok(Resumed {
-                model_spec,
-                method,
-                untrained: data.keyframes.clone(),
-                edits: Edits::default(),
+        model_specs
+            .into_iter()
+            .map(|model_spec| {
+                let method = model_spec.start(gpu.clone())?;
+                Ok(Resumed {
+                    model_spec,
+                    method,
+                    untrained: data.keyframes.clone(),
+                    edits: Edits::default(),
+                })
             })
-        };
-        model_specs.into_iter().map(start).collect()
+            .collect()
     }
 
     /// The flags to store in the checkpoint, besides those of the images, by name.
     fn flags(&self, limits: Limits) -> BTreeMap<String, String> {
-        let canonical = |file: &PathBuf| {
-            file.canonicalize()
-                .unwrap_or_else(|_| file.clone())
-                .display()
-                .to_string()
-        };
+        let depth_from = self.depth_from.as_deref().map(canonical);
+        let lpips_weights = self.lpips_weights.as_deref().map(canonical);
         // The file does not exist yet, so it cannot be canonicalized.
-        let to_write = |file: &PathBuf| {
-            std::path::absolute(file)
-                .unwrap_or_else(|_| file.clone())
-                .display()
-                .to_string()
-        };
+        let write_rig = self.write_rig.as_deref().map(absolute);
         let given = [
             (SECONDS, limits.seconds.map(|seconds| seconds.to_string())),
             (STEPS, limits.steps.map(|steps| steps.to_string())),
-            (DEPTH_FROM, self.depth_from.as_ref().map(canonical)),
-            (LPIPS_WEIGHTS, self.lpips_weights.as_ref().map(canonical)),
-            (WRITE_RIG, self.write_rig.as_ref().map(to_write)),
+            (DEPTH_FROM, depth_from),
+            (LPIPS_WEIGHTS, lpips_weights),
+            (WRITE_RIG, write_rig),
             (PROFILE, self.profile.then(|| true.to_string())),
         ];
         let flags = given
@@ -511,6 +537,8 @@ impl Args {
                 "no rig file is written: the previous run wrote {file:?}; to write it again, add --write-rig"
             );
         }
+        // A given limit replaces both previous ones. Otherwise, `--steps` would not continue a run
+        // that had reached its `--seconds`.
         let has_limit = self.seconds.is_some() || self.steps.is_some();
         let limit = |name: &str| flag(name).filter(|_| !has_limit);
         Self {
@@ -541,25 +569,24 @@ impl Args {
             || self.steps.is_some()
             || self.replay_decisions.is_some()
             || !self.images.options().flags().is_empty();
-        let has_model = || {
-            self.resume
-                .as_deref()
-                .is_some_and(|folder| run_folder::check_no_model(folder).is_err())
-        };
-        checkpoint.is_finished && !asks_for_more && has_model()
+        checkpoint.is_finished && !asks_for_more && self.has_saved_model()
+    }
+
+    /// Whether the folder of `--resume` contains a model.
+    fn has_saved_model(&self) -> bool {
+        self.resume
+            .as_deref()
+            .is_some_and(|folder| run_folder::check_no_model(folder).is_err())
     }
 
     fn report_finished(&self, checkpoint: &Checkpoint) -> anyhow::Result<Exit> {
         let folder = self.resume.as_deref().unwrap_or(Path::new(""));
-        let limit = |name| {
-            checkpoint
-                .flags
-                .get(name)
-                .map(|value| format!("--{name} {value}"))
-        };
-        let limits = [limit(STEPS), limit(SECONDS)]
+        let limits = [STEPS, SECONDS]
             .into_iter()
-            .flatten()
+            .filter_map(|name| {
+                let value = checkpoint.flags.get(name)?;
+                Some(format!("--{name} {value}"))
+            })
             .collect::<Vec<_>>()
             .join(" ");
         if self.json {
@@ -580,20 +607,20 @@ impl Args {
 
     /// The given folder; an unfinished run continues in its previous folder.
     fn out(&self) -> Option<&Path> {
-        let unfinished = || {
-            self.resume
-                .as_deref()
-                .filter(|folder| run_folder::check_no_model(folder).is_ok())
-        };
-        self.out.as_deref().or_else(unfinished)
+        self.out.as_deref().or_else(|| self.unfinished_folder())
+    }
+
+    /// The folder of the previous run, if it contains no model yet.
+    fn unfinished_folder(&self) -> Option<&Path> {
+        self.resume
+            .as_deref()
+            .filter(|folder| run_folder::check_no_model(folder).is_ok())
     }
 
     /// Logs in which ways the resumed run differs from an uninterrupted one.
     fn resumed(&self, resumed: Resumed) -> Resumed {
-        let (planned, step) = (
-            resumed.model_spec.options.common.n_planned_steps,
-            resumed.method.progress().step,
-        );
+        let planned = resumed.model_spec.options.common.n_planned_steps;
+        let step = resumed.method.progress().step;
         log::info!("continuing from step {step} of {planned} planned steps");
         if self.steps.is_some_and(|steps| steps > planned) {
             log::warn!(

@@ -73,6 +73,8 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let cameras = cameras(&paths);
     let models = paths.iter().map(|path| methods::load(gpu.clone(), path));
     let mut models = models.collect::<session::Result<Vec<LoadedModel>>>()?;
+    // Without cameras, the page needs another initial view, from outside the model. The bounds of a
+    // model take time, so they are only computed then.
     let bounds = if cameras.is_empty() {
         bounds(&mut models)?
     } else {
@@ -155,17 +157,18 @@ fn check_is_model(model: &Path) -> Result<(), BadArgument> {
 /// The cameras of the first model whose folder lists them. An unreadable list only causes a
 /// warning.
 fn cameras(models: &[PathBuf]) -> Vec<KeyframePose> {
-    let read = |folder: &PathBuf| {
-        camera_list::read(folder).unwrap_or_else(|error| {
-            log::warn!("cannot show cameras: {error:#}");
-            None
-        })
-    };
     let folders = models.iter().filter(|model| model.is_dir());
     folders
-        .filter_map(read)
+        .filter_map(|folder| read_cameras(folder))
         .find(|cameras| !cameras.is_empty())
         .unwrap_or_default()
+}
+
+fn read_cameras(folder: &Path) -> Option<Vec<KeyframePose>> {
+    camera_list::read(folder).unwrap_or_else(|error| {
+        log::warn!("cannot show cameras: {error:#}");
+        None
+    })
 }
 
 fn in_page(cameras: Vec<KeyframePose>, model_from_page: &Transform) -> Vec<KeyframePose> {
@@ -200,6 +203,7 @@ fn first_view(
         .collect();
     scene_hint::from_cameras(poses).or_else(|| {
         let Bounds { center_m, radius_m } = bounds?;
+        // The frame of the page may differ from that of the model.
         let center = model_from_page.inverse() * nalgebra::Point3::from(center_m);
         Some(scene_hint::from_bounds(&Bounds {
             center_m: center.coords.into(),
@@ -210,6 +214,7 @@ fn first_view(
 
 /// The report in a model's folder; `Null` if there is none.
 fn report(model: &Path) -> Value {
+    // Splat files of other programs have no report.
     let text = files::read_text(&model.join("report.json")).unwrap_or_default();
     serde_json::from_str(&text).unwrap_or_default()
 }
@@ -224,13 +229,8 @@ fn model_status(path: &Path, model: &LoadedModel) -> ModelStatus {
 
 fn trained_status(model: &Path, kind: ModelKind, progress: &Progress) -> ModelStatus {
     let report = report(model);
-    let (done, evaluations) = (&report["done"], report["evaluations"].as_array());
-    let point = |evaluation: &Value| {
-        Some((
-            evaluation["seconds"].as_f64()?,
-            evaluation["psnr"].as_f64()?,
-        ))
-    };
+    let done = &report["done"];
+    let evaluations = report["evaluations"].as_array();
     ModelStatus {
         method: kind.name().to_owned(),
         step: done["steps"].as_u64().unwrap_or(progress.step),
@@ -245,9 +245,17 @@ fn trained_status(model: &Path, kind: ModelKind, progress: &Progress) -> ModelSt
             .into_iter()
             .flatten()
             .chain([done])
-            .filter_map(point)
+            .filter_map(scored_point)
             .collect(),
     }
+}
+
+/// Training time and PSNR of an evaluation; `None` if it has no PSNR.
+fn scored_point(evaluation: &Value) -> Option<(f64, f64)> {
+    Some((
+        evaluation["seconds"].as_f64()?,
+        evaluation["psnr"].as_f64()?,
+    ))
 }
 
 #[cfg(test)]

@@ -38,23 +38,33 @@ impl Printed<'_> {
 
     /// Positions of all corners after alignment. `None` where this fails.
     fn aligned(&self, plane: &Plane, lattice: &Lattice) -> BTreeMap<Cell, Option<[f64; 2]>> {
-        let aligned = |(&cell, &pixel): (&Cell, &[f64; 2])| {
-            let neighborhood = |pixel_by_point| Neighborhood {
-                point_m: self.point_m(cell),
-                pixel,
-                pixel_by_point,
-                bend: lattice.bend(cell, pixel, self.square_m),
-                side_m: self.side_m,
-                reach_px: None,
-            };
-            let pixel_by_point = lattice.pixel_by_point(cell, pixel, self.square_m);
-            (
-                cell,
-                pixel_by_point
-                    .and_then(|map| template::find(plane, &self.surface, &neighborhood(map))),
-            )
+        // Every corner is predicted from the lattice before alignment, so that the result does not
+        // depend on the order of the corners.
+        lattice
+            .corners
+            .iter()
+            .map(|(&cell, &pixel)| (cell, self.aligned_corner(plane, lattice, cell, pixel)))
+            .collect()
+    }
+
+    /// Position of one corner after alignment.
+    fn aligned_corner(
+        &self,
+        plane: &Plane,
+        lattice: &Lattice,
+        cell: Cell,
+        pixel: [f64; 2],
+    ) -> Option<[f64; 2]> {
+        // Scale, shear and bend come from the neighbors only, so that any lens is supported.
+        let neighborhood = Neighborhood {
+            point_m: self.point_m(cell),
+            pixel,
+            pixel_by_point: lattice.pixel_by_point(cell, pixel, self.square_m)?,
+            bend: lattice.bend(cell, pixel, self.square_m),
+            side_m: self.side_m,
+            reach_px: None,
         };
-        lattice.corners.iter().map(aligned).collect()
+        template::find(plane, &self.surface, &neighborhood)
     }
 
     /// Position of a corner in the board frame, meters.

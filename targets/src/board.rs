@@ -65,27 +65,23 @@ impl TargetSpec {
     /// Corners of the pattern's bounding rectangle in the board frame: smallest x and y, largest x
     /// and y, meters.
     pub fn bounds_m(&self) -> [[f64; 2]; 2] {
-        let of_squares = |squares: [u32; 2], square_m: f64, first: f64| {
-            [
-                [first; 2],
-                squares.map(|count| f64::from(count) * square_m + first),
-            ]
-        };
         match self.pattern {
+            // The origin is the first inner corner, one square inside.
             Pattern::Chessboard { inner, square_m } => {
-                of_squares(inner.map(|count| count + 1), square_m, -square_m)
+                bounds_of_squares(inner.map(|count| count + 1), square_m, -square_m)
             }
             Pattern::Charuco {
                 squares, square_m, ..
-            } => of_squares(squares, square_m, 0.0),
+            } => bounds_of_squares(squares, square_m, 0.0),
             Pattern::Puzzleboard {
                 squares, square_m, ..
-            } => of_squares(squares, square_m, -square_m),
+            } => bounds_of_squares(squares, square_m, -square_m),
             Pattern::Aprilgrid {
                 tags,
                 tag_m,
                 spacing_frac,
             } => {
+                // Small squares, as wide as the gap between tags, surround the outermost tags.
                 let gap = tag_m * spacing_frac;
                 [
                     [-gap; 2],
@@ -111,13 +107,15 @@ impl TargetSpec {
         else {
             return vec![Transform::identity()];
         };
-        let quarters: &[f64] = match (
-            (columns + rows) % 2 == 0,
-            columns == rows && columns % 2 == 0,
-        ) {
-            (_, true) => &[0.0, 1.0, 2.0, 3.0],
-            (true, _) => &[0.0, 2.0],
-            _ => &[0.0],
+        // The numbers of squares are one larger. Opposite squares at the corners of the board have
+        // the same color if both numbers are even or both are odd; all four have it if both are
+        // odd.
+        let quarters: &[f64] = if columns == rows && columns % 2 == 0 {
+            &[0.0, 1.0, 2.0, 3.0]
+        } else if (columns + rows) % 2 == 0 {
+            &[0.0, 2.0]
+        } else {
+            &[0.0]
         };
         let center =
             Vector3::new(f64::from(columns - 1), f64::from(rows - 1), 0.0) * (square_m / 2.0);
@@ -129,6 +127,15 @@ impl TargetSpec {
     }
 }
 
+/// Smallest and largest x and y of a board of squares whose upper left corner is at
+/// `(first_m, first_m)`.
+fn bounds_of_squares(squares: [u32; 2], square_m: f64, first_m: f64) -> [[f64; 2]; 2] {
+    [
+        [first_m; 2],
+        squares.map(|count| f64::from(count) * square_m + first_m),
+    ]
+}
+
 /// Lower left, lower right, upper right and upper left corner of a square of side 1 whose top left
 /// corner is the origin.
 pub(crate) const CORNERS_FROM_LOWER_LEFT: [[f64; 2]; 4] =
@@ -136,7 +143,9 @@ pub(crate) const CORNERS_FROM_LOWER_LEFT: [[f64; 2]; 4] =
 
 /// Top left corner of a tag of an AprilGrid.
 pub(crate) fn tag_origin(tags: [u32; 2], tag_m: f64, spacing_frac: f64, tag: u32) -> [f64; 2] {
-    let (column, row_from_bottom) = (tag % tags[0], tag / tags[0]);
+    let column = tag % tags[0];
+    // Kalibr numbers the rows from the bottom, but y points down.
+    let row_from_bottom = tag / tags[0];
     let row = tags[1] - 1 - row_from_bottom;
     [column, row].map(|count| f64::from(count) * tag_m * (1.0 + spacing_frac))
 }

@@ -41,7 +41,8 @@ const ARUCO: [&str; 16] = [
     "6X6_50", "6X6_100", "6X6_250", "6X6_1000", "7X7_50", "7X7_100", "7X7_250", "7X7_1000",
 ];
 /// Largest number of wrong cells that are corrected in 4X4 markers, whose codes are similar, and in
-/// larger ones.
+/// larger ones. More corrections find more markers in bad images, and more markers where there are
+/// none.
 const CORRECTED: [u32; 2] = [0, 2];
 
 impl Dictionary {
@@ -95,6 +96,7 @@ impl Dictionary {
 
     /// Whether a cell of a marker without its border is black.
     pub(crate) fn is_black(&self, id: u32, row: usize, column: usize) -> bool {
+        // Specifications are checked to have no larger ids, so this is never reached.
         let code = self.codes.get(id as usize).copied().unwrap_or(0);
         code >> (row * self.n_bits + column) & 1 == 1
     }
@@ -115,8 +117,8 @@ impl Dictionary {
         if cells.len() != n * n {
             return None;
         }
-        // Cell of the upright marker, for each number of quarter turns that the marker appears
-        // rotated by.
+        // Cell of the upright marker, for each number of quarter turns by which the marker appears
+        // rotated.
         let cell = |turns: usize, row: usize, column: usize| match turns {
             0 => cells[row * n + column],
             1 => cells[column * n + (n - 1 - row)],
@@ -129,6 +131,7 @@ impl Dictionary {
                 code | u64::from(cell(quarter_turns, at / n, at % n)) << at
             });
             for (id, code) in (0..).zip(self.codes) {
+                // The Hamming distance. Of equals, the first id and rotation are kept.
                 let n_wrong = (seen ^ code).count_ones();
                 if n_wrong <= n_corrected && best.is_none_or(|best| n_wrong < best.n_wrong) {
                     best = Some(Match {

@@ -2,7 +2,8 @@
 
 use crate::error::NotDetected;
 
-/// Smallest side of an image that is searched.
+/// Smallest side of an image that is searched. The smallest chessboard has 4 by 4 squares, which
+/// are at most 6 pixels wide in such an image.
 const MIN_SIDE_PX: u32 = 24;
 
 /// An 8-bit gray image, row by row. Pixel `(0, 0)` covers `[0,1) x [0,1)`.
@@ -74,12 +75,14 @@ impl Plane {
     )]
     pub(crate) fn sample(&self, [x, y]: [f64; 2]) -> f32 {
         let clamp = |value: f64, size: usize| (value - 0.5).clamp(0.0, (size - 1) as f64);
-        let (x, y) = (clamp(x, self.width), clamp(y, self.height));
-        let (left, top) = (
-            (x as usize).min(self.width - 2),
-            (y as usize).min(self.height - 2),
-        );
-        let (right_frac, lower_frac) = ((x - left as f64) as f32, (y - top as f64) as f32);
+        let x = clamp(x, self.width);
+        let y = clamp(y, self.height);
+        // At the last column or row, the pixels to the left and above are used with a fraction of
+        // 1, so that the neighbors always exist.
+        let left = (x as usize).min(self.width - 2);
+        let top = (y as usize).min(self.height - 2);
+        let right_frac = (x - left as f64) as f32;
+        let lower_frac = (y - top as f64) as f32;
         let at = top * self.width + left;
         let [upper, lower] = [at, at + self.width]
             .map(|at| self.values[at] + (self.values[at + 1] - self.values[at]) * right_frac);
@@ -88,6 +91,9 @@ impl Plane {
 
     /// Smooths with the binomial kernel (1 4 6 4 1) / 16 along both axes, a Gaussian of 1 px.
     pub(crate) fn smoothed(&self) -> Self {
+        // The kernel is separable: two passes with 5 values each, instead of one with 25. Two
+        // pixels at each border are not smoothed, because the kernel would reach outside;
+        // detection keeps away from them.
         let mut across = self.values.clone();
         for (out, row) in across
             .chunks_exact_mut(self.width)
@@ -115,10 +121,13 @@ impl Plane {
 
     /// Halves the size by averaging blocks of 2x2 pixels. Position `p` becomes `p / 2`.
     pub(crate) fn halved(&self) -> Self {
-        let (width, height) = (self.width / 2, self.height / 2);
+        // A last odd column or row is dropped.
+        let width = self.width / 2;
+        let height = self.height / 2;
         let mut values = Vec::with_capacity(width * height);
         for y in 0..height {
-            let (upper, lower) = (self.row(2 * y), self.row(2 * y + 1));
+            let upper = self.row(2 * y);
+            let lower = self.row(2 * y + 1);
             let pairs = upper.chunks_exact(2).zip(lower.chunks_exact(2));
             values.extend(
                 pairs.map(|(upper, lower)| (upper[0] + upper[1] + lower[0] + lower[1]) * 0.25),
@@ -133,6 +142,8 @@ impl Plane {
 
     /// Whether the image can be halved and still be searched.
     pub(crate) fn can_be_halved(&self) -> bool {
+        // Half the image then still has four times the smallest side. In smaller images, the
+        // squares of most boards would be only a few pixels wide at half resolution.
         self.width.min(self.height) >= 8 * MIN_SIDE_PX as usize
     }
 }

@@ -10,10 +10,19 @@ use crate::gray::Plane;
 use crate::lattice::{Cell, Lattice, STEPS, distance};
 use crate::saddle::{Saddle, angle_between};
 use std::collections::VecDeque;
+use std::f64::consts::PI;
 
 /// Largest angle between an edge and the line to the neighbor, radians.
+///
+/// The edge's direction is measured on a ring of a few pixels, and fisheye lenses bend the line
+/// between two corners. The next direction of a lattice, the diagonal, is 0.79 rad away under
+/// frontal view, so half of that separates the two.
 const MAX_ANGLE_RAD: f64 = 0.4;
-/// Length of neighboring links relative to each other.
+/// Largest length of neighboring links relative to each other.
+///
+/// Foreshortening makes the two axes of a board differ by `1 / cos(tilt)`, which is 2.5 at 66
+/// degrees. Smaller values reject tilted boards; larger ones accept links across a missing corner
+/// more often.
 const MAX_RATIO: f64 = 2.5;
 
 /// Links saddles. Returns the lattices with at least `min` corners, the largest first.
@@ -24,6 +33,7 @@ pub(crate) fn link(plane: &Plane, saddles: &[Saddle], min: usize) -> Vec<Lattice
     let mut is_used = vec![false; saddles.len()];
     let mut grids = Vec::new();
     for seed in 0..saddles.len() {
+        // A saddle with a single link is at the end of a line, not on a board of at least 3 x 3.
         if is_used[seed] || links[seed].iter().flatten().count() < 2 {
             continue;
         }
@@ -45,15 +55,15 @@ fn links(plane: &Plane, saddles: &[Saddle]) -> Vec<[Link; 4]> {
     let nearest: Vec<[Link; 4]> = (0..saddles.len())
         .map(|from| std::array::from_fn(|edge| nearest_along(saddles, &buckets, from, edge)))
         .collect();
-    let is_mutual = |from: usize, edge: usize, (to, back): (usize, usize)| {
-        nearest[to][back] == Some((from, edge))
-    };
+    // Two checks remove wrong neighbors: both ends must agree, and the image must show an edge
+    // between them. Texture next to a board rarely passes both.
     let mut links = vec![[None; 4]; saddles.len()];
     for (from, edges) in links.iter_mut().enumerate() {
         for (edge, link) in edges.iter_mut().enumerate() {
             *link = nearest[from][edge].filter(|&link| {
-                is_mutual(from, edge, link)
-                    && is_edge(plane, &saddles[from], edge, &saddles[link.0])
+                let (to, back) = link;
+                nearest[to][back] == Some((from, edge))
+                    && is_edge(plane, &saddles[from], edge, &saddles[to])
             });
         }
     }
@@ -71,68 +81,74 @@ fn links(plane: &Plane, saddles: &[Saddle]) -> Vec<[Link; 4]> {
 /// The nearest saddle along an edge that has an edge back, with black and white on the same sides.
 fn nearest_along(saddles: &[Saddle], buckets: &Buckets, from: usize, edge: usize) -> Link {
     let origin = &saddles[from];
-    let is_candidate = |to: usize| {
-        let (dx, dy) = (
-            saddles[to].pixel[0] - origin.pixel[0],
-            saddles[to].pixel[1] - origin.pixel[1],
-        );
-        let toward_rad = dy.atan2(dx);
-        if to == from || angle_between(toward_rad, origin.edges_rad[edge]).abs() > MAX_ANGLE_RAD {
-            return None;
+    buckets.nearest(saddles, origin.pixel, |to| {
+        if to == from {
+            None
+        } else {
+            edge_back(origin, edge, &saddles[to])
         }
-        let back_rad = |back: usize| {
-            angle_between(
-                toward_rad + std::f64::consts::PI,
-                saddles[to].edges_rad[back],
-            )
-            .abs()
-        };
-        // An edge with black after it, in ascending angles, is seen from its other end with black
-        // before it.
-        let back = [1 - edge % 2, 3 - edge % 2]
-            .into_iter()
-            .min_by(|&a, &b| back_rad(a).total_cmp(&back_rad(b)))?;
-        (back_rad(back) <= MAX_ANGLE_RAD).then_some(back)
-    };
-    buckets.nearest(saddles, origin.pixel, is_candidate)
+    })
+}
+
+/// The edge of a saddle that leads back to `origin`, if the saddle lies along an edge of `origin`.
+fn edge_back(origin: &Saddle, edge: usize, saddle: &Saddle) -> Option<usize> {
+    let dx = saddle.pixel[0] - origin.pixel[0];
+    let dy = saddle.pixel[1] - origin.pixel[1];
+    let toward_rad = dy.atan2(dx);
+    if angle_between(toward_rad, origin.edges_rad[edge]).abs() > MAX_ANGLE_RAD {
+        return None;
+    }
+    let back_rad = |back: usize| angle_between(toward_rad + PI, saddle.edges_rad[back]).abs();
+    // An edge with black after it, in ascending angles, is seen from its other end with black
+    // before it. Only two of the four edges are therefore possible.
+    let back = [1 - edge % 2, 3 - edge % 2]
+        .into_iter()
+        .min_by(|&a, &b| back_rad(a).total_cmp(&back_rad(b)))?;
+    (back_rad(back) <= MAX_ANGLE_RAD).then_some(back)
 }
 
 /// Whether the image is black on one side of the line between two saddles and white on the other.
 fn is_edge(plane: &Plane, from: &Saddle, edge: usize, to: &Saddle) -> bool {
     // Puzzleboards have a dot in the middle third of every edge, so its outer thirds are examined.
     const ALONG: [f64; 4] = [0.2, 0.3, 0.7, 0.8];
+    // Distance of the samples from the line, relative to its length. It must exceed the deviation
+    // of a bent line, and stay inside the square.
     const ACROSS: f64 = 0.12;
+    // Blur reduces the contrast of small squares near their edges, so a part of it is enough.
     const MIN_CONTRAST_FRAC: f32 = 0.25;
-    let (dx, dy) = (to.pixel[0] - from.pixel[0], to.pixel[1] - from.pixel[1]);
+    let dx = to.pixel[0] - from.pixel[0];
+    let dy = to.pixel[1] - from.pixel[1];
+    // Below one pixel, interpolation would mix both sides.
     let across_px = (ACROSS * dx.hypot(dy)).max(1.0) / dx.hypot(dy);
-    let black_sign = if edge.is_multiple_of(2) { 1.0 } else { -1.0 }; // Black is at ascending angles of even edges.
+    // Black is at ascending angles of even edges.
+    let black_sign = if edge.is_multiple_of(2) { 1.0 } else { -1.0 };
     let contrast = from.contrast.min(to.contrast) * MIN_CONTRAST_FRAC;
     ALONG.into_iter().all(|along| {
         let center = [from.pixel[0] + along * dx, from.pixel[1] + along * dy];
-        let side = |sign: f64| {
-            [
-                center[0] - sign * across_px * dy,
-                center[1] + sign * across_px * dx,
-            ]
-        };
-        plane.sample(side(-black_sign)) - plane.sample(side(black_sign)) > contrast
+        let white = plane.sample(beside(center, -black_sign, across_px, [dx, dy]));
+        let black = plane.sample(beside(center, black_sign, across_px, [dx, dy]));
+        white - black > contrast
     })
+}
+
+/// The position next to a point of a line with direction `[dx, dy]`: at ascending angles for a
+/// positive sign.
+fn beside(point: [f64; 2], sign: f64, across_px: f64, [dx, dy]: [f64; 2]) -> [f64; 2] {
+    [
+        point[0] - sign * across_px * dy,
+        point[1] + sign * across_px * dx,
+    ]
 }
 
 /// Removes links that are much longer than the other links of a saddle: they skip a missing corner
 /// or leave the board.
 fn drop_odd_lengths(saddles: &[Saddle], links: &mut [[Link; 4]]) {
-    let length = |from: usize, link: Link| {
-        link.map(|(to, _)| distance(saddles[from].pixel, saddles[to].pixel))
-    };
-    let shortest = |from: usize| {
-        links[from]
-            .iter()
-            .filter_map(|&link| length(from, link))
-            .min_by(f64::total_cmp)
-    };
-    let shortest: Vec<f64> = (0..saddles.len())
-        .map(|from| shortest(from).unwrap_or(f64::INFINITY))
+    // All lengths are compared with those before any link is removed, so that the result does not
+    // depend on the order of the saddles.
+    let shortest: Vec<f64> = links
+        .iter()
+        .enumerate()
+        .map(|(from, edges)| shortest_link_px(saddles, from, edges))
         .collect();
     for (from, edges) in links.iter_mut().enumerate() {
         for link in edges {
@@ -145,6 +161,16 @@ fn drop_odd_lengths(saddles: &[Saddle], links: &mut [[Link; 4]]) {
     }
 }
 
+/// Length of the shortest link of a saddle, pixels; infinite if it has none.
+fn shortest_link_px(saddles: &[Saddle], from: usize, edges: &[Link; 4]) -> f64 {
+    edges
+        .iter()
+        .flatten()
+        .map(|&(to, _)| distance(saddles[from].pixel, saddles[to].pixel))
+        .min_by(f64::total_cmp)
+        .unwrap_or(f64::INFINITY)
+}
+
 /// Assigns columns and rows, starting at a saddle, which is at (0, 0). Its edge 0 leads to column
 /// 1, so the sector between its edges 2 and 3 is at the upper left, and black.
 fn walk(saddles: &[Saddle], links: &[[Link; 4]], seed: usize, is_used: &mut [bool]) -> Lattice {
@@ -153,6 +179,8 @@ fn walk(saddles: &[Saddle], links: &[[Link; 4]], seed: usize, is_used: &mut [boo
     let mut queue = VecDeque::from([(seed, [0, 0], 0_usize)]);
     is_used[seed] = true;
     lattice.corners.insert([0, 0], saddles[seed].pixel);
+    // Breadth first: near the seed, cells are certain. If a wrong link leads to a cell that is
+    // already taken, the earlier assignment, which needed fewer links, is kept.
     while let Some((from, cell, first_step)) = queue.pop_front() {
         for (edge, link) in links[from].iter().enumerate() {
             let Some((to, back)) = *link else { continue };
@@ -163,6 +191,8 @@ fn walk(saddles: &[Saddle], links: &[[Link; 4]], seed: usize, is_used: &mut [boo
             }
             is_used[to] = true;
             lattice.corners.insert(neighbor, saddles[to].pixel);
+            // Edge `back` of the neighbor points opposite to `step`, that is to `step + 2`. Its
+            // edge 0 is `back` quarter turns before that; 4 keeps the difference positive.
             queue.push_back((to, neighbor, (step + 2 + 4 - back) % 4));
         }
     }
@@ -178,6 +208,8 @@ struct Buckets {
 
 impl Buckets {
     fn new(saddles: &[Saddle]) -> Self {
+        // About the size of a square in a common image, so that the nearest neighbor is found in
+        // the first rings.
         const SIDE_PX: f64 = 24.0;
         let bucket = |pixel: [f64; 2]| pixel.map(|value| index(value, SIDE_PX));
         let mut counts = [1, 1];
@@ -204,6 +236,7 @@ impl Buckets {
         pixel: [f64; 2],
         accept: impl Fn(usize) -> Option<T>,
     ) -> Option<(usize, T)> {
+        // Squares of up to about 260 pixels. Larger ones are found at a lower resolution.
         const MAX_RINGS: usize = 12;
         let center = pixel.map(|value| index(value, self.side_px));
         let mut best: Option<(f64, usize, T)> = None;
@@ -218,6 +251,7 @@ impl Buckets {
             };
             for row in range(1) {
                 for column in range(0) {
+                    // Buckets inside the ring were searched before.
                     if row.abs_diff(center[1]).max(column.abs_diff(center[0])) != ring {
                         continue;
                     }

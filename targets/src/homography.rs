@@ -16,6 +16,8 @@ impl Homography {
         let mut matrix = SMatrix::<f64, 8, 8>::zeros();
         let mut right = SVector::<f64, 8>::zeros();
         for (at, ([x, y], [u, v])) in from.iter().zip(to).enumerate() {
+            // Two linear equations per point, from u = (h0 x + h1 y + h2) / (h6 x + h7 y + 1), and
+            // the same for v, after multiplication by the denominator.
             let rows = [
                 [*x, *y, 1.0, 0.0, 0.0, 0.0, -u * x, -u * y],
                 [0.0, 0.0, 0.0, *x, *y, 1.0, -v * x, -v * y],
@@ -26,6 +28,7 @@ impl Homography {
             (right[2 * at], right[2 * at + 1]) = (*u, *v);
         }
         let solution = matrix.lu().solve(&right)?;
+        // Three points on a line make the matrix singular, which rounding may hide from `solve`.
         if !solution.iter().all(|value| value.is_finite()) {
             return None;
         }
@@ -44,6 +47,7 @@ impl Homography {
     /// Derivative of the image of a point with respect to the point.
     pub(crate) fn jacobian(&self, [x, y]: [f64; 2]) -> Matrix2<f64> {
         let mapped = self.0 * Vector3::new(x, y, 1.0);
+        // The quotient rule: d(a / z) = (da - a / z dz) / z.
         let quotient = |row: usize, column: usize| {
             (self.0[(row, column)] - mapped[row] / mapped.z * self.0[(2, column)]) / mapped.z
         };

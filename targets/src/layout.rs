@@ -17,7 +17,8 @@ pub(crate) struct Layout {
     pub(crate) is_legacy: bool,
 }
 
-/// Largest deviation of a marker from where its neighbor predicts it, relative to its side.
+/// Largest deviation of a marker from where its neighbor predicts it, relative to its side. Lenses
+/// and blur cause a part of this; in another arrangement, markers are a whole square away.
 const MAX_DEVIATION: f64 = 0.35;
 
 /// The arrangements in which a board may be printed, the standard one first.
@@ -30,6 +31,7 @@ pub(crate) fn layouts(pattern: &Pattern) -> Vec<Layout> {
             ..
         } => {
             let layout = |is_legacy| charuco(squares, square_m, marker_m, is_legacy);
+            // For odd numbers of rows, both arrangements are the same.
             if squares[1].is_multiple_of(2) {
                 vec![layout(false), layout(true)]
             } else {
@@ -42,23 +44,27 @@ pub(crate) fn layouts(pattern: &Pattern) -> Vec<Layout> {
             spacing_frac,
         } => {
             // Programs disagree on the rotation of the tags; their places are the same.
-            let tag = |quarter_turns: usize, tag: u32| {
-                let [x, y] = tag_origin(tags, tag_m, spacing_frac, tag);
-                let square = UNIT_SQUARE.map(|[column, row]| [x + column * tag_m, y + row * tag_m]);
-                std::array::from_fn(|at| square[(at + quarter_turns) % 4])
-            };
-            let layout = |quarter_turns| Layout {
-                corners_m: (0..tags[0] * tags[1])
-                    .map(|id| tag(quarter_turns, id))
+            let upright: Vec<Quad> = (0..tags[0] * tags[1])
+                .map(|id| square_at(tag_origin(tags, tag_m, spacing_frac, id), tag_m))
+                .collect();
+            let rotated = |quarter_turns: usize| Layout {
+                corners_m: upright
+                    .iter()
+                    .map(|quad| std::array::from_fn(|at| quad[(at + quarter_turns) % 4]))
                     .collect(),
                 is_legacy: false,
             };
-            (0..4).map(layout).collect()
+            (0..4).map(rotated).collect()
         }
         Pattern::Chessboard { .. } | Pattern::Puzzleboard { .. } | Pattern::Tag { .. } => {
             Vec::new()
         }
     }
+}
+
+/// Corners of a square with this upper left corner.
+fn square_at([x, y]: [f64; 2], side_m: f64) -> Quad {
+    UNIT_SQUARE.map(|[column, row]| [x + column * side_m, y + row * side_m])
 }
 
 /// Whether a square of a ChArUco board is black. In the legacy pattern with an even number of rows,
@@ -72,12 +78,13 @@ fn charuco(squares: [u32; 2], square_m: f64, marker_m: f64, is_legacy: bool) -> 
     let margin_m = (square_m - marker_m) / 2.0;
     let cells = (0..squares[1]).flat_map(|row| (0..squares[0]).map(move |column| [column, row]));
     let white = cells.filter(|&[column, row]| !is_black_square(column, row, squares[1], is_legacy));
-    let marker = |cell: [u32; 2]| {
-        let [x, y] = cell.map(|count| f64::from(count) * square_m + margin_m);
-        UNIT_SQUARE.map(|[column, row]| [x + column * marker_m, y + row * marker_m])
-    };
+    // Markers are in the middle of white squares, and numbered in this order.
+    let corners_m = white
+        .map(|cell| cell.map(|count| f64::from(count) * square_m + margin_m))
+        .map(|corner| square_at(corner, marker_m))
+        .collect();
     Layout {
-        corners_m: white.map(marker).collect(),
+        corners_m,
         is_legacy,
     }
 }
@@ -94,7 +101,7 @@ pub(crate) struct Fit {
 /// Chooses the layout in which most markers predict the places of their neighbors. `None` if there
 /// is no marker.
 ///
-/// A marker without neighbors cannot be confirmed, but is kept, unless most others contradict it.
+/// A single marker cannot be confirmed, but is kept.
 pub(crate) fn fit(layouts: Vec<Layout>, markers: &[Marker]) -> Option<Fit> {
     let fits = layouts.into_iter().map(|layout| {
         let (markers, n_confirmed) = confirmed(&layout, markers);
@@ -104,17 +111,19 @@ pub(crate) fn fit(layouts: Vec<Layout>, markers: &[Marker]) -> Option<Fit> {
             n_confirmed,
         }
     });
-    // Of equals, the first is kept.
-    let better = |best: Fit, next: Fit| {
+    // Of equals, the first is kept: the standard arrangement.
+    let best = fits.reduce(|best, next| {
         if next.n_confirmed > best.n_confirmed {
             next
         } else {
             best
         }
-    };
-    fits.reduce(better).filter(|fit| !fit.markers.is_empty())
+    });
+    best.filter(|fit| !fit.markers.is_empty())
 }
 
+/// The markers that a majority of their neighbors confirm, or a single marker, and the number of
+/// confirmed ones.
 fn confirmed(layout: &Layout, markers: &[Marker]) -> (Vec<Marker>, usize) {
     let known: Vec<&Marker> = markers
         .iter()
@@ -130,6 +139,7 @@ fn confirmed(layout: &Layout, markers: &[Marker]) -> (Vec<Marker>, usize) {
             .map(|other| (distance(center_m(marker), center_m(other)), *other))
             .collect();
         others.sort_by(|a, b| a.0.total_cmp(&b.0));
+        // As many as a marker inside the board has at the same distance.
         const N_NEIGHBORS: usize = 4;
         let nearest = others.first().map_or(0.0, |other| other.0);
         let close = others
@@ -140,6 +150,8 @@ fn confirmed(layout: &Layout, markers: &[Marker]) -> (Vec<Marker>, usize) {
         votes.push((close.map(|(_, other)| vote(other)).sum(), *marker));
     }
     let n_confirmed = votes.iter().filter(|(votes, _)| *votes > 0).count();
+    // A single marker has no neighbor to confirm it. Several markers that do not confirm each other
+    // are misreadings, or on another board.
     let is_kept = |(votes, _): &&(i32, &Marker)| {
         *votes > 0 || (*votes == 0 && n_confirmed == 0 && known.len() == 1)
     };
@@ -154,27 +166,29 @@ fn confirmed(layout: &Layout, markers: &[Marker]) -> (Vec<Marker>, usize) {
     (kept, n_confirmed)
 }
 
-/// Whether two markers predict each other's corners.
+/// Whether one of two markers predicts the corners of the other. One direction is enough, because
+/// the homography of the smaller image is less accurate.
 fn agrees(layout: &Layout, a: &Marker, b: &Marker) -> bool {
-    let predicts = |from: &Marker, to: &Marker| {
-        let corners_m = &layout.corners_m[from.id as usize];
-        let origin = center(corners_m);
-        let centered = |corners_m: &Quad| corners_m.map(|[x, y]| [x - origin[0], y - origin[1]]);
-        let Some(pixel_from_board) =
-            Homography::from_corners(&centered(corners_m), &from.corners_px)
-        else {
-            return false;
-        };
-        let to_m = centered(&layout.corners_m[to.id as usize]);
-        let side_px = distance(to.corners_px[0], to.corners_px[2]) / 2_f64.sqrt();
-        // Farther markers are predicted less accurately, in particular through a fisheye lens.
-        let steps = (center(&to_m)[0].hypot(center(&to_m)[1])
-            / distance(corners_m[0], corners_m[1]))
-        .max(1.0);
-        let off = |at: usize| distance(pixel_from_board.map(to_m[at]), to.corners_px[at]);
-        (0..4).all(|at| off(at) <= MAX_DEVIATION * steps * side_px)
+    predicts(layout, a, b) || predicts(layout, b, a)
+}
+
+/// Whether the homography of a marker predicts the corners of another one.
+fn predicts(layout: &Layout, from: &Marker, to: &Marker) -> bool {
+    let corners_m = &layout.corners_m[from.id as usize];
+    let origin = center(corners_m);
+    let centered = |corners_m: &Quad| corners_m.map(|[x, y]| [x - origin[0], y - origin[1]]);
+    let Some(pixel_from_board) = Homography::from_corners(&centered(corners_m), &from.corners_px)
+    else {
+        return false;
     };
-    predicts(a, b) || predicts(b, a)
+    let to_m = centered(&layout.corners_m[to.id as usize]);
+    // From the diagonal.
+    let side_px = distance(to.corners_px[0], to.corners_px[2]) / 2_f64.sqrt();
+    // Farther markers are predicted less accurately, in particular through a fisheye lens.
+    let steps =
+        (center(&to_m)[0].hypot(center(&to_m)[1]) / distance(corners_m[0], corners_m[1])).max(1.0);
+    let off = |at: usize| distance(pixel_from_board.map(to_m[at]), to.corners_px[at]);
+    (0..4).all(|at| off(at) <= MAX_DEVIATION * steps * side_px)
 }
 
 pub(crate) fn center(quad: &Quad) -> [f64; 2] {

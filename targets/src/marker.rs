@@ -6,9 +6,11 @@ use crate::homography::Homography;
 use crate::lattice::distance;
 use crate::quad::{Quad, shortest_side};
 
-/// Smallest difference in gray value between black and white cells.
+/// Smallest difference in gray value between black and white cells. Lower values read cells from
+/// noise; higher ones lose dark images.
 const MIN_CONTRAST: f32 = 14.0;
-/// Part of the border cells that may be read wrong.
+/// Part of the border cells that may be read wrong: 2 of the 20 of a 4X4 marker. Fingers and
+/// highlights cover single cells; texture without a border has about half of them wrong.
 const MAX_BORDER_ERRORS: f64 = 0.1;
 
 /// A square of side 1 with its corners in the order of a [`Quad`].
@@ -35,6 +37,8 @@ pub(crate) fn decode(
 ) -> Vec<Marker> {
     let mut markers: Vec<Marker> = Vec::new();
     for quad in quads {
+        // The width of the border is not known. At a wrong width, the cells do not align, and no
+        // code fits.
         let decoded = borders.iter().find_map(|&border| {
             let cells = read_cells(plane, quad, dictionary.n_bits(), border)?;
             dictionary.decode(&cells)
@@ -47,6 +51,7 @@ pub(crate) fn decode(
         else {
             continue;
         };
+        // Start with the corner that is the upper left one of the upright marker.
         let corners_px = std::array::from_fn(|at| quad[(at + quarter_turns) % 4]);
         let marker = Marker {
             id,
@@ -93,6 +98,7 @@ pub(crate) fn read_exactly(
         let Some(mut cells) = read_cells(plane, quad, n, 1) else {
             continue;
         };
+        // Random cells equal one of the codes in one of four rotations.
         exact.n_by_chance += 4.0 * f64::from(dictionary.n_markers()) * 0.5_f64.powf((n * n) as f64);
         if is_mirrored {
             cells.chunks_exact_mut(n).for_each(<[bool]>::reverse);
@@ -110,27 +116,29 @@ pub(crate) fn read_exactly(
 /// or the contrast is low.
 fn read_cells(plane: &Plane, quad: &Quad, n_bits: usize, border: usize) -> Option<Vec<bool>> {
     let n = n_bits + 2 * border;
+    // Cells smaller than 1.5 pixels are blurred into each other.
     if shortest_side(quad) < 1.5 * n as f64 {
         return None;
     }
     let pixel_from_unit = Homography::from_corners(&UNIT_SQUARE, quad)?;
     let mut values = Vec::with_capacity(n * n);
     for at in 0..n * n {
+        // Positions in the cell: away from its sides, where neighbors blur into it.
         const OFFSETS: [[f64; 2]; 5] = [[0.5, 0.5], [0.3, 0.3], [0.7, 0.3], [0.3, 0.7], [0.7, 0.7]];
-        let sample = |[x, y]: [f64; 2]| {
-            let point = [
-                ((at % n) as f64 + x) / n as f64,
-                ((at / n) as f64 + y) / n as f64,
-            ];
-            plane.sample(pixel_from_unit.map(point))
-        };
-        values.push(OFFSETS.map(sample).iter().sum::<f32>() / OFFSETS.len() as f32);
+        let cell = [at % n, at / n].map(|count| count as f64);
+        let samples = OFFSETS.map(|[x, y]| {
+            let in_marker = [(cell[0] + x) / n as f64, (cell[1] + y) / n as f64];
+            plane.sample(pixel_from_unit.map(in_marker))
+        });
+        values.push(samples.iter().sum::<f32>() / OFFSETS.len() as f32);
     }
+    // One threshold per marker follows the light across the image.
     let threshold = threshold(&values)?;
     let is_black: Vec<bool> = values.iter().map(|&value| value < threshold).collect();
     let is_inside = |at: usize| {
         (border..n - border).contains(&(at % n)) && (border..n - border).contains(&(at / n))
     };
+    // The border is checked first: most dark quadrilaterals are no markers.
     let n_border = n * n - n_bits * n_bits;
     let n_wrong = (0..n * n)
         .filter(|&at| !is_inside(at) && !is_black[at])
@@ -152,11 +160,14 @@ fn threshold(values: &[f32]) -> Option<f32> {
     let mut sorted = values.to_vec();
     sorted.sort_by(f32::total_cmp);
     let total: f32 = sorted.iter().sum();
-    let (mut sum, mut best) = (0.0, (0.0, 0.0, 0.0));
+    let mut sum = 0.0;
+    let mut best = (0.0, 0.0, 0.0);
     for at in 1..sorted.len() {
         sum += sorted[at - 1];
-        let (n_low, n_high) = (at as f32, (sorted.len() - at) as f32);
+        let n_low = at as f32;
+        let n_high = (sorted.len() - at) as f32;
         let difference = (total - sum) / n_high - sum / n_low;
+        // Between the two classes, times a constant.
         let variance = n_low * n_high * difference * difference;
         if variance > best.0 {
             best = (variance, difference, (sorted[at - 1] + sorted[at]) / 2.0);

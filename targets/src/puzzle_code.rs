@@ -63,36 +63,37 @@ pub(crate) fn locate(
     dots: &[(Edge, bool)],
     is_possible: impl Fn([u32; 2]) -> bool,
 ) -> Option<Position> {
-    let agreement = |is_vertical: bool, columns: u32, rows: u32| -> Vec<usize> {
-        let agrees = |offset: [u32; 2]| {
-            let of_kind = dots
-                .iter()
-                .filter(|(edge, _)| edge.is_vertical == is_vertical);
-            of_kind
-                .filter(|(edge, is_white)| {
-                    edge.shifted(offset[0], offset[1]).is_white() == *is_white
-                })
-                .count()
-        };
-        (0..columns * rows)
-            .map(|at| agrees([at % columns, at / columns]))
-            .collect()
-    };
-    let vertical = agreement(true, LONG, SHORT);
-    let horizontal = agreement(false, SHORT, LONG);
-    let n_right = |[column, row]: [u32; 2]| {
-        let at_vertical = column % LONG + LONG * (row % SHORT);
-        let at_horizontal = column % SHORT + SHORT * (row % LONG);
-        vertical[at_vertical as usize] + horizontal[at_horizontal as usize]
-    };
+    // Each table has 501 entries. Comparing all dots at all 251001 offsets would take 250 times as
+    // long.
+    let vertical = agreement(dots, true, [LONG, SHORT]);
+    let horizontal = agreement(dots, false, [SHORT, LONG]);
     let offsets = (0..PERIOD).flat_map(|row| (0..PERIOD).map(move |column| [column, row]));
     let possible = offsets.filter(|&offset| is_possible(offset));
     possible
-        .map(|offset| Position {
-            offset,
-            n_right: n_right(offset),
+        .map(|offset| {
+            let [column, row] = offset;
+            let at_vertical = column % LONG + LONG * (row % SHORT);
+            let at_horizontal = column % SHORT + SHORT * (row % LONG);
+            Position {
+                offset,
+                n_right: vertical[at_vertical as usize] + horizontal[at_horizontal as usize],
+            }
         })
         .max_by_key(|position| position.n_right)
+}
+
+/// Number of dots on edges of one kind that agree with the master pattern, for every offset below
+/// these columns and rows, row by row.
+fn agreement(dots: &[(Edge, bool)], is_vertical: bool, [columns, rows]: [u32; 2]) -> Vec<usize> {
+    let n_right_at = |column: u32, row: u32| {
+        dots.iter()
+            .filter(|(edge, _)| edge.is_vertical == is_vertical)
+            .filter(|(edge, is_white)| edge.shifted(column, row).is_white() == *is_white)
+            .count()
+    };
+    (0..columns * rows)
+        .map(|at| n_right_at(at % columns, at / columns))
+        .collect()
 }
 
 #[cfg(test)]

@@ -5,10 +5,16 @@ use crate::gray::Plane;
 use crate::lattice::distance;
 
 /// Sides of the windows for the local mean, pixels.
+///
+/// A small window separates small markers in uneven light. In a marker that is much larger than the
+/// window, the middle of a black area is not darker than its surroundings, so larger markers need
+/// larger windows.
 const WINDOWS_PX: [usize; 3] = [9, 23, 61];
-/// A pixel is dark if it is darker than the local mean by this much.
+/// A pixel is dark if it is darker than the local mean by this much. It exceeds the noise of common
+/// images, so that even areas are not full of dark dots.
 const DARKER_BY: f32 = 5.0;
-/// Shortest side of a quadrilateral, pixels.
+/// Shortest side of a quadrilateral, pixels. The smallest markers have 6 x 6 cells with the border,
+/// which cannot be read with less than a pixel per cell.
 const MIN_SIDE_PX: f64 = 6.0;
 /// Largest distance of an outline from its polygon, relative to the square root of the enclosed
 /// area.
@@ -27,12 +33,14 @@ pub(crate) fn find(plane: &Plane, do_touch: bool) -> Vec<Quad> {
     let mut quads = Vec::new();
     for window_px in WINDOWS_PX {
         let mut is_dark = threshold(plane, &sums, window_px);
+        // The pixels decide which regions are dark; the corners are then located in the gray image.
         let mut add =
             |outline: &[[i32; 2]]| quads.extend(quad(outline).map(|quad| refine(plane, quad)));
-        outlines(&is_dark, plane.size(), &mut add);
+        Mask::new(&is_dark, plane.size()).outlines(&mut add);
+        // Both are searched: erosion separates touching regions, and removes small markers.
         if do_touch {
             erode(&mut is_dark, plane.size());
-            outlines(&is_dark, plane.size(), &mut add);
+            Mask::new(&is_dark, plane.size()).outlines(&mut add);
         }
     }
     quads
@@ -60,18 +68,19 @@ impl Sums {
     }
 }
 
+/// Whether each pixel is darker than the mean of a window around it.
 fn threshold(plane: &Plane, sums: &Sums, window_px: usize) -> Vec<bool> {
     let [width, height] = plane.size();
     let half = window_px / 2;
     let mut is_dark = Vec::with_capacity(width * height);
     for y in 0..height {
-        let (top, bottom) = (
-            y.saturating_sub(half) * sums.stride,
-            (y + half + 1).min(height) * sums.stride,
-        );
+        // At the border of the image, the window is cut off.
+        let top = y.saturating_sub(half) * sums.stride;
+        let bottom = (y + half + 1).min(height) * sums.stride;
         let n_rows = (bottom - top) / sums.stride;
         for (x, &value) in plane.row(y).iter().enumerate() {
-            let (left, right) = (x.saturating_sub(half), (x + half + 1).min(width));
+            let left = x.saturating_sub(half);
+            let right = (x + half + 1).min(width);
             let sum = sums.sums[bottom + right] - sums.sums[bottom + left] - sums.sums[top + right]
                 + sums.sums[top + left];
             let n = (n_rows * (right - left)) as f64;
@@ -96,62 +105,104 @@ fn erode(is_dark: &mut [bool], [width, height]: [usize; 2]) {
     }
 }
 
-/// Walks around every dark region (of pixels with common sides), on the borders between pixels,
-/// dark on the right.
-///
-/// Points are pixel corners, so the outline lies between dark and bright pixels. Holes are skipped.
-fn outlines(is_dark: &[bool], [width, height]: [usize; 2], mut visit: impl FnMut(&[[i32; 2]])) {
-    let dark = |x: i32, y: i32| {
+/// The pixels of an image that are dark.
+#[derive(Clone, Copy)]
+struct Mask<'a> {
+    is_dark: &'a [bool],
+    width: usize,
+    height: usize,
+}
+
+impl<'a> Mask<'a> {
+    fn new(is_dark: &'a [bool], [width, height]: [usize; 2]) -> Self {
+        Self {
+            is_dark,
+            width,
+            height,
+        }
+    }
+
+    /// Whether a pixel is dark. Everything outside the image is bright.
+    fn at(&self, [x, y]: [i32; 2]) -> bool {
         let (Ok(x), Ok(y)) = (usize::try_from(x), usize::try_from(y)) else {
             return false;
         };
-        x < width && y < height && is_dark[y * width + x]
-    };
-    let (Ok(n_columns), Ok(n_rows)) = (i32::try_from(width), i32::try_from(height)) else {
-        return;
-    };
-    let mut is_visited = vec![false; width * height]; // Upper borders of dark pixels.
-    let mut outline = Vec::new();
-    for y in 0..n_rows {
-        for x in 0..n_columns {
-            let at = y.cast_unsigned() as usize * width + x.cast_unsigned() as usize;
-            if !is_dark[at] || is_visited[at] || dark(x, y - 1) {
-                continue;
-            }
-            outline.clear();
-            let (mut point, mut step) = ([x, y], 0_usize);
-            let mut twice_area = 0_i64;
-            loop {
-                outline.push(point);
-                if step == 0 {
-                    is_visited[point[1].cast_unsigned() as usize * width
-                        + point[0].cast_unsigned() as usize] = true;
+        x < self.width && y < self.height && self.is_dark[y * self.width + x]
+    }
+
+    /// Index of a pixel inside the image.
+    fn index(&self, [x, y]: [i32; 2]) -> usize {
+        y.cast_unsigned() as usize * self.width + x.cast_unsigned() as usize
+    }
+
+    /// Walks around every dark region (of pixels with common sides), on the borders between pixels,
+    /// dark on the right.
+    ///
+    /// Points are pixel corners, so the outline lies between dark and bright pixels. Holes are
+    /// skipped.
+    fn outlines(&self, mut visit: impl FnMut(&[[i32; 2]])) {
+        let (Ok(n_columns), Ok(n_rows)) = (i32::try_from(self.width), i32::try_from(self.height))
+        else {
+            return;
+        };
+        // Upper borders of dark pixels that an outline has passed. Every outline has at least one,
+        // so looking for one that was not passed finds every region once.
+        let mut is_visited = vec![false; self.width * self.height];
+        let mut outline = Vec::new();
+        for y in 0..n_rows {
+            for x in 0..n_columns {
+                let at = self.index([x, y]);
+                if !self.is_dark[at] || is_visited[at] || self.at([x, y - 1]) {
+                    continue;
                 }
-                let [dx, dy] = crate::lattice::STEPS[step];
-                let next = [point[0] + dx, point[1] + dy];
-                twice_area += i64::from(point[0]) * i64::from(next[1])
-                    - i64::from(next[0]) * i64::from(point[1]);
-                point = next;
-                // The two pixels ahead, left and right of the walking direction.
-                let (left, right) = match step {
-                    0 => ([0, -1], [0, 0]),
-                    1 => ([0, 0], [-1, 0]),
-                    2 => ([-1, 0], [-1, -1]),
-                    _ => ([-1, -1], [0, -1]),
-                };
-                let is_dark_at =
-                    |offset: [i32; 2]| dark(point[0] + offset[0], point[1] + offset[1]);
-                step = match (is_dark_at(left), is_dark_at(right)) {
-                    (_, false) => (step + 1) % 4,
-                    (true, true) => (step + 3) % 4,
-                    (false, true) => step,
-                };
-                if point == [x, y] && step == 0 {
-                    break;
+                let twice_area = self.walk_around([x, y], &mut is_visited, &mut outline);
+                // Outlines of holes run the other way, so their area is negative.
+                if twice_area as f64 > MIN_SIDE_PX * MIN_SIDE_PX {
+                    visit(&outline);
                 }
             }
-            if twice_area as f64 > MIN_SIDE_PX * MIN_SIDE_PX {
-                visit(&outline);
+        }
+    }
+
+    /// Walks around one region, starting with the upper border of a pixel, and marks all upper
+    /// borders on the way. Returns twice the enclosed area, by the shoelace formula.
+    fn walk_around(
+        &self,
+        start: [i32; 2],
+        is_visited: &mut [bool],
+        outline: &mut Vec<[i32; 2]>,
+    ) -> i64 {
+        outline.clear();
+        let mut point = start;
+        let mut step = 0_usize;
+        let mut twice_area = 0_i64;
+        loop {
+            outline.push(point);
+            if step == 0 {
+                is_visited[self.index(point)] = true;
+            }
+            let [dx, dy] = crate::lattice::STEPS[step];
+            let next = [point[0] + dx, point[1] + dy];
+            twice_area +=
+                i64::from(point[0]) * i64::from(next[1]) - i64::from(next[0]) * i64::from(point[1]);
+            point = next;
+            // The two pixels ahead, left and right of the walking direction.
+            let (left, right) = match step {
+                0 => ([0, -1], [0, 0]),
+                1 => ([0, 0], [-1, 0]),
+                2 => ([-1, 0], [-1, -1]),
+                _ => ([-1, -1], [0, -1]),
+            };
+            let is_dark_at = |[dx, dy]: [i32; 2]| self.at([point[0] + dx, point[1] + dy]);
+            // Dark stays on the right: turn right where it ends, left where it blocks the way. Of
+            // two dark pixels that touch at a corner, the left one is another region.
+            step = match (is_dark_at(left), is_dark_at(right)) {
+                (_, false) => (step + 1) % 4,
+                (true, true) => (step + 3) % 4,
+                (false, true) => step,
+            };
+            if point == start && step == 0 {
+                return twice_area;
             }
         }
     }
@@ -162,24 +213,29 @@ fn quad(outline: &[[i32; 2]]) -> Option<Quad> {
     let points: Vec<[f64; 2]> = outline.iter().map(|point| point.map(f64::from)).collect();
     let area = area(&points);
     let tolerance_px = (TOLERANCE * area.sqrt()).max(MIN_TOLERANCE_PX);
-    // Outlines of quadrilaterals are short compared to their area.
+    // Outlines of quadrilaterals are short compared to their area: a square has 4, a rectangle of
+    // 1 x 30 has 11. This also bounds the time for text and texture, whose outlines are long.
     if points.len() as f64 > 12.0 * area.sqrt() {
         return None;
     }
     let n = points.len();
+    // The point farthest from the center is a corner, and so is the one farthest from that corner.
+    // From these two, splitting finds the others.
     let center = [0, 1].map(|axis| points.iter().map(|point| point[axis]).sum::<f64>() / n as f64);
     let farthest = |from: [f64; 2]| {
         (0..n).max_by(|&a, &b| distance(points[a], from).total_cmp(&distance(points[b], from)))
     };
     let first = farthest(center)?;
     let second = farthest(points[first])?;
-    let (low, high) = (first.min(second), first.max(second));
+    let low = first.min(second);
+    let high = first.max(second);
     let mut corners = vec![low];
     split(&points, low, high, tolerance_px, &mut corners);
     corners.push(high);
     split(&points, high, low + n, tolerance_px, &mut corners);
     let corners: [usize; 4] = corners.try_into().ok()?;
     let quad = corners.map(|at| points[at % n]);
+    // Polygons within the tolerance enclose a similar area, unless the outline is folded.
     let is_similar = (self::area(&quad) / area - 1.0).abs() < 0.3;
     (is_similar && is_convex(&quad) && shortest_side(&quad) >= MIN_SIDE_PX).then_some(quad)
 }
@@ -188,12 +244,11 @@ fn quad(outline: &[[i32; 2]]) -> Option<Quad> {
 /// Stops at five corners.
 fn split(points: &[[f64; 2]], from: usize, to: usize, tolerance_px: f64, corners: &mut Vec<usize>) {
     let n = points.len();
-    let (a, b) = (points[from % n], points[to % n]);
+    let a = points[from % n];
+    let b = points[to % n];
+    // Both are the same point if the outline is cut only once.
     let length = distance(a, b).max(1e-9);
-    let away = |at: usize| {
-        let point = points[at % n];
-        ((b[0] - a[0]) * (point[1] - a[1]) - (b[1] - a[1]) * (point[0] - a[0])).abs() / length
-    };
+    let away = |at: usize| cross(a, b, points[at % n]).abs() / length;
     let Some(at) = (from + 1..to).max_by(|&a, &b| away(a).total_cmp(&away(b))) else {
         return;
     };
@@ -203,6 +258,11 @@ fn split(points: &[[f64; 2]], from: usize, to: usize, tolerance_px: f64, corners
     split(points, from, at, tolerance_px, corners);
     corners.push(at);
     split(points, at, to, tolerance_px, corners);
+}
+
+/// Cross product of the vectors from `a` to `b` and to a point: twice the area of the triangle.
+fn cross(a: [f64; 2], b: [f64; 2], point: [f64; 2]) -> f64 {
+    (b[0] - a[0]) * (point[1] - a[1]) - (b[1] - a[1]) * (point[0] - a[0])
 }
 
 /// Enclosed area; positive for clockwise outlines.
@@ -216,6 +276,7 @@ fn area(points: &[[f64; 2]]) -> f64 {
         / 2.0
 }
 
+/// Whether all corners turn clockwise.
 fn is_convex(quad: &Quad) -> bool {
     (0..4).all(|at| {
         let [a, b, c] = [0, 1, 2].map(|offset| quad[(at + offset) % 4]);
@@ -233,6 +294,7 @@ pub(crate) fn shortest_side(quad: &Quad) -> f64 {
 ///
 /// Returns the quadrilateral unchanged if a side cannot be located or a corner moves far.
 fn refine(plane: &Plane, quad: Quad) -> Quad {
+    // A corner that moves farther belongs to another edge, such as that of a cell.
     let max_move_px = (0.15 * shortest_side(&quad)).max(2.0);
     let sides: [Option<Line>; 4] =
         std::array::from_fn(|at| fit_side(plane, quad[at], quad[(at + 1) % 4]));
@@ -258,16 +320,22 @@ struct Line {
 }
 
 impl Line {
+    fn distance(&self, point: [f64; 2]) -> f64 {
+        (self.normal[0] * point[0] + self.normal[1] * point[1] - self.offset).abs()
+    }
+
     fn intersection(a: &Self, b: &Self) -> Option<[f64; 2]> {
         let determinant = a.normal[0] * b.normal[1] - a.normal[1] * b.normal[0];
         let x = (a.offset * b.normal[1] - b.offset * a.normal[1]) / determinant;
         let y = (b.offset * a.normal[0] - a.offset * b.normal[0]) / determinant;
+        // The determinant is the sine of the angle between the lines.
         (determinant.abs() > 1e-3).then_some([x, y])
     }
 }
 
 /// Fits a line to the transition from dark to bright along a side; dark is on the right.
 fn fit_side(plane: &Plane, from: [f64; 2], to: [f64; 2]) -> Option<Line> {
+    // The outline follows pixel borders, so it is off by about a pixel, and more with blur.
     const REACH_PX: f64 = 2.0;
     const STEP_PX: f64 = 0.5;
     let length = distance(from, to);
@@ -278,6 +346,7 @@ fn fit_side(plane: &Plane, from: [f64; 2], to: [f64; 2]) -> Option<Line> {
         clippy::cast_sign_loss,
         reason = "a small positive number"
     )]
+    // One point per pixel. Beyond 40, more points hardly improve the line.
     let n = (length as usize).clamp(4, 40);
     let mut points: Vec<[f64; 2]> = Vec::with_capacity(n);
     for at in 0..n {
@@ -287,7 +356,10 @@ fn fit_side(plane: &Plane, from: [f64; 2], to: [f64; 2]) -> Option<Line> {
         let sample = |away: f64| {
             f64::from(plane.sample([0, 1].map(|axis| center[axis] + away * outward[axis])))
         };
-        let (mut weight_sum, mut sum) = (0.0, 0.0);
+        // The mean of all positions across the side, weighted by the squared rise from dark to
+        // bright. Falling edges are those of cells and do not count.
+        let mut weight_sum = 0.0;
+        let mut sum = 0.0;
         let mut away = -REACH_PX;
         while away <= REACH_PX {
             let rise = (sample(away + STEP_PX) - sample(away - STEP_PX)).max(0.0);
@@ -295,6 +367,7 @@ fn fit_side(plane: &Plane, from: [f64; 2], to: [f64; 2]) -> Option<Line> {
             sum += rise * rise * away;
             away += STEP_PX;
         }
+        // At least one rise of 5 gray values, or several smaller ones.
         if weight_sum > 25.0 {
             let away = sum / weight_sum;
             points.push([0, 1].map(|axis| center[axis] + away * outward[axis]));
@@ -303,10 +376,10 @@ fn fit_side(plane: &Plane, from: [f64; 2], to: [f64; 2]) -> Option<Line> {
     if points.len() < 3 {
         return None;
     }
+    // Where something touches the side, points are off. They are dropped by their distance from a
+    // first line, relative to the median distance; a perfect line must not drop its own noise.
     let line = fit_line(&points)?;
-    let off = |point: &[f64; 2]| {
-        (line.normal[0] * point[0] + line.normal[1] * point[1] - line.offset).abs()
-    };
+    let off = |point: &[f64; 2]| line.distance(*point);
     let mut offs: Vec<f64> = points.iter().map(off).collect();
     offs.sort_by(f64::total_cmp);
     let allowed = (2.5 * offs[offs.len() / 2]).max(0.1);
@@ -314,20 +387,25 @@ fn fit_side(plane: &Plane, from: [f64; 2], to: [f64; 2]) -> Option<Line> {
     fit_line(&points)
 }
 
-/// Total least squares.
+/// Sum of the products of the deviations from the mean along two axes.
+fn central_moment(points: &[[f64; 2]], mean: [f64; 2], [a, b]: [usize; 2]) -> f64 {
+    points
+        .iter()
+        .map(|point| (point[a] - mean[a]) * (point[b] - mean[b]))
+        .sum::<f64>()
+}
+
+/// Fits a line by total least squares: distances count across the line, whatever its direction.
 fn fit_line(points: &[[f64; 2]]) -> Option<Line> {
     if points.len() < 2 {
         return None;
     }
     let n = points.len() as f64;
     let mean = [0, 1].map(|axis| points.iter().map(|point| point[axis]).sum::<f64>() / n);
-    let moment = |a: usize, b: usize| {
-        points
-            .iter()
-            .map(|point| (point[a] - mean[a]) * (point[b] - mean[b]))
-            .sum::<f64>()
-    };
-    let (xx, xy, yy) = (moment(0, 0), moment(0, 1), moment(1, 1));
+    let xx = central_moment(points, mean, [0, 0]);
+    let xy = central_moment(points, mean, [0, 1]);
+    let yy = central_moment(points, mean, [1, 1]);
+    // Direction of the principal axis of the scatter.
     let direction_rad = (2.0 * xy).atan2(xx - yy) / 2.0;
     let normal = [-direction_rad.sin(), direction_rad.cos()];
     Some(Line {

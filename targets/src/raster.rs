@@ -4,7 +4,7 @@ use crate::error::PrintError;
 use crate::spec::{Pattern, TargetSpec};
 use crate::surface::{Surface, pixel_mean};
 
-/// Largest side of a picture, pixels.
+/// Largest side of a picture, pixels. A square picture of this size has 256 MiB.
 const MAX_SIDE_PX: u32 = 16_384;
 
 /// A picture of a target.
@@ -43,6 +43,7 @@ impl TargetSpec {
         let margin_m = self.margin_m();
         let side_px =
             [0, 1].map(|axis| ((high[axis] - low[axis] + 2.0 * margin_m) * px_per_m).ceil());
+        // Comparisons with NaN are false, so that it is refused, too.
         let is_valid = px_per_m > 0.0
             && side_px
                 .iter()
@@ -84,12 +85,12 @@ impl TargetSpec {
 )]
 fn white_part(surface: &Surface<'_>, cell: [u32; 2], origin_m: [f64; 2], px_per_m: f64) -> u8 {
     let [column, row] = cell.map(f64::from);
-    let is_white = |x: f64, y: f64| {
+    let mean = pixel_mean(|x, y| {
         let point = [
             origin_m[0] + (column + x) / px_per_m,
             origin_m[1] + (row + y) / px_per_m,
         ];
         f64::from(u8::from(!surface.is_black(point)))
-    };
-    (255.0 * pixel_mean(is_white)).round() as u8
+    });
+    (255.0 * mean).round() as u8
 }

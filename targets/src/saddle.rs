@@ -9,15 +9,20 @@
 use crate::gray::Plane;
 use std::f64::consts::{PI, TAU};
 
-/// Smallest difference in gray value between black and white sectors.
+/// Smallest difference in gray value between black and white sectors. Larger values lose boards in
+/// the dark; smaller ones find saddles in noise. This and the other thresholds of detection were
+/// tuned on the photographs of docs/benchmarks/2026-11-26-calibration.md.
 const MIN_CONTRAST: f32 = 12.0;
 /// Largest deviation of opposite edges from a straight line, radians. Perspective keeps lines
 /// straight; the rest is for blur, noise and fisheye lenses.
 const MAX_BEND_RAD: f64 = 0.55;
-/// Smallest angle of a sector, radians.
+/// Smallest angle of a sector, radians: about two samples of the ring, because a sector without a
+/// sample inside cannot be seen. Such sharp sectors occur only on boards that are tilted strongly.
 const MIN_SECTOR_RAD: f64 = 0.35;
-/// Radius of the ring around candidates, pixels.
+/// Radius of the ring around candidates, pixels. The ring must be outside the blur of the corner,
+/// and smaller than the squares around it.
 const RING_PX: f64 = 4.0;
+/// Samples of the ring: one per 0.8 pixels of its length.
 const N_RING: usize = 32;
 
 /// A saddle point.
@@ -34,7 +39,8 @@ pub(crate) struct Saddle {
 /// Finds saddle points. `plane` is slightly smoothed.
 pub(crate) fn find(plane: &Plane) -> Vec<Saddle> {
     let [width, height] = plane.size();
-    let margin = 6; // The ring and the Hessian stay inside.
+    // The ring and the Hessian stay inside.
+    let margin = 6;
     if width <= 2 * margin + 2 || height <= 2 * margin + 2 {
         return Vec::new();
     }
@@ -61,15 +67,21 @@ fn response(plane: &Plane) -> Vec<f32> {
     let [width, height] = plane.size();
     let mut response = vec![0.0; width * height];
     for y in 1..height - 1 {
-        let (above, here, below) = (plane.row(y - 1), plane.row(y), plane.row(y + 1));
+        let rows = [plane.row(y - 1), plane.row(y), plane.row(y + 1)];
         for x in 1..width - 1 {
-            let xx = here[x - 1] - 2.0 * here[x] + here[x + 1];
-            let yy = above[x] - 2.0 * here[x] + below[x];
-            let xy = (below[x + 1] - below[x - 1] - above[x + 1] + above[x - 1]) * 0.25;
-            response[y * width + x] = xy * xy - xx * yy;
+            response[y * width + x] = response_at(rows, x);
         }
     }
     response
+}
+
+/// Minus the determinant of the Hessian at column `x` of the middle of three rows. It is positive
+/// at saddles, where the two principal curvatures have opposite signs, and negative at blobs.
+fn response_at([above, here, below]: [&[f32]; 3], x: usize) -> f32 {
+    let xx = here[x - 1] - 2.0 * here[x] + here[x + 1];
+    let yy = above[x] - 2.0 * here[x] + below[x];
+    let xy = (below[x + 1] - below[x - 1] - above[x + 1] + above[x - 1]) * 0.25;
+    xy * xy - xx * yy
 }
 
 /// Whether a response is the largest within two pixels; of equal ones, the first.
@@ -94,14 +106,17 @@ fn stationary_point(plane: &Plane, x: usize, y: usize) -> [f64; 2] {
     let determinant = xx * yy - xy * xy;
     let dx = (xy * gradient[1] - yy * gradient[0]) / determinant;
     let dy = (xy * gradient[0] - xx * gradient[1]) / determinant;
-    let limited = |delta: f64| {
-        if delta.is_finite() {
-            delta.clamp(-1.0, 1.0)
-        } else {
-            0.0
-        }
-    };
     [x as f64 + 0.5 + limited(dx), y as f64 + 0.5 + limited(dy)]
+}
+
+/// Limits a Newton step to one pixel. The expansion holds only near the pixel; on a plateau, the
+/// determinant is zero and the step is not finite.
+fn limited(delta_px: f64) -> f64 {
+    if delta_px.is_finite() {
+        delta_px.clamp(-1.0, 1.0)
+    } else {
+        0.0
+    }
 }
 
 /// Samples a ring around a point and returns the saddle if two black and two white sectors
@@ -118,22 +133,23 @@ pub(crate) fn ring(plane: &Plane, center: [f64; 2], radius_px: f64) -> Option<Sa
     let samples: [f32; N_RING] = std::array::from_fn(sample);
     let mut sorted = samples;
     sorted.sort_by(f32::total_cmp);
+    // Means of the darkest and the brightest quarter: about half of the samples are black, so these
+    // quarters lie inside the sectors, and single noisy samples do not decide.
     let quarter_mean = |quarter: &[f32]| quarter.iter().sum::<f32>() / quarter.len() as f32;
-    let (black, white) = (
-        quarter_mean(&sorted[..N_RING / 4]),
-        quarter_mean(&sorted[N_RING * 3 / 4..]),
-    );
-    let (contrast, threshold) = (white - black, (white + black) / 2.0);
+    let black = quarter_mean(&sorted[..N_RING / 4]);
+    let white = quarter_mean(&sorted[N_RING * 3 / 4..]);
+    let contrast = white - black;
+    let threshold = (white + black) / 2.0;
     if contrast < MIN_CONTRAST {
         return None;
     }
+    // Walk around the ring and note every change of color: its angle, interpolated between the two
+    // samples, and whether black follows.
     let mut edges = [(0.0, false); 4];
     let mut n_edges = 0;
     for at in 0..N_RING {
-        let (here, next) = (
-            samples[at] - threshold,
-            samples[(at + 1) % N_RING] - threshold,
-        );
+        let here = samples[at] - threshold;
+        let next = samples[(at + 1) % N_RING] - threshold;
         if (here < 0.0) != (next < 0.0) {
             let edge = edges.get_mut(n_edges)?; // A fifth edge: not a saddle.
             *edge = (
@@ -149,20 +165,22 @@ pub(crate) fn ring(plane: &Plane, center: [f64; 2], radius_px: f64) -> Option<Sa
     // Start with the edge that a black sector follows.
     let first = usize::from(!edges[0].1);
     let edges_rad: [f64; 4] = std::array::from_fn(|at| {
+        // Angles stay ascending when the first edge is put last.
         let turns = if first + at >= 4 { TAU } else { 0.0 };
         edges[(first + at) % 4].0 + turns
     });
+    // Two lines cross at a corner of a board. Other places with four sectors, such as texture, have
+    // edges that do not continue on the other side.
     let bend = |at: usize| (edges_rad[at + 2] - edges_rad[at] - PI).abs();
-    let sector = |at: usize| {
-        if at == 3 {
-            edges_rad[0] + TAU - edges_rad[3]
-        } else {
-            edges_rad[at + 1] - edges_rad[at]
-        }
-    };
+    let sectors_rad = [
+        edges_rad[1] - edges_rad[0],
+        edges_rad[2] - edges_rad[1],
+        edges_rad[3] - edges_rad[2],
+        edges_rad[0] + TAU - edges_rad[3],
+    ];
     let is_saddle = bend(0) < MAX_BEND_RAD
         && bend(1) < MAX_BEND_RAD
-        && (0..4).all(|at| sector(at) > MIN_SECTOR_RAD);
+        && sectors_rad.iter().all(|&sector| sector > MIN_SECTOR_RAD);
     is_saddle.then_some(Saddle {
         pixel: center,
         edges_rad,
@@ -187,7 +205,10 @@ pub(crate) fn angle_between(a_rad: f64, b_rad: f64) -> f64 {
     reason = "pixel indices are bounded by the image"
 )]
 pub(crate) fn refine(plane: &Plane, start: [f64; 2], half_window_px: f64) -> Option<[f64; 2]> {
+    // Most corners converge in a few steps. Points that still move after that many are kept.
     const MAX_STEPS: usize = 12;
+    // A fiftieth of the smallest error of corners in renders, 0.011 pixels
+    // (docs/benchmarks/2026-11-26-calibration.md).
     const CONVERGED_PX: f64 = 2e-4;
     let reach = half_window_px.ceil() + 1.0;
     let mut center = start;
@@ -195,11 +216,19 @@ pub(crate) fn refine(plane: &Plane, start: [f64; 2], half_window_px: f64) -> Opt
         if !plane.contains(center, reach + 1.5) {
             return None;
         }
-        let (mut xx, mut xy, mut yy, mut bx, mut by) = (0.0, 0.0, 0.0, 0.0, 0.0);
-        let per_variance = -2.0 / (half_window_px * half_window_px); // Half the window is one standard deviation.
+        // Sums of the normal equations: the structure tensor, and its product with the positions.
+        // Positions are relative to the current center, so the solution is the step.
+        let mut xx = 0.0;
+        let mut xy = 0.0;
+        let mut yy = 0.0;
+        let mut bx = 0.0;
+        let mut by = 0.0;
+        // Half of `half_window_px` is one standard deviation.
+        let per_variance = -2.0 / (half_window_px * half_window_px);
         for y in (center[1] - reach) as usize..=(center[1] + reach) as usize {
             for x in (center[0] - reach) as usize..=(center[0] + reach) as usize {
-                let (dx, dy) = (x as f64 + 0.5 - center[0], y as f64 + 0.5 - center[1]);
+                let dx = x as f64 + 0.5 - center[0];
+                let dy = y as f64 + 0.5 - center[1];
                 let gx = f64::from(plane.at(x + 1, y) - plane.at(x - 1, y));
                 let gy = f64::from(plane.at(x, y + 1) - plane.at(x, y - 1));
                 let weight = ((dx * dx + dy * dy) * per_variance).exp();
@@ -225,6 +254,7 @@ pub(crate) fn refine(plane: &Plane, start: [f64; 2], half_window_px: f64) -> Opt
         ];
         center = [center[0] + step[0], center[1] + step[1]];
         let moved = (center[0] - start[0]).hypot(center[1] - start[1]);
+        // Written so that a NaN is not near.
         let is_near = moved <= half_window_px;
         if !is_near {
             return None;
@@ -254,17 +284,16 @@ pub(crate) fn find_near(
     let range = |center: f64| (center - reach_px) as usize..=(center + reach_px) as usize;
     let mut best: Option<(f32, usize, usize)> = None;
     for y in range(predicted[1]) {
-        let (above, here, below) = (plane.row(y - 1), plane.row(y), plane.row(y + 1));
+        let rows = [plane.row(y - 1), plane.row(y), plane.row(y + 1)];
         for x in range(predicted[0]) {
-            let xx = here[x - 1] - 2.0 * here[x] + here[x + 1];
-            let yy = above[x] - 2.0 * here[x] + below[x];
-            let xy = (below[x + 1] - below[x - 1] - above[x + 1] + above[x - 1]) * 0.25;
-            let value = xy * xy - xx * yy;
+            let value = response_at(rows, x);
             if best.is_none_or(|best| value > best.0) {
                 best = Some((value, x, y));
             }
         }
     }
+    // A negative response is a blob. Weak responses are allowed, unlike in `find`: the prediction is
+    // evidence, and the ring checks the contrast.
     let (_, x, y) = best.filter(|best| best.0 > 0.0)?;
     ring(plane, stationary_point(plane, x, y), radius_px)
 }

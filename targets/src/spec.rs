@@ -5,9 +5,10 @@ use crate::error::SpecError;
 use std::fmt;
 use std::str::FromStr;
 
-/// Smallest and largest square or tag, meters.
+/// Smallest and largest square or tag, meters. Outside, the unit is probably wrong.
 const SIDE_M: [f64; 2] = [0.001, 2.0];
-/// Largest number of columns or rows.
+/// Largest number of columns or rows. It bounds the time and the memory of detection, and keeps
+/// products of counts far below the range of `u32`.
 const MAX_COUNT: u32 = 100;
 
 /// A calibration target: its pattern and its dimensions.
@@ -110,7 +111,8 @@ impl fmt::Display for TargetSpec {
                 marker_m,
                 dictionary,
             } => {
-                let (square, marker) = (Millimeters(*square_m), Millimeters(*marker_m));
+                let square = Millimeters(*square_m);
+                let marker = Millimeters(*marker_m);
                 write!(
                     f,
                     "charuco:{columns}x{rows}:{square}:{marker}:{}",
@@ -150,6 +152,7 @@ pub(crate) struct Millimeters(pub(crate) f64);
 
 impl fmt::Display for Millimeters {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        // A picometer: far above the rounding of the conversion, far below any length in use.
         const DIGITS: f64 = 1e9;
         write!(f, "{}mm", (self.0 * 1e3 * DIGITS).round() / DIGITS)
     }
@@ -198,6 +201,7 @@ impl Reader<'_> {
             expected: "4X4_50, 4X4_100, 4X4_250, 4X4_1000, or the same with 5X5, 6X6 or 7X7"
                 .to_owned(),
         })?;
+        // Every second square has a marker. Of an odd number of squares, black has one more.
         let needed = squares[0] * squares[1] / 2;
         if needed > dictionary.n_markers() {
             return Err(self.too_small(
@@ -244,6 +248,7 @@ impl Reader<'_> {
         self.expect_parts(&[3, 4], form)?;
         let squares = self.counts(1, ["columns of squares", "rows of squares"], [6, MAX_COUNT])?;
         let square_m = self.length(2, "square")?;
+        // The origin is limited, so that the largest board lies within one period of the pattern.
         let origin = match self.parts.len() {
             3 => [0, 0],
             _ => self.counts(
@@ -278,10 +283,9 @@ impl Reader<'_> {
         let id: u32 = self.number(2, "tag id")?;
         let max = Dictionary::tag36h11().n_markers() - 1;
         if id > max {
-            let (spec, what) = (self.spec.to_owned(), "as tag id");
             return Err(SpecError::CountRange {
-                spec,
-                what,
+                spec: self.spec.to_owned(),
+                what: "as tag id",
                 found: id,
                 min: 0,
                 max,
@@ -313,15 +317,8 @@ impl Reader<'_> {
         [min, max]: [u32; 2],
     ) -> Result<[u32; 2], SpecError> {
         let value = self.parts[part];
-        let parse = || {
-            let (columns, rows) = value.split_once(['x', 'X'])?;
-            Some([
-                columns.trim().parse::<u32>().ok()?,
-                rows.trim().parse::<u32>().ok()?,
-            ])
-        };
         let spec = || self.spec.to_owned();
-        let counts = parse().ok_or_else(|| SpecError::Counts {
+        let counts = parse_counts(value).ok_or_else(|| SpecError::Counts {
             spec: spec(),
             value: value.to_owned(),
         })?;
@@ -346,6 +343,7 @@ impl Reader<'_> {
         let with_unit = |unit: &str, per_meter: f64| {
             Some((lower.strip_suffix(unit)?.trim().to_owned(), per_meter))
         };
+        // Meters last: the other units end with "m", too.
         let split = with_unit("mm", 1000.0)
             .or_else(|| with_unit("cm", 100.0))
             .or_else(|| with_unit("m", 1.0));
@@ -393,6 +391,15 @@ impl Reader<'_> {
             suggestion: suggestion.to_owned(),
         }
     }
+}
+
+/// Parses counts such as `9x6`.
+fn parse_counts(value: &str) -> Option<[u32; 2]> {
+    let (columns, rows) = value.split_once(['x', 'X'])?;
+    Some([
+        columns.trim().parse::<u32>().ok()?,
+        rows.trim().parse::<u32>().ok()?,
+    ])
 }
 
 #[cfg(test)]

@@ -59,49 +59,16 @@ impl Surface<'_> {
                 dictionary,
             } => {
                 let position = [x / square_m, y / square_m];
-                let Some([column, row]) = square(position, *squares) else {
-                    return false;
-                };
-                if is_black_square(column, row, squares[1], self.is_legacy) {
-                    return true;
-                }
                 let marker_frac = marker_m / square_m;
-                let in_marker = [
-                    position[0] - f64::from(column),
-                    position[1] - f64::from(row),
-                ]
-                .map(|frac| (frac - 0.5) / marker_frac + 0.5);
-                is_black_cell(
-                    dictionary,
-                    self.charuco_id(*squares, column, row),
-                    BORDER,
-                    in_marker,
-                )
+                self.is_black_on_charuco(*squares, marker_frac, dictionary, position)
             }
             Pattern::Aprilgrid {
                 tags,
                 tag_m,
                 spacing_frac,
             } => {
-                let pitch = 1.0 + spacing_frac;
-                let position = [x, y].map(|value| (value / tag_m + spacing_frac) / pitch);
-                // One more column and row: the last consists of small squares only.
-                let Some([column, row]) = square(position, tags.map(|count| count + 1)) else {
-                    return false;
-                };
-                let in_pitch = [
-                    (position[0] - f64::from(column)) * pitch,
-                    (position[1] - f64::from(row)) * pitch,
-                ];
-                match in_pitch.map(|value| value < *spacing_frac) {
-                    [true, true] => true,
-                    [false, false] if column < tags[0] && row < tags[1] => {
-                        let id = (tags[1] - 1 - row) * tags[0] + column;
-                        let in_tag = in_pitch.map(|value| value - spacing_frac);
-                        is_black_cell(&Dictionary::tag36h11(), id, GRID_TAG_BORDER, in_tag)
-                    }
-                    _ => false,
-                }
+                let in_tags = [x / tag_m, y / tag_m];
+                is_black_on_aprilgrid(*tags, *spacing_frac, in_tags)
             }
             Pattern::Puzzleboard {
                 squares,
@@ -112,6 +79,7 @@ impl Surface<'_> {
                 let Some(cell) = square(position, *squares) else {
                     return false;
                 };
+                // Dots are printed over the squares.
                 let dot = dot_near(position, cell, *squares, *origin);
                 dot.unwrap_or_else(|| {
                     is_black_square(cell[0] + origin[0], cell[1] + origin[1], 1, false)
@@ -126,6 +94,31 @@ impl Surface<'_> {
         }
     }
 
+    /// Whether a ChArUco board is black at a position in squares. `marker_frac`: side of the
+    /// markers relative to the squares.
+    fn is_black_on_charuco(
+        &self,
+        squares: [u32; 2],
+        marker_frac: f64,
+        dictionary: &Dictionary,
+        position: [f64; 2],
+    ) -> bool {
+        let Some([column, row]) = square(position, squares) else {
+            return false;
+        };
+        if is_black_square(column, row, squares[1], self.is_legacy) {
+            return true;
+        }
+        // The marker is in the middle of the square.
+        let in_marker = [
+            position[0] - f64::from(column),
+            position[1] - f64::from(row),
+        ]
+        .map(|frac| (frac - 0.5) / marker_frac + 0.5);
+        let id = self.charuco_id(squares, column, row);
+        is_black_cell(dictionary, id, BORDER, in_marker)
+    }
+
     /// Id of the marker in a white square: they are numbered row by row.
     fn charuco_id(&self, squares: [u32; 2], column: u32, row: u32) -> u32 {
         let is_white = |column, row| !is_black_square(column, row, squares[1], self.is_legacy);
@@ -137,23 +130,11 @@ impl Surface<'_> {
     /// All shapes, in the order of painting.
     pub(crate) fn shapes(&self) -> Vec<Shape> {
         let mut shapes = Vec::new();
-        let cells = |counts: [u32; 2]| {
-            (0..counts[1]).flat_map(move |row| (0..counts[0]).map(move |column| [column, row]))
-        };
-        let mut squares_of =
-            |counts: [u32; 2], first_m: f64, square_m: f64, is_black: &dyn Fn([u32; 2]) -> bool| {
-                for cell in cells(counts).filter(|&cell| is_black(cell)) {
-                    let corner = cell.map(|count| first_m + f64::from(count) * square_m);
-                    shapes.push(Shape::Rectangle([
-                        corner,
-                        corner.map(|value| value + square_m),
-                    ]));
-                }
-            };
         match *self.pattern {
             Pattern::Chessboard { inner, square_m } => {
+                let squares = inner.map(|count| count + 1);
                 let is_black = |[column, row]: [u32; 2]| is_black_square(column, row, 1, false);
-                squares_of(inner.map(|count| count + 1), -square_m, square_m, &is_black);
+                black_squares(squares, -square_m, square_m, is_black, &mut shapes);
             }
             Pattern::Charuco {
                 squares,
@@ -164,7 +145,7 @@ impl Surface<'_> {
                 let is_black = |[column, row]: [u32; 2]| {
                     is_black_square(column, row, squares[1], self.is_legacy)
                 };
-                squares_of(squares, 0.0, square_m, &is_black);
+                black_squares(squares, 0.0, square_m, is_black, &mut shapes);
                 for cell in cells(squares).filter(|&cell| !is_black(cell)) {
                     let corner =
                         cell.map(|count| f64::from(count) * square_m + (square_m - marker_m) / 2.0);
@@ -177,26 +158,7 @@ impl Surface<'_> {
                 tag_m,
                 spacing_frac,
             } => {
-                let (gap_m, pitch_m) = (tag_m * spacing_frac, tag_m * (1.0 + spacing_frac));
-                for cell in cells(tags.map(|count| count + 1)) {
-                    let corner = cell.map(|count| f64::from(count) * pitch_m - gap_m);
-                    shapes.push(Shape::Rectangle([
-                        corner,
-                        corner.map(|value| value + gap_m),
-                    ]));
-                }
-                for [column, row] in cells(tags) {
-                    let id = (tags[1] - 1 - row) * tags[0] + column;
-                    let corner = [column, row].map(|count| f64::from(count) * pitch_m);
-                    marker(
-                        &Dictionary::tag36h11(),
-                        id,
-                        GRID_TAG_BORDER,
-                        corner,
-                        tag_m,
-                        &mut shapes,
-                    );
-                }
+                aprilgrid_shapes(tags, tag_m, spacing_frac, &mut shapes);
             }
             Pattern::Puzzleboard {
                 squares,
@@ -206,29 +168,8 @@ impl Surface<'_> {
                 let is_black = |[column, row]: [u32; 2]| {
                     is_black_square(column + origin[0], row + origin[1], 1, false)
                 };
-                squares_of(squares, -square_m, square_m, &is_black);
-                for [column, row] in cells(squares) {
-                    for is_vertical in [true, false] {
-                        let is_last = if is_vertical {
-                            column + 1 == squares[0]
-                        } else {
-                            row + 1 == squares[1]
-                        };
-                        if is_last {
-                            continue;
-                        }
-                        let middle = if is_vertical { [1.0, 0.5] } else { [0.5, 1.0] };
-                        let center = [
-                            f64::from(column) + middle[0] - 1.0,
-                            f64::from(row) + middle[1] - 1.0,
-                        ];
-                        shapes.push(Shape::Disk {
-                            center: center.map(|value| value * square_m),
-                            radius: square_m * DOT_FRAC / 2.0,
-                            is_black: !edge([column, row], is_vertical, origin).is_white(),
-                        });
-                    }
-                }
+                black_squares(squares, -square_m, square_m, is_black, &mut shapes);
+                dots(squares, square_m, origin, &mut shapes);
             }
             Pattern::Tag { id, side_m } => {
                 marker(
@@ -242,6 +183,106 @@ impl Surface<'_> {
             }
         }
         shapes
+    }
+}
+
+/// Whether an AprilGrid is black at a position in sides of a tag.
+fn is_black_on_aprilgrid(tags: [u32; 2], spacing_frac: f64, in_tags: [f64; 2]) -> bool {
+    // The board repeats with a pitch of one tag and one gap. Counted from the small square left of
+    // and above the first tag, each period begins with the gap.
+    let pitch = 1.0 + spacing_frac;
+    let position = in_tags.map(|value| (value + spacing_frac) / pitch);
+    // One more column and row: the last consists of small squares only.
+    let Some([column, row]) = square(position, tags.map(|count| count + 1)) else {
+        return false;
+    };
+    let in_pitch = [
+        (position[0] - f64::from(column)) * pitch,
+        (position[1] - f64::from(row)) * pitch,
+    ];
+    match in_pitch.map(|value| value < spacing_frac) {
+        // Small black squares touch the corners of four tags.
+        [true, true] => true,
+        [false, false] if column < tags[0] && row < tags[1] => {
+            let id = grid_tag_id(tags, [column, row]);
+            let in_tag = in_pitch.map(|value| value - spacing_frac);
+            is_black_cell(&Dictionary::tag36h11(), id, GRID_TAG_BORDER, in_tag)
+        }
+        _ => false,
+    }
+}
+
+/// Id of a tag of an AprilGrid. Kalibr counts rows from the bottom.
+fn grid_tag_id(tags: [u32; 2], [column, row]: [u32; 2]) -> u32 {
+    (tags[1] - 1 - row) * tags[0] + column
+}
+
+/// Columns and rows of all cells, row by row.
+fn cells(counts: [u32; 2]) -> impl Iterator<Item = [u32; 2]> {
+    (0..counts[1]).flat_map(move |row| (0..counts[0]).map(move |column| [column, row]))
+}
+
+/// Appends the black squares of a board. `first_m`: x and y of the upper left corner.
+fn black_squares(
+    counts: [u32; 2],
+    first_m: f64,
+    square_m: f64,
+    is_black: impl Fn([u32; 2]) -> bool,
+    shapes: &mut Vec<Shape>,
+) {
+    for cell in cells(counts).filter(|&cell| is_black(cell)) {
+        let corner = cell.map(|count| first_m + f64::from(count) * square_m);
+        shapes.push(Shape::Rectangle([
+            corner,
+            corner.map(|value| value + square_m),
+        ]));
+    }
+}
+
+/// Appends the small squares and the tags of an AprilGrid.
+fn aprilgrid_shapes(tags: [u32; 2], tag_m: f64, spacing_frac: f64, shapes: &mut Vec<Shape>) {
+    let gap_m = tag_m * spacing_frac;
+    let pitch_m = tag_m * (1.0 + spacing_frac);
+    for cell in cells(tags.map(|count| count + 1)) {
+        let corner = cell.map(|count| f64::from(count) * pitch_m - gap_m);
+        shapes.push(Shape::Rectangle([
+            corner,
+            corner.map(|value| value + gap_m),
+        ]));
+    }
+    let dictionary = Dictionary::tag36h11();
+    for cell in cells(tags) {
+        let id = grid_tag_id(tags, cell);
+        let corner = cell.map(|count| f64::from(count) * pitch_m);
+        marker(&dictionary, id, GRID_TAG_BORDER, corner, tag_m, shapes);
+    }
+}
+
+/// Appends the dots of a puzzleboard, one per edge between two of its squares.
+fn dots(squares: [u32; 2], square_m: f64, origin: [u32; 2], shapes: &mut Vec<Shape>) {
+    for [column, row] in cells(squares) {
+        for is_vertical in [true, false] {
+            // The outermost edges have a square on one side only, and no dot.
+            let is_last = if is_vertical {
+                column + 1 == squares[0]
+            } else {
+                row + 1 == squares[1]
+            };
+            if is_last {
+                continue;
+            }
+            let middle = if is_vertical { [1.0, 0.5] } else { [0.5, 1.0] };
+            // The origin of the board is the lower right corner of the first square.
+            let center = [
+                f64::from(column) + middle[0] - 1.0,
+                f64::from(row) + middle[1] - 1.0,
+            ];
+            shapes.push(Shape::Disk {
+                center: center.map(|value| value * square_m),
+                radius: square_m * DOT_FRAC / 2.0,
+                is_black: !edge([column, row], is_vertical, origin).is_white(),
+            });
+        }
     }
 }
 
@@ -260,7 +301,8 @@ pub(crate) fn pixel_mean(color: impl Fn(f64, f64) -> f64) -> f64 {
         [0.5, 1.0],
         [1.0, 1.0],
     ];
-    // Most pixels have one color.
+    // Most pixels have one color, which their corners and sides show. Only shapes smaller than half
+    // a pixel could be missed.
     let first = color(0.5, 0.5);
     if BORDER.into_iter().all(|[x, y]| color(x, y) == first) {
         return first;
@@ -268,13 +310,12 @@ pub(crate) fn pixel_mean(color: impl Fn(f64, f64) -> f64) -> f64 {
     // A lattice in which no two samples share a row or a column, so that edges along them are
     // smooth, too.
     let half = 0.5 / N_SAMPLES as f64;
-    let sample = |n: f64| {
-        color(
-            n / N_SAMPLES as f64 + half,
-            (n * GOLDEN_FRAC).fract() + half,
-        )
-    };
-    (0..N_SAMPLES).map(|n| sample(n as f64)).sum::<f64>() / N_SAMPLES as f64
+    let samples = (0..N_SAMPLES).map(|n| {
+        let x = n as f64 / N_SAMPLES as f64 + half;
+        let y = (n as f64 * GOLDEN_FRAC).fract() + half;
+        color(x, y)
+    });
+    samples.sum::<f64>() / N_SAMPLES as f64
 }
 
 /// The square that contains a position in units of squares. `None` outside of all squares.
@@ -300,6 +341,7 @@ fn is_black_cell(dictionary: &Dictionary, id: u32, border: usize, point: [f64; 2
         return false;
     };
     let [column, row] = cell.map(|value| value as usize);
+    // Only the inner cells carry bits.
     let is_inside = |at: usize| (border..border + n_bits).contains(&at);
     !(is_inside(column) && is_inside(row)) || dictionary.is_black(id, row - border, column - border)
 }
@@ -317,22 +359,18 @@ fn marker(
     let n_bits = dictionary.n_bits();
     let n = n_bits + 2 * border;
     let cell_m = side_m / n as f64;
-    let mut rectangle = |columns: [usize; 2], rows: [usize; 2]| {
-        let at = |column: usize, row: usize| {
-            [
-                corner[0] + column as f64 * cell_m,
-                corner[1] + row as f64 * cell_m,
-            ]
-        };
-        shapes.push(Shape::Rectangle([
-            at(columns[0], rows[0]),
-            at(columns[1], rows[1]),
-        ]));
+    let point = |column: usize, row: usize| {
+        [0, 1].map(|axis| corner[axis] + [column, row][axis] as f64 * cell_m)
     };
-    rectangle([0, n], [0, border]);
-    rectangle([0, n], [n - border, n]);
-    rectangle([0, border], [border, n - border]);
-    rectangle([n - border, n], [border, n - border]);
+    let mut add = |columns: [usize; 2], rows: [usize; 2]| {
+        let low = point(columns[0], rows[0]);
+        shapes.push(Shape::Rectangle([low, point(columns[1], rows[1])]));
+    };
+    add([0, n], [0, border]);
+    add([0, n], [n - border, n]);
+    add([0, border], [border, n - border]);
+    add([n - border, n], [border, n - border]);
+    // One rectangle per run of black cells: fewer shapes, and no seams between cells of a row.
     for row in 0..n_bits {
         let mut column = 0;
         while column < n_bits {
@@ -340,7 +378,7 @@ fn marker(
                 .find(|&at| !dictionary.is_black(id, row, at))
                 .unwrap_or(n_bits);
             if end > column {
-                rectangle(
+                add(
                     [column + border, end + border],
                     [row + border, row + border + 1],
                 );
@@ -350,6 +388,7 @@ fn marker(
     }
 }
 
+/// The edge right of or below a square of the board, in the master pattern.
 fn edge([column, row]: [u32; 2], is_vertical: bool, origin: [u32; 2]) -> Edge {
     let [column, row] = [column + origin[0], row + origin[1]].map(u32::cast_signed);
     Edge {
@@ -375,6 +414,7 @@ fn dot_near(
     let covers = |x: f64, y: f64| (in_square[0] - x).hypot(in_square[1] - y) <= reach;
     let color =
         |cell: [u32; 2], is_vertical: bool| Some(!edge(cell, is_vertical, origin).is_white());
+    // Dots are smaller than half a square, so at most one covers a position.
     if column > 0 && covers(0.0, 0.5) {
         color([column - 1, row], true)
     } else if column + 1 < squares[0] && covers(1.0, 0.5) {

@@ -31,6 +31,44 @@ const MARGIN_FRAC: f64 = 0.06;
 const INK: f64 = 30.0;
 const PAPER: f64 = 205.0;
 const BACKGROUND: f64 = 105.0;
+
+/// A target on its sheet of paper.
+struct Sheet<'a> {
+    surface: Surface<'a>,
+    /// Smallest and largest x and y of the paper, meters.
+    bounds_m: [[f64; 2]; 2],
+}
+
+impl Sheet<'_> {
+    /// Gray value of a point of the board frame, meters.
+    fn gray(&self, point: [f64; 2]) -> f64 {
+        let [low, high] = self.bounds_m;
+        let is_on_paper = (0..2).all(|axis| point[axis] >= low[axis] && point[axis] <= high[axis]);
+        if !is_on_paper {
+            BACKGROUND
+        } else if self.surface.is_black(point) {
+            INK
+        } else {
+            PAPER
+        }
+    }
+
+    /// Mean gray value of a pixel, from the board positions of its corners: upper left, upper
+    /// right, lower left, lower right.
+    fn pixel(&self, corners: [Option<[f64; 2]>; 4]) -> f64 {
+        // A ray of a corner that does not meet the board, as at the horizon.
+        let [Some(a), Some(b), Some(c), Some(d)] = corners else {
+            return BACKGROUND;
+        };
+        pixel_mean(|x, y| {
+            self.gray([0, 1].map(|axis| {
+                (a[axis] * (1.0 - x) + b[axis] * x) * (1.0 - y)
+                    + (c[axis] * (1.0 - x) + d[axis] * x) * y
+            }))
+        })
+    }
+}
+
 /// Renders a target. Returns one byte per pixel, row by row.
 ///
 /// Every pixel is the mean of a grid of samples. Between the corners of a pixel, board positions
@@ -47,31 +85,21 @@ pub fn render(target: &TargetSpec, view: &View) -> Vec<u8> {
         .collect();
     let [low, high] = target.bounds_m();
     let margin_m = MARGIN_FRAC * (high[0] - low[0]).max(high[1] - low[1]);
-    let color = |point: [f64; 2]| {
-        let is_on_paper = (0..2).all(|axis| {
-            point[axis] >= low[axis] - margin_m && point[axis] <= high[axis] + margin_m
-        });
-        match (is_on_paper, surface.is_black(point)) {
-            (false, _) => BACKGROUND,
-            (true, true) => INK,
-            (true, false) => PAPER,
-        }
+    let sheet = Sheet {
+        surface,
+        bounds_m: [
+            low.map(|value| value - margin_m),
+            high.map(|value| value + margin_m),
+        ],
     };
-    let pixel = |at: usize| {
-        let corner = (at / width) * (width + 1) + at % width;
-        let corners =
-            [corner, corner + 1, corner + width + 1, corner + width + 2].map(|at| points[at]);
-        let [Some(a), Some(b), Some(c), Some(d)] = corners else {
-            return BACKGROUND;
-        };
-        pixel_mean(|x, y| {
-            color([0, 1].map(|axis| {
-                (a[axis] * (1.0 - x) + b[axis] * x) * (1.0 - y)
-                    + (c[axis] * (1.0 - x) + d[axis] * x) * y
-            }))
+    let sharp: Vec<f64> = (0..width * height)
+        .map(|at| {
+            // Rows of corners are one longer than rows of pixels.
+            let corner = (at / width) * (width + 1) + at % width;
+            let corners = [corner, corner + 1, corner + width + 1, corner + width + 2];
+            sheet.pixel(corners.map(|at| points[at]))
         })
-    };
-    let sharp: Vec<f64> = (0..width * height).map(pixel).collect();
+        .collect();
     let blurred = blur(
         &blur(&sharp, [width, height], 1, view.blur_px),
         [width, height],
@@ -79,21 +107,27 @@ pub fn render(target: &TargetSpec, view: &View) -> Vec<u8> {
         view.blur_px,
     );
     let mut random = Random::new(view.seed);
-    let lit = |(at, value): (usize, f64)| {
-        let fall_off = 1.0 - 0.25 * (at % width) as f64 / width as f64;
-        quantized(value * fall_off + view.noise * random.normal())
-    };
-    blurred.into_iter().enumerate().map(lit).collect()
+    blurred
+        .into_iter()
+        .enumerate()
+        .map(|(at, value)| {
+            // A quarter darker at the right border: detection must not rely on even light.
+            let fall_off = 1.0 - 0.25 * (at % width) as f64 / width as f64;
+            quantized(value * fall_off + view.noise * random.normal())
+        })
+        .collect()
 }
 
 /// Ids and exact pixels of the corners that are inside the image and in front of the camera.
 pub fn truth(target: &TargetSpec, view: &View) -> Vec<(u32, [f64; 2])> {
-    let pixel = |id: u32| {
-        let point_in_camera = view.camera_from_board * nalgebra::Point3::from(target.corner(id)?);
-        let pixel = view.intrinsics.project(&point_in_camera.coords)?;
-        view.intrinsics.contains(pixel).then_some((id, pixel))
-    };
-    (0..target.n_corners()).filter_map(pixel).collect()
+    (0..target.n_corners())
+        .filter_map(|id| {
+            let point_in_board = nalgebra::Point3::from(target.corner(id)?);
+            let point_in_camera = view.camera_from_board * point_in_board;
+            let pixel = view.intrinsics.project(&point_in_camera.coords)?;
+            view.intrinsics.contains(pixel).then_some((id, pixel))
+        })
+        .collect()
 }
 
 /// Where the ray of a pixel position meets the board.
@@ -102,6 +136,7 @@ fn point_on_board(view: &View, pixel: [f64; 2]) -> Option<[f64; 2]> {
     let board_from_camera = view.camera_from_board.inverse();
     let origin: Vector3<f64> = board_from_camera.translation.vector;
     let ray = board_from_camera.rotation * ray_in_camera;
+    // The board is the plane z = 0 of its frame.
     let distance = -origin.z / ray.z;
     (distance > 0.0 && distance.is_finite())
         .then(|| [origin.x + distance * ray.x, origin.y + distance * ray.y])
@@ -123,20 +158,23 @@ fn blur(values: &[f64], [width, height]: [usize; 2], stride: usize, sigma_px: f6
     };
     let weights: Vec<f64> = (0..=2 * reach).map(weight).collect();
     let sum: f64 = weights.iter().sum();
-    let (n, position) = if stride == 1 { (width, 0) } else { (height, 1) };
-    let blurred = |at: usize| {
-        let here = [at % width, at / width][position];
+    let n = if stride == 1 { width } else { height };
+    let mut blurred = Vec::with_capacity(values.len());
+    for at in 0..values.len() {
+        // Position along the axis of the blur, and the start of its row or column.
+        let here = if stride == 1 { at % width } else { at / width };
+        let start = at - here * stride;
+        // Beyond the border, the outermost value continues.
         let neighbor = |offset: usize| {
-            values[at - here * stride + (here + offset).saturating_sub(reach).min(n - 1) * stride]
+            values[start + (here + offset).saturating_sub(reach).min(n - 1) * stride]
         };
-        weights
+        let weighted = weights
             .iter()
             .enumerate()
-            .map(|(offset, weight)| weight * neighbor(offset))
-            .sum::<f64>()
-            / sum
-    };
-    (0..values.len()).map(blurred).collect()
+            .map(|(offset, weight)| weight * neighbor(offset));
+        blurred.push(weighted.sum::<f64>() / sum);
+    }
+    blurred
 }
 
 #[expect(

@@ -10,9 +10,10 @@ use crate::gray::Plane;
 use crate::surface::Surface;
 use nalgebra::{Matrix2, Matrix4, Vector2, Vector4};
 
-/// Smallest correlation between image and pattern.
+/// Smallest correlation between image and pattern. Larger values lose corners that are blurred or
+/// partly covered by a highlight; smaller ones accept other patterns.
 const MIN_CORRELATION: f64 = 0.75;
-/// Smallest standard deviation of the gray values.
+/// Smallest standard deviation of the gray values. In an even area, noise alone could correlate.
 const MIN_DEVIATION: f64 = 6.0;
 
 /// The surroundings of a corner.
@@ -34,14 +35,17 @@ pub(crate) struct Neighborhood {
     pub(crate) reach_px: Option<f64>,
 }
 
-/// Half the side of the window, relative to the image of `side_m`, and its limits in pixels.
+/// Half the side of the window, relative to the image of `side_m`, and its limits in pixels. Larger
+/// windows average more noise, but contain more bending and take longer (with the square).
 pub(crate) const WINDOW_FRAC: f64 = 0.35;
 const HALF_WINDOW_PX: [f64; 2] = [3.0, 9.0];
 /// Largest distance from a prediction, relative to the image of `side_m`, and its limits in pixels.
+/// It must stay below the distance to the next edge, or the pattern may lock to that.
 const REACH_FRAC: f64 = 0.12;
 const REACH_PX: [f64; 2] = [1.5, 8.0];
 /// Numbers of times the pattern is blurred by the kernel (1 2 1) / 4, from images in focus to
-/// images out of focus.
+/// images out of focus. The kernel has a variance of 1/2, so these are standard deviations of 0.7,
+/// 1.4 and 2.2 pixels.
 const BLURS: [usize; 3] = [1, 4, 10];
 /// Above this correlation, no other blur is tried.
 const GOOD_CORRELATION: f64 = 0.94;
@@ -58,6 +62,8 @@ pub(crate) fn find(
         side_m,
         ..
     } = *neighborhood;
+    // The shorter side of the foreshortened square, so that the window does not reach into
+    // neighboring squares.
     let side_px = pixel_by_point
         .column(0)
         .norm()
@@ -91,6 +97,83 @@ pub(crate) fn find(
         .map(|(_, pixel)| pixel)
 }
 
+/// A function of the pixels of a square patch, row by row.
+struct Patch {
+    side: i32,
+    values: Vec<f64>,
+}
+
+impl Patch {
+    /// Value of a pixel.
+    fn at(&self, x: i32, y: i32) -> f64 {
+        self.values[(y * self.side + x).cast_unsigned() as usize]
+    }
+
+    /// Blurs with the kernel (1 2 1) / 4 along both axes. The `margin` outermost pixels on each
+    /// side keep their values.
+    fn blurred(&self, margin: i32) -> Self {
+        let mut values = self.values.clone();
+        for y in margin..self.side - margin {
+            for x in margin..self.side - margin {
+                let row = |y: i32| self.at(x - 1, y) + 2.0 * self.at(x, y) + self.at(x + 1, y);
+                values[(y * self.side + x).cast_unsigned() as usize] =
+                    (row(y - 1) + 2.0 * row(y) + row(y + 1)) / 16.0;
+            }
+        }
+        Self {
+            side: self.side,
+            values,
+        }
+    }
+}
+
+/// The part of a pixel that is white, 0 to 1, in the printed pattern around a corner.
+///
+/// `offset`: position of the pixel's center relative to the corner, pixels.
+fn white_frac(
+    surface: &Surface<'_>,
+    neighborhood: &Neighborhood,
+    point_by_pixel: &Matrix2<f64>,
+    offset: [f64; 2],
+) -> f64 {
+    // The centers of 4 x 4 equal parts of the pixel.
+    const OFFSETS: [f64; 4] = [-0.375, -0.125, 0.125, 0.375];
+    let samples = OFFSETS
+        .iter()
+        .flat_map(|dy| OFFSETS.map(|dx| [offset[0] + dx, offset[1] + dy]));
+    samples
+        .filter(|&sample| is_white(surface, neighborhood, point_by_pixel, sample))
+        .count() as f64
+        / 16.0
+}
+
+/// Whether the printed pattern is white at a position relative to the corner, pixels.
+fn is_white(
+    surface: &Surface<'_>,
+    neighborhood: &Neighborhood,
+    point_by_pixel: &Matrix2<f64>,
+    [x, y]: [f64; 2],
+) -> bool {
+    // The pixel is a function of second order of the board point. Its inverse is approximated by
+    // one step: the linear inverse gives the point at which the second-order part is evaluated, and
+    // this part is subtracted before the final linear inverse.
+    let first = point_by_pixel * Vector2::new(x, y);
+    let [xx, xy, yy] = [
+        first.x * first.x / 2.0,
+        first.x * first.y,
+        first.y * first.y / 2.0,
+    ];
+    let bent = [0, 1].map(|axis| {
+        let bend = neighborhood.bend.map(|derivative| derivative[axis]);
+        xx * bend[0] + xy * bend[1] + yy * bend[2]
+    });
+    let away = point_by_pixel * Vector2::new(x - bent[0], y - bent[1]);
+    !surface.is_black([
+        neighborhood.point_m[0] + away.x,
+        neighborhood.point_m[1] + away.y,
+    ])
+}
+
 /// The rendered pattern with its derivatives.
 struct Template {
     half_px: i32,
@@ -110,66 +193,35 @@ impl Template {
         n_blurs: usize,
     ) -> Option<Self> {
         let point_by_pixel = neighborhood.pixel_by_point.try_inverse()?;
-        // More pixels on each side for blur and derivatives.
+        // More pixels on each side: each blur takes one, and the derivatives one more.
         let padding = i32::try_from(n_blurs).ok()? + 1;
-        let (padded, side) = (half_px + padding, 2 * (half_px + padding) + 1);
-        let value = |at: i32| {
-            const OFFSETS: [f64; 4] = [-0.375, -0.125, 0.125, 0.375];
-            let offset = [f64::from(at % side - padded), f64::from(at / side - padded)];
-            let samples = OFFSETS
-                .iter()
-                .flat_map(|dy| OFFSETS.map(|dx| [offset[0] + dx, offset[1] + dy]));
-            let is_white = |[x, y]: [f64; 2]| {
-                let first = point_by_pixel * Vector2::new(x, y);
-                let [xx, xy, yy] = [
-                    first.x * first.x / 2.0,
-                    first.x * first.y,
-                    first.y * first.y / 2.0,
-                ];
-                let bent = [0, 1].map(|axis| {
-                    let bend = neighborhood.bend.map(|derivative| derivative[axis]);
-                    xx * bend[0] + xy * bend[1] + yy * bend[2]
-                });
-                let away = point_by_pixel * Vector2::new(x - bent[0], y - bent[1]);
-                !surface.is_black([
-                    neighborhood.point_m[0] + away.x,
-                    neighborhood.point_m[1] + away.y,
-                ])
-            };
-            samples.filter(|&sample| is_white(sample)).count() as f64 / 16.0
+        let padded = half_px + padding;
+        let side = 2 * padded + 1;
+        let offset = |at: i32| [f64::from(at % side - padded), f64::from(at / side - padded)];
+        let mut patch = Patch {
+            side,
+            values: (0..side * side)
+                .map(|at| white_frac(surface, neighborhood, &point_by_pixel, offset(at)))
+                .collect(),
         };
-        let sharp: Vec<f64> = (0..side * side).map(value).collect();
-        let at = |values: &[f64], x: i32, y: i32| values[(y * side + x).cast_unsigned() as usize];
         // Lenses and sensors blur, too.
-        let mut blurred = sharp;
         for pass in 1..=padding - 1 {
-            let before = blurred.clone();
-            for y in pass..side - pass {
-                for x in pass..side - pass {
-                    let row = |y: i32| {
-                        at(&before, x - 1, y) + 2.0 * at(&before, x, y) + at(&before, x + 1, y)
-                    };
-                    blurred[(y * side + x).cast_unsigned() as usize] =
-                        (row(y - 1) + 2.0 * row(y) + row(y + 1)) / 16.0;
-                }
-            }
+            patch = patch.blurred(pass);
         }
         let inner = || {
             (padding..side - padding).flat_map(|y| (padding..side - padding).map(move |x| (x, y)))
         };
-        let values: Vec<f64> = inner().map(|(x, y)| at(&blurred, x, y)).collect();
+        let values: Vec<f64> = inner().map(|(x, y)| patch.at(x, y)).collect();
         let mean = values.iter().sum::<f64>() / values.len() as f64;
         let values: Vec<f64> = values.into_iter().map(|value| value - mean).collect();
         let norm = values.iter().map(|value| value * value).sum::<f64>().sqrt();
-        let derivative = |(x, y): (i32, i32)| {
-            let dx = (at(&blurred, x + 1, y) - at(&blurred, x - 1, y)) / 2.0;
-            let dy = (at(&blurred, x, y + 1) - at(&blurred, x, y - 1)) / 2.0;
-            (dx, dy)
-        };
+        // The derivatives are those of the pattern, not of the image, so they are computed once
+        // instead of in each step (Baker and Matthews 2004).
         let steepest: Vec<Vector4<f64>> = inner()
             .zip(&values)
-            .map(|(cell, &value)| {
-                let (dx, dy) = derivative(cell);
+            .map(|((x, y), &value)| {
+                let dx = (patch.at(x + 1, y) - patch.at(x - 1, y)) / 2.0;
+                let dy = (patch.at(x, y + 1) - patch.at(x, y - 1)) / 2.0;
                 Vector4::new(dx, dy, value, 1.0)
             })
             .collect();
@@ -202,6 +254,7 @@ impl Template {
         is_near.then(|| (self.correlation(plane, refined), refined))
     }
 
+    /// Gray values of the image in the window around a position, row by row.
     fn samples(&self, plane: &Plane, center: [f64; 2]) -> impl Iterator<Item = f64> {
         let range = -self.half_px..=self.half_px;
         let offsets = range
@@ -212,13 +265,17 @@ impl Template {
 
     /// Correlation coefficient of the image and the pattern, -1 to 1.
     fn correlation(&self, plane: &Plane, center: [f64; 2]) -> f64 {
-        let (mut sum, mut squares, mut products) = (0.0, 0.0, 0.0);
+        let mut sum = 0.0;
+        let mut squares = 0.0;
+        let mut products = 0.0;
         for (sample, value) in self.samples(plane, center).zip(&self.values) {
             sum += sample;
             squares += sample * sample;
             products += sample * value;
         }
         let n = self.values.len() as f64;
+        // Rounding can make the variance of an even area negative. The products need no mean,
+        // because the values of the pattern add up to zero.
         let deviation = (squares - sum * sum / n).max(0.0).sqrt();
         if deviation < MIN_DEVIATION * n.sqrt() {
             0.0
@@ -229,6 +286,8 @@ impl Template {
 
     /// Shifts the pattern to the position of least squares.
     fn align(&self, plane: &Plane, start: [f64; 2]) -> Option<[f64; 2]> {
+        // Enough for any shift within the limits below. Oscillating steps end here, too; the
+        // correlation then decides.
         const MAX_STEPS: usize = 20;
         const CONVERGED_PX: f64 = 1e-3;
         let mut center = start;
@@ -242,12 +301,16 @@ impl Template {
             // The image is gain * pattern(shifted) + offset; its derivative with respect to the
             // shift is gain * gradient.
             let gain = solution[2];
+            // Black and white are swapped: this is another place of the pattern.
             if gain <= 0.0 {
                 return None;
             }
             let step = [solution[0] / gain, solution[1] / gain];
+            // Far from the solution, the linear model overshoots.
             let limited = step.map(|value| value.clamp(-0.7, 0.7));
             center = [center[0] - limited[0], center[1] - limited[1]];
+            // The start is the best whole pixel, so the solution is within a pixel of it, with some
+            // reserve. Written so that a NaN is not near.
             let is_near = (center[0] - start[0]).hypot(center[1] - start[1]) < 2.0;
             if !is_near {
                 return None;

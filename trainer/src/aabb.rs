@@ -18,6 +18,7 @@ impl Aabb {
     /// Whether the box contains a point in world.
     #[must_use]
     pub fn contains(&self, point_m: [f64; 3]) -> bool {
+        // The box is aligned with its own axes, so the test is a comparison per axis in its frame.
         let in_box = self
             .world_from_box
             .inverse_transform_point(&Point3::from(point_m));

@@ -34,10 +34,14 @@ use std::sync::Arc;
 const STATE_KEY: &str = "aligned";
 const METADATA_KEY: &str = "alignment";
 
-/// Number of keyframes at which a live run is aligned for the first time: about four of them are
-/// validation images. It is aligned again each time the number has grown by the next constant, a
-/// factor.
+/// Number of keyframes at which a live run is aligned for the first time. About four of them are
+/// validation images, which is the smallest number with which alignment accepts a parameter. With
+/// fewer keyframes, alignment would compute without effect; with more, the model would be trained
+/// longer on wrong cameras.
 const FIRST_LIVE_ALIGNMENT: usize = 25;
+/// Factor by which the number of keyframes grows between two alignments of a live run. Because it
+/// is a factor, a long run is aligned only a logarithmic number of times. A smaller factor corrects
+/// cameras sooner, but needs more CPU time and restarts more models.
 const LIVE_ALIGNMENT_GROWTH: f64 = std::f64::consts::SQRT_2;
 
 /// A keyframe with its corrections before and after an alignment.
@@ -217,6 +221,8 @@ impl<M: Recalibrate + 'static> Aligned<M> {
         placeholders: &[Arc<Keyframe>],
         resume: impl FnOnce(&Checkpoint, &[Arc<Keyframe>]) -> Result<(M, Vec<Arc<Keyframe>>), Error>,
     ) -> Result<ResumedModel, Error> {
+        // The model does not know the state of the alignment, so it is taken out first. A
+        // checkpoint without it was written by a model that is not aligned.
         let mut own_checkpoint = checkpoint.clone();
         let Some(state) = own_checkpoint
             .state
@@ -225,9 +231,6 @@ impl<M: Recalibrate + 'static> Aligned<M> {
         else {
             let (model, untrained) = resume(checkpoint, &[keyframes, placeholders].concat())?;
             return Ok((Box::new(model), untrained));
-        };
-        let invalid_state = |error: serde_json::Error| Error::CheckpointState {
-            reason: error.to_string(),
         };
         let AlignedState {
             choice,
@@ -244,15 +247,22 @@ impl<M: Recalibrate + 'static> Aligned<M> {
             keyframes: ids,
             n_begun,
         } = serde_json::from_value(state).map_err(invalid_state)?;
+        // Checkpoints do not contain a running alignment. It starts again from the same keyframes,
+        // and its result is due at the same step, so the resumed run gives the same model.
         let mut alignment_task = AlignmentTask::done(alignment);
         if !is_aligned {
             alignment_task.request_again();
         }
+
+        // The model was trained on corrected keyframes, and verifies that it gets the same ones.
         let corrected = keyframes
             .iter()
             .map(|keyframe| alignment_task.corrected(keyframe));
         let corrected: Vec<_> = corrected.chain(placeholders.iter().cloned()).collect();
         let (model, untrained) = resume(&own_checkpoint, &corrected)?;
+
+        // Alignment needs the originals in the order in which they arrived, and the same numbers of
+        // them as before: alignment uses a prefix, and so do the references of movements.
         let originals: BTreeMap<_, _> = keyframes
             .iter()
             .map(|keyframe| (id_of(keyframe), keyframe))
@@ -267,6 +277,7 @@ impl<M: Recalibrate + 'static> Aligned<M> {
         let n_with_pixels = |n: usize| ids.iter().take(n).filter_map(with_pixels).count();
         let [n_begun, n_references] = [n_begun, n_references].map(|n| n.map(n_with_pixels));
         let original_keyframes: Vec<_> = ids.iter().filter_map(with_pixels).collect();
+
         // Uncorrected, because `push` corrects them.
         let untrained = untrained
             .iter()
@@ -296,16 +307,22 @@ impl<M: Recalibrate + 'static> Aligned<M> {
     /// Starts alignment if it is requested and there are enough keyframes.
     fn begin_alignment(&mut self) {
         let n_keyframes = self.original_keyframes.len();
+        // If a checkpoint was written while alignment ran, the resumed run must start it even if
+        // keyframes were removed since.
         let has_enough = self.n_begun.is_some() || n_keyframes >= self.begins_at;
         if !self.alignment_task.is_requested() || !has_enough {
             return;
         }
+        // A resumed alignment must not use keyframes that arrived after it began.
         let n_begun = *self.n_begun.get_or_insert(n_keyframes);
+        // The due step of a single alignment counts from the start of training, because all its
+        // keyframes are pushed before the first step.
         let from = if self.timing == AlignTiming::Once {
             0
         } else {
             self.model.progress().step
         };
+        // In real time, no step is due: the caller polls for the result.
         if self.timing != AlignTiming::RealTime {
             self.due_step.get_or_insert(from + self.alignment_steps);
         }
@@ -316,6 +333,8 @@ impl<M: Recalibrate + 'static> Aligned<M> {
     /// Applies the result of alignment at a fixed step, or when the model is idle.
     fn finish_alignment_when_due(&mut self) -> Result<(), Error> {
         let step = self.model.progress().step;
+        // An idle model may never reach the due step: a distance field has no steps left once it
+        // has fused all keyframes. Its result is applied at once.
         let is_idle = step > 0 && self.model.is_idle() && self.is_awaited();
         let is_due = is_idle || self.due_step.is_some_and(|due_step| step >= due_step);
         if self.alignment_task.is_done() || !is_due {
@@ -327,10 +346,13 @@ impl<M: Recalibrate + 'static> Aligned<M> {
 
     /// Waits for the result of alignment and applies it.
     fn finish_alignment(&mut self) -> Result<(), Error> {
+        // `finish` replaces the result, but the model holds keyframes with the previous one.
         let previous = AlignmentTask::done(self.alignment_task.result().cloned());
         let is_changed = self.alignment_task.finish(&self.original_keyframes)?;
         let n_begun = self.n_begun.take();
         self.due_step = None;
+        // Live runs request the next alignment at once. It begins when enough keyframes have
+        // arrived.
         if self.timing != AlignTiming::Once {
             self.begins_at = next_live_alignment(self.original_keyframes.len());
             self.alignment_task.request_again();
@@ -340,6 +362,8 @@ impl<M: Recalibrate + 'static> Aligned<M> {
         }
         if self.detects_movements && self.alignment_task.result().is_some() {
             match (&self.movements, n_begun) {
+                // The first alignment is trusted: movements are measured relative to the keyframes
+                // that it used.
                 (None, Some(n_begun)) => self.detect_movements(n_begun),
                 (Some((_, n_references)), _) if is_changed => {
                     // The latest keyframes are tested again with the new corrections.
@@ -350,6 +374,7 @@ impl<M: Recalibrate + 'static> Aligned<M> {
                 _ => {}
             }
         }
+        // Nothing reads the originals after a single alignment, and they hold all pixels.
         if self.timing == AlignTiming::Once {
             self.original_keyframes.clear();
         }
@@ -369,6 +394,8 @@ impl<M: Recalibrate + 'static> Aligned<M> {
                 after: alignment.corrected(original),
             })
             .collect();
+        // A model that cannot move with its keyframes starts again from step 0. Its earlier steps
+        // stay part of the total, which limits and schedules of the session count.
         let n_steps = self.model.n_total_steps()?;
         self.model.recalibrate(&keyframes, alignment)?;
         let n_forgotten = n_steps.wrapping_sub(self.model.n_total_steps()?);
@@ -395,12 +422,15 @@ impl<M: Recalibrate + 'static> Aligned<M> {
     /// Applies a movement if one was found. With `wait`, tests all keyframes first. Returns whether
     /// a movement was applied. During an alignment, no keyframes are tested.
     fn poll_movement(&mut self, wait: bool) -> Result<bool, Error> {
+        // A running alignment may change the corrections with which the task's keyframes were
+        // corrected. Detection starts again after it.
         let (Some((task, _)), None) = (&mut self.movements, self.n_begun) else {
             return Ok(false);
         };
         let Some(movement) = task.poll(wait)? else {
             return Ok(false);
         };
+        // Reports give the time since the first keyframe of the run.
         let first = self.first_stamp.unwrap_or(Stamp(movement.since_nanos));
         let previous = AlignmentTask::done(self.alignment_task.result().cloned());
         self.alignment_task.add_movement(movement, first);
@@ -412,8 +442,10 @@ impl<M: Recalibrate + 'static> Aligned<M> {
             log::warn!("{movement}");
         }
         self.recalibrate(&previous)?;
+        // The next alignment begins now: it uses the images since the movement, too.
         let n_keyframes = self.original_keyframes.len();
-        self.begins_at = n_keyframes; // The next alignment uses the images since the movement, too.
+        self.begins_at = n_keyframes;
+        // All keyframes are corrected now, so all of them can be references for the next movement.
         self.detect_movements(n_keyframes);
         Ok(true)
     }
@@ -429,6 +461,8 @@ impl<M: Recalibrate + 'static> Aligned<M> {
 
     /// Whether alignment must end before the first step.
     fn precedes_training(&self) -> bool {
+        // Alignment from features takes seconds, and wrong cameras would cost the model more.
+        // Registration with depth takes longer and runs beside training.
         self.timing == AlignTiming::Once
             && self.model.progress().step == 0
             && self.alignment_task.is_requested()
@@ -450,6 +484,8 @@ impl<M: Recalibrate + 'static> Aligned<M> {
 
 impl<M: Recalibrate + 'static> Method for Aligned<M> {
     fn push(&mut self, keyframe: Arc<Keyframe>) -> Result<(), Error> {
+        // Test keyframes must not influence the cameras. A single alignment that is done needs no
+        // more keyframes. In live runs, the task is always requested again.
         let is_used =
             !self.alignment_task.is_done() && keyframe.split != Split::Test && keyframe.is_finite();
         // Validation keyframes are pushed again after resuming.
@@ -458,6 +494,8 @@ impl<M: Recalibrate + 'static> Method for Aligned<M> {
                 .original_keyframes
                 .iter()
                 .any(|known| id_of(known) == id_of(&keyframe));
+        // In lockstep, the test of the previous keyframe must end before this one is corrected:
+        // otherwise its correction would depend on the speed of the test.
         if is_new && self.timing == AlignTiming::Lockstep {
             self.poll_movement(true)?;
         }
@@ -480,6 +518,7 @@ impl<M: Recalibrate + 'static> Method for Aligned<M> {
             .position(|keyframe| id_of(keyframe) == (camera, stamp.0))
         {
             self.original_keyframes.remove(ix);
+            // Both numbers count a prefix of the list, which just became shorter.
             self.n_begun = self
                 .n_begun
                 .map(|n_begun| n_begun - usize::from(ix < n_begun));
@@ -499,10 +538,12 @@ impl<M: Recalibrate + 'static> Method for Aligned<M> {
             self.begin_alignment();
             self.finish_alignment()?;
         }
+        // The result is applied exactly at its due step, so a batch of steps must end there.
         self.finish_alignment_when_due()?;
         let n_steps = self.model.step(n.min(self.steps_to_alignment()))?;
         if n_steps > 0 {
-            self.begin_alignment(); // After the first step, which itself needs much CPU time.
+            // After the first step, which itself needs much CPU time.
+            self.begin_alignment();
             if let (Some((task, _)), None) = (&mut self.movements, self.n_begun) {
                 task.begin();
             }
@@ -511,6 +552,8 @@ impl<M: Recalibrate + 'static> Method for Aligned<M> {
     }
 
     fn is_idle(&self) -> bool {
+        // While alignment is awaited, the caller must go on calling `step`, which applies the
+        // result. Before the first step, there is nothing to train on, so waiting would not end.
         self.model.is_idle() && (!self.is_awaited() || self.model.progress().step == 0)
     }
 
@@ -518,6 +561,7 @@ impl<M: Recalibrate + 'static> Method for Aligned<M> {
         if self.timing != AlignTiming::RealTime {
             return Ok(false);
         }
+        // No alignment is running, so a movement may be found instead.
         if self.n_begun.is_none() {
             return self.poll_movement(wait);
         }
@@ -637,6 +681,7 @@ impl<M: Recalibrate + 'static> Method for Aligned<M> {
     }
 
     fn save(&mut self, folder: &Path) -> Result<(), Error> {
+        // The model writes its own metadata; the alignment is added to the same file afterwards.
         self.model.save(folder)?;
         let Some(alignment) = self.alignment_task.result() else {
             return Ok(());
@@ -686,9 +731,8 @@ impl<M: Recalibrate + 'static> Method for Aligned<M> {
                 .collect(),
             n_begun: self.n_begun,
         };
-        let invalid_state = |error: serde_json::Error| Error::CheckpointState {
-            reason: error.to_string(),
-        };
+        // The state of the alignment is captured now, with the state of the model. Only reading the
+        // GPU buffers is deferred.
         let state = serde_json::to_value(state).map_err(invalid_state)?;
         let pending = self.model.checkpoint()?;
         Ok(PendingCheckpoint::new(move || {
@@ -701,8 +745,16 @@ impl<M: Recalibrate + 'static> Method for Aligned<M> {
     }
 }
 
+fn invalid_state(error: serde_json::Error) -> Error {
+    Error::CheckpointState {
+        reason: error.to_string(),
+    }
+}
+
 /// Index of the first keyframe that is among the last `n` of its camera.
 fn first_recent(keyframes: &[Arc<Keyframe>], n: usize) -> usize {
+    // Counted from the newest keyframe on, because cameras have different rates: the last keyframes
+    // of a slow camera may be far from the end of the list.
     let mut n_later = BTreeMap::<&str, usize>::new();
     let mut first = keyframes.len();
     for (ix, keyframe) in keyframes.iter().enumerate().rev() {
@@ -1051,10 +1103,8 @@ mod tests {
             for (ix, (keyframe, right)) in keyframes.iter().zip(&right).enumerate() {
                 let camera = model.calibrated_camera(keyframe).unwrap();
                 let left = right.world_from_camera.inverse() * camera.world_from_camera;
-                let (degrees, mm) = (
-                    left.rotation.angle().to_degrees(),
-                    1e3 * left.translation.vector.norm(),
-                );
+                let degrees = left.rotation.angle().to_degrees();
+                let mm = 1e3 * left.translation.vector.norm();
                 assert!(
                     degrees < 0.06 && mm < 0.8,
                     "image {ix}: {degrees} degrees, {mm} mm"

@@ -12,10 +12,12 @@ use std::io::Write;
 use std::path::Path;
 
 const MAGIC: [u8; 8] = *b"FRIGCKPT";
-/// Version of the layout and of the states of all methods.
+/// Version of the layout and of the states of all methods. There is only one number, because a
+/// checkpoint is continued by the program that wrote it, or by none.
 const VERSION: u32 = 6;
 /// Length of magic, version and header length together.
 const PREAMBLE_BYTES: usize = 16;
+/// Length of a SHA-256.
 const CHECKSUM_BYTES: usize = 32;
 
 /// Everything needed to continue training a model.
@@ -145,8 +147,12 @@ impl Checkpoint {
             state: self.state.clone(),
             arrays: lengths.collect(),
         })?;
+        // The preamble is binary and has a fixed length, so that a reader of any version can find
+        // out what the file is, and how much JSON follows.
         let n_bytes = u32::try_from(header.len()).map_err(std::io::Error::other)?;
         let preamble = [&MAGIC[..], &VERSION.to_le_bytes(), &n_bytes.to_le_bytes()].concat();
+        // The checksum is computed while writing, because arrays take gigabytes and must not be
+        // copied into one buffer.
         let mut checksum = Sha256::new();
         let chunks = [&preamble, &header]
             .into_iter()
@@ -159,24 +165,10 @@ impl Checkpoint {
     }
 
     fn from_bytes(bytes: &[u8]) -> Result<Self, String> {
-        let preamble = bytes.get(..PREAMBLE_BYTES).ok_or("truncated")?;
-        if preamble[..8] != MAGIC {
-            return Err("not a checkpoint file".to_owned());
-        }
-        let word = |at: usize| {
-            u32::from_le_bytes([
-                preamble[at],
-                preamble[at + 1],
-                preamble[at + 2],
-                preamble[at + 3],
-            ])
-        };
-        if word(8) != VERSION {
-            return Err(format!(
-                "format version {}, this program reads version {VERSION}",
-                word(8)
-            ));
-        }
+        let n_header_bytes = n_header_bytes(bytes)?;
+
+        // The checksum is computed first, but reported last: a file that was cut off fails it, too,
+        // and `truncated` is the more useful reason.
         let whole = bytes
             .len()
             .checked_sub(CHECKSUM_BYTES)
@@ -185,13 +177,17 @@ impl Checkpoint {
         let (body, checksum) = bytes.split_at(whole);
         let checksum_matches = Sha256::digest(body)[..] == *checksum;
         let rest = &body[PREAMBLE_BYTES..];
-        let header = rest.get(..word(12) as usize).ok_or("truncated")?;
-        let mut rest = &rest[header.len()..];
+        let header = rest.get(..n_header_bytes).ok_or("truncated")?;
+        let rest = &rest[header.len()..];
+        // Invalid JSON in an intact file is an error of the program that wrote it. In a damaged
+        // file, the message of the JSON parser would mislead.
         let header: Header = match serde_json::from_slice(header) {
             Ok(header) => header,
             Err(error) if checksum_matches => return Err(format!("invalid header: {error}")),
             Err(_) => return Err("damaged: the checksum does not match".to_owned()),
         };
+
+        // Lengths come from the file, so their sum may overflow; such a file is too short as well.
         let expected = header
             .arrays
             .iter()
@@ -204,17 +200,7 @@ impl Checkpoint {
             _ if !checksum_matches => return Err("damaged: the checksum does not match".to_owned()),
             _ => {}
         }
-        let mut arrays = Vec::new();
-        for ArrayHeader { name, bytes } in header.arrays {
-            let n_bytes =
-                usize::try_from(bytes).expect("not longer than the file, which is in memory");
-            let (array, after) = rest.split_at(n_bytes);
-            arrays.push(Array {
-                name,
-                bytes: array.to_vec(),
-            });
-            rest = after;
-        }
+        let arrays = arrays_in(header.arrays, rest);
         let Header {
             method,
             seconds,
@@ -236,6 +222,47 @@ impl Checkpoint {
             arrays,
         })
     }
+}
+
+/// Checks magic and version of a file. Returns the length of its JSON header.
+fn n_header_bytes(bytes: &[u8]) -> Result<usize, String> {
+    let preamble = bytes.get(..PREAMBLE_BYTES).ok_or("truncated")?;
+    if preamble[..8] != MAGIC {
+        return Err("not a checkpoint file".to_owned());
+    }
+    let version = word_at(preamble, 8);
+    if version != VERSION {
+        return Err(format!(
+            "format version {version}, this program reads version {VERSION}"
+        ));
+    }
+    Ok(word_at(preamble, 12) as usize)
+}
+
+/// The little-endian number that begins at byte `at` of a preamble.
+fn word_at(preamble: &[u8], at: usize) -> u32 {
+    u32::from_le_bytes([
+        preamble[at],
+        preamble[at + 1],
+        preamble[at + 2],
+        preamble[at + 3],
+    ])
+}
+
+/// Divides the bytes after the header into arrays. Their lengths must add up to those of `bytes`.
+fn arrays_in(headers: Vec<ArrayHeader>, bytes: &[u8]) -> Vec<Array> {
+    let mut rest = bytes;
+    let mut arrays = Vec::new();
+    for ArrayHeader { name, bytes } in headers {
+        let n_bytes = usize::try_from(bytes).expect("not longer than the file, which is in memory");
+        let (array, after) = rest.split_at(n_bytes);
+        arrays.push(Array {
+            name,
+            bytes: array.to_vec(),
+        });
+        rest = after;
+    }
+    arrays
 }
 
 #[cfg(test)]

@@ -27,6 +27,7 @@ impl Method for FailedModel {
     }
 
     fn is_idle(&self) -> bool {
+        // Nothing would change with further steps, so a loop that trains until idle ends.
         true
     }
 

@@ -71,6 +71,8 @@ impl KeyframeSignature {
     /// Describes a difference between `keyframe` and the recorded one; `None` if they match.
     fn difference(&self, keyframe: &Keyframe) -> Option<String> {
         let other = Self::of(keyframe);
+        // Values are compared bit by bit: a pose that was estimated again, however similar, is
+        // other data, and continuing with it would not give the model of an uninterrupted run.
         let [[width, height], [other_width, other_height]] = [self.size_px, other.size_px];
         let problem = if self.size_px != other.size_px {
             format!("has {other_width}x{other_height} pixels, had {width}x{height}")
@@ -99,13 +101,15 @@ pub(crate) fn match_keyframes(
     expected: &[KeyframeSignature],
     keyframes: &[Arc<Keyframe>],
 ) -> Result<MatchedAndOthers, Error> {
+    // A model is not trained on test keyframes. Without this filter, a keyframe that has become a
+    // test keyframe since, with another split, would be trained on.
     let by_name: HashMap<_, _> = keyframes
         .iter()
         .filter(|keyframe| keyframe.split != Split::Test)
         .map(|keyframe| ((&*keyframe.camera, keyframe.stamp.0), keyframe))
         .collect();
-    let (mut found, mut missing): (Vec<Arc<Keyframe>>, Vec<Arc<Keyframe>>) =
-        (Vec::new(), Vec::new());
+    let mut found: Vec<Arc<Keyframe>> = Vec::new();
+    let mut missing: Vec<Arc<Keyframe>> = Vec::new();
     for expected in expected {
         let Some(keyframe) = by_name.get(&(expected.camera.as_str(), expected.stamp_nanos)) else {
             missing.push(Arc::new(expected.placeholder()));
@@ -116,11 +120,15 @@ pub(crate) fn match_keyframes(
         }
         found.push(Arc::clone(keyframe));
     }
+    // All missing keyframes are listed, so that the caller can continue without them in one
+    // attempt.
     if !missing.is_empty() {
         return Err(Error::MissingKeyframes {
             placeholders: missing,
         });
     }
+    // By address, not by name: the others include test keyframes, and a second keyframe with the
+    // same camera and stamp must not disappear.
     let is_matched =
         |keyframe: &Arc<Keyframe>| found.iter().any(|matched| Arc::ptr_eq(matched, keyframe));
     let others = keyframes

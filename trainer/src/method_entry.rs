@@ -67,7 +67,7 @@ pub struct SingleFile {
     pub description: &'static str,
     /// Supported extensions.
     pub extensions: &'static [&'static str],
-    /// Extensions of such files in other formats. The error when reading one names its format.
+    /// Extensions of formats that cannot be read. The error names the format.
     pub unsupported_extensions: &'static [&'static str],
 }
 

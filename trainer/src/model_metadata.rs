@@ -47,16 +47,10 @@ impl ModelMetadata {
     /// Differences between the file and the splats of the model, as sentences without a period. The
     /// values of the splats are used.
     pub(crate) fn differences(&self, n_splats: u64, sh_degree: u32) -> Vec<String> {
-        let differs = |what, stated: Option<u64>, actual: u64| {
-            let stated = stated.filter(|stated| *stated != actual)?;
-            Some(format!(
-                "{what} is {stated} in {METADATA_FILE}, but {actual} in the file of splats, which is used"
-            ))
-        };
-        let of_splats = differs("splats", self.splats, n_splats);
+        let of_splats = difference("splats", self.splats, n_splats);
         of_splats
             .into_iter()
-            .chain(differs("sh_degree", self.sh_degree, sh_degree.into()))
+            .chain(difference("sh_degree", self.sh_degree, sh_degree.into()))
             .collect()
     }
 
@@ -70,6 +64,15 @@ impl ModelMetadata {
     }
 }
 
+/// Describes that a stated number differs from the actual one; `None` if it does not, or if no
+/// number is stated.
+fn difference(what: &str, stated: Option<u64>, actual: u64) -> Option<String> {
+    let stated = stated.filter(|stated| *stated != actual)?;
+    Some(format!(
+        "{what} is {stated} in {METADATA_FILE}, but {actual} in the file of splats, which is used"
+    ))
+}
+
 /// Reads the file in the folder of a saved model; everything is empty if it does not exist.
 ///
 /// # Errors
@@ -81,6 +84,7 @@ pub(crate) fn read_metadata(folder: &Path) -> Result<ModelMetadata, Error> {
         path: path.clone(),
         reason,
     };
+    // Splat files of other programs come without metadata.
     let bytes = match files::read(&path, files::Budget::TEXT) {
         Err(error) if error.kind() == std::io::ErrorKind::NotFound => {
             return Ok(ModelMetadata::default());
@@ -93,6 +97,7 @@ pub(crate) fn read_metadata(folder: &Path) -> Result<ModelMetadata, Error> {
 fn parse(bytes: &[u8]) -> Result<ModelMetadata, String> {
     let metadata: ModelMetadata =
         serde_json::from_slice(bytes).map_err(|error| error.to_string())?;
+    // Written so that a NaN is refused.
     let background = metadata.background_srgb;
     if background
         .iter()

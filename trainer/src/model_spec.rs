@@ -61,6 +61,7 @@ impl ModelSpec {
     ) -> Result<Self, Error> {
         let mut specific = (kind.entry().default_options)();
         for (name, value) in settings {
+            // `get_mut` does not insert: an option that this method lacks stays absent.
             if let Some(option) = specific.get_mut(name) {
                 *option = value.clone();
             }
@@ -137,12 +138,15 @@ pub fn resume_without_missing(
     checkpoint: &Checkpoint,
     keyframes: &[Arc<Keyframe>],
 ) -> Result<(Resumed, Vec<KeyframeId>), Error> {
+    // Only an attempt finds out which keyframes the model needs. The second one uses placeholders
+    // for the missing ones, because a model may store parameters of keyframes in their order.
     let placeholders = match resume_with(gpu.clone(), checkpoint, keyframes, &[]) {
         Ok(resumed) => return Ok((resumed, Vec::new())),
         Err(Error::MissingKeyframes { placeholders }) => placeholders,
         Err(error) => return Err(error),
     };
     let mut resumed = resume_with(gpu, checkpoint, keyframes, &placeholders)?;
+    // Placeholders have no pixels, so they must be gone before the first step.
     for missing in &placeholders {
         resumed.method.remove(&missing.camera, missing.stamp)?;
     }

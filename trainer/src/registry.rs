@@ -55,16 +55,12 @@ impl ModelKind {
         if model.is_file() {
             return Ok(Self::of_single_file(model));
         }
-        let is_complete = |kind: &Self| {
-            kind.0
-                .files
-                .last()
-                .is_some_and(|file| model.join(file).is_file())
-        };
-        let by_files = || Self::ALL.iter().copied().find(is_complete);
+        // Folders of other programs have no `model.json`, so the method follows from their files.
         let path = model.join(METADATA_FILE);
         let bytes = match files::read(&path, files::Budget::TEXT) {
-            Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(by_files()),
+            Err(error) if error.kind() == std::io::ErrorKind::NotFound => {
+                return Ok(Self::of_files(model));
+            }
             read => read.map_err(|source| Error::Read {
                 path: path.clone(),
                 source,
@@ -76,21 +72,44 @@ impl ModelKind {
             .method
             .as_deref()
             .and_then(Self::from_name)
-            .or_else(by_files))
+            .or_else(|| Self::of_files(model)))
+    }
+
+    /// The first method of which the folder contains a complete model.
+    fn of_files(folder: &Path) -> Option<Self> {
+        Self::ALL
+            .iter()
+            .copied()
+            .find(|kind| kind.is_complete(folder))
+    }
+
+    /// Whether a folder contains a complete model of this method. The last file is moved into place
+    /// after all others.
+    fn is_complete(self, folder: &Path) -> bool {
+        self.0
+            .files
+            .last()
+            .is_some_and(|file| folder.join(file).is_file())
     }
 
     /// The method whose models are single files with the extension of this file, including
     /// extensions that are not supported.
     pub fn of_single_file(file: &Path) -> Option<Self> {
         let extension = file.extension()?.to_str()?.to_ascii_lowercase();
-        let has_extension = |kind: &Self| {
-            let single_file = kind.0.single_file;
-            let extensions = single_file
-                .into_iter()
-                .flat_map(|single| [single.extensions, single.unsupported_extensions]);
-            extensions.flatten().any(|known| *known == extension)
-        };
-        Self::ALL.iter().copied().find(has_extension)
+        Self::ALL
+            .iter()
+            .copied()
+            .find(|kind| kind.knows_extension(&extension))
+    }
+
+    /// Whether the method has single files with this extension, supported or not.
+    fn knows_extension(self, extension: &str) -> bool {
+        let single_file = self.0.single_file;
+        let mut extensions = single_file
+            .into_iter()
+            .flat_map(|single| [single.extensions, single.unsupported_extensions])
+            .flatten();
+        extensions.any(|known| *known == extension)
     }
 
     /// Names of the model files of all methods, in the order in which the files are moved into

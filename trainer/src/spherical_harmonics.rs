@@ -9,8 +9,12 @@ use nalgebra::Vector3;
 /// Number of coefficients of the highest degree.
 pub const MAX_N_COEFFS: usize = 16;
 
+// Normalization constants of the real spherical harmonics, with the signs of the Condon-Shortley
+// phase. C0 is 1/2 sqrt(1/pi) and C1 is 1/2 sqrt(3/pi).
 const C0: f64 = 0.282_094_791_773_878_14;
 const C1: f64 = 0.488_602_511_902_919_9;
+// Degree 2, for m from -2 to 2: 1/2 sqrt(15/pi) for m = -2, -1 and 1, 1/4 sqrt(5/pi) for m = 0, and
+// 1/4 sqrt(15/pi) for m = 2.
 const C2: [f64; 5] = [
     1.092_548_430_592_079_2,
     -1.092_548_430_592_079_2,
@@ -18,6 +22,8 @@ const C2: [f64; 5] = [
     -1.092_548_430_592_079_2,
     0.546_274_215_296_039_6,
 ];
+// Degree 3, for m from -3 to 3: 1/4 sqrt(35/(2 pi)) for m = -3 and 3, 1/2 sqrt(105/pi) for m = -2,
+// 1/4 sqrt(21/(2 pi)) for m = -1 and 1, 1/4 sqrt(7/pi) for m = 0, and 1/4 sqrt(105/pi) for m = 2.
 const C3: [f64; 7] = [
     -0.590_043_589_926_643_5,
     2.890_611_442_640_554,
@@ -44,7 +50,9 @@ pub fn color_backward(
     v_color: &[f64; 3],
 ) -> (Vec<[f64; 3]>, Vector3<f64>) {
     let direction = offset.normalize();
-    let (basis, by_direction) = (basis(&direction), basis_gradient(&direction));
+    let basis = basis(&direction);
+    let by_direction = basis_gradient(&direction);
+    // The gradient of max(color, 0): a channel below 0 does not depend on its coefficients.
     let unclamped = unclamped_color(sh, offset);
     let v_color: [f64; 3] = std::array::from_fn(|channel| {
         if unclamped[channel] > 0.0 {
@@ -118,6 +126,8 @@ fn basis_gradient(direction: &Vector3<f64>) -> [Vector3<f64>; MAX_N_COEFFS] {
 
 fn unclamped_color(sh: &[[f64; 3]], offset: &Vector3<f64>) -> [f64; 3] {
     let basis = basis(&offset.normalize());
+    // The offset 0.5 is part of the format of splat files: coefficients of zero are gray (Kerbl et
+    // al. 2023).
     std::array::from_fn(|channel| {
         0.5 + sh
             .iter()

@@ -5,7 +5,9 @@ use crate::gpu::{Gpu, PendingRead};
 use crate::method::submit_millis;
 use std::time::Instant;
 
-/// Weight of the latest submit in the smoothed step time.
+/// Weight of the latest submit in the smoothed step time. A larger weight follows the growth of a
+/// model faster; a smaller one lets single slow submits, such as those that compete with a render,
+/// shorten the following submits less.
 const NEW_WEIGHT: f64 = 0.2;
 
 /// Tracks training submits: at most one is in flight while the next one is recorded.
@@ -58,9 +60,12 @@ impl Submits {
         };
         let counters = counters.finish(gpu)?;
         let completed = Instant::now();
-        let began = since.max(self.idle_since); // The previous submit may have been running at `since`.
+        // The previous submit may have been running at `since`, and the GPU executes one after
+        // another.
+        let began = since.max(self.idle_since);
         self.idle_since = completed;
         let millis = (completed - began).as_secs_f64() * 1e3 / n_steps.max(1) as f64;
+        // The first measurement has nothing to be averaged with.
         self.step_millis = match self.step_millis {
             0.0 => millis,
             smoothed => (1.0 - NEW_WEIGHT) * smoothed + NEW_WEIGHT * millis,

@@ -23,6 +23,7 @@ impl ServerClock {
 
     /// The time of an instant; negative before the server started.
     pub(crate) fn millis(self, at: Instant) -> f64 {
+        // One of the two is 0: durations cannot be negative.
         let after = at.saturating_duration_since(self.started).as_secs_f64();
         let before = self.started.saturating_duration_since(at).as_secs_f64();
         (after - before) * 1e3
@@ -30,6 +31,7 @@ impl ServerClock {
 
     /// The instant of a time; `None` if it is before the server started, or not representable.
     pub(crate) fn instant(self, millis: f64) -> Option<Instant> {
+        // The number comes from a client, so it may be negative, NaN, or too large to add.
         self.started
             .checked_add(Duration::try_from_secs_f64(millis * 1e-3).ok()?)
     }

@@ -48,6 +48,7 @@ pub struct EditRequest {
 impl EditRequest {
     /// Validates a client's message.
     pub(crate) fn check(client: u64, message: &EditMessage) -> Result<Self, InvalidRequest> {
+        // A box with another action would be ignored, although the operator expects an effect.
         let action = match (message.action, &message.erased_box) {
             (EditKind::Erase, Some(erased_box)) => {
                 EditAction::Erase(checked_box(erased_box, "box")?)
@@ -67,6 +68,7 @@ impl EditRequest {
     /// A request for the first model, with no client that waits for it.
     pub fn of_nobody(action: EditAction) -> Self {
         Self {
+            // Clients are numbered from 1, so a rejection is sent to nobody.
             client: 0,
             id: None,
             method: None,

@@ -11,7 +11,8 @@ use ::foxglove::messages::{
     Pose, PosesInFrame, Quaternion, Timestamp, Vector3,
 };
 use ::foxglove::{
-    Channel, ChannelBuilder, Context, PartialMetadata, RawChannel, Schema, WebSocketServer,
+    Channel, ChannelBuilder, Context, FoxgloveError, PartialMetadata, RawChannel, Schema,
+    WebSocketServer,
 };
 use kinematics::urdf::{Joint, JointKind};
 use kinematics::{Stamp, Transform};
@@ -20,17 +21,19 @@ use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::net::SocketAddr;
 use std::sync::Arc;
-use std::sync::mpsc::sync_channel;
+use std::sync::mpsc::{SyncSender, sync_channel};
 use std::thread::JoinHandle;
 use std::time::Duration;
 use tokio::sync::watch;
 
-/// Period of checking whether a client is connected.
+/// Period of checking whether a client is connected. With a longer period, the first image comes
+/// later.
 const CLIENT_CHECK_PERIOD: Duration = Duration::from_millis(200);
 /// Keyframes and metrics are repeated with this period, because Foxglove sends only what comes
 /// after a subscription.
 const REPEAT_PERIOD: Duration = Duration::from_secs(1);
-/// Messages that may wait for a client; older ones are dropped.
+/// Messages that may wait for a client; older ones are dropped. With more, a slow client shows
+/// older data.
 const MAX_WAITING: usize = 64;
 /// The frame of all poses.
 const WORLD: &str = "world";
@@ -54,7 +57,7 @@ impl FoxgloveServer {
         if !address.ip().is_loopback() {
             return Err(Error::FoxgloveNotLoopback { address });
         }
-        let (stop, mut stopped) = watch::channel(false);
+        let (stop, stopped) = watch::channel(false);
         let runtime = tokio::runtime::Builder::new_current_thread()
             .enable_all()
             .build()
@@ -63,30 +66,8 @@ impl FoxgloveServer {
         let thread = std::thread::Builder::new()
             .name("viz-foxglove".to_owned())
             .spawn(move || {
-                runtime.block_on(async {
-                    // Not the context of the process, which all servers would share.
-                    let context = Context::new();
-                    let server = WebSocketServer::new()
-                        .name(concat!("fieldrig ", env!("CARGO_PKG_VERSION")))
-                        .bind(address.ip().to_string(), address.port())
-                        .message_backlog_size(MAX_WAITING)
-                        .context(&context);
-                    let handle = match server.start().await {
-                        Ok(handle) => handle,
-                        Err(error) => return drop(started_sender.send(Err(error))),
-                    };
-                    drop(started_sender.send(Ok(handle.port())));
-                    let topics = Topics::new(&context, &hub);
-                    tokio::select! {
-                        () = watch_clients(&hub, || handle.client_count()) => {}
-                        () = publish_images(&topics) => {}
-                        () = publish_robot(&topics) => {}
-                        () = publish_lists(&topics) => {}
-                        _ = stopped.changed() => {}
-                    }
-                    hub.set_observed(false);
-                    drop(handle.stop());
-                });
+                runtime.block_on(serve(address, &hub, &started_sender, stopped));
+                // Does not wait for images that are still being encoded.
                 runtime.shutdown_background();
             })
             .map_err(|source| Error::Thread { source })?;
@@ -134,6 +115,38 @@ impl Drop for FoxgloveServer {
             log::error!("the Foxglove server on {} panicked", self.address);
         }
     }
+}
+
+/// Reports whether listening has begun, and publishes topics until the server stops.
+async fn serve(
+    address: SocketAddr,
+    hub: &Hub,
+    started: &SyncSender<Result<u16, FoxgloveError>>,
+    mut stopped: watch::Receiver<bool>,
+) {
+    // Not the context of the process, which all servers would share.
+    let context = Context::new();
+    let server = WebSocketServer::new()
+        .name(concat!("fieldrig ", env!("CARGO_PKG_VERSION")))
+        .bind(address.ip().to_string(), address.port())
+        .message_backlog_size(MAX_WAITING)
+        .context(&context);
+    let handle = match server.start().await {
+        Ok(handle) => handle,
+        Err(error) => return drop(started.send(Err(error))),
+    };
+    drop(started.send(Ok(handle.port())));
+    let topics = Topics::new(&context, hub);
+    tokio::select! {
+        () = watch_clients(hub, || handle.client_count()) => {}
+        () = publish_images(&topics) => {}
+        () = publish_robot(&topics) => {}
+        () = publish_lists(&topics) => {}
+        _ = stopped.changed() => {}
+    }
+    // Otherwise, the run would continue to decode images for nobody.
+    hub.set_observed(false);
+    drop(handle.stop());
 }
 
 /// Makes the run publish images and robot states while a client is connected. Never returns.
@@ -208,6 +221,7 @@ async fn publish_images(topics: &Topics) {
             let camera = cameras
                 .entry(Arc::clone(&image.camera))
                 .or_insert_with(|| CameraTopics::new(&topics.context, &image.camera));
+            // A new image of one camera changes the map of all cameras.
             if camera.published.replace(image.stamp) == Some(image.stamp) {
                 continue;
             }
@@ -228,6 +242,7 @@ async fn publish_images(topics: &Topics) {
                     nanos(image.stamp),
                 );
             }
+            // Calibration and pose are cheap, but encoding is not.
             if !camera.image.has_sinks() {
                 continue;
             }
@@ -257,26 +272,21 @@ async fn publish_robot(topics: &Topics) {
     let mut states = topics.hub.latest::<Option<Arc<RobotState>>>().subscribe();
     states.mark_changed();
     while states.changed().await.is_ok() {
-        let (state, description) = (
-            states.borrow_and_update().clone(),
-            topics
-                .hub
-                .latest::<Option<Arc<RobotDescription>>>()
-                .borrow()
-                .clone(),
-        );
+        let state = states.borrow_and_update().clone();
+        let description = topics
+            .hub
+            .latest::<Option<Arc<RobotDescription>>>()
+            .borrow()
+            .clone();
         let (Some(state), Some(description)) = (state, description) else {
             continue;
         };
         let joints = description.joint_names.iter().zip(&state.positions);
-        let joint = |(name, position): (&String, &f64)| JointState {
-            name: name.clone(),
-            position: Some(*position),
-            ..JointState::default()
-        };
         let joint_states = JointStates {
             timestamp: Some(timestamp(state.stamp)),
-            joints: joints.map(joint).collect(),
+            joints: joints
+                .map(|(name, position)| joint_state(name, *position))
+                .collect(),
         };
         topics
             .joint_states
@@ -285,6 +295,14 @@ async fn publish_robot(topics: &Topics) {
         topics
             .transforms
             .log_with_time(&FrameTransforms { transforms }, nanos(state.stamp));
+    }
+}
+
+fn joint_state(name: &str, position: f64) -> JointState {
+    JointState {
+        name: name.to_owned(),
+        position: Some(position),
+        ..JointState::default()
     }
 }
 
@@ -300,6 +318,7 @@ async fn publish_lists(topics: &Topics) {
             Ok(()) = keyframes.changed() => (true, false),
             Ok(()) = status.changed() => (false, true),
         };
+        // The list has no stamp of its own: it gets that of its newest keyframe.
         if has_keyframes {
             let keyframes = keyframes.borrow_and_update().clone();
             let newest = keyframes
@@ -343,29 +362,34 @@ fn metrics(status: &Status) -> String {
 }
 
 fn poses_in_frame(keyframes: &[KeyframePose], newest: Stamp) -> PosesInFrame {
-    let pose = |keyframe: &KeyframePose| {
-        let (position, orientation) = parts(&keyframe.world_from_camera);
-        Pose {
-            position: Some(position),
-            orientation: Some(orientation),
-        }
-    };
     PosesInFrame {
         timestamp: Some(timestamp(newest)),
         frame_id: WORLD.to_owned(),
-        poses: keyframes.iter().map(pose).collect(),
+        poses: keyframes
+            .iter()
+            .map(|keyframe| pose(&keyframe.world_from_camera))
+            .collect(),
+    }
+}
+
+fn pose(transform: &Transform) -> Pose {
+    let (position, orientation) = parts(transform);
+    Pose {
+        position: Some(position),
+        orientation: Some(orientation),
     }
 }
 
 /// The pinhole part of the lens.
 fn calibration(image: &LiveImage) -> CameraCalibration {
-    let ([fx, fy], [cx, cy]) = (image.focal_px, image.principal_px);
+    let [fx, fy] = image.focal_px;
+    let [cx, cy] = image.principal_px;
     CameraCalibration {
         timestamp: Some(timestamp(image.stamp)),
         frame_id: camera_frame(&image.camera),
         width: image.size_px[0],
         height: image.size_px[1],
-        // Pixel centers are at integers in Foxglove.
+        // Pixel centers are at integers in Foxglove, as in ROS. The matrices are row-major.
         k: vec![fx, 0.0, cx - 0.5, 0.0, fy, cy - 0.5, 0.0, 0.0, 1.0],
         r: vec![1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
         p: vec![
@@ -395,6 +419,7 @@ fn link_transforms(description: &RobotDescription, state: &RobotState) -> Vec<Fr
         .iter()
         .map(|joint| frame_transform(state.stamp, &joint.parent, &joint.child, &in_parent(joint)))
         .collect();
+    // The states have the pose of the base link, but the tree of transforms begins at the root.
     let path = robot
         .root()
         .and_then(|root| Ok((root, robot.path(root, &description.base_link)?)));
@@ -417,13 +442,8 @@ fn parent_from_child(
     description: &RobotDescription,
     positions: &[f64],
 ) -> Transform {
-    let measured = |name: &str| {
-        let ix = description
-            .joint_names
-            .iter()
-            .position(|other| other == name)?;
-        positions.get(ix).copied()
-    };
+    let measured = |name: &str| measured_position(name, description, positions);
+    // Joints that are not measured stay at 0, as on the page.
     let position = match &joint.mimic {
         Some(mimic) => mimic.multiplier * measured(&mimic.source).unwrap_or(0.0) + mimic.offset,
         None => measured(&joint.name).unwrap_or(0.0),
@@ -437,6 +457,15 @@ fn parent_from_child(
         JointKind::Prismatic => Translation3::from(position * joint.axis.into_inner()).into(),
     };
     joint.parent_from_joint * motion
+}
+
+/// The position of a joint in a state; `None` if it is not measured.
+fn measured_position(name: &str, description: &RobotDescription, positions: &[f64]) -> Option<f64> {
+    let ix = description
+        .joint_names
+        .iter()
+        .position(|other| other == name)?;
+    positions.get(ix).copied()
 }
 
 fn frame_transform(
@@ -456,7 +485,8 @@ fn frame_transform(
 }
 
 fn parts(transform: &Transform) -> (Vector3, Quaternion) {
-    let (translation, rotation) = (transform.translation.vector, transform.rotation.coords);
+    let translation = transform.translation.vector;
+    let rotation = transform.rotation.coords;
     let position = Vector3 {
         x: translation.x,
         y: translation.y,

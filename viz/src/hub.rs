@@ -32,9 +32,11 @@ pub struct Hub {
 type LatestData = BTreeMap<TypeId, Box<dyn Any + Send>>;
 
 /// A client gets keyframes and images this long after it has joined, or after its hello. Earlier,
-/// it is not known which of them it wants, and at which size.
+/// it is not known which of them it wants, and at which size. With less time, pages on slow links
+/// get complete lists and large images first; with more, clients that send no hello wait longer.
 const HELLO_GRACE: Duration = Duration::from_millis(500);
-/// Maximum number of edits that wait to be applied.
+/// Maximum number of edits that wait to be applied. It is also the maximum number of edits of a
+/// model.
 pub(crate) const MAX_WAITING_EDITS: usize = 64;
 
 /// What a client receives.
@@ -96,6 +98,8 @@ impl Hub {
     /// The latest data of this type. Each topic has types of its own, and sets and reads them in
     /// its module.
     pub(crate) fn latest<T: Default + Send + Sync + 'static>(&self) -> watch::Sender<T> {
+        // Without a field for each topic, a new topic needs no change here. The lock is held only
+        // to find the sender, so the training thread does not wait for whoever reads the data.
         let mut latest = self.shared.latest.lock();
         let sender = latest
             .entry(TypeId::of::<T>())
@@ -153,6 +157,8 @@ impl Hub {
     /// Requests an action of the run.
     pub(crate) fn control(&self, action: Control) {
         let mut controls = self.shared.controls.lock();
+        // Repeated clicks count once, and as the last action: after pause, resume and pause, the
+        // run must pause.
         controls.retain(|earlier| *earlier != action);
         controls.push(action);
     }
@@ -176,6 +182,7 @@ impl Hub {
             .queue()
             .unreported(client)
             .and_then(|unreported| unreported.shown(id, view, shown_at));
+        // The lock of the queue has been released, so that there is no order of locks to keep.
         if let Some(picture) = picture {
             self.shared.shown_pictures.lock().push(picture);
         }
@@ -230,6 +237,7 @@ impl Hub {
     ///
     /// For callers that have nothing to train.
     pub fn wait_for_request(&self, timeout: Duration) -> bool {
+        // The queue is unlocked while waiting, and requests notify after they have released it.
         let mut queue = self.queue();
         self.shared
             .work_arrived
@@ -246,6 +254,7 @@ impl Hub {
     pub(crate) fn leave(&self, client: u64) {
         self.queue().leave(client);
         self.shared.demands.lock().remove(&client);
+        // Chunks of a model take as much memory as its file.
         self.drop_unused_chunks();
     }
 
@@ -273,6 +282,7 @@ impl Hub {
 
     pub(crate) fn release(&self, client: u64) {
         self.queue().release(client);
+        // There is room for another picture of this client, so its next request can be rendered.
         self.shared.work_arrived.notify_all();
     }
 
@@ -329,6 +339,7 @@ impl PendingRender {
     pub fn deliver(mut self, picture: impl Into<Rendered>) {
         let rendered = picture.into();
         let header = self.header(rendered.size_px());
+        // Coarse stages take less time, and the estimate is for the full picture.
         if header.last {
             self.hub
                 .queue()
@@ -345,8 +356,8 @@ impl PendingRender {
 
     /// Sends the client a one-sentence reason why this picture could not be rendered.
     pub fn fail(mut self, reason: &str) {
-        let view_request = &self.job.view_request;
-        let (id, view) = (view_request.id, Arc::clone(&view_request.view));
+        let id = self.job.view_request.id;
+        let view = Arc::clone(&self.job.view_request.view);
         self.enqueue_answer(Outgoing::Failed {
             id,
             view,
@@ -378,6 +389,7 @@ impl PendingRender {
             render_millis: self.started.elapsed().as_secs_f64() * 1e3,
             encode_millis: None,
             keyframes: self.trained_on.map(|trained_on| trained_on.n),
+            // These are known only when the picture is sent.
             newest_keyframe: None,
             sent_millis: 0.0,
             color: None,
@@ -388,6 +400,7 @@ impl PendingRender {
 
 impl Drop for PendingRender {
     fn drop(&mut self) {
+        // The run dropped it, for example after an error. Its place must become free.
         if !self.is_released {
             self.hub.release(self.job.client);
         }

@@ -9,6 +9,7 @@ const MAX_SKEW: f64 = 1e-3;
 
 /// The row-major 4x4 matrix of a pose.
 pub(crate) fn row_major(pose: &Transform) -> [f64; 16] {
+    // The library stores columns, so the columns of the transposed matrix are the rows.
     let rows = pose.to_homogeneous().transpose();
     let mut numbers = [0.0; 16];
     numbers.copy_from_slice(rows.as_slice());
@@ -21,12 +22,15 @@ pub(crate) fn from_row_major(rows: &[f64; 16]) -> Option<Transform> {
         rows[0], rows[1], rows[2], rows[4], rows[5], rows[6], rows[8], rows[9], rows[10],
     );
     let skew = (rotation.transpose() * rotation - Matrix3::identity()).amax();
-    // Written so that NaN is rejected.
+    // Written so that NaN is rejected. The determinant excludes reflections, which are orthonormal,
+    // too.
     let is_rigid = rows.iter().all(|number| number.is_finite())
         && skew <= MAX_SKEW
         && rotation.determinant() > 0.0
         && rows[12..] == [0.0, 0.0, 0.0, 1.0];
     is_rigid.then(|| {
+        // The small skew that is allowed above disappears here, because the quaternion is
+        // normalized.
         let rotation =
             UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(rotation));
         Isometry3::from_parts(Translation3::new(rows[3], rows[7], rows[11]), rotation)

@@ -3,25 +3,32 @@
 use super::method::Errors;
 use super::scene::{brown_conrady, intrinsics, view};
 use calibration::hand_eye::{
-    BoardObservation, HandEyeInput, HandEyeOptions, HandEyeSample, Setup, calibrate_hand_eye,
+    BoardObservation, HandEyeInput, HandEyeOptions, HandEyeSample, JointOffset, Setup,
+    calibrate_hand_eye,
 };
 use kinematics::quantile::median;
 use kinematics::random::Random;
-use kinematics::{Chain, Transform};
+use kinematics::{Chain, Intrinsics, Transform};
 use nalgebra::Vector3;
 use rayon::prelude::{IntoParallelIterator, ParallelIterator};
 use serde::Serialize;
 
 const URDF: &str = include_str!("../../../rigs/robots/panda.urdf");
+/// Number of corners of the board.
+const N_CORNERS: usize = 54;
 /// With joint 6 at zero, the axes of joints 5 and 7 are parallel.
 const HOME_RAD: [f64; 7] = [0.0, -0.5, 0.0, -2.2, 0.0, 0.0, 0.8];
 const WRIST_IX: usize = 5;
 /// Angles of joint 6 from the singularity, degrees.
 const ANGLES_DEG: [f64; 6] = [0.0, 2.0, 5.0, 15.0, 45.0, 90.0];
-/// Standard deviation of joint 6 and of the other joints around the arm configuration, radians.
+/// Standard deviation of joint 6 around the arm configuration, radians. It is small, so that the
+/// whole run stays near the tested distance from the singularity.
 const WRIST_SPREAD_RAD: f64 = 0.01;
+/// Standard deviation of the other joints, radians: enough rotation for a calibration, but most
+/// poses still show the whole board.
 const SPREAD_RAD: f64 = 0.2;
-/// Standard deviation of the joint offsets, radians.
+/// Standard deviation of the joint offsets, radians: 3 mm at a distance of 0.8 m, far above the
+/// noise of the corners.
 const OFFSET_RAD: f64 = 0.004;
 const N_POSES: usize = 25;
 const CORNER_PX: f64 = 0.1;
@@ -75,14 +82,6 @@ impl ArmConfiguration {
             .filter(|deviation| **deviation < 3.0)
             .count();
         let of_joints = |frac: f64| (estimates_joints && !solved.is_empty()).then_some(frac);
-        let column = |value: fn(&Errors) -> f64| {
-            median(
-                &solved
-                    .iter()
-                    .map(|(errors, _)| value(errors))
-                    .collect::<Vec<_>>(),
-            )
-        };
         Self {
             angle_deg,
             estimates_joints,
@@ -92,8 +91,8 @@ impl ArmConfiguration {
                 .iter()
                 .filter(|(errors, _)| errors.has_failed())
                 .count(),
-            mm: column(|errors| errors.mm),
-            deg: column(|errors| errors.deg),
+            mm: median_of(&solved, |errors| errors.mm),
+            deg: median_of(&solved, |errors| errors.deg),
             observable_frac: of_joints(
                 deviations.len() as f64 / (N_ESTIMATED_OFFSETS * solved.len().max(1)) as f64,
             ),
@@ -102,56 +101,103 @@ impl ArmConfiguration {
     }
 }
 
+/// Median of a kind of error.
+fn median_of(solved: &[&(Errors, Vec<f64>)], value: fn(&Errors) -> f64) -> Option<f64> {
+    let values: Vec<f64> = solved.iter().map(|(errors, _)| value(errors)).collect();
+    median(&values)
+}
+
+/// An arm whose joints have offsets, with a camera.
+struct Arm<'a> {
+    chain: &'a Chain,
+    /// Mean positions of the joints.
+    home: [f64; 7],
+    /// True positions minus reported positions, radians.
+    offsets: Vec<f64>,
+    flange_from_camera: Transform,
+}
+
+impl Arm<'_> {
+    fn forward(&self, joints: &[f64]) -> Transform {
+        self.chain.forward(joints).expect("seven joints")
+    }
+
+    /// Measurements around the mean positions, from which the whole board is visible. Fewer than
+    /// [`N_POSES`] if such positions are rare.
+    fn samples(&self, lens: &Intrinsics, random: &mut Random) -> Vec<HandEyeSample> {
+        const MAX_ATTEMPTS: usize = 20_000;
+        // In front of the camera at the mean arm configuration.
+        let base_from_board = self.forward(&self.home)
+            * self.flange_from_camera
+            * Transform::new(Vector3::new(-0.1, -0.06, 0.5), Vector3::new(0.2, 0.1, 0.0));
+        let mut samples = Vec::new();
+        for _ in 0..MAX_ATTEMPTS {
+            let joints: Vec<f64> = self
+                .home
+                .iter()
+                .enumerate()
+                .map(|(ix, joint)| joint + spread_rad(ix) * random.normal())
+                .collect();
+            // The camera is where the true positions move it. The calibration gets the reported
+            // ones.
+            let moved: Vec<f64> = joints
+                .iter()
+                .zip(&self.offsets)
+                .map(|(joint, offset)| joint + offset)
+                .collect();
+            let pose = (self.forward(&moved) * self.flange_from_camera).inverse() * base_from_board;
+            let board = view(lens, &pose, CORNER_PX, random);
+            if board.points.len() == N_CORNERS {
+                samples.push(HandEyeSample {
+                    name: format!("{}", samples.len()),
+                    base_from_flange: self.forward(&joints),
+                    board: BoardObservation::View(board),
+                    joints: Some(joints),
+                });
+            }
+            if samples.len() == N_POSES {
+                break;
+            }
+        }
+        samples
+    }
+
+    /// The pose of the camera that a calibration should find.
+    fn truth(&self) -> Transform {
+        // The offset of the last joint is equivalent to a rotation of the camera; it is not
+        // estimated separately.
+        let mut last = vec![0.0; self.home.len()];
+        last[self.home.len() - 1] = self.offsets[self.home.len() - 1];
+        self.forward(&vec![0.0; self.home.len()]).inverse()
+            * self.forward(&last)
+            * self.flange_from_camera
+    }
+}
+
+/// Standard deviation of a joint, radians.
+fn spread_rad(joint_ix: usize) -> f64 {
+    if joint_ix == WRIST_IX {
+        WRIST_SPREAD_RAD
+    } else {
+        SPREAD_RAD
+    }
+}
+
 fn run(chain: &Chain, angle_deg: f64, estimates_joints: bool, seed: u64) -> Run {
-    const MAX_ATTEMPTS: usize = 20_000;
     let mut random = Random::new(7000 + seed);
     let lens = intrinsics(brown_conrady());
-    let flange_from_camera = Transform::new(
-        Vector3::new(0.05, -0.03, 0.08),
-        Vector3::new(0.1, -0.2, 1.6),
-    );
     let mut home = HOME_RAD;
     home[WRIST_IX] += angle_deg.to_radians();
-    let offsets: Vec<f64> = home.iter().map(|_| OFFSET_RAD * random.normal()).collect();
-    let forward = |joints: &[f64]| chain.forward(joints).expect("seven joints");
-    // In front of the camera at the mean arm configuration.
-    let base_from_board = forward(&home)
-        * flange_from_camera
-        * Transform::new(Vector3::new(-0.1, -0.06, 0.5), Vector3::new(0.2, 0.1, 0.0));
-    let mut samples = Vec::new();
-    for _ in 0..MAX_ATTEMPTS {
-        let spread_rad = |ix: usize| {
-            if ix == WRIST_IX {
-                WRIST_SPREAD_RAD
-            } else {
-                SPREAD_RAD
-            }
-        };
-        let joints: Vec<f64> = home
-            .iter()
-            .enumerate()
-            .map(|(ix, joint)| joint + spread_rad(ix) * random.normal())
-            .collect();
-        let moved: Vec<f64> = joints
-            .iter()
-            .zip(&offsets)
-            .map(|(joint, offset)| joint + offset)
-            .collect();
-        let pose = (forward(&moved) * flange_from_camera).inverse() * base_from_board;
-        let board = view(&lens, &pose, CORNER_PX, &mut random);
-        const N_CORNERS: usize = 54;
-        if board.points.len() == N_CORNERS {
-            samples.push(HandEyeSample {
-                name: format!("{}", samples.len()),
-                base_from_flange: forward(&joints),
-                board: BoardObservation::View(board),
-                joints: Some(joints),
-            });
-        }
-        if samples.len() == N_POSES {
-            break;
-        }
-    }
+    let arm = Arm {
+        chain,
+        home,
+        offsets: home.iter().map(|_| OFFSET_RAD * random.normal()).collect(),
+        flange_from_camera: Transform::new(
+            Vector3::new(0.05, -0.03, 0.08),
+            Vector3::new(0.1, -0.2, 1.6),
+        ),
+    };
+    let samples = arm.samples(&lens, &mut random);
     let input = HandEyeInput {
         setup: Setup::EyeInHand,
         samples,
@@ -165,23 +211,20 @@ fn run(chain: &Chain, angle_deg: f64, estimates_joints: bool, seed: u64) -> Run 
         },
     };
     let found = calibrate_hand_eye(&input).ok()?;
-    // The offset of the last joint is equivalent to a rotation of the camera; it is not estimated
-    // separately.
-    let mut last = vec![0.0; home.len()];
-    last[home.len() - 1] = offsets[home.len() - 1];
-    let truth = forward(&vec![0.0; home.len()]).inverse() * forward(&last) * flange_from_camera;
-    let deviation = |(offset, truth): (&calibration::hand_eye::JointOffset, &f64)| {
-        let [value, sigma] = offset.estimate?;
-        Some((value - truth).abs() / sigma)
-    };
     let deviations = found
         .joint_offsets
         .iter()
-        .zip(&offsets)
-        .filter_map(deviation)
+        .zip(&arm.offsets)
+        .filter_map(|(offset, truth)| deviation(offset, *truth))
         .collect();
     Some((
-        Errors::of(&found.parent_from_camera, &truth, None),
+        Errors::of(&found.parent_from_camera, &arm.truth(), None),
         deviations,
     ))
+}
+
+/// Error of an estimated offset in standard deviations; `None` if it is not observable.
+fn deviation(offset: &JointOffset, truth: f64) -> Option<f64> {
+    let [value, sigma] = offset.estimate?;
+    Some((value - truth).abs() / sigma)
 }

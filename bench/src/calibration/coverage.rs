@@ -43,12 +43,6 @@ type Run = (f64, [f64; 2]);
 impl Coverage {
     fn of(name: &'static str, units: [&'static str; 2], runs: Vec<Option<Run>>) -> Self {
         let found: Vec<Run> = runs.iter().copied().flatten().collect();
-        let column = |ix: usize| {
-            found
-                .iter()
-                .map(|(_, errors)| errors[ix])
-                .collect::<Vec<f64>>()
-        };
         let mut levels: Vec<f64> = found.iter().map(|(level, _)| *level).collect();
         levels.sort_by(f64::total_cmp);
         let n_covered = levels.iter().filter(|level| **level < 0.95).count();
@@ -57,12 +51,17 @@ impl Coverage {
             n_runs: runs.len(),
             n_refused: runs.len() - found.len(),
             covered_frac: n_covered as f64 / found.len().max(1) as f64,
-            median: [0, 1].map(|ix| median(&column(ix)).unwrap_or(f64::NAN)),
-            p95: [0, 1].map(|ix| p95(column(ix))),
+            median: [0, 1].map(|ix| median(&column(&found, ix)).unwrap_or(f64::NAN)),
+            p95: [0, 1].map(|ix| p95(column(&found, ix))),
             units,
             levels,
         }
     }
+}
+
+/// One of the two errors of each run.
+fn column(runs: &[Run], ix: usize) -> Vec<f64> {
+    runs.iter().map(|(_, errors)| errors[ix]).collect()
 }
 
 fn p95(mut values: Vec<f64>) -> f64 {
@@ -72,7 +71,6 @@ fn p95(mut values: Vec<f64>) -> f64 {
 
 /// Measures all kinds.
 pub(super) fn measure(scenes: CoverageScenes) -> Vec<Coverage> {
-    let seeds = scenes.first_seed..scenes.first_seed + scenes.runs;
     let no_robot_noise = Noise {
         corner_px: scenes.corner_px,
         robot_rad: 0.0,
@@ -83,25 +81,15 @@ pub(super) fn measure(scenes: CoverageScenes) -> Vec<Coverage> {
         robot_m: 3e-4,
         ..no_robot_noise
     };
-    let hand_eye = |name, noise: Noise, given: Given, options: HandEyeOptions| {
-        let runs = seeds
-            .clone()
-            .into_par_iter()
-            .map(|seed| hand_eye_run(seed, scenes.n_poses, noise, given, options));
-        Coverage::of(name, ["mm", "degrees"], runs.collect())
-    };
-    let lens = |name, lens: Lens, model: LensModel| {
-        let runs = seeds
-            .clone()
-            .into_par_iter()
-            .map(|seed| intrinsics_run(seed, scenes, lens, model));
-        Coverage::of(name, ["px", "px"], runs.collect())
-    };
     let default = HandEyeOptions::default();
     let with_lens = HandEyeOptions {
         estimate_intrinsics: true,
         ..default
     };
+    // Each kind has another source of uncertainty: corners, robot poses, the given lens, or a lens
+    // that is estimated, too.
+    let hand_eye = |name, noise, given, options| hand_eye(scenes, name, noise, given, options);
+    let lens = |name, lens, model| intrinsics_coverage(scenes, name, lens, model);
     vec![
         hand_eye(
             "hand-eye, no robot pose noise",
@@ -147,6 +135,41 @@ pub(super) fn measure(scenes: CoverageScenes) -> Vec<Coverage> {
     ]
 }
 
+impl CoverageScenes {
+    fn seeds(self) -> std::ops::Range<u64> {
+        self.first_seed..self.first_seed + self.runs
+    }
+}
+
+/// Coverage of a hand-eye calibration.
+fn hand_eye(
+    scenes: CoverageScenes,
+    name: &'static str,
+    noise: Noise,
+    given: Given,
+    options: HandEyeOptions,
+) -> Coverage {
+    let runs = scenes
+        .seeds()
+        .into_par_iter()
+        .map(|seed| hand_eye_run(seed, scenes.n_poses, noise, given, options));
+    Coverage::of(name, ["mm", "degrees"], runs.collect())
+}
+
+/// Coverage of a calibration of intrinsics.
+fn intrinsics_coverage(
+    scenes: CoverageScenes,
+    name: &'static str,
+    lens: Lens,
+    model: LensModel,
+) -> Coverage {
+    let runs = scenes
+        .seeds()
+        .into_par_iter()
+        .map(|seed| intrinsics_run(seed, scenes, lens, model));
+    Coverage::of(name, ["px", "px"], runs.collect())
+}
+
 /// What is given besides the robot poses.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Given {
@@ -182,10 +205,8 @@ fn hand_eye_run(
             &intrinsics(brown_conrady()),
             LensModel::BrownConrady5,
         )?;
-        (input.intrinsics, input.intrinsics_covariance) = (
-            Some(lens.intrinsics.clone()),
-            Some(lens.intrinsics_covariance()),
-        );
+        input.intrinsics = Some(lens.intrinsics.clone());
+        input.intrinsics_covariance = Some(lens.intrinsics_covariance());
     }
     let found = calibrate_hand_eye(&input).ok()?;
     let error = scene.flange_from_camera.inverse() * found.parent_from_camera;
@@ -244,6 +265,8 @@ fn intrinsics_run(seed: u64, scenes: CoverageScenes, lens: Lens, model: LensMode
             .zip(&true_params)
             .map(|(param, truth)| param.value - truth),
     );
+    // The squared Mahalanobis distance has a chi-squared distribution if the covariance is right.
+    // A covariance that is not positive definite counts as a result outside of any ellipsoid.
     let squared = found
         .covariance
         .clone()
@@ -261,7 +284,10 @@ pub(super) fn chi_squared_cdf(x: f64, degrees_of_freedom: usize) -> f64 {
     if !is_small {
         return 1.0;
     }
-    let (a, half) = (0.5 * degrees_of_freedom as f64, 0.5 * x.max(0.0));
+    // With `a` half of the degrees of freedom and `h` half of `x`, the probability is
+    // `h^a e^-h / Gamma(a + 1) * (1 + h / (a + 1) + h^2 / ((a + 1) (a + 2)) + ...)`.
+    let a = 0.5 * degrees_of_freedom as f64;
+    let half = 0.5 * x.max(0.0);
     // Gamma(a + 1) from Gamma(1) or Gamma(1/2).
     let (mut gamma, mut at) = if degrees_of_freedom.is_multiple_of(2) {
         (1.0, 1.0)
@@ -272,7 +298,10 @@ pub(super) fn chi_squared_cdf(x: f64, degrees_of_freedom: usize) -> f64 {
         gamma *= at;
         at += 1.0;
     }
-    let (mut term, mut sum, mut n) = (1.0, 1.0, a);
+    // Terms below the rounding error of the sum do not change it.
+    let mut term = 1.0;
+    let mut sum = 1.0;
+    let mut n = a;
     while term > 1e-16 * sum {
         n += 1.0;
         term *= half / n;

@@ -81,8 +81,10 @@ fn pair(sample: &HandEyeSample) -> Option<(Transform, Transform)> {
 
 /// Squared Mahalanobis distance of the error; below 12.59 in 95 % of correct calibrations.
 pub(super) fn squared_error(found: &HandEyeCalibration, truth: &Transform) -> f64 {
+    // In the axes of the camera, translation first, as the covariance is reported.
     let error = found.parent_from_camera.inverse() * truth;
-    let (t, r) = (error.translation.vector, error.rotation.scaled_axis());
+    let t = error.translation.vector;
+    let r = error.rotation.scaled_axis();
     let error = Vector6::new(t.x, t.y, t.z, r.x, r.y, r.z);
     found
         .covariance
@@ -117,9 +119,13 @@ impl Errors {
     }
 
     /// Whether the result failed: error above 5 mm or 0.5 degrees, or not finite.
+    ///
+    /// The limits are far above the noise of all conditions, so that only wrong solutions exceed
+    /// them.
     pub(super) fn has_failed(&self) -> bool {
         const MAX_MM: f64 = 5.0;
         const MAX_DEG: f64 = 0.5;
+        // A NaN fails both comparisons, and counts as a failure.
         !(self.mm <= MAX_MM && self.deg <= MAX_DEG)
     }
 }

@@ -4,7 +4,7 @@ use super::coverage::Coverage;
 use super::method::Method;
 use super::speed::Speed;
 use super::stability::{Cell, OutlierType, methods};
-use super::{CalibrationOptions, Results};
+use super::{ArmConfiguration, CalibrationOptions, Results, RigResult};
 use crate::findings::Findings;
 use session::Table;
 use session::chart::{Axis, Chart, Line, Point, Scale};
@@ -14,7 +14,9 @@ const BASE_SPREAD_DEG: f64 = 20.0;
 const BASE_POSES: usize = 12;
 
 pub(super) fn findings(options: &CalibrationOptions, results: &Results) -> Findings {
-    let (mut charts, mut tables) = (Vec::new(), Vec::new());
+    let mut charts = Vec::new();
+    let mut tables = Vec::new();
+    // Parts that were not requested have no results.
     if !results.coverage.is_empty() {
         charts.push(("-coverage", coverage_chart(&results.coverage)));
         tables.push(coverage_table(&results.coverage));
@@ -63,17 +65,21 @@ pub(super) fn findings(options: &CalibrationOptions, results: &Results) -> Findi
 
 /// The tables in Markdown.
 pub(super) fn markdown(tables: &[Table]) -> String {
-    let row = |cells: &[String]| format!("| {} |\n", cells.join(" | "));
-    let table = |table: &Table| {
-        let rows: String = table.rows.iter().map(|cells| row(cells)).collect();
-        format!(
-            "## {}\n\n{}{}\n{rows}\n",
-            table.title,
-            row(&table.head),
-            "|---".repeat(table.head.len()) + "|"
-        )
-    };
-    tables.iter().map(table).collect()
+    tables.iter().map(markdown_table).collect()
+}
+
+fn markdown_table(table: &Table) -> String {
+    let rows: String = table.rows.iter().map(|cells| markdown_row(cells)).collect();
+    format!(
+        "## {}\n\n{}{}\n{rows}\n",
+        table.title,
+        markdown_row(&table.head),
+        "|---".repeat(table.head.len()) + "|"
+    )
+}
+
+fn markdown_row(cells: &[String]) -> String {
+    format!("| {} |\n", cells.join(" | "))
 }
 
 fn axis(label: &str, scale: Scale, ticks: Vec<f64>) -> Axis {
@@ -93,24 +99,32 @@ fn point(x: f64, y: f64) -> Point {
     }
 }
 
+/// Confidence levels of the chart, percent.
+const LEVELS: [f64; 10] = [10.0, 20.0, 30.0, 40.0, 50.0, 60.0, 70.0, 80.0, 90.0, 95.0];
+
+/// Percentage of the results whose ellipsoid of a confidence level (in percent) contains the truth.
+fn observed_percent(coverage: &Coverage, level: f64) -> f64 {
+    let n = coverage
+        .levels
+        .iter()
+        .filter(|own| **own <= 0.01 * level)
+        .count();
+    100.0 * n as f64 / coverage.levels.len().max(1) as f64
+}
+
+fn coverage_line(coverage: &Coverage) -> Line {
+    Line {
+        label: coverage.name.to_owned(),
+        points: LEVELS
+            .map(|level| point(level, observed_percent(coverage, level)))
+            .to_vec(),
+        is_peer: false,
+    }
+}
+
 fn coverage_chart(results: &[Coverage]) -> Chart {
-    const LEVELS: [f64; 10] = [10.0, 20.0, 30.0, 40.0, 50.0, 60.0, 70.0, 80.0, 90.0, 95.0];
-    let line = |coverage: &Coverage| {
-        let observed = |level: f64| {
-            let n = coverage
-                .levels
-                .iter()
-                .filter(|own| **own <= 0.01 * level)
-                .count();
-            100.0 * n as f64 / coverage.levels.len().max(1) as f64
-        };
-        let points = LEVELS.map(|level| point(level, observed(level))).to_vec();
-        Line {
-            label: coverage.name.to_owned(),
-            points,
-            is_peer: false,
-        }
-    };
+    // With the right covariance, the ellipsoid of a level contains the truth in that fraction of
+    // the results. A line below is overconfident, one above too cautious.
     let ideal = Line {
         label: "ideal".into(),
         points: LEVELS.map(|level| point(level, level)).into(),
@@ -125,26 +139,25 @@ fn coverage_chart(results: &[Coverage]) -> Chart {
             Scale::Linear,
             Vec::new(),
         ),
-        lines: results.iter().map(line).chain([ideal]).collect(),
+        lines: results.iter().map(coverage_line).chain([ideal]).collect(),
         thresholds: Vec::new(),
         markers: Vec::new(),
     }
 }
 
+fn coverage_row(coverage: &Coverage) -> Vec<String> {
+    let [first, second] = coverage.units;
+    let pair = |values: [f64; 2]| format!("{:.3} {first}, {:.4} {second}", values[0], values[1]);
+    vec![
+        coverage.name.to_owned(),
+        format!("{:.1} %", 100.0 * coverage.covered_frac),
+        pair(coverage.median),
+        pair(coverage.p95),
+        format!("{} of {}", coverage.n_refused, coverage.n_runs),
+    ]
+}
+
 fn coverage_table(results: &[Coverage]) -> Table {
-    let row = |coverage: &Coverage| {
-        let pair = |values: [f64; 2]| {
-            let [first, second] = coverage.units;
-            format!("{:.3} {first}, {:.4} {second}", values[0], values[1])
-        };
-        vec![
-            coverage.name.to_owned(),
-            format!("{:.1} %", 100.0 * coverage.covered_frac),
-            pair(coverage.median),
-            pair(coverage.p95),
-            format!("{} of {}", coverage.n_refused, coverage.n_runs),
-        ]
-    };
     Table {
         title: "Coverage of the 95 % ellipsoid".into(),
         head: words([
@@ -154,7 +167,7 @@ fn coverage_table(results: &[Coverage]) -> Table {
             "95th percentile",
             "refused",
         ]),
-        rows: results.iter().map(row).collect(),
+        rows: results.iter().map(coverage_row).collect(),
     }
 }
 
@@ -165,44 +178,46 @@ fn words<const N: usize>(words: [&str; N]) -> Vec<String> {
 fn speed_chart(results: &[Speed], label: &str, value: fn(&Speed) -> f64) -> Chart {
     let mut ticks: Vec<f64> = results.iter().map(|speed| speed.n_poses as f64).collect();
     ticks.dedup();
-    let line = |method: Method| {
+    let mut lines = Vec::new();
+    for method in Method::ALL {
+        // A method that refused all scenes has no error.
         let own = results
             .iter()
             .filter(|speed| speed.method == method.name() && value(speed).is_finite());
-        let points = own
-            .map(|speed| point(speed.n_poses as f64, value(speed)))
-            .collect();
-        Line {
+        lines.push(Line {
             label: method.name().to_owned(),
-            points,
+            points: own
+                .map(|speed| point(speed.n_poses as f64, value(speed)))
+                .collect(),
             is_peer: matches!(method, Method::ClosedForm(_)),
-        }
-    };
+        });
+    }
     Chart {
         title: format!("Hand-eye calibration: {label}"),
         subtitle: "0.1 px, 0.1 mm and 0.1 mrad of noise; median".into(),
         x: axis("poses", Scale::Log, ticks),
         y: axis(label, Scale::Log, Vec::new()),
-        lines: Method::ALL.map(line).into(),
+        lines,
         thresholds: Vec::new(),
         markers: Vec::new(),
     }
 }
 
+fn speed_row(speed: &Speed) -> Vec<String> {
+    vec![
+        speed.method.to_owned(),
+        speed.n_poses.to_string(),
+        format!("{:.1}", speed.millis),
+        format!("{:.3}", speed.mm),
+        format!("{:.4}", speed.deg),
+    ]
+}
+
 fn speed_table(results: &[Speed]) -> Table {
-    let row = |speed: &Speed| {
-        vec![
-            speed.method.to_owned(),
-            speed.n_poses.to_string(),
-            format!("{:.1}", speed.millis),
-            format!("{:.3}", speed.mm),
-            format!("{:.4}", speed.deg),
-        ]
-    };
     Table {
         title: "Time and error".into(),
         head: words(["method", "poses", "ms", "mm", "degrees"]),
-        rows: results.iter().map(row).collect(),
+        rows: results.iter().map(speed_row).collect(),
     }
 }
 
@@ -260,30 +275,53 @@ fn sweeps() -> [Sweep; 4] {
 }
 
 fn stability_charts(cells: &[Cell]) -> impl Iterator<Item = (&'static str, Chart)> {
-    const FAILED_MM: f64 = 5.0;
-    sweeps().into_iter().map(move |sweep| {
-        let own: Vec<&Cell> = cells.iter().filter(|cell| (sweep.is_in)(cell)).collect();
-        let mut levels: Vec<f64> = own.iter().map(|cell| (sweep.value)(cell)).collect();
+    sweeps()
+        .into_iter()
+        .map(move |sweep| (sweep.suffix, sweep.chart(cells)))
+}
+
+impl Sweep {
+    /// Position error of each method over the varied quantity.
+    fn chart(&self, cells: &[Cell]) -> Chart {
+        const FAILED_MM: f64 = 5.0;
+        let own: Vec<&Cell> = cells.iter().filter(|cell| (self.is_in)(cell)).collect();
+        let mut levels: Vec<f64> = own.iter().map(|cell| (self.value)(cell)).collect();
         levels.sort_by(f64::total_cmp);
         levels.dedup();
-        let line = |method: Method| {
-            let of_method = own.iter().filter(|cell| cell.method == method.name());
-            let points = of_method.filter_map(|cell| Some(point((sweep.value)(cell), cell.mm?))).collect();
-            Line { label: method.name().to_owned(), points, is_peer: matches!(method, Method::ClosedForm(_)) }
-        };
-        let chart = Chart {
-            title: format!("Hand-eye calibration: {}", sweep.label),
+        Chart {
+            title: format!("Hand-eye calibration: {}", self.label),
             subtitle: format!(
                 "median error of the results; no point: all runs refused. Otherwise {BASE_POSES} poses, {BASE_SPREAD_DEG} degrees"
             ),
-            x: axis(sweep.label, Scale::Levels(levels), Vec::new()),
+            x: axis(self.label, Scale::Levels(levels), Vec::new()),
             y: axis("position error, mm", Scale::Log, Vec::new()),
-            lines: methods().map(line).collect(),
+            lines: methods().map(|method| self.line(method, &own)).collect(),
             thresholds: vec![(FAILED_MM, "failed: above 5 mm".into())],
             markers: Vec::new(),
+        }
+    }
+
+    fn line(&self, method: Method, cells: &[&Cell]) -> Line {
+        let of_method = cells.iter().filter(|cell| cell.method == method.name());
+        Line {
+            label: method.name().to_owned(),
+            points: of_method
+                .filter_map(|cell| Some(point((self.value)(cell), cell.mm?)))
+                .collect(),
+            is_peer: matches!(method, Method::ClosedForm(_)),
+        }
+    }
+
+    /// The refused and failed results of a cell.
+    fn describe_failures(&self, cell: &Cell) -> String {
+        let rest = match (cell.n_refused, cell.n_failed) {
+            (0, 0) => "ok".to_owned(),
+            (refused, 0) => format!("{refused} refused"),
+            (0, failed) => format!("{failed} failed"),
+            (refused, failed) => format!("{refused} refused, {failed} failed"),
         };
-        (sweep.suffix, chart)
-    })
+        format!("{}: {rest}", (self.value)(cell))
+    }
 }
 
 /// For each sweep and method: refused and failed results at each level.
@@ -294,16 +332,7 @@ fn limits_table(cells: &[Cell]) -> Table {
             let own = cells
                 .iter()
                 .filter(|cell| (sweep.is_in)(cell) && cell.method == method.name());
-            let level = |cell: &Cell| {
-                let rest = match (cell.n_refused, cell.n_failed) {
-                    (0, 0) => "ok".to_owned(),
-                    (refused, 0) => format!("{refused} refused"),
-                    (0, failed) => format!("{failed} failed"),
-                    (refused, failed) => format!("{refused} refused, {failed} failed"),
-                };
-                format!("{}: {rest}", (sweep.value)(cell))
-            };
-            let levels: Vec<String> = own.map(level).collect();
+            let levels: Vec<String> = own.map(|cell| sweep.describe_failures(cell)).collect();
             rows.push(vec![
                 format!("{}, {}", sweep.label, method.name()),
                 levels.join("; "),
@@ -318,36 +347,33 @@ fn limits_table(cells: &[Cell]) -> Table {
     }
 }
 
-fn totals_table(cells: &[Cell]) -> Table {
-    let row = |method: Method| {
-        let sum = |value: fn(&Cell) -> usize| -> usize {
-            cells
-                .iter()
-                .filter(|cell| cell.method == method.name())
-                .map(value)
-                .sum()
-        };
-        let n_runs = sum(|cell| cell.n_runs);
-        let [refused, failed, outside_region] = [
-            sum(|cell| cell.n_refused),
-            sum(|cell| cell.n_failed),
-            sum(|cell| cell.n_failed_outside_region),
-        ];
-        let has_uncertainty = !matches!(method, Method::ClosedForm(_));
-        let outside_region = if has_uncertainty {
-            outside_region.to_string()
-        } else {
-            "not reported".into()
-        };
-        vec![
-            method.name().to_owned(),
-            n_runs.to_string(),
-            (n_runs - refused - failed).to_string(),
-            refused.to_string(),
-            failed.to_string(),
-            outside_region,
-        ]
+/// The row of a method: sums over all conditions.
+fn totals_row(cells: &[Cell], method: Method) -> Vec<String> {
+    let own: Vec<&Cell> = cells
+        .iter()
+        .filter(|cell| cell.method == method.name())
+        .collect();
+    let n_runs: usize = own.iter().map(|cell| cell.n_runs).sum();
+    let n_refused: usize = own.iter().map(|cell| cell.n_refused).sum();
+    let n_failed: usize = own.iter().map(|cell| cell.n_failed).sum();
+    let n_outside_region: usize = own.iter().map(|cell| cell.n_failed_outside_region).sum();
+    // A closed-form solver has no confidence region.
+    let outside_region = if matches!(method, Method::ClosedForm(_)) {
+        "not reported".into()
+    } else {
+        n_outside_region.to_string()
     };
+    vec![
+        method.name().to_owned(),
+        n_runs.to_string(),
+        (n_runs - n_refused - n_failed).to_string(),
+        n_refused.to_string(),
+        n_failed.to_string(),
+        outside_region,
+    ]
+}
+
+fn totals_table(cells: &[Cell]) -> Table {
     Table {
         title: "All combinations of rotation, poses and outliers".into(),
         head: words([
@@ -358,35 +384,36 @@ fn totals_table(cells: &[Cell]) -> Table {
             "failed",
             "failed and outside the 99.99 % confidence region",
         ]),
-        rows: methods().map(row).collect(),
+        rows: methods().map(|method| totals_row(cells, method)).collect(),
     }
 }
 
+fn number(value: Option<f64>, digits: usize) -> String {
+    value.map_or("-".to_owned(), |value| format!("{value:.digits$}"))
+}
+
+fn percent(frac: Option<f64>) -> String {
+    frac.map_or("-".to_owned(), |frac| format!("{:.0} %", 100.0 * frac))
+}
+
+fn arm_configuration_row(configuration: &ArmConfiguration) -> Vec<String> {
+    let offsets = if configuration.estimates_joints {
+        "offsets estimated"
+    } else {
+        "offsets ignored"
+    };
+    vec![
+        format!("{} degrees, {offsets}", configuration.angle_deg),
+        number(configuration.mm, 2),
+        number(configuration.deg, 3),
+        format!("{} of {}", configuration.n_refused, configuration.n_runs),
+        configuration.n_failed.to_string(),
+        percent(configuration.observable_frac),
+        percent(configuration.within_3_sigma_frac),
+    ]
+}
+
 fn arm_configurations_table(results: &Results) -> Table {
-    let percent =
-        |frac: Option<f64>| frac.map_or("-".to_owned(), |frac| format!("{:.0} %", 100.0 * frac));
-    let number = |value: Option<f64>, digits: usize| {
-        value.map_or("-".to_owned(), |value| format!("{value:.digits$}"))
-    };
-    let row = |configuration: &super::ArmConfiguration| {
-        vec![
-            format!(
-                "{} degrees, {}",
-                configuration.angle_deg,
-                if configuration.estimates_joints {
-                    "offsets estimated"
-                } else {
-                    "offsets ignored"
-                }
-            ),
-            number(configuration.mm, 2),
-            number(configuration.deg, 3),
-            format!("{} of {}", configuration.n_refused, configuration.n_runs),
-            configuration.n_failed.to_string(),
-            percent(configuration.observable_frac),
-            percent(configuration.within_3_sigma_frac),
-        ]
-    };
     Table {
         title: "Distance of joint 6 from the wrist singularity, with joint offsets of 4 mrad"
             .into(),
@@ -399,23 +426,30 @@ fn arm_configurations_table(results: &Results) -> Table {
             "offsets observable",
             "within 3 sigma",
         ]),
-        rows: results.arm_configurations.iter().map(row).collect(),
+        rows: results
+            .arm_configurations
+            .iter()
+            .map(arm_configuration_row)
+            .collect(),
+    }
+}
+
+fn rigs_line(rigs: &[RigResult], label: &str, value: fn(&RigResult) -> Option<f64>) -> Line {
+    // A refused rig has no point.
+    let points = rigs
+        .iter()
+        .filter_map(|rig| Some(point(rig.seed as f64, value(rig)?)));
+    Line {
+        label: label.to_owned(),
+        points: points.collect(),
+        is_peer: label != "error",
     }
 }
 
 fn rigs_chart(results: &Results) -> Chart {
     const GOAL_MM: f64 = 0.2;
-    let line = |label: &str, value: &dyn Fn(&super::RigResult) -> Option<f64>| {
-        let points = results
-            .rigs
-            .iter()
-            .filter_map(|rig| Some(point(rig.seed as f64, value(rig)?)));
-        Line {
-            label: label.to_owned(),
-            points: points.collect(),
-            is_peer: label != "error",
-        }
-    };
+    let line =
+        |label: &str, value: fn(&RigResult) -> Option<f64>| rigs_line(&results.rigs, label, value);
     Chart {
         title: "Calibration without a target: position error".into(),
         subtitle: "hand-eye wrong by 3 degrees and 20 mm in random directions".into(),
@@ -426,30 +460,28 @@ fn rigs_chart(results: &Results) -> Chart {
         ),
         y: axis("mm", Scale::Log, Vec::new()),
         lines: vec![
-            line("error", &|rig| rig.errors.map(|errors| errors.mm)),
-            line("reported standard deviation", &|rig| rig.sigma_mm),
+            line("error", |rig| rig.errors.map(|errors| errors.mm)),
+            line("reported standard deviation", |rig| rig.sigma_mm),
         ],
         thresholds: vec![(GOAL_MM, "goal: 0.2 mm".into())],
         markers: Vec::new(),
     }
 }
 
+fn rig_row(rig: &RigResult) -> Vec<String> {
+    vec![
+        rig.seed.to_string(),
+        rig.n_images.to_string(),
+        number(rig.errors.map(|errors| errors.mm), 3),
+        number(rig.sigma_mm, 3),
+        number(rig.errors.map(|errors| errors.deg), 4),
+        number(rig.sigma_deg, 4),
+        format!("{:.1}", rig.seconds),
+        if rig.reaches_goal() { "yes" } else { "no" }.to_owned(),
+    ]
+}
+
 fn rigs_table(results: &Results) -> Table {
-    let number = |value: Option<f64>, digits: usize| {
-        value.map_or("-".to_owned(), |value| format!("{value:.digits$}"))
-    };
-    let row = |rig: &super::RigResult| {
-        vec![
-            rig.seed.to_string(),
-            rig.n_images.to_string(),
-            number(rig.errors.map(|errors| errors.mm), 3),
-            number(rig.sigma_mm, 3),
-            number(rig.errors.map(|errors| errors.deg), 4),
-            number(rig.sigma_deg, 4),
-            format!("{:.1}", rig.seconds),
-            if rig.reaches_goal() { "yes" } else { "no" }.to_owned(),
-        ]
-    };
     Table {
         title: "Calibration without a target".into(),
         head: words([
@@ -462,7 +494,7 @@ fn rigs_table(results: &Results) -> Table {
             "s",
             "goal reached",
         ]),
-        rows: results.rigs.iter().map(row).collect(),
+        rows: results.rigs.iter().map(rig_row).collect(),
     }
 }
 

@@ -39,6 +39,7 @@ pub(super) fn measure(rig_file: &Path, seed: u64, scan_secs: f64) -> Result<RigR
         Override::new("sim.seed", seed_of_scene),
     ];
     let mut rig = Rig::load(rig_file, &overrides).map_err(capture::Error::from)?;
+    // The simulated camera stays where it is. Only the pose in the rig file becomes wrong.
     let camera = &mut rig.cameras[0];
     let truth = camera
         .sim

@@ -66,6 +66,8 @@ pub(super) fn camera_from_board(
     let mut pose = Transform::identity();
     for _ in 0..MAX_ATTEMPTS {
         let mut turn = normal_vector(random, spread_rad);
+        // At larger tilts, the corners of a real board would be hard to detect. Rotations about the
+        // optical axis are not limited.
         turn.x = turn.x.clamp(-MAX_TILT_RAD, MAX_TILT_RAD);
         turn.y = turn.y.clamp(-MAX_TILT_RAD, MAX_TILT_RAD);
         let rotation = UnitQuaternion::from_scaled_axis(turn);
@@ -85,21 +87,29 @@ pub(super) fn view(
     noise_px: f64,
     random: &mut Random,
 ) -> BoardView {
-    let point = |point_in_board: Vector3<f64>| {
-        let pixel = intrinsics.project(&(pose * Point3::from(point_in_board)).coords)?;
+    let mut points = Vec::new();
+    for point_in_board in corners() {
+        let point_in_camera = pose * Point3::from(point_in_board);
+        let Some(pixel) = intrinsics.project(&point_in_camera.coords) else {
+            continue;
+        };
+        // Without noise, no random numbers are drawn: the search for a pose must not affect the
+        // noise of the scene.
         let pixel = if noise_px > 0.0 {
             pixel.map(|value| value + noise_px * random.normal())
         } else {
             pixel
         };
-        intrinsics.contains(pixel).then_some(BoardPoint {
-            point_in_board,
-            pixel,
-        })
-    };
+        if intrinsics.contains(pixel) {
+            points.push(BoardPoint {
+                point_in_board,
+                pixel,
+            });
+        }
+    }
     BoardView {
         name: String::new(),
-        points: corners().filter_map(point).collect(),
+        points,
     }
 }
 
@@ -127,33 +137,26 @@ impl Scene {
 
     /// Measured robot poses and corners.
     pub(super) fn samples(&self, noise: Noise, seed: u64) -> Vec<HandEyeSample> {
+        // Not the seed of the scene, whose random numbers would otherwise repeat as noise.
         let mut random = Random::new(seed ^ 0x5eed_0000);
         let lens = intrinsics(brown_conrady());
-        let mut sample = |(ix, pose): (usize, &Transform)| {
+        let mut samples = Vec::new();
+        for (ix, pose) in self.base_from_flange.iter().enumerate() {
             let error = Transform::new(
                 normal_vector(&mut random, noise.robot_m),
                 normal_vector(&mut random, noise.robot_rad),
             );
             let camera_from_board =
                 (pose * self.flange_from_camera).inverse() * self.base_from_board;
-            let board = BoardObservation::View(view(
-                &lens,
-                &camera_from_board,
-                noise.corner_px,
-                &mut random,
-            ));
-            HandEyeSample {
+            let board = view(&lens, &camera_from_board, noise.corner_px, &mut random);
+            samples.push(HandEyeSample {
                 name: format!("{ix}"),
                 base_from_flange: pose * error,
-                board,
+                board: BoardObservation::View(board),
                 joints: None,
-            }
-        };
-        self.base_from_flange
-            .iter()
-            .enumerate()
-            .map(&mut sample)
-            .collect()
+            });
+        }
+        samples
     }
 }
 
@@ -161,17 +164,22 @@ impl Scene {
 /// out.
 pub(super) fn with_board_poses(samples: &[HandEyeSample]) -> Vec<HandEyeSample> {
     let lens = intrinsics(brown_conrady());
-    let pose = |sample: &HandEyeSample| {
-        let BoardObservation::View(view) = &sample.board else {
-            return Some(sample.clone());
-        };
-        let board = BoardObservation::Pose(board_pose(&lens, &view.points)?.camera_from_board);
-        Some(HandEyeSample {
-            board,
-            ..sample.clone()
-        })
+    samples
+        .iter()
+        .filter_map(|sample| with_board_pose(sample, &lens))
+        .collect()
+}
+
+/// A sample with the pose of the board; `None` if its corners do not determine one.
+fn with_board_pose(sample: &HandEyeSample, lens: &Intrinsics) -> Option<HandEyeSample> {
+    let BoardObservation::View(view) = &sample.board else {
+        return Some(sample.clone());
     };
-    samples.iter().filter_map(pose).collect()
+    let board = BoardObservation::Pose(board_pose(lens, &view.points)?.camera_from_board);
+    Some(HandEyeSample {
+        board,
+        ..sample.clone()
+    })
 }
 
 /// Input for these samples.

@@ -33,11 +33,14 @@ pub(super) fn measure(n_seeds: u64) -> Vec<Speed> {
             .map(|seed| Scene::new(n_poses, SPREAD_RAD, 3000 + seed))
             .collect();
         for method in Method::ALL {
-            let (mut millis, mut mm, mut deg) = (Vec::new(), Vec::new(), Vec::new());
+            let mut millis = Vec::new();
+            let mut mm = Vec::new();
+            let mut deg = Vec::new();
             for (seed, scene) in (0..).zip(&scenes) {
                 let samples = scene.samples(NOISE, seed);
                 let started = Instant::now();
                 let outcome = method.calibrate(&samples, &scene.flange_from_camera);
+                // A refusal takes time, too, but has no error.
                 millis.push(started.elapsed().as_secs_f64() * 1e3);
                 if let Some(errors) = outcome.errors() {
                     mm.push(errors.mm);

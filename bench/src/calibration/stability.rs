@@ -99,17 +99,16 @@ fn cells(condition: Condition, n_seeds: u64) -> Vec<Cell> {
             (scene, samples)
         })
         .collect();
-    let cell = |method: Method| {
-        let calibrate = |(scene, samples): &(Scene, Vec<HandEyeSample>)| {
-            method.calibrate(samples, &scene.flange_from_camera)
-        };
-        Cell::of(
-            condition,
-            method,
-            &runs.iter().map(calibrate).collect::<Vec<_>>(),
-        )
-    };
-    methods().map(cell).collect()
+    let mut cells = Vec::new();
+    // All methods get the same measurements.
+    for method in methods() {
+        let outcomes: Vec<Outcome> = runs
+            .iter()
+            .map(|(scene, samples)| method.calibrate(samples, &scene.flange_from_camera))
+            .collect();
+        cells.push(Cell::of(condition, method, &outcomes));
+    }
+    cells
 }
 
 impl Condition {
@@ -124,6 +123,7 @@ impl Condition {
                         continue;
                     };
                     let n = n_outliers(view.points.len());
+                    // Otherwise, the outliers of all images would be in the same part of the board.
                     random.shuffle(&mut view.points);
                     for point in &mut view.points[..n] {
                         let offset = [0, 1].map(|_| random.uniform(-MAX_OFFSET_PX, MAX_OFFSET_PX));

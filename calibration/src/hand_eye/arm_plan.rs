@@ -29,7 +29,8 @@ pub const MIN_POSES: usize = 10;
 const MAX_UNSEEN: usize = 8;
 
 /// Standard deviation of the position up to which an estimate selects poses, as long as small
-/// rotations remain, millimeters.
+/// rotations remain, millimeters. With a larger error of the camera pose, suggested poses may not
+/// show the target; with a smaller limit, the arm makes more small rotations, which add little.
 const MAX_EARLY_SIGMA_MM: f64 = 20.0;
 
 /// What an arm does next.
@@ -142,6 +143,7 @@ impl<'a> ArmPlan<'a> {
         estimate: Result<&HandEyeCalibration, &Error>,
         current: &[f64],
     ) -> ArmStep {
+        // A plan ends in three ways; an accurate result is reported first.
         let n = input.samples.len();
         if let Ok(calibration) = estimate {
             let sigma_mm = calibration.sigma_mm.into_iter().fold(0.0, f64::max);
@@ -165,13 +167,8 @@ impl<'a> ArmPlan<'a> {
         }
         // A few small rotations first: with fewer samples, or a large uncertainty, an estimate may
         // be far off.
-        let is_uncertain = |found: &HandEyeCalibration| {
-            found
-                .sigma_mm
-                .iter()
-                .any(|sigma| *sigma > MAX_EARLY_SIGMA_MM)
-        };
         if n < 5 || estimate.as_ref().map_or(true, |found| is_uncertain(found)) {
+            // Poses that the arm does not reach are skipped for good.
             while let Some((pose, purpose)) = self.first.pop_front() {
                 if let Some(joints) = self.reach.joints_for(&pose, current) {
                     return ArmStep::Move { joints, purpose };
@@ -206,16 +203,36 @@ impl<'a> ArmPlan<'a> {
     }
 }
 
+/// Whether an estimate is too uncertain to select poses.
+fn is_uncertain(found: &HandEyeCalibration) -> bool {
+    found
+        .sigma_mm
+        .iter()
+        .any(|sigma| *sigma > MAX_EARLY_SIGMA_MM)
+}
+
+/// Purpose of a rotation about an axis of a body, for people.
+fn purpose(verb: &str, (sign, axis): (f64, usize), degrees: f64, body: &str) -> String {
+    format!(
+        "{verb} by {:.0} degrees about the {body}'s {} axis",
+        sign * degrees,
+        ["x", "y", "z"][axis]
+    )
+}
+
 /// Rotations about the center of the target according to the approximate pose of the camera, which
-/// keep the target in view. If that pose is far off, the target leaves the view; therefore, small
+/// keep the target in view. If that pose is far off, the target leaves the view. Therefore, small
 /// rotations about the flange follow.
 fn first_poses(
     reach: &Reach<'_>,
     first: &FirstView<'_>,
     center_in_board: &Vector3<f64>,
 ) -> VecDeque<(Transform, String)> {
-    /// Rotation about the target, and about the flange, degrees.
+    /// Rotation about the target, degrees: large enough for a first estimate, small enough to be
+    /// reached almost everywhere.
     const ABOUT_TARGET_DEG: f64 = 15.0;
+    /// Rotations about the flange, degrees. They move the target in the image by the same angle, so
+    /// it stays in view only if they are much smaller than half the field of view.
     const ABOUT_FLANGE_DEG: [f64; 2] = [6.0, 10.0];
     const DIRECTIONS: [(f64, usize); 6] = [
         (1.0, 0),
@@ -231,13 +248,6 @@ fn first_poses(
     let unit = |(sign, axis): (f64, usize)| {
         Vector3::from_fn(|row, _| if row == axis { sign } else { 0.0 })
     };
-    let name = |verb: &str, (sign, axis): (f64, usize), degrees: f64, body: &str| {
-        format!(
-            "{verb} by {:.0} degrees about the {body}'s {} axis",
-            sign * degrees,
-            ["x", "y", "z"][axis]
-        )
-    };
     let mut poses = VecDeque::new();
     if let Some(board) = planar_pose::board_poses(first.view, first.intrinsics).first() {
         let base_from_camera = match first.setup {
@@ -249,10 +259,12 @@ fn first_poses(
         poses.extend(DIRECTIONS.map(|direction| {
             let axis = base_from_camera.rotation * unit(direction);
             let rotation = UnitQuaternion::from_scaled_axis(axis * ABOUT_TARGET_DEG.to_radians());
+            // Maps the center to itself. For the eye to hand, the same motion of the flange rotates
+            // the target about its own center.
             let about_center = Transform::from_parts((center - rotation * center).into(), rotation);
             (
                 about_center * start,
-                name("orbit the target", direction, ABOUT_TARGET_DEG, "camera"),
+                purpose("orbit the target", direction, ABOUT_TARGET_DEG, "camera"),
             )
         }));
     }
@@ -261,7 +273,7 @@ fn first_poses(
             let rotation = Transform::new(Vector3::zeros(), unit(direction) * degrees.to_radians());
             (
                 start * rotation,
-                name("rotate the flange", direction, degrees, "flange"),
+                purpose("rotate the flange", direction, degrees, "flange"),
             )
         }));
     }

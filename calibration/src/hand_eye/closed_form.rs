@@ -5,14 +5,16 @@
 
 use kinematics::Transform;
 use nalgebra::{
-    DMatrix, DVector, Matrix3, Quaternion, Rotation3, SMatrix, SymmetricEigen, Translation3,
-    UnitQuaternion, Vector3,
+    DMatrix, DVector, Matrix3, Quaternion, Rotation3, SMatrix, SVector, SymmetricEigen,
+    Translation3, UnitQuaternion, Vector3,
 };
 
-/// Motions with a smaller rotation, in radians, have no usable rotation axis.
+/// Motions with a smaller rotation, in radians, have no usable rotation axis: the error of a robot's
+/// rotation is of this size.
 const MIN_ROTATION_RAD: f64 = 1e-3;
 
-/// Maximum number of pairs of samples in a solution.
+/// Maximum number of pairs of samples in a solution: all pairs of 63 samples. It bounds the time for
+/// recordings with hundreds of samples; every sample still is in many pairs.
 const MAX_MOTIONS: usize = 2000;
 
 /// A closed-form solver.
@@ -62,6 +64,7 @@ pub(super) struct Motion {
 ///   constant.
 pub(super) fn motions(pairs: &[(Transform, Transform)]) -> Vec<Motion> {
     let n = pairs.len();
+    // Numbers of pairs grow with the square of the number of samples.
     let stride = (n * n.saturating_sub(1) / 2).div_ceil(MAX_MOTIONS).max(1);
     let all = (0..n).flat_map(|i| (i + 1..n).map(move |j| (i, j)));
     all.step_by(stride)
@@ -86,7 +89,8 @@ fn park_martin_rotation(motions: &[Motion]) -> Option<UnitQuaternion<f64>> {
 /// The rotation `r` that maximizes the trace of `r' correlation` (Kabsch 1976). `None` if it is not
 /// unique.
 pub(crate) fn nearest_rotation(correlation: &Matrix3<f64>) -> Option<UnitQuaternion<f64>> {
-    const MIN_RATIO: f64 = 1e-9; // Of the second to the first singular value; parallel axes have 0.
+    // Of the second to the first singular value; parallel axes have 0.
+    const MIN_RATIO: f64 = 1e-9;
     if !correlation.iter().all(|value| value.is_finite()) {
         return None;
     }
@@ -94,7 +98,10 @@ pub(crate) fn nearest_rotation(correlation: &Matrix3<f64>) -> Option<UnitQuatern
     if svd.singular_values[1] <= MIN_RATIO * svd.singular_values[0] {
         return None;
     }
-    let (u, v_t) = (svd.u?, svd.v_t?);
+    let u = svd.u?;
+    let v_t = svd.v_t?;
+    // If the product of the two orthogonal matrices is a reflection, the direction with the smallest
+    // singular value is flipped, which costs the least.
     let mirror = Matrix3::from_diagonal(&Vector3::new(1.0, 1.0, (u * v_t).determinant().signum()));
     Some(UnitQuaternion::from_rotation_matrix(
         &Rotation3::from_matrix_unchecked(u * mirror * v_t),
@@ -105,7 +112,9 @@ fn tsai_lenz_rotation(motions: &[Motion]) -> Option<UnitQuaternion<f64>> {
     let mut normal = Matrix3::zeros();
     let mut right = Vector3::zeros();
     for motion in motions {
-        let (p_a, p_b) = (modified_rodrigues(&motion.a), modified_rodrigues(&motion.b));
+        let p_a = modified_rodrigues(&motion.a);
+        let p_b = modified_rodrigues(&motion.b);
+        // skew(p_a + p_b) x = p_b - p_a.
         let skew = (p_a + p_b).cross_matrix();
         normal += skew.transpose() * skew;
         right += skew.transpose() * (p_b - p_a);
@@ -132,7 +141,8 @@ fn positive(rotation: UnitQuaternion<f64>) -> Quaternion<f64> {
 }
 
 fn solve(normal: &Matrix3<f64>, right: &Vector3<f64>) -> Option<Vector3<f64>> {
-    const MIN_RATIO: f64 = 1e-12; // Squares of singular values.
+    // Of eigenvalues, which are squares of singular values.
+    const MIN_RATIO: f64 = 1e-12;
     let eigen = SymmetricEigen::new(*normal);
     (eigen.eigenvalues.min() > MIN_RATIO * eigen.eigenvalues.max()).then_some(())?;
     normal.cholesky().map(|factor| factor.solve(right))
@@ -165,6 +175,8 @@ pub(super) fn relative_scale(
     (rows > 4).then_some(())?;
     let mut matrix = DMatrix::zeros(rows, 4);
     let mut right = DVector::zeros(rows);
+    // (R_a - 1) t - s R t_b = -t_a: the equation of `with_translation`, with the scale as the fourth
+    // unknown.
     for (ix, motion) in motions.iter().enumerate() {
         let factor = motion.a.rotation.to_rotation_matrix().into_inner() - Matrix3::identity();
         matrix.fixed_view_mut::<3, 3>(3 * ix, 0).copy_from(&factor);
@@ -189,12 +201,15 @@ pub(super) fn relative_scale(
 }
 
 fn daniilidis(motions: &[Motion]) -> Option<Transform> {
+    // Six linear equations per motion for the eight elements of the dual quaternion. The scalar
+    // parts of `a` and `b` are equal, so only the vector parts give equations.
     let mut normal = SMatrix::<f64, 8, 8>::zeros();
     for motion in motions {
         if motion.a.rotation.angle() < MIN_ROTATION_RAD {
             continue;
         }
-        let ((a, a_dual), (b, b_dual)) = (dual_quaternion(&motion.a), dual_quaternion(&motion.b));
+        let (a, a_dual) = dual_quaternion(&motion.a);
+        let (b, b_dual) = dual_quaternion(&motion.b);
         let mut rows = SMatrix::<f64, 6, 8>::zeros();
         for (row, column, difference, sum) in [
             (0, 0, a.imag() - b.imag(), a.imag() + b.imag()),
@@ -221,20 +236,47 @@ fn daniilidis(motions: &[Motion]) -> Option<Transform> {
     (eigen.eigenvalues[order[2]] > MIN_RATIO * eigen.eigenvalues[order[7]]).then_some(())?;
     let null = [order[0], order[1]].map(|ix| {
         let vector = eigen.eigenvectors.column(ix).into_owned();
-        let part = |first: usize| {
-            Quaternion::new(
-                vector[first],
-                vector[first + 1],
-                vector[first + 2],
-                vector[first + 3],
-            )
-        };
-        (part(0), part(4))
+        (quaternion_at(&vector, 0), quaternion_at(&vector, 4))
     });
-    let dot = |p: &Quaternion<f64>, q: &Quaternion<f64>| p.coords.dot(&q.coords);
-    // The real part has unit length and is orthogonal to the dual part (equations 31 to 35).
+    let (s, t) = coefficients(&null)?;
     let [(u1, v1), (u2, v2)] = &null;
-    let (first, middle, last) = (dot(u1, v1), dot(u1, v2) + dot(u2, v1), dot(u2, v2));
+    let real = *u1 * s + *u2 * t;
+    let dual = *v1 * s + *v2 * t;
+    let norm = real.norm();
+    (norm > 0.0).then_some(())?;
+    let real = real / norm;
+    let dual = dual / norm;
+    let translation = (dual * real.conjugate()).imag() * 2.0;
+    Some(Transform::from_parts(
+        translation.into(),
+        UnitQuaternion::from_quaternion(real),
+    ))
+}
+
+/// The quaternion in four elements of a vector.
+fn quaternion_at(vector: &SVector<f64, 8>, first: usize) -> Quaternion<f64> {
+    Quaternion::new(
+        vector[first],
+        vector[first + 1],
+        vector[first + 2],
+        vector[first + 3],
+    )
+}
+
+/// Dot product of quaternions as vectors of four numbers.
+fn dot(p: &Quaternion<f64>, q: &Quaternion<f64>) -> f64 {
+    p.coords.dot(&q.coords)
+}
+
+/// The combination of two null vectors, each with real and dual part, that is a dual quaternion of
+/// unit length after scaling: its real part is orthogonal to its dual part (Daniilidis 1999,
+/// equations 31 to 35).
+fn coefficients(null: &[(Quaternion<f64>, Quaternion<f64>); 2]) -> Option<(f64, f64)> {
+    let [(u1, v1), (u2, v2)] = null;
+    // Orthogonality is a quadratic equation for the ratio of both coefficients.
+    let first = dot(u1, v1);
+    let middle = dot(u1, v2) + dot(u2, v1);
+    let last = dot(u2, v2);
     let candidates: Vec<(f64, f64)> = if first.abs() < f64::EPSILON {
         vec![(1.0, 0.0), (last, -middle)]
     } else {
@@ -243,21 +285,13 @@ fn daniilidis(motions: &[Motion]) -> Option<Transform> {
             .map(|root| ((-middle + root) / (2.0 * first), 1.0))
             .to_vec()
     };
+    // One of the two solutions has a real part near zero, and is no rotation.
     let squared_norm = |&(s, t): &(f64, f64)| {
         (s * s * dot(u1, u1) + 2.0 * s * t * dot(u1, u2) + t * t * dot(u2, u2)) / (s * s + t * t)
     };
-    let (s, t) = candidates
+    candidates
         .into_iter()
-        .max_by(|p, q| squared_norm(p).total_cmp(&squared_norm(q)))?;
-    let (real, dual) = (*u1 * s + *u2 * t, *v1 * s + *v2 * t);
-    let norm = real.norm();
-    (norm > 0.0).then_some(())?;
-    let (real, dual) = (real / norm, dual / norm);
-    let translation = (dual * real.conjugate()).imag() * 2.0;
-    Some(Transform::from_parts(
-        translation.into(),
-        UnitQuaternion::from_quaternion(real),
-    ))
+        .max_by(|p, q| squared_norm(p).total_cmp(&squared_norm(q)))
 }
 
 /// Real and dual part (Daniilidis 1999, section 3.2).

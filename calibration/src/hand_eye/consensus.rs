@@ -40,7 +40,8 @@ impl Consensus {
     }
 }
 
-/// Number of samples whose agreement decides.
+/// Number of samples whose agreement decides: `(n + p + 1) / 2` for solutions of `p = 3` samples,
+/// which tolerates the most wrong samples (Rousseeuw 1984).
 fn n_deciding(n: usize) -> usize {
     (n + 4).div_ceil(2).min(n)
 }
@@ -64,6 +65,8 @@ impl Metric {
                     .norm()
             })
             .collect();
+        // A rotation error moves the board in the image as much as a translation of the angle times
+        // the distance.
         Self {
             lever_m: kinematics::quantile::median(&distances)
                 .unwrap_or(1.0)
@@ -86,6 +89,7 @@ pub(super) fn find(samples: &[Sample]) -> Option<Consensus> {
     /// Without a choice, this number suffices.
     const TRIALS_WITHOUT_CHOICE: usize = 200;
     let metric = Metric::of(samples);
+    // A fixed seed, so that the same samples give the same result.
     let mut random = Random::new(1);
     let mut best: Option<(f64, Solution)> = None;
     let has_choice = samples.iter().any(|sample| sample.candidates.len() > 1);
@@ -105,6 +109,8 @@ pub(super) fn find(samples: &[Sample]) -> Option<Consensus> {
             best = Some((score, solution));
         }
     }
+    // Concentration steps: solutions of half of the samples are more accurate than those of three.
+    // Each step decreases the sum of squares until the set of samples no longer changes.
     let (mut least, mut solution) = best?;
     for _ in 0..10 {
         let Some(next) = concentrate(samples, &solution, metric) else {
@@ -130,6 +136,8 @@ fn pick(
     trial: usize,
     random: &mut Random,
 ) -> Option<[(Transform, Transform); 3]> {
+    // Flange and camera rotate by the same angle, so different angles show a wrong sample or
+    // candidate without solving. The limit is far above the errors of good samples.
     const MAX_DIFFERENCE_RAD: f64 = 0.2;
     let n = samples.len();
     (n >= 3).then_some(())?;
@@ -173,18 +181,22 @@ pub(super) fn solve(pairs: &[(Transform, Transform)], solver: ClosedForm) -> Opt
 
 /// For each sample the candidate that fits best, and its distance in meters.
 fn distances(samples: &[Sample], solution: &Solution, metric: Metric) -> (Vec<usize>, Vec<f64>) {
-    let nearest = |sample: &Sample| {
-        let predicted = solution.camera_from_board(&sample.a);
-        let distances = sample
-            .candidates
-            .iter()
-            .map(|candidate| metric.distance_m(&predicted, &candidate.camera_from_board));
-        distances
-            .enumerate()
-            .min_by(|a, b| a.1.total_cmp(&b.1))
-            .unwrap_or((0, f64::INFINITY))
-    };
-    samples.iter().map(nearest).unzip()
+    samples
+        .iter()
+        .map(|sample| nearest(sample, solution, metric))
+        .unzip()
+}
+
+/// The candidate of a sample that fits best, and its distance in meters.
+fn nearest(sample: &Sample, solution: &Solution, metric: Metric) -> (usize, f64) {
+    let predicted = solution.camera_from_board(&sample.a);
+    sample
+        .candidates
+        .iter()
+        .map(|candidate| metric.distance_m(&predicted, &candidate.camera_from_board))
+        .enumerate()
+        .min_by(|a, b| a.1.total_cmp(&b.1))
+        .unwrap_or((0, f64::INFINITY))
 }
 
 /// The candidate of each sample that fits a solution best.
@@ -192,6 +204,7 @@ pub(super) fn choose(samples: &[Sample], solution: &Solution) -> Vec<usize> {
     distances(samples, solution, Metric::of(samples)).0
 }
 
+/// Sum of the squares of the smallest distances. The others may be arbitrarily wrong.
 fn trimmed_squares(distances_m: &[f64]) -> f64 {
     let mut sorted = distances_m.to_vec();
     sorted.sort_unstable_by(f64::total_cmp);

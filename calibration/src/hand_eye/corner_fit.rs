@@ -11,7 +11,8 @@ use crate::{BoardPoint, Error};
 use kinematics::{Chain, Intrinsics, Transform};
 use nalgebra::{DVector, Isometry3, Matrix2x3, Matrix3, Point3, SMatrix, Vector3, Vector6};
 
-/// Threshold of the robust loss, in standard deviations of a corner.
+/// Threshold of the robust loss, in standard deviations of a corner. Outliers were removed before,
+/// so it only limits the influence of what remains.
 const LOSS_THRESHOLD: f64 = 3.0;
 
 /// Corners of one image and the pose of the robot.
@@ -78,9 +79,13 @@ impl CornerProblem<'_> {
         let Some(chain) = self.chain else {
             return Some((view.base_from_flange, Vec::new()));
         };
+        // The reported pose need not be that of the chain's tip: a tool frame may be set in the
+        // controller. The difference is kept.
         let corrected = corrected_joints(&view.joints, offsets);
         let tip_from_flange = chain.forward(&view.joints).ok()?.inverse() * view.base_from_flange;
         let twists = chain.tip_twists_by_joint(&corrected).ok()?;
+        // The first joint's offset is the same as a motion of the base, the last one's as a motion
+        // of the flange; both are contained in the other parameters.
         let inner = twists[1..twists.len() - 1]
             .iter()
             .map(|twist| twist.of_attached(&tip_from_flange))
@@ -101,6 +106,7 @@ impl CornerProblem<'_> {
         let n_intrinsics = self.n_intrinsics;
         let n_shared = N_PARAMS + n_intrinsics + self.n_joints();
         let corner_px = self.noise.corner_px.unwrap_or(1.0);
+        // Shared parameters first (solution, intrinsics, joint offsets), then the error of the pose.
         let mut rows = [vec![0.0; n_shared + 6], vec![0.0; n_shared + 6]];
         for point in &view.points {
             let at = chain.at(&point.point_in_board);
@@ -164,6 +170,7 @@ impl least_squares::Problem for CornerProblem<'_> {
         for view in &self.stops[block_ix] {
             self.evaluate_view(state, view, error, sums)?;
         }
+        // The prior of the pose error. All images at a stop share it, so it is added once.
         for (first, sigma) in [(0, self.noise.rotation_rad), (3, self.noise.translation_m)] {
             for ix in first..first + 3 {
                 let mut row = vec![0.0; n_shared + 6];
@@ -211,6 +218,7 @@ impl least_squares::Problem for CornerProblem<'_> {
     }
 }
 
+/// Rotation first, then translation.
 fn stacked(rotation: &Vector3<f64>, translation: &Vector3<f64>) -> Vector6<f64> {
     Vector6::new(
         rotation.x,
@@ -273,6 +281,7 @@ impl PointChain {
         let cross = self.error_rad.cross_matrix();
         let (point_in_camera, camera_from_y, by_flange, by_error) = match self.setup {
             Setup::EyeInHand => {
+                // The board is at rest in the base; the point moves against the flange.
                 let point_in_flange = map(&self.base_from_flange.inverse(), &point_in_y);
                 let point = map(&self.error_motion.inverse(), &point_in_flange);
                 let rotation = matrix(self.camera_from_x.rotation);
@@ -290,11 +299,13 @@ impl PointChain {
                 )
             }
             Setup::EyeToHand => {
+                // The board moves with the flange.
                 let rotated = self.error_motion.rotation * point_in_y;
                 let point = rotated + self.error_motion.translation.vector;
                 let camera_from_flange = self.camera_from_x * self.base_from_flange;
                 let rotation = matrix(camera_from_flange.rotation);
                 let by_flange = joined(-rotation * point.cross_matrix(), rotation);
+                // The left Jacobian, likewise.
                 let left = Matrix3::identity() + cross * 0.5;
                 let by_error = joined(-rotation * rotated.cross_matrix() * left, rotation);
                 (
@@ -305,6 +316,8 @@ impl PointChain {
                 )
             }
         };
+        // `x` and `y` move in the axes of camera and board: see `Solution::moved`. A motion of the
+        // camera moves the point in the opposite direction.
         let mut by_solution = SMatrix::<f64, 3, 12>::zeros();
         let camera_from_board = camera_from_y * self.y_rotation;
         for (column, block) in [
@@ -326,6 +339,7 @@ impl PointChain {
     }
 }
 
+/// The columns of a rotation, then those of a translation.
 fn joined(rotation: Matrix3<f64>, translation: Matrix3<f64>) -> SMatrix<f64, 3, 6> {
     let mut both = SMatrix::<f64, 3, 6>::zeros();
     both.fixed_view_mut::<3, 3>(0, 0).copy_from(&rotation);

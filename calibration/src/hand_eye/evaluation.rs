@@ -38,7 +38,8 @@ pub(super) fn scatter(boards: &[Transform]) -> Option<Scatter> {
 }
 
 /// Largest number of fits of a cross-validation. With more measurements, several are left out at a
-/// time.
+/// time, because the time would grow with the square of their number. Leaving out one of 60 changes
+/// a solution very little already.
 pub const MAX_FOLDS: usize = 60;
 
 /// For each measurement, the solution of the others: stops are left out one by one, or with many
@@ -53,6 +54,7 @@ pub(super) fn held_out_solutions(
     noise: HandEyeNoise,
     knows_noise: bool,
 ) -> Vec<Option<Solution>> {
+    // Measurements at one stop share the error of the robot pose, so they are left out together.
     let mut stops: Vec<usize> = measurements
         .iter()
         .map(|measurement| measurement.stop_ix)
@@ -64,21 +66,24 @@ pub(super) fn held_out_solutions(
         stops.partition_point(|stop| *stop < measurement.stop_ix) % n_folds
     };
     let n_left_out = stops.len().div_ceil(n_folds.max(1));
-    let without = |fold: usize| {
-        let others: Vec<Measurement> = measurements
-            .iter()
-            .filter(|other| fold_of(other) != fold)
-            .cloned()
-            .collect();
-        (stops.len() >= n_left_out + 3).then_some(())?;
-        let fit = if knows_noise {
-            pose_fit::fit_with_known_noise
-        } else {
-            pose_fit::fit
-        };
-        Some(fit(setup, &others, solution, noise).ok()?.solution)
+    // The others must be at three stops at least.
+    let is_possible = stops.len() >= n_left_out + 3;
+    let fit = if knows_noise {
+        pose_fit::fit_with_known_noise
+    } else {
+        pose_fit::fit
     };
-    let folds: Vec<Option<Solution>> = (0..n_folds).map(without).collect();
+    let folds: Vec<Option<Solution>> = (0..n_folds)
+        .map(|fold| {
+            is_possible.then_some(())?;
+            let others: Vec<Measurement> = measurements
+                .iter()
+                .filter(|other| fold_of(other) != fold)
+                .cloned()
+                .collect();
+            Some(fit(setup, &others, solution, noise).ok()?.solution)
+        })
+        .collect();
     measurements
         .iter()
         .map(|measurement| folds[fold_of(measurement)])

@@ -15,7 +15,8 @@ use nalgebra::{DMatrix, Matrix3, SymmetricEigen, Vector3};
 /// transform that is accurate to 2 to 20 mm.
 const MAX_AMPLIFICATION: f64 = 20.0;
 
-/// Recommended rotation about each axis, degrees.
+/// Recommended rotation about each axis, degrees. Errors of the robot poses are then amplified by a
+/// factor of about 3, instead of up to [`MAX_AMPLIFICATION`].
 const RECOMMENDED_DEG: f64 = 20.0;
 
 /// Checks that the rotations span at least two directions.
@@ -89,6 +90,8 @@ impl RotationExcitation {
 /// RMS rotations about three orthogonal axes of the body, radians, the largest first, and the axes
 /// as columns.
 pub(super) fn rotation_spread(poses: &[Transform]) -> Option<([f64; 3], Matrix3<f64>)> {
+    // Rotation vectors relative to the mean rotation are small, so that their covariance describes
+    // the spread.
     let sum: Matrix3<f64> = poses
         .iter()
         .map(|pose| pose.rotation.to_rotation_matrix().into_inner())
@@ -130,15 +133,8 @@ pub(super) fn check_uncertainty(
     max_sigma_rad: f64,
     camera_in_flange: bool,
 ) -> Result<(), Refusal> {
-    let worst = |first: usize| {
-        let eigen = SymmetricEigen::new(covariance.fixed_view::<3, 3>(first, first).into_owned());
-        let ix = eigen.eigenvalues.imax();
-        (
-            sigma_of(eigen.eigenvalues[ix]),
-            eigen.eigenvectors.column(ix).into_owned(),
-        )
-    };
-    let ((sigma_rad, rotation_axis), (sigma_m, direction)) = (worst(0), worst(3));
+    let (sigma_rad, rotation_axis) = worst_direction(covariance, 0);
+    let (sigma_m, direction) = worst_direction(covariance, 3);
     // Written so that NaN is refused.
     if sigma_m <= max_sigma_m && sigma_rad <= max_sigma_rad {
         return Ok(());
@@ -151,7 +147,8 @@ pub(super) fn check_uncertainty(
         );
         (direction, what)
     } else {
-        let (is, at_most) = (sigma_rad.to_degrees(), max_sigma_rad.to_degrees());
+        let is = sigma_rad.to_degrees();
+        let at_most = max_sigma_rad.to_degrees();
         (
             rotation_axis,
             format!(
@@ -159,6 +156,7 @@ pub(super) fn check_uncertainty(
             ),
         )
     };
+    // People move the flange, so its axes are named if the camera is on it.
     let (axis, body) = if camera_in_flange {
         (solution.x.rotation * in_camera, "flange")
     } else {
@@ -174,9 +172,21 @@ pub(super) fn check_uncertainty(
     })
 }
 
+/// Largest standard deviation in any direction of three parameters, starting with parameter `first`,
+/// and this direction.
+fn worst_direction(covariance: &DMatrix<f64>, first: usize) -> (f64, Vector3<f64>) {
+    let eigen = SymmetricEigen::new(covariance.fixed_view::<3, 3>(first, first).into_owned());
+    let ix = eigen.eigenvalues.imax();
+    (
+        sigma_of(eigen.eigenvalues[ix]),
+        eigen.eigenvectors.column(ix).into_owned(),
+    )
+}
+
 /// Name of an axis: "the flange's z axis", or its components if it is not close to a coordinate
 /// axis.
 pub(super) fn axis_name(axis: &Vector3<f64>, body: &str) -> String {
+    // 15 degrees: a person who moves an arm does not aim more accurately.
     const CLOSE_RAD: f64 = 0.26;
     let largest = axis.iamax();
     if axis[largest].abs() >= CLOSE_RAD.cos() {

@@ -25,16 +25,9 @@ impl Solution {
     /// The solution after a rotation and a translation of `x` in camera axes (6 values), and of `y`
     /// in board axes.
     pub(super) fn moved(&self, step: &[f64]) -> Self {
-        let part = |first: usize| {
-            let rotation = Vector3::new(step[first], step[first + 1], step[first + 2]);
-            Transform::new(
-                Vector3::new(step[first + 3], step[first + 4], step[first + 5]),
-                rotation,
-            )
-        };
         Self {
-            x: self.x * part(0),
-            y: self.y * part(6),
+            x: self.x * motion(&step[..6]),
+            y: self.y * motion(&step[6..]),
         }
     }
 
@@ -42,6 +35,14 @@ impl Solution {
     pub(super) fn camera_from_board(&self, a: &Transform) -> Transform {
         self.x.inverse() * a.inverse() * self.y
     }
+}
+
+/// The transform of a rotation vector followed by a translation.
+fn motion(step: &[f64]) -> Transform {
+    Transform::new(
+        Vector3::new(step[3], step[4], step[5]),
+        Vector3::new(step[0], step[1], step[2]),
+    )
 }
 
 /// `a` of a robot pose.
@@ -69,19 +70,22 @@ pub(super) fn residual(predicted: &Transform, measured: &Transform) -> Vector6<f
 
 /// Derivatives of [`residual`] with respect to the parameters of [`Solution::moved`].
 pub(super) fn residual_jacobian(predicted: &Transform, residual: &Vector6<f64>) -> Matrix6x12 {
+    // The rotation vector of a product changes by the inverse left Jacobian times a small rotation
+    // on the left. For small residuals, it is close to the identity.
     let left = inverse_left_jacobian(&residual.fixed_rows::<3>(0).into_owned());
     let rotation = predicted.rotation.to_rotation_matrix().into_inner();
     let mut jacobian = Matrix6x12::zeros();
-    let mut put = |row: usize, column: usize, block: Matrix3<f64>| {
+    for (row, column, block) in [
+        (0, 0, -left),
+        (0, 6, left * rotation),
+        (3, 0, predicted.translation.vector.cross_matrix()),
+        (3, 3, -Matrix3::identity()),
+        (3, 9, rotation),
+    ] {
         jacobian
             .fixed_view_mut::<3, 3>(row, column)
             .copy_from(&block);
-    };
-    put(0, 0, -left);
-    put(0, 6, left * rotation);
-    put(3, 0, predicted.translation.vector.cross_matrix());
-    put(3, 3, -Matrix3::identity());
-    put(3, 9, rotation);
+    }
     jacobian
 }
 
@@ -120,6 +124,7 @@ pub(super) fn residual_by_flange(
 fn inverse_left_jacobian(rotation_vector: &Vector3<f64>) -> Matrix3<f64> {
     const SMALL_RAD: f64 = 1e-4;
     let angle = rotation_vector.norm();
+    // The series: the quotient below loses all digits near zero.
     let second = if angle < SMALL_RAD {
         1.0 / 12.0 + angle * angle / 720.0
     } else {
@@ -154,10 +159,12 @@ pub(super) fn add_whitened(
     residual: &Vector6<f64>,
     jacobian: &Matrix6x12,
 ) {
-    let (residual, rows) = (whitening * residual, (whitening * jacobian).transpose());
+    let whitened = whitening * residual;
+    // Matrices are stored by columns, so the rows are contiguous in the transpose.
+    let rows = (whitening * jacobian).transpose();
     let row = |ix: usize| &rows.as_slice()[N_PARAMS * ix..N_PARAMS * (ix + 1)];
     sums.add(
-        residual.into(),
+        whitened.into(),
         [row(0), row(1), row(2), row(3), row(4), row(5)],
     );
 }

@@ -8,11 +8,12 @@ use std::fmt;
 
 /// Number of poses after which no more are needed, if the rotations suffice.
 pub const RECOMMENDED_POSES: usize = 12;
-/// Rotation about each axis that the poses should span, degrees.
+/// Rotation about each axis that the poses should span, degrees: 20 in both directions.
 const MIN_SPAN_DEG: f64 = 40.0;
-/// Number of poses that are asked for at a time.
+/// Number of poses that are asked for at a time: two in each direction.
 const POSES_AT_A_TIME: usize = 4;
-/// A pose counts as rotated about an axis from this angle, degrees.
+/// A pose counts as rotated about an axis from this angle, degrees. It is half of the angle that is
+/// asked for, because people rotate an arm by eye.
 const ROTATED_DEG: f64 = 10.0;
 
 /// Coverage of the robot poses so far.
@@ -70,6 +71,7 @@ impl HandEyeGuidance {
             .min_by(|a, b| a.1.total_cmp(&b.1))
         {
             _ if n_poses == 0 => HandEyeAdvice::ShowTarget,
+            // The axis with the smallest span determines the accuracy.
             Some((axis, span)) if span < MIN_SPAN_DEG => {
                 let n_rotated = rotations
                     .iter()
@@ -111,6 +113,7 @@ fn rotations(
         .collect()
 }
 
+/// Difference of the largest and the smallest value; 0 without values.
 fn span(values: impl Iterator<Item = f64>) -> f64 {
     let (low, high) = values.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), value| {
         (low.min(value), high.max(value))
@@ -118,15 +121,17 @@ fn span(values: impl Iterator<Item = f64>) -> f64 {
     if high >= low { high - low } else { 0.0 }
 }
 
+/// A number of poses in words.
+fn more_poses(n: usize) -> String {
+    if n == 1 {
+        "one more pose".to_owned()
+    } else {
+        format!("{n} more poses")
+    }
+}
+
 impl fmt::Display for HandEyeAdvice {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let poses = |n: usize| {
-            if n == 1 {
-                "one more pose".to_owned()
-            } else {
-                format!("{n} more poses")
-            }
-        };
         match self {
             Self::ShowTarget => f.write_str("move the arm until the camera sees the whole target"),
             Self::Rotate {
@@ -138,10 +143,10 @@ impl fmt::Display for HandEyeAdvice {
                 write!(
                     f,
                     "{}, rotated by 20 degrees or more in both directions about the {body}'s {name} axis",
-                    poses(*n_poses)
+                    more_poses(*n_poses)
                 )
             }
-            Self::More(n) => write!(f, "{} in other directions", poses(*n)),
+            Self::More(n) => write!(f, "{} in other directions", more_poses(*n)),
             Self::Enough => f.write_str("the poses suffice"),
         }
     }

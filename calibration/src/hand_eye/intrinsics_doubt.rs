@@ -43,6 +43,8 @@ impl IntrinsicsDoubt {
         let decrease = 2.0 * (fixed.cost - free.cost) / free.variance.max(1.0);
         let limit = n_params + 6.0 * (2.0 * n_params).sqrt();
         (decrease > limit).then_some(())?;
+        // The given intrinsics have an uncertainty of their own. A change within it contradicts
+        // nothing, and the uncertainty is propagated to the result anyway.
         if covariance.is_some_and(|given| {
             squared_change(intrinsics, free, given).is_some_and(|square| square < limit)
         }) {
@@ -113,8 +115,9 @@ fn change_of_intrinsics(given: &Intrinsics, free: &Intrinsics) -> String {
         "the principal point moves by ({x:.1}, {y:.1}) px from ({:.1}, {:.1})",
         given.principal_px[0], given.principal_px[1]
     );
-    match largest(given.principal_px, free.principal_px) > largest(given.focal_px, free.focal_px) {
-        true => format!("{principal}, {focal}"),
-        false => format!("{focal}, {principal}"),
+    if largest(given.principal_px, free.principal_px) > largest(given.focal_px, free.focal_px) {
+        format!("{principal}, {focal}")
+    } else {
+        format!("{focal}, {principal}")
     }
 }

@@ -11,10 +11,11 @@ use super::{BoardObservation, HandEyeInput, HandEyeSample, Setup};
 use kinematics::Transform;
 
 /// Positions of a robot or distances of a board in meters do not exceed this; in millimeters they
-/// do.
+/// do, from 2 cm on.
 const MAX_POSITION_M: f64 = 20.0;
 
-/// A variant of the input explains it if it fits better by this factor.
+/// A variant of the input explains it if it fits better by this factor. A smaller factor would blame
+/// good input whose variant fits slightly better by chance.
 const MUCH_BETTER: f64 = 5.0;
 
 /// Checks that the positions can be meters.
@@ -37,6 +38,7 @@ pub(super) fn check_magnitudes(samples: &[HandEyeSample]) -> Result<(), Refusal>
                 .reduce(f64::max),
         })
         .collect();
+    // The median, because single positions may be wrong for other reasons.
     for (name, values) in [("base_from_flange", robot), ("the board", board)] {
         let median = kinematics::quantile::median(&values).unwrap_or(0.0);
         if median > MAX_POSITION_M {
@@ -51,6 +53,9 @@ pub(super) fn check_magnitudes(samples: &[HandEyeSample]) -> Result<(), Refusal>
     Ok(())
 }
 
+/// A calibrated camera predicts the board within this fraction of its distance.
+const GOOD_FRAC: f64 = 0.02;
+
 /// The mistake that explains why the samples disagree. `None` if they agree or no known mistake
 /// explains it.
 pub(super) fn explain(
@@ -58,8 +63,6 @@ pub(super) fn explain(
     samples: &[Sample],
     consensus: Option<&Consensus>,
 ) -> Option<Refusal> {
-    /// A calibrated camera predicts the board within this fraction of its distance.
-    const GOOD_FRAC: f64 = 0.02;
     let distances: Vec<f64> = samples
         .iter()
         .map(|sample| {
@@ -87,9 +90,12 @@ pub(super) fn explain(
             .iter()
             .all(|candidate| candidate.corners.is_none())
     });
+    // A shift is tested first: with shifted lists, all other tests would compare wrong pairs.
     if let Some(refusal) = shift_mistake(input, samples, found_m, distance_m) {
         return Some(refusal);
     }
+    // Wrong units are tested even if the samples agree roughly: a scale near 1, such as that of a
+    // board of another size, leaves small errors only.
     if let Some(scale) = scale_mistake(samples, consensus) {
         return Some(Refusal::new(
             format!("{residual}, and {}", scale.0),
@@ -97,23 +103,41 @@ pub(super) fn explain(
         ));
     }
     if found_m <= GOOD_FRAC * distance_m {
-        // If both poses of each sample are inverted, the samples agree on the inverse of another
-        // transform.
-        let is_behind =
-            |sample: &&Sample| sample.candidates[0].camera_from_board.translation.z <= 0.0;
-        let n_behind = samples.iter().filter(is_behind).count();
-        let is_inverted =
-            input.options.board_is_seen && has_poses && 5 * n_behind > 4 * samples.len();
-        return is_inverted.then(|| {
-            Refusal::new(
-                format!(
-                    "the board is behind the camera in {n_behind} of {} samples: either the camera has the axes of OpenGL (y up, z backward), expected x right, y down, z forward; or the given matrices are board_from_camera",
-                    samples.len()
-                ),
-                "negate the second and third row of camera_from_board in the first case; in the second, invert the board poses, and check that the robot poses are base_from_flange",
-            )
-        });
+        let is_tested = input.options.board_is_seen && has_poses;
+        return is_tested.then(|| behind_mistake(samples)).flatten();
     }
+    inversion_mistake(input, samples, has_poses, [found_m, distance_m], &residual)
+}
+
+/// Explanation of samples that agree on a board behind the camera: other camera axes, or both poses
+/// of each sample inverted, so that they agree on the inverse of another transform.
+fn behind_mistake(samples: &[Sample]) -> Option<Refusal> {
+    let is_behind = |sample: &&Sample| sample.candidates[0].camera_from_board.translation.z <= 0.0;
+    let n_behind = samples.iter().filter(is_behind).count();
+    // Most, not all: a few samples may be wrong in another way.
+    (5 * n_behind > 4 * samples.len()).then(|| {
+        Refusal::new(
+            format!(
+                "the board is behind the camera in {n_behind} of {} samples: either the camera has the axes of OpenGL (y up, z backward), expected x right, y down, z forward; or the given matrices are board_from_camera",
+                samples.len()
+            ),
+            "negate the second and third row of camera_from_board in the first case; in the second, invert the board poses, and check that the robot poses are base_from_flange",
+        )
+    })
+}
+
+/// Explanation by robot or board poses that are inverted, if the samples agree after inverting the
+/// robot poses.
+///
+/// * `[found_m, distance_m]`: how well the samples agree as given, and the distance of the board.
+/// * `residual`: the disagreement, as text.
+fn inversion_mistake(
+    input: &HandEyeInput<'_>,
+    samples: &[Sample],
+    has_poses: bool,
+    [found_m, distance_m]: [f64; 2],
+    residual: &str,
+) -> Option<Refusal> {
     // Inverting either transform swaps the unknowns, so the data do not determine which one was
     // inverted.
     let variant: Vec<Sample> = samples
@@ -138,27 +162,25 @@ pub(super) fn explain(
     );
     let robot_remedy = format!("invert the robot poses, or choose the setup {other}");
     let board = "camera_from_board is inverted: the given matrices are board_from_camera";
-    // The camera sees only boards in front of it.
-    let n_in_front = |invert: bool| {
-        let z = |sample: &&Sample| {
-            let pose = sample.candidates[0].camera_from_board;
-            (if invert { pose.inverse() } else { pose }).translation.z
-        };
-        samples.iter().filter(|sample| z(sample) > 0.0).count()
+    // The camera sees only boards in front of it. Poses from corners are not inverted: this program
+    // computed them.
+    let is_in_front = |sample: &Sample| sample.candidates[0].camera_from_board.translation.z > 0.0;
+    let inverse_is_in_front = |sample: &Sample| {
+        let pose = sample.candidates[0].camera_from_board;
+        pose.inverse().translation.z > 0.0
     };
-    Some(
-        match (
-            n_in_front(false) == samples.len() || !has_poses,
-            has_poses && n_in_front(true) == samples.len(),
-        ) {
-            (true, false) => Refusal::new(format!("{fits} {robot}"), robot_remedy),
-            (false, _) => Refusal::new(format!("{fits} {board}"), "invert the board poses"),
-            (true, true) => Refusal::new(
-                format!("{fits} {robot}; or if {board}"),
-                format!("{robot_remedy}, or invert the board poses"),
-            ),
-        },
-    )
+    let may_be_robot = !has_poses || samples.iter().all(is_in_front);
+    let may_be_board = has_poses && samples.iter().all(inverse_is_in_front);
+    Some(if !may_be_robot {
+        Refusal::new(format!("{fits} {board}"), "invert the board poses")
+    } else if may_be_board {
+        Refusal::new(
+            format!("{fits} {robot}; or if {board}"),
+            format!("{robot_remedy}, or invert the board poses"),
+        )
+    } else {
+        Refusal::new(format!("{fits} {robot}"), robot_remedy)
+    })
 }
 
 /// Positions of the robot or the board that are in another unit than the others.
@@ -198,31 +220,13 @@ fn shift_mistake(
     found_m: f64,
     distance_m: f64,
 ) -> Option<Refusal> {
-    /// A shift by chance does not fit this many samples better.
-    const MIN_SAMPLES: usize = 6;
     /// Better fits cannot be improved by a shift.
     const MIN_FRAC: f64 = 0.002;
-    if samples.len() < MIN_SAMPLES || found_m < MIN_FRAC * distance_m {
+    if samples.len() < MIN_SHIFTED_SAMPLES || found_m < MIN_FRAC * distance_m {
         return None;
     }
-    let shifted_m = |shift: isize| {
-        let moved = |sample: &Sample| {
-            let other = input
-                .samples
-                .get(sample.sample_ix.checked_add_signed(shift)?)?;
-            Some(Sample {
-                a: geometry::a_of(input.setup, &other.base_from_flange),
-                ..sample.clone()
-            })
-        };
-        let moved: Vec<Sample> = samples.iter().filter_map(moved).collect();
-        let is_enough = moved.len() + 1 >= MIN_SAMPLES;
-        is_enough
-            .then(|| consensus::find(&moved))
-            .flatten()
-            .map_or(f64::INFINITY, |found| found.median_m())
-    };
-    let (shift, best_m) = [(1, shifted_m(1)), (-1, shifted_m(-1))]
+    let (shift, best_m) = [1, -1]
+        .map(|shift| (shift, shifted_median_m(input, samples, shift)))
         .into_iter()
         .min_by(|a, b| a.1.total_cmp(&b.1))?;
     if best_m * MUCH_BETTER > found_m.min(distance_m) {
@@ -256,10 +260,37 @@ fn shift_mistake(
     ))
 }
 
+/// A shift by chance does not fit this many samples better.
+const MIN_SHIFTED_SAMPLES: usize = 6;
+
+/// Median distance of the samples, meters, if each board is paired with the robot pose of the sample
+/// `shift` places later. Infinite if they have no solution.
+fn shifted_median_m(input: &HandEyeInput<'_>, samples: &[Sample], shift: isize) -> f64 {
+    let shifted: Vec<Sample> = samples
+        .iter()
+        .filter_map(|sample| {
+            let other_ix = sample.sample_ix.checked_add_signed(shift)?;
+            let other = input.samples.get(other_ix)?;
+            Some(Sample {
+                a: geometry::a_of(input.setup, &other.base_from_flange),
+                ..sample.clone()
+            })
+        })
+        .collect();
+    // The sample at one end has no partner.
+    if shifted.len() + 1 < MIN_SHIFTED_SAMPLES {
+        return f64::INFINITY;
+    }
+    consensus::find(&shifted).map_or(f64::INFINITY, |found| found.median_m())
+}
+
 /// Explanation by different units of the robot's and the board's translations, and the remedy.
 fn scale_mistake(samples: &[Sample], consensus: Option<&Consensus>) -> Option<(String, String)> {
+    /// A scale closer to 1 or to 0 may be noise.
     const MIN_SIGMAS: f64 = 5.0;
+    /// Smaller changes are errors of the robot or of the print.
     const MIN_CHANGE: f64 = 0.02;
+    /// Factor by which the scale must improve the agreement.
     const BETTER: f64 = 3.0;
     let choice = consensus.map_or_else(|| vec![0; samples.len()], |found| found.choice.clone());
     let pairs: Vec<(Transform, Transform)> = samples
@@ -286,24 +317,20 @@ fn scale_mistake(samples: &[Sample], consensus: Option<&Consensus>) -> Option<(S
     if explained_m * BETTER > consensus.map_or(f64::INFINITY, Consensus::median_m) {
         return None;
     }
+    Some(explain_scale(scale, sigma))
+}
+
+/// What a scale of the robot's translations relative to the board's means, and the remedy.
+fn explain_scale(scale: f64, sigma: f64) -> (String, String) {
     /// Units and how many make a meter.
     const UNITS: [(&str, f64); 3] = [
         ("millimeters", 1000.0),
         ("centimeters", 100.0),
         ("inches", 39.37),
     ];
-    let near = |expected: f64| (scale / expected - 1.0).abs() < 0.1;
-    let unit_of = |value: f64| {
-        UNITS
-            .into_iter()
-            .find(|(_, per_m)| (value / per_m - 1.0).abs() < 0.1)
-    };
-    let why = |body: &str, other: &str, unit: &str, per_m: f64| {
-        format!(
-            "the positions of {body} are {per_m} times too large relative to those of {other}: they are probably in {unit}"
-        )
-    };
-    Some(if near(-1.0) {
+    let is_near = |value: f64, expected: f64| (value / expected - 1.0).abs() < 0.1;
+    let unit_of = |value: f64| UNITS.into_iter().find(|(_, per_m)| is_near(value, *per_m));
+    if is_near(scale, -1.0) {
         (
             "the board moves mirrored relative to the robot: the images are flipped, or the target was printed mirrored"
                 .to_owned(),
@@ -311,12 +338,12 @@ fn scale_mistake(samples: &[Sample], consensus: Option<&Consensus>) -> Option<(S
         )
     } else if let Some((unit, per_m)) = unit_of(scale) {
         (
-            why("the robot", "the board", unit, per_m),
+            wrong_unit("the robot", "the board", unit, per_m),
             format!("divide the positions of base_from_flange by {per_m}"),
         )
     } else if let Some((unit, per_m)) = unit_of(1.0 / scale) {
         (
-            why("the board", "the robot", unit, per_m),
+            wrong_unit("the board", "the robot", unit, per_m),
             format!(
                 "divide the positions of camera_from_board, or the size of the board, by {per_m}"
             ),
@@ -328,7 +355,14 @@ fn scale_mistake(samples: &[Sample], consensus: Option<&Consensus>) -> Option<(S
             ),
             format!("check the size of the squares: it seems to be {scale:.3} times the given one"),
         )
-    })
+    }
+}
+
+/// A sentence on positions that are in another unit than those of another body.
+fn wrong_unit(body: &str, other: &str, unit: &str, per_m: f64) -> String {
+    format!(
+        "the positions of {body} are {per_m} times too large relative to those of {other}: they are probably in {unit}"
+    )
 }
 
 /// Names of the samples whose board is seen from the other side than in most samples: its corners
@@ -337,6 +371,7 @@ pub(super) fn mirrored<'a>(
     samples: &'a [HandEyeSample],
     poses: &[(usize, Transform)],
 ) -> Vec<&'a str> {
+    // The board's z axis points away from a viewer of the printed side.
     let is_front = |pose: &Transform| {
         (pose.rotation * nalgebra::Vector3::z()).dot(&pose.translation.vector) > 0.0
     };

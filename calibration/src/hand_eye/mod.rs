@@ -47,7 +47,7 @@ pub use refusal::Refusal;
 pub use report::{HandEyeCalibration, JointOffset, SampleReport, SampleStatus};
 pub use shutter::{FlangeMotion, corners_at_mid_exposure};
 
-use crate::{BoardView, Error};
+use crate::{BoardPoint, BoardView, Error};
 use kinematics::{Chain, Intrinsics, Transform, transform};
 use nalgebra::{DMatrix, SymmetricEigen};
 use samples::Sorted;
@@ -175,9 +175,11 @@ pub const MIN_SAMPLES: usize = 3;
 pub fn calibrate_hand_eye(input: &HandEyeInput<'_>) -> Result<HandEyeCalibration, Error> {
     check(input)?;
     let refused = |refusal| Error::Refused(Box::new(refusal));
+    // Units first: all other checks compare meters.
     if let Err(refusal) = mistakes::check_magnitudes(&input.samples) {
         return Err(refused(mistakes::unit_mistake(input).unwrap_or(refusal)));
     }
+    // Rotations about one axis do not determine the result, however good the images are.
     let robot_poses: Vec<Transform> = input
         .samples
         .iter()
@@ -207,6 +209,8 @@ pub fn calibrate_hand_eye(input: &HandEyeInput<'_>) -> Result<HandEyeCalibration
             },
         )));
     }
+    // Known mistakes are named before anything is estimated: outlier rejection would only report
+    // that the samples disagree.
     let consensus = consensus::find(&samples);
     if let Some(refusal) = mistakes::explain(input, &samples, consensus.as_ref()) {
         return Err(refused(refusal));
@@ -218,6 +222,7 @@ pub fn calibrate_hand_eye(input: &HandEyeInput<'_>) -> Result<HandEyeCalibration
         )));
     };
     let refined = refine::refine(input, samples, consensus)?;
+    // Without the outliers, the remaining rotations may no longer suffice.
     let used: Vec<Transform> = refined
         .used()
         .map(|sample| input.samples[sample.sample_ix].base_from_flange)
@@ -232,6 +237,8 @@ pub fn calibrate_hand_eye(input: &HandEyeInput<'_>) -> Result<HandEyeCalibration
         input.setup == Setup::EyeInHand,
     )
     .map_err(|refusal| {
+        // An uncertain result has a cause. Contradicting intrinsics are the most specific one, then
+        // contradicting poses, then too little motion, which the refusal names.
         let doubt = refined.intrinsics_doubt.as_deref();
         if let Some(refusal) =
             mistakes::contradiction(&refined, calibration.scatter.mm).filter(|_| doubt.is_none())
@@ -268,9 +275,13 @@ fn too_few(n: usize, kind: &str, what: &str) -> Refusal {
     )
 }
 
+/// An error for invalid input.
+fn invalid(why: String) -> Result<(), Error> {
+    Err(Error::HandEyeInput { why })
+}
+
 /// Rejects invalid values.
 fn check(input: &HandEyeInput<'_>) -> Result<(), Error> {
-    let invalid = |why: String| Err(Error::HandEyeInput { why });
     if input.samples.len() < MIN_SAMPLES {
         let n = input.samples.len();
         return Err(Error::Refused(Box::new(too_few(
@@ -292,40 +303,7 @@ fn check(input: &HandEyeInput<'_>) -> Result<(), Error> {
         ));
     }
     for sample in &input.samples {
-        let is_rigid = |pose: &Transform| {
-            transform::is_finite(pose)
-                && (pose.rotation.norm() - 1.0).abs() < transform::RIGID_TOLERANCE
-        };
-        if !is_rigid(&sample.base_from_flange) {
-            return invalid(format!(
-                "sample {:?}: base_from_flange is not a finite rigid transform",
-                sample.name
-            ));
-        }
-        match &sample.board {
-            BoardObservation::Pose(pose) if !is_rigid(pose) => {
-                return invalid(format!(
-                    "sample {:?}: camera_from_board is not a finite rigid transform",
-                    sample.name
-                ));
-            }
-            BoardObservation::View(view) => {
-                let is_finite = |point: &crate::BoardPoint| {
-                    point
-                        .point_in_board
-                        .iter()
-                        .chain(&point.pixel)
-                        .all(|value| value.is_finite())
-                };
-                if let Some(ix) = view.points.iter().position(|point| !is_finite(point)) {
-                    return invalid(format!(
-                        "sample {:?}: corner {ix} is not finite",
-                        sample.name
-                    ));
-                }
-            }
-            BoardObservation::Pose(_) => (),
-        }
+        check_sample(sample)?;
     }
     let options = &input.options;
     let needs_corners = options.estimate_intrinsics || options.estimate_joint_offsets;
@@ -352,26 +330,74 @@ fn check(input: &HandEyeInput<'_>) -> Result<(), Error> {
         let Some(chain) = input.chain else {
             return invalid("joint offsets need the chain of the arm (a URDF)".to_owned());
         };
-        const MIN_JOINTS: usize = 3;
-        if chain.n_joints() < MIN_JOINTS {
-            return invalid(format!(
-                "joint offsets need at least {MIN_JOINTS} joints; the chain has {}",
-                chain.n_joints()
-            ));
-        }
-        for sample in &input.samples {
-            let joints = sample.joints.as_deref().unwrap_or_default();
-            if let Err(error) = chain.forward(joints) {
-                return invalid(format!("sample {:?}: {error}", sample.name));
-            }
-        }
-        check_joints(&input.samples, chain)?;
+        check_chain(&input.samples, chain)?;
     }
     Ok(())
 }
 
+/// Rejects values of a sample that are not finite, and matrices that are no rigid transforms.
+fn check_sample(sample: &HandEyeSample) -> Result<(), Error> {
+    let is_rigid = |pose: &Transform| {
+        transform::is_finite(pose)
+            && (pose.rotation.norm() - 1.0).abs() < transform::RIGID_TOLERANCE
+    };
+    if !is_rigid(&sample.base_from_flange) {
+        return invalid(format!(
+            "sample {:?}: base_from_flange is not a finite rigid transform",
+            sample.name
+        ));
+    }
+    match &sample.board {
+        BoardObservation::Pose(pose) if !is_rigid(pose) => {
+            return invalid(format!(
+                "sample {:?}: camera_from_board is not a finite rigid transform",
+                sample.name
+            ));
+        }
+        BoardObservation::View(view) => {
+            if let Some(ix) = view.points.iter().position(|point| !is_finite(point)) {
+                return invalid(format!(
+                    "sample {:?}: corner {ix} is not finite",
+                    sample.name
+                ));
+            }
+        }
+        BoardObservation::Pose(_) => (),
+    }
+    Ok(())
+}
+
+/// Whether all coordinates of a corner are finite.
+fn is_finite(point: &BoardPoint) -> bool {
+    point
+        .point_in_board
+        .iter()
+        .chain(&point.pixel)
+        .all(|value| value.is_finite())
+}
+
+/// Rejects a chain with too few joints for offsets, and joint values that do not belong to it.
+fn check_chain(samples: &[HandEyeSample], chain: &Chain) -> Result<(), Error> {
+    // The offsets of the first and the last joint are not observable, so one must be left.
+    const MIN_JOINTS: usize = 3;
+    if chain.n_joints() < MIN_JOINTS {
+        return invalid(format!(
+            "joint offsets need at least {MIN_JOINTS} joints; the chain has {}",
+            chain.n_joints()
+        ));
+    }
+    for sample in samples {
+        let joints = sample.joints.as_deref().unwrap_or_default();
+        if let Err(error) = chain.forward(joints) {
+            return invalid(format!("sample {:?}: {error}", sample.name));
+        }
+    }
+    check_joints(samples, chain)
+}
+
 /// Rejects a matrix that is not a covariance of `n` parameters.
 fn check_covariance(covariance: &DMatrix<f64>, n: usize) -> Result<(), String> {
+    // Relative to the variances. Files with fewer than 6 digits are rejected.
     const ROUNDING: f64 = 1e-6;
     let [rows, columns] = [covariance.nrows(), covariance.ncols()];
     if [rows, columns] != [n, n] {
@@ -382,6 +408,8 @@ fn check_covariance(covariance: &DMatrix<f64>, n: usize) -> Result<(), String> {
     if covariance.iter().any(|value| !value.is_finite()) {
         return Err("the covariance of the intrinsics is not finite".to_owned());
     }
+    // Focal lengths in pixels and distortion coefficients have variances of different magnitude.
+    // In the correlation matrix, one tolerance fits all.
     let scales = covariance
         .diagonal()
         .map(|variance| variance.abs().max(f64::MIN_POSITIVE).sqrt());
@@ -390,43 +418,45 @@ fn check_covariance(covariance: &DMatrix<f64>, n: usize) -> Result<(), String> {
     });
     let is_symmetric = (&correlation - correlation.transpose()).amax() < ROUNDING;
     let is_positive = SymmetricEigen::new(correlation).eigenvalues.min() > -ROUNDING;
-    match is_symmetric && is_positive && covariance.diagonal().min() >= 0.0 {
-        true => Ok(()),
-        false => Err(
+    if is_symmetric && is_positive && covariance.diagonal().min() >= 0.0 {
+        Ok(())
+    } else {
+        Err(
             "the covariance of the intrinsics is not symmetric and positive; copy all its digits"
                 .to_owned(),
-        ),
+        )
     }
+}
+
+/// Median angle by which the reported flange rotates against the tip of the chain, relative to the
+/// first sample, radians. It is zero if the joint values, times `factor`, explain the motion.
+fn median_tip_rotation_rad(samples: &[HandEyeSample], chain: &Chain, factor: f64) -> f64 {
+    let tip_from_flange = |sample: &HandEyeSample| {
+        let joints = sample.joints.iter().flatten();
+        let joints: Vec<f64> = joints.map(|value| factor * value).collect();
+        Some((chain.forward(&joints).ok()?.inverse() * sample.base_from_flange).rotation)
+    };
+    let rotations: Vec<_> = samples.iter().filter_map(tip_from_flange).collect();
+    let angles: Vec<f64> = rotations
+        .iter()
+        .map(|rotation| rotation.angle_to(&rotations[0]))
+        .collect();
+    kinematics::quantile::median(&angles).unwrap_or(0.0)
 }
 
 /// Rejects joint values that do not explain the motion of the flange.
 fn check_joints(samples: &[HandEyeSample], chain: &Chain) -> Result<(), Error> {
     /// Offsets of the joints move the flange less than this.
     const MAX_ROTATION_RAD: f64 = 0.1;
-    let median_angle = |factor: f64| {
-        let tip_from_flange = |sample: &HandEyeSample| {
-            let joints: Vec<f64> = sample
-                .joints
-                .iter()
-                .flatten()
-                .map(|value| factor * value)
-                .collect();
-            Some((chain.forward(&joints).ok()?.inverse() * sample.base_from_flange).rotation)
-        };
-        let rotations: Vec<_> = samples.iter().filter_map(tip_from_flange).collect();
-        let angles: Vec<f64> = rotations
-            .iter()
-            .map(|rotation| rotation.angle_to(&rotations[0]))
-            .collect();
-        kinematics::quantile::median(&angles).unwrap_or(0.0)
-    };
-    let found = median_angle(1.0);
+    let found = median_tip_rotation_rad(samples, chain, 1.0);
     if found < MAX_ROTATION_RAD {
         return Ok(());
     }
-    let hint = match median_angle(std::f64::consts::PI / 180.0) < MAX_ROTATION_RAD {
-        true => "they are in degrees, and must be in radians",
-        false => "check the order of the joints and the link of the flange",
+    let if_degrees = median_tip_rotation_rad(samples, chain, std::f64::consts::PI / 180.0);
+    let hint = if if_degrees < MAX_ROTATION_RAD {
+        "they are in degrees, and must be in radians"
+    } else {
+        "check the order of the joints and the link of the flange"
     };
     let degrees = found.to_degrees();
     Err(Error::HandEyeInput {

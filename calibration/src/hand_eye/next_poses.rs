@@ -63,12 +63,13 @@ pub fn suggest_next_poses(
         calibration,
         options,
     };
-    let mut information = match calibration.refined.covariance.clone().try_inverse() {
-        Some(information) => information,
-        None => return Vec::new(),
+    let Some(mut information) = calibration.refined.covariance.clone().try_inverse() else {
+        return Vec::new();
     };
     let candidates = scene.candidates();
     let mut suggested: Vec<NextPose> = Vec::new();
+    // Greedily: the best pose, then the best one given the first, and so on. Comparing all sets of
+    // poses would take far longer.
     for _ in 0..options.n_poses {
         let Some(before) = log_volume(&information) else {
             break;
@@ -78,9 +79,8 @@ pub fn suggest_next_poses(
             log_volume(&with).map_or(0.0, |after| before - after)
         };
         let is_new = |candidate: &&Candidate| {
-            suggested
-                .iter()
-                .all(|earlier| earlier.base_from_flange != candidate.base_from_flange)
+            let mut earlier = suggested.iter();
+            earlier.all(|earlier| earlier.base_from_flange != candidate.base_from_flange)
         };
         let best = candidates
             .iter()
@@ -97,6 +97,7 @@ pub fn suggest_next_poses(
             joints: best.joints.clone(),
             motion,
             relation,
+            // The volume is that of variances: half of its logarithm, shared by six parameters.
             sigma_frac: (-gain / 12.0).exp(),
         });
     }
@@ -105,11 +106,23 @@ pub fn suggest_next_poses(
 
 /// Logarithm of the determinant of the covariance of the hand-eye transform.
 fn log_volume(information: &DMatrix<f64>) -> Option<f64> {
+    // Only the hand-eye transform counts. The pose of the board is estimated, but is no goal.
     let covariance = information.clone().cholesky()?.inverse();
     let hand_eye: Matrix6<f64> = covariance.fixed_view::<6, 6>(0, 0).into_owned();
     Some(2.0 * hand_eye.cholesky()?.l().diagonal().map(f64::ln).sum())
 }
 
+/// Whether a point in the camera frame is imaged inside a margin, which is a fraction of the size.
+fn is_in_image(intrinsics: &Intrinsics, point: &Vector3<f64>, margin_frac: f64) -> bool {
+    intrinsics.project(point).is_some_and(|pixel| {
+        (0..2).all(|axis| {
+            let size = f64::from(intrinsics.size_px[axis]);
+            pixel[axis] > margin_frac * size && pixel[axis] < (1.0 - margin_frac) * size
+        })
+    })
+}
+
+/// A pose that may be suggested.
 struct Candidate {
     base_from_flange: Transform,
     joints: Option<Vec<f64>>,
@@ -126,6 +139,8 @@ struct Scene<'a> {
 
 impl Scene<'_> {
     fn candidates(&self) -> Vec<Candidate> {
+        // More trials find slightly better poses, and take longer, most of all with inverse
+        // kinematics.
         const TRIALS: usize = 1500;
         let refined = &self.calibration.refined;
         let used: Vec<usize> = refined.used().map(|sample| sample.sample_ix).collect();
@@ -134,10 +149,12 @@ impl Scene<'_> {
             .iter()
             .map(|m| m.camera_from_board.translation.vector.norm())
             .collect();
-        let (Some(distance_m), false) = (kinematics::quantile::median(&distances), used.is_empty())
-        else {
+        let Some(distance_m) = kinematics::quantile::median(&distances) else {
             return Vec::new();
         };
+        if used.is_empty() {
+            return Vec::new();
+        }
         let unit_covariance = self.mean_unit_covariance();
         let mut random = Random::new(self.options.seed);
         (0..TRIALS)
@@ -160,6 +177,8 @@ impl Scene<'_> {
                     camera_from_board,
                     unit_covariance,
                 };
+                // The information of the new sample, as if its board pose were as accurate as those
+                // so far.
                 let (jacobian, weight) = report::residual_information(
                     self.input.setup,
                     &measurement,
@@ -196,6 +215,7 @@ impl Scene<'_> {
         sample_ix: usize,
         random: &mut Random,
     ) -> Option<(Transform, Option<Vec<f64>>)> {
+        // Large changes have more information, but the board leaves the image more often.
         const MAX_JOINT_CHANGE: f64 = 0.8;
         const MAX_ROTATION_RAD: f64 = 0.9;
         let sample = &self.input.samples[sample_ix];
@@ -210,12 +230,14 @@ impl Scene<'_> {
                 .iter()
                 .zip(chain.limits())
                 .all(|(joint, limit)| (limit.lower..=limit.upper).contains(joint));
+            // Relative to the reported pose, because a tool frame may follow the chain's tip.
             let before = chain.forward(joints).ok()?;
             let pose = chain.forward(&moved).ok()? * before.inverse() * sample.base_from_flange;
             return is_allowed.then_some((pose, Some(moved)));
         }
         // Rotates the camera about the center of the board, or the board about its own center.
         let solution = &self.calibration.refined.solution;
+        // A normal vector has a uniform direction.
         let axis = Vector3::new(random.normal(), random.normal(), random.normal()).normalize();
         let turn = UnitQuaternion::from_scaled_axis(axis * random.uniform(0.2, MAX_ROTATION_RAD));
         let base_from_board = match self.input.setup {
@@ -241,11 +263,15 @@ impl Scene<'_> {
         ))
     }
 
+    /// Whether all of the board is in view, at a distance and tilt at which it is detected.
     fn is_well_visible(&self, camera_from_board: &Transform, distance_m: f64) -> bool {
-        const DISTANCES: std::ops::RangeInclusive<f64> = 0.6..=1.6; // Relative to the samples so far.
+        // Relative to the samples so far, in which the board was detected.
+        const DISTANCES: std::ops::RangeInclusive<f64> = 0.6..=1.6;
         const MARGIN_FRAC: f64 = 0.02;
-        const ARM_MARGIN_FRAC: f64 = 0.05; // The arm moves before anyone can check whether the board is in view.
-        const HALF_VIEW_RAD: f64 = 0.35; // Without intrinsics: the field of view of a narrow camera.
+        // The arm moves before anyone can check whether the board is in view.
+        const ARM_MARGIN_FRAC: f64 = 0.05;
+        // Without intrinsics: the field of view of a narrow camera.
+        const HALF_VIEW_RAD: f64 = 0.35;
         let center = (camera_from_board * Point3::from(self.options.center_in_board)).coords;
         let normal = camera_from_board.rotation * Vector3::z();
         let tilt_cosine = normal.dot(&center.normalize()).abs();
@@ -258,6 +284,7 @@ impl Scene<'_> {
         if tilt_cosine < self.options.max_tilt_rad.cos() {
             return false;
         }
+        // Eight points of a circle around the board.
         let rim = (0..8).map(|step| {
             let (sine, cosine) = (f64::from(step) * std::f64::consts::FRAC_PI_4).sin_cos();
             let point = self.options.center_in_board
@@ -269,23 +296,18 @@ impl Scene<'_> {
         } else {
             MARGIN_FRAC
         };
-        let is_inside = |intrinsics: &Intrinsics, point: &Vector3<f64>| {
-            intrinsics.project(point).is_some_and(|pixel| {
-                (0..2).all(|axis| {
-                    let size = f64::from(intrinsics.size_px[axis]);
-                    pixel[axis] > margin_frac * size && pixel[axis] < (1.0 - margin_frac) * size
-                })
-            })
-        };
         match &self.calibration.refined.intrinsics {
-            Some(intrinsics) => rim.into_iter().all(|point| is_inside(intrinsics, &point)),
+            Some(intrinsics) => rim
+                .into_iter()
+                .all(|point| is_in_image(intrinsics, &point, margin_frac)),
             None => rim
                 .into_iter()
                 .all(|point| point.z > 0.0 && point.xy().norm() < HALF_VIEW_RAD.tan() * point.z),
         }
     }
 
-    /// The motion from the closest sample, as an instruction, and its rotation, as a description.
+    /// The motion from the sample that the candidate was derived from, as an instruction, and its
+    /// rotation, as a description.
     fn motion(&self, candidate: &Candidate) -> [String; 2] {
         let sample = &self.input.samples[candidate.sample_ix];
         let old_from_new = sample.base_from_flange.inverse() * candidate.base_from_flange;
@@ -302,6 +324,7 @@ impl Scene<'_> {
         } else {
             Vector3::z()
         };
+        // Axes are named by their positive direction, so the angle gets the sign.
         let signed_deg = angle_deg * axis[axis.iamax()].signum();
         let name = excitation::axis_name(&axis, body);
         let moved = match self.input.setup {

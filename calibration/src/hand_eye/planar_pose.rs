@@ -17,7 +17,8 @@ use nalgebra::{
     Vector6,
 };
 
-/// Minimum number of corners for a pose.
+/// Minimum number of corners for a pose: a homography has eight parameters, and a corner two
+/// coordinates.
 pub(super) const MIN_CORNERS: usize = 4;
 
 /// Threshold of the robust loss, pixels. Corners of sharp images are accurate to a tenth of a
@@ -49,6 +50,7 @@ impl BoardPose {
 /// The poses that explain the corners, best first: one or two. Empty if the corners do not
 /// determine a pose. Corners beyond the range of the lens model are outliers.
 pub(super) fn board_poses(view: &BoardView, intrinsics: &Intrinsics) -> Vec<BoardPose> {
+    // Corners without a ray cannot be used, but keep their place in the list of inliers.
     let ray = |point: &BoardPoint| intrinsics.unproject(point.pixel).map(|ray| ray.xy());
     let rays: Vec<Option<Vector2<f64>>> = view.points.iter().map(ray).collect();
     let seen = view
@@ -82,41 +84,58 @@ fn poses_in_range(
     let Some(plane) = Plane::new(points) else {
         return Vec::new();
     };
-    let all = vec![true; points.len()];
-    let attempt = |is_inlier: &[bool]| -> Vec<BoardPose> {
-        let Some(homography) = homography(&plane.points, rays, is_inlier) else {
-            return Vec::new();
-        };
-        let mut poses: Vec<BoardPose> = initial_rotations(&homography)
-            .into_iter()
-            .filter_map(|rotation| {
-                let camera_from_plane = with_translation(rotation, &plane.points, rays, is_inlier)?;
-                refine(
-                    camera_from_plane * plane.plane_from_board,
-                    points,
-                    intrinsics,
-                    is_inlier,
-                )
-            })
-            .collect();
-        poses.sort_by(|a, b| a.squares_px2.total_cmp(&b.squares_px2));
-        poses
+    // All corners first: without outliers, this is the best result, and the fastest.
+    let corners = Corners {
+        plane: &plane,
+        points,
+        rays,
+        intrinsics,
     };
-    let mut poses = attempt(&all);
+    let mut poses = corners.poses(&vec![true; points.len()]);
     let has_outliers = poses
         .first()
         .is_none_or(|best| best.n_inliers() < points.len());
     if has_outliers && let Some(consensus) = consensus_corners(&plane.points, rays, intrinsics) {
-        let robust = attempt(&consensus);
+        let robust = corners.poses(&consensus);
         let n_inliers = |poses: &[BoardPose]| poses.first().map_or(0, BoardPose::n_inliers);
         if n_inliers(&robust) >= n_inliers(&poses) {
             poses = robust;
         }
     }
+    // A near board has one solution only, which both initial poses lead to.
     if poses.len() == 2 && is_same(&poses[0].camera_from_board, &poses[1].camera_from_board) {
         poses.truncate(1);
     }
     poses
+}
+
+/// Corners of one board, on the board and in the camera.
+struct Corners<'a> {
+    plane: &'a Plane,
+    points: &'a [BoardPoint],
+    rays: &'a [Vector2<f64>],
+    intrinsics: &'a Intrinsics,
+}
+
+impl Corners<'_> {
+    /// The poses that minimize the reprojection error of the selected corners, best first.
+    fn poses(&self, is_used: &[bool]) -> Vec<BoardPose> {
+        let plane_points = &self.plane.points;
+        let Some(homography) = homography(plane_points, self.rays, is_used) else {
+            return Vec::new();
+        };
+        let mut poses: Vec<BoardPose> = initial_rotations(&homography)
+            .into_iter()
+            .filter_map(|rotation| {
+                let camera_from_plane =
+                    with_translation(rotation, plane_points, self.rays, is_used)?;
+                let camera_from_board = camera_from_plane * self.plane.plane_from_board;
+                refine(camera_from_board, self.points, self.intrinsics, is_used)
+            })
+            .collect();
+        poses.sort_by(|a, b| a.squares_px2.total_cmp(&b.squares_px2));
+        poses
+    }
 }
 
 /// Whether two poses are the same solution.
@@ -134,6 +153,7 @@ struct Plane {
 impl Plane {
     /// `None` if the points are too few or on a line.
     fn new(points: &[BoardPoint]) -> Option<Self> {
+        // Of the shorter to the longer side. Corners on a line determine no rotation about it.
         const MIN_WIDTH_RATIO: f64 = 1e-3;
         (points.len() >= MIN_CORNERS).then_some(())?;
         let centroid = points
@@ -150,28 +170,27 @@ impl Plane {
         if !spread.iter().all(|value| value.is_finite()) {
             return None;
         }
+        // The two directions of the largest spread span the plane. The board's own axes are not
+        // used, because a target may be given in any frame.
         let eigen = spread.symmetric_eigen();
         let mut order = [0, 1, 2];
         order.sort_by(|&i, &j| eigen.eigenvalues[j].total_cmp(&eigen.eigenvalues[i]));
         let [first, second, _] = order;
         (eigen.eigenvalues[second] > MIN_WIDTH_RATIO.powi(2) * eigen.eigenvalues[first])
             .then_some(())?;
-        let (x, y) = (
-            eigen.eigenvectors.column(first).into_owned(),
-            eigen.eigenvectors.column(second).into_owned(),
-        );
+        let x = eigen.eigenvectors.column(first).into_owned();
+        let y = eigen.eigenvectors.column(second).into_owned();
         let axes = Matrix3::from_rows(&[x.transpose(), y.transpose(), x.cross(&y).transpose()]);
         let rotation =
             UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(axes));
         let plane_from_board = Transform::from_parts((rotation * -centroid).into(), rotation);
-        let in_plane = |point: &BoardPoint| {
-            (plane_from_board * nalgebra::Point3::from(point.point_in_board))
-                .coords
-                .xy()
-        };
+        let points_in_plane = points.iter().map(|point| {
+            let point_in_board = nalgebra::Point3::from(point.point_in_board);
+            (plane_from_board * point_in_board).coords.xy()
+        });
         Some(Self {
             plane_from_board,
-            points: points.iter().map(in_plane).collect(),
+            points: points_in_plane.collect(),
         })
     }
 }
@@ -200,6 +219,7 @@ fn homography(
 
 /// Both rotations that the homography allows at the origin of the plane.
 fn initial_rotations(homography: &Matrix3<f64>) -> Vec<UnitQuaternion<f64>> {
+    // Position of the origin's image, and the derivative of the image there.
     let h = homography;
     let v = Vector2::new(h[(0, 2)], h[(1, 2)]);
     let jacobian = Matrix2::new(
@@ -208,6 +228,8 @@ fn initial_rotations(homography: &Matrix3<f64>) -> Vec<UnitQuaternion<f64>> {
         h[(1, 0)] - h[(2, 0)] * v.y,
         h[(1, 1)] - h[(2, 1)] * v.y,
     );
+    // In a frame whose z axis is the ray to the origin, the derivative is the upper left part of the
+    // rotation, up to scale.
     let to_ray = Rotation3::rotation_between(&Vector3::z(), &v.push(1.0))
         .unwrap_or_else(Rotation3::identity);
     let projection = Matrix2x3::new(1.0, 0.0, -v.x, 0.0, 1.0, -v.y) * to_ray.matrix();
@@ -219,12 +241,14 @@ fn initial_rotations(homography: &Matrix3<f64>) -> Vec<UnitQuaternion<f64>> {
     if largest.is_nan() || largest <= 0.0 {
         return Vec::new();
     }
+    // The scale follows from the unit length of the columns: the largest singular value of the upper
+    // left part of a rotation is 1.
     let upper = scaled / largest;
     let rest = Matrix2::identity() - upper.transpose() * upper;
-    let (b0, b1) = (
-        rest[(0, 0)].max(0.0).sqrt(),
-        rest[(1, 1)].max(0.0).sqrt() * rest[(0, 1)].signum(),
-    );
+    // The third row completes the columns to unit length. Its sign is not determined: these are the
+    // two solutions, which tilt the board to opposite sides of the ray.
+    let b0 = rest[(0, 0)].max(0.0).sqrt();
+    let b1 = rest[(1, 1)].max(0.0).sqrt() * rest[(0, 1)].signum();
     [1.0, -1.0]
         .into_iter()
         .filter_map(|sign| {
@@ -244,7 +268,9 @@ fn with_translation(
     rays: &[Vector2<f64>],
     is_used: &[bool],
 ) -> Option<Transform> {
-    let (mut normal, mut right) = (Matrix3::zeros(), Vector3::zeros());
+    // The rotated point plus the translation must be parallel to the ray: two linear equations.
+    let mut normal = Matrix3::zeros();
+    let mut right = Vector3::zeros();
     for ((point, ray), _) in points
         .iter()
         .zip(rays)
@@ -306,7 +332,7 @@ fn residual(
     let (pixel, by_point) =
         intrinsics.project_with_jacobian(&(rotated + pose.translation.vector))?;
     let by_rotation = -by_point * rotated.cross_matrix();
-    let row = |axis: usize| {
+    let rows = [0_usize, 1].map(|axis| {
         std::array::from_fn(|ix| {
             if ix < 3 {
                 by_rotation[(axis, ix)]
@@ -314,13 +340,12 @@ fn residual(
                 by_point[(axis, ix - 3)]
             }
         })
-    };
-    Some((
-        [pixel[0] - point.pixel[0], pixel[1] - point.pixel[1]],
-        [row(0), row(1)],
-    ))
+    });
+    Some(([pixel[0] - point.pixel[0], pixel[1] - point.pixel[1]], rows))
 }
 
+/// Minimizes the reprojection error of the selected corners, and evaluates all corners at the
+/// result.
 fn refine(
     initial: Transform,
     points: &[BoardPoint],
@@ -347,6 +372,8 @@ fn refine(
     let pose = least_squares::minimize(&problem, initial, &options)
         .ok()?
         .state;
+    // All corners are judged, not only the used ones: a corner that the initial set left out may fit
+    // the refined pose.
     let errors: Vec<f64> = points
         .iter()
         .map(|point| {
@@ -371,6 +398,7 @@ fn refine(
         }
         squares_px2 += error * error;
     }
+    // Inliers that do not determine the pose give no covariance.
     information.cholesky()?;
     Some(BoardPose {
         camera_from_board: pose,
@@ -389,7 +417,8 @@ pub(super) fn stepped(
     points: &[BoardPoint],
     intrinsics: &Intrinsics,
 ) -> Option<(Transform, Matrix6<f64>)> {
-    let (mut information, mut gradient) = (Matrix6::zeros(), Vector6::zeros());
+    let mut information = Matrix6::zeros();
+    let mut gradient = Vector6::zeros();
     for point in points {
         let (error, rows) = residual(predicted, point, intrinsics)?;
         for (value, row) in error.into_iter().zip(rows) {
@@ -408,6 +437,7 @@ fn inlier_limit(errors: &[f64]) -> f64 {
     const MEDIAN_OF_NORM: f64 = 1.1774;
     /// One in 20 000 corners without a mistake exceeds it.
     const DEVIATIONS: f64 = 4.5;
+    /// Deviations of corners within an image are not normal. Below this, none counts as wrong.
     const MIN_PX: f64 = 0.5;
     let median = kinematics::quantile::median(errors).unwrap_or(0.0);
     (DEVIATIONS * median / MEDIAN_OF_NORM).max(MIN_PX)
@@ -420,9 +450,13 @@ fn consensus_corners(
     rays: &[Vector2<f64>],
     intrinsics: &Intrinsics,
 ) -> Option<Vec<bool>> {
-    const TRIALS: usize = 150; // Finds four good corners with 99.99 % probability if half of them are wrong.
+    // Finds four good corners with 99.99 % probability if half of them are wrong:
+    // (1 - 0.5^4)^150 = 6e-5.
+    const TRIALS: usize = 150;
+    // A homography of four noisy corners is inaccurate far from them.
     const ALLOWED_PX: f64 = 3.0;
     let n = points.len();
+    // Rays are in units of the focal length.
     let allowed = ALLOWED_PX / intrinsics.focal_px[0];
     let mut random = Random::new(1);
     let mut order: Vec<usize> = (0..n).collect();

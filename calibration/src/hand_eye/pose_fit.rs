@@ -87,20 +87,19 @@ pub(super) struct Measurement {
 
 /// The chosen candidate of each sample, with weights for all of them.
 pub(super) fn measurements(samples: &[Sample], choice: &[usize]) -> Vec<Measurement> {
-    let of = |(sample, choice): (&Sample, &usize)| {
+    let mut measurements = Vec::with_capacity(samples.len());
+    for (sample, choice) in samples.iter().zip(choice) {
         let candidate = &sample.candidates[*choice];
-        Measurement {
+        let corners = candidate.corners.as_ref();
+        measurements.push(Measurement {
             stop_ix: sample.stop_ix,
             weight: 1.0,
             a: sample.a,
             camera_from_board: candidate.camera_from_board,
-            unit_covariance: candidate
-                .corners
-                .as_ref()
-                .map(|corners| corners.unit_covariance),
-        }
-    };
-    with_weights(samples.iter().zip(choice).map(of).collect())
+            unit_covariance: corners.map(|corners| corners.unit_covariance),
+        });
+    }
+    with_weights(measurements)
 }
 
 /// Weighs measurements such that each stop counts once.
@@ -159,13 +158,18 @@ fn fit_with(
     noise: HandEyeNoise,
     max_rounds: usize,
 ) -> Result<PoseFit, Error> {
-    const CONVERGED: f64 = 1e-3; // Relative change of the information about the parameters.
-    let (mut solution, mut noise) = (initial, noise);
+    // Relative change of the information about the parameters. It is far below the uncertainty of
+    // variances that are estimated from tens of samples.
+    const CONVERGED: f64 = 1e-3;
+    let mut solution = initial;
+    let mut noise = noise;
     let options = least_squares::Options {
         loss: geometry::SAMPLE_LOSS,
         max_steps: 30,
         ..least_squares::Options::default()
     };
+    // The weights depend on the variances, and those on the residuals of the solution: both are
+    // estimated in turns.
     let mut last: Option<(least_squares::Fit<Solution>, f64)> = None;
     for _ in 0..max_rounds {
         let problem = Whitened::new(setup, measurements, &solution, &noise);
@@ -215,10 +219,8 @@ pub(super) fn sandwich_covariance(
     weighting: &HandEyeNoise,
     noise: &HandEyeNoise,
 ) -> Option<DMatrix<f64>> {
-    let (mut information, mut scatter) = (
-        SMatrix::<f64, 12, 12>::zeros(),
-        SMatrix::<f64, 12, 12>::zeros(),
-    );
+    let mut information = SMatrix::<f64, 12, 12>::zeros();
+    let mut scatter = SMatrix::<f64, 12, 12>::zeros();
     for measurement in measurements {
         let predicted = solution.camera_from_board(&measurement.a);
         let residual = geometry::residual(&predicted, &measurement.camera_from_board);
@@ -247,25 +249,30 @@ pub(super) fn initial_noise(
     solution: &Solution,
     corner_px: Option<f64>,
 ) -> HandEyeNoise {
-    /// Median of the norm of three normal numbers with deviation 1.
-    const MEDIAN_OF_NORM: f64 = 1.538;
     let residuals: Vec<Vector6<f64>> = measurements
         .iter()
         .map(|m| geometry::residual(&solution.camera_from_board(&m.a), &m.camera_from_board))
         .collect();
-    let sigma = |first: usize, min: f64| {
-        let norms: Vec<f64> = residuals
-            .iter()
-            .map(|residual| residual.fixed_rows::<3>(first).norm())
-            .collect();
-        (kinematics::quantile::median(&norms).unwrap_or(0.0) / MEDIAN_OF_NORM).max(min)
-    };
     HandEyeNoise {
         corner_px,
         residual_px: corner_px,
-        rotation_rad: sigma(0, 1e-6),
-        translation_m: sigma(3, 1e-6),
+        rotation_rad: median_sigma(&residuals, 0),
+        translation_m: median_sigma(&residuals, 3),
     }
+}
+
+/// Standard deviation of three components of residuals, starting with `first`, from the median of
+/// their norms.
+fn median_sigma(residuals: &[Vector6<f64>], first: usize) -> f64 {
+    /// Median of the norm of three normal numbers with deviation 1.
+    const MEDIAN_OF_NORM: f64 = 1.538;
+    /// Exact samples of a simulation have residuals of zero, which would give infinite weights.
+    const MIN: f64 = 1e-6;
+    let norms: Vec<f64> = residuals
+        .iter()
+        .map(|residual| residual.fixed_rows::<3>(first).norm())
+        .collect();
+    (kinematics::quantile::median(&norms).unwrap_or(0.0) / MEDIAN_OF_NORM).max(MIN)
 }
 
 /// Derivatives of the covariance of a residual with respect to the variances, in the order of
@@ -277,6 +284,8 @@ fn covariance_parts(
     noise: &HandEyeNoise,
 ) -> Vec<Matrix6<f64>> {
     match (&measurement.unit_covariance, noise.corner_px) {
+        // With corners, errors of the robot pose act on the board as a motion of the flange does.
+        // They are correlated: a rotation of the flange also moves the board.
         (Some(unit), Some(_)) => {
             let predicted = solution.camera_from_board(&measurement.a);
             let by_flange = geometry::residual_by_flange(setup, solution, &predicted);
@@ -286,6 +295,7 @@ fn covariance_parts(
             };
             vec![part(0), part(3), *unit]
         }
+        // Given poses: rotation and translation have independent errors of unknown origin.
         _ => {
             let block = |first: usize| {
                 Matrix6::from_diagonal(&Vector6::from_fn(|ix, _| {
@@ -357,23 +367,35 @@ impl<'a> Whitened<'a> {
         solution: &Solution,
         noise: &HandEyeNoise,
     ) -> Self {
-        let whitening = |measurement: &Measurement| {
-            let factor = covariance(setup, measurement, solution, noise).cholesky();
-            let whitening = factor
-                .and_then(|factor| factor.l().try_inverse())
-                .unwrap_or_else(Matrix6::zeros);
-            whitening * measurement.weight.sqrt()
-        };
+        let whitening = measurements
+            .iter()
+            .map(|measurement| whitening(setup, measurement, solution, noise))
+            .collect();
         let lever_m = measurements
             .iter()
             .map(|m| m.camera_from_board.translation.vector.norm())
             .fold(0.01, f64::max);
         Self {
             measurements,
-            whitening: measurements.iter().map(whitening).collect(),
+            whitening,
             lever_m,
         }
     }
+}
+
+/// The matrix that turns the residual of a measurement into six independent residuals with unit
+/// variance. Zero, so that the measurement has no influence, if there is none.
+fn whitening(
+    setup: Setup,
+    measurement: &Measurement,
+    solution: &Solution,
+    noise: &HandEyeNoise,
+) -> Matrix6<f64> {
+    let factor = covariance(setup, measurement, solution, noise).cholesky();
+    let whitening = factor
+        .and_then(|factor| factor.l().try_inverse())
+        .unwrap_or_else(Matrix6::zeros);
+    whitening * measurement.weight.sqrt()
 }
 
 impl least_squares::Problem for Whitened<'_> {
@@ -413,6 +435,7 @@ impl least_squares::Problem for Whitened<'_> {
     }
 }
 
+/// Variances after one step, and the degrees of freedom of the covariance that follows from them.
 struct Update {
     noise: HandEyeNoise,
     n_free: f64,
@@ -433,7 +456,12 @@ fn update_variances(
         .try_inverse()
         .unwrap_or_else(|| DMatrix::zeros(N_PARAMS, N_PARAMS));
     let x_information = inverse.view((0, 0), (6, 6)).into_owned().try_inverse();
-    let (mut squares, mut expected) = (vec![0.0; n_variances], vec![0.0; n_variances]);
+    // Per variance: the part of the squared residuals that it explains, and the part that is
+    // expected with the current values, given that the parameters were fitted to the same residuals.
+    let mut squares = vec![0.0; n_variances];
+    let mut expected = vec![0.0; n_variances];
+    // The Fisher information about the variances, and the derivative of the logarithm of the
+    // hand-eye covariance (the mean over its six parameters), for the degrees of freedom.
     let mut fisher = DMatrix::<f64>::zeros(n_variances, n_variances);
     let mut log_volume_by_variance = DVector::<f64>::zeros(n_variances);
     for measurement in measurements {
@@ -473,6 +501,7 @@ fn update_variances(
             .map(|measurement| measurement.weight)
             .sum::<f64>();
     fisher *= ((n_scalars - N_PARAMS as f64) / n_scalars).max(0.05);
+    // Limited, because the first steps may be far off, and a variance of zero would stay zero.
     let updated: Vec<f64> = (0..n_variances)
         .map(|k| {
             let factor: f64 = f64::sqrt(squares[k] / expected[k]);
@@ -484,6 +513,7 @@ fn update_variances(
                 }
         })
         .collect();
+    // Satterthwaite 1946: a variance with `n` degrees of freedom has a relative variance of `2 / n`.
     let relative_variance = fisher.try_inverse().map_or(f64::INFINITY, |covariance| {
         log_volume_by_variance.dot(&(covariance * &log_volume_by_variance))
     });
@@ -501,6 +531,8 @@ fn update_variances(
 /// Weight of [`geometry::SAMPLE_LOSS`], divided by its mean for normal residuals.
 fn robust_weight(squared_norm: f64) -> f64 {
     const THRESHOLD: f64 = 3.55;
+    // The mean of the weighted square relative to six. Without it, variances of normal residuals
+    // would be 1 % too small.
     const MEAN: f64 = 0.99;
     (THRESHOLD / squared_norm.sqrt()).min(1.0) / MEAN
 }

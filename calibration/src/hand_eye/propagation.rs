@@ -24,12 +24,14 @@ pub(super) fn propagated(
         .view((0, 0), (N_PARAMS, N_PARAMS))
         .into_owned();
     let shared = free.information.view((0, N_PARAMS), (N_PARAMS, n_others));
+    // `A` above. Its sign does not matter, because it enters squared.
     let by_others = own.cholesky()?.solve(&shared.into_owned());
     let of_fit = free
         .covariance
         .view((N_PARAMS, N_PARAMS), (n_others, n_others))
         .into_owned();
     let covariance = covariance.unwrap_or(&of_fit);
+    // A covariance of another lens model has another size.
     (covariance.shape() == (n_others, n_others))
         .then(|| &by_others * covariance * by_others.transpose())
 }

@@ -2,10 +2,12 @@
 
 use kinematics::{Chain, Transform};
 
-/// Distance that configurations keep from the limits of the joints, radians or meters.
+/// Distance that configurations keep from the limits of the joints, radians or meters. Some
+/// controllers stop an arm shortly before its limits.
 const LIMIT_MARGIN: f64 = 0.05;
 /// Largest change of a joint between two configurations of a path at which the distance from the
-/// start is checked, radians or meters.
+/// start is checked, radians or meters. One joint moves the flange of an arm of 1 m by 5 cm between
+/// them.
 const PATH_STEP: f64 = 0.05;
 
 /// The space around a start configuration in which an arm moves.
@@ -26,9 +28,8 @@ impl Reach<'_> {
     /// from it back to the start, stay near the start.
     pub fn joints_for(&self, base_from_flange: &Transform, current: &[f64]) -> Option<Vec<f64>> {
         let start = self.chain.forward(self.start).ok()?;
-        let distance_m =
-            |pose: &Transform| (pose.translation.vector - start.translation.vector).norm();
-        if distance_m(base_from_flange) > self.max_distance_m {
+        // The distance is checked before inverse kinematics, which takes long.
+        if distance_m(base_from_flange, &start) > self.max_distance_m {
             return None;
         }
         let bounds: Vec<[f64; 2]> = self
@@ -50,32 +51,45 @@ impl Reach<'_> {
             .chain
             .inverse(base_from_flange, self.start, &bounds)
             .ok()??;
-        let is_near = |from: &[f64]| {
-            let largest = from
-                .iter()
-                .zip(&joints)
-                .map(|(from, to)| (to - from).abs())
-                .fold(0.0, f64::max);
-            #[expect(
-                clippy::cast_possible_truncation,
-                clippy::cast_sign_loss,
-                reason = "joints move by a few radians"
-            )]
-            let n_steps = (largest / PATH_STEP).ceil().clamp(1.0, 10_000.0) as u32;
-            (1..n_steps).all(|step| {
-                let share = f64::from(step) / f64::from(n_steps);
-                let between: Vec<f64> = from
-                    .iter()
-                    .zip(&joints)
-                    .map(|(from, to)| from + share * (to - from))
-                    .collect();
-                self.chain
-                    .forward(&between)
-                    .is_ok_and(|pose| distance_m(&pose) <= self.max_distance_m)
-            })
-        };
-        (current.len() == joints.len() && is_near(current) && is_near(self.start)).then_some(joints)
+        // The way back is checked, too: an arm that cannot return to its start would have to be
+        // freed by hand.
+        let is_allowed = current.len() == joints.len()
+            && self.path_is_near(current, &joints, &start)
+            && self.path_is_near(self.start, &joints, &start);
+        is_allowed.then_some(joints)
     }
+
+    /// Whether the flange stays near its pose at the start on the straight path in joint space
+    /// between two configurations. The ends are not checked.
+    fn path_is_near(&self, from: &[f64], to: &[f64], start: &Transform) -> bool {
+        let largest = from
+            .iter()
+            .zip(to)
+            .map(|(from, to)| (to - from).abs())
+            .fold(0.0, f64::max);
+        #[expect(
+            clippy::cast_possible_truncation,
+            clippy::cast_sign_loss,
+            reason = "joints move by a few radians"
+        )]
+        let n_steps = (largest / PATH_STEP).ceil().clamp(1.0, 10_000.0) as u32;
+        (1..n_steps).all(|step| {
+            let share = f64::from(step) / f64::from(n_steps);
+            let between: Vec<f64> = from
+                .iter()
+                .zip(to)
+                .map(|(from, to)| from + share * (to - from))
+                .collect();
+            self.chain
+                .forward(&between)
+                .is_ok_and(|pose| distance_m(&pose, start) <= self.max_distance_m)
+        })
+    }
+}
+
+/// Distance between the positions of two poses, meters.
+fn distance_m(a: &Transform, b: &Transform) -> f64 {
+    (a.translation.vector - b.translation.vector).norm()
 }
 
 #[cfg(test)]

@@ -64,6 +64,14 @@ impl Refined {
     }
 }
 
+/// Samples, the candidate of each, and the fit so far.
+struct Progress {
+    samples: Vec<Sample>,
+    choice: Vec<usize>,
+    stage: Stage,
+    closed_form: ClosedForm,
+}
+
 /// Refines a consensus.
 ///
 /// # Errors
@@ -73,6 +81,8 @@ pub(super) fn refine(
     mut samples: Vec<Sample>,
     consensus: Consensus,
 ) -> Result<Refined, Error> {
+    // First from board poses: this estimates the noise and finds the outliers, which the
+    // minimization of reprojection errors would not tolerate.
     let is_inlier = consensus.is_inlier();
     let mut choice = consensus.choice;
     let chosen = select(&pose_fit::measurements(&samples, &choice), &is_inlier);
@@ -82,16 +92,19 @@ pub(super) fn refine(
     let mut stage = reject_and_fit(input, &samples, &mut choice, is_inlier, initial, noise)?;
 
     let Some(given) = input.intrinsics.clone().filter(|_| corner_px.is_some()) else {
-        return Ok(finish(
+        let progress = Progress {
             samples,
             choice,
             stage,
             closed_form,
-            input.intrinsics.clone(),
-        ));
+        };
+        return Ok(progress.finish(input.intrinsics.clone()));
     };
+    // The pose that fits one image best is biased for a board that faces the camera. Steps from the
+    // predicted poses are not, so outliers are searched again with them.
     relinearize(input, &mut samples, &choice, &stage, &given);
-    let (solution, noise) = (stage.fit.solution, stage.fit.noise);
+    let solution = stage.fit.solution;
+    let noise = stage.fit.noise;
     stage = reject_and_fit(
         input,
         &samples,
@@ -100,15 +113,39 @@ pub(super) fn refine(
         solution,
         noise,
     )?;
+    // Then from corners.
+    let progress = Progress {
+        samples,
+        choice,
+        stage,
+        closed_form,
+    };
+    if input.options.estimate_intrinsics || input.options.estimate_joint_offsets {
+        progress.refine_with_others(input, given)
+    } else {
+        progress.refine_with_given(input, given)
+    }
+}
 
-    let is_free = input.options.estimate_intrinsics || input.options.estimate_joint_offsets;
-    if !is_free {
-        let selection = Selection {
+impl Progress {
+    fn selection<'a>(&'a self, input: &'a HandEyeInput<'a>) -> Selection<'a> {
+        Selection {
             input,
-            samples: &samples,
-            choice: &choice,
-            stage: &stage,
-        };
+            samples: &self.samples,
+            choice: &self.choice,
+            stage: &self.stage,
+        }
+    }
+
+    /// Minimizes the reprojection error with the given intrinsics and joints.
+    fn refine_with_given(
+        mut self,
+        input: &HandEyeInput<'_>,
+        given: Intrinsics,
+    ) -> Result<Refined, Error> {
+        // A fit with free intrinsics shows whether the given ones are right, and how their
+        // uncertainty changes the result. It may fail for few images; then nothing is known.
+        let selection = self.selection(input);
         let lens = input.intrinsics_covariance.as_ref();
         let free = corner_fit(
             selection,
@@ -124,76 +161,92 @@ pub(super) fn refine(
             .as_ref()
             .and_then(|free| IntrinsicsDoubt::new(selection, &given, free, lens));
         let by_lens = free.as_ref().and_then(|free| propagated(free, Some(lens?)));
-        (stage.fit, stage.weighting) = choose_weights(
-            Selection {
-                input,
-                samples: &samples,
-                choice: &choice,
-                stage: &stage,
-            },
-            &given,
-        )?;
-        stage.fit.solution = minimize_corners(
-            Selection {
-                input,
-                samples: &samples,
-                choice: &choice,
-                stage: &stage,
-            },
-            &given,
-        )?;
+        (self.stage.fit, self.stage.weighting) = choose_weights(self.selection(input), &given)?;
+        self.stage.fit.solution = minimize_corners(self.selection(input), &given)?;
+        // The doubt contains the effect of the lens, so only one of both is added.
         if let Some(doubt) = &doubt {
-            stage.fit.covariance += doubt.covariance(&stage.fit.solution);
+            self.stage.fit.covariance += doubt.covariance(&self.stage.fit.solution);
         } else if let Some(by_lens) = by_lens {
-            stage.fit.covariance += by_lens;
+            self.stage.fit.covariance += by_lens;
         }
-        let mut refined = finish(samples, choice, stage, closed_form, Some(given));
+        let mut refined = self.finish(Some(given));
         refined.intrinsics_doubt = doubt.map(|doubt| doubt.warning);
-        return Ok(refined);
+        Ok(refined)
     }
-    let free = minimize_free(input, &mut samples, &mut choice, &mut stage, given)?;
-    let corrected = with_offsets(input, &free.state.joint_offsets);
-    let intrinsics = free.state.intrinsics.clone();
-    (stage.fit, stage.weighting) = choose_weights(
-        Selection {
-            input: &corrected,
-            samples: &samples,
-            choice: &choice,
-            stage: &stage,
-        },
-        &intrinsics,
-    )?;
-    stage.fit.solution = minimize_corners(
-        Selection {
-            input: &corrected,
-            samples: &samples,
-            choice: &choice,
-            stage: &stage,
-        },
-        &intrinsics,
-    )?;
-    match propagated(&free, None) {
-        Some(by_others) => stage.fit.covariance += by_others,
-        None => stage.fit.covariance += free.covariance.view((0, 0), (N_PARAMS, N_PARAMS)),
+
+    /// Minimizes the reprojection error together with intrinsics, joint offsets, or both.
+    fn refine_with_others(
+        mut self,
+        input: &HandEyeInput<'_>,
+        given: Intrinsics,
+    ) -> Result<Refined, Error> {
+        let free = minimize_free(
+            input,
+            &mut self.samples,
+            &mut self.choice,
+            &mut self.stage,
+            given,
+        )?;
+        // With the estimates of the others fixed, the solution is found as with given ones. Their
+        // uncertainty is added to its covariance.
+        let corrected = with_offsets(input, &free.state.joint_offsets);
+        let intrinsics = free.state.intrinsics.clone();
+        (self.stage.fit, self.stage.weighting) =
+            choose_weights(self.selection(&corrected), &intrinsics)?;
+        self.stage.fit.solution = minimize_corners(self.selection(&corrected), &intrinsics)?;
+        match propagated(&free, None) {
+            Some(by_others) => self.stage.fit.covariance += by_others,
+            None => self.stage.fit.covariance += free.covariance.view((0, 0), (N_PARAMS, N_PARAMS)),
+        }
+        let n_intrinsics = if input.options.estimate_intrinsics {
+            intrinsics.params().len()
+        } else {
+            0
+        };
+        let mut refined = self.finish(Some(intrinsics));
+        // Order of the shared parameters: solution, intrinsics, joint offsets.
+        refined.intrinsics_sigma = (0..n_intrinsics)
+            .map(|ix| free.sigma(N_PARAMS + ix))
+            .collect();
+        let offsets = free.state.joint_offsets.iter().enumerate();
+        refined.joint_offsets = offsets
+            .map(|(ix, offset)| (*offset, free.sigma(N_PARAMS + n_intrinsics + ix)))
+            .collect();
+        Ok(refined)
     }
-    let n_intrinsics = if input.options.estimate_intrinsics {
-        intrinsics.params().len()
-    } else {
-        0
-    };
-    let mut refined = finish(samples, choice, stage, closed_form, Some(intrinsics));
-    refined.intrinsics_sigma = (0..n_intrinsics)
-        .map(|ix| free.sigma(N_PARAMS + ix))
-        .collect();
-    let offsets = free.state.joint_offsets.iter().enumerate();
-    refined.joint_offsets = offsets
-        .map(|(ix, offset)| (*offset, free.sigma(N_PARAMS + n_intrinsics + ix)))
-        .collect();
-    Ok(refined)
+
+    /// The result, without standard deviations of other parameters and without doubts.
+    fn finish(self, intrinsics: Option<Intrinsics>) -> Refined {
+        // The 95 % quantile of F with 6 and n degrees of freedom relative to that of chi squared / 6,
+        // to first order.
+        const CHI_SQUARED_95: f64 = 12.59;
+        let Self {
+            samples,
+            choice,
+            stage,
+            closed_form,
+        } = self;
+        let enlarged = 1.0 + (CHI_SQUARED_95 - 4.0) / (2.0 * stage.fit.n_free);
+        Refined {
+            solution: stage.fit.solution,
+            noise: stage.fit.noise,
+            weighting: stage.weighting,
+            covariance: stage.fit.covariance * enlarged,
+            samples,
+            choice,
+            is_inlier: stage.is_inlier,
+            squared_distances: stage.squared_distances,
+            closed_form,
+            intrinsics,
+            intrinsics_sigma: Vec::new(),
+            joint_offsets: Vec::new(),
+            intrinsics_doubt: None,
+        }
+    }
 }
 
 /// Estimates intrinsics and joint offsets. The variances depend on the poses of the board, and
-/// those on the intrinsics.
+/// those on the intrinsics, so both are estimated in turns.
 fn minimize_free(
     input: &HandEyeInput<'_>,
     samples: &mut Vec<Sample>,
@@ -201,8 +254,10 @@ fn minimize_free(
     stage: &mut Stage,
     given: Intrinsics,
 ) -> Result<Fit<CornerState>, Error> {
+    // The noise determines only the weights, which need not be exact.
     const ROUNDS: usize = 3;
-    let (mut intrinsics, mut offsets) = (given, Vec::new());
+    let mut intrinsics = given;
+    let mut offsets = Vec::new();
     for round in 0.. {
         let free = Free {
             intrinsics: input.options.estimate_intrinsics,
@@ -223,6 +278,7 @@ fn minimize_free(
         intrinsics = fit.state.intrinsics.clone();
         offsets.clone_from(&fit.state.joint_offsets);
         let corrected = with_offsets(input, &offsets);
+        // The poses of the board follow from the corners with the new lens.
         let usable = samples::samples(&corrected, Some(&intrinsics)).usable;
         if usable.len() != samples.len() {
             return Err(Error::Refused(Box::new(Refusal::new(
@@ -232,6 +288,7 @@ fn minimize_free(
         }
         *samples = usable;
         *choice = consensus::choose(samples, &stage.fit.solution);
+        // The lens fits better now, so the error of the corners is smaller.
         let noise = HandEyeNoise {
             residual_px: corner_noise(samples, choice, &stage.is_inlier),
             ..stage.fit.noise
@@ -271,7 +328,8 @@ fn relinearize(
     stage: &Stage,
     intrinsics: &Intrinsics,
 ) {
-    /// Beyond, the step may not be accurate.
+    /// Beyond, the step may not be accurate. It is three times the limit of outliers, so that
+    /// excluded samples can return.
     const MAX_SQUARED_DISTANCE: f64 = 100.0;
     for ix in 0..samples.len() {
         if stage.squared_distances[ix] > MAX_SQUARED_DISTANCE {
@@ -310,38 +368,13 @@ fn choose_weights(
     } = selection;
     let estimated = &stage.fit;
     let measurements = select(&pose_fit::measurements(samples, choice), &stage.is_inlier);
-    let used: Vec<(&Sample, usize)> = samples
-        .iter()
-        .zip(choice)
-        .zip(&stage.is_inlier)
-        .filter(|(_, is_inlier)| **is_inlier)
-        .map(|((sample, choice), _)| (sample, *choice))
-        .collect();
-    let held_out_error = |weighting: HandEyeNoise| -> Option<f64> {
-        let folds = evaluation::held_out_solutions(
-            input.setup,
-            &measurements,
-            estimated.solution,
-            weighting,
-            true,
-        );
-        let folds: Vec<Solution> = folds.into_iter().collect::<Option<_>>()?;
-        let squares_px2 = used.iter().zip(&folds).map(|((sample, choice), solution)| {
-            let points = corners(input, sample, *choice);
-            evaluation::reprojection_squares(&predicted(solution, sample), &points, intrinsics)
-        });
-        let boards: Vec<Transform> = folds
-            .iter()
-            .zip(&measurements)
-            .map(|(solution, m)| board_in_parent(solution, m))
-            .collect();
-        let scatter = evaluation::scatter(&boards)?;
-        Some(squares_px2.sum::<f64>().sqrt() * scatter.mm * scatter.deg)
-    };
     let best = FACTORS
         .into_iter()
         .map(|factor| estimated.noise.with_robot_errors(factor))
-        .filter_map(|weighting| Some((held_out_error(weighting)?, weighting)))
+        .filter_map(|weighting| {
+            let error = held_out_error(selection, &measurements, intrinsics, weighting)?;
+            Some((error, weighting))
+        })
         .min_by(|a, b| a.0.total_cmp(&b.0));
     let Some((_, weighting)) = best else {
         return Ok((estimated.clone(), estimated.noise));
@@ -349,6 +382,8 @@ fn choose_weights(
     let solution =
         pose_fit::fit_with_known_noise(input.setup, &measurements, estimated.solution, weighting)?
             .solution;
+    // The weights are no longer the inverse of the noise, so the covariance is not simply the
+    // inverse of the information.
     let covariance = pose_fit::sandwich_covariance(
         input.setup,
         &measurements,
@@ -365,6 +400,48 @@ fn choose_weights(
         },
         weighting,
     ))
+}
+
+/// Product of the errors of held-out samples with these weights: reprojection, and position and
+/// rotation of the board.
+///
+/// * `measurements`: those of the samples that agree.
+fn held_out_error(
+    selection: Selection<'_>,
+    measurements: &[Measurement],
+    intrinsics: &Intrinsics,
+    weighting: HandEyeNoise,
+) -> Option<f64> {
+    let Selection {
+        input,
+        samples,
+        choice,
+        stage,
+    } = selection;
+    let folds = evaluation::held_out_solutions(
+        input.setup,
+        measurements,
+        stage.fit.solution,
+        weighting,
+        true,
+    );
+    let folds: Vec<Solution> = folds.into_iter().collect::<Option<_>>()?;
+    let used = samples
+        .iter()
+        .zip(choice)
+        .zip(&stage.is_inlier)
+        .filter(|(_, is_inlier)| **is_inlier);
+    let squares_px2 = used.zip(&folds).map(|(((sample, choice), _), solution)| {
+        let points = corners(input, sample, *choice);
+        evaluation::reprojection_squares(&predicted(solution, sample), &points, intrinsics)
+    });
+    let boards: Vec<Transform> = folds
+        .iter()
+        .zip(measurements)
+        .map(|(solution, m)| board_in_parent(solution, m))
+        .collect();
+    let scatter = evaluation::scatter(&boards)?;
+    Some(squares_px2.sum::<f64>().sqrt() * scatter.mm * scatter.deg)
 }
 
 /// The input with corrected joints applied to the robot poses.
@@ -388,26 +465,16 @@ fn with_offsets<'a>(input: &HandEyeInput<'a>, offsets: &[f64]) -> HandEyeInput<'
 
 /// The closed form with the smallest leave-one-out scatter, and its solution.
 fn best_closed_form(measurements: &[Measurement], fallback: Solution) -> (ClosedForm, Solution) {
-    const MAX_FOLDS: usize = 20;
     let pairs: Vec<(Transform, Transform)> = measurements
         .iter()
         .map(|m| (m.a, m.camera_from_board))
         .collect();
-    let stride = pairs.len().div_ceil(MAX_FOLDS).max(1);
-    let score = |solver: ClosedForm| -> Option<f64> {
-        let boards: Option<Vec<Transform>> = (0..pairs.len())
-            .step_by(stride)
-            .map(|left_out| {
-                let mut others = pairs.clone();
-                let (a, camera_from_board) = others.remove(left_out);
-                Some(a * consensus::solve(&others, solver)?.x * camera_from_board)
-            })
-            .collect();
-        Some(evaluation::scatter(&boards?)?.mm)
-    };
     ClosedForm::ALL
         .into_iter()
-        .filter_map(|solver| Some((score(solver)?, solver, consensus::solve(&pairs, solver)?)))
+        .filter_map(|solver| {
+            let error_mm = leave_one_out_mm(&pairs, solver)?;
+            Some((error_mm, solver, consensus::solve(&pairs, solver)?))
+        })
         .min_by(|a, b| a.0.total_cmp(&b.0))
         .map_or(
             (ClosedForm::ParkMartin, fallback),
@@ -415,35 +482,23 @@ fn best_closed_form(measurements: &[Measurement], fallback: Solution) -> (Closed
         )
 }
 
-fn finish(
-    samples: Vec<Sample>,
-    choice: Vec<usize>,
-    stage: Stage,
-    closed_form: ClosedForm,
-    intrinsics: Option<Intrinsics>,
-) -> Refined {
-    // The 95 % quantile of F with 6 and n degrees of freedom relative to that of chi squared / 6,
-    // to first order.
-    const CHI_SQUARED_95: f64 = 12.59;
-    let enlarged = 1.0 + (CHI_SQUARED_95 - 4.0) / (2.0 * stage.fit.n_free);
-    Refined {
-        solution: stage.fit.solution,
-        noise: stage.fit.noise,
-        weighting: stage.weighting,
-        covariance: stage.fit.covariance * enlarged,
-        samples,
-        choice,
-        is_inlier: stage.is_inlier,
-        squared_distances: stage.squared_distances,
-        closed_form,
-        intrinsics,
-        intrinsics_sigma: Vec::new(),
-        joint_offsets: Vec::new(),
-        intrinsics_doubt: None,
-    }
+/// Scatter of the positions of the board, each from a closed form without this pair, millimeters.
+fn leave_one_out_mm(pairs: &[(Transform, Transform)], solver: ClosedForm) -> Option<f64> {
+    /// Enough to rank three solvers; each one solves for all pairs of the others.
+    const MAX_FOLDS: usize = 20;
+    let stride = pairs.len().div_ceil(MAX_FOLDS).max(1);
+    let boards: Option<Vec<Transform>> = (0..pairs.len())
+        .step_by(stride)
+        .map(|left_out| {
+            let mut others = pairs.to_vec();
+            let (a, camera_from_board) = others.remove(left_out);
+            Some(a * consensus::solve(&others, solver)?.x * camera_from_board)
+        })
+        .collect();
+    Some(evaluation::scatter(&boards?)?.mm)
 }
 
-/// `a` of a sample with corrected joints.
+/// Pose of the board in the base or on the flange according to one measurement.
 pub(super) fn board_in_parent(solution: &Solution, measurement: &Measurement) -> Transform {
     measurement.a * solution.x * measurement.camera_from_board
 }

@@ -107,7 +107,8 @@ pub struct SampleReport {
     pub points: Vec<PointFit>,
 }
 
-/// Largest standard deviation of a joint offset that counts as observable, radians or meters.
+/// Largest standard deviation of a joint offset that counts as observable, radians or meters: 1
+/// degree. A larger value would report offsets that the data hardly determine.
 const MAX_JOINT_SIGMA: f64 = 0.0175;
 
 /// Evaluates a refined solution.
@@ -130,6 +131,7 @@ pub(super) fn report(
     let sigma =
         |first: usize| [0, 1, 2].map(|axis| sigma_of(covariance[(first + axis, first + axis)]));
     let mut samples = sample_reports(input, refined);
+    // Every sample has exactly one status.
     debug_assert_eq!(
         refined.samples.len() + without_board.len() + repeated.len(),
         samples.len()
@@ -168,10 +170,12 @@ pub(super) fn report(
     })
 }
 
+/// A covariance with position before rotation.
 fn position_first(covariance: &Matrix6<f64>) -> Matrix6<f64> {
     Matrix6::from_fn(|row, column| covariance[((row + 3) % 6, (column + 3) % 6)])
 }
 
+/// Errors of held-out samples.
 struct HeldOut {
     scatter: Option<Scatter>,
     rms_px: Option<f64>,
@@ -215,7 +219,8 @@ fn rms_px(
         .zip(&refined.choice)
         .zip(&refined.is_inlier)
         .filter(|(_, is_inlier)| **is_inlier);
-    let (mut squares, mut n) = (0.0, 0);
+    let mut squares = 0.0;
+    let mut n = 0;
     for (used_ix, ((sample, choice), _)) in used.enumerate() {
         let points = selection::corners(input, sample, *choice);
         squares += evaluation::reprojection_squares(
@@ -228,6 +233,7 @@ fn rms_px(
     (n > 0).then(|| (squares / n as f64).sqrt())
 }
 
+/// The errors of all samples, in the order of the input.
 fn sample_reports(input: &HandEyeInput<'_>, refined: &Refined) -> Vec<SampleReport> {
     let mut reports: Vec<SampleReport> = input
         .samples
@@ -253,6 +259,7 @@ fn sample_reports(input: &HandEyeInput<'_>, refined: &Refined) -> Vec<SampleRepo
         };
         report.rotation_deg = Some(residual.fixed_rows::<3>(0).norm().to_degrees());
         report.position_mm = Some(1e3 * residual.fixed_rows::<3>(3).norm());
+        // The squared distance has six degrees of freedom.
         report.normalized = Some((refined.squared_distances[ix] / 6.0).sqrt());
         let board =
             sample.a * refined.solution.x * sample.candidates[refined.choice[ix]].camera_from_board;
@@ -268,19 +275,33 @@ fn sample_reports(input: &HandEyeInput<'_>, refined: &Refined) -> Vec<SampleRepo
                 (evaluation::reprojection_squares(&pose, &points, intrinsics) / points.len() as f64)
                     .sqrt()
             });
-        let fit = |point: &BoardPoint| {
-            let in_camera = (pose * nalgebra::Point3::from(point.point_in_board)).coords;
-            let [u, v] = refined.intrinsics.as_ref()?.project(&in_camera)?;
-            Some(PointFit {
-                pixel: point.pixel,
-                residual_px: [point.pixel[0] - u, point.pixel[1] - v],
-            })
-        };
-        report.points = points.iter().filter_map(fit).collect();
+        if let Some(intrinsics) = &refined.intrinsics {
+            report.points = point_fits(&pose, &points, intrinsics);
+        }
     }
     reports
 }
 
+/// Reprojection errors of corners. Corners that cannot be projected are left out.
+fn point_fits(
+    camera_from_board: &Transform,
+    points: &[BoardPoint],
+    intrinsics: &Intrinsics,
+) -> Vec<PointFit> {
+    points
+        .iter()
+        .filter_map(|point| {
+            let point_in_board = nalgebra::Point3::from(point.point_in_board);
+            let [u, v] = intrinsics.project(&(camera_from_board * point_in_board).coords)?;
+            Some(PointFit {
+                pixel: point.pixel,
+                residual_px: [point.pixel[0] - u, point.pixel[1] - v],
+            })
+        })
+        .collect()
+}
+
+/// One entry per joint of the chain, if offsets were estimated.
 fn joint_offsets(input: &HandEyeInput<'_>, refined: &Refined) -> Vec<JointOffset> {
     let Some(chain) = input.chain.filter(|_| input.options.estimate_joint_offsets) else {
         return Vec::new();
@@ -303,16 +324,20 @@ fn joint_offsets(input: &HandEyeInput<'_>, refined: &Refined) -> Vec<JointOffset
         .collect()
 }
 
+/// Names of the samples with a status.
+fn named(reports: &[SampleReport], status: SampleStatus) -> Vec<&str> {
+    reports
+        .iter()
+        .filter(|report| report.status == status)
+        .map(|report| report.name.as_str())
+        .collect()
+}
+
+/// Problems that do not invalidate the result: those of the lens, of single samples, and of their
+/// number.
 fn problems(input: &HandEyeInput<'_>, refined: &Refined, reports: &[SampleReport]) -> Vec<String> {
     let mut warnings: Vec<String> = refined.intrinsics_doubt.clone().into_iter().collect();
-    let named = |status: SampleStatus| -> Vec<&str> {
-        reports
-            .iter()
-            .filter(|report| report.status == status)
-            .map(|report| report.name.as_str())
-            .collect()
-    };
-    let outliers = named(SampleStatus::Outlier);
+    let outliers = named(reports, SampleStatus::Outlier);
     if !outliers.is_empty() {
         warnings.push(format!(
             "{} samples disagree with the others and were not used: {}",
@@ -320,7 +345,7 @@ fn problems(input: &HandEyeInput<'_>, refined: &Refined, reports: &[SampleReport
             outliers.join(", ")
         ));
     }
-    let without = named(SampleStatus::NoBoard);
+    let without = named(reports, SampleStatus::NoBoard);
     if !without.is_empty() {
         warnings.push(format!(
             "{} images do not show enough corners for a pose: {}",
@@ -328,6 +353,8 @@ fn problems(input: &HandEyeInput<'_>, refined: &Refined, reports: &[SampleReport
             without.join(", ")
         ));
     }
+    // A mirrored board in single samples is a detection with swapped corners; in most samples, it
+    // is the way the board is described.
     let poses: Vec<(usize, Transform)> = refined
         .samples
         .iter()
@@ -347,7 +374,7 @@ fn problems(input: &HandEyeInput<'_>, refined: &Refined, reports: &[SampleReport
             mirrored.join(", ")
         ));
     }
-    let repeated = named(SampleStatus::Repeated);
+    let repeated = named(reports, SampleStatus::Repeated);
     if !repeated.is_empty() {
         let what = if repeated.len() == 1 {
             "sample is"
@@ -371,6 +398,7 @@ fn problems(input: &HandEyeInput<'_>, refined: &Refined, reports: &[SampleReport
             "{n_used} samples were taken at {n_stops} different robot poses: samples at the same pose share its error and count as one"
         ));
     }
+    // Twelve unknowns: with three to five poses, one that is wrong hardly contradicts the others.
     if n_stops < 6 {
         warnings
             .push(format!("only {n_stops} robot poses were used: with fewer than 6, wrong samples may go unnoticed"));
@@ -407,6 +435,7 @@ pub(super) fn residual_information(
     noise: &HandEyeNoise,
 ) -> Option<(geometry::Matrix6x12, Matrix6<f64>)> {
     let predicted = solution.camera_from_board(&measurement.a);
+    // A future measurement is expected to have no residual.
     let jacobian = geometry::residual_jacobian(&predicted, &nalgebra::Vector6::zeros());
     let weight = pose_fit::covariance(setup, measurement, solution, noise)
         .cholesky()?

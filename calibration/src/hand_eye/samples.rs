@@ -62,6 +62,7 @@ pub(super) fn samples(
         without_board: Vec::new(),
         repeated: Vec::new(),
     };
+    // Robot poses of the stops so far.
     let mut stops: Vec<Transform> = Vec::new();
     for (sample_ix, sample) in input.samples.iter().enumerate() {
         if input.samples[..sample_ix]
@@ -71,42 +72,12 @@ pub(super) fn samples(
             sorted.repeated.push(sample_ix);
             continue;
         }
-        let poses: Vec<Candidate> = match (&sample.board, intrinsics) {
-            (BoardObservation::Pose(pose), _) => vec![Candidate {
-                camera_from_board: *pose,
-                board_from_equivalent: Transform::identity(),
-                corners: None,
-            }],
-            (BoardObservation::View(view), Some(intrinsics)) => {
-                likely(planar_pose::board_poses(view, intrinsics))
-                    .into_iter()
-                    .filter_map(of_corners)
-                    .collect()
-            }
-            (BoardObservation::View(_), None) => Vec::new(),
-        };
+        let poses = measured_poses(&sample.board, intrinsics);
         if poses.is_empty() {
             sorted.without_board.push(sample_ix);
             continue;
         }
-        let mut candidates = Vec::new();
-        for pose in &poses {
-            candidates.push(pose.clone());
-            candidates.extend(
-                input
-                    .board_symmetries
-                    .iter()
-                    .filter(|symmetry| !is_identity(symmetry))
-                    .map(|symmetry| {
-                        let camera_from_board = pose.camera_from_board * symmetry;
-                        Candidate {
-                            camera_from_board,
-                            board_from_equivalent: *symmetry,
-                            ..pose.clone()
-                        }
-                    }),
-            );
-        }
+        let candidates = with_symmetries(&poses, input.board_symmetries);
         let a = geometry::a_of(input.setup, &sample.base_from_flange);
         let stop_ix = stops
             .iter()
@@ -125,6 +96,43 @@ pub(super) fn samples(
     sorted
 }
 
+/// The poses of the board that one measurement allows, without its symmetries.
+fn measured_poses(
+    board: &BoardObservation,
+    intrinsics: Option<&kinematics::Intrinsics>,
+) -> Vec<Candidate> {
+    match (board, intrinsics) {
+        (BoardObservation::Pose(pose), _) => vec![Candidate {
+            camera_from_board: *pose,
+            board_from_equivalent: Transform::identity(),
+            corners: None,
+        }],
+        (BoardObservation::View(view), Some(intrinsics)) => {
+            likely(planar_pose::board_poses(view, intrinsics))
+                .into_iter()
+                .filter_map(of_corners)
+                .collect()
+        }
+        (BoardObservation::View(_), None) => Vec::new(),
+    }
+}
+
+/// Every pose, followed by those of the equivalent rotations of the board.
+fn with_symmetries(poses: &[Candidate], symmetries: &[Transform]) -> Vec<Candidate> {
+    let mut candidates = Vec::new();
+    for pose in poses {
+        candidates.push(pose.clone());
+        // The identity is in most lists of symmetries, and would be a second equal candidate.
+        let rotations = symmetries.iter().filter(|symmetry| !is_identity(symmetry));
+        candidates.extend(rotations.map(|symmetry| Candidate {
+            camera_from_board: pose.camera_from_board * symmetry,
+            board_from_equivalent: *symmetry,
+            ..pose.clone()
+        }));
+    }
+    candidates
+}
+
 /// Whether two samples have the same values.
 fn is_same(a: &HandEyeSample, b: &HandEyeSample) -> bool {
     let is_same_board = match (&a.board, &b.board) {
@@ -137,6 +145,7 @@ fn is_same(a: &HandEyeSample, b: &HandEyeSample) -> bool {
 
 /// Whether a robot reports the same pose twice, up to the noise of its encoders.
 fn is_same_stop(a: &Transform, b: &Transform) -> bool {
+    // Above the noise of encoders, below any motion that adds information.
     const SAME_M: f64 = 5e-4;
     const SAME_RAD: f64 = 1e-3;
     let difference = a.inverse() * b;
@@ -164,7 +173,8 @@ fn likely(mut poses: Vec<BoardPose>) -> Vec<BoardPose> {
     /// Ratio of sums of squares; for a board of normal size, a wrong solution exceeds it by orders
     /// of magnitude.
     const MAX_RATIO: f64 = 4.0;
-    const MIN_PX: f64 = 0.05; // Residuals of an exact simulation do not exclude anything.
+    // Residuals of an exact simulation do not exclude anything.
+    const MIN_PX: f64 = 0.05;
     if let [best, second] = poses.as_slice() {
         let floor = best.is_inlier.len() as f64 * MIN_PX * MIN_PX;
         if second.squares_px2 > MAX_RATIO * (best.squares_px2 + floor)
@@ -176,6 +186,7 @@ fn likely(mut poses: Vec<BoardPose>) -> Vec<BoardPose> {
     poses
 }
 
+/// The candidate of a pose from corners. `None` if they do not determine all six parameters.
 fn of_corners(pose: BoardPose) -> Option<Candidate> {
     let unit_covariance = pose.information.try_inverse()?;
     Some(Candidate {

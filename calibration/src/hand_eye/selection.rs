@@ -31,10 +31,12 @@ pub(super) fn reject_and_fit(
 ) -> Result<Stage, Error> {
     /// Squared distance with six degrees of freedom that one good sample in 100 000 exceeds.
     const MAX_SQUARED_DISTANCE: f64 = 33.1;
+    // Sets that alternate end here.
     const MAX_ROUNDS: usize = 8;
     let mut solution = initial;
     let mut stage = None;
     for _ in 0..MAX_ROUNDS {
+        // If a minority agrees, another group of samples may be the right one.
         let n_used = is_inlier.iter().filter(|is_inlier| **is_inlier).count();
         if 2 * n_used < samples.len() || samples::n_stops(samples, &is_inlier) < MIN_SAMPLES {
             return Err(Error::Refused(Box::new(Refusal::new(
@@ -52,7 +54,9 @@ pub(super) fn reject_and_fit(
             solution,
             noise,
         )?;
-        (solution, noise) = (fit.solution, fit.noise);
+        solution = fit.solution;
+        noise = fit.noise;
+        // All samples are judged again, so that a sample that was excluded by a bad start returns.
         let next_choice = consensus::choose(samples, &solution);
         let measurements = pose_fit::measurements(samples, &next_choice);
         let squared_distances: Vec<f64> = measurements
@@ -92,6 +96,7 @@ pub(super) fn corners(input: &HandEyeInput<'_>, sample: &Sample, choice: usize) 
     else {
         return Vec::new();
     };
+    // All samples must describe the same board, so corners are rotated to the chosen orientation.
     let equivalent_from_board = candidate.board_from_equivalent.inverse();
     view.points
         .iter()
@@ -121,6 +126,9 @@ pub(super) struct Free {
     pub(super) joints: bool,
 }
 
+/// Minimizes the reprojection error of the selected samples.
+///
+/// * `offsets`: initial joint offsets; zero if there are none.
 pub(super) fn corner_fit(
     selection: Selection<'_>,
     intrinsics: &Intrinsics,
@@ -139,6 +147,7 @@ pub(super) fn corner_fit(
         .zip(&stage.is_inlier)
         .filter(|(_, is_inlier)| **is_inlier);
     let chain = input.chain.filter(|_| free.joints);
+    // Images at one stop share the error of the robot pose: one block of the problem.
     let mut by_stop = std::collections::BTreeMap::<usize, Vec<View>>::new();
     for ((sample, choice), _) in used {
         let given = &input.samples[sample.sample_ix];
@@ -184,8 +193,10 @@ pub(super) fn corner_noise(
     choice: &[usize],
     is_inlier: &[bool],
 ) -> Option<f64> {
-    const MIN_PX: f64 = 0.003; // Exact corners of a simulation.
-    let (mut squares, mut n_free) = (0.0, 0.0);
+    // Exact corners of a simulation.
+    const MIN_PX: f64 = 0.003;
+    let mut squares = 0.0;
+    let mut n_free = 0.0;
     for ((sample, choice), _) in samples
         .iter()
         .zip(choice)
@@ -194,6 +205,7 @@ pub(super) fn corner_noise(
     {
         let corners = sample.candidates[*choice].corners.as_ref()?;
         squares += corners.squares_px2;
+        // Two coordinates per corner; six parameters were fitted to each image.
         n_free += 2.0
             * corners
                 .is_inlier

@@ -31,22 +31,33 @@ pub fn corners_at_mid_exposure(
     let Some(pose) = board_pose(intrinsics, points) else {
         return points.to_vec();
     };
-    let corrected = |point: &BoardPoint| {
-        let at_mid = pose.camera_from_board * Point3::from(point.point_in_board);
-        let at_row =
-            motion.row_from_mid(point.pixel[1] / f64::from(intrinsics.size_px[1])) * at_mid;
-        let pixels = intrinsics
-            .project(&at_mid.coords)
-            .zip(intrinsics.project(&at_row.coords));
-        let Some((mid, row)) = pixels else {
-            return *point;
-        };
-        BoardPoint {
-            pixel: [0, 1].map(|axis| point.pixel[axis] + mid[axis] - row[axis]),
-            ..*point
-        }
+    points
+        .iter()
+        .map(|point| corrected(intrinsics, &pose.camera_from_board, point, motion))
+        .collect()
+}
+
+/// One corner at mid-exposure.
+fn corrected(
+    intrinsics: &Intrinsics,
+    camera_from_board: &Transform,
+    point: &BoardPoint,
+    motion: &FlangeMotion<'_>,
+) -> BoardPoint {
+    let at_mid = camera_from_board * Point3::from(point.point_in_board);
+    // The row of the detected corner is that in which it was exposed.
+    let at_row = motion.row_from_mid(point.pixel[1] / f64::from(intrinsics.size_px[1])) * at_mid;
+    let pixels = intrinsics
+        .project(&at_mid.coords)
+        .zip(intrinsics.project(&at_row.coords));
+    let Some((mid, row)) = pixels else {
+        return *point;
     };
-    points.iter().map(corrected).collect()
+    // Only the difference of both predictions is applied, so that errors of the pose cancel.
+    BoardPoint {
+        pixel: [0, 1].map(|axis| point.pixel[axis] + mid[axis] - row[axis]),
+        ..*point
+    }
 }
 
 impl FlangeMotion<'_> {

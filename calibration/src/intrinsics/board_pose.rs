@@ -45,17 +45,17 @@ pub fn board_pose(intrinsics: &Intrinsics, points: &[BoardPoint]) -> Option<Boar
 pub(super) fn initial_pose(intrinsics: &Intrinsics, points: &[BoardPoint]) -> Option<Transform> {
     /// 68 degrees from the optical axis.
     const MAX_RADIUS: f64 = 2.5;
+    /// Twice the minimum of a homography, so that the initial pose is not spoiled by a few points.
     const MIN_ACCURATE: usize = 8;
     // Points beyond the lens model are left out.
-    let on_plane = |point: &BoardPoint| {
-        Some((
-            point.point_in_board.xy(),
-            unproject(intrinsics, point.pixel)?,
-        ))
-    };
-    let mut pairs: Vec<_> = points.iter().filter_map(on_plane).collect();
+    let mut pairs = Vec::with_capacity(points.len());
+    for point in points {
+        if let Some(ray) = unproject(intrinsics, point.pixel) {
+            pairs.push((point.point_in_board.xy(), ray));
+        }
+    }
     // Errors of directions close to 90 degrees are large on the plane `z = 1`.
-    let is_accurate = |pair: &(_, Vector2<f64>)| pair.1.norm() < MAX_RADIUS;
+    let is_accurate = |pair: &(Vector2<f64>, Vector2<f64>)| pair.1.norm() < MAX_RADIUS;
     if pairs.iter().filter(|pair| is_accurate(pair)).count() >= MIN_ACCURATE {
         pairs.retain(is_accurate);
     }
@@ -131,10 +131,14 @@ pub(super) fn refine(
     initial: Transform,
 ) -> Option<BoardPose> {
     const MAX_STEPS: usize = 30;
-    const CONVERGED: f64 = 1e-9; // Of the squared error.
+    // Of the squared error.
+    const CONVERGED: f64 = 1e-9;
     let mut at = NormalEquations::new(intrinsics, points, &initial)?;
-    let (mut pose, mut damping) = (initial, 1e-4);
+    let mut pose = initial;
+    let mut damping = 1e-4;
     for _ in 0..MAX_STEPS {
+        // Marquardt's damping is relative to the diagonal, so that radians and meters need no
+        // scales.
         let mut matrix = at.matrix;
         (0..6).for_each(|ix| matrix[(ix, ix)] *= 1.0 + damping);
         let step = -matrix.cholesky()?.solve(&at.gradient);
@@ -144,14 +148,18 @@ pub(super) fn refine(
         match trial {
             Some(trial) => {
                 let converged = at.squares - trial.squares <= CONVERGED * at.squares;
-                (pose, at, damping) = (trial_pose, trial, f64::max(damping * 0.1, 1e-12));
+                pose = trial_pose;
+                at = trial;
+                damping = f64::max(damping * 0.1, 1e-12);
                 if converged {
                     break;
                 }
             }
+            // Steps as short as this one change nothing; the pose is at a minimum.
             None if damping > 1e6 => break,
             None => damping *= 10.0,
         }
+        // The decrease that the linear model predicts.
         if step.dot(&at.gradient).abs() <= CONVERGED * at.squares {
             break;
         }
@@ -162,6 +170,7 @@ pub(super) fn refine(
     })
 }
 
+/// Normal equations of the reprojection error of one image, for the step of [`moved`].
 struct NormalEquations {
     matrix: Matrix6<f64>,
     gradient: Vector6<f64>,

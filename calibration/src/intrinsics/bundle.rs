@@ -12,6 +12,7 @@ use nalgebra::{DVector, Point3, Vector2, Vector6};
 /// Noise of corner detectors that is never undercut, pixels.
 pub(super) const MIN_NOISE_PX: f64 = 0.005;
 
+/// Models with nearly redundant coefficients take the most steps.
 const MAX_STEPS: usize = 60;
 
 /// Intrinsics and the pose `camera_from_board` in each image.
@@ -29,15 +30,20 @@ impl Bundle {
         image_ix: usize,
         points: &[BoardPoint],
     ) -> Vec<Option<Vector2<f64>>> {
-        let residual = |point: &BoardPoint| {
-            let in_camera = self.poses[image_ix] * Point3::from(point.point_in_board);
-            let projected = self.intrinsics.project(&in_camera.coords)?;
-            Some(Vector2::new(
-                point.pixel[0] - projected[0],
-                point.pixel[1] - projected[1],
-            ))
-        };
-        points.iter().map(residual).collect()
+        let pose = &self.poses[image_ix];
+        points
+            .iter()
+            .map(|point| self.residual(pose, point))
+            .collect()
+    }
+
+    fn residual(&self, camera_from_board: &Transform, point: &BoardPoint) -> Option<Vector2<f64>> {
+        let in_camera = camera_from_board * Point3::from(point.point_in_board);
+        let projected = self.intrinsics.project(&in_camera.coords)?;
+        Some(Vector2::new(
+            point.pixel[0] - projected[0],
+            point.pixel[1] - projected[1],
+        ))
     }
 
     /// Norms of the residuals; infinite where the lens cannot image the point.
@@ -89,6 +95,7 @@ pub(super) fn refine(
     least_squares::minimize(&problem, start, &options)
 }
 
+/// One block per image, whose local parameters are the pose of the target.
 struct Reprojection<'a> {
     images: &'a [&'a [BoardPoint]],
     /// Indices of the estimated parameters in [`Intrinsics::params`].
@@ -119,6 +126,7 @@ impl Problem for Reprojection<'_> {
             let projection = bundle.intrinsics.project_with_derivatives(&in_camera)?;
             let by_rotation =
                 projection.by_point * board_pose::by_rotation(pose, &point.point_in_board);
+            // Arrays on the stack, because this runs for every corner in every step.
             let mut rows = [[0.0; MAX_INTRINSICS_PARAMS + 6]; 2];
             for (axis, row) in rows.iter_mut().enumerate() {
                 for (derivative, param) in row.iter_mut().zip(&self.params) {

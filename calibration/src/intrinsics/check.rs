@@ -24,42 +24,10 @@ pub(super) fn usable_images(
     views: &[BoardView],
     sizes_px: &[[u32; 2]],
 ) -> Result<(Vec<usize>, Vec<Rejected>), Error> {
-    if sizes_px.len() != views.len() {
-        return Err(Error::ImageSizes {
-            n_images: views.len(),
-            n_sizes: sizes_px.len(),
-        });
-    }
-    for (view, size_px) in views.iter().zip(sizes_px) {
-        if *size_px != sizes_px[0] {
-            let (first, first_px) = (views[0].name.clone(), sizes_px[0]);
-            return Err(Error::MixedImageSizes {
-                first,
-                first_px,
-                other: view.name.clone(),
-                other_px: *size_px,
-            });
-        }
-        if size_px.contains(&0) {
-            return Err(Error::EmptyImage {
-                image: view.name.clone(),
-            });
-        }
-        let is_finite = |point: &BoardPoint| {
-            point
-                .pixel
-                .iter()
-                .chain(point.point_in_board.iter())
-                .all(|value| value.is_finite())
-        };
-        if !view.points.iter().all(is_finite) {
-            return Err(Error::NonFinitePoint {
-                image: view.name.clone(),
-            });
-        }
-    }
+    check_views(views, sizes_px)?;
     check_target(views.iter().flat_map(|view| &view.points))?;
-    let (mut usable, mut rejected) = (Vec::new(), Vec::new());
+    let mut usable = Vec::new();
+    let mut rejected = Vec::new();
     for (ix, view) in views.iter().enumerate() {
         let n_points = view.points.len();
         let distance_px = |other: &usize| median_distance_px(view, &views[*other]);
@@ -87,17 +55,59 @@ pub(super) fn usable_images(
     Ok((usable, rejected))
 }
 
+/// Rejects images of different sizes, and points that are not finite.
+fn check_views(views: &[BoardView], sizes_px: &[[u32; 2]]) -> Result<(), Error> {
+    if sizes_px.len() != views.len() {
+        return Err(Error::ImageSizes {
+            n_images: views.len(),
+            n_sizes: sizes_px.len(),
+        });
+    }
+    for (view, size_px) in views.iter().zip(sizes_px) {
+        // One lens has one size: intrinsics of cropped or scaled images differ.
+        if *size_px != sizes_px[0] {
+            return Err(Error::MixedImageSizes {
+                first: views[0].name.clone(),
+                first_px: sizes_px[0],
+                other: view.name.clone(),
+                other_px: *size_px,
+            });
+        }
+        if size_px.contains(&0) {
+            return Err(Error::EmptyImage {
+                image: view.name.clone(),
+            });
+        }
+        if !view.points.iter().all(is_finite) {
+            return Err(Error::NonFinitePoint {
+                image: view.name.clone(),
+            });
+        }
+    }
+    Ok(())
+}
+
+/// Whether all coordinates of a point are finite.
+fn is_finite(point: &BoardPoint) -> bool {
+    point
+        .pixel
+        .iter()
+        .chain(point.point_in_board.iter())
+        .all(|value| value.is_finite())
+}
+
 /// Median distance of the points that two images share, pixels; `None` if they do not share most of
 /// them.
 fn median_distance_px(view: &BoardView, other: &BoardView) -> Option<f64> {
-    let distance = |point: &BoardPoint| {
-        let same = other
-            .points
-            .iter()
-            .find(|other| other.point_in_board == point.point_in_board)?;
-        Some((point.pixel[0] - same.pixel[0]).hypot(point.pixel[1] - same.pixel[1]))
-    };
-    let distances: Vec<f64> = view.points.iter().filter_map(distance).collect();
+    let distances: Vec<f64> = view
+        .points
+        .iter()
+        .filter_map(|point| {
+            let mut others = other.points.iter();
+            let same = others.find(|other| other.point_in_board == point.point_in_board)?;
+            Some((point.pixel[0] - same.pixel[0]).hypot(point.pixel[1] - same.pixel[1]))
+        })
+        .collect();
     if 2 * distances.len() < view.points.len() {
         None
     } else {
@@ -116,7 +126,9 @@ pub(super) fn check_n_images(n_images: usize) -> Result<(), Error> {
     }
 }
 
+/// Rejects targets of an implausible size, and targets that are not flat.
 fn check_target<'a>(points: impl Iterator<Item = &'a BoardPoint> + Clone) -> Result<(), Error> {
+    /// Outside, the points are probably in other units.
     const SIZES_M: std::ops::RangeInclusive<f64> = 0.002..=10.0;
     /// Allowed deviation from a plane, relative to the size of the target.
     const MAX_BEND: f64 = 0.02;
@@ -154,12 +166,14 @@ pub(super) fn check_observable(fit: &Fit<Bundle>) -> Result<(), Error> {
     const FOCAL_FRACS: std::ops::Range<f64> = 0.05..100.0;
     let intrinsics = &fit.state.intrinsics;
     let side_px = f64::from(intrinsics.size_px[0].max(intrinsics.size_px[1]));
+    // For messages: without tilts, focal length and distance cannot be distinguished.
     let max_tilt_deg = fit.state.poses.iter().map(|pose| {
         let normal = pose.rotation * Vector3::z();
         normal.z.abs().min(1.0).acos().to_degrees()
     });
     let max_tilt_deg = max_tilt_deg.fold(0.0, f64::max);
     for (axis, focal_px) in intrinsics.focal_px.into_iter().enumerate() {
+        // Written so that NaN is refused.
         let sigma_frac = fit.sigma(axis) / focal_px.abs();
         if !(sigma_frac < MAX_SIGMA_FRAC && FOCAL_FRACS.contains(&(focal_px / side_px))) {
             return Err(Error::FocalLengthUnobservable {

@@ -86,6 +86,8 @@ impl Coefficients {
 
     /// Typical magnitudes of the estimated parameters.
     pub(super) fn scales(self, intrinsics: &Intrinsics) -> DVector<f64> {
+        // Radial coefficients of common lenses are a few tenths. Tangential ones describe elements
+        // that are not centered, and are ten times smaller.
         const COEFFICIENT: f64 = 0.1;
         const TANGENTIAL: f64 = 0.01;
         let [fx, fy] = intrinsics.focal_px.map(f64::abs);
@@ -103,6 +105,7 @@ impl Coefficients {
     /// Intrinsics with this lens model. Coefficients of the given intrinsics are kept if they exist
     /// in this model and are estimated.
     pub(super) fn applied_to(self, intrinsics: &Intrinsics) -> Intrinsics {
+        // Coefficients of the two families have the same names, but other meanings.
         let is_fisheye = |lens: &Lens| matches!(lens, Lens::KannalaBrandt(_));
         let mut k = [0.0; 8];
         if is_fisheye(&intrinsics.lens) == (self.family == Family::KannalaBrandt) {

@@ -14,6 +14,8 @@ pub struct ImageGrid<T> {
     pub values: Vec<T>,
 }
 
+/// Cells of the aspect ratio of common images, 16:9. With more cells, more images are needed to
+/// cover them.
 const N_COLUMNS: usize = 16;
 const N_ROWS: usize = 9;
 
@@ -24,11 +26,13 @@ impl ImageGrid<usize> {
     }
 }
 
+/// See [`ImageGrid::coverage`].
 fn coverage(size_px: [u32; 2], pixels: impl Iterator<Item = [f64; 2]>) -> ImageGrid<usize> {
     let mut values = vec![0; N_COLUMNS * N_ROWS];
     for [x, y] in pixels {
         let [width, height] = size_px.map(f64::from);
-        let (column, row) = (x / width * N_COLUMNS as f64, y / height * N_ROWS as f64);
+        let column = x / width * N_COLUMNS as f64;
+        let row = y / height * N_ROWS as f64;
         if (0.0..N_COLUMNS as f64).contains(&column) && (0.0..N_ROWS as f64).contains(&row) {
             #[expect(
                 clippy::cast_possible_truncation,
@@ -57,6 +61,15 @@ fn centers(size_px: [u32; 2]) -> impl Iterator<Item = [f64; 2]> + Clone {
             ]
         })
     })
+}
+
+/// Standard deviation of a pixel in the worst direction, from its derivatives with respect to
+/// parameters with this covariance.
+fn sigma_px(derivatives: &DMatrix<f64>, covariance: &DMatrix<f64>) -> f64 {
+    let product = derivatives * covariance * derivatives.transpose();
+    let [a, b, c] = [product[(0, 0)], product[(0, 1)], product[(1, 1)]];
+    let eigenvalues = Matrix2::new(a, b, b, c).symmetric_eigenvalues();
+    eigenvalues.max().max(0.0).sqrt()
 }
 
 /// Derivatives of the projection of distant points with respect to the intrinsics, at the centers
@@ -89,7 +102,9 @@ impl ProjectionDerivatives {
                     Some((by_params, by_point * -direction.cross_matrix()))
                 })
                 .collect();
-        let (mut normal_matrix, mut rhs) = (Matrix3::zeros(), Matrix3xX::zeros(params.len()));
+        // One least-squares problem per parameter, all with the same normal matrix.
+        let mut normal_matrix = Matrix3::zeros();
+        let mut rhs = Matrix3xX::zeros(params.len());
         for (by_params, by_rotation) in uncompensated.iter().flatten() {
             normal_matrix += by_rotation.tr_mul(by_rotation);
             rhs += by_rotation.transpose() * by_params;
@@ -97,32 +112,24 @@ impl ProjectionDerivatives {
         // Without an inverse there is nothing to rotate: the lens images no cell.
         let inverse = normal_matrix.try_inverse().unwrap_or_else(Matrix3::zeros);
         let rotation_by_params = -(inverse * rhs);
-        let compensated = |(by_params, by_rotation): (DMatrix<f64>, Matrix2x3<f64>)| {
-            let by_rotation = by_rotation * &rotation_by_params;
-            DMatrix::from_fn(2, params.len(), |row, column| {
-                by_params[(row, column)] + by_rotation[(row, column)]
-            })
-        };
-        Self {
-            cells: uncompensated
-                .into_iter()
-                .map(|cell| cell.map(compensated))
-                .collect(),
+        let mut cells = Vec::with_capacity(uncompensated.len());
+        for cell in uncompensated {
+            cells.push(cell.map(|(by_params, by_rotation)| {
+                let by_rotation = by_rotation * &rotation_by_params;
+                DMatrix::from_fn(2, params.len(), |row, column| {
+                    by_params[(row, column)] + by_rotation[(row, column)]
+                })
+            }));
         }
+        Self { cells }
     }
 
     /// Standard deviation in the worst direction of the image, pixels.
     pub(super) fn sigmas_px(&self, covariance: &DMatrix<f64>) -> ImageGrid<Option<f64>> {
-        let sigma_px = |derivatives: &DMatrix<f64>| {
-            let product = derivatives * covariance * derivatives.transpose();
-            let [a, b, c] = [product[(0, 0)], product[(0, 1)], product[(1, 1)]];
-            let eigenvalues = Matrix2::new(a, b, b, c).symmetric_eigenvalues();
-            eigenvalues.max().max(0.0).sqrt()
-        };
         let values = self
             .cells
             .iter()
-            .map(|cell| cell.as_ref().map(sigma_px))
+            .map(|cell| Some(sigma_px(cell.as_ref()?, covariance)))
             .collect();
         ImageGrid {
             n_columns: N_COLUMNS,
@@ -225,6 +232,7 @@ pub(super) fn information(
         cross.gemm_tr(1.0, &by_pose, &by_params, 1.0);
         local += by_pose.tr_mul(&by_pose);
     }
+    // The Schur complement: what the image says about the intrinsics after its pose is estimated.
     let eliminated = local.cholesky()?.solve(&cross);
     Some(shared - cross.transpose() * eliminated)
 }

@@ -12,10 +12,11 @@ use std::fmt;
 
 /// Number of images after which no more are needed, if they cover everything.
 pub const RECOMMENDED_IMAGES: usize = 15;
-/// A part of the image is covered if this fraction of its cells has corners.
+/// A part of the image is covered if this fraction of its cells has corners. A target rarely reaches
+/// the outermost cells, so all of them would ask too much.
 const MIN_COVERED_FRAC: f64 = 0.5;
 /// A tilt in a direction counts from this angle between the normal of the target and the line of
-/// sight.
+/// sight. It is below the 20 degrees that are asked for, because people tilt by eye.
 const MIN_TILT_DEG: f64 = 15.0;
 /// Number of images with each tilt.
 const MIN_TILTED: usize = 2;
@@ -88,13 +89,8 @@ impl IntrinsicsGuidance {
     ///
     /// * `intrinsics`: an approximate lens, for the tilts; its size is that of the images.
     pub fn new(views: &[BoardView], intrinsics: &Intrinsics) -> Self {
-        let pixels = || {
-            views
-                .iter()
-                .flat_map(|view| &view.points)
-                .map(|point| point.pixel)
-        };
-        let coverage = ImageGrid::coverage(intrinsics.size_px, pixels());
+        let points = views.iter().flat_map(|view| &view.points);
+        let coverage = ImageGrid::coverage(intrinsics.size_px, points.map(|point| point.pixel));
         let n_covered = coverage.values.iter().filter(|n| **n > 0).count();
         Self {
             n_images: views.len(),
@@ -117,15 +113,7 @@ fn advice(
         .iter()
         .filter_map(|view| tilt_deg(view, intrinsics))
         .collect();
-    let is_tilted = |side: Side, [about_x, about_y]: [f64; 2]| {
-        let angle = match side {
-            Side::Left => about_y,
-            Side::Right => -about_y,
-            Side::Upper => -about_x,
-            Side::Lower => about_x,
-        };
-        angle >= MIN_TILT_DEG
-    };
+    // Tilts first: they determine the focal length, without which coverage is of little use.
     let n_tilted = |side: Side| tilts.iter().filter(|tilt| is_tilted(side, **tilt)).count();
     let missing_tilt = [Side::Left, Side::Right, Side::Upper, Side::Lower]
         .into_iter()
@@ -144,14 +132,27 @@ fn advice(
     }
 }
 
+/// Whether a tilt, as of [`tilt_deg`], moves a side away from the camera.
+fn is_tilted(side: Side, [about_x, about_y]: [f64; 2]) -> bool {
+    let angle = match side {
+        Side::Left => about_y,
+        Side::Right => -about_y,
+        Side::Upper => -about_x,
+        Side::Lower => about_x,
+    };
+    angle >= MIN_TILT_DEG
+}
+
 /// Fraction of the cells with corners among those whose centers are in a part of the image.
 fn covered_frac(coverage: &ImageGrid<usize>, [columns, rows]: [[f64; 2]; 2]) -> f64 {
     let is_inside = |ix: usize, n: usize, [low, high]: [f64; 2]| {
         (low..high).contains(&((ix as f64 + 0.5) / n as f64))
     };
-    let (mut n, mut n_covered) = (0_u32, 0_u32);
+    let mut n = 0_u32;
+    let mut n_covered = 0_u32;
     for (ix, value) in coverage.values.iter().enumerate() {
-        let (column, row) = (ix % coverage.n_columns, ix / coverage.n_columns);
+        let column = ix % coverage.n_columns;
+        let row = ix / coverage.n_columns;
         if is_inside(column, coverage.n_columns, columns) && is_inside(row, coverage.n_rows, rows) {
             n += 1;
             n_covered += u32::from(*value > 0);
@@ -174,6 +175,7 @@ fn tilt_deg(view: &BoardView, intrinsics: &Intrinsics) -> Option<[f64; 2]> {
     let sight = (pose * nalgebra::Point3::from(center))
         .coords
         .try_normalize(0.0)?;
+    // A numbering of the points may be mirrored, so the normal may point to either side.
     let normal = pose.rotation * Vector3::z();
     let normal = if normal.dot(&sight) < 0.0 {
         -normal

@@ -20,10 +20,14 @@ pub(crate) fn homography(pairs: &[(Vector2<f64>, Vector2<f64>)]) -> Option<Matri
     }
     let normalize_from = normalization(pairs.iter().map(|pair| pair.0))?;
     let normalize_to = normalization(pairs.iter().map(|pair| pair.1))?;
-    let (mut normal_matrix, mut rhs) = (SMatrix::<f64, 8, 8>::zeros(), SVector::<f64, 8>::zeros());
+    let mut normal_matrix = SMatrix::<f64, 8, 8>::zeros();
+    let mut rhs = SVector::<f64, 8>::zeros();
     for (from, to) in pairs {
-        let (from, to) = (normalize_from.apply(from), normalize_to.apply(to));
-        let (x, y) = (from.x, from.y);
+        let from = normalize_from.apply(from);
+        let to = normalize_to.apply(to);
+        let x = from.x;
+        let y = from.y;
+        // The projection equations, multiplied by the depth.
         let rows = [
             (
                 SVector::from([x, y, 1.0, 0.0, 0.0, 0.0, -to.x * x, -to.x * y]),
@@ -61,6 +65,7 @@ struct Normalization {
     scale: f64,
 }
 
+/// `None` if all points are the same, or one is not finite.
 fn normalization(points: impl Iterator<Item = Vector2<f64>> + Clone) -> Option<Normalization> {
     let n = points.clone().count() as f64;
     let mean = points.clone().sum::<Vector2<f64>>() / n;
@@ -112,19 +117,21 @@ impl Normalization {
 ///
 /// Source: Zhang 2000, section 3.1; the rotation is the nearest one (appendix C).
 pub(super) fn pose(homography: &Matrix3<f64>) -> Option<Transform> {
-    let (first, second) = (
-        homography.column(0).into_owned(),
-        homography.column(1).into_owned(),
-    );
+    // The first two columns are those of the rotation, up to the scale. With noise, their lengths
+    // differ a little.
+    let first = homography.column(0).into_owned();
+    let second = homography.column(1).into_owned();
     let length = 0.5 * (first.norm() + second.norm());
     if !(length > 0.0 && length.is_finite()) {
         return None;
     }
     // The target is in front of the camera.
     let scale = if homography[(2, 2)] < 0.0 { -1.0 } else { 1.0 } / length;
-    let (x, y) = (first * scale, second * scale);
+    let x = first * scale;
+    let y = second * scale;
     let svd = Matrix3::from_columns(&[x, y, x.cross(&y)]).svd(true, true);
-    let (u, v_t) = (svd.u?, svd.v_t?);
+    let u = svd.u?;
+    let v_t = svd.v_t?;
     let mut rotation = u * v_t;
     if rotation.determinant() < 0.0 {
         rotation = u * Matrix3::from_diagonal(&Vector3::new(1.0, 1.0, -1.0)) * v_t;

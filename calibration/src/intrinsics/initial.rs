@@ -28,22 +28,13 @@ impl Start {
         poses: Vec<Option<Transform>>,
         images: &[&[BoardPoint]],
     ) -> Self {
-        let error_px = |(pose, points): (&Option<Transform>, &&[BoardPoint])| {
-            let Some(pose) = pose else {
-                return f64::INFINITY;
-            };
-            let bundle = Bundle {
-                intrinsics: intrinsics.clone(),
-                poses: vec![*pose],
-            };
-            let squares = bundle
-                .errors_px(0, points)
-                .into_iter()
-                .map(|error| error * error)
-                .sum::<f64>();
-            (squares / points.len() as f64).sqrt()
-        };
-        let errors_px = poses.iter().zip(images).map(error_px).collect();
+        let errors_px = poses
+            .iter()
+            .zip(images)
+            .map(|(pose, points)| {
+                pose.map_or(f64::INFINITY, |pose| rms_px(&intrinsics, pose, points))
+            })
+            .collect();
         Self {
             intrinsics,
             poses,
@@ -55,6 +46,20 @@ impl Start {
     pub(super) fn median_error_px(&self) -> f64 {
         median(&self.errors_px).unwrap_or(f64::INFINITY)
     }
+}
+
+/// Root mean square of the reprojection error of one image, pixels.
+fn rms_px(intrinsics: &Intrinsics, pose: Transform, points: &[BoardPoint]) -> f64 {
+    let bundle = Bundle {
+        intrinsics: intrinsics.clone(),
+        poses: vec![pose],
+    };
+    let squares = bundle
+        .errors_px(0, points)
+        .into_iter()
+        .map(|error| error * error)
+        .sum::<f64>();
+    (squares / points.len() as f64).sqrt()
 }
 
 /// Initial values for lenses that are close to a pinhole: the best of Zhang's closed form, of the
@@ -71,6 +76,8 @@ pub(super) fn pinhole(images: &[&[BoardPoint]], size_px: [u32; 2]) -> Option<Sta
         .iter()
         .map(|homography| centered(homography, size_px))
         .collect();
+    // Closed forms are exact without distortion, but fail for few or similar tilts. The scan is
+    // coarse, but never fails.
     let closed_forms = [zhang(&normalized), single_focal(&normalized)];
     let scan = PINHOLE_FOCAL_FRACS.map(|frac| Some(([frac; 2], [0.0; 2])));
     let candidates = closed_forms.into_iter().chain(scan).flatten();
@@ -116,11 +123,13 @@ pub(super) fn fisheye(images: &[&[BoardPoint]], size_px: [u32; 2]) -> Option<Sta
     best(refined)
 }
 
+/// The start with the smallest median error. `None` if half of its images have no pose.
 fn best(starts: impl Iterator<Item = Start>) -> Option<Start> {
     let best = starts.min_by(|a, b| a.median_error_px().total_cmp(&b.median_error_px()))?;
     best.median_error_px().is_finite().then_some(best)
 }
 
+/// The homography from the plane of the target to the image.
 fn pixel_from_plane(points: &[BoardPoint]) -> Option<Matrix3<f64>> {
     let pairs: Vec<_> = points
         .iter()
@@ -144,11 +153,14 @@ fn centered(homography: &Matrix3<f64>, size_px: [u32; 2]) -> Matrix3<f64> {
         0.0,
         1.0,
     );
+    // The scale of a homography is arbitrary. Columns of unit length give all images the same
+    // weight.
     let homography = normalize * homography;
     let length = (homography.column(0).norm() * homography.column(1).norm()).sqrt();
     homography / length
 }
 
+/// Center and longer side of the image, pixels.
 fn frame(size_px: [u32; 2]) -> ([f64; 2], f64) {
     (
         size_px.map(|side| 0.5 * f64::from(side)),
@@ -162,6 +174,7 @@ type Plane = ([f64; 2], [f64; 2]);
 /// Converts to pixels. `None` if the focal lengths are implausible or the principal point is
 /// outside the image.
 fn denormalized((focal, principal): Plane, size_px: [u32; 2], lens: Lens) -> Option<Intrinsics> {
+    // Closed forms of nearly degenerate images give arbitrary numbers.
     const FOCAL_FRACS: std::ops::Range<f64> = 0.05..100.0;
     const MAX_ASPECT: f64 = 2.0;
     let (center, side) = frame(size_px);
@@ -188,25 +201,19 @@ fn zhang(homographies: &[Matrix3<f64>]) -> Option<Plane> {
     }
     let mut normal_matrix = Matrix6::zeros();
     for homography in homographies {
-        let constraint = |i: usize, j: usize| {
-            let (a, b) = (homography.column(i), homography.column(j));
-            Vector6::new(
-                a[0] * b[0],
-                a[0] * b[1] + a[1] * b[0],
-                a[1] * b[1],
-                a[2] * b[0] + a[0] * b[2],
-                a[2] * b[1] + a[1] * b[2],
-                a[2] * b[2],
-            )
-        };
-        for row in [constraint(0, 1), constraint(0, 0) - constraint(1, 1)] {
+        // The first two columns of a rotation are orthogonal and have the same length.
+        for row in [
+            constraint(homography, 0, 1),
+            constraint(homography, 0, 0) - constraint(homography, 1, 1),
+        ] {
             normal_matrix += row * row.transpose();
         }
     }
-    // No skew.
+    // No skew: one more row per image that sets the second element to zero.
     normal_matrix[(1, 1)] += homographies.len() as f64;
     let eigen = normal_matrix.symmetric_eigen();
     let b = eigen.eigenvectors.column(eigen.eigenvalues.imin());
+    // Elements of the image of the absolute conic, in the notation of Zhang's appendix B.
     let [b11, b12, b22, b13, b23, b33] = [b[0], b[1], b[2], b[3], b[4], b[5]];
     let determinant = b11 * b22 - b12 * b12;
     let cy = (b12 * b13 - b11 * b23) / determinant;
@@ -221,6 +228,20 @@ fn zhang(homographies: &[Matrix3<f64>]) -> Option<Plane> {
         .then_some(([fx, fy], [cx, cy]))
 }
 
+/// The vector `v_ij` of Zhang 2000, equation 7, for two columns of a homography.
+fn constraint(homography: &Matrix3<f64>, i: usize, j: usize) -> Vector6<f64> {
+    let a = homography.column(i);
+    let b = homography.column(j);
+    Vector6::new(
+        a[0] * b[0],
+        a[0] * b[1] + a[1] * b[0],
+        a[1] * b[1],
+        a[2] * b[0] + a[0] * b[2],
+        a[2] * b[1] + a[1] * b[2],
+        a[2] * b[2],
+    )
+}
+
 /// Closed form for one focal length, with the principal point at the center of the image and square
 /// pixels.
 ///
@@ -229,17 +250,24 @@ fn zhang(homographies: &[Matrix3<f64>]) -> Option<Plane> {
 fn single_focal(homographies: &[Matrix3<f64>]) -> Option<Plane> {
     let mut sums = Matrix2::<f64>::zeros();
     for homography in homographies {
-        let dot = |i: usize, j: usize| {
-            let (a, b) = (homography.column(i), homography.column(j));
-            Vector2::new(a[0] * b[0] + a[1] * b[1], -a[2] * b[2])
-        };
-        for row in [dot(0, 1), dot(0, 0) - dot(1, 1)] {
+        for row in [
+            products(homography, 0, 1),
+            products(homography, 0, 0) - products(homography, 1, 1),
+        ] {
             sums += row * row.transpose();
         }
     }
     // row[0] / focal² = row[1].
     let focal = (sums[(0, 0)] / sums[(0, 1)]).sqrt();
     focal.is_finite().then_some(([focal; 2], [0.0; 2]))
+}
+
+/// Product of two columns of a homography: of the first two rows, which are divided by the squared
+/// focal length, and minus that of the last row.
+fn products(homography: &Matrix3<f64>, i: usize, j: usize) -> Vector2<f64> {
+    let a = homography.column(i);
+    let b = homography.column(j);
+    Vector2::new(a[0] * b[0] + a[1] * b[1], -a[2] * b[2])
 }
 
 #[cfg(test)]

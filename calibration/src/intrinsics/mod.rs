@@ -71,6 +71,8 @@ pub enum LensModel {
 /// If the input is malformed, if too few images are usable, if no lens model fits, or if the images
 /// do not determine the focal length or the principal point. The message contains the remedy.
 pub fn calibrate_intrinsics(input: &IntrinsicsInput<'_>) -> Result<IntrinsicsCalibration, Error> {
+    // Each phase rejects what would mislead the next one: malformed input, gross errors of single
+    // corners, images that contradict the others, and results that are not determined.
     let (usable, mut rejected) = check::usable_images(input.views, input.sizes_px)?;
     let images: Vec<&[BoardPoint]> = usable
         .iter()
@@ -122,6 +124,7 @@ fn select(
     near_pinhole: Option<RobustFit>,
     fisheye: Option<RobustFit>,
 ) -> Result<(Option<RobustFit>, Vec<LensTrial>), Error> {
+    // Relative to the better of both typical errors. A wrong lens model has errors far above it.
     const MAX_ERROR_RATIO: f64 = 3.0;
     // A fit that rejects images is not better than one that explains them, and one with large
     // errors explains none.
@@ -158,12 +161,15 @@ fn select(
 
 /// Refuses a fit with errors that no corner detector has.
 fn check_match(fit: &RobustFit, size_px: [u32; 2]) -> Result<(), Error> {
+    // Of the longer side of the image: 38 px of 1280. Errors of this size come from a wrong layout
+    // of the target.
     const MAX_ERROR_FRAC: f64 = 0.03;
     let side_px = f64::from(size_px[0].max(size_px[1]));
-    match fit.typical_px < MAX_ERROR_FRAC * side_px {
-        true => Ok(()),
-        false => Err(Error::TargetMismatch {
+    if fit.typical_px < MAX_ERROR_FRAC * side_px {
+        Ok(())
+    } else {
+        Err(Error::TargetMismatch {
             error_px: format!("{:.1}", fit.typical_px),
-        }),
+        })
     }
 }

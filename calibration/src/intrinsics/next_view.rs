@@ -32,6 +32,7 @@ const REGIONS: [([f64; 2], &str); 9] = [
     ([1.0, 1.0], "at the lower right of the image"),
 ];
 
+/// Large enough to determine the focal length, small enough for corners to be detected well.
 const TILT_DEG: f64 = 35.0;
 /// Rotation axes of the tilts in the camera frame, and the side of the target that is farther away.
 const TILTS: [([f64; 2], Option<&str>); 9] = [
@@ -76,6 +77,8 @@ pub(super) fn suggest(
         let covariance = information.cholesky()?.inverse() * known.variance;
         Some(mean_square.dot(&covariance).max(0.0).sqrt())
     };
+    // 162 poses. Each adds the information of one image with all points of the target, as if none
+    // were missed.
     let current_px = sigma_px(known.information.clone())?;
     let mut best: Option<NextView> = None;
     for (region, region_words) in REGIONS {
@@ -103,21 +106,12 @@ pub(super) fn suggest(
                     .as_ref()
                     .is_none_or(|best| predicted_sigma_px < best.predicted_sigma_px)
                 {
-                    let tilt = match side {
-                        Some(side) => {
-                            format!(
-                                "tilt the target {TILT_DEG:.0} degrees with its {side} away from the camera"
-                            )
-                        }
-                        None => "hold the target facing the camera".to_owned(),
-                    };
-                    let distance_m = (camera_from_board * nalgebra::Point3::from(board.center))
-                        .coords
-                        .norm();
-                    let instruction = format!("{tilt}, {region_words}, {distance_m:.2} m away");
+                    let center = camera_from_board * nalgebra::Point3::from(board.center);
+                    let distance_m = center.coords.norm();
+                    let tilt = tilt_words(side);
                     best = Some(NextView {
                         camera_from_board,
-                        instruction,
+                        instruction: format!("{tilt}, {region_words}, {distance_m:.2} m away"),
                         sigma_px: current_px,
                         predicted_sigma_px,
                     });
@@ -126,6 +120,16 @@ pub(super) fn suggest(
         }
     }
     best
+}
+
+/// How to hold the target.
+fn tilt_words(side: Option<&str>) -> String {
+    match side {
+        Some(side) => {
+            format!("tilt the target {TILT_DEG:.0} degrees with its {side} away from the camera")
+        }
+        None => "hold the target facing the camera".to_owned(),
+    }
 }
 
 /// All points of the target that were seen in any image.
@@ -142,6 +146,7 @@ impl Board {
             .flat_map(|points| *points)
             .map(|p| p.point_in_board)
             .collect();
+        // Sorted, so that equal points are neighbors.
         let key = |point: &Vector3<f64>| [point.x, point.y, point.z];
         points.sort_by(|a, b| {
             key(a)
@@ -172,6 +177,7 @@ impl Board {
         let distance_for = |axis: usize| {
             intrinsics.focal_px[axis] * self.extent[axis] / (extent_frac * size_px[axis])
         };
+        // Both sides of the target must fit.
         let distance_m = f64::max(distance_for(0), distance_for(1));
         let pixel = [0, 1].map(|axis| {
             let half_extent_px = 0.5 * intrinsics.focal_px[axis] * self.extent[axis] / distance_m;

@@ -7,7 +7,7 @@ use super::grid::{ImageGrid, ProjectionDerivatives};
 use super::next_view::{self, NextView};
 use super::robust::RobustFit;
 use super::selection::LensTrial;
-use crate::BoardView;
+use crate::{BoardPoint, BoardView};
 use kinematics::quantile::median;
 use kinematics::{Intrinsics, Lens, Transform};
 use nalgebra::DMatrix;
@@ -187,46 +187,54 @@ impl std::fmt::Display for RejectionReason {
 
 /// The images and corners that a fit does not use.
 pub(super) fn rejections(views: &[&BoardView], fit: &RobustFit) -> Vec<Rejected> {
-    let (kept, intrinsics) = (&fit.kept, &fit.fit.state.intrinsics);
-    let typical_px = fit.typical_px;
-    let reason = |(image_ix, view): (usize, &&BoardView)| {
-        let position = kept
-            .image_ixs
-            .iter()
-            .position(|kept_ix| *kept_ix == image_ix);
-        let pose = match position {
-            Some(position) => Some(fit.fit.state.poses[position]),
-            None => board_pose(intrinsics, &view.points).map(|pose| pose.camera_from_board),
-        };
-        let errors_px = pose.map_or(vec![f64::INFINITY], |pose| {
-            let single = Bundle {
-                intrinsics: intrinsics.clone(),
-                poses: vec![pose],
-            };
-            single.errors_px(0, &view.points)
-        });
-        let Some(position) = position else {
-            let median_px = median(&errors_px).unwrap_or(f64::INFINITY);
-            return Some(RejectionReason::Inconsistent {
-                median_px,
-                typical_px,
+    let mut rejected = Vec::new();
+    for (image_ix, view) in views.iter().enumerate() {
+        if let Some(reason) = rejection(image_ix, view, fit) {
+            rejected.push(Rejected {
+                image: view.name.clone(),
+                reason,
             });
+        }
+    }
+    rejected
+}
+
+/// Why an image or some of its corners are not used. `None` if all are.
+fn rejection(image_ix: usize, view: &BoardView, fit: &RobustFit) -> Option<RejectionReason> {
+    let kept = &fit.kept;
+    let intrinsics = &fit.fit.state.intrinsics;
+    let typical_px = fit.typical_px;
+    let position = kept
+        .image_ixs
+        .iter()
+        .position(|kept_ix| *kept_ix == image_ix);
+    // A rejected image has no pose in the fit, so its best pose is searched.
+    let pose = match position {
+        Some(position) => Some(fit.fit.state.poses[position]),
+        None => board_pose(intrinsics, &view.points).map(|pose| pose.camera_from_board),
+    };
+    let errors_px = pose.map_or(vec![f64::INFINITY], |pose| {
+        let single = Bundle {
+            intrinsics: intrinsics.clone(),
+            poses: vec![pose],
         };
-        let n_corners = view.points.len() - kept.points[position].len();
-        let max_px = errors_px.iter().copied().fold(0.0, f64::max);
-        (n_corners > 0).then_some(RejectionReason::Corners {
-            n_corners,
-            max_px,
+        single.errors_px(0, &view.points)
+    });
+    let Some(position) = position else {
+        let median_px = median(&errors_px).unwrap_or(f64::INFINITY);
+        return Some(RejectionReason::Inconsistent {
+            median_px,
             typical_px,
-        })
+        });
     };
-    let rejected = |(ix, view): (usize, &&BoardView)| {
-        Some(Rejected {
-            image: view.name.clone(),
-            reason: reason((ix, view))?,
-        })
-    };
-    views.iter().enumerate().filter_map(rejected).collect()
+    // Corners are rejected from the largest error on, so the largest of all is one of them.
+    let n_corners = view.points.len() - kept.points[position].len();
+    let max_px = errors_px.iter().copied().fold(0.0, f64::max);
+    (n_corners > 0).then_some(RejectionReason::Corners {
+        n_corners,
+        max_px,
+        typical_px,
+    })
 }
 
 /// Summarizes a fit.
@@ -255,14 +263,7 @@ pub(super) fn report(
         .iter()
         .enumerate()
         .map(|(ix, view_ix)| {
-            let points = &kept.points[ix];
-            let residuals = fit.state.residuals(ix, points).into_iter().flatten();
-            let points = points.iter().zip(residuals);
-            let points = points.map(|(point, residual)| PointFit {
-                pixel: point.pixel,
-                residual_px: residual.into(),
-            });
-            let points: Vec<PointFit> = points.collect();
+            let points = point_fits(&fit.state, ix, &kept.points[ix]);
             ImageFit {
                 name: views[*view_ix].name.clone(),
                 rms_px: rms_px(points.iter()),
@@ -271,6 +272,7 @@ pub(super) fn report(
             }
         })
         .collect();
+    // The projection uncertainty now, and the image that reduces it most.
     let derivatives = ProjectionDerivatives::new(&fit.state.intrinsics, &params);
     let known = next_view::Known {
         intrinsics: &fit.state.intrinsics,
@@ -305,6 +307,19 @@ pub(super) fn report(
         covariance: fit.covariance,
         images,
     }
+}
+
+/// Points of an image with their residuals.
+fn point_fits(bundle: &Bundle, image_ix: usize, points: &[BoardPoint]) -> Vec<PointFit> {
+    let residuals = bundle.residuals(image_ix, points).into_iter().flatten();
+    points
+        .iter()
+        .zip(residuals)
+        .map(|(point, residual)| PointFit {
+            pixel: point.pixel,
+            residual_px: residual.into(),
+        })
+        .collect()
 }
 
 /// Root mean square of the norms of the residuals.

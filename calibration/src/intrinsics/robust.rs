@@ -9,16 +9,20 @@ use crate::BoardPoint;
 use crate::least_squares::{Fit, Loss};
 use kinematics::quantile::median;
 use kinematics::random::Random;
+use kinematics::{Intrinsics, Transform};
 use nalgebra::{Matrix3, Vector2};
 
 /// Minimum number of corners that an image keeps; with fewer, its pose has no redundancy worth
 /// using.
 pub(super) const MIN_POINTS: usize = 6;
 /// A corner is rejected if its error exceeds this multiple of the standard deviation of the others.
+/// Normal errors do not (1 in 10^8), but errors of real corners have longer tails.
 const MAX_SIGMAS: f64 = 6.0;
-/// An image is rejected if its median error exceeds this multiple of that of the others.
+/// An image is rejected if its median error exceeds this multiple of that of the others. Blurred
+/// images have errors of a few times the usual ones, and still contribute.
 const MAX_MEDIAN_RATIO: f64 = 6.0;
-/// An image is rejected if more than this fraction of its corners are.
+/// An image is rejected if more than this fraction of its corners are. Then the minority may be
+/// right.
 const MAX_OUTLIER_FRAC: f64 = 0.5;
 /// Ratio between the median and the standard deviation per axis of the norm of a normal error
 /// (Rayleigh distribution).
@@ -87,6 +91,8 @@ pub(super) fn fit(
     /// first fit.
     const MAX_START_RATIO: f64 = 8.0;
     let max_error_px = MAX_START_RATIO * start.median_error_px();
+    // A wrong pose in the first fit would bend the lens. Images that are left out here are judged
+    // again later.
     let image_ixs: Vec<usize> = (0..images.len())
         .filter(|ix| start.errors_px[*ix] <= max_error_px)
         .collect();
@@ -138,23 +144,13 @@ fn consistent_points(points: &[BoardPoint]) -> Vec<BoardPoint> {
         .iter()
         .map(|point| (point.point_in_board.xy(), Vector2::from(point.pixel)))
         .collect();
-    let errors = |homography: &Matrix3<f64>| -> Vec<f64> {
-        let error = |(from, to): &(Vector2<f64>, Vector2<f64>)| {
-            let mapped = homography * from.push(1.0);
-            let error = (mapped.xy() / mapped.z - to).norm();
-            if error.is_nan() { f64::INFINITY } else { error }
-        };
-        pairs.iter().map(error).collect()
-    };
     // Smooth distortion leaves small errors of similar size at all points.
     const MAX_SMOOTH_RATIO: f64 = 5.0;
     const MAX_SMOOTH_FRAC: f64 = 0.015;
     if let Some(all) = homography(&pairs) {
-        let errors = errors(&all);
-        let (max_px, median_px) = (
-            errors.iter().copied().fold(0.0, f64::max),
-            median(&errors).unwrap_or(f64::INFINITY),
-        );
+        let errors = transfer_errors(&all, &pairs);
+        let max_px = errors.iter().copied().fold(0.0, f64::max);
+        let median_px = median(&errors).unwrap_or(f64::INFINITY);
         let first = pairs[0].1;
         let extent_px = pairs
             .iter()
@@ -166,12 +162,13 @@ fn consistent_points(points: &[BoardPoint]) -> Vec<BoardPoint> {
             return points.to_vec();
         }
     }
+    // The seed depends only on the input, so that the result is repeatable.
     let mut random = Random::new(points.len() as u64);
     let sampled = (0..N_SAMPLES).filter_map(|_| {
         let sample: Vec<_> = (0..homography::MIN_POINTS)
             .map(|_| pairs[random.below(pairs.len())])
             .collect();
-        let errors = errors(&homography(&sample)?);
+        let errors = transfer_errors(&homography(&sample)?, &pairs);
         Some((median(&errors)?, errors))
     });
     let Some((median_px, errors)) = sampled.min_by(|a, b| a.0.total_cmp(&b.0)) else {
@@ -183,6 +180,19 @@ fn consistent_points(points: &[BoardPoint]) -> Vec<BoardPoint> {
         .zip(errors)
         .filter(|(_, error)| *error <= max_error_px)
         .map(|(point, _)| *point)
+        .collect()
+}
+
+/// Distances between the second points of pairs and the images of the first ones; infinite for
+/// points at infinity.
+fn transfer_errors(homography: &Matrix3<f64>, pairs: &[(Vector2<f64>, Vector2<f64>)]) -> Vec<f64> {
+    pairs
+        .iter()
+        .map(|(from, to)| {
+            let mapped = homography * from.push(1.0);
+            let error = (mapped.xy() / mapped.z - to).norm();
+            if error.is_nan() { f64::INFINITY } else { error }
+        })
         .collect()
 }
 
@@ -205,12 +215,12 @@ pub(super) fn refit(
             break;
         }
         let has_changed = judged != kept;
-        (kept, bundle) = (judged, judged_bundle);
+        kept = judged;
         // Without outliers, the fit with equal weights follows at once.
         bundle = if has_changed {
-            huber(&kept, bundle, coefficients)?
+            huber(&kept, judged_bundle, coefficients)?
         } else {
-            squared(&kept, bundle, coefficients, ROUGH)?.state
+            squared(&kept, judged_bundle, coefficients, ROUGH)?.state
         };
     }
     let mut fit = squared(&kept, bundle, coefficients, EXACT)?;
@@ -225,7 +235,9 @@ pub(super) fn refit(
     })
 }
 
+/// A fit that limits the influence of remaining outliers.
 fn huber(kept: &Kept, bundle: Bundle, coefficients: Coefficients) -> Option<Bundle> {
+    // The norm of normal errors exceeds it in 4 % of the corners: exp(-2.5² / 2).
     const THRESHOLD_SIGMAS: f64 = 2.5;
     let errors: Vec<f64> = (0..kept.points.len())
         .flat_map(|ix| bundle.errors_px(ix, &kept.points[ix]))
@@ -241,6 +253,7 @@ fn huber(kept: &Kept, bundle: Bundle, coefficients: Coefficients) -> Option<Bund
     )
 }
 
+/// A fit that weights all corners equally.
 fn squared(
     kept: &Kept,
     bundle: Bundle,
@@ -257,9 +270,24 @@ fn squared(
     .ok()
 }
 
+/// Errors of the corners of one image.
+fn errors_px(intrinsics: &Intrinsics, pose: Transform, points: &[BoardPoint]) -> Vec<f64> {
+    let single = Bundle {
+        intrinsics: intrinsics.clone(),
+        poses: vec![pose],
+    };
+    single.errors_px(0, points)
+}
+
+/// Median of the errors of an image with a pose.
+fn median_px(image: &Option<(Transform, Vec<f64>)>) -> Option<f64> {
+    image.as_ref().and_then(|(_, errors)| median(errors))
+}
+
 /// Selects the images and corners that agree with the intrinsics, and returns the poses of these
 /// images and the typical error.
 fn judge(images: &[&[BoardPoint]], kept: &Kept, bundle: &Bundle) -> Option<(Kept, Bundle, f64)> {
+    // The poses of all images, also of those that are not in use, so that they can return.
     let poses: Vec<_> = (0..images.len())
         .map(|image_ix| {
             let position = kept
@@ -272,45 +300,40 @@ fn judge(images: &[&[BoardPoint]], kept: &Kept, bundle: &Bundle) -> Option<(Kept
             })
         })
         .collect();
-    let errors = |image_ix: usize, pose| {
-        let single = Bundle {
-            intrinsics: bundle.intrinsics.clone(),
-            poses: vec![pose],
-        };
-        single.errors_px(0, images[image_ix])
+    let located = |image_ix: usize, pose: Transform| {
+        let errors = errors_px(&bundle.intrinsics, pose, images[image_ix]);
+        (pose, errors)
     };
-    let mut located: Vec<Option<_>> = (0..images.len())
-        .map(|ix| Some((poses[ix]?, errors(ix, poses[ix]?))))
+    let mut located_images: Vec<Option<(Transform, Vec<f64>)>> = (0..images.len())
+        .map(|ix| Some(located(ix, poses[ix]?)))
         .collect();
-    let median_of =
-        |located: &Option<(_, Vec<f64>)>| located.as_ref().and_then(|(_, errors)| median(errors));
+    // The typical error: a median of medians, which neither wrong corners nor wrong images change.
     let medians: Vec<f64> = kept
         .image_ixs
         .iter()
-        .filter_map(|ix| median_of(&located[*ix]))
+        .filter_map(|ix| median_px(&located_images[*ix]))
         .collect();
     let typical_px = median(&medians)?.max(MIN_NOISE_PX);
     let max_median_px = MAX_MEDIAN_RATIO * typical_px;
-    for (image_ix, located) in located.iter_mut().enumerate() {
+    for (image_ix, image) in located_images.iter_mut().enumerate() {
         // The pose may be in the wrong minimum.
-        if median_of(located).is_some_and(|median_px| median_px > max_median_px) {
+        if median_px(image).is_some_and(|median_px| median_px > max_median_px) {
             let other = board_pose(&bundle.intrinsics, images[image_ix])
-                .map(|found| found.camera_from_board);
-            let other = other.map(|pose| (pose, errors(image_ix, pose)));
-            if median_of(&other).is_some_and(|median_px| median_px <= max_median_px) {
-                *located = other;
+                .map(|found| located(image_ix, found.camera_from_board));
+            if median_px(&other).is_some_and(|median_px| median_px <= max_median_px) {
+                *image = other;
             }
         }
     }
-    let (mut judged, mut judged_poses) = (
-        Kept {
-            image_ixs: Vec::new(),
-            points: Vec::new(),
-        },
-        Vec::new(),
-    );
-    for (image_ix, located) in located.into_iter().enumerate() {
-        let Some((pose, errors)) = located else {
+    // Images and corners within the limits. The limit of corners follows the image, because all
+    // corners of a blurred image have larger errors.
+    let mut judged = Kept {
+        image_ixs: Vec::new(),
+        points: Vec::new(),
+    };
+    let mut judged_poses = Vec::new();
+    for (image_ix, image) in located_images.into_iter().enumerate() {
+        let Some((pose, errors)) = image else {
             continue;
         };
         let median_px = median(&errors)?;

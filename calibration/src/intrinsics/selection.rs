@@ -31,6 +31,7 @@ pub struct LensTrial {
 /// Minimum gain of additional coefficients, dB. Smaller gains do not change an image by a visible
 /// amount.
 const MIN_GAIN_DB: f64 = 0.05;
+/// Minimum gain in standard errors: about 2 % of useless coefficients exceed it by chance.
 const MIN_STANDARD_ERRORS: f64 = 2.0;
 
 /// A model with its held-out error in each image.
@@ -64,6 +65,7 @@ pub(super) fn select(
     let mut best = polynomial
         .as_ref()
         .and_then(|start| score(kept, start, Coefficients::PINHOLE));
+    // The start of all comparisons.
     if best.is_none() {
         // A pinhole may not be able to image all points.
         best = polynomial
@@ -130,6 +132,8 @@ fn start_of(kept: &Kept, fit: &RobustFit) -> Option<Bundle> {
     if let Some(positions) = positions {
         return Some(fit.fit.state.with_images(positions.into_iter()));
     }
+    // The fit rejected an image that the reference keeps. Its pose is estimated with the lens of the
+    // fit, so that both models are compared on the same images.
     let intrinsics = &fit.fit.state.intrinsics;
     let pose = |points: &Vec<BoardPoint>| {
         Some(board_pose::board_pose(intrinsics, points)?.camera_from_board)
@@ -141,7 +145,9 @@ fn start_of(kept: &Kept, fit: &RobustFit) -> Option<Bundle> {
     })
 }
 
+/// Compares two models by their held-out errors.
 fn compare(baseline: &Scored, variant: &Scored) -> LensTrial {
+    // Paired by image: images differ in blur and distance much more than models do.
     let gain_db = |(baseline, variant): (&f64, &f64)| 20.0 * (baseline / variant).log10();
     let gains_db: Vec<f64> = baseline
         .errors_px
@@ -166,7 +172,9 @@ fn compare(baseline: &Scored, variant: &Scored) -> LensTrial {
 /// The intrinsics are fitted to the other folds. The pose of the held-out image is fitted to every
 /// second corner and evaluated on the others, and the other way around.
 fn score(kept: &Kept, start: &Bundle, coefficients: Coefficients) -> Option<Scored> {
+    // Each fold is a fit. With five, a fit uses 80 % of the images.
     const MAX_FOLDS: usize = 5;
+    // Differences of models are far larger than the error that this leaves.
     const TOLERANCE: f64 = 1e-7;
     let images = kept.images();
     let start = Bundle {
@@ -209,15 +217,9 @@ fn held_out_error_px(
     points: &[BoardPoint],
     camera_from_board: &kinematics::Transform,
 ) -> Option<f64> {
-    let half = |parity: usize| {
-        points
-            .iter()
-            .skip(parity)
-            .step_by(2)
-            .copied()
-            .collect::<Vec<BoardPoint>>()
-    };
-    let halves = [half(0), half(1)];
+    let halves = [0, 1].map(|parity| -> Vec<BoardPoint> {
+        points.iter().skip(parity).step_by(2).copied().collect()
+    });
     let mut squares = 0.0;
     for (training, held_out) in [(&halves[0], &halves[1]), (&halves[1], &halves[0])] {
         let pose = board_pose::refine(intrinsics, training, *camera_from_board)?;

@@ -54,6 +54,7 @@ impl<S> Fit<S> {
 /// The standard deviation of a variance; infinite if the variance is NaN or negative beyond
 /// rounding errors.
 pub(crate) fn sigma_of(variance: f64) -> f64 {
+    // Variances of unobservable parameters are sums of numbers that cancel.
     const TINY: f64 = 1e-15;
     if variance >= -TINY {
         variance.max(0.0).sqrt()
@@ -65,6 +66,7 @@ pub(crate) fn sigma_of(variance: f64) -> f64 {
 /// Relative size of an eigenvalue that cannot be distinguished from zero.
 const ROUNDING: f64 = 1e-15;
 
+/// Summarizes the last state of a minimization.
 pub(super) fn fit<S>(
     at: Evaluation<S>,
     scales: &DVector<f64>,
@@ -74,6 +76,7 @@ pub(super) fn fit<S>(
 ) -> Fit<S> {
     let information = normal_equations::information(&at.blocks, scales.len());
     let (variance, covariance_factor) = variances(&at, n_params, options.min_noise);
+    // Eigenvectors depend on units, so directions are computed in units of the scales.
     let scaled = DMatrix::from_diagonal(scales) * &information * DMatrix::from_diagonal(scales);
     // An empty matrix has no decomposition.
     let eigen = if scales.is_empty() {
@@ -84,6 +87,8 @@ pub(super) fn fit<S>(
     } else {
         SymmetricEigen::new(scaled)
     };
+    // Unobservable directions have eigenvalues of zero or below, by rounding. The floor keeps their
+    // variance finite.
     let floor = (ROUNDING * eigen.eigenvalues.iter().copied().fold(0.0, f64::max))
         .max(f64::MIN_POSITIVE / ROUNDING);
     let mut directions: Vec<Direction> = eigen

@@ -30,6 +30,7 @@ pub(super) struct LossAt {
 }
 
 impl Loss {
+    /// The loss of a residual vector with this squared norm.
     pub(super) fn at(self, squared_norm: f64) -> LossAt {
         match self {
             Self::Squared => LossAt {

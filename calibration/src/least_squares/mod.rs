@@ -90,8 +90,12 @@ pub fn minimize<P: Problem>(
     initial: P::State,
     options: &Options,
 ) -> Result<Fit<P::State>, Error> {
+    // Relative to the diagonal. Initial states are close to the solution, so the first step is
+    // almost a Gauss-Newton step.
     const INITIAL_DAMPING: f64 = 1e-4;
+    // Below the rounding of the diagonal, damping has no effect.
     const MIN_DAMPING: f64 = 1e-15;
+    // Steps are then too short to change the parameters: there is no descent.
     const MAX_DAMPING: f64 = 1e12;
     let scales = problem.scales();
     let n_shared = scales.len();
@@ -105,8 +109,10 @@ pub fn minimize<P: Problem>(
         });
     }
     let noise_floor = at.totals.n_scalars as f64 * options.min_noise.powi(2);
-    let (mut damping, mut growth) = (INITIAL_DAMPING, 2.0);
-    let (mut converged, mut n_steps) = (false, 0);
+    let mut damping = INITIAL_DAMPING;
+    let mut growth = 2.0;
+    let mut converged = false;
+    let mut n_steps = 0;
     while n_steps < options.max_steps && !converged && damping < MAX_DAMPING {
         n_steps += 1;
         let trial = normal_equations::step(&at.blocks, n_shared, damping).and_then(|step| {
@@ -117,12 +123,14 @@ pub fn minimize<P: Problem>(
             (trial.totals.loss < at.totals.loss).then_some((trial, gain))
         });
         match trial {
+            // The better the model has predicted the decrease, the less damping the next step gets.
             Some((trial, gain)) => {
                 at = trial;
                 damping =
                     (damping * (1.0 - (2.0 * gain - 1.0).powi(3)).max(1.0 / 10.0)).max(MIN_DAMPING);
                 growth = 2.0;
             }
+            // The step failed or increased the cost. Damping grows faster with every failure.
             None => {
                 damping *= growth;
                 growth *= 2.0;
@@ -156,7 +164,8 @@ impl<S: Clone> Evaluation<S> {
     /// The block with a residual that is not defined.
     fn new<P: Problem<State = S>>(problem: &P, state: S, loss: Loss) -> Result<Self, usize> {
         let n_shared = problem.scales().len();
-        let (mut blocks, mut totals) = (Vec::with_capacity(problem.n_blocks()), Totals::default());
+        let mut blocks = Vec::with_capacity(problem.n_blocks());
+        let mut totals = Totals::default();
         for block_ix in 0..problem.n_blocks() {
             let mut sums = BlockSums::new(loss, n_shared, problem.n_local(block_ix));
             problem

@@ -52,14 +52,13 @@ impl Totals {
 impl BlockSums {
     pub(crate) fn new(loss: Loss, n_shared: usize, n_local: usize) -> Self {
         let n = n_shared + n_local;
-        let (products, gradient) = (DMatrix::zeros(n, n), DVector::zeros(n));
         Self {
             loss,
             n_shared,
             n_local,
             weighted_derivatives: Vec::new(),
-            products,
-            gradient,
+            products: DMatrix::zeros(n, n),
+            gradient: DVector::zeros(n),
             totals: Totals::default(),
         }
     }
@@ -89,6 +88,8 @@ impl BlockSums {
             self.weighted_derivatives
                 .extend(row.iter().map(|derivative| root_weight * derivative));
         }
+        // A change along the residual changes the weight, too; the other `D - 1` directions only
+        // rotate it.
         let dims = D as f64;
         self.totals.add(&Totals {
             loss: loss.value,
@@ -125,7 +126,8 @@ impl BlockSums {
 
     /// Factor of the local part, damped. `None` if it is not positive definite.
     fn local_factor(&self, damping: f64) -> Option<Cholesky<f64, Dyn>> {
-        let (first, n) = (self.n_shared, self.n_local);
+        let first = self.n_shared;
+        let n = self.n_local;
         let mut local = self.products.view((first, first), (n, n)).into_owned();
         damp(&mut local, damping);
         Cholesky::new(local)
@@ -156,7 +158,9 @@ pub(super) fn step(blocks: &[BlockSums], n_shared: usize, damping: f64) -> Optio
     } else {
         Cholesky::new(reduced.matrix)?.solve(&reduced.gradient)
     };
-    let (mut local, mut predicted) = (Vec::with_capacity(blocks.len()), 0.0);
+    // Back-substitution: the local steps follow from the shared one, block by block.
+    let mut local = Vec::with_capacity(blocks.len());
+    let mut predicted = 0.0;
     for (block, factor) in blocks.iter().zip(&reduced.factors) {
         let step = match factor {
             Some(factor) => {
@@ -167,6 +171,8 @@ pub(super) fn step(blocks: &[BlockSums], n_shared: usize, damping: f64) -> Optio
             }
             None => DVector::zeros(0),
         };
+        // With the diagonal damping `D`, the model predicts a decrease of
+        // `0.5 step' (D step - gradient)`.
         for (ix, value) in shared.iter().chain(&step).enumerate() {
             predicted +=
                 0.5 * value * (damping * block.products[(ix, ix)] * value - block.gradient[ix]);
@@ -213,6 +219,7 @@ pub(super) fn information(blocks: &[BlockSums], n_shared: usize) -> DMatrix<f64>
 /// sandwich estimator (White 1980).
 pub(super) fn dispersion(blocks: &[BlockSums], n_shared: usize, variance: f64) -> f64 {
     const DAMPING: f64 = 1e-12;
+    // With fewer degrees of freedom between blocks, the ratio would be mostly noise.
     const MIN_EXPECTED: f64 = 1.0;
     let reduced: Option<Vec<Reduced>> = blocks
         .iter()
@@ -229,11 +236,13 @@ pub(super) fn dispersion(blocks: &[BlockSums], n_shared: usize, variance: f64) -
     let Some(factor) = Cholesky::new(sum) else {
         return 1.0;
     };
-    let (mut scatter, mut expected) = (0.0, 0.0);
+    let mut scatter = 0.0;
+    let mut expected = 0.0;
     for block in &reduced {
         scatter += block.gradient.dot(&factor.solve(&block.gradient));
         let mut matrix = block.matrix.clone();
         matrix.fill_upper_triangle_with_lower_triangle();
+        // `P_b` above.
         let share = factor.solve(&matrix);
         expected += share.trace() - share.transpose().dot(&share);
     }
@@ -255,13 +264,14 @@ struct Reduced {
 
 impl Reduced {
     fn new(blocks: &[BlockSums], n_shared: usize, damping: f64) -> Option<Self> {
-        let (mut matrix, mut gradient) =
-            (DMatrix::zeros(n_shared, n_shared), DVector::zeros(n_shared));
+        let mut matrix = DMatrix::zeros(n_shared, n_shared);
+        let mut gradient = DVector::zeros(n_shared);
         let mut factors = Vec::with_capacity(blocks.len());
         for block in blocks {
             matrix += block.products.view((0, 0), (n_shared, n_shared));
             gradient += block.gradient.rows(0, n_shared);
         }
+        // Damping before elimination, as for a system that is solved as a whole.
         damp(&mut matrix, damping);
         for block in blocks {
             if block.n_local == 0 {

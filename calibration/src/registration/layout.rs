@@ -110,48 +110,40 @@ impl Layout {
     pub(super) fn new(set: ParamSet, images: &[(usize, &Keyframe)], n_cameras: usize) -> Self {
         let mut layout = Self::default();
         for camera in 0..n_cameras {
-            let keyframes = || {
-                images
-                    .iter()
-                    .filter(move |image| image.0 == camera)
-                    .map(|image| image.1)
-            };
-            let moves = keyframes().any(|keyframe| {
+            let keyframes: Vec<&Keyframe> = images
+                .iter()
+                .filter(|image| image.0 == camera)
+                .map(|image| image.1)
+                .collect();
+            let moves = keyframes.iter().any(|keyframe| {
                 keyframe
                     .twist
                     .is_some_and(|twist| twist.linear_m_s.norm() + twist.angular_rad_s.norm() > 0.0)
             });
             let has_rolling_shutter =
-                moves && keyframes().any(|keyframe| keyframe.readout_secs > 0.0);
-            let mut allocate = |on: bool, n: usize, param: &dyn Fn(usize) -> CalibrationParam| {
-                let at = layout.params.len();
-                on.then(|| {
-                    layout.params.extend((0..n).map(param));
-                    at
-                })
-            };
-            layout.by_camera.push(CameraParamOffsets {
-                extrinsics: allocate(set.contains(ParamSet::EXTRINSICS), 6, &|part| {
+                moves && keyframes.iter().any(|keyframe| keyframe.readout_secs > 0.0);
+            // A parameter that changes no residual would be reported as unobservable, although the
+            // user cannot make it observable.
+            let has_time_offset = set.contains(ParamSet::TIME_OFFSET) && moves;
+            let has_readout = set.contains(ParamSet::READOUT) && has_rolling_shutter;
+            let offsets = CameraParamOffsets {
+                extrinsics: layout.allocate(set.contains(ParamSet::EXTRINSICS), 6, |part| {
                     CalibrationParam::Extrinsics(camera, part)
                 }),
-                time_offset: allocate(set.contains(ParamSet::TIME_OFFSET) && moves, 1, &|_| {
-                    CalibrationParam::TimeOffset(camera)
-                }),
-                depth_pose: allocate(set.contains(ParamSet::DEPTH_POSE), 6, &|part| {
+                time_offset: layout
+                    .allocate(has_time_offset, 1, |_| CalibrationParam::TimeOffset(camera)),
+                depth_pose: layout.allocate(set.contains(ParamSet::DEPTH_POSE), 6, |part| {
                     CalibrationParam::DepthPose(camera, part)
                 }),
-                lens: allocate(set.contains(ParamSet::LENS), 4, &|part| {
+                lens: layout.allocate(set.contains(ParamSet::LENS), 4, |part| {
                     CalibrationParam::Lens(camera, part)
                 }),
-                depth_scale: allocate(set.contains(ParamSet::DEPTH_SCALE), 1, &|_| {
+                depth_scale: layout.allocate(set.contains(ParamSet::DEPTH_SCALE), 1, |_| {
                     CalibrationParam::DepthScale(camera)
                 }),
-                readout: allocate(
-                    set.contains(ParamSet::READOUT) && has_rolling_shutter,
-                    1,
-                    &|_| CalibrationParam::Readout(camera),
-                ),
-            });
+                readout: layout.allocate(has_readout, 1, |_| CalibrationParam::Readout(camera)),
+            };
+            layout.by_camera.push(offsets);
         }
         let n_joints = images
             .iter()
@@ -165,6 +157,21 @@ impl Layout {
                 .extend((0..n_joints).map(CalibrationParam::Joint));
         }
         layout
+    }
+
+    /// Appends `n` parameters, if `is_on`, and returns the index of the first.
+    fn allocate(
+        &mut self,
+        is_on: bool,
+        n: usize,
+        param: impl Fn(usize) -> CalibrationParam,
+    ) -> Option<usize> {
+        let begin = self.params.len();
+        if !is_on {
+            return None;
+        }
+        self.params.extend((0..n).map(param));
+        Some(begin)
     }
 
     /// The extrinsics of one camera.

@@ -12,10 +12,12 @@ use rayon::prelude::*;
 /// as efficient as least squares for normal noise).
 const CAUCHY_SCALE: f64 = 2.385;
 /// Standard deviation of the prior on the gain, around 1. The next constant is that of the offset,
-/// around 0.
+/// around 0. They are wide: automatic exposure changes both by less between two images. Without a
+/// prior, a pair of even images would not determine them.
 const PRIOR_GAIN_DEVIATION: f64 = 0.2;
 const PRIOR_OFFSET: f64 = 30.0;
-/// Minimum number of samples of a pair.
+/// Minimum number of samples of a pair. With fewer, gain and offset of the pair would absorb most of
+/// what the samples say.
 const MIN_SAMPLES: usize = 12;
 
 /// Scatter of the residuals: brightness on a scale of 0 to 255, depth in meters at 1 m.
@@ -49,6 +51,8 @@ pub(super) enum PixelSubset {
 
 impl PixelSubset {
     fn includes(self, pixel: [f64; 2]) -> bool {
+        // Larger than the correlation of textures and of the blur, so that the two halves are
+        // independent; small enough for several blocks in each image.
         const BLOCK_PX: f64 = 64.0;
         match self {
             Self::All => true,
@@ -124,6 +128,7 @@ pub(super) fn tone<'a>(
     correspondences: impl Iterator<Item = &'a Correspondence> + Clone,
     noise: f64,
 ) -> Tone {
+    // The equations are linear; only the weights change between iterations.
     const MAX_ITERATIONS: usize = 3;
     let mut tone = Tone {
         gain: 1.0,
@@ -131,12 +136,13 @@ pub(super) fn tone<'a>(
     };
     for _ in 0..MAX_ITERATIONS {
         // Normal equations of the changes of gain and offset.
-        let (prior_gain, prior_offset) = (
-            (noise / PRIOR_GAIN_DEVIATION).powi(2),
-            (noise / PRIOR_OFFSET).powi(2),
-        );
-        let (mut xx, mut x, mut n) = (prior_gain, 0.0, prior_offset);
-        let (mut xr, mut r) = (prior_gain * (1.0 - tone.gain), -prior_offset * tone.offset);
+        let prior_gain = (noise / PRIOR_GAIN_DEVIATION).powi(2);
+        let prior_offset = (noise / PRIOR_OFFSET).powi(2);
+        let mut xx = prior_gain;
+        let mut x = 0.0;
+        let mut n = prior_offset;
+        let mut xr = prior_gain * (1.0 - tone.gain);
+        let mut r = -prior_offset * tone.offset;
         for correspondence in correspondences.clone() {
             let residual = correspondence.photo(tone);
             let weight = weight(residual, noise);
@@ -154,6 +160,7 @@ pub(super) fn tone<'a>(
     tone
 }
 
+/// Cauchy weight of a residual.
 fn weight(residual: f64, noise: f64) -> f64 {
     1.0 / (1.0 + (residual / (CAUCHY_SCALE * noise)).powi(2))
 }
@@ -166,24 +173,25 @@ pub(super) fn of_pairs(
     pairs: &[Pair],
     options: &ResidualOptions,
 ) -> Vec<PairSums> {
-    let of = |pair: &Pair| {
-        let (i, j) = (&views[pair.from], &views[pair.to]);
-        let mut params = [i.params(), j.params()].concat();
-        params.sort_unstable();
-        params.dedup();
-        let index_of = |param: usize| params.partition_point(|known| *known < param);
-        let param_columns = [
-            ParamColumns::new(i, index_of),
-            ParamColumns::new(j, index_of),
-        ];
-        of_pair(
-            sides(images, views, *pair),
-            &param_columns,
-            params.clone(),
-            options,
-        )
-    };
-    pairs.par_iter().map(of).collect()
+    pairs
+        .par_iter()
+        .map(|pair| of_shared_pair(sides(images, views, *pair), options))
+        .collect()
+}
+
+/// Contribution of a pair to the parameters that its two views depend on.
+fn of_shared_pair(sides: [Side<'_>; 2], options: &ResidualOptions) -> PairSums {
+    let [i, j] = sides.map(|side| side.view);
+    // Two images of one camera share their parameters.
+    let mut params = [i.params(), j.params()].concat();
+    params.sort_unstable();
+    params.dedup();
+    let index_of = |param: usize| params.partition_point(|known| *known < param);
+    let param_columns = [
+        ParamColumns::new(i, index_of),
+        ParamColumns::new(j, index_of),
+    ];
+    of_pair(sides, &param_columns, params.clone(), options)
 }
 
 /// Contribution of every pair to the motions of its two cameras: six parameters of the first, then
@@ -194,19 +202,17 @@ pub(super) fn of_free_pairs(
     pairs: &[Pair],
     options: &ResidualOptions,
 ) -> Vec<PairSums> {
-    let of = |pair: &Pair| {
-        let param_columns = [
-            ParamColumns::free(&views[pair.from], 0),
-            ParamColumns::free(&views[pair.to], 6),
-        ];
-        of_pair(
-            sides(images, views, *pair),
-            &param_columns,
-            (0..12).collect(),
-            options,
-        )
-    };
-    pairs.par_iter().map(of).collect()
+    pairs
+        .par_iter()
+        .map(|pair| {
+            let sides = sides(images, views, *pair);
+            let param_columns = [
+                ParamColumns::free(sides[0].view, 0),
+                ParamColumns::free(sides[1].view, 6),
+            ];
+            of_pair(sides, &param_columns, (0..12).collect(), options)
+        })
+        .collect()
 }
 
 /// Contribution of a pair to the motion of its second camera, with the first one fixed.
@@ -218,6 +224,80 @@ pub(super) fn of_second(sides: [Side<'_>; 2], options: &ResidualOptions) -> Pair
     of_pair(sides, &param_columns, (0..6).collect(), options)
 }
 
+/// Normal equations of one pair: the parameters, followed by gain and offset of the pair.
+struct ToneSums {
+    /// Number of rows.
+    n: usize,
+    /// Lower triangle, row by row.
+    information: Vec<f64>,
+    /// Negative gradient of the cost.
+    gradient: Vec<f64>,
+}
+
+impl ToneSums {
+    fn new(n_params: usize) -> Self {
+        let n = n_params + 2;
+        Self {
+            n,
+            information: vec![0.0; n * n],
+            gradient: vec![0.0; n],
+        }
+    }
+
+    /// Adds a residual with its derivatives. Most of them are zero, because a pair does not depend
+    /// on the parameters of other cameras.
+    fn add(&mut self, row: &[f64], residual: f64, noise: f64) {
+        let weight = weight(residual, noise) / (noise * noise);
+        let n = self.n;
+        for (ix, derivative) in row
+            .iter()
+            .enumerate()
+            .filter(|(_, derivative)| **derivative != 0.0)
+        {
+            let scaled = weight * derivative;
+            self.gradient[ix] -= scaled * residual;
+            for (sum, other) in self.information[ix * n..][..=ix].iter_mut().zip(row) {
+                *sum += scaled * other;
+            }
+        }
+    }
+
+    /// Element of the symmetric information matrix.
+    fn at(&self, row: usize, column: usize) -> f64 {
+        self.information[row.max(column) * self.n + row.min(column)]
+    }
+
+    /// Writes the normal equations of the parameters: the Schur complement of gain and offset.
+    fn eliminate_tone(&self, sums: &mut PairSums) {
+        let n = self.n - 2;
+        let prior_information = [
+            1.0 / (PRIOR_GAIN_DEVIATION * PRIOR_GAIN_DEVIATION),
+            1.0 / (PRIOR_OFFSET * PRIOR_OFFSET),
+        ];
+        let gg = self.at(n, n) + prior_information[0];
+        let go = self.at(n + 1, n);
+        let oo = self.at(n + 1, n + 1) + prior_information[1];
+        let determinant = gg * oo - go * go;
+        for row in 0..n {
+            // How gain and offset follow a change of the parameter.
+            let rhs = [self.at(n, row), self.at(n + 1, row)];
+            let of_tone = [
+                (oo * rhs[0] - go * rhs[1]) / determinant,
+                (gg * rhs[1] - go * rhs[0]) / determinant,
+            ];
+            sums.gradient[row] = self.gradient[row]
+                - of_tone[0] * self.gradient[n]
+                - of_tone[1] * self.gradient[n + 1];
+            for column in 0..n {
+                sums.information[(row, column)] = self.at(row, column)
+                    - of_tone[0] * self.at(n, column)
+                    - of_tone[1] * self.at(n + 1, column);
+            }
+        }
+    }
+}
+
+/// Contribution of a pair to parameters with these columns.
 fn of_pair(
     sides: [Side<'_>; 2],
     [i, j]: &[ParamColumns<'_>; 2],
@@ -244,60 +324,22 @@ fn of_pair(
         photo: photo_noise,
         depth: depth_noise,
     } = options.noise;
+    // Gain and offset are estimated first, so that the weights of the brightness residuals do not
+    // depend on the exposure of the images.
     let tone = tone(correspondences.iter(), photo_noise);
-    let (mut information, mut gradient) = (vec![0.0; (n + 2) * (n + 2)], vec![0.0; n + 2]);
+    let mut with_tone = ToneSums::new(n);
     let mut row = vec![0.0; n + 2];
-    let mut add = |row: &[f64], residual: f64, noise: f64| {
-        let weight = weight(residual, noise) / (noise * noise);
-        for (ix, derivative) in row
-            .iter()
-            .enumerate()
-            .filter(|(_, derivative)| **derivative != 0.0)
-        {
-            let scaled = weight * derivative;
-            gradient[ix] -= scaled * residual;
-            for (sum, other) in information[ix * (n + 2)..][..=ix].iter_mut().zip(row) {
-                *sum += scaled * other;
-            }
-        }
-    };
     for correspondence in &correspondences {
         let photo = correspondence.photo(tone);
         correspondence.photo_jacobian(i, j, tone, &mut row);
-        add(&row, photo, photo_noise);
+        with_tone.add(&row, photo, photo_noise);
         let depth = correspondence.depth();
         correspondence.depth_jacobian(i, j, &mut row);
-        add(&row, depth, depth_noise);
+        with_tone.add(&row, depth, depth_noise);
         sums.photo.push(photo.abs());
         sums.depth.push(depth.abs());
     }
-    let at = |row: usize, column: usize| information[row.max(column) * (n + 2) + row.min(column)];
-    // The Schur complement of gain and offset.
-    let prior_information = [
-        1.0 / (PRIOR_GAIN_DEVIATION * PRIOR_GAIN_DEVIATION),
-        1.0 / (PRIOR_OFFSET * PRIOR_OFFSET),
-    ];
-    let [gg, go, oo] = [
-        at(n, n) + prior_information[0],
-        at(n + 1, n),
-        at(n + 1, n + 1) + prior_information[1],
-    ];
-    let determinant = gg * oo - go * go;
-    let solve_tone = |rhs: [f64; 2]| {
-        [
-            (oo * rhs[0] - go * rhs[1]) / determinant,
-            (gg * rhs[1] - go * rhs[0]) / determinant,
-        ]
-    };
-    for row in 0..n {
-        let of_tone = solve_tone([at(n, row), at(n + 1, row)]);
-        sums.gradient[row] =
-            gradient[row] - of_tone[0] * gradient[n] - of_tone[1] * gradient[n + 1];
-        for column in 0..n {
-            sums.information[(row, column)] =
-                at(row, column) - of_tone[0] * at(n, column) - of_tone[1] * at(n + 1, column);
-        }
-    }
+    with_tone.eliminate_tone(&mut sums);
     sums
 }
 
@@ -308,15 +350,19 @@ pub(super) fn noise_of(sums: &[PairSums]) -> Option<Noise> {
         photo: 0.3,
         depth: 5e-5,
     };
-    let scatter = |of: fn(&PairSums) -> &[f64]| {
-        let mut all: Vec<f64> = sums
-            .iter()
-            .flat_map(|pair| of(pair).iter().copied())
-            .collect();
-        quantile(&mut all, 0.5, Rank::Upper).map(|median| 1.4826 * median)
-    };
     Some(Noise {
-        photo: scatter(|pair| &pair.photo)?.max(MIN_NOISE.photo),
-        depth: scatter(|pair| &pair.depth)?.max(MIN_NOISE.depth),
+        photo: scatter(sums, |pair| &pair.photo)?.max(MIN_NOISE.photo),
+        depth: scatter(sums, |pair| &pair.depth)?.max(MIN_NOISE.depth),
     })
+}
+
+/// Standard deviation of normal residuals with the same median of their absolute values.
+fn scatter(sums: &[PairSums], residuals_of: fn(&PairSums) -> &[f64]) -> Option<f64> {
+    /// Of a normal distribution: 1 divided by its 75 % quantile.
+    const SIGMA_PER_MEDIAN: f64 = 1.4826;
+    let mut all: Vec<f64> = sums
+        .iter()
+        .flat_map(|pair| residuals_of(pair).iter().copied())
+        .collect();
+    quantile(&mut all, 0.5, Rank::Upper).map(|median| SIGMA_PER_MEDIAN * median)
 }

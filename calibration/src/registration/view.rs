@@ -31,6 +31,20 @@ impl RigidTransform {
     }
 }
 
+/// Unit motion along (0 to 2) or about (3 to 5) an axis.
+fn unit_twist(part: usize) -> Twist {
+    let unit = |axis: usize| Vector3::from_fn(|row, _| if row == axis { 1.0 } else { 0.0 });
+    let (linear_m_s, angular_rad_s) = if part < 3 {
+        (unit(part), Vector3::zeros())
+    } else {
+        (Vector3::zeros(), unit(part - 3))
+    };
+    Twist {
+        linear_m_s,
+        angular_rad_s,
+    }
+}
+
 /// View of an image with the current corrections.
 #[derive(Clone, Debug)]
 pub(super) struct CorrectedView {
@@ -71,24 +85,26 @@ impl CorrectedView {
             .twist
             .map(|twist| twist.of_attached(&raw_from_corrected));
         let mut columns = params.motions(twist_of_corrected.as_ref());
-        let mut add_column = |param: usize, twist: &Twist, camera_from_twist: &Transform| {
-            let twist = twist.of_attached(camera_from_twist);
-            columns.push((param, twist.linear_m_s, twist.angular_rad_s));
-        };
+        // Velocities per joint are given at the raw camera. Joints are corrected before drift and
+        // extrinsics, so their motion is converted to the axes of the corrected camera.
         if let Some(joints) = layout.joints() {
             let time_corrected_from_corrected =
                 correction.time_corrected_from_input(keyframe) * raw_from_corrected;
             for (joint, twist) in keyframe.joint_twists.iter().enumerate() {
-                add_column(joints + joint, twist, &time_corrected_from_corrected);
+                let twist = twist.of_attached(&time_corrected_from_corrected);
+                columns.push((joints + joint, twist.linear_m_s, twist.angular_rad_s));
             }
         }
-        let share = |values: [f64; 2], change: &dyn Fn(usize, f64) -> f64| {
-            if image.shares_lens {
-                [change(0, values[0]), change(1, values[1])]
-            } else {
-                values
+        // Depth that was registered to the color image has the errors of its lens, too.
+        let mut depth_focal_px = depth.focal_px;
+        let mut depth_principal_px = depth.principal_px;
+        if image.shares_lens {
+            for axis in 0..2 {
+                depth_focal_px[axis] = depth.focal_px[axis] * correction.log_focal[axis].exp();
+                depth_principal_px[axis] = depth.principal_px[axis]
+                    + correction.principal_offset_focals[axis] * depth.focal_px[axis];
             }
-        };
+        }
         Some(Self {
             world_from_camera: RigidTransform::of(&posed.world_from_camera),
             color_from_depth: RigidTransform::of(&correction.color_from_depth(keyframe, depth)),
@@ -100,12 +116,8 @@ impl CorrectedView {
                 twist.of_attached(&raw_from_corrected)
             }),
             readout_secs: (keyframe.readout_secs + correction.readout_secs).max(0.0),
-            depth_focal_px: share(depth.focal_px, &|axis, focal| {
-                focal * correction.log_focal[axis].exp()
-            }),
-            depth_principal_px: share(depth.principal_px, &|axis, principal| {
-                principal + correction.principal_offset_focals[axis] * depth.focal_px[axis]
-            }),
+            depth_focal_px,
+            depth_principal_px,
             depth_factor: correction.log_depth_scale.exp(),
             columns,
             depth_pose: params.depth_pose,
@@ -124,24 +136,15 @@ impl CorrectedView {
         world_from_frame: &Transform,
     ) -> Self {
         let frame_from_camera = world_from_frame.inverse() * world_from_camera;
-        let unit = |axis: usize| Vector3::from_fn(|row, _| if row == axis { 1.0 } else { 0.0 });
-        let column = |param: usize| {
-            let (linear_m_s, angular_rad_s) = if param < 3 {
-                (unit(param), Vector3::zeros())
-            } else {
-                (Vector3::zeros(), unit(param - 3))
-            };
-            let twist = Twist {
-                linear_m_s,
-                angular_rad_s,
-            }
-            .of_attached(&frame_from_camera);
-            (param, twist.linear_m_s, twist.angular_rad_s)
-        };
-        let world_from_camera = RigidTransform::of(world_from_camera);
+        let columns = (0..6)
+            .map(|param| {
+                let twist = unit_twist(param).of_attached(&frame_from_camera);
+                (param, twist.linear_m_s, twist.angular_rad_s)
+            })
+            .collect();
         Self {
-            world_from_camera,
-            columns: (0..6).map(column).collect(),
+            world_from_camera: RigidTransform::of(world_from_camera),
+            columns,
             ..self.clone()
         }
     }
@@ -166,6 +169,8 @@ impl CorrectedView {
         if self.readout_secs == 0.0 {
             return (*still, 0.0);
         }
+        // The row depends on the position, and the position on the time of the row. Two iterations
+        // suffice, because points move by a few rows at most during the readout.
         let drift = -self.readout_secs * self.twist.apparent_velocity(still);
         let mut at = *still;
         let mut share = 0.0;

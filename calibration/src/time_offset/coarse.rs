@@ -8,7 +8,8 @@ use super::stamps;
 use super::stream::Stream;
 use crate::hand_eye::Refusal;
 
-/// Correlation below this value does not show a common motion.
+/// Correlation below this value does not show a common motion. Unrelated streams of a few seconds
+/// reach it by chance, but their orientations do not agree in the refinement.
 const MIN_CORRELATION: f64 = 0.3;
 
 /// The initial offset, accurate to about a step of the grid.
@@ -29,7 +30,11 @@ pub(super) fn correlate(
 ) -> Result<Vec<Coarse>, Refusal> {
     /// Lower maxima are not tried.
     const SIMILAR: f64 = 0.7;
+    /// Periodic motions have a maximum per period. Each one is refined, which takes most of the
+    /// time.
     const MAX_OTHERS: usize = 4;
+    // Stamps in other units spread the motion over a long time, which looks like no rotation. This
+    // is tested per stream, because streams in different units do not overlap.
     for (name, stream) in [("A", a), ("B", b)] {
         let own = Grid::new(stream, stream);
         if let (Some(refusal), Err(_)) = (
@@ -67,6 +72,7 @@ pub(super) fn correlate(
             ),
         });
     };
+    // No correlation. A wrong rate of one clock destroys it, too, and has another remedy.
     if best.value < MIN_CORRELATION {
         if let Some(refusal) = clock_rate_mistake(a, b) {
             return Err(refusal);
@@ -101,16 +107,9 @@ pub(super) fn correlate(
 pub(super) fn clock_rate_mistake(a: &Stream, b: &Stream) -> Option<Refusal> {
     /// Unrelated motions of usual length do not reach it.
     const MIN_CORRELATION: f64 = 0.7;
-    let correlation = |factor: f64| {
-        let correlations = Grid::new(a, &b.scaled(factor)).correlations(None);
-        correlations
-            .iter()
-            .map(|correlation| correlation.value)
-            .fold(0.0, f64::max)
-    };
     let words = [(0.5, "twice"), (2.0, "half")]
         .into_iter()
-        .find(|(factor, _)| correlation(*factor) > MIN_CORRELATION)?
+        .find(|(factor, _)| largest_correlation(a, &b.scaled(*factor)) > MIN_CORRELATION)?
         .1;
     Some(Refusal::new(
         format!(
@@ -118,6 +117,15 @@ pub(super) fn clock_rate_mistake(a: &Stream, b: &Stream) -> Option<Refusal> {
         ),
         "check how the stamps were computed, for example from a frame number and a wrong frame rate",
     ))
+}
+
+/// Largest correlation of two streams at any offset.
+fn largest_correlation(a: &Stream, b: &Stream) -> f64 {
+    Grid::new(a, b)
+        .correlations(None)
+        .iter()
+        .map(|correlation| correlation.value)
+        .fold(0.0, f64::max)
 }
 
 fn signed(n: usize) -> i64 {
@@ -134,10 +142,13 @@ pub(super) struct Grid {
 
 impl Grid {
     pub(super) fn new(a: &Stream, b: &Stream) -> Self {
+        // The time grows with the square of the number of points. In recordings that need more, the
+        // step is longer, and the refinement starts from a less accurate offset.
         const MAX_POINTS: f64 = 4000.0;
         let durations = [a, b].map(|stream| stream.end_secs() - stream.start_secs());
         let finest = a.step_secs().max(b.step_secs());
         let step_secs = finest.max(durations[0].max(durations[1]) / MAX_POINTS);
+        // Windows of two steps: shorter ones amplify noise, longer ones blur the motion.
         let rates = [a, b].map(|stream| Rates::new(stream, step_secs, 2.0 * step_secs));
         Self {
             rates,
@@ -149,6 +160,7 @@ impl Grid {
     /// Correlations at all lags with enough overlap. Without a limit, clocks with different zeros
     /// are allowed.
     pub(super) fn correlations(&self, max_offset_secs: Option<f64>) -> Vec<Correlation> {
+        // Of the shorter stream. With less overlap, correlations by chance are high.
         const MIN_OVERLAP: f64 = 0.25;
         let [n_a, n_b] = self
             .rates
@@ -243,8 +255,12 @@ impl Correlation {
     fn new(a: &Rates, b: &Rates, lag: i64, min_overlap: f64) -> Option<Self> {
         let first = usize::try_from(lag.max(0)).ok()?;
         let first_b = usize::try_from((-lag).max(0)).ok()?;
-        let (a, b) = (a.values.get(first..)?, b.values.get(first_b..)?);
-        let (mut n, mut sums, mut squares, mut product) = (0.0, [0.0; 2], [0.0; 2], 0.0);
+        let a = a.values.get(first..)?;
+        let b = b.values.get(first_b..)?;
+        let mut n = 0.0;
+        let mut sums = [0.0; 2];
+        let mut squares = [0.0; 2];
+        let mut product = 0.0;
         for (x, y) in a.iter().zip(b).filter_map(|(a, b)| Some(((*a)?, (*b)?))) {
             n += 1.0;
             sums[0] += x;
@@ -257,6 +273,7 @@ impl Correlation {
         let variance = |ix: usize| squares[ix] / n - (sums[ix] / n).powi(2);
         let value =
             (product / n - sums[0] * sums[1] / (n * n)) / (variance(0) * variance(1)).sqrt();
+        // A constant rate has no variance.
         value.is_finite().then_some(())?;
         let significance = value * (n / (1.0 - value * value).max(1e-9)).sqrt();
         Some(Self {
@@ -267,15 +284,17 @@ impl Correlation {
     }
 }
 
+/// Whether a correlation is larger than both neighbors; of equal ones, the last counts.
+fn is_maximum(correlations: &[Correlation], ix: usize) -> bool {
+    let value = correlations[ix].value;
+    ix > 0
+        && ix + 1 < correlations.len()
+        && value >= correlations[ix - 1].value
+        && value > correlations[ix + 1].value
+}
+
 /// Maxima outside the neighborhood of the best one, the most significant first.
 fn other_maxima<'a>(correlations: &'a [Correlation], best: &Correlation) -> Vec<&'a Correlation> {
-    let is_maximum = |ix: usize| {
-        let value = correlations[ix].value;
-        ix > 0
-            && ix + 1 < correlations.len()
-            && value >= correlations[ix - 1].value
-            && value > correlations[ix + 1].value
-    };
     // The neighborhood of the maximum ends where the correlation falls to half.
     let best_ix = correlations
         .iter()
@@ -292,7 +311,8 @@ fn other_maxima<'a>(correlations: &'a [Correlation], best: &Correlation) -> Vec<
         .take_while(|correlation| is_high(correlation))
         .count();
     let mut others: Vec<&Correlation> = (0..correlations.len())
-        .filter(|ix| (ix + n_before < best_ix || *ix >= best_ix + n_after) && is_maximum(*ix))
+        .filter(|ix| ix + n_before < best_ix || *ix >= best_ix + n_after)
+        .filter(|ix| is_maximum(correlations, *ix))
         .map(|ix| &correlations[ix])
         .collect();
     others.sort_by(|p, q| q.significance.total_cmp(&p.significance));

@@ -38,6 +38,8 @@ pub(super) struct Fine {
 /// If the streams do not overlap.
 pub(super) fn refine(a: &Stream, b: &Stream, offset_secs: f64) -> Result<Fine, Error> {
     const MIN_SIGMAS: f64 = 3.0;
+    // Twice: without a drift, then with one. An insignificant drift would only add to the
+    // uncertainty of the offset.
     let problem = Orientations::new(a, b, offset_secs)?;
     let initial = problem.initial_state(offset_secs)?;
     let without = problem.fit(initial)?;
@@ -67,6 +69,7 @@ pub(super) fn refine(a: &Stream, b: &Stream, offset_secs: f64) -> Result<Fine, E
     })
 }
 
+/// Values of all parameters.
 #[derive(Clone, Copy, Debug)]
 struct State {
     a_body_from_b_body: UnitQuaternion<f64>,
@@ -120,25 +123,29 @@ impl<'a> Orientations<'a> {
                 "record both streams for at least ten seconds at the same time",
             ))));
         }
-        let (first, last) = (times_b[0].0, times_b[times_b.len() - 1].0);
-        let (mid_secs, half_secs) = (0.5 * (first + last), 0.5 * (last - first));
+        let first = times_b[0].0;
+        let last = times_b[times_b.len() - 1].0;
         Ok(Self {
             a,
             rate_half_secs,
             times_b,
-            mid_secs,
-            half_secs,
+            // The drift is relative to the middle, where it is not correlated with the offset.
+            mid_secs: 0.5 * (first + last),
+            half_secs: 0.5 * (last - first),
             has_drift: false,
             scale_rad: 1.0,
         })
     }
 
+    /// Time on A's clock.
     fn secs_a(&self, secs_b: f64, state: &State) -> f64 {
         secs_b + state.offset_secs + state.drift * (secs_b - self.mid_secs)
     }
 
     /// Rotations from the correlation of rotation vectors over about half a second (Kabsch 1976).
     fn initial_state(&self, offset_secs: f64) -> Result<State, Error> {
+        // Long enough for rotations above the noise of the poses, short enough for rotation vectors
+        // of less than half a turn.
         const SPAN_SECS: f64 = 0.5;
         let mut correlation = Matrix3::zeros();
         let mut later_ix = 0;
@@ -149,11 +156,9 @@ impl<'a> Orientations<'a> {
             let Some((later_secs, later)) = self.times_b.get(later_ix) else {
                 break;
             };
-            let ends = (
-                self.a.at(secs + offset_secs),
-                self.a.at(later_secs + offset_secs),
-            );
-            let (Some(start), Some(end)) = ends else {
+            let start = self.a.at(secs + offset_secs);
+            let end = self.a.at(later_secs + offset_secs);
+            let (Some(start), Some(end)) = (start, end) else {
                 continue;
             };
             let in_a = (start.rotation.inverse() * end.rotation).scaled_axis();
@@ -167,6 +172,8 @@ impl<'a> Orientations<'a> {
         };
         let rotation = nearest_rotation(&(correlation + Matrix3::identity() * smallest))
             .ok_or_else(undetermined)?;
+        // With the rotation between the bodies, each pair of poses gives the rotation between the
+        // reference frames.
         let references: Matrix3<f64> = self
             .times_b
             .iter()
@@ -187,8 +194,11 @@ impl<'a> Orientations<'a> {
     /// Robust fit; the scale of the residuals is estimated in three rounds.
     fn fit(&self, initial: State) -> Result<Fit<State>, Error> {
         const ROUNDS: usize = 4;
+        // Exact poses of a simulation have no residuals.
         const MIN_SCALE_RAD: f64 = 1e-7;
         let options = least_squares::Options {
+            // In standard deviations. Not convex, but the start is close, and tracking systems
+            // report wrong poses that the Huber loss would follow.
             loss: Loss::Cauchy { threshold: 2.5 },
             max_steps: 40,
             ..least_squares::Options::default()
@@ -203,6 +213,7 @@ impl<'a> Orientations<'a> {
         least_squares::minimize(&problem, state, &options)
     }
 
+    /// See [`Fine::motion_rad`].
     fn motion_rad(&self) -> f64 {
         let sum: Matrix3<f64> = self
             .times_b
@@ -220,12 +231,14 @@ impl<'a> Orientations<'a> {
         (squares / self.times_b.len() as f64).sqrt()
     }
 
+    /// Residuals of all poses that are not in a gap of A.
     fn residuals(&self, state: &State) -> impl Iterator<Item = Vector3<f64>> {
         self.times_b
             .iter()
             .filter_map(|(secs, in_b)| self.residual(state, *secs, in_b).map(|found| found.0))
     }
 
+    /// See [`Fine::residuals`].
     fn residuals_over_time(&self, state: &State) -> Vec<[f64; 2]> {
         let residual = |(secs, in_b): &(f64, UnitQuaternion<f64>)| {
             self.residual(state, *secs, in_b)
@@ -236,6 +249,7 @@ impl<'a> Orientations<'a> {
 
     /// Standard deviation per axis from the median of the norms.
     fn median_rad(&self, state: &State) -> f64 {
+        // Median of the norm of three normal numbers with deviation 1.
         const MEDIAN_OF_NORM: f64 = 1.538;
         let norms: Vec<f64> = self
             .residuals(state)
@@ -244,6 +258,7 @@ impl<'a> Orientations<'a> {
         kinematics::quantile::median(&norms).unwrap_or(0.0) / MEDIAN_OF_NORM
     }
 
+    /// Root mean square of the residuals.
     fn rms_rad(&self, state: &State) -> f64 {
         (self
             .residuals(state)
@@ -294,6 +309,7 @@ impl<'a> Orientations<'a> {
                     continue;
                 };
                 let rows = derivatives.rows(self.has_drift, secs - self.mid_secs);
+                // The weight of the Cauchy loss of `fit`.
                 let ratio = residual.norm_squared() / (2.5 * scale).powi(2);
                 let weight = 1.0 / (1.0 + ratio);
                 for (axis, row) in rows.iter().enumerate() {
@@ -315,6 +331,7 @@ impl<'a> Orientations<'a> {
     }
 }
 
+/// Derivatives of a residual with respect to both rotations and the offset.
 struct Derivatives {
     by_x: Matrix3<f64>,
     by_y: Matrix3<f64>,
@@ -380,16 +397,13 @@ impl least_squares::Problem for Orientations<'_> {
     }
 
     fn moved(&self, state: &State, shared: &DVector<f64>, _local: &[DVector<f64>]) -> State {
-        let part = |first: usize| {
-            UnitQuaternion::from_scaled_axis(Vector3::new(
-                shared[first],
-                shared[first + 1],
-                shared[first + 2],
-            ))
+        let rotation = |first: usize| {
+            let vector = shared.fixed_rows::<3>(first).into_owned();
+            UnitQuaternion::from_scaled_axis(vector)
         };
         State {
-            a_body_from_b_body: state.a_body_from_b_body * part(0),
-            a_reference_from_b_reference: state.a_reference_from_b_reference * part(3),
+            a_body_from_b_body: state.a_body_from_b_body * rotation(0),
+            a_reference_from_b_reference: state.a_reference_from_b_reference * rotation(3),
             offset_secs: state.offset_secs + shared[OFFSET_IX],
             drift: state.drift
                 + if self.has_drift {

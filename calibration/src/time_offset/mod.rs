@@ -120,6 +120,7 @@ pub fn estimate_time_offset(
     b: &[PoseSample],
     options: &TimeOffsetOptions,
 ) -> Result<TimeOffset, Error> {
+    // Checked in any case: streams with wrong quaternions may give an offset with large residuals.
     let found = estimate(a, b, options);
     match quaternion_order::mistake(a, b, options, found.as_ref()) {
         Some(refusal) => Err(Error::Refused(Box::new(refusal))),
@@ -134,7 +135,8 @@ fn estimate(
     options: &TimeOffsetOptions,
 ) -> Result<TimeOffset, Error> {
     let refused = |refusal| Error::Refused(Box::new(refusal));
-    let (a, b) = (Stream::new("A", a)?, Stream::new("B", b)?);
+    let a = Stream::new("A", a)?;
+    let b = Stream::new("B", b)?;
     let coarse = coarse::correlate(&a, &b, options.max_offset_secs).map_err(refused)?;
     // The stream with the higher rate is interpolated, because its interpolation errors are
     // smaller.
@@ -147,6 +149,8 @@ fn estimate(
             _ => error,
         })?;
     let offset_secs = sign * fine.offset_secs;
+    // Rotation rates are the same for a stream and its inverse, but orientations are not: the fit
+    // then drifts away from its start.
     if (offset_secs - coarse.offset_secs).abs() > 10.0 * coarse.step_secs {
         return Err(refused(Refusal::new(
             format!(
@@ -179,6 +183,7 @@ fn estimate(
             "rotate the bodies faster and with more changes of direction",
         )));
     }
+    // The fit describes A's time at points of B. With swapped streams, its times are on A's clock.
     let mid_secs = if is_swapped {
         fine.mid_secs + fine.offset_secs
     } else {
@@ -281,7 +286,7 @@ fn body_transform(
     b: &Stream,
     secs_a: impl Fn(f64) -> f64,
 ) -> Result<Result<BodyTransform, Refusal>, Error> {
-    /// More poses of a stream are not independent of each other.
+    /// More poses of a stream are not independent of each other, and would only take longer.
     const MAX_SAMPLES: usize = 50;
     let pairs: Vec<(f64, Transform, Transform)> = b
         .samples
@@ -318,6 +323,8 @@ fn body_transform(
             scatter: found.scatter,
         })),
         Err(Error::Refused(refusal)) => {
+            // The hand-eye calibration names its own input. Longer names come first, because the
+            // shorter ones are parts of them.
             let names = [
                 ("base_from_flange", "stream A"),
                 ("camera_from_board", "the inverse of stream B"),

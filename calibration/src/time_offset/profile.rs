@@ -25,22 +25,24 @@ pub fn motion_profile(
     b: &[PoseSample],
     options: &TimeOffsetOptions,
 ) -> Result<MotionProfile, Error> {
-    let (a, b) = (Stream::new("A", a)?, Stream::new("B", b)?);
+    let a = Stream::new("A", a)?;
+    let b = Stream::new("B", b)?;
     let grid = Grid::new(&a, &b);
-    let curve = |stream: &Stream, ix: usize| {
-        let values = grid.rates[ix].values.iter().enumerate();
-        values
-            .filter_map(|(ix, rate)| {
-                Some([stream.start_secs() + ix as f64 * grid.step_secs, (*rate)?])
-            })
-            .collect()
-    };
+    let curves = [curve(&a, &grid, 0), curve(&b, &grid, 1)];
     let correlations = grid.correlations(options.max_offset_secs);
     Ok(MotionProfile {
-        rates: [curve(&a, 0), curve(&b, 1)],
+        rates: curves,
         correlation: correlations
             .iter()
             .map(|at| [grid.offset_secs(at.lag), at.value])
             .collect(),
     })
+}
+
+/// Times and rates of one of the streams of a grid. Gaps are left out.
+fn curve(stream: &Stream, grid: &Grid, stream_ix: usize) -> Vec<[f64; 2]> {
+    let values = grid.rates[stream_ix].values.iter().enumerate();
+    values
+        .filter_map(|(ix, rate)| Some([stream.start_secs() + ix as f64 * grid.step_secs, (*rate)?]))
+        .collect()
 }

@@ -19,6 +19,7 @@ pub(super) fn mistake(
     const MAX_GOOD_DEG: f64 = 2.0;
     /// Residual with the right order.
     const MAX_EXPLAINED_DEG: f64 = 6.0;
+    /// Factor by which the other order must fit better. A smaller one would blame noisy streams.
     const BETTER: f64 = 3.0;
     let found_deg = match found {
         Ok(offset) => median_deg(offset),
@@ -28,11 +29,13 @@ pub(super) fn mistake(
     if found_deg <= MAX_GOOD_DEG {
         return None;
     }
+    // Only the fit of the orientations matters here.
     let options = TimeOffsetOptions {
         hand_eye: false,
         ..*options
     };
-    let (w_first_a, w_first_b) = (w_first(a), w_first(b));
+    let w_first_a = w_first(a);
+    let w_first_b = w_first(b);
     let variants = [
         ("stream A", &w_first_a[..], b),
         ("stream B", a, &w_first_b[..]),
@@ -45,9 +48,10 @@ pub(super) fn mistake(
     if best_deg > MAX_EXPLAINED_DEG || best_deg * BETTER > found_deg {
         return None;
     }
-    let as_given = match found_deg.is_finite() {
-        true => format!("differ by {found_deg:.1} degrees (median) after alignment"),
-        false => "do not agree".to_owned(),
+    let as_given = if found_deg.is_finite() {
+        format!("differ by {found_deg:.1} degrees (median) after alignment")
+    } else {
+        "do not agree".to_owned()
     };
     Some(Refusal::new(
         format!(
@@ -65,12 +69,12 @@ fn median_deg(offset: &TimeOffset) -> f64 {
 
 /// The poses for quaternions whose first number is w.
 fn w_first(samples: &[PoseSample]) -> Vec<PoseSample> {
-    let reordered = |sample: &PoseSample| {
+    let mut reordered = samples.to_vec();
+    for sample in &mut reordered {
+        // The coordinates are stored as x, y, z, w, in the order in which they were read.
         let [first, second, third, fourth]: [f64; 4] = sample.pose.rotation.coords.into();
-        let mut pose = sample.pose;
-        pose.rotation =
+        sample.pose.rotation =
             UnitQuaternion::from_quaternion(Quaternion::new(first, second, third, fourth));
-        PoseSample { pose, ..*sample }
-    };
-    samples.iter().map(reordered).collect()
+    }
+    reordered
 }

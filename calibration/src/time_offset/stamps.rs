@@ -10,7 +10,8 @@ const UNITS: [(&str, f64); 3] = [
     ("microseconds", 1e6),
     ("nanoseconds", 1e9),
 ];
-/// Times between poses of cameras, trackers and robots, seconds.
+/// Times between poses of cameras, trackers and robots, seconds: 2.5 to 2500 Hz. The range spans a
+/// factor of 1000, the ratio of neighboring units, so that a step fits one unit only.
 const USUAL_STEPS_SECS: std::ops::RangeInclusive<f64> = 0.0004..=0.4;
 
 /// The unit of stamps that are not seconds. Real steps of several seconds look like milliseconds,
@@ -34,6 +35,7 @@ pub(super) fn unit_mistake(name: &str, step_secs: f64) -> Option<Refusal> {
     ))
 }
 
+/// A step in any unit, as text.
 fn rounded(value: f64) -> String {
     if value < 1e4 {
         format!("{value:.1}")
@@ -63,25 +65,30 @@ pub(super) fn distant_stamp(name: &str, sorted: &[PoseSample]) -> Option<String>
     ))
 }
 
-/// Describes stamps that several different poses share. A few of them are dropped.
-pub(super) fn repeated_stamps(name: &str, sorted: &[PoseSample]) -> Option<String> {
-    const MAX_FRAC: f64 = 0.2;
+/// Whether two neighboring poses differ, but have the same stamp. Equal poses with equal stamps are
+/// repetitions, which some recorders write.
+fn is_conflict(pair: &[PoseSample]) -> bool {
     const SAME_RAD: f64 = 1e-9;
     const SAME_M: f64 = 1e-9;
-    let is_conflict = |pair: &&[PoseSample]| {
-        let difference = pair[0].pose.inverse() * pair[1].pose;
-        pair[0].secs == pair[1].secs
-            && (difference.rotation.angle() > SAME_RAD
-                || difference.translation.vector.norm() > SAME_M)
-    };
-    let n_conflicts = sorted.windows(2).filter(is_conflict).count();
+    let difference = pair[0].pose.inverse() * pair[1].pose;
+    pair[0].secs == pair[1].secs
+        && (difference.rotation.angle() > SAME_RAD || difference.translation.vector.norm() > SAME_M)
+}
+
+/// Describes stamps that several different poses share. A few of them are dropped.
+pub(super) fn repeated_stamps(name: &str, sorted: &[PoseSample]) -> Option<String> {
+    /// Fewer are left to deduplication.
+    const MAX_FRAC: f64 = 0.2;
+    let mut conflicts = sorted.windows(2).filter(|pair| is_conflict(pair));
+    let n_conflicts = conflicts.clone().count();
     if n_conflicts as f64 <= MAX_FRAC * sorted.len() as f64 {
         return None;
     }
-    let example = sorted.windows(2).find(is_conflict)?[0].secs;
-    let cause = match sorted.iter().all(|sample| sample.secs.fract() == 0.0) {
-        true => "the stamps are probably rounded to whole seconds",
-        false => "the file probably contains several bodies, or its stamps are rounded",
+    let example = conflicts.next()?[0].secs;
+    let cause = if sorted.iter().all(|sample| sample.secs.fract() == 0.0) {
+        "the stamps are probably rounded to whole seconds"
+    } else {
+        "the file probably contains several bodies, or its stamps are rounded"
     };
     Some(format!(
         "{n_conflicts} of {} poses of stream {name} have the same stamp as another pose (for example {example}), expected one pose per stamp; {cause}",

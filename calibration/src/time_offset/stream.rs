@@ -5,8 +5,15 @@ use crate::Error;
 use kinematics::{Transform, transform};
 use nalgebra::Vector3;
 
-/// Minimum number of poses of a stream.
+/// Minimum number of poses of a stream. Fewer cannot show a correlation.
 const MIN_POSES: usize = 20;
+
+/// Whether a sample is finite and its rotation has unit length.
+fn is_valid(sample: &PoseSample) -> bool {
+    sample.secs.is_finite()
+        && transform::is_finite(&sample.pose)
+        && (sample.pose.rotation.norm() - 1.0).abs() < transform::RIGID_TOLERANCE
+}
 
 /// Poses in the order of time, interpolated between neighbors that are not separated by a gap.
 #[derive(Clone, Debug)]
@@ -22,14 +29,10 @@ impl Stream {
     /// # Errors
     /// If a value is not finite, or if there are too few poses.
     pub(super) fn new(name: &str, samples: &[PoseSample]) -> Result<Self, Error> {
-        /// Neighbors whose distance exceeds the median by this factor are not interpolated.
+        /// Neighbors whose distance exceeds the median by this factor are not interpolated: up to
+        /// two poses in a row may be missing.
         const GAP: f64 = 3.5;
         let invalid = |why: String| Err(Error::TimeOffsetInput { why });
-        let is_valid = |sample: &PoseSample| {
-            sample.secs.is_finite()
-                && transform::is_finite(&sample.pose)
-                && (sample.pose.rotation.norm() - 1.0).abs() < transform::RIGID_TOLERANCE
-        };
         if let Some(ix) = samples.iter().position(|sample| !is_valid(sample)) {
             return invalid(format!(
                 "pose {ix} of stream {name} is not finite or its quaternion has no unit length"
@@ -40,6 +43,7 @@ impl Stream {
         if let Some(why) = stamps::repeated_stamps(name, &sorted) {
             return invalid(why);
         }
+        // The first pose with a stamp is kept. Interpolation divides by the time between neighbors.
         sorted.dedup_by(|later, earlier| later.secs <= earlier.secs);
         if let Some(why) = stamps::distant_stamp(name, &sorted) {
             return invalid(why);
@@ -61,6 +65,7 @@ impl Stream {
         })
     }
 
+    /// Median time between neighbors, which gaps do not affect.
     pub(super) fn median_step_secs(&self) -> f64 {
         let steps: Vec<f64> = self
             .samples
@@ -100,6 +105,7 @@ impl Stream {
         let after = self.samples.partition_point(|sample| sample.secs <= secs);
         let (before, after) = match after {
             0 => return None,
+            // The time of the last pose itself is in the stream.
             n if n == self.samples.len() => {
                 let last = &self.samples[n - 1];
                 if secs > last.secs {
@@ -126,7 +132,8 @@ impl Stream {
         secs: f64,
         half_secs: f64,
     ) -> Option<(Transform, Vector3<f64>)> {
-        let (before, after) = (self.at(secs - half_secs)?, self.at(secs + half_secs)?);
+        let before = self.at(secs - half_secs)?;
+        let after = self.at(secs + half_secs)?;
         Some((
             self.at(secs)?,
             (before.rotation.inverse() * after.rotation).scaled_axis() / (2.0 * half_secs),
@@ -135,10 +142,8 @@ impl Stream {
 
     /// Magnitude of the mean rotation rate in a window around a time, rad/s.
     pub(super) fn rotation_rate(&self, secs: f64, window_secs: f64) -> Option<f64> {
-        let (before, after) = (
-            self.at(secs - 0.5 * window_secs)?,
-            self.at(secs + 0.5 * window_secs)?,
-        );
+        let before = self.at(secs - 0.5 * window_secs)?;
+        let after = self.at(secs + 0.5 * window_secs)?;
         Some(before.rotation.angle_to(&after.rotation) / window_secs)
     }
 }

@@ -9,7 +9,7 @@ use drivers::can::{BusConfig, MotorConfig};
 use kinematics::Chain;
 use toml::Table;
 
-/// Maximum joint offset, rad or m.
+/// Maximum joint offset, rad or m. A larger one is probably in degrees, or has the wrong sign.
 const MAX_JOINT_OFFSET: f64 = 1.0;
 
 keys! {
@@ -80,6 +80,8 @@ pub(super) fn read(mut keys: Section<'_>) -> Option<(Arm, String)> {
     let has_flange_link = keys.has("flange_link");
     let arm = Arm::read_keys(&mut keys);
     let urdf = keys.get::<String>("urdf", ());
+    // An invalid driver counts as an arm, so that the keys that an arm needs are checked in the
+    // same pass.
     let has_arm = arm.as_ref().is_none_or(|arm| arm.driver != ArmDriver::None);
     if has_arm && urdf.is_none() {
         keys.missing(
@@ -143,6 +145,8 @@ pub(super) fn resolve_joints(file: &str, arm: &mut Arm) -> Result<(), ConfigErro
         .order_in(&arm.joints)
         .map_err(|e| robot("arm.joints", e))?;
     resolve_motors(file, arm)?;
+    // Offsets are checked against the resolved joints, because the rig file may leave the list of
+    // joints to the URDF.
     check_offsets(
         file,
         "arm.joint_offsets",
@@ -204,6 +208,7 @@ fn resolve_motors(file: &str, arm: &mut Arm) -> Result<(), ConfigError> {
             arm.joints.join(", ")
         )));
     }
+    // A joint without a motor would have no readings, and the join would reject every joint state.
     if let Some(joint) = arm
         .joints
         .iter()
@@ -227,6 +232,7 @@ fn resolve_motors(file: &str, arm: &mut Arm) -> Result<(), ConfigError> {
         }
     }
     let mut motors = std::mem::take(&mut arm.motors);
+    // Readings then have the order of `arm.joints`.
     motors.sort_by_key(|motor| index_of(&motor.joint));
     arm.motors = motors;
     Ok(())

@@ -95,6 +95,8 @@ pub(super) fn read(mut keys: Section<'_>) -> Option<Base> {
 
 /// Reads a tag and its ID. Reports an invalid value and returns `None`.
 fn tag(id: &str, family: Family, keys: Section<'_>) -> Option<(u32, TagPlacement)> {
+    // The comparison with the text rejects other spellings of a number, such as `+1` or `007`,
+    // which would allow two tables for one tag.
     let number = id
         .parse()
         .ok()
@@ -117,25 +119,27 @@ fn tag(id: &str, family: Family, keys: Section<'_>) -> Option<(u32, TagPlacement
     ))
 }
 
-pub(super) fn write(base: &Base) -> Table {
-    let tag = |(id, tag): (&u32, &TagPlacement)| {
-        let TagPlacement {
+/// The table of one tag, with its ID as the name.
+fn tag_entry((id, tag): (&u32, &TagPlacement)) -> Option<(String, Value)> {
+    let TagPlacement {
+        size_m,
+        world_from_tag,
+    } = *tag;
+    entry(
+        &id.to_string(),
+        &TagKeys {
             size_m,
             world_from_tag,
-        } = *tag;
-        entry(
-            &id.to_string(),
-            &TagKeys {
-                size_m,
-                world_from_tag,
-            },
-        )
-    };
+        },
+    )
+}
+
+pub(super) fn write(base: &Base) -> Table {
     let mut table = base.write_keys();
     if !base.tags.is_empty() {
         table.insert(
             "tag".to_owned(),
-            Value::Table(base.tags.iter().filter_map(tag).collect()),
+            Value::Table(base.tags.iter().filter_map(tag_entry).collect()),
         );
     }
     table

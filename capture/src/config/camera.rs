@@ -244,6 +244,8 @@ pub(super) fn read(name: &str, mut keys: Section<'_>) -> Option<Camera> {
         intrinsics: !keys.has("intrinsics"),
         ..UnknownCalibration::default()
     };
+    // Size and `rectified` are keys of the camera and not of its lens. They are read separately and
+    // then combined with the lens.
     let size_px = keys.required::<[u32; 2]>("size_px", (), "width and height of the images");
     let rectified = keys.get("rectified", ()).unwrap_or(false);
     let camera = Camera::read_keys(&mut keys);
@@ -280,7 +282,9 @@ pub(super) fn read(name: &str, mut keys: Section<'_>) -> Option<Camera> {
         ..camera?
     };
     if let Some(lens) = &mut camera.sim.truth.intrinsics {
-        (lens.size_px, lens.rectified) = (camera.intrinsics.size_px, camera.intrinsics.rectified);
+        // The true lens belongs to the same images.
+        lens.size_px = camera.intrinsics.size_px;
+        lens.rectified = camera.intrinsics.rectified;
     }
     if reports_intrinsics {
         camera.realsense.unknown = unknown;
@@ -300,12 +304,14 @@ fn depth(
     let depth = Depth::read_keys(&mut keys);
     keys.end();
     let depth = depth?;
-    let lens = match unknown.depth_intrinsics {
-        // Depth of the same size as the color image is registered to it; depth of another size is
-        // assumed to have the same field of view.
-        true if size_px == color.size_px => color.clone(),
-        true => color.resized(size_px),
-        false => depth.intrinsics,
+    let lens = if !unknown.depth_intrinsics {
+        depth.intrinsics
+    } else if size_px == color.size_px {
+        // Depth of the same size as the color image is registered to it.
+        color.clone()
+    } else {
+        // Depth of another size is assumed to have the same field of view.
+        color.resized(size_px)
     };
     Some(Depth {
         intrinsics: Intrinsics {
@@ -330,6 +336,7 @@ pub(super) fn write(camera: &Camera) -> Table {
         "rectified",
         &(intrinsics.rectified && !realsense.unknown.intrinsics),
     ));
+    // A placeholder in the effective rig file would look like a calibration.
     if realsense.unknown.intrinsics {
         table.remove("intrinsics");
     }

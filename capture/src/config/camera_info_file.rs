@@ -1,4 +1,4 @@
-//! Camera info files of ROS in place of tables `intrinsics`.
+//! Reads camera info files of ROS, which replace `intrinsics` tables in rig files.
 
 use super::ConfigError;
 use super::key::{entry, number};
@@ -10,8 +10,9 @@ use toml::{Table, Value};
 
 const KEY: &str = "intrinsics";
 
-/// Replaces paths of camera info files by tables with their contents, for the color and depth
-/// images of all cameras of a rig. Paths are relative to `folder`. Logs notes about their contents.
+/// Replaces the paths of camera info files with tables of their contents, for the color and depth
+/// images of all cameras of a rig. The paths are relative to `folder`. Logs notes about the
+/// contents.
 pub(super) fn insert_contents(
     rig: &mut Table,
     folder: &Path,
@@ -26,6 +27,7 @@ pub(super) fn insert_contents(
         };
         let files = Files { folder, context };
         files.insert(&format!("camera.{name}"), camera, &Table::new())?;
+        // Depth inherits the size of the color images if it has none of its own.
         let color = camera.clone();
         if let Some(Value::Table(depth)) = camera.get_mut("depth") {
             files.insert(&format!("camera.{name}.depth"), depth, &color)?;
@@ -40,8 +42,8 @@ struct Files<'a> {
 }
 
 impl Files<'_> {
-    /// Replaces the path in the table of a camera or of its depth. `defaults` has the keys that are
-    /// absent in `table`.
+    /// Replaces the path in the table of a camera or of its depth. `defaults` contains the values
+    /// of keys that are absent in `table`.
     fn insert(
         &self,
         table_path: &str,
@@ -51,7 +53,8 @@ impl Files<'_> {
         let Some(Value::String(file)) = table.get(KEY) else {
             return Ok(());
         };
-        let (key, path) = (format!("{table_path}.{KEY}"), self.folder.join(file));
+        let key = format!("{table_path}.{KEY}");
+        let path = self.folder.join(file);
         let rejected = |reason: String| ConfigError::CameraInfo {
             at: self.context.location(&key),
             key: key.clone(),
@@ -64,6 +67,8 @@ impl Files<'_> {
         })?;
         let info = CameraInfo::parse(&text).map_err(&rejected)?;
         let setting = |name: &str| table.get(name).or_else(|| defaults.get(name));
+        // With `rectified = true`, distortion would be ignored, and the camera matrix would be that
+        // of other images.
         if setting("rectified") == Some(&Value::Boolean(true)) {
             return Err(rejected(
                 "these are the lens parameters of raw images, but rectified = true; remove that key, or use the numbers of \
@@ -73,6 +78,8 @@ impl Files<'_> {
         }
         let sides = setting("size_px").and_then(Value::as_array);
         let sides = sides.and_then(|sides| sides.iter().map(number).collect::<Option<Vec<f64>>>());
+        // The parameters are not scaled to another size: cameras may crop instead of scaling, which
+        // the file does not show.
         if let (Some([width, height]), Some(sides)) = (info.size_px, sides)
             && sides != [f64::from(width), f64::from(height)]
         {

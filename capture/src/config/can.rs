@@ -46,18 +46,20 @@ impl Key for &'static dyn MotorFamily {
     type Limits = ();
 
     fn read(keys: &mut Section<'_>, key: &'static str, (): ()) -> Option<Self> {
-        let named = |value: &Value| {
-            FAMILIES
-                .iter()
-                .copied()
-                .find(|family| value.as_str() == Some(family.name()))
-        };
-        keys.parse(key, named, family_names)
+        keys.parse(key, family_named, family_names)
     }
 
     fn write(&self) -> Option<Value> {
         Some(self.name().into())
     }
+}
+
+/// The family with this name.
+fn family_named(value: &Value) -> Option<&'static dyn MotorFamily> {
+    FAMILIES
+        .iter()
+        .copied()
+        .find(|family| value.as_str() == Some(family.name()))
 }
 
 /// The names of all families.
@@ -144,6 +146,7 @@ fn motor(joint: String, mut keys: Section<'_>, buses: &[BusConfig]) -> Option<Mo
             };
             keys.invalid("bus", &Value::String(bus), &allowed)
         });
+    // Families without gains do not read their keys, so that these keys are reported as unknown.
     let gains = if family.has_gains() {
         gains(&mut keys)
     } else {
@@ -151,7 +154,9 @@ fn motor(joint: String, mut keys: Section<'_>, buses: &[BusConfig]) -> Option<Mo
     };
     let protocol = protocol(&mut keys, family, id);
     keys.end();
-    let (bus_ix, protocol) = (bus_ix?, protocol?);
+    // Only now, so that all problems of the motor have been reported.
+    let bus_ix = bus_ix?;
+    let protocol = protocol?;
     Some(MotorConfig {
         joint,
         bus_ix,
@@ -195,13 +200,13 @@ fn setting(keys: &mut Section<'_>, key: &MotorKey) -> Option<SettingValue> {
         AllowedValues::Whole(range) => keys.get(key.name, range.clone()).map(SettingValue::Whole),
         AllowedValues::Number(range) => keys.get(key.name, range.clone()).map(SettingValue::Number),
         AllowedValues::Words(words) => {
-            let named = |value: &Value| {
+            let find = |value: &Value| {
                 words
                     .iter()
                     .copied()
                     .find(|word| value.as_str() == Some(word))
             };
-            keys.parse(key.name, named, || quoted(words.iter().copied()))
+            keys.parse(key.name, find, || quoted(words.iter().copied()))
                 .map(SettingValue::Word)
         }
     }
@@ -226,36 +231,37 @@ fn gains(keys: &mut Section<'_>) -> Option<Gains> {
 
 /// The tables of buses and motors that are not empty.
 pub(super) fn write(buses: &[BusConfig], motors: &[MotorConfig]) -> Table {
-    let bus = |bus: &BusConfig| {
-        let BusConfig {
-            bitrate_hz,
-            data_bitrate_hz,
-            accept_no_restart,
-            ..
-        } = *bus;
-        entry(
-            &bus.interface,
-            &BusKeys {
-                bitrate_hz,
-                data_bitrate_hz,
-                accept_no_restart,
-            },
-        )
-    };
-    let motor = |motor: &MotorConfig| {
-        (
-            motor.joint.clone(),
-            Value::Table(write_motor(motor, &buses[motor.bus_ix].interface)),
-        )
-    };
+    let motors = motors.iter().map(|motor| {
+        let bus = &buses[motor.bus_ix].interface;
+        (motor.joint.clone(), Value::Table(write_motor(motor, bus)))
+    });
     let tables: [(_, Table); 2] = [
-        ("bus", buses.iter().filter_map(bus).collect()),
-        ("motor", motors.iter().map(motor).collect()),
+        ("bus", buses.iter().filter_map(bus_entry).collect()),
+        ("motor", motors.collect()),
     ];
+    // Rigs without CAN motors have no empty tables in their effective rig file.
     let filled = tables.into_iter().filter(|(_, tables)| !tables.is_empty());
     filled
         .map(|(key, tables)| (key.to_owned(), Value::Table(tables)))
         .collect()
+}
+
+/// The table of one bus, with its interface as the name.
+fn bus_entry(bus: &BusConfig) -> Option<(String, Value)> {
+    let BusConfig {
+        bitrate_hz,
+        data_bitrate_hz,
+        accept_no_restart,
+        ..
+    } = *bus;
+    entry(
+        &bus.interface,
+        &BusKeys {
+            bitrate_hz,
+            data_bitrate_hz,
+            accept_no_restart,
+        },
+    )
 }
 
 fn write_motor(motor: &MotorConfig, bus: &str) -> Table {
@@ -267,8 +273,8 @@ fn write_motor(motor: &MotorConfig, bus: &str) -> Table {
         following,
         ..
     } = *motor;
-    let (family, MotorSettings { id, values }) =
-        (motor.protocol.family(), motor.protocol.settings());
+    let family = motor.protocol.family();
+    let MotorSettings { id, values } = motor.protocol.settings();
     let gains = GainKeys {
         stiffness_nm_rad: gains.map(|gains| gains.stiffness_nm_rad),
         damping_nm_s_rad: gains.map(|gains| gains.damping_nm_s_rad),

@@ -205,17 +205,16 @@ impl Key for f64 {
     type Limits = RangeInclusive<Self>;
 
     fn read(keys: &mut Section<'_>, key: &'static str, limits: Self::Limits) -> Option<Self> {
-        let allowed = || {
-            format!(
-                "numbers from {} to {}",
-                rounded(*limits.start()),
-                rounded(*limits.end())
-            )
-        };
         keys.parse(
             key,
             |value| number(value).filter(|number| limits.contains(number)),
-            allowed,
+            || {
+                format!(
+                    "numbers from {} to {}",
+                    rounded(*limits.start()),
+                    rounded(*limits.end())
+                )
+            },
         )
     }
 
@@ -242,6 +241,7 @@ pub(super) fn number(value: &Value) -> Option<f64> {
     let number = value
         .as_float()
         .or_else(|| value.as_integer().map(|whole| whole as f64))?;
+    // TOML has `nan` and `inf`, but no key of a rig file has a meaning for them.
     number.is_finite().then_some(number)
 }
 

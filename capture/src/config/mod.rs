@@ -92,6 +92,7 @@ impl Rig {
     /// other problem with keys.
     pub fn load(path: &Path, overrides: &[Override]) -> Result<Self, ConfigError> {
         let text = read_file("the rig file", path)?;
+        // Messages name the file and not its folder, which the user knows.
         let file = path.file_name().map_or_else(
             || path.display().to_string(),
             |name| name.to_string_lossy().into_owned(),
@@ -164,25 +165,13 @@ impl Rig {
     /// cameras, and joint offsets.
     #[must_use]
     pub fn has_same_calibration(&self, other: &Self) -> bool {
-        const TOLERANCE: f64 = 1e-9; // Writing and reading a pose may change its last bit.
-        let is_same = |one: &Camera, other: &Camera| {
-            let difference = one.parent_from_camera.inverse() * other.parent_from_camera;
-            one.name == other.name
-                && one.parent == other.parent
-                && difference.translation.vector.norm() < TOLERANCE
-                && difference.rotation.angle() < TOLERANCE
-                && one.intrinsics == other.intrinsics
-                && one.stamp_to_mid_exposure == other.stamp_to_mid_exposure
-                && one.readout_micros == other.readout_micros
-                && one.depth == other.depth
-        };
         self.arm.joint_offsets == other.arm.joint_offsets
             && self.cameras.len() == other.cameras.len()
             && self
                 .cameras
                 .iter()
                 .zip(&other.cameras)
-                .all(|(one, other)| is_same(one, other))
+                .all(|(one, other)| is_calibrated_equally(one, other))
     }
 
     /// Returns the same rig with a single scene model.
@@ -206,6 +195,7 @@ impl Rig {
     /// If a file cannot be written.
     pub fn write_resolved(&self, folder: &Path) -> std::io::Result<PathBuf> {
         let path = folder.join(drivers::recording::RIG_FILE);
+        // The description first: a rig file that is complete can then always be read.
         files::write(
             &folder.join(drivers::recording::URDF_FILE),
             &self.arm.urdf_text,
@@ -213,6 +203,20 @@ impl Rig {
         files::write(&path, self.to_toml())?;
         Ok(path)
     }
+}
+
+/// Whether all calibration of two cameras is the same.
+fn is_calibrated_equally(one: &Camera, other: &Camera) -> bool {
+    const TOLERANCE: f64 = 1e-9; // Writing and reading a pose may change its last bit.
+    let difference = one.parent_from_camera.inverse() * other.parent_from_camera;
+    one.name == other.name
+        && one.parent == other.parent
+        && difference.translation.vector.norm() < TOLERANCE
+        && difference.rotation.angle() < TOLERANCE
+        && one.intrinsics == other.intrinsics
+        && one.stamp_to_mid_exposure == other.stamp_to_mid_exposure
+        && one.readout_micros == other.readout_micros
+        && one.depth == other.depth
 }
 
 fn read_file(description: &'static str, path: &Path) -> Result<String, ConfigError> {

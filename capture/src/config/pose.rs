@@ -30,6 +30,8 @@ impl Key for Transform {
         } = keys.get(key, ())?;
         let quaternion = Quaternion::new(w, i, j, k);
         let norm = quaternion.norm();
+        // Numbers rounded to three or more digits pass. A larger deviation shows a typing error or
+        // another convention, such as Euler angles.
         if (norm - 1.0).abs() > 1e-3 {
             let got = Value::from(vec![i, j, k, w]);
             return keys.invalid(
@@ -38,9 +40,10 @@ impl Key for Transform {
                 "numbers whose squares sum to 1",
             );
         }
-        let rotation = match (norm - 1.0).abs() < UNIT_NORM_TOLERANCE {
-            true => UnitQuaternion::new_unchecked(quaternion),
-            false => UnitQuaternion::new_normalize(quaternion),
+        let rotation = if (norm - 1.0).abs() < UNIT_NORM_TOLERANCE {
+            UnitQuaternion::new_unchecked(quaternion)
+        } else {
+            UnitQuaternion::new_normalize(quaternion)
         };
         Some(Self::from_parts(Translation3::new(x, y, z), rotation))
     }

@@ -51,6 +51,8 @@ pub(super) fn keys(
         message: e.message().to_owned(),
     };
     let mut table: Table = toml::from_str(text).map_err(syntax)?;
+    // Flags are applied to the text of the file, before anything is checked. Their values then have
+    // the same ranges and defaults as keys.
     for flag in overrides {
         set(&mut table, flag.key, flag.value.clone());
     }
@@ -62,6 +64,8 @@ pub(super) fn keys(
 }
 
 fn rig(mut root: Section<'_>) -> Option<(Rig, String)> {
+    // Every table is read before any error returns, so that all problems of the file are reported
+    // at once.
     let arm = arm::read(root.section("arm"));
     let base = base::read(root.section("base"));
     let cameras = root.named_sections("camera");
@@ -102,6 +106,8 @@ fn set(table: &mut Table, key: &str, value: Value) {
         None => {
             table.insert(key.to_owned(), value);
         }
+        // If the file has a value where a flag needs a table, the flag is dropped here, and the
+        // value is reported as invalid when the table is read.
         Some((parent, rest)) => {
             let inner = table
                 .entry(parent.to_owned())

@@ -11,7 +11,8 @@ use std::collections::{BTreeMap, BTreeSet};
 use toml::de::{DeTable, DeValue};
 use toml::{Table, Value};
 
-/// Maximum number of listed problems; further ones are only counted.
+/// Maximum number of listed problems; further ones are only counted. A file of another kind, given by
+/// mistake, may have thousands of unknown keys.
 const MAX_PROBLEMS: usize = 50;
 
 /// State shared by all sections while a rig file is read.
@@ -71,12 +72,9 @@ impl ParseContext {
             } => *line,
             _ => 0,
         });
-        let meant = |key: &str| {
-            problems
-                .iter()
-                .any(|problem| matches!(problem, ConfigError::UnknownKey { nearest: Some(meant), .. } if meant == key))
-        };
-        let is_meant = |problem: &ConfigError| matches!(problem, ConfigError::Missing { key, .. } if meant(key));
+        // If a misspelled key has been reported with the key that it probably means, that key is not
+        // reported as missing in addition.
+        let is_meant = |problem: &ConfigError| matches!(problem, ConfigError::Missing { key, .. } if is_suggested(key, &problems));
         let others: Vec<_> = others
             .into_iter()
             .filter(|problem| !is_meant(problem))
@@ -109,7 +107,7 @@ impl ParseContext {
         }
     }
 
-    /// Where the value of a key, a dotted path, comes from.
+    /// The place that sets the value of a key. The key is a dotted path.
     pub(super) fn location(&self, key: &str) -> SourceLocation {
         // A flag may replace a whole table, and keys inside an inline table are on its line.
         let mut path = key;
@@ -134,6 +132,13 @@ impl ParseContext {
             }
         }
     }
+}
+
+/// Whether an unknown key is probably a misspelling of `key`.
+fn is_suggested(key: &str, problems: &[ConfigError]) -> bool {
+    problems
+        .iter()
+        .any(|problem| matches!(problem, ConfigError::UnknownKey { nearest: Some(meant), .. } if meant == key))
 }
 
 fn note_lines(
@@ -185,6 +190,7 @@ impl<'a> Section<'a> {
     /// Ends the section and reports unread keys as unknown.
     pub(super) fn end(self) {
         for key in self.table.keys() {
+            // The search for similar names is not needed for a problem that is only counted.
             if self.context.problems.borrow().len() >= MAX_PROBLEMS {
                 self.context.n_more_problems.update(|n| n + 1);
                 continue;
@@ -225,7 +231,8 @@ impl<'a> Section<'a> {
         let Some(mut parent) = self.optional_section(key) else {
             return Vec::new();
         };
-        let (n, budget) = (parent.table.len(), Budget::RIG_TABLES);
+        let n = parent.table.len();
+        let budget = Budget::RIG_TABLES;
         if budget.check_elements(n as u64).is_err() {
             let got = Value::String(format!("{n} tables"));
             self.invalid::<()>(
@@ -282,10 +289,13 @@ impl<'a> Section<'a> {
     pub(super) fn missing(&self, key: &str, meaning: impl Into<Cow<'static, str>>) {
         let key = join(&self.path, key);
         let is_reported = |problem: &ConfigError| matches!(problem, ConfigError::InvalidValue { key: other, .. } if *other == key);
+        // The temporary borrow ends with the condition, because `report` borrows the list again.
         if !self.context.problems.borrow().iter().any(is_reported) {
-            let (file, meaning) = (self.context.file.clone(), meaning.into());
-            self.context
-                .report(ConfigError::Missing { file, key, meaning });
+            self.context.report(ConfigError::Missing {
+                file: self.context.file.clone(),
+                key,
+                meaning: meaning.into(),
+            });
         }
     }
 

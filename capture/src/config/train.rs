@@ -45,6 +45,8 @@ pub struct Methods {
 
 impl PartialEq for Methods {
     fn eq(&self, other: &Self) -> bool {
+        // The place in a file is no part of the value: a rig read from its effective rig file must
+        // equal the original.
         self.names == other.names
     }
 }
@@ -70,25 +72,29 @@ impl Methods {
     ///
     /// If a name is not among `known`. The error contains its line in the rig file.
     pub fn resolve<T: Copy>(&self, known: &[(&str, T)]) -> Result<Vec<T>, ConfigError> {
-        let find = |name: &String| {
-            known
-                .iter()
-                .find(|(known, _)| known == name)
-                .map(|(_, method)| *method)
-                .ok_or_else(|| {
-                    let names: Vec<_> = known.iter().map(|(name, _)| format!("{name:?}")).collect();
-                    ConfigError::InvalidValue {
-                        at: self.location.clone(),
-                        key: "train.method".into(),
-                        got: format!("{name:?}"),
-                        allowed: format!(
-                            "{}, or a list of these without duplicates",
-                            names.join(", ")
-                        ),
-                    }
-                })
-        };
-        self.names.iter().map(find).collect()
+        self.names
+            .iter()
+            .map(|name| self.resolve_one(name, known))
+            .collect()
+    }
+
+    fn resolve_one<T: Copy>(&self, name: &str, known: &[(&str, T)]) -> Result<T, ConfigError> {
+        known
+            .iter()
+            .find(|(known, _)| *known == name)
+            .map(|(_, method)| *method)
+            .ok_or_else(|| {
+                let names: Vec<_> = known.iter().map(|(name, _)| format!("{name:?}")).collect();
+                ConfigError::InvalidValue {
+                    at: self.location.clone(),
+                    key: "train.method".into(),
+                    got: format!("{name:?}"),
+                    allowed: format!(
+                        "{}, or a list of these without duplicates",
+                        names.join(", ")
+                    ),
+                }
+            })
     }
 }
 

@@ -6,11 +6,13 @@ use crate::config::{Camera, Parent, Rig};
 use kinematics::{Lens, Transform};
 
 const CHECK: &str = "calibration";
-/// Maximum plausible distance of a camera from the flange that carries it.
+/// Maximum plausible distance of a camera from the flange that carries it. Lengths in centimeters or
+/// millimeters exceed it.
 const MAX_DISTANCE_M: f64 = 3.0;
-/// Plausible horizontal fields of view.
+/// Plausible horizontal fields of view. Focal lengths in millimeters or normalized by the width fall
+/// outside.
 const FIELD_OF_VIEW_DEG: std::ops::RangeInclusive<f64> = 5.0..=160.0;
-/// Minimum plausible exposure time.
+/// Minimum plausible exposure time. Times in milliseconds are below it.
 const MIN_EXPOSURE_MICROS: f64 = 5.0;
 
 /// Checks the values of all cameras. Empty if all are plausible.
@@ -45,12 +47,14 @@ fn problems(camera: &Camera) -> Vec<(String, String)> {
         }
     }
     let intrinsics = &camera.intrinsics;
+    // Placeholders of unknown intrinsics are implausible, but not an error of the user.
     if !camera.realsense.unknown.intrinsics {
         let size_px = intrinsics.size_px.map(f64::from);
         let field_of_view_deg = 2.0
             * (0.5 * size_px[0] / intrinsics.focal_px[0])
                 .atan()
                 .to_degrees();
+        // The formula above holds for a pinhole; a fisheye may see more than half of the space.
         let has_wide_lens =
             matches!(intrinsics.lens, Lens::KannalaBrandt(_)) && !intrinsics.rectified;
         if !FIELD_OF_VIEW_DEG.contains(&field_of_view_deg) && !has_wide_lens {

@@ -36,10 +36,6 @@ pub(super) fn franka(rig: Option<&Rig>) -> Vec<Finding> {
         return findings;
     }
     let host = host_of(&arm.address);
-    let output_of = |program: &str, arguments: &[&str]| {
-        let output = Command::new(program).args(arguments).output().ok()?;
-        Some(String::from_utf8_lossy(&output.stdout).into_owned())
-    };
     findings.extend(
         output_of("ip", &["-o", "route", "get", host])
             .map(|command_output| route(Path::new("/sys"), host, &command_output)),
@@ -58,10 +54,18 @@ pub(super) fn franka(rig: Option<&Rig>) -> Vec<Finding> {
             )
         }
     };
+    // A connection to a host that does not respond would only wait for its timeout and report the
+    // same problem again.
     let is_reachable = pinged.verdict != Verdict::Fail;
     findings.push(pinged);
     findings.extend(is_reachable.then(|| port(&arm.address)));
     findings
+}
+
+/// The output of a program; `None` if it is not installed.
+fn output_of(program: &str, arguments: &[&str]) -> Option<String> {
+    let output = Command::new(program).args(arguments).output().ok()?;
+    Some(String::from_utf8_lossy(&output.stdout).into_owned())
 }
 
 /// Checks that the controller accepts clients, by opening a connection and closing it without
@@ -109,9 +113,10 @@ fn kernel(sys: &Path, os_release: &str) -> Finding {
     if is_realtime {
         return Finding::ok("kernel", "PREEMPT_RT");
     }
-    let remedy = match os_release.lines().any(|line| line == "ID=ubuntu") {
-        true => "sudo pro enable realtime-kernel, then boot into it",
-        false => "sudo apt-get install -y linux-image-rt-amd64, then boot into it",
+    let remedy = if os_release.lines().any(|line| line == "ID=ubuntu") {
+        "sudo pro enable realtime-kernel, then boot into it"
+    } else {
+        "sudo apt-get install -y linux-image-rt-amd64, then boot into it"
     };
     Finding::warn(
         "kernel",
@@ -137,13 +142,7 @@ fn locked_memory(proc: &Path) -> Finding {
 
 /// Checks the route to the robot in the output of `ip -o route get`.
 fn route(sys: &Path, host: &str, command_output: &str) -> Finding {
-    let after = |word: &str| {
-        let mut words = command_output
-            .split_whitespace()
-            .skip_while(|found| *found != word);
-        words.nth(1)
-    };
-    let Some(interface) = after("dev") else {
+    let Some(interface) = word_after(command_output, "dev") else {
         let remedy = "sudo ip addr add 172.16.0.1/24 dev INTERFACE   (the interface with the robot's cable; an unused address in the robot's network)";
         return Finding::fail("route", format!("no route to {host}"), remedy);
     };
@@ -162,7 +161,7 @@ fn route(sys: &Path, host: &str, command_output: &str) -> Finding {
             "connect the robot's cable to this computer",
         );
     }
-    match after("via") {
+    match word_after(command_output, "via") {
         Some(router) => {
             let message = format!("{host} is reached via the router {router} ({interface})");
             Finding::warn(
@@ -173,6 +172,13 @@ fn route(sys: &Path, host: &str, command_output: &str) -> Finding {
         }
         None => Finding::ok("route", format!("{host} is on {interface}")),
     }
+}
+
+/// The word that follows a keyword.
+fn word_after<'a>(text: &'a str, keyword: &str) -> Option<&'a str> {
+    text.split_whitespace()
+        .skip_while(|found| *found != keyword)
+        .nth(1)
 }
 
 /// Checks response and latency of the robot in the output of `ping -q`.

@@ -13,11 +13,12 @@ use serde::Serialize;
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
-/// A device is reported if its rate is below this fraction of the rate in the rig file.
+/// A device is reported if its rate is below this fraction of the rate in the rig file. The margin
+/// allows for one missing sample in a short measurement.
 const MIN_RATE_FRAC: f64 = 0.95;
 
 /// Minimum time between the first and the last sample for comparing the stamps with the clock of
-/// this computer.
+/// this computer. In a shorter time, the variation of latencies would be large in comparison.
 const MIN_RECEIVED_SECS: f64 = 0.5;
 
 /// Measurements of one device, or of the keyframes made from its images.
@@ -138,7 +139,8 @@ pub fn listen(rig: &Rig, secs: f64, stop: &Stop) -> Result<ListenResult> {
     let mut join = Join::new(&rig)?;
     let mut tracks: BTreeMap<String, Track> = BTreeMap::new();
     let mut findings = Vec::new();
-    let (began, cpu_before) = (Instant::now(), clock::process_cpu_time());
+    let began = Instant::now();
+    let cpu_before = clock::process_cpu_time();
     while !stop.requested() && began.elapsed().as_secs_f64() < secs {
         let sample = match source.next_sample() {
             Ok(Some(sample)) => sample,
@@ -152,20 +154,16 @@ pub fn listen(rig: &Rig, secs: f64, stop: &Stop) -> Result<ListenResult> {
                 break;
             }
         };
+        // The time of arrival is taken before any work on the sample, so that the latency is that
+        // of the device.
         let now = clock::now();
-        let (device, dropped) = match &sample {
-            Sample::Image(image) if image.is_depth() => {
-                (format!("camera {:?} depth", image.camera), image.n_skipped)
-            }
-            Sample::Image(image) => (format!("camera {:?}", image.camera), image.n_skipped),
-            Sample::Joints(_) => ("arm".to_owned(), 0),
-            Sample::Base(_) => ("base".to_owned(), 0),
-            Sample::Range(scan) => (format!("range scanner {:?}", scan.scanner), 0),
-            Sample::Truth(_) | Sample::BaseTruth(_) => continue,
+        let Some((device, dropped)) = device_of(&sample) else {
+            continue;
         };
         let track = tracks.entry(device).or_default();
         track.note(sample.stamp(), now);
         track.dropped += dropped;
+        // The samples are joined as in a run, because missing poses show only here.
         for event in join.push(sample) {
             if let JoinEvent::Accepted(keyframe) = event {
                 let track = tracks
@@ -197,33 +195,53 @@ pub fn listen(rig: &Rig, secs: f64, stop: &Stop) -> Result<ListenResult> {
         .collect();
     findings.extend(devices.iter().filter_map(problem));
     findings.extend(devices.iter().filter_map(wrong_unit));
-    let rejected: Vec<_> = join
-        .counts()
+    findings.extend(join_finding(&join));
+    Ok(ListenResult { devices, findings })
+}
+
+/// Name of the device that delivered a sample, and the number of its images that were dropped
+/// before; `None` for ground truth, which no device delivers.
+fn device_of(sample: &Sample) -> Option<(String, u64)> {
+    Some(match sample {
+        Sample::Image(image) if image.is_depth() => {
+            (format!("camera {:?} depth", image.camera), image.n_skipped)
+        }
+        Sample::Image(image) => (format!("camera {:?}", image.camera), image.n_skipped),
+        Sample::Joints(_) => ("arm".to_owned(), 0),
+        Sample::Base(_) => ("base".to_owned(), 0),
+        Sample::Range(scan) => (format!("range scanner {:?}", scan.scanner), 0),
+        Sample::Truth(_) | Sample::BaseTruth(_) => return None,
+    })
+}
+
+/// Lists why images did not become keyframes. This is normal, for example while the robot stands
+/// still, unless most images have no pose.
+fn join_finding(join: &Join) -> Option<Finding> {
+    let counts = join.counts();
+    let rejected: Vec<_> = counts
         .rejected
         .iter()
         .map(|(why, n)| format!("{n} {}", why.name()))
         .collect();
-    let n_posed = join.counts().images
-        - join
-            .counts()
-            .rejected
-            .get(&Rejection::NoPose)
-            .copied()
-            .unwrap_or(0);
-    if !rejected.is_empty() {
-        let message = format!(
-            "images that did not become keyframes: {}",
-            rejected.join(", ")
-        );
-        findings.push(if 2 * n_posed < join.counts().images {
-            let remedy =
-                "each image needs joint states, and base poses if the base moves, around its time: check their source";
-            Finding::warn("join", message, remedy)
-        } else {
-            Finding::ok("join", message)
-        });
+    if rejected.is_empty() {
+        return None;
     }
-    Ok(ListenResult { devices, findings })
+    let n_without_pose = counts
+        .rejected
+        .get(&Rejection::NoPose)
+        .copied()
+        .unwrap_or(0);
+    let n_posed = counts.images - n_without_pose;
+    let message = format!(
+        "images that did not become keyframes: {}",
+        rejected.join(", ")
+    );
+    Some(if 2 * n_posed < counts.images {
+        let remedy = "each image needs joint states, and base poses if the base moves, around its time: check their source";
+        Finding::warn("join", message, remedy)
+    } else {
+        Finding::ok("join", message)
+    })
 }
 
 /// The devices of a rig with their expected rates; `None` if the rig file does not set a rate.
@@ -256,7 +274,7 @@ fn expected(rig: &Rig) -> BTreeMap<String, Option<f64>> {
     expected
 }
 
-/// The device without data, if an error of a source is about one.
+/// The device that sent no data, if the error is about such a device.
 fn silent_device(error: &Error) -> Option<String> {
     match error {
         Error::NoJoints { .. } => Some("arm".to_owned()),
@@ -269,17 +287,18 @@ fn silent_device(error: &Error) -> Option<String> {
 /// What to do about an error of a device.
 fn remedy(error: &Error, monitors: &[DatagramMonitor]) -> &'static str {
     let device = silent_device(error);
-    match monitors
+    let has_monitor = monitors
         .iter()
-        .any(|monitor| Some(monitor.device()) == device.as_deref())
-    {
-        true => "check its sender: docs/reference/udp.md describes the format",
-        false => "check the device and its cable",
+        .any(|monitor| Some(monitor.device()) == device.as_deref());
+    if has_monitor {
+        "check its sender: docs/reference/udp.md describes the format"
+    } else {
+        "check the device and its cable"
     }
 }
 
-/// The devices that sent nothing. Devices whose datagrams cannot be used have a finding of their
-/// own.
+/// A finding for each device that sent nothing. Devices whose datagrams cannot be used have another
+/// finding.
 fn missing(
     rig: &Rig,
     expected: &BTreeMap<String, Option<f64>>,

@@ -3,7 +3,8 @@
 use super::{Finding, field};
 use std::path::Path;
 
-/// Enough for a model of a million splats with its keyframes and the optimizer state.
+/// Enough for a model of a million splats with its keyframes and the optimizer state. With less, a
+/// run may have to swap, or fails when its store of keyframes is full.
 const SUFFICIENT_MEMORY_KIB: u64 = 4 << 20;
 
 /// Checks that the memory is sufficient for a run.

@@ -101,7 +101,9 @@ impl std::fmt::Display for Finding {
 /// Checks clocks, memory, priorities and permissions, the devices of `rig`, and connected devices
 /// in general.
 pub fn check(rig: Option<&Rig>) -> Vec<Finding> {
-    let (dev, proc, sys) = (Path::new("/dev"), Path::new("/proc"), Path::new("/sys"));
+    let dev = Path::new("/dev");
+    let proc = Path::new("/proc");
+    let sys = Path::new("/sys");
     let mut findings = vec![clock::clock(), clock::clock_source(sys)];
     findings.extend(governor::governor(sys));
     findings.extend([

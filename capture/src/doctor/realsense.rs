@@ -90,23 +90,24 @@ pub(super) fn files(rig: &Rig) -> Vec<Finding> {
         let file = &camera.realsense.file;
         camera.driver == CameraDriver::Realsense && !file.as_os_str().is_empty() && !file.is_file()
     };
-    let missing_file = |camera: &Camera| {
-        let message = format!(
-            "camera {:?}: the file {} does not exist",
-            camera.name,
-            camera.realsense.file.display()
-        );
-        Finding::fail(
-            "realsense",
-            message,
-            "camera.NAME.realsense.file is relative to the folder of the rig file",
-        )
-    };
     rig.cameras
         .iter()
         .filter(missing)
         .map(missing_file)
         .collect()
+}
+
+fn missing_file(camera: &Camera) -> Finding {
+    let message = format!(
+        "camera {:?}: the file {} does not exist",
+        camera.name,
+        camera.realsense.file.display()
+    );
+    Finding::fail(
+        "realsense",
+        message,
+        "camera.NAME.realsense.file is relative to the folder of the rig file",
+    )
 }
 
 #[cfg(test)]

@@ -22,6 +22,8 @@ pub(super) fn permissions(dev: &Path) -> Finding {
     let denied: Vec<String> = nodes
         .iter()
         .filter(|node| {
+            // Opened for reading and writing, as the drivers do. Any other error, such as a busy
+            // device, is no problem of permissions.
             let opened = std::fs::File::options().read(true).write(true).open(node);
             opened.is_err_and(|error| error.kind() == std::io::ErrorKind::PermissionDenied)
         })
@@ -49,18 +51,20 @@ pub(super) fn unstable_nodes(rig: &Rig) -> Vec<Finding> {
         .iter()
         .filter(|camera| camera.driver == CameraDriver::V4l2);
     let unstable = cameras.filter(|camera| camera.device.starts_with("/dev/video"));
-    let warn = |camera: &Camera| {
-        let message = format!(
-            "camera {:?}: {} may become another camera after a restart",
-            camera.name, camera.device
-        );
-        Finding::warn(
-            "cameras",
-            message,
-            "use the stable name that fieldrig devices prints",
-        )
-    };
-    unstable.map(warn).collect()
+    unstable.map(unstable_node).collect()
+}
+
+#[cfg(target_os = "linux")]
+fn unstable_node(camera: &Camera) -> Finding {
+    let message = format!(
+        "camera {:?}: {} may become another camera after a restart",
+        camera.name, camera.device
+    );
+    Finding::warn(
+        "cameras",
+        message,
+        "use the stable name that fieldrig devices prints",
+    )
 }
 
 /// Reports V4L2 cameras of a rig that are not connected.

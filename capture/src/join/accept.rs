@@ -49,12 +49,16 @@ impl Acceptance {
     /// Checks that the camera has moved enough since the nearest keyframe. For a fixed camera,
     /// checks instead that enough time has passed.
     pub(super) fn check_motion(&self, stamp: Stamp, pose: &Transform) -> Result<(), Rejection> {
+        // A fixed camera would never move by the minimum spacing. Its images still show moving
+        // objects, so a few of them are taken over time.
         let moved = if self.is_fixed {
             let waited = self.last.is_none_or(|last| {
                 stamp.secs_since(last) * 1e3 >= self.config.fixed_interval_millis
             });
             waited && self.accepted.len() < self.config.fixed_keyframes
         } else {
+            // The distance to every accepted pose counts, not only to the last one: an arm that
+            // repeats its path would otherwise add the same views in each round.
             self.accepted
                 .iter()
                 .all(|accepted| self.spacing.between(accepted, pose) >= 1.0)
@@ -76,6 +80,9 @@ impl Acceptance {
         depth_m: f64,
     ) -> Result<(), Rejection> {
         let Some(twist) = &camera_pose.twist else {
+            // Shear is proportional to the readout time, so a global shutter needs no velocity.
+            // Blur cannot be predicted without a velocity either; strong blur is found by the test
+            // of sharpness.
             return if self.readout_secs > 0.0 {
                 Err(Rejection::ShearUnknown)
             } else {
@@ -83,6 +90,8 @@ impl Acceptance {
             };
         };
         let speed_px_s = motion::image_speed_px_s(twist, pinhole, depth_m);
+        // A camera that does not report its exposure is not tested for blur here. Its blurred
+        // images are found by their sharpness.
         let blur_px = speed_px_s * exposure_secs.unwrap_or(0.0);
         let shear_px = speed_px_s * self.readout_secs;
         // Written so that a NaN speed is rejected too.
@@ -104,6 +113,8 @@ impl Acceptance {
         if !is_well_exposed || statistics.clipped_frac > self.config.max_clipped_frac {
             return Err(Rejection::Exposure);
         }
+        // The history is updated before the test, also with images that are rejected. Otherwise, a
+        // camera that turns to a blurry scene would be rejected forever.
         let relative = self.sharpness.relative(statistics.sharpness);
         if relative >= self.config.min_sharpness_frac {
             Ok(())

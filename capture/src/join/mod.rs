@@ -27,7 +27,7 @@ use accept::Acceptance;
 use assemble::Undistorter;
 use drivers::{Image, Sample, TruthImage};
 use keyframe::{Keyframe, KeyframeList, RangePoints, Split};
-use kinematics::{HistoryError, Stamp, Transform};
+use kinematics::{HistoryError, JointState, Stamp, Transform};
 use ranges::RangeScans;
 use spacing::Spacing;
 use std::sync::Arc;
@@ -150,6 +150,7 @@ impl Join {
     /// limits.
     #[must_use]
     pub fn taking_only(mut self, list: KeyframeList) -> Self {
+        // Nothing may be evicted, so that the spacing of this store has no effect.
         self.store = KeyframeStore::new(
             usize::MAX,
             u64::MAX,
@@ -199,28 +200,11 @@ impl Join {
     /// Processes one sample and returns the resulting events.
     pub fn push(&mut self, sample: Sample) -> Vec<JoinEvent> {
         let mut events = Vec::new();
+        // The newest stamp of any device is the clock of all waits. Wall time would make a replay
+        // decide differently from the run that it repeats.
         self.newest = self.newest.max(sample.stamp());
         match sample {
-            Sample::Joints(state) => {
-                if !self.warned_joint_limits
-                    && let Some(joint_limit_warning) = self.motion.joint_limit_warning(&state)
-                {
-                    log::warn!("{joint_limit_warning}");
-                    self.warned_joint_limits = true;
-                }
-                match self.motion.push_joints(state) {
-                    Ok(()) => {}
-                    Err(JointsRejection::Invalid) => self.counts.joints_rejected += 1,
-                    Err(JointsRejection::TooFast(jump)) => {
-                        if self.counts.joints_too_fast == 0 {
-                            log::warn!(
-                                "ignored a joint state: {jump}; stop other programs that send joint states, or correct the URDF"
-                            );
-                        }
-                        self.counts.joints_too_fast += 1;
-                    }
-                }
-            }
+            Sample::Joints(state) => self.push_joints(state),
             Sample::Base(pose) => {
                 let is_valid = self.motion.push_base(&pose);
                 self.counts.base_poses_rejected += u64::from(!is_valid);
@@ -241,6 +225,8 @@ impl Join {
                 }
             }
         }
+        // Any sample may complete a waiting image: a joint reading gives it a pose, and a sample of
+        // another device may end its wait.
         self.process_ready(false, &mut events);
         events
     }
@@ -255,6 +241,7 @@ impl Join {
     /// Accepts or rejects all pending images, because the source has restarted. Its stamps continue
     /// to increase, but the robot jumps back, so the motion up to now is not used for later images.
     pub(crate) fn restart(&mut self) -> Vec<JoinEvent> {
+        // Images that still wait belong to the motion before the jump, so they are decided first.
         let events = self.finish();
         self.motion.restart();
         events
@@ -297,6 +284,30 @@ impl Join {
         )?)
     }
 
+    /// Adds a joint state. The first state of each kind of problem is logged, all of them are counted.
+    fn push_joints(&mut self, state: JointState) {
+        // States that are ignored below are checked, too: readings in degrees also imply impossible
+        // speeds, but this warning names the cause.
+        if !self.warned_joint_limits
+            && let Some(joint_limit_warning) = self.motion.joint_limit_warning(&state)
+        {
+            log::warn!("{joint_limit_warning}");
+            self.warned_joint_limits = true;
+        }
+        match self.motion.push_joints(state) {
+            Ok(()) => {}
+            Err(JointsRejection::Invalid) => self.counts.joints_rejected += 1,
+            Err(JointsRejection::TooFast(jump)) => {
+                if self.counts.joints_too_fast == 0 {
+                    log::warn!(
+                        "ignored a joint state: {jump}; stop other programs that send joint states, or correct the URDF"
+                    );
+                }
+                self.counts.joints_too_fast += 1;
+            }
+        }
+    }
+
     fn push_image(&mut self, image: Image, events: &mut Vec<JoinEvent>) {
         self.counts.device_skipped += image.n_skipped;
         self.counts.images += u64::from(!image.is_depth());
@@ -305,6 +316,8 @@ impl Join {
             .iter_mut()
             .find(|camera| camera.config.name == image.camera)
         else {
+            // Only color images are counted and rejected. A depth image of an unknown camera
+            // belongs to a color image that is rejected already.
             if !image.is_depth() {
                 self.counts
                     .unknown_cameras
@@ -316,6 +329,7 @@ impl Join {
         if image.is_depth() {
             let stamp = camera.config.mid_exposure(image.stamp);
             camera.waiting.push_depth(stamp, image);
+        // Color images keep their device stamp in the queue, because ground truth is found by it.
         } else if let Some(dropped_image) = camera.waiting.push_color(image) {
             let stamp = camera.config.mid_exposure(dropped_image.stamp);
             self.reject(&dropped_image.camera, stamp, Rejection::QueueFull, events);
@@ -336,6 +350,8 @@ impl Join {
                 .cloned()
                 .map(JoinEvent::RangeScan),
         );
+        // The order of the cameras is fixed (that of the rig file), so that a replay gives the
+        // keyframes in the order of the run.
         for camera_ix in 0..self.cameras.len() {
             while let Some(ready) = self.next_ready(camera_ix, at_end) {
                 match ready {
@@ -363,6 +379,8 @@ impl Join {
         let camera = &mut self.cameras[camera_ix];
         let device_stamp = camera.waiting.oldest()?.stamp;
         let stamp = camera.config.mid_exposure(device_stamp);
+        // An image with a lost partner must not wait forever, because newer images of its camera
+        // queue behind it.
         let overdue = at_end || self.newest.secs_since(stamp) > self.max_wait_secs;
         let camera_pose = match self.motion.at(&camera.config, stamp) {
             Err(HistoryError::NotYet { .. }) if !overdue => return None,
@@ -371,11 +389,15 @@ impl Join {
         let period_secs = 1.0 / camera.config.rate_hz;
         let mut depth = None;
         if camera.config.depth.is_some() && camera_pose.is_ok() {
+            // Depth and color of one exposure are at most half a period apart. A depth image
+            // further away belongs to a neighboring color image.
             let (depth_stamp, is_final) = camera.waiting.depth_near(stamp, 0.5 * period_secs);
             if !is_final && !overdue {
                 return None;
             }
             if let Some(depth_stamp) = depth_stamp {
+                // The depth image has its own pose, because the camera moves between the two
+                // exposures.
                 match self.motion.at(&camera.config, depth_stamp) {
                     Err(HistoryError::NotYet { .. }) if !overdue => return None,
                     Ok(camera_pose) => {
@@ -385,6 +407,7 @@ impl Join {
                             .cloned()
                             .zip(Some(camera_pose))
                     }
+                    // Depth without a pose is useless, but the color image is still good.
                     Err(_) => {}
                 }
             }
@@ -394,10 +417,14 @@ impl Join {
             Partner::Available(truth) => Some(truth.clone()),
             Partner::NotYet | Partner::Never => None,
         };
+        // A recording of a simulator may have no ground truth. Without this, every image of such a
+        // recording would wait until it is overdue.
         if truth.is_none() && overdue && camera_pose.is_ok() {
             camera.waiting.stop_waiting_for_truth();
         }
         let image = camera.waiting.take_oldest()?;
+        // The depth image of this color image may also be the nearest one of the next, so it is
+        // kept for one period.
         camera
             .waiting
             .forget_before(stamp, device_stamp, period_secs);
@@ -418,7 +445,8 @@ impl Join {
             .list
             .as_ref()
             .map(|list| list.split_of(&ready.image.camera, ready.stamp));
-        let (name, stamp) = (Arc::clone(&ready.image.camera), ready.stamp);
+        let name = Arc::clone(&ready.image.camera);
+        let stamp = ready.stamp;
         self.first_image
             .get_or_insert_with(|| (Arc::clone(&name), stamp));
         let camera = &mut self.cameras[camera_ix];
@@ -431,13 +459,20 @@ impl Join {
             Ok(keyframe) => keyframe,
             Err(why) => return self.reject(&name, stamp, why, events),
         };
+        // Only accepted images count for the split, so that each camera has the same share of test
+        // keyframes, however many of its images are rejected.
         camera.n_accepted += 1;
         self.counts.accepted += 1;
+        // A depth camera measures every pixel at the time of the image. Scans are older and sparse,
+        // so they are used only without such a camera.
         let depth_from_ranges = if camera.config.depth.is_none() {
             self.ranges.depth_of(&keyframe)
         } else {
             None
         };
+        // The offset is chosen once, at the first keyframe of this run, so that the distances in
+        // time between its keyframes stay those of the device. One second keeps them apart from the
+        // last keyframe of the earlier run.
         let stamp_offset_nanos =
             *self
                 .stamp_offset_nanos

@@ -21,10 +21,15 @@ const MAX_READINGS: usize = 20_000;
 const MAX_LIMIT_EXCESS: f64 = 0.2;
 /// Joint states that imply more than this multiple of a joint's speed limit are ignored as states
 /// of another arm. The margin allows for an arm that is pushed, and for a URDF with reduced limits.
+/// A smaller value would ignore the states of such arms; a larger one would let states of a second
+/// arm through that happen to be close.
 const MAX_SPEED_FACTOR: f64 = 3.0;
-/// Added to the time between two readings, because their stamps may be inaccurate.
+/// Added to the time between two readings, because their stamps may be inaccurate. At 1 kHz, two
+/// readings whose stamps are too close would otherwise seem to move at many times their speed.
 const MAX_STAMP_ERROR_SECS: f64 = 0.02;
-/// So many ignored states in a row that agree with each other are accepted.
+/// So many ignored states in a row that agree with each other are accepted. Fewer would accept
+/// states of another arm that arrive between ours; more would lose longer parts of the motion after
+/// a real jump, for example after a pause of the sender.
 const MIN_CONSISTENT: u32 = 5;
 /// Maximum gap for interpolating base poses from tags, in image periods. It lets one image in
 /// between lack a pose.
@@ -50,6 +55,8 @@ fn distance(from: f64, to: f64, limits: &JointLimits) -> f64 {
     let n_turns = if limits.lower.is_finite() {
         0.0
     } else {
+        // A continuous joint may report an angle modulo a full turn. The nearest number of full
+        // turns is taken out.
         (moved / TAU).round()
     };
     (moved - n_turns * TAU).abs()
@@ -91,6 +98,18 @@ pub(crate) struct CameraPose {
     pub(super) base: Option<BaseState>,
 }
 
+impl CameraPose {
+    /// The pose of a camera that no joint moves.
+    fn without_joints(world_from_camera: Transform, twist: Twist, base: Option<BaseState>) -> Self {
+        Self {
+            world_from_camera,
+            twist: Some(twist),
+            joint_twists: [].into(),
+            base,
+        }
+    }
+}
+
 impl Motion {
     /// The motion of the robot of a rig, without readings.
     pub(crate) fn new(rig: &Rig) -> crate::Result<Self> {
@@ -98,12 +117,15 @@ impl Motion {
             .context("the arm's URDF")?;
         let order = chain.order_in(&rig.arm.joints).context("arm.joints")?;
         let max_gap = Duration::from_secs_f64(rig.join.max_gap_millis * 1e-3);
+        // With tags, the slowest camera decides how far apart base poses are.
         // Tags give the base pose only at images, not in between.
         let min_rate_hz = rig
             .cameras
             .iter()
             .map(|camera| camera.rate_hz)
             .fold(f64::INFINITY, f64::min);
+        // A rate below 1 Hz counts as 1 Hz. Interpolating across several seconds of a driving base
+        // would give wrong poses.
         let between_images = Duration::from_secs_f64(MAX_IMAGE_INTERVALS / min_rate_hz.max(1.0));
         let max_base_gap = if rig.base.driver == BaseDriver::Tags {
             max_gap.max(between_images)
@@ -162,16 +184,9 @@ impl Motion {
     /// # Errors
     /// If they are not valid, or imply an impossible speed. They are then ignored.
     pub(crate) fn push_joints(&mut self, state: JointState) -> Result<(), JointsRejection> {
-        let ordered = |numbers: &[f64]| -> Option<Vec<f64>> {
-            if numbers.is_empty() {
-                return Some(Vec::new());
-            }
-            self.order
-                .iter()
-                .map(|ix| numbers.get(*ix).copied())
-                .collect()
-        };
-        let state = match (ordered(&state.position), ordered(&state.velocity)) {
+        // Devices report joints in their own order. The chain needs its own, and it needs offsets
+        // before interpolation, so that everything after this line uses URDF positions.
+        let state = match (self.ordered(&state.position), self.ordered(&state.velocity)) {
             (Some(position), Some(velocity)) if !position.is_empty() => {
                 let position = position
                     .iter()
@@ -187,6 +202,8 @@ impl Motion {
             }
             _ => return Err(JointsRejection::Invalid),
         };
+        // Joint states of a second program on the same bus or port mix with those of the arm. They
+        // are recognized by speeds that the arm cannot reach.
         let newest = self
             .joints
             .newest()
@@ -213,6 +230,18 @@ impl Motion {
             .map_err(|_| JointsRejection::Invalid)
     }
 
+    /// The numbers of a reading in the order of the chain; empty if the device does not report
+    /// them, `None` if some are missing.
+    fn ordered(&self, numbers: &[f64]) -> Option<Vec<f64>> {
+        if numbers.is_empty() {
+            return Some(Vec::new());
+        }
+        self.order
+            .iter()
+            .map(|ix| numbers.get(*ix).copied())
+            .collect()
+    }
+
     /// Describes the first joint that cannot have moved from one state to the other.
     fn jump(&self, before: &JointState, state: &JointState) -> Option<String> {
         let secs = state.stamp.secs_since(before.stamp);
@@ -222,6 +251,8 @@ impl Motion {
         let joints = self.chain.joint_names().iter().zip(self.chain.limits());
         let mut joints = joints.zip(before.position.iter().zip(&state.position));
         let ((name, limits), (from, to)) = joints.find(|((_, limits), (from, to))| {
+            // A URDF without a speed limit, or with the limit 0, says nothing about speeds, so its
+            // joints are never ignored.
             let max_speed = MAX_SPEED_FACTOR * limits.velocity;
             max_speed > 0.0
                 && distance(**from, **to, limits) > max_speed * (secs + MAX_STAMP_ERROR_SECS)
@@ -244,6 +275,8 @@ impl Motion {
                     .push(pose.stamp, pose.world_from_base)
                     .is_ok();
                 if is_valid {
+                    // A pose that the history has rejected is out of order or not finite, and must
+                    // not end a station.
                     reported
                         .station_detector
                         .push(pose.stamp, &pose.world_from_base);
@@ -286,6 +319,9 @@ impl Motion {
         camera: &config::Camera,
         stamp: Stamp,
     ) -> Result<CameraPose, HistoryError> {
+        // The state of the base is stored with each keyframe, so that a later correction of the
+        // base pose can be applied to it. A camera in the room is not carried by the base and needs
+        // none.
         let (world_from_base, base_twist, base) = match &self.base {
             BaseMotion::Fixed(pose) => (*pose, Twist::zero(), None),
             BaseMotion::ReportedPoses(reported) if camera.parent != Parent::World => {
@@ -300,17 +336,16 @@ impl Motion {
             }
             BaseMotion::ReportedPoses(_) => (Transform::identity(), Twist::zero(), None),
         };
-        let pose_with_base = |world_from_camera, twist| CameraPose {
-            world_from_camera,
-            twist: Some(twist),
-            joint_twists: [].into(),
-            base: base.clone(),
-        };
         match camera.parent {
-            Parent::World => Ok(pose_with_base(camera.parent_from_camera, Twist::zero())),
-            Parent::Base => Ok(pose_with_base(
+            Parent::World => Ok(CameraPose::without_joints(
+                camera.parent_from_camera,
+                Twist::zero(),
+                base,
+            )),
+            Parent::Base => Ok(CameraPose::without_joints(
                 world_from_base * camera.parent_from_camera,
                 base_twist.of_attached(&camera.parent_from_camera),
+                base,
             )),
             Parent::Flange => {
                 let joints = self.joints.at(stamp)?;
@@ -319,6 +354,8 @@ impl Motion {
                 let Ok(base_from_flange) = self.chain.forward(&joints.position) else {
                     return Err(HistoryError::NotFinite);
                 };
+                // Both twists are those of the flange in flange axes: the base carries it, and the
+                // joints move it. Velocities of a point add up in the same axes.
                 let by_base = base_twist.of_attached(&base_from_flange);
                 let by_arm = self
                     .chain
@@ -328,6 +365,8 @@ impl Motion {
                     linear_m_s: by_arm.linear_m_s + by_base.linear_m_s,
                     angular_rad_s: by_arm.angular_rad_s + by_base.angular_rad_s,
                 });
+                // If joint offsets are estimated later, the pose of the camera changes along these
+                // twists.
                 let by_joint = self
                     .chain
                     .tip_twists_by_joint(&joints.position)
@@ -351,9 +390,8 @@ impl Motion {
 /// Mean image speed in pixels per second for a scene at a constant depth, over the image center and
 /// the centers of its quadrants.
 pub(super) fn image_speed_px_s(twist: &Twist, intrinsics: &Intrinsics, depth_m: f64) -> f64 {
-    let [width, height] = intrinsics.size_px.map(f64::from);
-    let [fx, fy] = intrinsics.focal_px;
-    let [cx, cy] = intrinsics.principal_px;
+    // Rotation about the optical axis moves only the outer points, and translation along it moves
+    // no point at the center. Five points see both.
     let sample_points = [
         [0.5, 0.5],
         [0.25, 0.25],
@@ -361,16 +399,30 @@ pub(super) fn image_speed_px_s(twist: &Twist, intrinsics: &Intrinsics, depth_m: 
         [0.25, 0.75],
         [0.75, 0.75],
     ];
-    let speed = |[x_frac, y_frac]: [f64; 2]| {
-        let ray = Vector3::new((x_frac * width - cx) / fx, (y_frac * height - cy) / fy, 1.0);
-        let velocity = twist.apparent_velocity(&(ray * depth_m));
-        let (du, dv) = (
-            fx * (velocity.x - ray.x * velocity.z) / depth_m,
-            fy * (velocity.y - ray.y * velocity.z) / depth_m,
-        );
-        du.hypot(dv)
-    };
-    sample_points.into_iter().map(speed).sum::<f64>() / 5.0
+    sample_points
+        .into_iter()
+        .map(|point_frac| point_speed_px_s(twist, intrinsics, depth_m, point_frac))
+        .sum::<f64>()
+        / 5.0
+}
+
+/// Image speed in pixels per second of the scene point at a depth, seen at this fraction of the
+/// image width and height.
+fn point_speed_px_s(
+    twist: &Twist,
+    intrinsics: &Intrinsics,
+    depth_m: f64,
+    [x_frac, y_frac]: [f64; 2],
+) -> f64 {
+    let [width, height] = intrinsics.size_px.map(f64::from);
+    let [fx, fy] = intrinsics.focal_px;
+    let [cx, cy] = intrinsics.principal_px;
+    let ray = Vector3::new((x_frac * width - cx) / fx, (y_frac * height - cy) / fy, 1.0);
+    let velocity = twist.apparent_velocity(&(ray * depth_m));
+    // Time derivative of the pinhole projection u = fx * x / z, with x / z = ray.x and z = depth_m.
+    let du = fx * (velocity.x - ray.x * velocity.z) / depth_m;
+    let dv = fy * (velocity.y - ray.y * velocity.z) / depth_m;
+    du.hypot(dv)
 }
 
 #[cfg(test)]

@@ -6,9 +6,11 @@ use kinematics::quantile::{Rank, quantile};
 /// cameras and averages out noise.
 const REDUCED_WIDTH: usize = 320;
 /// Number of images whose median sharpness is the reference. They are so few that they show similar
-/// content.
+/// content. More would compare images of different parts of the scene; fewer would let two blurred
+/// images in a row become the reference.
 const SHARPNESS_WINDOW: usize = 9;
-/// Brightness limits (0 to 255). Pixels at or beyond them count as clipped.
+/// Brightness limits (0 to 255). Pixels at or beyond them count as clipped. One level of margin at
+/// both ends allows for the rounding of JPEG and YUV conversions.
 const CLIPPED: [u8; 2] = [1, 254];
 
 /// Brightness and sharpness of one image.
@@ -28,6 +30,8 @@ impl PixelStatistics {
     /// Computes the statistics of `rgb`, `[height, width, 3]`, sRGB.
     pub(super) fn of(rgb: &[u8], size_px: [u32; 2]) -> Self {
         let [width, height] = size_px.map(|side| side as usize);
+        // Integer blocks, so that every pixel has the same weight. Pixels of an incomplete block at
+        // the right and bottom edge are left out.
         let block = (width / REDUCED_WIDTH).max(1);
         let reduced = Reduced::of(rgb, [width, height], block);
         #[expect(
@@ -67,9 +71,12 @@ impl Reduced {
             let line = &rgb[row * width * 3..][..size[0] * block * 3];
             let out = &mut sums[row / block * size[0]..][..size[0]];
             for (pixels, sum) in line.chunks_exact(block * 3).zip(out) {
+                // Sums of integers are exact, so that the order of summation does not matter.
                 for pixel in pixels.as_chunks::<3>().0 {
                     let luma = luma(*pixel);
                     *sum += luma;
+                    // A saturated color, such as a red lamp, has one channel at the limit. Only if
+                    // all channels are at it, the exposure is wrong.
                     let clipped = pixel.iter().all(|c| *c <= CLIPPED[0])
                         || pixel.iter().all(|c| *c >= CLIPPED[1]);
                     reduced.n_clipped += u64::from(clipped);
@@ -89,7 +96,10 @@ impl Reduced {
 
     fn sharpness(&self) -> f64 {
         let [width, height] = self.size;
-        let (mut luma, mut laplacian) = (Variance::default(), Variance::default());
+        let mut luma = Variance::default();
+        let mut laplacian = Variance::default();
+        // The border has no four neighbors. A 2 x 2 image has no inner pixels, and its sharpness is
+        // 0.
         for row in 1..height.saturating_sub(1) {
             for column in 1..width.saturating_sub(1) {
                 let at = row * width + column;
@@ -101,6 +111,7 @@ impl Reduced {
                 luma.add(self.luma[at]);
             }
         }
+        // A flat image, for example of a covered lens, has no contrast by which to divide.
         if luma.get() > 0.0 {
             laplacian.get() / luma.get()
         } else {
@@ -128,6 +139,8 @@ impl Variance {
         if self.n == 0.0 {
             0.0
         } else {
+            // Rounding can make this slightly negative for equal values. Callers therefore compare
+            // it with 0 before they divide by it.
             self.sum_of_squares / self.n - (self.sum / self.n) * (self.sum / self.n)
         }
     }
@@ -151,6 +164,7 @@ impl SharpnessHistory {
         self.0.push_back(sharpness);
         let mut latest: Vec<f64> = self.0.iter().copied().collect();
         let median = quantile(&mut latest, 0.5, Rank::Upper).unwrap_or(0.0);
+        // If most images are flat, nothing can be compared, and the image passes.
         if median > 0.0 {
             sharpness / median
         } else {

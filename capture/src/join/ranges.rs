@@ -10,7 +10,8 @@ use nalgebra::Point3;
 use std::collections::VecDeque;
 use std::sync::Arc;
 
-/// Maximum number of scans that wait for base poses; beyond it, the oldest are dropped.
+/// Maximum number of scans that wait for base poses; beyond it, the oldest are dropped. At 10 Hz,
+/// these are the scans of more than six seconds.
 const MAX_WAITING: usize = 64;
 
 /// Side of a depth cell in pixels. The rings of a scanner are about ten pixels apart.
@@ -18,7 +19,8 @@ const CELL_PX: u32 = 8;
 /// Maximum time between an image and the scans used for its depth. Older and newer scans were taken
 /// from elsewhere, with other occlusions.
 const MAX_TIME_DIFFERENCE_SECS: f64 = 1.0;
-/// Minimum number of filled cells for a depth map.
+/// Minimum number of filled cells for a depth map. Fewer points say little about the image, and a
+/// map with them would count as depth in registration.
 const MIN_CELLS: usize = 16;
 
 /// The scans that wait for base poses, and the newest transformed ones.
@@ -68,6 +70,8 @@ impl RangeScans {
     pub(super) fn depth_of(&self, keyframe: &Keyframe) -> Option<DepthMap> {
         let size_px = keyframe.size_px.map(|side| side.div_ceil(CELL_PX));
         let per_cell = f64::from(CELL_PX);
+        // Pixel centers are at half-integers, so dividing by the cell size maps pixel coordinates
+        // to cell coordinates without an offset.
         let camera_from_world = keyframe.world_from_camera.inverse();
         let [focal_px, principal_px] =
             [keyframe.focal_px, keyframe.principal_px].map(|of| of.map(|px| px / per_cell));
@@ -84,24 +88,30 @@ impl RangeScans {
             let point = camera_from_world * Point3::from(*point).cast::<f64>();
             let cell =
                 [0, 1].map(|axis| focal_px[axis] * point[axis] / point.z + principal_px[axis]);
+            // Points behind the camera would project into the image mirrored. A NaN fails each of
+            // these comparisons.
             if point.z > 0.0
                 && (0..2).all(|axis| cell[axis] >= 0.0 && cell[axis] < f64::from(size_px[axis]))
             {
                 #[expect(
                     clippy::cast_possible_truncation,
                     clippy::cast_sign_loss,
-                    reason = "inside the map; f32 is precise enough for a range"
+                    reason = "inside the map"
                 )]
-                let (ix, z) = (
-                    cell[1] as usize * size_px[0] as usize + cell[0] as usize,
-                    point.z as f32,
-                );
+                let ix = cell[1] as usize * size_px[0] as usize + cell[0] as usize;
+                #[expect(
+                    clippy::cast_possible_truncation,
+                    reason = "f32 is precise enough for a range"
+                )]
+                let z = point.z as f32;
                 depth_m[ix] = depth_m[ix].min(z);
             }
         }
         let mut n_filled = 0;
         for depth_m in &mut depth_m {
             n_filled += usize::from(depth_m.is_finite());
+            // Infinity marks an empty cell while the minimum is taken. In depth maps, 0 means no
+            // reading.
             *depth_m = if depth_m.is_finite() { *depth_m } else { 0.0 };
         }
         let world_from_camera = keyframe.world_from_camera;
@@ -141,6 +151,8 @@ impl RangeScans {
         max_wait_secs: f64,
     ) -> PlacementCounts {
         let mut counts_placed = PlacementCounts::default();
+        // In order: a scan whose poses are not known yet holds back later ones, whose poses are not
+        // known either.
         while let Some(scan) = self.waiting.front() {
             match self.in_world(scan, motion) {
                 Ok(in_world) => {
@@ -171,6 +183,8 @@ impl RangeScans {
         let world_from_scanner =
             |stamp: Stamp| Ok(motion.world_from_base(stamp)? * scanner.base_from_scanner);
         let mut points = Vec::with_capacity(scan.points.len());
+        // A scanner rotates for up to 0.1 s, in which a driving base moves by centimeters. Each
+        // point is therefore transformed with its own base pose.
         // Points of one column share the same time.
         let mut column = (u32::MAX, world_from_scanner(scan.stamp)?);
         let first = column.1;

@@ -115,6 +115,7 @@ impl Counts {
     #[must_use]
     pub fn data_losses(&self, sample_use: SampleUse) -> Vec<String> {
         let mut data_losses = Vec::new();
+        // Images without a recording are only candidates: a dropped one is replaced by the next.
         if sample_use == SampleUse::Recorded && self.device_skipped > 0 {
             data_losses.push(dropped_by_devices(self.device_skipped));
         }

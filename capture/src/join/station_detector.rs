@@ -4,9 +4,13 @@
 use kinematics::{Stamp, Transform};
 use std::collections::VecDeque;
 
-/// Time for which the base must stay near one pose to count as stationary.
+/// Time for which the base must stay near one pose to count as stationary. A shorter time would take
+/// the moment at which a base reverses for a station; a longer one would lose the first keyframes
+/// of a station.
 const STATIONARY_SECS: f64 = 0.5;
-/// Maximum distance from that pose, meters and (next constant) radians.
+/// Maximum distance from that pose, meters and (next constant) radians. Larger values would merge
+/// slow motion into a station; smaller ones would split a station of a base that sways while its arm
+/// moves.
 const STATIONARY_M: f64 = 0.005;
 const STATIONARY_RAD: f64 = 0.005;
 /// Maximum number of stations kept, far more than any image waits for.
@@ -32,16 +36,21 @@ struct Span {
 impl StationDetector {
     /// Adds the next pose of the base.
     pub(super) fn push(&mut self, stamp: Stamp, world_from_base: &Transform) {
+        // Each pose is compared with the first one of the rest, not with its predecessor.
+        // Otherwise, a base that creeps would count as stationary.
         let Some((since, _)) = self
             .stationary_since
             .filter(|(_, pose)| is_near(pose, world_from_base))
         else {
-            (self.stationary_since, self.is_known) = (Some((stamp, *world_from_base)), false);
+            self.stationary_since = Some((stamp, *world_from_base));
+            self.is_known = false;
             return;
         };
         if stamp.secs_since(since) < STATIONARY_SECS {
             return;
         }
+        // A station begins when it is detected, not when the rest began. An image before that
+        // moment may have been decided already, without a station.
         if !std::mem::replace(&mut self.is_known, true) {
             let station = self.stations.back().map_or(0, |last| last.station + 1);
             self.stations.push_back(Span {
@@ -66,6 +75,7 @@ impl StationDetector {
     /// The station at a stamp that is not later than the newest pose; `None` while the base moves
     /// or has just stopped.
     pub(super) fn at(&self, stamp: Stamp) -> Option<usize> {
+        // Images are close to the newest pose, so the search goes backwards.
         let span = self.stations.iter().rev().find(|span| span.from <= stamp)?;
         (stamp <= span.to).then_some(span.station)
     }

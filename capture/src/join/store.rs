@@ -52,6 +52,9 @@ impl KeyframeStore {
 
     /// Adds a keyframe; returns the cameras and stamps of the evicted ones.
     pub(super) fn push(&mut self, keyframe: Arc<Keyframe>) -> Vec<(Arc<str>, Stamp)> {
+        // Distances are symmetric, so one pass updates the entries and finds the distance of the
+        // new keyframe. Cameras are independent: equal poses of two cameras are not redundant,
+        // because their images differ.
         let mut nearest = f64::INFINITY;
         for kept in self
             .kept
@@ -73,6 +76,8 @@ impl KeyframeStore {
             nearest,
         });
         let mut evicted = Vec::new();
+        // The last keyframe stays even if it alone exceeds the limit of bytes, because a run
+        // without keyframes cannot train.
         while self.kept.len() > 1
             && (self.kept.len() > self.max_keyframes || self.bytes > self.max_bytes)
         {
@@ -83,17 +88,11 @@ impl KeyframeStore {
     }
 
     fn most_redundant(&self) -> usize {
-        let count = |split| {
-            self.kept
-                .iter()
-                .filter(|kept| kept.keyframe.split == split)
-                .count()
-        };
         #[expect(
             clippy::cast_precision_loss,
             reason = "a store holds far fewer than 2^53 keyframes"
         )]
-        let load = |(split, share): &(Split, f64)| count(*split) as f64 / share;
+        let load = |(split, share): &(Split, f64)| self.n_of(*split) as f64 / share;
         let fullest = SHARES
             .iter()
             .max_by(|a, b| load(a).total_cmp(&load(b)))
@@ -103,9 +102,19 @@ impl KeyframeStore {
             .iter()
             .enumerate()
             .filter(|(_, kept)| Some(kept.keyframe.split) == fullest);
+        // `min_by` returns the first of equal elements. Both keyframes of the closest pair have the
+        // same distance, and the first is the older one.
         candidates
             .min_by(|(_, a), (_, b)| a.nearest.total_cmp(&b.nearest))
             .map_or(0, |(ix, _)| ix)
+    }
+
+    /// Number of keyframes of a split.
+    fn n_of(&self, split: Split) -> usize {
+        self.kept
+            .iter()
+            .filter(|kept| kept.keyframe.split == split)
+            .count()
     }
 
     fn remove(&mut self, ix: usize) -> Arc<Keyframe> {
@@ -115,6 +124,8 @@ impl KeyframeStore {
             .filter(|ix| self.kept[*ix].keyframe.camera == evicted.keyframe.camera)
             .collect();
         let pose = |ix: usize| &self.kept[ix].keyframe.world_from_camera;
+        // Only the keyframes whose nearest neighbor was the evicted one need a new distance.
+        // Recomputing all would take quadratic time per keyframe in a full store.
         let orphaned: Vec<(usize, f64)> = same_camera
             .iter()
             .filter(|ix| {

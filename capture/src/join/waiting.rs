@@ -8,7 +8,8 @@ use drivers::{Image, TruthImage};
 use kinematics::Stamp;
 use std::collections::VecDeque;
 
-/// Maximum number of waiting images of each kind.
+/// Maximum number of waiting images of each kind, two seconds at 30 Hz. The limit bounds memory if
+/// joint states stop arriving while images continue.
 const MAX_WAITING: usize = 64;
 
 /// Samples of one camera, each kind in stamp order.
@@ -59,6 +60,7 @@ impl Waiting {
     }
 
     pub(super) fn push_truth(&mut self, truth: TruthImage) {
+        // Ground truth that arrives after all is waited for again.
         self.expects_truth = true;
         push(&mut self.truth, truth);
     }
@@ -123,6 +125,8 @@ impl Waiting {
 
     /// Removes depth and truth that only earlier color images needed.
     pub(super) fn forget_before(&mut self, stamp: Stamp, device_stamp: Stamp, period_secs: f64) {
+        // Truth belongs to exactly one image, which is found by its device stamp. Truth of an image
+        // that was dropped is removed here, too.
         self.truth.retain(|truth| truth.image.stamp > device_stamp);
         self.depth
             .retain(|(at, _)| stamp.secs_since(*at) <= period_secs);

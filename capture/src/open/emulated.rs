@@ -29,6 +29,7 @@ pub(super) fn open(rig: &mut Rig) -> crate::Result<(Box<dyn MovableArm>, Box<dyn
     let mut simulated = sim::open(&unlimited(rig)?)?;
     let motors = MotorHistory::default();
     let config = RobotConfig {
+        // Port 0: the system chooses a free port, so that several runs do not collide.
         address: SocketAddr::from((Ipv4Addr::LOCALHOST, 0)),
         // That of the Panda in the simulated scenes.
         version: FciVersion::V5,
@@ -36,6 +37,7 @@ pub(super) fn open(rig: &mut Rig) -> crate::Result<(Box<dyn MovableArm>, Box<dyn
         flange_from_tool: Transform::identity(),
         limits: Limits::panda(),
     };
+    // The arm starts where the simulated arm is, or it would jump at the first image.
     let track = JointTrack::at_rest(simulated.start_position()?).map_err(crate::Error::other)?;
     let controller = emulate_fci(track, config, ANSWER_WAIT, Some(motors.clone()))?;
     rig.arm.address = controller.address().to_string();

@@ -87,19 +87,27 @@ impl Opened {
     /// Repeats the recording at `path` without end.
     #[must_use]
     pub fn repeated(self, path: &Path) -> Self {
-        let (path, damage) = (path.to_owned(), Arc::clone(&self.damage));
-        let reopen = move || -> Result<Box<dyn Source>, drivers::Error> {
-            let recording = Recording::open(&path)?;
-            Ok(Box::new(RecordingSource {
-                recording,
-                damage: Arc::clone(&damage),
-            }))
-        };
+        let path = path.to_owned();
+        let damage = Arc::clone(&self.damage);
+        // Opened again for each round: a source cannot be rewound.
+        let reopen = move || open_recording(&path, &damage);
         Self {
             source: Box::new(Repeating::new(self.source, reopen)),
             ..self
         }
     }
+}
+
+/// Opens a recording at its first sample.
+fn open_recording(
+    path: &Path,
+    damage: &Arc<OnceLock<String>>,
+) -> Result<Box<dyn Source>, drivers::Error> {
+    let recording = Recording::open(path)?;
+    Ok(Box::new(RecordingSource {
+        recording,
+        damage: Arc::clone(damage),
+    }))
 }
 
 /// Opens the devices of a rig. Calibration that the rig file omits is read from the cameras that
@@ -122,6 +130,8 @@ pub(crate) fn rig_with_monitors(
         use_simulated_devices(&mut rig);
     }
     without_readout_if_ideal(&mut rig);
+    // The settings are checked before any device is opened, so that an error of the rig file does
+    // not start cameras.
     if let Some(device) = unsupported_device(&rig) {
         bail!("{device} cannot be opened by this version; {SIM_HINT}");
     }
@@ -132,10 +142,12 @@ pub(crate) fn rig_with_monitors(
     let opened =
         real::open(&mut rig).map_err(|error| Error::Failed(format!("{error:#}; {SIM_HINT}")));
     let (real, monitors) = opened?;
-    let (source, stamp_clock): (Box<dyn Source>, _) = match is_any_simulated(&rig) {
-        true => simulate(&rig, real)?,
-        false => (Box::new(Live::new(real)?), StampClock::Computer),
+    let (source, stamp_clock): (Box<dyn Source>, _) = if is_any_simulated(&rig) {
+        simulate(&rig, real)?
+    } else {
+        (Box::new(Live::new(real)?), StampClock::Computer)
     };
+    // Behind all devices, because the tags are searched in the images of any camera on the robot.
     let source = match rig.base.driver {
         BaseDriver::Tags => Box::new(TagBaseSource::new(&rig, source)?),
         _ => source,
@@ -155,6 +167,8 @@ pub(crate) fn rig_with_monitors(
 fn use_simulated_devices(rig: &mut Rig) {
     rig.arm.driver = ArmDriver::Sim;
     rig.base.driver = match rig.base.driver {
+        // The scene decides whether the base moves. Tags locate a simulated base, too, because the
+        // cameras see them.
         _ if base_moves(&rig.sim.scene) => BaseDriver::Sim,
         BaseDriver::Tags => BaseDriver::Tags,
         _ => BaseDriver::Fixed,
@@ -180,28 +194,17 @@ pub fn recording(path: &Path, rig: Option<Rig>, overrides: &[Override]) -> crate
         None => stored_rig(path, &recording, overrides)?,
     };
     if let Some(recorded) = recording.joint_names() {
+        // A rig given by the user may have another joint order, or even belong to another robot.
+        // Joint readings in the recording keep their order, so offsets must follow it.
         chain_of(&rig)?
             .order_in(recorded)
             .with_context(|| format!("the recording {path:?} does not match the robot"))?;
-        let in_recorded_order = |offsets: &[f64]| -> Vec<f64> {
-            let of = |name: &String| rig.arm.joints.iter().position(|known| known == name);
-            let offset = |name: &String| {
-                of(name)
-                    .and_then(|ix| offsets.get(ix))
-                    .copied()
-                    .unwrap_or(0.0)
-            };
-            if offsets.is_empty() {
-                Vec::new()
-            } else {
-                recorded.iter().map(offset).collect()
-            }
-        };
         let offsets = [&rig.arm.joint_offsets, &rig.arm.sim.true_joint_offsets]
-            .map(|offsets| in_recorded_order(offsets));
+            .map(|offsets| in_recorded_order(offsets, &rig.arm.joints, recorded));
         [rig.arm.joint_offsets, rig.arm.sim.true_joint_offsets] = offsets;
         rig.arm.joints = recorded.to_vec();
     }
+    // The cameras cannot be asked any more.
     check_intrinsics(&rig)?;
     without_readout_if_ideal(&mut rig);
     let damage = Arc::default();
@@ -217,6 +220,23 @@ pub fn recording(path: &Path, rig: Option<Rig>, overrides: &[Override]) -> crate
     })
 }
 
+/// Offsets of `joints`, in the order of the recorded joints; empty if there are none.
+fn in_recorded_order(offsets: &[f64], joints: &[String], recorded: &[String]) -> Vec<f64> {
+    if offsets.is_empty() {
+        return Vec::new();
+    }
+    let ix_of = |name: &String| joints.iter().position(|known| known == name);
+    recorded
+        .iter()
+        .map(|name| {
+            ix_of(name)
+                .and_then(|ix| offsets.get(ix))
+                .copied()
+                .unwrap_or(0.0)
+        })
+        .collect()
+}
+
 /// Creates a recording of a rig, with the rig file and the URDF attached.
 ///
 /// # Errors
@@ -228,6 +248,8 @@ pub fn recorder(path: &Path, rig: &Rig) -> crate::Result<Recorder> {
         .iter()
         .map(|camera| (&*camera.name, &camera.intrinsics))
         .collect();
+    // The rig with all settings resolved, including the calibration that cameras report. The
+    // recording can then be used without these files and devices.
     let resolved = rig.to_toml();
     let description = RecordingMetadata {
         files: &[
@@ -251,21 +273,23 @@ pub fn chain_of(rig: &Rig) -> crate::Result<Chain> {
 }
 
 fn stored_rig(path: &Path, recording: &Recording, overrides: &[Override]) -> crate::Result<Rig> {
-    let text = |name| {
-        let bytes = recording.attachment(name).with_context(|| {
-            format!(
-                "the recording {path:?} contains no {name}, which fieldrig stores in it; if another program removed it, give the rig file with --rig to `fieldrig train`, `eval`, `export` or `calibrate`"
-            )
-        })?;
-        std::str::from_utf8(bytes)
-            .with_context(|| format!("the recording {path:?}: {name} is not text"))
-    };
     Ok(Rig::parse(
         RIG_FILE,
-        text(RIG_FILE)?,
-        text(URDF_FILE)?,
+        stored_text(path, recording, RIG_FILE)?,
+        stored_text(path, recording, URDF_FILE)?,
         overrides,
     )?)
+}
+
+/// The text of a file that is stored in a recording.
+fn stored_text<'a>(path: &Path, recording: &'a Recording, name: &str) -> crate::Result<&'a str> {
+    let bytes = recording.attachment(name).with_context(|| {
+        format!(
+            "the recording {path:?} contains no {name}, which fieldrig stores in it; if another program removed it, give the rig file with --rig to `fieldrig train`, `eval`, `export` or `calibrate`"
+        )
+    })?;
+    std::str::from_utf8(bytes)
+        .with_context(|| format!("the recording {path:?}: {name} is not text"))
 }
 
 /// Sets the readout time of simulated cameras without imperfections to 0: they expose all rows at

@@ -27,11 +27,14 @@ pub struct Movable {
 /// or only one of arm and camera is simulated.
 pub fn movable(rig: &Rig, devices: Devices, camera: &str) -> crate::Result<Movable> {
     let mut rig = rig.clone();
+    // Other devices would only take bandwidth, or fail although they are not needed.
     rig.cameras.retain(|other: &Camera| &*other.name == camera);
     rig.scanners.clear();
     let Some(driver) = rig.cameras.first().map(|camera| camera.driver) else {
         bail!("the rig has no camera {camera:?}");
     };
+    // Remembered, because `use_simulated_devices` overwrites it, and an emulated controller needs
+    // the driver of the real arm.
     let arm_driver = rig.arm.driver;
     if devices == Devices::Sim {
         use_simulated_devices(&mut rig);

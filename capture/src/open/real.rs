@@ -30,7 +30,10 @@ const READ_ONLY: &str = "arms with this driver can only be read; to move the arm
 /// Opens all real devices of a rig, possibly none, with monitors of those that receive datagrams.
 /// Fills in calibration that is stored in a camera.
 pub(super) fn open(rig: &mut Rig) -> crate::Result<(Devices, Vec<DatagramMonitor>)> {
-    let (mut devices, mut monitors) = (Devices::default(), Vec::new());
+    let mut devices = Devices::default();
+    let mut monitors = Vec::new();
+    // Cameras first: some of them store intrinsics, which are copied to the rig before anything
+    // uses it.
     for camera in &mut rig.cameras {
         match camera.driver {
             CameraDriver::V4l2 => devices.cameras.extend(v4l2_cameras(camera)?),
@@ -133,6 +136,8 @@ pub(super) fn motion_limits(
         let joint = joint_ix
             .map(|joint_ix| chain.limits()[joint_ix])
             .context("a joint of the rig is not in its URDF")?;
+        // Invalid limits do not disturb reading. A motion needs them, because they are what keeps
+        // the arm from its stops.
         if !joint.is_range_valid {
             bail!(
                 "arm.motion: the <limit> of joint {name:?} in the URDF is invalid; give finite numbers, lower at most upper"
@@ -177,6 +182,7 @@ fn movable_config(rig: &Rig, motion: &ArmMotion) -> crate::Result<MovableArmConf
     let path = &motion.odrive_endpoints;
     let endpoints =
         || Endpoints::parse(&files::read_text(path.as_ref())?).map_err(crate::Error::other);
+    // Only ODrive axes with firmware 0.6 need this file, so an empty path is no error.
     let odrive_endpoints = match path.as_str() {
         "" => None,
         _ => Some(endpoints().with_context(|| format!("arm.motion.odrive_endpoints {path:?}"))?),
@@ -319,6 +325,7 @@ pub fn udp_arm_address(rig: &Rig) -> crate::Result<SocketAddr> {
 /// Opens the color images of a V4L2 camera, and its depth images if the rig file configures depth.
 #[cfg(target_os = "linux")]
 fn v4l2_cameras(camera: &Camera) -> crate::Result<Vec<Box<dyn drivers::Camera>>> {
+    // The settings of depth are checked before the color camera is opened.
     let depth = camera
         .depth
         .as_ref()

@@ -22,6 +22,9 @@ mod with_sdk {
 
     /// Maximum difference between the intrinsics in the rig file and those stored in the camera,
     /// pixels. Above it, one of them probably belongs to another camera.
+    ///
+    /// A recalibration of the same camera changes its projections by less, and another camera of the
+    /// same type usually by more.
     const MAX_DIFFERENCE_PX: f64 = 5.0;
 
     /// Opens a camera and copies calibration that the rig file omits from it. Values in the rig
@@ -33,6 +36,8 @@ mod with_sdk {
             intrinsics,
             depth_intrinsics,
             camera_from_depth,
+            // Taken, so that nothing counts as unknown any more and the rig can be stored in a
+            // recording.
         } = std::mem::take(&mut camera.realsense.unknown);
         apply_known(
             "intrinsics",
@@ -109,8 +114,11 @@ mod with_sdk {
         const STEPS: u32 = 8;
         let pixels = (0..=STEPS).flat_map(|row| (0..=STEPS).map(move |column| [column, row]));
         let differences = pixels.filter_map(|steps| {
+            // A grid from border to border, because lens models differ most in the corners.
             let side = |axis: usize| f64::from(rig.size_px[axis] * steps[axis]) / f64::from(STEPS);
             let pixel = [side(0), side(1)];
+            // Pixels that one of the lenses cannot project are left out: distortion models are only
+            // defined near the image.
             let projected = known.project(&rig.unproject(pixel)?)?;
             Some((projected[0] - pixel[0]).hypot(projected[1] - pixel[1]))
         });

@@ -30,16 +30,19 @@ pub(super) fn open(rig: &Rig, real: Devices) -> crate::Result<(Box<dyn Source>, 
         ));
     }
     // Real devices use the clock of this computer. Without them, the simulation starts at 0.
-    let (start, stamp_clock) = match any_real {
-        true => (drivers::clock::now(), StampClock::Computer),
-        false => (Stamp::default(), StampClock::Simulation),
+    let (start, stamp_clock) = if any_real {
+        (drivers::clock::now(), StampClock::Computer)
+    } else {
+        (Stamp::default(), StampClock::Simulation)
     };
     // In real time the limits are checked here, because devices that end would look like devices
     // that fail.
-    (config.duration_secs, config.n_images) = (None, None);
+    config.duration_secs = None;
+    config.n_images = None;
     let sim::LiveRig {
         mut devices, truth, ..
     } = sim::open(&config)?.into_live(start)?;
+    // A real device replaces the simulated one of the same kind.
     devices.arm = real.arm.or(devices.arm);
     devices.base = devices.base.or(real.base);
     devices.scanners.extend(real.scanners);
@@ -80,6 +83,7 @@ struct RealTime {
 
 impl Source for RealTime {
     fn next_sample(&mut self) -> Result<Option<Sample>, Error> {
+        // Before the next sample, because an image waits for its ground truth in the join.
         if let Some(truth) = self.truth.take() {
             return Ok(Some(truth));
         }
@@ -87,6 +91,7 @@ impl Source for RealTime {
             return Ok(None);
         }
         let sample = self.live.next_sample()?;
+        // `sim.n_images` counts images of the first camera, as in lockstep.
         if let Some(Sample::Image(image)) = &sample
             && !image.is_depth()
             && image.camera == self.first_camera
@@ -113,6 +118,8 @@ fn config_of(rig: &Rig) -> crate::Result<sim::Config> {
             known.join(", ")
         );
     };
+    // Ground truth is in the coordinates of the scene. Another origin would make every comparison
+    // with it wrong.
     if rig.base.world_from_base != Transform::identity() {
         bail!("a simulated base is at the world origin: base.world_from_base must be the identity");
     }
@@ -178,10 +185,9 @@ fn target_of((name, target): (&String, &SimTarget)) -> crate::Result<sim::Target
             world_from_board.unwrap_or_default(),
         ),
     };
-    let (name, spec) = (format!("sim.target.{name}"), target.spec.clone());
     Ok(sim::TargetConfig {
-        name,
-        spec,
+        name: format!("sim.target.{name}"),
+        spec: target.spec.clone(),
         parent,
         parent_from_board,
     })
@@ -205,6 +211,8 @@ fn scanner_of(scanner: &Scanner) -> sim::ScannerConfig {
 fn camera_of(camera: &Camera) -> sim::CameraConfig {
     let default = sim::SensorConfig::default();
     let truth = &camera.sim.truth;
+    // The simulated camera has the true values. The rig file may contain wrong ones on purpose, as
+    // the input of a calibration.
     let intrinsics = truth.intrinsics.as_ref().unwrap_or(&camera.intrinsics);
     sim::CameraConfig {
         name: camera.name.to_string(),

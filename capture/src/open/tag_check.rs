@@ -11,7 +11,8 @@ use kinematics::{HistoryError, Stamp};
 use std::collections::{BTreeMap, VecDeque};
 
 /// Interval between the images of a camera in which tags are searched, seconds. Detection must not
-/// slow down a run.
+/// slow down a run. A contradiction is confirmed by several images, so it is found after a few
+/// seconds.
 const INTERVAL_SECS: f64 = 0.5;
 /// Maximum number of detections that wait for joint states.
 const MAX_WAITING: usize = 16;
@@ -45,31 +46,24 @@ impl TagCheckSource {
         source: Box<dyn Source>,
         notes: &Notes,
     ) -> crate::Result<Box<dyn Source>> {
+        // Tags that locate the base cannot check the poses that are computed from it.
         if rig.base.tags.is_empty() || rig.base.driver != BaseDriver::Fixed {
             return Ok(source);
         }
-        let checked = |config: &Camera| CheckedCamera {
-            config: config.clone(),
-            check: TagCheck::new(&config.name),
-            last_image: None,
-        };
         let cameras = rig
             .cameras
             .iter()
-            .map(|camera| (camera.name.to_string(), checked(camera)))
+            .map(|camera| (camera.name.to_string(), CheckedCamera::new(camera)))
             .collect();
-        let (detector, robot) = (TagDetector::start(rig.base.tag_family)?, Motion::new(rig)?);
-        let (tags, is_lockstep, notes) = (rig.base.tags.clone(), rig.sim.lockstep, notes.clone());
-        let pending = VecDeque::new();
         Ok(Box::new(Self {
             source,
-            detector,
-            is_lockstep,
+            detector: TagDetector::start(rig.base.tag_family)?,
+            is_lockstep: rig.sim.lockstep,
             cameras,
-            tags,
-            robot,
-            pending,
-            notes,
+            tags: rig.base.tags.clone(),
+            robot: Motion::new(rig)?,
+            pending: VecDeque::new(),
+            notes: notes.clone(),
         }))
     }
 
@@ -92,6 +86,7 @@ impl TagCheckSource {
             camera.last_image = Some(image.stamp);
             let new_detections = self.detector.detect_blocking(image.clone());
             self.enqueue(new_detections);
+        // If the detector is busy, the next image is tried, without waiting for another interval.
         } else if self.detector.detect(image.clone()) {
             camera.last_image = Some(image.stamp);
         }
@@ -127,6 +122,15 @@ impl TagCheckSource {
 }
 
 impl CheckedCamera {
+    fn new(config: &Camera) -> Self {
+        Self {
+            config: config.clone(),
+            check: TagCheck::new(&config.name),
+            last_image: None,
+        }
+    }
+
+    /// Compares the calibrated pose of an image with the pose from its tags.
     fn compare(
         &mut self,
         stamp: Stamp,

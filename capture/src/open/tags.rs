@@ -17,7 +17,7 @@ use std::collections::{BTreeMap, VecDeque};
 /// nothing, which is reported elsewhere.
 const MAX_WAITING: usize = 64;
 /// After this many images in which no pose fits the tags, one of the tags is probably not where the
-/// rig file places it.
+/// rig file places it. A single image may have a wrong detection.
 const MIN_MISFIT_IMAGES: u64 = 3;
 /// Time without a pose after which a warning gives the reason, seconds.
 const WARN_AFTER_SECS: f64 = 5.0;
@@ -56,8 +56,10 @@ struct TagCounts {
 
 impl TagBaseSource {
     pub(super) fn new(rig: &Rig, source: Box<dyn Source>) -> crate::Result<Self> {
+        // With the base at the origin, `Motion` returns poses of cameras relative to the base.
         let mut arm = rig.clone();
-        (arm.base.driver, arm.base.world_from_base) = (BaseDriver::Fixed, Transform::identity());
+        arm.base.driver = BaseDriver::Fixed;
+        arm.base.world_from_base = Transform::identity();
         let is_on_robot = |camera: &&Camera| camera.parent != Parent::World;
         let cameras: Vec<_> = rig.cameras.iter().filter(is_on_robot).cloned().collect();
         if cameras.is_empty() {
@@ -88,6 +90,8 @@ impl TagBaseSource {
             return;
         }
         self.counts.n_images += 1;
+        // In lockstep, the result must not depend on the speed of the detection. In real time,
+        // images that arrive during a detection are skipped instead.
         if self.is_lockstep {
             let new_detections = self.detector.detect_blocking(image.clone());
             self.enqueue(new_detections);
@@ -137,6 +141,7 @@ impl TagBaseSource {
         let Some(camera) = self.camera(&detection.camera) else {
             return;
         };
+        // Tags that the rig file does not place say nothing about the base.
         let known = detection
             .tags
             .iter()
@@ -145,18 +150,24 @@ impl TagBaseSource {
         let estimate = locate(&rolling_camera, &known.collect::<Vec<_>>());
         match estimate {
             Ok(estimate) if self.newest.is_none_or(|newest| stamp > newest) => {
+                // world_from_base = world_from_camera * camera_from_base.
                 let world_from_base = estimate.world_from_camera * base_from_camera.inverse();
                 let covariance = of_base(&estimate.covariance, base_from_camera);
+                // An uncertain pose would displace all keyframes near it. Without a pose, only
+                // those keyframes are lost.
                 if !self.is_certain(&covariance) {
                     self.counts.n_uncertain += 1;
                     return;
                 }
+                // While the base stands still, the mean over many images is more precise than a
+                // single one.
                 let world_from_base = self.pose_filter.push(&world_from_base, &covariance);
                 self.ready.push_back(Sample::Base(BasePose {
                     stamp,
                     world_from_base,
                 }));
-                (self.newest, self.no_pose_since) = (Some(stamp), None);
+                self.newest = Some(stamp);
+                self.no_pose_since = None;
                 self.counts.n_poses += 1;
             }
             // Another camera already gave a pose with this or a later stamp.
@@ -175,6 +186,7 @@ impl TagBaseSource {
 
     /// Whether the covariance is within the limits of the rig file.
     fn is_certain(&self, covariance: &Matrix6<f64>) -> bool {
+        // The trace of a block of the covariance is the mean square of the length of that error.
         let sigma = |first: usize| covariance.diagonal().fixed_rows::<3>(first).sum().sqrt();
         sigma(0) <= self.max_sigma[0] && sigma(3) <= self.max_sigma[1]
     }
@@ -194,6 +206,8 @@ impl TagBaseSource {
                 }
             }
         }
+        // A single image without a tag is normal; only a long time without any pose keeps the run
+        // from making keyframes.
         let since = *self
             .no_pose_since
             .get_or_insert(self.newest.unwrap_or(stamp));
@@ -208,6 +222,7 @@ impl TagBaseSource {
                 "base: no pose for {:.0} s; camera {camera:?}: {why}{others}",
                 stamp.secs_since(since)
             );
+            // The next warning follows after the same time.
             self.no_pose_since = Some(stamp);
         }
     }
@@ -227,6 +242,8 @@ pub(super) fn rolling_shutter_camera<'a>(
 
 impl Source for TagBaseSource {
     fn next_sample(&mut self) -> Result<Option<Sample>, Error> {
+        // Before the next sample is read, because a base pose belongs before the images that wait
+        // for it.
         let new_detections = self.detector.new_detections();
         self.enqueue(new_detections);
         self.process_ready();
@@ -234,12 +251,14 @@ impl Source for TagBaseSource {
             return Ok(Some(pose));
         }
         let Some(sample) = self.source.next_sample()? else {
+            // The last detections finish after the source has ended.
             let new_detections = self.detector.finish();
             self.enqueue(new_detections);
             self.process_ready();
             return Ok(self.ready.pop_front());
         };
         match &sample {
+            // The join receives the same states and counts the rejected ones.
             Sample::Joints(state) => drop(self.arm.push_joints(state.clone())),
             Sample::Image(image) => self.detect(image),
             _ => {}
@@ -276,6 +295,8 @@ impl Drop for TagBaseSource {
 /// camera on the base.
 fn of_base(of_camera: &Matrix6<f64>, base_from_camera: &Transform) -> Matrix6<f64> {
     let camera_from_base = base_from_camera.inverse();
+    // Column `ix` of the adjoint is the twist of the base that unit component `ix` of the camera's
+    // twist causes.
     let columns: [Vector6<f64>; 6] = std::array::from_fn(|ix| {
         let unit =
             |first: usize| Vector3::from_fn(|axis, _| f64::from(u8::from(axis + first == ix)));
@@ -287,6 +308,7 @@ fn of_base(of_camera: &Matrix6<f64>, base_from_camera: &Transform) -> Matrix6<f6
         Vector6::from_iterator(moved.linear_m_s.iter().chain(&moved.angular_rad_s).copied())
     });
     let adjoint = Matrix6::from_columns(&columns);
+    // Propagation of a covariance C through a linear map A: A C A^T.
     adjoint * of_camera * adjoint.transpose()
 }
 

@@ -9,7 +9,7 @@ use std::ops::Range;
 /// Value of a pixel that no square covers: larger than any count minus one.
 pub(super) const NO_DEPTH: u16 = u16::MAX;
 /// Maximum square width, in columns, with its own strip. Wider squares are rare and are written
-/// column by column.
+/// column by column. More strips would take more time to merge in every run.
 const MAX_STRIPS: usize = 4;
 /// Padding before the first column of a strip.
 const PAD: usize = MAX_STRIPS;
@@ -23,7 +23,8 @@ const WIDE: u16 = u16::MAX;
 /// Largest image width, in columns. Columns beyond it get no depth because they have no cell in a
 /// strip.
 pub(super) const MAX_COLUMNS: usize = N_STRIP_CELLS - 1 - N_DISCARD_CELLS - PAD - 1;
-/// Number of pixels tested at once.
+/// Number of pixels tested at once: a few vector registers. A longer block computes more beyond the
+/// first match, a shorter one tests for an exit more often.
 const BLOCK: usize = 32;
 
 /// First and last column and row that each pixel of one row of depth covers, clipped to the image.
@@ -62,6 +63,7 @@ impl NearestDepth {
             width,
             nearest: vec![NO_DEPTH; width * height],
             strips: Box::new([NO_DEPTH; N_STRIP_CELLS]),
+            // A wide image has longer strips, of which fewer fit.
             n_strips: MAX_STRIPS.min((N_STRIP_CELLS - 1 - N_DISCARD_CELLS) / stride),
             stride,
             lines: vec![0; depth_width],
@@ -102,10 +104,10 @@ impl NearestDepth {
     /// Writes a run of pixels into the strips.
     #[inline(always)]
     fn fill(&mut self, run: Range<usize>, bounds: &PixelBounds) {
-        let (strip_cells, count_minus_one) = (
-            &self.strip_cells[run.clone()],
-            &self.count_minus_one[run.clone()],
-        );
+        let strip_cells = &self.strip_cells[run.clone()];
+        let count_minus_one = &self.count_minus_one[run.clone()];
+        // The fast loop handles nearly all runs: one cell per pixel, without a branch. A pixel
+        // without depth writes into a cell that nobody reads, which is cheaper than skipping it.
         let has_too_wide = strip_cells
             .iter()
             .fold(false, |any, cell| any | (*cell == WIDE));
@@ -118,6 +120,8 @@ impl NearestDepth {
         }
         for (ix, (cell, count_minus_one)) in run.zip(strip_cells.iter().zip(count_minus_one)) {
             let columns = match *cell {
+                // The columns of the first strip, which stands for squares of one column, so that a
+                // wide square is a row of them.
                 WIDE => {
                     usize::from(bounds.first[0][ix]) + PAD
                         ..usize::from(bounds.last[0][ix]) + PAD + 1
@@ -139,13 +143,23 @@ impl NearestDepth {
             first: [left, top],
             last: [right, bottom],
         } = bounds;
-        let (left, top, right, bottom) = (&left[..n], &top[..n], &right[..n], &bottom[..n]);
-        let (lines, strip_cells) = (&mut self.lines[..n], &mut self.strip_cells[..n]);
+        // Slices of one length let the compiler drop the bounds checks, which would prevent vector
+        // instructions in the loop.
+        let left = &left[..n];
+        let top = &top[..n];
+        let right = &right[..n];
+        let bottom = &bottom[..n];
+        let lines = &mut self.lines[..n];
+        let strip_cells = &mut self.strip_cells[..n];
         let count_minus_one = &mut self.count_minus_one[..n];
-        let (stride, n_strips) = (self.stride as u16, self.n_strips as u16);
+        let stride = self.stride as u16;
+        let n_strips = self.n_strips as u16;
         let discard = n_strips * stride;
         for ix in 0..n {
+            // No branches and no short circuits: pixels with and without depth alternate
+            // irregularly at the edges of objects, where branches would be mispredicted.
             let is_visible = (row[ix] != 0) & (left[ix] <= right[ix]) & (top[ix] <= bottom[ix]);
+            // The results for pixels that cover nothing may wrap around. They are replaced below.
             let n_more = right[ix].wrapping_sub(left[ix]);
             let cell = n_more
                 .wrapping_mul(stride)
@@ -170,6 +184,8 @@ impl NearestDepth {
     #[inline(always)]
     fn write_run(&mut self, run: Range<usize>, bounds: &PixelBounds) {
         let lines = self.lines[run.start];
+        // Only the columns that the run has touched are merged and cleared, as most runs are much
+        // narrower than the image.
         let line_bounds = self.lines[run.clone()].iter();
         let columns = bounds.first[0][run.clone()]
             .iter()
@@ -188,7 +204,10 @@ impl NearestDepth {
         if from > to {
             return;
         }
-        let (from, n) = (usize::from(from), usize::from(to - from) + 1);
+        let n = usize::from(to - from) + 1;
+        let from = usize::from(from);
+        // From the widest squares to single columns: each strip is spread into the next narrower
+        // one. This takes one pass per width instead of one per square.
         for n_more in (1..self.n_strips).rev() {
             // A square of this many columns is the union of two squares that are one column
             // narrower.
@@ -202,6 +221,8 @@ impl NearestDepth {
             strip[PAD + from..][..n].fill(NO_DEPTH);
         }
         let columns = &mut self.strips[PAD + from..][..n];
+        // The squares of the run cover all these lines alike, so the merged row is the same for
+        // each.
         for line in lines >> 16..=lines & 0xFFFF {
             let line = &mut self.nearest[(line as usize - 1) * self.width + from - 1..][..n];
             line.iter_mut()
@@ -216,15 +237,12 @@ impl NearestDepth {
 /// compiler can vectorize.
 #[inline(always)]
 fn find_blockwise(numbers: &[u32], predicate: impl Fn(u32) -> bool) -> Option<usize> {
-    let has_one = |block: &&[u32]| {
+    // A fold without early exit, unlike `any`: it tests all numbers of a block at once.
+    let (block_ix, block) = numbers.chunks(BLOCK).enumerate().find(|(_, block)| {
         block
             .iter()
             .fold(false, |any, number| any | predicate(*number))
-    };
-    let (block_ix, block) = numbers
-        .chunks(BLOCK)
-        .enumerate()
-        .find(|(_, block)| has_one(block))?;
+    })?;
     Some(BLOCK * block_ix + block.iter().position(|number| predicate(*number))?)
 }
 
@@ -233,7 +251,8 @@ fn find_blockwise(numbers: &[u32], predicate: impl Fn(u32) -> bool) -> Option<us
 #[inline(always)]
 fn merge(nearest: &mut [u16], center: &[u16], left: &[u16]) {
     let n = nearest.len();
-    let (center, left) = (&center[..n], &left[..n]);
+    let center = &center[..n];
+    let left = &left[..n];
     for ix in 0..n {
         nearest[ix] = nearest[ix].min(center[ix]).min(left[ix]);
     }

@@ -96,6 +96,8 @@ impl pulp::NullaryFnOnce for Task<'_> {
         let mut data: Arc<[u8]> = std::iter::repeat_n(0, 2 * aligned.len()).collect();
         let bytes = Arc::get_mut(&mut data).expect("the buffer was just created and is not shared");
         for (bytes, count_minus_one) in bytes.as_chunks_mut::<2>().0.iter_mut().zip(aligned) {
+            // The images store counts minus one, so that no depth is the largest number and loses
+            // every comparison.
             let count = count_minus_one.wrapping_add(1);
             // The largest count is invalid, too.
             *bytes = if count == u16::MAX {
@@ -117,6 +119,8 @@ impl DepthAlignment {
         let rays: Vec<[f64; 3]> = rays
             .map(|corner| match depth.unproject(corner) {
                 Some(ray) => (color_from_depth.rotation * ray).into(),
+                // NaN passes through all computations and fails the comparison that decides whether
+                // a pixel is visible.
                 None => [f64::NAN; 3],
             })
             .collect();
@@ -272,13 +276,12 @@ fn project_by(
     distort: impl Fn(f32, f32) -> ([f32; 2], bool),
 ) {
     let n = counts.len();
-    let (xs, ys, zs, columns, rows) = (
-        &xs[..n],
-        &ys[..n],
-        &zs[..n],
-        &mut columns[..n],
-        &mut rows[..n],
-    );
+    // Slices of one length need no bounds checks in the loop.
+    let xs = &xs[..n];
+    let ys = &ys[..n];
+    let zs = &zs[..n];
+    let columns = &mut columns[..n];
+    let rows = &mut rows[..n];
     let View {
         depth_in_color: [tx, ty, tz],
         focal_px: [fx, fy],
@@ -286,12 +289,13 @@ fn project_by(
         hidden_px,
     } = *view;
     for ix in 0..n {
+        // The ray was rotated in advance, so a point in the color camera is only a scaled ray plus
+        // the offset between the cameras.
         let z = counts[ix] * zs[ix] + tz;
+        // One division instead of two: a division takes several times as long as a multiplication.
         let inverse = 1.0 / z;
-        let (x, y) = (
-            (counts[ix] * xs[ix] + tx) * inverse,
-            (counts[ix] * ys[ix] + ty) * inverse,
-        );
+        let x = (counts[ix] * xs[ix] + tx) * inverse;
+        let y = (counts[ix] * ys[ix] + ty) * inverse;
         let ([distorted_x, distorted_y], is_valid) = distort(x, y);
         // Moving the column out of the image is sufficient to hide a pixel.
         columns[ix] = if (z > 0.0) & is_valid {
@@ -320,13 +324,16 @@ fn number(numbers: &mut [u16], positions_px: &[f32], side: u32, corner: Corner) 
     // Above 2^23, floats have no fraction and their low bits are the integer.
     const INTEGER_FLOAT: f32 = 8_388_608.0;
     let n = positions_px.len();
-    let (numbers, positions_px) = (&mut numbers[..n], &positions_px[..n]);
+    let numbers = &mut numbers[..n];
+    let positions_px = &positions_px[..n];
     for ix in 0..n {
         // These comparisons compile to vector instructions; `max` and `min` do not because of their
         // NaN handling.
         let one_based = positions_px[ix] + 1.0;
         let one_based = if one_based > min { one_based } else { min };
         let one_based = if one_based < max { one_based } else { max };
+        // Adding and subtracting rounds to the nearest integer. Where this rounded up, one is
+        // subtracted to obtain the integer below.
         let nearest = (one_based + INTEGER_FLOAT) - INTEGER_FLOAT;
         let below = nearest - if nearest > one_based { 1.0 } else { 0.0 };
         numbers[ix] = (below + INTEGER_FLOAT).to_bits() as u16;
@@ -336,6 +343,7 @@ fn number(numbers: &mut [u16], positions_px: &[f32], side: u32, corner: Corner) 
 impl ColorCamera {
     fn new(camera: &Intrinsics) -> Self {
         let lens = match camera.lens {
+            // Lenses without distortion take the fastest of the loops.
             _ if camera.is_pinhole() => ColorLens::Pinhole,
             Lens::Pinhole => ColorLens::Pinhole,
             Lens::BrownConrady(k) => ColorLens::BrownConrady(k.map(narrow)),
@@ -360,8 +368,13 @@ impl ColorCamera {
 /// Largest radius on the plane `z` = 1 at the edge of the image, plus a margin for corners just
 /// outside.
 fn max_radius(camera: &Intrinsics) -> f64 {
+    // Squares at the edge of the image have corners outside, which must still be projected. A
+    // larger margin would reach the radii where distortion polynomials turn back, and draw depth
+    // from far outside the field of view into the image.
     const MARGIN: f64 = 1.02;
     let [width, height] = camera.size_px;
+    // The largest radius of a lens is not necessarily in a corner, because the principal point may
+    // be off center and the tangential part is not symmetric. So the whole border is searched.
     let columns = (0..=width).flat_map(|column| [[column, 0], [column, height]]);
     let rows = (0..=height).flat_map(|row| [[0, row], [width, row]]);
     let radii = columns

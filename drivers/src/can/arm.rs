@@ -1,7 +1,7 @@
 //! Reads an arm whose joints are motors on CAN buses. One thread per bus polls and listens; the
 //! caller receives states of all joints.
 
-use super::bus::Bus;
+use super::bus::{Bus, MAX_SENDING};
 use super::bus_load::max_cycle_rate_hz;
 use super::config::{ArmConfig, BusConfig};
 use super::frame_io::{BusEvent, WireErrors};
@@ -16,13 +16,17 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, TrySendError, sync
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-/// Interval at which a bus thread checks whether it should stop, if no cycle is due earlier.
+/// Interval at which a bus thread checks whether it should stop, if no cycle is due earlier. A
+/// longer interval delays the drop of the arm, which waits for the threads.
 const POLL: Duration = Duration::from_millis(50);
 /// Capacity of the queue of readings for a slow caller: one second of seven motors at 1 kHz.
 pub(super) const MAX_WAITING: usize = 7000;
-/// If a loop iteration of a bus thread takes longer than this, the thread was not scheduled.
-const MAX_LOOP_DELAY: Duration = Duration::from_millis(200);
-/// A motor that sends nothing for this long causes an error.
+/// If a loop iteration of a bus thread takes this much longer than its waits, the thread was not
+/// scheduled.
+const MAX_LOOP_DELAY: Duration = Duration::from_millis(20);
+/// A motor that sends nothing for this long causes an error. A lower value would report motors
+/// behind a bus that restarts after a bus-off; with a higher one, the caller learns later that a
+/// joint is gone.
 const MAX_SILENCE: Duration = Duration::from_secs(1);
 
 /// A read-only arm, which cannot be moved. Dropping it stops the polling but does not affect the
@@ -42,9 +46,12 @@ impl CanArm {
     /// # Errors
     /// If a bus is not set up as configured or a motor does not answer.
     pub fn open(config: &ArmConfig) -> Result<Self, Error> {
+        // The queue is bounded, so that a caller that does not read cannot make memory grow.
         let (sender, readings) = sync_channel(MAX_WAITING);
         let stop = Arc::new(AtomicBool::new(false));
         let mut buses = Vec::new();
+        // All motors are found before the first thread starts. A missing motor is then an error of
+        // this call, and its queries cannot lose answers to a thread that reads the same bus.
         for (bus_ix, bus) in config.buses.iter().enumerate() {
             let bus = Bus::open(bus)?;
             let motors_of_bus = config
@@ -62,6 +69,8 @@ impl CanArm {
             .iter()
             .map(|motor| motor.joint.clone())
             .collect();
+        // The arm exists before its threads: if one of them cannot be started, dropping the arm
+        // stops those that run already.
         let mut arm = Self {
             joints: Joints::new(names.len()),
             names,
@@ -108,6 +117,8 @@ impl Arm for CanArm {
                     }
                 }
                 Ok(Err(error)) => return Err(error),
+                // The queue is disconnected when every bus thread has ended. The errors that ended
+                // them were returned by earlier calls.
                 Err(RecvTimeoutError::Timeout | RecvTimeoutError::Disconnected) => {
                     return Err(Error::NoJoints { waited: timeout });
                 }
@@ -142,10 +153,14 @@ impl Cycle {
             .collect();
         if motors
             .iter()
+            // One SYNC makes all CANopen drives of the bus sample at the same instant, so they need
+            // no polls of their own.
             .any(|(_, motor)| motor.protocol().canopen_node().is_some())
         {
             poll_frames.push(canopen::encode_sync());
         }
+        // The load of the bus includes the answers. Motors with their own rate load the bus
+        // whatever our rate is, so they are counted apart.
         let mut cycle_frames = poll_frames.clone();
         let mut unsolicited = Vec::new();
         for (answer, own_rate_hz) in motors
@@ -157,14 +172,36 @@ impl Cycle {
                 None => cycle_frames.push(answer),
             }
         }
-        let poll_rate_hz = match poll_frames.is_empty() {
+        let poll_rate_hz = if poll_frames.is_empty() {
             // Nothing is polled; the motors choose their own rates.
-            true => rate_hz,
-            false => max_cycle_rate_hz(bus, &cycle_frames, &unsolicited, rate_hz),
+            rate_hz
+        } else {
+            max_cycle_rate_hz(bus, &cycle_frames, &unsolicited, rate_hz)
         };
         Self {
             poll_frames,
             period: Duration::from_secs_f64(1.0 / poll_rate_hz),
+        }
+    }
+}
+
+/// What the thread of a bus has heard and lost so far.
+struct Progress {
+    /// Time at which each motor was last heard.
+    last_heard: Vec<Stamp>,
+    errors: WireErrors,
+    /// Readings that did not fit into the queue.
+    n_dropped: u64,
+    /// Polls for which the interface had no space.
+    n_unsent: u64,
+}
+
+impl Progress {
+    /// Excludes a stall of this computer from the silence of the motors, because no frames were
+    /// read in this time.
+    fn excuse_silence(&mut self, stall: Duration) {
+        for last_heard in &mut self.last_heard {
+            *last_heard = last_heard.plus_secs(stall.as_secs_f64());
         }
     }
 }
@@ -189,27 +226,29 @@ impl BusReader {
     fn read(&self) -> Result<(), Error> {
         let start = clock::now();
         let mut next_cycle = start;
-        let mut errors = WireErrors::default();
-        let mut last_heard: Vec<Stamp> = vec![start; self.motors.len()];
-        let (mut n_dropped, mut n_unsent) = (0_u64, 0_u64);
         let mut previous = start;
+        // An iteration waits up to `POLL` for a frame, and for each poll that finds the queue of
+        // the interface full. On a blocked bus, that is no stall: the silence of its motors counts.
+        let n_polls = u32::try_from(self.cycle.poll_frames.len()).unwrap_or(u32::MAX);
+        let max_iteration = POLL + MAX_SENDING.saturating_mul(n_polls) + MAX_LOOP_DELAY;
+        let mut progress = Progress {
+            last_heard: vec![start; self.motors.len()],
+            errors: WireErrors::default(),
+            n_dropped: 0,
+            n_unsent: 0,
+        };
         while !self.stop.load(Ordering::Relaxed) {
             let now = clock::now();
             let stall = now.duration_since(std::mem::replace(&mut previous, now));
-            if stall > MAX_LOOP_DELAY {
-                // While this computer was stalled, no frames were read, so this time does not count
-                // as silence of a motor.
-                last_heard
-                    .iter_mut()
-                    .for_each(|last_heard| *last_heard = last_heard.plus_secs(stall.as_secs_f64()));
+            if stall > max_iteration {
+                progress.excuse_silence(stall);
             }
             if !self.cycle.poll_frames.is_empty() && now >= next_cycle {
-                for poll_frame in &self.cycle.poll_frames {
-                    n_unsent += u64::from(!self.bus.send(poll_frame)?);
-                }
+                self.poll(&mut progress)?;
                 // Missed cycles are not made up for.
                 next_cycle = (next_cycle + self.cycle.period).max(now);
-                self.check_silence(&last_heard, now, &errors)?;
+                // On a busy bus, `receive` never times out, so silence is checked here as well.
+                self.check_silence(&progress, now)?;
             }
             let remaining = if self.cycle.poll_frames.is_empty() {
                 POLL
@@ -218,60 +257,89 @@ impl BusReader {
             };
             match self.bus.receive(remaining)? {
                 Some((stamp, BusEvent::Frame(frame))) => {
-                    for (ix, (joint_ix, motor)) in self.motors.iter().enumerate() {
-                        let Some(reading) = motor.read(&frame) else {
-                            continue;
-                        };
-                        // Uses the time of reading, not the stamp: a late reader does not make a
-                        // motor silent.
-                        last_heard[ix] = now;
-                        let reading_of_joint = JointReading {
-                            joint_ix: *joint_ix,
-                            stamp,
-                            reading,
-                        };
-                        match self.sender.try_send(Ok(reading_of_joint)) {
-                            Ok(()) => {}
-                            Err(TrySendError::Full(_)) => n_dropped += 1,
-                            Err(TrySendError::Disconnected(_)) => return Ok(()),
-                        }
-                        break;
+                    if !self.deliver(&frame, stamp, now, &mut progress) {
+                        return Ok(());
                     }
                 }
                 Some((_, BusEvent::Errors(new_errors))) => {
-                    self.log_errors(&mut errors, &new_errors)
+                    self.log_errors(&mut progress.errors, &new_errors)
                 }
-                None => self.check_silence(&last_heard, clock::now(), &errors)?,
+                None => self.check_silence(&progress, clock::now())?,
             }
         }
+        self.log_summary(start, &progress);
+        Ok(())
+    }
+
+    /// Sends the poll frames of one cycle.
+    fn poll(&self, progress: &mut Progress) -> Result<(), Error> {
+        for poll_frame in &self.cycle.poll_frames {
+            // A poll that finds the queue full is only counted. The next cycle replaces it, and a
+            // bus that stays blocked shows as silence of its motors.
+            progress.n_unsent += u64::from(!self.bus.send(poll_frame)?);
+        }
+        Ok(())
+    }
+
+    /// Passes the reading in a frame, if there is one, to the arm. `now` is the time of reading.
+    /// Returns whether the arm still exists.
+    fn deliver(&self, frame: &Frame, stamp: Stamp, now: Stamp, progress: &mut Progress) -> bool {
+        for (ix, (joint_ix, motor)) in self.motors.iter().enumerate() {
+            let Some(reading) = motor.read(frame) else {
+                continue;
+            };
+            // Uses the time of reading, not the stamp: a late reader does not make a motor silent.
+            progress.last_heard[ix] = now;
+            let reading_of_joint = JointReading {
+                joint_ix: *joint_ix,
+                stamp,
+                reading,
+            };
+            match self.sender.try_send(Ok(reading_of_joint)) {
+                Ok(()) => {}
+                // Waiting for a slow caller would fill the socket's buffer, and frames would be
+                // lost without being counted.
+                Err(TrySendError::Full(_)) => progress.n_dropped += 1,
+                Err(TrySendError::Disconnected(_)) => return false,
+            }
+            // Addresses on a bus are unique, so no other motor has sent this frame.
+            break;
+        }
+        true
+    }
+
+    /// Logs how well the bus was read since `start`.
+    fn log_summary(&self, start: Stamp, progress: &Progress) {
         let seconds = clock::now().secs_since(start);
         let interface = &self.bus.config().interface;
+        // The bound avoids a division by zero if the arm is dropped at once.
         let load = 100.0 * self.bus.busy().as_secs_f64() / seconds.max(1e-9);
+        let Progress {
+            errors,
+            n_dropped,
+            n_unsent,
+            ..
+        } = progress;
         log::info!(
             "{interface}: bus load {load:.1} % without stuff bits; {n_unsent} polls not sent (queue full), {n_dropped} readings dropped; \
              errors on the wire: {errors}"
         );
-        Ok(())
     }
 
     /// Returns an error for the first motor that has been silent for too long; this ends the joint
     /// states. The error includes the errors on the wire, because a failed bus silences its motors,
     /// too.
-    fn check_silence(
-        &self,
-        last_heard: &[Stamp],
-        now: Stamp,
-        errors: &WireErrors,
-    ) -> Result<(), Error> {
+    fn check_silence(&self, progress: &Progress, now: Stamp) -> Result<(), Error> {
         let silent = |last_heard: &Stamp| now.duration_since(*last_heard) > MAX_SILENCE;
         let Some(((_, motor), _)) = self
             .motors
             .iter()
-            .zip(last_heard)
+            .zip(&progress.last_heard)
             .find(|(_, last_heard)| silent(last_heard))
         else {
             return Ok(());
         };
+        let errors = &progress.errors;
         let mut reason = format!("no frame from the motor for {MAX_SILENCE:?}");
         if errors.n_frames > 0 {
             reason += &format!("; errors on the wire so far: {errors}");
@@ -287,6 +355,9 @@ impl BusReader {
     /// Logs errors on the wire each time the controller goes bus-off or restarts, and otherwise
     /// each time their number has doubled.
     fn log_errors(&self, total: &mut WireErrors, new_errors: &WireErrors) {
+        // A controller retransmits an unacknowledged frame continuously, and each attempt may be
+        // reported. Logging at powers of two shows the first errors at once and does not flood the
+        // log.
         let previous = total.n_frames.checked_ilog2();
         total.add(new_errors);
         if new_errors.n_bus_off + new_errors.n_restarts > 0

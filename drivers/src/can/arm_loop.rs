@@ -30,21 +30,29 @@ use std::time::Duration;
 
 /// Fraction of the watchdog timeout after which this thread stops the arm. It stops before the
 /// motors do, so that no motor is commanded while others have already stopped.
+///
+/// A larger fraction leaves less time for the fail-safe command to reach all motors. A smaller one
+/// stops the arm after shorter stalls of this computer.
 const SILENCE_FRAC: f64 = 0.8;
 /// A motor counts as silent only after this many cycles. If this thread was late, the answer of the
-/// motor may still arrive.
+/// motor may still arrive. Without this guard, a thread that wakes up after a stall would compare
+/// the old stamps with the new time before it reads the waiting frames.
 const MIN_MISSED_CYCLES: u64 = 3;
 /// Maximum time for the motors to report their positions, and to report that they are enabled.
 const STARTUP_TIMEOUT: Duration = Duration::from_secs(2);
-/// Time in which an interface sends half of its queue, which usually holds ten frames.
+/// Time in which an interface sends half of its queue, which usually holds ten frames: five frames
+/// of up to 135 bits take 0.68 ms at 1 Mbit/s. A longer wait would delay the commands of the other
+/// motors of this cycle.
 const MAX_QUEUED: Duration = Duration::from_micros(800);
 /// Maximum wait for space in the queue when sending a fail-safe command. If the queue stays full,
 /// nobody is receiving.
 const MAX_FAIL_SAFE_WAIT: Duration = Duration::from_millis(5);
-/// Interval at which an idle thread checks for requests.
+/// Interval at which an idle thread checks for requests. It also bounds how late a thread with a
+/// long cycle notices that it must shut down.
 const POLL: Duration = Duration::from_millis(20);
 /// Additional time, beyond the time that its limits require, in which an arm must come to rest on
-/// shutdown.
+/// shutdown. It covers late cycles and a target that was set just before; without a bound, an arm
+/// that never comes to rest would block the end of the program.
 const STOP_MARGIN: Duration = Duration::from_secs(1);
 
 type Reply<T> = SyncSender<Result<T, Error>>;
@@ -151,16 +159,21 @@ impl ArmLoop {
         let mut next_cycle = clock::now();
         let mut shutdown_deadline = None;
         loop {
+            // The program is about to exit without an orderly stop, so this comes before everything
+            // else.
             if CommandedArm::is_fail_safe_due() {
                 break;
             }
             if self.is_shutting_down.load(Ordering::Relaxed) {
+                // The deadline is fixed at the first pass. Computing it anew in each pass would
+                // move it into the future forever.
                 let shutdown_by = *shutdown_deadline
                     .get_or_insert_with(|| clock::now() + self.max_stop_duration());
                 if self.is_at_rest() || clock::now() > shutdown_by {
                     break;
                 }
             }
+            // Requests come before the cycle, so that a stop acts on the next setpoint.
             while let Ok(request) = self.requests.try_recv() {
                 self.handle_request(request);
             }
@@ -175,6 +188,8 @@ impl ArmLoop {
                     next_cycle = now + self.plan.period;
                 }
             }
+            // The time until the next cycle is spent listening: the checks of that cycle need the
+            // newest answers.
             let result = self.listen(next_cycle.duration_since(clock::now()).min(POLL));
             if let Err(error) = result {
                 self.abort(&reason_of(&error));
@@ -206,9 +221,13 @@ impl ArmLoop {
             }
             // The arm is not moving, so it is already at rest.
             (Request::Stop(answer), _) => drop(answer.try_send(Ok(()))),
+            // Everything is prepared anew: while the arm was stopped, an interface may have been
+            // set up again, and motors may have been reset or replaced.
             (Request::Recover(answer), ArmState::Stopped { .. }) => match self.prepare() {
                 Ok(prepared) => {
                     self.prepared = Some(prepared);
+                    // Preparing takes longer than a watchdog timeout, which is no stall of this
+                    // thread.
                     self.last_cycle = clock::now_including_suspend();
                     self.arm_state = ArmState::Measuring {
                         since: clock::now(),
@@ -253,6 +272,8 @@ impl ArmLoop {
 
     /// Runs one cycle in the current state.
     fn cycle(&mut self, now: Stamp) -> Result<(), Error> {
+        // This clock counts the time in which a laptop is suspended. The motors' watchdogs expire
+        // then, but the monotonic clock stands still.
         let now_including_suspend = clock::now_including_suspend();
         let stall = now_including_suspend.duration_since(self.last_cycle);
         self.last_cycle = now_including_suspend;
@@ -260,100 +281,131 @@ impl ArmLoop {
             return Ok(());
         };
         prepared.cycle_ix += 1;
+        // A single missed cycle does no harm, because every setpoint is followed by a newer one.
+        // Late cycles are only counted, for the summary at the end.
         if stall > 2 * self.plan.period {
             self.n_late += 1;
             self.max_stall = self.max_stall.max(stall);
         }
-        let max_silence_allowed = self.plan.timeout.mul_f64(SILENCE_FRAC);
-        let is_overdue = stall > max_silence_allowed;
-        let stall_error = || {
-            motion(format!(
-                "this computer stalled for {:.0} ms",
-                1e3 * stall.as_secs_f64()
-            ))
-        };
-        match &mut self.arm_state {
+        match self.arm_state {
             ArmState::Stopped { since, .. } => {
-                // Polls may also reset a watchdog, so they wait until it has expired.
-                if now.duration_since(*since) > 2 * self.plan.timeout {
-                    // A bus failure has already been reported.
-                    let _ = prepared.poll_stopped();
-                }
-                self.resend_fail_safe(now);
-                return Ok(());
+                self.stopped_cycle(since, now);
+                Ok(())
             }
-            ArmState::Measuring { since, .. } => {
-                if let Some(positions) = prepared.positions(*since) {
-                    let limits = prepared.limits(&self.config.motion.limits);
-                    let generator = TrajectoryGenerator::new(&limits, &positions, self.plan.period)
-                        .map_err(motion)?;
-                    prepared
-                        .movable_motors
-                        .iter_mut()
-                        .for_each(MovableMotor::clear_health);
-                    let ArmState::Measuring { reply, .. } =
-                        std::mem::replace(&mut self.arm_state, ArmState::stopped(now, None))
-                    else {
-                        return Ok(());
-                    };
-                    let generator = Box::new(generator);
-                    self.arm_state = ArmState::Enabling {
-                        since: now,
-                        is_ordered: false,
-                        generator,
-                        reply,
-                    };
-                    return Ok(());
-                }
-                if now.duration_since(*since) > STARTUP_TIMEOUT {
-                    return Err(prepared.silent_before_start());
-                }
-                prepared.poll_disabled()?;
-                return prepared.send_sync(self.plan.host);
+            ArmState::Measuring { since, .. } => self.measuring_cycle(since, now),
+            ArmState::Enabling { since, .. } => {
+                self.check_stall(stall)?;
+                self.enabling_cycle(since, now)
             }
+            ArmState::Moving { .. } => {
+                self.check_stall(stall)?;
+                self.moving_cycle(now)
+            }
+        }
+    }
+
+    /// Returns an error if this thread stalled for so long that the motors have stopped or are
+    /// about to. A setpoint from before the stall must then not be sent any more.
+    fn check_stall(&self, stall: Duration) -> Result<(), Error> {
+        if stall <= self.max_silence() {
+            return Ok(());
+        }
+        Err(motion(format!(
+            "this computer stalled for {:.0} ms",
+            1e3 * stall.as_secs_f64()
+        )))
+    }
+
+    /// Time without commands or answers after which this thread stops the arm.
+    fn max_silence(&self) -> Duration {
+        self.plan.timeout.mul_f64(SILENCE_FRAC)
+    }
+
+    /// A cycle of an arm that stopped at `since`.
+    fn stopped_cycle(&mut self, since: Stamp, now: Stamp) {
+        // Polls may also reset a watchdog, so they wait until it has expired.
+        if let Some(prepared) = &self.prepared
+            && now.duration_since(since) > 2 * self.plan.timeout
+        {
+            // A bus failure has already been reported.
+            let _ = prepared.poll_stopped();
+        }
+        self.resend_fail_safe(now);
+    }
+
+    /// A cycle in which the motors, prepared at `since` and disabled, are polled for their
+    /// positions. Once all have answered, the arm may be enabled.
+    fn measuring_cycle(&mut self, since: Stamp, now: Stamp) -> Result<(), Error> {
+        let Some(prepared) = &mut self.prepared else {
+            return Ok(());
+        };
+        let Some(positions) = prepared.positions(since) else {
+            if now.duration_since(since) > STARTUP_TIMEOUT {
+                return Err(prepared.silent_before_start());
+            }
+            prepared.poll_disabled()?;
+            return prepared.send_sync(self.plan.host);
+        };
+        // The generator starts where the joints are now. An older position would make them jump
+        // when they are enabled.
+        let limits = prepared.limits(&self.config.motion.limits);
+        let generator =
+            TrajectoryGenerator::new(&limits, &positions, self.plan.period).map_err(motion)?;
+        // Frames that queued up during the preparation may report faults that it has cleared. Only
+        // reports from now on count.
+        prepared
+            .movable_motors
+            .iter_mut()
+            .for_each(MovableMotor::clear_health);
+        let measuring = std::mem::replace(&mut self.arm_state, ArmState::stopped(now, None));
+        let ArmState::Measuring { reply, .. } = measuring else {
+            return Ok(());
+        };
+        self.arm_state = ArmState::Enabling {
+            since: now,
+            is_ordered: false,
+            generator: Box::new(generator),
+            reply,
+        };
+        Ok(())
+    }
+
+    /// A cycle in which the motors are enabled, which began at `since`. Once all report that they
+    /// are enabled, the arm may move.
+    fn enabling_cycle(&mut self, since: Stamp, now: Stamp) -> Result<(), Error> {
+        let (
+            Some(prepared),
             ArmState::Enabling {
-                since,
                 is_ordered,
                 generator,
                 ..
-            } => {
-                if is_overdue {
-                    return Err(stall_error());
-                }
-                prepared.command(generator)?;
-                if !*is_ordered {
-                    *is_ordered = true;
-                    prepared.enable()?;
-                    prepared.command(generator)?;
-                }
-                prepared.send_sync(self.plan.host)?;
-                if now.duration_since(*since) > STARTUP_TIMEOUT {
-                    return Err(prepared.not_enabled());
-                }
-                if !prepared.all_enabled() {
-                    return Ok(());
-                }
-            }
-            ArmState::Moving { generator } => {
-                if is_overdue {
-                    return Err(stall_error());
-                }
-                prepared.check(now, max_silence_allowed)?;
-                prepared.command(generator)?;
-                prepared.send_sync(self.plan.host)?;
-                let motion_now = if generator.is_at_rest() {
-                    Motion::Holding
-                } else {
-                    Motion::Moving
-                };
-                *self.motion.lock() = motion_now;
-                return Ok(());
-            }
+            },
+        ) = (&mut self.prepared, &mut self.arm_state)
+        else {
+            return Ok(());
+        };
+        // Motors get their target before they are enabled, so that none moves to an old one. Drives
+        // are enabled by these commands, one state per cycle.
+        prepared.command(generator)?;
+        if !*is_ordered {
+            // The order is sent once. Repeating it would enable a motor again that has stopped
+            // because of a fault.
+            *is_ordered = true;
+            prepared.enable()?;
+            // A motor that ignores commands while it is disabled gets its target now.
+            prepared.command(generator)?;
         }
-        // All motors are enabled.
+        prepared.send_sync(self.plan.host)?;
+        if now.duration_since(since) > STARTUP_TIMEOUT {
+            return Err(prepared.not_enabled());
+        }
+        if !prepared.all_enabled() {
+            return Ok(());
+        }
+        let enabling = std::mem::replace(&mut self.arm_state, ArmState::stopped(now, None));
         if let ArmState::Enabling {
             generator, reply, ..
-        } = std::mem::replace(&mut self.arm_state, ArmState::stopped(now, None))
+        } = enabling
         {
             self.arm_state = ArmState::Moving { generator };
             *self.motion.lock() = Motion::Holding;
@@ -363,12 +415,37 @@ impl ArmLoop {
         Ok(())
     }
 
+    /// A cycle of an enabled arm.
+    fn moving_cycle(&mut self, now: Stamp) -> Result<(), Error> {
+        let max_silence_allowed = self.max_silence();
+        let (Some(prepared), ArmState::Moving { generator }) =
+            (&mut self.prepared, &mut self.arm_state)
+        else {
+            return Ok(());
+        };
+        // The checks come first: after a fault of one motor, the others must not get another
+        // setpoint.
+        prepared.check(now, max_silence_allowed)?;
+        prepared.command(generator)?;
+        // The SYNC follows the targets of all drives, so that they accept them at the same instant.
+        prepared.send_sync(self.plan.host)?;
+        let motion_now = if generator.is_at_rest() {
+            Motion::Holding
+        } else {
+            Motion::Moving
+        };
+        *self.motion.lock() = motion_now;
+        Ok(())
+    }
+
     /// Processes incoming frames until the timeout expires.
     fn listen(&mut self, timeout: Duration) -> Result<(), Error> {
         let Some(prepared) = &mut self.prepared else {
             std::thread::sleep(timeout);
             return Ok(());
         };
+        // One thread reads all buses. It waits for all of them at once and then reads each until it
+        // is empty, so that no bus delays another.
         Bus::wait_for_any(&prepared.buses, timeout);
         let is_stopped = matches!(self.arm_state, ArmState::Stopped { .. });
         for bus_ix in 0..prepared.buses.len() {
@@ -398,6 +475,9 @@ impl ArmLoop {
                             "{interface}: errors on the wire so far: {:?}",
                             prepared.errors
                         );
+                        // In bus-off, the controller discards commands. Even if it restarts
+                        // automatically, the motors may have stopped, so only a person enables the
+                        // arm again.
                         if new_errors.n_bus_off > 0 && !is_stopped {
                             return Err(motion(format!("{interface} went bus-off")));
                         }
@@ -416,6 +496,8 @@ impl ArmLoop {
         }
         let fail_safe = self.fail_safe_command();
         if let Some(prepared) = &self.prepared {
+            // Motors with a watchdog get the command, too: all joints then stop together, and not
+            // each at the end of its own timeout.
             prepared.shutdown(fail_safe, |_| true);
         }
         self.stopped(reason, Some(fail_safe));
@@ -424,6 +506,8 @@ impl ArmLoop {
     /// The fail-safe command of all motors: `on_loss`, or release if not all motors were enabled
     /// yet.
     fn fail_safe_command(&self) -> OnLoss {
+        // Holding or damping needs enabled motors. If only some are enabled, those would hold while
+        // the others fall, so all are released.
         if matches!(self.arm_state, ArmState::Moving { .. }) {
             self.plan.on_loss
         } else {
@@ -438,6 +522,8 @@ impl ArmLoop {
             reason: reason.to_owned(),
             pending_fail_safe,
         };
+        // Whoever waits for the arm to be enabled gets the reason. Otherwise, the request would end
+        // with a timeout that names no cause.
         let before = std::mem::replace(&mut self.arm_state, stopped);
         *self.motion.lock() = Motion::Stopped {
             reason: reason.to_owned(),
@@ -460,9 +546,13 @@ impl ArmLoop {
 
     /// Maximum time for the arm to come to rest.
     fn max_stop_duration(&self) -> Duration {
+        // Worst case: a joint at full velocity that still has its full acceleration in the
+        // direction of motion. Removing that acceleration takes `a / j`. Then the joint decelerates
+        // from `v` in `v / a`, plus `a / j` for the two ramps of the deceleration.
         let secs = |joint: &MotionLimits| {
             joint.velocity / joint.acceleration + 2.0 * joint.acceleration / joint.jerk
         };
+        // The joints stop independently, so the slowest one counts.
         let max_secs = self
             .config
             .motion
@@ -500,6 +590,7 @@ impl ArmLoop {
             ..
         } = self.arm_state
         {
+            // The normal cycle has ended, so this loop paces itself.
             std::thread::sleep(self.plan.period);
             // A bus failure has already been reported.
             let _ = self.listen(Duration::ZERO);
@@ -524,19 +615,18 @@ impl ArmLoop {
             *pending_fail_safe = None;
             return;
         };
-        let has_no_watchdog = |movable_motor: &MovableMotor| {
-            !movable_motor
-                .motor()
-                .protocol()
-                .watchdog(&self.plan)
-                .is_available()
-        };
-        prepared.shutdown(fail_safe, has_no_watchdog);
+        // Motors with a watchdog are left out. A resent command would reset their watchdog, and
+        // they stop in any case.
+        prepared.shutdown(fail_safe, |movable_motor| {
+            has_no_watchdog(movable_motor, &self.plan)
+        });
+        // An answer soon after the stop may reply to an earlier command, so it does not prove that
+        // the motor has received this one.
         let watchdog_deadline = *since + self.plan.timeout;
         let all = prepared.movable_motors.iter().zip(&prepared.last_heard);
         let silent_motors: Vec<_> = all
             .filter(|(movable_motor, last_heard)| {
-                has_no_watchdog(movable_motor) && last_heard.0 < watchdog_deadline
+                has_no_watchdog(movable_motor, &self.plan) && last_heard.0 < watchdog_deadline
             })
             .collect();
         if now < watchdog_deadline + STARTUP_TIMEOUT && !silent_motors.is_empty() {
@@ -554,8 +644,16 @@ impl ArmLoop {
     }
 }
 
+/// Whether a motor would execute its last command forever if commands stopped.
+fn has_no_watchdog(movable_motor: &MovableMotor, plan: &WatchdogPlan) -> bool {
+    let watchdog = movable_motor.motor().protocol().watchdog(plan);
+    !watchdog.is_available()
+}
+
 impl Drop for ArmLoop {
     fn drop(&mut self) {
+        // After an orderly end, the motors have their fail-safe command. After a panic, motors
+        // without a watchdog would execute their last command forever.
         if std::thread::panicking() {
             self.abort("the thread of the arm failed; this is a bug, please report it");
             self.finish_fail_safe();
@@ -596,6 +694,8 @@ impl PreparedMotors {
             if movable_motor.config().bus_ix != bus_ix {
                 continue;
             }
+            // A frame without a reading, such as a statusword, still updates the health. It does
+            // not count as heard, because the following error needs positions.
             if let Some(reading) = movable_motor.process_frame(frame) {
                 self.last_heard[joint_ix] = (stamp, self.cycle_ix);
                 self.latest[joint_ix] = Some(reading);
@@ -611,12 +711,16 @@ impl PreparedMotors {
 
     /// Positions of all joints, once every motor has reported since `since`.
     fn positions(&self, since: Stamp) -> Option<Vec<f64>> {
-        let of = |(reading, last_heard): (&Option<Reading>, &(Stamp, u64))| {
-            reading
-                .filter(|_| last_heard.0 >= since)
-                .map(|reading| reading.position_rad)
-        };
-        self.latest.iter().zip(&self.last_heard).map(of).collect()
+        let mut positions_rad = Vec::with_capacity(self.latest.len());
+        for (latest, (heard, _)) in self.latest.iter().zip(&self.last_heard) {
+            // Frames that queued up during the preparation are older. Since then, the joint may
+            // have sagged.
+            if *heard < since {
+                return None;
+            }
+            positions_rad.push((*latest)?.position_rad);
+        }
+        Some(positions_rad)
     }
 
     fn limits(&self, joints: &[MotionLimits]) -> Vec<MotionLimits> {
@@ -671,6 +775,8 @@ impl PreparedMotors {
             self.bus_of(movable_motor)
                 .send_within(&command, MAX_QUEUED)?;
         }
+        // The following error is measured against this position, and the fail-safe command "hold"
+        // commands it.
         self.sent_rad = setpoint.position;
         Ok(())
     }
@@ -680,6 +786,8 @@ impl PreparedMotors {
             let frames = movable_motor
                 .enable()
                 .map_err(|error| self.fault(movable_motor, error.to_string()))?;
+            // Unlike setpoints, these frames are sent once, so they wait longer for space in the
+            // queue.
             for frame in &frames {
                 self.bus_of(movable_motor).send(frame)?;
             }
@@ -700,17 +808,19 @@ impl PreparedMotors {
     }
 
     fn buses_with_drives(&self) -> impl Iterator<Item = &Bus> {
-        let has_drives = |bus_ix: usize| {
-            self.movable_motors
-                .iter()
-                .filter(|movable_motor| movable_motor.config().bus_ix == bus_ix)
-                .any(|movable_motor| movable_motor.motor().protocol().canopen_node().is_some())
-        };
         self.buses
             .iter()
             .enumerate()
-            .filter(move |(ix, _)| has_drives(*ix))
+            .filter(move |(ix, _)| self.has_drives(*ix))
             .map(|(_, bus)| bus)
+    }
+
+    /// Whether a motor on the bus is a CANopen drive.
+    fn has_drives(&self, bus_ix: usize) -> bool {
+        self.movable_motors
+            .iter()
+            .filter(|movable_motor| movable_motor.config().bus_ix == bus_ix)
+            .any(|movable_motor| movable_motor.motor().protocol().canopen_node().is_some())
     }
 
     fn all_enabled(&self) -> bool {
@@ -736,6 +846,8 @@ impl PreparedMotors {
                 continue;
             };
             let following = &movable_motor.config().following;
+            // A loaded or fast joint lags its command, too, so the configured limit must exceed the
+            // error of normal motions.
             if let Some(violation) = following.violation(*sent_rad, position_rad, effort_nm) {
                 return Err(self.fault(movable_motor, violation));
             }
@@ -746,12 +858,15 @@ impl PreparedMotors {
                 Some(Health::Fault(reason)) => {
                     return Err(self.fault(movable_motor, reason.clone()));
                 }
+                // We have not disabled it: another program did, or it was reset by a loss of power.
                 Some(Health::Off) | None => {
                     return Err(
                         self.fault(movable_motor, "the motor was disabled by something else")
                     );
                 }
             }
+            // Both conditions must hold. Time alone would blame a motor for a stall of this thread;
+            // cycles alone would stop the arm after a few lost frames at a high rate.
             let silence = now.duration_since(*stamp);
             if silence > movable_motor.max_silence(max_silence_allowed)
                 && self.cycle_ix - cycle_ix > MIN_MISSED_CYCLES
@@ -776,6 +891,8 @@ impl PreparedMotors {
             .zip(&self.sent_rad)
             .filter(|(movable_motor, _)| selects(movable_motor))
         {
+            // A motor that cannot be reached must not keep the others from their command, so errors
+            // are ignored and the loop continues.
             if let Ok(frame) = movable_motor.shutdown(fail_safe, *sent_rad) {
                 let _ = self
                     .bus_of(movable_motor)
@@ -785,6 +902,8 @@ impl PreparedMotors {
     }
 
     fn silent_before_start(&self) -> Error {
+        // Only one motor fits into the message. The one that was heard least recently is the most
+        // likely culprit.
         let most_silent = self
             .last_heard
             .iter()

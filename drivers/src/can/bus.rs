@@ -18,8 +18,9 @@ use std::io;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
-/// Maximum time for which sending is retried while the interface's queue is full.
-const MAX_SENDING: Duration = Duration::from_millis(20);
+/// Maximum time for which sending is retried while the interface's queue is full. A queue of ten
+/// frames empties in 1.4 ms at 1 Mbit/s, and in 11 ms at 125 kbit/s, if frames are acknowledged.
+pub(super) const MAX_SENDING: Duration = Duration::from_millis(20);
 /// `errno` for "no buffer space": the interface's queue is full.
 const ENOBUFS: i32 = 105;
 
@@ -39,10 +40,15 @@ impl Bus {
     /// If the interface is not set up as in `config`. The error contains the command that sets it
     /// up.
     pub fn open(config: &BusConfig) -> Result<Self, Error> {
+        // A wrong bit rate would disturb every node on the bus, so the interface is checked before
+        // the socket exists.
         Link::read(&config.interface)?.check(config)?;
         let open = CanFdSocket::open(&config.interface).and_then(|socket| {
+            // Error frames are off by default. They tell an unpowered motor from a bus that is cut.
             socket.set_error_filter_accept_all()?;
+            // A stamp of the kernel does not depend on when this thread is scheduled.
             socket.set_recv_timestamp(true)?;
+            // All waits use `poll`, which has a better resolution and can wait for several buses.
             socket.set_nonblocking(true)?;
             Ok(socket)
         });
@@ -90,6 +96,9 @@ impl Bus {
                     if clock::now().duration_since(start) >= bound {
                         return Ok(false);
                     }
+                    // A classic frame takes up to 135 us at 1 Mbit/s, so one or two slots become
+                    // free in this time. The kernel does not report when: a CAN socket counts as
+                    // writable while the queue is full.
                     std::thread::sleep(Duration::from_micros(200));
                 }
                 Err(source) => return Err(self.bus_error(source)),
@@ -105,6 +114,8 @@ impl Bus {
                 CanRemoteFrame::new_remote(id, frame.n_bytes()).ok_or_else(invalid)?;
             return self.socket.write_frame(&socket_frame);
         }
+        // The type of the socket frame determines the format on the wire. A classic-only node
+        // answers an FD frame with error frames.
         if frame.is_fd() {
             let mut socket_frame = CanFdFrame::new(id, frame.data()).ok_or_else(invalid)?;
             socket_frame.set_brs(frame.is_switched());
@@ -132,6 +143,7 @@ impl Bus {
             &mut [PollFd::new(&self.socket, PollFlags::IN)],
             Some(&timespec(timeout)),
         ) {
+            // A signal ends the wait early. The caller waits again if it has time left.
             Ok(0) | Err(Errno::INTR) => return Ok(None),
             Ok(_) => {}
             Err(error) => return Err(self.bus_error(error.into())),
@@ -158,9 +170,11 @@ impl Bus {
         Ok(Some((stamp, BusEvent::Frame(frame))))
     }
 
+    /// Adds the duration of a frame to the load.
     fn count(&self, frame: &Frame) {
         let busy = Duration::from_secs_f64(frame.bits(Stuffing::None).seconds(self.config.rates()));
         let nanos = u64::try_from(busy.as_nanos()).unwrap_or(u64::MAX);
+        // Nothing else is ordered by this counter.
         self.busy_nanos.fetch_add(nanos, Ordering::Relaxed);
     }
 
@@ -213,14 +227,11 @@ fn timespec(timeout: Duration) -> Timespec {
 }
 
 fn socket_id(id: Id) -> SocketId {
-    match id.is_extended() {
-        true => SocketId::Extended(
-            ExtendedId::new(id.value()).expect("an extended ID has at most 29 bits"),
-        ),
-        false => {
-            let value = u16::try_from(id.value()).expect("a standard ID has at most 11 bits");
-            SocketId::Standard(StandardId::new(value).expect("a standard ID has at most 11 bits"))
-        }
+    if id.is_extended() {
+        SocketId::Extended(ExtendedId::new(id.value()).expect("an extended ID has at most 29 bits"))
+    } else {
+        let value = u16::try_from(id.value()).expect("a standard ID has at most 11 bits");
+        SocketId::Standard(StandardId::new(value).expect("a standard ID has at most 11 bits"))
     }
 }
 

@@ -124,6 +124,9 @@ pub struct FollowingLimits {
 impl Default for FollowingLimits {
     fn default() -> Self {
         Self {
+            // With a stiffness of 30 N m / rad, a motor pushes against an obstacle with 6 N m at
+            // this error. A smaller default would stop loaded or fast joints, which lag their
+            // commands.
             max_error_rad: 0.2,
             max_effort_nm: None,
             is_off: false,
@@ -142,6 +145,8 @@ impl FollowingLimits {
         if self.is_off {
             return None;
         }
+        // The position comes first: every family reports it, but not every family reports an
+        // effort.
         let error_rad = (commanded_rad - position_rad).abs();
         if error_rad > self.max_error_rad {
             return Some(format!(
@@ -150,7 +155,10 @@ impl FollowingLimits {
                 self.max_error_rad
             ));
         }
-        let (effort_nm, max_effort_nm) = (effort_nm?.abs(), self.max_effort_nm?);
+        // If the motor reports no effort, or the rig file sets no limit, there is nothing to
+        // exceed.
+        let effort_nm = effort_nm?.abs();
+        let max_effort_nm = self.max_effort_nm?;
         (effort_nm > max_effort_nm).then(|| {
             format!("its effort is {effort_nm:.2} N m, and max_effort_nm is {max_effort_nm}: the joint is blocked or overloaded")
         })

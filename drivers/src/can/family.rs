@@ -14,7 +14,8 @@ use std::ops::RangeInclusive;
 use std::sync::Arc;
 use std::time::Duration;
 
-/// Maximum time until the first report of a motor that sends unsolicited reports.
+/// Maximum time until the first report of a motor that sends unsolicited reports. The rarest report
+/// is the heartbeat of CANopen drives, which is set to every 500 ms, so one of them may be lost.
 pub(super) const MAX_REPORT: Duration = Duration::from_secs(1);
 /// Maximum time for a motor to report that it is disabled, or in another mode.
 pub(super) const MAX_CHANGE: Duration = Duration::from_secs(1);
@@ -142,6 +143,7 @@ pub trait MotionProtocol: Debug + Send {
 impl dyn MotorProtocol {
     /// Whether the two motors would have conflicting IDs on the same bus.
     pub fn conflicts_with(&self, other: &Self) -> bool {
+        // Families use different parts of the identifier, so their numbers cannot be compared.
         let theirs = other.addresses();
         self.family().name() == other.family().name()
             && self

@@ -18,7 +18,17 @@ const FD_LENGTHS: [usize; 7] = [12, 16, 20, 24, 32, 48, 64];
 
 /// One motor of each family, each on its own bus.
 pub(crate) fn motors() -> Vec<MotorConfig> {
-    let motor = |(ix, family): (usize, &&dyn MotorFamily)| MotorConfig {
+    FAMILIES
+        .iter()
+        .enumerate()
+        .map(|(ix, family)| example_motor(ix, *family))
+        .collect()
+}
+
+/// The motor of a family. Its ratio, direction and offset are not neutral, so that the conversion
+/// to the joint is exercised, too.
+fn example_motor(ix: usize, family: &dyn MotorFamily) -> MotorConfig {
+    MotorConfig {
         joint: format!("joint{ix}"),
         bus_ix: ix,
         protocol: family.fuzzing().motor,
@@ -27,8 +37,7 @@ pub(crate) fn motors() -> Vec<MotorConfig> {
         offset_rad: 0.25,
         gains: None,
         following: FollowingLimits::default(),
-    };
-    FAMILIES.iter().enumerate().map(motor).collect()
+    }
 }
 
 /// Decodes concatenated frames. Each starts with one byte that contains the DLC (data length code)
@@ -51,12 +60,17 @@ pub(crate) fn decode_frames(mut bytes: &[u8]) -> Vec<Frame> {
             Id::standard(number & 0x7FF)
         };
         let id = id.expect("the identifier is masked to 11 or 29 bits");
+        // CAN FD has no remote frames.
         let is_remote = head & 0x20 != 0 && !is_fd;
+        // Input that ends too early is padded with zeros, so that every input is a sequence of
+        // valid frames.
         let payload = &take::<64>(&mut &bytes[..bytes.len().min(n_bytes)])[..n_bytes];
-        let frame = match is_remote {
-            true => Frame::remote(id, n_bytes),
-            false if is_fd => Frame::fd(id, payload, head & 0x80 != 0),
-            false => Frame::classic(id, payload),
+        let frame = if is_remote {
+            Frame::remote(id, n_bytes)
+        } else if is_fd {
+            Frame::fd(id, payload, head & 0x80 != 0)
+        } else {
+            Frame::classic(id, payload)
         };
         bytes = if is_remote {
             bytes
@@ -86,7 +100,10 @@ pub fn frames(bytes: &[u8]) {
         codecs(&frame);
         now += Duration::from_millis(1);
         for (ix, emulated) in emulated.iter_mut().enumerate() {
+            // Every motor gets every frame, because on a real bus, any node may send any
+            // identifier.
             check(&listeners[ix], &frame);
+            // A command out of range has no answer, as on a real motor.
             let answers = emulated.take(&frame).unwrap_or_default();
             for sent in answers
                 .into_iter()
@@ -117,6 +134,7 @@ fn check(motor: &Motor, frame: &Frame) {
     };
     let config = motor.config();
     let limits = config.protocol.ranges().unwrap_or(LIMITS);
+    // Ranges may be infinite. Then only the plausibility check of `Motor::read` applies.
     let max_rad = (limits.position_rad / config.gear_ratio + config.offset_rad.abs()).min(MAX_RAD);
     let max_rad_s = (limits.velocity_rad_s / config.gear_ratio).min(MAX_RAD);
     let max_nm = limits.torque_nm * config.gear_ratio;

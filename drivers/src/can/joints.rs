@@ -26,10 +26,16 @@ impl Joints {
 
     /// Adds a reading. Once every joint has a new reading, returns a state and starts over.
     pub(super) fn take(&mut self, joint_reading: &JointReading) -> Option<JointState> {
+        // A second reading of a joint replaces the first, so a fast motor does not hold back newer
+        // data.
         self.newest[joint_reading.joint_ix] = Some((joint_reading.stamp, joint_reading.reading));
         let all = self.newest.iter().copied().collect::<Option<Vec<_>>>()?;
+        // Every state consists of new readings only. Otherwise, a silent motor would keep its last
+        // position in all later states.
         self.newest.fill(None);
         let stamp = all.iter().map(|(stamp, _)| *stamp).max()?;
+        // Motors answer one after another. At 1 rad/s and 2 ms between the first and the last
+        // answer, joining them without extrapolation would be wrong by 2 mrad.
         let at = |(stamp_of_reading, reading): &(Stamp, Reading)| {
             reading.position_rad + reading.velocity_rad_s * stamp.secs_since(*stamp_of_reading)
         };
@@ -40,6 +46,8 @@ impl Joints {
                 .iter()
                 .map(|(_, reading)| reading.velocity_rad_s)
                 .collect(),
+            // If one motor reports no effort, the list stays empty, because it must have one entry
+            // per joint or none.
             effort: all
                 .iter()
                 .map(|(_, reading)| reading.effort_nm)

@@ -8,7 +8,10 @@ use socketcan::nl::{CanState, InterfaceDetails, Mtu};
 use std::io;
 use std::path::Path;
 
-/// Time from a bus-off to the automatic restart in the commands that we print, milliseconds.
+/// Time from a bus-off to the automatic restart in the commands that we print, milliseconds. A
+/// shorter time would let a node with a permanent fault disturb the bus more often; a longer one
+/// lengthens the gap in the joint states, which must stay below the second after which a motor
+/// counts as silent.
 const RESTART_MILLIS: u32 = 100;
 
 /// State of a controller according to its error counters.
@@ -81,18 +84,15 @@ impl Link {
 
     fn of(interface: &str, details: &InterfaceDetails) -> Self {
         let can = &details.can;
-        let rate = |timing: Option<socketcan::nl::CanBitTiming>| {
-            timing
-                .map(|timing| timing.bitrate)
-                .filter(|bitrate_hz| *bitrate_hz > 0)
-        };
+
         Self {
             interface: interface.to_owned(),
             is_up: details.is_up,
             is_fd: details.mtu == Some(Mtu::Fd),
-            bitrate_hz: rate(can.bit_timing),
-            data_bitrate_hz: rate(can.data_bit_timing),
+            bitrate_hz: bit_rate_hz(can.bit_timing),
+            data_bitrate_hz: bit_rate_hz(can.data_bit_timing),
             restart_millis: can.restart_ms,
+            // The driver of a virtual interface reports no controller, and so no state.
             state: can.state.map(|state| match state {
                 CanState::ErrorActive => State::Active,
                 CanState::ErrorWarning => State::Warning,
@@ -114,32 +114,39 @@ impl Link {
     /// Problems that must be fixed before motors can be read with `config`. Empty if there are
     /// none.
     pub fn problems(&self, config: &BusConfig) -> Vec<LinkProblem> {
+        // One command configures the interface completely, so it fixes every problem.
         let command = set_up_command(&self.interface, self.is_virtual(), config);
-        let mut problems = Vec::new();
-        let mut report = |problem: String| {
-            problems.push(LinkProblem {
+        self.problem_texts(config)
+            .into_iter()
+            .map(|problem| LinkProblem {
                 problem,
                 command: command.clone(),
             })
-        };
+            .collect()
+    }
+
+    /// Descriptions of the problems, the most basic first.
+    fn problem_texts(&self, config: &BusConfig) -> Vec<String> {
+        let mut problems = Vec::new();
         if !self.is_up {
-            report("it is down".to_owned());
+            problems.push("it is down".to_owned());
         }
         if config.data_bitrate_hz.is_some() && !self.is_fd {
-            report("it does not accept FD frames".to_owned());
+            problems.push("it does not accept FD frames".to_owned());
         }
+        // A virtual interface has no bit rate that could be wrong, and cannot go bus-off.
         if self.is_virtual() {
             return problems;
         }
         match self.bitrate_hz {
             Some(bitrate_hz) if bitrate_hz == config.bitrate_hz => {}
             Some(bitrate_hz) => {
-                report(format!(
+                problems.push(format!(
                     "its bit rate is {bitrate_hz}, but the rig file requires {}",
                     config.bitrate_hz
                 ));
             }
-            None => report(format!(
+            None => problems.push(format!(
                 "no bit rate is set; the rig file requires {}",
                 config.bitrate_hz
             )),
@@ -151,19 +158,22 @@ impl Link {
             let reported = self
                 .data_bitrate_hz
                 .map_or_else(|| "not set".to_owned(), |rate| rate.to_string());
-            report(format!(
+            problems.push(format!(
                 "its bit rate for FD data is {reported}, but the rig file requires {data_bitrate_hz}"
             ));
         }
+        // Without a restart, one bus-off would end the reading of the arm until somebody sets up
+        // the interface again.
         if self.restart_millis == Some(0) && !config.accept_no_restart {
-            report(format!(
+            problems.push(format!(
                 "it does not restart after a bus-off (restart-ms 0; for an adapter without automatic restart, on a serial \
                  line for instance, set arm.bus.{}.accept_no_restart = true)",
                 self.interface
             ));
         }
+        // An interface that is down is `Stopped`, which is reported above.
         if self.is_up && self.state >= Some(State::BusOff) {
-            report(
+            problems.push(
                 "it is bus-off: check wiring, termination and the bit rate of the other nodes"
                     .to_owned(),
             );
@@ -219,9 +229,12 @@ fn set_up_command(interface: &str, is_virtual: bool, config: &BusConfig) -> Stri
             None => format!("sudo ip link set {interface} up"),
         };
     }
+    // An interface must be down while its bit rate changes, so the command takes it down first.
+    // That is harmless if it is down already.
     let fd = config
         .data_bitrate_hz
         .map_or_else(String::new, |rate| format!(" dbitrate {rate} fd on"));
+    // For adapters that do not support `restart-ms`, `ip` would refuse the whole command.
     let restart = if config.accept_no_restart {
         String::new()
     } else {
@@ -233,10 +246,18 @@ fn set_up_command(interface: &str, is_virtual: bool, config: &BusConfig) -> Stri
     )
 }
 
+/// The bit rate in a timing, bit/s. The kernel reports 0 if none is set.
+fn bit_rate_hz(timing: Option<socketcan::nl::CanBitTiming>) -> Option<u32> {
+    timing
+        .map(|timing| timing.bitrate)
+        .filter(|bitrate_hz| *bitrate_hz > 0)
+}
+
 /// `errno` for "no such device".
 const ENODEV: i32 = 19;
 
 fn missing_interface(interface: &str) -> io::Error {
+    // A virtual interface does not exist before it is created, so listing hardware would not help.
     if interface.starts_with("vcan") {
         let create_command = format!(
             "sudo modprobe vcan; sudo ip link add dev {interface} type vcan; sudo ip link set {interface} up"

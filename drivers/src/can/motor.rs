@@ -8,7 +8,9 @@ use crate::Error;
 use crate::wire::can::Frame;
 use crate::wire::can::mit::Limits;
 
-/// Greater positions (rad) or velocities (rad/s) of a joint are implausible and ignored.
+/// Greater positions (rad) or velocities (rad/s) of a joint are implausible and ignored. The limit
+/// is far beyond every motor, and small enough that computations with the values stay finite.
+/// Corrupted floating-point values are mostly much larger.
 pub(super) const MAX_RAD: f64 = 1e4;
 
 /// Position, velocity and effort of a joint.
@@ -30,6 +32,8 @@ impl Motor {
     /// Makes the motor report its position, and waits for the first report.
     pub(super) fn set_up(bus: &dyn FrameIo, config: &MotorConfig) -> Result<Self, Error> {
         let motor = Self::set_up_for_motion(bus, config)?;
+        // Such a motor is silent until another master commands it. Reading it makes no sense before
+        // that, so the error names this cause.
         if let Reports::WhenCommanded { if_silent } = config.protocol.reports() {
             motor.wait_for_reading(&MotorQuery::new(bus, &config.joint), if_silent)?;
         }
@@ -43,8 +47,11 @@ impl Motor {
         config: &MotorConfig,
     ) -> Result<Self, Error> {
         let query = MotorQuery::new(bus, &config.joint);
+        // The ranges come first: without them, the raw values of a report have no meaning.
         let limits = config.protocol.set_up(&query)?;
         let motor = Self::with_limits(config.clone(), limits);
+        // A motor that is polled has answered the queries of its set-up. One that reports without
+        // being asked may not have been heard yet.
         if let Reports::Unasked { if_silent } = config.protocol.reports() {
             motor.wait_for_reading(&query, if_silent)?;
         }
@@ -83,6 +90,8 @@ impl Motor {
             velocity_rad_s,
             torque_nm,
         } = self.protocol().read(frame, &self.limits)?;
+        // A gear divides position and velocity and multiplies the torque. Dividing by the signed
+        // ratio also reverses the torque of a reversed motor.
         let per_turn = self.per_turn();
         let reading = Reading {
             position_rad: position_rad * per_turn + self.config.offset_rad,

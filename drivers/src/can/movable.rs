@@ -18,7 +18,8 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-/// Maximum time for the arm's thread to reply. It checks for requests once per cycle.
+/// Maximum time for the arm's thread to reply. It checks for requests once per cycle, so a reply
+/// that takes longer means that the thread has ended or is stuck.
 const MAX_ANSWER: Duration = Duration::from_secs(1);
 /// Maximum time to recover. Preparing and enabling takes some hundred milliseconds per motor.
 const MAX_RECOVERY: Duration = Duration::from_secs(60);
@@ -62,11 +63,14 @@ impl MovableCanArm {
             .map(|motor| motor.joint.clone())
             .collect();
         let (sender, readings) = sync_channel(MAX_WAITING);
+        // Only one request waits at a time, because the owner waits for each reply.
         let (requests, request_receiver) = sync_channel(1);
         let motion = Arc::new(Mutex::new(Motion::Stopped {
             reason: "the arm has not been enabled yet".to_owned(),
         }));
         let is_shutting_down = Arc::new(AtomicBool::new(false));
+        // The configuration is checked before the lock is taken, so that a mistake in the rig file
+        // is reported even while another program moves the arm.
         let arm_loop = ArmLoop::new(
             config,
             request_receiver,
@@ -74,6 +78,8 @@ impl MovableCanArm {
             Arc::clone(&motion),
             Arc::clone(&is_shutting_down),
         )?;
+        // The lock comes before the thread, and thus before any frame. Two programs that command
+        // the same motors would alternate between two targets.
         let locks = config
             .arm
             .buses
@@ -82,6 +88,8 @@ impl MovableCanArm {
             .collect::<Result<_, _>>()?;
         let device = "movable CAN arm".to_owned();
         let commanded = CommandedArm::new();
+        // `apply_fail_safe` waits until `commanded` is dropped, which must not be before each motor
+        // has its fail-safe command.
         let run = move || {
             arm_loop.run();
             drop(commanded);
@@ -99,6 +107,7 @@ impl MovableCanArm {
             thread,
             _locks: locks,
         };
+        // If enabling fails, dropping the arm ends the thread, which disables the motors.
         arm.recover()?;
         Ok(arm)
     }
@@ -109,7 +118,10 @@ impl MovableCanArm {
         request: impl FnOnce(SyncSender<Result<T, Error>>) -> Request,
         timeout: Duration,
     ) -> Result<T, Error> {
+        // Each request has its own channel. A reply that comes after the timeout cannot be mistaken
+        // for the reply to the next request.
         let (sender, answer) = sync_channel(1);
+        // Waits have a timeout, because the thread may have ended after a panic.
         let no_answer = || Error::Motion {
             reason: "the arm's thread does not answer".to_owned(),
         };
@@ -139,6 +151,8 @@ impl Arm for MovableCanArm {
                         return Ok(state);
                     }
                 }
+                // A stopped arm reports no state, but that is no error: the reason is in `motion`,
+                // and the arm may be recovered.
                 Err(RecvTimeoutError::Timeout | RecvTimeoutError::Disconnected) => {
                     return Err(Error::NoJoints { waited: timeout });
                 }
@@ -170,6 +184,8 @@ impl MovableArm for MovableCanArm {
 
 impl Drop for MovableCanArm {
     fn drop(&mut self) {
+        // Joining the thread waits until the arm is at rest and each motor has its fail-safe
+        // command. After that, the locks are released.
         self.is_shutting_down.store(true, Ordering::Relaxed);
         if let Some(thread) = self.thread.take() {
             // A thread that panicked has already printed the panic message.

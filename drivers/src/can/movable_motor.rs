@@ -36,6 +36,9 @@ impl MovableMotor {
     ) -> Result<Self, Error> {
         let movable_motor = Self::new(Motor::set_up_for_motion(bus, config)?);
         let query = MotorQuery::new(bus, &config.joint);
+        // The order matters. Gains are checked before anything is changed. The motor is disabled
+        // before its mode changes, because in another mode its last command would have another
+        // meaning. A motor whose watchdog does not read back as set stays disabled.
         movable_motor.check_gains(&query)?;
         movable_motor.motion.switch_off(&query)?;
         movable_motor.motion.set_watchdog(&query, plan)?;
@@ -71,11 +74,11 @@ impl MovableMotor {
 
     /// The limits of the joint, clipped to the range that the motor's protocol can encode.
     pub(super) fn limits(&self, joint: &MotionLimits) -> MotionLimits {
-        let (config, per_turn, range) = (
-            self.motor.config(),
-            self.motor.per_turn(),
-            self.motor.limits(),
-        );
+        let config = self.motor.config();
+        let per_turn = self.motor.per_turn();
+        let range = self.motor.limits();
+        // Commands in MIT mode are clamped silently to this range. A joint that is sent beyond it
+        // would stop short of its target, with a growing following error.
         let max = range.position_rad * per_turn.abs();
         let [lower, upper] = joint.position;
         MotionLimits {
@@ -122,10 +125,13 @@ impl MovableMotor {
         let per_turn = self.motor.per_turn();
         let [kp_nm_rad, kd_nm_s_rad] = self.gains().unwrap_or([0.0; 2]);
         Command {
+            // The inverse of `Motor::read`, so that a motor that is sent its own reading stays
+            // where it is.
             position_rad: (position_rad - self.motor.config().offset_rad) / per_turn,
             velocity_rad_s: velocity_rad_s / per_turn,
             kp_nm_rad,
             kd_nm_s_rad,
+            // There is no dynamic model of the arm, so gravity is left to the stiffness.
             torque_nm: 0.0,
         }
     }
@@ -133,10 +139,12 @@ impl MovableMotor {
     /// The fail-safe command, after which the motor does what `on_loss` specifies without further
     /// commands. `position_rad` is the last commanded position of the joint.
     pub(super) fn shutdown(&self, on_loss: OnLoss, position_rad: f64) -> Result<Frame, CanError> {
+        // Velocity 0, so that a moving joint comes to rest at this position, or is damped.
         let command = self.motor_command(position_rad, 0.0);
         match on_loss {
             OnLoss::Release => self.motion.release(),
             OnLoss::Hold => self.motion.hold(&command),
+            // Without stiffness, the command resists motion and has no position to return to.
             OnLoss::Damp => self.motion.command(&Command {
                 kp_nm_rad: 0.0,
                 ..command
@@ -147,6 +155,7 @@ impl MovableMotor {
     /// Updates the motor's health from a frame. Returns the reading of the joint if the frame
     /// contains one.
     pub(super) fn process_frame(&mut self, frame: &Frame) -> Option<Reading> {
+        // A frame may report health, a reading or both, depending on the family.
         if let Some(health) = self.motion.health(frame) {
             self.health = Some(health);
         }
@@ -156,6 +165,9 @@ impl MovableMotor {
     /// Stiffness and damping at the motor: those of the joint, divided by the square of the gear
     /// ratio.
     fn gains(&self) -> Option<[f64; 2]> {
+        // With `n` motor turns per joint turn, the motor deviates `n` times as far, and its torque
+        // counts `n` times at the joint. Both factors apply, so the same stiffness at the joint
+        // needs `1 / n²` of it at the motor.
         let squared = self.motor.per_turn().powi(2);
         let gains = self.motor.config().gains?;
         Some([
@@ -171,12 +183,13 @@ impl MovableMotor {
             return Ok(());
         };
         let max = self.motor.limits();
-        match kp <= max.kp_nm_rad && kd <= max.kd_nm_s_rad {
-            true => Ok(()),
-            false => Err(query.fault(format!(
+        if kp <= max.kp_nm_rad && kd <= max.kd_nm_s_rad {
+            Ok(())
+        } else {
+            Err(query.fault(format!(
                 "stiffness and damping at the motor are {kp} N m / rad and {kd} N m s / rad, but its protocol supports at most {} and {}",
                 max.kp_nm_rad, max.kd_nm_s_rad
-            ))),
+            )))
         }
     }
 }

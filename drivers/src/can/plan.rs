@@ -7,7 +7,9 @@ use crate::Error;
 use crate::wire::can::canopen::{self, NodeState};
 use std::time::Duration;
 
-/// Minimum watchdog timeout, in cycles.
+/// Minimum watchdog timeout, in cycles. The arm is stopped after 80 % of the timeout. Four cycles
+/// are the smallest number for which this is more than the three cycles for which a motor may
+/// always be silent.
 const MIN_CYCLES: u32 = 4;
 
 /// Makes all checks that are possible before any frame is sent, and returns the watchdog
@@ -16,7 +18,8 @@ const MIN_CYCLES: u32 = 4;
 /// # Errors
 /// If a motor does not support the configuration.
 pub(super) fn watchdog_plan(config: &MovableArmConfig) -> Result<WatchdogPlan, Error> {
-    let (arm, motion_config) = (&config.arm, &config.motion);
+    let arm = &config.arm;
+    let motion_config = &config.motion;
     if motion_config.limits.len() != arm.motors.len() {
         let reason = format!(
             "limits are given for {} joints, but the arm has {}",
@@ -25,6 +28,8 @@ pub(super) fn watchdog_plan(config: &MovableArmConfig) -> Result<WatchdogPlan, E
         );
         return Err(Error::Motion { reason });
     }
+    // The plan comes before the checks of the motors, because whether a motor has a watchdog
+    // depends on the plan.
     let host = unused_node(config)?;
     let plan = WatchdogPlan {
         on_loss: motion_config.on_loss,
@@ -37,6 +42,8 @@ pub(super) fn watchdog_plan(config: &MovableArmConfig) -> Result<WatchdogPlan, E
     for motor in &arm.motors {
         check_motor(&plan, motor, &arm.buses[motor.bus_ix].interface)?;
     }
+    // The period depends on the bus load, so only now is it known how many cycles fit into the
+    // timeout.
     if plan.timeout < MIN_CYCLES * plan.period {
         let reason = format!(
             "arm.motion.timeout_millis must be at least {MIN_CYCLES} cycles of {:.1} ms",
@@ -53,54 +60,67 @@ pub(super) fn check_motor(
     config: &MotorConfig,
     interface: &str,
 ) -> Result<(), Error> {
-    let fault = |reason| {
-        Err(Error::Motor {
-            joint: config.joint.clone(),
-            interface: interface.to_owned(),
-            reason,
-        })
-    };
     let watchdog = config.protocol.watchdog(plan);
+    // Without a watchdog, the arm would continue after a crash of this computer. That must be a
+    // decision of the person who wrote the rig file.
     if let Watchdog::Missing { reason, .. } = watchdog
         && !plan.accept_no_watchdog
     {
-        return fault(format!(
+        let reason = format!(
             "{reason}: it would execute its last command forever if this computer stopped sending; it is moved only with \
              arm.motion.accept_no_watchdog = true"
-        ));
+        );
+        return Err(motor_error(config, interface, reason));
     }
     let can = watchdog.actions();
+    // All motors of an arm must react alike. If one held its joint while the others released
+    // theirs, the arm would swing around it.
     if !can.contains(&plan.on_loss) {
         let can: Vec<_> = can.iter().map(|can| format!("{:?}", can.name())).collect();
         let requested = plan.on_loss.name();
-        return fault(format!(
+        let reason = format!(
             "arm.motion.on_loss is {requested:?}, but this motor can only {}",
             can.join(" or ")
-        ));
-    }
-    if config.gains.is_none() && config.protocol.family().has_gains() {
-        return fault(
-            "to move this motor, set its stiffness_nm_rad and damping_nm_s_rad".to_owned(),
         );
+        return Err(motor_error(config, interface, reason));
+    }
+    // A command in MIT mode without gains would leave the joint limp, and there are no gains that
+    // suit every arm.
+    if config.gains.is_none() && config.protocol.family().has_gains() {
+        let reason = "to move this motor, set its stiffness_nm_rad and damping_nm_s_rad".to_owned();
+        return Err(motor_error(config, interface, reason));
     }
     Ok(())
 }
 
+/// The error of a motor that cannot be moved as planned.
+fn motor_error(config: &MotorConfig, interface: &str, reason: String) -> Error {
+    Error::Motor {
+        joint: config.joint.clone(),
+        interface: interface.to_owned(),
+        reason,
+    }
+}
+
 /// An unused CANopen node number for this computer.
 fn unused_node(config: &MovableArmConfig) -> Result<canopen::Node, Error> {
-    let is_used = |node: canopen::Node| {
-        config
-            .arm
-            .motors
-            .iter()
-            .any(|motor| motor.protocol.canopen_node() == Some(node))
-    };
+    // From the top, because drives are usually numbered from 1. A drive that the rig file does not
+    // list would otherwise be likely to share our number.
     let mut numbers = (1..=127)
         .rev()
         .filter_map(|number| canopen::Node::new(number).ok());
-    let unused = numbers.find(|node| !is_used(*node));
+    let unused = numbers.find(|node| !is_used(config, *node));
     let reason = "no free CANopen node number is left for this computer".to_owned();
     unused.ok_or(Error::Motion { reason })
+}
+
+/// Whether a motor of the arm has this CANopen node number.
+fn is_used(config: &MovableArmConfig, node: canopen::Node) -> bool {
+    config
+        .arm
+        .motors
+        .iter()
+        .any(|motor| motor.protocol.canopen_node() == Some(node))
 }
 
 /// Cycle period that the slowest bus allows. If there are CiA 402 drives, it is rounded up to whole
@@ -118,17 +138,21 @@ fn period(config: &MovableArmConfig, host: canopen::Node) -> Duration {
         if motors.is_empty() {
             continue;
         }
-        let (mut cycle_frames, mut unsolicited) = (Vec::new(), Vec::new());
+        let mut cycle_frames = Vec::new();
+        let mut unsolicited = Vec::new();
         for traffic in motors.iter().map(|motor| motor.protocol.traffic()) {
             cycle_frames.extend(traffic.cycle_frames);
             unsolicited.extend(traffic.unsolicited);
         }
+        // In each cycle, drives also get our heartbeat, which their watchdog monitors, and the
+        // SYNC.
         if motors.iter().any(is_drive) {
             cycle_frames.extend([
                 canopen::encode_sync(),
                 canopen::encode_heartbeat(host, NodeState::Operational),
             ]);
         }
+        // One thread serves all buses with the same cycle, so the slowest bus determines the rate.
         rate_hz = rate_hz.min(max_cycle_rate_hz(
             bus,
             &cycle_frames,
@@ -137,15 +161,12 @@ fn period(config: &MovableArmConfig, host: canopen::Node) -> Duration {
         ));
     }
     let period = Duration::from_secs_f64(1.0 / rate_hz);
-    match config.arm.motors.iter().any(|motor| is_drive(&motor)) {
-        true => Duration::from_millis(
-            period
-                .as_nanos()
-                .div_ceil(1_000_000)
-                .try_into()
-                .unwrap_or(u64::MAX),
-        ),
-        false => period,
+    if config.arm.motors.iter().any(|motor| is_drive(&motor)) {
+        // Rounding up keeps the bus load within its limit.
+        let millis = period.as_nanos().div_ceil(1_000_000);
+        Duration::from_millis(millis.try_into().unwrap_or(u64::MAX))
+    } else {
+        period
     }
 }
 

@@ -7,9 +7,12 @@ use crate::{Error, clock};
 use std::cell::Cell;
 use std::time::Duration;
 
-/// Maximum time for an answer. On a full bus at 1 Mbit/s a frame waits for some milliseconds.
+/// Maximum time for an answer. On a full bus at 1 Mbit/s a frame waits for some milliseconds. A
+/// longer time delays the error about a missing motor.
 const MAX_ANSWER: Duration = Duration::from_millis(50);
-/// Number of requests before the motor counts as silent.
+/// Number of requests before the motor counts as silent. Repeating a request is harmless, because
+/// all requests set or read absolute values. A single lost frame must not fail the set-up of an arm
+/// with many motors.
 const MAX_ATTEMPTS: usize = 4;
 
 /// Request-response access to one motor.
@@ -70,9 +73,10 @@ impl<'a> MotorQuery<'a> {
     /// Sends an encoded frame.
     pub fn send(&self, frame: Result<Frame, CanError>) -> Result<(), Error> {
         let frame = self.map_error(frame)?;
-        match self.bus.send(&frame)? {
-            true => Ok(()),
-            false => Err(self.fault("cannot send: the interface's queue stays full")),
+        if self.bus.send(&frame)? {
+            Ok(())
+        } else {
+            Err(self.fault("cannot send: the interface's queue stays full"))
         }
     }
 
@@ -83,6 +87,7 @@ impl<'a> MotorQuery<'a> {
         timeout_limit: Duration,
         mut matches: impl FnMut(&Frame) -> Option<T>,
     ) -> Result<Option<T>, Error> {
+        // Other nodes keep sending, so frames that do not match must not extend the wait.
         let deadline = clock::now() + timeout_limit;
         loop {
             let remaining = deadline.duration_since(clock::now());
@@ -112,6 +117,8 @@ impl<'a> MotorQuery<'a> {
         mut matches: impl FnMut(&Frame) -> Option<T>,
     ) -> Result<T, Error> {
         for _ in 0..MAX_ATTEMPTS {
+            // A full queue is no error here. If the frame was not sent, no answer arrives, and the
+            // next attempt repeats it.
             self.bus.send(poll_frame)?;
             if let Some(answer) = self.wait(MAX_ANSWER, &mut matches)? {
                 return Ok(answer);

@@ -82,6 +82,8 @@ impl MotorSettings {
     /// The choice of a word from a table of names; `None` if absent.
     pub fn choice<T: Copy>(&self, name: &str, choices: &[(&str, T)]) -> Option<T> {
         match self.values.get(name)? {
+            // The rig file was checked against the allowed words, so the search fails only if the
+            // two tables of a family differ.
             SettingValue::Word(word) => choices
                 .iter()
                 .find(|(known, _)| known == word)

@@ -85,7 +85,8 @@ fn implausible(intrinsics: &Intrinsics) -> Option<String> {
     })
 }
 
-/// Positions beyond this are assumed to be mistakes, meters.
+/// Positions beyond this are assumed to be mistakes, meters. Scenes are far smaller, and f32, in
+/// which models are trained, has a resolution of 1 mm at this distance.
 const MAX_POSITION_M: f64 = 1e4;
 
 /// Images skipped while reading.
@@ -121,7 +122,9 @@ impl SkippedImages {
         images: Vec<DatasetImage>,
         mut notes: Vec<String>,
     ) -> Result<Dataset, Error> {
-        let (n_missing, n_unusable) = (self.missing.len(), self.unusable.len() + self.broken.len());
+        let n_missing = self.missing.len();
+        let n_unusable = self.unusable.len() + self.broken.len();
+        // One example says more about the cause than the counts.
         if images.is_empty() {
             let first_broken = self.broken.iter().chain(&self.unusable).next();
             let first_broken = first_broken.map(|(name, reason)| format!(" ({name}: {reason})"));

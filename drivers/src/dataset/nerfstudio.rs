@@ -20,7 +20,8 @@ use std::path::{Path, PathBuf};
 
 /// File that identifies such a folder.
 pub const FILE_NAME: &str = "transforms.json";
-/// Relative difference of two focal lengths that are meant to be equal.
+/// Relative difference of two focal lengths that are meant to be equal. Rounded angles differ by
+/// far less; angles of another camera or axis differ by more.
 const MAX_FOCAL_DIFFERENCE: f64 = 0.01;
 /// Depth counts are millimeters unless the file specifies another unit.
 const DEFAULT_METERS_PER_COUNT: f64 = 0.001;
@@ -68,198 +69,318 @@ pub fn read(path: &Path) -> Result<Dataset, Error> {
         path: file.clone(),
         source,
     })?;
-    let file_error = |reason: String| Error::DatasetFile {
-        path: file.clone(),
-        reason,
-    };
     if !text.trim_start().starts_with('{') {
         return Err(file_error(
+            &file,
             "not a recording (.mcap), a dataset folder or a transforms.json".to_owned(),
         ));
     }
     let mut document: Document = serde_json::from_str(&json::nan_as_null(&text))
-        .map_err(|error| file_error(error.to_string()))?;
+        .map_err(|error| file_error(&file, error.to_string()))?;
+    // Files list frames in any order. Sorted by name, the numbered images of a video follow each
+    // other, and repeated entries are neighbors.
     document
         .frames
         .sort_by(|a, b| a.file_path.cmp(&b.file_path));
-    let splits = document.splits().map_err(file_error)?;
+    let splits = document
+        .splits()
+        .map_err(|reason| file_error(&file, reason))?;
     let meters_per_count = document
-        .depth_unit_scale_factor
-        .unwrap_or(DEFAULT_METERS_PER_COUNT);
-    if !METERS_PER_COUNT.contains(&meters_per_count) {
-        return Err(file_error(format!(
-            "depth_unit_scale_factor is {meters_per_count:e} meters per count, expected a number from 1e-6 to 1"
-        )));
-    }
-
-    let (mut images, mut skipped, mut notes) =
-        (Vec::new(), SkippedImages::default(), document.notes());
-    let (mut unlisted, mut rounded, mut has_other_size) = (Vec::new(), Vec::new(), false);
+        .meters_per_count()
+        .map_err(|reason| file_error(&file, reason))?;
+    let mut reading = Reading {
+        file: &file,
+        folder: &folder,
+        document: &document,
+        splits: &splits,
+        meters_per_count,
+        images: Vec::new(),
+        skipped: SkippedImages::default(),
+        notes: document.notes(),
+        unlisted: Vec::new(),
+        rounded: Vec::new(),
+        has_other_size: false,
+    };
     for (ix, entry) in document.frames.iter().enumerate() {
-        if ix > 0 && document.frames[ix - 1].file_path == entry.file_path {
-            skipped.unusable.push((
-                entry.file_path.clone(),
+        reading.add(ix, entry)?;
+    }
+    reading.finish()
+}
+
+fn file_error(file: &Path, reason: String) -> Error {
+    Error::DatasetFile {
+        path: file.to_owned(),
+        reason,
+    }
+}
+
+/// The images read so far, and everything that will be noted about the others.
+struct Reading<'a> {
+    file: &'a Path,
+    folder: &'a Path,
+    document: &'a Document,
+    splits: &'a HashMap<String, ListedSplit>,
+    meters_per_count: f64,
+    images: Vec<DatasetImage>,
+    skipped: SkippedImages,
+    notes: Vec<String>,
+    /// Images in no list of a split.
+    unlisted: Vec<String>,
+    /// Images whose poses are rounded.
+    rounded: Vec<String>,
+    /// Whether an image had another size than its lens parameters.
+    has_other_size: bool,
+}
+
+/// The poses of one frame.
+struct FramePoses {
+    world_from_camera: Transform,
+    /// Whether the numbers of the photo's pose are rounded.
+    is_rounded: bool,
+    /// Pose of the depth camera, if it has its own.
+    world_from_depth: Option<Transform>,
+}
+
+impl Reading<'_> {
+    /// Adds the image of a frame, or notes why it is skipped.
+    ///
+    /// # Errors
+    /// If the frame has a malformed matrix or unsupported lens parameters. Such a mistake is
+    /// usually in all frames, and a dataset without them would be empty.
+    fn add(&mut self, ix: usize, entry: &FrameEntry) -> Result<(), Error> {
+        let name = &entry.file_path;
+        if ix > 0 && self.document.frames[ix - 1].file_path == *name {
+            self.skipped.unusable.push((
+                name.clone(),
                 "listed twice, only the first entry is used".to_owned(),
             ));
-            continue;
+            return Ok(());
         }
-        let listed = splits.get(normalized(&entry.file_path).as_str()).copied();
-        if !splits.is_empty() && listed.is_none() {
-            unlisted.push(entry.file_path.clone());
-            continue;
+        let listed = self.splits.get(normalized(name).as_str()).copied();
+        if !self.splits.is_empty() && listed.is_none() {
+            self.unlisted.push(name.clone());
+            return Ok(());
         }
-        let frame_error =
-            |reason: String| file_error(format!("frame {:?}: {reason}", entry.file_path));
-        let rows = rows_of(&entry.transform_matrix).map_err(frame_error)?;
-        let depth_rows = entry
-            .depth_transform_matrix
-            .as_ref()
-            .map(rows_of)
-            .transpose()
-            .map_err(frame_error)?;
-        let Some(image_path) = find_image(&folder, &entry.file_path) else {
-            skipped.missing.push(entry.file_path.clone());
-            continue;
+        let (rows, depth_rows) = entry
+            .matrices()
+            .map_err(|why| self.frame_error(name, &why))?;
+        let Some(image_path) = find_image(self.folder, name) else {
+            self.skipped.missing.push(name.clone());
+            return Ok(());
         };
+        // Only the header is read here. Decoding all images would take long, and each is decoded
+        // when it is needed.
         let size_px = match image_size_px(&image_path) {
             Ok(size_px) => size_px,
             Err(error) => {
-                skipped
-                    .broken
-                    .push((entry.file_path.clone(), reason_of(&error)));
-                continue;
+                self.skipped.broken.push((name.clone(), reason_of(&error)));
+                return Ok(());
             }
         };
-        let poses = world_from_camera(&rows).and_then(|pose| {
-            Ok((
-                pose,
-                depth_rows
-                    .map(|rows| self::world_from_camera(&rows))
-                    .transpose()?,
-            ))
-        });
-        let (world_from_camera, depth_pose) = match poses {
-            Ok(((pose, is_rounded), depth_pose)) => {
-                if is_rounded {
-                    rounded.push(entry.file_path.clone());
-                }
-                (pose, depth_pose.map(|(pose, _)| pose))
-            }
-            Err(reason) => {
-                skipped.broken.push((entry.file_path.clone(), reason));
-                continue;
-            }
+        let Some(poses) = self.poses_of(name, &rows, depth_rows.as_ref()) else {
+            return Ok(());
         };
-        if let Some(excessive_distance_m) = [Some(world_from_camera), depth_pose]
-            .into_iter()
-            .flatten()
-            .find_map(excessive_distance_m)
-        {
-            skipped.broken.push((
-                entry.file_path.clone(),
-                format!("its pose is {excessive_distance_m:e} m away, the maximum is {MAX_POSITION_M:e} m"),
-            ));
-            continue;
+        let camera = entry.camera.or(&self.document.camera);
+        let intrinsics = camera
+            .intrinsics(size_px)
+            .map_err(|why| self.frame_error(name, &why))?;
+        if camera.size_px().is_some_and(|reported| reported != size_px) {
+            self.note_other_size(size_px);
         }
-        let camera = entry.camera.or(&document.camera);
-        let intrinsics = camera.intrinsics(size_px).map_err(frame_error)?;
-        if !has_other_size && camera.size_px().is_some_and(|reported| reported != size_px) {
-            has_other_size = true;
-            notes.push(format!(
-                "images are {}x{}, which differs from transforms.json; lens parameters are scaled",
-                size_px[0], size_px[1]
-            ));
-        }
-        let depth_path = entry
-            .depth_file_path
-            .as_ref()
-            .and_then(|name| find_image(&folder, name));
-        images.push(DatasetImage {
-            name: entry.file_path.clone(),
+        let depth = self.depth_of(entry, &poses);
+        self.images.push(DatasetImage {
+            name: name.clone(),
             intrinsics,
-            world_from_camera,
+            world_from_camera: poses.world_from_camera,
+            // The index in the list, so that the stamps of the others stay the same if an image
+            // is removed from the folder.
             stamp: Stamp(
                 i64::try_from(ix)
                     .unwrap_or(i64::MAX)
                     .saturating_mul(1_000_000),
             ),
             image_path,
-            depth: depth_path.map(|path| DepthFile {
-                path,
-                meters_per_count,
-                world_from_camera: depth_pose.unwrap_or(world_from_camera),
+            depth,
+            // A mask that is named but missing is an error when the image is loaded: training on
+            // the pixels that it should exclude would go unnoticed.
+            mask_path: entry.mask_path.as_ref().map(|name| {
+                find_image(self.folder, name).unwrap_or_else(|| self.folder.join(name))
             }),
-            mask_path: entry
-                .mask_path
-                .as_ref()
-                .map(|name| find_image(&folder, name).unwrap_or_else(|| folder.join(name))),
             listed,
         });
+        Ok(())
     }
-    let names: BTreeSet<String> = document
-        .frames
-        .iter()
-        .map(|entry| normalized(&entry.file_path))
-        .collect();
-    let mut absent: Vec<String> = splits
-        .keys()
-        .filter(|name| !names.contains(*name))
-        .cloned()
-        .collect();
-    absent.sort_unstable();
-    for (names, what) in [
-        (
-            &unlisted,
-            "not used, because train_filenames, val_filenames and test_filenames do not contain them",
-        ),
-        (
-            &absent,
-            "only in train_filenames, val_filenames or test_filenames, but not in frames",
-        ),
-    ] {
-        if !names.is_empty() {
-            let (images, verb) = plural(names.len(), "image");
-            notes.push(format!("{images} {verb} {what}: {}", first_names(names)));
+
+    fn frame_error(&self, name: &str, reason: &str) -> Error {
+        file_error(self.file, format!("frame {name:?}: {reason}"))
+    }
+
+    /// The poses of an image, or `None` after noting why the image is skipped.
+    fn poses_of(
+        &mut self,
+        name: &str,
+        rows: &[f64; 16],
+        depth_rows: Option<&[f64; 16]>,
+    ) -> Option<FramePoses> {
+        let poses = match FramePoses::new(rows, depth_rows) {
+            Ok(poses) => poses,
+            Err(reason) => {
+                self.skipped.broken.push((name.to_owned(), reason));
+                return None;
+            }
+        };
+        if poses.is_rounded {
+            self.rounded.push(name.to_owned());
+        }
+        if let Some(excessive_distance_m) = poses.excessive_distance_m() {
+            self.skipped.broken.push((
+                name.to_owned(),
+                format!("its pose is {excessive_distance_m:e} m away, the maximum is {MAX_POSITION_M:e} m"),
+            ));
+            return None;
+        }
+        Some(poses)
+    }
+
+    /// Notes that images have another size than the file says. Once, because the images of a
+    /// downscaled dataset have one size.
+    fn note_other_size(&mut self, [width, height]: [u32; 2]) {
+        if !std::mem::replace(&mut self.has_other_size, true) {
+            self.notes.push(format!(
+                "images are {width}x{height}, which differs from transforms.json; lens parameters are scaled"
+            ));
         }
     }
-    if !rounded.is_empty() {
-        let (images, _) = plural(rounded.len(), "image");
-        notes.push(format!(
-            "the rotations of {images} are rounded to about three decimals, so the poses may be off by 0.1 degrees; write at \
-             least four decimals: {}",
-            first_names(&rounded)
-        ));
+
+    /// The depth image of a frame, if its file exists.
+    fn depth_of(&self, entry: &FrameEntry, poses: &FramePoses) -> Option<DepthFile> {
+        let name = entry.depth_file_path.as_ref()?;
+        Some(DepthFile {
+            path: find_image(self.folder, name)?,
+            meters_per_count: self.meters_per_count,
+            world_from_camera: poses.world_from_depth.unwrap_or(poses.world_from_camera),
+        })
     }
-    if images.is_empty() && !unlisted.is_empty() {
-        return Err(file_error(format!(
-            "train_filenames, val_filenames and test_filenames contain no image of frames: they name {}, frames {}",
-            first_names(&absent),
-            first_names(&unlisted)
-        )));
+
+    /// Adds notes about everything that was left out, and builds the dataset.
+    ///
+    /// # Errors
+    /// If it has no images.
+    fn finish(mut self) -> Result<Dataset, Error> {
+        let absent = self.absent();
+        self.note_splits(&absent);
+        if !self.rounded.is_empty() {
+            let (images, _) = plural(self.rounded.len(), "image");
+            self.notes.push(format!(
+                "the rotations of {images} are rounded to about three decimals, so the poses may be off by 0.1 degrees; write at \
+                 least four decimals: {}",
+                first_names(&self.rounded)
+            ));
+        }
+        // This error comes before that of an empty dataset, because it names the cause.
+        if self.images.is_empty() && !self.unlisted.is_empty() {
+            return Err(file_error(
+                self.file,
+                format!(
+                    "train_filenames, val_filenames and test_filenames contain no image of frames: they name {}, frames {}",
+                    first_names(&absent),
+                    first_names(&self.unlisted)
+                ),
+            ));
+        }
+        self.note_missing_depth();
+        // The points are in the frame of the poses: nerfstudio applies `applied_transform` to both
+        // when it writes them.
+        let folder = self.folder;
+        let points_path = self
+            .document
+            .ply_file_path
+            .as_ref()
+            .map(|name| find_file(folder, name).unwrap_or_else(|| folder.join(name)));
+        Ok(Dataset {
+            points_path,
+            ..self.skipped.dataset(folder, self.images, self.notes)?
+        })
     }
-    let lacking = document
-        .frames
-        .iter()
-        .filter(|entry| entry.lacks_depth(&folder));
-    let missing_depth: Vec<String> = lacking
-        .filter_map(|entry| entry.depth_file_path.clone())
-        .collect();
-    if !missing_depth.is_empty() {
-        let (images, verb) = plural(missing_depth.len(), "depth image");
-        notes.push(format!(
-            "{images} {verb} missing: {}",
-            first_names(&missing_depth)
-        ));
+
+    /// Names in the lists of splits that are not names of frames.
+    fn absent(&self) -> Vec<String> {
+        let names: BTreeSet<String> = self
+            .document
+            .frames
+            .iter()
+            .map(|entry| normalized(&entry.file_path))
+            .collect();
+        let mut absent: Vec<String> = self
+            .splits
+            .keys()
+            .filter(|name| !names.contains(*name))
+            .cloned()
+            .collect();
+        // The order of a hash map differs between runs.
+        absent.sort_unstable();
+        absent
     }
-    // The points are in the frame of the poses: nerfstudio applies `applied_transform` to both when
-    // it writes them.
-    let points_path = document
-        .ply_file_path
-        .map(|name| find_file(&folder, &name).unwrap_or_else(|| folder.join(name)));
-    Ok(Dataset {
-        points_path,
-        ..skipped.dataset(&folder, images, notes)?
-    })
+
+    /// Notes the differences between the frames and the lists of splits.
+    fn note_splits(&mut self, absent: &[String]) {
+        for (names, what) in [
+            (
+                &self.unlisted[..],
+                "not used, because train_filenames, val_filenames and test_filenames do not contain them",
+            ),
+            (
+                absent,
+                "only in train_filenames, val_filenames or test_filenames, but not in frames",
+            ),
+        ] {
+            if !names.is_empty() {
+                let (images, verb) = plural(names.len(), "image");
+                self.notes
+                    .push(format!("{images} {verb} {what}: {}", first_names(names)));
+            }
+        }
+    }
+
+    /// Notes the depth images that are named but missing, although the photo exists.
+    fn note_missing_depth(&mut self) {
+        let lacking = self
+            .document
+            .frames
+            .iter()
+            .filter(|entry| entry.lacks_depth(self.folder));
+        let missing_depth: Vec<String> = lacking
+            .filter_map(|entry| entry.depth_file_path.clone())
+            .collect();
+        if !missing_depth.is_empty() {
+            let (images, verb) = plural(missing_depth.len(), "depth image");
+            self.notes.push(format!(
+                "{images} {verb} missing: {}",
+                first_names(&missing_depth)
+            ));
+        }
+    }
+}
+
+impl FramePoses {
+    /// Converts the poses of a frame. The error is the reason why one of them is invalid.
+    fn new(rows: &[f64; 16], depth_rows: Option<&[f64; 16]>) -> Result<Self, String> {
+        let (world_from_camera, is_rounded) = world_from_camera(rows)?;
+        let depth = depth_rows.map(self::world_from_camera).transpose()?;
+        Ok(Self {
+            world_from_camera,
+            is_rounded,
+            world_from_depth: depth.map(|(pose, _)| pose),
+        })
+    }
+
+    /// Largest absolute coordinate of a pose, if it exceeds the maximum.
+    fn excessive_distance_m(&self) -> Option<f64> {
+        [Some(self.world_from_camera), self.world_from_depth]
+            .into_iter()
+            .flatten()
+            .find_map(excessive_distance_m)
+    }
 }
 
 /// The whole file.
@@ -304,6 +425,7 @@ impl Document {
                 }
             }
         }
+        // Some files list only the images that are held out; the rest is meant for training.
         if self.train_filenames.is_empty() && !splits.is_empty() {
             for entry in &self.frames {
                 splits
@@ -317,20 +439,27 @@ impl Document {
             .collect())
     }
 
+    /// The unit of depth images, meters.
+    fn meters_per_count(&self) -> Result<f64, String> {
+        let meters_per_count = self
+            .depth_unit_scale_factor
+            .unwrap_or(DEFAULT_METERS_PER_COUNT);
+        if METERS_PER_COUNT.contains(&meters_per_count) {
+            return Ok(meters_per_count);
+        }
+        Err(format!(
+            "depth_unit_scale_factor is {meters_per_count:e} meters per count, expected a number from 1e-6 to 1"
+        ))
+    }
+
     /// Notes about keys that are not used.
     fn notes(&self) -> Vec<String> {
         let mut notes = Vec::new();
-        let unknown = |keys: &BTreeMap<String, Value>| -> Vec<String> {
-            keys.keys()
-                .filter(|key| !UNUSED.contains(&key.as_str()))
-                .map(|key| format!("{key:?}"))
-                .collect()
-        };
-        let of_file = unknown(&self.other);
+        let of_file = unknown_keys(&self.other);
         let of_frames: BTreeSet<String> = self
             .frames
             .iter()
-            .flat_map(|entry| unknown(&entry.other))
+            .flat_map(|entry| unknown_keys(&entry.other))
             .collect();
         for (keys, place) in [
             (of_file, ""),
@@ -345,6 +474,14 @@ impl Document {
         }
         notes
     }
+}
+
+/// The keys that this reader does not know, quoted.
+fn unknown_keys(keys: &BTreeMap<String, Value>) -> Vec<String> {
+    keys.keys()
+        .filter(|key| !UNUSED.contains(&key.as_str()))
+        .map(|key| format!("{key:?}"))
+        .collect()
 }
 
 /// A path in the form in which paths are compared: with slashes, and without `./` at its start.
@@ -419,6 +556,13 @@ fn deserialize_finite<'de, D: Deserializer<'de>>(from: D) -> Result<Option<f64>,
 }
 
 impl FrameEntry {
+    /// The matrices of the photo and, if it has its own, of the depth camera.
+    fn matrices(&self) -> Result<([f64; 16], Option<[f64; 16]>), String> {
+        let rows = rows_of(&self.transform_matrix)?;
+        let depth_rows = self.depth_transform_matrix.as_ref().map(rows_of);
+        Ok((rows, depth_rows.transpose()?))
+    }
+
     fn lacks_depth(&self, folder: &Path) -> bool {
         let exists = |name: &String| find_image(folder, name).is_some();
         exists(&self.file_path)
@@ -435,6 +579,7 @@ fn rows_of(matrix: &Matrix) -> Result<[f64; 16], String> {
         .flatten()
         .map(|value| value.unwrap_or(f64::NAN))
         .collect();
+    // Some programs leave out the constant last row.
     if rows.len() == 12 {
         rows.extend([0.0, 0.0, 0.0, 1.0]);
     }
@@ -469,13 +614,11 @@ pub fn opengl_from_camera() -> Transform {
 impl CameraEntry {
     /// Returns these parameters, and the common ones where they are not set.
     fn or(&self, common: &Self) -> Self {
-        let model = || {
-            self.camera_model
-                .clone()
-                .or_else(|| common.camera_model.clone())
-        };
         Self {
-            camera_model: model(),
+            camera_model: self
+                .camera_model
+                .clone()
+                .or_else(|| common.camera_model.clone()),
             w: self.w.or(common.w),
             h: self.h.or(common.h),
             fl_x: self.fl_x.or(common.fl_x),
@@ -508,32 +651,9 @@ impl CameraEntry {
 
     /// Lens parameters for images of the given size.
     fn intrinsics(&self, image_px: [u32; 2]) -> Result<Intrinsics, String> {
+        // Without a size, the parameters are those of the images as they are.
         let size_px = self.size_px().unwrap_or(image_px);
         let [width, height] = size_px.map(f64::from);
-        let focal_px = |given: (&str, Option<f64>), angle: (&str, Option<f64>), side_px: f64| {
-            if let (name, Some(angle_rad)) = angle
-                && !(angle_rad > 0.0 && angle_rad < std::f64::consts::PI)
-            {
-                return Err(format!(
-                    "{name} is {angle_rad}, expected radians from 0 to pi; is it in degrees?"
-                ));
-            }
-            let from_angle = angle
-                .1
-                .map(|angle_rad| 0.5 * side_px / (0.5 * angle_rad).tan());
-            match (given.1, from_angle) {
-                // Angles are usually written with fewer digits.
-                (Some(focal_px), Some(from_angle))
-                    if (from_angle / focal_px - 1.0).abs() > MAX_FOCAL_DIFFERENCE =>
-                {
-                    Err(format!(
-                        "{} is {focal_px}, but {} means {from_angle:.1} for {side_px} pixels; remove the wrong one",
-                        given.0, angle.0
-                    ))
-                }
-                (focal_px, from_angle) => Ok(focal_px.or(from_angle)),
-            }
-        };
         let focal_x = focal_px(
             ("fl_x", self.fl_x),
             ("camera_angle_x", self.camera_angle_x),
@@ -559,6 +679,8 @@ impl CameraEntry {
         if let Some(reason) = implausible(&reported) {
             return Err(reason);
         }
+        // The parameters refer to the size in the file. Images may be downscaled copies, as in the
+        // folders `images_2` and `images_4` of nerfstudio.
         Ok(reported.resized(image_px))
     }
 
@@ -578,18 +700,53 @@ impl CameraEntry {
             None if fisheye => Ok(Lens::KannalaBrandt([k1, k2, k3, k4])),
             None | Some("OPENCV" | "PINHOLE" | "SIMPLE_PINHOLE" | "SIMPLE_RADIAL" | "RADIAL") => {
                 let coefficients = [k1, k2, p1, p2, k3];
-                match (k4 == 0.0, coefficients == [0.0; 5]) {
-                    (false, _) => Err(format!(
+                if k4 != 0.0 {
+                    return Err(format!(
                         "k4 is {k4}, but a fourth radial coefficient is only supported for OPENCV_FISHEYE"
-                    )),
-                    (true, true) => Ok(Lens::Pinhole),
-                    (true, false) => Ok(Lens::BrownConrady(coefficients)),
+                    ));
+                }
+                // Without distortion, images need not be resampled.
+                if coefficients == [0.0; 5] {
+                    Ok(Lens::Pinhole)
+                } else {
+                    Ok(Lens::BrownConrady(coefficients))
                 }
             }
             Some(other) => Err(format!(
                 "camera_model is {other:?}, expected OPENCV, PINHOLE, SIMPLE_PINHOLE, SIMPLE_RADIAL, RADIAL or OPENCV_FISHEYE"
             )),
         }
+    }
+}
+
+/// The focal length along one axis, pixels, from a focal length, a field of view, or both; `None`
+/// without either. Each has the name of its key.
+fn focal_px(
+    given: (&str, Option<f64>),
+    angle: (&str, Option<f64>),
+    side_px: f64,
+) -> Result<Option<f64>, String> {
+    if let (name, Some(angle_rad)) = angle
+        && !(angle_rad > 0.0 && angle_rad < std::f64::consts::PI)
+    {
+        return Err(format!(
+            "{name} is {angle_rad}, expected radians from 0 to pi; is it in degrees?"
+        ));
+    }
+    let from_angle = angle
+        .1
+        .map(|angle_rad| 0.5 * side_px / (0.5 * angle_rad).tan());
+    match (given.1, from_angle) {
+        // Angles are usually written with fewer digits.
+        (Some(focal_px), Some(from_angle))
+            if (from_angle / focal_px - 1.0).abs() > MAX_FOCAL_DIFFERENCE =>
+        {
+            Err(format!(
+                "{} is {focal_px}, but {} means {from_angle:.1} for {side_px} pixels; remove the wrong one",
+                given.0, angle.0
+            ))
+        }
+        (focal_px, from_angle) => Ok(focal_px.or(from_angle)),
     }
 }
 
@@ -608,6 +765,7 @@ fn find_image(folder: &Path, name: &str) -> Option<PathBuf> {
     }
     for name in [name, &name.replace('\\', "/")] {
         for extension in EXTENSIONS {
+            // Synthetic datasets such as NeRF's Blender scenes leave out the extension.
             for extension in [extension.to_owned(), extension.to_uppercase()] {
                 let path = folder.join(format!("{name}.{extension}"));
                 if path.is_file() {

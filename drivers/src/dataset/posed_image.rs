@@ -82,6 +82,8 @@ impl DatasetImage {
         let mut rgba = into_rgba(decode_file(&self.image_path, Budget::COLOR_IMAGE)?);
         self.require_size(&self.image_path, [rgba.width(), rgba.height()])?;
         for pixel in rgba.pixels_mut() {
+            // Half transparent pixels are used: only fully transparent ones were cut out on
+            // purpose.
             pixel.0[3] = if pixel.0[3] == 0 { 0 } else { 255 };
         }
         let mut mask_warning = None;
@@ -98,6 +100,8 @@ impl DatasetImage {
                 pixel.0[3] = if mask_pixel.0[0] == 0 { 0 } else { pixel.0[3] };
             }
         }
+        // Depth helps training but is not necessary, so a broken depth image does not cost the
+        // photo.
         let (depth, depth_error) = match self.depth.as_ref().map(|file| self.load_depth(file)) {
             Some(Err(error)) => (None, Some(error.to_string())),
             Some(Ok(depth)) => (Some(depth), None),
@@ -112,6 +116,7 @@ impl DatasetImage {
     }
 
     fn load_depth(&self, file: &DepthFile) -> Result<DepthImage, Error> {
+        // 8-bit depth would be a picture for people, with unknown scaling.
         let DynamicImage::ImageLuma16(counts) = decode_file(&file.path, Budget::DEPTH_IMAGE)?
         else {
             return Err(Error::NotDepth {
@@ -169,6 +174,7 @@ fn is_in_alpha(mask: &DynamicImage) -> bool {
         return false;
     }
     let mask = mask.to_luma_alpha8();
+    // Such a mask was drawn as transparency. As a gray image, it would exclude everything.
     let alpha = mask.pixels().next().map(|pixel| pixel.0[1]);
     mask.pixels().all(|pixel| pixel.0[0] == 0)
         && mask.pixels().any(|pixel| Some(pixel.0[1]) != alpha)
@@ -187,6 +193,7 @@ fn decode_file(path: &Path, budget: Budget) -> Result<DynamicImage, Error> {
         path: path.to_owned(),
         source,
     })?;
+    // The header is checked before decoding, because a small file may declare a huge image.
     let reader = ImageReader::new(Cursor::new(&bytes)).with_guessed_format();
     let size = reader
         .map_err(image::ImageError::from)
@@ -215,6 +222,7 @@ fn open_image(path: &Path) -> Result<ImageReader<std::io::BufReader<std::fs::Fil
 }
 
 fn decode_error(path: &Path, source: image::ImageError) -> Error {
+    // The decoder only reports an unknown format. Phones save HEIC, so its name helps.
     if let Some(format) = unsupported_format(path) {
         return Error::ImageFormat {
             path: path.to_owned(),

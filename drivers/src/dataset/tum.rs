@@ -21,14 +21,17 @@ const POSE_LIST: &str = "groundtruth.txt";
 /// Optional file with the lens parameters: `fx fy cx cy`, then optionally `k1 k2 p1 p2 k3`, with
 /// pixel centers at integers as in OpenCV.
 const CAMERA_FILE: &str = "calibration.txt";
-/// Maximum time between an image and its depth image or pose.
+/// Maximum time between an image and its depth image or pose. The `associate.py` of the benchmark
+/// has the same default. At 30 Hz, it is a little more than half of the interval between images, so
+/// that every image finds the closest one of the other kind.
 const MAX_GAP_NANOS: i64 = 20_000_000;
 /// Upper limit of the time between two poses that are interpolated, whatever their median interval.
 const MAX_POSE_INTERVAL_NANOS: i64 = 110_000_000;
 /// Poses are not interpolated over a gap of more than this number of usual intervals.
 const MAX_USUAL_INTERVALS: f64 = 1.5;
+/// The depth images of the benchmark have 5000 counts per meter.
 const METERS_PER_COUNT: f64 = 1.0 / 5000.0;
-/// Size of the images of the cameras of the benchmark.
+/// Image size of the benchmark's cameras.
 const BENCHMARK_PX: [u32; 2] = [640, 480];
 
 /// Lens parameters of the cameras of the benchmark, by a part of the folder name: `fx fy cx cy`,
@@ -62,81 +65,107 @@ const CAMERAS: [(&str, [f64; 9]); 3] = [
 /// and counted. Lens parameters come from `calibration.txt`, else from the folder name. The details
 /// are in docs/reference/datasets.md.
 pub fn read(folder: &Path) -> Result<Dataset, Error> {
-    let (camera, mut lens_px) = camera_of(folder)?;
+    let (camera, lens_px) = camera_of(folder)?;
     let mut skipped = SkippedImages::default();
     let colors = stamped_names(folder, COLOR_LIST, &mut skipped)?;
-    let mut depths = match exists(&folder.join(DEPTH_LIST)) {
-        true => Some(stamped_names(folder, DEPTH_LIST, &mut skipped)?),
-        false => None,
+    let mut depths = if exists(&folder.join(DEPTH_LIST)) {
+        Some(stamped_names(folder, DEPTH_LIST, &mut skipped)?)
+    } else {
+        None
     };
     let repeated_depth = depths.as_mut().map(remove_repeated).unwrap_or_default();
     let poses = Poses::read(folder, &mut skipped)?;
-    let (mut images, mut missing_depth): (Vec<DatasetImage>, Vec<String>) =
-        (Vec::new(), Vec::new());
-    let (mut n_without_depth, mut depth_without_pose) = (0, Vec::new());
+    let mut reading = Reading {
+        folder,
+        camera,
+        lens_px,
+        depths,
+        poses,
+        images: Vec::new(),
+        skipped,
+        n_without_depth: 0,
+        missing_depth: Vec::new(),
+        depth_without_pose: Vec::new(),
+    };
     for (stamp, name) in colors {
-        if images.last().is_some_and(|last| last.stamp == stamp) {
-            skipped
+        reading.add(stamp, name)?;
+    }
+    reading.finish(&repeated_depth)
+}
+
+/// The photos read so far, and everything that will be noted about the others.
+struct Reading<'a> {
+    folder: &'a Path,
+    camera: Intrinsics,
+    /// Image size of the lens parameters; `None` until the first photo if it is unknown.
+    lens_px: Option<[u32; 2]>,
+    /// Depth images by time; `None` if there is no list of them.
+    depths: Option<Vec<(Stamp, String)>>,
+    poses: Poses,
+    images: Vec<DatasetImage>,
+    skipped: SkippedImages,
+    /// Number of photos without a depth image that is close in time.
+    n_without_depth: usize,
+    missing_depth: Vec<String>,
+    depth_without_pose: Vec<String>,
+}
+
+impl Reading<'_> {
+    /// Adds a photo, or notes why it is skipped.
+    ///
+    /// # Errors
+    /// If the lens parameters are implausible for the first photo.
+    fn add(&mut self, stamp: Stamp, name: String) -> Result<(), Error> {
+        // Lists are sorted by time. Keyframes are identified by camera and stamp, which must be
+        // different for each.
+        if self.images.last().is_some_and(|last| last.stamp == stamp) {
+            self.skipped
                 .unusable
                 .push((name, "another photo has the same time".to_owned()));
-            continue;
+            return Ok(());
         }
-        let Some(image_path) = find_file(folder, &name) else {
-            skipped.missing.push(name);
-            continue;
+        let Some(image_path) = find_file(self.folder, &name) else {
+            self.skipped.missing.push(name);
+            return Ok(());
         };
-        let world_from_camera = match poses.at(stamp) {
+        let world_from_camera = match self.poses.at(stamp) {
             Ok(pose) => pose,
             Err(reason) => {
-                skipped.unusable.push((name, reason));
-                continue;
+                self.skipped.unusable.push((name, reason));
+                return Ok(());
             }
         };
         let Ok(size_px) = image_size_px(&image_path) else {
-            skipped.broken.push((name, "not an image".to_owned()));
-            continue;
+            self.skipped.broken.push((name, "not an image".to_owned()));
+            return Ok(());
         };
         let intrinsics = Intrinsics {
             size_px,
-            ..camera.clone()
+            ..self.camera.clone()
         };
-        if images.is_empty()
+        // All photos have the same lens parameters, so the first one decides.
+        if self.images.is_empty()
             && let Some(reason) = implausible(&intrinsics)
         {
             return Err(Error::DatasetFile {
-                path: folder.to_owned(),
+                path: self.folder.to_owned(),
                 reason,
             });
         }
-        // Without another statement, the lens parameters are those of the first photo.
-        let expected_px = *lens_px.get_or_insert(size_px);
+        // If their size is unknown, the lens parameters are assumed to be for photos of the size of
+        // the first one.
+        let expected_px = *self.lens_px.get_or_insert(size_px);
         if size_px != expected_px {
-            let [[width, height], [lens_width, lens_height]] = [size_px, expected_px];
+            let [width, height] = size_px;
+            let [lens_width, lens_height] = expected_px;
             let reason = format!(
                 "it has {width}x{height} pixels, but the lens parameters are for {lens_width}x{lens_height}"
             );
-            skipped.broken.push((name, reason));
-            continue;
+            self.skipped.broken.push((name, reason));
+            return Ok(());
         }
-        let mut depth = None;
-        match depths.as_ref().map(|depths| nearest(depths, stamp)) {
-            None => {}
-            Some(None) => n_without_depth += 1,
-            Some(Some((depth_stamp, depth_name))) => {
-                match (poses.at(*depth_stamp), find_file(folder, depth_name)) {
-                    (Err(reason), _) => depth_without_pose.push(format!("{depth_name} ({reason})")),
-                    (Ok(_), None) => missing_depth.push(depth_name.clone()),
-                    (Ok(world_from_camera), Some(path)) => {
-                        depth = Some(DepthFile {
-                            path,
-                            meters_per_count: METERS_PER_COUNT,
-                            world_from_camera,
-                        });
-                    }
-                }
-            }
-        }
-        images.push(DatasetImage {
+        let depth = self.depth_at(stamp);
+        self.images.push(DatasetImage {
             name,
             intrinsics,
             world_from_camera,
@@ -146,32 +175,70 @@ pub fn read(folder: &Path) -> Result<Dataset, Error> {
             mask_path: None,
             listed: None,
         });
+        Ok(())
     }
-    let mut notes = match n_without_depth {
-        0 => Vec::new(),
-        1 => vec!["1 photo has no depth image within 20 ms".to_owned()],
-        n => vec![format!("{n} photos have no depth image within 20 ms")],
-    };
-    for (names, what) in [
-        (&missing_depth, "missing"),
-        (
-            &depth_without_pose,
-            "not used, because no pose belongs to the time",
-        ),
-        (
-            &repeated_depth,
-            "not used, because an earlier line has the same time; write times with more decimals",
-        ),
-    ] {
-        if !names.is_empty() {
-            let (images, verb) = plural(names.len(), "depth image");
-            notes.push(format!("{images} {verb} {what}: {}", first_names(names)));
+
+    /// The depth image that is closest in time. It has its own pose: color and depth are not taken
+    /// at the same time, and the camera moves in between.
+    fn depth_at(&mut self, stamp: Stamp) -> Option<DepthFile> {
+        let depths = self.depths.as_ref()?;
+        let Some((depth_stamp, depth_name)) = nearest(depths, stamp) else {
+            self.n_without_depth += 1;
+            return None;
+        };
+        match (
+            self.poses.at(*depth_stamp),
+            find_file(self.folder, depth_name),
+        ) {
+            (Err(reason), _) => {
+                self.depth_without_pose
+                    .push(format!("{depth_name} ({reason})"));
+                None
+            }
+            (Ok(_), None) => {
+                self.missing_depth.push(depth_name.clone());
+                None
+            }
+            (Ok(world_from_camera), Some(path)) => Some(DepthFile {
+                path,
+                meters_per_count: METERS_PER_COUNT,
+                world_from_camera,
+            }),
         }
     }
-    skipped.dataset(folder, images, notes)
+
+    /// Adds notes about depth images that are not used, and builds the dataset.
+    ///
+    /// # Errors
+    /// If it has no photos.
+    fn finish(self, repeated_depth: &[String]) -> Result<Dataset, Error> {
+        let mut notes = match self.n_without_depth {
+            0 => Vec::new(),
+            1 => vec!["1 photo has no depth image within 20 ms".to_owned()],
+            n => vec![format!("{n} photos have no depth image within 20 ms")],
+        };
+        for (names, what) in [
+            (&self.missing_depth[..], "missing"),
+            (
+                &self.depth_without_pose[..],
+                "not used, because no pose belongs to the time",
+            ),
+            (
+                repeated_depth,
+                "not used, because an earlier line has the same time; write times with more decimals",
+            ),
+        ] {
+            if !names.is_empty() {
+                let (images, verb) = plural(names.len(), "depth image");
+                notes.push(format!("{images} {verb} {what}: {}", first_names(names)));
+            }
+        }
+        self.skipped.dataset(self.folder, self.images, notes)
+    }
 }
 
-/// Whether there is something with this name, also a broken link. Only then may errors be ignored.
+/// Whether anything has this name, including a broken link. An optional file is skipped only if
+/// nothing has its name; otherwise, errors in reading it are reported.
 fn exists(path: &Path) -> bool {
     !matches!(path.symlink_metadata(), Err(error) if error.kind() == ErrorKind::NotFound)
 }
@@ -184,8 +251,8 @@ fn find_file(folder: &Path, name: &str) -> Option<PathBuf> {
         .find(|path| path.is_file())
 }
 
-/// Removes entries with the time of an earlier one. Returns their names, except where they are
-/// equal.
+/// Removes entries that have the same time as an earlier one. Returns their names, unless both
+/// names are equal.
 fn remove_repeated(entries: &mut Vec<(Stamp, String)>) -> Vec<String> {
     let mut repeated = Vec::new();
     entries.dedup_by(|later, first| {
@@ -197,8 +264,8 @@ fn remove_repeated(entries: &mut Vec<(Stamp, String)>) -> Vec<String> {
     repeated
 }
 
-/// Lens parameters of a folder, and the size of the images to which they refer if it is known. The
-/// caller sets the size to that of each photo.
+/// Lens parameters of a folder, and the image size for which they are valid, if it is known. The
+/// caller sets the size in the lens parameters to that of each photo.
 fn camera_of(folder: &Path) -> Result<(Intrinsics, Option<[u32; 2]>), Error> {
     let path = folder.join(CAMERA_FILE);
     let (numbers, lens_px) = if exists(&path) {
@@ -223,10 +290,10 @@ fn camera_of(folder: &Path) -> Result<(Intrinsics, Option<[u32; 2]>), Error> {
         Lens::BrownConrady([k1, k2, p1, p2, k3])
     };
     // Pixel centers are at integers in these files and at half-integers in ours.
-    let (focal_px, principal_px) = ([fx, fy], [cx + 0.5, cy + 0.5]);
+    let principal_px = [cx + 0.5, cy + 0.5];
     let intrinsics = Intrinsics {
         size_px: BENCHMARK_PX,
-        focal_px,
+        focal_px: [fx, fy],
         principal_px,
         lens,
         rectified: false,
@@ -327,6 +394,8 @@ fn stamped_lines(
             }),
         }
     }
+    // A list without any valid line is of another format, which is worth an error; a few bad lines
+    // are not.
     if let (true, Some(first)) = (lines.is_empty(), invalid.first()) {
         return Err(Error::DatasetFile {
             path,
@@ -334,6 +403,8 @@ fn stamped_lines(
         });
     }
     skipped.lines(list, &invalid);
+    // Lists that were merged or edited may be out of order, and stamps are searched by bisection.
+    // The sort is stable, so that of two lines with one time, the first one counts.
     lines.sort_by_key(|line| line.stamp);
     Ok(lines)
 }
@@ -369,12 +440,16 @@ fn stamp_of(word: &str) -> Option<Stamp> {
     let n_digits = i64::try_from(integer.len()).ok()?
         + exponent.parse::<i32>().map(i64::from).ok()?
         + NANOS_EXPONENT;
+    // Leading zeros do not count, so that long numbers such as `000000000001.5` fit, too.
     let zeros = digits.bytes().take_while(|digit| *digit == b'0').count();
     let n_significant = n_digits - i64::try_from(zeros).ok()?;
     if zeros == digits.len() || n_significant <= 0 {
         return Some(Stamp(0));
     }
+    // An i64 has at most 19 digits. The limit also keeps a huge exponent from producing as many
+    // digits.
     let n_significant = usize::try_from(n_significant).ok().filter(|n| *n < 20)?;
+    // Digits after the last nanosecond are cut off, and missing ones are zeros.
     let padded = digits
         .bytes()
         .skip(zeros)
@@ -388,6 +463,7 @@ fn stamp_of(word: &str) -> Option<Stamp> {
 fn nearest<T>(entries: &[(Stamp, T)], stamp: Stamp) -> Option<&(Stamp, T)> {
     let gap = |entry: &(Stamp, T)| entry.0.nanos_since(stamp).saturating_abs();
     let after = entries.partition_point(|entry| entry.0 < stamp);
+    // The closest entry is the last one before the stamp or the first one after it.
     let candidates = &entries[after.saturating_sub(1)..entries.len().min(after + 1)];
     candidates
         .iter()
@@ -405,7 +481,8 @@ struct Poses {
 impl Poses {
     fn read(folder: &Path, skipped: &mut SkippedImages) -> Result<Self, Error> {
         let mut poses: Vec<(Stamp, Transform)> = Vec::new();
-        let (mut invalid, mut repeated) = (Vec::new(), Vec::new());
+        let mut invalid = Vec::new();
+        let mut repeated = Vec::new();
         for Line {
             number,
             stamp,
@@ -448,14 +525,14 @@ impl Poses {
     fn at(&self, stamp: Stamp) -> Result<Transform, String> {
         let after_ix = self.poses.partition_point(|(other, _)| *other < stamp);
         let after = self.poses.get(after_ix);
+        // A pose with exactly this time is used bit for bit, even if its neighbors are far away.
         if let Some((after_stamp, pose)) = after
             && *after_stamp == stamp
         {
             return Ok(*pose);
         }
-        let (Some(after), Some(before)) =
-            (after, after_ix.checked_sub(1).map(|ix| &self.poses[ix]))
-        else {
+        let before = after_ix.checked_sub(1).map(|ix| &self.poses[ix]);
+        let (Some(after), Some(before)) = (after, before) else {
             return Err("its time is before the first or after the last pose".to_owned());
         };
         let interval_nanos = after.0.nanos_since(before.0);
@@ -485,6 +562,8 @@ fn max_interval_nanos(poses: &[(Stamp, Transform)]) -> i64 {
         .unwrap_or_default();
     #[expect(clippy::cast_possible_truncation, reason = "the cast saturates")]
     let max = (MAX_USUAL_INTERVALS * usual as f64) as i64;
+    // At the lower bound, no pose is further than the maximum gap from the closest reading. The
+    // upper bound keeps a sparse trajectory from inventing motion.
     max.clamp(2 * MAX_GAP_NANOS, MAX_POSE_INTERVAL_NANOS)
 }
 
@@ -493,6 +572,8 @@ fn pose_of(columns: &str) -> Result<Transform, &'static str> {
     let Some([x, y, z, qx, qy, qz, qw]) = numbers.as_deref() else {
         return Err("expected seven numbers tx ty tz qx qy qz qw after the time");
     };
+    // Files round quaternions to four decimals, which changes the length by less than 0.001. A
+    // length that differs by more than 0.01 belongs to other columns.
     let rotation = Quaternion::new(*qw, *qx, *qy, *qz);
     // The comparisons are written so that NaN fails them.
     let is_near = [x, y, z].iter().all(|along| along.abs() <= MAX_POSITION_M);

@@ -4,7 +4,7 @@
 pub(crate) mod fuzz;
 
 use super::motion_loop::{MotionLoop, StampedState};
-use super::session::{Session, error_text};
+use super::session::{Session, error_text, fault};
 use super::state::{MAX_STATE_BYTES, NumberedState, decode, pose};
 use super::{N_JOINTS, StateStatistics, realtime};
 use crate::udp::sequence::{SequencePosition, SequenceTracker};
@@ -22,15 +22,18 @@ use std::time::{Duration, Instant};
 /// Capacity of the queue of states for a slow caller: one second. When it is full, the oldest state
 /// is dropped.
 const MAX_WAITING: usize = 1000;
-/// A robot that sends nothing for this long counts as lost.
+/// A robot that sends nothing for this long counts as lost. At a thousand states per second, this
+/// is no matter of lost datagrams, but of a cable, the power or a closed connection.
 const MAX_SILENCE: Duration = Duration::from_secs(1);
 /// Maximum difference between our forward kinematics and the robot's own. Beyond it, the
-/// description belongs to another robot.
+/// description belongs to another robot. Poses of FCI 10 are rounded by less than a micrometer, and
+/// the wrong link or tool is usually off by centimeters, so the value need not be exact.
 const MAX_POSE_ERROR_M: f64 = 2e-3;
 const MAX_POSE_ERROR_RAD: f64 = 0.5 / 180.0 * std::f64::consts::PI;
 const NANOS_PER_STATE: i64 = 1_000_000;
 /// A robot that received no answer for this long has stopped waiting. States that arrived in the
-/// meantime are not answered.
+/// meantime are not answered. The time is that of 20 missed commands, after which a robot ends its
+/// motion.
 const MAX_RESPONSE_GAP: Duration = Duration::from_millis(20);
 
 /// Configuration of an arm from the rig file.
@@ -82,37 +85,20 @@ impl FrankaArm {
         motion_loop: impl FnOnce(&Arc<Session>, &RobotState) -> Result<Option<MotionLoop>, String>,
     ) -> Result<Self, Error> {
         let address = &config.address;
-        let fault = |reason| Error::Fci {
-            address: address.clone(),
-            reason,
-        };
         let n = config.joint_names.len();
         if n != N_JOINTS || config.chain.n_joints() != N_JOINTS {
-            return Err(fault(format!(
-                "the rig file names {n} joints, but the arm has {N_JOINTS}"
-            )));
+            return Err(fault(
+                address,
+                format!("the rig file names {n} joints, but the arm has {N_JOINTS}"),
+            ));
         }
         let session = Arc::new(Session::open(address)?);
-        let Session { network, version } = &*session;
-        let version = *version;
-        let deadline = clock::now() + MAX_SILENCE;
-        let mut buffer = [0; MAX_STATE_BYTES];
-        let first = loop {
-            // After a receive error, a state may still arrive.
-            let n = network.udp.blocking_receive(&mut buffer).unwrap_or(0);
-            match decode(version, &buffer[..n]) {
-                Some(first) => break first.state,
-                None if clock::now() < deadline => {}
-                None => {
-                    return Err(fault(format!(
-                        "it sends no states; check that this computer's firewall lets UDP datagrams to port {} pass",
-                        network.udp.port()
-                    )));
-                }
-            }
-        };
-        check_kinematics(config, &first).map_err(fault)?;
-        let motion_loop = motion_loop(&session, &first).map_err(fault)?;
+        let version = session.version;
+        let first = first_state(address, &session)?;
+        // A wrong robot description would give every image a wrong pose, and the error would look
+        // like a bad calibration. So it is detected before anything is read or moved.
+        check_kinematics(config, &first).map_err(|reason| fault(address, reason))?;
+        let motion_loop = motion_loop(&session, &first).map_err(|reason| fault(address, reason))?;
         let mut reader = StateReader::new(address.clone(), version, motion_loop);
         reader.log_mode(&first);
         let shared = Arc::new(Shared::default());
@@ -187,25 +173,54 @@ impl Drop for FrankaArm {
     }
 }
 
+/// Waits for the first state of a controller that has accepted the connection.
+fn first_state(address: &str, session: &Session) -> Result<RobotState, Error> {
+    let Session { network, version } = session;
+    let deadline = clock::now() + MAX_SILENCE;
+    let mut buffer = [0; MAX_STATE_BYTES];
+    loop {
+        // After a receive error, a state may still arrive.
+        let n = network.udp.blocking_receive(&mut buffer).unwrap_or(0);
+        match decode(*version, &buffer[..n]) {
+            Some(first) => return Ok(first.state),
+            None if clock::now() < deadline => {}
+            None => {
+                // Requests work, so TCP is not blocked. States come over UDP, to a port that a
+                // firewall may not know.
+                return Err(fault(
+                    address,
+                    format!(
+                        "it sends no states; check that this computer's firewall lets UDP datagrams to port {} pass",
+                        network.udp.port()
+                    ),
+                ));
+            }
+        }
+    }
+}
+
 /// Compares the flange pose according to the rig file with the pose that the robot reports.
 fn check_kinematics(config: &ArmConfig, state: &RobotState) -> Result<(), String> {
     let chain = &config.chain;
     let chain_error = |error: kinematics::Error| error.to_string();
     let sequence = chain.order_in(&config.joint_names).map_err(chain_error)?;
+    // The chain may list the joints in another order than the robot.
     let q: Vec<f64> = sequence.iter().map(|ix| state.q[*ix]).collect();
     let ours = chain.forward(&q).map_err(chain_error)?;
     let matrix = |name, matrix| {
         pose(matrix).map_err(|error| format!("its {name} is not a valid pose: {error}"))
     };
-    let (base_from_tool, flange_from_tool) = (
-        matrix("O_T_EE", &state.O_T_EE)?,
-        matrix("F_T_EE", &state.F_T_EE)?,
-    );
+    let base_from_tool = matrix("O_T_EE", &state.O_T_EE)?;
+    let flange_from_tool = matrix("F_T_EE", &state.F_T_EE)?;
+    // The robot reports its tool, whose pose depends on settings in Desk. Removing it leaves the
+    // flange, which depends on the joints only.
     let reported = base_from_tool * flange_from_tool.inverse();
     let (error_m, error_rad) = difference(&ours, &reported);
     if error_m <= MAX_POSE_ERROR_M && error_rad <= MAX_POSE_ERROR_RAD {
         return Ok(());
     }
+    // If the rig file agrees with the tool instead, its author has named the hand as the flange.
+    // This mistake can be told from the others.
     let (tool_error_m, tool_error_rad) = difference(&ours, &base_from_tool);
     let tip = chain.tip_link();
     let likely_cause = if tool_error_m <= MAX_POSE_ERROR_M && tool_error_rad <= MAX_POSE_ERROR_RAD {
@@ -273,6 +288,7 @@ impl StateReader {
     fn run(mut self, session: &Session, shared: &Shared) {
         realtime::request_realtime(&format!("arm at {}", self.address));
         if let Err(reason) = self.read(session, shared) {
+            // The caller of a motion learns that it has ended even if nobody reads joint states.
             if let Some(motion_loop) = &mut self.motion_loop {
                 motion_loop.handle_disconnect(&reason);
             }
@@ -295,7 +311,11 @@ impl StateReader {
         loop {
             let mut received = network.udp.blocking_receive(&mut buffer).ok();
             let mut at = clock::now();
+            // Measured when the first waiting state is read. After a stall of this thread, the
+            // robot no longer waits for an answer to any of them.
             let is_fresh = at.duration_since(last_received) <= MAX_RESPONSE_GAP;
+            // All waiting states are read, so that each gets a stamp. Only the newest one is
+            // answered: for the earlier ones, an answer would come too late.
             let mut newest = None;
             while let Some(n) = received {
                 // Datagrams from other addresses are rejected.
@@ -313,6 +333,7 @@ impl StateReader {
                 at = clock::now();
             }
             if let Some((from, numbered, stamp)) = newest {
+                // Late and duplicate states do not count: a robot that only repeats itself is lost.
                 last_received = at;
                 shared.arrived.notify_all();
                 self.log_mode(&numbered.state);
@@ -326,9 +347,11 @@ impl StateReader {
                 }
                 continue;
             }
+            // Without states, `handle_datagram` does not see the request to stop.
             if shared.state.lock().stop {
                 return Ok(());
             }
+            // A closed connection is noticed here, earlier than by the silence.
             network
                 .tcp
                 .throw_if_connection_closed()
@@ -370,6 +393,7 @@ impl StateReader {
         let NumberedState { number, state } = numbered;
         let statistics = &mut state_queue.statistics;
         match self.sequence.position(*number, at) {
+            // UDP may lose, duplicate and reorder datagrams. The numbers tell these cases apart.
             SequencePosition::New { n_lost } => statistics.n_lost += n_lost,
             SequencePosition::Restart => statistics.n_restarts += 1,
             SequencePosition::Current | SequencePosition::Late => {
@@ -386,11 +410,14 @@ impl StateReader {
             clock: Clock::Device,
             stamp_nanos,
         };
+        // The robot sends at a steady rate, but the network and the scheduler delay the arrival.
+        // The map between the clocks removes that jitter.
         let Some(stamp) = self.sequence.stamp(&header, at) else {
             statistics.n_rejected += 1;
             return None;
         };
         statistics.count(at.duration_since(stamp));
+        // The oldest is dropped: joint states are matched with images that are about to arrive.
         if state_queue.queue.len() >= MAX_WAITING {
             state_queue.queue.pop_front();
             statistics.n_dropped += 1;
@@ -411,7 +438,8 @@ impl StateReader {
             return;
         }
         self.mode = state.robot_mode;
-        let (address, mode) = (&self.address, self.mode);
+        let address = &self.address;
+        let mode = self.mode;
         match mode {
             RobotMode::Reflex if self.motion_loop.is_none() => {
                 let reasons = state.last_motion_errors.names().join(", ");

@@ -7,14 +7,26 @@ use franka::joint_velocity_limits::JointVelocityLimitsConfig;
 use franka::rate_limiting::{self, fer, limit_rate_joint_positions};
 
 /// Fraction of the robot's maximum velocity and acceleration that we use. The rest is a reserve for
-/// lost commands.
+/// lost commands: the robot then keeps its acceleration for some milliseconds, and the next
+/// setpoints make up for the difference. A larger fraction makes motions faster, and reflexes more
+/// likely.
 const LIMIT_FRAC: f64 = 0.5;
 /// Fraction of the robot's maximum jerk that we use. If a command is lost and we do not notice, the
 /// next command appears to the robot with four times its jerk.
+///
+/// The factor follows from the differences of positions. With the jerk `j` and the step `T`, the
+/// lost command leaves the robot `j T³` behind the trajectory, and the next one brings it back.
+/// Over these steps, the position error is `0, 0, -j T³, 0`. Its third difference is `3 j T³`,
+/// which is added to the `j T³` of the trajectory. A factor of a quarter thus keeps this jerk
+/// within the same fraction as the velocity.
 const JERK_LIMIT_FRAC: f64 = 0.25 * LIMIT_FRAC;
-/// Distance of targets from the ends of a joint's range.
+/// Distance of targets from the ends of a joint's range. The robot stops with an error beyond the
+/// end, so a joint that overshoots by rounding, or by a missed command at the end of a motion, must
+/// still be inside. It costs 0.3 degrees of range.
 const MARGIN_RAD: f64 = 5e-3;
-/// Margin subtracted from the velocity near the end of a range, in addition to the robot's own.
+/// Margin subtracted from the velocity near the end of a range, in addition to the robot's own. It
+/// covers the tolerance of libfranka's limiter, 0.001 rad/s, and the difference between continuous
+/// and sampled velocities.
 const SPEED_MARGIN_RAD_S: f64 = 1e-2;
 /// Changes by the rate limiter that are smaller than this are rounding errors.
 const UNCHANGED_RAD: f64 = 1e-9;
@@ -55,14 +67,11 @@ impl RobotLimits {
         let speed = JointVelocityLimitsConfig::from_urdf(urdf).map_err(|error| {
             format!("cannot parse the robot description that it serves: {error}")
         })?;
-        let range = |ix: usize| {
-            [
-                speed[ix].lower_position_limit,
-                speed[ix].upper_position_limit,
-            ]
-        };
         Ok(Self {
-            position_rad: std::array::from_fn(range),
+            position_rad: std::array::from_fn(|ix| {
+                let joint = &speed[ix];
+                [joint.lower_position_limit, joint.upper_position_limit]
+            }),
             acceleration_rad_s2: rate_limiting::MAX_JOINT_ACCELERATION,
             jerk_rad_s3: rate_limiting::MAX_JOINT_JERK,
             speed: SpeedLimits::PositionDependent(Box::new(speed)),
@@ -83,40 +92,53 @@ impl RobotLimits {
                 "limits are given for {n} joints, but the arm has {N_JOINTS}"
             ));
         }
-        let allowed = |(ix, requested): (usize, &MotionLimits)| {
-            let (max_speed, deceleration, offset) = match &self.speed {
-                SpeedLimits::Constant(max_speed) => {
-                    (max_speed[ix], self.acceleration_rad_s2[ix], 0.0)
-                }
-                SpeedLimits::PositionDependent(joints) => (
-                    joints[ix].max_velocity,
-                    joints[ix].deceleration_limit,
-                    joints[ix].velocity_offset + SPEED_MARGIN_RAD_S,
-                ),
-            };
-            let margin = MARGIN_RAD + offset.powi(2) / (2.0 * deceleration * (1.0 - LIMIT_FRAC));
-            let [lower, upper] = self.position_rad[ix];
-            let position = [
-                requested.position[0].max(lower + margin),
-                requested.position[1].min(upper - margin),
-            ];
-            if position[0] >= position[1] {
-                let [min, max] = requested.position;
-                return Err(format!(
-                    "the ranges of joint {} do not overlap: {min} to {max} rad in the rig file, {lower} to {upper} rad in the robot",
-                    ix + 1
-                ));
-            }
-            Ok(MotionLimits {
-                position,
-                velocity: requested.velocity.min(LIMIT_FRAC * max_speed),
-                acceleration: requested
-                    .acceleration
-                    .min(LIMIT_FRAC * deceleration.min(self.acceleration_rad_s2[ix])),
-                jerk: requested.jerk.min(JERK_LIMIT_FRAC * self.jerk_rad_s3[ix]),
-            })
+        requested
+            .iter()
+            .enumerate()
+            .map(|(ix, requested)| self.allowed_for_joint(ix, requested))
+            .collect()
+    }
+
+    /// Limits of one joint, see [`RobotLimits::allowed`].
+    fn allowed_for_joint(
+        &self,
+        ix: usize,
+        requested: &MotionLimits,
+    ) -> Result<MotionLimits, String> {
+        let (max_speed, deceleration, offset) = match &self.speed {
+            // Without limits that depend on the position, only the fixed margin is needed.
+            SpeedLimits::Constant(max_speed) => (max_speed[ix], self.acceleration_rad_s2[ix], 0.0),
+            SpeedLimits::PositionDependent(joints) => (
+                joints[ix].max_velocity,
+                joints[ix].deceleration_limit,
+                joints[ix].velocity_offset + SPEED_MARGIN_RAD_S,
+            ),
         };
-        requested.iter().enumerate().map(allowed).collect()
+        let margin = MARGIN_RAD + offset.powi(2) / (2.0 * deceleration * (1.0 - LIMIT_FRAC));
+        let [lower, upper] = self.position_rad[ix];
+        let position = [
+            requested.position[0].max(lower + margin),
+            requested.position[1].min(upper - margin),
+        ];
+        // The rig file is probably of another robot. An empty range would also make the clamping of
+        // targets panic.
+        if position[0] >= position[1] {
+            let [min, max] = requested.position;
+            return Err(format!(
+                "the ranges of joint {} do not overlap: {min} to {max} rad in the rig file, {lower} to {upper} rad in the robot",
+                ix + 1
+            ));
+        }
+        Ok(MotionLimits {
+            position,
+            velocity: requested.velocity.min(LIMIT_FRAC * max_speed),
+            // The deceleration of the position-dependent limits may be lower than the maximum
+            // acceleration, and the derivation above needs `a <= LIMIT_FRAC * D`.
+            acceleration: requested
+                .acceleration
+                .min(LIMIT_FRAC * deceleration.min(self.acceleration_rad_s2[ix])),
+            jerk: requested.jerk.min(JERK_LIMIT_FRAC * self.jerk_rad_s3[ix]),
+        })
     }
 
     /// Limits the rates of a position to be sent, so that the robot does not trigger a reflex.
@@ -151,6 +173,8 @@ impl RobotLimits {
             &reference.acceleration_rad_s2,
         );
         let limited = limited.map_err(|error| error.to_string())?;
+        // The limiter computes the position from rates, so it differs by rounding even if nothing
+        // was limited. Only a real change displaces the generator and is counted.
         let is_same = limited
             .iter()
             .zip(requested_rad)

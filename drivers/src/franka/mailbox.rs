@@ -67,6 +67,8 @@ impl MotionMailbox {
 
     /// Changes the state, and wakes up all waiting callers.
     pub(super) fn update(&self, change: impl FnOnce(&mut MailboxState)) {
+        // The lock is released at the end of this line, so that the callers that wake up do not
+        // wait for it.
         change(&mut self.lock());
         self.changed.notify_all();
     }
@@ -79,6 +81,8 @@ impl MotionMailbox {
     ) -> Option<MutexGuard<'_, MailboxState>> {
         let deadline = Instant::now() + timeout;
         let mut mailbox_state = self.lock();
+        // The condition is checked in a loop: a condition variable may wake up without a change, or
+        // for a change of another field.
         while !condition(&mailbox_state) {
             let remaining = deadline.saturating_duration_since(Instant::now());
             if remaining.is_zero() {

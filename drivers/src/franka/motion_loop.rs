@@ -18,10 +18,14 @@ use std::time::Duration;
 
 const STEP: Duration = Duration::from_millis(1);
 /// Number of states at rest after which a motion ends, so that a person may guide the arm by hand.
+/// Starting a motion takes a request and its answer, so a caller that sends several targets in a
+/// row should not have to start one for each.
 const MAX_AT_REST: u32 = 1000;
 /// Number of states within which a motion must start. Source: FCI documentation.
 const MAX_STATES_UNTIL_START: u32 = 1000;
-/// Number of states within which a robot reports why a motion ended.
+/// Number of states within which a robot reports why a motion ended. The report comes over TCP, and
+/// may arrive after the states, which come over UDP. Without a bound, a lost connection would leave
+/// the arm neither idle nor stopped.
 const MAX_STATES_UNTIL_RESPONSE: u32 = 100;
 
 /// Moves an arm in response to its states.
@@ -103,12 +107,16 @@ impl MotionLoop {
     pub(super) fn cycle(&mut self, stamped: &StampedState<'_>) {
         let state = &stamped.numbered.state;
         self.take_mode(state);
+        // Each state of the loop is consumed and replaced, so that a finished motion cannot be
+        // continued by mistake.
         self.motion_state = match std::mem::replace(&mut self.motion_state, MotionState::Idle) {
             MotionState::Idle => match self.mailbox.lock().started_motion.take() {
                 Some(id) => MotionState::Beginning { id, n_waited: 0 },
                 None => MotionState::Idle,
             },
             MotionState::Beginning { id, n_waited } => self.start_motion(id, n_waited, stamped),
+            // The robot has ended the motion: as requested, or because of a reflex or the user
+            // stop. A command that arrives now belongs to the next motion.
             MotionState::ActiveMotion(active) if state.robot_mode != RobotMode::Move => {
                 self.mailbox
                     .update(|mailbox_state| mailbox_state.accepts_commands = false);
@@ -151,6 +159,8 @@ impl MotionLoop {
         self.mode = mode;
         self.mailbox
             .update(|mailbox_state| mailbox_state.mode = mode);
+        // Between motions, nobody waits for an answer, so a user stop would go unnoticed until the
+        // next target.
         if let (MotionState::Idle, RobotMode::Reflex | RobotMode::UserStopped, Some(reason)) =
             (&self.motion_state, mode, cause(state))
         {
@@ -160,6 +170,8 @@ impl MotionLoop {
 
     fn start_motion(&mut self, id: u32, n_waited: u32, stamped: &StampedState<'_>) -> MotionState {
         let StampedState { numbered, .. } = stamped;
+        // The answer to the request and the states come over different connections, so states from
+        // before the motion may still arrive.
         if numbered.state.robot_mode != RobotMode::Move {
             return match request::outcome(&self.session, id) {
                 Ok(None) if n_waited < MAX_STATES_UNTIL_START => MotionState::Beginning {
@@ -177,6 +189,8 @@ impl MotionLoop {
                 Err(why) => self.finish(Some(why)),
             };
         }
+        // The trajectory starts at the position that the robot commands, not at the measured one.
+        // The two differ by the sag under load, which would be a jump.
         let reference = Reference::at_rest(&numbered.state);
         let generator = match TrajectoryGenerator::new(&self.limits, &reference.position_rad, STEP)
         {
@@ -202,16 +216,21 @@ impl MotionLoop {
     fn run(&mut self, mut active: Box<ActiveMotion>, stamped: &StampedState<'_>) -> MotionState {
         let NumberedState { number, state } = stamped.numbered;
         let n_states = number.saturating_sub(active.number);
+        // First it is determined what the robot did with the last command. The next one must
+        // continue from there, or it looks like a jump.
         let fate = match n_states {
             0 => CommandFate::Followed,
             n => active.tracker.advance(active.sent, n, state),
         };
-        (active.number, active.sent) = (*number, None);
+        active.number = *number;
+        active.sent = None;
         let command = self.take_command(&mut active, n_states, fate, stamped);
         let position_rad = match self.next_position(&mut active, command.as_ref(), fate) {
             Ok(position_rad) => position_rad,
             Err(why) => return self.halt(active.id, why),
         };
+        // The motion advances even if nothing is sent: the next state shows that the robot has
+        // extrapolated.
         if stamped.is_fresh {
             self.send(&mut active, stamped, position_rad);
         }
@@ -245,10 +264,15 @@ impl MotionLoop {
                 .count_robot_success(stamped.numbered.state.control_command_success_rate);
         }
         let command = mailbox_state.command.take();
+        // A command that has just arrived keeps the motion alive. Otherwise, it would be lost with
+        // the end of the motion.
         let is_at_rest = active.generator.is_at_rest() && command.is_none();
         active.n_at_rest = if is_at_rest { active.n_at_rest + 1 } else { 0 };
         if is_at_rest && (active.n_at_rest > MAX_AT_REST || mailbox_state.is_shutting_down) {
-            (active.is_ending, mailbox_state.accepts_commands) = (true, false);
+            // Under the same lock as the command above, so that no command can come in between and
+            // be accepted by a motion that ends.
+            active.is_ending = true;
+            mailbox_state.accepts_commands = false;
         }
         let motion = if is_at_rest {
             Motion::Holding
@@ -285,8 +309,12 @@ impl MotionLoop {
         let desired = desired
             .try_into()
             .map_err(|_| "the setpoint has the wrong number of joints".to_owned())?;
+        // The generator respects its limits, but a missed command or a displaced reference adds to
+        // them. What is sent must be within the limits of the robot in any case.
         let (position_rad, is_limited) = self.robot.limited(desired, reference)?;
         if is_limited {
+            // The generator must know that its setpoint was not sent. Its next one would otherwise
+            // be limited, too.
             generator.resume(&reference.sent(position_rad).setpoint())?;
             self.mailbox.lock().statistics.n_limited += 1;
         }
@@ -331,6 +359,8 @@ impl MotionLoop {
 
     /// Makes the robot brake.
     fn halt(&self, id: u32, reason: String) -> MotionState {
+        // Ceasing to send would also stop the robot, after 20 ms and with a reflex that a person
+        // must clear.
         let reason = match request::halt(&self.session) {
             Ok(()) => reason,
             Err(why) => format!("{reason}; {why}"),
@@ -363,6 +393,8 @@ impl MotionLoop {
                 };
             }
             Ok(Some(MotionResponse::Finished)) => reason,
+            // The states name the cause in more detail, such as the reflex. The answer is added for
+            // what the states do not contain.
             Ok(Some(MotionResponse::Rejected(why))) => {
                 Some(reason.map_or(why.clone(), |reason| format!("{reason} ({why})")))
             }
@@ -385,12 +417,10 @@ impl MotionLoop {
         match reason {
             Some(reason) => self.stop_because(reason),
             None => self.mailbox.update(|mailbox_state| {
-                (
-                    mailbox_state.is_idle,
-                    mailbox_state.accepts_commands,
-                    mailbox_state.command,
-                    mailbox_state.motion,
-                ) = (true, false, None, Motion::Holding);
+                mailbox_state.is_idle = true;
+                mailbox_state.accepts_commands = false;
+                mailbox_state.command = None;
+                mailbox_state.motion = Motion::Holding;
             }),
         }
         MotionState::Idle
@@ -400,11 +430,9 @@ impl MotionLoop {
         log::warn!("{}: {reason}", self.device);
         self.mailbox.update(|mailbox_state| {
             // A command from before the stop must not be executed after the recovery.
-            (
-                mailbox_state.is_idle,
-                mailbox_state.accepts_commands,
-                mailbox_state.command,
-            ) = (true, false, None);
+            mailbox_state.command = None;
+            mailbox_state.is_idle = true;
+            mailbox_state.accepts_commands = false;
             mailbox_state.motion = Motion::Stopped { reason };
         });
     }
@@ -415,10 +443,10 @@ impl MotionLoop {
 fn cause(state: &RobotState) -> Option<String> {
     match state.robot_mode {
         RobotMode::Reflex => {
-            let (errors, last) = (
-                state.current_errors.names(),
-                state.last_motion_errors.names(),
-            );
+            // The current errors may already be cleared when the state is sent. Those of the last
+            // motion then still name the cause.
+            let errors = state.current_errors.names();
+            let last = state.last_motion_errors.names();
             let names = if errors.is_empty() { last } else { errors };
             Some(format!("stopped by a reflex: {}", names.join(", ")))
         }

@@ -21,7 +21,8 @@ use std::time::Duration;
 const ROBOT_TIMEOUT: Duration = Duration::from_millis(20);
 /// Maximum time for an arm to come to rest and end its motion.
 const STOP_TIMEOUT: Duration = Duration::from_secs(5);
-/// Maximum time until the states agree with the robot's reply.
+/// Maximum time until the states agree with the robot's reply. They come over another connection,
+/// so states from before the reply may still arrive.
 const SETTLE_TIMEOUT: Duration = Duration::from_secs(2);
 
 /// A Franka arm that is moved by joint positions, under the joint impedance controller of the
@@ -86,8 +87,11 @@ impl MovableFrankaArm {
             &resolved.map_or_else(|| address.clone(), |resolved| resolved.ip().to_string()),
         )?;
         let mailbox = Arc::new(MotionMailbox::default());
+        // The limits depend on the robot, which is known only after the connection. The closure
+        // stores what this value needs of them.
         let connected = OnceLock::new();
         let arm = FrankaArm::open_with(config, |session, first| {
+            // A Panda serves no description, so its limits are built in.
             let robot = match session.version {
                 FciVersion::V5 => RobotLimits::panda(),
                 FciVersion::V10 => RobotLimits::of_description(&request::description(session)?)?,
@@ -103,6 +107,7 @@ impl MovableFrankaArm {
                 robot,
                 limits,
             );
+            // A robot that is stopped already is reported at once, and not at the first target.
             motion_loop.take_mode(first);
             Ok(Some(motion_loop))
         })?;
@@ -154,10 +159,14 @@ impl MovableFrankaArm {
         };
         let mode = mailbox_state.mode;
         let refusal = refusal(&mailbox_state);
+        // The requests below wait for the robot, and the thread needs the lock in every
+        // millisecond.
         drop(mailbox_state);
         if let Some(why) = refusal.or_else(|| request::blocking_reason(mode).map(str::to_owned)) {
             return Err(self.fault(why));
         }
+        // Settings are sent with the first motion, so that a program that only opens the arm
+        // changes nothing.
         if !self.is_set {
             request::set(&self.session, &self.contact).map_err(|why| self.fault(why))?;
             self.is_set = true;
@@ -165,15 +174,16 @@ impl MovableFrankaArm {
         let id = request::start_motion(&self.session);
         let id = id.map_err(|why| self.fault(format!("it refused to start a motion: {why}")))?;
         self.mailbox.update(|mailbox_state| {
-            (
-                mailbox_state.started_motion,
-                mailbox_state.accepts_commands,
-                mailbox_state.is_idle,
-            ) = (Some(id), true, false);
-            (mailbox_state.command, mailbox_state.motion) = (
-                Some(MotionCommand::SetTarget(target.clone())),
-                Motion::Moving,
-            );
+            mailbox_state.started_motion = Some(id);
+            mailbox_state.accepts_commands = true;
+            mailbox_state.is_idle = false;
+            mailbox_state.command = Some(MotionCommand::SetTarget(target.clone()));
+            // Set here and not by the thread: a caller may wait for the end of the motion as soon
+            // as this returns.
+            // If the robot has stopped since the request was sent, the reason must not be lost.
+            if refusal(mailbox_state).is_none() {
+                mailbox_state.motion = Motion::Moving;
+            }
         });
         Ok(())
     }
@@ -201,6 +211,8 @@ impl Arm for MovableFrankaArm {
 
 impl MovableArm for MovableFrankaArm {
     fn command(&mut self, target: &JointTarget) -> Result<JointTarget, Error> {
+        // The generator clamps as well, but on another thread. Clamping here gives the caller the
+        // accepted target at once.
         let target = clamp_to_range(target, &self.limits).map_err(|why| self.fault(why))?;
         let mut mailbox_state = self.mailbox.lock();
         if let Some(why) = refusal(&mailbox_state) {
@@ -208,10 +220,8 @@ impl MovableArm for MovableFrankaArm {
             return Err(self.fault(why));
         }
         if mailbox_state.accepts_commands {
-            (mailbox_state.command, mailbox_state.motion) = (
-                Some(MotionCommand::SetTarget(target.clone())),
-                Motion::Moving,
-            );
+            mailbox_state.command = Some(MotionCommand::SetTarget(target.clone()));
+            mailbox_state.motion = Motion::Moving;
             return Ok(target);
         }
         drop(mailbox_state);
@@ -239,17 +249,17 @@ impl MovableArm for MovableFrankaArm {
         }) else {
             return Err(self.fault("a motion is active"));
         };
-        let (mode, is_lost, motion) = (
-            mailbox_state.mode,
-            mailbox_state.is_lost,
-            mailbox_state.motion.clone(),
-        );
+        let mode = mailbox_state.mode;
+        let is_lost = mailbox_state.is_lost;
+        let motion = mailbox_state.motion.clone();
         drop(mailbox_state);
         match (motion, mode) {
             (Motion::Stopped { reason }, _) if is_lost => return Err(self.fault(reason)),
             (Motion::Stopped { .. }, RobotMode::Reflex) => {
                 request::recover(&self.session).map_err(|why| self.fault(why))?;
             }
+            // There is no reflex to clear. The robot either became ready in the meantime, or needs
+            // a person.
             (Motion::Stopped { .. }, mode) => {
                 if let Some(why) = request::blocking_reason(mode) {
                     return Err(self.fault(why));
@@ -272,6 +282,8 @@ impl Drop for MovableFrankaArm {
     fn drop(&mut self) {
         self.mailbox.update(|mailbox_state| {
             mailbox_state.is_shutting_down = true;
+            // A pending target is replaced. Without a motion, a stop has nothing to do, and would
+            // wait in the mailbox for the next one.
             mailbox_state.command = mailbox_state
                 .accepts_commands
                 .then_some(MotionCommand::Stop);

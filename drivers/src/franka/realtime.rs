@@ -20,6 +20,9 @@ pub(super) fn request_realtime(device: &str) {
             reason.trim_start_matches("libfranka: ")
         ));
     }
+    // A page fault that reads from a disk takes longer than the millisecond in which a state must
+    // be answered. `ONFAULT` locks pages when they are used, so that large unused reservations take
+    // no memory.
     if let Err(error) = mlockall(MlockAllFlags::CURRENT | MlockAllFlags::ONFAULT) {
         denied.push(format!("locked memory ({error})"));
     }

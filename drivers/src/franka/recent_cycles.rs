@@ -23,6 +23,8 @@ struct Cycle {
 impl Cycle {
     /// Joint with the largest commanded acceleration, and that acceleration in rad/s².
     fn largest_acceleration(&self) -> Option<(usize, f64)> {
+        // Computed as the robot does, from differences of positions. A violated limit shows here,
+        // even if the trajectory itself was smooth.
         let sent = self.assumed.sent(self.sent_rad?);
         let accelerations = sent
             .acceleration_rad_s2
@@ -38,6 +40,8 @@ impl Cycle {
 pub(super) struct RecentCycles(VecDeque<Cycle>);
 
 impl RecentCycles {
+    /// A robot gives up after 20 missed commands, and reports the reflex some states later. This
+    /// covers both, and what came before.
     const MAX: usize = 60;
 
     pub(super) fn new() -> Self {
@@ -76,6 +80,7 @@ impl RecentCycles {
             .iter()
             .filter(|cycle| cycle.sent_rad.is_none())
             .count();
+        // States that were lost just before the end are in the gap before the last number.
         let numbers = self.0.iter().map(|cycle| cycle.number).chain([last_number]);
         let n_lost: u64 = numbers
             .clone()

@@ -8,19 +8,26 @@ use franka::{RobotState, rate_limiting};
 /// Seconds between commands.
 const STEP_SECS: f64 = rate_limiting::DELTA_T;
 /// Maximum position difference between our reference and the robot's, in rad. Smaller differences
-/// come from the rounding of FCI 10, for positions up to 8 rad.
+/// come from the rounding of FCI 10, for positions up to 8 rad: its floats are 4.8e-7 apart there,
+/// so rounding changes them by at most 2.4e-7. A larger tolerance would hide missed commands; a
+/// smaller one would take rounding for a displaced reference.
 const POSITION_TOLERANCE_RAD: f64 = 4e-7;
 /// Maximum velocity difference between our reference and the robot's, for velocities up to 8 rad/s.
+/// Rounding takes a quarter of it. A missed command with a jerk of 10 rad/s³ changes the velocity
+/// by 1e-5 rad/s, ten times this tolerance.
 const VELOCITY_TOLERANCE_RAD_S: f64 = 1e-6;
 /// Maximum number of steps by which a reported reference may be behind: `franka-sim` reports what
-/// its joint thread has processed.
+/// its joint thread has processed. A larger value would accept a reference that is really
+/// elsewhere, at 1 rad/s by a milliradian per step.
 const MAX_BEHIND: f64 = 3.0;
 /// Number of consecutive missing commands after which the robot stops. Source: FCI documentation,
 /// "Real-time control commands".
 const MAX_MISSED: u64 = 20;
 /// Number of most recent commands over which the robot computes its success rate.
 pub(super) const N_SUCCESS_WINDOW: u64 = 100;
-/// Number of missed commands that a success rate may not contain yet.
+/// Number of missed commands that a success rate may not contain yet. The rate and the reference
+/// may come from different cycles of the robot. With a larger number, a mistake lasts longer; with
+/// a smaller one, commands that were really missed could count as received.
 const MAX_UNREPORTED: f64 = 3.0;
 
 /// Commanded joint positions, rad, with velocities and accelerations as differences per
@@ -92,16 +99,25 @@ impl ReferenceTracker {
         let (reference, fate) = self.reference.advance(sent, n_states, state);
         self.reference = reference;
         if fate != CommandFate::Missed(n_states) {
-            (self.if_all_received, self.n_doubtful) = (reference, 0);
+            // The robot has followed a command, or its reference is elsewhere. Either way, all
+            // earlier doubts are settled.
+            self.if_all_received = reference;
+            self.n_doubtful = 0;
             return fate;
         }
+        // Two explanations are tracked side by side: that all commands since the last certain one
+        // were missed, and that all were received.
         self.if_all_received = self.if_all_received.after(sent, n_states);
+        // A state that was not answered is a missed command for certain, so it raises no doubt.
         self.n_doubtful += u64::from(sent.is_some());
         let is_contradicted = self.n_doubtful as f64 > n_reported_missed(state) + MAX_UNREPORTED;
+        // The rate alone does not decide. If several states were lost, the other explanation may be
+        // wrong as well, so it must also match the reported position.
         if !is_contradicted || !self.if_all_received.is_near(state) {
             return fate;
         }
-        (self.reference, self.n_doubtful) = (self.if_all_received, 0);
+        self.reference = self.if_all_received;
+        self.n_doubtful = 0;
         CommandFate::Unknown
     }
 }
@@ -109,12 +125,16 @@ impl ReferenceTracker {
 /// Number of commands in the success window that the robot missed, according to its success rate.
 /// NaN if it reports NaN.
 fn n_reported_missed(state: &RobotState) -> f64 {
+    // The rate is a multiple of 1 %, but it is sent as a float, so the product is rounded to a
+    // whole number.
     ((1.0 - state.control_command_success_rate.clamp(0.0, 1.0)) * N_SUCCESS_WINDOW as f64).round()
 }
 
 impl Reference {
     /// A reference at rest, at the commanded position that the robot reports.
     pub(super) fn at_rest(state: &RobotState) -> Self {
+        // Before the first command, the reported rates may still be those of the joints, which sag
+        // or are guided by hand.
         Self {
             position_rad: state.q_d,
             velocity_rad_s: [0.0; N_JOINTS],
@@ -132,6 +152,8 @@ impl Reference {
 
     /// The reference a millisecond later, after a position was sent.
     pub(super) fn sent(&self, position_rad: [f64; N_JOINTS]) -> Self {
+        // The robot differentiates the positions that it receives. Only the same differences give
+        // the velocity, acceleration and jerk that it checks.
         let velocity_rad_s: [f64; N_JOINTS] =
             std::array::from_fn(|ix| (position_rad[ix] - self.position_rad[ix]) / STEP_SECS);
         let acceleration_rad_s2 =
@@ -179,40 +201,48 @@ impl Reference {
         state: &RobotState,
     ) -> (Self, CommandFate) {
         let reported = Self::reported(state);
+        // After so many states, the robot has stopped extrapolating, so the predictions below no
+        // longer apply.
         if n_states > MAX_MISSED {
             return (reported, CommandFate::Unknown);
         }
-        let matches_rates = |reference: &Self| {
-            let pairs = reference
-                .velocity_rad_s
-                .into_iter()
-                .zip(reported.velocity_rad_s);
-            pairs
-                .into_iter()
-                .all(|(own, robot)| (own - robot).abs() <= VELOCITY_TOLERANCE_RAD_S)
-        };
+        // Only the first new state can have followed `sent`. Nothing was sent in answer to the
+        // others, because they arrived together with the newest one, or not at all.
         let n_after = n_states - 1;
         let if_sent_received = sent.map(|position_rad| self.after(Some(position_rad), n_states));
         let if_received = if_sent_received.filter(|reference| reference.is_near(state));
         let if_missed = self.after(None, n_states);
         match if_received {
             Some(if_received)
-                if !matches_rates(&if_received)
-                    && matches_rates(&if_missed)
-                    && !matches_rates(self) =>
+                // Both predictions are within the rounding of the position, and the velocities
+                // match only the one without the command.
+                if !if_received.has_velocities_of(&reported)
+                    && if_missed.has_velocities_of(&reported)
+                    && !self.has_velocities_of(&reported) =>
             {
                 (if_missed, CommandFate::Missed(n_states))
             }
             Some(if_received) if n_after == 0 => (if_received, CommandFate::Followed),
             Some(if_received) => (if_received, CommandFate::Missed(n_after)),
+            // The position does not match the prediction with the command, or there was no command.
             None => match if_sent_received {
                 _ if if_missed.is_near(state) => (if_missed, CommandFate::Missed(n_states)),
+                // A robot that reports late seems to be behind. Our own reference stays, because
+                // the robot will get there.
                 Some(if_received) if n_after == 0 && if_received.is_shortly_after(&reported) => {
                     (if_received, CommandFate::Followed)
                 }
                 _ => (reported, CommandFate::Unknown),
             },
         }
+    }
+
+    /// Whether all velocities match the reported ones up to rounding.
+    fn has_velocities_of(&self, reported: &Self) -> bool {
+        self.velocity_rad_s
+            .into_iter()
+            .zip(reported.velocity_rad_s)
+            .all(|(own, robot)| (own - robot).abs() <= VELOCITY_TOLERANCE_RAD_S)
     }
 
     /// Whether all positions match the reported ones up to rounding.

@@ -72,35 +72,21 @@ pub(super) fn description(session: &Session) -> Result<String, String> {
 
 /// Sets the collision thresholds and the stiffness, and checks each answer.
 pub(super) fn set(session: &Session, contact: &ContactConfig) -> Result<(), String> {
-    let ([x, y, z], [about_x, about_y, about_z]) = (contact.force_n, contact.moment_nm);
-    let (torque, force) = (&contact.torque_nm, &[x, y, z, about_x, about_y, about_z]);
+    let [x, y, z] = contact.force_n;
+    let [about_x, about_y, about_z] = contact.moment_nm;
+    let torque = &contact.torque_nm;
+    let force = &[x, y, z, about_x, about_y, about_z];
     // Lower thresholds are only reported. The same thresholds apply with and without acceleration.
     let collision = v10::SetCollisionBehaviorRequest::new(
         torque, torque, torque, torque, force, force, force, force,
     );
-    let number = |v5: v5::Command, v10: v10::Command| match session.version {
-        FciVersion::V5 => v5.to_u32(),
-        FciVersion::V10 => v10.to_u32(),
-    };
-    let set = |what: &str, number: u32, payload: &[u8]| {
-        let answer = ask(session, number, payload, MAX_ANSWER)?;
-        match (session.version, first(&answer)?) {
-            (_, 0) => Ok(()),
-            (FciVersion::V5, status) => Err(format!(
-                "{what}: {}",
-                status_text(v5::GetterSetterStatus::from_u8(status))
-            )),
-            (FciVersion::V10, status) => Err(format!(
-                "{what}: {}",
-                status_text(v10::GetterSetterStatus::from_u8(status))
-            )),
-        }
-    };
-    let command = number(
+    let command = command_number(
+        session,
         v5::Command::SetCollisionBehavior,
         v10::Command::SetCollisionBehavior,
     );
-    set(
+    apply(
+        session,
         "it rejected the collision thresholds",
         command,
         collision.as_bytes(),
@@ -108,15 +94,41 @@ pub(super) fn set(session: &Session, contact: &ContactConfig) -> Result<(), Stri
     let Some(stiffness) = &contact.stiffness_nm_rad else {
         return Ok(());
     };
-    let command = number(
+    let command = command_number(
+        session,
         v5::Command::SetJointImpedance,
         v10::Command::SetJointImpedance,
     );
-    set(
+    apply(
+        session,
         "it rejected the joint stiffness",
         command,
         v10::SetJointImpedanceRequest::new(stiffness).as_bytes(),
     )
+}
+
+/// The number of a command in the robot's FCI version. The versions number them differently.
+fn command_number(session: &Session, v5: v5::Command, v10: v10::Command) -> u32 {
+    match session.version {
+        FciVersion::V5 => v5.to_u32(),
+        FciVersion::V10 => v10.to_u32(),
+    }
+}
+
+/// Changes a setting, and checks the answer. `problem` starts the error message.
+fn apply(session: &Session, problem: &str, number: u32, payload: &[u8]) -> Result<(), String> {
+    let answer = ask(session, number, payload, MAX_ANSWER)?;
+    match (session.version, first(&answer)?) {
+        (_, 0) => Ok(()),
+        (FciVersion::V5, status) => Err(format!(
+            "{problem}: {}",
+            status_text(v5::GetterSetterStatus::from_u8(status))
+        )),
+        (FciVersion::V10, status) => Err(format!(
+            "{problem}: {}",
+            status_text(v10::GetterSetterStatus::from_u8(status))
+        )),
+    }
 }
 
 /// Requests a joint position motion under the robot's joint impedance controller. Returns its ID
@@ -139,6 +151,8 @@ pub(super) fn start_motion(session: &Session) -> Result<u32, String> {
                 .to_vec()
         }
     };
+    // The number of this command and of `StopMove` is the same in both versions. A motion has two
+    // answers with one ID: this one, and another when it ends.
     let id = send(session, v10::Command::Move.to_u32(), &request)?;
     match decode_response(session.version, &wait(session, id, MAX_ANSWER)?) {
         MotionResponse::Started => Ok(id),
@@ -169,10 +183,11 @@ pub(super) fn outcome(session: &Session, id: u32) -> Result<Option<MotionRespons
 
 /// Clears a reflex.
 pub(super) fn recover(session: &Session) -> Result<(), String> {
-    let number = match session.version {
-        FciVersion::V5 => v5::Command::AutomaticErrorRecovery.to_u32(),
-        FciVersion::V10 => v10::Command::AutomaticErrorRecovery.to_u32(),
-    };
+    let number = command_number(
+        session,
+        v5::Command::AutomaticErrorRecovery,
+        v10::Command::AutomaticErrorRecovery,
+    );
     let answer = ask(session, number, &[], MAX_RECOVERY)?;
     let why = match (session.version, first(&answer)?) {
         (_, 0) => return Ok(()),
@@ -191,11 +206,11 @@ pub(super) fn command(
     position_rad: &[f64; N_JOINTS],
     is_last: bool,
 ) -> Vec<u8> {
-    let (message_id, q_c, motion_generation_finished) = (
-        U64::new(number),
-        f64s_to_wire(position_rad),
-        u8::from(is_last),
-    );
+    // The number of the state that is answered. By it, the robot tells which millisecond the
+    // positions are for.
+    let message_id = U64::new(number);
+    let q_c = f64s_to_wire(position_rad);
+    let motion_generation_finished = u8::from(is_last);
     match version {
         FciVersion::V5 => {
             let motion = v5::MotionGeneratorCommand {
@@ -249,6 +264,7 @@ fn decode_response(version: FciVersion, payload: &[u8]) -> MotionResponse {
     let Some(status) = payload.first() else {
         return MotionResponse::Rejected("its answer to the motion request is empty".to_owned());
     };
+    // The versions number the statuses differently, but name them alike.
     let name = match version {
         FciVersion::V5 => v5::MoveStatus::from_u8(*status).map(|status| format!("{status:?}")),
         FciVersion::V10 => franka::MoveStatus::from_u8(*status).map(|status| format!("{status:?}")),

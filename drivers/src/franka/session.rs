@@ -11,7 +11,8 @@ pub(super) const POLL: Duration = Duration::from_millis(100);
 /// Maximum time for the answer to a connection request; a controller that accepts us answers within
 /// milliseconds.
 const MAX_ANSWER: Duration = Duration::from_secs(2);
-/// Interval of checks for an answer.
+/// Interval of checks for an answer. The crate's own wait for an answer has no time limit, so
+/// answers are polled for.
 const POLL_INTERVAL: Duration = Duration::from_millis(1);
 /// Hint in the error if a controller rejects the connection.
 const ONE_CLIENT_HINT: &str = "FCI accepts one client at a time: stop the other one; if the arm is only read, that one may \
@@ -33,11 +34,11 @@ enum ConnectResponse {
 impl Session {
     /// Connects with FCI 10, or with FCI 5 if the controller uses that version.
     pub(super) fn open(address: &str) -> Result<Self, Error> {
-        let fault = |reason| Error::Fci {
-            address: address.to_owned(),
-            reason,
+        let connect = |version: FciVersion| {
+            connect(address, number(version)).map_err(|reason| fault(address, reason))
         };
-        let connect = |version: FciVersion| connect(address, number(version)).map_err(fault);
+        // A controller that uses another version rejects the connection, and reports its own
+        // version.
         let server_version = match connect(FciVersion::V10)? {
             ConnectResponse::Accepted(network) => {
                 return Ok(Self {
@@ -65,12 +66,24 @@ impl Session {
                 }
             }
         }
-        Err(fault(format!(
-            "it uses FCI version {server_version}; supported are versions 5 (Panda) and 10 (FR3)"
-        )))
+        Err(fault(
+            address,
+            format!(
+                "it uses FCI version {server_version}; supported are versions 5 (Panda) and 10 (FR3)"
+            ),
+        ))
     }
 }
 
+/// An error of the controller at this address.
+pub(super) fn fault(address: &str, reason: String) -> Error {
+    Error::Fci {
+        address: address.to_owned(),
+        reason,
+    }
+}
+
+/// The number of a version on the wire.
 fn number(version: FciVersion) -> u16 {
     match version {
         FciVersion::V5 => robot::v5::ROBOT_VERSION,
@@ -89,14 +102,11 @@ fn connect(address: &str, version: u16) -> Result<ConnectResponse, String> {
     );
     // The host does not exist or refuses connections, so other clients are not the cause.
     let network = network.map_err(|error| error_text(&error))?;
+    // The controller sends its states to the UDP port that the request names.
     let mut request = version.to_le_bytes().to_vec();
     request.extend(network.udp.port().to_le_bytes());
-    let disconnected = |error: FrankaError| {
-        format!(
-            "it closed the connection ({}). {ONE_CLIENT_HINT}",
-            error_text(&error).trim_end_matches('.')
-        )
-    };
+    // A controller that serves another client may accept the connection, and then close it or stay
+    // silent.
     let id = network
         .tcp
         .send_request(robot::Command::Connect.to_u32(), &request)
@@ -120,6 +130,14 @@ fn connect(address: &str, version: u16) -> Result<ConnectResponse, String> {
     }
 }
 
+/// The reason if the controller closes the connection during the negotiation.
+fn disconnected(error: FrankaError) -> String {
+    format!(
+        "it closed the connection ({}). {ONE_CLIENT_HINT}",
+        error_text(&error).trim_end_matches('.')
+    )
+}
+
 /// The answer to a request, including its header; `None` if it does not arrive in time.
 pub(super) fn answer(
     network: &Network,
@@ -140,8 +158,9 @@ pub(super) fn answer(
 pub(super) fn error_text(error: &FrankaError) -> String {
     let text = error.to_string();
     let text = text.trim_start_matches("libfranka: ");
-    match text.ends_with('.') {
-        true => text.to_owned(),
-        false => format!("{text}."),
+    if text.ends_with('.') {
+        text.to_owned()
+    } else {
+        format!("{text}.")
     }
 }

@@ -7,7 +7,8 @@ use zerocopy::FromBytes;
 
 /// One byte more than the longest state, so that datagrams that are too long are detected.
 pub(super) const MAX_STATE_BYTES: usize = size_of::<v5::RobotState>() + 1;
-/// Maximum angle of any joint. States with larger angles are invalid.
+/// Maximum angle of any joint. States with larger angles are invalid. All joints of both robots
+/// stay within 5 rad, so the value only excludes corrupted states.
 const MAX_RAD: f64 = 10.0;
 
 /// A state with its number, which increases by one per millisecond of the robot's clock.
@@ -37,6 +38,8 @@ pub(super) fn decode(version: FciVersion, bytes: &[u8]) -> Option<NumberedState>
             (wire.message_id.get(), RobotState::from_wire(&wire))
         }
     };
+    // Datagrams have no checksum beside that of UDP. A corrupted angle would give an image a wrong
+    // pose, so implausible states are dropped. NaN fails the comparison.
     let are_angles = state.q.iter().all(|angle| angle.abs() <= MAX_RAD);
     let are_numbers = state
         .dq

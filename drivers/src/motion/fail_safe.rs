@@ -7,7 +7,8 @@ use std::time::{Duration, Instant};
 static IS_DUE: AtomicBool = AtomicBool::new(false);
 /// Arms that this process commands, and that need a fail-safe command.
 static N_COMMANDED: AtomicUsize = AtomicUsize::new(0);
-/// The fail-safe command is resent for at most the largest timeout (2 s) plus 2 s.
+/// Maximum time to wait for the arms. The fail-safe command is resent for at most the largest
+/// timeout (2 s) plus 2 s; the rest is a reserve for a busy computer.
 const MAX_WAIT: Duration = Duration::from_secs(5);
 
 /// Sends the fail-safe command to all arms with CAN motors that this process moves, without
@@ -16,8 +17,11 @@ const MAX_WAIT: Duration = Duration::from_secs(5);
 ///
 /// Franka arms brake when the connection ends.
 pub fn apply_fail_safe() {
+    // It is never reset, so an arm that is opened later sends nothing either. The program is about
+    // to end.
     IS_DUE.store(true, Ordering::Relaxed);
     let deadline = Instant::now() + MAX_WAIT;
+    // Polling needs no locks, so this also works while another thread has panicked or holds one.
     while N_COMMANDED.load(Ordering::Relaxed) > 0 && Instant::now() < deadline {
         std::thread::sleep(Duration::from_millis(2));
     }

@@ -13,10 +13,14 @@ use std::time::Duration;
 
 /// Maximum distance by which a joint may be outside its range, radians or meters. Causes are
 /// backlash, an encoder offset, or a motion that continued without commands and is too fast to stop
-/// before the end of the range.
+/// before the end of the range.///
+/// With a smaller value, an arm with such a joint cannot be enabled, or stops with an error. A
+/// larger one permits motions closer to the mechanical stops beyond the range.
 const MAX_OVERSHOOT: f64 = 0.02;
 
-/// Fractions by which the jerk is reduced if no trajectory is found with the full jerk.
+/// Fractions by which the jerk is reduced if no trajectory is found with the full jerk. The
+/// smallest reduction comes first, because it changes the motion least. It need only exceed the
+/// rounding errors that make the case degenerate.
 const JERK_REDUCTIONS: [f64; 3] = [1e-6, 1e-4, 1e-2];
 
 /// Setpoint of all joints at an instant, in their order; radians or meters, and seconds.
@@ -62,6 +66,8 @@ impl TrajectoryGenerator {
     ) -> Result<Self, String> {
         let n = limits.len();
         check(position, n)?;
+        // The library checks limits only when it plans. Checking them here names the joint, before
+        // the motors are enabled.
         let mut limits = limits.to_vec();
         for (ix, (joint, position)) in limits.iter_mut().zip(position).enumerate() {
             let [lower, upper] = joint.position;
@@ -71,6 +77,7 @@ impl TrajectoryGenerator {
                     ix + 1
                 ));
             }
+            // Written so that NaN fails.
             if [joint.velocity, joint.acceleration, joint.jerk]
                 .iter()
                 .any(|limit| !limit.is_finite() || *limit <= 0.0)
@@ -80,11 +87,14 @@ impl TrajectoryGenerator {
                     ix + 1
                 ));
             }
+            // A joint that starts outside its range may stay there, so the range is widened to its
+            // position. It never widens further.
             joint.position = [lower.min(*position), upper.max(*position)];
         }
         let each = |of: fn(&MotionLimits) -> f64| data_array(limits.iter().map(of));
         let mut input = InputParameter::new(Some(n));
         input.current_position = data_array(position.iter().copied());
+        // Without a target, the first setpoints hold this position.
         input.target_position = data_array(position.iter().copied());
         input.max_velocity = each(|joint| joint.velocity);
         input.max_acceleration = each(|joint| joint.acceleration);
@@ -112,9 +122,12 @@ impl TrajectoryGenerator {
             .zip(&self.limits)
             .map(clamp_to_range)
             .collect();
+        // A stop before this target may have changed both.
         self.input.control_interface = ControlInterface::Position;
         self.input.synchronization = Synchronization::Time;
         self.input.target_position = data_array(position.iter().copied());
+        // An earlier trajectory may have been allowed to overshoot. The new one must stay inside
+        // again, if it can.
         self.keep_in_range();
         self.is_at_rest = false;
         Ok(JointTarget { position })
@@ -123,6 +136,9 @@ impl TrajectoryGenerator {
     /// Stops each joint as soon as its limits allow, independently of the others.
     pub fn stop(&mut self) {
         if !self.is_at_rest {
+            // In velocity control, the target is velocity 0 at any position. Without
+            // synchronization, no joint waits for the slowest one, so each moves as little as
+            // possible.
             self.input.control_interface = ControlInterface::Velocity;
             self.input.synchronization = Synchronization::None;
         }
@@ -137,6 +153,8 @@ impl TrajectoryGenerator {
         self.input.current_position = data_array(from.position.iter().copied());
         self.input.current_velocity = data_array(from.velocity.iter().copied());
         self.input.current_acceleration = data_array(from.acceleration.iter().copied());
+        // An earlier trajectory may have been allowed to overshoot. The new one must stay inside
+        // again, if it can.
         self.keep_in_range();
         self.is_at_rest = false;
         Ok(())
@@ -160,6 +178,8 @@ impl TrajectoryGenerator {
     /// Tries a step with slightly reduced jerk. `rsruckig` finds no trajectory if a joint reaches
     /// its full acceleration for zero time, which happens for some round distances.
     fn update_with_less_jerk(&mut self) -> Option<RuckigResult> {
+        // Restoring the full jerk makes the next step plan again with it, so the reduction lasts
+        // only as long as it is needed.
         let full = self.input.max_jerk.clone();
         let result = JERK_REDUCTIONS.iter().find_map(|reduction| {
             self.input.max_jerk = data_array(full.iter().map(|jerk| jerk * (1.0 - reduction)));
@@ -177,6 +197,8 @@ impl TrajectoryGenerator {
             self.input.max_position.take(),
         );
         let result = self.ruckig.update(&self.input, &mut self.output);
+        // Without bounds, the trajectory may go anywhere, so its extrema are checked before it is
+        // used.
         let extrema = self.output.trajectory.get_position_extrema();
         let is_within_tolerance =
             self.limits
@@ -187,9 +209,12 @@ impl TrajectoryGenerator {
                     trajectory.min >= lower - MAX_OVERSHOOT
                         && trajectory.max <= upper + MAX_OVERSHOOT
                 });
+        // A stop is accepted wherever it ends: it is the shortest way to rest, and an error would
+        // end the control of a moving arm.
         let is_stop = self.input.control_interface == ControlInterface::Velocity;
         match result {
             Ok(result) if is_within_tolerance || is_stop => Some(result),
+            // The bounds come back, so that the next target is planned with them.
             _ => {
                 (self.input.min_position, self.input.max_position) = position_bounds;
                 None
@@ -211,7 +236,8 @@ impl TrajectoryGenerator {
                 message.lines().next().unwrap_or_default()
             );
         };
-        let ([lower, upper], input) = (joint.position, &self.input);
+        let [lower, upper] = joint.position;
+        let input = &self.input;
         let [position, velocity, target] = [
             &input.current_position,
             &input.current_velocity,
@@ -229,12 +255,16 @@ impl TrajectoryGenerator {
     pub fn step(&mut self) -> Result<Setpoint, String> {
         if !self.is_at_rest {
             let result = match self.ruckig.update(&self.input, &mut self.output) {
+                // The full limits come first, then a barely slower motion, then one that leaves the
+                // range for a moment.
                 Err(error) => self
                     .update_with_less_jerk()
                     .or_else(|| self.update_with_overshoot())
                     .ok_or_else(|| self.describe(&error))?,
                 Ok(result) => result,
             };
+            // The setpoint is the start of the next step. The trajectory is planned again only if
+            // the input has changed.
             self.output.pass_to_input(&mut self.input);
             if result == RuckigResult::Finished {
                 self.is_at_rest = true;

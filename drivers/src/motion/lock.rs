@@ -24,6 +24,8 @@ impl MotionLock {
         let fail = |error: std::io::Error| Error::Motion {
             reason: format!("cannot lock {name}: {error}"),
         };
+        // The prefix keeps the name apart from those of other programs: all programs of a network
+        // namespace share the abstract names.
         let address =
             SocketAddr::from_abstract_name(format!("fieldrig-move/{name}")).map_err(fail)?;
         match UnixListener::bind_addr(&address) {
@@ -31,6 +33,8 @@ impl MotionLock {
                 _listener: listener,
             }),
             Err(error) if error.kind() == std::io::ErrorKind::AddrInUse => {
+                // Connecting shows who holds the lock: the kernel reports the process that listens.
+                // It may end just now, so its number is optional.
                 let owner = UnixStream::connect_addr(&address)
                     .ok()
                     .and_then(|stream| socket_peercred(stream).ok());

@@ -122,6 +122,8 @@ impl MotionLimits {
         jerk_secs: f64,
     ) -> Self {
         let velocity = joint.velocity.min(max_speed);
+        // The limits follow from times, because a time suits joints of any size. An acceleration
+        // would have to be chosen for each joint.
         let acceleration = velocity / acceleration_secs;
         Self {
             position: [joint.lower, joint.upper],

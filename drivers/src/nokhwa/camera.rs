@@ -19,7 +19,7 @@ const MAX_OPENING: Duration = Duration::from_secs(8);
 /// Pause between two attempts to reconnect.
 const RETRY_PAUSE: Duration = Duration::from_millis(200);
 /// Maximum number of threads that hang in a call and cannot be ended. After that, no new thread is
-/// started.
+/// started: each holds memory and perhaps the camera, and more attempts have hardly a chance.
 const MAX_ABANDONED: usize = 8;
 /// Maximum time to wait until a streaming thread stops.
 const SHUTDOWN_TIMEOUT: Duration = Duration::from_secs(1);
@@ -140,6 +140,7 @@ impl ReopenableCamera for NokhwaDevice {
 
     /// Starts a thread that opens the camera, and does not wait for it.
     fn open(&mut self) -> Result<NokhwaStream, Failure<Problem>> {
+        // A call that returned late has ended its thread, and no longer counts.
         self.abandoned.retain(|alive| alive.strong_count() > 0);
         if self.abandoned.len() >= MAX_ABANDONED {
             return Err(Problem::TooManyAbandoned {
@@ -150,6 +151,7 @@ impl ReopenableCamera for NokhwaDevice {
         let thread = Arc::new(());
         Ok(NokhwaStream {
             alive: Arc::downgrade(&thread),
+            // Only the thread holds a strong reference.
             worker: Worker::start(&self.config, thread)?,
             description: None,
             last_image_at: Instant::now(),
@@ -180,8 +182,15 @@ impl ReopenableCamera for NokhwaDevice {
         match stream.worker.next(deadline.min(gives_up_at)) {
             Some(WorkerEvent::Frame(mut frame)) => {
                 if self.config.delivery == Delivery::Newest {
-                    while let Some(WorkerEvent::Frame(newer)) = stream.worker.next(Instant::now()) {
-                        frame = newer;
+                    while let Some(event) = stream.worker.next(Instant::now()) {
+                        match event {
+                            WorkerEvent::Frame(newer) => frame = newer,
+                            WorkerEvent::Streaming(description) => {
+                                stream.description = Some(description);
+                            }
+                            // Images from before a failure are outdated.
+                            WorkerEvent::Failed(problem) => return Err(problem.into()),
+                        }
                     }
                 }
                 stream.last_image_at = Instant::now();
@@ -189,11 +198,13 @@ impl ReopenableCamera for NokhwaDevice {
                 Ok(Some(self.image_of(frame, n_skipped)))
             }
             Some(WorkerEvent::Streaming(description)) => {
-                (stream.description, stream.last_image_at) = (Some(description), Instant::now());
+                stream.description = Some(description);
+                stream.last_image_at = Instant::now();
                 Ok(None)
             }
             Some(WorkerEvent::Failed(problem)) => Err(problem.into()),
             None if Instant::now() >= gives_up_at => {
+                // Dropping the stream must not wait for a thread that hangs.
                 stream.is_abandoned = true;
                 self.n_abandoned += 1;
                 self.abandoned.push(Weak::clone(&stream.alive));

@@ -93,10 +93,13 @@ impl Worker {
     /// Starts a thread that opens the camera and streams. The thread holds `alive` until it ends.
     pub(super) fn start(config: &Config, alive: Arc<()>) -> Result<Self, Problem> {
         let shared = Arc::new(Shared::default());
-        let (config, sender) = (config.clone(), Arc::clone(&shared));
+        let config = config.clone();
+        let sender = Arc::clone(&shared);
         let thread = std::thread::Builder::new()
             .name(format!("nokhwa {}", config.name))
             .spawn(move || {
+                // Dropped when the thread ends, which the camera observes through its weak
+                // reference. A join handle would block if a call hangs.
                 let _alive = alive;
                 if let Err(problem) = stream(&config, &sender) {
                     sender.send(WorkerEvent::Failed(problem));
@@ -167,6 +170,7 @@ fn stream(config: &Config, shared: &Shared) -> Result<(), Problem> {
     )));
     while is_receiving {
         let buffer = camera.frame().map_err(unplugged)?;
+        // Before the copy, whose time must not count as latency.
         let arrival = clock::now();
         let bytes = trim(buffer.buffer(), format, config.intrinsics.size_px);
         is_receiving = shared.send(WorkerEvent::Frame(Frame {
@@ -232,6 +236,7 @@ fn open(config: &Config, index: CameraIndex) -> Result<(Camera, V4l2Format), Pro
         reason = "compared with the original below"
     )]
     let whole_hz = rate_hz.round() as u32;
+    // nokhwa only knows integer rates. A rounded one would make the estimated gaps wrong.
     if f64::from(whole_hz) != rate_hz {
         return Err(Problem::Rate { rate_hz });
     }
@@ -246,6 +251,8 @@ fn open(config: &Config, index: CameraIndex) -> Result<(Camera, V4l2Format), Pro
         let request = RequestedFormat::with_formats(RequestedFormatType::Exact(exact), &formats);
         match Camera::new(index.clone(), request) {
             Ok(camera) => return Ok((camera, *name)),
+            // The first error is that of the most preferred format, and usually the most useful
+            // one.
             Err(error) => reason = reason.or(Some(error.to_string())),
         }
     }

@@ -142,10 +142,13 @@ impl ReopenableCamera for RealsenseDevice {
 
     /// Resets the camera, which has the effect of reconnecting it. Fails if it is not connected.
     fn reset(&mut self, n_tries: u32) -> bool {
+        // A reset takes seconds and makes other programs lose the camera, so reopening is tried
+        // first.
         if !n_tries.is_multiple_of(TRIES_BEFORE_RESET) {
             return false;
         }
         let found = Context::new().and_then(|context| find::camera(&context, &self.config.serial));
+        // A camera that is unplugged cannot be reset.
         let Ok(device) = found else { return false };
         log::warn!(
             "camera {:?}: it is connected but does not stream; resetting it",

@@ -21,18 +21,12 @@ pub struct FoundCamera {
 
 impl FoundCamera {
     pub(super) fn of(device: &Device) -> Self {
-        let info = |kind| {
-            device
-                .info
-                .info(kind)
-                .map(|text| text.to_string_lossy().into_owned())
-        };
         Self {
-            name: info(Rs2CameraInfo::Name).unwrap_or_else(|| "RealSense".into()),
-            serial: info(Rs2CameraInfo::SerialNumber).unwrap_or_default(),
-            firmware: info(Rs2CameraInfo::FirmwareVersion).unwrap_or_default(),
-            recommended_firmware: info(Rs2CameraInfo::RecommendedFirmwareVersion),
-            usb: info(Rs2CameraInfo::UsbTypeDescriptor),
+            name: info(device, Rs2CameraInfo::Name).unwrap_or_else(|| "RealSense".into()),
+            serial: info(device, Rs2CameraInfo::SerialNumber).unwrap_or_default(),
+            firmware: info(device, Rs2CameraInfo::FirmwareVersion).unwrap_or_default(),
+            recommended_firmware: info(device, Rs2CameraInfo::RecommendedFirmwareVersion),
+            usb: info(device, Rs2CameraInfo::UsbTypeDescriptor),
         }
     }
 
@@ -45,21 +39,32 @@ impl FoundCamera {
 
     /// Whether its firmware is older than the version that the library recommends.
     pub fn has_old_firmware(&self) -> bool {
-        let numbers = |version: &str| {
-            version
-                .split('.')
-                .map(|part| part.parse().unwrap_or(0))
-                .collect::<Vec<u32>>()
-        };
+        // Compared part by part as numbers: as text, 5.9 would be newer than 5.16.
         self.recommended_firmware
             .as_deref()
-            .is_some_and(|requested| numbers(&self.firmware) < numbers(requested))
+            .is_some_and(|requested| version_numbers(&self.firmware) < version_numbers(requested))
     }
 
     /// Name and serial number for messages.
     pub(super) fn describe(&self) -> String {
         format!("{} {}", self.name, self.serial)
     }
+}
+
+/// A text that a device reports about itself.
+fn info(device: &Device, kind: Rs2CameraInfo) -> Option<String> {
+    device
+        .info
+        .info(kind)
+        .map(|text| text.to_string_lossy().into_owned())
+}
+
+/// The parts of a version, such as 5.16.0.1.
+fn version_numbers(version: &str) -> Vec<u32> {
+    version
+        .split('.')
+        .map(|part| part.parse().unwrap_or(0))
+        .collect()
 }
 
 /// All connected cameras.

@@ -12,7 +12,8 @@ use realsense_sys as sys;
 /// Maximum error of a fit of our lens model to one of the library, in pixels. The error for a D455
 /// is 0.04.
 const MAX_FIT_ERROR_PX: f64 = 0.5;
-/// Number of fit points along each side of the image.
+/// Number of fit points along each side of the image. Five coefficients of smooth polynomials need
+/// far fewer; the density lets the maximum error between the points be close to that at the points.
 const N_FIT_POINTS: u32 = 24;
 
 /// Converts intrinsics of the library to ours.
@@ -41,6 +42,7 @@ pub(super) fn intrinsics(
         sys::rs2_distortion_RS2_DISTORTION_KANNALA_BRANDT4 => {
             Lens::KannalaBrandt([k[0], k[1], k[2], k[3]])
         }
+        // After Kannala-Brandt, which is not a pinhole even with zero coefficients.
         _ if k == [0.0; 5] => Lens::Pinhole,
         sys::rs2_distortion_RS2_DISTORTION_NONE => Lens::Pinhole,
         sys::rs2_distortion_RS2_DISTORTION_BROWN_CONRADY => Lens::BrownConrady(k),
@@ -81,7 +83,8 @@ pub(super) fn raw(intrinsics: &Intrinsics) -> sys::rs2_intrinsics {
             [k1, k2, k3, k4, 0.0],
         ),
         Lens::RationalBrownConrady(_) => {
-            let ([fx, fy], [cx, cy]) = (intrinsics.focal_px, intrinsics.principal_px);
+            let [fx, fy] = intrinsics.focal_px;
+            let [cx, cy] = intrinsics.principal_px;
             let distort =
                 |[x, y]: [f64; 2]| match intrinsics.project(&nalgebra::Vector3::new(x, y, 1.0)) {
                     Some([u, v]) => ([x, y], [(u - cx) / fx, (v - cy) / fy]),
@@ -184,12 +187,15 @@ fn fit_brown_conrady(
             let side = |axis: usize, step: u32| {
                 f64::from(pinhole.size_px[axis] * step) / f64::from(N_FIT_POINTS)
             };
+            // Points on the borders, too: distortion is strongest in the corners, and a polynomial
+            // must not extrapolate there.
             let ray_at = pinhole.unproject([side(0, column), side(1, row)])?;
             pairs.push(pair([ray_at.x, ray_at.y]));
         }
     }
     // The displacement caused by the lens is linear in its coefficients.
-    let (mut normal_matrix, mut rhs) = (Matrix5::zeros(), Vector5::zeros());
+    let mut normal_matrix = Matrix5::zeros();
+    let mut rhs = Vector5::zeros();
     for ([x, y], distorted_point) in &pairs {
         let r2 = x * x + y * y;
         let powers = [r2, r2 * r2, r2 * r2 * r2];
@@ -220,6 +226,7 @@ fn fit_brown_conrady(
             rhs += row * displacement;
         }
     }
+
     let [k1, k2, p1, p2, k3] = normal_matrix.cholesky()?.solve(&rhs).into();
     let k = [k1, k2, p1, p2, k3];
     let fit_error_px = pairs.iter().map(|(ray, distorted_point)| {

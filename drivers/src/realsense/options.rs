@@ -78,6 +78,27 @@ fn apply_image_settings(settings: &Settings, sensor: &mut Sensor) -> Result<Vec<
     let mut applied = Vec::new();
     // Automatic exposure must not lower the rate.
     set_if_supported(sensor, Rs2Option::AutoExposurePriority, 0.0);
+    exposure_and_gain(settings, sensor, &mut applied)?;
+    white_balance(settings.white_balance_kelvin, sensor, &mut applied)?;
+    if let Some(brightness) = settings.brightness {
+        set(
+            sensor,
+            "realsense.brightness",
+            Rs2Option::Brightness,
+            narrow(brightness.into()),
+            0.0,
+        )?;
+        applied.push(format!("brightness {brightness}"));
+    }
+    Ok(applied)
+}
+
+/// Exposure and gain, which share one automatic mode.
+fn exposure_and_gain(
+    settings: &Settings,
+    sensor: &mut Sensor,
+    applied: &mut Vec<String>,
+) -> Result<(), Problem> {
     match (settings.exposure_micros, settings.gain) {
         (None, None) => set_if_supported(sensor, Rs2Option::EnableAutoExposure, 1.0),
         (None, Some(gain)) => {
@@ -89,6 +110,7 @@ fn apply_image_settings(settings: &Settings, sensor: &mut Sensor) -> Result<Vec<
             });
         }
         (Some(micros), gain) => {
+            // The automatic mode goes off first, because it overwrites values.
             set_if_supported(sensor, Rs2Option::EnableAutoExposure, 0.0);
             let counts = narrow(micros / exposure_micros_per_count(sensor));
             set(
@@ -111,7 +133,15 @@ fn apply_image_settings(settings: &Settings, sensor: &mut Sensor) -> Result<Vec<
             }
         }
     }
-    match settings.white_balance_kelvin {
+    Ok(())
+}
+
+fn white_balance(
+    kelvin: Option<i32>,
+    sensor: &mut Sensor,
+    applied: &mut Vec<String>,
+) -> Result<(), Problem> {
+    match kelvin {
         None => set_if_supported(sensor, Rs2Option::EnableAutoWhiteBalance, 1.0),
         Some(kelvin) => {
             set_if_supported(sensor, Rs2Option::EnableAutoWhiteBalance, 0.0);
@@ -125,21 +155,12 @@ fn apply_image_settings(settings: &Settings, sensor: &mut Sensor) -> Result<Vec<
             applied.push(format!("white balance {kelvin} K"));
         }
     }
-    if let Some(brightness) = settings.brightness {
-        set(
-            sensor,
-            "realsense.brightness",
-            Rs2Option::Brightness,
-            narrow(brightness.into()),
-            0.0,
-        )?;
-        applied.push(format!("brightness {brightness}"));
-    }
-    Ok(applied)
+    Ok(())
 }
 
 fn laser(sensor: &mut Sensor, power: f64) -> Result<(), Problem> {
     const KEY: &str = "realsense.laser_power";
+    // The range of the power may not include 0; the emitter has a switch of its own.
     if power == 0.0 && is_supported(sensor, Rs2Option::EmitterEnabled) {
         return set(sensor, KEY, Rs2Option::EmitterEnabled, 0.0, 0.0);
     }
@@ -154,6 +175,7 @@ fn laser(sensor: &mut Sensor, power: f64) -> Result<(), Problem> {
 /// Value of the preset with this name. Case is ignored; underscores and hyphens match spaces.
 fn preset(sensor: &Sensor, name: &str) -> Result<f32, Problem> {
     const KEY: &str = "realsense.preset";
+    // Case and separators have no meaning in names of presets.
     let normalized = |name: &str| name.to_lowercase().replace(['_', '-'], " ");
     let range = sensor
         .options
@@ -218,6 +240,7 @@ fn set(
             reason: error.to_string(),
         })?;
     match sensor.options.get_option(option) {
+        // The library reports success even if the camera rounds or ignores a value.
         Some(got) if (got - value).abs() > tolerance => Err(Problem::ReadBack {
             setting,
             requested: value,

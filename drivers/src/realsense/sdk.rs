@@ -106,6 +106,7 @@ impl Context {
             path: path.to_owned(),
             reason,
         };
+        // Opened here first, because the error of the operating system names the cause.
         if let Err(error) = std::fs::File::open(path) {
             return Err(file_problem(error.to_string()));
         }
@@ -197,9 +198,10 @@ impl Device {
     pub(super) fn set_paused(&self, is_paused: bool) -> Result<(), Problem> {
         // SAFETY: the device is alive; for a device that is not a file, the call returns an error.
         call("pause or resume a file", |error| unsafe {
-            match is_paused {
-                true => sys::rs2_playback_device_pause(self.raw.as_ptr(), error),
-                false => sys::rs2_playback_device_resume(self.raw.as_ptr(), error),
+            if is_paused {
+                sys::rs2_playback_device_pause(self.raw.as_ptr(), error);
+            } else {
+                sys::rs2_playback_device_resume(self.raw.as_ptr(), error);
             }
         })
     }
@@ -361,8 +363,13 @@ impl Mode {
     /// The profile must live as long as the mode.
     unsafe fn read(profile: NonNull<sys::rs2_stream_profile>) -> Result<Option<Self>, Problem> {
         const WHAT: &str = "describe a mode";
-        let (mut stream, mut format) = (0, 0);
-        let (mut index, mut unique, mut rate_hz, mut width, mut height) = (0, 0, 0, 0, 0);
+        let mut stream = 0;
+        let mut format = 0;
+        let mut index = 0;
+        let mut unique = 0;
+        let mut rate_hz = 0;
+        let mut width = 0;
+        let mut height = 0;
         // SAFETY: the profile is alive, and all output pointers are valid.
         unsafe {
             let profile = profile.as_ptr();
@@ -455,6 +462,7 @@ impl Queue {
     /// Waits for the next image. Returns `None` if none came in time.
     pub(super) fn wait(&self, timeout: Duration) -> Result<Option<Frame>, Problem> {
         const WHAT: &str = "wait for an image";
+        // The library counts whole milliseconds.
         let millis = u32::try_from(timeout.as_millis()).unwrap_or(u32::MAX);
         let mut frame = null_mut();
         // SAFETY: the queue is alive; a received frame is owned here, and `Frame` frees it.

@@ -83,6 +83,7 @@ impl Session {
         if config.file.is_none() {
             warn_of_device(&config.name, &found);
             let applied = options::apply(&config.settings, &mut device, started.image_sensor);
+            // Started streams keep a camera busy, even after a failed start.
             let applied = applied.inspect_err(|_| started.stop(&device))?;
             description = format!("{description}; set and read back: {}", applied.join(", "));
         }
@@ -141,6 +142,7 @@ impl Session {
                         .max(0)
                         .unsigned_abs(),
                 );
+                // The error contains the time until the next call is useful.
                 if remaining.is_zero() {
                     return Ok(Next::NotDue(due_in));
                 }
@@ -190,6 +192,7 @@ impl Session {
 
     /// Copies a frame to an image. Returns `None` for duplicates.
     fn image(&mut self, frame: Frame) -> Result<Option<Image>, Problem> {
+        // First, so that filters and copies do not delay the stamp.
         let arrival = clock::now();
         let is_depth = frame.stream_profile().kind() == Rs2StreamKind::Depth;
         let counter = &mut self.counter[usize::from(is_depth)];
@@ -197,6 +200,7 @@ impl Session {
         match counter.last_number.replace(number) {
             // The library sometimes returns the last image of a stream again.
             Some(last) if last == number => return Ok(None),
+            // Numbers that decrease come from a restart of the stream, which loses nothing.
             Some(last) if number > last => counter.n_unreported += number - last - 1,
             _ => {}
         }
@@ -227,6 +231,7 @@ impl Session {
             exposure_secs,
             n_skipped: std::mem::take(&mut counter.n_unreported),
         };
+        // Before the filters: they take most of the time, and the file has to catch up.
         if self.stamps.is_before_open(image.stamp) {
             self.n_before_open += 1;
             return Ok(None);
@@ -274,7 +279,8 @@ impl Drop for Session {
     /// Stops the streams while draining the queue. Otherwise they would deadlock: stopping waits
     /// for the thread that reads the file, and that thread waits for space in the queue.
     fn drop(&mut self) {
-        let (queue, is_stopped) = (&self.queue, AtomicBool::new(false));
+        let queue = &self.queue;
+        let is_stopped = AtomicBool::new(false);
         std::thread::scope(|scope| {
             scope.spawn(|| {
                 while !is_stopped.load(Ordering::Relaxed) {

@@ -102,6 +102,8 @@ impl Stamps {
     fn device_nanos(&mut self, frame_time: &FrameTime) -> Option<i64> {
         if let Some(micros) = frame_time.mid_exposure_micros {
             // Emulated cameras use 64-bit counts, which do not wrap.
+            // A count that fits into 32 bits is unwrapped even if it has 64 bits: it cannot have
+            // wrapped then, and both give the same result.
             let is_64_bit = micros > i64::from(u32::MAX);
             return Some(if is_64_bit {
                 micros.saturating_mul(1000)

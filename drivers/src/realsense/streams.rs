@@ -88,6 +88,7 @@ struct StreamRequest {
 impl StreamRequest {
     fn fits(&self, mode: &Mode, rate_hz: Option<f64>) -> bool {
         mode.size_px == self.size_px
+            // The library reports rates as integers, so 29.97 Hz is 30.
             && rate_hz.is_none_or(|rate_hz| (f64::from(mode.rate_hz) - rate_hz).abs() < 0.5)
             && self.formats.contains(&mode.format)
             && self.is_of_stream(mode)
@@ -104,42 +105,53 @@ impl StreamRequest {
     fn choose(&self, config: &Config, modes: &[Modes]) -> Result<(usize, usize), Problem> {
         // A file has only one rate, which follows from its stamps.
         let rate_hz = config.file.is_none().then_some(config.rate_hz);
-        let all = || {
-            let of_sensor = |(sensor, modes): (usize, &'_ Modes)| {
-                (0..modes.modes.len())
-                    .map(move |mode| (sensor, mode))
-                    .collect::<Vec<_>>()
-            };
-            modes.iter().enumerate().flat_map(of_sensor)
-        };
         let mode_at = |(sensor, mode): (usize, usize)| &modes[sensor].modes[mode];
-        let rank = |indices: &(usize, usize)| {
-            self.formats
-                .iter()
-                .position(|format| *format == mode_at(*indices).format)
-        };
-        all()
+        indices_of_all(modes)
+            .into_iter()
             .filter(|indices| self.fits(mode_at(*indices), rate_hz))
-            .min_by_key(rank)
-            .ok_or_else(|| {
-                let offered: BTreeSet<String> = all()
-                    .map(mode_at)
-                    .filter(|mode| self.is_of_stream(mode))
-                    .map(describe)
-                    .collect();
-                let offered: Vec<_> = offered.into_iter().collect();
-                let [width, height] = self.size_px;
-                let rate = rate_hz.map_or(String::new(), |rate_hz| format!(" at {rate_hz} Hz"));
-                Problem::NoMode {
-                    requested: format!("{} {width}x{height}{rate}", self.name),
-                    offered: if offered.is_empty() {
-                        format!("no {}", self.name)
-                    } else {
-                        offered.join(", ")
-                    },
-                }
-            })
+            .min_by_key(|indices| self.rank(mode_at(*indices)))
+            .ok_or_else(|| self.no_mode(modes, rate_hz))
     }
+
+    /// Place of the format of a mode in the order of preference.
+    fn rank(&self, mode: &Mode) -> Option<usize> {
+        self.formats
+            .iter()
+            .position(|format| *format == mode.format)
+    }
+
+    /// The problem that no mode fits, with the modes that the camera offers for this stream.
+    fn no_mode(&self, modes: &[Modes], rate_hz: Option<f64>) -> Problem {
+        // A set: several sensors or formats of the library may describe the same mode.
+        let offered: BTreeSet<String> = modes
+            .iter()
+            .flat_map(|modes| &modes.modes)
+            .filter(|mode| self.is_of_stream(mode))
+            .map(describe)
+            .collect();
+        let offered: Vec<_> = offered.into_iter().collect();
+        let [width, height] = self.size_px;
+        let rate = rate_hz.map_or(String::new(), |rate_hz| format!(" at {rate_hz} Hz"));
+        Problem::NoMode {
+            requested: format!("{} {width}x{height}{rate}", self.name),
+            offered: if offered.is_empty() {
+                format!("no {}", self.name)
+            } else {
+                offered.join(", ")
+            },
+        }
+    }
+}
+
+/// Index of the sensor and of the mode of all modes.
+fn indices_of_all(modes: &[Modes]) -> Vec<(usize, usize)> {
+    let mut indices = Vec::new();
+    for (sensor, modes) in modes.iter().enumerate() {
+        for mode in 0..modes.modes.len() {
+            indices.push((sensor, mode));
+        }
+    }
+    indices
 }
 
 /// Opens the requested streams and starts them into a queue.
@@ -148,6 +160,8 @@ pub(super) fn start(
     device: &Device,
     queue: &Queue,
 ) -> Result<ActiveStreams, Problem> {
+    // The modes of all sensors are needed first: color and depth may be streams of one sensor or of
+    // two.
     let modes: Vec<Modes> = device
         .sensors
         .iter()
@@ -166,26 +180,25 @@ pub(super) fn start(
     }
     .choose(config, &modes)?;
     let depth = config.depth_size_px.map(|size_px| {
-        let (stream, format) = (
-            sys::rs2_stream_RS2_STREAM_DEPTH,
-            sys::rs2_format_RS2_FORMAT_Z16,
-        );
         StreamRequest {
             name: "depth",
-            stream,
+            stream: sys::rs2_stream_RS2_STREAM_DEPTH,
             size_px,
-            formats: vec![format],
+            formats: vec![sys::rs2_format_RS2_FORMAT_Z16],
         }
         .choose(config, &modes)
     });
     let depth = depth.transpose()?;
     let mode_at = |(sensor, mode): (usize, usize)| &modes[sensor].modes[mode];
+    // The calibration is read before the streams start: it depends on the mode, and a problem with
+    // it then needs no cleaning up.
     let calibration = Calibration {
         intrinsics: lens::intrinsics(&mode_at(image).intrinsics()?, name)?,
         depth: depth
             .map(|depth| depth_calibration(device, depth, mode_at(depth), mode_at(image)))
             .transpose()?,
     };
+    // Everything below refers to modes by the indices of sensor and mode.
     let chosen: Vec<_> = std::iter::once(image).chain(depth).collect();
     let description: Vec<_> = chosen
         .iter()
@@ -203,6 +216,8 @@ pub(super) fn start(
         description: description.join(" and "),
         _modes: Vec::new(),
     };
+    // All modes of a sensor must be opened in one call: depth and infrared share a sensor, and a
+    // second call fails.
     for sensor in &started.sensors {
         let sensor_modes: Vec<_> = chosen
             .iter()
@@ -214,9 +229,11 @@ pub(super) fn start(
             .inspect_err(|_| started.stop(device))?;
     }
     started
+        // If one sensor fails, the others must be stopped, or the camera stays busy.
         .run(device, queue, config.file.is_some())
         .inspect_err(|_| started.stop(device))?;
     Ok(ActiveStreams {
+        // The running modes point into the lists, so these are kept as long as the streams.
         _modes: modes,
         ..started
     })

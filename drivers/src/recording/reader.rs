@@ -19,7 +19,7 @@ use std::sync::Arc;
 
 /// Maximum number of unused topics, attachments and metadata that are reported.
 const MAX_UNUSED: usize = 50;
-/// Maximum number of these in the error about a recording without samples.
+/// Maximum number of unused parts in the error about a recording without samples.
 const MAX_UNUSED_IN_ERROR: usize = 5;
 
 /// A recording that is being replayed: a [`Source`] of its samples in recorded order.
@@ -34,7 +34,7 @@ pub struct Recording {
     attachments: BTreeMap<String, Vec<u8>>,
     joint_names: Option<Vec<String>>,
     notes: Notes,
-    /// Topics, attachments and metadata of other programs, as in messages.
+    /// Topics, attachments and metadata of other programs, as messages name them.
     unused: BTreeSet<String>,
     /// Parts of a ground-truth sample that is not complete yet.
     true_color: Option<Image>,
@@ -42,7 +42,7 @@ pub struct Recording {
     first: Option<Sample>,
     n_samples: u64,
     damage: Option<String>,
-    /// The damage without the name of the file and the number of samples.
+    /// Description of the damage, without the name of the file and the number of samples.
     damage_kind: Option<String>,
     ended: bool,
 }
@@ -116,6 +116,8 @@ impl Recording {
             damage_kind: None,
             ended: false,
         };
+        // Joint names and attachments precede the first sample, so reading it makes them available.
+        // It also tells a recording of this program from other MCAP files.
         recording.first = recording.read_sample()?;
         if recording.first.is_none() {
             return Err(Error::EmptyRecording {
@@ -127,6 +129,7 @@ impl Recording {
             .iter()
             .any(|name| recording.attachment(name).is_none())
         {
+            // This reads the headers of the whole file, so it is done only if necessary.
             recording.find_attachments().map_err(open)?;
         }
         Ok(recording)
@@ -191,7 +194,7 @@ impl Recording {
         match self.attachments.get(name) {
             None => drop(self.attachments.insert(name.to_owned(), data.to_vec())),
             Some(first) if first == data => {}
-            // As after merging recordings.
+            // This happens when recordings are merged.
             Some(_) => self.notes.add_at(format!("attachment {name:?}"), "attachment", || {
                 format!(
                     "{} contains another one of this name with other contents; the first is used, unless a rig file is given",
@@ -203,6 +206,7 @@ impl Recording {
 
     /// Logs that a part of the file has no effect.
     fn report_unused(&mut self, what: String) {
+        // Files of other programs may have thousands of topics.
         if self.unused.len() > MAX_UNUSED || self.unused.contains(&what) {
             return;
         }
@@ -221,6 +225,8 @@ impl Recording {
                 Ok(None) => self.ended = true,
                 Ok(Some(RawRecord { opcode, bytes })) => match Record::decode(opcode, &bytes) {
                     Ok(record) => {
+                        // Most records are no samples: schemas, channels, and the parts of a
+                        // ground-truth sample.
                         if let Some(sample) = self.take(record)? {
                             self.n_samples += 1;
                             return Ok(Some(sample));
@@ -282,6 +288,7 @@ impl Recording {
                             source,
                         });
                 }
+                // Messages of other programs are skipped without decoding.
                 None if self.unused_channels.contains(&channel_id) => {}
                 None => self.end_damaged(&format!(
                     "is damaged (a message on channel {channel_id}, which is not announced)"
@@ -292,7 +299,7 @@ impl Recording {
         Ok(None)
     }
 
-    /// Takes the announcement of a channel. The error says what its topic contains instead of the
+    /// Registers an announced channel. The error describes what its topic contains instead of the
     /// expected messages.
     fn announce(
         &mut self,
@@ -311,6 +318,8 @@ impl Recording {
                 Ok(())
             };
         };
+        // A topic with one of our names but other messages is an error: leaving it out would
+        // silently lose a camera or the joints.
         let (readable, readable_encoding) = topic.readable();
         // Calibrations are not read.
         let is_read = !matches!(topic, Topic::Calibration(_));
@@ -321,6 +330,7 @@ impl Recording {
             ));
         }
         let used_key = topic.metadata_key();
+        // Other keys are reported, because their authors expected an effect.
         let value = used_key
             .and_then(|key| metadata.get(key))
             .map(|value| (*value).to_owned());
@@ -348,8 +358,8 @@ impl Recording {
         Ok(())
     }
 
-    /// Takes the joint names of a channel. All channels must have the same, because a rig has one
-    /// arm.
+    /// Stores the joint names of a channel. All channels must list the same names, because a rig
+    /// has one arm.
     fn take_joint_names(&mut self, topic_name: &str, names: &str) -> Result<(), String> {
         if names.is_empty() {
             self.notes.add(topic_name, "joint_names", || {
@@ -388,16 +398,7 @@ impl Recording {
             Topic::Color(camera) => Sample::Image(self.image(channel, camera, data)?),
             Topic::Depth(camera) => {
                 let image = self.image(channel, camera, data)?;
-                if let (PixelFormat::DepthU16 { meters_per_count }, Some(listed)) =
-                    (image.format, &channel.metadata)
-                    && listed.parse::<f64>() != Ok(meters_per_count)
-                {
-                    self.notes.add(topic_name, "meters_per_count", || {
-                        format!(
-                            "meters_per_count is {listed} in the metadata of the channel, but {meters_per_count} in messages, which is used"
-                        )
-                    });
-                }
+                self.notes.check_depth_scale(channel, &image);
                 Sample::Image(image)
             }
             Topic::Joints => {
@@ -409,24 +410,8 @@ impl Recording {
                 );
                 Sample::Joints(state)
             }
-            Topic::Base => {
-                self.notes
-                    .agree_frames(topic_name, ["world", "base"], data)?;
-                let (stamp, world_from_base) = foxglove::decode_transform(data)?;
-                Sample::Base(BasePose {
-                    stamp,
-                    world_from_base,
-                })
-            }
-            Topic::TrueBase => {
-                self.notes
-                    .agree_frames(topic_name, ["world", "base_truth"], data)?;
-                let (stamp, world_from_base) = foxglove::decode_transform(data)?;
-                Sample::BaseTruth(BasePose {
-                    stamp,
-                    world_from_base,
-                })
-            }
+            Topic::Base => Sample::Base(self.base_pose(topic_name, "base", data)?),
+            Topic::TrueBase => Sample::BaseTruth(self.base_pose(topic_name, "base_truth", data)?),
             Topic::Range(scanner) => {
                 let mut scan = point_cloud::decode(data)?;
                 self.notes.agree(topic_name, scanner, &mut scan.scanner);
@@ -441,37 +426,63 @@ impl Recording {
                 self.true_depth_m = Some(foxglove::decode_depth_m(data)?);
                 return Ok(None);
             }
-            Topic::TruePose(camera) => {
-                self.notes
-                    .agree_frames(topic_name, ["world", camera.as_str()], data)?;
-                let (stamp, world_from_camera, psnr_ceiling) = foxglove::decode_true_pose(data)?;
-                let depth_m = self.true_depth_m.take().unwrap_or_else(|| Arc::from([]));
-                let color = self.true_color.take();
-                let image = color
-                    .filter(|image| *image.camera == **camera && image.stamp == stamp)
-                    .ok_or(Malformed::Missing {
-                        name: "true color of this pose",
-                    })?;
-                let n_px = image.size_px[0] as usize * image.size_px[1] as usize;
-                if !depth_m.is_empty() && depth_m.len() != n_px {
-                    return Err(Malformed::Missing {
-                        name: "true depth of this pose",
-                    });
-                }
-                Sample::Truth(TruthImage {
-                    image,
-                    depth_m,
-                    world_from_camera,
-                    psnr_ceiling,
-                })
-            }
+            Topic::TruePose(camera) => Sample::Truth(self.truth(topic_name, camera, data)?),
         }))
+    }
+
+    /// A pose of the base, or its true pose in the frame `base_truth`.
+    fn base_pose(
+        &mut self,
+        topic_name: &str,
+        frame: &str,
+        data: &[u8],
+    ) -> Result<BasePose, Malformed> {
+        self.notes
+            .agree_frames(topic_name, ["world", frame], data)?;
+        let (stamp, world_from_base) = foxglove::decode_transform(data)?;
+        Ok(BasePose {
+            stamp,
+            world_from_base,
+        })
+    }
+
+    /// Completes a ground-truth sample with its pose, which follows its images in the file.
+    fn truth(
+        &mut self,
+        topic_name: &str,
+        camera: &str,
+        data: &[u8],
+    ) -> Result<TruthImage, Malformed> {
+        self.notes
+            .agree_frames(topic_name, ["world", camera], data)?;
+        let (stamp, world_from_camera, psnr_ceiling) = foxglove::decode_true_pose(data)?;
+        let depth_m = self.true_depth_m.take().unwrap_or_else(|| Arc::from([]));
+        let color = self.true_color.take();
+        // The images of another camera or time would give scores against the wrong truth.
+        let image = color
+            .filter(|image| *image.camera == *camera && image.stamp == stamp)
+            .ok_or(Malformed::Missing {
+                name: "true color of this pose",
+            })?;
+        let n_px = image.size_px[0] as usize * image.size_px[1] as usize;
+        if !depth_m.is_empty() && depth_m.len() != n_px {
+            return Err(Malformed::Missing {
+                name: "true depth of this pose",
+            });
+        }
+        Ok(TruthImage {
+            image,
+            depth_m,
+            world_from_camera,
+            psnr_ceiling,
+        })
     }
 
     /// Decodes an image of the kind that its topic requires.
     fn image(&mut self, channel: &Channel, camera: &str, data: &[u8]) -> Result<Image, Malformed> {
         let mut image = foxglove::decode_image(&channel.schema_name, data)?;
-        let (color, depth) = ("a color format", "16UC1 (depth)");
+        let color = "a color format";
+        let depth = "16UC1 (depth)";
         let (found, expected) = match (&channel.topic, image.is_depth()) {
             (Topic::Depth(_), false) => (color, depth),
             (Topic::Color(_) | Topic::TrueColor(_), true) => (depth, color),
@@ -493,7 +504,7 @@ fn other_channel(id: u16) -> String {
     format!("another channel of the file has the same number, {id}")
 }
 
-/// What differs from recordings of this program and does not prevent reading.
+/// Differences from recordings of this program that do not prevent reading.
 #[derive(Debug, Default)]
 struct Notes(BTreeMap<(String, &'static str), String>);
 
@@ -509,6 +520,7 @@ impl Notes {
         subject: &'static str,
         difference: impl FnOnce() -> String,
     ) {
+        // Millions of messages may have the same difference.
         if let Entry::Vacant(entry) = self.0.entry((place, subject)) {
             let place = entry.key().0.clone();
             let difference = entry.insert(difference());
@@ -541,6 +553,8 @@ impl Notes {
             return Ok(());
         }
         let [expected_parent, expected_child] = expected;
+        // The inverse of a pose is a pose, too, so nothing later would notice. The robot would move
+        // backwards.
         if [child, parent] == expected {
             let expected = format!("{expected_parent:?}: the pose is inverted");
             return Err(Malformed::Unsupported {
@@ -555,6 +569,20 @@ impl Notes {
             )
         });
         Ok(())
+    }
+
+    /// Compares the scale of a depth image with that in the metadata of its channel.
+    fn check_depth_scale(&mut self, channel: &Channel, image: &Image) {
+        if let (PixelFormat::DepthU16 { meters_per_count }, Some(listed)) =
+            (image.format, &channel.metadata)
+            && listed.parse::<f64>() != Ok(meters_per_count)
+        {
+            self.add(&channel.topic_name, "meters_per_count", || {
+                format!(
+                    "meters_per_count is {listed} in the metadata of the channel, but {meters_per_count} in messages, which is used"
+                )
+            });
+        }
     }
 
     /// Compares the lengths of the lists of a joint state.

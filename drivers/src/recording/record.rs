@@ -61,9 +61,13 @@ impl<'a> Record<'a> {
                 name: fields.text()?,
             },
             CHANNEL => {
-                let (id, schema_id, topic) = (fields.two()?, fields.two()?, fields.text()?);
+                let id = fields.two()?;
+                let schema_id = fields.two()?;
+                let topic = fields.text()?;
                 let encoding = fields.text()?;
                 let n_bytes = fields.four()?.into();
+                // The map has its own length in bytes, so its entries cannot reach into the next
+                // field.
                 let mut entries = Fields(fields.bytes(n_bytes)?);
                 let mut metadata = BTreeMap::new();
                 while !entries.0.is_empty() {
@@ -83,18 +87,22 @@ impl<'a> Record<'a> {
                 let _times = fields.bytes(8 + 8)?;
                 Self::Message {
                     channel_id,
+                    // The data of a message extend to the end of the record, without a length.
                     data: fields.0,
                 }
             }
             ATTACHMENT => {
                 let _times = fields.bytes(8 + 8)?;
-                let (name, _media_type) = (fields.text()?, fields.text()?);
+                let name = fields.text()?;
+                let _media_type = fields.text()?;
                 let n_bytes = fields.eight()?;
                 let data = fields.bytes(n_bytes)?;
                 let checksummed = &bytes[..bytes.len() - fields.0.len()];
                 let stored_crc = fields.four()?;
+                // 0 means that the writer computed no checksum.
                 if stored_crc != 0 && stored_crc != crc32fast::hash(checksummed) {
                     return Err(RecordError::Checksum {
+                        // The name comes from a damaged record, and may be megabytes of garbage.
                         name: name.chars().take(100).collect(),
                     });
                 }

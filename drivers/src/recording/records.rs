@@ -10,7 +10,8 @@ use lz4_flex::frame::FrameDecoder;
 use ruzstd::decoding::StreamingDecoder;
 use std::io::{Cursor, Read, Seek, SeekFrom};
 
-/// Maximum allocation before any byte of a record was read.
+/// Maximum allocation before any byte of a record was read. Most records are smaller, and take one
+/// allocation; a damaged length costs no more than this.
 const MAX_PREALLOCATED_BYTES: u64 = 1 << 20;
 /// Length of a record's header: opcode and length.
 const HEAD_BYTES: usize = 1 + 8;
@@ -85,12 +86,15 @@ impl<R: Read> Records<R> {
     /// Returns the next record, or `None` at the footer and after an error.
     pub(super) fn next(&mut self) -> Result<Option<RawRecord>, ReadError> {
         let next = if self.ended { Ok(None) } else { self.read() };
+        // After an error, the position in the file means nothing.
         self.ended |= !matches!(next, Ok(Some(_)));
         next
     }
 
     fn read(&mut self) -> Result<Option<RawRecord>, ReadError> {
         loop {
+            // Checked after the last record of the chunk has been returned: the records before
+            // damage are worth having, and the error then ends the recording.
             if let Some(chunk) = self.chunk.take_if(|chunk| chunk.n_remaining == 0) {
                 let computed = chunk.hasher.finalize();
                 if chunk.checksum != 0 && chunk.checksum != computed {
@@ -121,10 +125,14 @@ impl<R: Read> Records<R> {
                 }
                 continue;
             };
+            // Records of an uncompressed chunk are read straight from the file. A chunk that was
+            // cut off by a crash thus yields all its complete records.
             let input: &mut dyn Read = match decompressed {
                 Some(records) => records,
                 None => &mut self.input,
             };
+            // Compared before reading, because a record must not take bytes of what follows the
+            // chunk.
             if *n_remaining < HEAD_BYTES as u64 {
                 return Err(ReadError::ExceedsChunk);
             }
@@ -145,10 +153,12 @@ impl<R: Read> Records<R> {
         let four =
             |at: usize| u32::from_le_bytes([head[at], head[at + 1], head[at + 2], head[at + 3]]);
         let n_uncompressed = u64::from(four(16)) | u64::from(four(20)) << 32;
-        let (checksum, n_name) = (four(24), u64::from(four(28)));
+        let checksum = four(24);
+        let n_name = u64::from(four(28));
         let compression = bytes_of(&mut self.input, n_name)?;
         let n_stored = u64::from_le_bytes(array(&mut self.input)?);
         let n_head = CHUNK_HEAD_BYTES as u64 + n_name + 8;
+        // Newer writers may add fields after the records.
         let n_padding = n_bytes
             .checked_sub(n_head)
             .and_then(|n| n.checked_sub(n_stored))
@@ -231,6 +241,7 @@ fn bytes_of(input: &mut (impl Read + ?Sized), n_bytes: u64) -> Result<Vec<u8>, R
     if Budget::RECORD.check_bytes(n_bytes).is_err() {
         return Err(ReadError::TooLong { n_bytes });
     }
+    // `n_bytes` is what the file declares. Only as much memory is taken as bytes arrive.
     let n_preallocated =
         usize::try_from(n_bytes.min(MAX_PREALLOCATED_BYTES)).expect("at most one megabyte");
     let mut bytes = Vec::with_capacity(n_preallocated);
@@ -281,6 +292,7 @@ fn decompress_all(
         });
     }
     let mut records = Vec::new();
+    // A chunk may consist of several frames, as parallel compressors write them.
     while (records.len() as u64) < declared_bytes && !frames.is_empty() {
         decompress(
             &mut frames,

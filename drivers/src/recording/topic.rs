@@ -10,7 +10,7 @@ pub(super) const JOINT_NAMES: &str = "joint_names";
 /// Metadata key of the scale of depth counts, in the channel of the depth images.
 pub(super) const METERS_PER_COUNT: &str = "meters_per_count";
 
-/// MCAP's names of the encodings of messages.
+/// Names of message encodings in MCAP.
 const PROTOBUF: &str = "protobuf";
 const JSON: &str = "json";
 
@@ -79,7 +79,7 @@ impl Topic {
         }
     }
 
-    /// The key that is used of the metadata of a channel.
+    /// The key in the metadata of a channel that is used.
     pub(super) fn metadata_key(&self) -> Option<&'static str> {
         match self {
             Self::Joints => Some(JOINT_NAMES),
@@ -102,6 +102,8 @@ impl Topic {
         {
             return Some(Self::Range(scanner.to_owned()));
         }
+        // Names of cameras contain no slash, so the first one ends the name, although kinds such as
+        // `truth/color` contain one, too.
         let (camera, kind) = name.strip_prefix("/camera/")?.split_once('/')?;
         let camera = camera.to_owned();
         Some(match kind {

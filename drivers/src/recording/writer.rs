@@ -15,7 +15,10 @@ use std::fs::File;
 use std::io::{BufWriter, ErrorKind, Seek, Write};
 use std::path::{Path, PathBuf};
 
+/// Size from which on a chunk is closed. Viewers read whole chunks, and their index has one entry
+/// per chunk: smaller chunks make the index longer, larger ones make seeking slower.
 const CHUNK_BYTES: u64 = 4 << 20;
+/// Longest time of samples in an open chunk, which a crash loses. Shorter times write more often.
 const FLUSH_NANOS: i64 = 1_000_000_000;
 
 /// Description of the rig, written before the first sample.
@@ -74,6 +77,8 @@ impl Recorder {
             },
         })?;
         let recorder = Self::to(Box::new(BufWriter::new(file)), path, recording_metadata);
+        // A file with only a header looks like a recording, and would block the name for the next
+        // attempt.
         if recorder.is_err() {
             remove_stub(path);
         }
@@ -92,8 +97,12 @@ impl Recorder {
         };
         let options = mcap::WriteOptions::new()
             .profile("fieldrig")
+            // Noisy images hardly compress (docs/benchmarks/2026-11-23-reference-figures.md), and
+            // only in uncompressed chunks are all complete records readable after a crash.
             .compression(None)
             .chunk_size(Some(CHUNK_BYTES))
+            // Nothing is patched later, so that whatever has been written is readable after a
+            // crash.
             .disable_seeking(true);
         let mut mcap = options.create(sink).map_err(recorder)?;
         for (name, data) in recording_metadata.files {
@@ -106,6 +115,7 @@ impl Recorder {
             };
             mcap.attach(&attachment).map_err(recorder)?;
         }
+        // The rig file must survive a crash before the first chunk is full.
         mcap.flush().map_err(recorder)?;
         Ok(Self {
             path: path.to_owned(),
@@ -215,6 +225,8 @@ impl Recorder {
     /// Closes the open chunk, which writes all samples to the file.
     fn close_chunk(&mut self) -> mcap::McapResult<()> {
         self.mcap()?.flush()?;
+        // Each flush is a good time to notice a removal: the file system has just been accessed
+        // anyway.
         self.check_place();
         self.recorded = RecordedSpan {
             n_samples: self.n_samples,
@@ -226,6 +238,22 @@ impl Recorder {
 
     fn try_write(&mut self, sample: &Sample) -> mcap::McapResult<()> {
         let stamp = sample.stamp();
+        self.announce_rig(stamp)?;
+        self.write_sample(sample)?;
+        self.n_samples += 1;
+        self.stamps = Some(with_stamp(self.stamps, stamp));
+        // Sample time instead of a clock: the same samples give the same file, byte for byte.
+        let open_since = *self.open_since.get_or_insert(stamp);
+        if self.open_bytes >= CHUNK_BYTES || stamp.0.saturating_sub(open_since.0) >= FLUSH_NANOS {
+            self.close_chunk()?;
+            self.open_since = Some(stamp);
+        }
+        Ok(())
+    }
+
+    /// Writes what readers and viewers need before the first sample: the joint names, and the lens
+    /// parameters with the stamp of that sample. Later calls write nothing.
+    fn announce_rig(&mut self, stamp: Stamp) -> mcap::McapResult<()> {
         if self.n_messages == 0 && !self.joint_names.is_empty() {
             // The channel is announced before all samples, so that readers know the joints
             // immediately.
@@ -240,6 +268,11 @@ impl Recorder {
                 &message,
             )?;
         }
+        Ok(())
+    }
+
+    fn write_sample(&mut self, sample: &Sample) -> mcap::McapResult<()> {
+        let stamp = sample.stamp();
         match sample {
             Sample::Image(image) => {
                 let camera = image.camera.to_string();
@@ -280,19 +313,14 @@ impl Recorder {
             }
             Sample::Truth(truth) => self.write_truth(truth)?,
         }
-        self.n_samples += 1;
-        self.stamps = Some(with_stamp(self.stamps, stamp));
-        let open_since = *self.open_since.get_or_insert(stamp);
-        if self.open_bytes >= CHUNK_BYTES || stamp.0.saturating_sub(open_since.0) >= FLUSH_NANOS {
-            self.close_chunk()?;
-            self.open_since = Some(stamp);
-        }
         Ok(())
     }
 
     fn write_truth(&mut self, truth: &TruthImage) -> mcap::McapResult<()> {
         let camera = || truth.image.camera.to_string();
         let stamp = truth.image.stamp;
+        // The pose comes last: it completes the sample for the reader, which drops incomplete ones
+        // at the end of a truncated file.
         self.write_image(Topic::TrueColor(camera()), &truth.image)?;
         if !truth.depth_m.is_empty() {
             let message =
@@ -407,7 +435,8 @@ impl std::fmt::Debug for Recorder {
 
 /// Counts the readable samples of a truncated recording.
 fn readable(path: &Path) -> RecordedSpan {
-    let (mut n_samples, mut stamps) = (0, None);
+    let mut n_samples = 0;
+    let mut stamps = None;
     if let Ok(mut recording) = Recording::open(path) {
         while let Ok(Some(sample)) = recording.next_sample() {
             n_samples += 1;
@@ -427,7 +456,7 @@ fn with_stamp(range: Option<[Stamp; 2]>, stamp: Stamp) -> [Stamp; 2] {
 }
 
 fn duration_secs(range: Option<[Stamp; 2]>) -> f64 {
-    range.map_or(0.0, |[first, last]| (last.0 - first.0) as f64 * 1e-9)
+    range.map_or(0.0, |[first, last]| last.0.saturating_sub(first.0) as f64 * 1e-9)
 }
 
 /// Unwraps an I/O error, which is more informative than the error of the format.

@@ -89,18 +89,9 @@ impl TagDetector {
         let (images, incoming) = sync_channel(0);
         // The thread can continue while the last result waits to be received.
         let (sender, detections) = sync_channel(1);
-        let detect_all = move || {
-            // The detector is created on this thread because it cannot be sent between threads.
-            let mut detector = detector(family);
-            while let Ok(image) = incoming.recv() {
-                if sender.send(detect(&mut detector, &image)).is_err() {
-                    return;
-                }
-            }
-        };
         let thread = std::thread::Builder::new()
             .name("tags".to_owned())
-            .spawn(detect_all);
+            .spawn(move || detect_all(family, &incoming, &sender));
         thread.map_err(|source| Error::Thread {
             device: "tags".to_owned(),
             source,
@@ -143,6 +134,21 @@ impl TagDetector {
     }
 }
 
+/// Thread function: detects tags until either channel is closed.
+fn detect_all(
+    family: Family,
+    incoming: &Receiver<Image>,
+    sender: &SyncSender<Result<TagDetections, Error>>,
+) {
+    // The detector is created on this thread because it cannot be sent between threads.
+    let mut detector = detector(family);
+    while let Ok(image) = incoming.recv() {
+        if sender.send(detect(&mut detector, &image)).is_err() {
+            return;
+        }
+    }
+}
+
 fn detector(family: Family) -> Detector {
     let tag_family = match family {
         Family::Tag36h11 => ApriltagFamily::tag_36h11(),
@@ -155,6 +161,7 @@ fn detector(family: Family) -> Detector {
         .add_family_bits(tag_family, CORRECTED_BITS)
         .build();
     let mut detector = detector.expect("the detector has a family");
+    // The detector has its own thread. More of them would compete with training for the processor.
     detector.set_thread_number(1);
     detector
 }
@@ -163,36 +170,43 @@ fn detector(family: Family) -> Detector {
 fn detect(detector: &mut Detector, image: &Image) -> Result<TagDetections, Error> {
     let rgb = image.decode_rgb()?;
     let [width, height] = image.size_px.map(|side| side as usize);
-    let tag_detections = |tags| TagDetections {
+    let mut detections = TagDetections {
         camera: Arc::clone(&image.camera),
         stamp: image.stamp,
-        tags,
+        tags: Vec::new(),
     };
     if width.min(height) < MIN_SIDE_PX {
-        return Ok(tag_detections(Vec::new()));
+        return Ok(detections);
     }
     let mut gray =
         Gray::zeros_with_alignment(width, height, 1).map_err(|_| image.wrong_kind("color"))?;
     for (gray, [red, green, blue]) in gray.as_slice_mut().iter_mut().zip(rgb.as_chunks().0) {
         // Rec. 601 luma weights in units of 1/256.
+        // The weights add up to 256, so the second byte of the sum is the gray value.
         let parts = 77 * u32::from(*red) + 150 * u32::from(*green) + 29 * u32::from(*blue);
         *gray = parts.to_le_bytes()[1];
     }
+    // Half the resolution takes a quarter of the time in the search, and the tags of a large image
+    // still have enough pixels.
     detector.set_decimation(if width * height < DECIMATE_ABOVE_PX {
         1.0
     } else {
         2.0
     });
     let new_detections = detector.detect(&gray);
-    let is_clear = |tag: &&apriltag::Detection| tag.decision_margin() >= MIN_MARGIN;
-    let detection = |tag: &apriltag::Detection| {
-        Some(TagDetection {
-            id: tag.id().try_into().ok()?,
-            corners_px: tag.corners(),
-        })
-    };
-    let tags = new_detections.iter().filter(is_clear).filter_map(detection);
-    Ok(tag_detections(tags.collect()))
+    let clear = new_detections
+        .iter()
+        .filter(|tag| tag.decision_margin() >= MIN_MARGIN);
+    detections.tags = clear.filter_map(detection).collect();
+    Ok(detections)
+}
+
+/// The id and corners of a tag; `None` if the id does not fit, which no family has.
+fn detection(tag: &apriltag::Detection) -> Option<TagDetection> {
+    Some(TagDetection {
+        id: tag.id().try_into().ok()?,
+        corners_px: tag.corners(),
+    })
 }
 
 #[cfg(test)]

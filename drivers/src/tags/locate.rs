@@ -19,11 +19,14 @@ const CORNER_SIGMA_PX: f64 = 0.2;
 /// tags viewed at a grazing angle are unreliable.
 const HUBER_PX: f64 = 3.0 * CORNER_SIGMA_PX;
 /// Maximum root mean square error, pixels. If it is larger, the corners do not match the tags of
-/// the rig file.
+/// the rig file. The bound lets through poses from measured tags and inaccurate intrinsics, whose
+/// errors are several times the noise of corners.
 const MAX_RMS_ERROR_PX: f64 = 3.0;
 /// Minimum ratio of the cost of the second-best pose to the best cost. Below it, the pose is
-/// ambiguous.
+/// ambiguous. A larger value rejects more correct poses of small or distant tags, a smaller one
+/// accepts more poses with the wrong tilt.
 const MIN_AMBIGUITY_RATIO: f64 = 3.0;
+/// Far more than needed from either start. It only bounds the time for corners that no pose fits.
 const MAX_ITERATIONS: usize = 50;
 
 /// A tag with a known pose.
@@ -50,6 +53,8 @@ pub struct RollingShutterCamera<'a> {
 impl RollingShutterCamera<'_> {
     /// Maps the camera frame at mid-exposure to the camera frame at the time of a row.
     fn row_from_mid_exposure(&self, row_px: f64) -> Transform {
+        // Rows are exposed from the top to the bottom at a constant rate. Corners just outside of
+        // the image belong to its first or last row.
         let since_mid_exposure_frac = row_px / f64::from(self.intrinsics.size_px[1].max(1)) - 0.5;
         transform::exp(
             &self.twist,
@@ -128,8 +133,11 @@ pub fn locate(
     if rms_error_px > MAX_RMS_ERROR_PX {
         return Err(LocateError::LargeReprojectionError { rms_error_px });
     }
-    // Contribution of noise to the cost.
+    // Contribution of noise to the cost. With it on both sides, the ratio of two nearly perfect
+    // fits is about 1, and their tiny costs do not decide which tilt is right.
     let floor = corners.len() as f64 * CORNER_SIGMA_PX * CORNER_SIGMA_PX;
+    // Solutions from several tags usually converge to one pose. 0.05 rad (3 degrees) separates
+    // rounding differences of one minimum from two minima, which are mirror images of each other.
     let is_different_pose = |(_, pose): &&(f64, Transform)| {
         (pose * camera_from_world.inverse()).rotation.angle() > 0.05
     };
@@ -140,7 +148,11 @@ pub fn locate(
     {
         return Err(LocateError::Ambiguous);
     }
+    // The residuals of four corners may be small by chance, as there are only two more measurements
+    // than unknowns.
     let sigma_px = rms_error_px.max(CORNER_SIGMA_PX);
+    // The inverse of the normal matrix, times the variance of a corner, is the covariance of the
+    // least-squares solution.
     let (_, normal_matrix, _) =
         equations(intrinsics, &corners, &camera_from_world).ok_or(LocateError::NoTag)?;
     let covariance =
@@ -203,22 +215,28 @@ fn pose_from_homography(size_m: f64, rays: [Vector3<f64>; 4]) -> Option<Transfor
     let mut rows = SMatrix::<f64, 8, 8>::zeros();
     let mut rhs = SVector::<f64, 8>::zeros();
     for (ix, (corner, ray)) in corners_in_tag(size_m).iter().zip(rays).enumerate() {
-        let ([x, y], [u, v]) = ([corner.x, corner.y], [ray.x / ray.z, ray.y / ray.z]);
+        let [x, y] = [corner.x, corner.y];
+        let [u, v] = [ray.x / ray.z, ray.y / ray.z];
+        // `u = (h0 x + h1 y + h2) / (h6 x + h7 y + 1)`, and alike for v, multiplied by the
+        // denominator. The last element is set to 1, as the tag's center is in front of the camera.
         rows.set_row(2 * ix, &[x, y, 1.0, 0.0, 0.0, 0.0, -u * x, -u * y].into());
         rows.set_row(
             2 * ix + 1,
             &[0.0, 0.0, 0.0, x, y, 1.0, -v * x, -v * y].into(),
         );
-        (rhs[2 * ix], rhs[2 * ix + 1]) = (u, v);
+        rhs[2 * ix] = u;
+        rhs[2 * ix + 1] = v;
     }
     let h = rows.lu().solve(&rhs)?;
-    let (first, second, center) = (
-        Vector3::new(h[0], h[3], h[6]),
-        Vector3::new(h[1], h[4], h[7]),
-        Vector3::new(h[2], h[5], 1.0),
-    );
+    let first = Vector3::new(h[0], h[3], h[6]);
+    let second = Vector3::new(h[1], h[4], h[7]);
+    let center = Vector3::new(h[2], h[5], 1.0);
+    // The columns are the axes of the tag and its position, up to a common factor. Noise makes the
+    // lengths of both axes differ, so their mean is used.
     let scale = 2.0 / (first.norm() + second.norm());
-    let (x, y) = (first * scale, second * scale);
+    let x = first * scale;
+    let y = second * scale;
+    // Noise also tilts the axes against each other. `from_matrix` finds a rotation close to them.
     let approximate = Matrix3::from_columns(&[x, y, x.cross(&y)]);
     let rotation = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix(&approximate));
     let pose = Transform::from_parts((center * scale).into(), rotation);
@@ -234,18 +252,23 @@ fn refine(
     let (mut cost, mut normal_matrix, mut rhs) = equations(intrinsics, corners, &pose)?;
     let mut damping = 1e-4;
     for _ in 0..MAX_ITERATIONS {
+        // Marquardt's scaling by the diagonal: meters and radians have different magnitudes.
         let damped = normal_matrix + Matrix6::from_diagonal(&(normal_matrix.diagonal() * damping));
         let step = damped.cholesky()?.solve(&rhs);
         let twist = Twist {
             linear_m_s: step.fixed_rows::<3>(0).into(),
             angular_rad_s: step.fixed_rows::<3>(3).into(),
         };
+        // The step is a motion of the world in the axes of the camera, so it is applied from the
+        // left.
         let next = transform::exp(&twist, 1.0) * pose;
         match equations(intrinsics, corners, &next) {
             Some(improved) if improved.0 < cost => {
                 let decrease = cost - improved.0;
-                (pose, damping) = (next, damping * 0.1);
+                pose = next;
+                damping *= 0.1;
                 (cost, normal_matrix, rhs) = improved;
+                // Further steps would only change the last digits of the pose.
                 if decrease < 1e-9 * cost {
                     break;
                 }
@@ -264,7 +287,9 @@ fn equations(
     corners: &[Corner],
     camera_from_world: &Transform,
 ) -> Option<(f64, Matrix6<f64>, Vector6<f64>)> {
-    let (mut cost, mut normal_matrix, mut rhs) = (0.0, Matrix6::zeros(), Vector6::zeros());
+    let mut cost = 0.0;
+    let mut normal_matrix = Matrix6::zeros();
+    let mut rhs = Vector6::zeros();
     for Corner {
         point_in_world,
         observed_px,
@@ -282,10 +307,15 @@ fn equations(
         d_point_d_pose
             .fixed_view_mut::<3, 3>(0, 3)
             .copy_from(&-point.cross_matrix());
+        // The chain rule: pixel by the point at its row, by the point at mid-exposure, by the pose.
+        // The motion during the exposure is known, so it adds only its rotation.
         let jacobian = d_pixel_d_point
             * row_from_mid_exposure.rotation.to_rotation_matrix().matrix()
             * d_point_d_pose;
         let residual_px = residual.norm();
+        // Weights of iteratively reweighted least squares: 1 up to the threshold, then inversely
+        // proportional to the residual. The cost is Huber's, twice the usual form: `r²` up to the
+        // threshold `h`, `2 h r - h²` above.
         let weight = HUBER_PX / residual_px.max(HUBER_PX);
         cost += weight * (2.0 - weight) * residual_px * residual_px;
         normal_matrix += jacobian.transpose() * jacobian * weight;

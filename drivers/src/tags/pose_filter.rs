@@ -36,6 +36,7 @@ impl StationaryPoseFilter {
         covariance: &Matrix6<f64>,
     ) -> Option<(Transform, Matrix6<f64>)> {
         let (average, average_covariance) = self.average.as_ref()?;
+        // A larger covariance makes the average give way to new poses.
         let average_covariance = average_covariance / FORGETTING_FACTOR;
         let residual = transform::log(&(average.inverse() * pose), 1.0);
         let residual = Vector6::from_iterator(
@@ -45,10 +46,14 @@ impl StationaryPoseFilter {
                 .chain(&residual.angular_rad_s)
                 .copied(),
         );
+        // The Kalman filter of a constant: the distance between average and pose has the sum of
+        // both covariances.
         let innovation_inverse = (average_covariance + covariance).try_inverse()?;
         if (residual.transpose() * innovation_inverse * residual).x > MAX_CHI_SQUARED {
             return None;
         }
+        // Each axis moves to the new pose in proportion to how uncertain the average is there. Tags
+        // far away determine the distance poorly but the direction well.
         let gain = average_covariance * innovation_inverse;
         let step = gain * residual;
         let twist = Twist {

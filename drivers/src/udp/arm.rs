@@ -34,7 +34,7 @@ impl UdpArm {
         self.states.counts()
     }
 
-    /// The same statistics for another thread.
+    /// A handle with which another thread can read these statistics.
     pub fn monitor(&self) -> DatagramMonitor {
         self.states.monitor()
     }

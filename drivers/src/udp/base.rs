@@ -37,7 +37,7 @@ impl UdpBase {
         self.poses.counts()
     }
 
-    /// The same statistics for another thread.
+    /// A handle with which another thread can read these statistics.
     pub fn monitor(&self) -> DatagramMonitor {
         self.poses.monitor()
     }
@@ -48,6 +48,7 @@ impl Base for UdpBase {
         let until = Instant::now() + timeout;
         let decode = |bytes: &[u8]| decode_pose(bytes).map(|pose| (pose.header, Some(pose)));
         loop {
+            // Skipped poses must not extend the wait.
             let remaining = until.saturating_duration_since(Instant::now());
             let (stamp, pose) = self
                 .poses
@@ -59,6 +60,7 @@ impl Base for UdpBase {
                         "skipped a pose with a standard deviation of {m:.3} m and {rad:.4} rad"
                     );
                     count_and_warn("base", &mut self.poses.counts.n_uncertain, 1, what);
+                    // The reader has published the counts before this pose was judged.
                     self.poses.publish_counts();
                 }
                 _ => {

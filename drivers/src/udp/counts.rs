@@ -72,7 +72,7 @@ impl DatagramMonitor {
         self.state.lock().counts
     }
 
-    /// Why the last rejected datagram was rejected; `None` if none was.
+    /// Reason for the last rejection; `None` if no datagram was rejected.
     pub fn last_rejection(&self) -> Option<String> {
         self.state.lock().last_rejection.clone()
     }
@@ -91,15 +91,15 @@ pub(super) const CLOCK_RESTARTED: &str =
     "the sender's clock restarted or jumped, or it does not count nanoseconds";
 
 /// Another sender may replace the current one after this time without a datagram from it. A
-/// restarted sender usually has a new address.
+/// restarted sender usually has a new address. A shorter time would let two programs alternate when
+/// one of them pauses; a longer one delays the data of a restarted sender.
 const MAX_SENDER_SILENCE: Duration = Duration::from_secs(2);
 
-/// This many datagrams from as many ports of one host, none of which is used twice, come from a
-/// single program that opens a socket for each datagram: up to four programs that keep their
-/// sockets would repeat a port.
+/// If this many datagrams come from different ports of one host, one program has opened a socket
+/// for each of them. Up to four programs that keep their sockets would have used a port again.
 const MIN_NEW_PORTS: usize = 5;
-/// Number of recent ports of such a program that are remembered. Few, because systems choose ports
-/// at random.
+/// Number of recent ports of such a program that are stored. It is small, because the system
+/// chooses ports at random and may soon choose one again.
 const MAX_RECENT_PORTS: usize = 8;
 
 /// The current sender: one at a time, so that the data of two programs cannot mix.
@@ -129,6 +129,8 @@ impl Senders {
         match self.current {
             Some((current, last)) if !self.is_current(current, from) => {
                 let is_silent = at.duration_since(last) >= MAX_SENDER_SILENCE;
+                // Asked first, because such a sender is never silent: each datagram would otherwise
+                // be ignored as that of another program.
                 if self.finds_new_ports(current, from) {
                     log::warn!(
                         "{device}: every datagram comes from another port of {}, so its sender opens a socket for each of \
@@ -141,8 +143,10 @@ impl Senders {
                         "now receiving from {from}; {current} was silent for more than {MAX_SENDER_SILENCE:?}"
                     );
                     count_and_warn(device, &mut self.n_changes, 1, what);
+                    // The ports seen so far are those of another program.
                     if self.has_new_ports || current.ip() != from.ip() {
-                        (self.has_new_ports, self.recent_ports) = (false, VecDeque::new());
+                        self.has_new_ports = false;
+                        self.recent_ports = VecDeque::new();
                     }
                 } else {
                     let ports = if self.has_new_ports {
@@ -154,10 +158,13 @@ impl Senders {
                         "ignored a datagram from {from}, because {current}{ports} is also sending; stop one of them"
                     );
                     count_and_warn(device, n_foreign, 1, what);
+                    // Nothing of the current sender changes: ignored datagrams must not keep it
+                    // alive.
                     return false;
                 }
                 self.keeps_port = false;
             }
+            // A second datagram from one port: this sender keeps its socket.
             Some(_) if !self.has_new_ports => {
                 self.keeps_port = true;
                 self.recent_ports.clear();
@@ -176,20 +183,25 @@ impl Senders {
 
     /// Whether a datagram comes from the current sender.
     fn is_current(&self, current: SocketAddr, from: SocketAddr) -> bool {
-        match self.has_new_ports {
-            true => current.ip() == from.ip() && !self.recent_ports.contains(&from.port()),
-            false => current == from,
+        if self.has_new_ports {
+            // A port that was used before belongs to a second program, which keeps its socket.
+            current.ip() == from.ip() && !self.recent_ports.contains(&from.port())
+        } else {
+            current == from
         }
     }
 
     /// Notes a datagram from another address than the current one. Returns whether it shows that
     /// the sender uses a new port for each datagram.
     fn finds_new_ports(&mut self, current: SocketAddr, from: SocketAddr) -> bool {
+        // A sender that keeps its port is known to be one program; another port of its host is
+        // another program.
         if self.has_new_ports || self.keeps_port || current.ip() != from.ip() {
             return false;
         }
         if self.recent_ports.contains(&from.port()) {
-            self.recent_ports.clear(); // A second program, which keeps its port.
+            // A second program, which keeps its port.
+            self.recent_ports.clear();
         }
         if self.recent_ports.is_empty() {
             self.recent_ports.push_back(current.port());
@@ -205,6 +217,7 @@ impl Senders {
 pub(super) fn count_and_warn(device: &str, n: &mut u64, more: u64, what: impl fmt::Display) {
     let before = n.checked_ilog2();
     *n = n.saturating_add(more);
+    // The logarithm changes at 1, 2, 4, 8 and so on.
     if n.checked_ilog2() != before {
         log::warn!("{device}: {what} ({n} so far)");
     }

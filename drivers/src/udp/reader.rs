@@ -31,18 +31,13 @@ impl DatagramReader {
     ) -> Result<Self, Error> {
         let receiver = Receiver::open(device.to_owned(), address)?;
         let monitor = DatagramMonitor::new(device, receiver.address());
-        let (sequence, counts, senders) = (
-            SequenceTracker::default(),
-            DatagramCounts::default(),
-            Senders::default(),
-        );
         Ok(Self {
             plural,
             receiver,
-            sequence,
-            counts,
+            sequence: SequenceTracker::default(),
+            counts: DatagramCounts::default(),
             monitor,
-            senders,
+            senders: Senders::default(),
         })
     }
 
@@ -56,7 +51,7 @@ impl DatagramReader {
         self.counts
     }
 
-    /// The same statistics for another thread.
+    /// A handle with which another thread can read these statistics.
     pub(super) fn monitor(&self) -> DatagramMonitor {
         self.monitor.clone()
     }
@@ -81,101 +76,123 @@ impl DatagramReader {
             if reading.is_some() {
                 return Ok(reading);
             }
+            // Even if invalid datagrams keep arriving.
             if Instant::now() >= until {
-                break; // Even if invalid datagrams keep arriving.
+                break;
             }
         }
         Ok(None)
     }
 
+    /// Checks one datagram and counts it. Returns its stamp and value, if it has a new one.
     pub(super) fn take<T>(
         &mut self,
         datagram: &ReceivedDatagram,
         decode: impl Fn(&[u8]) -> Result<(DatagramHeader, Option<T>), Malformed>,
     ) -> Option<(Stamp, T)> {
-        let Self {
-            plural,
-            receiver,
-            sequence,
-            counts,
-            monitor,
-            senders,
-        } = self;
-        let device = receiver.device();
-        counts.n_received += 1;
+        self.counts.n_received += 1;
+        let plural = self.plural;
         count_and_warn(
-            device,
-            &mut counts.n_dropped,
+            self.receiver.device(),
+            &mut self.counts.n_dropped,
             datagram.n_dropped,
             format_args!("{plural} were dropped because the program was too slow"),
         );
         let (header, reading) = match decode(&datagram.bytes) {
             Ok(decoded) => decoded,
             Err(error) => {
-                count_and_warn(
-                    device,
-                    &mut counts.n_rejected,
-                    1,
-                    format_args!("rejected a datagram: {error}"),
-                );
-                monitor.set_last_rejection(error.to_string());
+                self.reject(error.to_string());
                 return None;
             }
         };
-        if !senders.accepts(device, datagram.from, datagram.at, &mut counts.n_foreign) {
+        // The sender is judged only by valid datagrams: whatever else reaches the port, such as a
+        // port scan, must not take the place of the current sender.
+        let device = self.receiver.device();
+        let n_foreign = &mut self.counts.n_foreign;
+        if !self
+            .senders
+            .accepts(device, datagram.from, datagram.at, n_foreign)
+        {
             return None;
         }
-        match sequence.position(header.seq, datagram.at) {
+        if !self.is_new(&header, datagram.at) {
+            return None;
+        }
+        // Checked after the sequence number, so that states of other joints do not count as lost.
+        let Some(reading) = reading else {
+            self.count_other();
+            return None;
+        };
+        let stamp = self.stamp(&header, datagram.at)?;
+        Some((stamp, reading))
+    }
+
+    /// Whether a datagram is newer than all before it. Counts lost and late ones, and restarts.
+    fn is_new(&mut self, header: &DatagramHeader, arrival: Stamp) -> bool {
+        let plural = self.plural;
+        let device = self.receiver.device();
+        match self.sequence.position(header.seq, arrival) {
             SequencePosition::New { n_lost } => count_and_warn(
                 device,
-                &mut counts.n_lost,
+                &mut self.counts.n_lost,
                 n_lost,
                 format_args!("{plural} did not arrive"),
             ),
             SequencePosition::Restart => count_and_warn(
                 device,
-                &mut counts.n_restarts,
+                &mut self.counts.n_restarts,
                 1,
                 "the sender's sequence numbers restarted",
             ),
             SequencePosition::Current | SequencePosition::Late => {
                 count_and_warn(
                     device,
-                    &mut counts.n_late,
+                    &mut self.counts.n_late,
                     1,
                     format_args!("{plural} were late or duplicate"),
                 );
-                return None;
+                return false;
             }
         }
-        let Some(reading) = reading else {
-            if counts.n_other == 0 {
-                log::info!(
-                    "{device}: ignoring states that name none of the arm's joints; if these are its joints, correct arm.joints"
-                );
-            }
-            counts.n_other += 1;
-            return None;
-        };
-        let n_before = sequence.n_clock_restarts();
-        let stamp = sequence.stamp(&header, datagram.at);
+        true
+    }
+
+    /// Counts a state that names none of the joints, and explains the first one: a gripper on the
+    /// same port sends such states, but so does an arm whose joints are named wrongly.
+    fn count_other(&mut self) {
+        if self.counts.n_other == 0 {
+            let device = self.receiver.device();
+            log::info!(
+                "{device}: ignoring states that name none of the arm's joints; if these are its joints, correct arm.joints"
+            );
+        }
+        self.counts.n_other += 1;
+    }
+
+    /// The stamp of a datagram on our clock. Rejects the datagram if its stamp is impossible.
+    fn stamp(&mut self, header: &DatagramHeader, arrival: Stamp) -> Option<Stamp> {
+        let n_before = self.sequence.n_clock_restarts();
+        let stamp = self.sequence.stamp(header, arrival);
         count_and_warn(
-            device,
-            &mut counts.n_clock_restarts,
-            sequence.n_clock_restarts() - n_before,
+            self.receiver.device(),
+            &mut self.counts.n_clock_restarts,
+            self.sequence.n_clock_restarts() - n_before,
             CLOCK_RESTARTED,
         );
         if stamp.is_none() {
-            let reason = sequence::rejection(&header, datagram.at);
-            count_and_warn(
-                device,
-                &mut counts.n_rejected,
-                1,
-                format_args!("rejected a datagram: {reason}"),
-            );
-            monitor.set_last_rejection(reason);
+            self.reject(sequence::rejection(header, arrival));
         }
-        Some((stamp?, reading))
+        stamp
+    }
+
+    fn reject(&mut self, reason: String) {
+        count_and_warn(
+            self.receiver.device(),
+            &mut self.counts.n_rejected,
+            1,
+            format_args!("rejected a datagram: {reason}"),
+        );
+        self.monitor.set_last_rejection(reason);
     }
 }
 

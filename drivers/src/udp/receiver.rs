@@ -10,7 +10,8 @@ use std::sync::Arc;
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-/// Capacity of the queue in bytes. If it is exceeded, the oldest datagram is dropped.
+/// Capacity of the queue in bytes. If it is exceeded, the oldest datagram is dropped. It bounds
+/// bytes instead of datagrams, because parts of scans are a hundred times as long as joint states.
 const MAX_WAITING_BYTES: usize = 16 << 20;
 /// Approximate memory use of a datagram in addition to its bytes, so that empty ones count, too.
 const OVERHEAD_BYTES: usize = 128;
@@ -108,6 +109,8 @@ impl Receiver {
     /// Returns the oldest queued datagram, or `None` if none came until `until`.
     pub(super) fn next(&self, until: Instant) -> Result<Option<ReceivedDatagram>, Error> {
         let mut state = self.shared.state.lock();
+        // Otherwise, the first read would return a burst of old values, and the clock map would
+        // start with their delays.
         if !std::mem::replace(&mut state.has_reader, true) {
             state.discard_before(clock::now() - MAX_BUFFERED_AGE);
         }
@@ -121,6 +124,7 @@ impl Receiver {
                     n_dropped: std::mem::take(&mut state.n_dropped),
                 }));
             }
+            // Datagrams that arrived before the error are returned first.
             if let Some(source) = state.error.take() {
                 return Err(Error::Network {
                     device: self.device.clone(),
@@ -141,6 +145,7 @@ impl Shared {
         let mut buffer = vec![0; MAX_DATAGRAM_BYTES];
         loop {
             let received = socket.recv_from(&mut buffer);
+            // Before the lock, so that a reader that holds it does not delay stamps.
             let at = clock::now();
             let mut state = self.state.lock();
             if state.stop {
@@ -174,6 +179,7 @@ impl State {
         {
             self.n_bytes -= discarded.len() + OVERHEAD_BYTES;
         }
+        // Drops before the first read are no fault of a slow caller.
         self.n_dropped = 0;
     }
 

@@ -62,7 +62,7 @@ impl UdpScanner {
         self.counts
     }
 
-    /// The same statistics for another thread.
+    /// A handle with which another thread can read these statistics.
     pub fn monitor(&self) -> DatagramMonitor {
         self.monitor.clone()
     }
@@ -70,7 +70,8 @@ impl UdpScanner {
     /// Resets the state to before the first datagram.
     #[cfg(any(test, fuzzing))]
     pub(super) fn reset(&mut self) {
-        (self.sequence, self.partial_scan) = (SequenceTracker::default(), None);
+        self.sequence = SequenceTracker::default();
+        self.partial_scan = None;
         self.completed.clear();
     }
 
@@ -87,6 +88,8 @@ impl UdpScanner {
             Ok(part) => part,
             Err(error) => return self.reject(format_args!("{error}")),
         };
+        // Two scanners may send to one port by mistake, and their points would be placed with the
+        // wrong pose.
         if *part.frame != *self.name {
             return self.reject(format_args!("it belongs to another frame"));
         }
@@ -131,6 +134,8 @@ impl UdpScanner {
     fn begin(&mut self, part: ScanPart, arrival: Stamp) {
         self.finish_scan();
         let n_before = self.sequence.n_clock_restarts();
+        // The stamp comes from the first part that arrives: it has the smallest delay, and all
+        // parts carry the same stamp.
         let stamp = self.sequence.stamp(&part.header, arrival);
         let n_new_restarts = self.sequence.n_clock_restarts() - n_before;
         count_and_warn(
@@ -164,6 +169,8 @@ impl UdpScanner {
                 "a part of a scan was late or duplicate",
             );
         };
+        // Parts of two scans with one sequence number, such as after a restart of the sender, must
+        // not be mixed.
         if partial_scan.header != part.header || partial_scan.parts.len() != part.n_parts as usize {
             return self.reject(format_args!("it contradicts another part of the same scan"));
         }
@@ -193,6 +200,8 @@ impl UdpScanner {
             n_missing,
             "parts of a scan did not arrive",
         );
+        // Parts are stored by their number, so points are in order even if parts were reordered on
+        // the way.
         let points: Arc<[RangePoint]> = parts.into_iter().flatten().flatten().collect();
         self.completed.push_back(RangeScan {
             scanner: Arc::clone(&self.name),
@@ -228,8 +237,9 @@ impl RangeScanner for UdpScanner {
             };
             self.take(&datagram);
             self.monitor.set_counts(self.counts);
+            // Even if invalid datagrams keep arriving.
             if self.completed.is_empty() && Instant::now() >= until {
-                break; // Even if invalid datagrams keep arriving.
+                break;
             }
         }
         Err(Error::NoScan {

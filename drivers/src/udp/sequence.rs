@@ -4,12 +4,14 @@ use crate::wire::datagram::{Clock, DatagramHeader};
 use kinematics::{ClockMap, Stamp};
 use std::time::Duration;
 
-/// Maximum gap in the sequence numbers. A larger difference means that the sender restarted.
+/// Maximum gap in the sequence numbers. A larger difference means that the sender restarted. A gap
+/// of 1000 is a second of joint states at 1 kHz; larger gaps would count a restart as lost values.
 const MAX_SEQUENCE_GAP: u64 = 1000;
 /// Maximum delay of a reordered datagram. If the newest datagram is older than this, a lower
 /// sequence number means that the sender restarted.
 const MAX_REORDER_AGE: Duration = Duration::from_secs(1);
-/// Stamps of our own clock older than this, or ahead by more than [`MAX_AHEAD`], are invalid.
+/// Stamps of our own clock older than this, or ahead by more than [`MAX_AHEAD`], are invalid. No
+/// network delays datagrams this long; such a stamp comes from another clock.
 const MAX_AGE: Duration = Duration::from_secs(5);
 /// Tolerance for rounding. Apart from that, stamps cannot be in the future.
 const MAX_AHEAD: Duration = Duration::from_millis(1);
@@ -43,18 +45,19 @@ impl SequenceTracker {
             return SequencePosition::New { n_lost: 0 };
         };
         let is_near = seq.abs_diff(newest) <= MAX_SEQUENCE_GAP;
-        let position = match seq > newest {
-            true if is_near => SequencePosition::New {
+        let position = if is_near && seq > newest {
+            SequencePosition::New {
                 n_lost: seq - newest - 1,
-            },
-            false if is_near && arrival.duration_since(since) <= MAX_REORDER_AGE => {
-                return if seq == newest {
-                    SequencePosition::Current
-                } else {
-                    SequencePosition::Late
-                };
             }
-            _ => SequencePosition::Restart,
+        } else if is_near && arrival.duration_since(since) <= MAX_REORDER_AGE {
+            // A late datagram does not become the newest one.
+            return if seq == newest {
+                SequencePosition::Current
+            } else {
+                SequencePosition::Late
+            };
+        } else {
+            SequencePosition::Restart
         };
         self.newest = Some((seq, arrival));
         position
@@ -73,10 +76,14 @@ impl SequenceTracker {
             Clock::Device => self.clock.stamp(header.stamp_nanos, arrival),
         };
         let is_recent = stamp >= arrival - MAX_AGE && stamp <= arrival + MAX_AHEAD;
+        // Histories and the merging of devices need increasing stamps. The clock map may also move
+        // a stamp slightly back.
         let is_after = self.newest_stamp.is_none_or(|newest| stamp > newest);
         if !(is_recent && is_after) {
             return None;
         }
+        // A rejected stamp is not stored: one stamp far ahead would otherwise reject all later
+        // ones.
         self.newest_stamp = Some(stamp);
         Some(stamp)
     }
@@ -84,7 +91,8 @@ impl SequenceTracker {
 
 /// Why a stamp is invalid, with a possible cause.
 pub(crate) fn rejection(header: &DatagramHeader, arrival: Stamp) -> String {
-    let (stamp_nanos, hint) = (header.stamp_nanos, hint(header, arrival));
+    let stamp_nanos = header.stamp_nanos;
+    let hint = hint(header, arrival);
     format!("the stamp {stamp_nanos} is not after the previous one, or not recent{hint}")
 }
 

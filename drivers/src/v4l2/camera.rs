@@ -7,7 +7,8 @@ use crate::{Camera, Error, Image};
 use kinematics::Intrinsics;
 use std::time::{Duration, Instant};
 
-/// Pause between two attempts to reconnect.
+/// Pause between two attempts to reconnect. Opening a missing node fails at once, so attempts cost
+/// little, and a shorter outage loses fewer images.
 const RETRY_PAUSE: Duration = Duration::from_millis(100);
 /// A stream without images for this long, or for the periods of this many images (next constant),
 /// is restarted, because cameras may hang.
@@ -104,12 +105,16 @@ impl ReopenableCamera for V4l2Device {
         stream: &mut V4l2Stream,
         deadline: Instant,
     ) -> Result<Option<Image>, Failure<Problem>> {
+        // Between opening and the first request, other devices may take seconds to open. The images
+        // in the queue are from before that.
         if !std::mem::replace(&mut self.was_read, true) {
             stream.discard_queued()?;
         }
         let image = stream.next_image(&self.config, deadline);
         self.n_damaged += stream.take_n_damaged();
         let image = image?;
+        // Damaged images count as silence: a camera that sends only damaged ones has hung, and is
+        // opened again.
         let waited = stream.time_since_image();
         if image.is_none()
             && waited

@@ -117,6 +117,8 @@ pub(super) fn apply(
     let steps = plan(settings, camera)?;
     for step in &steps {
         match camera.set(step.id, step.value) {
+            // A missing device is a disconnection, even if the control is optional: the driver then
+            // reconnects.
             Err(error) if step.is_required || error == Errno::NODEV => {
                 return Err(refused(step.control, error));
             }
@@ -241,6 +243,7 @@ impl AutoControl {
             steps.push(Step {
                 control,
                 id,
+                // The automatic mode is off if the rig file sets a value, else on.
                 value: i32::from(!is_required),
                 tolerance: 0,
                 is_required,
@@ -263,6 +266,7 @@ fn fixed(
     let known = camera.find(id).ok_or(Problem::NoControl { control })?;
     let step = known.step.max(1);
     let is_known = (known.minimum..=known.maximum).contains(&value)
+        // In 64 bits, because the difference of two 32-bit numbers may overflow.
         && (i64::from(value) - i64::from(known.minimum)) % i64::from(step) == 0;
     if !is_known {
         return Err(Problem::ControlRange {
@@ -310,15 +314,25 @@ fn exposure(
         steps.push(Step {
             control,
             id: Id::ExposureAutoPriority,
+            // With automatic exposure, cameras lower their rate in the dark. Images would then be
+            // missing, and their motion blur would be longer.
             value: 0,
             tolerance: 0,
             is_required: false,
         });
     }
-    let Some(micros) = micros else { return Ok(()) };
-    let Some(known) = camera.find(Id::ExposureAbsolute) else {
-        return Ok(());
-    };
+    if let Some(micros) = micros
+        && let Some(known) = camera.find(Id::ExposureAbsolute)
+    {
+        steps.push(exposure_time(micros, &known)?);
+    }
+    Ok(())
+}
+
+/// A fixed exposure time, rounded to the steps of its control.
+fn exposure_time(micros: f64, known: &QueryControl) -> Result<Step, Problem> {
+    // The kernel would round silently; the nearest step of the control is chosen here, so that the
+    // value read back can be compared.
     let step = f64::from(known.step.max(1));
     let nearest = ((micros / MICROS_PER_COUNT - f64::from(known.minimum)) / step).round() * step
         + f64::from(known.minimum);
@@ -341,15 +355,15 @@ fn exposure(
         })?;
     #[expect(clippy::cast_possible_truncation, reason = "a tenth of 32 bits")]
     let tolerance = (f64::from(value) * EXPOSURE_TOLERANCE_FRAC) as i32;
+    // The tolerance of a short exposure may be less than one step.
     let tolerance = tolerance.max(known.step);
-    steps.push(Step {
+    Ok(Step {
         control: "exposure_micros",
         id: Id::ExposureAbsolute,
         value,
         tolerance,
         is_required: true,
-    });
-    Ok(())
+    })
 }
 
 #[cfg(test)]

@@ -75,6 +75,9 @@ unsafe impl<T: Plain> Ioctl for Exchange<'_, T> {
 impl Device {
     /// Opens a node in nonblocking mode.
     pub(super) fn open(path: &Path) -> rustix::io::Result<Self> {
+        // Nonblocking, so that a device that stops sending cannot block the thread: `wait` has a
+        // timeout, `DQBUF` has none. Closed in child processes, which would otherwise keep the
+        // device busy.
         let flags = OFlags::RDWR | OFlags::NONBLOCK | OFlags::CLOEXEC;
         Ok(Self {
             fd: rustix::fs::open(path, flags, Mode::empty())?,
@@ -102,7 +105,8 @@ impl Device {
     /// Enumerates entries with increasing indices until the device has no more. The list is empty
     /// if the device lacks the request.
     fn list<T: Plain>(&self, request: &Request<T>, mut request_at: impl FnMut(u32) -> T) -> Vec<T> {
-        const MAX_ENTRIES: u32 = 1000; // Terminates even if a driver never ends its list.
+        // Terminates even if a driver never ends its list.
+        const MAX_ENTRIES: u32 = 1000;
         let entry = |index| {
             let mut entry = request_at(index);
             self.ioctl(request, &mut entry).is_ok().then_some(entry)
@@ -113,6 +117,8 @@ impl Device {
     pub(super) fn identity(&self) -> rustix::io::Result<Identity> {
         let mut reported = abi::Capability::default();
         self.ioctl(&abi::QUERYCAP, &mut reported)?;
+        // `capabilities` covers all nodes of a device, `device_caps` only this one. Old drivers
+        // report just the first.
         let of_node = if reported.capabilities & abi::CAP_DEVICE_CAPS == 0 {
             reported.capabilities
         } else {
@@ -174,6 +180,8 @@ impl Device {
             width,
             height,
             fourcc,
+            // Interlaced rows are exposed at two different times, which no lens model here
+            // describes.
             field: abi::FIELD_NONE,
             ..Default::default()
         };
@@ -195,6 +203,7 @@ impl Device {
             capture: Default::default(),
             rest: [0; 40],
         };
+        // The other parameters are read first, because `S_PARM` sets all of them.
         if self.ioctl(&abi::G_PARM, &mut parm).is_err()
             || parm.capture.capability & abi::CAP_TIMEPERFRAME == 0
         {
@@ -231,20 +240,20 @@ impl Device {
 
     /// Entries of a menu control that this device supports.
     pub(super) fn menu(&self, id: u32, range: std::ops::RangeInclusive<i32>) -> Vec<i32> {
-        let has = |entry: &i32| {
-            u32::try_from(*entry).is_ok_and(|index| {
-                self.ioctl(
-                    &abi::QUERYMENU,
-                    &mut abi::QueryMenu {
-                        id,
-                        index,
-                        ..Default::default()
-                    },
-                )
-                .is_ok()
-            })
+        range.filter(|entry| self.has_entry(id, *entry)).collect()
+    }
+
+    /// Whether a menu has this entry. Menus may have gaps, which the kernel reports as errors.
+    fn has_entry(&self, id: u32, entry: i32) -> bool {
+        let Ok(index) = u32::try_from(entry) else {
+            return false;
         };
-        range.filter(has).collect()
+        let mut menu = abi::QueryMenu {
+            id,
+            index,
+            ..Default::default()
+        };
+        self.ioctl(&abi::QUERYMENU, &mut menu).is_ok()
     }
 
     pub(super) fn control_value(&self, id: u32) -> rustix::io::Result<i32> {
@@ -272,6 +281,7 @@ impl Device {
             let mut buffer = buffer_of(index);
             self.ioctl(&abi::QUERYBUF, &mut buffer)
                 .map_err(Refused::Buffers)?;
+            // Every buffer is mapped before the device may write to it.
             buffers.push(Mapped::new(&self.fd, &buffer).map_err(Refused::Buffers)?);
             self.ioctl(&abi::QBUF, &mut buffer_of(index))
                 .map_err(Refused::Buffers)?;
@@ -315,9 +325,11 @@ impl Stream {
             tv_nsec: timeout.subsec_nanos().into(),
         };
         match poll(&mut poll_fds, Some(&timeout)) {
+            // The caller compares its deadline and waits again.
             Err(Errno::INTR) => Ok(false),
             Err(error) => Err(error),
-            Ok(_) => Ok(!poll_fds[0].revents().is_empty()), // Includes errors: taking the image returns the error.
+            // Includes errors: taking the image returns the error.
+            Ok(_) => Ok(!poll_fds[0].revents().is_empty()),
         }
     }
 
@@ -345,6 +357,7 @@ impl Stream {
 
     /// Bytes of a filled buffer, limited to the size of the buffer.
     pub(super) fn bytes(&self, filled: &FilledBuffer) -> &[u8] {
+        // An index or length from a faulty driver must not cause a panic.
         let Some(mapping) = self.buffers.get(filled.index as usize) else {
             return &[];
         };

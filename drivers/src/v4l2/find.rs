@@ -117,31 +117,36 @@ pub(super) fn candidates(device: &str) -> Result<Vec<PathBuf>, Problem> {
     if device.starts_with('/') {
         return Ok(vec![PathBuf::from(device)]);
     }
-    let has_bus_address = |node: &Node| {
-        Device::open(&node.path)
-            .and_then(|open| open.identity())
-            .is_ok_and(|identity| identity.bus == device)
-    };
-    let is_match = |node: &Node| node.serial.as_deref() == Some(device) || has_bus_address(node);
+    let is_match =
+        |node: &Node| node.serial.as_deref() == Some(device) || has_bus_address(node, device);
     let found = nodes(Path::new("/")).into_iter().filter(is_match).collect();
     paths_of_one_camera(device, found)
+}
+
+/// Whether a node has this bus address. This opens the node, unlike a comparison of serial numbers.
+fn has_bus_address(node: &Node, address: &str) -> bool {
+    Device::open(&node.path)
+        .and_then(|open| open.identity())
+        .is_ok_and(|identity| identity.bus == address)
 }
 
 /// Checks whether a connected device matches `device` of a rig file. Nodes are only opened to read
 /// their bus address.
 pub fn check_connected(device: &str) -> Result<(), Problem> {
-    match candidates(device)?.iter().any(|path| path.exists()) {
-        true => Ok(()),
-        false => Err(Problem::NoDevice {
-            device: device.to_owned(),
-        }),
+    if candidates(device)?.iter().any(|path| path.exists()) {
+        return Ok(());
     }
+    Err(Problem::NoDevice {
+        device: device.to_owned(),
+    })
 }
 
 /// Checks that all nodes belong to one camera, since serial numbers are not always unique, and
 /// returns their paths.
 fn paths_of_one_camera(device: &str, found: Vec<Node>) -> Result<Vec<PathBuf>, Problem> {
     let device = device.to_owned();
+    // A camera has several nodes, which share a USB device. Two cameras of one model may have the
+    // same serial number.
     let is_one = found.windows(2).all(|pair| pair[0].usb == pair[1].usb);
     let paths: Vec<_> = found.into_iter().map(|node| node.path).collect();
     match paths.len() {
@@ -164,15 +169,13 @@ fn nodes(root: &Path) -> Vec<Node> {
         .filter_map(|entry| entry.ok()?.file_name().into_string().ok())
         .filter_map(|name| Some((number(&name)?, name)))
         .collect();
+    // By number: sorted as text, video10 would come before video2.
     names.sort_unstable();
     names
         .into_iter()
         .map(|(_, name)| {
             let usb = usb_folder(&class.join(&name).join("device"));
-            let attribute = |name| {
-                let text = std::fs::read_to_string(usb.as_ref()?.join(name)).ok()?;
-                Some(text.trim().to_owned()).filter(|text| !text.is_empty())
-            };
+            let attribute = |name| usb.as_ref().and_then(|usb| usb_attribute(usb, name));
             Node {
                 path: root.join("dev").join(&name),
                 serial: attribute("serial"),
@@ -183,11 +186,19 @@ fn nodes(root: &Path) -> Vec<Node> {
         .collect()
 }
 
+/// An attribute of a USB device in sysfs; `None` if it is missing or empty.
+fn usb_attribute(usb: &Path, name: &str) -> Option<String> {
+    let text = std::fs::read_to_string(usb.join(name)).ok()?;
+    Some(text.trim().to_owned()).filter(|text| !text.is_empty())
+}
+
 /// Folder of the USB device that an interface belongs to.
 fn usb_folder(device: &Path) -> Option<PathBuf> {
     let folder = device.canonicalize().ok()?;
     folder
         .ancestors()
+        // A video node belongs to an interface, whose parent is the USB device with its serial
+        // number and speed.
         .find(|ancestor| ancestor.join("idVendor").exists())
         .map(Path::to_owned)
 }
@@ -197,20 +208,23 @@ fn stable_links(root: &Path, node: &Path) -> Vec<PathBuf> {
     let Ok(node) = node.canonicalize() else {
         return Vec::new();
     };
-    let links_in = |folder: &str| {
-        let mut links: Vec<PathBuf> = std::fs::read_dir(root.join("dev/v4l").join(folder))
-            .into_iter()
-            .flatten()
-            .filter_map(|entry| Some(entry.ok()?.path()))
-            .filter(|link| link.canonicalize().is_ok_and(|meant| meant == node))
-            .collect();
-        links.sort_unstable();
-        links
-    };
     ["by-id", "by-path"]
         .into_iter()
-        .flat_map(links_in)
+        .flat_map(|folder| links_to(&node, &root.join("dev/v4l").join(folder)))
         .collect()
+}
+
+/// The links in a folder that lead to a node.
+fn links_to(node: &Path, folder: &Path) -> Vec<PathBuf> {
+    let mut links: Vec<PathBuf> = std::fs::read_dir(folder)
+        .into_iter()
+        .flatten()
+        .filter_map(|entry| Some(entry.ok()?.path()))
+        .filter(|link| link.canonicalize().is_ok_and(|meant| meant == *node))
+        .collect();
+    // The order of a folder is arbitrary, and the first link becomes the name in a rig file.
+    links.sort_unstable();
+    links
 }
 
 #[cfg(test)]

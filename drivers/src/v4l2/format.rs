@@ -7,7 +7,7 @@ use super::abi::{DISCRETE, Fraction, FrameInterval, FrameSize};
 use crate::{Error, PixelFormat, V4l2Colors, YuvColors, YuvLayout};
 
 /// Rates with a smaller relative difference are considered equal, because devices report fractions
-/// of integers.
+/// of integers: 29.97 Hz differs from 30 Hz by 0.1 %. A larger value could accept 24 for 25 Hz.
 const SAME_RATE_FRAC: f64 = 0.01;
 
 impl V4l2Format {
@@ -56,22 +56,21 @@ impl V4l2Format {
         colors: V4l2Colors,
         meters_per_count: f64,
     ) -> Result<PixelFormat, Error> {
-        let yuv = |layout| {
-            Ok(PixelFormat::Yuv {
-                layout,
-                colors: YuvColors::from_v4l2(colors)?,
-            })
+        let layout = match self {
+            Self::Yuyv => YuvLayout::Yuyv,
+            Self::Uyvy => YuvLayout::Uyvy,
+            Self::Nv12 => YuvLayout::Nv12,
+            Self::Rgb => return Ok(PixelFormat::Rgb8),
+            Self::Bgr => return Ok(PixelFormat::Bgr8),
+            Self::Mjpeg => return Ok(PixelFormat::Jpeg),
+            Self::Grey => return Ok(PixelFormat::Gray8),
+            Self::Z16 => return Ok(PixelFormat::DepthU16 { meters_per_count }),
         };
-        match self {
-            Self::Yuyv => yuv(YuvLayout::Yuyv),
-            Self::Uyvy => yuv(YuvLayout::Uyvy),
-            Self::Nv12 => yuv(YuvLayout::Nv12),
-            Self::Rgb => Ok(PixelFormat::Rgb8),
-            Self::Bgr => Ok(PixelFormat::Bgr8),
-            Self::Mjpeg => Ok(PixelFormat::Jpeg),
-            Self::Grey => Ok(PixelFormat::Gray8),
-            Self::Z16 => Ok(PixelFormat::DepthU16 { meters_per_count }),
-        }
+        // Only YUV depends on the reported colors, so unknown ones are no error for other formats.
+        Ok(PixelFormat::Yuv {
+            layout,
+            colors: YuvColors::from_v4l2(colors)?,
+        })
     }
 }
 
@@ -157,7 +156,9 @@ impl Sizes {
         match self {
             Self::One(size) => *size == requested,
             Self::Range { min, max, step } => (0..2).all(|side| {
-                let (requested, min, max) = (requested[side], min[side], max[side]);
+                let requested = requested[side];
+                let min = min[side];
+                let max = max[side];
                 (min..=max).contains(&requested)
                     && (requested - min).is_multiple_of(step[side].max(1))
             }),
@@ -204,19 +205,21 @@ pub(super) fn choose(
     size_px: [u32; 2],
     rate_hz: f64,
 ) -> Option<&Mode> {
-    let fits = |mode: &&Mode| mode.sizes.has(size_px) && mode.rates.has(rate_hz);
-    let of = |format: V4l2Format| {
-        modes
-            .iter()
-            .filter(move |mode| mode.format == format)
-            .find(fits)
-    };
+    let suitable: Vec<&Mode> = modes
+        .iter()
+        .filter(|mode| mode.sizes.has(size_px) && mode.rates.has(rate_hz))
+        .collect();
     match format {
-        Some(format) => of(format),
+        Some(format) => first_of_format(&suitable, format),
+        // The order of preference decides, not the order in which the device lists its formats.
         None => V4l2Format::COLOR_FORMATS
             .iter()
-            .find_map(|(_, each)| of(*each)),
+            .find_map(|(_, format)| first_of_format(&suitable, *format)),
     }
+}
+
+fn first_of_format<'a>(modes: &[&'a Mode], format: V4l2Format) -> Option<&'a Mode> {
+    modes.iter().find(|mode| mode.format == format).copied()
 }
 
 /// Index of a format in order of preference. Depth comes last because it is only selected
@@ -244,29 +247,35 @@ pub(super) fn usb_bytes_per_sec(mbits: f64) -> f64 {
 
 /// Describes the modes that exceed a bandwidth, each with the lowest rate that exceeds it.
 pub(super) fn modes_exceeding(modes: &[Mode], bytes_per_sec: f64) -> Vec<String> {
-    let exceeds = |mode: &Mode| {
-        let [width, height] = mode.sizes.max();
-        let required_bytes_per_sec =
-            |rate_hz: f64| mode.format.bytes_per_sec([width, height], rate_hz);
-        let rates: &[f64] = match &mode.rates {
-            Rates::Unknown => &[],
-            Rates::List(rates) => rates,
-            Rates::Range { max_hz, .. } => std::slice::from_ref(max_hz),
-        };
-        let slowest = rates
-            .iter()
-            .copied()
-            .filter(|hz| required_bytes_per_sec(*hz) > Some(bytes_per_sec))
-            .fold(f64::INFINITY, f64::min);
-        let megabytes = required_bytes_per_sec(slowest)
-            .filter(|required_bytes_per_sec| required_bytes_per_sec.is_finite())?
-            * 1e-6;
-        Some(format!(
-            "{} {width}x{height} at {slowest:.0} Hz ({megabytes:.0} MB/s)",
-            mode.format.name()
-        ))
+    modes
+        .iter()
+        .filter_map(|mode| excess(mode, bytes_per_sec))
+        .collect()
+}
+
+/// Describes a mode at the lowest rate that exceeds a bandwidth, if any does.
+fn excess(mode: &Mode, bytes_per_sec: f64) -> Option<String> {
+    let [width, height] = mode.sizes.max();
+    let required_bytes_per_sec = |rate_hz: f64| mode.format.bytes_per_sec([width, height], rate_hz);
+    let rates: &[f64] = match &mode.rates {
+        Rates::Unknown => &[],
+        Rates::List(rates) => rates,
+        Rates::Range { max_hz, .. } => std::slice::from_ref(max_hz),
     };
-    modes.iter().filter_map(exceeds).collect()
+    // Compressed formats require `None`, which is below any bandwidth.
+    let slowest = rates
+        .iter()
+        .copied()
+        .filter(|hz| required_bytes_per_sec(*hz) > Some(bytes_per_sec))
+        .fold(f64::INFINITY, f64::min);
+    // Infinite if no rate exceeds the bandwidth.
+    let megabytes = required_bytes_per_sec(slowest)
+        .filter(|required_bytes_per_sec| required_bytes_per_sec.is_finite())?
+        * 1e-6;
+    Some(format!(
+        "{} {width}x{height} at {slowest:.0} Hz ({megabytes:.0} MB/s)",
+        mode.format.name()
+    ))
 }
 
 /// Whether two rates, in images per second, are considered equal.
@@ -289,54 +298,60 @@ pub(super) fn interval_of(rate_hz: f64) -> Fraction {
         reason = "a rig's rates are 0.01 to 1000"
     )]
     let whole = |number: f64| number.round() as u32;
-    match rate_hz.fract() == 0.0 {
-        true => Fraction {
+    if rate_hz.fract() == 0.0 {
+        Fraction {
             numerator: 1,
             denominator: whole(rate_hz),
-        },
-        false => Fraction {
+        }
+    } else {
+        Fraction {
             numerator: whole(PARTS),
             denominator: whole(PARTS * rate_hz),
-        },
+        }
     }
 }
 
 /// Describes modes for messages: each format with its sizes and the highest rate at each.
 pub fn summary(modes: &[Mode]) -> String {
-    let size = |mode: &Mode| {
-        let sizes = match &mode.sizes {
-            Sizes::One([width, height]) => format!("{width}x{height}"),
-            Sizes::Range {
-                min: [w0, h0],
-                max: [w1, h1],
-                ..
-            } => format!("{w0}x{h0} to {w1}x{h1}"),
-        };
-        let max_hz = match &mode.rates {
-            Rates::Unknown => return sizes,
-            Rates::List(rates) => rates.iter().copied().fold(0.0, f64::max),
-            Rates::Range { max_hz, .. } => *max_hz,
-        };
-        format!("{sizes} up to {} Hz", (max_hz * 100.0).round() / 100.0)
-    };
-    let of_format = |format: V4l2Format| {
-        let sizes: Vec<_> = modes
-            .iter()
-            .filter(|mode| mode.format == format)
-            .map(size)
-            .collect();
-        (!sizes.is_empty()).then(|| format!("{}: {}", format.name(), sizes.join(", ")))
-    };
     let formats = V4l2Format::COLOR_FORMATS
         .iter()
         .map(|(_, format)| *format)
         .chain([V4l2Format::Z16]);
-    let all: Vec<_> = formats.filter_map(of_format).collect();
+    let all: Vec<_> = formats
+        .filter_map(|format| summary_of_format(modes, format))
+        .collect();
     if all.is_empty() {
         "no supported format".to_owned()
     } else {
         all.join("; ")
     }
+}
+
+/// A format with its sizes and the highest rate at each, if the device offers it.
+fn summary_of_format(modes: &[Mode], format: V4l2Format) -> Option<String> {
+    let sizes: Vec<_> = modes
+        .iter()
+        .filter(|mode| mode.format == format)
+        .map(sizes_and_rate)
+        .collect();
+    (!sizes.is_empty()).then(|| format!("{}: {}", format.name(), sizes.join(", ")))
+}
+
+fn sizes_and_rate(mode: &Mode) -> String {
+    let sizes = match &mode.sizes {
+        Sizes::One([width, height]) => format!("{width}x{height}"),
+        Sizes::Range {
+            min: [w0, h0],
+            max: [w1, h1],
+            ..
+        } => format!("{w0}x{h0} to {w1}x{h1}"),
+    };
+    let max_hz = match &mode.rates {
+        Rates::Unknown => return sizes,
+        Rates::List(rates) => rates.iter().copied().fold(0.0, f64::max),
+        Rates::Range { max_hz, .. } => *max_hz,
+    };
+    format!("{sizes} up to {} Hz", (max_hz * 100.0).round() / 100.0)
 }
 
 #[cfg(test)]

@@ -17,6 +17,7 @@ impl Sequence {
             .last
             .replace(number)
             .map_or(1, |last| number.wrapping_sub(last));
+        // The difference wraps like the numbers. More than half the range ahead means behind.
         if ahead > u32::MAX / 2 {
             0
         } else {

@@ -14,12 +14,14 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-/// Number of image buffers: a quarter of a second at 30 Hz.
+/// Number of image buffers: a quarter of a second at 30 Hz. With fewer, images are lost when the
+/// caller pauses; more take more memory of the kernel.
 const N_BUFFERS: u32 = 8;
 /// A stamp that is earlier than the start of the stream or later than now by more than this comes
 /// from another clock, regardless of its flag.
 const MAX_STAMP_ERROR_SECS: f64 = 1.0;
-/// Maximum duration of an exposure query, as a fraction of the time between two images.
+/// Maximum duration of an exposure query, as a fraction of the time between two images. Some
+/// cameras answer so slowly that images would be lost in the meantime.
 const MAX_EXPOSURE_QUERY_FRAC: f64 = 0.25;
 
 /// A streaming device.
@@ -48,19 +50,7 @@ impl V4l2Stream {
         let candidates = find::candidates(&config.device)?;
         // A depth camera has nodes for color, infrared and depth under one serial number. The node
         // with the most preferred format is used.
-        let rank = |path: &&PathBuf| {
-            let modes = open(config, path)
-                .map(|device| find::modes(&device))
-                .unwrap_or_default();
-            let mode = format::choose(
-                &modes,
-                config.format,
-                config.intrinsics.size_px,
-                config.rate_hz,
-            );
-            mode.map_or(usize::MAX, |mode| format::rank(mode.format))
-        };
-        match candidates.iter().min_by_key(rank) {
+        match candidates.iter().min_by_key(|path| rank(config, path)) {
             Some(path) => Self::start_node(config, path),
             None => Err(Problem::NoDevice {
                 device: config.device.clone(),
@@ -87,6 +77,7 @@ impl V4l2Stream {
             .map_err(Failure::Final)?;
         controls::apply(&config.settings, &device)?;
         let requested = requested(config, Some(mode.format));
+        // Before the start of the stream, so that no stamp of it can be earlier.
         let started_at = clock::now();
         let stream = device.stream(N_BUFFERS).map_err(|refused| {
             let bytes_per_sec = mode
@@ -94,6 +85,7 @@ impl V4l2Stream {
                 .bytes_per_sec(config.intrinsics.size_px, config.rate_hz);
             stream_problem(refused, path, requested.clone(), bytes_per_sec)
         })?;
+        // Only now are settings final: some cameras reset them when the stream starts.
         let applied = controls::confirm(&config.settings, stream.device())?;
         Ok(Self {
             stream,
@@ -150,6 +142,7 @@ impl V4l2Stream {
             };
             self.stream.requeue(filled).map_err(lost)?;
         }
+        // The discarded images must not appear as a gap before the first one.
         self.sequence = Sequence::default();
         Ok(())
     }
@@ -167,6 +160,9 @@ impl V4l2Stream {
             };
             self.n_unreported += self.sequence.n_skipped_before(filled.sequence);
             let image =
+                // The image is copied before its buffer goes back to the device. Copying takes a
+                // fraction of the time between images; holding buffers would leave the device
+                // without any.
                 (!filled.is_damaged).then(|| self.image_of(&filled, config.intrinsics.size_px));
             self.stream.requeue(filled).map_err(lost)?;
             match image {
@@ -180,6 +176,7 @@ impl V4l2Stream {
                     if let Some(Err(error)) = other {
                         log::debug!("{error}");
                     }
+                    // A damaged image counts as lost, too: the caller never sees it.
                     self.n_unreported += 1;
                     self.n_damaged += 1;
                     if Instant::now() >= deadline {
@@ -201,6 +198,8 @@ impl V4l2Stream {
         loop {
             match self.stream.take().map_err(lost)? {
                 Some(newer) => {
+                    // For `Newest`: continue until the queue is empty, and give back what is not
+                    // the newest. The skipped ones are counted in order of their sequence numbers.
                     if let Some(older) = taken.replace(newer) {
                         self.n_unreported += self.sequence.n_skipped_before(older.sequence) + 1;
                         self.stream.requeue(older).map_err(lost)?;
@@ -240,6 +239,8 @@ impl V4l2Stream {
     fn stamp_of(&mut self, filled: &FilledBuffer) -> Stamp {
         let now = clock::now();
         let stamp = Stamp(filled.stamp_nanos);
+        // Some drivers report monotonic stamps but send stamps of the camera's own clock, which
+        // starts at another time.
         let valid_range =
             self.started_at.plus_secs(-MAX_STAMP_ERROR_SECS)..now.plus_secs(MAX_STAMP_ERROR_SECS);
         if filled.is_monotonic && valid_range.contains(&stamp) {
@@ -329,10 +330,25 @@ fn open(config: &Config, path: &Path) -> Result<Device, Problem> {
     }
 }
 
+/// How preferred the format is that a node would send; nodes without a suitable mode come last.
+fn rank(config: &Config, path: &Path) -> usize {
+    let modes = open(config, path)
+        .map(|device| find::modes(&device))
+        .unwrap_or_default();
+    let mode = format::choose(
+        &modes,
+        config.format,
+        config.intrinsics.size_px,
+        config.rate_hz,
+    );
+    mode.map_or(usize::MAX, |mode| format::rank(mode.format))
+}
+
 /// Selects and sets a mode, and checks that the device uses exactly that mode.
 fn set_mode(config: &Config, path: &Path, device: &Device) -> Result<(Mode, PixFormat), Problem> {
     let modes = find::modes(device);
-    let (size_px, rate_hz) = (config.intrinsics.size_px, config.rate_hz);
+    let size_px = config.intrinsics.size_px;
+    let rate_hz = config.rate_hz;
     let mode =
         format::choose(&modes, config.format, size_px, rate_hz).ok_or_else(|| Problem::NoMode {
             requested: requested(config, config.format),
@@ -349,6 +365,8 @@ fn set_mode(config: &Config, path: &Path, device: &Device) -> Result<(Mode, PixF
     };
     let pix = device.set_format(mode.fourcc, size_px).map_err(refused)?;
     let got_hz = device.set_rate_hz(rate_hz).map_err(refused)?;
+    // The kernel replaces an unsupported request with the closest supported one instead of refusing
+    // it. Lens parameters are valid for one size only.
     let is_same = pix.fourcc == mode.fourcc && [pix.width, pix.height] == size_px;
     if !is_same || got_hz.is_some_and(|got_hz| !format::is_same_rate(got_hz, rate_hz)) {
         let format = V4l2Format::from_fourcc(pix.fourcc).map_or("another format", V4l2Format::name);
@@ -359,6 +377,7 @@ fn set_mode(config: &Config, path: &Path, device: &Device) -> Result<(Mode, PixF
             got,
         });
     }
+    // Drivers may ignore the requested field order without an error.
     if ![FIELD_ANY, FIELD_NONE].contains(&pix.field) {
         log::warn!(
             "camera {:?}: it sends interlaced images; alternate rows are exposed at different times",

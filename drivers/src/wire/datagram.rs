@@ -262,39 +262,48 @@ pub fn decode_scan(bytes: &[u8]) -> Result<ScanPart, Malformed> {
     }
     let echo_positions = echo_positions(&wire)?;
     let n = echo_positions.len();
-    let check_length = |name, len: Option<usize>| match len {
-        Some(len) if len != n => Err(invalid(format!(
-            "{name} has {len} entries, but there are {n} points or ranges"
-        ))),
-        _ => Ok(()),
-    };
-    check_length("rings", wire.rings.as_ref().map(Vec::len))?;
-    check_length("offsets_micros", wire.offsets_micros.as_ref().map(Vec::len))?;
-    let point = |(ix, echo_position): (usize, Option<[f32; 3]>)| {
-        Some(RangePoint {
-            position_m: echo_position?,
-            ring: wire.rings.as_ref().map_or(0, |rings| rings[ix]),
-            offset_micros: wire
-                .offsets_micros
-                .as_ref()
-                .map_or(0, |offsets| offsets[ix]),
+    check_length("rings", wire.rings.as_ref().map(Vec::len), n)?;
+    check_length(
+        "offsets_micros",
+        wire.offsets_micros.as_ref().map(Vec::len),
+        n,
+    )?;
+    // Directions without an echo have rings and offsets, too, so they are left out only here.
+    let points = echo_positions
+        .into_iter()
+        .enumerate()
+        .filter_map(|(ix, echo_position)| {
+            Some(RangePoint {
+                position_m: echo_position?,
+                ring: wire.rings.as_ref().map_or(0, |rings| rings[ix]),
+                offset_micros: wire
+                    .offsets_micros
+                    .as_ref()
+                    .map_or(0, |offsets| offsets[ix]),
+            })
         })
-    };
+        .collect();
     Ok(ScanPart {
         header: DatagramHeader {
             seq: wire.seq,
             clock: wire.clock,
             stamp_nanos: wire.stamp_nanos,
         },
-        points: echo_positions
-            .into_iter()
-            .enumerate()
-            .filter_map(point)
-            .collect(),
+        points,
         frame: wire.frame,
         part: wire.part,
         n_parts: wire.parts,
     })
+}
+
+/// Checks the length of an optional list with one entry per point or range.
+fn check_length(name: &str, len: Option<usize>, n: usize) -> Result<(), Malformed> {
+    match len {
+        Some(len) if len != n => Err(invalid(format!(
+            "{name} has {len} entries, but there are {n} points or ranges"
+        ))),
+        _ => Ok(()),
+    }
 }
 
 /// Decodes a base pose.
@@ -319,9 +328,12 @@ pub fn decode_pose(bytes: &[u8]) -> Result<PoseDatagram, Malformed> {
     if !is_unit {
         return Err(invalid("quat_xyzw is not a unit quaternion".to_owned()));
     }
-    let rotation = match (quaternion.norm() - 1.0).abs() < 1e-12 {
-        true => UnitQuaternion::new_unchecked(quaternion),
-        false => UnitQuaternion::new_normalize(quaternion),
+    // A quaternion of f64 is kept bit for bit, so that a pose survives encoding and decoding. One
+    // that was rounded is normalized.
+    let rotation = if (quaternion.norm() - 1.0).abs() < 1e-12 {
+        UnitQuaternion::new_unchecked(quaternion)
+    } else {
+        UnitQuaternion::new_normalize(quaternion)
     };
     Ok(PoseDatagram {
         header: DatagramHeader {
@@ -346,6 +358,8 @@ fn covariance(numbers: Vec<f64>) -> Result<Box<[f64; 36]>, Malformed> {
     }
     for (row, column) in (0..6).flat_map(|row| (0..row).map(move |column| (row, column))) {
         let [lower, upper] = [covariance[6 * row + column], covariance[6 * column + row]];
+        // The Cauchy-Schwarz inequality: a covariance is at most the product of both standard
+        // deviations.
         let max_covariance = (covariance[7 * row] * covariance[7 * column]).sqrt();
         if (lower - upper).abs() > SYMMETRY_TOLERANCE * max_covariance
             || lower.abs() > (1.0 + SYMMETRY_TOLERANCE) * max_covariance
@@ -384,42 +398,24 @@ pub fn decode_joints(
         clock,
         stamp_nanos,
     };
-    let (order, n) = match &reported {
-        None => ((0..names.len()).collect(), names.len()),
+    let layout = match &reported {
+        None => JointLayout {
+            order: (0..names.len()).collect(),
+            n: names.len(),
+            per: "joint",
+        },
         Some(reported) => match order_of(names, reported)? {
-            Some(order) => (order, reported.len()),
+            Some(order) => JointLayout {
+                order,
+                n: reported.len(),
+                per: "name",
+            },
             None => return Ok((header, None)),
         },
     };
-    let numbers =
-        |what: &str, numbers: &[Option<f64>], is_optional: bool| -> Result<Vec<f64>, Malformed> {
-            if is_optional && numbers.is_empty() {
-                return Ok(Vec::new());
-            }
-            if numbers.len() != n {
-                let per = if reported.is_some() { "name" } else { "joint" };
-                return Err(invalid(format!(
-                    "{what} has {} numbers, expected {n}, one per {per}",
-                    numbers.len()
-                )));
-            }
-            let ordered: Option<Vec<f64>> = order.iter().map(|ix: &usize| numbers[*ix]).collect();
-            match ordered {
-                Some(ordered) if ordered.iter().any(|number| number.abs() > MAX_ABS_VALUE) => {
-                    Err(invalid(format!(
-                        "{what} has an absolute value above {MAX_ABS_VALUE}"
-                    )))
-                }
-                Some(ordered) => Ok(ordered),
-                None if is_optional => Ok(Vec::new()),
-                None => Err(invalid(format!("{what} has null or NaN"))),
-            }
-        };
-    let (position, velocity) = (
-        numbers("position", &position, false)?,
-        numbers("velocity", &velocity, true)?,
-    );
-    let effort = numbers("effort", &effort, true)?;
+    let position = layout.numbers("position", &position, false)?;
+    let velocity = layout.numbers("velocity", &velocity, true)?;
+    let effort = layout.numbers("effort", &effort, true)?;
     Ok((
         header,
         Some(JointsDatagram {
@@ -431,17 +427,58 @@ pub fn decode_joints(
     ))
 }
 
+/// Where the lists of a datagram have the numbers of our joints.
+struct JointLayout {
+    /// Index of each of our joints in the lists.
+    order: Vec<usize>,
+    /// Length of the lists.
+    n: usize,
+    /// What the lists have one number for, in messages.
+    per: &'static str,
+}
+
+impl JointLayout {
+    /// The numbers of our joints. A list that is optional may be empty. If it has null or NaN for
+    /// one of our joints, it counts as empty.
+    fn numbers(
+        &self,
+        what: &str,
+        numbers: &[Option<f64>],
+        is_optional: bool,
+    ) -> Result<Vec<f64>, Malformed> {
+        if is_optional && numbers.is_empty() {
+            return Ok(Vec::new());
+        }
+        if numbers.len() != self.n {
+            return Err(invalid(format!(
+                "{what} has {} numbers, expected {}, one per {}",
+                numbers.len(),
+                self.n,
+                self.per
+            )));
+        }
+        let ordered: Option<Vec<f64>> = self.order.iter().map(|ix| numbers[*ix]).collect();
+        match ordered {
+            Some(ordered) if ordered.iter().any(|number| number.abs() > MAX_ABS_VALUE) => {
+                Err(invalid(format!(
+                    "{what} has an absolute value above {MAX_ABS_VALUE}"
+                )))
+            }
+            Some(ordered) => Ok(ordered),
+            None if is_optional => Ok(Vec::new()),
+            None => Err(invalid(format!("{what} has null or NaN"))),
+        }
+    }
+}
+
 /// Index of each joint in `reported`; `None` if it contains none of the joints.
 fn order_of(joints: &[String], reported: &[String]) -> Result<Option<Vec<usize>>, Malformed> {
-    let find = |joint: &String| -> Result<Option<usize>, Malformed> {
-        let mut found = (0..reported.len()).filter(|ix| reported[*ix] == *joint);
-        let first = found.next();
-        match found.next() {
-            None => Ok(first),
-            Some(_) => Err(invalid(format!("names has {joint:?} twice"))),
-        }
-    };
-    let found = joints.iter().map(find).collect::<Result<Vec<_>, _>>()?;
+    let found = joints
+        .iter()
+        .map(|joint| only_index_of(joint, reported))
+        .collect::<Result<Vec<_>, _>>()?;
+    // Several devices may send to one port. A datagram with some of the joints, though, is a
+    // mistake in the names.
     if found.iter().all(Option::is_none) && !joints.is_empty() {
         return Ok(None);
     }
@@ -452,23 +489,32 @@ fn order_of(joints: &[String], reported: &[String]) -> Result<Option<Vec<usize>>
         .map(|(joint, _)| joint);
     match missing {
         None => Ok(Some(found.into_iter().flatten().collect())),
-        Some(missing) => {
-            let list = |names: &[String]| {
-                let names: String = names
-                    .join(", ")
-                    .chars()
-                    .filter(|c| !c.is_control())
-                    .take(MAX_LIST_CHARS)
-                    .collect();
-                names
-            };
-            Err(invalid(format!(
-                "names lacks {missing:?}; it has {}, and arm.joints has {}",
-                list(reported),
-                list(joints)
-            )))
-        }
+        Some(missing) => Err(invalid(format!(
+            "names lacks {missing:?}; it has {}, and arm.joints has {}",
+            shown(reported),
+            shown(joints)
+        ))),
     }
+}
+
+/// Index of a joint in `reported`, which must not contain it twice.
+fn only_index_of(joint: &str, reported: &[String]) -> Result<Option<usize>, Malformed> {
+    let mut found = (0..reported.len()).filter(|ix| reported[*ix] == *joint);
+    let first = found.next();
+    match found.next() {
+        None => Ok(first),
+        Some(_) => Err(invalid(format!("names has {joint:?} twice"))),
+    }
+}
+
+/// Names for a message, without control characters: they come from the network and are logged.
+fn shown(names: &[String]) -> String {
+    names
+        .join(", ")
+        .chars()
+        .filter(|c| !c.is_control())
+        .take(MAX_LIST_CHARS)
+        .collect()
 }
 
 /// Positions of the echoes: one entry per direction of a part; `None` if there was no echo.
@@ -482,49 +528,62 @@ fn echo_positions(wire: &WireScan) -> Result<Vec<Option<[f32; 3]>>, Malformed> {
                     numbers.len()
                 )));
             }
-            match points
+            // False for NaN, too.
+            let is_near = points
                 .iter()
                 .flatten()
-                .all(|coordinate| f64::from(coordinate.abs()) <= MAX_ABS_VALUE)
-            {
-                true => Ok(points.iter().map(|point| Some(*point)).collect()),
-                false => Err(invalid(format!(
+                .all(|coordinate| f64::from(coordinate.abs()) <= MAX_ABS_VALUE);
+            if !is_near {
+                return Err(invalid(format!(
                     "points_m has an absolute value above {MAX_ABS_VALUE} m"
-                ))),
+                )));
             }
+            Ok(points.iter().map(|point| Some(*point)).collect())
         }
-        (None, Some(ranges)) => {
-            let angle = |name, angle: Option<f64>| match angle {
-                Some(angle) if angle.abs() <= MAX_ANGLE_RAD => Ok(angle),
-                _ => Err(invalid(format!(
-                    "ranges_m requires {name} between -{MAX_ANGLE_RAD} and {MAX_ANGLE_RAD} rad"
-                ))),
-            };
-            let (first, step) = (
-                angle("first_rad", wire.first_rad)?,
-                angle("step_rad", wire.step_rad)?,
-            );
-            let elevation = angle("elevation_rad", Some(wire.elevation_rad.unwrap_or(0.0)))?;
-            let echo_position = |(ix, range): (usize, &Option<f32>)| {
-                let Some(range_m) = range.map(f64::from) else {
-                    return Ok(None);
-                };
-                match (0.0..=MAX_ABS_VALUE).contains(&range_m) {
-                    true => Ok(Some(position_from_polar(
-                        range_m,
-                        first + ix as f64 * step,
-                        elevation,
-                    ))),
-                    false => Err(invalid(format!(
-                        "ranges_m has a number outside 0 to {MAX_ABS_VALUE} m"
-                    ))),
-                }
-            };
-            ranges.iter().enumerate().map(echo_position).collect()
-        }
+        (None, Some(ranges)) => positions_from_ranges(wire, ranges),
         _ => Err(invalid(
             "expected either points_m or ranges_m, not both".to_owned(),
         )),
+    }
+}
+
+/// Positions of the echoes of a planar scan, which has one range per direction.
+fn positions_from_ranges(
+    wire: &WireScan,
+    ranges: &[Option<f32>],
+) -> Result<Vec<Option<[f32; 3]>>, Malformed> {
+    let first_rad = angle("first_rad", wire.first_rad)?;
+    let step_rad = angle("step_rad", wire.step_rad)?;
+    let elevation_rad = angle("elevation_rad", Some(wire.elevation_rad.unwrap_or(0.0)))?;
+    let mut positions = Vec::with_capacity(ranges.len());
+    for (ix, range) in ranges.iter().enumerate() {
+        let Some(range_m) = range.map(f64::from) else {
+            positions.push(None);
+            continue;
+        };
+        if !(0.0..=MAX_ABS_VALUE).contains(&range_m) {
+            return Err(invalid(format!(
+                "ranges_m has a number outside 0 to {MAX_ABS_VALUE} m"
+            )));
+        }
+        // Multiplied instead of added up, so that rounding errors do not accumulate.
+        let azimuth_rad = first_rad + ix as f64 * step_rad;
+        positions.push(Some(position_from_polar(
+            range_m,
+            azimuth_rad,
+            elevation_rad,
+        )));
+    }
+    Ok(positions)
+}
+
+/// A required angle. A value in degrees is usually above the maximum.
+fn angle(name: &str, angle_rad: Option<f64>) -> Result<f64, Malformed> {
+    match angle_rad {
+        Some(angle_rad) if angle_rad.abs() <= MAX_ANGLE_RAD => Ok(angle_rad),
+        _ => Err(invalid(format!(
+            "ranges_m requires {name} between -{MAX_ANGLE_RAD} and {MAX_ANGLE_RAD} rad"
+        ))),
     }
 }
 
@@ -547,18 +606,19 @@ fn check_kind(bytes: &[u8], expected: &'static str) -> Result<(), Malformed> {
         // The text from the sender is not repeated, because it may be of any length.
         return Err(invalid(format!("the kind is not {expected:?}")));
     }
-    match version == VERSION {
-        true => Ok(()),
-        false => Err(invalid(format!(
+    if version != VERSION {
+        return Err(invalid(format!(
             "version {version} is not supported, expected {VERSION}"
-        ))),
+        )));
     }
+    Ok(())
 }
 
 /// Parses JSON in which `NaN` and `Infinity`, which Python writes, are read as null.
 fn parse_json<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, Malformed> {
     let parse =
         |bytes: &[u8]| serde_json::from_slice(bytes).map_err(|error| invalid(reported(&error)));
+    // Replacing costs a copy of the text, so it is done only if the plain text is not JSON.
     parse(bytes).or_else(|error| match std::str::from_utf8(bytes) {
         Ok(text) if text.contains("NaN") || text.contains("Infinity") => {
             parse(json::nan_as_null(text).as_bytes())

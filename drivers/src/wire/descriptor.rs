@@ -203,8 +203,8 @@ pub const POINT_CLOUD: Schema = Schema {
 };
 
 impl Schema {
-    /// Numbers of the fields of an encoded message that the schema does not have, in the order of
-    /// the message.
+    /// Numbers of the fields of an encoded message that are not in the schema, in the order of the
+    /// message.
     pub fn unknown_fields(&self, message: &[u8]) -> Vec<u32> {
         let is_unknown = |number: &u32| self.fields.iter().all(|field| field.number != *number);
         fields(message)
@@ -217,6 +217,7 @@ impl Schema {
     /// The encoded `FileDescriptorSet`: the files that this message depends on, then its own file.
     pub fn file_descriptor_set(&self) -> Vec<u8> {
         let mut set = Message::default();
+        // Readers resolve imports in order, so dependencies come before the file that uses them.
         for dependency in self.dependencies {
             set.message(1, &dependency.file());
         }

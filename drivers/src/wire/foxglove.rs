@@ -74,6 +74,7 @@ pub fn schema_of(format: PixelFormat) -> descriptor::Schema {
 
 /// Encodes an image as `CompressedImage` or `RawImage`, see [`schema_of`].
 pub fn encode_image(image: &Image) -> Vec<u8> {
+    // 256 bytes are usually enough for all other fields, so the message is allocated once.
     let mut message = Message::with_capacity(image.data.len() + 256);
     message.message(1, &timestamp(image.stamp));
     match image.format {
@@ -173,10 +174,12 @@ pub fn decode_image(schema: &str, bytes: &[u8]) -> Result<Image, Malformed> {
             (N_SKIPPED, _) => image.n_skipped = field.varint()?,
             (YUV_COLORS, false) => colors = Some(field.text()?),
             (METERS_PER_COUNT, false) => meters_per_count = Some(field.double()?),
-            _ => {} // Unknown fields of a newer version, see `descriptor::Schema::unknown_fields`.
+            // Unknown fields of a newer version, see `descriptor::Schema::unknown_fields`.
+            _ => {}
         }
     }
     image.stamp = stamp.ok_or(Malformed::Missing { name: "timestamp" })?;
+    // An absent number is 0 in proto3, so an absent size cannot be distinguished from 0.
     if size_px.contains(&0) {
         return Err(Malformed::Missing {
             name: if compressed {
@@ -187,41 +190,62 @@ pub fn decode_image(schema: &str, bytes: &[u8]) -> Result<Image, Malformed> {
         });
     }
     image.size_px = size_px;
-    image.format = match (format, compressed) {
-        ("jpeg", true) => PixelFormat::Jpeg,
-        ("png", true) => PixelFormat::Png,
-        ("rgb8", false) => PixelFormat::Rgb8,
-        ("bgr8", false) => PixelFormat::Bgr8,
-        ("mono8", false) => PixelFormat::Gray8,
-        ("16UC1", false) => PixelFormat::DepthU16 {
+    // Fields may be in any order, so the format is put together after all have been read.
+    image.format = if compressed {
+        compressed_format(format)?
+    } else {
+        raw_format(format, meters_per_count, colors)?
+    };
+    without_padding(image, step)
+}
+
+fn compressed_format(name: &str) -> Result<PixelFormat, Malformed> {
+    match name {
+        "jpeg" => Ok(PixelFormat::Jpeg),
+        "png" => Ok(PixelFormat::Png),
+        _ => Err(Malformed::PixelFormat {
+            name: name.to_owned(),
+        }),
+    }
+}
+
+/// The format of a `RawImage` from its encoding and the fields that only some encodings have.
+fn raw_format(
+    name: &str,
+    meters_per_count: Option<f64>,
+    colors: Option<&str>,
+) -> Result<PixelFormat, Malformed> {
+    Ok(match name {
+        "rgb8" => PixelFormat::Rgb8,
+        "bgr8" => PixelFormat::Bgr8,
+        "mono8" => PixelFormat::Gray8,
+        "16UC1" => PixelFormat::DepthU16 {
             meters_per_count: positive(meters_per_count.ok_or(Malformed::Missing {
                 name: "meters_per_count",
             })?)?,
         },
-        (name, compressed) => match lookup(&YUV_LAYOUTS, name) {
-            Some(layout) if !compressed => PixelFormat::Yuv {
+        _ => match lookup(&YUV_LAYOUTS, name) {
+            Some(layout) => PixelFormat::Yuv {
                 layout,
                 colors: yuv_colors(colors)?,
             },
-            _ => {
+            None => {
                 return Err(Malformed::PixelFormat {
                     name: name.to_owned(),
                 });
             }
         },
-    };
-    without_padding(image, step)
+    })
 }
 
 fn positive(meters_per_count: f64) -> Result<f64, Malformed> {
     if meters_per_count > 0.0 && meters_per_count.is_finite() {
         return Ok(meters_per_count);
     }
-    let (found, expected) = (meters_per_count.to_string(), "a positive number".to_owned());
     Err(Malformed::Unsupported {
         name: "meters_per_count",
-        found,
-        expected,
+        found: meters_per_count.to_string(),
+        expected: "a positive number".to_owned(),
     })
 }
 
@@ -273,7 +297,9 @@ pub fn encode_depth_m(camera: &str, stamp: Stamp, size_px: [u32; 2], depth_m: &[
 
 /// Decodes the depth in meters that [`encode_depth_m`] encoded.
 pub fn decode_depth_m(bytes: &[u8]) -> Result<Arc<[f32]>, Malformed> {
-    let (mut size_px, mut encoding, mut data) = ([0; 2], "", None);
+    let mut size_px = [0; 2];
+    let mut encoding = "";
+    let mut data = None;
     for field in fields(bytes) {
         let field = field?;
         match field.number {
@@ -311,6 +337,8 @@ pub fn encode_calibration(camera: &str, stamp: Stamp, intrinsics: &Intrinsics) -
     let [fx, fy] = intrinsics.focal_px;
     let [cx, cy] = intrinsics.principal_px;
     let (model, distortion): (&str, &[f64]) = match &intrinsics.lens {
+        // Viewers undistort images with these coefficients, and a rectified image must not be
+        // undistorted again.
         _ if intrinsics.rectified => ("", &[]),
         Lens::Pinhole => ("", &[]),
         Lens::BrownConrady(k) => ("plumb_bob", k),
@@ -351,8 +379,8 @@ pub fn encode_transform(
     message.into_bytes()
 }
 
-/// Decodes stamp and pose from a `FrameTransform`: poses of this program bit for bit. Quaternions
-/// of other programs may be rounded and are normalized.
+/// Decodes stamp and pose from a `FrameTransform`. Poses that this program wrote are restored bit
+/// for bit. Quaternions of other programs may be rounded; they are normalized.
 pub fn decode_transform(bytes: &[u8]) -> Result<(Stamp, Transform), Malformed> {
     let mut stamp = None;
     let mut translation = None;
@@ -375,8 +403,9 @@ pub fn decode_transform(bytes: &[u8]) -> Result<(Stamp, Transform), Malformed> {
     Ok((stamp, from_xyz_xyzw([x, y, z, i, j, k, w])))
 }
 
-/// Normalizes a quaternion, unless its length is 1 up to rounding: that would change its last bits.
-/// One that is not finite stays so, and the users of the pose reject it.
+/// Normalizes a quaternion. A quaternion whose length is 1 up to rounding is returned unchanged,
+/// because normalizing would change its last bits. So is one that is not finite; users of the pose
+/// reject it.
 fn unit_quaternion(quaternion: [f64; 4]) -> Result<[f64; 4], Malformed> {
     /// Products of many rotations, and quaternions in f32, stay below it.
     const EXACT: f64 = 1e-6;
@@ -394,14 +423,10 @@ fn unit_quaternion(quaternion: [f64; 4]) -> Result<[f64; 4], Malformed> {
     if deviation <= ROUNDED {
         return Ok(quaternion.map(|number| number / length));
     }
-    let (found, expected) = (
-        format!("a quaternion of length {length}"),
-        "one of length 1".to_owned(),
-    );
     Err(Malformed::Unsupported {
         name: "rotation",
-        found,
-        expected,
+        found: format!("a quaternion of length {length}"),
+        expected: "one of length 1".to_owned(),
     })
 }
 
@@ -453,6 +478,7 @@ pub(super) fn numbers<const N: usize>(field: &Field<'_>) -> Result<[f64; N], Mal
     let mut numbers = [0.0; N];
     for inner in fields(field.bytes()?) {
         let inner = inner?;
+        // Numbers of fields come from the file, and may be anything.
         let slot = (inner.number as usize)
             .checked_sub(1)
             .and_then(|ix| numbers.get_mut(ix));
@@ -465,6 +491,7 @@ pub(super) fn numbers<const N: usize>(field: &Field<'_>) -> Result<[f64; N], Mal
 
 pub(super) fn timestamp(stamp: Stamp) -> Message {
     let mut message = Message::default();
+    // Euclidean division: nanoseconds of a `Timestamp` are not negative, even before zero.
     message.varint(1, stamp.0.div_euclid(NANOS_PER_SEC).cast_unsigned());
     message.varint(2, stamp.0.rem_euclid(NANOS_PER_SEC).cast_unsigned());
     message

@@ -48,12 +48,6 @@ const FIELDS: [&str; 4] = ["timestamp", "position", "velocity", "effort"];
 
 /// Encodes joint states as JSON. Decoding restores finite numbers bit for bit, and others as NaN.
 pub fn encode(state: &JointState) -> Vec<u8> {
-    let finite = |numbers: &[f64]| {
-        numbers
-            .iter()
-            .map(|number| number.is_finite().then_some(*number))
-            .collect()
-    };
     let nsec = u32::try_from(state.stamp.0.rem_euclid(NANOS_PER_SEC))
         .expect("the remainder is below one billion");
     let wire = Wire {
@@ -68,22 +62,26 @@ pub fn encode(state: &JointState) -> Vec<u8> {
     serde_json::to_vec(&wire).expect("numbers and lists always serialize")
 }
 
+/// The numbers; `None` for those that are not finite, which JSON does not have.
+fn finite(numbers: &[f64]) -> Vec<Option<f64>> {
+    numbers
+        .iter()
+        .map(|number| number.is_finite().then_some(*number))
+        .collect()
+}
+
 /// Decodes the joint state that [`encode`] encoded.
 pub fn decode(bytes: &[u8]) -> Result<JointState, Malformed> {
     let wire: Wire = serde_json::from_slice(bytes).map_err(|e| Malformed::Json {
         reason: e.to_string(),
     })?;
     let Timestamp { sec, nsec } = wire.timestamp;
+    // Checked arithmetic: the numbers come from a file.
     let nanos = Some(i64::from(nsec)).filter(|nanos| *nanos < NANOS_PER_SEC);
     let stamp = sec
         .checked_mul(NANOS_PER_SEC)
         .zip(nanos)
         .and_then(|(whole, nanos)| whole.checked_add(nanos));
-    let numbers = |read: Vec<Option<f64>>| {
-        read.into_iter()
-            .map(|number| number.unwrap_or(f64::NAN))
-            .collect()
-    };
     Ok(JointState {
         stamp: stamp.map(Stamp).ok_or_else(|| Malformed::Json {
             reason: "the timestamp is out of range".into(),
@@ -92,6 +90,13 @@ pub fn decode(bytes: &[u8]) -> Result<JointState, Malformed> {
         velocity: numbers(wire.velocity),
         effort: numbers(wire.effort),
     })
+}
+
+/// The numbers, with NaN for null.
+fn numbers(read: Vec<Option<f64>>) -> Vec<f64> {
+    read.into_iter()
+        .map(|number| number.unwrap_or(f64::NAN))
+        .collect()
 }
 
 /// Names of the fields of a message that [`decode`] does not read, in alphabetical order.

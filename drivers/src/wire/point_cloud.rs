@@ -30,6 +30,7 @@ pub fn encode(scan: &RangeScan) -> Vec<u8> {
                 .flat_map(|meters| meters.to_le_bytes()),
         );
         data.extend(point.ring.to_le_bytes());
+        // Padding, so that the last number is aligned to four bytes.
         data.extend([0; 2]);
         data.extend(point.offset_micros.to_le_bytes());
     }
@@ -52,8 +53,9 @@ pub fn encode(scan: &RangeScan) -> Vec<u8> {
 
 /// Identity pose: the points are in the frame of the scanner itself.
 fn identity() -> Message {
-    let (mut position, mut orientation, mut pose) =
-        (Message::default(), Message::default(), Message::default());
+    let mut position = Message::default();
+    let mut orientation = Message::default();
+    let mut pose = Message::default();
     position.double(1, 0.0).double(2, 0.0).double(3, 0.0);
     orientation
         .double(1, 0.0)
@@ -66,7 +68,10 @@ fn identity() -> Message {
 
 /// Decodes the scan that [`encode`] encoded. A cloud with another layout is an error.
 pub fn decode(bytes: &[u8]) -> Result<RangeScan, Malformed> {
-    let (mut stamp, mut scanner, mut stride, mut points) = (None, Arc::from(""), None, None);
+    let mut stamp = None;
+    let mut scanner = Arc::from("");
+    let mut stride = None;
+    let mut points = None;
     let mut layout = Vec::new();
     for field in fields(bytes) {
         let field = field?;
@@ -84,6 +89,8 @@ pub fn decode(bytes: &[u8]) -> Result<RangeScan, Malformed> {
     if stride != Some(STRIDE) || data.len() % STRIDE as usize != 0 {
         return Err(Malformed::Range { field: 4 });
     }
+    // A cloud of another program may have the same stride with other contents. Its bytes would be
+    // read as wrong positions.
     if layout != FIELDS {
         return Err(Malformed::Unsupported {
             name: "fields",
@@ -106,7 +113,8 @@ pub fn decode(bytes: &[u8]) -> Result<RangeScan, Malformed> {
 
 /// Rejects points in another frame than that of the scanner.
 fn expect_identity(pose: &Field<'_>) -> Result<(), Malformed> {
-    let (mut position, mut orientation) = ([0.0; 3], [0.0, 0.0, 0.0, 1.0]);
+    let mut position = [0.0; 3];
+    let mut orientation = [0.0, 0.0, 0.0, 1.0];
     for field in fields(pose.bytes()?) {
         let field = field?;
         match field.number {
@@ -128,7 +136,9 @@ fn expect_identity(pose: &Field<'_>) -> Result<(), Malformed> {
 
 /// Name, offset and type of one `PackedElementField`.
 fn point_field<'a>(field: &Field<'a>) -> Result<(&'a str, u32, u64), Malformed> {
-    let (mut name, mut offset, mut kind) = ("", 0, 0);
+    let mut name = "";
+    let mut offset = 0;
+    let mut kind = 0;
     for inner in fields(field.bytes()?) {
         let inner = inner?;
         match inner.number {
@@ -210,7 +220,7 @@ mod tests {
             points: [].into(),
         };
         let changed = |change: &Message| {
-            // Fields of a message may be in any order, so that encoded parts can be concatenated.
+            // Fields of a message may be in any order, so encoded parts can be concatenated.
             decode(&[encode(&scan), change.clone().into_bytes()].concat())
                 .map_err(|error| error.to_string())
         };

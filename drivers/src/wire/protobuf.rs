@@ -74,6 +74,7 @@ impl Message {
     }
 
     fn raw_varint(&mut self, mut value: u64) {
+        // Seven bits per byte, the lowest first; the high bit means that more follow.
         while value >= 0x80 {
             self.0.push(value.to_le_bytes()[0] | 0x80);
             value >>= 7;
@@ -173,6 +174,7 @@ impl<'a> Iterator for Fields<'a> {
             return None;
         }
         let field = self.field();
+        // Without the length of a field, the next one cannot be found.
         if field.is_err() {
             self.0 = &[];
         }
@@ -185,6 +187,8 @@ impl<'a> Fields<'a> {
         let key = self.varint()?;
         let number = u32::try_from(key >> 3).map_err(|_| Malformed::Range { field: u32::MAX })?;
         let wire_type = key.to_le_bytes()[0] & 7;
+        // The wire type gives the length even of unknown fields, so messages of newer versions can
+        // be read.
         let value = match wire_type {
             VARINT => Value::Varint(self.varint()?),
             FIXED64 => Value::Fixed64(u64::from_le_bytes(self.array()?)),
@@ -206,6 +210,8 @@ impl<'a> Fields<'a> {
 
     fn varint(&mut self) -> Result<u64, Malformed> {
         let mut value = 0;
+        // Ten groups of seven bits hold 64 bits. The format allows no more, so that bytes with the
+        // high bit set cannot keep the loop going.
         for shift in (0..64).step_by(7) {
             let [byte] = self.array()?;
             value |= u64::from(byte & 0x7f) << shift;

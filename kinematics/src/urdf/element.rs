@@ -5,19 +5,24 @@ use roxmltree::{Document, Node, ParsingOptions};
 use std::borrow::Cow;
 use std::collections::{BTreeMap, BTreeSet};
 
-/// Maximum size of a robot description.
+/// Maximum size of a robot description. It is far above that of any robot, whose meshes are in
+/// other files, and keeps a wrong file from filling the memory.
 pub const MAX_BYTES: usize = 16 << 20;
+/// The parser's memory grows with the number of nodes.
 const MAX_NODES: u32 = 1 << 20;
 /// The parser's time grows with the square of an element's attributes, and with the cube of nested
 /// namespaces.
 const MAX_ATTRIBUTES: usize = 2000;
 const MAX_NAMESPACES: usize = 100;
+/// Notes are printed; more of them would hide the first ones, which often cause the others.
 const MAX_NOTES: usize = 100;
 
 /// Repairs what the parsers of other programs accept: white space before the XML declaration, and
 /// prefixes without a namespace. Lines stay as they are.
 pub(super) fn repaired(xml: &str) -> Cow<'_, str> {
     let mut text = Cow::Borrowed(xml);
+    // A declaration that does not start the file is an error in XML 1.0. Everything else in it,
+    // such as the encoding, does not matter for text that has been decoded already.
     let begin = xml.len() - xml.trim_start().len();
     if begin > 0
         && xml[begin..].starts_with("<?xml")
@@ -25,6 +30,8 @@ pub(super) fn repaired(xml: &str) -> Cow<'_, str> {
     {
         text.to_mut().replace_range(begin..begin + n + 2, "");
     }
+    // Parsers that ignore namespaces accept prefixes without a declaration. `xacro` is left
+    // undeclared on purpose: its elements mean that the file has not been expanded.
     let unbound: String = prefixes(xml)
         .into_iter()
         .filter(|prefix| {
@@ -42,15 +49,11 @@ pub(super) fn repaired(xml: &str) -> Cow<'_, str> {
 
 /// The prefixes of elements and attributes, a limited number; values of attributes may add others.
 fn prefixes(xml: &str) -> BTreeSet<&str> {
-    let is_plain = |prefix: &&str| {
-        prefix.starts_with(|first: char| first.is_ascii_alphabetic() || first == '_')
-            && prefix
-                .chars()
-                .all(|c| c.is_ascii_alphanumeric() || c == '_' || c == '-')
-    };
     let mut found = BTreeSet::new();
     for tag in xml.split('<').skip(1) {
         let tag = tag.split('>').next().unwrap_or_default();
+        // The name of the element, then those of its attributes. White space in values yields words
+        // that look like attributes; these only add declarations that nothing uses.
         let names = tag
             .split_whitespace()
             .enumerate()
@@ -61,8 +64,9 @@ fn prefixes(xml: &str) -> BTreeSet<&str> {
         found.extend(
             names
                 .filter_map(|name| Some(name.split_once(':')?.0))
-                .filter(is_plain),
+                .filter(|prefix| is_plain_name(prefix)),
         );
+        // `parse` refuses more declarations than this anyway.
         if found.len() > MAX_NAMESPACES {
             break;
         }
@@ -70,17 +74,22 @@ fn prefixes(xml: &str) -> BTreeSet<&str> {
     found
 }
 
+/// Whether text can be declared as a prefix: a name of ASCII characters. Others may be anything
+/// before a colon, such as a part of a path, and declaring them could make the file invalid.
+fn is_plain_name(text: &str) -> bool {
+    text.starts_with(|first: char| first.is_ascii_alphabetic() || first == '_')
+        && text
+            .chars()
+            .all(|c| c.is_ascii_alphanumeric() || c == '_' || c == '-')
+}
+
 /// Parses XML whose size and structure are limited.
 pub(super) fn parse(xml: &str) -> Result<Document<'_>, Error> {
-    let syntax = |why: String| Error::UrdfSyntax { why };
-    let limited = |what: &str, n: usize, max: usize| match n > max {
-        true => Err(syntax(format!(
-            "its {n} {what} exceed the maximum of {max}"
-        ))),
-        false => Ok(()),
-    };
+    // All limits are checked before the parser runs, because its time depends on them.
     limited("bytes", xml.len(), MAX_BYTES)?;
     limited("namespaces", xml.matches("xmlns").count(), MAX_NAMESPACES)?;
+    // Counted in the text before parsing, because parsing is what takes the time. The count may be
+    // too high, as values and comments contain `=`, too.
     let n_attributes = |element: &str| element.bytes().filter(|byte| *byte == b'=').count();
     limited(
         "attributes in one element",
@@ -99,14 +108,26 @@ pub(super) fn parse(xml: &str) -> Result<Document<'_>, Error> {
             roxmltree::Error::DtdDetected => "; remove the <!DOCTYPE>",
             _ => "",
         };
-        syntax(format!("{error}{hint}"))
+        Error::UrdfSyntax {
+            why: format!("{error}{hint}"),
+        }
     })?;
     match document.root_element().tag_name().name() {
         "robot" => Ok(document),
-        other => Err(syntax(format!(
-            "it describes a <{other}>, expected a <robot>"
-        ))),
+        other => Err(Error::UrdfSyntax {
+            why: format!("it describes a <{other}>, expected a <robot>"),
+        }),
     }
+}
+
+/// An error if a text has more than `max` of something.
+fn limited(what: &str, n: usize, max: usize) -> Result<(), Error> {
+    if n <= max {
+        return Ok(());
+    }
+    Err(Error::UrdfSyntax {
+        why: format!("its {n} {what} exceed the maximum of {max}"),
+    })
 }
 
 /// The reason why an element cannot be used.
@@ -128,9 +149,10 @@ pub(crate) struct Notes {
 
 impl Notes {
     pub(crate) fn add(&mut self, line: u32, text: &str) {
-        match self.texts.len() < MAX_NOTES {
-            true => self.texts.push(format!("line {line}: {text}")),
-            false => self.n_omitted += 1,
+        if self.texts.len() < MAX_NOTES {
+            self.texts.push(format!("line {line}: {text}"));
+        } else {
+            self.n_omitted += 1;
         }
     }
 
@@ -209,6 +231,7 @@ impl<'a> Element<'a> {
         let Some(first) = all.next() else {
             return Ok(None);
         };
+        // Positions in the file differ between copies, so only names and values are compared.
         let attributes =
             |element: Element<'a>| element.0.attributes().map(|a| (a.name(), a.value()));
         match all.find(|other| !attributes(first).eq(attributes(*other))) {
@@ -244,6 +267,7 @@ impl<'a> Element<'a> {
             .collect();
         let numbers = numbers.and_then(|numbers| <[f64; N]>::try_from(numbers).ok());
         if let Some(numbers) =
+            // `parse` of f64 accepts "nan" and "inf".
             numbers.filter(|numbers| numbers.iter().all(|number| number.is_finite()))
         {
             return Ok(Some(numbers));
@@ -257,6 +281,7 @@ impl<'a> Element<'a> {
         } else {
             ""
         };
+        // The text may be a whole file by mistake.
         let shown: String = text.chars().take(60).collect();
         Err(self.problem(format!(
             "{name} of <{}> is {shown:?}, expected {expected}{xacro}",
@@ -270,36 +295,37 @@ impl<'a> Element<'a> {
 
     /// Notes each attribute and child that is not listed.
     pub(crate) fn note_unknown(self, attributes: &[&str], children: &[&str], notes: &mut Notes) {
-        let mut add = |what: String, at: usize| {
-            let line = || self.0.document().text_pos_at(at).row;
-            let known = notes.unknown.entry((self.tag().to_owned(), what));
-            known
-                .and_modify(|(_, n)| *n += 1)
-                .or_insert_with(|| (line(), 1));
-        };
         for attribute in self.0.attributes() {
             if attribute.namespace().is_none() && !attributes.contains(&attribute.name()) {
-                add(
-                    format!("the attribute {:?}", attribute.name()),
-                    attribute.range().start,
-                );
+                let what = format!("the attribute {:?}", attribute.name());
+                self.add_unknown(what, attribute.range().start, notes);
             }
         }
         for child in self.0.children().filter(Node::is_element) {
             let tag = child.tag_name();
             if tag.namespace() == self.0.document().root_element().tag_name().namespace() {
                 if !children.contains(&tag.name()) {
-                    add(format!("<{}>", tag.name()), child.range().start);
+                    let what = format!("<{}>", tag.name());
+                    self.add_unknown(what, child.range().start, notes);
                 }
             } else if tag
                 .namespace()
                 .is_some_and(|namespace| namespace.contains("xacro"))
             {
-                add(
-                    format!("<xacro:{}>, which xacro has not expanded,", tag.name()),
-                    child.range().start,
-                );
+                let what = format!("<xacro:{}>, which xacro has not expanded,", tag.name());
+                self.add_unknown(what, child.range().start, notes);
             }
         }
+    }
+
+    /// Counts an unknown name at a position of the text.
+    fn add_unknown(self, what: String, at: usize, notes: &mut Notes) {
+        // Finding a line takes time that grows with the file, so it is done only for the first one.
+        let first = || (self.0.document().text_pos_at(at).row, 1);
+        notes
+            .unknown
+            .entry((self.tag().to_owned(), what))
+            .and_modify(|(_, n)| *n += 1)
+            .or_insert_with(first);
     }
 }

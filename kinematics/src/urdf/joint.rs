@@ -28,7 +28,9 @@ const LIMIT_ATTRIBUTES: [&str; 7] = [
     "deceleration",
     "jerk",
 ];
-/// Shortest quaternion that is normalized instead of refused.
+/// Shortest quaternion that is normalized instead of refused. Rounding in a file changes a unit
+/// quaternion by far less than its length; a quaternion as short as this is a mistake, and its
+/// direction is noise.
 const MIN_QUATERNION_NORM: f64 = 1e-6;
 
 /// Reads a joint. An invalid pose, axis, type or mimic rule is stored in [`Joint::problem`],
@@ -43,16 +45,8 @@ pub(super) fn read(element: Element<'_>, notes: &mut Notes) -> Result<Joint, Err
         .required("name")
         .map_err(invalid("a joint".to_owned()))?;
     let what = format!("joint {name:?}");
-    let link = |tag| -> Result<String, Error> {
-        let read = || {
-            let link = element
-                .only(tag)?
-                .ok_or_else(|| element.problem(format!("it has no <{tag}>")))?;
-            link.required("link")
-        };
-        Ok(read().map_err(invalid(what.clone()))?.to_owned())
-    };
-    let (parent, child) = (link("parent")?, link("child")?);
+    let parent = link_in(element, "parent").map_err(invalid(what.clone()))?;
+    let child = link_in(element, "child").map_err(invalid(what.clone()))?;
     note_unknown(element, notes);
     let (motion, problem) = match Motion::read(element, &what, notes) {
         Ok(motion) => (motion, None),
@@ -79,6 +73,14 @@ pub(super) fn read(element: Element<'_>, notes: &mut Notes) -> Result<Joint, Err
         mimic,
         problem,
     })
+}
+
+/// The name of the link in the `<parent>` or `<child>` of a joint.
+fn link_in(joint: Element<'_>, tag: &'static str) -> Result<String, Problem> {
+    let link = joint
+        .only(tag)?
+        .ok_or_else(|| joint.problem(format!("it has no <{tag}>")))?;
+    Ok(link.required("link")?.to_owned())
 }
 
 fn note_unknown(element: Element<'_>, notes: &mut Notes) {
@@ -131,6 +133,8 @@ impl Motion {
                 "unknown type {other:?}, expected fixed, revolute, continuous, prismatic, floating, planar or spherical"
             ))),
         };
+        // Axis, limits and mimic rule of a fixed joint mean nothing, so they are not read, and
+        // errors in them do not matter.
         let parent_from_joint = origin(element)?;
         let is_movable = matches!(kind, JointKind::Revolute | JointKind::Prismatic);
         if !is_movable {
@@ -146,6 +150,8 @@ impl Motion {
             Err(Problem { line, why }) => {
                 notes.add(line, &format!("{what}: {why}"));
                 JointLimits {
+                    // The joint is still part of the kinematics, but must not be moved: its real
+                    // range is unknown.
                     is_range_valid: false,
                     ..JointLimits::NONE
                 }
@@ -192,11 +198,13 @@ pub(crate) fn origin(element: Element<'_>) -> Result<Transform, Problem> {
 
 fn axis(joint: Element<'_>) -> Result<Unit<Vector3<f64>>, Problem> {
     let Some(axis) = joint.only("axis")? else {
+        // The default of the URDF specification.
         return Ok(Vector3::x_axis());
     };
     let Some(xyz) = axis.numbers("xyz")? else {
         return Ok(Vector3::x_axis());
     };
+    // Any length but zero is accepted: only the direction matters.
     Unit::try_new(Vector3::from(xyz), f64::MIN_POSITIVE)
         .ok_or_else(|| axis.problem("xyz of <axis> is zero, expected a direction"))
 }
@@ -205,13 +213,9 @@ fn mimic(joint: Element<'_>) -> Result<Option<Mimic>, Problem> {
     let Some(mimic) = joint.only("mimic")? else {
         return Ok(None);
     };
-    let (source, multiplier) = (
-        mimic.required("joint")?.to_owned(),
-        mimic.number("multiplier")?.unwrap_or(1.0),
-    );
     Ok(Some(Mimic {
-        source,
-        multiplier,
+        source: mimic.required("joint")?.to_owned(),
+        multiplier: mimic.number("multiplier")?.unwrap_or(1.0),
         offset: mimic.number("offset")?.unwrap_or(0.0),
     }))
 }
@@ -242,10 +246,13 @@ fn read_limits(
         effort,
         ..JointLimits::NONE
     };
+    // Two zeros are not a range but missing values: a joint without motion would be fixed.
     if is_continuous || (lower.unwrap_or(0.0), upper.unwrap_or(0.0)) == (0.0, 0.0) {
         return unlimited;
     }
-    let (lower, upper) = (lower.unwrap_or(0.0), upper.unwrap_or(0.0));
+    let lower = lower.unwrap_or(0.0);
+    let upper = upper.unwrap_or(0.0);
+    // False for NaN, which stands for a number that could not be read.
     if lower <= upper {
         return JointLimits {
             lower,
@@ -253,6 +260,7 @@ fn read_limits(
             ..unlimited
         };
     }
+    // NaN has been noted with its own message.
     if !(lower.is_nan() || upper.is_nan()) {
         notes.add(limit.line(), &format!("{what}: lower of <limit> is {lower}, above upper, which is {upper}; the joint has no range and is not moved"));
     }

@@ -56,36 +56,7 @@ impl Robot {
             &mut notes,
         );
         let name = root.attribute("name").unwrap_or_default().to_owned();
-        let invalid = |what, problem: element::Problem| Error::UrdfElement {
-            line: problem.line,
-            what,
-            why: problem.why,
-        };
-        let name_of = |link: Element<'_>| -> Result<String, Error> {
-            Ok(link
-                .required("name")
-                .map_err(|problem| invalid("a link".to_owned(), problem))?
-                .to_owned())
-        };
-        // Finding a line takes time, so it is done only for notes.
-        let (mut links, mut element_of) = (Vec::new(), HashMap::new());
-        for element in root.all("link") {
-            let link = name_of(element)?;
-            if let Some(first) = element_of
-                .get(&link)
-                .map(|first: &Element<'_>| first.line())
-            {
-                notes.add(
-                    element.line(),
-                    &format!(
-                        "link {link:?} is defined again; its definition in line {first} is used"
-                    ),
-                );
-                continue;
-            }
-            element_of.insert(link.clone(), element);
-            links.push(link);
-        }
+        let links = read_links(root, &mut notes)?;
         if links.is_empty() {
             return Err(Error::NoLinks { robot: name });
         }
@@ -93,25 +64,13 @@ impl Robot {
             .all("joint")
             .map(|joint| joint::read(joint, &mut notes))
             .collect::<Result<Vec<_>, _>>()?;
-        for (joint, element) in joints.iter_mut().zip(root.all("joint")) {
-            if let Some(link) = [&joint.parent, &joint.child]
-                .into_iter()
-                .find(|link| !element_of.contains_key(*link))
-            {
-                let undefined = Error::UndefinedLink {
-                    joint: joint.name.clone(),
-                    link: link.clone(),
-                };
-                notes.add(
-                    element.line(),
-                    &format!("joint {:?}: link {link:?} is not defined", joint.name),
-                );
-                joint.problem.get_or_insert(undefined);
-            }
-        }
+        mark_undefined_links(root, &links, &mut joints, &mut notes);
+        // These problems concern the tree as a whole: no chain of such a file can be trusted.
         let joints_by_name = indices_by_name("joint", root.all("joint"))?;
         let joint_above = joints_above(&links, &joints)?;
         reject_cycles(&links, &joints, &joint_above)?;
+        // Shapes come last: they are only drawn and checked for collisions, so their errors are
+        // notes.
         let mut shapes = shape::read_all(root, &mut notes);
         drop_below_problems(&links, &joints, &joint_above, &mut shapes);
         Ok(Self {
@@ -198,6 +157,7 @@ impl Robot {
             joints_upwards.push(&self.joints[above]);
             link = &self.joints[above].parent;
         }
+        // A link has one parent but many children, so the only direct way is upwards.
         joints_upwards.reverse();
         Ok(joints_upwards)
     }
@@ -214,6 +174,60 @@ impl Robot {
     }
 }
 
+/// The names of all links, in file order. A link that is defined again is noted and left out.
+fn read_links(root: Element<'_>, notes: &mut Notes) -> Result<Vec<String>, Error> {
+    let mut links = Vec::new();
+    // Elements instead of lines: finding a line takes time, so it is done only for notes.
+    let mut element_of: HashMap<String, Element<'_>> = HashMap::new();
+    for element in root.all("link") {
+        let link = element
+            .required("name")
+            .map_err(|problem| Error::UrdfElement {
+                line: problem.line,
+                what: "a link".to_owned(),
+                why: problem.why,
+            })?
+            .to_owned();
+        if let Some(first) = element_of.get(&link).map(|first| first.line()) {
+            notes.add(
+                element.line(),
+                &format!("link {link:?} is defined again; its definition in line {first} is used"),
+            );
+            continue;
+        }
+        element_of.insert(link.clone(), element);
+        links.push(link);
+    }
+    Ok(links)
+}
+
+/// Stores a problem in each joint with a link that is not defined. It is not an error of the file,
+/// because only chains through this joint need the link.
+fn mark_undefined_links(
+    root: Element<'_>,
+    links: &[String],
+    joints: &mut [Joint],
+    notes: &mut Notes,
+) {
+    let links: HashSet<&String> = links.iter().collect();
+    for (joint, element) in joints.iter_mut().zip(root.all("joint")) {
+        if let Some(link) = [&joint.parent, &joint.child]
+            .into_iter()
+            .find(|link| !links.contains(*link))
+        {
+            let undefined = Error::UndefinedLink {
+                joint: joint.name.clone(),
+                link: link.clone(),
+            };
+            notes.add(
+                element.line(),
+                &format!("joint {:?}: link {link:?} is not defined", joint.name),
+            );
+            joint.problem.get_or_insert(undefined);
+        }
+    }
+}
+
 /// Index of each element with a name, in file order.
 fn indices_by_name<'a>(
     kind: &'static str,
@@ -222,6 +236,8 @@ fn indices_by_name<'a>(
     let mut indices = HashMap::new();
     let mut lines = Vec::new();
     for (ix, element) in elements.enumerate() {
+        // The element instead of its line: finding a line takes time, and is needed only for the
+        // error.
         lines.push(element);
         let name = element.attribute("name").unwrap_or_default();
         if let Some(first_ix) = indices.insert(name.to_owned(), ix) {
@@ -244,6 +260,8 @@ fn joints_above(
     let mut above: HashMap<String, Option<usize>> =
         links.iter().map(|link| (link.clone(), None)).collect();
     for (joint_ix, joint) in joints.iter().enumerate() {
+        // The joint has a problem already. Its child must stay without a parent, or be that of a
+        // valid joint.
         if !above.contains_key(&joint.parent) || !above.contains_key(&joint.child) {
             continue;
         }
@@ -266,6 +284,8 @@ fn reject_cycles(
     // Links from which a root was reached.
     let mut sound: HashSet<&str> = HashSet::new();
     for start in links {
+        // Each walk ends at a root, at a link of an earlier walk, or where it meets itself. So each
+        // link is walked once in total, and the time is linear even in deep trees.
         let mut walked: HashSet<&str> = HashSet::new();
         let mut link: &str = start;
         while !sound.contains(link) {
@@ -291,6 +311,7 @@ fn drop_below_problems(
     above: &HashMap<String, Option<usize>>,
     shapes: &mut HashMap<String, shape::LinkShapes>,
 ) {
+    // Files without problems, which are nearly all, skip the search.
     if joints.iter().all(|joint| joint.problem.is_none()) {
         return;
     }
@@ -306,6 +327,8 @@ fn drop_below_problems(
         .filter(|link| !is_placed(link))
         .collect();
     let mut seen: HashSet<&str> = dropped.iter().copied().collect();
+    // The search visits each link once: a shape below an invalid joint has no known pose, wherever
+    // it is.
     while let Some(link) = dropped.pop() {
         shapes.remove(link);
         dropped.extend(

@@ -23,55 +23,20 @@ pub(super) fn table(head: &str, columns: &[Column], rows: &[BarRow]) -> String {
     if rows.is_empty() {
         return String::new();
     }
-    let value = |row: &BarRow, ix: usize| row.values.get(ix).copied().flatten();
-    let shown: Vec<(usize, &Column)> = columns
+    let shown: Vec<ShownColumn> = columns
         .iter()
         .enumerate()
-        .filter(|(ix, _)| rows.iter().any(|row| value(row, *ix).is_some()))
+        .filter(|(ix, _)| rows.iter().any(|row| row.value(*ix).is_some()))
+        .map(|(ix, &(name, digits))| ShownColumn {
+            ix,
+            name,
+            digits,
+            largest: largest(rows, ix),
+        })
         .collect();
-    let largest = |ix: usize| {
-        let of = |all: bool| {
-            let values = rows
-                .iter()
-                .filter(|row| all || row.tag.is_empty())
-                .filter_map(|row| value(row, ix));
-            values.filter(|value| value.is_finite()).fold(0.0, f64::max)
-        };
-        if of(false) > 0.0 { of(false) } else { of(true) }
-    };
-    let largest: Vec<f64> = shown.iter().map(|(ix, _)| largest(*ix)).collect();
-    let row = |row: &BarRow| {
-        let cells = shown
-            .iter()
-            .zip(&largest)
-            .map(|((ix, (_, digits)), largest)| {
-                let value = value(row, *ix);
-                let percent =
-                    value.map_or(0.0, |value| (100.0 * value / largest).clamp(0.0, 100.0));
-                let percent = if percent.is_finite() { percent } else { 0.0 };
-                format!(
-                    "<td class=\"bar\" style=\"--part:{percent:.1}%\">{}</td>",
-                    number(value, *digits)
-                )
-            });
-        let tag = match row.tag.is_empty() {
-            true => String::new(),
-            false => format!(" <span class=\"tag\">{}</span>", escaped(&row.tag)),
-        };
-        let class = if row.tag.is_empty() {
-            ""
-        } else {
-            " class=\"unused\""
-        };
-        format!(
-            "<tr{class}><td>{}{tag}</td>{}</tr>\n",
-            escaped(&row.name),
-            cells.collect::<String>()
-        )
-    };
     let names: String = shown
         .iter()
-        .map(|(_, (name, _))| format!("<th>{}</th>", escaped(name)))
+        .map(|column| format!("<th>{}</th>", escaped(column.name)))
         .collect();
     let class = if rows.len() > MAX_ROWS {
         "wide long"
@@ -81,8 +46,68 @@ pub(super) fn table(head: &str, columns: &[Column], rows: &[BarRow]) -> String {
     format!(
         "<div class=\"{class}\"><table class=\"bars\">\n<thead><tr><th>{}</th>{names}</tr></thead>\n<tbody>{}</tbody></table></div>",
         escaped(head),
-        rows.iter().map(row).collect::<String>()
+        rows.iter().map(|row| row.html(&shown)).collect::<String>()
     )
+}
+
+/// A column that has values.
+struct ShownColumn {
+    /// Its index among the values of a row.
+    ix: usize,
+    name: &'static str,
+    digits: usize,
+    /// The value with a full bar.
+    largest: f64,
+}
+
+/// Largest value of a column in rows without a tag; of all rows if there is none.
+fn largest(rows: &[BarRow], ix: usize) -> f64 {
+    // An outlier may be hundreds of times larger than the other values, whose bars would disappear.
+    let used = largest_of(rows.iter().filter(|row| row.tag.is_empty()), ix);
+    if used > 0.0 {
+        used
+    } else {
+        largest_of(rows.iter(), ix)
+    }
+}
+
+/// Largest finite value of a column; 0 if there is none.
+fn largest_of<'a>(rows: impl Iterator<Item = &'a BarRow>, ix: usize) -> f64 {
+    rows.filter_map(|row| row.value(ix))
+        .filter(|value| value.is_finite())
+        .fold(0.0, f64::max)
+}
+
+impl BarRow {
+    fn value(&self, ix: usize) -> Option<f64> {
+        self.values.get(ix).copied().flatten()
+    }
+
+    fn html(&self, columns: &[ShownColumn]) -> String {
+        let cells = columns.iter().map(|column| {
+            let value = self.value(column.ix);
+            let percent = value.map_or(0.0, |value| {
+                (100.0 * value / column.largest).clamp(0.0, 100.0)
+            });
+            // 0 / 0 is a NaN, which CSS would reject.
+            let percent = if percent.is_finite() { percent } else { 0.0 };
+            format!(
+                "<td class=\"bar\" style=\"--part:{percent:.1}%\">{}</td>",
+                number(value, column.digits)
+            )
+        });
+        let (class, tag) = if self.tag.is_empty() {
+            ("", String::new())
+        } else {
+            let tag = format!(" <span class=\"tag\">{}</span>", escaped(&self.tag));
+            (" class=\"unused\"", tag)
+        };
+        format!(
+            "<tr{class}><td>{}{tag}</td>{}</tr>\n",
+            escaped(&self.name),
+            cells.collect::<String>()
+        )
+    }
 }
 
 #[cfg(test)]

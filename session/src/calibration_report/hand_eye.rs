@@ -66,6 +66,7 @@ impl HandEyeReport<'_> {
             "RMS rotation about three orthogonal axes. The second-largest rotation limits the accuracy: turn the flange by 20 degrees or more about different axes.",
             &self.excitation(),
         );
+        // The fraction is that of the standard deviation that remains.
         let next = self.next_poses.iter().map(|next| {
             let percent = format!("{:.0} %", 100.0 * (1.0 - next.sigma_frac));
             vec![next.motion.clone(), percent]
@@ -76,21 +77,7 @@ impl HandEyeReport<'_> {
             next.collect(),
         );
         if let Some(calibration) = self.calibration {
-            let legend = "Position of the board according to each sample, relative to the result. An elongated cloud or two clusters indicate a systematic error.";
-            page.section(
-                "Scatter of the board",
-                legend,
-                &page::gallery(&scatter_plots(calibration)),
-            );
-            page.section(
-                "Held-out samples",
-                "",
-                &page::note(Some(&held_out(calibration))),
-            );
-            let legend = "Difference between the measured and predicted board pose. Bars are relative to the largest error of a used sample.";
-            let columns = [("position, mm", 2), ("rotation, °", 3), ("corners, px", 3)];
-            let rows: Vec<BarRow> = calibration.samples.iter().map(row).collect();
-            page.section("Samples", legend, &bars::table("sample", &columns, &rows));
+            add_errors(&mut page, calibration);
         }
         let reasons = self
             .unused
@@ -174,76 +161,118 @@ impl HandEyeReport<'_> {
         let Some(excitation) = RotationExcitation::of(&poses) else {
             return String::new();
         };
-        let row = |(axis, rms_rad): (String, f64)| {
-            let is_weak = rms_rad < excitation.min_rad;
-            let tag = if is_weak { "hardly any rotation" } else { "" };
-            BarRow {
-                name: axis,
-                tag: tag.to_owned(),
-                values: vec![Some(rms_rad.to_degrees())],
-            }
-        };
+        let min_rad = excitation.min_rad;
         let rows: Vec<BarRow> = excitation
             .axes
             .into_iter()
             .zip(excitation.rms_rad)
-            .map(row)
+            .map(|(axis, rms_rad)| excitation_row(axis, rms_rad, min_rad))
             .collect();
         bars::table("rotation around", &[("RMS, °", 1)], &rows)
     }
 
     fn pictures(&self) -> Vec<String> {
-        let picture = |report: &SampleReport| {
-            let tag = if report.status == SampleStatus::Used {
-                ""
-            } else {
-                ", not used"
-            };
-            let caption = format!("{}: {} px RMS{tag}", report.name, number(report.rms_px, 3));
-            photo::with_corners(self.photos, &report.name, &caption, &report.points)
-        };
         let pictures: Vec<String> = match self.calibration {
-            Some(calibration) => {
-                let with = |status: SampleStatus| {
-                    calibration
-                        .samples
-                        .iter()
-                        .filter(move |sample| sample.status == status && sample.rms_px.is_some())
-                };
-                let used: Vec<&SampleReport> = with(SampleStatus::Used).collect();
-                let errors: Vec<f64> = used
-                    .iter()
-                    .map(|sample| sample.rms_px.unwrap_or(0.0))
-                    .collect();
-                let chosen = photo::worst_and_median(&errors)
-                    .into_iter()
-                    .map(|ix| used[ix]);
-                chosen
-                    .chain(with(SampleStatus::Outlier).take(2))
-                    .map(picture)
-                    .collect()
-            }
-            None => {
-                let view = |sample: &HandEyeSample| match &sample.board {
-                    BoardObservation::View(view) => {
-                        let caption = format!("{}: detected corners", sample.name);
-                        Some(photo::with_corners(
-                            self.photos,
-                            &sample.name,
-                            &caption,
-                            &detected_points(view),
-                        ))
-                    }
-                    BoardObservation::Pose(_) => None,
-                };
-                self.samples.iter().filter_map(view).take(2).collect()
-            }
+            Some(calibration) => self.pictures_of_result(calibration),
+            None => self
+                .samples
+                .iter()
+                .filter_map(|sample| self.picture_of_input(sample))
+                .take(2)
+                .collect(),
         };
+        // A photo that cannot be read again has no picture.
         pictures
             .into_iter()
             .filter(|picture| !picture.is_empty())
             .collect()
     }
+
+    /// Photos of the worst and the median sample, and of two outliers, with detected and predicted
+    /// corners.
+    fn pictures_of_result(&self, calibration: &HandEyeCalibration) -> Vec<String> {
+        // Samples whose pose was given without an image have no error in pixels.
+        let used: Vec<&SampleReport> = with_status(calibration, SampleStatus::Used).collect();
+        let errors: Vec<f64> = used
+            .iter()
+            .map(|sample| sample.rms_px.unwrap_or(0.0))
+            .collect();
+        let chosen = photo::worst_and_median(&errors)
+            .into_iter()
+            .map(|ix| used[ix]);
+        chosen
+            .chain(with_status(calibration, SampleStatus::Outlier).take(2))
+            .map(|sample| self.picture_of_sample(sample))
+            .collect()
+    }
+
+    /// Photo of a sample with detected and predicted corners.
+    fn picture_of_sample(&self, report: &SampleReport) -> String {
+        let tag = if report.status == SampleStatus::Used {
+            ""
+        } else {
+            ", not used"
+        };
+        let caption = format!("{}: {} px RMS{tag}", report.name, number(report.rms_px, 3));
+        photo::with_corners(self.photos, &report.name, &caption, &report.points)
+    }
+
+    /// Photo of a sample with its detected corners; `None` if its pose was given without an image.
+    fn picture_of_input(&self, sample: &HandEyeSample) -> Option<String> {
+        match &sample.board {
+            BoardObservation::View(view) => {
+                let caption = format!("{}: detected corners", sample.name);
+                Some(photo::with_corners(
+                    self.photos,
+                    &sample.name,
+                    &caption,
+                    &detected_points(view),
+                ))
+            }
+            BoardObservation::Pose(_) => None,
+        }
+    }
+}
+
+/// Samples of a status that have corners.
+fn with_status(
+    calibration: &HandEyeCalibration,
+    status: SampleStatus,
+) -> impl Iterator<Item = &SampleReport> {
+    calibration
+        .samples
+        .iter()
+        .filter(move |sample| sample.status == status && sample.rms_px.is_some())
+}
+
+/// A row for the rotation about one axis, with a tag if it is too small.
+fn excitation_row(axis: String, rms_rad: f64, min_rad: f64) -> BarRow {
+    let is_weak = rms_rad < min_rad;
+    let tag = if is_weak { "hardly any rotation" } else { "" };
+    BarRow {
+        name: axis,
+        tag: tag.to_owned(),
+        values: vec![Some(rms_rad.to_degrees())],
+    }
+}
+
+/// Adds the sections about the errors of a result.
+fn add_errors(page: &mut Page, calibration: &HandEyeCalibration) {
+    let legend = "Position of the board according to each sample, relative to the result. An elongated cloud or two clusters indicate a systematic error.";
+    page.section(
+        "Scatter of the board",
+        legend,
+        &page::gallery(&scatter_plots(calibration)),
+    );
+    page.section(
+        "Held-out samples",
+        "",
+        &page::note(Some(&held_out(calibration))),
+    );
+    let legend = "Difference between the measured and predicted board pose. Bars are relative to the largest error of a used sample.";
+    let columns = [("position, mm", 2), ("rotation, °", 3), ("corners, px", 3)];
+    let rows: Vec<BarRow> = calibration.samples.iter().map(row).collect();
+    page.section("Samples", legend, &bars::table("sample", &columns, &rows));
 }
 
 fn three(values: [f64; 3], digits: usize) -> String {
@@ -298,13 +327,15 @@ fn held_out(calibration: &HandEyeCalibration) -> String {
     let Some(scatter) = calibration.held_out_scatter else {
         return "There are too few samples to leave one out.".to_owned();
     };
-    let method = match n_used > MAX_FOLDS {
-        true => format!(
+    let method = if n_used > MAX_FOLDS {
+        format!(
             "The samples are divided into {MAX_FOLDS} groups, and each group is evaluated with a calibration from the others"
-        ),
-        false => "Each sample is evaluated with a calibration from the others".to_owned(),
+        )
+    } else {
+        "Each sample is evaluated with a calibration from the others".to_owned()
     };
-    let (mm, deg) = (number(Some(scatter.mm), 2), number(Some(scatter.deg), 3));
+    let mm = number(Some(scatter.mm), 2);
+    let deg = number(Some(scatter.deg), 3);
     format!(
         "{method}: scatter of the board {mm} mm and {deg}°. With all samples: {} mm and {}°.",
         number(Some(calibration.scatter.mm), 2),
@@ -332,19 +363,26 @@ fn scatter_plots(calibration: &HandEyeCalibration) -> Vec<String> {
         Setup::EyeInHand => "base",
         Setup::EyeToHand => "flange",
     };
-    let plot = |across: usize, up: usize| {
-        let point = |sample: &SampleReport| {
-            let offset = sample.board_offset_mm?;
-            let is_outlier = sample.status != SampleStatus::Used;
-            Some(ScatterPoint {
-                name: sample.name.clone(),
-                at: [offset[across], offset[up]],
-                is_outlier,
-            })
-        };
-        let points: Vec<ScatterPoint> = calibration.samples.iter().filter_map(point).collect();
-        let label = |axis: usize| format!("{} of the {parent}, mm", ["x", "y", "z"][axis]);
-        page::figure("", &scatter::svg([&label(across), &label(up)], &points))
+    let label = |axis: usize| format!("{} of the {parent}, mm", ["x", "y", "z"][axis]);
+    // Two plots with a common axis show all three coordinates.
+    [[0, 1], [0, 2]]
+        .into_iter()
+        .map(|[across, up]| {
+            let points = scatter_points(&calibration.samples, [across, up]);
+            page::figure("", &scatter::svg([&label(across), &label(up)], &points))
+        })
+        .collect()
+}
+
+/// Positions of the board according to each sample, along two axes.
+fn scatter_points(samples: &[SampleReport], [across, up]: [usize; 2]) -> Vec<ScatterPoint> {
+    let point = |sample: &SampleReport| {
+        let offset = sample.board_offset_mm?;
+        Some(ScatterPoint {
+            name: sample.name.clone(),
+            at: [offset[across], offset[up]],
+            is_outlier: sample.status != SampleStatus::Used,
+        })
     };
-    vec![plot(0, 1), plot(0, 2)]
+    samples.iter().filter_map(point).collect()
 }

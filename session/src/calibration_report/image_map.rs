@@ -54,12 +54,15 @@ impl ImageMap {
 
     /// Length in image pixels of one unit of line width.
     fn unit(&self) -> f64 {
+        // A map is shown about 640 CSS pixels wide, whatever the size of the image. Lines then have
+        // the same width in all maps.
         self.size_px[0].max(self.size_px[1]) / 640.0
     }
 
     /// Draws an embedded photo of the part.
     pub(super) fn photo(&mut self, uri: &str) {
-        let ([x, y], [width, height]) = (self.first_px, self.size_px);
+        let [x, y] = self.first_px;
+        let [width, height] = self.size_px;
         self.push(&format!(
             "<image x=\"{x}\" y=\"{y}\" width=\"{width}\" height=\"{height}\" preserveAspectRatio=\"none\" href=\"{uri}\"/>\n"
         ));
@@ -75,15 +78,11 @@ impl ImageMap {
             .copied()
             .filter(|value| value.is_finite())
             .fold(0.0, f64::max);
-        let (width, height) = (
-            self.size_px[0] / grid.n_columns as f64,
-            self.size_px[1] / grid.n_rows as f64,
-        );
+        let width = self.size_px[0] / grid.n_columns as f64;
+        let height = self.size_px[1] / grid.n_rows as f64;
         for (ix, value) in grid.values.iter().enumerate() {
-            let (x, y) = (
-                (ix % grid.n_columns) as f64 * width,
-                (ix / grid.n_columns) as f64 * height,
-            );
+            let x = (ix % grid.n_columns) as f64 * width;
+            let y = (ix / grid.n_columns) as f64 * height;
             let cell =
                 format!("x=\"{x:.1}\" y=\"{y:.1}\" width=\"{width:.1}\" height=\"{height:.1}\"");
             self.push(&match value.filter(|value| value.is_finite()) {
@@ -101,6 +100,8 @@ impl ImageMap {
 
     /// Draws dots.
     pub(super) fn dots(&mut self, pixels: impl Iterator<Item = [f64; 2]>) {
+        // One path for all dots: thousands of elements would make the page slow. Lines without
+        // length have round caps, which are the dots.
         let mut path = String::new();
         for [x, y] in pixels {
             write!(path, "M{x:.1} {y:.1}h0").expect("writing to a string cannot fail");
@@ -113,18 +114,25 @@ impl ImageMap {
 
     /// Draws circles around detected corners and crosses at the predicted ones.
     pub(super) fn corners(&mut self, points: &[PointFit]) {
-        let (mut circles, mut crosses) = (String::new(), String::new());
-        let (radius, arm) = (7.0 * self.unit(), 5.0 * self.unit());
+        let mut circles = String::new();
+        let mut crosses = String::new();
+        let radius = 7.0 * self.unit();
+        let arm = 5.0 * self.unit();
         for PointFit {
             pixel: [x, y],
             residual_px: [dx, dy],
         } in points
         {
-            let (left, diameter) = (x - radius, 2.0 * radius);
+            // A path has no circles, so each one consists of two half arcs.
+            let left = x - radius;
+            let diameter = 2.0 * radius;
             write!(circles, "M{left:.1} {y:.1}a{radius:.1} {radius:.1} 0 1 0 {diameter:.1} 0a{radius:.1} {radius:.1} 0 1 0 -{diameter:.1} 0")
                 .expect("writing to a string cannot fail");
+            // Without a result, there is no prediction.
             if dx.is_finite() && dy.is_finite() {
-                let (u, v) = (x - dx, y - dy);
+                // Residuals are detected minus predicted positions.
+                let u = x - dx;
+                let v = y - dy;
                 let side = 2.0 * arm;
                 write!(
                     crosses,
@@ -170,6 +178,8 @@ impl ImageMap {
             .iter()
             .map(|point| point.residual_px[0].hypot(point.residual_px[1]))
             .collect();
+        // A quantile instead of the maximum, so that one wrong corner does not make all other arrows
+        // too short to see.
         let rank = kinematics::quantile::Rank::Nearest;
         let long_px = kinematics::quantile::quantile(&mut lengths, 0.95, rank).unwrap_or(0.0);
         let magnification =
@@ -194,7 +204,8 @@ impl ImageMap {
     }
 
     pub(super) fn svg(&self, label: &str) -> String {
-        let ([x, y], [width, height]) = (self.first_px, self.size_px);
+        let [x, y] = self.first_px;
+        let [width, height] = self.size_px;
         let label = crate::chart::drawing::escaped(label);
         format!(
             "<svg class=\"map\" role=\"img\" aria-label=\"{label}\" viewBox=\"{x} {y} {width} {height}\">\n\

@@ -83,6 +83,12 @@ impl IntrinsicsReport<'_> {
                 calibration.trials.iter().map(trial).collect(),
             );
         }
+        self.add_images(&mut page);
+        page.finish()
+    }
+
+    /// Adds the sections about single images.
+    fn add_images(&self, page: &mut Page) {
         let legend = "RMS distance between detected and projected corners. Bars are relative to the largest error of a used image.";
         let columns = [("error, px", 3), ("corners", 0)];
         page.section(
@@ -101,7 +107,6 @@ impl IntrinsicsReport<'_> {
             "Images with the fewest and a median number of corners"
         };
         page.section(title, legend, &page::gallery(&self.pictures()));
-        page.finish()
     }
 
     fn input_figures(&self) -> Vec<page::Figure> {
@@ -130,6 +135,17 @@ impl IntrinsicsReport<'_> {
         if pixels.is_empty() {
             return Vec::new();
         }
+        let mut maps = vec![self.coverage_map(pixels, next)];
+        // The other maps show properties of a result.
+        if let Some(calibration) = self.calibration {
+            maps.push(self.uncertainty_map(calibration));
+            maps.push(self.residual_map(calibration));
+        }
+        maps
+    }
+
+    /// Where the corners are in the images, and the outline of the suggested next image.
+    fn coverage_map(&self, pixels: Vec<[f64; 2]>, next: Option<&NextView>) -> String {
         let counted = ImageGrid::coverage(self.size_px, pixels.iter().copied());
         let values: Vec<Option<f64>> = counted.values.iter().map(|n| Some(*n as f64)).collect();
         let n_empty = counted.values.iter().filter(|n| **n == 0).count();
@@ -149,28 +165,29 @@ impl IntrinsicsReport<'_> {
             map.outline(&outline);
             caption.push_str(" Dashed: the target in the suggested next image.");
         }
-        let mut maps = vec![page::figure(
-            &caption,
-            &map.svg("corners per part of the image"),
-        )];
-        let Some(calibration) = self.calibration else {
-            return maps;
-        };
+        page::figure(&caption, &map.svg("corners per part of the image"))
+    }
+
+    /// How uncertain the projection is in each part of the image.
+    fn uncertainty_map(&self, calibration: &IntrinsicsCalibration) -> String {
         let mut map = ImageMap::new(self.size_px);
         map.grid(&calibration.uncertainty_px, Shade::Bad, 2);
         let [low, high] = range(&calibration.uncertainty_px);
         let caption = format!(
             "Projection uncertainty: standard deviation of the projection of a distant point, {low:.2} px (light) to {high:.2} px (dark)."
         );
-        maps.push(page::figure(&caption, &map.svg("projection uncertainty")));
+        page::figure(&caption, &map.svg("projection uncertainty"))
+    }
+
+    /// The residuals of all corners.
+    fn residual_map(&self, calibration: &IntrinsicsCalibration) -> String {
         let mut map = ImageMap::new(self.size_px);
         let points: Vec<PointFit> = corners(calibration).copied().collect();
         let magnification = map.arrows(&points);
         let caption = format!(
             "Residuals: detected minus projected corners, magnified {magnification:.0} times. If neighboring arrows point the same way, the lens model does not fit or the target is not flat."
         );
-        maps.push(page::figure(&caption, &map.svg("residuals of all corners")));
-        maps
+        page::figure(&caption, &map.svg("residuals of all corners"))
     }
 
     /// Corners of the target in the suggested image.
@@ -185,6 +202,7 @@ impl IntrinsicsReport<'_> {
         let (low, high) = points.fold((infinite, -infinite), |(low, high), point| {
             (low.inf(&point), high.sup(&point))
         });
+        // The target is flat: all of its points have the same z.
         let corner = |[x, y]: [f64; 2]| {
             intrinsics.project(&(next.camera_from_board * Point3::new(x, y, low.z)).coords)
         };
@@ -206,30 +224,36 @@ impl IntrinsicsReport<'_> {
         if self.views.is_empty() {
             return Vec::new();
         }
-        let row = |view: &BoardView| {
-            let images = self
-                .calibration
-                .map_or(&[][..], |calibration| &calibration.images);
-            let used = images.iter().find(|image| image.name == view.name);
-            let n_corners = used.map_or(view.points.len(), |image| image.points.len());
-            let tag = match (used, self.calibration) {
-                (None, Some(_)) => "not used",
-                (Some(_), _) if n_corners < view.points.len() => "some corners rejected",
-                _ => "",
-            };
-            let values = vec![used.map(|image| image.rms_px), Some(n_corners as f64)];
-            BarRow {
-                name: view.name.clone(),
-                tag: tag.to_owned(),
-                values,
-            }
-        };
         let without = self.unused.iter().map(|unused| BarRow {
             name: unused.name.clone(),
             tag: "not used".to_owned(),
             values: vec![None, None],
         });
-        self.views.iter().map(row).chain(without).collect()
+        self.views
+            .iter()
+            .map(|view| self.row(view))
+            .chain(without)
+            .collect()
+    }
+
+    /// The row of an image in which the target was detected.
+    fn row(&self, view: &BoardView) -> BarRow {
+        let images = self
+            .calibration
+            .map_or(&[][..], |calibration| &calibration.images);
+        let used = images.iter().find(|image| image.name == view.name);
+        let n_corners = used.map_or(view.points.len(), |image| image.points.len());
+        // Without a result, nothing is known about any image, and there is no tag.
+        let tag = match (used, self.calibration) {
+            (None, Some(_)) => "not used",
+            (Some(_), _) if n_corners < view.points.len() => "some corners rejected",
+            _ => "",
+        };
+        BarRow {
+            name: view.name.clone(),
+            tag: tag.to_owned(),
+            values: vec![used.map(|image| image.rms_px), Some(n_corners as f64)],
+        }
     }
 
     fn reasons(&self) -> Vec<Vec<String>> {
@@ -282,6 +306,7 @@ impl IntrinsicsReport<'_> {
             }
         };
         let shown = pictures.into_iter().filter(|picture| !picture.is_empty());
+        // After a refusal, an image without the target often shows the reason, such as blur.
         let none = self.unused.first().map(|unused| {
             photo::with_corners(
                 self.photos,
@@ -325,26 +350,31 @@ fn corners(calibration: &IntrinsicsCalibration) -> impl Iterator<Item = &PointFi
 }
 
 fn range(grid: &ImageGrid<Option<f64>>) -> [f64; 2] {
-    let known = || {
-        grid.values
-            .iter()
-            .flatten()
-            .copied()
-            .filter(|value| value.is_finite())
-    };
+    let known = grid
+        .values
+        .iter()
+        .flatten()
+        .copied()
+        .filter(|value| value.is_finite());
     [
-        known().fold(f64::INFINITY, f64::min),
-        known().fold(0.0, f64::max),
+        known.clone().fold(f64::INFINITY, f64::min),
+        known.fold(0.0, f64::max),
     ]
 }
 
-fn figures(calibration: &IntrinsicsCalibration) -> Vec<page::Figure> {
-    let value = |name: &str| calibration.params.iter().find(|param| param.name == name);
-    let with_deviation = |name: &str| {
-        value(name).map_or(String::new(), |param| {
+/// Value and standard deviation of a parameter; empty if the lens model does not have it.
+fn with_deviation(calibration: &IntrinsicsCalibration, name: &str) -> String {
+    calibration
+        .params
+        .iter()
+        .find(|param| param.name == name)
+        .map_or(String::new(), |param| {
             with_sigma(param.value, param.sigma, 1)
         })
-    };
+}
+
+fn figures(calibration: &IntrinsicsCalibration) -> Vec<page::Figure> {
+    let with_deviation = |name: &str| with_deviation(calibration, name);
     vec![
         ("RMS error", number(Some(calibration.rms_px), 3), "px"),
         (
@@ -366,21 +396,23 @@ fn parameters(calibration: &IntrinsicsCalibration) -> Vec<Vec<String>> {
         ("cx", "principal point x, px"),
         ("cy", "principal point y, px"),
     ];
-    let row = |param: &calibration::EstimatedParam| {
+    let mut rows = Vec::new();
+    for param in &calibration.params {
         let meaning = MEANINGS.iter().find(|(name, _)| *name == param.name);
+        // Pixels need fewer decimals than coefficients of distortion, which are below 1.
         let digits = if meaning.is_some() { 3 } else { 5 };
-        vec![
+        rows.push(vec![
             meaning
                 .map_or(param.name, |(_, meaning)| meaning)
                 .to_owned(),
             with_sigma(param.value, param.sigma, digits),
-        ]
-    };
-    let noise = vec![
+        ]);
+    }
+    rows.push(vec![
         "noise of a corner along one axis, px".to_owned(),
         number(Some(calibration.noise_px), 3),
-    ];
-    calibration.params.iter().map(row).chain([noise]).collect()
+    ]);
+    rows
 }
 
 const TRIAL_HEAD: [&str; 5] = [

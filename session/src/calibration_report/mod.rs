@@ -55,17 +55,21 @@ pub fn check_target_file(file: &Path) -> Result<(), Error> {
     let is_page = file
         .extension()
         .is_some_and(|extension| extension.eq_ignore_ascii_case("html"));
-    match folder.is_dir() && !file.is_dir() && is_page {
-        true if is_other_file(file) => Err(Error::BadInput(format!(
-            "--report {}: the file exists and is not a report of fieldrig; choose another name",
-            file.display()
-        ))),
-        true => Ok(()),
-        false => Err(Error::BadInput(format!(
+    if !folder.is_dir() || file.is_dir() || !is_page {
+        return Err(Error::BadInput(format!(
             "--report {}: must be a file with the extension .html in an existing folder",
             file.display()
-        ))),
+        )));
     }
+    // Reports are replaced, so that a command can be repeated. A mistyped name must not replace
+    // another page.
+    if is_other_file(file) {
+        return Err(Error::BadInput(format!(
+            "--report {}: the file exists and is not a report of fieldrig; choose another name",
+            file.display()
+        )));
+    }
+    Ok(())
 }
 
 /// Whether a file exists that is neither empty nor a report.

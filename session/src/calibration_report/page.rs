@@ -38,20 +38,8 @@ impl Page {
             escaped(text),
             list(&heading.warnings)
         );
-        let figure = |(name, value, unit): &Figure| {
-            let unit = if unit.is_empty() {
-                String::new()
-            } else {
-                format!("<small>{unit}</small>")
-            };
-            format!(
-                "<div><dd>{}{unit}</dd><dt>{}</dt></div>\n",
-                escaped(value),
-                escaped(name)
-            )
-        };
         if !figures.is_empty() {
-            let figures: String = figures.iter().map(figure).collect();
+            let figures: String = figures.iter().map(key_figure).collect();
             html.push_str(&format!("<dl class=\"figures\">\n{figures}</dl>\n"));
         }
         Self {
@@ -108,6 +96,20 @@ impl Page {
             self.html
         )
     }
+}
+
+/// A key figure as an entry of a description list.
+fn key_figure((name, value, unit): &Figure) -> String {
+    let unit = if unit.is_empty() {
+        String::new()
+    } else {
+        format!("<small>{unit}</small>")
+    };
+    format!(
+        "<div><dd>{}{unit}</dd><dt>{}</dt></div>\n",
+        escaped(value),
+        escaped(name)
+    )
 }
 
 /// A list of sentences; nothing if there are none.

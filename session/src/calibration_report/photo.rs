@@ -10,8 +10,11 @@ use image::imageops::FilterType;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-/// Maximum side of an embedded photo.
+/// Maximum side of an embedded photo. Corners must be visible, but a report has several photos and
+/// should stay small enough to send.
 const MAX_SIDE_PX: u32 = 800;
+/// JPEG quality. Edges of the board look clean at this quality; a higher one mainly enlarges the
+/// page.
 const QUALITY: u8 = 78;
 
 /// An image that a report can show.
@@ -96,33 +99,42 @@ fn read(file: &Path) -> crate::Result<DynamicImage> {
 
 /// The part of an image that contains all corners and a margin.
 fn around(points: &[PointFit], size_px: [u32; 2]) -> ImagePart {
-    const MARGIN_FRAC: f64 = 0.2;
     let range = |axis: usize| {
-        let pixels = || points.iter().map(|point| point.pixel[axis]);
-        let (low, high) = (
-            pixels().fold(f64::INFINITY, f64::min),
-            pixels().fold(f64::NEG_INFINITY, f64::max),
-        );
-        let (margin, size) = (MARGIN_FRAC * (high - low), f64::from(size_px[axis]));
-        let [low, high] =
-            [(low - margin).floor(), (high + margin).ceil()].map(|at| at.clamp(0.0, size));
-        #[expect(
-            clippy::cast_possible_truncation,
-            clippy::cast_sign_loss,
-            reason = "inside the image"
-        )]
-        (high > low + 1.0).then_some((low as u32, (high - low) as u32))
+        let pixels = points.iter().map(|point| point.pixel[axis]);
+        range_with_margin(pixels, size_px[axis])
     };
     match (range(0), range(1)) {
         (Some((x, width)), Some((y, height))) => ImagePart {
             first_px: [x, y],
             size_px: [width, height],
         },
+        // Without corners, or if all are outside the image, the whole image is shown.
         _ => ImagePart {
             first_px: [0, 0],
             size_px,
         },
     }
+}
+
+/// First pixel and number of pixels of a range with a margin, inside an image of `size_px`; `None`
+/// if it is empty.
+fn range_with_margin(
+    pixels: impl Iterator<Item = f64> + Clone,
+    size_px: u32,
+) -> Option<(u32, u32)> {
+    const MARGIN_FRAC: f64 = 0.2;
+    let low = pixels.clone().fold(f64::INFINITY, f64::min);
+    let high = pixels.fold(f64::NEG_INFINITY, f64::max);
+    let margin = MARGIN_FRAC * (high - low);
+    let size = f64::from(size_px);
+    let [low, high] =
+        [(low - margin).floor(), (high + margin).ceil()].map(|at| at.clamp(0.0, size));
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "inside the image"
+    )]
+    (high > low + 1.0).then_some((low as u32, (high - low) as u32))
 }
 
 /// Indices of the largest and the median value; fewer if there are fewer values.

@@ -16,17 +16,22 @@ pub(super) struct ScatterPoint {
 pub(super) fn svg(axes: [&str; 2], points: &[ScatterPoint]) -> String {
     const SIDE: f64 = 320.0;
     const CENTER: f64 = SIDE / 2.0;
+    /// Distance of the outer ticks from the center. The rest of the side is for labels.
     const REACH: f64 = 125.0;
+    // Outliers do not determine the scale, because they would hide the scatter of the others.
     let used = points
         .iter()
         .filter(|point| !point.is_outlier)
         .flat_map(|point| point.at);
     let step = tick_step(used.map(f64::abs).fold(1e-6, f64::max));
     let range = 2.0 * step;
+    // Points at the edge are beyond the last tick, so that they can be told from points on it.
     let to = |value: f64| REACH * (value / range).clamp(-1.12, 1.12);
     let mut shapes = String::new();
     for tick in [-2.0, -1.0, 0.0, 1.0, 2.0] {
-        let (at, low, high) = (CENTER + REACH * tick / 2.0, CENTER - REACH, CENTER + REACH);
+        let at = CENTER + REACH * tick / 2.0;
+        let low = CENTER - REACH;
+        let high = CENTER + REACH;
         let label = short(tick * step);
         writeln!(
             shapes,
@@ -83,7 +88,9 @@ fn tick_step(largest: f64) -> f64 {
         .unwrap_or(10.0 * power)
 }
 
+/// A number without zeros at its end.
 fn short(value: f64) -> String {
+    // Adding 0 turns -0 into 0, whose sign would be printed.
     let text = format!("{:.4}", value + 0.0);
     text.trim_end_matches('0').trim_end_matches('.').to_owned()
 }

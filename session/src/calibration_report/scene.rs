@@ -23,138 +23,140 @@ pub struct SceneReport<'a> {
 impl SceneReport<'_> {
     /// The page.
     pub fn html(&self) -> String {
+        let verdict = self.calibration.map_or(String::new(), verdict);
+        let mut page = Page::new(
+            "Calibration from a static scene",
+            self.heading,
+            &verdict,
+            &self.figures(),
+        );
+        if let Some(calibration) = self.calibration {
+            self.add_corrections(&mut page, calibration);
+        }
+        page.table(
+            "Cameras",
+            &["camera", "images", "accepted gain, dB", "extrinsics"],
+            self.n_images
+                .iter()
+                .map(|(name, n_images)| self.camera(name, *n_images))
+                .collect(),
+        );
+        if let Some(calibration) = self.calibration {
+            self.add_poses(&mut page, calibration);
+        }
+        page.finish()
+    }
+
+    fn figures(&self) -> Vec<page::Figure> {
         let n_images: usize = self.n_images.iter().map(|(_, n)| n).sum();
         let mut figures: Vec<page::Figure> = vec![
             ("images", n_images.to_string(), ""),
             ("cameras", self.n_images.len().to_string(), ""),
         ];
-        let mut verdict = String::new();
-        if let Some(calibration) = self.calibration {
-            let alignment = &calibration.alignment;
-            let gains_db: Vec<f64> = alignment
-                .trials
-                .iter()
-                .filter(|trial| trial.kept)
-                .map(|trial| trial.gain_db)
-                .collect();
-            figures.push(("pairs of images", alignment.n_pairs.to_string(), ""));
+        let Some(calibration) = self.calibration else {
+            return figures;
+        };
+        let alignment = &calibration.alignment;
+        figures.push(("pairs of images", alignment.n_pairs.to_string(), ""));
+        figures.push((
+            "accepted corrections",
+            alignment.estimates.len().to_string(),
+            "",
+        ));
+        // Each trial is measured against the result of the ones before it, so the gains add up.
+        let gains_db: Vec<f64> = alignment
+            .trials
+            .iter()
+            .filter(|trial| trial.kept)
+            .map(|trial| trial.gain_db)
+            .collect();
+        if !gains_db.is_empty() {
             figures.push((
-                "accepted corrections",
-                alignment.estimates.len().to_string(),
-                "",
+                "gain on validation images",
+                format!("{:+.2}", gains_db.iter().sum::<f64>()),
+                "dB",
             ));
-            if !gains_db.is_empty() {
-                figures.push((
-                    "gain on validation images",
-                    format!("{:+.2}", gains_db.iter().sum::<f64>()),
-                    "dB",
-                ));
-            }
-            verdict = match alignment.estimates.len() {
-                0 => {
-                    "Nothing to correct: no parameter improves the prediction of validation images."
-                        .to_owned()
-                }
-                1 => "1 correction was accepted.".to_owned(),
-                n => format!("{n} corrections were accepted."),
-            };
         }
-        let mut page = Page::new(
-            "Calibration from a static scene",
-            self.heading,
-            &verdict,
-            &figures,
-        );
-        if let Some(calibration) = self.calibration {
-            let alignment = &calibration.alignment;
-            let corrections: Vec<Vec<String>> = alignment
-                .estimates
-                .iter()
-                .flat_map(|of| self.rows(of))
-                .collect();
-            page.table(
-                "Corrections",
-                &["parameter", "value ± standard deviation", "direction"],
-                corrections,
-            );
-            let head = [
-                "tested parameters",
-                "gain on validation images, dB",
-                "by camera, dB",
-                "images",
-                "decision",
-            ];
-            page.table(
-                "Trials",
-                &head,
-                alignment.trials.iter().map(trial).collect(),
-            );
-        }
-        page.table(
-            "Cameras",
-            &["camera", "images", "accepted gain, dB", "extrinsics"],
-            self.cameras(),
-        );
-        if let Some(calibration) = self.calibration {
-            let unobservable = calibration
-                .alignment
-                .unobservable
-                .iter()
-                .map(|direction| vec![direction.to_string()]);
-            page.table(
-                "Unobservable directions",
-                &["combination"],
-                unobservable.collect(),
-            );
-            page.table("Poses of the cameras", &POSE_HEAD, self.poses(calibration));
-            page.table(
-                "Standard deviations of the poses",
-                &SIGMA_HEAD,
-                self.sigmas(calibration),
-            );
-            page.table(
-                "Relative camera poses",
-                &POSE_HEAD,
-                self.relative_poses(calibration),
-            );
-        }
-        page.finish()
+        figures
     }
 
-    fn cameras(&self) -> Vec<Vec<String>> {
-        let row = |(name, n_images): &(String, usize)| {
-            let refused = self
-                .calibration
-                .and_then(|calibration| calibration.refused.get(name));
-            let is_corrected = |calibration: &SceneCalibration| {
-                calibration
-                    .alignment
-                    .estimates
-                    .iter()
-                    .any(|estimate| matches!(estimate, Estimate::HandEye(estimate) if estimate.camera == *name))
-            };
-            let state = match (refused, self.calibration) {
-                (Some(reason), _) => format!("kept: {reason}"),
-                (None, Some(calibration)) if is_corrected(calibration) => "corrected".to_owned(),
-                (None, Some(_)) => "not changed".to_owned(),
-                (None, None) => "–".to_owned(),
-            };
-            let kept = self
-                .calibration
-                .iter()
-                .flat_map(|calibration| &calibration.alignment.trials);
-            let gains_db: Vec<f64> = kept
-                .filter(|trial| trial.kept)
-                .filter_map(|trial| trial.gain_by_camera_db.get(name).copied())
-                .collect();
-            let gain = if gains_db.is_empty() {
-                "–".to_owned()
-            } else {
-                format!("{:+.2}", gains_db.iter().sum::<f64>())
-            };
-            vec![name.clone(), n_images.to_string(), gain, state]
+    /// Adds the tables of corrections and of the trials that have decided about them.
+    fn add_corrections(&self, page: &mut Page, calibration: &SceneCalibration) {
+        let alignment = &calibration.alignment;
+        let corrections: Vec<Vec<String>> = alignment
+            .estimates
+            .iter()
+            .flat_map(|of| self.rows(of))
+            .collect();
+        page.table(
+            "Corrections",
+            &["parameter", "value ± standard deviation", "direction"],
+            corrections,
+        );
+        let head = [
+            "tested parameters",
+            "gain on validation images, dB",
+            "by camera, dB",
+            "images",
+            "decision",
+        ];
+        page.table(
+            "Trials",
+            &head,
+            alignment.trials.iter().map(trial).collect(),
+        );
+    }
+
+    /// Adds the tables of poses and of their uncertainty.
+    fn add_poses(&self, page: &mut Page, calibration: &SceneCalibration) {
+        let unobservable = calibration
+            .alignment
+            .unobservable
+            .iter()
+            .map(|direction| vec![direction.to_string()]);
+        page.table(
+            "Unobservable directions",
+            &["combination"],
+            unobservable.collect(),
+        );
+        page.table("Poses of the cameras", &POSE_HEAD, self.poses(calibration));
+        page.table(
+            "Standard deviations of the poses",
+            &SIGMA_HEAD,
+            self.sigmas(calibration),
+        );
+        page.table(
+            "Relative camera poses",
+            &POSE_HEAD,
+            self.relative_poses(calibration),
+        );
+    }
+
+    /// The row of a camera: its number of images, the accepted gain, and whether it was corrected.
+    fn camera(&self, name: &str, n_images: usize) -> Vec<String> {
+        let refused = self
+            .calibration
+            .and_then(|calibration| calibration.refused.get(name));
+        let state = match (refused, self.calibration) {
+            (Some(reason), _) => format!("kept: {reason}"),
+            (None, Some(calibration)) if is_corrected(calibration, name) => "corrected".to_owned(),
+            (None, Some(_)) => "not changed".to_owned(),
+            (None, None) => "–".to_owned(),
         };
-        self.n_images.iter().map(row).collect()
+        let kept = self
+            .calibration
+            .iter()
+            .flat_map(|calibration| &calibration.alignment.trials);
+        let gains_db: Vec<f64> = kept
+            .filter(|trial| trial.kept)
+            .filter_map(|trial| trial.gain_by_camera_db.get(name).copied())
+            .collect();
+        let gain = if gains_db.is_empty() {
+            "–".to_owned()
+        } else {
+            format!("{:+.2}", gains_db.iter().sum::<f64>())
+        };
+        vec![name.to_owned(), n_images.to_string(), gain, state]
     }
 
     /// Poses relative to the parents, before and after.
@@ -184,35 +186,31 @@ impl SceneReport<'_> {
     /// Standard deviations of the poses in the parents and between cameras, along and about the
     /// axes of the camera.
     fn sigmas(&self, calibration: &SceneCalibration) -> Vec<Vec<String>> {
-        let row = |name: String, sigmas: PoseSigmas| {
-            let list = |values: [f64; 3]| values.map(|value| format!("{value:.3}")).join(", ");
-            vec![
-                name,
-                list(sigmas.m.map(|m| 1e3 * m)),
-                list(sigmas.rad.map(f64::to_degrees)),
-            ]
-        };
-        let of_camera = |(name, _): &(String, usize)| {
-            let own = calibration
-                .sigmas(name)
-                .map(|sigmas| row(format!("{name} in its parent"), sigmas));
-            let relative = calibration.relative(name);
-            let relative = relative
-                .and_then(|found| Some(row(format!("{name} in {}", found.first), found.sigmas?)));
-            own.into_iter().chain(relative)
-        };
-        self.n_images.iter().flat_map(of_camera).collect()
+        let mut rows = Vec::new();
+        for (name, _) in self.n_images {
+            if let Some(sigmas) = calibration.sigmas(name) {
+                rows.push(sigma_row(format!("{name} in its parent"), sigmas));
+            }
+            // Two cameras may be well determined relative to each other even if their common parent
+            // is not.
+            if let Some(relative) = calibration.relative(name)
+                && let Some(sigmas) = relative.sigmas
+            {
+                rows.push(sigma_row(format!("{name} in {}", relative.first), sigmas));
+            }
+        }
+        rows
     }
 
     fn relative_poses(&self, calibration: &SceneCalibration) -> Vec<Vec<String>> {
-        let of_camera = |(name, _): &(String, usize)| {
-            let relative = calibration.relative(name)?;
-            Some(pose(
-                format!("{name} in {}", relative.first),
-                &relative.first_from_camera,
-            ))
-        };
-        self.n_images.iter().filter_map(of_camera).collect()
+        let mut rows = Vec::new();
+        for (name, _) in self.n_images {
+            if let Some(relative) = calibration.relative(name) {
+                let title = format!("{name} in {}", relative.first);
+                rows.push(pose(title, &relative.first_from_camera));
+            }
+        }
+        rows
     }
 
     fn rows(&self, estimate: &Estimate) -> Vec<Vec<String>> {
@@ -254,25 +252,17 @@ impl SceneReport<'_> {
                 principal_offset_focals,
                 principal_offset_sigma,
             } => {
-                let row = |what: &str, values: &[f64; 2], sigmas: &[f64; 2], axis: usize| {
-                    let (value, sigma) = (1e2 * values[axis], 1e2 * sigmas[axis]);
-                    let name = format!("{what} {} of {camera}", ["x", "y"][axis]);
-                    vec![
-                        name,
-                        format!("{value:.3} ± {sigma:.3} % of the focal length"),
-                        String::new(),
-                    ]
-                };
-                let focal = [0, 1].map(|axis| row("focal length", focal_frac, focal_sigma, axis));
-                let principal = [0, 1].map(|axis| {
-                    row(
-                        "principal point",
-                        principal_offset_focals,
-                        principal_offset_sigma,
-                        axis,
-                    )
-                });
-                focal.into_iter().chain(principal).collect()
+                let mut rows = Vec::new();
+                for (axis, letter) in ["x", "y"].into_iter().enumerate() {
+                    let name = format!("focal length {letter} of {camera}");
+                    rows.push(lens_row(name, focal_frac[axis], focal_sigma[axis]));
+                }
+                for (axis, letter) in ["x", "y"].into_iter().enumerate() {
+                    let name = format!("principal point {letter} of {camera}");
+                    let sigma = principal_offset_sigma[axis];
+                    rows.push(lens_row(name, principal_offset_focals[axis], sigma));
+                }
+                rows
             }
             Estimate::ImagePoses {
                 camera,
@@ -302,6 +292,44 @@ const SIGMA_HEAD: [&str; 3] = [
     "about its axes (x, y, z), °",
 ];
 
+/// What was decided, in one sentence.
+fn verdict(calibration: &SceneCalibration) -> String {
+    match calibration.alignment.estimates.len() {
+        0 => "Nothing to correct: no parameter improves the prediction of validation images."
+            .to_owned(),
+        1 => "1 correction was accepted.".to_owned(),
+        n => format!("{n} corrections were accepted."),
+    }
+}
+
+/// Whether the extrinsics of a camera were corrected.
+fn is_corrected(calibration: &SceneCalibration, camera: &str) -> bool {
+    calibration.alignment.estimates.iter().any(
+        |estimate| matches!(estimate, Estimate::HandEye(estimate) if estimate.camera == camera),
+    )
+}
+
+/// A row of standard deviations along and about the axes of a camera.
+fn sigma_row(name: String, sigmas: PoseSigmas) -> Vec<String> {
+    let list = |values: [f64; 3]| values.map(|value| format!("{value:.3}")).join(", ");
+    vec![
+        name,
+        list(sigmas.m.map(|m| 1e3 * m)),
+        list(sigmas.rad.map(f64::to_degrees)),
+    ]
+}
+
+/// A row of a lens parameter, whose value and deviation are fractions of the focal length.
+fn lens_row(name: String, value_frac: f64, sigma_frac: f64) -> Vec<String> {
+    let value = 1e2 * value_frac;
+    let sigma = 1e2 * sigma_frac;
+    vec![
+        name,
+        format!("{value:.3} ± {sigma:.3} % of the focal length"),
+        String::new(),
+    ]
+}
+
 fn pose(name: String, pose: &Transform) -> Vec<String> {
     let [x, y, z]: [f64; 3] = (1e3 * pose.translation.vector).into();
     let [qx, qy, qz, qw]: [f64; 4] = pose.rotation.coords.into();
@@ -314,14 +342,10 @@ fn pose(name: String, pose: &Transform) -> Vec<String> {
 
 fn pose_rows(what: &str, estimate: &PoseEstimate) -> Vec<Vec<String>> {
     let direction = |[x, y, z]: [f64; 3]| format!("({x:.2} {y:.2} {z:.2})");
-    let (deg, sigma_deg) = (
-        estimate.rotation_rad.to_degrees(),
-        estimate.rotation_sigma_rad.to_degrees(),
-    );
-    let (mm, sigma_mm) = (
-        1e3 * estimate.translation_m,
-        1e3 * estimate.translation_sigma_m,
-    );
+    let deg = estimate.rotation_rad.to_degrees();
+    let sigma_deg = estimate.rotation_sigma_rad.to_degrees();
+    let mm = 1e3 * estimate.translation_m;
+    let sigma_mm = 1e3 * estimate.translation_sigma_m;
     vec![
         vec![
             format!("rotation of {what}"),

@@ -17,7 +17,8 @@ pub struct TimeOffsetReport<'a> {
     pub offset: Option<&'a TimeOffset>,
 }
 
-/// Maximum number of points of a curve.
+/// Maximum number of points of a curve: about one per pixel of its width. More would enlarge the
+/// page without a visible difference.
 const MAX_POINTS: usize = 800;
 
 impl TimeOffsetReport<'_> {
@@ -57,62 +58,87 @@ impl TimeOffsetReport<'_> {
         let (Some(start_a), Some(start_b)) = (a.first(), b.first()) else {
             return String::new();
         };
-        let shown = liveliest(a);
-        let part = |curve: &[[f64; 2]], secs_a: &dyn Fn(f64) -> f64| -> Vec<[f64; 2]> {
-            let moved = curve
-                .iter()
-                .map(|[secs, rate]| [secs_a(*secs), rate.to_degrees()]);
-            let shown = moved
-                .filter(|[secs, _]| shown.contains(secs))
-                .map(|[secs, rate]| [secs - start_a[0], rate]);
-            interrupted(&shown.collect::<Vec<_>>())
+        let shown = ShownPart {
+            secs: liveliest(a),
+            start_secs: start_a[0],
         };
+        let rates_a = shown.degrees(a, |secs| secs);
+        // The clocks may have different epochs. Before the correction, both streams begin at the
+        // same time.
         let from_first = |secs: f64| secs - start_b[0] + start_a[0];
-        let rates_a = part(a, &|secs| secs);
         let before = rates_chart(
             "Before: both streams from their first stamps",
-            [rates_a.clone(), part(b, &from_first)],
+            [rates_a.clone(), shown.degrees(b, from_first)],
         );
         let Some(offset) = self.offset else {
             return before;
         };
+        // With drift, the offset holds at `mid_secs` and changes linearly with the time.
         let drift = offset.drift_ppm.map_or(0.0, |[drift, _]| 1e-6 * drift);
         let on_a = |secs: f64| secs + offset.offset_secs + drift * (secs - offset.mid_secs);
         before
             + &rates_chart(
                 "After: both streams on the clock of A",
-                [rates_a, part(b, &on_a)],
+                [rates_a, shown.degrees(b, on_a)],
             )
+    }
+}
+
+/// The part of the recording that is shown.
+struct ShownPart {
+    /// Interval on the clock of A, seconds.
+    secs: std::ops::RangeInclusive<f64>,
+    /// Time that is shown as 0.
+    start_secs: f64,
+}
+
+impl ShownPart {
+    /// The part of a curve, in degrees per second. `secs_on_a` converts times to the clock of A.
+    fn degrees(&self, curve: &[[f64; 2]], secs_on_a: impl Fn(f64) -> f64) -> Vec<[f64; 2]> {
+        let moved = curve
+            .iter()
+            .map(|[secs, rate]| [secs_on_a(*secs), rate.to_degrees()]);
+        let shown = moved
+            .filter(|[secs, _]| self.secs.contains(secs))
+            .map(|[secs, rate]| [secs - self.start_secs, rate]);
+        interrupted(&shown.collect::<Vec<_>>())
     }
 }
 
 /// The interval of a curve in which its values vary most.
 fn liveliest(curve: &[[f64; 2]]) -> std::ops::RangeInclusive<f64> {
+    /// Long enough for several movements, short enough to see an offset of tens of milliseconds.
     const SHOWN_SECS: f64 = 15.0;
-    let variation = |first: f64| {
-        let values = || {
-            curve
-                .iter()
-                .filter(|[secs, _]| (first..=first + SHOWN_SECS).contains(secs))
-                .map(|[_, value]| *value)
-        };
-        let n = values().count().max(1) as f64;
-        let mean = values().sum::<f64>() / n;
-        values().map(|value| (value - mean).powi(2)).sum::<f64>()
-    };
     let (Some([first, _]), Some([last, _])) = (curve.first(), curve.last()) else {
         return 0.0..=0.0;
     };
     let mut best = (0.0, *first);
     let mut at = *first;
+    // Intervals overlap by half, so that a movement is not cut by the borders of all of them. At
+    // least one is tried, also on a short recording.
     while at < (last - SHOWN_SECS).max(first + 0.5 * SHOWN_SECS) {
-        let found = variation(at);
+        let found = variation(curve, at..=at + SHOWN_SECS);
         if found > best.0 {
             best = (found, at);
         }
         at += 0.5 * SHOWN_SECS;
     }
     best.1..=best.1 + SHOWN_SECS
+}
+
+/// Sum of the squared differences from the mean, over the points of a curve in an interval.
+fn variation(curve: &[[f64; 2]], interval: std::ops::RangeInclusive<f64>) -> f64 {
+    let values: Vec<f64> = curve
+        .iter()
+        .filter(|[secs, _]| interval.contains(secs))
+        .map(|[_, value]| *value)
+        .collect();
+    let n = values.len().max(1) as f64;
+    let mean = values.iter().sum::<f64>() / n;
+    values
+        .iter()
+        .map(|value| (value - mean).powi(2))
+        .sum::<f64>()
 }
 
 fn figures(offset: &TimeOffset) -> Vec<page::Figure> {
@@ -196,9 +222,10 @@ fn correlation(profile: &MotionProfile, offset: Option<&TimeOffset>) -> String {
     } else {
         0.0
     };
-    let label = match base_secs == 0.0 {
-        true => "offset, s".to_owned(),
-        false => format!("offset relative to {base_secs:.0} s (s)"),
+    let label = if base_secs == 0.0 {
+        "offset, s".to_owned()
+    } else {
+        format!("offset relative to {base_secs:.0} s (s)")
     };
     let curve = profile
         .correlation
@@ -258,7 +285,9 @@ fn residual(offset: &TimeOffset) -> String {
 
 /// Inserts a NaN point into each gap, so that the line is interrupted.
 fn interrupted(curve: &[[f64; 2]]) -> Vec<[f64; 2]> {
-    const GAP: f64 = 2.5; // Relative to the smallest step.
+    // Relative to the smallest step. One missing sample doubles the step and is no gap; two of them
+    // are.
+    const GAP: f64 = 2.5;
     let step = curve
         .windows(2)
         .map(|pair| pair[1][0] - pair[0][0])
@@ -303,17 +332,19 @@ fn with_peaks(curve: &[[f64; 2]]) -> Vec<[f64; 2]> {
     if curve.len() <= MAX_POINTS {
         return curve.to_vec();
     }
-    let extremes = |part: &[[f64; 2]]| {
-        let by_value = |a: &&[f64; 2], b: &&[f64; 2]| a[1].total_cmp(&b[1]);
-        let mut two = [part.iter().min_by(by_value), part.iter().max_by(by_value)]
-            .map(|point| point.copied().unwrap_or_default());
-        two.sort_by(|a, b| a[0].total_cmp(&b[0]));
-        two
-    };
     curve
         .chunks(curve.len().div_ceil(MAX_POINTS / 2))
         .flat_map(extremes)
         .collect()
+}
+
+/// The lowest and the highest point of a part, in order of time.
+fn extremes(part: &[[f64; 2]]) -> [[f64; 2]; 2] {
+    let by_value = |a: &&[f64; 2], b: &&[f64; 2]| a[1].total_cmp(&b[1]);
+    let mut two = [part.iter().min_by(by_value), part.iter().max_by(by_value)]
+        .map(|point| point.copied().unwrap_or_default());
+    two.sort_by(|a, b| a[0].total_cmp(&b[0]));
+    two
 }
 
 #[cfg(test)]

@@ -41,13 +41,18 @@ const N_TICKS: f64 = 7.0;
 impl Axis {
     /// Returns the axis with a range that contains `values`.
     pub(super) fn span(&self, values: impl Iterator<Item = f64>) -> AxisRange {
-        let (mut low, mut high) = (f64::INFINITY, f64::NEG_INFINITY);
+        let mut low = f64::INFINITY;
+        let mut high = f64::NEG_INFINITY;
         for value in values.filter(|value| value.is_finite()) {
-            (low, high) = (low.min(value), high.max(value));
+            low = low.min(value);
+            high = high.max(value);
         }
+        // Without values, any range draws an empty chart. It is above 0 for a logarithmic axis.
         if low > high {
-            (low, high) = (1.0, 2.0);
+            low = 1.0;
+            high = 2.0;
         }
+        // Space at both ends keeps the outermost dots inside the plot.
         let (low, high) = match &self.scale {
             Scale::Linear => {
                 let missing = (MIN_SPAN - (high - low)).max(0.0) / 2.0;
@@ -102,7 +107,8 @@ fn level_position(levels: &[f64], value: f64) -> f64 {
     let next = levels
         .partition_point(|level| *level < value)
         .clamp(1, levels.len() - 1);
-    let (before, after) = (levels[next - 1], levels[next]);
+    let before = levels[next - 1];
+    let after = levels[next];
     (next - 1) as f64 + (value - before) / (after - before)
 }
 
@@ -115,7 +121,10 @@ fn linear_ticks(low: f64, high: f64) -> Vec<f64> {
         .into_iter()
         .find(|step| *step >= rough);
     let step = step.unwrap_or(10.0 * power);
-    let (mut ticks, mut n) = (Vec::new(), (low / step).ceil());
+    let mut ticks = Vec::new();
+    // Products instead of repeated sums, whose rounding errors would accumulate and could remove the
+    // last tick.
+    let mut n = (low / step).ceil();
     while n * step <= high {
         ticks.push(n * step);
         n += 1.0;
@@ -136,6 +145,8 @@ fn log_ticks(low: f64, high: f64) -> Vec<f64> {
         .iter()
         .flat_map(|power| [*power, 2.0 * power, 5.0 * power]);
     let all: Vec<f64> = all.filter(|tick| (low..=high).contains(tick)).collect();
+    // Within less than a decade, 1, 2 and 5 may give a single tick, from which no scale can be
+    // read.
     if all.len() < 3 {
         let multiples = powers
             .iter()

@@ -176,6 +176,7 @@ fn hex([red, green, blue]: Color) -> String {
 
 /// Escapes text for SVG and HTML, inside elements and quoted attributes.
 pub fn escaped(text: &str) -> String {
+    // `&` first. Otherwise, the entities of the other characters would be escaped again.
     text.replace('&', "&amp;")
         .replace('<', "&lt;")
         .replace('>', "&gt;")

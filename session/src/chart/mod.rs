@@ -144,6 +144,7 @@ impl Chart {
         let mut shapes = Vec::new();
         self.draw_grid(&plot, &mut shapes);
         self.draw_thresholds(&plot, &mut shapes);
+        // All bands come before all lines: a band must not hide the line of another one.
         for (ix, line) in self.lines.iter().enumerate() {
             draw_band(line, color_of(ix), &plot, &mut shapes);
         }
@@ -157,6 +158,8 @@ impl Chart {
     }
 
     fn draw_grid(&self, plot: &Plot, shapes: &mut Vec<VectorShape>) {
+        // Where the last label ends. A label that would overlap it is left out, but its grid line is
+        // drawn.
         let mut free_from = f64::MIN;
         for (value, label) in &plot.x.ticks {
             let x = plot.x(*value);
@@ -202,7 +205,8 @@ impl Chart {
     /// Each marker has its own row above the plot, so that labels do not overlap.
     fn draw_markers(&self, plot: &Plot, shapes: &mut Vec<VectorShape>) {
         for (row, marker) in self.markers.iter().enumerate() {
-            let (x, color) = (plot.x(marker.x), color_of(marker.line_ix));
+            let x = plot.x(marker.x);
+            let color = color_of(marker.line_ix);
             let y = TITLE_HEIGHT + MARKER_ROW * (row as f64 + 0.4);
             let points = vec![[x, y + 7.0], [x, plot.bottom]];
             shapes.push(VectorShape::Line {
@@ -211,6 +215,7 @@ impl Chart {
                 width: 1.2,
                 dash: Some([5.0, 4.0]),
             });
+            // The label is centered on its line, but stays inside the plot.
             let half = 0.5 * text_width(&marker.label, TextSize::Normal);
             let center = x.min(plot.right - half).max(plot.left + half);
             shapes.push(text([center, y], &marker.label, color, Anchor::Middle));
@@ -218,15 +223,12 @@ impl Chart {
     }
 
     fn draw_titles(&self, plot: &Plot, shapes: &mut Vec<VectorShape>) {
-        let size = TextSize::Title;
-        let anchor = Anchor::Start;
-        let at = [LEFT, 20.0];
         shapes.push(VectorShape::Text {
-            at,
+            at: [LEFT, 20.0],
             text: self.title.clone(),
             color: INK,
-            size,
-            anchor,
+            size: TextSize::Title,
+            anchor: Anchor::Start,
             vertical: false,
         });
         shapes.push(text([LEFT, 40.0], &self.subtitle, FAINT_INK, Anchor::Start));
@@ -237,14 +239,12 @@ impl Chart {
             INK,
             Anchor::Middle,
         ));
-        let at = [18.0, 0.5 * (plot.top + plot.bottom)];
-        let (size, anchor) = (TextSize::Normal, Anchor::Middle);
         shapes.push(VectorShape::Text {
-            at,
+            at: [18.0, 0.5 * (plot.top + plot.bottom)],
             text: self.y.label.clone(),
             color: INK,
-            size,
-            anchor,
+            size: TextSize::Normal,
+            anchor: Anchor::Middle,
             vertical: true,
         });
     }
@@ -366,18 +366,20 @@ fn draw_line(line: &Line, ix: usize, plot: &Plot, shapes: &mut Vec<VectorShape>)
 
 /// Draws a dot whose shape identifies the line: disc, square, triangle, diamond.
 fn draw_dot([x, y]: [f64; 2], line_ix: usize, shapes: &mut Vec<VectorShape>) {
+    // Corners, direction of the first one as a fraction of a turn, radius. The shapes have about the
+    // same area; 24 corners look like a circle.
     let (n_corners, first_angle_frac, radius) = [
         (24, 0.0, 3.6),
         (4, 0.125, 4.6),
         (3, 0.75, 5.2),
         (4, 0.0, 5.0),
     ][line_ix % 4];
-    let corner = |ix: u32| {
+    let mut points = Vec::new();
+    for ix in 0_u32..n_corners {
         let angle =
             std::f64::consts::TAU * (f64::from(ix) / f64::from(n_corners) + first_angle_frac);
-        [x + radius * angle.cos(), y + radius * angle.sin()]
-    };
-    let points = (0..n_corners).map(corner).collect();
+        points.push([x + radius * angle.cos(), y + radius * angle.sin()]);
+    }
     shapes.push(VectorShape::Area {
         points,
         color: color_of(line_ix),
@@ -418,6 +420,8 @@ fn wrap(text: &str, max_chars: usize) -> Vec<String> {
                 rows.push(String::new());
                 continue;
             }
+            // One more character than the maximum is taken, because the last one of a word is its
+            // space, which is removed at the end of a row.
             row.extend(left.drain(..left.len().min(max_chars + 1 - n_used.min(max_chars))));
         }
     }

@@ -12,7 +12,7 @@ const FONT: &[u8] = include_bytes!("font/NotoSansMono-Latin.ttf");
 const FONT_FAMILY: &str = "Noto Sans Mono";
 /// Width of every letter of the monospaced font, as a fraction of the font size.
 const LETTER_WIDTH_FRAC: f64 = 0.6;
-/// Pixels per unit of the drawing.
+/// Pixels per unit of the drawing. Screens with a high resolution show two pixels per CSS pixel.
 const PIXELS_PER_UNIT: u32 = 2;
 
 /// The built-in font, which replaces all sans-serif fonts.

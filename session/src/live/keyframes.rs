@@ -4,12 +4,17 @@ use super::{IDLE, Live, Pace};
 use crate::ledger::KeyframeTimes;
 use crate::scene_hint;
 use crate::session::Session;
-use capture::{Change, FeedItem};
+use capture::{Change, FeedItem, InputTimes};
+use keyframe::Keyframe;
+use kinematics::Stamp;
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-/// Minimum number of keyframes that determine the first view of the scene.
+/// Minimum number of keyframes that determine the first view of the scene. With few keyframes, the
+/// optical axes may not yet determine a common point; a view that changes later disturbs operators.
 const HINT_KEYFRAMES: usize = 5;
-/// Polling period while waiting for a keyframe or a picture request.
+/// Polling period while waiting for a keyframe or a picture request. It delays pictures and
+/// keyframes by at most this time; a shorter one would use more of a processor.
 const POLL_PERIOD: Duration = Duration::from_millis(2);
 
 impl Live {
@@ -24,6 +29,8 @@ impl Live {
             return Ok(());
         }
         self.apply_alignments()?;
+        // Training time begins with the first image, so it includes the time until the first
+        // keyframes.
         if let Some(first_image) = self.feed.first_image() {
             self.sessions
                 .iter_mut()
@@ -31,36 +38,48 @@ impl Live {
         }
         let n_before = self.keyframes.len();
         match self.pace {
-            Pace::RealTime => {
-                if !self.is_training() || self.is_idle() || self.requests.is_paused {
-                    let first = self.wait_for_change();
-                    first.map_or(Ok(()), |item| self.apply(item))?;
-                }
-                while let Some(item) = self.feed.next(Duration::ZERO) {
-                    self.apply(item)?;
-                }
-            }
-            Pace::Lockstep { steps_per_keyframe } => {
-                while !self.feed.ended() && self.is_keyframe_due() {
-                    let Some(item) = self.wait_for_change() else {
-                        break;
-                    };
-                    let is_new = matches!(item.change, Change::Accepted(_));
-                    self.apply(item)?;
-                    if is_new && self.is_training() {
-                        for (at, session) in self.next_keyframe_at.iter_mut().zip(&self.sessions) {
-                            *at = session.progress().step + steps_per_keyframe;
-                        }
-                    }
-                }
-            }
+            Pace::RealTime => self.take_waiting_keyframes()?,
+            Pace::Lockstep { steps_per_keyframe } => self.take_due_keyframes(steps_per_keyframe)?,
         }
         if self.keyframes.len() != n_before {
             self.publish_keyframes();
+            // After these keyframes, the first view is final: later ones must not move the view of
+            // operators.
             if self.keyframes.len() <= self.start_keyframes.max(HINT_KEYFRAMES)
                 && let Some(hint) = scene_hint::from_keyframes(&self.keyframes)
             {
                 self.hub.set_scene_hint(hint);
+            }
+        }
+        Ok(())
+    }
+
+    /// Takes all keyframes that wait in the queue. Waits for one if there is nothing to train.
+    fn take_waiting_keyframes(&mut self) -> crate::Result<()> {
+        if !self.is_training() || self.is_idle() || self.requests.is_paused {
+            let first = self.wait_for_change();
+            first.map_or(Ok(()), |item| self.apply(item))?;
+        }
+        while let Some(item) = self.feed.next(Duration::ZERO) {
+            self.apply(item)?;
+        }
+        Ok(())
+    }
+
+    /// Takes keyframes as long as one is due at the current steps of the models.
+    fn take_due_keyframes(&mut self, steps_per_keyframe: u64) -> crate::Result<()> {
+        while !self.feed.ended() && self.is_keyframe_due() {
+            let Some(item) = self.wait_for_change() else {
+                break;
+            };
+            let is_new = matches!(item.change, Change::Accepted(_));
+            self.apply(item)?;
+            // An evicted keyframe makes room for a new one, and does not count. Before training
+            // starts, keyframes are taken without steps in between.
+            if is_new && self.is_training() {
+                for (at, session) in self.next_keyframe_at.iter_mut().zip(&self.sessions) {
+                    *at = session.progress().step + steps_per_keyframe;
+                }
             }
         }
         Ok(())
@@ -85,6 +104,9 @@ impl Live {
             return self.feed.next(IDLE);
         }
         let started = Instant::now();
+        // Keyframes and requests arrive in two queues, and a thread can wait for only one of them.
+        // The loop therefore polls the first queue and waits for the second one, or only for
+        // keyframes while no picture may be drawn.
         loop {
             let before = Instant::now();
             let timeout = if self.budget.may_render() {
@@ -114,57 +136,69 @@ impl Live {
 
     fn apply(&mut self, FeedItem { change, times }: FeedItem) -> crate::Result<()> {
         match change {
-            Change::Accepted(keyframe) => {
-                let keyframe = match &mut self.keyframe_change {
-                    Some(change) => change(keyframe),
-                    None => keyframe,
-                };
-                let pushed_at_steps = self
-                    .sessions
-                    .iter()
-                    .map(|session| session.progress().step)
-                    .collect();
-                self.keyframes.push(keyframe.clone());
-                let mut pushed = Ok(());
-                // A model that has made all its steps gets no more keyframes, so that it equals a
-                // model trained alone.
-                for session in self
-                    .sessions
-                    .iter_mut()
-                    .filter(|session| !session.has_finished_steps())
-                {
-                    // Continues after a GPU failure, so that every session holds the keyframe for
-                    // its restored model.
-                    pushed = pushed.and(session.push(&keyframe));
-                }
-                if let Some(input) = times {
-                    self.ledger.push(KeyframeTimes {
-                        camera: keyframe.camera.clone(),
-                        stamp: keyframe.stamp,
-                        input,
-                        pushed: Instant::now(),
-                        pushed_at_steps,
-                        trained: None,
-                        sent: None,
-                        shown: None,
-                    });
-                }
-                pushed
-            }
-            Change::Evicted { camera, stamp } => {
-                self.n_evicted += 1;
-                self.keyframes
-                    .retain(|keyframe| keyframe.camera != camera || keyframe.stamp != stamp);
-                let mut removed = Ok(());
-                for session in self
-                    .sessions
-                    .iter_mut()
-                    .filter(|session| !session.has_finished_steps())
-                {
-                    removed = removed.and(session.remove(&camera, stamp));
-                }
-                removed
-            }
+            Change::Accepted(keyframe) => self.add_keyframe(keyframe, times),
+            Change::Evicted { camera, stamp } => self.remove_keyframe(&camera, stamp),
         }
+    }
+
+    /// Pushes an accepted keyframe to the models.
+    fn add_keyframe(
+        &mut self,
+        keyframe: Arc<Keyframe>,
+        times: Option<InputTimes>,
+    ) -> crate::Result<()> {
+        let keyframe = match &mut self.keyframe_change {
+            Some(change) => change(keyframe),
+            None => keyframe,
+        };
+        // Read before the push, which may wait for queued steps.
+        let pushed_at_steps = self
+            .sessions
+            .iter()
+            .map(|session| session.progress().step)
+            .collect();
+        self.keyframes.push(keyframe.clone());
+        let mut pushed = Ok(());
+        // A model that has made all its steps gets no more keyframes, so that it equals a model
+        // trained alone.
+        for session in self
+            .sessions
+            .iter_mut()
+            .filter(|session| !session.has_finished_steps())
+        {
+            // Continues after a GPU failure, so that every session holds the keyframe for its
+            // restored model.
+            pushed = pushed.and(session.push(&keyframe));
+        }
+        if let Some(input) = times {
+            self.ledger.push(KeyframeTimes {
+                camera: keyframe.camera.clone(),
+                stamp: keyframe.stamp,
+                input,
+                pushed: Instant::now(),
+                pushed_at_steps,
+                trained: None,
+                sent: None,
+                shown: None,
+            });
+        }
+        pushed
+    }
+
+    /// Removes an evicted keyframe from the models.
+    fn remove_keyframe(&mut self, camera: &Arc<str>, stamp: Stamp) -> crate::Result<()> {
+        self.n_evicted += 1;
+        self.keyframes
+            .retain(|keyframe| keyframe.camera != *camera || keyframe.stamp != stamp);
+        let mut removed = Ok(());
+        for session in self
+            .sessions
+            .iter_mut()
+            .filter(|session| !session.has_finished_steps())
+        {
+            // As in `add_keyframe`, a failure must not leave the sessions with different keyframes.
+            removed = removed.and(session.remove(camera, stamp));
+        }
+        removed
     }
 }

@@ -19,9 +19,11 @@ use std::time::{Duration, Instant};
 use trainer::AlignTiming;
 use viz::Hub;
 
-/// Time without any keyframe until it is reported.
+/// Time without any keyframe until it is reported. A shorter time would warn while a robot has only
+/// just begun to move; after a longer one, an operator has waited in vain.
 const WARN_AFTER: Duration = Duration::from_secs(10);
-/// Maximum wait for a keyframe when there is nothing to do.
+/// Maximum wait for a keyframe when there is nothing to do. Controls, edits and the status wait as
+/// long; a shorter wait would use more of a processor for checks without result.
 const IDLE: Duration = Duration::from_millis(10);
 
 /// When the models receive keyframes.
@@ -112,9 +114,10 @@ impl Live {
             .iter()
             .map(|(why, n)| format!("{n} {why}"))
             .collect();
-        let reason = match rejected.is_empty() {
-            true => "no image has been joined with a pose".to_owned(),
-            false => format!("images rejected: {}", rejected.join(", ")),
+        let reason = if rejected.is_empty() {
+            "no image has been joined with a pose".to_owned()
+        } else {
+            format!("images rejected: {}", rejected.join(", "))
         };
         log::warn!(
             "no keyframe after {} s, so nothing is trained: {reason}",
@@ -195,9 +198,12 @@ impl Live {
     /// Runs one cycle: takes keyframes, trains, draws and publishes. Reopens the GPU if it fails.
     pub fn advance(&mut self) -> crate::Result<()> {
         self.warn_without_keyframes();
+        // Requests of operators come first, so that the pictures and the status of this cycle
+        // already show their effect.
         self.apply_controls();
         self.record_shown_pictures();
         self.apply_edits();
+        // After a GPU failure, the remaining stages are skipped: each of them would fail, too.
         let advanced = self
             .take_keyframes()
             .and_then(|()| self.step())
@@ -227,10 +233,13 @@ impl Live {
     /// Trains for one slice once there are enough keyframes. During an evaluation, scores one test
     /// image instead. Does not train if a requested picture may be drawn now.
     fn step(&mut self) -> crate::Result<()> {
+        // Checked even if no steps are made: callbacks may report a lost device at any time, and an
+        // idle run must recover, too.
         self.sessions.iter().try_for_each(Session::check_gpu)?;
         if !self.is_training() {
             return Ok(());
         }
+        // One image per cycle, so that requested pictures are drawn between two images.
         if let Some(session) = self
             .sessions
             .iter_mut()
@@ -248,22 +257,32 @@ impl Live {
                 .try_for_each(Session::write_checkpoint_when_due)?;
         }
         if self.is_finished() || self.requests.is_paused {
+            // Nothing is trained. Waits for a request, so that the loop does not use a whole
+            // processor.
             self.hub.wait_for_request(IDLE);
             return Ok(());
         }
         if self.is_render_pending() {
             return Ok(());
         }
+        self.train_slice()
+    }
+
+    /// Trains the next model for one slice.
+    fn train_slice(&mut self) -> crate::Result<()> {
+        // A picture waits for the submit in progress, so submits are shorter while clients are
+        // connected.
         let is_watched = self.hub.n_clients() > 0;
         self.sessions
             .iter_mut()
             .for_each(|session| session.set_watched(is_watched));
+        // In lockstep, no model trains beyond the step at which its next keyframe is due. After the
+        // end of the input, no keyframe is due any more.
         let is_paced = self.pace != Pace::RealTime && !self.feed.ended();
-        let due = &self.next_keyframe_at;
-        let max_steps = |ix: usize, session: &Session| match is_paced {
-            true => due[ix].saturating_sub(session.progress().step),
-            false => u64::MAX,
-        };
+        let due = is_paced.then_some(&self.next_keyframe_at[..]);
+        let max_steps = |ix: usize, session: &Session| n_steps_until_due(due, ix, session);
+        // Only in real time: the time of a step differs between runs, and a lockstep run must not
+        // depend on it.
         if self.pace == Pace::RealTime {
             self.sessions
                 .iter_mut()
@@ -271,7 +290,8 @@ impl Live {
         }
         let before = Instant::now();
         let step_before = self.sessions[0].progress().step;
-        let (hub, budget) = (&self.hub, self.budget);
+        let hub = &self.hub;
+        let budget = self.budget;
         time_slices::train_next(&mut self.sessions, max_steps, || {
             budget.may_render() && hub.wait_for_request(Duration::ZERO)
         })?;
@@ -354,6 +374,13 @@ pub struct LiveOptions {
     pub device_notes: Notes,
     /// Reopens the GPU after a failure.
     pub open_gpu: OpenGpu,
+}
+
+/// Number of steps of a session until its next keyframe is due; unlimited without due steps.
+fn n_steps_until_due(due: Option<&[u64]>, session_ix: usize, session: &Session) -> u64 {
+    due.map_or(u64::MAX, |due| {
+        due[session_ix].saturating_sub(session.progress().step)
+    })
 }
 
 /// Index of the session of a method; of the first one if no method is given.

@@ -6,9 +6,12 @@ use std::time::{Duration, Instant};
 use trainer::QueuedPicture;
 use viz::PendingRender;
 
-/// Maximum number of pictures in the GPU's queue.
+/// Maximum number of pictures in the GPU's queue. Eight viewers, as in the benchmarks of live runs,
+/// fill it with one picture each. With fewer pictures, the GPU is idle more often while they are
+/// delivered. Each queued picture holds memory for its read-back until it is delivered.
 const MAX_QUEUED_PICTURES: usize = 8;
-/// Maximum time for which pictures are drawn before other work continues.
+/// Maximum time for which pictures are drawn before other work continues. New keyframes, controls
+/// and the status wait as long.
 const MAX_RENDER_TIME: Duration = Duration::from_millis(100);
 
 /// A requested picture that the GPU may still be drawing.
@@ -38,20 +41,8 @@ impl Live {
             }
             self.budget.add_training(before.elapsed());
             let before = Instant::now();
-            // The GPU draws the next pictures while the first ones are delivered.
-            let mut queued = Vec::new();
-            let mut is_any_on_gpu = false;
-            while let Some(picture) = self.queue_picture() {
-                let is_on_gpu = picture
-                    .queued
-                    .as_ref()
-                    .is_ok_and(|queued| !queued.is_ready());
-                is_any_on_gpu |= is_on_gpu;
-                queued.push(picture);
-                if !is_on_gpu || queued.len() == MAX_QUEUED_PICTURES {
-                    break;
-                }
-            }
+            let (queued, is_any_on_gpu) = self.queue_pictures();
+            // Queued before the pictures are delivered, so that the GPU does not become idle.
             let trained = if is_any_on_gpu {
                 self.queue_steps()
             } else {
@@ -60,21 +51,50 @@ impl Live {
             let mut began = before;
             for picture in queued {
                 self.deliver(picture, began);
+                // The GPU draws the pictures one after the other. The time of the next one begins
+                // when this one is complete.
                 began = Instant::now();
             }
             self.budget.add_render(before.elapsed());
+            // An error of training is returned only now, because the clients of the queued pictures
+            // wait for an answer in any case.
             trained?;
         }
         Ok(())
     }
 
+    /// Starts to draw the next requested pictures, so that the GPU draws some of them while others
+    /// are delivered. Returns them, and whether the GPU may still be drawing one.
+    fn queue_pictures(&mut self) -> (Vec<QueuedRender>, bool) {
+        let mut queued = Vec::new();
+        let mut is_any_on_gpu = false;
+        while let Some(picture) = self.queue_picture() {
+            let is_on_gpu = picture
+                .queued
+                .as_ref()
+                .is_ok_and(|queued| !queued.is_ready());
+            is_any_on_gpu |= is_on_gpu;
+            queued.push(picture);
+            // A picture that is complete already is delivered before the next one is drawn: its
+            // method draws pictures one by one, which may take long.
+            if !is_on_gpu || queued.len() == MAX_QUEUED_PICTURES {
+                break;
+            }
+        }
+        (queued, is_any_on_gpu)
+    }
+
     /// Queues steps behind pictures, which keeps the GPU busy while the pictures are delivered.
-    /// Only for a single model in real time, where this needs no other work.
+    ///
+    /// Only for a single model in real time, where this needs no other work: several models would
+    /// need a choice of the next one, and lockstep the check whether a keyframe is due.
     fn queue_steps(&mut self) -> crate::Result<()> {
         let is_training =
             self.is_training() && !self.is_idle() && !self.is_scoring() && !self.requests.is_paused;
-        let (Pace::RealTime, [session], true) = (self.pace, &mut self.sessions[..], is_training)
-        else {
+        if self.pace != Pace::RealTime || !is_training {
+            return Ok(());
+        }
+        let [session] = &mut self.sessions[..] else {
             return Ok(());
         };
         if !session.is_over() {
@@ -99,6 +119,7 @@ impl Live {
             let session = &mut self.sessions[session_ix];
             pending.request.edits = Arc::clone(session.edits());
             let queued = session.queue_picture(&pending.request, pending.packing());
+            // Determined now: steps that are queued behind the picture are not in it.
             let trained_on = self
                 .ledger
                 .trained_keyframes(session_ix, session.progress().step);
@@ -133,6 +154,8 @@ impl Live {
     /// Records which pictures of the first model clients have shown.
     pub(super) fn record_shown_pictures(&mut self) {
         for picture in self.hub.take_shown_pictures() {
+            // The ledger has one time per keyframe. With several models, it would otherwise mix
+            // models that receive different shares of the time.
             if session_for_method(&self.sessions, picture.method.as_deref()) == Some(0) {
                 self.ledger.shown(&picture);
             }

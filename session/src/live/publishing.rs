@@ -2,19 +2,23 @@
 
 use super::Live;
 use crate::chunk_publisher::ChunkPublisher;
+use crate::ledger::Ledger;
 use crate::observations::{ModelState, ObservationPublisher, PosedKeyframe};
 use crate::session::Session;
 use calibration::CalibratedCamera;
 use capture::Notes;
 use keyframe::Keyframe;
+use kinematics::Transform;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use trainer::RenderRequest;
 use viz::{Hub, KeyframePose, ModelStatus, Status};
 
-/// Period of status messages.
+/// Period of status messages. Shorter periods make the numbers of the page harder to read and send
+/// more; longer ones delay the results of controls and edits.
 const PUBLISH_PERIOD: Duration = Duration::from_millis(250);
-/// Maximum fraction of the time that is spent on scoring between scheduled evaluations.
+/// Maximum fraction of the time that is spent on scoring between scheduled evaluations. It buys
+/// points of the PSNR curve with training time.
 const SCORE_FRAC: f64 = 0.03;
 
 /// What was published, and what to publish next.
@@ -57,15 +61,13 @@ impl Live {
             .map(|keyframe| self.sessions[0].camera_of(keyframe))
             .collect();
         let posed = || self.keyframes.iter().zip(&cameras);
-        // Live images get the correction of their camera's newest keyframe.
-        let correction = |(keyframe, camera): (&Arc<Keyframe>, &CalibratedCamera)| {
-            (
-                keyframe.camera.clone(),
-                keyframe.world_from_camera.inverse() * camera.world_from_camera,
-            )
-        };
-        self.hub
-            .set_camera_corrections(posed().map(correction).collect());
+        // The keyframes are in order of arrival, and the last value of a key remains in the map.
+        // Live images therefore get the correction of their camera's newest keyframe.
+        self.hub.set_camera_corrections(
+            posed()
+                .map(|(keyframe, camera)| camera_correction(keyframe, camera))
+                .collect(),
+        );
         self.hub.set_keyframe_sources(&self.keyframes);
         self.hub.set_keyframes(
             posed()
@@ -77,17 +79,13 @@ impl Live {
 
     /// Publishes the keyframes again if corrections have moved one of them noticeably.
     fn publish_moved_keyframes(&mut self) {
-        let has_moved = |(keyframe, published): (&Arc<Keyframe>, &CalibratedCamera)| {
-            self.sessions[0]
-                .camera_of(keyframe)
-                .differs_noticeably(published)
-        };
-        if self
+        let session = &self.sessions[0];
+        let has_moved = self
             .keyframes
             .iter()
             .zip(&self.publishing.cameras)
-            .any(has_moved)
-        {
+            .any(|(keyframe, published)| session.camera_of(keyframe).differs_noticeably(published));
+        if has_moved {
             self.publish_keyframes();
         }
     }
@@ -110,21 +108,13 @@ impl Live {
             return;
         }
         let session = &mut self.sessions[0];
-        let posed = |keyframe: &Arc<Keyframe>| {
-            let camera = session.camera_of(keyframe);
-            PosedKeyframe {
-                pose: frustum(keyframe, &camera),
-                keyframe: Some(Arc::clone(keyframe)),
-                color_from_depth: camera.color_from_depth.unwrap_or_default(),
-            }
-        };
-        let keyframes: Vec<PosedKeyframe> = self.keyframes.iter().map(posed).collect();
-        let captured_at = |pose: &KeyframePose| {
-            let mut newest_first = self.ledger.keyframes().iter().rev();
-            let times = newest_first
-                .find(|times| times.camera == pose.camera && times.stamp == pose.stamp)?;
-            Some(times.captured_at())
-        };
+        let keyframes: Vec<PosedKeyframe> = self
+            .keyframes
+            .iter()
+            .map(|keyframe| posed_keyframe(session, keyframe))
+            .collect();
+        let ledger = &self.ledger;
+        let captured_at = |pose: &KeyframePose| captured_at(ledger, pose);
         let edits = Arc::clone(session.edits());
         let model = ModelState {
             step: session.progress().step,
@@ -154,10 +144,11 @@ impl Live {
             && !self.is_scoring()
         {
             let before = Instant::now();
-            // Scores only one image at a time, so that viewers do not wait.
+            // Scores only one image at a time, so that viewers do not wait. The models take turns.
             self.publishing.next_refreshed =
                 (self.publishing.next_refreshed + 1) % self.sessions.len();
             let session = &mut self.sessions[self.publishing.next_refreshed];
+            // A model without steps has no score yet, and drawing it would create its splats.
             if session.progress().step > 0 {
                 session.n_total_steps()?;
                 session.refresh_psnr()?;
@@ -193,6 +184,34 @@ impl Live {
             ..Status::default()
         });
     }
+}
+
+/// Name of a keyframe's camera, and the correction of its pose: the corrected camera in the frame of
+/// the reported one.
+fn camera_correction(keyframe: &Keyframe, camera: &CalibratedCamera) -> (Arc<str>, Transform) {
+    (
+        keyframe.camera.clone(),
+        keyframe.world_from_camera.inverse() * camera.world_from_camera,
+    )
+}
+
+/// A keyframe with the corrections of a model.
+fn posed_keyframe(session: &Session, keyframe: &Arc<Keyframe>) -> PosedKeyframe {
+    let camera = session.camera_of(keyframe);
+    PosedKeyframe {
+        pose: frustum(keyframe, &camera),
+        keyframe: Some(Arc::clone(keyframe)),
+        color_from_depth: camera.color_from_depth.unwrap_or_default(),
+    }
+}
+
+/// When the image of a keyframe was captured; `None` for keyframes of an earlier run.
+fn captured_at(ledger: &Ledger, pose: &KeyframePose) -> Option<Instant> {
+    // The newest keyframe is asked for, so the search begins at the end.
+    let mut newest_first = ledger.keyframes().iter().rev();
+    let times =
+        newest_first.find(|times| times.camera == pose.camera && times.stamp == pose.stamp)?;
+    Some(times.captured_at())
 }
 
 fn model_status(session: &Session) -> ModelStatus {

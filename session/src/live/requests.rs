@@ -34,6 +34,7 @@ impl Requests {
 impl Live {
     /// Applies the actions that operators have requested. An evaluation is completed first.
     pub(super) fn apply_controls(&mut self) {
+        // All images of an evaluation are scored on the same state of the model.
         if self.is_scoring() {
             return;
         }
@@ -43,15 +44,17 @@ impl Live {
                 Control::Resume => self.requests.is_paused = false,
                 Control::Save => {
                     let mut is_due = true;
+                    // Every session is asked, also after one that writes no checkpoints.
                     for session in &mut self.sessions {
                         is_due &= session.request_checkpoint();
                     }
-                    self.requests.checkpoint_note = Some(match is_due {
-                        true => format!(
+                    self.requests.checkpoint_note = Some(if is_due {
+                        format!(
                             "checkpoint requested after {:.0} s",
                             self.sessions[0].secs()
-                        ),
-                        false => "this run writes no checkpoints".to_owned(),
+                        )
+                    } else {
+                        "this run writes no checkpoints".to_owned()
                     });
                 }
             }
@@ -88,6 +91,7 @@ impl Live {
     fn report_edit(&mut self, request: &EditRequest, edited: Result<Option<String>, String>) {
         match edited {
             Ok(note) => {
+                // Without a note, a search was started and nothing has changed yet.
                 if note.is_some() {
                     self.requests.edit_note = note;
                     self.requests.edit_revision += 1;

@@ -18,15 +18,21 @@ use kinematics::quantile::{Rank, quantile};
 use nalgebra::{Matrix3, Point3, Vector3};
 use viz::{ObservationMap, ObservedCell};
 
-/// Number of cells along the longest side of the grid.
+/// Number of cells along the longest side of the grid. With more cells, the map is sharper, but
+/// fewer rays meet each cell, and the size of the map grows with the cube of this number.
 const MAX_CELLS: u32 = 96;
-/// The grid contains the points between these quantiles along each axis, and this fraction of their
-/// extent beyond.
+/// The grid contains the points between these quantiles along each axis. A few wrong depth values,
+/// for example at reflections, would otherwise enlarge the grid and make all cells coarse.
 const QUANTILES: [f64; 2] = [0.01, 0.99];
+/// The grid contains this fraction of the extent beyond the quantiles, for the surfaces at the
+/// border that the quantiles cut off.
 const MARGIN_FRAC: f64 = 0.1;
-/// Number of cells by which observations are extended.
+/// Number of cells by which observations are extended. Depth maps have as many pixels per row as the
+/// grid has cells, so neighboring rays of a near camera meet adjacent cells. Seen from farther away
+/// or at an angle, they leave gaps of a few cells, which two extensions fill.
 const N_EXTENSIONS: usize = 2;
-/// Number of points that determine the quantiles.
+/// Number of points that determine the quantiles. With this many, 200 points lie beyond each
+/// quantile.
 const MAX_SAMPLES: usize = 20_000;
 /// Standard deviation of a position across the ray, pixels of the image: includes the error of the
 /// pose.
@@ -34,7 +40,8 @@ const SIGMA_PX: f64 = 1.0;
 /// Standard deviation of depth at 1 m, meters. It grows with the square of the depth, as for stereo
 /// cameras.
 const DEPTH_SIGMA_AT_1_M: f64 = 0.002;
-/// Positions with a larger deviation count as not determined, meters.
+/// Positions with a larger deviation count as not determined, meters. Rounding gives a singular
+/// information matrix a small eigenvalue, and thus a large deviation instead of an infinite one.
 const MAX_SIGMA_M: f64 = 10.0;
 
 /// Depth and pose of one keyframe.
@@ -108,18 +115,26 @@ fn add_keyframe(cells: &mut SparseCells<Cell>, grid: &Grid, ix: usize, keyframe:
             newest: keyframe.stamp,
             keyframe: usize::MAX,
         });
+        // Points of one keyframe are adjacent in the loop, so its index is enough to detect that it
+        // has already contributed to this cell.
         if std::mem::replace(&mut cell.keyframe, ix) == ix {
             continue;
         }
         cell.newest = cell.newest.max(keyframe.stamp);
         let ray = point.coords - camera;
-        let (distance_m, direction) = (ray.norm(), ray.normalize());
+        let distance_m = ray.norm();
+        let direction = ray.normalize();
+        // Information, in 1/m^2, is the inverse square of the standard deviation. Across the ray,
+        // the deviation is the width that a pixel covers at this distance.
         let across = (distance_m * keyframe.pixel_rad * SIGMA_PX).powi(-2);
+        // The depth of a stereo camera is `f * b / disparity`. For a fixed error of the disparity,
+        // the error of the depth grows with its square. A rendered depth is no measurement.
         let along = if keyframe.is_measured {
             (DEPTH_SIGMA_AT_1_M * distance_m.powi(2)).powi(-2)
         } else {
             0.0
         };
+        // `across * (I - d d^T) + along * d d^T`, see `docs/design/viewer.md`.
         cell.information +=
             across * Matrix3::identity() + (along - across) * direction * direction.transpose();
     }
@@ -157,6 +172,8 @@ impl<T> SparseCells<T> {
 impl Cell {
     /// Standard deviation of the position in the least certain direction, meters.
     fn sigma_m(&self) -> f64 {
+        // The smallest eigenvalue belongs to the least certain direction. Rounding may make it
+        // negative.
         let sigma_m = self
             .information
             .symmetric_eigenvalues()
@@ -164,6 +181,7 @@ impl Cell {
             .max(0.0)
             .sqrt()
             .recip();
+        // A NaN fails this comparison and becomes infinite, too.
         if sigma_m <= MAX_SIGMA_M {
             sigma_m
         } else {
@@ -185,20 +203,17 @@ impl Grid {
             .flat_map(|keyframe| points(&keyframe.depth))
             .step_by(stride)
             .collect();
-        let along = |axis: usize, frac: f64| {
-            quantile(
-                &mut sample.iter().map(|point| point[axis]).collect::<Vec<_>>(),
-                frac,
-                Rank::Upper,
-            )
-        };
-        let (mut min_m, mut extent_m) = (Vector3::zeros(), Vector3::zeros());
+        let mut min_m: Vector3<f64> = Vector3::zeros();
+        let mut extent_m: Vector3<f64> = Vector3::zeros();
         for axis in 0..3 {
-            let [low, high] = [along(axis, QUANTILES[0])?, along(axis, QUANTILES[1])?];
+            let low = quantile_along(&sample, axis, QUANTILES[0])?;
+            let high = quantile_along(&sample, axis, QUANTILES[1])?;
             let margin = MARGIN_FRAC * (high - low);
-            (min_m[axis], extent_m[axis]) = (low - margin, high - low + 2.0 * margin);
+            min_m[axis] = low - margin;
+            extent_m[axis] = high - low + 2.0 * margin;
         }
         let cell_m = extent_m.max() / f64::from(MAX_CELLS);
+        // All points may coincide, for example in a picture of a single pixel.
         if !(cell_m.is_finite() && cell_m > 0.0) {
             return None;
         }
@@ -234,9 +249,16 @@ impl Grid {
     }
 }
 
+/// Quantile of one coordinate of points; `None` without points.
+fn quantile_along(points: &[Point3<f64>], axis: usize, frac: f64) -> Option<f64> {
+    let mut coordinates: Vec<f64> = points.iter().map(|point| point[axis]).collect();
+    quantile(&mut coordinates, frac, Rank::Upper)
+}
+
 /// The points of a depth map in world.
 fn points(depth: &DepthMap) -> impl Iterator<Item = Point3<f64>> {
     let width = depth.size_px[0];
+    // 0 marks unknown depth. A model may render an infinite one.
     let readings = depth
         .depth_m
         .iter()

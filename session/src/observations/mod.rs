@@ -14,16 +14,23 @@ use trainer::{Edits, Picture, Projection, RenderRequest};
 use viz::{Hub, KeyframePose};
 
 /// Maximum width of the depth maps. A cell of the map then meets several rays of most keyframes.
+/// The time for rendering and for the map grows with the square of the width.
 const MAX_WIDTH_PX: u32 = 96;
-/// Minimum time between two checks, and between two maps.
+/// Minimum time between two checks: the time for rendering per check, divided by its allowed
+/// fraction.
 const CHECK_PERIOD: Duration = Duration::from_millis(50);
+/// Minimum time between two maps. Each one is computed and sent as a whole.
 const MAP_PERIOD: Duration = Duration::from_secs(1);
-/// Time for rendering depth per check, unless a single picture takes longer.
+/// Time for rendering depth per check, unless a single picture takes longer. Training waits as
+/// long.
 const RENDER_TIME: Duration = Duration::from_millis(5);
-/// Maximum fraction of the time for rendering, and of one processor for maps.
+/// Maximum fraction of the time for rendering, which training would otherwise use.
 const MAX_RENDER_FRAC: f64 = 0.1;
+/// Maximum fraction of one processor for maps.
 const MAX_MAP_FRAC: f64 = 0.1;
-/// Depth is rendered again after this factor of training steps.
+/// Depth is rendered again after this factor of training steps. A model changes less and less, so
+/// the intervals grow with the number of steps. A smaller factor follows the model more closely,
+/// and renders more often.
 const STEP_FACTOR: f64 = 1.5;
 
 /// Camera and stamp of a keyframe.
@@ -117,6 +124,7 @@ impl ObservationPublisher {
             self.edits = Arc::clone(model.edits);
             self.depths.retain(|_, known| known.rendered_at.is_none());
         }
+        // Depth of evicted keyframes is removed, so that memory stays bounded.
         let keys: BTreeSet<Key> = keyframes.iter().map(PosedKeyframe::key).collect();
         let n_before = self.depths.len();
         self.depths.retain(|key, _| keys.contains(key));
@@ -125,6 +133,8 @@ impl ObservationPublisher {
         self.render_depths(keyframes, model.step, render);
         self.start_map(keyframes, model.captured_at);
         let spent = began.elapsed();
+        // A single picture may take longer than `RENDER_TIME`, on a CPU for example. The pause after
+        // it keeps the fraction of the time.
         self.next_check = Instant::now() + CHECK_PERIOD.max(spent.div_f64(MAX_RENDER_FRAC));
         spent
     }
@@ -141,7 +151,8 @@ impl ObservationPublisher {
             let Entry::Vacant(entry) = self.depths.entry(keyframe.key()) else {
                 continue;
             };
-            let stride = depth.size_px[0].div_ceil(MAX_WIDTH_PX) | 1; // Must be odd.
+            // Odd, so that each remaining pixel is the center of the block that it stands for.
+            let stride = depth.size_px[0].div_ceil(MAX_WIDTH_PX) | 1;
             entry.insert(KnownDepth {
                 depth: depth.subsampled(stride),
                 rendered_at: None,
@@ -158,17 +169,17 @@ impl ObservationPublisher {
         step: u64,
         mut render: impl FnMut(&RenderRequest) -> Result<Picture, trainer::Error>,
     ) {
-        #[expect(clippy::cast_precision_loss, reason = "steps are far below 2^52")]
-        let is_outdated = |known: &KnownDepth| {
-            known
-                .rendered_at
-                .is_some_and(|at| step as f64 > STEP_FACTOR * at as f64)
-        };
         let rendered_at = |keyframe: &PosedKeyframe| self.depths.get(&keyframe.key())?.rendered_at;
         let mut due: Vec<_> = keyframes
             .iter()
-            .filter(|keyframe| self.depths.get(&keyframe.key()).is_none_or(is_outdated))
+            .filter(|keyframe| {
+                self.depths
+                    .get(&keyframe.key())
+                    .is_none_or(|known| known.is_outdated(step))
+            })
             .collect();
+        // Keyframes without depth come first, because `None` is less than any step. Among those, the
+        // newest ones are the most interesting to an operator.
         due.sort_by_key(|keyframe| {
             (
                 rendered_at(keyframe),
@@ -194,6 +205,7 @@ impl ObservationPublisher {
                 },
             );
             self.is_changed = true;
+            // The remaining keyframes follow with the next checks.
             if began.elapsed() >= RENDER_TIME {
                 return;
             }
@@ -212,13 +224,7 @@ impl ObservationPublisher {
         if self.task.is_some() || Instant::now() < self.next_map {
             return;
         }
-        let has_moved = |keyframe: &PosedKeyframe| match self.mapped.get(&keyframe.key()) {
-            Some(mapped) => {
-                transform::is_noticeable(&(mapped.inverse() * keyframe.world_from_depth()))
-            }
-            None => false, // It has no depth yet.
-        };
-        if !self.is_changed && !keyframes.iter().any(has_moved) {
+        if !self.is_changed && !keyframes.iter().any(|keyframe| self.has_moved(keyframe)) {
             return;
         }
         let known = keyframes
@@ -236,12 +242,22 @@ impl ObservationPublisher {
         let newest = known.max_by_key(|(keyframe, _)| keyframe.pose.stamp.0);
         let newest_at = newest.and_then(|(keyframe, _)| captured_at(&keyframe.pose));
         let hub = self.hub.clone();
-        let compute = move || {
+        let began = Instant::now();
+        // On another thread: a map of many keyframes takes longer than a training step.
+        let task = Task::start("observations", move || {
             if let Some(map) = map::map_of(&observed) {
                 hub.set_observations(&viz::ObservationMap { newest_at, ..map });
             }
-        };
-        self.task = Some((Instant::now(), Task::start("observations", compute)));
+        });
+        self.task = Some((began, task));
+    }
+
+    /// Whether corrections have moved the depth of a keyframe noticeably since the last map.
+    fn has_moved(&self, keyframe: &PosedKeyframe) -> bool {
+        // A keyframe that is not in the map has no depth yet. Once it has, `is_changed` is set.
+        self.mapped.get(&keyframe.key()).is_some_and(|mapped| {
+            transform::is_noticeable(&(mapped.inverse() * keyframe.world_from_depth()))
+        })
     }
 }
 
@@ -256,6 +272,13 @@ impl PosedKeyframe {
 }
 
 impl KnownDepth {
+    /// Whether the depth was rendered with a much less trained model. Measured depth never is.
+    #[expect(clippy::cast_precision_loss, reason = "steps are far below 2^52")]
+    fn is_outdated(&self, step: u64) -> bool {
+        self.rendered_at
+            .is_some_and(|at| step as f64 > STEP_FACTOR * at as f64)
+    }
+
     /// The depth of a keyframe with its current pose.
     fn posed(&self, keyframe: &PosedKeyframe) -> PosedDepth {
         PosedDepth {
@@ -281,6 +304,7 @@ fn depth_request(pose: &KeyframePose, edits: &Arc<Edits>) -> RenderRequest {
     let size_px = pose
         .size_px
         .map(|size| ((f64::from(size) * scale).round() as u32).max(1));
+    // The rounded size has a slightly different aspect ratio, so each axis has its own scale.
     let axes = [0, 1].map(|axis| f64::from(size_px[axis]) / f64::from(pose.size_px[axis]));
     let scaled = |values: [f64; 2]| [values[0] * axes[0], values[1] * axes[1]];
     RenderRequest {

@@ -11,7 +11,7 @@ pub(crate) use pictures::{Comparison, Scored, compare};
 use crate::chart::drawing::escaped;
 use crate::chart::{Axis, Chart, Line, Point, Scale};
 use crate::next_commands::NextCommand;
-use crate::table::Table;
+use crate::table::{Table, html_row};
 use crate::{evaluation_schedule, run_folder};
 use serde_json::{Map, Value};
 use std::fmt::Write;
@@ -19,7 +19,8 @@ use std::path::Path;
 
 /// Name of the page in the folder of a run.
 pub(crate) const FILE: &str = "report.html";
-/// Tables with more rows than this are collapsed.
+/// Tables with more rows than this are collapsed. The schedule of evaluations has this many times in
+/// about two hours of training.
 const MAX_OPEN_ROWS: usize = 16;
 
 /// The content of the page.
@@ -44,7 +45,8 @@ impl Page<'_> {
     }
 
     fn html(&self) -> String {
-        let (done, report) = (&self.report["done"], self.report);
+        let report = self.report;
+        let done = &report["done"];
         let method = done["method"].as_str().unwrap_or("model");
         let name = self.folder.display().to_string();
         let title = escaped(&format!("{name}: {method}"));
@@ -170,7 +172,8 @@ fn figures(done: &Value, primitive: &str) -> String {
         .expect("a String never fails");
     }
     for (camera, psnr) in done["psnr_per_camera"].as_object().into_iter().flatten() {
-        let (camera, psnr) = (escaped(camera), psnr.as_f64().unwrap_or_default());
+        let camera = escaped(camera);
+        let psnr = psnr.as_f64().unwrap_or_default();
         writeln!(
             html,
             "<div><dd>{psnr:.2}<small>dB</small></dd><dt>PSNR of {camera}</dt></div>"
@@ -187,23 +190,23 @@ fn data_losses(data_losses: &Value) -> String {
         .filter_map(Value::as_str)
         .map(|loss| format!("<li>{}</li>", escaped(loss)))
         .collect();
-    match items.is_empty() {
-        true => String::new(),
-        false => format!("<div class=\"warn\"><strong>Lost data</strong><ul>{items}</ul></div>\n"),
+    if items.is_empty() {
+        return String::new();
     }
+    format!("<div class=\"warn\"><strong>Lost data</strong><ul>{items}</ul></div>\n")
 }
 
 fn commands(next: &[NextCommand]) -> String {
-    let entry = |next: &NextCommand| {
-        format!(
-            "<dt>{}</dt><dd><code>{}</code></dd>\n",
-            escaped(&next.purpose),
-            escaped(&next.command)
-        )
-    };
-    let entries: String = next.iter().map(entry).collect();
-    if entries.is_empty() {
+    if next.is_empty() {
         return String::new();
+    }
+    let mut entries = String::new();
+    for NextCommand { purpose, command } in next {
+        let purpose = escaped(purpose);
+        let command = escaped(command);
+        entries.push_str(&format!(
+            "<dt>{purpose}</dt><dd><code>{command}</code></dd>\n"
+        ));
     }
     format!("<h2>Next commands</h2>\n<dl class=\"commands card\">\n{entries}</dl>\n")
 }
@@ -218,25 +221,25 @@ fn comparison_section(comparisons: &[Comparison], n_tests: usize) -> String {
         };
         return format!("<h2>Test images</h2>\n<p class=\"legend\">No comparison: {reason}.</p>\n");
     }
-    let count_note = match comparisons.len() == n_tests {
-        true => String::new(),
-        false => format!(
+    let count_note = if comparisons.len() == n_tests {
+        String::new()
+    } else {
+        format!(
             "{} of {n_tests} test images, including the best and the worst. ",
             comparisons.len()
-        ),
+        )
     };
     let mut html = format!(
         "<h2>Test images</h2>\n<p class=\"legend\">{count_note}Left to right: the camera image and the model's render from \
          the same pose. None of these images was used for training.</p>\n<div class=\"comparisons\">\n"
     );
     let by_psnr = |a: &&Comparison, b: &&Comparison| a.psnr.total_cmp(&b.psnr);
-    let (worst, best) = (
-        comparisons.iter().min_by(by_psnr),
-        comparisons.iter().max_by(by_psnr),
-    );
+    let worst = comparisons.iter().min_by(by_psnr);
+    let best = comparisons.iter().max_by(by_psnr);
     for comparison in comparisons {
         let is =
             |other: Option<&Comparison>| other.is_some_and(|other| std::ptr::eq(other, comparison));
+        // Of one or two images, every one would be the best or the worst.
         let tag = match comparisons.len() {
             ..3 => "",
             _ if is(worst) => "<span class=\"tag\">worst</span>",
@@ -287,18 +290,14 @@ fn comparison_card(comparison: &Comparison, tag: &str) -> String {
 
 /// Accuracy over time.
 fn curve(report: &Value, method: &str) -> String {
-    let point = |evaluation: &Value| {
-        Some((
-            evaluation["seconds"].as_f64().filter(|secs| *secs > 0.0)?,
-            evaluation["psnr"].as_f64()?,
-        ))
-    };
     let mut points: Vec<(f64, f64)> = array(&report["evaluations"])
         .iter()
-        .filter_map(point)
+        .filter_map(curve_point)
         .collect();
     let last_secs = points.last().map_or(0.0, |(secs, _)| *secs);
-    points.extend(point(&report["done"]).filter(|(secs, _)| *secs > 1.01 * last_secs));
+    // The final evaluation often follows a scheduled one at once. Two points at the same place would
+    // look like a jump.
+    points.extend(curve_point(&report["done"]).filter(|(secs, _)| *secs > 1.01 * last_secs));
     if points.len() < 2 {
         return String::new();
     }
@@ -338,6 +337,13 @@ fn curve(report: &Value, method: &str) -> String {
         "<h2>Training curve</h2>\n<div class=\"chart card\">{}</div>\n",
         chart.draw().svg()
     )
+}
+
+/// Training time in seconds and PSNR of an evaluation; `None` if one is unknown.
+fn curve_point(evaluation: &Value) -> Option<(f64, f64)> {
+    // The time axis is logarithmic.
+    let secs = evaluation["seconds"].as_f64().filter(|secs| *secs > 0.0)?;
+    Some((secs, evaluation["psnr"].as_f64()?))
 }
 
 fn scores_of_images(report: &Value) -> Table {
@@ -386,17 +392,8 @@ fn table(title: &str, objects: &Value, (key, head): (&str, &str), columns: &[Col
     let objects = array(objects);
     let is_known = |column: &&Column<'_>| objects.iter().any(|object| object[column.0].is_number());
     let columns: Vec<&Column<'_>> = columns.iter().filter(is_known).collect();
-    let cell = |object: &Value, (key, _, factor, digits): &Column<'_>| match object[*key].as_f64() {
-        Some(value) if *digits == 0 => grouped(factor * value),
-        Some(value) => format!("{:.*}", *digits, factor * value),
-        None => "–".to_owned(),
-    };
-    let first = |object: &Value| match &object[key] {
-        Value::Number(number) => format!("{:.2}", number.as_f64().unwrap_or_default()),
-        other => text_of(other),
-    };
     let row = |object: &Value| -> Vec<String> {
-        std::iter::once(first(object))
+        std::iter::once(row_header(&object[key]))
             .chain(columns.iter().map(|column| cell(object, column)))
             .collect()
     };
@@ -407,6 +404,23 @@ fn table(title: &str, objects: &Value, (key, head): (&str, &str), columns: &[Col
             .map(str::to_owned)
             .collect(),
         rows: objects.iter().map(row).collect(),
+    }
+}
+
+/// Text of a cell.
+fn cell(object: &Value, (key, _, factor, digits): &Column<'_>) -> String {
+    match object[*key].as_f64() {
+        Some(value) if *digits == 0 => grouped(factor * value),
+        Some(value) => format!("{:.*}", *digits, factor * value),
+        None => "–".to_owned(),
+    }
+}
+
+/// Text of the first cell of a row: a name, or a time.
+fn row_header(value: &Value) -> String {
+    match value {
+        Value::Number(number) => format!("{:.2}", number.as_f64().unwrap_or_default()),
+        other => text_of(other),
     }
 }
 
@@ -425,56 +439,39 @@ fn collapsible(table: &Table, title: &str) -> String {
 
 /// Durations of a live run.
 fn latencies(latencies: &Value) -> Table {
-    let row = |latency: &Value| {
-        let [name, values] = latency.as_array()?.as_slice() else {
-            return None;
-        };
-        let millis = |key: &str| {
-            values[key]
-                .as_f64()
-                .map_or("–".to_owned(), |millis| format!("{millis:.0}"))
-        };
-        Some(vec![
-            text_of(name),
-            millis("p50"),
-            millis("p99"),
-            text_of(&values["n"]),
-        ])
-    };
     let head = ["duration", "median, ms", "99 %, ms", "keyframes"]
         .map(str::to_owned)
         .to_vec();
     Table {
         title: "Latency".into(),
         head,
-        rows: array(latencies).iter().filter_map(row).collect(),
+        rows: array(latencies).iter().filter_map(latency_row).collect(),
     }
+}
+
+/// The row of a stage; `None` if the report has another form.
+fn latency_row(latency: &Value) -> Option<Vec<String>> {
+    let [name, values] = latency.as_array()?.as_slice() else {
+        return None;
+    };
+    Some(vec![
+        text_of(name),
+        whole_millis(&values["p50"]),
+        whole_millis(&values["p99"]),
+        text_of(&values["n"]),
+    ])
+}
+
+/// A whole number of milliseconds.
+fn whole_millis(value: &Value) -> String {
+    value
+        .as_f64()
+        .map_or("–".to_owned(), |millis| format!("{millis:.0}"))
 }
 
 /// The results of A/B trials.
 fn trials(trials: &Value) -> String {
-    let rows: Vec<Vec<String>> = array(trials)
-        .iter()
-        .map(|trial| {
-            let number = |key: &str| trial[key].as_f64().unwrap_or_default();
-            let kept = if trial["kept"] == Value::Bool(true) {
-                "kept"
-            } else {
-                "dropped"
-            };
-            let gain = format!(
-                "{:+.2} ± {:.2}",
-                number("gain_db"),
-                number("standard_error_db")
-            );
-            vec![
-                text_of(&trial["candidate"]),
-                gain,
-                text_of(&trial["n_images"]),
-                kept.to_owned(),
-            ]
-        })
-        .collect();
+    let rows: Vec<Vec<String>> = array(trials).iter().map(trial_row).collect();
     if rows.is_empty() {
         return String::new();
     }
@@ -489,20 +486,35 @@ fn trials(trials: &Value) -> String {
     .html()
 }
 
-fn settings_table(title: &str, rows: Vec<Vec<String>>, is_collapsed: bool) -> String {
-    let row = |row: &Vec<String>| {
-        let cells: String = row
-            .iter()
-            .map(|cell| format!("<td>{}</td>", escaped(cell)))
-            .collect();
-        format!("<tr>{cells}</tr>\n")
+/// The row of a trial.
+fn trial_row(trial: &Value) -> Vec<String> {
+    let number = |key: &str| trial[key].as_f64().unwrap_or_default();
+    let kept = if trial["kept"] == Value::Bool(true) {
+        "kept"
+    } else {
+        "dropped"
     };
-    let rows: String = rows.iter().map(row).collect();
+    let gain = format!(
+        "{:+.2} ± {:.2}",
+        number("gain_db"),
+        number("standard_error_db")
+    );
+    vec![
+        text_of(&trial["candidate"]),
+        gain,
+        text_of(&trial["n_images"]),
+        kept.to_owned(),
+    ]
+}
+
+fn settings_table(title: &str, rows: Vec<Vec<String>>, is_collapsed: bool) -> String {
+    let rows: String = rows.iter().map(|cells| html_row(cells, "td")).collect();
     let table =
         format!("<div class=\"wide settings\"><table><tbody>\n{rows}</tbody></table></div>\n");
-    match is_collapsed {
-        true => format!("<details><summary>{title}</summary>\n{table}</details>\n"),
-        false => format!("<h2>{title}</h2>\n{table}"),
+    if is_collapsed {
+        format!("<details><summary>{title}</summary>\n{table}</details>\n")
+    } else {
+        format!("<h2>{title}</h2>\n{table}")
     }
 }
 
@@ -534,12 +546,6 @@ fn rows_of(key: &str, value: &Value) -> Vec<Vec<String>> {
 
 /// A value as one line of text.
 fn text_of(value: &Value) -> String {
-    let of_map = |map: &Map<String, Value>| {
-        let known = map.iter().filter(|(_, value)| !value.is_null());
-        known
-            .map(|(key, value)| format!("{} {}", key.replace('_', " "), text_of(value)))
-            .collect::<Vec<_>>()
-    };
     match value {
         Value::Null => "–".to_owned(),
         Value::Bool(is_true) => String::from(if *is_true { "yes" } else { "no" }),
@@ -549,8 +555,16 @@ fn text_of(value: &Value) -> String {
             _ => number.to_string(),
         },
         Value::Array(items) => items.iter().map(text_of).collect::<Vec<_>>().join(", "),
-        Value::Object(map) => of_map(map).join(", "),
+        Value::Object(map) => words_of(map).join(", "),
     }
+}
+
+/// Keys and values of a map, as text.
+fn words_of(map: &Map<String, Value>) -> Vec<String> {
+    map.iter()
+        .filter(|(_, value)| !value.is_null())
+        .map(|(key, value)| format!("{} {}", key.replace('_', " "), text_of(value)))
+        .collect()
 }
 
 /// A number with up to four decimals; in scientific notation if it is very small or large.
@@ -568,6 +582,7 @@ fn grouped(value: f64) -> String {
     let mut text = String::from(if value < 0.0 { "-" } else { "" });
     for (ix, digit) in digits.chars().enumerate() {
         if ix > 0 && (digits.len() - ix).is_multiple_of(3) {
+            // A narrow space without a line break.
             text.push('\u{202f}');
         }
         text.push(digit);
@@ -582,22 +597,28 @@ fn array(value: &Value) -> &[Value] {
 /// The settings of a run: the first line of the newest decision log in a folder; `Null` if there is
 /// no log.
 pub(crate) fn settings_in(folder: &Path) -> Value {
-    let step_of = |name: &str| {
-        name.strip_prefix("decisions-from-")?
-            .strip_suffix(".jsonl")?
-            .parse::<u64>()
-            .ok()
-    };
+    // A run that continues from a checkpoint has a log of its own, named after its first step.
     let names = std::fs::read_dir(folder).into_iter().flatten().flatten();
     let newest = names
-        .filter_map(|entry| Some((step_of(entry.file_name().to_str()?)?, entry.path())))
+        .filter_map(|entry| Some((first_step(entry.file_name().to_str()?)?, entry.path())))
         .max();
     let path = newest.map_or_else(|| folder.join("decisions.jsonl"), |(_, path)| path);
-    let first_line = || -> Option<Value> {
-        let text = files::read_text(&path).ok()?;
-        serde_json::from_str(text.lines().next()?).ok()
-    };
-    first_line().unwrap_or_default()
+    first_line(&path).unwrap_or_default()
+}
+
+/// The step in the name of a log that continues from a checkpoint; `None` for other names.
+fn first_step(log_name: &str) -> Option<u64> {
+    log_name
+        .strip_prefix("decisions-from-")?
+        .strip_suffix(".jsonl")?
+        .parse()
+        .ok()
+}
+
+/// The JSON in the first line of a file; `None` if there is none.
+fn first_line(path: &Path) -> Option<Value> {
+    let text = files::read_text(path).ok()?;
+    serde_json::from_str(text.lines().next()?).ok()
 }
 
 #[cfg(test)]

@@ -10,22 +10,29 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 use trainer::{Method, Picture};
 
-/// Maximum number of test images shown.
+/// Maximum number of test images shown. Each one is rendered again for the page, and adds to its
+/// size.
 const MAX_IMAGES: usize = 12;
-/// Fraction of the depths that are clipped at each end of the color scale.
+/// Fraction of the depths that are clipped at each end of the color scale. Without clipping, a few
+/// wrong depth values would leave only a small part of the scale for the scene.
 const OUTSIDE_FRAC: f64 = 0.02;
 /// Maximum side of the image and the render.
 const MAX_SIDE_PX: u32 = 640;
 /// Maximum side of the error and depth pictures.
 const MAX_SMALL_SIDE_PX: u32 = 320;
+/// JPEG quality of image and render. Artifacts of the compression must not look like errors of the
+/// model.
 const QUALITY: u8 = 82;
+/// JPEG quality of the error and depth pictures, which show only large-scale structure.
 const SMALL_QUALITY: u8 = 75;
-/// Maximum total size of all pictures, encoded as base64.
+/// Maximum total size of all pictures, encoded as base64. The page should open at once and fit into
+/// a message.
 const MAX_TEXT_BYTES: usize = 2_600_000;
 /// After this time, no further picture is drawn. On a CPU, one picture of a neural field may take
 /// half a minute.
 const MAX_RENDER_TIME: Duration = Duration::from_secs(10);
-/// Color difference, 0 to 255, from which the error map has its brightest color.
+/// Color difference, 0 to 255, from which the error map has its brightest color: a quarter of the
+/// range. With the full range, typical errors of a few percent would all look black.
 const MAX_ERROR: u8 = 64;
 
 /// One test image and the model's render of it.
@@ -75,11 +82,13 @@ pub(crate) fn compare(
         }
         let comparison = Comparison::of(method, &scored[ix])?;
         n_bytes += comparison.n_bytes();
+        // One comparison is shown in any case.
         if n_bytes > MAX_TEXT_BYTES && !comparisons.is_empty() {
             break;
         }
         comparisons.push((ix, comparison));
     }
+    // They were drawn in order of importance, and are shown in the order of the images.
     comparisons.sort_by_key(|(ix, _)| *ix);
     Ok(comparisons
         .into_iter()
@@ -97,6 +106,8 @@ fn selected(psnr: &[f64]) -> Vec<usize> {
     let mut spread: Vec<usize> = (0..n_spread).collect();
     spread.sort_by_key(|n| n.reverse_bits());
     let spread = spread.into_iter().map(|n| n * psnr.len() / n_spread);
+    // The spread indices may contain the worst or the best image. The last part fills the gaps that
+    // these duplicates leave.
     for ix in (0..psnr.len())
         .max_by(by_psnr)
         .into_iter()
@@ -117,6 +128,7 @@ impl Comparison {
         let [size_px, small_px] =
             [MAX_SIDE_PX, MAX_SMALL_SIDE_PX].map(|side| fit_size(keyframe.size_px, side));
         let small = |rgba: &[u8], to_px| downscale::rgba(rgba.to_vec(), keyframe.size_px, to_px);
+        // The render is masked like the image, so that both show the pixels that are scored.
         let image = small(&keyframe.rgba_srgb, size_px);
         let render = mask_colors(&small(&opaque(&rendered.rgba_srgb), size_px), &image);
         let error = errors(
@@ -153,19 +165,25 @@ impl DepthPicture {
         let Some(range_m) = trimmed_range(&mut known, OUTSIDE_FRAC).map(f32s_of) else {
             return Ok(None);
         };
-        let span_m = (range_m[1] - range_m[0]).max(1e-6);
-        let color = |z: f32| {
-            if z > 0.0 && z.is_finite() {
-                turbo((z - range_m[0]) / span_m)
-            } else {
-                [0; 3]
-            }
-        };
-        let pixels: Vec<u8> = subsampled.into_iter().flat_map(color).collect();
+        let pixels: Vec<u8> = subsampled
+            .into_iter()
+            .flat_map(|z_m| depth_color(z_m, range_m))
+            .collect();
         Ok(Some(Self {
             picture: data_uri(&pixels, size_px, SMALL_QUALITY)?,
             range_m,
         }))
+    }
+}
+
+/// Color of a depth in a range; black if the depth is unknown.
+fn depth_color(z_m: f32, [near_m, far_m]: [f32; 2]) -> [u8; 3] {
+    if z_m > 0.0 && z_m.is_finite() {
+        // A picture of a wall that faces the camera has a single depth.
+        let span_m = (far_m - near_m).max(1e-6);
+        turbo((z_m - near_m) / span_m)
+    } else {
+        [0; 3]
     }
 }
 
@@ -198,18 +216,23 @@ fn errors(render: &[u8], image: &[u8]) -> Vec<u8> {
         .0
         .iter()
         .zip(image.as_chunks::<4>().0);
-    let error = |(render, image): (&[u8; 4], &[u8; 4])| {
-        let largest = (0..3)
-            .map(|channel| render[channel].abs_diff(image[channel]))
-            .max()
-            .unwrap_or_default();
-        if image[3] > 0 {
-            heat(f32::from(largest) / f32::from(MAX_ERROR))
-        } else {
-            [0; 3]
-        }
-    };
-    pixels.flat_map(error).collect()
+    pixels
+        .flat_map(|(render, image)| error_color(render, image))
+        .collect()
+}
+
+/// Color of the difference of two pixels; black if the image is masked there.
+fn error_color(render: &[u8; 4], image: &[u8; 4]) -> [u8; 3] {
+    // The largest difference of a channel. A mean would hide an error that changes only the hue.
+    let largest = (0..3)
+        .map(|channel| render[channel].abs_diff(image[channel]))
+        .max()
+        .unwrap_or_default();
+    if image[3] > 0 {
+        heat(f32::from(largest) / f32::from(MAX_ERROR))
+    } else {
+        [0; 3]
+    }
 }
 
 /// A color map of increasing brightness: black, purple, red, orange, light yellow, evenly spaced.

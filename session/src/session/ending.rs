@@ -2,7 +2,7 @@
 
 use super::Session;
 use super::outcome::TrainingOutcome;
-use super::reporter::ScoredModel;
+use super::reporter::{Reporter, ScoredModel};
 use crate::checkpoints::Snapshot;
 use crate::evaluate::Scores;
 use crate::next_commands::{DataSource, SavedModel};
@@ -62,65 +62,117 @@ pub fn finish(
     mut endings: Vec<EndingSession<impl Serialize>>,
     hub: Option<&Hub>,
 ) -> crate::Result<Vec<FinishedModel>> {
-    // All models are saved before scoring, so that a second Ctrl-C during scoring loses nothing.
+    // The training time of all models ends before the first one is saved. Saving takes time, which
+    // would otherwise count for the models that are saved later.
     let ended_secs: Vec<f64> = endings
         .iter_mut()
         .map(|ending| ending.session.stop_training())
         .collect::<crate::Result<_>>()?;
+    // All models are saved before scoring, so that a second Ctrl-C during scoring loses nothing.
+    let mut errors = Errors::default();
+    let mut saved = save_all(endings, ended_secs, &mut errors);
+    // Checkpoints are written on other threads, so they are complete only after this wait.
+    wait_for_checkpoints(&mut saved, &mut errors);
+    if saved
+        .iter()
+        .any(|saved| saved.ending.session.stop.requested())
+    {
+        log::info!("saved; scoring the test images (Ctrl-C again skips this)");
+    }
+    let mut finished = Vec::new();
+    for SavedSession {
+        ending,
+        seconds,
+        sha256,
+    } in saved
+    {
+        let EndingSession {
+            session,
+            out,
+            details,
+        } = ending;
+        match session.report_end(&out, seconds, &sha256, &details, hub) {
+            Ok(model) => finished.push(model),
+            Err(error) => errors.record(error),
+        }
+    }
+    errors.into_result().map(|()| finished)
+}
+
+/// Errors of several models. The first one is returned, all others are logged.
+#[derive(Default)]
+struct Errors {
+    first: Option<crate::Error>,
+}
+
+impl Errors {
+    /// Keeps the first error, and logs an error after it.
+    fn record(&mut self, error: crate::Error) {
+        if self.first.is_none() {
+            self.first = Some(error);
+        } else {
+            log::error!("{error:#}");
+        }
+    }
+
+    /// Returns the first error, if there was one.
+    fn into_result(self) -> crate::Result<()> {
+        self.first.map_or(Ok(()), Err)
+    }
+}
+
+/// A session whose model is saved.
+struct SavedSession<P> {
+    /// The session, with the folder in which its model was saved.
+    ending: EndingSession<P>,
+    /// Training time, seconds.
+    seconds: f64,
+    /// Checksum of the saved model.
+    sha256: String,
+}
+
+/// Saves all models. Those that cannot be saved are left out.
+fn save_all<P>(
+    endings: Vec<EndingSession<P>>,
+    ended_secs: Vec<f64>,
+    errors: &mut Errors,
+) -> Vec<SavedSession<P>> {
     let mut saved = Vec::new();
-    // The first error is returned, all others are logged.
-    let mut failed = Ok(());
-    let mut record_error = |error: crate::Error| match failed {
-        Ok(()) => failed = Err(error),
-        Err(_) => log::error!("{error:#}"),
-    };
     for (mut ending, seconds) in endings.into_iter().zip(ended_secs) {
         // A model that cannot be saved does not prevent saving the others.
         match ending.session.save(&ending.out, seconds) {
             Ok(Saved {
                 folder,
                 sha256,
-                failed: error,
+                failed,
             }) => {
                 ending.out = folder;
                 ending.session.write_cameras(&ending.out);
-                error.into_iter().for_each(&mut record_error);
-                saved.push((ending, seconds, sha256));
+                if let Some(error) = failed {
+                    errors.record(error);
+                }
+                saved.push(SavedSession {
+                    ending,
+                    seconds,
+                    sha256,
+                });
             }
-            Err(error) => record_error(error),
+            Err(error) => errors.record(error),
         }
     }
-    for (ending, ..) in &mut saved {
+    saved
+}
+
+/// Waits until the last checkpoint of each saved model is on disk.
+fn wait_for_checkpoints<P>(saved: &mut [SavedSession<P>], errors: &mut Errors) {
+    for SavedSession { ending, .. } in saved {
         if let Err(error) = ending.session.persistence.wait() {
-            record_error(error.with_context(format!(
+            errors.record(error.with_context(format!(
                 "the model was saved in {}, but not the last checkpoint",
                 ending.out.display()
             )));
         }
     }
-    if saved
-        .iter()
-        .any(|(ending, ..)| ending.session.stop.requested())
-    {
-        log::info!("saved; scoring the test images (Ctrl-C again skips this)");
-    }
-    let mut finished = Vec::new();
-    for (
-        EndingSession {
-            session,
-            out,
-            details,
-        },
-        seconds,
-        sha256,
-    ) in saved
-    {
-        match session.report_end(&out, seconds, &sha256, &details, hub) {
-            Ok(model) => finished.push(model),
-            Err(error) => record_error(error),
-        }
-    }
-    failed.map(|()| finished)
 }
 
 /// A model on disk.
@@ -140,6 +192,7 @@ impl Session {
 
     /// Waits for queued work and returns the training time in seconds.
     fn stop_training(&mut self) -> crate::Result<f64> {
+        // Queued steps count as training time, so the time is read after them.
         self.gpu.wait()?;
         let seconds = self.time.end_secs();
         self.reporter.report_training_ended();
@@ -159,17 +212,17 @@ impl Session {
         // keyframes after it is resumed.
         let is_live = self.persistence.keeps_keyframes();
         let is_finished = self.is_over() || (self.is_idle() && !is_live);
-        let (method, keyframes, edits) = (self.method.as_mut(), &self.keyframes[..], &*self.edits);
-        let snapshot = Snapshot {
-            method,
-            keyframes,
-            edits,
+        let checkpoint = self.persistence.take_last_checkpoint(Snapshot {
+            method: self.method.as_mut(),
+            keyframes: &self.keyframes,
+            edits: &self.edits,
             seconds,
             is_finished,
-        };
-        let checkpoint = self.persistence.take_last_checkpoint(snapshot);
+        });
         let saved = run_folder::save_model(self.method.as_mut(), &self.edits, out)
             .and_then(|()| run_folder::checkpoint_sha256(out));
+        // The checkpoint is written after the model: if the disk has no space for both, the model
+        // is the more important one.
         self.persistence.write_checkpoint(checkpoint);
         match saved {
             Ok(sha256) => Ok(Saved {
@@ -177,6 +230,8 @@ impl Session {
                 sha256,
                 failed: None,
             }),
+            // The disk may be full, or the folder read-only. Other errors, such as a lost GPU,
+            // would also occur in another folder.
             Err(error) if error.is_io() => self.save_elsewhere(out, error),
             Err(error) => Err(error),
         }
@@ -184,14 +239,7 @@ impl Session {
 
     /// Saves the model in a temporary folder, because its run folder could not be written.
     fn save_elsewhere(&mut self, out: &Path, save_error: crate::Error) -> crate::Result<Saved> {
-        let edits = &self.edits;
-        let save = |method: &mut dyn Method| {
-            let folder = run_folder::make_fallback_folder()?;
-            run_folder::save_model(method, edits, &folder)?;
-            let sha256 = run_folder::checkpoint_sha256(&folder)?;
-            Ok((folder, sha256))
-        };
-        match save(self.method.as_mut()) {
+        match save_in_fallback_folder(self.method.as_mut(), &self.edits) {
             Ok((folder, sha256)) => {
                 let context = format!(
                     "cannot save the model in {}; it was saved in {}",
@@ -205,8 +253,8 @@ impl Session {
                 })
             }
             Err(error) => {
-                let error: crate::Error = error;
                 log::error!("cannot save the model in a temporary folder either: {error:#}");
+                // The user can act on the first error, which concerns the requested folder.
                 Err(save_error.with_context(format!(
                     "cannot save the model in {}; {}",
                     out.display(),
@@ -268,33 +316,18 @@ impl Session {
     fn score_at_end(&mut self, seconds: f64, hub: Option<&Hub>) -> crate::Result<TrainingOutcome> {
         self.gpu.wait()?;
         self.persistence.log_render();
-        let (n_all, kind) = (self.scoreboard.tests().len(), self.reporter.kind());
-        let (reporter, edits) = (&mut self.reporter, &self.edits);
-        let mut n_reported = None;
-        let meanwhile = |method: &mut dyn Method, n_scored: usize| {
-            if n_reported.replace(n_scored) != Some(n_scored) {
-                reporter.report_scoring(n_scored, n_all);
-                if let Some(hub) = hub {
-                    hub.set_state(&format!("scoring, {n_scored} of {n_all} images"));
-                }
-            }
-            if let Some(pending) = hub.and_then(Hub::next_request) {
-                let other = pending
-                    .method()
-                    .filter(|name| *name != kind.name())
-                    .map(str::to_owned);
-                match other {
-                    Some(other) => {
-                        pending.fail(&format!(
-                            "cannot render {other} while {} is scored; try again later",
-                            kind.name()
-                        ));
-                    }
-                    None => viewer::answer(pending, method, edits),
-                }
-            }
+        let mut work = WorkDuringScoring {
+            n_all: self.scoreboard.tests().len(),
+            n_reported: None,
+            reporter: &mut self.reporter,
+            edits: &self.edits,
+            hub,
         };
-        let per_image = self.scoreboard.score_all(self.method.as_mut(), meanwhile)?;
+        let per_image = self
+            .scoreboard
+            .score_all(self.method.as_mut(), |method, n_scored| {
+                work.advance(method, n_scored);
+            })?;
         let progress = self.method.progress();
         Ok(TrainingOutcome {
             seconds,
@@ -305,5 +338,57 @@ impl Session {
             evaluations: self.reporter.take_evaluations(),
             per_image,
         })
+    }
+}
+
+/// Saves a model in a new temporary folder. Returns the folder and the checksum of the model.
+fn save_in_fallback_folder(
+    method: &mut dyn Method,
+    edits: &Edits,
+) -> crate::Result<(PathBuf, String)> {
+    let folder = run_folder::make_fallback_folder()?;
+    run_folder::save_model(method, edits, &folder)?;
+    let sha256 = run_folder::checkpoint_sha256(&folder)?;
+    Ok((folder, sha256))
+}
+
+/// What happens while a model is scored: progress is reported, and viewers get pictures.
+struct WorkDuringScoring<'a> {
+    /// Number of test images.
+    n_all: usize,
+    /// The progress that was last reported.
+    n_reported: Option<usize>,
+    reporter: &'a mut Reporter,
+    edits: &'a Arc<Edits>,
+    hub: Option<&'a Hub>,
+}
+
+impl WorkDuringScoring<'_> {
+    /// Reports that `n_scored` images are scored, and draws at most one picture.
+    fn advance(&mut self, method: &mut dyn Method, n_scored: usize) {
+        // Called often, also without progress, so that viewers do not wait for the next score.
+        if self.n_reported.replace(n_scored) != Some(n_scored) {
+            let n_all = self.n_all;
+            self.reporter.report_scoring(n_scored, n_all);
+            if let Some(hub) = self.hub {
+                hub.set_state(&format!("scoring, {n_scored} of {n_all} images"));
+            }
+        }
+        if let Some(pending) = self.hub.and_then(Hub::next_request) {
+            let scored_method = self.reporter.kind().name();
+            let other = pending
+                .method()
+                .filter(|name| *name != scored_method)
+                .map(str::to_owned);
+            match other {
+                // Only the model that is scored is available here. A viewer repeats its request.
+                Some(other) => {
+                    pending.fail(&format!(
+                        "cannot render {other} while {scored_method} is scored; try again later"
+                    ));
+                }
+                None => viewer::answer(pending, method, self.edits),
+            }
+        }
     }
 }

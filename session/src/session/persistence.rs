@@ -137,6 +137,7 @@ impl Persistence {
 
     /// Keeps an evicted keyframe, without pixels, as long as the newest checkpoint may contain it.
     pub(super) fn evict(&mut self, keyframe: &Keyframe) {
+        // Without pixels, because evicting keyframes is what bounds the memory of a long run.
         if self.recovery.is_some() {
             self.evicted.push(Arc::new(without_pixels(keyframe)));
         }
@@ -158,6 +159,7 @@ impl Persistence {
         let Some(checkpoints) = &mut self.checkpoints else {
             return Ok(());
         };
+        // Borrowed again for the snapshot, because the step is read after it.
         let method = snapshot.method;
         if checkpoints.write_when_due(Snapshot {
             method: &mut *method,
@@ -254,16 +256,9 @@ impl Persistence {
         let Some(recovery) = &self.recovery else {
             keyframe::bail!("this run cannot continue on another device")
         };
-        let written = self
-            .checkpoints
-            .as_mut()
-            .and_then(Checkpoints::newest)
-            .map(Path::to_owned);
-        let checkpoint = match (written, &recovery.resumed) {
-            (Some(path), _) => Some(Checkpoint::read(&path).map_err(crate::Error::from)),
-            (None, Some(folder)) => Some(checkpoints::read(folder)),
-            (None, None) => None,
-        };
+        let checkpoint = newest_checkpoint(self.checkpoints.as_mut(), recovery.resumed.as_deref());
+        // A checkpoint requires all keyframes that its model was trained on, including those that
+        // were evicted after it was taken. Their descriptions are enough.
         let held: Vec<Arc<Keyframe>> = recovery.known.iter().chain(keyframes).cloned().collect();
         let all = [&held[..], &self.evicted[..]].concat();
         let resumed = checkpoint.map_or(Ok(None), |checkpoint| resume(gpu, checkpoint, &all))?;
@@ -272,16 +267,14 @@ impl Persistence {
             Some(resumed) => (resumed.method, resumed.untrained),
             None => (recovery.model_spec.start(gpu.clone())?, held.clone()),
         };
+        // Kernels are compiled here, so that this time does not count as training time.
         method.prepare()?;
-        let is_in = |keyframes: &[Arc<Keyframe>], keyframe_ref: &Arc<Keyframe>| {
-            keyframes
-                .iter()
-                .any(|other| Arc::ptr_eq(other, keyframe_ref))
-        };
+        // Evictions since the checkpoint are repeated. Keyframes that the model was not trained on
+        // are not in its store.
         for keyframe in self
             .evicted
             .iter()
-            .filter(|keyframe| !is_in(&untrained, keyframe))
+            .filter(|keyframe| !contains(&untrained, keyframe))
         {
             method.remove(&keyframe.camera, keyframe.stamp)?;
         }
@@ -295,9 +288,14 @@ impl Persistence {
             .continued_from(is_resumed.then_some(from_step));
         let mut decisions = DecisionLog::create(&recovery.folder, settings)?;
         held.iter()
-            .filter(|keyframe| !is_in(&untrained, keyframe))
+            .filter(|keyframe| !contains(&untrained, keyframe))
             .for_each(|keyframe| decisions.restored(from_step, keyframe));
-        for keyframe in untrained.iter().filter(|keyframe| is_in(&held, keyframe)) {
+        // Keyframes that arrived after the checkpoint. Those that were evicted since are among the
+        // untrained ones, too, and are left out.
+        for keyframe in untrained
+            .iter()
+            .filter(|keyframe| contains(&held, keyframe))
+        {
             method.push(keyframe.clone())?;
             decisions.pushed(method.n_total_steps()?, keyframe);
         }
@@ -312,6 +310,24 @@ impl Persistence {
         self.decisions = Some(decisions);
         Ok(method)
     }
+}
+
+/// The newest checkpoint: one that this run has written, or else the one that the run was resumed
+/// from. `None` if there is none.
+fn newest_checkpoint(
+    checkpoints: Option<&mut Checkpoints>,
+    resumed_folder: Option<&Path>,
+) -> Option<crate::Result<Checkpoint>> {
+    match (checkpoints.and_then(Checkpoints::newest), resumed_folder) {
+        (Some(path), _) => Some(Checkpoint::read(path).map_err(crate::Error::from)),
+        (None, Some(folder)) => Some(checkpoints::read(folder)),
+        (None, None) => None,
+    }
+}
+
+/// Whether a list contains this very keyframe, not only one with the same camera and stamp.
+fn contains(keyframes: &[Arc<Keyframe>], keyframe: &Arc<Keyframe>) -> bool {
+    keyframes.iter().any(|other| Arc::ptr_eq(other, keyframe))
 }
 
 /// Resumes a model from a checkpoint. Returns `None` if the checkpoint cannot be used, and an error
@@ -331,7 +347,10 @@ fn resume(
     };
     match checkpoint.and_then(resume) {
         Ok((resumed, _)) => Ok(Some(resumed)),
+        // The new device has failed, too: the caller tries again.
         Err(error) if error.is_gpu_error() => Err(error),
+        // The checkpoint is unusable, for example damaged. Starting again loses training time;
+        // an error would lose the run.
         Err(error) => {
             log::warn!("cannot resume from the newest checkpoint: {error:#}");
             Ok(None)

@@ -6,9 +6,11 @@ use std::time::{Duration, Instant};
 use trainer::Method;
 use trainer::gpu::PassTiming;
 
-/// Number of profiled steps, over which medians are taken.
+/// Number of profiled steps, over which medians are taken. It is odd, so that the median is one of
+/// the measured values. More steps would take longer; with few, one slow step changes the median.
 const N_PROFILED: usize = 21;
-/// Warm-up time, because drivers are slow for a while after large buffers were freed.
+/// Warm-up time, because drivers are slow for a while after large buffers were freed. With a
+/// shorter warm-up, these slow steps would be part of the medians.
 const PROFILE_WARM_UP: Duration = Duration::from_millis(700);
 
 /// GPU time of each kernel in a step in milliseconds: medians over [`N_PROFILED`] steps, in order
@@ -22,8 +24,11 @@ pub(super) fn profile(method: &mut dyn Method) -> crate::Result<Vec<(&'static st
     }
     for _ in 0..N_PROFILED {
         let mut sums: BTreeMap<&'static str, f64> = BTreeMap::new();
+        // A kernel may run several times in one step, for example in the passes of a sort. Its
+        // times are summed before the median is taken.
         for PassTiming { name, millis } in method.profile_step()? {
             *sums.entry(name).or_default() += millis;
+            // The map is sorted by name. The list keeps the order of execution.
             if !names.contains(&name) {
                 names.push(name);
             }

@@ -221,7 +221,10 @@ impl Reporter {
             evaluations: &outcome.evaluations,
             per_image: self.named(&outcome.per_image),
         };
+        // The page and the event follow even if the report was not written: the model is saved, and
+        // its scores must not be lost. The error is returned at the end.
         let written = run_folder::write_json(&out.join("report.json"), &report);
+        // The page is an addition, so its error is only logged.
         let page = model
             .comparisons
             .and_then(|comparisons| self.write_page(out, &report, &comparisons));

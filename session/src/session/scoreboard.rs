@@ -10,9 +10,11 @@ use std::sync::Arc;
 use std::time::Duration;
 use trainer::Method;
 
-/// Maximum time of one scheduled evaluation.
+/// Maximum time of one scheduled evaluation, during which nothing is trained. In a long run, the
+/// allowed fraction of the training time would permit evaluations of many minutes.
 const MAX_EVALUATION: Duration = Duration::from_secs(60);
 /// Maximum number of points of the PSNR curve. When it is reached, every other point is removed.
+/// The curve is sent to viewers with each status, so its length must not grow with the run.
 const MAX_HISTORY: usize = 512;
 
 /// How a session is evaluated.
@@ -82,6 +84,8 @@ impl Scoreboard {
         if keyframe.split != Split::Test {
             return;
         }
+        // Masked pixels have no alpha and are not compared. Without any other pixel, there is no
+        // score.
         if keyframe.rgba_srgb.chunks_exact(4).any(|pixel| pixel[3] > 0) {
             self.tests.push_back(keyframe.clone());
         } else {
@@ -119,6 +123,8 @@ impl Scoreboard {
             ..
         } = self.evaluators;
         let max_frac = max_frac_during_training.unwrap_or(f64::INFINITY);
+        // Without a limit, the product is infinite, or NaN at 0 s. Neither is a `Duration`, and both
+        // become the longest one.
         let allowed = Duration::try_from_secs_f64(max_frac * secs)
             .unwrap_or(Duration::MAX)
             .saturating_sub(self.spent);
@@ -179,6 +185,7 @@ impl Scoreboard {
 
     /// Returns the test keyframe with the oldest score and moves it to the end of the queue.
     pub(super) fn next_to_refresh(&mut self) -> Option<Arc<Keyframe>> {
+        // A queue, so that every test keyframe is scored again once per round.
         let oldest = self.tests.pop_front()?;
         self.tests.push_back(oldest.clone());
         Some(oldest)
@@ -193,6 +200,7 @@ impl Scoreboard {
         let Some(psnr) = self.psnr() else { return };
         self.history.push((secs, psnr));
         if self.history.len() > MAX_HISTORY {
+            // The number of points is odd here, so the first and the last one are both kept.
             let mut keep = false;
             self.history.retain(|_| {
                 keep = !keep;

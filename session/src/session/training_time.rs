@@ -95,6 +95,8 @@ impl TrainingTime {
     pub(super) fn add_steps(&mut self, n: u64) {
         if n > 0 {
             let secs = self.secs();
+            // The rate is measured from the first step on. Before it, the run waited for keyframes
+            // and for the compilation of kernels.
             self.first_step_secs.get_or_insert(secs);
             self.n_steps += n;
         }
@@ -124,6 +126,7 @@ impl TrainingTime {
 
     /// Marks the session as finished at the current training time, unless it is already finished.
     pub(super) fn mark_finished(&mut self) {
+        // Only the first mark counts: the session may be asked again while others still train.
         let secs = self.secs();
         self.finished_secs.get_or_insert(secs);
     }

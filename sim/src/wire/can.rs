@@ -14,7 +14,8 @@ use std::time::Duration;
 
 /// Encoding ranges of a Damiao DM4310: rad, rad/s and Nm.
 const DAMIAO_LIMITS: Limits = Limits::of(12.5, 30.0, 10.0);
-/// Time to wait for messages on a bus before servicing motors that report periodically.
+/// Time to wait for messages on a bus before servicing motors that report periodically. It must be
+/// shorter than the period of their reports.
 const RECEIVE_TIMEOUT: Duration = Duration::from_millis(1);
 
 /// Motors that reply until they are dropped.
@@ -42,6 +43,8 @@ impl EmulatedMotors {
             threads: Vec::new(),
         };
         for (bus_ix, bus) in arm.buses.iter().enumerate() {
+            // One thread per bus, like the driver. Motors on one bus answer in the order of the
+            // messages.
             let joints_of_bus = arm
                 .motors
                 .iter()
@@ -52,8 +55,9 @@ impl EmulatedMotors {
                 config: motor.clone(),
                 motor: EmulatedMotor::new(&*motor.protocol, DAMIAO_LIMITS),
             });
-            let (bus, joints_of_bus, track) =
-                (Bus::open(bus)?, joints_of_bus.collect(), track.clone());
+            let bus = Bus::open(bus)?;
+            let joints_of_bus = joints_of_bus.collect();
+            let track = track.clone();
             let flags = Arc::clone(&motors.flags);
             let device = format!("emulated motors on {}", bus.config().interface);
             let thread = std::thread::Builder::new()
@@ -97,6 +101,8 @@ impl EmulatedJoint {
             offset_rad,
             ..
         } = self.config;
+        // The inverse of the conversion in the driver: position and velocity scale with the gear
+        // ratio, torque with its inverse.
         let motor_per_joint = gear_ratio * if is_reversed { -1.0 } else { 1.0 };
         let of = |numbers: &[f64]| numbers.get(self.joint_ix).copied().unwrap_or(0.0);
         self.motor.set_motion(Motion {
@@ -116,6 +122,8 @@ fn run_bus(
     while !flags.stop.load(Ordering::Relaxed) {
         let arrived = bus.receive(RECEIVE_TIMEOUT)?;
         let now = clock::now();
+        // The script counts until a client takes over any motor. Then all motors stay where they
+        // are, because a script that moves some joints would fight the client.
         let joints = (!flags.is_client_controlled.load(Ordering::Relaxed)).then(|| track.at(now));
         for emulated_joint in &mut joints_on_bus {
             if let Some(joints) = &joints {

@@ -4,7 +4,7 @@ use super::JointTrack;
 use crate::MotorHistory;
 use drivers::Error;
 use drivers::franka::emulated::{CommandedJoints, EmulatedRobot, Joints, RobotConfig};
-use kinematics::JointState;
+use kinematics::{JointState, Stamp};
 use std::time::Duration;
 
 /// Accepts clients until it is dropped. Once a client has moved the arm, it follows client commands
@@ -18,21 +18,40 @@ pub fn emulate_fci(
     answer_wait: Duration,
     motors: Option<MotorHistory>,
 ) -> Result<EmulatedRobot, Error> {
-    let mut is_client_controlled = false;
-    let mut simulate_joints = move |now, client_target: &CommandedJoints| {
-        if client_target.is_moving && !std::mem::replace(&mut is_client_controlled, true) {
+    let mut arm = ScriptedArm {
+        track,
+        motors,
+        is_client_controlled: false,
+    };
+    let joint_simulator = move |now: Stamp, client_target: &CommandedJoints| {
+        let joints = arm.joints_at(now, client_target);
+        arm.record(now, &joints);
+        joints
+    };
+    EmulatedRobot::start_waiting(config, answer_wait, Box::new(joint_simulator))
+}
+
+/// An arm that follows a script until a client moves it.
+struct ScriptedArm {
+    track: JointTrack,
+    motors: Option<MotorHistory>,
+    is_client_controlled: bool,
+}
+
+impl ScriptedArm {
+    fn joints_at(&mut self, now: Stamp, client_target: &CommandedJoints) -> Joints {
+        if client_target.is_moving && !std::mem::replace(&mut self.is_client_controlled, true) {
             log::info!("a client controls the arm: it no longer follows the script");
         }
-        if is_client_controlled {
-            let (position_rad, velocity_rad_s) =
-                (client_target.position_rad, client_target.velocity_rad_s);
+        // The arm then follows its target without error, as a perfect controller would.
+        if self.is_client_controlled {
             return Joints {
-                position_rad,
-                velocity_rad_s,
+                position_rad: client_target.position_rad,
+                velocity_rad_s: client_target.velocity_rad_s,
                 ..Joints::default()
             };
         }
-        let state = track.at(now);
+        let state = self.track.at(now);
         let to_joint_array =
             |numbers: Vec<f64>| std::array::from_fn(|ix| numbers.get(ix).copied().unwrap_or(0.0));
         Joints {
@@ -41,20 +60,17 @@ pub fn emulate_fci(
             torque_nm: to_joint_array(state.effort),
             ..Joints::default()
         }
-    };
-    let joint_simulator = move |now, client_target: &CommandedJoints| {
-        let joints = simulate_joints(now, client_target);
-        if let Some(motors) = &motors {
-            let (position, velocity) =
-                (joints.position_rad.to_vec(), joints.velocity_rad_s.to_vec());
+    }
+
+    /// Moves the simulated arm, if there is one, to the same joints.
+    fn record(&self, now: Stamp, joints: &Joints) {
+        if let Some(motors) = &self.motors {
             motors.record(JointState {
                 stamp: now,
-                position,
-                velocity,
+                position: joints.position_rad.to_vec(),
+                velocity: joints.velocity_rad_s.to_vec(),
                 effort: Vec::new(),
             });
         }
-        joints
-    };
-    EmulatedRobot::start_waiting(config, answer_wait, Box::new(joint_simulator))
+    }
 }

@@ -97,6 +97,7 @@ impl JointTrack {
                 requested: playback_clock.scripted,
             });
         };
+        // The history holds the whole script, because it may be played from any instant.
         let mut history = JointHistory::new(MAX_GAP, readings.len().max(2));
         readings
             .iter()

@@ -17,7 +17,8 @@ use std::time::Duration;
 /// Maximum echoes per datagram. Each takes about 60 bytes as JSON; a datagram holds at most 65 507
 /// bytes.
 const MAX_POINTS: usize = 1000;
-/// Period at which the state at rest is resent.
+/// Period at which the state at rest is resent. Receivers count a sender as lost if they hear nothing,
+/// and interpolate only between readings that are close in time.
 const RESEND_PERIOD: Duration = Duration::from_millis(20);
 /// Period at which the thread checks whether to stop.
 const STOP_CHECK_PERIOD: Duration = Duration::from_millis(50);
@@ -113,6 +114,8 @@ impl Sender {
     fn run(mut self) {
         let script_entries = self.script_entries();
         if let Some((first, _)) = script_entries.first() {
+            // Before the script, the devices stand still at its start, so that a program can
+            // connect.
             self.resend_end_state(0, *first);
         }
         for (due_stamp, script_entry) in script_entries {
@@ -125,6 +128,7 @@ impl Sender {
                 ScriptEntry::Scan(scanner_ix, ix) => self.send_scan(scanner_ix, ix),
             }
         }
+        // Afterwards, they stand still at its end until they are dropped.
         self.resend_end_state(usize::MAX, Stamp(i64::MAX));
     }
 
@@ -159,6 +163,7 @@ impl Sender {
                 .enumerate()
                 .filter(|(_, scan)| *scan.scanner == **name);
             script_entries.extend(revolutions.map(|(ix, RangeScan { stamp, points, .. })| {
+                // A scan can only be sent after its last point was measured.
                 let last_micros = points
                     .iter()
                     .map(|point| point.offset_micros)
@@ -170,6 +175,7 @@ impl Sender {
                 )
             }));
         }
+        // The sort is stable, so entries that are due at the same time keep their order.
         script_entries.sort_by_key(|(due_stamp, _)| *due_stamp);
         script_entries
     }
@@ -177,11 +183,11 @@ impl Sender {
     /// Repeatedly sends the joints and base at one end of the script, until shortly before a time.
     fn resend_end_state(&mut self, end: usize, until: Stamp) {
         let last = |n: usize| n.checked_sub(1).map(|last| last.min(end));
-        let (joints_ix, pose_ix) = (
-            last(self.script.joints.len()),
-            last(self.script.poses.len()),
-        );
+        let joints_ix = last(self.script.joints.len());
+        let pose_ix = last(self.script.poses.len());
         let mut now = clock::now();
+        // The last state at rest comes at least one period before the script, so that its stamp
+        // stays below that of the script's first entry.
         while now.plus_secs(RESEND_PERIOD.as_secs_f64()) < until {
             if let Some(ix) = joints_ix {
                 self.send_joints(ix, now, true);
@@ -206,6 +212,7 @@ impl Sender {
             if left.is_zero() {
                 return true;
             }
+            // In short pieces, so that dropping the senders does not wait for a distant entry.
             std::thread::sleep(left.min(STOP_CHECK_PERIOD));
         }
     }
@@ -261,6 +268,7 @@ impl Sender {
         } else {
             points.chunks(MAX_POINTS).collect()
         };
+        // The number of parts is in every datagram, so that a receiver notices lost ones.
         let n_parts = u32::try_from(chunks.len()).unwrap_or(u32::MAX);
         for (part, points) in (0..).zip(chunks) {
             let scan = ScanPart {

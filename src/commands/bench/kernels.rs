@@ -47,14 +47,15 @@ pub(crate) struct Args {
 struct Size([u32; 2]);
 
 fn parse_size(text: &str) -> Result<Size, String> {
-    let parse = |part: &str| {
-        part.parse::<u32>()
-            .ok()
-            .filter(|size| (1..=16_384).contains(size))
-    };
     text.split_once('x')
-        .and_then(|(width, height)| Some(Size([parse(width)?, parse(height)?])))
+        .and_then(|(width, height)| Some(Size([parse_side(width)?, parse_side(height)?])))
         .ok_or_else(|| "expected WIDTHxHEIGHT in pixels, each from 1 to 16384".to_owned())
+}
+
+fn parse_side(text: &str) -> Option<u32> {
+    text.parse::<u32>()
+        .ok()
+        .filter(|size| (1..=16_384).contains(size))
 }
 
 pub(super) fn run(args: &Args) -> anyhow::Result<()> {

@@ -116,12 +116,14 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Exit> {
         .map(|path| Rig::load(path, &[]))
         .transpose()?;
     let rig = open::recording(&args.recording, rig, &[])?.rig;
-    let (mut runs, mut data_losses) = (Vec::new(), Vec::new());
+    let mut runs = Vec::new();
+    let mut data_losses = Vec::new();
     for conditions in args.conditions() {
         let Some((run, losses)) = args.measure(&rig, conditions)? else {
             log::warn!("interrupted: the results do not contain the run with {conditions}");
             break;
         };
+        // All runs play the same recording, so they have the same losses.
         data_losses.extend(
             losses
                 .into_iter()
@@ -135,6 +137,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Exit> {
         }
         runs.push(run);
     }
+    // Charts without a run would only look like a result.
     if runs.is_empty() {
         anyhow::bail!("interrupted before the first run ended");
     }
@@ -188,6 +191,7 @@ fn describe(run: &LiveRun) -> String {
 
 impl Args {
     fn conditions(&self) -> Vec<Conditions> {
+        // Errors and disturbances are compared with one viewer each, so that the load is the same.
         let with_one = Conditions {
             n_viewers: 1,
             hand_eye_error: None,
@@ -206,6 +210,8 @@ impl Args {
                     millimeters,
                     seed,
                 };
+                // The effect of an error depends on its direction, so several directions are
+                // measured.
                 (1..=self.directions).map(move |seed| Conditions {
                     hand_eye_error: Some(error(seed)),
                     ..with_one
@@ -225,6 +231,8 @@ impl Args {
         rig: &Rig,
         conditions: Conditions,
     ) -> anyhow::Result<Option<(LiveRun, Vec<String>)>> {
+        // Named by the process, so that two benchmarks with the same output do not remove each
+        // other's folder.
         let folder = self.out.join(format!("run-{}", std::process::id()));
         std::fs::create_dir_all(&folder)
             .with_context(|| format!("cannot create {}", folder.display()))?;
@@ -248,6 +256,7 @@ impl Args {
         if let Some(disturbance) = conditions.disturbance {
             disturbance.apply_to_rig(&mut rig);
         }
+        // The run reads the disturbed rig from a file, as it would read a wrong calibration.
         rig.write_resolved(folder)
             .with_context(|| format!("cannot write into {}", folder.display()))?;
         let mut flags = vec![
@@ -256,10 +265,8 @@ impl Args {
             "--real-time".into(),
         ];
         flags.extend(self.repeat.then(|| "--repeat".into()));
-        let (rig_file, out) = (
-            folder.join(drivers::recording::RIG_FILE),
-            folder.join("out"),
-        );
+        let rig_file = folder.join(drivers::recording::RIG_FILE);
+        let out = folder.join("out");
         let flags = run_flags::parse(
             &rig_file,
             self.seconds,
@@ -268,6 +275,7 @@ impl Args {
             &self.run_flags,
         )?;
         let mut running = run::start(&flags, None, &mut CreatedFolders::default())?;
+        // A disturbance in the middle of the run shows how fast the model recovers.
         let change = conditions
             .disturbance
             .and_then(|disturbance| disturbance.keyframe_change(1, 0.5 * self.seconds));
@@ -290,6 +298,7 @@ impl Args {
         while running.run_time_slice()? {
             timeline.sample(&running.live, &running.gpu, &viewers);
         }
+        // Measured before the viewers disconnect, because their latencies are part of it.
         let measured = LiveRun::of(conditions, &running.live, &viewers, &timeline);
         drop(viewers);
         let DiscardedRun {
@@ -300,6 +309,7 @@ impl Args {
         } = running.discard()?;
         let input = InputCounts::of(&input_result);
         match (input_result.input_error, no_model_reason) {
+            // An interruption explains all other problems, so it comes first.
             _ if is_interrupted => Ok(None),
             (Some(error), _) => {
                 Err(anyhow::Error::new(error).context("the recording cannot be read"))

@@ -101,12 +101,15 @@ fn measure(args: &Args, flags: &run::Args) -> anyhow::Result<(MemoryRun, Option<
         ..MemoryRun::default()
     };
     let mut due = Instant::now();
-    let (mut last_printed, mut written) = (None, Instant::now());
+    let mut last_printed = None;
+    let mut written = Instant::now();
     while running.run_time_slice()? {
         let now = Instant::now();
         if now < due {
             continue;
         }
+        // From now on and not from the last due time, so that a long step is not followed by
+        // several samples at once.
         due = now + every;
         let sample = measured.add_sample(&running.live, &running.gpu, &viewers)?;
         if args.json {
@@ -117,6 +120,8 @@ fn measure(args: &Args, flags: &run::Args) -> anyhow::Result<(MemoryRun, Option<
             print::report(describe(&sample));
             last_printed = Some(now);
         }
+        // The results so far survive if the run is killed after hours, for example for lack of
+        // memory.
         if written.elapsed() >= WRITE_PERIOD {
             measured.findings()?.write(&args.out)?;
             written = Instant::now();
@@ -147,7 +152,8 @@ impl Args {
             ("--every-secs", self.every_secs, 0.01..=3600.0),
         ] {
             if !allowed.contains(&value) {
-                let (from, to) = (allowed.start(), allowed.end());
+                let from = allowed.start();
+                let to = allowed.end();
                 return Err(BadArgument(format!(
                     "{flag} {value}: must be a number from {from} to {to}"
                 )));

@@ -79,6 +79,8 @@ impl BenchObserver for Printer {
     }
 
     fn training(&self, limits: Limits) -> Box<dyn Observer> {
+        // The bar is for the single run; `on_run` reports its result in a line that fits the
+        // others.
         let output = if self.json {
             OutputMode::Nothing
         } else {
@@ -92,7 +94,8 @@ impl BenchObserver for Printer {
             print_json(report);
             return;
         }
-        let (run, end) = (report.run, &report.run.end);
+        let run = report.run;
+        let end = &run.end;
         let cached = if report.is_cached {
             ", done earlier"
         } else {

@@ -61,14 +61,14 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Exit> {
 
 impl Args {
     fn options(&self) -> StabilityOptions {
-        let is_selected = |disturbance: &Disturbance| {
+        let disturbances = Disturbance::ALL.into_iter().filter(|disturbance| {
             self.disturb
                 .iter()
                 .any(|selected| selected.includes(*disturbance))
-        };
+        });
         StabilityOptions {
             data: self.data.clone(),
-            disturbances: Disturbance::ALL.into_iter().filter(is_selected).collect(),
+            disturbances: disturbances.collect(),
             can_skip_clock_offset: !self.disturb.contains(&DisturbanceArg::ClockOffset),
             levels: self.levels.clone(),
             rate_hz: self.rate_hz,

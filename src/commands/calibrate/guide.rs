@@ -41,17 +41,17 @@ impl<'a> Guide<'a> {
         bar: ProgressBar,
         page: GuidancePage,
     ) -> Self {
-        let (views, base_from_flange, detected) = (Vec::new(), Vec::new(), Vec::new());
         let guide = Self {
             target,
             camera,
             purpose,
             bar,
             page,
-            views,
-            base_from_flange,
-            detected,
+            views: Vec::new(),
+            base_from_flange: Vec::new(),
+            detected: Vec::new(),
         };
+        // The first advice appears before any image, so that the user knows how to begin.
         guide.show(&guide.advice());
         guide
     }
@@ -66,17 +66,21 @@ impl<'a> Guide<'a> {
     }
 
     fn detect(&mut self, images: &[CalibrationImage]) {
+        // There is one detection per image, so their number is the index of the first new image.
         for image in &images[self.detected.len()..] {
             let detected = images::detect_in_image(image, self.target);
             let view = detected.board.as_ref().ok().map(|board| &board.view);
+            // Images without the target are shown, too: the user sees why it was not found.
             self.page.show_searched(image.size_px, &image.gray, view);
             let text = match &detected.board {
                 Ok(board) => {
+                    // A copy, because the detection itself is kept for the estimate.
                     self.views.push(board.view.clone());
                     self.base_from_flange
                         .extend(image.arm.as_ref().map(|arm| arm.base_from_flange));
                     self.advice()
                 }
+                // The reason replaces the advice, while the target can still be moved.
                 Err(reason) => format!("{}: {reason}", detected.name),
             };
             self.show(&text);
@@ -86,6 +90,7 @@ impl<'a> Guide<'a> {
 
     /// The target in each of all images.
     pub(super) fn finish(mut self, images: &[CalibrationImage]) -> Vec<DetectedImage> {
+        // Images that arrived after the last update.
         self.detect(images);
         self.page.finish();
         self.detected
@@ -108,9 +113,11 @@ impl<'a> Guide<'a> {
             }
             Purpose::HandEye => {
                 let is_on_flange = self.camera.parent == Parent::Flange;
-                let (setup, body) = match is_on_flange {
-                    true => (Setup::EyeInHand, "camera"),
-                    false => (Setup::EyeToHand, "flange"),
+                // The moving body, whose rotations count: it carries the camera or the target.
+                let (setup, body) = if is_on_flange {
+                    (Setup::EyeInHand, "camera")
+                } else {
+                    (Setup::EyeToHand, "flange")
                 };
                 let guidance = HandEyeGuidance::new(
                     &self.base_from_flange,
@@ -129,14 +136,16 @@ impl<'a> Guide<'a> {
                 )
             }
         };
-        match is_enough {
-            true => format!("{so_far}; {advice}: press Ctrl-C to calibrate"),
-            false => format!("{so_far}; next: {advice}"),
+        if is_enough {
+            format!("{so_far}; {advice}: press Ctrl-C to calibrate")
+        } else {
+            format!("{so_far}; next: {advice}")
         }
     }
 
     fn show(&self, text: &str) {
         self.page.guide(text);
+        // A hidden bar swallows messages, for example if stderr is a file.
         if self.bar.is_hidden() {
             log::info!("{text}");
         } else {

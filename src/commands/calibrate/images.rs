@@ -61,27 +61,18 @@ const EXTENSIONS: [&str; 3] = ["jpg", "jpeg", "png"];
 
 /// The image files in a folder, in order of their names.
 pub(super) fn files(folder: &Path) -> Result<Vec<ImageFile>, BadArgument> {
+    // A single image is a likely mistake. Without this check, the error would be about a folder.
     if folder.is_file() {
         return Err(BadArgument(format!(
             "{} is a file, expected a folder of images",
             folder.display()
         )));
     }
-    let unreadable = |error: std::io::Error| {
-        BadArgument(format!(
-            "cannot read the folder {}: {error}",
-            folder.display()
-        ))
-    };
+    let unreadable = |error: std::io::Error| unreadable_folder(folder, &error);
     let mut files = Vec::new();
     for entry in std::fs::read_dir(folder).map_err(unreadable)? {
         let path = entry.map_err(unreadable)?.path();
-        let is_known = |extension: &std::ffi::OsStr| {
-            EXTENSIONS
-                .iter()
-                .any(|known| extension.eq_ignore_ascii_case(known))
-        };
-        if path.extension().is_some_and(is_known) {
+        if is_image(&path) {
             let name = path
                 .file_name()
                 .unwrap_or(path.as_os_str())
@@ -90,6 +81,7 @@ pub(super) fn files(folder: &Path) -> Result<Vec<ImageFile>, BadArgument> {
             files.push(ImageFile { name, path });
         }
     }
+    // The order of a folder differs between file systems, and reports list images in this order.
     files.sort_by(|a, b| a.path.cmp(&b.path));
     if files.is_empty() {
         return Err(BadArgument(format!(
@@ -98,6 +90,22 @@ pub(super) fn files(folder: &Path) -> Result<Vec<ImageFile>, BadArgument> {
         )));
     }
     Ok(files)
+}
+
+fn unreadable_folder(folder: &Path, error: &std::io::Error) -> BadArgument {
+    BadArgument(format!(
+        "cannot read the folder {}: {error}",
+        folder.display()
+    ))
+}
+
+/// Whether a file has the extension of an image. Other files in the folder are ignored.
+fn is_image(path: &Path) -> bool {
+    path.extension().is_some_and(|extension| {
+        EXTENSIONS
+            .iter()
+            .any(|known| extension.eq_ignore_ascii_case(known))
+    })
 }
 
 /// Detects a target in image files, on all processors; the results are in the order of the files.
@@ -152,6 +160,7 @@ fn check_readable(images: &[DetectedImage]) -> Result<(), BadArgument> {
     let Some((first, reason)) = unreadable.first() else {
         return Ok(());
     };
+    // A few damaged files must not end a calibration of many images.
     if unreadable.len() == images.len() {
         return Err(BadArgument(format!(
             "none of {} images can be read; {first}: {reason}",
@@ -184,13 +193,15 @@ pub(super) fn other_size<'a>(
 ) -> Option<OtherSize> {
     /// Fewer images may show a part of the board.
     const MIN_IMAGES: usize = 3;
-    let (mut n_images, mut n_detected) = (0, 0);
+    let mut n_images = 0;
+    let mut n_detected = 0;
     let mut found_sizes: Vec<(Counts, usize)> = Vec::new();
     for image in images {
         n_images += 1;
         match &image.board {
             Ok(_) => n_detected += 1,
             Err(NoBoard::NotDetected(targets::NotDetected::OtherSize { found, .. })) => {
+                // Few different sizes occur, so a list is enough.
                 match found_sizes.iter_mut().find(|(size, _)| size == found) {
                     Some((_, n)) => *n += 1,
                     None => found_sizes.push((*found, 1)),
@@ -199,6 +210,7 @@ pub(super) fn other_size<'a>(
             Err(_) => (),
         }
     }
+    // The most frequent other size: a wrong count of one image may give any size.
     let (found, n) = found_sizes
         .into_iter()
         .max_by_key(|(_, n)| *n)
@@ -226,6 +238,7 @@ fn detect_in_file(path: &Path, name: &str, target: &TargetSpec) -> Result<Board,
     let unreadable = |error: image::ImageError| NoBoard::Unreadable(error.to_string());
     let reader = files::open(path)
         .map(BufReader::new)
+        // The contents decide on the format, because the extension may be wrong.
         .and_then(|file| ImageReader::new(file).with_guessed_format());
     let gray = reader
         .map_err(|error| unreadable(error.into()))?

@@ -126,9 +126,11 @@ struct Detected {
 
 /// Detects the target, calibrates, and prints the result.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
+    // Checked first, so that a wrong path does not cost a calibration.
     let report = args.report.open()?;
     let mut rig = args.rig.open(&args.input)?;
     let detected = args.detect(report.is_some(), rig.as_mut())?;
+    // Before the calibration, because its result could not be written.
     if let (Some(rig), Some(size_px)) = (&rig, detected.sizes_px.first()) {
         rig.expect_size(*size_px)?;
     }
@@ -152,6 +154,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         )?;
         rig.write()?;
     }
+    // The report comes last: the rig file is written even if the report could not be.
     written?;
     Ok(Exit::Done)
 }
@@ -187,12 +190,14 @@ impl Args {
             };
         let unused = images::unused(&images);
         let other_size = images::other_size(images.iter(), &self.target);
-        let (mut views, mut sizes_px) = (Vec::new(), Vec::new());
+        let mut views = Vec::new();
+        let mut sizes_px = Vec::new();
         for board in images.into_iter().filter_map(|image| image.board.ok()) {
             views.push(board.view);
             sizes_px.push(board.size_px);
         }
         let mut warnings = warnings;
+        // If the other size prevails, `calibrate` refuses with this text instead.
         if let Some(size) = other_size.as_ref().filter(|size| !size.prevails) {
             log::warn!("{}", size.text);
             warnings.push(size.text.clone());
@@ -220,6 +225,8 @@ impl Args {
         if let Some(reason) = no_images {
             return Err(InsufficientData(reason.clone()).into());
         }
+        // A board of another size would be calibrated with wrong corners, so this is an error if
+        // most images show it.
         if let Some(size) = other_size.as_ref().filter(|size| size.prevails) {
             return Err(
                 InsufficientData(format!("{}: {}", self.input.display(), size.text)).into(),
@@ -235,7 +242,9 @@ impl Args {
             let reason = read.first().map_or(String::new(), |first| {
                 format!("; {}: {}", first.name, first.reason)
             });
-            let (input, target, n) = (self.input.display(), &self.target, read.len());
+            let input = self.input.display();
+            let target = &self.target;
+            let n = read.len();
             let text = format!("{input}: {target} was not detected in any of {n} images{reason}");
             return Err(InsufficientData(text).into());
         }
@@ -268,6 +277,7 @@ impl Args {
                 LensFile::of(&calibration.intrinsics).to_toml()
             )
         });
+        // Without images, the charts of the report still need a size.
         const NO_IMAGE_PX: [u32; 2] = [640, 480];
         let report = IntrinsicsReport {
             heading: &heading,
@@ -352,6 +362,8 @@ fn printed<'a>(calibration: &'a IntrinsicsCalibration, unused: &[Unused]) -> Pri
             is_unreadable: false,
         });
     let rejected = unused.chain(rejected).collect();
+    // The first parameters are the focal lengths and the principal point, which have fields of
+    // their own.
     const N_PINHOLE_PARAMS: usize = 4;
     let names = calibration.params.iter().map(|param| param.name);
     Printed {
@@ -427,6 +439,7 @@ fn describe(printed: &Printed<'_>) -> anyhow::Result<()> {
         lens.model_name(),
         images.len()
     ))?;
+    // Parameters that were not estimated have no standard deviation.
     let with_sigma = |name: &str, value: f64| match sigma.get(name) {
         Some(sigma) => format!("{value:.3} +- {sigma:.3}"),
         None => format!("{value:.3}"),

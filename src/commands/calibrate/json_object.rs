@@ -28,6 +28,7 @@ impl<'de> Visitor<'de> for UniqueVisitor {
     type Value = Value;
 
     fn expecting(&self, formatter: &mut Formatter<'_>) -> std::fmt::Result {
+        // Never shown, because values of all kinds are accepted.
         formatter.write_str("a value")
     }
 
@@ -66,6 +67,7 @@ impl<'de> Visitor<'de> for UniqueVisitor {
     fn visit_map<A: MapAccess<'de>>(self, mut object: A) -> Result<Value, A::Error> {
         let mut map = Map::new();
         while let Some((key, Unique(value))) = object.next_entry::<String, Unique>()? {
+            // `serde_json` would silently keep the last value.
             if map.contains_key(&key) {
                 return Err(A::Error::custom(format_args!(
                     "the key {key:?} occurs twice; keep one of them"
@@ -105,6 +107,7 @@ impl<'a> JsonObject<'a> {
                 kind_of(value)
             )));
         };
+        // A misspelled optional key would otherwise be ignored.
         if let Some(unknown) = map.keys().find(|key| !known.contains(&key.as_str())) {
             let hint = match capture::nearest_name(unknown, known.iter().copied()) {
                 Some(key) => format!("did you mean {key:?}?"),
@@ -140,12 +143,13 @@ impl<'a> JsonObject<'a> {
     }
 
     pub(super) fn text(&self, key: &str) -> Result<Option<&'a str>, BadArgument> {
-        let text = |value: &'a Value| {
-            value
-                .as_str()
-                .ok_or_else(|| self.invalid(key, format!("{}, expected a string", kind_of(value))))
-        };
-        self.get(key).map(text).transpose()
+        self.get(key)
+            .map(|value| {
+                value.as_str().ok_or_else(|| {
+                    self.invalid(key, format!("{}, expected a string", kind_of(value)))
+                })
+            })
+            .transpose()
     }
 
     pub(super) fn numbers(&self, key: &str) -> Result<Option<Vec<f64>>, BadArgument> {
@@ -168,6 +172,7 @@ impl<'a> JsonObject<'a> {
         let Some(numbers) = self.numbers(key)? else {
             return Ok(None);
         };
+        // Kept for the message, because the conversion consumes the list.
         let n = numbers.len();
         numbers
             .try_into()

@@ -55,19 +55,8 @@ impl LensFile {
     ];
 
     pub(super) fn read(object: &JsonObject<'_>) -> Result<Self, BadArgument> {
-        let side = |value: f64| {
-            let is_side = value.fract() == 0.0 && (1.0..=f64::from(u32::MAX)).contains(&value);
-            #[expect(
-                clippy::cast_possible_truncation,
-                clippy::cast_sign_loss,
-                reason = "a whole number in the range"
-            )]
-            is_side
-                .then_some(value as u32)
-                .ok_or_else(|| object.invalid("size_px", "must be whole numbers above 0"))
-        };
         let size_px = match object.array::<2>("size_px")? {
-            Some([width, height]) => Some([side(width)?, side(height)?]),
+            Some([width, height]) => Some([side(object, width)?, side(object, height)?]),
             None => None,
         };
         let model = match (object.text("model")?, object.text("lens")?) {
@@ -118,14 +107,16 @@ impl LensFile {
         }
     }
 
-    /// Covariance of [`Intrinsics::params`]. With standard deviations only, the parameters count as
-    /// independent, and those without one as exact.
+    /// Covariance of [`Intrinsics::params`]. If only standard deviations are given, the parameters
+    /// count as independent, and parameters without a standard deviation count as exact.
     pub(super) fn covariance(
         &self,
         intrinsics: &Intrinsics,
     ) -> Result<Option<DMatrix<f64>>, BadArgument> {
         let n = intrinsics.params().len();
         let name = |ix: usize| param_names(self.model.as_deref())[ix];
+        // A standard deviation of a coefficient that the lens lacks is probably that of another
+        // lens.
         if let Some((ix, _)) = self.sigmas.iter().find(|(ix, _)| *ix >= n) {
             let params = param_names(self.model.as_deref())[..n].join(", ");
             return Err(BadArgument(format!(
@@ -140,11 +131,13 @@ impl LensFile {
             for (ix, sigma) in &self.sigmas {
                 independent[(*ix, *ix)] = sigma * sigma;
             }
+            // Without standard deviations, the uncertainty is unknown, not zero.
             return Ok((!self.sigmas.is_empty()).then_some(independent));
         };
         /// Relative difference of two standard deviations that are meant to be equal; they may be
         /// rounded.
         const MAX_DIFFERENCE: f64 = 0.01;
+        // Files often contain both, and one of them may have been edited.
         for (ix, sigma) in &self.sigmas {
             let of_covariance = given[(*ix, *ix)].max(0.0).sqrt();
             if (sigma - of_covariance).abs() > MAX_DIFFERENCE * sigma.max(of_covariance) {
@@ -160,6 +153,7 @@ impl LensFile {
     /// The intrinsics for images of the given size.
     pub(super) fn intrinsics(&self, size_px: [u32; 2]) -> Result<Intrinsics, BadArgument> {
         let [width, height] = size_px;
+        // Intrinsics are not scaled to another resolution, because cameras often crop instead.
         if let Some(own) = self.size_px.filter(|own| *own != size_px) {
             return Err(BadArgument(format!(
                 "the intrinsics are for images of {}x{} pixels, but the images have {width}x{height}; calibrate this resolution",
@@ -193,12 +187,7 @@ impl LensFile {
         let k = &self.distortion;
         let default = if k.is_empty() { PINHOLE } else { BROWN_CONRADY };
         let model = self.model.as_deref().unwrap_or(default);
-        let too_many = |max: usize| {
-            BadArgument(format!(
-                "intrinsics: {} distortion coefficients; {model} has at most {max}",
-                k.len()
-            ))
-        };
+        let too_many = |max| too_many(k.len(), model, max);
         match model {
             PINHOLE if k.is_empty() => Ok(Lens::Pinhole),
             PINHOLE => Err(too_many(0)),
@@ -219,16 +208,10 @@ impl LensFile {
 
     /// The value of `intrinsics` in a rig file.
     pub(super) fn to_toml(&self) -> String {
-        let list = |values: &[f64]| {
-            values
-                .iter()
-                .map(f64::to_string)
-                .collect::<Vec<_>>()
-                .join(", ")
-        };
-        let distortion = match self.distortion.is_empty() {
-            true => String::new(),
-            false => format!(", distortion = [{}]", list(&self.distortion)),
+        let distortion = if self.distortion.is_empty() {
+            String::new()
+        } else {
+            format!(", distortion = [{}]", list(&self.distortion))
         };
         format!(
             "{{ focal_px = [{}], principal_px = [{}], lens = \"{}\"{distortion} }}",
@@ -237,6 +220,34 @@ impl LensFile {
             self.model_name()
         )
     }
+}
+
+/// A width or height of an image.
+#[expect(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "a whole number in the range"
+)]
+fn side(object: &JsonObject<'_>, value: f64) -> Result<u32, BadArgument> {
+    let is_side = value.fract() == 0.0 && (1.0..=f64::from(u32::MAX)).contains(&value);
+    is_side
+        .then_some(value as u32)
+        .ok_or_else(|| object.invalid("size_px", "must be whole numbers above 0"))
+}
+
+/// The error for `n` coefficients of a model that has at most `max`.
+fn too_many(n: usize, model: &str, max: usize) -> BadArgument {
+    BadArgument(format!(
+        "intrinsics: {n} distortion coefficients; {model} has at most {max}"
+    ))
+}
+
+fn list(values: &[f64]) -> String {
+    values
+        .iter()
+        .map(f64::to_string)
+        .collect::<Vec<_>>()
+        .join(", ")
 }
 
 /// Names of focal lengths and principal point, and of the coefficients of both kinds of lenses in

@@ -100,6 +100,7 @@ impl RigFlags {
         let Some(file) = &self.write_rig else {
             return Ok(None);
         };
+        // All commands recognize rig files by this extension.
         if !is_rig_file(file) {
             return Err(BadArgument(format!(
                 "--write-rig {}: must have the extension .toml",
@@ -122,6 +123,7 @@ impl RigFlags {
             (InputKind::Rig | InputKind::Files, _) => Rig::load(input, &[])?,
         };
         let camera = self.camera_of(&rig)?.name.to_string();
+        // Before images are taken, because the result could not be written.
         corrected_rig::check_target_file(&rig, file)?;
         Ok(Some(RigOutput {
             rig,
@@ -164,6 +166,7 @@ impl RigOutput {
     /// Adds offsets to those in the rig file.
     pub(super) fn add_joint_offsets(&mut self, offsets: &[JointOffset]) {
         let arm = &mut self.rig.arm;
+        // The rig file may have no offsets, or fewer than joints.
         arm.joint_offsets.resize(arm.joints.len(), 0.0);
         for (name, total) in arm.joints.iter().zip(&mut arm.joint_offsets) {
             let found = offsets
@@ -204,6 +207,7 @@ impl RigOutput {
 
     /// Rejects a setup in which the camera is attached to another frame than in the rig file.
     pub(super) fn expect_setup(&self, setup: Setup) -> anyhow::Result<()> {
+        // The result is dropped: only the error counts.
         corrected_rig::with_extrinsics(
             &self.rig,
             &self.camera,
@@ -218,6 +222,8 @@ impl RigOutput {
         const MAX_PX: f64 = 0.01;
         let given = &corrected_rig::camera(&self.rig, &self.camera)?.intrinsics;
         let pairs = given.params().into_iter().zip(used.params());
+        // Lens models differ in their number of parameters, and `zip` would compare only the first
+        // ones.
         let differ = given.params().len() != used.params().len()
             || pairs.into_iter().any(|(a, b)| (a - b).abs() > MAX_PX);
         if differ {
@@ -303,9 +309,11 @@ pub(super) fn heading<T>(
 ) -> Option<Heading> {
     let refused = match result {
         Ok(_) => None,
+        // A refusal is a result, too: the report shows what is missing.
         Err(error) if exit::of(error) == Exit::InsufficientData => {
             let text = format!("{error:#}");
             Some(
+                // The heading already says that the calibration was refused.
                 text.strip_prefix("calibration refused: ")
                     .map_or(text.clone(), str::to_owned),
             )

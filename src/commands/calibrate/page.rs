@@ -40,7 +40,9 @@ impl GuidancePage {
     /// Serves the page for a camera.
     pub(super) fn start(args: &PageArgs, camera: &Camera) -> anyhow::Result<Self> {
         let hub = Hub::new();
+        // The page only helps, so a used port must not prevent the calibration.
         let page = args.serve_or_free_port(&hub)?;
+        // On stderr, because stdout has the result.
         print::notice("the page shows camera images and what to do next:");
         page.lines().iter().for_each(print::notice);
         let began = Instant::now();
@@ -96,6 +98,7 @@ impl GuidancePage {
     /// Shows an image of the camera with the corners of earlier images, unless no client shows
     /// images.
     pub(super) fn show_live(&mut self, image: &Image) {
+        // Checked before decoding, because most images are not shown.
         let now = Instant::now();
         if image.camera != self.camera
             || image.is_depth()
@@ -123,14 +126,18 @@ impl GuidancePage {
             .flat_map(|view| &view.points)
             .map(|point| point.pixel)
             .collect();
+        // The target is searched in gray images, so that is what the user sees of them.
         let rgb = gray.iter().flat_map(|value| [*value; 3]).collect();
         // The stamp only has to differ from that of the previous image.
         let stamp = Stamp::from_secs(self.began.elapsed().as_secs_f64());
         self.publish(stamp, size_px, rgb, &newest);
         if view.is_some() {
             self.n_views += 1;
+            // Otherwise, the next live image would replace the new corners before anyone has seen
+            // them.
             self.next_live = Instant::now() + DETECTED_FOR;
         }
+        // Only after the image was published, in which these corners are the newest.
         self.corners_px.extend(newest);
     }
 
@@ -138,6 +145,7 @@ impl GuidancePage {
         // Visible if the page shows the image in the width of a phone.
         const WIDTH_PER_DOT: u32 = 320;
         let radius = size_px[0].div_ceil(2 * WIDTH_PER_DOT);
+        // The newest corners last, so that dots of earlier ones do not hide them.
         for (corners_px, color, radius) in [
             (&self.corners_px[..], EARLIER_SRGB, radius),
             (newest_px, NEWEST_SRGB, 3 * radius),
@@ -152,6 +160,7 @@ impl GuidancePage {
             captured_at: Instant::now(),
             size_px,
             pixels: LivePixels::Rgb(rgb.into()),
+            // The pose is what the calibration estimates.
             world_from_camera: None,
             focal_px: self.focal_px,
             principal_px: self.principal_px,
@@ -168,6 +177,7 @@ fn draw_dot(rgb: &mut [u8], size_px: [u32; 2], [x, y]: [f64; 2], radius: u32, co
     )]
     let (x, y) = (x.floor() as i64, y.floor() as i64);
     let radius = i64::from(radius);
+    // A dot at the border is cut, not moved.
     for row in (y - radius).max(0)..=(y + radius).min(height - 1) {
         for column in (x - radius).max(0)..=(x + radius).min(width - 1) {
             let first =

@@ -15,7 +15,6 @@ use calibration::hand_eye::{
 use capture::config::{ArmDriver, Camera, Override, Parent, Rig};
 use capture::open::{self, Devices, Opened};
 use capture::{ArmDuringImage, CalibrationImage, CalibrationImages, calibration_images};
-use drivers::Sample;
 use kinematics::{Chain, Intrinsics, Stamp, Transform};
 use nalgebra::DMatrix;
 use session::calibration_report::{Photo, Photos, Unused};
@@ -24,9 +23,12 @@ use std::ops::ControlFlow;
 use std::path::Path;
 use targets::TargetSpec;
 
-/// Time for which devices are read if no flag limits it, seconds.
+/// Time for which devices are read if no flag limits it, seconds: enough for about twenty poses of an
+/// arm or a target moved by hand.
 const DEFAULT_SECS: f64 = 30.0;
-/// Maximum predicted image motion over readout, exposure and stamp uncertainty, pixels.
+/// Maximum predicted image motion over readout, exposure and stamp uncertainty, pixels. Corners are
+/// corrected for the motion during the readout, but only as well as the velocity is known. A smaller
+/// value rejects images of slow motions; a larger one lets blurred corners through.
 const MAX_SHIFT_PX: f64 = 3.0;
 
 /// Images of one camera in which a target was searched.
@@ -70,6 +72,7 @@ impl RigFlags {
     ) -> anyhow::Result<Option<Scan>> {
         self.check(input)?;
         let kind = InputKind::of(input);
+        // Image files and samples files are read by the caller.
         if kind == InputKind::Files {
             return Ok(None);
         }
@@ -93,6 +96,7 @@ impl RigFlags {
                 open::recording(input, rig, &[])?
             }
         };
+        // The rig as opened: cameras may have reported calibration that the file lacks.
         let rig = opened.rig.clone();
         if options.purpose == Purpose::HandEye && rig.arm.driver == ArmDriver::None {
             return Err(BadArgument(format!(
@@ -101,6 +105,7 @@ impl RigFlags {
             ))
             .into());
         }
+        // The calibration that a simulated camera reports is not that of the real one.
         if let Some(output) = output.filter(|_| kind == InputKind::Rig && !self.sim) {
             output.set_rig(&rig);
         }
@@ -121,6 +126,7 @@ impl RigFlags {
             .images
             .is_empty()
             .then(|| no_images(input, &rig, &camera, &found));
+        // From devices, the target was detected while they were read.
         let detected = detected.unwrap_or_else(|| {
             images::detect_each(&found.images, options.is_hidden, |image| {
                 images::detect_in_image(image, target)
@@ -135,6 +141,7 @@ impl RigFlags {
     }
 
     fn open_devices(&self, rig_file: &Path) -> anyhow::Result<Opened> {
+        // In lockstep, the result does not depend on the speed of this computer.
         let overrides = if self.sim {
             vec![Override::new("sim.lockstep", true)]
         } else {
@@ -162,6 +169,7 @@ impl RigFlags {
         let stop = signals::stop_on_signals_logging(
             "calibrating with the images so far; Ctrl-C again exits at once",
         )?;
+        // Only recordings have stamps that are unrelated to this computer's clock.
         let is_live = !matches!(opened.stamp_clock, capture::StampClock::Unrelated);
         let template = if is_live {
             "{spinner} {msg}"
@@ -174,27 +182,30 @@ impl RigFlags {
             .transpose()?;
         let mut guide =
             page.map(|page| Guide::new(target, camera, options.purpose, bar.clone(), page));
+        // A recording ends by itself.
         let limit_secs = if is_live {
             self.seconds.unwrap_or(DEFAULT_SECS)
         } else {
             f64::INFINITY
         };
         let mut first: Option<Stamp> = None;
-        let on_sample = |sample: &Sample, images: &[CalibrationImage]| {
+        let found = calibration_images(opened, &camera.name, MAX_SHIFT_PX, |sample, images| {
             bar.set_position(images.len() as u64);
             if let Some(guide) = &mut guide {
                 guide.update(sample, images);
             }
+            // Counted by stamps, because a simulation does not run in real time.
             let since_first = sample
                 .stamp()
                 .secs_since(*first.get_or_insert(sample.stamp()));
-            match since_first > limit_secs || stop.requested() {
-                true => ControlFlow::Break(()),
-                false => ControlFlow::Continue(()),
+            if since_first > limit_secs || stop.requested() {
+                ControlFlow::Break(())
+            } else {
+                ControlFlow::Continue(())
             }
-        };
-        let found = calibration_images(opened, &camera.name, MAX_SHIFT_PX, on_sample);
+        });
         bar.finish_and_clear();
+        // The bar is removed before an error is shown.
         let found = found?;
         let detected = guide.map(|guide| guide.finish(&found.images));
         Ok((found, detected))
@@ -202,7 +213,8 @@ impl RigFlags {
 }
 
 fn no_images(input: &Path, rig: &Rig, camera: &Camera, found: &CalibrationImages) -> String {
-    let (input, name) = (input.display(), &camera.name);
+    let input = input.display();
+    let name = &camera.name;
     match (found.n_read, found.n_fast) {
         (0, _) => {
             let names: Vec<&str> = rig.cameras.iter().map(|camera| &*camera.name).collect();
@@ -229,7 +241,8 @@ impl Scan {
         detected: Vec<DetectedImage>,
         options: ScanOptions,
     ) -> anyhow::Result<Self> {
-        let (mut photos, mut images) = (Photos::new(), Vec::new());
+        let mut photos = Photos::new();
+        let mut images = Vec::new();
         for (image, detected) in found.images.into_iter().zip(detected) {
             let CalibrationImage {
                 size_px, gray, arm, ..
@@ -255,6 +268,8 @@ impl Scan {
         images: Vec<(DetectedImage, Option<ArmDuringImage>)>,
         photos: Photos,
     ) -> anyhow::Result<Self> {
+        // Hand-eye calibration knows only flange and base. A camera in the world does not move
+        // relative to the base, because the base is fixed.
         let base_from_world = rig.base.world_from_base.inverse();
         let (setup, parent_from_camera) = match camera.parent {
             Parent::Flange => (Setup::EyeInHand, camera.parent_from_camera),
@@ -264,12 +279,12 @@ impl Scan {
                 base_from_world * camera.parent_from_camera,
             ),
         };
+        // Without an arm, as for a lens, no robot description is needed.
         let chain = images
             .iter()
             .any(|(_, arm)| arm.is_some())
             .then(|| open::chain_of(&rig))
             .transpose()?;
-        let (no_images, warnings) = (None, Vec::new());
         Ok(Self {
             rig,
             camera,
@@ -278,8 +293,8 @@ impl Scan {
             chain,
             images,
             photos,
-            no_images,
-            warnings,
+            no_images: None,
+            warnings: Vec::new(),
         })
     }
 
@@ -344,14 +359,17 @@ impl Scan {
 
     /// The images, with corners corrected for a rolling shutter.
     pub(super) fn detected(&mut self) -> Vec<DetectedImage> {
+        // Moved out, because the correction needs the rest of `self`.
         let images = std::mem::take(&mut self.images);
-        let corrected = |(mut image, arm): (DetectedImage, Option<ArmDuringImage>)| {
-            if let (Ok(board), Some(arm)) = (&mut image.board, arm) {
-                board.view = self.at_mid_exposure(&board.view, &arm, &self.parent_from_camera);
-            }
-            image
-        };
-        images.into_iter().map(corrected).collect()
+        images
+            .into_iter()
+            .map(|(mut image, arm)| {
+                if let (Ok(board), Some(arm)) = (&mut image.board, arm) {
+                    board.view = self.at_mid_exposure(&board.view, &arm, &self.parent_from_camera);
+                }
+                image
+            })
+            .collect()
     }
 
     /// Samples for hand-eye calibration, and the images without target with the reasons.
@@ -360,11 +378,13 @@ impl Scan {
         &self,
         parent_from_camera: Option<&Transform>,
     ) -> (Vec<HandEyeSample>, Vec<Unused>) {
-        let (mut samples, mut unused) = (Vec::new(), Vec::new());
+        let mut samples = Vec::new();
+        let mut unused = Vec::new();
         for (image, arm) in &self.images {
             let name = image.name.clone();
             match (&image.board, arm) {
                 (Ok(board), Some(arm)) => {
+                    // The correction for a rolling shutter depends on it.
                     let camera_pose = parent_from_camera.unwrap_or(&self.parent_from_camera);
                     let view = self.at_mid_exposure(&board.view, arm, camera_pose);
                     samples.push(HandEyeSample {

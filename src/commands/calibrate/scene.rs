@@ -8,7 +8,6 @@ use crate::{print, signals};
 use calibration::{CameraCorrection, Estimate, PoseSigmas, Trial, rigid_transform};
 use capture::config::{Override, Rig};
 use capture::open::{self, Devices};
-use drivers::Sample;
 use keyframe::listed;
 use kinematics::Stamp;
 use serde::Serialize;
@@ -109,13 +108,16 @@ struct PrintedRelative {
 /// Calibrates and prints the estimates. Exit code 4 if the data do not determine the extrinsics of
 /// any camera.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
+    // `auto` chooses the parameters itself, so a list contradicts it.
     if args.params.len() > 1 && args.params.contains(&Refine::Auto) {
         return Err(
             BadArgument("--params: auto cannot be combined with other values".into()).into(),
         );
     }
+    // Checked first, so that a wrong path does not cost a calibration.
     let report = args.report.open()?;
     let given = args.rig_as_given()?;
+    // Checked before data is read, which may take long.
     if let Some(file) = &args.write_rig {
         let Some(rig) = &given else {
             let input = args.input.display();
@@ -148,12 +150,14 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     }
     if is_refused {
         outputs::log_failure(written);
+        // The reason is part of the JSON output, so it is not printed again.
         return if args.json {
             Ok(Exit::InsufficientData)
         } else {
             Err(InsufficientData(printed.refused.unwrap_or_default()).into())
         };
     }
+    // A file without a correction would only look like a result.
     if let (Some(file), Some(before), Some(after)) = (&args.write_rig, &rig, &calibration.rig) {
         if after.has_same_calibration(before) {
             log::info!(
@@ -165,6 +169,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
             log::info!("rig file written to {}", file.display());
         }
     }
+    // The report comes last: the rig file is written even if the report could not be.
     written?;
     Ok(exit)
 }
@@ -172,6 +177,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
 /// Why no camera could be calibrated; `None` if one could.
 fn refusal(data: &Data, calibration: &SceneCalibration) -> Option<String> {
     let alignment = &calibration.alignment;
+    // Without validation images, no correction can be accepted, whatever the data show.
     if alignment.estimates.is_empty() && !alignment.has_enough_validation_images() {
         return Some(
             "too few validation images to accept a correction; record more images".to_owned(),
@@ -227,6 +233,7 @@ impl Args {
             });
             heading
                 .warnings
+                // If all cameras are refused, the heading has the reasons already.
                 .extend(kept.filter(|_| heading.refused.is_none()));
         }
         let mut n_images: BTreeMap<String, usize> = BTreeMap::new();
@@ -251,6 +258,7 @@ impl Args {
         if is_rig_file(&self.input) {
             return Ok(Some(Rig::load(&self.input, &[])?));
         }
+        // Dataset folders have no rig file.
         let is_recording = session::run_folder::is_recording(&self.input);
         Ok(is_recording
             .then(|| Data::rig_as_given(&self.input, &self.options()))
@@ -274,6 +282,7 @@ impl Args {
                 &|read| bar.show(read),
             )?);
         }
+        // Both flags are about data that were recorded before.
         if self.keyframes.is_some() || self.rig.is_some() {
             return Err(
                 BadArgument("--keyframes and --rig need a recording as input".into()).into(),
@@ -282,6 +291,7 @@ impl Args {
         let stop = signals::stop_on_signals_logging(
             "calibrating with the images so far; Ctrl-C again exits at once",
         )?;
+        // In lockstep, the result does not depend on the speed of this computer.
         let overrides = if self.sim {
             vec![Override::new("sim.lockstep", true)]
         } else {
@@ -298,13 +308,18 @@ impl Args {
         )?;
         let seconds = self.seconds.unwrap_or(DEFAULT_SECS);
         let mut first: Option<Stamp> = None;
-        let is_end = |sample: &Sample| {
-            let since_first = sample
-                .stamp()
-                .secs_since(*first.get_or_insert(sample.stamp()));
-            since_first > seconds || stop.requested()
-        };
-        Ok(Data::from_devices(opened, is_end, &|read| bar.show(read))?)
+        let data = Data::from_devices(
+            opened,
+            |sample| {
+                // Counted by stamps, because a simulation does not run in real time.
+                let since_first = sample
+                    .stamp()
+                    .secs_since(*first.get_or_insert(sample.stamp()));
+                since_first > seconds || stop.requested()
+            },
+            &|read| bar.show(read),
+        )?;
+        Ok(data)
     }
 }
 
@@ -343,6 +358,7 @@ fn printed<'a>(
     Printed {
         n_images: data.keyframes.len(),
         cameras: cameras.collect(),
+        // With a rig file, the poses of its cameras say the same.
         given_from_corrected: match calibration.rig {
             Some(_) => BTreeMap::new(),
             None => alignment
@@ -391,6 +407,7 @@ fn given_from_corrected<'a>(
         correction.rotation_rad.into(),
         correction.translation_m.into(),
     );
+    // The estimate leads from given to corrected frames. Poses of cameras need the opposite.
     (camera, matrix_of(&corrected_from_given.inverse()))
 }
 
@@ -404,6 +421,7 @@ fn describe(
     for line in alignment.lines() {
         print::line(line)?;
     }
+    // With `auto`, only confirmed corrections are applied.
     if !is_auto && alignment.trials.iter().any(|trial| !trial.kept) {
         log::warn!(
             "the corrections are applied as requested, but validation images do not confirm all of them"
@@ -421,6 +439,7 @@ fn describe(
         print_matrix(matrix)?;
     }
     for (name, camera) in &printed.cameras {
+        // If all cameras are refused, the reason is the error of the command.
         if let (Some(reason), None) = (&camera.refused, &printed.refused) {
             log::warn!("camera {name:?} keeps its extrinsics: {reason}");
         }

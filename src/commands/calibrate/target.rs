@@ -41,6 +41,7 @@ pub(crate) struct Args {
 
 /// Writes the PDF file.
 pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
+    // All errors below are about the arguments, so nothing is written before they are checked.
     let bad = |error: targets::PrintError| BadArgument(error.to_string());
     let paper: Paper = args.paper.parse().map_err(bad)?;
     let pdf = args.target.pdf(paper).map_err(bad)?;
@@ -53,9 +54,11 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
             BadArgument(format!("--out {}: must end with .pdf", args.out.display())).into(),
         );
     }
+    // An old file may describe a printed target that is still in use, so it is never replaced.
     if args.out.exists() {
         return Err(BadArgument(format!("{} exists", args.out.display())).into());
     }
+    // Only a warning: the target still serves for the lens.
     if let Some(warning) = symmetry_warning(&args.target) {
         log::warn!("{warning}");
     }

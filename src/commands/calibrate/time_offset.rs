@@ -69,8 +69,10 @@ struct Printed {
 /// Estimates and prints the offset. Exit code 4 if the motion does not determine it, or a requested
 /// transform.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
+    // Checked first, so that a wrong path does not cost a calibration.
     let report = args.report.open()?;
-    let (a, b) = (read(&args.a)?, read(&args.b)?);
+    let a = read(&args.a)?;
+    let b = read(&args.b)?;
     let options = TimeOffsetOptions {
         hand_eye: args.hand_eye,
         max_offset_secs: args.max_offset,
@@ -80,6 +82,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let written = match report {
         Some(path) => args.write_report(
             path,
+            // A report without the profile is better than none.
             motion_profile(&a, &b, &options).ok().as_ref(),
             &result,
         ),
@@ -107,6 +110,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     written?;
     match refused {
         None => Ok(Exit::Done),
+        // The reason is part of the JSON output already.
         Some(_) if args.json => Ok(Exit::InsufficientData),
         Some(reason) => Err(InsufficientData(reason).into()),
     }
@@ -174,9 +178,11 @@ fn read(path: &Path) -> anyhow::Result<Vec<PoseSample>> {
     let mut samples = Vec::new();
     for (ix, line) in text.lines().enumerate() {
         let parsed = line
+            // Any usual separator, because such files come from many programs.
             .split([',', ' ', ';', '\t'])
             .filter(|field| !field.is_empty())
             .map(str::parse::<f64>);
+        // Any line that is not all numbers counts as a comment or header.
         let Ok(numbers) = parsed.collect::<Result<Vec<f64>, _>>() else {
             continue;
         };
@@ -197,6 +203,7 @@ fn read(path: &Path) -> anyhow::Result<Vec<PoseSample>> {
             return Err(BadArgument(format!("{}: t, x, y and z must be finite", place())).into());
         }
         let norm = quaternion.norm();
+        // Normalized afterwards. A larger deviation shows another order of the columns.
         let is_unit = (norm - 1.0).abs() < MAX_NORM_ERROR; // False for NaN.
         if !is_unit {
             return Err(BadArgument(format!(

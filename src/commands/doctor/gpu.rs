@@ -9,6 +9,7 @@ pub(super) fn gpu() -> Vec<Finding> {
     let gpu = match open_gpu() {
         Ok(gpu) => gpu,
         Err(error) => {
+            // The remedy depends on whether there is no adapter at all or a wrong choice.
             let adapters = Gpu::adapters();
             let remedy = if adapters.is_empty() {
                 "sudo apt-get install -y libvulkan1 mesa-vulkan-drivers   (a software adapter; a GPU needs its own driver)"
@@ -22,6 +23,7 @@ pub(super) fn gpu() -> Vec<Finding> {
             return vec![Finding::fail("gpu", error.to_string(), remedy)];
         }
     };
+    // Everything works on a software adapter, so it is no failure.
     let adapter = if gpu.is_software() {
         let remedy = "training is slow on a software adapter: install the Vulkan driver of the GPU, if there is one";
         Finding::warn("gpu", gpu.describe(), remedy)
@@ -42,6 +44,7 @@ pub(super) fn gpu() -> Vec<Finding> {
         format!("largest buffer {mib} MiB, subgroup lanes {lanes}, timestamps {timestamps}");
     let mut findings = vec![adapter, Finding::ok("gpu limits", message)];
     let adapters = Gpu::adapters();
+    // With one adapter there is nothing to select.
     if adapters.len() > 1 {
         findings.push(Finding::ok(
             "gpus",

@@ -25,6 +25,7 @@ struct CameraFile {
 impl CameraFiles {
     /// Creates an entry for each RealSense camera of the rig.
     pub(super) fn new(rig: &Rig, folder: &Path) -> anyhow::Result<Self> {
+        // Absolute, because the rig file that names these files may be read from another folder.
         let folder =
             std::path::absolute(folder).context("cannot resolve the folder of the camera files")?;
         let camera_file = |camera: &Camera| CameraFile {
@@ -48,6 +49,7 @@ impl CameraFiles {
     pub(super) fn take(&mut self, image: Image) -> anyhow::Result<()> {
         match self
             .camera_files
+            // Only RealSense cameras have an entry.
             .iter_mut()
             .find(|camera_file| camera_file.camera.name == image.camera)
         {
@@ -61,14 +63,15 @@ impl CameraFiles {
     pub(super) fn finish(self, rig: &mut Rig) -> anyhow::Result<Vec<String>> {
         let mut descriptions = Vec::new();
         for camera_file in self.camera_files {
-            let (name, path) = (
-                Arc::clone(&camera_file.camera.name),
-                camera_file.path.clone(),
-            );
+            // Copies, because finishing consumes the entry.
+            let name = Arc::clone(&camera_file.camera.name);
+            let path = camera_file.path.clone();
             camera_file.finish()?;
             descriptions.push(format!("camera {name:?}: {}", path.display()));
             for camera in rig.cameras.iter_mut().filter(|camera| camera.name == name) {
-                (camera.realsense.file, camera.realsense.pace) = (path.clone(), Pace::Clock);
+                camera.realsense.file = path.clone();
+                // Each image is then delivered at the time of its stamp, in step with the other devices.
+                camera.realsense.pace = Pace::Clock;
             }
         }
         Ok(descriptions)
@@ -117,9 +120,11 @@ impl CameraFile {
                 camera_from_depth: depth.camera_from_depth,
                 meters_per_count,
             }),
+            // The rig file promises depth images, and their unit is in the first one: keep waiting.
             (Some(_), None) => return Ok(()),
             (None, _) => None,
         };
+        // The header of the file describes all its streams, so it is written once both are known.
         if !has_color {
             return Ok(());
         }
@@ -128,6 +133,7 @@ impl CameraFile {
             clippy::cast_sign_loss,
             reason = "rates are small numbers above 0"
         )]
+        // The file stores whole rates. At least 1, because a slower camera would get a rate of 0.
         let rate_hz = rate_hz.round().max(1.0) as u16;
         let emulated = EmulatedCamera {
             name: "fieldrig simulated camera".to_owned(),
@@ -138,6 +144,7 @@ impl CameraFile {
             depth,
         };
         let mut writer = BagWriter::create(&self.path, &emulated)?;
+        // The waiting images come first, in the order in which they arrived.
         self.pending
             .drain(..)
             .try_for_each(|image| writer.write(&image))?;
@@ -147,6 +154,7 @@ impl CameraFile {
 
     fn finish(self) -> anyhow::Result<()> {
         let name = &self.camera.name;
+        // A camera without a file sent too few images to define the format of its streams.
         let writer = self
             .writer
             .with_context(|| format!("the recording has too few images of camera {name:?}"))?;

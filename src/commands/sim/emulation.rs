@@ -68,6 +68,8 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Exit> {
         .unwrap_or_else(|| PathBuf::from(format!("sim-{name}")));
     std::fs::create_dir_all(&folder)
         .with_context(|| format!("cannot create the folder {}", folder.display()))?;
+    // All samples are prepared before the playback: simulating and encoding would not keep up with
+    // real time.
     let recording = match &args.from {
         Some(path) => path.clone(),
         None => match simulate(args, &rig, &folder, &stop)? {
@@ -88,6 +90,8 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Exit> {
         scripted: first,
         emulated: clock::now().plus_secs(args.start_in),
     };
+    // The playback time is known only now, so the stamps of the camera files are shifted by an
+    // offset in the rig file.
     for camera in &mut rig.cameras {
         camera.realsense.clock_offset_nanos = playback_clock
             .emulated
@@ -95,15 +99,15 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Exit> {
             .saturating_sub(playback_clock.scripted.0);
     }
     let rig_file = write_rig(&folder, &rig)?;
+    // Last, because the playback time is running.
     let emulated = EmulatedDevices::start(&rig, &script, playback_clock, args)?;
     descriptions.extend(emulated.descriptions.iter().cloned());
     if args.json {
-        let (starts_in_secs, seconds) = (args.start_in, args.seconds);
         print::report_json(&ReadyEvent {
             event: "ready",
             rig: &rig_file,
-            starts_in_secs,
-            seconds,
+            starts_in_secs: args.start_in,
+            seconds: args.seconds,
             devices: &descriptions,
         })?;
     } else {
@@ -123,6 +127,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Exit> {
 
 /// The rig and its name.
 fn load(rig_or_scene: &str) -> anyhow::Result<(String, Rig)> {
+    // Names of scenes come before files, so that a folder of the same name does not hide them.
     if let Some((name, text, urdf)) = SCENES.iter().find(|(name, ..)| *name == rig_or_scene) {
         return Ok(((*name).to_owned(), Rig::parse(name, text, urdf, &[])?));
     }
@@ -156,6 +161,7 @@ fn check(rig: &Rig) -> Result<(), BadArgument> {
 /// Simulates the rig into a recording; `None` if interrupted.
 fn simulate(args: &Args, rig: &Rig, folder: &Path, stop: &Stop) -> anyhow::Result<Option<PathBuf>> {
     let mut simulated = rig.clone();
+    // The simulation is recorded, not watched, so it need not run in real time.
     simulated.sim.lockstep = true;
     let Opened {
         rig, mut source, ..
@@ -184,6 +190,7 @@ fn simulate(args: &Args, rig: &Rig, folder: &Path, stop: &Stop) -> anyhow::Resul
         bar.set_message(format!("{secs:.1} of {:.1} s simulated", args.seconds));
         recorder.write(&sample)?;
     }
+    // An interrupted simulation is left unfinished, and removed by the next one.
     recorder.finish()?;
     bar.finish_and_clear();
     Ok(Some(path))
@@ -220,6 +227,7 @@ fn read(
         }
     }
     bar.finish_and_clear();
+    // A damaged recording still has data to play back.
     if let Some(damage) = damage.get() {
         log::warn!("{damage}; the data before that is played back");
     }
@@ -230,6 +238,7 @@ fn read(
 fn write_rig(folder: &Path, rig: &Rig) -> anyhow::Result<PathBuf> {
     let path = folder.join(drivers::recording::RIG_FILE);
     let urdf = folder.join(drivers::recording::URDF_FILE);
+    // The rig file names the robot description, so both are in one folder.
     for (path, text) in [(&path, &rig.to_toml()), (&urdf, &rig.arm.urdf_text)] {
         files::write(path, text).with_context(|| format!("cannot write {}", path.display()))?;
     }
@@ -256,7 +265,8 @@ impl EmulatedDevices {
             JointTrack::new(&script.joints, playback_clock)
                 .context("cannot play back the joint states")
         };
-        let (mut robot, mut motors) = (None, None);
+        let mut robot = None;
+        let mut motors = None;
         let mut datagram_targets = DatagramTargets::default();
         let mut descriptions = Vec::new();
         match rig.arm.driver {
@@ -364,11 +374,12 @@ fn wait(stop: &Stop, starts_at: Stamp, args: &Args) -> anyhow::Result<()> {
             _ => "playback has ended; devices stand still until Ctrl-C".to_owned(),
         });
         if secs >= args.seconds && !std::mem::replace(&mut is_over, true) {
-            match args.json {
-                true => print::report_json(&serde_json::json!({ "event": "over" }))?,
-                false => print::report(
+            if args.json {
+                print::report_json(&serde_json::json!({ "event": "over" }))?;
+            } else {
+                print::report(
                     "Playback has ended: the emulated devices stand still but respond until Ctrl-C.",
-                ),
+                );
             }
         }
         std::thread::sleep(POLL);

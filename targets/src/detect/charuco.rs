@@ -53,9 +53,13 @@ pub(super) fn corners(target: &TargetSpec, plane: &Plane, fit: &Fit) -> Vec<(u32
         printed,
         inner,
     };
+    // A wrong corner next to a marker would displace the predictions of others, so it is removed
+    // before the lattice is completed.
     let mut lattice = search.near_markers(fit);
     lattice.remove_outliers();
     search.complete(&mut lattice);
+    // Now every corner has neighbors, which give a more accurate scale and shear than a marker, or
+    // the neighbors on one side only.
     search.printed.align(plane, &mut lattice);
     lattice.remove_outliers();
     let id = |cell: Cell| (cell[1] * inner[0] + cell[0]).cast_unsigned();
@@ -72,6 +76,7 @@ impl Search<'_> {
         let mut predictions: BTreeMap<Cell, Vec<Predicted>> = BTreeMap::new();
         for marker in &fit.markers {
             let corners_m = &fit.layout.corners_m[marker.id as usize];
+            // `Homography` needs points near the origin.
             let center_m = layout::center(corners_m);
             let centered =
                 corners_m.map(|corner| [corner[0] - center_m[0], corner[1] - center_m[1]]);
@@ -79,12 +84,15 @@ impl Search<'_> {
             else {
                 continue;
             };
+            // The corners of the square around the marker are only a margin away from it, so that
+            // the homography of the marker predicts them through any lens.
             for [x, y] in [[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]] {
                 let offset_m = [x * self.printed.square_m, y * self.printed.square_m];
                 #[expect(clippy::cast_possible_truncation, reason = "counts of squares")]
                 let cell = [0, 1].map(|axis| {
                     ((center_m[axis] + offset_m[axis]) / self.printed.square_m).round() as i32 - 1
                 });
+                // Squares at the border of the board have corners that are not inner corners.
                 if (0..2).all(|axis| (0..self.inner[axis]).contains(&cell[axis])) {
                     let prediction = (
                         pixel_from_board.map(offset_m),
@@ -96,6 +104,8 @@ impl Search<'_> {
         }
         let mut lattice = Lattice::default();
         for (cell, predictions) in predictions {
+            // Most corners touch two squares with markers. The mean of both predictions has less
+            // noise.
             let n = predictions.len() as f64;
             let pixel = [0, 1].map(|axis| {
                 predictions
@@ -119,6 +129,8 @@ impl Search<'_> {
 
     /// Finds missing corners next to others, repeatedly.
     fn complete(&self, lattice: &mut Lattice) {
+        // A pass adds neighbors of known corners. From one end of the board to the other, it takes
+        // at most this many passes.
         for _ in 0..self.inner[0] + self.inner[1] {
             let cells = (0..self.inner[1])
                 .flat_map(|row| (0..self.inner[0]).map(move |column| [column, row]));
@@ -138,6 +150,7 @@ impl Search<'_> {
         }
     }
 
+    /// Aligns a predicted corner with the printed pattern.
     fn find(&self, cell: Cell, pixel: [f64; 2], pixel_by_point: Matrix2<f64>) -> Option<[f64; 2]> {
         let Printed {
             surface, side_m, ..
@@ -147,6 +160,7 @@ impl Search<'_> {
             point_m,
             pixel,
             pixel_by_point,
+            // Unknown until the corner has neighbors on both sides.
             bend: [[0.0; 2]; 3],
             side_m,
             reach_px: None,

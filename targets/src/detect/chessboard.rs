@@ -9,13 +9,18 @@ use crate::lattice::{Cell, Lattice, Refinement, STEPS};
 use crate::saddle::{self, angle_between};
 use crate::spec::TargetSpec;
 
-/// Images with more pixels are first searched at half resolution.
+/// Images with more pixels are first searched at half resolution, which has a quarter of the pixels.
+/// Corners are refined in the full image in any case.
 const HALVE_ABOVE_PX: usize = 3_000_000;
-/// Number of resolutions that are searched.
+/// Number of resolutions that are searched. The ring around saddles has a fixed radius, so squares
+/// must neither be smaller than the ring nor blurred over much more than it. Three resolutions cover
+/// a factor of four.
 const N_LEVELS: usize = 3;
-/// A row or column belongs to the board if it has at least this part of its corners.
+/// A row or column belongs to the board if it has at least this part of its corners. Chance corners
+/// next to the board form lines with few corners; hidden corners leave most of a line.
 const MIN_LINE_FRAC: f64 = 0.5;
-/// A board is used if at least these percent of its corners are found.
+/// A board is used if at least these percent of its corners are found. With fewer, a wrong grid of
+/// the right size is more likely than a board with that many hidden corners.
 const MIN_CORNER_PERCENT: usize = 60;
 
 /// Squares are empty.
@@ -80,6 +85,7 @@ pub(super) fn detect(
                     side_m: square_m,
                 }
                 .align(plane, &mut lattice);
+                // Cells of the board are not negative after renumbering.
                 let id = |cell: Cell| {
                     Some(u32::try_from(cell[1]).ok()? * inner[0] + u32::try_from(cell[0]).ok()?)
                 };
@@ -105,6 +111,7 @@ pub(super) fn detect(
 
 /// Whether almost all corners of a larger grid were found.
 fn is_complete_and_larger(grid: &Lattice, inner: [u32; 2]) -> bool {
+    // A grid with gaps may contain corners of the surroundings, so it is no evidence.
     const MIN_PERCENT: usize = 95;
     let Some([low, high]) = grid.range() else {
         return false;
@@ -120,6 +127,7 @@ fn is_complete_and_larger(grid: &Lattice, inner: [u32; 2]) -> bool {
 fn matching(lattice: &mut Lattice, inner: [u32; 2], plane: &Plane) -> Result<Lattice, NotDetected> {
     // Lines at the edge of the board may have been missed.
     const GROWN_LINES: i32 = 1;
+    // Fill the grid first, so that its size can be judged.
     if let Some([low, high]) = lattice.range() {
         let is_smaller =
             (high[0] - low[0] + 1) * (high[1] - low[1] + 1) < (inner[0] * inner[1]).cast_signed();
@@ -133,6 +141,8 @@ fn matching(lattice: &mut Lattice, inner: [u32; 2], plane: &Plane) -> Result<Lat
             REFINEMENT,
         );
     }
+    // Corners of the surroundings are removed in three ways: they are no saddles, they do not fit
+    // their neighbors, or their line has too few corners.
     lattice.refine(plane, REFINEMENT);
     lattice.remove_outliers();
     trim(lattice);
@@ -152,16 +162,27 @@ fn matching(lattice: &mut Lattice, inner: [u32; 2], plane: &Plane) -> Result<Lat
             min,
         });
     }
+    oriented(lattice, [low, high], inner).ok_or(NotDetected::Nothing {
+        target: "chessboard",
+    })
+}
+
+/// Chooses among the rotations of a grid with these smallest and largest cells that give the board.
+/// Returns the renumbered corners.
+fn oriented(lattice: &Lattice, [low, high]: [Cell; 2], inner: [u32; 2]) -> Option<Lattice> {
+    let size = [high[0] - low[0] + 1, high[1] - low[1] + 1].map(i32::cast_unsigned);
     let is_odd = (inner[0] + inner[1]) % 2 == 1;
-    let candidates = (0..4).filter(|&turns| {
-        inner
-            == if turns % 2 == 0 {
-                size
-            } else {
-                [size[1], size[0]]
-            }
-    });
-    let oriented = candidates.filter_map(|turns| {
+    let mut rotations = Vec::new();
+    for turns in 0..4 {
+        let rotated_size = if turns % 2 == 0 {
+            size
+        } else {
+            [size[1], size[0]]
+        };
+        if inner != rotated_size {
+            continue;
+        }
+        // The cell that becomes the board's first corner.
         let corner = [
             if turns == 1 || turns == 2 {
                 high[0]
@@ -174,47 +195,37 @@ fn matching(lattice: &mut Lattice, inner: [u32; 2], plane: &Plane) -> Result<Lat
         // is the one that the grid counts as upper left, and colors alternate. Rotations by 90
         // degrees look at another square.
         let is_black = (corner[0] + corner[1] + turns).rem_euclid(2) == 0;
-        (!is_odd || is_black).then_some((is_black, turns, corner))
-    });
-    let oriented: Vec<_> = oriented
-        .map(|(is_black, turns, corner)| (is_black, renumber(lattice, corner, turns as usize)))
-        .collect();
+        if !is_odd || is_black {
+            rotations.push((is_black, renumber(lattice, corner, turns as usize)));
+        }
+    }
     // A square board with an odd number of corners per side changes colors with every rotation by
-    // 90 degrees.
-    let has_black = oriented.iter().any(|(is_black, _)| *is_black);
+    // 90 degrees. If no rotation has a black square there, the board is printed with white corners,
+    // and all rotations remain.
+    let has_black = rotations.iter().any(|(is_black, _)| *is_black);
+    // What remains is a symmetry of the board. The choice follows the image, so that the ids stay
+    // the same in all images of a board that is roughly upright.
     let from_right = |lattice: &Lattice| x_axis_rad(lattice).map_or(f64::INFINITY, f64::abs);
-    let candidates = oriented
+    rotations
         .into_iter()
         .filter(|(is_black, _)| *is_black || !has_black)
-        .map(|(_, lattice)| lattice);
-    let best = candidates.min_by(|a, b| from_right(a).total_cmp(&from_right(b)));
-    best.ok_or(NotDetected::Nothing {
-        target: "chessboard",
-    })
+        .map(|(_, lattice)| lattice)
+        .min_by(|a, b| from_right(a).total_cmp(&from_right(b)))
 }
 
 /// Removes outermost lines that have few corners: these are not part of the board.
 pub(super) fn trim(lattice: &mut Lattice) {
     while let Some([low, high]) = lattice.range() {
-        let line = |axis: usize, at: i32| {
-            let n = lattice
-                .corners
-                .keys()
-                .filter(|cell| cell[axis] == at)
-                .count();
-            (
-                n as f64 / f64::from(high[1 - axis] - low[1 - axis] + 1),
-                axis,
-                at,
-            )
-        };
-        let lines = [
-            line(0, low[0]),
-            line(0, high[0]),
-            line(1, low[1]),
-            line(1, high[1]),
-        ];
-        let weakest = lines.into_iter().min_by(|a, b| a.0.total_cmp(&b.0));
+        // One line at a time, the weakest first: its removal changes the length of the lines across
+        // it.
+        let lines: [(usize, i32); 4] = [(0, low[0]), (0, high[0]), (1, low[1]), (1, high[1])];
+        let weakest = lines
+            .into_iter()
+            .map(|(axis, at)| {
+                let length = high[1 - axis] - low[1 - axis] + 1;
+                (line_frac(lattice, axis, at, length), axis, at)
+            })
+            .min_by(|a, b| a.0.total_cmp(&b.0));
         match weakest {
             Some((frac, axis, at)) if frac < MIN_LINE_FRAC => {
                 lattice.corners.retain(|cell, _| cell[axis] != at)
@@ -224,27 +235,34 @@ pub(super) fn trim(lattice: &mut Lattice) {
     }
 }
 
-/// The cells seen from a corner, with the x axis along `STEPS[turns]`.
-fn renumber(lattice: &Lattice, corner: Cell, turns: usize) -> Lattice {
-    let (x, y) = (STEPS[turns], STEPS[(turns + 1) % 4]);
-    let cell = |cell: &Cell| {
-        let offset = [cell[0] - corner[0], cell[1] - corner[1]];
-        [
-            offset[0] * x[0] + offset[1] * x[1],
-            offset[0] * y[0] + offset[1] * y[1],
-        ]
-    };
-    Lattice {
-        corners: lattice
-            .corners
-            .iter()
-            .map(|(at, &pixel)| (cell(at), pixel))
-            .collect(),
-    }
+/// The part of the corners of a line that exist: of column `at` for axis 0, of row `at` for axis 1.
+fn line_frac(lattice: &Lattice, axis: usize, at: i32, length: i32) -> f64 {
+    let n = lattice
+        .corners
+        .keys()
+        .filter(|cell| cell[axis] == at)
+        .count();
+    n as f64 / f64::from(length)
 }
 
-/// Direction of the board's x axis in the image, from the pair of corners farthest apart in any
-/// row.
+/// The cells seen from a corner, with the x axis along `STEPS[turns]`.
+fn renumber(lattice: &Lattice, corner: Cell, turns: usize) -> Lattice {
+    let x = STEPS[turns];
+    let y = STEPS[(turns + 1) % 4];
+    let mut renumbered = Lattice::default();
+    for (cell, &pixel) in &lattice.corners {
+        let offset = [cell[0] - corner[0], cell[1] - corner[1]];
+        let cell = [
+            offset[0] * x[0] + offset[1] * x[1],
+            offset[0] * y[0] + offset[1] * y[1],
+        ];
+        renumbered.corners.insert(cell, pixel);
+    }
+    renumbered
+}
+
+/// Direction of the board's x axis in the image: that of the sum of the distances between all
+/// neighbors along it.
 fn x_axis_rad(lattice: &Lattice) -> Option<f64> {
     let mut sum = [0.0; 2];
     for (cell, pixel) in &lattice.corners {
@@ -260,24 +278,25 @@ fn wrong_size(lattice: &Lattice, size: [u32; 2], inner: [u32; 2], plane: &Plane)
     // Columns are the longer side of the target, in the message only.
     let is_swapped = (size[0] < size[1]) != (inner[0] < inner[1]);
     let [columns, rows] = if is_swapped { [size[1], size[0]] } else { size };
-    let (found, expected) = (
-        Counts { columns, rows },
-        Counts {
-            columns: inner[0],
-            rows: inner[1],
-        },
-    );
-    let is_at_border = |(cell, pixel): (&Cell, &[f64; 2])| {
+    let found = Counts { columns, rows };
+    let expected = Counts {
+        columns: inner[0],
+        rows: inner[1],
+    };
+    // The next corner would be outside the image, or too close to its border to be verified by the
+    // ring.
+    let is_at_border = lattice.corners.iter().any(|(cell, pixel)| {
         let spacing_px = lattice.spacing_px(*cell).unwrap_or(0.0);
         !plane.contains(*pixel, 1.5 * spacing_px)
-    };
+    });
     let is_smaller = columns <= inner[0] && rows <= inner[1];
+    // Smaller than any chessboard that can be specified: chance corners.
     const MIN_SIDE: u32 = 3;
     if size.iter().any(|&side| side < MIN_SIDE) {
         NotDetected::Nothing {
             target: "chessboard",
         }
-    } else if is_smaller && lattice.corners.iter().any(is_at_border) {
+    } else if is_smaller && is_at_border {
         NotDetected::Partial { found, expected }
     } else {
         NotDetected::OtherSize { found, expected }

@@ -12,7 +12,9 @@ use crate::spec::{Millimeters, Pattern, TargetSpec};
 
 /// Fewer different markers without an error may be chance.
 const MIN_MARKERS: usize = 3;
-/// Cells per side from which a single marker without an error is no chance.
+/// Cells per side from which a single marker without an error is no chance: random cells are one of
+/// 1000 markers, in any of four rotations, with a probability of `4000 / 2^36`, or 6e-8. With 4
+/// cells, it would be 6 %.
 const MIN_BITS_OF_SINGLE: usize = 6;
 
 /// Difference of the size of markers that may prevent the detection of corners.
@@ -29,9 +31,12 @@ pub(super) fn marker_size(
     markers: &[Marker],
     min_change: f64,
 ) -> Option<NotDetected> {
+    /// Fewer pairs could agree by chance.
     const MIN_PAIRS: usize = 4;
     /// Pairs that measure the same size, if the markers are in the right places.
     const MIN_SAME_FRAC: f64 = 0.8;
+    /// Largest relative difference between sizes that are the same. Lens and perspective change the
+    /// scale from a marker to its neighbor.
     const SAME: f64 = 0.1;
     let Pattern::Charuco {
         square_m, marker_m, ..
@@ -40,20 +45,26 @@ pub(super) fn marker_size(
         return None;
     };
     let expected_frac = marker_m / square_m;
-    let measured = |layout: &Layout| -> Option<f64> {
-        let fracs = neighbor_fracs(layout, markers, square_m, marker_m);
-        let mut sorted = fracs.clone();
-        sorted.sort_by(f64::total_cmp);
-        let median = *sorted.get(sorted.len() / 2)?;
+    // If the markers are not where the layout says, their distances scatter. The first layout in
+    // which most pairs agree is the right one.
+    let mut measured = None;
+    for layout in layouts(&target.pattern) {
+        let mut fracs = neighbor_fracs(&layout, markers, square_m, marker_m);
+        fracs.sort_by(f64::total_cmp);
+        let Some(&median) = fracs.get(fracs.len() / 2) else {
+            continue;
+        };
         let n_same = fracs
             .iter()
             .filter(|frac| (*frac / median - 1.0).abs() < SAME)
             .count();
-        let is_consistent =
-            fracs.len() >= MIN_PAIRS && n_same as f64 >= MIN_SAME_FRAC * fracs.len() as f64;
-        is_consistent.then_some(median)
-    };
-    let found_frac = layouts(&target.pattern).iter().find_map(measured)?;
+        if fracs.len() >= MIN_PAIRS && n_same as f64 >= MIN_SAME_FRAC * fracs.len() as f64 {
+            measured = Some(median);
+            break;
+        }
+    }
+    let found_frac = measured?;
+    // A marker as large as its square is a misreading, not a board.
     let is_possible = found_frac > 0.0 && found_frac < 1.0;
     (is_possible && (found_frac / expected_frac - 1.0).abs() > min_change).then(|| {
         NotDetected::MarkerSize {
@@ -74,7 +85,9 @@ pub(super) fn other_counts(
     markers: &[Marker],
     n_confirmed: usize,
 ) -> Option<NotDetected> {
+    // Bounds the time of a failed detection. Boards of common paper sizes have fewer columns.
     const MAX_COLUMNS: u32 = 40;
+    // Below, another board may fit a few markers by chance.
     const MIN_CONFIRMED: usize = 4;
     let (expected, what) = match target.pattern {
         Pattern::Charuco { squares, .. } => (squares, "squares"),
@@ -82,7 +95,36 @@ pub(super) fn other_counts(
         _ => return None,
     };
     let n_ids = markers.iter().map(|marker| marker.id + 1).max()?;
-    let with = |counts: [u32; 2]| match target.pattern.clone() {
+    // The number of columns alone determines where a marker is. The number of rows is the smallest
+    // that contains all ids, or that of the target with its sides swapped.
+    let counts = (2..=MAX_COLUMNS)
+        .filter(|columns| *columns != expected[0])
+        .map(|columns| {
+            // Every second square of a ChArUco board has a marker.
+            let per_marker = if what == "squares" { 2 } else { 1 };
+            let needed = (per_marker * n_ids).div_ceil(columns).max(2);
+            let is_swapped = columns == expected[1] && needed <= expected[0];
+            [columns, if is_swapped { expected[0] } else { needed }]
+        });
+    let fits = counts.filter_map(|counts| {
+        let layouts = layouts(&with_counts(&target.pattern, counts));
+        Some((counts, layout::fit(layouts, markers)?.n_confirmed))
+    });
+    // Of equals, the swapped sides: this mistake is more common than a different board.
+    let (found, n_found) =
+        fits.max_by_key(|(counts, n)| (*n, *counts == [expected[1], expected[0]]))?;
+    let of = |[columns, rows]: [u32; 2]| Counts { columns, rows };
+    (n_found >= MIN_CONFIRMED && n_found > 2 * n_confirmed).then(|| NotDetected::OtherCounts {
+        found: of(found),
+        expected: of(expected),
+        what,
+    })
+}
+
+/// A pattern with other counts of columns and rows. Patterns without counts of markers are the
+/// same.
+fn with_counts(pattern: &Pattern, counts: [u32; 2]) -> Pattern {
+    match pattern.clone() {
         Pattern::Charuco {
             square_m,
             marker_m,
@@ -104,30 +146,12 @@ pub(super) fn other_counts(
             spacing_frac,
         },
         other => other,
-    };
-    // The number of columns alone determines where a marker is.
-    let counts = (2..=MAX_COLUMNS)
-        .filter(|columns| *columns != expected[0])
-        .map(|columns| {
-            let per_marker = if what == "squares" { 2 } else { 1 };
-            let needed = (per_marker * n_ids).div_ceil(columns).max(2);
-            let is_swapped = columns == expected[1] && needed <= expected[0];
-            [columns, if is_swapped { expected[0] } else { needed }]
-        });
-    let fits = counts.filter_map(|counts| {
-        Some((
-            counts,
-            layout::fit(layouts(&with(counts)), markers)?.n_confirmed,
-        ))
-    });
-    let (found, n_found) =
-        fits.max_by_key(|(counts, n)| (*n, *counts == [expected[1], expected[0]]))?;
-    let of = |[columns, rows]: [u32; 2]| Counts { columns, rows };
-    (n_found >= MIN_CONFIRMED && n_found > 2 * n_confirmed).then(|| NotDetected::OtherCounts {
-        found: of(found),
-        expected: of(expected),
-        what,
-    })
+    }
+}
+
+/// A quadrilateral relative to a point.
+fn relative(quad: &Quad, [x, y]: [f64; 2]) -> Quad {
+    quad.map(|corner| [corner[0] - x, corner[1] - y])
 }
 
 /// The size of a marker relative to a square according to each marker and its neighbors.
@@ -138,13 +162,11 @@ fn neighbor_fracs(layout: &Layout, markers: &[Marker], square_m: f64, marker_m: 
         let Some(corners_m) = layout.corners_m.get(from.id as usize) else {
             continue;
         };
-        let (center_m, center_px) = (layout::center(corners_m), layout::center(&from.corners_px));
-        let relative =
-            |quad: &Quad, [x, y]: [f64; 2]| quad.map(|corner| [corner[0] - x, corner[1] - y]);
-        let (on_board, in_image) = (
-            relative(corners_m, center_m),
-            relative(&from.corners_px, center_px),
-        );
+        // `Homography` needs points near the origin.
+        let center_m = layout::center(corners_m);
+        let center_px = layout::center(&from.corners_px);
+        let on_board = relative(corners_m, center_m);
+        let in_image = relative(&from.corners_px, center_px);
         let Some(board_from_pixel) = Homography::from_corners(&in_image, &on_board) else {
             continue;
         };
@@ -155,6 +177,8 @@ fn neighbor_fracs(layout: &Layout, markers: &[Marker], square_m: f64, marker_m: 
             let squares = distance(layout::center(to_m), center_m) / square_m;
             let [x, y] = layout::center(&to.corners_px);
             let [across, along] = board_from_pixel.map([x - center_px[0], y - center_px[1]]);
+            // The distance of the neighbor is known in squares from the layout, and measured in
+            // sides of the marker by its homography. Their ratio is the size of the marker.
             let sides = across.hypot(along) / marker_m;
             if squares < MAX_SQUARES && sides > 0.0 && sides.is_finite() {
                 fracs.push(squares / sides);
@@ -162,6 +186,24 @@ fn neighbor_fracs(layout: &Layout, markers: &[Marker], square_m: f64, marker_m: 
         }
     }
     fracs
+}
+
+/// Whether a number of different markers without an error is no chance.
+fn is_plausible(n: usize, dictionary: &Dictionary) -> bool {
+    n >= MIN_MARKERS || (n > 0 && dictionary.n_bits() >= MIN_BITS_OF_SINGLE)
+}
+
+/// Number of markers, without those that may be chance: four times their expected number.
+#[expect(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "a small positive number"
+)]
+fn n_certain(exact: &Exact) -> usize {
+    exact
+        .ids
+        .len()
+        .saturating_sub((4.0 * exact.n_by_chance).ceil() as usize)
 }
 
 /// Explains why the markers found in an image are not those of the target.
@@ -186,12 +228,12 @@ pub(super) fn markers(
     let expected = first_id..first_id + u32::try_from(n_on_target).unwrap_or(0);
     let mut ids: Vec<u32> = markers.iter().map(|marker| marker.id).collect();
     ids.dedup();
-    let is_plausible = |n: usize, dictionary: &Dictionary| {
-        n >= MIN_MARKERS || (n > 0 && dictionary.n_bits() >= MIN_BITS_OF_SINGLE)
-    };
+    // Markers of the right dictionary: the target is another one, or is described wrongly.
     if is_plausible(ids.len(), dictionary) {
         let n_expected = ids.iter().filter(|id| expected.contains(id)).count();
         let found = Ids(ids);
+        // A majority of foreign ids means another board. With ids of the target, counts or sizes
+        // are wrong, from the most to the least specific reason.
         return if 2 * n_expected < found.0.len() {
             NotDetected::OtherIds {
                 found,
@@ -203,24 +245,14 @@ pub(super) fn markers(
             reason.unwrap_or(NotDetected::OtherArrangement { found })
         };
     }
-    // Number of markers, without those that may be chance.
-    #[expect(
-        clippy::cast_possible_truncation,
-        clippy::cast_sign_loss,
-        reason = "a small positive number"
-    )]
-    let n_certain = |exact: &Exact| {
-        exact
-            .ids
-            .len()
-            .saturating_sub((4.0 * exact.n_by_chance).ceil() as usize)
-    };
+    // Cameras that flip their images horizontally show valid cells in mirrored order.
     let mirrored = read_exactly(plane, quads, dictionary, true);
     if is_plausible(n_certain(&mirrored), dictionary) {
         return NotDetected::Mirrored {
             n: mirrored.ids.len(),
         };
     }
+    // Last, all other dictionaries, which takes the longest.
     let others = Dictionary::all().filter(|other| other != dictionary);
     let read = others.map(|other| (read_exactly(plane, quads, &other, false), other));
     // Of equals, the first: the smallest dictionary that contains all markers.

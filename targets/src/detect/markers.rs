@@ -14,7 +14,9 @@ use crate::template::{self, Neighborhood};
 
 /// Widths of the black border of tags, in cells: Kalibr prints 2, AprilTag 1.
 const TAG_BORDERS: [usize; 2] = [1, 2];
-/// Largest difference of the size of ChArUco markers from that of the target, relative to it.
+/// Largest difference of the size of ChArUco markers from that of the target, relative to it. Blur
+/// makes small markers look up to 10 % smaller, so a found board needs a clearer contradiction than
+/// [`diagnosis::MIN_SIZE_CHANGE`].
 const MAX_SIZE_CHANGE: f64 = 0.2;
 /// Largest distance of a corner from the intersection of the tag's sides, relative to the side:
 /// lenses bend them.
@@ -22,6 +24,7 @@ const MAX_MOVE_FRAC: f64 = 0.04;
 
 /// Finds a ChArUco board, an AprilGrid or a tag.
 pub(super) fn detect(target: &TargetSpec, plane: &Plane) -> Result<Detection, NotDetected> {
+    // Only on AprilGrids do other black squares touch the corners of tags.
     let quads = quad::find(plane, matches!(target.pattern, Pattern::Aprilgrid { .. }));
     let (dictionary, borders): (Dictionary, &[usize]) = match target.pattern {
         Pattern::Charuco { dictionary, .. } => (dictionary, &[1]),
@@ -76,18 +79,13 @@ fn tag(
 
 /// Corners of all tags of an AprilGrid.
 fn aprilgrid(target: &TargetSpec, tag_m: f64, plane: &Plane, fit: &Fit) -> Vec<(u32, [f64; 2])> {
-    let of_marker = |marker: &Marker| {
+    let mut pixels = Vec::new();
+    for marker in &fit.markers {
         let ids = [0, 1, 2, 3].map(|corner| 4 * marker.id + corner);
-        corners(
-            target,
-            plane,
-            marker,
-            &fit.layout.corners_m[marker.id as usize],
-            ids,
-            tag_m,
-        )
-    };
-    fit.markers.iter().flat_map(of_marker).collect()
+        let corners_m = &fit.layout.corners_m[marker.id as usize];
+        pixels.extend(corners(target, plane, marker, corners_m, ids, tag_m));
+    }
+    pixels
 }
 
 /// Refines the corners of a marker. `corners_m`: their positions on the board, in the order of the
@@ -120,6 +118,8 @@ fn corners(
                 pixel_by_point: pixel_from_board.jacobian(centered[at]),
                 bend: [[0.0; 2]; 3],
                 side_m: CLEAR_FRAC * side_m,
+                // Far less than a cell, so that no edge inside the tag is taken for the corner.
+                // The lower limit leaves room for the error of the outline.
                 reach_px: Some((reach_frac * shortest_side(&marker.corners_px)).clamp(1.5, 4.0)),
             };
             let found = template::find(plane, &target.surface(), &neighborhood);
@@ -127,16 +127,22 @@ fn corners(
             corners_px[at] = found.unwrap_or(corners_px[at]);
         }
     }
-    let id = |at: usize| {
-        let is_here = |id: &u32| {
-            target
-                .corner(*id)
-                .is_some_and(|corner| distance([corner.x, corner.y], corners_m[at]) < 1e-6 * side_m)
-        };
-        ids.into_iter().find(is_here)
-    };
+    // Ids are assigned by position, because the order of the corners depends on the rotation of the
+    // tags in the layout.
     (0..4)
         .filter(|&at| is_found[at])
-        .filter_map(|at| Some((id(at)?, corners_px[at])))
+        .filter_map(|at| {
+            let id = id_at(target, ids, corners_m[at], 1e-6 * side_m)?;
+            Some((id, corners_px[at]))
+        })
         .collect()
+}
+
+/// The id among `ids` of the target's corner at a position on the board.
+fn id_at(target: &TargetSpec, ids: [u32; 4], point_m: [f64; 2], tolerance_m: f64) -> Option<u32> {
+    ids.into_iter().find(|&id| {
+        target
+            .corner(id)
+            .is_some_and(|corner| distance([corner.x, corner.y], point_m) < tolerance_m)
+    })
 }

@@ -71,6 +71,7 @@ impl TargetSpec {
                 };
                 board.detect(&plane)
             }
+            // These three have markers, from which the search starts.
             Pattern::Charuco { .. } | Pattern::Aprilgrid { .. } | Pattern::Tag { .. } => {
                 markers::detect(self, &plane)
             }
@@ -83,14 +84,18 @@ impl TargetSpec {
         pixels: impl IntoIterator<Item = (u32, [f64; 2])>,
         is_legacy: bool,
     ) -> Detection {
-        let corner = |(id, pixel)| {
-            Some(DetectedCorner {
-                id,
-                point_in_board: self.corner(id)?,
-                pixel,
-            })
-        };
-        let mut corners: Vec<DetectedCorner> = pixels.into_iter().filter_map(corner).collect();
+        let mut corners = Vec::new();
+        for (id, pixel) in pixels {
+            if let Some(point_in_board) = self.corner(id) {
+                corners.push(DetectedCorner {
+                    id,
+                    point_in_board,
+                    pixel,
+                });
+            }
+        }
+        // Detectors return corners in the order of markers or of the lattice. Callers compare
+        // detections of several images, so they need one order.
         corners.sort_by_key(|corner| corner.id);
         Detection {
             corners,

@@ -33,6 +33,7 @@ impl TargetSpec {
             pattern_mm[0] + 2.0 * (PAGE_MARGIN_MM + MARK_MM),
             pattern_mm[1] + 2.0 * PAGE_MARGIN_MM + MARK_MM + FOOTER_MM,
         ];
+        // The tolerance absorbs rounding: a paper of exactly this size must fit.
         let fits = |paper: &Paper| (0..2).all(|axis| need_mm[axis] <= paper.size_mm()[axis] + 1e-6);
         let Some(sheet) = [paper, paper.rotated()].into_iter().find(fits) else {
             return Err(PrintError::TooLarge {
@@ -67,6 +68,7 @@ impl TargetSpec {
                 Shape::Disk { .. } => None,
             })
             .collect();
+        // Rectangles first: dots of puzzleboards cover the squares.
         page.set_gray(0.0);
         page.fill_rectangles(&rectangles);
         for shape in shapes {
@@ -92,9 +94,12 @@ impl TargetSpec {
     ) {
         const RULERS_MM: [u32; 4] = [100, 50, 20, 10];
         let width_mm = size_mm[0] - 2.0 * PAGE_MARGIN_MM;
+        // 12 mm for the label next to the ruler.
         let is_short = |length: &u32| f64::from(*length) + 12.0 <= width_mm;
         let length = RULERS_MM.into_iter().find(is_short).unwrap_or(RULERS_MM[3]);
-        let (left, top) = (PAGE_MARGIN_MM, corner_mm[1] + pattern_mm[1] + 4.0);
+        let left = PAGE_MARGIN_MM;
+        // Below the white margin that the detection of outer corners needs.
+        let top = corner_mm[1] + pattern_mm[1] + 4.0;
         page.line([left, top], [left + f64::from(length), top], 0.2);
         for at in 0..=length {
             let tick_mm = if at % 10 == 0 {
@@ -128,10 +133,8 @@ fn draw_axes(page: &mut Page, corner_mm: [f64; 2]) {
     const AWAY_MM: f64 = 4.5;
     const TIP_MM: f64 = 1.2;
     let origin = corner_mm.map(|value| value - AWAY_MM);
-    let (x_end, y_end) = (
-        [origin[0] + LENGTH_MM, origin[1]],
-        [origin[0], origin[1] + LENGTH_MM],
-    );
+    let x_end = [origin[0] + LENGTH_MM, origin[1]];
+    let y_end = [origin[0], origin[1] + LENGTH_MM];
     for (end, label) in [(x_end, "x"), (y_end, "y")] {
         page.line(origin, end, 0.25);
         // Along the axis, and across it.

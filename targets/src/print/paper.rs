@@ -21,7 +21,7 @@ const NAMED: [(&str, [f64; 2]); 7] = [
     ("a0", [841.0, 1189.0]),
     ("2a0", [1189.0, 1682.0]),
 ];
-/// Sides of other papers, millimeters.
+/// Smallest and largest side of other papers, millimeters. Outside, the unit is probably wrong.
 const SIDE_MM: [f64; 2] = [50.0, 5000.0];
 
 impl Paper {
@@ -44,14 +44,13 @@ impl Paper {
 
     /// The smallest named paper into which a rectangle fits, or one of exactly this size.
     pub(super) fn for_size(need_mm: [f64; 2]) -> Self {
-        let fits = |size_mm: &[f64; 2]| {
-            let rotated = [size_mm[1], size_mm[0]];
-            [*size_mm, rotated]
-                .iter()
-                .any(|size_mm| (0..2).all(|axis| need_mm[axis] <= size_mm[axis]))
-        };
-        let named = NAMED.into_iter().map(|(_, size_mm)| size_mm).find(fits);
+        let fits = |[width, height]: [f64; 2]| need_mm[0] <= width && need_mm[1] <= height;
+        let named = NAMED
+            .into_iter()
+            .map(|(_, size_mm)| size_mm)
+            .find(|&[width, height]| fits([width, height]) || fits([height, width]));
         Self {
+            // Rounded up to centimeters, a size that a print shop can be asked for.
             size_mm: named.unwrap_or_else(|| need_mm.map(|value| (value / 10.0).ceil() * 10.0)),
         }
     }
@@ -71,21 +70,24 @@ impl FromStr for Paper {
         if let Some((_, size_mm)) = NAMED.into_iter().find(|(name, _)| *name == value) {
             return Ok(Self { size_mm });
         }
-        let parse = || {
-            let (width, height) = value.strip_suffix("mm")?.split_once('x')?;
-            let size_mm = [
-                width.trim().parse::<f64>().ok()?,
-                height.trim().parse::<f64>().ok()?,
-            ];
-            size_mm
-                .iter()
-                .all(|side| (SIDE_MM[0]..=SIDE_MM[1]).contains(side))
-                .then_some(Self { size_mm })
-        };
-        parse().ok_or_else(|| PrintError::Paper {
+        let size_mm = parse_size_mm(&value).ok_or_else(|| PrintError::Paper {
             value: text.to_owned(),
-        })
+        })?;
+        Ok(Self { size_mm })
     }
+}
+
+/// Parses a size such as `600x400mm`.
+fn parse_size_mm(value: &str) -> Option<[f64; 2]> {
+    let (width, height) = value.strip_suffix("mm")?.split_once('x')?;
+    let size_mm = [
+        width.trim().parse::<f64>().ok()?,
+        height.trim().parse::<f64>().ok()?,
+    ];
+    size_mm
+        .iter()
+        .all(|side| (SIDE_MM[0]..=SIDE_MM[1]).contains(side))
+        .then_some(size_mm)
 }
 
 impl fmt::Display for Paper {

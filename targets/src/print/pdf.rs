@@ -23,6 +23,7 @@ impl Page {
     }
 
     fn point(&self, [x, y]: [f64; 2]) -> [f64; 2] {
+        // The origin of PDF pages is at the lower left, and y points up.
         [x * POINTS_PER_MM, (self.size_mm[1] - y) * POINTS_PER_MM]
     }
 
@@ -37,6 +38,7 @@ impl Page {
 
     /// Sets the gray value of everything that follows; 0 is black, 1 is white.
     pub(super) fn set_gray(&mut self, gray: f64) {
+        // One operator for filling, one for lines.
         self.operator(&[gray], "g");
         self.operator(&[gray], "G");
     }
@@ -70,7 +72,8 @@ impl Page {
 
     /// Draws a line.
     pub(super) fn line(&mut self, from: [f64; 2], to: [f64; 2], width_mm: f64) {
-        let (from, to) = (self.point(from), self.point(to));
+        let from = self.point(from);
+        let to = self.point(to);
         self.operator(&[width_mm * POINTS_PER_MM], "w");
         self.operator(&from, "m");
         self.operator(&to, "l");
@@ -80,6 +83,7 @@ impl Page {
     /// Writes text in Helvetica, starting at the left end of its baseline.
     pub(super) fn text(&mut self, at: [f64; 2], size_mm: f64, text: &str) {
         let [x, y] = self.point(at);
+        // The font is used with its built-in encoding, in which only ASCII is safe.
         let printable = text
             .chars()
             .filter(|character| character.is_ascii_graphic() || *character == ' ');
@@ -104,6 +108,7 @@ impl Page {
             .chars()
             .filter(|character| character.is_ascii_alphanumeric() || " :.x_-".contains(*character))
             .collect();
+        // Objects are numbered from 1 in this order, and refer to each other by these numbers.
         let objects = [
             // Printer dialogs that follow this preference do not scale the page.
             "<< /Type /Catalog /Pages 2 0 R /ViewerPreferences << /PrintScaling /None >> >>"
@@ -127,6 +132,8 @@ impl Page {
             offsets.push(file.len());
             let _ = write!(file, "{number} 0 obj\n{object}\nendobj\n");
         }
+        // The table of positions. Readers start at its own position, which is at the end of the
+        // file. Each entry has exactly 20 bytes, and object 0 heads the list of free objects.
         let start = file.len();
         let n = objects.len() + 1;
         let _ = write!(file, "xref\n0 {n}\n0000000000 65535 f \n");

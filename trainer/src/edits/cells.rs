@@ -5,7 +5,8 @@ use crate::nerf::reference::space::contract;
 use nalgebra::{Matrix4, Vector3};
 use serde::{Deserialize, Serialize};
 
-/// Maximum number of cells along an axis; indices have 30 bits.
+/// Maximum number of cells along an axis. Indices then have 30 bits, so kernels compute them in
+/// `u32`.
 const MAX_CELLS: u32 = 1024;
 /// Smallest radius of the cube with equal cells, meters. Its inverse times any coordinate is finite
 /// in f32.
@@ -45,6 +46,9 @@ impl CellGrid {
 
     /// Width of the cells at a point along the narrower directions, meters.
     pub(crate) fn cell_m(&self, point_m: [f64; 3]) -> f64 {
+        // The contracted cube is 4 radii wide. At the distance `largest`, the contraction of Barron
+        // et al. 2022 (equation 10) maps to (2 - 1 / largest) / largest times the coordinate.
+        // Widths across the ray are divided by this factor; along the ray, cells are wider still.
         let largest = self
             .scaled(point_m)
             .iter()
@@ -54,15 +58,13 @@ impl CellGrid {
 
     /// Indices of the cells around a cell, itself excluded.
     pub(crate) fn neighbors(&self, index: u32) -> impl Iterator<Item = u32> + use<> {
-        let (grid, n) = (*self, self.n_cells);
+        let grid = *self;
+        let n = self.n_cells;
         let coord = [index % n, index / n % n, index / (n * n)];
+        // Index 13 of the 3 x 3 x 3 block is the cell itself.
         (0..27_u32).filter(|ix| *ix != 13).filter_map(move |ix| {
             let steps = [ix % 3, ix / 3 % 3, ix / 9];
-            let moved = |axis: usize| {
-                (coord[axis] + steps[axis])
-                    .checked_sub(1)
-                    .filter(|along| *along < n)
-            };
+            let moved = |axis: usize| moved_by(coord[axis], steps[axis], n);
             Some(grid.index([moved(0)?, moved(1)?, moved(2)?]))
         })
     }
@@ -75,6 +77,12 @@ impl CellGrid {
     fn scaled(&self, point_m: [f64; 3]) -> [f64; 3] {
         std::array::from_fn(|axis| (point_m[axis] - self.center_m[axis]) / self.radius_m)
     }
+}
+
+/// A coordinate moved by `step - 1`; `None` outside the grid of `n` cells. Steps are 0 to 2,
+/// because coordinates are unsigned.
+fn moved_by(along: u32, step: u32, n: u32) -> Option<u32> {
+    (along + step).checked_sub(1).filter(|along| *along < n)
 }
 
 /// Marks cells of a grid: one bit per cell.
@@ -136,6 +144,7 @@ impl CellSet {
     pub(super) fn new(grid: CellGrid, cells: impl IntoIterator<Item = u32>) -> Self {
         let mut ranges: Vec<[u32; 2]> = Vec::new();
         for cell in cells {
+            // Floaters fill runs of cells along x, so ranges take fewer words than cells.
             match ranges.last_mut() {
                 Some([_, end]) if *end == cell => *end += 1,
                 _ => ranges.push([cell, cell + 1]),
@@ -163,6 +172,7 @@ impl CellSet {
                  {MIN_RADIUS_M:e} m to {MAX_COORD_M:e} m and 1 to {MAX_CELLS} cells"
             ));
         }
+        // Kernels search the ranges by bisection, which needs this order.
         let end = n_cells.pow(3);
         let is_ordered = ranges.windows(2).all(|pair| pair[0][1] <= pair[1][0]);
         if ranges.is_empty()
@@ -181,6 +191,7 @@ impl CellSet {
     /// Whether the set contains a point in world.
     pub fn contains(&self, point_m: [f64; 3]) -> bool {
         let cell = self.grid.cell_at(point_m);
+        // Only the first range that ends after the cell can contain it.
         let n_before = self.ranges.partition_point(|[_, end]| *end <= cell);
         self.ranges
             .get(n_before)

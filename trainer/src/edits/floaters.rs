@@ -51,16 +51,20 @@ impl CellLabels {
     /// Divides occupied cells into groups, after connecting adjacent ones. Groups with few cells
     /// are floaters.
     pub(crate) fn of_occupied(grid: &CellGrid, occupied: &CellMask, mut groups: Groups) -> Self {
+        // Cells that touch only at a corner are adjacent, too: a thin slanted surface must not fall
+        // apart.
         for cell in occupied.cells() {
             grid.neighbors(cell)
                 .filter(|other| occupied.contains(*other))
                 .for_each(|other| groups.join(cell, other));
         }
+        // Sizes are known only after all cells are joined, so the labels need a second pass.
         let mut sizes = vec![0; grid.n()];
         for cell in occupied.cells() {
             sizes[groups.representative(cell) as usize] += 1;
         }
-        let (mut labels, n_occupied) = (Self::none(grid), occupied.n_marked());
+        let mut labels = Self::none(grid);
+        let n_occupied = occupied.n_marked();
         for cell in occupied.cells() {
             let is_floating =
                 is_floater_size(sizes[groups.representative(cell) as usize], n_occupied);
@@ -76,6 +80,7 @@ impl CellLabels {
 
     /// Also keeps the cells around those of large parts.
     pub(crate) fn keep_around(&mut self, grid: &CellGrid) {
+        // From a copy: otherwise the cells that were just added would spread, too.
         let inner = self.kept.clone();
         self.kept
             .extend(inner.cells().flat_map(|cell| grid.neighbors(cell)));

@@ -18,13 +18,16 @@ impl Groups {
 
     /// Connects two items.
     pub(crate) fn join(&mut self, a: u32, b: u32) {
-        let (a, b) = (self.representative(a), self.representative(b));
+        let a = self.representative(a);
+        let b = self.representative(b);
+        // The smaller index wins, so the representative does not depend on the order of joining.
         self.parents[a.max(b) as usize] = a.min(b);
     }
 
     /// The representative of an item's group. Shortens the path to it.
     pub(crate) fn representative(&mut self, mut item: u32) -> u32 {
         while self.parents[item as usize] != item {
+            // Path halving keeps paths short, so that joining n pairs takes almost linear time.
             let parent = self.parents[item as usize];
             self.parents[item as usize] = self.parents[parent as usize];
             item = parent;

@@ -21,13 +21,16 @@ use std::io::ErrorKind;
 use std::path::Path;
 use stored::StoredEdit;
 
-/// Maximum number of edits of a model.
+/// Maximum number of edits of a model. Kernels test every point against every edit, so a larger
+/// number makes renders slower.
 pub const MAX_EDITS: usize = 64;
-/// Largest absolute coordinate of an edit, meters. Products of such numbers are finite in f32.
+/// Largest absolute coordinate of an edit, meters. Products of two or three such numbers are finite
+/// in f32, whose largest number is 3.4e38.
 const MAX_COORD_M: f64 = 1e9;
 /// Name of the file in a model folder.
 const FILE: &str = "edits.json";
-/// Words of an edit in [`Edits::words`], in groups of four.
+/// Words of an edit in [`Edits::words`], in groups of four: three rows of a transform, and two
+/// groups that depend on the kind of edit.
 const GROUPS_PER_EDIT: usize = 5;
 
 /// One edit.
@@ -148,8 +151,8 @@ impl Edits {
     /// Fails if the file cannot be read or is damaged.
     pub fn read(model: &Path) -> Result<Self, Error> {
         let path = model.join(FILE);
-        // Anything else with this name, such as a broken link, is an error: erased parts would
-        // return without it.
+        // Anything else with this name, such as a broken link, is an error, because erased parts
+        // would otherwise reappear.
         if let Err(error) = path.symlink_metadata()
             && matches!(error.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory)
         {
@@ -171,6 +174,7 @@ impl Edits {
     /// Fails if the file cannot be written or removed.
     pub fn write(&self, folder: &Path) -> Result<(), Error> {
         let path = folder.join(FILE);
+        // A file that is left over would erase parts again when the model is loaded.
         if self.is_empty() {
             return match std::fs::remove_file(&path) {
                 Err(source) if source.kind() != std::io::ErrorKind::NotFound => {
@@ -194,6 +198,8 @@ impl Edits {
     ///
     /// * `world_from_drawn`: maps points of the kernel to world, meters.
     pub(crate) fn words(&self, world_from_drawn: &Matrix4<f64>) -> Vec<[u32; 4]> {
+        // All edits have the same size, so that a kernel finds each one by its index. The ranges of
+        // cells vary in number, so they follow after the last edit, which refers to them.
         let n = u32::try_from(self.len()).expect("at most 64");
         let mut words = vec![[n, 0, 0, 0]];
         let mut ranges: Vec<[u32; 4]> = Vec::new();
@@ -216,11 +222,13 @@ impl Edits {
 /// The data of a box: rows of its transform, and its corners. A last word of 0 marks a box.
 fn box_words(aabb: &Aabb, world_from_drawn: &Matrix4<f64>) -> [[u32; 4]; GROUPS_PER_EDIT] {
     let [x, y, z] = rows(&(aabb.world_from_box.inverse().to_homogeneous() * world_from_drawn));
-    let corner = |corner_m: [f64; 3]| {
-        let [x, y, z] = crate::gpu::f32s_of(corner_m).map(f32::to_bits);
-        [x, y, z, 0]
-    };
-    [x, y, z, corner(aabb.min_m), corner(aabb.max_m)]
+    [x, y, z, corner_words(aabb.min_m), corner_words(aabb.max_m)]
+}
+
+/// A corner of a box, as bits of f32.
+fn corner_words(corner_m: [f64; 3]) -> [u32; 4] {
+    let [x, y, z] = crate::gpu::f32s_of(corner_m).map(f32::to_bits);
+    [x, y, z, 0]
 }
 
 /// The upper three rows of a matrix, as bits of f32.

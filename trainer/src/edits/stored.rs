@@ -23,19 +23,24 @@ pub(super) enum StoredEdit {
 
 impl From<Edits> for Vec<StoredEdit> {
     fn from(edits: Edits) -> Self {
-        let stored = |edit| match edit {
+        edits.0.into_iter().map(StoredEdit::from).collect()
+    }
+}
+
+impl From<Edit> for StoredEdit {
+    fn from(edit: Edit) -> Self {
+        match edit {
             Edit::Box(Aabb {
                 world_from_box,
                 min_m,
                 max_m,
-            }) => StoredEdit::Box {
+            }) => Self::Box {
                 world_from_box: to_rows(&world_from_box),
                 min_m,
                 max_m,
             },
-            Edit::Cells(CellSet { grid, ranges }) => StoredEdit::Cells { grid, ranges },
-        };
-        edits.0.into_iter().map(stored).collect()
+            Edit::Cells(CellSet { grid, ranges }) => Self::Cells { grid, ranges },
+        }
     }
 }
 
@@ -43,6 +48,7 @@ impl TryFrom<Vec<StoredEdit>> for Edits {
     type Error = String;
 
     fn try_from(stored: Vec<StoredEdit>) -> Result<Self, String> {
+        // Files come from users, so they are checked like new edits.
         if stored.len() > MAX_EDITS {
             return Err(format!(
                 "{} edits, expected at most {MAX_EDITS}",

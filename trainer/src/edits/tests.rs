@@ -227,8 +227,8 @@ fn erased(edits: &Edits) -> Vec<bool> {
     points.map(|point_m| edits.erases(point_m)).collect()
 }
 
-/// A field of the table in docs/reference/files.md, a valid value, and invalid values with words of
-/// their errors.
+/// A field of the table in docs/reference/files.md, a valid value, and invalid values with words
+/// that the errors contain.
 type Case = (&'static str, Value, Vec<(Value, &'static str)>);
 
 fn cases() -> [Case; 8] {
@@ -305,7 +305,7 @@ fn cases() -> [Case; 8] {
     ]
 }
 
-/// Changes each field alone.
+/// Changes one field at a time.
 #[test]
 fn every_documented_field_is_used_and_other_values_are_refused() {
     let page = include_str!("../../../docs/reference/files.md");

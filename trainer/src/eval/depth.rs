@@ -14,7 +14,8 @@ pub fn depth_rmse_m(rendered_m: &[f32], truth_m: &[f32]) -> Result<Option<f64>, 
             truth: truth_m.len(),
         });
     }
-    let (mut squares, mut n_known) = (0.0_f64, 0_u32);
+    let mut squares = 0.0_f64;
+    let mut n_known = 0_u32;
     for (&rendered, &truth) in rendered_m.iter().zip(truth_m) {
         if rendered > 0.0 && truth > 0.0 {
             squares += (f64::from(rendered) - f64::from(truth)).powi(2);
@@ -49,6 +50,9 @@ pub fn surface_error(
     rendered_m: &[f32],
     measured: &DepthMap,
 ) -> Result<Option<SurfaceError>, Error> {
+    // Relative difference of depth between neighbors. At an edge, the normal would be that of no
+    // surface. A smaller value leaves out slanted surfaces, too; a larger one counts the rims of
+    // objects.
     const EDGE_FRAC: f64 = 0.04;
     let [width, height] = measured.size_px;
     let n_pixels = width as usize * height as usize;
@@ -63,7 +67,11 @@ pub fn surface_error(
     let pixel = |x: u32, y: u32| y as usize * width as usize + x as usize;
     let z_m = |x: u32, y: u32| f64::from(measured.depth_m[pixel(x, y)]);
     let point = |x: u32, y: u32| measured.point(x, y, z_m(x, y));
-    let (mut sum_m, mut n_rendered, mut n_near, mut n_measured) = (0.0, 0_u32, 0_u32, 0_u32);
+    let mut sum_m = 0.0;
+    let mut n_rendered = 0_u32;
+    let mut n_near = 0_u32;
+    let mut n_measured = 0_u32;
+    // Pixels at the border lack a neighbor.
     for (y, x) in (1..height.saturating_sub(1))
         .flat_map(|y| (1..width.saturating_sub(1)).map(move |x| (y, x)))
     {
@@ -73,6 +81,7 @@ pub fn surface_error(
         if !(z > 0.0 && z.is_finite() && around.into_iter().all(is_on_surface)) {
             continue;
         }
+        // Central differences along both axes span the tangent plane.
         let normal =
             (point(x + 1, y) - point(x - 1, y)).cross(&(point(x, y + 1) - point(x, y - 1)));
         let Some(normal) = normal.try_normalize(0.0) else {
@@ -81,6 +90,9 @@ pub fn surface_error(
         n_measured += 1;
         let rendered = f64::from(rendered_m[pixel(x, y)]);
         if rendered > 0.0 {
+            // A point on a ray is linear in its depth. The offset of the rendered point from the
+            // measured one is therefore the point of the same pixel at the difference of the
+            // depths.
             let distance_m = normal.dot(&measured.point(x, y, rendered - z)).abs();
             sum_m += distance_m;
             n_rendered += 1;

@@ -8,7 +8,9 @@ use std::path::Path;
 
 /// Minimum side length, pixels: the size of the patches to which the weights were fitted.
 const MIN_SIDE_PX: u32 = 64;
-/// Channel means and standard deviations of the inputs, which are between -1 and 1.
+/// Channel means and standard deviations of the inputs, which are between -1 and 1. They are the
+/// usual ones of `ImageNet` for values between 0 and 1 (0.485, 0.456, 0.406 and 0.229, 0.224,
+/// 0.225), doubled, and the means lowered by 1.
 const CHANNEL_MEAN: [f32; 3] = [-0.030, -0.088, -0.188];
 const CHANNEL_DEVIATION: [f32; 3] = [0.458, 0.448, 0.450];
 /// Keeps the normalization of an all-zero feature finite.
@@ -78,6 +80,8 @@ impl Lpips {
     ///
     /// Fails for pictures with a side below 64 pixels, and if all pixels are masked.
     pub fn distance(&self, pair: &PixelPair<'_>) -> Result<f64, Error> {
+        // Smaller pictures would shrink to nothing in the pooling layers, and the weights were not
+        // fitted to them.
         pair.require_side("LPIPS", MIN_SIDE_PX)?;
         if !(0..pair.truth_rgba.len() / 4).any(|ix| pair.is_visible(ix)) {
             return Err(Error::AllPixelsMasked);
@@ -93,6 +97,8 @@ impl Lpips {
         let mut truth = self
             .first
             .forward(&network_input(pair, pair.truth_rgba)?, 0, 2)?;
+        // Pictures pass through the network side by side, so that only the features of one depth
+        // are in memory.
         let mut total = feature_distance(&rendered, &truth, &self.channel_weights[0])?;
         for (stage, weights) in self.stages.iter().zip(&self.channel_weights[1..]) {
             for fire in stage {
@@ -111,6 +117,8 @@ fn network_input(pair: &PixelPair<'_>, rgba: &[u8]) -> candle_core::Result<Tenso
     let mut planes = Vec::with_capacity(3 * n_pixels);
     for color in 0..3 {
         planes.extend((0..n_pixels).map(|ix| {
+            // A masked pixel has the same value in both pictures, so it adds no difference itself.
+            // It still influences the features of its neighbors.
             let value = if pair.is_visible(ix) {
                 f32::from(rgba[4 * ix + color]) / 127.5 - 1.0
             } else {
@@ -136,6 +144,7 @@ fn feature_distance(
         .sum_keepdim(1)?
         .flatten_all()?
         .to_vec1::<f32>()?;
+    // Summed in f64: a large picture has millions of pixels.
     Ok(per_pixel.iter().copied().map(f64::from).sum::<f64>() / per_pixel.len() as f64)
 }
 
@@ -183,6 +192,7 @@ struct Fire {
 
 impl Fire {
     fn of(tensors: &HashMap<String, Tensor>, ix: usize, halve: bool) -> candle_core::Result<Self> {
+        // Names of the layers in torchvision, from which the weights come.
         let part = |name: &str| Convolution::of(tensors, &format!("features.{ix}.{name}"));
         Ok(Self {
             halve,

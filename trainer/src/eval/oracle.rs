@@ -52,8 +52,10 @@ fn metrics_agree_with_the_oracle() {
     let rows = json(&folder.join("oracle_metrics.json"));
     let mut all_agree = true;
     for row in rows.as_array().unwrap() {
-        let (a, b) = (row["a"].as_str().unwrap(), row["b"].as_str().unwrap());
-        let (first, second) = (picture(&folder, a), picture(&folder, b));
+        let a = row["a"].as_str().unwrap();
+        let b = row["b"].as_str().unwrap();
+        let first = picture(&folder, a);
+        let second = picture(&folder, b);
         let pair = PixelPair::new(first.size_px, &first.rgba, &second.rgba).unwrap();
         let expected = |column: &str| row[column].as_f64().unwrap();
         all_agree &= agrees(
@@ -94,7 +96,8 @@ fn lpips_matches_the_oracle_pair_by_pair() {
         .unwrap()
     {
         let (a, b) = names.split_once('|').unwrap();
-        let (first, second) = (picture(&folder, a), picture(&folder, b));
+        let first = picture(&folder, a);
+        let second = picture(&folder, b);
         let pair = PixelPair::new(first.size_px, &first.rgba, &second.rgba).unwrap();
         let expected = row["lpips_squeeze_v0.1"].as_f64().unwrap();
         assert!(agrees(
@@ -111,10 +114,8 @@ fn slightly_brighter_picture_does_not_agree() {
     let Some(folder) = test_support::data_folder("metrics") else {
         return;
     };
-    let (a, b) = (
-        picture(&folder, "fox_a.png"),
-        picture(&folder, "fox_b_noise.png"),
-    );
+    let a = picture(&folder, "fox_a.png");
+    let b = picture(&folder, "fox_b_noise.png");
     // One level brighter everywhere: hardly visible, but every metric must detect it.
     let brighter: Vec<u8> = b
         .rgba
@@ -138,10 +139,8 @@ fn slightly_brighter_picture_does_not_agree() {
     #[cfg(feature = "lpips")]
     {
         let lpips = Lpips::load(&folder.join("lpips_squeeze_v0.1.safetensors")).unwrap();
-        let (got, expected) = (
-            lpips.distance(&wrong).unwrap(),
-            lpips.distance(&right).unwrap(),
-        );
+        let got = lpips.distance(&wrong).unwrap();
+        let expected = lpips.distance(&right).unwrap();
         assert!(!agrees("lpips", got, expected, LPIPS_TOLERANCE));
     }
 }
@@ -153,7 +152,8 @@ fn lpips_ignores_masked_pixels_and_rejects_small_pictures() {
         return;
     };
     let lpips = Lpips::load(&folder.join("lpips_squeeze_v0.1.safetensors")).unwrap();
-    let (a, mut b) = (picture(&folder, "fox_a.png"), picture(&folder, "fox_a.png"));
+    let a = picture(&folder, "fox_a.png");
+    let mut b = picture(&folder, "fox_a.png");
     for pixel in b.rgba.chunks_exact_mut(4).take(5000) {
         pixel.copy_from_slice(&[255, 0, 255, 0]);
     }

@@ -5,10 +5,13 @@ use super::PixelPair;
 use crate::Error;
 use rayon::prelude::*;
 
-/// Side of the window, pixels.
+/// Side of the window, pixels, as in Wang et al. 2004.
 const WINDOW_PX: u32 = 11;
 const WINDOW: usize = WINDOW_PX as usize;
+/// Standard deviation of the Gaussian window, pixels, as in Wang et al. 2004.
 const SIGMA_PX: f64 = 1.5;
+/// The constants `(K1 L)²` and `(K2 L)²` of Wang et al. 2004 for values from 0 to 1 (`L` = 1). They
+/// keep the quotient finite in black and in uniform windows.
 const C1: f32 = 0.01 * 0.01;
 const C2: f32 = 0.03 * 0.03;
 
@@ -51,20 +54,16 @@ struct SumAndDifference {
 impl SumAndDifference {
     fn of(pair: &PixelPair<'_>) -> Self {
         let n_pixels = pair.truth_rgba.len() / 4;
-        let (mut sum, mut difference) = (
-            Vec::with_capacity(3 * n_pixels),
-            Vec::with_capacity(3 * n_pixels),
-        );
+        let mut sum = Vec::with_capacity(3 * n_pixels);
+        let mut difference = Vec::with_capacity(3 * n_pixels);
         for (rendered, truth) in pair
             .rendered_rgba
             .chunks_exact(4)
             .zip(pair.truth_rgba.chunks_exact(4))
         {
             for color in 0..3 {
-                let (rendered, truth) = (
-                    f32::from(rendered[color]) / 255.0,
-                    f32::from(truth[color]) / 255.0,
-                );
+                let rendered = f32::from(rendered[color]) / 255.0;
+                let truth = f32::from(truth[color]) / 255.0;
                 sum.push(rendered + truth);
                 difference.push(rendered - truth);
             }
@@ -87,6 +86,7 @@ fn masked_counts(pair: &PixelPair<'_>) -> Option<Vec<u8>> {
     let masked = |x: usize, y: usize| u8::from(!pair.is_visible(y * width + x));
     let mut counts = vec![0; width * (height - WINDOW + 1)];
     for x in 0..width {
+        // A running count: the window moves down by one row, which gains a pixel and loses another.
         let mut count: u8 = (0..WINDOW).map(|y| masked(x, y)).sum();
         counts[x] = count;
         for y in 1..=height - WINDOW {
@@ -124,11 +124,13 @@ impl RowScratch {
         masked: Option<&[u8]>,
         y: usize,
     ) -> (f64, usize) {
+        // The Gaussian window is separable. Along y first, so that the scratch memory is four rows.
         self.blur_along_y(signal, y);
         self.blur_along_x();
         let n_columns = self.width - WINDOW + 1;
         let masked_row = masked.map(|counts| &counts[y * self.width..(y + 1) * self.width]);
-        let (mut total, mut n_windows) = (0.0, 0);
+        let mut total = 0.0;
+        let mut n_windows = 0;
         for x in 0..n_columns {
             if masked_row.is_some_and(|row| row[x..x + WINDOW].iter().any(|&count| count > 0)) {
                 continue;
@@ -162,6 +164,7 @@ impl RowScratch {
         for (blurred, blurred_y) in self.blurred.iter_mut().zip(&self.blurred_y) {
             blurred.fill(0.0);
             for (offset, &weight) in self.weights.iter().enumerate() {
+                // Colors are interleaved, so the next pixel is three values further.
                 for (out, value) in blurred.iter_mut().zip(&blurred_y[3 * offset..]) {
                     *out += weight * value;
                 }
@@ -173,10 +176,10 @@ impl RowScratch {
     fn ssim_at(&self, ix: usize) -> f32 {
         let [sum, difference, sum_square, difference_square] =
             self.blurred.each_ref().map(|blurred| blurred[ix]);
-        let (sum_variance, difference_variance) = (
-            sum_square - sum * sum,
-            difference_square - difference * difference,
-        );
+        // With s = x + y and d = x - y: s² - d² = 4 x y and s² + d² = 2 (x² + y²). The same
+        // identities hold for means, variances and the covariance.
+        let sum_variance = sum_square - sum * sum;
+        let difference_variance = difference_square - difference * difference;
         let twice_product = (sum * sum - difference * difference) / 2.0;
         let squares = (sum * sum + difference * difference) / 2.0;
         let twice_covariance = (sum_variance - difference_variance) / 2.0;
@@ -217,7 +220,8 @@ mod tests {
 
     #[test]
     fn equal_pictures_score_one_and_unrelated_ones_near_zero() {
-        let (a, b) = (noise(40 * 30, 1), noise(40 * 30, 2));
+        let a = noise(40 * 30, 1);
+        let b = noise(40 * 30, 2);
         let same = ssim(&PixelPair::new([40, 30], &a, &a).unwrap()).unwrap();
         assert!((same - 1.0).abs() < 1e-6, "{same}");
         let unrelated = ssim(&PixelPair::new([40, 30], &a, &b).unwrap()).unwrap();

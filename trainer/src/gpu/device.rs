@@ -12,15 +12,17 @@ use std::sync::mpsc::RecvTimeoutError;
 use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
-/// Interval between checks of the device while waiting for a read-back.
+/// Interval between checks of the device while waiting for a read-back. It delays only the
+/// detection of a lost device.
 const CHECK_PERIOD: Duration = Duration::from_millis(100);
 /// Size of the memory blocks that small buffers share on a software adapter: the smallest size that
 /// wgpu accepts.
 const SOFTWARE_BLOCK_BYTES: u64 = 4 << 20;
 /// Maximum total size of read-back buffers kept for reuse. A 1024x1024 picture with depth takes 8
-/// MiB.
+/// MiB, so four of them are kept.
 const MAX_IDLE_STAGING_BYTES: u64 = 32 << 20;
-/// Maximum number of read-back buffers kept for reuse.
+/// Maximum number of read-back buffers kept for reuse. Training, pictures and scores read buffers
+/// of different sizes at the same time.
 const MAX_IDLE_STAGING: usize = 8;
 
 /// One GPU, real or software.
@@ -53,6 +55,7 @@ struct LiveBuffers {
 impl LiveBuffers {
     /// Counts a new buffer; returns its label and the total bytes of all buffers.
     fn add(&self, label: &str, bytes: u64) -> (Arc<str>, u64) {
+        // Labels are shared: models create buffers with the same label again and again.
         let mut by_label = self.by_label.lock();
         let key = by_label
             .get_key_value(label)
@@ -96,13 +99,15 @@ impl Health {
             wgpu::Error::Internal { description, .. } => Failure::Driver(description),
             wgpu::Error::Validation { description, .. } => Failure::Invalid(description),
         };
+        // Later errors are usually consequences of the first one.
         self.failed.get_or_init(|| failure);
     }
 
     /// Registers callbacks that record the errors of a device.
     fn of(device: &wgpu::Device) -> Arc<Self> {
         let health = Arc::<Self>::default();
-        let (on_loss, on_error) = (health.clone(), health.clone());
+        let on_loss = health.clone();
+        let on_error = health.clone();
         device.set_device_lost_callback(move |reason, message| {
             log::debug!("the device was lost ({reason:?}): {message}");
             on_loss.lost.get_or_init(|| message);
@@ -126,6 +131,42 @@ fn instance() -> wgpu::Instance {
         backend_options: wgpu::BackendOptions::default(),
         display: None,
     })
+}
+
+/// The adapter with this index, or the fastest one; a software adapter if there is no other.
+fn find_adapter(
+    instance: &wgpu::Instance,
+    requested: Option<usize>,
+) -> Result<wgpu::Adapter, Error> {
+    let Some(ix) = requested else {
+        return pollster::block_on(instance.request_adapter(&wgpu::RequestAdapterOptions {
+            power_preference: wgpu::PowerPreference::HighPerformance,
+            ..wgpu::RequestAdapterOptions::default()
+        }))
+        .map_err(|_| Error::NoAdapter);
+    };
+    let mut adapters = all_adapters(instance);
+    if ix >= adapters.len() {
+        return Err(Error::NoSuchAdapter {
+            ix,
+            n_adapters: adapters.len(),
+        });
+    }
+    Ok(adapters.swap_remove(ix))
+}
+
+/// Experimental features of wgpu that the optional features need.
+fn experimental_features(optional: Optional) -> wgpu::ExperimentalFeatures {
+    if optional.half_matrices {
+        // SAFETY: kernels with cooperative matrices are our own; each load and store stays
+        // within its array.
+        #[expect(unsafe_code, reason = "cooperative matrices are experimental in wgpu")]
+        unsafe {
+            wgpu::ExperimentalFeatures::enabled()
+        }
+    } else {
+        wgpu::ExperimentalFeatures::disabled()
+    }
 }
 
 fn all_adapters(instance: &wgpu::Instance) -> Vec<wgpu::Adapter> {
@@ -161,44 +202,20 @@ impl Gpu {
     /// other.
     pub fn open(options: &GpuOptions) -> Result<Arc<Self>, Error> {
         let instance = instance();
-        let adapter = match options.adapter {
-            Some(ix) => {
-                let mut adapters = all_adapters(&instance);
-                if ix >= adapters.len() {
-                    return Err(Error::NoSuchAdapter {
-                        ix,
-                        n_adapters: adapters.len(),
-                    });
-                }
-                adapters.swap_remove(ix)
-            }
-            None => pollster::block_on(instance.request_adapter(&wgpu::RequestAdapterOptions {
-                power_preference: wgpu::PowerPreference::HighPerformance,
-                ..wgpu::RequestAdapterOptions::default()
-            }))
-            .map_err(|_| Error::NoAdapter)?,
-        };
+        let adapter = find_adapter(&instance, options.adapter)?;
         let optional = Optional::of(&adapter, options);
+        // All that the adapter has, instead of the defaults of WebGPU: large models need buffers
+        // beyond 128 MiB.
         let mut limits = adapter.limits();
         if let Some(bytes) = options.max_binding_bytes {
             limits.max_storage_buffer_binding_size =
                 limits.max_storage_buffer_binding_size.min(bytes);
         }
-        let experimental_features = if optional.half_matrices {
-            // SAFETY: kernels with cooperative matrices are our own; each load and store stays
-            // within its array.
-            #[expect(unsafe_code, reason = "cooperative matrices are experimental in wgpu")]
-            unsafe {
-                wgpu::ExperimentalFeatures::enabled()
-            }
-        } else {
-            wgpu::ExperimentalFeatures::disabled()
-        };
         let (device, queue) = pollster::block_on(adapter.request_device(&wgpu::DeviceDescriptor {
             label: Some("fieldrig"),
             required_features: optional.features(),
             required_limits: limits.clone(),
-            experimental_features,
+            experimental_features: experimental_features(optional),
             memory_hints: memory_hints(adapter.get_info().device_type),
             ..wgpu::DeviceDescriptor::default()
         }))
@@ -344,6 +361,7 @@ impl Gpu {
     /// Creates a zeroed storage buffer. Fails if the adapter cannot bind it or has no memory for
     /// it.
     pub fn storage(&self, label: &str, bytes: u64) -> Result<Buffer, Error> {
+        // An empty buffer cannot be bound, and arrays of `vec4f` need whole elements.
         let bytes = bytes.max(16).next_multiple_of(16);
         if bytes > self.max_binding_bytes() {
             return Err(Error::BufferTooLarge {
@@ -362,6 +380,8 @@ impl Gpu {
         let usage = wgpu::BufferUsages::STORAGE
             | wgpu::BufferUsages::COPY_SRC
             | wgpu::BufferUsages::COPY_DST;
+        // Callers can react to a lack of memory with smaller buffers. Outside of an error scope, it
+        // would be recorded as a permanent failure of the device.
         let memory = self.device.push_error_scope(wgpu::ErrorFilter::OutOfMemory);
         let buffer = self.buffer(label, bytes, usage);
         pollster::block_on(memory.pop()).map_or(Ok(buffer), |_| Err(full()))
@@ -396,6 +416,7 @@ impl Gpu {
     /// Writes to a buffer before the next submit. Pads `contents` with zeros to a multiple of 4
     /// bytes.
     pub fn write(&self, buffer: &Buffer, offset_bytes: u64, contents: &[u8]) {
+        // wgpu writes only whole words. The tail is copied, so that the rest need not be.
         let whole = contents.len() / 4 * 4;
         self.queue
             .write_buffer(&buffer.raw, offset_bytes, &contents[..whole]);
@@ -452,13 +473,16 @@ impl Gpu {
         mut encoder: wgpu::CommandEncoder,
         reads: &[(&Buffer, usize)],
     ) -> PendingRead {
+        // Copies, too, have whole words only.
         let padded = |n_bytes: usize| n_bytes.next_multiple_of(4);
         let n_all_bytes = reads
             .iter()
             .map(|(_, n_bytes)| padded(*n_bytes) as u64)
             .sum();
         let Some(staging) = self.staging(n_all_bytes) else {
-            self.queue.submit([encoder.finish()]); // The encoded commands still run.
+            // The encoded commands still run, so the state of the model does not depend on the
+            // read.
+            self.queue.submit([encoder.finish()]);
             return PendingRead(Err(n_all_bytes));
         };
         let mut parts = Vec::with_capacity(reads.len());
@@ -492,6 +516,8 @@ impl Gpu {
     fn staging(&self, bytes: u64) -> Option<wgpu::Buffer> {
         let bytes = bytes.max(4);
         let mut idle = self.idle_staging.lock();
+        // Much larger buffers are left for large reads: a read of a few counters would block one
+        // for a picture.
         let fits = |buffer: &wgpu::Buffer| (bytes..=4 * bytes).contains(&buffer.size());
         let found = idle
             .iter()
@@ -501,6 +527,7 @@ impl Gpu {
         if let Some(buffer) = found.map(|(ix, _)| ix).and_then(|ix| idle.remove(ix)) {
             return Some(buffer);
         }
+        // Other threads must be able to return buffers while this one allocates.
         drop(idle);
         let memory = self.device.push_error_scope(wgpu::ErrorFilter::OutOfMemory);
         let staging = self.device.create_buffer(&wgpu::BufferDescriptor {
@@ -541,8 +568,9 @@ impl Gpu {
     }
 
     fn poll(&self, until: wgpu::PollType) -> Result<(), Error> {
-        // wgpu panics if the device is lost during the wait.
-        let _mapping = self.mapped.read(); // Polling maps buffers.
+        // Polling maps buffers, so the device must not be destroyed meanwhile.
+        let _mapping = self.mapped.read();
+        // wgpu panics if the device is lost during the wait. Any other panic is passed on.
         let polled = std::panic::catch_unwind(AssertUnwindSafe(|| self.device.poll(until)));
         match polled {
             Ok(Ok(_)) => Ok(()),
@@ -622,6 +650,7 @@ impl PendingRead {
             submission_index: Some(submission),
             timeout: None,
         })?;
+        // The data are on the host now, but the callback that maps them may still have to run.
         let is_mapped = loop {
             // The callback may run on another waiting thread, and may never run if the device is
             // lost.
@@ -635,10 +664,12 @@ impl PendingRead {
             return Err(gpu.failure());
         }
         let reading = gpu.mapped.read();
-        gpu.check()?; // Before mapped memory is accessed, because destroying the device unmaps it.
+        // Before mapped memory is accessed, because destroying the device unmaps it.
+        gpu.check()?;
         let view = staging.get_mapped_range(..).map_err(|_| gpu.failure())?;
         let read: Vec<&[u8]> = parts.iter().map(|part| &view[part.clone()]).collect();
         let taken = take(&read);
+        // In this order: a buffer must not be unmapped while a view of it exists.
         drop(read);
         drop(view);
         drop(reading);
@@ -736,7 +767,8 @@ mod tests {
             }
         }
         gpu.wait().unwrap();
-        let (live, reserved) = (gpu.live_bytes(), gpu.reserved_bytes().expect("Vulkan"));
+        let live = gpu.live_bytes();
+        let reserved = gpu.reserved_bytes().expect("Vulkan");
         assert!(
             live == 8 * (24 << 20) && reserved <= live + 8 * SOFTWARE_BLOCK_BYTES,
             "{reserved} bytes reserved for {live} bytes"

@@ -76,6 +76,8 @@ impl Passes {
         if n_groups == 0 {
             return;
         }
+        // Folded onto as few rows as possible, of almost equal length: at most one group less than
+        // `rows` is superfluous, and kernels return early in it.
         let rows = n_groups.div_ceil(MAX_GROUPS_PER_AXIS);
         let columns = n_groups.div_ceil(rows);
         assert!(
@@ -83,27 +85,9 @@ impl Passes {
             "{}: {n_groups} workgroups exceed the limit of a dispatch",
             pipeline.name
         );
-        let find = |name: &str| {
-            buffers
-                .iter()
-                .find(|(given, _)| *given == name)
-                .map(|(_, buffer)| *buffer)
-        };
-        let found: Option<Vec<&Buffer>> = pipeline
-            .bindings
-            .iter()
-            .map(|binding| find(&binding.name))
-            .collect();
-        let Some(found) = found.filter(|found| found.len() == buffers.len()) else {
-            let reads: Vec<_> = pipeline
-                .bindings
-                .iter()
-                .map(|binding| binding.name.as_str())
-                .collect();
-            let given: Vec<_> = buffers.iter().map(|(name, _)| *name).collect();
-            panic!("kernel {} binds {reads:?}, got {given:?}", pipeline.name);
-        };
+        let found = buffers_by_binding(pipeline, buffers);
         let key = (pipeline.id, found.iter().map(|buffer| buffer.id).collect());
+        // Training repeats the same dispatches thousands of times, with the same buffers.
         let bind_group = self.bind_groups.entry(key).or_insert_with(|| {
             let entries: Vec<_> = pipeline
                 .bindings
@@ -187,6 +171,8 @@ impl Passes {
     ///
     /// Returns `None` if the adapter has no timestamps.
     pub fn submit_timed_total(&mut self, gpu: &Gpu) -> Result<Option<f64>, Error> {
+        // Two timestamps around the whole list, unlike in `submit_timed`: a pass per kernel would
+        // add time between kernels that a submit in training does not spend.
         let timed = gpu.optional.timestamps;
         let queries = timed.then(|| {
             gpu.device.create_query_set(&wgpu::QuerySetDescriptor {
@@ -201,6 +187,7 @@ impl Passes {
             usage: wgpu::BufferUsages::QUERY_RESOLVE | wgpu::BufferUsages::COPY_SRC,
             mapped_at_creation: false,
         });
+        // Queries can be resolved only into a buffer of its own usage, from which they are copied.
         let copy = gpu.storage("span.copy", 16)?;
         let mut encoder = gpu
             .device
@@ -231,6 +218,8 @@ impl Passes {
             gpu.wait()?;
             return Ok(Vec::new());
         }
+        // A timestamp can only be written at the boundaries of a pass, so every kernel gets its
+        // own.
         let n = u32_of(self.list.len() as u64);
         let queries = gpu.device.create_query_set(&wgpu::QuerySetDescriptor {
             label: Some("timing"),
@@ -272,6 +261,7 @@ impl Passes {
         gpu.queue.submit([encoder.finish()]);
         let ticks: Vec<u64> = gpu.read(&copy, n_stamps)?;
         let nanos_per_tick = f64::from(gpu.queue.get_timestamp_period());
+        // Saturating, in case a driver reports an end before its beginning.
         let millis = |span: &[u64]| span[1].saturating_sub(span[0]) as f64 * nanos_per_tick / 1e6;
         Ok(names
             .into_iter()
@@ -282,6 +272,33 @@ impl Passes {
             })
             .collect())
     }
+}
+
+/// The buffers of a dispatch in the order of the kernel's bindings.
+fn buffers_by_binding<'b>(pipeline: &Pipeline, buffers: &[(&str, &'b Buffer)]) -> Vec<&'b Buffer> {
+    let found: Option<Vec<&Buffer>> = pipeline
+        .bindings
+        .iter()
+        .map(|binding| buffer_named(buffers, &binding.name))
+        .collect();
+    // A buffer that the kernel does not bind is a mistake, too: probably a typo in its name.
+    let Some(found) = found.filter(|found| found.len() == buffers.len()) else {
+        let reads: Vec<_> = pipeline
+            .bindings
+            .iter()
+            .map(|binding| binding.name.as_str())
+            .collect();
+        let given: Vec<_> = buffers.iter().map(|(name, _)| *name).collect();
+        panic!("kernel {} binds {reads:?}, got {given:?}", pipeline.name);
+    };
+    found
+}
+
+fn buffer_named<'b>(buffers: &[(&str, &'b Buffer)], name: &str) -> Option<&'b Buffer> {
+    buffers
+        .iter()
+        .find(|(given, _)| *given == name)
+        .map(|(_, buffer)| *buffer)
 }
 
 /// Encodes an empty pass that writes one timestamp at its beginning or end.
@@ -307,6 +324,8 @@ fn encode_all(encoder: &mut wgpu::CommandEncoder, list: impl Iterator<Item = Pas
     while let Some(pass) = passes.next() {
         match pass {
             Pass::Clear { .. } | Pass::Copy { .. } => transfer(encoder, &pass),
+            // Successive kernels share one compute pass, in which wgpu inserts the barriers between
+            // dispatches.
             first @ Pass::Dispatch { .. } => {
                 let mut compute =
                     encoder.begin_compute_pass(&wgpu::ComputePassDescriptor::default());

@@ -36,7 +36,10 @@ impl Pipeline {
         overrides: &[(&str, f64)],
     ) -> Result<Self, Error> {
         let module = reflect(name, text)?;
-        let (bytes, limit_bytes) = (wgsl::workgroup_bytes(&module), gpu.max_workgroup_bytes());
+        // Checked here, so that the error has the numbers. wgpu would report an invalid pipeline
+        // later, which looks like a bug of this program.
+        let bytes = wgsl::workgroup_bytes(&module);
+        let limit_bytes = gpu.max_workgroup_bytes();
         if bytes > limit_bytes {
             return Err(Error::WorkgroupTooLarge {
                 kernel: name,
@@ -44,6 +47,7 @@ impl Pipeline {
                 limit_bytes,
             });
         }
+        // From the WGSL, so that Rust names no binding numbers, and a wrong name is detected.
         let bindings: Arc<[Binding]> = wgsl::bindings(&module).into();
         let device = &gpu.device;
         let source = wgpu::ShaderSource::Naga(Cow::Owned(module));
@@ -61,23 +65,9 @@ impl Pipeline {
             reason = "a second bound would cost time in every iteration of the innermost loops"
         )]
         let shader = unsafe { device.create_shader_module_trusted(described, checks) };
-        let entries: Vec<wgpu::BindGroupLayoutEntry> = bindings
-            .iter()
-            .map(|binding| wgpu::BindGroupLayoutEntry {
-                binding: binding.number,
-                visibility: wgpu::ShaderStages::COMPUTE,
-                ty: wgpu::BindingType::Buffer {
-                    ty: match binding.access {
-                        Access::Uniform => wgpu::BufferBindingType::Uniform,
-                        Access::Read => wgpu::BufferBindingType::Storage { read_only: true },
-                        Access::ReadWrite => wgpu::BufferBindingType::Storage { read_only: false },
-                    },
-                    has_dynamic_offset: false,
-                    min_binding_size: None,
-                },
-                count: None,
-            })
-            .collect();
+        // Explicit, with all declared buffers: a layout that wgpu derives would lack those that
+        // this variant of the kernel does not use, and `dispatch` would have to know.
+        let entries: Vec<_> = bindings.iter().map(layout_entry).collect();
         let layout = device.create_bind_group_layout(&wgpu::BindGroupLayoutDescriptor {
             label: Some(name),
             entries: &entries,
@@ -94,6 +84,7 @@ impl Pipeline {
             entry_point: Some("main"),
             compilation_options: wgpu::PipelineCompilationOptions {
                 constants: overrides,
+                // Kernels write workgroup memory before they read it.
                 zero_initialize_workgroup_memory: false,
             },
             cache: None,
@@ -118,6 +109,24 @@ impl Pipeline {
             .map(|(kernel, overrides)| Self::new(gpu, kernel, overrides))
             .collect::<Result<_, _>>()?;
         Ok(compiled.try_into().expect("as many pipelines as kernels"))
+    }
+}
+
+fn layout_entry(binding: &Binding) -> wgpu::BindGroupLayoutEntry {
+    let ty = match binding.access {
+        Access::Uniform => wgpu::BufferBindingType::Uniform,
+        Access::Read => wgpu::BufferBindingType::Storage { read_only: true },
+        Access::ReadWrite => wgpu::BufferBindingType::Storage { read_only: false },
+    };
+    wgpu::BindGroupLayoutEntry {
+        binding: binding.number,
+        visibility: wgpu::ShaderStages::COMPUTE,
+        ty: wgpu::BindingType::Buffer {
+            ty,
+            has_dynamic_offset: false,
+            min_binding_size: None,
+        },
+        count: None,
     }
 }
 

@@ -27,6 +27,7 @@ pub(super) struct Key {
 
 impl Key {
     pub(super) fn new(text: String, overrides: &[(&str, f64)]) -> Self {
+        // Bits, because f64 has no `Eq`.
         let bits = overrides
             .iter()
             .map(|(name, value)| ((*name).to_owned(), value.to_bits()));
@@ -51,11 +52,14 @@ impl PipelineCache {
         key: Key,
         compile: impl FnOnce() -> Result<Pipeline, Error>,
     ) -> Result<Pipeline, Error> {
+        // The map is locked only to find the slot, and the slot while compiling. Other kernels
+        // therefore compile at the same time, and the same kernel is not compiled twice.
         let slot = Arc::clone(self.0.lock().entry(key).or_default());
         let mut slot = slot.lock();
         if let Some(compiled) = &*slot {
             return Ok(compiled.clone());
         }
+        // If this fails, the slot stays empty, and the next caller gets the error, too.
         let compiled = compile()?;
         Ok(slot.insert(compiled).clone())
     }

@@ -40,6 +40,8 @@ impl Optional {
         let allowed = options.optional_features;
         let features = adapter.features();
         let info = adapter.get_info();
+        // Kernels compute their lane's place from the size of a subgroup, so it must not vary.
+        // Subgroups of fewer than 4 lanes would save no work.
         let same_size = info.subgroup_min_size == info.subgroup_max_size;
         let subgroups =
             features.contains(wgpu::Features::SUBGROUP) && same_size && info.subgroup_min_size >= 4;
@@ -48,6 +50,7 @@ impl Optional {
             timestamps: allowed && features.contains(wgpu::Features::TIMESTAMP_QUERY),
             half_matrices: allowed
                 && options.matrices
+                // A whole subgroup multiplies each matrix.
                 && subgroups
                 && features.contains(HALF_MATRICES)
                 && has_half_matrices(adapter),

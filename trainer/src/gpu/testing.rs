@@ -2,6 +2,7 @@
 //! Rust and WGSL.
 
 use super::{Gpu, GpuOptions, Kernel, reflect, resolve};
+use crate::Error;
 use parking_lot::Mutex;
 use std::sync::Arc;
 
@@ -100,44 +101,34 @@ pub(crate) type StructLayout = (Vec<(String, usize)>, usize);
 
 /// Asserts that the kernels parse and validate.
 pub(crate) fn assert_valid<'k>(kernels: impl IntoIterator<Item = &'k Kernel>) {
-    let error = |kernel: &Kernel| {
-        let validate = |text: String| reflect(kernel.source.name, &text).map(drop);
-        resolve(kernel.source, kernel.shared)
-            .and_then(validate)
-            .err()
-    };
     let errors: Vec<String> = kernels
         .into_iter()
-        .filter_map(error)
+        .filter_map(validation_error)
         .map(|error| error.to_string())
         .collect();
     assert!(errors.is_empty(), "{}", errors.join("\n"));
 }
 
+/// Why a kernel is invalid; `None` if it is valid.
+fn validation_error(kernel: &Kernel) -> Option<Error> {
+    let validate = |text: String| reflect(kernel.source.name, &text).map(drop);
+    resolve(kernel.source, kernel.shared)
+        .and_then(validate)
+        .err()
+}
+
+/// Parses a kernel that must be valid.
+fn module_of(kernel: &Kernel) -> wgpu::naga::Module {
+    let text = resolve(kernel.source, kernel.shared).unwrap();
+    reflect(kernel.source.name, &text).unwrap()
+}
+
 /// The layout of the WGSL struct `name`. Asserts that all kernels that declare the struct agree.
 pub(crate) fn layout_in_wgsl(kernels: &[Kernel], name: &str) -> StructLayout {
-    let layout = |kernel: &Kernel| {
-        let module = reflect(
-            kernel.source.name,
-            &resolve(kernel.source, kernel.shared).unwrap(),
-        )
-        .unwrap();
-        module
-            .types
-            .iter()
-            .find_map(|(_, found)| match &found.inner {
-                wgpu::naga::TypeInner::Struct { members, span }
-                    if found.name.as_deref() == Some(name) =>
-                {
-                    let fields = members
-                        .iter()
-                        .map(|member| (member.name.clone().unwrap(), member.offset as usize));
-                    Some((fields.collect(), *span as usize))
-                }
-                _ => None,
-            })
-    };
-    let layouts: Vec<StructLayout> = kernels.iter().filter_map(layout).collect();
+    let layouts: Vec<StructLayout> = kernels
+        .iter()
+        .filter_map(|kernel| declared_layout(kernel, name))
+        .collect();
     let first = layouts
         .first()
         .unwrap_or_else(|| panic!("no kernel declares {name}"));
@@ -148,25 +139,32 @@ pub(crate) fn layout_in_wgsl(kernels: &[Kernel], name: &str) -> StructLayout {
     first.clone()
 }
 
+/// The layout of a struct in one kernel; `None` if the kernel does not declare it.
+fn declared_layout(kernel: &Kernel, name: &str) -> Option<StructLayout> {
+    let module = module_of(kernel);
+    module
+        .types
+        .iter()
+        .find_map(|(_, found)| match &found.inner {
+            wgpu::naga::TypeInner::Struct { members, span }
+                if found.name.as_deref() == Some(name) =>
+            {
+                let fields = members
+                    .iter()
+                    .map(|member| (member.name.clone().unwrap(), member.offset as usize));
+                Some((fields.collect(), *span as usize))
+            }
+            _ => None,
+        })
+}
+
 /// The value of the WGSL constant `name`, a u32. Asserts that all kernels that declare the constant
 /// agree.
 pub(crate) fn constant_in_wgsl(kernels: &[Kernel], name: &str) -> u32 {
-    let value = |kernel: &Kernel| {
-        let module = reflect(
-            kernel.source.name,
-            &resolve(kernel.source, kernel.shared).unwrap(),
-        )
-        .unwrap();
-        let (_, constant) = module
-            .constants
-            .iter()
-            .find(|(_, constant)| constant.name.as_deref() == Some(name))?;
-        match module.global_expressions[constant.init] {
-            wgpu::naga::Expression::Literal(wgpu::naga::Literal::U32(value)) => Some(value),
-            ref other => panic!("{name} is {other:?}"),
-        }
-    };
-    let values: Vec<u32> = kernels.iter().filter_map(value).collect();
+    let values: Vec<u32> = kernels
+        .iter()
+        .filter_map(|kernel| declared_constant(kernel, name))
+        .collect();
     let first = *values
         .first()
         .unwrap_or_else(|| panic!("no kernel declares {name}"));
@@ -175,6 +173,19 @@ pub(crate) fn constant_in_wgsl(kernels: &[Kernel], name: &str) -> u32 {
         "{name} differs between kernels: {values:?}"
     );
     first
+}
+
+/// The value of a constant in one kernel; `None` if the kernel does not declare it.
+fn declared_constant(kernel: &Kernel, name: &str) -> Option<u32> {
+    let module = module_of(kernel);
+    let (_, constant) = module
+        .constants
+        .iter()
+        .find(|(_, constant)| constant.name.as_deref() == Some(name))?;
+    match module.global_expressions[constant.init] {
+        wgpu::naga::Expression::Literal(wgpu::naga::Literal::U32(value)) => Some(value),
+        ref other => panic!("{name} is {other:?}"),
+    }
 }
 
 /// Asserts that a struct has these fields, in this order and at the same offsets, in Rust and in

@@ -56,6 +56,7 @@ fn append(
                 kernel: source.name,
                 import: name.to_owned(),
             })?;
+        // Marked before its own imports are resolved, so that imports in a circle end.
         if !seen.contains(&import.name) {
             seen.push(import.name);
             append(*import, shared, seen, text)?;
@@ -70,6 +71,8 @@ pub fn reflect(name: &'static str, text: &str) -> Result<naga::Module, Error> {
         kernel: name,
         message,
     };
+    // All capabilities are allowed here: wgpu checks those of the adapter when it creates the
+    // module.
     let module =
         naga::front::wgsl::parse_str(text).map_err(|error| rejected(error.emit_to_string(text)))?;
     naga::valid::Validator::new(
@@ -108,6 +111,7 @@ pub(super) fn bindings(module: &naga::Module) -> Vec<Binding> {
                 naga::AddressSpace::Storage { .. } => Access::Read,
                 _ => return None,
             };
+            // Private and workgroup variables have no binding, and are no buffers.
             let number = variable.binding.as_ref()?.binding;
             Some(Binding {
                 name: variable.name.clone()?,
@@ -116,6 +120,7 @@ pub(super) fn bindings(module: &naga::Module) -> Vec<Binding> {
             })
         })
         .collect();
+    // A file may declare them in any order, and imports come first.
     found.sort_by_key(|binding| binding.number);
     found
 }

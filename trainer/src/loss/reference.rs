@@ -11,6 +11,7 @@ use super::rendered_image::{RenderedImage, Upstream};
 pub const WINDOW_RADIUS: usize = 5;
 /// Standard deviation of the SSIM window, pixels.
 pub const WINDOW_SIGMA_PX: f64 = 1.5;
+/// The constants `(K1 L)²` and `(K2 L)²` of Wang et al. 2004 for values from 0 to 1 (`L` = 1).
 const C1: f64 = 0.01 * 0.01;
 const C2: f64 = 0.03 * 0.03;
 
@@ -56,10 +57,10 @@ pub struct Loss {
 /// Loss of a rendered image, and its gradient with respect to the image.
 pub fn loss(image: &RenderedImage, target: &Target, weights: &Weights) -> (Loss, Upstream) {
     let n_pixels = target.rgb.len();
-    let (rendered, truth) = (
-        composed(image, target, weights),
-        masked(&target.rgb, target),
-    );
+    // Masked pixels are black in both images, so they have no residual. Windows of SSIM that
+    // contain some still count.
+    let rendered = composed(image, target, weights);
+    let truth = masked(&target.rgb, target);
     let mut upstream = Upstream {
         rgb: vec![[0.0; 3]; n_pixels],
         transmittance: vec![0.0; n_pixels],
@@ -67,13 +68,8 @@ pub fn loss(image: &RenderedImage, target: &Target, weights: &Weights) -> (Loss,
     };
     let mut loss = Loss::default();
     for channel in 0..3 {
-        let plane = |pixels: &[[f64; 3]]| {
-            pixels
-                .iter()
-                .map(|pixel| pixel[channel])
-                .collect::<Vec<_>>()
-        };
-        let (rendered, truth) = (plane(&rendered), plane(&truth));
+        let rendered = plane(&rendered, channel);
+        let truth = plane(&truth, channel);
         let (l1, v_l1) = mean_abs(&rendered, &truth);
         let (ssim, v_ssim) = mean_ssim(target.size_px, &rendered, &truth);
         loss.l1 += l1 / 3.0;
@@ -83,6 +79,8 @@ pub fn loss(image: &RenderedImage, target: &Target, weights: &Weights) -> (Loss,
                 - weights.dssim_frac * v_ssim[pixel_ix])
                 / 3.0;
             upstream.rgb[pixel_ix][channel] = v;
+            // The background is seen through the splats, so the color also depends on the
+            // transmittance.
             upstream.transmittance[pixel_ix] += v * weights.background_rgb[channel];
         }
     }
@@ -91,6 +89,11 @@ pub fn loss(image: &RenderedImage, target: &Target, weights: &Weights) -> (Loss,
         + weights.dssim_frac * loss.dssim
         + weights.depth_per_m * loss.depth_m;
     (loss, upstream)
+}
+
+/// One channel of an image.
+fn plane(pixels: &[[f64; 3]], channel: usize) -> Vec<f64> {
+    pixels.iter().map(|pixel| pixel[channel]).collect()
 }
 
 /// Mean absolute difference and its gradient with respect to `rendered`. The gradient is 0 where
@@ -113,15 +116,20 @@ pub fn mean_ssim(size_px: [usize; 2], rendered: &[f64], truth: &[f64]) -> (f64, 
     let n_pixels = rendered.len() as f64;
     let product = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).collect::<Vec<_>>();
     let blurred = |plane: &[f64]| blurred(size_px, plane);
-    let (mean_x, mean_y) = (blurred(rendered), blurred(truth));
+    let mean_x = blurred(rendered);
+    let mean_y = blurred(truth);
     let mean_xx = blurred(&product(rendered, rendered));
     let mean_yy = blurred(&product(truth, truth));
     let mean_xy = blurred(&product(rendered, truth));
 
     let mut sum = 0.0;
-    let (mut v_mean_x, mut v_mean_xx, mut v_mean_xy) = (Vec::new(), Vec::new(), Vec::new());
+    let mut v_mean_x = Vec::new();
+    let mut v_mean_xx = Vec::new();
+    let mut v_mean_xy = Vec::new();
     for ix in 0..rendered.len() {
-        let (x, y) = (mean_x[ix], mean_y[ix]);
+        let x = mean_x[ix];
+        let y = mean_y[ix];
+        // Numerator and denominator of the two factors of SSIM (Wang et al. 2004, equation 13).
         let luminance = (2.0 * x * y + C1, x * x + y * y + C1);
         let contrast = (
             2.0 * (mean_xy[ix] - x * y) + C2,
@@ -130,16 +138,19 @@ pub fn mean_ssim(size_px: [usize; 2], rendered: &[f64], truth: &[f64]) -> (f64, 
         let denominator = luminance.1 * contrast.1;
         let ssim = luminance.0 * contrast.0 / denominator;
         sum += ssim;
-        // The variances depend on the mean, too, so its gradient has three parts.
-        let (v_variance, v_covariance) = (-ssim / contrast.1, 2.0 * luminance.0 / denominator);
+        // The variances depend on the mean, too, so its gradient has three parts: directly, through
+        // variance = mean_xx - x², and through covariance = mean_xy - x y.
+        let v_variance = -ssim / contrast.1;
+        let v_covariance = 2.0 * luminance.0 / denominator;
         let v_luminance = 2.0 * y * contrast.0 / denominator - 2.0 * x * ssim / luminance.1;
         v_mean_x.push((v_luminance - 2.0 * x * v_variance - y * v_covariance) / n_pixels);
         v_mean_xx.push(v_variance / n_pixels);
         v_mean_xy.push(v_covariance / n_pixels);
     }
     // The window is symmetric, so blurring is its own transpose.
-    let (by_mean, by_square, by_product) =
-        (blurred(&v_mean_x), blurred(&v_mean_xx), blurred(&v_mean_xy));
+    let by_mean = blurred(&v_mean_x);
+    let by_square = blurred(&v_mean_xx);
+    let by_product = blurred(&v_mean_xy);
     let v = (0..rendered.len())
         .map(|ix| by_mean[ix] + 2.0 * rendered[ix] * by_square[ix] + truth[ix] * by_product[ix]);
     (sum / n_pixels, v.collect())
@@ -162,6 +173,8 @@ fn depth(
     {
         // Compares the rendered depth with the true depth; both are weighted by the coverage.
         let residual_m = image.depth[pixel_ix] - (1.0 - image.transmittance[pixel_ix]) * depth_m;
+        // A clipped residual has no gradient: beyond the clip, the splats in this pixel belong to
+        // another surface, and pulling them would not help.
         sum += residual_m.abs().min(weights.depth_clip_m);
         if residual_m.abs() < weights.depth_clip_m {
             let v = weights.depth_per_m * sign(residual_m) / n_pixels;
@@ -174,20 +187,18 @@ fn depth(
 
 /// The render over the background; black where the target is masked.
 fn composed(image: &RenderedImage, target: &Target, weights: &Weights) -> Vec<[f64; 3]> {
-    let over = |(rgb, transmittance): (&[f64; 3], &f64)| {
-        std::array::from_fn(|channel| {
-            rgb[channel] + transmittance * weights.background_rgb[channel]
-        })
-    };
-    masked(
-        &image
-            .rgb
-            .iter()
-            .zip(&image.transmittance)
-            .map(over)
-            .collect::<Vec<_>>(),
-        target,
-    )
+    let over_background: Vec<_> = image
+        .rgb
+        .iter()
+        .zip(&image.transmittance)
+        .map(|(rgb, transmittance)| over(rgb, *transmittance, &weights.background_rgb))
+        .collect();
+    masked(&over_background, target)
+}
+
+/// A premultiplied color over a background.
+fn over(rgb: &[f64; 3], transmittance: f64, background_rgb: &[f64; 3]) -> [f64; 3] {
+    std::array::from_fn(|channel| rgb[channel] + transmittance * background_rgb[channel])
 }
 
 fn masked(rgb: &[[f64; 3]], target: &Target) -> Vec<[f64; 3]> {
@@ -210,19 +221,38 @@ pub fn window() -> [f64; 2 * WINDOW_RADIUS + 1] {
 /// Convolution with the window along x, then along y; 0 outside the borders.
 fn blurred(size_px: [usize; 2], plane: &[f64]) -> Vec<f64> {
     let [width, height] = size_px;
-    let window = window();
-    let along = |plane: &[f64], stride: usize, ix: usize, position: usize, side: usize| -> f64 {
-        let first = WINDOW_RADIUS.saturating_sub(position);
-        let end = window.len().min(side + WINDOW_RADIUS - position);
-        (first..end)
-            .map(|tap| window[tap] * plane[ix + stride * tap - stride * WINDOW_RADIUS])
-            .sum()
+    let along_x = Axis {
+        stride: 1,
+        side: width,
     };
-    let by_x: Vec<_> = (0..plane.len())
-        .map(|ix| along(plane, 1, ix, ix % width, width))
-        .collect();
+    let along_y = Axis {
+        stride: width,
+        side: height,
+    };
+    blurred_along(along_y, &blurred_along(along_x, plane))
+}
+
+/// An axis of an image that is stored row by row.
+struct Axis {
+    /// Difference of the indices of two neighboring pixels.
+    stride: usize,
+    /// Number of pixels.
+    side: usize,
+}
+
+/// Convolution with the window along one axis.
+fn blurred_along(Axis { stride, side }: Axis, plane: &[f64]) -> Vec<f64> {
+    let window = window();
     (0..plane.len())
-        .map(|ix| along(&by_x, width, ix, ix / width, height))
+        .map(|ix| {
+            // Taps outside the image multiply zeros, so they are left out.
+            let position = ix / stride % side;
+            let first = WINDOW_RADIUS.saturating_sub(position);
+            let end = window.len().min(side + WINDOW_RADIUS - position);
+            (first..end)
+                .map(|tap| window[tap] * plane[ix + stride * tap - stride * WINDOW_RADIUS])
+                .sum()
+        })
         .collect()
 }
 
@@ -355,12 +385,14 @@ mod tests {
     fn ssim_matches_its_definition() {
         let (image, target) = image_and_target();
         let plane = |pixels: &[[f64; 3]]| pixels.iter().map(|pixel| pixel[1]).collect::<Vec<_>>();
-        let (x, y) = (plane(&image.rgb), plane(&target.rgb));
+        let x = plane(&image.rgb);
+        let y = plane(&target.rgb);
         let weight = |dx: i32, dy: i32| (-f64::from(dx * dx + dy * dy) / (2.0 * 1.5 * 1.5)).exp();
         let total: f64 = (-5..=5)
             .flat_map(|dy| (-5..=5).map(move |dx| weight(dx, dy)))
             .sum();
-        let (width, height) = (17_i32, 14_i32);
+        let width = 17_i32;
+        let height = 14_i32;
         let at = |plane: &[f64], column: i32, row: i32| {
             let inside = (0..width).contains(&column) && (0..height).contains(&row);
             if inside {
@@ -378,7 +410,8 @@ mod tests {
                     .map(|(dx, dy)| weight(dx, dy) / total * value(column + dx, row + dy))
                     .sum()
             };
-            let (mx, my) = (mean(&|c, r| at(&x, c, r)), mean(&|c, r| at(&y, c, r)));
+            let mx = mean(&|c, r| at(&x, c, r));
+            let my = mean(&|c, r| at(&y, c, r));
             let vx = mean(&|c, r| (at(&x, c, r) - mx).powi(2));
             let vy = mean(&|c, r| (at(&y, c, r) - my).powi(2));
             let vxy = mean(&|c, r| (at(&x, c, r) - mx) * (at(&y, c, r) - my));

@@ -153,17 +153,16 @@ impl MeanColor {
 /// Mean color of an image, 0 to 255.
 fn mean_srgb(keyframe: &Keyframe) -> [f64; 3] {
     let pixels = keyframe.rgba_srgb.as_chunks::<4>().0;
-    let sum = |channel: usize| {
-        pixels
-            .iter()
-            .map(|pixel| f64::from(pixel[channel]))
-            .sum::<f64>()
-    };
-    [0, 1, 2].map(|channel| sum(channel) / pixels.len().max(1) as f64)
+    [0, 1, 2].map(|channel| channel_sum(pixels, channel) / pixels.len().max(1) as f64)
+}
+
+fn channel_sum(pixels: &[[u8; 4]], channel: usize) -> f64 {
+    pixels.iter().map(|pixel| f64::from(pixel[channel])).sum()
 }
 
 impl Recalibrate for MeanColor {
     fn recalibrate(&mut self, keyframes: &[CorrectedKeyframe], _: &Alignment) -> Result<(), Error> {
+        // The mean does not depend on poses. It restarts anyway, as an example for models that do.
         *self = Self::new(self.options.clone());
         keyframes
             .iter()

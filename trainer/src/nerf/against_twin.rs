@@ -69,11 +69,13 @@ fn check_weights(
     expected: &[f64],
     abs: [f64; 2],
 ) {
-    let (mut got, mut expected) = (got, expected);
+    let mut got = got;
+    let mut expected = expected;
     for (layer, ([n_in, n_out], [n_in_padded, n_out_padded])) in layers(twin, widths).enumerate() {
         let (here, others) = got.split_at((n_in_padded * n_out_padded) as usize);
         for (at, got) in here.iter().enumerate() {
-            let (row, column) = (at / n_in_padded as usize, at % n_in_padded as usize);
+            let row = at / n_in_padded as usize;
+            let column = at % n_in_padded as usize;
             let is_real = row < n_out && column < n_in;
             let expected = if is_real {
                 expected[row * n_in + column]
@@ -119,6 +121,14 @@ struct Bench {
     image_params: Buffer,
 }
 
+/// Middle of a sample in the unit cube.
+fn point_of(ray: &Ray, [begin, end]: &[f64; 2]) -> [f32; 4] {
+    let at =
+        std::array::from_fn(|axis| ray.origin[axis] + 0.5 * (begin + end) * ray.direction[axis]);
+    let [x, y, z] = f32s_of(contract(at));
+    [x, y, z, 0.0]
+}
+
 fn bench(options: &GpuOptions, twin: &Field, rays: &[Ray], scales: &[f32]) -> Bench {
     let gpu = test_gpu_with(options);
     let widths = Widths::new(
@@ -148,7 +158,9 @@ fn bench(options: &GpuOptions, twin: &Field, rays: &[Ray], scales: &[f32]) -> Be
             ..Batch::of(n_rays)
         }),
     );
-    let (mut gpu_rays, mut spans, mut points) = (Vec::new(), Vec::new(), Vec::new());
+    let mut gpu_rays = Vec::new();
+    let mut spans = Vec::new();
+    let mut points = Vec::new();
     for (ray, embedding) in rays.iter().zip(0..) {
         let byte = |value: f64| u32::from(format!("{:.0}", 255.0 * value).parse::<u8>().unwrap());
         let [red, green, blue] = ray.target.rgb.map(byte);
@@ -169,14 +181,7 @@ fn bench(options: &GpuOptions, twin: &Field, rays: &[Ray], scales: &[f32]) -> Be
             sample: 0,
         };
         spans.extend(ray.spans.iter().map(span));
-        let point = |[begin, end]: &[f64; 2]| {
-            let at = std::array::from_fn(|axis| {
-                ray.origin[axis] + 0.5 * (begin + end) * ray.direction[axis]
-            });
-            let [x, y, z] = f32s_of(contract(at));
-            [x, y, z, 0.0]
-        };
-        points.extend(ray.spans.iter().flat_map(point));
+        points.extend(ray.spans.iter().flat_map(|span| point_of(ray, span)));
     }
     let slot = RaySlot::new(&gpu, n_rays + 3).unwrap();
     gpu.write(&slot.rays, 0, bytemuck::cast_slice(&gpu_rays));
@@ -261,7 +266,8 @@ fn expected(twin: &Field, rays: &[Ray]) -> FieldGrad {
 }
 
 fn check_colors_and_gradients(options: &GpuOptions) {
-    let (twin, rays) = (field(7), rays());
+    let twin = field(7);
+    let rays = rays();
     let expected = expected(&twin, &rays);
     let largest = expected
         .table
@@ -358,7 +364,8 @@ fn check_colors_and_gradients(options: &GpuOptions) {
 
 /// Rendered colors differ from the twin because skipped samples take the color of the selected one.
 fn check_pictures(options: &GpuOptions) {
-    let (twin, rays) = (field(7), rays());
+    let twin = field(7);
+    let rays = rays();
     let bench = bench(options, &twin, &rays, &vec![1.0; twin.shape.n_cells.len()]);
     let Bench {
         gpu,
@@ -457,7 +464,8 @@ fn check_image_param_gradients(options: &GpuOptions) {
     const N_IMAGES: usize = (N_RAYS as usize).div_ceil(RAYS_PER_IMAGE);
     const ALL: u32 = (1 << params::IMAGE_PARAM_STRIDE) - 1;
     const RATES: [f64; 3] = [0.25, 0.125, 0.0625];
-    let (twin, rays) = (field(7), rays());
+    let twin = field(7);
+    let rays = rays();
     // Rotation, translation and appearance embedding gradients of each ray.
     let expected: Vec<[[f64; 3]; 3]> = rays
         .iter()
@@ -544,14 +552,10 @@ fn check_image_param_gradients(options: &GpuOptions) {
         for (ix, (got, expected)) in got.iter().zip(&expected).enumerate() {
             let samples = of_images[ix].first_sample as usize
                 ..(of_images[ix].first_sample + of_images[ix].n_samples) as usize;
-            let embedding = |axis: usize| {
-                v_embeddings[samples.clone()]
-                    .iter()
-                    .map(|v| v[axis])
-                    .sum::<f32>()
-            };
+            let of_ray = &v_embeddings[samples];
             for axis in 0..3 {
-                for (part, got) in [got[0][axis], got[1][axis], embedding(axis)]
+                let embedding = of_ray.iter().map(|v| v[axis]).sum::<f32>();
+                for (part, got) in [got[0][axis], got[1][axis], embedding]
                     .into_iter()
                     .enumerate()
                 {
@@ -577,7 +581,8 @@ fn check_image_param_gradients(options: &GpuOptions) {
                     );
                     continue;
                 }
-                let (part, axis) = (image_param / 3, image_param % 3);
+                let part = image_param / 3;
+                let axis = image_param % 3;
                 let sum: f64 = of_image.iter().map(|ray| ray[part][axis]).sum();
                 let [value, first, second, n_steps] = got.map(f64::from);
                 let label = |name: &str| format!("image {image}, parameter {image_param}, {name}");
@@ -800,7 +805,8 @@ fn optimizer_steps_match_twin() {
 /// Checks the first step of the weights against the summed gradients of the kernels. The twin's
 /// gradients differ too much from f16 gradients to predict the sign of a small gradient.
 fn check_first_step(options: &GpuOptions) {
-    let (twin, rays) = (field(7), rays());
+    let twin = field(7);
+    let rays = rays();
     let bench = bench(options, &twin, &rays, &vec![1.0; twin.shape.n_cells.len()]);
     let Bench {
         gpu,
@@ -851,7 +857,8 @@ fn check_first_step(options: &GpuOptions) {
         .zip(before)
         .enumerate()
     {
-        let (derivative, before) = (f64::from(derivative), f64::from(before));
+        let derivative = f64::from(derivative);
+        let before = f64::from(before);
         let expected = before - 0.01 * (derivative / (derivative.abs() + 1e-4) + 0.5 * before);
         mismatches.check(format!("weight {ix}"), got[ix].into(), expected, 2e-5, 1e-5);
         n_moved += usize::from(derivative.abs() > 1e-5);
@@ -865,7 +872,8 @@ fn check_first_step(options: &GpuOptions) {
 
 #[test]
 fn saturated_gradients_are_counted_and_skipped() {
-    let (twin, rays) = (field(7), rays());
+    let twin = field(7);
+    let rays = rays();
     let bench = bench(
         &GpuOptions::default(),
         &twin,

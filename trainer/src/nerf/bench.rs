@@ -4,12 +4,12 @@
 //! has a known number of samples. Their colors are noise. The occupancy is not updated.
 
 use super::field_trainer::{Compiled, FieldTrainer, STEPS_PER_SUBMIT};
-use super::options::NerfBudget;
+use super::options::{NerfBudget, NerfOptions};
 use super::params::Ray;
 use super::reference::grid::GridShape;
 use super::sizes::Sizes;
 use crate::Error;
-use crate::gpu::{Gpu, PassTiming, f32_of, f32s_of};
+use crate::gpu::{Gpu, PassTiming, PendingRead, f32_of, f32s_of};
 use crate::model_options::ModelOptions;
 use calibration::ParamSet;
 use kinematics::random::{hash, unit_from_bits};
@@ -67,21 +67,21 @@ pub fn time_steps(
         nerf_budget,
     };
     let compiled = Arc::new(Compiled::new(gpu, &sizes.nerf_budget)?);
-    let mut field_trainer = FieldTrainer::new(gpu, &options, sizes, compiled)?;
-    let rays = synthetic_rays(nerf_budget);
-    let submit = |field_trainer: &mut FieldTrainer, n_steps: usize| {
-        for slot_ix in 0..n_steps {
-            field_trainer.record_step(gpu, &options, slot_ix, STEP, &rays, ParamSet::empty())?;
-        }
-        Ok::<_, crate::Error>(field_trainer.submit(gpu))
+    let field_trainer = FieldTrainer::new(gpu, &options, sizes, compiled)?;
+    let mut timed_field = TimedField {
+        gpu,
+        options,
+        field_trainer,
+        rays: synthetic_rays(nerf_budget),
     };
-    submit(&mut field_trainer, STEPS_PER_SUBMIT)?.finish::<u32>(gpu)?;
+    // The first submit allocates buffers, so it is not timed.
+    timed_field.submit()?.finish::<u32>(gpu)?;
     let n_submits = n_repeats.div_ceil(STEPS_PER_SUBMIT);
     let since = Instant::now();
     let mut before = None;
     for _ in 0..n_submits {
         // As in training, encode the next submit while the previous one runs.
-        if let Some(before) = before.replace(submit(&mut field_trainer, STEPS_PER_SUBMIT)?) {
+        if let Some(before) = before.replace(timed_field.submit()?) {
             before.finish::<u32>(gpu)?;
         }
     }
@@ -91,29 +91,9 @@ pub fn time_steps(
     };
     let step_wall_millis =
         since.elapsed().as_secs_f64() * 1e3 / (n_submits * STEPS_PER_SUBMIT) as f64;
-    let timed = |field_trainer: &mut FieldTrainer,
-                 list: &dyn Fn(&mut FieldTrainer) -> Result<(), Error>| {
-        let mut timed = Vec::new();
-        for _ in 0..n_repeats.max(1) {
-            list(field_trainer)?;
-            let since = Instant::now();
-            let passes = field_trainer.submit_timed(gpu)?;
-            let wall = since.elapsed().as_secs_f64() * 1e3;
-            let sum = if passes.is_empty() {
-                wall
-            } else {
-                passes.iter().map(|pass| pass.millis).sum()
-            };
-            timed.push((sum, passes));
-        }
-        timed.sort_by(|(a, _), (b, _)| a.total_cmp(b));
-        Ok::<_, crate::Error>(timed.swap_remove(timed.len() / 2))
-    };
-    let (step_millis, passes) = timed(&mut field_trainer, &|field_trainer| {
-        field_trainer.record_step(gpu, &options, 0, STEP, &rays, ParamSet::empty())
-    })?;
-    let (colors_millis, _) = timed(&mut field_trainer, &|field_trainer| {
-        field_trainer.record_colors(gpu)
+    let (step_millis, passes) = timed_field.median(n_repeats, |field| field.record_step(0))?;
+    let (colors_millis, _) = timed_field.median(n_repeats, |field| {
+        field.field_trainer.record_colors(field.gpu)
     })?;
     Ok(StepFigures {
         n_rays,
@@ -126,6 +106,58 @@ pub fn time_steps(
     })
 }
 
+/// A field whose steps are timed, and the rays on which they train.
+struct TimedField<'a> {
+    gpu: &'a Gpu,
+    options: ModelOptions<NerfOptions>,
+    field_trainer: FieldTrainer,
+    rays: Vec<Ray>,
+}
+
+impl TimedField<'_> {
+    fn record_step(&mut self, slot_ix: usize) -> Result<(), Error> {
+        self.field_trainer.record_step(
+            self.gpu,
+            &self.options,
+            slot_ix,
+            STEP,
+            &self.rays,
+            ParamSet::empty(),
+        )
+    }
+
+    /// Submits as many steps as training does.
+    fn submit(&mut self) -> Result<PendingRead, Error> {
+        for slot_ix in 0..STEPS_PER_SUBMIT {
+            self.record_step(slot_ix)?;
+        }
+        Ok(self.field_trainer.submit(self.gpu))
+    }
+
+    /// Median time of recorded passes, milliseconds, and the time of each pass in that repetition.
+    fn median(
+        &mut self,
+        n_repeats: usize,
+        record: impl Fn(&mut Self) -> Result<(), Error>,
+    ) -> Result<(f64, Vec<PassTiming>), Error> {
+        let mut timed = Vec::new();
+        for _ in 0..n_repeats.max(1) {
+            record(self)?;
+            let since = Instant::now();
+            let passes = self.field_trainer.submit_timed(self.gpu)?;
+            let wall = since.elapsed().as_secs_f64() * 1e3;
+            let sum = if passes.is_empty() {
+                wall
+            } else {
+                passes.iter().map(|pass| pass.millis).sum()
+            };
+            timed.push((sum, passes));
+        }
+        timed.sort_by(|(a, _), (b, _)| a.total_cmp(b));
+        Ok(timed.swap_remove(timed.len() / 2))
+    }
+}
+
 /// Rays with equal numbers of samples, which together fill the batch.
 fn synthetic_rays(nerf_budget: NerfBudget) -> Vec<Ray> {
     let NerfBudget {
@@ -136,24 +168,25 @@ fn synthetic_rays(nerf_budget: NerfBudget) -> Vec<Ray> {
     } = nerf_budget;
     // Half a step shorter, so that rounding does not change the count.
     let length = 2.0 / f64::from(n_steps) * (f64::from(n_samples / n_rays) - 0.5);
-    let ray = |ix: u32| {
-        let number = |stream: u64| 2.0 * unit_from_bits(hash(u64::from(ix) << 8 | stream)) - 1.0;
-        let triple = |stream: u64| Vector3::from_fn(|axis, _| number(stream + axis as u64));
-        let direction = triple(0).normalize();
-        // Clamped so that the whole ray is in the region where steps have constant length.
-        let origin =
-            (triple(3) * 0.5).map(|along| along.clamp(-0.5, 0.5)) - 0.5 * length * direction;
-        let target = hash(u64::from(ix) << 8 | 6).to_le_bytes();
-        Ray {
-            origin: f32s_of(origin.into()),
-            direction: f32s_of(direction.into()),
-            begin: 0.0,
-            end: f32_of(length),
-            target_rgb: u32::from_le_bytes([target[0], target[1], target[2], 255]),
-            ..Ray::default()
-        }
-    };
-    (0..n_rays).map(ray).collect()
+    (0..n_rays).map(|ix| synthetic_ray(ix, length)).collect()
+}
+
+/// A ray with a random middle near the center, a random direction and a random color.
+fn synthetic_ray(ix: u32, length: f64) -> Ray {
+    let number = |stream: u64| 2.0 * unit_from_bits(hash(u64::from(ix) << 8 | stream)) - 1.0;
+    let triple = |stream: u64| Vector3::from_fn(|axis, _| number(stream + axis as u64));
+    let direction = triple(0).normalize();
+    // Clamped so that the whole ray is in the region where steps have constant length.
+    let origin = (triple(3) * 0.5).map(|along| along.clamp(-0.5, 0.5)) - 0.5 * length * direction;
+    let target = hash(u64::from(ix) << 8 | 6).to_le_bytes();
+    Ray {
+        origin: f32s_of(origin.into()),
+        direction: f32s_of(direction.into()),
+        begin: 0.0,
+        end: f32_of(length),
+        target_rgb: u32::from_le_bytes([target[0], target[1], target[2], 255]),
+        ..Ray::default()
+    }
 }
 
 #[cfg(test)]

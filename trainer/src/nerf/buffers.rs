@@ -68,8 +68,7 @@ pub(crate) struct Occupancy {
     pub(crate) n_cells: u32,
 }
 
-/// Words of the bits of all groups and blocks of cells, and of a whole set, as in
-/// `cell_blocks.wgsl`.
+/// Words of the bits of all groups and blocks of cells, as in `cell_blocks.wgsl`.
 pub(crate) fn n_box_words(n_cells: u32) -> u32 {
     const MAX_BLOCKS: u32 = 16;
     const MAX_GROUPS: u32 = 64;
@@ -90,6 +89,7 @@ impl Occupancy {
         let n = occupancy_update.n_cells.pow(3) as usize;
         let n_set_words = n.div_ceil(32) + n_box_words(occupancy_update.n_cells) as usize;
         Ok(Self {
+            // All bits are set: without hints, rays are sampled everywhere until the first update.
             occupied: gpu.storage_with(
                 "nerf.occupied",
                 &vec![255; 4 * (2 * n_set_words).next_multiple_of(4)],
@@ -191,6 +191,7 @@ impl ImageParamBuffers {
     ) -> Result<Self, Error> {
         let n_images = rule.n_images;
         Ok(Self {
+            // New buffers are filled with zeros.
             image_params: gpu.storage(
                 "nerf.image_params",
                 u64::from(n_images) * (IMAGE_PARAM_STRIDE * size_of::<ImageParam>()) as u64,
@@ -220,6 +221,7 @@ impl FieldBuffers {
             } else {
                 None
             },
+            // Every binding needs a buffer, even if the variant of a kernel does not use it.
             unused_buffer: gpu.storage("nerf.unused", 16)?,
             no_image_params: gpu.storage("nerf.no_image_params", 16)?,
             n_entries: shape.n_entries_total(),
@@ -235,6 +237,7 @@ impl FieldBuffers {
 impl FieldGradients {
     pub(crate) fn new(gpu: &Gpu, shape: &GridShape) -> Result<Self, Error> {
         Ok(Self {
+            // Integers: sums of floats would depend on the order of the atomic additions.
             grid: gpu.storage("nerf.v_grid", 8 * u64::from(shape.n_entries_total()))?,
             scales: gpu.storage("nerf.scales", 4 * shape.n_cells.len() as u64)?,
             counts: gpu.storage("nerf.counts", 8)?,
@@ -288,6 +291,7 @@ impl StepBuffers {
         let floats = |name: &str, n_rows: u32, width: u32| {
             gpu.storage(name, 4 * u64::from(n_rows) * u64::from(width))
         };
+        // Kernels read and write whole tiles of samples.
         let in_tiles =
             u64::from(n_samples.next_multiple_of(N_TILE)) * u64::from(widths.bytes_per_number());
         Ok(Self {

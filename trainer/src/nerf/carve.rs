@@ -13,7 +13,7 @@ const UNBOUNDED: u32 = 0;
 const FREE: u32 = 1 << 30;
 const SURFACE: u32 = 2 << 30;
 /// Maximum distance up to which cells along rays without a reading are marked, in units of the
-/// scene radius.
+/// scene radius. At this distance, contraction leaves only 1 % of the cube's radius beyond.
 const UNBOUNDED_DISTANCE: f64 = 50.0;
 /// Depth readings per ray whose free space is marked. Surfaces and missing readings are processed
 /// at a spacing of half a cell; free space needs fewer rays.
@@ -104,6 +104,8 @@ fn is_small_hole(depth: &DepthMap, [x, y]: [u32; 2]) -> bool {
     };
     let pixels =
         around(y, height).flat_map(|y| around(x, width).map(move |x| (y * width + x) as usize));
+    // A hole, such as a reflection, is surrounded by readings. In a window or the sky, they are
+    // missing all around.
     let (n, n_read) = pixels.fold((0, 0), |(n, n_read), pixel| {
         (
             n + 1,
@@ -115,6 +117,7 @@ fn is_small_hole(depth: &DepthMap, [x, y]: [u32; 2]) -> bool {
 
 /// World width of the cell around a point. Cells in the contracted region are wider.
 fn cell_width(march: &March, point: [f64; 3]) -> f64 {
+    // Contraction scales lengths along a ray by 1 / |x|^2 outside the inner cube.
     4.0 / march.n_cells as f64 * largest(point).1.max(1.0).powi(2)
 }
 
@@ -128,6 +131,8 @@ pub(crate) fn hints(keyframes: &[&Keyframe], extent: &Extent, march: &March) -> 
         surfaces,
     } = keyframes
         .par_iter()
+        // Threads collect sets of their own. Unions do not depend on the order in which they are
+        // joined.
         .fold(empty, |mut cells, keyframe| {
             if let Some(depth) = &keyframe.depth {
                 cells.add_depth_image(depth, extent, march);
@@ -136,6 +141,8 @@ pub(crate) fn hints(keyframes: &[&Keyframe], extent: &Extent, march: &March) -> 
             cells
         })
         .reduce(empty, Cells::and);
+    // A surface outweighs free space, which rays of other images may graze; free space outweighs
+    // missing readings, which prove nothing.
     let unbounded = unbounded.difference(&free).map(|cell| cell | UNBOUNDED);
     let free = free.difference(&surfaces).map(|cell| cell | FREE);
     let nothing = CellSet::new(0);
@@ -185,6 +192,7 @@ impl Cells {
                     (depth.world_from_camera.rotation * along.normalize()).into(),
                 );
                 let is_unbounded = reading_m == 0.0;
+                // The readings around a small hole mark the same cells better.
                 if is_unbounded && is_small_hole(depth, [x, y]) {
                     continue;
                 }
@@ -216,11 +224,6 @@ impl Cells {
         let depth = depth
             .as_ref()
             .map(|depth| (depth, depth.world_from_camera.inverse() * world_from_camera));
-        let is_in_depth = |along: Vector3<f64>| {
-            depth
-                .as_ref()
-                .is_some_and(|(depth, pose)| is_in_depth_image(depth, pose, along))
-        };
         let stride = stride_of(*focal_px, march) as usize;
         let origin = extent
             .in_scene_units(world_from_camera)
@@ -233,7 +236,11 @@ impl Cells {
                 let [right, down] =
                     [0, 1].map(|axis| (coordinate[axis] - principal_px[axis]) / focal_px[axis]);
                 let along = Vector3::new(right, down, 1.0).normalize();
-                if !is_in_depth(along) {
+                // The depth image has the better hints where it sees the same direction.
+                let is_in_depth = depth
+                    .as_ref()
+                    .is_some_and(|(depth, pose)| is_in_depth_image(depth, pose, along));
+                if !is_in_depth {
                     self.mark_along_ray(
                         march,
                         (origin, (world_from_camera.rotation * along).into()),
@@ -251,6 +258,8 @@ impl Cells {
         let cell = |t: f64| march.cell(point(t)).0;
         let width = |t: f64| cell_width(march, point(t));
         let is_unbounded = distance == 0.0;
+        // Free space ends before the reading, by its error and the width of a cell: the cell of the
+        // surface must not be carved.
         let end = if is_unbounded {
             UNBOUNDED_DISTANCE
         } else {
@@ -261,6 +270,7 @@ impl Cells {
         } else {
             &mut self.free
         };
+        // Half a cell per step, so that few of the crossed cells are missed.
         let mut t = 0.0;
         while t < end {
             passed.insert(cell(t));

@@ -8,14 +8,18 @@ use kinematics::{Transform, Twist};
 use nalgebra::{Matrix3, Matrix4, Point3, Vector3};
 use serde::{Deserialize, Serialize};
 
-/// Depth readings per keyframe that are used to estimate the extent.
+/// Depth readings per keyframe that are used to estimate the extent. The extent is a quantile over
+/// all keyframes, so few per keyframe suffice.
 const SAMPLES_PER_KEYFRAME: usize = 64;
-/// Fraction of the readings, on each side along each axis, that may be outside.
+/// Fraction of the readings, on each side along each axis, that may be outside. With a larger
+/// fraction, walls are contracted; with a smaller one, a few wrong readings enlarge the cube, and
+/// cells are wider.
 const OUTSIDE_FRAC: f64 = 0.02;
 /// Readings beyond this multiple of the median depth are ignored, because contraction covers them.
 const FAR_OVER_MEDIAN: f64 = 2.0;
 /// Radius if there is no information, meters.
 const DEFAULT_RADIUS_M: f64 = 1.0;
+/// Minimum radius, meters. It keeps divisions finite if all cameras and readings are at one place.
 const MIN_RADIUS_M: f64 = 0.01;
 /// A scene that extends beyond this many radii needs a new field: contraction leaves too little
 /// resolution there.
@@ -48,19 +52,7 @@ impl Extent {
             return Self::without_depth(keyframes, &cameras);
         };
         visible_points.retain(|(z_m, _)| *z_m <= FAR_OVER_MEDIAN * median_m);
-        let range = |axis: usize| {
-            let mut along: Vec<f64> = visible_points
-                .iter()
-                .map(|(_, point)| point[axis])
-                .collect();
-            let trimmed_range = trimmed_range(&mut along, OUTSIDE_FRAC)
-                .expect("readings at the median depth remain");
-            let camera_coords = cameras.iter().map(|camera| camera[axis]);
-            camera_coords.fold(trimmed_range, |trimmed_range, camera| {
-                [trimmed_range[0].min(camera), trimmed_range[1].max(camera)]
-            })
-        };
-        let ranges = [0, 1, 2].map(range);
+        let ranges = [0, 1, 2].map(|axis| range_along(axis, &visible_points, &cameras));
         let radius_m = ranges
             .iter()
             .map(|[low, high]| 0.5 * (high - low))
@@ -79,10 +71,11 @@ impl Extent {
         // regularized toward the cameras' mean.
         const CENTER_REGULARIZATION: f64 = 1e-3;
         let mean = cameras.iter().sum::<Vector3<f64>>() / cameras.len().max(1) as f64;
-        let (mut normal, mut right) = (
-            Matrix3::identity() * CENTER_REGULARIZATION,
-            mean * CENTER_REGULARIZATION,
-        );
+        let mut normal = Matrix3::identity() * CENTER_REGULARIZATION;
+        let mut right = mean * CENTER_REGULARIZATION;
+        // Normal equations: `across` projects an offset from the camera onto the plane
+        // perpendicular to the axis. Parallel axes alone would give a singular matrix, hence the
+        // regularization.
         for keyframe in keyframes {
             let axis = keyframe.world_from_camera.rotation * Vector3::z();
             let across = Matrix3::identity() - axis * axis.transpose();
@@ -162,14 +155,32 @@ fn depth_samples(keyframe: &Keyframe) -> Vec<(f64, Vector3<f64>)> {
         .zip(depth.depth_m.iter())
         .step_by(step)
         .filter(|(_, z)| **z > 0.0 && z.is_finite());
-    let point = |(ix, z): (u32, &f32)| {
-        let in_camera = depth.point(ix % width, ix / width, f64::from(*z));
-        (
-            f64::from(*z),
-            (depth.world_from_camera * Point3::from(in_camera)).coords,
-        )
-    };
-    valid.map(point).collect()
+    valid
+        .map(|(ix, z)| {
+            let in_camera = depth.point(ix % width, ix / width, f64::from(*z));
+            let in_world = depth.world_from_camera * Point3::from(in_camera);
+            (f64::from(*z), in_world.coords)
+        })
+        .collect()
+}
+
+/// Range that contains all cameras and nearly all points, whose depths are ignored, along an axis.
+fn range_along(
+    axis: usize,
+    visible_points: &[(f64, Vector3<f64>)],
+    cameras: &[Vector3<f64>],
+) -> [f64; 2] {
+    let mut along: Vec<f64> = visible_points
+        .iter()
+        .map(|(_, point)| point[axis])
+        .collect();
+    let of_points =
+        trimmed_range(&mut along, OUTSIDE_FRAC).expect("readings at the median depth remain");
+    // No camera is trimmed: rays begin at cameras, where steps must be short.
+    let camera_coords = cameras.iter().map(|camera| camera[axis]);
+    camera_coords.fold(of_points, |range, camera| {
+        [range[0].min(camera), range[1].max(camera)]
+    })
 }
 
 /// Size of a pixel in the scene, meters: median over the keyframes.

@@ -24,45 +24,59 @@ use kinematics::random::{hash, unit_from_bits};
 use rayon::prelude::*;
 use std::sync::Arc;
 
-/// Maximum number of steps per submit. The rays of all these steps are on the GPU at once.
+/// Maximum number of steps per submit. The rays of all these steps are on the GPU at once, so more
+/// steps need more memory. With fewer, the GPU waits for the host more often.
 pub(crate) const STEPS_PER_SUBMIT: usize = 8;
-/// Steps between two updates of the occupancy.
+/// Steps between two updates of the occupancy, as in Mueller et al. 2022, appendix C.
 const OCCUPANCY_UPDATE_PERIOD: u64 = 16;
 /// First step that updates the occupancy if there is depth. Until then, depth is more reliable than
 /// the field.
 const FIRST_OCCUPANCY_UPDATE_WITH_DEPTH: u64 = 128;
-/// Factor on a cell's previous occupancy at each update.
+/// Factor on a cell's previous occupancy at each update. With a larger factor, cells that became
+/// empty are sampled longer; with a smaller one, a single point that happens to miss a thin object
+/// clears its cell.
 const OCCUPANCY_DECAY: f32 = 0.7;
-/// Fraction of the cells that an update evaluates, limited by the batch size.
+/// Fraction of the cells that an update evaluates, limited by the batch size, whose buffers it
+/// uses. A larger fraction makes updates slower; with a smaller one, cells follow the field with a
+/// longer delay.
 const UPDATED_FRAC: f64 = 0.25;
-/// Maximum number of samples of a training ray, as a multiple of the mean.
+/// Maximum number of samples of a training ray, as a multiple of the mean, so that few rays through
+/// unknown space cannot use up the batch.
 const MAX_SAMPLES_OVER_MEAN: u32 = 4;
 /// Samples per round for a ray of a picture; `MAX_SAMPLES_PER_ROUND` of `find_samples.wgsl`.
 const SAMPLES_PER_ROUND: u32 = 8;
-/// Maximum number of rounds, which limits the length of rays.
+/// Maximum number of rounds, which limits the length of rays: 2048 samples, four times as many as
+/// steps cross the refined inner cube.
 const MAX_ROUNDS: u32 = 256;
-/// Number of rounds for the first picture.
+/// Number of rounds for the first picture, whose need is unknown. If it is too small, the picture
+/// is drawn again; superfluous rounds find no samples.
 const FIRST_ROUNDS: u32 = 16;
 /// The prepass traces one ray per square of this many pixels; `FRONT_STRIDE` of
-/// `picture_rays.wgsl`.
+/// `picture_rays.wgsl`. It costs a 16th of the rays of the picture.
 const FRONT_STRIDE: u32 = 4;
 /// Initial range of the entries (Mueller et al. 2022, section 4).
 const INITIAL_ENTRY_RANGE: f64 = 1e-4;
-/// Distance residuals beyond this have no gradient, in units of the scene radius.
+/// Distance residuals beyond this have no gradient, in units of the scene radius: such a reading
+/// belongs to a surface that the ray does not show yet, or is wrong.
 const DISTANCE_CLIP: f32 = 0.5;
-/// Relative error of a depth camera.
+/// Relative error of a depth camera, which widens the band of the line-of-sight loss with distance.
+/// A wider band gives blurred surfaces; a narrower one penalizes correct surfaces.
 const DEPTH_BAND_FRAC: f32 = 0.01;
-/// Minimum distance in the distortion loss, in units of the scene radius.
+/// Minimum distance in the distortion loss, in units of the scene radius. The loss compares inverse
+/// distances, which would grow without bound near the camera.
 const DISTORTION_NEAR: f32 = 0.05;
 /// Initial step of an image's rotation (radians) and translation (units of the scene radius):
 /// observed surfaces are roughly a third of a radius away.
 const ROTATION_RATE: f32 = 5e-4;
 const TRANSLATION_RATE: f32 = ROTATION_RATE / 3.0;
-/// Initial step of a component of an image's appearance embedding.
+/// Initial step of a component of an image's appearance embedding: the initial learning rate of the
+/// weights that it is multiplied by.
 const EMBEDDING_RATE: f32 = 2e-2;
-/// Initial decay per step of an image's rotation, translation and embedding, as a fraction.
+/// Initial decay per step of an image's rotation, translation and embedding, as a fraction. Without
+/// it, all images could drift together, which no image contradicts.
 const IMAGE_PARAM_DECAY: f32 = 5e-4;
-/// Initial scale of gradients, before their magnitudes are known.
+/// Initial scale of gradients (2^20), before their magnitudes are known. Gradients of grid entries
+/// are summed as integers. `end_step` then chooses the scale of each level from its largest sum.
 const INITIAL_GRADIENT_SCALE: f32 = 1_048_576.0;
 
 /// Index of a picture's parameters in their buffer, which holds no others.
@@ -170,27 +184,27 @@ impl FieldTrainer {
     /// Initializes entries with small random numbers, and weights with random numbers that preserve
     /// the variance (Glorot and Bengio 2010).
     fn initialize(&self, gpu: &Gpu, seed: u64, widths: &Widths) {
-        let uniform = |stream: u64, ix: usize, bound: f64| {
-            f32_of(
-                bound * (2.0 * unit_from_bits(hash(seed ^ hash(stream << 40 | ix as u64))) - 1.0),
-            )
-        };
         let n_numbers = 2 * self.field.n_entries as usize;
+        let entry_stream = RandomStream { seed, stream: 1 };
         let entries: Vec<f32> = (0..n_numbers)
             .into_par_iter()
-            .map(|ix| uniform(1, ix, INITIAL_ENTRY_RANGE))
+            .map(|ix| entry_stream.uniform(ix, INITIAL_ENTRY_RANGE))
             .collect();
         gpu.write(&self.field.grid, 0, bytemuck::cast_slice(&entries));
         let mut weights: Vec<f32> = Vec::new();
         let layers = widths.layers().into_iter().zip(widths.used_layers());
         for (([n_in, n_out], [used_in, used_out]), stream) in layers.zip(2..) {
+            // Numbers and bound follow from the widths without padding, so that a field starts with
+            // the same weights on all adapters.
+            let weight_stream = RandomStream { seed, stream };
             let bound = (6.0 / f64::from(used_in + used_out)).sqrt();
             for at in 0..n_in * n_out {
-                let (row, column) = (at / n_in, at % n_in);
+                let row = at / n_in;
+                let column = at % n_in;
                 let is_used = row < used_out && column < used_in;
                 let ix = (row * used_in + column) as usize;
                 weights.push(if is_used {
-                    uniform(stream, ix, bound)
+                    weight_stream.uniform(ix, bound)
                 } else {
                     0.0
                 });
@@ -260,6 +274,8 @@ impl FieldTrainer {
         };
         let images = images.as_ref().filter(|_| !learned.is_empty());
         passes.convert_weights(list);
+        // The occupancy first: it evaluates the field in the buffers of the batch, and the rays of
+        // this step are sampled in the cells that it marks.
         let first_update = if self.sizes.has_depth {
             FIRST_OCCUPANCY_UPDATE_WITH_DEPTH
         } else {
@@ -268,6 +284,7 @@ impl FieldTrainer {
         if step.is_multiple_of(OCCUPANCY_UPDATE_PERIOD) && step >= first_update {
             passes.occupancy_update(list, occupancy, moments);
         }
+        // Poses change the rays, so they precede the samples.
         if images.is_some() && learned.contains(ParamSet::IMAGE_POSES) {
             passes.apply_pose(list);
         }
@@ -275,6 +292,8 @@ impl FieldTrainer {
         passes.place_samples_in_rays(list, occupancy);
         passes.forward(list, kept);
         passes.backward(list, kept, gradients);
+        // All gradients use the parameters before this step, so nothing is updated before the last
+        // one.
         if let Some(images) = images {
             if learned.contains(ParamSet::IMAGE_POSES) {
                 passes.pose_gradients(list, kept, images);
@@ -336,25 +355,17 @@ impl FieldTrainer {
         passes.forward(list, kept);
         passes.composite(list, kept);
         list.submit(gpu);
-        list.clear_bindings(); // This buffer of image parameters is used once.
+        // This buffer of image parameters is used once, and cached bindings would keep it.
+        list.clear_bindings();
         let ray_colors: Vec<[f32; 4]> = gpu.read(&kept.ray_colors, rays.len())?;
         let errors: Vec<[f32; 2]> = gpu.read(&kept.ray_errors, rays.len())?;
         let background = background(options, 0);
-        let rgb = |[red, green, blue, left]: [f32; 4]| {
-            let composite_over =
-                |channel: usize, color: f32| f64::from(color + left * background[channel]);
-            [
-                composite_over(0, red),
-                composite_over(1, green),
-                composite_over(2, blue),
-            ]
-        };
         Ok(ray_colors
             .into_iter()
             .zip(errors)
             .map(|(ray_colors, [error, _])| RayColor {
                 error: error.into(),
-                rgb: rgb(ray_colors),
+                rgb: over_background(ray_colors, background),
             })
             .collect())
     }
@@ -371,6 +382,7 @@ impl FieldTrainer {
         let n_allocated = self.images.as_ref().map_or(0, |images| images.n_images);
         let rule = ImageParamRule {
             learned: learned_bits(learned),
+            // A power of two, so that images of a live run do not replace the buffer one by one.
             n_images: if n_allocated >= n_images {
                 n_allocated
             } else {
@@ -391,6 +403,7 @@ impl FieldTrainer {
             n_rays, n_samples, ..
         } = self.sizes.nerf_budget;
         let images = ImageParamBuffers::new(gpu, &rule, n_rays, n_samples)?;
+        // Values and optimizer state of known images stay; those of new images start at zero.
         if let Some(known) = self.images.take() {
             gpu.copy(
                 (&known.image_params, 0),
@@ -452,6 +465,7 @@ impl FieldTrainer {
         let mut image_params = read_image_params(gpu, images, images.n_images as usize)?;
         if image_ix < image_params.len() {
             image_params.remove(image_ix);
+            // The buffer keeps its size.
             image_params.push([[0.0; 4]; IMAGE_PARAM_STRIDE]);
         }
         gpu.write(&images.image_params, 0, bytemuck::cast_slice(&image_params));
@@ -495,6 +509,7 @@ impl FieldTrainer {
         self.make_slot(gpu, slot_ix)?;
         let slot = &self.slots[slot_ix];
         gpu.write(&slot.rays, 0, bytemuck::cast_slice(rays));
+        // The limit of a single ray; the batch as a whole has its own, see `place_samples`.
         let max_samples_per_ray = n_samples / n_rays * MAX_SAMPLES_OVER_MEAN;
         gpu.write(
             &slot.march,
@@ -512,6 +527,7 @@ impl FieldTrainer {
             distortion: f32_of(options.specific.distortion),
             near: DISTORTION_NEAR,
             line_of_sight: f32_of(options.specific.line_of_sight),
+            // A surface cannot be located better than the steps; see design/nerf.md.
             band: 2.0 * march_of(self.sizes.nerf_budget).step,
             band_frac: DEPTH_BAND_FRAC,
             unused: 0.0,
@@ -574,6 +590,7 @@ impl FieldTrainer {
     /// Halves the size of cells and steps. The new cells inherit the occupancy of the old ones. No
     /// submit may be in flight.
     pub(crate) fn refine_cells(&mut self, gpu: &Gpu) -> Result<(), Error> {
+        // Read before the old buffers are dropped.
         let n = self.sizes.nerf_budget.n_cells as usize;
         let known: Vec<f32> = gpu.read(&self.occupancy.cell_occupancy, n.pow(3))?;
         self.sizes.nerf_budget = self.sizes.nerf_budget.refined();
@@ -584,22 +601,9 @@ impl FieldTrainer {
             &occupancy_update_of(&self.sizes.nerf_budget),
             self.sizes.has_depth,
         )?;
-        // A step of half the length has half the opacity. Negative values mark cells that were
-        // never updated.
-        let half_step_opacity = |cell_occupancy: f32| {
-            if cell_occupancy > 0.0 {
-                0.5 * cell_occupancy
-            } else {
-                cell_occupancy
-            }
-        };
-        let row = |row: usize| {
-            let (y, z) = (row % (2 * n), row / (2 * n));
-            (0..2 * n).map(move |x| x / 2 + n * (y / 2 + n * (z / 2)))
-        };
         let refined: Vec<f32> = (0..4 * n * n)
             .into_par_iter()
-            .flat_map_iter(row)
+            .flat_map_iter(|row| coarse_cells_of_row(row, n))
             .map(|cell| half_step_opacity(known[cell]))
             .collect();
         gpu.write(
@@ -618,15 +622,15 @@ impl FieldTrainer {
             passes: list,
             ..
         } = self;
-        let (slot, image_params) = (&slots[0], &field.no_image_params);
         let passes = FieldPasses {
             gpu,
             pipelines: &compiled.pipelines,
             field,
             samples,
-            slot,
-            image_params,
+            slot: &slots[0],
+            image_params: &field.no_image_params,
         };
+        // Rays read the marks, not the values, so the marks are made before the next step.
         passes.mark_occupied_cells(list, occupancy, moments);
         list.submit(gpu);
         Ok(())
@@ -661,18 +665,18 @@ impl FieldTrainer {
             passes: list,
             ..
         } = self;
-        let (slot, image_params) = (&slots[0], &field.no_image_params);
         FieldPasses {
             gpu,
             pipelines: &compiled.pipelines,
             field,
             samples,
-            slot,
-            image_params,
+            slot: &slots[0],
+            image_params: &field.no_image_params,
         }
         .hint(list, occupancy, moments, &buffer);
         list.submit(gpu);
-        list.clear_bindings(); // The hints are used once.
+        // The hints are used once.
+        list.clear_bindings();
         Ok(())
     }
 
@@ -703,17 +707,7 @@ impl FieldTrainer {
         let Some((slot, samples, canvas)) = &self.picture else {
             return Err(Error::internal("the canvas of a picture is missing"));
         };
-        gpu.write(&canvas.view, 0, bytemuck::bytes_of(&camera.view()));
-        let backdrop = Backdrop {
-            srgb: background_srgb,
-            radius_m: f32_of(extent.radius_m),
-        };
-        gpu.write(&canvas.backdrop, 0, bytemuck::bytes_of(&backdrop));
-        gpu.write(
-            &canvas.image_params,
-            0,
-            bytemuck::cast_slice(&image_params_of(&[embedding])),
-        );
+        write_view(gpu, canvas, camera, background_srgb, extent, embedding);
         let erased = self.erased.set(
             gpu,
             &mut self.passes,
@@ -740,66 +734,47 @@ impl FieldTrainer {
             image_params,
         };
         picture_passes.convert_for_picture(list, canvas);
+
+        // The prepass over every fourth pixel along x and y comes first: all rays of the picture
+        // start at the distances that it finds.
         let low_px: usize = camera
             .size_px
             .map(|px| px.div_ceil(FRONT_STRIDE) as usize)
             .iter()
             .product();
-        let batches_of = |n_pixels: usize, stride: u32| {
-            let firsts = (0..n_pixels).step_by(slot.n_rays as usize);
-            firsts.map(move |first| (first, (n_pixels - first).min(slot.n_rays as usize), stride))
-        };
+        let batches: Vec<PictureBatch> = PictureBatch::all(low_px, slot.n_rays, FRONT_STRIDE)
+            .chain(PictureBatch::all(n_pixels, slot.n_rays, 1))
+            .collect();
+
+        // The number of rounds is fixed before they are recorded, so the host waits only once per
+        // attempt. If rays remain, the picture is drawn again with more rounds.
         loop {
-            let mut n_batches = 0;
-            for (first, n, stride) in
-                batches_of(low_px, FRONT_STRIDE).chain(batches_of(n_pixels, 1))
-            {
-                let [first_ray, n_rays] =
-                    [first, n].map(|ix| u32::try_from(ix).expect("an image's pixels"));
-                let max_found = SAMPLES_PER_ROUND;
-                let march = March {
-                    first_ray,
-                    max_found,
-                    pixel_stride: stride,
-                    ..march_of(sizes.nerf_budget)
-                };
-                gpu.write(&slot.march, 0, bytemuck::bytes_of(&march));
-                for batch in [&samples.batch, &canvas.selected] {
-                    gpu.write(batch, 0, bytemuck::bytes_of(&Batch::of(n_rays)));
-                }
-                picture_passes.picture_rays(list, canvas);
-                for _ in 0..*picture_rounds {
-                    picture_passes.find(list, occupancy, erased);
-                    picture_passes.select(list, canvas);
-                    if stride == 1 {
-                        picture_passes.picture_colors(list, canvas);
-                        picture_passes.show(list, canvas);
-                    }
-                }
-                if stride > 1 {
-                    picture_passes.keep_fronts(list, canvas);
-                }
-                let at = 8 * n_batches as u64;
+            for (batch_ix, batch) in batches.iter().enumerate() {
+                batch.write(&picture_passes, canvas, sizes.nerf_budget);
+                batch.record(
+                    &picture_passes,
+                    list,
+                    canvas,
+                    occupancy,
+                    erased,
+                    *picture_rounds,
+                );
+                let at = 8 * batch_ix as u64;
                 list.copy((&samples.batch, 4), (&canvas.progress, at), 4);
                 list.copy((&canvas.selected, 8), (&canvas.progress, at + 4), 4);
-                n_batches += 1;
-                list.submit(gpu); // The next batch overwrites the parameters of this one.
+                // The next batch overwrites the parameters of this one.
+                list.submit(gpu);
             }
-            let progress = gpu.read::<[u32; 2]>(&canvas.progress, n_batches)?;
+            let progress = gpu.read::<[u32; 2]>(&canvas.progress, batches.len())?;
             let needed = progress
                 .iter()
                 .map(|[_, n_rounds]| *n_rounds)
                 .max()
                 .unwrap_or(0);
+            // The last round of a complete batch found no samples.
             let is_complete = progress.iter().all(|[n_samples, _]| *n_samples == 0)
                 || *picture_rounds >= MAX_ROUNDS;
-            // Some more rounds for the next picture: without samples, they take little time.
-            *picture_rounds = if is_complete {
-                needed + needed / 4 + 2
-            } else {
-                2 * *picture_rounds
-            }
-            .min(MAX_ROUNDS);
+            *picture_rounds = next_rounds(*picture_rounds, needed, is_complete);
             if is_complete {
                 break;
             }
@@ -821,6 +796,7 @@ impl FieldTrainer {
             canvas.n_pixels >= n_pixels && slot.n_rays >= n_rays
         };
         if !self.picture.as_ref().is_some_and(fits) {
+            // Freed before the larger ones are allocated.
             self.passes.clear_bindings();
             self.picture = None;
             let samples = SampleBuffers::new(gpu, SAMPLES_PER_ROUND * n_rays)?;
@@ -836,6 +812,150 @@ impl FieldTrainer {
         }
         Ok(())
     }
+}
+
+/// Rays of a picture that are processed at once.
+#[derive(Clone, Copy, Debug)]
+struct PictureBatch {
+    first_ray: u32,
+    n_rays: u32,
+    /// Pixels along x and y per ray: 1, or more in the prepass.
+    pixel_stride: u32,
+}
+
+impl PictureBatch {
+    /// Batches of up to `max_rays` that cover `n_rays`.
+    fn all(n_rays: usize, max_rays: u32, pixel_stride: u32) -> impl Iterator<Item = Self> {
+        let max_rays = max_rays as usize;
+        (0..n_rays).step_by(max_rays).map(move |first| {
+            let [first_ray, n_rays] = [first, (n_rays - first).min(max_rays)]
+                .map(|ix| u32::try_from(ix).expect("an image's pixels"));
+            Self {
+                first_ray,
+                n_rays,
+                pixel_stride,
+            }
+        })
+    }
+
+    /// Writes the parameters of the batch before its passes.
+    fn write(&self, passes: &FieldPasses<'_>, canvas: &Canvas, nerf_budget: NerfBudget) {
+        let gpu = passes.gpu;
+        let march = March {
+            first_ray: self.first_ray,
+            max_found: SAMPLES_PER_ROUND,
+            pixel_stride: self.pixel_stride,
+            ..march_of(nerf_budget)
+        };
+        gpu.write(&passes.slot.march, 0, bytemuck::bytes_of(&march));
+        for batch in [&passes.samples.batch, &canvas.selected] {
+            gpu.write(batch, 0, bytemuck::bytes_of(&Batch::of(self.n_rays)));
+        }
+    }
+
+    /// Records the passes of the batch, with a fixed number of rounds of samples.
+    fn record(
+        &self,
+        passes: &FieldPasses<'_>,
+        list: &mut Passes,
+        canvas: &Canvas,
+        occupancy: &Occupancy,
+        erased: &Buffer,
+        n_rounds: u32,
+    ) {
+        passes.picture_rays(list, canvas);
+        for _ in 0..n_rounds {
+            passes.find(list, occupancy, erased);
+            passes.select(list, canvas);
+            // The prepass needs only the distances at which rays become opaque.
+            if self.pixel_stride == 1 {
+                passes.picture_colors(list, canvas);
+                passes.show(list, canvas);
+            }
+        }
+        if self.pixel_stride > 1 {
+            passes.keep_fronts(list, canvas);
+        }
+    }
+}
+
+/// Writes the parameters of a picture: its view, its background and its appearance embedding.
+fn write_view(
+    gpu: &Gpu,
+    canvas: &Canvas,
+    camera: &Camera,
+    background_srgb: [f32; 3],
+    extent: &Extent,
+    embedding: [f64; EMBEDDING_DIM],
+) {
+    gpu.write(&canvas.view, 0, bytemuck::bytes_of(&camera.view()));
+    // Depth is read back in meters, but rays are in units of the radius.
+    let backdrop = Backdrop {
+        srgb: background_srgb,
+        radius_m: f32_of(extent.radius_m),
+    };
+    gpu.write(&canvas.backdrop, 0, bytemuck::bytes_of(&backdrop));
+    gpu.write(
+        &canvas.image_params,
+        0,
+        bytemuck::cast_slice(&image_params_of(&[embedding])),
+    );
+}
+
+/// Number of rounds for the next attempt, or for the next picture.
+fn next_rounds(n_rounds: u32, needed: u32, is_complete: bool) -> u32 {
+    let n_next = if is_complete {
+        // Some more for the next picture, whose view may be deeper: without samples, they take
+        // little time.
+        needed + needed / 4 + 2
+    } else {
+        2 * n_rounds
+    };
+    n_next.min(MAX_ROUNDS)
+}
+
+/// Reproducible random numbers. Each one depends only on seed, stream and index, so they can be
+/// computed in parallel, and in any order.
+#[derive(Clone, Copy, Debug)]
+struct RandomStream {
+    seed: u64,
+    stream: u64,
+}
+
+impl RandomStream {
+    /// A number between `-bound` and `bound`.
+    fn uniform(&self, ix: usize, bound: f64) -> f32 {
+        let Self { seed, stream } = self;
+        let bits = hash(seed ^ hash(stream << 40 | ix as u64));
+        f32_of(bound * (2.0 * unit_from_bits(bits) - 1.0))
+    }
+}
+
+/// The coarse cells around the cells of a row, after the `n` cells along each axis were halved.
+fn coarse_cells_of_row(row: usize, n: usize) -> impl Iterator<Item = usize> {
+    let y = row % (2 * n);
+    let z = row / (2 * n);
+    (0..2 * n).map(move |x| x / 2 + n * (y / 2 + n * (z / 2)))
+}
+
+/// Opacity of a step of half the length, which is half the opacity as long as it is small. Values
+/// that are not positive mark cells that were never updated, or that no image observes.
+fn half_step_opacity(cell_occupancy: f32) -> f32 {
+    if cell_occupancy > 0.0 {
+        0.5 * cell_occupancy
+    } else {
+        cell_occupancy
+    }
+}
+
+/// Color of a ray over a background. The last number of `ray_color` is the transmittance.
+fn over_background([red, green, blue, left]: [f32; 4], background: [f32; 3]) -> [f64; 3] {
+    let composite_over = |channel: usize, color: f32| f64::from(color + left * background[channel]);
+    [
+        composite_over(0, red),
+        composite_over(1, green),
+        composite_over(2, blue),
+    ]
 }
 
 /// Rendered color of a ray.
@@ -872,12 +992,19 @@ fn embedding_dim() -> u32 {
 
 /// Bit mask of the optimized parameters.
 fn learned_bits(learned: ParamSet) -> u32 {
-    let bits = |params: ParamSet, first: usize, n: usize| match learned.contains(params) {
-        true => ((1 << n) - 1) << first,
-        false => 0,
-    };
-    bits(ParamSet::IMAGE_POSES, 0, EMBEDDING)
-        | bits(ParamSet::IMAGE_GAINS, EMBEDDING, EMBEDDING_DIM)
+    let mut bits = 0;
+    if learned.contains(ParamSet::IMAGE_POSES) {
+        bits |= bit_range(0, EMBEDDING);
+    }
+    if learned.contains(ParamSet::IMAGE_GAINS) {
+        bits |= bit_range(EMBEDDING, EMBEDDING_DIM);
+    }
+    bits
+}
+
+/// `n` bits from the bit `first` on.
+fn bit_range(first: usize, n: usize) -> u32 {
+    ((1_u32 << n) - 1) << first
 }
 
 /// Parameters of an occupancy update.
@@ -931,6 +1058,8 @@ fn rule(options: &ModelOptions<NerfOptions>, weight_decay: f32) -> AdamRule {
     AdamRule {
         rate: f32_of(options.specific.rate),
         final_rate_frac: f32_of(options.specific.final_rate_frac),
+        // As in Mueller et al. 2022, section 4. Gradients of grid entries are small and rare, so
+        // epsilon must be far below them.
         betas: [0.9, 0.99],
         epsilon: 1e-15,
         weight_decay,

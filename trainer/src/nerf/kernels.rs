@@ -127,14 +127,18 @@ pub(crate) const KERNELS: &[Kernel] = &[
     kernel!("end_step"),
 ];
 
-/// Samples per workgroup; `TILE` of `network_tile.wgsl`.
+/// Samples per workgroup; `TILE` of `network_tile.wgsl`. With 64 samples, a render took 0.48 ms
+/// instead of 0.30 ms ("Kernel layouts" in `docs/benchmarks/2026-11-23-nerf.md`).
 pub(crate) const N_TILE: u32 = 32;
-/// Tiles of samples per partial sum of weight gradients.
+/// Tiles of samples per partial sum of weight gradients. More tiles leave fewer workgroups; fewer
+/// tiles give more partial sums to add.
 pub(crate) const CHUNK_TILES: u32 = 16;
 pub(crate) const N_CHUNK: u32 = CHUNK_TILES * N_TILE;
-/// Threads per tile with cooperative matrices: a multiple of every subgroup size.
+/// Threads per tile with cooperative matrices: a multiple of every subgroup size. With 64 threads,
+/// a render took 0.37 ms instead of 0.30 ms ("Kernel layouts" in
+/// `docs/benchmarks/2026-11-23-nerf.md`).
 const HALF_LANES: u32 = 128;
-/// Maximum number of rows of a layer.
+/// Maximum number of rows of a layer, for which workgroup memory is reserved.
 const MAX_ROWS: u32 = 64;
 /// Rows of a cooperative matrix.
 const MATRIX: u32 = 16;
@@ -170,9 +174,11 @@ fn layers_of([n_features, n_hidden, n_color_in]: [u32; 3]) -> [[u32; 2]; 5] {
 
 impl Widths {
     pub(crate) fn new(gpu: &Gpu, n_levels: u32, hidden: u32, embedding_dim: u32) -> Self {
+        // Of the 16 outputs of the first network, one is the density; the other 15 are inputs here.
         let inputs = u32::try_from(N_DIRECTION).expect("16") + 15 + embedding_dim;
         let is_half_precision = gpu.optional().half_matrices;
         let used = [2 * n_levels, hidden, inputs].map(|width| width.next_multiple_of(4));
+        // Kernels read four numbers at a time, or a matrix of 16 rows.
         let [n_features, n_hidden, n_color_in] = if is_half_precision {
             used.map(|width| width.next_multiple_of(MATRIX))
         } else {
@@ -281,6 +287,106 @@ pub(crate) struct FieldPipelines {
     pub(crate) end_step: Pipeline,
 }
 
+/// Compiles the kernels with network layers, whose constants are the widths of the layers.
+struct LayerKernels<'a> {
+    gpu: &'a Gpu,
+    widths: &'a Widths,
+    /// The constants that all of them share.
+    sizes: [(&'static str, f64); 5],
+}
+
+impl<'a> LayerKernels<'a> {
+    fn new(gpu: &'a Gpu, widths: &'a Widths) -> Self {
+        let n_lanes = if widths.is_half_precision {
+            HALF_LANES
+        } else {
+            // A thread computes four outputs of four samples: 32 * n_hidden / 16 threads.
+            2 * widths.n_hidden
+        };
+        let sizes = [
+            ("N_FEATURES", f64::from(widths.n_features)),
+            ("N_HIDDEN", f64::from(widths.n_hidden)),
+            ("N_COLOR_IN", f64::from(widths.n_color_in)),
+            ("N_COLORS", f64::from(widths.n_colors())),
+            ("LANES", f64::from(n_lanes)),
+        ];
+        Self { gpu, widths, sizes }
+    }
+
+    /// The variant for f32 or for cooperative matrices.
+    fn of_precision(&self, [full, half]: [Kernel; 2]) -> Kernel {
+        if self.widths.is_half_precision {
+            half
+        } else {
+            full
+        }
+    }
+
+    /// The shared constants and more.
+    fn sizes_and(&self, more: &[(&'static str, f64)]) -> Vec<(&'static str, f64)> {
+        [&self.sizes[..], more].concat()
+    }
+
+    /// A variant of the networks that computes and stores what the `enabled` constants name.
+    fn networks(
+        &self,
+        [full, half]: [&'static [Source]; 2],
+        enabled: &[&'static str],
+    ) -> Result<Pipeline, Error> {
+        let flag = |name: &'static str| (name, f64::from(u8::from(enabled.contains(&name))));
+        let kind = ["DENSITY", "COLORS", "STORE_ACTIVATIONS", "STORE_GEOMETRY"].map(flag);
+        let kernels = [
+            kernel!("field_forward", full),
+            kernel!("field_forward", half),
+        ];
+        // Constants select the parts of one kernel, so that all variants share its code.
+        let embedding_dim = [("EMBEDDING_DIM", f64::from(self.widths.embedding_dim))];
+        Pipeline::new(
+            self.gpu,
+            self.of_precision(kernels),
+            &self.sizes_and(&[&kind[..], &embedding_dim].concat()),
+        )
+    }
+
+    /// The networks of pictures: densities of all samples, and colors of the selected ones.
+    fn picture_networks(&self) -> (Result<Pipeline, Error>, Result<Pipeline, Error>) {
+        let variants = [FULL_PICTURE, HALF_PICTURE];
+        rayon::join(
+            || self.networks(variants, &["DENSITY", "STORE_GEOMETRY"]),
+            || self.networks(variants, &["COLORS"]),
+        )
+    }
+
+    fn backward(&self) -> Result<Pipeline, Error> {
+        let kernel = self.of_precision([
+            kernel!("field_backward", FULL),
+            kernel!("field_backward", HALF),
+        ]);
+        Pipeline::new(self.gpu, kernel, &self.sizes)
+    }
+
+    fn weight_gradients(&self) -> Result<Pipeline, Error> {
+        let kernel = self.of_precision([
+            kernel!("weight_gradients"),
+            kernel!("weight_gradients_half", HALF),
+        ]);
+        let mut constants = vec![("CHUNK_TILES", f64::from(CHUNK_TILES))];
+        if !self.widths.is_half_precision {
+            // Each thread sums the gradients of 16 weights of a layer; the largest layer needs the
+            // most threads.
+            let max_weights = self
+                .widths
+                .layers()
+                .iter()
+                .map(|[n_in, n_out]| n_in * n_out)
+                .max()
+                .expect("five layers");
+            constants.push(("SUM_LANES", f64::from(max_weights / 16)));
+        }
+        Pipeline::new(self.gpu, kernel, &self.sizes_and(&constants))
+    }
+}
+
 impl FieldPipelines {
     /// Pipelines for up to `n_samples` samples; `picture_embedding_ix` is the index of a picture's
     /// parameters in its buffer.
@@ -290,90 +396,24 @@ impl FieldPipelines {
         n_samples: u32,
         picture_embedding_ix: u32,
     ) -> Result<Self, Error> {
-        let Widths {
-            n_features,
-            n_hidden,
-            n_color_in,
-            embedding_dim,
-            is_half_precision,
-            ..
-        } = *widths;
-        let sizes = [
-            ("N_FEATURES", f64::from(n_features)),
-            ("N_HIDDEN", f64::from(n_hidden)),
-            ("N_COLOR_IN", f64::from(n_color_in)),
-            ("N_COLORS", f64::from(widths.n_colors())),
-            (
-                "LANES",
-                f64::from(if is_half_precision {
-                    HALF_LANES
-                } else {
-                    2 * n_hidden
-                }),
-            ),
-        ];
-        let select_precision =
-            |[full, half]: [Kernel; 2]| if is_half_precision { half } else { full };
-        let with = |more: &[(&'static str, f64)]| [&sizes[..], more].concat();
-        let networks = |[full, half]: [&'static [Source]; 2], enabled: &[&'static str]| {
-            let flag = |name: &'static str| (name, f64::from(u8::from(enabled.contains(&name))));
-            let kind = ["DENSITY", "COLORS", "STORE_ACTIVATIONS", "STORE_GEOMETRY"].map(flag);
-            let kernels = [
-                kernel!("field_forward", full),
-                kernel!("field_forward", half),
-            ];
-            let embedding_dim = [("EMBEDDING_DIM", f64::from(embedding_dim))];
-            Pipeline::new(
-                gpu,
-                select_precision(kernels),
-                &with(&[&kind[..], &embedding_dim].concat()),
-            )
-        };
-        // Each thread sums the gradients of 16 weights.
-        let max_weights = widths
-            .layers()
-            .iter()
-            .map(|[n_in, n_out]| n_in * n_out)
-            .max()
-            .expect("five layers");
-        let chunk = ("CHUNK_TILES", f64::from(CHUNK_TILES));
-        let sums = if is_half_precision {
-            vec![chunk]
-        } else {
-            vec![chunk, ("SUM_LANES", f64::from(max_weights / 16))]
-        };
+        let layers = LayerKernels::new(gpu, widths);
         let hint = |kind: f64| Pipeline::new(gpu, kernel!("hint_cells"), &[("KIND", kind)]);
         let plain = |kernel: Kernel| Pipeline::new(gpu, kernel, &[]);
         // These take long to compile, so they are compiled in parallel.
-        let pictures = || {
-            rayon::join(
-                || networks([FULL_PICTURE, HALF_PICTURE], &["DENSITY", "STORE_GEOMETRY"]),
-                || networks([FULL_PICTURE, HALF_PICTURE], &["COLORS"]),
-            )
-        };
         let (
             (densities, (picture_densities, picture_colors)),
             (learned, (field_backward, weight_gradients)),
         ) = rayon::join(
-            || rayon::join(|| networks([FULL, HALF], &["DENSITY"]), pictures),
             || {
-                let backward = || {
-                    let kernel = select_precision([
-                        kernel!("field_backward", FULL),
-                        kernel!("field_backward", HALF),
-                    ]);
-                    Pipeline::new(gpu, kernel, &sizes)
-                };
-                let gradients = || {
-                    let kernel = select_precision([
-                        kernel!("weight_gradients"),
-                        kernel!("weight_gradients_half", HALF),
-                    ]);
-                    Pipeline::new(gpu, kernel, &with(&sums))
-                };
                 rayon::join(
-                    || networks([FULL, HALF], &["DENSITY", "COLORS", "STORE_ACTIVATIONS"]),
-                    || rayon::join(backward, gradients),
+                    || layers.networks([FULL, HALF], &["DENSITY"]),
+                    || layers.picture_networks(),
+                )
+            },
+            || {
+                rayon::join(
+                    || layers.networks([FULL, HALF], &["DENSITY", "COLORS", "STORE_ACTIVATIONS"]),
+                    || rayon::join(|| layers.backward(), || layers.weight_gradients()),
                 )
             },
         );
@@ -404,7 +444,8 @@ impl FieldPipelines {
             picture_densities: picture_densities?,
             picture_colors: picture_colors?,
             forward: learned?,
-            weights_to_half: is_half_precision
+            weights_to_half: widths
+                .is_half_precision
                 .then(|| plain(kernel!("weights_to_half", HALF)))
                 .transpose()?,
             pack_grid: plain(kernel!("pack_grid"))?,
@@ -413,20 +454,20 @@ impl FieldPipelines {
             apply_poses: plain(kernel!("apply_poses"))?,
             point_gradients: Pipeline::new(
                 gpu,
-                select_precision([
+                layers.of_precision([
                     kernel!("point_gradients", FULL),
                     kernel!("point_gradients", HALF),
                 ]),
-                &sizes,
+                &layers.sizes,
             )?,
             ray_gradients: plain(kernel!("ray_gradients"))?,
             embedding_gradients: Pipeline::new(
                 gpu,
-                select_precision([
+                layers.of_precision([
                     kernel!("embedding_gradients", FULL),
                     kernel!("embedding_gradients", HALF),
                 ]),
-                &with(&[("EMBEDDING_DIM", embedding_dim.into())]),
+                &layers.sizes_and(&[("EMBEDDING_DIM", widths.embedding_dim.into())]),
             )?,
             update_images: plain(kernel!("update_images"))?,
             weight_gradients: weight_gradients?,

@@ -36,22 +36,23 @@ fn is_occupied(cell: usize) -> bool {
 type TestRay = ([f64; 3], [f64; 3], [f64; 2], f64);
 
 fn rays() -> Vec<TestRay> {
+    (0..u64::from(N_RAYS)).map(random_ray).collect()
+}
+
+fn random_ray(seed: u64) -> TestRay {
     let rounded = |x: f64| f64::from(f32_of(x));
-    let ray = |seed: u64| {
-        let mut random = F32Random::new(seed);
-        let direction = nalgebra::Vector3::from(random.array::<3>(-1.0, 1.0))
-            .normalize()
-            .map(rounded);
-        // Some begin outside the inner cube, some end inside it.
-        let end = if seed.is_multiple_of(5) { 1.5 } else { 1000.0 };
-        (
-            random.array(-2.0, 2.0),
-            direction.into(),
-            [0.125, end],
-            rounded(random.uniform(0.0, 0.99)),
-        )
-    };
-    (0..u64::from(N_RAYS)).map(ray).collect()
+    let mut random = F32Random::new(seed);
+    let direction = nalgebra::Vector3::from(random.array::<3>(-1.0, 1.0))
+        .normalize()
+        .map(rounded);
+    // Some begin outside the inner cube, some end inside it.
+    let end = if seed.is_multiple_of(5) { 1.5 } else { 1000.0 };
+    (
+        random.array(-2.0, 2.0),
+        direction.into(),
+        [0.125, end],
+        rounded(random.uniform(0.0, 0.99)),
+    )
 }
 
 #[test]
@@ -131,7 +132,9 @@ fn samples_lie_in_occupied_cells_within_limit() {
         placed.iter().map(|ray| ray.n_samples).sum::<u32>(),
         n_samples
     );
-    let (mut mismatches, mut n_compared, mut n_thinned) = (Mismatches::default(), 0, 0);
+    let mut mismatches = Mismatches::default();
+    let mut n_compared = 0;
+    let mut n_thinned = 0;
     for (ix, (ray, (origin, direction, range, jitter))) in placed.iter().zip(&rays).enumerate() {
         let (segments, margin) =
             MARCH.segments((*origin, *direction), *range, *jitter, is_occupied);
@@ -154,7 +157,8 @@ fn samples_lie_in_occupied_cells_within_limit() {
         );
         let begin = ray.first_sample as usize;
         for (sample, [low, high]) in expected.into_iter().enumerate() {
-            let (span, point) = (spans[begin + sample], points[begin + sample]);
+            let span = spans[begin + sample];
+            let point = points[begin + sample];
             assert_eq!(span.ray as usize, ix);
             mismatches.check(
                 format!("begin {ix} {sample}"),

@@ -33,10 +33,13 @@ use std::path::Path;
 use std::sync::Arc;
 use std::time::Instant;
 
-/// Distance at which rays begin, in units of the scene radius.
+/// Distance at which rays begin, in units of the scene radius. Nearer, the field could explain
+/// single images by fog in front of their cameras.
 const NEAR_DISTANCE: f32 = 0.03;
 /// Occupancy cells are refined after this fraction (1 / divisor) of the planned steps. This is
-/// before the first trial, because trials compare fields of the same size.
+/// before the first trial, because trials compare fields of the same size. Refined cells from the
+/// start on gave 18.0 instead of 25.1 dB after 1 s; without refinement, the static arm reached 30.0
+/// instead of 31.7 dB after 8 s (`docs/benchmarks/2026-11-23-nerf.md`).
 const REFINE_DIVISOR: u64 = 10;
 /// Depth stride on a software adapter, where a 640x480 picture takes tens of seconds early in
 /// training. Every ninth pixel is enough for depth.
@@ -134,6 +137,8 @@ impl NerfModel {
             return Ok(false);
         }
         if std::mem::take(&mut self.is_extent_stale) || self.field.is_none() {
+            // Depth is reprojected on all cores here. Otherwise, the first ray of an image would do
+            // it, on one.
             self.images.par_iter().for_each(|image| {
                 image.depth_m();
             });
@@ -178,9 +183,11 @@ impl NerfModel {
             return Ok(());
         }
         log::debug!("nerf: {extent:?}, {sizes:?}");
+        // Snapshots of a trial have the sizes of the old field. Its memory is freed before the next
+        // field is allocated.
         self.finish_in_flight()?;
         self.abort_trials()?;
-        self.field = None; // Free its memory before allocating the next field.
+        self.field = None;
         let compiled = self.compiled()?;
         self.field = Some((
             extent,
@@ -193,6 +200,7 @@ impl NerfModel {
     /// Applies occupancy hints of new images, if any image has depth, and initializes their
     /// appearance embeddings.
     fn hint(&mut self) -> Result<(), Error> {
+        // The embeddings first: `n_hinted` still separates the known images from the new ones.
         self.initialize_embeddings()?;
         self.hint_images(self.n_hinted..self.images.len())?;
         if self.field.is_some() {
@@ -265,6 +273,7 @@ impl NerfModel {
         let Some((extent, field_trainer)) = &mut self.field else {
             return Ok(());
         };
+        // New images may have arrived since the last step.
         if !learned_params.is_empty() {
             field_trainer.allocate_images(&self.gpu, self.images.len(), learned_params)?;
         }
@@ -291,6 +300,8 @@ impl NerfModel {
 
     /// Number of steps that fit into the time limit of a submit.
     fn steps_per_submit(&self) -> u64 {
+        // On a software adapter, a step takes longer than the limit. Until the first submit was
+        // timed, a step of unknown duration is submitted alone.
         match self.submits.n_steps_in_limit() {
             Some(n) if !self.gpu.is_software() => n.clamp(1, STEPS_PER_SUBMIT as u64),
             _ => 1,
@@ -322,6 +333,8 @@ impl NerfModel {
 impl Recalibrate for NerfModel {
     /// Continues with the corrected images. Pose corrections of single images start again at zero.
     fn recalibrate(&mut self, keyframes: &[CorrectedKeyframe], _: &Alignment) -> Result<(), Error> {
+        // The halves of a trial must be trained on the same images, so a running trial starts
+        // again.
         self.finish_in_flight()?;
         self.undo_trial()?;
         let corrected = replacement(keyframes);
@@ -330,7 +343,8 @@ impl Recalibrate for NerfModel {
             corrected(&mut keyframe);
             *image = RayImage::new(keyframe);
         }
-        (self.is_extent_stale, self.corrections) = (true, None);
+        self.is_extent_stale = true;
+        self.corrections = None;
         if let Some((_, field_trainer)) = &mut self.field {
             field_trainer.reset_image_params_except(
                 &self.gpu,
@@ -355,6 +369,7 @@ impl Method for NerfModel {
             return Ok(());
         }
         keyframe.check()?;
+        // Validation keyframes decide trials. Afterwards, they are images like all others.
         let is_validation = keyframe.split == Split::Validation && !self.trials.are_finished();
         let image = RayImage::new(keyframe);
         if is_validation {
@@ -374,6 +389,7 @@ impl Method for NerfModel {
         if let Some(ix) = self.images.iter().position(is_match) {
             self.finish_in_flight()?;
             self.abort_trials()?;
+            // Parameters on the GPU are in the order of the images.
             self.images.remove(ix);
             self.n_hinted -= usize::from(ix < self.n_hinted);
             self.corrections = None;
@@ -392,6 +408,7 @@ impl Method for NerfModel {
         self.advance_trials_when_due()?;
         // Validation images may have become training images. Use them from the next step on.
         self.begin()?;
+        // A submit ends where the host has to change the field.
         let max_steps = self.steps_to_finer_cells().min(self.steps_to_trial());
         let n_steps = n.min(self.steps_per_submit()).min(max_steps);
         let since = Instant::now();
@@ -401,11 +418,13 @@ impl Method for NerfModel {
         let Some((_, field_trainer)) = &mut self.field else {
             return Err(no_field());
         };
+        // Waits for the previous submit while this one runs.
         let batch = field_trainer.submit(&self.gpu);
-        self.finish_in_flight()?; // Waits for the previous submit while this one runs.
+        self.finish_in_flight()?;
         self.submits.begin(batch, n_steps, since);
+        // The caller expects `n` completed steps.
         if n_steps == n {
-            self.finish_in_flight()?; // The caller expects `n` completed steps.
+            self.finish_in_flight()?;
         }
         Ok(n_steps)
     }

@@ -156,15 +156,17 @@ pub(crate) const EMBEDDING: usize = 6;
 pub(crate) fn image_params_of<const N: usize>(
     embeddings: &[[f64; N]],
 ) -> Vec<[ImageParam; IMAGE_PARAM_STRIDE]> {
-    let params_with_embedding = |embedding: &[f64; N]| {
-        let mut image_params = [[0.0; 4]; IMAGE_PARAM_STRIDE];
-        image_params[EMBEDDING..]
-            .iter_mut()
-            .zip(embedding)
-            .for_each(|(image_param, value)| image_param[0] = f32_of(*value));
-        image_params
-    };
     embeddings.iter().map(params_with_embedding).collect()
+}
+
+/// Parameters of an image without a pose correction.
+fn params_with_embedding<const N: usize>(embedding: &[f64; N]) -> [ImageParam; IMAGE_PARAM_STRIDE] {
+    let mut image_params = [[0.0; 4]; IMAGE_PARAM_STRIDE];
+    image_params[EMBEDDING..]
+        .iter_mut()
+        .zip(embedding)
+        .for_each(|(image_param, value)| image_param[0] = f32_of(*value));
+    image_params
 }
 
 impl AdamRule {
@@ -173,6 +175,8 @@ impl AdamRule {
         StepScale {
             rate_frac: 1.0,
             unused: 0.0,
+            // Bias corrections of the moments (Kingma and Ba 2015, algorithm 1). `end_step`
+            // computes those of later steps.
             correction: self.betas.map(|beta| 1.0 / (1.0 - beta)),
         }
     }
@@ -180,19 +184,23 @@ impl AdamRule {
 
 /// The levels of a grid in the layout of the kernels.
 pub(crate) fn levels(shape: &GridShape) -> Vec<Level> {
-    let level = |ix: usize| {
-        let is_dense = (u64::from(shape.n_cells[ix]) + 1).pow(3) <= 1 << shape.log2_entries;
-        let mask = if is_dense {
-            0
-        } else {
-            (1 << shape.log2_entries) - 1
-        };
-        Level {
-            n_cells: shape.n_cells[ix],
-            begin: shape.begin(ix),
-            mask,
-            unused: 0,
-        }
+    (0..shape.n_cells.len())
+        .map(|ix| level(shape, ix))
+        .collect()
+}
+
+fn level(shape: &GridShape, ix: usize) -> Level {
+    // A level with fewer corners than entries needs no hash; the mask 0 marks it.
+    let is_dense = (u64::from(shape.n_cells[ix]) + 1).pow(3) <= 1 << shape.log2_entries;
+    let mask = if is_dense {
+        0
+    } else {
+        (1 << shape.log2_entries) - 1
     };
-    (0..shape.n_cells.len()).map(level).collect()
+    Level {
+        n_cells: shape.n_cells[ix],
+        begin: shape.begin(ix),
+        mask,
+        unused: 0,
+    }
 }

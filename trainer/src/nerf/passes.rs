@@ -89,6 +89,7 @@ impl Canvas {
 /// Layers of both networks.
 const N_LAYERS: u64 = 5;
 /// Maximum number of workgroups that evaluate the networks; they process larger batches in a loop.
+/// Only the GPU knows the number of samples, so there are groups for a full batch.
 const MAX_NETWORK_GROUPS: u64 = 8192;
 /// Byte range of the number of samples in a batch.
 const N_SAMPLES_BYTES: Range<u64> = 4..8;
@@ -138,6 +139,8 @@ impl FieldPasses<'_> {
             ("n_found", &slot.n_found),
             ("rays", &slot.rays),
         ];
+        // One workgroup: where the samples of a ray begin depends on all rays before it, and how
+        // many are kept depends on all rays.
         list.dispatch(gpu, &pipelines.place_samples, 1, &shared);
         let written = [
             ("n_before", &slot.n_before),
@@ -145,6 +148,7 @@ impl FieldPasses<'_> {
             ("spans", &samples.spans),
             ("points", &samples.points),
         ];
+        // The rays are walked a second time instead of storing segments whose number is unknown.
         let n_groups = groups(THREADS_PER_RAY * slot.n_rays, 64);
         list.dispatch(
             gpu,
@@ -173,10 +177,8 @@ impl FieldPasses<'_> {
             n_points,
             ..
         } = occupancy;
-        let (occupancy_update, steps) = (
-            ("occupancy_update", occupancy_update),
-            ("steps", &moments.steps),
-        );
+        let occupancy_update = ("occupancy_update", occupancy_update);
+        let steps = ("steps", &moments.steps);
         let n_point_groups = groups(*n_points, 64);
         let sampled = [
             occupancy_update,
@@ -185,6 +187,8 @@ impl FieldPasses<'_> {
             ("points", &samples.points),
         ];
         list.dispatch(gpu, &pipelines.sample_cells, n_point_groups, &sampled);
+        // The points take the place of samples, so the kernels and buffers of training evaluate
+        // them.
         self.densities(list);
         let cell_occupancy = ("cell_occupancy", cell_occupancy);
         list.dispatch(
@@ -209,6 +213,7 @@ impl FieldPasses<'_> {
         moments: &FieldMoments,
         hints: &Buffer,
     ) {
+        // One dispatch per kind, because a cell may have several hints, and their order matters.
         for kernel in &self.pipelines.hint_cells {
             let n_groups = (hints.bytes() / 4).div_ceil(64);
             list.dispatch(
@@ -240,15 +245,12 @@ impl FieldPasses<'_> {
             n_cells,
             ..
         } = occupancy;
-        let (cell_occupancy, steps) = (
-            ("cell_occupancy", cell_occupancy),
-            ("steps", &moments.steps),
-        );
+        let cell_occupancy = ("cell_occupancy", cell_occupancy);
+        let steps = ("steps", &moments.steps);
+        // The threshold depends on the mean over all cells, so the sum comes first.
         list.clear(occupancy_sum);
-        let (sum, n_word_groups) = (
-            ("occupancy_sum", occupancy_sum),
-            groups(n_cells.pow(3) / 32, 64),
-        );
+        let sum = ("occupancy_sum", occupancy_sum);
+        let n_word_groups = groups(n_cells.pow(3) / 32, 64);
         list.dispatch(
             gpu,
             &pipelines.sum_cells,
@@ -264,6 +266,7 @@ impl FieldPasses<'_> {
             steps,
         ];
         list.dispatch(gpu, &pipelines.mark_cells, n_word_groups, &marked);
+        // Groups and blocks of both sets: the cells to sample, and the solid cells.
         let n_words = 2 * n_box_words(*n_cells);
         list.dispatch(
             gpu,
@@ -281,6 +284,8 @@ impl FieldPasses<'_> {
             field,
             ..
         } = *self;
+        // Weights change in every step, so their f16 copies are made again. Without matrices, the
+        // layers read the f32 weights.
         if let (Some(kernel), Some(half)) = (&pipelines.weights_to_half, &field.half_weights) {
             let n_groups = (half.bytes() / 16).div_ceil(64);
             list.dispatch(
@@ -371,6 +376,7 @@ impl FieldPasses<'_> {
                 geometry,
             ],
         );
+        // Each round fills the list of selected samples anew.
         list.clear_range(selected, N_SAMPLES_BYTES);
         let composited = [
             ("march", &slot.march),
@@ -470,6 +476,8 @@ impl FieldPasses<'_> {
             slot,
             ..
         } = *self;
+        // Rays add their samples to the batch by an atomic counter, which starts at zero in each
+        // round.
         list.clear_range(&samples.batch, N_SAMPLES_BYTES);
         let found = [
             ("march", &slot.march),
@@ -589,11 +597,9 @@ impl FieldPasses<'_> {
             slot,
             ..
         } = *self;
-        let (batch, rays, spans) = (
-            ("batch", &samples.batch),
-            ("rays", &slot.rays),
-            ("spans", &samples.spans),
-        );
+        let batch = ("batch", &samples.batch);
+        let rays = ("rays", &slot.rays);
+        let spans = ("spans", &samples.spans);
         let v_points = ("v_points", &images.v_points);
         let looked_up = [
             batch,
@@ -611,6 +617,7 @@ impl FieldPasses<'_> {
             groups(samples.n_samples, 64),
             &looked_up,
         );
+        // A ray's gradient is the sum over its samples, in their order.
         let summed = [batch, rays, spans, v_points, ("v_rays", &images.v_rays)];
         list.dispatch(
             gpu,
@@ -672,6 +679,8 @@ impl FieldPasses<'_> {
             ("v_embeddings", &images.v_embeddings),
             ("image_params", &images.image_params),
         ];
+        // A workgroup per image sums the gradients of its rays. Images without rays in this batch
+        // keep their parameters.
         list.dispatch(
             gpu,
             &pipelines.update_images,
@@ -725,16 +734,14 @@ impl FieldPasses<'_> {
             samples,
             ..
         } = *self;
+        // From the loss back to the samples, then through the networks to grid entries and
+        // activations, and from the activations to the weights.
         self.composite(list, step);
         let batch = ("batch", &samples.batch);
-        let (v_log_density, v_colors) = (
-            ("v_log_density", &step.v_log_density),
-            ("v_colors", &step.v_colors),
-        );
-        let (activations, v_activations) = (
-            ("activations", &step.activations),
-            ("v_activations", &step.v_activations),
-        );
+        let v_log_density = ("v_log_density", &step.v_log_density);
+        let v_colors = ("v_colors", &step.v_colors);
+        let activations = ("activations", &step.activations);
+        let v_activations = ("v_activations", &step.v_activations);
         let carried = [
             batch,
             ("levels", &field.levels),
@@ -754,6 +761,8 @@ impl FieldPasses<'_> {
             groups(samples.n_samples, N_TILE),
             &carried,
         );
+        // Partial sums per chunk of samples, which `update_weights` adds in a fixed order. Float
+        // atomics would add them in an order that depends on scheduling.
         let n_chunks = groups(samples.n_samples, N_TILE * CHUNK_TILES);
         let summed = [
             batch,
@@ -786,10 +795,8 @@ impl FieldPasses<'_> {
             samples,
             ..
         } = *self;
-        let (steps, step_scale) = (
-            ("steps", &moments.steps),
-            ("step_scale", &moments.step_scale),
-        );
+        let steps = ("steps", &moments.steps);
+        let step_scale = ("step_scale", &moments.step_scale);
         let weighed = [
             ("rule", weights_rule),
             step_scale,
@@ -804,7 +811,8 @@ impl FieldPasses<'_> {
             (field.weights.bytes() / 16).div_ceil(16),
             &weighed,
         );
-        let (scales, largest) = (("scales", &gradients.scales), ("largest", &moments.largest));
+        let scales = ("scales", &gradients.scales);
+        let largest = ("largest", &moments.largest);
         let learned = [
             ("rule", grid_rule),
             step_scale,
@@ -821,6 +829,7 @@ impl FieldPasses<'_> {
             groups(field.n_entries, 256),
             &learned,
         );
+        // Last, because it replaces the scales with which this step's gradients were summed.
         list.dispatch(
             gpu,
             &pipelines.end_step,

@@ -11,9 +11,11 @@ use nalgebra::Vector3;
 use rayon::prelude::*;
 use std::sync::{Arc, OnceLock};
 
-/// Rays per parallel task.
+/// Rays per parallel task. A ray takes only a few operations, so smaller tasks would cost more than
+/// they compute.
 const RAYS_PER_TASK: usize = 512;
-/// Attempts to find a pixel that is not masked.
+/// Attempts to find a pixel that is not masked. If all fail, the ray has no target and no effect.
+/// The number is bounded, because an image may be masked entirely.
 const MAX_ATTEMPTS: u64 = 4;
 /// End of rays without a reading. Contraction leaves no resolution far beyond this distance.
 const MAX_DISTANCE: f32 = 1e3;
@@ -54,14 +56,16 @@ impl RayImage {
             principal_px,
             ..
         } = &*self.keyframe;
-        let (x, y) = (pixel_ix % *width as usize, pixel_ix / *width as usize);
+        let x = pixel_ix % *width as usize;
+        let y = pixel_ix / *width as usize;
         let along =
             |pixel: usize, axis: usize| (pixel as f64 + 0.5 - principal_px[axis]) / focal_px[axis];
         let mut in_camera = Vector3::new(along(x, 0), along(y, 1), 1.0);
         let mut origin_m = Vector3::zeros();
         if let Some(twist) = &self.keyframe.twist {
             // The camera motion moves a point by -tau (v + w x p) in the camera; the ray applies
-            // the inverse.
+            // the inverse. `tau` is the time of the pixel's row after the middle of the image, to
+            // which the pose belongs.
             let tau_secs =
                 ((y as f64 + 0.5) / f64::from(*height) - 0.5) * self.keyframe.readout_secs;
             in_camera += twist.angular_rad_s.cross(&in_camera) * tau_secs;
@@ -121,10 +125,22 @@ pub(crate) fn draw(images: &[RayImage], extent: &Extent, draw: &RaySampling) -> 
     if images.is_empty() {
         return Vec::new();
     }
-    let key = hash(draw.seed ^ hash(draw.step));
-    let ray = |ix: u64| {
+    (0..draw.n_rays)
+        .into_par_iter()
+        .with_min_len(RAYS_PER_TASK)
+        .map(|ix| draw.ray(images, extent, ix.into()))
+        .collect()
+}
+
+impl RaySampling {
+    /// The ray at an index of the batch. It depends on seed, step and index only, so rays are
+    /// computed in parallel.
+    fn ray(&self, images: &[RayImage], extent: &Extent, ix: u64) -> params::Ray {
+        let key = hash(self.seed ^ hash(self.step));
         let ray_key = hash(key ^ hash(ix));
-        let share = (ix as f64 + unit_from_bits(ray_key)) / f64::from(draw.n_rays);
+        // Stratified: successive rays belong to successive images, so all images get the same
+        // number of rays.
+        let share = (ix as f64 + unit_from_bits(ray_key)) / f64::from(self.n_rays);
         #[expect(
             clippy::cast_possible_truncation,
             clippy::cast_sign_loss,
@@ -132,28 +148,30 @@ pub(crate) fn draw(images: &[RayImage], extent: &Extent, draw: &RaySampling) -> 
         )]
         let image_ix = ((share * images.len() as f64) as usize).min(images.len() - 1);
         let image = &images[image_ix];
-        let n_pixels = image.keyframe.rgba_srgb.len() as u64 / 4;
-        let pick = |attempt: u64| {
-            let word = hash(ray_key.wrapping_add(1 + attempt));
-            // The upper half of a 64-bit product: uniform over all pixels.
-            usize::try_from((u128::from(word) * u128::from(n_pixels)) >> 64)
-                .expect("less than a length")
-        };
-        let is_unmasked = |pixel_ix: &usize| image.keyframe.rgba_srgb[4 * pixel_ix + 3] > 0;
-        let pixel_ix = (0..MAX_ATTEMPTS)
-            .map(pick)
-            .find(is_unmasked)
-            .unwrap_or_else(|| pick(0));
+        let pixel_ix = unmasked_pixel(&image.keyframe, ray_key);
+        // A number of its own for each purpose; the constant only makes the key different.
         let jitter = f32_of(unit_from_bits(hash(ray_key ^ 0x5bd1_e995)));
         let embedding = u32::try_from(image_ix).expect("few images");
         params::Ray {
             embedding,
-            ..image.ray(extent, pixel_ix, draw.begin, jitter)
+            ..image.ray(extent, pixel_ix, self.begin, jitter)
         }
-    };
-    (0..draw.n_rays)
-        .into_par_iter()
-        .with_min_len(RAYS_PER_TASK)
-        .map(|ix| ray(ix.into()))
-        .collect()
+    }
+}
+
+/// Index of a random pixel, which is not masked if a few attempts find one.
+fn unmasked_pixel(keyframe: &Keyframe, ray_key: u64) -> usize {
+    let n_pixels = keyframe.rgba_srgb.len() as u64 / 4;
+    let pick = |attempt: u64| random_ix(hash(ray_key.wrapping_add(1 + attempt)), n_pixels);
+    let is_unmasked = |pixel_ix: &usize| keyframe.rgba_srgb[4 * pixel_ix + 3] > 0;
+    (0..MAX_ATTEMPTS)
+        .map(pick)
+        .find(is_unmasked)
+        .unwrap_or_else(|| pick(0))
+}
+
+/// An index below `n` from random bits.
+fn random_ix(bits: u64, n: u64) -> usize {
+    // The upper half of a 64-bit product: uniform over all indices.
+    usize::try_from((u128::from(bits) * u128::from(n)) >> 64).expect("less than a length")
 }

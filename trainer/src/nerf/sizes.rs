@@ -8,18 +8,22 @@ use crate::model_options::ModelOptions;
 use keyframe::{DepthMap, Keyframe};
 use serde::{Deserialize, Serialize};
 
-/// Cells of the coarsest level along an axis.
+/// Cells of the coarsest level along an axis, as in Mueller et al. 2022, table 1.
 const N_CELLS_COARSEST: u32 = 16;
-/// Ratio of the resolutions of adjacent levels.
+/// Ratio of the resolutions of adjacent levels. With a larger one, fewer levels reach the finest
+/// cells, but structures between two levels are represented worse.
 const LEVEL_GROWTH: f64 = 1.5;
 /// Width of the finest cells in pixels. Finer cells would fit noise.
 const PIXELS_PER_CELL: f64 = 1.5;
 /// Pixels of an image per entry of a level. Images overlap, and surfaces occupy few cells of a
 /// level.
 const PIXELS_PER_ENTRY: f64 = 0.5;
-/// Limits of the number of levels.
+/// Limits of the number of levels. Mueller et al. 2022 use 16. Each level adds a lookup of eight
+/// corners per sample.
 pub(crate) const MIN_LEVELS: u32 = 4;
 pub(crate) const MAX_LEVELS: u32 = 16;
+/// The coarsest level has 17^3 corners, about 2^12. With fewer entries, even this level would have
+/// many collisions.
 const MIN_LOG2_ENTRIES: u32 = 12;
 /// Bytes per entry: the entry, its gradients and its moments.
 const BYTES_PER_ENTRY: u64 = 8 + 8 + MOMENT_BYTES_PER_ENTRY;
@@ -49,6 +53,7 @@ fn has_dense_depth<'a>(keyframes: impl Iterator<Item = &'a Keyframe>) -> bool {
         let readings = depth.depth_m.iter().step_by(STRIDE);
         2 * readings.clone().filter(|z| **z > 0.0).count() > readings.count()
     };
+    // A majority in both cases: a few images without depth, or with holes, change little.
     let known: Vec<bool> = keyframes
         .map(|keyframe| keyframe.depth.as_ref().is_some_and(is_known))
         .collect();
@@ -65,7 +70,8 @@ impl Sizes {
         keyframes: impl Iterator<Item = &'a Keyframe> + Clone,
         extent: &Extent,
     ) -> Result<Self, Error> {
-        // The unit cube covers four radii at the scale of the inner cube.
+        // As many cells as pixels resolve, and levels from the coarsest to the finest. The unit
+        // cube covers four radii at the scale of the inner cube.
         let cell_m = PIXELS_PER_CELL * pixel_size_m(keyframes.clone(), extent);
         #[expect(
             clippy::cast_possible_truncation,
@@ -80,12 +86,17 @@ impl Sizes {
         )]
         let n_levels =
             1 + (f64::from(finest / N_CELLS_COARSEST).ln() / LEVEL_GROWTH.ln()).ceil() as u32;
+        // An even number, so that the features, two per level, are a multiple of four like all
+        // widths.
         let n_levels = n_levels.next_multiple_of(2).clamp(
             MIN_LEVELS,
             nerf_budget.max_levels.clamp(MIN_LEVELS, MAX_LEVELS),
         );
         let has_depth = keyframes.clone().any(|keyframe| keyframe.depth.is_some());
         let can_refine = nerf_budget.refined() != nerf_budget && has_dense_depth(keyframes.clone());
+
+        // As many entries as the largest image has detail, rounded up to a power of two, which
+        // hashing needs.
         let n_pixels = keyframes
             .map(|keyframe| keyframe.rgba_srgb.len() / 4)
             .max()
@@ -98,6 +109,9 @@ impl Sizes {
         let entries_for_pixels = (n_pixels.max(1) as f64 / PIXELS_PER_ENTRY).log2().ceil() as u32;
         let max_log2_entries_allowed = nerf_budget.max_log2_entries.max(MIN_LOG2_ENTRIES);
         let mut log2_entries = entries_for_pixels.clamp(MIN_LOG2_ENTRIES, max_log2_entries_allowed);
+
+        // Fewer entries if the budget, or the largest buffer (the moments), does not hold them.
+        // More collisions blur the field, but fewer levels would lose its detail entirely.
         let max_bytes = options.common.max_bytes.unwrap_or(u64::MAX);
         loop {
             let shape = GridShape::between(N_CELLS_COARSEST, finest, n_levels, log2_entries);
@@ -145,6 +159,8 @@ impl Sizes {
             ..
         } = self.nerf_budget;
         let is_increasing = self.n_cells.windows(2).all(|pair| pair[0] <= pair[1]);
+        // Sizes come from files. Kernels are compiled and buffers allocated for them, so absurd
+        // ones must be refused before.
         let is_usable = (1..=16).contains(&self.n_cells.len())
             && self.n_cells.iter().all(|n| (1..=1 << 20).contains(n))
             && is_increasing

@@ -216,10 +216,8 @@ fn resume_and_load_are_bit_exact() {
     );
     let mut loaded = NerfModel::load(gpu(), folder.path()).unwrap();
     let request = request(&keyframes[1]);
-    let (drawn, again) = (
-        half.render(&request).unwrap(),
-        loaded.render(&request).unwrap(),
-    );
+    let drawn = half.render(&request).unwrap();
+    let again = loaded.render(&request).unwrap();
     assert!(drawn.rgba_srgb == again.rgba_srgb && drawn.depth_m == again.depth_m);
     assert!(loaded.is_idle() && loaded.step(3).unwrap() == 0);
 
@@ -586,10 +584,8 @@ fn changing_light_is_modeled() {
     model.save(folder.path()).unwrap();
     let mut loaded = NerfModel::load(gpu(), folder.path()).unwrap();
     for request in [like(&changing[5], 5), request(&changing[5])] {
-        let (drawn, again) = (
-            model.render(&request).unwrap(),
-            loaded.render(&request).unwrap(),
-        );
+        let drawn = model.render(&request).unwrap();
+        let again = loaded.render(&request).unwrap();
         assert!(drawn.rgba_srgb == again.rgba_srgb && drawn.depth_m == again.depth_m);
     }
 
@@ -741,7 +737,8 @@ fn rays_pass_pixel_centers_at_row_time() {
             (f64::from(pixel) + 0.5 - keyframe.principal_px[axis]) / keyframe.focal_px[axis]
         };
         // A rotation about z moves the ray's x and y.
-        let (u, v) = (normalized(x, 0), normalized(y, 1));
+        let u = normalized(x, 0);
+        let v = normalized(y, 1);
         let seen = Vector3::new(u - tau * 2.0 * v, v + tau * 2.0 * u, 1.0);
         let pose = &keyframe.world_from_camera;
         let expected =
@@ -1017,7 +1014,8 @@ fn training_continues_with_corrected_cameras() {
     const N_BEFORE: u64 = 120;
     const N_AFTER: u64 = 40;
     let all = ball_on_floor(9);
-    let (test_view, seen) = (&all[4], [&all[..4], &all[5..]].concat());
+    let test_view = &all[4];
+    let seen = [&all[..4], &all[5..]].concat();
     let psnr_of =
         |model: &mut NerfModel| psnr(&model.render(&request(test_view)).unwrap(), test_view);
     let wrong: Vec<_> = seen.iter().map(with_wrong_extrinsics).collect();

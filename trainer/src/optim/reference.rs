@@ -46,6 +46,8 @@ impl Adam {
     ) {
         moments.first = self.beta1 * moments.first + (1.0 - self.beta1) * gradient;
         moments.second = self.beta2 * moments.second + (1.0 - self.beta2) * gradient * gradient;
+        // Both means start at zero and grow at different rates. Without the corrections, the size
+        // of the first steps would depend on the two decays instead of on `rate`.
         let steps = f64::from(step);
         let first = moments.first / (1.0 - self.beta1.powf(steps));
         let second = moments.second / (1.0 - self.beta2.powf(steps));
@@ -83,6 +85,8 @@ impl Adam {
         gradients: &[f64],
         second: &mut f64,
     ) {
+        // One mean for all parameters saves memory, and moves them along their gradient instead of
+        // along its signs.
         let mean_square = gradients
             .iter()
             .map(|gradient| gradient * gradient)
@@ -105,7 +109,8 @@ mod tests {
     fn steps_match_explicit_means() {
         let adam = Adam::default();
         let gradients = [0.3, -0.1, 0.25, 2.0, -1.5, 1e-3];
-        let (mut param, mut moments) = (1.0, Moments::default());
+        let mut param = 1.0;
+        let mut moments = Moments::default();
         let mut expected = 1.0;
         let mut mismatches = Mismatches::default();
         for (ix, &gradient) in gradients.iter().enumerate() {
@@ -153,7 +158,8 @@ mod tests {
 
     #[test]
     fn converges_in_a_narrow_valley() {
-        let (mut params, mut moments) = ([4.0, -3.0], [Moments::default(); 2]);
+        let mut params = [4.0, -3.0];
+        let mut moments = [Moments::default(); 2];
         for step in 1..=2000 {
             let gradients = [2.0 * (params[0] - 1.0), 200.0 * (params[1] + 0.5)];
             let rate = 0.05 * 0.997_f64.powf(f64::from(step));

@@ -9,11 +9,16 @@ use crate::view::Camera;
 use crate::{Error, Picture, Projection, RenderRequest};
 use panorama::{Face, Panorama};
 
-/// MCUs (8 x 8 pixels, no subsampling) per restart interval, which one lane encodes.
+/// MCUs (8 x 8 pixels, no subsampling) per restart interval, which one lane encodes. More MCUs
+/// leave fewer lanes to work in parallel; with fewer, the markers between intervals lengthen the
+/// file.
 const MCUS_PER_INTERVAL: u32 = 2;
-/// Capacity of an interval, in words: four times the average at [`WORDS_PER_MCU`].
+/// Capacity of an interval, in words: four times the average at [`WORDS_PER_MCU`], because detail
+/// is distributed unevenly in a picture.
 const WORDS_PER_INTERVAL: u32 = 4 * WORDS_PER_MCU * MCUS_PER_INTERVAL;
-/// Maximum average of coded words per MCU. At quality 92, pictures of splats need about 6.
+/// Maximum average of coded words per MCU. At quality 92, pictures of splats need about 6. The
+/// read-back has this size, so a larger number makes each picture slower. A picture that does not
+/// fit is read back again without packing.
 const WORDS_PER_MCU: u32 = 16;
 /// Words before the coded words.
 const HEADER_WORDS: u32 = 4;
@@ -195,6 +200,7 @@ impl Rendered {
                 rendered = draw(&camera, Output { format, face: None })?;
             }
             Projection::Equirectangular => {
+                // Only the last face is read back, with the whole panorama.
                 for face in Face::all(request.size_px) {
                     rendered = draw(
                         &face.camera(request),
@@ -354,7 +360,8 @@ struct Buffers {
 impl Buffers {
     fn new(gpu: &Gpu, sizes: Sizes) -> Result<Self, Error> {
         let words = |name: &str, n: u32| gpu.storage(name, 4 * u64::from(n));
-        let (n_mcus, n_squares) = (sizes.n_mcus(), sizes.n_squares());
+        let n_mcus = sizes.n_mcus();
+        let n_squares = sizes.n_squares();
         Ok(Self {
             n_mcus,
             n_squares,
@@ -392,9 +399,24 @@ impl Packer {
             buffers.n_mcus >= sizes.n_mcus() && buffers.n_squares >= sizes.n_squares()
         };
         if !self.buffers.as_ref().is_some_and(fits) {
+            // Cached bindings own the old buffers, too. Both are dropped before the larger ones are
+            // allocated, so that memory need not hold both.
             passes.clear_bindings();
-            self.buffers = None; // Freed before the larger ones are allocated.
+            self.buffers = None;
             self.buffers = Some(Buffers::new(gpu, sizes)?);
+        }
+        Ok(())
+    }
+
+    /// Uploads the tables of a JPEG quality, unless they are those of the last picture.
+    fn set_quality(&mut self, gpu: &Gpu, passes: &mut Passes, quality: u8) -> Result<(), Error> {
+        if self.tables.as_ref().is_none_or(|(of, _)| *of != quality) {
+            passes.clear_bindings();
+            let tables = tables::transform_tables(quality);
+            self.tables = Some((
+                quality,
+                gpu.storage_with("packing.tables", bytemuck::cast_slice(&tables))?,
+            ));
         }
         Ok(())
     }
@@ -411,89 +433,107 @@ impl Packer {
     ) -> Result<Vec<(&Buffer, usize)>, Error> {
         let sizes = Sizes::of(size_px);
         self.reserve(gpu, passes, sizes)?;
-        if let Some(quality) = packing.jpeg_quality
-            && self.tables.as_ref().is_none_or(|(of, _)| *of != quality)
-        {
-            passes.clear_bindings();
-            let tables = tables::transform_tables(quality);
-            self.tables = Some((
-                quality,
-                gpu.storage_with("packing.tables", bytemuck::cast_slice(&tables))?,
-            ));
+        if let Some(quality) = packing.jpeg_quality {
+            self.set_quality(gpu, passes, quality)?;
         }
-        let Self {
-            transform,
-            code,
-            offsets,
-            join,
-            halve,
-            count,
-            codes,
-            tables,
-            buffers,
-        } = self;
-        let buffers = buffers
+        let buffers = self
+            .buffers
             .as_ref()
             .ok_or_else(|| Error::internal("the buffers of the packer are missing"))?;
         gpu.write(&buffers.packing, 0, bytemuck::bytes_of(&sizes));
-        let uniform = ("packing", &buffers.packing);
-        let packed = ("packed", &buffers.packed);
-        let [coefficients, non_zero] = [
-            ("coefficients", &buffers.coefficients),
-            ("non_zero", &buffers.non_zero),
-        ];
-        let [coded, n_coded] = [("coded", &buffers.coded), ("n_coded", &buffers.n_coded)];
+        // The header has the overflow flag and the largest depth, which kernels update atomically.
         passes.clear_range(&buffers.packed, 0..4 * u64::from(HEADER_WORDS));
+        // Only what was requested is read back, but the header always.
         let mut n_words = HEADER_WORDS;
-        if let Some((_, tables)) = tables.as_ref().filter(|_| packing.jpeg_quality.is_some()) {
+        let tables = self
+            .tables
+            .as_ref()
+            .filter(|_| packing.jpeg_quality.is_some());
+        if let Some((_, tables)) = tables {
             n_words += sizes.n_words;
-            let n_intervals = u64::from(sizes.n_intervals);
-            let transformed = [
-                uniform,
-                ("pixels", pixels),
-                ("tables", tables),
-                coefficients,
-                non_zero,
-            ];
-            passes.dispatch(gpu, transform, sizes.n_mcus().into(), &transformed);
-            let encoded = [
-                uniform,
-                coefficients,
-                non_zero,
-                ("codes", &*codes),
-                coded,
-                n_coded,
-                packed,
-            ];
-            passes.dispatch(gpu, code, n_intervals.div_ceil(32), &encoded);
-            passes.dispatch(gpu, offsets, 1, &[uniform, n_coded, packed]);
-            passes.dispatch(
-                gpu,
-                join,
-                n_intervals.div_ceil(8),
-                &[uniform, coded, n_coded, packed],
-            );
+            self.record_jpeg(gpu, passes, sizes, buffers, [pixels, tables]);
         }
-        let mut reads = vec![(packed.1, 4 * n_words as usize)];
+        let mut reads = vec![(&buffers.packed, 4 * n_words as usize)];
         if packing.depth {
-            let n_squares = u64::from(sizes.n_squares());
-            let halved = ("halved", &buffers.halved);
-            let counts = ("depth_counts", &buffers.depth_counts);
-            passes.dispatch(
-                gpu,
-                halve,
-                n_squares.div_ceil(256),
-                &[uniform, ("depths", depths), halved, packed],
-            );
-            passes.dispatch(
-                gpu,
-                count,
-                n_squares.div_ceil(512),
-                &[uniform, halved, packed, counts],
-            );
-            reads.push((counts.1, 2 * sizes.n_squares() as usize));
+            self.record_depth(gpu, passes, sizes, buffers, depths);
+            reads.push((&buffers.depth_counts, 2 * sizes.n_squares() as usize));
         }
         Ok(reads)
+    }
+
+    /// Records the passes that encode the color. Each restart interval is encoded independently
+    /// into its own words; then the intervals are joined without gaps.
+    fn record_jpeg(
+        &self,
+        gpu: &Gpu,
+        passes: &mut Passes,
+        sizes: Sizes,
+        buffers: &Buffers,
+        [pixels, tables]: [&Buffer; 2],
+    ) {
+        let uniform = ("packing", &buffers.packing);
+        let packed = ("packed", &buffers.packed);
+        let coefficients = ("coefficients", &buffers.coefficients);
+        let non_zero = ("non_zero", &buffers.non_zero);
+        let coded = ("coded", &buffers.coded);
+        let n_coded = ("n_coded", &buffers.n_coded);
+        let n_intervals = u64::from(sizes.n_intervals);
+        let transformed = [
+            uniform,
+            ("pixels", pixels),
+            ("tables", tables),
+            coefficients,
+            non_zero,
+        ];
+        passes.dispatch(gpu, &self.transform, sizes.n_mcus().into(), &transformed);
+        let encoded = [
+            uniform,
+            coefficients,
+            non_zero,
+            ("codes", &self.codes),
+            coded,
+            n_coded,
+            packed,
+        ];
+        passes.dispatch(gpu, &self.code, n_intervals.div_ceil(32), &encoded);
+        // One workgroup: the offset of an interval is the sum of all lengths before it.
+        passes.dispatch(gpu, &self.offsets, 1, &[uniform, n_coded, packed]);
+        passes.dispatch(
+            gpu,
+            &self.join,
+            n_intervals.div_ceil(8),
+            &[uniform, coded, n_coded, packed],
+        );
+    }
+
+    /// Records the passes that halve and quantize the depths. The step of the counts depends on the
+    /// largest depth of the picture, so it takes two passes.
+    fn record_depth(
+        &self,
+        gpu: &Gpu,
+        passes: &mut Passes,
+        sizes: Sizes,
+        buffers: &Buffers,
+        depths: &Buffer,
+    ) {
+        let uniform = ("packing", &buffers.packing);
+        let packed = ("packed", &buffers.packed);
+        let n_squares = u64::from(sizes.n_squares());
+        let halved = ("halved", &buffers.halved);
+        let counts = ("depth_counts", &buffers.depth_counts);
+        passes.dispatch(
+            gpu,
+            &self.halve,
+            n_squares.div_ceil(256),
+            &[uniform, ("depths", depths), halved, packed],
+        );
+        // A thread packs two counts into a word.
+        passes.dispatch(
+            gpu,
+            &self.count,
+            n_squares.div_ceil(512),
+            &[uniform, halved, packed, counts],
+        );
     }
 }
 
@@ -521,9 +561,11 @@ impl Reader {
             format: Format::Picture { depth },
             ..output
         };
+        // On a CPU, kernels would take longer than the encoders of the server.
         if gpu.is_software() {
-            return Ok(unpacked); // Kernels would take longer than the encoders of the server.
+            return Ok(unpacked);
         }
+        // Buffers are reserved here, where another format can still be chosen.
         match created(&mut self.packer, gpu)?.reserve(
             gpu,
             passes,
@@ -546,6 +588,7 @@ impl Reader {
         canvas: [&'a Buffer; 2],
     ) -> Result<Vec<(&'a Buffer, usize)>, Error> {
         let Self { packer, panorama } = self;
+        // Faces are collected in the panorama, so the canvas may be overwritten by the next one.
         let canvas = match output.face {
             Some(face) => Panorama::record(panorama, gpu, passes, face, canvas)?,
             None => canvas,
@@ -584,6 +627,7 @@ impl Reader {
         canvas: [&Buffer; 2],
     ) -> Result<Rendered, Error> {
         let (Format::Picture { depth } | Format::Packed(Packing { depth, .. })) = output.format;
+        // The pixels are still on the GPU, so the view need not be drawn again.
         let [pixels, depths] = match (output.face, &self.panorama) {
             (Some(_), Some(panorama)) => panorama.canvas(),
             _ => canvas,
@@ -608,6 +652,8 @@ impl Reader {
         view_px: [u32; 2],
         canvas: [&Buffer; 2],
     ) -> Result<Option<Rendered>, Error> {
+        // If packing is not possible, or the file turns out too long, the picture is read back as
+        // pixels.
         let output = self.available(gpu, passes, output, view_px)?;
         let reads = self.record(gpu, passes, output, view_px, canvas)?;
         if reads.is_empty() {
@@ -646,11 +692,13 @@ pub(crate) fn unpack(
     let [n_words, overflow, furthest, _] = header[..] else {
         return None;
     };
+    // Kernels drop words that do not fit, so the file would be damaged.
     if overflow != 0 {
         return None;
     }
     let jpeg = match packing.jpeg_quality {
         Some(quality) => {
+            // Sizes in JPEG files have 16 bits.
             let [Ok(width), Ok(height)] = size_px.map(u16::try_from) else {
                 return None;
             };
@@ -665,6 +713,7 @@ pub(crate) fn unpack(
         let furthest_m = f64::from(f32::from_bits(furthest));
         PackedDepth {
             size_px: Sizes::of(size_px).half_size_px(),
+            // Without any depth, all counts are zero, and any step is right except zero.
             meters_per_count: if furthest_m > 0.0 {
                 furthest_m / f64::from(u16::MAX)
             } else {
@@ -830,10 +879,8 @@ mod tests {
                 image::codecs::jpeg::JpegEncoder::new_with_quality(&mut by_library, quality)
                     .encode(&rgb, size_px[0], size_px[1], image::ExtendedColorType::Rgb8)
                     .unwrap();
-                let (ours, library) = (
-                    mean_abs_error(&jpeg, &picture),
-                    mean_abs_error(&by_library, &picture),
-                );
+                let ours = mean_abs_error(&jpeg, &picture);
+                let library = mean_abs_error(&by_library, &picture);
                 assert!(
                     ours < library + 0.1,
                     "{size_px:?}, quality {quality}: {ours}, by a library {library}"

@@ -32,6 +32,8 @@ impl Face {
         self.ix + 1 == N_FACES
     }
 
+    /// Width and height of a face, pixels. Across its middle, a face covers a quarter of the
+    /// panorama's width and half of its height.
     fn edge_px(self) -> u32 {
         let [width, height] = self.panorama_px;
         (width / 4).max(height / 2).max(1)
@@ -39,6 +41,7 @@ impl Face {
 
     fn rotation(self) -> Rotation3<f64> {
         let about = |axis, angle| Rotation3::from_axis_angle(&axis, angle);
+        // Forward, right, back and left, then up and down: x is right and y is down.
         match self.ix {
             0 => Rotation3::identity(),
             1 => about(Vector3::y_axis(), FRAC_PI_2),
@@ -57,6 +60,7 @@ impl Face {
             world_from_camera: request.world_from_camera
                 * Transform::from_parts(Translation3::identity(), rotation),
             size_px: [edge_px; 2],
+            // A field of view of 90 degrees, so that the six faces cover all directions.
             focal_px: [f64::from(edge_px) / 2.0; 2],
             principal_px: [f64::from(edge_px) / 2.0; 2],
             shutter: None,
@@ -122,8 +126,9 @@ impl Panorama {
             .as_ref()
             .is_none_or(|panorama| panorama.n_pixels < n_pixels)
         {
+            // Freed before the larger one is allocated.
             passes.clear_bindings();
-            *panorama = None; // Freed before the larger one is allocated.
+            *panorama = None;
             *panorama = Some(Self::new(gpu, n_pixels)?);
         }
         let panorama = panorama

@@ -77,7 +77,8 @@ fn zigzag() -> [usize; 64] {
     let mut order: Vec<usize> = (0..64).collect();
     // Along a diagonal, odd ones go down and even ones go up.
     order.sort_by_key(|at| {
-        let (row, column) = (at / 8, at % 8);
+        let row = at / 8;
+        let column = at % 8;
         (
             row + column,
             if (row + column) % 2 == 1 { row } else { column },
@@ -93,6 +94,8 @@ fn zigzag() -> [usize; 64] {
 /// Quantization of luminance and chrominance, row by row, scaled as in the software of the
 /// Independent JPEG Group.
 fn quantizers(quality: u8) -> [[u8; 64]; 2] {
+    // Quality 50 is the table itself. Below, percentages grow hyperbolically; above, they fall
+    // linearly to 0, where every quantizer is 1.
     let quality = u32::from(quality.clamp(1, 100));
     let percent = if quality < 50 {
         5000 / quality
@@ -102,27 +105,33 @@ fn quantizers(quality: u8) -> [[u8; 64]; 2] {
     let scaled = |base: u8| {
         u8::try_from(((u32::from(base) * percent + 50) / 100).clamp(1, 255)).unwrap_or(u8::MAX)
     };
-    let chrominance = |at: usize| {
-        CHROMINANCE
-            .get(at / 8)
-            .and_then(|row| row.get(at % 8))
-            .copied()
-            .unwrap_or(99)
-    };
     [
         LUMINANCE.map(scaled),
         std::array::from_fn(|at| scaled(chrominance(at))),
     ]
 }
 
+/// Quantization of chrominance at quality 50, at an index row by row (table K.2).
+fn chrominance(at: usize) -> u8 {
+    CHROMINANCE
+        .get(at / 8)
+        .and_then(|row| row.get(at % 8))
+        .copied()
+        .unwrap_or(99)
+}
+
 /// The table of `jpeg_transform`: cosines `[frequency, position]`; reciprocal quantizers of
 /// luminance and chrominance, row by row; zigzag positions, row by row.
 pub(super) fn transform_tables(quality: u8) -> Vec<f32> {
     let basis = (0..64).map(|at| {
-        let (frequency, position) = (f64::from(at / 8), f64::from(at % 8));
+        let frequency = f64::from(at / 8);
+        let position = f64::from(at % 8);
+        // Makes the transform orthonormal (T.81, A.3.3, with the factor 1/4 divided between the
+        // axes).
         let norm = if at < 8 { 0.125f64.sqrt() } else { 0.5 };
         norm * ((2.0 * position + 1.0) * frequency * PI / 16.0).cos()
     });
+    // The kernel multiplies, because divisions are slower.
     let reciprocals = quantizers(quality)
         .into_iter()
         .flatten()
@@ -147,7 +156,10 @@ pub(super) fn codes() -> Vec<u32> {
 /// Codes by symbol (T.81, annex C).
 fn codes_of(huffman: &Huffman, n_symbols: usize) -> Vec<u32> {
     let mut codes = vec![0; n_symbols];
-    let (mut code, mut symbols) = (0, huffman.symbols.iter());
+    let mut code = 0;
+    let mut symbols = huffman.symbols.iter();
+    // Codes of one length are successive numbers. The first code of the next length follows the
+    // last one, with a zero appended, so no code is the beginning of another.
     for (n_bits, n_codes) in (1..).zip(huffman.n_codes) {
         for symbol in symbols.by_ref().take(n_codes.into()) {
             codes[usize::from(*symbol)] = n_bits << 16 | code;
@@ -161,21 +173,19 @@ fn codes_of(huffman: &Huffman, n_symbols: usize) -> Vec<u32> {
 /// Everything before the coded data of a file with three colors at full resolution.
 pub(super) fn file_header(size_px: [u16; 2], quality: u8, mcus_per_interval: u16) -> Vec<u8> {
     let mut file = vec![0xff, 0xd8];
-    let mut segment = |marker: u8, contents: &[u8]| {
-        let length = u16::try_from(contents.len() + 2).expect("segments are short");
-        file.extend_from_slice(&[0xff, marker]);
-        file.extend_from_slice(&length.to_be_bytes());
-        file.extend_from_slice(contents);
-    };
-    segment(0xe0, b"JFIF\0\x01\x01\0\0\x01\0\x01\0\0");
+    // Version 1.1, an aspect ratio of 1, and no thumbnail.
+    push_segment(&mut file, 0xe0, b"JFIF\0\x01\x01\0\0\x01\0\x01\0\0");
+    // Quantization tables, 8 bits per entry, in zigzag order.
     let positions = zigzag();
     for (number, quantizers) in (0..).zip(quantizers(quality)) {
         let mut contents = [number; 65];
         for (position, quantizer) in positions.into_iter().zip(quantizers) {
             contents[1 + position] = quantizer;
         }
-        segment(0xdb, &contents);
+        push_segment(&mut file, 0xdb, &contents);
     }
+    // Baseline frame: 8 bits per sample and three components. Each one has its number, sampling
+    // factors of 1 by 1, and the number of its quantization table.
     let [width, height] = size_px.map(u16::to_be_bytes);
     let frame = [
         &[8],
@@ -184,16 +194,28 @@ pub(super) fn file_header(size_px: [u16; 2], quality: u8, mcus_per_interval: u16
         &[3, 1, 0x11, 0, 2, 0x11, 1, 3, 0x11, 1],
     ]
     .concat();
-    segment(0xc0, &frame);
+    push_segment(&mut file, 0xc0, &frame);
+    // Huffman tables. The high half of the number is the class, DC or AC.
     for (number, huffman) in [0x00, 0x10, 0x01, 0x11].into_iter().zip(HUFFMAN) {
-        segment(
+        push_segment(
+            &mut file,
             0xc4,
             &[&[number], &huffman.n_codes[..], huffman.symbols].concat(),
         );
     }
-    segment(0xdd, &mcus_per_interval.to_be_bytes());
-    segment(0xda, &[3, 1, 0x00, 2, 0x11, 3, 0x11, 0, 63, 0]);
+    push_segment(&mut file, 0xdd, &mcus_per_interval.to_be_bytes());
+    // One scan with all components and all 64 coefficients.
+    push_segment(&mut file, 0xda, &[3, 1, 0x00, 2, 0x11, 3, 0x11, 0, 63, 0]);
     file
+}
+
+/// Appends a marker segment (T.81, B.1.1.4).
+fn push_segment(file: &mut Vec<u8>, marker: u8, contents: &[u8]) {
+    // The length counts itself, but not the marker.
+    let length = u16::try_from(contents.len() + 2).expect("segments are short");
+    file.extend_from_slice(&[0xff, marker]);
+    file.extend_from_slice(&length.to_be_bytes());
+    file.extend_from_slice(contents);
 }
 
 #[cfg(test)]

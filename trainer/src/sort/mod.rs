@@ -84,6 +84,8 @@ pub struct SortBuffers {
 impl RadixSort {
     /// Compiles the variant that suits the adapter.
     pub fn new(gpu: &Gpu) -> Result<Self, Error> {
+        // The parallel scatter has ranks for 16 subgroups of its 256 threads, so subgroups need 16
+        // lanes. On a CPU, barriers are expensive.
         let parallel = !gpu.is_software()
             && gpu
                 .optional()
@@ -97,6 +99,7 @@ impl RadixSort {
             .optional()
             .subgroup_lanes
             .is_some_and(|lanes| lanes > 32);
+        // A ballot of up to 32 lanes fits into one word; the wide kernel compares four.
         let [count, scan, scatter] = if parallel {
             [
                 kernel!("radix_count_parallel"),
@@ -134,6 +137,8 @@ impl RadixSort {
         counter: u32,
         largest: u32,
     ) -> Result<SortBuffers, Error> {
+        // The number of keys is known only on the GPU, so dispatches and buffers are sized for the
+        // largest one.
         let max_blocks = n_max.div_ceil(self.block()).max(1);
         let words =
             |name: &str, n: u32| gpu.storage(&format!("{label}.{name}"), 4 * u64::from(n.max(1)));
@@ -162,13 +167,17 @@ impl RadixSort {
     /// values are replaced by the original indices of the keys; their previous content does not
     /// matter.
     pub fn sort(&self, gpu: &Gpu, passes: &mut Passes, buffers: &SortBuffers, status: &Buffer) {
+        // Sequential kernels assign a thread, not a workgroup, to each block; eight share a
+        // workgroup.
         let n_groups = if self.parallel {
             buffers.max_blocks
         } else {
             buffers.max_blocks.div_ceil(8)
         };
         for (pass, digit) in buffers.digits.iter().enumerate() {
-            let (from, to) = (pass % 2, 1 - pass % 2);
+            // Two passes, so the results end up in the first buffers again.
+            let from = pass % 2;
+            let to = 1 - pass % 2;
             let keys = &buffers.keys[from];
             let base: [(&str, &Buffer); 3] = [
                 ("digit", digit),
@@ -181,6 +190,8 @@ impl RadixSort {
                 n_groups.into(),
                 &[base[0], base[1], base[2], ("keys", keys)],
             );
+            // The first pass writes indices itself, so nobody has to fill the values with 0, 1, 2
+            // and so on.
             let scatter = if pass == 0 {
                 &self.scatter_indices
             } else {
@@ -197,6 +208,8 @@ impl RadixSort {
                 ("keys_out", &buffers.keys[to]),
                 ("values_out", &buffers.values[to]),
             ]);
+            // The parallel scan has a workgroup per digit, which sums its own row of counts. The
+            // scatter then adds the totals of smaller digits.
             if self.parallel {
                 passes.dispatch(
                     gpu,
@@ -212,6 +225,8 @@ impl RadixSort {
         }
     }
 
+    /// Number of keys in a block. Smaller blocks need more counts and scans; larger ones leave
+    /// fewer blocks to run in parallel. The kernels contain the same numbers.
     fn block(&self) -> u32 {
         if self.parallel { 2048 } else { 256 }
     }

@@ -140,6 +140,12 @@ impl KernelFixture {
         }
     }
 
+    /// Sets one counter of the status.
+    fn write_counter(&self, counter: usize, value: u32) {
+        self.gpu
+            .write(&self.status, 4 * counter as u64, &value.to_le_bytes());
+    }
+
     pub(super) fn render(&self) -> (Vec<[f32; 4]>, Vec<f32>) {
         let mut passes = Passes::default();
         self.passes().draw(&mut passes, &self.draw);
@@ -229,38 +235,38 @@ fn pictures_with_dropped_splats_match_the_twin() {
     const SEED: u32 = 7;
     let view = scene::tilted_view();
     let mut splats = scene::small_scene(1, 40);
+    // At most 0.62, so that the raised opacity stays below 1.
     splats
         .iter_mut()
         .for_each(|splat| splat.opacity_logit = splat.opacity_logit.min(0.5));
     let fixture = KernelFixture::new(&GpuOptions::default(), &view, &arrays_of(&splats));
-    let write = |counter: usize, value: u32| {
-        fixture
-            .gpu
-            .write(&fixture.status, 4 * counter as u64, &value.to_le_bytes())
-    };
-    write(status::DROP_FRAC, DROP_FRAC.to_bits());
-    write(status::DROP_SEED, SEED);
-    let kept_at = |step: u32| -> Vec<u32> {
-        (0..40)
-            .filter(|splat_ix| uniform3([*splat_ix, step, SEED])[0] >= DROP_FRAC.into())
-            .collect()
-    };
-    assert!(
-        (20..40).contains(&kept_at(0).len()) && kept_at(0) != kept_at(1),
-        "{:?}",
-        kept_at(0)
-    );
+    fixture.write_counter(status::DROP_FRAC, DROP_FRAC.to_bits());
+    fixture.write_counter(status::DROP_SEED, SEED);
+    let [at_0, at_1] = [0, 1].map(|step| kept_splats(40, step, SEED, DROP_FRAC));
+    assert!((20..40).contains(&at_0.len()) && at_0 != at_1, "{at_0:?}");
     for step in [0, 1] {
-        write(status::STEP, step);
-        let more_opaque = |splat_ix: u32| {
-            let mut splat = splats[splat_ix as usize].clone();
-            let opacity = 1.0 / (1.0 + (-splat.opacity_logit).exp()) / (1.0 - f64::from(DROP_FRAC));
-            splat.opacity_logit = (opacity / (1.0 - opacity)).ln();
-            splat
-        };
-        let rendered: Vec<Splat> = kept_at(step).into_iter().map(more_opaque).collect();
+        fixture.write_counter(status::STEP, step);
+        let rendered: Vec<Splat> = kept_splats(40, step, SEED, DROP_FRAC)
+            .into_iter()
+            .map(|splat_ix| more_opaque(&splats[splat_ix as usize], DROP_FRAC))
+            .collect();
         check_picture(&fixture, &view, &rendered);
     }
+}
+
+/// Indices of the first `n` splats that a step does not leave out.
+fn kept_splats(n: u32, step: u32, seed: u32, drop_frac: f32) -> Vec<u32> {
+    (0..n)
+        .filter(|splat_ix| uniform3([*splat_ix, step, seed])[0] >= drop_frac.into())
+        .collect()
+}
+
+/// The splat with the opacity that makes up for dropped splats.
+fn more_opaque(splat: &Splat, drop_frac: f32) -> Splat {
+    let mut splat = splat.clone();
+    let opacity = 1.0 / (1.0 + (-splat.opacity_logit).exp()) / (1.0 - f64::from(drop_frac));
+    splat.opacity_logit = (opacity / (1.0 - opacity)).ln();
+    splat
 }
 
 /// Compares the fixture's picture with that of the twin.
@@ -379,6 +385,7 @@ fn check_gradients_with_loss(view: &View, splats: &[Splat], variants: &[GpuOptio
     let rendered = reference::render(view, splats);
     let unambiguous = unambiguous_pixels(view, splats);
     let mut target = target_of(&rendered, view.size_px);
+    // At other pixels, f32 may draw another set of splats, whose gradients differ completely.
     for (visible, unambiguous) in target.visible.iter_mut().zip(&unambiguous) {
         *visible &= unambiguous;
     }
@@ -479,6 +486,7 @@ fn check_gradients(
     let fixture = KernelFixture::new(options, view, &arrays_of(splats));
     let gpu = &fixture.gpu;
     let target_buffers = TargetBuffers::new(gpu, target, weights);
+    // A variant of `update` stores the gradients in place of the values, so no rule is needed.
     let rule = gpu.uniform_with("rule", &<Rule as bytemuck::Zeroable>::zeroed());
     let gradients_only = TrainPipelines::gradients_only(gpu).unwrap();
     let mut passes = Passes::default();
@@ -505,6 +513,7 @@ fn check_gradients(
         upstream,
         weights.background_rgb,
     );
+    // The loss first: an error there would appear in all gradients.
     let n = target.rgb.len();
     let param_values: Vec<[f32; 4]> = gpu.read(&fixture.image_buffers.upstream, n).unwrap();
     let mut mismatches = Mismatches::default();
@@ -533,23 +542,27 @@ fn check_gradients(
     }
     mismatches.assert_none();
 
-    let got = fixture.splats.read(gpu).unwrap();
+    check_splat_gradients(&fixture.splats.read(gpu).unwrap(), &expected.splats);
+}
+
+/// Largest magnitude of some values of all splats.
+fn largest(splats: &[Splat], of: fn(&Splat) -> Vec<f64>) -> f64 {
+    splats
+        .iter()
+        .flat_map(of)
+        .fold(1e-12f64, |max, value| max.max(value.abs()))
+}
+
+/// Compares the gradients of all splats, relative to the largest gradient of the same kind: small
+/// ones are differences of large sums.
+fn check_splat_gradients(got: &SplatArrays, expected: &[Splat]) {
     let mut mismatches = Mismatches::default();
-    let largest = |of: fn(&Splat) -> Vec<f64>| {
-        expected
-            .splats
-            .iter()
-            .flat_map(of)
-            .fold(1e-12f64, |max, value| max.max(value.abs()))
-    };
-    let [mean, scale, rotation, opacity, sh] = [
-        largest(|splat| splat.mean.to_vec()),
-        largest(|splat| splat.log_scale.to_vec()),
-        largest(|splat| splat.rotation_wxyz.to_vec()),
-        largest(|splat| vec![splat.opacity_logit]),
-        largest(|splat| splat.sh.as_flattened().to_vec()),
-    ];
-    for (ix, splat) in expected.splats.iter().enumerate() {
+    let mean = largest(expected, |splat| splat.mean.to_vec());
+    let scale = largest(expected, |splat| splat.log_scale.to_vec());
+    let rotation = largest(expected, |splat| splat.rotation_wxyz.to_vec());
+    let opacity = largest(expected, |splat| vec![splat.opacity_logit]);
+    let sh = largest(expected, |splat| splat.sh.as_flattened().to_vec());
+    for (ix, splat) in expected.iter().enumerate() {
         for axis in 0..3 {
             mismatches.check(
                 format!("mean {ix} {axis}"),
@@ -567,14 +580,10 @@ fn check_gradients(
             );
         }
         for part in 0..4 {
-            let (gpu, twin) = (
-                got.rotations_wxyz[ix][part].into(),
-                splat.rotation_wxyz[part],
-            );
             mismatches.check(
                 format!("rotation {ix} {part}"),
-                gpu,
-                twin,
+                got.rotations_wxyz[ix][part].into(),
+                splat.rotation_wxyz[part],
                 GRADIENT_REL * rotation,
                 GRADIENT_REL,
             );
@@ -635,34 +644,23 @@ fn check_camera_gradients(
     background_rgb: [f64; 3],
 ) {
     const STEP: f64 = 1e-5;
+    // Decisions stay fixed: a splat that appears or vanishes would make the differences jump.
     let decisions = reference::decide(view, splats);
+    let loss_of =
+        |changed: &View| upstream.dot(&reference::render_decided(changed, splats, &decisions));
     let along = |change: &dyn Fn(&mut View, f64)| {
-        let image = |step: f64| {
-            let mut changed = view.clone();
-            change(&mut changed, step);
-            reference::render_decided(&changed, splats, &decisions)
-        };
-        let (high, low) = (image(STEP), image(-STEP));
-        let dot = |high: &RenderedImage, sign: f64| {
-            let rgb = high
-                .rgb
-                .as_flattened()
-                .iter()
-                .zip(upstream.rgb.as_flattened())
-                .map(|(x, v)| x * v)
-                .sum::<f64>();
-            let of = |x: &[f64], v: &[f64]| x.iter().zip(v).map(|(x, v)| x * v).sum::<f64>();
-            sign * (rgb
-                + of(&high.depth, &upstream.depth)
-                + of(&high.transmittance, &upstream.transmittance))
-        };
-        (dot(&high, 1.0) + dot(&low, -1.0)) / (2.0 * STEP)
+        let mut high = view.clone();
+        let mut low = view.clone();
+        change(&mut high, STEP);
+        change(&mut low, -STEP);
+        (loss_of(&high) - loss_of(&low)) / (2.0 * STEP)
     };
     let [x, y, z, rotation_x, rotation_y, rotation_z] = by_view.pose;
     let twist = moving_keyframe().twist.unwrap();
     let translation = Vector3::new(x, y, z);
     let rotation = Vector3::new(rotation_x, rotation_y, rotation_z);
     let mut expected = vec![rotation_x, rotation_y, rotation_z, x, y, z];
+    // The pose lags behind the image by the time offset, so the camera moves back along its twist.
     expected.push(-twist.angular_rad_s.dot(&rotation) - twist.linear_m_s.dot(&translation));
     for axis in 0..2 {
         expected.push(along(&|view, step| view.focal_px[axis] *= step.exp()));
@@ -673,6 +671,8 @@ fn check_camera_gradients(
         }));
     }
     let image = reference::render_decided(view, splats, &decisions);
+    // A gain multiplies the picture including its background, so the derivative with respect to its
+    // logarithm at 0 is the picture.
     for channel in 0..3 {
         let picture = |pixel: usize| {
             image.rgb[pixel][channel] + image.transmittance[pixel] * background_rgb[channel]
@@ -683,6 +683,7 @@ fn check_camera_gradients(
                 .sum(),
         );
     }
+    // Parameters of one group have the same unit, and their gradients about the same magnitude.
     let mut mismatches = Mismatches::default();
     for group in [0..3, 3..6, 6..7, 7..9, 9..11, 11..14] {
         let largest = expected[group.clone()]
@@ -723,6 +724,7 @@ fn check_hidden_splats(variants: &[GpuOptions]) {
         let fixture = KernelFixture::new(options, &view, &arrays_of(&stack));
         let gpu = &fixture.gpu;
         let n_pixels = (view.size_px[0] * view.size_px[1]) as usize;
+        // Slots with gradients of an earlier step, and a gradient at every pixel.
         gpu.write(
             &fixture.scratch.gradients,
             0,
@@ -777,6 +779,7 @@ fn invalid_splats_are_not_drawn() {
         corrupt(&mut splat);
         invalid_splats.push(splat);
     }
+    // Its projection divides by zero.
     let mut on_camera_plane = splats[1].clone();
     on_camera_plane.mean = view.camera_from_world.inverse().translation.vector.into();
     invalid_splats.push(on_camera_plane);
@@ -803,6 +806,7 @@ fn camera_params_start_at_zero_and_step_by_their_rate() {
         let set = ParamSet::LENS | ParamSet::IMAGE_GAINS;
         let mut cameras = CameraParams::new(gpu, set).unwrap();
         let lens = cameras.lens(gpu, &moving_keyframe()).unwrap();
+        // A scene of 1 m, at the start of training: all rates have their initial values.
         cameras.write_rule(gpu, 0.0, 1.0);
         let target = target_of(&reference::render(&view, &splats), view.size_px);
         let weights = loss_reference::Weights {
@@ -832,6 +836,7 @@ fn camera_params_start_at_zero_and_step_by_their_rate() {
         view_passes.update(&mut passes, &fixture.train.update_with_camera, &rule, true);
         cameras.refine(&view_passes, &mut passes, &fixture.train, &lens);
         passes.submit(gpu);
+        // Phase 1: the view was corrected before the step, with parameters of zero.
         let corrected: Vec<f32> = gpu.read(&cameras.corrected, 20).unwrap();
         let base = camera_of(&view).view();
         for (ix, (got, expected)) in corrected
@@ -844,6 +849,7 @@ fn camera_params_start_at_zero_and_step_by_their_rate() {
                 "word {ix}: {got}, expected {expected}"
             );
         }
+        // Phase 2: only the lens is enabled among the parameters of the camera.
         let steps: Vec<f64> = cameras.param_values(gpu);
         for (param, step) in steps.iter().enumerate() {
             let rate = if (7..11).contains(&param) { 1e-3 } else { 0.0 };

@@ -11,7 +11,8 @@ use std::path::Path;
 /// Size of a splat: three floats for the mean and three for the standard deviations, four bytes
 /// each for color with opacity, and for the rotation.
 const SPLAT_BYTES: usize = 32;
-/// Standard deviations of 0, which have no finite logarithm, are raised to this value.
+/// Standard deviations of 0, which have no finite logarithm, are raised to this value. A nanometer
+/// is invisible at any distance.
 const MIN_SCALE: f32 = 1e-9;
 
 /// Reads a `.splat` file. Splats with invalid numbers are left out, with a warning.
@@ -28,6 +29,7 @@ pub(super) fn read(path: &Path) -> Result<SplatArrays, Error> {
 }
 
 fn from_bytes(bytes: &[u8]) -> Result<SplatArrays, String> {
+    // The format has no signature. The length is all that can be checked.
     let (rows, rest) = bytes.as_chunks::<SPLAT_BYTES>();
     if rows.is_empty() || !rest.is_empty() {
         return Err(format!(
@@ -35,6 +37,7 @@ fn from_bytes(bytes: &[u8]) -> Result<SplatArrays, String> {
             bytes.len()
         ));
     }
+    // Quaternions are stored as `128 q + 128`, w first, and colors without spherical harmonics.
     let rotation =
         |row: &[u8; SPLAT_BYTES]| [28, 29, 30, 31].map(|at| (f32::from(row[at]) - 128.0) / 128.0);
     let color =
@@ -53,13 +56,14 @@ fn from_bytes(bytes: &[u8]) -> Result<SplatArrays, String> {
     })
 }
 
-/// The three floats from a byte of a row on.
+/// The three floats that start at a byte of a row.
 fn floats(row: &[u8; SPLAT_BYTES], start: usize) -> [f32; 3] {
     [0, 4, 8].map(|at| f32::from_le_bytes(std::array::from_fn(|ix| row[start + at + ix])))
 }
 
 /// Logarithm of a standard deviation; NaN for invalid ones.
 fn log_scale(scale: f32) -> f32 {
+    // False for NaN and negative numbers. The caller leaves out splats with NaN.
     if scale >= 0.0 {
         scale.max(MIN_SCALE).ln()
     } else {
@@ -67,8 +71,8 @@ fn log_scale(scale: f32) -> f32 {
     }
 }
 
-/// Bytes 0 and 255 are decoded as the center of their half step, because opacities of 0 and 1 have
-/// no finite logit.
+/// Bytes 0 and 255 are decoded as 0.25 and 254.75, because opacities of 0 and 1 have no finite
+/// logit.
 fn opacity_logit(byte: u8) -> f32 {
     let opacity = f32::from(byte).clamp(0.25, 254.75) / 255.0;
     (opacity / (1.0 - opacity)).ln()

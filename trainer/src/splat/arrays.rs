@@ -92,6 +92,8 @@ impl SplatArrays {
     pub(crate) fn without_invalid(mut self, path: &Path) -> Result<Self, Error> {
         const MAX_LOGIT: f32 = 30.0;
         self.check_lengths()?;
+        // Other programs write opacities of 0 and 1, whose logits are infinite. Beyond +-30, the
+        // logistic function is 0 or 1 up to f32 rounding.
         for logit in self
             .opacity_logits
             .iter_mut()
@@ -105,6 +107,7 @@ impl SplatArrays {
             return self.checked();
         };
         let n_invalid = 1 + invalid.count();
+        // `checked` has more precise messages for the usual causes.
         if n_invalid == n_splats {
             self.checked()?;
             return Err(Error::SplatArrays(format!(
@@ -118,14 +121,12 @@ impl SplatArrays {
         self.filtered(|ix| self.fault(ix).is_none()).checked()
     }
 
-    /// Why a splat of a file cannot be drawn sensibly; `None` if it can.
+    /// Why a splat from a file cannot be used; `None` if it can.
     fn fault(&self, ix: usize) -> Option<&'static str> {
         let n_coeffs = self.n_coefficients();
-        let (mean, log_scales, rotation) = (
-            &self.means[ix],
-            &self.log_scales[ix],
-            &self.rotations_wxyz[ix],
-        );
+        let mean = &self.means[ix];
+        let log_scales = &self.log_scales[ix];
+        let rotation = &self.rotations_wxyz[ix];
         let color = self.sh[ix * n_coeffs..(ix + 1) * n_coeffs].as_flattened();
         let mut all = mean
             .iter()
@@ -181,25 +182,28 @@ impl SplatArrays {
 
     /// Indices of the splats that are drawn. Splats with values that are not finite are not.
     pub(crate) fn visible(&self) -> Vec<u32> {
-        let is_finite = |ix: usize| {
-            let shape = self.means[ix]
-                .iter()
-                .chain(&self.log_scales[ix])
-                .chain(&self.rotations_wxyz[ix]);
-            shape
-                .chain(&self.sh[ix * self.n_coefficients()])
-                .all(|value| value.is_finite())
-        };
         let is_visible =
-            |ix: &u32| self.opacity(*ix as usize) > MIN_ALPHA && is_finite(*ix as usize);
+            |ix: &u32| self.opacity(*ix as usize) > MIN_ALPHA && self.is_finite(*ix as usize);
         (0..u32::try_from(self.n_splats()).unwrap_or(u32::MAX))
             .filter(is_visible)
             .collect()
     }
 
+    /// Whether the shape and the constant color of a splat are finite.
+    fn is_finite(&self, ix: usize) -> bool {
+        let shape = self.means[ix]
+            .iter()
+            .chain(&self.log_scales[ix])
+            .chain(&self.rotations_wxyz[ix]);
+        shape
+            .chain(&self.sh[ix * self.n_coefficients()])
+            .all(|value| value.is_finite())
+    }
+
     /// The splats for which `is_kept` is true of the index.
     #[must_use]
     pub(crate) fn filtered(&self, is_kept: impl Fn(usize) -> bool + Sync) -> Self {
+        // In parallel, because the condition may search through edits. The order is kept.
         let kept: Vec<usize> = (0..self.n_splats())
             .into_par_iter()
             .filter(|ix| is_kept(*ix))

@@ -9,12 +9,14 @@ use calibration::{Candidate, MIN_VALIDATION_IMAGES, ParamSet, Trial};
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, VecDeque};
 
-/// Number of latest keyframes that a decision is based on.
+/// Number of latest keyframes that a decision is based on. More of them delay the detection of a
+/// change. Fewer let a single outlier decide.
 const MAX_SCORED: usize = 8;
 /// Minimum mean gain, dB. Smaller gains may come from areas that the model does not show yet.
 const MIN_MEAN_GAIN_DB: f64 = 1.0;
 /// Minimum PSNR with the best gains, dB. If it is lower, the picture differs in more than
-/// brightness.
+/// brightness. A higher minimum ignores more keyframes, especially early in a run, when the model
+/// is still coarse.
 const MIN_PSNR_DB: f64 = 18.0;
 
 /// Scores of the latest keyframes.
@@ -38,9 +40,13 @@ impl ArrivalGains {
         log_gains: [f64; 3],
         psnr: impl Fn([f64; 3]) -> Option<f64>,
     ) -> Option<Trial> {
+        // Gains that were fitted to different content say nothing about the exposure, so they must
+        // not predict the next keyframe, either.
         if psnr(log_gains.map(f64::exp))? < MIN_PSNR_DB {
             return None;
         }
+        // Cameras adapt their exposure independently, so each one predicts only its own keyframes.
+        // The first keyframe of a camera has no prediction.
         let previous = self.last_log_gains.insert(camera.to_owned(), log_gains)?;
         self.differences_db
             .push_back(psnr(previous.map(f64::exp))? - psnr([1.0; 3])?);
@@ -51,6 +57,7 @@ impl ArrivalGains {
             Candidate::Cameras(ParamSet::IMAGE_GAINS),
             self.differences_db.make_contiguous(),
         );
+        // A wrong decision cannot be reverted in a live run, so significance alone is not enough.
         let is_clear = trial.n_images >= MIN_VALIDATION_IMAGES && trial.gain_db >= MIN_MEAN_GAIN_DB;
         (trial.kept && is_clear).then_some(trial)
     }

@@ -1,9 +1,9 @@
 //! Times rendering and training steps on a given cloud, in total and pass by pass.
 //!
-//! The setup matches the benchmark of the peer implementation: a pinhole camera at [`Eye::Outside`]
-//! looking along z with a focal length of 0.9 image widths, a target of uniform noise, L1 loss, and
-//! an update of every splat per step. [`Losses::Training`] adds the other losses of training with
-//! depth.
+//! The setup matches the benchmark of the peer implementation. A pinhole camera at
+//! [`Eye::Outside`] looks along z with a focal length of 0.9 image widths. The target is uniform
+//! noise, the loss is L1, and each step updates every splat. [`Losses::Training`] adds the other
+//! losses of training with depth.
 
 use super::arrays::SplatArrays;
 use super::buffers::{ImageBuffers, Scratch, ScratchSize, SplatBuffers, n_bins, n_tiles};
@@ -152,6 +152,7 @@ pub fn time_kernels(
         bench.time(&mut passes, repeats, KernelBench::record_picture)?;
     let (step_millis, step_wall_millis) =
         bench.time(&mut passes, repeats, KernelBench::record_step)?;
+    // Timestamps around every pass slow down a step, so passes are timed in an additional one.
     bench.record_step(&mut passes)?;
     let mut timings = passes.submit_timed(gpu)?;
     let mut packed_millis = None;
@@ -203,28 +204,8 @@ impl KernelBench {
         let mut splats = SplatBuffers::new(&gpu, n_splats, cloud.sh_degree)?;
         splats.append(&gpu, cloud);
         let n_pixels = size_px[0] * size_px[1];
-        let focal_px = [0.9 * f64::from(size_px[0]); 2];
-        let camera = Camera {
-            world_from_camera: Transform::translation(0.0, 0.0, eye.z_m()),
-            size_px,
-            focal_px,
-            principal_px: size_px.map(|size| f64::from(size) / 2.0),
-            shutter: None,
-            near_m: 0.01,
-            far_m: 1e6,
-            crop: None,
-            edits: Arc::default(),
-            low_pass_px2: LOW_PASS_PX2,
-        };
-        let noise: Vec<u32> = (0..n_pixels)
-            .map(|pixel| {
-                pixel
-                    .wrapping_mul(2_654_435_761)
-                    .rotate_left(11)
-                    .wrapping_mul(0x85eb_ca6b)
-                    | 0xff00_0000
-            })
-            .collect();
+        let camera = camera(size_px, eye);
+        let noise: Vec<u32> = (0..n_pixels).map(noise_pixel).collect();
         let (depth_m, supervision) = match losses {
             Losses::L1 => (0.0, <Supervision as bytemuck::Zeroable>::zeroed()),
             Losses::Training => (
@@ -254,6 +235,7 @@ impl KernelBench {
             supervision: gpu.uniform_with("bench.supervision", &supervision),
             gains: gpu.storage_with("bench.gains", bytemuck::cast_slice(&[1.0f32; 4]))?,
             rule: gpu.uniform_with("bench.rule", &rule()),
+            // Two rules instead of one that is rewritten, so that no upload is part of the timing.
             rule_visible: gpu.uniform_with(
                 "bench.rule_touched",
                 &Rule {
@@ -273,6 +255,7 @@ impl KernelBench {
 
     /// Measures the required size of the intersection buffers and allocates them.
     fn size_buffers(&mut self) -> Result<(), Error> {
+        // The first pass measures the lists, the second one verifies that they fit.
         for _ in 0..2 {
             let mut passes = Passes::default();
             self.view_passes().draw(&mut passes, &self.draw);
@@ -285,6 +268,8 @@ impl KernelBench {
                 n_slots: with_headroom(counters[status::NEED_SLOTS]),
                 n_bins: n_bins(self.size_px),
             };
+            // A minimal buffer frees the previous one before the larger one is allocated, so that
+            // both do not count toward the peak of memory.
             drop(passes);
             self.scratch = Scratch::new(
                 &self.gpu,
@@ -410,6 +395,7 @@ impl KernelBench {
             self.gpu.wait()?;
             n_warm += 1;
         }
+        // Back to back, which includes the time for recording on the CPU.
         let since = Instant::now();
         for _ in 0..repeats.n_consecutive {
             record(self, passes)?;
@@ -417,6 +403,7 @@ impl KernelBench {
         }
         self.gpu.wait()?;
         let consecutive_millis = since.elapsed().as_secs_f64() * 1e3 / repeats.n_consecutive as f64;
+        // One by one, with timestamps on the GPU. The median ignores runs that other work delayed.
         let mut spans = Vec::new();
         for _ in 0..repeats.n_timed {
             record(self, passes)?;
@@ -445,6 +432,31 @@ impl KernelBench {
                 / n as f64
         }))
     }
+}
+
+/// The camera of the peer's benchmark.
+fn camera(size_px: [u32; 2], eye: Eye) -> Camera {
+    Camera {
+        world_from_camera: Transform::translation(0.0, 0.0, eye.z_m()),
+        size_px,
+        focal_px: [0.9 * f64::from(size_px[0]); 2],
+        principal_px: size_px.map(|size| f64::from(size) / 2.0),
+        shutter: None,
+        near_m: 0.01,
+        far_m: 1e6,
+        crop: None,
+        edits: Arc::default(),
+        low_pass_px2: LOW_PASS_PX2,
+    }
+}
+
+/// Opaque color of a pixel of noise: a hash of its index.
+fn noise_pixel(pixel: u32) -> u32 {
+    pixel
+        .wrapping_mul(2_654_435_761)
+        .rotate_left(11)
+        .wrapping_mul(0x85eb_ca6b)
+        | 0xff00_0000
 }
 
 fn rule() -> Rule {

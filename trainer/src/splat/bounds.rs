@@ -3,11 +3,13 @@
 use super::arrays::SplatArrays;
 use crate::Bounds;
 
-/// Minimum fraction of opaque splats. Below it, the bounds are computed from all splats.
+/// Minimum fraction of opaque splats. Below it, the bounds are computed from all splats: a few
+/// opaque ones may be outliers. At the start of training without depth, all are transparent.
 const MIN_OPAQUE_FRAC: f64 = 0.02;
 
 /// Bounds around the median of the splats that are at least half opaque; `None` without splats.
 pub(super) fn bounds(splats: &SplatArrays) -> Option<Bounds> {
+    // A logit above 0 is an opacity above one half.
     let n_opaque = splats
         .opacity_logits
         .iter()

@@ -57,6 +57,7 @@ pub(crate) struct SplatBuffers {
 impl SplatBuffers {
     /// Creates an empty model with capacity for `capacity` splats of `sh_degree`.
     pub(crate) fn new(gpu: &Gpu, capacity: u32, sh_degree: u32) -> Result<Self, Error> {
+        // Buffers cannot be empty.
         let capacity = capacity.max(1);
         let n = u64::from(capacity);
         let rest = u64::from(n_sh_rest(sh_degree)).max(1);
@@ -77,13 +78,19 @@ impl SplatBuffers {
             active_degree: sh_degree,
             is_antialiased: false,
             model: gpu.uniform_with("splat.model", &sizes),
+            // `vec4f` per splat: a `vec3f` takes as much space in a storage buffer. The fourth
+            // component of a shape is the opacity logit.
             means: gpu.storage("splat.means", 16 * n)?,
             rotations: gpu.storage("splat.rotations", 16 * n)?,
             shapes: gpu.storage("splat.shapes", 16 * n)?,
+            // One plane per color coefficient: neighboring lanes read neighboring words.
             sh_dc: gpu.storage("splat.sh_dc", 12 * n)?,
             sh_rest: gpu.storage("splat.sh_rest", 4 * rest * n)?,
+            // First and second moments of means, rotations and shapes: 2 x 3 `vec4f`.
             moments: gpu.storage("splat.moments", 96 * n)?,
             sh_dc_moments: gpu.storage("splat.sh_dc_moments", 24 * n)?,
+            // All higher coefficients share one second moment; see docs/design/splats.md, section
+            // "Optimizer".
             sh_rest_moments: gpu.storage("splat.sh_rest_moments", 4 * n)?,
             error_sums: gpu.storage("splat.error_sums", 4 * n)?,
         })
@@ -100,11 +107,13 @@ impl SplatBuffers {
     /// Returns a copy with capacity for `capacity` splats of `sh_degree`, including the moments.
     pub(crate) fn resized(&self, gpu: &Gpu, capacity: u32, sh_degree: u32) -> Result<Self, Error> {
         let mut larger = Self::new(gpu, capacity, sh_degree)?;
-        let (stride_from, stride_to) = (u64::from(self.capacity), u64::from(larger.capacity));
+        let stride_from = u64::from(self.capacity);
+        let stride_to = u64::from(larger.capacity);
         let mut copies = Passes::default();
         for ((from, n_planes, bytes), (to, n_planes_to, _)) in
             self.planes().iter().zip(larger.planes())
         {
+            // A lower degree has fewer planes of higher coefficients; they come last.
             for plane in 0..u64::from(*n_planes.min(&n_planes_to)) {
                 copies.copy(
                     (from, plane * stride_from * bytes),
@@ -140,12 +149,12 @@ impl SplatBuffers {
     }
 
     fn write_model(&self, gpu: &Gpu) {
-        let (sh_degree, n_sh_rest) = (self.active_degree, n_sh_rest(self.active_degree));
         let sizes = Model {
             n_splats: self.n_splats,
             capacity: self.capacity,
-            sh_degree,
-            n_sh_rest,
+            // Kernels see only the active degree. Inactive coefficients stay as they are.
+            sh_degree: self.active_degree,
+            n_sh_rest: n_sh_rest(self.active_degree),
             is_antialiased: self.is_antialiased.into(),
             unused_0: 0,
             unused_1: 0,
@@ -179,30 +188,34 @@ impl SplatBuffers {
             bytemuck::cast_slice(&arrays.rotations_wxyz),
         );
         gpu.write(&self.shapes, 16 * first, bytemuck::cast_slice(&shapes));
-        let n_coeffs = arrays.n_coefficients();
-        let plane = |function: usize, channel: usize| -> Vec<f32> {
-            arrays
-                .sh
-                .chunks_exact(n_coeffs)
-                .map(|coeffs| coeffs.get(function).map_or(0.0, |rgb| rgb[channel]))
-                .collect()
-        };
+        self.append_colors(gpu, arrays);
+        let n_new = u32::try_from(n_new).expect("the caller ensured a capacity that fits into u32");
+        self.is_antialiased = arrays.is_antialiased;
+        self.set_n_splats(gpu, self.n_splats + n_new);
+    }
+
+    /// Writes the colors of new splats after the last splat.
+    fn append_colors(&self, gpu: &Gpu, arrays: &SplatArrays) {
+        let first = u64::from(self.n_splats);
+        let n_new = arrays.means.len();
         let stride = u64::from(self.capacity);
         for channel in 0..3 {
             gpu.write(
                 &self.sh_dc,
                 4 * (channel as u64 * stride + first),
-                bytemuck::cast_slice(&plane(0, channel)),
+                bytemuck::cast_slice(&plane_of(arrays, 0, channel)),
             );
         }
+        // The memory may hold the coefficients of splats that were removed, so missing ones are
+        // cleared. A clear needs no transfer from the host, unlike a write of zeros.
         let mut zeros = Passes::default();
         for ix in 0..n_sh_rest(self.sh_degree) as usize {
             let at = 4 * (ix as u64 * stride + first);
-            if 1 + ix / 3 < n_coeffs {
+            if 1 + ix / 3 < arrays.n_coefficients() {
                 gpu.write(
                     &self.sh_rest,
                     at,
-                    bytemuck::cast_slice(&plane(1 + ix / 3, ix % 3)),
+                    bytemuck::cast_slice(&plane_of(arrays, 1 + ix / 3, ix % 3)),
                 );
             } else {
                 zeros.clear_range(&self.sh_rest, at..at + 4 * n_new as u64);
@@ -211,18 +224,14 @@ impl SplatBuffers {
         if !zeros.is_empty() {
             zeros.submit(gpu);
         }
-        let n_new = u32::try_from(n_new).expect("the caller ensured a capacity that fits into u32");
-        self.is_antialiased = arrays.is_antialiased;
-        self.set_n_splats(gpu, self.n_splats + n_new);
     }
 
     /// Reads the parameters back.
     pub(crate) fn read(&self, gpu: &Gpu) -> Result<SplatArrays, Error> {
         if self.n_splats == 0 {
-            let (sh_degree, is_antialiased) = (self.sh_degree, self.is_antialiased);
             return Ok(SplatArrays {
-                sh_degree,
-                is_antialiased,
+                sh_degree: self.sh_degree,
+                is_antialiased: self.is_antialiased,
                 ..SplatArrays::default()
             });
         }
@@ -232,13 +241,15 @@ impl SplatBuffers {
     /// Begins to read the parameters of at least one splat, with color coefficients up to this
     /// degree.
     pub(crate) fn begin_read(&self, gpu: &Gpu, max_sh_degree: u32) -> PendingSplats {
-        let (n, stride) = (self.n_splats as usize, self.capacity as usize);
+        let n = self.n_splats as usize;
+        let stride = self.capacity as usize;
         let sh_degree = self.sh_degree.min(max_sh_degree);
         let n_rest = n_sh_rest(sh_degree) as usize;
         PendingSplats {
             means: gpu.begin_read(&self.means, 4 * n),
             rotations: gpu.begin_read(&self.rotations, 4 * n),
             shapes: gpu.begin_read(&self.shapes, 4 * n),
+            // Planes are read with their gaps, in one copy.
             dc: gpu.begin_read(&self.sh_dc, 3 * stride),
             rest: (n_rest > 0).then(|| gpu.begin_read(&self.sh_rest, n_rest * stride)),
             n,
@@ -315,19 +326,15 @@ impl PendingSplats {
         let dc: Vec<f32> = self.dc.finish(gpu)?;
         let rest: Vec<f32> = self.rest.map_or(Ok(Vec::new()), |rest| rest.finish(gpu))?;
         let n_coeffs = (sh_degree as usize + 1).pow(2);
-        let coeff = |ix: usize, function: usize| -> [f32; 3] {
-            std::array::from_fn(|channel| {
-                if function == 0 {
-                    dc[channel * stride + ix]
-                } else {
-                    rest[(3 * (function - 1) + channel) * stride + ix]
-                }
-            })
-        };
-        let sh = (0..n)
-            .flat_map(|ix| (0..n_coeffs).map(move |function| (ix, function)))
-            .map(|(ix, function)| coeff(ix, function))
-            .collect();
+        // Planes on the GPU, but splat by splat in host memory.
+        let mut sh = Vec::with_capacity(n * n_coeffs);
+        for ix in 0..n {
+            sh.push([0, 1, 2].map(|channel| dc[channel * stride + ix]));
+            for function in 1..n_coeffs {
+                let plane = 3 * (function - 1);
+                sh.push([0, 1, 2].map(|channel| rest[(plane + channel) * stride + ix]));
+            }
+        }
         Ok(SplatArrays {
             means: means.iter().map(|[x, y, z, _]| [*x, *y, *z]).collect(),
             log_scales: shapes.iter().map(|[x, y, z, _]| [*x, *y, *z]).collect(),
@@ -338,6 +345,15 @@ impl PendingSplats {
             is_antialiased,
         })
     }
+}
+
+/// The values of one color coefficient of all splats; zeros if the splats have no such coefficient.
+fn plane_of(arrays: &SplatArrays, function: usize, channel: usize) -> Vec<f32> {
+    arrays
+        .sh
+        .chunks_exact(arrays.n_coefficients())
+        .map(|coeffs| coeffs.get(function).map_or(0.0, |rgb| rgb[channel]))
+        .collect()
 }
 
 /// Temporary buffers for drawing one view and training on it.
@@ -396,15 +412,20 @@ impl Scratch {
             n_bins,
         } = size;
         let n_blocks = n_splats.div_ceil(BLOCK);
+        // Pictures and software adapters need no segments.
         let n_segments = if n_slots > 0 && pipelines.has_segments {
             n_segments(n_entries, n_slots)
         } else {
             [0; 2]
         };
-        let n_of_tiles = 3 * TILES_PER_BIN * n_bins; // The first segment and two pieces of each tile.
+        // The first segment and two pieces of each tile.
+        let n_of_tiles = 3 * TILES_PER_BIN * n_bins;
+        // 16 bytes: four words of `Segment`.
         let segment_bytes =
             16 * (u64::from(n_segments[0]) + u64::from(n_segments[1]) + u64::from(n_of_tiles));
+        // A float for each part of the state of each pixel of a tile.
         let state_bytes = u64::from(4 * N_STATE_PARTS * 2 * STATE_PAIRS);
+        // In u64, because the product can exceed 32 bits.
         let per_bin =
             |name: &str, n: u32| gpu.storage(name, 4 * u64::from(n_bins) * u64::from(n.max(1)));
         let capacity = Capacity {
@@ -423,6 +444,7 @@ impl Scratch {
                     ..capacity
                 },
             ),
+            // Per splat: what `project` and `count_bins` compute.
             projected_splats: gpu.storage("splat.projected_splats", 48 * u64::from(n_splats))?,
             tile_counts: words("splat.tile_counts", n_splats)?,
             touched: gpu.storage("splat.touched", 12 * u64::from(n_splats))?,
@@ -436,15 +458,20 @@ impl Scratch {
                 status::N_SPLATS,
                 status::FURTHEST,
             )?,
+            // Counts that become offsets. Two levels, because summing thousands of blocks one by
+            // one would take too long.
             bin_counts: per_bin("splat.bin_counts", n_blocks)?,
             group_counts: per_bin("splat.group_counts", n_blocks.div_ceil(GROUP))?,
             bin_totals: words("splat.bin_totals", n_bins)?,
             bin_starts: words("splat.bin_starts", n_bins + 1)?,
             entries: gpu.storage("splat.entries", 16 * u64::from(n_entries.max(1)))?,
+            // One bit per entry and tile of a bin: 16 words for 32 entries.
             tile_bits: gpu.storage(
                 "splat.tile_bits",
                 64 * u64::from(n_entries.div_ceil(32).max(1)),
             )?,
+            // The largest buffer: the gradient of every intersection has its own slot, so that sums
+            // have a fixed order.
             gradients: gpu.storage("splat.gradients", 48 * u64::from(n_slots))?,
             camera_sums: gpu.storage(
                 "splat.camera_sums",
@@ -468,6 +495,8 @@ impl Scratch {
 /// Maximum number of segments after the first of each tile, and of pieces of hidden ends (without
 /// two per tile), for lists of this length; see shared/segment.wgsl.
 fn n_segments(n_entries: u32, n_slots: u32) -> [u32; 2] {
+    // Segments are made of whole batches, so there can be twice as many as intended. An entry of a
+    // bin can be in the hidden end of the lists of all of its tiles.
     [
         (n_slots / SEGMENT_SPLATS).min(2 * TARGET_SEGMENTS),
         n_entries.div_ceil(HIDDEN_ENTRIES / TILES_PER_BIN),
@@ -500,30 +529,28 @@ impl ImageBuffers {
         n_tiles: u32,
         for_training: bool,
     ) -> Result<Self, Error> {
+        let n_trained_pixels = if for_training { n_pixels } else { 0 };
         let each = |name: &str, bytes: u64| gpu.storage(name, bytes * u64::from(n_pixels));
-        let gradient_buffer = |name: &str, bytes: u64| {
-            gpu.storage(
-                name,
-                if for_training {
-                    bytes * u64::from(n_pixels)
-                } else {
-                    0
-                },
-            )
-        };
+        let trained =
+            |name: &str, bytes: u64| gpu.storage(name, bytes * u64::from(n_trained_pixels));
         let tiles = |name: &str, bytes: u64| gpu.storage(name, bytes * u64::from(n_tiles));
         Ok(Self {
             n_pixels,
             n_tiles,
+            // Composited in f32, for the gradients: color with transmittance, depth, and the last
+            // splat that contributes.
             image: each("splat.image", 16)?,
             depth: each("splat.depth", 4)?,
             last: each("splat.last", 4)?,
+            // Packed for display and scores.
             pixels: each("splat.pixels", 4)?,
             depths: each("splat.depths", 4)?,
+            // Four u32 per color and workgroup of 256 pixels.
             products: gpu.storage("splat.products", 48 * u64::from(n_pixels.div_ceil(256)))?,
-            ssim_gradients: gradient_buffer("splat.ssim_gradients", 36)?,
-            upstream: gradient_buffer("splat.upstream", 16)?,
-            pixel_totals: gradient_buffer("splat.pixel_totals", 8)?,
+            // Gradients with respect to three window statistics of three colors.
+            ssim_gradients: trained("splat.ssim_gradients", 36)?,
+            upstream: trained("splat.upstream", 16)?,
+            pixel_totals: trained("splat.pixel_totals", 8)?,
             gain_sums: tiles("splat.gain_sums", 16)?,
         })
     }

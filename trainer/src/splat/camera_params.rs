@@ -35,9 +35,13 @@ fn image_mask(set: ParamSet) -> u32 {
 /// Index of the first gain among the parameters, as in `shared/camera_params.wgsl`.
 const LOG_GAIN: u32 = 11;
 /// Initial learning rate of rotations, radians per step. All other rates are derived from it.
+/// Larger rates find large errors sooner, but let cameras follow the noise of single images.
 const ROTATION_RATE: f64 = 1e-3;
-/// Fraction of the learning rates that remains after the planned steps.
+/// Fraction of the learning rates that remains after the planned steps, as for the means of splats.
 const FINAL_FRAC: f64 = 0.01;
+/// Fraction by which each step moves the parameters of its image toward zero. Without it, all
+/// images of a camera could drift together, which cannot be distinguished from a motion of the
+/// scene.
 const IMAGE_DECAY: f64 = 0.001;
 
 /// The camera parameters on the GPU.
@@ -92,6 +96,7 @@ impl CameraParams {
     /// Uploads the lens of a keyframe. Allocates parameter slots for the camera and the image if
     /// they are new.
     pub(crate) fn lens(&mut self, gpu: &Gpu, keyframe: &Keyframe) -> Result<Buffer, Error> {
+        // A keyframe keeps its slots if it is pushed again, so its estimates are not lost.
         let camera = match self.cameras.get(&keyframe.camera) {
             Some(slots) => slots.camera,
             None => {
@@ -116,16 +121,9 @@ impl CameraParams {
         if let Some(slots) = self.cameras.get_mut(&keyframe.camera) {
             slots.images.insert(keyframe.stamp, image);
         }
-        let part = |of: fn(&Twist) -> Vector3<f64>| {
-            let [x, y, z] = keyframe
-                .twist
-                .as_ref()
-                .map_or([0.0; 3], |twist| f32s_of(of(twist).into()));
-            [x, y, z, 0.0]
-        };
         let lens = Lens {
-            linear: part(|twist| twist.linear_m_s),
-            angular: part(|twist| twist.angular_rad_s),
+            linear: twist_part(keyframe, |twist| twist.linear_m_s),
+            angular: twist_part(keyframe, |twist| twist.angular_rad_s),
             camera_params: camera * N_PARAMS,
             image_params: image * N_PARAMS,
             unused: [0; 2],
@@ -165,7 +163,8 @@ impl CameraParams {
     ) -> Result<(), Error> {
         self.set = set;
         if params.bytes() < self.used_bytes() {
-            self.params = gpu.storage("splat.camera_params", self.used_bytes())?; // Zeros.
+            // New buffers are zeroed.
+            self.params = gpu.storage("splat.camera_params", self.used_bytes())?;
             gpu.copy((&params, 0), (&self.params, 0), params.bytes());
         } else {
             self.params = params;
@@ -177,6 +176,7 @@ impl CameraParams {
         self.n_used += 1;
         let bytes = SLOT_BYTES * u64::from(self.n_used);
         if bytes > self.params.bytes() {
+            // Twice the need, so that the buffer is copied rarely while images arrive.
             let larger = gpu.storage("splat.camera_params", 2 * bytes)?;
             gpu.copy((&self.params, 0), (&larger, 0), self.params.bytes());
             self.params = larger;
@@ -191,9 +191,13 @@ impl CameraParams {
             camera_mask: camera_mask(self.set),
             image_mask: image_mask(self.set),
             rotation_rate: f32_of(rate),
+            // At the distance of the scene, a translation then moves the image as much as a
+            // rotation does.
             translation_rate_m: f32_of(rate * scene_size_m),
             time_offset_rate: f32_of(rate),
             focal_rate: f32_of(rate),
+            // Exposure can change by a factor of two between two images, so its logarithm has
+            // farther to go.
             gain_rate: f32_of(10.0 * rate),
             image_decay: f32_of(IMAGE_DECAY),
         };
@@ -265,17 +269,10 @@ impl CameraParams {
 
     /// Slot assignment, for a checkpoint.
     pub(crate) fn slots(&self) -> CameraSlots {
-        let images = |slots: &Slots| {
-            slots
-                .images
-                .iter()
-                .map(|(stamp, slot)| (stamp.0, *slot))
-                .collect()
-        };
         CameraSlots(
             self.cameras
                 .iter()
-                .map(|(name, slots)| (name.to_string(), (slots.camera, images(slots))))
+                .map(|(name, slots)| (name.to_string(), (slots.camera, slots.of_images())))
                 .collect(),
         )
     }
@@ -293,6 +290,8 @@ impl CameraParams {
             .0
             .values()
             .flat_map(|(camera, images)| std::iter::once(camera).chain(images.values()));
+        // Distinct slots need at least as many numbers. A shared slot would let two cameras change
+        // each other's parameters.
         self.n_used = all.map(|slot| slot + 1).max().unwrap_or(0);
         if (self.n_used as usize) < n_slots {
             return Err(Error::CheckpointState {
@@ -337,61 +336,97 @@ impl CameraParams {
             (self.used_bytes().min(params.bytes()) / 16) as usize,
         )?;
         params.resize((self.n_used * N_PARAMS) as usize, [0.0; 4]);
-        let value = |slot: u32, param: u32, learned: u32| {
-            let on = learned & (1 << param) != 0;
-            if on {
-                f64::from(params[(slot * N_PARAMS + param) as usize][0])
-            } else {
-                0.0
-            }
-        };
-        let correction_of = |slots: &Slots| {
-            let camera_value = |param| value(slots.camera, param, camera_mask(set));
-            let drift =
-                |slot: &u32| [0, 1, 2, 3, 4, 5].map(|param| value(*slot, param, image_mask(set)));
-            let log_gains = |slot: &u32| {
-                [LOG_GAIN, LOG_GAIN + 1, LOG_GAIN + 2]
-                    .map(|param| value(*slot, param, image_mask(set)))
-            };
-            let drift: BTreeMap<i64, [f64; 6]> = if set.contains(ParamSet::IMAGE_POSES) {
-                slots
-                    .images
-                    .iter()
-                    .map(|(stamp, slot)| (stamp.0, drift(slot)))
-                    .collect()
-            } else {
-                BTreeMap::new()
-            };
-            CameraCorrection {
-                rotation_rad: [0, 1, 2].map(camera_value),
-                translation_m: [3, 4, 5].map(camera_value),
-                time_offset_secs: camera_value(6),
-                log_focal: [7, 8].map(camera_value),
-                principal_offset_focals: [9, 10].map(camera_value),
-                drift_weight: if set.contains(ParamSet::IMAGE_POSES) {
-                    drift_weight(&drift, scene_size_m)
-                } else {
-                    1.0
-                },
-                drift,
-                log_gains: if set.contains(ParamSet::IMAGE_GAINS) {
-                    slots
-                        .images
-                        .iter()
-                        .map(|(stamp, slot)| (stamp.0, log_gains(slot)))
-                        .collect()
-                } else {
-                    BTreeMap::new()
-                },
-                ..CameraCorrection::default()
-            }
-        };
+        let values = ParamValues { params, set };
         Ok(self
             .cameras
             .iter()
-            .map(|(name, slots)| (name.to_string(), correction_of(slots)))
+            .map(|(name, slots)| (name.to_string(), values.correction(slots, scene_size_m)))
             .collect())
     }
+}
+
+impl Slots {
+    /// Slots of the images by stamp in nanoseconds.
+    fn of_images(&self) -> BTreeMap<i64, u32> {
+        self.images
+            .iter()
+            .map(|(stamp, slot)| (stamp.0, *slot))
+            .collect()
+    }
+}
+
+/// The parameters of all slots, in host memory.
+struct ParamValues {
+    /// Each with its value first, followed by the state of the optimizer.
+    params: Vec<[f32; 4]>,
+    /// The optimized parameters.
+    set: ParamSet,
+}
+
+impl ParamValues {
+    /// The correction of a camera and its images.
+    fn correction(&self, slots: &Slots, scene_size_m: f64) -> CameraCorrection {
+        let camera_value = |param| self.value(slots.camera, param, camera_mask(self.set));
+        let drift: BTreeMap<i64, [f64; 6]> = if self.set.contains(ParamSet::IMAGE_POSES) {
+            self.of_images(slots, [0, 1, 2, 3, 4, 5])
+        } else {
+            BTreeMap::new()
+        };
+        // The indices are those of `shared/camera_params.wgsl`.
+        CameraCorrection {
+            rotation_rad: [0, 1, 2].map(camera_value),
+            translation_m: [3, 4, 5].map(camera_value),
+            time_offset_secs: camera_value(6),
+            log_focal: [7, 8].map(camera_value),
+            principal_offset_focals: [9, 10].map(camera_value),
+            drift_weight: if self.set.contains(ParamSet::IMAGE_POSES) {
+                drift_weight(&drift, scene_size_m)
+            } else {
+                1.0
+            },
+            drift,
+            log_gains: if self.set.contains(ParamSet::IMAGE_GAINS) {
+                self.of_images(slots, [LOG_GAIN, LOG_GAIN + 1, LOG_GAIN + 2])
+            } else {
+                BTreeMap::new()
+            },
+            ..CameraCorrection::default()
+        }
+    }
+
+    /// Parameters of each image of a camera, by stamp in nanoseconds.
+    fn of_images<const N: usize>(
+        &self,
+        slots: &Slots,
+        params: [u32; N],
+    ) -> BTreeMap<i64, [f64; N]> {
+        slots
+            .images
+            .iter()
+            .map(|(stamp, slot)| {
+                let values = params.map(|param| self.value(*slot, param, image_mask(self.set)));
+                (stamp.0, values)
+            })
+            .collect()
+    }
+
+    /// Value of a parameter; 0 if the mask of optimized parameters does not contain it.
+    fn value(&self, slot: u32, param: u32, mask: u32) -> f64 {
+        // Kernels do not apply such a parameter, either, even if a trial has changed it.
+        if mask & (1 << param) == 0 {
+            return 0.0;
+        }
+        f64::from(self.params[(slot * N_PARAMS + param) as usize][0])
+    }
+}
+
+/// One part of the velocity of a keyframe's camera, padded to `vec4f`; zeros if it is unknown.
+fn twist_part(keyframe: &Keyframe, of: fn(&Twist) -> Vector3<f64>) -> [f32; 4] {
+    let [x, y, z] = keyframe
+        .twist
+        .as_ref()
+        .map_or([0.0; 3], |twist| f32s_of(of(twist).into()));
+    [x, y, z, 0.0]
 }
 
 /// Bytes of the parameters of one camera or image.

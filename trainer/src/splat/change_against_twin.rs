@@ -119,6 +119,7 @@ fn optimizer_steps_match_the_twin() {
         depth_clip_m: 50.0,
         background_rgb: [0.125, 0.25, 0.5],
     };
+    // At other pixels, f32 may draw another set of splats.
     let mut target = target_of(&reference::render(&view, &splats), view.size_px);
     for (visible, unambiguous) in target
         .visible
@@ -132,6 +133,7 @@ fn optimizer_steps_match_the_twin() {
         .iter_mut()
         .for_each(|depth_m| *depth_m = f64::from(f32_of(*depth_m)));
     let target_buffers = TargetBuffers::new(gpu, &target, &weights);
+    // Several steps, because the first one does not show whether moments are carried over.
     let mut moments: Vec<SplatMoments> = vec![vec![Default::default(); 11 + 48]; splats.len()];
     for step in 0..N_STEPS {
         let (_, upstream) =
@@ -196,6 +198,7 @@ fn growth_matches_the_twin() {
         splats[ix].opacity_logit = -9.0; // Dead.
     }
     let mut random = scene::F32Random::new(9);
+    // A few large errors, so that some families have many children.
     let errors: Vec<f32> = (0..N_BEFORE)
         .map(|_| f32_of(random.uniform(0.0, 1.0).powi(8)))
         .collect();
@@ -235,6 +238,7 @@ fn growth_matches_the_twin() {
     let n_children = expected.parents.iter().flatten().count();
     assert_eq!(n_children, 204, "the number of dead and new splats");
 
+    // Moments that differ everywhere show which ones are reset.
     gpu.write(&fixture.splats.error_sums, 0, bytemuck::cast_slice(&errors));
     let n_planes = 6 * growth.capacity as usize;
     let moments: Vec<[f32; 4]> = (0..n_planes)
@@ -354,6 +358,15 @@ fn column(entries: &[[u32; 4]], part: usize) -> Vec<u32> {
     entries.iter().map(|entry| entry[part]).collect()
 }
 
+/// Squared Mahalanobis distance of the center of a pixel from a projected splat.
+fn squared_distance(position: &[f32; 4], conic: &[f32; 4], pixel: [u32; 2]) -> f64 {
+    let [a, b, c, _] = conic.map(f64::from);
+    let [x, y] = pixel.map(|px| f64::from(px) + 0.5);
+    let dx = x - f64::from(position[0]);
+    let dy = y - f64::from(position[1]);
+    a * dx * dx + 2.0 * b * dx * dy + c * dy * dy
+}
+
 /// Checks the bins against a direct computation: a splat belongs to a tile if it reaches a pixel of
 /// the tile.
 #[test]
@@ -379,11 +392,9 @@ fn tile_lists_are_complete_and_depth_ordered() {
         .unwrap();
     let n_entries = starts[starts.len() - 1] as usize;
     let entries: Vec<[u32; 4]> = gpu.read(&fixture.scratch.entries, n_entries).unwrap();
-    let (splat_of, masks, slots) = (
-        column(&entries, 0),
-        column(&entries, 1),
-        column(&entries, 2),
-    );
+    let splat_of = column(&entries, 0);
+    let masks = column(&entries, 1);
+    let slots = column(&entries, 2);
     let mut taken: Vec<u32> = masks
         .iter()
         .zip(&slots)
@@ -399,15 +410,17 @@ fn tile_lists_are_complete_and_depth_ordered() {
     );
     // Depth keys have 16 bits. They divide the range of depths into octaves, each with the same
     // number of steps.
-    let depths = || {
-        projected_splats
-            .iter()
-            .map(|[position, ..]| position[2])
-            .filter(|z| *z > 0.0)
-    };
-    let octaves = (depths().fold(0.0, f32::max) / depths().fold(f32::INFINITY, f32::min)).log2();
+    let visible_m: Vec<f32> = projected_splats
+        .iter()
+        .map(|[position, ..]| position[2])
+        .filter(|z| *z > 0.0)
+        .collect();
+    let farthest_m = visible_m.iter().copied().fold(0.0, f32::max);
+    let nearest_m = visible_m.iter().copied().fold(f32::INFINITY, f32::min);
+    let octaves = (farthest_m / nearest_m).log2();
     let key_step = (octaves + 1.0).log2().ceil().exp2() / 65536.0;
-    let (mut n_listed, mut n_unnecessary) = (0, 0);
+    let mut n_listed = 0;
+    let mut n_unnecessary = 0;
     for tile in 0..n_tiles[0] * n_tiles[1] {
         let at = [tile % n_tiles[0], tile / n_tiles[0]];
         let bin = (at[1] / 4 * n_bins[0] + at[0] / 4) as usize;
@@ -427,17 +440,16 @@ fn tile_lists_are_complete_and_depth_ordered() {
         );
         let corner = [tile % n_tiles[0] * 16, tile / n_tiles[0] * 16];
         for (splat_ix, [position, conic, _]) in (0..).zip(&projected_splats) {
-            let [a, b, c, reach] = conic.map(f64::from);
-            let distance = |pixel: u32| {
-                let at =
-                    [corner[0] + pixel % 16, corner[1] + pixel / 16].map(|px| f64::from(px) + 0.5);
-                let [dx, dy] = [
-                    at[0] - f64::from(position[0]),
-                    at[1] - f64::from(position[1]),
-                ];
-                a * dx * dx + 2.0 * b * dx * dy + c * dy * dy
-            };
-            let nearest = (0..256).map(distance).fold(f64::INFINITY, f64::min);
+            let reach = f64::from(conic[3]);
+            let nearest = (0..256)
+                .map(|pixel| {
+                    squared_distance(
+                        position,
+                        conic,
+                        [corner[0] + pixel % 16, corner[1] + pixel / 16],
+                    )
+                })
+                .fold(f64::INFINITY, f64::min);
             let n_times = list.iter().filter(|listed| **listed == splat_ix).count();
             assert!(
                 n_times <= 1,

@@ -40,6 +40,7 @@ const LARGE_SIZE: f64 = 60.0;
 #[expect(clippy::cast_possible_truncation, reason = "drawn in f64, used in f32")]
 pub fn synthetic_cloud(n_splats: usize, seed: u64) -> SplatArrays {
     let mut random = Random::new(seed);
+    // Splats fill a volume, so their spacing goes with the cube root of their number.
     let typical_log_scale = (0.6 / (n_splats as f64).cbrt()).ln();
     let mut splats = SplatArrays {
         sh_degree: SH_DEGREE,
@@ -87,6 +88,8 @@ pub fn scan_cloud(n_splats: usize, seed: u64) -> SplatArrays {
         ..SplatArrays::default()
     };
     for splat_ix in 0..n_splats {
+        // Drawn for every splat, also for the huge ones, so that their number does not change the
+        // others.
         let kind = random.unit();
         let (xy_m, size_m, depth_m) = if splat_ix < N_HUGE {
             ([0.2 * random.normal(), 0.2 * random.normal()], 3.0, 0.0)
@@ -109,6 +112,7 @@ pub fn scan_cloud(n_splats: usize, seed: u64) -> SplatArrays {
             };
             (xy_m, size * scale_m, 0.01 * random.normal())
         };
+        // The wall is uneven, so that the order by depth differs from the order in the list.
         let [x_m, y_m] = xy_m;
         splats.means.push(
             [
@@ -118,6 +122,7 @@ pub fn scan_cloud(n_splats: usize, seed: u64) -> SplatArrays {
             ]
             .map(|m| m as f32),
         );
+        // Flat along the third axis, and elongated along the second.
         let log_size = size_m.ln() + 0.5 * random.normal();
         let flatness = [0.0, 0.4 * random.normal(), -2.0];
         splats
@@ -138,24 +143,26 @@ pub fn scan_cloud(n_splats: usize, seed: u64) -> SplatArrays {
 /// Reads a cloud written with numpy's `savez`: `means`, `quats` (w first), `log_scales`,
 /// `opacities_logit`, `sh` (n, 16, 3), all f32.
 pub fn load_cloud_npz(path: &Path) -> Result<SplatArrays, Error> {
-    let read = || -> io::Result<SplatArrays> {
-        let mut file = ZipArchive::new(BufReader::new(files::open(path)?))?;
-        Ok(SplatArrays {
-            means: rows(&mut file, "means", &[3])?,
-            log_scales: rows(&mut file, "log_scales", &[3])?,
-            rotations_wxyz: rows(&mut file, "quats", &[4])?,
-            opacity_logits: rows::<1>(&mut file, "opacities_logit", &[])?.concat(),
-            sh: rows(&mut file, "sh", &[N_COEFFICIENTS as u64, 3])?,
-            sh_degree: SH_DEGREE,
-            is_antialiased: false,
-        })
-    };
-    read()
+    read_npz(path)
         .map_err(|error| Error::SplatFile {
             path: path.to_owned(),
             reason: error.to_string(),
         })?
         .checked()
+}
+
+/// Reads the arrays of a cloud, without checking them.
+fn read_npz(path: &Path) -> io::Result<SplatArrays> {
+    let mut file = ZipArchive::new(BufReader::new(files::open(path)?))?;
+    Ok(SplatArrays {
+        means: rows(&mut file, "means", &[3])?,
+        log_scales: rows(&mut file, "log_scales", &[3])?,
+        rotations_wxyz: rows(&mut file, "quats", &[4])?,
+        opacity_logits: rows::<1>(&mut file, "opacities_logit", &[])?.concat(),
+        sh: rows(&mut file, "sh", &[N_COEFFICIENTS as u64, 3])?,
+        sh_degree: SH_DEGREE,
+        is_antialiased: false,
+    })
 }
 
 /// Reads an f32 array of shape (n, `inner_shape`) as rows of `N`.
@@ -182,6 +189,7 @@ fn rows<const N: usize>(
         );
         return Err(io::Error::other(message));
     }
+    // In Fortran order, the values of one splat are not adjacent.
     if array.order() != Order::C {
         return Err(io::Error::other(format!(
             "array {name:?} is in Fortran order, expected C order"

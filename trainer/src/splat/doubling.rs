@@ -9,12 +9,15 @@ use super::schedule::GROWTH_PERIOD;
 use super::trial_steps::TrialSteps;
 use serde::{Deserialize, Serialize};
 
-/// A rejected doubling is tried again at this multiple of the step at which it was rejected.
+/// A rejected doubling is tried again at this multiple of the step at which it was rejected. The
+/// intervals grow, because the longer a model has converged, the less likely the result changes.
 const RETRY_FACTOR: f64 = 1.5;
 /// Maximum share of the planned steps, or of the steps so far if these are more, that are spent on
-/// the discarded halves of trials.
+/// the discarded halves of trials. These steps are missing from training: a larger share finds the
+/// number of splats sooner, but makes the model worse at every time before that.
 const MAX_SHARE: f64 = 0.15;
-/// The search for the number of splats restarts when this share of the images is new.
+/// The search for the number of splats restarts when this share of the images is new. With a
+/// smaller share, the model would hardly ever be reduced while images arrive.
 const NEW_SHARE: f64 = 0.25;
 
 /// Schedule of the trials.
@@ -33,6 +36,8 @@ impl Doubling {
     /// Whether a trial may start at `step`. Trials start only at multiples of [`GROWTH_PERIOD`],
     /// where submits end.
     pub(crate) fn is_due(&self, step: u64, n_planned_steps: u64, steps: &TrialSteps) -> bool {
+        // One half of each trial is discarded, whatever the result. The first trial is always run:
+        // without it, short trainings would never grow beyond the first steps.
         let max_discarded = MAX_SHARE * step.max(n_planned_steps) as f64;
         let is_affordable = self.n_trials == 0
             || ((self.n_trials + 1) * steps.doubling_half) as f64 <= max_discarded;
@@ -60,10 +65,14 @@ impl Doubling {
     /// Whether the search must restart, because many of the `n_images` images are new. If so,
     /// allows the next trial.
     pub(crate) fn restart(&mut self, n_images: usize) -> bool {
-        let n_new = n_images.saturating_sub(self.n_images); // Images are pushed again after resuming.
+        // After resuming, images are pushed again one by one, so their number may be smaller than
+        // the saved one for a while.
+        let n_new = n_images.saturating_sub(self.n_images);
         let is_due = n_new > 0 && n_new as f64 >= NEW_SHARE * n_images as f64;
         if is_due {
-            (self.not_before, self.n_images) = (0, n_images);
+            // With new images, an earlier rejection says little.
+            self.not_before = 0;
+            self.n_images = n_images;
         }
         is_due
     }

@@ -82,10 +82,12 @@ fn load(gpu: Arc<Gpu>, model: &Path) -> Result<Box<dyn Method>, Error> {
         ..SplatOptions::default()
     };
     let trainer = SplatTrainer::from_arrays(gpu, options.into(), &splats)?;
-    Ok(match model.is_dir() {
-        true => Box::new(Aligned::load(trainer.with_saved_metadata(model)?, model)?),
-        false => Box::new(trainer),
-    })
+    // Only the folder of a saved model has camera corrections and an alignment.
+    if model.is_dir() {
+        let trainer = trainer.with_saved_metadata(model)?;
+        return Ok(Box::new(Aligned::load(trainer, model)?));
+    }
+    Ok(Box::new(trainer))
 }
 
 fn write_ply(request: &ExportRequest<'_>) -> Result<Exported, Error> {
@@ -98,6 +100,7 @@ fn write_spz(request: &ExportRequest<'_>) -> Result<Exported, Error> {
 
 /// Validates the splats of a model and writes them to a file.
 fn write(request: &ExportRequest<'_>, format: Format) -> Result<Exported, Error> {
+    // Edits are stored beside the model, and are applied only now.
     let splats = file::read(request.model)?.without_erased(&Edits::read(request.model)?);
     file::write(request.out, format, &splats)?;
     let detail = format!("of SH degree {}", splats.sh_degree);

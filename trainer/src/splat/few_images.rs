@@ -6,18 +6,22 @@ use super::options::SplatOptions;
 use super::params::Supervision;
 use crate::gpu::f32_of;
 
-/// Up to this number of images, the regularization is complete.
+/// Up to this number of images, the regularization is complete. The changes were measured with 6
+/// and 11 images (docs/benchmarks/2026-11-25-few-images.md).
 const VERY_FEW_IMAGES: usize = 20;
 /// Completed fraction of the planned steps from which on splats are dropped at the full rate.
 /// Earlier, dropping would only slow down training.
 const DROP_RAMP_FRAC: f64 = 0.2;
-/// Depth residuals above this limit have no gradient.
+/// Depth residuals above this limit have no gradient, because such readings are often outliers of
+/// the sensor.
 const DEPTH_CLIP_M: f64 = 0.2;
 /// Limit for few images. Splats that float in front of a surface are often farther from it than
 /// [`DEPTH_CLIP_M`]. With many images, the color loss removes them; with few images, only the depth
 /// loss does.
 const FEW_DEPTH_CLIP_M: f64 = 1.0;
-/// Weight of the depth loss for few images, relative to the usual weight.
+/// Weight of the depth loss for few images, relative to the usual weight. It lowers the depth
+/// error. Ten times the weight lowers it a little more, but also the PSNR
+/// (docs/benchmarks/2026-11-25-few-images.md).
 const FEW_DEPTH_WEIGHT: f64 = 3.0;
 
 /// How much regularization a model needs: 0 to 1.
@@ -27,6 +31,8 @@ pub(crate) struct Scarcity(f64);
 impl Scarcity {
     /// Scarcity for `n` images, counting validation images.
     pub(crate) fn of_images(n: usize) -> Self {
+        // Linear between the two numbers, so that a single new image never changes the training
+        // much.
         let missing = FEW_IMAGES.saturating_sub(n) as f64 / (FEW_IMAGES - VERY_FEW_IMAGES) as f64;
         Self(missing.min(1.0))
     }
@@ -69,6 +75,7 @@ impl Scarcity {
     /// range is centered at the mean color, as far as it fits into 0 to 1; with many images, it
     /// begins at black.
     fn min_background_srgb(self, mean_srgb: [f32; 3], range: f64) -> [f32; 3] {
+        // The random color is this minimum plus up to `range`.
         mean_srgb.map(|color| {
             f32_of(self.0 * (f64::from(color) - 0.5 * range).clamp(0.0, (1.0 - range).max(0.0)))
         })

@@ -33,6 +33,7 @@ pub(super) fn read(model: &Path) -> Result<SplatArrays, Error> {
         model.join(IN_FOLDER)
     };
     let splats = read_file(&path);
+    // A user who names this file probably means the saved model.
     let is_in_model = is_file && path.file_name().is_some_and(|name| name == IN_FOLDER);
     let hint = if is_in_model {
         "; for a saved model, give its folder"
@@ -66,6 +67,7 @@ fn read_file(path: &Path) -> Result<SplatArrays, Error> {
                 reason,
             })
         }
+        // Files of unknown extensions, too: a PLY header is recognized by its content.
         _ => ply::read(path),
     }
 }

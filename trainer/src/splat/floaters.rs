@@ -12,14 +12,18 @@ use crate::edits::{CellGrid, CellLabels, CellMask, Floaters, Groups};
 use crate::gpu::f32_of;
 use nalgebra::{Quaternion, UnitQuaternion, Vector3};
 
-/// Cells along an axis: cells within the radius of the scene are 2 % of it wide.
+/// Cells along an axis: cells within the radius of the scene are 2 % of it wide. Smaller cells
+/// separate parts that are only loosely connected, such as thin objects. Larger ones join floaters
+/// to nearby surfaces.
 const N_CELLS: u32 = 200;
 /// Sum of opacities above which a cell is occupied.
 const MIN_CELL_OPACITY: f32 = 0.5;
-/// Splats cover cells up to this many standard deviations.
+/// Splats cover cells up to this many standard deviations, where 14 % of the opacity is left.
 const REACH: f64 = 2.0;
-/// Maximum number of sampled points of one splat, and of all splats: some seconds on one core.
+/// Maximum number of sampled points of one splat. It bounds the time that a single huge splat can
+/// take.
 const MAX_SAMPLES: f64 = 16_384.0;
+/// Maximum number of sampled points of all splats: some seconds on one core.
 const MAX_TOTAL_SAMPLES: f64 = 5e7;
 
 /// The small parts of a splat model; `None` if there are none.
@@ -34,6 +38,8 @@ pub(super) fn floaters(splats: &SplatArrays) -> Option<Floaters> {
     let (occupied, connected) = occupied(splats, &visible, &grid);
     let mut labels = CellLabels::of_occupied(&grid, &occupied, connected);
     labels.keep_around(&grid);
+    // Splats that are too faint to occupy a cell belong to no part. They are floaters unless they
+    // are next to a large part.
     let mean_m = |ix: usize| splats.means[ix].map(f64::from);
     let cells = visible.iter().map(|ix| grid.cell_at(mean_m(*ix)));
     labels
@@ -58,14 +64,10 @@ fn occupied(splats: &SplatArrays, visible: &[usize], grid: &CellGrid) -> (CellMa
         .iter()
         .map(|ix| n_steps(splats, *ix, grid))
         .collect();
-    let total = |max: f64| {
-        steps
-            .iter()
-            .map(|steps| n_samples(steps).min(max))
-            .sum::<f64>()
-    };
+    // Large models with many large splats would take minutes. Coarser sampling of the largest
+    // splats loses least, because they still have many points.
     let mut max_samples = MAX_SAMPLES;
-    while max_samples > 1.0 && total(max_samples) > MAX_TOTAL_SAMPLES {
+    while max_samples > 1.0 && n_samples_of_all(&steps, max_samples) > MAX_TOTAL_SAMPLES {
         max_samples /= 2.0;
     }
     let mut opacities = vec![0.0_f32; grid.n()];
@@ -77,8 +79,11 @@ fn occupied(splats: &SplatArrays, visible: &[usize], grid: &CellGrid) -> (CellMa
         let center = grid.cell_at(splats.means[ix].map(f64::from));
         for (point_m, falloff) in samples(splats, ix, &limited(steps, max_samples)) {
             let cell = grid.cell_at(point_m);
+            // The points nearest to the center come first, so a cell gets the highest opacity of
+            // its points. Several points in one cell must not add up.
             if std::mem::replace(&mut last_splat[cell as usize], number) != number {
                 opacities[cell as usize] += f32_of(falloff * opacity);
+                // A faint splat that spans a gap, such as haze, must not connect both sides.
                 if opacity >= MIN_CELL_OPACITY.into() {
                     connected.join(center, cell);
                 }
@@ -107,8 +112,18 @@ fn n_samples(steps: &[f64; 3]) -> f64 {
     steps.iter().map(|n| 2.0 * n + 1.0).product()
 }
 
+/// Number of points of all splats, each of which has at most `max` points.
+fn n_samples_of_all(steps: &[[f64; 3]], max: f64) -> f64 {
+    steps
+        .iter()
+        .map(|steps| n_samples(steps).min(max))
+        .sum::<f64>()
+}
+
 /// The steps of a splat, fewer if it has more than `max_samples` points.
 fn limited(steps: &[f64; 3], max_samples: f64) -> [f64; 3] {
+    // The excess is divided evenly among the axes along which the splat extends beyond a cell: a
+    // flat splat has only two of them, and needs the square root.
     let n_axes = steps.iter().filter(|n| **n > 0.0).count().max(1);
     let factor = (max_samples / n_samples(steps))
         .min(1.0)

@@ -14,10 +14,16 @@ use calibration::{Candidate, Trial};
 use serde::{Deserialize, Serialize};
 
 /// From this number of images on, the number of splats is not limited.
+///
+/// The measured data sets with few images have 6, 11 and 36 of them, those with many 43 and more
+/// (docs/benchmarks/2026-11-25-few-images.md). A larger value costs the time of a search where no
+/// limit is needed.
 pub(crate) const FEW_IMAGES: usize = 40;
-/// Maximum number of folds.
+/// Maximum number of folds. Each fold trains a model from the start, so more folds take more time.
+/// With fewer folds, each model is trained on a smaller part of the images than the final model.
 const MAX_FOLDS: usize = 3;
-/// A new search starts when the number of images has grown by this factor.
+/// A new search starts when the number of images has grown by this factor. A smaller factor repeats
+/// the search more often, and a larger one keeps a limit that is too low for the new images.
 const NEW_SEARCH_GROWTH: f64 = 1.25;
 
 /// State of the search.
@@ -119,6 +125,7 @@ impl FoldModels {
     pub(crate) fn n_steps(&self, step: u64, steps: &TrialSteps) -> (u64, u64) {
         let warm_up = self.main.schedule.step.min(steps.max_warm_up());
         let n_folds = self.folds.len() as u64;
+        // From the second round on, folds continue from the doubled models of the previous round.
         let of_fold = 2 * steps.comparison + if self.trials.is_empty() { warm_up } else { 0 };
         let after_phase = match self.phase {
             FoldPhase::WarmUp => 2 * steps.comparison,
@@ -165,6 +172,7 @@ impl GrowthSearch {
     pub(crate) fn abort(&mut self) -> Option<Box<FoldModels>> {
         match std::mem::replace(self, Self::Waiting { not_before: 0 }) {
             Self::Running(models) => Some(models),
+            // Not running: put the state back.
             other => {
                 *self = other;
                 None
@@ -174,6 +182,7 @@ impl GrowthSearch {
 
     /// Whether regular densification may add splats.
     pub(crate) fn may_grow(&self) -> bool {
+        // In a comparison, the two models must differ by exactly one doubling.
         self.running()
             .is_none_or(|models| models.phase == FoldPhase::WarmUp)
     }
@@ -193,6 +202,7 @@ impl GrowthSearch {
             Self::Waiting { not_before } if step < steps.search.max(*not_before) => {
                 steps.search.max(*not_before) - step
             }
+            // At least 1, because a submit of zero steps would make no progress.
             Self::Running(models) => models.until.saturating_sub(step).max(1),
             _ => u64::MAX,
         }
@@ -250,6 +260,8 @@ impl GrowthSearch {
 /// Divides images into folds. Consecutive images are in different folds, because an image is
 /// predicted from its neighbors.
 pub(crate) fn folds(images: Vec<ImageId>) -> Vec<Vec<ImageId>> {
+    // Views are in the order of arrival, so neighbors in the list are neighbors in space. Blocks of
+    // consecutive images would leave a whole area without training images.
     let n_folds = n_folds(images.len());
     let mut folds = vec![Vec::new(); n_folds];
     for (ix, image) in images.into_iter().enumerate() {
@@ -265,12 +277,16 @@ pub(crate) fn doubling_trial(
     baseline: &[HeldOutScore],
     variant: &[HeldOutScore],
 ) -> Trial {
+    // Both lists contain the same images in the same order. Images without a score in either list
+    // are left out of that mean.
     let pairs = || baseline.iter().zip(variant);
     let gains =
         pairs().filter_map(|(baseline, variant)| Some(variant.psnr_db? - baseline.psnr_db?));
     let rises = pairs()
         .filter_map(|(baseline, variant)| Some(variant.depth_rmse_m? - baseline.depth_rmse_m?));
     let mut trial = Trial::of_gains(candidate, &gains.collect::<Vec<f64>>());
+    // Splats that float in front of surfaces can raise the PSNR of nearby views, but not the
+    // accuracy of depth. Without depth, both values are 0, and only PSNR decides.
     let (rise_m, error_m) = mean_and_standard_error(&rises.collect::<Vec<f64>>());
     trial.kept &= rise_m <= error_m;
     log::info!(
@@ -284,6 +300,7 @@ pub(crate) fn doubling_trial(
 fn mean_and_standard_error(values: &[f64]) -> (f64, f64) {
     let n = values.len().max(1) as f64;
     let mean = values.iter().sum::<f64>() / n;
+    // The unbiased variance divides by n - 1. The lower bounds avoid 0 / 0 for short lists.
     let variance = values
         .iter()
         .map(|value| (value - mean).powi(2))

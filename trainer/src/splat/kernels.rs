@@ -97,6 +97,8 @@ macro_rules! tile_sources {
         blend_sources!(source!("pixels", "pixels_2"), source!("tile_queue"), source!("segment"), $($source),*)
     };
 }
+// Variants of one kernel differ only in the source of one import. Shared code is written once, and
+// each variant is compiled without branches for the others.
 const RASTERIZE: &[Source] = tile_sources!(source!("segments", "segments_none"));
 const RASTERIZE_SEGMENTS: &[Source] = tile_sources!(source!("segments", "segments_stored"));
 const BACKWARD: &[Source] = tile_sources!(source!("sums", "sums_subgroup"));
@@ -139,19 +141,22 @@ struct Blend {
 
 fn blend(gpu: &Gpu) -> Blend {
     match gpu.optional().subgroup_lanes {
-        // Software adapters: no GPU has subgroups of exactly 8 lanes.
+        // Software adapters: no GPU has subgroups of exactly 8 lanes. Their lanes read memory one
+        // after the other, so few lanes per tile are faster.
         Some(8) => Blend {
             rasterize: kernel!("rasterize_strips", BLEND_STRIPS),
             rasterize_segments: None,
             backward: kernel!("backward_strips", BLEND_STRIPS),
             subgroup: None,
         },
+        // A workgroup has 128 lanes, so larger subgroups would not be full.
         Some(lanes) if (16..=128).contains(&lanes) => Blend {
             rasterize: kernel!("rasterize", RASTERIZE),
             rasterize_segments: Some(kernel!("rasterize", RASTERIZE_SEGMENTS)),
             backward: kernel!("backward", BACKWARD),
             subgroup: Some(lanes),
         },
+        // Without subgroups of a known size, lanes are summed through workgroup memory.
         _ => Blend {
             rasterize: kernel!("rasterize", RASTERIZE),
             rasterize_segments: Some(kernel!("rasterize", RASTERIZE_SEGMENTS)),
@@ -202,6 +207,8 @@ pub(crate) const KERNELS: &[Kernel] = &[
 /// parallel to them.
 macro_rules! compile {
     ($gpu:expr, { $($given:ident: $value:expr),* $(,)? }, { $($field:ident: $kernel:expr, $overrides:expr);* $(;)? }) => {{
+        // The values may contain `?`, which needs a closure of its own. Both sides compile for
+        // seconds, so they run in parallel.
         let others = || -> Result<_, Error> { Ok(($($value),*)) };
         let compile = || Pipeline::compile_all($gpu, [$(($kernel, &$overrides[..])),*]);
         let (others, compiled) = rayon::join(others, compile);
@@ -311,11 +318,13 @@ pub(crate) struct TrainPipelines {
 impl TrainPipelines {
     pub(crate) fn new(gpu: &Gpu) -> Result<Self, Error> {
         let blend = blend(gpu);
+        // A constant of the kernel, so that the compiler unrolls the sums over a subgroup.
         let lanes: Vec<_> = blend
             .subgroup
             .map(|lanes| ("SUBGROUP", f64::from(lanes)))
             .into_iter()
             .collect();
+        // Only software adapters have no segments.
         let in_strips = blend.rasterize_segments.is_none();
         let loss = kernel!(
             "loss",

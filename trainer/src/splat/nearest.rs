@@ -15,8 +15,9 @@ pub(crate) fn mean_spacings_m(points: &[[f32; 3]]) -> Vec<Option<f64>> {
         .collect()
 }
 
-/// A balanced tree without nodes: of each range of `order`, the middle point separates those with
-/// smaller coordinates along one axis from those with larger ones. The axes take turns.
+/// A balanced tree, stored as an order of the points. In each range of `order`, the middle point
+/// separates points with smaller coordinates along one axis from points with larger ones. The axes
+/// alternate.
 struct Tree<'a> {
     points: &'a [[f32; 3]],
     /// Indices of the points.
@@ -37,13 +38,14 @@ impl<'a> Tree<'a> {
         self.search(&self.order, 0, from, &mut nearest);
         let distances: Vec<f64> = nearest
             .into_iter()
+            // With fewer than four points, some places remain at infinity.
             .filter(|squared| squared.is_finite())
             .map(f64::sqrt)
             .collect();
         (!distances.is_empty()).then(|| distances.iter().sum::<f64>() / distances.len() as f64)
     }
 
-    /// Replaces larger squared distances in `nearest`, which ascend, by those of the points in
+    /// Updates `nearest`, the smallest squared distances in ascending order, with the points in
     /// `range`.
     fn search(&self, range: &[u32], axis: usize, from: &[f32; 3], nearest: &mut [f64; N_NEAREST]) {
         let middle = range.len() / 2;
@@ -56,7 +58,10 @@ impl<'a> Tree<'a> {
             nearest[N_NEAREST - 1] = squared;
             nearest.sort_unstable_by(f64::total_cmp);
         }
-        let (smaller, larger) = (&range[..middle], &range[middle + 1..]);
+        let smaller = &range[..middle];
+        let larger = &range[middle + 1..];
+        // The side of the query point comes first: its points are likely to be near, and the found
+        // distances often exclude the other side.
         let (near, far) = if offset(axis) < 0.0 {
             (smaller, larger)
         } else {
@@ -64,6 +69,7 @@ impl<'a> Tree<'a> {
         };
         let next_axis = (axis + 1) % 3;
         self.search(near, next_axis, from, nearest);
+        // No point beyond the separating plane is closer than the plane.
         if offset(axis) * offset(axis) < nearest[N_NEAREST - 1] {
             self.search(far, next_axis, from, nearest);
         }
@@ -75,6 +81,8 @@ fn separate(points: &[[f32; 3]], range: &mut [u32], axis: usize) {
     if range.len() < 2 {
         return;
     }
+    // Selection is sufficient, because the halves need no order, and takes linear time per level.
+    // The order of equal coordinates does not matter: `search` visits both sides of them.
     let middle = range.len() / 2;
     range.select_nth_unstable_by(middle, |a, b| {
         points[*a as usize][axis].total_cmp(&points[*b as usize][axis])

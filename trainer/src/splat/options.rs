@@ -56,13 +56,20 @@ impl Default for SplatOptions {
         Self {
             max_splats: 400_000,
             count: CountPolicy::default(),
+            // As in Kerbl et al. 2023, like the weight of D-SSIM.
             sh_degree: 3,
             dssim_frac: 0.2,
             depth_per_m: 0.1,
             random_background: 0.25,
+            // Chosen from 0, 6, 13 and 20 by the scores of three data sets
+            // (docs/benchmarks/2026-11-23-splats.md, section "Ablation").
             cost_images: 13.0,
+            // Twice the fraction of 3DGS-MCMC.
             growth_frac: 0.1,
+            // As in 3DGS-MCMC.
             noise: 5e5,
+            // With 6 and 11 images, 10 % gained less
+            // (docs/benchmarks/2026-11-25-few-images.md, section "Single changes").
             drop_frac: 0.2,
             coarse_steps: None,
             seeds_per_image: None,
@@ -75,7 +82,9 @@ impl SplatOptions {
     /// Bytes per splat: parameters, Adam's moments and the error sum. The higher SH coefficients
     /// share one moment.
     pub fn bytes_per_splat(&self) -> u64 {
-        let n_floats = 12 + 3; // Means, rotations and shapes are padded to 4 each.
+        // Means, rotations and shapes are padded to 4 each, and the constant color has 3. Each has
+        // two moments. The last two words are the shared moment and the error sum.
+        let n_floats = 12 + 3;
         4 * (3 * n_floats + u64::from(super::buffers::n_sh_rest(self.sh_degree)) + 1 + 1)
     }
 }
@@ -87,6 +96,7 @@ impl ModelOptions<SplatOptions> {
             .common
             .max_bytes
             .map_or(u64::MAX, |bytes| bytes / self.specific.bytes_per_splat());
+        // At least one splat, because buffers cannot be empty.
         self.specific
             .max_splats
             .min(u32::try_from(by_bytes).unwrap_or(u32::MAX))

@@ -75,6 +75,8 @@ pub(crate) fn grow(
     let weights = ("weights", &buffers.weights);
     let block_weights = ("block_weights", &buffers.block_weights);
     passes.clear(&buffers.n_children);
+    // Cumulative errors within blocks of 256 splats, and of the blocks, from which parents are
+    // sampled by binary search.
     passes.dispatch(
         gpu,
         &pipelines.grow_weigh,
@@ -90,6 +92,7 @@ pub(crate) fn grow(
         ],
     );
     passes.dispatch(gpu, &pipelines.grow_scan, 1, &[uniform, block_weights]);
+    // Every child chooses its parent, and counts itself there.
     passes.dispatch(
         gpu,
         &pipelines.grow_child,
@@ -108,6 +111,8 @@ pub(crate) fn grow(
         ]
         .concat(),
     );
+    // Opacity and scale depend on the size of the family, so they follow once all children are
+    // counted.
     passes.dispatch(
         gpu,
         &pipelines.grow_family,
@@ -150,6 +155,8 @@ impl ViewPasses<'_> {
     ) {
         self.list(passes, draw, &self.scratch.capacity);
         let mut buffers = self.rasterized();
+        // The segments are by-products of blending: their states are the running values at their
+        // starts.
         let rasterize = match &train.rasterize_segments {
             Some(rasterize) => {
                 buffers.extend(self.segments());
@@ -203,11 +210,12 @@ impl ViewPasses<'_> {
             scratch,
             status,
             view,
-            size_px,
             ..
         } = *self;
         let n_blocks = u64::from(splats.n_splats.div_ceil(BLOCK));
-        let [view, model] = [("view", view), ("model", &splats.model)];
+        let view = ("view", view);
+        let model = ("model", &splats.model);
+        let keys = ("depth_keys", &scratch.by_depth.keys[0]);
         passes.dispatch(
             gpu,
             &pipelines.project,
@@ -217,18 +225,16 @@ impl ViewPasses<'_> {
                     view,
                     model,
                     ("projected_splats", &scratch.projected_splats),
-                    ("depth_keys", &scratch.by_depth.keys[0]),
+                    keys,
                     ("status", status),
                 ][..],
                 &splats.parameters(),
             ]
             .concat(),
         );
+        // A separate kernel, so that training, which never erases, does not pay for the check.
         if let Some(erased) = self.erased {
-            let (means, keys) = (
-                ("means", &splats.means),
-                ("depth_keys", &scratch.by_depth.keys[0]),
-            );
+            let means = ("means", &splats.means);
             passes.dispatch(
                 gpu,
                 &pipelines.erase,
@@ -237,39 +243,50 @@ impl ViewPasses<'_> {
             );
         }
         pipelines.sort.sort(gpu, passes, &scratch.by_depth, status);
-        let by_depth = ("by_depth", &scratch.by_depth.values[0]);
+        self.bin(passes, pipelines, capacity);
+    }
+
+    /// Lists the splats of every bin in depth order, if the lists fit into this capacity.
+    fn bin(&self, passes: &mut Passes, pipelines: &DrawPipelines, capacity: &Buffer) {
+        let Self {
+            gpu,
+            splats,
+            scratch,
+            size_px,
+            ..
+        } = *self;
+        let n_blocks = u64::from(splats.n_splats.div_ceil(BLOCK));
+        // Workgroup memory holds the counts of a limited number of bins, so large images need
+        // several workgroups per block.
         let n_windows = u64::from(n_bins(size_px).div_ceil(WINDOW_BINS));
-        let [projected_splats, tile_counts] = [
-            ("projected_splats", &scratch.projected_splats),
-            ("tile_counts", &scratch.tile_counts),
-        ];
-        let [bin_counts, group_counts] = [
-            ("bin_counts", &scratch.bin_counts),
-            ("group_counts", &scratch.group_counts),
-        ];
-        let [bin_totals, bin_starts] = [
-            ("bin_totals", &scratch.bin_totals),
-            ("bin_starts", &scratch.bin_starts),
-        ];
-        let [block_slots, status] = [("block_slots", &scratch.block_slots), ("status", status)];
-        let [touched, slot_offsets] = [
-            ("touched", &scratch.touched),
-            ("slot_offsets", &scratch.slot_offsets),
-        ];
-        let keys = ("depth_keys", &scratch.by_depth.keys[0]);
+        let view = ("view", self.view);
+        let model = ("model", &splats.model);
+        let status = ("status", self.status);
+        let by_depth = ("by_depth", &scratch.by_depth.values[0]);
+        let bin_counts = ("bin_counts", &scratch.bin_counts);
+        let group_counts = ("group_counts", &scratch.group_counts);
+        let bin_totals = ("bin_totals", &scratch.bin_totals);
+        let bin_starts = ("bin_starts", &scratch.bin_starts);
+        let block_slots = ("block_slots", &scratch.block_slots);
+        let touched = ("touched", &scratch.touched);
+        let slot_offsets = ("slot_offsets", &scratch.slot_offsets);
+        let entries = ("entries", &scratch.entries);
+        // Count first, then emit: WebGPU guarantees no forward progress between workgroups, so a
+        // single pass in which blocks wait for their predecessors could hang.
         let counted = [
             view,
             model,
-            keys,
+            ("depth_keys", &scratch.by_depth.keys[0]),
             by_depth,
-            projected_splats,
+            ("projected_splats", &scratch.projected_splats),
             touched,
-            tile_counts,
+            ("tile_counts", &scratch.tile_counts),
             slot_offsets,
             block_slots,
             bin_counts,
         ];
         passes.dispatch(gpu, &pipelines.count_bins, n_blocks * n_windows, &counted);
+        // Turns the counts into offsets: groups of blocks, then all groups of a bin, then all bins.
         let n_groups = n_blocks.div_ceil(u64::from(GROUP));
         passes.dispatch(
             gpu,
@@ -295,7 +312,8 @@ impl ViewPasses<'_> {
             ("segment_counts", &scratch.segment_counts),
         ];
         passes.dispatch(gpu, &pipelines.allocate, 1, &allocated);
-        let entries = ("entries", &scratch.entries);
+        // Every block now knows its range in every list, so the order of its entries depends only
+        // on counts.
         let emitted = [
             view,
             model,
@@ -311,6 +329,8 @@ impl ViewPasses<'_> {
             ("slot_begins", &scratch.slot_begins),
         ];
         passes.dispatch(gpu, &pipelines.emit, n_blocks * n_windows, &emitted);
+        // The number of entries is known only on the GPU, so workgroups are dispatched for the
+        // whole capacity.
         let tile_bits = ("tile_bits", &scratch.tile_bits);
         let n_groups = u64::from(scratch.n_entries.div_ceil(512));
         passes.dispatch(
@@ -367,6 +387,7 @@ impl ViewPasses<'_> {
             ("target_image", target.image),
             ("gains", target.gains),
         ];
+        // Before the loss, which reads the gradients of whole windows.
         if target.ssim {
             let mut buffers = base.to_vec();
             buffers.push(("ssim_gradients", &image_buffers.ssim_gradients));
@@ -416,9 +437,13 @@ impl ViewPasses<'_> {
             ("pixel_totals", &image_buffers.pixel_totals),
             ("gradients", &scratch.gradients),
         ]);
+        // Without segments, a workgroup processes the whole list of a tile.
         let mut n_groups = n_tiles;
         if pipelines.rasterize_segments.is_some() {
             buffers.extend(self.segments());
+            // The first segment of each tile, further segments, and the pieces of hidden ends with
+            // up to two more per tile. Their numbers are known only on the GPU, so these are upper
+            // bounds.
             let [n_further, n_hidden] = scratch.n_segments.map(u64::from);
             n_groups = n_tiles + n_further + n_hidden + 2 * n_tiles;
         }

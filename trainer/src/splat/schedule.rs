@@ -1,15 +1,23 @@
 //! The training schedule: progress, and the steps at which the splat count and the SH degree
 //! change.
 
-/// Steps between changes of the splat count.
+/// Steps between changes of the splat count. As in Kerbl et al. 2023.
+///
+/// Each change restarts Adam moments and lowers the scores for some tens of steps
+/// (docs/benchmarks/2026-11-23-splats.md). A shorter period leaves no time to recover. A longer
+/// one delays growth.
 pub(crate) const GROWTH_PERIOD: u64 = 100;
-/// Step of the first change of the splat count.
+/// Step of the first change of the splat count. Before it, the error sums that select parents
+/// reflect mainly the initial colors.
 const GROWTH_START: u64 = 200;
-/// Fraction of the planned steps after which the splat count stays constant.
+/// Fraction of the planned steps after which the splat count stays constant. The remaining steps
+/// refine the splats and test smaller models.
 const GROWTH_END_FRAC: f64 = 0.75;
-/// Steps between increases of the active SH degree.
+/// Steps between increases of the active SH degree. If all degrees were active from the start,
+/// view-dependent colors could explain errors of the geometry. Kerbl et al. 2023 raise the degree
+/// every 1000 of 30 000 steps.
 const SH_PERIOD: u64 = 300;
-/// Maximum SH degree.
+/// Maximum SH degree that the kernels evaluate, as in Kerbl et al. 2023.
 const MAX_SH_DEGREE: u64 = 3;
 
 /// Position in the training schedule.
@@ -51,7 +59,8 @@ impl Schedule {
             reason = "a fraction of a u64"
         )]
         let n_growth_steps = (GROWTH_END_FRAC * self.n_planned_steps as f64) as u64;
-        (self.start + n_growth_steps).next_multiple_of(GROWTH_PERIOD) // Submits end at these steps.
+        // Submits end at these steps, so the end takes effect at an exact step.
+        (self.start + n_growth_steps).next_multiple_of(GROWTH_PERIOD)
     }
 
     /// Whether growth has ended.
@@ -61,6 +70,8 @@ impl Schedule {
 
     /// Whether the splat count changes at the current step.
     pub(super) fn is_growth_due(&self) -> bool {
+        // The last step is compared because the count changes before a step is trained. A failed
+        // submit may lead to the same step again.
         self.step >= GROWTH_START
             && !self.is_mature()
             && self.step.is_multiple_of(GROWTH_PERIOD)

@@ -10,7 +10,7 @@ use super::nearest::mean_spacings_m;
 use super::views::FAR_M;
 use crate::InitialPoints;
 use crate::gpu::{f32_of, f32s_of};
-use keyframe::Keyframe;
+use keyframe::{DepthMap, Keyframe};
 use kinematics::random::Random;
 use nalgebra::{Matrix3, Point3, Rotation3, UnitQuaternion, Vector3};
 use rayon::prelude::*;
@@ -18,18 +18,31 @@ use std::collections::HashSet;
 use std::sync::Arc;
 
 /// Neighboring depths that differ by more than this fraction belong to different surfaces.
+///
+/// A smaller value also rejects oblique surfaces, whose depth changes quickly, too. A larger one
+/// seeds discs that bridge the gap between an object and its background.
 const EDGE_FRAC: f64 = 0.04;
-/// Standard deviation of a disc, in grid spacings. Neighbors overlap without blurring.
+/// Standard deviation of a disc, in grid spacings. Neighbors overlap without blurring: smaller
+/// discs leave gaps, larger ones blend the colors of several neighbors.
 const SPREAD: f64 = 0.6;
-/// Thickness of a disc, in grid spacings.
+/// Thickness of a disc, in grid spacings. It is a quarter of [`SPREAD`]: flat, because it lies on a
+/// surface, but thick enough to be seen from the side.
 const THICKNESS: f64 = 0.15;
+/// A disc is known to lie on a surface, so it is mostly opaque. It stays below 1, where the
+/// gradient of the logit vanishes.
 const SEED_OPACITY: f64 = 0.7;
 /// Number of initial splats if there is no depth.
 const N_RANDOM: usize = 50_000;
+/// Most positions of a random cloud are wrong. Low opacity lets the gradients reach splats behind
+/// them.
 const RANDOM_OPACITY: f64 = 0.1;
 /// As in Kerbl et al. 2023.
 const POINT_OPACITY: f64 = 0.1;
+/// Value of the constant spherical harmonic: `1 / (2 sqrt(pi))`.
 const SH_0: f64 = 0.282_094_791_773_878_14;
+/// Smallest weight of the slant of a surface, reached at 73 degrees. More oblique surfaces would
+/// get discs that extend far beyond their neighbors, and their normals are uncertain.
+const MIN_SLANT: f64 = 0.3;
 
 /// Creates discs and stores the positions that already have splats.
 #[derive(Clone, Debug, Default)]
@@ -59,12 +72,16 @@ pub(crate) struct Density {
 }
 
 /// Number of discs that an image may get even if it has few pixels.
+///
+/// At the density of a large image, a depth image of 160 x 120 pixels would get only 400 discs, too
+/// few to show the shape of a scene.
 const MIN_DISCS: f64 = 4000.0;
 
 impl Density {
     /// Distance between discs in pixels, a whole number.
     fn stride_px(self, size_px: [u32; 2]) -> f64 {
         let n_pixels = f64::from(size_px[0]) * f64::from(size_px[1]);
+        // The maximum is applied last: it also holds for small images.
         let n = self
             .max_discs
             .min((n_pixels / self.px_per_disc).max(MIN_DISCS));
@@ -80,6 +97,9 @@ impl Seeder {
     /// given the discs of all earlier batches. Positions are then claimed sequentially, so the
     /// result does not depend on thread scheduling.
     pub(crate) fn discs(&mut self, keyframes: &[Arc<Keyframe>], density: Density) -> SplatArrays {
+        // Within a batch, several keyframes may propose discs at the same place, all but one of
+        // which are discarded. A larger batch wastes more of this work, and a smaller one keeps
+        // fewer cores busy.
         const BATCH: usize = 32;
         let mut seeds = Seeds::new();
         for batch in keyframes.chunks(BATCH) {
@@ -107,68 +127,85 @@ impl Seeder {
         let Some(depth) = &keyframe.depth else {
             return Vec::new();
         };
-        let mut discs = Vec::new();
         let [width, height] = depth.size_px;
         let stride = density.stride_px(depth.size_px) as u32;
-        let at = |x: u32, y: u32| f64::from(depth.depth_m[(y * width + x) as usize]);
+        let mut discs = Vec::new();
         for y in (stride / 2..height).step_by(stride as usize) {
             for x in (stride / 2..width).step_by(stride as usize) {
-                let z = at(x, y);
-                if !(z > 0.0 && z <= FAR_M)
-                    || x < stride
-                    || y < stride
-                    || x + stride >= width
-                    || y + stride >= height
-                {
-                    continue;
-                }
-                let neighbors = [
-                    at(x - stride, y),
-                    at(x + stride, y),
-                    at(x, y - stride),
-                    at(x, y + stride),
-                ];
-                if neighbors
-                    .iter()
-                    .any(|near| (near - z).abs() > EDGE_FRAC * z && *near > 0.0)
-                {
-                    continue;
-                }
-                let here = depth.point(x, y, z);
-                let spacing_m = f64::from(stride) * z / depth.focal_px[0];
-                let position = depth.world_from_camera * Point3::from(here);
-                if self.is_occupied(&position, spacing_m) {
-                    continue;
-                }
-                let Some(color) = color_at(keyframe, &position) else {
-                    continue;
-                };
-                let filled = |near: f64| if near > 0.0 { near } else { z };
-                let across = depth.point(x + stride, y, filled(neighbors[1]))
-                    - depth.point(x - stride, y, filled(neighbors[0]));
-                let down = depth.point(x, y + stride, filled(neighbors[3]))
-                    - depth.point(x, y - stride, filled(neighbors[2]));
-                let normal = across
-                    .cross(&down)
-                    .try_normalize(1e-12)
-                    .unwrap_or_else(Vector3::z);
-                // On an oblique surface, the grid points are farther apart.
-                let slant = (normal.dot(&here.normalize()).abs()).max(0.3);
-                let size_m = [
-                    SPREAD * spacing_m / slant.sqrt(),
-                    SPREAD * spacing_m / slant.sqrt(),
-                    THICKNESS * spacing_m,
-                ];
-                discs.push(Disc {
-                    position,
-                    spacing_m,
-                    normal: depth.world_from_camera * normal,
-                    size_m,
-                    color,
-                });
+                discs.extend(self.candidate_disc(keyframe, depth, stride, [x, y]));
             }
         }
         discs
+    }
+
+    /// Proposes a disc at one depth reading. Returns `None` if the reading is unusable, at an edge,
+    /// at an occupied position or outside the color image.
+    fn candidate_disc(
+        &self,
+        keyframe: &Keyframe,
+        depth: &DepthMap,
+        stride: u32,
+        [x, y]: [u32; 2],
+    ) -> Option<Disc> {
+        let [width, height] = depth.size_px;
+        let at = |x: u32, y: u32| f64::from(depth.depth_m[(y * width + x) as usize]);
+        let z = at(x, y);
+        // Positive comparisons, so that a NaN is rejected. At the border, neighbors are missing.
+        if !(z > 0.0 && z <= FAR_M)
+            || x < stride
+            || y < stride
+            || x + stride >= width
+            || y + stride >= height
+        {
+            return None;
+        }
+        let neighbors = [
+            at(x - stride, y),
+            at(x + stride, y),
+            at(x, y - stride),
+            at(x, y + stride),
+        ];
+        // At depth edges, readings mix both surfaces, and the normal would be wrong. Missing
+        // neighbors are no edge, because sensors have many holes.
+        if neighbors
+            .iter()
+            .any(|near| (near - z).abs() > EDGE_FRAC * z && *near > 0.0)
+        {
+            return None;
+        }
+        let here = depth.point(x, y, z);
+        let spacing_m = f64::from(stride) * z / depth.focal_px[0];
+        let position = depth.world_from_camera * Point3::from(here);
+        if self.is_occupied(&position, spacing_m) {
+            return None;
+        }
+        let color = color_at(keyframe, &position)?;
+        // A missing neighbor is assumed at the depth of the center, which turns the normal toward
+        // the camera.
+        let filled = |near: f64| if near > 0.0 { near } else { z };
+        let across = depth.point(x + stride, y, filled(neighbors[1]))
+            - depth.point(x - stride, y, filled(neighbors[0]));
+        let down = depth.point(x, y + stride, filled(neighbors[3]))
+            - depth.point(x, y - stride, filled(neighbors[2]));
+        let normal = across
+            .cross(&down)
+            .try_normalize(1e-12)
+            .unwrap_or_else(Vector3::z);
+        // On an oblique surface, the grid points are farther apart, but only along one axis. The
+        // square root distributes the larger area evenly over both axes of the disc.
+        let slant = (normal.dot(&here.normalize()).abs()).max(MIN_SLANT);
+        let size_m = [
+            SPREAD * spacing_m / slant.sqrt(),
+            SPREAD * spacing_m / slant.sqrt(),
+            THICKNESS * spacing_m,
+        ];
+        Some(Disc {
+            position,
+            spacing_m,
+            normal: depth.world_from_camera * normal,
+            size_m,
+            color,
+        })
     }
 
     /// Creates discs for the uncovered parts of a keyframe without depth. Their depths come from
@@ -180,27 +217,14 @@ impl Seeder {
         default_m: f64,
     ) -> SplatArrays {
         let mut seeds = Seeds::new();
-        let [width, height] = keyframe.size_px.map(f64::from);
         let stride = density.stride_px(keyframe.size_px);
-        let n_cells = [width, height].map(|px| (px / stride).ceil() as usize);
-        let camera_from_world = keyframe.world_from_camera.inverse();
-        let mut inverse_depths = InverseDepths::new(n_cells);
-        for position in &self.positions {
-            let point = camera_from_world * position;
-            let cell = [0, 1].map(|axis| {
-                let px =
-                    keyframe.focal_px[axis] * point[axis] / point.z + keyframe.principal_px[axis];
-                (px / stride).floor()
-            });
-            if point.z > 0.0
-                && (0..2).all(|axis| cell[axis] >= 0.0 && cell[axis] < n_cells[axis] as f64)
-            {
-                inverse_depths.set_nearest([cell[0] as usize, cell[1] as usize], 1.0 / point.z);
-            }
-        }
+        let inverse_depths = self.inverse_depths_in(keyframe, stride);
+        let n_cells = inverse_depths.n_cells;
         let filled = inverse_depths.filled(1.0 / default_m);
         for row in 0..n_cells[1] {
             for column in 0..n_cells[0] {
+                // Neighbors count as covered, too: a seeded position is only a sample of a surface
+                // that extends to the adjacent cells.
                 if inverse_depths.is_known_nearby([column, row]) {
                     continue;
                 }
@@ -217,6 +241,8 @@ impl Seeder {
                 if !self.claim(&position, spacing_m) {
                     continue;
                 }
+                // The orientation of the surface is unknown. A disc that faces the camera covers
+                // its cell of the image.
                 let towards = keyframe.world_from_camera.translation.vector - position.coords;
                 let size = [
                     SPREAD * spacing_m,
@@ -227,6 +253,29 @@ impl Seeder {
             }
         }
         seeds.arrays
+    }
+
+    /// Inverse depths of the seeded positions in the image of a keyframe, which is divided into
+    /// cells of `stride` pixels.
+    fn inverse_depths_in(&self, keyframe: &Keyframe, stride: f64) -> InverseDepths {
+        let [width, height] = keyframe.size_px.map(f64::from);
+        let n_cells = [width, height].map(|px| (px / stride).ceil() as usize);
+        let camera_from_world = keyframe.world_from_camera.inverse();
+        let mut inverse_depths = InverseDepths::new(n_cells);
+        for position in &self.positions {
+            let point = camera_from_world * position;
+            let cell = [0, 1].map(|axis| {
+                let px =
+                    keyframe.focal_px[axis] * point[axis] / point.z + keyframe.principal_px[axis];
+                (px / stride).floor()
+            });
+            if point.z > 0.0
+                && (0..2).all(|axis| cell[axis] >= 0.0 && cell[axis] < n_cells[axis] as f64)
+            {
+                inverse_depths.set_nearest([cell[0] as usize, cell[1] as usize], 1.0 / point.z);
+            }
+        }
+        inverse_depths
     }
 
     /// Bytes of one position in a checkpoint.
@@ -260,7 +309,8 @@ impl Seeder {
             .0
             .iter()
             .map(|bytes| i32::from_le_bytes(*bytes));
-        let (positions, cells) = (positions.collect::<Vec<_>>(), cells.collect::<Vec<_>>());
+        let positions = positions.collect::<Vec<_>>();
+        let cells = cells.collect::<Vec<_>>();
         Self {
             occupied_cells: cells
                 .as_chunks()
@@ -278,6 +328,8 @@ impl Seeder {
     }
 
     fn is_occupied(&self, position: &Point3<f64>, spacing_m: f64) -> bool {
+        // Discs of half and twice the size count as similar. A keyframe from much closer adds finer
+        // discs on the same surface.
         let octave = octave_of(spacing_m);
         [octave - 1, octave, octave + 1]
             .iter()
@@ -315,6 +367,7 @@ impl SeedSnapshot {
     /// Returns the positions (x, y, z as f64) in seeding order, and the cells (octave, x, y, z as
     /// i32) in ascending order.
     pub(crate) fn into_bytes(mut self) -> (Vec<u8>, Vec<u8>) {
+        // A hash set has no fixed order, and equal states must have equal checkpoints.
         self.cells.sort_unstable();
         let positions = self
             .positions
@@ -347,6 +400,7 @@ impl InverseDepths {
     /// Sets a cell's inverse depth unless a nearer one is known.
     fn set_nearest(&mut self, [column, row]: [usize; 2], per_m: f64) {
         let known = &mut self.per_m[row * self.n_cells[0] + column];
+        // A nearer surface hides farther ones. Its inverse depth is larger.
         *known = known.max(per_m);
     }
 
@@ -372,6 +426,8 @@ impl InverseDepths {
                 .map(|per_m| if *per_m > 0.0 { *per_m } else { default_per_m })
                 .collect();
         }
+        // One level of a pyramid: each coarse cell has the mean of its known cells, and remains
+        // unknown (0) without any. Recursion then fills the unknown coarse cells.
         let mut coarse = Self::new([width.div_ceil(2), height.div_ceil(2)]);
         for (ix, mean) in coarse.per_m.iter_mut().enumerate() {
             let [column, row] = [2 * (ix % coarse.n_cells[0]), 2 * (ix / coarse.n_cells[0])];
@@ -399,7 +455,8 @@ impl InverseDepths {
 /// intervals of the list are used. Points without a color get the color of the first keyframe that
 /// shows them.
 pub(crate) fn balls(points: &InitialPoints, keyframes: &[&Keyframe], n_max: usize) -> SplatArrays {
-    // Of several points at one position, the first is used: a distance of zero is no size.
+    // Of several points at one position, the first is used, because a distance of zero cannot be a
+    // size.
     let mut seen = HashSet::new();
     let is_first = |ix: &usize| seen.insert(points.points_in_world_m[*ix].map(f32::to_bits));
     let distinct: Vec<usize> = (0..points.points_in_world_m.len())
@@ -450,9 +507,12 @@ fn color_of_point(points: &InitialPoints, ix: usize, keyframes: &[&Keyframe]) ->
 pub(crate) fn random_cloud(keyframes: &[&Keyframe], seed: u64, n_max: usize) -> SplatArrays {
     let mut seeds = Seeds::new();
     let focus = common_focus(keyframes);
+    // The constant separates these random numbers from others that are drawn with the same seed.
     let mut random = Random::new(seed ^ 0x5eed_5eed);
     let n = N_RANDOM.min(n_max);
     for _ in 0..n {
+        // A random pixel of a random image gives a ray that is certainly in view, and a color. The
+        // product may round up to the length, hence the minimum.
         let keyframe =
             keyframes[((random.unit() * keyframes.len() as f64) as usize).min(keyframes.len() - 1)];
         let [width, height] = keyframe.size_px;
@@ -460,8 +520,9 @@ pub(crate) fn random_cloud(keyframes: &[&Keyframe], seed: u64, n_max: usize) -> 
         let y = ((random.unit() * f64::from(height)) as u32).min(height - 1);
         let camera = keyframe.world_from_camera.translation.vector;
         let distance_m = (focus - camera).norm().max(1e-3);
-        // Depths range from a third to three times the distance. Beyond the focus, they are uniform
-        // in inverse depth.
+        // Depths range from a third to three times the distance, because the scene is expected
+        // around the focus. Up to the focus, they are uniform. Beyond it, they are uniform in
+        // inverse depth, which suits backgrounds at unknown distances.
         let share = random.unit();
         let z = distance_m
             * if share < 0.5 {
@@ -476,10 +537,13 @@ pub(crate) fn random_cloud(keyframes: &[&Keyframe], seed: u64, n_max: usize) -> 
         );
         let pixel = ((y * width + x) * 4) as usize;
         let rgb = &keyframe.rgba_srgb[pixel..pixel + 4];
+        // Masked pixels show no part of the scene.
         if rgb[3] == 0 {
             continue;
         }
         let position = keyframe.world_from_camera * Point3::from(ray * z);
+        // Mean distance of the splats in one image: each image has about `n / keyframes.len()` of
+        // them. The size follows the depth, so near and far splats look equally large.
         let spacing_px =
             (f64::from(width) * f64::from(height) * keyframes.len() as f64 / n as f64).sqrt();
         let size = 0.3 * spacing_px * z / keyframe.focal_px[0];
@@ -491,11 +555,15 @@ pub(crate) fn random_cloud(keyframes: &[&Keyframe], seed: u64, n_max: usize) -> 
 
 /// Point with the smallest sum of squared distances to all optical axes.
 pub(crate) fn common_focus(keyframes: &[&Keyframe]) -> Vector3<f64> {
+    // The small diagonal keeps the matrix invertible if all axes are parallel, as with a single
+    // image. The focus then tends to the point nearest to the origin.
     let mut normal_matrix = Matrix3::identity() * 1e-6;
     let mut rhs = Vector3::zeros();
     for keyframe in keyframes {
         let axis = keyframe.world_from_camera * Vector3::z();
         let camera = keyframe.world_from_camera.translation.vector;
+        // Projects onto the plane across the axis. Its product with `point - camera` is the offset
+        // of the point from the axis.
         let across = Matrix3::identity() - axis * axis.transpose();
         normal_matrix += across;
         rhs += across * camera;
@@ -547,11 +615,15 @@ impl Seeds {
         opacity: f64,
         color: [f64; 3],
     ) {
+        // The thin axis is z. For a normal of -z, the axis of the rotation is not unique, so x is
+        // used.
         let rotation_matrix =
             Rotation3::rotation_between(&Vector3::z(), normal).unwrap_or_else(|| {
                 Rotation3::from_axis_angle(&Vector3::x_axis(), std::f64::consts::PI)
             });
         let rotation = UnitQuaternion::from_rotation_matrix(&rotation_matrix);
+        // The inverses of the maps from the optimized values: `exp`, the logistic function, and
+        // `color = 0.5 + SH_0 * coefficient` (Kerbl et al. 2023).
         let arrays = &mut self.arrays;
         arrays.means.push(f32s_of(position.coords.into()));
         arrays

@@ -97,6 +97,7 @@ impl SplatTrainer {
         options: ModelOptions<SplatOptions>,
         pipelines: LazyPipelines,
     ) -> Result<Self, Error> {
+        // Software adapters get coarser images, fewer seeds and less image memory by default.
         let is_software = gpu.is_software();
         Ok(Self {
             renderer: Renderer::new(&gpu)?,
@@ -110,6 +111,7 @@ impl SplatTrainer {
                 options.specific.count,
                 options.specific.trial_steps,
             ),
+            // With `TestedGrowth`, doublings are already tested while images arrive.
             growth_search: GrowthSearch::new(options.specific.count == CountPolicy::Tested),
             skipped: SkippedSteps::default(),
             saved_corrections: BTreeMap::new(),
@@ -141,8 +143,8 @@ impl SplatTrainer {
         {
             log::warn!("{}: {difference}", folder.display());
         }
-        (self.saved_corrections, self.saved_background_srgb) =
-            (metadata.cameras, metadata.background_srgb);
+        self.saved_corrections = metadata.cameras;
+        self.saved_background_srgb = metadata.background_srgb;
         Ok(self)
     }
 
@@ -179,6 +181,7 @@ impl SplatTrainer {
     }
 
     fn add_view(&mut self, keyframe: Arc<Keyframe>) -> Result<(), Error> {
+        // The steps of a failed submit are repeated, and must be repeated on the same views.
         self.finish_in_flight()?;
         self.seeding.push(keyframe.clone());
         self.views.push(keyframe);
@@ -203,6 +206,7 @@ impl SplatTrainer {
     /// Seeds the areas that depth does not cover. Uses discs if any keyframe has depth; otherwise
     /// balls at the initial points, if there are any, and a random cloud.
     fn prepare_training(&mut self) -> Result<(), Error> {
+        // Depth comes first, because the other discs take their depths from its discs.
         self.seed_from_depth()?;
         for keyframe in self.seeding.take_unseeded() {
             if let Some(discs) = self.seeding.discs_without_depth(&keyframe) {
@@ -213,6 +217,7 @@ impl SplatTrainer {
             self.views
                 .assign_lenses(&self.recorder.gpu, &mut self.model.cameras)?;
         }
+        // No keyframe has depth, or no reading is usable.
         if self.model.splats.n_splats == 0 && !self.views.is_empty() {
             let keyframes: Vec<&Keyframe> = self.views.keyframes().map(AsRef::as_ref).collect();
             let n_max = self.options.cap() as usize;
@@ -221,8 +226,8 @@ impl SplatTrainer {
                 .map(|points| seed::balls(points, &keyframes, n_max))
                 .unwrap_or_default();
             let cloud = seed::random_cloud(&keyframes, self.options.common.seed, n_max);
-            // Points are missing where images have no texture, so there are at least as many splats
-            // as without points.
+            // Structure from motion finds no points where images have no texture. Therefore, there
+            // are at least as many splats as without points.
             let n_random = cloud.n_splats().saturating_sub(balls.n_splats());
             self.add(&balls)?;
             self.add(&cloud.filtered(|ix| ix < n_random))?;
@@ -272,10 +277,13 @@ impl SplatTrainer {
 
 impl Method for SplatTrainer {
     fn push(&mut self, keyframe: Arc<Keyframe>) -> Result<(), Error> {
-        self.finish_in_flight()?; // The step of the arrival must be exact.
+        // A failed submit may reduce the step count, and the step of the arrival must be exact.
+        self.finish_in_flight()?;
         if keyframe.split == Split::Test {
             return Ok(());
         }
+        // Its seeds would not be finite, and its steps would be wasted, because non-finite
+        // gradients are dropped.
         if !keyframe.is_finite() {
             log::warn!(
                 "skipping the image of camera {:?} at {} ns: its pose, intrinsics or velocity is not finite",
@@ -285,6 +293,7 @@ impl Method for SplatTrainer {
             return Ok(());
         }
         self.abort_growth_search()?; // It is repeated with this keyframe.
+        // Once the trials have ended, nothing needs validation, and the image is used for training.
         if keyframe.split == Split::Validation && self.trials.holds_validation() {
             self.trials.validation.push(ValidationImage {
                 keyframe,
@@ -311,6 +320,7 @@ impl Method for SplatTrainer {
         self.seeding.remove(is_removed);
         self.trials.remove(is_removed);
         self.update_growth_search();
+        // Bindings keep the buffers of removed images alive.
         self.recorder.passes.clear_bindings();
         Ok(())
     }
@@ -330,6 +340,9 @@ impl Method for SplatTrainer {
 
     fn n_total_steps(&mut self) -> Result<u64, Error> {
         self.finish_in_flight()?;
+        // The number of reverted steps can be negative in between: a growth search starts again at
+        // step 0, and later returns to the step of the model on all images. Only the sum is
+        // meaningful, hence the wrapping addition.
         Ok(self
             .schedule
             .step
@@ -337,9 +350,11 @@ impl Method for SplatTrainer {
     }
 
     fn background_srgb(&self) -> [f32; 3] {
-        match self.views.is_empty() {
-            true => self.saved_background_srgb,
-            false => Scarcity::of_images(self.n_images()).background_srgb(self.views.mean_srgb()),
+        // A loaded model has no images, so it keeps the background with which it was saved.
+        if self.views.is_empty() {
+            self.saved_background_srgb
+        } else {
+            Scarcity::of_images(self.n_images()).background_srgb(self.views.mean_srgb())
         }
     }
 
@@ -378,6 +393,8 @@ impl Method for SplatTrainer {
         request: &RenderRequest,
         packing: Packing,
     ) -> Result<QueuedPicture, Error> {
+        // Only single views can be queued. A panorama is composed of several, so it is drawn to
+        // the end here.
         let Projection::Pinhole {
             focal_px,
             principal_px,
@@ -408,9 +425,12 @@ impl Method for SplatTrainer {
         if splats.n_splats == 0 {
             return Ok(None);
         }
+        // The copy is queued between two steps. The closure waits for it and encodes it on another
+        // thread, so that training continues.
         let gpu = Arc::clone(&self.recorder.gpu);
         let pending = splats.begin_read(&gpu, splats.active_degree().min(MAX_SH_DEGREE));
-        let (chunker, edits) = (Arc::clone(&self.chunker), Arc::clone(edits));
+        let chunker = Arc::clone(&self.chunker);
+        let edits = Arc::clone(edits);
         Ok(Some(PendingChunks::new(move || {
             let arrays = pending.finish(&gpu)?.without_erased(&edits);
             Ok(chunker.lock().chunks(&arrays, only_changed))
@@ -422,7 +442,8 @@ impl Method for SplatTrainer {
         if splats.n_splats == 0 {
             return Err(Error::NoFloaters);
         }
-        let (gpu, edits) = (Arc::clone(&self.recorder.gpu), Arc::clone(edits));
+        let gpu = Arc::clone(&self.recorder.gpu);
+        let edits = Arc::clone(edits);
         let pending = splats.begin_read(&gpu, 0);
         Ok(PendingFloaters::new(move || {
             floaters(&pending.finish(&gpu)?.without_erased(&edits)).ok_or(Error::NoFloaters)
@@ -456,6 +477,8 @@ impl Method for SplatTrainer {
     /// The estimated corrections, or the loaded ones if none are estimated.
     fn camera_corrections(&mut self) -> Result<BTreeMap<String, CameraCorrection>, Error> {
         self.finish_in_flight()?;
+        // Corrections belong to the displayed splats: during a trial of camera parameters, those
+        // in training differ.
         let cameras = &self.model.cameras;
         let displayed = self.displayed_state().map(|snapshot| &snapshot.cameras);
         let (set, params) = displayed.map_or((cameras.set, &cameras.params), |(set, params)| {
@@ -489,6 +512,7 @@ impl Method for SplatTrainer {
     }
 
     fn pause_growth(&mut self, is_paused: bool) -> Result<bool, Error> {
+        // Both halves of a comparison must grow alike.
         let is_compared =
             self.trials.running_trial().is_some() || self.growth_search.running().is_some();
         if self.model.is_growth_paused == is_paused || is_compared {
@@ -515,6 +539,7 @@ impl Method for SplatTrainer {
 
     fn save(&mut self, folder: &Path) -> Result<(), Error> {
         self.finish_in_flight()?;
+        // A change whose trial has not ended is not proven, so it is not saved.
         self.cancel_trial()?;
         let arrays = self.arrays()?;
         std::fs::create_dir_all(folder).map_err(|source| Error::Write {

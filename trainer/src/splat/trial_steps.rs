@@ -40,11 +40,19 @@ impl Default for TrialSteps {
     fn default() -> Self {
         Self {
             first_trial: 500,
+            // Long enough for the optimizer to settle after the change, and short enough that a
+            // trial, whose losing half is discarded, does not cost much. A change that pays only
+            // later is rejected.
             trial_half: 250,
+            // A pose of an image changes only in steps on this image.
             per_image: 4,
             max_trial_half: 1200,
+            // After six changes of the splat count, so that the model has grown by more than half.
             first_doubling: 800,
+            // Three periods, because a doubling needs time until the new splats have found their
+            // places.
             doubling_half: 3 * GROWTH_PERIOD,
+            // The same steps as above, for few images.
             search: 800,
             search_pause: 500,
             comparison: 250,

@@ -3,11 +3,9 @@
 //!
 //! The baseline and the variant with the change are trained from the same state for the same number
 //! of steps. Keyframes that arrive during the first half of a trial are added to both at the same
-//! step; later ones wait for the end of the trial. An addition is accepted if its mean gain over
-//! the validation keyframes exceeds both a minimum and two standard errors. A reduction is accepted
-//! if its loss plus half a standard error stays within a limit, and the total loss of all
-//! reductions is at most [`MAX_TOTAL_LOSS_DB`]. After the last trial, the validation keyframes
-//! become training keyframes.
+//! step; later ones wait for the end of the trial. [`Trial::of`] decides whether the mean gain over
+//! the validation keyframes is significant. The total loss of all reductions is at most
+//! [`MAX_TOTAL_LOSS_DB`]. After the last trial, the validation keyframes become training keyframes.
 
 use super::arrival_gains::ArrivalGains;
 use super::buffers::SplatBuffers;
@@ -24,10 +22,17 @@ use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 
 /// Maximum total loss of the reductions accepted since the last doubling, dB.
+///
+/// Each halving alone may cost 0.1 dB. Without a limit of the sum, several accepted halvings would
+/// add up to a visible loss. A larger value gives smaller models that look worse.
 const MAX_TOTAL_LOSS_DB: f64 = 0.15;
 /// Maximum number of validation keyframes that are scored.
+///
+/// Each trial renders all of them twice at full resolution. More keyframes give a smaller standard
+/// error, but delay training.
 pub(crate) const MAX_SCORED: usize = 24;
-/// Halving ends once the number of splats is at most this value.
+/// Halving ends once the number of splats is at most this value, where a smaller model saves hardly
+/// any time or memory.
 const MIN_SPLATS: u32 = 1000;
 
 /// Per-image gains. Their trial needs no training, because their effect follows from sums over
@@ -58,6 +63,7 @@ pub(crate) struct ValidationImage {
 impl ValidationImage {
     /// The image on the GPU, uploaded on first use.
     pub(crate) fn uploaded(&mut self, gpu: &Gpu) -> Result<&Buffer, Error> {
+        // `take` and `insert` instead of `get_or_insert_with`, because the upload can fail.
         let image = match self.image.take() {
             Some(image) => image,
             None => gpu.storage_with("splat.validation", &self.keyframe.rgba_srgb)?,
@@ -78,6 +84,7 @@ fn id_of(keyframe: &Keyframe) -> ImageId {
 
 /// Scores of the images that both maps contain.
 fn pair_scores(baseline_db: &Scores, variant_db: &Scores) -> (Vec<f64>, Vec<f64>) {
+    // A validation keyframe can be removed between the two scores. Its difference is unknown then.
     baseline_db
         .iter()
         .filter_map(|(id, baseline)| Some((*baseline, *variant_db.get(id)?)))
@@ -137,7 +144,7 @@ pub(crate) struct RunningTrial {
     /// Last step of this half.
     pub(crate) until: u64,
     /// The state that is not in training. In the first half of a trial, this is the state at the
-    /// start of the trial; in the second half, the state at the end of the first half.
+    /// start of the trial. In the second half, it is the state at the end of the first half.
     pub(crate) other: Box<Snapshot>,
     /// The validation keyframes on which both halves are scored.
     pub(crate) scored: Vec<ImageId>,
@@ -232,6 +239,8 @@ impl RunningTrial {
     }
 
     fn due(&self, step: u64) -> Due {
+        // Arrivals come first: a keyframe that arrived at the last step of the first half must also
+        // be added to the variant before the variant is scored.
         match (step >= self.until, self.is_second_half()) {
             _ if step >= self.next_arrival_step() => Due::Arrival,
             (false, _) => Due::Nothing,
@@ -249,6 +258,8 @@ impl SplatTrials {
             CountPolicy::ToCap => CountState::ToCap,
             CountPolicy::Tested | CountPolicy::TestedGrowth => CountState::Growing,
         };
+        // Without anything to test, the validation keyframes are training keyframes from the first
+        // step on.
         let is_finished = candidates.is_empty() && count == CountState::ToCap;
         let trial_phase = if is_finished {
             SplatTrialPhase::Finished
@@ -279,9 +290,12 @@ impl SplatTrials {
 
     /// Whether regular densification may add splats at this step.
     pub(crate) fn may_grow(&self, step: u64) -> bool {
+        // From this step on, only accepted trials add splats.
         if self.doubling.is_some() && step >= self.steps.first_doubling {
             return false;
         }
+        // During the first halving, `count` is still `Growing`. Densification would undo the
+        // halving in the variant, and enlarge the baseline.
         let is_halving = matches!(
             self.running_trial(),
             Some(RunningTrial {
@@ -314,7 +328,9 @@ impl SplatTrials {
             return Due::Nothing;
         }
         if self.validation.len() < MIN_VALIDATION_IMAGES {
-            // Wait for more images, but not indefinitely.
+            // Wait for more images, but not indefinitely: images that validate nothing are more
+            // useful for training. With growth in trials, images arrive during the whole run, so
+            // it is worth waiting until growth ends.
             let waits = context.step < 2 * self.steps.first_trial
                 || (self.doubling.is_some() && !context.is_mature);
             return if waits {
@@ -323,6 +339,8 @@ impl SplatTrials {
                 Due::ReleaseValidation
             };
         }
+        // Cameras come before the size: with wrong cameras, more splats may only fit the errors of
+        // the poses.
         if let Some(params) = self.candidates.front() {
             return if *params == GAINS {
                 Due::Gains
@@ -346,6 +364,8 @@ impl SplatTrials {
             from: context.sh_degree,
             to: self.degree,
         };
+        // The degree is reduced last, at the final number of splats: the details that a color of a
+        // higher degree adds depend on how many splats there are.
         match self.count {
             CountState::ToCap => Due::ReleaseValidation,
             CountState::Finished if self.degree < context.sh_degree => Due::Begin(lower),
@@ -363,6 +383,7 @@ impl SplatTrials {
             SplatTrialPhase::Waiting if step < self.steps.first_trial => {
                 self.steps.first_trial - step
             }
+            // At least 1, because a submit of zero steps would make no progress.
             SplatTrialPhase::Running(trial) => trial
                 .until
                 .min(trial.next_arrival_step())
@@ -378,20 +399,23 @@ impl SplatTrials {
         let SplatTrialPhase::Running(trial) = &mut self.trial_phase else {
             return false;
         };
+        // In the second half, the baseline has already been trained and scored. Only the variant
+        // could still train on a new keyframe, which would not be a fair comparison.
         let is_deferred = trial.is_second_half();
-        match is_deferred {
-            true => trial.deferred.push(keyframe.clone()),
-            false => trial.arrivals.push_back(Arrival {
+        if is_deferred {
+            trial.deferred.push(keyframe.clone());
+        } else {
+            trial.arrivals.push_back(Arrival {
                 step,
                 keyframe: keyframe.clone(),
-            }),
+            });
         }
         is_deferred
     }
 
-    /// If growth depends on trials and many of the `n_images` images are new, restarts the search
-    /// for the number of splats, and excludes validation keyframes that arrive from now on from
-    /// training. Has no effect during a trial.
+    /// Restarts the search for the number of splats, if growth depends on trials and many of the
+    /// `n_images` images are new. Validation keyframes that arrive from now on are excluded from
+    /// training again. Has no effect during a trial.
     pub(crate) fn restart_growth(&mut self, n_images: usize) {
         if self.running_trial().is_none()
             && self
@@ -415,16 +439,21 @@ impl SplatTrials {
     /// The validation keyframes to score: those of the running trial, or else an evenly spaced
     /// subset.
     pub(crate) fn scored(&self) -> Vec<ImageId> {
-        let stride = self.validation.len().div_ceil(MAX_SCORED).max(1);
-        let spread = || {
-            self.validation
-                .iter()
-                .step_by(stride)
-                .map(|validation| id_of(&validation.keyframe))
-                .collect()
-        };
+        // Both halves are scored on the same keyframes, even if more have arrived since.
         self.running_trial()
-            .map_or_else(spread, |trial| trial.scored.clone())
+            .map_or_else(|| self.evenly_spaced(), |trial| trial.scored.clone())
+    }
+
+    /// At most [`MAX_SCORED`] of the validation keyframes.
+    fn evenly_spaced(&self) -> Vec<ImageId> {
+        // Neighbors in time show nearly the same view, so every n-th keyframe represents the scene
+        // better than the first or last ones.
+        let stride = self.validation.len().div_ceil(MAX_SCORED).max(1);
+        self.validation
+            .iter()
+            .step_by(stride)
+            .map(|validation| id_of(&validation.keyframe))
+            .collect()
     }
 
     /// A validation keyframe, unless it was removed.
@@ -437,6 +466,8 @@ impl SplatTrials {
 
     pub(crate) fn begin(&mut self, candidate: Candidate, from: Snapshot, n_views: usize) {
         let n_steps = match candidate {
+            // A step changes the parameters of one image only, so the number of steps must grow
+            // with the number of images.
             Candidate::Cameras(params)
                 if params.intersects(ParamSet::IMAGE_POSES | ParamSet::IMAGE_GAINS) =>
             {
@@ -450,6 +481,7 @@ impl SplatTrials {
             self.doubling.iter_mut().for_each(Doubling::begin);
         }
         let until = from.schedule.step + n_steps;
+        // Before the phase changes: `scored` returns the list of a running trial otherwise.
         let scored = self.scored();
         self.trial_phase = SplatTrialPhase::Running(RunningTrial {
             candidate,
@@ -495,8 +527,10 @@ impl SplatTrials {
         } = self.take_second_half()?;
         let (baseline_db, variant_db) = pair_scores(&baseline_db?, variant_db);
         let kept = self.evaluate(candidate, &baseline_db, &variant_db);
+        // Each result determines the next trial.
         match candidate {
             Candidate::Cameras(_) => drop(self.candidates.pop_front()),
+            // The next doubling may follow at once.
             Candidate::Doubled { .. } if kept => {}
             Candidate::Doubled { .. } => self
                 .doubling
@@ -506,6 +540,8 @@ impl SplatTrials {
                 self.count = CountState::Halving
             }
             Candidate::Halved { .. } => self.count = CountState::Finished,
+            // The lowest acceptable degree is searched upward from 0, so the first accepted one
+            // is the result. `from` is above the new degree of the model, which ends the search.
             Candidate::ShDegree { from, to } => self.degree = if kept { from } else { to + 1 },
         }
         Some(TrialEnd {
@@ -545,6 +581,7 @@ impl SplatTrials {
             .add(&keyframe.camera, log_gains, psnr)?;
         trial.log_result();
         self.finished.push(trial);
+        // Gains stay enabled, so there is nothing left to watch for.
         self.arrival_gains = None;
         Some(GAINS)
     }
@@ -554,6 +591,8 @@ impl SplatTrials {
             "{candidate}: PSNR without the change {baseline_db:.3?} dB, with it {variant_db:.3?} dB"
         );
         let mut trial = Trial::of(candidate, baseline_db, variant_db);
+        // A doubling that was accepted starts a new model size, so earlier losses do not count. A
+        // reduction that improved the score is no credit for later ones: its gain may be noise.
         let is_growth =
             |trial: &&Trial| trial.kept && matches!(trial.candidate, Candidate::Doubled { .. });
         let since_growth = self
@@ -597,7 +636,8 @@ impl SplatTrials {
     pub(crate) fn abort(&mut self) -> Option<TrialEnd> {
         let canceled = self.cancel();
         if self.running_trial().is_some() {
-            self.trial_phase = SplatTrialPhase::Waiting; // The first half trains the baseline.
+            // The first half trains the baseline, so nothing must be restored.
+            self.trial_phase = SplatTrialPhase::Waiting;
         }
         canceled
     }
@@ -606,6 +646,7 @@ impl SplatTrials {
     fn take_second_half(&mut self) -> Option<RunningTrial> {
         match std::mem::replace(&mut self.trial_phase, SplatTrialPhase::Waiting) {
             SplatTrialPhase::Running(trial) if trial.is_second_half() => Some(trial),
+            // Not in a second half: put the phase back.
             other => {
                 self.trial_phase = other;
                 None
@@ -656,8 +697,10 @@ impl SplatTrials {
         };
         self.candidates = remaining_trials.params.into();
         self.arrival_gains = remaining_trials.arrival_gains;
-        (self.count, self.doubling) = (remaining_trials.count, remaining_trials.doubling);
-        (self.degree, self.finished) = (remaining_trials.degree, finished);
+        self.count = remaining_trials.count;
+        self.doubling = remaining_trials.doubling;
+        self.degree = remaining_trials.degree;
+        self.finished = finished;
     }
 
     /// Restores a trial from a checkpoint.
@@ -676,6 +719,8 @@ impl SplatTrials {
     pub(crate) fn remove(&mut self, is_removed: impl Fn(&Keyframe) -> bool) {
         self.validation
             .retain(|validation| !is_removed(&validation.keyframe));
+        // A removed keyframe must not come back at the same step of the second half, or at the end
+        // of the trial.
         if let SplatTrialPhase::Running(trial) = &mut self.trial_phase {
             trial
                 .arrivals

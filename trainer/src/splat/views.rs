@@ -14,8 +14,10 @@ use keyframe::{DepthMap, Keyframe};
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
-/// Near and far clipping distances of training cameras along z, meters.
+/// Near clipping distance of training cameras along z, meters. Nearer splats would cover the whole
+/// image.
 const NEAR_M: f64 = 0.01;
+/// Far clipping distance along z, meters. Larger depth readings are not seeded, either.
 pub(crate) const FAR_M: f64 = 1e4;
 
 /// Transforms that differ by less, in meters and radians, are the same up to rounding.
@@ -53,6 +55,8 @@ impl Order {
     }
 
     pub(crate) fn pick(&mut self, step: u64, n_views: usize) -> usize {
+        // The order depends only on seed, step and number of views, so that a resumed run
+        // continues with the same views.
         let n = n_views as u64;
         if self.order.len() != n_views || self.round != step / n {
             self.round = step / n;
@@ -66,12 +70,15 @@ impl Order {
 /// Knuth (MMIX).
 fn shuffled(round: u64, n_views: usize, seed: u64) -> Vec<usize> {
     let mut order: Vec<usize> = (0..n_views).collect();
+    // Multiplication by large odd constants spreads seed and round over all bits, so that
+    // successive rounds start from unrelated states.
     let mut state =
         seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) ^ round.wrapping_mul(0xd134_2543_de82_ef95);
     for at in (1..n_views).rev() {
         state = state
             .wrapping_mul(6_364_136_223_846_793_005)
             .wrapping_add(1_442_695_040_888_963_407);
+        // The upper bits: the low bits of such a generator have short periods.
         order.swap(at, ((state >> 33) % (at as u64 + 1)) as usize);
     }
     order
@@ -111,8 +118,8 @@ pub(crate) struct Keep<'a> {
 /// Removes images from the GPU and returns their buffers for reuse.
 ///
 /// First removes images coarser than [`Keep::coarsest`]. If the rest still exceeds `max_bytes`,
-/// removes the most recently used images, because every view is used once per round and the other
-/// images are therefore needed sooner.
+/// removes the most recently used images. Every view is used once per round, so the other images
+/// are needed sooner.
 pub(crate) fn drop_levels(views: &mut [TrainView], keep: Keep<'_>) -> Vec<Level> {
     let mut dropped = Vec::new();
     let mut candidates = Vec::new();
@@ -121,6 +128,8 @@ pub(crate) fn drop_levels(views: &mut [TrainView], keep: Keep<'_>) -> Vec<Level>
         let coarsest = view.clamped(keep.coarsest);
         for level_ix in 0..view.levels.len() {
             let is_needed = keep.needed.contains(&(view_ix, level_ix));
+            // Training never returns to a coarser resolution. Finer images stay: trials, gains and
+            // contributions use full resolution.
             if level_ix > coarsest && !is_needed {
                 dropped.extend(view.levels[level_ix].take());
             } else if let Some(level) = &view.levels[level_ix] {
@@ -131,14 +140,16 @@ pub(crate) fn drop_levels(views: &mut [TrainView], keep: Keep<'_>) -> Vec<Level>
             }
         }
     }
-    if bytes > keep.max_bytes {
-        candidates.sort_unstable();
-        while let (true, Some((_, view_ix, level_ix))) = (bytes > keep.max_bytes, candidates.pop())
-        {
-            if let Some(level) = views[view_ix].levels[level_ix].take() {
-                bytes -= level.bytes();
-                dropped.push(level);
-            }
+    candidates.sort_unstable();
+    while bytes > keep.max_bytes {
+        // The last candidate is the most recently used one. Without candidates, all images are
+        // needed, and the limit is exceeded.
+        let Some((_, view_ix, level_ix)) = candidates.pop() else {
+            break;
+        };
+        if let Some(level) = views[view_ix].levels[level_ix].take() {
+            bytes -= level.bytes();
+            dropped.push(level);
         }
     }
     dropped
@@ -164,12 +175,16 @@ impl TrainView {
     /// kept unless the correction changes them.
     pub(crate) fn replace_camera(&mut self, gpu: &Gpu, keyframe: Arc<Keyframe>) {
         let has_same_depth = has_same_depth(&self.keyframe, &keyframe);
+        // The lens is a slot of camera parameters, which start anew after a correction.
         self.lens = None;
         self.keyframe = keyframe;
+        // The color pixels never change, but uploaded depth is reprojected into the color camera,
+        // so it depends on the extrinsics and intrinsics.
         if !has_same_depth {
             self.median_depth_m = median_depth_m(&self.keyframe);
             self.levels = [const { None }; 3];
         }
+        // Poses are part of the small view uniform, so large images need no second upload.
         for (level_ix, level) in self.levels.iter().enumerate() {
             if let Some(level) = level {
                 let view = camera_of(&self.keyframe).at_level(level_ix as u32).view();
@@ -235,11 +250,15 @@ impl TrainView {
         reused: Option<Level>,
     ) -> Result<(), Error> {
         let depth_bytes = bytemuck::cast_slice(&images.depth_m);
-        let (size_px, view) = (images.camera.size_px, images.camera.view());
+        let size_px = images.camera.size_px;
+        let view = images.camera.view();
+        // Writing to an existing buffer avoids an allocation in each step, if not all images fit
+        // into memory.
         self.levels[level] = Some(match reused {
             Some(reused) => {
                 gpu.write(&reused.view, 0, bytemuck::bytes_of(&view));
                 gpu.write(&reused.image, 0, &images.image);
+                // Without depth, the readings of the previous view must not remain.
                 match depth_bytes {
                     [] => gpu.clear(&reused.depth, 0, reused.depth.bytes()),
                     _ => gpu.write(&reused.depth, 0, depth_bytes),
@@ -278,10 +297,8 @@ pub(crate) struct LevelImages {
 impl LevelImages {
     pub(crate) fn new(keyframe: &Keyframe, level: usize) -> Self {
         let camera = camera_of(keyframe).at_level(level as u32);
-        let (image, depth_m) = (
-            downscaled_image(keyframe, camera.size_px, level as u32),
-            downscaled_depth(keyframe, camera.size_px, level as u32),
-        );
+        let image = downscaled_image(keyframe, camera.size_px, level as u32);
+        let depth_m = downscaled_depth(keyframe, camera.size_px, level as u32);
         Self {
             camera,
             image,
@@ -301,11 +318,14 @@ impl LevelImages {
 
 /// See [`TrainView::clamped`].
 fn clamped(level: u32, [width, height]: [u32; 2]) -> usize {
+    // Halving the shorter side `ilog2(side / tile)` times leaves at least one tile.
     level.min((width.min(height) / TILE_PX).max(1).ilog2()) as usize
 }
 
 /// Whether the depth of two versions of a keyframe, seen from its color camera, is the same.
 fn has_same_depth(a: &Keyframe, b: &Keyframe) -> bool {
+    // A correction of the color camera's pose often moves the depth camera along with it. Then
+    // their relative pose, the only one that matters here, is the same up to rounding.
     let color_from_depth = |keyframe: &Keyframe| CalibratedCamera::of(keyframe).color_from_depth;
     let is_same_frame = match (color_from_depth(a), color_from_depth(b)) {
         (Some(a), Some(b)) => {
@@ -317,6 +337,7 @@ fn has_same_depth(a: &Keyframe, b: &Keyframe) -> bool {
     };
     let is_same_lens =
         |a: &DepthMap, b: &DepthMap| a.focal_px == b.focal_px && a.principal_px == b.principal_px;
+    // Corrected keyframes usually share the array, so the comparison of all readings is rare.
     let has_same_readings = a.depth.as_ref().zip(b.depth.as_ref()).is_none_or(|(a, b)| {
         is_same_lens(a, b) && (Arc::ptr_eq(&a.depth_m, &b.depth_m) || a.depth_m == b.depth_m)
     });
@@ -345,7 +366,8 @@ pub(crate) fn camera_of(keyframe: &Keyframe) -> Camera {
 /// Mean color of a sample of the pixels that are not masked.
 fn mean_srgb(keyframe: &Keyframe) -> Option<[f64; 3]> {
     const STRIDE: usize = 61; // A prime, so that the sample covers all columns.
-    let (mut sums, mut n) = ([0.0; 3], 0.0);
+    let mut sums = [0.0; 3];
+    let mut n = 0.0;
     for pixel in keyframe
         .rgba_srgb
         .as_chunks::<4>()
@@ -372,7 +394,9 @@ fn downscaled_image(keyframe: &Keyframe, size_px: [u32; 2], level: u32) -> Arc<[
     let mut downscaled = Vec::with_capacity(4 * (size_px[0] * size_px[1]) as usize);
     for y in 0..size_px[1] as usize {
         for x in 0..size_px[0] as usize {
+            // Integer sums fit: at level 2, 16 pixels of at most 255 are added.
             let mut sums = [0u32; 3];
+            // A mean that includes masked pixels would leak their color into the loss.
             let mut is_visible = true;
             for row in y * edge..(y + 1) * edge {
                 for pixel in keyframe.rgba_srgb[4 * (row * width + x * edge)..]
@@ -385,6 +409,8 @@ fn downscaled_image(keyframe: &Keyframe, size_px: [u32; 2], level: u32) -> Arc<[
                     }
                 }
             }
+            // Half of the area is added for rounding to the nearest value. Rounding down would
+            // darken coarse images by half a level.
             let area = (edge * edge) as u32;
             downscaled.extend(sums.map(|sum| {
                 u8::try_from((sum + area / 2) / area).expect("a mean of bytes is a byte")
@@ -403,7 +429,8 @@ fn downscaled_depth(keyframe: &Keyframe, size_px: [u32; 2], level: u32) -> Arc<[
         return full;
     }
     let width = keyframe.size_px[0] as usize;
-    let (edge, middle) = (1usize << level, (1usize << level) / 2);
+    let edge = 1usize << level;
+    let middle = edge / 2;
     (0..size_px[1] as usize)
         .flat_map(|y| (0..size_px[0] as usize).map(move |x| (x, y)))
         .map(|(x, y)| full[(y * edge + middle) * width + x * edge + middle])

@@ -34,6 +34,8 @@ impl WorkCounts {
         n_splats: u32,
         size_px: [u32; 2],
     ) -> Result<Self, Error> {
+        // The kernels need no list per tile, so its length is counted here from the masks of the
+        // bin's entries.
         let bin_starts: Vec<u32> = gpu.read(&scratch.bin_starts, n_bins(size_px) as usize + 1)?;
         let n_entries = bin_starts.last().copied().unwrap_or(0);
         let entries: Vec<[u32; 4]> = gpu.read(&scratch.entries, n_entries as usize)?;
@@ -54,13 +56,16 @@ impl WorkCounts {
             ..Self::default()
         };
         for (tile, past_last) in (0u32..).zip(past_last) {
-            let (column, row) = (tile % columns, tile / columns);
+            let column = tile % columns;
+            let row = tile / columns;
             let bin = (row / 4 * bin_columns + column / 4) as usize;
+            // One bit per tile of the bin, row by row.
             let mask = 1 << (row % 4 * 4 + column % 4);
             let list = &entries[bin_starts[bin] as usize..bin_starts[bin + 1] as usize];
             let touching =
                 |part: &[[u32; 4]]| part.iter().filter(|entry| entry[1] & mask != 0).count() as u64;
-            let (n, n_visible) = (touching(list), touching(&list[..past_last as usize]));
+            let n = touching(list);
+            let n_visible = touching(&list[..past_last as usize]);
             counts.n_intersections += n;
             counts.n_visible += n_visible;
             counts.longest_list = counts.longest_list.max(n);

@@ -87,7 +87,9 @@ fn fused_with_twin(keyframes: &[Arc<Keyframe>]) -> (Blocks, VoxelBlocks, VoxelGr
 }
 
 fn compare(got: &Blocks, twin: &VoxelBlocks, voxel_grid: &VoxelGrid) {
-    let (mut n_observed, mut n_off, mut n_colored) = (0_usize, 0_usize, 0_usize);
+    let mut n_observed = 0_usize;
+    let mut n_off = 0_usize;
+    let mut n_colored = 0_usize;
     let quantum_m = DISTANCE_QUANTA * voxel_grid.scale_m / 32767.0;
     for (block_coord, block) in got {
         for (ix, expected) in twin[block_coord].iter().enumerate() {
@@ -179,7 +181,8 @@ fn check_pictures(edits: &Arc<Edits>, min_hits: usize) {
             ..scenes::request(pose)
         })
         .unwrap();
-    let (mut n_hits, mut n_off) = (0_usize, 0_usize);
+    let mut n_hits = 0_usize;
+    let mut n_off = 0_usize;
     let mut mismatches = Mismatches::default();
     for (ix, ray) in rays(&pose, &voxel_grid).iter().enumerate() {
         let hit = reference::cast(&blocks, &voxel_grid, ray, edits);
@@ -265,6 +268,18 @@ fn readings_match_twin() {
     mismatches.assert_none();
 }
 
+/// Replaces each depth of a keyframe, given its index and its value.
+fn replace_depth(keyframe: &mut Arc<Keyframe>, fill: &dyn Fn(usize, f32) -> f32) {
+    let depth = Arc::make_mut(keyframe).depth.as_mut().unwrap();
+    depth.depth_m = depth
+        .depth_m
+        .iter()
+        .enumerate()
+        .map(|(ix, z)| fill(ix, *z))
+        .collect::<Vec<_>>()
+        .into();
+}
+
 #[test]
 fn non_finite_depth_is_ignored() {
     let finite = scene();
@@ -278,16 +293,6 @@ fn non_finite_depth_is_ignored() {
         f32::MIN_POSITIVE,
         -0.0,
     ];
-    let replace_depth = |keyframe: &mut Arc<Keyframe>, fill: &dyn Fn(usize, f32) -> f32| {
-        let depth = Arc::make_mut(keyframe).depth.as_mut().unwrap();
-        depth.depth_m = depth
-            .depth_m
-            .iter()
-            .enumerate()
-            .map(|(ix, z)| fill(ix, *z))
-            .collect::<Vec<_>>()
-            .into();
-    };
     // Holes in one copy, non-finite values at the same pixels in the other.
     let mut with_holes = finite.clone();
     replace_depth(&mut with_holes[1], &|ix, z| {

@@ -9,13 +9,15 @@ pub(super) fn bounds<'a>(
     blocks: impl Iterator<Item = &'a GridCoord>,
     voxel_grid: &VoxelGrid,
 ) -> Option<Bounds> {
-    let center = |block: &GridCoord| {
-        let coordinate = |axis: usize| {
-            (f64::from(block[axis]) + 0.5) * f64::from(BLOCK_EDGE) * voxel_grid.voxel_m
-        };
-        [0, 1, 2].map(|axis| voxel_grid.anchor_m[axis] + coordinate(axis))
-    };
-    Bounds::of_points(&blocks.map(center).collect::<Vec<_>>())
+    let centers_m: Vec<_> = blocks.map(|block| center_m(block, voxel_grid)).collect();
+    Bounds::of_points(&centers_m)
+}
+
+/// Center of a block in world, meters.
+fn center_m(block: &GridCoord, voxel_grid: &VoxelGrid) -> [f64; 3] {
+    let coordinate =
+        |axis: usize| (f64::from(block[axis]) + 0.5) * f64::from(BLOCK_EDGE) * voxel_grid.voxel_m;
+    [0, 1, 2].map(|axis| voxel_grid.anchor_m[axis] + coordinate(axis))
 }
 
 #[cfg(test)]

@@ -57,6 +57,7 @@ impl FieldBuffers {
 
     /// Number of blocks that have a slot.
     pub(crate) fn n_blocks(&self, gpu: &Gpu) -> Result<u32, Error> {
+        // The counter includes requests for blocks that did not fit.
         Ok(self.counters(gpu)?[status::N_BLOCKS].min(self.capacity.n_blocks))
     }
 

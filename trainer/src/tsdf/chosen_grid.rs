@@ -9,14 +9,18 @@ use kinematics::quantile::{Rank, quantile};
 use nalgebra::{Matrix4, Translation3, UnitQuaternion};
 use serde::{Deserialize, Serialize};
 
-/// Range of automatically chosen voxel sizes, meters.
+/// Range of automatically chosen voxel sizes, meters. It protects against a first image that is not
+/// typical of the scene, such as one that is almost covered by a near object.
 const VOXEL_RANGE_M: [f64; 2] = [0.001, 0.2];
-/// Minimum truncation in voxels.
+/// Minimum truncation in voxels. With fewer, interpolation lacks observed voxels on both sides of
+/// slanted surfaces. With more, the two sides of thicker objects share voxels.
 const TRUNCATION_VOXELS: f64 = 4.0;
-/// Maximum factor by which depth noise increases the truncation.
+/// Maximum factor by which depth noise increases the truncation. Stored distances have 16 bits up
+/// to the largest truncation, so a larger factor makes their steps coarser.
 const MAX_TRUNCATION_FACTOR: f64 = 4.0;
 /// Fraction of `max_bytes` that the surface in one image may take when the voxel size is chosen.
-/// The scene is larger than one image.
+/// The scene is larger than one image. A smaller fraction makes voxels coarser than necessary; with
+/// a larger one, more blocks have to be moved to host memory.
 const ONE_IMAGE_FRAC: f64 = 0.1;
 
 /// Voxel size and related settings of a field.
@@ -69,14 +73,21 @@ impl VoxelGrid {
             let n_blocks = ONE_IMAGE_FRAC * bytes as f64 / BYTES_PER_BLOCK as f64;
             (area_m2 / (16.0 * n_blocks.max(1.0))).sqrt()
         });
+        // The coarsest of the three wins: finer voxels than a pixel, or than the noise, store no
+        // detail.
         let chosen_grid = px_m
             .max(by_noise_m)
             .max(by_bytes_m)
             .clamp(VOXEL_RANGE_M[0], VOXEL_RANGE_M[1]);
+        // Rounded up to a multiple of 0.5 mm, so that nearly equal first images give the same grid.
         let voxel_m = positive(options.voxel_m).unwrap_or_else(|| (chosen_grid * 2e3).ceil() / 2e3);
         let truncation_m = positive(options.truncation_m)
             .unwrap_or(TRUNCATION_VOXELS * voxel_m)
+            // Weights fall off between one voxel behind the surface and the truncation, so the
+            // truncation must be larger than a voxel.
             .max(2.0 * voxel_m);
+        // A multiple of the width of a chunk (8 blocks of 8 voxels): fields with the same voxels
+        // then have the same chunks, wherever they begin.
         let chunk_m = 64.0 * voxel_m;
         let anchor = depth
             .world_from_camera
@@ -126,18 +137,27 @@ fn valid_depths<'a>(
     depths.filter(|(_, z)| *z > 0.01 && *z <= options.max_depth_m)
 }
 
+/// Depth at an index; `None` outside the image or if the reading is invalid.
+fn valid_depth(options: &TsdfOptions, depth: &DepthMap, ix: usize) -> Option<f64> {
+    depth
+        .depth_m
+        .get(ix)
+        .map(|z| f64::from(*z))
+        .filter(|z| *z > 0.01 && *z <= options.max_depth_m)
+}
+
+/// Standard deviation of depth at 1 m, estimated from second differences along rows; see
+/// [`VoxelGrid::choose`].
 fn noise_per_m2(options: &TsdfOptions, depth: &DepthMap) -> f64 {
     let width = depth.size_px[0] as usize;
-    let at = |ix: usize| {
-        depth
-            .depth_m
-            .get(ix)
-            .map(|z| f64::from(*z))
-            .filter(|z| *z > 0.01 && *z <= options.max_depth_m)
-    };
+    let at = |ix: usize| valid_depth(options, depth, ix);
+    // Neighbors must be in the same row. Noise of depth cameras grows with the square of depth, so
+    // dividing by the square makes all readings comparable.
     let mut second_differences: Vec<f64> = valid_depths(options, depth)
         .filter(|(ix, _)| ix % width > 0 && ix % width + 1 < width)
         .filter_map(|(ix, z)| Some((at(ix - 1)? - 2.0 * z + at(ix + 1)?).abs() / (z * z)))
         .collect();
+    // 1.6449 is the 90th percentile of the absolute value of a standard normal variable. The
+    // coefficients 1, -2 and 1 have a sum of squares of 6.
     quantile(&mut second_differences, 0.9, Rank::Upper).unwrap_or(0.0) / (1.6449 * 6.0f64.sqrt())
 }

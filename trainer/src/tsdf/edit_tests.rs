@@ -48,7 +48,8 @@ fn erased_object_shows_what_is_behind_it() {
         })
         .unwrap();
     let erased = ball_box();
-    let (mut n_revealed, mut n_kept) = (0, 0);
+    let mut n_revealed = 0;
+    let mut n_kept = 0;
     for (ix, (before, after)) in whole.depth_m.iter().zip(&edited.depth_m).enumerate() {
         let point = |depth_m: f32| point_at(&view.world_from_camera, ix, depth_m);
         if *before > 0.0 && !erased.contains(point(*before)) {
@@ -89,7 +90,8 @@ fn point_at(world_from_camera: &Transform, pixel_ix: usize, depth_m: f32) -> [f6
 #[test]
 fn mesh_files_and_exports_lack_erased_triangles() {
     let mut model = fused_model(scenes::options(), &ball_on_floor(6));
-    let (whole, edits) = (model.mesh().unwrap(), without_ball());
+    let whole = model.mesh().unwrap();
+    let edits = without_ball();
     let left = model.mesh_without(&edits).unwrap();
     let margin = Vector3::repeat(0.02);
     let inner = Aabb {

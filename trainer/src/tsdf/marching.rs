@@ -62,6 +62,7 @@ impl MeshBuffers {
         list.submit_timed(gpu)
     }
 
+    /// Extracts the triangles of the listed blocks, a batch at a time.
     fn mesh_listed(
         &mut self,
         gpu: &Gpu,
@@ -82,12 +83,14 @@ impl MeshBuffers {
             let mut list = Passes::default();
             passes::march(gpu, &mut list, pipelines, field, self);
             list.submit(gpu);
+            // Only the GPU knows the length of the list. Both counters are read at once.
             let n_stale = gpu.begin_read(&self.stale, 1);
             let needed: Vec<u32> = gpu.read(&self.needed, N_NEEDED)?;
             let n_stale = n_stale.finish::<u32>(gpu)?[0];
             if needed[0] > self.mesh_capacity.n_vertices
                 || needed[1] > self.mesh_capacity.n_triangles
             {
+                // Kernels count the triangles that did not fit, so the second attempt fits.
                 self.grow(gpu, &needed)?;
                 continue;
             }
@@ -103,6 +106,7 @@ impl MeshBuffers {
     }
 
     fn grow(&mut self, gpu: &Gpu, needed: &[u32]) -> Result<(), Error> {
+        // A quarter more than needed, because the mesh of a growing field grows, too.
         let [n_vertices, n_triangles] = [needed[0], needed[1]].map(|n| n.saturating_add(n / 4));
         self.mesh_capacity.n_vertices = self.mesh_capacity.n_vertices.max(n_vertices);
         self.mesh_capacity.n_triangles = self.mesh_capacity.n_triangles.max(n_triangles);
@@ -123,6 +127,7 @@ impl MeshBuffers {
         needed: &[u32],
         block_meshes: &mut Vec<(GridCoord, BlockMesh)>,
     ) -> Result<(), Error> {
+        // All reads begin before the first wait, so their copies overlap.
         let parts = gpu.begin_read(&self.parts, n_blocks * size_of::<BlockMeshRange>() / 4);
         let vertices = gpu.begin_read(
             &self.vertices,
@@ -137,6 +142,7 @@ impl MeshBuffers {
                 vertices: vertices[own(part.first_vertex, part.n_vertices)].to_vec(),
                 triangles: triangles[own(part.first_triangle, part.n_triangles)]
                     .iter()
+                    // Indices on the GPU count through the batch; blocks are kept separately.
                     .map(|corners| corners.map(|ix| ix - part.first_vertex))
                     .collect(),
             };

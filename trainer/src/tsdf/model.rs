@@ -181,7 +181,8 @@ impl TsdfModel {
     /// Chooses the voxel size from the first depth image with valid readings and discards earlier
     /// ones. Returns whether there was one.
     fn begin(&mut self) -> Result<bool, Error> {
-        // The maximum size of a binding limits the field, just like a budget.
+        // The maximum size of a binding limits the field, just like a budget. The voxel size must
+        // fit it.
         let max_blocks = capacity::max_blocks_within(
             &self.gpu,
             self.options.common.max_bytes,
@@ -192,6 +193,8 @@ impl TsdfModel {
             let Some(first) = self.queue.pending.front() else {
                 return Ok(false);
             };
+            // An image without valid readings, such as the first one of a sensor that is starting,
+            // says nothing about the scene.
             match first
                 .depth
                 .as_ref()
@@ -237,12 +240,15 @@ impl TsdfModel {
 
     /// Fuses the first pending keyframe after loading the blocks that it could change.
     fn step_with_host_blocks(&mut self, n: u64) -> Result<u64, Error> {
+        // One keyframe at a time: only the host knows which blocks the next one needs, and blocks
+        // of one may have to make room for those of another.
         if n == 0 || self.queue.pending.is_empty() {
             return Ok(0);
         }
         if !self.load_blocks_of_first()? {
+            // The next image needs different blocks, so it may fit.
             self.skip_first();
-            return Ok(1); // The next image needs different blocks.
+            return Ok(1);
         }
         self.record(0, 0)?;
         self.passes.submit(&self.gpu);
@@ -285,6 +291,8 @@ impl TsdfModel {
 
     /// Counts fused keyframes. If the buffers overflowed, grows them and returns true.
     fn apply_counters(&mut self, counters: &[u32]) -> Result<bool, Error> {
+        // The GPU decides which keyframes were fused. After an overflow, later ones of the same
+        // submit are not, so they stay pending.
         for _ in 0..self.fusion.apply_counters(counters) {
             self.queue.complete_first();
         }
@@ -305,8 +313,11 @@ impl TsdfModel {
         let Some(store) = &mut self.store else {
             return Ok(());
         };
+        // Cached bindings would keep the buffers that were replaced.
         let n_excess = store.grow(&self.gpu, &self.pipelines, counters)?;
         self.passes.clear_bindings();
+        // Only blocks that the failed image does not observe may be evicted, otherwise it would
+        // need them again at once.
         if n_excess > 0
             && let Some(keyframe) = self.queue.pending.front()
             && let Some(frustum) = ViewFrustum::of_depth(keyframe, &store.voxel_grid)
@@ -334,6 +345,8 @@ impl Recalibrate for TsdfModel {
 
 impl Method for TsdfModel {
     fn push(&mut self, keyframe: Arc<Keyframe>) -> Result<(), Error> {
+        // A keyframe without depth contains no surface, so this is not an error: in a rig, only
+        // some cameras have depth.
         if keyframe.split == Split::Test || keyframe.depth.is_none() {
             return Ok(());
         }
@@ -356,14 +369,20 @@ impl Method for TsdfModel {
             self.finish_in_flight()?;
             return Ok(self.queue.step() - before);
         }
+        // If some blocks are in host memory, the host must load those that the image could change
+        // first.
         if self.n_host_blocks() > 0 {
             self.finish_in_flight()?;
             return self.step_with_host_blocks(n);
         }
+
+        // Otherwise, the next submit is recorded while the previous one runs. Keyframes in flight
+        // are still pending, but must not be recorded again.
         let n_in_flight =
             usize::try_from(self.fusion.submits.n_steps_in_flight()).expect("few keyframes");
         let n_left = self.queue.pending.len().saturating_sub(n_in_flight) as u64;
-        let n_asked = n.saturating_sub(n_in_flight as u64); // `progress` does not include keyframes in flight.
+        // `progress` does not include keyframes in flight.
+        let n_asked = n.saturating_sub(n_in_flight as u64);
         let n_per_submit = self.fusion.keyframes_per_submit();
         let n_keyframes = usize::try_from(n_asked.min(n_left))
             .unwrap_or(usize::MAX)
@@ -372,6 +391,7 @@ impl Method for TsdfModel {
             self.finish_in_flight()?;
             return Ok(self.queue.step() - before);
         }
+
         let since = Instant::now();
         for ix in 0..n_keyframes {
             self.record(n_in_flight + ix, ix)?;
@@ -380,14 +400,18 @@ impl Method for TsdfModel {
         let counters = self
             .passes
             .submit_reading(&self.gpu, &[(&field.status, 4 * status::LEN)]);
-        let failed = self.finish_in_flight()?; // Waits for the previous submit while this one runs.
+
+        // Waits for the previous submit while this one runs. If the previous one overflowed, the
+        // new one had no effect, and its counters need not be read.
+        let failed = self.finish_in_flight()?;
         if !failed {
             self.fusion
                 .submits
                 .begin(counters, n_keyframes as u64, since);
-        } // After a failure, the new submit had no effect.
+        }
+        // At the end, the caller expects a correct count.
         if n_keyframes as u64 == n_asked || n_keyframes as u64 == n_left {
-            self.finish_in_flight()?; // The caller expects a correct count.
+            self.finish_in_flight()?;
         }
         Ok(n_keyframes as u64)
     }
@@ -446,6 +470,7 @@ impl Method for TsdfModel {
         let Some(voxel_grid) = self.voxel_grid().cloned() else {
             return Ok(None);
         };
+        // Encoding takes CPU time, so it is left to the thread that waits for the result.
         let chunks = self.meshing.take_chunks(&voxel_grid, edits, only_changed);
         Ok(Some(PendingChunks::new(move || {
             Ok(chunks.encode(&voxel_grid))
@@ -455,7 +480,10 @@ impl Method for TsdfModel {
     fn find_floaters(&mut self, edits: &Arc<Edits>) -> Result<PendingFloaters, Error> {
         self.update_mesh()?;
         let voxel_grid = self.voxel_grid().cloned().ok_or(Error::NoFloaters)?;
-        let (blocks, edits) = (self.meshing.blocks().clone(), Arc::clone(edits));
+        // Blocks are shared, so the copy is cheap, and fusion may go on while another thread
+        // searches.
+        let blocks = self.meshing.blocks().clone();
+        let edits = Arc::clone(edits);
         Ok(PendingFloaters::new(move || {
             let mesh = mesh::joined(&blocks, &voxel_grid, &edits);
             mesh::floaters(&mesh, voxel_grid.voxel_m).ok_or(Error::NoFloaters)

@@ -9,7 +9,9 @@ use crate::gpu::{Buffer, Gpu, Passes};
 use crate::view::View;
 use keyframe::Keyframe;
 
-/// Maximum number of workgroups that share the visible blocks: enough to fill any GPU.
+/// Maximum number of workgroups that share the visible blocks: enough to fill any GPU. Only the GPU
+/// knows how many blocks are visible, so each group processes several if there are more, and groups
+/// without a block end at once.
 const MAX_INTEGRATE_GROUPS: u32 = 8192;
 
 /// Buffers for one keyframe, and the readings derived from its depth.
@@ -84,6 +86,7 @@ pub(crate) fn fuse(
         readings,
         n_pixels,
     } = slot;
+    // Normals and validity first: invalid readings allocate no blocks.
     let n_groups = n_pixels.div_ceil(64);
     list.dispatch(
         gpu,
@@ -96,6 +99,7 @@ pub(crate) fn fuse(
             ("readings", readings),
         ],
     );
+    // All blocks before any voxel: if the pool overflows, nothing of this image may be fused.
     list.dispatch(
         gpu,
         &pipelines.allocate_blocks,
@@ -110,6 +114,7 @@ pub(crate) fn fuse(
             ("coords", coords),
         ],
     );
+    // Not only the blocks of this image's surfaces: voxels in front of them are carved.
     list.dispatch(
         gpu,
         &pipelines.find_visible,
@@ -139,6 +144,8 @@ pub(crate) fn fuse(
             ("changed", changed),
         ],
     );
+    // A pass of its own: all workgroups of `integrate` must have ended before the image counts as
+    // fused.
     list.dispatch(gpu, &pipelines.end_keyframe, 1, &[("status", status)]);
 }
 
@@ -214,6 +221,7 @@ pub(crate) fn list_stale(
         changed,
         ..
     } = buffers;
+    // The flags make each block appear once in the list, whose first word is its length.
     list.clear(&mesh.is_stale);
     list.clear_range(&mesh.stale, 0..4);
     list.dispatch(

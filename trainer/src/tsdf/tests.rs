@@ -557,7 +557,8 @@ fn crop_and_depth_range_limit_the_picture() {
         max_m: corner.into(),
     });
     let cropped = model.render(&request).unwrap();
-    let (mut n, mut n_off) = (0, 0);
+    let mut n = 0;
+    let mut n_off = 0;
     for (ix, depth) in cropped
         .depth_m
         .iter()

@@ -11,7 +11,8 @@ use crate::Error;
 use crate::gpu::{Gpu, Passes};
 use std::collections::BTreeSet;
 
-/// Blocks gathered at once.
+/// Blocks gathered at once: 12.6 MB. Larger batches need more GPU memory beside the field; smaller
+/// ones wait for the GPU more often.
 const GATHER_BATCH: usize = 2048;
 
 impl FieldBuffers {
@@ -26,6 +27,9 @@ impl FieldBuffers {
     ) -> Result<Self, Error> {
         let n = self.n_blocks(gpu)?;
         let mut counters = self.counters(gpu)?;
+        // Slots stay the same, so blocks are copied as a whole. The table is rebuilt, because
+        // positions in it depend on its size. If it is too small again, the next attempt doubles
+        // it.
         loop {
             let resized = Self::new(gpu, voxel_grid, capacity)?;
             for (from, to, bytes) in [
@@ -64,6 +68,7 @@ impl FieldBuffers {
         blocks: &Blocks,
         mut capacity: Capacity,
     ) -> Result<Self, Error> {
+        // Slots are assigned in order of the coordinates; `Meshing` relies on this.
         let n = u32::try_from(blocks.len()).unwrap_or(u32::MAX);
         capacity.n_blocks = capacity.n_blocks.max(n);
         loop {
@@ -102,6 +107,8 @@ impl FieldBuffers {
         slots: &[u32],
     ) -> Result<Vec<Block>, Error> {
         let mut blocks = Vec::with_capacity(slots.len());
+        // The blocks are scattered over the pool. A kernel gathers them, so that only they are read
+        // back.
         for part in slots.chunks(GATHER_BATCH) {
             let n = part.len();
             let listed = gpu.storage_with("tsdf.listed", bytemuck::cast_slice(part))?;
@@ -161,6 +168,7 @@ impl FieldBuffers {
         let moved_slots: Vec<u32> = (end.min(n_before)..n_before)
             .filter(|slot| !gone.contains(slot))
             .collect();
+        // Read before anything is written, because holes are filled in place.
         let moved = self.read(gpu, pipelines, &moved_slots)?;
         let moved = moved_slots
             .iter()
@@ -179,8 +187,10 @@ impl FieldBuffers {
         for (slot, (block_coord, block)) in free_slots.zip(incoming) {
             self.write_block(gpu, slot.into(), block_coord, &block);
         }
+        // Slots past the end must be unobserved when new blocks get them.
         if end < n_before {
-            let (from, n) = (u64::from(end), u64::from(n_before - end));
+            let from = u64::from(end);
+            let n = u64::from(n_before - end);
             gpu.clear(&self.geometry, 4 * 512 * from, 4 * 512 * n);
             gpu.clear(&self.colors, 8 * 512 * from, 8 * 512 * n);
         }

@@ -6,7 +6,8 @@ use keyframe::Shutter;
 use kinematics::Transform;
 use std::sync::Arc;
 
-/// Edge of a tile, pixels.
+/// Edge of a tile, pixels, as in Kerbl et al. 2023. Larger tiles sort fewer entries; in smaller
+/// ones, fewer pixels test splats that do not cover them.
 pub(crate) const TILE_PX: u32 = 16;
 
 /// `View` of shared/view.wgsl.
@@ -47,7 +48,9 @@ pub(crate) struct Camera {
     pub(crate) low_pass_px2: f64,
 }
 
-/// Variance of the low-pass at full size, pixels squared.
+/// Variance of the low-pass at full size, pixels squared, as in Kerbl et al. 2023: a splat covers
+/// about a pixel at least. A larger value blurs the picture; with a smaller one, splats fall
+/// between pixel centers.
 pub(crate) const LOW_PASS_PX2: f64 = 0.3;
 
 impl Camera {
@@ -79,21 +82,20 @@ impl Camera {
             size_px: self.size_px.map(|size| (size >> level).max(1)),
             focal_px: self.focal_px.map(|focal| focal * share),
             principal_px: self.principal_px.map(|principal| principal * share),
-            low_pass_px2: self.low_pass_px2 * share * share, // Keeps the filter width in the world constant.
+            // Keeps the filter width in the world constant.
+            low_pass_px2: self.low_pass_px2 * share * share,
             ..self.clone()
         }
     }
 
     /// The view that the kernels read.
     pub(crate) fn view(&self) -> View {
-        let shutter = |of: fn(&Shutter) -> nalgebra::Vector3<f64>| {
-            self.shutter.as_ref().map_or([0.0; 3], |shutter| {
-                f32s_of((of(shutter) * shutter.readout_secs).into())
-            })
-        };
-        let linear = shutter(|shutter| shutter.twist.linear_m_s);
-        let angular = shutter(|shutter| shutter.twist.angular_rad_s);
+        // Kernels scale the motion by the row of a pixel, so they need the motion during a readout
+        // instead of velocity and time.
+        let linear = during_readout(self.shutter.as_ref(), |shutter| shutter.twist.linear_m_s);
+        let angular = during_readout(self.shutter.as_ref(), |shutter| shutter.twist.angular_rad_s);
         let center = f32s_of::<3>(self.world_from_camera.translation.vector.into());
+        // The fourth number of a row would be padding, so it holds a scalar of the view.
         let with = |xyz: [f32; 3], w: f32| [xyz[0], xyz[1], xyz[2], w];
         let crop_w = if self.crop.is_some() { 1.0 } else { 0.0 };
         let camera = rows_of(&self.world_from_camera.inverse());
@@ -123,6 +125,17 @@ impl Camera {
             crop_max: with(self.crop.map_or([0.0; 3], |crop| f32s_of(crop.max_m)), 0.0),
         }
     }
+}
+
+/// Motion of the camera during a readout, from the velocity that `velocity` selects; zero for a
+/// global shutter.
+fn during_readout(
+    shutter: Option<&Shutter>,
+    velocity: fn(&Shutter) -> nalgebra::Vector3<f64>,
+) -> [f32; 3] {
+    shutter.map_or([0.0; 3], |shutter| {
+        f32s_of((velocity(shutter) * shutter.readout_secs).into())
+    })
 }
 
 /// The upper three rows of the transform's matrix.

@@ -22,6 +22,15 @@ struct Erased {
     buffer: Buffer,
 }
 
+impl Erased {
+    /// Whether the buffer holds these edits in this frame.
+    fn is_of(&self, edits: &Arc<Edits>, world_from_drawn: &Matrix4<f64>) -> bool {
+        // Requests of one client share the edits, so most comparisons end at the address.
+        let has_same_edits = Arc::ptr_eq(&self.edits, edits) || self.edits == *edits;
+        has_same_edits && self.world_from_drawn == *world_from_drawn
+    }
+}
+
 impl ErasedSpace {
     /// Nothing is erased.
     pub(crate) fn none(gpu: &Gpu) -> Result<Self, Error> {
@@ -44,14 +53,15 @@ impl ErasedSpace {
         if edits.is_empty() {
             return Ok(&self.nothing);
         }
-        let is_same = |erased: &Erased| {
-            let has_same_edits = Arc::ptr_eq(&erased.edits, edits) || erased.edits == *edits;
-            has_same_edits && erased.world_from_drawn == world_from_drawn
-        };
-        let erased = match self.newest.take().filter(is_same) {
+        let same = self
+            .newest
+            .take()
+            .filter(|erased| erased.is_of(edits, &world_from_drawn));
+        let erased = match same {
             Some(erased) => erased,
             None => {
-                passes.clear_bindings(); // Frees the previous buffer.
+                // Cached bindings hold the previous buffer, which would not be freed.
+                passes.clear_bindings();
                 Erased {
                     edits: Arc::clone(edits),
                     world_from_drawn,
@@ -99,7 +109,9 @@ mod tests {
                 .unwrap()
                 .id
         };
-        let (none, one, other) = (Arc::default(), with_boxes(1), with_boxes(2));
+        let none = Arc::default();
+        let one = with_boxes(1);
+        let other = with_boxes(2);
         let ids = [id_of(&none, 1.0), id_of(&one, 1.0)];
         for _ in 0..3 {
             assert_eq!([id_of(&none, 2.0), id_of(&one, 1.0)], ids);

@@ -12,7 +12,8 @@ use std::sync::LazyLock;
 use trainer::PackedDepth;
 
 /// Ratio of two consecutive counts, minus 1: depths are wrong by at most half of it, 0.2 %. The
-/// models' own errors are larger.
+/// models' own errors are larger. Twice the step saves 30 % of the bytes, half the step costs 30 %
+/// (`docs/benchmarks/2026-11-26-viewer-protocol.md`).
 const LOG_STEP: f64 = 0.004;
 /// Symbol of a pixel whose count follows in the second part.
 const ESCAPE: u8 = 255;
@@ -51,17 +52,25 @@ pub(crate) struct CompactDepth {
 
 /// Compresses a depth map.
 pub(crate) fn compress(depth: &PackedDepth, effort: Effort) -> std::io::Result<CompactDepth> {
-    let counts = depth
+    let counts: Vec<u16> = depth
         .counts
         .chunks_exact(2)
-        .map(|count| u16::from_le_bytes([count[0], count[1]]));
-    let nearest = counts.clone().filter(|count| *count > 0).min().unwrap_or(1);
+        .map(|count| u16::from_le_bytes([count[0], count[1]]))
+        .collect();
+    // Logarithmic counts begin at the nearest surface, so that they are small, whatever the scale.
+    let nearest = counts
+        .iter()
+        .copied()
+        .filter(|count| *count > 0)
+        .min()
+        .unwrap_or(1);
     let min_m = f64::from(nearest) * depth.meters_per_count;
     let log_step = LOG_STEP.ln_1p();
-    let counts: Vec<u16> = counts.collect();
-    let (mut symbols, mut escaped) = (Vec::with_capacity(counts.len()), Vec::new());
+    let mut symbols = Vec::with_capacity(counts.len());
+    let mut escaped = Vec::new();
     // The count to the left predicts a count; in the first column, the count above.
     let mut above = 0;
+    // An empty picture must not lead to rows of length 0, which `chunks` does not allow.
     for row in counts.chunks((depth.size_px[0] as usize).max(1)) {
         let mut predicted = above;
         above = log_count(row[0], nearest, log_step);
@@ -77,10 +86,12 @@ pub(crate) fn compress(depth: &PackedDepth, effort: Effort) -> std::io::Result<C
             predicted = code;
         }
     }
+    // Escaped counts come last: between the symbols, they would break the patterns that zlib finds.
     symbols.append(&mut escaped);
     let bytes = match effort {
         Effort::Fast => fdeflate::compress_to_vec(&symbols),
         Effort::Small => {
+            // About the size of the stream for depth of splats, so that the buffer rarely grows.
             let mut encoder = ZlibEncoder::new(
                 Vec::with_capacity(symbols.len() / 4),
                 Compression::new(LEVEL),
@@ -107,16 +118,22 @@ fn log_count(count: u16, nearest: u16, log_step: f64) -> u16 {
     if count < nearest {
         return 0;
     }
+    // A table, because a picture has hundreds of thousands of pixels, but there are only 65536
+    // counts.
     let above = LOGARITHMS[usize::from(count)] - LOGARITHMS[usize::from(nearest)];
+    // Rounded, and 1 more, because 0 means that there is no surface.
     (above / log_step as f32 + 1.5) as u16
 }
 
 /// The difference to the prediction: 0, -1, 1, -2, 2, ...; `None` if it is too large, or the pixel
 /// or its prediction has no surface but not both.
 fn symbol(code: u16, predicted: u16) -> Option<u8> {
+    // The edge of a hole is a large jump that says nothing about the shape of the surface.
     if (code == 0) != (predicted == 0) {
         return None;
     }
+    // Small differences of both signs get small symbols, as in the zigzag coding of Protocol
+    // Buffers.
     let symbol = if code >= predicted {
         2 * u32::from(code - predicted)
     } else {

@@ -126,6 +126,8 @@ fn encode_in_strips(
     if width_px == 0 || height_px == 0 {
         return Err(JpegError::Size { width, height });
     }
+    // With halved chroma, a block of 8 x 8 chroma values covers 16 x 16 pixels. A strip ends with a
+    // complete block, because the encoder would repeat its last row otherwise.
     let block_px: u16 = if chroma == Chroma::Full { 8 } else { 16 };
     let blocks_per_row = width_px.div_ceil(block_px);
     let n_block_rows = usize::from(height_px.div_ceil(block_px));
@@ -142,15 +144,16 @@ fn encode_in_strips(
         );
     }
     let rows_per_strip = rows_per_strip.min(max_rows);
-    let strip_bytes =
-        rows_per_strip * usize::from(block_px) * width as usize * pixels.layout.n_channels();
+    let row_bytes = width as usize * pixels.layout.n_channels();
+    let strip_bytes = rows_per_strip * usize::from(block_px) * row_bytes;
     let strips = std::thread::scope(|scope| {
+        // All threads are started before the first one is waited for.
         let tasks: Vec<_> = pixels
             .bytes
             .chunks(strip_bytes)
             .map(|bytes| {
-                let rows = bytes.len() / (width as usize * pixels.layout.n_channels());
-                let rows = u16::try_from(rows).expect("a strip is not higher than its image");
+                let rows = u16::try_from(bytes.len() / row_bytes)
+                    .expect("a strip is not higher than its image");
                 scope.spawn(move || {
                     encode_strip(bytes, pixels.layout, [width_px, rows], quality, chroma)
                 })
@@ -172,6 +175,7 @@ fn encode_strip(
     quality: u8,
     chroma: Chroma,
 ) -> Result<Vec<u8>, JpegError> {
+    // Headers, and about one bit per channel value, so that the buffer rarely grows.
     let mut file = Vec::with_capacity(1024 + bytes.len() / 12);
     let mut encoder = Encoder::new(&mut file, quality);
     encoder.set_sampling_factor(match chroma {
@@ -205,15 +209,20 @@ struct Parts {
 
 /// Joins the files of the strips into the file of the whole image.
 fn join(strips: &[Vec<u8>], height_px: u16, interval: u16) -> Vec<u8> {
+    // The tables of all strips are the same, so the headers of the first one apply to the whole
+    // image.
     let first = &strips[0];
     let parts = parts_of(first);
     let mut file =
         Vec::with_capacity(strips.iter().map(|strip| strip.len() + 2).sum::<usize>() + 6);
     file.extend_from_slice(&first[..parts.scan_header]);
+    // The first strip has its own height.
     file[parts.height..parts.height + 2].copy_from_slice(&height_px.to_be_bytes());
+    // Must come before the scan header (ITU-T T.81, section B.2.4.4).
     file.extend_from_slice(&[0xFF, DEFINE_RESTART_INTERVAL, 0, 4]);
     file.extend_from_slice(&interval.to_be_bytes());
     file.extend_from_slice(&first[parts.scan_header..parts.scan]);
+    // Markers count from 0 to 7 and start again, so that decoders notice a lost one.
     for (strip, number) in strips.iter().zip((0..8).cycle()) {
         let scan = parts_of(strip).scan;
         file.extend_from_slice(&strip[scan..strip.len() - END_OF_IMAGE.len()]);
@@ -228,10 +237,13 @@ fn join(strips: &[Vec<u8>], height_px: u16, interval: u16) -> Vec<u8> {
 /// Iterates over the segments of a file that the encoder wrote.
 fn parts_of(file: &[u8]) -> Parts {
     let mut height = 0;
+    // After the marker for the start of the image, which has no length.
     let mut at = 2;
+    // Ends, because the encoder always writes a scan. Files of others never come here.
     loop {
         let length = usize::from(u16::from_be_bytes([file[at + 2], file[at + 3]]));
         match file[at + 1] {
+            // Marker, length of the segment and precision come before the height.
             START_OF_FRAME => height = at + 5,
             START_OF_SCAN => {
                 return Parts {
@@ -242,6 +254,7 @@ fn parts_of(file: &[u8]) -> Parts {
             }
             _ => {}
         }
+        // The length counts itself, but not the marker.
         at += 2 + length;
     }
 }
@@ -255,6 +268,8 @@ pub(crate) fn downscale(pixels: &Pixels<'_>, size_px: [u32; 2]) -> Result<Vec<u8
     let rows = Spans::new(pixels.size_px[1], size_px[1]);
     let mut rgb = Vec::with_capacity(3 * size_px[0] as usize * size_px[1] as usize);
     let mut row_sums = vec![0.0_f32; row_bytes];
+    // First along columns, then along rows: each source value is then read only once for each
+    // target row.
     for row in 0..size_px[1] {
         row_sums.fill(0.0);
         for (y, weight) in rows.of(row) {
@@ -305,7 +320,9 @@ impl Spans {
         reason = "positions in the source image"
     )]
     fn of(&self, target: u32) -> impl Iterator<Item = (usize, f32)> + use<> {
-        let (begin, scale) = (f64::from(target) * self.scale, self.scale);
+        let scale = self.scale;
+        let begin = f64::from(target) * scale;
+        // Rounding could reach beyond the last source pixel.
         let end = (begin + scale).min(f64::from(self.n_source));
         let last = (end.ceil() as u32).min(self.n_source);
         ((begin.floor() as u32)..last).map(move |at| {

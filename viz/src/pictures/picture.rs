@@ -15,9 +15,12 @@ use std::borrow::Cow;
 use std::time::Instant;
 use trainer::{JPEG_QUALITY, PackedDepth, Packing, Picture, Rendered};
 
-/// JPEG quality of intermediate stages, which are soon replaced.
+/// JPEG quality of intermediate stages, which are soon replaced. With a higher quality, they take
+/// longer to send, and the last stage comes later.
 const QUALITY_INTERMEDIATE: u8 = 80;
-/// JPEG quality of live images. They are shown without enlargement, several times per second.
+/// JPEG quality of live images. They are shown without enlargement, several times per second. They
+/// are most of what an idle page receives: 56 of 62 kB/s with quality 80
+/// (`docs/benchmarks/2026-11-26-viewer-protocol.md`).
 const QUALITY_LIVE: u8 = 72;
 /// Smaller pictures keep full color resolution, because halving it saves little and the page
 /// enlarges these pictures.
@@ -97,6 +100,7 @@ pub(crate) fn pack_picture(
     } = drawn;
     let view_request = &*job.view_request;
     let began = Instant::now();
+    // The GPU has packed it already, unless the client wants a format that it does not support.
     let (color, depth) = match rendered {
         Rendered::Packed(packed) => (packed.jpeg, packed.depth),
         Rendered::Picture(picture) => encode_picture(view_request, header.last, &picture)?,
@@ -107,36 +111,12 @@ pub(crate) fn pack_picture(
         offset: 0,
         bytes: color.len(),
     });
-    let format = match (view_request.depth, effort) {
-        (Some(DepthFormat::CompactHalf), None) => Some(DepthFormat::U16Half),
-        (requested, _) => requested,
-    };
-    let depth = match depth.zip(format) {
+    let depth = match depth {
         None => Vec::new(),
-        Some((packed, format @ DepthFormat::CompactHalf)) => {
-            let compact = compress(&packed, effort.unwrap_or(Effort::Fast))?;
-            header.depth = Some(DepthPart {
-                format,
-                size_px: compact.size_px,
-                meters_per_count: None,
-                min_m: Some(compact.min_m),
-                log_step: Some(compact.log_step),
-                offset,
-                bytes: compact.bytes.len(),
-            });
-            compact.bytes
-        }
-        Some((packed, format @ (DepthFormat::U16Half | DepthFormat::F32))) => {
-            header.depth = Some(DepthPart {
-                format,
-                size_px: packed.size_px,
-                meters_per_count: Some(packed.meters_per_count),
-                min_m: None,
-                log_step: None,
-                offset,
-                bytes: packed.counts.len(),
-            });
-            packed.counts
+        Some(packed) => {
+            let (part, bytes) = depth_part(view_request, packed, effort, offset)?;
+            header.depth = part;
+            bytes
         }
     };
     header.encode_millis = Some(began.elapsed().as_secs_f64() * 1e3);
@@ -147,6 +127,45 @@ pub(crate) fn pack_picture(
         color: color.unwrap_or_default(),
         depth,
     })
+}
+
+/// The depth in the requested format, and its position in the payload. Nothing if none was
+/// requested.
+fn depth_part(
+    view_request: &ViewRequest,
+    packed: PackedDepth,
+    effort: Option<Effort>,
+    offset: usize,
+) -> Result<(Option<DepthPart>, Vec<u8>), PackError> {
+    let format = match (view_request.depth, effort) {
+        // Within a computer, compression takes longer than it saves. Clients look at the format.
+        (Some(DepthFormat::CompactHalf), None) => DepthFormat::U16Half,
+        (Some(requested), _) => requested,
+        (None, _) => return Ok((None, Vec::new())),
+    };
+    if format == DepthFormat::CompactHalf {
+        let compact = compress(&packed, effort.unwrap_or(Effort::Fast))?;
+        let part = DepthPart {
+            format,
+            size_px: compact.size_px,
+            meters_per_count: None,
+            min_m: Some(compact.min_m),
+            log_step: Some(compact.log_step),
+            offset,
+            bytes: compact.bytes.len(),
+        };
+        return Ok((Some(part), compact.bytes));
+    }
+    let part = DepthPart {
+        format,
+        size_px: packed.size_px,
+        meters_per_count: Some(packed.meters_per_count),
+        min_m: None,
+        log_step: None,
+        offset,
+        bytes: packed.counts.len(),
+    };
+    Ok((Some(part), packed.counts))
 }
 
 /// Encodes the requested color and depth of a picture.
@@ -175,6 +194,8 @@ fn pack_color(picture: &Picture, is_last: bool) -> Result<Vec<u8>, JpegError> {
         layout: Layout::Rgba,
         bytes: &picture.rgba_srgb,
     };
+    // Large intermediate stages are replaced before anybody looks closely, so their chroma is
+    // halved.
     let is_small = picture.rgba_srgb.len() < 4 * MIN_HALVED_PX;
     let quality = if is_last {
         JPEG_QUALITY
@@ -209,11 +230,13 @@ pub(crate) fn pack_live_image(
 pub(crate) fn live_jpeg(image: &LiveImage, size_px: [u32; 2]) -> Result<Cow<'_, [u8]>, PackError> {
     let decoded;
     let pixels = match &image.pixels {
+        // Encoding the file again would cost time and quality.
         LivePixels::Jpeg(file) if size_px == image.size_px => return Ok(Cow::Borrowed(file)),
         LivePixels::Jpeg(file) => {
             decoded =
                 image::load_from_memory_with_format(file, image::ImageFormat::Jpeg)?.into_rgb8();
             let got = [decoded.width(), decoded.height()];
+            // The header would state the intrinsics of another size.
             if got != image.size_px {
                 return Err(PackError::SizeMismatch {
                     got,
@@ -293,12 +316,11 @@ fn half_depth(picture: &Picture, n_threads: usize) -> PackedDepth {
     let size_px = picture.size_px.map(|n| n.div_ceil(2));
     let out_width = size_px[0] as usize;
     let pairs_per_thread = (size_px[1] as usize).div_ceil(n_threads.max(1)).max(1);
-    let (bands, mut bytes) = (
-        picture
-            .depth_m
-            .chunks((2 * width * pairs_per_thread).max(1)),
-        Vec::new(),
-    );
+    // Pairs of rows belong to one thread each. `chunks` does not allow a length of 0.
+    let bands = picture
+        .depth_m
+        .chunks((2 * width * pairs_per_thread).max(1));
+    // The scale of the counts is needed before any of them can be written.
     let furthest_m = std::thread::scope(|scope| {
         let tasks: Vec<_> = bands
             .clone()
@@ -314,32 +336,33 @@ fn half_depth(picture: &Picture, n_threads: usize) -> PackedDepth {
     } else {
         1.0
     };
-    bytes.resize(2 * out_width * size_px[1] as usize, 0);
+    let mut bytes = vec![0; 2 * out_width * size_px[1] as usize];
     std::thread::scope(|scope| {
         for (band, packed) in bands.zip(bytes.chunks_mut((2 * out_width * pairs_per_thread).max(1)))
         {
-            scope.spawn(move || {
-                let mut nearest_m = vec![0.0; out_width];
-                for (rows, packed) in band
-                    .chunks(2 * width)
-                    .zip(packed.chunks_exact_mut(2 * out_width))
-                {
-                    let (upper, lower) = rows.split_at(width);
-                    // The last row of an odd height has no row below it.
-                    nearest_of_squares(
-                        upper,
-                        if lower.is_empty() { upper } else { lower },
-                        &mut nearest_m,
-                    );
-                    write_counts(&nearest_m, 1.0 / meters_per_count, packed);
-                }
-            });
+            scope.spawn(move || halve_band(band, width, 1.0 / meters_per_count, packed));
         }
     });
     PackedDepth {
         size_px,
         meters_per_count,
         counts: bytes,
+    }
+}
+
+/// Packs the counts of a band of rows; each row of counts is made from two rows of depths.
+fn halve_band(depth_m: &[f32], width: usize, counts_per_meter: f64, packed: &mut [u8]) {
+    let out_width = width.div_ceil(2);
+    let mut nearest_m = vec![0.0; out_width];
+    for (rows, packed) in depth_m
+        .chunks(2 * width)
+        .zip(packed.chunks_exact_mut(2 * out_width))
+    {
+        let (upper, lower) = rows.split_at(width);
+        // The last row of an odd height has no row below it.
+        let lower = if lower.is_empty() { upper } else { lower };
+        nearest_of_squares(upper, lower, &mut nearest_m);
+        write_counts(&nearest_m, counts_per_meter, packed);
     }
 }
 
@@ -366,7 +389,9 @@ fn max_depth(depth_m: &[f32]) -> f32 {
 fn nearest_of_squares(upper: &[f32], lower: &[f32], nearest_m: &mut [f32]) {
     let squares = upper.chunks(2).zip(lower.chunks(2));
     for (nearest, (upper, lower)) in nearest_m.iter_mut().zip(squares) {
-        let (right_above, right_below) = (upper[upper.len() - 1], lower[lower.len() - 1]);
+        // The last column of an odd width has no column to its right.
+        let right_above = upper[upper.len() - 1];
+        let right_below = lower[lower.len() - 1];
         let left = depth_or_infinity(upper[0]).min(depth_or_infinity(lower[0]));
         *nearest = left
             .min(depth_or_infinity(right_above))
@@ -382,6 +407,7 @@ fn nearest_of_squares(upper: &[f32], lower: &[f32], nearest_m: &mut [f32]) {
 fn write_counts(depth_m: &[f32], counts_per_meter: f64, packed: &mut [u8]) {
     for (packed, depth) in packed.chunks_exact_mut(2).zip(depth_m) {
         let count = (f64::from(*depth) * counts_per_meter + 0.5) as u16;
+        // A very near surface is still a surface: 0 means that there is none.
         let count = if depth.is_finite() { count.max(1) } else { 0 };
         packed.copy_from_slice(&count.to_le_bytes());
     }

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 /// Maximum number of sent pictures per view and model of which a client can still report when they
-/// were shown.
+/// were shown. Only few pictures are on their way at a time; others were dropped by the client.
 const MAX_UNREPORTED: usize = 16;
 /// Maximum number of pairs of a view and a model per client; the one that was sent longest ago is
 /// dropped.
@@ -14,7 +14,8 @@ const MAX_STREAMS: usize = 8;
 /// A client has waited for the keyframes of a picture that it has not reported if less than this
 /// passed between the picture before that one and the next picture that it reports.
 const MAX_WAIT: Duration = Duration::from_secs(10);
-/// Maximum number of shown pictures that wait for the run; the oldest are dropped.
+/// Maximum number of shown pictures that wait for the run; the oldest are dropped. A command that
+/// does not measure latency never takes them.
 const MAX_SHOWN: usize = 1024;
 
 /// The keyframes on which a model had been trained when a picture was drawn.
@@ -91,6 +92,8 @@ impl UnreportedPictures {
     /// Adds a picture that is about to be sent. The first picture of a model in a view has no new
     /// keyframes: the client did not wait for them.
     pub(crate) fn sent(&mut self, picture: SentPicture) {
+        // At most `MAX_STREAMS` entries, so searching is cheaper than a map with an order of its
+        // own.
         let found = self
             .0
             .iter()
@@ -109,22 +112,15 @@ impl UnreportedPictures {
     /// reported before.
     pub(crate) fn shown(&mut self, id: u64, view: &str, shown_at: Instant) -> Option<ShownPicture> {
         let mut streams = self.0.iter_mut().filter(|stream| *stream.view == *view);
-        streams.find_map(|stream| stream.take(id)).map(
-            |(
-                SentPicture {
-                    method, sent_at, ..
-                },
-                new_keyframes,
-            )| {
-                let shown_at = shown_at.min(Instant::now()).max(sent_at);
-                ShownPicture {
-                    method,
-                    new_keyframes,
-                    sent_at,
-                    shown_at,
-                }
-            },
-        )
+        let (picture, new_keyframes) = streams.find_map(|stream| stream.take(id))?;
+        // The time comes from the client, whose estimate of the server's clock may be wrong.
+        let shown_at = shown_at.min(Instant::now()).max(picture.sent_at);
+        Some(ShownPicture {
+            method: picture.method,
+            new_keyframes,
+            sent_at: picture.sent_at,
+            shown_at,
+        })
     }
 }
 
@@ -141,6 +137,7 @@ impl Stream {
     }
 
     fn push(&mut self, picture: SentPicture) {
+        // Empty if the picture was drawn earlier than the last one, with fewer keyframes.
         let new_keyframes = self.n_keyframes..picture.n_keyframes;
         let waits_since = std::mem::replace(&mut self.last_sent_at, picture.sent_at);
         self.n_keyframes = self.n_keyframes.max(picture.n_keyframes);
@@ -157,6 +154,7 @@ impl Stream {
     /// Removes a picture and those that were sent before it. Their new keyframes become those of
     /// the picture.
     fn take(&mut self, id: u64) -> Option<(SentPicture, Range<u64>)> {
+        // From the end, because a client may use a number again.
         let ix = self
             .pictures
             .iter()
@@ -167,6 +165,8 @@ impl Stream {
             new_keyframes,
             ..
         } = self.pictures.pop_front()?;
+        // The client has dropped the older pictures for newer ones, so its operator saw their
+        // keyframes only now. If the page was hidden for long, nobody waited for them.
         let waited = older
             .iter()
             .filter(|old| picture.sent_at - old.waits_since <= MAX_WAIT);

@@ -13,9 +13,11 @@ use tokio::sync::Notify;
 use trainer::Rendered;
 
 /// Maximum number of pictures per client that are being rendered or sent. It limits rendering for
-/// slow clients.
+/// slow clients. With one, the next picture would be rendered only after the last one was sent;
+/// with more, pictures are older when they arrive.
 const MAX_UNSENT: usize = 2;
-/// Memory that each client may use for these pictures, bytes. Any picture without f32 depth fits.
+/// Memory that each client may use for these pictures, bytes. Any picture without f32 depth fits:
+/// the largest, of 4096 x 4096 pixels, counts as exactly this much.
 const CLIENT_BYTES: usize = 16 << 20;
 /// Additional memory for larger pictures, bytes, shared by all clients of a role. Viewers and
 /// operators have separate shares, so that slow viewers do not delay operators.
@@ -25,10 +27,13 @@ const SHARED_BYTES: usize = 256 << 20;
 /// the reasons of further failed edits.
 const MAX_OUTBOX: usize = 64;
 
-/// Maximum number of views per client.
+/// Maximum number of views per client. The name of a view is text of the client, so without a
+/// limit, the list could grow forever.
 pub(crate) const MAX_VIEWS: usize = 8;
 
-/// If the full picture is expected to take less time than this, coarser stages are skipped.
+/// If the full picture is expected to take less time than this, coarser stages are skipped: they
+/// would be replaced before anybody sees them. At 30 pictures per second, a picture is shown for 33
+/// ms.
 const FAST_MILLIS: f64 = 30.0;
 
 /// All connected clients and their requests.
@@ -131,10 +136,12 @@ impl Queue {
     ///
     /// Only the last stage is kept if it is expected to be fast.
     pub(crate) fn view_request(&mut self, client: u64, mut view_request: ViewRequest) -> bool {
+        // The session is about to end, so an error would reach nobody.
         let Some(waiting) = self.clients.get_mut(&client) else {
             return true;
         };
         if !waiting.views.contains_key(&view_request.view) && waiting.views.len() >= MAX_VIEWS {
+            // An idle view is kept only for its render time.
             let idle = waiting
                 .views
                 .iter()
@@ -170,10 +177,9 @@ impl Queue {
     /// The next stage to render: clients in turn, the views of a client in turn, and the stages of
     /// a view in order.
     pub(crate) fn take(&mut self) -> Option<RenderJob> {
-        let (after, before) = (
-            self.clients.range(self.last_served + 1..),
-            self.clients.range(..=self.last_served),
-        );
+        // Numbers of clients only grow, so the next one in turn is the next larger number.
+        let after = self.clients.range(self.last_served + 1..);
+        let before = self.clients.range(..=self.last_served);
         let (client, name) = after
             .chain(before)
             .find_map(|(&id, waiting)| Some((id, self.next_view(waiting)?)))?;
@@ -188,6 +194,7 @@ impl Queue {
             .clients
             .values()
             .filter(|other| other.role == waiting.role);
+        // Clients need the shared memory only for what exceeds their own.
         let n_shared = same_role
             .map(|other| other.n_unsent_bytes().saturating_sub(CLIENT_BYTES))
             .sum();
@@ -201,13 +208,9 @@ impl Queue {
             .get_mut(&job.client)
             .and_then(|waiting| waiting.views.get_mut(&job.view_request.view));
         if let Some(view) = view {
-            let (method, n_px) = (
-                job.view_request.method.clone(),
-                n_px_of_last_stage(&job.view_request),
-            );
             view.last_full = Some(FullPicture {
-                method,
-                n_px,
+                method: job.view_request.method.clone(),
+                n_px: n_px_of_last_stage(&job.view_request),
                 millis,
             });
         }
@@ -242,6 +245,7 @@ impl Queue {
     /// Records that a stage was sent or will never be rendered.
     pub(crate) fn release(&mut self, client: u64) {
         if let Some(waiting) = self.clients.get_mut(&client) {
+            // Pictures are sent in the order in which they were taken, so this is the oldest.
             waiting.unsent.pop_front();
         }
     }
@@ -270,6 +274,8 @@ impl ClientQueue {
         if self.unsent.len() >= MAX_UNSENT {
             return None;
         }
+        // A picture that is larger than the client's memory must be the only one, so that a client
+        // cannot take all of the shared memory.
         let n_more = if self.unsent.is_empty() {
             n_shared_bytes
         } else {
@@ -278,6 +284,7 @@ impl ClientQueue {
         let n_free = (CLIENT_BYTES + n_more).saturating_sub(self.n_unsent_bytes());
         let last = Bound::Excluded(Arc::clone(&self.last_served));
         let after = self.views.range::<Arc<str>, _>((last, Bound::Unbounded));
+        // All views follow again, from the first to the last served one.
         let mut in_turn = after.chain(&self.views);
         let fits = |view: &ViewQueue| view.n_bytes_of_next().is_some_and(|n| n <= n_free);
         in_turn
@@ -287,6 +294,7 @@ impl ClientQueue {
 
     fn take(&mut self, client: u64, name: Arc<str>) -> Option<RenderJob> {
         let view = self.views.get_mut(&name)?;
+        // Counted before rendering, because the memory is needed from then on.
         self.unsent.push_back(view.n_bytes_of_next()?);
         let view_request = view.view_request.clone()?;
         let stage = view.next_stage;
@@ -314,15 +322,12 @@ impl ViewQueue {
             .size_px
             .map(|n| n as usize);
         let is_f32 = view_request.depth == Some(DepthFormat::F32);
-        Some(
-            width
-                * height
-                * if is_f32 {
-                    4 + 4 * usize::from(view_request.color)
-                } else {
-                    1
-                },
-        )
+        let n_bytes_per_px = if is_f32 {
+            4 + 4 * usize::from(view_request.color)
+        } else {
+            1
+        };
+        Some(width * height * n_bytes_per_px)
     }
 }
 
@@ -330,9 +335,12 @@ impl FullPicture {
     /// Expected render time of the last stage of a request: the time of the previous picture,
     /// scaled up if the request has more pixels.
     fn expected_millis(&self, view_request: &ViewRequest) -> f64 {
+        // Another model may be much slower, so the estimate would be meaningless.
         if self.method != view_request.method {
             return f64::INFINITY;
         }
+        // A picture with fewer pixels takes less time, but not in proportion: each picture has
+        // costs that do not depend on its size.
         self.millis * (n_px_of_last_stage(view_request) / self.n_px).max(1.0)
     }
 }

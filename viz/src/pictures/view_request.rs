@@ -7,9 +7,10 @@ use std::sync::Arc;
 use std::time::Instant;
 use trainer::{Aabb, Projection, RenderRequest};
 
-/// Maximum width and height that a client may request, pixels.
+/// Maximum width and height that a client may request, pixels. It covers the screens in use, and
+/// bounds the memory for a picture: 64 MiB of colors.
 pub(crate) const MAX_SIZE_PX: u32 = 4096;
-/// Maximum number of stages of a request.
+/// Maximum number of stages of a request. Each of them is a picture that must be rendered.
 const MAX_STAGES: usize = 8;
 /// Default stages: fractions of the full width and height, rendered in order.
 pub(crate) const DEFAULT_STAGES: [f64; 3] = [0.1, 0.5, 1.0];
@@ -116,6 +117,7 @@ impl ViewRequest {
         if outputs.is_empty() {
             return Err(InvalidRequest::NoOutput);
         }
+        // The size comes before everything that is computed from it.
         let size_px = checked_size(message.size_px)?;
         let (near_m, far_m) = checked_range(
             message.near_m.unwrap_or(DEFAULT_NEAR_M),
@@ -156,6 +158,8 @@ impl ViewRequest {
         let full = self.request.size_px.map(f64::from);
         let scale = self.stages[stage];
         let size_px = self.request.size_px.map(|n| scaled(n, scale));
+        // From the rounded size, which is not exactly `scale` times the full size. Otherwise, the
+        // stages would be shifted against each other by up to half a pixel.
         let ratio = [
             f64::from(size_px[0]) / full[0],
             f64::from(size_px[1]) / full[1],
@@ -209,6 +213,7 @@ fn checked_size(size_px: [u32; 2]) -> Result<[u32; 2], InvalidRequest> {
 }
 
 fn checked_range(near_m: f64, far_m: f64) -> Result<(f64, f64), InvalidRequest> {
+    // This check and those below are written so that NaN is rejected.
     let fits = near_m > 0.0 && near_m < far_m && far_m.is_finite();
     if fits {
         Ok((near_m, far_m))
@@ -240,9 +245,11 @@ fn checked_projection(
         return Ok(Projection::Equirectangular);
     };
     let [width, height] = size_px.map(f64::from);
+    // With both, they could contradict each other.
     let focal_px = match (focal_px, vertical_fov_rad) {
         (Some(focal_px), None) => focal_px,
         (None, Some(angle)) if angle > 0.0 && angle < std::f64::consts::PI => {
+            // Half the height is seen under half the angle. Pixels are square.
             [0.5 * height / (0.5 * angle).tan(); 2]
         }
         _ => return Err(InvalidRequest::Pinhole),
@@ -269,6 +276,7 @@ pub(crate) fn checked_box(
         Some(rows) => rigid(rows, "world_from_box")?,
         None => Transform::identity(),
     };
+    // The difference of two finite corners can be infinite.
     let fits = message
         .min_m
         .iter()

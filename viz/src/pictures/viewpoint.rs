@@ -17,6 +17,7 @@ pub(crate) struct Viewpoint {
 impl Viewpoint {
     /// The viewpoint of a request; `None` if it is for a named view or shows all directions.
     pub(crate) fn of(view_request: &ViewRequest) -> Option<Self> {
+        // Named views, such as the one in a corner, are not what the operator looks at most.
         let request = &view_request.request;
         if !view_request.view.is_empty() {
             return None;
@@ -28,16 +29,16 @@ impl Viewpoint {
         else {
             return None;
         };
-        let farthest = |axis: usize| {
+        // Tangents of the angles to the farther edge along x and y. A cone through the corner
+        // contains the whole picture, and is easier to test against than a pyramid.
+        let tangents = [0, 1].map(|axis| {
             let side = f64::from(request.size_px[axis]);
-            principal_px[axis]
-                .abs()
-                .max((side - principal_px[axis]).abs())
-                / focal_px[axis]
-        };
+            let principal = principal_px[axis];
+            principal.abs().max((side - principal).abs()) / focal_px[axis]
+        });
         Some(Self {
             camera_from_world: request.world_from_camera.inverse(),
-            half_angle_rad: farthest(0).hypot(farthest(1)).atan(),
+            half_angle_rad: tangents[0].hypot(tangents[1]).atan(),
         })
     }
 
@@ -47,7 +48,9 @@ impl Viewpoint {
         let (center, radius_m) = bounds(layout);
         let in_camera = (self.camera_from_world * world_from_model * center).coords;
         let distance_m = in_camera.norm();
+        // Inside the sphere, the angle to it is not defined.
         let is_around = distance_m <= radius_m;
+        // The sphere touches the cone if its center is outside by at most the angle of its radius.
         let is_in_view = is_around
             || in_camera.angle(&Vector3::z()) - (radius_m / distance_m).asin()
                 <= self.half_angle_rad;
@@ -57,6 +60,8 @@ impl Viewpoint {
 
 /// Center and radius of a sphere around a chunk, in the frame of the model.
 fn bounds(layout: &ChunkLayout) -> (Point3<f64>, f64) {
+    // A sphere does not depend on the direction of the camera, and chunks are about as wide as
+    // high.
     let [min, max] = match layout {
         ChunkLayout::Mesh {
             origin_m,

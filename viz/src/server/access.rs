@@ -5,7 +5,7 @@ use serde::Serialize;
 use std::net::IpAddr;
 use subtle::ConstantTimeEq;
 
-/// Length of a token, random bytes.
+/// Length of a token, random bytes: 128 bits cannot be guessed.
 const TOKEN_BYTES: usize = 16;
 /// The page keeps its token in a cookie whose name starts like this and ends in the port. Cookies
 /// do not distinguish ports, so a browser sends those of all servers of a computer.
@@ -81,7 +81,9 @@ impl Tokens {
     }
 
     fn role_of(&self, token: &str) -> Option<Role> {
-        let (is_operator, is_viewer) = (self.operator.is(token), self.viewer.is(token));
+        // Both comparisons are always made, so that the time does not reveal which one succeeded.
+        let is_operator = self.operator.is(token);
+        let is_viewer = self.viewer.is(token);
         if is_operator {
             Some(Role::Operator)
         } else {
@@ -128,10 +130,12 @@ impl Access {
         let host = text(header::HOST).ok_or(refusal)?;
         let has_same_origin = match headers.get(header::ORIGIN) {
             None => true, // Not a browser.
+            // An origin that is no text, or `null`, is foreign.
             Some(_) => {
                 text(header::ORIGIN).and_then(|origin| origin.strip_prefix(scheme)) == Some(host)
             }
         };
+        // A shared server has names that it does not know, such as those of a local name server.
         let is_known_host = matches!(self, Self::Tokens(_)) || is_loopback(host);
         if has_same_origin && is_known_host {
             Ok(())
@@ -145,6 +149,8 @@ impl Access {
         let Self::Tokens(tokens) = self else {
             return Ok(Role::Operator);
         };
+        // A browser sends the cookies of all servers of a computer. Any of them may be the right
+        // one.
         let mut refusal = Refusal::NoToken;
         for token in tokens_in(headers) {
             match tokens.role_of(token) {
@@ -158,6 +164,7 @@ impl Access {
 
 /// Whether a `Host` header names this computer.
 fn is_loopback(host: &str) -> bool {
+    // The last colon separates the port, unless it belongs to an IPv6 address without one.
     let name = host
         .rsplit_once(':')
         .filter(|(_, port)| port.parse::<u16>().is_ok())

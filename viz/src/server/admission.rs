@@ -16,18 +16,23 @@ use std::time::{Duration, Instant};
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio::net::TcpStream;
 
-/// Maximum number of open connections; lower if the limit on open files requires it.
+/// Maximum number of open connections; lower if the limit on open files requires it. A page needs
+/// one connection for the WebSocket, and a few for its files while it is loaded.
 const MAX_CONNECTIONS: usize = 256;
-/// Maximum number of WebSocket clients.
+/// Maximum number of WebSocket clients. Each one may use memory for pictures that are not sent yet:
+/// see `pictures/queue.rs`.
 const MAX_CLIENTS: usize = 32;
 /// The process may open this many files per connection: connections use at most a quarter of the
 /// limit.
 const DESCRIPTORS_PER_CONNECTION: usize = 4;
 /// A connection whose peer accepts no bytes for this long is closed.
 const WRITE_TIMEOUT: Duration = Duration::from_secs(5);
-/// An HTTP connection that has neither received a request nor sent data for this long is closed.
+/// An HTTP connection that has neither received a request nor sent data for this long is closed. It
+/// is longer than the time that the server waits for the next request, so it matters mostly
+/// for responses that make no progress.
 const IDLE_TIMEOUT: Duration = Duration::from_secs(10);
-/// A client that does not answer a ping within this time is disconnected.
+/// A client that does not answer a ping within this time is disconnected. It is longer than
+/// [`WRITE_TIMEOUT`], because the answer may wait behind data of a slow link.
 const PONG_TIMEOUT: Duration = Duration::from_secs(8);
 /// A client that has not answered a ping for this long may be replaced by a new one.
 const UNRESPONSIVE_AFTER: Duration = Duration::from_secs(1);
@@ -47,9 +52,11 @@ pub(crate) struct Limits {
 impl Limits {
     /// The limits of a process that may open this many files.
     pub(crate) fn of_descriptors(n_descriptors: usize) -> Self {
+        // Even with few descriptors, one page must be able to load its files.
         let connections = (n_descriptors / DESCRIPTORS_PER_CONNECTION).clamp(8, MAX_CONNECTIONS);
         Self {
             connections,
+            // Clients never take all connections, so the files of a page can always be loaded.
             clients: MAX_CLIENTS.min(connections / 2),
         }
     }
@@ -63,6 +70,7 @@ impl Limits {
 #[cfg(unix)]
 fn max_descriptors() -> usize {
     let limit = rustix::process::getrlimit(rustix::process::Resource::Nofile).current;
+    // `None` means that there is no limit.
     limit.map_or(usize::MAX, |limit| {
         usize::try_from(limit).unwrap_or(usize::MAX)
     })
@@ -151,9 +159,12 @@ impl Admission {
 
     /// Adds an accepted connection. Returns whether another one was closed to make room.
     pub(crate) fn admit(self: &Arc<Self>, stream: TcpStream) -> (GuardedStream, bool) {
+        // Unknown peers count as remote, which only costs compression.
         let is_loopback = stream
             .peer_addr()
             .is_ok_and(|peer| peer.ip().to_canonical().is_loopback());
+        // The evicted connection closes later, when its task notices. Until then, there may be one
+        // more connection than the limit.
         let has_evicted =
             self.registry().connections.len() >= self.limits.connections && self.evict();
         let mut registry = self.registry();
@@ -179,9 +190,12 @@ impl Admission {
         let registry = self.registry();
         let candidates = registry.connections.values().filter_map(|connection| {
             let state = connection.state();
+            // Clients are replaced only by other clients. Closed connections are about to leave.
             let is_candidate = !state.is_closed && state.client.is_none();
             is_candidate.then_some((state.requested.is_some(), state.idle_since(), connection))
         });
+        // Connections that have never sent a complete request come first: `false` is less than
+        // `true`.
         let oldest = candidates.min_by_key(|(has_requested, since, _)| (*has_requested, *since));
         oldest
             .inspect(|(.., connection)| connection.close("replaced by a new connection"))
@@ -199,13 +213,12 @@ impl Admission {
             .connections
             .values()
             .filter(|other| other.is_admitted());
-        let (mut n_admitted, mut most_dispensable): (
-            usize,
-            Option<(Dispensability, &Arc<Connection>)>,
-        ) = (0, None);
+        let mut n_admitted = 0;
+        let mut most_dispensable: Option<(Dispensability, &Arc<Connection>)> = None;
         let mut last_viewer: Option<(Instant, &Arc<Connection>)> = None;
         for other in admitted {
             n_admitted += 1;
+            // The viewer that came last loses its place, because those before it were there first.
             if let Some(since) = other.viewer_since()
                 && last_viewer.is_none_or(|(last, _)| since >= last)
             {
@@ -218,6 +231,7 @@ impl Admission {
             }
         }
         if n_admitted >= self.limits.clients {
+            // An inactive operator is replaced before an active viewer.
             let last_viewer = last_viewer.filter(|_| is_operator).map(|(_, other)| other);
             let Some(other) = most_dispensable.map(|(_, other)| other).or(last_viewer) else {
                 return false;
@@ -238,6 +252,7 @@ impl Admission {
     pub(crate) fn sweep(&self) {
         let now = Instant::now();
         for connection in self.registry().connections.values() {
+            // Closing only wakes up tasks: they remove the connection when this lock is free again.
             if let Some(reason) = connection.timeout_reason(now) {
                 connection.close(reason);
             }
@@ -299,17 +314,21 @@ impl Connection {
         let state = self.state();
         let client = state.client.as_ref();
         client.map_or(Duration::ZERO, |client| {
+            // A new client has the same time for its first message.
             client.last_message.unwrap_or(client.admitted).elapsed()
         })
     }
 
     /// Sets the size of the kernel's send buffer from the next write on.
     pub(crate) fn set_send_buffer(&self, n_bytes: usize) {
+        // The session does not have the socket: it is inside the WebSocket and TLS layers.
         self.send_buffer_bytes.store(n_bytes, Ordering::Relaxed);
     }
 
     /// Returns whether a ping is due. At most one ping is unanswered at a time.
     pub(crate) fn start_ping(&self) -> bool {
+        // The time of an unanswered ping stays that of the first one, so that the time-out is
+        // reached.
         match &mut self.state().client {
             Some(client) if client.pinged.is_none() => {
                 client.pinged = Some(Instant::now());
@@ -346,6 +365,7 @@ impl Connection {
     fn dispensability(&self, now: Instant) -> Option<Dispensability> {
         let state = self.state();
         let client = state.client.as_ref()?;
+        // A client does not react if it does not answer, or if the kernel can send it nothing.
         let stuck_for = [client.pinged, state.blocked_since]
             .into_iter()
             .flatten()
@@ -354,6 +374,8 @@ impl Connection {
         if let Some(stuck_for) = stuck_for.filter(|time| *time >= UNRESPONSIVE_AFTER) {
             return Some((2, stuck_for));
         }
+        // A page answers pings and sends messages. A program that does only one of both may be a
+        // socket that somebody has left open.
         match client.last_message.filter(|_| client.has_answered) {
             None => Some((1, now - client.admitted)),
             Some(last_message) if now - last_message >= IDLE_CLIENT_AFTER => {
@@ -371,6 +393,8 @@ impl Connection {
         if is_timed_out(state.blocked_since, WRITE_TIMEOUT) {
             return Some("its peer does not read");
         }
+        // A client may be silent as long as it answers, for example to watch without sending
+        // anything.
         match &state.client {
             Some(client) => {
                 is_timed_out(client.pinged, PONG_TIMEOUT).then_some("it does not answer pings")
@@ -388,6 +412,7 @@ impl Connection {
         }
         log::debug!("closed connection {}: {reason}", self.number);
         state.is_closed = true;
+        // Woken up after the lock is released, because the tasks take it at once.
         let wakers = [state.reader.take(), state.writer.take()];
         drop(state);
         wakers.into_iter().flatten().for_each(Waker::wake);
@@ -417,6 +442,7 @@ impl GuardedStream {
     pub(crate) async fn first_byte(&self) -> io::Result<u8> {
         let mut byte = [0];
         let n_bytes = poll_fn(|context| {
+            // Checked and registered under one lock, so that closing in between is not missed.
             let mut state = self.connection.state();
             if state.is_closed {
                 return Poll::Ready(Err(io::ErrorKind::ConnectionAborted.into()));
@@ -425,6 +451,7 @@ impl GuardedStream {
             self.stream.poll_peek(context, &mut ReadBuf::new(&mut byte))
         })
         .await?;
+        // The peer has closed the connection without sending anything.
         if n_bytes == 0 {
             Err(io::ErrorKind::UnexpectedEof.into())
         } else {
@@ -435,6 +462,7 @@ impl GuardedStream {
     /// Applies [`Connection::set_send_buffer`]. A failure affects only latency.
     #[cfg(unix)]
     fn resize_send_buffer(&self) {
+        // Taken out, so that the system call is made only after a change.
         let n_bytes = self.connection.send_buffer_bytes.swap(0, Ordering::Relaxed);
         if n_bytes == 0 {
             return;
@@ -462,11 +490,13 @@ impl GuardedStream {
         let mut state = self.connection.state();
         match &written {
             Poll::Pending => {
+                // The start of the whole blocked time: writes are polled again and again.
                 state.blocked_since.get_or_insert_with(Instant::now);
                 state.writer = Some(context.waker().clone());
             }
             Poll::Ready(result) => {
                 state.blocked_since = None;
+                // Shows that a download makes progress, even if no request follows.
                 if result.as_ref().is_ok_and(|n_bytes| *n_bytes > 0) {
                     state.written = Some(Instant::now());
                 }
@@ -487,6 +517,7 @@ impl AsyncRead for GuardedStream {
             return Poll::Ready(Err(io::ErrorKind::ConnectionAborted.into()));
         }
         let read = Pin::new(&mut self.stream).poll_read(context, buffer);
+        // Remembers whom to wake up if the connection is closed.
         if read.is_pending() {
             self.connection.state().reader = Some(context.waker().clone());
         }

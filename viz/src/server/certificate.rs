@@ -49,11 +49,14 @@ impl Certificate {
                 file: file.clone(),
                 reason: error.to_string(),
             })?;
+            // Several processes may start at the same time. The first file wins, and all of them
+            // read it.
             create(folder, &file, &pem).map_err(|source| Error::WriteCertificate {
                 file: file.clone(),
                 source,
             })?;
         }
+        // Stricter than for files of users: nobody else needs a key that this program has made.
         check_is_private(&file, GROUP_AND_OTHERS)?;
         Self::read(&file, &file)
     }
@@ -82,7 +85,7 @@ impl Certificate {
         let key = PrivateKeyDer::from_pem_slice(&read(key_file)?)
             .map_err(|error| failed(key_file, &error))?;
         let certificate = Self { chain, key };
-        // Detects a key of another certificate.
+        // Detects a key of another certificate now, and not only when the first client connects.
         certificate
             .server_config()
             .map_err(|error| failed(certificate_file, &error))?;
@@ -106,6 +109,7 @@ impl Certificate {
             .with_safe_default_protocol_versions()?
             .with_no_client_auth()
             .with_single_cert(self.chain.clone(), self.key.clone_key())?;
+        // WebSockets over HTTP/2 would need another handshake, so browsers must use HTTP/1.1.
         config.alpn_protocols = vec![b"http/1.1".to_vec()];
         Ok(Arc::new(config))
     }
@@ -113,6 +117,7 @@ impl Certificate {
 
 /// A new certificate for this computer and its private key.
 fn self_signed_pem(host_name: &str) -> Result<String, rcgen::Error> {
+    // Computers may have names that are invalid in certificates, for example with underscores.
     let is_dns_name = !host_name.is_empty()
         && host_name
             .chars()
@@ -123,6 +128,7 @@ fn self_signed_pem(host_name: &str) -> Result<String, rcgen::Error> {
         "::1".to_owned(),
     ];
     if is_dns_name {
+        // `.local` is the name in the local network (multicast DNS).
         names.extend([host_name.to_owned(), format!("{host_name}.local")]);
     }
     let mut params = CertificateParams::new(names)?;
@@ -156,10 +162,13 @@ fn create(folder: &Path, file: &Path, pem: &str) -> std::io::Result<()> {
     #[cfg(unix)]
     std::os::unix::fs::DirBuilderExt::mode(&mut builder, 0o700);
     builder.recursive(true).create(folder)?;
-    // Created with mode 0600.
+    // Created with mode 0600. The name appears only when the file is complete, because another
+    // process may read it at any time.
     let mut temporary = tempfile::NamedTempFile::new_in(folder)?;
     temporary.write_all(pem.as_bytes())?;
+    // Otherwise, a power failure could leave an empty file, which would have to be deleted by hand.
     temporary.as_file().sync_all()?;
+    // A browser may trust the existing file already, so it is never replaced.
     match temporary.persist_noclobber(file) {
         Err(error) if error.error.kind() != ErrorKind::AlreadyExists => Err(error.error),
         _ => Ok(()),

@@ -34,6 +34,7 @@ impl ClientLog {
     /// Logs a line, unless there were too many. The first line of the next period is preceded by
     /// the number of omitted lines.
     pub(crate) fn line(&self, text: Arguments<'_>) {
+        // The lock is released before logging, which may wait for a disk or a terminal.
         let (n_omitted, is_logged) = self.budget.lock().count(Instant::now());
         if n_omitted > 0 {
             log::info!(
@@ -59,6 +60,7 @@ impl Budget {
                 n_lines: 0,
             };
         }
+        // Lines that are left out count, too, because their number is logged.
         self.n_lines = self.n_lines.saturating_add(1);
         (n_omitted, self.n_lines <= MAX_LINES)
     }

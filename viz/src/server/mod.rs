@@ -39,7 +39,8 @@ use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::sync::watch;
 use tokio_rustls::TlsAcceptor;
 
-/// Maximum time that a stopping server waits until its clients have received the goodbye.
+/// Maximum time that a stopping server waits until its clients have received the goodbye. A client
+/// that does not read must not delay the end of the program for longer.
 const GOODBYE_TIMEOUT: Duration = Duration::from_millis(500);
 /// A connection is closed if the headers of a request take longer than this, or the next request
 /// arrives later than this.
@@ -48,7 +49,7 @@ const HEADER_TIMEOUT: Duration = Duration::from_secs(3);
 const MAX_REQUEST_BYTES: usize = 32 * 1024;
 /// Period of checking connections for timeouts.
 const SWEEP_PERIOD: Duration = Duration::from_millis(250);
-/// Pause after a failed accept.
+/// Pause after a failed accept, so that a permanent failure does not keep a processor busy.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(50);
 /// Size of the kernel's send buffer per connection, bytes; Linux doubles it. For slow clients, data
 /// in a larger buffer would only become outdated.
@@ -126,9 +127,12 @@ impl Server {
         access: Access,
         tls: Option<TlsAcceptor>,
     ) -> Result<Self, Error> {
+        // Here and not on the thread, so that errors are returned to the caller.
         let (listener, address) = listen(listen_address)?;
         let scheme = if tls.is_some() { "https" } else { "http" };
         let (stop, stopped) = watch::channel(false);
+        // One thread: sessions mostly wait, and everything that computes runs on threads for
+        // blocking tasks.
         let runtime = tokio::runtime::Builder::new_current_thread()
             .enable_all()
             .build()
@@ -165,6 +169,7 @@ impl Server {
 impl Drop for Server {
     fn drop(&mut self) {
         self.stop.send_replace(true);
+        // The port must be free, and the goodbyes sent, before the program ends.
         if self
             .thread
             .take()
@@ -197,7 +202,8 @@ async fn serve(
     set_socket_options(&listener);
     let listener = tokio::net::TcpListener::from_std(listener)?;
     let clock = ServerClock::start();
-    let (topics, publisher) = (topics::start_all(&hub), Publisher::default());
+    let topics = topics::start_all(&hub);
+    let publisher = Publisher::default();
     tokio::spawn(topics::encode_all(
         hub.clone(),
         clock,
@@ -224,6 +230,7 @@ async fn serve(
         () = sweep(&admission) => {}
         _ = stopped.changed() => {}
     }
+    // No new connections while the sessions say goodbye.
     drop(listener);
     let all_disconnected = async {
         while hub.n_clients() > 0 {
@@ -286,6 +293,7 @@ async fn accept(
                 if !is_failing {
                     log::warn!("cannot accept a connection: {error}");
                 }
+                // One warning per series of failures: it may last for hours.
                 is_failing = true;
                 admission.evict();
                 tokio::time::sleep(ACCEPT_PAUSE).await;
@@ -298,6 +306,7 @@ async fn accept(
 async fn sweep(admission: &Admission) {
     loop {
         tokio::time::sleep(SWEEP_PERIOD).await;
+        // One timer for all connections, instead of one for each read and write.
         admission.sweep();
     }
 }
@@ -324,6 +333,7 @@ where
     let service = hyper::service::service_fn(|request: hyper::Request<hyper::body::Incoming>| {
         connection.requested();
         let mut request = request.map(Body::new);
+        // The handler of the WebSocket needs it, to count the client.
         request.extensions_mut().insert(Arc::clone(&connection));
         app.call(request)
     });
@@ -353,13 +363,15 @@ fn router(app_state: AppState) -> Router {
         .route("/robot/{mesh}", get(robot_mesh))
         .route("/ws", get(connect))
         .route_layer(from_fn_with_state(app_state.clone(), require_token));
-    // The files of the page contain no data.
+    // The files of the page contain no data, and the page needs them before it can send the token:
+    // it reads it from the fragment of the address, which browsers do not send.
     for file in FILES {
         router = router.route(
             file.path,
             get(move |headers: HeaderMap| async move { file.response(&headers) }),
         );
     }
+    // The last layer is the outermost: refusals have the security headers, too.
     router
         .layer(from_fn_with_state(
             app_state.clone(),
@@ -408,6 +420,7 @@ async fn robot_mesh(
         )
             .into_response();
     };
+    // Meshes can have many megabytes. Hashing them on this thread would delay all sessions.
     let hashed = Arc::clone(&bytes);
     let etag = match tokio::task::spawn_blocking(move || etag(&hashed)).await {
         Ok(etag) => etag,
@@ -444,6 +457,7 @@ async fn connect(
     Extension(role): Extension<Role>,
     State(app_state): State<AppState>,
 ) -> Response {
+    // Before the upgrade, so that a refused client gets an HTTP status with a reason.
     if !app_state
         .admission
         .admit_client(&connection, role == Role::Operator)

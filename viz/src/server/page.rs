@@ -75,6 +75,8 @@ impl PageFile {
     /// The response to a GET request: the file, compressed if the client accepts it, or 304 if the
     /// client has this version.
     pub(crate) fn response(&self, request: &HeaderMap) -> Response {
+        // Browsers ask for every file each time, so that a page of an older version never talks to
+        // this server.
         let etag = self.etag();
         let shared: [(HeaderName, &str); 3] = [
             (header::ETAG, &etag),
@@ -101,6 +103,7 @@ impl PageFile {
     /// Checksum and size of the file, taken from the last bytes of its gzip form. The tag is weak
     /// because both encodings share it.
     fn etag(&self) -> String {
+        // A gzip file ends with the CRC-32 and the length of its content (RFC 1952, section 2.3.1).
         let trailer = &self.gzip[self.gzip.len() - 8..];
         let hex: String = trailer.iter().map(|byte| format!("{byte:02x}")).collect();
         format!("W/\"{hex}\"")
@@ -118,12 +121,14 @@ fn items(request: &HeaderMap, name: HeaderName) -> impl Iterator<Item = &str> {
 
 /// Whether the client already has the version of a file with this `ETag`.
 pub(crate) fn has_version(request: &HeaderMap, etag: &str) -> bool {
+    // The weak comparison of RFC 9110, section 13.1.2, ignores whether tags are weak.
     let opaque = |tag: &str| tag.trim_start_matches("W/").to_owned();
     items(request, header::IF_NONE_MATCH).any(|item| item == "*" || opaque(item) == opaque(etag))
 }
 
 fn accepts_gzip(request: &HeaderMap) -> bool {
     items(request, header::ACCEPT_ENCODING).any(|item| {
+        // A weight of 0 means that the coding is not acceptable (RFC 9110, section 12.4.2).
         let (coding, weight) = item.split_once(';').unwrap_or((item, ""));
         let is_excluded = weight
             .trim()

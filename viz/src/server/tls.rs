@@ -7,7 +7,8 @@ use tokio::io::AsyncWriteExt;
 use tokio_rustls::TlsAcceptor;
 use tokio_rustls::server::TlsStream;
 
-/// A connection is closed if its handshake takes longer than this.
+/// A connection is closed if its handshake takes longer than this. Until then, it takes one of the
+/// places for connections.
 const HANDSHAKE_TIMEOUT: Duration = Duration::from_secs(3);
 /// Encrypted data that may wait for the kernel, bytes: at most one record, so that little data
 /// becomes outdated there.
@@ -37,6 +38,8 @@ async fn handshake(
     acceptor: &TlsAcceptor,
     mut stream: GuardedStream,
 ) -> io::Result<TlsStream<GuardedStream>> {
+    // People often type the address without https. A TLS alert would only show that something
+    // failed.
     if stream.first_byte().await? != HANDSHAKE_RECORD {
         stream.write_all(TLS_REQUIRED).await?;
         stream.shutdown().await?;

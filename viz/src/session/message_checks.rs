@@ -123,17 +123,13 @@ fn check_subscription(subscriptions: &mut Subscriptions, message: SubscribeMessa
     let of_topics = TOPICS
         .iter()
         .filter_map(|row| subscriptions.period(row.name));
-    let periods = of_topics
+    let mut periods = of_topics
         .chain(images.period)
         .chain(chunks.map(|chunks| chunks.period));
     assert!(
         chunks.is_none_or(|chunks| chunks.method.len() <= 256 && chunks.max_bytes_per_sec >= 1e4)
     );
-    assert!(
-        periods
-            .into_iter()
-            .all(|period| period.as_secs_f64() >= 0.999 / MAX_RATE_HZ)
-    );
+    assert!(periods.all(|period| period.as_secs_f64() >= 0.999 / MAX_RATE_HZ));
     for size_px in [[640, 480], [1, 4000], [4096, 1]] {
         let fitted = fitted(size_px, images.max_px);
         assert!(

@@ -22,7 +22,10 @@ use crate::server::client_log::ClientLog;
 use crate::server::server_context::ServerContext;
 use crate::session::link_rate::LinkRate;
 use crate::session::negotiation::{Negotiated, negotiate};
-use crate::session::protocol::{ClientMessage, ControlMessage, ShownMessage, SubscribeMessage};
+use crate::session::protocol::{
+    ClientHello, ClientMessage, ControlMessage, EditMessage, RenderMessage, ShownMessage,
+    SubscribeMessage,
+};
 use crate::session::writer::{Reply, Writer};
 use axum::extract::ws::{Message, WebSocket};
 use futures_util::StreamExt;
@@ -33,9 +36,10 @@ use std::time::{Duration, Instant};
 use tokio::sync::{mpsc, watch};
 
 /// Maximum number of replies that wait to be sent. Further messages of the client are read only
-/// when there is room.
+/// when there is room, so that a client that sends without reading cannot fill the memory.
 const MAX_REPLIES: usize = 64;
-/// A client that leaves [`MAX_REPLIES`] replies unread for this long is disconnected.
+/// A client that leaves [`MAX_REPLIES`] replies unread for this long is disconnected. With less
+/// time, a slow link that is busy with a picture would be taken for such a client.
 const MAX_REPLY_WAIT: Duration = Duration::from_secs(2);
 /// After a goodbye, the connection stays open until the client closes it, but at most for this
 /// time. If it were closed while something from the client is unread, the kernel would reset it and
@@ -49,6 +53,8 @@ pub(crate) async fn serve(
     role: Role,
     server_context: ServerContext,
 ) {
+    // From here on, the guard removes the client even if this task is dropped, as when the server
+    // stops.
     let (client, wake) = server_context.hub.join(role);
     let client_guard = ClientGuard {
         hub: &server_context.hub,
@@ -82,6 +88,8 @@ pub(crate) async fn serve(
         link,
         part_sent: Instant::now(),
     };
+    // Both run in one task, and neither waits for the other: a client can request another view
+    // while a picture is being sent.
     let mut reading = std::pin::pin!(reader.run());
     tokio::select! {
         () = &mut reading => {}
@@ -90,6 +98,7 @@ pub(crate) async fn serve(
             let _ = tokio::time::timeout(LINGER, reading).await;
         }
     }
+    // Before the log entry, so that the client is gone when somebody reads it.
     drop(client_guard);
     log.line(format_args!("client {client} disconnected"));
 }
@@ -130,6 +139,7 @@ impl Reader<'_> {
                     self.connection.record_pong();
                     continue;
                 }
+                // The WebSocket library answers them.
                 Message::Ping(_) => continue,
                 Message::Text(text) => self.answer(&text).unwrap_or_else(|error| {
                     Some(Reply::Error {
@@ -142,6 +152,7 @@ impl Reader<'_> {
                     message: "binary messages are not supported, send JSON as text".to_owned(),
                 }),
             };
+            // Even an invalid message shows that the client is alive.
             self.connection.last_message();
             let Some(reply) = reply else { continue };
             let is_last = matches!(reply, Reply::Goodbye { .. });
@@ -156,6 +167,7 @@ impl Reader<'_> {
                     ));
                     return;
                 }
+                // The writer has ended in the meantime.
                 Ok(Err(_)) => return self.discard().await,
             }
         }
@@ -171,87 +183,101 @@ impl Reader<'_> {
         }
     }
 
+    /// Handles a message. Returns the reply, if there is one.
     fn answer(&self, text: &str) -> Result<Option<Reply>, InvalidRequest> {
         let message: ClientMessage = serde_json::from_str(text)?;
+        // Here and not in the handlers, so that no message is forgotten.
         if self.role < message.required_role() {
             return Err(InvalidRequest::NotOperator);
         }
-        Ok(match message {
-            ClientMessage::Hello(hello) => Some(match negotiate(&hello) {
-                Ok(agreement) => {
-                    let has_keyframe_changes = agreement.negotiated.has_keyframe_changes;
-                    self.change_demand(|demand| {
-                        demand.has_hello = true;
-                        demand.has_keyframe_changes = has_keyframe_changes;
-                    });
-                    Reply::Welcome(agreement)
-                }
-                Err(reason) => Reply::Goodbye { reason },
-            }),
-            ClientMessage::Render(message) => {
-                let view_request = ViewRequest::check(&message)?;
-                if let Some(viewpoint) = Viewpoint::of(&view_request) {
-                    self.demand
-                        .send_modify(|demand| demand.viewpoint = Some(viewpoint));
-                }
-                if !self.hub.view_request(self.client, view_request) {
-                    return Err(InvalidRequest::Views { max: MAX_VIEWS });
-                }
-                None
-            }
-            ClientMessage::Subscribe(message) => {
-                self.subscribe(message)?;
-                None
-            }
+        match message {
+            ClientMessage::Hello(hello) => return Ok(Some(self.hello(&hello))),
+            ClientMessage::Render(message) => self.render(&message)?,
+            ClientMessage::Subscribe(message) => self.subscribe(message)?,
             ClientMessage::Control(ControlMessage { action }) => {
                 self.log
                     .line(format_args!("client {}: {action:?}", self.client));
                 self.hub.control(action);
-                None
             }
-            ClientMessage::Shown(ShownMessage {
-                id,
-                view,
-                shown_millis,
-            }) => {
-                let shown_at = self.clock.instant(shown_millis);
-                let shown_at = shown_at.ok_or(InvalidRequest::ShownTime { got: shown_millis })?;
-                self.hub.picture_shown(
-                    self.client,
-                    id,
-                    view.as_deref().unwrap_or_default(),
-                    shown_at,
-                );
-                None
+            ClientMessage::Shown(message) => self.shown(&message)?,
+            ClientMessage::Edit(message) => self.edit(&message)?,
+            ClientMessage::Ping(ping) => return Ok(Some(Reply::Pong { t: ping.t })),
+            ClientMessage::Goodbye(_) => {
+                let reason = "the client disconnected".to_owned();
+                return Ok(Some(Reply::Goodbye { reason }));
             }
-            ClientMessage::Edit(message) => {
-                let request = EditRequest::check(self.client, &message)?;
-                self.log.line(format_args!(
-                    "client {}: edit: {}",
-                    self.client,
-                    request.action()
-                ));
-                if !self.hub.edit(request) {
-                    return Err(InvalidRequest::Edits {
-                        max: MAX_WAITING_EDITS,
-                    });
-                }
-                None
+        }
+        Ok(None)
+    }
+
+    fn hello(&self, hello: &ClientHello) -> Reply {
+        match negotiate(hello) {
+            Ok(agreement) => {
+                let has_keyframe_changes = agreement.negotiated.has_keyframe_changes;
+                self.change_demand(|demand| {
+                    demand.has_hello = true;
+                    demand.has_keyframe_changes = has_keyframe_changes;
+                });
+                Reply::Welcome(agreement)
             }
-            ClientMessage::Ping(ping) => Some(Reply::Pong { t: ping.t }),
-            ClientMessage::Goodbye(_) => Some(Reply::Goodbye {
-                reason: "the client disconnected".to_owned(),
-            }),
-        })
+            Err(reason) => Reply::Goodbye { reason },
+        }
+    }
+
+    fn render(&self, message: &RenderMessage) -> Result<(), InvalidRequest> {
+        let view_request = ViewRequest::check(message)?;
+        if let Some(viewpoint) = Viewpoint::of(&view_request) {
+            // Only the writer of this session needs it, so the hub is not informed: views change
+            // many times per second.
+            self.demand
+                .send_modify(|demand| demand.viewpoint = Some(viewpoint));
+        }
+        if !self.hub.view_request(self.client, view_request) {
+            return Err(InvalidRequest::Views { max: MAX_VIEWS });
+        }
+        Ok(())
+    }
+
+    fn shown(&self, message: &ShownMessage) -> Result<(), InvalidRequest> {
+        let ShownMessage {
+            id,
+            view,
+            shown_millis,
+        } = message;
+        let shown_at = self
+            .clock
+            .instant(*shown_millis)
+            .ok_or(InvalidRequest::ShownTime { got: *shown_millis })?;
+        let view = view.as_deref().unwrap_or_default();
+        self.hub.picture_shown(self.client, *id, view, shown_at);
+        Ok(())
+    }
+
+    fn edit(&self, message: &EditMessage) -> Result<(), InvalidRequest> {
+        let request = EditRequest::check(self.client, message)?;
+        // Edits change what everybody sees, so the log says who made them.
+        self.log.line(format_args!(
+            "client {}: edit: {}",
+            self.client,
+            request.action()
+        ));
+        if !self.hub.edit(request) {
+            return Err(InvalidRequest::Edits {
+                max: MAX_WAITING_EDITS,
+            });
+        }
+        Ok(())
     }
 
     fn subscribe(&self, message: SubscribeMessage) -> Result<(), InvalidRequest> {
+        // A changed copy, because other threads may be reading the present subscriptions.
         let mut subscriptions = (*self.demand.borrow().subscriptions).clone();
         subscriptions.apply(message)?;
         self.change_demand(|demand| demand.subscriptions = Arc::new(subscriptions));
         Ok(())
     }
 
+    /// Changes what the client receives, for the writer of this session and for the hub.
     fn change_demand(&self, change: impl FnOnce(&mut Demand)) {
         self.demand.send_modify(change);
         self.hub
@@ -261,6 +287,7 @@ impl Reader<'_> {
 
 /// The id in a message that is otherwise invalid, so that the sender can identify it.
 fn id_of(text: &str) -> Option<u64> {
+    // Unlike the messages, this type ignores all other fields.
     #[derive(Deserialize)]
     struct Numbered {
         id: u64,

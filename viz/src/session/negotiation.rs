@@ -65,6 +65,8 @@ pub(crate) fn negotiate(hello: &ClientHello) -> Result<Agreement, String> {
             );
         }
     };
+    // The newest version of the one that is older. It must not be older than what the other one
+    // supports.
     let protocol = newest.min(PROTOCOL_VERSION);
     if protocol < oldest.max(BASE_PROTOCOL_VERSION) {
         let client = if oldest == newest {
@@ -82,6 +84,7 @@ pub(crate) fn negotiate(hello: &ClientHello) -> Result<Agreement, String> {
              {outdated}"
         ));
     }
+    // In the order of the server, each name once, whatever the client sends.
     let names: Vec<_> = CAPABILITIES
         .into_iter()
         .filter(|name| hello.capabilities.iter().any(|wanted| wanted == name))

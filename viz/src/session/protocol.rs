@@ -10,13 +10,16 @@ pub const PROTOCOL_VERSION: u32 = 4;
 /// oldest version that the server supports.
 pub const BASE_PROTOCOL_VERSION: u32 = 3;
 
-/// Maximum length of a client's text message, bytes.
+/// Maximum length of a client's text message, bytes. The longest ones, render requests, have about
+/// 1 kB.
 pub(crate) const MAX_MESSAGE_BYTES: usize = 64 * 1024;
 
-/// Maximum rate that clients can subscribe to.
+/// Maximum rate that clients can subscribe to. It limits the work that a single client can cause.
 pub(crate) const MAX_RATE_HZ: f64 = 100.0;
 
-/// Maximum number of keyframes in a `keyframe_changes` message.
+/// Maximum number of keyframes in a `keyframe_changes` message. Text messages are not split into
+/// parts, so their length limits how long urgent messages wait: 32 keyframes have about 20 kB. With
+/// fewer, a long list takes more messages.
 pub(crate) const MAX_CHANGED_KEYFRAMES: usize = 32;
 
 /// Messages from clients.
@@ -45,6 +48,7 @@ impl ClientMessage {
     /// The role that a client needs to send this message. Whatever changes the run requires an
     /// operator.
     pub(crate) fn required_role(&self) -> Role {
+        // Without a wildcard, so that the compiler asks for the role of every new message.
         match self {
             Self::Hello(_)
             | Self::Render(_)

@@ -267,6 +267,7 @@ pub(crate) struct LiveHeader<'a> {
 impl<'a> LiveHeader<'a> {
     /// The header of an image that is sent at `size_px`.
     pub(crate) fn new(image: &'a LiveImage, size_px: [u32; 2], clock: ServerClock) -> Self {
+        // The page computes with the intrinsics of the image that it gets.
         let scale = [0, 1].map(|axis| f64::from(size_px[axis]) / f64::from(image.size_px[axis]));
         let scaled = |values: [f64; 2]| [values[0] * scale[0], values[1] * scale[1]];
         Self {
@@ -297,6 +298,7 @@ impl ServerMessage<'_> {
 
 /// A binary message: header length as little-endian u32, JSON header, payload.
 pub(crate) fn frame(header: &BinaryHeader<'_>, payload: &[&[u8]]) -> Vec<u8> {
+    // The length comes first, because the end of JSON cannot be found without parsing it.
     let header = serde_json::to_vec(header).expect("these types hold only strings and numbers");
     let n_header = u32::try_from(header.len()).expect("a header has some hundred bytes");
     let n_payload: usize = payload.iter().map(|part| part.len()).sum();

@@ -19,7 +19,8 @@ use crate::session::protocol::{BASE_PROTOCOL_VERSION, PROTOCOL_VERSION};
 use crate::session::server_message::{BinaryHeader, PartHeader, ServerMessage, frame};
 use crate::topics::client_updates::{ClientUpdates, Next};
 use crate::topics::items::ItemTopic;
-use crate::topics::robot::{Description, RobotState, RobotStateMessage};
+use crate::topics::robot::{RobotState, RobotStateMessage};
+use crate::topics::robot_state::Description;
 use axum::body::Bytes;
 use axum::extract::ws::{Message, WebSocket};
 use futures_util::SinkExt;
@@ -31,15 +32,18 @@ use tokio::sync::{Notify, mpsc, watch};
 use tokio::task::{JoinError, JoinHandle};
 use tokio::time::MissedTickBehavior;
 
-/// Period of heartbeats; short enough for pages to detect silence quickly.
+/// Period of heartbeats; short enough for pages to detect silence quickly. The page shows a problem
+/// after 0.8 s without a message, so that two heartbeats may be late.
 const HEARTBEAT_PERIOD: Duration = Duration::from_millis(250);
 /// Period of WebSocket pings. The next one is sent only if the last one was answered.
 const PING_PERIOD: Duration = Duration::from_secs(1);
 /// Pictures take precedence over live images and keyframe lists, but delay them by at most this
-/// time.
+/// time. With a longer time, camera images look stuck while the operator moves the view, which
+/// requests pictures back to back.
 const MAX_UPDATE_DELAY: Duration = Duration::from_millis(500);
 /// A client with the capability `heartbeat` that has been silent for longer gets no pictures,
-/// images and robot states: they would be outdated when the connection works again.
+/// images and robot states: they would be outdated when the connection works again. The page sends
+/// a message every 500 ms, so this is four of its periods.
 const MAX_SILENCE: Duration = Duration::from_secs(2);
 
 /// A message that the reader asks the writer to send.
@@ -81,6 +85,27 @@ struct Transfer {
     is_picture: bool,
 }
 
+/// The binary message that is being sent, and how many there were.
+#[derive(Default)]
+struct Transfers {
+    current: Option<Transfer>,
+    n_started: u64,
+}
+
+impl Transfers {
+    /// Begins to send a message.
+    fn start(&mut self, bytes: Bytes, is_picture: bool) {
+        // Parts carry the number, so that a client does not join parts of different messages.
+        self.n_started += 1;
+        self.current = Some(Transfer {
+            number: self.n_started,
+            bytes,
+            n_sent: 0,
+            is_picture,
+        });
+    }
+}
+
 /// An encoded picture, or the reason why there is none.
 type EncodingResult = Result<Result<PackedPicture, PackError>, JoinError>;
 
@@ -102,54 +127,38 @@ impl Writer<'_> {
             .hub
             .latest::<Option<Arc<RobotState>>>()
             .subscribe();
+        // A state from before the connection is as good as a new one.
         robot_state.mark_changed();
         let mut robot_state_sent: Option<Instant> = None;
         let mut updates = ClientUpdates::new(&self.server_context.topics);
         let mut long_update_sent = Instant::now();
+        // The next message of the topics, and whether it is long.
         let mut waiting_update: Option<(Message, bool)> = None;
         let mut encoding: Option<EncodingTask> = None;
-        let mut transfer: Option<Transfer> = None;
-        let mut n_transfers = 0;
-        let mut start_transfer = |bytes: Bytes, is_picture| {
-            n_transfers += 1;
-            Some(Transfer {
-                number: n_transfers,
-                bytes,
-                n_sent: 0,
-                is_picture,
-            })
-        };
+        let mut transfers = Transfers::default();
         let mut heartbeat = tokio::time::interval(HEARTBEAT_PERIOD);
         let mut ping = tokio::time::interval(PING_PERIOD);
+        // If the client reads slowly, ticks are missed. Sending them all at once would say nothing.
         heartbeat.set_missed_tick_behavior(MissedTickBehavior::Delay);
         ping.set_missed_tick_behavior(MissedTickBehavior::Delay);
         self.send_hello().await?;
         loop {
+            // A client without heartbeats may be silent for any time.
             let is_heard =
                 !self.negotiated.has_heartbeat || self.connection.silence() <= MAX_SILENCE;
+            // One picture is encoded while the one before it is sent. If more were encoded in
+            // advance, they would be outdated when it is their turn.
             if encoding.is_none()
                 && is_heard
                 && let Some(outgoing) = self.server_context.hub.collect(self.client)
             {
-                match outgoing {
-                    Outgoing::Picture(drawn) => {
-                        encoding = Some(encode(
-                            drawn,
-                            self.link.effort(self.connection.is_loopback()),
-                        ))
-                    }
-                    Outgoing::Failed { id, view, reason } => {
-                        let sent = self.send_error(Some(id), &view, &reason).await;
-                        self.server_context.hub.release(self.client);
-                        sent?;
-                        continue;
-                    }
-                    Outgoing::Rejected { id, reason } => {
-                        self.send_error(id, "", &reason).await?;
-                        continue;
-                    }
+                encoding = self.begin(outgoing).await?;
+                if encoding.is_none() {
+                    // It was an error, which has been sent. There may be more results.
+                    continue;
                 }
             }
+            // The client may have subscribed, or moved its view, since the last round.
             let (subscriptions, settles_at) = {
                 let demand = demand.borrow_and_update();
                 updates.viewpoint = demand.viewpoint;
@@ -159,11 +168,15 @@ impl Writer<'_> {
                 )
             };
             let mut update_due = settles_at;
+            // Long messages wait until the client has said which ones it wants, and until nothing
+            // else is being sent. A picture that is being encoded comes first, but not forever: on
+            // a slow machine, there is always one.
             let allows_long = is_heard
                 && settles_at.is_none()
-                && transfer.is_none()
+                && transfers.current.is_none()
                 && (encoding.is_none() || long_update_sent.elapsed() > MAX_UPDATE_DELAY);
             if waiting_update.is_none() {
+                // Before looking: a message that is published in between wakes up the loop again.
                 published.mark_unchanged();
                 let has_changes = self.negotiated.has_keyframe_changes;
                 match updates.next(&subscriptions, has_changes, Instant::now(), allows_long) {
@@ -176,7 +189,8 @@ impl Writer<'_> {
                 }
             }
             let is_waiting_long = waiting_update.as_ref().map(|(_, is_long)| *is_long);
-            // A waiting short message may be the robot, which comes before its states.
+            // States need the description of the robot, and a waiting short message may be a new
+            // one.
             let state_period = subscriptions.period(Description::NAME);
             let state_due = state_period
                 .filter(|_| {
@@ -189,7 +203,10 @@ impl Writer<'_> {
                         .and_then(|sent| sent.checked_add(period))
                         .unwrap_or_else(Instant::now)
                 });
+            let is_sending = transfers.current.is_some();
             tokio::select! {
+                // In this order, because each branch is more urgent than the next. All of them can
+                // be dropped while they wait, so nothing is lost if another one is chosen.
                 biased;
                 _ = stopped.changed() => return self.send_goodbye_when_stopped().await,
                 Some(reply) = replies.recv() => self.reply(reply).await?,
@@ -213,43 +230,70 @@ impl Writer<'_> {
                         self.send(message).await?;
                     }
                 }
-                () = std::future::ready(()), if transfer.is_some() && is_heard => {
-                    if let Some(mut current) = transfer.take() {
+                () = std::future::ready(()), if is_sending && is_heard => {
+                    if let Some(mut current) = transfers.current.take() {
+                        // One part, and then everything above has its turn again.
                         let sent = self.send_part(&mut current).await;
                         let is_complete = current.n_sent == current.bytes.len();
+                        // The run may now render the next picture for this client.
                         if current.is_picture && (is_complete || sent.is_break()) {
                             self.server_context.hub.release(self.client);
                         }
                         sent?;
-                        transfer = (!is_complete).then_some(current);
+                        transfers.current = (!is_complete).then_some(current);
                     }
                 }
-                () = std::future::ready(()), if is_waiting_long == Some(true) && transfer.is_none() => {
+                () = std::future::ready(()), if is_waiting_long == Some(true) && !is_sending => {
                     long_update_sent = Instant::now();
                     match waiting_update.take() {
-                        Some((Message::Binary(bytes), _)) => transfer = start_transfer(bytes, false),
+                        Some((Message::Binary(bytes), _)) => transfers.start(bytes, false),
+                        // Texts have no parts. Long lists come in several messages instead.
                         Some((message, _)) => self.send(message).await?,
                         None => {}
                     }
                 }
-                encoded = finished(&mut encoding), if transfer.is_none() => {
+                // The encoded picture waits in its task until the last message is complete.
+                encoded = finished(&mut encoding), if !is_sending => {
                     let Some(EncodingTask { id, view, .. }) = encoding.take() else { continue };
                     let reason = match encoded {
                         Ok(Ok(packed)) => {
-                            transfer = start_transfer(self.message_of(packed).into(), true);
+                            transfers.start(self.message_of(packed).into(), true);
                             continue;
                         }
                         Ok(Err(error)) => error.to_string(),
+                        // The task panicked. The client must not wait for the picture forever.
                         Err(error) => error.to_string(),
                     };
                     let sent = self.send_error(Some(id), &view, &reason).await;
                     self.server_context.hub.release(self.client);
                     sent?;
                 }
+                // The branches below only begin the next round.
                 () = wake.notified(), if encoding.is_none() => {}
                 _ = published.changed(), if waiting_update.is_none() => {}
                 _ = demand.changed() => {}
                 () = sleep_until(update_due) => {}
+            }
+        }
+    }
+
+    /// Begins to encode a picture, or sends the reason why there is none.
+    async fn begin(&mut self, outgoing: Outgoing) -> ControlFlow<(), Option<EncodingTask>> {
+        match outgoing {
+            Outgoing::Picture(drawn) => {
+                let effort = self.link.effort(self.connection.is_loopback());
+                ControlFlow::Continue(Some(encode(drawn, effort)))
+            }
+            Outgoing::Failed { id, view, reason } => {
+                let sent = self.send_error(Some(id), &view, &reason).await;
+                // Even if the connection is broken: the place of the picture must become free.
+                self.server_context.hub.release(self.client);
+                sent?;
+                ControlFlow::Continue(None)
+            }
+            Outgoing::Rejected { id, reason } => {
+                self.send_error(id, "", &reason).await?;
+                ControlFlow::Continue(None)
             }
         }
     }
@@ -259,20 +303,15 @@ impl Writer<'_> {
         let sent_at = Instant::now();
         let message = packed.message(sent_at, self.server_context.clock);
         let request = &packed.job.view_request;
-        // Depth alone shows no keyframes.
+        // Only complete pictures count as shown. Depth alone shows no keyframes.
         if let Some(trained_on) = packed
             .trained_on
             .filter(|_| packed.header.last && request.color)
         {
-            let (id, view, method) = (
-                request.id,
-                Arc::clone(&request.view),
-                request.method.clone(),
-            );
             let picture = SentPicture {
-                id,
-                view,
-                method,
+                id: request.id,
+                view: Arc::clone(&request.view),
+                method: request.method.clone(),
                 n_keyframes: trained_on.n,
                 sent_at,
             };
@@ -303,6 +342,7 @@ impl Writer<'_> {
                 names,
                 negotiated,
             }) => {
+                // Before the reply: the client may rely on it as soon as it has received the reply.
                 self.negotiated = negotiated;
                 self.send_message(&ServerMessage::Welcome {
                     protocol,
@@ -312,6 +352,8 @@ impl Writer<'_> {
             }
             Reply::Error { id, message } => self.send_error(id, "", &message).await,
             Reply::Pong { t } => {
+                // The clock is read when the reply is sent, which may have waited. Clients use the
+                // reply with the smallest difference to their own clock.
                 let clock_millis = self.server_context.clock.now_millis();
                 self.send_message(&ServerMessage::Pong { t, clock_millis })
                     .await
@@ -330,6 +372,7 @@ impl Writer<'_> {
         };
         let begin = transfer.n_sent;
         let end = n_bytes.min(begin.saturating_add(n_part));
+        // A message that fits into one part needs no header.
         let message = if begin == 0 && end == n_bytes {
             Message::Binary(transfer.bytes.clone())
         } else {
@@ -343,12 +386,15 @@ impl Writer<'_> {
                 &[&transfer.bytes[begin..end]],
             ))
         };
+        // Sending ends when the kernel has accepted the part. If its buffer is full, that takes as
+        // long as the link needs for a part.
         let began = Instant::now();
         let pause = began - self.part_sent;
         self.send(message).await?;
         self.part_sent = Instant::now();
         self.link
             .observe(end - begin, self.part_sent - began, pause);
+        // The buffer holds what cannot be replaced by newer data any more.
         self.connection.set_send_buffer(self.link.buffer_bytes());
         transfer.n_sent = end;
         ControlFlow::Continue(())
@@ -373,6 +419,7 @@ impl Writer<'_> {
         self.send_message(&ServerMessage::Goodbye { reason })
             .await?;
         self.send(Message::Close(None)).await?;
+        // The session ends. The reader waits until the client has received the goodbye.
         ControlFlow::Break(())
     }
 
@@ -384,6 +431,7 @@ impl Writer<'_> {
         match self.sink.send(message).await {
             Ok(()) => ControlFlow::Continue(()),
             Err(error) => {
+                // Usual when a page is closed, so this is no warning.
                 log::debug!("client {}: {error}", self.client);
                 ControlFlow::Break(())
             }
@@ -391,9 +439,11 @@ impl Writer<'_> {
     }
 }
 
+/// Encodes a picture on another thread: it takes milliseconds, in which no session could send.
 fn encode(drawn: Box<DrawnPicture>, effort: Option<Effort>) -> EncodingTask {
     let view_request = &drawn.job.view_request;
-    let (id, view) = (view_request.id, Arc::clone(&view_request.view));
+    let id = view_request.id;
+    let view = Arc::clone(&view_request.view);
     let task = tokio::task::spawn_blocking(move || pack_picture(*drawn, effort));
     EncodingTask { id, view, task }
 }

@@ -9,9 +9,11 @@ use nalgebra::Vector3;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-/// Maximum number of points; beyond it, every second point is removed.
+/// Maximum number of points; beyond it, every second point is removed. The whole path is sent after
+/// every change. With 512 points, the message has about 12 kB, at most twice a second.
 const MAX_POINTS: usize = 512;
-/// Minimum distance of two points at first, meters.
+/// Minimum distance of two points at first, meters. A base at rest, whose position is measured with
+/// noise below this distance, adds no points.
 const INITIAL_SPACING_M: f64 = 0.02;
 /// Maximum time between two positions on the path.
 const POSITION_PERIOD: Duration = Duration::from_millis(100);
@@ -69,12 +71,16 @@ impl BasePath {
         {
             return false;
         }
+        // The length of a run is not known in advance. Halving the resolution keeps the whole path,
+        // while removing the oldest points would lose its beginning.
         if self.points_m.len() == MAX_POINTS {
             let mut ix = 0;
+            // Keeps the points with even indices, and thus the start of the path.
             self.points_m.retain(|_| {
                 ix += 1;
                 ix % 2 == 1
             });
+            // Otherwise, the new part of the path would be denser than the old one.
             self.spacing_m *= 2.0;
         }
         self.points_m.push(position_m);

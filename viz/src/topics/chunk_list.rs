@@ -31,10 +31,13 @@ impl ChunkList {
     /// Applies new chunks. Returns false if they only contain changes, but the list is empty, so
     /// that the chunks that have not changed are missing.
     pub(crate) fn apply(&mut self, new: ModelChunks) -> bool {
+        // The list was dropped while the changes were computed, because no client drew the model
+        // for a moment.
         if !new.is_complete && self.version == 0 {
             return false;
         }
         self.version += 1;
+        // A complete list may lack chunks without naming them as removed.
         let before = if new.is_complete {
             std::mem::take(&mut self.chunks)
         } else {
@@ -44,6 +47,8 @@ impl ChunkList {
             self.chunks.remove(&id);
         }
         for chunk in new.chunks {
+            // The sum continues across complete lists, so that clients receive only what has
+            // changed. NaN counts as no change, because `max` returns the other number.
             let last = before.get(&chunk.id).or_else(|| self.chunks.get(&chunk.id));
             let total_change = last.map_or(0.0, |last| last.total_change) + chunk.change.max(0.0);
             let versioned = VersionedChunk {

@@ -12,9 +12,11 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-/// Unused budget is saved for at most this time, seconds.
+/// Unused budget is saved for at most this time, seconds. With a longer time, a pause of training
+/// is followed by a longer burst, which delays pictures on slow links.
 const MAX_SAVED_SECS: f64 = 0.1;
-/// New chunks may exceed the budget. Changes make up for at most this time, seconds.
+/// New chunks may exceed the budget. Changes make up for at most this time, seconds. Without a
+/// maximum, a large model would get no changes for a long time after it was sent completely.
 const MAX_DEBT_SECS: f64 = 1.0;
 
 /// What a client has of a model.
@@ -58,60 +60,76 @@ impl ChunkSender {
         now: Instant,
     ) -> NextChunk {
         if subscription.number != self.n_subscriptions {
+            // It may be for another model, or the client may have discarded its chunks.
             *self = Self {
                 n_subscriptions: subscription.number,
                 ..Self::default()
             };
         }
         self.refill(subscription.max_bytes_per_sec, now);
-        let unsent = |chunk: &&Arc<VersionedChunk>| !self.sent.contains_key(&chunk.chunk.id);
-        if let Some(chunk) = first_needed(list, viewpoint, unsent) {
+        // First round: something of everything. A coarse model without holes is more useful than an
+        // exact part of it.
+        let is_unsent = |chunk: &&Arc<VersionedChunk>| self.copy_of(chunk).is_none();
+        if let Some(chunk) = first_needed(list, viewpoint, is_unsent) {
+            // Meshes, and chunks of few splats, have no coarse form.
             let is_fine = chunk.chunk.coarse.is_none();
             return self.send(list, &chunk, is_fine, subscription);
         }
-        // Removed chunks were replaced by others, which the client has by now.
-        if self.sent.keys().any(|id| !list.chunks.contains_key(id)) {
-            let (kept, removed): (BTreeMap<_, _>, BTreeMap<_, _>) = std::mem::take(&mut self.sent)
-                .into_iter()
-                .partition(|(id, _)| list.chunks.contains_key(id));
-            self.sent = kept;
-            let ids = removed.into_keys().collect();
-            let message = ServerMessage::ModelChunksRemoved {
-                method: &subscription.method,
-                ids,
-            };
-            return NextChunk::Send(message.to_message());
+        // Removed chunks were replaced by others, which the client has by now. If they were removed
+        // earlier, the picture would have holes.
+        if let Some(removal) = self.next_removal(list, &subscription.method) {
+            return NextChunk::Send(removal);
         }
-        let is_coarse = |chunk: &&Arc<VersionedChunk>| {
-            self.sent
-                .get(&chunk.chunk.id)
-                .is_some_and(|sent| !sent.is_fine)
-        };
+        // Second round: all details.
+        let is_coarse =
+            |chunk: &&Arc<VersionedChunk>| self.copy_of(chunk).is_some_and(|copy| !copy.is_fine);
         if let Some(chunk) = first_needed(list, viewpoint, is_coarse) {
             return self.send(list, &chunk, true, subscription);
         }
-        let missed = |chunk: &VersionedChunk| {
-            chunk.total_change
-                - self
-                    .sent
-                    .get(&chunk.chunk.id)
-                    .map_or(0.0, |sent| sent.total_change)
-        };
+        // Changes, which never end while the model is trained. Only they wait for the budget. The
+        // largest come first. Changes that the client has missed add up, so every chunk has its
+        // turn.
         let is_outdated = |chunk: &&Arc<VersionedChunk>| {
-            self.sent
-                .get(&chunk.chunk.id)
-                .is_some_and(|sent| sent.version != chunk.version)
+            self.copy_of(chunk)
+                .is_some_and(|copy| copy.version != chunk.version)
         };
-        let Some(chunk) = most_changed(list.chunks.values().filter(is_outdated), missed) else {
+        let outdated = list.chunks.values().filter(is_outdated);
+        let Some(chunk) = most_changed(outdated, |chunk| self.missed_change(chunk)) else {
             return NextChunk::Wait;
         };
         if self.balance_bytes < 0.0 {
+            // The chunk is chosen again then: another one may have changed more.
             let secs = -self.balance_bytes / subscription.max_bytes_per_sec;
             return NextChunk::WaitUntil(now + Duration::from_secs_f64(secs));
         }
         self.send(list, &chunk, true, subscription)
     }
 
+    /// What the client has of a chunk.
+    fn copy_of(&self, chunk: &VersionedChunk) -> Option<&SentChunk> {
+        self.sent.get(&chunk.chunk.id)
+    }
+
+    /// How much a chunk has changed since it was sent to the client.
+    fn missed_change(&self, chunk: &VersionedChunk) -> f64 {
+        chunk.total_change - self.copy_of(chunk).map_or(0.0, |copy| copy.total_change)
+    }
+
+    /// The message that removes the chunks that no longer exist; `None` if the client has none.
+    fn next_removal(&mut self, list: &ChunkList, method: &str) -> Option<Message> {
+        if self.sent.keys().all(|id| list.chunks.contains_key(id)) {
+            return None;
+        }
+        let (kept, removed): (BTreeMap<_, _>, BTreeMap<_, _>) = std::mem::take(&mut self.sent)
+            .into_iter()
+            .partition(|(id, _)| list.chunks.contains_key(id));
+        self.sent = kept;
+        let ids = removed.into_keys().collect();
+        let message = ServerMessage::ModelChunksRemoved { method, ids };
+        Some(message.to_message())
+    }
+
+    /// Adds the budget of the time since the last call.
     fn refill(&mut self, bytes_per_sec: f64, now: Instant) {
         let secs = self
             .updated
@@ -121,6 +139,7 @@ impl ChunkSender {
             (self.balance_bytes + secs * bytes_per_sec).min(MAX_SAVED_SECS * bytes_per_sec);
     }
 
+    /// The message with a chunk, which counts as sent.
     fn send(
         &mut self,
         list: &ChunkList,
@@ -141,6 +160,7 @@ impl ChunkSender {
                 total_change: *total_change,
             },
         );
+        // After the chunk was counted: the page shows how much is left after this message.
         let n_incomplete = list
             .chunks
             .keys()
@@ -161,6 +181,7 @@ impl ChunkSender {
             layout: data.layout,
         };
         let bytes = frame(&BinaryHeader::ModelChunk(&header), &[&data.bytes]);
+        // All chunks are paid for, so that changes wait after the model was sent.
         let max_debt_bytes = MAX_DEBT_SECS * subscription.max_bytes_per_sec;
         self.balance_bytes = (self.balance_bytes - bytes.len() as f64).max(-max_debt_bytes);
         NextChunk::Send(Message::binary(bytes))
@@ -177,6 +198,7 @@ fn first_needed(
     let Some(viewpoint) = viewpoint else {
         return most_changed(candidates, |chunk| chunk.total_change);
     };
+    // Every chunk has a fine form, so its bounds decide in both rounds.
     let ranked = candidates.map(|chunk| {
         (
             viewpoint.rank(&list.world_from_model, &chunk.chunk.fine.layout),

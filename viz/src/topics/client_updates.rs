@@ -25,6 +25,13 @@ pub(crate) struct NamedFeed {
     pub(crate) feed: Box<dyn Feed>,
 }
 
+/// What a client has asked for.
+#[derive(Clone, Copy)]
+struct ClientNeeds<'a> {
+    subscriptions: &'a Subscriptions,
+    has_keyframe_changes: bool,
+}
+
 /// What to do next.
 #[derive(Debug, PartialEq)]
 pub(crate) enum Next {
@@ -41,6 +48,7 @@ pub(crate) enum Next {
 impl ClientUpdates {
     /// The feeds of a client that has received nothing.
     pub(crate) fn new(topics: &[Arc<dyn Topic>]) -> Self {
+        // `start_all` has started the topics in the order of the table.
         let feeds = TOPICS.iter().zip(topics).map(|(row, topic)| NamedFeed {
             name: row.name,
             priority: row.priority,
@@ -68,39 +76,53 @@ impl ClientUpdates {
         allows_long: bool,
     ) -> Next {
         let mut timer = Timer::new(now);
-        let mut next_of = |updates: &mut Self, priority| {
-            let mut client = ClientState {
-                subscriptions,
-                has_keyframe_changes,
-                viewpoint: updates.viewpoint.as_ref(),
-                keyframes: &mut updates.keyframes,
-            };
-            let mut feeds = updates
-                .feeds
-                .iter_mut()
-                .filter(|named| named.priority == priority);
-            feeds.find_map(|named| named.feed.next(&mut client, &mut timer))
+        let client = ClientNeeds {
+            subscriptions,
+            has_keyframe_changes,
         };
-        if let Some(message) = next_of(self, Priority::Short) {
+        if let Some(message) = self.next_of(Priority::Short, client, &mut timer) {
             return Next::Short(message);
         }
         if allows_long {
+            // On a slow link, a new image waits whenever the last one has been sent. Keyframes
+            // would then never be sent, or images never, whichever comes first in the order.
             let in_turn = if self.was_live {
                 [Priority::Keyframes, Priority::Live]
             } else {
                 [Priority::Live, Priority::Keyframes]
             };
             for priority in in_turn {
-                if let Some(message) = next_of(self, priority) {
+                if let Some(message) = self.next_of(priority, client, &mut timer) {
                     self.was_live = priority == Priority::Live;
                     return Next::Long(message);
                 }
             }
-            if let Some(message) = next_of(self, Priority::Background) {
+            if let Some(message) = self.next_of(Priority::Background, client, &mut timer) {
                 return Next::Long(message);
             }
         }
+        // If long messages are not allowed now, the session asks again when they are.
         timer.earliest().map_or(Next::Wait, Next::WaitUntil)
+    }
+
+    /// The next message of the topics with a priority, in the order of the table.
+    fn next_of(
+        &mut self,
+        priority: Priority,
+        needs: ClientNeeds<'_>,
+        timer: &mut Timer,
+    ) -> Option<Message> {
+        let mut client = ClientState {
+            subscriptions: needs.subscriptions,
+            has_keyframe_changes: needs.has_keyframe_changes,
+            viewpoint: self.viewpoint.as_ref(),
+            keyframes: &mut self.keyframes,
+        };
+        let mut feeds = self
+            .feeds
+            .iter_mut()
+            .filter(|named| named.priority == priority);
+        feeds.find_map(|named| named.feed.next(&mut client, timer))
     }
 
     /// Whether the client has received anything of a topic.
@@ -121,7 +143,7 @@ mod tests {
     use crate::topics::keyframe_points::PointTopic;
     use crate::topics::keyframes::{KeyframeTopic, SharedLog};
     use crate::topics::live_images::LiveImageTopic;
-    use crate::topics::robot::Description;
+    use crate::topics::robot_state::Description;
     use crate::topics::scene::Scene;
     use crate::topics::status::RunStatus;
     use crate::topics::subscriptions::Subscriptions;

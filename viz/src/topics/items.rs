@@ -57,12 +57,11 @@ struct State<T: ItemTopic> {
 impl<T: ItemTopic> Items<T> {
     /// A topic for the data of a hub.
     pub(crate) fn new(hub: &Hub) -> Self {
-        let (topic, source, encoded) = (T::default(), receiver(hub), Throttle::new(T::PERIOD));
         Self {
             state: Mutex::new(State {
-                topic,
-                source,
-                encoded,
+                topic: T::default(),
+                source: receiver(hub),
+                encoded: Throttle::new(T::PERIOD),
                 items: BTreeMap::new(),
             }),
         }
@@ -77,6 +76,8 @@ impl<T: ItemTopic> Items<T> {
 
 impl<T: ItemTopic> Topic for Items<T> {
     fn encode(&self, context: &EncodeContext<'_>) {
+        // Without a client, the data stays marked as changed, so that it is encoded as soon as a
+        // client subscribes.
         if T::DEFAULT != DefaultRate::Always && !context.is_wanted(T::NAME) {
             return;
         }
@@ -87,6 +88,7 @@ impl<T: ItemTopic> Topic for Items<T> {
             encoded,
             items,
         } = &mut *state;
+        // Before looking at the data: what has changed must stay marked until the period is over.
         if !encoded.is_due(context.now) {
             return;
         }
@@ -94,6 +96,8 @@ impl<T: ItemTopic> Topic for Items<T> {
             return;
         };
         encoded.begin(context.now);
+        // The messages are numbered in the order of their keys. The feed sends those first whose
+        // number was sent longest ago, so that no key is preferred for long.
         for (key, message) in topic.encode(&source, context.clock) {
             context
                 .publisher
@@ -103,6 +107,7 @@ impl<T: ItemTopic> Topic for Items<T> {
 
     fn clear(&self) {
         let mut state = self.state.lock();
+        // Topics remember what they have encoded, and would not encode it again.
         state.topic = T::default();
         state.source.mark_changed();
         state.encoded.reset();
@@ -130,14 +135,14 @@ impl<T: ItemTopic> Feed for ItemFeed<T> {
             DefaultRate::Always => Duration::ZERO,
             _ => client.subscriptions.period(T::NAME)?,
         };
+        // Sessions and the encoder run on the same thread, so this lock is usually free.
         let state = self.items.state.lock();
         let waiting = state.items.iter().filter_map(|(key, item)| {
             let sent = self.sent.get(key).copied().unwrap_or_default();
-            (item.number > sent.number && timer.is_due(sent.at, period)).then_some((
-                sent.number,
-                key,
-                item,
-            ))
+            // The timer is asked only about new messages: it remembers when those are due that
+            // are not.
+            let is_next = item.number > sent.number && timer.is_due(sent.at, period);
+            is_next.then_some((sent.number, key, item))
         });
         let (_, key, item) = waiting.min_by_key(|(number, ..)| *number)?;
         self.sent.insert(

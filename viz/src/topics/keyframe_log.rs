@@ -6,8 +6,8 @@ use crate::topics::updates::KeyframePose;
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 
-/// Maximum number of remembered removals. A client that has not received older ones gets the
-/// complete list.
+/// Maximum number of remembered removals, 16 bytes each. A client that has not received older ones
+/// gets the complete list. With fewer, clients on slow links get complete lists more often.
 const MAX_REMOVALS: usize = 1024;
 
 /// The keyframes, and which version of the list changed them. The version counts single changes.
@@ -102,6 +102,8 @@ impl KeyframeLog {
 
     /// Replaces the list.
     pub(crate) fn set(&mut self, keyframes: &[KeyframePose]) {
+        // Keyframes are recognized by camera and stamp, and among those with the same stamp by
+        // their order: stamps need not be unique.
         let mut numbers = BTreeMap::new();
         let mut n_same: BTreeMap<(&str, i64), u32> = BTreeMap::new();
         for keyframe in keyframes {
@@ -110,12 +112,17 @@ impl KeyframeLog {
                 .or_default();
             let key = (Arc::clone(&keyframe.camera), keyframe.stamp.0, *n_before);
             *n_before += 1;
+            // What remains in `self.numbers` after the loop is not in the new list.
             let number = self.numbers.remove(&key).unwrap_or_else(|| {
                 self.n_added += 1;
                 self.n_added
             });
             let before = self.keyframes.get(&number);
+            // The pose is compared with the one in the log, not with the one in the last list, so
+            // that slow drift adds up until it is noticeable.
             if before.is_none_or(|entry| has_changed(&entry.keyframe, keyframe)) {
+                // Every change has a version of its own, so that a long list can be interrupted
+                // after any keyframe.
                 self.version += 1;
                 let added = before.map_or(self.version, |entry| entry.added);
                 let entry = Entry {
@@ -127,7 +134,8 @@ impl KeyframeLog {
             }
             numbers.insert(key, number);
         }
-        // The rest is no longer in the list.
+        // The rest is no longer in the list. Removals come after additions: between two messages, a
+        // client has too many keyframes rather than too few.
         for number in std::mem::replace(&mut self.numbers, numbers).into_values() {
             self.keyframes.remove(&number);
             self.version += 1;
@@ -146,6 +154,7 @@ impl KeyframeLog {
     pub(crate) fn next_changes(&self, position: ListPosition) -> Option<Changes> {
         // A list does not contain keyframes that were removed before it was started, so it needs
         // only later removals.
+        // A version above that of the log would be a mistake, and a complete list corrects it.
         let is_outdated = position.version.max(position.began) < self.forgotten
             || position.version > self.version;
         let position = if is_outdated {
@@ -157,6 +166,7 @@ impl KeyframeLog {
         if from_version == self.version {
             return None;
         }
+        // In the order of the changes: the last one that is sent is then the version of the client.
         let mut changed: Vec<_> = self
             .keyframes
             .iter()
@@ -168,16 +178,17 @@ impl KeyframeLog {
             Some((_, next)) => next.changed - 1,
             None => self.version,
         };
-        let keyframes = changed.into_iter().take(MAX_CHANGED_KEYFRAMES);
-        let keyframes = keyframes
+        let keyframes = changed
+            .into_iter()
+            .take(MAX_CHANGED_KEYFRAMES)
             .map(|(number, entry)| NumberedKeyframe::new(*number, &entry.keyframe))
             .collect();
-        let is_new =
-            |(at, _): &&(u64, u64)| from_version > 0 && *at > from_version && *at <= version;
+        // A new list is empty at first, so nothing can be removed from it.
+        let is_new = |at: u64| from_version > 0 && at > from_version && at <= version;
         let removed = self
             .removals
             .iter()
-            .filter(is_new)
+            .filter(|(at, _)| is_new(*at))
             .map(|(_, number)| *number)
             .collect();
         let is_new_list = from_version == 0;
@@ -186,6 +197,8 @@ impl KeyframeLog {
         } else {
             position.began
         };
+        // Until the list is complete, a keyframe that was added earlier may not have been sent, if
+        // it has changed since then: its change is now near the end of the list.
         let complete = if version == self.version {
             version
         } else {

@@ -18,10 +18,13 @@ use std::sync::{Arc, Weak};
 use std::time::Instant;
 use tokio::sync::watch;
 
-/// Maximum number of points per keyframe. A run has hundreds of keyframes that overlap.
+/// Maximum number of points per keyframe. A run has hundreds of keyframes that overlap. With 9
+/// bytes per point, a keyframe has 22 kB.
 const MAX_POINTS: usize = 2500;
 /// Points whose depth differs from that of a neighbor by more than this fraction are left out: they
-/// lie on edges, where depth cameras report values in between.
+/// lie on edges, where depth cameras report values in between. With a smaller fraction, surfaces
+/// that are seen at a grazing angle lose their points, too; with a larger one, points float behind
+/// edges.
 const MAX_EDGE_FRAC: f64 = 0.05;
 
 /// Name in `subscribe`.
@@ -74,22 +77,27 @@ impl Topic for PointTopic {
         let mut log = self.log.lock();
         let mut points = self.points.lock();
         if let Some(Some(log)) = take_if_changed(&mut log) {
+            // Points of removed keyframes would fill the memory in a long run.
             points.messages.retain(|number, _| log.contains(*number));
         }
         let is_wanted = context
             .settled()
             .any(|demand| demand.subscriptions.period(NAME).is_some());
+        // One keyframe at a time, so that packing takes at most one processor away from training.
         if !is_wanted || points.is_running {
             return;
         }
         let log = log.borrow();
         let mut newest_first = log.iter().flat_map(|log| log.newest_first());
+        // The newest keyframes come first, because they show where the robot is now.
         let Some((number, pose)) =
             newest_first.find(|(number, _)| !points.messages.contains_key(number))
         else {
             return;
         };
         points.is_running = true;
+        // `None` if the run has dropped the keyframe in the meantime. It then counts as one without
+        // points, and is not looked for again.
         let source = context.hub.keyframe_source(&pose.camera, pose.stamp);
         let task = PackingTask {
             number,
@@ -140,6 +148,7 @@ impl PackingTask {
 impl Drop for PackingTask {
     fn drop(&mut self) {
         let mut points = self.points.lock();
+        // Has an effect only after a panic: `run` has inserted the message otherwise.
         points.messages.entry(self.number).or_insert(None);
         points.is_running = false;
     }
@@ -162,20 +171,24 @@ impl Feed for PointFeed {
     fn next(&mut self, client: &mut ClientState<'_>, timer: &mut Timer) -> Option<Message> {
         // Clients discard points together with their keyframes, and a new subscription begins with
         // all points.
-        let (n_subscriptions, n_lists) =
-            (client.subscriptions.number(NAME), client.keyframes.n_lists);
+        let n_subscriptions = client.subscriptions.number(NAME);
+        let n_lists = client.keyframes.n_lists;
         if n_subscriptions != self.n_subscriptions || n_lists != self.n_lists {
-            (self.n_subscriptions, self.n_lists) = (n_subscriptions, n_lists);
+            self.n_subscriptions = n_subscriptions;
+            self.n_lists = n_lists;
             self.sent.clear();
         }
         let period = client.subscriptions.period(NAME)?;
         let log = self.log.borrow();
+        // Complete lists have no numbers to which the points could belong.
         let log = log.as_ref().filter(|_| client.has_keyframe_changes)?;
         let points = self.points.lock();
+        // Numbers are not used twice, so numbers of removed keyframes are no longer needed.
         self.sent
             .retain(|number| points.messages.contains_key(number));
         let mut newest_first = points.messages.iter().rev();
         let (number, message) = newest_first.find_map(|(number, message)| {
+            // Clients drop points without a keyframe, so the keyframe must have been sent before.
             let is_next =
                 !self.sent.contains(number) && log.is_sent(*number, client.keyframes.position);
             Some((number, message.as_ref()?)).filter(|_| is_next)
@@ -211,6 +224,7 @@ impl Hub {
 
 /// The binary message with the points of a keyframe; `None` if it has no usable depth.
 fn pack_points(id: u64, keyframe: &Keyframe) -> Option<Vec<u8>> {
+    // A depth map of a wrong size would be indexed out of bounds.
     let is_complete = |depth: &&DepthMap| depth.depth_m.len() == n_pixels(depth.size_px);
     let (points, colors) = points_in_camera(keyframe, keyframe.depth.as_ref().filter(is_complete)?);
     let (positions, meters_per_count) = pack_positions(&points)?;
@@ -232,30 +246,21 @@ fn n_pixels([width, height]: [u32; 2]) -> usize {
 /// Points on a regular grid of the depth map, in the frame of the keyframe's color camera, and
 /// their colors.
 fn points_in_camera(keyframe: &Keyframe, depth: &DepthMap) -> (Vec<Vector3<f64>>, Vec<u8>) {
-    let [width, height] = depth.size_px;
     let n_px = n_pixels(depth.size_px);
+    // The same stride along both axes keeps the points evenly distributed.
     let stride = (1..)
         .find(|stride: &usize| n_px / (stride * stride) <= MAX_POINTS)
         .unwrap_or(1);
+    // Depth cameras may have another pose than the color camera.
     let camera_from_depth = keyframe.world_from_camera.inverse() * depth.world_from_camera;
-    let depth_at = |x: u32, y: u32| f64::from(depth.depth_m[(y * width + x) as usize]);
-    let (mut points, mut colors) = (Vec::new(), Vec::new());
-    for y in (stride as u64 / 2..u64::from(height))
-        .step_by(stride)
-        .filter_map(|y| u32::try_from(y).ok())
-    {
-        for x in (stride as u64 / 2..u64::from(width))
-            .step_by(stride)
-            .filter_map(|x| u32::try_from(x).ok())
-        {
-            let z_m = depth_at(x, y);
-            let neighbors = [(x + 1, y), (x, y + 1)]
-                .into_iter()
-                .filter(|(x, y)| *x < width && *y < height);
-            let is_edge = neighbors
-                .map(|(x, y)| depth_at(x, y))
-                .any(|other| (other - z_m).abs() > MAX_EDGE_FRAC * z_m);
-            if z_m.is_nan() || z_m <= 0.0 || is_edge {
+    let [width, height] = depth.size_px;
+    let mut points = Vec::new();
+    let mut colors = Vec::new();
+    for y in grid_positions(height, stride) {
+        for x in grid_positions(width, stride) {
+            let z_m = depth_at(depth, [x, y]);
+            // NaN and 0 mean that nothing was measured.
+            if z_m.is_nan() || z_m <= 0.0 || is_edge(depth, [x, y]) {
                 continue;
             }
             let point = camera_from_depth * Point3::from(depth.point(x, y, z_m));
@@ -269,6 +274,31 @@ fn points_in_camera(keyframe: &Keyframe, depth: &DepthMap) -> (Vec<Vector3<f64>>
     (points, colors)
 }
 
+/// Every `stride`-th pixel along a side, starting at half a stride, so that the grid is centered.
+fn grid_positions(side: u32, stride: usize) -> impl Iterator<Item = u32> {
+    (stride as u64 / 2..u64::from(side))
+        .step_by(stride)
+        .filter_map(|position| u32::try_from(position).ok())
+}
+
+/// Depth of a pixel, meters.
+fn depth_at(depth: &DepthMap, [x, y]: [u32; 2]) -> f64 {
+    f64::from(depth.depth_m[(y * depth.size_px[0] + x) as usize])
+}
+
+/// Whether the depth changes suddenly between a pixel and its neighbors on the right and below.
+fn is_edge(depth: &DepthMap, [x, y]: [u32; 2]) -> bool {
+    let [width, height] = depth.size_px;
+    let z_m = depth_at(depth, [x, y]);
+    // The neighbors of the other sides have the pixel as theirs.
+    let neighbors = [[x + 1, y], [x, y + 1]]
+        .into_iter()
+        .filter(|[x, y]| *x < width && *y < height);
+    neighbors
+        .map(|neighbor| depth_at(depth, neighbor))
+        .any(|other| (other - z_m).abs() > MAX_EDGE_FRAC * z_m)
+}
+
 /// Color of the pixel onto which a point projects; `None` outside the image.
 #[expect(
     clippy::cast_possible_truncation,
@@ -279,6 +309,7 @@ fn color_at(keyframe: &Keyframe, point: &Point3<f64>) -> Option<[u8; 3]> {
     let [width, height] = keyframe.size_px;
     let u = keyframe.focal_px[0] * point.x / point.z + keyframe.principal_px[0];
     let v = keyframe.focal_px[1] * point.y / point.z + keyframe.principal_px[1];
+    // Written so that NaN is not inside.
     let is_inside = point.z > 0.0
         && (0.0..f64::from(width)).contains(&u)
         && (0.0..f64::from(height)).contains(&v);

@@ -17,9 +17,12 @@ use tokio::sync::watch;
 
 /// Name in `subscribe`.
 const NAME: &str = "keyframes";
-/// Minimum time between two versions of the keyframe list.
+/// Minimum time between two versions of the keyframe list. Each one is compared with the last one,
+/// keyframe by keyframe.
 const LOG_PERIOD: Duration = Duration::from_millis(200);
-/// Minimum time between two complete lists, which are long.
+/// Minimum time between two complete lists, which are long: about 600 bytes for each keyframe. It
+/// is slightly shorter than the period of 1 s at which clients receive them, so that a new list is
+/// there when it is due.
 const LIST_PERIOD: Duration = Duration::from_millis(950);
 
 /// The topic in the table.
@@ -85,21 +88,26 @@ impl KeyframeTopic {
 
 impl Topic for KeyframeTopic {
     fn encode(&self, context: &EncodeContext<'_>) {
-        let mut state = self.state.lock();
-        let state = &mut *state;
+        let mut guard = self.state.lock();
+        let state = &mut *guard;
         if state.log_made.is_due(context.now)
             && let Some(list) = take_if_changed(&mut state.source)
         {
             state.log_made.begin(context.now);
             state.log.set(&list);
             state.is_list_outdated = true;
+            // Feeds and tasks read the shared copy while this one changes.
             let log = Arc::new(state.log.clone());
             context
                 .publisher
                 .publish(|_| _ = self.shared_log.send_replace(Some(log)));
         }
+        // Clients that know changes need no complete list, but it is known only after their hello
+        // that they do.
         let needs_list = context.settled().any(|demand| !demand.has_keyframe_changes);
         let is_due = state.is_list_outdated && state.list_made.is_due(context.now);
+        // At most one list is encoded at a time. On a busy machine, tasks would pile up, and an
+        // older list could be published after a newer one.
         if needs_list && is_due && !std::mem::replace(&mut self.list.lock().is_running, true) {
             state.list_made.begin(context.now);
             state.is_list_outdated = false;
@@ -108,6 +116,7 @@ impl Topic for KeyframeTopic {
                 publisher: context.publisher.clone(),
             };
             let keyframes = state.source.borrow().clone();
+            // While a long list was encoded on this thread, no session could send anything.
             tokio::task::spawn_blocking(move || task.run(&keyframes));
         }
     }
@@ -119,6 +128,7 @@ impl Topic for KeyframeTopic {
         state.list_made.reset();
         state.is_list_outdated = true;
         self.list.lock().item = None;
+        // The numbers of the keyframes stay the same, because `state.log` is kept.
         self.shared_log.send_if_modified(|log| log.take().is_some());
     }
 
@@ -167,7 +177,8 @@ impl Feed for KeyframeFeed {
     fn next(&mut self, client: &mut ClientState<'_>, timer: &mut Timer) -> Option<Message> {
         let n_subscriptions = client.subscriptions.number(NAME);
         if n_subscriptions > self.n_subscriptions {
-            // A new subscription begins with the complete list.
+            // A new subscription begins with the complete list. This is how a client whose list is
+            // inconsistent, for example after an error in the page, gets a new one.
             self.n_subscriptions = n_subscriptions;
             self.list = Sent::default();
             self.changes_at = None;
@@ -217,9 +228,12 @@ impl KeyframeFeed {
             position,
             is_new_list,
         } = log.next_changes(client.keyframes.position)?;
+        // The points depend on both: points are sent only after their keyframe, and again after a
+        // new list, with which clients discard them.
         client.keyframes.n_lists += u64::from(is_new_list);
         client.keyframes.position = position;
-        // The parts of a long list follow each other.
+        // The parts of a long list follow each other without a pause: the period counts from the
+        // end of the last complete list.
         self.changes_at = log.is_up_to_date(position).then_some(timer.now);
         Some(Message::text(json))
     }

@@ -5,7 +5,7 @@ use crate::clock::ServerClock;
 use crate::hub::Demand;
 use crate::pictures::picture::pack_live_image;
 use crate::session::server_message::ServerMessage;
-use crate::topics::subscriptions::{Subscriptions, fitted};
+use crate::topics::subscriptions::{LIVE_IMAGES, Subscriptions, fitted};
 use crate::topics::updates::LiveImage;
 use crate::topics::{
     ClientState, DefaultRate, EncodeContext, Feed, Item, Priority, Publisher, Row, Sent, Timer,
@@ -20,17 +20,18 @@ use std::time::{Duration, Instant};
 use tokio::sync::watch;
 
 /// Maximum number of images of a camera that are encoded at the same time. Clients may want many
-/// different sizes.
+/// different sizes. With more, clients with unusual sizes wait less, but encoding takes more
+/// processors away from training.
 const MAX_IMAGE_ENCODINGS: usize = 4;
 
-/// Name in `subscribe`.
-pub(crate) const NAME: &str = "live_images";
-/// Minimum time between two images for clients that have not subscribed.
-pub(crate) const DEFAULT_PERIOD: Duration = Duration::from_millis(190);
+/// Minimum time between two images for clients that have not subscribed. It is slightly shorter
+/// than the 200 ms of the documented rate, so that an image of a camera with 5 images per second
+/// that comes a little early need not wait for the rest of the period.
+const DEFAULT_PERIOD: Duration = Duration::from_millis(190);
 
 /// The topic in the table.
 pub(crate) const ROW: Row = Row {
-    name: NAME,
+    name: LIVE_IMAGES,
     default: DefaultRate::Period(DEFAULT_PERIOD),
     priority: Priority::Live,
     start: |hub| Arc::new(LiveImageTopic::new(hub)),
@@ -91,7 +92,8 @@ impl Topic for LiveImageTopic {
         let wanted = wanted_images(context.settled(), live_images.keys());
         let mut images = self.images.lock();
         let EncodedImages { encodings, items } = &mut *images;
-        // Sizes that no client wants any longer.
+        // Forget sizes that no client wants any longer, such as that of a window before it was
+        // resized. A running task still needs its entry, which says that it runs.
         encodings.retain(|key, encoding| encoding.is_running || wanted.contains_key(key));
         items.retain(|key, _| wanted.contains_key(key));
         for (key, image) in images_to_encode(wanted, encodings, &live_images, context.now) {
@@ -100,6 +102,8 @@ impl Topic for LiveImageTopic {
                 at: context.now,
                 is_running: true,
             };
+            // The time counts from the beginning. If it counted from the end, the rate would be
+            // lower than requested by the time for encoding.
             encodings.insert(key.clone(), encoding);
             let task = EncodingTask {
                 key,
@@ -113,6 +117,7 @@ impl Topic for LiveImageTopic {
 
     fn clear(&self) {
         let mut images = self.images.lock();
+        // Running tasks may still publish their image. It is removed in the next check.
         images.encodings.retain(|_, encoding| encoding.is_running);
         images.items.clear();
     }
@@ -157,6 +162,7 @@ fn live_message(image: &LiveImage, max_px: [u32; 2], clock: ServerClock) -> Mess
     match pack_live_image(image, fitted(image.size_px, max_px), clock) {
         Ok(bytes) => Message::binary(bytes),
         Err(error) => {
+            // Sent in place of the image, so that the operator learns why the camera shows nothing.
             let message = format!("live image of camera {:?}: {error}", image.camera);
             ServerMessage::Error {
                 id: None,
@@ -180,6 +186,8 @@ fn wanted_images<'a>(
             let Some(period) = subscription.period else {
                 continue;
             };
+            // Each image is encoded for the client that wants it most often. The feeds of the
+            // others leave images out.
             let shortest = wanted
                 .entry((Arc::clone(camera), subscription.max_px))
                 .or_insert(period);
@@ -201,10 +209,13 @@ fn images_to_encode(
     for ((camera, _), _) in encodings.iter().filter(|(_, encoding)| encoding.is_running) {
         *n_running.entry(Arc::clone(camera)).or_default() += 1;
     }
+    // Sizes without an encoding come first, because `None` is less than any time.
     let mut wanted: Vec<_> = wanted.into_iter().collect();
     wanted.sort_by_key(|(key, _)| encodings.get(key).map(|encoding| encoding.at));
     let to_encode = wanted.into_iter().filter_map(|(key, period)| {
         let image = live_images.get(&key.0)?;
+        // Every image that is set has an address of its own. The entry keeps its image, so the
+        // address cannot be used again.
         let is_new = encodings.get(&key).is_none_or(|encoding| {
             !encoding.is_running
                 && now.saturating_duration_since(encoding.at) >= period
@@ -233,6 +244,7 @@ impl Feed for ImageFeed {
         let waiting = images.items.iter().filter_map(|((camera, max_px), item)| {
             let subscription = client.subscriptions.images_of(camera);
             let sent = self.sent.get(camera).copied().unwrap_or_default();
+            // Images of other sizes are for other clients.
             let is_wanted = *max_px == subscription.max_px && item.number > sent.number;
             let is_next = is_wanted && timer.is_due(sent.at, subscription.period?);
             is_next.then_some((sent.number, camera, item))
@@ -254,6 +266,7 @@ impl Hub {
     /// clients are connected. Its pose is corrected as set by [`Self::set_camera_corrections`].
     pub fn set_live_image(&self, mut image: LiveImage) {
         let corrections = self.latest::<CameraCorrections>();
+        // Here and not when the image is sent, so that Foxglove gets the same pose.
         if let (Some(pose), Some(correction)) = (
             &mut image.world_from_camera,
             corrections.borrow().get(&image.camera),

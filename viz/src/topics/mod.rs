@@ -22,6 +22,7 @@ pub(crate) mod observation_map;
 mod positions;
 pub(crate) mod range_scan;
 pub(crate) mod robot;
+pub(crate) mod robot_state;
 mod scene;
 mod status;
 pub(crate) mod subscriptions;
@@ -46,7 +47,7 @@ pub(crate) const TOPICS: &[Row] = &[
     items::row::<scene::Scene>(),
     items::row::<status::RunStatus>(),
     items::row::<base_path::BasePathTopic>(),
-    items::row::<robot::Description>(),
+    items::row::<robot_state::Description>(),
     live_images::ROW,
     items::row::<range_scan::RangeScanTopic>(),
     keyframes::ROW,
@@ -176,7 +177,11 @@ impl Publisher {
     /// Calls `store` with the number of a new message, and then wakes up the sessions. Later
     /// messages have larger numbers.
     pub(crate) fn publish(&self, store: impl FnOnce(u64)) {
+        // Only the order of the numbers matters. The locks of the topics order the messages. Number
+        // 0 is left for clients that have received nothing.
         store(1 + self.n_messages.fetch_add(1, Ordering::Relaxed));
+        // After storing: a session that is woken up earlier would find nothing, and then sleep
+        // until the next message.
         self.changed.send_replace(());
     }
 
@@ -217,10 +222,13 @@ impl Timer {
 
     /// Whether a message may be sent after this period since the last one.
     pub(crate) fn is_due(&mut self, last: Option<Instant>, period: Duration) -> bool {
+        // The first message is due at once, and so is one whose time cannot be represented.
         let due = last
             .and_then(|at| at.checked_add(period))
             .unwrap_or(self.now);
         if due > self.now {
+            // There is something to send. Without this time, the session would sleep until
+            // something else changes.
             self.wait_until(due);
         }
         due <= self.now
@@ -228,6 +236,7 @@ impl Timer {
 
     /// Records that a message is due at this time.
     pub(crate) fn wait_until(&mut self, due: Instant) {
+        // All feeds of a client share the timer, and its session sleeps only once.
         self.earliest = Some(self.earliest.map_or(due, |earliest| earliest.min(due)));
     }
 
@@ -263,8 +272,24 @@ impl Throttle {
     }
 }
 
-/// Period of checking the hub for new data.
+/// Period of checking the hub for new data. A message is delayed by at most this time. With a
+/// shorter period, the topics are asked more often whether they have something to encode.
 const CHECK_PERIOD: Duration = Duration::from_millis(20);
+
+/// What a client receives before it subscribes.
+///
+/// This is here and not in `subscriptions.rs`, because the hub stores subscriptions, and the topics
+/// use the hub: the files would import each other in a cycle.
+impl Default for Subscriptions {
+    fn default() -> Self {
+        Self::new(TOPICS.iter().filter_map(|row| match row.default {
+            // Nobody can subscribe to these topics, so their names must be unknown.
+            DefaultRate::Always => None,
+            DefaultRate::Period(period) => Some((row.name, Some(period))),
+            DefaultRate::Off => Some((row.name, None)),
+        }))
+    }
+}
 
 /// Starts all topics for the data of a hub.
 pub(crate) fn start_all(hub: &Hub) -> Arc<[Arc<dyn Topic>]> {
@@ -279,14 +304,18 @@ pub(crate) async fn encode_all(
     publisher: Publisher,
 ) {
     let mut check = tokio::time::interval(CHECK_PERIOD);
+    // A check that is late, because the machine is busy, must not be followed by a burst of checks.
     check.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
     loop {
         check.tick().await;
         if hub.n_clients() == 0 {
+            // Messages may take much memory, and those of the next client must not be old.
             topics.iter().for_each(|topic| topic.clear());
             continue;
         }
-        let (demands, now) = (hub.demands(), Instant::now());
+        let demands = hub.demands();
+        // One time for all topics, so that their periods end in the same check.
+        let now = Instant::now();
         let context = EncodeContext {
             hub: &hub,
             clock,
@@ -312,6 +341,7 @@ fn take_if_changed<T: Clone>(receiver: &mut watch::Receiver<T>) -> Option<T> {
 /// A receiver of data of the hub that also returns what was set earlier.
 fn receiver<T: Default + Send + Sync + 'static>(hub: &Hub) -> watch::Receiver<T> {
     let mut receiver = hub.latest::<T>().subscribe();
+    // A new receiver counts the present value as seen, but no client has received it.
     receiver.mark_changed();
     receiver
 }

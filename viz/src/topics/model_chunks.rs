@@ -3,6 +3,7 @@
 use crate::Hub;
 use crate::topics::chunk_list::ChunkList;
 use crate::topics::chunk_sender::{ChunkSender, NextChunk};
+use crate::topics::subscriptions::MODEL_CHUNKS;
 use crate::topics::{
     ClientState, DefaultRate, EncodeContext, Feed, Priority, Row, Timer, Topic, receiver,
     take_if_changed,
@@ -16,12 +17,9 @@ use std::time::Duration;
 use tokio::sync::watch;
 use trainer::ModelChunks;
 
-/// Name in `subscribe`.
-pub(crate) const NAME: &str = "model_chunks";
-
 /// The topic in the table.
 pub(crate) const ROW: Row = Row {
-    name: NAME,
+    name: MODEL_CHUNKS,
     default: DefaultRate::Off,
     priority: Priority::Background,
     start: |hub| {
@@ -45,10 +43,13 @@ struct ChunkTopic {
 impl Topic for ChunkTopic {
     fn encode(&self, context: &EncodeContext<'_>) {
         if take_if_changed(&mut self.lists.lock()).is_some() {
+            // There is no message to store: this only wakes up the sessions, whose feeds compare
+            // versions.
             context.publisher.publish(|_| ());
         }
     }
 
+    // Without clients, the hub has no chunks: see `drop_unused_chunks`.
     fn clear(&self) {}
 
     fn feed(self: Arc<Self>) -> Box<dyn Feed> {
@@ -69,12 +70,14 @@ impl Feed for ChunkFeed {
     /// A chunk of the model that the client draws, or the ids of removed chunks.
     fn next(&mut self, client: &mut ClientState<'_>, timer: &mut Timer) -> Option<Message> {
         let subscription = client.subscriptions.model_chunks.as_ref()?;
+        // The run may not have made chunks since the client has subscribed.
         let list = self.lists.borrow().get(&subscription.method).cloned()?;
         match self
             .sender
             .next(&list, subscription, client.viewpoint, timer.now)
         {
             NextChunk::Send(message) => Some(message),
+            // The budget is used up.
             NextChunk::WaitUntil(due) => {
                 timer.wait_until(due);
                 None
@@ -105,16 +108,22 @@ impl Hub {
     /// Sets the chunks of a model, or those that have changed. They are kept only while a client
     /// draws the model.
     pub fn set_model_chunks(&self, method: &str, chunks: ModelChunks) {
+        // The client may have left while the chunks were encoded on another thread. Nobody would
+        // free them.
         if self.chunk_period(method).is_none() {
             return;
         }
         let world_from_model = self.latest::<WorldFromModel>().borrow().unwrap_or_default();
         self.latest::<ModelLists>().send_modify(|lists| {
+            // Feeds may be reading the present list, so the new one is a copy. Copies share the
+            // chunks.
             let mut list = lists
                 .get(method)
                 .map(|list| (**list).clone())
                 .unwrap_or_default();
             list.world_from_model = world_from_model;
+            // Changes of chunks that were dropped in the meantime are discarded. The run sends all
+            // chunks when it sees that none are there (`has_model_chunks`).
             if list.apply(chunks) {
                 lists.insert(method.into(), Arc::new(list));
             }
@@ -131,6 +140,8 @@ impl Hub {
     /// Frees the chunks of models that no client draws any longer.
     pub(crate) fn drop_unused_chunks(&self) {
         self.latest::<ModelLists>().send_if_modified(|lists| {
+            // Called whenever a subscription changes. Sessions must wake up only if a list was
+            // removed.
             let n_before = lists.len();
             lists.retain(|method, _| self.chunk_period(method).is_some());
             lists.len() < n_before

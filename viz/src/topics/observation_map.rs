@@ -16,8 +16,9 @@ use std::time::Instant;
 const UNOBSERVED: u8 = 0;
 /// Code of observed cells whose position is not determined.
 const UNDETERMINED: u8 = 255;
-/// Number represented by code 1.
+/// Age represented by code 1, seconds. Lower ages all count as current.
 const MIN_AGE_SECS: f64 = 0.1;
+/// Standard deviation represented by code 1, meters.
 const MIN_SIGMA_M: f64 = 1e-5;
 /// Natural logarithm of the ratio of two consecutive codes: code 254 stands for 31 hours and for 11
 /// m.
@@ -108,9 +109,12 @@ pub(crate) struct PackedObservations {
 impl PackedObservations {
     /// Compresses a map.
     pub(crate) fn new(map: &ObservationMap) -> std::io::Result<Self> {
+        // Two planes, because neighbors of the same kind are similar, which zlib needs.
         let n_cells: usize = map.n_cells.iter().map(|n| *n as usize).product();
         let mut codes = vec![UNOBSERVED; 2 * n_cells];
         let (ages, sigmas) = codes.split_at_mut(n_cells);
+        // A cell outside the grid would be a mistake of the caller, but no reason to panic on the
+        // thread that computes the map.
         for cell in map.observed.iter().filter(|cell| cell.ix < n_cells) {
             ages[cell.ix] = code(cell.age_secs, MIN_AGE_SECS);
             sigmas[cell.ix] = code(cell.sigma_m, MIN_SIGMA_M);
@@ -134,6 +138,7 @@ impl PackedObservations {
             cell_m: self.cell_m,
             n_cells: self.n_cells,
             n_keyframes: self.n_keyframes,
+            // Each server has a clock of its own, so this cannot be packed in advance.
             newest_millis: self.newest_at.map(|at| clock.millis(at)),
             min_age_secs: MIN_AGE_SECS,
             min_sigma_m: MIN_SIGMA_M,
@@ -145,12 +150,16 @@ impl PackedObservations {
 
 /// The logarithmic code of a number.
 fn code(value: f64, min: f64) -> u8 {
+    // Ages and deviations extend over many orders of magnitude, and their relative error matters.
+    // NaN becomes `min`, because `max` returns the other number.
     let steps = (value.max(min) / min).ln() / LOG_STEP;
     #[expect(
         clippy::cast_possible_truncation,
         clippy::cast_sign_loss,
         reason = "between 1 and 254"
     )]
+    // The largest code, 254, stands for 253 steps. Infinity, for what was not measured, fails the
+    // test, too.
     if steps < f64::from(UNDETERMINED - 2) + 0.5 {
         1 + steps.round() as u8
     } else {

@@ -10,9 +10,11 @@ pub(crate) fn pack_positions(points_m: &[Vector3<f64>]) -> Option<(Vec<u8>, f64)
         .iter()
         .flat_map(|point| point.iter())
         .fold(0.0_f64, |max, value| max.max(value.abs()));
+    // The scale below would be 0 or not finite. `f64::max` ignores NaN, which the cast turns to 0.
     if extent_m <= 0.0 || !extent_m.is_finite() {
         return None;
     }
+    // The farthest coordinate gets the largest count, for the finest step that 16 bits allow.
     let meters_per_count = extent_m / f64::from(i16::MAX);
     #[expect(
         clippy::cast_possible_truncation,

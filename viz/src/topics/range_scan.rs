@@ -13,7 +13,9 @@ use nalgebra::{Point3, Vector3};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-/// Maximum number of points that are sent per scan.
+/// Maximum number of points that are sent per scan, 36 kB. Scans of 3D scanners have many more;
+/// with a larger number, their surfaces look denser on the page, and other data waits longer on
+/// slow links.
 const MAX_POINTS: usize = 6000;
 
 /// A scan and the correction of its base pose.
@@ -43,6 +45,7 @@ impl ItemTopic for RangeScanTopic {
     fn encode(&mut self, scans: &RangeScans, _: ServerClock) -> Vec<(Arc<str>, Message)> {
         let mut messages = Vec::new();
         for (scanner, scan) in scans {
+            // The map has the scans of all scanners, but usually only one of them is new.
             let known = self.encoded.insert(Arc::clone(scanner), Arc::clone(scan));
             if known.is_some_and(|known| Arc::ptr_eq(&known, scan)) {
                 continue;
@@ -71,7 +74,10 @@ fn pack_range_scan(range_scan: &RangeScan) -> Option<Vec<u8>> {
         scan,
         map_from_odom,
     } = range_scan;
+    // Relative to the scanner, counts of 16 bits have the finest step. Relative to the world, they
+    // would have to cover the distance to its origin, too.
     let origin = map_from_odom * Point3::from(scan.world_from_scanner.translation.vector);
+    // Every n-th point: points are in the order of measurement, so all directions stay covered.
     let stride = scan.points_in_world_m.len().div_ceil(MAX_POINTS).max(1);
     let from_origin =
         |point: &[f32; 3]| map_from_odom * Point3::from(*point).cast::<f64>() - origin;

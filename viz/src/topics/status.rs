@@ -16,8 +16,10 @@ pub(crate) struct RunStatus;
 
 impl ItemTopic for RunStatus {
     const NAME: &'static str = "status";
+    // Slightly shorter than the documented 200 ms, as for live images.
     const DEFAULT: DefaultRate = DefaultRate::Period(Duration::from_millis(190));
     const PRIORITY: Priority = Priority::Short;
+    // People cannot read numbers that change more often.
     const PERIOD: Duration = Duration::from_millis(100);
     type Source = Option<Arc<Status>>;
 
@@ -55,6 +57,7 @@ impl Hub {
 
     /// Changes the latest status.
     pub fn change_status(&self, change: impl FnOnce(&mut Status)) {
+        // Within the lock, so that two threads do not overwrite each other's changes.
         self.latest::<Option<Arc<Status>>>().send_modify(|latest| {
             let mut status = latest.as_deref().cloned().unwrap_or_default();
             change(&mut status);

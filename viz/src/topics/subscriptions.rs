@@ -2,12 +2,16 @@
 
 use crate::pictures::view_request::InvalidRequest;
 use crate::session::protocol::{MAX_RATE_HZ, SubscribeMessage};
-use crate::topics::{DefaultRate, TOPICS, live_images, model_chunks};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
 
-/// Maximum number of cameras with a subscription of their own.
+/// Topic whose subscriptions can choose a camera and a size.
+pub(crate) const LIVE_IMAGES: &str = "live_images";
+/// Topic whose subscriptions choose a model and a budget.
+pub(crate) const MODEL_CHUNKS: &str = "model_chunks";
+/// Maximum number of cameras with a subscription of their own. A client can name cameras that do
+/// not exist, so the list needs a limit.
 const MAX_CAMERAS: usize = 64;
 /// Maximum length of a camera name, bytes.
 const MAX_NAME_BYTES: usize = 256;
@@ -15,11 +19,14 @@ const MAX_NAME_BYTES: usize = 256;
 /// height.
 const DEFAULT_IMAGE_PX: [u32; 2] = [640, u32::MAX];
 /// Minimum size of live images, pixels. Larger sizes are rounded down to multiples of it, so that
-/// clients of similar sizes share images.
+/// clients of similar sizes share images. With larger steps, more clients share an image, but its
+/// size fits their windows less well.
 const MIN_IMAGE_PX: u32 = 16;
-/// Default and limits of the rate at which changed chunks are sent: 4.8 Mbit/s leaves room on
-/// ordinary wireless links.
+/// Default rate at which changed chunks are sent: 4.8 Mbit/s leaves room on ordinary wireless
+/// links.
 const DEFAULT_CHUNK_BYTES_PER_SEC: f64 = 6e5;
+/// Limits of that rate. Dividing by it gives the time until a chunk is due, so it must not be close
+/// to zero.
 const CHUNK_BYTES_PER_SEC: std::ops::RangeInclusive<f64> = 1e4..=1e9;
 /// Longest period. Slower subscriptions get one message a day.
 const MAX_PERIOD: Duration = Duration::from_secs(86_400);
@@ -68,68 +75,52 @@ pub(crate) struct ChunkSubscription {
     pub(crate) max_bytes_per_sec: f64,
 }
 
-impl Default for Subscriptions {
-    fn default() -> Self {
-        let topics = TOPICS.iter().filter_map(|row| {
-            let period = match row.default {
-                DefaultRate::Always => return None,
-                DefaultRate::Period(period) => Some(period),
-                DefaultRate::Off => None,
-            };
-            Some((row.name, Subscription { period, number: 0 }))
-        });
-        let period = Some(live_images::DEFAULT_PERIOD);
+impl Subscriptions {
+    /// The subscriptions of a client that has sent none, from the names of the topics and their
+    /// default periods.
+    pub(crate) fn new(
+        default_periods: impl IntoIterator<Item = (&'static str, Option<Duration>)>,
+    ) -> Self {
+        let topics: BTreeMap<&'static str, Subscription> = default_periods
+            .into_iter()
+            .map(|(name, period)| (name, Subscription { period, number: 0 }))
+            .collect();
+        // Images have two entries: the one in `topics` only counts the subscriptions, and this one
+        // decides what is sent.
+        let live_images = ImageSubscription {
+            period: topics.get(LIVE_IMAGES).and_then(|topic| topic.period),
+            max_px: DEFAULT_IMAGE_PX,
+        };
         Self {
-            topics: topics.collect(),
+            topics,
             model_chunks: None,
-            live_images: ImageSubscription {
-                period,
-                max_px: DEFAULT_IMAGE_PX,
-            },
+            live_images,
             cameras: BTreeMap::new(),
         }
     }
-}
 
-impl Subscriptions {
     /// Applies a client's message.
     pub(crate) fn apply(&mut self, message: SubscribeMessage) -> Result<(), InvalidRequest> {
+        // Everything is checked before the first change, so that a rejected message changes
+        // nothing.
+        let topic = self.checked_topic(&message)?;
         let SubscribeMessage {
-            topic,
             rate_hz,
             camera,
             size_px,
             method,
             max_bytes_per_sec,
+            ..
         } = message;
-        let Some((&topic, _)) = self.topics.get_key_value(&*topic) else {
-            let known = self.topics.keys().copied().collect();
-            return Err(InvalidRequest::Topic { got: topic, known });
-        };
-        if !(0.0..=MAX_RATE_HZ).contains(&rate_hz) {
-            return Err(InvalidRequest::Rate { got: rate_hz });
-        }
-        if topic != live_images::NAME && (camera.is_some() || size_px.is_some()) {
-            return Err(InvalidRequest::NotImages);
-        }
-        if topic != model_chunks::NAME && (method.is_some() || max_bytes_per_sec.is_some()) {
-            return Err(InvalidRequest::NotChunks);
-        }
-        if let Some(got) = size_px.filter(|size_px| size_px.iter().any(|side| *side < MIN_IMAGE_PX))
-        {
-            return Err(InvalidRequest::ImageSize {
-                got,
-                min: MIN_IMAGE_PX,
-            });
-        }
+        // A rate close to 0 has a period that is too long for a `Duration`, or even infinite.
         let period = Duration::try_from_secs_f64(1.0 / rate_hz)
             .unwrap_or(MAX_PERIOD)
             .min(MAX_PERIOD);
         let period = (rate_hz > 0.0).then_some(period);
-        if topic == model_chunks::NAME {
+        if topic == MODEL_CHUNKS {
             self.model_chunks = self.chunk_subscription(period, method, max_bytes_per_sec)?;
         }
-        if topic == live_images::NAME {
+        if topic == LIVE_IMAGES {
             let rounded =
                 |size_px: [u32; 2]| size_px.map(|side| side / MIN_IMAGE_PX * MIN_IMAGE_PX);
             let images = ImageSubscription {
@@ -141,9 +132,44 @@ impl Subscriptions {
                 Some(camera) => self.set_camera(camera, images)?,
             }
         }
+        // The number grows with every message, even if the rate stays the same: some topics begin
+        // from the start after a new subscription, and this is how a client asks for that.
         let number = 1 + self.number(topic);
         self.topics.insert(topic, Subscription { period, number });
         Ok(())
+    }
+
+    /// The topic of a message. It is an error if fields of the message do not apply to the topic.
+    fn checked_topic(&self, message: &SubscribeMessage) -> Result<&'static str, InvalidRequest> {
+        let Some((&topic, _)) = self.topics.get_key_value(&*message.topic) else {
+            let known = self.topics.keys().copied().collect();
+            let got = message.topic.clone();
+            return Err(InvalidRequest::Topic { got, known });
+        };
+        // Written so that NaN is rejected.
+        if !(0.0..=MAX_RATE_HZ).contains(&message.rate_hz) {
+            return Err(InvalidRequest::Rate {
+                got: message.rate_hz,
+            });
+        }
+        // Fields of other topics are refused: a client that sends them expects an effect.
+        if topic != LIVE_IMAGES && (message.camera.is_some() || message.size_px.is_some()) {
+            return Err(InvalidRequest::NotImages);
+        }
+        if topic != MODEL_CHUNKS
+            && (message.method.is_some() || message.max_bytes_per_sec.is_some())
+        {
+            return Err(InvalidRequest::NotChunks);
+        }
+        // Smaller sizes would be rounded down to 0.
+        let is_too_small = |size_px: &[u32; 2]| size_px.iter().any(|side| *side < MIN_IMAGE_PX);
+        if let Some(got) = message.size_px.filter(is_too_small) {
+            return Err(InvalidRequest::ImageSize {
+                got,
+                min: MIN_IMAGE_PX,
+            });
+        }
+        Ok(topic)
     }
 
     /// Minimum time between two messages of a topic; `None` if it is not sent.
@@ -158,6 +184,7 @@ impl Subscriptions {
             .map_or(0, |subscription| subscription.number)
     }
 
+    /// The subscription to chunks that a message describes; `None` if it ends the subscription.
     fn chunk_subscription(
         &self,
         period: Option<Duration>,
@@ -176,7 +203,7 @@ impl Subscriptions {
                 got: max_bytes_per_sec,
             });
         }
-        let number = 1 + self.number(model_chunks::NAME);
+        let number = 1 + self.number(MODEL_CHUNKS);
         Ok(Some(ChunkSubscription {
             number,
             method: method.into(),
@@ -200,11 +227,13 @@ impl Subscriptions {
             .any(|images| images.period.is_some())
     }
 
+    /// Subscribes to the images of one camera, instead of the subscription for all cameras.
     fn set_camera(
         &mut self,
         camera: String,
         images: ImageSubscription,
     ) -> Result<(), InvalidRequest> {
+        // At the limit, the rate of a known camera can still be changed.
         let is_known = self.cameras.contains_key(&*camera);
         if camera.len() > MAX_NAME_BYTES || (!is_known && self.cameras.len() >= MAX_CAMERAS) {
             return Err(InvalidRequest::Cameras {
@@ -225,8 +254,10 @@ impl Subscriptions {
     reason = "smaller than the image"
 )]
 pub(crate) fn fitted(size_px: [u32; 2], max_px: [u32; 2]) -> [u32; 2] {
+    // An image without pixels must not lead to a division by zero.
     let ratio = |axis: usize| f64::from(max_px[axis]) / f64::from(size_px[axis].max(1));
     let scale = ratio(0).min(ratio(1)).min(1.0);
+    // The short side of a long, thin image would be rounded to 0 pixels.
     size_px.map(|side| ((f64::from(side) * scale).round() as u32).clamp(1, side.max(1)))
 }
 

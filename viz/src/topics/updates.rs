@@ -7,6 +7,8 @@ use std::sync::Arc;
 use std::time::Instant;
 
 /// Maximum number of points of the accuracy curve on the page. Longer curves are thinned evenly.
+/// The curve is a part of every status message, several times per second, while the chart is only
+/// some hundred pixels wide.
 const MAX_HISTORY: usize = 512;
 
 /// Status of a run.
@@ -90,6 +92,7 @@ impl Status {
             let n = model.psnr_history.len();
             if n > MAX_HISTORY {
                 let last = n - 1;
+                // From index 0 to index `last`, both included. The page shows the newest score.
                 let kept = |ix: usize| model.psnr_history[ix * last / (MAX_HISTORY - 1)];
                 model.psnr_history = (0..MAX_HISTORY).map(kept).collect();
             }

@@ -180,6 +180,7 @@ pub enum StateCommand {
 impl Mode {
     /// Whether the value of [`SUPPORTED_MODES`] includes this mode.
     pub fn is_in(self, supported: u32) -> bool {
+        // The object counts modes from 1 and bits from 0.
         supported >> (self as i8 - 1) & 1 == 1
     }
 }
@@ -202,6 +203,7 @@ impl State {
     /// Decodes the state in a statusword. Mode-specific and manufacturer-specific bits are ignored.
     pub fn from_statusword(statusword: u16) -> Result<Self, CanError> {
         // Bit 5 (quick stop, active low) is part of the state only in powered or ready states.
+        // Bits 0 to 3 and 6 are part of every state.
         match (statusword & 0x4F, statusword & 0x20 != 0) {
             (0x00, _) => Ok(Self::NotReadyToSwitchOn),
             (0x40, _) => Ok(Self::SwitchOnDisabled),
@@ -227,6 +229,8 @@ impl State {
             Self::SwitchOnDisabled => Some(StateCommand::Shutdown),
             Self::ReadyToSwitchOn => Some(StateCommand::SwitchOn),
             Self::SwitchedOn => Some(StateCommand::EnableOperation),
+            // A drive need not support the transition back to the enabled state, so the way leads
+            // through the disabled state.
             Self::QuickStopActive => Some(StateCommand::DisableVoltage),
             Self::Fault if may_reset_fault => Some(StateCommand::ResetFault),
             Self::Fault
@@ -260,6 +264,8 @@ impl State {
             (Self::OperationEnabled | Self::QuickStopActive, StateCommand::DisableVoltage) => {
                 Self::SwitchOnDisabled
             }
+            // A fault ignores all other commands, so that no command enables a faulty drive by
+            // accident.
             (Self::Fault, StateCommand::ResetFault) => Self::SwitchOnDisabled,
             (state, _) => state,
         }
@@ -341,14 +347,16 @@ fn checked_count(
     value: f64,
     unit: f64,
 ) -> Result<i32, CanError> {
-    match (range.0..=range.1).contains(&count) {
-        true => Ok(count as i32),
-        false => Err(CanError::Range {
+    // NaN is in no range, so it is rejected as well.
+    if (range.0..=range.1).contains(&count) {
+        Ok(count as i32)
+    } else {
+        Err(CanError::Range {
             field,
             value,
             lower: range.0 * unit,
             upper: range.1 * unit,
-        }),
+        })
     }
 }
 

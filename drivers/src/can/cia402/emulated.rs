@@ -19,9 +19,13 @@ fn number(index: u16, subindex: u8) -> u32 {
 /// Decodes the command in a controlword; `None` if its bits form no command. Source: CiA 402-2,
 /// table of the controlword.
 fn decode_controlword(controlword: u16, before: u16) -> Option<StateCommand> {
+    // A reset is a rising edge of bit 7, so a controlword that is repeated in each cycle resets a
+    // fault only once.
     if controlword & !before & 0x80 != 0 {
         return Some(StateCommand::ResetFault);
     }
+    // The masks are the "don't care" bits of the table: disabling and the quick stop ignore most
+    // bits, so they work whatever was sent before.
     match controlword & 0x8F {
         word if word & 0x82 == 0 => Some(StateCommand::DisableVoltage),
         word if word & 0x86 == 0x02 => Some(StateCommand::QuickStop),
@@ -53,6 +57,8 @@ impl EmulatedProtocol for EmulatedCia402 {
             return Ok(Vec::new());
         }
         let node = self.address.node;
+        // Identifiers of the predefined connection set of CiA 301: 0 is NMT, 0x80 SYNC, 0x580 and
+        // 0x600 SDO answers and requests, 0x700 heartbeats.
         let sdo = 0x600 + u32::from(node.number());
         let watched_node = written(drive, CONSUMER_HEARTBEAT).map_or(0, |entry| entry >> 16 & 0x7F);
         match (frame.id().value(), frame.data()) {
@@ -65,6 +71,7 @@ impl EmulatedProtocol for EmulatedCia402 {
                 };
                 Ok(Vec::new())
             }
+            // Outside the operational state, PDOs are neither sent nor accepted.
             (0x80, &[]) if self.node_state == NodeState::Operational => self.synchronous(drive),
             (id, &[_]) if watched_node > 0 && id == 0x700 + watched_node => {
                 drive.reset_watchdog();
@@ -73,6 +80,7 @@ impl EmulatedProtocol for EmulatedCia402 {
             (id, &[low, high, a, b, c, d])
                 if id == Pdo::First.id(Direction::Receive, node).value() =>
             {
+                // The command takes effect at the next SYNC, as for all drives of the bus.
                 if self.node_state == NodeState::Operational && self.accepts_targets(drive) {
                     self.pending_command = Some((
                         u16::from_le_bytes([low, high]),
@@ -82,27 +90,7 @@ impl EmulatedProtocol for EmulatedCia402 {
                 Ok(Vec::new())
             }
             (id, &[command, low, high, subindex, a, b, c, d]) if id == sdo => {
-                let index = u16::from_le_bytes([low, high]);
-                let answer = match command >> 5 {
-                    1 => {
-                        let value = u32::from_le_bytes([a, b, c, d]);
-                        let is_timeout = index == CONSUMER_HEARTBEAT.index;
-                        drive.set(number(index, subindex), value, is_timeout);
-                        if index == codec::CONTROLWORD.index {
-                            self.state_command(u16::from_le_bytes([a, b]), None, drive);
-                        }
-                        [0x60, low, high, subindex, 0, 0, 0, 0]
-                    }
-                    2 => {
-                        let [a, b, c, d] = self.reply(index, subindex, drive).to_le_bytes();
-                        [0x43, low, high, subindex, a, b, c, d]
-                    }
-                    _ => return Ok(Vec::new()),
-                };
-                Ok(vec![Frame::classic(
-                    Id::standard(0x580 + u32::from(node.number()))?,
-                    &answer,
-                )?])
+                self.answer_sdo([command, low, high, subindex, a, b, c, d], drive)
             }
             _ => Ok(Vec::new()),
         }
@@ -116,6 +104,8 @@ impl EmulatedProtocol for EmulatedCia402 {
     }
 
     fn timeout(&self, drive: &EmulatedDrive) -> Option<Duration> {
+        // The lower half of the entry is the time, the upper half the node. A time of 0 disables
+        // the consumer.
         let millis = written(drive, CONSUMER_HEARTBEAT)? & 0xFFFF;
         (millis > 0).then(|| Duration::from_millis(millis.into()))
     }
@@ -126,6 +116,8 @@ impl EmulatedProtocol for EmulatedCia402 {
             return;
         }
         match written(drive, codec::ABORT_CONNECTION) {
+            // See `codec::ABORT_CONNECTION` for the numbers. Without a setting, the drive
+            // continues.
             Some(1) => self.change_state(codec::State::Fault, drive),
             Some(2) => self.change_state(codec::State::SwitchOnDisabled, drive),
             Some(3) => self.change_state(codec::State::QuickStopActive, drive),
@@ -148,6 +140,35 @@ impl EmulatedCia402 {
             pending_command: None,
             last_controlword: 0,
         }
+    }
+
+    /// Executes a request to read or write an object, and returns the answer.
+    fn answer_sdo(
+        &mut self,
+        [command, low, high, subindex, a, b, c, d]: [u8; 8],
+        drive: &mut EmulatedDrive,
+    ) -> Result<Vec<Frame>, CanError> {
+        let index = u16::from_le_bytes([low, high]);
+        // The upper three bits are the command specifier: 1 starts a write, 2 a read.
+        let answer = match command >> 5 {
+            1 => {
+                let value = u32::from_le_bytes([a, b, c, d]);
+                let is_timeout = index == CONSUMER_HEARTBEAT.index;
+                drive.set(number(index, subindex), value, is_timeout);
+                if index == codec::CONTROLWORD.index {
+                    // A controlword by SDO takes effect at once, without a SYNC.
+                    self.state_command(u16::from_le_bytes([a, b]), None, drive);
+                }
+                [0x60, low, high, subindex, 0, 0, 0, 0]
+            }
+            2 => {
+                let [a, b, c, d] = self.reply(index, subindex, drive).to_le_bytes();
+                [0x43, low, high, subindex, a, b, c, d]
+            }
+            _ => return Ok(Vec::new()),
+        };
+        let id = Id::standard(0x580 + u32::from(self.address.node.number()))?;
+        Ok(vec![Frame::classic(id, &answer)?])
     }
 
     /// Value of an object.
@@ -204,6 +225,7 @@ impl EmulatedCia402 {
         self.state = state;
         drive.actuation = match state {
             codec::State::OperationEnabled => {
+                // A drive holds its position when it is enabled, until the first target arrives.
                 let position_rad = drive.motion().position_rad;
                 Actuation::Follow(Command {
                     position_rad,
@@ -211,6 +233,8 @@ impl EmulatedCia402 {
                 })
             }
             codec::State::QuickStopActive => match written(drive, codec::QUICK_STOP_OPTION) {
+                // Only these values keep the drive in the state; with the others, it releases the
+                // shaft.
                 Some(5..=7) => Actuation::Stop,
                 _ => {
                     self.state = codec::State::SwitchOnDisabled;

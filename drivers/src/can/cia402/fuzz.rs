@@ -36,7 +36,8 @@ pub(super) fn fuzzing() -> FamilyFuzzing {
 #[cfg(test)]
 fn set_up(node: Node) -> Vec<Frame> {
     use crate::wire::can::canopen::{Direction, Nmt, Pdo, encode_nmt, encode_write};
-    let (pdo, direction) = (Pdo::First, Direction::Transmit);
+    let pdo = Pdo::First;
+    let direction = Direction::Transmit;
     let objects = [
         (pdo.mapping(direction, 1), codec::POSITION.mapped().into()),
         (pdo.mapping(direction, 2), codec::VELOCITY.mapped().into()),

@@ -30,7 +30,9 @@ use crate::wire::can::mit::Limits;
 use std::ops::RangeInclusive;
 use std::sync::Arc;
 
-/// Heartbeat interval to which a drive is set, milliseconds.
+/// Heartbeat interval to which a drive is set, milliseconds. The first heartbeat proves that the
+/// drive is operational, so a longer interval slows the set-up of each drive; a shorter one takes
+/// bandwidth from the cycle.
 const HEARTBEAT_MILLIS: i64 = 500;
 const COUNTS_PER_TURN: &str = "counts_per_turn";
 const RATED_TORQUE_NM: &str = "rated_torque_nm";
@@ -74,6 +76,7 @@ impl MotorFamily for Cia402Family {
     fn motor(&self, settings: &MotorSettings) -> Option<Arc<dyn MotorProtocol>> {
         let node = Node::new(u8::try_from(settings.id).ok()?).ok()?;
         let counts_per_turn = settings.number(COUNTS_PER_TURN)?;
+        // Torques are optional: reading positions does not need them.
         let rated_torque_nm = settings.number(RATED_TORQUE_NM).unwrap_or(0.0);
         Some(Arc::new(Cia402 {
             node,
@@ -102,6 +105,7 @@ pub struct Cia402 {
 impl Cia402 {
     fn limits(self) -> Limits {
         Limits {
+            // Beyond 32 bits of counts, a target cannot be encoded.
             position_rad: self.units.rad_from_raw(i32::MAX),
             ..UNLIMITED
         }
@@ -140,6 +144,7 @@ impl MotorProtocol for Cia402 {
     /// Makes the drive send position and velocity at every SYNC, and starts it. The drive stays
     /// disabled.
     fn set_up(&self, query: &MotorQuery<'_>) -> Result<Limits, Error> {
+        // Two objects of four bytes fill one PDO, so one frame per SYNC reports the motion.
         let objects = [codec::POSITION, codec::VELOCITY];
         let mut entries =
             setup::map_pdo_at_every_sync(Pdo::First, Direction::Transmit, self.node, &objects);
@@ -165,13 +170,9 @@ impl MotorProtocol for Cia402 {
         }
         let [a, b, c, d, e, f, g, h] = *<&[u8; 8]>::try_from(frame.data()).ok()?;
         let [position, velocity] = [[a, b, c, d], [e, f, g, h]].map(i32::from_le_bytes);
-        let (position_rad, velocity_rad_s) = (
-            self.units.rad_from_raw(position),
-            self.units.rad_from_raw(velocity),
-        );
         Some(MotorReading {
-            position_rad,
-            velocity_rad_s,
+            position_rad: self.units.rad_from_raw(position),
+            velocity_rad_s: self.units.rad_from_raw(velocity),
             torque_nm: None,
         })
     }
@@ -191,6 +192,7 @@ impl MotorProtocol for Cia402 {
     fn motion(&self, _limits: &Limits) -> Box<dyn MotionProtocol> {
         Box::new(motion::Cia402Motion {
             address: *self,
+            // Until the drive reports its state, its commands must not enable it.
             state: codec::State::NotReadyToSwitchOn,
         })
     }

@@ -48,6 +48,8 @@ impl MotionProtocol for Cia402Motion {
     fn switch_off(&self, query: &MotorQuery<'_>) -> Result<(), Error> {
         let node = self.address.node;
         let deadline = clock::now() + MAX_CHANGE;
+        // A drive may need several commands: a fault reaction must end before the fault can be
+        // reset, and after that the drive may still be powered.
         loop {
             let statusword = get(query, node, codec::STATUSWORD)?;
             let [low, high, ..] = statusword.to_le_bytes();
@@ -77,14 +79,18 @@ impl MotionProtocol for Cia402Motion {
 
     fn set_watchdog(&self, query: &MotorQuery<'_>, plan: &WatchdogPlan) -> Result<(), Error> {
         let node = self.address.node;
+        // A time that does not fit is shortened, which stops the drive earlier rather than later.
         let millis = u16::try_from(plan.timeout.as_millis()).unwrap_or(u16::MAX);
         let heartbeat = canopen::consumer_heartbeat(plan.host, millis);
         set_and_check(query, node, canopen::CONSUMER_HEARTBEAT, heartbeat.into())?;
         let reaction = match plan.on_loss {
             OnLoss::Hold => {
+                // With other values, the drive would release the shaft after the stop, and an arm
+                // without brakes would fall.
                 set_and_check(query, node, codec::QUICK_STOP_OPTION, codec::STAY_STOPPED)?;
                 codec::ABORT_BY_QUICK_STOP
             }
+            // `Damp` is refused before anything is sent, because drives have no such reaction.
             OnLoss::Damp | OnLoss::Release => codec::ABORT_BY_DISABLING,
         };
         set_and_check(query, node, codec::ABORT_CONNECTION, reaction)
@@ -93,12 +99,16 @@ impl MotionProtocol for Cia402Motion {
     /// Makes the drive accept a position and report its state at every SYNC.
     fn set_mode(&self, query: &MotorQuery<'_>, plan: &WatchdogPlan) -> Result<(), Error> {
         let node = self.address.node;
+        // In the cyclic mode, the drive follows our trajectory directly. In the profile modes, it
+        // would add its own ramps to each target.
         let supported = get(query, node, codec::SUPPORTED_MODES)?;
         if !Mode::CyclicPosition.is_in(supported) {
             return Err(query.fault(format!(
                 "the drive has no cyclic synchronous position mode (object 0x6502 is {supported:#x}), and no other mode is supported"
             )));
         }
+        // A drive changes its mode some time after the object is written. A target that arrives
+        // before would be executed in the old mode.
         set(query, node, codec::MODE, Mode::CyclicPosition as i64)?;
         let deadline = clock::now() + MAX_CHANGE;
         while get(query, node, codec::MODE_DISPLAY)? != Mode::CyclicPosition as u32 {
@@ -123,6 +133,8 @@ impl MotionProtocol for Cia402Motion {
                 result => query.map_error(result)?,
             }
         }
+        // Controlword and target travel in one PDO. In two, a drive could be enabled with an old
+        // target.
         let targets = [codec::CONTROLWORD, codec::TARGET_POSITION];
         let mut entries = map_pdo_at_every_sync(Pdo::First, Direction::Receive, node, &targets);
         entries.extend(map_pdo_at_every_sync(
@@ -143,12 +155,16 @@ impl MotionProtocol for Cia402Motion {
     /// fault.
     fn command(&self, command: &Command) -> Result<Frame, CanError> {
         let state_command = match self.state {
+            // The controlword is part of each target, so it must repeat the command that keeps the
+            // drive enabled.
             State::OperationEnabled => StateCommand::EnableOperation,
             state => state
                 .next_enabling_command(false)
                 .unwrap_or(StateCommand::DisableVoltage),
         };
         let [low, high] = state_command.controlword().to_le_bytes();
+        // A position that does not fit is an error, because clamping would move the joint
+        // elsewhere.
         let raw = self
             .address
             .units
@@ -161,6 +177,7 @@ impl MotionProtocol for Cia402Motion {
     }
 
     fn hold(&self, _command: &Command) -> Result<Frame, CanError> {
+        // The drive brakes on its own ramp and then stays stopped, see `set_watchdog`.
         self.encode(StateCommand::QuickStop)
     }
 
@@ -172,6 +189,8 @@ impl MotionProtocol for Cia402Motion {
         self.state = self.decode_state(frame)?;
         Some(match self.state {
             State::OperationEnabled => Health::Enabled,
+            // We send no quick stop while the arm moves, so the drive has stopped for a reason of
+            // its own, such as its watchdog.
             State::QuickStopActive => Health::Fault("the drive made a quick stop".to_owned()),
             State::Fault | State::FaultReactionActive => {
                 Health::Fault("the drive reports a fault".to_owned())

@@ -43,14 +43,17 @@ pub(super) fn set_and_check(
     value: i64,
 ) -> Result<(), Error> {
     set(query, node, object, value)?;
+    // The value may be negative, and the bytes of the answer beyond the object are undefined. Only
+    // the bytes of the object are compared.
     let bits = u32::MAX >> (32 - 8 * u32::from(object.n_bytes));
     let reported = get(query, node, object)? & bits;
-    match i64::from(reported) == value & i64::from(bits) {
-        true => Ok(()),
-        false => Err(query.fault(format!(
+    if i64::from(reported) == value & i64::from(bits) {
+        Ok(())
+    } else {
+        Err(query.fault(format!(
             "object {:#06x}:{:02x} was set to {value} but reads back as {reported:#x}",
             object.index, object.subindex
-        ))),
+        )))
     }
 }
 
@@ -96,12 +99,15 @@ pub(super) fn map_pdo_at_every_sync(
 ) -> Vec<(Object, i64)> {
     let id = i64::from(pdo.id(direction, node).value());
     let mut entries = vec![
+        // Disabled first, then with 0 mapped objects: otherwise, drives refuse changes of the
+        // mapping.
         (pdo.communication(direction, 1), id | PDO_OFF),
         (pdo.mapping(direction, 0), 0),
     ];
     for (place, object) in (1..).zip(objects) {
         entries.push((pdo.mapping(direction, place), object.mapped().into()));
     }
+    // The number of objects comes last: with it, the drive checks and accepts the mapping.
     entries.push((
         pdo.mapping(direction, 0),
         i64::try_from(objects.len()).expect("at most eight objects"),
@@ -119,6 +125,8 @@ pub(super) fn start_drive(
     node: Node,
     entries: &[(Object, i64)],
 ) -> Result<(), Error> {
+    // PDOs are inactive in the pre-operational state, so no half-configured PDO is sent or
+    // accepted.
     query.send(Ok(canopen::encode_nmt(
         Nmt::EnterPreOperational,
         Some(node),
@@ -127,6 +135,8 @@ pub(super) fn start_drive(
         set(query, node, *object, *value)?;
     }
     query.send(Ok(canopen::encode_nmt(Nmt::Start, Some(node))))?;
+    // NMT commands have no answer. The next heartbeat shows whether the drive has executed this
+    // one.
     let started = query.wait(MAX_REPORT, |frame| match canopen::decode_heartbeat(frame) {
         Ok((from, NodeState::Operational)) => (from == node).then_some(()),
         _ => None,

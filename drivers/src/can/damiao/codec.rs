@@ -211,18 +211,20 @@ pub enum Access {
 )]
 pub fn timeout_ticks(timeout_secs: f64) -> Result<u32, CanError> {
     let upper = f64::from(u32::MAX) * TIMEOUT_TICK_SECS;
-    match (0.0..=upper).contains(&timeout_secs) {
-        true if timeout_secs == 0.0 => Ok(0),
-        // Subtract a small amount so that rounding errors do not add a tick. Never return 0, which
-        // would disable the timeout.
-        true => Ok((timeout_secs / TIMEOUT_TICK_SECS - 1e-6).ceil().max(1.0) as u32),
-        false => Err(CanError::Range {
+    if !(0.0..=upper).contains(&timeout_secs) {
+        return Err(CanError::Range {
             field: "the timeout in seconds",
             value: timeout_secs,
             lower: 0.0,
             upper,
-        }),
+        });
     }
+    if timeout_secs == 0.0 {
+        return Ok(0);
+    }
+    // Subtract a small amount so that rounding errors do not add a tick. Never return 0, which
+    // would disable the timeout.
+    Ok((timeout_secs / TIMEOUT_TICK_SECS - 1e-6).ceil().max(1.0) as u32)
 }
 
 /// Converts a value of register `TIMEOUT` to seconds.
@@ -233,6 +235,7 @@ pub fn timeout_secs(ticks: u32) -> f64 {
 /// Ranges of a motor's raw values from its registers `PMAX`, `VMAX` and `TMAX`, which must be
 /// positive.
 pub fn limits_from_registers(p_max: f32, v_max: f32, t_max: f32) -> Result<Limits, CanError> {
+    // A range of 0 or NaN would turn every raw value into the same position, or into NaN.
     for (field, max) in [("PMAX", p_max), ("VMAX", v_max), ("TMAX", t_max)] {
         if !(max > 0.0 && max.is_finite()) {
             return Err(CanError::Range {
@@ -294,18 +297,17 @@ pub fn encode_register(
 /// Decodes a motor's register answer.
 pub fn decode_register(frame: &Frame) -> Result<RegisterMessage, CanError> {
     let [low, high, code, number, a, b, c, d] = eight_bytes(frame, REGISTER, false)?;
-    let register = || {
-        decode_enum("the register", number.into(), &Register::ALL, |known| {
-            known as u32
-        })
-    };
-    let value = |register: Register| match register.is_integer() {
-        true => Value::Integer(u32::from_le_bytes([a, b, c, d])),
-        false => Value::Float(f32::from_le_bytes([a, b, c, d])),
-    };
+    // The kind of access is decoded first, because feedback has the same CAN ID. In feedback, the
+    // byte of the register is part of the velocity.
     let access = match code {
-        0x33 => register().map(|register| Access::Reported(register, value(register)))?,
-        0x55 => register().map(|register| Access::Write(register, value(register)))?,
+        0x33 => {
+            let register = decode_register_number(number)?;
+            Access::Reported(register, decode_value(register, [a, b, c, d]))
+        }
+        0x55 => {
+            let register = decode_register_number(number)?;
+            Access::Write(register, decode_value(register, [a, b, c, d]))
+        }
         other => {
             return Err(CanError::Undefined {
                 field: "the kind of access",
@@ -317,6 +319,22 @@ pub fn decode_register(frame: &Frame) -> Result<RegisterMessage, CanError> {
         motor: u16::from_le_bytes([low, high]),
         access,
     })
+}
+
+/// The register with this number.
+fn decode_register_number(number: u8) -> Result<Register, CanError> {
+    decode_enum("the register", number.into(), &Register::ALL, |known| {
+        known as u32
+    })
+}
+
+/// Decodes the value of a register.
+fn decode_value(register: Register, bytes: [u8; 4]) -> Value {
+    if register.is_integer() {
+        Value::Integer(u32::from_le_bytes(bytes))
+    } else {
+        Value::Float(f32::from_le_bytes(bytes))
+    }
 }
 
 /// Decodes a motor's feedback. Register answers have the same CAN ID, so the caller must
@@ -360,6 +378,7 @@ pub fn encode_feedback(
 fn value_bytes(register: Register, value: Value) -> Result<[u8; 4], CanError> {
     match (register.is_integer(), value) {
         (true, Value::Integer(integer)) => Ok(integer.to_le_bytes()),
+        // A motor would store NaN and use it as a limit.
         (false, Value::Float(real)) if real.is_finite() => Ok(real.to_le_bytes()),
         _ => Err(CanError::Undefined {
             field: "the kind of value of the register",

@@ -20,35 +20,15 @@ impl EmulatedProtocol for EmulatedDamiao {
         let Ok(bytes) = <[u8; 8]>::try_from(frame.data()) else {
             return Ok(Vec::new());
         };
+        // All motors share the ID of register messages, and the payload names the motor.
         if frame.id() == Id::standard(0x7FF)? {
-            let [low, high, code, register, a, b, c, d] = bytes;
-            if u16::from_le_bytes([low, high]) != motor {
-                return Ok(Vec::new());
-            }
-            let reply = |value: u32, code: u8| {
-                let [a, b, c, d] = value.to_le_bytes();
-                Frame::classic(answer_id, &[low, high, code, register, a, b, c, d])
-            };
-            return match code {
-                0x33 => register_value(drive, register)
-                    .map(|value| reply(value, code))
-                    .into_iter()
-                    .collect(),
-                0x55 => {
-                    drive.set(
-                        register.into(),
-                        u32::from_le_bytes([a, b, c, d]),
-                        register == Register::Timeout as u8,
-                    );
-                    Ok(vec![reply(u32::from_le_bytes([a, b, c, d]), code)?])
-                }
-                0xCC => Ok(vec![self.feedback(answer_id, drive)?]),
-                _ => Ok(Vec::new()),
-            };
+            return self.access_register(bytes, drive);
         }
         if frame.id() != Id::standard(motor.into())? {
             return Ok(Vec::new());
         }
+        // State commands and MIT commands have the same ID. Seven bytes of FF are a command with
+        // all values near their upper limits, which no controller sends.
         match bytes {
             [
                 0xFF,
@@ -61,6 +41,7 @@ impl EmulatedProtocol for EmulatedDamiao {
                 state_command @ 0xFB..=0xFE,
             ] => match state_command {
                 0xFB => drive.faults = 0,
+                // A fault must be cleared first.
                 0xFC if drive.faults == 0 => drive.switch_on(),
                 0xFD => drive.actuation = Actuation::Free,
                 _ => {}
@@ -79,6 +60,7 @@ impl EmulatedProtocol for EmulatedDamiao {
     }
 
     fn time_out(&mut self, drive: &mut EmulatedDrive) {
+        // A motor that was disabled already has nothing to report.
         if drive.state() == State::Enabled {
             drive.faults = COMMUNICATION_LOST;
         }
@@ -91,6 +73,41 @@ impl EmulatedProtocol for EmulatedDamiao {
 }
 
 impl EmulatedDamiao {
+    /// Executes a register message, and returns the answer. There is none if the message is for
+    /// another motor.
+    fn access_register(
+        &self,
+        [low, high, code, register, a, b, c, d]: [u8; 8],
+        drive: &mut EmulatedDrive,
+    ) -> Result<Vec<Frame>, CanError> {
+        let Damiao { motor, feedback } = self.0;
+        let answer_id = Id::standard(feedback.into())?;
+        if u16::from_le_bytes([low, high]) != motor {
+            return Ok(Vec::new());
+        }
+        let reply = |value: u32, code: u8| {
+            let [a, b, c, d] = value.to_le_bytes();
+            Frame::classic(answer_id, &[low, high, code, register, a, b, c, d])
+        };
+        match code {
+            0x33 => register_value(drive, register)
+                .map(|value| reply(value, code))
+                .into_iter()
+                .collect(),
+            0x55 => {
+                drive.set(
+                    register.into(),
+                    u32::from_le_bytes([a, b, c, d]),
+                    register == Register::Timeout as u8,
+                );
+                // The answer repeats the message even if the write is ignored, so a driver must
+                // read the register back.
+                Ok(vec![reply(u32::from_le_bytes([a, b, c, d]), code)?])
+            }
+            0xCC => Ok(vec![self.feedback(answer_id, drive)?]),
+            _ => Ok(Vec::new()),
+        }
+    }
     fn feedback(&self, answer_id: Id, drive: &EmulatedDrive) -> Result<Frame, CanError> {
         let status = match (drive.faults, drive.state()) {
             (COMMUNICATION_LOST, _) => Status::LostCommunication,

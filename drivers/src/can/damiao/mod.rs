@@ -90,6 +90,8 @@ impl Damiao {
         };
         let poll_frame = query.map_error(codec::encode_register(&poll_frame, None))?;
         let answer_id = query.map_error(Id::standard(self.feedback.into()))?;
+        // Several motors may answer with the same CAN ID, so the answer must also name the motor
+        // and the register.
         query.request_answer(&poll_frame, |frame| match codec::decode_register(frame) {
             Ok(RegisterMessage {
                 motor: from,
@@ -101,6 +103,16 @@ impl Damiao {
         })
     }
 
+    /// Reads a register that contains a floating-point number.
+    fn float_register(self, query: &MotorQuery<'_>, register: Register) -> Result<f32, Error> {
+        match self.register(query, register)? {
+            Value::Float(real) => Ok(real),
+            Value::Integer(_) => Err(query.fault(format!(
+                "register {register:?} is not a floating-point number"
+            ))),
+        }
+    }
+
     /// The feedback in a frame; `None` if the frame is from another motor or has other content.
     fn feedback(self, frame: &Frame, limits: &Limits) -> Option<codec::Feedback> {
         let is_from_motor =
@@ -108,6 +120,8 @@ impl Damiao {
         let feedback = is_from_motor
             .then(|| codec::decode_feedback(frame, limits).ok())
             .flatten()?;
+        // Feedback contains only the lower four bits of the ID. They detect a second motor with the
+        // same feedback ID.
         (u16::from(feedback.motor_low) == self.motor & 0xF).then_some(feedback)
     }
 
@@ -138,18 +152,14 @@ impl MotorProtocol for Damiao {
     }
 
     fn set_up(&self, query: &MotorQuery<'_>) -> Result<Limits, Error> {
-        let real = |register| match self.register(query, register)? {
-            Value::Float(real) => Ok(real),
-            Value::Integer(_) => Err(query.fault(format!(
-                "register {register:?} is not a floating-point number"
-            ))),
-        };
+        // Owners can change these registers. With wrong ranges, all positions would be scaled
+        // wrongly without any error, so they are read instead of taken from the model.
         let [p_max, v_max, t_max] = [
             Register::PositionLimit,
             Register::VelocityLimit,
             Register::TorqueLimit,
         ]
-        .map(real);
+        .map(|register| self.float_register(query, register));
         let limits = query.map_error(codec::limits_from_registers(p_max?, v_max?, t_max?))?;
         log::debug!("{}: ranges of raw values: {limits:?}", query.name());
         Ok(limits)

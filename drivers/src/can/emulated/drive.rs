@@ -59,6 +59,8 @@ impl EmulatedDrive {
 
     pub(super) fn set_motion(&mut self, motion: Motion) {
         self.shaft.motion = motion;
+        // Otherwise, the next step would simulate the time since the last one, and move the shaft
+        // away from where it was put.
         self.simulated_until = None;
     }
 
@@ -97,6 +99,8 @@ impl EmulatedDrive {
 
     /// Follows an MIT-mode command if the motor is enabled.
     pub(in crate::can) fn obey(&mut self, command: Command) {
+        // Only commands that are followed reset the watchdog. A disabled motor that is polled must
+        // not seem to be commanded.
         if self.state() == State::Enabled {
             self.actuation = Actuation::Mit(command);
             self.target = Some(command);

@@ -109,12 +109,9 @@ impl EmulatedMotor {
     /// Advances the simulation of shaft and watchdog to `now`, and returns the unsolicited frames.
     pub fn report(&mut self, now: Stamp) -> Result<Vec<Frame>, CanError> {
         self.drive.advance(now);
-        let has_timed_out = |reset_at: Stamp| {
-            self.protocol
-                .timeout(&self.drive)
-                .is_some_and(|timeout| now.duration_since(reset_at) > timeout)
-        };
-        if self.drive.watchdog_reset_at.is_some_and(has_timed_out) {
+        // The shaft moves up to `now` under the last command before the watchdog is checked. Called
+        // once per millisecond, this delays the reaction by a millisecond at most.
+        if self.has_timed_out(now) {
             self.time_out(now);
         }
         let mut sent = Vec::new();
@@ -127,9 +124,23 @@ impl EmulatedMotor {
         Ok(sent)
     }
 
-    /// Lets the watchdog expire if it is due.
+    /// Whether the watchdog has been running for longer than its timeout.
+    fn has_timed_out(&self, now: Stamp) -> bool {
+        // A watchdog that was never reset is not running.
+        let Some(reset_at) = self.drive.watchdog_reset_at else {
+            return false;
+        };
+        self.protocol
+            .timeout(&self.drive)
+            .is_some_and(|timeout| now.duration_since(reset_at) > timeout)
+    }
+
+    /// Lets the watchdog expire.
     fn time_out(&mut self, now: Stamp) {
+        // It expires once, and runs again after the next command.
         self.drive.watchdog_reset_at = None;
+        // The time is recorded for tests, which ask when a motor was stopped. An idle motor was
+        // not.
         if self.state() == State::Enabled {
             self.drive.timed_out_at = Some(now);
         }

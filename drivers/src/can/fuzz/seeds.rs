@@ -12,25 +12,27 @@ use std::time::Duration;
 
 /// Encodes frames in the format of [`super::decode_frames`].
 pub(crate) fn encode_frames(frames: &[Frame]) -> Vec<u8> {
-    let encode = |frame: &Frame| {
-        let n = frame.n_bytes();
-        let code = if n <= 8 {
-            n
-        } else {
-            9 + FD_LENGTHS
-                .iter()
-                .position(|len| *len == n)
-                .expect("an FD length")
-        };
-        let flag = |condition: bool, bit: u8| if condition { bit } else { 0 };
-        let head = u8::try_from(code).expect("small")
-            | flag(frame.id().is_extended(), 0x10)
-            | flag(frame.is_remote(), 0x20)
-            | flag(frame.is_fd(), 0x40)
-            | flag(frame.is_switched(), 0x80);
-        [&[head][..], &frame.id().value().to_le_bytes(), frame.data()].concat()
+    frames.iter().flat_map(encode_frame).collect()
+}
+
+fn encode_frame(frame: &Frame) -> Vec<u8> {
+    let n = frame.n_bytes();
+    // A DLC (data length code) above 8 is an index into the lengths of FD frames.
+    let code = if n <= 8 {
+        n
+    } else {
+        9 + FD_LENGTHS
+            .iter()
+            .position(|len| *len == n)
+            .expect("an FD length")
     };
-    frames.iter().flat_map(encode).collect()
+    let flag = |condition: bool, bit: u8| if condition { bit } else { 0 };
+    let head = u8::try_from(code).expect("small")
+        | flag(frame.id().is_extended(), 0x10)
+        | flag(frame.is_remote(), 0x20)
+        | flag(frame.is_fd(), 0x40)
+        | flag(frame.is_switched(), 0x80);
+    [&[head][..], &frame.id().value().to_le_bytes(), frame.data()].concat()
 }
 
 /// All frames on the buses while an arm is set up and read for some cycles.
@@ -52,11 +54,14 @@ pub(super) fn record_traffic() -> Vec<(Vec<Frame>, Vec<Reading>)> {
 fn record_traffic_of(config: &MotorConfig) -> (Vec<Frame>, Vec<Reading>) {
     let mut emulated = EmulatedMotor::new(&*config.protocol, LIMITS);
     let listeners = Motor::with_limits(config.clone(), LIMITS);
-    let (mut sent_frames, mut expected_readings) = (fuzzing(config).set_up, Vec::new());
+    let mut sent_frames = fuzzing(config).set_up;
+    let mut expected_readings = Vec::new();
     for frame in sent_frames.clone() {
         sent_frames.extend(emulated.take(&frame).expect("a frame of the driver"));
     }
     for cycle in 0..6_u16 {
+        // The position differs in each cycle, so that tests can tell which reading a corrupted
+        // frame came from.
         emulated.set_motion(Motion {
             position_rad: 0.4 * f64::from(cycle),
             velocity_rad_s: 0.5,

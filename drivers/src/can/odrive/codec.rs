@@ -25,6 +25,8 @@ pub struct Node(u8);
 impl Node {
     /// Creates a node ID.
     pub fn new(number: u8) -> Result<Self, CanError> {
+        // 63 is valid on the wire, where an axis without an ID uses it. Rig files cannot contain
+        // it.
         match number {
             0..=63 => Ok(Self(number)),
             _ => Err(CanError::IdRange {
@@ -221,15 +223,13 @@ pub enum Answer {
 /// Encodes a request to a node.
 pub fn encode_request(node: Node, request: &Request) -> Result<Frame, CanError> {
     let data = |code: Code, bytes: &[u8]| Frame::classic(id_of(node, code)?, bytes);
-    let endpoint = |opcode: u8, endpoint: u16, value: [u8; 4]| {
-        let ([low, high], [a, b, c, d]) = (endpoint.to_le_bytes(), value);
-        data(Code::EndpointRequest, &[opcode, low, high, 0, a, b, c, d])
-    };
     match *request {
         Request::Ask(code) => Frame::remote(id_of(node, code)?, 8),
         Request::EmergencyStop => data(Code::EmergencyStop, &[]),
         Request::ClearErrors => data(Code::ClearErrors, &[0]),
         Request::SetState(state) => data(Code::SetState, &u32::from(state as u8).to_le_bytes()),
+        // Input mode 1 passes targets through. With a ramp or filter of the axis, a joint would lag
+        // the planned trajectory.
         Request::SetMode(control) => data(Code::SetMode, &[control as u8, 0, 0, 0, 1, 0, 0, 0]),
         Request::SetPosition {
             position_rad,
@@ -254,9 +254,20 @@ pub fn encode_request(node: Node, request: &Request) -> Result<Frame, CanError> 
         Request::SetTorque(torque_nm) => {
             data(Code::SetTorque, &encode_f32("the torque", torque_nm)?)
         }
-        Request::ReadEndpoint(number) => endpoint(0, number, [0; 4]),
-        Request::WriteEndpoint(number, value) => endpoint(1, number, value),
+        Request::ReadEndpoint(number) => {
+            data(Code::EndpointRequest, &endpoint_bytes(0, number, [0; 4]))
+        }
+        Request::WriteEndpoint(number, value) => {
+            data(Code::EndpointRequest, &endpoint_bytes(1, number, value))
+        }
     }
+}
+
+/// Payload of an endpoint request; `opcode` is 0 to read and 1 to write.
+fn endpoint_bytes(opcode: u8, number: u16, value: [u8; 4]) -> [u8; 8] {
+    let [low, high] = number.to_le_bytes();
+    let [a, b, c, d] = value;
+    [opcode, low, high, 0, a, b, c, d]
 }
 
 /// Decodes a message from a node.
@@ -269,32 +280,29 @@ pub fn decode_answer(frame: &Frame) -> Result<(Node, Answer), CanError> {
         });
     }
     let [.., high, low] = id.value().to_be_bytes();
+    // The 11 bits of the identifier are a node of six bits and a command of five.
     let number = high << 3 | low >> 5;
     let got_bytes = frame.data().len();
-    let Ok([a, b, c, d, e, f, g, h]) = <[u8; 8]>::try_from(frame.data()) else {
+    let Ok(bytes) = <[u8; 8]>::try_from(frame.data()) else {
         return Err(CanError::Length {
             message: MESSAGE,
             got_bytes,
             expected_bytes: 8,
         });
     };
-    let words = (
+    let answer = decode_payload(low & 0x1F, bytes)?;
+    Ok((Node(number), answer))
+}
+
+/// Decodes the payload of the message with the command `code`.
+fn decode_payload(code: u8, [a, b, c, d, e, f, g, h]: [u8; 8]) -> Result<Answer, CanError> {
+    // Most payloads consist of two words, integers or floats. In the others, the bytes have their
+    // own meaning.
+    let words = [
         u32::from_le_bytes([a, b, c, d]),
         u32::from_le_bytes([e, f, g, h]),
-    );
-    let reals = || {
-        let (first, second) = (
-            f64::from(f32::from_bits(words.0)),
-            f64::from(f32::from_bits(words.1)),
-        );
-        match first.is_finite() && second.is_finite() {
-            true => Ok((first, second)),
-            false => Err(CanError::NotFinite {
-                field: "a value of an ODrive",
-            }),
-        }
-    };
-    let is = |code: Code| low & 0x1F == code as u8;
+    ];
+    let is = |known: Code| code == known as u8;
     let answer = if is(Code::Version) {
         Answer::Version {
             hardware: [b, c, d],
@@ -305,30 +313,30 @@ pub fn decode_answer(frame: &Frame) -> Result<(Node, Answer), CanError> {
             known as u32
         })?;
         Answer::Heartbeat {
-            errors: words.0,
+            errors: words[0],
             state,
         }
     } else if is(Code::Errors) {
         Answer::Errors {
-            active: words.0,
-            disarm_reason: words.1,
+            active: words[0],
+            disarm_reason: words[1],
         }
     } else if is(Code::EndpointAnswer) {
         Answer::Endpoint(u16::from_le_bytes([b, c]), [e, f, g, h])
     } else if is(Code::Motion) {
-        let (position, velocity) = reals()?;
+        let (position, velocity) = finite_pair(words)?;
         Answer::Motion {
             position_rad: position * TAU,
             velocity_rad_s: velocity * TAU,
         }
     } else if is(Code::Current) {
-        let (target_a, measured_a) = reals()?;
+        let (target_a, measured_a) = finite_pair(words)?;
         Answer::Current {
             target_a,
             measured_a,
         }
     } else if is(Code::Torques) {
-        let (target_nm, estimate_nm) = reals()?;
+        let (target_nm, estimate_nm) = finite_pair(words)?;
         Answer::Torques {
             target_nm,
             estimate_nm,
@@ -336,10 +344,23 @@ pub fn decode_answer(frame: &Frame) -> Result<(Node, Answer), CanError> {
     } else {
         return Err(CanError::Undefined {
             field: "the command of an ODrive",
-            raw: u32::from(low & 0x1F),
+            raw: u32::from(code),
         });
     };
-    Ok((Node(number), answer))
+    Ok(answer)
+}
+
+/// The numbers in two words.
+fn finite_pair(words: [u32; 2]) -> Result<(f64, f64), CanError> {
+    let [first, second] = words.map(|word| f64::from(f32::from_bits(word)));
+    // An axis without a calibrated encoder may send NaN, which must not become a position.
+    if first.is_finite() && second.is_finite() {
+        Ok((first, second))
+    } else {
+        Err(CanError::NotFinite {
+            field: "a value of an ODrive",
+        })
+    }
 }
 
 /// Encodes a message from an emulated axis.
@@ -420,9 +441,12 @@ fn encode_f32(field: &'static str, value: f64) -> Result<[u8; 4], CanError> {
     reason = "the cast clamps, as intended"
 )]
 fn encode_thousandths(field: &'static str, value: f64) -> Result<[u8; 2], CanError> {
-    match value.is_nan() {
-        true => Err(CanError::NotFinite { field }),
-        false => Ok(((value / FEED_FORWARD).round() as i16).to_le_bytes()),
+    if value.is_nan() {
+        Err(CanError::NotFinite { field })
+    } else {
+        // Clamping is acceptable for feedforward: the position loop of the axis makes up for it. A
+        // clamped position would be another target.
+        Ok(((value / FEED_FORWARD).round() as i16).to_le_bytes())
     }
 }
 

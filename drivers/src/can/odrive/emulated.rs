@@ -27,6 +27,22 @@ pub fn endpoints() -> Endpoints {
     }
 }
 
+/// Changes the state of an axis to idle (1) or closed-loop control (8). Other states are ignored.
+fn request_state(data: &[u8], drive: &mut EmulatedDrive) {
+    match data {
+        [1, 0, 0, 0] => drive.actuation = Actuation::Free,
+        [8, 0, 0, 0] if drive.faults == 0 => {
+            // It starts at its current position, whatever was requested before.
+            let position_rad = drive.motion().position_rad;
+            drive.actuation = Actuation::Follow(Command {
+                position_rad,
+                ..Command::default()
+            });
+        }
+        _ => {}
+    }
+}
+
 #[derive(Debug)]
 pub(super) struct EmulatedOdrive {
     pub(super) node: Node,
@@ -39,6 +55,8 @@ impl EmulatedProtocol for EmulatedOdrive {
             return Ok(Vec::new());
         }
         let is_object = |code: Code| id.value() & 0x1F == code as u32;
+        // A remote frame requests a message. Of those that nodes do not send periodically, the
+        // driver needs only the version.
         if frame.is_remote() {
             let version = Answer::Version {
                 hardware: HARDWARE,
@@ -51,18 +69,7 @@ impl EmulatedProtocol for EmulatedOdrive {
             };
         }
         if is_object(Code::SetState) {
-            match frame.data() {
-                [1, 0, 0, 0] => drive.actuation = Actuation::Free,
-                [8, 0, 0, 0] if drive.faults == 0 => {
-                    // It starts at its current position, whatever was requested before.
-                    let position_rad = drive.motion().position_rad;
-                    drive.actuation = Actuation::Follow(Command {
-                        position_rad,
-                        ..Command::default()
-                    });
-                }
-                _ => {}
-            }
+            request_state(frame.data(), drive);
         } else if is_object(Code::ClearErrors) {
             drive.faults = 0;
         } else if is_object(Code::SetPosition) {
@@ -74,6 +81,7 @@ impl EmulatedProtocol for EmulatedOdrive {
                 velocity_rad_s: f64::from(i16::from_le_bytes([e, f])) * 1e-3 * TAU,
                 ..Command::default()
             };
+            // An idle axis does not remember targets.
             if drive.state() == State::Enabled {
                 drive.actuation = Actuation::Follow(command);
                 drive.target = Some(command);

@@ -52,21 +52,27 @@ struct Endpoint {
     kind: String,
 }
 
+impl Flat {
+    /// Number of the endpoint with this path and type.
+    fn number(&self, name: &'static str, kind: &'static str) -> Result<u16, EndpointsError> {
+        // The type determines how the bytes of a value are encoded. With another one, the timeout
+        // would be written as a different number.
+        let found = self
+            .endpoints
+            .get(name)
+            .filter(|endpoint| endpoint.kind == kind);
+        found
+            .map(|endpoint| endpoint.id)
+            .ok_or(EndpointsError::Missing { name, kind })
+    }
+}
+
 impl Endpoints {
     /// Parses the text of a `flat_endpoints.json`.
     pub fn parse(text: &str) -> Result<Self, EndpointsError> {
         let flat: Flat = serde_json::from_str(text)?;
-        let number = |name: &'static str, kind: &'static str| {
-            let found = flat
-                .endpoints
-                .get(name)
-                .filter(|endpoint| endpoint.kind == kind);
-            found
-                .map(|endpoint| endpoint.id)
-                .ok_or(EndpointsError::Missing { name, kind })
-        };
-        let watchdog_timeout = number("axis0.config.watchdog_timeout", "float")?;
-        let enable_watchdog = number("axis0.config.enable_watchdog", "bool")?;
+        let watchdog_timeout = flat.number("axis0.config.watchdog_timeout", "float")?;
+        let enable_watchdog = flat.number("axis0.config.enable_watchdog", "bool")?;
         Ok(Self {
             firmware: flat.fw_version,
             hardware: flat.hw_version,

@@ -29,7 +29,8 @@ use codec::Answer;
 use std::ops::RangeInclusive;
 use std::sync::Arc;
 
-/// Default rate of encoder messages.
+/// Default rate of encoder messages. It is used to estimate the bus load; an axis with another rate
+/// loads the bus more or less.
 const REPORT_HZ: f64 = 100.0;
 /// Default rate of heartbeats, which contain the state of the axis.
 const HEARTBEAT_HZ: f64 = 10.0;
@@ -131,10 +132,14 @@ impl MotorProtocol for Odrive {
     }
 
     fn watchdog(&self, plan: &WatchdogPlan) -> Watchdog {
+        // The endpoint numbers change with the firmware. Without the file of this firmware, a write
+        // could change any other setting of the axis.
         match plan.endpoints {
             Some(_) => Watchdog::Available(&[OnLoss::Release]),
             None => Watchdog::Missing {
                 reason: "without arm.motion.odrive_endpoints the watchdog of this axis cannot be set",
+                // An axis in position mode holds its last target by itself. It has no command for
+                // damping.
                 actions: &[OnLoss::Hold, OnLoss::Release],
             },
         }

@@ -10,7 +10,8 @@ use crate::wire::can::mit::Command;
 use crate::wire::can::{CanError, Frame};
 use std::time::Duration;
 
-/// Longest interval between reports of an axis.
+/// Longest interval between reports of an axis. Encoder messages come every 10 ms by default, so
+/// this tolerates a few lost ones, and slower settings of the axis.
 const MAX_REPORT_INTERVAL: Duration = Duration::from_millis(50);
 
 /// An `ODrive` axis that may be moved.
@@ -40,17 +41,19 @@ impl OdriveMotion {
 
     /// Checks that the endpoint numbers belong to the firmware of the axis.
     fn check_endpoints(&self, query: &MotorQuery<'_>, endpoints: &Endpoints) -> Result<(), Error> {
+        // As in `can_restore_config.py` of ODrive, this comes before any write.
         let (hardware, firmware) =
             self.ask(query, &Request::Ask(Code::Version), |answer| match answer {
                 Answer::Version { hardware, firmware } => Some((hardware, firmware)),
                 _ => None,
             })?;
-        match endpoints.match_versions(hardware, firmware) {
-            true => Ok(()),
-            false => Err(query.fault(format!(
+        if endpoints.match_versions(hardware, firmware) {
+            Ok(())
+        } else {
+            Err(query.fault(format!(
                 "it runs firmware {firmware:?} on hardware {hardware:?}, but arm.motion.odrive_endpoints is for firmware {} on hardware {}",
                 endpoints.firmware, endpoints.hardware
-            ))),
+            )))
         }
     }
 }
@@ -60,9 +63,12 @@ impl MotionProtocol for OdriveMotion {
         for request in [Request::SetState(State::Idle), Request::ClearErrors] {
             query.send(self.encode(&request))?;
         }
+        // Neither request has an answer, but the heartbeat reports state and errors.
         let mut last = None;
         let off = query.wait(MAX_CHANGE, |frame| match codec::decode_answer(frame) {
             Ok((from, Answer::Heartbeat { errors, state })) if from == self.node => {
+                // A watchdog that is still enabled from an earlier run expires again while the axis
+                // is idle, so this error may be set at any time.
                 last = Some((errors & !codec::WATCHDOG_TIMER_EXPIRED, state));
                 (last == Some((0, State::Idle))).then_some(())
             }
@@ -86,6 +92,8 @@ impl MotionProtocol for OdriveMotion {
             (endpoints.enable_watchdog, [1, 0, 0, 0], 1),
         ];
         for (number, bytes, n_bytes) in settings {
+            // The timeout is written before the watchdog is enabled. In the other order, the
+            // watchdog would run with an old timeout.
             query.send(self.encode(&Request::WriteEndpoint(number, bytes)))?;
             let reported = self.ask(
                 query,
@@ -106,6 +114,8 @@ impl MotionProtocol for OdriveMotion {
     }
 
     fn set_mode(&self, query: &MotorQuery<'_>, _plan: &WatchdogPlan) -> Result<(), Error> {
+        // The mode cannot be read over CANSimple. A wrong mode shows as a following error at the
+        // first motion.
         query.send(self.encode(&Request::SetMode(Control::Position)))
     }
 
@@ -129,6 +139,7 @@ impl MotionProtocol for OdriveMotion {
         self.encode(&Request::SetPosition {
             position_rad,
             velocity_rad_s,
+            // There is no model of the load that could predict a torque.
             torque_nm: 0.0,
         })
     }
@@ -142,6 +153,7 @@ impl MotionProtocol for OdriveMotion {
             Ok((from, Answer::Heartbeat { errors, state })) if from == self.node => {
                 Some(match (errors, state) {
                     (0, State::ClosedLoopControl) => Health::Enabled,
+                    // Idle without an error: somebody has disabled the axis.
                     (0, _) => Health::Off,
                     (codec::WATCHDOG_TIMER_EXPIRED, _) => {
                         Health::Fault(COMMUNICATION_LOST.to_owned())

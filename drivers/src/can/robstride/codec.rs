@@ -191,40 +191,14 @@ pub fn encode_request(
     request: &Request,
     limits: &Limits,
 ) -> Result<Frame, CanError> {
+    // Bits 8 to 23 of the identifier contain our ID, except in motion commands, where they contain
+    // the torque. That leaves all eight bytes of payload for the other four values.
     let host_only = u16::from(host);
-    let with_magic = |last: u8| {
-        [
-            MAGIC[0], MAGIC[1], MAGIC[2], MAGIC[3], MAGIC[4], MAGIC[5], last, 8,
-        ]
-    };
     let (kind, middle, bytes) = match *request {
         Request::Identify => (Communication::Identity, host_only, [0; 8]),
         Request::Move(command) => {
-            let scales = Scales::with_bits(limits, 16);
-            let [p1, p0] = scales
-                .position
-                .raw_from_value("the position", command.position_rad)?
-                .to_be_bytes();
-            let [v1, v0] = scales
-                .velocity
-                .raw_from_value("the velocity", command.velocity_rad_s)?
-                .to_be_bytes();
-            let [kp1, kp0] = scales
-                .kp
-                .raw_from_value("kp", command.kp_nm_rad)?
-                .to_be_bytes();
-            let [kd1, kd0] = scales
-                .kd
-                .raw_from_value("kd", command.kd_nm_s_rad)?
-                .to_be_bytes();
-            let torque = scales
-                .torque
-                .raw_from_value("the torque", command.torque_nm)?;
-            (
-                Communication::Motion,
-                torque,
-                [p1, p0, v1, v0, kp1, kp0, kd1, kd0],
-            )
+            let (torque, bytes) = encode_motion_command(&command, limits)?;
+            (Communication::Motion, torque, bytes)
         }
         Request::Enable => (Communication::Enable, host_only, [0; 8]),
         Request::Stop { clear_fault } => (
@@ -253,6 +227,39 @@ pub fn encode_request(
     Frame::classic(id_of(kind, middle, motor)?, &bytes)
 }
 
+/// The torque field of a motion command, which is in its identifier, and its payload.
+fn encode_motion_command(command: &Command, limits: &Limits) -> Result<(u16, [u8; 8]), CanError> {
+    // Unlike in MIT mode, all values have 16 bits, and the payload is big-endian. Parameters are
+    // little-endian.
+    let scales = Scales::with_bits(limits, 16);
+    let [p1, p0] = scales
+        .position
+        .raw_from_value("the position", command.position_rad)?
+        .to_be_bytes();
+    let [v1, v0] = scales
+        .velocity
+        .raw_from_value("the velocity", command.velocity_rad_s)?
+        .to_be_bytes();
+    let [kp1, kp0] = scales
+        .kp
+        .raw_from_value("kp", command.kp_nm_rad)?
+        .to_be_bytes();
+    let [kd1, kd0] = scales
+        .kd
+        .raw_from_value("kd", command.kd_nm_s_rad)?
+        .to_be_bytes();
+    let torque = scales
+        .torque
+        .raw_from_value("the torque", command.torque_nm)?;
+    Ok((torque, [p1, p0, v1, v0, kp1, kp0, kd1, kd0]))
+}
+
+/// Payload of a request that a motor executes only with the fixed bytes.
+fn with_magic(last: u8) -> [u8; 8] {
+    let [a, b, c, d, e, f] = MAGIC;
+    [a, b, c, d, e, f, last, 8]
+}
+
 /// Decodes a motion command to the motor ID `motor`, for emulated motors.
 pub fn decode_move(frame: &Frame, motor: u8, limits: &Limits) -> Option<Command> {
     let [a, b, c, d, e, f, g, h] = eight_bytes(frame, MESSAGE, true).ok()?;
@@ -273,11 +280,13 @@ pub fn decode_move(frame: &Frame, motor: u8, limits: &Limits) -> Option<Command>
 /// Decodes a message from a motor to the host ID `host`.
 pub fn decode_answer(frame: &Frame, host: u8, limits: &Limits) -> Result<Answer, CanError> {
     let bytes = eight_bytes(frame, MESSAGE, true)?;
-    let [kind, flags, motor, to] = frame.id().value().to_be_bytes();
+    let id_bytes = frame.id().value().to_be_bytes();
+    let [kind, flags, motor, to] = id_bytes;
     let foreign = CanError::UnexpectedFrame {
         message: MESSAGE,
         id: frame.id().value(),
     };
+    // Motors broadcast their identity, so this comes before the check of the destination.
     if kind == Communication::Identity as u8 {
         return if to == BROADCAST {
             Ok(Answer::Identity {
@@ -288,30 +297,19 @@ pub fn decode_answer(frame: &Frame, host: u8, limits: &Limits) -> Result<Answer,
             Err(foreign)
         };
     }
+    // Requests have the motor as their destination, so those of other programs are not mistaken for
+    // answers.
     if to != host {
         return Err(foreign);
     }
     let [a, b, c, d, e, f, g, h] = bytes;
     if kind == Communication::Feedback as u8 || kind == Communication::ActiveReport as u8 {
-        let modes = [Mode::Reset, Mode::Calibration, Mode::Run];
-        let scales = Scales::with_bits(limits, 16);
-        return Ok(Answer::Feedback(Feedback {
-            motor,
-            is_unsolicited: kind == Communication::ActiveReport as u8,
-            mode: decode_enum("the mode", (flags >> 6).into(), &modes, |known| {
-                known as u32
-            })?,
-            faults: Faults(flags & 0x3F),
-            motion: Motion {
-                position_rad: scales.position.value_from_raw(u16::from_be_bytes([a, b])),
-                velocity_rad_s: scales.velocity.value_from_raw(u16::from_be_bytes([c, d])),
-                torque_nm: scales.torque.value_from_raw(u16::from_be_bytes([e, f])),
-            },
-            winding_celsius: f64::from(u16::from_be_bytes([g, h])) / 10.0,
-        }));
+        return decode_feedback(id_bytes, bytes, limits).map(Answer::Feedback);
     }
     if kind == Communication::ReadParameter as u8 {
         let index = u16::from_le_bytes([a, b]);
+        // The motor does not know the parameter, or its value cannot be read. The payload is then
+        // undefined.
         if flags != 0 {
             return Err(CanError::Refused {
                 parameter: index.into(),
@@ -326,19 +324,43 @@ pub fn decode_answer(frame: &Frame, host: u8, limits: &Limits) -> Result<Answer,
         });
     }
     if kind == Communication::Fault as u8 {
-        let (faults, warnings) = (
-            u32::from_le_bytes([a, b, c, d]),
-            u32::from_le_bytes([e, f, g, h]),
-        );
         return Ok(Answer::Fault {
             motor,
-            faults,
-            warnings,
+            faults: u32::from_le_bytes([a, b, c, d]),
+            warnings: u32::from_le_bytes([e, f, g, h]),
         });
     }
     Err(CanError::Undefined {
         field: "the communication type",
         raw: kind.into(),
+    })
+}
+
+/// Decodes the state and motion of a motor. `id_bytes` are the bytes of the identifier, the highest
+/// first.
+fn decode_feedback(
+    id_bytes: [u8; 4],
+    bytes: [u8; 8],
+    limits: &Limits,
+) -> Result<Feedback, CanError> {
+    let [kind, flags, motor, _] = id_bytes;
+    let [a, b, c, d, e, f, g, h] = bytes;
+    let modes = [Mode::Reset, Mode::Calibration, Mode::Run];
+    let scales = Scales::with_bits(limits, 16);
+    Ok(Feedback {
+        motor,
+        is_unsolicited: kind == Communication::ActiveReport as u8,
+        // Two bits of mode above six fault bits.
+        mode: decode_enum("the mode", (flags >> 6).into(), &modes, |known| {
+            known as u32
+        })?,
+        faults: Faults(flags & 0x3F),
+        motion: Motion {
+            position_rad: scales.position.value_from_raw(u16::from_be_bytes([a, b])),
+            velocity_rad_s: scales.velocity.value_from_raw(u16::from_be_bytes([c, d])),
+            torque_nm: scales.torque.value_from_raw(u16::from_be_bytes([e, f])),
+        },
+        winding_celsius: f64::from(u16::from_be_bytes([g, h])) / 10.0,
     })
 }
 

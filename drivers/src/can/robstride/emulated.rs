@@ -31,6 +31,8 @@ impl EmulatedProtocol for EmulatedRobstride {
         let parameter = u32::from(u16::from_le_bytes([low, high]));
         match kind {
             1 => {
+                // In other modes, the motor ignores motion commands. Motion mode is the factory
+                // setting.
                 let command = codec::decode_move(frame, self.motor, &drive.limits);
                 if drive
                     .setting(Parameter::RunMode as u32)

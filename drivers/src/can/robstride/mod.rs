@@ -28,7 +28,8 @@ use codec::{Answer, Feedback, Parameter, Request, Value};
 use std::ops::RangeInclusive;
 use std::sync::Arc;
 
-/// Our host ID. The manufacturer's program uses the same ID.
+/// Our host ID, to which motors send their answers. The manufacturer's program uses the same ID, so
+/// fieldrig must not run beside it on one bus.
 pub(super) const HOST: u8 = 0xFD;
 /// Value of [`Parameter::ReportInterval`] for the shortest interval.
 const SHORTEST_REPORT: u32 = 1;
@@ -76,10 +77,8 @@ impl MotorFamily for RobstrideFamily {
     }
 
     fn motor(&self, settings: &MotorSettings) -> Option<Arc<dyn MotorProtocol>> {
-        let (motor, model) = (
-            u8::try_from(settings.id).ok()?,
-            settings.choice(MODEL, &MODELS)?,
-        );
+        let motor = u8::try_from(settings.id).ok()?;
+        let model = settings.choice(MODEL, &MODELS)?;
         Some(Arc::new(Robstride { motor, model }))
     }
 
@@ -154,6 +153,8 @@ impl MotorProtocol for Robstride {
     fn set_up(&self, query: &MotorQuery<'_>) -> Result<Limits, Error> {
         let limits = self.model.limits();
         let interval = Request::Write(Parameter::ReportInterval, Value::Integer(SHORTEST_REPORT));
+        // The interval is set first, so that the first reports already come at the right rate.
+        // Neither request is acknowledged separately: the reports show that both were executed.
         for request in [interval, Request::ReportActively(true)] {
             self.send(query, &request, &limits)?;
         }
@@ -177,6 +178,7 @@ impl MotorProtocol for Robstride {
 
     fn traffic(&self) -> Traffic {
         Traffic {
+            // A motor in motion answers each command, and still sends its periodic reports.
             cycle_frames: vec![long_frame(); 2],
             unsolicited: vec![(long_frame(), REPORT_HZ)],
         }

@@ -38,6 +38,8 @@ impl MotionProtocol for RobstrideMotion {
     fn switch_off(&self, query: &MotorQuery<'_>) -> Result<(), Error> {
         self.address
             .send(query, &Request::Stop { clear_fault: true }, &self.limits)?;
+        // The answer to the stop and the periodic reports have the same content, and an earlier
+        // report may still be queued. The wait ends at the first one that shows the new state.
         let mut last = None;
         let off = query.wait(MAX_CHANGE, |frame| {
             let reported = self.address.feedback(frame, &self.limits)?;
@@ -72,6 +74,7 @@ impl MotionProtocol for RobstrideMotion {
     }
 
     fn release(&self) -> Result<Frame, CanError> {
+        // A fault stays set until a person recovers the arm, so that its reason can still be read.
         self.encode(&Request::Stop { clear_fault: false })
     }
 
@@ -80,6 +83,8 @@ impl MotionProtocol for RobstrideMotion {
             Ok(Answer::Feedback(reported)) if reported.motor == self.address.motor => {
                 Some(match (reported.mode, reported.faults) {
                     (Mode::Run, Faults(0)) => Health::Enabled,
+                    // A motor whose watchdog has expired is in its reset mode without any fault
+                    // bit.
                     (_, Faults(0)) => Health::Off,
                     (_, Faults(bits)) => {
                         Health::Fault(format!("the motor reports the fault bits {bits:#08b}"))

@@ -6,6 +6,7 @@ use crate::wire::can::{CanError, decode_enum};
 
 /// Ticks of `canTimeout` per second.
 const TIMEOUT_TICKS_HZ: f64 = 20_000.0;
+
 /// A parameter that we read or write.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u16)]
@@ -64,6 +65,7 @@ impl Parameter {
     /// Decodes the value in the last four bytes of a message.
     pub(super) fn value(self, [a, b, c, d]: [u8; 4]) -> Value {
         match self.integer_bytes() {
+            // The bytes beyond the size of the parameter are undefined.
             Some(1) => Value::Integer(a.into()),
             Some(2) => Value::Integer(u16::from_le_bytes([a, b]).into()),
             Some(_) => Value::Integer(u32::from_le_bytes([a, b, c, d])),
@@ -74,6 +76,8 @@ impl Parameter {
     /// Encodes a value as the last four bytes of a message.
     pub(super) fn value_bytes(self, value: Value) -> Result<[u8; 4], CanError> {
         match (self.integer_bytes(), value) {
+            // A value that does not fit would be cut off by the motor. The comparison excludes four
+            // bytes, for which the shift would overflow.
             (Some(n_bytes), Value::Integer(whole))
                 if n_bytes == 4 || whole < 1 << (8 * n_bytes) =>
             {
@@ -112,20 +116,21 @@ pub enum Value {
 )]
 pub fn timeout(timeout_secs: f64) -> Result<Value, CanError> {
     let upper = f64::from(u32::MAX) / TIMEOUT_TICKS_HZ;
-    match (0.0..=upper).contains(&timeout_secs) {
-        true if timeout_secs == 0.0 => Ok(Value::Integer(0)),
-        // Subtract a small amount so that rounding errors do not add a tick. Never return 0, which
-        // would disable the timeout.
-        true => Ok(Value::Integer(
-            (timeout_secs * TIMEOUT_TICKS_HZ - 1e-6).ceil().max(1.0) as u32,
-        )),
-        false => Err(CanError::Range {
+    if !(0.0..=upper).contains(&timeout_secs) {
+        return Err(CanError::Range {
             field: "the timeout in seconds",
             value: timeout_secs,
             lower: 0.0,
             upper,
-        }),
+        });
     }
+    if timeout_secs == 0.0 {
+        return Ok(Value::Integer(0));
+    }
+    // Subtract a small amount so that rounding errors do not add a tick. Never return 0, which
+    // would disable the timeout.
+    let ticks = (timeout_secs * TIMEOUT_TICKS_HZ - 1e-6).ceil().max(1.0) as u32;
+    Ok(Value::Integer(ticks))
 }
 
 #[cfg(test)]

@@ -146,6 +146,7 @@ pub fn decode_feedback(
             id: frame.id().value(),
         });
     }
+    // Six bytes from older firmware, eight from newer. Any other length is another message.
     let (motor, motion, rest) = match *frame.data() {
         [motor, a, b, c, d, e, ref rest @ ..] if rest.is_empty() || rest.len() == 2 => {
             (motor, [a, b, c, d, e], rest)
@@ -206,6 +207,7 @@ pub fn encode_feedback(
         } else {
             0.0
         };
+        // Rounded before the check, so that values that round into the range are accepted.
         let count = (drive_celsius + zero).round();
         if !(0.0..=255.0).contains(&count) {
             let field = "the temperature";

@@ -41,6 +41,8 @@ impl EmulatedProtocol for EmulatedTMotor {
             },
             command => drive.obey(mit::decode(&command, &drive.limits)),
         }
+        // Every frame gets an answer, also those that are ignored, because a driver polls with the
+        // command that disables the motor.
         let fault = if drive.faults == 0 {
             Fault::None
         } else {

@@ -69,10 +69,8 @@ impl MotorFamily for TMotorFamily {
     }
 
     fn motor(&self, settings: &MotorSettings) -> Option<Arc<dyn MotorProtocol>> {
-        let (motor, model) = (
-            u8::try_from(settings.id).ok()?,
-            settings.choice(MODEL, &MODELS)?,
-        );
+        let motor = u8::try_from(settings.id).ok()?;
+        let model = settings.choice(MODEL, &MODELS)?;
         Some(Arc::new(TMotor { motor, model }))
     }
 
@@ -132,6 +130,8 @@ impl MotorProtocol for TMotor {
     }
 
     fn typical_answer(&self) -> (Frame, Option<f64>) {
+        // Another master causes its answers, at a rate that is unknown here, so they are left out
+        // of the bus load.
         (short_frame(), Some(0.0))
     }
 
@@ -148,6 +148,8 @@ impl MotorProtocol for TMotor {
     }
 
     fn watchdog(&self, _plan: &WatchdogPlan) -> Watchdog {
+        // All three are commands in MIT mode that the motor executes until the next one, so this
+        // computer can send any of them as its last.
         let actions = &[OnLoss::Hold, OnLoss::Damp, OnLoss::Release];
         Watchdog::Missing {
             reason: "a motor of this family has no watchdog",

@@ -18,6 +18,8 @@ pub(super) struct TMotorMotion {
 
 impl MotionProtocol for TMotorMotion {
     fn switch_off(&self, query: &MotorQuery<'_>) -> Result<(), Error> {
+        // The motor does not report whether it is enabled. Its answer only shows that it has
+        // received the command, which also clears faults.
         let disable = query.map_error(self.release())?;
         query
             .request_answer(&disable, |frame| self.address.feedback(frame, &self.limits))
@@ -55,6 +57,8 @@ impl MotionProtocol for TMotorMotion {
         let reported = self.address.feedback(frame, &self.limits)?;
         // It does not report whether it is enabled.
         Some(match reported.health.map(|health| health.fault) {
+            // Firmware of 2020 and earlier reports no faults. A motor that has stopped then shows
+            // as a following error.
             None | Some(Fault::None) => Health::Enabled,
             Some(fault) => Health::Fault(format!("the motor stopped: {fault:?}")),
         })

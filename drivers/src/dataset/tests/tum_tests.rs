@@ -33,8 +33,8 @@ fn make_unreadable(folder: &Path, list: &str) {
 
 type Change = fn(&Path);
 
-/// A row of the table in docs/reference/datasets.md, words of the message, and the only change to a
-/// folder.
+/// A row of the table in docs/reference/datasets.md, words that the message contains, and a change
+/// to a folder.
 const CASES: &[(&str, &str, Change)] = &[
     ("empty lines, lines that start with `#`", "", |folder| {
         for list in LISTS {
@@ -340,7 +340,7 @@ const CASES: &[(&str, &str, Change)] = &[
     }),
 ];
 
-/// Changes each part of a folder alone, and compares the effect with the table in
+/// Changes one part of a folder at a time, and compares the effect with the table in
 /// docs/reference/datasets.md.
 #[test]
 fn parts_of_tum_folders_are_used_refused_or_named_as_documented() {

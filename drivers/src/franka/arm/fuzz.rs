@@ -38,6 +38,8 @@ pub(crate) fn decode_positions(version: FciVersion, mut bytes: &[u8]) -> Vec<Vec
         let (datagram, rest) = bytes.split_at(n_bytes);
         bytes = rest;
         let mut padded = datagram.to_vec();
+        // States are longer than most fuzzing input. Padding lets short inputs get past the check
+        // of the length.
         padded.resize(super::super::state::n_bytes(version), 0);
         for datagram in [datagram, &padded] {
             at += Duration::from_millis(1);
@@ -78,15 +80,16 @@ pub(crate) fn decode_positions(version: FciVersion, mut bytes: &[u8]) -> Vec<Vec
 
 /// Encodes datagrams in the format of [`states`].
 pub(crate) fn with_length_prefixes(datagrams: &[Vec<u8>]) -> Vec<u8> {
-    let length = |datagram: &[u8]| {
-        u16::try_from(datagram.len())
-            .expect("shorter than 64 kB")
-            .to_le_bytes()
-    };
     datagrams
         .iter()
-        .flat_map(|datagram| [&length(datagram)[..], datagram].concat())
+        .flat_map(|datagram| [&length_prefix(datagram)[..], datagram].concat())
         .collect()
+}
+
+fn length_prefix(datagram: &[u8]) -> [u8; 2] {
+    u16::try_from(datagram.len())
+        .expect("shorter than 64 kB")
+        .to_le_bytes()
 }
 
 #[cfg(test)]

@@ -81,10 +81,6 @@ impl Limits {
 
     /// Limits of the FR3. Source: `franka_description` and `rate_limiting.h` of libfranka 0.21.2.
     pub fn fr3() -> Self {
-        let braking = |(deceleration_rad_s2, margin_rad_s)| BrakingLimit {
-            deceleration_rad_s2,
-            margin_rad_s,
-        };
         let braking = [
             (6.0, 0.3),
             (2.585, 0.2),
@@ -94,7 +90,7 @@ impl Limits {
             (5.5, 0.35),
             (17.0, 0.35),
         ]
-        .map(braking);
+        .map(braking_limit);
         Self {
             position_rad: [
                 [-2.7501, 2.7501],
@@ -115,19 +111,26 @@ impl Limits {
     /// Minimum and maximum velocity of a joint at an angle, rad/s.
     fn velocity_range(&self, ix: usize, position_rad: f64) -> [f64; 2] {
         let [min, max] = self.position_rad[ix];
+        [
+            -self.max_velocity(ix, position_rad - min),
+            self.max_velocity(ix, max - position_rad),
+        ]
+    }
+
+    /// Maximum velocity of a joint towards an end of its range at this distance, rad/s.
+    fn max_velocity(&self, ix: usize, distance_rad: f64) -> f64 {
         let max_rate = self.velocity_rad_s[ix];
-        let towards = |left_rad: f64| match &self.braking {
-            Some(braking) => {
-                let BrakingLimit {
-                    deceleration_rad_s2,
-                    margin_rad_s,
-                } = braking[ix];
-                ((2.0 * deceleration_rad_s2 * left_rad.max(0.0)).sqrt() - margin_rad_s)
-                    .clamp(0.0, max_rate)
-            }
-            None => max_rate,
+        let Some(braking) = &self.braking else {
+            return max_rate;
         };
-        [-towards(position_rad - min), towards(max - position_rad)]
+        let BrakingLimit {
+            deceleration_rad_s2,
+            margin_rad_s,
+        } = braking[ix];
+        // Within the margin, and beyond the end of the range, a joint may not move towards the end
+        // at all.
+        ((2.0 * deceleration_rad_s2 * distance_rad.max(0.0)).sqrt() - margin_rad_s)
+            .clamp(0.0, max_rate)
     }
 
     /// Checks the step from the previous commanded joint states to the current ones.
@@ -136,14 +139,17 @@ impl Limits {
         before: &CommandedJoints,
         now: &CommandedJoints,
     ) -> Result<(), Violation> {
+        // NaN compares as false with everything, so it would pass the second condition.
         let exceeds =
             |number: f64, max_rate: f64| number.is_nan() || number.abs() > max_rate + ROUNDING;
         for ix in 0..N_JOINTS {
-            let (position, velocity) = (now.position_rad[ix], now.velocity_rad_s[ix]);
+            let position = now.position_rad[ix];
+            let velocity = now.velocity_rad_s[ix];
             let [min, max] = self.position_rad[ix];
             if !(min..=max).contains(&position) {
                 return Err(Violation::Position);
             }
+            // The limits belong to the position from which the joint starts this step.
             let [min_velocity, max_velocity] = self.velocity_range(ix, before.position_rad[ix]);
             if !(min_velocity - ROUNDING..=max_velocity + ROUNDING).contains(&velocity) {
                 return Err(Violation::Velocity);
@@ -157,6 +163,13 @@ impl Limits {
             }
         }
         Ok(())
+    }
+}
+
+fn braking_limit((deceleration_rad_s2, margin_rad_s): (f64, f64)) -> BrakingLimit {
+    BrakingLimit {
+        deceleration_rad_s2,
+        margin_rad_s,
     }
 }
 

@@ -27,6 +27,7 @@ pub(super) fn urdf(limits: &Limits) -> String {
         let velocity = limits.velocity_rad_s[ix];
         let effort = if ix < 4 { 87 } else { 12 };
         let roll = quarters * std::f64::consts::FRAC_PI_2;
+        // Clients require the element. With these values, it limits nothing.
         let braking = limits.braking.map_or((1e3, 0.0), |braking| {
             (braking[ix].deceleration_rad_s2, braking[ix].margin_rad_s)
         });

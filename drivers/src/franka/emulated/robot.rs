@@ -99,11 +99,15 @@ impl Robot {
                 let status = self.begin(command_id, payload);
                 vec![self.move_byte(status)]
             }
+            // The client that waits for the end of the motion gets its reply before the one to this
+            // request.
             Request::Stop => {
                 replies.extend(self.end(MoveStatus::Preempted));
                 vec![0]
             }
             Request::Recover => {
+                // During the reflex, the joints may have been moved by hand. The next motion starts
+                // where they are.
                 if matches!(self.mode, Mode::Reflex) {
                     self.mode = Mode::Idle;
                     self.commanded = CommandedJoints {
@@ -114,6 +118,8 @@ impl Robot {
                 vec![u8::from(is_moving)]
             }
             Request::Model => [&[0], model::urdf(&self.config.limits).as_bytes()].concat(),
+            // A library is machine code for the client, which an emulator does not have. Clients
+            // can do without it.
             Request::Library => vec![v5::LoadModelLibraryStatus::Error.to_u8()],
             Request::CartesianLimit => vec![0; size_of::<v5::GetCartesianLimitResponse>()],
             Request::Set(_) if is_moving => {
@@ -167,6 +173,7 @@ impl Robot {
         });
         self.reflex_reason = Errors::default();
         self.commanded.is_moving = true;
+        // The success rate is that of one motion.
         self.answered.clear();
         MoveStatus::MotionStarted
     }
@@ -194,6 +201,7 @@ impl Robot {
                 else {
                     return INVALID;
                 };
+                // The upper thresholds stop the robot; the lower ones are only reported.
                 self.contact_nm = f64s_to_f64(&thresholds.upper_torque_thresholds_nominal);
             }
             Setting::JointImpedance
@@ -215,37 +223,26 @@ impl Robot {
         command: Option<&Command>,
         could_answer: bool,
     ) -> Option<Reply> {
-        let Mode::Move(mut motion) = self.mode else {
+        let Mode::Move(motion) = self.mode else {
             return None;
         };
+        // Before the first command, the robot waits without counting. States that nobody could
+        // answer are not the client's fault.
         if command.is_some() || (could_answer && motion.has_begun) {
             self.answered.truncate(N_SUCCESS_WINDOW - 1);
             self.answered.push_front(command.is_some());
         }
         let before = self.commanded;
         let Some(command) = command else {
-            motion.n_missed += u32::from(could_answer);
-            let max = if motion.has_begun {
-                MAX_MISSED
-            } else {
-                MAX_UNTIL_FIRST
-            };
-            if motion.n_missed > max {
-                return self.trigger_reflex("communication_constraints_violation");
-            }
-            self.mode = Mode::Move(motion);
-            if motion.has_begun {
-                self.commanded = next_commanded(&before, |ix, _| {
-                    before.velocity_rad_s[ix] + before.acceleration_rad_s2[ix] * STEP_SECS
-                });
-            }
-            return None;
+            return self.extrapolate(motion, could_answer);
         };
         let now = next_commanded(&before, |ix, from| match motion.generator {
             TrajectoryGenerator::Position => (command.position_rad[ix] - from) / STEP_SECS,
             TrajectoryGenerator::Velocity => command.velocity_rad_s[ix],
         });
         if let Err(violation) = self.config.limits.check(&before, &now) {
+            // A client that starts elsewhere violates other limits as well, but the wrong start is
+            // the cause.
             let is_wrong_start =
                 !motion.has_begun && motion.generator == TrajectoryGenerator::Position;
             let violation = if is_wrong_start {
@@ -266,21 +263,47 @@ impl Robot {
         }
         // From here on, the joints are at rest.
         let can_stop = |(velocity, max): (f64, f64)| velocity.abs() <= max * STEP_SECS;
-        match now
+        let is_slow_enough = now
             .velocity_rad_s
             .into_iter()
             .zip(self.config.limits.acceleration_rad_s2)
-            .all(can_stop)
-        {
-            true => self.end(MoveStatus::Success),
-            false => self.trigger_reflex(Violation::Acceleration.name()),
+            .all(can_stop);
+        if is_slow_enough {
+            self.end(MoveStatus::Success)
+        } else {
+            self.trigger_reflex(Violation::Acceleration.name())
         }
+    }
+
+    /// Continues the motion for a millisecond without a command. The joints keep their
+    /// acceleration, as on a real robot, until too many commands are missing.
+    fn extrapolate(&mut self, mut motion: Motion, could_answer: bool) -> Option<Reply> {
+        motion.n_missed += u32::from(could_answer);
+        let max = if motion.has_begun {
+            MAX_MISSED
+        } else {
+            MAX_UNTIL_FIRST
+        };
+        if motion.n_missed > max {
+            return self.trigger_reflex("communication_constraints_violation");
+        }
+        self.mode = Mode::Move(motion);
+        // Before the first command, there is no motion to continue.
+        if motion.has_begun {
+            let before = self.commanded;
+            self.commanded = next_commanded(&before, |ix, _| {
+                before.velocity_rad_s[ix] + before.acceleration_rad_s2[ix] * STEP_SECS
+            });
+        }
+        None
     }
 
     /// Updates the actual joint states. A contact ends the motion.
     pub(super) fn observe(&mut self, joints: Joints) -> Option<Reply> {
         self.joints = joints;
         let Mode::Move(_) = self.mode else {
+            // Between motions, a person may guide the arm by hand. A smaller difference is the sag
+            // under load, which must not accumulate.
             let is_displaced = |(commanded, is): (f64, f64)| (commanded - is).abs() > MAX_SAG_RAD;
             if self
                 .commanded

@@ -62,21 +62,14 @@ impl EmulatedRobot {
                 reason,
             });
         }
-        let bind = || {
-            let listener = TcpListener::bind(config.address)?;
-            listener.set_nonblocking(true)?;
-            let states = UdpSocket::bind((config.address.ip(), 0))?;
-            states.set_nonblocking(true)?;
-            Ok((listener.local_addr()?, listener, states))
-        };
-        let listen = |source| Error::Listen {
+        let (address, listener, states) = bind(config.address).map_err(|source| Error::Listen {
             device: device.clone(),
             address: config.address,
             source,
-        };
-        let (address, listener, states) = bind().map_err(listen)?;
+        })?;
         let joints = joint_simulator(clock::now(), &CommandedJoints::default());
-        let (n_states_sent, stop) = (Arc::default(), Arc::new(AtomicBool::new(false)));
+        let n_states_sent: Arc<AtomicU64> = Arc::default();
+        let stop = Arc::new(AtomicBool::new(false));
         let mut server = Server {
             listener,
             states,
@@ -121,6 +114,16 @@ impl Drop for EmulatedRobot {
     }
 }
 
+/// Opens the sockets for clients and for states. Returns them with the address for clients.
+fn bind(address: SocketAddr) -> std::io::Result<(SocketAddr, TcpListener, UdpSocket)> {
+    let listener = TcpListener::bind(address)?;
+    // One thread serves both sockets in every millisecond, so neither may block it.
+    listener.set_nonblocking(true)?;
+    let states = UdpSocket::bind((address.ip(), 0))?;
+    states.set_nonblocking(true)?;
+    Ok((listener.local_addr()?, listener, states))
+}
+
 struct Server {
     listener: TcpListener,
     states: UdpSocket,
@@ -153,25 +156,28 @@ impl Server {
         // The numbers start as if the robot had been on for a while.
         let mut number = 1_000_000;
         while !self.stop.load(Ordering::Relaxed) {
+            // Computed from the start, so that late steps do not shift all later ones.
             let due = start_time + STEP * n_steps;
             let now = clock::now();
             let lag = now.duration_since(due);
-            let max_lag = match self.robot.commanded.is_moving {
+            let max_lag = if self.robot.commanded.is_moving && !self.answer_wait.is_zero() {
                 // The answers to late states are awaited, too.
-                true if !self.answer_wait.is_zero() => Duration::MAX,
-                _ => MAX_LAG,
+                Duration::MAX
+            } else {
+                MAX_LAG
             };
             if lag > max_lag {
                 let n_skipped = u32::try_from(lag.as_millis()).unwrap_or(u32::MAX);
-                (n_steps, number) = (
-                    n_steps.saturating_add(n_skipped),
-                    number + u64::from(n_skipped),
-                );
+                // The numbers of skipped states are skipped, too, so that clients see them as lost,
+                // and the clock of the robot stays right.
+                n_steps = n_steps.saturating_add(n_skipped);
+                number += u64::from(n_skipped);
                 continue;
             }
             std::thread::sleep(due.duration_since(now));
             self.step(due, number, lag >= STEP);
-            (n_steps, number) = (n_steps.saturating_add(1), number + 1);
+            n_steps = n_steps.saturating_add(1);
+            number += 1;
         }
     }
 
@@ -189,11 +195,14 @@ impl Server {
             }
         }
         self.accept_client();
+        // The answer to the last state moves the joints, and only then the next state is sent.
         let command = self.command(number - 1, wait);
         // If several states are overdue, only the last one can have been answered.
         let could_answer = !is_late || !wait.is_zero();
         let finished = self.robot.follow(command.as_ref(), could_answer);
         let joints = (self.joint_simulator)(due, &self.robot.commanded);
+        // The simulator sees the new commanded positions before the robot sees the joints, as a
+        // real arm follows its commands.
         let contact = self.robot.observe(joints);
         if let Some(client) = &mut self.client {
             let sent = finished
@@ -223,6 +232,7 @@ impl Server {
             }
             if stream
                 .set_nonblocking(true)
+                // Small replies must not wait for more data.
                 .and_then(|()| stream.set_nodelay(true))
                 .is_ok()
             {
@@ -262,6 +272,8 @@ impl Server {
                         .client
                         .as_ref()
                         .is_some_and(|client| client.ip == from.ip());
+                    // Answers to earlier states are too late. The last one with the right number
+                    // counts.
                     match Command::decode(self.robot.config.version, &buffer[..n]) {
                         Some(command) if is_from_client && command.number == number => {
                             received = Some(Some(command))
@@ -294,9 +306,12 @@ impl Client {
                 HeaderLayout::Robot.decode_header(&self.buffer_in)
             {
                 let size = usize::try_from(size).unwrap_or(usize::MAX);
+                // The size comes from the client, so it is checked before anything waits for that
+                // many bytes.
                 if !(ROBOT_HEADER_LEN..=MAX_MESSAGE_BYTES).contains(&size) {
                     return Err(Disconnected);
                 }
+                // TCP may deliver a message in parts. The rest comes with a later step.
                 if self.buffer_in.len() < size {
                     break;
                 }
@@ -317,6 +332,7 @@ impl Client {
             Some(Request::Connect) => {
                 self.connect(robot.config.version, command, command_id, payload)
             }
+            // Other requests are only allowed after the versions were compared.
             Some(request) if self.states_to.is_some() => robot
                 .answer(request, command, command_id, payload)
                 .iter()

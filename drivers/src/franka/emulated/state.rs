@@ -14,7 +14,8 @@ const GRAVITY_M_S2: f64 = -9.81;
 macro_rules! state {
     ($robot:expr, $number:expr, $version:ident) => {{
         let robot: &Robot = $robot;
-        let (joints, commanded) = (&robot.joints, &robot.commanded);
+        let joints = &robot.joints;
+        let commanded = &robot.commanded;
         let flange_from_nominal = robot.config.flange_from_tool;
         let flange_from_tool = flange_from_nominal * robot.nominal_from_tool;
         let tool_at =
@@ -26,6 +27,7 @@ macro_rules! state {
             message_id: U64::new($number),
             O_T_EE: numbers(&tool_at(&joints.position_rad)),
             O_T_EE_d: numbers(&tool_at(&commanded.position_rad)),
+            // Commanded and desired poses agree, because nothing filters the commands.
             O_T_EE_c: numbers(&tool_at(&commanded.position_rad)),
             F_T_EE: numbers(&columns(&flange_from_tool)),
             F_T_NE: numbers(&columns(&flange_from_nominal)),
@@ -48,6 +50,7 @@ macro_rules! state {
             motion_generator_mode,
             controller_mode,
             robot_mode,
+            // Current errors end with the reflex. Its reason stays until the next motion.
             errors: if matches!(robot.mode, Mode::Reflex) {
                 reasons
             } else {

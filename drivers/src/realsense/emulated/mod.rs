@@ -101,7 +101,8 @@ impl BagWriter {
     /// Starts a file. An existing file of that name is replaced.
     pub fn create(path: &Path, camera: &EmulatedCamera) -> Result<Self, Problem> {
         let context = Context::new()?;
-        let _ = std::fs::remove_file(path); // Usually missing. If removal fails, the library reports an error.
+        // Usually missing. If removal fails, the library reports an error.
+        let _ = std::fs::remove_file(path);
         let _guard = device_creation_lock();
         // SAFETY: the device is checked and then owned here; sensors and profiles live as long as
         // the device.
@@ -113,41 +114,10 @@ impl BagWriter {
             device
         };
         // SAFETY: as above; added sensors live in the device.
-        let (color, depth) = unsafe {
-            let depth = camera
-                .depth
-                .as_ref()
-                .map(|depth| EmulatedStream::depth(device, camera, depth))
-                .transpose()?;
-            let color = EmulatedStream::color(device, camera)?;
-            if let (Some(emulated), Some(depth)) = (&depth, &camera.depth) {
-                let extrinsics = lens::extrinsics(&depth.camera_from_depth);
-                call("register extrinsics", |error| {
-                    sys::rs2_register_extrinsics(
-                        emulated.profile.as_ptr(),
-                        color.profile.as_ptr(),
-                        extrinsics,
-                        error,
-                    );
-                })?;
-            }
-            (color, depth)
-        };
+        let (color, depth) = unsafe { EmulatedStream::all(device, camera)? };
         // SAFETY: the device is not freed elsewhere.
         let device = unsafe { Device::new(device)? };
-        let file_problem = |reason: String| Problem::File {
-            path: path.to_owned(),
-            reason,
-        };
-        let name = path_name(path).map_err(file_problem)?;
-        // SAFETY: device and name are alive; the recorder is then owned here and keeps the device
-        // alive.
-        let recorder = unsafe {
-            let recorder = call("create a recorder", |error| {
-                sys::rs2_create_record_device_ex(device.as_ptr(), name.as_ptr(), 1, error)
-            });
-            Device::new(recorder.map_err(|problem| file_problem(problem.to_string()))?)?
-        };
+        let recorder = recorder(&device, path)?;
         let mut writer = Self {
             path: path.to_owned(),
             number: N_FILES.fetch_add(1, Ordering::Relaxed),
@@ -193,13 +163,9 @@ impl BagWriter {
             (false, _) => &mut self.color,
         };
         if image.format != emulated.format || image.size_px != emulated.size_px {
-            let (got, expected) = (
-                format!("{:?} {:?}", image.format, image.size_px),
-                (emulated.format, emulated.size_px),
-            );
             return Err(file_problem(format!(
-                "an image is {got}, expected {:?} {:?} for the emulated camera",
-                expected.0, expected.1
+                "an image is {:?} {:?}, expected {:?} {:?} for the emulated camera",
+                image.format, image.size_px, emulated.format, emulated.size_px
             )));
         }
         let bytes = image
@@ -217,9 +183,28 @@ impl BagWriter {
     pub fn finish(self) -> Result<(), Problem> {
         self.queue.empty()?;
         self.recorder.sensors.iter().for_each(Sensor::stop);
-        let (path, number) = (self.path.clone(), self.number);
+        let path = self.path.clone();
+        let number = self.number;
+        // Dropping the recorder makes the library write what it still holds.
         drop(self);
         wait_until_written(&path, number, 0, || Ok(()))
+    }
+}
+
+/// A device that records the images of another one in a new file.
+fn recorder(device: &Device, path: &Path) -> Result<Device, Problem> {
+    let file_problem = |reason: String| Problem::File {
+        path: path.to_owned(),
+        reason,
+    };
+    let name = path_name(path).map_err(file_problem)?;
+    // SAFETY: device and name are alive; the recorder is then owned here and keeps the device
+    // alive.
+    unsafe {
+        let recorder = call("create a recorder", |error| {
+            sys::rs2_create_record_device_ex(device.as_ptr(), name.as_ptr(), 1, error)
+        });
+        Device::new(recorder.map_err(|problem| file_problem(problem.to_string()))?)
     }
 }
 
@@ -228,20 +213,14 @@ impl BagWriter {
 /// # Safety
 /// The pointer must be a software device.
 unsafe fn register(device: *mut sys::rs2_device, camera: &EmulatedCamera) -> Result<(), Problem> {
-    let text = |text: &str| {
-        CString::new(text).map_err(|error| Problem::Library {
-            what: "use the name of a camera",
-            reason: error.to_string(),
-        })
-    };
     let infos = [
         (
             sys::rs2_camera_info_RS2_CAMERA_INFO_NAME,
-            text(&camera.name)?,
+            c_string(&camera.name)?,
         ),
         (
             sys::rs2_camera_info_RS2_CAMERA_INFO_SERIAL_NUMBER,
-            text(&camera.serial)?,
+            c_string(&camera.serial)?,
         ),
         (
             sys::rs2_camera_info_RS2_CAMERA_INFO_PRODUCT_LINE,
@@ -257,7 +236,47 @@ unsafe fn register(device: *mut sys::rs2_device, camera: &EmulatedCamera) -> Res
     Ok(())
 }
 
+/// A name or serial number as a C string.
+fn c_string(text: &str) -> Result<CString, Problem> {
+    CString::new(text).map_err(|error| Problem::Library {
+        what: "use the name of a camera",
+        reason: error.to_string(),
+    })
+}
+
 impl EmulatedStream {
+    /// Adds the color stream and, if the camera has it, the depth stream, with the pose between
+    /// them.
+    ///
+    /// # Safety
+    /// The pointer must be a software device that outlives both.
+    unsafe fn all(
+        device: *mut sys::rs2_device,
+        camera: &EmulatedCamera,
+    ) -> Result<(Self, Option<Self>), Problem> {
+        // SAFETY: guaranteed by the caller; profiles live as long as the device.
+        unsafe {
+            let depth = camera
+                .depth
+                .as_ref()
+                .map(|depth| Self::depth(device, camera, depth))
+                .transpose()?;
+            let color = Self::color(device, camera)?;
+            if let (Some(emulated), Some(depth)) = (&depth, &camera.depth) {
+                let extrinsics = lens::extrinsics(&depth.camera_from_depth);
+                call("register extrinsics", |error| {
+                    sys::rs2_register_extrinsics(
+                        emulated.profile.as_ptr(),
+                        color.profile.as_ptr(),
+                        extrinsics,
+                        error,
+                    );
+                })?;
+            }
+            Ok((color, depth))
+        }
+    }
+
     /// # Safety
     /// The pointer must be a software device that outlives this.
     unsafe fn color(
@@ -331,10 +350,8 @@ impl EmulatedStream {
         // SAFETY: guaranteed by the caller; the sensor lives in the device.
         unsafe {
             let emulated = Self::add(device, DEPTH_SENSOR, stream, format, DEPTH_EXPOSURE_SECS)?;
-            let (units, scale) = (
-                sys::rs2_option_RS2_OPTION_DEPTH_UNITS,
-                narrow(depth.meters_per_count),
-            );
+            let units = sys::rs2_option_RS2_OPTION_DEPTH_UNITS;
+            let scale = narrow(depth.meters_per_count);
             call("set depth units", |error| {
                 abi::rs2_software_sensor_add_read_only_option(
                     emulated.sensor.as_ptr(),
@@ -467,6 +484,8 @@ static LENT_PIXELS: Mutex<LentPixels> = Mutex::new(BTreeMap::new());
 static N_FILES: AtomicU64 = AtomicU64::new(0);
 
 fn lend_pixels(file: u64, bytes: &[u8]) -> *mut c_void {
+    // The library returns the pixels on a thread of its own when it has written them, so they
+    // cannot be borrowed.
     let mut copy: Box<[u8]> = bytes.into();
     let pixels = copy.as_mut_ptr();
     LENT_PIXELS.lock().insert(pixels.addr(), (file, copy));
@@ -486,6 +505,7 @@ fn wait_until_written(
 ) -> Result<(), Problem> {
     let started = Instant::now();
     loop {
+        // In every round, because it frees images that have been written in the meantime.
         poll()?;
         if LENT_PIXELS
             .lock()

@@ -52,7 +52,7 @@ struct Part {
 #[derive(Clone)]
 struct Chunk {
     compression: &'static str,
-    /// `None`: that of the contents.
+    /// `None`: the correct checksum.
     checksum: Option<u32>,
 }
 
@@ -66,7 +66,7 @@ struct Contents {
     schema_encoding: &'static str,
     schema_text: &'static str,
     parts: Vec<Part>,
-    /// Time of all messages according to MCAP, and number of the first.
+    /// `log_time` of all messages, and `sequence` of the first one.
     log_time: u64,
     chunk: Option<Chunk>,
     /// Records after the messages.
@@ -86,7 +86,7 @@ fn image(camera: &str, format: PixelFormat, data: &[u8]) -> Image {
     }
 }
 
-/// What this program writes: one message on each kind of topic.
+/// A recording as this program writes it, with one message on each kind of topic.
 fn contents() -> Contents {
     let protobuf = |topic, schema: descriptor::Schema, message| Part {
         topic,
@@ -346,7 +346,7 @@ impl Contents {
     }
 }
 
-/// What reading a file results in.
+/// Result of reading a file.
 #[derive(Debug, PartialEq)]
 struct Read {
     samples: Vec<Sample>,
@@ -395,7 +395,7 @@ fn with_source(error: &crate::Error) -> String {
 
 type Change = fn(&mut Contents);
 
-/// A row of the table in docs/reference/recording.md, words of the note or error, and the only
+/// A row of the table in docs/reference/recording.md, words that the note or error contains, and a
 /// change to a file.
 const CASES: &[(&str, &str, Change)] = &[
     ("profile and library of the header", "", |file| {
@@ -939,7 +939,7 @@ const CASES: &[(&str, &str, Change)] = &[
     ),
 ];
 
-/// Changes each part of a file alone, and compares the effect with the table in
+/// Changes one part of a file at a time, and compares the effect with the table in
 /// docs/reference/recording.md.
 #[test]
 fn parts_of_recordings_are_used_refused_or_named_as_documented() {

@@ -243,7 +243,10 @@ pub fn encode_write(node: Node, object: Object, value: i64) -> Result<Frame, Can
             });
         }
     };
-    let (lower, upper) = (-(1_i64 << (n_bits - 1)), (1_i64 << n_bits) - 1);
+    // From the smallest signed to the largest unsigned number: objects of one length may be either,
+    // and their bytes are the same.
+    let lower = -(1_i64 << (n_bits - 1));
+    let upper = (1_i64 << n_bits) - 1;
     if !(lower..=upper).contains(&value) {
         #[expect(clippy::cast_precision_loss, reason = "only for the error message")]
         let [value, lower, upper] = [value, lower, upper].map(|number| number as f64);
@@ -282,6 +285,7 @@ pub enum SdoAnswer {
 
 /// Interprets the lower `n_bytes` (1, 2 or 4) as two's complement.
 pub fn signed(raw: u32, n_bytes: u8) -> i32 {
+    // The arithmetic shift to the right copies the sign bit into the unused bits.
     let n_unused_bits = 32 - 8 * u32::from(n_bytes.clamp(1, 4));
     (raw << n_unused_bits).cast_signed() >> n_unused_bits
 }
@@ -313,6 +317,7 @@ pub fn decode_sdo(frame: &Frame) -> Result<(Node, SdoAnswer), CanError> {
             } else {
                 4
             };
+            // Bytes beyond the reported length are undefined.
             let raw = value & (u32::MAX >> (32 - 8 * u32::from(n_bytes)));
             Ok((
                 node,
@@ -381,6 +386,7 @@ fn from_node<'a>(
         .checked_sub(base)
         .and_then(|number| Node::new(u8::try_from(number).ok()?).ok());
     match node {
+        // FD frames and 29-bit identifiers of other devices on the bus may have the same number.
         Some(node) if !frame.is_remote() && !frame.is_fd() && !frame.id().is_extended() => {
             Ok((node, frame.data()))
         }

@@ -167,6 +167,9 @@ impl Frame {
         let n_data = u32::try_from(8 * self.data().len()).expect("at most 64 bytes");
         let n_stuff_bits = |n_bits: u32| match stuffing {
             Stuffing::None => 0,
+            // A stuff bit follows five equal bits and starts the next group of five itself, so
+            // after the first one, every four bits of the frame may bring another (Davis et al.
+            // 2007, equation 1).
             Stuffing::Worst => (n_bits - 1) / 4,
         };
         let Kind::Fd { switched } = self.kind else {
@@ -181,19 +184,24 @@ impl Frame {
         // stuff count, CRC and their fixed stuff bits.
         let head = if self.id.extended { 36 } else { 17 };
         let body = 5 + n_data;
+        // Up to 16 bytes, the CRC has 17 bits, else 21. It has its own fixed stuff bits, and the
+        // stuff count in front of it has four bits.
         let check = if n_data <= 8 * 16 {
             4 + 17 + 6
         } else {
             4 + 21 + 7
         };
         let nominal = head + n_stuff_bits(head) + 1 + TAIL_BITS;
+        // Stuffing continues across the switch of the rate, so the stuff bits of the data phase are
+        // those of both parts minus those of the head.
         let data = body + n_stuff_bits(head + body) - n_stuff_bits(head) + check;
-        match switched {
-            true => Bits { nominal, data },
-            false => Bits {
+        if switched {
+            Bits { nominal, data }
+        } else {
+            Bits {
                 nominal: nominal + data,
                 data: 0,
-            },
+            }
         }
     }
 }

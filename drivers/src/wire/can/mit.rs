@@ -128,6 +128,7 @@ pub fn encode(command: &Command, limits: &Limits) -> Result<[u8; 8], CanError> {
     ];
     Ok(fields
         .iter()
+        // The fields follow each other without gaps, the highest bit first: 16 + 4 x 12 = 64 bits.
         .fold(0_u64, |bits, (raw, n_bits)| {
             bits << n_bits | u64::from(*raw)
         })

@@ -125,6 +125,7 @@ pub(crate) fn eight_bytes(
     extended: bool,
 ) -> Result<[u8; 8], CanError> {
     let id = frame.id();
+    // The same number means different messages in both kinds of identifiers.
     if frame.is_remote() || id.is_extended() != extended {
         return Err(CanError::UnexpectedFrame {
             message,

@@ -55,6 +55,8 @@ impl Scale {
         }
         let unit_interval =
             (value.clamp(self.lower, self.upper) - self.lower) / (self.upper - self.lower);
+        // `ceil(x - 0.5)` rounds halves down, which makes 0 of a symmetric range the same integer
+        // as in the sources: half of the largest integer, which is odd, truncated.
         Ok((unit_interval * self.max_raw() - 0.5)
             .ceil()
             .clamp(0.0, self.max_raw()) as u16)

@@ -108,6 +108,7 @@ fn calibrate_and_print(
     report: Option<&Path>,
     mut rig: Option<RigOutput>,
 ) -> anyhow::Result<Exit> {
+    // The rig file is checked before the calibration, so that its result can be written.
     if let Some(rig) = &rig {
         rig.expect_setup(source.setup())?;
     }
@@ -133,6 +134,7 @@ fn calibrate_and_print(
                 .collect(),
             ..printed::printed(&calibrated.calibration)
         },
+        // JSON output contains a refusal like a result, for programs that evaluate it.
         Err(error) if exit::of(error) == Exit::InsufficientData && args.json => {
             Printed::refused(source.setup(), format!("{error:#}"))
         }
@@ -172,6 +174,7 @@ fn calibrate_and_print(
             (None, Some(given)) => rig.warn_if_intrinsics_differ(&given)?,
             (None, None) => (),
         }
+        // The joints of a samples file need not be those of the rig.
         match source {
             Source::Scan { .. } => rig.add_joint_offsets(&calibration.joint_offsets),
             Source::File(_) if !calibration.joint_offsets.is_empty() => {
@@ -197,9 +200,11 @@ fn with_reason(error: anyhow::Error, source: &Source, samples: &Samples) -> anyh
         .collect();
     match unused.first() {
         Some(first) if exit::of(&error) == Exit::InsufficientData => {
+            // Unreadable images do not count, because they say nothing about the target.
             let n_all = source.n_samples() - (samples.unused.len() - unused.len());
             let n = unused.len();
-            let (name, reason) = (&first.name, &first.reason);
+            let name = &first.name;
+            let reason = &first.reason;
             let text = format!(
                 "{error:#}; {n} of {n_all} images do not show the target: {name}: {reason}"
             );
@@ -212,6 +217,7 @@ fn with_reason(error: anyhow::Error, source: &Source, samples: &Samples) -> anyh
 /// A refusal with a warning about the target.
 fn with_symmetry(error: calibration::Error, symmetry: Option<&str>) -> anyhow::Error {
     match symmetry {
+        // An ambiguous target is a likely reason for a refusal.
         Some(symmetry) if matches!(error, calibration::Error::Refused(_)) => {
             InsufficientData(format!("{error}; {symmetry}")).into()
         }
@@ -337,6 +343,7 @@ impl Args {
             .unwrap_or_default();
         let chain = self.chain()?;
         let intrinsics = source.intrinsics(samples.size_px)?;
+        // If the lens is estimated, too, the given one is only a start.
         let covariance = match &intrinsics {
             Some(intrinsics) if !self.with_intrinsics => {
                 source.intrinsics_covariance(intrinsics)?
@@ -359,6 +366,7 @@ impl Args {
             intrinsics: intrinsics.clone(),
             intrinsics_covariance: covariance,
             board_symmetries: &symmetries,
+            // Only one of them can exist: `--urdf` is refused with a rig.
             chain: chain.as_ref().or(source.chain()),
             options: self.options(),
         };

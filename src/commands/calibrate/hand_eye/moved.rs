@@ -22,11 +22,15 @@ use session::calibration_report::{Photo, Photos};
 use std::path::Path;
 use targets::{GrayImage, TargetSpec};
 
-/// Largest change of a joint from the start, radians.
+/// Largest change of a joint from the start, radians. A user who has checked the surroundings of the
+/// arm expects motions near its current posture. Larger changes give more different poses, but
+/// also let elbow and cables reach farther.
 const MAX_JOINT_CHANGE_RAD: f64 = 1.2;
-/// Maximum distance of the flange from its position at the start, unless a flag sets it, meters.
+/// Maximum distance of the flange from its position at the start, unless a flag sets it, meters: room
+/// that is usually free around an arm that was moved to its target by hand.
 const DEFAULT_DISTANCE_M: f64 = 0.3;
-/// Standard deviation of the rotation at which the result is accurate, degrees.
+/// Standard deviation of the rotation at which the result is accurate, degrees: half a millimeter at
+/// a distance of half a meter.
 const GOAL_DEG: f64 = 0.05;
 
 /// Flags for moving the arm.
@@ -69,6 +73,8 @@ impl MovedArm {
     /// calibration, or why the motion was not completed.
     pub(super) fn finish(mut self, result: anyhow::Result<Exit>) -> anyhow::Result<Exit> {
         let failure = self.failure.take();
+        // The arm is held before anything is returned, because the motors of some arms release it
+        // when this program ends.
         let held = self.hold_after(result.as_ref().err());
         match (held, failure) {
             (Err(error), None) if result.is_ok() => Err(error),
@@ -122,7 +128,9 @@ impl MoveFlags {
         request: &Request<'_>,
         output: Option<&mut RigOutput>,
     ) -> anyhow::Result<(Scan, MovedArm)> {
-        let (input, flags) = (request.input.display(), request.rig);
+        let input = request.input.display();
+        let flags = request.rig;
+        // Everything that needs no device is checked before the arm is enabled.
         flags.check(request.input)?;
         if InputKind::of(request.input) != InputKind::Rig {
             return Err(BadArgument(format!(
@@ -165,6 +173,7 @@ impl MoveFlags {
         } else {
             Devices::Real
         };
+        // Before the arm: without its page, nobody sees what the arm will do.
         let page = GuidancePage::start(&flags.page, &given_camera)?;
         let mut capture = ArmCapture::new(open::movable(&given, devices, camera)?)?;
         let rig = resolved(&given, capture.rig());
@@ -179,14 +188,13 @@ impl MoveFlags {
             Parent::World => rig.base.world_from_base.inverse() * camera.parent_from_camera,
             Parent::Flange | Parent::Base => camera.parent_from_camera,
         };
-        let (found, photos) = (Vec::new(), Photos::new());
         let mut images = Images {
             camera: &camera,
             base_or_flange_from_camera,
             request,
             page,
-            found,
-            photos,
+            found: Vec::new(),
+            photos: Photos::new(),
         };
         let failure = self.take_images(&mut capture, &mut images, &stop).err();
         let Images {
@@ -197,6 +205,7 @@ impl MoveFlags {
         } = images;
         page.finish();
         drop(page);
+        // A simulated arm has nothing to fall.
         let holds_on_exit = is_simulated
             || given
                 .arm
@@ -250,6 +259,7 @@ impl MoveFlags {
         images: &mut Images<'_>,
         stop: &Stop,
     ) -> anyhow::Result<()> {
+        // The start is the only pose that is known to be safe, so the arm returns there at the end.
         let start = capture.joints()?;
         let chain = capture.chain().clone();
         let Some(first) = capture.image(stop)? else {
@@ -287,12 +297,15 @@ impl MoveFlags {
         };
         let mut plan = ArmPlan::new(&reach, &poses, &goals, &first);
         let symmetries = images.request.target.symmetry();
+        // Estimate with the images so far, choose the pose that lowers the uncertainty most, move
+        // there, and take an image.
         loop {
             let estimate_input = images.hand_eye_input(&chain, &symmetries);
             let estimate = calibrate_hand_eye(&estimate_input);
             if let Ok(found) = &estimate {
                 let largest = |sigmas: [f64; 3]| sigmas.into_iter().fold(0.0, f64::max);
-                let (mm, deg) = (largest(found.sigma_mm), largest(found.sigma_deg));
+                let mm = largest(found.sigma_mm);
+                let deg = largest(found.sigma_deg);
                 log::info!("standard deviations so far: {mm:.2} mm, {deg:.3} degrees");
             }
             let current = capture.joints()?;
@@ -306,6 +319,8 @@ impl MoveFlags {
             let motion = format!("moving to pose {}: {purpose}", images.found.len() + 1);
             log::info!("{motion}");
             images.page.guide(&motion);
+            // After Ctrl-C, the arm stays where it came to rest, because nobody expects another
+            // motion.
             if !capture.move_to(&joints, stop)? {
                 return Ok(());
             }
@@ -314,6 +329,8 @@ impl MoveFlags {
             };
             match images.add(image) {
                 Ok(_) => plan.seen(),
+                // A pose from which the target is not visible only costs time. The plan avoids its
+                // neighborhood.
                 Err(reason) => {
                     log::info!("pose {}: {reason}", images.found.len());
                     plan.unseen();
@@ -336,6 +353,7 @@ fn resolved(given: &Rig, opened: &Rig) -> Rig {
             .iter()
             .find(|other| other.name == camera.name)
         {
+            // A rig that was simulated with `--sim` keeps its real drivers when it is written.
             let driver = camera.driver;
             *camera = Camera {
                 driver,
@@ -344,6 +362,18 @@ fn resolved(given: &Rig, opened: &Rig) -> Rig {
         }
     }
     rig
+}
+
+/// The sample of an image in which the target is visible.
+fn sample_of((image, arm): &(DetectedImage, Option<ArmDuringImage>)) -> Option<HandEyeSample> {
+    let board = image.board.as_ref().ok()?;
+    let arm = arm.as_ref()?;
+    Some(HandEyeSample {
+        name: image.name.clone(),
+        base_from_flange: arm.base_from_flange,
+        board: BoardObservation::View(board.view.clone()),
+        joints: Some(arm.joints.clone()),
+    })
 }
 
 /// The images so far.
@@ -413,18 +443,9 @@ impl Images<'_> {
         chain: &'a Chain,
         symmetries: &'a [Transform],
     ) -> HandEyeInput<'a> {
-        let sample = |(image, arm): &(DetectedImage, Option<ArmDuringImage>)| {
-            let (board, arm) = (image.board.as_ref().ok()?, arm.as_ref()?);
-            Some(HandEyeSample {
-                name: image.name.clone(),
-                base_from_flange: arm.base_from_flange,
-                board: BoardObservation::View(board.view.clone()),
-                joints: Some(arm.joints.clone()),
-            })
-        };
         HandEyeInput {
             setup: self.setup(),
-            samples: self.found.iter().filter_map(sample).collect(),
+            samples: self.found.iter().filter_map(sample_of).collect(),
             intrinsics: Some(self.camera.intrinsics.clone()),
             intrinsics_covariance: None, // Further poses do not lower its effect.
             board_symmetries: symmetries,

@@ -96,6 +96,7 @@ impl PrintedPose {
 pub(super) fn printed(calibration: &HandEyeCalibration) -> Printed {
     let camera = Some(matrix_of(&calibration.parent_from_camera));
     let board = Some(matrix_of(&calibration.parent_from_board));
+    // The outer `Option` is whether the setup has this matrix, the inner one whether it is known.
     let of_setup =
         |setup: Setup, matrix: Option<Matrix>| (calibration.setup == setup).then_some(matrix);
     let held_out = calibration.held_out_scatter;
@@ -143,6 +144,7 @@ pub(super) fn printed(calibration: &HandEyeCalibration) -> Printed {
                 rms_px: sample.rms_px,
             })
             .collect(),
+        // The caller adds them, because they depend on the target.
         next_poses: Vec::new(),
         warnings: calibration.warnings.clone(),
         refused: None,
@@ -169,6 +171,7 @@ impl PrintedSample {
 impl Printed {
     /// Without a result.
     pub(super) fn refused(setup: Setup, reason: String) -> Self {
+        // The keys are those of a result, with null instead of a matrix.
         let of_setup = |other: Setup| (setup == other).then_some(None);
         Self {
             flange_from_camera: of_setup(Setup::EyeInHand),
@@ -183,18 +186,25 @@ impl Printed {
 
 /// The value of `parent_from_camera` in a rig file.
 pub(super) fn pose_toml(pose: &Transform) -> String {
-    let list = |values: &[f64]| {
-        values
-            .iter()
-            .map(|value| format!("{value:.9}"))
-            .collect::<Vec<_>>()
-            .join(", ")
-    };
-    let (xyz_m, quat_xyzw) = (
-        list(pose.translation.vector.as_slice()),
-        list(pose.rotation.coords.as_slice()),
-    );
+    let xyz_m = nine_digits(pose.translation.vector.as_slice());
+    let quat_xyzw = nine_digits(pose.rotation.coords.as_slice());
     format!("{{ xyz_m = [{xyz_m}], quat_xyzw = [{quat_xyzw}] }}")
+}
+
+/// Numbers for a rig file. Nine digits are a nanometer, below any calibration error.
+fn nine_digits(values: &[f64]) -> String {
+    values
+        .iter()
+        .map(|value| format!("{value:.9}"))
+        .collect::<Vec<_>>()
+        .join(", ")
+}
+
+fn three(values: Option<[f64; 3]>, unit: &str) -> String {
+    let values = values
+        .unwrap_or_default()
+        .map(|value| format!("{value:.3}"));
+    format!("{} {unit}", values.join(", "))
 }
 
 /// Prints the result. `rig_pose`: `parent_from_camera` for the rig file.
@@ -219,12 +229,6 @@ pub(super) fn describe(printed: &Printed, rig_pose: Option<&Transform>) -> anyho
     if let Some(intrinsics) = &printed.intrinsics {
         print::line(format!("intrinsics = {}", intrinsics.to_toml()))?;
     }
-    let three = |values: Option<[f64; 3]>, unit: &str| {
-        let values = values
-            .unwrap_or_default()
-            .map(|value| format!("{value:.3}"));
-        format!("{} {unit}", values.join(", "))
-    };
     print::line(format!(
         "standard deviations of the camera along and about its x, y and z axes: {}; {}",
         three(printed.sigma_mm, "mm"),

@@ -57,8 +57,12 @@ impl SamplesFile {
         let name = path.display().to_string();
         let text = outputs::read_text(path)?;
         let mut value = json_object::parse(&text)
+            // Such files often come from other programs, so the error says what to change.
             .map_err(|error| BadArgument(format!("{name}: {error}{}", not_json_hint(&text))))?;
+        // Paths in the file are relative to it, so that its folder can be moved.
         let folder = path.parent().unwrap_or(Path::new(""));
+        // The intrinsics may be written in several formats, or be in a file of their own. They are
+        // converted in place, so that the code below reads one format.
         if let Some(intrinsics) = value.get_mut("intrinsics") {
             let invalid = |why: String| BadArgument(format!("{name}: intrinsics: {why}"));
             let mut source = String::new();
@@ -75,6 +79,7 @@ impl SamplesFile {
                 .iter()
                 .for_each(|note| log::warn!("{name}: intrinsics: {source}{note}"));
         }
+        // Unknown keys are errors, because a misspelled one would be ignored silently.
         let file = JsonObject::new(&name, String::new(), &value, &FILE_KEYS)?;
         let intrinsics = file.object("intrinsics", &LensFile::KEYS)?;
         let target = file.text("target")?.map(target_argument).transpose();
@@ -107,6 +112,8 @@ impl SamplesFile {
             setup,
             entries,
         };
+        // These two are optional keys, because samples may contain poses of the board instead of
+        // images.
         if read.has_images() && read.target.is_none() {
             return Err(file.invalid(
                 "target",
@@ -143,7 +150,7 @@ impl SamplesFile {
         })
     }
 
-    /// Parts of the file that have no effect on the result: a clause without a period each.
+    /// Notes about parts of the file that do not affect the result, without a period.
     ///
     /// * `estimates_joints`: whether the offsets of joints are estimated.
     pub(super) fn unused(&self, estimates_joints: bool) -> Vec<&'static str> {
@@ -184,6 +191,7 @@ impl SamplesFile {
         };
         let files: Vec<ImageFile> = self.entries.iter().filter_map(image).collect();
         let detected = match &self.target {
+            // Without images there is nothing to detect, and the target is optional.
             Some(target) if !files.is_empty() => images::detect(&files, target, is_hidden)?,
             _ => Vec::new(),
         };
@@ -196,6 +204,7 @@ impl SamplesFile {
             photos: images::photos(&files),
             ..Samples::default()
         };
+        // The results are in the order of the images, so one is taken for each entry with an image.
         let mut detected = detected.into_iter();
         for (ix, entry) in self.entries.iter().enumerate() {
             let (name, board) = match &entry.board {
@@ -203,22 +212,18 @@ impl SamplesFile {
                 EntryBoard::Image(_) => {
                     let DetectedImage { name, board, .. } =
                         detected.next().expect("one result per image");
+                    // Listed in `unused` above.
                     let Ok(board) = board else { continue };
+                    // One lens model applies to all images, and it depends on their size.
                     samples.expect_size(&name, board.size_px)?;
                     (name, BoardObservation::View(board.view))
                 }
             };
-            let Entry {
-                base_from_flange,
-                joints,
-                ..
-            } = entry;
-            let (base_from_flange, joints) = (*base_from_flange, joints.clone());
             samples.used.push(HandEyeSample {
                 name,
-                base_from_flange,
+                base_from_flange: entry.base_from_flange,
                 board,
-                joints,
+                joints: entry.joints.clone(),
             });
         }
         Ok(samples)
@@ -226,18 +231,21 @@ impl SamplesFile {
 
     /// An error if no image shows the target.
     pub(super) fn check_detected(&self, samples: &Samples) -> Result<(), InsufficientData> {
-        match samples.used.is_empty() && !samples.unused.is_empty() {
-            true => Err(InsufficientData(format!(
+        // Without any image, the samples are poses, and the calibration itself checks their number.
+        if samples.used.is_empty() && !samples.unused.is_empty() {
+            Err(InsufficientData(format!(
                 "{}: no image shows the target",
                 self.path.display()
-            ))),
-            false => Ok(()),
+            )))
+        } else {
+            Ok(())
         }
     }
 }
 
 /// A hint at numbers that other programs write but JSON does not have.
 fn not_json_hint(text: &str) -> &'static str {
+    // Whole words only: "inf" is also a part of other words.
     let has = |word: &str| {
         text.split(|c: char| !c.is_ascii_alphabetic())
             .any(|found| found == word)
@@ -258,6 +266,7 @@ impl Samples {
     /// Rejects images of another size than that of the first one.
     fn expect_size(&mut self, name: &str, size_px: [u32; 2]) -> Result<(), calibration::Error> {
         let first_px = *self.size_px.get_or_insert(size_px);
+        // The first image defines the size.
         if first_px == size_px {
             return Ok(());
         }
@@ -282,6 +291,7 @@ fn check_images(samples: &[JsonObject<'_>], entries: &[Entry]) -> Result<(), Bad
         let EntryBoard::Image(image) = &entry.board else {
             continue;
         };
+        // The same pose twice is allowed, because the same sample may simply be listed twice.
         let first = *first_use.entry(&image.path).or_insert(ix);
         if entries[first].base_from_flange != entry.base_from_flange {
             let why = format!(
@@ -299,6 +309,7 @@ fn pose(sample: &JsonObject<'_>, key: &str) -> Result<Option<Transform>, BadArgu
     /// Positions beyond this are assumed to be mistakes.
     const MAX_POSITION_M: f64 = 1e4;
     let pose = sample.transform(key)?;
+    // The largest coordinate stands for the distance: the limit is only a rough one.
     let farthest_m = pose.map_or(0.0, |pose| pose.translation.vector.amax());
     if farthest_m > MAX_POSITION_M {
         let why = format!(
@@ -317,6 +328,7 @@ impl Entry {
             (Some(pose), None) => EntryBoard::Pose(pose),
             (None, Some(image)) => {
                 let path = folder.join(image);
+                // Checked before any image is searched for the target, which takes long.
                 if !path.is_file() {
                     return Err(
                         sample.invalid("image", format!("{} does not exist", path.display()))
@@ -333,6 +345,7 @@ impl Entry {
                     sample.invalid("image", "missing; give \"image\" or \"camera_from_board\"")
                 );
             }
+            // Two sources for one value may contradict each other, so neither is preferred.
             (Some(_), Some(_)) => {
                 return Err(sample.invalid(
                     "image",

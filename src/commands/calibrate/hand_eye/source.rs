@@ -44,6 +44,7 @@ impl Source {
     /// Kinematics of the arm, if the rig has one.
     pub(super) fn chain(&self) -> Option<&Chain> {
         match self {
+            // A samples file has joint values at most, no robot description.
             Self::File(_) => None,
             Self::Scan { scan, .. } => scan.chain(),
         }
@@ -55,6 +56,7 @@ impl Source {
         size_px: Option<[u32; 2]>,
     ) -> anyhow::Result<Option<Intrinsics>> {
         match (self, size_px) {
+            // A rig file always has intrinsics, with their own image size.
             (Self::Scan { scan, .. }, _) => Ok(Some(scan.intrinsics().clone())),
             (Self::File(file), Some(size_px)) => Ok(file.intrinsics(size_px)?),
             (Self::File(_), None) => Ok(None),
@@ -75,6 +77,7 @@ impl Source {
     /// Problems of the input that do not prevent a calibration.
     pub(super) fn warnings(&self) -> &[String] {
         match self {
+            // Problems of a file were reported when it was read.
             Self::File(_) => &[],
             Self::Scan { scan, .. } => &scan.warnings,
         }
@@ -103,6 +106,8 @@ impl Source {
 
     /// An error if there is no image, or if no image shows the target.
     pub(super) fn check(&self, samples: &Samples) -> anyhow::Result<()> {
+        // More images show another board than the given one, so the target is probably wrong. That
+        // explains missing detections better than the errors below.
         if let Some(size) = samples.other_size.as_ref().filter(|size| size.prevails) {
             return Err(InsufficientData(size.text.clone()).into());
         }
@@ -115,6 +120,7 @@ impl Source {
     /// `parent_from_camera` of a rig file for an estimated pose.
     pub(super) fn rig_pose(&self, parent_from_camera: &Transform) -> Transform {
         match self {
+            // Without a rig, the pose is relative to the flange or base as it is.
             Self::File(_) => *parent_from_camera,
             Self::Scan { scan, .. } => scan.rig_pose(parent_from_camera),
         }

@@ -54,6 +54,13 @@ fn invalid_state(reason: String) -> Error {
     Error::CheckpointState { reason }
 }
 
+fn write_error(path: &Path, source: std::io::Error) -> Error {
+    Error::Write {
+        path: path.to_owned(),
+        source,
+    }
+}
+
 impl FieldSnapshot {
     /// Number of images that the parameter array can hold.
     fn image_capacity(&self) -> Option<u32> {
@@ -80,6 +87,7 @@ impl FieldTrainer {
 
     /// Buffers needed to continue training, by name.
     fn training_buffers(&self) -> Vec<(String, &Buffer)> {
+        // Gradients are not stored: they are zero between steps.
         let mut all = self.render_buffers();
         all.extend(
             [
@@ -104,15 +112,12 @@ impl FieldTrainer {
 
 /// Starts reading buffers back to the host.
 fn begin_read(gpu: &Gpu, buffers: Vec<(String, &Buffer)>) -> Vec<(String, PendingRead)> {
-    let read = |buffer: &Buffer| {
-        gpu.begin_read(
-            buffer,
-            usize::try_from(buffer.bytes() / 4).expect("a buffer fits into memory"),
-        )
-    };
     buffers
         .into_iter()
-        .map(|(name, buffer)| (name, read(buffer)))
+        .map(|(name, buffer)| {
+            let n_words = usize::try_from(buffer.bytes() / 4).expect("a buffer fits into memory");
+            (name, gpu.begin_read(buffer, n_words))
+        })
         .collect()
 }
 
@@ -131,6 +136,7 @@ fn finish(gpu: &Gpu, reads: Vec<(String, PendingRead)>) -> Result<Vec<Array>, Er
 impl NerfModel {
     fn state(&self) -> Result<NerfState, Error> {
         Ok(NerfState {
+            // The sizes in use, because another adapter would choose others.
             options: self
                 .options
                 .clone()
@@ -166,24 +172,26 @@ impl NerfModel {
             .map_or(Vec::new(), |(_, field_trainer)| {
                 begin_read(&self.gpu, field_trainer.training_buffers())
             });
-        let (step, n_hinted, learned_params) = (self.step, self.n_hinted, self.learned_params);
         Ok(FieldSnapshot {
             arrays: finish(&self.gpu, reads)?,
-            step,
-            n_hinted,
-            learned_params,
+            step: self.step,
+            n_hinted: self.n_hinted,
+            learned_params: self.learned_params,
         })
     }
 
     /// Restores a snapshot. No submit may be in flight.
     pub(super) fn restore(&mut self, snapshot: &FieldSnapshot) -> Result<(), Error> {
-        (self.step, self.learned_params) = (snapshot.step, snapshot.learned_params);
+        self.step = snapshot.step;
+        self.learned_params = snapshot.learned_params;
+        // Images may have arrived since. Their hints are added again.
         self.n_hinted = snapshot.n_hinted.min(self.images.len());
-        self.is_extent_stale |= self.n_hinted < self.images.len(); // Their hints are added again.
+        self.is_extent_stale |= self.n_hinted < self.images.len();
         self.corrections = None;
         let Some((_, field_trainer)) = &mut self.field else {
             return Ok(());
         };
+        // The buffer of image parameters may have been created or enlarged since.
         match snapshot.image_capacity() {
             Some(image_capacity) => field_trainer.allocate_images(
                 &self.gpu,
@@ -203,18 +211,22 @@ impl NerfModel {
     /// During a trial, saves the state from before the trial. The trial restarts after resuming.
     pub(super) fn take_checkpoint(&mut self) -> Result<PendingCheckpoint, Error> {
         self.finish_in_flight()?;
-        let (gpu, mut state) = (self.gpu.clone(), self.state()?);
+        let gpu = self.gpu.clone();
+        let mut state = self.state()?;
         if let Some(before) = self.trials.before() {
-            (state.step, state.learned_params, state.image_capacity) =
-                (before.step, before.learned_params, before.image_capacity());
+            state.step = before.step;
+            state.learned_params = before.learned_params;
+            state.image_capacity = before.image_capacity();
             state.n_hinted = before.n_hinted.min(self.images.len());
             state.is_extent_stale |= state.n_hinted < self.images.len();
-            let (state, arrays) = (to_json(&state)?, before.arrays.clone());
+            let state = to_json(&state)?;
+            let arrays = before.arrays.clone();
             return Ok(PendingCheckpoint::new(move || {
                 Ok(Checkpoint::new(METHOD, state, arrays))
             }));
         }
         let state = to_json(&state)?;
+        // The copies are queued now, before later steps; waiting for them is deferred.
         let reads = self
             .field
             .as_ref()
@@ -242,6 +254,7 @@ impl NerfModel {
             .map_err(|error| invalid_state(error.to_string()))?;
         let mut model = Self::new(gpu, state.options.clone())?;
         if let Some((extent, sizes)) = &state.field {
+            // Buffers have the sizes in the state, and each array must have the size of its buffer.
             sizes.check()?;
             let compiled = model.compiled()?;
             let mut field_trainer =
@@ -277,6 +290,7 @@ impl NerfModel {
         keyframes: &[Arc<Keyframe>],
     ) -> Result<(Self, Vec<Arc<Keyframe>>), Error> {
         let (mut model, state) = Self::of_state(gpu, checkpoint, FieldTrainer::training_buffers)?;
+        // The order of the images is the order of their parameters on the GPU.
         let (images, rest) = keyframe_signature::match_keyframes(&state.images, keyframes)?;
         model.images = images.into_iter().map(RayImage::new).collect();
         model.is_extent_stale = state.is_extent_stale;
@@ -294,10 +308,6 @@ impl NerfModel {
 
     pub(super) fn write_folder(&mut self, folder: &Path) -> Result<(), Error> {
         self.finish_in_flight()?;
-        let write_error = |path: &Path, source| Error::Write {
-            path: path.to_owned(),
-            source,
-        };
         std::fs::create_dir_all(folder).map_err(|source| write_error(folder, source))?;
         let reads = self
             .field
@@ -305,7 +315,8 @@ impl NerfModel {
             .map_or(Vec::new(), |(_, field_trainer)| {
                 begin_read(&self.gpu, field_trainer.render_buffers())
             });
-        let (state, arrays) = (to_json(&self.state()?)?, finish(&self.gpu, reads)?);
+        let state = to_json(&self.state()?)?;
+        let arrays = finish(&self.gpu, reads)?;
         let cameras = self.camera_corrections()?;
         Checkpoint::new(METHOD, state, arrays).write(&folder.join(FIELD_FILE))?;
         let sizes = self

@@ -26,13 +26,16 @@ use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 
 /// Fractions (1 / divisor) of the planned steps: start of optimizing image parameters (earlier, the
-/// field is too coarse), start of trials, and length of each half of a trial.
+/// field is too coarse), start of trials, and length of each half of a trial. Longer halves show
+/// smaller gains, but a rejected variant costs all steps of its half.
 const POSE_START_DIVISOR: u64 = 32;
 const TRIAL_START_DIVISOR: u64 = 8;
 const TRIAL_LENGTH_DIVISOR: u64 = 16;
-/// Batches of rays for a comparison: some hundred rays per image.
+/// Batches of rays for a comparison: some hundred rays per image. More rays reduce the noise of
+/// each image's score, but the scatter between images limits a decision, too.
 const VALIDATION_BATCHES: u64 = 8;
-/// Seed for choosing the rays of a comparison.
+/// Seed for choosing the rays of a comparison. It is fixed, so that variant and baseline are
+/// compared on the same rays.
 const VALIDATION_SEED: u64 = 0x6a75_6467;
 
 /// Snapshot of the field at some step, in host memory.
@@ -117,6 +120,8 @@ impl NerfModel {
     /// The step at which a trial starts or changes its phase.
     fn next_trial_step(&self) -> Option<u64> {
         let share = |of: u64| (self.options.common.n_planned_steps / of).max(1);
+        // Both halves begin at the same step, because the field is restored in between. The end of
+        // a half is therefore measured from there.
         let at = match self.trials.before() {
             None => share(TRIAL_START_DIVISOR),
             Some(before) => before.step + share(TRIAL_LENGTH_DIVISOR),
@@ -144,6 +149,7 @@ impl NerfModel {
             return Ok(());
         };
         match self.trials.running.take() {
+            // With few images, no gain can be significant.
             None if self.validation_images.len() < MIN_VALIDATION_IMAGES => {
                 log::info!(
                     "{candidate}: no trial: {} validation images found, at least {MIN_VALIDATION_IMAGES} needed",
@@ -151,6 +157,7 @@ impl NerfModel {
                 );
                 self.end_trials();
             }
+            // Start: the quick check first, because a trial costs steps.
             None => match self.rule_out(candidate)? {
                 Some(trial) => self.end_trial(&trial),
                 None => {
@@ -161,6 +168,8 @@ impl NerfModel {
                     self.learned_params |= candidate;
                 }
             },
+            // Half time: the variant is scored and kept, and the baseline starts from the same
+            // field.
             Some(RunningTrial {
                 before,
                 variant: None,
@@ -174,6 +183,8 @@ impl NerfModel {
                     variant: Some((variant, variant_errors)),
                 });
             }
+            // End: the baseline is scored. The field is the baseline already, so only a variant
+            // that is kept must be restored.
             Some(RunningTrial {
                 before,
                 variant: Some((variant, variant_errors)),
@@ -213,6 +224,7 @@ impl NerfModel {
         let Some(before) = self.trials.before() else {
             return Ok(());
         };
+        // The field keeps its steps, but not the parameters on trial, whose benefit is unknown.
         self.learned_params = before.learned_params;
         if let Some((_, field_trainer)) = &mut self.field {
             field_trainer.reset_image_params_except(&self.gpu, self.learned_params)?;
@@ -236,8 +248,8 @@ impl NerfModel {
         if !candidate.contains(ParamSet::IMAGE_GAINS) {
             return Ok(None);
         }
-        let (training_images, validation_images) =
-            (self.images.clone(), self.validation_images.clone());
+        let training_images = self.images.clone();
+        let validation_images = self.validation_images.clone();
         let own = self.compare(&training_images, &[])?;
         let log_gains: Vec<f64> = own.iter().map(Comparison::log_gain).collect();
         // The mean over all images is the brightness of the field itself.
@@ -247,15 +259,12 @@ impl NerfModel {
             let camera_gains = known.entry(&image.keyframe.camera).or_default();
             camera_gains.insert(image.keyframe.stamp.0, [log_gain - mean]);
         }
-        let predicted = |image: &RayImage| {
-            interpolate(
-                known.get(image.keyframe.camera.as_ref())?,
-                image.keyframe.stamp,
-            )
-        };
         let compared = self.compare(&validation_images, &[])?;
         let variant = validation_images.iter().zip(&compared).map(|(image, own)| {
-            let [log_gain] = predicted(image).unwrap_or_default();
+            let of_camera = known.get(image.keyframe.camera.as_ref());
+            let [log_gain] = of_camera
+                .and_then(|of_camera| interpolate(of_camera, image.keyframe.stamp))
+                .unwrap_or_default();
             own.error_with_gain(log_gain.exp())
         });
         let baseline = compared.iter().map(|own| own.error_with_gain(1.0));
@@ -277,12 +286,6 @@ impl NerfModel {
             Some(correction) => RayImage::new(correction.corrected(&image.keyframe).into()),
             None => image.clone(),
         };
-        let embedding = |image: &RayImage| {
-            interpolate(
-                &correction_of(image)?.appearance_embeddings,
-                image.keyframe.stamp,
-            )
-        };
         let images: Vec<RayImage> = self
             .validation_images
             .iter()
@@ -291,7 +294,7 @@ impl NerfModel {
         let appearance_embeddings: Vec<_> = self
             .validation_images
             .iter()
-            .map(|image| embedding(image).unwrap_or_default())
+            .map(|image| interpolated_embedding(&corrections, image))
             .collect();
         let compared = self.compare(&images, &appearance_embeddings)?;
         Ok(compared
@@ -326,6 +329,7 @@ impl NerfModel {
                 &rays,
                 appearance_embeddings,
             )?) {
+                // Masked pixels have no target. A field may be non-finite in a trial that diverges.
                 let [rgb @ .., alpha] = ray.target_rgb.to_le_bytes();
                 if alpha > 0 && render_rays.error.is_finite() {
                     sums[ray.embedding as usize]
@@ -383,18 +387,11 @@ impl NerfModel {
         let Some((_, field_trainer)) = &mut self.field else {
             return Ok(());
         };
-        let predicted = |image: &RayImage| {
-            interpolate(
-                &corrections
-                    .get(image.keyframe.camera.as_ref())?
-                    .appearance_embeddings,
-                image.keyframe.stamp,
-            )
-        };
         let appearance_embeddings: Vec<_> = self.images[self.n_hinted..]
             .iter()
-            .map(|image| predicted(image).unwrap_or_default())
+            .map(|image| interpolated_embedding(&corrections, image))
             .collect();
+        // Without parameters so far, the next step allocates them, and all start at zero.
         if field_trainer.images.is_some() {
             field_trainer.allocate_images(&self.gpu, self.images.len(), learned_params)?;
             field_trainer.initialize_images(&self.gpu, self.n_hinted, &appearance_embeddings);
@@ -415,16 +412,33 @@ impl NerfModel {
                 *stamp,
             )
         });
-        let all = || {
-            corrections
-                .values()
-                .flat_map(|correction| correction.appearance_embeddings.values())
-        };
+        let all = || all_embeddings(corrections);
         let n = all().count().max(1) as f64;
         Ok(embedding_of_image.unwrap_or_else(|| {
             std::array::from_fn(|ix| all().map(|embedding| embedding[ix]).sum::<f64>() / n)
         }))
     }
+}
+
+/// Appearance embedding of an image, interpolated between those of its camera; neutral if the
+/// camera has none.
+fn interpolated_embedding(
+    corrections: &BTreeMap<String, CameraCorrection>,
+    image: &RayImage,
+) -> [f64; EMBEDDING_DIM] {
+    corrections
+        .get(image.keyframe.camera.as_ref())
+        .and_then(|correction| interpolate(&correction.appearance_embeddings, image.keyframe.stamp))
+        .unwrap_or_default()
+}
+
+/// The embeddings of all images of all cameras.
+fn all_embeddings(
+    corrections: &BTreeMap<String, CameraCorrection>,
+) -> impl Iterator<Item = &[f64; EMBEDDING_DIM]> {
+    corrections
+        .values()
+        .flat_map(|correction| correction.appearance_embeddings.values())
 }
 
 /// Converts a field's pose correction (rotation about the camera, translation in world) to rotation
@@ -437,12 +451,15 @@ fn drift_of(
     let given = &keyframe.world_from_camera;
     let rotation = UnitQuaternion::from_scaled_axis(Vector3::new(*a, *b, *c));
     let translation_m = Vector3::new(*x, *y, *z) * extent.radius_m;
+    // The kernel adds the translation in world, and rotates directions about the camera, so the
+    // rotation is on the left.
     let found = Transform::from_parts(
         Translation3::from(given.translation.vector + translation_m),
         rotation * given.rotation,
     );
     let drift = found.inverse() * given;
-    let (rotation_rad, translation_m) = (drift.rotation.scaled_axis(), drift.translation.vector);
+    let rotation_rad = drift.rotation.scaled_axis();
+    let translation_m = drift.translation.vector;
     [
         rotation_rad.x,
         rotation_rad.y,
@@ -476,6 +493,8 @@ impl Comparison {
 
     /// Logarithm of the gain that minimizes the squared error of the picture.
     fn log_gain(&self) -> f64 {
+        // Least squares: the derivative of |gain * rendered - target|^2 is zero. A black picture
+        // has no gain.
         let gain = self.sum_rendered_target / self.sum_rendered_sq;
         if gain > 0.0 && gain.is_finite() {
             gain.ln()
@@ -493,6 +512,8 @@ impl Comparison {
 
 /// Gain of a candidate, from mean squared errors of the same images with it and without it.
 fn measure_gain(candidate: ParamSet, variant: &[f64], baseline: &[f64]) -> Trial {
+    // In dB, so that bright and dark images count alike. Images without rays have an error of 0,
+    // and no gain.
     let gains: Vec<f64> = variant
         .iter()
         .zip(baseline)

@@ -9,7 +9,8 @@ use super::space::{contract, contract_backward};
 pub const N_GEOMETRY_FEATURES: usize = 15;
 /// Basis functions of the direction: spherical harmonics up to degree 3.
 pub const N_DIRECTION: usize = 16;
-/// Upper limit of the logarithm of the density, to keep densities finite.
+/// Upper limit of the logarithm of the density, to keep densities finite. At exp(12) per radius, a
+/// ray is opaque after a fraction of a step.
 pub const MAX_LOG_DENSITY: f64 = 12.0;
 
 /// Added to the network's log density. Sets the density of an untrained field.
@@ -110,6 +111,7 @@ impl Field {
         v_rgb: [f64; 3],
         gradient: &mut FieldGrad,
     ) -> ([f64; 3], Vec<f64>) {
+        // Derivative of the sigmoid.
         let v_out: Vec<f64> = point
             .rgb
             .iter()
@@ -122,6 +124,8 @@ impl Field {
         let (v_geometry_features, v_embedding) =
             v_input[N_DIRECTION..].split_at(N_GEOMETRY_FEATURES);
         let log_density = point.density_layers.last().expect("an output layer")[0];
+        // The derivative of the exponential is the density itself. A clamped density does not
+        // depend on its logarithm.
         let v_log = if log_density + LOG_DENSITY_BIAS < MAX_LOG_DENSITY {
             v_density * point.density
         } else {

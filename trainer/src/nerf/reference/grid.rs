@@ -58,6 +58,7 @@ impl GridShape {
     pub fn entry(&self, level: usize, corner: [u32; 3]) -> u32 {
         let side = self.n_cells[level] + 1;
         let [x, y, z] = corner;
+        // The primes of Mueller et al. 2022, equation 4; the first one is 1.
         let is_dense = u64::from(side).pow(3) <= 1u64 << self.log2_entries;
         let offset = if is_dense {
             x + side * (y + side * z)
@@ -78,6 +79,12 @@ struct Corner {
     weight_gradient: [f64; 3],
 }
 
+/// Linear interpolation weight along an axis of the lower corner (step 0) or the upper corner (step
+/// 1).
+fn part_of(share: f64, step: u32) -> f64 {
+    if step == 1 { share } else { 1.0 - share }
+}
+
 /// Corners of the cell of a level around a point of the unit cube. Points outside are clamped to
 /// the cube.
 fn corners(shape: &GridShape, level: usize, at: [f64; 3]) -> [Corner; 8] {
@@ -93,13 +100,9 @@ fn corners(shape: &GridShape, level: usize, at: [f64; 3]) -> [Corner; 8] {
     std::array::from_fn(|ix| {
         let step: [u32; 3] =
             std::array::from_fn(|axis| u32::try_from(ix >> axis & 1).expect("0 or 1"));
-        let part = |axis: usize| {
-            if step[axis] == 1 {
-                share[axis]
-            } else {
-                1.0 - share[axis]
-            }
-        };
+        let part = |axis: usize| part_of(share[axis], step[axis]);
+        // The derivative of a product of three linear factors. It is zero outside the cube, where
+        // points are clamped.
         let weight_gradient = std::array::from_fn(|axis| {
             let sign = if step[axis] == 1 { n_cells } else { -n_cells };
             let inside = at[axis] >= 0.0 && at[axis] <= 1.0;
@@ -124,13 +127,12 @@ pub fn interpolate(shape: &GridShape, table: &[[f64; N_FEATURES]], at: [f64; 3])
     let mut features = Vec::with_capacity(shape.n_outputs());
     for level in 0..shape.n_cells.len() {
         let corners = corners(shape, level, at);
-        let sum = |feature: usize| -> f64 {
+        features.extend((0..N_FEATURES).map(|feature| -> f64 {
             corners
                 .iter()
                 .map(|corner| corner.weight * table[corner.entry][feature])
                 .sum()
-        };
-        features.extend((0..N_FEATURES).map(sum));
+        }));
     }
     features
 }

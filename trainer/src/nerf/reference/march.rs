@@ -25,7 +25,24 @@ pub struct RaySegment {
     pub length: f64,
 }
 
-/// Components of a direction that are smaller than this are replaced by it.
+impl RaySegment {
+    /// Middle of the segment on a ray.
+    fn middle(&self, origin: [f64; 3], direction: [f64; 3]) -> [f64; 3] {
+        std::array::from_fn(|axis| {
+            origin[axis] + (self.begin + 0.5 * self.length) * direction[axis]
+        })
+    }
+
+    /// Span of `stride` times the length around the middle.
+    fn widened(&self, stride: usize) -> [f64; 2] {
+        let middle = self.begin + 0.5 * self.length;
+        let reach = 0.5 * self.length * stride as f64;
+        [middle - reach, middle + reach]
+    }
+}
+
+/// Components of a direction that are smaller than this are replaced by it, so that divisions by
+/// them stay finite.
 const MIN_DIRECTION: f64 = 1e-9;
 
 /// The part of a ray inside the inner cube, and its number of steps.
@@ -87,14 +104,12 @@ impl March {
         is_occupied: impl Fn(usize) -> bool,
     ) -> (Vec<RaySegment>, f64) {
         let path = self.path((origin, direction), range);
-        let middle = |segment: &RaySegment| {
-            std::array::from_fn(|axis| {
-                origin[axis] + (segment.begin + 0.5 * segment.length) * direction[axis]
-            })
-        };
         let n_segments = (path.n_steps - jitter).ceil().max(0.0);
         let to_nearest_count = path.n_steps - jitter - (path.n_steps - jitter).round();
-        let (mut found, mut min_margin) = (Vec::new(), to_nearest_count.abs());
+        // The kernel computes in f32. Rays whose decisions depend on rounding have a small margin,
+        // and tests leave them out.
+        let mut found = Vec::new();
+        let mut min_margin = to_nearest_count.abs();
         let mut ix = 0.0;
         while ix < n_segments {
             let [begin, end] = [ix, ix + 1.0].map(|ix| path.distance_at(self.step, ix + jitter));
@@ -102,7 +117,7 @@ impl March {
                 begin,
                 length: end - begin,
             };
-            let (cell, margin) = self.cell(middle(&segment));
+            let (cell, margin) = self.cell(segment.middle(origin, direction));
             min_margin = min_margin.min(margin);
             if is_occupied(cell) {
                 found.push(segment);
@@ -113,6 +128,7 @@ impl March {
     }
 
     fn path(&self, (origin, direction): ([f64; 3], [f64; 3]), [begin, end]: [f64; 2]) -> Path {
+        // Intersection with the inner cube (slab method), and not before the beginning of the ray.
         let [mut enter, mut leave] = [begin, f64::INFINITY];
         for axis in 0..3 {
             let along = if direction[axis].abs() < MIN_DIRECTION {
@@ -124,6 +140,8 @@ impl March {
             enter = enter.max(low.min(high));
             leave = leave.min(low.max(high));
         }
+        // Outside, the share 1 - 1 / (1 + u) of a distance u grows by the same amount with each
+        // step, and stays below 1. A ray without end therefore has a finite number of steps.
         let contracted_share = |distance: f64| 1.0 - 1.0 / (1.0 + distance);
         let mut path = Path {
             enter: begin,
@@ -164,18 +182,12 @@ impl March {
             reason = "a fraction of the stride"
         )]
         let phase = ((jitter * stride as f64) as usize).min(stride - 1);
-        let span = |segment: &RaySegment| {
-            let (middle, reach) = (
-                segment.begin + 0.5 * segment.length,
-                0.5 * segment.length * stride as f64,
-            );
-            [middle - reach, middle + reach]
-        };
+        // A random phase, so that all segments are sampled in the course of several steps.
         segments
             .iter()
             .skip(phase)
             .step_by(stride)
-            .map(span)
+            .map(|segment| segment.widened(stride))
             .collect()
     }
 }

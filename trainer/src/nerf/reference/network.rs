@@ -22,7 +22,8 @@ impl Network {
         let mut layers = vec![input.to_vec()];
         let mut begin = 0;
         for (ix, pair) in self.sizes.windows(2).enumerate() {
-            let (n_in, n_out) = (pair[0], pair[1]);
+            let n_in = pair[0];
+            let n_out = pair[1];
             let before = &layers[ix];
             let weights = self.weights[begin..begin + n_in * n_out].chunks_exact(n_in);
             let sums = weights.map(|row| {
@@ -52,8 +53,11 @@ impl Network {
         let mut v_out = upstream.to_vec();
         let mut end = self.weights.len();
         for (ix, pair) in self.sizes.windows(2).enumerate().rev() {
-            let (n_in, n_out) = (pair[0], pair[1]);
+            let n_in = pair[0];
+            let n_out = pair[1];
             let begin = end - n_in * n_out;
+            // The stored activation is after the `ReLU`, so it is positive exactly where the
+            // gradient passes.
             if ix + 2 < self.sizes.len() {
                 for (v, x) in v_out.iter_mut().zip(&layers[ix + 1]) {
                     *v *= f64::from(*x > 0.0);
@@ -67,7 +71,8 @@ impl Network {
                     v_in[column] += v * self.weights[at];
                 }
             }
-            (v_out, end) = (v_in, begin);
+            v_out = v_in;
+            end = begin;
         }
         v_out
     }

@@ -27,7 +27,10 @@ impl ImagePose {
     /// * `direction`: corrected direction of the ray, of length 1.
     /// * `sample_positions`: distance along the ray and gradient of each sample.
     pub fn gradients(direction: [f64; 3], sample_positions: &[(f64, [f64; 3])]) -> Self {
-        let (mut v_origin, mut v_direction) = (Vector3::zeros(), Vector3::zeros());
+        // A sample is at origin + distance * direction. A small rotation w changes the direction by
+        // w x direction, so the gradient with respect to w is direction x v_direction.
+        let mut v_origin = Vector3::zeros();
+        let mut v_direction = Vector3::zeros();
         for (distance, gradient) in sample_positions {
             v_origin += Vector3::from(*gradient);
             v_direction += *distance * Vector3::from(*gradient);

@@ -75,29 +75,31 @@ pub fn composite_backward(
     rendered: &RenderedRay,
     upstream: &Upstream,
 ) -> Vec<(f64, [f64; 3])> {
-    let v_weight = |ix: usize| {
-        let color: f64 = (0..3)
-            .map(|channel| upstream.rgb[channel] * samples[ix].rgb[channel])
-            .sum();
-        color + upstream.distance * samples[ix].middle() + upstream.weights[ix]
-    };
+    let v_weight = |ix: usize| weight_gradient(&samples[ix], upstream, ix);
     // A sample occludes all samples behind it.
     let mut behind = rendered.transmittance * upstream.transmittance;
     let mut gradients = Vec::with_capacity(samples.len());
     for ix in (0..samples.len()).rev() {
-        let transmittance_after: f64 = {
-            let optical_depth: f64 = samples[..=ix]
-                .iter()
-                .map(|sample| sample.density * sample.length())
-                .sum();
-            (-optical_depth).exp()
-        };
+        let optical_depth: f64 = samples[..=ix]
+            .iter()
+            .map(|sample| sample.density * sample.length())
+            .sum();
+        let transmittance_after = (-optical_depth).exp();
+        // More density adds to the weight of this sample, and takes from everything behind it.
         let v_density = samples[ix].length() * (transmittance_after * v_weight(ix) - behind);
         gradients.push((v_density, upstream.rgb.map(|v| v * rendered.weights[ix])));
         behind += rendered.weights[ix] * v_weight(ix);
     }
     gradients.reverse();
     gradients
+}
+
+/// Gradient with respect to the weight of a sample: through the color, the distance, and directly.
+fn weight_gradient(sample: &Sample, upstream: &Upstream, ix: usize) -> f64 {
+    let color: f64 = (0..3)
+        .map(|channel| upstream.rgb[channel] * sample.rgb[channel])
+        .sum();
+    color + upstream.distance * sample.middle() + upstream.weights[ix]
 }
 
 /// Distortion loss: spread of the weights along a ray. Also returns its gradient with respect to
@@ -123,7 +125,11 @@ pub fn distortion(samples: &[Sample], weights: &[f64], near: f64) -> (f64, Vec<f
         .fold((0.0, 0.0), |sums, (weight, middle)| {
             (sums.0 + weight, sums.1 + weight * middle)
         });
-    let (mut before, mut loss) = ((0.0, 0.0), 0.0);
+    // Sums of weights, and of weights times positions, of all samples before and after the current
+    // one. They replace the double sum of the equation: |a - b| is a - b for samples before, and b
+    // - a for those after.
+    let mut before = (0.0, 0.0);
+    let mut loss = 0.0;
     let mut gradients = Vec::with_capacity(weights.len());
     for ((weight, middle), length) in weights.iter().zip(&middles).zip(&lengths) {
         let after = (

@@ -53,12 +53,12 @@ pub(crate) fn ray(seed: u64) -> Ray {
         .normalize()
         .map(rounded);
     let mut cursor = 0.2;
-    let span = |_| {
+    let mut spans = Vec::new();
+    for _ in 0..7 {
         let begin = rounded(cursor + random.uniform(0.02, 0.2));
         cursor = rounded(begin + random.uniform(0.1, 0.6));
-        [begin, cursor]
-    };
-    let spans = (0..7).map(span).collect();
+        spans.push([begin, cursor]);
+    }
     let embedding = random.array::<EMBEDDING_DIM>(-0.5, 0.5).to_vec();
     let target = Target {
         rgb: random
@@ -95,15 +95,17 @@ pub(crate) fn samples(field: &Field, ray: &Ray) -> Vec<Sample> {
 
 /// The samples of a ray, with colors viewed along another direction.
 fn samples_viewed_along(field: &Field, ray: &Ray, direction: [f64; 3]) -> Vec<Sample> {
-    let sample = |span: &[f64; 2]| {
-        let point = field.point(sample_position(ray, *span), direction, &ray.embedding);
-        Sample {
-            span: *span,
-            density: point.density,
-            rgb: point.rgb,
-        }
-    };
-    ray.spans.iter().map(sample).collect()
+    ray.spans
+        .iter()
+        .map(|span| {
+            let point = field.point(sample_position(ray, *span), direction, &ray.embedding);
+            Sample {
+                span: *span,
+                density: point.density,
+                rgb: point.rgb,
+            }
+        })
+        .collect()
 }
 
 pub(crate) fn loss(field: &Field, ray: &Ray) -> f64 {
@@ -126,11 +128,9 @@ pub(crate) fn gradient(field: &Field, ray: &Ray) -> (FieldGrad, SamplePositions,
     let rendered = ray::composite(&samples);
     let (_, upstream) = ray::loss(&samples, &rendered, &ray.target, &WEIGHTS);
     let gradients = ray::composite_backward(&samples, &rendered, &upstream);
-    let (mut gradient, mut v_positions, mut v_embedding) = (
-        FieldGrad::zeros(field),
-        Vec::new(),
-        vec![0.0; EMBEDDING_DIM],
-    );
+    let mut gradient = FieldGrad::zeros(field);
+    let mut v_positions = Vec::new();
+    let mut v_embedding = vec![0.0; EMBEDDING_DIM];
     for (span, (v_density, v_rgb)) in ray.spans.iter().zip(gradients) {
         let at = sample_position(ray, *span);
         let point = field.point(at, ray.direction, &ray.embedding);

@@ -26,18 +26,18 @@ pub fn contract_backward(at: [f64; 3], upstream: [f64; 3]) -> [f64; 3] {
     let by_max = (2.0 - 2.0 * max_abs) / (max_abs * max_abs * max_abs);
     let along: f64 = at.iter().zip(upstream).map(|(x, v)| x * v).sum();
     let mut gradient = upstream.map(|v| v * factor);
+    // Moving the largest coordinate changes the factor of all three.
     gradient[axis] += along * by_max * at[axis].signum();
     gradient.map(|v| v / 4.0)
 }
 
 /// The axis with the largest absolute coordinate, and that absolute value.
 pub(crate) fn largest(point: [f64; 3]) -> (usize, f64) {
-    let larger = |best: (usize, f64), axis: usize| {
-        if point[axis].abs() > best.1 {
-            (axis, point[axis].abs())
-        } else {
-            best
+    let mut best = (0, 0.0);
+    for (axis, along) in point.into_iter().enumerate() {
+        if along.abs() > best.1 {
+            best = (axis, along.abs());
         }
-    };
-    (0..3).fold((0, 0.0), larger)
+    }
+    best
 }

@@ -19,7 +19,8 @@ fn central(at: impl Fn(f64) -> f64) -> f64 {
 fn ray_gradients_match_central_differences() {
     let mut mismatches = Mismatches::default();
     for seed in [3, 4, 5] {
-        let (field, ray) = (field(seed), ray(seed + 10));
+        let field = field(seed);
+        let ray = ray(seed + 10);
         let (gradients, v_positions, v_embedding) = gradient(&field, &ray);
         let nudged = |change: &dyn Fn(&mut Field, f64), step: f64| {
             let mut field = field.clone();
@@ -182,7 +183,8 @@ fn grid_interpolates_linearly_between_corners() {
         table[shape.entry(0, corner) as usize] = linear(corner.map(|x| f64::from(x) / 4.0));
     }
     for at in [[0.0; 3], [1.0; 3], [0.25, 0.5, 0.75], [0.13, 0.99, 0.47]] {
-        let (found, expected) = (grid::interpolate(&shape, &table, at), linear(at));
+        let found = grid::interpolate(&shape, &table, at);
+        let expected = linear(at);
         assert!(
             found
                 .iter()

@@ -4,7 +4,8 @@ use rayon::prelude::*;
 use std::collections::BTreeMap;
 use std::ops::Range;
 
-/// Number of levels below the root. Ids of the smallest cells have 52 bits.
+/// Number of levels below the root. Ids of the smallest cells have 52 bits, so a page can hold them
+/// as JavaScript numbers.
 const N_LEVELS: u32 = 17;
 /// Edge of the root, meters; the smallest cells have edges of 8 mm. Splats outside belong to the
 /// nearest cell.
@@ -12,9 +13,11 @@ const ROOT_M: f64 = 1024.0;
 /// Maximum number of splats in a cell: some ten kilobytes, so that a chunk does not delay pictures
 /// for long.
 const MAX_SPLATS: usize = 2048;
-/// A cell of the last version is divided only above this number, and cells are merged only below
-/// the other.
+/// A cell of the last version is divided only above this number. Without a distance from
+/// [`MAX_SPLATS`], a cell with about as many splats would be divided and merged again and again,
+/// and sent each time.
 const MAX_SPLATS_KEPT: usize = 2560;
+/// Cells of the last version are merged only if they have at most this many splats together.
 const MAX_SPLATS_MERGED: usize = 1024;
 /// Levels between a cell and its parts.
 const PART_LEVELS: u32 = 2;
@@ -32,11 +35,13 @@ impl Cell {
 
     /// A number that differs for all cells of all levels.
     pub(super) fn id(self) -> u64 {
+        // A leading one marks the level. Without it, the first cells of all levels would be 0.
         1 << (3 * self.level) | self.first >> (3 * (N_LEVELS - self.level))
     }
 
     /// Index of the part of the cell that contains a location.
     pub(super) fn part_of(self, code: u64) -> usize {
+        // The smallest cells have no levels below them, so all of their splats are in few parts.
         let shift = 3 * N_LEVELS.saturating_sub(self.level + PART_LEVELS);
         usize::try_from(code >> shift & ((1 << (3 * PART_LEVELS)) - 1)).unwrap_or(0)
     }
@@ -72,6 +77,7 @@ pub(super) fn location_codes(means: &[[f32; 3]], members: &[u32]) -> Vec<(u64, u
     reason = "clamped to 17 bits"
 )]
 fn location_code(mean: [f32; 3]) -> u64 {
+    // The clamp moves splats outside of the root to its border. A NaN becomes 0.
     let n_cells = f64::from(1_u32 << N_LEVELS);
     let along =
         mean.map(|at| ((f64::from(at) / ROOT_M + 0.5) * n_cells).clamp(0.0, n_cells - 1.0) as u64);
@@ -119,10 +125,12 @@ fn divide<T>(
     if range.is_empty() {
         return;
     }
+    // Splats at one position cannot be separated by further division.
     if range.len() <= max_splats || cell.level == N_LEVELS {
         leaves.push((cell, range));
         return;
     }
+    // The splats are sorted by location code, so those of each child are consecutive.
     let mut begin = range.start;
     for child in cell.children() {
         let n = sorted[begin..range.end].partition_point(|(code, _)| *code < child.end());

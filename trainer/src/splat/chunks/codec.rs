@@ -4,14 +4,16 @@ use crate::gpu::f32_of;
 use crate::model_chunks::{ChunkData, ChunkLayout};
 use crate::splat::arrays::SplatArrays;
 use std::f64::consts::FRAC_1_SQRT_2;
+use std::ops::Range;
 
 /// Highest degree of spherical harmonics in a chunk. Degree 3 would need twice as many bytes.
 pub(in crate::splat) const MAX_SH_DEGREE: u32 = 2;
 /// Constant basis function.
 pub(super) const SH_0: f64 = 0.282_094_791_773_878_14;
-/// Bits of a coordinate of a mean.
+/// Bits of a coordinate of a mean. In a cell of 1 m, a step is 0.12 mm.
 const MEAN_BITS: u32 = 13;
-/// Range of constant colors. View-dependent parts are added to them.
+/// Range of constant colors. It is wider than 0 to 1, because view-dependent parts are added to
+/// them.
 const COLOR_RANGE: [f64; 2] = [-0.5, 1.5];
 /// Larger ranges of standard deviations are clamped at the lower end: such splats are thinner than
 /// a pixel.
@@ -21,7 +23,8 @@ const N_DEGREE_1: usize = 3;
 const N_DEGREE_2: usize = 8;
 /// Maximum magnitude of a coefficient in 5 bits.
 const MAX_SH_COUNT: f64 = 15.0;
-/// Larger coefficients are clamped, in units of the root mean square of the chunk.
+/// Larger coefficients are clamped, in units of the root mean square of the chunk. A single outlier
+/// would otherwise make the steps of all other coefficients too coarse.
 const MAX_SH_DEVIATIONS: f64 = 4.0;
 
 /// Encodes these splats in the given order.
@@ -64,49 +67,33 @@ struct Ranges {
 
 impl Ranges {
     fn of(splats: &SplatArrays, members: &[u32], sh_degree: u32) -> Self {
-        let means = || members.iter().map(|ix| splats.means[*ix as usize]);
-        let extreme = |begin: f32, pick: fn(f32, f32) -> f32| -> [f32; 3] {
-            means().fold([begin; 3], |so_far, mean| {
-                std::array::from_fn(|axis| pick(so_far[axis], mean[axis]))
-            })
-        };
-        let log_scales = || {
-            members
-                .iter()
-                .flat_map(|ix| splats.log_scales[*ix as usize])
-        };
-        let largest = log_scales().fold(f32::NEG_INFINITY, f32::max);
-        let smallest = log_scales()
-            .fold(f32::INFINITY, f32::min)
-            .max(largest - f32_of(MAX_LOG_SCALE_SPAN));
-        let sh_range = |degree: u32, functions: std::ops::Range<usize>| -> f32 {
-            let values = || {
-                members
-                    .iter()
-                    .filter(|_| degree <= sh_degree)
-                    .flat_map(|ix| {
-                        functions
-                            .clone()
-                            .flat_map(|function| higher_coefficient(splats, *ix, function))
-                    })
-            };
-            let n_values = values().count().max(1) as f64;
-            let rms = (values().map(|value| value * value).sum::<f64>() / n_values).sqrt();
-            f32_of(
-                values()
-                    .map(f64::abs)
-                    .fold(0.0, f64::max)
-                    .min(MAX_SH_DEVIATIONS * rms),
-            )
+        let mut min_m = [f32::INFINITY; 3];
+        let mut max_m = [f32::NEG_INFINITY; 3];
+        let mut smallest = f32::INFINITY;
+        let mut largest = f32::NEG_INFINITY;
+        for ix in members {
+            let mean = splats.means[*ix as usize];
+            min_m = std::array::from_fn(|axis| min_m[axis].min(mean[axis]));
+            max_m = std::array::from_fn(|axis| max_m[axis].max(mean[axis]));
+            for log_scale in splats.log_scales[*ix as usize] {
+                smallest = smallest.min(log_scale);
+                largest = largest.max(log_scale);
+            }
+        }
+        // A wide range would make the steps of visible sizes too coarse.
+        let smallest = smallest.max(largest - f32_of(MAX_LOG_SCALE_SPAN));
+        // Coefficients of degree 2 are usually smaller, so each degree has its own range.
+        let degree_1 = if sh_degree >= 1 { 0..N_DEGREE_1 } else { 0..0 };
+        let degree_2 = if sh_degree >= 2 {
+            N_DEGREE_1..N_DEGREE_2
+        } else {
+            0..0
         };
         Self {
-            min_m: extreme(f32::INFINITY, f32::min),
-            max_m: extreme(f32::NEG_INFINITY, f32::max),
+            min_m,
+            max_m,
             log_scale: [smallest, largest],
-            sh: [
-                sh_range(1, 0..N_DEGREE_1),
-                sh_range(2, N_DEGREE_1..N_DEGREE_2),
-            ],
+            sh: [degree_1, degree_2].map(|functions| sh_range(splats, members, functions)),
             sh_degree,
         }
     }
@@ -121,6 +108,7 @@ impl Ranges {
                 MEAN_BITS,
             )
         });
+        // Eight bits each for scales, opacity and color.
         let scales = splats.log_scales[ix]
             .map(|scale| count(scale.into(), self.log_scale.map(f64::from), 8));
         let color = splats.sh[ix * splats.n_coefficients()];
@@ -148,6 +136,7 @@ impl Ranges {
                 .into_iter()
                 .enumerate()
             {
+                // A range of 0 has no steps. All coefficients are 0 then.
                 let is_present = degree <= self.sh_degree as usize && range > 0.0;
                 let share = if is_present { value / range } else { 0.0 };
                 let field = 3 * function + channel;
@@ -156,6 +145,20 @@ impl Ranges {
         }
         words
     }
+}
+
+/// Largest magnitude of these higher coefficients, without outliers.
+fn sh_range(splats: &SplatArrays, members: &[u32], functions: Range<usize>) -> f32 {
+    let mut values: Vec<f64> = Vec::new();
+    for ix in members {
+        for function in functions.clone() {
+            values.extend(higher_coefficient(splats, *ix, function));
+        }
+    }
+    let n_values = values.len().max(1) as f64;
+    let rms = (values.iter().map(|value| value * value).sum::<f64>() / n_values).sqrt();
+    let largest = values.iter().map(|value| value.abs()).fold(0.0, f64::max);
+    f32_of(largest.min(MAX_SH_DEVIATIONS * rms))
 }
 
 /// Red, green and blue of a basis function after the constant one; zero if the splats have none.
@@ -177,6 +180,7 @@ fn higher_coefficient(splats: &SplatArrays, splat_ix: u32, function: usize) -> [
     reason = "clamped to the bits"
 )]
 fn count(value: f64, [min, max]: [f64; 2], bits: u32) -> u32 {
+    // In a range without extent, all values are equal, and 0 stands for them.
     let max_count = f64::from((1_u32 << bits) - 1);
     let share = if max > min {
         (value - min) / (max - min)
@@ -210,6 +214,7 @@ fn rotation_word(wxyz: [f32; 4]) -> u32 {
         .map(|part| part * part)
         .sum::<f64>()
         .sqrt()
+        // Not 0, even for an invalid rotation.
         .max(1e-30);
     let largest_ix = (1..4).fold(0, |largest, ix| {
         if wxyz[ix].abs() > wxyz[largest].abs() {
@@ -218,6 +223,8 @@ fn rotation_word(wxyz: [f32; 4]) -> u32 {
             largest
         }
     });
+    // A quaternion and its negative are the same rotation, so the sign of the omitted component
+    // need not be stored. The others are at most 1 / sqrt(2).
     let sign = wxyz[largest_ix].signum() / length;
     let others = (0..4)
         .filter(|ix| *ix != largest_ix)

@@ -17,13 +17,16 @@ use std::hash::{DefaultHasher, Hasher};
 
 pub(super) use self::codec::MAX_SH_DEGREE;
 
-/// The coarse form of a chunk has one of this many splats.
+/// The coarse form of a chunk has one of this many splats. More splats look better, but delay the
+/// first picture of the whole scene.
 const COARSE_STRIDE: usize = 8;
-/// The maximum factor by which coarse splats are enlarged.
+/// The maximum factor by which coarse splats are enlarged. Beyond it, they would blur into blobs
+/// that hide other chunks.
 const MAX_SCALE_FACTOR: f64 = 2.0;
-/// Changes are measured in `N_PARTS` parts of a cell.
+/// Changes are measured in `N_PARTS` parts of a cell: 4 x 4 x 4.
 const N_PARTS: usize = 64;
 /// A change that leaves the sums of all parts as they are counts as this fraction of the sums.
+/// Without it, a chunk whose splats only trade places would never be sent.
 const MIN_CHANGE_FRAC: f64 = 1e-3;
 
 /// Sums over the splats in each part of a cell: visible area, and the same times red, green and
@@ -50,38 +53,18 @@ impl Chunker {
         if !only_changed {
             self.last.clear();
         }
+        // Without a last version, the receiver has to discard chunks that it may still have.
         let is_complete = self.last.is_empty();
         let sorted = location_codes(&splats.means, &splats.visible());
         let cells = leaves(&sorted, &self.last);
         let made: Vec<(Cell, Content, ModelChunk)> = cells
             .into_par_iter()
             .map(|(cell, range)| {
-                let sums = sums(splats, cell, &sorted[range.clone()]);
-                let mut members: Vec<u32> = sorted[range]
-                    .iter()
-                    .map(|(_, splat_ix)| *splat_ix)
-                    .collect();
-                members.sort_by(|a, b| area(splats, *b).total_cmp(&area(splats, *a)));
-                let fine = encode(splats, &members, 1.0, splats.sh_degree);
-                let mut hasher = DefaultHasher::new();
-                hasher.write(&fine.bytes);
-                let content = Content {
-                    hash: hasher.finish(),
-                    sums,
-                };
-                let change = change(self.last.get(&cell), &content);
-                (
-                    cell,
-                    content,
-                    ModelChunk {
-                        id: cell.id(),
-                        change,
-                        coarse: coarse(splats, &members),
-                        fine,
-                    },
-                )
+                let (content, chunk) = encoded(splats, cell, &sorted[range], self.last.get(&cell));
+                (cell, content, chunk)
             })
             .collect();
+        // Cells that remain in `last` no longer exist: they were divided, merged or emptied.
         let mut last = std::mem::take(&mut self.last);
         let mut chunks = Vec::new();
         for (cell, content, chunk) in made {
@@ -101,8 +84,40 @@ impl Chunker {
     }
 }
 
+/// Encodes the splats of a cell. `before` is its content in the last version.
+fn encoded(
+    splats: &SplatArrays,
+    cell: Cell,
+    members: &[(u64, u32)],
+    before: Option<&Content>,
+) -> (Content, ModelChunk) {
+    let sums = sums(splats, cell, members);
+    let mut members: Vec<u32> = members.iter().map(|(_, splat_ix)| *splat_ix).collect();
+    // The most visible splats come first, because the coarse form consists of the first ones.
+    members.sort_by(|a, b| area(splats, *b).total_cmp(&area(splats, *a)));
+    let fine = encode(splats, &members, 1.0, splats.sh_degree);
+    // A hash instead of the bytes, which would double the memory of the model.
+    let mut hasher = DefaultHasher::new();
+    hasher.write(&fine.bytes);
+    // The bytes are relative to the box and the ranges in the layout. They stay the same if all
+    // splats of a chunk move together.
+    hasher.write(format!("{:?}", fine.layout).as_bytes());
+    let content = Content {
+        hash: hasher.finish(),
+        sums,
+    };
+    let chunk = ModelChunk {
+        id: cell.id(),
+        change: change(before, &content),
+        coarse: coarse(splats, &members),
+        fine,
+    };
+    (content, chunk)
+}
+
 /// Opacity times the largest cross section of a splat, square meters up to a constant factor.
 fn area(splats: &SplatArrays, splat_ix: u32) -> f64 {
+    // The product of the two largest standard deviations, as a sum of logarithms.
     let log_scale = splats.log_scales[splat_ix as usize].map(f64::from);
     let smallest = log_scale.into_iter().fold(f64::INFINITY, f64::min);
     splats.opacity(splat_ix as usize) * (log_scale.iter().sum::<f64>() - smallest).exp()
@@ -113,7 +128,9 @@ fn coarse(splats: &SplatArrays, members: &[u32]) -> Option<ChunkData> {
     let n = members.len().div_ceil(COARSE_STRIDE);
     let total = |members: &[u32]| members.iter().map(|ix| area(splats, *ix)).sum::<f64>();
     let ratio = total(members) / total(&members[..n]);
+    // An area grows with the square of the scale.
     let scale_factor = ratio.sqrt().clamp(1.0, MAX_SCALE_FACTOR);
+    // If the coarse form has all splats, the fine form takes no longer.
     (n < members.len()).then(|| encode(splats, &members[..n], scale_factor, 0))
 }
 

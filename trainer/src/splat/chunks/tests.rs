@@ -402,3 +402,16 @@ fn changes_are_listed_where_they_are_and_by_their_size() {
         "transparent splats and NaN are left out"
     );
 }
+
+/// The bytes of a chunk are relative to its box.
+#[test]
+fn chunk_whose_splats_move_together_has_changed() {
+    let mut splats = of_degree_2(synthetic_cloud(300, 2));
+    let mut chunker = Chunker::default();
+    let first = chunker.chunks(&splats, true);
+    for mean in &mut splats.means {
+        mean[0] += 1e-3;
+    }
+    let moved = chunker.chunks(&splats, true);
+    assert!(moved.removed.is_empty() && moved.chunks.len() == first.chunks.len());
+}

@@ -2,7 +2,8 @@
 
 use std::borrow::Cow;
 
-/// Maximum length of a header. Headers of splat files have about 2000 bytes.
+/// Maximum length of a header. Headers of splat files have about 2000 bytes. The limit bounds the
+/// search for the end of the header in files that have none.
 const MAX_HEADER_BYTES: usize = 64 * 1024;
 
 /// The tables of a file.
@@ -117,6 +118,8 @@ impl NumberType {
 impl<'a> Header<'a> {
     /// Parses the header and finds the tables.
     pub(super) fn parse(bytes: &'a [u8]) -> Result<Self, String> {
+        // Binary rows follow directly, so the header cannot be split into lines before its end is
+        // known.
         let searched = &bytes[..bytes.len().min(MAX_HEADER_BYTES)];
         let end = [&b"\nend_header\n"[..], b"\nend_header\r\n"]
             .into_iter()
@@ -176,6 +179,7 @@ impl<'a> Header<'a> {
     }
 
     fn parse_line(&mut self, line: &str, format: &mut Option<Format>) -> Result<(), String> {
+        // A property belongs to the last element before it.
         let words: Vec<&str> = line.split_whitespace().collect();
         match (words.as_slice(), self.elements.last_mut()) {
             ([] | ["obj_info", ..], _) => {}
@@ -192,15 +196,14 @@ impl<'a> Header<'a> {
                 let count = count
                     .parse()
                     .map_err(|_| format!("element {name}: count {count:?} is not a number"))?;
-                let (name, rows) = ((*name).to_owned(), Err("it is not in the file".to_owned()));
-                let (properties, lists) = (Vec::new(), Vec::new());
                 self.elements.push(Element {
-                    name,
+                    name: (*name).to_owned(),
                     count,
                     row_bytes: 0,
-                    properties,
-                    lists,
-                    rows,
+                    properties: Vec::new(),
+                    lists: Vec::new(),
+                    // Replaced when the rows are found.
+                    rows: Err("it is not in the file".to_owned()),
                 });
             }
             (["property", "list", length, word, name], Some(element)) => {
@@ -208,17 +211,17 @@ impl<'a> Header<'a> {
                 let [Some(length), Some(number)] = types else {
                     return Err(format!("property {name}: unknown type in {line:?}"));
                 };
-                let (n_before, bytes_before) = (element.properties.len(), element.row_bytes);
                 element.lists.push(List {
                     length,
                     number,
-                    n_before,
-                    bytes_before,
+                    n_before: element.properties.len(),
+                    bytes_before: element.row_bytes,
                 });
             }
             (["property", word, name], Some(element)) => {
                 let number_type = NumberType::of(word)
                     .ok_or_else(|| format!("property {name}: unknown type {word:?}"))?;
+                // Which of the two a reader means would be a guess.
                 if element
                     .properties
                     .iter()
@@ -241,9 +244,11 @@ impl<'a> Header<'a> {
     /// Finds the rows of each element up to the first incomplete one; later ones keep their error.
     fn locate_binary(&mut self, mut rest: &'a [u8], format: Format) {
         for element in &mut self.elements {
-            let n_bytes = match element.lists.is_empty() {
-                true => element.count.checked_mul(element.row_bytes),
-                false => bytes_with_lists(element, rest, format),
+            // Checked, because the count is any number of the file.
+            let n_bytes = if element.lists.is_empty() {
+                element.count.checked_mul(element.row_bytes)
+            } else {
+                bytes_with_lists(element, rest, format)
             };
             let Some((rows, after)) = n_bytes.and_then(|n_bytes| rest.split_at_checked(n_bytes))
             else {
@@ -251,6 +256,7 @@ impl<'a> Header<'a> {
                 return;
             };
             rest = after;
+            // Tables with lists are skipped, so their bytes need no swapping.
             element.rows = Ok(match format {
                 Format::BigEndian if element.lists.is_empty() => swapped(element, rows).into(),
                 _ => rows.into(),
@@ -265,7 +271,7 @@ impl<'a> Header<'a> {
             .split(|byte| *byte == b'\n')
             .filter(|line| !line.trim_ascii().is_empty());
         for element in &mut self.elements {
-            // A number and a space take at least two bytes.
+            // A number and a space take at least two bytes. A larger count must not reserve memory.
             let n_words = element
                 .count
                 .checked_mul(element.properties.len() + element.lists.len());
@@ -274,40 +280,15 @@ impl<'a> Header<'a> {
                 return;
             }
             let mut rows = Vec::with_capacity(element.count * element.row_bytes);
-            let mut read_row = || -> Option<Result<(), String>> {
-                let mut words = std::str::from_utf8(lines.next()?)
-                    .ok()?
-                    .split_ascii_whitespace();
-                let n_expected = element.properties.len();
-                let wrong = || Some(Err(format!("it does not have {n_expected} numbers")));
-                for (property_ix, property) in element.properties.iter().enumerate() {
-                    if skip_lists(&element.lists, property_ix, &mut words).is_none() {
-                        return wrong();
-                    }
-                    let Some(word) = words.next() else {
-                        return wrong();
-                    };
-                    let Some(bytes) = property.number_type.little_endian(word) else {
-                        let shown: String = word.chars().take(30).collect();
-                        return Some(Err(format!(
-                            "{}: {shown:?} is not a valid {:?}",
-                            property.name, property.number_type
-                        )));
-                    };
-                    rows.extend(bytes);
+            let problem = (0..element.count).find_map(|row| {
+                match lines.next().and_then(|line| std::str::from_utf8(line).ok()) {
+                    Some(line) => read_row(element, line, &mut rows)
+                        .err()
+                        .map(|reason| format!("row {row} of {:?}: {reason}", element.name)),
+                    None => Some(truncated(element)),
                 }
-                let is_complete = skip_lists(&element.lists, n_expected, &mut words).is_some();
-                if is_complete && words.next().is_none() {
-                    Some(Ok(()))
-                } else {
-                    wrong()
-                }
-            };
-            let problem = (0..element.count).find_map(|row| match read_row() {
-                Some(Ok(())) => None,
-                Some(Err(reason)) => Some(format!("row {row} of {:?}: {reason}", element.name)),
-                None => Some(truncated(element)),
             });
+            // The start of later elements is unknown, so they keep their error.
             if let Some(problem) = problem {
                 element.rows = Err(problem);
                 return;
@@ -316,6 +297,29 @@ impl<'a> Header<'a> {
         }
         self.n_unread = lines.map(<[u8]>::len).sum();
     }
+}
+
+/// Appends the numbers of a row of text to `rows`, little-endian.
+fn read_row(element: &Element<'_>, line: &str, rows: &mut Vec<u8>) -> Result<(), String> {
+    let mut words = line.split_ascii_whitespace();
+    let n_expected = element.properties.len();
+    let wrong = || format!("it does not have {n_expected} numbers");
+    for (property_ix, property) in element.properties.iter().enumerate() {
+        skip_lists(&element.lists, property_ix, &mut words).ok_or_else(wrong)?;
+        let word = words.next().ok_or_else(wrong)?;
+        let bytes = property.number_type.little_endian(word).ok_or_else(|| {
+            // The word comes from the file and may be long.
+            let shown: String = word.chars().take(30).collect();
+            format!(
+                "{}: {shown:?} is not a valid {:?}",
+                property.name, property.number_type
+            )
+        })?;
+        rows.extend(bytes);
+    }
+    skip_lists(&element.lists, n_expected, &mut words).ok_or_else(wrong)?;
+    // More words than properties mean that the header does not describe the row.
+    words.next().map_or(Ok(()), |_| Err(wrong()))
 }
 
 fn truncated(element: &Element<'_>) -> String {
@@ -343,6 +347,8 @@ fn skip_lists<'a>(
 
 /// Size of the rows of an element with lists; `None` if they are not complete.
 fn bytes_with_lists(element: &Element<'_>, bytes: &[u8], format: Format) -> Option<usize> {
+    // Lengths come from the file, so every sum is checked. A loop over a large count ends early:
+    // each row takes at least one byte of the file.
     let mut at = 0_usize;
     for _ in 0..element.count {
         let mut n_passed_bytes = 0;

@@ -16,7 +16,8 @@ use std::path::Path;
 /// Constant factor of the first spherical harmonic, `1 / (2 sqrt(pi))`.
 pub(super) const SH_0: f32 = 0.282_094_8;
 /// Thickness of a flat splat (2D Gaussian splatting), relative to its smaller radius, as a
-/// logarithm.
+/// logarithm. It is one thousandth: thin enough to be invisible from the side, and thick enough for
+/// a covariance that is invertible in f32.
 const LOG_FLATNESS: f32 = -7.0;
 /// Properties of splats that are not used: normals, which are zero in these files, and names of
 /// other programs for numbers that do not affect pictures.
@@ -59,14 +60,9 @@ pub fn write(path: &Path, splats: &SplatArrays) -> Result<(), Error> {
 /// The splats, and notes about what is not used.
 fn from_bytes(bytes: &[u8]) -> Result<(SplatArrays, Vec<String>), String> {
     let header = Header::parse(bytes)?;
-    let mut notes = Vec::new();
+    let mut notes: Vec<String> = note_of_unread(&header).into_iter().collect();
     let is_antialiased = is_antialiased(header.comments());
-    if header.n_unread() > 0 {
-        notes.push(format!(
-            "{} bytes after the last row are not used",
-            header.n_unread()
-        ));
-    }
+    // Only the packed layout of SuperSplat has chunks.
     if header.has_element("chunk") {
         return Ok((
             SplatArrays {
@@ -76,6 +72,8 @@ fn from_bytes(bytes: &[u8]) -> Result<(SplatArrays, Vec<String>), String> {
             notes,
         ));
     }
+    // Point clouds and meshes have the same extension. Naming them is more useful than naming the
+    // first missing property.
     let vertices = header.table("vertex")?;
     let names: Vec<&str> = vertices.names().collect();
     let is_splat =
@@ -93,17 +91,13 @@ fn from_bytes(bytes: &[u8]) -> Result<(SplatArrays, Vec<String>), String> {
     let color = ColorColumns::of(&vertices)?;
     notes.extend(color.note());
     let filter = vertices.column("filter_3D").ok();
+    // A property that fieldrig does not know may change how the splats look.
     let unused: Vec<&str> = names
         .iter()
         .copied()
         .filter(|name| !is_used(name, &color))
         .collect();
-    if !unused.is_empty() {
-        notes.push(format!(
-            "properties that are not used: {}",
-            unused.join(", ")
-        ));
-    }
+    notes.extend(note_of_unused(&unused));
     let rows = 0..vertices.n_rows();
     let mut splats = SplatArrays {
         means: rows
@@ -123,10 +117,22 @@ fn from_bytes(bytes: &[u8]) -> Result<(SplatArrays, Vec<String>), String> {
         sh_degree: color.degree,
         is_antialiased,
     };
+    // Last, because the filter changes scales and opacities that were read.
     if let Some(filter) = filter {
         rows.for_each(|row| widen(&mut splats, row, filter.f32(row)));
     }
     Ok((splats, notes))
+}
+
+/// Note about bytes after the last row, if there are any.
+fn note_of_unread(header: &Header<'_>) -> Option<String> {
+    let n_unread = header.n_unread();
+    (n_unread > 0).then(|| format!("{n_unread} bytes after the last row are not used"))
+}
+
+/// Note about properties that are not used, if there are any.
+fn note_of_unused(names: &[&str]) -> Option<String> {
+    (!names.is_empty()).then(|| format!("properties that are not used: {}", names.join(", ")))
 }
 
 /// Whether the comments name the opacity correction of Mip-Splatting, as Brush (`SplatRenderMode:
@@ -161,6 +167,7 @@ fn is_used(name: &str, color: &ColorColumns<'_>) -> bool {
 fn widen(splats: &mut SplatArrays, row: usize, filter_m: f32) {
     let variances = splats.log_scales[row].map(|log_scale| (2.0 * log_scale).exp());
     let widened = variances.map(|variance| variance + filter_m * filter_m);
+    // The volume is the square root of the determinant of the covariance.
     let ratio = variances
         .iter()
         .zip(&widened)
@@ -183,6 +190,7 @@ impl<'a> Scales<'a> {
     fn of(vertices: &Table<'a>) -> Result<Self, String> {
         match vertices.columns(["scale_0", "scale_1", "scale_2"]) {
             Ok(columns) => Ok(Self::Solid(columns)),
+            // If even two scales are missing, the error names one of them.
             Err(_) => vertices.columns(["scale_0", "scale_1"]).map(Self::Flat),
         }
     }
@@ -191,6 +199,7 @@ impl<'a> Scales<'a> {
         match self {
             Self::Solid(columns) => columns.each_ref().map(|column| column.f32(row)),
             Self::Flat(columns) => {
+                // A sum of logarithms is a product of lengths.
                 let [a, b] = columns.each_ref().map(|column| column.f32(row));
                 [a, b, a.min(b) + LOG_FLATNESS]
             }
@@ -221,6 +230,7 @@ impl<'a> ColorColumns<'a> {
         let n_rest = rest.len() / 3;
         let constant = match vertices.columns(["f_dc_0", "f_dc_1", "f_dc_2"]) {
             Ok(columns) => ConstantColor::Coefficients(columns),
+            // Some programs write plain vertex colors. Without these, the usual layout is named.
             Err(missing) => {
                 let channels = vertices
                     .columns(["red", "green", "blue"])
@@ -251,6 +261,7 @@ impl<'a> ColorColumns<'a> {
                 .each_ref()
                 .map(|column| (column.channel(row) - 0.5) / SH_0),
         };
+        // From planes of channels to one color per coefficient.
         let n_used = (self.degree as usize + 1).pow(2) - 1;
         let rest = (0..n_used)
             .map(|ix| std::array::from_fn(|color| self.rest[color * self.n_rest + ix].f32(row)));
@@ -263,6 +274,7 @@ fn rest_columns<'a>(table: &Table<'a>) -> Result<(u32, Vec<Column<'a>>), String>
     let rest: Vec<_> = (0..)
         .map_while(|ix| table.column(&format!("f_rest_{ix}")).ok())
         .collect();
+    // Three channels of `(degree + 1)^2 - 1` coefficients. Degree 4 (72) is read as degree 3.
     let degree = match rest.len() {
         0 => 0,
         9 => 1,
@@ -288,6 +300,7 @@ fn write_to(file: &mut impl Write, splats: &SplatArrays) -> std::io::Result<()> 
         "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3",
     ]
     .map(str::to_owned);
+    // As Brush writes it, so that other programs apply the opacity correction, too.
     let comment = if splats.is_antialiased {
         "comment SplatRenderMode: mip\n"
     } else {
@@ -303,6 +316,7 @@ fn write_to(file: &mut impl Write, splats: &SplatArrays) -> std::io::Result<()> 
     }
     writeln!(file, "end_header")?;
     for (splat_ix, color) in splats.sh.chunks_exact(n_coefficients).enumerate() {
+        // The layout has normals, which splats do not have. Readers expect zeros.
         let no_normal = [0.0; 3];
         let rest = (0..3).flat_map(|channel| {
             color[1..]

@@ -13,7 +13,8 @@ const MIN_OPACITY: f32 = 0.5 / 255.0;
 
 /// Unpacks the splats of a file.
 pub(super) fn splats(header: &Header<'_>) -> Result<SplatArrays, String> {
-    let (chunks, vertices) = (header.table("chunk")?, header.table("vertex")?);
+    let chunks = header.table("chunk")?;
+    let vertices = header.table("vertex")?;
     if vertices.n_rows().div_ceil(SPLATS_PER_CHUNK) != chunks.n_rows() {
         return Err(format!(
             "{} splats do not match {} chunks of 256",
@@ -28,19 +29,19 @@ pub(super) fn splats(header: &Header<'_>) -> Result<SplatArrays, String> {
         "packed_scale",
         "packed_color",
     ])?;
-    let (sh_degree, rest) = match header.has_element("sh") {
-        true => {
-            let sh = header.table("sh")?;
-            if sh.n_rows() != vertices.n_rows() {
-                return Err(format!(
-                    "element \"sh\" has {} rows, expected {}",
-                    sh.n_rows(),
-                    vertices.n_rows()
-                ));
-            }
-            rest_columns(&sh)?
+    // Files without view-dependent colors lack the element.
+    let (sh_degree, rest) = if header.has_element("sh") {
+        let sh = header.table("sh")?;
+        if sh.n_rows() != vertices.n_rows() {
+            return Err(format!(
+                "element \"sh\" has {} rows, expected {}",
+                sh.n_rows(),
+                vertices.n_rows()
+            ));
         }
-        false => (0, Vec::new()),
+        rest_columns(&sh)?
+    } else {
+        (0, Vec::new())
     };
     let mut splats = SplatArrays {
         sh_degree,
@@ -56,6 +57,7 @@ pub(super) fn splats(header: &Header<'_>) -> Result<SplatArrays, String> {
         splats
             .log_scales
             .push(bounds.log_scale.lerp(chunk, three_fractions(scale?)));
+        // Red is in the highest byte.
         let [red, green, blue, opacity] = color?.to_be_bytes().map(|byte| f32::from(byte) / 255.0);
         let opacity = opacity.clamp(MIN_OPACITY, 1.0 - MIN_OPACITY);
         splats.opacity_logits.push((opacity / (1.0 - opacity)).ln());
@@ -83,19 +85,23 @@ struct Bounds<'a> {
 
 impl<'a> Bounds<'a> {
     fn of(chunks: &Table<'a>) -> Result<Self, String> {
-        let range = |min, max| -> Result<_, String> {
-            Ok(PropertyRange {
-                min: chunks.columns(min)?,
-                max: chunks.columns(max)?,
-            })
-        };
         Ok(Self {
-            position: range(["min_x", "min_y", "min_z"], ["max_x", "max_y", "max_z"])?,
-            log_scale: range(
+            position: PropertyRange::of(
+                chunks,
+                ["min_x", "min_y", "min_z"],
+                ["max_x", "max_y", "max_z"],
+            )?,
+            log_scale: PropertyRange::of(
+                chunks,
                 ["min_scale_x", "min_scale_y", "min_scale_z"],
                 ["max_scale_x", "max_scale_y", "max_scale_z"],
             )?,
-            color: range(["min_r", "min_g", "min_b"], ["max_r", "max_g", "max_b"]).ok(),
+            color: PropertyRange::of(
+                chunks,
+                ["min_r", "min_g", "min_b"],
+                ["max_r", "max_g", "max_b"],
+            )
+            .ok(),
         })
     }
 
@@ -112,10 +118,19 @@ struct PropertyRange<'a> {
     max: [Column<'a>; 3],
 }
 
-impl PropertyRange<'_> {
+impl<'a> PropertyRange<'a> {
+    /// The columns of these names.
+    fn of(chunks: &Table<'a>, min: [&str; 3], max: [&str; 3]) -> Result<Self, String> {
+        Ok(Self {
+            min: chunks.columns(min)?,
+            max: chunks.columns(max)?,
+        })
+    }
+
     fn lerp(&self, chunk: usize, frac: [f32; 3]) -> [f32; 3] {
         std::array::from_fn(|axis| {
-            let (min, max) = (self.min[axis].f32(chunk), self.max[axis].f32(chunk));
+            let min = self.min[axis].f32(chunk);
+            let max = self.max[axis].f32(chunk);
             min + (max - min) * frac[axis]
         })
     }
@@ -135,9 +150,12 @@ fn frac(bits: u32, n_bits: u32) -> f32 {
 /// Unpacks a quaternion. The highest two bits select its largest component, which is positive and
 /// not stored. The other three have 10 bits each.
 fn rotation_wxyz(bits: u32) -> [f32; 4] {
+    // The other components of a unit quaternion are at most `1 / sqrt(2)` in size, so 10 bits span
+    // this range instead of -1 to 1.
     let largest_ix = (bits >> 30) as usize;
     let others =
         [20, 10, 0].map(|shift| (frac(bits >> shift, 10) - 0.5) * std::f32::consts::SQRT_2);
+    // Rounding, or a damaged file, can make the sum exceed 1.
     let squares: f32 = others.iter().map(|part| part * part).sum();
     let mut wxyz = [(1.0 - squares).max(0.0).sqrt(); 4];
     for (part_ix, other) in (0..4).filter(|&ix| ix != largest_ix).zip(others) {

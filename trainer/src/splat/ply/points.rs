@@ -1,12 +1,12 @@
 //! Point clouds in `.ply` files: positions, and optionally colors.
 
-use super::UNUSED;
 use super::header::{Column, Header};
+use super::{UNUSED, note_of_unread, note_of_unused};
 use crate::{Error, InitialPoints};
 use files::Budget;
 use std::path::Path;
 
-/// Larger coordinates are assumed to be mistakes, as for the positions of cameras, meters.
+/// Larger coordinates, in meters, are assumed to be mistakes, like those of cameras.
 const MAX_COORDINATE_M: f32 = 1e4;
 const COORDINATES: [&str; 3] = ["x", "y", "z"];
 const CHANNELS: [&str; 3] = ["red", "green", "blue"];
@@ -14,8 +14,8 @@ const CHANNELS: [&str; 3] = ["red", "green", "blue"];
 /// Reads a `.ply` file of points, in any format of PLY. The vertices of a mesh are points, too.
 /// Also returns notes for the user about everything that is not used.
 ///
-/// Read are the properties `x`, `y`, `z`, `red`, `green` and `blue`, of any number type. Points
-/// whose coordinates are not finite or exceed 10 km are left out.
+/// Reads the properties `x`, `y`, `z`, `red`, `green` and `blue`, which may have any number type.
+/// Points whose coordinates are not finite or exceed 10 km are left out.
 ///
 /// # Errors
 /// If the file cannot be read, is not a PLY file, contains splats, or contains no usable point.
@@ -34,33 +34,20 @@ fn points_from_bytes(bytes: &[u8]) -> Result<(InitialPoints, Vec<String>), Strin
     let header = Header::parse(bytes)?;
     let vertices = header.table("vertex")?;
     let names: Vec<&str> = vertices.names().collect();
-    let is_of_splat = |name: &&str| {
-        ["scale_", "rot_", "f_dc_"]
-            .iter()
-            .any(|start| name.starts_with(start))
-    };
-    if header.has_element("chunk") || names.iter().any(is_of_splat) {
+    // Splats have positions, too, but a user who gives a model instead of points has mixed up the
+    // files.
+    if header.has_element("chunk") || names.iter().any(|name| is_of_splat(name)) {
         return Err("it is a splat model, expected a point cloud".to_owned());
     }
+    // Colors are used only if all three channels are present.
     let coordinates = vertices.columns(COORDINATES)?;
     let channels = vertices.columns(CHANNELS).ok();
-    let mut notes = Vec::new();
-    if header.n_unread() > 0 {
-        notes.push(format!(
-            "{} bytes after the last row are not used",
-            header.n_unread()
-        ));
-    }
+    let mut notes: Vec<String> = note_of_unread(&header).into_iter().collect();
     let is_color = |name: &&str| channels.is_some() && CHANNELS.contains(name);
     let is_unused =
         |name: &&str| !COORDINATES.contains(name) && !UNUSED.contains(name) && !is_color(name);
     let unused: Vec<&str> = names.iter().copied().filter(is_unused).collect();
-    if !unused.is_empty() {
-        notes.push(format!(
-            "properties that are not used: {}",
-            unused.join(", ")
-        ));
-    }
+    notes.extend(note_of_unused(&unused));
 
     let n_all = vertices.n_rows();
     let mut points = InitialPoints::default();
@@ -86,6 +73,13 @@ fn points_from_bytes(bytes: &[u8]) -> Result<(InitialPoints, Vec<String>), Strin
         (_, n_left_out) => notes.push(format!("left out {n_left_out} of {n_all} points: {reason}")),
     }
     Ok((points, notes))
+}
+
+/// Whether only splats have a property of this name.
+fn is_of_splat(name: &str) -> bool {
+    ["scale_", "rot_", "f_dc_"]
+        .iter()
+        .any(|start| name.starts_with(start))
 }
 
 fn color_at(channels: &[Column<'_>; 3], row: usize) -> [u8; 3] {

@@ -59,11 +59,14 @@ pub(crate) fn update(
         rule.final_mean_rate_frac,
     ]
     .map(f64::from);
+    // Phase 1: gradients of the loss and of the costs, and the rates at this step.
     let since = f64::from(step) - f64::from(rule.schedule_start);
     let progress = (since / f64::from(rule.n_planned_steps).max(1.0)).clamp(0.0, 1.0);
     let mean_rate = of_mean * final_frac.powf(progress);
     let opacity = sigmoid(splat.opacity_logit);
     let mut gradient = gradient.clone();
+    // The costs are the mean opacity and the mean scale. They double over the planned steps,
+    // because models start to overfit late.
     gradient.opacity_logit +=
         (1.0 + progress) * f64::from(rule.opacity_cost) * opacity * (1.0 - opacity);
     for axis in 0..3 {
@@ -77,6 +80,7 @@ pub(crate) fn update(
         .chain([of_opacity])
         .chain([of_dc; 3])
         .collect();
+    // Phase 2: Adam. The higher coefficients, which follow the other values, share a moment.
     let mut updated = values(splat);
     let gradients = values(&gradient);
     let adam = Adam {
@@ -100,6 +104,9 @@ pub(crate) fn update(
         &mut moments[n_own].second,
     );
 
+    // Phase 3: noise moves nearly transparent splats to positions where they may be useful
+    // (Kheradmand et al. 2024, section 4.1). It is the product of the covariance and a normal
+    // vector, and fades out above the opacity of 0.005, below which splats count as dead.
     let [w, x, y, z] = splat.rotation_wxyz;
     let rotation = UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z));
     let along = rotation.inverse() * Vector3::from(normal3([splat_ix, step, rule.seed]));
@@ -107,6 +114,8 @@ pub(crate) fn update(
     let noise_weight = 1.0 / (1.0 + (100.0 * (opacity - 0.005)).exp());
     let jitter = rotation * variance.component_mul(&along) * (noise * mean_rate * noise_weight);
 
+    // Phase 4: values stay in range. A logit of 12 is an opacity that differs from 1 by 6e-6, where
+    // its gradient would vanish.
     let range = rule.log_scale_range.map(f64::from);
     let norm = updated[6..10]
         .iter()
@@ -122,7 +131,8 @@ pub(crate) fn update(
     }
 }
 
-/// Maximum family size. Larger families are treated as if they had this size.
+/// Maximum family size. Larger families are treated as if they had this size. The alternating sum
+/// of [`share_opacity`] has terms that grow with the size and would cancel in f32.
 const MAX_FAMILY: u32 = 16;
 
 /// Splats after a change of the splat count, and the parent of each new splat.
@@ -137,6 +147,7 @@ pub(crate) struct Grown {
 /// Replaces dead splats and creates new ones as children of parents that are chosen by error. A
 /// child gets a position within its parent and a share of its parent's opacity.
 pub(crate) fn grow(splats: &[Splat], errors: &[f64], growth: &Growth) -> Grown {
+    // Dead splats are replaced, so they cannot be parents.
     let is_dead = |splat: &Splat| sigmoid(splat.opacity_logit) < f64::from(growth.min_opacity);
     let mut cumulative = Vec::with_capacity(splats.len());
     let mut total = 0.0;
@@ -154,6 +165,7 @@ pub(crate) fn grow(splats: &[Splat], errors: &[f64], growth: &Growth) -> Grown {
         if splats.get(ix).is_some_and(|splat| !is_dead(splat)) {
             continue;
         }
+        // The constants 7 and 11 separate the random numbers of this kernel.
         let threshold = uniform3([child, growth.key, 7])[0] * total;
         let parent = cumulative.partition_point(|sum| *sum <= threshold);
         let before = if parent > 0 {
@@ -166,6 +178,7 @@ pub(crate) fn grow(splats: &[Splat], errors: &[f64], growth: &Growth) -> Grown {
         n_children[parent] += 1;
         let [w, x, y, z] = splats[parent].rotation_wxyz;
         let rotation = UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z));
+        // Clamped, so that no child leaves its parent.
         let normal = normal3([child, growth.key, 11]);
         let offset_in_parent: [f64; 3] = std::array::from_fn(|axis| {
             splats[parent].log_scale[axis].exp() * normal[axis].clamp(-2.0, 2.0)
@@ -176,6 +189,7 @@ pub(crate) fn grow(splats: &[Splat], errors: &[f64], growth: &Growth) -> Grown {
             grown[ix].mean[axis] += offset[axis];
         }
     }
+    // A parent and its children get the same share. `n_children` of a child is that of its parent.
     for (ix, splat) in grown.iter_mut().enumerate() {
         let n = n_children
             .get(parents[ix].unwrap_or(ix))
@@ -192,16 +206,20 @@ pub(crate) fn grow(splats: &[Splat], errors: &[f64], growth: &Growth) -> Grown {
     }
 }
 
+/// Binomial coefficient: number of ways to choose `k` of `n`.
+fn choose(n: u32, k: u32) -> f64 {
+    (0..k)
+        .map(|i| f64::from(n - i) / f64::from(i + 1))
+        .product::<f64>()
+}
+
 /// Sets the opacity and size of one of `n` splats so that together they look like the original
 /// splat.
 fn share_opacity(splat: &mut Splat, n: u32) {
+    // `n` splats of the new opacity at the same place are as opaque as the original one. The scale
+    // follows from Kheradmand et al. 2024, equation 9.
     let opacity = sigmoid(splat.opacity_logit).clamp(1e-4, 0.9999);
     let shared = (1.0 - (1.0 - opacity).powf(1.0 / f64::from(n))).clamp(0.005, 0.9999);
-    let choose = |n: u32, k: u32| {
-        (0..k)
-            .map(|i| f64::from(n - i) / f64::from(i + 1))
-            .product::<f64>()
-    };
     let term = |i: u32, k: u32| {
         let sign = if k.is_multiple_of(2) { 1.0 } else { -1.0 };
         sign * choose(i - 1, k) * shared.powf(f64::from(k + 1)) / f64::from(k + 1).sqrt()

@@ -163,6 +163,7 @@ pub fn render_backward(view: &View, splats: &[Splat], upstream: &Upstream) -> Re
         ..RenderGrad::default()
     };
     for (splat_ix, splat) in splats.iter().enumerate() {
+        // An invisible splat has a gradient of zero in the shape of the splat.
         let Some(row_share) = decisions.row_shares[splat_ix] else {
             grad.splats.push(SplatGrad {
                 sh: vec![[0.0; 3]; splat.sh.len()],
@@ -179,6 +180,7 @@ pub fn render_backward(view: &View, splats: &[Splat], upstream: &Upstream) -> Re
 }
 
 fn project_decided(view: &View, splats: &[Splat], decisions: &Decisions) -> Vec<Projected> {
+    // Invisible splats keep their place, so that indices stay those of the splats.
     let project_one = |(splat, row_share): (&Splat, &Option<f64>)| {
         row_share
             .map(|row_share| project::project_at(view, splat, row_share))

@@ -14,7 +14,8 @@ pub const MIN_ALPHA: f64 = 1.0 / 255.0;
 /// pixels.
 pub const BLUR_PX2: f64 = 0.3;
 /// Margin around the image beyond which the Jacobian is clamped, as a fraction of half the image
-/// size.
+/// size. As in gsplat. Far outside, the linear approximation of the projection would stretch splats
+/// across the whole image.
 const MARGIN_FRAC: f64 = 0.3;
 
 /// Projects a splat; `None` if it is nearer than `near_m` or too transparent to draw.
@@ -32,6 +33,8 @@ pub fn project(view: &View, splat: &Splat) -> Option<Projected> {
 /// The row is determined with the camera's pose at the middle row, without motion. The share is 0
 /// for splats that are nearer than `near_m` in that pose.
 pub fn row_share(view: &View, splat: &Splat) -> f64 {
+    // Behind the camera, the projection is meaningless. The motion during readout may still bring
+    // the splat into view.
     let point_in_camera = view.camera_from_world * nalgebra::Point3::from(splat.mean);
     if point_in_camera.z < view.near_m {
         return 0.0;
@@ -52,7 +55,9 @@ pub fn project_at(view: &View, splat: &Splat, row_share: f64) -> Projected {
         1.0
     };
     let opacity = sigmoid(splat.opacity_logit) * compensation;
-    let reach = (2.0 * (opacity / MIN_ALPHA).ln()).max(0.0).sqrt(); // Standard deviations until alpha is MIN_ALPHA.
+    // Standard deviations until alpha is MIN_ALPHA: `opacity * exp(-reach^2 / 2) = MIN_ALPHA`.
+    // Along an axis of the image, an ellipse reaches that many square roots of the variance.
+    let reach = (2.0 * (opacity / MIN_ALPHA).ln()).max(0.0).sqrt();
     Projected {
         mean_px: [fx * point.x / point.z + cx, fy * point.y / point.z + cy],
         conic: [
@@ -88,7 +93,9 @@ pub fn project_backward(
     let (v_sh, v_offset) = sh::color_backward(&splat.sh, &offset_in_world(view, splat), &v.color);
     let opacity = sigmoid(splat.opacity_logit);
 
-    // From the conic to the log scale and the rotation.
+    // From the conic to the log scale and the rotation. `b` of the conic stands for two entries of
+    // the symmetric matrix, so each gets half of its gradient. For the inverse M of a matrix, the
+    // derivative is `-M dC M`.
     let v_conic = Matrix2::new(v.conic[0], 0.5 * v.conic[1], 0.5 * v.conic[1], v.conic[2]);
     let v_cov = -parts.conic * v_conic * parts.conic;
     let v_image_from_world = 2.0 * v_cov * parts.image_from_world * parts.cov_in_world;
@@ -171,6 +178,8 @@ impl Parts {
         let linear_m = Vector3::from(view.linear_m);
         let angular_rad = Vector3::from(view.angular_rad);
 
+        // Rolling shutter: the point moves against the camera while the rows are read. First order
+        // in the motion; see docs/design/splats.md, section "Rendering an image".
         let still_point = camera_from_world * Vector3::from(splat.mean)
             + view.camera_from_world.translation.vector;
         let point_in_camera =
@@ -178,10 +187,13 @@ impl Parts {
         let moved_from_still = Matrix3::identity() - row_share * angular_rad.cross_matrix();
         let moved_from_world = moved_from_still * camera_from_world;
 
+        // Covariance in the world: R S S^T R^T (Kerbl et al. 2023, equation 6).
         let axes = rotation_matrix(&unit(&splat.rotation_wxyz))
             * Matrix3::from_diagonal(&Vector3::from(splat.log_scale).map(f64::exp));
         let cov_in_world = axes * axes.transpose();
 
+        // Covariance on the image plane, from C in the world: J R C R^T J^T plus the low-pass
+        // (Zwicker et al. 2001).
         let z = point_in_camera.z;
         let ratio = [0, 1].map(|axis| clamped_ratio(view, axis, point_in_camera[axis] / z));
         let [fx, fy] = view.focal_px;
@@ -216,11 +228,9 @@ impl Parts {
 /// Clamps the ratio x/z (axis 0) or y/z (axis 1) to the image plus a margin. Also returns whether
 /// the ratio changed.
 fn clamped_ratio(view: &View, axis: usize, ratio: f64) -> (f64, bool) {
-    let (focal_px, principal_px, size_px) = (
-        view.focal_px[axis],
-        view.principal_px[axis],
-        f64::from(view.size_px[axis]),
-    );
+    let focal_px = view.focal_px[axis];
+    let principal_px = view.principal_px[axis];
+    let size_px = f64::from(view.size_px[axis]);
     let margin = MARGIN_FRAC * 0.5 * size_px / focal_px;
     let lowest = -(principal_px / focal_px + margin);
     let highest = (size_px - principal_px) / focal_px + margin;
@@ -252,9 +262,12 @@ fn jacobian_backward(view: &View, parts: &Parts, v_jacobian: &Matrix2x3<f64>) ->
     let mut v_point = Vector3::zeros();
     for axis in 0..2 {
         let (ratio, clamped) = parts.ratio[axis];
-        let (v_diagonal, v_last) = (v_jacobian[(axis, axis)], v_jacobian[(axis, 2)]);
+        let v_diagonal = v_jacobian[(axis, axis)];
+        let v_last = v_jacobian[(axis, 2)];
         let f_per_z2 = view.focal_px[axis] / (z * z);
+        // Through the factors 1 / z, with a fixed ratio.
         v_point.z += f_per_z2 * (ratio * v_last - v_diagonal);
+        // Through the ratio. A clamped ratio does not depend on the point.
         if !clamped {
             v_point[axis] -= f_per_z2 * v_last;
             v_point.z += f_per_z2 * ratio * v_last;
@@ -272,6 +285,7 @@ fn shape_backward(splat: &Splat, v_cov: &Matrix3<f64>) -> ([f64; 3], [f64; 4]) {
     let v_axes = 2.0 * v_cov * rotation * Matrix3::from_diagonal(&scale);
     let v_log_scale =
         std::array::from_fn(|axis| rotation.column(axis).dot(&v_axes.column(axis)) * scale[axis]);
+    // Normalization removes the part of the gradient along the quaternion.
     let v_unit = rotation_matrix_backward(&unit_wxyz, &(v_axes * Matrix3::from_diagonal(&scale)));
     let along: f64 = unit_wxyz.iter().zip(v_unit).map(|(unit, v)| unit * v).sum();
     let length = length(&splat.rotation_wxyz);

@@ -13,6 +13,17 @@ use safetensors::SafeTensors;
 const ABS: f64 = 2e-6;
 const REL: f64 = 1e-5;
 
+/// The values of a tensor of f32.
+fn floats(tensors: &SafeTensors<'_>, name: &str) -> Vec<f64> {
+    let data = tensors
+        .tensor(name)
+        .expect("the file contains this tensor")
+        .data();
+    data.chunks_exact(4)
+        .map(|b| f64::from(f32::from_le_bytes([b[0], b[1], b[2], b[3]])))
+        .collect()
+}
+
 #[test]
 fn render_matches_a_published_picture() {
     let Some(folder) = test_support::data_folder("splats") else {
@@ -21,15 +32,6 @@ fn render_matches_a_published_picture() {
     let bytes = std::fs::read(folder.join("brush_tiny_case.safetensors"))
         .expect("the test data contain this file");
     let tensors = SafeTensors::deserialize(&bytes).expect("a valid file");
-    let floats = |name: &str| -> Vec<f64> {
-        let data = tensors
-            .tensor(name)
-            .expect("the file contains this tensor")
-            .data();
-        data.chunks_exact(4)
-            .map(|b| f64::from(f32::from_le_bytes([b[0], b[1], b[2], b[3]])))
-            .collect()
-    };
     let &[height, width, 4] = tensors
         .tensor("out_img")
         .expect("the file contains the picture")
@@ -52,8 +54,12 @@ fn render_matches_a_published_picture() {
         angular_rad: [0.0; 3],
         is_antialiased: false,
     };
-    let (means, scales, quats) = (floats("means"), floats("scales"), floats("quats"));
-    let (opacities, coeffs, picture) = (floats("opacities"), floats("coeffs"), floats("out_img"));
+    let means = floats(&tensors, "means");
+    let scales = floats(&tensors, "scales");
+    let quats = floats(&tensors, "quats");
+    let opacities = floats(&tensors, "opacities");
+    let coeffs = floats(&tensors, "coeffs");
+    let picture = floats(&tensors, "out_img");
     let splat = |ix: usize| Splat {
         mean: std::array::from_fn(|axis| means[3 * ix + axis]),
         log_scale: std::array::from_fn(|axis| scales[3 * ix + axis]),

@@ -5,7 +5,8 @@
 use super::project::{MIN_ALPHA, project, row_share};
 use super::{Projected, ProjectedGrad, RenderedImage, Splat, Upstream, View};
 
-/// Maximum alpha of a splat at a pixel.
+/// Maximum alpha of a splat at a pixel. The gradient divides by `1 - alpha`, which must not become
+/// zero.
 pub const MAX_ALPHA: f64 = 0.999;
 /// Compositing of a pixel stops before the splat that would lower the transmittance to this value
 /// or less.
@@ -42,7 +43,9 @@ pub fn decide(view: &View, splats: &[Splat]) -> Decisions {
 pub fn composite(view: &View, projected: &[Projected], decisions: &Decisions) -> RenderedImage {
     let mut image = RenderedImage::default();
     for (center_px, contributors) in view.pixel_centers().zip(&decisions.contributors) {
-        let (mut rgb, mut depth, mut transmittance) = ([0.0; 3], 0.0, 1.0);
+        let mut rgb = [0.0; 3];
+        let mut depth = 0.0;
+        let mut transmittance = 1.0;
         for splat in contributors.iter().map(|&splat_ix| &projected[splat_ix]) {
             let alpha = Coverage::new(splat, &center_px).alpha();
             let weight = alpha * transmittance;
@@ -70,25 +73,32 @@ pub fn composite_backward(
 ) -> Vec<ProjectedGrad> {
     let mut grads = vec![ProjectedGrad::default(); projected.len()];
     for (pixel_ix, center_px) in view.pixel_centers().enumerate() {
-        let (v_rgb, v_depth) = (upstream.rgb[pixel_ix], upstream.depth[pixel_ix]);
-        let mut in_front = Vec::new(); // Transmittance in front of each contributor.
+        let v_rgb = upstream.rgb[pixel_ix];
+        let v_depth = upstream.depth[pixel_ix];
+        // Transmittance in front of each contributor. Kerbl et al. 2023 recover it by divisions,
+        // in which small values lose precision.
+        let mut in_front = Vec::new();
         let mut transmittance = 1.0;
         for &splat_ix in &decisions.contributors[pixel_ix] {
             in_front.push(transmittance);
             transmittance *= 1.0 - Coverage::new(&projected[splat_ix], &center_px).alpha();
         }
-        // Part of the loss that depends on everything behind the current splat.
+        // Part of the loss that depends on everything behind the current splat. The twin goes back
+        // to front, as in Kerbl et al. 2023. The kernel goes front to back.
         let mut behind = upstream.transmittance[pixel_ix] * transmittance;
         for (&splat_ix, transmittance) in
             decisions.contributors[pixel_ix].iter().zip(in_front).rev()
         {
-            let (splat, grad) = (&projected[splat_ix], &mut grads[splat_ix]);
+            let splat = &projected[splat_ix];
+            let grad = &mut grads[splat_ix];
             let coverage = Coverage::new(splat, &center_px);
             let weight = coverage.alpha() * transmittance;
             let per_weight = (0..3)
                 .map(|channel| splat.color[channel] * v_rgb[channel])
                 .sum::<f64>()
                 + splat.depth * v_depth;
+            // More alpha shows more of this splat, and less of everything behind it, whose weights
+            // all contain the factor `1 - alpha`.
             let v_alpha = transmittance * per_weight - behind / (1.0 - coverage.alpha());
             grad.color
                 .iter_mut()
@@ -117,7 +127,9 @@ pub fn threshold_margins(view: &View, splats: &[Splat]) -> Vec<f64> {
 
 fn threshold_margin(front_to_back: &[(usize, Projected)], center_px: &[f64; 2]) -> f64 {
     let distance = |value: f64, threshold: f64| (value / threshold - 1.0).abs();
-    let (mut margin, mut transmittance, mut depth_in_front) = (f64::INFINITY, 1.0, None);
+    let mut margin = f64::INFINITY;
+    let mut transmittance = 1.0;
+    let mut depth_in_front = None;
     for (_, splat) in front_to_back {
         let coverage = Coverage::new(splat, center_px);
         margin = margin
@@ -170,6 +182,7 @@ fn contributors(front_to_back: &[(usize, Projected)], center_px: &[f64; 2]) -> V
             continue;
         }
         transmittance *= 1.0 - coverage.alpha();
+        // Before the splat is added: it would not be visible anymore (Kerbl et al. 2023).
         if transmittance <= MIN_TRANSMITTANCE {
             break;
         }

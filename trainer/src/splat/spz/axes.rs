@@ -40,17 +40,15 @@ impl Axes {
         match number {
             // Not specified.
             0 => Ok(Self::RIGHT_UP_BACK),
+            // The bits stand for right instead of left, up instead of down, and front instead of
+            // back.
             1..=8 => {
-                let sign = |bit: u32, if_set: f32| {
-                    if (number - 1) >> bit & 1 == 1 {
-                        if_set
-                    } else {
-                        -if_set
-                    }
-                };
-                // The bits stand for right instead of left, up instead of down, and front instead
-                // of back.
-                Ok(Self([sign(0, 1.0), sign(1, -1.0), sign(2, 1.0)]))
+                let bits = number - 1;
+                Ok(Self([
+                    sign(bits, 0, 1.0),
+                    sign(bits, 1, -1.0),
+                    sign(bits, 2, 1.0),
+                ]))
             }
             9..=16 => Err(format!(
                 "its y axis points to the front or back (coordinate system {number}), which is not supported; save it \
@@ -68,6 +66,8 @@ impl Axes {
 
     /// Converts x, y and z of a quaternion. A mirrored ellipsoid has the same scales.
     pub(super) fn rotation_xyz(self, [x, y, z]: [f32; 3]) -> [f32; 3] {
+        // The vector of a quaternion is along the axis of rotation, which is a pseudovector: a
+        // mirror also reverses the sense of rotation.
         let [x_sign, y_sign, z_sign] = self.0;
         [
             y_sign * z_sign * x,
@@ -82,6 +82,15 @@ impl Axes {
     }
 }
 
+/// `if_set` if a bit is set, otherwise its negative.
+fn sign(bits: u32, bit: u32, if_set: f32) -> f32 {
+    if bits >> bit & 1 == 1 {
+        if_set
+    } else {
+        -if_set
+    }
+}
+
 /// Reads the records of extensions. Returns the axes and the number of bytes that are used.
 ///
 /// A record consists of a type, the size of its contents, and the contents. Other programs ignore
@@ -89,6 +98,7 @@ impl Axes {
 pub(super) fn from_extensions(mut records: &[u8]) -> Result<(Axes, u64), String> {
     while let Some(([t0, t1, t2, t3, n0, n1, n2, n3], rest)) = records.split_first_chunk::<8>() {
         let n_bytes = u32::from_le_bytes([*n0, *n1, *n2, *n3]) as usize;
+        // Incomplete.
         let Some((contents, after)) = rest.split_at_checked(n_bytes) else {
             break;
         };

@@ -62,8 +62,9 @@ impl Header {
         if bytes[..4] != MAGIC {
             return Err("the decompressed data does not begin with \"NGSP\"".to_owned());
         }
-        let (version, n_splats, [sh_degree, fractional_bits, flags]) =
-            (word(4), word(8), [bytes[12], bytes[13], bytes[14]]);
+        let version = word(4);
+        let n_splats = word(8);
+        let [sh_degree, fractional_bits, flags] = [bytes[12], bytes[13], bytes[14]];
         if !(MIN_VERSION..=MAX_VERSION).contains(&version) {
             return Err(format!(
                 "format version {version}, expected {MIN_VERSION} to {MAX_VERSION}"
@@ -80,6 +81,7 @@ impl Header {
                 "spherical harmonics of degree {sh_degree}, expected at most {MAX_SH_DEGREE}"
             ));
         }
+        // A mean has 23 bits and a sign.
         if fractional_bits > 23 {
             return Err(format!(
                 "means have {fractional_bits} fractional bits, expected at most 23"
@@ -143,6 +145,8 @@ impl Header {
 
     /// Size of all attributes in bytes. Fails if a file of this size cannot contain them.
     fn n_body_bytes(&self, n_file_bytes: usize) -> Result<usize, String> {
+        // A small file can claim billions of splats. Compression has a limit, so such a file is
+        // rejected before memory is allocated.
         let n_body_bytes =
             self.n_splats as u64 * self.attribute_bytes().iter().sum::<usize>() as u64;
         let is_possible = Budget::SPLATS
@@ -189,6 +193,7 @@ fn from_gzip(bytes: &[u8]) -> Result<Contents<'_>, String> {
             header.version
         ));
     }
+    // Limits on every read: a stream can decompress to more bytes than the header specifies.
     let n_body_bytes = header.n_body_bytes(bytes.len())?;
     let mut body = Vec::new();
     gzip.by_ref()
@@ -252,7 +257,8 @@ fn from_zstd(header: Header, bytes: &[u8]) -> Result<Contents<'_>, String> {
         .ok_or("truncated")?;
     let n_streams = usize::from(long_header[15]);
     let table_start = u32::from_le_bytes(std::array::from_fn(|ix| long_header[16 + ix])) as usize;
-    // An attribute without bytes has no stream.
+    // Phase 1: the streams and the table must be in the file. An attribute without bytes has no
+    // stream.
     let sizes = header
         .attribute_bytes()
         .map(|per_splat| header.n_splats * per_splat);
@@ -268,6 +274,8 @@ fn from_zstd(header: Header, bytes: &[u8]) -> Result<Contents<'_>, String> {
     let (table, mut streams) = bytes[table_start..]
         .split_at_checked(ROW_BYTES * n_streams)
         .ok_or("truncated")?;
+    // Phase 2: each stream is decompressed into its part of the body, so that a stream with a
+    // wrong size cannot shift the attributes after it.
     let mut body = vec![0_u8; header.n_body_bytes(bytes.len())?];
     let mut undecoded = body.as_mut_slice();
     for (stream_ix, (row, size)) in table
@@ -288,11 +296,13 @@ fn from_zstd(header: Header, bytes: &[u8]) -> Result<Contents<'_>, String> {
         let (attribute, after) = undecoded.split_at_mut(size);
         decompress(stream, attribute)
             .map_err(|reason| format!("stream {stream_ix} is damaged ({reason})"))?;
-        (streams, undecoded) = (others, after);
+        streams = others;
+        undecoded = after;
     }
     if !streams.is_empty() {
         return Err(format!("{} bytes follow the last stream", streams.len()));
     }
+    // Bytes that the header does not announce are no records.
     let extensions: &[u8] = if header.has_extensions() {
         extensions
     } else {
@@ -315,12 +325,13 @@ fn decompress(frames: &[u8], attribute: &mut [u8]) -> Result<(), String> {
     let n_decoded = FrameDecoder::new()
         .decode_all(frames, attribute)
         .map_err(|error| error.to_string())?;
-    match n_decoded == attribute.len() {
-        true => Ok(()),
-        false => Err(format!(
+    if n_decoded == attribute.len() {
+        Ok(())
+    } else {
+        Err(format!(
             "it contains {n_decoded} bytes, expected {}",
             attribute.len()
-        )),
+        ))
     }
 }
 

@@ -26,7 +26,8 @@ use std::path::Path;
 
 /// The version that is written.
 const WRITTEN_VERSION: u32 = 3;
-/// Maximum number of fractional bits of a mean, for steps of 15 micrometers.
+/// Maximum number of fractional bits of a mean, for steps of 15 micrometers. Finer steps would be
+/// below the accuracy of any scan, and random bits compress badly.
 const MAX_FRACTIONAL_BITS: u8 = 16;
 
 /// Reads a `.spz` file of splats.
@@ -74,6 +75,7 @@ fn from_bytes(bytes: &[u8]) -> Result<(SplatArrays, Vec<String>), String> {
 
 /// Decodes the splats of a body whose length matches the header.
 fn splats(header: &Header, axes: Axes, body: &[u8]) -> SplatArrays {
+    // Attributes are stored one after another, each for all splats.
     let n_splats = header.n_splats;
     let mut rest = body;
     let [means, alphas, colors, scales, rotations, higher] =
@@ -94,31 +96,29 @@ fn splats(header: &Header, axes: Axes, body: &[u8]) -> SplatArrays {
         let signed = coefficients.iter().zip(sh_signs);
         sh.extend(signed.map(|(rgb, sign)| rgb.map(|byte| sign * quantize::sh_from_byte(byte))));
     }
-    let mean = |bytes: &[u8; 9]| {
-        let [x, y, z] = [0, 3, 6].map(|at| [bytes[at], bytes[at + 1], bytes[at + 2]]);
-        axes.vector([x, y, z].map(|fixed| quantize::mean_from_fixed(fixed, header.fractional_bits)))
-    };
-    let rotation = |xyzw: [f32; 4]| {
-        let [x, y, z] = axes.rotation_xyz([xyzw[0], xyzw[1], xyzw[2]]);
-        [xyzw[3], x, y, z]
-    };
+    // Version 2 has three bytes per rotation, later versions have four.
     let rotations_wxyz = if header.has_short_rotations() {
         rotations
             .as_chunks()
             .0
             .iter()
-            .map(|bytes| rotation(quantize::rotation_from_three(*bytes)))
+            .map(|bytes| rotation_wxyz(axes, quantize::rotation_from_three(*bytes)))
             .collect()
     } else {
         rotations
             .as_chunks()
             .0
             .iter()
-            .map(|bytes| rotation(quantize::rotation_from_smallest(*bytes)))
+            .map(|bytes| rotation_wxyz(axes, quantize::rotation_from_smallest(*bytes)))
             .collect()
     };
     SplatArrays {
-        means: means.as_chunks().0.iter().map(mean).collect(),
+        means: means
+            .as_chunks()
+            .0
+            .iter()
+            .map(|bytes| mean(axes, header.fractional_bits, bytes))
+            .collect(),
         log_scales: scales
             .as_chunks::<3>()
             .0
@@ -136,6 +136,18 @@ fn splats(header: &Header, axes: Axes, body: &[u8]) -> SplatArrays {
     }
 }
 
+/// Decodes a mean: three signed 24-bit numbers.
+fn mean(axes: Axes, fractional_bits: u8, bytes: &[u8; 9]) -> [f32; 3] {
+    let [x, y, z] = [0, 3, 6].map(|at| [bytes[at], bytes[at + 1], bytes[at + 2]]);
+    axes.vector([x, y, z].map(|fixed| quantize::mean_from_fixed(fixed, fractional_bits)))
+}
+
+/// Converts a decoded rotation to our axes and order.
+fn rotation_wxyz(axes: Axes, xyzw: [f32; 4]) -> [f32; 4] {
+    let [x, y, z] = axes.rotation_xyz([xyzw[0], xyzw[1], xyzw[2]]);
+    [xyzw[3], x, y, z]
+}
+
 /// Encodes the header and the splats without compression.
 fn uncompressed_bytes(splats: &SplatArrays) -> Result<Vec<u8>, Error> {
     let max_splats = files::Budget::SPLATS.max_elements;
@@ -151,6 +163,7 @@ fn uncompressed_bytes(splats: &SplatArrays) -> Result<Vec<u8>, Error> {
     let fractional_bits = fractional_bits(&splats.means)?;
     let axes = Axes::RIGHT_UP_BACK;
     let sh_signs = axes.sh_signs();
+    // The header: signature, version, number of splats, degree, fractional bits, flags, reserved.
     let mut bytes = MAGIC.to_vec();
     bytes.extend(
         [WRITTEN_VERSION, n_splats]
@@ -169,6 +182,7 @@ fn uncompressed_bytes(splats: &SplatArrays) -> Result<Vec<u8>, Error> {
         },
         0,
     ]);
+    // The attributes, in the order of `Header::attribute_bytes`.
     for mean in &splats.means {
         let fixed = axes
             .vector(*mean)
@@ -202,6 +216,7 @@ fn uncompressed_bytes(splats: &SplatArrays) -> Result<Vec<u8>, Error> {
 
 /// Largest number of fractional bits at which all means are in range.
 fn fractional_bits(means: &[[f32; 3]]) -> Result<u8, Error> {
+    // One number of bits applies to all means, so the farthest splat determines the accuracy.
     let max_coordinate_m = means
         .as_flattened()
         .iter()

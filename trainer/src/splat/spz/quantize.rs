@@ -9,7 +9,8 @@ use std::f64::consts::FRAC_1_SQRT_2;
 
 /// Maximum magnitude of a mean as a signed 24-bit number.
 pub(super) const MAX_FIXED: i32 = (1 << 23) - 1;
-/// Factor that spreads the constant colors, which are mostly small, over the range of a byte.
+/// Factor that spreads the constant colors, which are mostly small, over the range of a byte. It is
+/// part of the format.
 const COLOR_SCALE: f64 = 0.15;
 /// Maximum magnitude of a quaternion component in 9 bits.
 const MAX_COMPONENT: u32 = (1 << 9) - 1;
@@ -26,7 +27,8 @@ pub(super) fn fixed_from_mean(meters: f32, fractional_bits: u8) -> [u8; 3] {
 }
 
 pub(super) fn mean_from_fixed([low, middle, high]: [u8; 3], fractional_bits: u8) -> f32 {
-    let fixed = i32::from_le_bytes([0, low, middle, high]) >> 8; // An arithmetic shift extends the sign.
+    // In the upper bytes, so that an arithmetic shift extends the sign.
+    let fixed = i32::from_le_bytes([0, low, middle, high]) >> 8;
     (f64::from(fixed) / f64::from(1_u32 << fractional_bits)) as f32
 }
 
@@ -50,6 +52,7 @@ pub(super) fn color_from_byte(byte: u8) -> f32 {
 }
 
 pub(super) fn byte_from_log_scale(log_scale: f32) -> u8 {
+    // From exp(-10) to exp(5.9) in steps of 6 %.
     byte((f64::from(log_scale) + 10.0) * 16.0)
 }
 
@@ -76,6 +79,8 @@ pub(super) fn smallest_from_rotation(xyzw: [f32; 4]) -> [u8; 4] {
     let xyzw = xyzw.map(f64::from);
     let length = xyzw.iter().map(|part| part * part).sum::<f64>().sqrt();
     let mut largest_ix = 0;
+    // The largest component is omitted: the error of a component that follows from the unit length
+    // is smallest for it.
     for ix in 1..4 {
         if xyzw[ix].abs() > xyzw[largest_ix].abs() {
             largest_ix = ix;
@@ -95,6 +100,7 @@ pub(super) fn rotation_from_smallest(bytes: [u8; 4]) -> [f32; 4] {
     let mut bits = u32::from_le_bytes(bytes);
     let largest_ix = (bits >> 30) as usize;
     let mut xyzw = [0.0; 4];
+    // In reverse, because the last component is in the lowest bits.
     for ix in (0..4).rev().filter(|ix| *ix != largest_ix) {
         let magnitude = f64::from(bits & MAX_COMPONENT) / f64::from(MAX_COMPONENT) * FRAC_1_SQRT_2;
         xyzw[ix] = if bits >> 9 & 1 == 0 {

@@ -148,11 +148,10 @@ impl ModelState {
     }
 
     fn schedule(&self, step: u64, n_planned_steps: u64) -> Schedule {
-        let (start, last_growth_step) = (self.schedule_start, self.last_growth_step);
         Schedule {
             step,
-            start,
-            last_growth_step,
+            start: self.schedule_start,
+            last_growth_step: self.last_growth_step,
             ..Schedule::new(n_planned_steps)
         }
     }
@@ -230,7 +229,71 @@ impl TrialState {
                 })
                 .collect(),
             baseline_db: self.baseline_scores.map(scores),
+            // Deferred keyframes are not in the checkpoint. They are pushed again after resuming,
+            // and then deferred again.
             deferred: Vec::new(),
+        })
+    }
+}
+
+/// The keyframes of a checkpoint, found among those of a run.
+struct SavedKeyframes {
+    /// The training views, in their order.
+    views: Vec<Arc<Keyframe>>,
+    /// The arrivals of the running trial, in their order.
+    arrivals: Vec<Arc<Keyframe>>,
+    /// The views that have not been seeded yet.
+    unseeded: Vec<Arc<Keyframe>>,
+    /// Keyframes that the checkpoint does not contain.
+    untrained: Vec<Arc<Keyframe>>,
+}
+
+impl SavedKeyframes {
+    fn find(state: &SavedState, keyframes: &[Arc<Keyframe>]) -> Result<Self, Error> {
+        let arrivals: Vec<&KeyframeSignature> = state
+            .trial
+            .iter()
+            .flat_map(|trial| &trial.arrivals)
+            .map(|arrival| &arrival.image)
+            .collect();
+        // In the first half of a trial, its arrivals are views. In the second half, they are added
+        // at a later step.
+        let is_second_half = state
+            .trial
+            .as_ref()
+            .is_some_and(|trial| trial.baseline_scores.is_some());
+        let (arrived, yet_to_arrive) = if is_second_half {
+            (Vec::new(), arrivals)
+        } else {
+            (arrivals, Vec::new())
+        };
+        let known: Vec<KeyframeSignature> =
+            state.views.iter().chain(yet_to_arrive).cloned().collect();
+        let (mut views, untrained) = keyframe_signature::match_keyframes(&known, keyframes)?;
+        let yet_to_arrive = views.split_off(state.views.len());
+        // Arrivals that are views must be the same keyframes as these, because keyframes are later
+        // compared by pointer.
+        let arrived = arrived
+            .into_iter()
+            .map(|image| {
+                let ix = state.views.iter().position(|view| view == image)?;
+                views.get(ix).cloned()
+            })
+            .collect::<Option<Vec<_>>>()
+            .ok_or_else(|| {
+                invalid_state("a view that arrived during a trial is missing".to_owned())
+            })?;
+        let unseeded = state
+            .unseeded
+            .iter()
+            .map(|ix| views.get(*ix).cloned())
+            .collect::<Option<Vec<_>>>()
+            .ok_or_else(|| invalid_state("a view is missing".to_owned()))?;
+        Ok(Self {
+            arrivals: [arrived, yet_to_arrive].concat(),
+            views,
+            unseeded,
+            untrained,
         })
     }
 }
@@ -239,9 +302,12 @@ impl SplatTrainer {
     /// Captures the state after all queued steps. This call only copies the model within GPU
     /// memory; [`PendingCheckpoint::finish`] copies it to the host and may run on any thread.
     pub(super) fn take_checkpoint(&mut self) -> Result<PendingCheckpoint, Error> {
+        // Keyframes that wait for seeding are not part of a checkpoint, and the step count must be
+        // exact.
         self.seed_from_depth()?;
         self.finish_in_flight()?;
-        let (gpu, cameras) = (&self.recorder.gpu, &self.model.cameras);
+        let gpu = &self.recorder.gpu;
+        let cameras = &self.model.cameras;
         // A running growth search is not saved but repeated.
         let (splats, params, schedule, scene) = match self.growth_search.running() {
             Some(FoldModels { main, .. }) => {
@@ -254,12 +320,9 @@ impl SplatTrainer {
                 &self.seeding.scene,
             ),
         };
-        let position_of = |keyframe: &Arc<Keyframe>| {
-            self.views
-                .keyframes()
-                .position(|view| Arc::ptr_eq(view, keyframe))
-        };
         let state = SavedState {
+            // Defaults that depend on the adapter are fixed, so that training continues alike on
+            // another one.
             options: self.options.clone().with(|options| {
                 options.specific.coarse_steps = Some(self.views.coarse_steps());
                 options.specific.seeds_per_image = Some(self.seeding.seeds_per_image());
@@ -276,7 +339,7 @@ impl SplatTrainer {
                 .seeding
                 .unseeded()
                 .iter()
-                .filter_map(position_of)
+                .filter_map(|keyframe| self.view_ix_of(keyframe))
                 .collect(),
             slots: cameras.slots(),
             remaining_trials: self.trials.remaining_trials(),
@@ -289,6 +352,8 @@ impl SplatTrainer {
         let state = serde_json::to_value(state).map_err(|error| Error::CheckpointState {
             reason: error.to_string(),
         })?;
+        // Reading back begins now, so that the arrays belong to this step. Training may change the
+        // buffers before the reads are finished.
         let params = (params, cameras.used_bytes());
         let mut halves = vec![PendingArrays::begin(gpu, "", splats, &scene.seeder, params)];
         if let Some(RunningTrial { other, .. }) = self.trials.running_trial() {
@@ -309,6 +374,13 @@ impl SplatTrainer {
                 .try_for_each(|half| half.finish(&gpu, &mut arrays))?;
             Ok(Checkpoint::new(METHOD, state, arrays))
         }))
+    }
+
+    /// Index of the view of a keyframe.
+    fn view_ix_of(&self, keyframe: &Arc<Keyframe>) -> Option<usize> {
+        self.views
+            .keyframes()
+            .position(|view| Arc::ptr_eq(view, keyframe))
     }
 
     /// Resumes training from a checkpoint as if it had not been interrupted. `keyframes` must
@@ -332,38 +404,13 @@ impl SplatTrainer {
         }
         let state: SavedState = serde_json::from_value(checkpoint.state.clone())
             .map_err(|error| invalid_state(error.to_string()))?;
-        // In the first half of a trial, its arrivals are views. In the second half, they are added
-        // at a later step.
-        let arrivals = || {
-            state
-                .trial
-                .iter()
-                .flat_map(|trial| &trial.arrivals)
-                .map(|arrival| &arrival.image)
-        };
-        let is_second_half = state
-            .trial
-            .as_ref()
-            .is_some_and(|trial| trial.baseline_scores.is_some());
-        let yet_to_arrive = arrivals().filter(|_| is_second_half);
-        let known: Vec<KeyframeSignature> =
-            state.views.iter().chain(yet_to_arrive).cloned().collect();
-        let (mut views, untrained) = keyframe_signature::match_keyframes(&known, keyframes)?;
-        let yet_to_arrive = views.split_off(state.views.len());
-        let arrived = arrivals()
-            .filter(|_| !is_second_half)
-            .map(|image| state.views.iter().position(|view| view == image));
-        let arrived = arrived
-            .map(|ix| views.get(ix?).cloned())
-            .collect::<Option<Vec<_>>>();
-        let arrived = arrived.ok_or_else(|| {
-            invalid_state("a view that arrived during a trial is missing".to_owned())
-        })?;
-        let arrivals = [arrived, yet_to_arrive].concat();
-        let unseeded = state.unseeded.iter().map(|ix| views.get(*ix).cloned());
-        let unseeded = unseeded
-            .collect::<Option<Vec<_>>>()
-            .ok_or_else(|| invalid_state("a view is missing".to_owned()))?;
+        let SavedKeyframes {
+            views,
+            arrivals,
+            unseeded,
+            untrained,
+        } = SavedKeyframes::find(&state, keyframes)?;
+        // The kernels count steps in 32 bits.
         let step = u32::try_from(state.step)
             .map_err(|_| invalid_state(format!("step {} does not fit into 32 bits", state.step)))?;
 
@@ -375,6 +422,7 @@ impl SplatTrainer {
             .optimizer
             .write_counter(gpu, status::N_NON_FINITE, state.n_non_finite);
         trainer.optimizer.n_non_finite = state.n_non_finite.into();
+
         trainer
             .model
             .cameras

@@ -11,14 +11,23 @@ use crate::splat::growth_search::{
     FEW_IMAGES, FoldModels, FoldPhase, GrowthLimit, GrowthSearch, HeldOutScore, doubling_trial,
     folds, n_folds, n_steps_of_first_round,
 };
+use crate::splat::kernels::TrainPipelines;
 use crate::splat::schedule::Schedule;
 use crate::splat::snapshot::{ObservedScene, Snapshot};
 use crate::splat::trials::ImageId;
 use crate::splat::views::Level;
 use crate::view::depth_in_color_view;
 use crate::{Error, Method};
-use calibration::{Candidate, MIN_VALIDATION_IMAGES};
-use std::collections::VecDeque;
+use calibration::{CameraCorrection, Candidate, MIN_VALIDATION_IMAGES};
+use std::collections::{BTreeMap, VecDeque};
+use std::sync::Arc;
+
+/// What the scores of all views of a fold have in common.
+struct ScoringContext {
+    learn: Arc<TrainPipelines>,
+    corrections: BTreeMap<String, CameraCorrection>,
+    background_srgb: [f32; 3],
+}
 
 impl SplatTrainer {
     /// Adapts the search to a change of the images, unless a trial is running, whose halves must be
@@ -47,6 +56,8 @@ impl SplatTrainer {
         match &self.growth_search {
             GrowthSearch::Running(models) => self.schedule.step >= models.until,
             GrowthSearch::Waiting { not_before } => {
+                // Two images are the minimum for two folds. A mature model, and one at the limit,
+                // cannot grow anyway.
                 self.schedule.step >= self.trials.steps.search.max(*not_before)
                     && self.views.len() >= 2
                     && !self.schedule.is_mature()
@@ -67,6 +78,8 @@ impl SplatTrainer {
             Some(FoldPhase::Baseline) => self.begin_fold_variant(),
             Some(FoldPhase::Variant) => self.end_fold_variant(),
         };
+        // The search holds several models at once, so memory can be too small for it even if it
+        // suffices for training.
         match advanced {
             Err(error) if error.is_out_of_memory() => {
                 log::warn!(
@@ -84,10 +97,13 @@ impl SplatTrainer {
     pub(super) fn n_steps_for_growth_search(&self) -> u64 {
         let step = self.schedule.step;
         match self.growth_search.running() {
+            // After the search, training on all images must continue for as many steps as the
+            // search has taken. Otherwise, the time is better spent on training.
             Some(models) => {
                 let (n_left, n_total) = models.n_steps(step, &self.trials.steps);
                 n_left + n_total
             }
+            // Twice: once for the search, and once for the training after it.
             None if self.is_growth_search_due() => {
                 2 * n_steps_of_first_round(step, n_folds(self.n_images()), &self.trials.steps)
             }
@@ -99,6 +115,7 @@ impl SplatTrainer {
     /// at the current one.
     pub(super) fn end_growth_search(&mut self) -> Result<bool, Error> {
         self.finish_in_flight()?; // A failed submit may reduce the step count.
+        // Accepted rounds of an unfinished search remain valid.
         let n_splats = if let Some(models) = self.growth_search.running_mut() {
             self.trials.finished.append(&mut models.trials);
             models.n_splats
@@ -125,6 +142,7 @@ impl SplatTrainer {
             return Ok(());
         };
         self.views.hold_out(&[]);
+        // The memory limit that a doubled model reached does not apply to the smaller main model.
         self.model.set_full(models.is_main_full);
         self.restore_snapshot(models.main)
     }
@@ -139,6 +157,7 @@ impl SplatTrainer {
                 .map(|keyframe| (keyframe.camera.clone(), keyframe.stamp))
                 .collect(),
         );
+        // The main model is moved out, not copied: it is not trained during the search.
         let n_splats = self.model.splats.n_splats;
         let until = self.schedule.step;
         let main = self.take_state()?;
@@ -166,20 +185,27 @@ impl SplatTrainer {
             return Ok(());
         };
         self.views.hold_out(&models.folds[models.fold_ix]);
+        // After an accepted round, its doubled models are the baselines of the next one.
         if let Some(previous) = models.previous.pop_front() {
             self.restore_snapshot(previous)?;
             return self.begin_fold_baseline();
         }
+        // As many steps as the main model, so that the comparison is made at the same stage of
+        // training.
         models.phase = FoldPhase::WarmUp;
         models.until = models
             .main
             .schedule
             .step
             .min(self.trials.steps.max_warm_up());
+        // Camera parameters are kept, although they were estimated with the images of the fold:
+        // scores would otherwise measure errors of the poses.
         let (set, params) = &models.main.cameras;
         let gpu = &self.recorder.gpu;
         let copy = gpu.storage("splat.camera_params", params.bytes())?;
         gpu.copy((params, 0), (&copy, 0), params.bytes());
+        // Splats and seeds start anew, because those of the main model were fitted to the images of
+        // the fold.
         let untrained = Snapshot {
             splats: SplatBuffers::new(gpu, 1, models.main.splats.sh_degree)?,
             cameras: (*set, copy),
@@ -200,8 +226,8 @@ impl SplatTrainer {
         let step = self.schedule.step;
         if let Some(models) = self.growth_search.running_mut() {
             models.fork = Some(fork);
-            (models.phase, models.until) =
-                (FoldPhase::Baseline, step + self.trials.steps.comparison);
+            models.phase = FoldPhase::Baseline;
+            models.until = step + self.trials.steps.comparison;
         }
         Ok(())
     }
@@ -213,6 +239,7 @@ impl SplatTrainer {
             return Ok(());
         };
         models.baseline.extend(scores);
+        // `until` stays: restoring the fork sets the step back to the start of the comparison.
         models.phase = FoldPhase::Variant;
         if let Some(fork) = models.fork.take() {
             self.restore_snapshot(fork)?;
@@ -239,6 +266,8 @@ impl SplatTrainer {
         if models.fold_ix < models.folds.len() {
             return self.begin_fold();
         }
+        // All folds are scored. The candidate names the splats of the main model. The models of
+        // folds have other numbers, but are doubled as well.
         let cap = self.options.cap();
         let to = models.n_splats.saturating_mul(2).min(cap);
         let candidate = Candidate::Doubled {
@@ -285,11 +314,6 @@ impl SplatTrainer {
 
     /// Scores the images of the current fold.
     fn score_held_out(&mut self) -> Result<Vec<HeldOutScore>, Error> {
-        let (learn, corrections, background_srgb) = (
-            self.learn()?,
-            self.learned_corrections()?,
-            self.background_srgb(),
-        );
         let held_out: Vec<ImageId> = self
             .growth_search
             .running()
@@ -299,45 +323,56 @@ impl SplatTrainer {
             .iter()
             .filter_map(|image| self.views.position(image))
             .collect();
+        let context = ScoringContext {
+            learn: self.learn()?,
+            corrections: self.learned_corrections()?,
+            background_srgb: self.background_srgb(),
+        };
         let mut scores = Vec::new();
         for chunk in view_ixs.chunks(view_set::VIEWS_AT_ONCE) {
             let places = chunk.iter().map(|view_ix| (*view_ix, 0)).collect();
             self.views
                 .upload(&mut self.recorder, &places, self.schedule.step)?;
             for view_ix in chunk {
-                let keyframe = self.views.keyframe(*view_ix).clone();
-                let camera = corrected_camera(&corrections, &keyframe);
-                let (_, Level { image, .. }) = self.views.ready_level((*view_ix, 0))?;
-                let drawn = DrawnView {
-                    splats: &self.model.splats,
-                    camera: &camera,
-                    background_srgb,
-                };
-                let products =
-                    self.renderer
-                        .compare(&mut self.recorder, drawn, &learn.score, image)?;
-                let measured_m = depth_in_color_view(&keyframe);
-                let depth_rmse_m = match measured_m.is_empty() {
-                    true => None,
-                    false => {
-                        let picture = self.renderer.picture(
-                            &mut self.recorder,
-                            drawn,
-                            Output::picture(true),
-                        )?;
-                        let picture = picture
-                            .ok_or_else(|| Error::internal("a picture was not read back"))?
-                            .into_picture()?;
-                        depth_rmse_m(&picture.depth_m, &measured_m)?
-                    }
-                };
-                scores.push(HeldOutScore {
-                    psnr_db: products::psnr_with_gains(&products, [1.0; 3]),
-                    depth_rmse_m,
-                });
+                scores.push(self.score_view(*view_ix, &context)?);
             }
         }
         Ok(scores)
+    }
+
+    /// Scores one view, whose image must be uploaded at full resolution.
+    fn score_view(
+        &mut self,
+        view_ix: usize,
+        context: &ScoringContext,
+    ) -> Result<HeldOutScore, Error> {
+        let keyframe = self.views.keyframe(view_ix).clone();
+        let camera = corrected_camera(&context.corrections, &keyframe);
+        let (_, Level { image, .. }) = self.views.ready_level((view_ix, 0))?;
+        let drawn = DrawnView {
+            splats: &self.model.splats,
+            camera: &camera,
+            background_srgb: context.background_srgb,
+        };
+        let products =
+            self.renderer
+                .compare(&mut self.recorder, drawn, &context.learn.score, image)?;
+        let measured_m = depth_in_color_view(&keyframe);
+        let depth_rmse_m = if measured_m.is_empty() {
+            None
+        } else {
+            let picture =
+                self.renderer
+                    .picture(&mut self.recorder, drawn, Output::picture(true))?;
+            let picture = picture
+                .ok_or_else(|| Error::internal("a picture was not read back"))?
+                .into_picture()?;
+            depth_rmse_m(&picture.depth_m, &measured_m)?
+        };
+        Ok(HeldOutScore {
+            psnr_db: products::psnr_with_gains(&products, [1.0; 3]),
+            depth_rmse_m,
+        })
     }
 
     /// The state to display: during a search or trial, the model without the tested change.

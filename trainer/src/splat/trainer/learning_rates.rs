@@ -7,9 +7,11 @@ use crate::splat::params::Rule;
 use crate::splat::schedule::Schedule;
 use crate::splat::snapshot::ObservedScene;
 
-/// Initial learning rate of the means, in scene sizes, and the fraction that remains after the
-/// planned steps.
+// The rates and Adam's parameters are those of Kerbl et al. 2023 and its reference implementation.
+
+/// Initial learning rate of the means, in scene sizes.
 const MEAN_RATE: f32 = 1.6e-4;
+/// Fraction of [`MEAN_RATE`] that remains after the planned steps.
 const FINAL_MEAN_RATE_FRAC: f32 = 0.01;
 const LOG_SCALE_RATE: f32 = 5e-3;
 const ROTATION_RATE: f32 = 1e-3;
@@ -18,12 +20,16 @@ const OPACITY_RATE: f32 = 5e-2;
 /// [`SH_REST_DIVISOR`].
 const SH_DC_RATE: f32 = 2.5e-3;
 const SH_REST_DIVISOR: f32 = 20.0;
-/// Adam's decay rates and epsilon.
+/// Adam's decay rates.
 const BETAS: [f32; 2] = [0.9, 0.999];
+/// Adam's epsilon. It is far below the usual 1e-8, because gradients of single splats are tiny: the
+/// loss is a mean over all pixels.
 const EPSILON: f32 = 1e-15;
-/// Range of the splats' standard deviations, in scene sizes.
+/// Range of the splats' standard deviations, in scene sizes. The lower end keeps the covariance
+/// invertible in f32. The upper end prevents splats that cover everything.
 const SCALE_RANGE: [f32; 2] = [1e-5, 2.0];
-/// Maximum costs of opacity and size relative to the color loss.
+/// Maximum costs of opacity and size relative to the color loss. With 6 and 11 images, three times
+/// these costs gained nothing (docs/benchmarks/2026-11-25-few-images.md).
 const MAX_COST: f64 = 0.1;
 
 /// Returns the update rule of the next steps, which train `n_splats` splats on `n_views` images.
@@ -35,6 +41,9 @@ pub(super) fn rule(
     n_splats: u32,
 ) -> Rule {
     let size = f32_of(scene.size_m);
+    // The fewer the images, the more splats overfit, so the cost is `(13 / n)^2` by default
+    // (docs/design/splats.md, section "Loss"). The loss contains the mean opacity and the mean
+    // scale, hence the division by the number of splats.
     let cost = (options.specific.cost_images / n_views.max(1) as f64)
         .powi(2)
         .min(MAX_COST);
@@ -61,6 +70,8 @@ pub(super) fn rule(
         scale_cost: cost,
         log_scale_range: SCALE_RANGE.map(|scale| (scale * size).ln()),
         seed,
+        // Without depth, many splats start at wrong positions. Costs and noise then act in every
+        // step, also on splats that its image does not show.
         update_all: u32::from(!scene.has_depth),
         unused: 0,
     }

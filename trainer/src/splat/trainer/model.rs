@@ -14,8 +14,11 @@ use crate::splat::params::Growth;
 use crate::splat::passes::{self, GrowthBuffers};
 
 /// Standard deviation of a child's offset from its parent, in standard deviations of the parent.
+/// 3DGS-MCMC places children at the parent's mean. With a larger spread, a family no longer renders
+/// as its parent did. With a smaller one, its members take longer to separate.
 const CHILD_SPREAD: f32 = 0.5;
-/// Splats below this opacity are replaced.
+/// Splats below this opacity are replaced, as in 3DGS-MCMC (Kheradmand et al. 2024). At most 0.5 %
+/// of a pixel depends on such a splat.
 const MIN_OPACITY: f32 = 0.005;
 
 /// Splats and camera parameters in training.
@@ -59,6 +62,7 @@ impl TrainedModel {
         if n_new == 0 {
             return Ok(());
         }
+        // Beyond the limit, a coarser sample of all areas is better than complete parts of a few.
         let kept = if n_new == arrays.n_splats() {
             arrays.clone()
         } else {
@@ -78,12 +82,14 @@ impl TrainedModel {
         n_more: u32,
         key: u32,
     ) -> Result<(), Error> {
+        // Dead splats are replaced even if none may be added.
         let n_before = self.splats.n_splats;
         let n_more = if self.is_full || self.is_growth_paused {
             0
         } else {
             n_more
         };
+        // Growth never removes splats, even if their number is above the limit.
         let n_after = n_before
             .saturating_add(n_more)
             .min(self.max_splats)
@@ -101,6 +107,7 @@ impl TrainedModel {
             min_opacity: MIN_OPACITY,
             unused: 0.0,
         };
+        // Without memory for the temporary buffers, training continues with the current splats.
         let buffers = match GrowthBuffers::new(&recorder.gpu, &growth) {
             Err(error) if error.is_out_of_memory() => {
                 self.stop_growing(&error);
@@ -134,6 +141,7 @@ impl TrainedModel {
         }
         match self.reserve(recorder, renderer, n_splats) {
             Ok(()) => Ok(n_splats),
+            // Without any splats, there is no model to continue with.
             Err(error) if error.is_out_of_memory() && self.splats.n_splats > 0 => {
                 self.stop_growing(&error);
                 Ok(n_splats.min(self.splats.capacity))
@@ -152,6 +160,8 @@ impl TrainedModel {
         if n_splats <= have {
             return Ok(());
         }
+        // At least half more than before, so that a model that grows by a tenth at a time is copied
+        // only at every few changes.
         let capacity = n_splats
             .max(have.saturating_mul(3) / 2)
             .min(self.max_splats.max(n_splats));

@@ -14,6 +14,7 @@ impl SplatTrainer {
         TrialContext {
             step: self.schedule.step,
             n_splats: self.model.splats.n_splats,
+            // A model that cannot or may not grow has no doubling to try.
             max_splats: if self.model.is_full() || self.model.is_growth_paused {
                 self.model.splats.n_splats
             } else {
@@ -67,6 +68,8 @@ impl SplatTrainer {
     /// Restores the state at the start of the trial and applies the tested change.
     fn begin_second_half(&mut self) -> Result<(), Error> {
         let baseline_db = self.score_validation()?;
+        // The trained baseline is kept: it is displayed during the second half, and restored if
+        // the change is rejected.
         let snapshot = match self.snapshot() {
             Ok(snapshot) => snapshot,
             Err(error) => return self.end_trials_without_memory(error),
@@ -80,6 +83,7 @@ impl SplatTrainer {
             return Ok(());
         };
         self.restore_snapshot(from)?;
+        // Keyframes of the first half are added again at the steps of their arrival.
         self.views
             .retain(|keyframe| !arrived.iter().any(|other| Arc::ptr_eq(other, keyframe)));
         match candidate {
@@ -94,6 +98,7 @@ impl SplatTrainer {
     /// Doubles the number of splats in the second half of a trial.
     fn double_for_trial(&mut self, n_splats: u32) -> Result<(), Error> {
         match self.grow_to(n_splats) {
+            // The trial is canceled first, because its end frees a copy of the model.
             Err(error) if error.is_out_of_memory() => {
                 let canceled = self.trials.cancel();
                 canceled.map_or(Ok(()), |canceled| self.end_trial(canceled))?;
@@ -133,6 +138,8 @@ impl SplatTrainer {
     ) -> Result<(), Error> {
         if let Some(snapshot) = restored {
             self.restore_snapshot(snapshot)?;
+            // The baseline was trained on these keyframes, so their splats exist. Seeding them
+            // again would double the splats.
             seeded
                 .into_iter()
                 .for_each(|keyframe| self.views.push(keyframe));
@@ -152,6 +159,7 @@ impl SplatTrainer {
             );
         }
         self.abort_growth_search()?;
+        // In the first half, the model in training is the one without the change.
         let Some(canceled) = self.trials.cancel() else {
             return Ok(());
         };
@@ -186,8 +194,11 @@ impl SplatTrainer {
     }
 
     pub(super) fn snapshot(&self) -> Result<Snapshot, Error> {
-        let (gpu, splats, cameras) = (&self.recorder.gpu, &self.model.splats, &self.model.cameras);
+        let gpu = &self.recorder.gpu;
+        let splats = &self.model.splats;
+        let cameras = &self.model.cameras;
         Ok(Snapshot {
+            // Resizing to the same size copies the buffers.
             splats: splats.resized(gpu, splats.capacity, splats.sh_degree)?,
             cameras: (cameras.set, cameras.copy(gpu)?),
             schedule: self.schedule,
@@ -197,6 +208,8 @@ impl SplatTrainer {
 
     pub(super) fn restore_snapshot(&mut self, snapshot: Snapshot) -> Result<(), Error> {
         self.recorder.passes.clear_bindings();
+        // Negative if the snapshot is from a later step, as at the end of a growth search. The sum
+        // of steps and reverted steps stays the number of steps that were trained.
         let n_reverted = self.schedule.step.wrapping_sub(snapshot.schedule.step);
         self.trials.n_reverted_steps = self.trials.n_reverted_steps.wrapping_add(n_reverted);
         self.model.splats = snapshot.splats;
@@ -205,6 +218,7 @@ impl SplatTrainer {
             .restore_snapshot(&self.recorder.gpu, snapshot.cameras)?;
         self.schedule = snapshot.schedule;
         self.seeding.scene = snapshot.scene;
+        // Kernels derive learning rates and random numbers from their own step counter.
         let step = u32::try_from(self.schedule.step).unwrap_or(u32::MAX);
         self.optimizer
             .write_counter(&self.recorder.gpu, status::STEP, step);

@@ -6,11 +6,14 @@ use super::optimizer::StepContext;
 use super::recorder::Recorder;
 use super::view_set::VIEWS_AT_ONCE;
 use crate::Error;
+use crate::gpu::Buffer;
 use crate::splat::buffers::SplatBuffers;
 use crate::splat::kernels::TrainPipelines;
 use crate::splat::params::{Gathering, status};
 
-/// Maximum number of views over which contributions are summed.
+/// Maximum number of views over which contributions are summed. Each view takes about as long as a
+/// training step at full resolution. With fewer views, splats that only the skipped views show
+/// would be pruned.
 const MAX_VIEWS: usize = 64;
 
 impl SplatTrainer {
@@ -23,12 +26,31 @@ impl SplatTrainer {
             .storage("splat.contributions", 4 * u64::from(n_splats))?;
         let stride = self.views.len().div_ceil(MAX_VIEWS).max(1);
         let sampled_views: Vec<usize> = (0..self.views.len()).step_by(stride).collect();
+        // All sizes are reserved first, because new image buffers would lose the errors that are
+        // written to them next.
         for view_ix in &sampled_views {
             self.reserve_view(self.views.size_px((*view_ix, 0)))?;
         }
+        self.set_unit_errors();
+        self.optimizer.set_n_splats(&self.recorder.gpu, n_splats);
+        // Dropped splats would contribute nothing.
+        self.optimizer.write_drop_frac(&self.recorder.gpu, 0.0);
+        for chunk in sampled_views.chunks(VIEWS_AT_ONCE) {
+            let next = chunk.iter().map(|view_ix| (*view_ix, 0)).collect();
+            self.views
+                .upload(&mut self.recorder, &next, self.schedule.step)?;
+            for view_ix in chunk {
+                self.add_contributions(learn, *view_ix, &contributions)?;
+            }
+        }
+        self.recorder.passes.clear_bindings();
+        self.recorder.gpu.read(&contributions, n_splats as usize)
+    }
+
+    /// Sets the error of every pixel to one and its other gradients to zero. Then, a splat's error
+    /// sum equals the sum of its blending weights.
+    fn set_unit_errors(&mut self) {
         if let Some(image_buffers) = &self.optimizer.image_buffers {
-            // With an error of one at every pixel, a splat's error sum equals the sum of its
-            // blending weights.
             self.recorder.gpu.write(
                 &image_buffers.pixel_totals,
                 0,
@@ -36,52 +58,48 @@ impl SplatTrainer {
             );
             self.recorder.passes.clear(&image_buffers.upstream);
         }
-        self.optimizer.set_n_splats(&self.recorder.gpu, n_splats);
-        self.optimizer.write_drop_frac(&self.recorder.gpu, 0.0);
-        for (ix, view_ix) in sampled_views.iter().copied().enumerate() {
-            if ix % VIEWS_AT_ONCE == 0 {
-                let next = sampled_views[ix..]
-                    .iter()
-                    .take(VIEWS_AT_ONCE)
-                    .map(|view_ix| (*view_ix, 0))
-                    .collect();
-                self.views
-                    .upload(&mut self.recorder, &next, self.schedule.step)?;
+    }
+
+    /// Adds the blending weights of each splat in a view to `contributions`.
+    fn add_contributions(
+        &mut self,
+        learn: &TrainPipelines,
+        view_ix: usize,
+        contributions: &Buffer,
+    ) -> Result<(), Error> {
+        // Repeated with larger buffers until they suffice.
+        loop {
+            let Self {
+                recorder: Recorder { gpu, passes },
+                model,
+                renderer,
+                optimizer,
+                views,
+                ..
+            } = &mut *self;
+            let context = StepContext {
+                gpu,
+                learn,
+                renderer,
+                model,
+            };
+            let view = optimizer
+                .prepared_view(&context, passes, views.ready_level((view_ix, 0))?)?
+                .view;
+            view.draw_for_backward(passes, &renderer.pipelines, learn);
+            view.backward(passes, learn);
+            // Has no effect if a buffer was too small, so no view is counted twice.
+            view.contribute(passes, learn, contributions);
+            passes.submit(gpu);
+            let counters: Vec<u32> = gpu.read(&optimizer.status, status::LEN)?;
+            if !self
+                .renderer
+                .grow_scratch(&mut self.recorder, &counters, true)?
+            {
+                return Ok(());
             }
-            loop {
-                let Self {
-                    recorder: Recorder { gpu, passes },
-                    model,
-                    renderer,
-                    optimizer,
-                    views,
-                    ..
-                } = &mut *self;
-                let context = StepContext {
-                    gpu,
-                    learn,
-                    renderer,
-                    model,
-                };
-                let view = optimizer
-                    .prepared_view(&context, passes, views.ready_level((view_ix, 0))?)?
-                    .view;
-                view.draw_for_backward(passes, &renderer.pipelines, learn);
-                view.backward(passes, learn);
-                view.contribute(passes, learn, &contributions); // Has no effect if a buffer was too small.
-                passes.submit(gpu);
-                let counters: Vec<u32> = gpu.read(&optimizer.status, status::LEN)?;
-                if !self
-                    .renderer
-                    .grow_scratch(&mut self.recorder, &counters, true)?
-                {
-                    break;
-                }
-                self.optimizer.clear_failure(&self.recorder.gpu);
-            }
+            self.optimizer.clear_failure(&self.recorder.gpu);
         }
-        self.recorder.passes.clear_bindings();
-        self.recorder.gpu.read(&contributions, n_splats as usize)
     }
 
     /// Keeps the `n_kept` splats that contribute most, without changing their order.
@@ -89,6 +107,7 @@ impl SplatTrainer {
         let learn = self.learn()?;
         let contributions = self.contributions(&learn)?;
         let mut by_contribution: Vec<u32> = (0..self.model.splats.n_splats).collect();
+        // Ties are resolved by index, so that a seed gives one result.
         by_contribution.sort_by(|a, b| {
             contributions[*b as usize]
                 .total_cmp(&contributions[*a as usize])
@@ -126,6 +145,8 @@ fn gather_splats(
     let n_kept = u32::try_from(kept.len()).expect("at most the number of splats, which is a u32");
     let mut fewer = SplatBuffers::new(gpu, n_kept, splats.sh_degree)?;
     let indices = gpu.storage_with("splat.kept", bytemuck::cast_slice(kept))?;
+    // One kernel copies all buffers, because it treats each entry as a number of words. Planes of
+    // one buffer are as far apart as the capacity, which differs between the two models.
     for ((from, n_planes, bytes), (to, _, _)) in splats.planes().iter().zip(fewer.planes()) {
         let words = u32::try_from(bytes / 4).expect("an entry has a few words");
         let gathering = Gathering {

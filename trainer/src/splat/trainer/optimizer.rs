@@ -65,6 +65,7 @@ impl Optimizer {
                 "splat.supervision",
                 &<Supervision as bytemuck::Zeroable>::zeroed(),
             ),
+            // Without D-SSIM in the loss, its passes would take time and change nothing.
             has_ssim: options.specific.dssim_frac > 0.0,
             n_non_finite: 0,
         })
@@ -150,12 +151,15 @@ impl Optimizer {
         view.draw_for_backward(passes, &renderer.pipelines, learn);
         view.compare(passes, learn, &target);
         view.backward(passes, learn);
+        // The gradients with respect to the camera are sums over all splats, which only one of the
+        // two variants of the kernel writes.
         if let Some(lens) = lens {
             view.update(passes, &learn.update_with_camera, &self.rule, true);
             model.cameras.refine(&view, passes, learn, lens);
         } else {
             view.update(passes, &learn.update, &self.rule, false);
         }
+        // The last pass of the step, because the others read the step counter.
         passes.dispatch(gpu, &learn.advance, 1, &[("status", &self.status)]);
         Ok(())
     }
@@ -174,6 +178,7 @@ impl Optimizer {
             renderer,
             model,
         } = *context;
+        // A rejected trial of camera parameters leaves slots behind that are not optimized.
         let lens = lens.filter(|_| !model.cameras.set.is_empty());
         if let Some(lens) = lens {
             model.cameras.correct(gpu, passes, learn, &level.view, lens);
@@ -193,6 +198,7 @@ impl Optimizer {
                 &level.view
             },
             size_px: level.size_px,
+            // Edits never affect training.
             erased: None,
         };
         Ok(PreparedView { view, level, lens })
@@ -208,6 +214,7 @@ impl Optimizer {
     /// Stores the number of non-finite gradients. Logs a warning when it becomes nonzero and at
     /// each doubling.
     pub(super) fn log_non_finite(&mut self, n_non_finite: u64) {
+        // `None`, the logarithm of 0, is less than any number.
         if n_non_finite.checked_ilog2() > self.n_non_finite.checked_ilog2() {
             log::warn!("dropped {n_non_finite} non-finite gradients of splats so far");
         }

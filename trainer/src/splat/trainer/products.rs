@@ -5,7 +5,7 @@ use crate::Error;
 use crate::gpu::{Buffer, Gpu, Passes, Pipeline};
 use crate::splat::buffers::ImageBuffers;
 
-/// Bytes of sums that each workgroup of `score.wgsl` writes.
+/// Bytes of sums that each workgroup of `score.wgsl` writes: four u32 for each of three colors.
 const GROUP_BYTES: usize = 48;
 /// Pixels per workgroup.
 const GROUP_PIXELS: u32 = 256;
@@ -42,19 +42,22 @@ pub(super) fn record(
 
 /// Adds up the sums of all workgroups, for red, green and blue.
 pub(super) fn sum_up(sums: &[[u32; 4]]) -> [Products; 3] {
-    let sum = |color: usize, part: usize| {
-        sums.iter()
-            .skip(color)
-            .step_by(3)
-            .map(|of| u64::from(of[part]))
-            .sum()
-    };
     [0, 1, 2].map(|color| Products {
-        picture_picture: sum(color, 0),
-        picture_image: sum(color, 1),
-        image_image: sum(color, 2),
-        n_visible: sum(color, 3),
+        picture_picture: sum_of(sums, color, 0),
+        picture_image: sum_of(sums, color, 1),
+        image_image: sum_of(sums, color, 2),
+        n_visible: sum_of(sums, color, 3),
     })
+}
+
+/// Adds up one of the four parts for one color.
+fn sum_of(sums: &[[u32; 4]], color: usize, part: usize) -> u64 {
+    // A workgroup of 256 pixels fits into u32 (256 * 255 * 255), but a picture does not.
+    sums.iter()
+        .skip(color)
+        .step_by(3)
+        .map(|of| u64::from(of[part]))
+        .sum()
 }
 
 /// PSNR in dB, bit-identical to [`crate::eval::psnr`] because integer sums are exact.
@@ -63,6 +66,8 @@ pub(super) fn psnr(products: &[Products; 3]) -> Result<f64, Error> {
     if n == 0 {
         return Err(Error::AllPixelsMasked);
     }
+    // (p - i)^2 = p^2 + i^2 - 2 p i. The difference of the sums is not negative, so it fits into
+    // u64.
     let squares: u64 = products
         .iter()
         .map(|color| color.picture_picture + color.image_image - 2 * color.picture_image)
@@ -87,7 +92,10 @@ pub(super) fn psnr_with_gains(products: &[Products; 3], gains: [f64; 3]) -> Opti
 
 /// Logarithms of the gains that best match a picture to an image.
 pub(super) fn log_gains(products: &[Products; 3]) -> [f64; 3] {
-    const MAX_LOG_GAIN: f64 = 1.5; // Two photographic stops: larger gains are not caused by exposure.
+    // About two photographic stops: larger gains are not caused by exposure.
+    const MAX_LOG_GAIN: f64 = 1.5;
+    // The gain that minimizes the sum of `(gain * p - i)^2` is `sum(p i) / sum(p^2)`. It is
+    // undefined for a black picture, and its logarithm is for a black image.
     products.map(|color| match (color.picture_image, color.picture_picture) {
         (0, _) | (_, 0) => 0.0,
         (with_image, picture_only) => (with_image as f64 / picture_only as f64)

@@ -21,13 +21,18 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 /// Maximum number of keyframes that determine the motion of the splats, spread evenly over all.
+/// Every splat is projected into each of them, so the time is proportional to their number.
 const MAX_KEYFRAMES: usize = 64;
 /// A splat belongs to the surface of a depth reading if it is at most this fraction of its depth
-/// away.
+/// away. Otherwise, the surface hides it, or it floats in front.
 const SURFACE_FRAC: f64 = 0.05;
-/// Depth error, as a fraction of the depth, at which the weight of a keyframe is halved.
+/// Depth error, as a fraction of the depth, at which the weight of a keyframe is halved. With wrong
+/// cameras, keyframes disagree about a surface. The one from which a splat was seeded agrees best,
+/// and should move it.
 const AGREEMENT_FRAC: f64 = 0.001;
-/// Weight of a keyframe without a depth reading: it shows the splat unless something hides it.
+/// Weight of a keyframe without a depth reading: it shows the splat unless something hides it. The
+/// weight matters only if no keyframe has depth there: at an error of [`SURFACE_FRAC`], the weight
+/// with depth is still 4e-4.
 const WITHOUT_DEPTH: f64 = 1e-4;
 /// Parameters of single images, which stay enabled. Shared parameters are part of the alignment.
 const IMAGE_PARAMS: ParamSet = ParamSet::IMAGE_POSES.union(ParamSet::IMAGE_GAINS);
@@ -40,13 +45,17 @@ impl Recalibrate for SplatTrainer {
     ) -> Result<(), Error> {
         self.finish_in_flight()?;
         self.abort_trial()?;
-        let learned = match self.model.cameras.set.is_empty() {
-            true => BTreeMap::new(),
-            false => self.camera_corrections()?,
+        let learned = if self.model.cameras.set.is_empty() {
+            BTreeMap::new()
+        } else {
+            self.camera_corrections()?
         };
+        // The splats first: their motion depends on the cameras before the correction.
         let gpu = self.recorder.gpu.clone();
         let motions = motions(keyframes, |camera| learned.get(camera));
         move_splats(&gpu, &self.model.splats, &motions)?;
+        // Then everything that refers to the keyframes. Views come before seeding, which takes the
+        // corrected depth from them.
         let corrected = replacement(keyframes);
         self.recorder.passes.clear_bindings();
         self.views.replace_cameras(&gpu, &corrected);
@@ -55,12 +64,16 @@ impl Recalibrate for SplatTrainer {
             .validation
             .iter_mut()
             .for_each(|image| corrected(&mut image.keyframe));
+        // Camera parameters start at zero again, because the keyframes now contain the correction.
         let mut params = self.model.cameras.set & IMAGE_PARAMS;
+        // Depth gives image poses to a few millimeters. The splats refine them, without a trial.
         if alignment.has_image_poses() && self.trials.remove_candidate(ParamSet::IMAGE_POSES) {
-            params |= ParamSet::IMAGE_POSES; // Depth gives image poses to a few millimeters; the splats refine them.
+            params |= ParamSet::IMAGE_POSES;
         }
         self.model.cameras =
             CameraParams::new(&gpu, self.options.common.cameras.always() | params)?;
+        // The splats must adapt to the corrected cameras, which needs learning rates that are not
+        // too small.
         self.schedule.extend_for_arrival();
         Ok(())
     }
@@ -150,6 +163,28 @@ struct Motion {
 }
 
 impl Motion {
+    /// The motion of a keyframe. `learned` is the correction of its camera that was learned with
+    /// the splats, if any.
+    fn of(keyframe: &CorrectedKeyframe, learned: Option<&CameraCorrection>) -> Self {
+        let CorrectedKeyframe { before, after } = keyframe;
+        // The splats fit the learned cameras, not those of the keyframes.
+        let before = learned.map_or_else(
+            || before.clone(),
+            |learned| Arc::new(learned.corrected(before)),
+        );
+        let rotation =
+            after.world_from_camera.rotation * before.world_from_camera.rotation.inverse();
+        Self {
+            before: PosedCamera::of(&before),
+            after: PosedCamera::of(after),
+            depth: before
+                .depth
+                .clone()
+                .map(|depth| (PosedCamera::of_depth(&depth), depth)),
+            rotation,
+        }
+    }
+
     /// Where the correction moves a point, and the weight of this motion; `None` if the keyframe
     /// does not show the point.
     fn of_point(&self, point: &Point3<f64>) -> Option<(Point3<f64>, f64)> {
@@ -159,11 +194,14 @@ impl Motion {
             let reading = reading_m(depth, px);
             (reading > 0.0).then_some((reading - z) / z)
         });
+        // The weight falls with the square of the error, like that of a robust mean, so that one
+        // keyframe in good agreement outweighs many others.
         let weight = match known {
             Some(error_frac) if error_frac.abs() > SURFACE_FRAC => return None,
             Some(error_frac) => 1.0 / (1.0 + (error_frac / AGREEMENT_FRAC).powi(2)),
             None => WITHOUT_DEPTH,
         };
+        // The image content stays at its pixel and depth. Only the camera changes.
         Some((self.after.point(px, z)?, weight))
     }
 }
@@ -176,41 +214,29 @@ fn motions<'a>(
 ) -> Vec<Motion> {
     let n = keyframes.len().min(MAX_KEYFRAMES);
     let subset = (0..n).map(|ix| &keyframes[ix * keyframes.len() / n]);
-    let motion = |CorrectedKeyframe { before, after }: &CorrectedKeyframe| {
-        let before = learned(&before.camera).map_or_else(
-            || before.clone(),
-            |learned| Arc::new(learned.corrected(before)),
-        );
-        let rotation =
-            after.world_from_camera.rotation * before.world_from_camera.rotation.inverse();
-        Motion {
-            before: PosedCamera::of(&before),
-            after: PosedCamera::of(after),
-            depth: before
-                .depth
-                .clone()
-                .map(|depth| (PosedCamera::of_depth(&depth), depth)),
-            rotation,
-        }
-    };
-    subset.map(motion).collect()
+    subset
+        .map(|keyframe| Motion::of(keyframe, learned(&keyframe.before.camera)))
+        .collect()
 }
 
 /// Position and rotation of a splat after the correction: the weighted means over the keyframes
 /// that show it, or those of the nearest camera if none does.
 fn moved(motions: &[Motion], point: &Point3<f64>) -> Option<(Point3<f64>, UnitQuaternion<f64>)> {
-    let (mut weights, mut shift) = (0.0, Vector3::zeros());
+    let mut weights = 0.0;
+    let mut shift = Vector3::zeros();
     let mut rotations = Quaternion::from_parts(0.0, Vector3::zeros());
     for motion in motions {
         let Some((position, weight)) = motion.of_point(point) else {
             continue;
         };
+        // Both signs of a quaternion are the same rotation, but their sum would cancel. For small
+        // rotations, the normalized sum of quaternions is their mean.
         let rotation = motion.rotation.into_inner();
         rotations += if rotation.w < 0.0 {
             -rotation
         } else {
             rotation
-        } * weight; // Both signs are the same rotation.
+        } * weight;
         shift += (position - point) * weight;
         weights += weight;
     }
@@ -220,6 +246,8 @@ fn moved(motions: &[Motion], point: &Point3<f64>) -> Option<(Point3<f64>, UnitQu
             UnitQuaternion::from_quaternion(rotations),
         ));
     }
+    // No keyframe shows the point. It may belong to the background, which moves rigidly with a
+    // camera near it.
     let distance = |motion: &&Motion| {
         (motion.before.world_from_camera.translation.vector - point.coords).norm_squared()
     };

@@ -13,11 +13,13 @@ use crate::view::ErasedSpace;
 use crate::{Error, Packing, QueuedPicture, Rendered};
 use nalgebra::Matrix4;
 
-/// Minimum capacity of the bin lists, in entries.
+/// Minimum capacity of the bin lists, in entries. Few large splats need many entries each, so small
+/// models would otherwise overflow in their first steps.
 const MIN_ENTRIES: u32 = 1 << 14;
 
 /// Divisors of the need that give the headroom of grown buffers, tried in this order: 1/2, 1/16,
-/// none.
+/// none. Each overflow repeats steps, so more headroom saves time. Less is better than no larger
+/// buffer at all.
 const HEADROOM_DIVISORS: [u32; 3] = [2, 16, u32::MAX];
 
 /// Draws pinhole views of splats.
@@ -83,15 +85,14 @@ impl Renderer {
         let output = self
             .reader
             .available(&recorder.gpu, &mut recorder.passes, output, view_px)?;
-        let take = |parts: &[&[u8]]| {
+        let taken = self.draw(recorder, drawn, ReadParts::Picture(output), |parts| {
             output
                 .is_complete()
                 .then(|| Reader::take(output, view_px, parts))
-        };
-        match (
-            self.draw(recorder, drawn, ReadParts::Picture(output), take)?,
-            &self.image_buffers,
-        ) {
+        })?;
+        match (taken, &self.image_buffers) {
+            // If the picture could not be packed, it is read from the image buffers in a second
+            // step.
             (Some(None), Some(ImageBuffers { pixels, depths, .. })) => {
                 let Recorder { gpu, passes } = recorder;
                 self.reader
@@ -129,6 +130,7 @@ impl Renderer {
         score: &Pipeline,
         rgba: &[u8],
     ) -> Result<[Products; 3], Error> {
+        // A larger buffer is fine: the kernel reads only the pixels of the view.
         let image = match self.compared.take() {
             Some(image) if image.bytes() >= rgba.len() as u64 => {
                 recorder.gpu.write(&image, 0, rgba);
@@ -185,6 +187,8 @@ impl Renderer {
         parts: ReadParts<'_>,
         take: impl Fn(&[&[u8]]) -> R,
     ) -> Result<R, Error> {
+        // The needed sizes depend on the view and are known only once it is binned. The counters
+        // contain the needs of the whole view, even if it does not fit, so one repetition suffices.
         loop {
             let (counters, taken) =
                 self.submit(recorder, drawn, parts)?
@@ -195,6 +199,7 @@ impl Renderer {
             if let Some(taken) = taken {
                 return Ok(taken);
             }
+            // Guards against an endless loop.
             if !self.grow_scratch(recorder, &counters, false)? {
                 return Err(Error::internal(
                     "a view failed although all of its buffers are large enough",
@@ -211,21 +216,14 @@ impl Renderer {
         DrawnView {
             splats,
             camera,
-            background_srgb: [red, green, blue],
+            background_srgb,
         }: DrawnView<'_>,
         parts: ReadParts<'_>,
     ) -> Result<PendingRead, Error> {
         let size_px = camera.size_px;
-        recorder
-            .gpu
-            .write(&self.view, 0, bytemuck::bytes_of(&camera.view()));
-        let background = Supervision {
-            background_srgb: [red, green, blue, 0.0],
-            ..bytemuck::Zeroable::zeroed()
-        };
-        recorder
-            .gpu
-            .write(&self.background, 0, bytemuck::bytes_of(&background));
+        self.write_view(&recorder.gpu, camera, background_srgb);
+        // Reserving may submit recorded passes and replace buffers, so it comes before the passes
+        // of this view are recorded.
         self.reserve_view(recorder, splats.capacity, size_px, false)?;
         reserve_image(recorder, &mut self.image_buffers, size_px, false)?;
         let erased = self.erased.set(
@@ -235,45 +233,54 @@ impl Renderer {
             Matrix4::identity(),
         )?;
         let erased = (!camera.edits.is_empty()).then_some(erased);
-        let (status, view, image_buffers) = (
-            &self.status,
-            &self.view,
-            self.image_buffers
-                .as_ref()
-                .ok_or_else(|| Error::internal("no image buffers are reserved for a view"))?,
-        );
+        let image_buffers = self
+            .image_buffers
+            .as_ref()
+            .ok_or_else(|| Error::internal("no image buffers are reserved for a view"))?;
         let scratch = self
             .scratch
             .as_ref()
             .map(|(_, scratch)| scratch)
             .ok_or_else(no_scratch)?;
         let Recorder { gpu, passes: list } = recorder;
-        write_n_splats(gpu, status, splats.n_splats);
+        write_n_splats(gpu, &self.status, splats.n_splats);
         let passes = ViewPasses {
             gpu,
             splats,
             scratch,
             image_buffers,
-            status,
-            view,
+            status: &self.status,
+            view: &self.view,
             size_px,
             erased,
         };
         passes.draw(list, &self.pipelines);
         passes.finish(list, &self.pipelines, &self.background);
-        let mut read = vec![(status, 4 * status::LEN)];
+        // The counters are read along with the results: they say whether the results are complete.
+        let mut read = vec![(&self.status, 4 * status::LEN)];
         match parts {
             ReadParts::Picture(output) => {
                 let canvas = [&image_buffers.pixels, &image_buffers.depths];
                 read.extend(self.reader.record(gpu, list, output, size_px, canvas)?);
             }
             ReadParts::Comparison { score, image } => {
-                let n_bytes =
-                    products::record(gpu, list, score, (view, image_buffers), size_px, image);
+                let buffers = (&self.view, image_buffers);
+                let n_bytes = products::record(gpu, list, score, buffers, size_px, image);
                 read.push((&image_buffers.products, n_bytes));
             }
         }
         Ok(list.submit_reading(gpu, &read))
+    }
+
+    /// Uploads the camera and the background of the next picture.
+    fn write_view(&self, gpu: &Gpu, camera: &Camera, [red, green, blue]: [f32; 3]) {
+        gpu.write(&self.view, 0, bytemuck::bytes_of(&camera.view()));
+        // Pictures share the kernel with training, but have no loss and no random background.
+        let background = Supervision {
+            background_srgb: [red, green, blue, 0.0],
+            ..bytemuck::Zeroable::zeroed()
+        };
+        gpu.write(&self.background, 0, bytemuck::bytes_of(&background));
     }
 
     /// The scratch buffers, which must be reserved first.
@@ -293,6 +300,8 @@ impl Renderer {
         size_px: [u32; 2],
         learned: bool,
     ) -> Result<(), Error> {
+        // First estimates: two bins per splat, and two tiles per bin. Buffers grow if a view needs
+        // more.
         let n_entries = (2 * capacity).max(MIN_ENTRIES);
         let n_slots = if learned { 2 * n_entries } else { 0 };
         self.reserve(
@@ -348,14 +357,14 @@ impl Renderer {
         };
         let mut grown = Ok(());
         for headroom_divisor in HEADROOM_DIVISORS {
-            let larger = |need: u32, have: u32| match need > have {
-                true => need.saturating_add(need / headroom_divisor),
-                false => have,
-            };
             let need = ScratchSize {
-                n_entries: larger(counters[status::NEED_ENTRIES], size.n_entries),
+                n_entries: with_headroom(
+                    counters[status::NEED_ENTRIES],
+                    size.n_entries,
+                    headroom_divisor,
+                ),
                 n_slots: if learned {
-                    larger(counters[status::NEED_SLOTS], size.n_slots)
+                    with_headroom(counters[status::NEED_SLOTS], size.n_slots, headroom_divisor)
                 } else {
                     size.n_slots
                 },
@@ -363,6 +372,7 @@ impl Renderer {
             };
             log::debug!("splat: growing the intersection buffers to {need:?}");
             grown = self.reserve(recorder, need);
+            // Only a lack of memory is a reason to try again with less headroom.
             if !grown.as_ref().is_err_and(Error::is_out_of_memory) {
                 break;
             }
@@ -381,6 +391,8 @@ impl Renderer {
         if fits {
             return Ok(());
         }
+        // No dimension shrinks. Otherwise, views of different sizes would take turns in replacing
+        // the buffers.
         let other = have.unwrap_or(need);
         let size = ScratchSize {
             n_splats: need.n_splats.max(other.n_splats),
@@ -391,6 +403,7 @@ impl Renderer {
         recorder.submit_and_release_buffers();
         self.scratch = None; // Freed before the larger one is allocated.
         let made = Scratch::new(&recorder.gpu, &self.pipelines, size);
+        // Restores the previous size, so that views that fit can still be drawn and trained on.
         if made.is_err()
             && let Some(had) = have
         {
@@ -404,6 +417,16 @@ impl Renderer {
 /// Whether the buffers were large enough, according to the counters that were read back.
 fn is_complete(counters: &[u8]) -> bool {
     counters[4 * status::FAILED..4 * (status::FAILED + 1)] == [0; 4]
+}
+
+/// New size of a buffer: `have` if it suffices, otherwise `need` plus its fraction
+/// `1 / headroom_divisor`.
+fn with_headroom(need: u32, have: u32, headroom_divisor: u32) -> u32 {
+    if need > have {
+        need.saturating_add(need / headroom_divisor)
+    } else {
+        have
+    }
 }
 
 /// Reserves buffers for a picture of this size, including its gradients if `learned`.
@@ -441,6 +464,7 @@ pub(super) fn write_n_splats(gpu: &Gpu, status: &Buffer, n_splats: u32) {
 
 /// Clears the failure flag and the requested buffer sizes.
 pub(super) fn clear_failure(gpu: &Gpu, status: &Buffer) {
+    // Three adjacent words: the flag and the two needs.
     gpu.write(status, 4 * status::FAILED as u64, &[0; 12]);
 }
 

@@ -30,6 +30,7 @@ pub(super) fn read_splats(
     prefix: &str,
     [n_splats, capacity, sh_degree, active_degree]: [u32; 4],
 ) -> Result<SplatBuffers, Error> {
+    // The numbers come from a file, and buffers are written at offsets that follow from them.
     if n_splats > capacity || active_degree > sh_degree || sh_degree > 3 {
         return Err(invalid_state(format!(
             "{n_splats} splats of SH degree {active_degree} do not fit capacity {capacity} and SH degree {sh_degree}"
@@ -40,6 +41,7 @@ pub(super) fn read_splats(
         let used_bytes = u64::from(n_splats) * bytes;
         let array =
             checkpoint.array(&format!("{prefix}{name}"), u64::from(n_planes) * used_bytes)?;
+        // Planes are contiguous in the checkpoint, but as far apart as the capacity on the GPU.
         for plane in 0..u64::from(n_planes) {
             let from = to_usize(plane * used_bytes);
             let at = plane * u64::from(capacity) * bytes;
@@ -56,16 +58,19 @@ pub(super) fn read_seeds(
     prefix: &str,
     n_seeds: u64,
 ) -> Result<Seeder, Error> {
-    let array = |name: &str, bytes: u64| {
-        let n_bytes = n_seeds
-            .checked_mul(bytes)
-            .ok_or_else(|| invalid_state(format!("{n_seeds} seeds are too many")))?;
-        checkpoint.array(&format!("{prefix}{name}"), n_bytes)
-    };
-    Ok(Seeder::from_bytes(
-        array(SEED_POSITIONS, Seeder::POSITION_BYTES)?,
-        array(SEED_CELLS, Seeder::CELL_BYTES)?,
-    ))
+    // Each seed has one position and one cell.
+    let n_position_bytes = n_seed_bytes(n_seeds, Seeder::POSITION_BYTES)?;
+    let positions = checkpoint.array(&format!("{prefix}{SEED_POSITIONS}"), n_position_bytes)?;
+    let n_cell_bytes = n_seed_bytes(n_seeds, Seeder::CELL_BYTES)?;
+    let cells = checkpoint.array(&format!("{prefix}{SEED_CELLS}"), n_cell_bytes)?;
+    Ok(Seeder::from_bytes(positions, cells))
+}
+
+/// Size of an array with `bytes` per seed. The number of seeds comes from a file.
+fn n_seed_bytes(n_seeds: u64, bytes: u64) -> Result<u64, Error> {
+    n_seeds
+        .checked_mul(bytes)
+        .ok_or_else(|| invalid_state(format!("{n_seeds} seeds are too many")))
 }
 
 /// The arrays of one model state, while they are being copied to the host.
@@ -100,24 +105,26 @@ impl PendingArrays {
     }
 
     pub(super) fn finish(self, gpu: &Gpu, arrays: &mut Vec<Array>) -> Result<(), Error> {
-        let mut add = |name: &str, bytes| {
-            arrays.push(Array {
-                name: format!("{}{name}", self.prefix),
-                bytes,
-            })
-        };
+        let prefix = self.prefix;
         for (name, planes) in ARRAYS.into_iter().zip(self.planes) {
-            add(name, planes.finish(gpu)?);
+            arrays.push(named(prefix, name, planes.finish(gpu)?));
         }
         let (positions, cells) = self.seeds.into_bytes();
-        add(SEED_POSITIONS, positions);
-        add(SEED_CELLS, cells);
-        add(
-            CAMERA_PARAMS,
-            self.params
-                .map_or(Ok(Vec::new()), |read| read.finish(gpu))?,
-        );
+        arrays.push(named(prefix, SEED_POSITIONS, positions));
+        arrays.push(named(prefix, SEED_CELLS, cells));
+        let params: Vec<u8> = self
+            .params
+            .map_or(Ok(Vec::new()), |read| read.finish(gpu))?;
+        arrays.push(named(prefix, CAMERA_PARAMS, params));
         Ok(())
+    }
+}
+
+/// An array of the model state with this prefix.
+fn named(prefix: &str, name: &str, bytes: Vec<u8>) -> Array {
+    Array {
+        name: format!("{prefix}{name}"),
+        bytes,
     }
 }
 
@@ -154,6 +161,7 @@ fn begin_read(
     if n_planes == 0 || splats.n_splats == 0 {
         return None;
     }
+    // All planes in one copy, without the unused end of the last one.
     let n = u64::from(n_planes - 1) * u64::from(splats.capacity) + u64::from(splats.n_splats);
     Some(gpu.begin_read(buffer, to_usize(n * bytes / 4)))
 }

@@ -5,7 +5,7 @@ use super::renderer::DrawnView;
 use super::view_set::VIEWS_AT_ONCE;
 use super::{SplatTrainer, displayed};
 use crate::splat::params::Camera;
-use crate::splat::trials::Scores;
+use crate::splat::trials::{ImageId, Scores};
 use crate::splat::views::{Level, camera_of};
 use crate::{Error, Method};
 use calibration::{CalibratedCamera, CameraCorrection, ParamSet, interpolate};
@@ -13,7 +13,9 @@ use keyframe::Keyframe;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
-/// Number of latest views whose gains are computed when gains are enabled in a live run.
+/// Number of latest views whose gains are computed when gains are enabled in a live run. It is
+/// twice the number of keyframes that the decision is based on, so it usually includes all that
+/// arrived after the change of exposure. Each view costs one picture.
 const MAX_NEW_EXPOSURES: usize = 16;
 
 /// A keyframe and the sums from its comparison with the rendered picture.
@@ -31,6 +33,8 @@ impl SplatTrainer {
         background_srgb: [f32; 3],
         keyframe: &Keyframe,
     ) -> Result<Option<f64>, Error> {
+        // Not `wait`: a score must not be delayed by the compilation of training pipelines. The
+        // caller can score the picture on the CPU.
         let Some(learn) = self.optimizer.pipelines.ready() else {
             return Ok(None);
         };
@@ -51,16 +55,10 @@ impl SplatTrainer {
 
     /// PSNR in dB of the validation keyframes, or of an evenly spaced subset if there are many.
     pub(super) fn score_validation(&mut self) -> Result<Scores, Error> {
-        let score = |(keyframe, products): &ScoredKeyframe| {
-            Some((
-                (keyframe.camera.clone(), keyframe.stamp),
-                products::psnr_with_gains(products, [1.0; 3])?,
-            ))
-        };
         Ok(self
             .compare_validation()?
             .iter()
-            .filter_map(score)
+            .filter_map(score_of)
             .collect())
     }
 
@@ -74,6 +72,8 @@ impl SplatTrainer {
             .iter()
             .map(|(keyframe, _)| self.neighbors(keyframe))
             .collect();
+        // The gains of a validation keyframe itself would be fitted to the image that they are
+        // scored on. Those of its neighbors predict them only if exposure really changes.
         let mut known: BTreeMap<usize, [f64; 3]> = BTreeMap::new();
         self.add_gains(
             &mut known,
@@ -81,19 +81,18 @@ impl SplatTrainer {
             &corrections,
         )?;
         // Subtract the mean over all images, because it is an error of the model's brightness.
-        let mean = |color: usize| {
-            known.values().map(|gains| gains[color]).sum::<f64>() / known.len().max(1) as f64
-        };
-        let mean = [0, 1, 2].map(mean);
-        let (mut baseline_db, mut variant_db) = (Vec::new(), Vec::new());
+        let mean = [0, 1, 2].map(|color| mean_gain(&known, color));
+        let mut baseline_db = Vec::new();
+        let mut variant_db = Vec::new();
         for ((keyframe, products), neighbors) in validation.iter().zip(&neighbors) {
-            let own = |view_ix: &usize| {
-                let gains = known.get(view_ix)?;
-                let stamp = self.views.keyframe(*view_ix).stamp.0;
-                Some((stamp, [0, 1, 2].map(|color| gains[color] - mean[color])))
-            };
-            let neighbor_gains: BTreeMap<i64, [f64; 3]> =
-                neighbors.iter().filter_map(own).collect();
+            let mut neighbor_gains: BTreeMap<i64, [f64; 3]> = BTreeMap::new();
+            for view_ix in neighbors {
+                if let Some(gains) = known.get(view_ix) {
+                    let stamp = self.views.keyframe(*view_ix).stamp.0;
+                    let relative = [0, 1, 2].map(|color| gains[color] - mean[color]);
+                    neighbor_gains.insert(stamp, relative);
+                }
+            }
             let gains = interpolate(&neighbor_gains, keyframe.stamp)
                 .unwrap_or_default()
                 .map(f64::exp);
@@ -115,8 +114,10 @@ impl SplatTrainer {
         mean: [f64; 3],
         first_ix: usize,
     ) -> Result<(), Error> {
+        // Read before gains are enabled: the pictures for the initial gains have none.
         let corrections = self.learned_corrections()?;
         self.model.cameras.enable(gains);
+        // Assigns the slots that the gains are written to.
         self.prepare_training()?;
         self.add_gains(
             &mut known,
@@ -137,6 +138,8 @@ impl SplatTrainer {
     /// optimized, compares the keyframe with the picture before training on it. During a trial, or
     /// if memory is too small for the picture, the keyframe is added without a comparison.
     pub(super) fn add_live_arrival(&mut self, keyframe: Arc<Keyframe>) -> Result<(), Error> {
+        // Before the first trial, the model is too coarse for a comparison. During a trial, the
+        // change must not depend on which half is in training.
         let is_watched = self.trials.watches_gains();
         let is_compared = is_watched || self.model.cameras.set.contains(ParamSet::IMAGE_GAINS);
         if !is_compared
@@ -145,7 +148,8 @@ impl SplatTrainer {
         {
             return self.add_arrival(keyframe);
         }
-        let (learn, background_srgb) = (self.learn()?, self.background_srgb());
+        let learn = self.learn()?;
+        let background_srgb = self.background_srgb();
         let camera = corrected_camera(&self.learned_corrections()?, &keyframe);
         let drawn = DrawnView {
             splats: &self.model.splats,
@@ -163,15 +167,19 @@ impl SplatTrainer {
             };
         let log_gains = products::log_gains(&products);
         self.add_arrival(keyframe.clone())?;
+        // While gains are watched for, they are not optimized, so there is nothing to initialize.
         if is_watched {
             let psnr = |gains| products::psnr_with_gains(&products, gains);
             let needed = self.trials.add_arrival_gains(&keyframe, log_gains, psnr);
-            // The model still has the brightness of earlier views.
+            // The model still has the brightness of earlier views, which need no gains. The
+            // latest views include those after the change of exposure.
             let first_ix = self.views.len().saturating_sub(MAX_NEW_EXPOSURES);
             return needed.map_or(Ok(()), |gains| {
                 self.enable_gains(gains, BTreeMap::new(), [0.0; 3], first_ix)
             });
         }
+        // Training would need many steps on this image to reach these gains. Until then, its
+        // brightness would change the model.
         self.views
             .assign_lenses(&self.recorder.gpu, &mut self.model.cameras)?;
         self.model
@@ -182,17 +190,25 @@ impl SplatTrainer {
 
     /// The last view before and the first view after a keyframe, from the same camera.
     fn neighbors(&self, keyframe: &Keyframe) -> Vec<usize> {
-        let of_camera = || {
-            self.views
-                .keyframes()
-                .enumerate()
-                .filter(|(_, other)| other.camera == keyframe.camera)
-        };
-        let before = of_camera().filter(|(_, other)| other.stamp <= keyframe.stamp);
-        let after = of_camera().filter(|(_, other)| other.stamp > keyframe.stamp);
-        let before = before.max_by_key(|(_, other)| other.stamp);
-        let after = after.min_by_key(|(_, other)| other.stamp);
+        // Other cameras have their own exposure. Views are in the order of arrival, which may
+        // differ from that of the stamps.
+        let before = self
+            .views_of_camera(&keyframe.camera)
+            .filter(|(_, other)| other.stamp <= keyframe.stamp)
+            .max_by_key(|(_, other)| other.stamp);
+        let after = self
+            .views_of_camera(&keyframe.camera)
+            .filter(|(_, other)| other.stamp > keyframe.stamp)
+            .min_by_key(|(_, other)| other.stamp);
         before.into_iter().chain(after).map(|(ix, _)| ix).collect()
+    }
+
+    /// The views of a camera, with their indices.
+    fn views_of_camera(&self, camera: &str) -> impl Iterator<Item = (usize, &Arc<Keyframe>)> {
+        self.views
+            .keyframes()
+            .enumerate()
+            .filter(move |(_, keyframe)| keyframe.camera.as_ref() == camera)
     }
 
     /// Computes the gains of those views that `known` does not contain yet.
@@ -206,6 +222,8 @@ impl SplatTrainer {
             .into_iter()
             .filter(|view_ix| !known.contains_key(view_ix))
             .collect();
+        // In chunks: images are downscaled and uploaded in parallel, but not all of them fit into
+        // memory on a software adapter.
         for chunk in unknown.chunks(VIEWS_AT_ONCE) {
             let places = chunk.iter().map(|view_ix| (*view_ix, 0)).collect();
             self.views
@@ -224,10 +242,8 @@ impl SplatTrainer {
         corrections: &CameraCorrections,
     ) -> Result<[f64; 3], Error> {
         let learn = self.learn()?;
-        let (camera, background_srgb) = (
-            corrected_camera(corrections, self.views.keyframe(view_ix)),
-            self.background_srgb(),
-        );
+        let camera = corrected_camera(corrections, self.views.keyframe(view_ix));
+        let background_srgb = self.background_srgb();
         let (_, Level { image, .. }) = self.views.ready_level((view_ix, 0))?;
         let drawn = DrawnView {
             splats: &self.model.splats,
@@ -241,16 +257,15 @@ impl SplatTrainer {
     }
 
     fn compare_validation(&mut self) -> Result<Vec<ScoredKeyframe>, Error> {
-        let (learn, corrections, background_srgb) = (
-            self.learn()?,
-            self.learned_corrections()?,
-            self.background_srgb(),
-        );
+        let learn = self.learn()?;
+        let corrections = self.learned_corrections()?;
+        let background_srgb = self.background_srgb();
         let mut compared = Vec::new();
         for id in self.trials.scored() {
+            // The keyframe may have been removed since the start of the trial.
             let Some(validation) = self.trials.validation(&id) else {
                 continue;
-            }; // Removed in the meantime.
+            };
             let camera = corrected_camera(&corrections, &validation.keyframe);
             let image = validation.uploaded(&self.recorder.gpu)?;
             let drawn = DrawnView {
@@ -282,8 +297,22 @@ impl SplatTrainer {
     }
 }
 
+/// Identity and PSNR in dB of a compared keyframe; `None` if it is fully masked.
+fn score_of((keyframe, products): &ScoredKeyframe) -> Option<(ImageId, f64)> {
+    Some((
+        (keyframe.camera.clone(), keyframe.stamp),
+        products::psnr_with_gains(products, [1.0; 3])?,
+    ))
+}
+
+/// Mean of the logarithms of the gains of one color over all views.
+fn mean_gain(known: &BTreeMap<usize, [f64; 3]>, color: usize) -> f64 {
+    known.values().map(|gains| gains[color]).sum::<f64>() / known.len().max(1) as f64
+}
+
 /// The camera of a keyframe with its corrections, for drawing.
 pub(super) fn corrected_camera(corrections: &CameraCorrections, keyframe: &Keyframe) -> Camera {
+    // A camera without corrections is drawn as its keyframe reports it.
     let lens = corrections.get(keyframe.camera.as_ref()).map_or_else(
         || CalibratedCamera::of(keyframe),
         |correction| correction.apply(keyframe),

@@ -14,12 +14,17 @@ use std::sync::Arc;
 /// Maximum share of the splat limit for the seeds of one image, so that enough remains for the
 /// other images.
 const SEED_SHARE: f64 = 1.0 / 8.0;
-/// Minimum number of pixels per seed. A higher density slows the first steps more than it helps.
+/// Minimum number of pixels per seed. A higher density slows the first steps more than it helps:
+/// with 15 pixels per seed, redkitchen reached 2.2 dB less after 1 s
+/// (docs/benchmarks/2026-11-23-splats.md).
 const PX_PER_SEED: f64 = 48.0;
-/// Default maximum number of seeds per image.
+/// Default maximum number of seeds per image. An image of 1280 x 720 pixels has 19 200 at the
+/// density above.
 const SEEDS_PER_IMAGE: f64 = 20_000.0;
+/// The same on a software adapter, where steps with more splats would take too long.
 const SOFTWARE_SEEDS_PER_IMAGE: f64 = 4_000.0;
-/// Minimum scale of the scene.
+/// Minimum scale of the scene. With a scale of zero, as of a single camera without depth, the means
+/// could not move.
 const MIN_SCENE_SIZE_M: f64 = 1e-3;
 
 /// Creates the initial splats for new keyframes.
@@ -82,6 +87,7 @@ impl Seeding {
         if arrived.is_empty() {
             return None;
         }
+        // All views, not only the new ones: the learning rate must fit the whole scene.
         self.scene.size_m = scene_size_m(views);
         let discs = self.scene.seeder.discs(&arrived, self.density);
         self.unseeded.extend(
@@ -103,18 +109,23 @@ impl Seeding {
             .iter_mut()
             .chain(&mut self.unseeded)
             .for_each(correct);
-        let is_pending = |keyframe: &Keyframe| {
-            self.pending
-                .iter()
-                .any(|other| other.camera == keyframe.camera && other.stamp == keyframe.stamp)
-        };
         let seeded: Vec<_> = views
             .keyframes()
-            .filter(|keyframe| !is_pending(keyframe))
+            .filter(|keyframe| !self.is_pending(keyframe))
             .cloned()
             .collect();
+        // Seeding again with the corrected cameras marks the corrected surfaces as occupied. The
+        // discs are dropped, because the model has their splats already.
         self.scene.seeder = Seeder::default();
-        drop(self.scene.seeder.discs(&seeded, self.density)); // The model has them already.
+        drop(self.scene.seeder.discs(&seeded, self.density));
+    }
+
+    /// Whether a keyframe has not been used for seeding yet.
+    fn is_pending(&self, keyframe: &Keyframe) -> bool {
+        // Camera and stamp identify a keyframe. Pointers do not, because corrections replace it.
+        self.pending
+            .iter()
+            .any(|other| other.camera == keyframe.camera && other.stamp == keyframe.stamp)
     }
 
     /// Keyframes with areas that depth does not cover.
@@ -140,7 +151,8 @@ impl Seeding {
 
     /// Restores the state of a checkpoint.
     pub(super) fn restore(&mut self, scene: ObservedScene, unseeded: Vec<Arc<Keyframe>>) {
-        (self.scene, self.unseeded) = (scene, unseeded);
+        self.scene = scene;
+        self.unseeded = unseeded;
     }
 }
 
@@ -160,6 +172,8 @@ fn scene_size_m(views: &ViewSet) -> f64 {
         .iter()
         .filter_map(|view| view.median_depth_m)
         .collect();
+    // Kerbl et al. 2023 use 1.1 times the spread of the cameras. It is too small if the cameras
+    // hardly move, so half of the median depth is a lower limit.
     let median_depth_m = quantile(&mut depths, 0.5, Rank::Upper).unwrap_or(spread);
     (1.1 * spread)
         .max(0.5 * median_depth_m)

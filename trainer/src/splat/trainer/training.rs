@@ -13,7 +13,9 @@ use crate::splat::params::status;
 use crate::splat::work_counts::WorkCounts;
 use std::time::Instant;
 
-/// Maximum number of steps per submit.
+/// Maximum number of steps per submit. A submit also ends at its time limit, so this number matters
+/// only for very short steps. More steps keep more images in memory at once, and repeat more work
+/// after an overflow.
 const MAX_STEPS_PER_SUBMIT: u64 = 64;
 /// Number of images prepared and uploaded together while a viewer requests pictures. A larger
 /// number would delay the pictures too much.
@@ -30,8 +32,11 @@ impl SplatTrainer {
             return Ok(0);
         }
         let learn = self.learn()?;
+        // Trials come before growth: a trial that starts at a growth step copies the model from
+        // before the growth, so that both halves grow at this step.
         self.try_when_due()?;
         self.grow_when_due(&learn)?;
+        // After both, because they can change the step count and the next step with other work.
         let n_steps = self.n_steps_of_submit(n);
         self.model
             .splats
@@ -44,12 +49,16 @@ impl SplatTrainer {
         }
         let counters = self.optimizer.submit(&mut self.recorder);
         self.schedule.step += n_steps;
-        let failed = self.finish_in_flight()?; // Waits for the previous submit while this one runs.
+        // Waits for the previous submit while this one runs, so that the GPU never idles.
+        let failed = self.finish_in_flight()?;
+        // After a failure, the failure flag turns this submit into a no-op, too. Its steps are
+        // repeated, so its counters are not needed.
         if !failed {
             self.optimizer.submits.begin(counters, n_steps, since);
-        } // After a failure, this submit fails, too. Its steps are repeated, so do not wait for it.
+        }
+        // The caller stops here, so the step count must be exact.
         if n_steps == n {
-            self.finish_in_flight()?; // The caller stops here, so the step count must be exact.
+            self.finish_in_flight()?;
         }
         Ok(n_steps)
     }
@@ -62,19 +71,15 @@ impl SplatTrainer {
         self.write_settings();
         self.record_step(&learn, self.schedule.step)?;
         let timings = self.recorder.passes.submit_timed(&self.recorder.gpu)?;
+        // The scratch buffers still hold the lists of this step.
         let place = self.views.of_step(self.schedule.step);
-        let (gpu, n_splats, size_px) = (
-            &self.recorder.gpu,
-            self.model.splats.n_splats,
-            self.views.size_px(place),
-        );
         let image_buffers = self.optimizer.image_buffers()?;
         let counts = WorkCounts::read(
-            gpu,
+            &self.recorder.gpu,
             self.renderer.scratch()?,
             image_buffers,
-            n_splats,
-            size_px,
+            self.model.splats.n_splats,
+            self.views.size_px(place),
         )?;
         log::info!("splat: {counts}");
         self.schedule.step += 1;
@@ -87,8 +92,9 @@ impl SplatTrainer {
             return Ok(());
         }
         self.finish_in_flight()?;
+        // If the submit failed, the change is due again once its steps are repeated.
         if !self.schedule.is_growth_due() {
-            return Ok(()); // The submit failed; the change is due again once its steps are repeated.
+            return Ok(());
         }
         self.schedule.last_growth_step = self.schedule.step;
         let key = growth_key(self.options.common.seed, self.schedule.step);
@@ -104,17 +110,18 @@ impl SplatTrainer {
     /// [`Error::OutOfMemory`] if GPU memory is insufficient.
     pub(super) fn grow_to(&mut self, n_splats: u32) -> Result<(), Error> {
         let learn = self.learn()?;
-        let (n_more, step) = (
-            n_splats.saturating_sub(self.model.splats.n_splats),
-            self.schedule.step,
-        );
+        let n_more = n_splats.saturating_sub(self.model.splats.n_splats);
+        let step = self.schedule.step;
+        // Replaces regular growth at this step, which would change the number again.
         self.schedule.last_growth_step = step;
         let key = growth_key(self.options.common.seed, step);
         let is_full = self.model.is_full();
         self.model
             .grow(&mut self.recorder, &mut self.renderer, &learn, n_more, key)?;
+        // A comparison with fewer splats than requested would be meaningless. The model is not
+        // marked as full: once the copies for the comparison are freed, it may be able to grow.
         if self.model.splats.n_splats < n_splats {
-            self.model.set_full(is_full); // Freeing the copies of the model may make enough memory available.
+            self.model.set_full(is_full);
             return Err(Error::OutOfMemory {
                 label: "splat.doubled".to_owned(),
                 bytes: 0,
@@ -141,6 +148,7 @@ impl SplatTrainer {
     /// Number of steps of the next submit. The submit stays within its time limit and does not pass
     /// a step at which other work is due.
     fn n_steps_of_submit(&self, n_requested: u64) -> u64 {
+        // Before the first measurement, a step may take arbitrarily long.
         let by_time = self.optimizer.submits.n_steps_in_limit().unwrap_or(1);
         n_requested
             .min(by_time.clamp(1, MAX_STEPS_PER_SUBMIT))
@@ -171,6 +179,8 @@ impl SplatTrainer {
         }
         let n_splats = model.splats.n_splats;
         optimizer.set_n_splats(gpu, n_splats);
+        // Both fractions use `completed_frac`, which changes only at growth steps. The result
+        // therefore does not depend on how many steps a submit holds.
         let scarcity = Scarcity::of_images(self.n_images());
         let drop_frac = scarcity.drop_frac(options.specific.drop_frac, schedule.completed_frac());
         optimizer.write_drop_frac(gpu, f32_of(drop_frac));
@@ -191,13 +201,13 @@ impl SplatTrainer {
     /// Uploads the missing images of the next `n` steps. On a GPU, prepares images of later steps
     /// as well, which keeps all CPU cores busy and avoids waiting for images in each step.
     fn prepare_images(&mut self, n: u64) -> Result<(), Error> {
-        let n_at_once = match (
-            self.recorder.gpu.is_software(),
-            self.optimizer.submits.is_watched(),
-        ) {
-            (true, _) => 0,
-            (false, true) => VIEWS_AT_ONCE_WATCHED,
-            (false, false) => MAX_STEPS_PER_SUBMIT,
+        // On a software adapter, the same cores would be taken from training.
+        let n_at_once = if self.recorder.gpu.is_software() {
+            0
+        } else if self.optimizer.submits.is_watched() {
+            VIEWS_AT_ONCE_WATCHED
+        } else {
+            MAX_STEPS_PER_SUBMIT
         };
         let step = self.schedule.step;
         self.views
@@ -207,6 +217,7 @@ impl SplatTrainer {
     /// Records the passes of one step.
     fn record_step(&mut self, learn: &TrainPipelines, step: u64) -> Result<(), Error> {
         let place = self.views.of_step(step);
+        // `train` has prepared the images of its steps, but `profile` has not.
         self.views
             .ensure_level(&mut self.recorder, place, self.schedule.step)?;
         self.reserve_view(self.views.size_px(place))?;
@@ -248,6 +259,8 @@ impl SplatTrainer {
         if matches!(grown, Ok(false)) {
             return Ok(false);
         }
+        // The step counter on the GPU stops at the first step that did not fit. All later steps
+        // were no-ops, so training continues there.
         let failed_step = u64::from(counters[status::STEP]);
         self.schedule.step = failed_step;
         match grown {
@@ -266,6 +279,7 @@ impl SplatTrainer {
     /// The given error if the steps of all images were skipped.
     fn skip_step(&mut self, error: Error) -> Result<(), Error> {
         self.model.stop_growing(&error);
+        // Within two rounds, every image has had its turn.
         let step = self.schedule.step;
         if self.skipped.add(step) > 2 * self.views.n_active() as u64 {
             return Err(error);
@@ -288,6 +302,7 @@ pub(super) struct SkippedSteps {
 impl SkippedSteps {
     /// Adds a step. Returns the number of consecutive skipped steps up to this one.
     fn add(&mut self, step: u64) -> u64 {
+        // Logs once per run: the number is at least 1 after the first skipped step.
         if self.n_consecutive == 0 {
             log::warn!("images that need too much GPU memory are skipped in training");
         }
@@ -301,6 +316,8 @@ impl SkippedSteps {
 /// Random seed for one change of the splat count.
 #[expect(clippy::cast_possible_truncation, reason = "bits of a hash")]
 pub(super) fn growth_key(seed: u64, step: u64) -> u32 {
+    // The constant is 2^32 divided by the golden ratio (Knuth's multiplicative hash). It gives
+    // consecutive steps keys that differ in many bits.
     (step as u32).wrapping_mul(0x9e37_79b9) ^ seed as u32
 }
 

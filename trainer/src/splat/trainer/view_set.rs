@@ -17,10 +17,14 @@ use std::sync::Arc;
 /// Maximum bytes of images on a software adapter. It allocates host memory, which already holds all
 /// keyframes.
 const SOFTWARE_IMAGE_BYTES: u64 = 256 << 20;
-/// Number of images uploaded together when iterating over all views.
+/// Number of images uploaded together when iterating over all views. They are downscaled in
+/// parallel, so the number should be at least that of the cores. All of them must fit into memory.
 pub(super) const VIEWS_AT_ONCE: usize = 16;
-/// Default of [`SplatOptions::coarse_steps`].
+/// Default of [`SplatOptions::coarse_steps`]. Coarse images make the first steps fast. On the
+/// static arm, training at full resolution from the start lost 2 dB at 1 s and 0.1 dB at 8 s
+/// (docs/benchmarks/2026-11-23-splats.md).
 const COARSE_STEPS: [u64; 2] = [150, 400];
+/// The same on a software adapter, whose steps at full resolution take much longer.
 const SOFTWARE_COARSE_STEPS: [u64; 2] = [500, 4000];
 
 /// Training views.
@@ -53,6 +57,7 @@ impl ViewSet {
             } else {
                 COARSE_STEPS
             }),
+            // On a GPU, a lack of memory is an error of the allocation, not a limit.
             max_image_bytes: if is_software {
                 SOFTWARE_IMAGE_BYTES
             } else {
@@ -91,6 +96,7 @@ impl ViewSet {
 
     /// Mean color of the images, sRGB; black without images.
     pub(super) fn mean_srgb(&self) -> [f32; 3] {
+        // Fully masked images have no mean.
         let known: Vec<[f64; 3]> = self.views.iter().filter_map(TrainView::mean_srgb).collect();
         let mean = |color: usize| {
             known.iter().map(|image| image[color]).sum::<f64>() / known.len().max(1) as f64
@@ -127,6 +133,7 @@ impl ViewSet {
 
     pub(super) fn retain(&mut self, is_kept: impl Fn(&Arc<Keyframe>) -> bool) {
         self.views.retain(|view| is_kept(&view.keyframe));
+        // Indices have changed.
         self.hold_out(&[]);
     }
 
@@ -164,6 +171,8 @@ impl ViewSet {
 
     /// The view and level that a step trains on.
     pub(super) fn of_step(&mut self, step: u64) -> ViewLevel {
+        // Images that are held out are not part of the order, so each round visits every other
+        // image once.
         let view_ix = self.active[self.order.pick(step, self.active.len())];
         (
             view_ix,
@@ -193,6 +202,8 @@ impl ViewSet {
         steps: Range<u64>,
         n_at_once: u64,
     ) -> Result<(), Error> {
+        // A larger batch only if anything is missing: otherwise, each submit would upload images of
+        // one more step, and wait for it.
         let mut requested = self.levels_of_steps(steps.clone());
         if !requested.iter().all(|place| self.has_level(*place)) {
             requested = self.levels_of_steps(steps.start..steps.end.max(steps.start + n_at_once));
@@ -221,34 +232,51 @@ impl ViewSet {
             .filter(|place| !self.has_level(*place))
             .collect();
         if !missing.is_empty() {
-            let made: Vec<LevelImages> = missing
-                .par_iter()
-                .map(|(view_ix, level)| LevelImages::new(&self.views[*view_ix].keyframe, *level))
-                .collect();
-            let new_bytes = made.iter().map(LevelImages::bytes).sum();
-            let keep = Keep {
-                needed: requested,
-                coarsest: level_at(step, self.coarse_steps),
-                max_bytes: self.max_image_bytes.saturating_sub(new_bytes),
-            };
-            let mut dropped = views::drop_levels(&mut self.views, keep);
-            if !dropped.is_empty() && !recorder.passes.is_empty() {
-                recorder.submit(); // The recorded passes use images that are replaced below.
-            }
-            for ((view_ix, level), images) in missing.into_iter().zip(&made) {
-                let same_size = dropped
-                    .iter()
-                    .position(|level| level.size_px == images.size_px());
-                let reused = same_size.map(|ix| dropped.swap_remove(ix));
-                self.views[view_ix].upload(&recorder.gpu, level, images, reused)?;
-            }
-            if !dropped.is_empty() {
-                recorder.passes.clear_bindings();
-            }
+            self.upload_missing(recorder, missing, requested, step)?;
         }
+        // A counter instead of the time, so that eviction does not depend on timing.
         self.n_image_requests += 1;
         for (view_ix, level) in requested {
             self.views[*view_ix].mark_used(*level, self.n_image_requests);
+        }
+        Ok(())
+    }
+
+    /// Uploads these levels, and evicts others if the limit of memory is exceeded.
+    fn upload_missing(
+        &mut self,
+        recorder: &mut Recorder,
+        missing: Vec<ViewLevel>,
+        requested: &BTreeSet<ViewLevel>,
+        step: u64,
+    ) -> Result<(), Error> {
+        let made: Vec<LevelImages> = missing
+            .par_iter()
+            .map(|(view_ix, level)| LevelImages::new(&self.views[*view_ix].keyframe, *level))
+            .collect();
+        let new_bytes = made.iter().map(LevelImages::bytes).sum();
+        let keep = Keep {
+            needed: requested,
+            coarsest: level_at(step, self.coarse_steps),
+            max_bytes: self.max_image_bytes.saturating_sub(new_bytes),
+        };
+        let mut dropped = views::drop_levels(&mut self.views, keep);
+        // The recorded passes use images that are overwritten below. Writes are executed before
+        // the passes of the next submit, so these passes must be submitted first.
+        if !dropped.is_empty() && !recorder.passes.is_empty() {
+            recorder.submit();
+        }
+        for ((view_ix, level), images) in missing.into_iter().zip(&made) {
+            // Only buffers of the same size can be overwritten.
+            let same_size = dropped
+                .iter()
+                .position(|level| level.size_px == images.size_px());
+            let reused = same_size.map(|ix| dropped.swap_remove(ix));
+            self.views[view_ix].upload(&recorder.gpu, level, images, reused)?;
+        }
+        // Cached bind groups keep the buffers that were not reused alive.
+        if !dropped.is_empty() {
+            recorder.passes.clear_bindings();
         }
         Ok(())
     }

@@ -38,6 +38,8 @@ fn edge_between(a: usize, b: usize) -> Edge {
 fn triangles(case: usize) -> Vec<[Edge; 3]> {
     let mut segments = segments(case);
     let mut triangles = Vec::new();
+    // Every edge that the surface cuts belongs to two faces, so the segments form closed loops. A
+    // case may have several.
     while let Some((first, mut end)) = segments.pop() {
         let mut corners = vec![first];
         while end != first {
@@ -48,6 +50,7 @@ fn triangles(case: usize) -> Vec<[Edge; 3]> {
                 .expect("each edge ends one segment and begins one");
             end = segments.swap_remove(next).1;
         }
+        // A fan from the first corner. The kernel has room for five triangles per case.
         triangles
             .extend((1..corners.len() - 1).map(|ix| [corners[0], corners[ix], corners[ix + 1]]));
     }
@@ -61,7 +64,9 @@ fn segments(case: usize) -> Vec<(Edge, Edge)> {
     let mut segments = Vec::new();
     for face in FACES {
         for at in 0..4 {
-            let (before, current) = (face[at], face[(at + 1) % 4]);
+            // A run of inside corners begins where the corner before it is outside.
+            let before = face[at];
+            let current = face[(at + 1) % 4];
             if is_inside(before) || !is_inside(current) {
                 continue;
             }
@@ -122,7 +127,8 @@ mod tests {
         for triangles in CASES.iter() {
             for triangle in triangles {
                 for side in 0..3 {
-                    let (from, to) = (triangle[side], triangle[(side + 1) % 3]);
+                    let from = triangle[side];
+                    let to = triangle[(side + 1) % 3];
                     let back = triangles
                         .iter()
                         .any(|other| (0..3).any(|k| (other[k], other[(k + 1) % 3]) == (to, from)));

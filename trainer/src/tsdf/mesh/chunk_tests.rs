@@ -42,7 +42,8 @@ fn decoded(chunk: &ModelChunk) -> Triangles {
     assert_eq!(bytes.len(), 9 * n_vertices + 6 * n_triangles);
     let (positions, rest) = bytes.split_at(6 * n_vertices);
     let (colors, indices) = rest.split_at(3 * n_vertices);
-    let (mut counts, mut color) = ([0_u16; 3], [0_u8; 3]);
+    let mut counts = [0_u16; 3];
+    let mut color = [0_u8; 3];
     let vertices: Vec<Vertex> = (0..n_vertices)
         .map(|ix| {
             counts = std::array::from_fn(|axis| {
@@ -249,7 +250,8 @@ fn chunks_lack_erased_triangles() {
             max_m: [0.4; 3],
         }))
         .unwrap();
-    let (none, edits) = (Arc::default(), Arc::new(edits));
+    let none = Arc::default();
+    let edits = Arc::new(edits);
     let mut replica = Replica::default();
     let voxel_m = model.voxel_grid().unwrap().voxel_m;
     let n_all = model

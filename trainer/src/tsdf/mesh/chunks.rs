@@ -19,7 +19,7 @@ use std::sync::Arc;
 const CHUNK_BLOCKS: i32 = 4;
 /// Voxels along an edge of a chunk with the cubes that begin in it.
 const CHUNK_VOXELS: i32 = CHUNK_BLOCKS * BLOCK_EDGE + 1;
-/// Bits per axis in an id.
+/// Bits per axis in an id. Three times 17 bits are 51, and ids must be below 2^53.
 const ID_BITS: u32 = 17;
 
 /// The blocks of a chunk that has changed.
@@ -45,12 +45,15 @@ impl ChangedChunks {
         edits: &Arc<Edits>,
         only_changed: bool,
     ) -> Self {
+        // The list of changes is taken in either case: after all chunks were sent, none has
+        // changed.
         let changed = mesher.take_changed().filter(|_| only_changed);
         let is_complete = changed.is_none();
         let mut chunks: BTreeMap<GridCoord, ChunkBlocks> = BTreeMap::new();
         for block in changed.unwrap_or_else(|| mesher.blocks().keys().copied().collect()) {
             chunks.entry(chunk_of(block)).or_default().n_changed += 1;
         }
+        // A chunk is encoded as a whole, so its unchanged blocks are needed, too.
         for (block, mesh) in mesher.blocks() {
             if let Some(chunk) = chunks.get_mut(&chunk_of(*block)) {
                 chunk.blocks.push((*block, Arc::clone(mesh)));
@@ -72,6 +75,7 @@ impl ChangedChunks {
                 .for_each(|(_, mesh)| *mesh = without_erased(mesh, voxel_grid, &self.edits));
             chunk.blocks.retain(|(_, mesh)| !mesh.triangles.is_empty());
         }
+        // A chunk whose last triangle has disappeared must be removed by the viewer.
         let (present, removed): (Vec<_>, Vec<_>) = self
             .chunks
             .into_iter()
@@ -111,17 +115,15 @@ fn encoded(coord: GridCoord, chunk: &ChunkBlocks, voxel_grid: &VoxelGrid) -> Mod
     for (block, mesh) in &chunk.blocks {
         let mut ix_of_vertex = Vec::with_capacity(mesh.vertices.len());
         for vertex in &mesh.vertices {
+            // Blocks of a chunk share the vertices on their faces. Other vertices need no lookup.
             let next = vertices.n;
             let ix = shared_key(*block, vertex.edge)
                 .map_or(next, |key| *shared_vertices.entry(key).or_insert(next));
             if ix == next {
-                let count = |axis: usize| {
-                    let offset_m = f64::from(vertex.position_m[axis]) - origin_in_field_m[axis];
-                    (offset_m / meters_per_count)
-                        .round()
-                        .clamp(0.0, f64::from(MAX_MESH_COUNT))
-                };
-                vertices.push([0, 1, 2].map(count), vertex.color);
+                let offset_m =
+                    |axis: usize| f64::from(vertex.position_m[axis]) - origin_in_field_m[axis];
+                let counts = [0, 1, 2].map(|axis| count_of(offset_m(axis), meters_per_count));
+                vertices.push(counts, vertex.color);
             }
             ix_of_vertex.push(ix);
         }
@@ -146,6 +148,13 @@ fn encoded(coord: GridCoord, chunk: &ChunkBlocks, voxel_grid: &VoxelGrid) -> Mod
         coarse: None,
         fine: ChunkData { layout, bytes },
     }
+}
+
+/// A coordinate relative to the chunk, in counts, rounded.
+fn count_of(offset_m: f64, meters_per_count: f64) -> f64 {
+    (offset_m / meters_per_count)
+        .round()
+        .clamp(0.0, f64::from(MAX_MESH_COUNT))
 }
 
 /// Encodes vertices as differences to the previous vertex.
@@ -174,7 +183,8 @@ impl VertexWriter {
         for (part, last) in [red, green, blue].iter().zip(self.last_color) {
             self.colors.push(part.wrapping_sub(last));
         }
-        (self.last_counts, self.last_color) = (counts, [red, green, blue]);
+        self.last_counts = counts;
+        self.last_color = [red, green, blue];
         self.n += 1;
     }
 }

@@ -33,6 +33,8 @@ impl Mesh {
         let mut cell_of_vertex = Vec::with_capacity(self.positions_m.len());
         for (ix, position) in self.positions_m.iter().enumerate() {
             let cell = position.map(|along| (f64::from(along) / cell_m).floor() as i64);
+            // Cells are numbered in the order of their first vertices, so the result does not
+            // depend on the order of the hash table.
             let next = u32::try_from(sums.len()).unwrap_or(u32::MAX);
             let at = *cells.entry(cell).or_insert(next);
             if at == next {
@@ -64,6 +66,7 @@ impl Mesh {
 
 #[expect(clippy::cast_possible_truncation, reason = "sums are f64, normals f32")]
 fn normal_of(sum: &CellSum) -> [f32; 3] {
+    // The normals of a thin sheet cancel out. Any direction is as good then.
     sum.normal
         .try_normalize(1e-9)
         .unwrap_or_else(Vector3::z)
@@ -77,6 +80,8 @@ fn merged(triangles: &[[u32; 3]], cell_of_vertex: &[u32]) -> Vec<[u32; 3]> {
     let mut kept = Vec::new();
     for triangle in triangles {
         let [a, b, c] = triangle.map(|ix| cell_of_vertex[ix as usize]);
+        // Rotation keeps the side from which the triangle is visible. The two sides of a sheet are
+        // different triangles.
         let smallest = a.min(b).min(c);
         let rotated = if a == smallest {
             [a, b, c]

@@ -5,7 +5,9 @@ use crate::Bounds;
 use crate::edits::{CellGrid, CellLabels, Floaters, Groups, is_floater_size};
 use nalgebra::Vector3;
 
-/// Width of the cells with which floaters are erased, voxels.
+/// Width of the cells with which floaters are erased, voxels. Narrower cells separate floaters
+/// better from nearby surfaces, but there are more of them; the largest grid has 1024 along an
+/// axis.
 const CELL_VOXELS: f64 = 2.0;
 /// Number of these cells along an axis, half of which cover the larger part of the mesh.
 const N_CELLS_RANGE: [f64; 2] = [64.0, 1024.0];
@@ -19,6 +21,7 @@ pub(in crate::tsdf) fn floaters(mesh: &Mesh, voxel_m: f64) -> Option<Floaters> {
         .map(|offset_m| std::array::from_fn(|axis| mesh.origin_m[axis] + f64::from(offset_m[axis])))
         .collect();
     let Bounds { center_m, radius_m } = Bounds::of_points(&positions_m)?;
+    // The contracted cube is 4 radii wide.
     let n_cells =
         (4.0 * radius_m / (CELL_VOXELS * voxel_m)).clamp(N_CELLS_RANGE[0], N_CELLS_RANGE[1]);
     #[expect(
@@ -34,6 +37,8 @@ pub(in crate::tsdf) fn floaters(mesh: &Mesh, voxel_m: f64) -> Option<Floaters> {
     let mut labels = CellLabels::none(&grid);
     for corners in &mesh.triangles {
         let is_floating = is_floater_size(part_sizes[corners[0] as usize], mesh.triangles.len());
+        // The triangles are small, so their corners are in all cells that they cross, or in
+        // neighbors.
         let cells = corners.map(|ix| grid.cell_at(positions_m[ix as usize]));
         if is_floating {
             &mut labels.floating
@@ -43,20 +48,26 @@ pub(in crate::tsdf) fn floaters(mesh: &Mesh, voxel_m: f64) -> Option<Floaters> {
         .extend(cells);
     }
     let cells = labels.erased(&grid)?;
-    let is_erased = |corners: &&[u32; 3]| {
-        let sum: Vector3<f64> = corners
-            .iter()
-            .map(|ix| Vector3::from(positions_m[*ix as usize]))
-            .sum();
-        cells.contains((sum / 3.0).into())
-    };
-    let n_erased = mesh.triangles.iter().filter(is_erased).count() as u64;
+    let n_erased = mesh
+        .triangles
+        .iter()
+        .filter(|corners| cells.contains(triangle_center_m(corners, &positions_m)))
+        .count() as u64;
     // Small parts right next to large ones share their cells.
     (n_erased > 0).then_some(Floaters {
         cells,
         n_erased,
         item: "triangle",
     })
+}
+
+/// Center of a triangle in world, meters. Erased triangles are those whose centers are erased.
+fn triangle_center_m(corners: &[u32; 3], positions_m: &[[f64; 3]]) -> [f64; 3] {
+    let sum: Vector3<f64> = corners
+        .iter()
+        .map(|ix| Vector3::from(positions_m[*ix as usize]))
+        .sum();
+    (sum / 3.0).into()
 }
 
 /// For each vertex, the number of triangles of its connected part.

@@ -5,9 +5,11 @@ use crate::Error;
 use serde_json::json;
 use std::path::Path;
 
+/// The letters `glTF`, `JSON` and `BIN` (glTF 2.0, section 4.4), little endian.
 const MAGIC: u32 = 0x4654_6c67;
 const JSON_CHUNK: u32 = 0x4e4f_534a;
 const BIN_CHUNK: u32 = 0x004e_4942;
+/// Types of numbers and targets of buffers, which glTF takes from OpenGL.
 const FLOAT: u32 = 5126;
 const UNSIGNED_INT: u32 = 5125;
 const VERTICES: u32 = 34_962;
@@ -26,12 +28,15 @@ pub fn write(path: &Path, mesh: &Mesh) -> Result<(), Error> {
 pub(super) fn to_bytes(mesh: &Mesh) -> Vec<u8> {
     let parts = parts(mesh);
     let mut json = description(mesh, &parts).to_string().into_bytes();
+    // Chunks begin at multiples of 4 bytes. JSON is padded with spaces.
     json.resize(json.len().next_multiple_of(4), b' ');
     let bin = parts.concat();
     let length = |n: usize| u32::try_from(n).unwrap_or(u32::MAX).to_le_bytes();
     let mut file = Vec::with_capacity(28 + json.len() + bin.len());
     file.extend(MAGIC.to_le_bytes());
     file.extend(2u32.to_le_bytes());
+    // An empty binary chunk is left out. The lengths are 8 bytes per chunk header, plus 12 bytes of
+    // the file's header.
     let n_chunks_bytes = if bin.is_empty() {
         8 + json.len()
     } else {
@@ -51,13 +56,6 @@ pub(super) fn to_bytes(mesh: &Mesh) -> Vec<u8> {
 
 /// Positions, normals, colors and indices, each a multiple of 4 bytes.
 fn parts(mesh: &Mesh) -> [Vec<u8>; 4] {
-    let floats = |values: &[[f32; 3]]| {
-        values
-            .iter()
-            .flatten()
-            .flat_map(|value| value.to_le_bytes())
-            .collect()
-    };
     // glTF expects linear vertex colors.
     let colors = mesh
         .colors_srgb
@@ -72,13 +70,22 @@ fn parts(mesh: &Mesh) -> [Vec<u8>; 4] {
         .flat_map(|ix| ix.to_le_bytes())
         .collect();
     [
-        floats(&mesh.positions_m),
-        floats(&mesh.normals),
+        float_bytes(&mesh.positions_m),
+        float_bytes(&mesh.normals),
         colors,
         indices,
     ]
 }
 
+fn float_bytes(values: &[[f32; 3]]) -> Vec<u8> {
+    values
+        .iter()
+        .flatten()
+        .flat_map(|value| value.to_le_bytes())
+        .collect()
+}
+
+/// Linear value of an sRGB byte (IEC 61966-2-1).
 fn linear(byte: u8) -> f32 {
     let part = f32::from(byte) / 255.0;
     if part <= 0.04045 {
@@ -88,8 +95,21 @@ fn linear(byte: u8) -> f32 {
     }
 }
 
+/// The extreme coordinate of the vertices along each axis.
+fn extreme(mesh: &Mesh, pick: fn(f32, f32) -> f32, begin: f32) -> Vec<f32> {
+    (0..3)
+        .map(|axis| {
+            mesh.positions_m
+                .iter()
+                .map(|position| position[axis])
+                .fold(begin, pick)
+        })
+        .collect()
+}
+
 fn description(mesh: &Mesh, parts: &[Vec<u8>; 4]) -> serde_json::Value {
     let asset = json!({"version": "2.0", "generator": "fieldrig"});
+    // Accessors of length 0 are invalid.
     if mesh.triangles.is_empty() {
         return json!({"asset": asset, "scene": 0, "scenes": [{}]});
     }
@@ -103,25 +123,18 @@ fn description(mesh: &Mesh, parts: &[Vec<u8>; 4]) -> serde_json::Value {
             view
         })
         .collect();
-    let extreme = |pick: fn(f32, f32) -> f32, begin: f32| -> Vec<f32> {
-        (0..3)
-            .map(|axis| {
-                mesh.positions_m
-                    .iter()
-                    .map(|position| position[axis])
-                    .fold(begin, pick)
-            })
-            .collect()
-    };
     let n = mesh.positions_m.len();
     let vec3 =
         |view: u32| json!({"bufferView": view, "componentType": FLOAT, "count": n, "type": "VEC3"});
+    // Bounds are required for positions, and only for them.
     let mut positions = vec3(0);
-    positions["min"] = json!(extreme(f32::min, f32::INFINITY));
-    positions["max"] = json!(extreme(f32::max, f32::NEG_INFINITY));
+    positions["min"] = json!(extreme(mesh, f32::min, f32::INFINITY));
+    positions["max"] = json!(extreme(mesh, f32::max, f32::NEG_INFINITY));
     let indices = json!({
         "bufferView": 3, "componentType": UNSIGNED_INT, "count": 3 * mesh.triangles.len(), "type": "SCALAR"
     });
+    // A rotation by -90 degrees about x turns z up into y up. The origin is a translation in f64,
+    // because positions in f32 lose precision far from it.
     let half = std::f64::consts::FRAC_1_SQRT_2;
     json!({
         "asset": asset,

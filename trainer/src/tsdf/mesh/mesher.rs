@@ -44,6 +44,7 @@ impl BlockMesh {
         let mut kept_ixs: Vec<Option<u32>> = vec![None; self.vertices.len()];
         let triangles = self.triangles.iter().zip(self.erased(voxel_grid, edits));
         for (corners, _) in triangles.filter(|(_, is_erased)| !is_erased) {
+            // Vertices are numbered in the order in which kept triangles use them.
             kept.triangles.push(corners.map(|ix| {
                 *kept_ixs[ix as usize].get_or_insert_with(|| {
                     kept.vertices.push(self.vertices[ix as usize]);
@@ -61,9 +62,11 @@ pub(super) fn without_erased(
     voxel_grid: &VoxelGrid,
     edits: &Edits,
 ) -> Arc<BlockMesh> {
-    match !edits.is_empty() && mesh.erased(voxel_grid, edits).any(|is_erased| is_erased) {
-        true => Arc::new(mesh.without_erased(voxel_grid, edits)),
-        false => Arc::clone(mesh),
+    // Most blocks contain no erased space, and are shared instead of copied.
+    if !edits.is_empty() && mesh.erased(voxel_grid, edits).any(|is_erased| is_erased) {
+        Arc::new(mesh.without_erased(voxel_grid, edits))
+    } else {
+        Arc::clone(mesh)
     }
 }
 
@@ -114,6 +117,8 @@ impl Mesher {
         let Some(changed) = self.changed.as_mut().filter(|_| before != *edits) else {
             return;
         };
+        // Edits may overlap, and may be undone. Only blocks in which other triangles are erased
+        // than before are sent again.
         let has_changed = |mesh: &BlockMesh| {
             mesh.erased(voxel_grid, &before)
                 .ne(mesh.erased(voxel_grid, edits))
@@ -161,6 +166,8 @@ pub(in crate::tsdf) fn joined(meshes: &BlockMeshes, voxel_grid: &VoxelGrid, edit
 
 /// Key of an edge that may belong to several blocks: its first voxel in the field, and its axis.
 pub(super) fn shared_key(block: GridCoord, edge: u32) -> Option<(GridCoord, u32)> {
+    // An edge has the number axis + 3 (x + 9 (y + 9 z)) of its first voxel, 0 to 8 along each axis.
+    // Only edges on a face of the block can be edges of a neighbor, too.
     let local = [edge / 3 % 9, edge / 27 % 9, edge / 243].map(u32::cast_signed);
     let is_shared = local.iter().any(|along| matches!(*along, 0 | BLOCK_EDGE));
     is_shared.then(|| {
@@ -179,6 +186,7 @@ pub(in crate::tsdf) fn unit_of(octahedral: u32) -> [f32; 3] {
     let bytes = octahedral.to_le_bytes();
     let [low, high] = [[bytes[0], bytes[1]], [bytes[2], bytes[3]]]
         .map(|half| f64::from(i16::from_le_bytes(half)) / 32767.0);
+    // The lower half of the octahedron is folded over the outer triangles of the square.
     let up = 1.0 - low.abs() - high.abs();
     let [x, y] = if up < 0.0 {
         [

@@ -6,7 +6,7 @@ use std::io::{BufWriter, Write};
 use std::path::Path;
 
 /// Positions are written as doubles if the origin is farther than this from the world's origin,
-/// meters.
+/// meters. At this distance, a float has steps of 0.06 mm. Many programs read only floats.
 const FAR_M: f64 = 1000.0;
 
 /// Writes a mesh in world, in meters.

@@ -184,10 +184,8 @@ fn ply_parts(bytes: &[u8]) -> (String, &[u8]) {
 fn ply_and_glb_files_hold_the_mesh() {
     let (mesh, _, _) = ball_mesh();
     let folder = tempfile::tempdir().unwrap();
-    let (ply, glb) = (
-        folder.path().join("mesh.ply"),
-        folder.path().join("mesh.glb"),
-    );
+    let ply = folder.path().join("mesh.ply");
+    let glb = folder.path().join("mesh.glb");
     write_ply(&ply, &mesh).unwrap();
     write_glb(&glb, &mesh).unwrap();
     let bytes = std::fs::read(ply).unwrap();

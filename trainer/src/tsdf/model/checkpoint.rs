@@ -81,6 +81,8 @@ impl TsdfModel {
             ..
         } = &mut model.queue;
         let known: Vec<KeyframeSignature> = fused.iter().chain(&*unmatched).cloned().collect();
+        // Fused keyframes are only verified: their contribution is in the blocks. Pending ones are
+        // needed with their pixels.
         let (mut found, rest) = keyframe_signature::match_keyframes(&known, keyframes)?;
         *pending = found.split_off(fused.len()).into();
         unmatched.clear();
@@ -110,19 +112,18 @@ impl TsdfModel {
                 blocks,
             )?);
         }
-        let (fused, unmatched) = (state.fused, state.pending);
-        let (n_skipped, n_removed) = (state.n_skipped, state.n_removed);
         model.queue = KeyframeQueue {
-            fused,
-            unmatched,
-            n_skipped,
-            n_removed,
+            fused: state.fused,
+            unmatched: state.pending,
+            n_skipped: state.n_skipped,
+            n_removed: state.n_removed,
             ..KeyframeQueue::default()
         };
         Ok(model)
     }
 }
 
+/// Checks the values with which kernels divide or allocate, because files come from users.
 fn check_lattice(voxel_grid: &VoxelGrid) -> Result<(), Error> {
     let positive = [
         voxel_grid.voxel_m,
@@ -173,16 +174,20 @@ fn arrays_of(blocks: &Blocks) -> Vec<Array> {
     .into()
 }
 
+/// Size of an array with `each` bytes per block. The number of blocks comes from a file, so it may
+/// be absurd.
+fn n_bytes(n_blocks: u64, each: u64) -> Result<u64, Error> {
+    n_blocks
+        .checked_mul(each)
+        .ok_or_else(|| invalid_state(format!("too many blocks: {n_blocks}")))
+}
+
 fn blocks_of(checkpoint: &Checkpoint, n_blocks: u64) -> Result<Blocks, Error> {
-    let n_bytes = |each: u64| {
-        n_blocks
-            .checked_mul(each)
-            .ok_or_else(|| invalid_state(format!("too many blocks: {n_blocks}")))
-    };
-    let block_coords = checkpoint.array(BLOCK_COORDS, n_bytes(12)?)?;
-    let geometry = checkpoint.array(GEOMETRY, n_bytes(4 * 512)?)?;
-    let colors = checkpoint.array(COLORS, n_bytes(8 * 512)?)?;
+    let block_coords = checkpoint.array(BLOCK_COORDS, n_bytes(n_blocks, 12)?)?;
+    let geometry = checkpoint.array(GEOMETRY, n_bytes(n_blocks, 4 * 512)?)?;
+    let colors = checkpoint.array(COLORS, n_bytes(n_blocks, 8 * 512)?)?;
     let word = |bytes: &[u8]| u32::from_le_bytes([bytes[0], bytes[1], bytes[2], bytes[3]]);
+    // All arrays have the order of the blocks' coordinates, not of their slots.
     let block_coords = block_coords.chunks_exact(12).map(|bytes| -> GridCoord {
         std::array::from_fn(|axis| word(&bytes[4 * axis..4 * axis + 4]).cast_signed())
     });
@@ -196,6 +201,7 @@ fn blocks_of(checkpoint: &Checkpoint, n_blocks: u64) -> Result<Blocks, Error> {
                 .map(|both| [word(&both[..4]), word(&both[4..])])
                 .collect(),
         });
+    // Of two blocks with the same coordinates, only one is left in the map.
     let blocks: Blocks = block_coords.zip(blocks).collect();
     if blocks.len() as u64 == n_blocks {
         Ok(blocks)

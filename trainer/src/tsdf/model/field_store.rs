@@ -15,12 +15,14 @@ use crate::tsdf::kernels::Pipelines;
 use crate::tsdf::params::status;
 use std::collections::BTreeSet;
 
-/// Initial capacity.
+/// Initial capacity: 26 MB. Growing copies the field, so a much smaller capacity would slow down
+/// the first images; a larger one would exceed small budgets.
 pub(super) const INITIAL_CAPACITY: Capacity = Capacity {
     n_blocks: 4096,
     n_chunks: 512,
 };
-/// Fraction of the pool that is freed at once, to avoid evictions for every image.
+/// Fraction of the pool that is freed at once, to avoid evictions for every image. With a larger
+/// fraction, more blocks are evicted that the next images need again.
 const EVICTED_FRAC: f64 = 0.125;
 
 /// A field that may be larger than the GPU's memory.
@@ -63,6 +65,8 @@ impl FieldStore {
         max_bytes: Option<u64>,
         blocks: Blocks,
     ) -> Result<Self, Error> {
+        // The first blocks in order are resident, the rest is in host memory. Which ones does not
+        // matter: every image and every render loads those that it needs.
         let max_resident =
             capacity::max_blocks_within(gpu, max_bytes, INITIAL_CAPACITY.n_chunks) as usize;
         let stale = blocks.keys().copied().collect();
@@ -108,12 +112,16 @@ impl FieldStore {
         pipelines: &Pipelines,
         counters: &[u32],
     ) -> Result<u32, Error> {
+        // Table and pool grow separately. A larger table leaves less of the budget for blocks.
         let mut capacity = self.buffers.capacity;
         if counters[status::TABLE_FULL] != 0 {
             capacity.n_chunks *= 2;
         }
         let n_needed = counters[status::N_BLOCKS];
         let n_allowed = capacity::max_blocks_within(gpu, self.max_bytes, capacity.n_chunks);
+        // By half at least, so that a field of n blocks is copied only a logarithmic number of
+        // times. The counter goes on counting after an overflow, so it is the number that the image
+        // needs.
         if n_needed > capacity.n_blocks {
             let n_target = n_needed.max(capacity.n_blocks.saturating_add(capacity.n_blocks / 2));
             capacity.n_blocks = n_target.min(n_allowed).max(capacity.n_blocks);
@@ -171,6 +179,7 @@ impl FieldStore {
             return Ok(true);
         }
         visible.sort_by(|a, b| frustum.distance_m(*a).total_cmp(&frustum.distance_m(*b)));
+        // Resident blocks that the camera observes, too, must stay.
         let n_slots = self.buffers.capacity.n_blocks as usize;
         let resident = self.buffers.block_coords(gpu)?;
         let n_observed = resident
@@ -207,6 +216,7 @@ impl FieldStore {
         n: usize,
         added: &Blocks,
     ) -> Result<usize, Error> {
+        // The flags of changed blocks belong to slots, which are about to be reassigned.
         self.stale.extend(self.buffers.take_changed(gpu)?);
         let block_coords = self.buffers.block_coords(gpu)?;
         let mut invisible_slots: Vec<(u32, GridCoord)> = (0..)
@@ -214,6 +224,8 @@ impl FieldStore {
             .map(|(slot, block_coord)| (slot, *block_coord))
             .filter(|(_, block)| !frustum.may_be_visible(*block))
             .collect();
+        // Slots depend on scheduling on the GPU. Ties are broken by coordinates, so that the choice
+        // does not.
         invisible_slots.sort_by(|(_, a), (_, b)| {
             frustum
                 .distance_m(*b)

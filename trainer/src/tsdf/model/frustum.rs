@@ -26,11 +26,13 @@ impl ViewFrustum {
     /// The frustum of a keyframe's depth camera; `None` if its depth image changes no block.
     pub(super) fn of_depth(keyframe: &Keyframe, voxel_grid: &VoxelGrid) -> Option<Self> {
         let depth = keyframe.depth.as_ref()?;
+        // The same condition as for recording the passes: without a depth view, nothing is fused.
         DepthView::of(keyframe, voxel_grid)?;
         Some(Self::new(
             &(voxel_grid.field_from_world() * depth.world_from_camera),
             [depth.focal_px, depth.principal_px],
             depth.size_px,
+            // Fusion also changes voxels behind the reading, up to the truncation.
             voxel_grid.max_depth_m + voxel_grid.scale_m,
             voxel_grid,
         ))
@@ -73,9 +75,13 @@ impl ViewFrustum {
     /// Conservative: true at least for all blocks that the kernel `find_visible` lists.
     pub(super) fn may_be_visible(&self, block: GridCoord) -> bool {
         let center = self.camera_from_field * self.center_of_block_m(block);
+        // Half the diagonal of a block is 4 sqrt(3) = 6.93 voxels, rounded up to 7.
         let radius_m = self.block_m * (7.0 + SLACK_VOXELS) / 8.0;
         let is_inside_sides = (0..2).all(|axis| {
-            let (focal, low) = (self.focal_px[axis], self.principal_px[axis]);
+            // The side planes pass through the camera and the borders of the image. Their normals
+            // are not unit vectors, so the radius is multiplied by their length.
+            let focal = self.focal_px[axis];
+            let low = self.principal_px[axis];
             let high = self.size_px[axis] - low;
             focal * center[axis] + low * center.z >= -radius_m * focal.hypot(low)
                 && high * center.z - focal * center[axis] >= -radius_m * focal.hypot(high)

@@ -9,7 +9,8 @@ use crate::tsdf::params::{DepthView, status};
 use crate::tsdf::passes::{self, KeyframeSlot};
 use keyframe::Keyframe;
 
-/// Maximum number of keyframes per submit. Their images are on the GPU at once.
+/// Maximum number of keyframes per submit. Their images are on the GPU at once, so more keyframes
+/// need more memory. With fewer, the GPU waits for the host more often.
 pub(super) const KEYFRAMES_PER_SUBMIT: usize = 4;
 
 /// Records and tracks submits of depth images.
@@ -36,6 +37,8 @@ impl Fusion {
 
     /// Number of keyframes in a submit that stays within the time limit.
     pub(super) fn keyframes_per_submit(&self) -> usize {
+        // Pictures wait for the running submit, so it must be short while they are requested.
+        // Otherwise, more images per submit waste less time between submits.
         match self.submits.n_steps_in_limit() {
             Some(n) if self.submits.is_watched() => usize::try_from(n)
                 .unwrap_or(usize::MAX)
@@ -66,6 +69,7 @@ impl Fusion {
         {
             passes.clear_bindings();
             let slot = KeyframeSlot::new(gpu, n_depth, n_color)?;
+            // Later slots have the old size, too.
             self.slots.truncate(slot_ix);
             self.slots.push(slot);
         }

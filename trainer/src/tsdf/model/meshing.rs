@@ -15,6 +15,8 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 /// Blocks per batch when not all blocks are on the GPU. Each batch gets a temporary field.
+/// Neighbors of the blocks are loaded, too, so small batches load many blocks twice; large ones
+/// need more memory.
 const BLOCKS_PER_BATCH: usize = 512;
 /// Initial number of chunks of such a temporary field.
 const CHUNKS_PER_BATCH: u32 = 256;
@@ -51,9 +53,10 @@ impl Meshing {
         pipelines: &Pipelines,
         store: &mut FieldStore,
     ) -> Result<usize, Error> {
-        let block_meshes = match store.host_blocks.is_empty() {
-            true => self.mesh_on_gpu(gpu, pipelines, store)?,
-            false => self.mesh_in_batches(gpu, pipelines, store)?,
+        let block_meshes = if store.host_blocks.is_empty() {
+            self.mesh_on_gpu(gpu, pipelines, store)?
+        } else {
+            self.mesh_in_batches(gpu, pipelines, store)?
         };
         let n = block_meshes.len();
         self.mesher.replace(block_meshes);
@@ -82,6 +85,8 @@ impl Meshing {
             stale,
             ..
         } = store;
+        // The flags on the GPU were taken whenever blocks moved to or from host memory. Those
+        // blocks are flagged again.
         if !stale.is_empty() {
             stale.extend(field.take_changed(gpu)?);
             field.set_changed(gpu, stale)?;
@@ -114,12 +119,14 @@ impl Meshing {
         let exists = |block_coord: &GridCoord| {
             slots.contains_key(block_coord) || host_blocks.contains_key(block_coord)
         };
+        // The triangles of a block depend on voxels of its neighbors, and so do its normals.
         let affected: BTreeSet<GridCoord> = stale.iter().flat_map(around).filter(exists).collect();
         let affected: Vec<GridCoord> = affected.into_iter().collect();
         let mut block_meshes = Vec::new();
         for part in affected.chunks(BLOCKS_PER_BATCH) {
             let required_coords: BTreeSet<GridCoord> =
                 part.iter().flat_map(around).filter(exists).collect();
+            // Blocks come from the GPU or from host memory, in order of their coordinates.
             let (resident, resident_slots): (Vec<GridCoord>, Vec<u32>) = required_coords
                 .iter()
                 .filter_map(|block_coord| Some((*block_coord, *slots.get(block_coord)?)))
@@ -136,6 +143,8 @@ impl Meshing {
             };
             let batch_field =
                 FieldBuffers::with_blocks(gpu, pipelines, voxel_grid, &blocks, capacity)?;
+            // `with_blocks` assigns slots in order. Only the blocks of this part are meshed; their
+            // neighbors belong to other parts, or are unchanged.
             let batch_slots: BTreeMap<GridCoord, u32> = blocks.into_keys().zip(0..).collect();
             let part: Vec<u32> = part
                 .iter()

@@ -17,7 +17,8 @@ use std::io::{Read, Write};
 use std::path::Path;
 use std::sync::Arc;
 
-/// Maximum size of an inflated array in bytes.
+/// Maximum size of an inflated array in bytes, so that a small damaged file cannot fill the memory
+/// of the host with zeros without end. Fields are far smaller.
 const MAX_ARRAY_BYTES: u64 = 1 << 36;
 
 impl TsdfModel {
@@ -47,10 +48,6 @@ impl TsdfModel {
     pub(super) fn write_folder(&mut self, folder: &Path) -> Result<(), Error> {
         self.finish_in_flight()?;
         self.fuse_one()?;
-        let write_error = |path: &Path, source| Error::Write {
-            path: path.to_owned(),
-            source,
-        };
         std::fs::create_dir_all(folder).map_err(|source| write_error(folder, source))?;
         let mesh = self.write_meshes(folder, &Edits::default())?;
         let blocks = folder.join(BLOCKS_FILE);
@@ -84,6 +81,14 @@ impl TsdfModel {
     }
 }
 
+fn write_error(path: &Path, source: std::io::Error) -> Error {
+    Error::Write {
+        path: path.to_owned(),
+        source,
+    }
+}
+
+/// Compresses an array. Unobserved voxels are zeros, which even the fastest level compresses well.
 fn deflated(array: Array) -> std::io::Result<Array> {
     let mut encoder = DeflateEncoder::new(Vec::new(), Compression::fast());
     encoder.write_all(&array.bytes)?;

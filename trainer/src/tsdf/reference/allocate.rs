@@ -38,6 +38,8 @@ pub fn required_blocks(
     let field_from_depth = voxel_grid.field_from_world() * depth.world_from_camera;
     let width = depth.size_px[0] as usize;
     let block_m = 8.0 * voxel_grid.voxel_m;
+    // The kernel rounds in f32, so it may add or miss blocks that a ray hardly touches. Blocks that
+    // it must and that it may allocate are therefore distinguished.
     let mut required = RequiredBlocks::default();
     for (ix, reading) in readings
         .iter()
@@ -48,12 +50,11 @@ pub fn required_blocks(
             depth,
             [(ix % width) as f64 + 0.5, (ix / width) as f64 + 0.5],
         );
+        // The truncation is measured along the ray, whose length per meter of depth is above 1.
         let band_m = voxel_grid.truncation_at(reading.depth_m) / ray.norm();
         let at = |z: f64| (field_from_depth * Point3::from(ray * z)).coords / block_m;
-        let (begin, end) = (
-            at((reading.depth_m - band_m).max(0.0)),
-            at(reading.depth_m + band_m),
-        );
+        let begin = at((reading.depth_m - band_m).max(0.0));
+        let end = at(reading.depth_m + band_m);
         for (enter, leave) in intervals(&begin, &end) {
             let middle = begin + (end - begin) * (0.5 * (enter + leave));
             let block_coord: GridCoord = middle.map(|along| along.floor() as i32).into();
@@ -62,6 +63,7 @@ pub fn required_blocks(
             {
                 required.definite.insert(block_coord);
             }
+            // Near a face, rounding may move the ray to the neighbor.
             for share in [enter, leave] {
                 let point = begin + (end - begin) * share;
                 for ix in 0..27 {
@@ -90,7 +92,8 @@ fn is_clear_of_faces(point: &Vector3<f64>, margin: f64) -> bool {
 fn intervals(begin: &Vector3<f64>, end: &Vector3<f64>) -> Vec<(f64, f64)> {
     let mut cuts = vec![0.0, 1.0];
     for axis in 0..3 {
-        let (low, high) = (begin[axis].min(end[axis]), begin[axis].max(end[axis]));
+        let low = begin[axis].min(end[axis]);
+        let high = begin[axis].max(end[axis]);
         let mut face = low.floor() + 1.0;
         while face < high {
             cuts.push((face - begin[axis]) / (end[axis] - begin[axis]));

@@ -6,7 +6,8 @@ use crate::tsdf::block::{Blocks, block_of, voxel_ix};
 use crate::tsdf::chosen_grid::VoxelGrid;
 use nalgebra::{Point3, Vector3};
 
-/// Length of a step, voxels.
+/// Length of a step, voxels. The interpolated distance is smooth within a voxel, so two crossings
+/// within such a step are unlikely. The kernel takes longer steps.
 const STEP_VOXELS: f64 = 0.05;
 
 /// A ray in the field's frame.
@@ -36,10 +37,13 @@ pub fn cast(blocks: &Blocks, voxel_grid: &VoxelGrid, ray: &Ray, edits: &Edits) -
     let mut depth_m = ray.range_m[0];
     let mut before: Option<(f64, f64)> = None;
     while depth_m < ray.range_m[1] {
+        // Only from positive to negative: back faces are not rendered. A point next to an
+        // unobserved voxel has no distance, so no surface is found there.
         let here = distance_at(blocks, &at(depth_m));
         if let (Some((outside_m, outside)), Some(inside)) =
             (before, here.filter(|distance| *distance < 0.0))
         {
+            // The zero of the line through both distances.
             let hit_m = outside_m + (depth_m - outside_m) * outside / (outside - inside);
             let hit_in_world =
                 ray.origin_m + ray.along * hit_m + Vector3::from(voxel_grid.anchor_m);
@@ -64,6 +68,7 @@ pub fn cast(blocks: &Blocks, voxel_grid: &VoxelGrid, ray: &Ray, edits: &Edits) -
     reason = "coordinates are rounded down on purpose"
 )]
 fn around(point: &Vector3<f64>) -> impl Iterator<Item = ([i32; 3], f64)> {
+    // Centers of voxels are at half-integers.
     let corner = point.map(|along| (along - 0.5).floor());
     let share = point.map(|along| along - 0.5) - corner;
     (0..8usize).map(move |ix| {
@@ -92,7 +97,10 @@ fn distance_at(blocks: &Blocks, point: &Vector3<f64>) -> Option<f64> {
 }
 
 fn color_at(blocks: &Blocks, point: &Vector3<f64>) -> [f64; 3] {
-    let (mut sum, mut weight) = (Vector3::zeros(), 0.0);
+    // Unlike distances, colors may be missing: only voxels near the surface store one. The weights
+    // of the others are normalized.
+    let mut sum = Vector3::zeros();
+    let mut weight = 0.0;
     for (voxel, part) in around(point) {
         let color = blocks
             .get(&block_of(voxel))

@@ -24,9 +24,16 @@ pub struct Voxel {
 /// Voxels of blocks, x fastest.
 pub type VoxelBlocks = BTreeMap<GridCoord, Vec<Voxel>>;
 
+/// Minimum cosine between ray and normal for scaling distances: normals of steeper surfaces are
+/// mostly noise.
 const MIN_RAY_DOT_NORMAL: f64 = 0.3;
+/// Number of observations of a solid voxel that one observation through it cancels, if the surface
+/// behind it is one truncation away, and if it is at least two away. More would carve away surfaces
+/// that pose errors only shift; see "Carving" in `docs/benchmarks/2026-11-23-tsdf.md`.
 const CARVING_NEAR: f64 = 1.0;
 const CARVING_FAR: f64 = 4.0;
+/// Colors are stored up to this distance from the surface, in voxels: pictures and meshes
+/// interpolate no others.
 const COLOR_VOXELS: f64 = 2.0;
 
 /// Fuses a keyframe with depth into the given blocks.
@@ -68,16 +75,24 @@ fn fuse(
     if reading.depth_m <= 0.0 {
         return;
     }
+    // Distance to the tangent plane of the surface, rather than along the ray.
     let distance_m = (reading.depth_m - point.z) * reading.ray_dot_normal.max(MIN_RAY_DOT_NORMAL);
     let truncation_m = voxel_grid.truncation_at(reading.depth_m);
     let ray_m = ray_of(depth, position_px).norm();
+    // Hidden voxels are unknown. This is measured along the ray: just past the rim of an object, a
+    // grazing ray has left the object again.
     let behind_m = (point.z - reading.depth_m) * ray_m;
     if behind_m > truncation_m {
         return;
     }
+    // The noise of depth grows with its square. `ray_dot_normal / ray_m` is the cosine of the angle
+    // to the normal, because `ray_dot_normal` is relative to a ray with z = 1. The falloff begins
+    // one voxel behind the surface.
     let nearness = (1.0 / (reading.depth_m * reading.depth_m)).min(1.0);
     let falloff = ((truncation_m - behind_m) / (truncation_m - voxel_grid.voxel_m)).clamp(0.0, 1.0);
     let gain_frac = nearness * (reading.ray_dot_normal / ray_m).powi(2) * falloff;
+    // Free space far in front of a surface. The distance to the nearest surface is unknown, so only
+    // solid voxels change: they lose weight until they count as unobserved.
     if distance_m > truncation_m {
         if voxel.weight > 0.0 && voxel.distance_m < 0.0 {
             let past_truncation = (distance_m / truncation_m - 1.0).min(1.0);
@@ -86,13 +101,15 @@ fn fuse(
                 .floor()
                 .max(1.0);
             if weight_loss >= voxel.weight {
-                (voxel.distance_m, voxel.weight) = (0.0, 0.0);
+                voxel.distance_m = 0.0;
+                voxel.weight = 0.0;
             } else {
                 voxel.weight -= weight_loss;
             }
         }
         return;
     }
+    // A running mean (Curless and Levoy 1996). The maximum weight makes moved objects fade.
     let weight_gain = (256.0 * gain_frac + 0.5).floor().clamp(1.0, 256.0);
     let sum = voxel.weight + weight_gain;
     voxel.distance_m = (voxel.distance_m * voxel.weight + distance_m * weight_gain) / sum;
@@ -125,6 +142,7 @@ fn fuse_color(
         return;
     };
     let [red, green, blue, alpha] = color_near(keyframe, position_px);
+    // Near a masked pixel, the interpolated color contains the masked one.
     if alpha <= 0.999 {
         return;
     }
@@ -156,6 +174,7 @@ fn projected(
     reason = "clamped to the image"
 )]
 fn corners(position_px: [f64; 2], size_px: [u32; 2]) -> ([usize; 4], [f64; 2]) {
+    // Pixel centers are at half-integers.
     let base = position_px.map(|along| (along - 0.5).floor());
     let clamped = |axis: usize, step: f64| {
         (base[axis] + step).clamp(0.0, f64::from(size_px[axis]) - 1.0) as usize
@@ -184,6 +203,7 @@ fn mixed(values: [f64; 4], share: [f64; 2]) -> f64 {
 fn reading_near(depth: &DepthMap, readings: &[Reading], position_px: [f64; 2]) -> Reading {
     let (at, share) = corners(position_px, depth.size_px);
     let four = at.map(|ix| readings[ix]);
+    // At the border of the valid readings, interpolation would mix in zeros.
     if four.iter().any(|reading| reading.depth_m <= 0.0) {
         return readings
             [position_px[1] as usize * depth.size_px[0] as usize + position_px[0] as usize];

@@ -66,12 +66,9 @@ impl<'a> BlockNeighborhood<'a> {
     fn gradient(&self, voxel: GridCoord) -> Vector3<f64> {
         let here = self.distance(voxel);
         Vector3::from_fn(|axis, _| {
-            let neighbor = |step: i32| {
-                let mut other = voxel;
-                other[axis] += step;
-                self.distance(other)
-            };
-            match (neighbor(-1), here, neighbor(1)) {
+            let low = self.distance(stepped(voxel, axis, -1));
+            let high = self.distance(stepped(voxel, axis, 1));
+            match (low, here, high) {
                 (Some(low), _, Some(high)) => 0.5 * (high - low),
                 (Some(low), Some(here), None) => here - low,
                 (None, Some(here), Some(high)) => high - here,
@@ -97,12 +94,16 @@ impl<'a> BlockNeighborhood<'a> {
         let (from, axis) = between;
         let to = moved(from, 1 << axis);
         let [here, there] = [from, to].map(|voxel| self.distance(voxel).unwrap_or(0.0));
+        // The edge is cut, so the distances differ in sign, and the linear interpolation has one
+        // zero.
         let share = here / (here - there);
         let position_m = std::array::from_fn(|along| {
             let voxel = f64::from(self.block_coord[along] * BLOCK_EDGE + from[along]);
             (voxel + 0.5 + if along == axis { share } else { 0.0 }) * voxel_m
         });
         let normal = self.gradient(from).lerp(&self.gradient(to), share);
+        // In a thin sheet, the gradients of its two sides may cancel out. The normal then points
+        // along the edge, to its outer end.
         let normal = normal.try_normalize(1e-12).unwrap_or_else(|| {
             let mut along = Vector3::zeros();
             along[axis] = (there - here).signum();
@@ -118,6 +119,13 @@ impl<'a> BlockNeighborhood<'a> {
     }
 }
 
+/// A voxel, `step` voxels further along an axis.
+fn stepped(mut voxel: GridCoord, axis: usize, step: i32) -> GridCoord {
+    voxel[axis] += step;
+    voxel
+}
+
+/// The voxel at a corner of the cube that begins at `voxel`.
 fn moved(voxel: GridCoord, corner: usize) -> GridCoord {
     std::array::from_fn(|axis| voxel[axis] + i32::from(corner >> axis & 1 == 1))
 }

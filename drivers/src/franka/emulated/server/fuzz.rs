@@ -49,12 +49,15 @@ pub(crate) fn commanded(
     let Some((mut stream, commands)) = connect(&mut server) else {
         return (first, first);
     };
-    let (mut number, mut n_remaining) = (FIRST, MAX_STEPS);
+    let mut number = FIRST;
+    let mut n_remaining = MAX_STEPS;
     while !bytes.is_empty() {
         let [kind] = take(&mut bytes);
         let length = u16::from_le_bytes(take(&mut bytes));
         let mut n_steps = 1;
         if kind % 3 == 2 {
+            // The total is bounded, so that an input of a few bytes cannot keep the fuzzer busy for
+            // minutes.
             n_steps = length.min(n_remaining);
             n_remaining -= n_steps;
         } else {

@@ -1,4 +1,4 @@
-//! What samples files may contain, as in docs/reference/samples.md.
+//! Compares what samples files may contain with docs/reference/samples.md.
 
 use super::{FILE_KEYS, SAMPLE_KEYS, SamplesFile};
 use crate::commands::calibrate::lens::{LensFile, param_names};
@@ -6,7 +6,7 @@ use serde_json::{Value, json};
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
-/// A folder with empty images, whose contents are read later.
+/// A folder with empty images. Reading a samples file does not open the images.
 fn folder() -> tempfile::TempDir {
     let folder = tempfile::tempdir().expect("a folder");
     for image in ["0.png", "1.png", "2.png"] {
@@ -163,7 +163,7 @@ fn unknown_and_repeated_keys_are_refused_everywhere() {
     }
 }
 
-/// A place, a key, its value, and words of the error.
+/// A place, a key, its value, and words that the error contains.
 type Contradiction = (&'static str, &'static str, Value, &'static str);
 
 #[test]

@@ -16,15 +16,16 @@ pub(crate) fn state_datagrams(version: FciVersion, n: u32) -> Vec<Vec<u8>> {
         Limits::fr3()
     };
     let mut server = server(version, limits);
-    let state = |ix: u32| {
+    let mut states = Vec::new();
+    for ix in 0..n {
         let position_rad = REST_RAD.map(|rest| rest + 0.002 * f64::from(ix));
         server.robot.observe(Joints {
             position_rad,
             ..Joints::default()
         });
-        server.robot.state(FIRST + u64::from(ix))
-    };
-    (0..n).map(state).collect()
+        states.push(server.robot.state(FIRST + u64::from(ix)));
+    }
+    states
 }
 
 fn record(kind: u8, bytes: &[u8]) -> Vec<u8> {
@@ -83,12 +84,14 @@ fn command(version: FciVersion, number: u64, offset_rad: f64) -> Vec<u8> {
     match version {
         FciVersion::V5 => {
             let mut command = v5::RobotCommand::default();
-            (command.message_id, command.motion.q_c) = (U64::new(number), q_c);
+            command.message_id = U64::new(number);
+            command.motion.q_c = q_c;
             command.as_bytes().to_vec()
         }
         FciVersion::V10 => {
             let mut command = v10::RobotCommand::default();
-            (command.message_id, command.motion.q_c) = (U64::new(number), q_c);
+            command.message_id = U64::new(number);
+            command.motion.q_c = q_c;
             command.as_bytes().to_vec()
         }
     }

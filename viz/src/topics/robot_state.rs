@@ -1,0 +1,59 @@
+//! The topic of the robot: its description, which clients receive once, and its state.
+
+use crate::Hub;
+use crate::clock::ServerClock;
+use crate::session::server_message::ServerMessage;
+use crate::topics::base_path::BasePath;
+use crate::topics::items::ItemTopic;
+use crate::topics::robot::{RobotDescription, RobotMessage, RobotState};
+use crate::topics::{DefaultRate, Priority};
+use axum::extract::ws::Message;
+use std::sync::Arc;
+
+/// The robot's description, which clients need before its states. Sessions send the states
+/// themselves, as soon as they arrive.
+#[derive(Default)]
+pub(crate) struct Description;
+
+impl ItemTopic for Description {
+    const NAME: &'static str = "robot_state";
+    const DEFAULT: DefaultRate = DefaultRate::Off;
+    const PRIORITY: Priority = Priority::Short;
+    type Source = Option<Arc<RobotDescription>>;
+
+    fn encode(&mut self, source: &Self::Source, _: ServerClock) -> Vec<(Arc<str>, Message)> {
+        let message = source
+            .as_ref()
+            .map(|robot| ServerMessage::Robot(&RobotMessage::from(&**robot)).to_message());
+        message
+            .map(|message| ("".into(), message))
+            .into_iter()
+            .collect()
+    }
+}
+
+impl Hub {
+    /// Sets the robot that clients draw.
+    pub fn set_robot(&self, robot: RobotDescription) {
+        self.latest::<Option<Arc<RobotDescription>>>()
+            .send_replace(Some(Arc::new(robot)));
+    }
+
+    /// Sets the current state of the robot.
+    pub fn set_robot_state(&self, state: RobotState) {
+        self.latest::<BasePath>()
+            // Positions that are left out must not cause a new message with the whole path.
+            .send_if_modified(|path| path.push(state.world_from_base.translation.vector.into()));
+        self.latest::<Option<Arc<RobotState>>>()
+            .send_replace(Some(Arc::new(state)));
+    }
+
+    /// Whether a client draws the robot, or the path of its base is due.
+    pub fn needs_robot_state(&self) -> bool {
+        // States are made on the thread that joins the samples, which should not work for nobody.
+        // The path is recorded even if no client is connected, so that later clients get all of it.
+        self.is_observed()
+            || self.latest::<BasePath>().borrow().is_due()
+            || self.is_wanted(Description::NAME)
+    }
+}
