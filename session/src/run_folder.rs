@@ -252,6 +252,7 @@ impl CreatedFolders {
 /// Writes the resolved rig file into a folder.
 fn write_rig(rig: &Rig, folder: &Path) -> crate::Result<()> {
     rig.write_resolved(folder)
+        .map(drop)
         .with_context(|| format!("cannot write into {}", folder.display()))
 }
 

@@ -157,12 +157,14 @@ fn motion() -> MotionConfig {
 /// Moves back and forth for 10 000 cycles. Checks on both sides that more than 99 % of the states
 /// are answered in time, not counting the time for which a processor was stalled.
 ///
-/// On a busy machine, up to three attempts are made. A reflex caused by a violated limit fails
-/// immediately.
+/// On a busy machine, up to three attempts are made. A reflex caused by a violated limit fails,
+/// unless a processor was stalled just before: `franka-sim` then catches up on several cycles at
+/// once, and uses a command that arrives too late for its cycle.
 fn follow_for_ten_thousand_cycles(name: &str, open: impl Fn() -> MovableFrankaArm) {
     const MAX_ATTEMPTS: usize = 3;
     const BY_RAD: f64 = 0.3;
     const NEAR_RAD: f64 = 5e-3; // The joints of franka-sim have inertia.
+    const STALL_BEFORE: Duration = Duration::from_millis(200);
     for attempt in 1..=MAX_ATTEMPTS {
         let mut arm = open();
         let rest = arm
@@ -170,17 +172,17 @@ fn follow_for_ten_thousand_cycles(name: &str, open: impl Fn() -> MovableFrankaAr
             .expect("the arm reports its joints")
             .position;
         let (stalls, began) = (Stalls::start(), Instant::now());
+        let mut violations: Vec<(Instant, String)> = Vec::new();
         let mut directions = [-1.0, 0.0, 1.0, 0.0].into_iter().cycle();
         while arm.motion_statistics().n_answered < 10_000 {
             let by_rad = BY_RAD * directions.next().expect("the iterator is infinite");
             let target = JointTarget {
                 position: rest.iter().map(|rest| rest + by_rad).collect(),
             };
-            let recover = |arm: &mut MovableFrankaArm, reason: &str| {
-                assert!(
-                    reason.contains("communication_constraints_violation"),
-                    "{name}: {reason}"
-                );
+            let mut recover = |arm: &mut MovableFrankaArm, reason: &str| {
+                if !reason.contains("communication_constraints_violation") {
+                    violations.push((Instant::now(), reason.to_owned()));
+                }
                 arm.recover().expect("the arm recovers");
             };
             match arm.command(&target) {
@@ -213,7 +215,14 @@ fn follow_for_ten_thousand_cycles(name: &str, open: impl Fn() -> MovableFrankaAr
             assert!(off < NEAR_RAD, "{name}: {off} rad from its target");
         }
         let statistics = arm.motion_statistics();
-        let stalled_frac = stalls.stop().frac(began, Instant::now());
+        let stalled = stalls.stop();
+        for (at, reason) in violations {
+            assert!(
+                stalled.frac(at - STALL_BEFORE, at) > 0.0,
+                "{name}: {reason}; no processor was stalled"
+            );
+        }
+        let stalled_frac = stalled.frac(began, Instant::now());
         let outcome = format!(
             "{name}: {statistics}; stalled for {:.1} % of the time",
             100.0 * stalled_frac

@@ -181,7 +181,7 @@ impl MovableFrankaArm {
             // Set here and not by the thread: a caller may wait for the end of the motion as soon
             // as this returns.
             // If the robot has stopped since the request was sent, the reason must not be lost.
-            if refusal(mailbox_state).is_none() {
+            if !matches!(mailbox_state.motion, Motion::Stopped { .. }) {
                 mailbox_state.motion = Motion::Moving;
             }
         });

@@ -456,7 +456,9 @@ fn with_stamp(range: Option<[Stamp; 2]>, stamp: Stamp) -> [Stamp; 2] {
 }
 
 fn duration_secs(range: Option<[Stamp; 2]>) -> f64 {
-    range.map_or(0.0, |[first, last]| last.0.saturating_sub(first.0) as f64 * 1e-9)
+    range.map_or(0.0, |[first, last]| {
+        last.0.saturating_sub(first.0) as f64 * 1e-9
+    })
 }
 
 /// Unwraps an I/O error, which is more informative than the error of the format.

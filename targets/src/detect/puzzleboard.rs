@@ -181,8 +181,7 @@ impl Board<'_> {
         let at = self
             .place([first[0] + 1, first[1] + 1], offset)
             .map(|value| value - 1);
-        (0..2)
-            .all(|axis| at[axis] + last[axis] - first[axis] <= self.squares[axis].cast_signed() - 1)
+        (0..2).all(|axis| at[axis] + last[axis] - first[axis] < self.squares[axis].cast_signed())
     }
 }
 

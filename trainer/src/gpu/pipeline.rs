@@ -59,11 +59,11 @@ impl Pipeline {
             force_loop_bounding: false,
             ..wgpu::ShaderRuntimeChecks::checked()
         };
-        // SAFETY: every loop of our kernels counts to a bound that is fixed before it starts.
         #[expect(
             unsafe_code,
             reason = "a second bound would cost time in every iteration of the innermost loops"
         )]
+        // SAFETY: every loop of our kernels counts to a bound that is fixed before it starts.
         let shader = unsafe { device.create_shader_module_trusted(described, checks) };
         // Explicit, with all declared buffers: a layout that wgpu derives would lack those that
         // this variant of the kernel does not use, and `dispatch` would have to know.

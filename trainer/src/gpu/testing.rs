@@ -45,11 +45,11 @@ fn close_devices_at_exit() {
     }
     static REGISTER: std::sync::Once = std::sync::Once::new();
     REGISTER.call_once(|| {
-        // SAFETY: the handler is a function without arguments that does not unwind.
         #[expect(
             unsafe_code,
             reason = "the test harness cannot call a function after the last test"
         )]
+        // SAFETY: the handler is a function without arguments that does not unwind.
         let status = unsafe { libc::atexit(close_devices) };
         assert_eq!(status, 0, "the C library keeps at least 32 handlers");
     });

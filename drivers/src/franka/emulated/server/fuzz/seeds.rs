@@ -83,14 +83,18 @@ fn command(version: FciVersion, number: u64, offset_rad: f64) -> Vec<u8> {
     let q_c = REST_RAD.map(|rest| F64::new(rest + offset_rad));
     match version {
         FciVersion::V5 => {
-            let mut command = v5::RobotCommand::default();
-            command.message_id = U64::new(number);
+            let mut command = v5::RobotCommand {
+                message_id: U64::new(number),
+                ..Default::default()
+            };
             command.motion.q_c = q_c;
             command.as_bytes().to_vec()
         }
         FciVersion::V10 => {
-            let mut command = v10::RobotCommand::default();
-            command.message_id = U64::new(number);
+            let mut command = v10::RobotCommand {
+                message_id: U64::new(number),
+                ..Default::default()
+            };
             command.motion.q_c = q_c;
             command.as_bytes().to_vec()
         }
