@@ -94,6 +94,7 @@ impl Growth {
     /// Returns `None` if less than a minute of samples can be used.
     #[must_use]
     pub fn of(samples: &[Sample], excluded: Excluded) -> Option<Self> {
+        // Until the store is full, keyframes are added and memory grows as intended.
         let full_at = samples
             .iter()
             .find(|sample| sample.evicted > 0)

@@ -96,6 +96,7 @@ impl MemoryRun {
             .iter()
             .map(|(label, bytes)| (label, *bytes))
             .collect();
+        // The largest ones are the candidates for savings.
         gpu_buffers.sort_by_key(|(_, bytes)| std::cmp::Reverse(*bytes));
         let gpu_rows = gpu_buffers
             .iter()

@@ -17,7 +17,9 @@ const SAMPLE_PERIOD: Duration = Duration::from_secs(1);
 /// Maximum number of time buckets. A run of an hour then has one per minute, whose medians are not
 /// affected by single slow pictures.
 const MAX_BUCKETS: usize = 60;
-/// Minimum duration for trends: nearly two minutes, measured at the last sample.
+/// Minimum duration for trends: nearly two minutes, measured at the last sample. In a shorter run,
+/// the second half is too short for a rate per hour. The last sample of a run of two minutes is a
+/// little earlier than its end.
 const MIN_SECS: f64 = 115.0;
 const SECS_PER_HOUR: f64 = 3600.0;
 const BYTES_PER_MB: f64 = 1e6;

@@ -19,8 +19,8 @@ use trainer::{ModelOptions, ModelSpec};
 
 /// Training time of a run if no flag limits it.
 const DEFAULT_SECONDS: f64 = 30.0;
-/// Losses of PSNR for which the size of the disturbance is reported, dB: a visible loss, and half of
-/// the accuracy (twice the mean squared error).
+/// Losses of PSNR for which the size of the disturbance is reported, dB. A loss of 3 dB is twice the
+/// mean squared error.
 const BREAKS_DB: [f64; 2] = [1.0, 3.0];
 const NANOS_PER_SEC: f64 = 1e9;
 /// Difference between consecutive stamps that only count images, nanoseconds.
@@ -290,6 +290,7 @@ impl StabilityOptions {
     /// for `all`.
     fn plans(&self, data: &NamedData) -> Result<Vec<DisturbancePlan>> {
         let mut selected = self.disturbances.clone();
+        // Stamps of photos only count images. Only a clock offset depends on their length.
         let (nanos_per_sec, rate_hz) = match (data.data.has_times, self.rate_hz) {
             (true, _) => (NANOS_PER_SEC, None),
             (false, Some(rate_hz)) => (NANOS_PER_COUNT * rate_hz, Some(rate_hz)),
@@ -351,7 +352,7 @@ impl Curve {
     fn add(&mut self, disturbance: Disturbance, level: f64, runs: Vec<Run>) {
         let ends: Vec<f64> = runs.iter().map(Run::psnr).collect();
         let Some((psnr, psnr_extent)) = median(&ends).zip(extent(&ends)) else {
-            return;
+            return; // There are no runs.
         };
         self.points.push(Level {
             level,

@@ -83,6 +83,7 @@ pub fn read(folder: &Path) -> crate::Result<Option<Vec<KeyframePose>>> {
     };
     let File { cameras } =
         serde_json::from_str(&text).with_context(|| format!("{} is damaged", path.display()))?;
+    // The matrices may have been edited or rounded by other programs, so each one is checked.
     let posed = cameras.into_iter().map(|camera| {
         let world_from_camera =
             camera_path::rigid(&camera.world_from_camera).with_context(|| {

@@ -79,6 +79,8 @@ impl ChunkPublisher {
             Some(published) => began >= published.next_at,
             None => true,
         };
+        // One task at a time: several models take turns, because each is due again only after its
+        // period.
         if self.task.is_some() || !is_due {
             return began.elapsed();
         }

@@ -116,6 +116,7 @@ pub fn with_intrinsics(
         .filter(|camera| *camera.name == *name)
     {
         let before = std::mem::replace(&mut camera.intrinsics, intrinsics.clone());
+        // The intrinsics are known now, so they are no longer read from the device.
         camera.realsense.unknown.intrinsics = false;
         // Symmetric, so the order of rows and columns does not matter.
         camera.intrinsics_covariance =
@@ -246,6 +247,7 @@ pub fn write(rig: &Rig, file: &Path) -> crate::Result<()> {
 /// Writes the robot's URDF next to a rig file, unless it is there.
 fn write_urdf(rig: &Rig, file: &Path) -> std::io::Result<()> {
     let urdf = file.with_file_name(drivers::recording::URDF_FILE);
+    // Created, never replaced: the folder may belong to another robot.
     let error = match files::create(&urdf, |out| out.write_all(rig.arm.urdf_text.as_bytes())) {
         Ok(()) => return Ok(()),
         Err(error) => error,

@@ -84,6 +84,7 @@ impl DataOptions {
     ) -> Result<Self, Error> {
         let now = self.flags();
         for (name, value) in before {
+            // A path with other contents is detected later, when keyframes are compared.
             let is_other = |now: &String| now != value && is_number(now) && is_number(value);
             if let Some(now) = now.get(name).filter(|now| is_other(now)) {
                 return Err(Error::BadInput(format!(
@@ -402,6 +403,7 @@ impl Data {
     pub fn initial_points(&self) -> Option<Arc<InitialPoints>> {
         let path = self.points_path.as_deref()?;
         let shown = path.display();
+        // Depth gives more points, at the surfaces that the images show.
         let is_learned_with_depth =
             |keyframe: &Arc<Keyframe>| keyframe.split != Split::Test && keyframe.depth.is_some();
         if self.keyframes.iter().any(is_learned_with_depth) {
@@ -559,6 +561,7 @@ impl Data {
                 .or_default()
                 .push(ix);
         }
+        // With every 8th image of the whole recording, a camera could have no test image at all.
         for ixs in by_camera.values() {
             let names: Vec<&str> = ixs.iter().map(|ix| self.names[*ix].as_str()).collect();
             for (ix, split) in ixs.iter().zip(holdout.splits(&names)?) {

@@ -187,6 +187,7 @@ impl TryFrom<bool> for True {
 
 impl Pushed {
     fn of(keyframe: &Keyframe) -> Self {
+        // The identity is left out, because most runs have a fixed base and no corrections.
         let map_from_odom = keyframe.base.as_ref().map(|base| base.map_from_odom);
         Self {
             camera: keyframe.camera.to_string(),
@@ -259,6 +260,7 @@ impl DecisionLog {
     /// Creates the log in a run folder. A run that continues from a checkpoint writes a separate
     /// file and keeps the earlier log.
     pub fn create(folder: &Path, settings: Settings) -> crate::Result<Self> {
+        // A replay needs the earlier log up to the checkpoint, and this one after it.
         let name = match settings.from_step {
             None => FILE.to_owned(),
             Some(step) => FILE.replace('.', &format!("-from-{step}.")),
@@ -342,6 +344,7 @@ impl DecisionLog {
 
     /// Records that a picture was drawn.
     pub fn seeded(&mut self) {
+        // Training has already created the splats that a picture would create.
         if self.activity == Activity::Nothing {
             self.activity = Activity::Seeded;
         }
@@ -373,6 +376,7 @@ impl DecisionLog {
             step,
             decision: Decision::End(True),
         }));
+        // The thread ends when it has written all waiting lines and no sender is left.
         drop(self.sender);
         let written = self
             .thread

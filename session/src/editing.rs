@@ -75,6 +75,7 @@ impl Editor {
         let Search { request, thread } = self
             .search
             .take_if(|search| wait || search.thread.is_finished())?;
+        // A panic in a search must not end the run.
         let found = match thread.join() {
             Ok(found) => found.map_err(|error| error.to_string()),
             Err(_) => Err("the search for floaters panicked".to_owned()),

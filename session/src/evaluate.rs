@@ -19,9 +19,9 @@ use trainer::{Method, Picture, Projection, RenderRequest};
 
 /// Environment variable with the path of the LPIPS weights, used if the flag is not given.
 const LPIPS_WEIGHTS: &str = "FIELDRIG_LPIPS_WEIGHTS";
-/// Near plane of renders, meters.
+/// Near plane of renders, meters. A gripper may be this close to its camera.
 const NEAR_M: f64 = 0.01;
-/// Far plane of renders, meters.
+/// Far plane of renders, meters. Photos of a dataset may show a landscape.
 const FAR_M: f64 = 1000.0;
 
 /// How long [`Evaluator::score_all`] waits for scores before it calls `meanwhile` again, which draws
@@ -200,7 +200,7 @@ impl Evaluator {
         tests: impl Iterator<Item = &'a Arc<Keyframe>>,
         mut meanwhile: impl FnMut(&mut dyn Method, usize),
     ) -> crate::Result<Vec<ImageScores>> {
-        // Two pictures per thread: one that is scored, and one that is ready for it. More would only
+        // Two pictures per thread: one that is scored, and one that waits for it. More would only
         // use more memory.
         let max_waiting = 2 * rayon::current_num_threads();
         let (sender, receiver) = std::sync::mpsc::sync_channel(max_waiting);
@@ -492,6 +492,7 @@ pub fn render_depth(
     let Some(color_from_depth) = lens.color_from_depth else {
         return Ok(None);
     };
+    // Rendered from the depth camera: between two viewpoints, near objects hide different parts.
     let drawn = method.render(&RenderRequest {
         world_from_camera: lens.world_from_camera * color_from_depth,
         size_px: depth.size_px,

@@ -105,6 +105,8 @@ pub fn specs(
     common: &CommonOptions,
     settings: &Settings,
 ) -> Result<Vec<ModelSpec>, Error> {
+    // Options that a method does not have are skipped, so that one list serves a run of several
+    // methods. Flags that no method has were rejected before.
     let spec = |kind: &ModelKind| ModelSpec::new(*kind, common.clone(), settings);
     kinds
         .iter()

@@ -70,6 +70,7 @@ fn read(file: &str, urdf_folder: &Path, left: Budget) -> Result<RobotMesh, Strin
         return Err(format!("no such file; tried {}", tried.join(", ")));
     };
     let shown = path.display();
+    // The budget of one file, but not more than what is left of the budget of all files.
     let max_bytes = Budget::MESH.max_bytes.min(left.max_bytes);
     let bytes = files::read(
         path,

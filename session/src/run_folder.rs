@@ -30,6 +30,7 @@ const SECS_PER_DAY: u64 = 86_400;
 
 /// Returns an error if a folder contains any model, so that results are never mixed or overwritten.
 pub fn check_no_model(folder: &Path) -> Result<(), Error> {
+    // A run of several methods has one subfolder per method. The empty path is the folder itself.
     let subfolders = [PathBuf::new()]
         .into_iter()
         .chain(ModelKind::ALL.iter().map(|kind| PathBuf::from(kind.name())));
@@ -68,6 +69,8 @@ pub fn check_no_unfinished_run(out: &Path) -> Result<(), Error> {
 
 /// Returns an error if results would be written into the folder of the data.
 pub fn check_not_data_folder(out: &Path, data: &Path) -> Result<(), Error> {
+    // The same folder may have several names, for example through a link. A folder that does not
+    // exist yet has no canonical path, and is no data.
     let canonical = |path: &Path| path.canonicalize().ok();
     match (canonical(out), canonical(data)) {
         (Some(folder), Some(data)) if folder == data => Err(Error::BadInput(format!(

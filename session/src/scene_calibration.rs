@@ -41,6 +41,7 @@ impl SceneCalibration {
     pub fn relative(&self, camera: &str) -> Option<RelativePose> {
         let cameras = &self.rig.as_ref()?.cameras;
         let camera = cameras.iter().find(|other| *other.name == *camera)?;
+        // By name, so that the reference does not depend on the order in the rig file.
         let same_parent = cameras.iter().filter(|other| other.parent == camera.parent);
         let first = same_parent
             .min_by_key(|other| &other.name)
@@ -116,6 +117,7 @@ pub fn calibrate_scene(
         }
         Err(error) => return Err(error),
     };
+    // Nothing is scored here, so test images would be wasted.
     let keyframes: Vec<_> = data.keyframes.iter().map(for_calibration).collect();
     let Some(alignment) = calibration::align(&keyframes, &choice) else {
         let n_images = counted(data.keyframes.len() as u64, "image");

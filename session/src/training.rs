@@ -44,6 +44,7 @@ pub fn train(
 ) -> crate::Result<Session> {
     let kind = plan.model_spec.kind;
     let mut method = plan.model_spec.start(gpu.clone())?;
+    // Compiling kernels takes seconds and is not training.
     method.prepare()?;
     let session = Session::new(
         gpu,
@@ -76,6 +77,7 @@ pub fn drive(
     stop: &Stop,
     open_gpu: OpenGpu,
 ) -> crate::Result<()> {
+    // The clock starts earlier by the time of the preparation, which is part of the method.
     let now = Instant::now();
     let began = now.checked_sub(preparation_time).unwrap_or(now);
     for session in &mut *sessions {
@@ -83,6 +85,7 @@ pub fn drive(
         for keyframe in keyframes {
             session.push(keyframe)?;
         }
+        // A model that is idle at once, with all keyframes, can never train.
         if session.is_idle() && session.progress().step == 0 {
             let others: Vec<&str> = ModelKind::ALL
                 .iter()

@@ -96,6 +96,7 @@ impl ModelViewer {
             self.publish_chunks();
             self.publish_observations();
         }
+        // Saving is a decision of the operator, because it changes the files of the model.
         if self.has_unsaved_edits() {
             log::warn!("the last edits are lost, because they were not saved on the page");
         }
@@ -139,6 +140,7 @@ impl ModelViewer {
 
     /// Applies the edits that operators have requested, and saves them if this is requested.
     fn apply_edits(&mut self) {
+        // The result of an earlier search comes before new edits, in the order of the requests.
         if let Some((request, found)) = self.editor.take_found(false) {
             let erased = found.and_then(|floaters| {
                 let model = model_mut(&mut self.models, request.method())?;
@@ -290,6 +292,8 @@ fn model_mut<'a>(
     models: &'a mut [ServedModel],
     method: Option<&str>,
 ) -> Result<&'a mut ServedModel, String> {
+    // By index, because returning a reference from a search would keep `models` borrowed for the
+    // error.
     match models
         .iter()
         .position(|model| method.is_none_or(|name| model.kind.name() == name))

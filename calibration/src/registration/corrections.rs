@@ -69,8 +69,11 @@ impl Corrections {
         for (ix, param) in layout.params.iter().enumerate() {
             let delta = step[ix];
             match *param {
+                // Motions are composed as a whole, when their first part comes; the other five parts
+                // are skipped below.
                 CalibrationParam::Extrinsics(camera, 0) => {
                     let correction = &mut self.by_camera[camera];
+                    // The step moves the camera; the correction maps points to the moved camera.
                     let extrinsics = transform::exp(&twist(step, ix), -1.0)
                         * rigid_transform(
                             correction.rotation_rad.into(),
@@ -94,6 +97,7 @@ impl Corrections {
                 CalibrationParam::TimeOffset(camera) => {
                     self.by_camera[camera].time_offset_secs += delta
                 }
+                // Joints carry all cameras of an arm, so the offset is stored with each of them.
                 CalibrationParam::Joint(joint) => {
                     for correction in &mut self.by_camera {
                         let n = correction.joint_offsets.len().max(joint + 1);

@@ -8,13 +8,17 @@ use super::solve::Solution;
 use super::sums::{self, Noise, PairSums, PixelSubset, ResidualOptions};
 use nalgebra::DVector;
 
-/// Maximum number of steps at each level, the finest first.
+/// Maximum number of steps at each level, the finest first. Coarse levels only bring the estimate
+/// into the range in which the next level converges.
 const MAX_ITERATIONS: [usize; 4] = [12, 4, 4, 4];
 /// Relative depth error above which a point counts as occluded, the finest level first. It is
 /// larger at coarse levels, where poses still have larger errors.
 pub(super) const OCCLUSION_FRAC: [f64; 4] = [0.04, 0.05, 0.07, 0.1];
-/// A step smaller than this number of standard deviations ends a level, the finest first.
+/// A step smaller than this number of standard deviations ends a level, the finest first. Further
+/// steps would be smaller than the error of the result.
 const CONVERGED_STEP_SIGMAS: [f64; 4] = [0.2, 2.0, 2.0, 2.0];
+/// Noise for the first residuals. It is replaced by an estimate after them, so it only must not
+/// reject many of them.
 pub(super) const INITIAL_NOISE: Noise = Noise {
     photo: 20.0,
     depth: 0.005,
@@ -36,6 +40,7 @@ impl Fit {
     /// at most as large as this change. Its direction may be another one, because the error is the
     /// sum of many, some of which do not depend on the pixel size in the same way.
     pub(super) fn add_discretization_error(&mut self, images: &[PreparedImage], pairs: &[Pair]) {
+        // Converged at level 1 from the result of level 0: the difference of both results.
         const LEVEL: usize = 1;
         if images.iter().all(|image| image.levels.len() <= LEVEL) {
             return;
@@ -70,6 +75,7 @@ impl Fit {
     }
 }
 
+/// A Gauss-Newton step from the given corrections.
 fn step(layout: &Layout, corrections: &Corrections, pairs: &[Pair], sums: &[PairSums]) -> Solution {
     let scales = layout.params.iter().map(|param| param.scale());
     let values = layout.params.iter().map(|param| corrections.value(*param));
@@ -101,7 +107,8 @@ pub(super) fn fit(
     ))?;
     let mut last = None;
     for level in (0..n_levels).rev() {
-        (options.level, options.occlusion_frac) = (level, OCCLUSION_FRAC[level]);
+        options.level = level;
+        options.occlusion_frac = OCCLUSION_FRAC[level];
         // At coarse levels, an approximate result from a subset of the pairs is sufficient.
         let stride = if level == 0 {
             1
@@ -116,6 +123,8 @@ pub(super) fn fit(
                 &subset,
                 &options,
             );
+            // The noise decreases as the images get aligned, and with it the residuals that count as
+            // outliers.
             options.noise = sums::noise_of(&sums)?;
             let solution = step(&layout, &corrections, &subset, &sums);
             corrections.apply_step(&layout, &solution.step);

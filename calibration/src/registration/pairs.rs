@@ -7,8 +7,8 @@ use rayon::prelude::*;
 /// Minimum fraction of an image's samples that its partner must show. With less overlap, a pair
 /// takes as long, but has fewer residuals and more of them at occlusions.
 const MIN_OVERLAP: f64 = 0.3;
-/// Number of samples that are tested for the overlap: its standard deviation is 7 % at most. All
-/// pairs of images are tested, so this determines the time of the selection.
+/// Number of samples that are tested for the overlap, which gives it a standard deviation of about
+/// 7 %. All pairs of images are tested, so this determines the time of the selection.
 const N_PROBES: usize = 40;
 /// Readings that differ by more than this fraction belong to different surfaces. The fraction is
 /// large because poses may have errors of centimeters.

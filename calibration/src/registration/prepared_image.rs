@@ -13,8 +13,9 @@ use std::sync::Arc;
 /// Maximum width of the finest level, pixels. At this width, errors of a hundredth of a pixel are
 /// far below the accuracy that calibration needs.
 const MAX_COLUMNS: u32 = 400;
-/// Minimum side of the coarsest level.
+/// Minimum side of the coarsest level. Smaller levels have too few texels inside their borders.
 const MIN_SIDE: usize = 40;
+/// Each level doubles the error from which the estimate converges.
 const MAX_LEVELS: usize = 4;
 /// Columns and rows of the grid of an image. Each cell contributes its most informative sample.
 const GRID_CELLS: [usize; 2] = [20, 15];
@@ -83,7 +84,8 @@ impl PreparedImage {
             brightness_at(sample).map(|at| at.gradient[0].hypot(at.gradient[1]))
         };
         let (samples, uniform_samples) = select_samples(depth, gradient_norm);
-        (image.samples, image.uniform_samples) = (samples, uniform_samples);
+        image.samples = samples;
+        image.uniform_samples = uniform_samples;
         Some(image)
     }
 
@@ -120,11 +122,14 @@ fn select_samples(
     depth: &DepthMap,
     gradient_norm: impl Fn(&DepthSample) -> Option<f64>,
 ) -> (Vec<DepthSample>, Vec<DepthSample>) {
-    const CANDIDATES_PER_SIDE: usize = 6; // Per cell.
+    // Per cell. Testing all pixels would take most of the time of the preparation.
+    const CANDIDATES_PER_SIDE: usize = 6;
     let [width, height] = depth.size_px.map(|side| side as usize);
-    let (mut strongest, mut uniform) = (Vec::new(), Vec::new());
+    let mut strongest = Vec::new();
+    let mut uniform = Vec::new();
     for cell in 0..GRID_CELLS[0] * GRID_CELLS[1] {
-        let (cell_x, cell_y) = (cell % GRID_CELLS[0], cell / GRID_CELLS[0]);
+        let cell_x = cell % GRID_CELLS[0];
+        let cell_y = cell / GRID_CELLS[0];
         let mut best: Option<(f64, DepthSample)> = None;
         let mut middle = None;
         for candidate in 0..CANDIDATES_PER_SIDE * CANDIDATES_PER_SIDE {
@@ -153,6 +158,7 @@ fn select_samples(
             if best.is_none_or(|(max, _)| norm > max) {
                 best = Some((norm, sample));
             }
+            // The first valid candidate from the middle of the cell on.
             if candidate >= CANDIDATES_PER_SIDE * CANDIDATES_PER_SIDE / 2 + CANDIDATES_PER_SIDE / 2
                 && middle.is_none()
             {
@@ -177,7 +183,8 @@ fn sample(depth: &DepthMap, x: usize, y: usize) -> Option<DepthSample> {
     if z_m.is_nan() || z_m <= 0.0 {
         return None;
     }
-    let (mut sum, mut n) = (0.0, 0.0);
+    let mut sum = 0.0;
+    let mut n = 0.0;
     for (dx, dy) in (0..25).map(|ix| (ix % 5, ix / 5)) {
         let neighbor = at(x + dx - RADIUS, y + dy - RADIUS);
         if neighbor > 0.0 {
@@ -206,13 +213,16 @@ pub(super) fn depth_at(depth: &DepthMap, pixel: [f64; 2]) -> Option<SampledValue
     if !(x >= 0.0 && y >= 0.0 && x < (width - 1) as f64 && y < (height - 1) as f64) {
         return None;
     }
-    let (left, top) = (x as usize, y as usize);
-    let (fx, fy) = (x - left as f64, y - top as f64);
+    let left = x as usize;
+    let top = y as usize;
+    let fx = x - left as f64;
+    let fy = y - top as f64;
     let corner = |dx: usize, dy: usize| f64::from(depth.depth_m[(top + dy) * width + left + dx]);
     let corners = [corner(0, 0), corner(1, 0), corner(0, 1), corner(1, 1)];
     let (min, max) = corners.iter().fold((f64::MAX, 0.0f64), |(min, max), z| {
         (min.min(*z), max.max(*z))
     });
+    // Holes are zeros. Written so that a NaN is a hole, too.
     if !(min > 0.0 && max - min <= SMOOTH_FRAC * min) {
         return None;
     }
@@ -225,6 +235,7 @@ pub(super) fn depth_at(depth: &DepthMap, pixel: [f64; 2]) -> Option<SampledValue
     ];
     Some(SampledValue {
         value: z,
+        // The gradient of z = 1 / inverse is -z² times that of the inverse.
         gradient: gradient.map(|gradient| -gradient * z * z),
     })
 }
@@ -233,29 +244,35 @@ pub(super) fn depth_at(depth: &DepthMap, pixel: [f64; 2]) -> Option<SampledValue
 pub(super) fn brightness(keyframe: &Keyframe, edge: usize) -> ([usize; 2], Vec<f32>) {
     let [width, height] = keyframe.size_px.map(|side| side as usize);
     let size = [width / edge, height / edge];
-    let mean = |ix: usize| {
-        let (x, y) = (ix % size[0], ix / size[0]);
-        let (mut sum, mut is_valid) = (0u32, true);
-        for row in y * edge..(y + 1) * edge {
-            for pixel in keyframe.rgba_srgb[4 * (row * width + x * edge)..]
-                .chunks_exact(4)
-                .take(edge)
-            {
-                is_valid &= pixel[3] > 0;
-                // The weights sum to 256.
-                sum +=
-                    77 * u32::from(pixel[0]) + 150 * u32::from(pixel[1]) + 29 * u32::from(pixel[2]);
-            }
-        }
-        if is_valid {
-            sum as f32 / (256 * edge * edge) as f32
-        } else {
-            f32::NAN
-        }
-    };
-    (size, (0..size[0] * size[1]).map(mean).collect())
+    let values = (0..size[0] * size[1])
+        .map(|ix| mean_brightness(keyframe, [ix % size[0], ix / size[0]], edge))
+        .collect();
+    (size, values)
 }
 
+/// Mean brightness of one square, which is given by its column and row.
+fn mean_brightness(keyframe: &Keyframe, [x, y]: [usize; 2], edge: usize) -> f32 {
+    let width = keyframe.size_px[0] as usize;
+    let mut sum = 0u32;
+    let mut is_valid = true;
+    for row in y * edge..(y + 1) * edge {
+        for pixel in keyframe.rgba_srgb[4 * (row * width + x * edge)..]
+            .chunks_exact(4)
+            .take(edge)
+        {
+            is_valid &= pixel[3] > 0;
+            // The weights of BT.601 times 256.
+            sum += 77 * u32::from(pixel[0]) + 150 * u32::from(pixel[1]) + 29 * u32::from(pixel[2]);
+        }
+    }
+    if is_valid {
+        sum as f32 / (256 * edge * edge) as f32
+    } else {
+        f32::NAN
+    }
+}
+
+/// The pyramid of a keyframe, the finest level first.
 fn levels(keyframe: &Keyframe) -> Vec<GrayImage> {
     let level_shift = keyframe.size_px[0]
         .div_ceil(MAX_COLUMNS)
@@ -269,7 +286,8 @@ fn levels(keyframe: &Keyframe) -> Vec<GrayImage> {
         let finer = |x: usize, y: usize| values[y * size[0] + x];
         values = (0..half[0] * half[1])
             .map(|ix| {
-                let (x, y) = (2 * (ix % half[0]), 2 * (ix / half[0]));
+                let x = 2 * (ix % half[0]);
+                let y = 2 * (ix / half[0]);
                 0.25 * (finer(x, y) + finer(x + 1, y) + finer(x, y + 1) + finer(x + 1, y + 1))
             })
             .collect();
@@ -282,45 +300,51 @@ fn levels(keyframe: &Keyframe) -> Vec<GrayImage> {
 /// Blurs with a binomial filter, five pixels wide. Interpolated values have less noise than values
 /// at pixel centers; without the blur, this would bias estimates towards half-pixel offsets.
 fn blurred([width, height]: [usize; 2], values_in: &[f32]) -> Vec<f32> {
+    let rows = blurred_along(values_in, [width, 1], |ix| ix % width);
+    blurred_along(&rows, [height, width], |ix| ix / width)
+}
+
+/// Blurs along one axis with `n` values that are `stride` apart. Outside, the outermost value
+/// continues.
+///
+/// * `coordinate`: position along the axis of the value at an index.
+fn blurred_along(
+    values: &[f32],
+    [n, stride]: [usize; 2],
+    coordinate: impl Fn(usize) -> usize,
+) -> Vec<f32> {
     const WEIGHTS: [f32; 5] = [1.0 / 16.0, 4.0 / 16.0, 6.0 / 16.0, 4.0 / 16.0, 1.0 / 16.0];
-    let blur_along = |values: &[f32],
-                      n: usize,
-                      stride: usize,
-                      coordinate: &dyn Fn(usize) -> usize|
-     -> Vec<f32> {
-        let at = |ix: usize, offset: usize| {
-            let neighbor_ix = (coordinate(ix) + offset).clamp(2, n + 1) - 2;
-            values[ix - coordinate(ix) * stride + neighbor_ix * stride]
-        };
-        (0..values.len())
-            .map(|ix| (0..5).map(|offset| WEIGHTS[offset] * at(ix, offset)).sum())
-            .collect()
+    let at = |ix: usize, offset: usize| {
+        let neighbor_ix = (coordinate(ix) + offset).clamp(2, n + 1) - 2;
+        values[ix - coordinate(ix) * stride + neighbor_ix * stride]
     };
-    let rows = blur_along(values_in, width, 1, &|ix| ix % width);
-    blur_along(&rows, height, width, &|ix| ix / width)
+    (0..values.len())
+        .map(|ix| (0..5).map(|offset| WEIGHTS[offset] * at(ix, offset)).sum())
+        .collect()
 }
 
 impl GrayImage {
     pub(super) fn new(size: [usize; 2], pixels: f64, values_in: &[f32]) -> Self {
         let [width, height] = size;
         let values = blurred(size, values_in);
-        let invalid = [f32::NAN; 3];
-        let texel = |ix: usize| {
-            let (x, y) = (ix % width, ix / width);
-            if x == 0 || y == 0 || x + 1 == width || y + 1 == height {
-                return invalid;
+        // Central differences per pixel of the keyframe, so that gradients of all levels have the
+        // same unit. They need neighbors on both sides.
+        let scale = 0.5 / pixels as f32;
+        let mut texels = vec![[f32::NAN; 3]; width * height];
+        for y in 1..height.saturating_sub(1) {
+            for x in 1..width.saturating_sub(1) {
+                let ix = y * width + x;
+                texels[ix] = [
+                    values[ix],
+                    scale * (values[ix + 1] - values[ix - 1]),
+                    scale * (values[ix + width] - values[ix - width]),
+                ];
             }
-            let scale = 0.5 / pixels as f32;
-            [
-                values[ix],
-                scale * (values[ix + 1] - values[ix - 1]),
-                scale * (values[ix + width] - values[ix - width]),
-            ]
-        };
+        }
         Self {
             size,
             pixels,
-            texels: (0..width * height).map(texel).collect(),
+            texels,
         }
     }
 
@@ -336,8 +360,10 @@ impl GrayImage {
         {
             return None;
         }
-        let (left, top) = (x as usize, y as usize);
-        let (fx, fy) = (x - left as f64, y - top as f64);
+        let left = x as usize;
+        let top = y as usize;
+        let fx = x - left as f64;
+        let fy = y - top as f64;
         let corner = |dx: usize, dy: usize| self.texels[(top + dy) * self.size[0] + left + dx];
         let [a, b, c, d] = [corner(0, 0), corner(1, 0), corner(0, 1), corner(1, 1)];
         let bilinear = |part: usize| {
@@ -348,6 +374,7 @@ impl GrayImage {
             value: bilinear(0),
             gradient: [bilinear(1), bilinear(2)],
         };
+        // One masked neighbor makes all of them NaN.
         (interpolated.value + interpolated.gradient[0] + interpolated.gradient[1])
             .is_finite()
             .then_some(interpolated)

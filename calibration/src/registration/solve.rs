@@ -39,7 +39,9 @@ impl Solution {
         sums: &[PairSums],
     ) -> Self {
         let n = scales.len();
-        let (mut information, mut gradient) = (DMatrix::zeros(n, n), DVector::zeros(n));
+        // In units of the scales, so that eigenvalues of meters and radians are comparable.
+        let mut information = DMatrix::zeros(n, n);
+        let mut gradient = DVector::zeros(n);
         for pair in sums {
             for (row, param) in pair.params.iter().enumerate() {
                 gradient[*param] += scales[*param] * pair.gradient[row];
@@ -59,6 +61,9 @@ impl Solution {
         let mut step = DVector::zeros(n);
         for (ix, observable) in is_observable.iter().enumerate() {
             let direction = eigen.eigenvectors.column(ix);
+            // A prior at zero, as strong as `INFLATION` residuals per direction. Components that the
+            // residuals do not determine return to zero: they may come from an earlier step in which
+            // the direction was another one.
             let length = if *observable {
                 (direction.dot(&gradient) - INFLATION * direction.dot(&values))
                     / (eigen.eigenvalues[ix] + INFLATION)
@@ -67,6 +72,8 @@ impl Solution {
             };
             step += direction * length;
         }
+        // A long step of a nearly unobservable direction would leave the range in which the
+        // linearization holds.
         let max_component = step.amax();
         if max_component > MAX_STEP {
             step *= MAX_STEP / max_component;
@@ -95,6 +102,7 @@ impl Solution {
             .map(|pair| pair.from.max(pair.to) + 1)
             .max()
             .unwrap_or(0);
+        // Gradients of all pairs of an image add up to its common error.
         let mut by_image = vec![DVector::<f64>::zeros(n); n_images];
         for (pair, sums) in pairs.iter().zip(sums) {
             for (row, param) in sums.params.iter().enumerate() {
@@ -168,6 +176,7 @@ impl Solution {
             .sum()
     }
 
+    /// Indices of the unobservable eigenvectors.
     fn unobservable_columns(&self) -> impl Iterator<Item = usize> {
         self.is_observable
             .iter()
@@ -194,6 +203,8 @@ impl Solution {
                 0.0
             }
         });
+        // Any basis of the unobservable space is as good. This one has vectors that do not change
+        // the selected parameters, if there are any, which are easier to describe.
         let rotated = SymmetricEigen::new(masked_basis.tr_mul(&masked_basis));
         let mut order: Vec<usize> = (0..columns.len()).collect();
         order.sort_by(|a, b| rotated.eigenvalues[*a].total_cmp(&rotated.eigenvalues[*b]));

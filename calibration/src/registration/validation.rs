@@ -19,8 +19,10 @@ const CLIP: f64 = 50.0;
 /// below the noise of a camera image do not count. The blurred images that are compared have less
 /// noise.
 const IMAGE_NOISE: f64 = 2.0;
+/// Relative depth difference above which a sample counts as occluded, as at the finest level of
+/// registration.
 const OCCLUSION_FRAC: f64 = 0.04;
-/// Minimum number of samples of a score.
+/// Minimum number of samples of a score. With fewer, the scores of images differ mostly by noise.
 const MIN_SAMPLES: usize = 30;
 
 /// A comparison of the predictions of validation images without (baseline) and with (variant) a
@@ -81,52 +83,64 @@ impl PairedComparison<'_> {
         for pair in self.pairs {
             by_image.entry(pair.to).or_default().push(*pair);
         }
-        let images: Vec<(usize, Vec<Pair>)> = by_image.into_iter().collect();
-        let errors_on_half = |to: usize, pairs: &[Pair], odd: bool| {
-            let image = &self.images[to];
-            let with_own_pose = |corrections: &Corrections, views: &[CorrectedView]| {
-                let correction = &corrections.by_camera[image.camera];
-                let correction = poses::fit_one(
-                    self.images,
-                    views,
-                    pairs,
-                    correction,
-                    PixelSubset::Blocks { odd },
-                )?;
-                CorrectedView::new(image, &correction, &Layout::default())
-            };
-            let with_own_pose = [
-                with_own_pose(self.baseline, &views[0])?,
-                with_own_pose(self.variant, &views[1])?,
-            ];
-            let mut sum = PairedErrors::default();
-            for pair in pairs {
-                let from = |ix: usize| Side {
+        let pairs_of_images: Vec<Vec<Pair>> = by_image.into_values().collect();
+        pairs_of_images
+            .par_iter()
+            .filter_map(|pairs| {
+                let mut sum = self.errors_on_half(&views, pairs, false)?;
+                add_errors(&mut sum, self.errors_on_half(&views, pairs, true)?);
+                (sum.0 > MIN_SAMPLES).then(|| ImageScore::new(pairs[0].to, sum))
+            })
+            .collect()
+    }
+
+    /// Errors on the even or odd blocks of an image, with a pose that is fitted to the other
+    /// blocks. All pairs lead to this image.
+    fn errors_on_half(
+        &self,
+        views: &[Vec<CorrectedView>; 2],
+        pairs: &[Pair],
+        fitted_is_odd: bool,
+    ) -> Option<PairedErrors> {
+        let fitted = PixelSubset::Blocks { odd: fitted_is_odd };
+        let evaluated = PixelSubset::Blocks {
+            odd: !fitted_is_odd,
+        };
+        let image = &self.images[pairs.first()?.to];
+        let own_views = [
+            self.with_own_pose(self.baseline, &views[0], pairs, fitted)?,
+            self.with_own_pose(self.variant, &views[1], pairs, fitted)?,
+        ];
+        let mut sum = PairedErrors::default();
+        for pair in pairs {
+            let sides = [0, 1].map(|ix: usize| {
+                let from = Side {
                     image: &self.images[pair.from],
                     view: &views[ix][pair.from],
                 };
-                let sides = [0, 1].map(|ix| {
-                    [
-                        from(ix),
-                        Side {
-                            image,
-                            view: &with_own_pose[ix],
-                        },
-                    ]
-                });
-                add_errors(
-                    &mut sum,
-                    errors(sides, self.noise, PixelSubset::Blocks { odd: !odd }),
-                );
-            }
-            Some(sum)
-        };
-        let score_of = |(to, pairs): &(usize, Vec<Pair>)| {
-            let mut sum = errors_on_half(*to, pairs, false)?;
-            add_errors(&mut sum, errors_on_half(*to, pairs, true)?);
-            (sum.0 > MIN_SAMPLES).then(|| ImageScore::new(*to, sum))
-        };
-        images.par_iter().filter_map(score_of).collect()
+                let to = Side {
+                    image,
+                    view: &own_views[ix],
+                };
+                [from, to]
+            });
+            add_errors(&mut sum, errors(sides, self.noise, evaluated));
+        }
+        Some(sum)
+    }
+
+    /// View of the image that all pairs lead to, with a pose that is fitted to some of its pixels.
+    fn with_own_pose(
+        &self,
+        corrections: &Corrections,
+        views: &[CorrectedView],
+        pairs: &[Pair],
+        fitted: PixelSubset,
+    ) -> Option<CorrectedView> {
+        let image = &self.images[pairs.first()?.to];
+        let correction = &corrections.by_camera[image.camera];
+        let correction = poses::fit_one(self.images, views, pairs, correction, fitted)?;
+        CorrectedView::new(image, &correction, &Layout::default())
     }
 
     fn views(&self) -> [Vec<CorrectedView>; 2] {
@@ -216,30 +230,33 @@ fn errors(sides: [[Side<'_>; 2]; 2], noise: Noise, part: PixelSubset) -> PairedE
     };
     let correspondences =
         sides.map(|sides| sums::correspondences(sides, &sides[0].image.uniform_samples, &options));
-    let both_visible = || {
-        correspondences[0]
-            .iter()
-            .zip(&correspondences[1])
-            .filter_map(|(one, other)| one.as_ref().zip(other.as_ref()))
-    };
-    let sum = |correspondences: Vec<&Correspondence>| {
-        let tone = sums::tone(correspondences.iter().copied(), noise.photo);
-        correspondences
-            .iter()
-            .map(|correspondence| correspondence.photo(tone).clamp(-CLIP, CLIP).powi(2))
-            .sum::<f64>()
-    };
+    // A sample that only one of them shows would favor or punish it for its visibility.
+    let (baseline, variant): (Vec<&Correspondence>, Vec<&Correspondence>) = correspondences[0]
+        .iter()
+        .zip(&correspondences[1])
+        .filter_map(|(one, other)| one.as_ref().zip(other.as_ref()))
+        .unzip();
     (
-        both_visible().count(),
-        sum(both_visible().map(|(one, _)| one).collect()),
-        sum(both_visible().map(|(_, other)| other).collect()),
+        baseline.len(),
+        squares(&baseline, noise.photo),
+        squares(&variant, noise.photo),
     )
+}
+
+/// Sum of squared brightness differences after the exposures of the two images are matched.
+fn squares(correspondences: &[&Correspondence], photo_noise: f64) -> f64 {
+    let tone = sums::tone(correspondences.iter().copied(), photo_noise);
+    correspondences
+        .iter()
+        .map(|correspondence| correspondence.photo(tone).clamp(-CLIP, CLIP).powi(2))
+        .sum::<f64>()
 }
 
 fn add_errors(sum: &mut PairedErrors, errors: PairedErrors) {
     *sum = (sum.0 + errors.0, sum.1 + errors.1, sum.2 + errors.2);
 }
 
+/// PSNR of baseline and variant, dB.
 fn psnr((n, baseline, variant): PairedErrors) -> (f64, f64) {
     let psnr = |squares: f64| {
         10.0 * (255.0 * 255.0 / (squares / n as f64 + IMAGE_NOISE * IMAGE_NOISE)).log10()

@@ -53,6 +53,7 @@ impl HandEyeReport<'_> {
             )],
         };
         let mut page = Page::new("Hand-eye calibration", self.heading, &verdict, &figures);
+        // After a refusal, the page shows the data on which the refusal is based.
         if let Some(calibration) = self.calibration {
             page.table(
                 "Result",

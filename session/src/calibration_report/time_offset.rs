@@ -232,6 +232,7 @@ fn correlation(profile: &MotionProfile, offset: Option<&TimeOffset>) -> String {
         .iter()
         .map(|[secs, value]| [secs - base_secs, *value])
         .collect::<Vec<_>>();
+    // The result is refined with the orientations, so it may differ from the peak.
     let (at, what) = match offset {
         Some(offset) => (offset.offset_secs - base_secs, "result"),
         None => (peak[0] - base_secs, "highest correlation"),

@@ -88,7 +88,7 @@ const TITLE_HEIGHT: f64 = 54.0;
 const MARKER_ROW: f64 = 15.0;
 const LEGEND_SWATCH: f64 = 34.0;
 const LEGEND_ROW: f64 = 15.0;
-/// Maximum characters per row of the legend.
+/// Maximum characters per row of the legend. Longer rows would leave less width for the plot.
 const MAX_LEGEND_CHARS: usize = 26;
 
 /// Position of the plot and the ranges of its axes.

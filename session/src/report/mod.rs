@@ -109,6 +109,7 @@ impl Page<'_> {
             "model sha256",
             &self.report["done"]["checkpoint_sha256"],
         ));
+        // Empty unless profiling was requested.
         let passes = array(&self.report["passes"]).iter().filter_map(|pass| {
             Some(vec![
                 format!("GPU time of {}", pass[0].as_str()?),
@@ -534,6 +535,7 @@ fn rows_of(key: &str, value: &Value) -> Vec<Vec<String>> {
             .iter()
             .flat_map(|(inner, value)| rows_of(&format!("{key}: {inner}"), value))
             .collect(),
+        // A list of objects in one cell would be unreadable.
         Value::Array(items) if items.iter().any(Value::is_object) => {
             let numbered = items.iter().enumerate();
             numbered

@@ -211,6 +211,7 @@ impl Reporter {
             adapter: model.adapter,
             details: model.details,
             alignment: model.alignment,
+            // Corrections of single images are as many as images, and mean nothing elsewhere.
             cameras: model
                 .cameras
                 .into_iter()

@@ -193,6 +193,8 @@ impl Scoreboard {
 
     /// Records the scores of images at this training time.
     pub(super) fn record(&mut self, images: &[ImageScores], secs: f64) {
+        // The mean over the latest score of each image. A mean over only the images of this call
+        // would jump between easy and difficult ones.
         for image in images {
             self.newest_psnr
                 .insert((image.camera.clone(), image.stamp_nanos), image.psnr);

@@ -1,6 +1,6 @@
 //! Who may use a server, and what for: tokens, roles, and the origins of pages.
 
-use axum::http::{HeaderMap, header};
+use axum::http::{HeaderMap, HeaderName, header};
 use serde::Serialize;
 use std::net::IpAddr;
 use subtle::ConstantTimeEq;
@@ -176,16 +176,19 @@ fn is_loopback(host: &str) -> bool {
     name.eq_ignore_ascii_case("localhost") || address.is_ok_and(|address| address.is_loopback())
 }
 
+/// The values of a header, without those that are not text.
+fn texts(headers: &HeaderMap, name: HeaderName) -> impl Iterator<Item = &str> {
+    headers
+        .get_all(name)
+        .into_iter()
+        .filter_map(|value| value.to_str().ok())
+}
+
 /// The tokens in a request.
 fn tokens_in(headers: &HeaderMap) -> impl Iterator<Item = &str> {
-    let text = |name| {
-        headers
-            .get_all(name)
-            .into_iter()
-            .filter_map(|value| value.to_str().ok())
-    };
-    let bearer = text(header::AUTHORIZATION).filter_map(|value| value.strip_prefix("Bearer "));
-    let cookies = text(header::COOKIE).flat_map(|value| value.split(';'));
+    let bearer =
+        texts(headers, header::AUTHORIZATION).filter_map(|value| value.strip_prefix("Bearer "));
+    let cookies = texts(headers, header::COOKIE).flat_map(|value| value.split(';'));
     let from_cookies =
         cookies.filter_map(|cookie| cookie.trim().strip_prefix(COOKIE_PREFIX)?.split_once('='));
     bearer

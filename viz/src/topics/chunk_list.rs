@@ -47,8 +47,8 @@ impl ChunkList {
             self.chunks.remove(&id);
         }
         for chunk in new.chunks {
-            // The sum continues across complete lists, so that clients receive only what has
-            // changed. NaN counts as no change, because `max` returns the other number.
+            // The sum continues across complete lists, so that it stays known how much a client has
+            // missed. NaN counts as no change, because `max` returns the other number.
             let last = before.get(&chunk.id).or_else(|| self.chunks.get(&chunk.id));
             let total_change = last.map_or(0.0, |last| last.total_change) + chunk.change.max(0.0);
             let versioned = VersionedChunk {

@@ -84,8 +84,8 @@ impl ClientUpdates {
             return Next::Short(message);
         }
         if allows_long {
-            // On a slow link, a new image waits whenever the last one has been sent. Keyframes
-            // would then never be sent, or images never, whichever comes first in the order.
+            // On a slow link, a new image waits whenever the last one has been sent. With a fixed
+            // order, the second kind would then never be sent.
             let in_turn = if self.was_live {
                 [Priority::Keyframes, Priority::Live]
             } else {
