@@ -187,7 +187,10 @@ mod tests {
 
     #[test]
     fn keys_in_titles_are_unique_and_have_actions() {
-        let main = include_str!("../../web/src/main.ts");
+        let main = concat!(
+            include_str!("../../web/src/main.ts"),
+            include_str!("../../web/src/topics/observations.ts")
+        );
         let help = include_str!("../../web/src/panels/help.ts");
         let keys: Vec<_> = buttons()
             .into_iter()
