@@ -88,8 +88,8 @@ pub struct CalibratedCamera {
     pub gains: [f64; 3],
 }
 
-/// Maximum relative difference between two focal lengths that is negligible: 0.6 px at the border of
-/// an image of 1280 px.
+/// Maximum relative difference between two focal lengths that is negligible: 0.6 px at the border
+/// of an image of 1280 px.
 const NOTICEABLE_FOCAL: f64 = 1e-3;
 
 impl CalibratedCamera {
@@ -150,8 +150,8 @@ impl CameraCorrection {
             Vector3::new(rotation_x, rotation_y, rotation_z),
             Vector3::new(x, y, z),
         );
-        // From right to left, in the order of causes: the time of the exposure, the joints, the pose
-        // of this image, and the mount of the camera.
+        // From right to left, in the order of causes: the time of the exposure, the joints, the
+        // pose of this image, and the mount of the camera.
         let world_from_camera =
             (extrinsics * drift * joints * time_offset * lens.world_from_camera.inverse())
                 .inverse();

@@ -9,7 +9,7 @@ use crate::stations::Stations;
 use crate::stop::Stop;
 use drivers::recording::Recorder;
 use drivers::{PixelFormat, Sample, Source};
-use keyframe::RangePoints;
+use keyframe::{LiveImage, LivePixels, RangePoints, RangeScan, RobotState};
 use kinematics::{Stamp, Transform};
 use parking_lot::Mutex;
 use std::collections::{BTreeMap, HashMap, VecDeque};
@@ -55,70 +55,16 @@ pub trait InputObserver: Send {
     fn needs_images(&self) -> bool;
 
     /// Receives an image.
-    fn observe(&self, image: ObservedImage);
+    fn observe(&self, image: LiveImage);
 
     /// Whether the motion of the robot is needed.
     fn needs_robot(&self) -> bool;
 
     /// Receives a reading of the robot.
-    fn observe_robot(&self, robot: ObservedRobot);
+    fn observe_robot(&self, robot: RobotState);
 
     /// Receives a scan of a range scanner.
-    fn observe_range_scan(&self, scan: ObservedRangeScan);
-}
-
-/// A scan of a range scanner.
-#[derive(Clone, Debug, PartialEq)]
-pub struct ObservedRangeScan {
-    /// The points, without the correction of their station.
-    pub scan: Arc<RangePoints>,
-    /// The correction of the station.
-    pub map_from_odom: Transform,
-}
-
-/// Joint positions and base pose of the robot at one time.
-#[derive(Clone, Debug, PartialEq)]
-pub struct ObservedRobot {
-    /// Time of the reading.
-    pub stamp: Stamp,
-    /// The same time on this process's clock; the time of arrival if the stamp comes from another
-    /// clock.
-    pub captured_at: Instant,
-    /// Pose of the base, with the correction of its station.
-    pub world_from_base: Transform,
-    /// Positions of [`Arm::joints`](crate::config::Arm::joints), radians or meters.
-    pub positions: Vec<f64>,
-}
-
-/// A camera image as received from the device, with its pose.
-#[derive(Clone, Debug)]
-pub struct ObservedImage {
-    /// Name of the camera.
-    pub camera: Arc<str>,
-    /// Mid-exposure.
-    pub stamp: Stamp,
-    /// Mid-exposure on this process's clock; the time of arrival if the stamp comes from another
-    /// clock.
-    pub captured_at: Instant,
-    /// Width and height, pixels.
-    pub size_px: [u32; 2],
-    /// The pixels, not undistorted.
-    pub pixels: ObservedPixels,
-    /// Pose of the camera at the stamp, with the correction of its station.
-    pub world_from_camera: Transform,
-    /// Focal length, pixels.
-    pub focal_px: [f64; 2],
-    /// Principal point, pixels.
-    pub principal_px: [f64; 2],
-}
-
-/// Pixels of an [`ObservedImage`].
-#[derive(Clone, Debug)]
-pub enum ObservedPixels {
-    /// A complete JPEG file.
-    Jpeg(Arc<[u8]>),
-    /// `[height, width, 3]`, sRGB.
-    Rgb(Arc<[u8]>),
+    fn observe_range_scan(&self, scan: RangeScan);
 }
 
 /// State of the input that the run reads while the input thread runs.
@@ -447,15 +393,15 @@ impl Pump {
         }
         let image = &posed_image.image;
         let pixels = match image.format {
-            PixelFormat::Rgb8 => ObservedPixels::Rgb(image.data.clone()),
+            PixelFormat::Rgb8 => LivePixels::Rgb(image.data.clone()),
             // Some cameras send JPEG without tables, which browsers cannot show.
             PixelFormat::Jpeg => match drivers::jpeg::first_image(&image.data) {
-                Ok(jpeg) => ObservedPixels::Jpeg(jpeg.as_ref().into()),
+                Ok(jpeg) => LivePixels::Jpeg(jpeg.as_ref().into()),
                 Err(_) => return,
             },
             PixelFormat::Bgr8 | PixelFormat::Gray8 | PixelFormat::Yuv { .. } | PixelFormat::Png => {
                 match image.decode_rgb() {
-                    Ok(rgb) => ObservedPixels::Rgb(rgb.into()),
+                    Ok(rgb) => LivePixels::Rgb(rgb.into()),
                     // The join counts images that do not decode.
                     Err(_) => return,
                 }
@@ -470,17 +416,18 @@ impl Pump {
         let pose = |stations: &Stations| {
             stations.corrected_pose(&image.camera, &posed_image.world_from_camera)
         };
-        self.observer.observe(ObservedImage {
+        self.observer.observe(LiveImage {
             camera: image.camera.clone(),
             stamp: image.stamp,
             captured_at: self.captured_at(image.stamp),
             size_px: image.size_px,
             pixels,
-            world_from_camera: self
-                .input
-                .stations
-                .as_ref()
-                .map_or(posed_image.world_from_camera, pose),
+            world_from_camera: Some(
+                self.input
+                    .stations
+                    .as_ref()
+                    .map_or(posed_image.world_from_camera, pose),
+            ),
             focal_px,
             principal_px,
         });
@@ -497,7 +444,7 @@ impl Pump {
             return;
         };
         let stations = self.input.stations.as_ref();
-        self.observer.observe_robot(ObservedRobot {
+        self.observer.observe_robot(RobotState {
             stamp: reading.stamp,
             captured_at: self.captured_at(reading.stamp),
             world_from_base: stations.map_or(reading.world_from_base, |stations| {
@@ -511,7 +458,7 @@ impl Pump {
     fn publish_range_scan(&self, scan: Arc<RangePoints>) {
         let stations = self.input.stations.as_ref();
         let map_from_odom = stations.map_or_else(Transform::identity, Stations::map_from_odom);
-        self.observer.observe_range_scan(ObservedRangeScan {
+        self.observer.observe_range_scan(RangeScan {
             scan,
             map_from_odom,
         });

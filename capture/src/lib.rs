@@ -56,10 +56,7 @@ pub use calibration_images::{
 };
 pub use config::{ConfigError, Override, Rig};
 pub use error::{Error, Result};
-pub use feed::{
-    Feed, FeedItem, Input, InputObserver, InputResult, InputTimes, ObservedImage, ObservedPixels,
-    ObservedRangeScan, ObservedRobot,
-};
+pub use feed::{Feed, FeedItem, Input, InputObserver, InputResult, InputTimes};
 pub use join::{Change, Counts, Join, JoinEvent, PosedImage, Rejection, SampleUse};
 pub use nearest_name::nearest_name;
 pub use notes::Notes;

@@ -260,7 +260,7 @@ impl DecisionLog {
     /// Creates the log in a run folder. A run that continues from a checkpoint writes a separate
     /// file and keeps the earlier log.
     pub fn create(folder: &Path, settings: Settings) -> crate::Result<Self> {
-        // A replay needs the earlier log up to the checkpoint, and this one after it.
+        // The earlier log reproduces the model of the checkpoint. This one continues from it.
         let name = match settings.from_step {
             None => FILE.to_owned(),
             Some(step) => FILE.replace('.', &format!("-from-{step}.")),

@@ -62,14 +62,15 @@ impl DepthSource {
         let mut model = methods::load(gpu, &self.model)
             .with_context(|| format!("--depth-from {model_name}"))?
             .method;
-        let n_all = Some(keyframes.len());
         let mut totals = Filled::default();
         let mut n_images = 0;
         // Rendered depth is no measurement with which test images could be compared.
-        let lacking = |keyframe: &&mut Arc<Keyframe>| {
-            keyframe.split != Split::Test && keyframe.lacks_dense_depth()
-        };
-        for (ix, keyframe) in keyframes.iter_mut().filter(lacking).enumerate() {
+        let mut lacking: Vec<&mut Arc<Keyframe>> = keyframes
+            .iter_mut()
+            .filter(|keyframe| keyframe.split != Split::Test && keyframe.lacks_dense_depth())
+            .collect();
+        let n_all = Some(lacking.len());
+        for (ix, keyframe) in lacking.iter_mut().enumerate() {
             let filled = fill(model.as_mut(), keyframe)?;
             n_images += usize::from(filled.n_rendered > 0);
             totals = Filled {

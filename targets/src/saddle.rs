@@ -292,8 +292,8 @@ pub(crate) fn find_near(
             }
         }
     }
-    // A negative response is a blob. Weak responses are allowed, unlike in `find`: the prediction is
-    // evidence, and the ring checks the contrast.
+    // A negative response is a blob. Weak responses are allowed, unlike in `find`: the prediction
+    // is evidence, and the ring checks the contrast.
     let (_, x, y) = best.filter(|best| best.0 > 0.0)?;
     ring(plane, stationary_point(plane, x, y), radius_px)
 }

@@ -3,8 +3,8 @@
 use crate::pictures::picture::live_jpeg;
 use crate::topics::keyframes::KeyframePoses;
 use crate::topics::live_images::LiveImages;
-use crate::topics::robot::{RobotDescription, RobotState};
-use crate::topics::updates::{KeyframePose, LiveImage, Status};
+use crate::topics::robot::RobotDescription;
+use crate::topics::updates::{KeyframePose, Status};
 use crate::{Error, Hub};
 use ::foxglove::messages::{
     CameraCalibration, CompressedImage, FrameTransform, FrameTransforms, JointState, JointStates,
@@ -14,6 +14,8 @@ use ::foxglove::{
     Channel, ChannelBuilder, Context, FoxgloveError, PartialMetadata, RawChannel, Schema,
     WebSocketServer,
 };
+use keyframe::LiveImage;
+use keyframe::RobotState;
 use kinematics::urdf::{Joint, JointKind};
 use kinematics::{Stamp, Transform};
 use nalgebra::{Translation3, UnitQuaternion};

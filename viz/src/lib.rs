@@ -29,17 +29,15 @@ pub use error::Error;
 #[cfg(feature = "foxglove")]
 pub use foxglove_server::FoxgloveServer;
 pub use hub::{Hub, PendingRender};
+pub use keyframe::{LiveImage, LivePixels, RangeScan, RobotState};
 pub use pictures::picture_times::{NewestKeyframe, ShownPicture, TrainedKeyframes};
 pub use server::access::{Role, Token, Tokens};
 pub use server::certificate::Certificate;
 pub use server::{Server, ServerConfig, Sharing};
 pub use session::protocol::{BASE_PROTOCOL_VERSION, Control, PROTOCOL_VERSION};
 pub use topics::observation_map::{ObservationMap, ObservedCell};
-pub use topics::range_scan::RangeScan;
-pub use topics::robot::{MeshFormat, RobotDescription, RobotMesh, RobotState};
-pub use topics::updates::{
-    Guidance, KeyframePose, LiveImage, LivePixels, ModelStatus, RunResult, SceneHint, Status,
-};
+pub use topics::robot::{MeshFormat, RobotDescription, RobotMesh};
+pub use topics::updates::{Guidance, KeyframePose, ModelStatus, RunResult, SceneHint, Status};
 
 /// Handles the messages of a client, one per line, and panics if a result is inconsistent.
 #[cfg(fuzzing)]

@@ -60,7 +60,7 @@ pub(super) fn measure(rig_file: &Path, seed: u64, scan_secs: f64) -> Result<RigR
         },
         &ignore_progress,
     )?;
-    // The scan takes its simulated time. Only the estimation is timed.
+    // Only the estimation is timed: the scan takes as long as the robot moves.
     let started = Instant::now();
     let found = match calibrate_scene(&data, &[Refine::Auto], Some(&given)) {
         Ok(found) => found,

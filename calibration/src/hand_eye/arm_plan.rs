@@ -191,6 +191,7 @@ impl<'a> ArmPlan<'a> {
             seed: self.n_refined as u64,
             ..self.poses
         };
+        // One pose at a time: the next estimate may change what is worth measuring.
         match suggest_next_poses(input, calibration, &options).pop() {
             Some(next) => match next.joints {
                 Some(joints) => ArmStep::Move { joints, purpose: next.relation },

@@ -9,12 +9,12 @@ use nalgebra::{
     Translation3, UnitQuaternion, Vector3,
 };
 
-/// Motions with a smaller rotation, in radians, have no usable rotation axis: the error of a robot's
-/// rotation is of this size.
+/// Motions with a smaller rotation, in radians, have no usable rotation axis: the errors of their
+/// rotations may be as large.
 const MIN_ROTATION_RAD: f64 = 1e-3;
 
-/// Maximum number of pairs of samples in a solution: all pairs of 63 samples. It bounds the time for
-/// recordings with hundreds of samples; every sample still is in many pairs.
+/// Maximum number of pairs of samples in a solution: all pairs of 63 samples. It bounds the time
+/// for recordings with hundreds of samples; every sample still is in many pairs.
 const MAX_MOTIONS: usize = 2000;
 
 /// A closed-form solver.
@@ -100,8 +100,8 @@ pub(crate) fn nearest_rotation(correlation: &Matrix3<f64>) -> Option<UnitQuatern
     }
     let u = svd.u?;
     let v_t = svd.v_t?;
-    // If the product of the two orthogonal matrices is a reflection, the direction with the smallest
-    // singular value is flipped, which costs the least.
+    // If the product of the two orthogonal matrices is a reflection, the direction with the
+    // smallest singular value is flipped, which costs the least.
     let mirror = Matrix3::from_diagonal(&Vector3::new(1.0, 1.0, (u * v_t).determinant().signum()));
     Some(UnitQuaternion::from_rotation_matrix(
         &Rotation3::from_matrix_unchecked(u * mirror * v_t),
@@ -175,8 +175,8 @@ pub(super) fn relative_scale(
     (rows > 4).then_some(())?;
     let mut matrix = DMatrix::zeros(rows, 4);
     let mut right = DVector::zeros(rows);
-    // (R_a - 1) t - s R t_b = -t_a: the equation of `with_translation`, with the scale as the fourth
-    // unknown.
+    // (R_a - 1) t - s R t_b = -t_a: the equation of `with_translation`, with the scale as the
+    // fourth unknown.
     for (ix, motion) in motions.iter().enumerate() {
         let factor = motion.a.rotation.to_rotation_matrix().into_inner() - Matrix3::identity();
         matrix.fixed_view_mut::<3, 3>(3 * ix, 0).copy_from(&factor);

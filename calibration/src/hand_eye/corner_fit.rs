@@ -106,7 +106,8 @@ impl CornerProblem<'_> {
         let n_intrinsics = self.n_intrinsics;
         let n_shared = N_PARAMS + n_intrinsics + self.n_joints();
         let corner_px = self.noise.corner_px.unwrap_or(1.0);
-        // Shared parameters first (solution, intrinsics, joint offsets), then the error of the pose.
+        // Shared parameters first (solution, intrinsics, joint offsets), then the error of the
+        // pose.
         let mut rows = [vec![0.0; n_shared + 6], vec![0.0; n_shared + 6]];
         for point in &view.points {
             let at = chain.at(&point.point_in_board);

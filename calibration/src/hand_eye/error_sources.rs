@@ -3,8 +3,8 @@
 use super::evaluation::Scatter;
 use super::pose_fit::HandEyeNoise;
 
-/// Errors that industrial arms, boards and calibrated cameras stay below. Lower limits would warn of
-/// inexpensive arms, whose errors are no mistake.
+/// Errors that industrial arms, boards and calibrated cameras stay below. Lower limits would warn
+/// of inexpensive arms, whose errors are no mistake.
 const MAX_RMS_PX: f64 = 3.0;
 const MAX_SCATTER: Scatter = Scatter { mm: 5.0, deg: 0.5 };
 /// Residual of sharp corners after a separate fit of each image, pixels. A right lens leaves a few

@@ -172,8 +172,8 @@ pub(super) fn check_uncertainty(
     })
 }
 
-/// Largest standard deviation in any direction of three parameters, starting with parameter `first`,
-/// and this direction.
+/// Largest standard deviation in any direction of three parameters, starting with parameter
+/// `first`, and this direction.
 fn worst_direction(covariance: &DMatrix<f64>, first: usize) -> (f64, Vector3<f64>) {
     let eigen = SymmetricEigen::new(covariance.fixed_view::<3, 3>(first, first).into_owned());
     let ix = eigen.eigenvalues.imax();

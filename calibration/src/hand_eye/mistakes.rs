@@ -14,8 +14,8 @@ use kinematics::Transform;
 /// do, from 2 cm on.
 const MAX_POSITION_M: f64 = 20.0;
 
-/// A variant of the input explains it if it fits better by this factor. A smaller factor would blame
-/// good input whose variant fits slightly better by chance.
+/// A variant of the input explains it if it fits better by this factor. A smaller factor would
+/// blame good input whose variant fits slightly better by chance.
 const MUCH_BETTER: f64 = 5.0;
 
 /// Checks that the positions can be meters.
@@ -263,8 +263,8 @@ fn shift_mistake(
 /// A shift by chance does not fit this many samples better.
 const MIN_SHIFTED_SAMPLES: usize = 6;
 
-/// Median distance of the samples, meters, if each board is paired with the robot pose of the sample
-/// `shift` places later. Infinite if they have no solution.
+/// Median distance of the samples, meters, if each board is paired with the robot pose of the
+/// sample `shift` places later. Infinite if they have no solution.
 fn shifted_median_m(input: &HandEyeInput<'_>, samples: &[Sample], shift: isize) -> f64 {
     let shifted: Vec<Sample> = samples
         .iter()

@@ -187,6 +187,8 @@ pub fn calibrate_hand_eye(input: &HandEyeInput<'_>) -> Result<HandEyeCalibration
         .collect();
     excitation::check_rotations(&robot_poses, "flange").map_err(refused)?;
 
+    // Samples without a board and repeated ones are reported, but not used: a repetition would
+    // count as an independent measurement.
     let Sorted {
         usable: samples,
         without_board,

@@ -228,8 +228,8 @@ fn initial_rotations(homography: &Matrix3<f64>) -> Vec<UnitQuaternion<f64>> {
         h[(1, 0)] - h[(2, 0)] * v.y,
         h[(1, 1)] - h[(2, 1)] * v.y,
     );
-    // In a frame whose z axis is the ray to the origin, the derivative is the upper left part of the
-    // rotation, up to scale.
+    // In a frame whose z axis is the ray to the origin, the derivative is the upper left part of
+    // the rotation, up to scale.
     let to_ray = Rotation3::rotation_between(&Vector3::z(), &v.push(1.0))
         .unwrap_or_else(Rotation3::identity);
     let projection = Matrix2x3::new(1.0, 0.0, -v.x, 0.0, 1.0, -v.y) * to_ray.matrix();
@@ -241,8 +241,8 @@ fn initial_rotations(homography: &Matrix3<f64>) -> Vec<UnitQuaternion<f64>> {
     if largest.is_nan() || largest <= 0.0 {
         return Vec::new();
     }
-    // The scale follows from the unit length of the columns: the largest singular value of the upper
-    // left part of a rotation is 1.
+    // The scale follows from the unit length of the columns: the largest singular value of the
+    // upper left part of a rotation is 1.
     let upper = scaled / largest;
     let rest = Matrix2::identity() - upper.transpose() * upper;
     // The third row completes the columns to unit length. Its sign is not determined: these are the
@@ -372,8 +372,8 @@ fn refine(
     let pose = least_squares::minimize(&problem, initial, &options)
         .ok()?
         .state;
-    // All corners are judged, not only the used ones: a corner that the initial set left out may fit
-    // the refined pose.
+    // All corners are judged, not only the used ones: a corner that the initial set left out may
+    // fit the refined pose.
     let errors: Vec<f64> = points
         .iter()
         .map(|point| {

@@ -457,7 +457,8 @@ fn update_variances(
         .unwrap_or_else(|| DMatrix::zeros(N_PARAMS, N_PARAMS));
     let x_information = inverse.view((0, 0), (6, 6)).into_owned().try_inverse();
     // Per variance: the part of the squared residuals that it explains, and the part that is
-    // expected with the current values, given that the parameters were fitted to the same residuals.
+    // expected with the current values, given that the parameters were fitted to the same
+    // residuals.
     let mut squares = vec![0.0; n_variances];
     let mut expected = vec![0.0; n_variances];
     // The Fisher information about the variances, and the derivative of the logarithm of the
@@ -513,7 +514,8 @@ fn update_variances(
                 }
         })
         .collect();
-    // Satterthwaite 1946: a variance with `n` degrees of freedom has a relative variance of `2 / n`.
+    // Satterthwaite 1946: a variance with `n` degrees of freedom has a relative variance of `2 /
+    // n`.
     let relative_variance = fisher.try_inverse().map_or(f64::INFINITY, |covariance| {
         log_volume_by_variance.dot(&(covariance * &log_volume_by_variance))
     });

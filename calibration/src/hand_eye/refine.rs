@@ -217,8 +217,8 @@ impl Progress {
 
     /// The result, without standard deviations of other parameters and without doubts.
     fn finish(self, intrinsics: Option<Intrinsics>) -> Refined {
-        // The 95 % quantile of F with 6 and n degrees of freedom relative to that of chi squared / 6,
-        // to first order.
+        // The 95 % quantile of F with 6 and n degrees of freedom relative to that of chi squared /
+        // 6, to first order.
         const CHI_SQUARED_95: f64 = 12.59;
         let Self {
             samples,

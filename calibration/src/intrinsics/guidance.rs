@@ -12,8 +12,8 @@ use std::fmt;
 
 /// Number of images after which no more are needed, if they cover everything.
 pub const RECOMMENDED_IMAGES: usize = 15;
-/// A part of the image is covered if this fraction of its cells has corners. A target rarely reaches
-/// the outermost cells, so all of them would ask too much.
+/// A part of the image is covered if this fraction of its cells has corners. A target rarely
+/// reaches the outermost cells, so all of them would ask too much.
 const MIN_COVERED_FRAC: f64 = 0.5;
 /// A tilt in a direction counts from this angle between the normal of the target and the line of
 /// sight. It is below the 20 degrees that are asked for, because people tilt by eye.

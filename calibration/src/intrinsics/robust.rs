@@ -19,7 +19,7 @@ pub(super) const MIN_POINTS: usize = 6;
 /// Normal errors do not (1 in 10^8), but errors of real corners have longer tails.
 const MAX_SIGMAS: f64 = 6.0;
 /// An image is rejected if its median error exceeds this multiple of that of the others. Blurred
-/// images have errors of a few times the usual ones, and still contribute.
+/// images have larger errors, but still contribute.
 const MAX_MEDIAN_RATIO: f64 = 6.0;
 /// An image is rejected if more than this fraction of its corners are. Then the minority may be
 /// right.

@@ -132,8 +132,8 @@ fn start_of(kept: &Kept, fit: &RobustFit) -> Option<Bundle> {
     if let Some(positions) = positions {
         return Some(fit.fit.state.with_images(positions.into_iter()));
     }
-    // The fit rejected an image that the reference keeps. Its pose is estimated with the lens of the
-    // fit, so that both models are compared on the same images.
+    // The fit rejected an image that the reference keeps. Its pose is estimated with the lens of
+    // the fit, so that both models are compared on the same images.
     let intrinsics = &fit.fit.state.intrinsics;
     let pose = |points: &Vec<BoardPoint>| {
         Some(board_pose::board_pose(intrinsics, points)?.camera_from_board)

@@ -69,11 +69,12 @@ impl Corrections {
         for (ix, param) in layout.params.iter().enumerate() {
             let delta = step[ix];
             match *param {
-                // Motions are composed as a whole, when their first part comes; the other five parts
-                // are skipped below.
+                // Motions are composed as a whole, when their first part comes; the other five
+                // parts are skipped below.
                 CalibrationParam::Extrinsics(camera, 0) => {
                     let correction = &mut self.by_camera[camera];
-                    // The step moves the camera; the correction maps points to the moved camera.
+                    // The step is a motion of the camera. The correction is applied after
+                    // `camera_from_world`, so it is the inverse.
                     let extrinsics = transform::exp(&twist(step, ix), -1.0)
                         * rigid_transform(
                             correction.rotation_rad.into(),

@@ -35,6 +35,14 @@ impl PoseSigmas {
     }
 }
 
+/// Variance of the sum of two parameters.
+fn variance_of_sum(solution: &Solution, n_params: usize, [a, b]: [usize; 2]) -> f64 {
+    let mut weights = DVector::zeros(n_params);
+    weights[a] += 1.0;
+    weights[b] += 1.0;
+    solution.variance(&weights)
+}
+
 impl ExtrinsicsCovariance {
     /// `None` if no extrinsics were estimated.
     pub(super) fn of(
@@ -52,23 +60,22 @@ impl ExtrinsicsCovariance {
             params.iter().enumerate().filter_map(first).unzip();
         (!cameras.is_empty()).then_some(())?;
         let ixs: Vec<usize> = begins.iter().flat_map(|begin| *begin..begin + 6).collect();
-        let variance = |a: usize, b: usize| {
-            let mut weights = DVector::zeros(params.len());
-            weights[a] += 1.0;
-            weights[b] += 1.0;
-            solution.variance(&weights)
-        };
-        // The variance of a doubled parameter is four times its own.
-        let own: Vec<f64> = ixs.iter().map(|ix| variance(*ix, *ix) / 4.0).collect();
-        let entry = |row: usize, column: usize| {
+        // The solution returns variances of weighted sums. Covariances follow from those of the
+        // sums of two parameters. The variance of a doubled parameter is four times its own.
+        let own: Vec<f64> = ixs
+            .iter()
+            .map(|ix| variance_of_sum(solution, params.len(), [*ix, *ix]) / 4.0)
+            .collect();
+        let covariance = DMatrix::from_fn(ixs.len(), ixs.len(), |row, column| {
             if row == column {
                 own[row]
             } else {
-                0.5 * (variance(ixs[row], ixs[column]) - own[row] - own[column])
+                let sum = variance_of_sum(solution, params.len(), [ixs[row], ixs[column]]);
+                0.5 * (sum - own[row] - own[column])
             }
-        };
+        });
         Some(Self {
-            covariance: DMatrix::from_fn(ixs.len(), ixs.len(), entry),
+            covariance,
             cameras,
         })
     }
@@ -88,7 +95,8 @@ impl ExtrinsicsCovariance {
         other: &str,
         first_from_other: &Transform,
     ) -> Option<PoseSigmas> {
-        let (first, other) = (self.ix(first)?, self.ix(other)?);
+        let first = self.ix(first)?;
+        let other = self.ix(other)?;
         // A motion of the first camera moves the other one in the opposite direction.
         let mut by_first = Matrix6::zeros();
         for part in 0..6 {

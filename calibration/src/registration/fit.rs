@@ -123,8 +123,8 @@ pub(super) fn fit(
                 &subset,
                 &options,
             );
-            // The noise decreases as the images get aligned, and with it the residuals that count as
-            // outliers.
+            // The noise decreases as the images get aligned, and with it the residuals that count
+            // as outliers.
             options.noise = sums::noise_of(&sums)?;
             let solution = step(&layout, &corrections, &subset, &sums);
             corrections.apply_step(&layout, &solution.step);

@@ -47,11 +47,13 @@ use std::sync::Arc;
 use sums::PixelSubset;
 
 /// Maximum number of images for estimating the shared parameters. The next constant is the maximum
-/// number of partners of each image.
+/// number of partners of each image. Time grows with the product of both; a few parameters do not
+/// need more images.
 const MAX_IMAGES: usize = 100;
 const PARTNERS_PER_IMAGE: usize = 4;
 /// Maximum number of validation images.
 const MAX_VALIDATION_IMAGES: usize = 32;
+/// Covariances follow from the scatter between pairs, which fewer do not determine.
 const MIN_PAIRS: usize = 4;
 /// Corrections smaller than this number of standard deviations are not significant.
 const MIN_SIGNIFICANT_SIGMAS: f64 = 3.0;
@@ -98,7 +100,8 @@ pub fn align(keyframes: &[Arc<Keyframe>], choice: &CameraRefinement) -> Option<A
         fit: None,
         corrections: Corrections::none(scene.cameras.len()),
     };
-    let (mut trials, mut unobservable) = (Vec::new(), Vec::new());
+    let mut trials = Vec::new();
+    let mut unobservable = Vec::new();
     let mut kept = match choice {
         CameraRefinement::Always(set) | CameraRefinement::AlwaysAndWatch(set, _) => {
             let variant = scene.model(*set, &uncorrected)?;
@@ -109,7 +112,8 @@ pub fn align(keyframes: &[Arc<Keyframe>], choice: &CameraRefinement) -> Option<A
             scene.select_params(candidates, uncorrected, &mut trials, &mut unobservable)
         }
         CameraRefinement::AlwaysAndTry(set, candidates) => {
-            let all = [&[*set], &candidates[..]].concat(); // Registration has no first step, so it tries every set.
+            // Registration has no first step, so it tries every set.
+            let all = [&[*set], &candidates[..]].concat();
             scene.select_params(&all, uncorrected, &mut trials, &mut unobservable)
         }
     };
@@ -125,9 +129,23 @@ pub fn align(keyframes: &[Arc<Keyframe>], choice: &CameraRefinement) -> Option<A
     Some(report::alignment(&scene, &kept, trials, unobservable))
 }
 
+/// Whether image poses may be estimated.
 fn includes_image_poses(choice: &CameraRefinement) -> bool {
     let mut sets = choice.candidates().iter().copied().chain([choice.always()]);
     sets.any(|set| set.contains(ParamSet::IMAGE_POSES))
+}
+
+/// Indices of the images of a split.
+fn images_of_split(images: &[PreparedImage], split: Split) -> Vec<usize> {
+    (0..images.len())
+        .filter(|ix| images[*ix].keyframe.split == split)
+        .collect()
+}
+
+/// At most `max_count` of the indices, spread evenly.
+fn subsample(ixs: &[usize], max_count: usize) -> Vec<usize> {
+    let n = ixs.len().min(max_count);
+    (0..n).map(|ix| ixs[ix * ixs.len() / n]).collect()
 }
 
 /// Corrections for a set of parameters.
@@ -155,19 +173,8 @@ impl AlignmentScene {
             .par_iter()
             .filter_map(|keyframe| PreparedImage::new(keyframe, camera_of(keyframe)))
             .collect();
-        let images_of_split = |split: Split| -> Vec<usize> {
-            (0..images.len())
-                .filter(|ix| images[*ix].keyframe.split == split)
-                .collect()
-        };
-        let subsample = |ixs: &[usize], max_count: usize| -> Vec<usize> {
-            let n = ixs.len().min(max_count);
-            (0..n).map(|ix| ixs[ix * ixs.len() / n]).collect()
-        };
-        let (train, validation_images) = (
-            images_of_split(Split::Train),
-            images_of_split(Split::Validation),
-        );
+        let train = images_of_split(&images, Split::Train);
+        let validation_images = images_of_split(&images, Split::Validation);
         let views = Corrections::none(cameras.len()).views(&images, &Layout::default());
         let training_subset = subsample(&train, MAX_IMAGES);
         let pairs = pairs::choose(
@@ -177,9 +184,11 @@ impl AlignmentScene {
             &training_subset,
             PARTNERS_PER_IMAGE,
         );
-        let all_pairs = match for_poses && training_subset.len() < train.len() {
-            true => pairs::choose(&images, &views, &train, &train, PARTNERS_PER_IMAGE),
-            false => pairs.clone(),
+        // Poses of all images need pairs of all images; shared parameters do not.
+        let all_pairs = if for_poses && training_subset.len() < train.len() {
+            pairs::choose(&images, &views, &train, &train, PARTNERS_PER_IMAGE)
+        } else {
+            pairs.clone()
         };
         let validation_pairs = pairs::choose(
             &images,
@@ -231,44 +240,41 @@ impl AlignmentScene {
     /// Also estimates individual poses of the validation images, after all decisions, because these
     /// images are trained on later.
     fn with_validation_poses(&self, mut model: CalibrationModel) -> CalibrationModel {
-        let images_of_split = |split: Split| -> Vec<usize> {
-            (0..self.images.len())
-                .filter(|ix| self.images[*ix].keyframe.split == split)
-                .collect()
-        };
         let views = model.corrections.views(&self.images, &Layout::default());
-        let pose_of = |to: &usize| {
-            let pairs = pairs::choose(
-                &self.images,
-                &views,
-                &images_of_split(Split::Train),
-                &[*to],
-                PARTNERS_PER_IMAGE,
-            );
-            let image = &self.images[*to];
-            let correction = poses::fit_one(
-                &self.images,
-                &views,
-                &pairs,
-                &model.corrections.by_camera[image.camera],
-                PixelSubset::All,
-            )?;
-            Some((
-                image.camera,
-                image.keyframe.stamp.0,
-                correction.drift_at(image.keyframe.stamp),
-            ))
-        };
-        let found: Vec<_> = images_of_split(Split::Validation)
+        let train = images_of_split(&self.images, Split::Train);
+        let validation_images = images_of_split(&self.images, Split::Validation);
+        let found: Vec<(usize, [f64; 6])> = validation_images
             .par_iter()
-            .filter_map(pose_of)
+            .filter_map(|ix| Some((*ix, self.drift_of(*ix, &model.corrections, &views, &train)?)))
             .collect();
-        for (camera, stamp, drift) in found {
-            model.corrections.by_camera[camera]
+        // Added after all of them are estimated: an entry changes the interpolated drift of others.
+        for (ix, drift) in found {
+            let image = &self.images[ix];
+            model.corrections.by_camera[image.camera]
                 .drift
-                .insert(stamp, drift);
+                .insert(image.keyframe.stamp.0, drift);
         }
         model
+    }
+
+    /// Drift of one image relative to training images.
+    fn drift_of(
+        &self,
+        image_ix: usize,
+        corrections: &Corrections,
+        views: &[view::CorrectedView],
+        train: &[usize],
+    ) -> Option<[f64; 6]> {
+        let pairs = pairs::choose(&self.images, views, train, &[image_ix], PARTNERS_PER_IMAGE);
+        let image = &self.images[image_ix];
+        let correction = poses::fit_one(
+            &self.images,
+            views,
+            &pairs,
+            &corrections.by_camera[image.camera],
+            PixelSubset::All,
+        )?;
+        Some(correction.drift_at(image.keyframe.stamp))
     }
 
     /// Restricts corrections to the parameters of a layout.
@@ -294,6 +300,7 @@ impl AlignmentScene {
         trials: &mut Vec<Trial>,
         unobservable: &mut Vec<Unobservable>,
     ) -> CalibrationModel {
+        // Forward: the candidates in order of likelihood, each together with those kept so far.
         let mut kept = uncorrected;
         let mut kept_sets: Vec<ParamSet> = Vec::new();
         for candidate in candidates {
@@ -320,6 +327,8 @@ impl AlignmentScene {
             }
             trials.push(trial);
         }
+        // Backward: a later parameter may explain what an earlier one was kept for. The last one
+        // was tested with all others.
         for kept_set in kept_sets.clone().into_iter().rev().skip(1) {
             let other_params = kept_sets
                 .iter()
@@ -361,31 +370,31 @@ impl AlignmentScene {
             variant: &variant.corrections,
             noise,
         };
-        let trial = |scores: Vec<validation::ImageScore>| {
-            let gains_db = scores.iter().map(|score| {
-                let camera = self.images[score.image_ix].camera;
-                (&*self.cameras[camera], score.variant_db - score.baseline_db)
-            });
-            let (baseline_db, variant_db): (Vec<f64>, Vec<f64>) = scores
-                .iter()
-                .map(|score| (score.baseline_db, score.variant_db))
-                .unzip();
-            log::debug!("alignment: {params}: without {baseline_db:.2?}, with {variant_db:.2?} dB");
-            let trial = Trial::of(Candidate::Cameras(params), &baseline_db, &variant_db);
-            trial.with_enough_images().with_cameras(gains_db)
-        };
-        match (
-            params.contains(ParamSet::IMAGE_POSES),
-            baseline.set.contains(ParamSet::IMAGE_POSES),
-        ) {
-            (true, _) => trial(comparison.scores_with_free_poses()),
-            (false, false) => trial(comparison.scores()),
-            // Individual image poses hide shared errors, so a parameter is rejected only if neither
-            // comparison shows a gain.
-            (false, true) => Some(trial(comparison.scores()))
-                .filter(|trial| trial.kept)
-                .unwrap_or_else(|| trial(comparison.scores_with_free_poses())),
+        if params.contains(ParamSet::IMAGE_POSES) {
+            return self.trial(params, &comparison.scores_with_free_poses());
         }
+        let trial = self.trial(params, &comparison.scores());
+        // Individual image poses hide shared errors, so a parameter is rejected only if neither
+        // comparison shows a gain.
+        if !trial.kept && baseline.set.contains(ParamSet::IMAGE_POSES) {
+            return self.trial(params, &comparison.scores_with_free_poses());
+        }
+        trial
+    }
+
+    /// The trial of a set of parameters with these scores.
+    fn trial(&self, params: ParamSet, scores: &[validation::ImageScore]) -> Trial {
+        let gains_db = scores.iter().map(|score| {
+            let camera = self.images[score.image_ix].camera;
+            (&*self.cameras[camera], score.variant_db - score.baseline_db)
+        });
+        let (baseline_db, variant_db): (Vec<f64>, Vec<f64>) = scores
+            .iter()
+            .map(|score| (score.baseline_db, score.variant_db))
+            .unzip();
+        log::debug!("alignment: {params}: without {baseline_db:.2?}, with {variant_db:.2?} dB");
+        let trial = Trial::of(Candidate::Cameras(params), &baseline_db, &variant_db);
+        trial.with_enough_images().with_cameras(gains_db)
     }
 }
 
@@ -393,12 +402,12 @@ impl CalibrationModel {
     /// Whether any of the parameters differs significantly from zero.
     fn has_significant(&self, params: &Layout) -> bool {
         let Some(fit) = &self.fit else { return false };
-        let is_significant = |ix: usize| {
-            let value = self.corrections.value(fit.layout.params[ix]);
-            value.abs() > MIN_SIGNIFICANT_SIGMAS * fit.solution.sigma(ix)
+        fit.layout.params.iter().enumerate().any(|(ix, param)| {
+            // A mostly unobservable parameter has a value only by its prior.
+            params.params.contains(param)
+                && self.corrections.value(*param).abs()
+                    > MIN_SIGNIFICANT_SIGMAS * fit.solution.sigma(ix)
                 && fit.solution.unobservable_frac(ix) < 0.5
-        };
-        (0..fit.layout.n())
-            .any(|ix| params.params.contains(&fit.layout.params[ix]) && is_significant(ix))
+        })
     }
 }

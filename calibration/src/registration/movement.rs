@@ -18,6 +18,7 @@ use super::layout::Layout;
 use super::pairs::{self, Pair};
 use super::poses;
 use super::prepared_image::PreparedImage;
+use super::solve::Solution;
 use super::sums::{self, Noise, PixelSubset, ResidualOptions};
 use super::validation;
 use super::view::CorrectedView;
@@ -31,19 +32,22 @@ use std::sync::Arc;
 
 /// Number of latest images of a camera that are considered as the start of a movement.
 pub const MOVEMENT_WINDOW: usize = 16;
-/// Maximum number of reference images. If there are more, every second one is dropped.
+/// Maximum number of reference images. If there are more, every second one is dropped. The time to
+/// choose partners for an image grows with their number.
 const MAX_REFERENCES: usize = 48;
 /// Maximum and minimum number of reference images with which an image is compared.
 const MAX_PARTNERS: usize = 6;
 const MIN_PARTNERS: usize = 2;
 /// Sum of stakes at which a movement is reported: at most 1 % false alarms in 1000 images.
 const ALARM: f64 = 1e5;
-/// Fraction of the stake that is bet on each image.
+/// Fraction of the stake that is bet on each image. A larger bet detects movements with fewer
+/// images, but one bad image costs most of the stake.
 const BET_FRAC: f64 = 0.8;
 /// Prediction gain that is ignored, dB: other calibration errors may improve neighboring images by
 /// this much.
 const MARGIN_DB: f64 = 0.2;
-/// Losses are clamped to this value, dB.
+/// Losses are clamped to this value, dB. Without a limit, the factor on the stake could become
+/// negative.
 const MAX_LOSS_DB: f64 = 0.5;
 /// Smaller movements are not reported, because they may be due to other calibration errors.
 const MIN_ROTATION_RAD: f64 = 0.005;
@@ -160,6 +164,7 @@ impl MovementDetector {
             },
         );
         let ix = self.images.len() - 1;
+        // Only references are partners: recent images may be on the other side of the movement.
         let pairs = pairs::choose(
             &self.images,
             &self.views,
@@ -180,8 +185,10 @@ impl MovementDetector {
             if let Some(movement) = self.movement(&recent) {
                 return Some(movement);
             }
+            // A rejected movement would be found again with the next image.
             recent.iter().for_each(|ix| self.states[*ix].stake = 1.0);
         }
+        // The window moves on: without a movement, its oldest image becomes a reference.
         if recent.len() > MOVEMENT_WINDOW {
             self.states[recent[0]] = ImageState {
                 is_reference: true,
@@ -192,6 +199,7 @@ impl MovementDetector {
         None
     }
 
+    /// Adds an image with its view.
     fn add(&mut self, image: PreparedImage, state: ImageState) {
         if let Some(view) =
             CorrectedView::new(&image, &CameraCorrection::default(), &Layout::default())
@@ -218,6 +226,8 @@ impl MovementDetector {
 
     /// Bets on an image, then estimates its own motion.
     fn bet(&mut self, ix: usize, pairs: &[Pair], recent: &[usize]) {
+        // Each bet is placed before the image is used: its motion is predicted from earlier images
+        // only. Otherwise, the factor would exceed 1 on average.
         let Some(noise) = self.noise(pairs) else {
             return;
         };
@@ -233,6 +243,7 @@ impl MovementDetector {
         self.states[ix].motion = self.own_motion(ix, pairs);
     }
 
+    /// Noise of the residuals of pairs, without a motion.
     fn noise(&self, pairs: &[Pair]) -> Option<Noise> {
         sums::noise_of(&sums::of_free_pairs(
             &self.images,
@@ -266,7 +277,8 @@ impl MovementDetector {
             &rigid_transform([a, b, c].into(), [x, y, z].into()).inverse(),
             1.0,
         );
-        let (linear, angular) = (twist.linear_m_s, twist.angular_rad_s);
+        let linear = twist.linear_m_s;
+        let angular = twist.angular_rad_s;
         Some((
             Vector6::new(
                 linear.x, linear.y, linear.z, angular.x, angular.y, angular.z,
@@ -277,7 +289,8 @@ impl MovementDetector {
 
     /// Mean of the motions of several images, weighted by their information.
     fn mean_motion(&self, ixs: &[usize]) -> Option<Vector6<f64>> {
-        let (mut information, mut weighted) = (Matrix6::zeros(), Vector6::zeros());
+        let mut information = Matrix6::zeros();
+        let mut weighted = Vector6::zeros();
         for (motion, weight) in ixs.iter().filter_map(|ix| self.states[*ix].motion.as_ref()) {
             information += weight;
             weighted += weight * motion;
@@ -290,13 +303,15 @@ impl MovementDetector {
     /// Share of the individual motions that their mean explains, weighted by information.
     fn explained_frac(&self, ixs: &[usize]) -> Option<f64> {
         let mean = self.mean_motion(ixs)?;
-        let squares = |motion: &dyn Fn(&Vector6<f64>) -> Vector6<f64>| {
-            let motions = ixs.iter().filter_map(|ix| self.states[*ix].motion.as_ref());
-            motions
-                .map(|(own, weight)| motion(own).dot(&(weight * motion(own))))
-                .sum::<f64>()
-        };
-        Some(1.0 - squares(&|own| own - mean) / squares(&|own| *own))
+        Some(1.0 - self.squares(ixs, &mean) / self.squares(ixs, &Vector6::zeros()))
+    }
+
+    /// Sum of the squared differences of individual motions from a motion, weighted by information.
+    fn squares(&self, ixs: &[usize], motion: &Vector6<f64>) -> f64 {
+        ixs.iter()
+            .filter_map(|ix| self.states[*ix].motion.as_ref())
+            .map(|(own, weight)| (own - motion).dot(&(weight * (own - motion))))
+            .sum::<f64>()
     }
 
     /// Gain in the prediction of an image from reference images if its camera has moved by
@@ -311,6 +326,7 @@ impl MovementDetector {
     /// The movement that explains the recent images of a camera; `None` if it is too small or
     /// explains too little.
     fn movement(&mut self, recent: &[usize]) -> Option<CameraMovement> {
+        // The start with the largest stake gives a first estimate of the motion.
         let stake = |position: &usize| self.states[recent[*position]].stake;
         let start = (0..recent.len()).max_by(|one, other| stake(one).total_cmp(&stake(other)))?;
         let motion = self.mean_motion(&recent[start..])?;
@@ -325,40 +341,18 @@ impl MovementDetector {
             .iter()
             .map(|pairs| gain(pairs).unwrap_or(0.0))
             .collect();
-        let since = |position: &usize| {
-            gains[*position..]
-                .iter()
-                .map(|gain| gain.clamp(-1.0, 1.0))
-                .sum::<f64>()
-        };
+        // Clamped, so that one image with a large gain does not decide alone.
+        let clamped: Vec<f64> = gains.iter().map(|gain| gain.clamp(-1.0, 1.0)).collect();
+        let since = |position: &usize| clamped[*position..].iter().sum::<f64>();
         let start = (0..recent.len()).max_by(|one, other| since(one).total_cmp(&since(other)))?;
         let moved = &recent[start..];
         let explained_frac = self.explained_frac(moved)?;
-        // All images since then are registered together.
-        for ix in moved {
-            self.images[*ix].camera = 1;
-        }
-        let pairs = pairs[start..].concat();
-        let mut initial = Corrections::none(2);
-        initial.by_camera[1] = correction_of(&motion);
-        let found = fit::fit(&self.images, &pairs, Layout::extrinsics_of(1), &initial);
-        for ix in moved {
-            self.images[*ix].camera = 0; // If the movement is rejected, they become references.
-        }
-        let found = found?;
+        let found = self.register_moved(moved, &pairs[start..].concat(), &motion)?;
         let CameraCorrection {
             rotation_rad,
             translation_m,
             ..
         } = found.corrections.by_camera[1];
-        let sigma = |vector: [f64; 3], begin: usize| {
-            let axis = Vector3::from(vector)
-                .try_normalize(0.0)
-                .unwrap_or_else(Vector3::zeros);
-            let mut weights = DVector::zeros(6);
-            weights.rows_mut(begin, 3).copy_from(&axis);
-            found.solution.variance(&weights).sqrt()
-        };
         let first = &self.images[moved[0]].keyframe;
         let movement = CameraMovement {
             camera: first.camera.to_string(),
@@ -366,8 +360,8 @@ impl MovementDetector {
             since_secs: 0.0,
             rotation_rad,
             translation_m,
-            rotation_sigma_rad: sigma(rotation_rad, 3),
-            translation_sigma_m: sigma(translation_m, 0),
+            rotation_sigma_rad: sigma_along(&found.solution, rotation_rad, 3),
+            translation_sigma_m: sigma_along(&found.solution, translation_m, 0),
             n_images: moved.len(),
         };
         log::debug!(
@@ -376,6 +370,27 @@ impl MovementDetector {
         let is_large = Vector3::from(rotation_rad).norm() > MIN_ROTATION_RAD
             || Vector3::from(translation_m).norm() > MIN_TRANSLATION_M;
         (is_large && explained_frac > MIN_EXPLAINED_FRAC).then_some(movement)
+    }
+
+    /// Registers all moved images together against the references, starting with a motion. They
+    /// count as those of a second camera, whose extrinsics are estimated.
+    fn register_moved(
+        &mut self,
+        moved: &[usize],
+        pairs: &[Pair],
+        motion: &Vector6<f64>,
+    ) -> Option<fit::Fit> {
+        for ix in moved {
+            self.images[*ix].camera = 1;
+        }
+        let mut initial = Corrections::none(2);
+        initial.by_camera[1] = correction_of(motion);
+        let found = fit::fit(&self.images, pairs, Layout::extrinsics_of(1), &initial);
+        // If the movement is rejected, they become references.
+        for ix in moved {
+            self.images[*ix].camera = 0;
+        }
+        found
     }
 
     /// Drops every second reference image if there are too many.
@@ -392,10 +407,21 @@ impl MovementDetector {
     }
 }
 
+/// Standard deviation of a vector along itself, whose parameters start at `begin`.
+fn sigma_along(solution: &Solution, vector: [f64; 3], begin: usize) -> f64 {
+    let axis = Vector3::from(vector)
+        .try_normalize(0.0)
+        .unwrap_or_else(Vector3::zeros);
+    let mut weights = DVector::zeros(6);
+    weights.rows_mut(begin, 3).copy_from(&axis);
+    solution.variance(&weights).sqrt()
+}
+
 fn is_used(keyframe: &Keyframe) -> bool {
     keyframe.split != Split::Test && keyframe.depth.is_some()
 }
 
+/// Residuals of all pixels at the finest level: new images are already aligned approximately.
 fn finest(noise: Noise) -> ResidualOptions {
     ResidualOptions {
         level: 0,

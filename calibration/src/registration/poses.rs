@@ -20,7 +20,10 @@ use std::collections::BTreeMap;
 /// constant) is the accuracy of arms.
 const MAX_POSE_ERROR: [f64; 2] = [0.02, 0.02];
 const MIN_POSE_ERROR: [f64; 2] = [2e-4, 3.5e-4];
+/// Maximum number of steps at each level, the finest first. The coarsest of four levels starts
+/// farthest from the solution.
 const MAX_ITERATIONS: [usize; 4] = [6, 4, 4, 6];
+/// Maximum step, relative to the expected pose errors.
 const MAX_STEP: f64 = 2.0;
 
 /// Estimates the poses of all images that are connected by pairs, starting from given corrections.
@@ -35,16 +38,8 @@ pub(super) fn fit(
 ) -> Option<Corrections> {
     let layout = Layout::default();
     let mut corrections = from.clone();
-    let slot_of_image: BTreeMap<usize, usize> = {
-        let mut ixs: Vec<usize> = pairs.iter().flat_map(|pair| [pair.from, pair.to]).collect();
-        ixs.sort_unstable();
-        ixs.dedup();
-        ixs.into_iter()
-            .enumerate()
-            .map(|(slot, ix)| (ix, slot))
-            .collect()
-    };
-    // Meters and radians.
+    let slot_of_image = slots(pairs);
+    // Motion of each image so far, meters and radians, towards which the prior is relative.
     let mut total = vec![Vector6::zeros(); slot_of_image.len()];
     let mut pose_error = MAX_POSE_ERROR;
     let n_levels = images.iter().map(|image| image.levels.len()).max()?;
@@ -61,7 +56,8 @@ pub(super) fn fit(
         &options,
     ))?;
     for level in (0..n_levels).rev() {
-        (options.level, options.occlusion_frac) = (level, OCCLUSION_FRAC[level]);
+        options.level = level;
+        options.occlusion_frac = OCCLUSION_FRAC[level];
         let scales = scales(pose_error);
         for _ in 0..MAX_ITERATIONS[level] {
             let sums =
@@ -88,21 +84,38 @@ pub(super) fn fit(
             }
             log::debug!("alignment: poses, level {level}, {:?}", options.noise);
         }
-        pose_error = [0, 1].map(|part| {
-            let squares = total
-                .iter()
-                .map(|total| total.fixed_rows::<3>(3 * part).norm_squared())
-                .sum::<f64>();
-            (squares / (3 * total.len()) as f64)
-                .sqrt()
-                .clamp(MIN_POSE_ERROR[part], MAX_POSE_ERROR[part])
-        });
+        pose_error = rms_motion(&total);
     }
     let depth_m = median_depth_m(images);
     for correction in &mut corrections.by_camera {
         correction.drift_weight = drift_weight(&correction.drift, depth_m);
     }
     Some(corrections)
+}
+
+/// Places of the images of pairs among the unknowns, in the order of their indices.
+fn slots(pairs: &[Pair]) -> BTreeMap<usize, usize> {
+    let mut ixs: Vec<usize> = pairs.iter().flat_map(|pair| [pair.from, pair.to]).collect();
+    ixs.sort_unstable();
+    ixs.dedup();
+    ixs.into_iter()
+        .enumerate()
+        .map(|(slot, ix)| (ix, slot))
+        .collect()
+}
+
+/// Root mean square of the motions along one axis, meters and radians, within the bounds of the
+/// expected pose error.
+fn rms_motion(motions: &[Vector6<f64>]) -> [f64; 2] {
+    [0, 1].map(|part| {
+        let squares = motions
+            .iter()
+            .map(|motion| motion.fixed_rows::<3>(3 * part).norm_squared())
+            .sum::<f64>();
+        (squares / (3 * motions.len()) as f64)
+            .sqrt()
+            .clamp(MIN_POSE_ERROR[part], MAX_POSE_ERROR[part])
+    })
 }
 
 /// Estimates the pose of one image relative to others that stay fixed, from a subset of its pixels.
@@ -131,23 +144,14 @@ pub(super) fn fit_one(
         noise: INITIAL_NOISE,
         part,
     };
-    let sums_of =
-        |image_correction: &CameraCorrection, options: &ResidualOptions| -> Option<Vec<PairSums>> {
-            let view = CorrectedView::new(image, image_correction, &Layout::default())?;
-            let from = |pair: &Pair| Side {
-                image: &images[pair.from],
-                view: &views[pair.from],
-            };
-            Some(
-                pairs
-                    .iter()
-                    .map(|pair| sums::of_second([from(pair), Side { image, view: &view }], options))
-                    .collect(),
-            )
-        };
+    let sums_of = |image_correction: &CameraCorrection, options: &ResidualOptions| {
+        let view = CorrectedView::new(image, image_correction, &Layout::default())?;
+        Some(sums_to(images, views, pairs, &view, options))
+    };
     options.noise = sums::noise_of(&sums_of(&image_correction, &options)?)?;
     for level in (0..n_levels).rev() {
-        (options.level, options.occlusion_frac) = (level, OCCLUSION_FRAC[level]);
+        options.level = level;
+        options.occlusion_frac = OCCLUSION_FRAC[level];
         for _ in 0..MAX_ITERATIONS[level] {
             let sums = sums_of(&image_correction, &options)?;
             options.noise = sums::noise_of(&sums)?;
@@ -167,6 +171,31 @@ pub(super) fn fit_one(
     Some(image_correction)
 }
 
+/// Contributions of pairs to the motion of the image that they lead to, which has this view.
+fn sums_to(
+    images: &[PreparedImage],
+    views: &[CorrectedView],
+    pairs: &[Pair],
+    view: &CorrectedView,
+    options: &ResidualOptions,
+) -> Vec<PairSums> {
+    pairs
+        .iter()
+        .map(|pair| {
+            let from = Side {
+                image: &images[pair.from],
+                view: &views[pair.from],
+            };
+            let to = Side {
+                image: &images[pair.to],
+                view,
+            };
+            sums::of_second([from, to], options)
+        })
+        .collect()
+}
+
+/// Scales of the six parameters of a pose.
 fn scales([translation_m, rotation_rad]: [f64; 2]) -> Vector6<f64> {
     Vector6::new(
         translation_m,
@@ -178,6 +207,7 @@ fn scales([translation_m, rotation_rad]: [f64; 2]) -> Vector6<f64> {
     )
 }
 
+/// Median depth of all samples, which converts rotations to lengths.
 fn median_depth_m(images: &[PreparedImage]) -> f64 {
     let mut depths: Vec<f64> = images
         .iter()
@@ -198,7 +228,7 @@ fn remove_mean(
     slot_of_image: &BTreeMap<usize, usize>,
     images: &[PreparedImage],
 ) {
-    const MAX_STANDARD_ERRORS: f64 = 2.0; // Standard errors.
+    const MAX_STANDARD_ERRORS: f64 = 2.0;
     let mut of_camera: BTreeMap<usize, Vec<usize>> = BTreeMap::new();
     for (ix, slot) in slot_of_image {
         of_camera.entry(images[*ix].camera).or_default().push(*slot);
@@ -245,6 +275,16 @@ fn apply_step(correction: &mut CameraCorrection, image: &PreparedImage, step: &V
     ];
 }
 
+/// Product of a block-diagonal matrix and a vector.
+fn block_products(blocks: &[Matrix6<f64>], x: &[Vector6<f64>]) -> Vec<Vector6<f64>> {
+    blocks.iter().zip(x).map(|(block, x)| block * x).collect()
+}
+
+/// Dot product of vectors of blocks.
+fn dot(a: &[Vector6<f64>], b: &[Vector6<f64>]) -> f64 {
+    a.iter().zip(b).map(|(a, b)| a.dot(b)).sum::<f64>()
+}
+
 /// Blocks of the normal equations, scaled by the expected pose errors.
 struct NormalEquations {
     diagonal: Vec<Matrix6<f64>>,
@@ -288,13 +328,10 @@ impl NormalEquations {
         equations
     }
 
+    /// The product of the symmetric matrix and a vector. Each block off the diagonal counts twice,
+    /// once transposed.
     fn multiply(&self, x: &[Vector6<f64>]) -> Vec<Vector6<f64>> {
-        let mut product: Vec<Vector6<f64>> = self
-            .diagonal
-            .iter()
-            .zip(x)
-            .map(|(block, x)| block * x)
-            .collect();
+        let mut product = block_products(&self.diagonal, x);
         for (row, column, block) in &self.off_diagonal {
             product[*row] += block * x[*column];
             product[*column] += block.tr_mul(&x[*row]);
@@ -304,26 +341,18 @@ impl NormalEquations {
 
     /// Solves the equations by conjugate gradients, preconditioned by the blocks on the diagonal.
     fn solve(&self) -> Vec<Vector6<f64>> {
+        // An inexact step is corrected by the next Gauss-Newton step.
         const MAX_CG_ITERATIONS: usize = 60;
+        // Of the squared residual.
         const TOLERANCE: f64 = 1e-8;
         let inverses: Vec<Matrix6<f64>> = self
             .diagonal
             .iter()
             .map(|block| block.try_inverse().unwrap_or_else(Matrix6::zeros))
             .collect();
-        let dot = |a: &[Vector6<f64>], b: &[Vector6<f64>]| {
-            a.iter().zip(b).map(|(a, b)| a.dot(b)).sum::<f64>()
-        };
-        let precondition = |r: &[Vector6<f64>]| {
-            inverses
-                .iter()
-                .zip(r)
-                .map(|(block, r)| block * r)
-                .collect::<Vec<_>>()
-        };
         let mut x = vec![Vector6::zeros(); self.rhs.len()];
         let mut residual = self.rhs.clone();
-        let mut preconditioned = precondition(&residual);
+        let mut preconditioned = block_products(&inverses, &residual);
         let mut direction = preconditioned.clone();
         let mut residual_product = dot(&residual, &preconditioned);
         let target_product = TOLERANCE * residual_product;
@@ -337,7 +366,7 @@ impl NormalEquations {
                 x[ix] += direction[ix] * length;
                 residual[ix] -= product[ix] * length;
             }
-            preconditioned = precondition(&residual);
+            preconditioned = block_products(&inverses, &residual);
             let next = dot(&residual, &preconditioned);
             for (direction, preconditioned) in direction.iter_mut().zip(&preconditioned) {
                 *direction = preconditioned + *direction * (next / residual_product);

@@ -134,6 +134,7 @@ pub struct Unobservable {
     pub moves_cameras: Vec<String>,
 }
 
+/// Summarizes the accepted model.
 pub(super) fn alignment(
     scene: &AlignmentScene,
     kept: &CalibrationModel,
@@ -149,17 +150,11 @@ pub(super) fn alignment(
     if kept.set.contains(ParamSet::IMAGE_POSES) {
         estimates.extend(scene.cameras.iter().enumerate().map(|(camera, name)| {
             let drift = &kept.corrections.by_camera[camera].drift;
-            let rms = |parts: std::ops::Range<usize>| {
-                let squares = drift
-                    .values()
-                    .map(|drift| drift[parts.clone()].iter().map(|x| x * x).sum::<f64>());
-                (squares.sum::<f64>() / drift.len().max(1) as f64).sqrt()
-            };
             Estimate::ImagePoses {
                 camera: name.to_string(),
                 n_images: drift.len(),
-                rms_m: rms(3..6),
-                rms_rad: rms(0..3),
+                rms_m: rms(drift, 3..6),
+                rms_rad: rms(drift, 0..3),
             }
         }));
     }
@@ -168,6 +163,8 @@ pub(super) fn alignment(
         .iter()
         .zip(&kept.corrections.by_camera)
         .map(|(name, correction)| (name.to_string(), correction.clone()));
+    // Without accepted parameters, there are no corrections, rather than corrections of zero:
+    // keyframes then stay as they are.
     let corrections = if kept.set.is_empty() {
         BTreeMap::new()
     } else {
@@ -188,6 +185,14 @@ pub(super) fn alignment(
     }
 }
 
+/// Root mean square over the images of the norm of some parts of their drift.
+fn rms(drift: &BTreeMap<i64, [f64; 6]>, parts: std::ops::Range<usize>) -> f64 {
+    let squares = drift
+        .values()
+        .map(|drift| drift[parts.clone()].iter().map(|x| x * x).sum::<f64>());
+    (squares.sum::<f64>() / drift.len().max(1) as f64).sqrt()
+}
+
 /// The estimate of the group of parameters that starts with a parameter; `None` if the parameter is
 /// not the first of its group.
 fn estimate(
@@ -206,6 +211,8 @@ fn estimate(
     };
     Some(match param {
         CalibrationParam::Extrinsics(camera, 0) => {
+            // The correction maps to the corrected camera; the report names the motion of the
+            // camera.
             let wrong_extrinsics = rigid_transform(
                 correction(camera).rotation_rad.into(),
                 correction(camera).translation_m.into(),
@@ -220,14 +227,11 @@ fn estimate(
             ))
         }
         CalibrationParam::DepthPose(camera, 0) => {
-            let (rotation, translation) = (
-                correction(camera).depth_rotation_rad.into(),
-                correction(camera).depth_translation_m.into(),
-            );
+            let correction = correction(camera);
             Estimate::DepthPose(pose_estimate(
                 name(camera),
-                rotation,
-                translation,
+                correction.depth_rotation_rad.into(),
+                correction.depth_translation_m.into(),
                 solution,
                 ix,
             ))
@@ -260,6 +264,7 @@ fn estimate(
     })
 }
 
+/// A motion with its uncertainty. Its six parameters start at `begin`: translation, then rotation.
 fn pose_estimate(
     camera: String,
     rotation: Vector3<f64>,
@@ -267,44 +272,54 @@ fn pose_estimate(
     solution: &Solution,
     begin: usize,
 ) -> PoseEstimate {
-    let part = |vector: Vector3<f64>, begin: usize| {
-        let axis = vector.try_normalize(0.0).unwrap_or_else(Vector3::zeros);
-        let mut weights = DVector::zeros(solution.step.len());
-        weights.rows_mut(begin, 3).copy_from(&axis);
-        (
-            vector.norm(),
-            solution.variance(&weights).sqrt(),
-            axis.into(),
-        )
-    };
-    let (rotation_rad, rotation_sigma_rad, rotation_axis) = part(rotation, begin + 3);
-    let (translation_m, translation_sigma_m, translation_axis) = part(translation, begin);
+    // Standard deviations along the estimated motion, which say whether its size is significant.
+    let rotation_axis = unit_or_zero(rotation);
+    let translation_axis = unit_or_zero(translation);
     PoseEstimate {
         camera,
-        rotation_rad,
-        rotation_sigma_rad,
-        rotation_axis,
-        translation_m,
-        translation_sigma_m,
-        translation_axis,
+        rotation_rad: rotation.norm(),
+        rotation_sigma_rad: sigma_along(solution, rotation_axis, begin + 3),
+        rotation_axis: rotation_axis.into(),
+        translation_m: translation.norm(),
+        translation_sigma_m: sigma_along(solution, translation_axis, begin),
+        translation_axis: translation_axis.into(),
     }
+}
+
+/// Direction of a vector; zero for a zero vector.
+fn unit_or_zero(vector: Vector3<f64>) -> Vector3<f64> {
+    vector.try_normalize(0.0).unwrap_or_else(Vector3::zeros)
+}
+
+/// Standard deviation of three parameters, starting at `begin`, along a direction.
+fn sigma_along(solution: &Solution, axis: Vector3<f64>, begin: usize) -> f64 {
+    let mut weights = DVector::zeros(solution.step.len());
+    weights.rows_mut(begin, 3).copy_from(&axis);
+    solution.variance(&weights).sqrt()
 }
 
 /// Unobservable directions of a fit.
 pub(super) fn unobservable(scene: &AlignmentScene, fit: &Fit) -> Vec<Unobservable> {
-    let is_not_translation = |ix: usize| {
-        !matches!(
-            fit.layout.params[ix],
-            CalibrationParam::Extrinsics(_, 0..3) | CalibrationParam::DepthPose(_, 0..3)
-        )
-    };
-    let directions = fit.solution.unobservable(is_not_translation);
+    // Directions that are pure translations first: they are the most common ones, and the easiest
+    // to understand.
+    let directions = fit
+        .solution
+        .unobservable(|ix| !is_translation(fit.layout.params[ix]));
     directions
         .iter()
         .map(|direction| describe(scene, &fit.layout.params, direction))
         .collect()
 }
 
+/// Whether a parameter is a translation of a camera or of a depth frame.
+fn is_translation(param: CalibrationParam) -> bool {
+    matches!(
+        param,
+        CalibrationParam::Extrinsics(_, 0..3) | CalibrationParam::DepthPose(_, 0..3)
+    )
+}
+
+/// Describes an unobservable direction by its significant parts.
 fn describe(
     scene: &AlignmentScene,
     params: &[CalibrationParam],
@@ -321,9 +336,8 @@ fn describe(
         .iter()
         .fold(0.0f64, |largest, value| largest.max(value.abs()));
     let is_significant = |ix: usize, n: usize| {
-        scaled[ix..ix + n]
-            .iter()
-            .any(|value| value.abs() > MIN_SHARE * largest)
+        let mut parts = scaled[ix..ix + n].iter();
+        parts.any(|value| value.abs() > MIN_SHARE * largest)
     };
     let axis = |ix: usize| {
         let along = Vector3::from_fn(|row, _| direction[ix + row]).normalize();
@@ -332,6 +346,7 @@ fn describe(
     let mut parts = Vec::new();
     for (ix, param) in params.iter().enumerate() {
         let name = |camera: usize| &scene.cameras[camera];
+        // Translations and rotations are described once, at their first part.
         parts.extend(match *param {
             CalibrationParam::Extrinsics(camera, 0) if is_significant(ix, 3) => Some(format!(
                 "translation of camera {:?} along its own {} axis",
@@ -377,6 +392,7 @@ fn describe(
             _ => None,
         });
     }
+    // `None` if the direction changes anything but extrinsics.
     let moved = (0..params.len())
         .filter(|ix| is_significant(*ix, 1))
         .map(|ix| match params[ix] {
@@ -414,6 +430,7 @@ impl Alignment {
             Some(correction) => correction.color_from_depth(keyframe, depth),
             None => keyframe.world_from_camera.inverse() * depth.world_from_camera,
         });
+        // Without the depth map, so that it is not scaled pixel by pixel for a pose.
         let aligned = self.corrected(&Arc::new(Keyframe {
             depth: None,
             ..keyframe.clone()
@@ -474,6 +491,8 @@ impl Alignment {
                         correction.translation_m.into(),
                     )
                 });
+        // The movement was estimated in the axes of the corrected camera, but movements are applied
+        // before the correction of the extrinsics.
         let before_extrinsics = extrinsics.inverse() * movement.correction() * extrinsics;
         let (rotation_rad, translation_m) = rotation_and_translation(&before_extrinsics);
         let since_secs = (movement.since_nanos - first.0) as f64 * 1e-9;
@@ -515,10 +534,12 @@ impl Alignment {
                 trial.gain_db,
                 trial.standard_error_db,
                 trial.n_images,
-                match trial.kept {
-                    true => "accepted",
-                    false if trial.n_images < MIN_VALIDATION_IMAGES => "too few images",
-                    false => "rejected",
+                if trial.kept {
+                    "accepted"
+                } else if trial.n_images < MIN_VALIDATION_IMAGES {
+                    "too few images"
+                } else {
+                    "rejected"
                 }
             ));
         }
@@ -599,7 +620,8 @@ impl std::fmt::Display for Estimate {
                 sigma,
                 unobservable_frac,
             } => {
-                let (value, sigma) = (value.to_degrees(), sigma.to_degrees());
+                let value = value.to_degrees();
+                let sigma = sigma.to_degrees();
                 write!(
                     f,
                     "offset of joint {joint_ix}: {value:+.3} +- {sigma:.3} degrees"

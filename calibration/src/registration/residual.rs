@@ -6,7 +6,7 @@
 //! move). The separate pose of the depth camera and the rolling shutter are our additions.
 
 use super::prepared_image::{DepthSample, GrayImage, PreparedImage, depth_at, point};
-use super::view::CorrectedView;
+use super::view::{CorrectedView, unit_twist};
 use nalgebra::Vector3;
 
 /// Resolutions that differ by at most this factor count as equal.
@@ -80,13 +80,12 @@ impl Correspondence {
         let depth_pixel = j.view.depth_pixel(&in_depth);
         let reading = depth_at(j.image.keyframe.depth.as_ref()?, depth_pixel)?;
         let factor = j.view.depth_factor;
-        let (reading_m, reading_gradient) = (
-            factor * reading.value,
-            reading.gradient.map(|gradient| factor * gradient),
-        );
+        let reading_m = factor * reading.value;
+        let reading_gradient = reading.gradient.map(|gradient| factor * gradient);
         if (reading_m - in_depth.z).abs() > occlusion_frac * reading_m {
             return None;
         }
+        // Slope of the surface at the reading: change of depth per meter across the axis.
         let tilt =
             [0, 1].map(|axis| reading_gradient[axis] * j.view.depth_focal_px[axis] / reading_m);
         let [level_i, level_j] = levels([i, j], [in_i.z, in_j.z], level);
@@ -140,10 +139,11 @@ impl Correspondence {
             &self.i,
             &gradient_by_point(i.view, &self.i, -tone.gain),
         );
-        let (gradient_j, gradient_i) = (
-            mid_exposure_gradient(j.view, &self.j, &read_j),
-            mid_exposure_gradient(i.view, &self.i, &read_i),
-        );
+        let gradient_j = mid_exposure_gradient(j.view, &self.j, &read_j);
+        let gradient_i = mid_exposure_gradient(i.view, &self.i, &read_i);
+        // With respect to the point in the axes of camera i. The point is fixed in camera i, so a
+        // motion of that camera carries the point along and changes only its place in j; a motion
+        // of j moves the point against it.
         let gradient_through_poses = i
             .view
             .world_from_camera
@@ -161,7 +161,8 @@ impl Correspondence {
             }
         }
         let n = row.len();
-        (row[n - 2], row[n - 1]) = (-self.i.brightness, -1.0);
+        row[n - 2] = -self.i.brightness;
+        row[n - 1] = -1.0;
     }
 
     /// Jacobian of [`Correspondence::depth`] with respect to the parameters; zero for gain and
@@ -177,6 +178,7 @@ impl Correspondence {
         let [fx, fy] = j.view.depth_focal_px;
         let q = &self.in_depth;
         let [sx, sy] = self.reading_gradient;
+        // The reading changes with the pixel, and the depth of the point by itself.
         let along_z = -(sx * fx * q.x + sy * fy * q.y) / (q.z * q.z) - 1.0;
         let in_depth = Vector3::new(sx * fx / q.z, sy * fy / q.z, along_z) * weight;
         let gradient_j = j.view.color_from_depth.rotation * in_depth;
@@ -195,6 +197,7 @@ impl Correspondence {
             row[scale] += weight * self.reading_m;
         }
         if let (Some(lens), true) = (j.lens, j.view.shares_lens) {
+            // The lens moves the pixel at which the depth of `j` is read.
             for axis in 0..2 {
                 let gradient = weight * self.reading_gradient[axis];
                 row[lens + axis] +=
@@ -211,7 +214,8 @@ impl Correspondence {
 fn levels([i, j]: [Side<'_>; 2], [z_i, z_j]: [f64; 2], level: usize) -> [usize; 2] {
     let texel_m =
         |side: Side<'_>, z_m: f64| z_m * side.image.level(level).texel_px() / side.view.focal_px[0];
-    let (of_i, of_j) = (texel_m(i, z_i), texel_m(j, z_j));
+    let of_i = texel_m(i, z_i);
+    let of_j = texel_m(j, z_j);
     let octaves = |share: f64| {
         (0..3)
             .take_while(|octave| share > HALF_OCTAVE * f64::from(1 << octave))
@@ -266,12 +270,12 @@ impl<'a> ParamColumns<'a> {
 
     /// Columns for the motion of the camera only: meters, then radians, starting at `begin`.
     pub(super) fn free(view: &'a CorrectedView, begin: usize) -> Self {
-        let unit = |axis: usize| Vector3::from_fn(|row, _| if row == axis { 1.0 } else { 0.0 });
-        let motion = |part: usize| match part {
-            0..3 => (begin + part, unit(part), Vector3::zeros()),
-            _ => (begin + part, Vector3::zeros(), unit(part - 3)),
-        };
-        let columns = (0..6).map(motion).collect();
+        let columns = (0..6)
+            .map(|part| {
+                let twist = unit_twist(part);
+                (begin + part, twist.linear_m_s, twist.angular_rad_s)
+            })
+            .collect();
         Self {
             columns,
             ..Self::still(view)
@@ -309,6 +313,8 @@ fn row_held_gradient(
     observed: &ObservedPoint,
     gradient: &Vector3<f64>,
 ) -> Vector3<f64> {
+    // Implicit differentiation of the row: position = displaced point - drift * share(row), and the
+    // row follows from the position.
     let drift = -view.readout_secs * view.twist.apparent_velocity(&observed.still);
     let z = observed.read.z;
     let row = Vector3::new(
@@ -328,6 +334,7 @@ fn mid_exposure_gradient(
     row_held - row_held.cross(&view.twist.angular_rad_s) * (observed.share * view.readout_secs)
 }
 
+/// Adds the derivatives with respect to the parameters that move a camera.
 fn add_motion(
     param_columns: &ParamColumns<'_>,
     point: &Vector3<f64>,
@@ -341,6 +348,7 @@ fn add_motion(
     }
 }
 
+/// Adds the derivatives with respect to a motion of a point: translation, then rotation.
 fn add_twist(row: &mut [f64], point: &Vector3<f64>, gradient: &Vector3<f64>, sign: f64) {
     let lever = point.cross(gradient);
     for axis in 0..3 {
@@ -368,6 +376,7 @@ fn add_depth(
     if let Some(scale) = i.depth_scale {
         row[scale] += in_depth.dot(&correspondence.point_in_depth_i);
     }
+    // The depth reading stays at its pixel; the lens moves the ray of that pixel.
     if let (Some(lens), true) = (i.lens, i.view.shares_lens) {
         for axis in 0..2 {
             row[lens + axis] -= in_depth[axis] * correspondence.point_in_depth_i[axis];
@@ -378,6 +387,8 @@ fn add_depth(
     }
 }
 
+/// Adds the derivatives with respect to the lens of a color camera: the point stays, and its pixel
+/// moves.
 fn add_lens(
     param_columns: &ParamColumns<'_>,
     observed: &ObservedPoint,

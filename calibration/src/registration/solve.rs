@@ -61,9 +61,10 @@ impl Solution {
         let mut step = DVector::zeros(n);
         for (ix, observable) in is_observable.iter().enumerate() {
             let direction = eigen.eigenvectors.column(ix);
-            // A prior at zero, as strong as `INFLATION` residuals per direction. Components that the
-            // residuals do not determine return to zero: they may come from an earlier step in which
-            // the direction was another one.
+            // A prior at zero with a standard deviation of one scale. Its information is multiplied
+            // by `INFLATION`, because that of the residuals is too large by this factor. Components
+            // that the residuals do not determine return to zero: an earlier step may have moved
+            // them, when the directions were others.
             let length = if *observable {
                 (direction.dot(&gradient) - INFLATION * direction.dot(&values))
                     / (eigen.eigenvalues[ix] + INFLATION)

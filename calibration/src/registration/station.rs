@@ -78,6 +78,8 @@ pub fn register_station(
     new: &[Arc<Keyframe>],
     world_from_base: &Transform,
 ) -> Option<StationCorrection> {
+    // A base has one pose per station, so its six parameters are always estimated together. The
+    // decision is the same as for cameras: significant, and better on validation images.
     let scene = StationScene::new(reference, new, world_from_base)?;
     let (estimate, solution, noise) = scene.fit()?;
     let trial = scene.evaluate(&estimate, noise);
@@ -155,9 +157,11 @@ fn base_motion(
 
 /// Describes an unobservable direction.
 fn describe(direction: &DVector<f64>) -> String {
+    // A part that is much smaller than the other one, in units of the scales, is omitted.
     const MIN_SHARE: f64 = 0.1;
     let vector = |begin: usize| Vector3::from_fn(|row, _| direction[begin + row]);
-    let (translation, rotation) = (vector(0), vector(3));
+    let translation = vector(0);
+    let rotation = vector(3);
     let sizes = [
         translation.norm() / PRIOR_TRANSLATION_M,
         rotation.norm() / PRIOR_ROTATION_RAD,
@@ -201,61 +205,57 @@ impl StationScene {
             .map(|keyframe| keyframe.camera.clone())
             .collect();
         let names: Vec<Arc<str>> = names.into_iter().collect();
-        let images = |keyframes: &[Arc<Keyframe>]| -> Vec<PreparedImage> {
-            let used: Vec<&Arc<Keyframe>> = keyframes
-                .iter()
-                .filter(|keyframe| keyframe.split != Split::Test && keyframe.depth.is_some())
-                .collect();
-            let n = used.len().min(MAX_IMAGES);
-            let camera_of =
-                |keyframe: &Keyframe| names.partition_point(|name| *name < keyframe.camera);
-            (0..n)
-                .into_par_iter()
-                .filter_map(|ix| {
-                    let keyframe = used[ix * used.len() / n];
-                    PreparedImage::new(keyframe, camera_of(keyframe))
-                })
-                .collect()
-        };
-        let mut all = images(reference);
-        let first_new = all.len();
-        all.extend(images(new));
-        let initial_views = Corrections::none(names.len()).views(&all, &Layout::default());
-        let of = |in_new_station: bool, split: Split| -> Vec<usize> {
-            (0..all.len())
-                .filter(|ix| {
-                    (*ix >= first_new) == in_new_station && all[*ix].keyframe.split == split
-                })
-                .collect()
-        };
-        let pairs_across = |splits: [Split; 2]| -> Vec<Pair> {
-            let (earlier, later) = (of(false, splits[0]), of(true, splits[1]));
-            let pairs = |candidates: &[usize], targets: &[usize]| {
-                pairs::choose(
-                    &all,
-                    &initial_views,
-                    candidates,
-                    targets,
-                    PARTNERS_PER_IMAGE,
-                )
-            };
-            [pairs(&later, &earlier), pairs(&earlier, &later)].concat()
-        };
-        let pairs = pairs_across([Split::Train, Split::Train]);
-        let validation_pairs = [
-            pairs_across([Split::Train, Split::Validation]),
-            pairs_across([Split::Validation, Split::Train]),
-        ]
-        .concat();
-        let scene = Self {
+        let mut images = prepared(reference, &names);
+        let first_new = images.len();
+        images.extend(prepared(new, &names));
+        let initial_views = Corrections::none(names.len()).views(&images, &Layout::default());
+        let mut scene = Self {
             first_new,
             initial_views,
             world_from_base: *world_from_base,
-            pairs,
-            validation_pairs,
-            images: all,
+            pairs: Vec::new(),
+            validation_pairs: Vec::new(),
+            images,
         };
+        // A validation image of either station is predicted from training images of the other one.
+        scene.pairs = scene.pairs_across([Split::Train, Split::Train]);
+        scene.validation_pairs = [
+            scene.pairs_across([Split::Train, Split::Validation]),
+            scene.pairs_across([Split::Validation, Split::Train]),
+        ]
+        .concat();
         (scene.pairs.len() >= MIN_PAIRS).then_some(scene)
+    }
+
+    /// Indices of the images of a split at the new station or at earlier ones.
+    fn images_of(&self, in_new_station: bool, split: Split) -> Vec<usize> {
+        (0..self.images.len())
+            .filter(|ix| {
+                (*ix >= self.first_new) == in_new_station
+                    && self.images[*ix].keyframe.split == split
+            })
+            .collect()
+    }
+
+    /// Pairs between earlier images and new ones of these splits, in both directions.
+    fn pairs_across(&self, [earlier, later]: [Split; 2]) -> Vec<Pair> {
+        let earlier = self.images_of(false, earlier);
+        let later = self.images_of(true, later);
+        [
+            self.choose_pairs(&later, &earlier),
+            self.choose_pairs(&earlier, &later),
+        ]
+        .concat()
+    }
+
+    fn choose_pairs(&self, candidates: &[usize], targets: &[usize]) -> Vec<Pair> {
+        pairs::choose(
+            &self.images,
+            &self.initial_views,
+            candidates,
+            targets,
+            PARTNERS_PER_IMAGE,
+        )
     }
 
     /// Views with the base moved by the estimate. Only views of the new station move; they have
@@ -268,14 +268,17 @@ impl StationScene {
             (self.world_from_base.translation.vector + part(0)).into(),
             UnitQuaternion::identity(),
         );
-        let view = |(ix, view): (usize, &CorrectedView)| match ix >= self.first_new {
-            true => view.moved_with_frame(
-                &(motion * self.images[ix].keyframe.world_from_camera),
-                &world_from_pivot,
-            ),
-            false => view.clone(),
-        };
-        self.initial_views.iter().enumerate().map(view).collect()
+        self.initial_views
+            .iter()
+            .enumerate()
+            .map(|(ix, view)| {
+                if ix < self.first_new {
+                    return view.clone();
+                }
+                let world_from_camera = motion * self.images[ix].keyframe.world_from_camera;
+                view.moved_with_frame(&world_from_camera, &world_from_pivot)
+            })
+            .collect()
     }
 
     /// Estimates translation, then rotation, from coarse to fine.
@@ -289,10 +292,9 @@ impl StationScene {
         });
         let mut estimate = DVector::zeros(6);
         let n_levels = self.images.iter().map(|image| image.levels.len()).max()?;
-        let (level, occlusion_frac) = (n_levels - 1, OCCLUSION_FRAC[n_levels - 1]);
         let mut options = ResidualOptions {
-            level,
-            occlusion_frac,
+            level: n_levels - 1,
+            occlusion_frac: OCCLUSION_FRAC[n_levels - 1],
             noise: INITIAL_NOISE,
             part: PixelSubset::All,
         };
@@ -303,7 +305,8 @@ impl StationScene {
         let mut noise = sums_of(&estimate, &options)?.1;
         let mut last = None;
         for level in (0..n_levels).rev() {
-            (options.level, options.occlusion_frac) = (level, OCCLUSION_FRAC[level]);
+            options.level = level;
+            options.occlusion_frac = OCCLUSION_FRAC[level];
             for _ in 0..MAX_ITERATIONS {
                 options.noise = Noise {
                     photo: BRIGHTNESS_NOISE_INFLATION * noise.photo,
@@ -328,19 +331,19 @@ impl StationScene {
     /// from the other.
     fn evaluate(&self, estimate: &DVector<f64>, noise: Noise) -> Trial {
         let views = [&DVector::zeros(6), estimate].map(|estimate| self.views(estimate));
-        let validation_image_of = |pair: &Pair| {
-            if self.images[pair.to].keyframe.split == Split::Validation {
-                pair.to
-            } else {
-                pair.from
-            }
-        };
+        // Pairs go in both directions, so the validation image may be the first or the second.
         let (baseline_db, variant_db) = validation::scores(
             &self.images,
             &self.validation_pairs,
             &views,
             noise,
-            validation_image_of,
+            |pair| {
+                if self.images[pair.to].keyframe.split == Split::Validation {
+                    pair.to
+                } else {
+                    pair.from
+                }
+            },
         );
         log::debug!("station: without {baseline_db:.2?}, with {variant_db:.2?} dB");
         Trial::of(
@@ -350,6 +353,25 @@ impl StationScene {
         )
         .with_enough_images()
     }
+}
+
+/// Prepares at most [`MAX_IMAGES`] keyframes with depth, spread evenly.
+///
+/// * `names`: names of the cameras in ascending order.
+fn prepared(keyframes: &[Arc<Keyframe>], names: &[Arc<str>]) -> Vec<PreparedImage> {
+    let used: Vec<&Arc<Keyframe>> = keyframes
+        .iter()
+        .filter(|keyframe| keyframe.split != Split::Test && keyframe.depth.is_some())
+        .collect();
+    let n = used.len().min(MAX_IMAGES);
+    (0..n)
+        .into_par_iter()
+        .filter_map(|ix| {
+            let keyframe = used[ix * used.len() / n];
+            let camera_ix = names.partition_point(|name| *name < keyframe.camera);
+            PreparedImage::new(keyframe, camera_ix)
+        })
+        .collect()
 }
 
 /// Composes a motion with a small motion that follows it.

@@ -12,12 +12,12 @@ use rayon::prelude::*;
 /// as efficient as least squares for normal noise).
 const CAUCHY_SCALE: f64 = 2.385;
 /// Standard deviation of the prior on the gain, around 1. The next constant is that of the offset,
-/// around 0. They are wide: automatic exposure changes both by less between two images. Without a
-/// prior, a pair of even images would not determine them.
+/// around 0. They are wide, because exposures differ. Without a prior, a pair of even images would
+/// not determine them.
 const PRIOR_GAIN_DEVIATION: f64 = 0.2;
 const PRIOR_OFFSET: f64 = 30.0;
-/// Minimum number of samples of a pair. With fewer, gain and offset of the pair would absorb most of
-/// what the samples say.
+/// Minimum number of samples of a pair. With fewer, gain and offset of the pair would absorb most
+/// of what the samples say.
 const MIN_SAMPLES: usize = 12;
 
 /// Scatter of the residuals: brightness on a scale of 0 to 255, depth in meters at 1 m.

@@ -32,7 +32,7 @@ impl RigidTransform {
 }
 
 /// Unit motion along (0 to 2) or about (3 to 5) an axis.
-fn unit_twist(part: usize) -> Twist {
+pub(super) fn unit_twist(part: usize) -> Twist {
     let unit = |axis: usize| Vector3::from_fn(|row, _| if row == axis { 1.0 } else { 0.0 });
     let (linear_m_s, angular_rad_s) = if part < 3 {
         (unit(part), Vector3::zeros())

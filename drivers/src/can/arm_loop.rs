@@ -223,23 +223,35 @@ impl ArmLoop {
             (Request::Stop(answer), _) => drop(answer.try_send(Ok(()))),
             // Everything is prepared anew: while the arm was stopped, an interface may have been
             // set up again, and motors may have been reset or replaced.
-            (Request::Recover(answer), ArmState::Stopped { .. }) => match self.prepare() {
-                Ok(prepared) => {
-                    self.prepared = Some(prepared);
-                    // Preparing takes longer than a watchdog timeout, which is no stall of this
-                    // thread.
-                    self.last_cycle = clock::now_including_suspend();
-                    self.arm_state = ArmState::Measuring {
-                        since: clock::now(),
-                        reply: answer,
-                    };
+            (
+                Request::Recover(answer),
+                ArmState::Stopped {
+                    pending_fail_safe, ..
+                },
+            ) => {
+                let pending_fail_safe = *pending_fail_safe;
+                match self.prepare() {
+                    Ok(prepared) => {
+                        self.prepared = Some(prepared);
+                        // Preparing takes longer than a watchdog timeout, which is no stall of this
+                        // thread.
+                        self.last_cycle = clock::now_including_suspend();
+                        self.arm_state = ArmState::Measuring {
+                            since: clock::now(),
+                            reply: answer,
+                        };
+                    }
+                    Err(error) => {
+                        // Motors that have not confirmed the fail-safe command may still execute
+                        // their last command, so it is resent through the former sockets.
+                        if pending_fail_safe.is_none() {
+                            self.prepared = None;
+                        }
+                        self.stopped(&reason_of(&error), pending_fail_safe);
+                        let _ = answer.try_send(Err(error));
+                    }
                 }
-                Err(error) => {
-                    self.prepared = None;
-                    self.stopped(&reason_of(&error), None);
-                    let _ = answer.try_send(Err(error));
-                }
-            },
+            }
             // The arm is enabled, or is being enabled.
             (Request::Recover(answer), _) => drop(answer.try_send(Ok(()))),
         }

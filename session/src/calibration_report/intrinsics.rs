@@ -294,12 +294,13 @@ impl IntrinsicsReport<'_> {
                 chosen.chain(rejected.take(1)).collect::<Vec<_>>()
             }
             None => {
-                let n_corners: Vec<f64> = self
+                // The worst view has the fewest corners.
+                let badness: Vec<f64> = self
                     .views
                     .iter()
-                    .map(|view| view.points.len() as f64)
+                    .map(|view| -(view.points.len() as f64))
                     .collect();
-                let chosen = photo::worst_and_median(&n_corners).into_iter();
+                let chosen = photo::worst_and_median(&badness).into_iter();
                 chosen
                     .filter_map(|ix| self.detected(&self.views[ix].name, "detected corners"))
                     .collect()

@@ -9,12 +9,12 @@ use crate::lattice::{Cell, Lattice, Refinement, STEPS};
 use crate::saddle::{self, angle_between};
 use crate::spec::TargetSpec;
 
-/// Images with more pixels are first searched at half resolution, which has a quarter of the pixels.
-/// Corners are refined in the full image in any case.
+/// Images with more pixels are first searched at half resolution, which has a quarter of the
+/// pixels. Corners are refined in the full image in any case.
 const HALVE_ABOVE_PX: usize = 3_000_000;
 /// Number of resolutions that are searched. The ring around saddles has a fixed radius, so squares
-/// must neither be smaller than the ring nor blurred over much more than it. Three resolutions cover
-/// a factor of four.
+/// must neither be smaller than the ring nor blurred over much more than it. Three resolutions
+/// cover a factor of four.
 const N_LEVELS: usize = 3;
 /// A row or column belongs to the board if it has at least this part of its corners. Chance corners
 /// next to the board form lines with few corners; hidden corners leave most of a line.

@@ -10,7 +10,7 @@ use crate::session::protocol::DepthFormat;
 use crate::session::server_message::{
     BinaryHeader, ColorPart, DepthPart, LiveHeader, NewestKeyframeMessage, PictureHeader, frame,
 };
-use crate::topics::updates::{LiveImage, LivePixels};
+use keyframe::{LiveImage, LivePixels};
 use std::borrow::Cow;
 use std::time::Instant;
 use trainer::{JPEG_QUALITY, PackedDepth, Packing, Picture, Rendered};
@@ -417,7 +417,7 @@ fn write_counts(depth_m: &[f32], counts_per_meter: f64, packed: &mut [u8]) {
 mod tests {
     use super::{half_depth, pack_live_image};
     use crate::clock::ServerClock;
-    use crate::topics::updates::{LiveImage, LivePixels};
+    use keyframe::{LiveImage, LivePixels};
     use kinematics::Stamp;
     use std::time::Instant;
     use trainer::{PackedDepth, Picture};

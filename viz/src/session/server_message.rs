@@ -5,8 +5,9 @@ use crate::pose::row_major;
 use crate::server::access::Role;
 use crate::session::protocol::{DepthFormat, ProjectionMessage};
 use crate::topics::robot::{RobotMessage, RobotStateMessage};
-use crate::topics::updates::{KeyframePose, LiveImage, SceneHint, Status};
+use crate::topics::updates::{KeyframePose, SceneHint, Status};
 use axum::extract::ws::Message;
+use keyframe::LiveImage;
 use serde::Serialize;
 use trainer::ChunkLayout;
 

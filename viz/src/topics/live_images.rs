@@ -6,12 +6,12 @@ use crate::hub::Demand;
 use crate::pictures::picture::pack_live_image;
 use crate::session::server_message::ServerMessage;
 use crate::topics::subscriptions::{LIVE_IMAGES, Subscriptions, fitted};
-use crate::topics::updates::LiveImage;
 use crate::topics::{
     ClientState, DefaultRate, EncodeContext, Feed, Item, Priority, Publisher, Row, Sent, Timer,
     Topic, receiver,
 };
 use axum::extract::ws::Message;
+use keyframe::LiveImage;
 use kinematics::Transform;
 use parking_lot::Mutex;
 use std::collections::BTreeMap;
@@ -293,7 +293,7 @@ impl Hub {
 #[cfg(test)]
 mod tests {
     use super::{ImageEncoding, ImageKey, MAX_IMAGE_ENCODINGS, images_to_encode};
-    use crate::topics::updates::{LiveImage, LivePixels};
+    use keyframe::{LiveImage, LivePixels};
     use kinematics::Stamp;
     use std::collections::{BTreeMap, BTreeSet};
     use std::sync::Arc;

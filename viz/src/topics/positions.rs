@@ -10,8 +10,12 @@ pub(crate) fn pack_positions(points_m: &[Vector3<f64>]) -> Option<(Vec<u8>, f64)
         .iter()
         .flat_map(|point| point.iter())
         .fold(0.0_f64, |max, value| max.max(value.abs()));
-    // The scale below would be 0 or not finite. `f64::max` ignores NaN, which the cast turns to 0.
-    if extent_m <= 0.0 || !extent_m.is_finite() {
+    // The scale below would be 0 or not finite. NaN is checked separately, because `f64::max`
+    // ignores it, and the cast below would turn it into 0.
+    let has_nan = points_m
+        .iter()
+        .any(|point| point.iter().any(|value| value.is_nan()));
+    if has_nan || extent_m <= 0.0 || !extent_m.is_finite() {
         return None;
     }
     // The farthest coordinate gets the largest count, for the finest step that 16 bits allow.
@@ -28,4 +32,27 @@ pub(crate) fn pack_positions(points_m: &[Vector3<f64>]) -> Option<(Vec<u8>, f64)
             .collect(),
         meters_per_count,
     ))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::pack_positions;
+    use nalgebra::Vector3;
+
+    #[test]
+    fn only_finite_points_away_from_the_origin_are_packed() {
+        let point = Vector3::new(1.0, -2.0, 0.5);
+        let (bytes, meters_per_count) = pack_positions(&[point]).expect("a finite point");
+        assert_eq!(
+            (bytes.len(), meters_per_count),
+            (6, 2.0 / f64::from(i16::MAX))
+        );
+        for wrong in [f64::NAN, f64::INFINITY] {
+            assert!(
+                pack_positions(&[point, Vector3::new(0.0, wrong, 0.0)]).is_none(),
+                "{wrong}"
+            );
+        }
+        assert!(pack_positions(&[]).is_none() && pack_positions(&[Vector3::zeros()]).is_none());
+    }
 }

@@ -7,8 +7,7 @@ use crate::topics::items::ItemTopic;
 use crate::topics::positions::pack_positions;
 use crate::topics::{DefaultRate, Priority};
 use axum::extract::ws::Message;
-use keyframe::RangePoints;
-use kinematics::Transform;
+use keyframe::RangeScan;
 use nalgebra::{Point3, Vector3};
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -17,15 +16,6 @@ use std::sync::Arc;
 /// with a larger number, their surfaces look denser on the page, and other data waits longer on
 /// slow links.
 const MAX_POINTS: usize = 6000;
-
-/// A scan and the correction of its base pose.
-#[derive(Clone, Debug, PartialEq)]
-pub struct RangeScan {
-    /// The points, before the correction.
-    pub scan: Arc<RangePoints>,
-    /// Corrects the world coordinates of the points.
-    pub map_from_odom: Transform,
-}
 
 /// Latest scans by scanner name.
 type RangeScans = BTreeMap<Arc<str>, Arc<RangeScan>>;
@@ -100,8 +90,8 @@ fn pack_range_scan(range_scan: &RangeScan) -> Option<Vec<u8>> {
 
 #[cfg(test)]
 mod tests {
-    use super::{MAX_POINTS, RangeScan, pack_range_scan};
-    use keyframe::RangePoints;
+    use super::{MAX_POINTS, pack_range_scan};
+    use keyframe::{RangePoints, RangeScan};
     use kinematics::{Stamp, Transform};
     use nalgebra::Vector3;
 

@@ -2,12 +2,11 @@
 
 use crate::clock::ServerClock;
 use crate::pose::row_major;
+use keyframe::RobotState;
 use kinematics::shape::{Geometry, Shape};
 use kinematics::urdf::{JointKind, Robot};
-use kinematics::{Stamp, Transform};
 use serde::Serialize;
 use std::sync::Arc;
-use std::time::Instant;
 
 /// The robot of a rig.
 #[derive(Clone, Debug)]
@@ -70,22 +69,6 @@ impl MeshFormat {
             Self::Obj => "model/obj",
         }
     }
-}
-
-/// Positions of the robot's joints and pose of its base at one time.
-#[derive(Clone, Debug, PartialEq)]
-pub struct RobotState {
-    /// Time of the joint positions or of the base pose, whichever is older.
-    pub stamp: Stamp,
-    /// The same time on this process's clock, from which the age of the state is computed.
-    ///
-    /// Recordings and simulations stamp with other clocks. For them, pass the time at which the
-    /// state was read.
-    pub captured_at: Instant,
-    /// Pose of the base link.
-    pub world_from_base: Transform,
-    /// Joint positions in the order of [`RobotDescription::joint_names`], radians or meters.
-    pub positions: Vec<f64>,
 }
 
 /// Fields of `robot_state`.

@@ -5,9 +5,10 @@ use crate::clock::ServerClock;
 use crate::session::server_message::ServerMessage;
 use crate::topics::base_path::BasePath;
 use crate::topics::items::ItemTopic;
-use crate::topics::robot::{RobotDescription, RobotMessage, RobotState};
+use crate::topics::robot::{RobotDescription, RobotMessage};
 use crate::topics::{DefaultRate, Priority};
 use axum::extract::ws::Message;
+use keyframe::RobotState;
 use std::sync::Arc;
 
 /// The robot's description, which clients need before its states. Sessions send the states

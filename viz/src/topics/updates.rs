@@ -4,7 +4,6 @@ use kinematics::{Stamp, Transform};
 use serde::Serialize;
 use std::collections::BTreeMap;
 use std::sync::Arc;
-use std::time::Instant;
 
 /// Maximum number of points of the accuracy curve on the page. Longer curves are thinned evenly.
 /// The curve is a part of every status message, several times per second, while the chart is only
@@ -123,41 +122,6 @@ pub struct KeyframePose {
     pub world_from_camera: Transform,
     /// Width and height, pixels.
     pub size_px: [u32; 2],
-    /// Focal length, pixels.
-    pub focal_px: [f64; 2],
-    /// Principal point, pixels.
-    pub principal_px: [f64; 2],
-}
-
-/// Pixels of a live image, sRGB.
-#[derive(Clone, Debug)]
-pub enum LivePixels {
-    /// A complete JPEG file; sent unchanged if the image is small.
-    Jpeg(Arc<[u8]>),
-    /// `[height, width, 3]`.
-    Rgb(Arc<[u8]>),
-    /// `[height, width, 4]`; alpha is ignored.
-    Rgba(Arc<[u8]>),
-}
-
-/// The current image of a camera.
-#[derive(Clone, Debug)]
-pub struct LiveImage {
-    /// Name of the camera.
-    pub camera: Arc<str>,
-    /// Mid-exposure.
-    pub stamp: Stamp,
-    /// Mid-exposure on this process's clock, from which the age of the image is computed.
-    ///
-    /// Recordings and simulations stamp with other clocks. For them, pass the time at which the
-    /// image was read.
-    pub captured_at: Instant,
-    /// Width and height, pixels.
-    pub size_px: [u32; 2],
-    /// The image.
-    pub pixels: LivePixels,
-    /// Pose at the stamp, if known.
-    pub world_from_camera: Option<Transform>,
     /// Focal length, pixels.
     pub focal_px: [f64; 2],
     /// Principal point, pixels.

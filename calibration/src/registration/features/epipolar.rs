@@ -34,11 +34,13 @@ impl Sampson {
         [one, other]: &[Sighting; 2],
     ) -> Self {
         let rays = [one.ray, other.ray].map(|ray| ray.push(1.0));
+        // The relative pose at the readout of the two rows.
         let essential = essential(
             rotation,
             &(translation_m + rotation * one.center_m - other.center_m),
         );
-        let (line, other_line) = (essential * rays[0], essential.tr_mul(&rays[1]));
+        let line = essential * rays[0];
+        let other_line = essential.tr_mul(&rays[1]);
         let gradients = [other_line, line].map(|line| Vector3::new(line.x, line.y, 0.0));
         let norm = (gradients[0].norm_squared() + gradients[1].norm_squared())
             .sqrt()
@@ -51,12 +53,15 @@ impl Sampson {
         }
     }
 
+    /// The signed distance.
     fn distance_rad(&self) -> f64 {
         self.numerator / self.norm
     }
 
     /// Derivatives of the distance by the elements of the essential matrix.
     fn derivatives(&self) -> Matrix3<f64> {
+        // The quotient rule for numerator / norm. The numerator is linear in the essential matrix,
+        // and the squared norm is quadratic.
         let by_norm = self.gradients[1] * self.rays[0].transpose()
             + self.rays[1] * self.gradients[0].transpose();
         let by_numerator = self.rays[1] * self.rays[0].transpose();
@@ -100,6 +105,7 @@ pub(super) struct PairMatches {
 }
 
 impl PairMatches {
+    /// Pose of the first camera in the frame of the second one.
     fn to_from_from(&self, cameras: &[MovingCamera]) -> Transform {
         cameras[self.pair.to].world_from_camera.inverse()
             * cameras[self.pair.from].world_from_camera
@@ -170,7 +176,8 @@ impl PairMatches {
         let (params, derivatives): (Vec<usize>, Vec<Matrix3<f64>>) =
             derivatives.into_iter().unzip();
         let n = params.len();
-        let (mut information, mut gradient) = (DMatrix::zeros(n, n), DVector::zeros(n));
+        let mut information = DMatrix::zeros(n, n);
+        let mut gradient = DVector::zeros(n);
         let mut row = vec![0.0; n];
         for (found, sampson) in self.sampsons(cameras, &to_from_from) {
             let scale = 1.0 / (noise_texels * found.texel_rad);
@@ -180,6 +187,7 @@ impl PairMatches {
             row.iter_mut()
                 .zip(&derivatives)
                 .for_each(|(value, derivative)| *value = by_essential.dot(derivative));
+            // The lens moves the rays, each along its own gradient.
             for (ix, camera) in pair_cameras.into_iter().enumerate() {
                 let by_ray = sampson.gradients[ix].xy() * (scale / sampson.norm);
                 for (param, motion) in camera
@@ -190,6 +198,7 @@ impl PairMatches {
                     row[params.partition_point(|other| *other < param)] += by_ray.dot(&motion);
                 }
             }
+            // The lower triangle only: this runs for every match in every iteration.
             for (ix, value) in row.iter().enumerate() {
                 let weighted = weight * value;
                 gradient[ix] -= weighted * residual;

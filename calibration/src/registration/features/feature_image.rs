@@ -11,7 +11,7 @@ use nalgebra::Vector2;
 use std::ops::Range;
 use std::sync::Arc;
 
-/// Maximum width of the finest level, pixels.
+/// Maximum width of the finest level, pixels. It bounds the time for large images.
 const MAX_COLUMNS: u32 = 800;
 /// Narrower images are enlarged to about this width, because corners of small images are only a few
 /// pixels apart.
@@ -28,16 +28,19 @@ const MAX_CORNERS: usize = 700;
 /// number of corners of a cell.
 const MIN_CELL: usize = 16;
 const CORNERS_PER_CELL: usize = 3;
-/// Minimum brightness gradient, in every direction, of a corner: root mean square per texel.
+/// Minimum brightness gradient, in every direction, of a corner: root mean square per texel. Lower
+/// values add corners that are noise.
 const MIN_GRADIENT: f32 = 1.5;
 /// Half the side of the window of a corner, texels.
 const WINDOW_RADIUS: usize = 2;
-/// Samples along each side of a descriptor, and their distance in texels.
+/// Samples along each side of a descriptor, and their distance in texels. A larger window is more
+/// distinctive, but shows a single flat surface less often.
 const SIDE: usize = 8;
 const SPACING: f64 = 2.5;
 /// Number of samples of a descriptor.
 pub(super) const DESCRIPTOR_LEN: usize = SIDE * SIDE;
-/// Minimum standard deviation of the samples of a descriptor.
+/// Minimum standard deviation of the samples of a descriptor. Below, normalization would amplify
+/// noise.
 const MIN_CONTRAST: f32 = 4.0;
 
 /// Brightness around a corner with zero mean and unit norm, so that the dot product of two
@@ -86,6 +89,40 @@ pub(super) struct FeatureImage {
     pub(super) descriptors: Vec<Descriptor>,
 }
 
+/// Side of the window of a corner, texels.
+const DIAMETER: usize = 2 * WINDOW_RADIUS + 1;
+
+/// Whether a response is larger than those of its eight neighbors; of equal ones, the first is.
+fn is_maximum(response: &[f32], width: usize, ix: usize) -> bool {
+    let own = response[ix];
+    let earlier = [ix - width - 1, ix - width, ix - width + 1, ix - 1];
+    let later = [ix + 1, ix + width - 1, ix + width, ix + width + 1];
+    earlier.iter().all(|other| own > response[*other])
+        && later.iter().all(|other| own >= response[*other])
+}
+
+/// Distance from a maximum to the vertex of the parabola through it and its neighbors along one
+/// axis, texels.
+fn vertex_offset(response: &[f32], ix: usize, stride: usize) -> f64 {
+    let [before, own, after] = [ix - stride, ix, ix + stride].map(|ix| f64::from(response[ix]));
+    let curvature = before - 2.0 * own + after;
+    if curvature < 0.0 {
+        (0.5 * (before - after) / curvature).clamp(-0.5, 0.5)
+    } else {
+        0.0
+    }
+}
+
+/// Sum of structure tensors in the window around an index, along one axis.
+fn window_sum(tensors: &[[f32; 3]], ix: usize, stride: usize) -> [f32; 3] {
+    let mut sum = [0.0; 3];
+    for step in 0..DIAMETER {
+        let tensor = tensors[ix + step * stride - WINDOW_RADIUS * stride];
+        sum = std::array::from_fn(|part| sum[part] + tensor[part]);
+    }
+    sum
+}
+
 /// A gray image, 0 to 255; NaN in masked areas.
 #[derive(Debug)]
 struct Level {
@@ -98,12 +135,12 @@ struct Level {
 impl FeatureImage {
     pub(super) fn new(keyframe: &Arc<Keyframe>, camera: usize) -> Self {
         let levels = levels(keyframe);
-        let cell = {
-            let n_texels = levels[0].values.len();
-            let side = ((n_texels * CORNERS_PER_CELL) as f64 / MAX_CORNERS as f64).sqrt() as usize;
-            side.max(MIN_CELL)
-        };
-        let (mut corners, mut descriptors) = (Vec::new(), Vec::new());
+        // Cells of a size with which the finest level has about the maximum number of corners.
+        let n_texels = levels[0].values.len();
+        let side = ((n_texels * CORNERS_PER_CELL) as f64 / MAX_CORNERS as f64).sqrt() as usize;
+        let cell = side.max(MIN_CELL);
+        let mut corners = Vec::new();
+        let mut descriptors = Vec::new();
         for (ix, level) in levels.iter().enumerate() {
             for texel in level.corners(cell) {
                 let Some(descriptor) = level.descriptor(texel, [1.0, 0.0]) else {
@@ -164,11 +201,13 @@ impl FeatureImage {
         self.texel_rad_of_level(0)
     }
 
+    /// Size of the texels of a level, radians near the image center.
     fn texel_rad_of_level(&self, level: usize) -> f64 {
         2.0 * self.levels[level].texel_px / (self.keyframe.focal_px[0] + self.keyframe.focal_px[1])
     }
 }
 
+/// Levels of a keyframe, the finest first.
 fn levels(keyframe: &Keyframe) -> Vec<Level> {
     let edge = keyframe.size_px[0].div_ceil(MAX_COLUMNS).max(1) as usize;
     let (size, values) = brightness(keyframe, edge);
@@ -239,15 +278,14 @@ impl Level {
         {
             return None;
         }
-        let (left, top) = (x as usize, y as usize);
-        let (fx, fy) = ((x - left as f64) as f32, (y - top as f64) as f32);
+        let left = x as usize;
+        let top = y as usize;
+        let fx = (x - left as f64) as f32;
+        let fy = (y - top as f64) as f32;
         let ix = top * self.size[0] + left;
-        let (above, below) = (
-            &self.values[ix..ix + 2],
-            &self.values[ix + self.size[0]..][..2],
-        );
         let row = |row: &[f32]| row[0] + fx * (row[1] - row[0]);
-        let (above, below) = (row(above), row(below));
+        let above = row(&self.values[ix..ix + 2]);
+        let below = row(&self.values[ix + self.size[0]..][..2]);
         Some(above + fy * (below - above))
     }
 
@@ -259,21 +297,14 @@ impl Level {
             return Vec::new();
         }
         let response = self.corner_response();
+        // The response is a squared gradient.
         let min_response = MIN_GRADIENT * MIN_GRADIENT;
-        let is_maximum = |ix: usize| {
-            let own = response[ix];
-            let neighbors = [ix - width - 1, ix - width, ix - width + 1, ix - 1];
-            let later = [ix + 1, ix + width - 1, ix + width, ix + width + 1];
-            own > min_response
-                && neighbors.iter().all(|other| own > response[*other])
-                && later.iter().all(|other| own >= response[*other])
-        };
         let n_cells = [width.div_ceil(cell), height.div_ceil(cell)];
         let mut by_cell: Vec<Vec<usize>> = vec![Vec::new(); n_cells[0] * n_cells[1]];
         for y in 1..height - 1 {
             for x in 1..width - 1 {
                 let ix = y * width + x;
-                if is_maximum(ix) {
+                if response[ix] > min_response && is_maximum(&response, width, ix) {
                     by_cell[y / cell * n_cells[0] + x / cell].push(ix);
                 }
             }
@@ -282,21 +313,10 @@ impl Level {
         for mut found in by_cell {
             found.sort_by(|a, b| response[*b].total_cmp(&response[*a]).then(a.cmp(b)));
             found.truncate(CORNERS_PER_CELL);
-            // The vertex of a parabola through the maximum and its neighbors.
-            let offset = |ix: usize, stride: usize| {
-                let [before, own, after] =
-                    [ix - stride, ix, ix + stride].map(|ix| f64::from(response[ix]));
-                let curvature = before - 2.0 * own + after;
-                if curvature < 0.0 {
-                    (0.5 * (before - after) / curvature).clamp(-0.5, 0.5)
-                } else {
-                    0.0
-                }
-            };
             corners.extend(found.into_iter().map(|ix| {
                 [
-                    (ix % width) as f64 + offset(ix, 1),
-                    (ix / width) as f64 + offset(ix, width),
+                    (ix % width) as f64 + vertex_offset(&response, ix, 1),
+                    (ix / width) as f64 + vertex_offset(&response, ix, width),
                 ]
             }));
         }
@@ -305,7 +325,6 @@ impl Level {
 
     /// Smaller eigenvalue of the mean structure tensor in a window; 0 at edges and in masked areas.
     fn corner_response(&self) -> Vec<f32> {
-        const DIAMETER: usize = 2 * WINDOW_RADIUS + 1;
         let [width, height] = self.size;
         let mut tensors = vec![[f32::NAN; 3]; self.values.len()];
         for y in 1..height - 1 {
@@ -316,19 +335,12 @@ impl Level {
                 tensors[ix] = [gx * gx, gx * gy, gy * gy];
             }
         }
-        let sum = |tensors: &[[f32; 3]], ix: usize, stride: usize| {
-            let mut sum = [0.0; 3];
-            for step in 0..DIAMETER {
-                let tensor = tensors[ix + step * stride - WINDOW_RADIUS * stride];
-                sum = std::array::from_fn(|part| sum[part] + tensor[part]);
-            }
-            sum
-        };
+        // The sum over the window, along rows first, then along columns.
         let mut rows = vec![[f32::NAN; 3]; tensors.len()];
         for y in 0..height {
             for x in WINDOW_RADIUS..width - WINDOW_RADIUS {
                 let ix = y * width + x;
-                rows[ix] = sum(&tensors, ix, 1);
+                rows[ix] = window_sum(&tensors, ix, 1);
             }
         }
         let mut response = vec![0.0; tensors.len()];
@@ -336,7 +348,7 @@ impl Level {
             for x in WINDOW_RADIUS..width - WINDOW_RADIUS {
                 let ix = y * width + x;
                 let [xx, xy, yy] =
-                    sum(&rows, ix, width).map(|sum| sum / (DIAMETER * DIAMETER) as f32);
+                    window_sum(&rows, ix, width).map(|sum| sum / (DIAMETER * DIAMETER) as f32);
                 let smaller = 0.5 * (xx + yy) - (0.25 * (xx - yy) * (xx - yy) + xy * xy).sqrt();
                 response[ix] = if smaller.is_finite() { smaller } else { 0.0 };
             }
@@ -346,6 +358,7 @@ impl Level {
 
     /// Descriptor at a position; `None` near the edges, in masked areas, and without contrast.
     fn descriptor(&self, center: [f64; 2], [cos, sin]: [f64; 2]) -> Option<Descriptor> {
+        // Half the diagonal of the samples, so that the window fits at any rotation.
         const RADIUS: f64 = 0.5 * (SIDE - 1) as f64 * SPACING * std::f64::consts::SQRT_2 + 1.0;
         let [left, top] = center.map(|coordinate| (coordinate - RADIUS).floor());
         let size = (2.0 * RADIUS).ceil() + 2.0;
@@ -360,15 +373,18 @@ impl Level {
         let mut samples = [0.0f32; DESCRIPTOR_LEN];
         for (ix, sample) in samples.iter_mut().enumerate() {
             let offset = |step: usize| (step as f32 - 0.5 * (SIDE - 1) as f32) * SPACING as f32;
-            let (dx, dy) = (offset(ix % SIDE), offset(ix / SIDE));
-            let (x, y) = (x + cos * dx - sin * dy, y + sin * dx + cos * dy);
-            let (column, row) = (x as u32, y as u32); // Conversions to u32 are faster than to usize.
-            let (fx, fy) = (x - column as f32, y - row as f32);
+            let dx = offset(ix % SIDE);
+            let dy = offset(ix / SIDE);
+            let sample_x = x + cos * dx - sin * dy;
+            let sample_y = y + sin * dx + cos * dy;
+            // Conversions to u32 are faster than to usize.
+            let column = sample_x as u32;
+            let row = sample_y as u32;
+            let fx = sample_x - column as f32;
+            let fy = sample_y - row as f32;
             let begin = row as usize * stride + column as usize;
-            let (above, below) = (
-                &window[begin..begin + 2],
-                &window[begin + stride..begin + stride + 2],
-            );
+            let above = &window[begin..begin + 2];
+            let below = &window[begin + stride..begin + stride + 2];
             let above = above[0] + fx * (above[1] - above[0]);
             *sample = above + fy * (below[0] + fx * (below[1] - below[0]) - above);
         }

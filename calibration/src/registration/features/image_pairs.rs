@@ -2,7 +2,8 @@
 
 use super::feature_image::FeatureImage;
 use super::moving_camera::MovingCamera;
-use crate::registration::pairs::Pair;
+use crate::registration::pairs::{Pair, spread_evenly};
+use keyframe::Keyframe;
 use kinematics::Transform;
 use kinematics::quantile::median;
 use nalgebra::Vector3;
@@ -36,48 +37,40 @@ pub(super) fn choose(
         .collect();
     let median_baseline_m = median_baseline_m(&poses);
     let min_baseline_m = (MIN_BASELINE_FRAC * median_baseline_m).max(MIN_BASELINE_M);
-    let partners_of = |to: usize| {
-        let distance = |from: usize| {
-            let to_from_from = poses[to].inverse() * poses[from];
-            let baseline_m = to_from_from.translation.vector.norm();
-            let view_angle_rad = (to_from_from.rotation * Vector3::z()).angle(&Vector3::z());
-            let is_suitable = from != to
-                && baseline_m > min_baseline_m
-                && view_angle_rad < MAX_VIEW_ANGLE_RAD
-                && overlap(&images[from], &images[to], &to_from_from) > MIN_OVERLAP;
-            is_suitable.then(|| to_from_from.rotation.angle() + baseline_m / median_baseline_m)
-        };
-        let mut suitable: Vec<(f64, usize)> = (0..images.len())
-            .filter_map(|from| Some((distance(from)?, from)))
-            .collect();
-        suitable.sort_by(|one, other| one.0.total_cmp(&other.0).then(one.1.cmp(&other.1)));
-        let n = suitable.len();
-        let picks: Vec<usize> = if n <= max_partners {
-            (0..n).collect()
-        } else {
-            (0..max_partners)
-                .map(|ix| ix * (n - 1) / (max_partners - 1).max(1))
-                .collect()
-        };
-        picks
-            .into_iter()
-            .map(|ix| Pair {
-                from: suitable[ix].1,
-                to,
-            })
-            .collect::<Vec<Pair>>()
-    };
     let mut pairs = (0..images.len())
         .into_par_iter()
-        .map(partners_of)
+        .map(|to| {
+            let suitable = (0..images.len()).filter_map(|from| {
+                let to_from_from = poses[to].inverse() * poses[from];
+                let baseline_m = to_from_from.translation.vector.norm();
+                let is_suitable = from != to
+                    && baseline_m > min_baseline_m
+                    && sees_the_same(&images[from], &images[to], &to_from_from);
+                // The median baseline makes translations comparable with rotations, without depth.
+                let motion = to_from_from.rotation.angle() + baseline_m / median_baseline_m;
+                is_suitable.then_some((motion, from))
+            });
+            spread_evenly(suitable.collect(), max_partners)
+                .into_iter()
+                .map(|from| Pair { from, to })
+                .collect::<Vec<Pair>>()
+        })
         .collect::<Vec<_>>()
         .concat();
+    // Two images may have chosen each other.
     let key = |pair: &Pair| (pair.from.min(pair.to), pair.from.max(pair.to));
     pairs.sort_by_key(key);
     pairs.dedup_by_key(|pair| key(pair));
     pairs
 }
 
+/// Whether two images may show the same corners.
+fn sees_the_same(from: &FeatureImage, to: &FeatureImage, to_from_from: &Transform) -> bool {
+    let view_angle_rad = (to_from_from.rotation * Vector3::z()).angle(&Vector3::z());
+    view_angle_rad < MAX_VIEW_ANGLE_RAD && overlap(from, to, to_from_from) > MIN_OVERLAP
+}
+
+/// Median distance between the positions of two images, meters; positive.
 fn median_baseline_m(poses: &[Transform]) -> f64 {
     let distance = |one: &Transform, other: &Transform| {
         (one.translation.vector - other.translation.vector).norm()
@@ -90,31 +83,41 @@ fn median_baseline_m(poses: &[Transform]) -> f64 {
 /// Largest fraction of an image that another one shows, over the depths.
 fn overlap(from: &FeatureImage, to: &FeatureImage, to_from_from: &Transform) -> f64 {
     let baseline_m = to_from_from.translation.vector.norm();
-    let (from, to) = (&from.keyframe, &to.keyframe);
-    let ray = |ix: usize| {
-        let share = [
-            (ix % GRID[0]) as f64 / GRID[0] as f64,
-            (ix / GRID[0]) as f64 / GRID[1] as f64,
-        ];
-        let half = [0.5 / GRID[0] as f64, 0.5 / GRID[1] as f64];
-        let axis = |axis: usize| {
-            let px = (share[axis] + half[axis]) * f64::from(from.size_px[axis]);
-            (px - from.principal_px[axis]) / from.focal_px[axis]
-        };
-        Vector3::new(axis(0), axis(1), 1.0)
-    };
+    let from = &from.keyframe;
+    let to = &to.keyframe;
+    // The depth is unknown. Images that show nothing in common at any depth are excluded.
     let n = GRID[0] * GRID[1];
-    let shown_at = |depth: f64| {
+    let mut largest = 0.0;
+    for depth in DEPTHS {
         let is_shown = |ix: &usize| {
-            let at = to_from_from.rotation * (ray(*ix) * depth * baseline_m)
-                + to_from_from.translation.vector;
-            at.z > 0.0
-                && (0..2).all(|axis| {
-                    let px = to.focal_px[axis] * at[axis] / at.z + to.principal_px[axis];
-                    (0.0..f64::from(to.size_px[axis])).contains(&px)
-                })
+            let in_from = grid_ray(from, *ix) * depth * baseline_m;
+            let at = to_from_from.rotation * in_from + to_from_from.translation.vector;
+            at.z > 0.0 && is_in_image(to, &at)
         };
-        (0..n).filter(is_shown).count() as f64 / n as f64
-    };
-    DEPTHS.map(shown_at).into_iter().fold(0.0, f64::max)
+        let share = (0..n).filter(is_shown).count() as f64 / n as f64;
+        largest = f64::max(largest, share);
+    }
+    largest
+}
+
+/// Ray through the center of a cell of [`GRID`], at a depth of 1.
+fn grid_ray(keyframe: &Keyframe, ix: usize) -> Vector3<f64> {
+    let share = [
+        (ix % GRID[0]) as f64 / GRID[0] as f64,
+        (ix / GRID[0]) as f64 / GRID[1] as f64,
+    ];
+    let half = [0.5 / GRID[0] as f64, 0.5 / GRID[1] as f64];
+    let [x, y] = [0, 1].map(|axis| {
+        let px = (share[axis] + half[axis]) * f64::from(keyframe.size_px[axis]);
+        (px - keyframe.principal_px[axis]) / keyframe.focal_px[axis]
+    });
+    Vector3::new(x, y, 1.0)
+}
+
+/// Whether a point in front of the camera is imaged.
+fn is_in_image(keyframe: &Keyframe, point: &Vector3<f64>) -> bool {
+    (0..2).all(|axis| {
+        let px = keyframe.focal_px[axis] * point[axis] / point.z + keyframe.principal_px[axis];
+        (0.0..f64::from(keyframe.size_px[axis])).contains(&px)
+    })
 }

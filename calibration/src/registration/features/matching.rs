@@ -5,13 +5,16 @@ use super::moving_camera::{MovingCamera, Sighting};
 use kinematics::Transform;
 use nalgebra::{Matrix3, Vector2, Vector3};
 
-/// Minimum normalized cross-correlation of a match.
+/// Minimum normalized cross-correlation of a match. Lower values add matches that are mostly wrong;
+/// higher ones lose corners that are seen from different directions.
 const MIN_CORRELATION: f32 = 0.75;
 /// Maximum squared distance of the best match's descriptor, relative to that of the second best.
 const MAX_RATIO: f32 = 0.7;
-/// Candidates closer than this to the best match, in texels, do not count as second best.
+/// Candidates closer than this to the best match, in texels, do not count as second best: they are
+/// the same corner on another level.
 const SAME_CORNER_TEXELS: f64 = 3.0;
-/// Maximum difference of the levels of two corners.
+/// Maximum difference of the levels of two corners: a factor of 1.5 in distance. More levels would
+/// allow larger differences, and more wrong matches.
 const MAX_LEVEL_DIFFERENCE: usize = 1;
 
 /// Two corners that show the same point.
@@ -48,6 +51,8 @@ pub(super) fn matches(
         .iter()
         .map(|corner| cameras[1].sighting(corner).ray)
         .collect();
+    // Descriptors of the second image along the axes of the first one. The roll is known, so
+    // descriptors need not be invariant, which makes them more distinctive.
     let descriptors: Vec<Option<Descriptor>> = to
         .corners
         .iter()
@@ -68,10 +73,12 @@ pub(super) fn matches(
             };
             let correlation = dot(&from.descriptors[ix], descriptor);
             candidates.push((correlation, other_ix));
+            // For the check in the other direction, which needs no second search.
             if correlation > best_of_to[other_ix].0 {
                 best_of_to[other_ix] = (correlation, ix);
             }
         }
+        // Of equal ones, the first.
         let Some(best) = candidates
             .iter()
             .copied()
@@ -88,21 +95,25 @@ pub(super) fn matches(
         let second = second
             .map(|(correlation, _)| *correlation)
             .fold(-1.0f32, f32::max);
+        // The squared distance of two unit vectors is 2 - 2 times their dot product.
         if best.0 > MIN_CORRELATION && 1.0 - best.0 < MAX_RATIO * (1.0 - second) {
             best_of_from[ix] = Some(best.1);
         }
     }
-    let mutual = |(ix, best): (usize, &Option<usize>)| {
-        let other = (*best)?;
-        let (one, other) =
-            (best_of_to[other].1 == ix).then_some((&from.corners[ix], &to.corners[other]))?;
-        let texel_rad = from.texel_rad(one).max(to.texel_rad(other));
-        Some(Match {
-            corners: [*one, *other],
-            texel_rad,
-        })
-    };
-    best_of_from.iter().enumerate().filter_map(mutual).collect()
+    // Matches that are the best in both directions.
+    let mut matches = Vec::new();
+    for (ix, best) in best_of_from.into_iter().enumerate() {
+        let Some(other_ix) = best.filter(|other_ix| best_of_to[*other_ix].1 == ix) else {
+            continue;
+        };
+        let one = from.corners[ix];
+        let other = to.corners[other_ix];
+        matches.push(Match {
+            corners: [one, other],
+            texel_rad: from.texel_rad(&one).max(to.texel_rad(&other)),
+        });
+    }
+    matches
 }
 
 /// Cosine and sine of the angle from the axes of the second image at a ray to those of the first
@@ -110,10 +121,10 @@ pub(super) fn matches(
 fn roll(to_from_from: &Matrix3<f64>, ray: &Vector2<f64>) -> Option<[f64; 2]> {
     // The axes of the first image as seen in the second: derivatives of the projection.
     let project = |axis: Vector3<f64>| axis.xy() - ray * axis.z;
-    let (x, y) = (
-        project(to_from_from.column(0).into()),
-        project(to_from_from.column(1).into()),
-    );
+    let x = project(to_from_from.column(0).into());
+    let y = project(to_from_from.column(1).into());
+    // The rotation nearest to the 2 x 2 matrix with these columns. Near zero, the images look in
+    // opposite directions.
     let sum = Vector2::new(x.x + y.y, x.y - y.x).try_normalize(1e-6)?;
     Some(sum.into())
 }
@@ -135,8 +146,11 @@ impl Band {
         let ray = corner.ray.push(1.0);
         let at_infinity = to_from_from.rotation * ray;
         let translation = to_from_from.transform_point(&corner.center_m.into()).coords;
+        // The epipolar line contains the images of all points on the ray.
         let line = translation.cross(&at_infinity);
         let scale = line.xy().norm().max(f64::MIN_POSITIVE);
+        // Points come from infinity to the epipole. Without a distant point in front of the second
+        // camera, both directions are allowed.
         let from_infinity = (at_infinity.z > 0.1).then(|| {
             let position = at_infinity.xy() / at_infinity.z;
             let direction = (translation.xy() - position * translation.z).try_normalize(0.0);
@@ -150,6 +164,7 @@ impl Band {
         }
     }
 
+    /// Whether a ray is near the line, and on the side of points in front of the first camera.
     fn contains(&self, ray: &Vector2<f64>) -> bool {
         (self.normal.dot(ray) + self.offset).abs() < self.tolerance_rad
             && self.from_infinity.is_none_or(|(position, direction)| {

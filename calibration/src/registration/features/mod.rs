@@ -39,13 +39,15 @@ use std::sync::Arc;
 /// calibration, but without depth, transforms are often measured by hand.
 const SCALE: f64 = 2.0;
 
-/// Cameras with fewer training and validation images keep the given extrinsics.
+/// Cameras with fewer training and validation images keep the given extrinsics, because the errors
+/// of an estimate may exceed those of the given ones.
 const MIN_IMAGES_PER_CAMERA: usize = 10;
 
 /// Minimum gain in cross-validation, dB. Errors of single poses cause smaller gains, too.
 const MIN_GAIN_DB: f64 = 0.1;
 
-/// Minimum gain with the matches of the baseline for a trial with others.
+/// Minimum gain with the matches of the baseline for a trial with others. It is lower than
+/// [`MIN_GAIN_DB`], because these matches favor the baseline.
 const MIN_QUICK_GAIN_DB: f64 = 0.03;
 
 /// One round of matching.
@@ -97,18 +99,21 @@ const CLOSE_FRAC: f64 = 0.1;
 const N_FOLDS: usize = 4;
 const CROSS_VALIDATION_PARTNERS: usize = 8;
 /// Largest displacement along the epipolar line, in units of the focal length, for which the search
-/// band is wide enough.
+/// band is wide enough: points at twice the distance between the cameras or more.
 const MAX_PARALLAX: f64 = 0.5;
-/// Minimum half width of the band, texels of the finest level.
+/// Minimum half width of the band, texels of the finest level. Corners are less accurate than a
+/// texel, and matches must be able to move away from their start.
 const MIN_BAND_TEXELS: f64 = 4.0;
 /// Noise that cross-validation assumes, so that differences below it do not count.
 const NOISE_TEXELS: f64 = 0.5;
-/// Minimum number of matches of a pair.
+/// Minimum number of matches of a pair. Fewer may all be wrong.
 const MIN_MATCHES: usize = 8;
-/// Limits of the standard deviation of the distances from the epipolar lines, texels.
+/// Limits of the standard deviation of the distances from the epipolar lines, texels. Above the
+/// upper one, the median contains wrong matches.
 const MIN_NOISE_TEXELS: f64 = 0.25;
 const MAX_NOISE_TEXELS: f64 = 1.5;
-/// The standard deviation that an iteration assumes, relative to the previous iteration.
+/// The standard deviation that an iteration assumes, relative to the previous iteration. A faster
+/// decrease excludes right matches before the estimate has come near them.
 const ANNEALING: f64 = 0.75;
 const MAX_ITERATIONS: usize = 40;
 /// A step smaller than this number of standard deviations ends a round.
@@ -151,12 +156,16 @@ pub(super) fn align(keyframes: &[Arc<Keyframe>], choice: &CameraRefinement) -> O
         fit: None,
         corrections: scene.uncorrected(),
     };
-    let (mut trials, mut unobservable, mut pairs) = (Vec::new(), Vec::new(), None);
+    let mut trials = Vec::new();
+    let mut unobservable = Vec::new();
+    let mut pairs = None;
     // Matches near the epipolar lines of the kept model.
     let mut kept_matches: Option<Vec<PairMatches>> = None;
     let is_optional = !matches!(choice, CameraRefinement::Always(_));
     for set in sets.into_iter().filter(|set| scene.layout(*set).n() > 0) {
         let has_extrinsics = set.contains(ParamSet::EXTRINSICS);
+        // Matching takes most of the time, so parameters that hardly improve existing matches are
+        // rejected without searching for new ones. For extrinsics, the existing matches say little.
         if is_optional && !has_extrinsics {
             let matches =
                 kept_matches.get_or_insert_with(|| scene.matches(&kept.corrections, &QUICK_ROUND));
@@ -194,7 +203,10 @@ pub(super) fn align(keyframes: &[Arc<Keyframe>], choice: &CameraRefinement) -> O
             scene.reset_insignificant_extrinsics(&mut variant);
         }
         if is_kept {
-            (kept, pairs, kept_matches) = (variant, Some(variant_pairs), None);
+            kept = variant;
+            pairs = Some(variant_pairs);
+            // The epipolar lines have moved.
+            kept_matches = None;
         } else {
             pairs.get_or_insert(variant_pairs);
         }
@@ -219,6 +231,7 @@ impl FeatureScene {
             }
         }
         ixs_of_camera.retain(|_, ixs| ixs.len() >= MIN_IMAGES_PER_CAMERA);
+        // The limit holds for all cameras together, but each one gets enough for an estimate.
         let max_images = (MAX_IMAGES / ixs_of_camera.len().max(1)).max(MIN_IMAGES_PER_CAMERA);
         let sampled = ixs_of_camera.values().flat_map(|ixs| {
             let n = ixs.len().min(max_images);
@@ -236,6 +249,7 @@ impl FeatureScene {
         Self { images, cameras }
     }
 
+    /// No corrections.
     fn uncorrected(&self) -> Corrections {
         Corrections::none(self.cameras.len())
     }
@@ -270,11 +284,14 @@ impl FeatureScene {
 
     /// Half the width of the search band of a pair, radians.
     fn band_rad(&self, pair: &Pair, to_from_from: &Transform, round: &Round) -> f64 {
-        let (from, to) = (&self.images[pair.from], &self.images[pair.to]);
+        let from = &self.images[pair.from];
+        let to = &self.images[pair.to];
         // An error that both images share cancels unless they are rotated relative to each other.
-        let share = match from.camera == to.camera {
-            true => 2.0 * (0.5 * to_from_from.rotation.angle()).sin(),
-            false => std::f64::consts::SQRT_2,
+        // Errors of two cameras are independent, and add up.
+        let share = if from.camera == to.camera {
+            2.0 * (0.5 * to_from_from.rotation.angle()).sin()
+        } else {
+            std::f64::consts::SQRT_2
         };
         let baseline_m = to_from_from.translation.vector.norm();
         let direction_rad = round.rotation_rad + share * round.translation_m / baseline_m;
@@ -285,24 +302,27 @@ impl FeatureScene {
     /// Matches pairs of images near their epipolar lines. Pairs with few matches are dropped.
     fn matches(&self, corrections: &Corrections, round: &Round) -> Vec<PairMatches> {
         let cameras = self.moving_cameras(corrections);
-        let of_pair = |pair: Pair| {
-            let pair_cameras = [&cameras[pair.from], &cameras[pair.to]];
-            let [from_pose, to_pose] = pair_cameras.map(|camera| camera.world_from_camera);
-            let to_from_from = to_pose.inverse() * from_pose;
-            let band_rad = self.band_rad(&pair, &to_from_from, round);
-            let (from, to) = (&self.images[pair.from], &self.images[pair.to]);
-            let matches = matching::matches(from, to, pair_cameras, band_rad);
-            (matches.len() >= MIN_MATCHES).then_some(PairMatches {
-                pair,
-                cameras: [from.camera, to.camera],
-                matches,
-                band_rad,
-            })
-        };
         image_pairs::choose(&self.images, &cameras, round.n_partners)
             .into_par_iter()
-            .filter_map(of_pair)
+            .map(|pair| self.matches_of_pair(pair, &cameras, round))
+            .filter(|found| found.matches.len() >= MIN_MATCHES)
             .collect()
+    }
+
+    /// Matches one pair of images near their epipolar lines.
+    fn matches_of_pair(&self, pair: Pair, cameras: &[MovingCamera], round: &Round) -> PairMatches {
+        let pair_cameras = [&cameras[pair.from], &cameras[pair.to]];
+        let [from_pose, to_pose] = pair_cameras.map(|camera| camera.world_from_camera);
+        let to_from_from = to_pose.inverse() * from_pose;
+        let band_rad = self.band_rad(&pair, &to_from_from, round);
+        let from = &self.images[pair.from];
+        let to = &self.images[pair.to];
+        PairMatches {
+            pair,
+            cameras: [from.camera, to.camera],
+            matches: matching::matches(from, to, pair_cameras, band_rad),
+            band_rad,
+        }
     }
 
     /// Estimates a set of parameters in rounds of matching, starting from another model. Also
@@ -344,23 +364,17 @@ impl FeatureScene {
             }
         }
         let (matches, fit) = last?;
+        // Images without texture or overlap also give matches, but not where the estimate predicts
+        // them.
         let cameras = self.moving_cameras(&corrections);
-        let is_inner =
-            |pair: &PairMatches, distance: &f64| distance.abs() < MAX_INNER_FRAC * pair.band_rad;
-        let of_pair = |pair: &PairMatches| {
+        let mut n_inner = 0;
+        let mut n = 0;
+        for pair in &matches {
             let distances = pair.distances_rad(&cameras);
-            (
-                distances
-                    .iter()
-                    .filter(|distance| is_inner(pair, distance))
-                    .count(),
-                distances.len(),
-            )
-        };
-        let (n_inner, n) = matches
-            .iter()
-            .map(of_pair)
-            .fold((0, 0), |all, pair| (all.0 + pair.0, all.1 + pair.1));
+            let max_rad = MAX_INNER_FRAC * pair.band_rad;
+            n_inner += distances.iter().filter(|rad| rad.abs() < max_rad).count();
+            n += distances.len();
+        }
         log::debug!("features: {n_inner} of {n} matches are consistent");
         let is_consistent = n_inner as f64 > MIN_INNER_MATCHES * n as f64;
         let model = CalibrationModel {
@@ -388,6 +402,8 @@ impl FeatureScene {
                 .for_each(|distance| *distance = distance.abs());
             let measured = 1.4826 * quantile(&mut distances, 0.5, Rank::Upper)?;
             let target = measured.clamp(MIN_NOISE_TEXELS, MAX_NOISE_TEXELS);
+            // From wide to narrow, at most by `ANNEALING` per iteration: with a narrow scale from
+            // the start, most right matches would count as outliers.
             let noise_texels = assumed_noise
                 .map_or(measured, |assumed| ANNEALING * assumed)
                 .max(target);
@@ -441,7 +457,8 @@ impl FeatureScene {
                 && !model.has_significant(&Layout::extrinsics_of(camera))
             {
                 let correction = &mut model.corrections.by_camera[camera];
-                (correction.rotation_rad, correction.translation_m) = ([0.0; 3], [0.0; 3]);
+                correction.rotation_rad = [0.0; 3];
+                correction.translation_m = [0.0; 3];
             }
         }
     }
@@ -449,12 +466,13 @@ impl FeatureScene {
     /// Cross-validation group of each image. The images of each camera are distributed evenly.
     fn folds(&self) -> Vec<usize> {
         let mut n_of_camera = vec![0; self.cameras.len()];
-        let fold_of = |image: &FeatureImage| {
+        let mut folds = Vec::with_capacity(self.images.len());
+        for image in &self.images {
             let rank = &mut n_of_camera[image.camera];
+            folds.push(*rank % N_FOLDS);
             *rank += 1;
-            (*rank - 1) % N_FOLDS
-        };
-        self.images.iter().map(fold_of).collect()
+        }
+        folds
     }
 
     /// Matches for comparing two models.
@@ -506,48 +524,75 @@ impl FeatureScene {
         matches: &[PairMatches],
     ) -> Trial {
         let folds = self.folds();
-        let [baseline_layout, variant_layout] =
-            [baseline, variant].map(|model| self.layout(model.set));
-        let of_fold = |fold: usize| {
-            let is_held_out = |image: usize| folds[image] == fold;
-            let (tested, used): (Vec<PairMatches>, Vec<PairMatches>) = matches
-                .iter()
-                .cloned()
-                .partition(|pair| is_held_out(pair.pair.from) || is_held_out(pair.pair.to));
-            let fitted = |layout: &Layout, model: &CalibrationModel| match layout.n() {
-                0 => Some(self.moving_cameras(&model.corrections)),
-                _ => self
-                    .fit(&used, layout, &model.corrections)
-                    .map(|fit| self.moving_cameras(&fit.corrections)),
-            };
-            let both = fitted(&baseline_layout, baseline).zip(fitted(&variant_layout, variant));
-            let gain_db = |image: usize| {
-                let (baseline, variant) = both.as_ref()?;
-                let pairs = tested
-                    .iter()
-                    .filter(|pair| pair.pair.from == image || pair.pair.to == image);
-                let gains = pairs.flat_map(|pair| {
-                    let distances = pair
-                        .distances_texels(baseline)
-                        .into_iter()
-                        .zip(pair.distances_texels(variant));
-                    distances.map(|(before, after)| {
-                        20.0 * (NOISE_TEXELS.hypot(before) / NOISE_TEXELS.hypot(after)).log10()
-                    })
-                });
-                let gains: Vec<f64> = gains.collect();
-                (!gains.is_empty()).then(|| gains.iter().sum::<f64>() / gains.len() as f64)
-            };
-            (0..self.images.len())
-                .filter(|image| is_held_out(*image))
-                .filter_map(gain_db)
-                .collect::<Vec<f64>>()
-        };
         let gains_db: Vec<f64> = (0..N_FOLDS)
             .into_par_iter()
-            .flat_map_iter(of_fold)
+            .flat_map_iter(|fold| {
+                let is_held_out: Vec<bool> =
+                    folds.iter().map(|of_image| *of_image == fold).collect();
+                self.held_out_gains_db([baseline, variant], matches, &is_held_out)
+            })
             .collect();
         log::debug!("features: {set}: gains {gains_db:.2?} dB");
         Trial::of_gains(Candidate::Cameras(set), &gains_db).with_enough_images()
     }
+
+    /// Gain of each held-out image, dB, if two models are estimated without them.
+    fn held_out_gains_db(
+        &self,
+        [baseline, variant]: [&CalibrationModel; 2],
+        matches: &[PairMatches],
+        is_held_out: &[bool],
+    ) -> Vec<f64> {
+        // A pair with one held-out image would reveal its corners to the estimate.
+        let (tested, used): (Vec<PairMatches>, Vec<PairMatches>) = matches
+            .iter()
+            .cloned()
+            .partition(|pair| is_held_out[pair.pair.from] || is_held_out[pair.pair.to]);
+        let both = self
+            .refitted(baseline, &used)
+            .zip(self.refitted(variant, &used));
+        let Some((baseline, variant)) = both else {
+            return Vec::new();
+        };
+        (0..self.images.len())
+            .filter(|image| is_held_out[*image])
+            .filter_map(|image| mean_gain_db(&tested, image, [&baseline, &variant]))
+            .collect()
+    }
+
+    /// Cameras after the parameters of a model are estimated again from these matches.
+    fn refitted(
+        &self,
+        model: &CalibrationModel,
+        matches: &[PairMatches],
+    ) -> Option<Vec<MovingCamera>> {
+        let layout = self.layout(model.set);
+        if layout.n() == 0 {
+            return Some(self.moving_cameras(&model.corrections));
+        }
+        let fit = self.fit(matches, &layout, &model.corrections)?;
+        Some(self.moving_cameras(&fit.corrections))
+    }
+}
+
+/// Mean decrease, dB, of the distances of the matches of an image from their epipolar lines, from
+/// baseline to variant cameras. `None` without matches.
+fn mean_gain_db(
+    pairs: &[PairMatches],
+    image: usize,
+    [baseline, variant]: [&[MovingCamera]; 2],
+) -> Option<f64> {
+    let pairs = pairs
+        .iter()
+        .filter(|pair| pair.pair.from == image || pair.pair.to == image);
+    let gains = pairs.flat_map(|pair| {
+        let before = pair.distances_texels(baseline).into_iter();
+        before
+            .zip(pair.distances_texels(variant))
+            .map(|(before, after)| {
+                20.0 * (NOISE_TEXELS.hypot(before) / NOISE_TEXELS.hypot(after)).log10()
+            })
+    });
+    let gains: Vec<f64> = gains.collect();
+    (!gains.is_empty()).then(|| gains.iter().sum::<f64>() / gains.len() as f64)
 }

@@ -48,6 +48,7 @@ impl MovingCamera {
 
     /// Where the camera saw a corner, to first order in the motion during readout.
     pub(super) fn sighting(&self, corner: &Corner) -> Sighting {
+        // Time from mid-exposure to the readout of the row.
         let secs = self.readout_secs * corner.row_share;
         let plane =
             [0, 1].map(|axis| (corner.px[axis] - self.principal_px[axis]) / self.focal_px[axis]);
@@ -94,6 +95,8 @@ impl MovingCamera {
         let Some(lens) = layout.of_camera(camera).lens else {
             return [None; 4];
         };
+        // A longer focal length moves rays toward the axis; an offset of the principal point moves
+        // all rays against it.
         let offset = |axis: usize| -self.keyframe_focal_px[axis] / self.focal_px[axis];
         [
             Some((lens, Vector2::new(-ray.x, 0.0))),
