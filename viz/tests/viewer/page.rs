@@ -251,7 +251,11 @@ fn page_renders_scene_and_overlays_correctly() {
     let is_tenth = widths
         .iter()
         .any(|width| (width * 10).abs_diff(full.size_px[0]) < 10);
-    let is_half = (widths[widths.len() - 2] * 2).abs_diff(full.size_px[0]) < 2;
+    // On a busy machine, the page may request the full picture again.
+    let before_full = widths.split(|width| *width == full.size_px[0]).next();
+    let is_half = before_full
+        .and_then(<[u32]>::last)
+        .is_some_and(|width| (width * 2).abs_diff(full.size_px[0]) < 2);
     assert!(
         is_tenth && is_half,
         "stages of 10, 50 and 100 %: {widths:?}"
