@@ -36,12 +36,12 @@ static LOST_OUTPUT: AtomicBool = AtomicBool::new(false);
 /// Maximum number of output chunks that wait to be written. With a queue, a terminal that accepts
 /// no output, for example after a broken connection, does not block the program.
 const MAX_WAITING: usize = 4096;
-/// At exit, the program waits at most this long for its output to be written. A slow connection needs
-/// seconds for a full queue; one that is broken never accepts it.
+/// At exit, the program waits at most this long for its output to be written. A slow connection
+/// needs seconds for a full queue; one that is broken never accepts it.
 const MAX_FLUSH: Duration = Duration::from_secs(5);
 
-/// A command waits at most this long for the log before it prints a line of its result. Lines of both
-/// streams then appear in the order in which they were written, unless stderr is blocked.
+/// A command waits at most this long for the log before it prints a line of its result. Lines of
+/// both streams then appear in the order in which they were written, unless stderr is blocked.
 const MAX_ORDERING: Duration = Duration::from_millis(200);
 
 /// A part of the output of one stream.

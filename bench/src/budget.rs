@@ -15,9 +15,9 @@ use trainer::{MethodOptions, ModelSpec};
 
 /// Training time of a run if no flag limits it.
 const DEFAULT_SECONDS: f64 = 60.0;
-/// Gain below which doubling the splats is not worthwhile, dB: the same value with which the trainer
-/// chooses their number, see the text of the page. Doubling the splats doubles the memory of the
-/// model.
+/// Gain below which doubling the splats is not worthwhile, dB: the same value with which the
+/// trainer chooses their number, see the text of the page. Doubling the splats doubles the memory
+/// of the model.
 const MIN_GAIN_DB: f64 = 0.1;
 
 /// Options of [`run`].

@@ -19,8 +19,8 @@ use trainer::{ModelOptions, ModelSpec};
 
 /// Training time of a run if no flag limits it.
 const DEFAULT_SECONDS: f64 = 30.0;
-/// Losses of PSNR for which the size of the disturbance is reported, dB. A loss of 3 dB is twice the
-/// mean squared error.
+/// Losses of PSNR for which the size of the disturbance is reported, dB. A loss of 3 dB is twice
+/// the mean squared error.
 const BREAKS_DB: [f64; 2] = [1.0, 3.0];
 const NANOS_PER_SEC: f64 = 1e9;
 /// Difference between consecutive stamps that only count images, nanoseconds.

@@ -23,8 +23,8 @@ const SETTLE_SECS: f64 = 0.3;
 /// Largest drift of a joint during that time, radians or meters: the difference between the means
 /// of both halves, which averages the noise of encoders.
 ///
-/// With a smaller value, arms that sway or have coarse encoders never count as resting. A larger one
-/// lets images of a moving camera through: 3e-4 rad at an arm's length of 1 m is 0.3 mm.
+/// With a smaller value, arms that sway or have coarse encoders never count as resting. A larger
+/// one lets images of a moving camera through: 3e-4 rad at an arm's length of 1 m is 0.3 mm.
 const MAX_DRIFT: f64 = 3e-4;
 /// Maximum time until the arm stands still and an image arrives.
 const MAX_WAIT_SECS: f64 = 15.0;

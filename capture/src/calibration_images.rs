@@ -27,8 +27,8 @@ const MAX_IMAGES: usize = 300;
 /// Interval between images of a robot without an arm, seconds. Images of a target held by hand that
 /// follow more closely show nearly the same view.
 const INTERVAL_SECS: f64 = 0.5;
-/// Uncertainty of image stamps for the check of the speed, seconds. A larger value keeps only images
-/// of slower motions.
+/// Uncertainty of image stamps for the check of the speed, seconds. A larger value keeps only
+/// images of slower motions.
 const STAMP_SIGMA_SECS: f64 = 0.002;
 
 /// A gray image.

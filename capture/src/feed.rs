@@ -235,7 +235,7 @@ impl Pump {
             if is_restarted && self.restart().is_err() {
                 break;
             }
-            // Before the join, so that a replay sees exactly what the join has seen.
+            // Before the join, so that a replay gets exactly the samples that the join got.
             self.record(&sample, &mut recording_error);
             self.remember_arrival(&sample);
             // Viewers get the readings at once; the join may hold images back for up to its longest

@@ -23,8 +23,8 @@ use std::time::{Duration, Instant};
 /// scan of a few seconds gives so many. With more, keyframes reach the trainer later; with fewer,
 /// the correction has fewer pairs of images and is less certain.
 const MIN_KEYFRAMES: usize = 14;
-/// Maximum time to wait for that many keyframes, seconds. Without a limit, a short visit or a camera
-/// without texture in view would hold its keyframes until the base leaves.
+/// Maximum time to wait for that many keyframes, seconds. Without a limit, a short visit or a
+/// camera without texture in view would hold its keyframes until the base leaves.
 const MAX_SCAN_SECS: f64 = 10.0;
 /// Maximum time to wait for a station while the base moves, seconds. A base that drives for longer
 /// may not stop at all. Afterwards, or with

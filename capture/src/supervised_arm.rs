@@ -114,7 +114,7 @@ impl SupervisedArm {
     /// # Errors
     /// If the arm rejects it.
     pub fn command(&mut self, requested: &JointTarget) -> crate::Result<JointTarget> {
-        // The driver knows the positions of its encoders, without offsets.
+        // The driver reports positions of its encoders, without offsets.
         let requested = self.with_offsets(requested, -1.0);
         let accepted = self.arm.command(&requested)?;
         Ok(self.with_offsets(&accepted, 1.0))

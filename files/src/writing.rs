@@ -68,7 +68,7 @@ pub fn create_from<T, E: From<Error>>(
         return Err(exists().into());
     }
     let unfinished = Unfinished::folder(path)?;
-    // `write` sees the final name, whose extension selects the format of some exports.
+    // `write` gets the final name, whose extension selects the format of some exports.
     let inside = unfinished.path.join(path.file_name().unwrap_or_default());
     let written = write(&inside)?;
     publish(&inside, path)?;
@@ -223,8 +223,8 @@ impl Unfinished {
                     let flags =
                         OFlags::RDONLY | OFlags::NOFOLLOW | OFlags::NONBLOCK | OFlags::CLOEXEC;
                     match rustix::fs::open(&unfinished, flags, Mode::empty()).map(File::from) {
-                        // The lock tells a leftover from a file that is being written: the kernel
-                        // releases it when its program ends, however that happens.
+                        // The lock distinguishes a leftover from a file that is being written: the
+                        // kernel releases it when its program ends, however that happens.
                         Ok(leftover) if !try_lock(&leftover)? => return Err(busy()),
                         // Holding the lock keeps other programs from removing a new file at this
                         // path in the meantime.

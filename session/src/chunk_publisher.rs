@@ -13,8 +13,8 @@ const MIN_PERIOD: Duration = Duration::from_millis(500);
 /// Pause after a failure. Each failure is logged, and its cause, such as a lack of memory, does not
 /// pass within one version.
 const RETRY_PERIOD: Duration = Duration::from_secs(10);
-/// Maximum fraction of the time that encoding takes. Encoding uses processors that training, devices
-/// and pictures need, too. With a larger fraction, viewers get large models more often.
+/// Maximum fraction of the time that encoding takes. Encoding uses processors that training,
+/// devices and pictures need, too. With a larger fraction, viewers get large models more often.
 const MAX_ENCODE_FRAC: f64 = 0.25;
 
 /// Encodes chunks on another thread, one model at a time.

@@ -24,8 +24,8 @@ const NEAR_M: f64 = 0.01;
 /// Far plane of renders, meters. Photos of a dataset may show a landscape.
 const FAR_M: f64 = 1000.0;
 
-/// How long [`Evaluator::score_all`] waits for scores before it calls `meanwhile` again, which draws
-/// pictures for viewers. A longer wait would delay these pictures.
+/// How long [`Evaluator::score_all`] waits for scores before it calls `meanwhile` again, which
+/// draws pictures for viewers. A longer wait would delay these pictures.
 const MEANWHILE_PERIOD: Duration = Duration::from_millis(5);
 
 /// Minimum alpha of a pixel that counts as covered by the model: half of the range. Below it, the

@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 use trainer::gpu::Gpu;
 
 /// Maximum number of attempts to reopen the GPU. A driver that resets needs seconds; a device that
-/// is still missing after several attempts has probably failed for good, and the run should report
+/// is still missing after several attempts has probably failed, and the run should report
 /// this instead of recording without training.
 const MAX_RECOVERIES: u32 = 3;
 /// The attempt count is reset after this time without a failure, because a run of several days may

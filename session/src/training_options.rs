@@ -114,8 +114,8 @@ pub struct AvailableData {
 }
 
 /// Minimum average number of images per camera for the optimization of extrinsics by default. The
-/// error of the extrinsics is shared by all images of a camera, while the errors of its poses differ
-/// from image to image. With few images, the two cannot be told apart.
+/// error of the extrinsics is shared by all images of a camera, while the errors of its poses
+/// differ from image to image. With few images, the two are indistinguishable.
 pub(crate) const MIN_IMAGES_PER_CAMERA: usize = 10;
 
 impl TrainingOptions {
@@ -252,8 +252,8 @@ impl TrainingOptions {
                 with_scene: CameraRefinement::Always(set),
             });
         }
-        // With depth, registration is more accurate than training with the scene. Only parameters of
-        // single images are left for the scene.
+        // With depth, registration is more accurate than training with the scene. Only parameters
+        // of single images are left for the scene.
         Ok(RefineSettings {
             align: CameraRefinement::Always(set - ParamSet::IMAGE_GAINS),
             with_scene: CameraRefinement::Always(

@@ -14,8 +14,8 @@ use viz::{
     Control, EditAction, EditRequest, Hub, KeyframePose, ModelStatus, PendingRender, Status,
 };
 
-/// Maximum response time to Ctrl-C while no client requests a picture. Edits wait as long; a shorter
-/// period would use more of a processor while nothing happens.
+/// Maximum response time to Ctrl-C while no client requests a picture. Edits wait as long; a
+/// shorter period would use more of a processor while nothing happens.
 const POLL_PERIOD: Duration = Duration::from_millis(100);
 
 /// A model that clients can view.
@@ -165,7 +165,8 @@ impl ModelViewer {
     /// Makes an edit; see [`Editor::apply`].
     fn edit(&mut self, request: &EditRequest) -> Result<Option<String>, String> {
         let model = model_mut(&mut self.models, request.method())?;
-        // Pages draw boxes in their own world, which is z up. Edits are stored in the model's world.
+        // Pages draw boxes in their own world, which is z up. Edits are stored in the model's
+        // world.
         let action = match *request.action() {
             EditAction::Erase(aabb) => EditAction::Erase(box_in_model(aabb, &self.model_from_page)),
             action => action,

@@ -285,7 +285,8 @@ pub(crate) fn objects() -> Vec<Object> {
 
 /// The textures by name, with baked lighting.
 pub(crate) fn textures() -> Vec<(&'static str, Texture)> {
-    /// Distance up to which objects darken a surface, meters: about the size of the cabinet's parts.
+    /// Distance up to which objects darken a surface, meters: about the size of the cabinet's
+    /// parts.
     const AMBIENT_REACH_M: f64 = 0.3;
     let mut occluders = Occluders::new(AMBIENT_REACH_M);
     furniture().add_occluders(&mut occluders);

@@ -465,7 +465,8 @@ impl Config {
             return Err(Error::NoCamera);
         }
         for (ix, camera) in self.cameras.iter().enumerate() {
-            // Samples name their camera, so two cameras of the same name could not be told apart.
+            // Samples name their camera, so two cameras of the same name would be
+            // indistinguishable.
             if self.cameras[..ix]
                 .iter()
                 .any(|other| other.name == camera.name)

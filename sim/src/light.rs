@@ -39,11 +39,12 @@ const FILLS: [Lamp; 2] = [
 /// Ambient light, sRGB 0 to 1.
 const AMBIENT: [f64; 3] = [0.37, 0.37, 0.39];
 
-/// Tangent of half the angle that the key lamp covers. A larger lamp gives softer shadows, which need
-/// more rays.
+/// Tangent of half the angle that the key lamp covers. A larger lamp gives softer shadows, which
+/// need more rays.
 const KEY_SIZE: f64 = 0.06;
 /// Number of rays to the key lamp and of ambient rays. Fewer rays give visible noise, which
-/// [`Texture::shade`](crate::texture::Texture::shade) blurs; more take longer when a scene is built.
+/// [`Texture::shade`](crate::texture::Texture::shade) blurs; more take longer when a scene is
+/// built.
 const N_KEY_RAYS: u64 = 12;
 const N_AMBIENT_RAYS: u64 = 20;
 
@@ -169,7 +170,8 @@ impl Occluders {
     ///
     /// `name` identifies the point and selects its random rays.
     pub(crate) fn light_frac(&self, point: &Point3<f64>, normal: &Vector3<f64>, name: u64) -> f64 {
-        /// Rays start this far above the surface, so that rounding does not let them hit it, meters.
+        /// Rays start this far above the surface, so that rounding does not let them hit it,
+        /// meters.
         const LIFT_M: f64 = 5e-4;
         let random = RandomStream::new(0x11_6874, &[name]);
         let from = point + normal * LIFT_M;

@@ -135,8 +135,8 @@ struct Holes {
     cluster_share: f64,
 }
 
-/// Maximum fraction of edge pixels that become holes. With 1, every depth edge would be missing, which
-/// real cameras do not show either.
+/// Maximum fraction of edge pixels that become holes. With 1, every depth edge would be missing,
+/// which real cameras do not show either.
 const MAX_EDGE_SHARE: f64 = 0.6;
 /// Side of a cluster of holes, pixels.
 const CLUSTER_PX: usize = 4;

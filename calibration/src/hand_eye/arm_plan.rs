@@ -168,7 +168,7 @@ impl<'a> ArmPlan<'a> {
         // A few small rotations first: with fewer samples, or a large uncertainty, an estimate may
         // be far off.
         if n < 5 || estimate.as_ref().map_or(true, |found| is_uncertain(found)) {
-            // Poses that the arm does not reach are skipped for good.
+            // Poses that the arm does not reach are skipped and not tried again.
             while let Some((pose, purpose)) = self.first.pop_front() {
                 if let Some(joints) = self.reach.joints_for(&pose, current) {
                     return ArmStep::Move { joints, purpose };

@@ -162,8 +162,8 @@ fn inversion_mistake(
     );
     let robot_remedy = format!("invert the robot poses, or choose the setup {other}");
     let board = "camera_from_board is inverted: the given matrices are board_from_camera";
-    // The camera sees only boards in front of it. Poses from corners are not inverted: this program
-    // computed them.
+    // Only boards in front of the camera are visible. Poses from corners are not inverted: this
+    // program computed them.
     let is_in_front = |sample: &Sample| sample.candidates[0].camera_from_board.translation.z > 0.0;
     let inverse_is_in_front = |sample: &Sample| {
         let pose = sample.candidates[0].camera_from_board;

@@ -372,7 +372,7 @@ fn refine(
     let pose = least_squares::minimize(&problem, initial, &options)
         .ok()?
         .state;
-    // All corners are judged, not only the used ones: a corner that the initial set left out may
+    // All corners are checked, not only the used ones: a corner that the initial set left out may
     // fit the refined pose.
     let errors: Vec<f64> = points
         .iter()

@@ -56,7 +56,7 @@ pub(super) fn reject_and_fit(
         )?;
         solution = fit.solution;
         noise = fit.noise;
-        // All samples are judged again, so that a sample that was excluded by a bad start returns.
+        // All samples are checked again, so that a sample that was excluded by a bad start returns.
         let next_choice = consensus::choose(samples, &solution);
         let measurements = pose_fit::measurements(samples, &next_choice);
         let squared_distances: Vec<f64> = measurements

@@ -91,7 +91,7 @@ pub(super) fn fit(
     /// first fit.
     const MAX_START_RATIO: f64 = 8.0;
     let max_error_px = MAX_START_RATIO * start.median_error_px();
-    // A wrong pose in the first fit would bend the lens. Images that are left out here are judged
+    // A wrong pose in the first fit would bend the lens. Images that are left out here are checked
     // again later.
     let image_ixs: Vec<usize> = (0..images.len())
         .filter(|ix| start.errors_px[*ix] <= max_error_px)

@@ -178,7 +178,7 @@ impl Correspondence {
         let [fx, fy] = j.view.depth_focal_px;
         let q = &self.in_depth;
         let [sx, sy] = self.reading_gradient;
-        // The reading changes with the pixel, and the depth of the point by itself.
+        // Two terms: the reading changes with the pixel, and the depth of the point changes.
         let along_z = -(sx * fx * q.x + sy * fy * q.y) / (q.z * q.z) - 1.0;
         let in_depth = Vector3::new(sx * fx / q.z, sy * fy / q.z, along_z) * weight;
         let gradient_j = j.view.color_from_depth.rotation * in_depth;

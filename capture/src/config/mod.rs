@@ -92,7 +92,7 @@ impl Rig {
     /// other problem with keys.
     pub fn load(path: &Path, overrides: &[Override]) -> Result<Self, ConfigError> {
         let text = read_file("the rig file", path)?;
-        // Messages name the file and not its folder, which the user knows.
+        // Messages name the file and not its folder, which the user has given.
         let file = path.file_name().map_or_else(
             || path.display().to_string(),
             |name| name.to_string_lossy().into_owned(),

@@ -11,8 +11,8 @@ use std::collections::{BTreeMap, BTreeSet};
 use toml::de::{DeTable, DeValue};
 use toml::{Table, Value};
 
-/// Maximum number of listed problems; further ones are only counted. A file of another kind, given by
-/// mistake, may have thousands of unknown keys.
+/// Maximum number of listed problems; further ones are only counted. A file of another kind, given
+/// by mistake, may have thousands of unknown keys.
 const MAX_PROBLEMS: usize = 50;
 
 /// State shared by all sections while a rig file is read.
@@ -72,8 +72,8 @@ impl ParseContext {
             } => *line,
             _ => 0,
         });
-        // If a misspelled key has been reported with the key that it probably means, that key is not
-        // reported as missing in addition.
+        // If a misspelled key has been reported with the key that it probably means, that key is
+        // not reported as missing in addition.
         let is_meant = |problem: &ConfigError| matches!(problem, ConfigError::Missing { key, .. } if is_suggested(key, &problems));
         let others: Vec<_> = others
             .into_iter()

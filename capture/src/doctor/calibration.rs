@@ -6,11 +6,11 @@ use crate::config::{Camera, Parent, Rig};
 use kinematics::{Lens, Transform};
 
 const CHECK: &str = "calibration";
-/// Maximum plausible distance of a camera from the flange that carries it. Lengths in centimeters or
-/// millimeters exceed it.
+/// Maximum plausible distance of a camera from the flange that carries it. Lengths in centimeters
+/// or millimeters exceed it.
 const MAX_DISTANCE_M: f64 = 3.0;
-/// Plausible horizontal fields of view. Focal lengths in millimeters or normalized by the width fall
-/// outside.
+/// Plausible horizontal fields of view. Focal lengths in millimeters or normalized by the width
+/// fall outside.
 const FIELD_OF_VIEW_DEG: std::ops::RangeInclusive<f64> = 5.0..=160.0;
 /// Minimum plausible exposure time. Times in milliseconds are below it.
 const MIN_EXPOSURE_MICROS: f64 = 5.0;

@@ -284,7 +284,8 @@ impl Join {
         )?)
     }
 
-    /// Adds a joint state. The first state of each kind of problem is logged, all of them are counted.
+    /// Adds a joint state. The first state of each kind of problem is logged, all of them are
+    /// counted.
     fn push_joints(&mut self, state: JointState) {
         // States that are ignored below are checked, too: readings in degrees also imply impossible
         // speeds, but this warning names the cause.

@@ -23,8 +23,8 @@ mod with_sdk {
     /// Maximum difference between the intrinsics in the rig file and those stored in the camera,
     /// pixels. Above it, one of them probably belongs to another camera.
     ///
-    /// A recalibration of the same camera changes its projections by less, and another camera of the
-    /// same type usually by more.
+    /// A recalibration of the same camera changes its projections by less, and another camera of
+    /// the same type usually by more.
     const MAX_DIFFERENCE_PX: f64 = 5.0;
 
     /// Opens a camera and copies calibration that the rig file omits from it. Values in the rig

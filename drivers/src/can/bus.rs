@@ -44,7 +44,8 @@ impl Bus {
         // the socket exists.
         Link::read(&config.interface)?.check(config)?;
         let open = CanFdSocket::open(&config.interface).and_then(|socket| {
-            // Error frames are off by default. They tell an unpowered motor from a bus that is cut.
+            // Error frames are off by default. They distinguish an unpowered motor from a bus that
+            // is cut.
             socket.set_error_filter_accept_all()?;
             // A stamp of the kernel does not depend on when this thread is scheduled.
             socket.set_recv_timestamp(true)?;

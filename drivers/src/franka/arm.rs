@@ -220,7 +220,7 @@ fn check_kinematics(config: &ArmConfig, state: &RobotState) -> Result<(), String
         return Ok(());
     }
     // If the rig file agrees with the tool instead, its author has named the hand as the flange.
-    // This mistake can be told from the others.
+    // This mistake is distinguishable from the others.
     let (tool_error_m, tool_error_rad) = difference(&ours, &base_from_tool);
     let tip = chain.tip_link();
     let likely_cause = if tool_error_m <= MAX_POSE_ERROR_M && tool_error_rad <= MAX_POSE_ERROR_RAD {
@@ -393,7 +393,7 @@ impl StateReader {
         let NumberedState { number, state } = numbered;
         let statistics = &mut state_queue.statistics;
         match self.sequence.position(*number, at) {
-            // UDP may lose, duplicate and reorder datagrams. The numbers tell these cases apart.
+            // UDP may lose, duplicate and reorder datagrams. The numbers distinguish these cases.
             SequencePosition::New { n_lost } => statistics.n_lost += n_lost,
             SequencePosition::Restart => statistics.n_restarts += 1,
             SequencePosition::Current | SequencePosition::Late => {

@@ -206,7 +206,7 @@ pub(super) fn command(
     position_rad: &[f64; N_JOINTS],
     is_last: bool,
 ) -> Vec<u8> {
-    // The number of the state that is answered. By it, the robot tells which millisecond the
+    // The number of the state that is answered. From it, the robot computes which millisecond the
     // positions are for.
     let message_id = U64::new(number);
     let q_c = f64s_to_wire(position_rad);

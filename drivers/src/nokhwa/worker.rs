@@ -236,7 +236,7 @@ fn open(config: &Config, index: CameraIndex) -> Result<(Camera, V4l2Format), Pro
         reason = "compared with the original below"
     )]
     let whole_hz = rate_hz.round() as u32;
-    // nokhwa only knows integer rates. A rounded one would make the estimated gaps wrong.
+    // nokhwa supports only integer rates. A rounded one would make the estimated gaps wrong.
     if f64::from(whole_hz) != rate_hz {
         return Err(Problem::Rate { rate_hz });
     }

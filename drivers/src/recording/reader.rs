@@ -117,7 +117,7 @@ impl Recording {
             ended: false,
         };
         // Joint names and attachments precede the first sample, so reading it makes them available.
-        // It also tells a recording of this program from other MCAP files.
+        // It also distinguishes recordings of this program from other MCAP files.
         recording.first = recording.read_sample()?;
         if recording.first.is_none() {
             return Err(Error::EmptyRecording {

@@ -60,7 +60,7 @@ impl Base for UdpBase {
                         "skipped a pose with a standard deviation of {m:.3} m and {rad:.4} rad"
                     );
                     count_and_warn("base", &mut self.poses.counts.n_uncertain, 1, what);
-                    // The reader has published the counts before this pose was judged.
+                    // The reader has published the counts before this pose was checked.
                     self.poses.publish_counts();
                 }
                 _ => {

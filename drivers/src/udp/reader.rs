@@ -105,7 +105,7 @@ impl DatagramReader {
                 return None;
             }
         };
-        // The sender is judged only by valid datagrams: whatever else reaches the port, such as a
+        // Only valid datagrams identify the sender: whatever else reaches the port, such as a
         // port scan, must not take the place of the current sender.
         let device = self.receiver.device();
         let n_foreign = &mut self.counts.n_foreign;

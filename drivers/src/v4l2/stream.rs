@@ -176,7 +176,7 @@ impl V4l2Stream {
                     if let Some(Err(error)) = other {
                         log::debug!("{error}");
                     }
-                    // A damaged image counts as lost, too: the caller never sees it.
+                    // A damaged image counts as lost, too: it is never returned to the caller.
                     self.n_unreported += 1;
                     self.n_damaged += 1;
                     if Instant::now() >= deadline {

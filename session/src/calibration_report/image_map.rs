@@ -178,8 +178,8 @@ impl ImageMap {
             .iter()
             .map(|point| point.residual_px[0].hypot(point.residual_px[1]))
             .collect();
-        // A quantile instead of the maximum, so that one wrong corner does not make all other arrows
-        // too short to see.
+        // A quantile instead of the maximum, so that one wrong corner does not make all other
+        // arrows too short to see.
         let rank = kinematics::quantile::Rank::Nearest;
         let long_px = kinematics::quantile::quantile(&mut lengths, 0.95, rank).unwrap_or(0.0);
         let magnification =

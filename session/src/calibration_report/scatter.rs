@@ -25,7 +25,7 @@ pub(super) fn svg(axes: [&str; 2], points: &[ScatterPoint]) -> String {
         .flat_map(|point| point.at);
     let step = tick_step(used.map(f64::abs).fold(1e-6, f64::max));
     let range = 2.0 * step;
-    // Points at the edge are beyond the last tick, so that they can be told from points on it.
+    // Points at the edge are beyond the last tick, to distinguish them from points on it.
     let to = |value: f64| REACH * (value / range).clamp(-1.12, 1.12);
     let mut shapes = String::new();
     for tick in [-2.0, -1.0, 0.0, 1.0, 2.0] {

@@ -122,8 +122,8 @@ fn linear_ticks(low: f64, high: f64) -> Vec<f64> {
         .find(|step| *step >= rough);
     let step = step.unwrap_or(10.0 * power);
     let mut ticks = Vec::new();
-    // Products instead of repeated sums, whose rounding errors would accumulate and could remove the
-    // last tick.
+    // Products instead of repeated sums, whose rounding errors would accumulate and could remove
+    // the last tick.
     let mut n = (low / step).ceil();
     while n * step <= high {
         ticks.push(n * step);

@@ -158,8 +158,8 @@ impl Chart {
     }
 
     fn draw_grid(&self, plot: &Plot, shapes: &mut Vec<VectorShape>) {
-        // Where the last label ends. A label that would overlap it is left out, but its grid line is
-        // drawn.
+        // Where the last label ends. A label that would overlap it is left out, but its grid line
+        // is drawn.
         let mut free_from = f64::MIN;
         for (value, label) in &plot.x.ticks {
             let x = plot.x(*value);
@@ -366,8 +366,8 @@ fn draw_line(line: &Line, ix: usize, plot: &Plot, shapes: &mut Vec<VectorShape>)
 
 /// Draws a dot whose shape identifies the line: disc, square, triangle, diamond.
 fn draw_dot([x, y]: [f64; 2], line_ix: usize, shapes: &mut Vec<VectorShape>) {
-    // Corners, direction of the first one as a fraction of a turn, radius. The shapes have about the
-    // same area; 24 corners look like a circle.
+    // Corners, direction of the first one as a fraction of a turn, radius. The shapes have about
+    // the same area; 24 corners look like a circle.
     let (n_corners, first_angle_frac, radius) = [
         (24, 0.0, 3.6),
         (4, 0.125, 4.6),

@@ -186,8 +186,8 @@ impl Live {
     }
 }
 
-/// Name of a keyframe's camera, and the correction of its pose: the corrected camera in the frame of
-/// the reported one.
+/// Name of a keyframe's camera, and the correction of its pose: the corrected camera in the frame
+/// of the reported one.
 fn camera_correction(keyframe: &Keyframe, camera: &CalibratedCamera) -> (Arc<str>, Transform) {
     (
         keyframe.camera.clone(),

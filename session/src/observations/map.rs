@@ -27,9 +27,9 @@ const QUANTILES: [f64; 2] = [0.01, 0.99];
 /// The grid contains this fraction of the extent beyond the quantiles, for the surfaces at the
 /// border that the quantiles cut off.
 const MARGIN_FRAC: f64 = 0.1;
-/// Number of cells by which observations are extended. Depth maps have as many pixels per row as the
-/// grid has cells, so neighboring rays of a near camera meet adjacent cells. Seen from farther away
-/// or at an angle, they leave gaps of a few cells, which two extensions fill.
+/// Number of cells by which observations are extended. Depth maps have as many pixels per row as
+/// the grid has cells, so neighboring rays of a near camera meet adjacent cells. Seen from farther
+/// away or at an angle, they leave gaps of a few cells, which two extensions fill.
 const N_EXTENSIONS: usize = 2;
 /// Number of points that determine the quantiles. With this many, 200 points lie beyond each
 /// quantile.

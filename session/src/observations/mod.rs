@@ -133,8 +133,8 @@ impl ObservationPublisher {
         self.render_depths(keyframes, model.step, render);
         self.start_map(keyframes, model.captured_at);
         let spent = began.elapsed();
-        // A single picture may take longer than `RENDER_TIME`, on a CPU for example. The pause after
-        // it keeps the fraction of the time.
+        // A single picture may take longer than `RENDER_TIME`, on a CPU for example. The pause
+        // after it keeps the fraction of the time.
         self.next_check = Instant::now() + CHECK_PERIOD.max(spent.div_f64(MAX_RENDER_FRAC));
         spent
     }
@@ -178,8 +178,8 @@ impl ObservationPublisher {
                     .is_none_or(|known| known.is_outdated(step))
             })
             .collect();
-        // Keyframes without depth come first, because `None` is less than any step. Among those, the
-        // newest ones are the most interesting to an operator.
+        // Keyframes without depth come first, because `None` is less than any step. Among those,
+        // the newest ones are the most interesting to an operator.
         due.sort_by_key(|keyframe| {
             (
                 rendered_at(keyframe),

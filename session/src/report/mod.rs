@@ -19,8 +19,8 @@ use std::path::Path;
 
 /// Name of the page in the folder of a run.
 pub(crate) const FILE: &str = "report.html";
-/// Tables with more rows than this are collapsed. The schedule of evaluations has this many times in
-/// about two hours of training.
+/// Tables with more rows than this are collapsed. The schedule of evaluations has this many times
+/// in about two hours of training.
 const MAX_OPEN_ROWS: usize = 16;
 
 /// The content of the page.
@@ -296,8 +296,8 @@ fn curve(report: &Value, method: &str) -> String {
         .filter_map(curve_point)
         .collect();
     let last_secs = points.last().map_or(0.0, |(secs, _)| *secs);
-    // The final evaluation often follows a scheduled one at once. Two points at the same place would
-    // look like a jump.
+    // The final evaluation often follows a scheduled one at once. Two points at the same place
+    // would look like a jump.
     points.extend(curve_point(&report["done"]).filter(|(secs, _)| *secs > 1.01 * last_secs));
     if points.len() < 2 {
         return String::new();

@@ -123,8 +123,8 @@ impl Scoreboard {
             ..
         } = self.evaluators;
         let max_frac = max_frac_during_training.unwrap_or(f64::INFINITY);
-        // Without a limit, the product is infinite, or NaN at 0 s. Neither is a `Duration`, and both
-        // become the longest one.
+        // Without a limit, the product is infinite, or NaN at 0 s. Neither is a `Duration`, and
+        // both become the longest one.
         let allowed = Duration::try_from_secs_f64(max_frac * secs)
             .unwrap_or(Duration::MAX)
             .saturating_sub(self.spent);

@@ -17,8 +17,8 @@ use std::time::Duration;
 /// Maximum echoes per datagram. Each takes about 60 bytes as JSON; a datagram holds at most 65 507
 /// bytes.
 const MAX_POINTS: usize = 1000;
-/// Period at which the state at rest is resent. Receivers count a sender as lost if they hear nothing,
-/// and interpolate only between readings that are close in time.
+/// Period at which the state at rest is resent. Receivers count a sender as lost if they hear
+/// nothing, and interpolate only between readings that are close in time.
 const RESEND_PERIOD: Duration = Duration::from_millis(20);
 /// Period at which the thread checks whether to stop.
 const STOP_CHECK_PERIOD: Duration = Duration::from_millis(50);

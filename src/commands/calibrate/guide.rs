@@ -51,7 +51,7 @@ impl<'a> Guide<'a> {
             base_from_flange: Vec::new(),
             detected: Vec::new(),
         };
-        // The first advice appears before any image, so that the user knows how to begin.
+        // The first advice appears before any image, so that it describes how to begin.
         guide.show(&guide.advice());
         guide
     }
@@ -70,7 +70,7 @@ impl<'a> Guide<'a> {
         for image in &images[self.detected.len()..] {
             let detected = images::detect_in_image(image, self.target);
             let view = detected.board.as_ref().ok().map(|board| &board.view);
-            // Images without the target are shown, too: the user sees why it was not found.
+            // Images without the target are shown, too: they often show why it was not found.
             self.page.show_searched(image.size_px, &image.gray, view);
             let text = match &detected.board {
                 Ok(board) => {

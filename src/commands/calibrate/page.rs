@@ -126,7 +126,7 @@ impl GuidancePage {
             .flat_map(|view| &view.points)
             .map(|point| point.pixel)
             .collect();
-        // The target is searched in gray images, so that is what the user sees of them.
+        // The target is searched in gray images, so the same images are shown.
         let rgb = gray.iter().flat_map(|value| [*value; 3]).collect();
         // The stamp only has to differ from that of the previous image.
         let stamp = Stamp::from_secs(self.began.elapsed().as_secs_f64());

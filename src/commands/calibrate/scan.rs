@@ -23,12 +23,12 @@ use std::ops::ControlFlow;
 use std::path::Path;
 use targets::TargetSpec;
 
-/// Time for which devices are read if no flag limits it, seconds: enough for about twenty poses of an
-/// arm or a target moved by hand.
+/// Time for which devices are read if no flag limits it, seconds: enough for about twenty poses of
+/// an arm or a target moved by hand.
 const DEFAULT_SECS: f64 = 30.0;
 /// Maximum predicted image motion over readout, exposure and stamp uncertainty, pixels. Corners are
-/// corrected for the motion during the readout, but only as well as the velocity is known. A smaller
-/// value rejects images of slow motions; a larger one lets blurred corners through.
+/// corrected for the motion during the readout, but only as well as the velocity is known. A
+/// smaller value rejects images of slow motions; a larger one lets blurred corners through.
 const MAX_SHIFT_PX: f64 = 3.0;
 
 /// Images of one camera in which a target was searched.
@@ -182,7 +182,7 @@ impl RigFlags {
             .transpose()?;
         let mut guide =
             page.map(|page| Guide::new(target, camera, options.purpose, bar.clone(), page));
-        // A recording ends by itself.
+        // A recording has an end.
         let limit_secs = if is_live {
             self.seconds.unwrap_or(DEFAULT_SECS)
         } else {

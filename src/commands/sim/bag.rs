@@ -70,7 +70,8 @@ impl CameraFiles {
             descriptions.push(format!("camera {name:?}: {}", path.display()));
             for camera in rig.cameras.iter_mut().filter(|camera| camera.name == name) {
                 camera.realsense.file = path.clone();
-                // Each image is then delivered at the time of its stamp, in step with the other devices.
+                // Each image is then delivered at the time of its stamp, in step with the other
+                // devices.
                 camera.realsense.pace = Pace::Clock;
             }
         }

@@ -127,7 +127,7 @@ fn is_complete_and_larger(grid: &Lattice, inner: [u32; 2]) -> bool {
 fn matching(lattice: &mut Lattice, inner: [u32; 2], plane: &Plane) -> Result<Lattice, NotDetected> {
     // Lines at the edge of the board may have been missed.
     const GROWN_LINES: i32 = 1;
-    // Fill the grid first, so that its size can be judged.
+    // Fill the grid first, so that its size can be checked.
     if let Some([low, high]) = lattice.range() {
         let is_smaller =
             (high[0] - low[0] + 1) * (high[1] - low[1] + 1) < (inner[0] * inner[1]).cast_signed();

@@ -236,7 +236,7 @@ impl Cells {
                 let [right, down] =
                     [0, 1].map(|axis| (coordinate[axis] - principal_px[axis]) / focal_px[axis]);
                 let along = Vector3::new(right, down, 1.0).normalize();
-                // The depth image has the better hints where it sees the same direction.
+                // The depth image has the better hints where it covers the same direction.
                 let is_in_depth = depth
                     .as_ref()
                     .is_some_and(|(depth, pose)| is_in_depth_image(depth, pose, along));

@@ -89,7 +89,7 @@ impl Canvas {
 /// Layers of both networks.
 const N_LAYERS: u64 = 5;
 /// Maximum number of workgroups that evaluate the networks; they process larger batches in a loop.
-/// Only the GPU knows the number of samples, so there are groups for a full batch.
+/// The number of samples is known only on the GPU, so there are groups for a full batch.
 const MAX_NETWORK_GROUPS: u64 = 8192;
 /// Byte range of the number of samples in a batch.
 const N_SAMPLES_BYTES: Range<u64> = 4..8;

@@ -190,8 +190,8 @@ impl RadixSort {
                 n_groups.into(),
                 &[base[0], base[1], base[2], ("keys", keys)],
             );
-            // The first pass writes indices itself, so nobody has to fill the values with 0, 1, 2
-            // and so on.
+            // The first pass writes indices itself, so no other pass has to fill the values with 0,
+            // 1, 2 and so on.
             let scatter = if pass == 0 {
                 &self.scatter_indices
             } else {

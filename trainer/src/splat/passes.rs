@@ -312,8 +312,8 @@ impl ViewPasses<'_> {
             ("segment_counts", &scratch.segment_counts),
         ];
         passes.dispatch(gpu, &pipelines.allocate, 1, &allocated);
-        // Every block now knows its range in every list, so the order of its entries depends only
-        // on counts.
+        // The range of every block in every list is now known, so the order of its entries depends
+        // only on counts.
         let emitted = [
             view,
             model,

@@ -83,7 +83,7 @@ impl MeshBuffers {
             let mut list = Passes::default();
             passes::march(gpu, &mut list, pipelines, field, self);
             list.submit(gpu);
-            // Only the GPU knows the length of the list. Both counters are read at once.
+            // The length of the list is known only on the GPU. Both counters are read at once.
             let n_stale = gpu.begin_read(&self.stale, 1);
             let needed: Vec<u32> = gpu.read(&self.needed, N_NEEDED)?;
             let n_stale = n_stale.finish::<u32>(gpu)?[0];

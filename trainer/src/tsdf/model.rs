@@ -240,8 +240,8 @@ impl TsdfModel {
 
     /// Fuses the first pending keyframe after loading the blocks that it could change.
     fn step_with_host_blocks(&mut self, n: u64) -> Result<u64, Error> {
-        // One keyframe at a time: only the host knows which blocks the next one needs, and blocks
-        // of one may have to make room for those of another.
+        // One keyframe at a time: which blocks the next one needs is known only on the host, and
+        // blocks of one may have to make room for those of another.
         if n == 0 || self.queue.pending.is_empty() {
             return Ok(0);
         }

@@ -72,7 +72,7 @@ fn reprojected(depth: &DepthMap, keyframe: &Keyframe) -> Arc<[f32]> {
         if !is_visible {
             continue;
         }
-        // A surface that the depth camera sees may be hidden from the color camera by a nearer one.
+        // A surface in the depth image may be hidden from the color camera by a nearer one.
         let nearest_m = &mut reprojected[pixel[1] as usize * width as usize + pixel[0] as usize];
         let depth_m = f32_of(point.z);
         if *nearest_m == 0.0 || depth_m < *nearest_m {

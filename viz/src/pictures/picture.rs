@@ -100,7 +100,7 @@ pub(crate) fn pack_picture(
     } = drawn;
     let view_request = &*job.view_request;
     let began = Instant::now();
-    // The GPU has packed it already, unless the client wants a format that it does not support.
+    // The GPU has packed it already, unless the client requests a format that it does not support.
     let (color, depth) = match rendered {
         Rendered::Packed(packed) => (packed.jpeg, packed.depth),
         Rendered::Picture(picture) => encode_picture(view_request, header.last, &picture)?,

@@ -32,7 +32,7 @@ const MAX_OUTBOX: usize = 64;
 pub(crate) const MAX_VIEWS: usize = 8;
 
 /// If the full picture is expected to take less time than this, coarser stages are skipped: they
-/// would be replaced before anybody sees them. At 30 pictures per second, a picture is shown for 33
+/// would be replaced before they are shown. At 30 pictures per second, a picture is shown for 33
 /// ms.
 const FAST_MILLIS: f64 = 30.0;
 

@@ -61,7 +61,7 @@ pub(crate) enum InvalidRequest {
     Views { max: usize },
     #[error("shown_millis is {got}, expected a time on the server's clock, 0 or more")]
     ShownTime { got: f64 },
-    #[error("topic is {got:?}, expected one of {}", quoted(known))]
+    #[error("topic is {got:?}, expected {}", keyframe::listed(known, "or"))]
     Topic {
         got: String,
         known: Vec<&'static str>,
@@ -82,11 +82,6 @@ pub(crate) enum InvalidRequest {
         "at most {max} cameras can have a subscription of their own, with names of at most {max_bytes} bytes"
     )]
     Cameras { max: usize, max_bytes: usize },
-}
-
-fn quoted(names: &[&str]) -> String {
-    let quoted: Vec<_> = names.iter().map(|name| format!("{name:?}")).collect();
-    quoted.join(", ")
 }
 
 /// A validated render message.

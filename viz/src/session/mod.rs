@@ -255,7 +255,7 @@ impl Reader<'_> {
 
     fn edit(&self, message: &EditMessage) -> Result<(), InvalidRequest> {
         let request = EditRequest::check(self.client, message)?;
-        // Edits change what everybody sees, so the log says who made them.
+        // Edits change the model for all clients, so the log names the client.
         self.log.line(format_args!(
             "client {}: edit: {}",
             self.client,

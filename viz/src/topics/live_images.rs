@@ -1,4 +1,4 @@
-//! The current images of the cameras, in the sizes that clients want.
+//! The current images of the cameras, in the sizes that clients request.
 
 use crate::Hub;
 use crate::clock::ServerClock;
@@ -92,7 +92,7 @@ impl Topic for LiveImageTopic {
         let wanted = wanted_images(context.settled(), live_images.keys());
         let mut images = self.images.lock();
         let EncodedImages { encodings, items } = &mut *images;
-        // Forget sizes that no client wants any longer, such as that of a window before it was
+        // Forget sizes that no client requests any longer, such as that of a window before it was
         // resized. A running task still needs its entry, which says that it runs.
         encodings.retain(|key, encoding| encoding.is_running || wanted.contains_key(key));
         items.retain(|key, _| wanted.contains_key(key));
@@ -186,7 +186,7 @@ fn wanted_images<'a>(
             let Some(period) = subscription.period else {
                 continue;
             };
-            // Each image is encoded for the client that wants it most often. The feeds of the
+            // Each image is encoded at the highest rate that a client requests. The feeds of the
             // others leave images out.
             let shortest = wanted
                 .entry((Arc::clone(camera), subscription.max_px))

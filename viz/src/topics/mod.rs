@@ -112,7 +112,7 @@ pub(crate) trait Topic: Send + Sync {
 
 /// The half of a topic that decides what one client receives next.
 pub(crate) trait Feed: Send {
-    /// The next message, which counts as sent. If it is not due yet, `timer` is told when.
+    /// The next message, which counts as sent. If it is not due yet, `timer` records the due time.
     fn next(&mut self, client: &mut ClientState<'_>, timer: &mut Timer) -> Option<Message>;
 
     /// Whether the client has received anything.
@@ -132,7 +132,7 @@ pub(crate) struct EncodeContext<'a> {
 }
 
 impl EncodeContext<'_> {
-    /// What those clients receive that have said what they want, or have had time to.
+    /// The demands of clients that have sent a hello, or have had time to.
     pub(crate) fn settled(&self) -> impl Iterator<Item = &Demand> {
         self.demands
             .iter()

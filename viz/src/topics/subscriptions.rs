@@ -344,7 +344,7 @@ mod tests {
         for (message, named) in [
             (
                 json!({"topic": "tides", "rate_hz": 1}),
-                "\"tides\", expected one of \"base_path\"",
+                "\"tides\", expected base_path, keyframe_points, ",
             ),
             (json!({"topic": "scene", "rate_hz": 1}), "\"scene\""),
             (json!({"topic": "status"}), "rate_hz"),

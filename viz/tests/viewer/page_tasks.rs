@@ -1,6 +1,6 @@
 //! Measures the tasks of the page's main thread while it receives the data of a run.
 //!
-//! WebGL is replaced by a stub, because drawing on the CPU would dominate the tasks. Skipped, with
+//! WebGL calls draw nothing, because drawing on the CPU would dominate the tasks. Skipped, with
 //! a message, if Chromium or the bundle (`make web`) is missing.
 
 use crate::analytic_scene;

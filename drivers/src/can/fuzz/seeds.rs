@@ -60,8 +60,8 @@ fn record_traffic_of(config: &MotorConfig) -> (Vec<Frame>, Vec<Reading>) {
         sent_frames.extend(emulated.take(&frame).expect("a frame of the driver"));
     }
     for cycle in 0..6_u16 {
-        // The position differs in each cycle, so that tests can tell which reading a corrupted
-        // frame came from.
+        // The position differs in each cycle, so that tests can identify the reading that a
+        // corrupted frame came from.
         emulated.set_motion(Motion {
             position_rad: 0.4 * f64::from(cycle),
             velocity_rad_s: 0.5,

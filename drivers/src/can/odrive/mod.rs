@@ -138,7 +138,7 @@ impl MotorProtocol for Odrive {
             Some(_) => Watchdog::Available(&[OnLoss::Release]),
             None => Watchdog::Missing {
                 reason: "without arm.motion.odrive_endpoints the watchdog of this axis cannot be set",
-                // An axis in position mode holds its last target by itself. It has no command for
+                // An axis in position mode holds its last target. It has no command for
                 // damping.
                 actions: &[OnLoss::Hold, OnLoss::Release],
             },

@@ -201,7 +201,7 @@ impl Server {
         let could_answer = !is_late || !wait.is_zero();
         let finished = self.robot.follow(command.as_ref(), could_answer);
         let joints = (self.joint_simulator)(due, &self.robot.commanded);
-        // The simulator sees the new commanded positions before the robot sees the joints, as a
+        // The simulator gets the new commanded positions before the robot reads the joints, as a
         // real arm follows its commands.
         let contact = self.robot.observe(joints);
         if let Some(client) = &mut self.client {

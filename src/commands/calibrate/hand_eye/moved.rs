@@ -22,15 +22,15 @@ use session::calibration_report::{Photo, Photos};
 use std::path::Path;
 use targets::{GrayImage, TargetSpec};
 
-/// Largest change of a joint from the start, radians. A user who has checked the surroundings of the
-/// arm expects motions near its current posture. Larger changes give more different poses, but
+/// Largest change of a joint from the start, radians. A user who has checked the surroundings of
+/// the arm expects motions near its current posture. Larger changes give more different poses, but
 /// also let elbow and cables reach farther.
 const MAX_JOINT_CHANGE_RAD: f64 = 1.2;
-/// Maximum distance of the flange from its position at the start, unless a flag sets it, meters: room
-/// that is usually free around an arm that was moved to its target by hand.
+/// Maximum distance of the flange from its position at the start, unless a flag sets it, meters:
+/// room that is usually free around an arm that was moved to its target by hand.
 const DEFAULT_DISTANCE_M: f64 = 0.3;
-/// Standard deviation of the rotation at which the result is accurate, degrees: half a millimeter at
-/// a distance of half a meter.
+/// Standard deviation of the rotation at which the result is accurate, degrees: half a millimeter
+/// at a distance of half a meter.
 const GOAL_DEG: f64 = 0.05;
 
 /// Flags for moving the arm.
@@ -173,7 +173,7 @@ impl MoveFlags {
         } else {
             Devices::Real
         };
-        // Before the arm: without its page, nobody sees what the arm will do.
+        // Before the arm: without its page, the planned motion is not shown.
         let page = GuidancePage::start(&flags.page, &given_camera)?;
         let mut capture = ArmCapture::new(open::movable(&given, devices, camera)?)?;
         let rig = resolved(&given, capture.rig());

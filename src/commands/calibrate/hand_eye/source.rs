@@ -120,7 +120,7 @@ impl Source {
     /// `parent_from_camera` of a rig file for an estimated pose.
     pub(super) fn rig_pose(&self, parent_from_camera: &Transform) -> Transform {
         match self {
-            // Without a rig, the pose is relative to the flange or base as it is.
+            // Without a rig, the pose is relative to the flange or base.
             Self::File(_) => *parent_from_camera,
             Self::Scan { scan, .. } => scan.rig_pose(parent_from_camera),
         }
