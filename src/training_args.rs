@@ -47,10 +47,10 @@ pub(crate) struct TrainingArgs {
     /// live runs]
     #[arg(long, value_name = "PARAMS", value_delimiter = ',', hide_possible_values = true, value_parser = refine())]
     pub(crate) refine: Vec<Refine>,
-    /// How the number of splats is chosen: to-cap (grow to --max-splats), tested (grow to
-    /// --max-splats, or to fewer splats if there are fewer than 40 images; then halve as long as
-    /// that costs less than 0.1 dB on validation images) or tested-growth (double as long as that
-    /// gains more than 0.1 dB, then halve) [default: to-cap; for data on disk with a GPU: tested]
+    /// How the number of splats is chosen: to-cap (grow to --max-splats), or tested (grow to
+    /// --max-splats, or to 8000 splats per image if there are fewer than 40 images; then halve as
+    /// long as that costs less than 0.1 dB on validation images) [default: to-cap; for data on disk
+    /// with a GPU: tested]
     #[arg(long, value_name = "HOW", hide_possible_values = true)]
     pub(crate) count: Option<CountArg>,
 }
@@ -106,7 +106,6 @@ fn refine_named(name: &str) -> Option<Refine> {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 pub(crate) enum CountArg {
     Tested,
-    TestedGrowth,
     ToCap,
 }
 
@@ -121,7 +120,6 @@ impl TrainingArgs {
             refine: self.refine.clone(),
             count: self.count.map(|count| match count {
                 CountArg::Tested => CountPolicy::Tested,
-                CountArg::TestedGrowth => CountPolicy::TestedGrowth,
                 CountArg::ToCap => CountPolicy::ToCap,
             }),
         }

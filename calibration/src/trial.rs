@@ -11,9 +11,9 @@ pub const MIN_VALIDATION_IMAGES: usize = 4;
 const MIN_GAIN_DB: f64 = 0.05;
 /// Minimum gain in standard errors: about 2 % of useless changes exceed it by chance.
 const MIN_STANDARD_ERRORS: f64 = 2.0;
-/// Minimum gain that justifies twice as many splats, dB. It is larger than the others, because more
-/// splats take more time and memory in every step.
-const MIN_GAIN_OF_DOUBLING_DB: f64 = 0.1;
+/// Maximum loss from half as many splats, dB. It is larger than the others, because splats take time
+/// and memory in every step.
+const MAX_LOSS_OF_HALVING_DB: f64 = 0.1;
 
 /// Selection of the camera parameters to optimize.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -76,13 +76,6 @@ pub enum Candidate {
         /// Splats after.
         to: u32,
     },
-    /// Doubles the number of splats. Tested by cross-validation.
-    Doubled {
-        /// Splats before.
-        from: u32,
-        /// Splats after.
-        to: u32,
-    },
     /// Lowers the degree of the colors.
     ShDegree {
         /// Degree of spherical harmonics before.
@@ -96,14 +89,14 @@ impl Candidate {
     /// Minimum gain of an addition, or maximum loss of a reduction, dB.
     fn min_gain_db(self) -> f64 {
         match self {
-            Self::Halved { .. } | Self::Doubled { .. } => MIN_GAIN_OF_DOUBLING_DB,
+            Self::Halved { .. } => MAX_LOSS_OF_HALVING_DB,
             Self::Cameras(_) | Self::ShDegree { .. } => MIN_GAIN_DB,
         }
     }
 
     /// Whether the change makes the model smaller.
     pub fn reduces_model(self) -> bool {
-        !matches!(self, Self::Cameras(_) | Self::Doubled { .. })
+        !matches!(self, Self::Cameras(_))
     }
 }
 
@@ -112,7 +105,6 @@ impl std::fmt::Display for Candidate {
         match self {
             Self::Cameras(params) => params.fmt(f),
             Self::Halved { from, to } => write!(f, "{to} of {from} splats"),
-            Self::Doubled { from, to } => write!(f, "{to} instead of {from} splats"),
             Self::ShDegree { from, to } => write!(f, "colors of degree {to} instead of {from}"),
         }
     }
@@ -189,7 +181,6 @@ impl Trial {
             Candidate::Halved { .. } | Candidate::ShDegree { .. } => {
                 -gain_db + 0.5 * standard_error_db <= min_db
             }
-            Candidate::Doubled { .. } => gain_db - standard_error_db > min_db,
             Candidate::Cameras(_) => {
                 gain_db > f64::max(min_db, MIN_STANDARD_ERRORS * standard_error_db)
             }
@@ -239,7 +230,6 @@ impl Trial {
     pub fn report(&self) -> TrialReport {
         let (candidate, is_reduction) = match self.candidate {
             Candidate::Cameras(params) => (params.to_string(), false),
-            Candidate::Doubled { from, to } => (format!("{to} instead of {from} splats"), false),
             Candidate::Halved { from, to } => (format!("{from} instead of {to} splats"), true),
             Candidate::ShDegree { from, to } => {
                 (format!("colors of degree {from} instead of {to}"), true)

@@ -134,8 +134,6 @@ pub enum Decision {
     Begin(True),
     /// The result of an alignment in the background was applied.
     Align(True),
-    /// A search for the model size was ended, because too little training time was left.
-    EndSizeSearch(True),
     /// Growth of the model was paused, because its steps took too long, or continued.
     PauseGrowth(bool),
     /// A checkpoint was taken at this step.
@@ -321,15 +319,6 @@ impl DecisionLog {
         self.write(Line::Entry(Entry {
             step,
             decision: Decision::Align(True),
-        }));
-    }
-
-    /// Logs that a search for the model size was ended after this many steps.
-    pub fn size_search_ended(&mut self, step: u64) {
-        self.log_activity(step);
-        self.write(Line::Entry(Entry {
-            step,
-            decision: Decision::EndSizeSearch(True),
         }));
     }
 

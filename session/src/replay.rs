@@ -230,7 +230,6 @@ impl Replay {
                 Decision::Seed(_) => session.seed()?,
                 // Waits: in the logged run, the result was ready at this step.
                 Decision::Align(_) => drop(session.poll_alignment(true)?),
-                Decision::EndSizeSearch(_) => session.end_size_search()?,
                 Decision::PauseGrowth(is_paused) => session.pause_growth(*is_paused)?,
                 // Starts training on the keyframes so far without a step.
                 Decision::Begin(_) => drop(session.step(0)?),

@@ -370,40 +370,13 @@ impl Session {
     /// Trains for at most `max_steps` steps.
     pub fn train_steps(&mut self, max_steps: u64) -> crate::Result<u64> {
         let left = self.n_steps_remaining().unwrap_or(u64::MAX);
-        // Before the steps, so that a search that cannot be completed in time does not begin.
-        self.end_size_search_when_late()?;
         // Logged even if no step is made: the request alone starts training on the keyframes so
         // far, which affects the model.
         self.persistence.log_step_request();
         let n = self.method.step(max_steps.min(left))?;
-        self.time.add_steps(n);
         // Tests simulate a lost GPU at a given step.
         gpu_loss::lose_when_due(&self.gpu, self.progress().step);
         Ok(n)
-    }
-
-    /// Ends a search for the model size if too little time is left for it and for the training
-    /// after it.
-    fn end_size_search_when_late(&mut self) -> crate::Result<()> {
-        let n_needed = self.method.n_steps_for_size_search();
-        let is_late = n_needed > 0
-            && self
-                .time
-                .n_steps_in_time()
-                .is_some_and(|n_left| n_left < n_needed as f64);
-        if is_late {
-            self.end_size_search()
-        } else {
-            Ok(())
-        }
-    }
-
-    /// Ends a search for the model size, if there is one.
-    pub(crate) fn end_size_search(&mut self) -> crate::Result<()> {
-        if self.method.end_size_search()? {
-            self.persistence.log_size_search_end(self.method.as_mut())?;
-        }
-        Ok(())
     }
 
     /// Pauses the growth of the model while its steps take too long for a live run. A larger model

@@ -660,14 +660,6 @@ impl<M: Recalibrate + 'static> Method for Aligned<M> {
         self.alignment_task.result()
     }
 
-    fn n_steps_for_size_search(&self) -> u64 {
-        self.model.n_steps_for_size_search()
-    }
-
-    fn end_size_search(&mut self) -> Result<bool, Error> {
-        self.model.end_size_search()
-    }
-
     fn pause_growth(&mut self, is_paused: bool) -> Result<bool, Error> {
         self.model.pause_growth(is_paused)
     }

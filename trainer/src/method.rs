@@ -170,17 +170,6 @@ pub trait Method {
     fn poll_alignment(&mut self, _wait: bool) -> Result<bool, Error> {
         Ok(false)
     }
-    /// Number of steps that must remain for a search for the model size that is pending or running:
-    /// the rest of the search, and as many steps after it as the whole search takes. 0 if there is
-    /// no search.
-    fn n_steps_for_size_search(&self) -> u64 {
-        0
-    }
-    /// Ends a search for the model size that is pending or running, with its result so far. Returns
-    /// whether there was one.
-    fn end_size_search(&mut self) -> Result<bool, Error> {
-        Ok(false)
-    }
     /// Pauses or continues the growth of the model. Returns false if this changes nothing, or is
     /// not possible now.
     fn pause_growth(&mut self, _is_paused: bool) -> Result<bool, Error> {

@@ -90,14 +90,6 @@ impl Persistence {
         Ok(())
     }
 
-    /// Logs that a search for the model size was ended.
-    pub(super) fn log_size_search_end(&mut self, method: &mut dyn Method) -> crate::Result<()> {
-        if let Some(decisions) = &mut self.decisions {
-            decisions.size_search_ended(method.n_total_steps()?);
-        }
-        Ok(())
-    }
-
     /// Logs that growth was paused or continued.
     pub(super) fn log_growth_pause(
         &mut self,

@@ -18,8 +18,6 @@ const MAX_IMAGES_DURING_TRAINING: usize = 3;
 struct Gray {
     level: u8,
     n_drawn: std::rc::Rc<std::cell::Cell<u32>>,
-    /// Whether a search for the model size is running.
-    is_searching: std::rc::Rc<std::cell::Cell<bool>>,
 }
 
 impl Method for Gray {
@@ -75,14 +73,6 @@ impl Method for Gray {
 
     fn alignment(&self) -> Option<&Alignment> {
         None
-    }
-
-    fn n_steps_for_size_search(&self) -> u64 {
-        if self.is_searching.get() { 1000 } else { 0 }
-    }
-
-    fn end_size_search(&mut self) -> Result<bool, Error> {
-        Ok(self.is_searching.replace(false))
     }
 
     fn progress(&self) -> Progress {
@@ -238,46 +228,5 @@ fn evaluation_is_dropped_when_stopping() {
     session.score_next().expect("dropped");
     assert!(
         !session.is_scoring() && session.reporter.evaluations().is_empty() && n_drawn.get() == 1
-    );
-}
-
-#[test]
-fn size_search_ends_before_the_time_limit() {
-    let is_ended = |limit_secs: Option<f64>| {
-        let method = Gray::default();
-        let is_searching = method.is_searching.clone();
-        let quick = Evaluator::psnr_only;
-        let evaluators = Evaluators {
-            during_training: quick(),
-            max_images_during_training: 1,
-            max_frac_during_training: None,
-            at_end: quick(),
-        };
-        let limits = Limits {
-            seconds: limit_secs,
-            steps: Some(100),
-        };
-        let gpu = Gpu::open(&GpuOptions::default()).expect("an adapter");
-        let mut session = Session::new(
-            gpu,
-            (ModelKind::default(), Box::new(method)),
-            evaluators,
-            limits,
-            Box::new(()),
-        );
-        let minute_ago = Instant::now()
-            .checked_sub(Duration::from_secs(60))
-            .expect("the machine has run for a minute");
-        session.start_clock(minute_ago);
-        session.train_steps(1).expect("a step");
-        is_searching.set(true);
-        session.train_steps(1).expect("a step");
-        !is_searching.get()
-    };
-    assert!(is_ended(Some(60.0)), "no time is left");
-    assert!(!is_ended(Some(1e9)), "there is enough time");
-    assert!(
-        !is_ended(None),
-        "without a time limit, no decision depends on timing"
     );
 }

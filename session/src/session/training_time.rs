@@ -27,10 +27,6 @@ impl Limits {
 pub(super) struct TrainingTime {
     limits: Limits,
     clock: Clock,
-    /// Steps so far, including those of trials.
-    n_steps: u64,
-    /// Training time at the first step.
-    first_step_secs: Option<f64>,
     /// Time for which this session has used a shared device.
     device_time: Duration,
     /// Training time at which this session finished, seconds; other sessions may still train.
@@ -43,8 +39,6 @@ impl TrainingTime {
         Self {
             limits,
             clock: Clock::default(),
-            n_steps: 0,
-            first_step_secs: None,
             device_time: Duration::ZERO,
             finished_secs: None,
         }
@@ -91,24 +85,6 @@ impl TrainingTime {
         self.n_steps_remaining(n_steps) == Some(0)
     }
 
-    /// Counts steps, for [`Self::n_steps_in_time`].
-    pub(super) fn add_steps(&mut self, n: u64) {
-        if n > 0 {
-            let secs = self.secs();
-            // The rate is measured from the first step on. Before it, the run waited for keyframes
-            // and for the compilation of kernels.
-            self.first_step_secs.get_or_insert(secs);
-            self.n_steps += n;
-        }
-    }
-
-    /// Number of steps until the time limit at the average rate so far; `None` without a time limit
-    /// or a rate.
-    pub(super) fn n_steps_in_time(&self) -> Option<f64> {
-        let spent_secs = self.secs() - self.first_step_secs?;
-        Some((self.limits.seconds? - self.secs()) * self.n_steps as f64 / spent_secs)
-    }
-
     /// Time for which this session has used a shared device.
     pub(super) fn device_time(&self) -> Duration {
         self.device_time
@@ -145,30 +121,5 @@ impl TrainingTime {
     /// seconds.
     pub(super) fn end_secs(&self) -> f64 {
         self.finished_secs.unwrap_or_else(|| self.secs())
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn remaining_steps_follow_from_the_average_rate() {
-        let mut time = TrainingTime::new(Limits {
-            seconds: Some(40.0),
-            steps: None,
-        });
-        time.start(
-            Instant::now()
-                .checked_sub(Duration::from_secs(30))
-                .expect("the machine has run for 30 s"),
-        );
-        assert_eq!(time.n_steps_in_time(), None, "no step yet");
-        time.first_step_secs = Some(10.0); // Until then, the run waited for keyframes.
-        time.add_steps(100);
-        let n_left = time.n_steps_in_time().expect("a limit");
-        assert!((n_left - 50.0).abs() < 2.0, "{n_left}");
-        time.limits.seconds = None;
-        assert_eq!(time.n_steps_in_time(), None, "no time limit");
     }
 }

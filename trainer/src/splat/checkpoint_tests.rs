@@ -40,6 +40,41 @@ fn assert_same(one: &Checkpoint, other: &Checkpoint) {
     assert_eq!(one.arrays.len(), other.arrays.len());
 }
 
+/// Earlier versions searched for the number of splats, and stored the settings and results.
+#[test]
+fn checkpoint_with_a_search_for_the_number_of_splats_is_resumed() {
+    let gpu = test_gpu();
+    let keyframes = keyframes(&gpu, true);
+    let mut trainer = new_trainer(&gpu, &keyframes, 3000);
+    train(&mut trainer, 10);
+    let checkpoint = checkpoint_of(&mut trainer);
+    let mut older = checkpoint.clone();
+    older.state["growth_search"] = serde_json::json!({
+        "limit": {"n_splats": 500, "n_images": 8}, "not_before": 0, "is_off": false
+    });
+    older.state["remaining_trials"]["doubling"] = serde_json::Value::Null;
+    older.state["options"]["specific"]["count"] = "TestedGrowth".into();
+    for name in [
+        "first_doubling",
+        "doubling_half",
+        "search",
+        "search_pause",
+        "comparison",
+    ] {
+        older.state["options"]["specific"]["trial_steps"][name] = 250.into();
+    }
+    older.state["finished_trials"] = serde_json::json!([{
+        "candidate": {"doubled": {"from": 500, "to": 1000}}, "gain_db": 0.2,
+        "standard_error_db": 0.1, "n_images": 8, "kept": true
+    }]);
+    let mut resumed = SplatTrainer::resume(gpu, &older, &keyframes).unwrap().0;
+    let mut state = checkpoint_of(&mut resumed).state;
+    assert_eq!(state["options"]["specific"]["count"], "Tested");
+    state["options"]["specific"]["count"] =
+        checkpoint.state["options"]["specific"]["count"].clone();
+    assert_eq!(state, checkpoint.state);
+}
+
 #[test]
 fn paused_growth_continues_on_request_and_after_resuming() {
     let gpu = test_gpu();

@@ -1,11 +1,22 @@
 //! Regularization of models trained on few images. It fades out as the number of images rises,
 //! because it costs detail with many images.
 
-use super::growth_search::FEW_IMAGES;
 use super::options::SplatOptions;
 use super::params::Supervision;
 use crate::gpu::f32_of;
 
+/// From this number of images on, models are not regularized, and the number of splats is limited
+/// only by the options.
+///
+/// The measured data sets with few images have 6 to 36 of them, those with many 43 and more
+/// (docs/benchmarks/2026-11-25-few-images.md).
+pub(crate) const FEW_IMAGES: usize = 40;
+/// Maximum number of splats per image if there are few images.
+///
+/// More splats overfit: beyond some number, other views score worse while the training images still
+/// score better. On eleven sets of 6 to 43 images, half as many cost 0.2 dB on average, and four
+/// times as many raised the depth error (docs/benchmarks/2026-11-29-number-of-splats.md).
+const MAX_SPLATS_PER_IMAGE: u32 = 8000;
 /// Up to this number of images, the regularization is complete. The changes were measured with 6
 /// and 11 images (docs/benchmarks/2026-11-25-few-images.md).
 const VERY_FEW_IMAGES: usize = 20;
@@ -23,6 +34,14 @@ const FEW_DEPTH_CLIP_M: f64 = 1.0;
 /// error. Ten times the weight lowers it a little more, but also the PSNR
 /// (docs/benchmarks/2026-11-25-few-images.md).
 const FEW_DEPTH_WEIGHT: f64 = 3.0;
+
+/// Maximum number of splats for `n` images, counting validation images.
+pub(crate) fn max_splats(n_images: usize) -> u32 {
+    match u32::try_from(n_images) {
+        Ok(n) if n_images < FEW_IMAGES => n * MAX_SPLATS_PER_IMAGE,
+        _ => u32::MAX,
+    }
+}
 
 /// How much regularization a model needs: 0 to 1.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -89,6 +108,14 @@ impl Scarcity {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn number_of_splats_is_limited_only_with_few_images() {
+        assert_eq!(
+            [0, 1, 11, 39, 40, 500].map(max_splats),
+            [0, 8000, 88_000, 312_000, u32::MAX, u32::MAX]
+        );
+    }
 
     #[test]
     fn regularization_fades_with_the_number_of_images() {

@@ -17,18 +17,12 @@ mod change_against_twin;
 mod checkpoint_tests;
 mod chunks;
 pub mod cloud;
-mod doubling;
-#[cfg(test)]
-mod doubling_tests;
 #[cfg(test)]
 mod edit_tests;
 mod entry;
 mod few_images;
 mod file;
 mod floaters;
-mod growth_search;
-#[cfg(test)]
-mod growth_search_tests;
 pub mod kernels;
 mod nearest;
 #[cfg(test)]

@@ -1,7 +1,6 @@
 //! The splat trainer: implements [`Method`] by combining the modules for training and drawing.
 
 mod checkpoint;
-mod growth_search;
 mod lazy_pipelines;
 mod learning_rates;
 mod model;
@@ -20,12 +19,10 @@ mod view_set;
 
 use super::arrays::SplatArrays;
 use super::bounds::bounds;
-use super::buffers::SplatBuffers;
 use super::chunks::{Chunker, MAX_SH_DEGREE};
 use super::few_images::Scarcity;
 use super::file::IN_FOLDER;
 use super::floaters::floaters;
-use super::growth_search::GrowthSearch;
 use super::kernels::TrainPipelines;
 use super::options::SplatOptions;
 use super::params::Camera;
@@ -34,7 +31,7 @@ use super::params::status;
 use super::ply;
 use super::schedule::Schedule;
 use super::seed;
-use super::trials::{CountPolicy, SplatTrials, ValidationImage};
+use super::trials::{SplatTrials, ValidationImage};
 use crate::checkpoint::PendingCheckpoint;
 use crate::edits::{Edits, PendingFloaters};
 use crate::gpu::{Gpu, PassTiming};
@@ -74,7 +71,6 @@ pub struct SplatTrainer {
     views: ViewSet,
     seeding: Seeding,
     trials: SplatTrials,
-    growth_search: GrowthSearch,
     skipped: SkippedSteps,
     /// Camera corrections loaded with a saved model.
     saved_corrections: BTreeMap<String, CameraCorrection>,
@@ -111,8 +107,6 @@ impl SplatTrainer {
                 options.specific.count,
                 options.specific.trial_steps,
             ),
-            // With `TestedGrowth`, doublings are already tested while images arrive.
-            growth_search: GrowthSearch::new(options.specific.count == CountPolicy::Tested),
             skipped: SkippedSteps::default(),
             saved_corrections: BTreeMap::new(),
             saved_background_srgb: [0.0; 3],
@@ -168,6 +162,16 @@ impl SplatTrainer {
     /// Results of the finished trials.
     pub fn trials(&self) -> &[Trial] {
         &self.trials.finished
+    }
+
+    /// Number of training and validation images. During a trial, validation images that arrive do
+    /// not count, because both halves must have the same number at each step.
+    fn n_images(&self) -> usize {
+        let n_validation = match self.trials.running_trial() {
+            Some(trial) => trial.scored.len(),
+            None => self.trials.validation.len(),
+        };
+        self.views.len() + n_validation
     }
 
     fn learn(&mut self) -> Result<Arc<TrainPipelines>, Error> {
@@ -242,7 +246,7 @@ impl SplatTrainer {
         background_srgb: [f32; 3],
         output: Output,
     ) -> Result<Option<Rendered>, Error> {
-        let splats = displayed(&self.growth_search, &self.trials, &self.model);
+        let splats = self.trials.displayed(&self.model.splats);
         self.renderer.picture(
             &mut self.recorder,
             DrawnView {
@@ -262,7 +266,7 @@ impl SplatTrainer {
         packing: Packing,
     ) -> Result<QueuedPicture, Error> {
         self.seed_from_depth()?;
-        let splats = displayed(&self.growth_search, &self.trials, &self.model);
+        let splats = self.trials.displayed(&self.model.splats);
         self.renderer.queue(
             &mut self.recorder,
             DrawnView {
@@ -292,34 +296,28 @@ impl Method for SplatTrainer {
             );
             return Ok(());
         }
-        self.abort_growth_search()?; // It is repeated with this keyframe.
         // Once the trials have ended, nothing needs validation, and the image is used for training.
         if keyframe.split == Split::Validation && self.trials.holds_validation() {
             self.trials.validation.push(ValidationImage {
                 keyframe,
                 image: None,
             });
-            self.update_growth_search();
             return Ok(());
         }
         // Both halves of a trial train on the same keyframes at the same steps.
         if self.trials.defer_arrival(&keyframe, self.schedule.step) {
             return Ok(());
         }
-        self.add_live_arrival(keyframe)?;
-        self.update_growth_search();
-        Ok(())
+        self.add_live_arrival(keyframe)
     }
 
     fn remove(&mut self, camera: &str, stamp: Stamp) -> Result<(), Error> {
         self.finish_in_flight()?; // The step of the removal must be exact.
-        self.abort_growth_search()?;
         let is_removed =
             |keyframe: &Keyframe| keyframe.camera.as_ref() == camera && keyframe.stamp == stamp;
         self.views.retain(|keyframe| !is_removed(keyframe));
         self.seeding.remove(is_removed);
         self.trials.remove(is_removed);
-        self.update_growth_search();
         // Bindings keep the buffers of removed images alive.
         self.recorder.passes.clear_bindings();
         Ok(())
@@ -340,13 +338,7 @@ impl Method for SplatTrainer {
 
     fn n_total_steps(&mut self) -> Result<u64, Error> {
         self.finish_in_flight()?;
-        // The number of reverted steps can be negative in between: a growth search starts again at
-        // step 0, and later returns to the step of the model on all images. Only the sum is
-        // meaningful, hence the wrapping addition.
-        Ok(self
-            .schedule
-            .step
-            .wrapping_add(self.trials.n_reverted_steps))
+        Ok(self.schedule.step + self.trials.n_reverted_steps)
     }
 
     fn background_srgb(&self) -> [f32; 3] {
@@ -421,7 +413,7 @@ impl Method for SplatTrainer {
         only_changed: bool,
         edits: &Arc<Edits>,
     ) -> Result<Option<PendingChunks>, Error> {
-        let splats = displayed(&self.growth_search, &self.trials, &self.model);
+        let splats = self.trials.displayed(&self.model.splats);
         if splats.n_splats == 0 {
             return Ok(None);
         }
@@ -438,7 +430,7 @@ impl Method for SplatTrainer {
     }
 
     fn find_floaters(&mut self, edits: &Arc<Edits>) -> Result<PendingFloaters, Error> {
-        let splats = displayed(&self.growth_search, &self.trials, &self.model);
+        let splats = self.trials.displayed(&self.model.splats);
         if splats.n_splats == 0 {
             return Err(Error::NoFloaters);
         }
@@ -480,7 +472,7 @@ impl Method for SplatTrainer {
         // Corrections belong to the displayed splats: during a trial of camera parameters, those
         // in training differ.
         let cameras = &self.model.cameras;
-        let displayed = self.displayed_state().map(|snapshot| &snapshot.cameras);
+        let displayed = self.trials.baseline().map(|snapshot| &snapshot.cameras);
         let (set, params) = displayed.map_or((cameras.set, &cameras.params), |(set, params)| {
             (*set, params)
         });
@@ -503,18 +495,9 @@ impl Method for SplatTrainer {
         None
     }
 
-    fn n_steps_for_size_search(&self) -> u64 {
-        self.n_steps_for_growth_search()
-    }
-
-    fn end_size_search(&mut self) -> Result<bool, Error> {
-        self.end_growth_search()
-    }
-
     fn pause_growth(&mut self, is_paused: bool) -> Result<bool, Error> {
         // Both halves of a comparison must grow alike.
-        let is_compared =
-            self.trials.running_trial().is_some() || self.growth_search.running().is_some();
+        let is_compared = self.trials.running_trial().is_some();
         if self.model.is_growth_paused == is_paused || is_compared {
             return Ok(false);
         }
@@ -524,9 +507,9 @@ impl Method for SplatTrainer {
     }
 
     fn progress(&self) -> Progress {
-        let displayed = displayed(&self.growth_search, &self.trials, &self.model);
+        let displayed = self.trials.displayed(&self.model.splats);
         Progress {
-            step: self.displayed_step(),
+            step: self.schedule.step,
             primitives: displayed.n_splats.into(),
             bytes: displayed.bytes(),
             step_millis: self.optimizer.submits.step_millis(),
@@ -565,18 +548,6 @@ impl Method for SplatTrainer {
     fn checkpoint(&mut self) -> Result<PendingCheckpoint, Error> {
         self.take_checkpoint()
     }
-}
-
-/// The splats to display: during a growth search or a trial, those without the tested change.
-fn displayed<'a>(
-    search: &'a GrowthSearch,
-    trials: &'a SplatTrials,
-    model: &'a TrainedModel,
-) -> &'a SplatBuffers {
-    search.running().map_or_else(
-        || trials.displayed(&model.splats),
-        |models| &models.main.splats,
-    )
 }
 
 /// Accessors for tests.

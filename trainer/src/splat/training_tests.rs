@@ -3,7 +3,7 @@
 
 use super::arrays::SplatArrays;
 use super::cloud::synthetic_cloud;
-use super::{SplatOptions, SplatTrainer, TrialSteps};
+use super::{SplatOptions, SplatTrainer};
 use crate::eval::{PixelPair, psnr};
 use crate::gpu::testing::test_gpu;
 use crate::gpu::{Gpu, f32s_of};
@@ -18,19 +18,6 @@ use std::sync::Arc;
 
 const SIZE_PX: [u32; 2] = [96, 80];
 const FOCAL_PX: f64 = 90.0;
-
-/// A quarter of the usual steps of trials: enough for decisions on small images.
-pub(super) const FEW_STEPS: TrialSteps = TrialSteps {
-    first_trial: 125,
-    trial_half: 60,
-    per_image: 1,
-    max_trial_half: 300,
-    first_doubling: 200,
-    doubling_half: 100,
-    search: 200,
-    search_pause: 125,
-    comparison: 60,
-};
 
 /// The inside of a colorful sphere: a closed surface with well-defined depth.
 pub(super) fn scene() -> SplatArrays {

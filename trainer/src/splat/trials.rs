@@ -9,7 +9,6 @@
 
 use super::arrival_gains::ArrivalGains;
 use super::buffers::SplatBuffers;
-use super::doubling::Doubling;
 use super::snapshot::Snapshot;
 use super::trial_steps::TrialSteps;
 use crate::Error;
@@ -21,7 +20,7 @@ use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 
-/// Maximum total loss of the reductions accepted since the last doubling, dB.
+/// Maximum total loss of the accepted reductions, dB.
 ///
 /// Each halving alone may cost 0.1 dB. Without a limit of the sum, several accepted halvings would
 /// add up to a visible loss. A larger value gives smaller models that look worse.
@@ -45,12 +44,11 @@ pub enum CountPolicy {
     /// Grows up to the limit.
     #[default]
     ToCap,
-    /// Grows up to the limit, or less if there are few images. Then halves the number repeatedly
-    /// while this costs less than 0.1 dB on validation images.
+    /// Grows up to the limit, or to fewer splats if there are few images. Then halves the number
+    /// repeatedly while this costs less than 0.1 dB on validation images.
+    // Runs of earlier versions also had `TestedGrowth`, which ended with the same halvings.
+    #[serde(alias = "TestedGrowth")]
     Tested,
-    /// Doubles the number as long as this gains more than 0.1 dB on validation images, then halves
-    /// it like [`Self::Tested`]. Restarts when many images are new.
-    TestedGrowth,
 }
 
 /// A validation keyframe, and its image on the GPU after the first comparison.
@@ -117,8 +115,6 @@ pub(crate) struct SplatTrials {
     pub(crate) steps: TrialSteps,
     candidates: VecDeque<ParamSet>,
     count: CountState,
-    /// Present if growth depends on trials.
-    doubling: Option<Doubling>,
     /// SH degree to try next, once the number of splats is final.
     degree: u32,
     pub(crate) validation: Vec<ValidationImage>,
@@ -184,8 +180,6 @@ pub(crate) struct RemainingTrials {
     is_finished: bool,
     params: Vec<ParamSet>,
     count: CountState,
-    #[serde(default)]
-    doubling: Option<Doubling>,
     degree: u32,
     #[serde(default)]
     arrival_gains: Option<ArrivalGains>,
@@ -214,9 +208,6 @@ pub(crate) enum Due {
 pub(crate) struct TrialContext {
     pub(crate) step: u64,
     pub(crate) n_splats: u32,
-    /// Maximum number of splats.
-    pub(crate) max_splats: u32,
-    pub(crate) n_planned_steps: u64,
     /// Whether growth has ended. Before that, a small model may score as well as a large one only
     /// because it converges faster.
     pub(crate) is_mature: bool,
@@ -252,11 +243,10 @@ impl RunningTrial {
 
 impl SplatTrials {
     pub(crate) fn new(cameras: &CameraRefinement, count: CountPolicy, steps: TrialSteps) -> Self {
-        let doubling = (count == CountPolicy::TestedGrowth).then(Doubling::default);
         let candidates: VecDeque<ParamSet> = cameras.candidates().iter().copied().collect();
         let count = match count {
             CountPolicy::ToCap => CountState::ToCap,
-            CountPolicy::Tested | CountPolicy::TestedGrowth => CountState::Growing,
+            CountPolicy::Tested => CountState::Growing,
         };
         // Without anything to test, the validation keyframes are training keyframes from the first
         // step on.
@@ -270,7 +260,6 @@ impl SplatTrials {
             steps,
             candidates,
             count,
-            doubling,
             degree: 0,
             validation: Vec::new(),
             finished: Vec::new(),
@@ -288,12 +277,8 @@ impl SplatTrials {
         !matches!(self.trial_phase, SplatTrialPhase::Finished)
     }
 
-    /// Whether regular densification may add splats at this step.
-    pub(crate) fn may_grow(&self, step: u64) -> bool {
-        // From this step on, only accepted trials add splats.
-        if self.doubling.is_some() && step >= self.steps.first_doubling {
-            return false;
-        }
+    /// Whether densification may add splats.
+    pub(crate) fn may_grow(&self) -> bool {
         // During the first halving, `count` is still `Growing`. Densification would undo the
         // halving in the variant, and enlarge the baseline.
         let is_halving = matches!(
@@ -329,11 +314,8 @@ impl SplatTrials {
         }
         if self.validation.len() < MIN_VALIDATION_IMAGES {
             // Wait for more images, but not indefinitely: images that validate nothing are more
-            // useful for training. With growth in trials, images arrive during the whole run, so
-            // it is worth waiting until growth ends.
-            let waits = context.step < 2 * self.steps.first_trial
-                || (self.doubling.is_some() && !context.is_mature);
-            return if waits {
+            // useful for training.
+            return if context.step < 2 * self.steps.first_trial {
                 Due::Nothing
             } else {
                 Due::ReleaseValidation
@@ -352,14 +334,6 @@ impl SplatTrials {
             from: context.n_splats,
             to: context.n_splats.div_ceil(2),
         };
-        let doubled = Candidate::Doubled {
-            from: context.n_splats,
-            to: context.n_splats.saturating_mul(2).min(context.max_splats),
-        };
-        let is_doubling_due = context.n_splats < context.max_splats
-            && self.doubling.is_some_and(|doubling| {
-                doubling.is_due(context.step, context.n_planned_steps, &self.steps)
-            });
         let lower = Candidate::ShDegree {
             from: context.sh_degree,
             to: self.degree,
@@ -372,7 +346,6 @@ impl SplatTrials {
             CountState::Finished => Due::ReleaseValidation,
             CountState::Halving => Due::Begin(halved),
             CountState::Growing if context.is_mature => Due::Begin(halved),
-            CountState::Growing if is_doubling_due => Due::Begin(doubled),
             CountState::Growing => Due::Nothing,
         }
     }
@@ -411,21 +384,6 @@ impl SplatTrials {
             });
         }
         is_deferred
-    }
-
-    /// Restarts the search for the number of splats, if growth depends on trials and many of the
-    /// `n_images` images are new. Validation keyframes that arrive from now on are excluded from
-    /// training again. Has no effect during a trial.
-    pub(crate) fn restart_growth(&mut self, n_images: usize) {
-        if self.running_trial().is_none()
-            && self
-                .doubling
-                .as_mut()
-                .is_some_and(|doubling| doubling.restart(n_images))
-        {
-            self.count = CountState::Growing;
-            self.trial_phase = SplatTrialPhase::Waiting;
-        }
     }
 
     /// Next keyframe to add in the second half of a trial.
@@ -474,12 +432,8 @@ impl SplatTrials {
                 (self.steps.per_image * n_views as u64)
                     .clamp(self.steps.trial_half, self.steps.max_trial_half)
             }
-            Candidate::Doubled { .. } => self.steps.doubling_half,
             _ => self.steps.trial_half,
         };
-        if matches!(candidate, Candidate::Doubled { .. }) {
-            self.doubling.iter_mut().for_each(Doubling::begin);
-        }
         let until = from.schedule.step + n_steps;
         // Before the phase changes: `scored` returns the list of a running trial otherwise.
         let scored = self.scored();
@@ -519,7 +473,6 @@ impl SplatTrials {
     pub(crate) fn end(&mut self, variant_db: &Scores) -> Option<TrialEnd> {
         let RunningTrial {
             candidate,
-            until,
             other,
             baseline_db,
             deferred,
@@ -530,12 +483,6 @@ impl SplatTrials {
         // Each result determines the next trial.
         match candidate {
             Candidate::Cameras(_) => drop(self.candidates.pop_front()),
-            // The next doubling may follow at once.
-            Candidate::Doubled { .. } if kept => {}
-            Candidate::Doubled { .. } => self
-                .doubling
-                .iter_mut()
-                .for_each(|doubling| doubling.reject(until)),
             Candidate::Halved { to, .. } if kept && to > MIN_SPLATS => {
                 self.count = CountState::Halving
             }
@@ -591,18 +538,11 @@ impl SplatTrials {
             "{candidate}: PSNR without the change {baseline_db:.3?} dB, with it {variant_db:.3?} dB"
         );
         let mut trial = Trial::of(candidate, baseline_db, variant_db);
-        // A doubling that was accepted starts a new model size, so earlier losses do not count. A
-        // reduction that improved the score is no credit for later ones: its gain may be noise.
-        let is_growth =
-            |trial: &&Trial| trial.kept && matches!(trial.candidate, Candidate::Doubled { .. });
-        let since_growth = self
+        // A reduction that improved the score is no credit for later ones: its gain may be noise.
+        let total_loss_db: f64 = self
             .finished
             .iter()
-            .rev()
-            .take_while(|trial| !is_growth(trial));
-        let reductions =
-            since_growth.filter(|finished| finished.kept && finished.candidate.reduces_model());
-        let total_loss_db: f64 = reductions
+            .filter(|finished| finished.kept && finished.candidate.reduces_model())
             .map(|finished| (-finished.gain_db).max(0.0))
             .sum();
         trial.kept &=
@@ -682,7 +622,6 @@ impl SplatTrials {
             is_finished: !self.holds_validation(),
             params: self.candidates.iter().copied().collect(),
             count: self.count,
-            doubling: self.doubling,
             degree: self.degree,
             arrival_gains: self.arrival_gains.clone(),
         }
@@ -698,7 +637,6 @@ impl SplatTrials {
         self.candidates = remaining_trials.params.into();
         self.arrival_gains = remaining_trials.arrival_gains;
         self.count = remaining_trials.count;
-        self.doubling = remaining_trials.doubling;
         self.degree = remaining_trials.degree;
         self.finished = finished;
     }
@@ -741,8 +679,6 @@ mod tests {
     const CONTEXT: TrialContext = TrialContext {
         step: 0,
         n_splats: 5000,
-        max_splats: 20_000,
-        n_planned_steps: 7000,
         is_mature: false,
         sh_degree: 3,
     };
@@ -810,7 +746,7 @@ mod tests {
             CountPolicy::ToCap,
             TrialSteps::default(),
         );
-        assert!(!trials.holds_validation() && trials.may_grow(0));
+        assert!(!trials.holds_validation() && trials.may_grow());
         assert_eq!(
             trials.due(TrialContext {
                 step: 10_000,

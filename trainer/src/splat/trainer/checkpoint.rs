@@ -10,7 +10,6 @@ use crate::keyframe_signature::{self, KeyframeSignature};
 use crate::model_options::{MethodOptions, ModelOptions};
 use crate::splat::buffers::SplatBuffers;
 use crate::splat::camera_params::CameraSlots;
-use crate::splat::growth_search::{FoldModels, SavedGrowthSearch};
 use crate::splat::options::SplatOptions;
 use crate::splat::params::status;
 use crate::splat::schedule::Schedule;
@@ -20,6 +19,7 @@ use calibration::{Candidate, ParamSet, Trial};
 use keyframe::Keyframe;
 use kinematics::Stamp;
 use serde::{Deserialize, Serialize};
+use serde_json::Value;
 use std::sync::Arc;
 
 const METHOD: &str = SplatOptions::METHOD;
@@ -48,8 +48,6 @@ struct SavedState {
     slots: CameraSlots,
     remaining_trials: RemainingTrials,
     finished_trials: Vec<Trial>,
-    #[serde(default)]
-    growth_search: SavedGrowthSearch,
     /// The running trial, if any.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     trial: Option<TrialState>,
@@ -86,6 +84,35 @@ struct TrialState {
     other_step: u64,
     other: ModelState,
     n_other_param_bytes: u64,
+}
+
+/// Removes what earlier versions stored about searches for the number of splats. Their runs
+/// continue without such a search.
+fn remove_obsolete(state: &mut Value) {
+    remove_fields(Some(&mut *state), &["growth_search"]);
+    remove_fields(state.pointer_mut("/remaining_trials"), &["doubling"]);
+    remove_fields(
+        state.pointer_mut("/options/specific/trial_steps"),
+        &[
+            "first_doubling",
+            "doubling_half",
+            "search",
+            "search_pause",
+            "comparison",
+        ],
+    );
+    let finished = state.pointer_mut("/finished_trials");
+    if let Some(trials) = finished.and_then(Value::as_array_mut) {
+        trials.retain(|trial| trial.pointer("/candidate/doubled").is_none());
+    }
+}
+
+fn remove_fields(object: Option<&mut Value>, names: &[&str]) {
+    if let Some(fields) = object.and_then(Value::as_object_mut) {
+        for name in names {
+            fields.remove(*name);
+        }
+    }
 }
 
 /// Camera name and stamp in nanoseconds.
@@ -308,18 +335,8 @@ impl SplatTrainer {
         self.finish_in_flight()?;
         let gpu = &self.recorder.gpu;
         let cameras = &self.model.cameras;
-        // A running growth search is not saved but repeated.
-        let (splats, params, schedule, scene) = match self.growth_search.running() {
-            Some(FoldModels { main, .. }) => {
-                (&main.splats, &main.cameras.1, &main.schedule, &main.scene)
-            }
-            None => (
-                &self.model.splats,
-                &cameras.params,
-                &self.schedule,
-                &self.seeding.scene,
-            ),
-        };
+        let (splats, schedule) = (&self.model.splats, &self.schedule);
+        let scene = &self.seeding.scene;
         let state = SavedState {
             // Defaults that depend on the adapter are fixed, so that training continues alike on
             // another one.
@@ -346,7 +363,6 @@ impl SplatTrainer {
             is_full: self.model.is_full(),
             is_growth_paused: self.model.is_growth_paused,
             finished_trials: self.trials.finished.clone(),
-            growth_search: self.growth_search.saved(),
             trial: self.trials.running_trial().map(TrialState::of),
         };
         let state = serde_json::to_value(state).map_err(|error| Error::CheckpointState {
@@ -354,7 +370,7 @@ impl SplatTrainer {
         })?;
         // Reading back begins now, so that the arrays belong to this step. Training may change the
         // buffers before the reads are finished.
-        let params = (params, cameras.used_bytes());
+        let params = (&cameras.params, cameras.used_bytes());
         let mut halves = vec![PendingArrays::begin(gpu, "", splats, &scene.seeder, params)];
         if let Some(RunningTrial { other, .. }) = self.trials.running_trial() {
             let params = (&other.cameras.1, other.cameras.1.bytes());
@@ -402,8 +418,10 @@ impl SplatTrainer {
                 checkpoint.method
             )));
         }
-        let state: SavedState = serde_json::from_value(checkpoint.state.clone())
-            .map_err(|error| invalid_state(error.to_string()))?;
+        let mut state = checkpoint.state.clone();
+        remove_obsolete(&mut state);
+        let state: SavedState =
+            serde_json::from_value(state).map_err(|error| invalid_state(error.to_string()))?;
         let SavedKeyframes {
             views,
             arrivals,
@@ -432,7 +450,6 @@ impl SplatTrainer {
             .restore(state.remaining_trials, state.finished_trials);
         trainer.model.set_full(state.is_full);
         trainer.model.is_growth_paused = state.is_growth_paused;
-        trainer.growth_search.restore(state.growth_search);
         if let Some(trial) = state.trial {
             let n_planned_steps = trainer.options.common.n_planned_steps;
             trainer.trials.restore_trial(trial.restored(

@@ -14,36 +14,21 @@ impl SplatTrainer {
         TrialContext {
             step: self.schedule.step,
             n_splats: self.model.splats.n_splats,
-            // A model that cannot or may not grow has no doubling to try.
-            max_splats: if self.model.is_full() || self.model.is_growth_paused {
-                self.model.splats.n_splats
-            } else {
-                self.options.cap()
-            },
-            n_planned_steps: self.options.common.n_planned_steps,
             is_mature: self.schedule.is_mature(),
             sh_degree: self.model.splats.sh_degree,
         }
     }
 
-    /// Work that is due for trials. They wait for the end of a growth search.
     fn due_trial(&self) -> Due {
-        match self.growth_search.running() {
-            Some(_) => Due::Nothing,
-            None => self.trials.due(self.trial_context()),
-        }
+        self.trials.due(self.trial_context())
     }
 
-    /// Starts, advances and ends trials and the growth search until nothing is due, so that all
-    /// effects of a trial's end apply at the same step. Postponing them to the next submit would
-    /// make training depend on timing.
+    /// Starts, advances and ends trials until nothing is due, so that all effects of a trial's end
+    /// apply at the same step. Postponing them to the next submit would make training depend on
+    /// timing.
     pub(super) fn try_when_due(&mut self) -> Result<(), Error> {
-        while self.is_growth_search_due() || self.due_trial() != Due::Nothing {
+        while self.due_trial() != Due::Nothing {
             self.finish_in_flight()?; // A failed submit may reduce the step count.
-            if self.is_growth_search_due() {
-                self.advance_growth_search()?;
-                continue;
-            }
             match self.due_trial() {
                 Due::Nothing => {}
                 Due::Begin(candidate) => self.begin_trial(candidate)?,
@@ -89,23 +74,9 @@ impl SplatTrainer {
         match candidate {
             Candidate::Cameras(params) => self.model.cameras.enable(params),
             Candidate::Halved { to, .. } => self.keep_most_contributing(to)?,
-            Candidate::Doubled { to, .. } => return self.double_for_trial(to),
             Candidate::ShDegree { to, .. } => self.lower_degree(to)?,
         }
         self.prepare_training()
-    }
-
-    /// Doubles the number of splats in the second half of a trial.
-    fn double_for_trial(&mut self, n_splats: u32) -> Result<(), Error> {
-        match self.grow_to(n_splats) {
-            // The trial is canceled first, because its end frees a copy of the model.
-            Err(error) if error.is_out_of_memory() => {
-                let canceled = self.trials.cancel();
-                canceled.map_or(Ok(()), |canceled| self.end_trial(canceled))?;
-                self.end_trials_without_memory(error)
-            }
-            grown => grown.and_then(|()| self.prepare_training()),
-        }
     }
 
     /// Adds a keyframe in the second half, at the same step at which it arrived in the first half.
@@ -146,19 +117,11 @@ impl SplatTrainer {
         }
         deferred
             .into_iter()
-            .try_for_each(|keyframe| self.add_arrival(keyframe))?;
-        self.update_growth_search();
-        Ok(())
+            .try_for_each(|keyframe| self.add_arrival(keyframe))
     }
 
-    /// Cancels a growth search, or a trial that is in its second half.
+    /// Cancels a trial that is in its second half.
     pub(super) fn cancel_trial(&mut self) -> Result<(), Error> {
-        if self.growth_search.running().is_some() {
-            log::warn!(
-                "training stopped while the number of splats was tested; more time or --count to-cap gives a better model"
-            );
-        }
-        self.abort_growth_search()?;
         // In the first half, the model in training is the one without the change.
         let Some(canceled) = self.trials.cancel() else {
             return Ok(());
@@ -167,9 +130,8 @@ impl SplatTrainer {
         self.end_trial(canceled)
     }
 
-    /// Ends a growth search or a trial without a decision; it is repeated.
+    /// Ends a trial without a decision; it is repeated.
     pub(super) fn abort_trial(&mut self) -> Result<(), Error> {
-        self.abort_growth_search()?;
         self.trials
             .abort()
             .map_or(Ok(()), |aborted| self.end_trial(aborted))
@@ -208,10 +170,11 @@ impl SplatTrainer {
 
     pub(super) fn restore_snapshot(&mut self, snapshot: Snapshot) -> Result<(), Error> {
         self.recorder.passes.clear_bindings();
-        // Negative if the snapshot is from a later step, as at the end of a growth search. The sum
-        // of steps and reverted steps stays the number of steps that were trained.
-        let n_reverted = self.schedule.step.wrapping_sub(snapshot.schedule.step);
-        self.trials.n_reverted_steps = self.trials.n_reverted_steps.wrapping_add(n_reverted);
+        // The sum of steps and reverted steps stays the number of steps that were trained.
+        // The snapshot may be from a later step, if the second half of a trial is canceled. Its first
+        // half was reverted before, so the result is not negative.
+        self.trials.n_reverted_steps =
+            self.trials.n_reverted_steps + self.schedule.step - snapshot.schedule.step;
         self.model.splats = snapshot.splats;
         self.model
             .cameras

@@ -43,7 +43,7 @@ impl SplatTrainer {
             return Ok(None);
         }
         let drawn = DrawnView {
-            splats: displayed(&self.growth_search, &self.trials, &self.model),
+            splats: self.trials.displayed(&self.model.splats),
             camera,
             background_srgb,
         };

@@ -7,9 +7,10 @@ use super::optimizer::StepContext;
 use super::recorder::Recorder;
 use crate::Error;
 use crate::gpu::{PassTiming, f32_of};
-use crate::splat::few_images::Scarcity;
+use crate::splat::few_images::{self, Scarcity};
 use crate::splat::kernels::TrainPipelines;
 use crate::splat::params::status;
+use crate::splat::trials::CountPolicy;
 use crate::splat::work_counts::WorkCounts;
 use std::time::Instant;
 
@@ -103,33 +104,6 @@ impl SplatTrainer {
             .grow(&mut self.recorder, &mut self.renderer, learn, n_new, key)
     }
 
-    /// Changes the splat count to `n_splats` outside of the schedule.
-    ///
-    /// # Errors
-    ///
-    /// [`Error::OutOfMemory`] if GPU memory is insufficient.
-    pub(super) fn grow_to(&mut self, n_splats: u32) -> Result<(), Error> {
-        let learn = self.learn()?;
-        let n_more = n_splats.saturating_sub(self.model.splats.n_splats);
-        let step = self.schedule.step;
-        // Replaces regular growth at this step, which would change the number again.
-        self.schedule.last_growth_step = step;
-        let key = growth_key(self.options.common.seed, step);
-        let is_full = self.model.is_full();
-        self.model
-            .grow(&mut self.recorder, &mut self.renderer, &learn, n_more, key)?;
-        // A comparison with fewer splats than requested would be meaningless. The model is not
-        // marked as full: once the copies for the comparison are freed, it may be able to grow.
-        if self.model.splats.n_splats < n_splats {
-            self.model.set_full(is_full);
-            return Err(Error::OutOfMemory {
-                label: "splat.doubled".to_owned(),
-                bytes: 0,
-            });
-        }
-        Ok(())
-    }
-
     /// Number of splats to add at a change of the splat count.
     #[expect(
         clippy::cast_possible_truncation,
@@ -138,11 +112,15 @@ impl SplatTrainer {
     )]
     fn n_new_splats(&self) -> u32 {
         let n_splats = self.model.splats.n_splats;
-        if !self.trials.may_grow(self.schedule.step) || !self.growth_search.may_grow() {
+        if !self.trials.may_grow() {
             return 0;
         }
         let n_new = (f64::from(n_splats) * self.options.specific.growth_frac).ceil() as u32;
-        n_new.min(self.growth_search.limit().saturating_sub(n_splats))
+        let limit = match self.options.specific.count {
+            CountPolicy::ToCap => u32::MAX,
+            CountPolicy::Tested => few_images::max_splats(self.n_images()),
+        };
+        n_new.min(limit.saturating_sub(n_splats))
     }
 
     /// Number of steps of the next submit. The submit stays within its time limit and does not pass
@@ -154,10 +132,6 @@ impl SplatTrainer {
             .min(by_time.clamp(1, MAX_STEPS_PER_SUBMIT))
             .min(self.schedule.steps_to_next_change())
             .min(self.trials.steps_left(self.schedule.step))
-            .min(
-                self.growth_search
-                    .steps_left(self.schedule.step, &self.trials.steps),
-            )
     }
 
     /// Uploads the settings of the next steps.
@@ -188,13 +162,7 @@ impl SplatTrainer {
         optimizer.write_supervision(gpu, &options.specific, scarcity, views.mean_srgb());
         optimizer.write_rule(
             gpu,
-            &learning_rates::rule(
-                options,
-                schedule,
-                &seeding.scene,
-                views.n_active(),
-                n_splats,
-            ),
+            &learning_rates::rule(options, schedule, &seeding.scene, views.len(), n_splats),
         );
     }
 
@@ -281,7 +249,7 @@ impl SplatTrainer {
         self.model.stop_growing(&error);
         // Within two rounds, every image has had its turn.
         let step = self.schedule.step;
-        if self.skipped.add(step) > 2 * self.views.n_active() as u64 {
+        if self.skipped.add(step) > 2 * self.views.len() as u64 {
             return Err(error);
         }
         self.schedule.step = step + 1;
@@ -326,8 +294,9 @@ mod tests {
     use super::*;
     use crate::Method;
     use crate::gpu::GpuOptions;
-    use crate::gpu::testing::test_gpu_with;
-    use crate::splat::training_tests::{n_keyframes, options, request, train};
+    use crate::gpu::testing::{test_gpu, test_gpu_with};
+    use crate::splat::cloud::synthetic_cloud;
+    use crate::splat::training_tests::{keyframes, n_keyframes, options, request, train};
     use keyframe::{Keyframe, Split};
     use std::sync::Arc;
 
@@ -352,7 +321,18 @@ mod tests {
             .for_each(|keyframe| trainer.push(keyframe.clone()).unwrap());
         train(&mut trainer, 3);
         trainer.finish_in_flight().unwrap();
-        trainer.grow_to(N_COVERING).unwrap();
+        let learn = trainer.learn().unwrap();
+        let n_more = N_COVERING - trainer.model.splats.n_splats;
+        trainer
+            .model
+            .grow(
+                &mut trainer.recorder,
+                &mut trainer.renderer,
+                &learn,
+                n_more,
+                0,
+            )
+            .unwrap();
         (trainer, keyframes)
     }
 
@@ -368,6 +348,29 @@ mod tests {
             &splats.shapes,
             0,
             bytemuck::cast_slice(&[[log_scale, log_scale, log_scale, -3.0]; N]),
+        );
+    }
+
+    #[test]
+    fn few_images_limit_the_number_of_splats() {
+        const N_SPLATS: usize = 7900;
+        let n_new = |count: CountPolicy| {
+            let gpu = test_gpu();
+            let options = options().with(|options| {
+                options.specific.count = count;
+                options.specific.max_splats = 100_000;
+            });
+            let cloud = synthetic_cloud(N_SPLATS, 1);
+            let mut trainer = SplatTrainer::from_arrays(gpu.clone(), options, &cloud).unwrap();
+            let only = keyframes(&gpu, true)
+                .into_iter()
+                .find(|keyframe| keyframe.split == Split::Train);
+            trainer.push(only.unwrap()).unwrap();
+            trainer.n_new_splats()
+        };
+        assert_eq!(
+            (n_new(CountPolicy::Tested), n_new(CountPolicy::ToCap)),
+            (100, 790)
         );
     }
 

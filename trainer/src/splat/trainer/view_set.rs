@@ -6,7 +6,6 @@ use crate::gpu::{Buffer, Gpu, f32_of};
 use crate::model_options::ModelOptions;
 use crate::splat::camera_params::CameraParams;
 use crate::splat::options::SplatOptions;
-use crate::splat::trials::ImageId;
 use crate::splat::views::{self, Keep, Level, LevelImages, Order, TrainView};
 use keyframe::Keyframe;
 use rayon::prelude::*;
@@ -31,8 +30,6 @@ const SOFTWARE_COARSE_STEPS: [u64; 2] = [500, 4000];
 #[derive(Debug)]
 pub(super) struct ViewSet {
     views: Vec<TrainView>,
-    /// Indices of the views to train on.
-    active: Vec<usize>,
     order: Order,
     coarse_steps: [u64; 2],
     /// Maximum bytes of the views' images on the GPU, unless a submit needs more.
@@ -50,7 +47,6 @@ impl ViewSet {
     pub(super) fn new(options: &ModelOptions<SplatOptions>, is_software: bool) -> Self {
         Self {
             views: Vec::new(),
-            active: Vec::new(),
             order: Order::new(options.common.seed),
             coarse_steps: options.specific.coarse_steps.unwrap_or(if is_software {
                 SOFTWARE_COARSE_STEPS
@@ -88,9 +84,7 @@ impl ViewSet {
         &self.views[view_ix].keyframe
     }
 
-    /// Adds a view. Training visits it, too.
     pub(super) fn push(&mut self, keyframe: Arc<Keyframe>) {
-        self.active.push(self.views.len());
         self.views.push(TrainView::new(keyframe));
     }
 
@@ -104,43 +98,13 @@ impl ViewSet {
         [0, 1, 2].map(|color| f32_of(mean(color)))
     }
 
-    /// Number of views to train on.
-    pub(super) fn n_active(&self) -> usize {
-        self.active.len()
-    }
-
-    /// The keyframes to train on.
-    pub(super) fn active_keyframes(&self) -> impl Iterator<Item = &Arc<Keyframe>> {
-        self.active.iter().map(|ix| &self.views[*ix].keyframe)
-    }
-
-    /// Trains on all views except these images.
-    pub(super) fn hold_out(&mut self, images: &[ImageId]) {
-        let held_out: BTreeSet<usize> = images
-            .iter()
-            .filter_map(|image| self.position(image))
-            .collect();
-        self.active = (0..self.views.len())
-            .filter(|ix| !held_out.contains(ix))
-            .collect();
-    }
-
-    /// Index of the view of an image.
-    pub(super) fn position(&self, (camera, stamp): &ImageId) -> Option<usize> {
-        self.keyframes()
-            .position(|keyframe| keyframe.camera == *camera && keyframe.stamp == *stamp)
-    }
-
     pub(super) fn retain(&mut self, is_kept: impl Fn(&Arc<Keyframe>) -> bool) {
         self.views.retain(|view| is_kept(&view.keyframe));
-        // Indices have changed.
-        self.hold_out(&[]);
     }
 
     /// Replaces all views.
     pub(super) fn replace(&mut self, keyframes: impl IntoIterator<Item = Arc<Keyframe>>) {
         self.views = keyframes.into_iter().map(TrainView::new).collect();
-        self.hold_out(&[]);
     }
 
     /// Replaces the cameras of all views; `correct` replaces a keyframe. Uploaded images are kept
@@ -171,9 +135,7 @@ impl ViewSet {
 
     /// The view and level that a step trains on.
     pub(super) fn of_step(&mut self, step: u64) -> ViewLevel {
-        // Images that are held out are not part of the order, so each round visits every other
-        // image once.
-        let view_ix = self.active[self.order.pick(step, self.active.len())];
+        let view_ix = self.order.pick(step, self.views.len());
         (
             view_ix,
             self.views[view_ix].clamped(level_at(step, self.coarse_steps)),
