@@ -5,10 +5,10 @@ use super::training_tests::{FEW_STEPS, n_keyframes, noisy, options, train};
 use super::trials::CountPolicy;
 use super::{SplatOptions, SplatTrainer, TrialSteps};
 use crate::Method;
-use crate::gpu::Gpu;
-use crate::gpu::testing::test_gpu;
 use crate::model_options::ModelOptions;
 use calibration::{Candidate, Trial};
+use gpu::Gpu;
+use gpu::testing::test_gpu;
 use keyframe::{Keyframe, Split};
 use std::sync::Arc;
 

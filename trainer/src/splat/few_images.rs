@@ -4,7 +4,7 @@
 use super::growth_search::FEW_IMAGES;
 use super::options::SplatOptions;
 use super::params::Supervision;
-use crate::gpu::f32_of;
+use kinematics::f32_of;
 
 /// Up to this number of images, the regularization is complete. The changes were measured with 6
 /// and 11 images (docs/benchmarks/2026-11-25-few-images.md).

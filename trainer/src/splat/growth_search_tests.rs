@@ -7,10 +7,10 @@ use super::trials::CountPolicy;
 use super::{SplatOptions, SplatTrainer};
 use crate::Method;
 use crate::checkpoint::Checkpoint;
-use crate::gpu::Gpu;
-use crate::gpu::testing::test_gpu;
 use crate::model_options::ModelOptions;
 use calibration::{Candidate, Trial};
+use gpu::Gpu;
+use gpu::testing::test_gpu;
 use keyframe::{Keyframe, Split};
 use std::sync::Arc;
 

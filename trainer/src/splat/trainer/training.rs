@@ -6,11 +6,12 @@ use super::learning_rates;
 use super::optimizer::StepContext;
 use super::recorder::Recorder;
 use crate::Error;
-use crate::gpu::{PassTiming, f32_of};
 use crate::splat::few_images::Scarcity;
 use crate::splat::kernels::TrainPipelines;
 use crate::splat::params::status;
 use crate::splat::work_counts::WorkCounts;
+use gpu::PassTiming;
+use kinematics::f32_of;
 use std::time::Instant;
 
 /// Maximum number of steps per submit. A submit also ends at its time limit, so this number matters
@@ -107,7 +108,7 @@ impl SplatTrainer {
     ///
     /// # Errors
     ///
-    /// [`Error::OutOfMemory`] if GPU memory is insufficient.
+    /// [`gpu::Error::OutOfMemory`] if GPU memory is insufficient.
     pub(super) fn grow_to(&mut self, n_splats: u32) -> Result<(), Error> {
         let learn = self.learn()?;
         let n_more = n_splats.saturating_sub(self.model.splats.n_splats);
@@ -122,10 +123,11 @@ impl SplatTrainer {
         // marked as full: once the copies for the comparison are freed, it may be able to grow.
         if self.model.splats.n_splats < n_splats {
             self.model.set_full(is_full);
-            return Err(Error::OutOfMemory {
+            return Err(gpu::Error::OutOfMemory {
                 label: "splat.doubled".to_owned(),
                 bytes: 0,
-            });
+            }
+            .into());
         }
         Ok(())
     }
@@ -325,9 +327,9 @@ pub(super) fn growth_key(seed: u64, step: u64) -> u32 {
 mod tests {
     use super::*;
     use crate::Method;
-    use crate::gpu::GpuOptions;
-    use crate::gpu::testing::test_gpu_with;
     use crate::splat::training_tests::{n_keyframes, options, request, train};
+    use gpu::GpuOptions;
+    use gpu::testing::test_gpu_with;
     use keyframe::{Keyframe, Split};
     use std::sync::Arc;
 
@@ -361,7 +363,7 @@ mod tests {
         const N: usize = N_COVERING as usize;
         assert_eq!(trainer.model.splats.n_splats, N_COVERING);
         let center = keyframe.world_from_camera * nalgebra::Point3::new(0.0, 0.0, 0.3);
-        let [x, y, z] = crate::gpu::f32s_of(center.coords.into());
+        let [x, y, z] = kinematics::f32s_of(center.coords.into());
         let (gpu, splats) = (&trainer.recorder.gpu, &trainer.model.splats);
         gpu.write(&splats.means, 0, bytemuck::cast_slice(&[[x, y, z, 0.0]; N]));
         gpu.write(
