@@ -62,7 +62,8 @@ quick: begin-test lint texts web-check ## Run lints and the tests that need neit
 	@scripts/run-tests.py --steps $(STEPS) --no-doc --quick -- --workspace --lib --bins $(TEST_FEATURES)
 
 test-gpu: deps ## Run the tests that need a real GPU
-	FIELDRIG_GPU_TESTS=demand scripts/run-tests.py --no-doc --only "^trainer unit" --filter needs_ -- --package trainer --lib
+	FIELDRIG_GPU_TESTS=demand scripts/run-tests.py --no-doc --only "^(gpu|trainer) unit" --filter needs_ -- \
+		--package gpu --package trainer --lib
 
 # Forgets the durations of earlier steps.
 begin-test:

@@ -32,12 +32,12 @@ import time
 BESIDE = ("fieldrig hil",)
 # Tests that need other settings than the rest of their program: program, part of the names of the tests, environment. Mesa's
 # software Vulkan has subgroups of 16 lanes with this width, so that the kernels for GPUs run, too.
-SEPARATE = (("trainer unit", "needs_large_subgroups", {"LP_NATIVE_VECTOR_WIDTH": "512"}),)
+SEPARATE = tuple((name, "needs_large_subgroups", {"LP_NATIVE_VECTOR_WIDTH": "512"}) for name in ("gpu unit", "trainer unit"))
 # Programs that only compute. They run one after another beside all others, with a lower priority, and use the time in which the
 # others wait for clocks, devices and browsers.
 COMPUTING = (
-    "trainer unit", "trainer unit needs_large_subgroups", "calibration unit", "sim rigs", "sim unit", "targets accuracy",
-    "targets photos", "examples in documentation",
+    "trainer unit", "trainer unit needs_large_subgroups", "gpu unit", "gpu unit needs_large_subgroups", "calibration unit",
+    "sim rigs", "sim unit", "targets accuracy", "targets photos", "examples in documentation",
 )
 # Steps by which a priority differs. A program with a priority that is lower by 10 gets a tenth of a busy processor.
 NICE = 10
@@ -47,10 +47,11 @@ FIRST = ("fieldrig program", "trainer unit")
 # so a test that needs one fails unless its module is listed here.
 WITHOUT_GPU = {"VK_DRIVER_FILES": "/dev/null", "VK_ICD_FILENAMES": "/dev/null"}
 NOT_QUICK = {
+    "gpu unit": ("device::tests", "passes::tests", "pipeline::tests", "sort::tests"),
     "trainer unit": (
-        "against_twin", "aligned::", "alignment_tests", "checkpoint_tests", "edit_tests", "gpu::",
+        "against_twin", "aligned::", "alignment_tests", "checkpoint_tests", "edit_tests",
         "mean_color::", "needs_", "nerf::bench", "nerf::tests", "non_finite_tests", "packing::tests",
-        "registry::tests", "sort::tests", "splat::chunks", "splat::entry", "splat::trainer", "training_tests", "trial_tests",
+        "registry::tests", "splat::chunks", "splat::entry", "splat::trainer", "training_tests", "trial_tests",
         "tsdf::mesh", "tsdf::tests", "view::erased",
     ),
     "session unit": ("session::tests", "recoveries::tests"),

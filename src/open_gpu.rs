@@ -1,9 +1,9 @@
 //! Opens the GPU with the settings from environment variables.
 
 use crate::allocator;
+use gpu::{Gpu, GpuOptions};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Once};
-use trainer::gpu::{Gpu, GpuOptions};
 
 /// Opens the GPU. `FIELDRIG_GPU` selects one of several; `FIELDRIG_GPU_FEATURES=none` disables all
 /// optional features, and `no-matrices` only cooperative matrices.
@@ -62,11 +62,11 @@ fn hide_caught_panics() {
 }
 
 /// For tests: with `FIELDRIG_TEST_OPEN_GPU_ONCE` set, the GPU can be opened only once.
-fn check_open_for_tests() -> Result<(), trainer::Error> {
+fn check_open_for_tests() -> Result<(), gpu::Error> {
     static IS_OPENED: AtomicBool = AtomicBool::new(false);
     let was_opened = IS_OPENED.swap(true, Ordering::Relaxed);
     if was_opened && std::env::var_os("FIELDRIG_TEST_OPEN_GPU_ONCE").is_some() {
-        return Err(trainer::Error::NoAdapter);
+        return Err(gpu::Error::NoAdapter);
     }
     Ok(())
 }

@@ -322,12 +322,13 @@ pub(crate) fn bar(length: Option<u64>, template: &'static str, hidden: bool) -> 
 }
 
 /// The crates that log progress.
-const WORKSPACE_CRATES: [&str; 9] = [
+const WORKSPACE_CRATES: [&str; 10] = [
     "fieldrig",
     "bench",
     "calibration",
     "capture",
     "drivers",
+    "gpu",
     "session",
     "sim",
     "trainer",

@@ -1,12 +1,12 @@
 //! Measures the speed of the splat kernels.
 
 use crate::{Error, Result};
+use gpu::PassTiming;
 use serde::Serialize;
 use session::Context;
 use session::OpenGpu;
 use std::path::PathBuf;
 use std::time::Duration;
-use trainer::gpu::PassTiming;
 use trainer::splat::arrays::SplatArrays;
 use trainer::splat::bench::{Eye, KernelFigures, KernelSetup, Losses, Repeats, time_kernels};
 use trainer::splat::cloud::{load_cloud_npz, scan_cloud, synthetic_cloud};

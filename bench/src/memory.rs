@@ -5,13 +5,13 @@ use crate::findings::Findings;
 use crate::growth::{Excluded, Growth, Sample, resident_bytes};
 use crate::statistics::extent;
 use crate::viewer::Viewer;
+use gpu::Gpu;
 use keyframe::counted;
 use kinematics::quantile::{Rank, quantile};
 use session::chart::{Axis, Chart, Line, Marker, Point, Scale};
 use session::{Live, Table};
 use std::collections::BTreeMap;
 use std::sync::Arc;
-use trainer::gpu::Gpu;
 
 /// Maximum number of points of a line in the chart.
 const MAX_POINTS: usize = 60;

@@ -5,12 +5,12 @@ use crate::growth::Excluded;
 use crate::memory;
 use crate::statistics::theil_sen;
 use crate::viewer::{ReceivedPicture, Viewer};
+use gpu::Gpu;
 use kinematics::quantile::median;
 use serde::Serialize;
 use session::Live;
 use session::chart::{Line, Point};
 use std::time::{Duration, Instant};
-use trainer::gpu::Gpu;
 
 /// Time between two samples.
 const SAMPLE_PERIOD: Duration = Duration::from_secs(1);

@@ -3,6 +3,7 @@
 
 use crate::{Error, Result};
 use capture::Stop;
+use gpu::Gpu;
 use keyframe::{Keyframe, Split};
 use keyframe::{ensure, failed};
 use serde::{Deserialize, Serialize};
@@ -16,7 +17,6 @@ use session::{
 use std::collections::HashSet;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use trainer::gpu::Gpu;
 use trainer::splat::SplatOptions;
 use trainer::{InitialPoints, MethodOptions, ModelKind, ModelOptions, ModelSpec};
 

@@ -10,6 +10,7 @@ use capture::config::{Override, Rig};
 use capture::open::{self, Opened};
 use capture::{Join, JoinEvent, SampleUse, StationReport, Stations, dataset};
 use drivers::Sample;
+use gpu::Gpu;
 use keyframe::ensure;
 use keyframe::{Holdout, Keyframe, KeyframeList, Split, counted};
 use kinematics::Stamp;
@@ -18,7 +19,6 @@ use std::collections::{BTreeMap, HashSet};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
-use trainer::gpu::Gpu;
 use trainer::splat::ply;
 use trainer::{InitialPoints, ModelKind};
 

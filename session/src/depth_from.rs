@@ -4,12 +4,12 @@ use crate::error::Context;
 use crate::evaluate::{self, CHECK_SAME_SCENE, MIN_ALPHA, MIN_COVERED_FRAC};
 use crate::read_progress::{OnReadProgress, ReadProgress};
 use crate::{Error, methods, run_folder};
+use gpu::Gpu;
 use keyframe::{DepthMap, Keyframe, Split, counted};
 use serde::Serialize;
 use sha2::{Digest, Sha256};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use trainer::gpu::Gpu;
 use trainer::{Method, Picture};
 
 /// A saved model from which depth is rendered.

@@ -1,8 +1,8 @@
 //! Makes the GPU fail on purpose, to test recovery.
 
+use gpu::Gpu;
 use std::sync::OnceLock;
 use std::sync::atomic::{AtomicBool, Ordering};
-use trainer::gpu::Gpu;
 
 static AT_STEP: OnceLock<u64> = OnceLock::new();
 

@@ -4,11 +4,11 @@ use crate::Error;
 use crate::run_folder::{expect_model, expect_one_model};
 use capture::Rig;
 use capture::config::Train;
+use gpu::Gpu;
 use keyframe::listed;
 use serde_json::Value;
 use std::path::Path;
 use std::sync::Arc;
-use trainer::gpu::Gpu;
 use trainer::{CommonOptions, LoadedModel, ModelKind, ModelSpec};
 
 /// Names and values of options that only some methods have.

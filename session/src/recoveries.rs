@@ -4,9 +4,9 @@
 use crate::Error;
 use crate::error::Context;
 use crate::session::Session;
+use gpu::Gpu;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
-use trainer::gpu::Gpu;
 
 /// Maximum number of attempts to reopen the GPU. A driver that resets needs seconds; a device that
 /// is still missing after several attempts has probably failed, and the run should report
@@ -107,8 +107,8 @@ fn restart_all(sessions: &mut [Session], open_gpu: OpenGpu) -> crate::Result<()>
 #[cfg(test)]
 mod tests {
     use super::*;
+    use gpu::GpuOptions;
     use std::sync::atomic::{AtomicU32, Ordering};
-    use trainer::gpu::GpuOptions;
 
     static N_OPENED: AtomicU32 = AtomicU32::new(0);
 
@@ -127,7 +127,7 @@ mod tests {
         assert!(error.to_string().contains("a buffer is missing"), "{error}");
         assert_eq!((N_OPENED.load(Ordering::Relaxed), recoveries.n), (0, 0));
         recoveries
-            .recover(&mut [], trainer::Error::DeviceLost.into())
+            .recover(&mut [], gpu::Error::DeviceLost.into())
             .expect("the GPU is reopened");
         assert_eq!((N_OPENED.load(Ordering::Relaxed), recoveries.n), (1, 1));
     }

@@ -26,6 +26,7 @@ use crate::observer::{Evaluation, Observer};
 use crate::recovery::Recovery;
 use calibration::{Alignment, CalibratedCamera, CameraCorrection};
 use capture::Stop;
+use gpu::Gpu;
 use keyframe::Keyframe;
 use kinematics::Stamp;
 use persistence::Persistence;
@@ -35,7 +36,6 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use trainer::edits::Floaters;
-use trainer::gpu::Gpu;
 use trainer::{
     Edits, FailedModel, InitialPoints, Method, ModelKind, Packing, Picture, Progress,
     QueuedPicture, RenderRequest, Rendered,

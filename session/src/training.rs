@@ -9,11 +9,11 @@ use crate::training_options::{Refine, RefineSettings, TrainingOptions};
 use crate::{Error, run_folder, time_slices};
 use capture::Stop;
 use capture::config::DEFAULT_SEED;
+use gpu::Gpu;
 use keyframe::{Keyframe, listed};
 use std::path::Path;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
-use trainer::gpu::Gpu;
 use trainer::splat::CountPolicy;
 use trainer::{self, CommonOptions, InitialPoints, ModelKind, ModelSpec};
 

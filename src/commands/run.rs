@@ -19,6 +19,7 @@ use capture::{
     StationReport, Stations, Stop,
 };
 use drivers::Source;
+use gpu::Gpu;
 use keyframe::{Keyframe, Split, counted};
 use kinematics::Stamp;
 use serde::Serialize;
@@ -37,7 +38,6 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 use trainer::checkpoint::Checkpoint;
-use trainer::gpu::Gpu;
 use trainer::splat::CountPolicy;
 use trainer::{CommonOptions, Edits, ModelKind, ModelSpec, Resumed};
 use viz::{Hub, RunResult};

@@ -10,6 +10,7 @@ use crate::training_args::TrainingArgs;
 use crate::{print, signals};
 use capture::StationReport;
 use capture::config::{Override, Rig};
+use gpu::Gpu;
 use keyframe::{Keyframe, Split, counted};
 use serde::Serialize;
 use session::depth_from::{self, DepthSource, RenderedDepth};
@@ -25,7 +26,6 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use trainer::checkpoint::Checkpoint;
-use trainer::gpu::Gpu;
 use trainer::{Edits, ModelKind, ModelSpec, Resumed};
 
 /// Maximum time of the scheduled evaluations, as a fraction of the training time. With more, the

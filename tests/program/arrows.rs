@@ -5,9 +5,11 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::process::Command;
 
 /// Every crate, and the workspace crates that it may depend on.
-const ALLOWED: [(&str, &[&str]); 16] = [
+const ALLOWED: [(&str, &[&str]); 17] = [
     ("background", &[]),
     ("files", &[]),
+    // Its helpers for tests are a feature.
+    ("gpu", &["test-support"]),
     ("kinematics", &[]),
     ("keyframe", &["files", "kinematics"]),
     ("calibration", &["background", "keyframe", "kinematics"]),
@@ -34,6 +36,7 @@ const ALLOWED: [(&str, &[&str]); 16] = [
             "background",
             "calibration",
             "files",
+            "gpu",
             "keyframe",
             "kinematics",
         ],
@@ -47,6 +50,7 @@ const ALLOWED: [(&str, &[&str]); 16] = [
             "capture",
             "drivers",
             "files",
+            "gpu",
             "keyframe",
             "kinematics",
             "trainer",
@@ -59,6 +63,7 @@ const ALLOWED: [(&str, &[&str]); 16] = [
             "calibration",
             "capture",
             "files",
+            "gpu",
             "keyframe",
             "kinematics",
             "session",
@@ -74,6 +79,7 @@ const ALLOWED: [(&str, &[&str]); 16] = [
             "capture",
             "drivers",
             "files",
+            "gpu",
             "keyframe",
             "kinematics",
             "session",

@@ -4,11 +4,11 @@
 #![cfg(feature = "sim")]
 
 use crate::small_rig;
+use gpu::{Gpu, GpuOptions};
 use serde_json::Value;
 use std::io::{BufRead, BufReader};
 use std::path::Path;
 use std::process::{Command, Output, Stdio};
-use trainer::gpu::{Gpu, GpuOptions};
 
 /// Number of images that the simulated camera delivers.
 const N_IMAGES: i64 = 40;

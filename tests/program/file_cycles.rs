@@ -12,13 +12,14 @@ use syn::visit::Visit;
 use syn::{Attribute, Item, UseTree};
 
 /// Source folders of the crates, relative to the workspace.
-const ROOTS: [&str; 12] = [
+const ROOTS: [&str; 13] = [
     "kinematics/src",
     "keyframe/src",
     "calibration/src",
     "drivers/src",
     "sim/src",
     "capture/src",
+    "trainer/gpu/src",
     "trainer/src",
     "viz/src",
     "session/src",

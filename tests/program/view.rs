@@ -3,13 +3,13 @@
 
 use crate::wall;
 use crate::wall::fieldrig;
+use gpu::{Gpu, GpuOptions};
 use serde_json::{Value, json};
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{SocketAddr, TcpListener, TcpStream};
 use std::path::Path;
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::time::Duration;
-use trainer::gpu::{Gpu, GpuOptions};
 use tungstenite::{Message, WebSocket};
 
 /// Much longer than two busy cores need for a small picture.

@@ -4,13 +4,13 @@
 //! are printed first. passes of one keyframe are printed before.
 
 use criterion::{Criterion, criterion_group, criterion_main};
+use gpu::{Gpu, GpuOptions, PassTiming};
 use keyframe::Keyframe;
 use keyframe::scenes::{TestShape, large_keyframe, look_at};
 use kinematics::Stamp;
 use nalgebra::{Point3, Vector3};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
-use trainer::gpu::{Gpu, GpuOptions, PassTiming};
 use trainer::tsdf::{TsdfModel, TsdfOptions};
 use trainer::{Method, Projection, RenderRequest};
 

@@ -9,7 +9,6 @@
 
 use crate::checkpoint::{Checkpoint, PendingCheckpoint};
 use crate::edits::{Edits, PendingFloaters};
-use crate::gpu::{Gpu, PassTiming};
 use crate::initial_points::InitialPoints;
 use crate::model_chunks::PendingChunks;
 use crate::model_metadata::{METADATA_FILE, read_metadata};
@@ -22,6 +21,7 @@ use calibration::{
     Alignment, AlignmentTask, CalibratedCamera, CameraCorrection, CameraRefinement,
     MOVEMENT_WINDOW, MovementTask, alignment_step,
 };
+use gpu::{Gpu, PassTiming};
 use keyframe::{Keyframe, Split};
 use kinematics::Stamp;
 use serde::{Deserialize, Serialize};
@@ -772,7 +772,6 @@ fn next_live_alignment(n: usize) -> usize {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::gpu::testing::test_gpu;
     use crate::mean_color::MeanColor;
     use crate::model_options::ModelOptions;
     use crate::nerf::{NerfBudget, NerfModel, NerfOptions};
@@ -781,6 +780,7 @@ mod tests {
     use crate::tsdf::TsdfModel;
     use calibration::ParamSet;
     use calibration::scenes::{Miscalibration, capture, remaining, wrong_extrinsics};
+    use gpu::testing::test_gpu;
     use kinematics::Transform;
     use nalgebra::Vector3;
 

@@ -14,73 +14,13 @@ pub enum Error {
     /// A keyframe is inconsistent.
     #[error(transparent)]
     Keyframe(#[from] keyframe::Error),
-    /// No GPU adapter, real or software, was found.
-    #[error(
-        "no GPU adapter found: install a Vulkan driver (software: the package mesa-vulkan-drivers)"
-    )]
-    NoAdapter,
-    /// The requested adapter does not exist.
-    #[error("no GPU with index {ix}: found {n_adapters} adapters, numbered from 0")]
-    NoSuchAdapter {
-        /// Requested index, from 0.
-        ix: usize,
-        /// Number of adapters found.
-        n_adapters: usize,
-    },
-    /// The adapter could not open a device.
-    #[error("cannot open a device on GPU {adapter:?}")]
-    NoDevice {
-        /// Name of the adapter.
-        adapter: String,
-        /// Cause.
-        source: wgpu::RequestDeviceError,
-    },
-    /// The GPU stopped answering.
-    #[error("the GPU stopped answering: its driver reset or lost the device")]
-    DeviceLost,
-    /// The GPU has no memory left for a buffer, or for commands; for commands, `label` is empty and
-    /// `bytes` is 0.
-    #[error(
-        "the GPU ran out of memory{}; close other programs that use it, use smaller images, or train a smaller model (--max-splats or --max-bytes of `fieldrig train` and `run`)",
-        buffer_suffix(label, *bytes)
-    )]
-    OutOfMemory {
-        /// Name of the buffer.
-        label: String,
-        /// Requested size, bytes.
-        bytes: u64,
-    },
-    /// The driver failed to execute a valid command.
-    #[error("the GPU's driver failed: {0}")]
-    DriverFailed(String),
-    /// A bug in this program: its state contradicts itself, or it gave the GPU an invalid command.
-    /// Another device would not help, so this is not a [GPU error](Self::is_gpu_error).
+    /// The GPU, or a kernel, failed.
+    #[error(transparent)]
+    Gpu(#[from] gpu::Error),
+    /// A bug in this program: its state contradicts itself. Another device would not help, so this
+    /// is not a [GPU error](Self::is_gpu_error).
     #[error("internal error: {0}; this is a bug in fieldrig, please report it")]
     Internal(String),
-    /// A buffer exceeds the adapter's limit.
-    #[error(
-        "buffer {label}: {bytes} bytes are more than this GPU can bind ({limit_bytes} bytes); use smaller images, or train a smaller model (--max-splats or --max-bytes of `fieldrig train` and `run`)"
-    )]
-    BufferTooLarge {
-        /// Name of the buffer.
-        label: String,
-        /// Requested size, bytes.
-        bytes: u64,
-        /// Maximum size, bytes.
-        limit_bytes: u64,
-    },
-    /// A kernel needs more workgroup memory than the adapter has.
-    #[error(
-        "kernel {kernel}: {bytes} bytes of workgroup memory are more than this GPU has ({limit_bytes} bytes)"
-    )]
-    WorkgroupTooLarge {
-        /// Name of the kernel.
-        kernel: &'static str,
-        /// Required size, bytes.
-        bytes: u32,
-        /// Available size, bytes.
-        limit_bytes: u32,
-    },
     /// The memory budget is below the minimum of the method.
     #[error("max_bytes = {max_bytes}: the smallest {model} takes {min_bytes} bytes")]
     BudgetTooSmall {
@@ -90,22 +30,6 @@ pub enum Error {
         max_bytes: u64,
         /// Minimum, bytes.
         min_bytes: u64,
-    },
-    /// A kernel imports an unknown source.
-    #[error("kernel {kernel}: unknown import {import:?}")]
-    UnknownImport {
-        /// Name of the kernel.
-        kernel: &'static str,
-        /// The import.
-        import: String,
-    },
-    /// A kernel does not parse or validate.
-    #[error("kernel {kernel}: {message}")]
-    Wgsl {
-        /// Name of the kernel.
-        kernel: &'static str,
-        /// Message of naga.
-        message: String,
     },
     /// A picture does not have four bytes per pixel.
     #[error("{what} picture of {width}x{height} pixels: got {got} bytes, expected {expected}")]
@@ -288,22 +212,11 @@ impl Error {
 
     /// Whether the GPU caused the error. If so, the same work may succeed on another device.
     pub fn is_gpu_error(&self) -> bool {
-        matches!(
-            self,
-            Self::DeviceLost | Self::OutOfMemory { .. } | Self::DriverFailed(_)
-        )
+        matches!(self, Self::Gpu(error) if error.is_gpu_error())
     }
 
     /// Whether a buffer of the requested size could not be allocated.
     pub(crate) fn is_out_of_memory(&self) -> bool {
-        matches!(self, Self::OutOfMemory { .. } | Self::BufferTooLarge { .. })
-    }
-}
-
-fn buffer_suffix(label: &str, bytes: u64) -> String {
-    if bytes == 0 {
-        String::new()
-    } else {
-        format!(": buffer {label} needs {bytes} bytes")
+        matches!(self, Self::Gpu(error) if error.is_out_of_memory())
     }
 }

@@ -1,29 +1,29 @@
 //! Placeholder for a model whose GPU failed.
 
 use crate::checkpoint::PendingCheckpoint;
-use crate::gpu::PassTiming;
 use crate::{Error, Method, Picture, Progress, RenderRequest};
 use calibration::{Alignment, CalibratedCamera, TrialReport};
+use gpu::PassTiming;
 use keyframe::Keyframe;
 use kinematics::Stamp;
 use std::path::Path;
 use std::sync::Arc;
 
-/// A model whose GPU failed: every operation returns [`Error::DeviceLost`].
+/// A model whose GPU failed: every operation returns [`gpu::Error::DeviceLost`].
 #[derive(Clone, Copy, Debug)]
 pub struct FailedModel;
 
 impl Method for FailedModel {
     fn push(&mut self, _: Arc<Keyframe>) -> Result<(), Error> {
-        Err(Error::DeviceLost)
+        Err(device_lost())
     }
 
     fn remove(&mut self, _: &str, _: Stamp) -> Result<(), Error> {
-        Err(Error::DeviceLost)
+        Err(device_lost())
     }
 
     fn step(&mut self, _: u64) -> Result<u64, Error> {
-        Err(Error::DeviceLost)
+        Err(device_lost())
     }
 
     fn is_idle(&self) -> bool {
@@ -34,27 +34,27 @@ impl Method for FailedModel {
     fn set_watched(&mut self, _: bool) {}
 
     fn n_total_steps(&mut self) -> Result<u64, Error> {
-        Err(Error::DeviceLost)
+        Err(device_lost())
     }
 
     fn seed(&mut self) -> Result<(), Error> {
-        Err(Error::DeviceLost)
+        Err(device_lost())
     }
 
     fn prepare(&mut self) -> Result<(), Error> {
-        Err(Error::DeviceLost)
+        Err(device_lost())
     }
 
     fn render(&mut self, _: &RenderRequest) -> Result<Picture, Error> {
-        Err(Error::DeviceLost)
+        Err(device_lost())
     }
 
     fn calibrated_camera(&mut self, _: &Keyframe) -> Result<CalibratedCamera, Error> {
-        Err(Error::DeviceLost)
+        Err(device_lost())
     }
 
     fn profile_step(&mut self) -> Result<Vec<PassTiming>, Error> {
-        Err(Error::DeviceLost)
+        Err(device_lost())
     }
 
     fn alignment(&self) -> Option<&Alignment> {
@@ -70,10 +70,14 @@ impl Method for FailedModel {
     }
 
     fn save(&mut self, _: &Path) -> Result<(), Error> {
-        Err(Error::DeviceLost)
+        Err(device_lost())
     }
 
     fn checkpoint(&mut self) -> Result<PendingCheckpoint, Error> {
-        Err(Error::DeviceLost)
+        Err(device_lost())
     }
+}
+
+fn device_lost() -> Error {
+    gpu::Error::DeviceLost.into()
 }

@@ -17,7 +17,6 @@ pub mod edits;
 mod error;
 pub mod eval;
 mod failed_model;
-pub mod gpu;
 mod initial_points;
 mod keyframe_signature;
 pub mod loss;
@@ -39,10 +38,8 @@ mod pending;
 mod random;
 mod registry;
 pub mod request;
-pub mod sort;
 pub mod spherical_harmonics;
 pub mod splat;
-mod submits;
 #[cfg(test)]
 mod test_scenes;
 

@@ -3,11 +3,11 @@
 use crate::bounds::Bounds;
 use crate::checkpoint::PendingCheckpoint;
 use crate::edits::{Edits, PendingFloaters};
-use crate::gpu::PassTiming;
 use crate::initial_points::InitialPoints;
 use crate::model_chunks::PendingChunks;
 use crate::{Error, Packing, Picture, QueuedPicture, RenderRequest, Rendered};
 use calibration::{Alignment, CalibratedCamera, CameraCorrection, TrialReport};
+use gpu::PassTiming;
 use keyframe::Keyframe;
 use kinematics::Stamp;
 use std::collections::BTreeMap;
@@ -25,22 +25,6 @@ pub struct Progress {
     pub bytes: u64,
     /// GPU time of a step, milliseconds, smoothed.
     pub step_millis: f64,
-}
-
-/// Maximum GPU time of a training submit. Short enough that checkpoints, keyframes and Ctrl-C are
-/// handled soon.
-const SUBMIT_MILLIS: f64 = 20.0;
-/// Maximum while pictures are requested: each picture waits for the running submit and the queued
-/// submit.
-const SUBMIT_MILLIS_WATCHED: f64 = 2.0;
-
-/// Maximum GPU time of a training submit, milliseconds.
-pub(crate) fn submit_millis(watched: bool) -> f64 {
-    if watched {
-        SUBMIT_MILLIS_WATCHED
-    } else {
-        SUBMIT_MILLIS
-    }
 }
 
 /// A scene model that trains on keyframes.

@@ -2,10 +2,10 @@
 //! load its models.
 
 use crate::checkpoint::Checkpoint;
-use crate::gpu::Gpu;
 use crate::model_options::ModelOptions;
 use crate::{Error, Method, ResumedModel};
 use calibration::ParamSet;
+use gpu::Gpu;
 use keyframe::Keyframe;
 use serde_json::Value;
 use std::path::Path;

@@ -1,10 +1,10 @@
 //! Creates, resumes and loads models of any method.
 
 use crate::checkpoint::Checkpoint;
-use crate::gpu::Gpu;
 use crate::model_options::{CommonOptions, MethodOptions, ModelOptions};
 use crate::registry::ModelKind;
 use crate::{Edits, Error, Method};
+use gpu::Gpu;
 use keyframe::Keyframe;
 use kinematics::Stamp;
 use serde::Deserialize;

@@ -2,7 +2,7 @@
 
 use crate::aabb::Aabb;
 use crate::edits::Edits;
-use crate::gpu::Buffer;
+use gpu::Buffer;
 use keyframe::Shutter;
 use kinematics::{Stamp, Transform};
 use std::sync::Arc;

@@ -5,12 +5,12 @@ use crate::checkpoints::{self, CheckpointWrite, Checkpoints, Snapshot};
 use crate::decisions::DecisionLog;
 use crate::kept_folder::KeptFolder;
 use crate::recovery::Recovery;
+use gpu::Gpu;
 use keyframe::{DepthMap, Keyframe};
 use kinematics::Stamp;
 use std::path::Path;
 use std::sync::Arc;
 use trainer::checkpoint::Checkpoint;
-use trainer::gpu::Gpu;
 use trainer::{Method, Resumed};
 
 /// Checkpoints, decision log and recovery data of a session.

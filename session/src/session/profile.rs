@@ -1,10 +1,10 @@
 //! GPU time of the kernels of a training step.
 
+use gpu::PassTiming;
 use kinematics::quantile::median;
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 use trainer::Method;
-use trainer::gpu::PassTiming;
 
 /// Number of profiled steps, over which medians are taken. It is odd, so that the median is one of
 /// the measured values. More steps would take longer; with few, one slow step changes the median.

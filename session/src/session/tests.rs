@@ -2,12 +2,12 @@
 
 use super::*;
 use calibration::{CalibratedCamera, TrialReport};
+use gpu::{GpuOptions, PassTiming};
 use keyframe::Split;
 use kinematics::Transform;
 use std::path::Path;
 use trainer::Error;
 use trainer::checkpoint::PendingCheckpoint;
-use trainer::gpu::{GpuOptions, PassTiming};
 
 const SIZE_PX: [u32; 2] = [4, 2];
 const N_TESTS: u8 = 5;

@@ -1,8 +1,8 @@
 //! Checks the GPU.
 
 use crate::open_gpu::open_gpu;
+use ::gpu::Gpu;
 use capture::doctor::Finding;
-use trainer::gpu::Gpu;
 
 /// Opens the GPU and describes it.
 pub(super) fn gpu() -> Vec<Finding> {

@@ -227,14 +227,14 @@ fn box_words(aabb: &Aabb, world_from_drawn: &Matrix4<f64>) -> [[u32; 4]; GROUPS_
 
 /// A corner of a box, as bits of f32.
 fn corner_words(corner_m: [f64; 3]) -> [u32; 4] {
-    let [x, y, z] = crate::gpu::f32s_of(corner_m).map(f32::to_bits);
+    let [x, y, z] = kinematics::f32s_of(corner_m).map(f32::to_bits);
     [x, y, z, 0]
 }
 
 /// The upper three rows of a matrix, as bits of f32.
 fn rows(matrix: &Matrix4<f64>) -> [[u32; 4]; 3] {
     std::array::from_fn(|row| {
-        std::array::from_fn(|column| crate::gpu::f32_of(matrix[(row, column)]).to_bits())
+        std::array::from_fn(|column| kinematics::f32_of(matrix[(row, column)]).to_bits())
     })
 }
 

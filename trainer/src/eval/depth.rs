@@ -108,8 +108,7 @@ pub fn surface_error(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::gpu::f32_of;
-    use kinematics::Transform;
+    use kinematics::{Transform, f32_of};
     use nalgebra::Vector3;
 
     fn measured(depth_m: Vec<f32>) -> DepthMap {

@@ -4,7 +4,6 @@
 //! example of a method.
 
 use crate::checkpoint::{Checkpoint, PendingCheckpoint};
-use crate::gpu::PassTiming;
 use crate::keyframe_signature::{self, KeyframeSignature};
 use crate::method_entry::MethodEntry;
 use crate::model_metadata::METADATA_FILE;
@@ -14,6 +13,7 @@ use crate::{
 };
 use calibration::Alignment;
 use calibration::{CalibratedCamera, ParamSet, TrialReport};
+use gpu::PassTiming;
 use keyframe::{Keyframe, Split};
 use kinematics::Stamp;
 use serde::{Deserialize, Serialize};

@@ -1,9 +1,9 @@
 //! A registered method is created, trained, saved, loaded and resumed by its name alone.
 
 use super::*;
-use crate::gpu::testing::test_gpu;
 use crate::test_scenes as scenes;
 use crate::{CommonOptions, ModelKind, ModelSpec, Projection, Resumed, load, resume};
+use gpu::testing::test_gpu;
 use kinematics::Transform;
 use std::sync::Arc;
 

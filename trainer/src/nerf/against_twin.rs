@@ -13,10 +13,11 @@ use super::reference::pose::ImagePose;
 use super::reference::ray as reference;
 use super::reference::scene::{EMBEDDING_DIM, Ray, WEIGHTS, field, gradient, ray, samples};
 use super::reference::space::contract;
-use crate::gpu::testing::test_gpu_with;
-use crate::gpu::{Buffer, Gpu, GpuOptions, Passes, f32_of, f32s_of};
 use crate::mismatches::Mismatches;
 use crate::optim::reference::{Adam, Moments};
+use gpu::testing::test_gpu_with;
+use gpu::{Buffer, Gpu, GpuOptions, Passes};
+use kinematics::{f32_of, f32s_of};
 
 /// Enough rays for more samples than one partial sum covers.
 const N_RAYS: u32 = 90;
@@ -937,7 +938,7 @@ fn first_step_follows_summed_gradients() {
 /// The same tests with cooperative matrices of f16 numbers, which no software adapter has.
 mod needs_matrices {
     use super::*;
-    use crate::gpu::testing::options_with_matrices;
+    use gpu::testing::options_with_matrices;
 
     #[test]
     fn colors_and_gradients_match_twin() {

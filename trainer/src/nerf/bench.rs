@@ -9,10 +9,11 @@ use super::params::Ray;
 use super::reference::grid::GridShape;
 use super::sizes::Sizes;
 use crate::Error;
-use crate::gpu::{Gpu, PassTiming, PendingRead, f32_of, f32s_of};
 use crate::model_options::ModelOptions;
 use calibration::ParamSet;
+use gpu::{Gpu, PassTiming, PendingRead};
 use kinematics::random::{hash, unit_from_bits};
+use kinematics::{f32_of, f32s_of};
 use nalgebra::Vector3;
 use std::sync::Arc;
 use std::time::Instant;
@@ -192,7 +193,7 @@ fn synthetic_ray(ix: u32, length: f64) -> Ray {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::gpu::testing::test_gpu;
+    use gpu::testing::test_gpu;
 
     #[test]
     fn timed_step_has_requested_sample_count() {

@@ -7,7 +7,7 @@ use super::params::{
 };
 use super::reference::grid::GridShape;
 use crate::Error;
-use crate::gpu::{Buffer, Gpu};
+use gpu::{Buffer, Gpu};
 
 /// All trained parameters of a field.
 #[derive(Debug)]

@@ -14,12 +14,13 @@ use super::params::{
 use super::passes::{Canvas, FieldPasses};
 use super::reference::march as reference;
 use super::sizes::{MAX_LEVELS, MIN_LEVELS, Sizes};
-use crate::gpu::{Buffer, Gpu, PassTiming, Passes, PendingRead, f32_of};
 use crate::model_options::ModelOptions;
 use crate::packing::{Output, Reader};
 use crate::view::{Camera, ErasedSpace};
 use crate::{Error, Rendered};
 use calibration::{EMBEDDING_DIM, ParamSet};
+use gpu::{Buffer, Gpu, PassTiming, Passes, PendingRead};
+use kinematics::f32_of;
 use kinematics::random::{hash, unit_from_bits};
 use rayon::prelude::*;
 use std::sync::Arc;
@@ -584,7 +585,7 @@ impl FieldTrainer {
 
     /// Submits the recorded passes with timestamps around each.
     pub(crate) fn submit_timed(&mut self, gpu: &Gpu) -> Result<Vec<PassTiming>, Error> {
-        self.passes.submit_timed(gpu)
+        Ok(self.passes.submit_timed(gpu)?)
     }
 
     /// Halves the size of cells and steps. The new cells inherit the occupancy of the old ones. No
@@ -982,7 +983,7 @@ fn read_image_params(
     images: &ImageParamBuffers,
     n_images: usize,
 ) -> Result<Vec<[ImageParam; IMAGE_PARAM_STRIDE]>, Error> {
-    gpu.read(&images.image_params, n_images.min(images.n_images as usize))
+    Ok(gpu.read(&images.image_params, n_images.min(images.n_images as usize))?)
 }
 
 /// Size of an image's appearance embedding.

@@ -2,7 +2,7 @@
 
 use super::reference::field::N_DIRECTION;
 use crate::Error;
-use crate::gpu::{Gpu, Kernel, Pipeline, Source};
+use gpu::{Gpu, Kernel, Pipeline, Source, shared};
 
 macro_rules! shared {
     ($name:literal) => {
@@ -38,7 +38,7 @@ macro_rules! layers {
     };
     ($numbers:literal, $forward:literal, $entries:literal) => {
         &[
-            shared!("folded"),
+            shared::FOLDED,
             shared!("ray_batch"),
             shared!("hash_grid"),
             shared!("grid_entries", concat!("grid_entries_", $entries)),
@@ -61,7 +61,7 @@ const FULL_PICTURE: &[Source] = layers!("full", "full", "packed");
 const HALF_PICTURE: &[Source] = layers!("half", "single", "packed");
 
 const SHARED: &[Source] = &[
-    shared!("folded"),
+    shared::FOLDED,
     shared!("ray_batch"),
     shared!("march_params"),
     shared!("space"),
@@ -69,7 +69,7 @@ const SHARED: &[Source] = &[
     shared!("march_threads"),
     shared!("density"),
     shared!("sample"),
-    shared!("scan"),
+    shared::SCAN,
     shared!("view"),
     shared!("picture_ray"),
     shared!("pixel_order"),
@@ -154,7 +154,7 @@ pub(crate) struct Widths {
     pub(crate) n_hidden: u32,
     pub(crate) n_color_in: u32,
     pub(crate) embedding_dim: u32,
-    /// Whether layers use f16 cooperative matrices ([`crate::gpu::Optional::half_matrices`]). If
+    /// Whether layers use f16 cooperative matrices ([`gpu::Optional::half_matrices`]). If
     /// so, their inputs are f16.
     pub(crate) is_half_precision: bool,
     /// Widths of features, hidden layers and inputs of the second network, without padding for
@@ -341,11 +341,11 @@ impl<'a> LayerKernels<'a> {
         ];
         // Constants select the parts of one kernel, so that all variants share its code.
         let embedding_dim = [("EMBEDDING_DIM", f64::from(self.widths.embedding_dim))];
-        Pipeline::new(
+        Ok(Pipeline::new(
             self.gpu,
             self.of_precision(kernels),
             &self.sizes_and(&[&kind[..], &embedding_dim].concat()),
-        )
+        )?)
     }
 
     /// The networks of pictures: densities of all samples, and colors of the selected ones.
@@ -362,7 +362,7 @@ impl<'a> LayerKernels<'a> {
             kernel!("field_backward", FULL),
             kernel!("field_backward", HALF),
         ]);
-        Pipeline::new(self.gpu, kernel, &self.sizes)
+        Ok(Pipeline::new(self.gpu, kernel, &self.sizes)?)
     }
 
     fn weight_gradients(&self) -> Result<Pipeline, Error> {
@@ -383,7 +383,11 @@ impl<'a> LayerKernels<'a> {
                 .expect("five layers");
             constants.push(("SUM_LANES", f64::from(max_weights / 16)));
         }
-        Pipeline::new(self.gpu, kernel, &self.sizes_and(&constants))
+        Ok(Pipeline::new(
+            self.gpu,
+            kernel,
+            &self.sizes_and(&constants),
+        )?)
     }
 }
 
@@ -488,11 +492,11 @@ impl FieldPipelines {
 #[cfg(test)]
 mod tests {
     use super::KERNELS;
-    use crate::gpu::testing::{assert_layout, assert_valid};
     use crate::nerf::params::{
         AdamRule, Backdrop, Batch, ImageParamRule, Level, March, OccupancyUpdate, Ray, RayLoss,
         Span, StepScale,
     };
+    use gpu::testing::{assert_layout, assert_valid};
 
     #[test]
     fn structs_have_the_same_layout_in_rust_and_wgsl() {

@@ -11,10 +11,8 @@ use super::rays::{self, RayImage, RaySampling};
 use super::sizes::Sizes;
 use crate::aligned::replacement;
 use crate::checkpoint::PendingCheckpoint;
-use crate::gpu::{Gpu, PassTiming};
 use crate::model_options::ModelOptions;
 use crate::packing::{Format, Output};
-use crate::submits::Submits;
 use crate::view::Camera;
 use crate::{
     Bounds, CorrectedKeyframe, Error, Method, Packing, Picture, Progress, Recalibrate,
@@ -23,6 +21,7 @@ use crate::{
 use calibration::Alignment;
 use calibration::TrialReport;
 use calibration::{CalibratedCamera, CameraCorrection, EMBEDDING_DIM, ParamSet};
+use gpu::{Gpu, PassTiming, Submits};
 use images::Trials;
 use keyframe::{Keyframe, Split};
 use kinematics::Stamp;
@@ -91,7 +90,7 @@ impl NerfModel {
             compiled: None,
             is_extent_stale: false,
             n_hinted: 0,
-            submits: Submits::new(),
+            submits: Submits::default(),
             step: 0,
         })
     }
@@ -264,7 +263,8 @@ impl NerfModel {
 
     /// Waits for the submit in flight.
     fn finish_in_flight(&mut self) -> Result<(), Error> {
-        self.submits.finish(&self.gpu).map(drop)
+        self.submits.finish(&self.gpu)?;
+        Ok(())
     }
 
     /// Records the next step as the `slot_ix`-th of a submit.

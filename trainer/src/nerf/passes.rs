@@ -7,8 +7,8 @@ use super::buffers::{
 use super::kernels::{CHUNK_TILES, FieldPipelines, N_TILE, Widths};
 use super::params::{Backdrop, Batch, IMAGE_PARAM_STRIDE, ImageParam};
 use crate::Error;
-use crate::gpu::{Buffer, Gpu, Passes, Pipeline};
 use crate::view::View;
+use gpu::{Buffer, Gpu, Passes, Pipeline};
 use std::ops::Range;
 
 /// Resources for the passes of one batch of rays.

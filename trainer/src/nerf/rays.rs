@@ -3,10 +3,10 @@
 
 use super::extent::Extent;
 use super::params;
-use crate::gpu::{f32_of, f32s_of};
 use crate::view::depth_in_color_view;
 use keyframe::Keyframe;
 use kinematics::random::{hash, unit_from_bits};
+use kinematics::{f32_of, f32s_of};
 use nalgebra::Vector3;
 use rayon::prelude::*;
 use std::sync::{Arc, OnceLock};

@@ -9,8 +9,6 @@ use super::sizes::Sizes;
 use super::{NerfModel, params};
 use crate::edits::{Edit, Edits};
 use crate::eval::{self, PixelPair};
-use crate::gpu::Gpu;
-use crate::gpu::testing::test_gpu;
 use crate::model_options::{CommonOptions, ModelOptions};
 use crate::test_scenes as scenes;
 use crate::{
@@ -18,6 +16,8 @@ use crate::{
     RenderRequest,
 };
 use calibration::{Alignment, CameraCorrection, CameraRefinement, ParamSet, rigid_transform};
+use gpu::Gpu;
+use gpu::testing::test_gpu;
 use keyframe::{DepthMap, Keyframe, Split};
 use kinematics::{Stamp, Transform, Twist};
 use nalgebra::{Point3, Vector3};

@@ -4,9 +4,9 @@
 mod panorama;
 mod tables;
 
-use crate::gpu::{Buffer, Gpu, Passes, PendingRead, Pipeline, Source};
 use crate::view::Camera;
 use crate::{Error, Picture, Projection, RenderRequest};
+use gpu::{Buffer, Gpu, Passes, PendingRead, Pipeline, Source, shared};
 use panorama::{Face, Panorama};
 
 /// MCUs (8 x 8 pixels, no subsampling) per restart interval, which one lane encodes. More MCUs
@@ -174,10 +174,10 @@ impl QueuedPicture {
                 is_complete,
                 packing,
                 size_px,
-            } => read.finish_with(gpu, |parts| {
+            } => Ok(read.finish_with(gpu, |parts| {
                 let packed = is_complete(parts[0]).then(|| unpack(packing, size_px, &parts[1..]));
                 packed.flatten().map(Rendered::Packed)
-            }),
+            })?),
         }
     }
 }
@@ -304,20 +304,14 @@ const SHARED: &[Source] = &[
         name: "packing",
         text: include_str!("packing.wgsl"),
     },
-    Source {
-        name: "folded",
-        text: include_str!("../shared/folded.wgsl"),
-    },
-    Source {
-        name: "scan",
-        text: include_str!("../shared/scan.wgsl"),
-    },
+    shared::FOLDED,
+    shared::SCAN,
 ];
 
 macro_rules! kernel {
     ($name:literal) => {
-        crate::gpu::Kernel {
-            source: crate::gpu::Source {
+        gpu::Kernel {
+            source: gpu::Source {
                 name: $name,
                 text: include_str!(concat!($name, ".wgsl")),
             },
@@ -637,9 +631,9 @@ impl Reader {
             gpu,
             &Picture::buffers(size_px, pixels, depth.then_some(depths)),
         );
-        read.finish_with(gpu, |parts| {
+        Ok(read.finish_with(gpu, |parts| {
             Rendered::Picture(Picture::from_parts(size_px, parts))
-        })
+        })?)
     }
 
     /// Submits the passes that draw a view into `canvas`, and reads the picture back if it is
@@ -732,9 +726,8 @@ pub(crate) fn unpack(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::gpu::Kernel;
-    use crate::gpu::testing::test_gpu;
-    use crate::gpu::testing::{assert_layout, assert_valid};
+    use gpu::Kernel;
+    use gpu::testing::{assert_layout, assert_valid, test_gpu};
 
     const KERNELS: &[Kernel] = &[
         kernel!("jpeg_transform"),

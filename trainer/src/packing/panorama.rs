@@ -2,10 +2,10 @@
 //! picture on the GPU.
 
 use super::kernel;
-use crate::gpu::{Buffer, Gpu, Passes, Pipeline, f32s_of};
 use crate::view::{Camera, LOW_PASS_PX2};
 use crate::{Error, RenderRequest};
-use kinematics::Transform;
+use gpu::{Buffer, Gpu, Passes, Pipeline};
+use kinematics::{Transform, f32s_of};
 use nalgebra::{Rotation3, Translation3, UnitQuaternion, Vector3};
 use std::f64::consts::{FRAC_PI_2, PI};
 use std::sync::Arc;

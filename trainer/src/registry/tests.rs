@@ -1,8 +1,8 @@
 //! Rules that every registered method must follow.
 
 use super::*;
-use crate::gpu::testing::test_gpu;
 use crate::{CommonOptions, ModelSpec, load, resume, resume_without_missing, test_scenes};
+use gpu::testing::test_gpu;
 use std::collections::BTreeSet;
 
 #[test]

@@ -12,13 +12,13 @@ use super::params::{Camera, LOW_PASS_PX2, Rule, Supervision, status};
 use super::passes::{Target, ViewPasses};
 use super::reference::random::uniform3;
 use super::reference::{self, RenderedImage, Splat, Upstream, View, scene};
-use crate::gpu::testing::test_gpu_with;
-use crate::gpu::{Buffer, Gpu, GpuOptions, Passes, f32_of};
 use crate::loss::reference as loss_reference;
 use crate::mismatches::Mismatches;
 use calibration::ParamSet;
+use gpu::testing::test_gpu_with;
+use gpu::{Buffer, Gpu, GpuOptions, Passes};
 use keyframe::{Keyframe, Shutter, Split};
-use kinematics::{Stamp, Transform, Twist};
+use kinematics::{Stamp, Transform, Twist, f32_of};
 use nalgebra::Vector3;
 use std::sync::Arc;
 
@@ -884,7 +884,7 @@ fn hidden_splats_have_no_gradient() {
 /// The same tests with the kernels for GPUs: `rasterize` and `backward` with sums over subgroups.
 mod needs_large_subgroups {
     use super::*;
-    use crate::gpu::testing::options_with_large_subgroups;
+    use gpu::testing::options_with_large_subgroups;
 
     #[test]
     fn pictures_match_the_twin() {

@@ -2,11 +2,11 @@
 //! checkpoint is bit-exact.
 
 use super::{SplatOptions, SplatTrainer, ply};
-use crate::gpu::Gpu;
-use crate::gpu::testing::test_gpu;
 use crate::{Aligned, CommonOptions, Method, ModelOptions};
 use calibration::scenes::{Miscalibration, capture, remaining, wrong_extrinsics};
 use calibration::{CameraRefinement, ParamSet};
+use gpu::Gpu;
+use gpu::testing::test_gpu;
 use keyframe::{Keyframe, Split};
 use std::sync::Arc;
 

@@ -13,11 +13,11 @@ use super::options::SplatOptions;
 use super::params::{Camera, LOW_PASS_PX2, Rule, Supervision, status};
 use super::passes::{Target, ViewPasses};
 use super::work_counts::WorkCounts;
-use crate::gpu::{Buffer, Gpu, PassTiming, Passes, f32_of};
 use crate::packing::{JPEG_QUALITY, Output, Reader};
 use crate::{Error, Packing};
-use kinematics::Transform;
+use gpu::{Buffer, Gpu, PassTiming, Passes};
 use kinematics::quantile::{Rank, quantile};
+use kinematics::{Transform, f32_of};
 use serde::Serialize;
 use std::cell::RefCell;
 use std::sync::Arc;
@@ -416,7 +416,7 @@ impl KernelBench {
     }
 
     fn counters(&self) -> Result<Vec<u32>, Error> {
-        self.gpu.read(&self.status, status::LEN)
+        Ok(self.gpu.read(&self.status, status::LEN)?)
     }
 
     fn mean_rgb(&self, passes: &mut Passes) -> Result<[f64; 3], Error> {

@@ -4,8 +4,8 @@ use super::arrays::SplatArrays;
 use super::kernels::DrawPipelines;
 use super::params::{Capacity, Model, TILE_PX, status};
 use crate::Error;
-use crate::gpu::{Buffer, Gpu, Passes, PendingRead};
-use crate::sort::SortBuffers;
+use gpu::sort::SortBuffers;
+use gpu::{Buffer, Gpu, Passes, PendingRead};
 
 /// Splats per block, consecutive in depth. This constant and the next two are those of
 /// shared/bins.wgsl.
@@ -569,8 +569,8 @@ pub(crate) fn n_tiles(size_px: [u32; 2]) -> u32 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::gpu::testing::constant_in_wgsl;
     use crate::splat::kernels::KERNELS;
+    use gpu::testing::constant_in_wgsl;
 
     #[test]
     fn constants_equal_those_in_wgsl() {

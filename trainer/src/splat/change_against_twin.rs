@@ -6,9 +6,10 @@ use super::params::{Growth, Rule, status};
 use super::passes::{GrowthBuffers, grow};
 use super::reference::change::{self, SplatMoments};
 use super::reference::{self, Splat, scene};
-use crate::gpu::{Gpu, GpuOptions, Passes, f32_of};
 use crate::loss::reference as loss_reference;
 use crate::mismatches::Mismatches;
+use gpu::{Gpu, GpuOptions, Passes};
+use kinematics::f32_of;
 
 /// A small scene of splats with SH degree 3 and with values that f32 represents exactly.
 fn full_degree_scene(seed: u64, n: usize) -> Vec<Splat> {

@@ -3,9 +3,9 @@
 use super::SplatTrainer;
 use super::training_tests::{keyframes, options, train};
 use crate::checkpoint::Checkpoint;
-use crate::gpu::Gpu;
-use crate::gpu::testing::test_gpu;
 use crate::{Error, Method};
+use gpu::Gpu;
+use gpu::testing::test_gpu;
 use keyframe::Keyframe;
 use std::sync::Arc;
 

@@ -4,12 +4,12 @@ use super::arrays::SplatArrays;
 use super::training_tests::{keyframes, options, pose, request, scene, train};
 use super::{SplatTrainer, file, ply};
 use crate::edits::{Edit, Edits, Floaters};
-use crate::gpu::testing::test_gpu;
-use crate::gpu::{Gpu, f32_of};
 use crate::method_entry::{ExportRequest, ExportWriter};
 use crate::{Aabb, ChunkLayout, Error, Method, ModelKind, ModelOptions, Picture};
-use kinematics::Transform;
+use gpu::Gpu;
+use gpu::testing::test_gpu;
 use kinematics::random::Random;
+use kinematics::{Transform, f32_of};
 use nalgebra::Vector3;
 use std::sync::Arc;
 

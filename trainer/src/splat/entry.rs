@@ -4,11 +4,11 @@ use super::file::{self, EXTENSIONS, Format, IN_FOLDER, UNSUPPORTED};
 use super::{SplatOptions, SplatTrainer};
 use crate::checkpoint::Checkpoint;
 use crate::edits::Edits;
-use crate::gpu::Gpu;
 use crate::method_entry::{Export, ExportRequest, ExportWriter, Exported, MethodEntry, SingleFile};
 use crate::model_options::{MethodOptions, ModelOptions, default_options};
 use crate::{Aligned, Error, Method, ResumedModel};
 use calibration::ParamSet;
+use gpu::Gpu;
 use keyframe::Keyframe;
 use std::path::Path;
 use std::sync::Arc;
@@ -114,9 +114,9 @@ fn write(request: &ExportRequest<'_>, format: Format) -> Result<Exported, Error>
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::gpu::testing::test_gpu;
     use crate::splat::arrays::SplatArrays;
     use crate::splat::ply;
+    use gpu::testing::test_gpu;
 
     #[test]
     fn saved_model_above_the_training_limit_is_loaded_completely() {

@@ -9,7 +9,7 @@ use super::arrays::SplatArrays;
 use super::bounds::bounds;
 use crate::Bounds;
 use crate::edits::{CellGrid, CellLabels, CellMask, Floaters, Groups};
-use crate::gpu::f32_of;
+use kinematics::f32_of;
 use nalgebra::{Quaternion, UnitQuaternion, Vector3};
 
 /// Cells along an axis: cells within the radius of the scene are 2 % of it wide. Smaller cells

@@ -1,8 +1,8 @@
 //! The kernels of the splat model and their pipelines.
 
 use crate::Error;
-use crate::gpu::{Gpu, Kernel, Pipeline, Source};
-use crate::sort::RadixSort;
+use gpu::sort::RadixSort;
+use gpu::{Gpu, Kernel, Pipeline, Source, shared};
 
 macro_rules! source {
     ($name:literal, $file:literal) => {
@@ -29,7 +29,7 @@ const SHARED: &[Source] = &[
     MODEL,
     PROJECTION,
     source!("sh"),
-    source!("scan"),
+    shared::SCAN,
     source!("scan_f32"),
     source!("random"),
     source!("supervision"),
@@ -74,12 +74,7 @@ macro_rules! update_sources {
 const WITH_CAMERA: &[Source] = update_sources!("camera_sums_tree");
 
 /// Imports of `erase`.
-const ERASE: &[Source] = &[
-    source!("folded"),
-    MODEL,
-    source!("space"),
-    source!("erased"),
-];
+const ERASE: &[Source] = &[shared::FOLDED, MODEL, source!("space"), source!("erased")];
 
 /// Imports of the per-pixel kernels.
 macro_rules! blend_sources {
@@ -357,25 +352,29 @@ impl TrainPipelines {
     /// with the twin.
     #[cfg(test)]
     pub(crate) fn gradients_only(gpu: &Gpu) -> Result<Pipeline, Error> {
-        Pipeline::new(
+        Ok(Pipeline::new(
             gpu,
             kernel!("update", WITH_CAMERA),
             &[("GRADIENTS_ONLY", 1.0)],
-        )
+        )?)
     }
 
     /// The kernel of the camera parameters in a variant that writes gradients instead of new
     /// values.
     #[cfg(test)]
     pub(crate) fn camera_gradients_only(gpu: &Gpu) -> Result<Pipeline, Error> {
-        Pipeline::new(gpu, kernel!("refine_camera"), &[("GRADIENTS_ONLY", 1.0)])
+        Ok(Pipeline::new(
+            gpu,
+            kernel!("refine_camera"),
+            &[("GRADIENTS_ONLY", 1.0)],
+        )?)
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::KERNELS;
-    use crate::gpu::testing::{assert_layout, assert_valid};
+    use gpu::testing::{assert_layout, assert_valid};
 
     #[test]
     fn structs_have_the_same_layout_in_rust_and_wgsl() {

@@ -96,7 +96,7 @@ fn separate(points: &[[f32; 3]], range: &mut [u32], axis: usize) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::gpu::f32_of;
+    use kinematics::f32_of;
     use kinematics::random::Random;
 
     /// Relative; sums of three numbers in another order.

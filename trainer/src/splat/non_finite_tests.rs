@@ -5,10 +5,9 @@ use super::SplatTrainer;
 use super::cloud::synthetic_cloud;
 use super::training_tests::{keyframes, options, test_psnr, train};
 use crate::Method;
-use crate::gpu::f32_of;
-use crate::gpu::testing::test_gpu;
+use gpu::testing::test_gpu;
 use keyframe::{DepthMap, Keyframe};
-use kinematics::{Stamp, Transform, Twist};
+use kinematics::{Stamp, Transform, Twist, f32_of};
 use nalgebra::{Point3, Vector3};
 use std::sync::Arc;
 

@@ -6,7 +6,7 @@ use super::buffers::{
 use super::kernels::{DrawPipelines, Ssim, TrainPipelines};
 use super::params::{Growth, TILE_PX};
 use crate::Error;
-use crate::gpu::{Buffer, Gpu, Passes, Pipeline};
+use gpu::{Buffer, Gpu, Passes, Pipeline};
 
 /// Buffers that the passes of one view use.
 #[derive(Clone, Copy, Debug)]

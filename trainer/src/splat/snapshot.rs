@@ -3,8 +3,8 @@
 use super::buffers::SplatBuffers;
 use super::schedule::Schedule;
 use super::seed::Seeder;
-use crate::gpu::Buffer;
 use calibration::ParamSet;
+use gpu::Buffer;
 
 /// All state that training changes. A snapshot is only taken when every keyframe has been seeded.
 #[derive(Debug)]

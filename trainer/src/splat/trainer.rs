@@ -34,7 +34,6 @@ use super::seed;
 use super::trials::{SplatTrials, ValidationImage};
 use crate::checkpoint::PendingCheckpoint;
 use crate::edits::{Edits, PendingFloaters};
-use crate::gpu::{Gpu, PassTiming};
 use crate::model_chunks::PendingChunks;
 use crate::model_metadata::{METADATA_FILE, read_metadata};
 use crate::model_options::{MethodOptions, ModelOptions};
@@ -44,6 +43,7 @@ use crate::{
     RenderRequest, Rendered,
 };
 use calibration::{Alignment, CalibratedCamera, CameraCorrection, Trial, TrialReport};
+use gpu::{Gpu, PassTiming};
 use keyframe::{Keyframe, Split};
 use kinematics::Stamp;
 use lazy_pipelines::LazyPipelines;

@@ -5,14 +5,14 @@ use super::arrays::SplatArrays;
 use super::cloud::synthetic_cloud;
 use super::{SplatOptions, SplatTrainer};
 use crate::eval::{PixelPair, psnr};
-use crate::gpu::testing::test_gpu;
-use crate::gpu::{Gpu, f32s_of};
 use crate::model_options::{CommonOptions, ModelOptions};
 use crate::view::Camera;
 use crate::{Aabb, InitialPoints, Method, Packing, Projection, RenderRequest, Rendered};
 use calibration::{CameraRefinement, ParamSet};
+use gpu::Gpu;
+use gpu::testing::test_gpu;
 use keyframe::{DepthMap, Keyframe, Split};
-use kinematics::{Stamp, Transform};
+use kinematics::{Stamp, Transform, f32s_of};
 use nalgebra::{Point3, Vector3};
 use std::sync::Arc;
 

@@ -6,9 +6,9 @@ use super::trials::MAX_SCORED;
 use super::{SplatTrainer, TrialSteps};
 use crate::Method;
 use crate::checkpoint::Checkpoint;
-use crate::gpu::Gpu;
-use crate::gpu::testing::test_gpu;
 use calibration::{CameraRefinement, ParamSet, Trial};
+use gpu::Gpu;
+use gpu::testing::test_gpu;
 use keyframe::{Keyframe, Split};
 use std::sync::Arc;
 

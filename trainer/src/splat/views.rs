@@ -7,9 +7,9 @@
 use super::camera_params::CameraParams;
 use super::params::{Camera, LOW_PASS_PX2, TILE_PX};
 use crate::Error;
-use crate::gpu::{Buffer, Gpu};
 use crate::view::{depth_in_color_view, median_depth_m};
 use calibration::CalibratedCamera;
+use gpu::{Buffer, Gpu};
 use keyframe::{DepthMap, Keyframe};
 use std::collections::BTreeSet;
 use std::sync::Arc;

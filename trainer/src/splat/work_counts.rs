@@ -3,7 +3,7 @@
 use super::buffers::{ImageBuffers, Scratch, n_bins, n_tiles};
 use super::params::TILE_PX;
 use crate::Error;
-use crate::gpu::Gpu;
+use gpu::Gpu;
 use serde::Serialize;
 use std::fmt;
 

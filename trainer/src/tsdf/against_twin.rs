@@ -12,11 +12,11 @@ use super::params::MeshVertex;
 use super::reference::{self, BlockTriangles, Ray, Vertex, VoxelBlocks};
 use super::tests::fuse_all;
 use crate::edits::{Edit, Edits};
-use crate::gpu::testing::test_gpu;
 use crate::mismatches::Mismatches;
 use crate::model_options::ModelOptions;
 use crate::test_scenes::{self as scenes, FOCAL_PX, PRINCIPAL_PX, SIZE_PX};
 use crate::{Aabb, Method, RenderRequest};
+use gpu::testing::test_gpu;
 use keyframe::Keyframe;
 use kinematics::Transform;
 use nalgebra::{Point3, Vector3};
@@ -239,7 +239,7 @@ fn readings_match_twin() {
         keyframe,
         &DepthView::of(keyframe, &voxel_grid).unwrap(),
     );
-    let mut list = crate::gpu::Passes::default();
+    let mut list = gpu::Passes::default();
     let pipelines = Pipelines::new(&gpu).unwrap();
     super::passes::fuse(&gpu, &mut list, &pipelines, &field, &slot);
     list.submit(&gpu);

@@ -5,7 +5,7 @@ use super::capacity::{BYTES_PER_BLOCK, BYTES_PER_CHUNK, Capacity};
 use super::chosen_grid::VoxelGrid;
 use super::params::{Field, status};
 use crate::Error;
-use crate::gpu::{Buffer, Gpu};
+use gpu::{Buffer, Gpu};
 use std::collections::BTreeSet;
 
 /// Buffers of a field.
@@ -52,7 +52,7 @@ impl FieldBuffers {
     }
 
     pub(crate) fn counters(&self, gpu: &Gpu) -> Result<Vec<u32>, Error> {
-        gpu.read(&self.status, status::LEN)
+        Ok(gpu.read(&self.status, status::LEN)?)
     }
 
     /// Number of blocks that have a slot.

@@ -1,7 +1,7 @@
 //! Sizes of the pool of blocks and of the hash table, and the GPU memory that they take.
 
 use super::block::N_VOXELS;
-use crate::gpu::Gpu;
+use gpu::Gpu;
 
 /// Bytes per block on the GPU: distances, colors, coordinates, and the flags `changed` and
 /// `visible`.

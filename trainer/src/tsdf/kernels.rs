@@ -1,7 +1,7 @@
 //! The compiled kernels of this model.
 
 use crate::Error;
-use crate::gpu::{Gpu, Kernel, Pipeline, Source};
+use gpu::{Gpu, Kernel, Pipeline, Source, shared};
 
 macro_rules! source {
     ($name:literal) => {
@@ -19,9 +19,9 @@ const SHARED: &[Source] = &[
     source!("field_status"),
     source!("field_insert"),
     source!("field_lookup"),
-    source!("folded"),
+    shared::FOLDED,
     source!("mesh_work"),
-    source!("scan"),
+    shared::SCAN,
     source!("depth_view"),
     source!("space"),
     source!("erased"),
@@ -89,9 +89,9 @@ impl Pipelines {
 #[cfg(test)]
 mod tests {
     use super::KERNELS;
-    use crate::gpu::testing::{assert_layout, assert_valid, layout_in_wgsl};
     use crate::tsdf::params::{Backdrop, BlockMeshRange, DepthView, Field, MeshBatch, MeshVertex};
     use crate::view::View;
+    use gpu::testing::{assert_layout, assert_valid, layout_in_wgsl};
 
     #[test]
     fn structs_have_the_same_fields_in_rust_and_wgsl() {

@@ -8,7 +8,7 @@ use super::mesh_buffers::{MeshBuffers, N_NEEDED};
 use super::params::{BlockMeshRange, MeshBatch, MeshVertex};
 use super::passes;
 use crate::Error;
-use crate::gpu::{Gpu, PassTiming, Passes};
+use gpu::{Gpu, PassTiming, Passes};
 
 impl MeshBuffers {
     /// Extracts the triangles of the blocks that changed, and of their neighbors.
@@ -59,7 +59,7 @@ impl MeshBuffers {
         let mut list = Passes::default();
         passes::list_stale(gpu, &mut list, pipelines, field, self);
         passes::march(gpu, &mut list, pipelines, field, self);
-        list.submit_timed(gpu)
+        Ok(list.submit_timed(gpu)?)
     }
 
     /// Extracts the triangles of the listed blocks, a batch at a time.

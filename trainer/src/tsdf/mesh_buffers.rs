@@ -3,7 +3,7 @@
 use super::mesh::CASES;
 use super::params::{BlockMeshRange, MeshBatch, MeshVertex};
 use crate::Error;
-use crate::gpu::{Buffer, Gpu};
+use gpu::{Buffer, Gpu};
 
 /// Sizes of a batch of blocks.
 #[derive(Clone, Copy, Debug)]

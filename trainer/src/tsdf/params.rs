@@ -1,10 +1,10 @@
 //! Small structs that kernels read, with the layouts of their WGSL counterparts.
 
 use super::chosen_grid::VoxelGrid;
-use crate::gpu::{f32_of, f32s_of};
 use crate::view::rows_of;
 use calibration::CalibratedCamera;
 use keyframe::Keyframe;
+use kinematics::{f32_of, f32s_of};
 
 /// `Field` of `shared/field.wgsl`.
 #[repr(C)]

@@ -5,8 +5,8 @@ use super::kernels::Pipelines;
 use super::mesh_buffers::MeshBuffers;
 use super::params::{Backdrop, DepthView};
 use crate::Error;
-use crate::gpu::{Buffer, Gpu, Passes};
 use crate::view::View;
+use gpu::{Buffer, Gpu, Passes};
 use keyframe::Keyframe;
 
 /// Maximum number of workgroups that share the visible blocks: enough to fill any GPU. Only the GPU

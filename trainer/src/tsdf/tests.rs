@@ -2,14 +2,14 @@
 
 use super::{TsdfModel, TsdfOptions};
 use crate::checkpoint::Checkpoint;
-use crate::gpu::testing::test_gpu;
-use crate::gpu::{Gpu, f32_of};
 use crate::test_scenes::{self as scenes, SIZE_PX, TestShape};
 use crate::{Aabb, Error, Method, ModelKind, ModelOptions, Picture, Projection, RenderRequest};
+use gpu::Gpu;
+use gpu::testing::test_gpu;
 use keyframe::Keyframe;
 use kinematics::quantile::{Rank, quantile};
 use kinematics::random::Random;
-use kinematics::{Stamp, Transform};
+use kinematics::{Stamp, Transform, f32_of};
 use nalgebra::{Point3, Vector3};
 use std::sync::Arc;
 

@@ -8,7 +8,7 @@ use super::kernels::Pipelines;
 use super::params::status;
 use super::passes;
 use crate::Error;
-use crate::gpu::{Gpu, Passes};
+use gpu::{Gpu, Passes};
 use std::collections::BTreeSet;
 
 /// Blocks gathered at once: 12.6 MB. Larger batches need more GPU memory beside the field; smaller
@@ -209,11 +209,12 @@ impl FieldBuffers {
         if self.index(gpu, pipelines, n)? {
             return Ok(());
         }
-        Err(Error::BufferTooLarge {
+        Err(gpu::Error::BufferTooLarge {
             label: "tsdf.keys".to_owned(),
             bytes: self.keys.bytes(),
             limit_bytes: self.keys.bytes(),
-        })
+        }
+        .into())
     }
 }
 

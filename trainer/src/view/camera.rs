@@ -1,9 +1,8 @@
 //! The camera of a view, and its uniform buffer.
 
-use crate::gpu::{f32_of, f32s_of};
 use crate::{Aabb, Edits, RenderRequest};
 use keyframe::Shutter;
-use kinematics::Transform;
+use kinematics::{Transform, f32_of, f32s_of};
 use std::sync::Arc;
 
 /// Edge of a tile, pixels, as in Kerbl et al. 2023. Larger tiles sort fewer entries; in smaller

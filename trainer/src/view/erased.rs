@@ -2,7 +2,7 @@
 
 use crate::Error;
 use crate::edits::Edits;
-use crate::gpu::{Buffer, Gpu, Passes};
+use gpu::{Buffer, Gpu, Passes};
 use nalgebra::Matrix4;
 use std::sync::Arc;
 
@@ -74,10 +74,10 @@ impl ErasedSpace {
 }
 
 fn buffer(gpu: &Gpu, edits: &Edits, world_from_drawn: &Matrix4<f64>) -> Result<Buffer, Error> {
-    gpu.storage_with(
+    Ok(gpu.storage_with(
         "erased",
         bytemuck::cast_slice(&edits.words(world_from_drawn)),
-    )
+    )?)
 }
 
 #[cfg(test)]
@@ -85,7 +85,7 @@ mod tests {
     use super::*;
     use crate::Aabb;
     use crate::edits::Edit;
-    use crate::gpu::testing::test_gpu;
+    use gpu::testing::test_gpu;
     use kinematics::Transform;
 
     #[test]
@@ -107,7 +107,7 @@ mod tests {
             erased
                 .set(&gpu, &mut passes, edits, Matrix4::new_scaling(scale))
                 .unwrap()
-                .id
+                .id()
         };
         let none = Arc::default();
         let one = with_boxes(1);

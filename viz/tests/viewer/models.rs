@@ -1,11 +1,11 @@
 //! Real models, which are drawn and published on a thread of their own, like those of a run.
 
+use gpu::{Gpu, GpuOptions};
 use keyframe::scenes::{ball, floor, ring};
 use nalgebra::{Point3, Quaternion, UnitQuaternion, Vector3};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
-use trainer::gpu::{Gpu, GpuOptions};
 use trainer::splat::arrays::SplatArrays;
 use trainer::splat::cloud::scan_cloud;
 use trainer::splat::{SplatOptions, SplatTrainer};

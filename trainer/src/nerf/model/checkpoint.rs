@@ -3,7 +3,6 @@
 use super::NerfModel;
 use super::images::{FieldSnapshot, Trials};
 use crate::checkpoint::{Array, Checkpoint, PendingCheckpoint};
-use crate::gpu::{Buffer, Gpu, PendingRead};
 use crate::keyframe_signature::{self, KeyframeSignature};
 use crate::model_metadata::{METADATA_FILE, read_metadata};
 use crate::model_options::{MethodOptions, ModelOptions};
@@ -17,6 +16,7 @@ use crate::nerf::sizes::Sizes;
 use crate::{Error, Method};
 use calibration::ParamSet;
 use calibration::TrialReport;
+use gpu::{Buffer, Gpu, PendingRead};
 use keyframe::Keyframe;
 use serde::{Deserialize, Serialize};
 use std::path::Path;

@@ -4,7 +4,6 @@
 use super::codec::{MAX_SH_DEGREE, encode};
 use super::{COARSE_STRIDE, Chunker};
 use crate::eval::{PixelPair, psnr};
-use crate::gpu::testing::test_gpu;
 use crate::splat::arrays::SplatArrays;
 use crate::splat::cloud::{scan_cloud, synthetic_cloud};
 use crate::splat::training_tests::{keyframes, options, request};
@@ -13,6 +12,7 @@ use crate::{
     ChunkData, ChunkLayout, Method, ModelChunk, ModelChunks, ModelOptions, Picture, Projection,
     RenderRequest,
 };
+use gpu::testing::test_gpu;
 use nalgebra::{Quaternion, UnitQuaternion};
 use std::collections::BTreeMap;
 use std::f64::consts::FRAC_1_SQRT_2;

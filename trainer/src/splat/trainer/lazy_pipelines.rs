@@ -1,9 +1,9 @@
 //! Training pipelines, compiled on another thread or on demand because compilation takes seconds.
 
 use crate::Error;
-use crate::gpu::Gpu;
 use crate::splat::kernels::TrainPipelines;
 use background::Task;
+use gpu::Gpu;
 use std::sync::Arc;
 
 /// Compilation state of the training pipelines.
@@ -25,7 +25,9 @@ impl Compiling {
     fn finish(&mut self, gpu: &Gpu) -> Result<Box<TrainPipelines>, Error> {
         let finished = self.0.take().map(Task::join);
         let Some(Ok(compiled)) = finished else {
-            return Err(gpu.failure_or("the thread that compiles the pipelines panicked"));
+            return Err(gpu
+                .failure_or("the thread that compiles the pipelines panicked")
+                .into());
         };
         compiled
     }
@@ -59,9 +61,9 @@ impl LazyPipelines {
             Self::Compiling(mut thread) => *thread.finish(gpu)?,
             Self::OnDemand => TrainPipelines::new(gpu)?,
             Self::Ready(_) | Self::Failed => {
-                return Err(gpu.failure_or(
-                    "a step was requested although its pipelines could not be compiled",
-                ));
+                return Err(gpu
+                    .failure_or("a step was requested although its pipelines could not be compiled")
+                    .into());
             }
         });
         *self = Self::Ready(ready.clone());

@@ -1,11 +1,11 @@
 //! Learning rates and costs of the splats' parameters.
 
-use crate::gpu::f32_of;
 use crate::model_options::ModelOptions;
 use crate::splat::options::SplatOptions;
 use crate::splat::params::Rule;
 use crate::splat::schedule::Schedule;
 use crate::splat::snapshot::ObservedScene;
+use kinematics::f32_of;
 
 // The rates and Adam's parameters are those of Kerbl et al. 2023 and its reference implementation.
 

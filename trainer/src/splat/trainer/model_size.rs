@@ -6,10 +6,10 @@ use super::optimizer::StepContext;
 use super::recorder::Recorder;
 use super::view_set::VIEWS_AT_ONCE;
 use crate::Error;
-use crate::gpu::Buffer;
 use crate::splat::buffers::SplatBuffers;
 use crate::splat::kernels::TrainPipelines;
 use crate::splat::params::{Gathering, status};
+use gpu::Buffer;
 
 /// Maximum number of views over which contributions are summed. Each view takes about as long as a
 /// training step at full resolution. With fewer views, splats that only the skipped views show
@@ -44,7 +44,7 @@ impl SplatTrainer {
             }
         }
         self.recorder.passes.clear_bindings();
-        self.recorder.gpu.read(&contributions, n_splats as usize)
+        Ok(self.recorder.gpu.read(&contributions, n_splats as usize)?)
     }
 
     /// Sets the error of every pixel to one and its other gradients to zero. Then, a splat's error
@@ -179,12 +179,12 @@ mod tests {
     use super::*;
     use crate::Method;
     use crate::eval::{PixelPair, psnr};
-    use crate::gpu::Gpu;
-    use crate::gpu::testing::test_gpu;
     use crate::splat::training_tests::{n_keyframes, noisy, options, request, test_psnr, train};
     use crate::splat::trials::CountPolicy;
     use calibration::Candidate;
     use calibration::Trial;
+    use gpu::Gpu;
+    use gpu::testing::test_gpu;
     use keyframe::{Keyframe, Split};
     use std::sync::Arc;
 

@@ -5,7 +5,6 @@ use super::model::TrainedModel;
 use super::recorder::Recorder;
 use super::renderer::{self, Renderer};
 use crate::Error;
-use crate::gpu::{Buffer, Gpu, Passes, PendingRead};
 use crate::model_options::ModelOptions;
 use crate::splat::buffers::ImageBuffers;
 use crate::splat::few_images::Scarcity;
@@ -14,7 +13,7 @@ use crate::splat::options::SplatOptions;
 use crate::splat::params::{Rule, Supervision, status};
 use crate::splat::passes::{Target, ViewPasses};
 use crate::splat::views::Level;
-use crate::submits::Submits;
+use gpu::{Buffer, Gpu, Passes, PendingRead, Submits};
 
 /// Updates the model to match the training images.
 #[derive(Debug)]
@@ -57,7 +56,7 @@ impl Optimizer {
     ) -> Result<Self, Error> {
         Ok(Self {
             pipelines,
-            submits: Submits::new(),
+            submits: Submits::default(),
             image_buffers: None,
             status: gpu.storage_with("splat.train_status", &[0; 4 * status::LEN])?,
             rule: gpu.uniform_with("splat.rule", &<Rule as bytemuck::Zeroable>::zeroed()),

@@ -2,8 +2,8 @@
 //! `score.wgsl` computes.
 
 use crate::Error;
-use crate::gpu::{Buffer, Gpu, Passes, Pipeline};
 use crate::splat::buffers::ImageBuffers;
+use gpu::{Buffer, Gpu, Passes, Pipeline};
 
 /// Bytes of sums that each workgroup of `score.wgsl` writes: four u32 for each of three colors.
 const GROUP_BYTES: usize = 48;

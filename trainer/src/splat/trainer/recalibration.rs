@@ -8,13 +8,13 @@
 
 use super::SplatTrainer;
 use crate::aligned::replacement;
-use crate::gpu::{Gpu, f32s_of};
 use crate::splat::buffers::SplatBuffers;
 use crate::splat::camera_params::CameraParams;
 use crate::{CorrectedKeyframe, Error, Method, Recalibrate};
 use calibration::{Alignment, CameraCorrection, ParamSet};
+use gpu::Gpu;
 use keyframe::{DepthMap, Keyframe};
-use kinematics::{Intrinsics, Lens, Transform};
+use kinematics::{Intrinsics, Lens, Transform, f32s_of};
 use nalgebra::{Point3, Quaternion, UnitQuaternion, Vector3};
 use rayon::prelude::*;
 use std::collections::BTreeMap;
@@ -290,10 +290,10 @@ fn move_splats(gpu: &Gpu, splats: &SplatBuffers, motions: &[Motion]) -> Result<(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::gpu::testing::test_gpu;
     use crate::model_options::ModelOptions;
     use crate::splat::SplatOptions;
     use calibration::scenes::{Miscalibration, capture, wrong_extrinsics};
+    use gpu::testing::test_gpu;
     use kinematics::quantile::{Rank, quantile};
 
     /// Median distance of the splats from the depth readings of these keyframes, meters along z.

@@ -1,6 +1,6 @@
 //! The GPU and the passes of the next submit.
 
-use crate::gpu::{Gpu, Passes};
+use gpu::{Gpu, Passes};
 use std::sync::Arc;
 
 /// Records passes for the GPU.

@@ -3,7 +3,6 @@
 
 use super::products::{self, Products};
 use super::recorder::Recorder;
-use crate::gpu::{Buffer, Gpu, PendingRead, Pipeline};
 use crate::packing::{Format, Output, Reader};
 use crate::splat::buffers::{ImageBuffers, Scratch, ScratchSize, SplatBuffers, n_bins, n_tiles};
 use crate::splat::kernels::DrawPipelines;
@@ -11,6 +10,7 @@ use crate::splat::params::{Camera, Supervision, View, status};
 use crate::splat::passes::ViewPasses;
 use crate::view::ErasedSpace;
 use crate::{Error, Packing, QueuedPicture, Rendered};
+use gpu::{Buffer, Gpu, PendingRead, Pipeline};
 use nalgebra::Matrix4;
 
 /// Minimum capacity of the bin lists, in entries. Few large splats need many entries each, so small

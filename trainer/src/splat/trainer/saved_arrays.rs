@@ -2,9 +2,9 @@
 
 use crate::Error;
 use crate::checkpoint::{Array, Checkpoint};
-use crate::gpu::{Buffer, Gpu, PendingRead};
 use crate::splat::buffers::{N_PLANAR_BUFFERS, SplatBuffers};
 use crate::splat::seed::{SeedSnapshot, Seeder};
+use gpu::{Buffer, Gpu, PendingRead};
 
 /// Names of the arrays, in the order of [`SplatBuffers::planes`].
 const ARRAYS: [&str; N_PLANAR_BUFFERS] = [

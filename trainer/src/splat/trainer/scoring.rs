@@ -330,10 +330,10 @@ mod tests {
     use super::*;
     use crate::Method;
     use crate::eval::{PixelPair, psnr};
-    use crate::gpu::Gpu;
-    use crate::gpu::testing::test_gpu;
     use crate::splat::training_tests::{n_keyframes, options, request, train};
     use calibration::{CameraRefinement, ParamSet};
+    use gpu::Gpu;
+    use gpu::testing::test_gpu;
     use keyframe::Split;
 
     const GAINS: ParamSet = ParamSet::IMAGE_GAINS;

@@ -6,12 +6,13 @@ use super::learning_rates;
 use super::optimizer::StepContext;
 use super::recorder::Recorder;
 use crate::Error;
-use crate::gpu::{PassTiming, f32_of};
 use crate::splat::few_images::{self, Scarcity};
 use crate::splat::kernels::TrainPipelines;
 use crate::splat::params::status;
 use crate::splat::trials::CountPolicy;
 use crate::splat::work_counts::WorkCounts;
+use gpu::PassTiming;
+use kinematics::f32_of;
 use std::time::Instant;
 
 /// Maximum number of steps per submit. A submit also ends at its time limit, so this number matters
@@ -293,10 +294,10 @@ pub(super) fn growth_key(seed: u64, step: u64) -> u32 {
 mod tests {
     use super::*;
     use crate::Method;
-    use crate::gpu::GpuOptions;
-    use crate::gpu::testing::{test_gpu, test_gpu_with};
     use crate::splat::cloud::synthetic_cloud;
     use crate::splat::training_tests::{keyframes, n_keyframes, options, request, train};
+    use gpu::GpuOptions;
+    use gpu::testing::{test_gpu, test_gpu_with};
     use keyframe::{Keyframe, Split};
     use std::sync::Arc;
 
@@ -341,7 +342,7 @@ mod tests {
         const N: usize = N_COVERING as usize;
         assert_eq!(trainer.model.splats.n_splats, N_COVERING);
         let center = keyframe.world_from_camera * nalgebra::Point3::new(0.0, 0.0, 0.3);
-        let [x, y, z] = crate::gpu::f32s_of(center.coords.into());
+        let [x, y, z] = kinematics::f32s_of(center.coords.into());
         let (gpu, splats) = (&trainer.recorder.gpu, &trainer.model.splats);
         gpu.write(&splats.means, 0, bytemuck::cast_slice(&[[x, y, z, 0.0]; N]));
         gpu.write(

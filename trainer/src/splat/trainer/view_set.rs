@@ -2,12 +2,13 @@
 
 use super::recorder::Recorder;
 use crate::Error;
-use crate::gpu::{Buffer, Gpu, f32_of};
 use crate::model_options::ModelOptions;
 use crate::splat::camera_params::CameraParams;
 use crate::splat::options::SplatOptions;
 use crate::splat::views::{self, Keep, Level, LevelImages, Order, TrainView};
+use gpu::{Buffer, Gpu};
 use keyframe::Keyframe;
+use kinematics::f32_of;
 use rayon::prelude::*;
 use std::collections::BTreeSet;
 use std::ops::Range;

@@ -2,10 +2,10 @@
 
 use super::Mesh;
 use crate::edits::Edits;
-use crate::gpu::f32_of;
 use crate::tsdf::block::{BLOCK_EDGE, GridCoord};
 use crate::tsdf::chosen_grid::VoxelGrid;
 use crate::tsdf::params::MeshVertex;
+use kinematics::f32_of;
 use nalgebra::Vector3;
 use rayon::prelude::*;
 use std::collections::{BTreeMap, BTreeSet, HashMap};

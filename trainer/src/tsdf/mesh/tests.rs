@@ -2,11 +2,11 @@
 
 use super::{Mesh, write_glb, write_ply};
 use crate::Method;
-use crate::gpu::testing::test_gpu;
 use crate::model_options::ModelOptions;
 use crate::test_scenes::{self as scenes, TestShape};
 use crate::tsdf::tests::fuse_all;
 use crate::tsdf::{TsdfModel, TsdfOptions};
+use gpu::testing::test_gpu;
 use keyframe::Keyframe;
 use nalgebra::{Point3, Vector3};
 use std::collections::BTreeMap;

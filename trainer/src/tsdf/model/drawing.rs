@@ -46,7 +46,7 @@ impl TsdfModel {
         )? {
             return Ok(None);
         }
-        self.passes.submit_timed_total(&self.gpu)
+        Ok(self.passes.submit_timed_total(&self.gpu)?)
     }
 
     /// Records the passes of a picture. Returns false if there is nothing to render.

@@ -6,13 +6,13 @@
 
 use super::frustum::ViewFrustum;
 use crate::Error;
-use crate::gpu::Gpu;
 use crate::tsdf::block::{Blocks, GridCoord};
 use crate::tsdf::buffers::FieldBuffers;
 use crate::tsdf::capacity::{self, Capacity};
 use crate::tsdf::chosen_grid::VoxelGrid;
 use crate::tsdf::kernels::Pipelines;
 use crate::tsdf::params::status;
+use gpu::Gpu;
 use std::collections::BTreeSet;
 
 /// Initial capacity: 26 MB. Growing copies the field, so a much smaller capacity would slow down

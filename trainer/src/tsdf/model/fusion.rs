@@ -2,11 +2,10 @@
 
 use super::field_store::FieldStore;
 use crate::Error;
-use crate::gpu::{Gpu, Passes};
-use crate::submits::Submits;
 use crate::tsdf::kernels::Pipelines;
 use crate::tsdf::params::{DepthView, status};
 use crate::tsdf::passes::{self, KeyframeSlot};
+use gpu::{Gpu, Passes, Submits};
 use keyframe::Keyframe;
 
 /// Maximum number of keyframes per submit. Their images are on the GPU at once, so more keyframes
@@ -29,7 +28,7 @@ impl Fusion {
     pub(super) fn new() -> Self {
         Self {
             slots: Vec::new(),
-            submits: Submits::new(),
+            submits: Submits::default(),
             n_fused_on_gpu: 0,
             n_outside: 0,
         }

@@ -1,6 +1,6 @@
 //! Optional features beyond the WebGPU defaults, and their fallbacks.
 
-use super::GpuOptions;
+use crate::GpuOptions;
 
 /// Optional features of the adapter; each has a fallback.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -1,7 +1,6 @@
 //! Lists of passes, and the only code that encodes them.
 
-use super::{Buffer, Gpu, PendingRead, Pipeline};
-use crate::Error;
+use crate::{Buffer, Error, Gpu, PendingRead, Pipeline};
 use std::collections::HashMap;
 use std::ops::Range;
 
@@ -64,8 +63,9 @@ impl Passes {
     /// names in the WGSL.
     ///
     /// # Panics
-    /// Panics if the names differ from those in the kernel, which is a bug in this crate. The
-    /// message lists both.
+    ///
+    /// If the names differ from those in the kernel, which is a bug in the caller. The message
+    /// lists both.
     pub fn dispatch(
         &mut self,
         gpu: &Gpu,
@@ -170,6 +170,10 @@ impl Passes {
     /// end of the last pass, milliseconds.
     ///
     /// Returns `None` if the adapter has no timestamps.
+    ///
+    /// # Errors
+    ///
+    /// If the device failed.
     pub fn submit_timed_total(&mut self, gpu: &Gpu) -> Result<Option<f64>, Error> {
         // Two timestamps around the whole list, unlike in `submit_timed`: a pass per kernel would
         // add time between kernels that a submit in training does not spend.
@@ -212,6 +216,10 @@ impl Passes {
     /// each.
     ///
     /// Returns an empty list if the adapter has no timestamps.
+    ///
+    /// # Errors
+    ///
+    /// If the device failed.
     pub fn submit_timed(&mut self, gpu: &Gpu) -> Result<Vec<PassTiming>, Error> {
         if !gpu.optional.timestamps {
             self.submit(gpu);
@@ -374,7 +382,7 @@ fn u32_of(value: u64) -> u32 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::gpu::GpuOptions;
+    use crate::GpuOptions;
 
     #[test]
     fn reads_are_batched_and_staging_is_reused() {

@@ -6,7 +6,7 @@
 //
 // Uses no barriers or subgroup operations: for adapters without them, and for CPUs, where barriers are expensive.
 
-#import view
+#import folded
 #import digit
 
 @group(0) @binding(0) var<uniform> digit: Digit;

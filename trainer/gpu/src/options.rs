@@ -11,7 +11,7 @@ pub struct GpuOptions {
     pub max_binding_bytes: Option<u64>,
     /// Maximum total size of all storage buffers, bytes; for tests of running out of memory.
     pub memory_limit_bytes: Option<u64>,
-    /// Index into [`Gpu::adapters`](super::Gpu::adapters); `None`: the fastest adapter.
+    /// Index into [`Gpu::adapters`](crate::Gpu::adapters); `None`: the fastest adapter.
     pub adapter: Option<usize>,
 }
 

@@ -4,7 +4,7 @@
 // reads     digit, status, keys [n]
 // writes    counts [256 digits, max_blocks]
 
-#import view
+#import folded
 #import digit
 
 @group(0) @binding(0) var<uniform> digit: Digit;

@@ -5,7 +5,7 @@
 // writes    keys_out [n], values_out [n]
 // source    Merrill and Grimshaw 2011; ranking by ballots as in Ashkiani et al. 2016
 
-#import view
+#import folded
 #import digit
 #import scan
 #import peers

@@ -1,7 +1,7 @@
 //! Compiled kernels, and the cache of a device.
 
-use super::wgsl::Binding;
 use crate::Error;
+use crate::wgsl::Binding;
 use parking_lot::Mutex;
 use std::collections::HashMap;
 use std::sync::Arc;

@@ -1,9 +1,8 @@
 //! Compute pipelines whose bindings are found by their names in the WGSL.
 
-use super::pipeline_cache::Key;
-use super::wgsl::{Access, Binding};
-use super::{Gpu, Pipeline, Source, reflect, resolve, wgsl};
-use crate::Error;
+use crate::pipeline_cache::Key;
+use crate::wgsl::{Access, Binding};
+use crate::{Error, Gpu, Pipeline, Source, reflect, resolve, wgsl};
 use rayon::prelude::*;
 use std::borrow::Cow;
 use std::sync::Arc;
@@ -20,6 +19,10 @@ pub struct Kernel {
 impl Pipeline {
     /// Compiles `kernel` with the given values of its `override`s, or returns the pipeline that
     /// this device has already compiled for them.
+    ///
+    /// # Errors
+    ///
+    /// If the WGSL is invalid, or needs more workgroup memory than the adapter has.
     pub fn new(gpu: &Gpu, kernel: Kernel, overrides: &[(&str, f64)]) -> Result<Self, Error> {
         let text = resolve(kernel.source, kernel.shared)?;
         let key = Key::new(text.clone(), overrides);
@@ -100,6 +103,10 @@ impl Pipeline {
 
     /// Compiles several kernels in parallel, because drivers take up to a tenth of a second for
     /// each.
+    ///
+    /// # Errors
+    ///
+    /// As [`Self::new`], for any of the kernels.
     pub fn compile_all<const N: usize>(
         gpu: &Gpu,
         kernels: [(Kernel, &[(&str, f64)]); N],
@@ -133,7 +140,7 @@ fn layout_entry(binding: &Binding) -> wgpu::BindGroupLayoutEntry {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::gpu::{GpuOptions, Passes};
+    use crate::{GpuOptions, Passes};
 
     #[test]
     fn kernel_exceeding_workgroup_memory_is_rejected() {

@@ -1,8 +1,9 @@
-//! Test helpers that check that kernels are valid, and that their structs have the same layout in
-//! Rust and WGSL.
+//! Helpers for tests: shared devices, and checks that kernels are valid and that their structs have
+//! the same layout in Rust and WGSL.
 
-use super::{Gpu, GpuOptions, Kernel, reflect, resolve};
-use crate::Error;
+pub use crate::assert_layout;
+
+use crate::{Error, Gpu, GpuOptions, Kernel, reflect, resolve};
 use parking_lot::Mutex;
 use std::sync::Arc;
 
@@ -12,12 +13,14 @@ static DEVICES: Mutex<Vec<(GpuOptions, Arc<Gpu>)>> = Mutex::new(Vec::new());
 /// A device that no other test uses at the same time. It may have been used by an earlier test, so
 /// its pipelines are compiled already; it has no buffers left. Tests of the device itself open
 /// their own.
-pub(crate) fn test_gpu() -> Arc<Gpu> {
+#[must_use]
+pub fn test_gpu() -> Arc<Gpu> {
     test_gpu_with(&GpuOptions::default())
 }
 
 /// [`test_gpu`] with options.
-pub(crate) fn test_gpu_with(options: &GpuOptions) -> Arc<Gpu> {
+#[must_use]
+pub fn test_gpu_with(options: &GpuOptions) -> Arc<Gpu> {
     let mut devices = DEVICES.lock();
     devices.retain(|(_, gpu)| gpu.check().is_ok());
     // The only other owners of a device are the test that uses it and its models, which may drop
@@ -29,7 +32,7 @@ pub(crate) fn test_gpu_with(options: &GpuOptions) -> Arc<Gpu> {
     {
         return gpu.clone();
     }
-    let gpu = Gpu::open(options).unwrap();
+    let gpu = Gpu::open(options).expect("tests need a GPU or a software adapter");
     if devices.is_empty() {
         close_devices_at_exit();
     }
@@ -61,7 +64,8 @@ const DEMAND_VARIABLE: &str = "FIELDRIG_GPU_TESTS";
 
 /// Options of a device with cooperative matrices of f16 numbers. If the adapter has none, reports
 /// the calling test as skipped and returns `None`.
-pub(crate) fn options_with_matrices() -> Option<GpuOptions> {
+#[must_use]
+pub fn options_with_matrices() -> Option<GpuOptions> {
     let options = GpuOptions::default();
     has(
         &options,
@@ -74,7 +78,8 @@ pub(crate) fn options_with_matrices() -> Option<GpuOptions> {
 /// Options of a device with subgroups of at least 16 lanes. If the adapter has none, reports the
 /// calling test as skipped and returns `None`. Lavapipe has them if `LP_NATIVE_VECTOR_WIDTH` is
 /// 512.
-pub(crate) fn options_with_large_subgroups() -> Option<GpuOptions> {
+#[must_use]
+pub fn options_with_large_subgroups() -> Option<GpuOptions> {
     let options = GpuOptions::default();
     let is_large = test_gpu()
         .optional()
@@ -97,10 +102,10 @@ fn has(options: &GpuOptions, is_available: bool, feature: &str) -> bool {
 }
 
 /// Names and offsets in bytes of the fields of a struct, and its size.
-pub(crate) type StructLayout = (Vec<(String, usize)>, usize);
+pub type StructLayout = (Vec<(String, usize)>, usize);
 
 /// Asserts that the kernels parse and validate.
-pub(crate) fn assert_valid<'k>(kernels: impl IntoIterator<Item = &'k Kernel>) {
+pub fn assert_valid<'k>(kernels: impl IntoIterator<Item = &'k Kernel>) {
     let errors: Vec<String> = kernels
         .into_iter()
         .filter_map(validation_error)
@@ -119,12 +124,13 @@ fn validation_error(kernel: &Kernel) -> Option<Error> {
 
 /// Parses a kernel that must be valid.
 fn module_of(kernel: &Kernel) -> wgpu::naga::Module {
-    let text = resolve(kernel.source, kernel.shared).unwrap();
-    reflect(kernel.source.name, &text).unwrap()
+    let text = resolve(kernel.source, kernel.shared).expect("all imports are known");
+    reflect(kernel.source.name, &text).expect("the kernel is valid")
 }
 
 /// The layout of the WGSL struct `name`. Asserts that all kernels that declare the struct agree.
-pub(crate) fn layout_in_wgsl(kernels: &[Kernel], name: &str) -> StructLayout {
+#[must_use]
+pub fn layout_in_wgsl(kernels: &[Kernel], name: &str) -> StructLayout {
     let layouts: Vec<StructLayout> = kernels
         .iter()
         .filter_map(|kernel| declared_layout(kernel, name))
@@ -151,16 +157,21 @@ fn declared_layout(kernel: &Kernel, name: &str) -> Option<StructLayout> {
             {
                 let fields = members
                     .iter()
-                    .map(|member| (member.name.clone().unwrap(), member.offset as usize));
+                    .map(|member| (name_of(member), member.offset as usize));
                 Some((fields.collect(), *span as usize))
             }
             _ => None,
         })
 }
 
+fn name_of(member: &wgpu::naga::StructMember) -> String {
+    member.name.clone().expect("fields in WGSL have names")
+}
+
 /// The value of the WGSL constant `name`, a u32. Asserts that all kernels that declare the constant
 /// agree.
-pub(crate) fn constant_in_wgsl(kernels: &[Kernel], name: &str) -> u32 {
+#[must_use]
+pub fn constant_in_wgsl(kernels: &[Kernel], name: &str) -> u32 {
     let values: Vec<u32> = kernels
         .iter()
         .filter_map(|kernel| declared_constant(kernel, name))
@@ -190,13 +201,13 @@ fn declared_constant(kernel: &Kernel, name: &str) -> Option<u32> {
 
 /// Asserts that a struct has these fields, in this order and at the same offsets, in Rust and in
 /// the WGSL of `$kernels`.
+#[macro_export]
 macro_rules! assert_layout {
     ($kernels:expr, $type:ident, [$($field:ident),* $(,)?]) => {
         let in_rust = (
             vec![$((stringify!($field).to_owned(), std::mem::offset_of!($type, $field))),*],
             size_of::<$type>(),
         );
-        assert_eq!(in_rust, $crate::gpu::testing::layout_in_wgsl($kernels, stringify!($type)), stringify!($type));
+        assert_eq!(in_rust, $crate::testing::layout_in_wgsl($kernels, stringify!($type)), stringify!($type));
     };
 }
-pub(crate) use assert_layout;

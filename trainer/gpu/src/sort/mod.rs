@@ -5,21 +5,21 @@
 //! Two variants give the same result: `parallel` ranks keys by subgroup ballots, `sequential`
 //! assigns one block of keys to each thread.
 
-use crate::Error;
-use crate::gpu::{Buffer, Gpu, Kernel, Passes, Pipeline, Source};
+use crate::shared::{FOLDED, SCAN};
+use crate::{Buffer, Error, Gpu, Kernel, Passes, Pipeline, Source};
 
-macro_rules! sources {
-    ($($name:literal => $file:literal),*) => {
-        &[$(Source { name: $name, text: include_str!($file) }),*]
+macro_rules! source {
+    ($name:literal, $file:literal) => {
+        Source {
+            name: $name,
+            text: include_str!($file),
+        }
     };
 }
 
-const SHARED: &[Source] = sources!(
-    "view" => "../shared/view.wgsl", "scan" => "../shared/scan.wgsl", "digit" => "digit.wgsl", "peers" => "peers_32.wgsl"
-);
-const SHARED_WIDE: &[Source] = sources!(
-    "view" => "../shared/view.wgsl", "scan" => "../shared/scan.wgsl", "digit" => "digit.wgsl", "peers" => "peers_128.wgsl"
-);
+const DIGIT: Source = source!("digit", "digit.wgsl");
+const SHARED: &[Source] = &[FOLDED, SCAN, DIGIT, source!("peers", "peers_32.wgsl")];
+const SHARED_WIDE: &[Source] = &[FOLDED, SCAN, DIGIT, source!("peers", "peers_128.wgsl")];
 
 macro_rules! kernel {
     ($name:literal) => {
@@ -83,6 +83,10 @@ pub struct SortBuffers {
 
 impl RadixSort {
     /// Compiles the variant that suits the adapter.
+    ///
+    /// # Errors
+    ///
+    /// If a kernel is invalid.
     pub fn new(gpu: &Gpu) -> Result<Self, Error> {
         // The parallel scatter has ranks for 16 subgroups of its 256 threads, so subgroups need 16
         // lanes. On a CPU, barriers are expensive.
@@ -129,6 +133,10 @@ impl RadixSort {
     /// Allocates buffers for up to `n_max` keys. When sorting, `status[counter]` must hold the
     /// number of keys, `status[largest]` the largest key, and the next word the smallest key,
     /// inverted. Keys with all bits set are excluded from this range and sorted last.
+    ///
+    /// # Errors
+    ///
+    /// If the adapter has no memory for the buffers or cannot bind them.
     pub fn buffers(
         &self,
         gpu: &Gpu,
@@ -235,8 +243,7 @@ impl RadixSort {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::gpu::testing::test_gpu;
-    use crate::gpu::testing::{assert_layout, assert_valid};
+    use crate::testing::{assert_layout, assert_valid, test_gpu};
 
     fn sorted_on_gpu(keys: &[u32], key_range: [u32; 2], parallel: bool) -> (Vec<u32>, Vec<u32>) {
         let gpu = test_gpu();
@@ -294,7 +301,7 @@ mod tests {
     }
 
     mod needs_large_subgroups {
-        use crate::gpu::testing::options_with_large_subgroups;
+        use crate::testing::options_with_large_subgroups;
 
         #[test]
         fn parallel_sort_is_stable_at_block_boundaries() {

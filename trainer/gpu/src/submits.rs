@@ -1,18 +1,22 @@
 //! The training submit in flight, and the measured duration of a step.
 
-use crate::Error;
-use crate::gpu::{Gpu, PendingRead};
-use crate::method::submit_millis;
+use crate::{Error, Gpu, PendingRead};
 use std::time::Instant;
 
 /// Weight of the latest submit in the smoothed step time. A larger weight follows the growth of a
 /// model faster; a smaller one lets single slow submits, such as those that compete with a render,
 /// shorten the following submits less.
 const NEW_WEIGHT: f64 = 0.2;
+/// Maximum GPU time of a training submit. Short enough that checkpoints, keyframes and Ctrl-C are
+/// handled soon.
+const SUBMIT_MILLIS: f64 = 20.0;
+/// Maximum while pictures are requested: each picture waits for the running submit and the queued
+/// submit.
+const SUBMIT_MILLIS_WATCHED: f64 = 2.0;
 
 /// Tracks training submits: at most one is in flight while the next one is recorded.
 #[derive(Debug)]
-pub(crate) struct Submits {
+pub struct Submits {
     in_flight: Option<InFlight>,
     /// Time at which the last submit was found to be complete.
     idle_since: Instant,
@@ -28,8 +32,9 @@ struct InFlight {
     since: Instant,
 }
 
-impl Submits {
-    pub(crate) fn new() -> Self {
+impl Default for Submits {
+    /// No submit is in flight, and none has been timed.
+    fn default() -> Self {
         Self {
             in_flight: None,
             idle_since: Instant::now(),
@@ -37,10 +42,12 @@ impl Submits {
             is_watched: false,
         }
     }
+}
 
+impl Submits {
     /// Registers a submit that returns counters at its end. Recording of the submit began at
     /// `since`.
-    pub(crate) fn begin(&mut self, counters: PendingRead, n_steps: u64, since: Instant) {
+    pub fn begin(&mut self, counters: PendingRead, n_steps: u64, since: Instant) {
         self.in_flight = Some(InFlight {
             counters,
             n_steps,
@@ -49,7 +56,11 @@ impl Submits {
     }
 
     /// Waits for the submit in flight and returns its counters, if there is one.
-    pub(crate) fn finish(&mut self, gpu: &Gpu) -> Result<Option<Vec<u32>>, Error> {
+    ///
+    /// # Errors
+    ///
+    /// If the device failed.
+    pub fn finish(&mut self, gpu: &Gpu) -> Result<Option<Vec<u32>>, Error> {
         let Some(InFlight {
             counters,
             n_steps,
@@ -74,7 +85,8 @@ impl Submits {
     }
 
     /// Number of steps in the submit in flight.
-    pub(crate) fn n_steps_in_flight(&self) -> u64 {
+    #[must_use]
+    pub fn n_steps_in_flight(&self) -> u64 {
         self.in_flight
             .as_ref()
             .map_or(0, |in_flight| in_flight.n_steps)
@@ -82,7 +94,8 @@ impl Submits {
 
     /// Number of steps that fit into the time limit of a submit; `None` until a submit has been
     /// timed.
-    pub(crate) fn n_steps_in_limit(&self) -> Option<u64> {
+    #[must_use]
+    pub fn n_steps_in_limit(&self) -> Option<u64> {
         #[expect(
             clippy::cast_possible_truncation,
             clippy::cast_sign_loss,
@@ -93,21 +106,34 @@ impl Submits {
     }
 
     /// Smoothed GPU time of a step, milliseconds; 0 until a submit has been timed.
-    pub(crate) fn step_millis(&self) -> f64 {
+    #[must_use]
+    pub fn step_millis(&self) -> f64 {
         self.step_millis
     }
 
-    #[cfg(test)]
-    pub(crate) fn assume_step_millis(&mut self, millis: f64) {
+    /// Replaces the measured time of a step.
+    #[cfg(any(test, feature = "testing"))]
+    pub fn assume_step_millis(&mut self, millis: f64) {
         self.step_millis = millis;
     }
 
-    pub(crate) fn is_watched(&self) -> bool {
+    /// Whether pictures are requested.
+    #[must_use]
+    pub fn is_watched(&self) -> bool {
         self.is_watched
     }
 
     /// Sets whether pictures are requested. If so, submits must be short.
-    pub(crate) fn set_watched(&mut self, watched: bool) {
+    pub fn set_watched(&mut self, watched: bool) {
         self.is_watched = watched;
+    }
+}
+
+/// Maximum GPU time of a training submit, milliseconds.
+fn submit_millis(is_watched: bool) -> f64 {
+    if is_watched {
+        SUBMIT_MILLIS_WATCHED
+    } else {
+        SUBMIT_MILLIS
     }
 }

@@ -4,7 +4,7 @@
 // reads     digit, status, keys [n], values [n]
 // writes    counts (overwritten), keys_out [n], values_out [n]
 
-#import view
+#import folded
 #import digit
 
 @group(0) @binding(0) var<uniform> digit: Digit;

@@ -30,6 +30,10 @@ pub(super) struct Binding {
 
 /// Replaces each line `#import name` with the shared source of that name, recursively; repeated
 /// imports are skipped.
+///
+/// # Errors
+///
+/// If a file imports a name that is not among the shared sources.
 pub fn resolve(kernel: Source, shared: &[Source]) -> Result<String, Error> {
     let mut text = String::new();
     let mut seen = Vec::new();
@@ -66,6 +70,10 @@ fn append(
 }
 
 /// Parses and validates WGSL.
+///
+/// # Errors
+///
+/// If the WGSL is invalid. The message names the kernel.
 pub fn reflect(name: &'static str, text: &str) -> Result<naga::Module, Error> {
     let rejected = |message: String| Error::Wgsl {
         kernel: name,

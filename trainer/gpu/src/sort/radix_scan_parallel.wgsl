@@ -4,7 +4,6 @@
 // reads     digit, status
 // writes    counts (in place), totals [256]
 
-#import view
 #import digit
 #import scan
 

@@ -1,8 +1,7 @@
 //! The device that all kernels and viewers share, and its buffers.
 
-use super::pipeline_cache::PipelineCache;
-use super::{GpuOptions, Optional};
-use crate::Error;
+use crate::pipeline_cache::PipelineCache;
+use crate::{Error, GpuOptions, Optional};
 use parking_lot::{Mutex, RwLock};
 use std::collections::{BTreeMap, VecDeque};
 use std::ops::Range;
@@ -200,6 +199,10 @@ impl Gpu {
 
     /// Opens the requested adapter, or the fastest one; uses a software adapter if there is no
     /// other.
+    ///
+    /// # Errors
+    ///
+    /// If there is no such adapter, or if it cannot open a device.
     pub fn open(options: &GpuOptions) -> Result<Arc<Self>, Error> {
         let instance = instance();
         let adapter = find_adapter(&instance, options.adapter)?;
@@ -323,8 +326,12 @@ impl Gpu {
         self.health.lost.get().is_some()
     }
 
-    /// Returns an error if the device was lost, ran out of memory, failed or got an invalid command
-    /// since it was opened.
+    /// Checks the device.
+    ///
+    /// # Errors
+    ///
+    /// If the device was lost, ran out of memory, failed or got an invalid command since it was
+    /// opened.
     pub fn check(&self) -> Result<(), Error> {
         let failed = self.health.failed.get();
         if matches!(failed, Some(Failure::Invalid(_))) && !self.is_lost() {
@@ -358,8 +365,11 @@ impl Gpu {
         self.device.destroy();
     }
 
-    /// Creates a zeroed storage buffer. Fails if the adapter cannot bind it or has no memory for
-    /// it.
+    /// Creates a zeroed storage buffer.
+    ///
+    /// # Errors
+    ///
+    /// If the adapter cannot bind the buffer or has no memory for it.
     pub fn storage(&self, label: &str, bytes: u64) -> Result<Buffer, Error> {
         // An empty buffer cannot be bound, and arrays of `vec4f` need whole elements.
         let bytes = bytes.max(16).next_multiple_of(16);
@@ -388,6 +398,10 @@ impl Gpu {
     }
 
     /// Creates a storage buffer that holds `contents`.
+    ///
+    /// # Errors
+    ///
+    /// As [`Self::storage`].
     pub fn storage_with(&self, label: &str, contents: &[u8]) -> Result<Buffer, Error> {
         let buffer = self.storage(label, contents.len() as u64)?;
         self.write(&buffer, 0, contents);
@@ -447,6 +461,10 @@ impl Gpu {
     }
 
     /// Waits for the GPU and reads the first `n` elements of `buffer`.
+    ///
+    /// # Errors
+    ///
+    /// If the device failed, or if there is no memory for the read-back.
     pub fn read<T: bytemuck::Pod>(&self, buffer: &Buffer, n: usize) -> Result<Vec<T>, Error> {
         if n == 0 {
             return Ok(Vec::new());
@@ -559,6 +577,10 @@ impl Gpu {
     }
 
     /// Waits until everything submitted is done.
+    ///
+    /// # Errors
+    ///
+    /// As [`Self::check`].
     pub fn wait(&self) -> Result<(), Error> {
         self.poll(wgpu::PollType::Wait {
             submission_index: None,
@@ -581,7 +603,8 @@ impl Gpu {
     }
 
     /// The recorded failure of the device, or an internal error if it works.
-    pub(crate) fn failure_or(&self, internal: &str) -> Error {
+    #[must_use]
+    pub fn failure_or(&self, internal: &str) -> Error {
         self.check()
             .err()
             .unwrap_or_else(|| Error::internal(internal))
@@ -630,11 +653,19 @@ struct Reading {
 
 impl PendingRead {
     /// Waits for the data of a read of one buffer.
+    ///
+    /// # Errors
+    ///
+    /// If the device failed, or if there was no memory for the read-back.
     pub fn finish<T: bytemuck::Pod>(self, gpu: &Gpu) -> Result<Vec<T>, Error> {
         self.finish_with(gpu, |parts| bytemuck::pod_collect_to_vec(parts[0]))
     }
 
     /// Waits for the data and passes the bytes of each buffer, in the requested order, to `take`.
+    ///
+    /// # Errors
+    ///
+    /// As [`Self::finish`].
     pub fn finish_with<R>(self, gpu: &Gpu, take: impl FnOnce(&[&[u8]]) -> R) -> Result<R, Error> {
         let reading = self.0.map_err(|bytes| Error::OutOfMemory {
             label: "readback".to_owned(),
@@ -690,6 +721,12 @@ pub struct Buffer {
 }
 
 impl Buffer {
+    /// Number that no other buffer of the same device has.
+    #[must_use]
+    pub fn id(&self) -> u64 {
+        self.id
+    }
+
     /// Size in bytes.
     pub fn bytes(&self) -> u64 {
         self.bytes
