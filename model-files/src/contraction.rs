@@ -1,5 +1,5 @@
 //! Contraction of the world to the unit cube: near space is scaled uniformly, far space is
-//! compressed.
+//! compressed. The cells of edits and the neural fields divide this cube.
 
 /// Contracts a point, given in units of the scene radius around its center, to the unit cube. The
 /// inner cube from -1 to 1 fills the central half along each axis; everything outside maps to the
@@ -15,24 +15,8 @@ pub fn contract(at: [f64; 3]) -> [f64; 3] {
     at.map(|x| (x / largest * (2.0 - 1.0 / largest) + 2.0) / 4.0)
 }
 
-/// Backpropagates a gradient from the contracted point to the point.
-pub fn contract_backward(at: [f64; 3], upstream: [f64; 3]) -> [f64; 3] {
-    let (axis, max_abs) = largest(at);
-    if max_abs <= 1.0 {
-        return upstream.map(|v| v / 4.0);
-    }
-    // x -> x (2 m - 1) / m^2, where m is the largest coordinate.
-    let factor = (2.0 * max_abs - 1.0) / (max_abs * max_abs);
-    let by_max = (2.0 - 2.0 * max_abs) / (max_abs * max_abs * max_abs);
-    let along: f64 = at.iter().zip(upstream).map(|(x, v)| x * v).sum();
-    let mut gradient = upstream.map(|v| v * factor);
-    // Moving the largest coordinate changes the factor of all three.
-    gradient[axis] += along * by_max * at[axis].signum();
-    gradient.map(|v| v / 4.0)
-}
-
 /// The axis with the largest absolute coordinate, and that absolute value.
-pub(crate) fn largest(point: [f64; 3]) -> (usize, f64) {
+pub fn largest(point: [f64; 3]) -> (usize, f64) {
     let mut best = (0, 0.0);
     for (axis, along) in point.into_iter().enumerate() {
         if along.abs() > best.1 {
@@ -40,4 +24,20 @@ pub(crate) fn largest(point: [f64; 3]) -> (usize, f64) {
         }
     }
     best
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn contraction_is_linear_inside_and_bounded_outside() {
+        assert_eq!(contract([0.0; 3]), [0.5; 3]);
+        assert_eq!(contract([1.0, -1.0, 0.0]), [0.75, 0.25, 0.5]);
+        let far = contract([1e9, 0.0, 0.0]);
+        assert!(
+            far[0] > 0.999_999 && far[0] < 1.0 && (far[1] - 0.5).abs() < 1e-9,
+            "{far:?}"
+        );
+    }
 }

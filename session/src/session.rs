@@ -28,17 +28,18 @@ use calibration::{Alignment, CalibratedCamera, CameraCorrection};
 use capture::Stop;
 use keyframe::Keyframe;
 use kinematics::Stamp;
+use model_files::{Edits, InitialPoints};
 use persistence::Persistence;
 use reporter::Reporter;
 use scoreboard::Scoreboard;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
-use trainer::edits::Floaters;
+use trainer::floaters::Floaters;
 use trainer::gpu::Gpu;
 use trainer::{
-    Edits, FailedModel, InitialPoints, Method, ModelKind, Packing, Picture, Progress,
-    QueuedPicture, RenderRequest, Rendered,
+    FailedModel, Method, ModelKind, Packing, Picture, Progress, QueuedPicture, RenderRequest,
+    Rendered,
 };
 use training_time::TrainingTime;
 use viz::EditRequest;

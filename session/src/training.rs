@@ -10,12 +10,13 @@ use crate::{Error, run_folder, time_slices};
 use capture::Stop;
 use capture::config::DEFAULT_SEED;
 use keyframe::{Keyframe, listed};
+use model_files::InitialPoints;
 use std::path::Path;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use trainer::gpu::Gpu;
 use trainer::splat::CountPolicy;
-use trainer::{self, CommonOptions, InitialPoints, ModelKind, ModelSpec};
+use trainer::{self, CommonOptions, ModelKind, ModelSpec};
 
 /// All inputs of a training run except its keyframes.
 pub struct TrainingPlan {

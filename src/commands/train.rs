@@ -11,6 +11,8 @@ use crate::{print, signals};
 use capture::StationReport;
 use capture::config::{Override, Rig};
 use keyframe::{Keyframe, Split, counted};
+use model_files::Edits;
+use model_files::checkpoint::Checkpoint;
 use serde::Serialize;
 use session::depth_from::{self, DepthSource, RenderedDepth};
 use session::next_commands::{DataSource, quoted};
@@ -24,9 +26,8 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
-use trainer::checkpoint::Checkpoint;
 use trainer::gpu::Gpu;
-use trainer::{Edits, ModelKind, ModelSpec, Resumed};
+use trainer::{ModelKind, ModelSpec, Resumed};
 
 /// Maximum time of the scheduled evaluations, as a fraction of the training time. With more, the
 /// scores are known more often, but training takes longer.

@@ -1,7 +1,7 @@
 //! Placeholder for a model whose GPU failed.
 
-use crate::checkpoint::PendingCheckpoint;
 use crate::gpu::PassTiming;
+use crate::pending::PendingCheckpoint;
 use crate::{Error, Method, Picture, Progress, RenderRequest};
 use calibration::{Alignment, CalibratedCamera, TrialReport};
 use keyframe::Keyframe;

@@ -9,16 +9,13 @@
 //! # Ok::<(), trainer::Error>(())
 //! ```
 
-mod aabb;
 mod aligned;
 mod bounds;
-pub mod checkpoint;
-pub mod edits;
 mod error;
 pub mod eval;
 mod failed_model;
+pub mod floaters;
 pub mod gpu;
-mod initial_points;
 mod keyframe_signature;
 pub mod loss;
 #[cfg(test)]
@@ -40,7 +37,6 @@ mod random;
 mod registry;
 pub mod request;
 pub mod sort;
-pub mod spherical_harmonics;
 pub mod splat;
 mod submits;
 #[cfg(test)]
@@ -49,13 +45,10 @@ mod test_scenes;
 pub mod tsdf;
 mod view;
 
-pub use aabb::Aabb;
 pub use aligned::{Aligned, CorrectedKeyframe, Recalibrate, ResumedModel};
 pub use bounds::Bounds;
-pub use edits::Edits;
 pub use error::Error;
 pub use failed_model::FailedModel;
-pub use initial_points::InitialPoints;
 pub use method::{Method, Progress};
 pub use model_chunks::{
     ChunkData, ChunkLayout, MAX_MESH_COUNT, ModelChunk, ModelChunks, PendingChunks,
@@ -65,6 +58,6 @@ pub use model_spec::{
     KeyframeId, LoadedModel, ModelSpec, Resumed, load, resume, resume_without_missing,
 };
 pub use packing::{JPEG_QUALITY, PackedDepth, PackedPicture, Packing, QueuedPicture, Rendered};
-pub use pending::Pending;
+pub use pending::{Pending, PendingCheckpoint};
 pub use registry::ModelKind;
 pub use request::{Picture, Projection, RenderRequest};

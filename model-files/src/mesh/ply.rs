@@ -22,7 +22,7 @@ pub fn write(path: &Path, mesh: &Mesh) -> Result<(), Error> {
     })
 }
 
-pub(super) fn write_to(file: &mut impl Write, mesh: &Mesh) -> std::io::Result<()> {
+fn write_to(file: &mut impl Write, mesh: &Mesh) -> std::io::Result<()> {
     let is_far = mesh.origin_m.iter().any(|along| along.abs() > FAR_M);
     let number_type = if is_far { "double" } else { "float" };
     writeln!(
@@ -50,7 +50,7 @@ pub(super) fn write_to(file: &mut impl Write, mesh: &Mesh) -> std::io::Result<()
             if is_far {
                 file.write_all(&along.to_le_bytes())?;
             } else {
-                file.write_all(&crate::gpu::f32_of(along).to_le_bytes())?;
+                file.write_all(&kinematics::f32_of(along).to_le_bytes())?;
             }
         }
         for along in mesh.normals[ix] {

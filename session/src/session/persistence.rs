@@ -7,9 +7,9 @@ use crate::kept_folder::KeptFolder;
 use crate::recovery::Recovery;
 use keyframe::{DepthMap, Keyframe};
 use kinematics::Stamp;
+use model_files::checkpoint::Checkpoint;
 use std::path::Path;
 use std::sync::Arc;
-use trainer::checkpoint::Checkpoint;
 use trainer::gpu::Gpu;
 use trainer::{Method, Resumed};
 

@@ -5,9 +5,8 @@ use calibration::{CalibratedCamera, TrialReport};
 use keyframe::Split;
 use kinematics::Transform;
 use std::path::Path;
-use trainer::Error;
-use trainer::checkpoint::PendingCheckpoint;
 use trainer::gpu::{GpuOptions, PassTiming};
+use trainer::{Error, PendingCheckpoint};
 
 const SIZE_PX: [u32; 2] = [4, 2];
 const N_TESTS: u8 = 5;

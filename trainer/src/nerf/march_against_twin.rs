@@ -6,11 +6,11 @@ use super::params::{self, Batch, OccupancyUpdate, Span};
 use super::passes::FieldPasses;
 use super::reference::grid::GridShape;
 use super::reference::march::March;
-use super::reference::space::contract;
 use crate::gpu::testing::test_gpu;
 use crate::gpu::{Passes, f32_of, f32s_of};
 use crate::mismatches::Mismatches;
 use crate::random::F32Random;
+use model_files::contraction::contract;
 
 const N_CELLS: u32 = 64;
 /// More rays than a workgroup scans at once.

@@ -10,10 +10,10 @@ use super::options::{NerfBudget, NerfOptions};
 use super::rays::{self, RayImage, RaySampling};
 use super::sizes::Sizes;
 use crate::aligned::replacement;
-use crate::checkpoint::PendingCheckpoint;
 use crate::gpu::{Gpu, PassTiming};
 use crate::model_options::ModelOptions;
 use crate::packing::{Format, Output};
+use crate::pending::PendingCheckpoint;
 use crate::submits::Submits;
 use crate::view::Camera;
 use crate::{

@@ -4,7 +4,6 @@
     reason = "channels and axes index several arrays at once"
 )]
 
-use super::arrays::SplatArrays;
 use super::buffers::{ImageBuffers, Scratch, ScratchSize, SplatBuffers, n_bins, n_tiles};
 use super::camera_params::CameraParams;
 use super::kernels::{DrawPipelines, TrainPipelines};
@@ -19,6 +18,7 @@ use crate::mismatches::Mismatches;
 use calibration::ParamSet;
 use keyframe::{Keyframe, Shutter, Split};
 use kinematics::{Stamp, Transform, Twist};
+use model_files::splat::arrays::SplatArrays;
 use nalgebra::Vector3;
 use std::sync::Arc;
 

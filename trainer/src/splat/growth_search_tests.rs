@@ -6,12 +6,12 @@ use super::training_tests::{FEW_STEPS, n_keyframes, noisy, options, train};
 use super::trials::CountPolicy;
 use super::{SplatOptions, SplatTrainer};
 use crate::Method;
-use crate::checkpoint::Checkpoint;
 use crate::gpu::Gpu;
 use crate::gpu::testing::test_gpu;
 use crate::model_options::ModelOptions;
 use calibration::{Candidate, Trial};
 use keyframe::{Keyframe, Split};
+use model_files::checkpoint::Checkpoint;
 use std::sync::Arc;
 
 const N_PLANNED_STEPS: u64 = 400;

@@ -4,8 +4,6 @@
 mod against_twin;
 #[cfg(test)]
 mod alignment_tests;
-mod antimatter15;
-pub mod arrays;
 mod arrival_gains;
 pub mod bench;
 mod bounds;
@@ -16,7 +14,6 @@ mod change_against_twin;
 #[cfg(test)]
 mod checkpoint_tests;
 mod chunks;
-pub mod cloud;
 mod doubling;
 #[cfg(test)]
 mod doubling_tests;
@@ -24,7 +21,6 @@ mod doubling_tests;
 mod edit_tests;
 mod entry;
 mod few_images;
-mod file;
 mod floaters;
 mod growth_search;
 #[cfg(test)]
@@ -36,12 +32,10 @@ mod non_finite_tests;
 mod options;
 mod params;
 mod passes;
-pub mod ply;
 pub mod reference;
 mod schedule;
 mod seed;
 mod snapshot;
-pub mod spz;
 mod trainer;
 #[cfg(test)]
 mod training_tests;

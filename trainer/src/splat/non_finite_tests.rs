@@ -2,13 +2,13 @@
 //! parameter.
 
 use super::SplatTrainer;
-use super::cloud::synthetic_cloud;
 use super::training_tests::{keyframes, options, test_psnr, train};
 use crate::Method;
 use crate::gpu::f32_of;
 use crate::gpu::testing::test_gpu;
 use keyframe::{DepthMap, Keyframe};
 use kinematics::{Stamp, Transform, Twist};
+use model_files::splat::cloud::synthetic_cloud;
 use nalgebra::{Point3, Vector3};
 use std::sync::Arc;
 

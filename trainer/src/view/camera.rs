@@ -1,9 +1,10 @@
 //! The camera of a view, and its uniform buffer.
 
+use crate::RenderRequest;
 use crate::gpu::{f32_of, f32s_of};
-use crate::{Aabb, Edits, RenderRequest};
 use keyframe::Shutter;
 use kinematics::Transform;
+use model_files::{Aabb, Edits};
 use std::sync::Arc;
 
 /// Edge of a tile, pixels, as in Kerbl et al. 2023. Larger tiles sort fewer entries; in smaller

@@ -2,7 +2,7 @@
 
 use crate::gpu::f32_of;
 use crate::model_chunks::{ChunkData, ChunkLayout};
-use crate::splat::arrays::SplatArrays;
+use model_files::splat::arrays::SplatArrays;
 use std::f64::consts::FRAC_1_SQRT_2;
 use std::ops::Range;
 

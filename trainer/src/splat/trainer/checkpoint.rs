@@ -4,10 +4,10 @@
 use super::SplatTrainer;
 use super::saved_arrays::{CAMERA_PARAMS, PendingArrays, invalid_state, read_seeds, read_splats};
 use crate::Error;
-use crate::checkpoint::{Checkpoint, PendingCheckpoint};
 use crate::gpu::Gpu;
 use crate::keyframe_signature::{self, KeyframeSignature};
 use crate::model_options::{MethodOptions, ModelOptions};
+use crate::pending::PendingCheckpoint;
 use crate::splat::buffers::SplatBuffers;
 use crate::splat::camera_params::CameraSlots;
 use crate::splat::growth_search::{FoldModels, SavedGrowthSearch};
@@ -19,6 +19,7 @@ use crate::splat::trials::{Arrival, RemainingTrials, RunningTrial};
 use calibration::{Candidate, ParamSet, Trial};
 use keyframe::Keyframe;
 use kinematics::Stamp;
+use model_files::checkpoint::Checkpoint;
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 

@@ -5,13 +5,13 @@ use super::renderer::Renderer;
 use crate::Error;
 use crate::gpu::Gpu;
 use crate::model_options::ModelOptions;
-use crate::splat::arrays::SplatArrays;
 use crate::splat::buffers::{SplatBuffers, n_sh_rest};
 use crate::splat::camera_params::CameraParams;
 use crate::splat::kernels::TrainPipelines;
 use crate::splat::options::SplatOptions;
 use crate::splat::params::Growth;
 use crate::splat::passes::{self, GrowthBuffers};
+use model_files::splat::arrays::SplatArrays;
 
 /// Standard deviation of a child's offset from its parent, in standard deviations of the parent.
 /// 3DGS-MCMC places children at the parent's mean. With a larger spread, a family no longer renders

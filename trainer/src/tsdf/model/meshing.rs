@@ -2,7 +2,6 @@
 
 use super::field_store::FieldStore;
 use crate::Error;
-use crate::edits::Edits;
 use crate::gpu::{Gpu, PassTiming};
 use crate::tsdf::block::{Blocks, GridCoord};
 use crate::tsdf::buffers::FieldBuffers;
@@ -11,6 +10,7 @@ use crate::tsdf::chosen_grid::VoxelGrid;
 use crate::tsdf::kernels::Pipelines;
 use crate::tsdf::mesh::{BlockMesh, BlockMeshes, ChangedChunks, Mesher};
 use crate::tsdf::mesh_buffers::{MeshBuffers, MeshCapacity};
+use model_files::Edits;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
