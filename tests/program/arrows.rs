@@ -5,17 +5,18 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::process::Command;
 
 /// Every crate, and the workspace crates that it may depend on.
-const ALLOWED: [(&str, &[&str]); 16] = [
+const ALLOWED: [(&str, &[&str]); 17] = [
     ("background", &[]),
     ("files", &[]),
     ("kinematics", &[]),
     ("keyframe", &["files", "kinematics"]),
     ("calibration", &["background", "keyframe", "kinematics"]),
     ("drivers", &["files", "kinematics"]),
+    ("model-files", &["files", "kinematics"]),
     ("sim", &["drivers", "kinematics", "targets"]),
     ("targets", &["kinematics"]),
     ("test-features", &[]),
-    ("test-support", &[]),
+    ("test-support", &["drivers", "kinematics"]),
     (
         "capture",
         &[
@@ -36,9 +37,13 @@ const ALLOWED: [(&str, &[&str]); 16] = [
             "files",
             "keyframe",
             "kinematics",
+            "model-files",
         ],
     ),
-    ("viz", &["files", "keyframe", "kinematics", "trainer"]),
+    (
+        "viz",
+        &["files", "keyframe", "kinematics", "model-files", "trainer"],
+    ),
     (
         "session",
         &[
@@ -49,6 +54,7 @@ const ALLOWED: [(&str, &[&str]); 16] = [
             "files",
             "keyframe",
             "kinematics",
+            "model-files",
             "trainer",
             "viz",
         ],
@@ -61,6 +67,7 @@ const ALLOWED: [(&str, &[&str]); 16] = [
             "files",
             "keyframe",
             "kinematics",
+            "model-files",
             "session",
             "trainer",
         ],
@@ -76,6 +83,7 @@ const ALLOWED: [(&str, &[&str]); 16] = [
             "files",
             "keyframe",
             "kinematics",
+            "model-files",
             "session",
             "sim",
             "targets",

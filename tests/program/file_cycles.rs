@@ -12,10 +12,11 @@ use syn::visit::Visit;
 use syn::{Attribute, Item, UseTree};
 
 /// Source folders of the crates, relative to the workspace.
-const ROOTS: [&str; 12] = [
+const ROOTS: [&str; 13] = [
     "kinematics/src",
     "keyframe/src",
     "calibration/src",
+    "model-files/src",
     "drivers/src",
     "sim/src",
     "capture/src",
