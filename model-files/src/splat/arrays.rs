@@ -7,7 +7,7 @@ use std::path::Path;
 
 /// Maximum number of color coefficients per splat (degree 3).
 const MAX_COEFFICIENTS: usize = 16;
-/// Splats that are more transparent are not drawn, see shared/projection.wgsl.
+/// Splats that are more transparent are not drawn, see `projection.wgsl` of the trainer.
 const MIN_ALPHA: f64 = 1.0 / 255.0;
 /// Maximum absolute coordinate of a mean in a file: beyond the size of the Earth, also in
 /// millimeters.
