@@ -2,14 +2,14 @@
 
 use crate::{Error, Result};
 use gpu::PassTiming;
+use model_files::splat::arrays::SplatArrays;
+use model_files::splat::cloud::{load_cloud_npz, scan_cloud, synthetic_cloud};
 use serde::Serialize;
 use session::Context;
 use session::OpenGpu;
 use std::path::PathBuf;
 use std::time::Duration;
-use trainer::splat::arrays::SplatArrays;
 use trainer::splat::bench::{Eye, KernelFigures, KernelSetup, Losses, Repeats, time_kernels};
-use trainer::splat::cloud::{load_cloud_npz, scan_cloud, synthetic_cloud};
 
 /// Values of options that are not given.
 struct Defaults {

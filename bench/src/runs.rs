@@ -6,6 +6,7 @@ use capture::Stop;
 use gpu::Gpu;
 use keyframe::{Keyframe, Split};
 use keyframe::{ensure, failed};
+use model_files::InitialPoints;
 use serde::{Deserialize, Serialize};
 use session::Context;
 use session::methods::MAX_SPLATS;
@@ -18,7 +19,7 @@ use std::collections::HashSet;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use trainer::splat::SplatOptions;
-use trainer::{InitialPoints, MethodOptions, ModelKind, ModelOptions, ModelSpec};
+use trainer::{MethodOptions, ModelKind, ModelOptions, ModelSpec};
 
 /// Folder of the runs inside the folder of the bench.
 const RUNS: &str = "bench-runs";

@@ -1,43 +1,15 @@
 //! Fuzz target for model files: splats in `.ply`, `.spz` and `.splat`, and training checkpoints.
-//! The crate `trainer` is not linked, to keep the build fast.
 //!
 //! The first byte selects the format of the other bytes: a complete `.ply`, the uncompressed
 //! contents of a `.spz`, a complete `.spz`, a checkpoint without its checksum, or a complete
 //! `.splat`.
 #![no_main]
-#![allow(dead_code, reason = "only reading is tested here")]
 
-#[path = "../../trainer/src/splat/antimatter15.rs"]
-mod antimatter15;
-#[path = "../../trainer/src/checkpoint.rs"]
-mod checkpoint;
-#[path = "../../trainer/src/initial_points.rs"]
-mod initial_points;
-#[path = "../../trainer/src/splat/ply/mod.rs"]
-mod ply;
-#[path = "../../trainer/src/splat/spz/mod.rs"]
-mod spz;
-mod splat {
-    pub use crate::arrays;
-}
-#[path = "../../trainer/src/splat/arrays.rs"]
-pub mod arrays;
-
-pub use initial_points::InitialPoints;
+use model_files::checkpoint::Checkpoint;
+use model_files::splat::{antimatter15, ply, spz};
 use sha2::Digest;
 use std::io::Write;
 use std::path::PathBuf;
-
-/// The errors that these files use. The error type of the trainer also has GPU errors.
-#[derive(Debug)]
-pub enum Error {
-    Read { path: PathBuf, source: std::io::Error },
-    Write { path: PathBuf, source: std::io::Error },
-    SplatFile { path: PathBuf, reason: String },
-    Checkpoint { path: PathBuf, reason: String },
-    CheckpointState { reason: String },
-    SplatArrays(String),
-}
 
 /// Writes a file in memory; each input overwrites it.
 fn file(bytes: &[u8]) -> PathBuf {
@@ -66,7 +38,7 @@ libfuzzer_sys::fuzz_target!(|bytes: &[u8]| {
         4 => antimatter15::read(&file(bytes)),
         _ => {
             let sum = sha2::Sha256::digest(bytes);
-            if let Ok(checkpoint) = checkpoint::Checkpoint::read(&file(&[bytes, &sum[..]].concat())) {
+            if let Ok(checkpoint) = Checkpoint::read(&file(&[bytes, &sum[..]].concat())) {
                 let _ = checkpoint.array("means", 12);
             }
             return;
@@ -77,7 +49,7 @@ libfuzzer_sys::fuzz_target!(|bytes: &[u8]| {
     // A format may reject positions outside its range. Every file that is written must be readable.
     for (write, read) in [(ply::write as fn(_, _) -> _, ply::read as fn(_) -> _), (spz::write, spz::read)] {
         if write(&path, &splats).is_ok() {
-            let reread = read(&path).unwrap_or_else(|error: Error| panic!("{error:?}"));
+            let reread = read(&path).unwrap_or_else(|error: model_files::Error| panic!("{error:?}"));
             assert_eq!((reread.n_splats(), reread.sh_degree), (splats.n_splats(), splats.sh_degree));
         }
     }

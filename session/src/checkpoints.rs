@@ -6,12 +6,13 @@ use crate::run_folder::{CHECKPOINT, expect_one_model};
 use crate::stored_keyframes::StoredKeyframes;
 use background::Task;
 use keyframe::Keyframe;
+use model_files::Edits;
+use model_files::checkpoint::Checkpoint;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
-use trainer::checkpoint::{Checkpoint, PendingCheckpoint};
-use trainer::{Edits, Method, ModelKind};
+use trainer::{Method, ModelKind, PendingCheckpoint};
 
 /// Default time between two checkpoints: the training time that a killed process loses at most.
 /// Each checkpoint writes the whole state, so shorter periods write more to the disk.
@@ -357,8 +358,8 @@ impl CheckpointWrite {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use trainer::Aabb;
-    use trainer::edits::Edit;
+    use model_files::Aabb;
+    use model_files::edits::Edit;
 
     #[test]
     fn checkpoint_period_must_be_a_number() {

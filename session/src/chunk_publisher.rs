@@ -1,10 +1,11 @@
 //! Publishes the chunks of models that clients draw themselves, without delaying training.
 
 use background::Task;
+use model_files::Edits;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
-use trainer::{Edits, Error, Method, ModelChunks, ModelKind};
+use trainer::{Error, Method, ModelChunks, ModelKind};
 use viz::Hub;
 
 /// Minimum time between two versions of a model, because each one is read from the GPU and encoded

@@ -14,13 +14,14 @@ use gpu::Gpu;
 use keyframe::ensure;
 use keyframe::{Holdout, Keyframe, KeyframeList, Split, counted};
 use kinematics::Stamp;
+use model_files::InitialPoints;
+use model_files::splat::ply;
 use sha2::{Digest, Sha256};
 use std::collections::{BTreeMap, HashSet};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
-use trainer::splat::ply;
-use trainer::{InitialPoints, ModelKind};
+use trainer::ModelKind;
 
 /// Which images are read, and how they are scaled and split.
 #[derive(Clone, Debug, Default)]

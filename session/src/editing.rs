@@ -1,8 +1,9 @@
 //! Applies the edits that operators request.
 
 use background::Task;
+use model_files::edits::{Edit, Edits};
 use std::sync::Arc;
-use trainer::edits::{Edit, Edits, Floaters, PendingFloaters};
+use trainer::floaters::{Floaters, PendingFloaters};
 use trainer::{Error, Method};
 use viz::{EditAction, EditRequest};
 
@@ -34,10 +35,12 @@ impl Editor {
         let applied = match action {
             EditAction::Erase(aabb) => Arc::make_mut(edits)
                 .push(Edit::Box(*aabb))
-                .map(|()| Some("erased a box".to_owned())),
+                .map(|()| Some("erased a box".to_owned()))
+                .map_err(Error::from),
             EditAction::Undo => Arc::make_mut(edits)
                 .undo()
-                .map(|()| Some("undid the last edit".to_owned())),
+                .map(|()| Some("undid the last edit".to_owned()))
+                .map_err(Error::from),
             // A second search would find the same floaters again.
             EditAction::RemoveFloaters if self.search.is_some() => {
                 return Err(

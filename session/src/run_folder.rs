@@ -5,13 +5,14 @@ use crate::error::Context;
 use capture::config::Rig;
 use keyframe::{Keyframe, listed};
 use keyframe::{bail, ensure};
+use model_files::Edits;
 use serde::Serialize;
 use sha2::{Digest, Sha256};
 use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
-use trainer::{Edits, Method, ModelKind};
+use trainer::{Method, ModelKind};
 
 /// File extension of recordings.
 const RECORDING_EXTENSION: &str = "mcap";

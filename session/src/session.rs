@@ -29,16 +29,17 @@ use capture::Stop;
 use gpu::Gpu;
 use keyframe::Keyframe;
 use kinematics::Stamp;
+use model_files::{Edits, InitialPoints};
 use persistence::Persistence;
 use reporter::Reporter;
 use scoreboard::Scoreboard;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
-use trainer::edits::Floaters;
+use trainer::floaters::Floaters;
 use trainer::{
-    Edits, FailedModel, InitialPoints, Method, ModelKind, Packing, Picture, Progress,
-    QueuedPicture, RenderRequest, Rendered,
+    FailedModel, Method, ModelKind, Packing, Picture, Progress, QueuedPicture, RenderRequest,
+    Rendered,
 };
 use training_time::TrainingTime;
 use viz::EditRequest;

@@ -11,13 +11,13 @@ use keyframe::ensure;
 use keyframe::{BaseState, DepthMap, Keyframe, split_from_name, split_name};
 use kinematics::transform::{from_xyz_xyzw, to_xyz_xyzw};
 use kinematics::{Stamp, Twist};
+use model_files::checkpoint::{Array, Checkpoint};
 use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use trainer::checkpoint::{Array, Checkpoint};
 
 const EXTENSION: &str = "keyframe";
 const METHOD: &str = "keyframe";
@@ -204,7 +204,7 @@ fn to_checkpoint(keyframe: &Keyframe) -> crate::Result<Checkpoint> {
         depth_from: None,
         flags: BTreeMap::new(),
         is_finished: false,
-        edits: trainer::Edits::default(),
+        edits: model_files::Edits::default(),
         state: serde_json::to_value(description)?,
         arrays,
     })

@@ -11,11 +11,12 @@ use capture::Stop;
 use capture::config::DEFAULT_SEED;
 use gpu::Gpu;
 use keyframe::{Keyframe, listed};
+use model_files::InitialPoints;
 use std::path::Path;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use trainer::splat::CountPolicy;
-use trainer::{self, CommonOptions, InitialPoints, ModelKind, ModelSpec};
+use trainer::{self, CommonOptions, ModelKind, ModelSpec};
 
 /// All inputs of a training run except its keyframes.
 pub struct TrainingPlan {

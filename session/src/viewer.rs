@@ -6,10 +6,11 @@ use crate::methods;
 use crate::observations::{ModelState, ObservationPublisher, PosedKeyframe};
 use capture::Stop;
 use kinematics::Transform;
+use model_files::{Aabb, Edits};
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
-use trainer::{Aabb, Edits, Method, ModelKind, RenderRequest, Rendered};
+use trainer::{Method, ModelKind, RenderRequest, Rendered};
 use viz::{
     Control, EditAction, EditRequest, Hub, KeyframePose, ModelStatus, PendingRender, Status,
 };
@@ -274,6 +275,7 @@ impl ServedModel {
         let written = self
             .edits
             .write(&self.path)
+            .map_err(trainer::Error::from)
             .and_then(|()| self.method.write_for_others(&self.path, &self.edits));
         match written {
             Ok(()) => {

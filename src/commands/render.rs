@@ -5,6 +5,7 @@ use crate::open_gpu::open_gpu;
 use crate::{print, signals};
 use anyhow::Context;
 use keyframe::counted;
+use model_files::Aabb;
 use serde::Serialize;
 use session::camera_path::{CameraPath, PathCamera};
 use session::evaluate::{covered_frac, warn_if_hardly_covered};
@@ -13,7 +14,7 @@ use session::run_folder::expect_model;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Instant;
-use trainer::{Aabb, LoadedModel, Picture, Projection, RenderRequest};
+use trainer::{LoadedModel, Picture, Projection, RenderRequest};
 
 /// Image size if neither a flag nor the camera path gives one.
 const DEFAULT_SIZE_PX: [u32; 2] = [1280, 720];

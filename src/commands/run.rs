@@ -22,6 +22,8 @@ use drivers::Source;
 use gpu::Gpu;
 use keyframe::{Keyframe, Split, counted};
 use kinematics::Stamp;
+use model_files::Edits;
+use model_files::checkpoint::Checkpoint;
 use serde::Serialize;
 use session::methods::{self, COUNT};
 use session::next_commands::{DataSource, quoted};
@@ -37,9 +39,8 @@ use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, OnceLock};
 use std::time::Duration;
-use trainer::checkpoint::Checkpoint;
 use trainer::splat::CountPolicy;
-use trainer::{CommonOptions, Edits, ModelKind, ModelSpec, Resumed};
+use trainer::{CommonOptions, ModelKind, ModelSpec, Resumed};
 use viz::{Hub, RunResult};
 
 /// Flags of `run`.

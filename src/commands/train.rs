@@ -12,6 +12,8 @@ use capture::StationReport;
 use capture::config::{Override, Rig};
 use gpu::Gpu;
 use keyframe::{Keyframe, Split, counted};
+use model_files::Edits;
+use model_files::checkpoint::Checkpoint;
 use serde::Serialize;
 use session::depth_from::{self, DepthSource, RenderedDepth};
 use session::next_commands::{DataSource, quoted};
@@ -25,8 +27,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
-use trainer::checkpoint::Checkpoint;
-use trainer::{Edits, ModelKind, ModelSpec, Resumed};
+use trainer::{ModelKind, ModelSpec, Resumed};
 
 /// Maximum time of the scheduled evaluations, as a fraction of the training time. With more, the
 /// scores are known more often, but training takes longer.

@@ -2,12 +2,10 @@
 //! bus, a base that sends datagrams, and a camera as a file. The production binary reads the arm
 //! and then moves it.
 
-#[path = "../program/wire/compare.rs"]
-mod compare;
-
 use std::io::{BufRead, BufReader};
 use std::path::Path;
 use std::process::{Command, Stdio};
+use test_support::wire_difference;
 
 /// Recording that was simulated on the host.
 pub(crate) const SCRIPT: &str = "rigs/mobile-arm.mcap";
@@ -75,7 +73,7 @@ fn mobile_arm_is_read_and_moved_through_drivers() {
         "--json",
     ]);
     assert_eq!(code, Some(0), "{printed}");
-    let difference = compare::difference(&script, Path::new("/tmp/mobile.mcap"));
+    let difference = wire_difference::difference(&script, Path::new("/tmp/mobile.mcap"));
     println!("wire: {difference:?}");
     assert!(difference.n_images >= 20, "{difference:?}");
     // Motors that report automatically do so every 10 ms, and joints rotate by less than half a
@@ -94,7 +92,7 @@ fn mobile_arm_is_read_and_moved_through_drivers() {
     ];
     let (code, printed) = fieldrig(&arguments);
     assert_eq!(code, Some(0), "{printed}");
-    assert!(compare::error_of_move(&printed) < 0.01, "{printed}");
+    assert!(wire_difference::error_of_move(&printed) < 0.01, "{printed}");
     let _ = playing.kill(); // It runs until it is stopped.
     let _ = playing.wait();
 }

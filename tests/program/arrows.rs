@@ -14,10 +14,11 @@ const ALLOWED: [(&str, &[&str]); 17] = [
     ("keyframe", &["files", "kinematics"]),
     ("calibration", &["background", "keyframe", "kinematics"]),
     ("drivers", &["files", "kinematics"]),
+    ("model-files", &["files", "kinematics"]),
     ("sim", &["drivers", "kinematics", "targets"]),
     ("targets", &["kinematics"]),
     ("test-features", &[]),
-    ("test-support", &[]),
+    ("test-support", &["drivers", "kinematics"]),
     (
         "capture",
         &[
@@ -39,9 +40,13 @@ const ALLOWED: [(&str, &[&str]); 17] = [
             "gpu",
             "keyframe",
             "kinematics",
+            "model-files",
         ],
     ),
-    ("viz", &["files", "keyframe", "kinematics", "trainer"]),
+    (
+        "viz",
+        &["files", "keyframe", "kinematics", "model-files", "trainer"],
+    ),
     (
         "session",
         &[
@@ -53,6 +58,7 @@ const ALLOWED: [(&str, &[&str]); 17] = [
             "gpu",
             "keyframe",
             "kinematics",
+            "model-files",
             "trainer",
             "viz",
         ],
@@ -66,6 +72,7 @@ const ALLOWED: [(&str, &[&str]); 17] = [
             "gpu",
             "keyframe",
             "kinematics",
+            "model-files",
             "session",
             "trainer",
         ],
@@ -82,6 +89,7 @@ const ALLOWED: [(&str, &[&str]); 17] = [
             "gpu",
             "keyframe",
             "kinematics",
+            "model-files",
             "session",
             "sim",
             "targets",

@@ -5,15 +5,15 @@
 use crate::small_rig;
 use crate::wall;
 use crate::wall::fieldrig;
+use model_files::Edits;
+#[cfg(feature = "sim")]
+use model_files::checkpoint::Checkpoint;
 use serde_json::{Value, json};
 use std::io::{BufRead, BufReader};
 use std::net::TcpStream;
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
-use trainer::Edits;
-#[cfg(feature = "sim")]
-use trainer::checkpoint::Checkpoint;
 use tungstenite::{Message, WebSocket};
 
 /// Maximum time until an expected message. Much longer than two busy cores need for a small

@@ -3,10 +3,10 @@
 #![expect(clippy::unwrap_used, reason = "a test that cannot continue may panic")]
 
 use crate::photos::dataset;
+use model_files::checkpoint::Checkpoint;
 use serde_json::Value;
 use std::path::Path;
 use std::process::{Command, Output};
-use trainer::checkpoint::Checkpoint;
 
 fn fieldrig(folder: &Path, args: &[&str], env: &[(&str, &str)]) -> Output {
     let mut command = Command::new(env!("CARGO_BIN_EXE_fieldrig"));

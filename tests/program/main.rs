@@ -22,6 +22,7 @@ mod output;
 mod page_replay;
 #[cfg(feature = "sim")]
 mod page_server;
+mod paths;
 mod photos;
 #[cfg(feature = "realsense")]
 mod realsense;

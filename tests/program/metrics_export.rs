@@ -2,12 +2,12 @@
 #![expect(clippy::unwrap_used, reason = "a test that cannot continue may panic")]
 
 use image::{ExtendedColorType, RgbaImage};
+use model_files::splat::arrays::SplatArrays;
+use model_files::splat::cloud::synthetic_cloud;
+use model_files::splat::{ply, spz};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
-use trainer::splat::arrays::SplatArrays;
-use trainer::splat::cloud::synthetic_cloud;
-use trainer::splat::{ply, spz};
 
 fn fieldrig(arguments: &[&str]) -> Output {
     let mut command = Command::new(env!("CARGO_BIN_EXE_fieldrig"));

@@ -4,10 +4,10 @@
 #![expect(clippy::unwrap_used, reason = "a test that cannot continue may panic")]
 
 use crate::photos::dataset;
+use model_files::checkpoint::Checkpoint;
 use std::os::unix::fs::{PermissionsExt, symlink};
 use std::path::Path;
 use std::process::{Child, Command, Output, Stdio};
-use trainer::checkpoint::Checkpoint;
 
 fn fieldrig(folder: &Path, args: &[&str]) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_fieldrig"));

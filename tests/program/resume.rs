@@ -4,11 +4,11 @@
 use crate::photos::dataset;
 #[cfg(feature = "sim")]
 use crate::small_rig;
+use model_files::checkpoint::Checkpoint;
 use serde_json::{Value, json};
 use std::path::Path;
 use std::process::{Command, Output, Stdio};
 use std::time::{Duration, Instant, SystemTime};
-use trainer::checkpoint::Checkpoint;
 
 const N_STEPS: &str = "260";
 const HALF: &str = "130";

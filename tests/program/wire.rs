@@ -3,13 +3,12 @@
 
 #![cfg(target_os = "linux")]
 
-mod compare;
-
 use crate::output::OnTerminal;
 use parking_lot::{Mutex, MutexGuard};
 use std::io::{BufRead, BufReader};
 use std::path::Path;
 use std::process::{Child, ChildStdout, Command, Stdio};
+use test_support::wire_difference;
 
 /// Start delay in seconds, sufficient for busy machines.
 const START_IN: &str = "5";
@@ -97,7 +96,7 @@ fn emulated_franka_rig_is_recorded_and_moved() {
         &rig,
     );
     assert!(matches!(code, Some(0 | 3)), "{printed}");
-    let difference = compare::difference(&script, &wire);
+    let difference = wire_difference::difference(&script, &wire);
     assert!(difference.n_images >= 60, "{difference:?}");
     // Here, joints rotate by at most half a radian per second, that is, half a milliradian per
     // millisecond.
@@ -115,7 +114,7 @@ fn emulated_franka_rig_is_recorded_and_moved() {
         &rig,
     );
     assert_eq!(code, Some(0), "{printed}");
-    assert!(compare::error_of_move(&printed) < 1e-3, "{printed}");
+    assert!(wire_difference::error_of_move(&printed) < 1e-3, "{printed}");
     let (code, printed) = fieldrig(
         &[
             "move",

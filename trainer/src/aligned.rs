@@ -7,12 +7,11 @@
 //! if it runs once. A result that changes the corrections replaces the keyframes; the model moves
 //! along with them or restarts, see [`Recalibrate`].
 
-use crate::checkpoint::{Checkpoint, PendingCheckpoint};
-use crate::edits::{Edits, PendingFloaters};
-use crate::initial_points::InitialPoints;
+use crate::floaters::PendingFloaters;
 use crate::model_chunks::PendingChunks;
 use crate::model_metadata::{METADATA_FILE, read_metadata};
 use crate::model_options::{AlignTiming, CommonOptions};
+use crate::pending::PendingCheckpoint;
 use crate::{
     Bounds, Error, Method, Packing, Picture, Progress, QueuedPicture, RenderRequest, Rendered,
 };
@@ -24,6 +23,8 @@ use calibration::{
 use gpu::{Gpu, PassTiming};
 use keyframe::{Keyframe, Split};
 use kinematics::Stamp;
+use model_files::checkpoint::Checkpoint;
+use model_files::{Edits, InitialPoints};
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, HashMap};
 use std::path::Path;

@@ -14,6 +14,9 @@ pub enum Error {
     /// A keyframe is inconsistent.
     #[error(transparent)]
     Keyframe(#[from] keyframe::Error),
+    /// A file of a model is invalid or cannot be accessed, or an edit is not allowed.
+    #[error(transparent)]
+    ModelFile(#[from] model_files::Error),
     /// The GPU, or a kernel, failed.
     #[error(transparent)]
     Gpu(#[from] gpu::Error),
@@ -100,17 +103,9 @@ pub enum Error {
     #[cfg(feature = "lpips")]
     #[error("LPIPS network failed")]
     LpipsNetwork(#[source] Box<candle_core::Error>),
-    /// A splat file or the metadata of a model is invalid.
+    /// The metadata of a model is invalid.
     #[error("cannot parse {path:?}: {reason}")]
     SplatFile {
-        /// The file.
-        path: PathBuf,
-        /// Description of the problem.
-        reason: String,
-    },
-    /// A file is not a checkpoint, or it is incomplete, damaged or of another version.
-    #[error("cannot read checkpoint {path:?}: {reason}")]
-    Checkpoint {
         /// The file.
         path: PathBuf,
         /// Description of the problem.
@@ -162,46 +157,18 @@ pub enum Error {
         /// Folder or file.
         path: PathBuf,
     },
-    /// Splats cannot be read.
-    #[error("cannot read splats from {}{hint}", path.display())]
-    NoSplats {
-        /// Folder or file.
-        path: PathBuf,
-        /// Suggested action, which completes the sentence.
-        hint: &'static str,
-        /// Cause.
-        source: Box<Self>,
-    },
     /// A mesh has no triangles left after simplification.
     #[error("no triangles are left at a cell width of {cell_m} m")]
     EmptyMesh {
         /// Width of a cell, meters.
         cell_m: f64,
     },
-    /// A model has the maximum number of edits.
-    #[error(
-        "a model has at most {} edits; undo one first",
-        crate::edits::MAX_EDITS
-    )]
-    TooManyEdits,
-    /// An edit has values that kernels cannot compute with.
-    #[error("invalid edit: {reason}")]
-    InvalidEdit {
-        /// Values found and expected.
-        reason: String,
-    },
-    /// A model has no edit that could be undone.
-    #[error("there is nothing to undo")]
-    NothingToUndo,
     /// No part of a model is small and unconnected.
     #[error("no floaters found: every part of the model is connected to a large part")]
     NoFloaters,
     /// The method cannot find floaters.
     #[error("floaters can be removed only from splats and distance fields; erase a box instead")]
     CannotFindFloaters,
-    /// Arrays of splats are inconsistent.
-    #[error("splats: {0}")]
-    SplatArrays(String),
 }
 
 impl Error {

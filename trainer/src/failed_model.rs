@@ -1,6 +1,6 @@
 //! Placeholder for a model whose GPU failed.
 
-use crate::checkpoint::PendingCheckpoint;
+use crate::pending::PendingCheckpoint;
 use crate::{Error, Method, Picture, Progress, RenderRequest};
 use calibration::{Alignment, CalibratedCamera, TrialReport};
 use gpu::PassTiming;

@@ -9,15 +9,12 @@
 //! # Ok::<(), trainer::Error>(())
 //! ```
 
-mod aabb;
 mod aligned;
 mod bounds;
-pub mod checkpoint;
-pub mod edits;
 mod error;
 pub mod eval;
 mod failed_model;
-mod initial_points;
+pub mod floaters;
 mod keyframe_signature;
 pub mod loss;
 #[cfg(test)]
@@ -38,7 +35,6 @@ mod pending;
 mod random;
 mod registry;
 pub mod request;
-pub mod spherical_harmonics;
 pub mod splat;
 #[cfg(test)]
 mod test_scenes;
@@ -46,13 +42,10 @@ mod test_scenes;
 pub mod tsdf;
 mod view;
 
-pub use aabb::Aabb;
 pub use aligned::{Aligned, CorrectedKeyframe, Recalibrate, ResumedModel};
 pub use bounds::Bounds;
-pub use edits::Edits;
 pub use error::Error;
 pub use failed_model::FailedModel;
-pub use initial_points::InitialPoints;
 pub use method::{Method, Progress};
 pub use model_chunks::{
     ChunkData, ChunkLayout, MAX_MESH_COUNT, ModelChunk, ModelChunks, PendingChunks,
@@ -62,6 +55,6 @@ pub use model_spec::{
     KeyframeId, LoadedModel, ModelSpec, Resumed, load, resume, resume_without_missing,
 };
 pub use packing::{JPEG_QUALITY, PackedDepth, PackedPicture, Packing, QueuedPicture, Rendered};
-pub use pending::Pending;
+pub use pending::{Pending, PendingCheckpoint};
 pub use registry::ModelKind;
 pub use request::{Picture, Projection, RenderRequest};

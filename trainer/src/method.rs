@@ -1,15 +1,15 @@
 //! The interface of all scene models.
 
 use crate::bounds::Bounds;
-use crate::checkpoint::PendingCheckpoint;
-use crate::edits::{Edits, PendingFloaters};
-use crate::initial_points::InitialPoints;
+use crate::floaters::PendingFloaters;
 use crate::model_chunks::PendingChunks;
+use crate::pending::PendingCheckpoint;
 use crate::{Error, Packing, Picture, QueuedPicture, RenderRequest, Rendered};
 use calibration::{Alignment, CalibratedCamera, CameraCorrection, TrialReport};
 use gpu::PassTiming;
 use keyframe::Keyframe;
 use kinematics::Stamp;
+use model_files::{Edits, InitialPoints};
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;

@@ -1,12 +1,12 @@
 //! Registry entry of a method: its names, files and options, and functions that create, resume and
 //! load its models.
 
-use crate::checkpoint::Checkpoint;
 use crate::model_options::ModelOptions;
 use crate::{Error, Method, ResumedModel};
 use calibration::ParamSet;
 use gpu::Gpu;
 use keyframe::Keyframe;
+use model_files::checkpoint::Checkpoint;
 use serde_json::Value;
 use std::path::Path;
 use std::sync::Arc;

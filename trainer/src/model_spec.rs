@@ -1,12 +1,13 @@
 //! Creates, resumes and loads models of any method.
 
-use crate::checkpoint::Checkpoint;
 use crate::model_options::{CommonOptions, MethodOptions, ModelOptions};
 use crate::registry::ModelKind;
-use crate::{Edits, Error, Method};
+use crate::{Error, Method};
 use gpu::Gpu;
 use keyframe::Keyframe;
 use kinematics::Stamp;
+use model_files::Edits;
+use model_files::checkpoint::Checkpoint;
 use serde::Deserialize;
 use serde_json::Value;
 use std::path::Path;

@@ -1,10 +1,14 @@
 //! Data that is being read from the GPU or encoded.
 
 use crate::Error;
+use model_files::checkpoint::Checkpoint;
 use std::fmt::{Debug, Formatter};
 
 /// A result that another thread can wait for.
 pub struct Pending<T>(Box<dyn FnOnce() -> Result<T, Error> + Send>);
+
+/// Training state that is being read back from the GPU. Training may continue meanwhile.
+pub type PendingCheckpoint = Pending<Checkpoint>;
 
 impl<T> Pending<T> {
     /// Wraps a function that waits for the result.

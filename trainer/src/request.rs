@@ -1,10 +1,9 @@
 //! Requests for pictures of a model, and the rendered pictures.
 
-use crate::aabb::Aabb;
-use crate::edits::Edits;
 use gpu::Buffer;
 use keyframe::Shutter;
 use kinematics::{Stamp, Transform};
+use model_files::{Aabb, Edits};
 use std::sync::Arc;
 
 /// How directions map to pixels.

@@ -2,7 +2,7 @@
 
 use crate::pictures::view_request::{InvalidRequest, checked_box};
 use crate::session::protocol::{EditKind, EditMessage};
-use trainer::Aabb;
+use model_files::Aabb;
 
 /// What an operator wants to change.
 #[derive(Clone, Copy, Debug, PartialEq)]

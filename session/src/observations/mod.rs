@@ -6,11 +6,12 @@ use background::Task;
 use keyframe::{DepthMap, Keyframe};
 use kinematics::{Stamp, Transform, transform};
 use map::PosedDepth;
+use model_files::Edits;
 use std::collections::btree_map::Entry;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
-use trainer::{Edits, Picture, Projection, RenderRequest};
+use trainer::{Picture, Projection, RenderRequest};
 use viz::{Hub, KeyframePose};
 
 /// Maximum width of the depth maps. A cell of the map then meets several rays of most keyframes.

@@ -7,10 +7,11 @@ use crate::checkpoints::Snapshot;
 use crate::evaluate::Scores;
 use crate::next_commands::{DataSource, SavedModel};
 use crate::{camera_list, run_folder, viewer};
+use model_files::Edits;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use trainer::{Edits, Method, ModelKind};
+use trainer::{Method, ModelKind};
 use viz::Hub;
 
 /// A trained model that has been saved and scored and is still in GPU memory.

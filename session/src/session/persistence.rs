@@ -8,9 +8,9 @@ use crate::recovery::Recovery;
 use gpu::Gpu;
 use keyframe::{DepthMap, Keyframe};
 use kinematics::Stamp;
+use model_files::checkpoint::Checkpoint;
 use std::path::Path;
 use std::sync::Arc;
-use trainer::checkpoint::Checkpoint;
 use trainer::{Method, Resumed};
 
 /// Checkpoints, decision log and recovery data of a session.

@@ -6,8 +6,7 @@ use gpu::{GpuOptions, PassTiming};
 use keyframe::Split;
 use kinematics::Transform;
 use std::path::Path;
-use trainer::Error;
-use trainer::checkpoint::PendingCheckpoint;
+use trainer::{Error, PendingCheckpoint};
 
 const SIZE_PX: [u32; 2] = [4, 2];
 const N_TESTS: u8 = 5;

@@ -3,6 +3,8 @@
 //! - [`data_folder`] finds real data, [`skip`] reports a test that cannot run on this machine.
 //! - [`Stalls`] measures when the machine could not run a test, so that deadlines of real protocols
 //!   can exclude this time.
+//! - `wire_difference` compares emulated samples with those that drivers received (feature
+//!   `recordings`).
 //! - `browser` drives headless Chromium, and `silhouette` compares robots in its screenshots
 //!   (feature `browser`).
 //!
@@ -21,6 +23,8 @@ mod data;
 pub mod silhouette;
 mod skip;
 mod stalls;
+#[cfg(feature = "recordings")]
+pub mod wire_difference;
 
 pub use data::data_folder;
 pub use skip::{is_demanded, skip};

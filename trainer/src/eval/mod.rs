@@ -4,13 +4,15 @@ mod depth;
 #[cfg(feature = "lpips")]
 mod lpips;
 #[cfg(not(feature = "lpips"))]
-#[path = "no_lpips.rs"]
-mod lpips;
+mod no_lpips;
 mod psnr;
 mod ssim;
 
 pub use depth::{SurfaceError, depth_rmse_m, surface_error};
+#[cfg(feature = "lpips")]
 pub use lpips::Lpips;
+#[cfg(not(feature = "lpips"))]
+pub use no_lpips::Lpips;
 pub use psnr::psnr;
 pub use ssim::ssim;
 

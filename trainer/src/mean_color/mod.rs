@@ -3,11 +3,11 @@
 //! It is registered like any other method but needs no kernels, so it also serves as a minimal
 //! example of a method.
 
-use crate::checkpoint::{Checkpoint, PendingCheckpoint};
 use crate::keyframe_signature::{self, KeyframeSignature};
 use crate::method_entry::MethodEntry;
 use crate::model_metadata::METADATA_FILE;
 use crate::model_options::{MethodOptions, ModelOptions, default_options};
+use crate::pending::PendingCheckpoint;
 use crate::{
     Aligned, CorrectedKeyframe, Error, Method, Picture, Progress, Recalibrate, RenderRequest,
 };
@@ -16,6 +16,7 @@ use calibration::{CalibratedCamera, ParamSet, TrialReport};
 use gpu::PassTiming;
 use keyframe::{Keyframe, Split};
 use kinematics::Stamp;
+use model_files::checkpoint::Checkpoint;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 use std::sync::Arc;

@@ -12,12 +12,12 @@ use super::reference::network::Network;
 use super::reference::pose::ImagePose;
 use super::reference::ray as reference;
 use super::reference::scene::{EMBEDDING_DIM, Ray, WEIGHTS, field, gradient, ray, samples};
-use super::reference::space::contract;
 use crate::mismatches::Mismatches;
 use crate::optim::reference::{Adam, Moments};
-use gpu::testing::test_gpu_with;
 use gpu::{Buffer, Gpu, GpuOptions, Passes};
+use gpu::testing::test_gpu_with;
 use kinematics::{f32_of, f32s_of};
+use model_files::contraction::contract;
 
 /// Enough rays for more samples than one partial sum covers.
 const N_RAYS: u32 = 90;

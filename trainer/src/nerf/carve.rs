@@ -2,9 +2,9 @@
 
 use super::extent::Extent;
 use super::reference::march::March;
-use super::reference::space::largest;
 use keyframe::{DepthMap, Keyframe};
 use kinematics::Transform;
+use model_files::contraction::largest;
 use nalgebra::Vector3;
 use rayon::prelude::*;
 

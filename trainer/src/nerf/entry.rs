@@ -2,13 +2,13 @@
 
 use super::files::FIELD_FILE;
 use super::{NerfModel, NerfOptions};
-use crate::checkpoint::Checkpoint;
 use crate::method_entry::MethodEntry;
 use crate::model_options::{MethodOptions, ModelOptions, default_options};
 use crate::{Aligned, Error, Method, ResumedModel};
 use calibration::ParamSet;
 use gpu::Gpu;
 use keyframe::Keyframe;
+use model_files::checkpoint::Checkpoint;
 use std::path::Path;
 use std::sync::Arc;
 

@@ -1,10 +1,10 @@
 //! Extent of the scene, estimated from the keyframes.
 
-use crate::Aabb;
 use crate::view::Camera;
 use keyframe::{Keyframe, Shutter};
 use kinematics::quantile::{Rank, quantile, trimmed_range};
 use kinematics::{Transform, Twist};
+use model_files::Aabb;
 use nalgebra::{Matrix3, Matrix4, Point3, Vector3};
 use serde::{Deserialize, Serialize};
 

@@ -6,12 +6,12 @@ use super::params::{self, Batch, OccupancyUpdate, Span};
 use super::passes::FieldPasses;
 use super::reference::grid::GridShape;
 use super::reference::march::March;
-use super::reference::space::contract;
 use crate::mismatches::Mismatches;
 use crate::random::F32Random;
 use gpu::Passes;
 use gpu::testing::test_gpu;
 use kinematics::{f32_of, f32s_of};
+use model_files::contraction::contract;
 
 const N_CELLS: u32 = 64;
 /// More rays than a workgroup scans at once.

@@ -10,9 +10,9 @@ use super::options::{NerfBudget, NerfOptions};
 use super::rays::{self, RayImage, RaySampling};
 use super::sizes::Sizes;
 use crate::aligned::replacement;
-use crate::checkpoint::PendingCheckpoint;
 use crate::model_options::ModelOptions;
 use crate::packing::{Format, Output};
+use crate::pending::PendingCheckpoint;
 use crate::view::Camera;
 use crate::{
     Bounds, CorrectedKeyframe, Error, Method, Packing, Picture, Progress, Recalibrate,

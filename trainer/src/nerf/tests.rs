@@ -7,19 +7,19 @@ use super::rays::{self, RayImage, RaySampling};
 use super::reference::march::March;
 use super::sizes::Sizes;
 use super::{NerfModel, params};
-use crate::edits::{Edit, Edits};
 use crate::eval::{self, PixelPair};
 use crate::model_options::{CommonOptions, ModelOptions};
 use crate::test_scenes as scenes;
 use crate::{
-    Aabb, CorrectedKeyframe, Error, Method, ModelKind, Picture, Projection, Recalibrate,
-    RenderRequest,
+    CorrectedKeyframe, Error, Method, ModelKind, Picture, Projection, Recalibrate, RenderRequest,
 };
 use calibration::{Alignment, CameraCorrection, CameraRefinement, ParamSet, rigid_transform};
 use gpu::Gpu;
 use gpu::testing::test_gpu;
 use keyframe::{DepthMap, Keyframe, Split};
 use kinematics::{Stamp, Transform, Twist};
+use model_files::Aabb;
+use model_files::edits::{Edit, Edits};
 use nalgebra::{Point3, Vector3};
 use std::sync::Arc;
 
@@ -129,7 +129,7 @@ fn psnr(picture: &Picture, keyframe: &Keyframe) -> f64 {
         .unwrap()
 }
 
-fn state(model: &mut NerfModel) -> crate::checkpoint::Checkpoint {
+fn state(model: &mut NerfModel) -> model_files::checkpoint::Checkpoint {
     model.checkpoint().unwrap().finish().unwrap()
 }
 
@@ -349,7 +349,7 @@ fn occupancy_cells_are_refined() {
         parts.push(state(&mut whole));
     }
     train_until(&mut whole, END);
-    let n_bytes = |checkpoint: &crate::checkpoint::Checkpoint| {
+    let n_bytes = |checkpoint: &model_files::checkpoint::Checkpoint| {
         checkpoint.array("cell_occupancy", 4 << 24).map(<[u8]>::len)
     };
     assert!(

@@ -157,7 +157,8 @@ fn every_method_resumes_without_missing_keyframes() {
 #[test]
 fn checkpoint_of_an_unknown_method_is_rejected() {
     let gpu = test_gpu();
-    let checkpoint = crate::checkpoint::Checkpoint::new("mesh", serde_json::json!({}), Vec::new());
+    let checkpoint =
+        model_files::checkpoint::Checkpoint::new("mesh", serde_json::json!({}), Vec::new());
     assert!(
         matches!(resume(gpu, &checkpoint, &[]), Err(Error::UnknownMethod { name }) if name == "mesh")
     );

@@ -4,7 +4,7 @@
 // groups that depend on the kind of edit. For a box, they are its corners, and the last word is 0. For cells, they are
 // the number of cells along an axis, the group at which ranges of cells begin, and in the last word their number.
 //
-// twin      edits/mod.rs
+// twin      model-files/src/edits/mod.rs
 
 const GROUPS_PER_EDIT = 5u;
 

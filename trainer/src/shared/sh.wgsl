@@ -1,6 +1,6 @@
 // sh: real spherical harmonics up to degree 3, in the order and with the signs of Kerbl et al. 2023.
 //
-// twin      spherical_harmonics.rs
+// twin      model-files/src/spherical_harmonics.rs
 
 const SH_0 = 0.28209479177387814;
 const SH_1 = 0.4886025119029199;

@@ -1,6 +1,6 @@
 // space: contracts the world to the unit cube. World coordinates are in units of the scene radius around its center.
 
-// twin: nerf/reference/space.rs
+// twin: model-files/src/contraction.rs
 fn contract(at: vec3f) -> vec3f {
     let size = abs(at);
     let largest = max(size.x, max(size.y, size.z));

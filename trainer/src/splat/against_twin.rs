@@ -4,7 +4,6 @@
     reason = "channels and axes index several arrays at once"
 )]
 
-use super::arrays::SplatArrays;
 use super::buffers::{ImageBuffers, Scratch, ScratchSize, SplatBuffers, n_bins, n_tiles};
 use super::camera_params::CameraParams;
 use super::kernels::{DrawPipelines, TrainPipelines};
@@ -19,6 +18,7 @@ use gpu::testing::test_gpu_with;
 use gpu::{Buffer, Gpu, GpuOptions, Passes};
 use keyframe::{Keyframe, Shutter, Split};
 use kinematics::{Stamp, Transform, Twist, f32_of};
+use model_files::splat::arrays::SplatArrays;
 use nalgebra::Vector3;
 use std::sync::Arc;
 

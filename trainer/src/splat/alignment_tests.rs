@@ -1,13 +1,14 @@
 //! Tests of training with alignment: the correction is applied to every camera, and resuming from a
 //! checkpoint is bit-exact.
 
-use super::{SplatOptions, SplatTrainer, ply};
+use super::{SplatOptions, SplatTrainer};
 use crate::{Aligned, CommonOptions, Method, ModelOptions};
 use calibration::scenes::{Miscalibration, capture, remaining, wrong_extrinsics};
 use calibration::{CameraRefinement, ParamSet};
 use gpu::Gpu;
 use gpu::testing::test_gpu;
 use keyframe::{Keyframe, Split};
+use model_files::splat::ply;
 use std::sync::Arc;
 
 const N_PLANNED_STEPS: u64 = 120;

@@ -5,7 +5,6 @@
 //! noise, the loss is L1, and each step updates every splat. [`Losses::Training`] adds the other
 //! losses of training with depth.
 
-use super::arrays::SplatArrays;
 use super::buffers::{ImageBuffers, Scratch, ScratchSize, SplatBuffers, n_bins, n_tiles};
 use super::few_images::Scarcity;
 use super::kernels::{DrawPipelines, TrainPipelines};
@@ -18,6 +17,7 @@ use crate::{Error, Packing};
 use gpu::{Buffer, Gpu, PassTiming, Passes};
 use kinematics::quantile::{Rank, quantile};
 use kinematics::{Transform, f32_of};
+use model_files::splat::arrays::SplatArrays;
 use serde::Serialize;
 use std::cell::RefCell;
 use std::sync::Arc;
@@ -200,7 +200,7 @@ impl KernelBench {
         let draw = DrawPipelines::new(&gpu)?;
         let train = TrainPipelines::new(&gpu)?;
         let n_splats = u32::try_from(cloud.n_splats())
-            .map_err(|_| Error::SplatArrays("more than 2^32 splats".to_owned()))?;
+            .map_err(|_| model_files::Error::SplatArrays("more than 2^32 splats".to_owned()))?;
         let mut splats = SplatBuffers::new(&gpu, n_splats, cloud.sh_degree)?;
         splats.append(&gpu, cloud);
         let n_pixels = size_px[0] * size_px[1];

@@ -1,7 +1,7 @@
 //! Bounds of a cloud of splats, without outliers.
 
-use super::arrays::SplatArrays;
 use crate::Bounds;
+use model_files::splat::arrays::SplatArrays;
 
 /// Minimum fraction of opaque splats. Below it, the bounds are computed from all splats: a few
 /// opaque ones may be outliers. At the start of training without depth, all are transparent.

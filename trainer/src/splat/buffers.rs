@@ -1,11 +1,11 @@
 //! GPU buffers of the model, of one view's intersections, and of one picture.
 
-use super::arrays::SplatArrays;
 use super::kernels::DrawPipelines;
 use super::params::{Capacity, Model, TILE_PX, status};
 use crate::Error;
-use gpu::sort::SortBuffers;
 use gpu::{Buffer, Gpu, Passes, PendingRead};
+use gpu::sort::SortBuffers;
+use model_files::splat::arrays::SplatArrays;
 
 /// Splats per block, consecutive in depth. This constant and the next two are those of
 /// shared/bins.wgsl.

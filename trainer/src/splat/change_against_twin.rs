@@ -1,7 +1,6 @@
 //! Tests of the kernels that bin, update and grow splats, against their f64 twins.
 
 use super::against_twin::{KernelFixture, TargetBuffers, arrays_of, target_of, unambiguous_pixels};
-use super::arrays::SplatArrays;
 use super::params::{Growth, Rule, status};
 use super::passes::{GrowthBuffers, grow};
 use super::reference::change::{self, SplatMoments};
@@ -10,6 +9,7 @@ use crate::loss::reference as loss_reference;
 use crate::mismatches::Mismatches;
 use gpu::{Gpu, GpuOptions, Passes};
 use kinematics::f32_of;
+use model_files::splat::arrays::SplatArrays;
 
 /// A small scene of splats with SH degree 3 and with values that f32 represents exactly.
 fn full_degree_scene(seed: u64, n: usize) -> Vec<Splat> {

@@ -2,11 +2,11 @@
 
 use super::SplatTrainer;
 use super::training_tests::{keyframes, options, train};
-use crate::checkpoint::Checkpoint;
 use crate::{Error, Method};
 use gpu::Gpu;
 use gpu::testing::test_gpu;
 use keyframe::Keyframe;
+use model_files::checkpoint::Checkpoint;
 use std::sync::Arc;
 
 /// Steps at which training stops: before the first change of splat count and SH degree, and between
@@ -223,7 +223,12 @@ fn different_data_and_invalid_states_are_rejected() {
         let mut other = checkpoint.clone();
         change(&mut other);
         let error = resume_error(&other, &keyframes);
-        assert!(matches!(error, Error::CheckpointState { .. }), "{error}");
+        let is_invalid_state = matches!(
+            error,
+            Error::CheckpointState { .. }
+                | Error::ModelFile(model_files::Error::CheckpointState { .. })
+        );
+        assert!(is_invalid_state, "{error}");
         error.to_string()
     };
     assert!(

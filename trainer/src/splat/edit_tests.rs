@@ -1,15 +1,18 @@
 //! Erased splats: pictures, chunks and exports without them, and floaters.
 
-use super::arrays::SplatArrays;
+use super::SplatTrainer;
 use super::training_tests::{keyframes, options, pose, request, scene, train};
-use super::{SplatTrainer, file, ply};
-use crate::edits::{Edit, Edits, Floaters};
+use crate::floaters::Floaters;
 use crate::method_entry::{ExportRequest, ExportWriter};
-use crate::{Aabb, ChunkLayout, Error, Method, ModelKind, ModelOptions, Picture};
+use crate::{ChunkLayout, Error, Method, ModelKind, ModelOptions, Picture};
 use gpu::Gpu;
 use gpu::testing::test_gpu;
 use kinematics::random::Random;
 use kinematics::{Transform, f32_of};
+use model_files::Aabb;
+use model_files::edits::{Edit, Edits};
+use model_files::splat::{file, ply};
+use model_files::splat::arrays::SplatArrays;
 use nalgebra::Vector3;
 use std::sync::Arc;
 
@@ -247,7 +250,7 @@ fn background_far_away_is_not_a_floater() {
 #[ignore = "measures time"]
 fn time_of_a_search() {
     for n_splats in [100_000, 1_000_000] {
-        let arrays = super::cloud::scan_cloud(n_splats, 3);
+        let arrays = model_files::splat::cloud::scan_cloud(n_splats, 3);
         let began = std::time::Instant::now();
         let found = super::floaters::floaters(&arrays);
         eprintln!(

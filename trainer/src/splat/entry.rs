@@ -1,15 +1,15 @@
 //! Registers splats as a method.
 
-use super::file::{self, EXTENSIONS, Format, IN_FOLDER, UNSUPPORTED};
 use super::{SplatOptions, SplatTrainer};
-use crate::checkpoint::Checkpoint;
-use crate::edits::Edits;
 use crate::method_entry::{Export, ExportRequest, ExportWriter, Exported, MethodEntry, SingleFile};
 use crate::model_options::{MethodOptions, ModelOptions, default_options};
 use crate::{Aligned, Error, Method, ResumedModel};
 use calibration::ParamSet;
 use gpu::Gpu;
 use keyframe::Keyframe;
+use model_files::Edits;
+use model_files::checkpoint::Checkpoint;
+use model_files::splat::file::{self, EXTENSIONS, Format, IN_FOLDER, UNSUPPORTED};
 use std::path::Path;
 use std::sync::Arc;
 
@@ -114,9 +114,9 @@ fn write(request: &ExportRequest<'_>, format: Format) -> Result<Exported, Error>
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::splat::arrays::SplatArrays;
-    use crate::splat::ply;
     use gpu::testing::test_gpu;
+    use model_files::splat::arrays::SplatArrays;
+    use model_files::splat::ply;
 
     #[test]
     fn saved_model_above_the_training_limit_is_loaded_completely() {

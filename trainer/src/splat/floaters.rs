@@ -5,11 +5,12 @@
 //! connects the cells that it covers. Splats that are too faint to occupy a cell are floaters, too,
 //! unless they are next to a large part.
 
-use super::arrays::SplatArrays;
 use super::bounds::bounds;
 use crate::Bounds;
-use crate::edits::{CellGrid, CellLabels, CellMask, Floaters, Groups};
+use crate::floaters::{CellLabels, CellMask, Floaters, Groups};
 use kinematics::f32_of;
+use model_files::edits::CellGrid;
+use model_files::splat::arrays::SplatArrays;
 use nalgebra::{Quaternion, UnitQuaternion, Vector3};
 
 /// Cells along an axis: cells within the radius of the scene are 2 % of it wide. Smaller cells

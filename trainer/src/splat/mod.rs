@@ -4,8 +4,6 @@
 mod against_twin;
 #[cfg(test)]
 mod alignment_tests;
-mod antimatter15;
-pub mod arrays;
 mod arrival_gains;
 pub mod bench;
 mod bounds;
@@ -16,12 +14,10 @@ mod change_against_twin;
 #[cfg(test)]
 mod checkpoint_tests;
 mod chunks;
-pub mod cloud;
 #[cfg(test)]
 mod edit_tests;
 mod entry;
 mod few_images;
-mod file;
 mod floaters;
 pub mod kernels;
 mod nearest;
@@ -30,12 +26,10 @@ mod non_finite_tests;
 mod options;
 mod params;
 mod passes;
-pub mod ply;
 pub mod reference;
 mod schedule;
 mod seed;
 mod snapshot;
-pub mod spz;
 mod trainer;
 #[cfg(test)]
 mod training_tests;

@@ -2,12 +2,12 @@
 //! parameter.
 
 use super::SplatTrainer;
-use super::cloud::synthetic_cloud;
 use super::training_tests::{keyframes, options, test_psnr, train};
 use crate::Method;
 use gpu::testing::test_gpu;
 use keyframe::{DepthMap, Keyframe};
 use kinematics::{Stamp, Transform, Twist, f32_of};
+use model_files::splat::cloud::synthetic_cloud;
 use nalgebra::{Point3, Vector3};
 use std::sync::Arc;
 

@@ -5,13 +5,13 @@
     reason = "pixels, cells and random draws are rounded down on purpose, within ranges that are checked"
 )]
 
-use super::arrays::SplatArrays;
 use super::nearest::mean_spacings_m;
 use super::views::FAR_M;
-use crate::InitialPoints;
 use keyframe::{DepthMap, Keyframe};
 use kinematics::random::Random;
 use kinematics::{f32_of, f32s_of};
+use model_files::InitialPoints;
+use model_files::splat::arrays::SplatArrays;
 use nalgebra::{Matrix3, Point3, Rotation3, UnitQuaternion, Vector3};
 use rayon::prelude::*;
 use std::collections::HashSet;

@@ -17,30 +17,27 @@ mod seeding;
 mod training;
 mod view_set;
 
-use super::arrays::SplatArrays;
 use super::bounds::bounds;
 use super::chunks::{Chunker, MAX_SH_DEGREE};
 use super::few_images::Scarcity;
-use super::file::IN_FOLDER;
 use super::floaters::floaters;
 use super::kernels::TrainPipelines;
 use super::options::SplatOptions;
 use super::params::Camera;
 #[cfg(test)]
 use super::params::status;
-use super::ply;
 use super::schedule::Schedule;
 use super::seed;
+use crate::floaters::PendingFloaters;
 use super::trials::{SplatTrials, ValidationImage};
-use crate::checkpoint::PendingCheckpoint;
-use crate::edits::{Edits, PendingFloaters};
 use crate::model_chunks::PendingChunks;
 use crate::model_metadata::{METADATA_FILE, read_metadata};
 use crate::model_options::{MethodOptions, ModelOptions};
 use crate::packing::{Format, Output};
+use crate::pending::PendingCheckpoint;
 use crate::{
-    Bounds, Error, InitialPoints, Method, Packing, Picture, Progress, Projection, QueuedPicture,
-    RenderRequest, Rendered,
+    Bounds, Error, Method, Packing, Picture, Progress, Projection, QueuedPicture, RenderRequest,
+    Rendered,
 };
 use calibration::{Alignment, CalibratedCamera, CameraCorrection, Trial, TrialReport};
 use gpu::{Gpu, PassTiming};
@@ -48,6 +45,10 @@ use keyframe::{Keyframe, Split};
 use kinematics::Stamp;
 use lazy_pipelines::LazyPipelines;
 use model::TrainedModel;
+use model_files::splat::arrays::SplatArrays;
+use model_files::splat::file::IN_FOLDER;
+use model_files::splat::ply;
+use model_files::{Edits, InitialPoints};
 use optimizer::Optimizer;
 use parking_lot::Mutex;
 use recorder::Recorder;

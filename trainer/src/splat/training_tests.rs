@@ -1,18 +1,19 @@
 //! Tests of the whole trainer: quality on test views, reproducibility, and limits of memory and
 //! splats.
 
-use super::arrays::SplatArrays;
-use super::cloud::synthetic_cloud;
 use super::{SplatOptions, SplatTrainer};
 use crate::eval::{PixelPair, psnr};
 use crate::model_options::{CommonOptions, ModelOptions};
 use crate::view::Camera;
-use crate::{Aabb, InitialPoints, Method, Packing, Projection, RenderRequest, Rendered};
+use crate::{Method, Packing, Projection, RenderRequest, Rendered};
 use calibration::{CameraRefinement, ParamSet};
 use gpu::Gpu;
 use gpu::testing::test_gpu;
 use keyframe::{DepthMap, Keyframe, Split};
 use kinematics::{Stamp, Transform, f32s_of};
+use model_files::{Aabb, InitialPoints};
+use model_files::splat::arrays::SplatArrays;
+use model_files::splat::cloud::synthetic_cloud;
 use nalgebra::{Point3, Vector3};
 use std::sync::Arc;
 

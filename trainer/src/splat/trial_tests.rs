@@ -5,11 +5,11 @@ use super::training_tests::{n_keyframes, options};
 use super::trials::MAX_SCORED;
 use super::{SplatTrainer, TrialSteps};
 use crate::Method;
-use crate::checkpoint::Checkpoint;
 use calibration::{CameraRefinement, ParamSet, Trial};
 use gpu::Gpu;
 use gpu::testing::test_gpu;
 use keyframe::{Keyframe, Split};
+use model_files::checkpoint::Checkpoint;
 use std::sync::Arc;
 
 const START: u64 = 250;

@@ -1,13 +1,15 @@
 //! Erased parts of a distance field: pictures, meshes and exports without them, and floaters.
 
-use super::mesh::{Mesh, floaters};
+use super::mesh::floaters;
 use super::tests::{BALL_CENTER, ball_on_floor, fused_model, gpu, same, view_of};
 use super::{TsdfModel, TsdfOptions};
-use crate::edits::{Edit, Edits};
 use crate::method_entry::{ExportRequest, ExportWriter};
 use crate::test_scenes::{self as scenes, TestShape};
-use crate::{Aabb, Method, ModelKind, RenderRequest};
+use crate::{Method, ModelKind, RenderRequest};
 use kinematics::Transform;
+use model_files::Aabb;
+use model_files::edits::{Edit, Edits};
+use model_files::mesh::Mesh;
 use nalgebra::{Point3, Vector3};
 use std::sync::Arc;
 

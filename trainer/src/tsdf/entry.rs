@@ -1,16 +1,16 @@
 //! Registers distance fields as a method.
 
 use super::files::{BLOCKS_FILE, MESH_GLB, MESH_PLY};
-use super::mesh::{Mesh, write_glb, write_ply};
 use super::{TsdfModel, TsdfOptions};
-use crate::checkpoint::Checkpoint;
-use crate::edits::Edits;
 use crate::method_entry::{Export, ExportRequest, ExportWriter, Exported, MethodEntry};
 use crate::model_options::{MethodOptions, ModelOptions, default_options};
 use crate::{Aligned, Error, Method, ResumedModel};
 use calibration::ParamSet;
 use gpu::Gpu;
 use keyframe::Keyframe;
+use model_files::Edits;
+use model_files::checkpoint::Checkpoint;
+use model_files::mesh::{Mesh, write_glb, write_ply};
 use std::path::Path;
 use std::sync::Arc;
 
@@ -77,7 +77,7 @@ fn load(gpu: Arc<Gpu>, folder: &Path) -> Result<Box<dyn Method>, Error> {
 fn export(
     gpu: Arc<Gpu>,
     request: &ExportRequest<'_>,
-    write: fn(&Path, &Mesh) -> Result<(), Error>,
+    write: fn(&Path, &Mesh) -> Result<(), model_files::Error>,
 ) -> Result<Exported, Error> {
     let mesh = TsdfModel::load(gpu, request.model)?.mesh_without(&Edits::read(request.model)?)?;
     // Simplification may merge all vertices into one. An empty file would look like a success.

@@ -12,7 +12,7 @@ mod entry;
 mod files;
 pub mod kernels;
 mod marching;
-pub mod mesh;
+mod mesh;
 mod mesh_buffers;
 mod model;
 mod options;

@@ -14,16 +14,16 @@ use super::bounds::bounds;
 use super::capacity::{self, BYTES_PER_BLOCK, BYTES_PER_CHUNK};
 use super::chosen_grid::VoxelGrid;
 use super::kernels::Pipelines;
-use super::mesh::{self, Mesh};
+use super::mesh;
 use super::options::TsdfOptions;
 use super::params::status;
 use super::passes::Canvas;
 use crate::Bounds;
-use crate::checkpoint::PendingCheckpoint;
-use crate::edits::{Edits, PendingFloaters};
+use crate::floaters::PendingFloaters;
 use crate::model_chunks::PendingChunks;
 use crate::model_options::ModelOptions;
 use crate::packing::{Format, Reader};
+use crate::pending::PendingCheckpoint;
 use crate::view::ErasedSpace;
 use crate::{
     CorrectedKeyframe, Error, Method, Packing, Picture, Progress, Recalibrate, RenderRequest,
@@ -40,6 +40,8 @@ use keyframe::{Keyframe, Split};
 use keyframe_queue::KeyframeQueue;
 use kinematics::Stamp;
 use meshing::Meshing;
+use model_files::Edits;
+use model_files::mesh::Mesh;
 use std::path::Path;
 use std::sync::Arc;
 use std::time::Instant;

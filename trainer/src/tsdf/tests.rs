@@ -1,15 +1,16 @@
 //! Tests of the whole model: rendering, carving, memory limits, saving and resuming.
 
 use super::{TsdfModel, TsdfOptions};
-use crate::checkpoint::Checkpoint;
 use crate::test_scenes::{self as scenes, SIZE_PX, TestShape};
-use crate::{Aabb, Error, Method, ModelKind, ModelOptions, Picture, Projection, RenderRequest};
+use crate::{Error, Method, ModelKind, ModelOptions, Picture, Projection, RenderRequest};
 use gpu::Gpu;
 use gpu::testing::test_gpu;
 use keyframe::Keyframe;
 use kinematics::quantile::{Rank, quantile};
 use kinematics::random::Random;
 use kinematics::{Stamp, Transform, f32_of};
+use model_files::Aabb;
+use model_files::checkpoint::Checkpoint;
 use nalgebra::{Point3, Vector3};
 use std::sync::Arc;
 
@@ -487,7 +488,7 @@ fn saved_model_renders_identically() {
     std::fs::write(folder.path().join("field.blocks"), b"nonsense").unwrap();
     assert!(matches!(
         TsdfModel::load(gpu(), folder.path()),
-        Err(Error::Checkpoint { .. })
+        Err(Error::ModelFile(model_files::Error::Checkpoint { .. }))
     ));
 }
 

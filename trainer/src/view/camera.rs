@@ -1,8 +1,9 @@
 //! The camera of a view, and its uniform buffer.
 
-use crate::{Aabb, Edits, RenderRequest};
+use crate::RenderRequest;
 use keyframe::Shutter;
 use kinematics::{Transform, f32_of, f32s_of};
+use model_files::{Aabb, Edits};
 use std::sync::Arc;
 
 /// Edge of a tile, pixels, as in Kerbl et al. 2023. Larger tiles sort fewer entries; in smaller

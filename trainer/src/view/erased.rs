@@ -1,10 +1,16 @@
 //! Erased space on the GPU.
 
 use crate::Error;
-use crate::edits::Edits;
 use gpu::{Buffer, Gpu, Passes};
-use nalgebra::Matrix4;
+use kinematics::{f32_of, f32s_of};
+use model_files::{Aabb, Edits};
+use model_files::edits::{CellGrid, CellSet, Edit};
+use nalgebra::{Matrix4, Vector3};
 use std::sync::Arc;
+
+/// Words of an edit in [`words`], in groups of four: three rows of a transform, and two groups that
+/// depend on the kind of edit.
+const GROUPS_PER_EDIT: usize = 5;
 
 /// The buffers of shared/erased.wgsl: views without edits have one of their own, so that
 /// alternating views with and without edits replace neither.
@@ -76,15 +82,83 @@ impl ErasedSpace {
 fn buffer(gpu: &Gpu, edits: &Edits, world_from_drawn: &Matrix4<f64>) -> Result<Buffer, Error> {
     Ok(gpu.storage_with(
         "erased",
-        bytemuck::cast_slice(&edits.words(world_from_drawn)),
+        bytemuck::cast_slice(&words(edits, world_from_drawn)),
     )?)
+}
+
+/// The data of shared/erased.wgsl, for kernels whose points are in a frame, and in units, other
+/// than the world's.
+///
+/// * `world_from_drawn`: maps points of the kernel to world, meters.
+fn words(edits: &Edits, world_from_drawn: &Matrix4<f64>) -> Vec<[u32; 4]> {
+    // All edits have the same size, so that a kernel finds each one by its index. The ranges of
+    // cells vary in number, so they follow after the last edit, which refers to them.
+    let n = u32::try_from(edits.len()).expect("at most 64");
+    let mut words = vec![[n, 0, 0, 0]];
+    let mut ranges: Vec<[u32; 4]> = Vec::new();
+    let first_range = 1 + GROUPS_PER_EDIT * edits.len();
+    for edit in edits.as_slice() {
+        words.extend(match edit {
+            Edit::Box(aabb) => box_words(aabb, world_from_drawn),
+            Edit::Cells(cells) => {
+                let first = u32::try_from(first_range + ranges.len()).unwrap_or(u32::MAX);
+                ranges.extend(range_words(cells));
+                cell_words(cells, world_from_drawn, first)
+            }
+        });
+    }
+    words.extend(ranges);
+    words
+}
+
+/// The data of a box: rows of its transform, and its corners. A last word of 0 marks a box.
+fn box_words(aabb: &Aabb, world_from_drawn: &Matrix4<f64>) -> [[u32; 4]; GROUPS_PER_EDIT] {
+    let [x, y, z] = rows(&(aabb.world_from_box.inverse().to_homogeneous() * world_from_drawn));
+    [x, y, z, corner_words(aabb.min_m), corner_words(aabb.max_m)]
+}
+
+/// A corner of a box, as bits of f32.
+fn corner_words(corner_m: [f64; 3]) -> [u32; 4] {
+    let [x, y, z] = f32s_of(corner_m).map(f32::to_bits);
+    [x, y, z, 0]
+}
+
+/// The data of a set of cells: rows of the transform to units of the radius, number of cells along
+/// an axis, the group where the ranges begin, and their number.
+fn cell_words(
+    cells: &CellSet,
+    world_from_drawn: &Matrix4<f64>,
+    first: u32,
+) -> [[u32; 4]; GROUPS_PER_EDIT] {
+    let CellGrid {
+        center_m,
+        radius_m,
+        n_cells,
+    } = *cells.grid();
+    let scale = Matrix4::new_scaling(1.0 / radius_m);
+    let [x, y, z] =
+        rows(&(scale * Matrix4::new_translation(&-Vector3::from(center_m)) * world_from_drawn));
+    let n_ranges = u32::try_from(cells.ranges().len()).unwrap_or(u32::MAX);
+    [x, y, z, [n_cells, 0, 0, first], [0, 0, 0, n_ranges]]
+}
+
+/// The ranges of a set of cells, two per group of four words.
+fn range_words(cells: &CellSet) -> impl Iterator<Item = [u32; 4]> {
+    cells.ranges().chunks(2).map(|pair| {
+        let [a, b] = pair[0];
+        let [c, d] = pair.get(1).copied().unwrap_or_default();
+        [a, b, c, d]
+    })
+}
+
+/// The upper three rows of a matrix, as bits of f32.
+fn rows(matrix: &Matrix4<f64>) -> [[u32; 4]; 3] {
+    std::array::from_fn(|row| std::array::from_fn(|column| f32_of(matrix[(row, column)]).to_bits()))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::Aabb;
-    use crate::edits::Edit;
     use gpu::testing::test_gpu;
     use kinematics::Transform;
 

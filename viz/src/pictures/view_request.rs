@@ -3,9 +3,10 @@
 use crate::pose::from_row_major;
 use crate::session::protocol::{BoxMessage, DepthFormat, Output, ProjectionMessage, RenderMessage};
 use kinematics::Transform;
+use model_files::Aabb;
 use std::sync::Arc;
 use std::time::Instant;
-use trainer::{Aabb, Projection, RenderRequest};
+use trainer::{Projection, RenderRequest};
 
 /// Maximum width and height that a client may request, pixels. It covers the screens in use, and
 /// bounds the memory for a picture: 64 MiB of colors.

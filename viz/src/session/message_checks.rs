@@ -11,7 +11,8 @@ use crate::session::protocol::{
 };
 use crate::topics::TOPICS;
 use crate::topics::subscriptions::{Subscriptions, fitted};
-use trainer::{Aabb, Projection, RenderRequest};
+use model_files::Aabb;
+use trainer::{Projection, RenderRequest};
 
 /// Handles the messages of a session, one per line, and panics if a result is inconsistent.
 pub(crate) fn check_session(session: &str) {

@@ -2,12 +2,12 @@
 
 use gpu::{Gpu, GpuOptions};
 use keyframe::scenes::{ball, floor, ring};
+use model_files::splat::arrays::SplatArrays;
+use model_files::splat::cloud::scan_cloud;
 use nalgebra::{Point3, Quaternion, UnitQuaternion, Vector3};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
-use trainer::splat::arrays::SplatArrays;
-use trainer::splat::cloud::scan_cloud;
 use trainer::splat::{SplatOptions, SplatTrainer};
 use trainer::tsdf::{TsdfModel, TsdfOptions};
 use trainer::{Method, ModelOptions, Projection, RenderRequest};

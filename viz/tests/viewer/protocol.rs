@@ -9,13 +9,14 @@ use crate::client::{Client, Received};
 use crate::robot;
 use keyframe::RangePoints;
 use kinematics::{Stamp, Transform};
+use model_files::Aabb;
 use nalgebra::{Translation3, Vector3};
 use serde_json::{Value, json};
 use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpListener, TcpStream};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
-use trainer::{Aabb, ChunkData, ChunkLayout, ModelChunk, ModelChunks};
+use trainer::{ChunkData, ChunkLayout, ModelChunk, ModelChunks};
 use viz::{
     Control, EditAction, Error, Hub, KeyframePose, LiveImage, LivePixels, ModelStatus,
     ObservationMap, ObservedCell, PendingRender, RangeScan, SceneHint, Server, ServerConfig,

@@ -2,7 +2,6 @@
 
 use super::NerfModel;
 use super::images::{FieldSnapshot, Trials};
-use crate::checkpoint::{Array, Checkpoint, PendingCheckpoint};
 use crate::keyframe_signature::{self, KeyframeSignature};
 use crate::model_metadata::{METADATA_FILE, read_metadata};
 use crate::model_options::{MethodOptions, ModelOptions};
@@ -13,11 +12,13 @@ use crate::nerf::options::NerfOptions;
 use crate::nerf::params::{IMAGE_PARAM_STRIDE, ImageParam};
 use crate::nerf::rays::RayImage;
 use crate::nerf::sizes::Sizes;
+use crate::pending::PendingCheckpoint;
 use crate::{Error, Method};
 use calibration::ParamSet;
 use calibration::TrialReport;
 use gpu::{Buffer, Gpu, PendingRead};
 use keyframe::Keyframe;
+use model_files::checkpoint::{Array, Checkpoint};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 use std::sync::Arc;

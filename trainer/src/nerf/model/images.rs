@@ -10,7 +10,6 @@
 
 use super::NerfModel;
 use crate::Error;
-use crate::checkpoint::Array;
 use crate::nerf::extent::Extent;
 use crate::nerf::field_trainer::RayColor;
 use crate::nerf::params::{EMBEDDING, IMAGE_PARAM_STRIDE};
@@ -21,6 +20,7 @@ use calibration::{
 };
 use keyframe::Keyframe;
 use kinematics::{Stamp, Transform};
+use model_files::checkpoint::Array;
 use nalgebra::{Translation3, UnitQuaternion, Vector3};
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;

@@ -2,7 +2,9 @@
 
 use super::grid::{self, GridShape, N_FEATURES};
 use super::network::Network;
-use super::space::{contract, contract_backward};
+use super::space::contract_backward;
+use model_files::contraction::contract;
+use model_files::spherical_harmonics;
 
 /// Geometry features: outputs of the first network, after the density, that are inputs of the
 /// second.
@@ -148,5 +150,5 @@ impl Field {
 
 /// Real spherical harmonics up to degree 3 of a direction of length 1, constant term first.
 pub fn harmonics(direction: [f64; 3]) -> [f64; N_DIRECTION] {
-    crate::spherical_harmonics::basis(&direction.into())
+    spherical_harmonics::basis(&direction.into())
 }

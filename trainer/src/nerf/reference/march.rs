@@ -3,7 +3,7 @@
 //! Source: occupancy of Mueller et al. 2022, appendix C; steps outside the inner cube grow to match
 //! the contraction.
 
-use super::space::contract;
+use model_files::contraction::contract;
 
 /// Parameters for walking rays; lengths are in units of the scene radius.
 #[derive(Clone, Copy, Debug, PartialEq)]

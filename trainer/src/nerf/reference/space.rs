@@ -1,19 +1,6 @@
-//! Contraction of the world to the unit cube: near space is scaled uniformly, far space is
-//! compressed.
+//! Gradient of the contraction of the world to the unit cube.
 
-/// Contracts a point, given in units of the scene radius around its center, to the unit cube. The
-/// inner cube from -1 to 1 fills the central half along each axis; everything outside maps to the
-/// surrounding shell.
-///
-/// Source: Barron et al. 2022, equation 10, with the largest coordinate in place of the length, so
-/// that cubes stay cubes.
-pub fn contract(at: [f64; 3]) -> [f64; 3] {
-    let (_, largest) = largest(at);
-    if largest <= 1.0 {
-        return at.map(|x| (x + 2.0) / 4.0);
-    }
-    at.map(|x| (x / largest * (2.0 - 1.0 / largest) + 2.0) / 4.0)
-}
+use model_files::contraction::largest;
 
 /// Backpropagates a gradient from the contracted point to the point.
 pub fn contract_backward(at: [f64; 3], upstream: [f64; 3]) -> [f64; 3] {
@@ -29,15 +16,4 @@ pub fn contract_backward(at: [f64; 3], upstream: [f64; 3]) -> [f64; 3] {
     // Moving the largest coordinate changes the factor of all three.
     gradient[axis] += along * by_max * at[axis].signum();
     gradient.map(|v| v / 4.0)
-}
-
-/// The axis with the largest absolute coordinate, and that absolute value.
-pub(crate) fn largest(point: [f64; 3]) -> (usize, f64) {
-    let mut best = (0, 0.0);
-    for (axis, along) in point.into_iter().enumerate() {
-        if along.abs() > best.1 {
-            best = (axis, along.abs());
-        }
-    }
-    best
 }

@@ -10,7 +10,7 @@ mod codec;
 use self::cells::{Cell, leaves, location_codes};
 use self::codec::encode;
 use crate::model_chunks::{ChunkData, ModelChunk, ModelChunks};
-use crate::splat::arrays::SplatArrays;
+use model_files::splat::arrays::SplatArrays;
 use rayon::prelude::*;
 use std::collections::BTreeMap;
 use std::hash::{DefaultHasher, Hasher};

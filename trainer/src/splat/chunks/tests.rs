@@ -4,8 +4,6 @@
 use super::codec::{MAX_SH_DEGREE, encode};
 use super::{COARSE_STRIDE, Chunker};
 use crate::eval::{PixelPair, psnr};
-use crate::splat::arrays::SplatArrays;
-use crate::splat::cloud::{scan_cloud, synthetic_cloud};
 use crate::splat::training_tests::{keyframes, options, request};
 use crate::splat::{SplatOptions, SplatTrainer};
 use crate::{
@@ -13,6 +11,8 @@ use crate::{
     RenderRequest,
 };
 use gpu::testing::test_gpu;
+use model_files::splat::arrays::SplatArrays;
+use model_files::splat::cloud::{scan_cloud, synthetic_cloud};
 use nalgebra::{Quaternion, UnitQuaternion};
 use std::collections::BTreeMap;
 use std::f64::consts::FRAC_1_SQRT_2;

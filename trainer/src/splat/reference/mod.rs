@@ -66,7 +66,7 @@ pub struct View {
     /// times readout time.
     pub angular_rad: [f64; 3],
     /// Whether opacities are lowered where [`BLUR_PX2`](project::BLUR_PX2) enlarges splats; see
-    /// [`SplatArrays::is_antialiased`](crate::splat::arrays::SplatArrays::is_antialiased).
+    /// [`SplatArrays::is_antialiased`](model_files::splat::arrays::SplatArrays::is_antialiased).
     /// Gradients ignore this.
     pub is_antialiased: bool,
 }

@@ -5,7 +5,7 @@
 //! The gradient treats this time as constant.
 
 use super::{Projected, ProjectedGrad, Splat, SplatGrad, View, ViewGrad};
-use crate::spherical_harmonics as sh;
+use model_files::spherical_harmonics as sh;
 use nalgebra::{Matrix2, Matrix2x3, Matrix3, Vector2, Vector3};
 
 /// Minimum alpha that is drawn.

@@ -4,9 +4,9 @@
 use super::SplatTrainer;
 use super::saved_arrays::{CAMERA_PARAMS, PendingArrays, invalid_state, read_seeds, read_splats};
 use crate::Error;
-use crate::checkpoint::{Checkpoint, PendingCheckpoint};
 use crate::keyframe_signature::{self, KeyframeSignature};
 use crate::model_options::{MethodOptions, ModelOptions};
+use crate::pending::PendingCheckpoint;
 use crate::splat::buffers::SplatBuffers;
 use crate::splat::camera_params::CameraSlots;
 use crate::splat::options::SplatOptions;
@@ -18,6 +18,7 @@ use calibration::{Candidate, ParamSet, Trial};
 use gpu::Gpu;
 use keyframe::Keyframe;
 use kinematics::Stamp;
+use model_files::checkpoint::Checkpoint;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use std::sync::Arc;

@@ -4,7 +4,6 @@ use super::recorder::Recorder;
 use super::renderer::Renderer;
 use crate::Error;
 use crate::model_options::ModelOptions;
-use crate::splat::arrays::SplatArrays;
 use crate::splat::buffers::{SplatBuffers, n_sh_rest};
 use crate::splat::camera_params::CameraParams;
 use crate::splat::kernels::TrainPipelines;
@@ -12,6 +11,7 @@ use crate::splat::options::SplatOptions;
 use crate::splat::params::Growth;
 use crate::splat::passes::{self, GrowthBuffers};
 use gpu::Gpu;
+use model_files::splat::arrays::SplatArrays;
 
 /// Standard deviation of a child's offset from its parent, in standard deviations of the parent.
 /// 3DGS-MCMC places children at the parent's mean. With a larger spread, a family no longer renders

@@ -1,10 +1,10 @@
 //! The arrays of a checkpoint: splats, seeds and camera parameters.
 
 use crate::Error;
-use crate::checkpoint::{Array, Checkpoint};
 use crate::splat::buffers::{N_PLANAR_BUFFERS, SplatBuffers};
 use crate::splat::seed::{SeedSnapshot, Seeder};
 use gpu::{Buffer, Gpu, PendingRead};
+use model_files::checkpoint::{Array, Checkpoint};
 
 /// Names of the arrays, in the order of [`SplatBuffers::planes`].
 const ARRAYS: [&str; N_PLANAR_BUFFERS] = [

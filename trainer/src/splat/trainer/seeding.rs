@@ -1,14 +1,14 @@
 //! Seeds splats on the surfaces visible in new keyframes.
 
 use super::view_set::ViewSet;
-use crate::InitialPoints;
 use crate::model_options::ModelOptions;
-use crate::splat::arrays::SplatArrays;
 use crate::splat::options::SplatOptions;
 use crate::splat::seed::{Density, Seeder};
 use crate::splat::snapshot::ObservedScene;
 use keyframe::Keyframe;
 use kinematics::quantile::{Rank, quantile};
+use model_files::InitialPoints;
+use model_files::splat::arrays::SplatArrays;
 use std::sync::Arc;
 
 /// Maximum share of the splat limit for the seeds of one image, so that enough remains for the

@@ -1,13 +1,14 @@
 //! Chunks of meshes, decoded as `docs/reference/protocol.md` says.
 
-use crate::edits::{Edit, Edits};
 use crate::test_scenes as scenes;
 use crate::tsdf::TsdfModel;
-use crate::tsdf::mesh::Mesh;
-use crate::{Aabb, ChunkLayout, Method, ModelChunk, ModelChunks};
+use crate::{ChunkLayout, Method, ModelChunk, ModelChunks};
 use flate2::read::ZlibDecoder;
 use gpu::testing::test_gpu;
 use kinematics::Transform;
+use model_files::Aabb;
+use model_files::edits::{Edit, Edits};
+use model_files::mesh::Mesh;
 use nalgebra::{Point3, Vector3};
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::io::Read;

@@ -4,12 +4,12 @@
 //! gaps. Values are stored as differences to the previous one, which zlib compresses well.
 
 use super::mesher::{BlockMesh, Mesher, shared_key, without_erased};
-use crate::edits::Edits;
 use crate::model_chunks::{ChunkData, ChunkLayout, MAX_MESH_COUNT, ModelChunk, ModelChunks};
 use crate::tsdf::block::{BLOCK_EDGE, GridCoord};
 use crate::tsdf::chosen_grid::VoxelGrid;
 use flate2::Compression;
 use flate2::write::ZlibEncoder;
+use model_files::Edits;
 use rayon::prelude::*;
 use std::collections::{BTreeMap, HashMap};
 use std::io::Write;

@@ -1,8 +1,9 @@
 //! Finds small parts of a mesh that are not connected to its large parts.
 
-use super::Mesh;
 use crate::Bounds;
-use crate::edits::{CellGrid, CellLabels, Floaters, Groups, is_floater_size};
+use crate::floaters::{CellLabels, Floaters, Groups, is_floater_size};
+use model_files::edits::CellGrid;
+use model_files::mesh::Mesh;
 use nalgebra::Vector3;
 
 /// Width of the cells with which floaters are erased, voxels. Narrower cells separate floaters

@@ -1,11 +1,11 @@
 //! An incrementally updated mesh: triangles per block, joined on request.
 
-use super::Mesh;
-use crate::edits::Edits;
 use crate::tsdf::block::{BLOCK_EDGE, GridCoord};
 use crate::tsdf::chosen_grid::VoxelGrid;
 use crate::tsdf::params::MeshVertex;
 use kinematics::f32_of;
+use model_files::Edits;
+use model_files::mesh::Mesh;
 use nalgebra::Vector3;
 use rayon::prelude::*;
 use std::collections::{BTreeMap, BTreeSet, HashMap};

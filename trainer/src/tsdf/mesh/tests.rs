@@ -1,6 +1,5 @@
-//! Meshes of known shapes: accuracy, closedness, and the files.
+//! Meshes of known shapes: accuracy and closedness.
 
-use super::{Mesh, write_glb, write_ply};
 use crate::Method;
 use crate::model_options::ModelOptions;
 use crate::test_scenes::{self as scenes, TestShape};
@@ -8,6 +7,7 @@ use crate::tsdf::tests::fuse_all;
 use crate::tsdf::{TsdfModel, TsdfOptions};
 use gpu::testing::test_gpu;
 use keyframe::Keyframe;
+use model_files::mesh::Mesh;
 use nalgebra::{Point3, Vector3};
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -165,70 +165,4 @@ fn clustered_mesh_is_smaller_and_close() {
     for cell_m in [0.0, -1.0, f64::NAN] {
         assert!(mesh.clustered(cell_m) == mesh);
     }
-}
-
-/// The text of the header, and the bytes after it.
-fn ply_parts(bytes: &[u8]) -> (String, &[u8]) {
-    let end = bytes
-        .windows(11)
-        .position(|window| window == b"end_header\n")
-        .unwrap()
-        + 11;
-    (
-        String::from_utf8(bytes[..end].to_vec()).unwrap(),
-        &bytes[end..],
-    )
-}
-
-#[test]
-fn ply_and_glb_files_hold_the_mesh() {
-    let (mesh, _, _) = ball_mesh();
-    let folder = tempfile::tempdir().unwrap();
-    let ply = folder.path().join("mesh.ply");
-    let glb = folder.path().join("mesh.glb");
-    write_ply(&ply, &mesh).unwrap();
-    write_glb(&glb, &mesh).unwrap();
-    let bytes = std::fs::read(ply).unwrap();
-    let (header, body) = ply_parts(&bytes);
-    assert!(header.contains(&format!("element vertex {}\n", mesh.positions_m.len())));
-    assert!(header.contains(&format!("element face {}\n", mesh.triangles.len())));
-    assert_eq!(
-        body.len(),
-        27 * mesh.positions_m.len() + 13 * mesh.triangles.len()
-    );
-
-    let bytes = std::fs::read(glb).unwrap();
-    let word = |at: usize| u32::from_le_bytes(bytes[at..at + 4].try_into().unwrap()) as usize;
-    assert_eq!(
-        (&bytes[..4], word(4), word(8)),
-        (&b"glTF"[..], 2, bytes.len())
-    );
-    assert_eq!(&bytes[16..20], b"JSON");
-    let json: serde_json::Value = serde_json::from_slice(&bytes[20..20 + word(12)]).unwrap();
-    let bin = 20 + word(12);
-    assert_eq!(&bytes[bin + 4..bin + 8], b"BIN\0");
-    assert_eq!(json["buffers"][0]["byteLength"], word(bin));
-    assert_eq!(bytes.len(), bin + 8 + word(bin));
-    let views = json["bufferViews"].as_array().unwrap();
-    let lengths: Vec<_> = views
-        .iter()
-        .map(|view| view["byteLength"].as_u64().unwrap())
-        .collect();
-    let n = mesh.positions_m.len() as u64;
-    assert_eq!(
-        lengths,
-        [12 * n, 12 * n, 12 * n, 12 * mesh.triangles.len() as u64]
-    );
-    let first = bin + 8;
-    let x = f32::from_le_bytes(bytes[first..first + 4].try_into().unwrap());
-    assert_eq!(x.to_bits(), mesh.positions_m[0][0].to_bits());
-    assert_eq!(
-        json["nodes"][1]["translation"],
-        serde_json::json!(mesh.origin_m)
-    );
-    let empty = super::glb::to_bytes(&Mesh::default());
-    assert_eq!(
-        u32::from_le_bytes(empty[8..12].try_into().unwrap()) as usize,
-        empty.len()
-    );
 }

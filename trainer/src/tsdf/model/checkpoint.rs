@@ -7,11 +7,12 @@ use super::TsdfModel;
 use super::field_store::FieldStore;
 use super::keyframe_queue::KeyframeQueue;
 use crate::Error;
-use crate::checkpoint::{Array, Checkpoint, PendingCheckpoint};
 use crate::keyframe_signature::{self, KeyframeSignature};
 use crate::model_options::{MethodOptions, ModelOptions};
+use crate::pending::PendingCheckpoint;
 use gpu::Gpu;
 use keyframe::Keyframe;
+use model_files::checkpoint::{Array, Checkpoint};
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 

@@ -2,7 +2,6 @@
 
 use super::field_store::FieldStore;
 use crate::Error;
-use crate::edits::Edits;
 use crate::tsdf::block::{Blocks, GridCoord};
 use crate::tsdf::buffers::FieldBuffers;
 use crate::tsdf::capacity::Capacity;
@@ -11,6 +10,7 @@ use crate::tsdf::kernels::Pipelines;
 use crate::tsdf::mesh::{BlockMesh, BlockMeshes, ChangedChunks, Mesher};
 use crate::tsdf::mesh_buffers::{MeshBuffers, MeshCapacity};
 use gpu::{Gpu, PassTiming};
+use model_files::Edits;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 

@@ -2,17 +2,17 @@
 
 use super::TsdfModel;
 use super::checkpoint::{METHOD, invalid_state};
-use crate::checkpoint::{Array, Checkpoint};
-use crate::edits::Edits;
 use crate::model_metadata::METADATA_FILE;
 use crate::model_options::CommonOptions;
 use crate::tsdf::files::{BLOCKS_FILE, MESH_GLB, MESH_PLY};
-use crate::tsdf::mesh::{Mesh, write_glb, write_ply};
 use crate::{Error, Method};
 use flate2::Compression;
 use flate2::read::DeflateDecoder;
 use flate2::write::DeflateEncoder;
 use gpu::Gpu;
+use model_files::Edits;
+use model_files::checkpoint::{Array, Checkpoint};
+use model_files::mesh::{Mesh, write_glb, write_ply};
 use std::io::{Read, Write};
 use std::path::Path;
 use std::sync::Arc;

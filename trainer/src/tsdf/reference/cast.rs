@@ -1,9 +1,9 @@
 //! Twin of `cast_rays.wgsl`: finds the first crossing from outside to inside with small constant
 //! steps.
 
-use crate::edits::Edits;
 use crate::tsdf::block::{Blocks, block_of, voxel_ix};
 use crate::tsdf::chosen_grid::VoxelGrid;
+use model_files::Edits;
 use nalgebra::{Point3, Vector3};
 
 /// Length of a step, voxels. The interpolated distance is smooth within a voxel, so two crossings

@@ -1,8 +1,7 @@
 //! A set of cells of a grid over all space.
 
-use super::{GROUPS_PER_EDIT, MAX_COORD_M, rows};
-use crate::nerf::reference::space::contract;
-use nalgebra::{Matrix4, Vector3};
+use super::MAX_COORD_M;
+use crate::contraction::contract;
 use serde::{Deserialize, Serialize};
 
 /// Maximum number of cells along an axis. Indices then have 30 bits, so kernels compute them in
@@ -40,12 +39,12 @@ impl CellGrid {
     }
 
     /// Number of cells.
-    pub(crate) fn n(&self) -> usize {
+    pub fn n(&self) -> usize {
         (self.n_cells as usize).pow(3)
     }
 
     /// Width of the cells at a point along the narrower directions, meters.
-    pub(crate) fn cell_m(&self, point_m: [f64; 3]) -> f64 {
+    pub fn cell_m(&self, point_m: [f64; 3]) -> f64 {
         // The contracted cube is 4 radii wide. At the distance `largest`, the contraction of Barron
         // et al. 2022 (equation 10) maps to (2 - 1 / largest) / largest times the coordinate.
         // Widths across the ray are divided by this factor; along the ray, cells are wider still.
@@ -57,7 +56,7 @@ impl CellGrid {
     }
 
     /// Indices of the cells around a cell, itself excluded.
-    pub(crate) fn neighbors(&self, index: u32) -> impl Iterator<Item = u32> + use<> {
+    pub fn neighbors(&self, index: u32) -> impl Iterator<Item = u32> + use<> {
         let grid = *self;
         let n = self.n_cells;
         let coord = [index % n, index / n % n, index / (n * n)];
@@ -85,51 +84,6 @@ fn moved_by(along: u32, step: u32, n: u32) -> Option<u32> {
     (along + step).checked_sub(1).filter(|along| *along < n)
 }
 
-/// Marks cells of a grid: one bit per cell.
-#[derive(Clone, Debug)]
-pub(crate) struct CellMask(Vec<u64>);
-
-impl CellMask {
-    /// No cell is marked.
-    pub(crate) fn none(grid: &CellGrid) -> Self {
-        Self(vec![0; grid.n().div_ceil(64)])
-    }
-
-    /// Marks a cell.
-    pub(crate) fn insert(&mut self, cell: u32) {
-        self.0[cell as usize / 64] |= 1 << (cell % 64);
-    }
-
-    /// Whether a cell is marked.
-    pub(crate) fn contains(&self, cell: u32) -> bool {
-        self.0[cell as usize / 64] >> (cell % 64) & 1 == 1
-    }
-
-    /// Number of marked cells.
-    pub(crate) fn n_marked(&self) -> usize {
-        self.0.iter().map(|word| word.count_ones() as usize).sum()
-    }
-
-    /// The marked cells, in increasing order.
-    pub(crate) fn cells(&self) -> impl Iterator<Item = u32> {
-        (0..)
-            .step_by(64)
-            .zip(&self.0)
-            .filter(|(_, word)| **word != 0)
-            .flat_map(|(first, word)| {
-                (0..64)
-                    .filter(move |bit| word >> bit & 1 == 1)
-                    .map(move |bit| first + bit)
-            })
-    }
-}
-
-impl Extend<u32> for CellMask {
-    fn extend<T: IntoIterator<Item = u32>>(&mut self, cells: T) {
-        cells.into_iter().for_each(|cell| self.insert(cell));
-    }
-}
-
 /// A set of at least one cell.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CellSet {
@@ -140,8 +94,8 @@ pub struct CellSet {
 }
 
 impl CellSet {
-    /// The set of these cells, in increasing order.
-    pub(super) fn new(grid: CellGrid, cells: impl IntoIterator<Item = u32>) -> Self {
+    /// The set of these cells, which are in increasing order.
+    pub fn new(grid: CellGrid, cells: impl IntoIterator<Item = u32>) -> Self {
         let mut ranges: Vec<[u32; 2]> = Vec::new();
         for cell in cells {
             // Floaters fill runs of cells along x, so ranges take fewer words than cells.
@@ -151,6 +105,16 @@ impl CellSet {
             }
         }
         Self { grid, ranges }
+    }
+
+    /// The grid of the cells.
+    pub fn grid(&self) -> &CellGrid {
+        &self.grid
+    }
+
+    /// Disjoint ranges of indices in increasing order: the first index, and the one after the last.
+    pub fn ranges(&self) -> &[[u32; 2]] {
+        &self.ranges
     }
 
     /// Checks that kernels can compute with the set. The error is a sentence without a period.
@@ -196,33 +160,5 @@ impl CellSet {
         self.ranges
             .get(n_before)
             .is_some_and(|[first, _]| *first <= cell)
-    }
-
-    /// The ranges, two per group of four words.
-    pub(super) fn range_words(&self) -> impl Iterator<Item = [u32; 4]> {
-        self.ranges.chunks(2).map(|pair| {
-            let [a, b] = pair[0];
-            let [c, d] = pair.get(1).copied().unwrap_or_default();
-            [a, b, c, d]
-        })
-    }
-
-    /// The data of the set: rows of the transform to units of the radius, number of cells along an
-    /// axis, the group where the ranges begin, and their number.
-    pub(super) fn words(
-        &self,
-        world_from_drawn: &Matrix4<f64>,
-        first: u32,
-    ) -> [[u32; 4]; GROUPS_PER_EDIT] {
-        let CellGrid {
-            center_m,
-            radius_m,
-            n_cells,
-        } = self.grid;
-        let scale = Matrix4::new_scaling(1.0 / radius_m);
-        let [x, y, z] =
-            rows(&(scale * Matrix4::new_translation(&-Vector3::from(center_m)) * world_from_drawn));
-        let n_ranges = u32::try_from(self.ranges.len()).unwrap_or(u32::MAX);
-        [x, y, z, [n_cells, 0, 0, first], [0, 0, 0, n_ranges]]
     }
 }

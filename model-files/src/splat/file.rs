@@ -8,16 +8,16 @@ use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
 
 /// Name of the splat file in a model folder.
-pub(super) const IN_FOLDER: &str = "splats.ply";
+pub const IN_FOLDER: &str = "splats.ply";
 
 /// Extensions of the formats that can be read.
-pub(super) const EXTENSIONS: [&str; 3] = ["ply", "spz", "splat"];
+pub const EXTENSIONS: [&str; 3] = ["ply", "spz", "splat"];
 /// Extensions of other formats, which are recognized to name them in the error.
-pub(super) const UNSUPPORTED: [&str; 2] = ["ksplat", "sog"];
+pub const UNSUPPORTED: [&str; 2] = ["ksplat", "sog"];
 
 /// Format of a written file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Format {
+pub enum Format {
     /// Values at full precision.
     Ply,
     /// Quantized and compressed values.
@@ -25,7 +25,7 @@ pub(super) enum Format {
 }
 
 /// Reads splats from a file or from a model folder.
-pub(super) fn read(model: &Path) -> Result<SplatArrays, Error> {
+pub fn read(model: &Path) -> Result<SplatArrays, Error> {
     let is_file = model.is_file();
     let path: PathBuf = if is_file {
         model.to_owned()
@@ -73,7 +73,7 @@ fn read_file(path: &Path) -> Result<SplatArrays, Error> {
 }
 
 /// Writes splats to a file.
-pub(super) fn write(path: &Path, format: Format, splats: &SplatArrays) -> Result<(), Error> {
+pub fn write(path: &Path, format: Format, splats: &SplatArrays) -> Result<(), Error> {
     match format {
         Format::Ply => ply::write(path, splats),
         Format::Spz => spz::write(path, splats),

@@ -22,7 +22,7 @@ pub fn write(path: &Path, mesh: &Mesh) -> Result<(), Error> {
     })
 }
 
-pub(super) fn write_to(file: &mut impl Write, mesh: &Mesh) -> std::io::Result<()> {
+fn write_to(file: &mut impl Write, mesh: &Mesh) -> std::io::Result<()> {
     let is_far = mesh.origin_m.iter().any(|along| along.abs() > FAR_M);
     let number_type = if is_far { "double" } else { "float" };
     writeln!(

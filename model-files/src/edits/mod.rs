@@ -4,18 +4,11 @@
 //! undoing an edit shows it again.
 
 mod cells;
-mod floaters;
-mod groups;
 mod stored;
 
-pub(crate) use cells::CellMask;
 pub use cells::{CellGrid, CellSet};
-pub(crate) use floaters::{CellLabels, is_floater_size};
-pub use floaters::{Floaters, PendingFloaters};
-pub(crate) use groups::Groups;
 
 use crate::{Aabb, Error};
-use nalgebra::Matrix4;
 use serde::{Deserialize, Serialize};
 use std::io::ErrorKind;
 use std::path::Path;
@@ -29,9 +22,6 @@ pub const MAX_EDITS: usize = 64;
 const MAX_COORD_M: f64 = 1e9;
 /// Name of the file in a model folder.
 const FILE: &str = "edits.json";
-/// Words of an edit in [`Edits::words`], in groups of four: three rows of a transform, and two
-/// groups that depend on the kind of edit.
-const GROUPS_PER_EDIT: usize = 5;
 
 /// One edit.
 #[derive(Clone, Debug, PartialEq)]
@@ -137,6 +127,12 @@ impl Edits {
         self.0.is_empty()
     }
 
+    /// The edits, oldest first.
+    #[must_use]
+    pub fn as_slice(&self) -> &[Edit] {
+        &self.0
+    }
+
     /// Whether a point in world, meters, is erased.
     #[must_use]
     pub fn erases(&self, point_m: [f64; 3]) -> bool {
@@ -163,7 +159,7 @@ impl Edits {
             source,
         })?;
         let file: File =
-            serde_json::from_str(&text).map_err(|source| Error::ModelMetadata { path, source })?;
+            serde_json::from_str(&text).map_err(|source| Error::EditsFile { path, source })?;
         Ok(file.edits)
     }
 
@@ -192,50 +188,6 @@ impl Edits {
         })?;
         files::write(&path, format!("{text}\n")).map_err(|source| Error::Write { path, source })
     }
-
-    /// The data of shared/erased.wgsl, for kernels whose points are in a frame, and in units, other
-    /// than the world's.
-    ///
-    /// * `world_from_drawn`: maps points of the kernel to world, meters.
-    pub(crate) fn words(&self, world_from_drawn: &Matrix4<f64>) -> Vec<[u32; 4]> {
-        // All edits have the same size, so that a kernel finds each one by its index. The ranges of
-        // cells vary in number, so they follow after the last edit, which refers to them.
-        let n = u32::try_from(self.len()).expect("at most 64");
-        let mut words = vec![[n, 0, 0, 0]];
-        let mut ranges: Vec<[u32; 4]> = Vec::new();
-        let first_range = 1 + GROUPS_PER_EDIT * self.len();
-        for edit in &self.0 {
-            words.extend(match edit {
-                Edit::Box(aabb) => box_words(aabb, world_from_drawn),
-                Edit::Cells(cells) => {
-                    let first = u32::try_from(first_range + ranges.len()).unwrap_or(u32::MAX);
-                    ranges.extend(cells.range_words());
-                    cells.words(world_from_drawn, first)
-                }
-            });
-        }
-        words.extend(ranges);
-        words
-    }
-}
-
-/// The data of a box: rows of its transform, and its corners. A last word of 0 marks a box.
-fn box_words(aabb: &Aabb, world_from_drawn: &Matrix4<f64>) -> [[u32; 4]; GROUPS_PER_EDIT] {
-    let [x, y, z] = rows(&(aabb.world_from_box.inverse().to_homogeneous() * world_from_drawn));
-    [x, y, z, corner_words(aabb.min_m), corner_words(aabb.max_m)]
-}
-
-/// A corner of a box, as bits of f32.
-fn corner_words(corner_m: [f64; 3]) -> [u32; 4] {
-    let [x, y, z] = kinematics::f32s_of(corner_m).map(f32::to_bits);
-    [x, y, z, 0]
-}
-
-/// The upper three rows of a matrix, as bits of f32.
-fn rows(matrix: &Matrix4<f64>) -> [[u32; 4]; 3] {
-    std::array::from_fn(|row| {
-        std::array::from_fn(|column| kinematics::f32_of(matrix[(row, column)]).to_bits())
-    })
 }
 
 #[cfg(test)]

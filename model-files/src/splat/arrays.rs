@@ -7,7 +7,7 @@ use std::path::Path;
 
 /// Maximum number of color coefficients per splat (degree 3).
 const MAX_COEFFICIENTS: usize = 16;
-/// Splats that are more transparent are not drawn, see shared/projection.wgsl.
+/// Splats that are more transparent are not drawn, see `projection.wgsl` of the trainer.
 const MIN_ALPHA: f64 = 1.0 / 255.0;
 /// Maximum absolute coordinate of a mean in a file: beyond the size of the Earth, also in
 /// millimeters.
@@ -49,7 +49,7 @@ impl SplatArrays {
     /// length zero.
     ///
     /// ```
-    /// use trainer::splat::arrays::SplatArrays;
+    /// use model_files::splat::arrays::SplatArrays;
     ///
     /// let one = SplatArrays {
     ///     means: vec![[0.0; 3]],
@@ -61,7 +61,7 @@ impl SplatArrays {
     ///     is_antialiased: false,
     /// };
     /// assert_eq!(one.checked()?.n_splats(), 1);
-    /// # Ok::<(), trainer::Error>(())
+    /// # Ok::<(), model_files::Error>(())
     /// ```
     pub fn checked(self) -> Result<Self, Error> {
         if self.n_coefficients() > MAX_COEFFICIENTS {
@@ -176,12 +176,12 @@ impl SplatArrays {
     }
 
     /// Opacity of a splat, 0 to 1.
-    pub(crate) fn opacity(&self, splat_ix: usize) -> f64 {
+    pub fn opacity(&self, splat_ix: usize) -> f64 {
         1.0 / (1.0 + (-f64::from(self.opacity_logits[splat_ix])).exp())
     }
 
     /// Indices of the splats that are drawn. Splats with values that are not finite are not.
-    pub(crate) fn visible(&self) -> Vec<u32> {
+    pub fn visible(&self) -> Vec<u32> {
         let is_visible =
             |ix: &u32| self.opacity(*ix as usize) > MIN_ALPHA && self.is_finite(*ix as usize);
         (0..u32::try_from(self.n_splats()).unwrap_or(u32::MAX))
@@ -202,7 +202,7 @@ impl SplatArrays {
 
     /// The splats for which `is_kept` is true of the index.
     #[must_use]
-    pub(crate) fn filtered(&self, is_kept: impl Fn(usize) -> bool + Sync) -> Self {
+    pub fn filtered(&self, is_kept: impl Fn(usize) -> bool + Sync) -> Self {
         // In parallel, because the condition may search through edits. The order is kept.
         let kept: Vec<usize> = (0..self.n_splats())
             .into_par_iter()
@@ -225,7 +225,7 @@ impl SplatArrays {
 
     /// The splats whose means are not in erased space.
     #[must_use]
-    pub(crate) fn without_erased(self, edits: &Edits) -> Self {
+    pub fn without_erased(self, edits: &Edits) -> Self {
         if edits.is_empty() {
             self
         } else {

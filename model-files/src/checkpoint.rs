@@ -4,7 +4,6 @@
 
 use crate::Error;
 use crate::edits::Edits;
-use crate::pending::Pending;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
@@ -50,9 +49,6 @@ pub struct Array {
     pub bytes: Vec<u8>,
 }
 
-/// Training state that is being read back from the GPU. Training may continue meanwhile.
-pub type PendingCheckpoint = Pending<Checkpoint>;
-
 /// The JSON header between preamble and arrays.
 #[derive(Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -79,7 +75,7 @@ struct ArrayHeader {
 
 impl Checkpoint {
     /// A checkpoint of a method's state. The caller fills in the remaining fields.
-    pub(crate) fn new(method: &str, state: serde_json::Value, arrays: Vec<Array>) -> Self {
+    pub fn new(method: &str, state: serde_json::Value, arrays: Vec<Array>) -> Self {
         Self {
             method: method.to_owned(),
             seconds: 0.0,
@@ -114,7 +110,7 @@ impl Checkpoint {
     }
 
     /// Returns the array with this name, which must have `n_bytes` bytes.
-    pub(crate) fn array(&self, name: &str, n_bytes: u64) -> Result<&[u8], Error> {
+    pub fn array(&self, name: &str, n_bytes: u64) -> Result<&[u8], Error> {
         let array = self.arrays.iter().find(|array| array.name == name);
         let bytes =
             array

@@ -16,7 +16,7 @@ const SPLAT_BYTES: usize = 32;
 const MIN_SCALE: f32 = 1e-9;
 
 /// Reads a `.splat` file. Splats with invalid numbers are left out, with a warning.
-pub(super) fn read(path: &Path) -> Result<SplatArrays, Error> {
+pub fn read(path: &Path) -> Result<SplatArrays, Error> {
     let bytes = files::read(path, files::Budget::SPLATS).map_err(|source| Error::Read {
         path: path.to_owned(),
         source,

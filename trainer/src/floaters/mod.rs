@@ -1,8 +1,15 @@
 //! Finds floaters: small parts of a model that are not connected to its large parts.
 
-use super::cells::{CellGrid, CellMask, CellSet};
-use super::groups::Groups;
+mod cell_mask;
+mod groups;
+#[cfg(test)]
+mod tests;
+
+pub(crate) use cell_mask::CellMask;
+pub(crate) use groups::Groups;
+
 use crate::pending::Pending;
+use model_files::edits::{CellGrid, CellSet};
 
 /// A part with less than this fraction (1 / divisor) of the cells or triangles of the whole is a
 /// floater.

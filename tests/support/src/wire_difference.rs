@@ -1,4 +1,4 @@
-//! Compares the emulated samples with those received by the drivers.
+//! Compares the emulated samples with those that drivers received over the wire.
 
 use drivers::recording::{RIG_FILE, Recording};
 use drivers::{Image, Sample, Source};
@@ -8,24 +8,25 @@ use std::path::Path;
 use std::time::Duration;
 
 /// Contents of a recording.
-pub(super) struct RecordedSamples {
+struct RecordedSamples {
     /// Color and depth images, in order.
-    pub(super) images: Vec<Image>,
-    pub(super) joints: JointHistory,
-    pub(super) poses: PoseHistory,
+    images: Vec<Image>,
+    joints: JointHistory,
+    poses: PoseHistory,
 }
 
 /// Differences between received and emulated samples, at the stamps of the images.
 #[derive(Debug)]
-pub(super) struct Difference {
-    pub(super) n_images: usize,
+pub struct Difference {
+    /// Number of received images, all of which are identical to emulated ones.
+    pub n_images: usize,
     /// Largest difference of any joint, rad, in the median image and in the worst one.
-    pub(super) joints_rad: [f64; 2],
+    pub joints_rad: [f64; 2],
     /// Largest difference of the base position, m.
-    pub(super) base_m: f64,
+    pub base_m: f64,
 }
 
-pub(super) fn read_samples(path: &Path) -> RecordedSamples {
+fn read_samples(path: &Path) -> RecordedSamples {
     let mut recording = Recording::open(path).expect("a recording");
     let gap = Duration::from_millis(100);
     let (joints, poses) = (
@@ -52,7 +53,7 @@ pub(super) fn read_samples(path: &Path) -> RecordedSamples {
 }
 
 /// Offset added to the script's stamps during playback, from the rig file written for it.
-pub(super) fn clock_offset_nanos(recording: &Path) -> i64 {
+fn clock_offset_nanos(recording: &Path) -> i64 {
     let recording = Recording::open(recording).expect("a recording");
     let rig = std::str::from_utf8(recording.attachment(RIG_FILE).expect("its rig"))
         .expect("text")
@@ -66,7 +67,7 @@ pub(super) fn clock_offset_nanos(recording: &Path) -> i64 {
 
 /// Compares samples at every received color image. Every image must be identical to an emulated
 /// one.
-pub(super) fn difference(script: &Path, wire: &Path) -> Difference {
+pub fn difference(script: &Path, wire: &Path) -> Difference {
     let offset_nanos = clock_offset_nanos(wire);
     let (script, wire) = (read_samples(script), read_samples(wire));
     let mut joints_rad = Vec::new();
@@ -121,7 +122,7 @@ pub(super) fn difference(script: &Path, wire: &Path) -> Difference {
 }
 
 /// Distance from the target at which `fieldrig move --json` reports that the arm arrived, rad or m.
-pub(super) fn error_of_move(received: &str) -> f64 {
+pub fn error_of_move(received: &str) -> f64 {
     let done = received
         .lines()
         .find(|line| line.contains("\"event\":\"done\""))

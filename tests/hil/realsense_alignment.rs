@@ -1,7 +1,6 @@
 //! Aligns the depth of a RealSense camera to its color with our code and with librealsense2. Run it
 //! on one core (`taskset -c 0`), because the library uses several.
 
-#[path = "../../tests/hil/realsense_scene.rs"]
 mod realsense_scene;
 
 use criterion::{Criterion, criterion_group, criterion_main};
