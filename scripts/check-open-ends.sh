@@ -4,7 +4,7 @@ set -eu
 cd "$(dirname "$0")/.."
 
 # The pattern is written so that this file does not match itself.
-found=$(find src kinematics model-files drivers sim trainer viz tests scripts rigs \
+found=$(find src kinematics drivers sim trainer viz tests scripts rigs \
     -name node_modules -prune -o -name dist -prune -o -type f \
     \( -name '*.rs' -o -name '*.wgsl' -o -name '*.ts' -o -name '*.toml' -o -name '*.sh' -o -name '*.xml' \) -print0 |
     xargs -0 grep -nE '(^|[^A-Za-z.])(TO''DO|FIX''ME|XX''X)([^(A-Za-z]|$)|TO''DO\([^#]' || true)

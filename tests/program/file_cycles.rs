@@ -16,7 +16,7 @@ const ROOTS: [&str; 13] = [
     "kinematics/src",
     "keyframe/src",
     "calibration/src",
-    "model-files/src",
+    "trainer/model-files/src",
     "drivers/src",
     "sim/src",
     "capture/src",

@@ -182,7 +182,7 @@ fn packed_files_of_another_program_are_read() {
 fn packed_file_with_missing_colors_is_rejected() {
     let seed = |name: &str| {
         std::fs::read(format!(
-            "{}/../fuzz/seeds/model/{name}",
+            "{}/../../fuzz/seeds/model/{name}",
             env!("CARGO_MANIFEST_DIR")
         ))
         .unwrap()
