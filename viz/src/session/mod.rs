@@ -97,6 +97,7 @@ pub(crate) async fn serve(
             // If the time is over, the client does not get a reply to its last messages.
             let _ = tokio::time::timeout(LINGER, reading).await;
         }
+        () = connection.closed() => {}
     }
     // Before the log entry, so that the client is gone when somebody reads it.
     drop(client_guard);
@@ -153,7 +154,7 @@ impl Reader<'_> {
                 }),
             };
             // Even an invalid message shows that the client is alive.
-            self.connection.last_message();
+            self.connection.record_message();
             let Some(reply) = reply else { continue };
             let is_last = matches!(reply, Reply::Goodbye { .. });
             // The writer may not have had time to send the replies to a burst of messages.
