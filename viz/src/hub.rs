@@ -1,6 +1,8 @@
 //! Shared state of the training thread and the server. The training thread never waits for a
 //! client.
 
+use crate::client::protocol::{Control, ProjectionMessage};
+use crate::client::server_message::PictureHeader;
 use crate::edit::EditRequest;
 use crate::pictures::picture::packing;
 use crate::pictures::picture_times::{SentPicture, ShownPicture, ShownPictures, TrainedKeyframes};
@@ -9,8 +11,6 @@ use crate::pictures::view_request::ViewRequest;
 use crate::pictures::viewpoint::Viewpoint;
 use crate::pose::row_major;
 use crate::server::access::Role;
-use crate::session::protocol::{Control, ProjectionMessage};
-use crate::session::server_message::PictureHeader;
 use crate::topics::subscriptions::Subscriptions;
 use parking_lot::{Condvar, Mutex, MutexGuard};
 use std::any::{Any, TypeId};
@@ -366,7 +366,7 @@ impl PendingRender {
     }
 
     fn enqueue_answer(&mut self, outgoing: Outgoing) {
-        self.is_released = true; // The session releases it after sending.
+        self.is_released = true; // The writer releases it after sending.
         self.hub.queue().push_outgoing(self.job.client, outgoing);
     }
 

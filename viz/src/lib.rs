@@ -12,6 +12,7 @@
 //! assert!(hub.next_request().is_none(), "nobody requests a picture yet");
 //! ```
 
+mod client;
 mod clock;
 mod edit;
 mod error;
@@ -21,9 +22,9 @@ mod hub;
 mod pictures;
 mod pose;
 mod server;
-mod session;
 mod topics;
 
+pub use client::protocol::{BASE_PROTOCOL_VERSION, Control, PROTOCOL_VERSION};
 pub use edit::{EditAction, EditRequest};
 pub use error::Error;
 #[cfg(feature = "foxglove")]
@@ -34,13 +35,12 @@ pub use pictures::picture_times::{NewestKeyframe, ShownPicture, TrainedKeyframes
 pub use server::access::{Role, Token, Tokens};
 pub use server::certificate::Certificate;
 pub use server::{Server, ServerConfig, Sharing};
-pub use session::protocol::{BASE_PROTOCOL_VERSION, Control, PROTOCOL_VERSION};
 pub use topics::observation_map::{ObservationMap, ObservedCell};
 pub use topics::robot::{MeshFormat, RobotDescription, RobotMesh};
 pub use topics::updates::{Guidance, KeyframePose, ModelStatus, RunResult, SceneHint, Status};
 
 /// Handles the messages of a client, one per line, and panics if a result is inconsistent.
 #[cfg(fuzzing)]
-pub fn check_session(session: &str) {
-    session::message_checks::check_session(session);
+pub fn check_messages(messages: &str) {
+    client::message_checks::check_messages(messages);
 }

@@ -1,22 +1,22 @@
 //! Checks the messages of viewers: every accepted request must be safe to render, and every
 //! accepted subscription must keep its limits. The fuzz target `page` calls it.
 
-use crate::clock::ServerClock;
-use crate::edit::{EditAction, EditRequest};
-use crate::pictures::view_request::{MAX_SIZE_PX, ViewRequest};
-use crate::session::negotiation::{CAPABILITIES, negotiate};
-use crate::session::protocol::{
+use crate::client::negotiation::{CAPABILITIES, negotiate};
+use crate::client::protocol::{
     BASE_PROTOCOL_VERSION, ClientHello, ClientMessage, EditMessage, MAX_RATE_HZ, PROTOCOL_VERSION,
     RenderMessage, ShownMessage, SubscribeMessage,
 };
+use crate::clock::ServerClock;
+use crate::edit::{EditAction, EditRequest};
+use crate::pictures::view_request::{MAX_SIZE_PX, ViewRequest};
 use crate::topics::TOPICS;
 use crate::topics::subscriptions::{Subscriptions, fitted};
 use trainer::{Aabb, Projection, RenderRequest};
 
-/// Handles the messages of a session, one per line, and panics if a result is inconsistent.
-pub(crate) fn check_session(session: &str) {
+/// Handles the messages of a client, one per line, and panics if a result is inconsistent.
+pub(crate) fn check_messages(messages: &str) {
     let mut subscriptions = Subscriptions::default();
-    for text in session.lines() {
+    for text in messages.lines() {
         match serde_json::from_str(text) {
             Ok(ClientMessage::Hello(hello)) => check_hello(&hello),
             Ok(ClientMessage::Render(message)) => check_render(&message),
@@ -141,7 +141,7 @@ fn check_subscription(subscriptions: &mut Subscriptions, message: SubscribeMessa
 
 #[cfg(test)]
 mod tests {
-    use super::check_session;
+    use super::check_messages;
     use kinematics::random::Random;
     use std::path::Path;
 
@@ -153,7 +153,7 @@ mod tests {
         let mut n_seeds = 0;
         for entry in std::fs::read_dir(folder).expect("the seeds") {
             let seed = std::fs::read_to_string(entry.expect("a file").path()).expect("text");
-            check_session(&seed);
+            check_messages(&seed);
             for _ in 0..2000 {
                 let mut bytes = seed.clone().into_bytes();
                 for _ in 0..=random.below(3) {
@@ -172,7 +172,7 @@ mod tests {
                         break;
                     }
                 }
-                check_session(&String::from_utf8_lossy(&bytes));
+                check_messages(&String::from_utf8_lossy(&bytes));
             }
             n_seeds += 1;
         }

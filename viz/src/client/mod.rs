@@ -1,5 +1,5 @@
-//! The session of one client, from hello to goodbye: a reader and a writer that never wait for each
-//! other.
+//! Serves one connected client, from hello to goodbye: a reader and a writer that never wait for
+//! each other.
 
 pub(crate) mod link_rate;
 #[cfg(any(test, fuzzing))]
@@ -10,6 +10,13 @@ pub(crate) mod server_message;
 mod writer;
 
 use crate::Hub;
+use crate::client::link_rate::LinkRate;
+use crate::client::negotiation::{Negotiated, negotiate};
+use crate::client::protocol::{
+    ClientHello, ClientMessage, ControlMessage, EditMessage, RenderMessage, ShownMessage,
+    SubscribeMessage,
+};
+use crate::client::writer::{Reply, Writer};
 use crate::clock::ServerClock;
 use crate::edit::EditRequest;
 use crate::hub::{Demand, MAX_WAITING_EDITS};
@@ -20,13 +27,6 @@ use crate::server::access::Role;
 use crate::server::admission::Connection;
 use crate::server::client_log::ClientLog;
 use crate::server::server_context::ServerContext;
-use crate::session::link_rate::LinkRate;
-use crate::session::negotiation::{Negotiated, negotiate};
-use crate::session::protocol::{
-    ClientHello, ClientMessage, ControlMessage, EditMessage, RenderMessage, ShownMessage,
-    SubscribeMessage,
-};
-use crate::session::writer::{Reply, Writer};
 use axum::extract::ws::{Message, WebSocket};
 use futures_util::StreamExt;
 use futures_util::stream::SplitStream;
@@ -104,7 +104,7 @@ pub(crate) async fn serve(
     log.line(format_args!("client {client} disconnected"));
 }
 
-/// Removes a client from the hub when its session ends, for whatever reason.
+/// Removes a client from the hub when it is no longer served, for whatever reason.
 struct ClientGuard<'a> {
     hub: &'a Hub,
     client: u64,
@@ -174,8 +174,8 @@ impl Reader<'_> {
         }
     }
 
-    /// Reads until the client disconnects, and ignores what it sends: the writer ends the session,
-    /// or has ended it.
+    /// Reads until the client disconnects, and ignores what it sends: the writer disconnects it,
+    /// or has done so.
     async fn discard(&mut self) {
         while let Some(Ok(message)) = self.stream.next().await {
             if matches!(message, Message::Close(_)) {
@@ -228,7 +228,7 @@ impl Reader<'_> {
     fn render(&self, message: &RenderMessage) -> Result<(), InvalidRequest> {
         let view_request = ViewRequest::check(message)?;
         if let Some(viewpoint) = Viewpoint::of(&view_request) {
-            // Only the writer of this session needs it, so the hub is not informed: views change
+            // Only the writer of this client needs it, so the hub is not informed: views change
             // many times per second.
             self.demand
                 .send_modify(|demand| demand.viewpoint = Some(viewpoint));
@@ -278,7 +278,7 @@ impl Reader<'_> {
         Ok(())
     }
 
-    /// Changes what the client receives, for the writer of this session and for the hub.
+    /// Changes what the client receives, for its writer and for the hub.
     fn change_demand(&self, change: impl FnOnce(&mut Demand)) {
         self.demand.send_modify(change);
         self.hub

@@ -4,6 +4,10 @@
 //! most one part. The parts and the kernel's buffer are so small that their transfer takes less
 //! than 100 ms. Everything else waits here, where newer data replaces older data.
 
+use crate::client::link_rate::LinkRate;
+use crate::client::negotiation::{Agreement, CAPABILITIES, Negotiated};
+use crate::client::protocol::{BASE_PROTOCOL_VERSION, PROTOCOL_VERSION};
+use crate::client::server_message::{BinaryHeader, PartHeader, ServerMessage, frame};
 use crate::hub::Demand;
 use crate::pictures::compact_depth::Effort;
 use crate::pictures::picture::{PackError, PackedPicture, pack_picture};
@@ -13,10 +17,6 @@ use crate::pictures::view_request::{DEFAULT_STAGES, MAX_SIZE_PX};
 use crate::server::access::Role;
 use crate::server::admission::Connection;
 use crate::server::server_context::ServerContext;
-use crate::session::link_rate::LinkRate;
-use crate::session::negotiation::{Agreement, CAPABILITIES, Negotiated};
-use crate::session::protocol::{BASE_PROTOCOL_VERSION, PROTOCOL_VERSION};
-use crate::session::server_message::{BinaryHeader, PartHeader, ServerMessage, frame};
 use crate::topics::client_updates::{ClientUpdates, Next};
 use crate::topics::items::ItemTopic;
 use crate::topics::robot::RobotStateMessage;
@@ -55,10 +55,10 @@ pub(crate) enum Reply {
     Goodbye { reason: String },
 }
 
-/// Control flow of a session: continue or end.
-pub(crate) type SessionFlow = ControlFlow<()>;
+/// Whether to serve the client further: continue or end.
+pub(crate) type ClientFlow = ControlFlow<()>;
 
-/// The sending half of a session.
+/// Sends to one client.
 pub(crate) struct Writer<'a> {
     pub(crate) sink: SplitSink<WebSocket, Message>,
     pub(crate) server_context: &'a ServerContext,
@@ -120,7 +120,7 @@ impl Writer<'_> {
         wake: &Notify,
         mut replies: mpsc::Receiver<Reply>,
         mut demand: watch::Receiver<Demand>,
-    ) -> SessionFlow {
+    ) -> ClientFlow {
         let mut stopped = self.server_context.stopped.clone();
         let mut published = self.server_context.publisher.changed();
         let mut robot_state = self
@@ -321,7 +321,7 @@ impl Writer<'_> {
         message
     }
 
-    async fn send_hello(&mut self) -> SessionFlow {
+    async fn send_hello(&mut self) -> ClientFlow {
         let hello = ServerMessage::Hello {
             protocol: BASE_PROTOCOL_VERSION,
             protocols: [BASE_PROTOCOL_VERSION, PROTOCOL_VERSION],
@@ -336,7 +336,7 @@ impl Writer<'_> {
         self.send_message(&hello).await
     }
 
-    async fn reply(&mut self, reply: Reply) -> SessionFlow {
+    async fn reply(&mut self, reply: Reply) -> ClientFlow {
         match reply {
             Reply::Welcome(Agreement {
                 protocol,
@@ -364,7 +364,7 @@ impl Writer<'_> {
     }
 
     /// Sends the next part, or the whole message if the client cannot join parts.
-    async fn send_part(&mut self, transfer: &mut Transfer) -> SessionFlow {
+    async fn send_part(&mut self, transfer: &mut Transfer) -> ClientFlow {
         let n_bytes = transfer.bytes.len();
         let n_part = if self.negotiated.has_parts {
             self.link.part_bytes()
@@ -402,7 +402,7 @@ impl Writer<'_> {
     }
 
     /// Sends the last status, which contains the result of the run, then a goodbye.
-    async fn send_goodbye_when_stopped(&mut self) -> SessionFlow {
+    async fn send_goodbye_when_stopped(&mut self) -> ClientFlow {
         let latest = self.server_context.hub.status();
         if let Some(status) = latest {
             self.send_message(&ServerMessage::Status(&status)).await?;
@@ -410,25 +410,25 @@ impl Writer<'_> {
         self.send_goodbye("the server has stopped").await
     }
 
-    async fn send_error(&mut self, id: Option<u64>, view: &str, message: &str) -> SessionFlow {
+    async fn send_error(&mut self, id: Option<u64>, view: &str, message: &str) -> ClientFlow {
         let view = (!view.is_empty()).then_some(view);
         self.send_message(&ServerMessage::Error { id, view, message })
             .await
     }
 
-    async fn send_goodbye(&mut self, reason: &str) -> SessionFlow {
+    async fn send_goodbye(&mut self, reason: &str) -> ClientFlow {
         self.send_message(&ServerMessage::Goodbye { reason })
             .await?;
         self.send(Message::Close(None)).await?;
-        // The session ends. The reader waits until the client has received the goodbye.
+        // The writer ends. The reader waits until the client has received the goodbye.
         ControlFlow::Break(())
     }
 
-    async fn send_message(&mut self, message: &ServerMessage<'_>) -> SessionFlow {
+    async fn send_message(&mut self, message: &ServerMessage<'_>) -> ClientFlow {
         self.send(message.to_message()).await
     }
 
-    async fn send(&mut self, message: Message) -> SessionFlow {
+    async fn send(&mut self, message: Message) -> ClientFlow {
         match self.sink.send(message).await {
             Ok(()) => ControlFlow::Continue(()),
             Err(error) => {
@@ -440,7 +440,7 @@ impl Writer<'_> {
     }
 }
 
-/// Encodes a picture on another thread: it takes milliseconds, in which no session could send.
+/// Encodes a picture on another thread: it takes milliseconds, in which no writer could send.
 fn encode(drawn: Box<DrawnPicture>, effort: Option<Effort>) -> EncodingTask {
     let view_request = &drawn.job.view_request;
     let id = view_request.id;

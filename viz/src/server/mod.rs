@@ -9,6 +9,7 @@ mod page;
 pub(crate) mod server_context;
 mod tls;
 
+use crate::client::protocol::MAX_MESSAGE_BYTES;
 use crate::clock::ServerClock;
 use crate::server::access::{Access, Role, Tokens};
 use crate::server::admission::{Admission, Connection, Limits};
@@ -17,10 +18,9 @@ use crate::server::client_log::ClientLog;
 use crate::server::guarded_stream::GuardedStream;
 use crate::server::page::{FILES, has_version};
 use crate::server::server_context::ServerContext;
-use crate::session::protocol::MAX_MESSAGE_BYTES;
 use crate::topics::robot::RobotDescription;
 use crate::topics::{self, Publisher};
-use crate::{Error, Hub, Status, session};
+use crate::{Error, Hub, Status, client};
 use axum::extract::{Extension, Path, Request, State, WebSocketUpgrade};
 use axum::http::{HeaderMap, HeaderName, HeaderValue, StatusCode, header};
 use axum::middleware::{Next, from_fn, from_fn_with_state};
@@ -131,7 +131,7 @@ impl Server {
         let (listener, address) = listen(listen_address)?;
         let scheme = if tls.is_some() { "https" } else { "http" };
         let (stop, stopped) = watch::channel(false);
-        // One thread: sessions mostly wait, and everything that computes runs on threads for
+        // One thread: clients mostly wait, and everything that computes runs on threads for
         // blocking tasks.
         let runtime = tokio::runtime::Builder::new_current_thread()
             .enable_all()
@@ -229,7 +229,7 @@ async fn serve(
         () = accept(&listener, &admission, tls.as_ref(), &app) => {}
         _ = stopped.changed() => {}
     }
-    // No new connections while the sessions say goodbye.
+    // No new connections while the clients receive the goodbye.
     drop(listener);
     let all_disconnected = async {
         while hub.n_clients() > 0 {
@@ -421,7 +421,7 @@ async fn robot_mesh(
         )
             .into_response();
     };
-    // Meshes can have many megabytes. Hashing them on this thread would delay all sessions.
+    // Meshes can have many megabytes. Hashing them on this thread would delay all clients.
     let hashed = Arc::clone(&bytes);
     let etag = match tokio::task::spawn_blocking(move || etag(&hashed)).await {
         Ok(etag) => etag,
@@ -472,9 +472,7 @@ async fn connect(
     upgrade
         .max_message_size(MAX_MESSAGE_BYTES)
         .max_frame_size(MAX_MESSAGE_BYTES)
-        .on_upgrade(move |socket| {
-            session::serve(socket, connection, role, app_state.server_context)
-        })
+        .on_upgrade(move |socket| client::serve(socket, connection, role, app_state.server_context))
 }
 
 /// Adds headers that keep other web sites from embedding or reading the responses.

@@ -1,7 +1,7 @@
 //! The path of a moving base, for viewers.
 
+use crate::client::server_message::ServerMessage;
 use crate::clock::ServerClock;
-use crate::session::server_message::ServerMessage;
 use crate::topics::items::ItemTopic;
 use crate::topics::{DefaultRate, Priority};
 use axum::extract::ws::Message;

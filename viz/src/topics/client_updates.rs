@@ -101,7 +101,7 @@ impl ClientUpdates {
                 return Next::Long(message);
             }
         }
-        // If long messages are not allowed now, the session asks again when they are.
+        // If long messages are not allowed now, the writer asks again when they are.
         timer.earliest().map_or(Next::Wait, Next::WaitUntil)
     }
 
@@ -137,7 +137,7 @@ impl ClientUpdates {
 mod tests {
     use super::{ClientUpdates, NamedFeed, Next};
     use crate::Hub;
-    use crate::session::protocol::SubscribeMessage;
+    use crate::client::protocol::SubscribeMessage;
     use crate::topics::items::Items;
     use crate::topics::keyframe_log::KeyframeLog;
     use crate::topics::keyframe_points::PointTopic;

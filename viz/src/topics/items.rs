@@ -135,7 +135,7 @@ impl<T: ItemTopic> Feed for ItemFeed<T> {
             DefaultRate::Always => Duration::ZERO,
             _ => client.subscriptions.period(T::NAME)?,
         };
-        // Sessions and the encoder run on the same thread, so this lock is usually free.
+        // Writers and the encoder run on the same thread, so this lock is usually free.
         let state = self.items.state.lock();
         let waiting = state.items.iter().filter_map(|(key, item)| {
             let sent = self.sent.get(key).copied().unwrap_or_default();

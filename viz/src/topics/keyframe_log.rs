@@ -1,7 +1,7 @@
 //! The keyframe list with the order of its changes, so that clients receive only what has changed.
 
-use crate::session::protocol::MAX_CHANGED_KEYFRAMES;
-use crate::session::server_message::{NumberedKeyframe, ServerMessage};
+use crate::client::protocol::MAX_CHANGED_KEYFRAMES;
+use crate::client::server_message::{NumberedKeyframe, ServerMessage};
 use crate::topics::updates::KeyframePose;
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
@@ -234,7 +234,7 @@ fn has_changed(before: &KeyframePose, after: &KeyframePose) -> bool {
 #[cfg(test)]
 mod tests {
     use super::{Changes, KeyframeLog, ListPosition, MAX_REMOVALS};
-    use crate::session::protocol::MAX_CHANGED_KEYFRAMES;
+    use crate::client::protocol::MAX_CHANGED_KEYFRAMES;
     use crate::topics::updates::KeyframePose;
     use kinematics::random::Random;
     use kinematics::{Stamp, Transform};

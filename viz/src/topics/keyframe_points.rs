@@ -1,7 +1,7 @@
 //! The depth of a keyframe as colored points, for viewers.
 
 use crate::Hub;
-use crate::session::server_message::{BinaryHeader, PointsHeader, frame};
+use crate::client::server_message::{BinaryHeader, PointsHeader, frame};
 use crate::topics::keyframes::SharedLog;
 use crate::topics::positions::pack_positions;
 use crate::topics::{

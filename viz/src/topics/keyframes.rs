@@ -2,7 +2,7 @@
 //! not know changes.
 
 use crate::Hub;
-use crate::session::server_message::{KeyframeMessage, ServerMessage};
+use crate::client::server_message::{KeyframeMessage, ServerMessage};
 use crate::topics::keyframe_log::{Changes, KeyframeLog, ListPosition};
 use crate::topics::updates::KeyframePose;
 use crate::topics::{
@@ -116,7 +116,7 @@ impl Topic for KeyframeTopic {
                 publisher: context.publisher.clone(),
             };
             let keyframes = state.source.borrow().clone();
-            // While a long list was encoded on this thread, no session could send anything.
+            // While a long list was encoded on this thread, no client could receive anything.
             tokio::task::spawn_blocking(move || task.run(&keyframes));
         }
     }

@@ -1,10 +1,10 @@
 //! The current images of the cameras, in the sizes that clients request.
 
 use crate::Hub;
+use crate::client::server_message::ServerMessage;
 use crate::clock::ServerClock;
 use crate::hub::Demand;
 use crate::pictures::picture::pack_live_image;
-use crate::session::server_message::ServerMessage;
 use crate::topics::subscriptions::{LIVE_IMAGES, Subscriptions, fitted};
 use crate::topics::{
     ClientState, DefaultRate, EncodeContext, Feed, Item, Priority, Publisher, Row, Sent, Timer,

@@ -95,8 +95,8 @@ pub(crate) enum Priority {
     Background,
 }
 
-/// The half of a topic that encodes new data once for all clients. It works outside the sessions,
-/// on the server's thread.
+/// The half of a topic that encodes new data once for all clients. It works outside the tasks of
+/// clients, on the server's thread.
 pub(crate) trait Topic: Send + Sync {
     /// Encodes what is new and due, if a client receives it. Work that takes more than a
     /// millisecond belongs on a thread for blocking tasks.
@@ -166,7 +166,7 @@ pub(crate) struct KeyframeProgress {
     pub(crate) n_lists: u64,
 }
 
-/// Numbers new messages, and wakes up the sessions.
+/// Numbers new messages, and wakes up the writers.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Publisher {
     n_messages: Arc<AtomicU64>,
@@ -174,13 +174,13 @@ pub(crate) struct Publisher {
 }
 
 impl Publisher {
-    /// Calls `store` with the number of a new message, and then wakes up the sessions. Later
+    /// Calls `store` with the number of a new message, and then wakes up the writers. Later
     /// messages have larger numbers.
     pub(crate) fn publish(&self, store: impl FnOnce(u64)) {
         // Only the order of the numbers matters. The locks of the topics order the messages. Number
         // 0 is left for clients that have received nothing.
         store(1 + self.n_messages.fetch_add(1, Ordering::Relaxed));
-        // After storing: a session that is woken up earlier would find nothing, and then sleep
+        // After storing: a writer that is woken up earlier would find nothing, and then sleep
         // until the next message.
         self.changed.send_replace(());
     }
@@ -227,7 +227,7 @@ impl Timer {
             .and_then(|at| at.checked_add(period))
             .unwrap_or(self.now);
         if due > self.now {
-            // There is something to send. Without this time, the session would sleep until
+            // There is something to send. Without this time, the writer would sleep until
             // something else changes.
             self.wait_until(due);
         }
@@ -236,7 +236,7 @@ impl Timer {
 
     /// Records that a message is due at this time.
     pub(crate) fn wait_until(&mut self, due: Instant) {
-        // All feeds of a client share the timer, and its session sleeps only once.
+        // All feeds of a client share the timer, and its writer sleeps only once.
         self.earliest = Some(self.earliest.map_or(due, |earliest| earliest.min(due)));
     }
 

@@ -43,7 +43,7 @@ struct ChunkTopic {
 impl Topic for ChunkTopic {
     fn encode(&self, context: &EncodeContext<'_>) {
         if take_if_changed(&mut self.lists.lock()).is_some() {
-            // There is no message to store: this only wakes up the sessions, whose feeds compare
+            // There is no message to store: this only wakes up the writers, whose feeds compare
             // versions.
             context.publisher.publish(|_| ());
         }
@@ -140,7 +140,7 @@ impl Hub {
     /// Frees the chunks of models that no client draws any longer.
     pub(crate) fn drop_unused_chunks(&self) {
         self.latest::<ModelLists>().send_if_modified(|lists| {
-            // Called whenever a subscription changes. Sessions must wake up only if a list was
+            // Called whenever a subscription changes. Writers must wake up only if a list was
             // removed.
             let n_before = lists.len();
             lists.retain(|method, _| self.chunk_period(method).is_some());

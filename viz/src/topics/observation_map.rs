@@ -1,8 +1,8 @@
 //! When and how precisely each part of the scene was observed, for viewers.
 
 use crate::Hub;
+use crate::client::server_message::{BinaryHeader, ObservationsHeader, frame};
 use crate::clock::ServerClock;
-use crate::session::server_message::{BinaryHeader, ObservationsHeader, frame};
 use crate::topics::items::ItemTopic;
 use crate::topics::{DefaultRate, Priority};
 use axum::extract::ws::Message;

@@ -1,8 +1,8 @@
 //! Scans of range scanners, for viewers.
 
 use crate::Hub;
+use crate::client::server_message::{BinaryHeader, RangeScanHeader, frame};
 use crate::clock::ServerClock;
-use crate::session::server_message::{BinaryHeader, RangeScanHeader, frame};
 use crate::topics::items::ItemTopic;
 use crate::topics::positions::pack_positions;
 use crate::topics::{DefaultRate, Priority};

@@ -1,8 +1,8 @@
 //! The topic of the robot: its description, which clients receive once, and its state.
 
 use crate::Hub;
+use crate::client::server_message::ServerMessage;
 use crate::clock::ServerClock;
-use crate::session::server_message::ServerMessage;
 use crate::topics::base_path::BasePath;
 use crate::topics::items::ItemTopic;
 use crate::topics::robot::{RobotDescription, RobotMessage};
@@ -11,7 +11,7 @@ use axum::extract::ws::Message;
 use keyframe::RobotState;
 use std::sync::Arc;
 
-/// The robot's description, which clients need before its states. Sessions send the states
+/// The robot's description, which clients need before its states. Writers send the states
 /// themselves, as soon as they arrive.
 #[derive(Default)]
 pub(crate) struct Description;

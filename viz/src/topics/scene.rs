@@ -1,8 +1,8 @@
 //! Scene extent and initial view.
 
 use crate::Hub;
+use crate::client::server_message::ServerMessage;
 use crate::clock::ServerClock;
-use crate::session::server_message::ServerMessage;
 use crate::topics::items::ItemTopic;
 use crate::topics::updates::SceneHint;
 use crate::topics::{DefaultRate, Priority};

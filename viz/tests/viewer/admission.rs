@@ -199,7 +199,7 @@ fn viewer_connects_despite_idle_sockets() {
 }
 
 #[test]
-fn client_slots_are_released_after_any_session_end() {
+fn client_slots_are_released_after_any_disconnection() {
     let (hub, server) = start();
     for _ in 0..3 {
         let clients: Vec<_> = (0..32).map(|_| Client::connect(server.address())).collect();
