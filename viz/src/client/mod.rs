@@ -18,8 +18,9 @@ use crate::client::protocol::{
 };
 use crate::client::writer::{Reply, Writer};
 use crate::clock::ServerClock;
+use crate::demands::Demand;
 use crate::edit::EditRequest;
-use crate::hub::{Demand, MAX_WAITING_EDITS};
+use crate::operator_requests::MAX_WAITING_EDITS;
 use crate::pictures::queue::MAX_VIEWS;
 use crate::pictures::view_request::{InvalidRequest, ViewRequest};
 use crate::pictures::viewpoint::Viewpoint;
@@ -198,7 +199,7 @@ impl Reader<'_> {
             ClientMessage::Control(ControlMessage { action }) => {
                 self.log
                     .line(format_args!("client {}: {action:?}", self.client));
-                self.hub.control(action);
+                self.hub.operator_requests().control(action);
             }
             ClientMessage::Shown(message) => self.shown(&message)?,
             ClientMessage::Edit(message) => self.edit(&message)?,
@@ -233,7 +234,7 @@ impl Reader<'_> {
             self.demand
                 .send_modify(|demand| demand.viewpoint = Some(viewpoint));
         }
-        if !self.hub.view_request(self.client, view_request) {
+        if !self.hub.pictures().request(self.client, view_request) {
             return Err(InvalidRequest::Views { max: MAX_VIEWS });
         }
         Ok(())
@@ -250,7 +251,9 @@ impl Reader<'_> {
             .instant(*shown_millis)
             .ok_or(InvalidRequest::ShownTime { got: *shown_millis })?;
         let view = view.as_deref().unwrap_or_default();
-        self.hub.picture_shown(self.client, *id, view, shown_at);
+        self.hub
+            .pictures()
+            .record_shown(self.client, *id, view, shown_at);
         Ok(())
     }
 
@@ -262,7 +265,7 @@ impl Reader<'_> {
             self.client,
             request.action()
         ));
-        if !self.hub.edit(request) {
+        if !self.hub.operator_requests().edit(request) {
             return Err(InvalidRequest::Edits {
                 max: MAX_WAITING_EDITS,
             });

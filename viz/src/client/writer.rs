@@ -8,9 +8,10 @@ use crate::client::link_rate::LinkRate;
 use crate::client::negotiation::{Agreement, CAPABILITIES, Negotiated};
 use crate::client::protocol::{BASE_PROTOCOL_VERSION, PROTOCOL_VERSION};
 use crate::client::server_message::{BinaryHeader, PartHeader, ServerMessage, frame};
-use crate::hub::Demand;
+use crate::demands::Demand;
 use crate::pictures::compact_depth::Effort;
 use crate::pictures::picture::{PackError, PackedPicture, pack_picture};
+use crate::pictures::picture_requests::PictureRequests;
 use crate::pictures::picture_times::SentPicture;
 use crate::pictures::queue::{DrawnPicture, Outgoing};
 use crate::pictures::view_request::{DEFAULT_STAGES, MAX_SIZE_PX};
@@ -151,7 +152,7 @@ impl Writer<'_> {
             // advance, they would be outdated when it is their turn.
             if encoding.is_none()
                 && is_heard
-                && let Some(outgoing) = self.server_context.hub.collect(self.client)
+                && let Some(outgoing) = self.pictures().collect(self.client)
             {
                 encoding = self.begin(outgoing).await?;
                 if encoding.is_none() {
@@ -238,7 +239,7 @@ impl Writer<'_> {
                         let is_complete = current.n_sent == current.bytes.len();
                         // The run may now render the next picture for this client.
                         if current.is_picture && (is_complete || sent.is_break()) {
-                            self.server_context.hub.release(self.client);
+                            self.pictures().release(self.client);
                         }
                         sent?;
                         transfers.current = (!is_complete).then_some(current);
@@ -266,7 +267,7 @@ impl Writer<'_> {
                         Err(error) => error.to_string(),
                     };
                     let sent = self.send_error(Some(id), &view, &reason).await;
-                    self.server_context.hub.release(self.client);
+                    self.pictures().release(self.client);
                     sent?;
                 }
                 // The branches below only begin the next round.
@@ -276,6 +277,10 @@ impl Writer<'_> {
                 () = sleep_until(update_due) => {}
             }
         }
+    }
+
+    fn pictures(&self) -> &PictureRequests {
+        self.server_context.hub.pictures()
     }
 
     /// Begins to encode a picture, or sends the reason why there is none.
@@ -288,7 +293,7 @@ impl Writer<'_> {
             Outgoing::Failed { id, view, reason } => {
                 let sent = self.send_error(Some(id), &view, &reason).await;
                 // Even if the connection is broken: the place of the picture must become free.
-                self.server_context.hub.release(self.client);
+                self.pictures().release(self.client);
                 sent?;
                 ControlFlow::Continue(None)
             }
@@ -316,7 +321,7 @@ impl Writer<'_> {
                 n_keyframes: trained_on.n,
                 sent_at,
             };
-            self.server_context.hub.picture_sent(self.client, picture);
+            self.pictures().record_sent(self.client, picture);
         }
         message
     }

@@ -3,7 +3,7 @@
 use crate::Hub;
 use crate::client::server_message::ServerMessage;
 use crate::clock::ServerClock;
-use crate::hub::Demand;
+use crate::demands::Demand;
 use crate::pictures::picture::pack_live_image;
 use crate::topics::subscriptions::{LIVE_IMAGES, Subscriptions, fitted};
 use crate::topics::{
@@ -286,7 +286,10 @@ impl Hub {
 
     /// Whether a client shows the images of any camera.
     pub fn needs_live_images(&self) -> bool {
-        self.is_observed() || self.has_subscription(Subscriptions::has_live_images)
+        self.is_observed()
+            || self
+                .demands()
+                .has_subscription(Subscriptions::has_live_images)
     }
 }
 

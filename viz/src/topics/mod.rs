@@ -32,7 +32,7 @@ pub(crate) mod updates;
 
 use crate::Hub;
 use crate::clock::ServerClock;
-use crate::hub::Demand;
+use crate::demands::Demand;
 use crate::pictures::viewpoint::Viewpoint;
 use crate::topics::keyframe_log::ListPosition;
 use crate::topics::subscriptions::Subscriptions;
@@ -313,7 +313,7 @@ pub(crate) async fn encode_all(
             topics.iter().for_each(|topic| topic.clear());
             continue;
         }
-        let demands = hub.demands();
+        let demands = hub.demands().all();
         // One time for all topics, so that their periods end in the same check.
         let now = Instant::now();
         let context = EncodeContext {

@@ -79,7 +79,7 @@ impl ItemTopic for Observations {
 impl Hub {
     /// Whether a client shows when and how precisely the scene was observed.
     pub fn needs_observations(&self) -> bool {
-        self.is_wanted(Observations::NAME)
+        self.demands().has_topic(Observations::NAME)
     }
 
     /// Sets the map of observations. Compresses it, which takes some milliseconds.

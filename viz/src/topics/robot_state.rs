@@ -55,6 +55,6 @@ impl Hub {
         // The path is recorded even if no client is connected, so that later clients get all of it.
         self.is_observed()
             || self.latest::<BasePath>().borrow().is_due()
-            || self.is_wanted(Description::NAME)
+            || self.demands().has_topic(Description::NAME)
     }
 }
