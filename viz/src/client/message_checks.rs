@@ -122,7 +122,7 @@ fn check_subscription(subscriptions: &mut Subscriptions, message: SubscribeMessa
     let chunks = subscriptions.model_chunks.as_ref();
     let of_topics = TOPICS
         .iter()
-        .filter_map(|row| subscriptions.period(row.name));
+        .filter_map(|entry| subscriptions.period(entry.name));
     let mut periods = of_topics
         .chain(images.period)
         .chain(chunks.map(|chunks| chunks.period));

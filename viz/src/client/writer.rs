@@ -18,10 +18,10 @@ use crate::pictures::view_request::{DEFAULT_STAGES, MAX_SIZE_PX};
 use crate::server::access::Role;
 use crate::server::admission::Connection;
 use crate::server::server_context::ServerContext;
-use crate::topics::client_updates::{ClientUpdates, Next};
-use crate::topics::items::ItemTopic;
+use crate::topics::client_updates::{ClientUpdates, NextUpdate};
 use crate::topics::robot::RobotStateMessage;
-use crate::topics::robot_state::Description;
+use crate::topics::robot_state::RobotDescriptionTopic;
+use crate::topics::shared_topic::SharedTopic;
 use axum::body::Bytes;
 use axum::extract::ws::{Message, WebSocket};
 use futures_util::SinkExt;
@@ -182,22 +182,22 @@ impl Writer<'_> {
                 published.mark_unchanged();
                 let has_changes = self.negotiated.has_keyframe_changes;
                 match updates.next(&subscriptions, has_changes, Instant::now(), allows_long) {
-                    Next::Short(message) => waiting_update = Some((message, false)),
-                    Next::Long(message) => waiting_update = Some((message, true)),
-                    Next::WaitUntil(time) => {
+                    NextUpdate::Short(message) => waiting_update = Some((message, false)),
+                    NextUpdate::Long(message) => waiting_update = Some((message, true)),
+                    NextUpdate::WaitUntil(time) => {
                         update_due = Some(update_due.map_or(time, |due| due.min(time)))
                     }
-                    Next::Wait => {}
+                    NextUpdate::Wait => {}
                 }
             }
             let is_waiting_long = waiting_update.as_ref().map(|(_, is_long)| *is_long);
             // States need the description of the robot, and a waiting short message may be a new
             // one.
-            let state_period = subscriptions.period(Description::NAME);
+            let state_period = subscriptions.period(RobotDescriptionTopic::NAME);
             let state_due = state_period
                 .filter(|_| {
                     is_heard
-                        && updates.has_sent(Description::NAME)
+                        && updates.has_sent(RobotDescriptionTopic::NAME)
                         && is_waiting_long != Some(false)
                 })
                 .map(|period| {

@@ -4,15 +4,14 @@
 //! clients. [`Feed`] decides what one client receives next. What the halves share is known to the
 //! topic alone.
 //!
-//! To add a topic, write a module and a row of [`TOPICS`]. If all clients receive the same
-//! messages, implement [`ItemTopic`](items::ItemTopic), which needs a name, a period and a function
-//! that encodes. `docs/reference/protocol.md` lists the topics.
+//! To add a topic, write a module and an entry of [`TOPICS`]. If all clients receive the same
+//! messages, implement [`SharedTopic`](shared_topic::SharedTopic), which needs a name, a period and
+//! a function that encodes. `docs/reference/protocol.md` lists the topics.
 
 mod base_path;
 pub(crate) mod chunk_list;
 mod chunk_sender;
 pub(crate) mod client_updates;
-pub(crate) mod items;
 mod keyframe_log;
 mod keyframe_points;
 pub(crate) mod keyframes;
@@ -24,6 +23,7 @@ pub(crate) mod range_scan;
 pub(crate) mod robot;
 pub(crate) mod robot_state;
 mod scene;
+pub(crate) mod shared_topic;
 mod status;
 pub(crate) mod subscriptions;
 #[cfg(test)]
@@ -43,23 +43,23 @@ use std::time::{Duration, Instant};
 use tokio::sync::watch;
 
 /// All topics. Within a priority, a client receives them in this order.
-pub(crate) const TOPICS: &[Row] = &[
-    items::row::<scene::Scene>(),
-    items::row::<status::RunStatus>(),
-    items::row::<base_path::BasePathTopic>(),
-    items::row::<robot_state::Description>(),
-    live_images::ROW,
-    items::row::<range_scan::RangeScanTopic>(),
-    keyframes::ROW,
-    keyframe_points::ROW,
-    items::row::<observation_map::Observations>(),
-    model_chunks::ROW,
+pub(crate) const TOPICS: &[TopicEntry] = &[
+    shared_topic::entry::<scene::SceneTopic>(),
+    shared_topic::entry::<status::StatusTopic>(),
+    shared_topic::entry::<base_path::BasePathTopic>(),
+    shared_topic::entry::<robot_state::RobotDescriptionTopic>(),
+    live_images::ENTRY,
+    shared_topic::entry::<range_scan::RangeScanTopic>(),
+    keyframes::ENTRY,
+    keyframe_points::ENTRY,
+    shared_topic::entry::<observation_map::ObservationTopic>(),
+    model_chunks::ENTRY,
     #[cfg(test)]
-    items::row::<test_topic::Weather>(),
+    shared_topic::entry::<test_topic::Weather>(),
 ];
 
-/// A topic in the table.
-pub(crate) struct Row {
+/// A topic in the list of all topics.
+pub(crate) struct TopicEntry {
     /// Name in `subscribe`.
     pub(crate) name: &'static str,
     /// What a client receives before it subscribes.
@@ -193,14 +193,14 @@ impl Publisher {
 
 /// An encoded message; clones share the bytes.
 #[derive(Clone, Debug)]
-pub(crate) struct Item {
+pub(crate) struct EncodedMessage {
     pub(crate) number: u64,
     pub(crate) message: Message,
 }
 
 /// Number of the last message of a kind that a client has received, and when it was sent.
 #[derive(Clone, Copy, Debug, Default)]
-pub(crate) struct Sent {
+pub(crate) struct LastSent {
     pub(crate) number: u64,
     pub(crate) at: Option<Instant>,
 }
@@ -282,18 +282,18 @@ const CHECK_PERIOD: Duration = Duration::from_millis(20);
 /// use the hub: the files would import each other in a cycle.
 impl Default for Subscriptions {
     fn default() -> Self {
-        Self::new(TOPICS.iter().filter_map(|row| match row.default {
+        Self::new(TOPICS.iter().filter_map(|entry| match entry.default {
             // Nobody can subscribe to these topics, so their names must be unknown.
             DefaultRate::Always => None,
-            DefaultRate::Period(period) => Some((row.name, Some(period))),
-            DefaultRate::Off => Some((row.name, None)),
+            DefaultRate::Period(period) => Some((entry.name, Some(period))),
+            DefaultRate::Off => Some((entry.name, None)),
         }))
     }
 }
 
 /// Starts all topics for the data of a hub.
 pub(crate) fn start_all(hub: &Hub) -> Arc<[Arc<dyn Topic>]> {
-    TOPICS.iter().map(|row| (row.start)(hub)).collect()
+    TOPICS.iter().map(|entry| (entry.start)(hub)).collect()
 }
 
 /// Encodes new data while clients are connected. Runs until the server stops.

@@ -5,7 +5,7 @@ use crate::topics::chunk_list::ChunkList;
 use crate::topics::chunk_sender::{ChunkSender, NextChunk};
 use crate::topics::subscriptions::MODEL_CHUNKS;
 use crate::topics::{
-    ClientState, DefaultRate, EncodeContext, Feed, Priority, Row, Timer, Topic, receiver,
+    ClientState, DefaultRate, EncodeContext, Feed, Priority, Timer, Topic, TopicEntry, receiver,
     take_if_changed,
 };
 use axum::extract::ws::Message;
@@ -18,7 +18,7 @@ use tokio::sync::watch;
 use trainer::ModelChunks;
 
 /// The topic in the table.
-pub(crate) const ROW: Row = Row {
+pub(crate) const ENTRY: TopicEntry = TopicEntry {
     name: MODEL_CHUNKS,
     default: DefaultRate::Off,
     priority: Priority::Background,
